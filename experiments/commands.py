@@ -1,0 +1,72 @@
+"""What all commands share: how they start, and how they report errors and progress."""
+
+import sys
+from collections.abc import Callable, Sequence
+
+from absl import app, logging
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+
+def run(main: Callable[[], None]) -> None:
+    """Runs a command; an error of the user's input ends it with one line and status 2."""
+
+    def guarded(arguments: Sequence[str]) -> None:
+        logging.set_verbosity(logging.ERROR)
+        if len(arguments) > 1:
+            sys.exit(f"Unexpected arguments {arguments[1:]}. Options begin with --; see --help.")
+        try:
+            main()
+        except ValueError as error:
+            print(f"error: {error}", file=sys.stderr)
+            sys.exit(2)
+
+    app.run(guarded)
+
+
+class ProgressBar:
+    """A progress bar with free text, or plain lines where the output is not a terminal."""
+
+    _PLAIN_LINES = 20
+
+    def __init__(self, label: str, total: int, done: int = 0) -> None:
+        """Starts a bar.
+
+        Args:
+          label: what is being done.
+          total: number of steps.
+          done: steps already done.
+        """
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[text]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            disable=not sys.stdout.isatty(),
+        )
+        self._task = self._bar.add_task(label, total=total, completed=done, text="")
+        self._label, self._total = label, total
+        self._printed = done
+
+    def __enter__(self) -> "ProgressBar":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._bar.stop()
+
+    def show(self, done: int, text: str) -> None:
+        """Moves the bar; on a plain output a line is printed every twentieth of the way."""
+        self._bar.update(self._task, completed=done, text=text)
+        due = done - self._printed >= self._total / self._PLAIN_LINES or done == self._total
+        if self._bar.disable and due:
+            print(f"{self._label} {done}/{self._total}  {text}", flush=True)
+            self._printed = done

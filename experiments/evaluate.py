@@ -1,0 +1,152 @@
+"""Renders a split of a scene with a trained model, and measures it.
+
+    python -m experiments.evaluate --run=runs/ball --split=test
+"""
+
+import json
+import math
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from absl import flags
+from jaxtyping import Bool, Float, UInt8
+
+from experiments import commands, figures
+from refref_jax import metrics
+from refref_jax.data import files, local_layout
+from refref_jax.data.cameras import image_rays
+from refref_jax.render import Model, Rendering, load_model, render_image
+from refref_jax.render.saved import latest_step
+from refref_jax.training import run_folder
+
+_RUN = flags.DEFINE_string("run", None, "Folder of a trained run.", required=True)
+_SPLIT = flags.DEFINE_enum("split", "test", list(local_layout.SPLITS), "Images to render.")
+_STEP = flags.DEFINE_integer("step", None, "Checkpoint to use; the newest if not given.", 0)
+_SCENE = flags.DEFINE_string("scene", None, "Folder of the scene, if it has moved.")
+_LIMIT = flags.DEFINE_integer("limit", None, "Only this many images, evenly spread.", 1)
+_CHUNK = flags.DEFINE_integer("chunk", 4096, "Paths at once: lower it if memory runs out.", 1)
+
+_METHODS = {"paper": "oracle"}
+
+_VIEWS_IN_COMPARISON = 4
+
+
+class Truth(NamedTuple):
+    """What a split says of its images; masks and distances may be missing."""
+
+    frames: local_layout.Frames
+    images: UInt8[np.ndarray, "frames h w 3"]
+    masks: Bool[np.ndarray, "frames h w"] | None
+    distances: Float[np.ndarray, "frames h w"] | None
+
+
+def main() -> None:
+    """Evaluates a run."""
+    run = Path(_RUN.value)
+    config = run_folder.read_config(run)
+    model = load_model(run, _STEP.value)
+    scene = Path(_SCENE.value or config.scene.path)
+    truth = read_truth(scene, _SPLIT.value)
+    out = run / "eval" / _SPLIT.value
+    per_image, views = evaluate(model, truth, out)
+    summary = {
+        "scene": scene.name,
+        "method": _METHODS.get(config.paths, config.paths),
+        "step": _STEP.value if _STEP.value is not None else latest_step(run),
+        "results": {key: _mean(per_image, key) for key in per_image[0] if key != "name"},
+        "per_image": per_image,
+    }
+    summary["results"]["seconds_per_image"] = summary["results"].pop("seconds")
+    text = json.dumps(_string_safe(summary), indent=2, allow_nan=False)
+    (out / "metrics.json").write_text(text + "\n", encoding="utf-8")
+    figures.write_comparison(out / "comparison.png", views)
+    for key, value in summary["results"].items():
+        print(f"{key:>22}  {'-' if value is None else format(value, '.4f')}")
+    print(f"Pictures: {out / 'comparison.png'}, {out / 'rgb'}, {out / 'distance'}")
+    print(f"Metrics:  {out / 'metrics.json'}")
+    print(f"Next: python -m experiments.render --run={run} --views=orbit")
+
+
+def read_truth(scene: Path, split: str) -> Truth:
+    """Reads all that a split has."""
+    frames = local_layout.read_frames(scene, split)
+    return Truth(
+        frames,
+        local_layout.read_images(frames),
+        local_layout.read_masks(frames) if frames.masks else None,
+        local_layout.read_distances(frames) if frames.depths else None,
+    )
+
+
+def evaluate(
+    model: Model, truth: Truth, out: Path
+) -> tuple[list[dict[str, Any]], list[figures.Comparison]]:
+    """Renders and measures each image, and writes what was rendered."""
+    for folder in ("rgb", "distance"):
+        (out / folder).mkdir(parents=True, exist_ok=True)
+    count = len(truth.images)
+    chosen = np.unique(np.linspace(0, count - 1, min(_LIMIT.value or count, count)).astype(int))
+    shown = set(chosen[np.linspace(0, chosen.size - 1, _VIEWS_IN_COMPARISON).astype(int)])
+    per_image, views = [], []
+    # The first rendering also compiles; it is not the one that is timed.
+    render_image(model, image_rays(truth.frames.cameras, 0), chunk=_CHUNK.value)
+    with commands.ProgressBar("evaluate", chosen.size) as bar:
+        for i in chosen:
+            name = truth.frames.names[i]
+            start = time.monotonic()
+            seen = render_image(model, image_rays(truth.frames.cameras, i), chunk=_CHUNK.value)
+            seconds = time.monotonic() - start
+            files.write_rgb(out / "rgb" / f"{name}.png", seen.rgb)
+            files.write_exr(out / "distance" / f"{name}.exr", seen.distance)
+            per_image.append({"name": name, **measure(seen, truth, i), "seconds": seconds})
+            if i in shown:
+                target = truth.images[i] / 255.0
+                views.append(figures.Comparison(name, target, seen.rgb, seen.distance))
+            bar.show(len(per_image), f"{name}  PSNR {per_image[-1]['psnr']:.2f}")
+    return per_image, views
+
+
+def measure(seen: Rendering, truth: Truth, i: int) -> dict[str, float | None]:
+    """Returns all metrics of one image; `None` for what the scene does not tell."""
+    target = (truth.images[i] / 255.0).astype(np.float32)
+    result = {
+        "psnr": metrics.psnr(seen.rgb, target),
+        "psnr_masked": None,
+        "ssim": metrics.ssim(seen.rgb, target),
+        "distance_mae": None,
+        "distance_mae_masked": None,
+    }
+    mask = None if truth.masks is None else truth.masks[i]
+    if mask is not None:
+        result["psnr_masked"] = metrics.psnr_masked(seen.rgb, target, mask)
+    if truth.distances is not None:
+        distance = truth.distances[i]
+        known = np.isfinite(distance)
+        result["distance_mae"] = metrics.mean_absolute_error(seen.distance, distance, known)
+        if mask is not None:
+            result["distance_mae_masked"] = metrics.mean_absolute_error(
+                seen.distance, distance, known & mask
+            )
+    return {key: None if value is None else float(value) for key, value in result.items()}
+
+
+def _mean(per_image: list[dict[str, Any]], key: str) -> float | None:
+    values = [image[key] for image in per_image if image[key] is not None]
+    return float(np.mean(values)) if values else None
+
+
+def _string_safe(value: Any) -> Any:
+    """Replaces numbers that JSON does not know by their names."""
+    if isinstance(value, dict):
+        return {key: _string_safe(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_string_safe(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value
+
+
+if __name__ == "__main__":
+    commands.run(main)

@@ -1,0 +1,80 @@
+"""Pictures for people, drawn with matplotlib."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float, UInt8
+
+matplotlib.use("Agg")
+from matplotlib import pyplot  # noqa: E402
+
+_COLOUR_MAP = "turbo"
+_ERROR_GAIN = 4.0
+_INCHES = 2.4
+
+
+class Comparison(NamedTuple):
+    """One view, true and rendered.
+
+    Attributes:
+      name: of the view.
+      target: true sRGB in `[0, 1]`.
+      rgb: rendered sRGB in `[0, 1]`.
+      distance: rendered distance, world units.
+    """
+
+    name: str
+    target: Float[np.ndarray, "h w 3"]
+    rgb: Float[np.ndarray, "h w 3"]
+    distance: Float[np.ndarray, "h w"]
+
+
+def write_comparison(path: Path, views: Sequence[Comparison]) -> None:
+    """Draws views as rows: ground truth, render, error, distance.
+
+    Distances share one scale, from 0 to the largest finite one.
+    """
+    titles = ("ground truth", "render", f"error x {_ERROR_GAIN:g}", "distance")
+    figure, axes = pyplot.subplots(
+        len(views),
+        len(titles),
+        figsize=(_INCHES * len(titles), _INCHES * len(views) + 0.4),
+        squeeze=False,
+        layout="constrained",
+    )
+    farthest = max(_largest_finite(view.distance) for view in views)
+    for row, view in zip(axes, views, strict=True):
+        row[0].imshow(view.target)
+        row[1].imshow(view.rgb)
+        row[2].imshow(np.clip(np.abs(view.rgb - view.target) * _ERROR_GAIN, 0.0, 1.0))
+        shown = row[3].imshow(view.distance, cmap=_COLOUR_MAP, vmin=0.0, vmax=farthest)
+        row[0].set_ylabel(view.name)
+        for axis in row:
+            axis.set_xticks([])
+            axis.set_yticks([])
+    for axis, title in zip(axes[0], titles, strict=True):
+        axis.set_title(title)
+    figure.colorbar(shown, ax=axes[:, 3], shrink=0.6, label="world units")
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+def colour_distances(
+    distances: Sequence[Float[np.ndarray, "h w"]],
+) -> list[UInt8[np.ndarray, "h w 3"]]:
+    """Colours distance maps on one scale, from 0 to the largest; misses are white."""
+    farthest = max(_largest_finite(distance) for distance in distances)
+    coloured = []
+    for distance in distances:
+        known = np.isfinite(distance)
+        rgb = matplotlib.colormaps[_COLOUR_MAP](np.where(known, distance, 0.0) / farthest)
+        coloured.append(np.round(255.0 * np.where(known[..., None], rgb[..., :3], 1.0)))
+    return [rgb.astype(np.uint8) for rgb in coloured]
+
+
+def _largest_finite(values: Float[np.ndarray, "*shape"]) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.max()) if finite.size else 1.0

@@ -1,0 +1,78 @@
+"""Renders the views of a split, or an orbit, as pictures, distance maps and a GIF.
+
+    python -m experiments.render --run=runs/ball --views=orbit --frames=60
+"""
+
+import math
+from pathlib import Path
+
+import imageio.v3 as iio
+from absl import flags
+
+from experiments import commands, figures
+from refref_jax.data import files, local_layout
+from refref_jax.data.cameras import Cameras, image_rays, orbit
+from refref_jax.render import load_model, render_image
+from refref_jax.training import run_folder
+
+_RUN = flags.DEFINE_string("run", None, "Folder of a trained run.", required=True)
+_VIEWS = flags.DEFINE_enum(
+    "views", "orbit", ["orbit", *local_layout.SPLITS], "Cameras: an orbit, or those of a split."
+)
+_STEP = flags.DEFINE_integer("step", None, "Checkpoint to use; the newest if not given.", 0)
+_SCENE = flags.DEFINE_string("scene", None, "Folder of the scene, if it has moved.")
+_OUT = flags.DEFINE_string("out", None, "Where to write; {run}/render/{views} if not given.")
+_FRAMES = flags.DEFINE_integer("frames", 60, "Frames of an orbit.", 1)
+_SIZE = flags.DEFINE_integer("size", 200, "Width and height of an orbit's frames, pixels.", 1)
+_FOV = flags.DEFINE_float("fov", 66.785, "Horizontal field of view of an orbit, degrees.", 1, 179)
+_DISTANCE = flags.DEFINE_float("distance", 4.0, "Distance of an orbit from the origin.", 1e-3)
+_ELEVATION = flags.DEFINE_float("elevation", 20.0, "Elevation of an orbit, degrees.", -89, 89)
+_FPS = flags.DEFINE_float("fps", 15.0, "Frames a second of the GIF.", 0.1)
+_CHUNK = flags.DEFINE_integer("chunk", 4096, "Paths at once: lower it if memory runs out.", 1)
+
+
+def main() -> None:
+    """Renders the chosen cameras."""
+    run = Path(_RUN.value)
+    model = load_model(run, _STEP.value)
+    cameras, names = _cameras(run)
+    out = Path(_OUT.value) if _OUT.value else run / "render" / _VIEWS.value
+    for folder in ("rgb", "distance"):
+        (out / folder).mkdir(parents=True, exist_ok=True)
+    frames, distances = [], []
+    with commands.ProgressBar("render", len(names)) as bar:
+        for i, name in enumerate(names):
+            seen = render_image(model, image_rays(cameras, i), chunk=_CHUNK.value)
+            files.write_rgb(out / "rgb" / f"{name}.png", seen.rgb)
+            files.write_exr(out / "distance" / f"{name}.exr", seen.distance)
+            frames.append(files.to_bytes(seen.rgb))
+            distances.append(seen.distance)
+            bar.show(i + 1, name)
+    coloured = figures.colour_distances(distances)
+    _write_gif(out / "rgb.gif", frames)
+    _write_gif(out / "distance.gif", coloured)
+    print(f"Pictures: {out / 'rgb.gif'}, {out / 'distance.gif'}, {out / 'rgb'}")
+    print(f"Distance in world units: {out / 'distance'}")
+
+
+def _cameras(run: Path) -> tuple[Cameras, tuple[str, ...]]:
+    if _VIEWS.value == "orbit":
+        cameras = orbit(
+            _FRAMES.value,
+            distance=_DISTANCE.value,
+            elevation=math.radians(_ELEVATION.value),
+            size=_SIZE.value,
+            angle_x=math.radians(_FOV.value),
+        )
+        return cameras, tuple(f"r_{i:03d}" for i in range(_FRAMES.value))
+    scene = Path(_SCENE.value or run_folder.read_config(run).scene.path)
+    frames = local_layout.read_frames(scene, _VIEWS.value)
+    return frames.cameras, frames.names
+
+
+def _write_gif(path: Path, frames: list) -> None:
+    iio.imwrite(path, frames, plugin="pillow", extension=".gif", duration=1000 / _FPS.value, loop=0)
+
+
+if __name__ == "__main__":
+    commands.run(main)

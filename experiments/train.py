@@ -1,0 +1,218 @@
+"""Trains a model of a scene.
+
+    python -m experiments.train --scene=experiments/data/cube_smcvx_ball --out=runs/ball
+"""
+
+import math
+import signal
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+from absl import flags
+
+from experiments import commands
+from experiments.presets import PRESETS, bounds
+from refref_jax.data import background, containment, lint, local_layout, meshes
+from refref_jax.data.batches import PixelSampler
+from refref_jax.data.geometry import build_geometry
+from refref_jax.optics.path_tracing import BUDGETS, Geometry
+from refref_jax.render import saved
+from refref_jax.render.saved import SavedModel
+from refref_jax.training import loop, run_folder
+from refref_jax.training.checkpoints import Checkpoints
+from refref_jax.training.config import SceneConfig, TrainingConfig
+from refref_jax.training.state import TrainState, init_state
+from refref_jax.training.steps import StepReport
+
+_SCENE = flags.DEFINE_string("scene", None, "Folder of the scene to train on.")
+_OUT = flags.DEFINE_string("out", None, "Folder to write the run to.", required=True)
+_PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Size of the model and its training.")
+_PATHS = flags.DEFINE_enum(
+    "paths",
+    "paper",
+    list(BUDGETS),
+    "Light paths: 'straight' ignores the objects; 'paper' bends up to 10 times and reflects at "
+    "the first surface.",
+)
+_INTERIOR = flags.DEFINE_enum(
+    "interior",
+    "field",
+    ["field", "clear"],
+    "'field' also learns what is inside the objects; 'clear' takes them to be clear.",
+)
+_RULE = flags.DEFINE_enum(
+    "rule",
+    "nested",
+    ["nested", "facing"],
+    "What lies outside each mesh: the part around it, or always air (as Cycles does it).",
+)
+_IOR = flags.DEFINE_multi_string(
+    "ior", [], "Index of refraction of a material or a mesh, as glass=1.52. May be repeated."
+)
+_BACKGROUND = flags.DEFINE_enum(
+    "background",
+    "auto",
+    ["auto", "bounded", "unbounded"],
+    "Whether there are walls, or an environment infinitely far away.",
+)
+_RADIUS = flags.DEFINE_float(
+    "radius",
+    None,
+    "Half edge of a bounded scene's cube (7.5 by default), or radius of an unbounded scene's "
+    "uncontracted ball, in world units.",
+    lower_bound=1e-6,
+)
+_STEPS = flags.DEFINE_integer("steps", None, "Training steps; the preset's if not given.", 1)
+_BATCH = flags.DEFINE_integer("batch", None, "Rays a step; the preset's if not given.", 1)
+_SEED = flags.DEFINE_integer("seed", 0, "Seed of everything random.", 0)
+_RESUME = flags.DEFINE_bool("resume", False, "Continue the run in --out, if there is one.")
+_LOG_EVERY = flags.DEFINE_integer("log_every", 50, "Steps between two lines of metrics.", 1)
+_CHECKPOINT_EVERY = flags.DEFINE_integer("checkpoint_every", 500, "Steps between checkpoints.", 1)
+_KEEP = flags.DEFINE_integer("keep", 2, "Newest checkpoints to keep.", 1)
+
+
+class Plan(NamedTuple):
+    """A run before it begins."""
+
+    config: TrainingConfig
+    model: SavedModel
+    geometry: Geometry
+
+
+class Interrupt:
+    """Notes that the user wants to stop, so that a step can be finished and saved."""
+
+    def __init__(self) -> None:
+        """Takes over the signals of Ctrl-C and of `kill`."""
+        self.requested = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._request)
+
+    def _request(self, number: int, frame: object) -> None:
+        del number, frame
+        self.requested = True
+
+
+def main() -> None:
+    """Plans a run, or finds the one to resume, and trains it."""
+    run = Path(_OUT.value)
+    resuming = _RESUME.value and run_folder.exists(run)
+    if not resuming:
+        run_folder.create(run, *plan_from_flags())
+    elif _SCENE.value is not None:
+        planned = plan_from_flags()
+        run_folder.check_unchanged(run, planned.config, planned.model)
+    train(run)
+    print(f"Run: {run}  (metrics.jsonl, checkpoints/)")
+    print(f"Next: python -m experiments.evaluate --run={run} --split=test")
+
+
+def plan_from_flags() -> Plan:
+    """Reads and checks the scene, and resolves all options."""
+    if _SCENE.value is None:
+        raise ValueError("No scene is given. Add --scene=FOLDER.")
+    scene = Path(_SCENE.value).resolve()
+    frames = local_layout.read_frames(scene, "train")
+    indices = _parse_indices(_IOR.value)
+    parts = meshes.read_meshes(scene, indices)
+    if not parts and _PATHS.value != "straight":
+        raise ValueError(
+            f"{scene / 'meshes'} holds no .ply file, so there is nothing to bend light. Add the "
+            "meshes of the objects, or use --paths=straight."
+        )
+    tree = containment.find_containment(parts)
+    _report_findings(lint.lint(parts, tree))
+    unbounded = background.is_unbounded(scene)
+    if _BACKGROUND.value != "auto":
+        unbounded = _BACKGROUND.value == "unbounded"
+    preset = PRESETS[_PRESET.value]
+    space = bounds(frames.cameras, unbounded=unbounded, radius=_RADIUS.value)
+    schedule = preset.schedule.over(_STEPS.value or preset.schedule.steps)
+    config = TrainingConfig(
+        scene=SceneConfig(str(scene), _RULE.value, tuple(sorted(indices.items()))),
+        paths=_PATHS.value,
+        loss=preset.loss,
+        schedule=schedule,
+        batch=_BATCH.value or preset.batch,
+        pool=preset.pool,
+        seed=_SEED.value,
+    )
+    model = SavedModel(preset.model(space, _INTERIOR.value), BUDGETS[_PATHS.value])
+    return Plan(config, model, build_geometry(parts, tree.parents, rule=_RULE.value))
+
+
+def train(run: Path) -> None:
+    """Trains the run of a folder from its newest checkpoint, or from the start."""
+    config, model = run_folder.read_config(run), saved.read_static(run)
+    frames = local_layout.read_frames(Path(config.scene.path), "train")
+    sampler = PixelSampler(
+        local_layout.read_images(frames), frames.cameras, seed=config.seed, batch=config.batch
+    )
+    geometry = saved.load_geometry(run)
+    setup = loop.set_up(config, model.config, model.budget, geometry, sampler)
+    state = init_state(config.seed, model.config, config.schedule)
+    with Checkpoints(run, keep=_KEEP.value) as checkpoints:
+        if checkpoints.newest() is not None:
+            state = checkpoints.restore(state)
+        _train(run, setup, state, checkpoints)
+
+
+def _train(run: Path, setup: loop.Setup, state: TrainState, checkpoints: Checkpoints) -> None:
+    total, step = setup.config.schedule.steps, int(state.step)
+    earlier = run_folder.rewind_metrics(run, step)
+    interrupt = Interrupt()
+    start = last = time.monotonic()
+    logged = step
+    with commands.ProgressBar("train", total, step) as bar:
+        for state, report in loop.run_steps(setup, state, total):
+            step += 1
+            if step % _LOG_EVERY.value == 0 or step == total:
+                report = jax.device_get(report)
+                now = time.monotonic()
+                rate = setup.config.batch * (step - logged) / (now - last)
+                _log(run, step, report, rate, earlier + now - start)
+                bar.show(step, f"loss {report.loss:.5f}  PSNR {report.psnr:.2f}  {rate:.0f} rays/s")
+                last, logged = now, step
+            if step % _CHECKPOINT_EVERY.value == 0 or step == total or interrupt.requested:
+                checkpoints.save(state)
+            if interrupt.requested:
+                break
+    if step < total:
+        print(f"Stopped at step {step}. Continue with --resume --out={run}.")
+
+
+def _log(run: Path, step: int, report: StepReport, rate: float, seconds: float) -> None:
+    if not math.isfinite(report.loss):
+        raise ValueError(
+            f"The loss is {report.loss} at step {step}. The last checkpoint is from before: "
+            "resume with another --seed or a smaller learning rate, and please report the scene."
+        )
+    values = {name: float(value) for name, value in report._asdict().items()}
+    line = {"step": step, **values, "rays_per_second": rate, "seconds": seconds}
+    run_folder.append_metrics(run, line)
+
+
+def _report_findings(findings: list[lint.Finding]) -> None:
+    for finding in findings:
+        print(finding)
+    if errors := [finding for finding in findings if finding.severity == "error"]:
+        raise ValueError(f"{len(errors)} mesh errors must be mended first: {errors[0]}")
+
+
+def _parse_indices(words: list[str]) -> dict[str, float]:
+    indices = {}
+    for word in words:
+        name, separator, number = word.partition("=")
+        try:
+            indices[name] = float(number)
+        except ValueError:
+            separator = ""
+        if not separator or not name:
+            raise ValueError(f"--ior={word} is not NAME=NUMBER. Write for example --ior=glass=1.52.")
+    return indices
+
+
+if __name__ == "__main__":
+    commands.run(main)

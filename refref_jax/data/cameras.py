@@ -1,0 +1,112 @@
+"""Pinhole cameras and their rays (NumPy only).
+
+Camera frame: x right, y up, looking along -z (OpenGL, Blender). World frame: the data set's own.
+Pixel `(row, column)` has its centre at `(column + 0.5, row + 0.5)`, rows counted from the top.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from refref_jax.geometry.rays import Rays
+
+
+class Cameras(NamedTuple):
+    """Cameras that share their intrinsics.
+
+    Attributes:
+      poses: camera-to-world matrices; the first three columns rotate, the last is the position
+        in world units.
+      width: image width in pixels.
+      height: image height in pixels.
+      focal: focal length in pixels; the principal point is the image centre.
+    """
+
+    poses: Float[np.ndarray, "cameras 3 4"]
+    width: int
+    height: int
+    focal: float
+
+
+def focal_length(width: int, angle_x: float) -> float:
+    """Returns the focal length in pixels of a horizontal field of view in radians."""
+    return 0.5 * width / math.tan(0.5 * angle_x)
+
+
+def pixel_rays(
+    cameras: Cameras,
+    camera: Int[np.ndarray, "*shape"],
+    row: Int[np.ndarray, "*shape"],
+    column: Int[np.ndarray, "*shape"],
+) -> Rays:
+    """Returns the rays through pixel centres, in single precision.
+
+    A ray's radius is that of the cone with the pixel's solid angle, scaled so that a disc of
+    that radius has the variance of the pixel (mip-NeRF: `2 / sqrt(12)` of its width).
+
+    Args:
+      cameras: the cameras.
+      camera: index of the camera of each ray.
+      row: pixel row, 0 at the top.
+      column: pixel column, 0 at the left.
+    """
+    towards, cosine = _unit_directions(cameras, row, column)
+    pose = cameras.poses[camera]
+    directions = np.einsum("...ij,...j->...i", pose[..., :3], towards)
+    # A pixel's solid angle is the cube of its cosine over the squared focal length.
+    width = cosine**1.5 / cameras.focal
+    return Rays(
+        np.ascontiguousarray(pose[..., 3], np.float32),
+        directions.astype(np.float32),
+        (width * 2.0 / math.sqrt(12.0)).astype(np.float32),
+    )
+
+
+def image_rays(cameras: Cameras, camera: int) -> Rays:
+    """Returns the rays of all pixels of one camera, as `[height, width]`."""
+    row, column = np.indices((cameras.height, cameras.width))
+    return pixel_rays(cameras, np.full(row.shape, camera), row, column)
+
+
+def orbit(
+    frames: int, *, distance: float, elevation: float, size: int, angle_x: float
+) -> Cameras:
+    """Returns cameras on a circle around the origin that look at it, with z up.
+
+    Args:
+      frames: number of cameras, spread evenly.
+      distance: from the origin, world units.
+      elevation: angle above the horizontal plane in radians, strictly between -pi/2 and pi/2.
+      size: width and height in pixels.
+      angle_x: horizontal field of view in radians.
+    """
+    azimuth = 2.0 * np.pi * np.arange(frames) / frames
+    zero = np.zeros_like(azimuth)
+    right = np.stack([-np.sin(azimuth), np.cos(azimuth), zero], axis=-1)
+    flat = np.stack([np.cos(azimuth), np.sin(azimuth), zero], axis=-1)
+    back = np.cos(elevation) * flat + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
+    up = np.cross(back, right)
+    poses = np.stack([right, up, back, distance * back], axis=-1)
+    return Cameras(poses, size, size, focal_length(size, angle_x))
+
+
+def planar_depth_to_distance(
+    cameras: Cameras, depth: Float[np.ndarray, "*images h w"]
+) -> Float[np.ndarray, "*images h w"]:
+    """Converts depth along the optical axis to distance along each pixel's unit ray."""
+    row, column = np.indices((cameras.height, cameras.width))
+    _, cosine = _unit_directions(cameras, row, column)
+    return (depth / cosine).astype(np.float32)
+
+
+def _unit_directions(
+    cameras: Cameras, row: Int[np.ndarray, "*shape"], column: Int[np.ndarray, "*shape"]
+) -> tuple[Float[np.ndarray, "*shape 3"], Float[np.ndarray, "*shape"]]:
+    """Returns unit directions in the camera frame, and their cosine with the optical axis."""
+    x = (column + 0.5 - 0.5 * cameras.width) / cameras.focal
+    y = -(row + 0.5 - 0.5 * cameras.height) / cameras.focal
+    planar = np.stack([x, y, -np.ones_like(x)], axis=-1)
+    norm = np.linalg.norm(planar, axis=-1)
+    return planar / norm[..., None], 1.0 / norm

@@ -1,0 +1,38 @@
+"""Assembles the meshes of a scene into what light paths are traced through (NumPy only)."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from refref_jax.data.meshes import MeshPart, Shading
+from refref_jax.geometry.corner_normals import CREASE_ANGLE, corner_normals
+from refref_jax.geometry.surface_build import build_surfaces
+from refref_jax.optics.interface_rules import RULES
+from refref_jax.optics.path_tracing import Geometry
+
+_CREASE_ANGLES: dict[Shading, float] = {"auto": CREASE_ANGLE, "smooth": np.pi, "flat": 0.0}
+
+
+def build_geometry(
+    parts: Sequence[MeshPart], parents: Sequence[int], *, rule: Literal["nested", "facing"]
+) -> Geometry:
+    """Builds surfaces and interfaces of all parts.
+
+    Args:
+      parts: the meshes; none is an empty scene.
+      parents: the innermost part around each part, from `containment.find_containment`.
+      rule: what lies outside a part, see `optics.interface_rules`.
+    """
+    triangles = [part.vertices[part.faces] for part in parts]
+    normals = [
+        corner_normals(part.vertices, part.faces, crease_angle=_CREASE_ANGLES[part.shading])
+        for part in parts
+    ]
+    owners = [np.full(len(part.faces), i) for i, part in enumerate(parts)]
+    surfaces = build_surfaces(
+        np.concatenate([np.zeros((0, 3, 3)), *triangles]),
+        np.concatenate([np.zeros((0, 3, 3)), *normals]),
+        np.concatenate([np.zeros(0, np.int64), *owners]),
+    )
+    return Geometry(surfaces, RULES[rule]([part.index for part in parts], parents))

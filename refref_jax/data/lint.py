@@ -1,0 +1,115 @@
+"""Examines the meshes of a scene before anything is traced (NumPy only)."""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from refref_jax.data.containment import Containment, signed_volume
+from refref_jax.data.meshes import MeshPart
+from refref_jax.optics.interface_rules import NO_PARENT
+
+# A triangle is degenerate when its area is below this share of its longest edge squared.
+_DEGENERATE = 1e-10
+
+
+class Finding(NamedTuple):
+    """Something about a mesh that a user should know.
+
+    Attributes:
+      severity: an `error` makes light paths wrong; a `warning` may; a `note` does not.
+      part: name of the part.
+      message: what it is, and what to do.
+    """
+
+    severity: Literal["error", "warning", "note"]
+    part: str
+    message: str
+
+    def __str__(self) -> str:
+        return f"{self.severity}: {self.part}: {self.message}"
+
+
+def lint(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
+    """Reports on every part: closed, outward, without waste, and where it lies."""
+    findings = []
+    for i, part in enumerate(parts):
+        findings += _edges(part)
+        findings += _faces(part)
+        if signed_volume(part) < 0.0:
+            findings.append(
+                Finding(
+                    "error",
+                    part.name,
+                    "its faces point inwards, so inside and outside are exchanged. Flip the "
+                    "faces and export it again.",
+                )
+            )
+        parent = containment.parents[i]
+        if parent != NO_PARENT:
+            findings.append(Finding("note", part.name, f"lies inside {parts[parent].name}."))
+    for inner, outer in containment.overlaps:
+        findings.append(
+            Finding(
+                "warning",
+                parts[inner].name,
+                f"cuts or touches {parts[outer].name}. The rules 'nested' and 'facing' ask for "
+                "bodies that are apart or strictly inside one another: leave a gap, or model "
+                "the surface between them as one interface.",
+            )
+        )
+    return findings
+
+
+def _edges(part: MeshPart) -> list[Finding]:
+    """Reports edges that a closed, consistently oriented surface does not have."""
+    directed = part.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    _, inverse, uses = np.unique(
+        np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    findings = []
+    if open_edges := int(np.sum(uses % 2)):
+        findings.append(
+            Finding(
+                "warning",
+                part.name,
+                f"is not watertight: {open_edges} edges are open. Light that slips through loses "
+                "track of its medium; close the holes.",
+            )
+        )
+    forward = np.where(directed[:, 0] < directed[:, 1], 1, -1)
+    balance = np.bincount(inverse.reshape(-1), forward)
+    if unbalanced := int(np.sum((balance != 0) & (uses % 2 == 0))):
+        findings.append(
+            Finding(
+                "error",
+                part.name,
+                f"is not oriented consistently: faces disagree across {unbalanced} edges. "
+                "Recalculate its normals to the outside.",
+            )
+        )
+    return findings
+
+
+def _faces(part: MeshPart) -> list[Finding]:
+    """Reports faces that carry no surface, or carry it twice."""
+    corners = part.vertices[part.faces]
+    edges = np.roll(corners, -1, axis=1) - corners
+    longest = np.max(np.sum(edges**2, axis=-1), axis=1)
+    area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1)
+    findings = []
+    if degenerate := int(np.sum(area <= _DEGENERATE * longest)):
+        findings.append(
+            Finding("note", part.name, f"has {degenerate} degenerate faces, which are ignored.")
+        )
+    duplicates = len(part.faces) - len(np.unique(np.sort(part.faces, axis=1), axis=0))
+    if duplicates:
+        findings.append(
+            Finding(
+                "error",
+                part.name,
+                f"has {duplicates} duplicate faces: light would cross the surface twice at one "
+                "point. Remove them.",
+            )
+        )
+    return findings

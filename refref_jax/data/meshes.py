@@ -1,0 +1,145 @@
+"""Reads the meshes of a scene and decides what they are made of (NumPy only).
+
+One PLY file is one part. Its material is the last word of the file's own name that the table of
+indices knows: `perfume_red_glass.ply` is glass. An optional `scene.json` may say for each mesh
+whether it was shaded smooth.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+
+from refref_jax.data.errors import SceneError
+
+INDEX_OF_REFRACTION: dict[str, float] = {
+    "glass": 1.5,
+    "water": 1.333,
+    "diamond": 2.418,
+    "air": 1.0,
+    "alcohol": 1.36,
+    "plastic": 1.45,
+    "perfume": 1.46,
+}
+"""Indices of the data set's materials."""
+
+Shading = Literal["auto", "smooth", "flat"]
+
+
+class MeshPart(NamedTuple):
+    """One closed surface and its material.
+
+    Attributes:
+      name: the file's stem.
+      vertices: world units; equal positions are merged.
+      faces: counter-clockwise seen from outside.
+      index: index of refraction inside.
+      shading: `smooth`, `flat`, or `auto` for smooth up to the crease angle.
+    """
+
+    name: str
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    index: float
+    shading: Shading
+
+
+def read_meshes(scene: Path, indices: Mapping[str, float] | None = None) -> list[MeshPart]:
+    """Reads all parts of a scene, ordered by name.
+
+    Args:
+      scene: the scene folder; its meshes are `meshes/*.ply`. None of them is no part.
+      indices: indices of refraction that replace or extend the table, by material or, for one
+        part alone, by file stem.
+
+    Raises:
+      SceneError: if a mesh is broken or empty, if its material is unknown, or if an index is
+        not positive or names nothing.
+    """
+    overrides = dict(indices or {})
+    for name, index in overrides.items():
+        if not index > 0.0 or not np.isfinite(index):
+            raise SceneError(
+                f"The index of refraction of {name!r} is {index}. Give a positive number, such as "
+                "1.5 for glass."
+            )
+    paths = sorted((scene / "meshes").glob("*.ply"))
+    _check_overrides(overrides, paths)
+    shading = _read_shading(scene / "scene.json")
+    return [_read_part(path, overrides, shading.get(path.name, "auto")) for path in paths]
+
+
+def read_mesh(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """Reads the vertices and triangles of one file, merging equal positions.
+
+    Raises:
+      SceneError: if the file is broken, or has no triangle.
+    """
+    try:
+        mesh = trimesh.load_mesh(path, process=False)
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+        vertices = np.asarray(mesh.vertices, np.float64)
+        faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
+    except Exception as error:  # trimesh raises whatever a broken file runs into
+        raise SceneError(
+            f"{path} can not be read as a mesh ({error}). It may be truncated: export it again."
+        ) from error
+    if len(faces) == 0:
+        raise SceneError(f"{path} has no triangles. Export the mesh again, or remove the file.")
+    if not np.all(np.isfinite(vertices)):
+        raise SceneError(f"{path} has a vertex that is not finite. Clean the mesh.")
+    return vertices, faces
+
+
+def _read_part(path: Path, overrides: Mapping[str, float], shading: Shading) -> MeshPart:
+    index = _index(path, overrides)
+    vertices, faces = read_mesh(path)
+    return MeshPart(path.stem, vertices, faces, index, shading)
+
+
+def _index(path: Path, overrides: Mapping[str, float]) -> float:
+    """Returns the index of the part's own override, or of the last known word of its name."""
+    if path.stem in overrides:
+        return overrides[path.stem]
+    table = INDEX_OF_REFRACTION | dict(overrides)
+    known = [word for word in path.stem.split("_") if word in table]
+    if not known:
+        raise SceneError(
+            f"The material of {path} is unknown: no word of its name is one of "
+            f"{', '.join(sorted(table))}. Rename the file, as in {path.stem}_glass.ply, or give "
+            f"its index: --ior={path.stem}=1.5."
+        )
+    return table[known[-1]]
+
+
+def _check_overrides(overrides: Mapping[str, float], paths: list[Path]) -> None:
+    words = {word for path in paths for word in path.stem.split("_")}
+    known = words | {path.stem for path in paths}
+    for name in overrides:
+        if name not in known:
+            raise SceneError(
+                f"The index of refraction given for {name!r} fits no mesh. The meshes are "
+                f"{', '.join(path.name for path in paths) or 'none'}: use one of their names, "
+                "without .ply, or a material in it."
+            )
+
+
+def _read_shading(path: Path) -> dict[str, Shading]:
+    """Returns the shading of each mesh file that `scene.json` describes."""
+    if not path.is_file():
+        return {}
+    try:
+        parts = json.loads(path.read_text(encoding="utf-8")).get("parts", [])
+        return {
+            Path(part["mesh"]).name: "smooth" if part["smooth_normals"] else "flat"
+            for part in parts
+            if "smooth_normals" in part
+        }
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise SceneError(
+            f"{path} can not be understood ({error}). Correct it, or remove it: it is optional."
+        ) from error

@@ -1,0 +1,87 @@
+"""Shading normals at the corners of triangles, on the host (NumPy only).
+
+Faces that meet at less than the crease angle belong to one smooth patch; at a corner, the
+normals of the patch's faces are averaged by the angle that each has there. Across a crease
+nothing is averaged, so a cube stays flat and a cylinder keeps its rim.
+
+Source: Thuermer and Wuethrich, Computing Vertex Normals from Polygonal Facets (1998), for the
+weight by angle.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+CREASE_ANGLE = np.radians(30.0)
+"""The angle between face normals, in radians, from which an edge counts as sharp."""
+
+
+def corner_normals(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    *,
+    crease_angle: float = CREASE_ANGLE,
+) -> Float[np.ndarray, "faces 3 3"]:
+    """Returns an outward unit normal for every corner of every face.
+
+    Args:
+      vertices: positions, shared between faces where the surface is connected.
+      faces: corners, counter-clockwise seen from outside.
+      crease_angle: radians; 0 gives face normals, pi smooths everything.
+
+    Returns:
+      Unit normals. Degenerate faces have zero ones, and do not count in any average.
+    """
+    corners = vertices[faces]
+    flat = face_normals(corners)
+    if crease_angle <= 0.0:
+        return np.repeat(flat[:, None], 3, axis=1)
+    patch = _smooth_patches(faces, flat, crease_angle)
+    key = patch[:, None].astype(np.int64) * len(vertices) + faces
+    _, group = np.unique(key, return_inverse=True)
+    group = group.reshape(-1)
+    weighted = (_corner_angles(corners)[..., None] * flat[:, None]).reshape(-1, 3)
+    sums = np.stack([np.bincount(group, weighted[:, axis]) for axis in range(3)], axis=-1)
+    averaged = _unit(sums)[group].reshape(-1, 3, 3)
+    # Opposite faces may cancel at a corner: fall back to the face's own normal there.
+    cancelled = np.all(averaged == 0.0, axis=-1, keepdims=True)
+    return np.where(cancelled, flat[:, None], averaged)
+
+
+def face_normals(corners: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "faces 3"]:
+    """Returns outward unit normals; zero for degenerate faces."""
+    return _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+
+
+def _smooth_patches(
+    faces: Int[np.ndarray, "faces 3"],
+    normals: Float[np.ndarray, "faces 3"],
+    crease_angle: float,
+) -> Int[np.ndarray, " faces"]:
+    """Numbers the patches of faces that are connected across smooth edges."""
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    owner = np.repeat(np.arange(len(faces)), 3)
+    order = np.lexsort((edges[:, 1], edges[:, 0]))
+    edges, owner = edges[order], owner[order]
+    shared = np.all(edges[1:] == edges[:-1], axis=1)
+    first, second = owner[:-1][shared], owner[1:][shared]
+    cosine = np.sum(normals[first] * normals[second], axis=1)
+    smooth = cosine > np.cos(crease_angle)
+    graph = coo_array(
+        (np.ones(smooth.sum(), bool), (first[smooth], second[smooth])),
+        shape=(len(faces), len(faces)),
+    )
+    return connected_components(graph, directed=False)[1]
+
+
+def _corner_angles(corners: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "faces 3"]:
+    """Returns the angle of each face at each of its corners, in radians."""
+    forward = _unit(np.roll(corners, -1, axis=1) - corners)
+    backward = _unit(np.roll(corners, 1, axis=1) - corners)
+    return np.arccos(np.clip(np.sum(forward * backward, axis=-1), -1.0, 1.0))
+
+
+def _unit(vectors: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 3"]:
+    norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.divide(vectors, norm, out=np.zeros_like(vectors), where=norm > 0.0)

@@ -1,0 +1,28 @@
+"""Packs meshes into `Surfaces` on the host (NumPy only)."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from refref_jax.geometry import bvh_build
+from refref_jax.geometry.surfaces import Surfaces
+
+
+def build_surfaces(
+    triangles: Float[np.ndarray, "faces 3 3"],
+    normals: Float[np.ndarray, "faces 3 3"],
+    parts: Int[np.ndarray, " faces"],
+) -> Surfaces:
+    """Builds the device record of a triangle soup, in single precision.
+
+    Args:
+      triangles: corners, counter-clockwise seen from outside, world units. May be empty.
+      normals: outward unit shading normals at the corners.
+      parts: index of each triangle's part.
+
+    Returns:
+      The surfaces, sorted into the leaves of their tree.
+    """
+    bvh, slots = bvh_build.build(triangles.astype(np.float32))
+    if len(triangles) == 0:
+        return Surfaces(bvh, np.zeros_like(bvh.triangles), slots)
+    return Surfaces(bvh, normals[slots].astype(np.float32), parts[slots].astype(np.int32))

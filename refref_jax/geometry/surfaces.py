@@ -1,0 +1,75 @@
+"""What a ray finds at a hit: the point, the two normals and the part of the scene.
+
+The *geometric* normal is the triangle's own and decides on which side a ray is. The *shading*
+normal is interpolated between the corners and bends the ray; on a flat part the two agree.
+Both point out of the body.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from refref_jax import numerics
+from refref_jax.geometry import triangles
+from refref_jax.geometry.bvh import BVH
+
+
+class Surfaces(NamedTuple):
+    """All surfaces of a scene, indexed by the triangle slots of their tree.
+
+    Attributes:
+      bvh: the tree, which also holds the corners.
+      normals: outward unit shading normals at the three corners.
+      parts: index of the mesh part that a triangle belongs to.
+    """
+
+    bvh: BVH
+    normals: Float[Array, "slots 3 3"]
+    parts: Int[Array, " slots"]
+
+
+class SurfacePoint(NamedTuple):
+    """A point on a surface.
+
+    Attributes:
+      position: on the triangle's plane, world units.
+      geometric_normal: outward, unit.
+      shading_normal: outward, unit.
+      part: index of the mesh part.
+      scale: largest absolute coordinate of the triangle, which sets the rounding error of
+        `position`.
+    """
+
+    position: Float[Array, "3"]
+    geometric_normal: Float[Array, "3"]
+    shading_normal: Float[Array, "3"]
+    part: Int[Array, ""]
+    scale: Float[Array, ""]
+
+
+def surface_point(
+    surfaces: Surfaces, slot: Int[Array, ""], barycentric: Float[Array, "2"]
+) -> SurfacePoint:
+    """Returns the point of one triangle at barycentric coordinates.
+
+    The position comes from the corners, not from a distance along a ray, so its error does not
+    grow with the length of the ray.
+
+    Args:
+      surfaces: the scene.
+      slot: a triangle; for `NO_SLOT` the result is some finite point without meaning.
+      barycentric: weights of the second and third corner.
+    """
+    corners = surfaces.bvh.triangles[slot]
+    geometric = triangles.geometric_normal(corners)
+    blended = triangles.interpolate(surfaces.normals[slot], barycentric)
+    shading = numerics.normalize(blended)
+    opposed = jnp.dot(shading, geometric) <= 0.0
+    return SurfacePoint(
+        position=triangles.interpolate(corners, barycentric),
+        geometric_normal=geometric,
+        shading_normal=jnp.where(opposed, geometric, shading),
+        part=surfaces.parts[slot],
+        scale=jnp.max(jnp.abs(corners)),
+    )

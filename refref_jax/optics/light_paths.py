@@ -1,0 +1,82 @@
+"""Light paths: the polylines that light takes from a pixel into the scene.
+
+Letters, as in the paper (section 4.2): a path has points `p_0 .. p_K`, unit directions
+`d_0 .. d_K` and cumulative distances `tau_0 = 0 .. tau_K`; segment `i` is
+`r(t) = p_i + (t - tau_i) d_i` for `t` in `[tau_i, tau_{i+1})`, and the last one never ends.
+`t` is arc length in world units.
+"""
+
+import enum
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from refref_jax.geometry.rays import Rays
+from refref_jax.optics.media import AMBIENT
+
+
+class PathStatus(enum.IntEnum):
+    """How a path ended."""
+
+    EMPTY = 0
+    """The slot holds no path; its weight is 0."""
+    MISSED = 1
+    """The ray met no interface; the path is straight."""
+    ESCAPED = 2
+    """The path bent, left the objects and goes on for ever along its last direction."""
+    OUT_OF_BENDS = 3
+    """The path would meet another interface, but its budget of bends is spent."""
+    NOT_TRACED = 4
+    """The last direction was not traced against the objects (the paper's reflected ray)."""
+
+
+class LightPaths(NamedTuple):
+    """The light paths of a batch of rays, padded to the same number of segments.
+
+    A ray may have any number of paths, in any order. Its colour is the sum of its paths'
+    colours times their weights.
+
+    Attributes:
+      points: start of each segment, world units; finite but meaningless where unused.
+      directions: unit direction of each segment; likewise.
+      tau: arc length at the start of each segment, increasing from 0; `inf` where unused.
+      media: medium of each segment (see `media`).
+      rays: index of the ray that a path belongs to.
+      weights: share of the path in its ray's linear RGB.
+      radii: footprint of the ray's pixel as a cone radius at unit distance.
+      bends: number of refractions and reflections.
+      statuses: a `PathStatus`.
+    """
+
+    points: Float[Array, "paths segments 3"]
+    directions: Float[Array, "paths segments 3"]
+    tau: Float[Array, "paths segments"]
+    media: Int[Array, "paths segments"]
+    rays: Int[Array, " paths"]
+    weights: Float[Array, "paths 3"]
+    radii: Float[Array, " paths"]
+    bends: Int[Array, " paths"]
+    statuses: Int[Array, " paths"]
+
+
+def straight(rays: Rays) -> LightPaths:
+    """Returns one straight path a ray, with full weight: the light paths of a plain NeRF."""
+    count = rays.radii.shape[0]
+    integers = jnp.arange(count, dtype=jnp.int32)
+    return LightPaths(
+        points=rays.origins[:, None],
+        directions=rays.directions[:, None],
+        tau=jnp.zeros_like(rays.radii)[:, None],
+        media=jnp.full((count, 1), AMBIENT, jnp.int32),
+        rays=integers,
+        weights=jnp.ones_like(rays.directions),
+        radii=rays.radii,
+        bends=jnp.zeros_like(integers),
+        statuses=jnp.full_like(integers, PathStatus.MISSED),
+    )
+
+
+def exists(paths: LightPaths) -> Bool[Array, " paths"]:
+    """Returns which slots hold a path."""
+    return paths.statuses != PathStatus.EMPTY

@@ -1,0 +1,19 @@
+"""Rendering: from light paths to colours. The library's public surface.
+
+    model = render.load_model("runs/demo")
+    rays = render.Rays(origins, directions, radii)
+    picture = render.render_image(model, rays)        # chunked and jitted
+    seen = render.render_rays(model, rays)            # one pure function, jit it yourself
+"""
+
+from refref_jax.geometry.rays import Rays as Rays
+from refref_jax.optics.path_tracing import BUDGETS as BUDGETS
+from refref_jax.optics.path_tracing import Budget as Budget
+from refref_jax.render.config import ModelConfig as ModelConfig
+from refref_jax.render.images import Rendering as Rendering
+from refref_jax.render.images import render_image as render_image
+from refref_jax.render.images import render_rays as render_rays
+from refref_jax.render.model import Model as Model
+from refref_jax.render.model import Params as Params
+from refref_jax.render.model import init_params as init_params
+from refref_jax.render.saved import load_model as load_model

@@ -1,0 +1,70 @@
+"""Static description of a model: what is sampled, how often, and by which fields."""
+
+import dataclasses
+from typing import Literal
+
+from refref_jax.fields.density_field import DensityFieldConfig
+from refref_jax.fields.radiance_field import RadianceFieldConfig
+
+Interior = Literal["field", "clear"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ProposalConfig:
+    """One round of proposal sampling.
+
+    Attributes:
+      field: its density field.
+      samples: intervals along a path.
+    """
+
+    field: DensityFieldConfig
+    samples: int
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelConfig:
+    """A model of a scene.
+
+    Attributes:
+      proposals: rounds of proposal sampling, coarse to fine; at least one.
+      field: the radiance field.
+      samples: intervals of the final round.
+      multisamples: points that stand for an interval's cone, 1 or 6.
+      interior: `field` also samples inside the objects (the paper); `clear` takes nothing to be
+        there, which holds for clear glass and costs no samples.
+      near: distance of the first sample from the camera, world units.
+      far: distance of the last; the background is opaque there.
+      radius: half edge of a bounded scene's cube, or radius of an unbounded scene's
+        uncontracted ball, world units, around the origin.
+      unbounded: whether space beyond the ball is contracted.
+      dilation: widening of a proposal before it is sampled, as a share of its mean bin width; 0
+        for none.
+    """
+
+    proposals: tuple[ProposalConfig, ...]
+    field: RadianceFieldConfig
+    samples: int
+    multisamples: int
+    interior: Interior
+    near: float
+    far: float
+    radius: float
+    unbounded: bool
+    dilation: float
+
+    def __post_init__(self) -> None:
+        """Checks what sampling relies on."""
+        if not self.proposals:
+            raise ValueError("A model needs at least one proposal round. Add one.")
+        if not 0.0 < self.near < self.far:
+            raise ValueError(
+                f"The distances must satisfy 0 < near < far; got near = {self.near} and far = "
+                f"{self.far}. Correct them."
+            )
+        if not self.radius > 0.0:
+            raise ValueError(f"The radius must be positive, not {self.radius}. Correct it.")
+        if self.interior not in ("field", "clear"):
+            raise ValueError(
+                f"The interior is 'field' or 'clear', not {self.interior!r}. Choose one."
+            )

@@ -1,0 +1,184 @@
+"""Renders images in pieces of fixed size, so that nothing is compiled twice.
+
+An image is traced in tiles. The paths of a tile are sorted so that the slots without a path come
+last, and are then rendered chunk by chunk: a pixel that misses the objects costs one path, not
+two. This is one of the two modules that call `jax.jit`.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from refref_jax.geometry.rays import Rays
+from refref_jax.optics import light_paths, path_tracing
+from refref_jax.optics.light_paths import LightPaths
+from refref_jax.optics.path_tracing import Budget, Geometry
+from refref_jax.render import colour, pixels
+from refref_jax.render.config import ModelConfig
+from refref_jax.render.model import Model, Params
+
+TILE = 16384
+"""Rays traced at once."""
+
+CHUNK = 4096
+"""Paths rendered at once: the option to lower when memory runs out."""
+
+
+class Rendering(NamedTuple):
+    """What rays see. The leading axes are those of the rays.
+
+    Attributes:
+      rgb: sRGB in `[0, 1]`.
+      distance: median distance of the light of the ray's heaviest path, as arc length from the
+        camera in world units.
+      mean_distance: its mean distance.
+      accumulation: share of light accounted for, 1 with an opaque background.
+    """
+
+    rgb: Float[Array, "*rays 3"]
+    distance: Float[Array, "*rays"]
+    mean_distance: Float[Array, "*rays"]
+    accumulation: Float[Array, "*rays"]
+
+
+class _Tile(NamedTuple):
+    """The paths of a tile, those that exist first.
+
+    Attributes:
+      paths: the light paths.
+      heaviest: whether a path carries most of its ray's light.
+      count: number of paths that exist.
+    """
+
+    paths: LightPaths
+    heaviest: Bool[Array, " paths"]
+    count: Int[Array, ""]
+
+
+def render_rays(model: Model, rays: Rays) -> Rendering:
+    """Renders rays in one piece: a pure function, to be jitted or differentiated by the caller.
+
+    Args:
+      model: the scene.
+      rays: `[n]` camera rays.
+    """
+    count = rays.radii.shape[0]
+    traced = path_tracing.trace(model.geometry, rays, budget=model.budget, capacity=count)
+    tile = _sort(traced.paths, count)
+    empty = jax.tree.map(jnp.zeros_like, _blank(count))
+    return _finish(_add(model.params, tile.paths, tile.heaviest, empty, config=model.config))
+
+
+def render_image(model: Model, rays: Rays, *, chunk: int = CHUNK) -> Rendering:
+    """Renders any number of rays in pieces of fixed size.
+
+    Args:
+      model: the scene.
+      rays: camera rays with any leading axes, usually `[height, width]`.
+      chunk: paths rendered at once.
+
+    Returns:
+      NumPy arrays, with the leading axes of the rays.
+    """
+    shape = rays.radii.shape
+    flat = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[len(shape) :]), rays)
+    tiles = [
+        _render_tile(model, _slice_rays(flat, start), chunk)
+        for start in range(0, flat.radii.shape[0], TILE)
+    ]
+    joined = jax.tree.map(lambda *parts: np.concatenate([np.asarray(x) for x in parts]), *tiles)
+    return jax.tree.map(
+        lambda x: x[: flat.radii.shape[0]].reshape(*shape, *x.shape[1:]), joined
+    )
+
+
+def _slice_rays(rays: Rays, start: int) -> Rays:
+    """Returns one tile of rays; the last one is filled up by repeating a ray."""
+    index = np.minimum(np.arange(start, start + TILE), rays.radii.shape[0] - 1)
+    return jax.tree.map(lambda x: x[index], rays)
+
+
+def _render_tile(model: Model, rays: Rays, chunk: int) -> Rendering:
+    tile = _trace_tile(model.geometry, rays, budget=model.budget)
+    sums = _blank(TILE)
+    for start in range(0, int(tile.count), chunk):
+        sums = _render_chunk(model.params, tile, sums, start, config=model.config, chunk=chunk)
+    return _finish_tile(sums)
+
+
+def _blank(count: int) -> Rendering:
+    zeros = jnp.zeros(count)
+    return Rendering(jnp.zeros((count, 3)), zeros, zeros, zeros)
+
+
+@functools.partial(jax.jit, static_argnames="budget")
+def _trace_tile(geometry: Geometry, rays: Rays, *, budget: Budget) -> _Tile:
+    traced = path_tracing.trace(geometry, rays, budget=budget, capacity=TILE)
+    return _sort(traced.paths, TILE)
+
+
+@functools.partial(jax.jit, static_argnames=("config", "chunk"))
+def _render_chunk(
+    params: Params,
+    tile: _Tile,
+    sums: Rendering,
+    start: Int[Array, ""],
+    *,
+    config: ModelConfig,
+    chunk: int,
+) -> Rendering:
+    # Slots past the end repeat the last path with no weight.
+    index = start + jnp.arange(chunk)
+    held = jnp.minimum(index, tile.count - 1)
+    paths = jax.tree.map(lambda x: x[held], tile.paths)
+    real = index < tile.count
+    paths = paths._replace(weights=jnp.where(real[:, None], paths.weights, 0.0))
+    return _add(params, paths, tile.heaviest[held] & real, sums, config=config)
+
+
+@jax.jit
+def _finish_tile(sums: Rendering) -> Rendering:
+    return _finish(sums)
+
+
+def _sort(paths: LightPaths, rays: int) -> _Tile:
+    """Moves the paths that exist to the front and marks the heaviest of each ray."""
+    exists = light_paths.exists(paths)
+    order = jnp.argsort(~exists, stable=True)
+    weight = jnp.mean(paths.weights, axis=-1)
+    most = jax.ops.segment_max(weight, paths.rays, num_segments=rays)
+    heaviest = exists & (weight >= most[paths.rays])
+    sorted_paths = jax.tree.map(lambda x: x[order], paths)
+    return _Tile(sorted_paths, heaviest[order], jnp.sum(exists))
+
+
+def _add(
+    params: Params,
+    paths: LightPaths,
+    heaviest: Bool[Array, " paths"],
+    sums: Rendering,
+    *,
+    config: ModelConfig,
+) -> Rendering:
+    """Adds some paths to the linear colours and distances of their rays."""
+    jitter = pixels.no_jitter(config, paths.radii.shape[0])
+    one = jnp.ones_like(paths.radii[0])
+    seen = pixels.render_paths(params, config, paths, jitter, anneal=one).composite
+    share = jnp.mean(paths.weights, axis=-1)
+    rays = sums.distance.shape[0]
+    # An index past the end drops the write.
+    target = jnp.where(heaviest, paths.rays, rays)
+    return Rendering(
+        rgb=sums.rgb.at[paths.rays].add(paths.weights * seen.rgb),
+        distance=sums.distance.at[target].set(seen.median, mode="drop"),
+        mean_distance=sums.mean_distance.at[target].set(seen.mean, mode="drop"),
+        accumulation=sums.accumulation.at[paths.rays].add(share * seen.accumulation),
+    )
+
+
+def _finish(sums: Rendering) -> Rendering:
+    return sums._replace(rgb=jnp.clip(colour.linear_to_srgb(sums.rgb), 0.0, 1.0))

@@ -1,0 +1,48 @@
+"""A model of a scene: fields, and the geometry that bends the light between them."""
+
+from typing import NamedTuple
+
+import jax
+from jaxtyping import Array
+
+from refref_jax.fields import density_field, radiance_field
+from refref_jax.optics.path_tracing import Budget, Geometry
+from refref_jax.render.config import ModelConfig
+
+
+class Params(NamedTuple):
+    """The learned part of a model.
+
+    Attributes:
+      proposals: parameters of each proposal round's density field.
+      field: parameters of the radiance field.
+    """
+
+    proposals: tuple[density_field.Params, ...]
+    field: radiance_field.Params
+
+
+class Model(NamedTuple):
+    """Everything that rendering needs.
+
+    Attributes:
+      config: static description of the fields and of the sampling.
+      budget: which light is followed.
+      geometry: what bends it.
+      params: the fields' parameters.
+    """
+
+    config: ModelConfig
+    budget: Budget
+    geometry: Geometry
+    params: Params
+
+
+def init_params(key: Array, config: ModelConfig) -> Params:
+    """Returns new parameters for all fields of a model."""
+    field_key, *keys = jax.random.split(key, 1 + len(config.proposals))
+    proposals = tuple(
+        density_field.init(proposal_key, proposal.field)
+        for proposal_key, proposal in zip(keys, config.proposals, strict=True)
+    )
+    return Params(proposals, radiance_field.init(field_key, config.field))

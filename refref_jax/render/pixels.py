@@ -1,0 +1,81 @@
+"""Colours of pixels from the light paths of a batch.
+
+Paths are rendered side by side; a pixel's colour is the weighted sum over its paths, in linear
+space (paper, arXiv 2505.05848, Fresnel blend), and is encoded as sRGB at the very end.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from refref_jax.optics.light_paths import LightPaths
+from refref_jax.render import colour, transport
+from refref_jax.render.config import ModelConfig
+from refref_jax.render.model import Params
+from refref_jax.render.transport import Jitter, PathRadiance
+
+
+class Pixels(NamedTuple):
+    """A batch of rendered rays.
+
+    Attributes:
+      rgb: sRGB colours, not clipped.
+      paths: what each path sees, for the losses.
+    """
+
+    rgb: Float[Array, "rays 3"]
+    paths: PathRadiance
+
+
+def render_pixels(
+    params: Params,
+    config: ModelConfig,
+    paths: LightPaths,
+    jitter: Jitter,
+    *,
+    rays: int,
+    anneal: Float[Array, ""],
+) -> Pixels:
+    """Renders a batch of rays from all of their paths.
+
+    Args:
+      params: the model's parameters.
+      config: the model.
+      paths: the light paths, in any order.
+      jitter: of each path.
+      rays: number of rays in the batch.
+      anneal: see `transport.path_radiance`.
+    """
+    seen = render_paths(params, config, paths, jitter, anneal=anneal)
+    linear = jax.ops.segment_sum(
+        paths.weights * seen.composite.rgb, paths.rays, num_segments=rays
+    )
+    return Pixels(colour.linear_to_srgb(linear), seen)
+
+
+def render_paths(
+    params: Params,
+    config: ModelConfig,
+    paths: LightPaths,
+    jitter: Jitter,
+    *,
+    anneal: Float[Array, ""],
+) -> PathRadiance:
+    """Renders each path of a batch on its own."""
+    render = jax.vmap(transport.path_radiance, in_axes=(None, None, 0, 0, None))
+    return render(params, config, paths, jitter, anneal)
+
+
+def random_jitter(key: Array, config: ModelConfig, paths: int) -> Jitter:
+    """Draws one offset and one rotation for every round of every path."""
+    shape = (paths, transport.rounds(config))
+    offsets, rotations = jax.random.uniform(key, (2, *shape))
+    return Jitter(offsets - 0.5, 2.0 * jnp.pi * rotations)
+
+
+def no_jitter(config: ModelConfig, paths: int) -> Jitter:
+    """Returns the jitter of a rendering without noise."""
+    zeros = jnp.zeros((paths, transport.rounds(config)))
+    return Jitter(zeros, zeros)

@@ -1,0 +1,137 @@
+"""A model on disk: what a run folder holds for rendering.
+
+    {run}/model.json            static description (`SavedModel`)
+    {run}/geometry.npz          surfaces and interfaces
+    {run}/checkpoints/{step}/   parameters, and the training state beside them
+
+A model can be rendered from these alone, without the scene that it was trained on.
+"""
+
+import dataclasses
+import os
+from pathlib import Path
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+
+from refref_jax import configuration
+from refref_jax.geometry.bvh import BVH
+from refref_jax.geometry.surfaces import Surfaces
+from refref_jax.optics.media import Interfaces
+from refref_jax.optics.path_tracing import Budget, Geometry
+from refref_jax.render.config import ModelConfig
+from refref_jax.render.model import Model, Params, init_params
+
+_MODEL = "model.json"
+_GEOMETRY = "geometry.npz"
+_CHECKPOINTS = "checkpoints"
+
+PARAMS_ITEM = "params"
+TRAINING_ITEM = "training"
+
+
+@dataclasses.dataclass(frozen=True)
+class SavedModel:
+    """The static half of a model.
+
+    Attributes:
+      config: fields and sampling.
+      budget: which light is followed.
+    """
+
+    config: ModelConfig
+    budget: Budget
+
+
+def save_scene(run: Path, saved: SavedModel, geometry: Geometry) -> None:
+    """Writes everything but the parameters into an existing folder."""
+    configuration.write(run / _MODEL, saved)
+    surfaces, interfaces = geometry
+    np.savez_compressed(
+        run / _GEOMETRY,
+        **surfaces.bvh._asdict(),
+        normals=surfaces.normals,
+        parts=surfaces.parts,
+        **interfaces._asdict(),
+    )
+
+
+def read_static(run: Path) -> SavedModel:
+    """Reads the static half of a model."""
+    return configuration.read(run / _MODEL, SavedModel)
+
+
+def load_model(run: str | os.PathLike[str], step: int | None = None) -> Model:
+    """Loads a trained model.
+
+    Args:
+      run: the folder that training wrote.
+      step: which checkpoint; the newest by default.
+
+    Raises:
+      ValueError: if the folder is not a run, or has no such checkpoint.
+    """
+    run = Path(run)
+    saved = read_static(run)
+    shapes = jax.eval_shape(lambda: init_params(jax.random.key(0), saved.config))
+    with open_checkpoints(run) as manager:
+        step = find_step(manager, run, step)
+        params = restore(manager, step, {PARAMS_ITEM: shapes})[PARAMS_ITEM]
+    return Model(saved.config, saved.budget, load_geometry(run), Params(*params))
+
+
+def latest_step(run: Path) -> int:
+    """Returns the step of a run's newest checkpoint.
+
+    Raises:
+      ValueError: if there is none.
+    """
+    with open_checkpoints(run) as manager:
+        return find_step(manager, run, None)
+
+
+def open_checkpoints(run: Path, *, keep: int | None = None) -> ocp.CheckpointManager:
+    """Opens the checkpoints of a run.
+
+    Args:
+      run: the run folder.
+      keep: how many of the newest to keep; `None` to read only.
+    """
+    reading = keep is None
+    return ocp.CheckpointManager(
+        (run / _CHECKPOINTS).absolute(),
+        item_names=(PARAMS_ITEM, TRAINING_ITEM),
+        options=ocp.CheckpointManagerOptions(max_to_keep=keep, read_only=reading),
+    )
+
+
+def find_step(manager: ocp.CheckpointManager, run: Path, step: int | None) -> int:
+    """Returns the wanted checkpoint, or the newest.
+
+    Raises:
+      ValueError: if it does not exist.
+    """
+    steps = sorted(manager.all_steps())
+    if not steps:
+        raise ValueError(
+            f"{run} holds no checkpoint. Train it first, or give the folder of a finished run."
+        )
+    if step is not None and step not in steps:
+        raise ValueError(f"{run} has no checkpoint of step {step}. It has {steps}: choose one.")
+    return steps[-1] if step is None else step
+
+
+def restore(manager: ocp.CheckpointManager, step: int, items: dict) -> ocp.args.Composite:
+    """Reads some items of a checkpoint into the shapes and types that are given."""
+    arguments = {name: ocp.args.StandardRestore(shapes) for name, shapes in items.items()}
+    return manager.restore(step, args=ocp.args.Composite(**arguments))
+
+
+def load_geometry(run: Path) -> Geometry:
+    """Reads the geometry that a run was made with."""
+    with np.load(run / _GEOMETRY) as arrays:
+        bvh = BVH(*(arrays[name] for name in BVH._fields))
+        surfaces = Surfaces(bvh, arrays["normals"], arrays["parts"])
+        interfaces = Interfaces(*(arrays[name] for name in Interfaces._fields))
+    return jax.tree.map(jax.numpy.asarray, Geometry(surfaces, interfaces))

@@ -1,0 +1,196 @@
+"""Radiance along one light path: proposal rounds, then the radiance field.
+
+One path per function; `pixels` maps them over a batch.
+
+Source: Barron et al., Mip-NeRF 360 (2022), section 3, and Zip-NeRF (2023); paper (arXiv
+2505.05848), section 4.2, for samples and directions on the bent path.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from refref_jax.fields import density_field, radiance_field
+from refref_jax.optics.light_paths import LightPaths
+from refref_jax.render import compositing
+from refref_jax.render.config import ModelConfig
+from refref_jax.render.model import Params
+from refref_jax.sampling import cones, domains, polylines, stepfun, warps
+from refref_jax.sampling.cones import Gaussians
+from refref_jax.sampling.polylines import Polyline
+
+# Least widening of a proposal, in units of the whole path (Mip-NeRF 360, supplement).
+_DILATION_BIAS = 0.0025
+
+# Adjacent cone patterns are turned against each other by this angle (Zip-NeRF, supplement).
+_PATTERN_TURN = jnp.pi / 6.0
+
+_SMALLEST_WEIGHT = 1e-30
+
+
+class Jitter(NamedTuple):
+    """Where in its stratum a path is sampled; all zero for rendering without noise.
+
+    Attributes:
+      offsets: shift of every sample of a round, in `[-0.5, 0.5)` strata.
+      rotations: turn of a round's cone patterns, radians.
+    """
+
+    offsets: Float[Array, "*paths rounds"]
+    rotations: Float[Array, "*paths rounds"]
+
+
+class Histogram(NamedTuple):
+    """How a round of sampling saw a path.
+
+    Attributes:
+      edges: of the intervals, in the normalised coordinate `s` in `[0, 1]`.
+      weights: share of the path's light in each.
+    """
+
+    edges: Float[Array, "*paths edges"]
+    weights: Float[Array, "*paths samples"]
+
+
+class PathRadiance(NamedTuple):
+    """What one path sees.
+
+    Attributes:
+      composite: colour and distances; distances are arc length from the camera.
+      histograms: of each proposal round, then of the final one.
+      outside: which of the final intervals lie outside the objects (by their middle).
+    """
+
+    composite: compositing.Composite
+    histograms: tuple[Histogram, ...]
+    outside: Bool[Array, " samples"]
+
+
+class _Round(NamedTuple):
+    """The intervals of one round, in every coordinate they are needed in.
+
+    Attributes:
+      s: edges in the normalised coordinate.
+      t: edges in the path's own coordinate, world units.
+      gaussians: multisamples of each interval, in the unit cube.
+    """
+
+    s: Float[Array, " edges"]
+    t: Float[Array, " edges"]
+    gaussians: Gaussians
+
+
+def path_radiance(
+    params: Params,
+    config: ModelConfig,
+    path: LightPaths,
+    jitter: Jitter,
+    anneal: Float[Array, ""],
+) -> PathRadiance:
+    """Renders one light path.
+
+    Args:
+      params: the model's parameters.
+      config: the model.
+      path: one path of the record.
+      jitter: of this path.
+      anneal: exponent on the proposals' weights, 0 for uniform sampling to 1 for full trust.
+    """
+    line = _polyline(config, path)
+    edges, weights = jnp.array([0.0, 1.0], path.radii.dtype), jnp.ones(1, path.radii.dtype)
+    histograms = []
+    spread = 1.0
+    for level, proposal in enumerate(config.proposals):
+        s = _resample(config, edges, weights, jitter.offsets[level], anneal, proposal.samples, spread)
+        samples = _place(config, line, path.radii, s, jitter.rotations[level])
+        see = jax.vmap(density_field.density, in_axes=(None, None, 0))
+        density = see(params.proposals[level], proposal.field, samples.gaussians)
+        weights = _weigh(config, density, samples.t)
+        edges = s
+        histograms.append(Histogram(edges, weights))
+        spread *= proposal.samples
+
+    s = _resample(config, edges, weights, jitter.offsets[-1], anneal, config.samples, spread)
+    samples = _place(config, line, path.radii, s, jitter.rotations[-1])
+    middle = jax.vmap(polylines.point_at, in_axes=(None, 0))(
+        line, 0.5 * (samples.t[1:] + samples.t[:-1])
+    )
+    see = jax.vmap(radiance_field.radiance, in_axes=(None, None, 0, 0))
+    seen = see(params.field, config.field, samples.gaussians, middle.direction)
+    weights = _weigh(config, seen.density, samples.t)
+    composite = compositing.composite(weights, seen.rgb, samples.t)
+    return PathRadiance(
+        composite=_in_arc_length(line, composite),
+        histograms=(*histograms, Histogram(s, weights)),
+        outside=middle.outside,
+    )
+
+
+def rounds(config: ModelConfig) -> int:
+    """Returns how many rounds of sampling a path takes, the final one included."""
+    return len(config.proposals) + 1
+
+
+def warp(config: ModelConfig) -> warps.DistanceWarp:
+    """Returns the model's distance warp."""
+    return warps.DistanceWarp(config.near, config.far, config.radius)
+
+
+def _polyline(config: ModelConfig, path: LightPaths) -> Polyline:
+    if config.interior == "clear":
+        return polylines.outside_path(path)
+    return polylines.whole_path(path)
+
+
+def _resample(
+    config: ModelConfig,
+    edges: Float[Array, " n+1"],
+    weights: Float[Array, " n"],
+    offset: Float[Array, ""],
+    anneal: Float[Array, ""],
+    samples: int,
+    spread: float,
+) -> Float[Array, " m+1"]:
+    """Draws the next round's intervals from the last one's weights."""
+    edges, weights = jax.lax.stop_gradient((edges, weights))
+    if config.dilation > 0.0 and weights.shape[0] > 1:
+        edges, weights = stepfun.dilate(edges, weights, config.dilation / spread + _DILATION_BIAS)
+    annealed = jnp.where(jnp.diff(edges) > 0.0, jnp.maximum(weights, _SMALLEST_WEIGHT) ** anneal, 0.0)
+    strata = (jnp.arange(samples, dtype=edges.dtype) + 0.5 + offset) / samples
+    return stepfun.sample_edges(strata, edges, annealed)
+
+
+def _place(
+    config: ModelConfig,
+    line: Polyline,
+    radius: Float[Array, ""],
+    s: Float[Array, " edges"],
+    rotation: Float[Array, ""],
+) -> _Round:
+    """Puts intervals on the path and their cones into the field's unit cube."""
+    t = warps.to_distance(warp(config), s)
+    turns = rotation + _PATTERN_TURN * (jnp.arange(t.shape[0] - 1) % 2)
+    domain = domains.Domain(config.radius, config.unbounded)
+
+    def cone(start: Array, end: Array, turn: Array) -> Gaussians:
+        world = cones.multisamples(line, radius, start, end, turn, count=config.multisamples)
+        return domains.to_unit_cube(domain, world)
+
+    return _Round(s, t, jax.vmap(cone)(t[:-1], t[1:], turns))
+
+
+def _weigh(
+    config: ModelConfig, density: Float[Array, " samples"], edges: Float[Array, " edges"]
+) -> Float[Array, " samples"]:
+    """Turns densities into weights; the last interval is opaque, as the background is."""
+    lengths = jnp.diff(edges) / config.radius
+    return compositing.opaque_end(compositing.alpha_weights(density, lengths))
+
+
+def _in_arc_length(line: Polyline, composite: compositing.Composite) -> compositing.Composite:
+    """Converts distances from the path's own coordinate to arc length."""
+    arc = jax.vmap(lambda t: polylines.point_at(line, t).arc)
+    median, mean = arc(jnp.stack([composite.median, composite.mean]))
+    return composite._replace(median=median, mean=mean)

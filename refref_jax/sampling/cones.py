@@ -1,0 +1,122 @@
+"""Multisamples of a pixel's cone, placed around the bent centre line of a light path.
+
+An interval of a path is a conical frustum. It is sampled at a few points, each an isotropic
+Gaussian, so that a field can blur what is finer than the pixel's footprint. The cone grows with
+arc length as if the path were straight; its pattern is carried along the bends.
+
+Source: Barron et al., Zip-NeRF (2023), section 2; paper (arXiv 2505.05848), supplement, for the
+bent centre line.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from refref_jax.sampling.polylines import Polyline, point_at
+
+# Zip-NeRF's hexagon: each triangle of points turns once, the second one shifted by half a turn.
+_HEXAGON = np.pi * np.array([0.0, 2.0 / 3.0, 4.0 / 3.0, 1.0, 5.0 / 3.0, 1.0 / 3.0])
+
+# Width of a multisample's Gaussian in units of its distance from the centre line.
+_HEXAGON_SCALE = 0.5
+
+
+class Gaussians(NamedTuple):
+    """Isotropic Gaussians that together stand for one interval of a path.
+
+    Attributes:
+      positions: means.
+      scales: standard deviations.
+    """
+
+    positions: Float[Array, "samples 3"]
+    scales: Float[Array, " samples"]
+
+
+def multisamples(
+    line: Polyline,
+    radius: Float[Array, ""],
+    start: Float[Array, ""],
+    end: Float[Array, ""],
+    rotation: Float[Array, ""],
+    *,
+    count: int,
+) -> Gaussians:
+    """Samples the frustum of one interval.
+
+    Six points reproduce the frustum's mean and its covariance across the ray; one point sits on
+    the centre line and takes that covariance as its own. A point belongs to the segment that
+    its own coordinate falls on, also when the interval straddles an interface.
+
+    Args:
+      line: the path.
+      radius: cone radius at unit arc length.
+      start: coordinate of the interval's start.
+      end: coordinate of its end, not below `start`.
+      rotation: turns the pattern about the centre line, radians.
+      count: 1 or 6.
+
+    Raises:
+      ValueError: if there is no pattern of that many points.
+    """
+    if count == 1:
+        t = _frustum_mean(start, end)
+        point = point_at(line, t)
+        return Gaussians(point.position[None], (0.5 * radius * point.arc)[None])
+    if count != _HEXAGON.size:
+        raise ValueError(
+            f"There is no cone pattern of {count} points. Use 1 (on the centre line) or 6 "
+            "(Zip-NeRF's hexagon)."
+        )
+    angles = jnp.asarray(_HEXAGON, start.dtype) + rotation
+
+    def one_sample(t: Float[Array, ""], angle: Float[Array, ""]) -> Gaussians:
+        point = point_at(line, t)
+        across = radius * point.arc / np.sqrt(2.0)
+        right, up = orthonormal_basis(point.direction)
+        offset = across * (jnp.cos(angle) * right + jnp.sin(angle) * up)
+        return Gaussians(point.position + offset, _HEXAGON_SCALE * across)
+
+    return jax.vmap(one_sample)(_hexagon_distances(start, end), angles)
+
+
+def orthonormal_basis(
+    direction: Float[Array, "3"],
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Returns two unit vectors that complete a unit vector to a right-handed basis.
+
+    Source: Duff et al., Building an Orthonormal Basis, Revisited (2017).
+    """
+    x, y, z = direction
+    sign = jnp.copysign(jnp.ones_like(z), z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    right = jnp.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
+    up = jnp.stack([b, sign + y * y * a, -y])
+    return right, up
+
+
+def _frustum_mean(start: Float[Array, ""], end: Float[Array, ""]) -> Float[Array, ""]:
+    """Returns the mean distance of a conical frustum (mip-NeRF, Eq 7), free of overflow."""
+    mean, ratio = _middle_and_ratio(start, end)
+    return mean * (1.0 + 2.0 * ratio**2 / (3.0 + ratio**2))
+
+
+def _hexagon_distances(start: Float[Array, ""], end: Float[Array, ""]) -> Float[Array, "6"]:
+    """Returns the distances of the six points, which match the frustum's moments (Eq 3)."""
+    mean, ratio = _middle_and_ratio(start, end)
+    spread = jnp.sqrt((ratio**2 - 1.0) ** 2 + 4.0)
+    steps = (3.0 / np.sqrt(7.0)) * (2.0 * jnp.arange(6) / 5.0 - 1.0)
+    shift = (1.0 + ratio) ** 2 + 2.0 + steps.astype(start.dtype) * spread
+    return start + mean * ratio * shift / (ratio**2 + 3.0)
+
+
+def _middle_and_ratio(
+    start: Float[Array, ""], end: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Returns the middle of an interval and its half-width as a share of it."""
+    mean = 0.5 * (start + end)
+    return mean, 0.5 * (end - start) / mean

@@ -1,0 +1,67 @@
+"""From world space to the unit cube that a field is stored in.
+
+A bounded scene is a cube, scaled. An unbounded one is contracted: a ball around the origin stays
+as it is and all of the space beyond it is squeezed into a shell of the same thickness.
+
+Source: Barron et al., Mip-NeRF 360 (2022), Eq 10; Zip-NeRF (2023), section 2, for the scale of a
+contracted Gaussian.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from refref_jax import numerics
+from refref_jax.sampling.cones import Gaussians
+
+
+class Domain(NamedTuple):
+    """The part of space that a field stores.
+
+    Attributes:
+      radius: half edge of a bounded scene's cube, or radius of an unbounded scene's
+        uncontracted ball; world units.
+      unbounded: whether space is contracted.
+    """
+
+    radius: float
+    unbounded: bool
+
+
+def to_unit_cube(domain: Domain, gaussian: Gaussians) -> Gaussians:
+    """Maps world-space Gaussians to `[0, 1]^3`; scales become fractions of the cube's edge.
+
+    Points outside a bounded scene's cube are moved to its nearest face.
+    """
+    positions = gaussian.positions / domain.radius
+    scales = gaussian.scales / domain.radius
+    if domain.unbounded:
+        return Gaussians(0.25 * contract(positions) + 0.5, 0.25 * scales * shrinkage(positions))
+    return Gaussians(jnp.clip(0.5 * positions + 0.5, 0.0, 1.0), 0.5 * scales)
+
+
+def contract(x: Float[Array, "*shape 3"]) -> Float[Array, "*shape 3"]:
+    """Contracts points to the ball of radius 2: `(2 - 1 / |x|) x / |x|` where `|x| > 1`."""
+    norm = numerics.length(x)[..., None]
+    outside = norm > 1.0
+    inverse = 1.0 / jnp.where(outside, norm, 1.0)
+    return jnp.where(outside, (2.0 - inverse) * inverse * x, x)
+
+
+def uncontract(z: Float[Array, "*shape 3"]) -> Float[Array, "*shape 3"]:
+    """Inverts `contract` for points with `|z| < 2`."""
+    norm = numerics.length(z)[..., None]
+    outside = norm > 1.0
+    held = jnp.where(outside, norm, 1.0)
+    return jnp.where(outside, z / (held * (2.0 - held)), z)
+
+
+def shrinkage(x: Float[Array, "*shape 3"]) -> Float[Array, "*shape"]:
+    """Returns by how much `contract` scales a small Gaussian at `x`: `|det J|^(1/3)`.
+
+    Where `|x| > 1` that is `(2 - 1 / |x|)^(2/3) |x|^(-4/3)`.
+    """
+    norm = numerics.length(x)
+    inverse = 1.0 / jnp.where(norm > 1.0, norm, 1.0)
+    return (2.0 - inverse) ** (2.0 / 3.0) * inverse ** (4.0 / 3.0)

@@ -1,0 +1,86 @@
+"""Static description of a training run."""
+
+import dataclasses
+from typing import Literal
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneConfig:
+    """What is trained on.
+
+    Attributes:
+      path: the scene folder.
+      rule: what lies outside each mesh part, see `optics.interface_rules`.
+      indices: indices of refraction that replace the table's, by material or part.
+    """
+
+    path: str
+    rule: Literal["nested", "facing"]
+    indices: tuple[tuple[str, float], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class LossConfig:
+    """What is minimised: the data loss plus the weighted others.
+
+    Attributes:
+      data: loss on sRGB colours.
+      interlevel: weight of the anti-aliased interlevel loss.
+      blurs: half-width of its blur for each proposal round, in normalised distance.
+      distortion: weight of the corrected distortion loss.
+      hash_decay: weight of the decay of the hash grids.
+    """
+
+    data: Literal["mse", "charbonnier"]
+    interlevel: float
+    blurs: tuple[float, ...]
+    distortion: float
+    hash_decay: float
+
+
+@dataclasses.dataclass(frozen=True)
+class ScheduleConfig:
+    """How the parameters move.
+
+    Attributes:
+      steps: steps until the learning rate has reached its end.
+      warmup: steps of linear warm-up.
+      peak: learning rate after the warm-up.
+      end: learning rate at the end; the decay between is exponential.
+      anneal: steps until the proposals are fully trusted.
+    """
+
+    steps: int
+    warmup: int
+    peak: float
+    end: float
+    anneal: int
+
+    def over(self, steps: int) -> "ScheduleConfig":
+        """Returns the same schedule stretched over another number of steps."""
+        scale = steps / self.steps
+        warmup, anneal = round(self.warmup * scale), round(self.anneal * scale)
+        return dataclasses.replace(self, steps=steps, warmup=warmup, anneal=anneal)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingConfig:
+    """A training run, together with the model's own configuration.
+
+    Attributes:
+      scene: what is trained on.
+      paths: name of the budget of light paths, see `optics.path_tracing`.
+      loss: what is minimised.
+      schedule: how.
+      batch: rays a step.
+      pool: batches whose light paths are traced at once.
+      seed: of the initial parameters, the order of pixels and the sampling.
+    """
+
+    scene: SceneConfig
+    paths: str
+    loss: LossConfig
+    schedule: ScheduleConfig
+    batch: int
+    pool: int
+    seed: int

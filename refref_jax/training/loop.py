@@ -1,0 +1,84 @@
+"""The loop over training steps: draws pixels, traces them in pools, and steps."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from refref_jax.data.batches import PixelSampler
+from refref_jax.optics.path_tracing import Budget, Geometry, capacity_for
+from refref_jax.render.config import ModelConfig
+from refref_jax.training import steps
+from refref_jax.training.config import TrainingConfig
+from refref_jax.training.state import TrainState
+
+# Pixels by which the share that meets an object is estimated.
+_SURVEY = 1 << 15
+
+
+class Setup(NamedTuple):
+    """Everything about a run that does not change.
+
+    Attributes:
+      config: the run.
+      model: the model.
+      budget: which light is followed.
+      geometry: what bends it.
+      sampler: where the pixels come from.
+      capacity: room for reflections in a batch.
+    """
+
+    config: TrainingConfig
+    model: ModelConfig
+    budget: Budget
+    geometry: Geometry
+    sampler: PixelSampler
+    capacity: int
+
+
+def set_up(
+    config: TrainingConfig,
+    model: ModelConfig,
+    budget: Budget,
+    geometry: Geometry,
+    sampler: PixelSampler,
+) -> Setup:
+    """Moves the geometry to the device, and measures how many rays meet it."""
+    geometry = jax.tree.map(jnp.asarray, geometry)
+    capacity = 0
+    if budget.reflections != "none":
+        rays = sampler.survey(_SURVEY).rays
+        fraction = float(steps.hit_fraction(geometry, rays))
+        capacity = capacity_for(budget, config.batch, fraction)
+    return Setup(config, model, budget, geometry, sampler, capacity)
+
+
+def run_steps(
+    setup: Setup, state: TrainState, until: int
+) -> Iterator[tuple[TrainState, steps.StepReport]]:
+    """Yields the state and the report after every step up to `until`.
+
+    A state is consumed by the step that follows it: copy what is to be kept. Starting from a
+    restored state continues exactly where its run would have gone on.
+    """
+    config = setup.config
+    step = int(state.step)
+    while step < until:
+        first = step - step % config.pool
+        pool = _trace(setup, first)
+        for batch in range(step - first, min(config.pool, until - first)):
+            state, report = steps.train_step(
+                state, pool, np.int32(batch), config=config, model=setup.model
+            )
+            step += 1
+            yield state, report
+
+
+def _trace(setup: Setup, first: int) -> steps.Pool:
+    drawn = setup.sampler.draw(first, setup.config.pool)
+    traced = steps.trace_pool(
+        setup.geometry, drawn.rays, budget=setup.budget, capacity=setup.capacity
+    )
+    return steps.Pool(traced, jnp.asarray(drawn.rgb))

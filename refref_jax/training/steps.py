@@ -1,0 +1,154 @@
+"""One training step, and the tracing of the light paths that many steps use.
+
+This is one of the two modules that call `jax.jit`.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+from refref_jax import losses
+from refref_jax.fields import hash_grid
+from refref_jax.geometry.rays import Rays
+from refref_jax.optics import light_paths, path_tracing
+from refref_jax.optics.light_paths import LightPaths
+from refref_jax.optics.path_tracing import Budget, Geometry, Traced
+from refref_jax.render import pixels
+from refref_jax.render.config import ModelConfig
+from refref_jax.render.model import Params
+from refref_jax.render.transport import PathRadiance
+from refref_jax.training.config import LossConfig, TrainingConfig
+from refref_jax.training.state import TrainState, optimizer
+
+# Slope of Schlick's bias function, by which trust in the proposals grows (Mip-NeRF 360).
+_ANNEAL_SLOPE = 10.0
+
+
+class Pool(NamedTuple):
+    """The light paths and true colours of many batches.
+
+    Attributes:
+      traced: paths, stacked by batch.
+      rgb: 8-bit sRGB.
+    """
+
+    traced: Traced
+    rgb: UInt8[Array, "batches rays 3"]
+
+
+class StepReport(NamedTuple):
+    """What a step measured before it moved the parameters.
+
+    Attributes:
+      loss: what is minimised.
+      psnr: of the batch's sRGB colours, in dB.
+      interlevel: unweighted interlevel loss.
+      distortion: unweighted distortion loss.
+      hash_decay: unweighted hash decay.
+      dropped: mean share of a ray's light that found no room among the batch's paths.
+    """
+
+    loss: Float[Array, ""]
+    psnr: Float[Array, ""]
+    interlevel: Float[Array, ""]
+    distortion: Float[Array, ""]
+    hash_decay: Float[Array, ""]
+    dropped: Float[Array, ""]
+
+
+@functools.partial(jax.jit, static_argnames=("budget", "capacity"))
+def trace_pool(geometry: Geometry, rays: Rays, *, budget: Budget, capacity: int) -> Traced:
+    """Traces the rays `[batches, rays]` of many batches; see `path_tracing.trace_batches`."""
+    return path_tracing.trace_batches(geometry, rays, budget=budget, capacity=capacity)
+
+
+@jax.jit
+def hit_fraction(geometry: Geometry, rays: Rays) -> Float[Array, ""]:
+    """Returns the share of rays `[rays]` that meet a surface."""
+    return jnp.mean(path_tracing.follow(geometry, rays, bends=1).hit.astype(jnp.float32))
+
+
+@functools.partial(jax.jit, static_argnames=("config", "model"), donate_argnames="state")
+def train_step(
+    state: TrainState,
+    pool: Pool,
+    batch: Int[Array, ""],
+    *,
+    config: TrainingConfig,
+    model: ModelConfig,
+) -> tuple[TrainState, StepReport]:
+    """Takes one step on one batch of a pool.
+
+    Args:
+      state: consumed: its buffers are reused for the result.
+      pool: light paths and colours.
+      batch: which of the pool's batches.
+      config: the run.
+      model: the model.
+    """
+    traced, rgb = jax.tree.map(lambda x: x[batch], pool)
+    key = jax.random.fold_in(jax.random.key(config.seed), state.step)
+    jitter = pixels.random_jitter(key, model, traced.paths.radii.shape[0])
+    anneal = _anneal(state.step, config.schedule.anneal)
+
+    def objective(params: Params) -> tuple[Float[Array, ""], StepReport]:
+        seen = pixels.render_pixels(
+            params, model, traced.paths, jitter, rays=rgb.shape[0], anneal=anneal
+        )
+        target = rgb.astype(jnp.float32) / 255.0
+        report = _measure(params, seen, target, traced, config.loss)
+        return report.loss, report
+
+    gradient, report = jax.grad(objective, has_aux=True)(state.params)
+    updates, moments = optimizer(config.schedule).update(gradient, state.optimizer, state.params)
+    params = optax.apply_updates(state.params, updates)
+    return TrainState(state.step + 1, params, moments), report
+
+
+def _measure(
+    params: Params,
+    seen: pixels.Pixels,
+    target: Float[Array, "rays 3"],
+    traced: Traced,
+    config: LossConfig,
+) -> StepReport:
+    mse = losses.mean_squared_error(seen.rgb, target)
+    data = mse if config.data == "mse" else losses.charbonnier(seen.rgb, target)
+    interlevel, distortion = _path_losses(seen.paths, traced.paths, config)
+    decay = losses.hash_decay(hash_grid.tables(params))
+    loss = (
+        data
+        + config.interlevel * interlevel
+        + config.distortion * distortion
+        + config.hash_decay * decay
+    )
+    psnr = -10.0 * jnp.log10(mse)
+    return StepReport(loss, psnr, interlevel, distortion, decay, jnp.mean(traced.dropped))
+
+
+def _path_losses(
+    seen: PathRadiance, paths: LightPaths, config: LossConfig
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Returns interlevel and distortion loss, averaged over the paths that exist."""
+    *proposals, final = seen.histograms
+    exists = light_paths.exists(paths)
+    interlevel = jnp.zeros(())
+    for proposal, blur in zip(proposals, config.blurs, strict=True):
+        per_path = jax.vmap(functools.partial(losses.interlevel, blur=blur))(final, proposal)
+        interlevel += _mean_where(exists, per_path)
+    distortion = jax.vmap(losses.distortion)(final, seen.outside)
+    return interlevel, _mean_where(exists, distortion)
+
+
+def _mean_where(mask: Bool[Array, " n"], values: Float[Array, " n"]) -> Float[Array, ""]:
+    return jnp.sum(jnp.where(mask, values, 0.0)) / jnp.sum(mask)
+
+
+def _anneal(step: Int[Array, ""], steps: int) -> Float[Array, ""]:
+    """Returns the exponent on the proposals' weights (Mip-NeRF 360, Eq 18)."""
+    progress = jnp.minimum(step.astype(jnp.float32) / max(1, steps), 1.0)
+    return _ANNEAL_SLOPE * progress / ((_ANNEAL_SLOPE - 1.0) * progress + 1.0)
