@@ -1,6 +1,6 @@
 """Renders a split of a scene with a trained model, and measures it.
 
-    python -m experiments.evaluate --run=runs/ball --split=test
+python -m experiments.evaluate --run=runs/ball --split=test
 """
 
 import json

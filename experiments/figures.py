@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 matplotlib.use("Agg")
-from matplotlib import pyplot  # noqa: E402
+from matplotlib import pyplot
 
 _COLOUR_MAP = "turbo"
 _ERROR_GAIN = 4.0

@@ -1,6 +1,6 @@
 """Renders the views of a split, or an orbit, as pictures, distance maps and a GIF.
 
-    python -m experiments.render --run=runs/ball --views=orbit --frames=60
+python -m experiments.render --run=runs/ball --views=orbit --frames=60
 """
 
 import math

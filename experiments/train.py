@@ -1,6 +1,6 @@
 """Trains a model of a scene.
 
-    python -m experiments.train --scene=experiments/data/cube_smcvx_ball --out=runs/ball
+python -m experiments.train --scene=experiments/data/cube_smcvx_ball --out=runs/ball
 """
 
 import math
@@ -17,7 +17,8 @@ from experiments.presets import PRESETS, bounds
 from refref_jax.data import background, containment, lint, local_layout, meshes
 from refref_jax.data.batches import PixelSampler
 from refref_jax.data.geometry import build_geometry
-from refref_jax.optics.path_tracing import BUDGETS, Geometry
+from refref_jax.optics.budgets import BUDGETS
+from refref_jax.optics.wavefront import Geometry
 from refref_jax.render import saved
 from refref_jax.render.saved import SavedModel
 from refref_jax.training import loop, run_folder
@@ -166,7 +167,7 @@ def _train(run: Path, setup: loop.Setup, state: TrainState, checkpoints: Checkpo
     start = last = time.monotonic()
     logged = step
     with commands.ProgressBar("train", total, step) as bar:
-        for state, report in loop.run_steps(setup, state, total):
+        for stepped, report in loop.run_steps(setup, state, total):
             step += 1
             if step % _LOG_EVERY.value == 0 or step == total:
                 report = jax.device_get(report)
@@ -176,7 +177,7 @@ def _train(run: Path, setup: loop.Setup, state: TrainState, checkpoints: Checkpo
                 bar.show(step, f"loss {report.loss:.5f}  PSNR {report.psnr:.2f}  {rate:.0f} rays/s")
                 last, logged = now, step
             if step % _CHECKPOINT_EVERY.value == 0 or step == total or interrupt.requested:
-                checkpoints.save(state)
+                checkpoints.save(stepped)
             if interrupt.requested:
                 break
     if step < total:
@@ -210,7 +211,7 @@ def _parse_indices(words: list[str]) -> dict[str, float]:
         except ValueError:
             separator = ""
         if not separator or not name:
-            raise ValueError(f"--ior={word} is not NAME=NUMBER. Write for example --ior=glass=1.52.")
+            raise ValueError(f"--ior={word} is not NAME=NUMBER. Write as in --ior=glass=1.52.")
     return indices
 
 

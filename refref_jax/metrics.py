@@ -4,8 +4,6 @@ import dm_pix
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from refref_jax import numerics
-
 
 def psnr(rendered: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Float[Array, ""]:
     """Returns the peak signal-to-noise ratio in dB; `inf` for equal images."""

@@ -94,4 +94,3 @@ def offset_origin(
     step = _OFFSET_IN_ULPS * jnp.finfo(point.dtype).eps * scale
     side = jnp.where(jnp.dot(direction, normal) >= 0, 1.0, -1.0)
     return point + step * side.astype(point.dtype) * normal
-

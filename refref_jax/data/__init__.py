@@ -1,0 +1,1 @@
+"""Scenes on disk: images, cameras, meshes. NumPy only; nothing here touches a device."""

@@ -20,7 +20,6 @@ def is_unbounded(scene: Path) -> bool:
                 return background["type"] == "env"
         except (ValueError, AttributeError, TypeError) as error:
             raise SceneError(
-                f"{path} can not be understood ({error}). Correct it, or remove it: it is "
-                "optional."
+                f"{path} can not be understood ({error}). Correct it, or remove it: it is optional."
             ) from error
     return scene.resolve().name.split("_")[0] == "env"

@@ -70,9 +70,7 @@ def image_rays(cameras: Cameras, camera: int) -> Rays:
     return pixel_rays(cameras, np.full(row.shape, camera), row, column)
 
 
-def orbit(
-    frames: int, *, distance: float, elevation: float, size: int, angle_x: float
-) -> Cameras:
+def orbit(frames: int, *, distance: float, elevation: float, size: int, angle_x: float) -> Cameras:
     """Returns cameras on a circle around the origin that look at it, with z up.
 
     Args:

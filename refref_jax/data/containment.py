@@ -63,7 +63,8 @@ def winding_number(
 ) -> Float[np.ndarray, " points"]:
     """Returns how often a surface winds around points: 1 inside, 0 outside a closed one.
 
-    0 without a look at the triangles for points outside the surface's bounding box. Negative where the faces point inwards.
+    0 without a look at the triangles for points outside the surface's bounding box. Negative
+    where the faces point inwards.
 
     Source: Jacobson et al., Robust Inside-Outside Segmentation using Generalized Winding
     Numbers (2013); van Oosterom and Strackee (1983) for the solid angle.

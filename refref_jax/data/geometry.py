@@ -9,7 +9,7 @@ from refref_jax.data.meshes import MeshPart, Shading
 from refref_jax.geometry.corner_normals import CREASE_ANGLE, corner_normals
 from refref_jax.geometry.surface_build import build_surfaces
 from refref_jax.optics.interface_rules import RULES
-from refref_jax.optics.path_tracing import Geometry
+from refref_jax.optics.wavefront import Geometry
 
 _CREASE_ANGLES: dict[Shading, float] = {"auto": CREASE_ANGLE, "smooth": np.pi, "flat": 0.0}
 

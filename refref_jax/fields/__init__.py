@@ -1,0 +1,1 @@
+"""Fields of density and colour. They know positions and directions, never rays."""

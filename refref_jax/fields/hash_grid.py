@@ -82,9 +82,7 @@ def tables(params: Any) -> list[Float[Array, "entries features"]]:
     return [leaf for path, leaf in leaves if _TABLE in jax.tree_util.keystr(path)]
 
 
-def vertex_index(
-    vertex: Int[Array, "3"], resolution: int, entries: int
-) -> Int[Array, ""]:
+def vertex_index(vertex: Int[Array, "3"], resolution: int, entries: int) -> Int[Array, ""]:
     """Returns the table entry of a grid vertex, `0 .. resolution` along each axis.
 
     Dense where every vertex has an entry of its own, hashed where not.
@@ -115,12 +113,8 @@ class HashGrid(nn.Module):
         levels = []
         for level, resolution in enumerate(resolutions(self.config)):
             size = min(self.config.entries, (resolution + 1) ** 3)
-            table = self.param(
-                f"{_TABLE}{level:02d}", _initialise, (size, self.config.features)
-            )
-            levels.append(
-                _interpolate(table, position, resolution) * fading(scale, resolution)
-            )
+            table = self.param(f"{_TABLE}{level:02d}", _initialise, (size, self.config.features))
+            levels.append(_interpolate(table, position, resolution) * fading(scale, resolution))
         return jnp.concatenate(levels)
 
 

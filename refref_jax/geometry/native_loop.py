@@ -20,8 +20,9 @@ def native_loop(function: Callable[_Arguments, _Result]) -> Callable[_Arguments,
     """Marks a function of arrays for one native kernel.
 
     The function must use every argument (XLA 0.10.2 aborts on an unused one inside an outer
-    loop), and hold no sort, scatter or callback. The mark sits on the call of a nested `jit`. Inside, it is taken back, or every small jitted
-    function of `jax.numpy` would inherit it and become a real call of its own.
+    loop), and hold no sort, scatter or callback. The mark sits on the call of a nested `jit`.
+    Inside, it is taken back, or every small jitted function of `jax.numpy` would inherit it and
+    become a real call of its own.
     """
 
     def unmarked(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:

@@ -53,9 +53,7 @@ def intersect(
     return Intersection(jnp.where(hit, distance, jnp.inf), jnp.stack([u, v]))
 
 
-def interpolate(
-    corners: Float[Array, "3 n"], barycentric: Float[Array, "2"]
-) -> Float[Array, " n"]:
+def interpolate(corners: Float[Array, "3 n"], barycentric: Float[Array, "2"]) -> Float[Array, " n"]:
     """Returns the value at `(u, v)` of a quantity given at the three corners.
 
     Outside the triangle (a hit within the edge tolerance) the pair is used as it is.
@@ -66,6 +64,4 @@ def interpolate(
 
 def geometric_normal(triangle: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """Returns the outward unit normal; zero for a degenerate triangle."""
-    return numerics.normalize(
-        jnp.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
-    )
+    return numerics.normalize(jnp.cross(triangle[1] - triangle[0], triangle[2] - triangle[0]))

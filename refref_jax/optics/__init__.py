@@ -1,0 +1,1 @@
+"""What light does at surfaces, and the paths that it takes."""

@@ -1,14 +1,14 @@
 """Rendering: from light paths to colours. The library's public surface.
 
-    model = render.load_model("runs/demo")
-    rays = render.Rays(origins, directions, radii)
-    picture = render.render_image(model, rays)        # chunked and jitted
-    seen = render.render_rays(model, rays)            # one pure function, jit it yourself
+model = render.load_model("runs/demo")
+rays = render.Rays(origins, directions, radii)
+picture = render.render_image(model, rays)        # chunked and jitted
+seen = render.render_rays(model, rays)            # one pure function, jit it yourself
 """
 
 from refref_jax.geometry.rays import Rays as Rays
-from refref_jax.optics.path_tracing import BUDGETS as BUDGETS
-from refref_jax.optics.path_tracing import Budget as Budget
+from refref_jax.optics.budgets import BUDGETS as BUDGETS
+from refref_jax.optics.budgets import Budget as Budget
 from refref_jax.render.config import ModelConfig as ModelConfig
 from refref_jax.render.images import Rendering as Rendering
 from refref_jax.render.images import render_image as render_image

@@ -15,8 +15,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
+from refref_jax.optics.budgets import Budget
 from refref_jax.optics.light_paths import LightPaths
-from refref_jax.optics.path_tracing import Budget, Geometry
+from refref_jax.optics.wavefront import Geometry
 from refref_jax.render import colour, pixels
 from refref_jax.render.config import ModelConfig
 from refref_jax.render.model import Model, Params
@@ -91,9 +92,7 @@ def render_image(model: Model, rays: Rays, *, chunk: int = CHUNK) -> Rendering:
         for start in range(0, flat.radii.shape[0], TILE)
     ]
     joined = jax.tree.map(lambda *parts: np.concatenate([np.asarray(x) for x in parts]), *tiles)
-    return jax.tree.map(
-        lambda x: x[: flat.radii.shape[0]].reshape(*shape, *x.shape[1:]), joined
-    )
+    return jax.tree.map(lambda x: x[: flat.radii.shape[0]].reshape(*shape, *x.shape[1:]), joined)
 
 
 def _slice_rays(rays: Rays, start: int) -> Rays:

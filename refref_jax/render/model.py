@@ -6,7 +6,8 @@ import jax
 from jaxtyping import Array
 
 from refref_jax.fields import density_field, radiance_field
-from refref_jax.optics.path_tracing import Budget, Geometry
+from refref_jax.optics.budgets import Budget
+from refref_jax.optics.wavefront import Geometry
 from refref_jax.render.config import ModelConfig
 
 

@@ -49,9 +49,7 @@ def render_pixels(
       anneal: see `transport.path_radiance`.
     """
     seen = render_paths(params, config, paths, jitter, anneal=anneal)
-    linear = jax.ops.segment_sum(
-        paths.weights * seen.composite.rgb, paths.rays, num_segments=rays
-    )
+    linear = jax.ops.segment_sum(paths.weights * seen.composite.rgb, paths.rays, num_segments=rays)
     return Pixels(colour.linear_to_srgb(linear), seen)
 
 

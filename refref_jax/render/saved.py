@@ -18,8 +18,9 @@ import orbax.checkpoint as ocp
 from refref_jax import configuration
 from refref_jax.geometry.bvh import BVH
 from refref_jax.geometry.surfaces import Surfaces
+from refref_jax.optics.budgets import Budget
 from refref_jax.optics.media import Interfaces
-from refref_jax.optics.path_tracing import Budget, Geometry
+from refref_jax.optics.wavefront import Geometry
 from refref_jax.render.config import ModelConfig
 from refref_jax.render.model import Model, Params, init_params
 

@@ -6,6 +6,8 @@ Source: Barron et al., Mip-NeRF 360 (2022), section 3, and Zip-NeRF (2023); pape
 2505.05848), section 4.2, for samples and directions on the bent path.
 """
 
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -26,8 +28,6 @@ _DILATION_BIAS = 0.0025
 
 # Adjacent cone patterns are turned against each other by this angle (Zip-NeRF, supplement).
 _PATTERN_TURN = jnp.pi / 6.0
-
-_SMALLEST_WEIGHT = 1e-30
 
 
 class Jitter(NamedTuple):
@@ -99,32 +99,26 @@ def path_radiance(
       anneal: exponent on the proposals' weights, 0 for uniform sampling to 1 for full trust.
     """
     line = _polyline(config, path)
-    edges, weights = jnp.array([0.0, 1.0], path.radii.dtype), jnp.ones(1, path.radii.dtype)
     histograms = []
-    spread = 1.0
     for level, proposal in enumerate(config.proposals):
-        s = _resample(config, edges, weights, jitter.offsets[level], anneal, proposal.samples, spread)
+        s = _resample(config, histograms, jitter.offsets[level], anneal, proposal.samples)
         samples = _place(config, line, path.radii, s, jitter.rotations[level])
         see = jax.vmap(density_field.density, in_axes=(None, None, 0))
         density = see(params.proposals[level], proposal.field, samples.gaussians)
-        weights = _weigh(config, density, samples.t)
-        edges = s
-        histograms.append(Histogram(edges, weights))
-        spread *= proposal.samples
+        histograms.append(Histogram(s, _weigh(config, density, samples.t)))
 
-    s = _resample(config, edges, weights, jitter.offsets[-1], anneal, config.samples, spread)
+    s = _resample(config, histograms, jitter.offsets[-1], anneal, config.samples)
     samples = _place(config, line, path.radii, s, jitter.rotations[-1])
-    middle = jax.vmap(polylines.point_at, in_axes=(None, 0))(
-        line, 0.5 * (samples.t[1:] + samples.t[:-1])
-    )
+    middles = 0.5 * (samples.t[1:] + samples.t[:-1])
+    points = jax.vmap(polylines.point_at, in_axes=(None, 0))(line, middles)
     see = jax.vmap(radiance_field.radiance, in_axes=(None, None, 0, 0))
-    seen = see(params.field, config.field, samples.gaussians, middle.direction)
+    seen = see(params.field, config.field, samples.gaussians, points.direction)
     weights = _weigh(config, seen.density, samples.t)
     composite = compositing.composite(weights, seen.rgb, samples.t)
     return PathRadiance(
         composite=_in_arc_length(line, composite),
         histograms=(*histograms, Histogram(s, weights)),
-        outside=middle.outside,
+        outside=points.outside,
     )
 
 
@@ -146,20 +140,23 @@ def _polyline(config: ModelConfig, path: LightPaths) -> Polyline:
 
 def _resample(
     config: ModelConfig,
-    edges: Float[Array, " n+1"],
-    weights: Float[Array, " n"],
+    histograms: Sequence[Histogram],
     offset: Float[Array, ""],
     anneal: Float[Array, ""],
     samples: int,
-    spread: float,
-) -> Float[Array, " m+1"]:
-    """Draws the next round's intervals from the last one's weights."""
-    edges, weights = jax.lax.stop_gradient((edges, weights))
-    if config.dilation > 0.0 and weights.shape[0] > 1:
-        edges, weights = stepfun.dilate(edges, weights, config.dilation / spread + _DILATION_BIAS)
-    annealed = jnp.where(jnp.diff(edges) > 0.0, jnp.maximum(weights, _SMALLEST_WEIGHT) ** anneal, 0.0)
-    strata = (jnp.arange(samples, dtype=edges.dtype) + 0.5 + offset) / samples
-    return stepfun.sample_edges(strata, edges, annealed)
+) -> Float[Array, " edges"]:
+    """Draws the next round's intervals where the last round saw light; evenly at first."""
+    strata = (jnp.arange(samples, dtype=offset.dtype) + 0.5 + offset) / samples
+    if not histograms:
+        ends = jnp.array([0.0, 1.0], offset.dtype)
+        return stepfun.sample_edges(strata, ends, jnp.ones_like(ends[:1]))
+    edges, weights = jax.lax.stop_gradient(histograms[-1])
+    if config.dilation > 0.0:
+        drawn = math.prod(histogram.weights.shape[-1] for histogram in histograms)
+        edges, weights = stepfun.dilate(edges, weights, config.dilation / drawn + _DILATION_BIAS)
+    # Bins of no width stay empty; the others tend to equal weight as the exponent tends to 0.
+    trusted = jnp.where(jnp.diff(edges) > 0.0, weights**anneal, 0.0)
+    return stepfun.sample_edges(strata, edges, trusted)
 
 
 def _place(

@@ -1,0 +1,1 @@
+"""Where along a path a field is asked."""

@@ -121,9 +121,7 @@ def integrate_linear(
     """
     widths = jnp.diff(points)
     areas = 0.5 * (values[..., 1:] + values[..., :-1]) * widths
-    start = jnp.concatenate(
-        [jnp.zeros_like(areas[..., :1]), jnp.cumsum(areas, axis=-1)], axis=-1
-    )
+    start = jnp.concatenate([jnp.zeros_like(areas[..., :1]), jnp.cumsum(areas, axis=-1)], axis=-1)
     held = jnp.clip(at, points[..., :1], points[..., -1:])
     bin_ = count_below(points[..., 1:-1], held)
     x = held - take(points, bin_)
@@ -140,12 +138,9 @@ def count_below(
     For the few dozen bins of a path this beats a binary search, whose steps depend on each
     other.
     """
-    return jnp.sum(
-        sorted_values[..., None, :] <= queries[..., :, None], axis=-1, dtype=jnp.int32
-    )
+    return jnp.sum(sorted_values[..., None, :] <= queries[..., :, None], axis=-1, dtype=jnp.int32)
 
 
 def take(values: Array, index: Int[Array, "*batch m"]) -> Array:
     """Returns `values[..., index]`, batch by batch."""
     return jnp.take_along_axis(values, index, axis=-1)
-

@@ -1,0 +1,1 @@
+"""Training: one optax step, its loop, and what a run writes."""

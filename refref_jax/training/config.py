@@ -69,7 +69,7 @@ class TrainingConfig:
 
     Attributes:
       scene: what is trained on.
-      paths: name of the budget of light paths, see `optics.path_tracing`.
+      paths: name of the budget of light paths, see `optics.budgets`.
       loss: what is minimised.
       schedule: how.
       batch: rays a step.

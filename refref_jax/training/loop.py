@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from refref_jax.data.batches import PixelSampler
-from refref_jax.optics.path_tracing import Budget, Geometry, capacity_for
+from refref_jax.optics.budgets import Budget, capacity_for
+from refref_jax.optics.wavefront import Geometry
 from refref_jax.render.config import ModelConfig
 from refref_jax.training import steps
 from refref_jax.training.config import TrainingConfig

@@ -1,8 +1,8 @@
 """What a run writes: configuration, model and metrics, all readable text.
 
-    {run}/config.json      the resolved `TrainingConfig`
-    {run}/model.json       see `render.saved`
-    {run}/metrics.jsonl    one line for every logged step
+{run}/config.json      the resolved `TrainingConfig`
+{run}/model.json       see `render.saved`
+{run}/metrics.jsonl    one line for every logged step
 """
 
 import json
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from refref_jax import configuration
-from refref_jax.optics.path_tracing import Geometry
+from refref_jax.optics.wavefront import Geometry
 from refref_jax.render import saved
 from refref_jax.render.saved import SavedModel
 from refref_jax.training.config import TrainingConfig

@@ -15,8 +15,10 @@ from refref_jax import losses
 from refref_jax.fields import hash_grid
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
+from refref_jax.optics.budgets import Budget
 from refref_jax.optics.light_paths import LightPaths
-from refref_jax.optics.path_tracing import Budget, Geometry, Traced
+from refref_jax.optics.path_tracing import Traced
+from refref_jax.optics.wavefront import Geometry, follow
 from refref_jax.render import pixels
 from refref_jax.render.config import ModelConfig
 from refref_jax.render.model import Params
@@ -69,7 +71,7 @@ def trace_pool(geometry: Geometry, rays: Rays, *, budget: Budget, capacity: int)
 @jax.jit
 def hit_fraction(geometry: Geometry, rays: Rays) -> Float[Array, ""]:
     """Returns the share of rays `[rays]` that meet a surface."""
-    return jnp.mean(path_tracing.follow(geometry, rays, bends=1).hit.astype(jnp.float32))
+    return jnp.mean(follow(geometry, rays, bends=1).hit.astype(jnp.float32))
 
 
 @functools.partial(jax.jit, static_argnames=("config", "model"), donate_argnames="state")

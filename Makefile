@@ -1,0 +1,41 @@
+# One command from a fresh clone: `make demo` trains and shows the oracle, `make test` tests.
+# Both create .venv first, and may be repeated.
+
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+
+VENV := .venv
+READY := $(VENV)/.ready
+RUN := $(VENV)/bin/python -m
+
+.PHONY: demo test test-slow lint format clean
+
+demo: $(READY)
+	$(RUN) experiments.train --scene=experiments/data/cube_smcvx_ball --preset=tiny \
+		--out=runs/demo --resume
+	$(RUN) experiments.evaluate --run=runs/demo --split=test
+	@echo "Look at runs/demo/eval/test/comparison.png"
+
+test: $(READY)
+	$(RUN) pytest
+
+test-slow: $(READY)
+	$(RUN) pytest -m slow
+
+lint: $(READY)
+	$(RUN) ruff check .
+	$(RUN) ruff format --check .
+
+format: $(READY)
+	$(RUN) ruff check --fix .
+	$(RUN) ruff format .
+
+clean:
+	rm -rf $(VENV) .pytest_cache .ruff_cache *.egg-info
+
+$(READY): pyproject.toml
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: install it first."; exit 1; }
+	@$(PYTHON) -m venv $(VENV) || { echo "The venv module is missing: on Debian, install \
+	python3-venv."; exit 1; }
+	$(RUN) pip install --quiet --disable-pip-version-check --editable ".[experiments,test,dev]"
+	@touch $@
