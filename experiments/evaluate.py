@@ -46,7 +46,7 @@ def main() -> None:
     """Evaluates a run."""
     run = Path(_RUN.value)
     config = run_folder.read_config(run)
-    model = load_model(run, _STEP.value)
+    model = load_model(run, step=_STEP.value)
     scene = Path(_SCENE.value or config.scene.path)
     truth = read_truth(scene, _SPLIT.value)
     out = run / "eval" / _SPLIT.value

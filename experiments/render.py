@@ -34,7 +34,7 @@ _CHUNK = flags.DEFINE_integer("chunk", 4096, "Paths at once: lower it if memory 
 def main() -> None:
     """Renders the chosen cameras."""
     run = Path(_RUN.value)
-    model = load_model(run, _STEP.value)
+    model = load_model(run, step=_STEP.value)
     cameras, names = _cameras(run)
     out = Path(_OUT.value) if _OUT.value else run / "render" / _VIEWS.value
     for folder in ("rgb", "distance"):

@@ -117,7 +117,7 @@ def plan_from_flags() -> Plan:
     scene = Path(_SCENE.value).resolve()
     frames = local_layout.read_frames(scene, "train")
     indices = _parse_indices(_IOR.value)
-    parts = meshes.read_meshes(scene, indices)
+    parts = meshes.read_meshes(scene, indices=indices)
     if not parts and _PATHS.value != "straight":
         raise ValueError(
             f"{scene / 'meshes'} holds no .ply file, so there is nothing to bend light. Add the "

@@ -32,8 +32,8 @@ def read(path: Path, kind: type[_Config]) -> _Config:
         return _build(kind, json.loads(path.read_text(encoding="utf-8")), kind.__name__)
     except (ValueError, TypeError) as error:
         raise ValueError(
-            f"{path} does not hold a {kind.__name__}: {error} Restore the file, or write it again "
-            "with this version."
+            f"{path} does not hold a {kind.__name__} ({error}). Restore the file, or write it "
+            "again with this version."
         ) from error
 
 
@@ -45,8 +45,8 @@ def _build(kind: Any, value: Any, where: str) -> Any:
     if origin is tuple:
         return _build_tuple(arguments, value, where)
     if origin is typing.Literal:
-        if value not in arguments:
-            raise ValueError(f"{where} is {value!r}, not one of {arguments}.")
+        if not any(value == option and type(value) is type(option) for option in arguments):
+            raise ValueError(f"{where} is {value!r}, not one of {arguments}")
         return value
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:
@@ -55,26 +55,28 @@ def _build(kind: Any, value: Any, where: str) -> Any:
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if type(value) is not kind:
-        raise ValueError(f"{where} is {value!r}, not of type {kind.__name__}.")
+        raise ValueError(f"{where} is {value!r}, not of type {kind.__name__}")
     return value
 
 
 def _build_dataclass(kind: Any, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
-        raise ValueError(f"{where} is {value!r}, not an object.")
+        raise ValueError(f"{where} is {value!r}, not an object")
     hints = typing.get_type_hints(kind)
     names = [field.name for field in dataclasses.fields(kind)]
-    if set(value) != set(names):
-        raise ValueError(f"{where} has the keys {sorted(value)}, not {sorted(names)}.")
+    if missing := set(names) - set(value):
+        raise ValueError(f"{where} lacks {', '.join(map(repr, sorted(missing)))}")
+    if unknown := set(value) - set(names):
+        raise ValueError(f"{where} has the unknown {', '.join(map(repr, sorted(unknown)))}")
     return kind(**{name: _build(hints[name], value[name], f"{where}.{name}") for name in names})
 
 
 def _build_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
     if not isinstance(value, list):
-        raise ValueError(f"{where} is {value!r}, not a list.")
+        raise ValueError(f"{where} is {value!r}, not a list")
     if len(arguments) == 2 and arguments[1] is Ellipsis:
         arguments = (arguments[0],) * len(value)
     if len(arguments) != len(value):
-        raise ValueError(f"{where} has {len(value)} items, not {len(arguments)}.")
+        raise ValueError(f"{where} has {len(value)} items, not {len(arguments)}")
     items = zip(arguments, value, strict=True)
     return tuple(_build(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(items))

@@ -3,6 +3,8 @@
 Letters: `s` is the normalised distance along a path, `w` its weights (see `sampling.stepfun`).
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -64,7 +66,7 @@ def distortion(final: Histogram, outside: Bool[Array, " samples"]) -> Float[Arra
     return between + within
 
 
-def hash_decay(tables: list[Float[Array, "entries features"]]) -> Float[Array, ""]:
+def hash_decay(tables: Sequence[Float[Array, "_ _"]]) -> Float[Array, ""]:
     """Returns the sum over levels of the mean squared entry.
 
     Taking the mean per level weighs coarse levels, with few entries, more than their share.

@@ -31,12 +31,27 @@ def safe_sqrt(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
+@jax.custom_jvp
 def safe_divide(
     numerator: Float[Array, "*shape"], denominator: Float[Array, "*shape"]
 ) -> Float[Array, "*shape"]:
-    """Returns `numerator / denominator`, and 0 with zero gradients where the denominator is 0."""
+    """Returns `numerator / denominator`, and 0 with zero gradients where the denominator is 0.
+
+    The gradient is formed from the quotient, never from the squared denominator, so it stays
+    finite down to denominators whose square is below the smallest number.
+    """
     nonzero = denominator != 0
     return jnp.where(nonzero, numerator / jnp.where(nonzero, denominator, 1.0), 0.0)
+
+
+@safe_divide.defjvp
+def _safe_divide_jvp(
+    primals: tuple[Array, Array], tangents: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    numerator, denominator = primals
+    quotient = safe_divide(numerator, denominator)
+    change = tangents[0] - quotient * tangents[1]
+    return quotient, safe_divide(change, denominator)
 
 
 def safe_reciprocal(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

@@ -5,6 +5,8 @@ from pathlib import Path
 
 from refref_jax.data.errors import SceneError
 
+_UNBOUNDED = {"cube": False, "sphere": False, "env": True}
+
 
 def is_unbounded(scene: Path) -> bool:
     """Returns whether the background is an environment map.
@@ -17,9 +19,10 @@ def is_unbounded(scene: Path) -> bool:
         try:
             background = json.loads(path.read_text(encoding="utf-8")).get("background", {})
             if "type" in background:
-                return background["type"] == "env"
-        except (ValueError, AttributeError, TypeError) as error:
+                return _UNBOUNDED[background["type"]]
+        except (ValueError, AttributeError, TypeError, KeyError) as error:
             raise SceneError(
-                f"{path} can not be understood ({error}). Correct it, or remove it: it is optional."
+                f"{path} can not be understood ({error!r}). Correct it (the background's type is "
+                f"one of {', '.join(_UNBOUNDED)}), or remove it: it is optional."
             ) from error
     return scene.resolve().name.split("_")[0] == "env"

@@ -48,8 +48,14 @@ class PixelSampler:
           batch: pixels a step.
 
         Raises:
-          ValueError: if the images have fewer pixels than a batch.
+          ValueError: if the images do not fit the cameras, or have fewer pixels than a batch.
         """
+        expected = (len(cameras.poses), cameras.height, cameras.width, 3)
+        if images.shape != expected:
+            raise ValueError(
+                f"The images are {images.shape}, but the cameras ask for {expected}. Give one "
+                "image a camera, in its size."
+            )
         self._pixels = images.reshape(-1, 3)
         self._cameras = cameras
         self._seed = seed

@@ -4,6 +4,7 @@ A point is inside a closed surface where the surface winds around it once. The w
 a sum over triangles, so it needs no rays and bears small defects of a mesh.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -11,16 +12,18 @@ import numpy as np
 from jaxtyping import Float
 
 from refref_jax.data.meshes import MeshPart
+from refref_jax.geometry.corner_normals import face_normals
 from refref_jax.optics.interface_rules import NO_PARENT
 
-# Vertices of a part that are tested against each other part.
-_PROBES = 16
+# Faces of a part that are tested against each other part.
+_PROBES = 64
+
+# How far off a face its probes lie, on both sides, as a share of the part's size. Bodies that are
+# closer than that touch.
+_GAP = 1e-5
 
 # Triangles times points of one sweep, to bound its memory.
 _SWEEP = 1 << 20
-
-# A part whose probes agree to this share is inside or outside; else its surface cuts the other.
-_AGREEMENT = 0.95
 
 
 class Containment(NamedTuple):
@@ -40,22 +43,17 @@ def find_containment(parts: Sequence[MeshPart]) -> Containment:
     count = len(parts)
     volumes = [abs(signed_volume(part)) for part in parts]
     contains = np.zeros((count, count), bool)
-    overlaps = []
-    for inner in range(count):
-        probes = _probes(parts[inner])
-        for outer in range(count):
-            if inner == outer:
-                continue
-            share = np.mean(np.abs(winding_number(parts[outer], probes)) > 0.5)
-            if share >= _AGREEMENT:
-                contains[outer, inner] = True
-            elif share > 1.0 - _AGREEMENT:
-                overlaps.append((inner, outer))
+    overlaps = set()
+    for inner, outer in itertools.permutations(range(count), 2):
+        inside = np.abs(winding_number(parts[outer], _probes(parts[inner]))) > 0.5
+        contains[outer, inner] = inside.all()
+        if inside.any() and not inside.all():
+            overlaps.add((min(inner, outer), max(inner, outer)))
     parents = []
     for inner in range(count):
         around = np.flatnonzero(contains[:, inner])
         parents.append(int(min(around, key=volumes.__getitem__)) if around.size else NO_PARENT)
-    return Containment(tuple(parents), tuple(overlaps))
+    return Containment(tuple(parents), tuple(sorted(overlaps)))
 
 
 def winding_number(
@@ -86,21 +84,33 @@ def signed_volume(part: MeshPart) -> float:
 
 
 def _probes(part: MeshPart) -> Float[np.ndarray, "probes 3"]:
-    """Returns centres of faces spread evenly over the list."""
+    """Returns points just inside and outside of faces spread evenly over the list."""
     chosen = np.unique(np.linspace(0, len(part.faces) - 1, _PROBES).astype(np.int64))
-    return part.vertices[part.faces[chosen]].mean(axis=1)
+    corners = part.vertices[part.faces[chosen]]
+    step = _GAP * np.max(np.ptp(part.vertices, axis=0)) * face_normals(corners)
+    centres = corners.mean(axis=1)
+    return np.concatenate([centres - step, centres + step])
 
 
 def _solid_angles(
     corners: Float[np.ndarray, "faces 3 3"], points: Float[np.ndarray, "points 3"]
 ) -> Float[np.ndarray, "points faces"]:
-    a, b, c = np.moveaxis(corners[None] - points[:, None, None], 2, 0)
-    la, lb, lc = (np.linalg.norm(edge, axis=-1) for edge in (a, b, c))
-    triple = np.sum(a * np.cross(b, c), axis=-1)
-    dots = (
-        la * lb * lc
-        + np.sum(a * b, axis=-1) * lc
-        + np.sum(b * c, axis=-1) * la
-        + np.sum(c * a, axis=-1) * lb
-    )
+    """Returns the signed solid angle of every triangle seen from every point."""
+    # Coordinates come first, so that every product below runs over whole arrays.
+    a, b, c = (corners[:, i].T[:, None] - points.T[:, :, None] for i in range(3))
+    la, lb, lc = (np.sqrt(_dot(edge, edge)) for edge in (a, b, c))
+    triple = _dot(a, np.stack([_minor(b, c, 1, 2), _minor(b, c, 2, 0), _minor(b, c, 0, 1)]))
+    dots = la * lb * lc + _dot(a, b) * lc + _dot(b, c) * la + _dot(c, a) * lb
     return 2.0 * np.arctan2(triple, dots)
+
+
+def _dot(
+    a: Float[np.ndarray, "3 points faces"], b: Float[np.ndarray, "3 points faces"]
+) -> Float[np.ndarray, "points faces"]:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _minor(
+    a: Float[np.ndarray, "3 points faces"], b: Float[np.ndarray, "3 points faces"], i: int, j: int
+) -> Float[np.ndarray, "points faces"]:
+    return a[i] * b[j] - a[j] * b[i]

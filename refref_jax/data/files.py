@@ -54,6 +54,8 @@ def read_depth(path: Path) -> Float[np.ndarray, "h w"]:
                 f"{path} has {depth.shape[-1]} channels, but a depth map has one. Export the Z "
                 "pass alone."
             )
+        if np.any(np.isnan(depth)):
+            raise SceneError(f"{path} has a depth that is not a number. Export it again.")
         return np.where(depth >= _DEPTH_OF_A_MISS, np.inf, depth).astype(np.float32)
     pixels = _read_png(path)
     grey = pixels if pixels.ndim == 2 else pixels[..., 0]
@@ -68,9 +70,9 @@ def read_exr(path: Path) -> Float[np.ndarray, "h w *channels"]:
             channels = {name: channel.pixels for name, channel in file.channels().items()}
     except Exception as error:  # OpenEXR raises what its C++ core does
         raise SceneError(f"{path} can not be read as EXR ({error}). Export it again.") from error
-    if "RGB" in channels:
+    if set(channels) == {"RGB"}:
         return channels["RGB"].astype(np.float32)
-    if len(channels) == 1:
+    if len(channels) == 1 and next(iter(channels.values())).ndim == 2:
         return next(iter(channels.values())).astype(np.float32)
     raise SceneError(
         f"{path} has the channels {sorted(channels)}. Export one channel, or R, G and B."

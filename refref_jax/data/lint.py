@@ -7,10 +7,8 @@ import numpy as np
 
 from refref_jax.data.containment import Containment, signed_volume
 from refref_jax.data.meshes import MeshPart
+from refref_jax.geometry.corner_normals import is_degenerate
 from refref_jax.optics.interface_rules import NO_PARENT
-
-# A triangle is degenerate when its area is below this share of its longest edge squared.
-_DEGENERATE = 1e-10
 
 
 class Finding(NamedTuple):
@@ -64,6 +62,7 @@ def lint(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
 def _edges(part: MeshPart) -> list[Finding]:
     """Reports edges that a closed, consistently oriented surface does not have."""
     directed = part.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    directed = directed[directed[:, 0] != directed[:, 1]]
     _, inverse, uses = np.unique(
         np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True
     )
@@ -93,12 +92,8 @@ def _edges(part: MeshPart) -> list[Finding]:
 
 def _faces(part: MeshPart) -> list[Finding]:
     """Reports faces that carry no surface, or carry it twice."""
-    corners = part.vertices[part.faces]
-    edges = np.roll(corners, -1, axis=1) - corners
-    longest = np.max(np.sum(edges**2, axis=-1), axis=1)
-    area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1)
     findings = []
-    if degenerate := int(np.sum(area <= _DEGENERATE * longest)):
+    if degenerate := int(np.sum(is_degenerate(part.vertices[part.faces]))):
         findings.append(
             Finding("note", part.name, f"has {degenerate} degenerate faces, which are ignored.")
         )

@@ -10,6 +10,7 @@ A depth map named as PNG is read from the float EXR beside it when there is one.
 
 import json
 import math
+from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,7 +60,8 @@ def read_frames(scene: Path, split: str) -> Frames:
     frames = _get(transforms, "frames", path)
     if not isinstance(frames, list) or not frames:
         raise SceneError(f"{path} lists no frames. Add frames, or remove the split.")
-    images = tuple(scene / f"{_get(f, 'file_path', path)}.png" for f in frames)
+    stems = [_get_text(frame, "file_path", path) for frame in frames]
+    images = tuple(scene / f"{stem}.png" for stem in stems)
     width, height = _image_size(images[0])
     angle = _get(transforms, "camera_angle_x", path)
     if not isinstance(angle, int | float) or not 0.0 < angle < math.pi:
@@ -75,7 +77,7 @@ def read_frames(scene: Path, split: str) -> Frames:
         images=images,
         masks=masks,
         depths=depths and tuple(_prefer_exr(depth) for depth in depths),
-        cameras=Cameras(poses, width, height, focal_length(width, angle)),
+        cameras=Cameras(poses, width, height, focal_length(width, float(angle))),
     )
     _check_files(result)
     return result
@@ -143,6 +145,13 @@ def _get(record: Any, key: str, path: Path) -> Any:
     return record[key]
 
 
+def _get_text(record: Any, key: str, path: Path) -> str:
+    text = _get(record, key, path)
+    if not isinstance(text, str):
+        raise SceneError(f"{key} is {text!r} in {path}. Give the name of a file.")
+    return text
+
+
 def _pose(matrix: Any, path: Path) -> Float[np.ndarray, "3 4"]:
     """Checks that a matrix is a rigid motion and returns its upper three rows."""
     try:
@@ -155,6 +164,11 @@ def _pose(matrix: Any, path: Path) -> Float[np.ndarray, "3 4"]:
         )
     rotation = pose[:3, :3]
     residual = np.max(np.abs(rotation @ rotation.T - np.eye(3)))
+    if np.max(np.abs(pose[3] - [0.0, 0.0, 0.0, 1.0])) > _ROTATION_TOLERANCE:
+        raise SceneError(
+            f"A transform_matrix in {path} ends with the row {pose[3]}, not 0 0 0 1. Export "
+            "camera-to-world matrices, with the position in the last column."
+        )
     if residual > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0.0:
         raise SceneError(
             f"A transform_matrix in {path} does not rotate: its axes are scaled, sheared or "
@@ -169,7 +183,7 @@ def _optional_files(
     """Returns the files that all frames name under a key, or `None` if no frame does."""
     if not any(isinstance(frame, dict) and key in frame for frame in frames):
         return None
-    return tuple(scene / _get(frame, key, path) for frame in frames)
+    return tuple(scene / _get_text(frame, key, path) for frame in frames)
 
 
 def _prefer_exr(path: Path) -> Path:
@@ -190,10 +204,11 @@ def _check_files(frames: Frames) -> None:
                     f"{path} does not exist, but the transforms file names it. Copy the scene "
                     "again, or remove the frame."
                 )
-    if len(set(frames.names)) != len(frames.names):
+    name, count = Counter(frames.names).most_common(1)[0]
+    if count > 1:
         raise SceneError(
-            f"Two frames of {frames.images[0].parent} have the same file name. Give every frame "
-            "a name of its own."
+            f"{count} frames of {frames.images[0].parent} have the same file name, {name}. Give "
+            "every frame a name of its own."
         )
 
 

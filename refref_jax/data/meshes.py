@@ -6,7 +6,8 @@ whether it was shaded smooth.
 """
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -26,6 +27,8 @@ INDEX_OF_REFRACTION: dict[str, float] = {
     "perfume": 1.46,
 }
 """Indices of the data set's materials."""
+
+_LONGEST_HEADER = 1 << 16
 
 Shading = Literal["auto", "smooth", "flat"]
 
@@ -48,7 +51,7 @@ class MeshPart(NamedTuple):
     shading: Shading
 
 
-def read_meshes(scene: Path, indices: Mapping[str, float] | None = None) -> list[MeshPart]:
+def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> list[MeshPart]:
     """Reads all parts of a scene, ordered by name.
 
     Args:
@@ -67,7 +70,9 @@ def read_meshes(scene: Path, indices: Mapping[str, float] | None = None) -> list
                 f"The index of refraction of {name!r} is {index}. Give a positive number, such as "
                 "1.5 for glass."
             )
-    paths = sorted((scene / "meshes").glob("*.ply"))
+    folder = scene / "meshes"
+    files = folder.iterdir() if folder.is_dir() else ()
+    paths = sorted(path for path in files if path.suffix.lower() == ".ply")
     _check_overrides(overrides, paths)
     shading = _read_shading(scene / "scene.json")
     return [_read_part(path, overrides, shading.get(path.name, "auto")) for path in paths]
@@ -81,7 +86,6 @@ def read_mesh(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 
     """
     try:
         mesh = trimesh.load_mesh(path, process=False)
-        mesh.merge_vertices(merge_tex=True, merge_norm=True)
         vertices = np.asarray(mesh.vertices, np.float64)
         faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
     except Exception as error:  # trimesh raises whatever a broken file runs into
@@ -90,9 +94,21 @@ def read_mesh(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 
         ) from error
     if len(faces) == 0:
         raise SceneError(f"{path} has no triangles. Export the mesh again, or remove the file.")
+    if len(faces) < _declared_faces(path) or faces.min() < 0 or faces.max() >= len(vertices):
+        raise SceneError(
+            f"{path} has fewer faces than it declares, or faces without vertices. It may be "
+            "truncated: export it again."
+        )
     if not np.all(np.isfinite(vertices)):
         raise SceneError(f"{path} has a vertex that is not finite. Clean the mesh.")
-    return vertices, faces
+    vertices, index = np.unique(vertices, axis=0, return_inverse=True)
+    return vertices, index.reshape(-1)[faces]
+
+
+def _declared_faces(path: Path) -> int:
+    """Returns how many faces a PLY header promises: no fewer triangles should be found."""
+    found = re.search(rb"element face (\d+)", path.read_bytes()[:_LONGEST_HEADER])
+    return int(found.group(1)) if found else 0
 
 
 def _read_part(path: Path, overrides: Mapping[str, float], shading: Shading) -> MeshPart:
@@ -102,23 +118,29 @@ def _read_part(path: Path, overrides: Mapping[str, float], shading: Shading) -> 
 
 
 def _index(path: Path, overrides: Mapping[str, float]) -> float:
-    """Returns the index of the part's own override, or of the last known word of its name."""
+    """Returns the index of the part's own override, or of its material."""
     if path.stem in overrides:
         return overrides[path.stem]
     table = INDEX_OF_REFRACTION | dict(overrides)
-    known = [word for word in path.stem.split("_") if word in table]
-    if not known:
+    material = _material(path, table)
+    if material is None:
         raise SceneError(
             f"The material of {path} is unknown: no word of its name is one of "
             f"{', '.join(sorted(table))}. Rename the file, as in {path.stem}_glass.ply, or give "
             f"its index: --ior={path.stem}=1.5."
         )
-    return table[known[-1]]
+    return table[material]
 
 
-def _check_overrides(overrides: Mapping[str, float], paths: list[Path]) -> None:
-    words = {word for path in paths for word in path.stem.split("_")}
-    known = words | {path.stem for path in paths}
+def _material(path: Path, table: Mapping[str, float]) -> str | None:
+    """Returns the last word of a file's name that the table knows."""
+    known = [word for word in path.stem.split("_") if word in table]
+    return known[-1] if known else None
+
+
+def _check_overrides(overrides: Mapping[str, float], paths: Sequence[Path]) -> None:
+    table = INDEX_OF_REFRACTION | dict(overrides)
+    known = {path.stem for path in paths} | {_material(path, table) for path in paths}
     for name in overrides:
         if name not in known:
             raise SceneError(

@@ -10,21 +10,21 @@ for the down-weighting.
 
 import dataclasses
 import itertools
+import math
 from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, UInt32
 
 from refref_jax import numerics
 from refref_jax.sampling.cones import Gaussians
 
 # The primes of Instant NGP's spatial hash.
-_PRIMES = np.array([1, 2654435761, 805459861], np.uint32)
+_PRIMES = (1, 2654435761, 805459861)
 
-_CORNERS = np.array(list(itertools.product((0, 1), repeat=3)), np.uint32)
+_CORNERS = tuple(itertools.product((0, 1), repeat=3))
 
 _INITIAL_RANGE = 1e-4
 
@@ -76,23 +76,23 @@ def feature_count(config: HashGridConfig) -> int:
     return config.levels * config.features
 
 
-def tables(params: Any) -> list[Float[Array, "entries features"]]:
+def tables(params: Any) -> list[Float[Array, "_ _"]]:
     """Returns the tables of all hash grids in a tree of parameters."""
     leaves = jax.tree_util.tree_leaves_with_path(params)
     return [leaf for path, leaf in leaves if _TABLE in jax.tree_util.keystr(path)]
 
 
-def vertex_index(vertex: Int[Array, "3"], resolution: int, entries: int) -> Int[Array, ""]:
+def vertex_index(vertex: UInt32[Array, "3"], resolution: int, entries: int) -> UInt32[Array, ""]:
     """Returns the table entry of a grid vertex, `0 .. resolution` along each axis.
 
     Dense where every vertex has an entry of its own, hashed where not.
     """
     side = resolution + 1
     if side**3 <= entries:
-        strides = np.array([1, side, side * side], np.uint32)
+        strides = jnp.array((1, side, side * side), jnp.uint32)
         return jnp.sum(vertex * strides, dtype=jnp.uint32)
-    x, y, z = vertex * _PRIMES
-    return (x ^ y ^ z) & np.uint32(entries - 1)
+    x, y, z = vertex * jnp.array(_PRIMES, jnp.uint32)
+    return (x ^ y ^ z) & jnp.uint32(entries - 1)
 
 
 class HashGrid(nn.Module):
@@ -136,7 +136,7 @@ def fading(scale: Float[Array, ""], resolution: int) -> Float[Array, ""]:
 
     1 for a point (`scale = 0`), falling to 0 as it outgrows the cells.
     """
-    return jax.lax.erf(numerics.safe_reciprocal(np.sqrt(8.0) * resolution * scale))
+    return jax.lax.erf(numerics.safe_reciprocal(math.sqrt(8.0) * resolution * scale))
 
 
 def _initialise(key: Array, shape: tuple[int, int]) -> Float[Array, "entries features"]:
@@ -149,7 +149,7 @@ def _interpolate(
     """Blends the entries at the eight corners of a point's cell (trilinear)."""
     scaled = position * resolution
     cell = jnp.clip(jnp.floor(scaled), 0, resolution - 1)
-    corners = cell.astype(jnp.uint32) + _CORNERS
+    corners = cell.astype(jnp.uint32)[None] + jnp.array(_CORNERS, jnp.uint32)
     entries = jax.vmap(lambda corner: vertex_index(corner, resolution, table.shape[0]))(corners)
     # The corners of one axis after the other, in the order of `_CORNERS`.
     x, y, z = jnp.stack([1.0 - (scaled - cell), scaled - cell], axis=1)

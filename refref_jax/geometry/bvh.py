@@ -114,7 +114,7 @@ def _hits_in_packets(
     count = limits.shape[0]
     padding = -count % _PACKET
 
-    def to_packets(x: Array, fill: float) -> Array:
+    def to_packets(x: Array, fill: float | int) -> Array:
         widths = [(0, padding)] + [(0, 0)] * (x.ndim - 1)
         padded = jnp.pad(x, widths, constant_values=fill)
         return padded.reshape(-1, _PACKET, *x.shape[1:])

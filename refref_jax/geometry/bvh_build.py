@@ -109,17 +109,17 @@ def _split(
 
 
 def _best_split(
-    key: Int[np.ndarray, " faces"],
-    faces: Int[np.ndarray, " faces"],
+    key: Int[np.ndarray, " sorted"],
+    faces: Int[np.ndarray, " sorted"],
     lower: Float[np.ndarray, "faces 3"],
     upper: Float[np.ndarray, "faces 3"],
     nodes: int,
 ) -> Int[np.ndarray, " nodes"]:
     """Returns how many triangles go left of the cheapest plane between bins.
 
-    The cost of a plane is `area(left) count(left) + area(right) count(right)`. The first and
-    the last bin of a node with extent are never empty, so every plane has triangles on both
-    sides.
+    The cost of a plane is `area(left) count(left) + area(right) count(right)`. In a node with
+    extent the first and the last bin are never empty, so every plane has triangles on both
+    sides; in one without, all triangles are in the first bin and the result has no meaning.
     """
     counts = np.bincount(key, minlength=nodes * _BINS)
     filled = np.flatnonzero(counts)
@@ -142,9 +142,9 @@ def _best_split(
 def _sweep_areas(
     low: Float[np.ndarray, "nodes bins 3"], high: Float[np.ndarray, "nodes bins 3"]
 ) -> Float[np.ndarray, "nodes bins"]:
-    """Returns half the surface area of the box around bins `0..i`, for every `i`."""
+    """Returns half the surface area of the box around bins `0..i`, for every `i`; 0 if empty."""
     extent = np.maximum.accumulate(high, axis=1) - np.minimum.accumulate(low, axis=1)
-    x, y, z = np.moveaxis(extent, -1, 0)
+    x, y, z = np.moveaxis(np.maximum(extent, 0.0), -1, 0)
     return x * y + y * z + z * x
 
 

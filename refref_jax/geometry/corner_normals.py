@@ -9,12 +9,16 @@ weight by angle.
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 CREASE_ANGLE = np.radians(30.0)
 """The angle between face normals, in radians, from which an edge counts as sharp."""
+
+# A face is degenerate when its area is below this share of its longest edge squared: where
+# single-precision files put three corners on one line.
+_DEGENERATE = 1e-6
 
 
 def corner_normals(
@@ -51,7 +55,16 @@ def corner_normals(
 
 def face_normals(corners: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "faces 3"]:
     """Returns outward unit normals; zero for degenerate faces."""
-    return _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    normals = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    return np.where(is_degenerate(corners)[:, None], 0.0, normals)
+
+
+def is_degenerate(corners: Float[np.ndarray, "faces 3 3"]) -> Bool[np.ndarray, " faces"]:
+    """Returns which faces have no area to speak of: their normals would be rounding errors."""
+    edges = np.roll(corners, -1, axis=1) - corners
+    longest = np.max(np.sum(edges**2, axis=-1), axis=1)
+    area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1)
+    return area <= _DEGENERATE * longest
 
 
 def _smooth_patches(
@@ -67,7 +80,8 @@ def _smooth_patches(
     shared = np.all(edges[1:] == edges[:-1], axis=1)
     first, second = owner[:-1][shared], owner[1:][shared]
     cosine = np.sum(normals[first] * normals[second], axis=1)
-    smooth = cosine > np.cos(crease_angle)
+    solid = np.any(normals != 0.0, axis=1)
+    smooth = (cosine > np.cos(crease_angle)) & solid[first] & solid[second]
     graph = coo_array(
         (np.ones(smooth.sum(), bool), (first[smooth], second[smooth])),
         shape=(len(faces), len(faces)),

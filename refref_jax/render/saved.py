@@ -63,7 +63,7 @@ def read_static(run: Path) -> SavedModel:
     return configuration.read(run / _MODEL, SavedModel)
 
 
-def load_model(run: str | os.PathLike[str], step: int | None = None) -> Model:
+def load_model(run: str | os.PathLike[str], *, step: int | None = None) -> Model:
     """Loads a trained model.
 
     Args:

@@ -168,7 +168,7 @@ def _place(
 ) -> _Round:
     """Puts intervals on the path and their cones into the field's unit cube."""
     t = warps.to_distance(warp(config), s)
-    turns = rotation + _PATTERN_TURN * (jnp.arange(t.shape[0] - 1) % 2)
+    turns = rotation + _PATTERN_TURN * (jnp.arange(t.shape[0] - 1, dtype=t.dtype) % 2)
     domain = domains.Domain(config.radius, config.unbounded)
 
     def cone(start: Array, end: Array, turn: Array) -> Gaussians:

@@ -8,17 +8,20 @@ Source: Barron et al., Zip-NeRF (2023), section 2; paper (arXiv 2505.05848), sup
 bent centre line.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from refref_jax.sampling.polylines import Polyline, point_at
 
 # Zip-NeRF's hexagon: each triangle of points turns once, the second one shifted by half a turn.
-_HEXAGON = np.pi * np.array([0.0, 2.0 / 3.0, 4.0 / 3.0, 1.0, 5.0 / 3.0, 1.0 / 3.0])
+_HEXAGON = tuple(math.pi * turn for turn in (0.0, 2.0 / 3.0, 4.0 / 3.0, 1.0, 5.0 / 3.0, 1.0 / 3.0))
+
+# Their distances, in the formula below.
+_HEXAGON_STEPS = tuple(3.0 / math.sqrt(7.0) * (2.0 * j / 5.0 - 1.0) for j in range(6))
 
 # Width of a multisample's Gaussian in units of its distance from the centre line.
 _HEXAGON_SCALE = 0.5
@@ -66,7 +69,7 @@ def multisamples(
         t = _frustum_mean(start, end)
         point = point_at(line, t)
         return Gaussians(point.position[None], (0.5 * radius * point.arc)[None])
-    if count != _HEXAGON.size:
+    if count != len(_HEXAGON):
         raise ValueError(
             f"There is no cone pattern of {count} points. Use 1 (on the centre line) or 6 "
             "(Zip-NeRF's hexagon)."
@@ -75,7 +78,7 @@ def multisamples(
 
     def one_sample(t: Float[Array, ""], angle: Float[Array, ""]) -> Gaussians:
         point = point_at(line, t)
-        across = radius * point.arc / np.sqrt(2.0)
+        across = radius * point.arc / math.sqrt(2.0)
         right, up = orthonormal_basis(point.direction)
         offset = across * (jnp.cos(angle) * right + jnp.sin(angle) * up)
         return Gaussians(point.position + offset, _HEXAGON_SCALE * across)
@@ -109,8 +112,8 @@ def _hexagon_distances(start: Float[Array, ""], end: Float[Array, ""]) -> Float[
     """Returns the distances of the six points, which match the frustum's moments (Eq 3)."""
     mean, ratio = _middle_and_ratio(start, end)
     spread = jnp.sqrt((ratio**2 - 1.0) ** 2 + 4.0)
-    steps = (3.0 / np.sqrt(7.0)) * (2.0 * jnp.arange(6) / 5.0 - 1.0)
-    shift = (1.0 + ratio) ** 2 + 2.0 + steps.astype(start.dtype) * spread
+    steps = jnp.asarray(_HEXAGON_STEPS, start.dtype)
+    shift = (1.0 + ratio) ** 2 + 2.0 + steps * spread
     return start + mean * ratio * shift / (ratio**2 + 3.0)
 
 

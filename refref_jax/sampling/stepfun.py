@@ -14,8 +14,8 @@ from refref_jax import numerics
 
 
 def heights(
-    edges: Float[Array, "*batch n+1"], weights: Float[Array, "*batch n"]
-) -> Float[Array, "*batch n"]:
+    edges: Float[Array, "*batch edges"], weights: Float[Array, "*batch edges-1"]
+) -> Float[Array, "*batch edges-1"]:
     """Returns `weights / widths`, 0 in bins of no width."""
     return numerics.safe_divide(weights, jnp.diff(edges))
 
@@ -36,8 +36,8 @@ def cumulative(weights: Float[Array, "*batch n"]) -> Float[Array, "*batch n+1"]:
 
 def invert_cumulative(
     u: Float[Array, "*batch m"],
-    edges: Float[Array, "*batch n+1"],
-    cdf: Float[Array, "*batch n+1"],
+    edges: Float[Array, "*batch edges"],
+    cdf: Float[Array, "*batch edges"],
 ) -> Float[Array, "*batch m"]:
     """Returns where a piecewise linear cumulative function takes the values `u` in `[0, 1]`."""
     bin_ = count_below(cdf[..., 1:-1], u)
@@ -48,8 +48,8 @@ def invert_cumulative(
 
 def sample_edges(
     u: Float[Array, "*batch m"],
-    edges: Float[Array, "*batch n+1"],
-    weights: Float[Array, "*batch n"],
+    edges: Float[Array, "*batch edges"],
+    weights: Float[Array, "*batch edges-1"],
 ) -> Float[Array, "*batch m+1"]:
     """Draws `m` intervals whose density follows a step function.
 
@@ -69,7 +69,7 @@ def sample_edges(
 
 
 def dilate(
-    edges: Float[Array, "*batch n+1"], weights: Float[Array, "*batch n"], amount: float
+    edges: Float[Array, "*batch edges"], weights: Float[Array, "*batch edges-1"], amount: float
 ) -> tuple[Float[Array, "*batch k"], Float[Array, "*batch k-1"]]:
     """Widens every bin by `amount` on both sides and keeps the maximum height.
 
@@ -91,7 +91,7 @@ def dilate(
 
 
 def blur(
-    edges: Float[Array, "*batch n+1"], values: Float[Array, "*batch n"], radius: float
+    edges: Float[Array, "*batch edges"], values: Float[Array, "*batch edges-1"], radius: float
 ) -> tuple[Float[Array, "*batch k"], Float[Array, "*batch k"]]:
     """Convolves a step function with a box of half-width `radius`.
 

@@ -39,11 +39,16 @@ def init_state(seed: int, model: ModelConfig, schedule: ScheduleConfig) -> Train
 
 
 def optimizer(schedule: ScheduleConfig) -> optax.GradientTransformation:
-    """Returns Adam with a linear warm-up and an exponential decay.
+    """Returns Adam under the schedule's learning rate."""
+    return optax.adam(learning_rate(schedule), b2=_SECOND_MOMENT_DECAY, eps=_EPSILON)
+
+
+def learning_rate(schedule: ScheduleConfig) -> optax.Schedule:
+    """Returns the learning rate by step: a linear warm-up, then an exponential decay.
 
     Source: paper (arXiv 2505.05848), supplement (implementation details).
     """
-    rate = optax.warmup_exponential_decay_schedule(
+    return optax.warmup_exponential_decay_schedule(
         init_value=0.0,
         peak_value=schedule.peak,
         warmup_steps=schedule.warmup,
@@ -51,4 +56,3 @@ def optimizer(schedule: ScheduleConfig) -> optax.GradientTransformation:
         decay_rate=schedule.end / schedule.peak,
         end_value=schedule.end,
     )
-    return optax.adam(rate, b2=_SECOND_MOMENT_DECAY, eps=_EPSILON)

@@ -1,0 +1,123 @@
+import itertools
+
+import numpy as np
+import pytest
+
+from refref_jax.data.batches import PixelSampler
+from refref_jax.data.cameras import orbit, pixel_rays
+
+_FRAMES, _HEIGHT, _WIDTH, _BATCH = 3, 4, 5, 8
+
+# 60 pixels make 7 whole batches of 8; four pixels are left out of each epoch.
+_PIXELS = _FRAMES * _HEIGHT * _WIDTH
+_STEPS = _PIXELS // _BATCH
+
+
+def _cameras():
+    cameras = orbit(_FRAMES, distance=4.0, elevation=0.3, size=_WIDTH, angle_x=1.0)
+    return cameras._replace(height=_HEIGHT)
+
+
+def _sampler(seed=1, batch=_BATCH):
+    """A sampler of images whose red is the number of the pixel."""
+    number = np.arange(_PIXELS, dtype=np.uint8)
+    images = np.stack([number, 255 - number, number // 2], axis=-1)
+    images = images.reshape(_FRAMES, _HEIGHT, _WIDTH, 3)
+    return PixelSampler(images, _cameras(), seed=seed, batch=batch)
+
+
+def _numbers(batch):
+    return batch.rgb[..., 0].astype(np.int64)
+
+
+def _assert_same(one, other):
+    for left, right in zip((*one.rays, one.rgb), (*other.rays, other.rgb), strict=True):
+        np.testing.assert_array_equal(left, right)
+
+
+def test_a_batch_depends_on_seed_and_step_alone():
+    whole = _sampler().draw(0, 8)
+    single = _sampler().draw(5, 1)
+    assert single.rgb.shape == (1, _BATCH, 3)
+    np.testing.assert_array_equal(single.rgb[0], whole.rgb[5])
+    np.testing.assert_array_equal(single.rays.directions[0], whole.rays.directions[5])
+
+
+def test_earlier_draws_do_not_matter():
+    sampler = _sampler()
+    later = sampler.draw(4 * _STEPS, 3)
+    earlier = sampler.draw(0, 3)
+    _assert_same(earlier, _sampler().draw(0, 3))
+    _assert_same(later, sampler.draw(4 * _STEPS, 3))
+
+
+def test_a_draw_may_cross_the_end_of_an_epoch():
+    sampler = _sampler()
+    across = sampler.draw(_STEPS - 2, 4)
+    assert across.rgb.shape == (4, _BATCH, 3)
+    for position, step in enumerate(range(_STEPS - 2, _STEPS + 2)):
+        np.testing.assert_array_equal(across.rgb[position], _sampler().draw(step, 1).rgb[0])
+
+
+@pytest.mark.parametrize("epoch", [0, 1, 1000])
+def test_no_pixel_comes_twice_in_an_epoch(epoch):
+    numbers = _numbers(_sampler().draw(epoch * _STEPS, _STEPS))
+    assert len(np.unique(numbers)) == _STEPS * _BATCH
+
+
+def test_epochs_differ_and_together_show_every_pixel():
+    sampler = _sampler()
+    epochs = [_numbers(sampler.draw(epoch * _STEPS, _STEPS)) for epoch in range(6)]
+    for one, other in itertools.pairwise(epochs):
+        assert np.any(one != other)
+    np.testing.assert_array_equal(np.unique(epochs), np.arange(_PIXELS))
+
+
+def test_seeds_differ():
+    assert np.any(_sampler(seed=1).draw(0, 1).rgb != _sampler(seed=2).draw(0, 1).rgb)
+
+
+def test_a_seed_s_second_epoch_is_not_the_next_seed_s_first():
+    second = _sampler(seed=1).draw(_STEPS, _STEPS)
+    assert np.any(second.rgb != _sampler(seed=2).draw(0, _STEPS).rgb)
+
+
+def test_rays_and_colours_belong_to_one_pixel():
+    drawn = _sampler().draw(3, 20)
+    number = _numbers(drawn)
+    frame, row, column = number // 20, number // 5 % 4, number % 5
+    expected = pixel_rays(_cameras(), frame, row, column)
+    assert drawn.rays.origins.shape == (20, _BATCH, 3)
+    for left, right in zip(drawn.rays, expected, strict=True):
+        np.testing.assert_array_equal(left, right)
+    np.testing.assert_array_equal(drawn.rgb[..., 1], 255 - number)
+
+
+def test_look_up_by_hand():
+    found = _sampler().look_up(np.array([0, 1, 5, 20, 59]))
+    frame, row, column = np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0], [1, 0, 0], [2, 3, 4]]).T
+    np.testing.assert_array_equal(_numbers(found), [0, 1, 5, 20, 59])
+    expected = pixel_rays(_cameras(), frame, row, column)
+    np.testing.assert_array_equal(found.rays.directions, expected.directions)
+
+
+def test_a_batch_may_be_all_pixels():
+    sampler = _sampler(batch=_PIXELS)
+    numbers = _numbers(sampler.draw(0, 2))
+    np.testing.assert_array_equal(np.sort(numbers, axis=1), np.tile(np.arange(_PIXELS), (2, 1)))
+    assert np.any(numbers[0] != numbers[1])
+
+
+def test_a_batch_larger_than_the_data():
+    with pytest.raises(ValueError, match=r"batch of 61 .* 60\. Use a smaller batch\."):
+        _sampler(batch=_PIXELS + 1)
+
+
+def test_a_survey_is_always_the_same():
+    sampler = _sampler()
+    survey = sampler.survey(200)
+    sampler.draw(7, 2)
+    assert survey.rgb.shape == (200, 3)
+    _assert_same(survey, sampler.survey(200))
+    _assert_same(survey, _sampler(seed=9, batch=2).survey(200))
+    assert len(np.unique(_numbers(survey))) > _PIXELS // 2

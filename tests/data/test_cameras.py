@@ -1,0 +1,226 @@
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from refref_jax.data.cameras import (
+    Cameras,
+    focal_length,
+    image_rays,
+    orbit,
+    pixel_rays,
+    planar_depth_to_distance,
+)
+
+# Rays are stored in single precision, whose rounding is 6e-8.
+_SINGLE = 2e-7
+
+# Poses and depths are computed in double precision.
+_DOUBLE = 1e-12
+
+# A pixel is not infinitely small: at 64 pixels the midpoint rule is off by about (1 / 64)^2.
+_MIDPOINT = 3e-4
+
+_UNPOSED = np.eye(4)[:3]
+
+# Two rotations with a shift: x -> y -> z -> x, and half a turn around x.
+_TURNED = np.array([[0.0, 0.0, 1.0, 5.0], [1.0, 0.0, 0.0, 6.0], [0.0, 1.0, 0.0, 7.0]])
+_UPSIDE_DOWN = np.array([[1.0, 0.0, 0.0, 0.5], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, -2.0]])
+
+
+def _cameras(width, height, focal, poses=(_UNPOSED,)):
+    return Cameras(np.stack(poses), width, height, focal)
+
+
+def _index(*values):
+    return np.array(values, np.int64)
+
+
+def _slow_direction(cameras, camera, x, y):
+    """The unit direction through image point (x, y) in pixels, number by number."""
+    in_camera = ((x - cameras.width / 2) / cameras.focal, (cameras.height / 2 - y) / cameras.focal)
+    vector = (*in_camera, -1.0)
+    pose = cameras.poses[camera]
+    world = [sum(pose[i, j] * vector[j] for j in range(3)) for i in range(3)]
+    norm = math.sqrt(sum(v * v for v in vector))
+    return np.array([v / norm for v in world])
+
+
+@pytest.mark.parametrize(
+    ("width", "angle", "focal"),
+    [
+        (100, math.pi / 2, 50.0),
+        (128, 2.0 * math.atan(0.5), 128.0),
+        (3, 2.0 * math.atan(1.5), 1.0),
+    ],
+)
+def test_focal_length_of_known_triangles(width, angle, focal):
+    assert focal_length(width, angle) == pytest.approx(focal, rel=_DOUBLE)
+
+
+def test_field_of_view_of_the_data_set_ends_at_the_image_border():
+    angle = 1.1656107902526855
+    focal = focal_length(800, angle)
+    assert 2.0 * math.atan2(400.0, focal) == pytest.approx(angle, rel=_DOUBLE)
+
+
+def test_centre_pixel_looks_along_minus_z():
+    rays = pixel_rays(_cameras(5, 3, 4.0), _index(0), _index(1), _index(2))
+    np.testing.assert_array_equal(rays.directions, [[0.0, 0.0, -1.0]])
+    np.testing.assert_array_equal(rays.origins, [[0.0, 0.0, 0.0]])
+
+
+def test_pixel_centres_are_at_half_pixels():
+    rays = image_rays(_cameras(2, 2, 1.0), 0)
+    planar = [
+        [[-0.5, 0.5, -1.0], [0.5, 0.5, -1.0]],
+        [[-0.5, -0.5, -1.0], [0.5, -0.5, -1.0]],
+    ]
+    np.testing.assert_allclose(rays.directions, np.array(planar) / math.sqrt(1.5), atol=_SINGLE)
+
+
+def test_camera_above_the_origin_sees_x_to_the_right_and_y_up():
+    pose = np.concatenate([np.eye(3), [[0.0], [0.0], [4.0]]], axis=1)
+    cameras = _cameras(9, 9, 9.0, [pose])
+    rays = image_rays(cameras, 0)
+    on_ground = rays.origins + rays.directions * (4.0 / -rays.directions[..., 2:])
+    np.testing.assert_allclose(on_ground[..., 2], 0.0, atol=1e-6)
+    assert np.all(np.diff(on_ground[..., 0], axis=1) > 0.0)
+    assert np.all(np.diff(on_ground[..., 1], axis=0) < 0.0)
+    np.testing.assert_allclose(on_ground[4, 4], 0.0, atol=1e-6)
+    np.testing.assert_allclose(on_ground[0, 8], [16.0 / 9.0, 16.0 / 9.0, 0.0], atol=1e-6)
+
+
+def test_a_pose_turns_and_moves_the_rays():
+    cameras = _cameras(3, 3, 2.0, [_UNPOSED, _TURNED])
+    rays = pixel_rays(cameras, _index(0, 1), _index(1, 1), _index(1, 1))
+    np.testing.assert_array_equal(rays.origins, [[0.0, 0.0, 0.0], [5.0, 6.0, 7.0]])
+    np.testing.assert_array_equal(rays.directions, [[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize("pose", [_UNPOSED, _TURNED, _UPSIDE_DOWN])
+def test_rays_agree_with_a_scalar_reference(pose):
+    cameras = _cameras(7, 4, 3.3, [_UPSIDE_DOWN, pose])
+    rays = image_rays(cameras, 1)
+    assert rays.origins.shape == rays.directions.shape == (4, 7, 3)
+    assert rays.radii.shape == (4, 7)
+    for row, column in itertools.product(range(4), range(7)):
+        expected = _slow_direction(cameras, 1, column + 0.5, row + 0.5)
+        np.testing.assert_allclose(rays.directions[row, column], expected, atol=_SINGLE)
+        np.testing.assert_array_equal(rays.origins[row, column], pose[:, 3])
+
+
+@pytest.mark.parametrize("shape", [(5,), (2, 3), (0,)])
+def test_pixels_may_have_any_shape(shape):
+    cameras = _cameras(4, 4, 4.0)
+    zero = np.zeros(shape, np.int64)
+    rays = pixel_rays(cameras, zero, zero + 1, zero + 2)
+    assert rays.origins.shape == rays.directions.shape == (*shape, 3)
+    assert rays.radii.shape == shape
+    assert {rays.origins.dtype, rays.directions.dtype, rays.radii.dtype} == {np.dtype(np.float32)}
+
+
+@pytest.mark.parametrize("focal", [0.5, 8.0, 1e4])
+def test_directions_are_unit_vectors(focal):
+    rays = image_rays(_cameras(16, 10, focal, [_TURNED]), 0)
+    np.testing.assert_allclose(np.linalg.norm(rays.directions, axis=-1), 1.0, atol=_SINGLE)
+
+
+@pytest.mark.parametrize("focal", [3.0, 12.0, 500.0])
+def test_radius_is_the_pixel_s_solid_angle_by_finite_differences(focal):
+    cameras = _cameras(12, 8, focal, [_TURNED])
+    rays = image_rays(cameras, 0)
+    step = 1e-4
+    for row, column in [(0, 0), (3, 7), (7, 11), (4, 5)]:
+        x, y = column + 0.5, row + 0.5
+        along_x = _slow_direction(cameras, 0, x + step, y) - _slow_direction(
+            cameras, 0, x - step, y
+        )
+        along_y = _slow_direction(cameras, 0, x, y + step) - _slow_direction(
+            cameras, 0, x, y - step
+        )
+        solid_angle = np.linalg.norm(np.cross(along_x, along_y)) / (2.0 * step) ** 2
+        expected = math.sqrt(solid_angle) * 2.0 / math.sqrt(12.0)
+        # Differences over 2e-4 pixels are good to about the square of that.
+        assert rays.radii[row, column] == pytest.approx(expected, rel=1e-6)
+
+
+def test_solid_angles_of_all_pixels_fill_the_image():
+    cameras = _cameras(64, 48, 40.0)
+    widths = image_rays(cameras, 0).radii.astype(np.float64) * math.sqrt(12.0) / 2.0
+    # The solid angle of a rectangle seen from above its centre.
+    a, b, d = 32.0, 24.0, 40.0
+    rectangle = 4.0 * math.atan(a * b / (d * math.sqrt(a * a + b * b + d * d)))
+    assert np.sum(widths**2) == pytest.approx(rectangle, rel=_MIDPOINT)
+
+
+def test_radius_of_the_centre_pixel_by_hand():
+    rays = pixel_rays(_cameras(3, 3, 10.0), _index(0), _index(1), _index(1))
+    assert rays.radii == pytest.approx(0.1 / math.sqrt(3.0), rel=_SINGLE)
+
+
+def test_planar_depth_by_hand():
+    distance = planar_depth_to_distance(_cameras(2, 2, 1.0), np.full((2, 2), 4.0))
+    np.testing.assert_allclose(distance, 4.0 * math.sqrt(1.5), rtol=_SINGLE)
+
+
+def test_planar_depth_is_scaled_by_the_length_of_the_direction_with_unit_z():
+    cameras = _cameras(7, 5, 3.0)
+    depth = np.random.default_rng(0).uniform(0.1, 20.0, (2, 3, 5, 7))
+    row, column = np.indices((5, 7))
+    x, y = (column + 0.5 - 3.5) / 3.0, (row + 0.5 - 2.5) / 3.0
+    expected = depth * np.linalg.norm(np.stack([x, y, np.ones((5, 7))]), axis=0)
+    np.testing.assert_allclose(planar_depth_to_distance(cameras, depth), expected, rtol=_SINGLE)
+
+
+def test_points_of_one_planar_depth_lie_in_one_plane():
+    cameras = _cameras(6, 6, 5.0, [_TURNED])
+    rays = image_rays(cameras, 0)
+    distance = planar_depth_to_distance(cameras, np.full((6, 6), 2.5))
+    points = rays.origins + distance[..., None] * rays.directions
+    axis = -_TURNED[:, 2]
+    np.testing.assert_allclose((points - _TURNED[:, 3]) @ axis, 2.5, rtol=1e-6)
+
+
+def test_a_miss_stays_infinitely_far():
+    depth = np.array([[np.inf, 1.0], [0.0, np.inf]])
+    distance = planar_depth_to_distance(_cameras(2, 2, 1.0), depth)
+    np.testing.assert_array_equal(np.isinf(distance), np.isinf(depth))
+    assert distance[1, 0] == 0.0
+
+
+@pytest.mark.parametrize("elevation", [-1.5, -0.4, 0.0, 0.7, 1.5])
+def test_orbit_cameras_look_at_the_origin_with_z_up(elevation):
+    cameras = orbit(7, distance=4.0, elevation=elevation, size=5, angle_x=1.0)
+    rotations, positions = cameras.poses[..., :3], cameras.poses[..., 3]
+    np.testing.assert_allclose(np.linalg.norm(positions, axis=1), 4.0, rtol=_DOUBLE)
+    np.testing.assert_allclose(positions[:, 2], 4.0 * math.sin(elevation), atol=_DOUBLE)
+    np.testing.assert_allclose(
+        rotations @ np.swapaxes(rotations, 1, 2), np.tile(np.eye(3), (7, 1, 1)), atol=_DOUBLE
+    )
+    np.testing.assert_allclose(np.linalg.det(rotations), 1.0, rtol=_DOUBLE)
+    np.testing.assert_allclose(rotations[:, 2, 0], 0.0, atol=_DOUBLE)
+    assert np.all(rotations[:, 2, 1] > 0.0)
+    for camera in range(7):
+        centre = pixel_rays(cameras, _index(camera), _index(2), _index(2))
+        np.testing.assert_allclose(centre.origins + 4.0 * centre.directions, 0.0, atol=2e-6)
+
+
+def test_orbit_starts_on_the_x_axis_and_goes_round_evenly():
+    cameras = orbit(4, distance=2.0, elevation=0.0, size=8, angle_x=math.pi / 2)
+    expected = [[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [-2.0, 0.0, 0.0], [0.0, -2.0, 0.0]]
+    np.testing.assert_allclose(cameras.poses[..., 3], expected, atol=_DOUBLE)
+    assert (cameras.width, cameras.height) == (8, 8)
+    assert cameras.focal == pytest.approx(4.0, rel=_DOUBLE)
+
+
+def test_orbit_sees_a_point_above_the_origin_in_the_upper_half():
+    cameras = orbit(3, distance=4.0, elevation=0.3, size=9, angle_x=1.0)
+    for camera in range(3):
+        rays = image_rays(cameras, camera)
+        towards = np.array([0.0, 0.0, 0.5]) - cameras.poses[camera, :, 3]
+        nearest = np.argmax(rays.directions @ (towards / np.linalg.norm(towards)))
+        row, column = np.unravel_index(nearest, (9, 9))
+        assert row < 4
+        assert column == 4

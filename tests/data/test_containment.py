@@ -1,0 +1,217 @@
+import itertools
+
+import numpy as np
+import pytest
+import trimesh
+
+from refref_jax.data import containment
+from refref_jax.data.containment import find_containment, signed_volume, winding_number
+from refref_jax.data.meshes import read_meshes
+from refref_jax.optics.interface_rules import NO_PARENT
+from tests.data.solids import as_part, ball, box, inverted, joined, shell
+
+# Sums of solid angles in double precision.
+_EXACT = 1e-9
+
+_ROTATION = trimesh.transformations.rotation_matrix(0.7, [1.0, 2.0, 3.0])[:3, :3]
+
+
+def _moved(part):
+    return part._replace(vertices=part.vertices @ _ROTATION.T + [0.3, -0.2, 0.1])
+
+
+def _shuffled(part):
+    order = np.random.default_rng(0).permutation(len(part.faces))
+    return part._replace(faces=part.faces[order])
+
+
+def _octant():
+    """One triangle that fills an eighth of the view from the origin."""
+    return box()._replace(vertices=np.eye(3), faces=np.array([[0, 1, 2]]))
+
+
+def _open_box(open_faces):
+    """A unit box that lacks its first sides."""
+    part = box()
+    corners = part.vertices[part.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    side = np.argmax(np.abs(normals), axis=1) * 2 + (normals.sum(axis=1) > 0.0)
+    return part._replace(faces=part.faces[side >= open_faces])
+
+
+def _pairs(found):
+    return {frozenset(pair) for pair in found.overlaps}
+
+
+# Winding numbers.
+
+
+def test_winding_number_of_an_octant_by_hand():
+    origin = np.zeros((1, 3))
+    np.testing.assert_allclose(winding_number(_octant(), origin), 0.125, atol=_EXACT)
+    np.testing.assert_allclose(winding_number(inverted(_octant()), origin), -0.125, atol=_EXACT)
+
+
+@pytest.mark.parametrize("missing", range(6))
+def test_an_open_box_is_seen_from_its_centre_by_sixths(missing):
+    centre = np.full((1, 3), 1e-12)
+    expected = 1.0 - missing / 6.0
+    np.testing.assert_allclose(winding_number(_open_box(missing), centre), expected, atol=_EXACT)
+
+
+def test_winding_number_is_one_inside_a_torus_and_zero_outside():
+    mesh = trimesh.creation.torus(1.0, 0.4, major_sections=48, minor_sections=24)
+    points = np.random.default_rng(0).uniform([-1.5, -1.5, -0.5], [1.5, 1.5, 0.5], (200, 3))
+    from_tube = np.hypot(np.hypot(points[:, 0], points[:, 1]) - 1.0, points[:, 2])
+    # The facets lie up to 0.01 inside the torus.
+    clear = np.abs(from_tube - 0.4) > 0.02
+    inside = from_tube < 0.4
+    part = as_part(mesh, "torus_glass")
+    assert 30 < np.sum(inside & clear) < 170
+    winding = winding_number(part, points[clear])
+    np.testing.assert_allclose(winding, inside[clear], atol=_EXACT)
+    np.testing.assert_allclose(winding_number(inverted(part), points[clear]), -winding, atol=_EXACT)
+
+
+def test_winding_number_of_nested_surfaces_adds_up():
+    points = np.array([[0.0, 0.0, 0.1], [1.7, 0.0, 0.0], [0.0, 2.5, 0.0]])
+    twice = joined("twice", ball(radius=2.0), ball(radius=1.5))
+    np.testing.assert_allclose(winding_number(twice, points), [2.0, 1.0, 0.0], atol=_EXACT)
+    np.testing.assert_allclose(winding_number(shell(), points), [0.0, 1.0, 0.0], atol=_EXACT)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_winding_number_knows_no_size(scale):
+    part = ball()._replace(vertices=scale * ball().vertices)
+    points = scale * np.array([[0.1, 0.2, 0.3], [0.7, 0.7, 0.7]])
+    np.testing.assert_allclose(winding_number(part, points), [1.0, 0.0], atol=_EXACT)
+
+
+def test_winding_number_is_the_same_in_several_sweeps(monkeypatch):
+    part = _open_box(2)
+    points = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
+    whole = winding_number(part, points)
+    monkeypatch.setattr(containment, "_SWEEP", 64)
+    np.testing.assert_allclose(winding_number(part, points), whole, atol=_EXACT)
+
+
+def test_winding_number_of_no_points():
+    assert winding_number(ball(), np.zeros((0, 3))).shape == (0,)
+
+
+def test_winding_number_beyond_the_bounding_box_is_exactly_zero():
+    points = np.array([[0.51, 0.0, 0.0], [0.0, -3.0, 0.0], [1e6, 1e6, 1e6]])
+    np.testing.assert_array_equal(winding_number(_open_box(3), points), 0.0)
+
+
+# Volumes.
+
+
+def test_volume_of_a_box_by_hand():
+    part = box(size=(1.0, 2.0, 3.0))
+    assert signed_volume(part) == pytest.approx(6.0)
+    assert signed_volume(inverted(part)) == pytest.approx(-6.0)
+
+
+def test_volume_does_not_change_far_from_the_origin():
+    moved = ball(centre=(1.1e6, -1.3e6, 1.7e6))
+    assert signed_volume(moved) == pytest.approx(signed_volume(ball()), rel=1e-7)
+
+
+def test_volume_of_a_hollow_ball_is_the_difference():
+    solid, cavity = signed_volume(ball(radius=2.0)), signed_volume(ball(radius=1.5))
+    assert signed_volume(shell()) == pytest.approx(solid - cavity)
+    # An inscribed polyhedron of 320 faces has 96 % of the ball's volume.
+    assert 0.95 < solid / (4.0 / 3.0 * np.pi * 8.0) < 1.0
+
+
+# Trees.
+
+
+def test_no_parts():
+    assert find_containment([]) == ((), ())
+
+
+def test_one_part():
+    assert find_containment([ball()]) == ((NO_PARENT,), ())
+
+
+@pytest.mark.parametrize("turn", [lambda part: part, inverted, _moved, _shuffled])
+@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
+def test_each_of_three_nested_parts_lies_in_the_next(order, turn):
+    parts = [ball(radius=0.5, centre=(0.2, 0.0, 0.0)), box(size=(2.0, 2.0, 2.0)), ball(radius=3.0)]
+    parents = [1, 2, NO_PARENT]
+    found = find_containment([turn(parts[i]) for i in order])
+    expected = [NO_PARENT if parents[i] == NO_PARENT else order.index(parents[i]) for i in order]
+    assert list(found.parents) == expected
+    assert found.overlaps == ()
+
+
+def test_two_balls_in_one():
+    parts = [
+        ball(radius=0.4, centre=(-0.5, 0.0, 0.0)),
+        ball(radius=2.0),
+        ball(radius=0.4, centre=(0.5, 0.0, 0.0)),
+    ]
+    assert find_containment(parts) == ((1, NO_PARENT, 1), ())
+
+
+@pytest.mark.parametrize("shift", [(2.1, 0.0, 0.0), (1.3, 1.3, 1.3), (1e3, 0.0, 0.0)])
+def test_balls_side_by_side(shift):
+    assert find_containment([ball(), ball(centre=shift)]) == ((NO_PARENT, NO_PARENT), ())
+
+
+@pytest.mark.parametrize("shift", [0.3, 1.0, 1.4])
+def test_balls_that_cut_each_other(shift):
+    found = find_containment([ball(), ball(centre=(shift, 0.0, 0.0))])
+    assert found.parents == (NO_PARENT, NO_PARENT)
+    assert _pairs(found) == {frozenset({0, 1})}
+
+
+def test_a_ball_that_sticks_out_of_a_larger_one():
+    found = find_containment([ball(radius=0.8, centre=(2.0, 0.0, 0.0)), ball(radius=2.0)])
+    assert found.parents == (NO_PARENT, NO_PARENT)
+    assert _pairs(found) == {frozenset({0, 1})}
+
+
+@pytest.mark.parametrize("part", [box(), ball(), _moved(box()), _moved(ball())])
+def test_coincident_parts_overlap_and_do_not_contain_each_other(part):
+    found = find_containment([part, part._replace(name="twin_water")])
+    assert found.parents == (NO_PARENT, NO_PARENT)
+    assert _pairs(found) == {frozenset({0, 1})}
+
+
+@pytest.mark.parametrize("place", [lambda part: part, _moved])
+def test_a_body_that_touches_the_wall_of_another_is_reported(place):
+    cup = place(as_part(trimesh.creation.cylinder(1.0, 2.0, sections=24), "cup_glass"))
+    drink = place(as_part(trimesh.creation.cylinder(1.0, 1.0, sections=24), "drink_water"))
+    assert _pairs(find_containment([cup, drink])) == {frozenset({0, 1})}
+
+
+@pytest.mark.parametrize("place", [lambda part: part, _moved])
+def test_boxes_that_share_one_side_are_reported(place):
+    parts = [place(box()), place(box(centre=(1.0, 0.0, 0.0)))]
+    found = find_containment(parts)
+    assert found.parents == (NO_PARENT, NO_PARENT)
+    assert _pairs(found) == {frozenset({0, 1})}
+
+
+def test_the_cavity_of_a_hollow_body_is_outside_of_it():
+    in_cavity, in_wall = ball(radius=0.5), ball(radius=0.1, centre=(1.7, 0.0, 0.0))
+    found = find_containment([shell(), in_cavity, in_wall])
+    assert found == ((NO_PARENT, NO_PARENT, 0), ())
+
+
+def test_a_hollow_body_lies_in_what_surrounds_it():
+    found = find_containment([shell(), ball(radius=5.0), ball(radius=0.5)])
+    assert found == ((1, NO_PARENT, 1), ())
+
+
+def test_an_open_box_still_contains_what_is_deep_inside():
+    found = find_containment([_open_box(1), ball(radius=0.1)])
+    assert found == ((NO_PARENT, 0), ())
+
+
+def test_bundled_ball_contains_a_small_one(ball_scene):
+    found = find_containment([*read_meshes(ball_scene), ball(radius=1.2)])
+    assert found == ((NO_PARENT, 0), ())

@@ -1,0 +1,108 @@
+import numpy as np
+import pytest
+
+from refref_jax.data.containment import find_containment
+from refref_jax.data.geometry import build_geometry
+from refref_jax.geometry.corner_normals import corner_normals, face_normals
+from refref_jax.optics.interface_rules import NO_PARENT
+from refref_jax.optics.media import AMBIENT
+from tests.data.solids import ball, box
+
+# Positions and normals are stored in single precision.
+_SINGLE = 1e-6
+
+
+def _nested():
+    return [
+        ball("bubble_air", radius=0.3, index=1.0),
+        box("cup_glass", size=(4.0, 4.0, 4.0), index=1.5),
+        ball("drink_water", index=1.333),
+    ]
+
+
+def _build(parts, rule="nested"):
+    return build_geometry(parts, find_containment(parts).parents, rule=rule)
+
+
+def _own_slots(geometry, part):
+    """Returns the slots of the triangles of a part; every triangle has at least one."""
+    return np.flatnonzero(np.asarray(geometry.surfaces.parts) == part)
+
+
+def test_media_of_nested_parts():
+    interfaces = _build(_nested()).interfaces
+    np.testing.assert_allclose(interfaces.index_inside, [1.0, 1.5, 1.333], rtol=_SINGLE)
+    np.testing.assert_allclose(interfaces.index_outside, [1.333, 1.0, 1.5], rtol=_SINGLE)
+    np.testing.assert_array_equal(interfaces.medium_outside, [3, AMBIENT, 2])
+
+
+def test_media_of_the_facing_rule_have_air_outside():
+    interfaces = _build(_nested(), rule="facing").interfaces
+    np.testing.assert_allclose(interfaces.index_inside, [1.0, 1.5, 1.333], rtol=_SINGLE)
+    np.testing.assert_array_equal(interfaces.index_outside, 1.0)
+    np.testing.assert_array_equal(interfaces.medium_outside, [3, AMBIENT, 2])
+
+
+def test_every_triangle_keeps_its_part():
+    parts = _nested()
+    geometry = _build(parts)
+    for number, part in enumerate(parts):
+        stored = np.asarray(geometry.surfaces.bvh.triangles)[_own_slots(geometry, number)]
+        expected = part.vertices[part.faces].astype(np.float32)
+        assert {t.tobytes() for t in stored} == {t.tobytes() for t in expected}
+
+
+def test_arrays_are_single_precision():
+    geometry = _build(_nested())
+    assert geometry.surfaces.normals.dtype == np.float32
+    assert geometry.surfaces.bvh.triangles.dtype == np.float32
+    assert geometry.surfaces.parts.dtype == np.int32
+    assert geometry.interfaces.index_inside.dtype == np.float32
+
+
+def _smooth(part):
+    return corner_normals(part.vertices, part.faces, crease_angle=np.pi)
+
+
+def _flat(part):
+    return np.repeat(face_normals(part.vertices[part.faces])[:, None], 3, axis=1)
+
+
+@pytest.mark.parametrize(
+    ("part", "shading", "normals"),
+    [
+        (ball(), "auto", _smooth),
+        (ball(), "smooth", _smooth),
+        (ball(), "flat", _flat),
+        (box(), "auto", _flat),
+        (box(), "smooth", _smooth),
+        (box(), "flat", _flat),
+    ],
+)
+def test_shading_decides_the_normals(part, shading, normals):
+    geometry = _build([part._replace(shading=shading)])
+    by_corners = {
+        corners.tobytes(): normal
+        for corners, normal in zip(
+            part.vertices[part.faces].astype(np.float32), normals(part), strict=True
+        )
+    }
+    surfaces = geometry.surfaces
+    for corners, normal in zip(surfaces.bvh.triangles, surfaces.normals, strict=True):
+        np.testing.assert_allclose(normal, by_corners[np.asarray(corners).tobytes()], atol=_SINGLE)
+
+
+def test_a_scene_without_parts_has_one_interface_that_does_nothing():
+    geometry = build_geometry([], [], rule="nested")
+    np.testing.assert_array_equal(geometry.interfaces.index_inside, [1.0])
+    np.testing.assert_array_equal(geometry.interfaces.index_outside, [1.0])
+    np.testing.assert_array_equal(geometry.interfaces.medium_outside, [AMBIENT])
+    assert geometry.surfaces.normals.shape == geometry.surfaces.bvh.triangles.shape
+    assert geometry.surfaces.parts.shape == geometry.surfaces.normals.shape[:1]
+
+
+@pytest.mark.parametrize("rule", ["nested", "facing"])
+def test_a_part_alone_is_surrounded_by_air(rule):
+    interfaces = build_geometry([ball()], [NO_PARENT], rule=rule).interfaces
+    np.testing.assert_array_equal(interfaces.index_outside, [1.0])
+    np.testing.assert_array_equal(interfaces.medium_outside, [AMBIENT])

@@ -1,0 +1,141 @@
+"""The commands, as a user calls them: on the bundled scene, for a handful of steps."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from refref_jax.data import files
+
+_ROOT = Path(__file__).parents[2]
+
+
+def _run(command, *options, fails=False):
+    result = subprocess.run(
+        [sys.executable, "-m", f"experiments.{command}", *map(str, options)],
+        cwd=_ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"JAX_PLATFORMS": "cpu"},
+    )
+    assert (result.returncode != 0) == fails, result.stdout + result.stderr
+    return result
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of six steps on the bundled scene."""
+    run = tmp_path_factory.mktemp("runs") / "ball"
+    scene = _ROOT / "experiments" / "data" / "cube_smcvx_ball"
+    options = ("--steps=6", "--batch=64", "--log_every=2", "--checkpoint_every=3")
+    result = _run("train", f"--scene={scene}", f"--out={run}", *options)
+    assert "experiments.evaluate" in result.stdout
+    return run
+
+
+def test_training_writes_a_readable_run(trained):
+    lines = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [2, 4, 6]
+    for line in lines:
+        assert {"step", "loss", "psnr", "rays_per_second", "seconds"} <= set(line)
+        assert np.all(np.isfinite(list(line.values())))
+    config = json.loads((trained / "config.json").read_text())
+    assert config["paths"] == "paper" and config["schedule"]["steps"] == 6
+    assert {path.name for path in (trained / "checkpoints").iterdir()} == {"3", "6"}
+
+
+def test_a_finished_run_is_neither_repeated_nor_overwritten(trained):
+    before = (trained / "metrics.jsonl").read_text()
+    _run("train", f"--out={trained}", "--resume")
+    assert (trained / "metrics.jsonl").read_text() == before
+    scene = json.loads((trained / "config.json").read_text())["scene"]["path"]
+    refused = _run("train", f"--scene={scene}", f"--out={trained}", fails=True)
+    assert "--resume" in refused.stderr and "Traceback" not in refused.stderr
+    changed = _run(
+        "train", f"--scene={scene}", f"--out={trained}", "--resume", "--seed=3", fails=True
+    )
+    assert "other options" in changed.stderr
+
+
+def test_evaluation_writes_images_metrics_and_a_comparison(trained):
+    result = _run("evaluate", f"--run={trained}", "--split=val", "--limit=2")
+    out = trained / "eval" / "val"
+    assert str(out / "comparison.png") in result.stdout
+    summary = json.loads((out / "metrics.json").read_text())
+    assert summary["scene"] == "cube_smcvx_ball"
+    assert summary["method"] == "oracle"
+    assert summary["step"] == 6
+    assert set(summary["results"]) == {
+        "psnr",
+        "psnr_masked",
+        "ssim",
+        "distance_mae",
+        "distance_mae_masked",
+        "seconds_per_image",
+    }
+    assert len(summary["per_image"]) == 2
+    mean = np.mean([image["psnr"] for image in summary["per_image"]])
+    np.testing.assert_allclose(summary["results"]["psnr"], mean)
+    for image in summary["per_image"]:
+        rgb = files.read_rgb(out / "rgb" / f"{image['name']}.png")
+        distance = files.read_exr(out / "distance" / f"{image['name']}.exr")
+        assert rgb.shape == (128, 128, 3) and distance.shape == (128, 128)
+        # The picture on disk is the one that was measured.
+        scene = Path(json.loads((trained / "config.json").read_text())["scene"]["path"])
+        target = files.read_rgb(scene / "val" / f"{image['name']}.png") / 255.0
+        psnr = -10 * np.log10(np.mean((rgb / 255.0 - target) ** 2))
+        assert psnr == pytest.approx(image["psnr"], abs=0.05)
+    assert iio.imread(out / "comparison.png").ndim == 3
+
+
+def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
+    _run("render", f"--run={trained}", "--views=orbit", "--frames=2", "--size=24")
+    out = trained / "render" / "orbit"
+    assert {path.name for path in (out / "rgb").iterdir()} == {"r_000.png", "r_001.png"}
+    assert files.read_exr(out / "distance" / "r_001.exr").shape == (24, 24)
+    assert iio.imread(out / "rgb.gif").shape[:3] == (2, 24, 24)
+    assert iio.imread(out / "distance.gif").shape[1:] == (24, 24, 3)
+
+
+@pytest.mark.parametrize(
+    ("command", "options", "message"),
+    [
+        ("train", ("--scene=nowhere",), "nowhere/transforms_train.json does not exist"),
+        ("train", (), "--scene"),
+        ("train", ("--scene=experiments/data/cube_smcvx_ball", "--ior=glass"), "NAME=NUMBER"),
+        ("train", ("--scene=experiments/data/cube_smcvx_ball", "--ior=gold=0.5"), "gold"),
+        ("evaluate", ("--run=nowhere",), "nowhere/config.json does not exist"),
+        ("render", ("--run=nowhere",), "nowhere/model.json does not exist"),
+    ],
+)
+def test_mistakes_end_with_one_line_that_says_what_to_do(tmp_path, command, options, message):
+    if command == "train":
+        options = (*options, f"--out={tmp_path / 'out'}")
+    result = _run(command, *options, fails=True)
+    assert message in result.stderr
+    assert "Traceback" not in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate", "render"])
+def test_help_explains_every_option(command):
+    result = subprocess.run(
+        [sys.executable, "-m", f"experiments.{command}", "--help"],
+        cwd=_ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    source = (_ROOT / "experiments" / f"{command}.py").read_text()
+    names = re.findall(r'flags\.DEFINE_\w+\(\s*"(\w+)"', source)
+    assert len(names) >= 6
+    for name in names:
+        assert re.search(rf"--(\[no\])?{name}:", result.stdout), name

@@ -1,0 +1,257 @@
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.fields import density_field, radiance_field
+from refref_jax.fields.density_field import DensityFieldConfig
+from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid, tables
+from refref_jax.fields.radiance_field import RadianceFieldConfig
+from refref_jax.sampling.cones import Gaussians
+from tests import gradients, reference_sampling, transformations
+
+# Two small matrix products in float32.
+_NETWORK = 1e-5
+
+_GRID = HashGridConfig(levels=2, coarsest=3, finest=10, entries=256, features=2)
+_DENSITY = DensityFieldConfig(_GRID, width=8)
+_RADIANCE = RadianceFieldConfig(
+    _GRID, density_width=8, bottleneck=4, colour_width=8, colour_depth=2
+)
+
+_CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)), np.float32)
+
+
+@functools.cache
+def _parameters(name):
+    """Returns parameters as after training: large entries, and biases that are not 0."""
+    field, config = {
+        "density": (density_field, _DENSITY),
+        "radiance": (radiance_field, _RADIANCE),
+    }[name]
+    params = field.init(jax.random.key(0), config)
+    rng = np.random.default_rng(1)
+    return jax.tree.map(lambda x: jnp.asarray(0.6 * rng.normal(size=x.shape), jnp.float32), params)
+
+
+def _gaussians(count=6, seed=0, scale=0.01):
+    rng = np.random.default_rng(seed)
+    positions = jnp.asarray(rng.uniform(size=(count, 3)), jnp.float32)
+    return Gaussians(positions, jnp.full(count, scale, jnp.float32))
+
+
+def _direction(seed=0):
+    vector = np.random.default_rng(seed).normal(size=3)
+    return jnp.asarray(vector / np.linalg.norm(vector), jnp.float32)
+
+
+@jax.jit
+def _density(params, gaussians):
+    return density_field.density(params, _DENSITY, gaussians)
+
+
+@jax.jit
+def _radiance(params, gaussians, direction):
+    return radiance_field.radiance(params, _RADIANCE, gaussians, direction)
+
+
+def _see(name, gaussians, direction=None, params=None):
+    """Returns density, and colour if the field has one, as one array."""
+    params = _parameters(name) if params is None else params
+    if name == "density":
+        return jnp.atleast_1d(_density(params, gaussians))
+    seen = _radiance(params, gaussians, _direction() if direction is None else direction)
+    return jnp.concatenate([seen.density[None], seen.rgb])
+
+
+_FIELDS = ("density", "radiance")
+
+# --- density ---
+
+
+@pytest.mark.parametrize(
+    ("raw", "expected"), [(1.0, np.log(2.0)), (101.0, 100.0), (-99.0, 0.0), (0.0, 0.3132617)]
+)
+def test_activate_density_by_hand(raw, expected):
+    got = density_field.activate_density(jnp.float32(raw))
+    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-30)
+
+
+@pytest.mark.parametrize("raw", [-1e30, -1e3, 0.0, 1e3, 1e30])
+def test_activate_density_is_finite_and_not_negative(raw):
+    value, slope = jax.value_and_grad(density_field.activate_density)(jnp.float32(raw))
+    assert value >= 0.0 and jnp.isfinite(value)
+    assert 0.0 <= slope <= 1.0
+
+
+def test_activate_density_check_grads():
+    gradients.assert_numerical(density_field.activate_density, 0.7)
+
+
+@pytest.mark.parametrize("name", _FIELDS)
+def test_density_is_never_negative(name):
+    densities = np.array([_see(name, _gaussians(seed=seed))[0] for seed in range(10)])
+    assert densities.min() >= 0.0
+    assert densities.max() > 1.2 * densities.min()
+
+
+@pytest.mark.parametrize("name", _FIELDS)
+def test_an_untrained_field_is_thin_but_not_empty(name):
+    field, config = (density_field, _DENSITY) if name == "density" else (radiance_field, _RADIANCE)
+    params = field.init(jax.random.key(1), config)
+    density = _see(name, _gaussians(), params=params)[0]
+    np.testing.assert_allclose(density, np.log1p(np.exp(-1.0)), rtol=1e-2)
+
+
+# --- colour ---
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_colours_stay_within_their_padding(seed):
+    huge = jax.tree.map(lambda x: 1e3 * x, _parameters("radiance"))
+    for params in (_parameters("radiance"), huge):
+        rgb = _see("radiance", _gaussians(seed=seed), _direction(seed), params)[1:]
+        assert ((rgb >= -0.001 - 1e-6) & (rgb <= 1.001 + 1e-6)).all()
+
+
+def test_black_and_white_lie_within_reach():
+    params = jax.tree.map(jnp.zeros_like, _parameters("radiance"))
+    last = max(name for name in params["params"] if name.startswith("Dense"))
+    params["params"][last]["bias"] = jnp.array([20.0, 0.0, -20.0])
+    rgb = _see("radiance", _gaussians(), params=params)[1:]
+    np.testing.assert_allclose(rgb, [1.001, 0.5, -0.001], atol=1e-6)
+
+
+def test_colour_depends_on_the_direction_and_density_does_not():
+    seen = np.array([_see("radiance", _gaussians(), _direction(seed)) for seed in range(5)])
+    np.testing.assert_array_equal(seen[:, 0], seen[0, 0])
+    assert (np.ptp(seen[:, 1:], axis=0) > 1e-3).all()
+
+
+def test_radiance_depends_on_the_position():
+    seen = np.array([_see("radiance", _gaussians(seed=seed)) for seed in range(5)])
+    assert (np.ptp(seen, axis=0) > 1e-3).all()
+
+
+# --- both ---
+
+
+def _dense(params, index, x):
+    layer = params["params"][f"Dense_{index}"]
+    return x @ np.asarray(layer["kernel"], np.float64) + np.asarray(layer["bias"], np.float64)
+
+
+def _mean_features(name, gaussians):
+    (grid,) = (key for key in _parameters(name)["params"] if "Grid" in key)
+    params = {"params": _parameters(name)["params"][grid]}
+    return np.asarray(MultisampledGrid(_GRID).apply(params, gaussians), np.float64)
+
+
+def test_the_density_network_against_numpy():
+    params, gaussians = _parameters("density"), _gaussians()
+    hidden = np.maximum(_dense(params, 0, _mean_features("density", gaussians)), 0.0)
+    raw = _dense(params, 1, hidden)[0]
+    np.testing.assert_allclose(
+        _see("density", gaussians)[0], np.logaddexp(0.0, raw - 1.0), rtol=_NETWORK
+    )
+
+
+def test_the_radiance_network_against_numpy():
+    params, gaussians, direction = _parameters("radiance"), _gaussians(), _direction()
+    hidden = np.maximum(_dense(params, 0, _mean_features("radiance", gaussians)), 0.0)
+    raw = _dense(params, 1, hidden)
+    hidden = np.concatenate([raw[1:], reference_sampling.spherical_harmonics(direction)])
+    for layer in (2, 3):
+        hidden = np.maximum(_dense(params, layer, hidden), 0.0)
+    rgb = 1.002 / (1.0 + np.exp(-_dense(params, 4, hidden))) - 0.001
+    got = _see("radiance", gaussians, direction)
+    np.testing.assert_allclose(got[0], np.logaddexp(0.0, raw[0] - 1.0), rtol=_NETWORK)
+    np.testing.assert_allclose(got[1:], rgb, atol=_NETWORK)
+
+
+@pytest.mark.parametrize("name", _FIELDS)
+def test_the_order_of_multisamples_does_not_matter(name):
+    gaussians = _gaussians()
+    order = jnp.array([3, 1, 5, 0, 4, 2])
+    shuffled = jax.tree.map(lambda x: x[order], gaussians)
+    np.testing.assert_allclose(_see(name, shuffled), _see(name, gaussians), rtol=_NETWORK)
+
+
+@pytest.mark.parametrize("name", _FIELDS)
+def test_multisamples_at_one_place_are_that_place(name):
+    one = _gaussians(count=1)
+    six = jax.tree.map(lambda x: jnp.repeat(x, 6, axis=0), one)
+    np.testing.assert_allclose(_see(name, six), _see(name, one), rtol=_NETWORK)
+
+
+@pytest.mark.parametrize("name", _FIELDS)
+@pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0, 1e30])
+def test_fields_are_finite_at_the_corners_of_the_cube(name, scale):
+    gaussians = Gaussians(jnp.asarray(_CORNERS[:6]), jnp.full(6, scale, jnp.float32))
+    assert jnp.isfinite(_see(name, gaussians)).all()
+
+
+@pytest.mark.parametrize("name", _FIELDS)
+def test_the_same_key_gives_the_same_field(name):
+    field, config = (density_field, _DENSITY) if name == "density" else (radiance_field, _RADIANCE)
+    first, same, other = (field.init(jax.random.key(key), config) for key in (5, 5, 6))
+    jax.tree.map(np.testing.assert_array_equal, first, same)
+    assert not np.array_equal(tables(first)[0], tables(other)[0])
+
+
+def test_parameters_hold_the_tables_of_their_grids():
+    for name in _FIELDS:
+        assert [table.shape for table in tables(_parameters(name))] == [(64, 2), (256, 2)]
+
+
+# --- gradients and transformations ---
+
+
+@functools.cache
+def _gradient(name):
+    def total(params, gaussians, direction):
+        if name == "density":
+            return density_field.density(params, _DENSITY, gaussians)
+        seen = radiance_field.radiance(params, _RADIANCE, gaussians, direction)
+        return seen.density + jnp.sum(seen.rgb)
+
+    return jax.jit(jax.grad(total, argnums=(0, 1, 2)))
+
+
+@pytest.mark.parametrize("name", _FIELDS)
+@pytest.mark.parametrize("scale", [0.0, 0.01, 1e30])
+def test_gradients_are_finite_at_the_corners_of_the_cube(name, scale):
+    for positions in (_CORNERS[:6], _CORNERS[2:]):
+        gaussians = Gaussians(jnp.asarray(positions), jnp.full(6, scale, jnp.float32))
+        got = _gradient(name)(_parameters(name), gaussians, _direction())
+        assert gradients.all_finite(got)
+
+
+@pytest.mark.parametrize("name", _FIELDS)
+def test_gradients_reach_every_layer_and_table(name):
+    total = jax.tree.map(jnp.zeros_like, _parameters(name))
+    for seed in range(8):
+        by_params = _gradient(name)(_parameters(name), _gaussians(seed=seed), _direction(seed))[0]
+        total = jax.tree.map(lambda a, b: a + jnp.abs(b), total, by_params)
+    assert all(bool(jnp.any(leaf > 0.0)) for leaf in jax.tree.leaves(total))
+
+
+_CASES = {
+    "density": lambda gaussians, direction: density_field.density(
+        _parameters("density"), _DENSITY, gaussians
+    ),
+    "radiance": lambda gaussians, direction: radiance_field.radiance(
+        _parameters("radiance"), _RADIANCE, gaussians, direction
+    ),
+}
+
+
+@pytest.mark.parametrize("transformation", transformations.ALL)
+@pytest.mark.parametrize("name", _CASES)
+def test_transformations_change_nothing(name, transformation):
+    gaussians = jax.tree.map(lambda *x: jnp.stack(x), *(_gaussians(seed=seed) for seed in range(3)))
+    directions = jnp.stack([_direction(seed) for seed in range(3)])
+    transformation(_CASES[name], (gaussians, directions))

@@ -1,0 +1,328 @@
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.special
+
+from refref_jax.fields import hash_grid
+from refref_jax.fields.hash_grid import HashGrid, HashGridConfig, MultisampledGrid
+from refref_jax.sampling.cones import Gaussians
+from tests import gradients, reference_sampling, transformations
+
+# Eight products of float32 numbers; the place in a cell of the finest level is rounded most.
+_BLENDING = 2e-5
+
+# The first two levels have fewer vertices than entries (4^3 and 6^3), the last two are hashed.
+_CONFIG = HashGridConfig(levels=4, coarsest=3, finest=18, entries=256, features=2)
+_SHAPE = (_CONFIG.levels, _CONFIG.coarsest, _CONFIG.finest, _CONFIG.entries)
+_RESOLUTIONS = [3, 5, 10, 18]
+
+_POSITIONS = np.concatenate(
+    [
+        np.array(list(itertools.product((0.0, 1.0), repeat=3))),
+        [[0.5, 0.5, 0.5], [1.0 / 3.0, 0.6, 0.1], [0.0, 0.4, 1.0], [1e-7, 1.0 - 1e-7, 0.2]],
+        np.random.default_rng(0).uniform(size=(20, 3)),
+    ]
+).astype(np.float32)
+
+
+@functools.cache
+def _parameters():
+    """Returns parameters whose entries are of about 1, so that errors show."""
+    params = HashGrid(_CONFIG).init(jax.random.key(0), jnp.zeros(3), jnp.float32(0.0))
+    rng = np.random.default_rng(1)
+    return jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), jnp.float32), params)
+
+
+@jax.jit
+def _features(params, positions, scales):
+    return jax.vmap(functools.partial(HashGrid(_CONFIG).apply, params))(positions, scales)
+
+
+def _at(positions, scales=None):
+    positions = jnp.asarray(positions, jnp.float32)
+    scales = jnp.zeros(positions.shape[0]) if scales is None else jnp.asarray(scales, jnp.float32)
+    return _features(_parameters(), positions, scales)
+
+
+def _expected(positions, scales=None):
+    tables = hash_grid.tables(_parameters())
+    scales = np.zeros(len(positions)) if scales is None else scales
+    return np.array(
+        [
+            reference_sampling.grid_features(tables, _SHAPE, position, scale)
+            for position, scale in zip(positions, scales, strict=True)
+        ]
+    )
+
+
+# --- configuration ---
+
+
+def test_resolutions_by_hand():
+    config = HashGridConfig(levels=5, coarsest=16, finest=256, entries=2, features=1)
+    assert hash_grid.resolutions(config) == [16, 32, 64, 128, 256]
+    assert hash_grid.resolutions(_CONFIG) == _RESOLUTIONS
+
+
+@pytest.mark.parametrize(
+    ("levels", "coarsest", "finest"), [(8, 16, 512), (10, 16, 8192), (2, 4, 4)]
+)
+def test_resolutions_grow_geometrically_to_the_finest(levels, coarsest, finest):
+    config = HashGridConfig(levels, coarsest, finest, entries=2, features=1)
+    got = hash_grid.resolutions(config)
+    assert got == reference_sampling.grid_resolutions(levels, coarsest, finest)
+    assert len(got) == levels and got[0] == coarsest and got[-1] == finest
+    assert got == sorted(got)
+
+
+def test_a_grid_of_one_level_has_its_coarsest_resolution():
+    config = HashGridConfig(levels=1, coarsest=7, finest=100, entries=2, features=3)
+    assert hash_grid.resolutions(config) == [7]
+    assert hash_grid.feature_count(config) == 3
+
+
+def test_feature_count_is_the_number_of_features():
+    assert hash_grid.feature_count(_CONFIG) == _at(_POSITIONS).shape[-1] == 8
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"levels": 0}, {"features": 0}, {"coarsest": 0}, {"coarsest": 20}, {"finest": 2}],
+)
+def test_impossible_shapes_are_refused(wrong):
+    shape = {"levels": 4, "coarsest": 3, "finest": 18, "entries": 256, "features": 2}
+    with pytest.raises(ValueError, match="1 <= coarsest <= finest"):
+        HashGridConfig(**{**shape, **wrong})
+
+
+@pytest.mark.parametrize(("entries", "hint"), [(0, 2), (1, 2), (3, 4), (255, 256), (257, 512)])
+def test_tables_must_have_a_power_of_two_entries(entries, hint):
+    with pytest.raises(ValueError, match=f"not {entries}. Use for example {hint}"):
+        HashGridConfig(levels=4, coarsest=3, finest=18, entries=entries, features=2)
+
+
+# --- vertices ---
+
+
+def _vertex(*coordinates):
+    return jnp.array(coordinates, jnp.uint32)
+
+
+def test_vertex_index_of_a_dense_level_by_hand():
+    assert hash_grid.vertex_index(_vertex(1, 2, 3), 4, 128) == 1 + 2 * 5 + 3 * 25
+
+
+def test_vertex_index_of_a_hashed_level_by_hand():
+    # 1 xor 2654435761 * 2 xor 805459861 * 3, each modulo 2^32; then the last eight bits.
+    expected = (1 ^ (2654435761 * 2 % 2**32) ^ (805459861 * 3 % 2**32)) % 256
+    assert hash_grid.vertex_index(_vertex(1, 2, 3), 16, 256) == expected
+
+
+@pytest.mark.parametrize(
+    ("resolution", "entries"), [(5, 256), (18, 256), (18, 8192), (8192, 2**16)]
+)
+def test_vertex_index_against_python_integers(resolution, entries):
+    vertices = np.random.default_rng(0).integers(0, resolution + 1, size=(40, 3))
+    vertices[:2] = [[0, 0, 0], [resolution] * 3]
+    expected = [reference_sampling.vertex_entry(v, resolution, entries) for v in vertices]
+    index = jax.vmap(lambda v: hash_grid.vertex_index(v, resolution, entries))
+    got = index(jnp.asarray(vertices, jnp.uint32))
+    np.testing.assert_array_equal(got, expected)
+    assert max(expected) < entries
+
+
+def test_vertices_of_a_dense_level_have_entries_of_their_own():
+    vertices = np.array(list(itertools.product(range(6), repeat=3)), np.uint32)
+    got = jax.vmap(lambda v: hash_grid.vertex_index(v, 5, 256))(jnp.asarray(vertices))
+    np.testing.assert_array_equal(np.sort(got), np.arange(216))
+
+
+# --- interpolation ---
+
+
+def test_features_against_a_loop():
+    np.testing.assert_allclose(_at(_POSITIONS), _expected(_POSITIONS), atol=_BLENDING)
+
+
+def test_features_of_blurred_points_against_a_loop():
+    scales = np.random.default_rng(2).choice([0.0, 1e-3, 0.03, 0.2, 1.0], size=len(_POSITIONS))
+    got, expected = _at(_POSITIONS, scales), _expected(_POSITIONS, scales)
+    np.testing.assert_allclose(got, expected, atol=_BLENDING)
+
+
+@pytest.mark.parametrize("vertex", [(0, 0, 0), (3, 3, 3), (0, 3, 1), (2, 1, 3)])
+def test_a_vertex_has_the_features_of_its_entry(vertex):
+    table = np.asarray(hash_grid.tables(_parameters())[0])
+    x, y, z = vertex
+    got = _at([np.array(vertex) / 3.0])[0, :2]
+    np.testing.assert_allclose(got, table[x + 4 * (y + 4 * z)], atol=_BLENDING)
+
+
+def test_the_middle_of_a_cell_has_the_mean_of_its_corners():
+    table = np.asarray(hash_grid.tables(_parameters())[0])
+    corners = [x + 4 * (y + 4 * z) for x, y, z in itertools.product((1, 2), repeat=3)]
+    got = _at([[0.5, 0.5, 0.5]])[0, :2]
+    np.testing.assert_allclose(got, table[corners].mean(axis=0), atol=_BLENDING)
+
+
+def test_features_are_continuous_across_cells():
+    for resolution in _RESOLUTIONS:
+        border = (resolution // 2) / resolution
+        sides = [[border - 1e-6, 0.3, 0.7], [border + 1e-6, 0.3, 0.7]]
+        before, after = np.asarray(_at(sides))
+        np.testing.assert_allclose(before, after, atol=1e-3)
+
+
+def test_equal_entries_give_the_same_features_everywhere():
+    params = jax.tree.map(lambda x: jnp.full_like(x, 0.7), _parameters())
+    got = _features(params, jnp.asarray(_POSITIONS), jnp.zeros(len(_POSITIONS)))
+    np.testing.assert_allclose(got, 0.7, atol=_BLENDING)
+
+
+def test_a_position_that_rounding_left_outside_the_cube_is_finite():
+    outside = np.nextafter(np.float32([0.0, 1.0]), np.float32([-1.0, 2.0]))
+    positions = np.array(list(itertools.product(outside, repeat=3)))
+    np.testing.assert_allclose(_at(positions), _at(np.round(positions)), atol=_BLENDING)
+
+
+# --- fading ---
+
+
+@pytest.mark.parametrize("resolution", [1, 16, 8192])
+def test_fading_follows_the_error_function(resolution):
+    scales = np.geomspace(1e-3, 1e3, 13) / resolution
+    expected = scipy.special.erf(1.0 / (np.sqrt(8.0) * scales * resolution))
+    got = jax.vmap(lambda s: hash_grid.fading(s, resolution))(jnp.asarray(scales, jnp.float32))
+    np.testing.assert_allclose(got, expected, rtol=2e-6)
+
+
+def test_fading_by_hand():
+    # A Gaussian of half a cell's width: erf(1 / sqrt(2)), the share within one deviation.
+    np.testing.assert_allclose(hash_grid.fading(jnp.float32(0.05), 10), 0.6826895, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("scale", "expected"), [(0.0, 1.0), (1e-30, 1.0), (1e10, 0.0), (1e30, 0.0)]
+)
+def test_fading_at_its_ends(scale, expected):
+    value, slope = jax.value_and_grad(lambda s: hash_grid.fading(s, 64))(jnp.float32(scale))
+    np.testing.assert_allclose(value, expected, atol=1e-10)
+    assert slope == 0.0 or scale > 1.0
+    assert jnp.isfinite(slope)
+
+
+def test_fading_falls_as_the_gaussian_grows():
+    faded = jax.vmap(lambda s: hash_grid.fading(s, 64))(jnp.geomspace(1e-4, 1e4, 100))
+    assert (jnp.diff(faded) <= 0.0).all() and ((faded >= 0.0) & (faded <= 1.0)).all()
+
+
+def test_a_blurred_point_loses_the_fine_levels_first():
+    sharp, blurred = np.asarray(_at([[0.3, 0.6, 0.1]] * 2, [0.0, 0.1]))
+    kept = blurred / sharp
+    np.testing.assert_allclose(kept[0::2], kept[1::2], rtol=1e-4)
+    assert (np.diff(kept[0::2]) < 0.0).all()
+
+
+def test_a_huge_gaussian_sees_nothing():
+    np.testing.assert_allclose(_at(_POSITIONS, np.full(len(_POSITIONS), 1e30)), 0.0, atol=1e-10)
+
+
+# --- multisamples ---
+
+
+def _multisamples(count, seed=0):
+    rng = np.random.default_rng(seed)
+    return Gaussians(
+        jnp.asarray(rng.uniform(size=(count, 3)), jnp.float32),
+        jnp.asarray(rng.uniform(size=count) * 0.1, jnp.float32),
+    )
+
+
+def test_multisamples_are_averaged():
+    gaussians = _multisamples(6)
+    nested = {"params": {"grid": _parameters()["params"]}}
+    got = MultisampledGrid(_CONFIG).apply(nested, gaussians)
+    np.testing.assert_allclose(got, np.mean(_at(*gaussians), axis=0), atol=_BLENDING)
+    np.testing.assert_allclose(got, _expected(*gaussians).mean(axis=0), atol=_BLENDING)
+
+
+def test_multisamples_share_their_tables():
+    grid = MultisampledGrid(_CONFIG)
+    one, six = (
+        jax.eval_shape(grid.init, jax.random.key(0), _multisamples(count)) for count in (1, 6)
+    )
+    assert jax.tree.map(jnp.shape, one) == jax.tree.map(jnp.shape, six)
+
+
+# --- tables ---
+
+
+def test_tables_are_all_found_in_order():
+    tables = hash_grid.tables(_parameters())
+    assert [table.shape for table in tables] == [(64, 2), (216, 2), (256, 2), (256, 2)]
+
+
+def test_tables_are_found_in_any_tree_and_nothing_else_is():
+    tree = {"a": (_parameters(), {"Dense_0": jnp.ones((3, 3))}), "b": [_parameters()]}
+    assert len(hash_grid.tables(tree)) == 8
+    assert hash_grid.tables({"Dense_0": jnp.ones(3)}) == []
+
+
+def test_tables_start_small_and_even():
+    params = HashGrid(_CONFIG).init(jax.random.key(3), jnp.zeros(3), jnp.float32(0.0))
+    entries = np.concatenate([np.ravel(table) for table in hash_grid.tables(params)])
+    assert abs(entries).max() <= 1e-4 and abs(entries.mean()) < 1e-5
+    np.testing.assert_allclose(entries.std(), 1e-4 / np.sqrt(3.0), rtol=0.1)
+
+
+# --- gradients and transformations ---
+
+
+@jax.jit
+def _gradients(params, position, scale):
+    total = lambda *x: jnp.sum(HashGrid(_CONFIG).apply(*x))
+    return jax.grad(total, argnums=(0, 1, 2))(params, position, scale)
+
+
+@pytest.mark.parametrize("position", [_POSITIONS[0], _POSITIONS[7], _POSITIONS[9], _POSITIONS[-1]])
+def test_gradients_reach_the_touched_entries_only(position):
+    by_params, _, _ = _gradients(_parameters(), jnp.asarray(position), jnp.float32(0.02))
+    for gradient, resolution in zip(hash_grid.tables(by_params), _RESOLUTIONS, strict=True):
+        expected = np.zeros(gradient.shape)
+        fade = reference_sampling.grid_fading(0.02, resolution)
+        for entry, weight in reference_sampling.touched_entries(
+            position, resolution, _CONFIG.entries
+        ):
+            expected[entry] += weight * fade
+        np.testing.assert_allclose(gradient, expected, atol=_BLENDING)
+        np.testing.assert_array_equal(np.asarray(gradient)[expected == 0.0], 0.0)
+
+
+@pytest.mark.parametrize("position", [_POSITIONS[0], _POSITIONS[7], _POSITIONS[9]])
+@pytest.mark.parametrize("scale", [0.0, 1e-30, 0.1, 1e10, 1e30])
+def test_gradients_are_finite(position, scale):
+    got = _gradients(_parameters(), jnp.asarray(position), jnp.float32(scale))
+    assert gradients.all_finite(got)
+
+
+def test_check_grads():
+    def features(tables, position, scale):
+        params = {"params": {f"hash_table_{i:02d}": table for i, table in enumerate(tables)}}
+        return HashGrid(_CONFIG).apply(params, position, scale)
+
+    wide = [np.asarray(table, np.float64) for table in hash_grid.tables(_parameters())]
+
+    def by_place(position, scale):
+        return features([jnp.asarray(table) for table in wide], position, scale)
+
+    gradients.assert_numerical(by_place, [0.31, 0.62, 0.13], 0.05, rtol=1e-3)
+
+
+@pytest.mark.parametrize("transformation", transformations.ALL)
+def test_transformations_change_nothing(transformation):
+    batches = jnp.asarray(_POSITIONS[-3:]), jnp.array([0.0, 0.01, 1.0])
+    transformation(lambda *x: HashGrid(_CONFIG).apply(_parameters(), *x), batches)

@@ -1,0 +1,274 @@
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+from refref_jax.geometry import bvh, bvh_build
+from refref_jax.geometry.rays import Rays
+from tests import reference
+
+# Distances are float32 sums of terms near 10.
+_DISTANCE_TOLERANCE = 2e-5
+
+
+@functools.partial(jax.jit, static_argnames="lockstep")
+def _trace(tree, origins, directions, limits, leaving, *, lockstep=False):
+    if lockstep:
+        return bvh._hits_in_lockstep(tree, origins, directions, limits, leaving)
+    rays = Rays(origins, directions, jnp.zeros(len(origins)))
+    return bvh.closest_hits(tree, rays, limits=limits, leaving=leaving)
+
+
+def _closest(triangles, origins, directions, *, limits=None, leaving=None, lockstep=False):
+    """Builds a tree and traces rays; returns distances, faces and barycentrics."""
+    tree, slots = bvh_build.build(np.asarray(triangles, np.float32))
+    count = len(origins)
+    limits = np.full(count, np.inf) if limits is None else limits
+    leaving = np.full(count, bvh.NO_SLOT) if leaving is None else leaving
+    hits = _trace(
+        jax.tree.map(jnp.asarray, tree),
+        jnp.asarray(origins, jnp.float32),
+        jnp.asarray(directions, jnp.float32),
+        jnp.asarray(limits, jnp.float32),
+        jnp.asarray(leaving, jnp.int32),
+        lockstep=lockstep,
+    )
+    found = np.asarray(hits.slots)
+    faces = np.where(found >= 0, slots[found], -1)
+    return np.asarray(hits.distances), faces, np.asarray(hits.barycentrics)
+
+
+def _unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def _soup(count, seed=0):
+    generator = np.random.default_rng(seed)
+    centres = generator.uniform(-1, 1, (count, 1, 3))
+    return centres + generator.normal(size=(count, 3, 3)) * 0.1
+
+
+def _random_rays(count, seed=1, reach=3.0):
+    generator = np.random.default_rng(seed)
+    origins = reach * _unit(generator.normal(size=(count, 3)))
+    return origins, _unit(generator.uniform(-1, 1, (count, 3)) - origins)
+
+
+@pytest.mark.parametrize("faces", [1, 2, 5, 40, 400])
+def test_hits_of_random_rays_equal_brute_force(faces):
+    triangles = _soup(faces)
+    origins, directions = _random_rays(200)
+    distances, found, _ = _closest(triangles, origins, directions)
+    expected, expected_faces = reference.hits_by_brute_force(triangles, origins, directions)
+    # Rays within the edge tolerance of an open edge may differ: a tiny share of a soup's.
+    agree = np.isfinite(distances) == np.isfinite(expected)
+    assert agree.mean() >= 0.995
+    both = np.isfinite(distances) & np.isfinite(expected)
+    np.testing.assert_array_equal(found[both], expected_faces[both])
+    np.testing.assert_allclose(distances[both], expected[both], atol=_DISTANCE_TOLERANCE)
+
+
+@pytest.mark.parametrize("kind", ["inside", "outside"])
+def test_axis_aligned_rays_against_a_box_are_exact(kind):
+    mesh = trimesh.creation.box(extents=(2, 2, 2))
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    start = np.array([0.3, -0.2, 0.1])
+    origins = np.broadcast_to(start, (6, 3)) if kind == "inside" else start - 4.0 * axes
+    distances, _, _ = _closest(mesh.triangles, origins, axes)
+    along = np.sum(axes * origins, axis=-1)
+    expected = 1.0 - along if kind == "inside" else -1.0 - along
+    np.testing.assert_allclose(distances, expected, rtol=1e-6)
+
+
+def test_a_ray_in_the_plane_of_a_triangle_misses():
+    triangle = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], float)
+    distances, faces, _ = _closest(triangle, [[-1.0, 0.2, 0.0]], [[1.0, 0.0, 0.0]])
+    assert distances[0] == np.inf
+    assert faces[0] == -1
+
+
+@pytest.mark.parametrize("target", ["vertices", "edges", "faces"])
+@pytest.mark.parametrize("subdivisions", [1, 3])
+def test_no_ray_slips_through_a_closed_surface(target, subdivisions):
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+    points = {
+        "vertices": mesh.vertices,
+        "edges": mesh.vertices[mesh.edges_unique].mean(axis=1),
+        "faces": mesh.triangles_center,
+    }[target]
+    generator = np.random.default_rng(0)
+    origins = generator.uniform(-0.2, 0.2, points.shape)
+    directions = _unit(points - origins)
+    distances, _, _ = _closest(mesh.triangles, origins, directions)
+    expected = np.linalg.norm(points - origins, axis=-1)
+    np.testing.assert_allclose(distances, expected, atol=_DISTANCE_TOLERANCE)
+
+
+@pytest.mark.parametrize("aim", ["random", "vertices", "edges", "axes"])
+def test_hits_agree_with_embree(aim):
+    embree = pytest.importorskip("embreex.rtcore_scene")
+    from embreex.mesh_construction import TriangleMesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=4)
+    origins, directions = _random_rays(len(mesh.vertices))
+    if aim == "vertices":
+        directions = _unit(mesh.vertices - origins)
+    elif aim == "edges":
+        directions = _unit(mesh.vertices[mesh.edges_unique[: len(origins)]].mean(1) - origins)
+    elif aim == "axes":
+        axes = np.repeat(np.concatenate([np.eye(3), -np.eye(3)]), 400, axis=0)
+        offsets = np.random.default_rng(0).uniform(-0.9, 0.9, axes.shape)
+        origins, directions = np.where(axes == 0, offsets, -3.0 * axes), axes
+    scene = embree.EmbreeScene()
+    TriangleMesh(scene, mesh.triangles.astype(np.float32))
+    theirs = scene.run(origins.astype(np.float32), directions.astype(np.float32), output=1)
+    expected = np.where(theirs["primID"] < 0, np.inf, theirs["tfar"])
+    distances, _, _ = _closest(mesh.triangles, origins, directions)
+    # Embree's fast mode loses some rays at vertices and edges of the silhouette; ours loses none.
+    ours_only = np.isfinite(distances) & ~np.isfinite(expected)
+    theirs_only = ~np.isfinite(distances) & np.isfinite(expected)
+    assert theirs_only.mean() <= 1e-3
+    assert ours_only.mean() <= (0.08 if aim in ("vertices", "edges") else 1e-3)
+    both = np.isfinite(distances) & np.isfinite(expected)
+    assert both.mean() > 0.3
+    close = np.abs(distances[both] - expected[both]) <= 1e-4
+    assert close.mean() >= 0.999 if aim in ("random", "axes") else close.mean() >= 0.97
+
+
+@pytest.mark.parametrize("count", [1, 15, 16, 17, 100])
+def test_packets_and_lockstep_give_the_same_hits(count):
+    triangles = _soup(60)
+    origins, directions = _random_rays(count)
+    packets = _closest(triangles, origins, directions)
+    lockstep = _closest(triangles, origins, directions, lockstep=True)
+    for ours, theirs in zip(packets, lockstep, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_an_empty_scene_is_missed():
+    distances, faces, _ = _closest(np.zeros((0, 3, 3)), *_random_rays(20))
+    assert np.all(distances == np.inf)
+    assert np.all(faces == -1)
+
+
+def test_degenerate_and_duplicate_triangles_do_no_harm():
+    triangles = _soup(30)
+    point = np.repeat(triangles[:5, :1], 3, axis=1)
+    line = triangles[5:10].copy()
+    line[:, 2] = 0.5 * (line[:, 0] + line[:, 1])
+    origins, directions = _random_rays(200)
+    clean, _, _ = _closest(triangles, origins, directions)
+    soiled, _, _ = _closest(
+        np.concatenate([triangles, point, line, triangles]), origins, directions
+    )
+    np.testing.assert_array_equal(soiled, clean)
+
+
+def test_triangles_in_one_place_still_make_a_tree():
+    triangles = np.repeat(_soup(1), 50, axis=0)
+    tree, _ = bvh_build.build(triangles.astype(np.float32))
+    assert tree.leaves[:, 1].max() <= bvh.LEAF_SIZE
+    assert tree.leaves[:, 1].sum() == 50
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e3, -1e4])
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_hits_scale_and_move_with_the_scene(offset, size):
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    origins, directions = _random_rays(100)
+    shift = np.array([offset, 0.0, 0.0]) * size
+    distances, _, _ = _closest(mesh.triangles * size + shift, origins * size + shift, directions)
+    expected, _, _ = _closest(mesh.triangles, origins, directions)
+    agree = np.isfinite(distances) == np.isfinite(expected)
+    # Coordinates near 1e4 leave 1e-3 of a unit: some rays at the silhouette change sides.
+    assert agree.mean() >= (1.0 if offset == 0.0 else 0.95)
+    both = np.isfinite(distances) & np.isfinite(expected)
+    tolerance = max(_DISTANCE_TOLERANCE, 1e-5 * abs(offset))
+    np.testing.assert_allclose(distances[both] / size, expected[both], atol=tolerance)
+
+
+def test_hits_beyond_the_limit_do_not_count():
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    origins, directions = _random_rays(200)
+    free, _, _ = _closest(mesh.triangles, origins, directions)
+    limits = np.where(np.arange(200) % 2, 2.2, -1.0)
+    limited, _, _ = _closest(mesh.triangles, origins, directions, limits=limits)
+    np.testing.assert_array_equal(limited, np.where(free <= limits, free, np.inf))
+
+
+def test_a_ray_does_not_hit_the_triangle_it_leaves():
+    triangles = np.array([[[0, -1, -1], [0, 1, -1], [0, 0, 1]]], float)
+    triangles = np.concatenate([triangles, triangles + np.array([1.0, 0.0, 0.0])])
+    _, slots = bvh_build.build(triangles.astype(np.float32))
+    first = int(np.flatnonzero(slots[:2] == 0)[0])
+    distances, faces, _ = _closest(
+        triangles, [[-1e-7, 0.0, 0.0]], [[1.0, 0.0, 0.0]], leaving=[first]
+    )
+    assert faces[0] == 1
+    assert distances[0] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_barycentrics_give_back_the_hit_point():
+    triangles = _soup(40)
+    origins, directions = _random_rays(200)
+    distances, faces, barycentrics = _closest(triangles, origins, directions)
+    hit = faces >= 0
+    u, v = barycentrics[hit].T[..., None]
+    a, b, c = np.moveaxis(triangles[faces[hit]], 1, 0)
+    points = (1 - u - v) * a + u * b + v * c
+    expected = origins[hit] + distances[hit, None] * directions[hit]
+    np.testing.assert_allclose(points, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("faces", [1, 4, 5, 33, 500])
+def test_the_tree_holds_every_face_once_and_bounds_it(faces):
+    triangles = _soup(faces).astype(np.float32)
+    tree, slots = bvh_build.build(triangles)
+    held = np.concatenate([np.arange(f, f + n) for f, n in tree.leaves])
+    np.testing.assert_array_equal(np.sort(held), np.arange(faces))
+    np.testing.assert_array_equal(np.sort(slots[:faces]), np.arange(faces))
+    for node, (first, count) in enumerate(tree.leaves):
+        below = slice(node, tree.skips[node])
+        slots_below = np.concatenate([np.arange(f, f + n) for f, n in tree.leaves[below]])
+        corners = tree.triangles[slots_below].reshape(-1, 3)
+        np.testing.assert_array_equal(tree.boxes[node, 0], corners.min(axis=0))
+        np.testing.assert_array_equal(tree.boxes[node, 1], corners.max(axis=0))
+        assert (count > 0) == (tree.skips[node] == node + 1)
+        assert first + count <= faces
+
+
+def test_a_coordinate_that_is_not_finite_is_an_error():
+    triangles = _soup(3)
+    triangles[1, 2, 0] = np.nan
+    with pytest.raises(ValueError, match="not finite"):
+        bvh_build.build(triangles)
+
+
+def test_the_traversal_is_compiled_as_one_native_loop_on_cpu():
+    if jax.default_backend() != "cpu":
+        pytest.skip("the native loop is for the CPU")
+    tree, _ = bvh_build.build(_soup(10).astype(np.float32))
+    rays = (jnp.zeros((32, 3)), jnp.ones((32, 3)), jnp.ones(32), jnp.zeros(32, jnp.int32))
+    text = _trace.lower(jax.tree.map(jnp.asarray, tree), *rays).compile().as_text()
+    assert 'xla_cpu_small_call="true"' in text, f"JAX {jax.__version__} drops the mark"
+
+
+@pytest.mark.slow
+def test_a_million_triangles_agree_with_embree():
+    embree = pytest.importorskip("embreex.rtcore_scene")
+    from embreex.mesh_construction import TriangleMesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=8)
+    assert len(mesh.faces) > 1e6
+    origins, directions = _random_rays(20000)
+    scene = embree.EmbreeScene()
+    TriangleMesh(scene, mesh.triangles.astype(np.float32))
+    theirs = scene.run(origins.astype(np.float32), directions.astype(np.float32), output=1)
+    expected = np.where(theirs["primID"] < 0, np.inf, theirs["tfar"])
+    distances, _, _ = _closest(mesh.triangles, origins, directions)
+    assert np.mean(np.isfinite(distances) != np.isfinite(expected)) <= 1e-3
+    both = np.isfinite(distances) & np.isfinite(expected)
+    assert np.mean(np.abs(distances[both] - expected[both]) <= 1e-4) >= 0.999

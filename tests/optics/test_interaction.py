@@ -1,0 +1,69 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.geometry.surfaces import SurfacePoint
+from refref_jax.optics import interaction, interface_rules
+from refref_jax.optics.interface_rules import NO_PARENT
+from refref_jax.optics.media import AMBIENT
+
+_GLASS = jax.tree.map(jnp.asarray, interface_rules.nested([1.5], [NO_PARENT]))
+
+
+def _meet(direction, shading=(0.0, 0.0, 1.0)):
+    """Meets a glass surface z = 0 that faces up; the shading normal may lean."""
+    shading = np.asarray(shading) / np.linalg.norm(shading)
+    point = SurfacePoint(
+        position=jnp.zeros(3),
+        geometric_normal=jnp.array([0.0, 0.0, 1.0]),
+        shading_normal=jnp.asarray(shading, jnp.float32),
+        part=jnp.int32(0),
+        scale=jnp.float32(1.0),
+    )
+    unit = np.asarray(direction) / np.linalg.norm(direction)
+    return interaction.meet(point, _GLASS, jnp.asarray(unit, jnp.float32))
+
+
+def test_entering_glass():
+    met = _meet([0.0, 0.0, -1.0])
+    np.testing.assert_allclose(met.direction, [0, 0, -1], atol=1e-6)
+    np.testing.assert_allclose(met.reflected, [0, 0, 1], atol=1e-6)
+    assert met.reflectance == pytest.approx(0.04, abs=1e-6)
+    assert (int(met.medium_before), int(met.medium)) == (AMBIENT, 1)
+    assert met.restart[2] < 0.0
+
+
+def test_leaving_glass():
+    met = _meet([0.3, 0.0, 1.0])
+    assert (int(met.medium_before), int(met.medium)) == (1, AMBIENT)
+    sine = 1.5 * 0.3 / np.hypot(0.3, 1.0)
+    np.testing.assert_allclose(met.direction, [sine, 0, np.sqrt(1 - sine**2)], atol=1e-6)
+    assert met.restart[2] > 0.0
+
+
+def test_total_reflection_stays_inside():
+    met = _meet([1.0, 0.0, 0.5])
+    assert met.total
+    assert met.reflectance == 1.0
+    np.testing.assert_allclose(met.direction, met.reflected)
+    assert (int(met.medium_before), int(met.medium)) == (1, 1)
+    assert met.direction[2] < 0.0 and met.restart[2] < 0.0
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.1, -0.1, 1.0, -1.0, 10.0])
+@pytest.mark.parametrize("slope", [-1.0, -0.1, -1e-3, -1e-6, 1e-6, 1e-3, 0.1, 1.0])
+def test_no_ray_leaves_on_the_wrong_side_however_the_shading_normal_leans(lean, slope):
+    met = _meet([1.0, 0.0, slope], shading=(lean, 0.0, 1.0))
+    incident = -np.sign(slope)
+    onward = incident if met.total else -incident
+    assert np.sign(met.reflected[2]) == incident
+    assert np.sign(met.direction[2]) == onward
+    for unit in (met.reflected, met.direction):
+        assert np.linalg.norm(unit) == pytest.approx(1.0, abs=1e-6)
+    assert 0.0 <= met.reflectance <= 1.0
+
+
+def test_the_shading_normal_bends_the_ray():
+    flat, leaning = _meet([0.2, 0.0, -1.0]), _meet([0.2, 0.0, -1.0], shading=(0.1, 0.0, 1.0))
+    assert np.linalg.norm(flat.direction - leaning.direction) > 0.02

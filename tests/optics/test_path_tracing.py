@@ -1,0 +1,337 @@
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.optics import path_tracing
+from refref_jax.optics.budgets import PAPER, STRAIGHT, Budget, capacity_for
+from refref_jax.optics.light_paths import PathStatus, straight
+from refref_jax.optics.media import AMBIENT
+from tests import reference, scenes
+from tests.reference import Sphere
+
+# Planar bodies are exact: what is left is float32 rounding near coordinates of 4.
+_PLANAR_TOLERANCE = 5e-6
+
+# An icosphere of 20,480 faces with interpolated normals against the true sphere.
+_SPHERE_TOLERANCE = 4e-3
+
+
+@functools.partial(jax.jit, static_argnames=("budget", "capacity"))
+def _trace_jitted(geometry, rays, *, budget, capacity):
+    return path_tracing.trace(geometry, rays, budget=budget, capacity=capacity)
+
+
+def _trace(geometry, rays, *, budget=PAPER, capacity=None):
+    capacity = len(rays.radii) if capacity is None else capacity
+    traced = _trace_jitted(geometry, rays, budget=budget, capacity=capacity)
+    return jax.tree.map(np.asarray, traced)
+
+
+def _refracted(geometry, rays, bends=10):
+    return _trace(geometry, rays, budget=Budget(bends, "none")).paths
+
+
+@functools.cache
+def _ball_in_ball(rule, inner_index=1.333):
+    return scenes.geometry(
+        scenes.ball(1.0, index=1.5, subdivisions=5, name="outer_glass"),
+        scenes.ball(0.6, index=inner_index, subdivisions=5, name="inner"),
+        rule=rule,
+    )
+
+
+def _check_against_spheres(geometry, spheres, heights, bends):
+    origins = np.array([[-4.0, y, 0.1] for y in heights])
+    paths = _refracted(geometry, scenes.rays(origins, [1.0, 0.0, 0.0]))
+    for i, origin in enumerate(origins):
+        expected = reference.trace_concentric_spheres(
+            spheres, origin, np.array([1.0, 0.0, 0.0]), 10
+        )
+        assert len(expected) == bends == paths.bends[i]
+        found = slice(1, bends + 1)
+        np.testing.assert_allclose(
+            paths.points[i, found], [b.point for b in expected], atol=_SPHERE_TOLERANCE
+        )
+        np.testing.assert_allclose(
+            paths.directions[i, found], [b.direction for b in expected], atol=_SPHERE_TOLERANCE
+        )
+        steps = np.diff([origin, *(b.point for b in expected)], axis=0)
+        tau = np.cumsum(np.linalg.norm(steps, axis=-1))
+        np.testing.assert_allclose(paths.tau[i, found], tau, atol=_SPHERE_TOLERANCE)
+        assert paths.statuses[i] == PathStatus.ESCAPED
+
+
+@pytest.mark.parametrize("degrees", [0.0, 10.0, 45.0, 70.0])
+def test_a_slab_shifts_light_sideways(degrees):
+    thickness, theta = 0.5, np.radians(degrees)
+    geometry = scenes.geometry(scenes.box((20.0, 20.0, thickness), index=1.5))
+    direction = np.array([np.sin(theta), 0.0, -np.cos(theta)])
+    start = -3.0 * direction
+    paths = _refracted(geometry, scenes.rays(start, direction))
+    assert paths.bends[0] == 2
+    np.testing.assert_allclose(paths.directions[0, 2], direction, atol=_PLANAR_TOLERANCE)
+    inner = np.arcsin(np.sin(theta) / 1.5)
+    shift = thickness * np.sin(theta - inner) / np.cos(inner)
+    offset = paths.points[0, 2] - start
+    sideways = np.linalg.norm(offset - np.dot(offset, direction) * direction)
+    np.testing.assert_allclose(sideways, shift, atol=_PLANAR_TOLERANCE)
+    inside = thickness / np.cos(inner)
+    np.testing.assert_allclose(paths.tau[0, 2] - paths.tau[0, 1], inside, atol=_PLANAR_TOLERANCE)
+
+
+def test_a_right_prism_turns_light_by_total_reflection():
+    geometry = scenes.geometry(scenes.right_prism())
+    # Down through the leg z = 1 plane's neighbour x = 0, against the hypotenuse, out at z = 0.
+    paths = _refracted(geometry, scenes.rays([-2.0, 0.1, 0.3], [1.0, 0.0, 0.0]))
+    assert paths.bends[0] == 3
+    np.testing.assert_allclose(paths.points[0, 2], [0.7, 0.1, 0.3], atol=_PLANAR_TOLERANCE)
+    np.testing.assert_allclose(paths.directions[0, 2], [0.0, 0.0, -1.0], atol=_PLANAR_TOLERANCE)
+    np.testing.assert_allclose(paths.directions[0, 3], [0.0, 0.0, -1.0], atol=_PLANAR_TOLERANCE)
+    np.testing.assert_array_equal(paths.media[0, :4], [AMBIENT, 1, 1, AMBIENT])
+
+
+def test_a_ball_of_glass():
+    geometry = scenes.geometry(scenes.ball(1.0, subdivisions=5))
+    _check_against_spheres(geometry, [Sphere(1.0, 1.5, 1.0)], [0.0, 0.2, 0.5, 0.8], 2)
+
+
+def test_a_hollow_shell():
+    shell = [Sphere(1.0, 1.5, 1.0), Sphere(0.6, 1.0, 1.5)]
+    _check_against_spheres(_ball_in_ball("nested", 1.0), shell, [0.0, 0.2, 0.4], 4)
+
+
+def test_water_in_glass_bends_less_where_they_touch():
+    nested = [Sphere(1.0, 1.5, 1.0), Sphere(0.6, 1.333, 1.5)]
+    _check_against_spheres(_ball_in_ball("nested"), nested, [0.1, 0.3, 0.5], 4)
+    facing = [Sphere(1.0, 1.5, 1.0), Sphere(0.6, 1.333, 1.0)]
+    _check_against_spheres(_ball_in_ball("facing"), facing, [0.1, 0.3, 0.5], 4)
+
+
+@pytest.mark.parametrize(
+    ("height", "nested", "facing"),
+    [(0.1, -2.23, -7.03), (0.3, -6.72, -21.82), (0.5, -11.17, -39.29)],
+)
+def test_nested_and_facing_differ_as_physics_says(height, nested, facing):
+    # Exit angles in degrees from an independent float64 calculation on true spheres.
+    rays = scenes.rays([-4.0, height, 0.0], [1.0, 0.0, 0.0])
+    for rule, expected in (("nested", nested), ("facing", facing)):
+        paths = _refracted(_ball_in_ball(rule), rays)
+        x, y, _ = paths.directions[0, paths.bends[0]]
+        assert np.degrees(np.arctan2(y, x)) == pytest.approx(expected, abs=0.3)
+
+
+def test_media_are_named_along_the_path():
+    paths = _refracted(_ball_in_ball("nested"), scenes.rays([-4.0, 0.1, 0.0], [1.0, 0.0, 0.0]))
+    # Parts are numbered in the order given: the outer ball is 1, the inner one 2.
+    np.testing.assert_array_equal(paths.media[0, :5], [AMBIENT, 1, 2, 1, AMBIENT])
+
+
+def test_equal_indices_are_invisible():
+    geometry = scenes.geometry(scenes.ball(1.0, index=1.0, subdivisions=3))
+    rays = scenes.rays([[-4.0, y, 0.0] for y in (0.0, 0.5, 0.9)], [1.0, 0.0, 0.0])
+    traced = _trace(geometry, rays)
+    paths = jax.tree.map(lambda x: x[:3], traced.paths)
+    for i in range(3):
+        np.testing.assert_allclose(paths.directions[i, paths.bends[i]], [1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(paths.weights, 1.0, atol=1e-6)
+
+
+def test_light_paths_are_reversible():
+    geometry = scenes.geometry(scenes.box((1.0, 1.2, 1.4), index=1.5))
+    generator = np.random.default_rng(3)
+    origins = generator.normal(size=(200, 3))
+    origins *= 4.0 / np.linalg.norm(origins, axis=-1, keepdims=True)
+    there = _refracted(
+        geometry, scenes.rays(origins, generator.uniform(-0.4, 0.4, (200, 3)) - origins)
+    )
+    through = np.flatnonzero((there.statuses == PathStatus.ESCAPED) & (there.bends <= 8))
+    assert through.size > 50
+    last = there.bends[through]
+    ends = there.points[through, last] + 2.0 * there.directions[through, last]
+    back = _refracted(geometry, scenes.rays(ends, -there.directions[through, last]))
+    home = back.directions[np.arange(through.size), back.bends]
+    # A path that grazes an edge or the critical angle may take another way back.
+    same = np.linalg.norm(home + there.directions[through, 0], axis=-1) < 1e-3
+    assert same.mean() > 0.97
+
+
+def test_points_directions_and_distances_agree():
+    geometry = scenes.geometry(scenes.ball(1.0, subdivisions=4))
+    rays = scenes.rays([[-4.0, y, 0.3] for y in np.linspace(-0.9, 0.9, 20)], [1.0, 0.0, 0.0])
+    paths = _trace(geometry, rays).paths
+    for i in np.flatnonzero(paths.statuses != PathStatus.EMPTY):
+        for k in range(paths.bends[i]):
+            length = paths.tau[i, k + 1] - paths.tau[i, k]
+            end = paths.points[i, k] + length * paths.directions[i, k]
+            np.testing.assert_allclose(end, paths.points[i, k + 1], atol=1e-5)
+        assert np.all(np.isinf(paths.tau[i, paths.bends[i] + 1 :]))
+    np.testing.assert_allclose(np.linalg.norm(paths.directions, axis=-1), 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("bends", [1, 2, 3])
+def test_a_path_out_of_bends_says_so_and_goes_on(bends):
+    rays = scenes.rays([-4.0, 0.1, 0.0], [1.0, 0.0, 0.0])
+    full = _refracted(_ball_in_ball("nested"), rays)
+    cut = _refracted(_ball_in_ball("nested"), rays, bends=bends)
+    assert cut.statuses[0] == PathStatus.OUT_OF_BENDS
+    assert cut.bends[0] == bends
+    np.testing.assert_array_equal(cut.directions[0], full.directions[0, : bends + 1])
+
+
+def test_a_budget_that_just_suffices_escapes():
+    rays = scenes.rays([-4.0, 0.1, 0.0], [1.0, 0.0, 0.0])
+    paths = _refracted(_ball_in_ball("nested"), rays, bends=4)
+    assert paths.statuses[0] == PathStatus.ESCAPED
+
+
+def test_rays_that_miss_stay_straight():
+    geometry = scenes.geometry(scenes.ball(1.0))
+    rays = scenes.rays([-4.0, 2.0, 0.0], [1.0, 0.0, 0.0])
+    traced = _trace(geometry, rays)
+    assert traced.paths.statuses[0] == PathStatus.MISSED
+    assert traced.paths.statuses[1] == PathStatus.EMPTY
+    assert np.all(traced.paths.weights[0] == 1.0) and np.all(traced.paths.weights[1] == 0.0)
+    assert np.all(np.isinf(traced.paths.tau[0, 1:]))
+
+
+def test_the_paper_reflects_once_at_the_first_surface():
+    geometry = scenes.geometry(scenes.box((2.0, 2.0, 2.0), index=1.5))
+    direction = np.array([0.6, 0.0, -0.8])
+    rays = scenes.rays(-4.0 * direction + [0.0, 0.0, 1.0], direction)
+    paths = _trace(geometry, rays).paths
+    reflectance = reference.fresnel_by_angles(np.arccos(0.8), 1.0, 1.5)
+    np.testing.assert_allclose(paths.weights[0], 1.0 - reflectance, atol=1e-6)
+    np.testing.assert_allclose(paths.weights[1], reflectance, atol=1e-6)
+    assert paths.statuses[1] == PathStatus.NOT_TRACED
+    assert paths.bends[1] == 1
+    np.testing.assert_allclose(paths.points[1, 1], [0.0, 0.0, 1.0], atol=_PLANAR_TOLERANCE)
+    np.testing.assert_allclose(paths.directions[1, 1], [0.6, 0.0, 0.8], atol=_PLANAR_TOLERANCE)
+    np.testing.assert_allclose(paths.tau[1, :2], [0.0, 4.0], atol=_PLANAR_TOLERANCE)
+    np.testing.assert_array_equal(paths.media[1, :2], [AMBIENT, AMBIENT])
+
+
+def test_fresnel_uses_the_index_of_the_part_that_was_hit():
+    diamond = scenes.box((1.0, 1.0, 1.0), index=2.418, name="a_diamond")
+    glass = scenes.ball(0.5, index=1.5, centre=(5.0, 0.0, 0.0), name="b_glass")
+    rays = scenes.rays([[0.0, 0.0, 4.0], [5.0, 0.0, 4.0]], [0.0, 0.0, -1.0])
+    paths = _trace(scenes.geometry(diamond, glass), rays).paths
+    np.testing.assert_allclose(1.0 - paths.weights[0], (1.418 / 3.418) ** 2, atol=1e-6)
+    # The ball's shading normal there is off by the mesh, not by much.
+    np.testing.assert_allclose(1.0 - paths.weights[1], 0.04, atol=1e-4)
+
+
+def _many_rays():
+    generator = np.random.default_rng(0)
+    targets = generator.uniform(-1.5, 1.5, (64, 3))
+    return scenes.rays([-4.0, 0.0, 0.0], targets + np.array([4.0, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize("capacity", [0, 5, 64])
+def test_weights_of_every_ray_sum_to_one_at_any_capacity(capacity):
+    geometry = scenes.geometry(scenes.ball(1.0))
+    full = _trace(geometry, _many_rays())
+    traced = _trace(geometry, _many_rays(), capacity=capacity)
+    sums = np.zeros((64, 3))
+    np.add.at(sums, traced.paths.rays, traced.paths.weights)
+    np.testing.assert_allclose(sums, 1.0, atol=1e-6)
+    share = full.paths.weights[64:, 0].sum()
+    kept = traced.paths.weights[64:, 0].sum()
+    np.testing.assert_allclose(traced.dropped.sum(), share - kept, atol=1e-5)
+    assert (traced.dropped.max() > 0) == (capacity == 5 or capacity == 0)
+
+
+def test_the_strongest_reflections_are_kept():
+    geometry = scenes.geometry(scenes.ball(1.0))
+    full = _trace(geometry, _many_rays()).paths.weights[64:, 0]
+    kept = _trace(geometry, _many_rays(), capacity=5).paths.weights[64:, 0]
+    np.testing.assert_allclose(kept, np.sort(full)[::-1][:5])
+
+
+def test_tracing_in_a_pool_equals_tracing_batch_by_batch():
+    geometry = scenes.geometry(scenes.ball(1.0))
+    rays = _many_rays()
+    batches = jax.tree.map(lambda x: x.reshape(4, 16, *x.shape[1:]), rays)
+    trace_pool = jax.jit(functools.partial(path_tracing.trace_batches, budget=PAPER, capacity=16))
+    pool = trace_pool(geometry, batches)
+    for i in range(4):
+        batch = jax.tree.map(lambda x, i=i: x[i], batches)
+        single = _trace(geometry, batch)
+        jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, atol=1e-6), pool, single)
+
+
+def test_the_straight_budget_ignores_the_objects():
+    rays = _many_rays()
+    traced = _trace(scenes.geometry(scenes.ball(1.0)), rays, budget=STRAIGHT, capacity=0)
+    jax.tree.map(np.testing.assert_array_equal, traced.paths, straight(rays))
+    assert np.all(traced.dropped == 0.0)
+
+
+def test_an_empty_scene_bends_nothing():
+    traced = _trace(scenes.geometry(), _many_rays())
+    assert np.all(traced.paths.statuses[:64] == PathStatus.MISSED)
+    assert np.all(traced.paths.statuses[64:] == PathStatus.EMPTY)
+    assert all(np.all(np.isfinite(x)) for x in (traced.paths.points, traced.paths.weights))
+
+
+def test_a_camera_inside_glass_starts_in_its_medium():
+    paths = _refracted(scenes.geometry(scenes.box()), scenes.rays([0.0, 0.0, 0.0], [0.1, 0.0, 1.0]))
+    np.testing.assert_array_equal(paths.media[0, :2], [1, AMBIENT])
+    sine = 1.5 * 0.1 / np.hypot(0.1, 1.0)
+    np.testing.assert_allclose(paths.directions[0, 1, 0], sine, atol=1e-6)
+
+
+def test_total_reflection_at_the_first_surface_needs_no_second_path():
+    rays = scenes.rays([0.0, 0.0, 0.0], [0.5, 0.0, 0.45])
+    paths = _trace(scenes.geometry(scenes.box((4.0, 4.0, 1.0))), rays).paths
+    np.testing.assert_array_equal(paths.weights[0], 1.0)
+    assert paths.statuses[1] == PathStatus.EMPTY
+
+
+@pytest.mark.parametrize("size", [1e-3, 1e3])
+def test_paths_scale_with_the_scene(size):
+    part = scenes.ball(1.0, subdivisions=3)
+    rays = scenes.rays([[-4.0, y, 0.1] for y in (0.1, 0.5, 0.8)], [1.0, 0.0, 0.0])
+    small = _refracted(scenes.geometry(part), rays)
+    scaled = _refracted(
+        scenes.geometry(part._replace(vertices=part.vertices * size)),
+        rays._replace(origins=rays.origins * size),
+    )
+    np.testing.assert_array_equal(scaled.bends, small.bends)
+    np.testing.assert_allclose(scaled.directions, small.directions, atol=1e-5)
+    used = np.isfinite(small.tau)
+    np.testing.assert_allclose(scaled.tau[used] / size, small.tau[used], atol=1e-5)
+
+
+def test_in_double_precision_a_slab_is_exact():
+    with jax.enable_x64(True):
+        geometry = jax.tree.map(
+            lambda x: x.astype(jnp.float64) if x.dtype == jnp.float32 else x,
+            scenes.geometry(scenes.box((8.0, 8.0, 0.5), index=1.5)),
+        )
+        theta = np.radians(40.0)
+        direction = np.array([[np.sin(theta), 0.0, -np.cos(theta)]])
+        rays = scenes.rays([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])._replace(
+            origins=jnp.asarray(-3.0 * direction),
+            directions=jnp.asarray(direction),
+            radii=jnp.full(1, 1e-3),
+        )
+        paths = _trace(geometry, rays).paths
+        np.testing.assert_allclose(paths.directions[0, 2], direction[0], atol=1e-14)
+        inner = np.arcsin(np.sin(theta) / 1.5)
+        np.testing.assert_allclose(
+            paths.tau[0, 2] - paths.tau[0, 1], 0.5 / np.cos(inner), rtol=1e-13
+        )
+
+
+def test_capacity_covers_the_hits_of_random_batches():
+    generator = np.random.default_rng(0)
+    for rays, fraction in [(1024, 0.2), (64, 0.5), (4096, 0.01)]:
+        capacity = capacity_for(PAPER, rays, fraction)
+        assert capacity <= rays
+        assert generator.binomial(rays, fraction, 10_000).max() <= capacity
+    assert capacity_for(STRAIGHT, 1024, 0.5) == 0
+    assert capacity_for(PAPER, 100, 1.0) == 100
+    assert capacity_for(PAPER, 100, 0.0) == 0

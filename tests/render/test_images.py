@@ -1,0 +1,92 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.data.cameras import image_rays
+from refref_jax.geometry.rays import Rays
+from refref_jax.optics.budgets import PAPER, STRAIGHT
+from refref_jax.render import Model, images, init_params, render_image, render_rays
+from tests import scenes
+from tests.small_model import CAMERAS, MODEL
+
+
+@pytest.fixture(scope="module")
+def model():
+    params = init_params(jax.random.key(0), MODEL)
+    return Model(MODEL, PAPER, scenes.geometry(scenes.ball(1.3, subdivisions=2)), params)
+
+
+@pytest.fixture(scope="module")
+def rays():
+    return image_rays(CAMERAS, 0)
+
+
+@pytest.fixture(scope="module")
+def whole(model, rays):
+    return render_image(model, rays)
+
+
+def test_an_image_has_the_shape_of_its_rays(whole):
+    assert whole.rgb.shape == (16, 16, 3)
+    assert whole.distance.shape == whole.mean_distance.shape == (16, 16)
+    assert np.all((whole.rgb >= 0.0) & (whole.rgb <= 1.0))
+    assert np.all(np.isfinite(whole.distance)) and np.all(whole.distance >= MODEL.near)
+    np.testing.assert_allclose(whole.accumulation, 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("chunk", [64, 100, 1000])
+def test_the_size_of_a_chunk_does_not_matter(model, rays, whole, chunk):
+    pieces = render_image(model, rays, chunk=chunk)
+    for ours, expected in zip(pieces, whole, strict=True):
+        np.testing.assert_allclose(ours, expected, atol=2e-5)
+
+
+def test_rendering_in_one_piece_gives_the_same(model, rays, whole):
+    flat = Rays(*(jnp.asarray(x.reshape(256, *x.shape[2:])) for x in rays))
+    single = jax.jit(lambda params: render_rays(model._replace(params=params), flat))
+    for ours, expected in zip(single(model.params), whole, strict=True):
+        np.testing.assert_allclose(ours, expected.reshape(ours.shape), atol=2e-5)
+
+
+def test_an_image_of_several_tiles(model, rays, whole, monkeypatch):
+    monkeypatch.setattr(images, "TILE", 100)
+    images._trace_tile.clear_cache()
+    tiled = render_image(model, rays)
+    images._trace_tile.clear_cache()
+    for ours, expected in zip(tiled, whole, strict=True):
+        np.testing.assert_allclose(ours, expected, atol=2e-5)
+
+
+def test_nothing_is_compiled_twice(model):
+    render_image(model, image_rays(CAMERAS, 0))
+    before = images._trace_tile._cache_size(), images._render_chunk._cache_size()
+    for camera in (1, 2):
+        render_image(model, image_rays(CAMERAS, camera))
+    assert (images._trace_tile._cache_size(), images._render_chunk._cache_size()) == before
+
+
+def test_rays_that_miss_pay_nothing_for_reflection(model, rays):
+    flat = Rays(*(x.reshape(256, *x.shape[2:]) for x in rays))
+    tile = images._slice_rays(flat, 0)
+    paper = images._trace_tile(model.geometry, tile, budget=PAPER)
+    straight = images._trace_tile(model.geometry, tile, budget=STRAIGHT)
+    # Of the tile's rays, some meet the ball; the last one is repeated, and misses it.
+    hits = np.sum(np.asarray(paper.paths.bends)[: images.TILE] > 0)
+    assert 0 < hits < 256
+    extra = int(paper.count) - int(straight.count)
+    assert extra == np.sum(np.asarray(paper.paths.statuses) == 4)
+    assert extra <= 256
+
+
+def test_gradients_reach_the_fields_and_are_finite(model, rays):
+    flat = Rays(*(jnp.asarray(x.reshape(256, *x.shape[2:])[::16]) for x in rays))
+
+    @jax.jit
+    @jax.grad
+    def slope(params):
+        return jnp.mean(render_rays(model._replace(params=params), flat).rgb)
+
+    gradient = jax.tree.leaves(slope(model.params))
+    assert all(np.all(np.isfinite(leaf)) for leaf in gradient)
+    assert any(np.any(np.asarray(leaf) != 0.0) for leaf in gradient)

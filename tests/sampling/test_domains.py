@@ -1,0 +1,245 @@
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.sampling import domains
+from refref_jax.sampling.cones import Gaussians
+from refref_jax.sampling.domains import Domain
+from tests import gradients, reference_sampling, transformations
+
+# A few float32 roundings.
+_ROUNDING = 1e-6
+
+_MAGNITUDES = 10.0 ** np.arange(-6, 7)
+
+_contract = jax.jit(domains.contract)
+_uncontract = jax.jit(domains.uncontract)
+_shrinkage = jax.jit(domains.shrinkage)
+
+
+def _points(magnitude, count=20):
+    """Returns points in all directions at a distance from the origin."""
+    directions = np.random.default_rng(0).normal(size=(count, 3))
+    directions[:3] = np.eye(3)
+    unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    return jnp.asarray(magnitude * unit, jnp.float32)
+
+
+def _cube(domain, positions, scales=None):
+    positions = jnp.asarray(positions, jnp.float32)
+    scales = jnp.zeros(positions.shape[0]) if scales is None else jnp.asarray(scales, jnp.float32)
+    return domains.to_unit_cube(domain, Gaussians(positions, scales))
+
+
+# --- contraction ---
+
+
+def test_contract_by_hand():
+    got = _contract(jnp.array([[0.5, 0.0, 0.0], [0.0, -2.0, 0.0], [0.0, 3.0, 4.0]]))
+    np.testing.assert_allclose(
+        got, [[0.5, 0.0, 0.0], [0.0, -1.5, 0.0], [0.0, 1.08, 1.44]], atol=_ROUNDING
+    )
+
+
+@pytest.mark.parametrize("magnitude", _MAGNITUDES)
+def test_contract_against_its_definition(magnitude):
+    points = _points(magnitude)
+    expected = [reference_sampling.contracted(point) for point in points]
+    np.testing.assert_allclose(_contract(points), expected, rtol=_ROUNDING, atol=_ROUNDING)
+
+
+@pytest.mark.parametrize("magnitude", _MAGNITUDES)
+def test_uncontract_inverts_contract(magnitude):
+    # Near the sphere of radius 2 a rounding is a share `|x|` of the whole distance.
+    points = _points(magnitude)
+    tolerance = _ROUNDING * max(magnitude, 1.0)
+    error = np.asarray(_uncontract(_contract(points)) - points, np.float64) / magnitude
+    assert np.linalg.norm(error, axis=-1).max() <= tolerance
+
+
+@pytest.mark.parametrize("radius", [1e-6, 0.5, 1.0, 1.5, 1.99])
+def test_contract_inverts_uncontract(radius):
+    points = _points(radius)
+    np.testing.assert_allclose(_contract(_uncontract(points)), points, atol=_ROUNDING)
+
+
+@pytest.mark.parametrize("magnitude", [0.0, 1e-30, 1e-6, 0.3, 0.999])
+def test_the_unit_ball_stays_as_it_is(magnitude):
+    points = _points(magnitude)
+    np.testing.assert_array_equal(_contract(points), points)
+    np.testing.assert_array_equal(_uncontract(points), points)
+    np.testing.assert_array_equal(_shrinkage(points), np.ones(20))
+
+
+def test_contraction_is_smooth_where_it_starts():
+    inner, outer = _points(1.0 - 1e-6), _points(1.0 + 1e-6)
+    np.testing.assert_allclose(_contract(outer), _contract(inner), atol=4e-6)
+    np.testing.assert_allclose(_shrinkage(outer), _shrinkage(inner), atol=4e-6)
+    jacobian = jax.jit(jax.vmap(jax.jacfwd(domains.contract)))
+    # Across the sphere the slope starts to fall like `1 / |x|^2`.
+    np.testing.assert_allclose(jacobian(outer), jacobian(inner), atol=1e-5)
+
+
+@pytest.mark.parametrize("magnitude", [2.0, 1e3, 1e6, 1e30])
+def test_everything_is_contracted_into_the_ball_of_radius_two(magnitude):
+    points = _points(magnitude)
+    contracted = np.asarray(_contract(points), np.float64)
+    norm = np.linalg.norm(contracted, axis=-1)
+    np.testing.assert_allclose(norm, 2.0 - 1.0 / magnitude, rtol=_ROUNDING)
+    along = contracted / norm[:, None]
+    np.testing.assert_allclose(along, np.asarray(points, np.float64) / magnitude, atol=_ROUNDING)
+
+
+def test_contraction_keeps_the_order_of_distances():
+    distances = np.geomspace(1e-3, 1e3, 200)
+    points = jnp.asarray(distances[:, None] * np.array([[0.6, 0.0, 0.8]]), jnp.float32)
+    assert (np.diff(np.linalg.norm(_contract(points), axis=-1)) > 0.0).all()
+
+
+# --- shrinkage ---
+
+
+@pytest.mark.parametrize("magnitude", [1e-3, 0.5, 1.5, 10.0, 1e3, 1e6])
+def test_shrinkage_is_the_cube_root_of_the_jacobians_determinant(magnitude):
+    with jax.enable_x64(True):
+        points = _points(magnitude).astype(jnp.float64)
+        jacobians = np.asarray(jax.jit(jax.vmap(jax.jacfwd(domains.contract)))(points))
+    expected = abs(np.linalg.det(jacobians)) ** (1.0 / 3.0)
+    np.testing.assert_allclose(_shrinkage(_points(magnitude)), expected, rtol=1e-5)
+
+
+def test_shrinkage_by_hand():
+    # (2 - 1/2)^(2/3) 2^(-4/3) = (9 / 64)^(1/3).
+    got = _shrinkage(jnp.array([0.0, 2.0, 0.0]))
+    np.testing.assert_allclose(got, (9.0 / 64.0) ** (1.0 / 3.0), rtol=_ROUNDING)
+
+
+# --- the unit cube ---
+
+_BOUNDED, _UNBOUNDED = Domain(2.0, False), Domain(2.0, True)
+
+
+def test_a_bounded_scene_fills_the_cube():
+    got = _cube(_BOUNDED, [[0.0, 1.0, -2.0], [2.0, -1.0, 0.5]], [0.4, 1.0])
+    np.testing.assert_allclose(
+        got.positions, [[0.5, 0.75, 0.0], [1.0, 0.25, 0.625]], atol=_ROUNDING
+    )
+    np.testing.assert_allclose(got.scales, [0.1, 0.25], rtol=_ROUNDING)
+
+
+def test_an_unbounded_scene_keeps_its_ball_in_the_middle():
+    got = _cube(_UNBOUNDED, [[0.0, 1.0, -2.0 / 3.0], [4.0, 0.0, 0.0]], [0.4, 0.4])
+    np.testing.assert_allclose(
+        got.positions, [[0.5, 0.625, 5.0 / 12.0], [0.875, 0.5, 0.5]], atol=_ROUNDING
+    )
+    shrunk = 0.05 * (9.0 / 64.0) ** (1.0 / 3.0)
+    np.testing.assert_allclose(got.scales, [0.05, shrunk], rtol=_ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ("outside", "expected"),
+    [
+        ([2.5, 0.0, 0.0], [1.0, 0.5, 0.5]),
+        ([-3.0, 1.0, 100.0], [0.0, 0.75, 1.0]),
+        ([1e30, -1e30, 0.0], [1.0, 0.0, 0.5]),
+    ],
+)
+def test_points_outside_a_bounded_scene_go_to_the_nearest_face(outside, expected):
+    np.testing.assert_allclose(_cube(_BOUNDED, [outside]).positions[0], expected, atol=_ROUNDING)
+
+
+@pytest.mark.parametrize("domain", [_BOUNDED, _UNBOUNDED])
+@pytest.mark.parametrize("magnitude", [0.0, 1e-30, 1e-3, 1.0, 2.0, 1e3, 1e10, 1e30])
+def test_everything_lands_in_the_unit_cube(domain, magnitude):
+    got = _cube(domain, _points(magnitude), np.full(20, 1e-3 * magnitude))
+    # Rounding may leave the cube by a unit in the last place; the hash grid holds its cells.
+    assert ((got.positions >= -_ROUNDING) & (got.positions <= 1.0 + _ROUNDING)).all()
+    assert ((got.scales >= 0.0) & jnp.isfinite(got.scales)).all()
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_scenes_of_another_size_look_the_same(unbounded):
+    points, scales = 3.0 * _points(1.0), np.full(20, 0.1)
+    small = _cube(Domain(2.0, unbounded), points, scales)
+    large = _cube(Domain(14.0, unbounded), 7.0 * points, 7.0 * scales)
+    for a, b in zip(small, large, strict=True):
+        np.testing.assert_allclose(a, b, atol=_ROUNDING)
+
+
+@pytest.mark.parametrize("magnitude", [0.5, 3.0, 100.0])
+def test_a_small_ball_keeps_its_volume_in_the_scale(magnitude):
+    # The scale of a contracted Gaussian is the cube root of how its volume changes.
+    centre, size = _points(magnitude, 3)[:1], 1e-3 * magnitude
+    corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * size
+    edges = np.asarray(centre, np.float64) + corners
+    cube = np.array([reference_sampling.contracted(x / 2.0) * 0.25 + 0.5 for x in edges])
+    sides = np.stack([cube[4] - cube[0], cube[2] - cube[0], cube[1] - cube[0]])
+    expected = abs(np.linalg.det(sides)) ** (1.0 / 3.0)
+    got = _cube(_UNBOUNDED, centre, [size]).scales[0]
+    np.testing.assert_allclose(got, expected, rtol=5e-3)
+
+
+# --- gradients and transformations ---
+
+
+@pytest.mark.parametrize("function", [domains.contract, domains.shrinkage])
+@pytest.mark.parametrize("magnitude", [0.0, 1e-30, 1e-6, 1.0, 1e6, 1e30])
+def test_gradients_are_finite_at_any_distance(function, magnitude):
+    jacobian = jax.jit(jax.vmap(jax.jacrev(function)))(_points(magnitude))
+    assert jnp.isfinite(jacobian).all()
+
+
+@pytest.mark.parametrize("radius", [0.0, 1e-30, 0.5, 1.0, 1.999])
+def test_gradients_of_uncontract_are_finite(radius):
+    jacobian = jax.jit(jax.vmap(jax.jacrev(domains.uncontract)))(_points(radius))
+    assert jnp.isfinite(jacobian).all()
+
+
+@pytest.mark.parametrize("magnitude", [3.0, 1e3, 1e6])
+def test_contract_has_the_right_gradient_far_away(magnitude):
+    points = _points(magnitude)
+    got = np.asarray(jax.jit(jax.vmap(jax.jacrev(domains.contract)))(points), np.float64)
+    for jacobian, point in zip(got, np.asarray(points, np.float64), strict=True):
+        unit = point / np.linalg.norm(point)
+        across = (2.0 - 1.0 / magnitude) / magnitude * (np.eye(3) - np.outer(unit, unit))
+        expected = across + np.outer(unit, unit) / magnitude**2
+        np.testing.assert_allclose(jacobian, expected, atol=3.0 * _ROUNDING / magnitude)
+
+
+@pytest.mark.parametrize("domain", [_BOUNDED, _UNBOUNDED])
+@pytest.mark.parametrize("magnitude", [0.0, 1e30])
+def test_gradients_of_the_unit_cube_are_finite(domain, magnitude):
+    def total(positions, scales):
+        return sum(jnp.sum(x) for x in _cube(domain, positions, scales))
+
+    arguments = _points(magnitude), jnp.ones(20)
+    assert gradients.all_finite(jax.jit(jax.grad(total, argnums=(0, 1)))(*arguments))
+
+
+@pytest.mark.parametrize("function", [domains.contract, domains.uncontract, domains.shrinkage])
+def test_check_grads(function):
+    gradients.assert_numerical(function, [[0.1, -0.4, 0.2], [0.5, -0.9, 0.8], [1.0, 1.2, -0.9]])
+
+
+def _box(positions, scales, *, domain):
+    return tuple(domains.to_unit_cube(domain, Gaussians(positions, scales)))
+
+
+_SOME = (jnp.stack([_points(x) for x in (0.5, 1.0, 20.0)]), jnp.ones((3, 20)))
+
+_CASES = {
+    "contract": lambda x, scales: domains.contract(x),
+    "uncontract": lambda x, scales: domains.uncontract(0.05 * x),
+    "shrinkage": lambda x, scales: domains.shrinkage(x),
+    "bounded": lambda x, scales: _box(x, scales, domain=_BOUNDED),
+    "unbounded": lambda x, scales: _box(x, scales, domain=_UNBOUNDED),
+}
+
+
+@pytest.mark.parametrize("transformation", transformations.ALL)
+@pytest.mark.parametrize("name", _CASES)
+def test_transformations_change_nothing(name, transformation):
+    transformation(_CASES[name], _SOME)

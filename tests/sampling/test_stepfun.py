@@ -1,0 +1,441 @@
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.sampling import stepfun
+from tests import gradients, reference_sampling, transformations
+
+# Cumulative sums of a dozen float32 numbers of about 1.
+_SUMMATION = 2e-6
+
+_BINS = 9
+
+_AMOUNT = 0.07
+
+_cumulative = jax.jit(stepfun.cumulative)
+_invert = jax.jit(stepfun.invert_cumulative)
+_sample = jax.jit(stepfun.sample_edges)
+_dilate = jax.jit(stepfun.dilate, static_argnums=2)
+_blur = jax.jit(stepfun.blur, static_argnums=2)
+_integrate = jax.jit(stepfun.integrate_linear)
+
+
+def _f32(*arrays):
+    return tuple(jnp.asarray(array, jnp.float32) for array in arrays)
+
+
+def _step_function(seed, *, empty=0):
+    """Returns edges in `[0, 1]` and weights that sum to 1, some of them 0, as float32."""
+    rng = np.random.default_rng(seed)
+    edges = np.concatenate([[0.0], np.sort(rng.uniform(size=_BINS - 1)), [1.0]])
+    weights = rng.uniform(0.05, 1.0, size=_BINS)
+    weights[rng.permutation(_BINS)[:empty]] = 0.0
+    return _f32(edges, weights / weights.sum())
+
+
+def _middles(count):
+    return (jnp.arange(count, dtype=jnp.float32) + 0.5) / count
+
+
+def _masses(edges, samples_edges):
+    """Returns the share of equally heavy intervals that falls into each bin."""
+    cdf = np.linspace(0.0, 1.0, len(samples_edges))
+    return np.diff(np.interp(edges, np.asarray(samples_edges, np.float64), cdf))
+
+
+# A dozen bins, of which some have no width at all.
+_NARROW = jnp.array([0.0, 0.2, 0.2, 0.2, 0.5, 0.5 + 1e-6, 0.8, 1.0, 1.0])
+
+
+# --- heights ---
+
+
+def test_heights_by_hand():
+    got = stepfun.heights(*_f32([0.0, 0.5, 0.5, 2.5], [0.25, 0.5, 1.0]))
+    np.testing.assert_allclose(got, [0.5, 0.0, 0.5])
+
+
+def test_heights_times_widths_are_the_weights():
+    edges, weights = _step_function(0)
+    got = stepfun.heights(edges, weights) * jnp.diff(edges)
+    np.testing.assert_allclose(got, weights, rtol=_SUMMATION)
+
+
+def test_heights_have_finite_gradients_where_a_bin_has_no_width():
+    total = lambda edges, weights: jnp.sum(stepfun.heights(edges, weights))
+    assert gradients.all_finite(jax.grad(total, argnums=(0, 1))(_NARROW, jnp.ones(8)))
+
+
+# --- cumulative ---
+
+
+def test_cumulative_by_hand():
+    got = _cumulative(jnp.array([1.0, 0.0, 2.0, 5.0]))
+    np.testing.assert_allclose(got, [0.0, 0.125, 0.125, 0.375, 1.0], rtol=_SUMMATION)
+
+
+@pytest.mark.parametrize("empty", [0, 4, _BINS - 1])
+def test_cumulative_against_a_loop(empty):
+    _, weights = _step_function(1, empty=empty)
+    expected = reference_sampling.cumulative(weights)
+    np.testing.assert_allclose(_cumulative(weights), expected, atol=_SUMMATION)
+
+
+def test_cumulative_of_nothing_is_uniform():
+    got = _cumulative(jnp.zeros(_BINS))
+    np.testing.assert_allclose(got, np.linspace(0.0, 1.0, _BINS + 1), atol=_SUMMATION)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-10, 1e10, 1e30])
+def test_cumulative_ignores_the_scale_of_the_weights(scale):
+    _, weights = _step_function(2, empty=2)
+    np.testing.assert_allclose(_cumulative(scale * weights), _cumulative(weights), atol=_SUMMATION)
+
+
+@pytest.mark.parametrize("bins", [7, 64, 193])
+def test_cumulative_runs_from_exactly_zero_to_exactly_one_and_never_decreases(bins):
+    rng = np.random.default_rng(bins)
+    weights = rng.uniform(size=(300, bins)) ** 4 * (rng.uniform(size=(300, bins)) > 0.5)
+    cdf = np.asarray(_cumulative(*_f32(weights)))
+    assert (cdf[:, 0] == 0.0).all() and (cdf[:, -1] == 1.0).all()
+    assert (np.diff(cdf, axis=-1) >= 0.0).all()
+
+
+@pytest.mark.parametrize("weights", [np.zeros(_BINS), np.eye(_BINS)[3], np.full(_BINS, 1e-30)])
+def test_cumulative_has_finite_gradients(weights):
+    total = lambda w: jnp.sum(jnp.square(stepfun.cumulative(w)))
+    assert gradients.all_finite(jax.jit(jax.grad(total))(*_f32(weights)))
+
+
+# --- its inverse ---
+
+
+def test_invert_cumulative_by_hand():
+    arguments = _f32([0.0, 0.25, 0.5, 0.75, 1.0], [0.0, 1.0, 4.0, 6.0], [0.0, 0.5, 0.5, 1.0])
+    np.testing.assert_allclose(_invert(*arguments), [0.0, 0.5, 4.0, 5.0, 6.0])
+
+
+@pytest.mark.parametrize("empty", [0, 4])
+def test_invert_cumulative_against_a_loop(empty):
+    edges, weights = _step_function(3, empty=empty)
+    cdf = _cumulative(weights)
+    u = np.random.default_rng(0).uniform(size=30).astype(np.float32)
+    wide = np.asarray(edges, np.float64), np.asarray(cdf, np.float64)
+    expected = [reference_sampling.invert_cumulative(float(x), *wide) for x in u]
+    np.testing.assert_allclose(_invert(jnp.asarray(u), edges, cdf), expected, atol=_SUMMATION)
+
+
+def test_invert_cumulative_inverts():
+    edges, weights = _step_function(4)
+    cdf = _cumulative(weights)
+    u = jnp.linspace(0.0, 1.0, 101)
+    back = np.interp(_invert(u, edges, cdf), edges, cdf)
+    np.testing.assert_allclose(back, u, atol=_SUMMATION)
+
+
+def test_invert_cumulative_meets_the_edges():
+    edges, weights = _step_function(5)
+    cdf = _cumulative(weights)
+    np.testing.assert_allclose(_invert(cdf, edges, cdf), edges, atol=_SUMMATION)
+
+
+def test_invert_cumulative_skips_what_is_empty():
+    edges, cdf = _f32([0.0, 1.0, 2.0, 3.0, 4.0], [0.0, 0.0, 1.0, 1.0, 1.0])
+    got = _invert(jnp.array([0.0, 1e-6, 0.5, 1.0 - 1e-6]), edges, cdf)
+    np.testing.assert_allclose(got, [1.0, 1.0, 1.5, 2.0], atol=1e-5)
+
+
+# --- sampling ---
+
+
+def test_sample_edges_by_hand():
+    # Samples at 1/4 and 3/4 of the mass: at 1 and 2.5, with 1.75 between.
+    got = _sample(*_f32([0.25, 0.75], [0.0, 2.0, 3.0], [0.5, 0.5]))
+    np.testing.assert_allclose(got, [0.25, 1.75, 3.0])
+
+
+@pytest.mark.parametrize("empty", [0, 4, _BINS - 1])
+@pytest.mark.parametrize("count", [2, 7, 16])
+def test_sample_edges_against_a_loop(empty, count):
+    edges, weights = _step_function(6, empty=empty)
+    u = np.sort(np.random.default_rng(count).uniform(size=count)).astype(np.float32)
+    expected = reference_sampling.sample_edges(u, edges, weights)
+    np.testing.assert_allclose(
+        _sample(jnp.asarray(u), edges, weights), expected, atol=2.0 * _SUMMATION
+    )
+
+
+def test_sampling_evenly_from_an_even_function_gives_even_intervals():
+    got = _sample(_middles(8), *_f32([0.0, 1.0], [0.3]))
+    np.testing.assert_allclose(got, np.linspace(0.0, 1.0, 9), atol=_SUMMATION)
+
+
+@pytest.mark.parametrize("empty", [0, 4])
+def test_many_samples_reproduce_the_weights(empty):
+    edges, weights = _step_function(7, empty=empty)
+    drawn = _sample(_middles(2048), edges, weights)
+    np.testing.assert_allclose(_masses(edges, drawn), weights, atol=2.0 / 2048)
+
+
+def test_sampling_again_from_even_intervals_changes_nothing():
+    edges, weights = _step_function(8)
+    once = _sample(_middles(64), edges, weights)
+    twice = _sample(_middles(64), once, jnp.ones(64))
+    # Only the edges at the ends and the kinks of the function are smoothed.
+    assert np.median(abs(np.asarray(once) - np.asarray(twice))) < 1e-3
+
+
+_HARD_WEIGHTS = [np.zeros(8), *np.eye(8), np.full(8, 1e-30), np.array([1.0, 0, 0, 0, 0, 0, 0, 1])]
+
+
+@pytest.mark.parametrize("weights", _HARD_WEIGHTS)
+@pytest.mark.parametrize("offset", [-0.5, 0.0, 0.499999])
+def test_samples_are_sorted_and_stay_within_the_domain(weights, offset):
+    u = (jnp.arange(16, dtype=jnp.float32) + 0.5 + offset) / 16.0
+    drawn = np.asarray(_sample(u, _NARROW, *_f32(weights)))
+    assert np.isfinite(drawn).all() and (np.diff(drawn) >= 0.0).all()
+    assert drawn[0] >= 0.0 and drawn[-1] <= 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_samples_of_random_functions_are_sorted_and_stay_within_the_domain(seed):
+    rng = np.random.default_rng(seed)
+    edges = np.sort(rng.uniform(size=(200, 65)) ** rng.choice([1, 8], size=(200, 1)), axis=-1)
+    weights = rng.uniform(size=(200, 64)) ** 8 * (rng.uniform(size=(200, 64)) > 0.7)
+    u = np.sort(rng.uniform(size=(200, 32)), axis=-1)
+    drawn = np.asarray(_sample(*_f32(u, edges, weights)))
+    first, last = np.float32(edges[:, :1]), np.float32(edges[:, -1:])
+    assert ((drawn >= first) & (drawn <= last)).all()
+    # Where a bin is left and the next one starts, rounding may swap two samples by this much.
+    assert (np.diff(drawn, axis=-1) >= -_SUMMATION).all()
+
+
+def test_all_weight_in_one_bin_draws_from_that_bin_only():
+    edges, weights = _f32([0.0, 0.3, 0.4, 1.0], [0.0, 7.0, 0.0])
+    drawn = _sample(_middles(8), edges, weights)
+    np.testing.assert_allclose(drawn, np.linspace(0.3, 0.4, 9), atol=_SUMMATION)
+
+
+def test_all_weight_in_a_bin_of_no_width_draws_one_point():
+    edges, weights = _f32([0.0, 0.3, 0.3, 1.0], [0.0, 7.0, 0.0])
+    np.testing.assert_allclose(_sample(_middles(8), edges, weights), np.full(9, 0.3), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(3.0, 0.0), (1.0, -5.0), (0.1, 100.0)])
+def test_sampling_moves_and_scales_with_the_edges(scale, shift):
+    edges, weights = _step_function(9)
+    moved = _sample(_middles(16), scale * edges + shift, 5.0 * weights)
+    expected = scale * _sample(_middles(16), edges, weights) + shift
+    np.testing.assert_allclose(moved, expected, atol=_SUMMATION * (scale + abs(shift)))
+
+
+# --- dilation ---
+
+
+def test_dilate_by_hand():
+    edges, weights = _dilate(*_f32([0.0, 0.4, 0.6, 1.0], [0.0, 1.0, 0.0]), 0.1)
+    # The bins' ends, and where they were moved to: -0.1, 0.3, 0.5 and 0.5, 0.7, 1.1.
+    np.testing.assert_allclose(edges, [0, 0, 0.3, 0.4, 0.5, 0.5, 0.6, 0.7, 1, 1], atol=1e-6)
+    inside = (edges[:-1] >= 0.2999) & (edges[1:] <= 0.7001)
+    heights = stepfun.heights(edges, weights)
+    wide = jnp.diff(edges) > 1e-5
+    np.testing.assert_allclose(heights[inside & wide], 2.5, rtol=1e-5)
+    np.testing.assert_array_equal(heights[~inside], 0.0)
+
+
+@pytest.mark.parametrize("amount", [0.0, 0.01, _AMOUNT, 0.4, 3.0])
+def test_dilate_against_a_loop(amount):
+    edges, weights = _step_function(10, empty=3)
+    grid, dilated = (np.asarray(x, np.float64) for x in _dilate(edges, weights, amount))
+    assert grid.shape == (3 * _BINS + 1,)
+    middles, widths = 0.5 * (grid[1:] + grid[:-1]), np.diff(grid)
+    tops = [reference_sampling.dilated_height(x, edges, weights, amount) for x in middles]
+    expected = np.array(tops) * widths / np.sum(np.array(tops) * widths)
+    np.testing.assert_allclose(dilated, expected, atol=5.0 * _SUMMATION)
+
+
+@pytest.mark.parametrize("amount", [0.0, 0.01, _AMOUNT, 0.4, 3.0])
+def test_dilate_keeps_the_domain_and_sums_to_one(amount):
+    edges, weights = _step_function(11, empty=3)
+    grid, dilated = _dilate(edges, 5.0 * weights, amount)
+    assert grid[0] == edges[0] and grid[-1] == edges[-1]
+    assert (jnp.diff(grid) >= 0.0).all() and (dilated >= 0.0).all()
+    np.testing.assert_allclose(jnp.sum(dilated), 1.0, rtol=_SUMMATION)
+
+
+@pytest.mark.parametrize("amount", [0.0, 0.01, _AMOUNT, 0.4])
+def test_dilate_covers_every_bin_and_never_loses_to_it(amount):
+    edges, weights = _step_function(12, empty=3)
+    heights = stepfun.heights(edges, weights)
+    grid, dilated = _dilate(edges, weights, amount)
+    dilated_heights = stepfun.heights(grid, dilated)
+    share = heights / jnp.max(heights)
+    dilated_share = dilated_heights / jnp.max(dilated_heights)
+    for x in np.linspace(0.0005, 0.9995, 200):
+        before = reference_sampling.height_at(x, edges, share)
+        after = reference_sampling.height_at(x, grid, dilated_share)
+        assert after >= before - 1e-4
+
+
+def test_dilation_by_nothing_changes_nothing():
+    edges, weights = _step_function(13)
+    grid, dilated = _dilate(edges, weights, 0.0)
+    np.testing.assert_allclose(
+        np.interp(edges, grid, np.concatenate([[0.0], np.cumsum(dilated)])),
+        _cumulative(weights),
+        atol=_SUMMATION,
+    )
+
+
+@pytest.mark.parametrize("weights", _HARD_WEIGHTS)
+def test_dilate_is_finite_with_bins_of_no_width(weights):
+    grid, dilated = _dilate(_NARROW, *_f32(weights), _AMOUNT)
+    assert jnp.isfinite(grid).all() and jnp.isfinite(dilated).all()
+    visible = (np.asarray(weights) * np.diff(_NARROW)).sum() > 0.0
+    np.testing.assert_allclose(jnp.sum(dilated), float(visible), rtol=_SUMMATION)
+
+
+# --- blur ---
+
+
+def test_blur_by_hand():
+    points, values = _blur(*_f32([0.0, 1.0], [2.0]), 0.25)
+    np.testing.assert_allclose(points, [-0.25, 0.25, 0.75, 1.25])
+    np.testing.assert_allclose(values, [0.0, 2.0, 2.0, 0.0], atol=_SUMMATION)
+
+
+@pytest.mark.parametrize("radius", [0.02, 0.1, 2.0])
+def test_blur_against_a_loop(radius):
+    edges, heights = _f32(_step_function(14)[0], np.random.default_rng(0).uniform(size=_BINS))
+    points, values = _blur(edges, heights, radius)
+    x = np.linspace(-2.0 * radius, 1.0 + 2.0 * radius, 50)
+    expected = [reference_sampling.blurred_height(at, edges, heights, radius) for at in x]
+    np.testing.assert_allclose(np.interp(x, points, values), expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("radius", [0.003, 0.03, 0.3])
+def test_blur_conserves_the_integral(radius):
+    edges, weights = _step_function(15, empty=3)
+    points, values = _blur(edges, stepfun.heights(edges, weights), radius)
+    np.testing.assert_allclose(np.trapezoid(values, points), 1.0, rtol=1e-4)
+    assert (values >= 0.0).all() and (jnp.diff(points) >= 0.0).all()
+
+
+def test_blur_is_linear():
+    edges, weights = _step_function(16)
+    points, values = _blur(edges, weights, 0.1)
+    points_twice, values_twice = _blur(edges, 2.0 * weights, 0.1)
+    np.testing.assert_array_equal(points_twice, points)
+    np.testing.assert_allclose(values_twice, 2.0 * values, atol=1e-5)
+
+
+# --- the integral of a piecewise linear function ---
+
+
+def test_integrate_linear_by_hand():
+    arguments = _f32([-1.0, 0.0, 0.5, 1.0, 2.0, 9.0], [0.0, 1.0, 3.0], [0.0, 2.0, 0.0])
+    np.testing.assert_allclose(
+        _integrate(*arguments), [0.0, 0.0, 0.25, 1.0, 2.5, 3.0], rtol=_SUMMATION
+    )
+
+
+def test_integrate_linear_against_numerical_quadrature():
+    rng = np.random.default_rng(0)
+    points, values = np.sort(rng.uniform(size=10)), rng.uniform(size=10)
+    x = np.linspace(0.0, 1.0, 200_001)
+    y = np.interp(x, points, values, left=0.0, right=0.0)
+    below = np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(x))])
+    at = rng.uniform(size=30)
+    got = _integrate(*_f32(at, points, values))
+    np.testing.assert_allclose(got, np.interp(at, x, below), atol=2e-5)
+
+
+def test_integrate_linear_meets_the_whole_integral():
+    points, values = _f32([0.0, 0.5, 0.5, 2.0], [1.0, 3.0, 1.0, 1.0])
+    got = _integrate(jnp.array([0.0, 0.5, 2.0, 1e30]), points, values)
+    np.testing.assert_allclose(got, [0.0, 1.0, 2.5, 2.5], rtol=_SUMMATION)
+
+
+def test_integrate_linear_never_decreases_where_the_function_is_not_negative():
+    points, values = _f32(np.sort(np.random.default_rng(1).uniform(size=10)), np.ones(10) * 0.3)
+    integral = _integrate(jnp.linspace(-1.0, 2.0, 500), points, values)
+    assert (jnp.diff(integral) >= -_SUMMATION).all()
+
+
+@pytest.mark.parametrize("radius", [0.02, 0.2])
+def test_a_blurred_function_integrates_to_its_masses(radius):
+    edges, weights = _step_function(17)
+    points, values = _blur(edges, stepfun.heights(edges, weights), radius)
+    at = jnp.linspace(0.0, 1.0, 21)
+    expected = [reference_sampling.blurred_mass_below(float(x), edges, weights, radius) for x in at]
+    np.testing.assert_allclose(_integrate(at, points, values), expected, atol=2e-5)
+
+
+# --- searching ---
+
+
+def test_count_below_is_a_right_sided_search():
+    values, queries = _f32([0.0, 1.0, 1.0, 3.0], [-1.0, 0.0, 0.5, 1.0, 3.0, 4.0])
+    expected = np.searchsorted(values, queries, side="right")
+    np.testing.assert_array_equal(stepfun.count_below(values, queries), expected)
+    assert stepfun.count_below(values, queries).dtype == jnp.int32
+
+
+def test_take_works_batch_by_batch():
+    values = jnp.arange(12.0).reshape(2, 2, 3)
+    index = jnp.array([[[0, 2], [1, 1]], [[2, 2], [0, 1]]])
+    got = stepfun.take(values, index)
+    for batch in itertools.product(range(2), repeat=2):
+        np.testing.assert_array_equal(got[batch], values[batch][index[batch]])
+
+
+# --- gradients and transformations ---
+
+
+def test_check_grads():
+    _, weights = _step_function(18)
+    edges = np.linspace(0.0, 1.0, _BINS + 1) ** 1.5
+    u = np.linspace(0.07, 0.93, 6)
+    gradients.assert_numerical(stepfun.heights, edges, weights)
+    gradients.assert_numerical(stepfun.cumulative, weights)
+    gradients.assert_numerical(stepfun.sample_edges, u, edges, weights)
+    gradients.assert_numerical(stepfun.integrate_linear, u, edges, np.append(weights, 0.2))
+
+
+def _batch():
+    """Returns edges, weights and quantiles with a leading axis."""
+    edges, weights = zip(*(_step_function(seed, empty=seed) for seed in range(3)), strict=True)
+    u = jnp.stack([_middles(5)] * 3)
+    return jnp.stack(edges), jnp.stack(weights), u
+
+
+_CASES = {
+    "heights": lambda edges, weights, u: stepfun.heights(edges, weights),
+    "cumulative": lambda edges, weights, u: stepfun.cumulative(weights),
+    "invert_cumulative": lambda edges, weights, u: stepfun.invert_cumulative(
+        u, edges, stepfun.cumulative(weights)
+    ),
+    "sample_edges": lambda edges, weights, u: stepfun.sample_edges(u, edges, weights),
+    "dilate": lambda edges, weights, u: stepfun.dilate(edges, weights, _AMOUNT),
+    "blur": lambda edges, weights, u: stepfun.blur(edges, weights, _AMOUNT),
+    "integrate_linear": lambda edges, weights, u: stepfun.integrate_linear(u, edges, edges),
+}
+
+
+@pytest.mark.parametrize("transformation", transformations.ALL)
+@pytest.mark.parametrize("name", _CASES)
+def test_transformations_change_nothing(name, transformation):
+    transformation(_CASES[name], _batch())
+
+
+@pytest.mark.parametrize("name", _CASES)
+def test_leading_axes_are_batches(name):
+    function = jax.jit(_CASES[name])
+    mapped = jax.jit(jax.vmap(_CASES[name]))(*_batch())
+    for got, expected in zip(
+        jax.tree.leaves(function(*_batch())), jax.tree.leaves(mapped), strict=True
+    ):
+        np.testing.assert_allclose(got, expected, atol=_SUMMATION)

@@ -1,0 +1,45 @@
+"""Small scenes with known answers, and rays to send into them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+
+from refref_jax.data.containment import find_containment
+from refref_jax.data.geometry import build_geometry
+from refref_jax.data.meshes import MeshPart
+from refref_jax.geometry.rays import Rays
+
+
+def ball(radius=1.0, *, index=1.5, subdivisions=4, centre=(0.0, 0.0, 0.0), name="ball_glass"):
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    return MeshPart(name, mesh.vertices + np.asarray(centre), mesh.faces, index, "auto")
+
+
+def box(extents=(1.0, 1.0, 1.0), *, index=1.5, name="box_glass"):
+    mesh = trimesh.creation.box(extents=extents)
+    return MeshPart(name, np.asarray(mesh.vertices), np.asarray(mesh.faces), index, "auto")
+
+
+def right_prism(index=1.5):
+    """A prism along y with a right angle at the origin; its legs lie in x = 0 and z = 0."""
+    base = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    mesh = trimesh.convex.convex_hull(np.array([[x, y, z] for x, z in base for y in (-1.0, 1.0)]))
+    return MeshPart("prism_glass", np.asarray(mesh.vertices), np.asarray(mesh.faces), index, "flat")
+
+
+def geometry(*parts, rule="nested"):
+    built = build_geometry(parts, find_containment(parts).parents, rule=rule)
+    return jax.tree.map(jnp.asarray, built)
+
+
+def rays(origins, directions):
+    origins = np.atleast_2d(np.asarray(origins, np.float64))
+    directions = np.atleast_2d(np.asarray(directions, np.float64))
+    origins, directions = np.broadcast_arrays(origins, directions)
+    unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    return Rays(
+        jnp.asarray(origins, jnp.float32),
+        jnp.asarray(unit, jnp.float32),
+        jnp.full(len(origins), 1e-3, jnp.float32),
+    )

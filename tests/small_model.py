@@ -1,0 +1,49 @@
+"""A model and a run small enough for tests, on images made from a formula."""
+
+import numpy as np
+
+from refref_jax.data.batches import PixelSampler
+from refref_jax.data.cameras import orbit
+from refref_jax.fields.density_field import DensityFieldConfig
+from refref_jax.fields.hash_grid import HashGridConfig
+from refref_jax.fields.radiance_field import RadianceFieldConfig
+from refref_jax.optics.budgets import PAPER
+from refref_jax.render.config import ModelConfig, ProposalConfig
+from refref_jax.render.saved import SavedModel
+from refref_jax.training.config import LossConfig, SceneConfig, ScheduleConfig, TrainingConfig
+
+_GRID = HashGridConfig(levels=2, coarsest=4, finest=16, entries=1 << 10, features=2)
+
+MODEL = ModelConfig(
+    proposals=(ProposalConfig(DensityFieldConfig(_GRID, width=8), samples=8),),
+    field=RadianceFieldConfig(_GRID, density_width=8, bottleneck=3, colour_width=8, colour_depth=1),
+    samples=6,
+    multisamples=1,
+    interior="field",
+    near=0.05,
+    far=15.0,
+    radius=7.5,
+    unbounded=False,
+    dilation=0.5,
+)
+
+SAVED = SavedModel(MODEL, PAPER)
+
+CONFIG = TrainingConfig(
+    scene=SceneConfig("nowhere", "nested", ()),
+    paths="paper",
+    loss=LossConfig(data="mse", interlevel=0.01, blurs=(0.01,), distortion=0.01, hash_decay=0.1),
+    schedule=ScheduleConfig(steps=12, warmup=2, peak=1e-2, end=1e-3, anneal=4),
+    batch=32,
+    pool=4,
+    seed=0,
+)
+
+CAMERAS = orbit(4, distance=4.0, elevation=0.3, size=16, angle_x=1.1656)
+
+
+def sampler(seed=0):
+    """Returns pixels of four images whose colours change smoothly."""
+    frame, row, column = np.indices((4, 16, 16))
+    images = np.stack([row * 16, column * 16, 60 * frame], axis=-1).astype(np.uint8)
+    return PixelSampler(images, CAMERAS, seed=seed, batch=CONFIG.batch)

@@ -1,0 +1,129 @@
+"""The shape of the package: which way imports fall, how long things are, who may compile."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+_ROOT = Path(__file__).parents[1]
+_PACKAGE = _ROOT / "refref_jax"
+
+# A module may import from its own floor's package and from lower floors only.
+_FLOORS = {
+    "numerics": 0,
+    "configuration": 0,
+    "geometry": 1,
+    "optics": 2,
+    "sampling": 3,
+    "fields": 4,
+    "render": 5,
+    "losses": 6,
+    "metrics": 6,
+    "data": 7,
+    "training": 8,
+}
+
+_MODULES = sorted(_PACKAGE.rglob("*.py"))
+_SCRIPTS = sorted((_ROOT / "experiments").glob("*.py"))
+
+_LONGEST_MODULE = 250
+_LONGEST_FUNCTION = 45
+
+_MAY_JIT = {"render/images.py", "training/steps.py", "geometry/native_loop.py"}
+
+_VAGUE_NAMES = {"utils", "util", "misc", "helpers", "common", "math"}
+
+
+def _name(path):
+    return path.relative_to(_PACKAGE).as_posix()
+
+
+def _imports(path):
+    """Yields the dotted names that a module imports."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def _functions(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef):
+            yield node
+
+
+def _body_lines(function):
+    body = function.body
+    if isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):
+        body = body[1:]
+    return body[-1].end_lineno - body[0].lineno + 1 if body else 0
+
+
+@pytest.mark.parametrize("path", _MODULES, ids=_name)
+def test_imports_fall(path):
+    here = path.relative_to(_PACKAGE).with_suffix("").parts[0]
+    if here == "__init__":
+        return
+    for name in _imports(path):
+        parts = name.split(".")
+        if parts[0] != "refref_jax":
+            continue
+        there = parts[1]
+        assert there == here or _FLOORS[there] < _FLOORS[here], f"{_name(path)} imports {name}"
+
+
+def test_every_module_has_a_floor():
+    tops = {path.relative_to(_PACKAGE).with_suffix("").parts[0] for path in _MODULES}
+    assert tops - {"__init__"} == set(_FLOORS)
+
+
+@pytest.mark.parametrize("path", [p for p in _MODULES if "data" in p.parts], ids=_name)
+def test_data_is_numpy_only(path):
+    allowed = {"geometry.rays", "geometry.surface_build", "geometry.corner_normals"}
+    for name in _imports(path):
+        assert name.split(".")[0] not in ("jax", "flax", "optax"), name
+        if name.startswith("refref_jax.geometry"):
+            assert any(name.startswith(f"refref_jax.{module}") for module in allowed), name
+
+
+@pytest.mark.parametrize("path", _MODULES, ids=_name)
+def test_numpy_and_jax_never_meet_in_one_function(path):
+    for function in _functions(path):
+        names = {node.id for node in ast.walk(function) if isinstance(node, ast.Name)}
+        assert not {"np", "jnp"} <= names, f"{function.name} uses both np and jnp"
+
+
+@pytest.mark.parametrize("path", _MODULES, ids=_name)
+def test_only_the_rim_compiles(path):
+    if _name(path) not in _MAY_JIT:
+        assert "jax.jit" not in path.read_text()
+
+
+@pytest.mark.parametrize("path", _MODULES, ids=_name)
+def test_guards_live_in_numerics(path):
+    text = path.read_text()
+    assert "nan_to_num" not in text
+    if path.name != "numerics.py":
+        assert "finfo" not in text
+
+
+@pytest.mark.parametrize("path", _MODULES + _SCRIPTS, ids=lambda p: p.name)
+def test_modules_and_functions_are_short_and_named(path):
+    assert path.stem not in _VAGUE_NAMES
+    assert len(path.read_text().splitlines()) <= _LONGEST_MODULE
+    for function in _functions(path):
+        assert _body_lines(function) <= _LONGEST_FUNCTION, function.name
+
+
+def test_one_snell_and_one_fresnel():
+    definitions = [
+        (function.name, _name(path)) for path in _MODULES for function in _functions(path)
+    ]
+    for name, home in [
+        ("refract", "optics/snell.py"),
+        ("reflect", "optics/snell.py"),
+        ("reflectance", "optics/fresnel.py"),
+        ("follow", "optics/wavefront.py"),
+    ]:
+        assert [where for found, where in definitions if found == name] == [home]

@@ -1,0 +1,212 @@
+import dataclasses
+import json
+import math
+import sys
+from typing import Literal
+
+import pytest
+
+from refref_jax import configuration
+
+
+@dataclasses.dataclass(frozen=True)
+class _Part:
+    name: str
+    weights: tuple[float, ...]
+    size: tuple[int, int]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    steps: int
+    rate: float
+    dry: bool
+    loss: Literal["mse", "charbonnier"]
+    main: _Part
+    others: tuple[_Part, ...]
+    pairs: tuple[tuple[str, float], ...]
+    limit: float | None
+    spare: _Part | None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Even:
+    number: int
+
+    def __post_init__(self):
+        if self.number % 2:
+            raise ValueError(f"{self.number} is odd.")
+
+
+_MAIN = _Part("fläche ≥ 1", (0.5, 0.25), (3, 4))
+_RUN = _Run(
+    steps=7,
+    rate=1e-3,
+    dry=False,
+    loss="mse",
+    main=_MAIN,
+    others=(_Part("a", (), (0, -1)), _Part("", (1.0,), (5, 6))),
+    pairs=(("glass", 1.5), ("water", 1.333)),
+    limit=None,
+    spare=None,
+)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "config.json"
+
+
+def _write_changed(path, change):
+    """Writes the run after a change of its parsed text."""
+    configuration.write(path, _RUN)
+    content = json.loads(path.read_text(encoding="utf-8"))
+    change(content)
+    path.write_text(json.dumps(content), encoding="utf-8")
+
+
+def _assert_refused(path, *words):
+    with pytest.raises(ValueError) as caught:
+        configuration.read(path, _Run)
+    message = str(caught.value)
+    for word in (path.name, *words):
+        assert word in message
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        _RUN,
+        dataclasses.replace(_RUN, limit=2.5, spare=_MAIN, loss="charbonnier", dry=True),
+        dataclasses.replace(_RUN, others=(), pairs=()),
+        dataclasses.replace(_RUN, rate=0.1 + 0.2, limit=5e-324),
+        dataclasses.replace(_RUN, rate=math.inf, limit=-math.inf),
+        dataclasses.replace(_RUN, rate=sys.float_info.max, steps=-(2**70)),
+    ],
+)
+def test_a_configuration_survives_the_round_trip(path, config):
+    configuration.write(path, config)
+    read = configuration.read(path, _Run)
+    assert read == config
+    assert isinstance(read.main, _Part)
+    assert isinstance(read.pairs, tuple)
+
+
+def test_the_file_is_readable_text(path):
+    configuration.write(path, _MAIN)
+    content = path.read_text(encoding="utf-8")
+    assert content.endswith("}\n")
+    assert json.loads(content) == {
+        "name": "fläche ≥ 1",
+        "weights": [0.5, 0.25],
+        "size": [3, 4],
+    }
+    assert len(content.splitlines()) > 3
+
+
+def test_a_float_may_be_written_as_an_integer(path):
+    _write_changed(path, lambda content: content.update(rate=1, limit=2))
+    read = configuration.read(path, _Run)
+    assert (read.rate, read.limit) == (1.0, 2.0)
+    assert isinstance(read.rate, float)
+    assert isinstance(read.limit, float)
+
+
+def test_the_order_of_keys_does_not_matter(path):
+    configuration.write(path, _RUN)
+    content = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps(dict(reversed(content.items()))), encoding="utf-8")
+    assert configuration.read(path, _Run) == _RUN
+
+
+@pytest.mark.parametrize("key", ["steps", "limit", "main"])
+def test_missing_key(path, key):
+    _write_changed(path, lambda content: content.pop(key))
+    _assert_refused(path, repr(key))
+
+
+def test_missing_key_of_a_nested_record(path):
+    _write_changed(path, lambda content: content["others"][1].pop("size"))
+    _assert_refused(path, "_Run.others[1]", "'size'")
+
+
+def test_unknown_key(path):
+    _write_changed(path, lambda content: content.update(stpes=7))
+    _assert_refused(path, "'stpes'")
+
+
+def test_unknown_key_of_a_nested_record(path):
+    _write_changed(path, lambda content: content["main"].update(colour="red"))
+    _assert_refused(path, "_Run.main", "'colour'")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("steps", 7.0),
+        ("steps", "7"),
+        ("steps", True),
+        ("steps", None),
+        ("rate", "0.001"),
+        ("rate", False),
+        ("rate", None),
+        ("rate", [0.001]),
+        ("dry", 0),
+        ("dry", "false"),
+        ("limit", "none"),
+        ("limit", True),
+        ("loss", 7),
+        ("loss", None),
+        ("main", None),
+        ("main", [1, 2]),
+        ("spare", 7),
+        ("others", {}),
+        ("others", None),
+        ("others", "ab"),
+        ("pairs", 7),
+    ],
+)
+def test_wrong_type(path, key, value):
+    _write_changed(path, lambda content: content.update({key: value}))
+    _assert_refused(path, f"_Run.{key}", repr(value))
+
+
+@pytest.mark.parametrize("value", ["MSE", "", "mse "])
+def test_wrong_choice_names_the_choices(path, value):
+    _write_changed(path, lambda content: content.update(loss=value))
+    _assert_refused(path, "_Run.loss", repr(value), "'mse'", "'charbonnier'")
+
+
+@pytest.mark.parametrize("size", [[], [3], [3, 4, 5]])
+def test_wrong_length(path, size):
+    _write_changed(path, lambda content: content["main"].update(size=size))
+    _assert_refused(path, "_Run.main.size", f"{len(size)} items, not 2")
+
+
+def test_wrong_item_of_a_tuple_is_named_by_its_place(path):
+    _write_changed(path, lambda content: content["pairs"][1].reverse())
+    _assert_refused(path, "_Run.pairs[1][0]")
+    _write_changed(path, lambda content: content["main"]["weights"].append("heavy"))
+    _assert_refused(path, "_Run.main.weights[2]", "'heavy'")
+
+
+@pytest.mark.parametrize("content", [b"", b'{"steps": 7', b"\xff\xfe", b"steps: 7"])
+def test_broken_json(path, content):
+    path.write_bytes(content)
+    _assert_refused(path, "Restore the file")
+
+
+@pytest.mark.parametrize("content", ["[]", "7", "null", '"text"'])
+def test_json_that_is_no_object(path, content):
+    path.write_text(content, encoding="utf-8")
+    _assert_refused(path, "not an object", "Restore the file")
+
+
+def test_missing_file(path):
+    _assert_refused(path, "does not exist", "Give a folder")
+
+
+def test_a_record_that_refuses_its_values_is_named(path):
+    path.write_text('{"number": 3}', encoding="utf-8")
+    with pytest.raises(ValueError, match=r"config\.json.*3 is odd"):
+        configuration.read(path, _Even)

@@ -1,0 +1,234 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from skimage.metrics import structural_similarity
+
+from refref_jax import metrics
+from tests import gradients, transformations
+
+# Decibels: float32 logarithms of float32 means.
+_DECIBELS = 1e-4
+
+# Variances of the window are differences of float32 means.
+_SIMILARITY = 2e-5
+
+_SHAPE = (14, 17, 3)
+
+
+def _images(seed=0):
+    target, noise = np.random.default_rng(seed).uniform(size=(2, *_SHAPE)).astype(np.float32)
+    return jnp.asarray(np.clip(target + 0.3 * (noise - 0.5), 0.0, 1.0)), jnp.asarray(target)
+
+
+def _mask():
+    mask = np.zeros(_SHAPE[:2], bool)
+    mask[3:9, 4:15] = True
+    return jnp.asarray(mask)
+
+
+# --- PSNR ---
+
+
+@pytest.mark.parametrize(("error", "expected"), [(1.0, 0.0), (0.1, 20.0), (0.01, 40.0)])
+def test_psnr_by_hand(error, expected):
+    target = jnp.zeros(_SHAPE)
+    np.testing.assert_allclose(metrics.psnr(target + error, target), expected, atol=_DECIBELS)
+
+
+def test_psnr_against_float64():
+    rendered, target = _images()
+    mean = np.mean(np.square(np.asarray(rendered, np.float64) - np.asarray(target, np.float64)))
+    np.testing.assert_allclose(
+        metrics.psnr(rendered, target), -10.0 * np.log10(mean), atol=_DECIBELS
+    )
+
+
+def test_psnr_of_equal_images_is_infinite():
+    _, target = _images()
+    assert metrics.psnr(target, target) == jnp.inf
+
+
+def test_psnr_treats_both_images_alike():
+    rendered, target = _images()
+    assert metrics.psnr(rendered, target) == metrics.psnr(target, rendered)
+
+
+@pytest.mark.parametrize("error", [1e-10, 1e-5, 1.0, 1e10])
+def test_psnr_over_magnitudes(error):
+    target = jnp.zeros(_SHAPE)
+    got = metrics.psnr(target + error, target)
+    np.testing.assert_allclose(got, -20.0 * np.log10(error), atol=1e-2)
+
+
+# --- PSNR over a mask ---
+
+
+def test_psnr_masked_by_hand():
+    mask, target = _mask(), jnp.zeros(_SHAPE)
+    rendered = jnp.where(mask[..., None], 0.1, 0.9) * jnp.ones(_SHAPE)
+    np.testing.assert_allclose(metrics.psnr_masked(rendered, target, mask), 20.0, atol=_DECIBELS)
+
+
+def test_psnr_masked_over_everything_is_the_psnr():
+    rendered, target = _images()
+    full = jnp.ones(_SHAPE[:2], bool)
+    np.testing.assert_allclose(
+        metrics.psnr_masked(rendered, target, full),
+        metrics.psnr(rendered, target),
+        atol=_DECIBELS,
+    )
+
+
+def test_psnr_masked_is_the_psnr_of_a_cropped_image():
+    rendered, target = _images()
+    crop = (slice(3, 9), slice(4, 15))
+    np.testing.assert_allclose(
+        metrics.psnr_masked(rendered, target, _mask()),
+        metrics.psnr(rendered[crop], target[crop]),
+        atol=_DECIBELS,
+    )
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, 1e30, np.inf, np.nan])
+def test_psnr_masked_ignores_what_is_outside(value):
+    rendered, target = _images()
+    changed = jnp.where(_mask()[..., None], rendered, value)
+    expected = metrics.psnr_masked(rendered, target, _mask())
+    assert metrics.psnr_masked(changed, target, _mask()) == expected
+
+
+def test_psnr_masked_of_equal_images_is_infinite():
+    _, target = _images()
+    assert metrics.psnr_masked(target, target, _mask()) == jnp.inf
+
+
+def test_psnr_masked_over_nothing_is_undefined():
+    rendered, target = _images()
+    assert jnp.isnan(metrics.psnr_masked(rendered, target, jnp.zeros(_SHAPE[:2], bool)))
+
+
+# --- SSIM ---
+
+
+def _similarity(rendered, target):
+    return structural_similarity(
+        np.asarray(rendered, np.float64),
+        np.asarray(target, np.float64),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        channel_axis=-1,
+        data_range=1.0,
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ssim_against_scikit_image(seed):
+    rendered, target = _images(seed)
+    np.testing.assert_allclose(
+        metrics.ssim(rendered, target), _similarity(rendered, target), atol=_SIMILARITY
+    )
+
+
+def test_ssim_of_unrelated_images_against_scikit_image():
+    rendered, target = _images(0)[0], _images(1)[1]
+    expected = _similarity(rendered, target)
+    assert expected < 0.2
+    np.testing.assert_allclose(metrics.ssim(rendered, target), expected, atol=_SIMILARITY)
+
+
+def test_ssim_of_equal_images_is_one():
+    _, target = _images()
+    np.testing.assert_allclose(metrics.ssim(target, target), 1.0, atol=_SIMILARITY)
+
+
+def test_ssim_of_flat_images_by_hand():
+    # No variance: (2 a b + c1) / (a^2 + b^2 + c1), with c1 = 0.01^2.
+    got = metrics.ssim(jnp.full(_SHAPE, 0.2), jnp.full(_SHAPE, 0.6))
+    np.testing.assert_allclose(got, (0.24 + 1e-4) / (0.4 + 1e-4), atol=1e-4)
+
+
+def test_ssim_treats_both_images_alike():
+    rendered, target = _images()
+    np.testing.assert_allclose(
+        metrics.ssim(rendered, target), metrics.ssim(target, rendered), atol=_SIMILARITY
+    )
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+def test_ssim_is_finite_on_flat_images(value):
+    _, target = _images()
+    flat = jnp.full(_SHAPE, value)
+    assert jnp.isfinite(metrics.ssim(flat, target)) and jnp.isfinite(metrics.ssim(flat, flat))
+
+
+# --- distances ---
+
+
+def test_mean_absolute_error_by_hand():
+    rendered = jnp.array([[1.0, 2.0], [3.0, 9.0]])
+    target = jnp.array([[1.5, 2.0], [2.0, 0.0]])
+    mask = jnp.array([[True, True], [True, False]])
+    np.testing.assert_allclose(metrics.mean_absolute_error(rendered, target, mask), 0.5)
+
+
+def test_mean_absolute_error_against_float64():
+    rendered, target = (10.0 * image[..., 0] for image in _images())
+    mask = np.asarray(_mask())
+    pairs = zip(np.asarray(rendered)[mask], np.asarray(target)[mask], strict=True)
+    errors = [abs(float(a) - float(b)) for a, b in pairs]
+    got = metrics.mean_absolute_error(rendered, target, _mask())
+    np.testing.assert_allclose(got, np.mean(errors), rtol=1e-6)
+
+
+@pytest.mark.parametrize("elsewhere", [np.inf, -np.inf, np.nan, 1e30])
+def test_mean_absolute_error_ignores_targets_outside_the_mask(elsewhere):
+    rendered, target = (image[..., 0] for image in _images())
+    missing = jnp.where(_mask(), target, elsewhere)
+    got = metrics.mean_absolute_error(rendered, missing, _mask())
+    assert got == metrics.mean_absolute_error(rendered, target, _mask())
+
+
+def test_mean_absolute_error_ignores_a_rendering_that_sees_nothing_outside_the_mask():
+    rendered, target = (image[..., 0] for image in _images())
+    blind = jnp.where(_mask(), rendered, jnp.inf)
+    got = metrics.mean_absolute_error(blind, target, _mask())
+    assert got == metrics.mean_absolute_error(rendered, target, _mask())
+
+
+def test_mean_absolute_error_over_nothing_is_undefined():
+    rendered, target = (image[..., 0] for image in _images())
+    assert jnp.isnan(metrics.mean_absolute_error(rendered, target, jnp.zeros_like(_mask())))
+
+
+def test_mean_absolute_error_of_a_constant_shift():
+    _, target = _images()
+    got = metrics.mean_absolute_error(target[..., 0] + 0.25, target[..., 0], _mask())
+    np.testing.assert_allclose(got, 0.25, rtol=1e-6)
+
+
+def test_metrics_check_grads():
+    rendered, target = (np.asarray(image, np.float64)[:12, :12] for image in _images())
+    gradients.assert_numerical(metrics.psnr, rendered, target)
+
+
+# --- transformations ---
+
+_METRICS = {
+    "psnr": (metrics.psnr, lambda a, b, mask: (a, b)),
+    "psnr_masked": (metrics.psnr_masked, lambda a, b, mask: (a, b, mask)),
+    "ssim": (metrics.ssim, lambda a, b, mask: (a, b)),
+    "mean_absolute_error": (
+        metrics.mean_absolute_error,
+        lambda a, b, mask: (a[..., 0], b[..., 0], mask),
+    ),
+}
+
+
+@pytest.mark.parametrize("transformation", transformations.ALL)
+@pytest.mark.parametrize("name", _METRICS)
+def test_transformations_change_nothing(name, transformation):
+    metric, choose = _METRICS[name]
+    items = [choose(*_images(seed), _mask()) for seed in range(2)]
+    transformation(metric, jax.tree.map(lambda *x: jnp.stack(x), *items))

@@ -1,0 +1,335 @@
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax import numerics
+from tests import gradients, transformations
+
+# A few float32 roundings.
+_ROUNDING = 5e-7
+
+_EPSILON = np.finfo(np.float32).eps
+_TINY = np.finfo(np.float32).tiny
+
+# Every magnitude of float32 that is a normal number, from the smallest up.
+_POSITIVE = np.array([_TINY, *(10.0 ** np.arange(-37, 39))], np.float32)
+_LATTICE = np.concatenate([-_POSITIVE[::-1], [-0.0, 0.0], _POSITIVE]).astype(np.float32)
+
+_DIRECTIONS = np.array(
+    [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.6, 0.0, -0.8], [1.0, 1.0, 1.0], [1.0, 1e-9, -1e-20]],
+    np.float32,
+)
+
+_MAGNITUDES = [1e-37, 1e-30, 1e-6, 1.0, 1e6, 1e30, 1e38]
+
+
+def _vectors(magnitude):
+    """Returns vectors of a magnitude; components that are no normal numbers are 0."""
+    vectors = _DIRECTIONS * np.float32(magnitude)
+    return np.where(abs(vectors) < _TINY, np.float32(0.0), vectors)
+
+
+def _gradient(function, *arguments):
+    """Returns the gradients of a function of arrays, element by element."""
+    total = lambda *x: jnp.sum(function(*x))
+    return jax.grad(total, argnums=tuple(range(len(arguments))))(*map(jnp.asarray, arguments))
+
+
+# --- safe_sqrt ---
+
+
+@pytest.mark.parametrize(
+    ("x", "expected"), [(4.0, 2.0), (0.25, 0.5), (0.0, 0.0), (-0.0, 0.0), (-1.0, 0.0)]
+)
+def test_safe_sqrt_by_hand(x, expected):
+    assert numerics.safe_sqrt(jnp.float32(x)) == expected
+
+
+def test_safe_sqrt_over_all_magnitudes():
+    got = numerics.safe_sqrt(jnp.asarray(_LATTICE))
+    expected = np.sqrt(np.maximum(_LATTICE, 0.0).astype(np.float64))
+    np.testing.assert_allclose(got, expected, rtol=_ROUNDING)
+
+
+def test_safe_sqrt_inverts_squares():
+    x = np.geomspace(1e-18, 1e18, 37, dtype=np.float32)
+    np.testing.assert_allclose(numerics.safe_sqrt(jnp.square(jnp.asarray(x))), x, rtol=_ROUNDING)
+
+
+def test_safe_sqrt_gradient_over_all_magnitudes():
+    (gradient,) = _gradient(numerics.safe_sqrt, _LATTICE)
+    held = np.where(_LATTICE > 0.0, _LATTICE, 1.0).astype(np.float64)
+    expected = np.where(_LATTICE > 0.0, 0.5 / np.sqrt(held), 0.0)
+    assert np.isfinite(gradient).all()
+    np.testing.assert_allclose(gradient, expected, rtol=_ROUNDING)
+
+
+@pytest.mark.parametrize("x", [-np.inf, -1.0, -_TINY, -0.0, 0.0])
+def test_safe_sqrt_gradient_is_exactly_zero_at_and_below_zero(x):
+    assert jax.grad(numerics.safe_sqrt)(jnp.float32(x)) == 0.0
+    assert jax.jvp(numerics.safe_sqrt, (jnp.float32(x),), (jnp.float32(1.0),))[1] == 0.0
+
+
+def test_safe_sqrt_check_grads():
+    gradients.assert_numerical(numerics.safe_sqrt, [0.1, 1.0, 7.0], order=2)
+
+
+# --- safe_divide ---
+
+
+@pytest.mark.parametrize(
+    ("numerator", "denominator", "expected"),
+    [(6.0, 3.0, 2.0), (-1.0, 4.0, -0.25), (0.0, 5.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 0.0)],
+)
+def test_safe_divide_by_hand(numerator, denominator, expected):
+    assert numerics.safe_divide(jnp.float32(numerator), jnp.float32(denominator)) == expected
+
+
+def test_safe_divide_over_all_magnitudes():
+    numerator, denominator = (x.ravel() for x in np.meshgrid(_LATTICE, _LATTICE))
+    wide = denominator.astype(np.float64)
+    expected = np.where(wide != 0.0, numerator / np.where(wide != 0.0, wide, 1.0), 0.0)
+    representable = (expected == 0.0) | ((abs(expected) >= _TINY) & (abs(expected) < 3e38))
+    got = numerics.safe_divide(jnp.asarray(numerator), jnp.asarray(denominator))
+    np.testing.assert_allclose(got[representable], expected[representable], rtol=_ROUNDING)
+
+
+@pytest.mark.parametrize("numerator", [0.0, 1.0, -1e30, np.inf])
+@pytest.mark.parametrize("denominator", [0.0, -0.0])
+def test_safe_divide_by_zero_is_zero_with_zero_gradients(numerator, denominator):
+    arguments = np.float32(numerator), np.float32(denominator)
+    assert numerics.safe_divide(*map(jnp.asarray, arguments)) == 0.0
+    assert _gradient(numerics.safe_divide, *arguments) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("magnitude", [1e-35, 1e-25, 1e-18, 1.0, 1e18, 1e25, 1e35])
+def test_safe_divide_gradient_is_finite_where_the_square_is_not_representable(magnitude):
+    size = np.float32(magnitude)
+    by_numerator, by_denominator = _gradient(numerics.safe_divide, 2.0 * size, size)
+    np.testing.assert_allclose(by_numerator, 1.0 / magnitude, rtol=_ROUNDING)
+    np.testing.assert_allclose(by_denominator, -2.0 / magnitude, rtol=_ROUNDING)
+
+
+def test_safe_divide_check_grads():
+    gradients.assert_numerical(numerics.safe_divide, [1.0, -2.0, 0.0], [0.5, 3.0, -1.0], order=2)
+
+
+# --- safe_reciprocal ---
+
+
+@pytest.mark.parametrize(
+    ("x", "expected"),
+    [(4.0, 0.25), (-0.5, -2.0), (0.0, 1e12), (-0.0, -1e12), (1e-30, 1e12), (-1e-13, -1e12)],
+)
+def test_safe_reciprocal_by_hand(x, expected):
+    got = numerics.safe_reciprocal(jnp.float32(x))
+    np.testing.assert_allclose(got, expected, rtol=_ROUNDING)
+
+
+def test_safe_reciprocal_over_all_magnitudes():
+    # The reciprocal of more than 1e37 is no normal number.
+    x = _LATTICE[abs(_LATTICE) < 5e37]
+    expected = 1.0 / np.copysign(np.maximum(abs(x).astype(np.float64), 1e-12), x)
+    np.testing.assert_allclose(numerics.safe_reciprocal(jnp.asarray(x)), expected, rtol=_ROUNDING)
+
+
+def test_safe_reciprocal_times_zero_is_zero():
+    assert (0.0 * numerics.safe_reciprocal(jnp.asarray(_LATTICE)) == 0.0).all()
+
+
+def test_safe_reciprocal_is_its_own_inverse():
+    x = np.geomspace(1e-11, 1e11, 23, dtype=np.float32)
+    back = numerics.safe_reciprocal(numerics.safe_reciprocal(jnp.asarray(x)))
+    np.testing.assert_allclose(back, x, rtol=_ROUNDING)
+
+
+# --- length ---
+
+
+@pytest.mark.parametrize(
+    ("vector", "expected"),
+    [
+        ([3.0, 4.0, 0.0], 5.0),
+        ([-2.0, 3.0, -6.0], 7.0),
+        ([0.0, 0.0, 0.0], 0.0),
+        ([-2.0], 2.0),
+        ([1.0, 1.0, 1.0, 1.0, 0.0], 2.0),
+    ],
+)
+def test_length_by_hand(vector, expected):
+    np.testing.assert_allclose(numerics.length(jnp.array(vector)), expected, rtol=_ROUNDING)
+
+
+@pytest.mark.parametrize("magnitude", _MAGNITUDES)
+def test_length_over_magnitudes(magnitude):
+    vectors = _vectors(magnitude)
+    expected = np.linalg.norm(vectors.astype(np.float64), axis=-1)
+    np.testing.assert_allclose(numerics.length(jnp.asarray(vectors)), expected, rtol=_ROUNDING)
+
+
+@pytest.mark.parametrize("magnitude", _MAGNITUDES)
+def test_length_gradient_is_the_unit_vector_at_any_magnitude(magnitude):
+    vectors = _vectors(magnitude)
+    wide = vectors.astype(np.float64)
+    unit = wide / np.linalg.norm(wide, axis=-1, keepdims=True)
+    (gradient,) = _gradient(numerics.length, vectors)
+    np.testing.assert_allclose(gradient, unit, rtol=_ROUNDING, atol=_ROUNDING)
+
+
+def test_length_of_zero_has_zero_gradient():
+    (gradient,) = _gradient(numerics.length, np.zeros((2, 3), np.float32))
+    np.testing.assert_array_equal(gradient, np.zeros((2, 3)))
+
+
+def test_length_scales():
+    vectors = jnp.asarray(_DIRECTIONS)
+    got = numerics.length(-3.0 * vectors)
+    np.testing.assert_allclose(got, 3.0 * numerics.length(vectors), rtol=_ROUNDING)
+
+
+def test_length_keeps_leading_axes():
+    assert numerics.length(jnp.ones((4, 2, 3))).shape == (4, 2)
+
+
+def test_length_check_grads():
+    gradients.assert_numerical(numerics.length, [[0.3, -0.4, 1.2], [2.0, 0.1, 0.5]])
+
+
+# --- normalize ---
+
+
+def test_normalize_by_hand():
+    got = numerics.normalize(jnp.array([[3.0, 0.0, -4.0], [0.0, 0.0, 0.5]]))
+    np.testing.assert_allclose(got, [[0.6, 0.0, -0.8], [0.0, 0.0, 1.0]], rtol=_ROUNDING)
+
+
+def test_normalize_keeps_zero_with_zero_gradient():
+    zero = jnp.zeros(3)
+    np.testing.assert_array_equal(numerics.normalize(zero), zero)
+    for jacobian in (jax.jacrev, jax.jacfwd):
+        got = jax.jit(jacobian(numerics.normalize))(zero)
+        np.testing.assert_array_equal(got, np.zeros((3, 3)))
+
+
+@pytest.mark.parametrize("magnitude", _MAGNITUDES)
+def test_normalize_over_magnitudes(magnitude):
+    vectors = _vectors(magnitude)
+    wide = vectors.astype(np.float64)
+    expected = wide / np.linalg.norm(wide, axis=-1, keepdims=True)
+    got = numerics.normalize(jnp.asarray(vectors))
+    np.testing.assert_allclose(got, expected, rtol=_ROUNDING)
+
+
+# At 1e-38 the entries of the Jacobian, of size 1 / |v|, reach the largest number.
+@pytest.mark.parametrize("magnitude", [1e-36, 1e-30, 1e-6, 1.0, 1e6, 1e30, 1e36])
+def test_normalize_gradient_projects_and_divides_by_the_length(magnitude):
+    jacobian = jax.jit(jax.jacrev(numerics.normalize))
+    for vector in _vectors(magnitude):
+        wide = vector.astype(np.float64)
+        norm = np.linalg.norm(wide)
+        expected = np.eye(3) - np.outer(wide, wide) / norm**2
+        got = np.asarray(jacobian(jnp.asarray(vector)), np.float64) * norm
+        np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-6)
+
+
+def test_normalize_gives_unit_length_and_ignores_scale():
+    normalize = jax.jit(numerics.normalize)
+    vectors = jnp.asarray(np.random.default_rng(0).normal(size=(50, 3)), jnp.float32)
+    unit = normalize(vectors)
+    np.testing.assert_allclose(np.linalg.norm(unit, axis=-1), np.ones(50), rtol=_ROUNDING)
+    np.testing.assert_allclose(normalize(7.0 * vectors), unit, atol=_ROUNDING)
+    np.testing.assert_allclose(normalize(unit), unit, atol=_ROUNDING)
+
+
+def test_normalize_check_grads():
+    gradients.assert_numerical(numerics.normalize, [[0.3, -0.4, 1.2], [2.0, 0.1, 0.5]])
+
+
+# --- offset_origin ---
+
+_NORMALS = np.array(
+    [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.6, -0.8, 0.0], [1.0, 1.0, 1.0] / np.sqrt(3.0)],
+    np.float32,
+)
+
+# Rounding the moved point costs up to half a unit in the last place on each axis.
+_STEP_BOUNDS_IN_ULPS = (7.0, 9.0)
+
+
+def _offset(point, direction, normal, scale):
+    return numerics.offset_origin(
+        *(jnp.asarray(x, jnp.float32) for x in (point, direction, normal, scale))
+    )
+
+
+@pytest.mark.parametrize("coordinate", [1e-3, 1e-1, 1.0, 2.0, 1e2, 1e4, 1e6])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_offset_origin_steps_off_the_surface_on_the_side_of_the_ray(coordinate, side):
+    low, high = (bound * _EPSILON * coordinate for bound in _STEP_BOUNDS_IN_ULPS)
+    points = np.float32(coordinate) * np.array(
+        [[1.0, 1.0, 1.0], [-1.0, 0.3, 0.0], [0.0, 0.7, -1.0]], np.float32
+    )
+    slant = np.array([0.3, 0.2, -0.4])
+    for point, normal in itertools.product(points, _NORMALS):
+        across = slant - np.dot(slant, normal) * normal
+        moved = _offset(point, side * normal + across, normal, coordinate)
+        step = np.asarray(moved, np.float64) - point
+        assert low <= side * np.dot(step, normal) <= high
+        assert np.linalg.norm(step) <= high
+
+
+def test_offset_origin_at_the_size_of_a_scene():
+    moved = _offset([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], 2.0)
+    np.testing.assert_allclose(moved, [0.0, 0.0, 1.9e-6], rtol=0.01)
+
+
+def test_offset_origin_does_not_depend_on_which_way_the_normal_points():
+    point, direction = [0.4, -0.3, 1.0], [0.1, 0.8, 0.59]
+    for normal in _NORMALS:
+        np.testing.assert_array_equal(
+            _offset(point, direction, normal, 1.0), _offset(point, direction, -normal, 1.0)
+        )
+
+
+def test_offset_origin_with_no_scale_is_the_point():
+    point = np.array([0.4, -0.3, 1.0], np.float32)
+    np.testing.assert_array_equal(_offset(point, [1.0, 0.0, 0.0], _NORMALS[3], 0.0), point)
+
+
+def test_offset_origin_of_a_grazing_ray_goes_along_the_normal():
+    moved = _offset([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], 1.0)
+    assert moved[2] > 0.0
+
+
+def test_offset_origin_moves_with_its_point():
+    rest = (jnp.array([0.0, 0.6, 0.8]), jnp.asarray(_NORMALS[2]), jnp.float32(1.0))
+    jacobian = jax.jacrev(numerics.offset_origin)(jnp.ones(3), *rest)
+    np.testing.assert_array_equal(jacobian, np.eye(3))
+
+
+# --- transformations ---
+
+_VECTORS = np.concatenate([_DIRECTIONS, np.zeros((1, 3), np.float32)])
+_SCALARS = np.array([-1.0, 0.0, 1e-20, 0.5, 3.0, 1e20], np.float32)
+
+_CASES = {
+    "safe_sqrt": (numerics.safe_sqrt, (_SCALARS,)),
+    "safe_divide": (numerics.safe_divide, (_SCALARS[::-1], _SCALARS)),
+    "safe_reciprocal": (numerics.safe_reciprocal, (_SCALARS,)),
+    "length": (numerics.length, (_VECTORS,)),
+    "normalize": (numerics.normalize, (_VECTORS,)),
+    "offset_origin": (
+        numerics.offset_origin,
+        (_VECTORS, _VECTORS[::-1], np.roll(_VECTORS, 1, axis=0), abs(_SCALARS)),
+    ),
+}
+
+
+@pytest.mark.parametrize("transformation", transformations.ALL)
+@pytest.mark.parametrize("name", _CASES)
+def test_transformations_change_nothing(name, transformation):
+    function, batches = _CASES[name]
+    transformation(function, tuple(jnp.asarray(np.ascontiguousarray(x)) for x in batches))

@@ -1,0 +1,167 @@
+import dataclasses
+import itertools
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from refref_jax.optics.budgets import PAPER, STRAIGHT
+from refref_jax.render.saved import load_model
+from refref_jax.training import loop, run_folder
+from refref_jax.training.checkpoints import Checkpoints
+from refref_jax.training.state import init_state
+from tests import scenes, small_model
+from tests.small_model import CONFIG, MODEL, SAVED
+
+_GEOMETRY = scenes.geometry(scenes.ball(1.3, subdivisions=2))
+
+
+def _setup(config=CONFIG, budget=PAPER):
+    return loop.set_up(config, MODEL, budget, _GEOMETRY, small_model.sampler(config.seed))
+
+
+def _start(config=CONFIG):
+    return init_state(config.seed, MODEL, config.schedule)
+
+
+def _train(setup, state, until):
+    reports = []
+    for stepped, report in loop.run_steps(setup, state, until):
+        state = stepped
+        reports.append(jax.device_get(report))
+    return state, reports
+
+
+def _assert_identical(a, b):
+    leaves_a, tree_a = jax.tree.flatten(jax.device_get(a))
+    leaves_b, tree_b = jax.tree.flatten(jax.device_get(b))
+    assert tree_a == tree_b
+    for x, y in zip(leaves_a, leaves_b, strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+@pytest.mark.parametrize("pause", [4, 6])
+def test_a_resumed_run_continues_bit_for_bit(tmp_path, pause):
+    straight_through, reports = _train(_setup(), _start(), 12)
+    first, early = _train(_setup(), _start(), pause)
+    with Checkpoints(tmp_path, keep=2) as checkpoints:
+        checkpoints.save(first)
+    with Checkpoints(tmp_path, keep=2) as checkpoints:
+        assert checkpoints.newest() == pause
+        restored = checkpoints.restore(_start())
+    _assert_identical(restored, first)
+    resumed, late = _train(_setup(), restored, 12)
+    _assert_identical(resumed, straight_through)
+    _assert_identical(early + late, reports)
+
+
+def test_the_same_seed_gives_the_same_run_and_another_one_does_not():
+    _, reports = _train(_setup(), _start(), 3)
+    _, again = _train(_setup(), _start(), 3)
+    _assert_identical(reports, again)
+    other = dataclasses.replace(CONFIG, seed=1)
+    _, different = _train(_setup(other), _start(other), 3)
+    assert different[0].loss != reports[0].loss
+
+
+def test_training_lowers_the_loss():
+    schedule = dataclasses.replace(CONFIG.schedule, steps=60)
+    config = dataclasses.replace(CONFIG, schedule=schedule)
+    _, reports = _train(_setup(config), _start(config), 60)
+    losses = [report.loss for report in reports]
+    assert np.all(np.isfinite(losses))
+    assert np.mean(losses[-10:]) < 0.6 * np.mean(losses[:10])
+
+
+def test_reports_say_what_was_measured():
+    _, (report,) = _train(_setup(), _start(), 1)
+    weights = CONFIG.loss
+    mse = 10.0 ** (-report.psnr / 10.0)
+    expected = (
+        mse
+        + weights.interlevel * report.interlevel
+        + weights.distortion * report.distortion
+        + weights.hash_decay * report.hash_decay
+    )
+    np.testing.assert_allclose(report.loss, expected, rtol=1e-4)
+    assert report.dropped == 0.0
+
+
+def test_charbonnier_changes_the_loss_only():
+    loss = dataclasses.replace(CONFIG.loss, data="charbonnier")
+    config = dataclasses.replace(CONFIG, loss=loss)
+    _, (mse,) = _train(_setup(), _start(), 1)
+    _, (charbonnier,) = _train(_setup(config), _start(config), 1)
+    np.testing.assert_allclose(charbonnier.psnr, mse.psnr, rtol=1e-6)
+    assert charbonnier.loss > mse.loss
+
+
+def test_straight_light_needs_no_room_for_reflections():
+    assert _setup(budget=STRAIGHT).capacity == 0
+    setup = _setup()
+    assert 0 < setup.capacity <= CONFIG.batch
+    _, reports = _train(_setup(budget=STRAIGHT), _start(), 2)
+    assert all(np.isfinite(report.loss) for report in reports)
+
+
+def test_only_the_newest_checkpoints_are_kept_and_none_twice(tmp_path):
+    steps = loop.run_steps(_setup(), _start(), 5)
+    with Checkpoints(tmp_path, keep=2) as checkpoints:
+        for state, _ in steps:
+            checkpoints.save(state)
+            checkpoints.save(state)
+    kept = sorted(int(path.name) for path in (tmp_path / "checkpoints").iterdir())
+    assert kept == [4, 5]
+
+
+def test_a_folder_without_checkpoints_says_so(tmp_path):
+    with Checkpoints(tmp_path, keep=1) as checkpoints:
+        assert checkpoints.newest() is None
+        with pytest.raises(ValueError, match="no checkpoint"):
+            checkpoints.restore(_start())
+
+
+def test_a_run_folder_holds_everything_that_rendering_needs(tmp_path):
+    run = tmp_path / "run"
+    run_folder.create(run, CONFIG, SAVED, _GEOMETRY)
+    state, _ = next(loop.run_steps(_setup(), _start(), 1))
+    with Checkpoints(run, keep=1) as checkpoints:
+        checkpoints.save(state)
+    model = load_model(run)
+    assert model.config == MODEL and model.budget == PAPER
+    _assert_identical(model.params, state.params)
+    _assert_identical(model.geometry, _GEOMETRY)
+    with pytest.raises(ValueError, match=r"step 7.*\[1\]"):
+        load_model(run, step=7)
+
+
+def test_a_run_is_never_overwritten(tmp_path):
+    run_folder.create(tmp_path, CONFIG, SAVED, _GEOMETRY)
+    with pytest.raises(ValueError, match="--resume"):
+        run_folder.create(tmp_path, CONFIG, SAVED, _GEOMETRY)
+    assert run_folder.read_config(tmp_path) == CONFIG
+
+
+def test_a_run_can_not_change_its_options(tmp_path):
+    run_folder.create(tmp_path, CONFIG, SAVED, _GEOMETRY)
+    run_folder.check_unchanged(tmp_path, CONFIG, SAVED)
+    with pytest.raises(ValueError, match="other options"):
+        run_folder.check_unchanged(tmp_path, dataclasses.replace(CONFIG, seed=5), SAVED)
+    model = dataclasses.replace(SAVED, config=dataclasses.replace(MODEL, samples=7))
+    with pytest.raises(ValueError, match="other options"):
+        run_folder.check_unchanged(tmp_path, CONFIG, model)
+
+
+def test_metrics_rewind_to_the_resumed_step(tmp_path):
+    assert run_folder.rewind_metrics(tmp_path, 0) == 0.0
+    for step in range(1, 6):
+        run_folder.append_metrics(tmp_path, {"step": step, "seconds": 2.0 * step})
+    assert run_folder.rewind_metrics(tmp_path, 3) == 6.0
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["step"] for line in lines] == [1, 2, 3]
+
+
+def test_the_loop_can_stop_in_the_middle_of_a_pool():
+    taken = list(itertools.islice(loop.run_steps(_setup(), _start(), 12), 5))
+    assert int(taken[-1][0].step) == 5

@@ -1,0 +1,41 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.training.config import ScheduleConfig
+from refref_jax.training.state import learning_rate, optimizer
+
+_PAPER = ScheduleConfig(steps=25_000, warmup=1000, peak=8e-3, end=1e-3, anneal=1000)
+
+
+@pytest.mark.parametrize(
+    ("step", "rate"),
+    [
+        (0, 0.0),
+        (500, 4e-3),
+        (1000, 8e-3),
+        (13_000, (8e-3 * 1e-3) ** 0.5),
+        (25_000, 1e-3),
+        (30_000, 1e-3),
+    ],
+)
+def test_the_papers_schedule(step, rate):
+    np.testing.assert_allclose(learning_rate(_PAPER)(step), rate, rtol=1e-5)
+
+
+def test_adam_follows_the_schedule():
+    schedule = ScheduleConfig(steps=10, warmup=2, peak=1e-2, end=1e-3, anneal=1)
+    adam = optimizer(schedule)
+    state = adam.init(jnp.zeros(()))
+    for step in range(10):
+        update, state = jax.jit(adam.update)(jnp.float32(3.0), state, jnp.zeros(()))
+        # On a constant gradient Adam's step is the learning rate.
+        np.testing.assert_allclose(-update, learning_rate(schedule)(step), rtol=1e-4)
+
+
+def test_a_schedule_stretches_with_its_steps():
+    half = _PAPER.over(12_500)
+    assert (half.steps, half.warmup, half.anneal) == (12_500, 500, 500)
+    assert (half.peak, half.end) == (_PAPER.peak, _PAPER.end)
+    assert _PAPER.over(25_000) == _PAPER
