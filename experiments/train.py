@@ -115,6 +115,7 @@ def plan_from_flags() -> Plan:
     if _SCENE.value is None:
         raise ValueError("No scene is given. Add --scene=FOLDER.")
     scene = Path(_SCENE.value).resolve()
+    local_layout.check_scene(scene)
     frames = local_layout.read_frames(scene, "train")
     indices = _parse_indices(_IOR.value)
     parts = meshes.read_meshes(scene, indices=indices)
@@ -147,14 +148,17 @@ def plan_from_flags() -> Plan:
 def train(run: Path) -> None:
     """Trains the run of a folder from its newest checkpoint, or from the start."""
     config, model = run_folder.read_config(run), saved.read_static(run)
-    frames = local_layout.read_frames(Path(config.scene.path), "train")
-    sampler = PixelSampler(
-        local_layout.read_images(frames), frames.cameras, seed=config.seed, batch=config.batch
-    )
-    geometry = saved.load_geometry(run)
-    setup = loop.set_up(config, model.config, model.budget, geometry, sampler)
-    state = init_state(config.seed, model.config, config.schedule)
     with Checkpoints(run, keep=_KEEP.value) as checkpoints:
+        if checkpoints.newest() == config.schedule.steps:
+            print(f"{run} is trained already: {config.schedule.steps} steps.")
+            return
+        frames = local_layout.read_frames(Path(config.scene.path), "train")
+        sampler = PixelSampler(
+            local_layout.read_images(frames), frames.cameras, seed=config.seed, batch=config.batch
+        )
+        geometry = saved.load_geometry(run)
+        setup = loop.set_up(config, model.config, model.budget, geometry, sampler)
+        state = init_state(config.seed, model.config, config.schedule)
         if checkpoints.newest() is not None:
             state = checkpoints.restore(state)
         _train(run, setup, state, checkpoints)

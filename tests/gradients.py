@@ -6,6 +6,7 @@ they are turned into JAX arrays on the way.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.test_util import check_grads
 
 
@@ -27,4 +28,4 @@ def assert_numerical(function, *arguments, order=1, modes=("fwd", "rev"), rtol=N
 
 def all_finite(tree):
     """Returns whether every number in a tree of arrays is finite."""
-    return all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(tree))
+    return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))

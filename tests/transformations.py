@@ -4,6 +4,7 @@ A case is a function and batches of its arguments; every argument has a leading 
 """
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 # XLA may fuse what runs op by op without `jit`: a few units in the last place.
@@ -12,20 +13,31 @@ _FUSION = 5e-6
 
 def jitted(function, batches):
     """Compares the function with and without `jit` on the first item."""
-    first = jax.tree.map(lambda x: x[0], batches)
+    first = _item(batches, 0)
     _assert_close(jax.jit(function)(*first), function(*first))
 
 
 def mapped(function, batches):
     """Compares `vmap` with a loop."""
+    _assert_equals_loop(jax.jit(jax.vmap(function))(*batches), jax.jit(function), batches)
+
+
+def batched(function, batches):
+    """Compares a function that takes leading axes with a loop over the first of them."""
     compiled = jax.jit(function)
-    together = jax.jit(jax.vmap(function))(*batches)
-    for index in range(jax.tree.leaves(batches)[0].shape[0]):
-        one = compiled(*jax.tree.map(lambda x, index=index: x[index], batches))
-        _assert_close(jax.tree.map(lambda x, index=index: x[index], together), one)
+    _assert_equals_loop(compiled(*batches), compiled, batches)
 
 
 ALL = (jitted, mapped)
+
+
+def _item(tree, index):
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[index]), tree)
+
+
+def _assert_equals_loop(together, compiled, batches):
+    for index in range(jax.tree.leaves(batches)[0].shape[0]):
+        _assert_close(_item(together, index), compiled(*_item(batches, index)))
 
 
 def _assert_close(got, expected):

@@ -22,7 +22,7 @@ def is_unbounded(scene: Path) -> bool:
                 return _UNBOUNDED[background["type"]]
         except (ValueError, AttributeError, TypeError, KeyError) as error:
             raise SceneError(
-                f"{path} can not be understood ({error!r}). Correct it (the background's type is "
-                f"one of {', '.join(_UNBOUNDED)}), or remove it: it is optional."
+                f"{path} can not be understood ({error!r}). The type of its background is one of "
+                f"{', '.join(_UNBOUNDED)}. Correct it, or remove it: it is optional."
             ) from error
     return scene.resolve().name.split("_")[0] == "env"

@@ -8,23 +8,20 @@
 A depth map named as PNG is read from the float EXR beside it when there is one.
 """
 
-import json
+import collections
 import math
-from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from refref_jax.data import files
+from refref_jax.data import files, transforms
 from refref_jax.data.cameras import Cameras, focal_length, planar_depth_to_distance
 from refref_jax.data.errors import SceneError
 
 SPLITS = ("train", "val", "test")
-
-# Poses are written with six digits or more; a larger deviation is a scale or a shear.
-_ROTATION_TOLERANCE = 1e-3
 
 
 class Frames(NamedTuple):
@@ -55,21 +52,23 @@ def read_frames(scene: Path, split: str) -> Frames:
     Raises:
       SceneError: if a file is missing or broken, or a pose is not a rigid motion.
     """
-    path = scene / f"transforms_{split}.json"
-    transforms = _read_json(path)
-    frames = _get(transforms, "frames", path)
+    path = scene / _transforms_name(split)
+    content = transforms.read_json(path)
+    frames = transforms.get(content, "frames", path)
     if not isinstance(frames, list) or not frames:
         raise SceneError(f"{path} lists no frames. Add frames, or remove the split.")
-    stems = [_get_text(frame, "file_path", path) for frame in frames]
+    stems = [transforms.get_text(frame, "file_path", path) for frame in frames]
     images = tuple(scene / f"{stem}.png" for stem in stems)
     width, height = _image_size(images[0])
-    angle = _get(transforms, "camera_angle_x", path)
+    angle = transforms.get(content, "camera_angle_x", path)
     if not isinstance(angle, int | float) or not 0.0 < angle < math.pi:
         raise SceneError(
             f"camera_angle_x is {angle!r} in {path}. Give the horizontal field of view in "
             "radians, between 0 and pi."
         )
-    poses = np.stack([_pose(_get(f, "transform_matrix", path), path) for f in frames])
+    poses = np.stack(
+        [transforms.rigid_motion(transforms.get(f, "transform_matrix", path), path) for f in frames]
+    )
     masks = _optional_files(scene, frames, "mask_file_path", path)
     depths = _optional_files(scene, frames, "depth_file_path", path)
     result = Frames(
@@ -83,9 +82,24 @@ def read_frames(scene: Path, split: str) -> Frames:
     return result
 
 
+def check_scene(scene: Path) -> None:
+    """Reads every file of every split once, so that a broken one is found before it is needed.
+
+    The splits `val` and `test` may be missing.
+
+    Raises:
+      SceneError: at the first file that is broken.
+    """
+    for split in SPLITS:
+        if split == "train" or (scene / _transforms_name(split)).is_file():
+            frames = read_frames(scene, split)
+            for readings in (_images(frames), _masks(frames), _depths(frames)):
+                collections.deque(readings, maxlen=0)
+
+
 def read_images(frames: Frames) -> UInt8[np.ndarray, "frames h w 3"]:
     """Reads the images of a split as 8-bit sRGB, over white where they are transparent."""
-    return np.stack([_checked(files.read_rgb(path), path, frames) for path in frames.images])
+    return np.stack(list(_images(frames)))
 
 
 def read_masks(frames: Frames) -> Bool[np.ndarray, "frames h w"]:
@@ -99,14 +113,7 @@ def read_masks(frames: Frames) -> Bool[np.ndarray, "frames h w"]:
             f"The frames of {frames.images[0].parent} have no masks. Add mask_file_path to each "
             "frame of the transforms file."
         )
-    masks = [_checked(files.read_mask(path), path, frames) for path in frames.masks]
-    for mask, path in zip(masks, frames.masks, strict=True):
-        if not mask.any():
-            raise SceneError(
-                f"{path} marks no object. Render the mask again, or remove the frame from the "
-                "transforms file."
-            )
-    return np.stack(masks)
+    return np.stack(list(_masks(frames)))
 
 
 def read_distances(frames: Frames) -> Float[np.ndarray, "frames h w"]:
@@ -120,61 +127,32 @@ def read_distances(frames: Frames) -> Float[np.ndarray, "frames h w"]:
             f"The frames of {frames.images[0].parent} have no depth maps. Add depth_file_path to "
             "each frame of the transforms file."
         )
-    depths = [_checked(files.read_depth(path), path, frames) for path in frames.depths]
-    return planar_depth_to_distance(frames.cameras, np.stack(depths))
+    return planar_depth_to_distance(frames.cameras, np.stack(list(_depths(frames))))
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise SceneError(
-            f"{path} does not exist. Give the folder of a scene, which holds "
-            "transforms_train.json, transforms_val.json and transforms_test.json."
-        )
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise SceneError(f"{path} is not valid JSON ({error}). Copy it again.") from error
-    if not isinstance(content, dict):
-        raise SceneError(f"{path} is not a JSON object. Copy it again.")
-    return content
+def _images(frames: Frames) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    for path in frames.images:
+        yield _checked(files.read_rgb(path), path, frames)
 
 
-def _get(record: Any, key: str, path: Path) -> Any:
-    if not isinstance(record, dict) or key not in record:
-        raise SceneError(f"{path} lacks the key {key!r}. Add it, as the data format asks.")
-    return record[key]
+def _masks(frames: Frames) -> Iterator[Bool[np.ndarray, "h w"]]:
+    for path in frames.masks or ():
+        mask = _checked(files.read_mask(path), path, frames)
+        if not mask.any():
+            raise SceneError(
+                f"{path} marks no object. Render the mask again, or remove the frame from the "
+                "transforms file."
+            )
+        yield mask
 
 
-def _get_text(record: Any, key: str, path: Path) -> str:
-    text = _get(record, key, path)
-    if not isinstance(text, str):
-        raise SceneError(f"{key} is {text!r} in {path}. Give the name of a file.")
-    return text
+def _depths(frames: Frames) -> Iterator[Float[np.ndarray, "h w"]]:
+    for path in frames.depths or ():
+        yield _checked(files.read_depth(path), path, frames)
 
 
-def _pose(matrix: Any, path: Path) -> Float[np.ndarray, "3 4"]:
-    """Checks that a matrix is a rigid motion and returns its upper three rows."""
-    try:
-        pose = np.asarray(matrix, np.float64)
-    except (TypeError, ValueError):
-        pose = np.empty(0)
-    if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
-        raise SceneError(
-            f"A transform_matrix in {path} is not a finite 4 x 4 matrix. Export the poses again."
-        )
-    rotation = pose[:3, :3]
-    residual = np.max(np.abs(rotation @ rotation.T - np.eye(3)))
-    if np.max(np.abs(pose[3] - [0.0, 0.0, 0.0, 1.0])) > _ROTATION_TOLERANCE:
-        raise SceneError(
-            f"A transform_matrix in {path} ends with the row {pose[3]}, not 0 0 0 1. Export "
-            "camera-to-world matrices, with the position in the last column."
-        )
-    if residual > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0.0:
-        raise SceneError(
-            f"A transform_matrix in {path} does not rotate: its axes are scaled, sheared or "
-            f"mirrored (deviation {residual:.2g}). Export the poses without scale."
-        )
-    return pose[:3]
+def _transforms_name(split: str) -> str:
+    return f"transforms_{split}.json"
 
 
 def _optional_files(
@@ -183,7 +161,7 @@ def _optional_files(
     """Returns the files that all frames name under a key, or `None` if no frame does."""
     if not any(isinstance(frame, dict) and key in frame for frame in frames):
         return None
-    return tuple(scene / _get_text(frame, key, path) for frame in frames)
+    return tuple(scene / transforms.get_text(frame, key, path) for frame in frames)
 
 
 def _prefer_exr(path: Path) -> Path:
@@ -204,7 +182,7 @@ def _check_files(frames: Frames) -> None:
                     f"{path} does not exist, but the transforms file names it. Copy the scene "
                     "again, or remove the frame."
                 )
-    name, count = Counter(frames.names).most_common(1)[0]
+    name, count = collections.Counter(frames.names).most_common(1)[0]
     if count > 1:
         raise SceneError(
             f"{count} frames of {frames.images[0].parent} have the same file name, {name}. Give "

@@ -1,3 +1,5 @@
+import shutil
+
 import numpy as np
 import pytest
 
@@ -379,3 +381,24 @@ def test_two_frames_of_one_name(scene, other):
     edit_transforms(scene, repeat)
     with scene_error("r_000", "Give every frame a name of its own"):
         local_layout.read_frames(scene, "train")
+
+
+@pytest.mark.parametrize("split", local_layout.SPLITS)
+@pytest.mark.parametrize("kind", ["", "mask", "depth"])
+def test_checking_a_scene_finds_a_broken_file_in_any_split(tmp_path, ball_scene, split, kind):
+    scene = tmp_path / "scene"
+    shutil.copytree(ball_scene, scene)
+    local_layout.check_scene(scene)
+    broken = sorted((scene / kind / split).glob("*.png"))[-1]
+    broken.write_bytes(broken.read_bytes()[:-30])
+    broken.with_suffix(".exr").unlink(missing_ok=True)
+    with scene_error(broken.name, "again"):
+        local_layout.check_scene(scene)
+
+
+def test_checking_a_scene_does_without_val_and_test(tmp_path, ball_scene):
+    scene = tmp_path / "scene"
+    shutil.copytree(ball_scene, scene)
+    for split in ("val", "test"):
+        (scene / f"transforms_{split}.json").unlink()
+    local_layout.check_scene(scene)

@@ -1,10 +1,11 @@
 """The commands, as a user calls them: on the bundled scene, for a handful of steps."""
 
 import json
-import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -12,32 +13,7 @@ import numpy as np
 import pytest
 
 from refref_jax.data import files
-
-_ROOT = Path(__file__).parents[2]
-
-
-def _run(command, *options, fails=False):
-    result = subprocess.run(
-        [sys.executable, "-m", f"experiments.{command}", *map(str, options)],
-        cwd=_ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"JAX_PLATFORMS": "cpu"},
-    )
-    assert (result.returncode != 0) == fails, result.stdout + result.stderr
-    return result
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A run of six steps on the bundled scene."""
-    run = tmp_path_factory.mktemp("runs") / "ball"
-    scene = _ROOT / "experiments" / "data" / "cube_smcvx_ball"
-    options = ("--steps=6", "--batch=64", "--log_every=2", "--checkpoint_every=3")
-    result = _run("train", f"--scene={scene}", f"--out={run}", *options)
-    assert "experiments.evaluate" in result.stdout
-    return run
+from tests.experiments.command import ROOT, run_command
 
 
 def test_training_writes_a_readable_run(trained):
@@ -53,19 +29,36 @@ def test_training_writes_a_readable_run(trained):
 
 def test_a_finished_run_is_neither_repeated_nor_overwritten(trained):
     before = (trained / "metrics.jsonl").read_text()
-    _run("train", f"--out={trained}", "--resume")
+    run_command("train", f"--out={trained}", "--resume")
     assert (trained / "metrics.jsonl").read_text() == before
     scene = json.loads((trained / "config.json").read_text())["scene"]["path"]
-    refused = _run("train", f"--scene={scene}", f"--out={trained}", fails=True)
+    refused = run_command("train", f"--scene={scene}", f"--out={trained}", fails=True)
     assert "--resume" in refused.stderr and "Traceback" not in refused.stderr
-    changed = _run(
+    changed = run_command(
         "train", f"--scene={scene}", f"--out={trained}", "--resume", "--seed=3", fails=True
     )
     assert "other options" in changed.stderr
 
 
+def test_an_interrupted_run_is_saved_and_goes_on(tmp_path):
+    run = tmp_path / "run"
+    options = ["--scene=experiments/data/cube_smcvx_ball", "--batch=64", f"--out={run}"]
+    command = [sys.executable, "-m", "experiments.train", *options, "--log_every=1"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        while not (run / "metrics.jsonl").exists() and process.poll() is None:
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        printed, _ = process.communicate()
+    assert process.returncode == 0
+    assert "--resume" in printed
+    stopped_at = int(re.search(r"Stopped at step (\d+)", printed).group(1))
+    assert {path.name for path in (run / "checkpoints").iterdir()} == {str(stopped_at)}
+    lines = (run / "metrics.jsonl").read_text().splitlines()
+    assert json.loads(lines[-1])["step"] == stopped_at
+
+
 def test_evaluation_writes_images_metrics_and_a_comparison(trained):
-    result = _run("evaluate", f"--run={trained}", "--split=val", "--limit=2")
+    result = run_command("evaluate", f"--run={trained}", "--split=val", "--limit=2")
     out = trained / "eval" / "val"
     assert str(out / "comparison.png") in result.stdout
     summary = json.loads((out / "metrics.json").read_text())
@@ -96,7 +89,7 @@ def test_evaluation_writes_images_metrics_and_a_comparison(trained):
 
 
 def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
-    _run("render", f"--run={trained}", "--views=orbit", "--frames=2", "--size=24")
+    run_command("render", f"--run={trained}", "--views=orbit", "--frames=2", "--size=24")
     out = trained / "render" / "orbit"
     assert {path.name for path in (out / "rgb").iterdir()} == {"r_000.png", "r_001.png"}
     assert files.read_exr(out / "distance" / "r_001.exr").shape == (24, 24)
@@ -118,7 +111,7 @@ def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
 def test_mistakes_end_with_one_line_that_says_what_to_do(tmp_path, command, options, message):
     if command == "train":
         options = (*options, f"--out={tmp_path / 'out'}")
-    result = _run(command, *options, fails=True)
+    result = run_command(command, *options, fails=True)
     assert message in result.stderr
     assert "Traceback" not in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1
@@ -129,12 +122,12 @@ def test_mistakes_end_with_one_line_that_says_what_to_do(tmp_path, command, opti
 def test_help_explains_every_option(command):
     result = subprocess.run(
         [sys.executable, "-m", f"experiments.{command}", "--help"],
-        cwd=_ROOT,
+        cwd=ROOT,
         capture_output=True,
         text=True,
         check=False,
     )
-    source = (_ROOT / "experiments" / f"{command}.py").read_text()
+    source = (ROOT / "experiments" / f"{command}.py").read_text()
     names = re.findall(r'flags\.DEFINE_\w+\(\s*"(\w+)"', source)
     assert len(names) >= 6
     for name in names:

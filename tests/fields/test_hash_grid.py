@@ -29,12 +29,16 @@ _POSITIONS = np.concatenate(
 ).astype(np.float32)
 
 
+def _initialise(seed):
+    return HashGrid(_CONFIG).init(jax.random.key(seed), jnp.zeros(3), jnp.float32(0.0))
+
+
 @functools.cache
 def _parameters():
     """Returns parameters whose entries are of about 1, so that errors show."""
-    params = HashGrid(_CONFIG).init(jax.random.key(0), jnp.zeros(3), jnp.float32(0.0))
+    shapes = jax.eval_shape(_initialise, 0)
     rng = np.random.default_rng(1)
-    return jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), jnp.float32), params)
+    return jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), jnp.float32), shapes)
 
 
 @jax.jit
@@ -44,8 +48,8 @@ def _features(params, positions, scales):
 
 def _at(positions, scales=None):
     positions = jnp.asarray(positions, jnp.float32)
-    scales = jnp.zeros(positions.shape[0]) if scales is None else jnp.asarray(scales, jnp.float32)
-    return _features(_parameters(), positions, scales)
+    scales = np.zeros(positions.shape[0]) if scales is None else scales
+    return _features(_parameters(), positions, jnp.asarray(scales, jnp.float32))
 
 
 def _expected(positions, scales=None):
@@ -212,12 +216,13 @@ def test_fading_at_its_ends(scale, expected):
     value, slope = jax.value_and_grad(lambda s: hash_grid.fading(s, 64))(jnp.float32(scale))
     np.testing.assert_allclose(value, expected, atol=1e-10)
     assert slope == 0.0 or scale > 1.0
-    assert jnp.isfinite(slope)
+    assert np.isfinite(slope)
 
 
 def test_fading_falls_as_the_gaussian_grows():
-    faded = jax.vmap(lambda s: hash_grid.fading(s, 64))(jnp.geomspace(1e-4, 1e4, 100))
-    assert (jnp.diff(faded) <= 0.0).all() and ((faded >= 0.0) & (faded <= 1.0)).all()
+    scales = jnp.asarray(np.geomspace(1e-4, 1e4, 100), jnp.float32)
+    faded = np.asarray(jax.vmap(lambda s: hash_grid.fading(s, 64))(scales))
+    assert (np.diff(faded) <= 0.0).all() and ((faded >= 0.0) & (faded <= 1.0)).all()
 
 
 def test_a_blurred_point_loses_the_fine_levels_first():
@@ -273,7 +278,7 @@ def test_tables_are_found_in_any_tree_and_nothing_else_is():
 
 
 def test_tables_start_small_and_even():
-    params = HashGrid(_CONFIG).init(jax.random.key(3), jnp.zeros(3), jnp.float32(0.0))
+    params = jax.jit(_initialise)(3)
     entries = np.concatenate([np.ravel(table) for table in hash_grid.tables(params)])
     assert abs(entries).max() <= 1e-4 and abs(entries.mean()) < 1e-5
     np.testing.assert_allclose(entries.std(), 1e-4 / np.sqrt(3.0), rtol=0.1)

@@ -37,7 +37,9 @@ _CONTEXTS = {
         "lambda: jnp.zeros(20)))(origins)"
     ),
     "vmap": "jax.jit(jax.vmap(lambda o: cast(tree, o, directions)))(origins[None])[0]",
-    "map": "jax.jit(lambda o: jax.lax.map(lambda x: cast(tree, x, directions), o))(origins[None])[0]",
+    "map": (
+        "jax.jit(lambda o: jax.lax.map(lambda x: cast(tree, x, directions), o))(origins[None])[0]"
+    ),
     "gradient": (
         "jax.jit(jax.grad(lambda o: jnp.sum(o[:, 0] + cast(tree, o, directions))))(origins)[:, 0] "
         "- 1 + expected"

@@ -87,7 +87,7 @@ def test_at_a_knot_the_later_segment_is_taken():
 def test_unused_segments_are_never_reached(make):
     path = made_paths.random_path(1, bends=2, segments=_SEGMENTS)
     line = make(path)
-    assert jnp.isinf(line.knots[3:]).all() and jnp.isfinite(line.knots[:3]).all()
+    assert np.isinf(line.knots[3:]).all() and np.isfinite(line.knots[:3]).all()
     t = [100.0, 1e6, 1e30, 3e38]
     np.testing.assert_array_equal(_segments_at(line, jnp.array(t)), np.full(4, 2))
     assert gradients.all_finite(_at(line, t[:3]))

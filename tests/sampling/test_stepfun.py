@@ -15,6 +15,7 @@ _BINS = 9
 
 _AMOUNT = 0.07
 
+_heights = jax.jit(stepfun.heights)
 _cumulative = jax.jit(stepfun.cumulative)
 _invert = jax.jit(stepfun.invert_cumulative)
 _sample = jax.jit(stepfun.sample_edges)
@@ -54,13 +55,13 @@ _NARROW = jnp.array([0.0, 0.2, 0.2, 0.2, 0.5, 0.5 + 1e-6, 0.8, 1.0, 1.0])
 
 
 def test_heights_by_hand():
-    got = stepfun.heights(*_f32([0.0, 0.5, 0.5, 2.5], [0.25, 0.5, 1.0]))
+    got = _heights(*_f32([0.0, 0.5, 0.5, 2.5], [0.25, 0.5, 1.0]))
     np.testing.assert_allclose(got, [0.5, 0.0, 0.5])
 
 
 def test_heights_times_widths_are_the_weights():
     edges, weights = _step_function(0)
-    got = stepfun.heights(edges, weights) * jnp.diff(edges)
+    got = _heights(edges, weights) * np.diff(edges)
     np.testing.assert_allclose(got, weights, rtol=_SUMMATION)
 
 
@@ -240,8 +241,8 @@ def test_dilate_by_hand():
     # The bins' ends, and where they were moved to: -0.1, 0.3, 0.5 and 0.5, 0.7, 1.1.
     np.testing.assert_allclose(edges, [0, 0, 0.3, 0.4, 0.5, 0.5, 0.6, 0.7, 1, 1], atol=1e-6)
     inside = (edges[:-1] >= 0.2999) & (edges[1:] <= 0.7001)
-    heights = stepfun.heights(edges, weights)
-    wide = jnp.diff(edges) > 1e-5
+    heights = _heights(edges, weights)
+    wide = np.diff(edges) > 1e-5
     np.testing.assert_allclose(heights[inside & wide], 2.5, rtol=1e-5)
     np.testing.assert_array_equal(heights[~inside], 0.0)
 
@@ -262,18 +263,18 @@ def test_dilate_keeps_the_domain_and_sums_to_one(amount):
     edges, weights = _step_function(11, empty=3)
     grid, dilated = _dilate(edges, 5.0 * weights, amount)
     assert grid[0] == edges[0] and grid[-1] == edges[-1]
-    assert (jnp.diff(grid) >= 0.0).all() and (dilated >= 0.0).all()
-    np.testing.assert_allclose(jnp.sum(dilated), 1.0, rtol=_SUMMATION)
+    assert (np.diff(grid) >= 0.0).all() and (dilated >= 0.0).all()
+    np.testing.assert_allclose(np.sum(dilated), 1.0, rtol=_SUMMATION)
 
 
 @pytest.mark.parametrize("amount", [0.0, 0.01, _AMOUNT, 0.4])
 def test_dilate_covers_every_bin_and_never_loses_to_it(amount):
     edges, weights = _step_function(12, empty=3)
-    heights = stepfun.heights(edges, weights)
+    heights = _heights(edges, weights)
     grid, dilated = _dilate(edges, weights, amount)
-    dilated_heights = stepfun.heights(grid, dilated)
-    share = heights / jnp.max(heights)
-    dilated_share = dilated_heights / jnp.max(dilated_heights)
+    dilated_heights = _heights(grid, dilated)
+    share = heights / np.max(heights)
+    dilated_share = dilated_heights / np.max(dilated_heights)
     for x in np.linspace(0.0005, 0.9995, 200):
         before = reference_sampling.height_at(x, edges, share)
         after = reference_sampling.height_at(x, grid, dilated_share)
@@ -293,9 +294,9 @@ def test_dilation_by_nothing_changes_nothing():
 @pytest.mark.parametrize("weights", _HARD_WEIGHTS)
 def test_dilate_is_finite_with_bins_of_no_width(weights):
     grid, dilated = _dilate(_NARROW, *_f32(weights), _AMOUNT)
-    assert jnp.isfinite(grid).all() and jnp.isfinite(dilated).all()
+    assert np.isfinite(grid).all() and np.isfinite(dilated).all()
     visible = (np.asarray(weights) * np.diff(_NARROW)).sum() > 0.0
-    np.testing.assert_allclose(jnp.sum(dilated), float(visible), rtol=_SUMMATION)
+    np.testing.assert_allclose(np.sum(dilated), float(visible), rtol=_SUMMATION)
 
 
 # --- blur ---
@@ -319,9 +320,9 @@ def test_blur_against_a_loop(radius):
 @pytest.mark.parametrize("radius", [0.003, 0.03, 0.3])
 def test_blur_conserves_the_integral(radius):
     edges, weights = _step_function(15, empty=3)
-    points, values = _blur(edges, stepfun.heights(edges, weights), radius)
+    points, values = _blur(edges, _heights(edges, weights), radius)
     np.testing.assert_allclose(np.trapezoid(values, points), 1.0, rtol=1e-4)
-    assert (values >= 0.0).all() and (jnp.diff(points) >= 0.0).all()
+    assert (values >= 0.0).all() and (np.diff(points) >= 0.0).all()
 
 
 def test_blur_is_linear():
@@ -362,13 +363,13 @@ def test_integrate_linear_meets_the_whole_integral():
 def test_integrate_linear_never_decreases_where_the_function_is_not_negative():
     points, values = _f32(np.sort(np.random.default_rng(1).uniform(size=10)), np.ones(10) * 0.3)
     integral = _integrate(jnp.linspace(-1.0, 2.0, 500), points, values)
-    assert (jnp.diff(integral) >= -_SUMMATION).all()
+    assert (np.diff(integral) >= -_SUMMATION).all()
 
 
 @pytest.mark.parametrize("radius", [0.02, 0.2])
 def test_a_blurred_function_integrates_to_its_masses(radius):
     edges, weights = _step_function(17)
-    points, values = _blur(edges, stepfun.heights(edges, weights), radius)
+    points, values = _blur(edges, _heights(edges, weights), radius)
     at = jnp.linspace(0.0, 1.0, 21)
     expected = [reference_sampling.blurred_mass_below(float(x), edges, weights, radius) for x in at]
     np.testing.assert_allclose(_integrate(at, points, values), expected, atol=2e-5)
@@ -399,10 +400,17 @@ def test_check_grads():
     _, weights = _step_function(18)
     edges = np.linspace(0.0, 1.0, _BINS + 1) ** 1.5
     u = np.linspace(0.07, 0.93, 6)
-    gradients.assert_numerical(stepfun.heights, edges, weights)
-    gradients.assert_numerical(stepfun.cumulative, weights)
-    gradients.assert_numerical(stepfun.sample_edges, u, edges, weights)
-    gradients.assert_numerical(stepfun.integrate_linear, u, edges, np.append(weights, 0.2))
+
+    def everything(u, edges, weights):
+        values = jnp.append(weights, weights[:1])
+        return (
+            stepfun.heights(edges, weights),
+            stepfun.cumulative(weights),
+            stepfun.sample_edges(u, edges, weights),
+            stepfun.integrate_linear(u, edges, values),
+        )
+
+    gradients.assert_numerical(everything, u, edges, weights)
 
 
 def _batch():
@@ -425,17 +433,7 @@ _CASES = {
 }
 
 
-@pytest.mark.parametrize("transformation", transformations.ALL)
+@pytest.mark.parametrize("transformation", [transformations.jitted, transformations.batched])
 @pytest.mark.parametrize("name", _CASES)
 def test_transformations_change_nothing(name, transformation):
     transformation(_CASES[name], _batch())
-
-
-@pytest.mark.parametrize("name", _CASES)
-def test_leading_axes_are_batches(name):
-    function = jax.jit(_CASES[name])
-    mapped = jax.jit(jax.vmap(_CASES[name]))(*_batch())
-    for got, expected in zip(
-        jax.tree.leaves(function(*_batch())), jax.tree.leaves(mapped), strict=True
-    ):
-        np.testing.assert_allclose(got, expected, atol=_SUMMATION)

@@ -126,10 +126,10 @@ def test_to_unit_holds_distances_outside_the_interval(warp):
 def test_gradients_are_finite_and_positive(warp):
     s = jnp.linspace(0.0, 1.0, 101)
     slope = jax.jit(jax.vmap(jax.grad(functools.partial(warps.to_distance, warp))))(s)
-    assert jnp.isfinite(slope).all() and (slope > 0.0).all()
+    assert np.isfinite(slope).all() and (slope > 0.0).all()
     t = jnp.asarray(_distances(warp), jnp.float32)
     slope = jax.jit(jax.vmap(jax.grad(functools.partial(warps.to_unit, warp))))(t)
-    assert jnp.isfinite(slope).all() and (slope[1:-1] > 0.0).all()
+    assert np.isfinite(slope).all() and (slope[1:-1] > 0.0).all()
 
 
 @pytest.mark.parametrize("warp", _WARPS)

@@ -1,0 +1,20 @@
+"""Runs a command as a user does."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+def run_command(command, *options, fails=False):
+    """Runs `python -m experiments.{command}` and checks whether it succeeds."""
+    result = subprocess.run(
+        [sys.executable, "-m", f"experiments.{command}", *map(str, options)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (result.returncode != 0) == fails, result.stdout + result.stderr
+    return result

@@ -1,0 +1,292 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.render import compositing
+from tests import gradients, reference_sampling, transformations
+
+# A dozen float32 products and sums.
+_SUMMATION = 2e-6
+
+_SAMPLES = 8
+
+_weigh = jax.jit(compositing.alpha_weights)
+_close = jax.jit(compositing.opaque_end)
+_composite = jax.jit(compositing.composite)
+
+# What the factors of a medium's depth may be multiplied by, as in the tests of Zip-NeRF.
+_MULTIPLIERS = [0.0, 1e-10, 1.0, 1e10, 1e30]
+
+
+def _f32(*arrays):
+    return tuple(jnp.asarray(array, jnp.float32) for array in arrays)
+
+
+def _medium(seed=0):
+    """Returns densities and lengths whose products are of about 0.3."""
+    rng = np.random.default_rng(seed)
+    return _f32(rng.uniform(0.1, 3.0, size=_SAMPLES), rng.uniform(0.1, 0.3, size=_SAMPLES))
+
+
+def _see(weights, *, edges=None, rgb=None):
+    count = len(weights)
+    edges = np.linspace(0.0, count, count + 1) if edges is None else edges
+    rgb = np.ones((count, 3)) if rgb is None else rgb
+    return _composite(*_f32(weights, rgb, edges))
+
+
+# --- weights ---
+
+
+def test_alpha_weights_by_hand():
+    # Each sample takes half of what reaches it, and the last one everything.
+    half = np.log(2.0)
+    got = _weigh(*_f32([half, 2.0 * half, 1e10], [1.0, 0.5, 1.0]))
+    np.testing.assert_allclose(got, [0.5, 0.25, 0.25], rtol=_SUMMATION)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_alpha_weights_against_a_loop(seed):
+    density, lengths = _medium(seed)
+    expected = reference_sampling.alpha_weights(density, lengths)
+    np.testing.assert_allclose(_weigh(density, lengths), expected, rtol=_SUMMATION)
+
+
+@pytest.mark.parametrize("density_scale", [0.0, 1e-10, 1e-5, 1.0, 1e5, 1e10])
+@pytest.mark.parametrize("length_scale", [1e-10, 1e-3, 1.0, 1e3, 1e6])
+def test_alpha_weights_over_magnitudes(density_scale, length_scale):
+    density, lengths = _medium()
+    density, lengths = np.float32(density_scale) * density, np.float32(length_scale) * lengths
+    expected = reference_sampling.alpha_weights(density, lengths)
+    got = _weigh(*_f32(density, lengths))
+    # Light that many samples have dimmed keeps the error of the exponent: up to 1e-6 times 100.
+    np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-37)
+
+
+def test_alpha_weights_can_be_built_backwards():
+    weights = np.array([0.1, 0.0, 0.3, 0.05, 0.2, 0.0, 0.3])
+    lengths = np.array([0.1, 0.2, 0.1, 1.0, 0.5, 2.0, 0.3])
+    reaching = 1.0 - np.concatenate([[0.0], np.cumsum(weights)[:-1]])
+    density = -np.log1p(-weights / reaching) / lengths
+    np.testing.assert_allclose(_weigh(*_f32(density, lengths)), weights, atol=_SUMMATION)
+
+
+def test_alpha_weights_leave_what_passes_through():
+    density, lengths = _medium()
+    passed = np.exp(-np.sum(np.asarray(density * lengths, np.float64)))
+    np.testing.assert_allclose(1.0 - np.sum(_weigh(density, lengths)), passed, atol=_SUMMATION)
+
+
+def test_splitting_a_sample_changes_nothing():
+    density, lengths = _medium()
+    halves = np.repeat(density, 2), np.repeat(lengths, 2) / 2.0
+    pairs = np.asarray(_weigh(*_f32(*halves))).reshape(-1, 2)
+    np.testing.assert_allclose(pairs.sum(axis=-1), _weigh(density, lengths), rtol=5e-6)
+
+
+@jax.jit
+def _weights_and_gradients(density, lengths):
+    # A sum over unequal factors, so that no gradient cancels.
+    factors = jnp.arange(1.0, _SAMPLES + 1.0)
+    total = lambda *x: jnp.sum(factors * compositing.alpha_weights(*x))
+    gradient = jax.grad(total, argnums=(0, 1))(density, lengths)
+    return compositing.alpha_weights(density, lengths), gradient
+
+
+@pytest.mark.parametrize("density_scale", _MULTIPLIERS)
+@pytest.mark.parametrize("length_scale", _MULTIPLIERS)
+def test_alpha_weights_are_finite_with_their_gradients(density_scale, length_scale):
+    density, lengths = (
+        np.float32(scale) * np.asarray(x)
+        for x, scale in zip(_medium(), (density_scale, length_scale), strict=True)
+    )
+    weights, gradient = _weights_and_gradients(*_f32(density, lengths))
+    assert gradients.all_finite((weights, gradient))
+    assert (np.asarray(weights) >= 0.0).all() and np.sum(weights) <= 1.0 + _SUMMATION
+
+
+@pytest.mark.parametrize("place", [0, 3, _SAMPLES - 1])
+@pytest.mark.parametrize("size", [1e10, 1e30, 3e38])
+def test_one_opaque_sample_takes_all_the_light_that_reaches_it(place, size):
+    density, lengths = np.zeros(_SAMPLES), np.ones(_SAMPLES)
+    density[place] = size
+    weights, gradient = _weights_and_gradients(*_f32(density, lengths))
+    np.testing.assert_array_equal(weights, np.eye(_SAMPLES)[place])
+    assert gradients.all_finite(gradient)
+
+
+def test_alpha_weights_check_grads():
+    gradients.assert_numerical(compositing.alpha_weights, *_medium())
+
+
+# --- the opaque end ---
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-10, 0.1, 1.0, 1e10])
+def test_an_opaque_end_makes_the_weights_sum_to_one(scale):
+    density, lengths = _medium()
+    weights = _close(_weigh(*_f32(scale * np.asarray(density), lengths)))
+    np.testing.assert_allclose(np.sum(weights), 1.0, rtol=_SUMMATION)
+    assert (np.asarray(weights) >= 0.0).all()
+
+
+def test_an_opaque_end_changes_the_last_sample_only():
+    weights = _weigh(*_medium())
+    np.testing.assert_array_equal(_close(weights)[:-1], weights[:-1])
+
+
+def test_an_opaque_end_by_hand():
+    np.testing.assert_allclose(_close(*_f32([0.25, 0.5, 0.0])), [0.25, 0.5, 0.25])
+    np.testing.assert_allclose(_close(*_f32([0.75, 0.5, 0.1])), [0.75, 0.5, 0.0])
+
+
+def test_an_opaque_end_is_an_infinitely_dense_last_sample():
+    density, lengths = _medium()
+    dense = np.concatenate([density[:-1], [1e30]])
+    np.testing.assert_allclose(
+        _close(_weigh(density, lengths)), _weigh(*_f32(dense, lengths)), atol=_SUMMATION
+    )
+
+
+def test_an_opaque_end_check_grads():
+    gradients.assert_numerical(compositing.opaque_end, _weigh(*_medium()))
+
+
+# --- colour ---
+
+
+def test_composite_sums_colours_by_hand():
+    seen = _see([0.5, 0.25], rgb=[[1.0, 0.0, 0.5], [0.0, 1.0, 0.5]])
+    np.testing.assert_allclose(seen.rgb, [0.5, 0.25, 0.375], rtol=_SUMMATION)
+    np.testing.assert_allclose(seen.accumulation, 0.75, rtol=_SUMMATION)
+
+
+def test_composite_sums_colours_against_float64():
+    rng = np.random.default_rng(0)
+    weights, rgb = np.asarray(_weigh(*_medium())), rng.uniform(size=(_SAMPLES, 3))
+    expected = np.sum(weights.astype(np.float64)[:, None] * np.float32(rgb), axis=0)
+    np.testing.assert_allclose(_see(weights, rgb=rgb).rgb, expected, rtol=_SUMMATION)
+
+
+# --- distances ---
+
+
+def test_median_by_hand():
+    edges = [1.0, 2.0, 4.0, 5.0]
+    # Half of the light has come after 0.3 of 0.6 of the second interval.
+    np.testing.assert_allclose(_see([0.2, 0.6, 0.2], edges=edges).median, 3.0, rtol=_SUMMATION)
+    np.testing.assert_allclose(_see([0.0, 0.0, 1.0], edges=edges).median, 4.5, rtol=_SUMMATION)
+
+
+def test_the_median_lies_between_two_equal_halves():
+    assert 2.0 <= _see([0.5, 0.0, 0.5], edges=[1.0, 2.0, 4.0, 5.0]).median <= 4.0
+
+
+def test_mean_by_hand():
+    seen = _see([0.2, 0.6, 0.2], edges=[1.0, 2.0, 4.0, 5.0])
+    np.testing.assert_allclose(seen.mean, 0.2 * 1.5 + 0.6 * 3.0 + 0.2 * 4.5, rtol=_SUMMATION)
+    np.testing.assert_allclose(
+        _see([0.1, 0.3, 0.1], edges=[1.0, 2.0, 4.0, 5.0]).mean, seen.mean, rtol=_SUMMATION
+    )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_distances_against_a_loop(seed):
+    rng = np.random.default_rng(seed)
+    weights = np.float32(rng.uniform(size=_SAMPLES) ** 4)
+    weights *= np.float32(rng.uniform(0.55, 1.0)) / weights.sum()
+    edges = np.float32(np.cumsum(rng.uniform(0.1, 2.0, size=_SAMPLES + 1)))
+    seen = _see(weights, edges=edges)
+    expected = reference_sampling.median_distance(weights, edges)
+    np.testing.assert_allclose(seen.median, expected, rtol=1e-5)
+    middles = 0.5 * (edges[1:].astype(np.float64) + edges[:-1])
+    np.testing.assert_allclose(seen.mean, np.average(middles, weights=weights), rtol=1e-5)
+
+
+@pytest.mark.parametrize("place", [0, 4, _SAMPLES - 1])
+def test_a_single_surface_is_found_in_its_interval(place):
+    edges = np.cumsum(np.geomspace(0.1, 3.0, _SAMPLES + 1))
+    density = np.where(np.arange(_SAMPLES) == place, 1e5, 0.0)
+    weights = _weigh(*_f32(density, np.diff(edges)))
+    seen = _see(weights, edges=edges)
+    middle = 0.5 * (edges[place] + edges[place + 1])
+    np.testing.assert_allclose(seen.median, middle, rtol=_SUMMATION)
+    np.testing.assert_allclose(seen.mean, middle, rtol=_SUMMATION)
+    np.testing.assert_allclose(seen.accumulation, 1.0, rtol=_SUMMATION)
+
+
+def test_the_median_finds_a_translucent_surface_in_front_of_a_wall():
+    edges = np.linspace(0.0, 8.0, 9)
+    front = np.eye(8)[2]
+    assert 2.0 <= _see(0.6 * front + 0.4 * np.eye(8)[7], edges=edges).median <= 3.0
+    assert 7.0 <= _see(0.4 * front + 0.6 * np.eye(8)[7], edges=edges).median <= 8.0
+
+
+def test_nothing_is_at_an_infinite_distance():
+    seen = _see(np.zeros(_SAMPLES))
+    assert seen.median == seen.mean == jnp.inf
+    assert seen.accumulation == 0.0
+
+
+@pytest.mark.parametrize(("total", "found"), [(0.49, False), (0.4999, False), (0.51, True)])
+def test_the_median_is_infinite_where_less_than_half_of_the_light_is_found(total, found):
+    seen = _see(total * np.full(_SAMPLES, 1.0 / _SAMPLES))
+    assert np.isfinite(seen.median) == found
+    np.testing.assert_allclose(seen.mean, 0.5 * _SAMPLES, rtol=_SUMMATION)
+
+
+def test_distances_scale_with_the_path():
+    weights = np.asarray(_weigh(*_medium()))
+    near = _see(weights, edges=np.linspace(1.0, 2.0, _SAMPLES + 1))
+    far = _see(weights, edges=1e6 * np.linspace(1.0, 2.0, _SAMPLES + 1))
+    np.testing.assert_allclose(far.median, 1e6 * near.median, rtol=_SUMMATION)
+    np.testing.assert_allclose(far.mean, 1e6 * near.mean, rtol=_SUMMATION)
+
+
+@jax.jit
+def _composite_gradients(density, lengths, rgb):
+    def total(density, lengths, rgb):
+        weights = compositing.alpha_weights(density, lengths)
+        edges = jnp.concatenate([jnp.zeros(1), jnp.cumsum(lengths)])
+        seen = compositing.composite(weights, rgb, edges)
+        finite = jnp.where(jnp.isfinite(seen.median), seen.median, 0.0)
+        finite += jnp.where(jnp.isfinite(seen.mean), seen.mean, 0.0)
+        return jnp.sum(seen.rgb) + seen.accumulation + finite
+
+    return jax.grad(total, argnums=(0, 1, 2))(density, lengths, rgb)
+
+
+# Past 1e10 the distances themselves have no finite squares.
+@pytest.mark.parametrize("density_scale", _MULTIPLIERS)
+@pytest.mark.parametrize("length_scale", _MULTIPLIERS[:-1])
+def test_gradients_of_colour_and_distances_are_finite(density_scale, length_scale):
+    density, lengths = (np.asarray(x) for x in _medium())
+    scaled = np.float32(density_scale) * density, np.float32(length_scale) * lengths
+    assert gradients.all_finite(_composite_gradients(*_f32(*scaled, np.ones((_SAMPLES, 3)))))
+
+
+def test_composite_check_grads():
+    weights, rgb = np.asarray(_weigh(*_medium())), np.random.default_rng(0).uniform(size=(8, 3))
+    edges = np.linspace(1.0, 3.0, _SAMPLES + 1)
+    gradients.assert_numerical(
+        lambda *x: tuple(compositing.composite(*x)), weights, rgb, edges, rtol=1e-4
+    )
+
+
+# --- transformations ---
+
+_CASES = {
+    "alpha_weights": lambda density, lengths: compositing.alpha_weights(density, lengths),
+    "opaque_end": lambda density, lengths: compositing.opaque_end(0.1 * density),
+    "composite": lambda density, lengths: compositing.composite(
+        0.05 * density, jnp.stack([density, lengths, density], axis=-1), jnp.append(lengths, 9.0)
+    ),
+}
+
+
+@pytest.mark.parametrize("transformation", transformations.ALL)
+@pytest.mark.parametrize("name", _CASES)
+def test_transformations_change_nothing(name, transformation):
+    items = [_medium(seed) for seed in range(3)]
+    transformation(_CASES[name], tuple(jnp.stack(x) for x in zip(*items, strict=True)))
