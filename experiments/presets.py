@@ -76,7 +76,7 @@ def _tiny_model(bounds_: Bounds, interior: Interior) -> ModelConfig:
         HashGridConfig(levels=4, coarsest=16, finest=64, entries=1 << 15, features=2), width=16
     )
     field = RadianceFieldConfig(
-        HashGridConfig(levels=8, coarsest=16, finest=512, entries=1 << 17, features=2),
+        HashGridConfig(levels=6, coarsest=16, finest=512, entries=1 << 17, features=4),
         density_width=32,
         bottleneck=15,
         colour_width=32,
@@ -120,7 +120,7 @@ PRESETS = {
     "tiny": Preset(
         model=_tiny_model,
         loss=LossConfig(
-            data="mse", interlevel=0.01, blurs=(0.01,), distortion=0.01, hash_decay=0.1
+            data="mse", interlevel=0.01, blurs=(0.03,), distortion=0.01, hash_decay=0.1
         ),
         schedule=ScheduleConfig(steps=2500, warmup=100, peak=1e-2, end=1e-3, anneal=250),
         batch=1024,

@@ -42,9 +42,8 @@ def interlevel(final: Histogram, proposal: Histogram, *, blur: float) -> Float[A
     Source: Barron et al., Zip-NeRF (2023), section 3 (anti-aliased interlevel loss).
     """
     edges, weights = jax.lax.stop_gradient(final)
-    points, values = stepfun.blur(edges, stepfun.heights(edges, weights), blur)
-    target = jnp.diff(stepfun.integrate_linear(proposal.edges, points, values))
-    target = jax.lax.stop_gradient(target)
+    below = stepfun.blurred_mass_below(proposal.edges, edges, weights, blur)
+    target = jax.lax.stop_gradient(jnp.diff(below))
     shortfall = jnp.maximum(target - proposal.weights, 0.0)
     return jnp.sum(jnp.square(shortfall) / (proposal.weights + _INTERLEVEL_PADDING))
 

@@ -20,7 +20,7 @@ def psnr_masked(
     Source: paper (arXiv 2505.05848), section 5 (PSNR_M).
     """
     squared = jnp.where(mask[..., None], jnp.square(rendered - target), 0.0)
-    error = jnp.sum(squared) / (3.0 * jnp.sum(mask))
+    error = jnp.sum(squared) / (3.0 * jnp.sum(mask, dtype=rendered.dtype))
     return -10.0 * jnp.log10(error)
 
 
@@ -37,5 +37,5 @@ def mean_absolute_error(
     Source: paper (arXiv 2505.05848), section 5 (DMAE).
     """
     error = jnp.where(mask, jnp.abs(rendered - jnp.where(mask, target, 0.0)), 0.0)
-    count = jnp.sum(mask)
+    count = jnp.sum(mask, dtype=rendered.dtype)
     return jnp.where(count > 0, jnp.sum(error) / count, jnp.nan)

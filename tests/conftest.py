@@ -6,14 +6,15 @@ import pytest
 # A silent broadcast between different ranks is a bug.
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# optax adds steps (integers) to rates (floats); everything below training must be explicit.
-_LOOSE = ("training", "experiments")
+# optax and dm-pix mix integers and floats; everything of ours must be explicit.
+_LOOSE = ("training", "experiments", "test_metrics.py")
 
 
 @pytest.fixture(autouse=True)
 def _strict_dtypes(request):
-    folder = Path(request.fspath).parent.name
-    with jax.numpy_dtype_promotion("standard" if folder in _LOOSE else "strict"):
+    path = Path(request.fspath)
+    loose = path.parent.name in _LOOSE or path.name in _LOOSE
+    with jax.numpy_dtype_promotion("standard" if loose else "strict"):
         yield
 
 

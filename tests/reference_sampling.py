@@ -153,16 +153,6 @@ def dilated_height(x, edges, weights, amount):
     return max(tops)
 
 
-def blurred_height(x, edges, heights, radius):
-    """Returns the mean of a step function over `[x - radius, x + radius]`."""
-    edges, heights = _wide(edges, heights)
-    total = 0.0
-    for low, high, height in zip(edges[:-1], edges[1:], heights, strict=True):
-        overlap = min(high, x + radius) - max(low, x - radius)
-        total += height * max(overlap, 0.0)
-    return total / (2.0 * radius)
-
-
 def blurred_mass_below(x, edges, weights, radius):
     """Returns the mass below `x` of a step function convolved with a box, in closed form."""
     edges, weights = _wide(edges, weights)

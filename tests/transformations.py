@@ -3,6 +3,8 @@
 A case is a function and batches of its arguments; every argument has a leading axis.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,21 +16,25 @@ _FUSION = 5e-6
 def jitted(function, batches):
     """Compares the function with and without `jit` on the first item."""
     first = _item(batches, 0)
-    _assert_close(jax.jit(function)(*first), function(*first))
+    _assert_close(_compiled(function)(*first), function(*first))
 
 
 def mapped(function, batches):
     """Compares `vmap` with a loop."""
-    _assert_equals_loop(jax.jit(jax.vmap(function))(*batches), jax.jit(function), batches)
+    _assert_equals_loop(jax.jit(jax.vmap(function))(*batches), _compiled(function), batches)
 
 
 def batched(function, batches):
     """Compares a function that takes leading axes with a loop over the first of them."""
-    compiled = jax.jit(function)
-    _assert_equals_loop(compiled(*batches), compiled, batches)
+    _assert_equals_loop(_compiled(function)(*batches), _compiled(function), batches)
 
 
 ALL = (jitted, mapped)
+
+
+@functools.cache
+def _compiled(function):
+    return jax.jit(function)
 
 
 def _item(tree, index):

@@ -63,7 +63,10 @@ def outside_path(path: LightPaths) -> Polyline:
     line = whole_path(path)
     ends = jnp.append(path.tau[1:], jnp.inf)
     lengths = jnp.where(jnp.isfinite(ends) & line.outside, ends - line.arcs, 0.0)
-    starts = jnp.cumsum(lengths) - lengths
+    # Summed anew for each segment, in one order: a segment without length then starts exactly
+    # where the next one does. A running sum rounds them apart, and a sample falls between.
+    earlier = jnp.tril(jnp.ones((lengths.size, lengths.size), bool), k=-1)
+    starts = jnp.sum(jnp.where(earlier, lengths[None, :], 0.0), axis=-1)
     return line._replace(knots=jnp.where(jnp.isfinite(path.tau), starts, jnp.inf))
 
 

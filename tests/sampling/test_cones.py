@@ -227,12 +227,12 @@ def _gradients(line, start, end):
     ],
 )
 def test_far_and_tiny_intervals_are_finite(start, end):
-    for line in (_straight((1.0, 2.0, -2.0)), polylines.whole_path(_elbow())):
-        for count in (1, 6):
-            positions, scales = _sample(line, start, end, count=count)
-            assert np.isfinite(positions).all() and np.isfinite(scales).all()
-            assert (scales >= 0.0).all()
-        assert gradients.all_finite(_gradients(line, jnp.float32(start), jnp.float32(end)))
+    line = polylines.whole_path(_elbow())
+    for count in (1, 6):
+        positions, scales = _wide(_sample(line, start, end, count=count))
+        assert np.isfinite(positions).all() and np.isfinite(scales).all()
+        assert (scales >= 0.0).all()
+    assert gradients.all_finite(_gradients(line, jnp.float32(start), jnp.float32(end)))
 
 
 # --- the basis ---

@@ -14,14 +14,15 @@ _SUMMATION = 2e-6
 _BINS = 9
 
 _AMOUNT = 0.07
+_AMOUNTS = [0.0, _AMOUNT, 3.0]
+_RADII = [0.003, _AMOUNT, 2.0]
 
 _heights = jax.jit(stepfun.heights)
 _cumulative = jax.jit(stepfun.cumulative)
 _invert = jax.jit(stepfun.invert_cumulative)
 _sample = jax.jit(stepfun.sample_edges)
 _dilate = jax.jit(stepfun.dilate, static_argnums=2)
-_blur = jax.jit(stepfun.blur, static_argnums=2)
-_integrate = jax.jit(stepfun.integrate_linear)
+_blurred_mass = jax.jit(stepfun.blurred_mass_below, static_argnums=3)
 
 
 def _f32(*arrays):
@@ -247,7 +248,7 @@ def test_dilate_by_hand():
     np.testing.assert_array_equal(heights[~inside], 0.0)
 
 
-@pytest.mark.parametrize("amount", [0.0, 0.01, _AMOUNT, 0.4, 3.0])
+@pytest.mark.parametrize("amount", _AMOUNTS)
 def test_dilate_against_a_loop(amount):
     edges, weights = _step_function(10, empty=3)
     grid, dilated = (np.asarray(x, np.float64) for x in _dilate(edges, weights, amount))
@@ -258,7 +259,7 @@ def test_dilate_against_a_loop(amount):
     np.testing.assert_allclose(dilated, expected, atol=5.0 * _SUMMATION)
 
 
-@pytest.mark.parametrize("amount", [0.0, 0.01, _AMOUNT, 0.4, 3.0])
+@pytest.mark.parametrize("amount", _AMOUNTS)
 def test_dilate_keeps_the_domain_and_sums_to_one(amount):
     edges, weights = _step_function(11, empty=3)
     grid, dilated = _dilate(edges, 5.0 * weights, amount)
@@ -267,7 +268,7 @@ def test_dilate_keeps_the_domain_and_sums_to_one(amount):
     np.testing.assert_allclose(np.sum(dilated), 1.0, rtol=_SUMMATION)
 
 
-@pytest.mark.parametrize("amount", [0.0, 0.01, _AMOUNT, 0.4])
+@pytest.mark.parametrize("amount", _AMOUNTS)
 def test_dilate_covers_every_bin_and_never_loses_to_it(amount):
     edges, weights = _step_function(12, empty=3)
     heights = _heights(edges, weights)
@@ -299,80 +300,51 @@ def test_dilate_is_finite_with_bins_of_no_width(weights):
     np.testing.assert_allclose(np.sum(dilated), float(visible), rtol=_SUMMATION)
 
 
-# --- blur ---
+# --- mass below a point, blurred ---
 
 
-def test_blur_by_hand():
-    points, values = _blur(*_f32([0.0, 1.0], [2.0]), 0.25)
-    np.testing.assert_allclose(points, [-0.25, 0.25, 0.75, 1.25])
-    np.testing.assert_allclose(values, [0.0, 2.0, 2.0, 0.0], atol=_SUMMATION)
+def test_blurred_mass_by_hand():
+    # One bin with mass 2, spread over [-0.25, 1.25]; ramps of width 0.5 at both ends.
+    at = [-9.0, -0.25, 0.0, 0.25, 0.5, 0.75, 1.25, 9.0]
+    expected = [0.0, 0.0, 0.125, 0.5, 1.0, 1.5, 2.0, 2.0]
+    got = _blurred_mass(*_f32(at, [0.0, 1.0], [2.0]), 0.25)
+    np.testing.assert_allclose(got, expected, atol=_SUMMATION)
 
 
-@pytest.mark.parametrize("radius", [0.02, 0.1, 2.0])
-def test_blur_against_a_loop(radius):
-    edges, heights = _f32(_step_function(14)[0], np.random.default_rng(0).uniform(size=_BINS))
-    points, values = _blur(edges, heights, radius)
-    x = np.linspace(-2.0 * radius, 1.0 + 2.0 * radius, 50)
-    expected = [reference_sampling.blurred_height(at, edges, heights, radius) for at in x]
-    np.testing.assert_allclose(np.interp(x, points, values), expected, atol=2e-5)
-
-
-@pytest.mark.parametrize("radius", [0.003, 0.03, 0.3])
-def test_blur_conserves_the_integral(radius):
-    edges, weights = _step_function(15, empty=3)
-    points, values = _blur(edges, _heights(edges, weights), radius)
-    np.testing.assert_allclose(np.trapezoid(values, points), 1.0, rtol=1e-4)
-    assert (values >= 0.0).all() and (np.diff(points) >= 0.0).all()
-
-
-def test_blur_is_linear():
-    edges, weights = _step_function(16)
-    points, values = _blur(edges, weights, 0.1)
-    points_twice, values_twice = _blur(edges, 2.0 * weights, 0.1)
-    np.testing.assert_array_equal(points_twice, points)
-    np.testing.assert_allclose(values_twice, 2.0 * values, atol=1e-5)
-
-
-# --- the integral of a piecewise linear function ---
-
-
-def test_integrate_linear_by_hand():
-    arguments = _f32([-1.0, 0.0, 0.5, 1.0, 2.0, 9.0], [0.0, 1.0, 3.0], [0.0, 2.0, 0.0])
-    np.testing.assert_allclose(
-        _integrate(*arguments), [0.0, 0.0, 0.25, 1.0, 2.5, 3.0], rtol=_SUMMATION
-    )
-
-
-def test_integrate_linear_against_numerical_quadrature():
-    rng = np.random.default_rng(0)
-    points, values = np.sort(rng.uniform(size=10)), rng.uniform(size=10)
-    x = np.linspace(0.0, 1.0, 200_001)
-    y = np.interp(x, points, values, left=0.0, right=0.0)
-    below = np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(x))])
-    at = rng.uniform(size=30)
-    got = _integrate(*_f32(at, points, values))
-    np.testing.assert_allclose(got, np.interp(at, x, below), atol=2e-5)
-
-
-def test_integrate_linear_meets_the_whole_integral():
-    points, values = _f32([0.0, 0.5, 0.5, 2.0], [1.0, 3.0, 1.0, 1.0])
-    got = _integrate(jnp.array([0.0, 0.5, 2.0, 1e30]), points, values)
-    np.testing.assert_allclose(got, [0.0, 1.0, 2.5, 2.5], rtol=_SUMMATION)
-
-
-def test_integrate_linear_never_decreases_where_the_function_is_not_negative():
-    points, values = _f32(np.sort(np.random.default_rng(1).uniform(size=10)), np.ones(10) * 0.3)
-    integral = _integrate(jnp.linspace(-1.0, 2.0, 500), points, values)
-    assert (np.diff(integral) >= -_SUMMATION).all()
-
-
-@pytest.mark.parametrize("radius", [0.02, 0.2])
-def test_a_blurred_function_integrates_to_its_masses(radius):
+@pytest.mark.parametrize("radius", _RADII)
+def test_blurred_mass_against_a_loop(radius):
     edges, weights = _step_function(17)
-    points, values = _blur(edges, _heights(edges, weights), radius)
-    at = jnp.linspace(0.0, 1.0, 21)
+    at = jnp.linspace(-2.0 * radius, 1.0 + 2.0 * radius, 31)
     expected = [reference_sampling.blurred_mass_below(float(x), edges, weights, radius) for x in at]
-    np.testing.assert_allclose(_integrate(at, points, values), expected, atol=2e-5)
+    np.testing.assert_allclose(_blurred_mass(at, edges, weights, radius), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("radius", _RADII)
+def test_blurred_mass_is_conserved_and_never_decreases(radius):
+    edges, weights = _step_function(15, empty=3)
+    at = jnp.linspace(-2.0 * radius, 1.0 + 2.0 * radius, 500)
+    below = np.asarray(_blurred_mass(at, edges, weights, radius))
+    assert below[0] == 0.0
+    np.testing.assert_allclose(below[-1], np.sum(weights), rtol=_SUMMATION)
+    assert (np.diff(below) >= -_SUMMATION).all()
+
+
+def test_blurred_mass_of_a_bin_without_width_is_that_of_a_point():
+    edges, weights = _f32([0.0, 0.5, 0.5, 1.0], [0.0, 1.0, 0.0])
+    got = _blurred_mass(jnp.array([0.3, 0.45, 0.5, 0.55, 0.7]), edges, weights, 0.1)
+    np.testing.assert_allclose(got, [0.0, 0.25, 0.5, 0.75, 1.0], atol=_SUMMATION)
+
+
+@pytest.mark.parametrize("width", [1e-3, 1e-5, 1e-7])
+def test_blurred_mass_of_thin_bins_is_no_more_than_they_hold(width):
+    edges = np.float32(0.6) + np.float32(width) * np.linspace(0.0, 1.0, 9)
+    edges, weights = _f32([0.0, *edges, 1.0], [0.0, *np.full(8, 0.125), 0.0])
+    below = np.asarray(_blurred_mass(jnp.linspace(0.0, 1.0, 201), edges, weights, 0.01))
+    assert (np.diff(below) >= -_SUMMATION).all()
+    assert below.max() <= 1.0 + _SUMMATION
+    # A float32 number near 0.6 is only known to 6e-8, which is 3e-6 of the blurred width.
+    expected = np.clip((np.linspace(0.0, 1.0, 201) - 0.6 - 0.5 * width + 0.01) / 0.02, 0.0, 1.0)
+    np.testing.assert_allclose(below, expected, atol=width / 0.02 + 1e-5)
 
 
 # --- searching ---
@@ -402,12 +374,11 @@ def test_check_grads():
     u = np.linspace(0.07, 0.93, 6)
 
     def everything(u, edges, weights):
-        values = jnp.append(weights, weights[:1])
         return (
             stepfun.heights(edges, weights),
             stepfun.cumulative(weights),
             stepfun.sample_edges(u, edges, weights),
-            stepfun.integrate_linear(u, edges, values),
+            stepfun.blurred_mass_below(u, edges, weights, 0.2),
         )
 
     gradients.assert_numerical(everything, u, edges, weights)
@@ -428,8 +399,9 @@ _CASES = {
     ),
     "sample_edges": lambda edges, weights, u: stepfun.sample_edges(u, edges, weights),
     "dilate": lambda edges, weights, u: stepfun.dilate(edges, weights, _AMOUNT),
-    "blur": lambda edges, weights, u: stepfun.blur(edges, weights, _AMOUNT),
-    "integrate_linear": lambda edges, weights, u: stepfun.integrate_linear(u, edges, edges),
+    "blurred_mass_below": lambda edges, weights, u: stepfun.blurred_mass_below(
+        u, edges, weights, _AMOUNT
+    ),
 }
 
 
