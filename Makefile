@@ -17,7 +17,7 @@ demo: $(READY)
 	@echo "Look at runs/demo/eval/test/comparison.png"
 
 test: $(READY)
-	$(RUN) pytest
+	$(RUN) pytest --numprocesses=auto --maxprocesses=4 --dist=loadscope
 
 test-slow: $(READY)
 	$(RUN) pytest -m slow

@@ -1,4 +1,8 @@
+import os
 from pathlib import Path
+
+# Several processes share an accelerator.
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 import jax
 import pytest
