@@ -61,8 +61,8 @@ _BACKGROUND = flags.DEFINE_enum(
 _RADIUS = flags.DEFINE_float(
     "radius",
     None,
-    "Half edge of a bounded scene's cube (7.5 by default), or radius of an unbounded scene's "
-    "uncontracted ball, in world units.",
+    "Half edge of the cube on whose faces a bounded scene's background stands (7.3 by default), or "
+    "radius of an unbounded scene's uncontracted ball, in world units.",
     lower_bound=1e-6,
 )
 _STEPS = flags.DEFINE_integer("steps", None, "Training steps; the preset's if not given.", 1)

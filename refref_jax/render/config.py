@@ -34,9 +34,11 @@ class ModelConfig:
       interior: `field` also samples inside the objects (the paper); `clear` takes nothing to be
         there, which holds for clear glass and costs no samples.
       near: distance of the first sample from the camera, world units.
-      far: distance of the last; the background is opaque there.
+      far: distance of the last; the background is opaque there. In a bounded scene a path ends
+        already where it leaves the cube.
       radius: half edge of a bounded scene's cube, or radius of an unbounded scene's
-        uncontracted ball, world units, around the origin.
+        uncontracted ball, world units, around the origin. Walls should stand on the faces of
+        the cube: between walls and faces the field has to guess.
       unbounded: whether space beyond the ball is contracted.
       dilation: widening of a proposal before it is sampled, as a share of its mean bin width; 0
         for none.

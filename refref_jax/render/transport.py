@@ -99,16 +99,17 @@ def path_radiance(
       anneal: exponent on the proposals' weights, 0 for uniform sampling to 1 for full trust.
     """
     line = _polyline(config, path)
+    warp = distance_warp(config, line)
     histograms = []
     for level, proposal in enumerate(config.proposals):
         s = _resample(config, histograms, jitter.offsets[level], anneal, proposal.samples)
-        samples = _place(config, line, path.radii, s, jitter.rotations[level])
+        samples = _place(config, line, warp, path.radii, s, jitter.rotations[level])
         see = jax.vmap(density_field.density, in_axes=(None, None, 0))
         density = see(params.proposals[level], proposal.field, samples.gaussians)
         histograms.append(Histogram(s, _weigh(config, density, samples.t)))
 
     s = _resample(config, histograms, jitter.offsets[-1], anneal, config.samples)
-    samples = _place(config, line, path.radii, s, jitter.rotations[-1])
+    samples = _place(config, line, warp, path.radii, s, jitter.rotations[-1])
     middles = 0.5 * (samples.t[1:] + samples.t[:-1])
     points = jax.vmap(polylines.point_at, in_axes=(None, 0))(line, middles)
     see = jax.vmap(radiance_field.radiance, in_axes=(None, None, 0, 0))
@@ -127,9 +128,18 @@ def rounds(config: ModelConfig) -> int:
     return len(config.proposals) + 1
 
 
-def warp(config: ModelConfig) -> warps.DistanceWarp:
-    """Returns the model's distance warp."""
-    return warps.DistanceWarp(config.near, config.far, config.radius)
+def distance_warp(config: ModelConfig, line: Polyline) -> warps.DistanceWarp:
+    """Returns the distance warp of a path: it ends where a bounded scene's cube does."""
+    last = jnp.sum(jnp.isfinite(line.knots)) - 1
+    leave = domains.exit_distance(domain(config), line.points[last], line.directions[last])
+    # A camera or a bend on the very face of the cube still leaves room for samples.
+    far = jnp.clip(line.knots[last] + leave, 2.0 * config.near, config.far)
+    return warps.DistanceWarp(config.near, far, config.radius)
+
+
+def domain(config: ModelConfig) -> domains.Domain:
+    """Returns the part of space that a model's fields store."""
+    return domains.Domain(config.radius, config.unbounded)
 
 
 def _polyline(config: ModelConfig, path: LightPaths) -> Polyline:
@@ -162,18 +172,18 @@ def _resample(
 def _place(
     config: ModelConfig,
     line: Polyline,
+    warp: warps.DistanceWarp,
     radius: Float[Array, ""],
     s: Float[Array, " edges"],
     rotation: Float[Array, ""],
 ) -> _Round:
     """Puts intervals on the path and their cones into the field's unit cube."""
-    t = warps.to_distance(warp(config), s)
+    t = warps.to_distance(warp, s)
     turns = rotation + _PATTERN_TURN * (jnp.arange(t.shape[0] - 1, dtype=t.dtype) % 2)
-    domain = domains.Domain(config.radius, config.unbounded)
 
     def cone(start: Array, end: Array, turn: Array) -> Gaussians:
         world = cones.multisamples(line, radius, start, end, turn, count=config.multisamples)
-        return domains.to_unit_cube(domain, world)
+        return domains.to_unit_cube(domain(config), world)
 
     return _Round(s, t, jax.vmap(cone)(t[:-1], t[1:], turns))
 

@@ -41,6 +41,25 @@ def to_unit_cube(domain: Domain, gaussian: Gaussians) -> Gaussians:
     return Gaussians(jnp.clip(0.5 * positions + 0.5, 0.0, 1.0), 0.5 * scales)
 
 
+def exit_distance(
+    domain: Domain, origin: Float[Array, "3"], direction: Float[Array, "3"]
+) -> Float[Array, ""]:
+    """Returns how far a ray goes before it leaves a bounded scene's cube for good.
+
+    `inf` for a ray that never meets the cube and in an unbounded scene. The gradient is not
+    meant to be used: which face is left changes abruptly.
+
+    Source: the slab method, Kay and Kajiya (1986).
+    """
+    if domain.unbounded:
+        return jnp.full_like(origin[0], jnp.inf)
+    inverse = numerics.safe_reciprocal(direction)
+    first = (-domain.radius - origin) * inverse
+    second = (domain.radius - origin) * inverse
+    enter, leave = jnp.max(jnp.minimum(first, second)), jnp.min(jnp.maximum(first, second))
+    return jnp.where((enter <= leave) & (leave >= 0.0), leave, jnp.inf)
+
+
 def contract(x: Float[Array, "*shape 3"]) -> Float[Array, "*shape 3"]:
     """Contracts points to the ball of radius 2: `(2 - 1 / |x|) x / |x|` where `|x| > 1`."""
     norm = numerics.length(x)[..., None]

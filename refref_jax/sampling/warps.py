@@ -20,12 +20,12 @@ class DistanceWarp(NamedTuple):
 
     Attributes:
       near: distance at `s = 0`, world units, > 0.
-      far: distance at `s = 1`, world units, > near.
+      far: distance at `s = 1`, world units, > near; may differ from path to path.
       unit: the scene's size, world units; steps start to grow at about this distance.
     """
 
     near: float
-    far: float
+    far: float | Float[Array, ""]
     unit: float
 
 
@@ -52,5 +52,5 @@ def _scale(warp: DistanceWarp) -> float:
     return abs(_LAMBDA - 1.0) / 2.0 * warp.unit
 
 
-def _ladder(warp: DistanceWarp, t: float) -> float:
+def _ladder(warp: DistanceWarp, t: float | Float[Array, ""]) -> float | Float[Array, ""]:
     return (1.0 + t / _scale(warp)) ** _LAMBDA

@@ -13,7 +13,7 @@ from refref_jax.fields.radiance_field import Radiance
 from refref_jax.render import pixels, transport
 from refref_jax.render.model import Params, init_params
 from refref_jax.render.transport import Jitter
-from refref_jax.sampling import warps
+from refref_jax.sampling import polylines, warps
 from tests import made_paths, reference_sampling
 from tests.small_model import MODEL
 
@@ -83,8 +83,37 @@ def test_rounds_counts_the_final_one():
     assert transport.rounds(dataclasses.replace(MODEL, proposals=MODEL.proposals * 3)) == 4
 
 
-def test_warp_is_that_of_the_scene():
-    assert transport.warp(MODEL) == (MODEL.near, MODEL.far, MODEL.radius)
+def _warp(config, path):
+    shape = polylines.outside_path if config.interior == "clear" else polylines.whole_path
+    return transport.distance_warp(config, shape(jax.tree.map(jnp.asarray, path)))
+
+
+@pytest.mark.parametrize("interior", _MODELS)
+def test_a_path_ends_on_the_walls_of_a_bounded_scene(interior):
+    path, warp = _bent(), _warp(_MODELS[interior], _bent())
+    assert (warp.near, warp.unit) == (MODEL.near, MODEL.radius)
+    end = _walk(path, float(warp.far), interior=interior)[0]
+    np.testing.assert_allclose(np.max(abs(end)), MODEL.radius, rtol=_SUMMATION)
+
+
+def test_a_path_of_an_unbounded_scene_ends_far_away():
+    config = dataclasses.replace(_FIELD, unbounded=True, far=1000.0)
+    assert float(_warp(config, _bent()).far) == 1000.0
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction", "far"),
+    [
+        ((0.0, 0.0, 9.0), (0.0, 0.0, 1.0), MODEL.far),  # starts and stays outside the walls
+        ((0.0, 0.0, -9.0), (0.0, 0.0, 1.0), MODEL.far),  # its exit lies past the far distance
+        ((0.0, 0.0, MODEL.radius), (0.0, 0.0, 1.0), 2.0 * MODEL.near),  # starts on a wall
+    ],
+)
+def test_a_path_always_has_room_for_samples(origin, direction, far):
+    path = made_paths.path([], [direction], [0], origin=origin, segments=_SEGMENTS)
+    np.testing.assert_allclose(_warp(_FIELD, path).far, far, rtol=_SUMMATION)
+    for leaf in jax.tree.leaves(_render(_FIELD, _batch(path))):
+        assert np.isfinite(leaf).all()
 
 
 @pytest.mark.parametrize("interior", _MODELS)
@@ -147,9 +176,9 @@ def _one(config, path):
 # --- the inside of objects ---
 
 
-def _coordinates(config, edges):
-    """Returns the distances at which a final interval has its edges."""
-    return np.asarray(warps.to_distance(transport.warp(config), jnp.asarray(edges)), np.float64)
+def _coordinates(config, path, edges):
+    """Returns the distances at which the intervals of a path have their edges."""
+    return np.asarray(warps.to_distance(_warp(config, path), jnp.asarray(edges)), np.float64)
 
 
 def _walk(path, t, *, interior):
@@ -171,7 +200,7 @@ def test_a_clear_interior_is_never_sampled():
 
 def test_a_field_interior_is_sampled_and_marked():
     paths = _batch(_bent(), _bent(media=(0, 0, 0)))
-    outside = np.asarray(_render(_FIELD, paths).outside)
+    outside = np.asarray(_render(_FIELD, paths, anneal=0.0).outside)
     assert not outside[0].all() and outside[1].all()
 
 
@@ -180,10 +209,10 @@ def test_intervals_are_marked_by_where_their_middle_lies(interior):
     config = _MODELS[interior]
     paths = _some_paths()
     seen = _render(config, paths)
-    t = _coordinates(config, seen.histograms[-1].edges)
     for index in range(4):
         path = _tree_item(paths, index)
-        for sample, (start, end) in enumerate(itertools.pairwise(t[index])):
+        t = _coordinates(config, path, seen.histograms[-1].edges[index])
+        for sample, (start, end) in enumerate(itertools.pairwise(t)):
             *_, outside = _walk(path, 0.5 * (start + end), interior=interior)
             assert seen.outside[index, sample] == outside
 
@@ -285,7 +314,7 @@ _WALL = 4.5
 def test_a_wall_behind_an_object_is_found_at_its_arc_length(plant, interior):
     path = _bent()
     seen = plant(Scene(wall=_WALL), interior, path)
-    t = _coordinates(_fine(interior), seen.histograms[-1].edges[0])
+    t = _coordinates(_fine(interior), path, seen.histograms[-1].edges[0])
     holding = int(np.argmax(seen.histograms[-1].weights[0]))
     width = t[holding + 1] - t[holding]
     assert width < 0.1
@@ -312,9 +341,9 @@ def test_a_wall_in_front_of_an_object_is_found_alike(plant):
 def test_colour_is_asked_with_the_direction_at_the_middle_of_an_interval(plant, interior):
     paths = [_tree_item(_some_paths(), index) for index in range(4)]
     seen = plant(Scene(fog=1.0), interior, *paths)
-    t = _coordinates(_fine(interior), seen.histograms[-1].edges)
     for index, path in enumerate(paths):
-        middles = 0.5 * (t[index, 1:] + t[index, :-1])
+        t = _coordinates(_fine(interior), path, seen.histograms[-1].edges[index])
+        middles = 0.5 * (t[1:] + t[:-1])
         directions = np.array([_walk(path, x, interior=interior)[1] for x in middles])
         expected = np.asarray(seen.histograms[-1].weights[index]) @ directions
         np.testing.assert_allclose(seen.composite.rgb[index], expected, atol=_SUMMATION)
@@ -324,7 +353,7 @@ def test_weights_follow_from_densities_and_lengths(plant):
     # 0.8 per scene radius everywhere, and an opaque end.
     seen = plant(Scene(fog=0.8), "field", _bent())
     for histogram in seen.histograms:
-        t = _coordinates(_FIELD, histogram.edges[0])
+        t = _coordinates(_FIELD, _bent(), histogram.edges[0])
         lengths = np.diff(t) / _FIELD.radius
         expected = reference_sampling.alpha_weights(np.full(lengths.size, 0.8), lengths)
         expected[-1] = 1.0 - expected[:-1].sum()
@@ -335,7 +364,7 @@ def test_an_empty_scene_shows_its_far_end(plant):
     seen = plant(Scene(), "field", _bent())
     weights = np.asarray(seen.histograms[-1].weights[0])
     np.testing.assert_array_equal(weights, np.eye(weights.size)[-1])
-    start, end = _coordinates(_FIELD, seen.histograms[-1].edges[0])[-2:]
+    start, end = _coordinates(_FIELD, _bent(), seen.histograms[-1].edges[0])[-2:]
     np.testing.assert_allclose(seen.composite.median[0], 0.5 * (start + end), rtol=_DISTANCE)
     np.testing.assert_allclose(seen.composite.rgb[0], _bent().directions[2], atol=_SUMMATION)
 
@@ -345,14 +374,13 @@ def test_samples_gather_where_light_comes_from(plant):
 
     def near_the_wall(anneal):
         seen = plant(Scene(wall=_WALL), "field", _bent(), anneal=anneal)
-        t = _coordinates(_FIELD, seen.histograms[-1].edges[0])
+        t = _coordinates(_FIELD, _bent(), seen.histograms[-1].edges[0])
         return np.sum(abs(0.5 * (t[1:] + t[:-1]) - wall) < 0.5)
 
     assert near_the_wall(1.0) > 3 * near_the_wall(0.0)
 
 
 # --- annealing and jitter ---
-
 
 
 def _jitter(offsets, rotations=None):

@@ -38,6 +38,56 @@ def _cube(domain, positions, scales=None):
     return _to_unit_cube(domain, Gaussians(positions, jnp.asarray(scales, jnp.float32)))
 
 
+# --- where a ray leaves ---
+
+_BOUNDED = Domain(radius=2.0, unbounded=False)
+
+_exit_distance = jax.jit(domains.exit_distance, static_argnums=0)
+
+
+def _unit(vector):
+    vector = np.asarray(vector, np.float64)
+    return vector / np.linalg.norm(vector)
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction", "expected"),
+    [
+        ((0, 0, 0), (1, 0, 0), 2.0),
+        ((0, 0, 0), (0, 0, -1), 2.0),
+        ((1, -1, 0.5), (0.6, 0, -0.8), 1.0 / 0.6),
+        ((-5, 0, 0), (1, 0, 0), 7.0),  # enters and leaves
+        ((2, 0, 0), (-1, 0, 0), 4.0),  # starts on a face
+        ((1, 1, 1), (1, 1, 1), np.sqrt(3.0)),  # through a corner
+        ((0, 0, 2), (1, 0, 0), 0.0),  # along a face, which is out already
+        ((5, 0, 0), (1, 0, 0), np.inf),  # behind
+        ((5, 5, 0), (1, -0.1, 0), np.inf),  # past
+        ((0, 3, 0), (1, 0, 0), np.inf),  # beside, parallel
+    ],
+)
+def test_exit_distance_by_hand(origin, direction, expected):
+    got = _exit_distance(
+        _BOUNDED, *(jnp.asarray(x, jnp.float32) for x in (origin, _unit(direction)))
+    )
+    np.testing.assert_allclose(got, expected, rtol=_ROUNDING)
+
+
+@pytest.mark.parametrize("radius", [1e-3, 7.3, 1e6])
+def test_exit_lies_on_a_face_and_nothing_beyond_it_inside(radius):
+    rng = np.random.default_rng(3)
+    domain = Domain(radius=radius, unbounded=False)
+    for _ in range(20):
+        origin, direction = rng.uniform(-radius, radius, size=3), _unit(rng.normal(size=3))
+        t = _exit_distance(domain, *(jnp.asarray(x, jnp.float32) for x in (origin, direction)))
+        end = origin + float(t) * direction
+        np.testing.assert_allclose(np.max(abs(end)), radius, rtol=1e-5)
+
+
+def test_an_unbounded_scene_is_never_left():
+    domain = Domain(radius=2.0, unbounded=True)
+    assert np.isinf(_exit_distance(domain, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])))
+
+
 # --- contraction ---
 
 
