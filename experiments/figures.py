@@ -14,6 +14,7 @@ from matplotlib import pyplot
 _COLOUR_MAP = "turbo"
 _ERROR_GAIN = 4.0
 _INCHES = 2.4
+_INCHES_OF_THE_SCALE = 1.1
 
 
 class Comparison(NamedTuple):
@@ -41,7 +42,7 @@ def write_comparison(path: Path, views: Sequence[Comparison]) -> None:
     figure, axes = pyplot.subplots(
         len(views),
         len(titles),
-        figsize=(_INCHES * len(titles), _INCHES * len(views) + 0.4),
+        figsize=(_INCHES * len(titles) + _INCHES_OF_THE_SCALE, _INCHES * len(views) + 0.4),
         squeeze=False,
         layout="constrained",
     )

@@ -12,6 +12,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from refref_jax.data.errors import SceneError
 
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
 # The 8-bit depth maps of the data set: white is 1 world unit, black 11.5 or more.
 _NEAREST_DEPTH = 1.0
 _DEPTH_RANGE = 10.5
@@ -108,12 +110,19 @@ def _read_png(path: Path) -> UInt8[np.ndarray, "h w *channels"]:
         ) from error
     if pixels.dtype == bool:
         pixels = pixels.astype(np.uint8) * 255
-    if pixels.dtype != np.uint8:
+    if pixels.dtype != np.uint8 or _has_sixteen_bits(path):
         raise SceneError(
-            f"{path} has {pixels.dtype} pixels, but 8-bit ones are expected. Convert it to an "
-            "8-bit PNG."
+            f"{path} has more than 8 bits a channel. Convert it to an 8-bit PNG: no more would be "
+            "used."
         )
     return pixels
+
+
+def _has_sixteen_bits(path: Path) -> bool:
+    """Returns whether a PNG's header says so; Pillow halves colours without a word."""
+    with path.open("rb") as file:
+        header = file.read(25)
+    return header.startswith(_PNG_SIGNATURE) and header[24] == 16
 
 
 def _require(path: Path) -> None:

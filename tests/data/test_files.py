@@ -1,3 +1,6 @@
+import struct
+import zlib
+
 import imageio.v3 as iio
 import numpy as np
 import OpenEXR
@@ -178,8 +181,24 @@ def test_to_bytes_rounds_and_clips(value, level):
 @pytest.mark.parametrize("read", [files.read_rgb, files.read_mask, files.read_depth])
 def test_sixteen_bits_are_refused(png, read):
     iio.imwrite(png, np.array([[0, 300], [65535, 1]], np.uint16), plugin="pillow")
-    with scene_error(png.name, "uint16", "8-bit"):
+    with scene_error(png.name, "more than 8 bits", "8-bit PNG"):
         read(png)
+
+
+def _chunk(name, content):
+    checksum = zlib.crc32(name + content)
+    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", checksum)
+
+
+def test_sixteen_bits_of_colour_are_refused(png):
+    # One pixel: no library here writes such a file, and Pillow reads it as 8 bits.
+    colour = 2
+    header = _chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 16, colour, 0, 0, 0))
+    pixel = _chunk(b"IDAT", zlib.compress(b"\0" + struct.pack(">HHH", 1, 300, 65535)))
+    png.write_bytes(b"\x89PNG\r\n\x1a\n" + header + pixel + _chunk(b"IEND", b""))
+    assert iio.imread(png, plugin="pillow").dtype == np.uint8
+    with scene_error(png.name, "more than 8 bits", "8-bit PNG"):
+        files.read_rgb(png)
 
 
 @pytest.mark.parametrize("read", [files.read_rgb, files.read_mask, files.read_depth])
