@@ -71,11 +71,6 @@ def resolutions(config: HashGridConfig) -> list[int]:
     return [round(config.coarsest * growth**level) for level in range(config.levels)]
 
 
-def feature_count(config: HashGridConfig) -> int:
-    """Returns the number of values that a grid gives for a point."""
-    return config.levels * config.features
-
-
 def tables(params: Any) -> list[Float[Array, "_ _"]]:
     """Returns the tables of all hash grids in a tree of parameters."""
     leaves = jax.tree_util.tree_leaves_with_path(params)

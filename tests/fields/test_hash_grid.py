@@ -86,11 +86,10 @@ def test_resolutions_grow_geometrically_to_the_finest(levels, coarsest, finest):
 def test_a_grid_of_one_level_has_its_coarsest_resolution():
     config = HashGridConfig(levels=1, coarsest=7, finest=100, entries=2, features=3)
     assert hash_grid.resolutions(config) == [7]
-    assert hash_grid.feature_count(config) == 3
 
 
-def test_feature_count_is_the_number_of_features():
-    assert hash_grid.feature_count(_CONFIG) == _at(_POSITIONS).shape[-1] == 8
+def test_a_point_has_the_features_of_all_levels():
+    assert _at(_POSITIONS).shape[-1] == _CONFIG.levels * _CONFIG.features
 
 
 @pytest.mark.parametrize(
