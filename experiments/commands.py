@@ -1,5 +1,6 @@
-"""What all commands share: how they start, and how they report errors and progress."""
+"""What all commands share: how they start, stop, and report errors and progress."""
 
+import signal
 import sys
 from collections.abc import Callable, Sequence
 
@@ -13,9 +14,15 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+INTERRUPTED = 130
+"""Status of a command that was stopped by Ctrl-C, as shells have it."""
+
 
 def run(main: Callable[[], None]) -> None:
-    """Runs a command; an error of the user's input ends it with one line and status 2."""
+    """Runs a command; an error of the user's input ends it with one line and status 2.
+
+    So do files that can not be read or written. Ctrl-C ends it with status 130.
+    """
 
     def guarded(arguments: Sequence[str]) -> None:
         logging.set_verbosity(logging.ERROR)
@@ -23,11 +30,30 @@ def run(main: Callable[[], None]) -> None:
             sys.exit(f"Unexpected arguments {arguments[1:]}. Options begin with --; see --help.")
         try:
             main()
-        except ValueError as error:
+        except (ValueError, OSError) as error:
             print(f"error: {error}", file=sys.stderr)
             sys.exit(2)
+        except KeyboardInterrupt:
+            print("Interrupted.", file=sys.stderr)
+            sys.exit(INTERRUPTED)
 
     app.run(guarded)
+
+
+class Interrupt:
+    """Notes that the user wants to stop, so that a step can be finished and saved."""
+
+    def __init__(self) -> None:
+        """Takes over the signals of Ctrl-C and of `kill`."""
+        self.requested = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._request)
+
+    def _request(self, number: int, frame: object) -> None:
+        del frame
+        self.requested = True
+        signal.signal(number, signal.SIG_DFL)
+        print("Stopping after this step; once more to stop at once.", flush=True)
 
 
 class ProgressBar:

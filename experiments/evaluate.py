@@ -46,7 +46,9 @@ def main() -> None:
     """Evaluates a run."""
     run = Path(_RUN.value)
     config = run_folder.read_config(run)
-    model = load_model(run, step=_STEP.value)
+    # Resolved first, and once: training may be going on.
+    step = _STEP.value if _STEP.value is not None else latest_step(run)
+    model = load_model(run, step=step)
     scene = Path(_SCENE.value or config.scene.path)
     truth = read_truth(scene, _SPLIT.value)
     out = run / "eval" / _SPLIT.value
@@ -54,7 +56,7 @@ def main() -> None:
     summary = {
         "scene": scene.name,
         "method": _METHODS.get(config.paths, config.paths),
-        "step": _STEP.value if _STEP.value is not None else latest_step(run),
+        "step": step,
         "results": {key: _mean(per_image, key) for key in per_image[0] if key != "name"},
         "per_image": per_image,
     }
@@ -83,9 +85,14 @@ def read_truth(scene: Path, split: str) -> Truth:
 def evaluate(
     model: Model, truth: Truth, out: Path
 ) -> tuple[list[dict[str, Any]], list[figures.Comparison]]:
-    """Renders and measures each image, and writes what was rendered."""
-    for folder in ("rgb", "distance"):
+    """Renders and measures each image, and writes what was rendered.
+
+    Pictures of an earlier evaluation go first, so that all of a folder are of one checkpoint.
+    """
+    for folder, kind in (("rgb", "*.png"), ("distance", "*.exr")):
         (out / folder).mkdir(parents=True, exist_ok=True)
+        for earlier in (out / folder).glob(kind):
+            earlier.unlink()
     count = len(truth.images)
     chosen = np.unique(np.linspace(0, count - 1, min(_LIMIT.value or count, count)).astype(int))
     shown = set(chosen[np.linspace(0, chosen.size - 1, _VIEWS_IN_COMPARISON).astype(int)])

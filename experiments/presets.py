@@ -18,7 +18,7 @@ from refref_jax.render.config import Interior, ModelConfig, ProposalConfig
 from refref_jax.training.config import LossConfig, ScheduleConfig
 
 _WALLS = 7.3
-"""Half edge of a bounded scene's cube, world units: where the data set's walls stand.
+"""Half edge of a bounded scene's cube, world units, if nothing tells: the data set's walls.
 
 Paths end there, on an opaque background. Of all the ways to choose an end this one alone knows
 where the background is: a cube 3 % too large costs 2.7 dB, since its faces are taken for walls.

@@ -4,7 +4,7 @@ python -m experiments.train --scene=experiments/data/cube_smcvx_ball --out=runs/
 """
 
 import math
-import signal
+import sys
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from absl import flags
 from experiments import commands
 from experiments.presets import PRESETS, bounds
 from refref_jax.data import background, containment, lint, local_layout, meshes
-from refref_jax.data.batches import PixelSampler
+from refref_jax.data.batches import PixelSampler, check_batch
 from refref_jax.data.geometry import build_geometry
 from refref_jax.optics.budgets import BUDGETS
 from refref_jax.optics.wavefront import Geometry
@@ -61,13 +61,13 @@ _BACKGROUND = flags.DEFINE_enum(
 _RADIUS = flags.DEFINE_float(
     "radius",
     None,
-    "Half edge of the cube on whose faces a bounded scene's background stands (7.3 by default), or "
-    "radius of an unbounded scene's uncontracted ball, in world units.",
+    "Half edge of the cube on whose faces a bounded scene's background stands (by default that of "
+    "scene.json, else 7.3), or radius of an unbounded scene's uncontracted ball, in world units.",
     lower_bound=1e-6,
 )
 _STEPS = flags.DEFINE_integer("steps", None, "Training steps; the preset's if not given.", 1)
 _BATCH = flags.DEFINE_integer("batch", None, "Rays a step; the preset's if not given.", 1)
-_SEED = flags.DEFINE_integer("seed", 0, "Seed of everything random.", 0)
+_SEED = flags.DEFINE_integer("seed", 0, "Seed of everything random.", 0, 2**32 - 1)
 _RESUME = flags.DEFINE_bool("resume", False, "Continue the run in --out, if there is one.")
 _LOG_EVERY = flags.DEFINE_integer("log_every", 50, "Steps between two lines of metrics.", 1)
 _CHECKPOINT_EVERY = flags.DEFINE_integer("checkpoint_every", 500, "Steps between checkpoints.", 1)
@@ -82,18 +82,9 @@ class Plan(NamedTuple):
     geometry: Geometry
 
 
-class Interrupt:
-    """Notes that the user wants to stop, so that a step can be finished and saved."""
-
-    def __init__(self) -> None:
-        """Takes over the signals of Ctrl-C and of `kill`."""
-        self.requested = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._request)
-
-    def _request(self, number: int, frame: object) -> None:
-        del number, frame
-        self.requested = True
+_DECIDED_AT_THE_START = (
+    *(_PRESET, _PATHS, _INTERIOR, _RULE, _IOR, _BACKGROUND, _RADIUS, _STEPS, _BATCH, _SEED),
+)
 
 
 def main() -> None:
@@ -103,11 +94,23 @@ def main() -> None:
     if not resuming:
         run_folder.create(run, *plan_from_flags())
     elif _SCENE.value is not None:
-        planned = plan_from_flags()
-        run_folder.check_unchanged(run, planned.config, planned.model)
-    train(run)
+        run_folder.check_unchanged(run, *plan_from_flags())
+    else:
+        _refuse_options(run)
+    if not train(run):
+        sys.exit(commands.INTERRUPTED)
     print(f"Run: {run}  (metrics.jsonl, checkpoints/)")
     print(f"Next: python -m experiments.evaluate --run={run} --split=test")
+
+
+def _refuse_options(run: Path) -> None:
+    """Refuses options that a resumed run would not heed."""
+    names = [holder.name for holder in _DECIDED_AT_THE_START]
+    if given := [f"--{name}" for name in names if flags.FLAGS[name].present]:
+        raise ValueError(
+            f"{run} goes on with the options that it was begun with: {', '.join(given)} would have "
+            "no effect. Leave it out, or add --scene to have all options compared."
+        )
 
 
 def plan_from_flags() -> Plan:
@@ -130,7 +133,9 @@ def plan_from_flags() -> Plan:
     if _BACKGROUND.value != "auto":
         unbounded = _BACKGROUND.value == "unbounded"
     preset = PRESETS[_PRESET.value]
-    space = bounds(frames.cameras, unbounded=unbounded, radius=_RADIUS.value)
+    radius = _RADIUS.value or (None if unbounded else background.half_extent(scene))
+    space = bounds(frames.cameras, unbounded=unbounded, radius=radius)
+    check_batch(frames.cameras, _BATCH.value or preset.batch)
     schedule = preset.schedule.over(_STEPS.value or preset.schedule.steps)
     config = TrainingConfig(
         scene=SceneConfig(str(scene), _RULE.value, tuple(sorted(indices.items()))),
@@ -145,29 +150,39 @@ def plan_from_flags() -> Plan:
     return Plan(config, model, build_geometry(parts, tree.parents, rule=_RULE.value))
 
 
-def train(run: Path) -> None:
-    """Trains the run of a folder from its newest checkpoint, or from the start."""
+def train(run: Path) -> bool:
+    """Trains the run of a folder from its newest checkpoint, or from the start.
+
+    Returns:
+      Whether it has reached its last step.
+    """
     config, model = run_folder.read_config(run), saved.read_static(run)
     with Checkpoints(run, keep=_KEEP.value) as checkpoints:
         if checkpoints.newest() == config.schedule.steps:
             print(f"{run} is trained already: {config.schedule.steps} steps.")
-            return
-        frames = local_layout.read_frames(Path(config.scene.path), "train")
+            return True
+        scene = Path(_SCENE.value or config.scene.path)
+        frames = local_layout.read_frames(scene, "train")
         sampler = PixelSampler(
             local_layout.read_images(frames), frames.cameras, seed=config.seed, batch=config.batch
         )
         geometry = saved.load_geometry(run)
         setup = loop.set_up(config, model.config, model.budget, geometry, sampler)
+        if setup.hit_fraction == 0.0 and config.paths != "straight":
+            print(
+                "warning: no pixel sees the meshes, so no light is bent. Check that their units, "
+                "axes and position are those of the cameras."
+            )
         state = init_state(config.seed, model.config, config.schedule)
         if checkpoints.newest() is not None:
             state = checkpoints.restore(state)
-        _train(run, setup, state, checkpoints)
+        return _train(run, setup, state, checkpoints)
 
 
-def _train(run: Path, setup: loop.Setup, state: TrainState, checkpoints: Checkpoints) -> None:
+def _train(run: Path, setup: loop.Setup, state: TrainState, checkpoints: Checkpoints) -> bool:
     total, step = setup.config.schedule.steps, int(state.step)
     earlier = run_folder.rewind_metrics(run, step)
-    interrupt = Interrupt()
+    interrupt = commands.Interrupt()
     start = last = time.monotonic()
     logged = step
     with commands.ProgressBar("train", total, step) as bar:
@@ -186,13 +201,14 @@ def _train(run: Path, setup: loop.Setup, state: TrainState, checkpoints: Checkpo
                 break
     if step < total:
         print(f"Stopped at step {step}. Continue with --resume --out={run}.")
+    return step == total
 
 
 def _log(run: Path, step: int, report: StepReport, rate: float, seconds: float) -> None:
     if not math.isfinite(report.loss):
         raise ValueError(
-            f"The loss is {report.loss} at step {step}. The last checkpoint is from before: "
-            "resume with another --seed or a smaller learning rate, and please report the scene."
+            f"The loss is {report.loss} at step {step}. Evaluate the last checkpoint, which is "
+            "finite, or train again with another --seed and --out; and please report the scene."
         )
     values = {name: float(value) for name, value in report._asdict().items()}
     line = {"step": step, **values, "rays_per_second": rate, "seconds": seconds}

@@ -1,8 +1,8 @@
 """Every numerical guard of the library, in one place.
 
 A guard keeps a value or a gradient finite where the plain formula would not. Each says what it
-returns at its edge, what its gradient is there, and why that is the useful choice. No other
-module clamps, adds an epsilon or hides a NaN.
+returns at its edge, what its gradient is there, and why that is the useful choice. Elsewhere a
+value is clipped only where its meaning has a range, and nothing hides a NaN.
 
 The pattern is the double `where`: JAX evaluates both branches of a `where` when it
 differentiates, so the *argument* of the dangerous function is replaced as well as its result.

@@ -1,10 +1,16 @@
-"""Whether a scene's background is near or infinitely far (NumPy only)."""
+"""Whether a scene's background is near or infinitely far, and where it stands (NumPy only).
 
-import json
+`scene.json` may tell; the data set's own scenes have none.
+"""
+
+import math
 from pathlib import Path
+from typing import Any
 
+from refref_jax.data import transforms
 from refref_jax.data.errors import SceneError
 
+_FILE = "scene.json"
 _UNBOUNDED = {"cube": False, "sphere": False, "env": True}
 
 
@@ -14,15 +20,36 @@ def is_unbounded(scene: Path) -> bool:
     `scene.json` decides if it names the background; otherwise the folder's name does, which
     begins with `env` in the data set, and with `cube` or `sphere` where there are walls.
     """
-    path = scene / "scene.json"
-    if path.is_file():
-        try:
-            background = json.loads(path.read_text(encoding="utf-8")).get("background", {})
-            if "type" in background:
-                return _UNBOUNDED[background["type"]]
-        except (ValueError, AttributeError, TypeError, KeyError) as error:
-            raise SceneError(
-                f"{path} can not be understood ({error!r}). The type of its background is one of "
-                f"{', '.join(_UNBOUNDED)}. Correct it, or remove it: it is optional."
-            ) from error
-    return scene.resolve().name.split("_")[0] == "env"
+    kind = _background(scene).get("type")
+    if kind is None:
+        return scene.resolve().name.split("_")[0] == "env"
+    if not isinstance(kind, str) or kind not in _UNBOUNDED:
+        raise SceneError(
+            f"The type of the background is {kind!r} in {scene / _FILE}, not one of "
+            f"{', '.join(_UNBOUNDED)}. Correct it, or remove the file: it is optional."
+        )
+    return _UNBOUNDED[kind]
+
+
+def half_extent(scene: Path) -> float | None:
+    """Returns half the edge of the cube that the walls form, if `scene.json` tells it."""
+    extent = _background(scene).get("half_extent")
+    if extent is None:
+        return None
+    if not isinstance(extent, (int, float)) or not 0.0 < extent < math.inf:
+        raise SceneError(
+            f"The half_extent of the background is {extent!r} in {scene / _FILE}. Give a positive "
+            "number, or remove it: it is optional."
+        )
+    return float(extent)
+
+
+def _background(scene: Path) -> dict[str, Any]:
+    path = scene / _FILE
+    background = transforms.read_json(path).get("background", {}) if path.is_file() else {}
+    if not isinstance(background, dict):
+        raise SceneError(
+            f"The background is {background!r} in {path}, not an object. Correct it, or remove the "
+            "file: it is optional."
+        )
+    return background

@@ -25,6 +25,20 @@ class PixelBatch(NamedTuple):
     rgb: UInt8[np.ndarray, "*shape 3"]
 
 
+def check_batch(cameras: Cameras, batch: int) -> None:
+    """Checks that the images of some cameras hold a batch.
+
+    Raises:
+      ValueError: if not.
+    """
+    pixels = len(cameras.poses) * cameras.height * cameras.width
+    if batch > pixels:
+        raise ValueError(
+            f"A batch of {batch} pixels is larger than all images together, which have {pixels}. "
+            "Use a smaller batch."
+        )
+
+
 class PixelSampler:
     """Draws batches of pixels from a set of images.
 
@@ -61,11 +75,7 @@ class PixelSampler:
         self._seed = seed
         self._batch = batch
         self._epoch, self._order = -1, np.empty(0, np.uint32)
-        if self._steps_per_epoch == 0:
-            raise ValueError(
-                f"A batch of {batch} pixels is larger than all images together, which have "
-                f"{len(self._pixels)}. Use a smaller batch."
-            )
+        check_batch(cameras, batch)
 
     @property
     def _steps_per_epoch(self) -> int:

@@ -67,7 +67,10 @@ def read_frames(scene: Path, split: str) -> Frames:
             "radians, between 0 and pi."
         )
     poses = np.stack(
-        [transforms.rigid_motion(transforms.get(f, "transform_matrix", path), path) for f in frames]
+        [
+            transforms.rigid_motion(transforms.get(frame, "transform_matrix", path), stem, path)
+            for frame, stem in zip(frames, stems, strict=True)
+        ]
     )
     masks = _optional_files(scene, frames, "mask_file_path", path)
     depths = _optional_files(scene, frames, "depth_file_path", path)

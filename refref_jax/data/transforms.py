@@ -47,7 +47,7 @@ def get_text(record: Any, name: str, path: Path) -> str:
     return text
 
 
-def rigid_motion(matrix: Any, path: Path) -> Float[np.ndarray, "3 4"]:
+def rigid_motion(matrix: Any, name: str, path: Path) -> Float[np.ndarray, "3 4"]:
     """Returns the upper three rows of a 4 x 4 matrix that rotates and moves, nothing else."""
     try:
         pose = np.asarray(matrix, np.float64)
@@ -55,18 +55,19 @@ def rigid_motion(matrix: Any, path: Path) -> Float[np.ndarray, "3 4"]:
         pose = np.empty(0)
     if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
         raise SceneError(
-            f"A transform_matrix in {path} is not a finite 4 x 4 matrix. Export the poses again."
+            f"The transform_matrix of {name} in {path} is not a finite 4 x 4 matrix. Export the "
+            "poses again."
         )
     rotation = pose[:3, :3]
     residual = np.max(np.abs(rotation @ rotation.T - np.eye(3)))
     if np.max(np.abs(pose[3] - [0.0, 0.0, 0.0, 1.0])) > _ROTATION_TOLERANCE:
         raise SceneError(
-            f"A transform_matrix in {path} ends with the row {pose[3]}, not 0 0 0 1. Export "
-            "camera-to-world matrices, with the position in the last column."
+            f"The transform_matrix of {name} in {path} ends with the row {pose[3]}, not "
+            "0 0 0 1. Export camera-to-world matrices, with the position in the last column."
         )
     if residual > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0.0:
         raise SceneError(
-            f"A transform_matrix in {path} does not rotate: its axes are scaled, sheared or "
-            f"mirrored (deviation {residual:.2g}). Export the poses without scale."
+            f"The transform_matrix of {name} in {path} does not rotate: its axes are scaled, "
+            f"sheared or mirrored (deviation {residual:.2g}). Export the poses without scale."
         )
     return pose[:3]

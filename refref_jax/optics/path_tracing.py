@@ -4,9 +4,14 @@ Rays are followed in one large pool (see `wavefront`); then each batch packs its
 and the reflections worth keeping into one list of fixed capacity. Rays that miss the objects
 have no reflection and take no room for one.
 
+To differentiation, light paths are constants: parameters of fields have gradients along them, but
+rays and geometry have none, and asking for one is an error. The loops have no reverse mode, and the
+hits that they find are constants besides.
+
 Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -61,11 +66,26 @@ def trace_batches(geometry: Geometry, rays: Rays, *, budget: Budget, capacity: i
     """
     if budget.bends == 0:
         return jax.vmap(lambda batch: Traced(straight(batch), jnp.zeros_like(batch.radii)))(rays)
+    return _trace_batches(budget, capacity, geometry, rays)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _trace_batches(budget: Budget, capacity: int, geometry: Geometry, rays: Rays) -> Traced:
     shape = rays.radii.shape
     pool = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
     followed = follow(geometry, pool, bends=budget.bends)
     batches = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), followed)
     return jax.vmap(lambda batch: pack(batch, budget=budget, capacity=capacity))(batches)
+
+
+@_trace_batches.defjvp
+def _refuse_gradients(budget: Budget, capacity: int, primals: object, tangents: object) -> None:
+    del budget, capacity, primals, tangents
+    raise TypeError(
+        "Light paths have no derivatives with respect to rays or geometry here: they would be "
+        "silently wrong. Differentiate with respect to the parameters of the fields only, or hold "
+        "rays and geometry constant with jax.lax.stop_gradient."
+    )
 
 
 def pack(followed: Followed, *, budget: Budget, capacity: int) -> Traced:

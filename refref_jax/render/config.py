@@ -34,8 +34,9 @@ class ModelConfig:
       interior: `field` also samples inside the objects (the paper); `clear` takes nothing to be
         there, which holds for clear glass and costs no samples.
       near: distance of the first sample from the camera, world units.
-      far: distance of the last; the background is opaque there. In a bounded scene a path ends
-        already where it leaves the cube.
+      far: distance of the last from the last bend, or from the camera on a straight path; the
+        background is opaque there. In a bounded scene a path ends already where it leaves the
+        cube, and `far` only serves paths that do not meet it.
       radius: half edge of a bounded scene's cube, or radius of an unbounded scene's
         uncontracted ball, world units, around the origin. Walls should stand on the faces of
         the cube: between walls and faces the field has to guess.

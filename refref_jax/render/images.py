@@ -69,13 +69,13 @@ def render_rays(model: Model, rays: Rays) -> Rendering:
     """
     count = rays.radii.shape[0]
     traced = path_tracing.trace(model.geometry, rays, budget=model.budget, capacity=count)
-    tile = _sort(traced.paths, count)
+    tile = _sort(traced.paths, count, count)
     empty = jax.tree.map(jnp.zeros_like, _blank(count))
     return _finish(_add(model.params, tile.paths, tile.heaviest, empty, config=model.config))
 
 
 def render_image(model: Model, rays: Rays, *, chunk: int = CHUNK) -> Rendering:
-    """Renders any number of rays in pieces of fixed size.
+    """Renders any number of rays in pieces of fixed size; 0 rays give an empty rendering.
 
     Args:
       model: the scene.
@@ -84,15 +84,22 @@ def render_image(model: Model, rays: Rays, *, chunk: int = CHUNK) -> Rendering:
 
     Returns:
       NumPy arrays, with the leading axes of the rays.
+
+    Raises:
+      ValueError: if a chunk holds no path.
     """
+    if chunk < 1:
+        raise ValueError(f"A chunk of {chunk} paths renders nothing. Give 1 or more.")
+    rays = jax.tree.map(np.asarray, rays)
     shape = rays.radii.shape
-    flat = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[len(shape) :]), rays)
-    tiles = [
-        _render_tile(model, _slice_rays(flat, start), chunk)
-        for start in range(0, flat.radii.shape[0], TILE)
-    ]
-    joined = jax.tree.map(lambda *parts: np.concatenate([np.asarray(x) for x in parts]), *tiles)
-    return jax.tree.map(lambda x: x[: flat.radii.shape[0]].reshape(*shape, *x.shape[1:]), joined)
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), rays)
+    count = flat.radii.shape[0]
+    tiles = [jax.tree.map(np.asarray, _blank(0))]
+    for start in range(0, count, TILE):
+        tile = _render_tile(model, _slice_rays(flat, start), min(TILE, count - start), chunk)
+        tiles.append(jax.tree.map(np.asarray, tile))
+    joined = jax.tree.map(lambda *parts: np.concatenate(parts), *tiles)
+    return jax.tree.map(lambda x: x[:count].reshape((*shape, *x.shape[1:])), joined)
 
 
 def _slice_rays(rays: Rays, start: int) -> Rays:
@@ -101,8 +108,8 @@ def _slice_rays(rays: Rays, start: int) -> Rays:
     return jax.tree.map(lambda x: x[index], rays)
 
 
-def _render_tile(model: Model, rays: Rays, chunk: int) -> Rendering:
-    tile = _trace_tile(model.geometry, rays, budget=model.budget)
+def _render_tile(model: Model, rays: Rays, real: int, chunk: int) -> Rendering:
+    tile = _trace_tile(model.geometry, rays, real, budget=model.budget)
     sums = _blank(TILE)
     for start in range(0, int(tile.count), chunk):
         sums = _render_chunk(model.params, tile, sums, start, config=model.config, chunk=chunk)
@@ -115,9 +122,9 @@ def _blank(count: int) -> Rendering:
 
 
 @functools.partial(jax.jit, static_argnames="budget")
-def _trace_tile(geometry: Geometry, rays: Rays, *, budget: Budget) -> _Tile:
+def _trace_tile(geometry: Geometry, rays: Rays, real: Int[Array, ""], *, budget: Budget) -> _Tile:
     traced = path_tracing.trace(geometry, rays, budget=budget, capacity=TILE)
-    return _sort(traced.paths, TILE)
+    return _sort(traced.paths, TILE, real)
 
 
 @functools.partial(jax.jit, static_argnames=("config", "chunk"))
@@ -144,9 +151,15 @@ def _finish_tile(sums: Rendering) -> Rendering:
     return _finish(sums)
 
 
-def _sort(paths: LightPaths, rays: int) -> _Tile:
-    """Moves the paths that exist to the front and marks the heaviest of each ray."""
-    exists = light_paths.exists(paths)
+def _sort(paths: LightPaths, rays: int, real: int | Int[Array, ""]) -> _Tile:
+    """Moves the paths that exist to the front and marks the heaviest of each ray.
+
+    Args:
+      paths: of a tile.
+      rays: size of the tile.
+      real: how many of its rays are not there to fill it up.
+    """
+    exists = light_paths.exists(paths) & (paths.rays < real)
     order = jnp.argsort(~exists, stable=True)
     weight = jnp.mean(paths.weights, axis=-1)
     most = jax.ops.segment_max(weight, paths.rays, num_segments=rays)

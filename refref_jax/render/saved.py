@@ -9,6 +9,7 @@ A model can be rendered from these alone, without the scene that it was trained 
 
 import dataclasses
 import os
+import zipfile
 from pathlib import Path
 
 import jax
@@ -26,7 +27,8 @@ from refref_jax.render.model import Model, Params, init_params
 
 _MODEL = "model.json"
 _GEOMETRY = "geometry.npz"
-_CHECKPOINTS = "checkpoints"
+
+CHECKPOINTS = "checkpoints"
 
 PARAMS_ITEM = "params"
 TRAINING_ITEM = "training"
@@ -101,7 +103,7 @@ def open_checkpoints(run: Path, *, keep: int | None = None) -> ocp.CheckpointMan
     """
     reading = keep is None
     return ocp.CheckpointManager(
-        (run / _CHECKPOINTS).absolute(),
+        (run / CHECKPOINTS).absolute(),
         item_names=(PARAMS_ITEM, TRAINING_ITEM),
         options=ocp.CheckpointManagerOptions(max_to_keep=keep, read_only=reading),
     )
@@ -124,15 +126,41 @@ def find_step(manager: ocp.CheckpointManager, run: Path, step: int | None) -> in
 
 
 def restore(manager: ocp.CheckpointManager, step: int, items: dict) -> ocp.args.Composite:
-    """Reads some items of a checkpoint into the shapes and types that are given."""
+    """Reads some items of a checkpoint into the shapes and types that are given.
+
+    Raises:
+      ValueError: if it is damaged.
+    """
     arguments = {name: ocp.args.StandardRestore(shapes) for name, shapes in items.items()}
-    return manager.restore(step, args=ocp.args.Composite(**arguments))
+    try:
+        return manager.restore(step, args=ocp.args.Composite(**arguments))
+    except Exception as error:  # Orbax raises what its storage does
+        raise ValueError(
+            f"The checkpoint {manager.directory / str(step)} can not be read ({_brief(error)}). "
+            "Remove it to use an older one, or train again."
+        ) from error
 
 
 def load_geometry(run: Path) -> Geometry:
-    """Reads the geometry that a run was made with."""
-    with np.load(run / _GEOMETRY) as arrays:
-        bvh = BVH(*(arrays[name] for name in BVH._fields))
-        surfaces = Surfaces(bvh, arrays["normals"], arrays["parts"])
-        interfaces = Interfaces(*(arrays[name] for name in Interfaces._fields))
+    """Reads the geometry that a run was made with.
+
+    Raises:
+      ValueError: if the file is missing or damaged.
+    """
+    path = run / _GEOMETRY
+    try:
+        with np.load(path) as arrays:
+            bvh = BVH(*(arrays[name] for name in BVH._fields))
+            surfaces = Surfaces(bvh, arrays["normals"], arrays["parts"])
+            interfaces = Interfaces(*(arrays[name] for name in Interfaces._fields))
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(
+            f"{path} can not be read ({_brief(error)}). Restore it, or train again into another "
+            "folder."
+        ) from error
     return jax.tree.map(jax.numpy.asarray, Geometry(surfaces, interfaces))
+
+
+def _brief(error: Exception) -> str:
+    """Returns the kind of an error and the first line of what it says."""
+    return f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"

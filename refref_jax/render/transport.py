@@ -129,11 +129,16 @@ def rounds(config: ModelConfig) -> int:
 
 
 def distance_warp(config: ModelConfig, line: Polyline) -> warps.DistanceWarp:
-    """Returns the distance warp of a path: it ends where a bounded scene's cube does."""
+    """Returns the distance warp of a path: it ends where a bounded scene's cube does.
+
+    The farthest distance counts from the last bend, so that a path that was turned around many
+    times still reaches the background.
+    """
     last = jnp.sum(jnp.isfinite(line.knots)) - 1
     leave = domains.exit_distance(domain(config), line.points[last], line.directions[last])
-    # A camera or a bend on the very face of the cube still leaves room for samples.
-    far = jnp.clip(line.knots[last] + leave, 2.0 * config.near, config.far)
+    far = line.knots[last] + jnp.minimum(leave, config.far)
+    # A camera on the very face of the cube still leaves room for samples.
+    far = jnp.maximum(far, 2.0 * config.near)
     return warps.DistanceWarp(config.near, far, config.radius)
 
 

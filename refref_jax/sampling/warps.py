@@ -43,8 +43,7 @@ def to_distance(warp: DistanceWarp, s: Float[Array, "*shape"]) -> Float[Array, "
 def to_unit(warp: DistanceWarp, t: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Maps a distance in `[near, far]` to `s` in `[0, 1]`; the inverse of `to_distance`."""
     start, end = _ladder(warp, warp.near), _ladder(warp, warp.far)
-    power = (1.0 + t / _scale(warp)) ** _LAMBDA
-    return jnp.clip((start - power) / (start - end), 0.0, 1.0)
+    return jnp.clip((start - _ladder(warp, t)) / (start - end), 0.0, 1.0)
 
 
 def _scale(warp: DistanceWarp) -> float:
@@ -52,5 +51,7 @@ def _scale(warp: DistanceWarp) -> float:
     return abs(_LAMBDA - 1.0) / 2.0 * warp.unit
 
 
-def _ladder(warp: DistanceWarp, t: float | Float[Array, ""]) -> float | Float[Array, ""]:
+def _ladder(
+    warp: DistanceWarp, t: float | Float[Array, "*shape"]
+) -> float | Float[Array, "*shape"]:
     return (1.0 + t / _scale(warp)) ** _LAMBDA

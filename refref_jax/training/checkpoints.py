@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
 from refref_jax.render.saved import (
@@ -35,10 +36,19 @@ class Checkpoints:
         return self._manager.latest_step()
 
     def save(self, state: TrainState) -> None:
-        """Writes a state, and waits: its buffers belong to the next step."""
+        """Writes a state, and waits: its buffers belong to the next step.
+
+        Raises:
+          ValueError: if a parameter is not finite. The checkpoints there are stay.
+        """
         step = int(state.step)
         if step == self.newest():
             return
+        if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(state.params)):
+            raise ValueError(
+                f"Parameters are not finite at step {step}, so no checkpoint is written. Evaluate "
+                "an earlier one, or train again with another --seed and --out."
+            )
         items = {
             PARAMS_ITEM: ocp.args.StandardSave(state.params),
             TRAINING_ITEM: ocp.args.StandardSave(_training_item(state)),

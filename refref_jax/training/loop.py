@@ -29,6 +29,7 @@ class Setup(NamedTuple):
       geometry: what bends it.
       sampler: where the pixels come from.
       capacity: room for reflections in a batch.
+      hit_fraction: share of the pixels that see an object, 0 if no light is bent.
     """
 
     config: TrainingConfig
@@ -37,6 +38,7 @@ class Setup(NamedTuple):
     geometry: Geometry
     sampler: PixelSampler
     capacity: int
+    hit_fraction: float
 
 
 def set_up(
@@ -48,12 +50,11 @@ def set_up(
 ) -> Setup:
     """Moves the geometry to the device, and measures how many rays meet it."""
     geometry = jax.tree.map(jnp.asarray, geometry)
-    capacity = 0
-    if budget.reflections != "none":
-        rays = sampler.survey(_SURVEY).rays
-        fraction = float(steps.hit_fraction(geometry, rays))
-        capacity = capacity_for(budget, config.batch, fraction)
-    return Setup(config, model, budget, geometry, sampler, capacity)
+    fraction = 0.0
+    if budget.bends > 0:
+        fraction = float(steps.hit_fraction(geometry, sampler.survey(_SURVEY).rays))
+    capacity = capacity_for(budget, config.batch, fraction)
+    return Setup(config, model, budget, geometry, sampler, capacity, fraction)
 
 
 def run_steps(

@@ -5,9 +5,13 @@
 {run}/metrics.jsonl    one line for every logged step
 """
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
+
+import jax
+import numpy as np
 
 from refref_jax import configuration
 from refref_jax.optics.wavefront import Geometry
@@ -17,6 +21,7 @@ from refref_jax.training.config import TrainingConfig
 
 _CONFIG = "config.json"
 _METRICS = "metrics.jsonl"
+_LEFT_BEHIND = (_CONFIG, _METRICS, saved.CHECKPOINTS)
 
 
 def exists(run: Path) -> bool:
@@ -30,9 +35,10 @@ def create(run: Path, config: TrainingConfig, model: SavedModel, geometry: Geome
     Raises:
       ValueError: if the folder holds a run already.
     """
-    if exists(run):
+    if found := [name for name in _LEFT_BEHIND if (run / name).exists()]:
         raise ValueError(
-            f"{run} holds a run already. Continue it with --resume, or give another --out."
+            f"{run} holds a run already, or what is left of one ({', '.join(found)}). Continue it "
+            "with --resume, or give another --out."
         )
     run.mkdir(parents=True, exist_ok=True)
     saved.save_scene(run, model, geometry)
@@ -44,16 +50,28 @@ def read_config(run: Path) -> TrainingConfig:
     return configuration.read(run / _CONFIG, TrainingConfig)
 
 
-def check_unchanged(run: Path, config: TrainingConfig, model: SavedModel) -> None:
-    """Checks that a run was made with this very configuration.
+def check_unchanged(
+    run: Path, config: TrainingConfig, model: SavedModel, geometry: Geometry
+) -> None:
+    """Checks that a run was made with this very configuration; only its scene may have moved.
 
     Raises:
       ValueError: if not.
     """
-    if read_config(run) != config or saved.read_static(run) != model:
+    begun = read_config(run)
+    moved = dataclasses.replace(
+        begun, scene=dataclasses.replace(begun.scene, path=config.scene.path)
+    )
+    if moved != config or saved.read_static(run) != model:
         raise ValueError(
             f"{run} was begun with other options than the ones given now. Give --out and "
             "--resume alone to continue it as it was, or choose another --out."
+        )
+    pairs = zip(jax.tree.leaves(saved.load_geometry(run)), jax.tree.leaves(geometry), strict=True)
+    if not all(np.array_equal(theirs, ours) for theirs, ours in pairs):
+        raise ValueError(
+            f"{run} was begun with other meshes than those of {config.scene.path}. Give the scene "
+            "that it was begun with, or choose another --out."
         )
 
 
@@ -72,7 +90,24 @@ def rewind_metrics(run: Path, step: int) -> float:
     path = run / _METRICS
     if not path.is_file():
         return 0.0
-    lines = [json.loads(text) for text in path.read_text(encoding="utf-8").splitlines()]
-    kept = [line for line in lines if line["step"] <= step]
-    path.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
+    kept = [line for line in _read_metrics(path) if line["step"] <= step]
+    rewritten = path.with_suffix(".tmp")
+    rewritten.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
+    rewritten.replace(path)
     return kept[-1]["seconds"] if kept else 0.0
+
+
+def _read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Reads all lines; the last one may be half written, where a run was killed."""
+    texts = path.read_text(encoding="utf-8").splitlines()
+    lines = []
+    for number, text in enumerate(texts, 1):
+        try:
+            lines.append(json.loads(text))
+        except ValueError as error:
+            if number == len(texts):
+                break
+            raise ValueError(
+                f"Line {number} of {path} is not JSON ({error}). Remove that line."
+            ) from error
+    return lines

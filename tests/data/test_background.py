@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from refref_jax.data.background import is_unbounded
+from refref_jax.data.background import half_extent, is_unbounded
 from tests.data.expectations import scene_error
 
 
@@ -51,17 +51,38 @@ def test_scene_json_may_be_silent(tmp_path, content):
     assert not is_unbounded(_scene(tmp_path / "cube_ball", content))
 
 
-@pytest.mark.parametrize("content", [[], 7, {"background": None}, {"background": 7}])
+@pytest.mark.parametrize(
+    "content", [{"background": None}, {"background": 7}, {"background": {"type": ["env"]}}]
+)
 def test_scene_json_of_another_shape(tmp_path, content):
-    with scene_error("scene.json", "Correct it, or remove it"):
+    with scene_error("scene.json", "or remove the file"):
         is_unbounded(_scene(tmp_path / "env_ball", content))
+
+
+@pytest.mark.parametrize("content", [[], 7])
+def test_scene_json_that_is_no_object(tmp_path, content):
+    with scene_error("scene.json", "not a JSON object"):
+        is_unbounded(_scene(tmp_path / "env_ball", content))
+
+
+def test_scene_json_tells_where_the_walls_stand(tmp_path, ball_scene):
+    assert half_extent(ball_scene) == 7.3
+    assert half_extent(_scene(tmp_path / "a", {"background": {"half_extent": 3}})) == 3.0
+    assert half_extent(_scene(tmp_path / "b", {"background": {"type": "cube"}})) is None
+    assert half_extent(_scene(tmp_path / "c")) is None
+
+
+@pytest.mark.parametrize("wrong", ["7", 0, -1.0, [7.3]])
+def test_walls_stand_at_a_positive_distance(tmp_path, wrong):
+    with scene_error("scene.json", "half_extent", "positive number"):
+        half_extent(_scene(tmp_path / "a", {"background": {"half_extent": wrong}}))
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00"])
 def test_scene_json_that_is_no_json(tmp_path, content):
     scene = _scene(tmp_path / "env_ball")
     (scene / "scene.json").write_bytes(content)
-    with scene_error("scene.json", "Correct it, or remove it"):
+    with scene_error("scene.json", "not valid JSON"):
         is_unbounded(scene)
 
 

@@ -6,6 +6,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 
+# Options of a training that takes seconds.
+TINY = ("--steps=6", "--batch=64", "--log_every=2", "--checkpoint_every=3")
+
 
 def run_command(command, *options, fails=False):
     """Runs `python -m experiments.{command}` and checks whether it succeeds."""

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,9 +12,10 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import trimesh
 
 from refref_jax.data import files
-from tests.experiments.command import ROOT, run_command
+from tests.experiments.command import ROOT, TINY, run_command
 
 
 def test_training_writes_a_readable_run(trained):
@@ -38,6 +40,29 @@ def test_a_finished_run_is_neither_repeated_nor_overwritten(trained):
         "train", f"--scene={scene}", f"--out={trained}", "--resume", "--seed=3", fails=True
     )
     assert "other options" in changed.stderr
+    ignored = run_command("train", f"--out={trained}", "--resume", "--seed=3", fails=True)
+    assert "--seed would have no effect" in ignored.stderr
+
+
+def test_a_run_goes_on_with_a_scene_that_has_moved(trained, tmp_path):
+    run, scene = tmp_path / "run", tmp_path / "moved"
+    shutil.copytree(trained, run)
+    config = json.loads((run / "config.json").read_text())
+    shutil.copytree(config["scene"]["path"], scene)
+    config["scene"]["path"] = "nowhere"
+    (run / "config.json").write_text(json.dumps(config))
+    shutil.rmtree(run / "checkpoints" / "6")
+    run_command("train", f"--scene={scene}", f"--out={run}", "--resume", *TINY)
+    assert {path.name for path in (run / "checkpoints").iterdir()} == {"3", "6"}
+
+
+def test_a_mesh_that_no_camera_sees_is_warned_about(tmp_path):
+    scene = tmp_path / "scene"
+    shutil.copytree(ROOT / "experiments" / "data" / "cube_smcvx_ball", scene)
+    path = next((scene / "meshes").iterdir())
+    trimesh.load(path).apply_translation([500.0, 0.0, 0.0]).export(path)
+    result = run_command("train", f"--scene={scene}", f"--out={tmp_path / 'run'}", *TINY)
+    assert "no pixel sees the meshes" in result.stdout
 
 
 def test_an_interrupted_run_is_saved_and_goes_on(tmp_path):
@@ -49,7 +74,7 @@ def test_an_interrupted_run_is_saved_and_goes_on(tmp_path):
             time.sleep(0.1)
         process.send_signal(signal.SIGINT)
         printed, _ = process.communicate()
-    assert process.returncode == 0
+    assert process.returncode == 130
     assert "--resume" in printed
     stopped_at = int(re.search(r"Stopped at step (\d+)", printed).group(1))
     assert {path.name for path in (run / "checkpoints").iterdir()} == {str(stopped_at)}
@@ -104,13 +129,15 @@ def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
         ("train", (), "--scene"),
         ("train", ("--scene=experiments/data/cube_smcvx_ball", "--ior=glass"), "NAME=NUMBER"),
         ("train", ("--scene=experiments/data/cube_smcvx_ball", "--ior=gold=0.5"), "gold"),
+        ("train", ("--scene=experiments/data/cube_smcvx_ball", "--batch=99999999"), "batch"),
+        ("train", ("--scene=experiments/data/cube_smcvx_ball", "--out=README.md/x"), "README.md"),
         ("evaluate", ("--run=nowhere",), "nowhere/config.json does not exist"),
         ("render", ("--run=nowhere",), "nowhere/model.json does not exist"),
     ],
 )
 def test_mistakes_end_with_one_line_that_says_what_to_do(tmp_path, command, options, message):
     if command == "train":
-        options = (*options, f"--out={tmp_path / 'out'}")
+        options = (f"--out={tmp_path / 'out'}", *options)
     result = run_command(command, *options, fails=True)
     assert message in result.stderr
     assert "Traceback" not in result.stderr

@@ -127,11 +127,12 @@ def test_hits_agree_with_embree(aim):
     theirs = scene.run(origins.astype(np.float32), directions.astype(np.float32), output=1)
     expected = np.where(theirs["primID"] < 0, np.inf, theirs["tfar"])
     distances, _, _ = _closest(mesh.triangles, origins, directions)
-    # Embree's fast mode loses some rays at vertices and edges of the silhouette; ours loses none.
+    # At vertices and edges of the silhouette either may miss. Within it nothing slips through: the
+    # back of the sphere would be found instead, at another distance.
     ours_only = np.isfinite(distances) & ~np.isfinite(expected)
     theirs_only = ~np.isfinite(distances) & np.isfinite(expected)
-    assert theirs_only.mean() <= 1e-3
-    assert ours_only.mean() <= (0.08 if aim in ("vertices", "edges") else 1e-3)
+    assert theirs_only.mean() <= (5e-3 if aim in ("vertices", "edges") else 1e-3)
+    assert ours_only.mean() <= (0.02 if aim in ("vertices", "edges") else 1e-3)
     both = np.isfinite(distances) & np.isfinite(expected)
     assert both.mean() > 0.3
     close = np.abs(distances[both] - expected[both]) <= 1e-4

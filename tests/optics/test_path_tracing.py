@@ -335,3 +335,34 @@ def test_capacity_covers_the_hits_of_random_batches():
     assert capacity_for(STRAIGHT, 1024, 0.5) == 0
     assert capacity_for(PAPER, 100, 1.0) == 100
     assert capacity_for(PAPER, 100, 0.0) == 0
+
+
+def test_light_that_escapes_a_closed_body_has_left_its_medium():
+    # Aimed next to the edges of a box: through a tolerant face light enters beside the body, and
+    # never leaves it. Only rays as close to an edge as rounding may do so.
+    box = scenes.geometry(scenes.box((1.0, 1.0, 1.0)))
+    rng = np.random.default_rng(0)
+    aim = rng.uniform(-0.5, 0.5, size=(4000, 3))
+    aim[:, :2] = 0.5 * np.sign(aim[:, :2]) * (1.0 + rng.uniform(-1e-3, 1e-3, size=(4000, 2)))
+    origin = np.array([-3.0, -2.0, 1.0])
+    paths = _refracted(box, scenes.rays(origin, aim - origin))
+    last = paths.media[np.arange(4000), paths.bends]
+    escaped = (paths.statuses == PathStatus.ESCAPED) & (paths.bends > 0)
+    assert escaped.sum() > 500
+    assert np.mean(last[escaped] != AMBIENT) <= 5e-3
+
+
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
+@pytest.mark.parametrize("of", ["rays", "geometry"])
+def test_derivatives_of_light_paths_are_refused(derivative, of):
+    glass = jax.tree.map(jnp.asarray, scenes.geometry(scenes.ball(1.0, subdivisions=1)))
+    rays = jax.tree.map(jnp.asarray, scenes.rays(np.array([[-4.0, 0.2, 0.1]]), [1.0, 0.0, 0.0]))
+
+    def exit_height(x):
+        moved = rays._replace(origins=rays.origins + x) if of == "rays" else rays
+        surfaces = glass.surfaces._replace(normals=glass.surfaces.normals + x)
+        shaped = glass._replace(surfaces=surfaces) if of == "geometry" else glass
+        return path_tracing.trace(shaped, moved, budget=PAPER, capacity=1).paths.points[0, 2, 1]
+
+    with pytest.raises(TypeError, match="no derivatives"):
+        derivative(exit_height)(jnp.float32(0.0))

@@ -6,6 +6,7 @@ import pytest
 from refref_jax.data.cameras import image_rays
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.budgets import PAPER, STRAIGHT
+from refref_jax.optics.light_paths import PathStatus
 from refref_jax.render import Model, images, init_params, render_image, render_rays
 from tests import scenes
 from tests.small_model import CAMERAS, MODEL
@@ -66,17 +67,44 @@ def test_nothing_is_compiled_twice(model):
     assert (images._trace_tile._cache_size(), images._render_chunk._cache_size()) == before
 
 
+def _first(image, count, shape):
+    """Returns the first pixels of an image in another shape."""
+    return image.reshape(256, *image.shape[2:])[:count].reshape((*shape, *image.shape[2:]))
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (0,), (2, 0), (3, 1, 2)])
+def test_rays_may_have_any_leading_axes(model, rays, whole, shape):
+    count = int(np.prod(shape))
+    some = Rays(*(_first(x, count, shape) for x in rays))
+    seen = render_image(model, some)
+    for ours, image in zip(seen, whole, strict=True):
+        expected = _first(image, count, shape)
+        assert ours.shape == expected.shape
+        np.testing.assert_allclose(ours, expected, atol=2e-5)
+
+
+def test_a_chunk_of_nothing_is_refused(model, rays):
+    with pytest.raises(ValueError, match="chunk of 0"):
+        render_image(model, rays, chunk=0)
+
+
+def test_rays_that_only_fill_up_a_tile_are_not_rendered(model, rays):
+    flat = Rays(*(x.reshape(256, *x.shape[2:]) for x in rays))
+    tile = images._trace_tile(model.geometry, images._slice_rays(flat, 0), 256, budget=STRAIGHT)
+    assert int(tile.count) == 256
+
+
 def test_rays_that_miss_pay_nothing_for_reflection(model, rays):
     flat = Rays(*(x.reshape(256, *x.shape[2:]) for x in rays))
     tile = images._slice_rays(flat, 0)
-    paper = images._trace_tile(model.geometry, tile, budget=PAPER)
-    straight = images._trace_tile(model.geometry, tile, budget=STRAIGHT)
-    # Of the tile's rays, some meet the ball; the last one is repeated, and misses it.
-    hits = np.sum(np.asarray(paper.paths.bends)[: images.TILE] > 0)
+    paper = images._trace_tile(model.geometry, tile, 256, budget=PAPER)
+    straight = images._trace_tile(model.geometry, tile, 256, budget=STRAIGHT)
+    # Of the tile's rays, some meet the ball.
+    count = int(paper.count)
+    hits = np.sum(np.asarray(paper.paths.bends)[:256] > 0)
     assert 0 < hits < 256
-    extra = int(paper.count) - int(straight.count)
-    assert extra == np.sum(np.asarray(paper.paths.statuses) == 4)
-    assert extra <= 256
+    reflections = np.asarray(paper.paths.statuses)[:count] == PathStatus.NOT_TRACED
+    assert count - int(straight.count) == np.sum(reflections) == hits
 
 
 def test_gradients_reach_the_fields_and_are_finite(model, rays):

@@ -96,9 +96,18 @@ def test_a_path_ends_on_the_walls_of_a_bounded_scene(interior):
     np.testing.assert_allclose(np.max(abs(end)), MODEL.radius, rtol=_SUMMATION)
 
 
+def test_a_path_that_is_turned_around_again_and_again_still_reaches_the_walls():
+    path = made_paths.path([5.0, 5.0, 5.0], [[0, 0, 1], [0, 0, -1]] * 2, [0, 1, 1, 0])
+    warp = _warp(_FIELD, path)
+    assert float(warp.far) == 27.5 > MODEL.far
+    end = _walk(path, float(warp.far), interior="field")[0]
+    np.testing.assert_allclose(end, [0.0, 0.0, -MODEL.radius], atol=_DISTANCE)
+
+
 def test_a_path_of_an_unbounded_scene_ends_far_away():
     config = dataclasses.replace(_FIELD, unbounded=True, far=1000.0)
-    assert float(_warp(config, _bent()).far) == 1000.0
+    path = _bent()
+    assert float(_warp(config, path).far) == 1000.0 + float(path.tau[2])
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,15 @@
 import dataclasses
 import itertools
 import json
+import shutil
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from refref_jax.optics.budgets import PAPER, STRAIGHT
+from refref_jax.render import saved
 from refref_jax.render.saved import load_model
 from refref_jax.training import loop, run_folder
 from refref_jax.training.checkpoints import Checkpoints
@@ -145,12 +148,61 @@ def test_a_run_is_never_overwritten(tmp_path):
 
 def test_a_run_can_not_change_its_options(tmp_path):
     run_folder.create(tmp_path, CONFIG, SAVED, _GEOMETRY)
-    run_folder.check_unchanged(tmp_path, CONFIG, SAVED)
+    run_folder.check_unchanged(tmp_path, CONFIG, SAVED, _GEOMETRY)
     with pytest.raises(ValueError, match="other options"):
-        run_folder.check_unchanged(tmp_path, dataclasses.replace(CONFIG, seed=5), SAVED)
+        run_folder.check_unchanged(tmp_path, dataclasses.replace(CONFIG, seed=5), SAVED, _GEOMETRY)
     model = dataclasses.replace(SAVED, config=dataclasses.replace(MODEL, samples=7))
     with pytest.raises(ValueError, match="other options"):
-        run_folder.check_unchanged(tmp_path, CONFIG, model)
+        run_folder.check_unchanged(tmp_path, CONFIG, model, _GEOMETRY)
+
+
+def test_a_scene_may_move_but_not_change(tmp_path):
+    run_folder.create(tmp_path, CONFIG, SAVED, _GEOMETRY)
+    scene = dataclasses.replace(CONFIG.scene, path="elsewhere")
+    moved = dataclasses.replace(CONFIG, scene=scene)
+    run_folder.check_unchanged(tmp_path, moved, SAVED, _GEOMETRY)
+    normals = 0.5 * _GEOMETRY.surfaces.normals
+    other = _GEOMETRY._replace(surfaces=_GEOMETRY.surfaces._replace(normals=normals))
+    with pytest.raises(ValueError, match="other meshes"):
+        run_folder.check_unchanged(tmp_path, moved, SAVED, other)
+
+
+@pytest.mark.parametrize("left", ["checkpoints", "metrics.jsonl"])
+def test_what_is_left_of_a_run_is_not_taken_over(tmp_path, left):
+    (tmp_path / left).mkdir()
+    with pytest.raises(ValueError, match=f"what is left of one .{left}"):
+        run_folder.create(tmp_path, CONFIG, SAVED, _GEOMETRY)
+
+
+@pytest.mark.parametrize("damage", ["truncated", "missing"])
+def test_a_damaged_geometry_is_named(tmp_path, damage):
+    run_folder.create(tmp_path, CONFIG, SAVED, _GEOMETRY)
+    path = tmp_path / "geometry.npz"
+    content = path.read_bytes()
+    path.unlink()
+    if damage == "truncated":
+        path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(ValueError, match=r"geometry\.npz can not be read"):
+        saved.load_geometry(tmp_path)
+
+
+def test_a_damaged_checkpoint_is_named(tmp_path):
+    run_folder.create(tmp_path, CONFIG, SAVED, _GEOMETRY)
+    state, _ = next(loop.run_steps(_setup(), _start(), 1))
+    with Checkpoints(tmp_path, keep=1) as checkpoints:
+        checkpoints.save(state)
+    shutil.rmtree(tmp_path / "checkpoints" / "1" / "params")
+    with pytest.raises(ValueError, match=r"checkpoints/1 can not be read"):
+        load_model(tmp_path)
+
+
+def test_parameters_that_are_not_finite_are_never_saved(tmp_path):
+    state, _ = next(loop.run_steps(_setup(), _start(), 1))
+    broken = state._replace(params=jax.tree.map(lambda x: x.at[0].set(jnp.nan), state.params))
+    with Checkpoints(tmp_path, keep=1) as checkpoints:
+        with pytest.raises(ValueError, match="not finite at step 1"):
+            checkpoints.save(broken)
+        assert checkpoints.newest() is None
 
 
 def test_metrics_rewind_to_the_resumed_step(tmp_path):
@@ -160,6 +212,24 @@ def test_metrics_rewind_to_the_resumed_step(tmp_path):
     assert run_folder.rewind_metrics(tmp_path, 3) == 6.0
     lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["step"] for line in lines] == [1, 2, 3]
+
+
+def test_a_half_written_last_line_of_metrics_is_dropped(tmp_path):
+    for step in range(1, 4):
+        run_folder.append_metrics(tmp_path, {"step": step, "seconds": 2.0 * step})
+    path = tmp_path / "metrics.jsonl"
+    path.write_text(path.read_text()[:-8])
+    assert run_folder.rewind_metrics(tmp_path, 3) == 4.0
+    assert [json.loads(line)["step"] for line in path.read_text().splitlines()] == [1, 2]
+
+
+def test_a_damaged_line_of_metrics_is_named_and_nothing_is_lost(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"step": 1, "seconds": 1}\n{"st\n{"step": 3, "seconds": 1}\n')
+    before = path.read_text()
+    with pytest.raises(ValueError, match=r"Line 2 of .*metrics\.jsonl"):
+        run_folder.rewind_metrics(tmp_path, 3)
+    assert path.read_text() == before
 
 
 def test_the_loop_can_stop_in_the_middle_of_a_pool():
