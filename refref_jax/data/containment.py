@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from refref_jax.data.meshes import MeshPart
 from refref_jax.geometry.corner_normals import face_normals
@@ -77,6 +77,15 @@ def winding_number(
     return total / (4.0 * np.pi)
 
 
+def beside_faces(
+    part: MeshPart, faces: Int[np.ndarray, " faces"], side: float
+) -> Float[np.ndarray, "faces 3"]:
+    """Returns points just off the middle of some faces: in front for side 1, behind for -1."""
+    corners = part.vertices[part.faces[faces]]
+    step = side * _GAP * np.max(np.ptp(part.vertices, axis=0))
+    return corners.mean(axis=1) + step * face_normals(corners)
+
+
 def signed_volume(part: MeshPart) -> float:
     """Returns the volume inside a closed surface, negative if its faces point inwards."""
     a, b, c = np.moveaxis(part.vertices[part.faces] - part.vertices.mean(axis=0), 1, 0)
@@ -86,10 +95,7 @@ def signed_volume(part: MeshPart) -> float:
 def _probes(part: MeshPart) -> Float[np.ndarray, "probes 3"]:
     """Returns points just inside and outside of faces spread evenly over the list."""
     chosen = np.unique(np.linspace(0, len(part.faces) - 1, _PROBES).astype(np.int64))
-    corners = part.vertices[part.faces[chosen]]
-    step = _GAP * np.max(np.ptp(part.vertices, axis=0)) * face_normals(corners)
-    centres = corners.mean(axis=1)
-    return np.concatenate([centres - step, centres + step])
+    return np.concatenate([beside_faces(part, chosen, -1.0), beside_faces(part, chosen, 1.0)])
 
 
 def _solid_angles(

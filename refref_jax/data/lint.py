@@ -4,11 +4,17 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
+from jaxtyping import Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from refref_jax.data.containment import Containment, signed_volume
+from refref_jax.data.containment import Containment, beside_faces, winding_number
 from refref_jax.data.meshes import MeshPart
 from refref_jax.geometry.corner_normals import is_degenerate
 from refref_jax.optics.interface_rules import NO_PARENT
+
+# -1 in front of an inverted closed piece; a lone open sheet gives -1/2.
+_WOUND_BACKWARDS = -0.75
 
 
 class Finding(NamedTuple):
@@ -34,15 +40,7 @@ def lint(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
     for i, part in enumerate(parts):
         findings += _edges(part)
         findings += _faces(part)
-        if signed_volume(part) < 0.0:
-            findings.append(
-                Finding(
-                    "error",
-                    part.name,
-                    "its faces point inwards, so inside and outside are exchanged. Flip the "
-                    "faces and export it again.",
-                )
-            )
+        findings += _bodies(part)
         parent = containment.parents[i]
         if parent != NO_PARENT:
             findings.append(Finding("note", part.name, f"lies inside {parts[parent].name}."))
@@ -57,6 +55,35 @@ def lint(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
             )
         )
     return findings
+
+
+def _bodies(part: MeshPart) -> list[Finding]:
+    """Reports pieces whose faces point inwards; those of a cavity do so rightly."""
+    faces = _largest_faces(part)
+    # In front of an inverted piece the surface winds around the other way; in a cavity not at all.
+    winding = winding_number(part, beside_faces(part, faces, 1.0))
+    inverted = int(np.sum(winding < _WOUND_BACKWARDS))
+    if not inverted:
+        return []
+    return [
+        Finding(
+            "error",
+            part.name,
+            f"the faces of {inverted} of its {len(faces)} pieces point inwards, so inside and "
+            "outside are exchanged. Flip those faces and export it again.",
+        )
+    ]
+
+
+def _largest_faces(part: MeshPart) -> Int[np.ndarray, " pieces"]:
+    """Returns the largest face of each connected piece."""
+    first, second = part.faces[:, [0, 1, 0]].ravel(), part.faces[:, [1, 2, 2]].ravel()
+    count = len(part.vertices)
+    graph = coo_array((np.ones(first.size, bool), (first, second)), shape=(count, count))
+    pieces = connected_components(graph, directed=False)[1][part.faces[:, 0]]
+    a, b, c = np.moveaxis(part.vertices[part.faces], 1, 0)
+    by_area = np.argsort(np.linalg.norm(np.cross(b - a, c - a), axis=-1), kind="stable")
+    return np.array(list(dict(zip(pieces[by_area], by_area, strict=True)).values()), np.int64)
 
 
 def _edges(part: MeshPart) -> list[Finding]:

@@ -96,7 +96,14 @@ def test_an_inverted_mesh(part):
     finding = _only(_findings(inverted(part)))
     assert finding.severity == "error"
     assert "point inwards" in finding.message
-    assert "Flip the faces" in finding.message
+    assert "Flip those faces" in finding.message
+
+
+def test_one_inverted_piece_among_others():
+    pieces = [ball(), inverted(ball(centre=(5.0, 0.0, 0.0))), box(centre=(0.0, 5.0, 0.0))]
+    finding = _only(_findings(joined("three_glass", *pieces)))
+    assert finding.severity == "error"
+    assert "1 of its 3 pieces" in finding.message
 
 
 def test_one_flipped_face():
