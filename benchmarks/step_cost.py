@@ -36,8 +36,8 @@ class _Method:
     def __init__(self, scene: Path, paths: str) -> None:
         preset = PRESETS[_PRESET.value]
         frames = local_layout.read_frames(scene, "train")
-        unbounded = background.is_unbounded(scene)
-        model = preset.model(bounds(frames.cameras, unbounded=unbounded, radius=None), "field")
+        space, radius = background.space(scene), background.half_extent(scene)
+        model = preset.model(bounds(frames.cameras, space=space, radius=radius), "field")
         parts = meshes.read_meshes(scene)
         parents = containment.find_containment(parts).parents
         config = TrainingConfig(

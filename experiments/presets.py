@@ -15,6 +15,7 @@ from refref_jax.fields.density_field import DensityFieldConfig
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.fields.radiance_field import RadianceFieldConfig
 from refref_jax.render.config import Interior, ModelConfig, ProposalConfig
+from refref_jax.sampling.domains import Space
 from refref_jax.training.config import LossConfig, ScheduleConfig
 
 _WALLS = 7.3
@@ -35,7 +36,7 @@ class Bounds:
     near: float
     far: float
     radius: float
-    unbounded: bool
+    space: Space
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Preset:
     pool: int
 
 
-def bounds(cameras: Cameras, *, unbounded: bool, radius: float | None) -> Bounds:
+def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
     """Returns the bounds of a scene.
 
     A bounded scene reaches from any camera to the farthest corner of its cube. An unbounded one
@@ -65,14 +66,14 @@ def bounds(cameras: Cameras, *, unbounded: bool, radius: float | None) -> Bounds
 
     Args:
       cameras: of the training images.
-      unbounded: whether the background is infinitely far.
+      space: `unbounded` if the background is infinitely far.
       radius: overrides the default of `ModelConfig.radius`.
     """
     farthest = float(np.max(np.linalg.norm(cameras.poses[:, :, 3], axis=-1)))
-    if unbounded:
-        return Bounds(_NEAR, _FAR_UNBOUNDED, radius or 1.25 * farthest, True)
+    if space == "unbounded":
+        return Bounds(_NEAR, _FAR_UNBOUNDED, radius or 1.25 * farthest, space)
     radius = radius or _WALLS
-    return Bounds(_NEAR, farthest + math.sqrt(3.0) * radius, radius, False)
+    return Bounds(_NEAR, farthest + math.sqrt(3.0) * radius, radius, space)
 
 
 def _tiny_model(bounds_: Bounds, interior: Interior) -> ModelConfig:

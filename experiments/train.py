@@ -129,12 +129,10 @@ def plan_from_flags() -> Plan:
         )
     tree = containment.find_containment(parts)
     _report_findings(lint.lint(parts, tree))
-    unbounded = background.is_unbounded(scene)
-    if _BACKGROUND.value != "auto":
-        unbounded = _BACKGROUND.value == "unbounded"
+    space = background.space(scene) if _BACKGROUND.value == "auto" else _BACKGROUND.value
     preset = PRESETS[_PRESET.value]
-    radius = _RADIUS.value or (None if unbounded else background.half_extent(scene))
-    space = bounds(frames.cameras, unbounded=unbounded, radius=radius)
+    radius = _RADIUS.value or (background.half_extent(scene) if space == "bounded" else None)
+    extent = bounds(frames.cameras, space=space, radius=radius)
     check_batch(frames.cameras, _BATCH.value or preset.batch)
     schedule = preset.schedule.over(_STEPS.value or preset.schedule.steps)
     config = TrainingConfig(
@@ -146,7 +144,7 @@ def plan_from_flags() -> Plan:
         pool=preset.pool,
         seed=_SEED.value,
     )
-    model = SavedModel(preset.model(space, _INTERIOR.value), BUDGETS[_PATHS.value])
+    model = SavedModel(preset.model(extent, _INTERIOR.value), BUDGETS[_PATHS.value])
     return Plan(config, model, build_geometry(parts, tree.parents, rule=_RULE.value))
 
 

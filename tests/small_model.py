@@ -23,7 +23,7 @@ MODEL = ModelConfig(
     near=0.05,
     far=15.0,
     radius=7.5,
-    unbounded=False,
+    space="bounded",
     dilation=0.5,
 )
 

@@ -9,26 +9,27 @@ from typing import Any
 
 from refref_jax.data import transforms
 from refref_jax.data.errors import SceneError
+from refref_jax.sampling.domains import Space
 
 _FILE = "scene.json"
-_UNBOUNDED = {"cube": False, "sphere": False, "env": True}
+_SPACES: dict[str, Space] = {"cube": "bounded", "sphere": "bounded", "env": "unbounded"}
 
 
-def is_unbounded(scene: Path) -> bool:
-    """Returns whether the background is an environment map.
+def space(scene: Path) -> Space:
+    """Returns `unbounded` if the background is an environment map.
 
     `scene.json` decides if it names the background; otherwise the folder's name does, which
     begins with `env` in the data set, and with `cube` or `sphere` where there are walls.
     """
     kind = _background(scene).get("type")
     if kind is None:
-        return scene.resolve().name.split("_")[0] == "env"
-    if not isinstance(kind, str) or kind not in _UNBOUNDED:
+        return "unbounded" if scene.resolve().name.split("_")[0] == "env" else "bounded"
+    if not isinstance(kind, str) or kind not in _SPACES:
         raise SceneError(
             f"The type of the background is {kind!r} in {scene / _FILE}, not one of "
-            f"{', '.join(_UNBOUNDED)}. Correct it, or remove the file: it is optional."
+            f"{', '.join(_SPACES)}. Correct it, or remove the file: it is optional."
         )
-    return _UNBOUNDED[kind]
+    return _SPACES[kind]
 
 
 def half_extent(scene: Path) -> float | None:

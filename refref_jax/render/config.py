@@ -5,6 +5,7 @@ from typing import Literal
 
 from refref_jax.fields.density_field import DensityFieldConfig
 from refref_jax.fields.radiance_field import RadianceFieldConfig
+from refref_jax.sampling.domains import Space
 
 Interior = Literal["field", "clear"]
 
@@ -40,7 +41,7 @@ class ModelConfig:
       radius: half edge of a bounded scene's cube, or radius of an unbounded scene's
         uncontracted ball, world units, around the origin. Walls should stand on the faces of
         the cube: between walls and faces the field has to guess.
-      unbounded: whether space beyond the ball is contracted.
+      space: `bounded` by the cube, or `unbounded`: beyond the ball it is contracted.
       dilation: widening of a proposal before it is sampled, as a share of its mean bin width; 0
         for none.
     """
@@ -53,7 +54,7 @@ class ModelConfig:
     near: float
     far: float
     radius: float
-    unbounded: bool
+    space: Space
     dilation: float
 
     def __post_init__(self) -> None:
@@ -67,6 +68,10 @@ class ModelConfig:
             )
         if not self.radius > 0.0:
             raise ValueError(f"The radius must be positive, not {self.radius}. Correct it.")
+        if self.space not in ("bounded", "unbounded"):
+            raise ValueError(
+                f"The space is 'bounded' or 'unbounded', not {self.space!r}. Choose one."
+            )
         if self.interior not in ("field", "clear"):
             raise ValueError(
                 f"The interior is 'field' or 'clear', not {self.interior!r}. Choose one."

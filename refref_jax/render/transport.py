@@ -144,7 +144,7 @@ def distance_warp(config: ModelConfig, line: Polyline) -> warps.DistanceWarp:
 
 def domain(config: ModelConfig) -> domains.Domain:
     """Returns the part of space that a model's fields store."""
-    return domains.Domain(config.radius, config.unbounded)
+    return domains.Domain(config.radius, config.space)
 
 
 def _polyline(config: ModelConfig, path: LightPaths) -> Polyline:

@@ -7,13 +7,15 @@ Source: Barron et al., Mip-NeRF 360 (2022), Eq 10; Zip-NeRF (2023), section 2, f
 contracted Gaussian.
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from refref_jax import numerics
 from refref_jax.sampling.cones import Gaussians
+
+Space = Literal["bounded", "unbounded"]
 
 
 class Domain(NamedTuple):
@@ -22,11 +24,11 @@ class Domain(NamedTuple):
     Attributes:
       radius: half edge of a bounded scene's cube, or radius of an unbounded scene's
         uncontracted ball; world units.
-      unbounded: whether space is contracted.
+      space: whether all there is lies in the cube, or space beyond the ball is contracted.
     """
 
     radius: float
-    unbounded: bool
+    space: Space
 
 
 def to_unit_cube(domain: Domain, gaussian: Gaussians) -> Gaussians:
@@ -36,7 +38,7 @@ def to_unit_cube(domain: Domain, gaussian: Gaussians) -> Gaussians:
     """
     positions = gaussian.positions / domain.radius
     scales = gaussian.scales / domain.radius
-    if domain.unbounded:
+    if domain.space == "unbounded":
         return Gaussians(0.25 * contract(positions) + 0.5, 0.25 * scales * shrinkage(positions))
     return Gaussians(jnp.clip(0.5 * positions + 0.5, 0.0, 1.0), 0.5 * scales)
 
@@ -51,7 +53,7 @@ def exit_distance(
 
     Source: the slab method, Kay and Kajiya (1986).
     """
-    if domain.unbounded:
+    if domain.space == "unbounded":
         return jnp.full_like(origin[0], jnp.inf)
     inverse = numerics.safe_reciprocal(direction)
     first = (-domain.radius - origin) * inverse

@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from refref_jax.data.background import half_extent, is_unbounded
+from refref_jax.data.background import half_extent, space
 from tests.data.expectations import scene_error
 
 
@@ -14,41 +14,43 @@ def _scene(folder, content=None):
 
 
 @pytest.mark.parametrize(
-    ("name", "unbounded"),
+    ("name", "expected"),
     [
-        ("env_smcvx_ball", True),
-        ("cube_smcvx_ball", False),
-        ("sphere_mmncvx_flask", False),
-        ("my_env_scene", False),
-        ("env", True),
+        ("env_smcvx_ball", "unbounded"),
+        ("cube_smcvx_ball", "bounded"),
+        ("sphere_mmncvx_flask", "bounded"),
+        ("my_env_scene", "bounded"),
+        ("env", "unbounded"),
     ],
 )
-def test_the_folder_s_name_tells_the_background(tmp_path, name, unbounded):
-    assert is_unbounded(_scene(tmp_path / name)) is unbounded
+def test_the_folder_s_name_tells_the_background(tmp_path, name, expected):
+    assert space(_scene(tmp_path / name)) == expected
 
 
 def test_only_the_folder_s_own_name_counts(tmp_path):
     parent = _scene(tmp_path / "env_data")
-    assert not is_unbounded(_scene(parent / "cube_smcvx_ball"))
+    assert space(_scene(parent / "cube_smcvx_ball")) == "bounded"
 
 
 def test_a_relative_path_is_resolved(tmp_path, monkeypatch):
     scene = _scene(tmp_path / "env_smcvx_ball")
     monkeypatch.chdir(scene)
-    assert is_unbounded(type(scene)("."))
+    assert space(type(scene)(".")) == "unbounded"
 
 
-@pytest.mark.parametrize(("kind", "unbounded"), [("env", True), ("cube", False), ("sphere", False)])
+@pytest.mark.parametrize(
+    ("kind", "expected"), [("env", "unbounded"), ("cube", "bounded"), ("sphere", "bounded")]
+)
 @pytest.mark.parametrize("name", ["env_ball", "cube_ball"])
-def test_scene_json_decides_before_the_name(tmp_path, name, kind, unbounded):
+def test_scene_json_decides_before_the_name(tmp_path, name, kind, expected):
     scene = _scene(tmp_path / name, {"background": {"type": kind}})
-    assert is_unbounded(scene) is unbounded
+    assert space(scene) == expected
 
 
 @pytest.mark.parametrize("content", [{}, {"parts": []}, {"background": {}}])
 def test_scene_json_may_be_silent(tmp_path, content):
-    assert is_unbounded(_scene(tmp_path / "env_ball", content))
-    assert not is_unbounded(_scene(tmp_path / "cube_ball", content))
+    assert space(_scene(tmp_path / "env_ball", content)) == "unbounded"
+    assert space(_scene(tmp_path / "cube_ball", content)) == "bounded"
 
 
 @pytest.mark.parametrize(
@@ -56,13 +58,13 @@ def test_scene_json_may_be_silent(tmp_path, content):
 )
 def test_scene_json_of_another_shape(tmp_path, content):
     with scene_error("scene.json", "or remove the file"):
-        is_unbounded(_scene(tmp_path / "env_ball", content))
+        space(_scene(tmp_path / "env_ball", content))
 
 
 @pytest.mark.parametrize("content", [[], 7])
 def test_scene_json_that_is_no_object(tmp_path, content):
     with scene_error("scene.json", "not a JSON object"):
-        is_unbounded(_scene(tmp_path / "env_ball", content))
+        space(_scene(tmp_path / "env_ball", content))
 
 
 def test_scene_json_tells_where_the_walls_stand(tmp_path, ball_scene):
@@ -83,8 +85,8 @@ def test_scene_json_that_is_no_json(tmp_path, content):
     scene = _scene(tmp_path / "env_ball")
     (scene / "scene.json").write_bytes(content)
     with scene_error("scene.json", "not valid JSON"):
-        is_unbounded(scene)
+        space(scene)
 
 
 def test_bundled_scene_has_walls(ball_scene):
-    assert not is_unbounded(ball_scene)
+    assert space(ball_scene) == "bounded"

@@ -21,7 +21,7 @@ _COLOUR = 1e-5
 _SEGMENTS = 4
 _RAYS = 3
 _CLEAR = dataclasses.replace(
-    MODEL, interior="clear", multisamples=6, unbounded=True, radius=2.0, far=1e3
+    MODEL, interior="clear", multisamples=6, space="unbounded", radius=2.0, far=1e3
 )
 
 

@@ -105,7 +105,7 @@ def test_a_path_that_is_turned_around_again_and_again_still_reaches_the_walls():
 
 
 def test_a_path_of_an_unbounded_scene_ends_far_away():
-    config = dataclasses.replace(_FIELD, unbounded=True, far=1000.0)
+    config = dataclasses.replace(_FIELD, space="unbounded", far=1000.0)
     path = _bent()
     assert float(_warp(config, path).far) == 1000.0 + float(path.tau[2])
 

@@ -40,7 +40,7 @@ def _cube(domain, positions, scales=None):
 
 # --- where a ray leaves ---
 
-_BOUNDED = Domain(radius=2.0, unbounded=False)
+_BOUNDED = Domain(radius=2.0, space="bounded")
 
 _exit_distance = jax.jit(domains.exit_distance, static_argnums=0)
 
@@ -75,7 +75,7 @@ def test_exit_distance_by_hand(origin, direction, expected):
 @pytest.mark.parametrize("radius", [1e-3, 7.3, 1e6])
 def test_exit_lies_on_a_face_and_nothing_beyond_it_inside(radius):
     rng = np.random.default_rng(3)
-    domain = Domain(radius=radius, unbounded=False)
+    domain = Domain(radius=radius, space="bounded")
     for _ in range(20):
         origin, direction = rng.uniform(-radius, radius, size=3), _unit(rng.normal(size=3))
         t = _exit_distance(domain, *(jnp.asarray(x, jnp.float32) for x in (origin, direction)))
@@ -84,7 +84,7 @@ def test_exit_lies_on_a_face_and_nothing_beyond_it_inside(radius):
 
 
 def test_an_unbounded_scene_is_never_left():
-    domain = Domain(radius=2.0, unbounded=True)
+    domain = Domain(radius=2.0, space="unbounded")
     assert np.isinf(_exit_distance(domain, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])))
 
 
@@ -174,7 +174,7 @@ def test_shrinkage_by_hand():
 
 # --- the unit cube ---
 
-_BOUNDED, _UNBOUNDED = Domain(2.0, False), Domain(2.0, True)
+_BOUNDED, _UNBOUNDED = Domain(2.0, "bounded"), Domain(2.0, "unbounded")
 
 
 def test_a_bounded_scene_fills_the_cube():
@@ -216,11 +216,11 @@ def test_everything_lands_in_the_unit_cube(domain, magnitude):
     assert (scales >= 0.0).all() and np.isfinite(scales).all()
 
 
-@pytest.mark.parametrize("unbounded", [False, True])
-def test_scenes_of_another_size_look_the_same(unbounded):
+@pytest.mark.parametrize("space", ["bounded", "unbounded"])
+def test_scenes_of_another_size_look_the_same(space):
     points, scales = 3.0 * _points(1.0), np.full(20, 0.1)
-    small = _cube(Domain(2.0, unbounded), points, scales)
-    large = _cube(Domain(14.0, unbounded), 7.0 * points, 7.0 * scales)
+    small = _cube(Domain(2.0, space), points, scales)
+    large = _cube(Domain(14.0, space), 7.0 * points, 7.0 * scales)
     for a, b in zip(small, large, strict=True):
         np.testing.assert_allclose(a, b, atol=_ROUNDING)
 
