@@ -214,10 +214,13 @@ def _log(run: Path, step: int, report: StepReport, rate: float, seconds: float) 
 
 
 def _report_findings(findings: list[lint.Finding]) -> None:
+    errors = [finding for finding in findings if finding.severity == "error"]
     for finding in findings:
-        print(finding)
-    if errors := [finding for finding in findings if finding.severity == "error"]:
-        raise ValueError(f"{len(errors)} mesh errors must be mended first: {errors[0]}")
+        if finding not in errors:
+            print(finding)
+    if errors:
+        told = "\n".join(f"  {finding.part}: {finding.message}" for finding in errors)
+        raise ValueError(f"the meshes must be mended first.\n{told}")
 
 
 def _parse_indices(words: list[str]) -> dict[str, float]:
