@@ -164,7 +164,9 @@ def _resample(
     strata = (jnp.arange(samples, dtype=offset.dtype) + 0.5 + offset) / samples
     if not histograms:
         ends = jnp.array([0.0, 1.0], offset.dtype)
-        return stepfun.sample_edges(strata, ends, jnp.ones_like(ends[:1]))
+        even = stepfun.sample_edges(strata, ends, jnp.ones_like(ends[:1]))
+        # Jitter must not cut the path short: its end is opaque, and would move with the noise.
+        return even.at[jnp.array([0, -1])].set(ends)
     edges, weights = jax.lax.stop_gradient(histograms[-1])
     if config.dilation > 0.0:
         drawn = math.prod(histogram.weights.shape[-1] for histogram in histograms)

@@ -421,6 +421,13 @@ def test_jitter_moves_samples_by_at_most_a_stratum(level, offset):
     assert (np.asarray(moved) >= 0.0).all() and (np.asarray(moved) <= 1.0).all()
 
 
+@pytest.mark.parametrize("offset", [-0.5, -0.2, 0.4999])
+def test_jitter_never_cuts_a_path_short(offset):
+    jitter = _jitter(np.full((4, 2), offset))
+    edges = np.asarray(_render(_FIELD, _some_paths(), jitter).histograms[0].edges)
+    assert (edges[:, 0] == 0.0).all() and (edges[:, -1] == 1.0).all()
+
+
 def test_jitter_of_trusted_samples_keeps_them_within_their_quantiles():
     paths = _some_paths()
     jitter = _jitter(np.full((4, 2), 0.3))
