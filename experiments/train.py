@@ -82,9 +82,8 @@ class Plan(NamedTuple):
     geometry: Geometry
 
 
-_DECIDED_AT_THE_START = (
-    *(_PRESET, _PATHS, _INTERIOR, _RULE, _IOR, _BACKGROUND, _RADIUS, _STEPS, _BATCH, _SEED),
-)
+# What a run is begun with, and can not change when it is resumed.
+_SETTLED = (_PRESET, _PATHS, _INTERIOR, _RULE, _IOR, _BACKGROUND, _RADIUS, _STEPS, _BATCH, _SEED)
 
 
 def main() -> None:
@@ -105,7 +104,7 @@ def main() -> None:
 
 def _refuse_options(run: Path) -> None:
     """Refuses options that a resumed run would not heed."""
-    names = [holder.name for holder in _DECIDED_AT_THE_START]
+    names = [holder.name for holder in _SETTLED]
     if given := [f"--{name}" for name in names if flags.FLAGS[name].present]:
         raise ValueError(
             f"{run} goes on with the options that it was begun with: {', '.join(given)} would have "
