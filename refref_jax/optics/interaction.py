@@ -62,7 +62,7 @@ def meet(
       direction: unit direction of the incident ray.
     """
     entering = jnp.dot(direction, point.geometric_normal) < 0.0
-    sides = media.crossing(interfaces, point.part, entering)
+    sides = media.crossing(interfaces, media.nowhere(interfaces), point.part, entering)
     outward = jnp.where(entering, 1.0, -1.0).astype(direction.dtype)
     geometric, shading = outward * point.geometric_normal, outward * point.shading_normal
 
