@@ -124,7 +124,13 @@ def _interfaces(
     media = [AMBIENT if parent == NO_PARENT else parent + 1 for parent in parents]
     if not media:
         # A scene without parts: one interface that no triangle refers to can be indexed.
-        inside, outside, media, tints, absorptions = [INDEX_OF_AIR], [INDEX_OF_AIR], [0], None, None
+        inside, outside, media, tints, absorptions = (
+            [INDEX_OF_AIR],
+            [INDEX_OF_AIR],
+            [AMBIENT],
+            None,
+            None,
+        )
     return Interfaces(
         np.asarray(inside, np.float32),
         np.asarray(outside, np.float32),

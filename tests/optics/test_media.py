@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 
 from refref_jax.optics import fresnel, interface_rules, media, snell
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import AMBIENT, EMPTY_SLOT, SLOTS
+from tests.gradients import assert_numerical
 
 _SINGLE = 1e-6
 
@@ -260,11 +260,10 @@ def test_gradients_of_absorption(medium):
     interfaces = _absorbing()
 
     def left(absorption, length):
-        changed = interfaces._replace(absorption=jnp.asarray(absorption))
-        return media.transmittance(changed, jnp.int32(medium), jnp.asarray(length))
+        changed = interfaces._replace(absorption=absorption)
+        return media.transmittance(changed, jnp.int32(medium), length)
 
-    arguments = (interfaces.absorption + 0.3, jnp.float32(0.8))
-    check_grads(left, arguments, order=1, modes=["rev"], atol=1e-2, rtol=1e-2)
+    assert_numerical(left, np.array([[0.3, 0.1, 0.0], [0.3, 0.8, 2.3]]), 0.8)
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-30, 1e30, np.inf])
