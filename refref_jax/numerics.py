@@ -95,6 +95,20 @@ def _largest_component(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape
     return jnp.where(largest > 0, held, 1.0)
 
 
+def exponential_decay(
+    rate: Float[Array, "*rates"], length: Float[Array, ""]
+) -> Float[Array, "*rates"]:
+    """Returns `exp(-rate * length)`, also over an infinite length.
+
+    There a rate of 0 leaves everything and any other leaves nothing, both with gradient 0; the
+    plain formula has NaN in the value of the first and in the gradient of the second. Over a
+    finite length the gradients are the true ones, also at rate 0.
+    """
+    endless = jnp.isinf(length)
+    decay = jnp.exp(-rate * jnp.where(endless, 0.0, length))
+    return jnp.where(endless, jnp.where(rate > 0, 0.0, 1.0), decay)
+
+
 def offset_origin(
     point: Float[Array, "3"], towards: Float[Array, "3"], scale: Float[Array, ""]
 ) -> Float[Array, "3"]:
