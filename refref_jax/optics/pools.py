@@ -36,6 +36,20 @@ class Pool(NamedTuple, Generic[_Items]):
     count: Int[Array, ""]
 
 
+def fill(items: _Items, count: int, slots: int) -> Pool[_Items]:
+    """Returns a pool with some slots, whose first `count` hold the records given."""
+
+    def pad(x: Array) -> Array:
+        return jnp.concatenate([x, jnp.zeros((slots - x.shape[0], *x.shape[1:]), x.dtype)])
+
+    return Pool(jax.tree.map(pad, items), jnp.int32(count))
+
+
+def join(first: _Items, second: _Items) -> _Items:
+    """Returns two blocks of records as one."""
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
+
+
 def append(pool: Pool[_Items], block: _Items, keep: Bool[Array, " block"]) -> Pool[_Items]:
     """Appends those records of a block that are to be kept, in their order.
 
