@@ -75,7 +75,7 @@ class _Children(NamedTuple):
 class _Walk(NamedTuple):
     """State of the loop."""
 
-    stack: Pool[_Live]
+    stack: Pool
     tree: PathTree
 
 
@@ -236,7 +236,7 @@ def _log(tree: PathTree, children: _Children, room: Room) -> tuple[PathTree, _Ch
     return tree, children._replace(live=live._replace(segments=index), exists=kept)
 
 
-def _push(tree: PathTree, stack: Pool[_Live], children: _Children, budget: Budget) -> _Walk:
+def _push(tree: PathTree, stack: Pool, children: _Children, budget: Budget) -> _Walk:
     """Puts children on the stack, and ends those that are not traced."""
     live = children.live
     if budget.reflections == "first":
