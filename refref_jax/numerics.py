@@ -110,21 +110,20 @@ def exponential_decay(
 
 
 def offset_origin(
-    point: Float[Array, "3"],
-    direction: Float[Array, "3"],
-    normal: Float[Array, "3"],
-    scale: Float[Array, ""],
+    point: Float[Array, "3"], towards: Float[Array, "3"], scale: Float[Array, ""]
 ) -> Float[Array, "3"]:
-    """Returns where to restart a ray that leaves a surface, just off it on the ray's own side.
+    """Returns where to restart a ray that leaves a surface, just off it.
 
-    The step is along the geometric `normal` (unit, either side) and proportional to `scale`,
-    the largest coordinate that took part in computing `point`, because that sets the rounding
-    error. At coordinates near 2 it is 2e-6 in float32: it clears the surface, and no wall worth
-    modelling is that thin.
+    The step is proportional to `scale`, the largest coordinate that took part in computing
+    `point`, because that sets the rounding error. At coordinates near 2 it is 2e-6 in float32: it
+    clears the surface, and no wall worth modelling is that thin.
+
+    Args:
+      point: on the surface.
+      towards: unit geometric normal on the side that the ray leaves to.
+      scale: largest absolute coordinate involved, at least 0.
 
     Source: after Waechter and Binder, A Fast and Robust Method for Avoiding
     Self-Intersection, Ray Tracing Gems (2019), ch. 6.
     """
-    step = _OFFSET_IN_ULPS * jnp.finfo(point.dtype).eps * scale
-    side = jnp.where(jnp.dot(direction, normal) >= 0, 1.0, -1.0)
-    return point + step * side.astype(point.dtype) * normal
+    return point + _OFFSET_IN_ULPS * jnp.finfo(point.dtype).eps * scale * towards
