@@ -147,7 +147,7 @@ def trace_batches(
     batches, count = rays.radii.shape
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
     if inside is not None:
-        inside = inside.reshape(-1, inside.shape[-1])
+        inside = inside.reshape(batches * count, inside.shape[-1])
     tree = follow(geometry, flat, _inside(geometry, flat, inside), budget=budget)
     ends, lost = _pack(tree, batches, count, capacity)
     paths = path_tree.polylines(
