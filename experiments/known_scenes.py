@@ -8,17 +8,19 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from experiments import scenes
 from refref_jax import metrics
 from refref_jax.data import background, cameras, containment, lint, local_layout, meshes
 from refref_jax.data.geometry import build_geometry
+from refref_jax.geometry.rays import Rays
 from refref_jax.optics.budgets import Budget
+from refref_jax.optics.media import interior_slots
 from refref_jax.optics.wavefront import Geometry
 from refref_jax.render import colour
 from refref_jax.render.backgrounds import Radiance, radiance_of
-from refref_jax.render.known import TILE, render_known
+from refref_jax.render.known import TILE, KnownRendering, render_known
 
 
 class KnownScene(NamedTuple):
@@ -32,6 +34,7 @@ class KnownScene(NamedTuple):
       indices: number of each in its split.
       images: true images of the views, 8-bit sRGB.
       masks: object masks, or `None` where the split has none.
+      inside: the parts that each view's camera is in; `None` where the rule keeps no list of them.
     """
 
     name: str
@@ -41,6 +44,7 @@ class KnownScene(NamedTuple):
     indices: tuple[int, ...]
     images: UInt8[np.ndarray, "views h w 3"]
     masks: Bool[np.ndarray, "views h w"] | None
+    inside: Int[np.ndarray, "views slots"] | None
 
 
 class View(NamedTuple):
@@ -91,6 +95,11 @@ def read_scene(
         indices=chosen,
         images=local_layout.read_images(frames),
         masks=local_layout.read_masks(frames) if frames.masks else None,
+        inside=(
+            containment.parts_around(parts, frames.cameras.poses[:, :, 3])
+            if interior_slots(geometry.interfaces)
+            else None
+        ),
     )
 
 
@@ -133,7 +142,7 @@ def side_of(rays_per_pixel: int) -> int:
 def warm_up(scene: KnownScene, budget: Budget) -> None:
     """Renders one tile, so that what is timed afterwards has been compiled."""
     rays = cameras.pixel_rays(scene.frames.cameras, *np.zeros((3, TILE), np.int64))
-    render_known(scene.geometry, scene.radiance, rays, budget=budget)
+    _render(scene, 0, rays, budget)
 
 
 def render_view(scene: KnownScene, view: int, *, budget: Budget, side: int) -> View:
@@ -147,7 +156,7 @@ def render_view(scene: KnownScene, view: int, *, budget: Budget, side: int) -> V
     """
     rays = cameras.image_rays(cameras.supersample(scene.frames.cameras, side), view)
     start = time.monotonic()
-    seen = render_known(scene.geometry, scene.radiance, rays, budget=budget)
+    seen = _render(scene, view, rays, budget)
     seconds = time.monotonic() - start
     linear = cameras.box_filter(seen.linear, side)
     return View(
@@ -181,6 +190,13 @@ def mean_of(measures: Sequence[Mapping[str, float | None]], key: str) -> float |
     """Returns the mean of a measure over the views that have it."""
     values = [measure[key] for measure in measures if measure[key] is not None]
     return float(np.mean(values)) if values else None
+
+
+def _render(scene: KnownScene, view: int, rays: Rays, budget: Budget) -> KnownRendering:
+    inside = scene.inside
+    if inside is not None:
+        inside = np.broadcast_to(inside[view], (*rays.radii.shape, inside.shape[1]))
+    return render_known(scene.geometry, scene.radiance, rays, budget=budget, inside=inside)
 
 
 def _choose(frames: local_layout.Frames, chosen: Sequence[int]) -> local_layout.Frames:

@@ -55,9 +55,7 @@ def append(pool: Pool[_Items], block: _Items, keep: Bool[Array, " block"]) -> Po
     return Pool(items, pool.count + jnp.sum(keep, dtype=jnp.int32))
 
 
-def shed(
-    pool: Pool[_Items], strength: Float[Array, " slots"], capacity: int
-) -> Shedding[_Items]:
+def shed(pool: Pool[_Items], strength: Float[Array, " slots"], capacity: int) -> Shedding[_Items]:
     """Drops the weakest records until a capacity is kept. Costs next to nothing if it is.
 
     Args:

@@ -38,6 +38,7 @@ _Items = TypeVar("_Items")
 BLOCK = 8192
 """Rays cast in a round. A larger one serves an accelerator, at the price of memory."""
 
+
 class Geometry(NamedTuple):
     """All that light meets: surfaces, and the interfaces that they stand for."""
 
@@ -154,9 +155,7 @@ def _refuse_gradients(budget: Budget, block: int, primals: object, tangents: obj
     )
 
 
-def _begin(
-    rays: Rays, inside: Int[Array, "rays slots"], budget: Budget, block: int
-) -> _Walk:
+def _begin(rays: Rays, inside: Int[Array, "rays slots"], budget: Budget, block: int) -> _Walk:
     """Puts the camera rays on the stack and their segments into the log."""
     count = rays.radii.shape[0]
     integers = jnp.arange(count, dtype=jnp.int32)

@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from refref_jax.geometry.rays import Rays
+from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.budgets import Budget
-from refref_jax.optics.ends_stand_in import trace_ends
-from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics.media import EMPTY_SLOT
 from refref_jax.optics.wavefront import Geometry
 from refref_jax.render import colour
 from refref_jax.render.backgrounds import Radiance
@@ -62,7 +62,13 @@ class _Tile(NamedTuple):
 
 
 def render_known(
-    geometry: Geometry, radiance: Radiance, rays: Rays, *, budget: Budget, tile: int = TILE
+    geometry: Geometry,
+    radiance: Radiance,
+    rays: Rays,
+    *,
+    budget: Budget,
+    inside: Int[np.ndarray, "*rays slots"] | None = None,
+    tile: int = TILE,
 ) -> KnownRendering:
     """Renders any number of rays in front of a known background; 0 rays give an empty rendering.
 
@@ -71,6 +77,8 @@ def render_known(
       radiance: what one ray sees of the background, see the module.
       rays: camera rays with any leading axes, usually `[height, width]`.
       budget: which light to follow.
+      inside: the parts that each ray starts in, for the rule `priority` (see
+        `data.containment.parts_around`); by default none.
       tile: rays traced at once: the option to lower when memory runs out.
 
     Raises:
@@ -80,31 +88,33 @@ def render_known(
         raise ValueError(f"A tile of {tile} rays renders nothing. Give 1 or more.")
     if jax.tree.structure(radiance) == jax.tree.structure(0):
         radiance = jax.tree_util.Partial(radiance)  # a leaf is no argument of a compiled function
-    rays = jax.tree.map(np.asarray, rays)
+    rays, inside = jax.tree.map(np.asarray, (rays, inside))
     shape = rays.radii.shape
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), rays)
-    count = flat.radii.shape[0]
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), (rays, inside))
+    count = rays.radii.size
     # On the device once, not once a tile.
     geometry, radiance = jax.device_put((geometry, radiance))
-    tiles = [jax.tree.map(np.asarray, _blank())]
+    tiles = [jax.device_get(_blank())]
     for start in range(0, count, tile):
-        part = _slice_rays(flat, start, tile)
-        tiles.append(jax.device_get(_render_tile(geometry, radiance, part, budget=budget)))
+        part = _slice_rays(*flat, start, tile)
+        tiles.append(jax.device_get(_render_tile(geometry, radiance, *part, budget=budget)))
     casts = sum(int(each.casts) for each in tiles)
     fields = [np.concatenate(field)[:count] for field in zip(*(t[:-1] for t in tiles), strict=True)]
     fields = [field.reshape(*shape, *field.shape[1:]) for field in fields]
-    filled_up = -count % tile
     # Each ray that fills up the last tile misses, which takes one cast if any are made.
-    return KnownRendering(*fields, casts - filled_up * (budget.bends > 0))
+    return KnownRendering(*fields, casts - (-count % tile) * (budget.bends > 0))
 
 
-def _slice_rays(rays: Rays, start: int, tile: int) -> Rays:
+def _slice_rays(
+    rays: Rays, inside: Int[np.ndarray, "rays slots"] | None, start: int, tile: int
+) -> tuple[Rays, Int[np.ndarray, "tile slots"] | None]:
     """Returns one tile of rays, filled up with rays that meet nothing."""
-    part = jax.tree.map(lambda x: x[start : start + tile], rays)
+    part, within = jax.tree.map(lambda x: x[start : start + tile], (rays, inside))
     missing = tile - part.radii.shape[0]
     away = np.tile(np.eye(3, dtype=part.directions.dtype)[:1], (missing, 1))
     filling = Rays(_OUT_OF_REACH * away, away, np.ones(missing, part.radii.dtype))
-    return Rays(*(np.concatenate(pair) for pair in zip(part, filling, strict=True)))
+    nowhere = jax.tree.map(lambda x: np.full((missing, x.shape[1]), EMPTY_SLOT, x.dtype), within)
+    return jax.tree.map(lambda a, b: np.concatenate([a, b]), (part, within), (filling, nowhere))
 
 
 def _blank() -> _Tile:
@@ -113,13 +123,20 @@ def _blank() -> _Tile:
 
 
 @functools.partial(jax.jit, static_argnames="budget")
-def _render_tile(geometry: Geometry, radiance: Radiance, rays: Rays, *, budget: Budget) -> _Tile:
+def _render_tile(
+    geometry: Geometry,
+    radiance: Radiance,
+    rays: Rays,
+    inside: Int[Array, "rays slots"] | None,
+    *,
+    budget: Budget,
+) -> _Tile:
     count = rays.radii.shape[0]
-    traced = trace_ends(geometry, rays, budget=budget)
+    traced = path_tracing.trace_ends(geometry, rays, budget=budget, inside=inside)
     ends = traced.ends
     seen = jax.vmap(radiance)(ends.origins, ends.directions)
     linear = jax.ops.segment_sum(ends.weights * seen, ends.rays, num_segments=count)
-    exists = (ends.statuses != PathStatus.EMPTY).astype(jnp.int32)
+    exists = light_paths.exists(ends).astype(jnp.int32)
     return _Tile(
         rgb=jnp.clip(colour.linear_to_srgb(linear), 0.0, 1.0),
         linear=linear,
