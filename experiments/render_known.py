@@ -91,7 +91,10 @@ def main() -> None:
     _report(summary)
     print(f"Pictures: {out / 'comparison.png'}, {out / 'rgb'}")
     print(f"Metrics:  {metrics_file}")
-    print(f"Next: python -m experiments.path_trade_off --scenes={_SCENE.value} --out={out}")
+    print(
+        f"Next: python -m experiments.path_trade_off --scenes={_SCENE.value} "
+        f"--out={out / 'trade_off'}"
+    )
 
 
 def render(
