@@ -45,6 +45,9 @@ _RULE = flags.DEFINE_enum(
     "What lies outside each mesh: the part around it, always air (as Cycles does it), or, of "
     "meshes that overlap, the one with the highest 'priority' in scene.json.",
 )
+_IOR = flags.DEFINE_multi_string(
+    "ior", [], "Index of refraction of a material or a mesh, as glass=1.52. May be repeated."
+)
 _OUT = flags.DEFINE_string("out", None, "Folder to write to.", required=True)
 
 
@@ -137,7 +140,11 @@ def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
 
 def _read(folder: Path) -> KnownScene:
     scene = known_scenes.read_scene(
-        folder, split=_SPLIT.value, views=_VIEWS.value, rule=_RULE.value, indices={}
+        folder,
+        split=_SPLIT.value,
+        views=_VIEWS.value,
+        rule=_RULE.value,
+        indices=scenes.parse_indices(_IOR.value),
     )
     if scene.masks is None:
         raise ValueError(
