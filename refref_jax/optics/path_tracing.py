@@ -1,7 +1,7 @@
 """The light paths of batches of rays under a budget.
 
 Rays are followed in one large pool (see `wavefront`); then each batch packs its paths into a list
-of fixed capacity, the heaviest first.
+of fixed capacity, in the order of its rays, each ray's heaviest path first.
 
 To differentiation, light paths are constants: parameters of fields have gradients along them, but
 rays and geometry have none, and asking for one is an error (see `single_path` for these).
@@ -19,7 +19,14 @@ from jaxtyping import Array, Float, Int
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import media, path_tree
 from refref_jax.optics.budgets import Budget
-from refref_jax.optics.light_paths import LightPaths, PathEnds, straight, straight_ends
+from refref_jax.optics.light_paths import (
+    LightPaths,
+    PathEnds,
+    PathStatus,
+    exists,
+    straight,
+    straight_ends,
+)
 from refref_jax.optics.path_tree import Ends, PathTree
 from refref_jax.optics.wavefront import BLOCK, Geometry, follow
 
@@ -28,7 +35,7 @@ class Traced(NamedTuple):
     """The light paths of one batch of rays.
 
     Attributes:
-      paths: the paths, heaviest first.
+      paths: the paths, in the order of their rays, each ray's heaviest first; empty slots last.
       lost: the share of each ray's linear RGB that found no room. Weights and losses of a ray sum
         to 1, less what tints and absorption took.
     """
@@ -49,6 +56,20 @@ class TracedEnds(NamedTuple):
     ends: PathEnds
     lost: Float[Array, "rays 3"]
     casts: Int[Array, ""]
+
+
+class Survey(NamedTuple):
+    """How many paths the rays of a scene have.
+
+    Attributes:
+      mean: mean number of paths of a ray.
+      deviation: its standard deviation over rays.
+      hit_fraction: share of rays that meet a surface.
+    """
+
+    mean: Float[Array, ""]
+    deviation: Float[Array, ""]
+    hit_fraction: Float[Array, ""]
 
 
 def trace_ends(
@@ -137,11 +158,14 @@ def trace_batches(
     return Traced(paths._replace(rays=paths.rays % count), lost.reshape(batches, count, 3))
 
 
-def count_paths(geometry: Geometry, rays: Rays, *, budget: Budget) -> Int[Array, " rays"]:
-    """Returns how many paths each ray has: what a batch has to have room for."""
-    traced = trace_ends(geometry, rays, budget=budget)
-    one = (traced.ends.statuses > 0).astype(jnp.int32)
-    return jax.ops.segment_sum(one, traced.ends.rays, num_segments=rays.radii.shape[0])
+def survey(geometry: Geometry, rays: Rays, *, budget: Budget) -> Survey:
+    """Measures what batches of a scene's rays need room for."""
+    count = rays.radii.shape[0]
+    ends = trace_ends(geometry, rays, budget=budget).ends
+    one = exists(ends).astype(jnp.float32)
+    paths = jax.ops.segment_sum(one, ends.rays, num_segments=count)
+    missing = jnp.sum(ends.statuses == PathStatus.MISSED, dtype=jnp.float32)
+    return Survey(jnp.mean(paths), jnp.std(paths), 1.0 - missing / count)
 
 
 def _inside(
@@ -159,21 +183,26 @@ def _pack(
     """Sorts paths into one list a batch, joined end to end; returns the light lost by now."""
     slots = tree.ends.items.rays.shape[0]
     ends = path_tree.listed(tree, slots)
-    exists = jnp.arange(slots) < tree.ends.count
-    batch = jnp.where(exists, ends.rays // rays, batches)
-    order = jnp.lexsort((-jnp.max(ends.weights, axis=-1), batch))
-    ends, batch = jax.tree.map(lambda x: x[order], (ends, batch))
-    begin = jnp.searchsorted(batch, jnp.arange(batches), side="left")
-    place = jnp.arange(slots) - begin[jnp.minimum(batch, batches - 1)]
-    fits = (batch < batches) & (place < capacity)
-    target = jnp.where(fits, batch * capacity + place, batches * capacity)
-    source = jnp.full(batches * capacity, slots, target.dtype)
-    source = source.at[target].set(jnp.arange(slots, dtype=target.dtype), mode="drop")
-    packed = jax.tree.map(lambda x: x[jnp.minimum(source, slots - 1)], ends)
+    weight = jnp.max(ends.weights, axis=-1)
+    # The slots past the last path form a batch of their own.
+    batch = jnp.where(jnp.arange(slots) < tree.ends.count, ends.rays // rays, batches)
+    strongest_first = jnp.lexsort((-weight, batch))
+    rank = _rank_in_group(batch[strongest_first], batches)
+    fits = jnp.zeros(slots, bool).at[strongest_first].set(rank < capacity) & (batch < batches)
+    group = jnp.where(fits, batch, batches)
+    order = jnp.lexsort((-weight, ends.rays, group))
+    place = group[order] * capacity + _rank_in_group(group[order], batches)
+    target = jnp.where(fits[order], place, batches * capacity)
+    source = jnp.full(batches * capacity, slots).at[target].set(order, mode="drop")
     homes = jnp.repeat(jnp.arange(batches, dtype=jnp.int32) * rays, capacity)
-    empty = source == slots
-    packed = path_tree.emptied(packed, empty)
-    packed = packed._replace(rays=jnp.where(empty, homes, packed.rays))
-    # Slots past the last path weigh nothing, so only paths without room count here.
+    packed = jax.tree.map(lambda x: x[jnp.minimum(source, slots - 1)], ends)
+    packed = path_tree.emptied(packed, source == slots)
+    packed = packed._replace(rays=jnp.where(source == slots, homes, packed.rays))
     left_over = jnp.where(fits[:, None], 0.0, ends.weights)
     return packed, tree.lost.at[ends.rays].add(left_over)
+
+
+def _rank_in_group(group: Int[Array, " n"], groups: int) -> Int[Array, " n"]:
+    """Returns the place of each record among its group's, for records sorted by group."""
+    begin = jnp.searchsorted(group, jnp.arange(groups + 1, dtype=group.dtype))
+    return jnp.arange(group.shape[0], dtype=begin.dtype) - begin[group]
