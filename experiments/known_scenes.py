@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from experiments import scenes
 from refref_jax import metrics
-from refref_jax.data import background, cameras, containment, lint, local_layout, meshes
+from refref_jax.data import background, cameras, containment, local_layout, meshes
 from refref_jax.data.geometry import build_geometry
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.budgets import Budget
@@ -85,7 +85,7 @@ def read_scene(
     frames = _choose(frames, chosen)
     parts = meshes.read_meshes(scene, indices=indices)
     tree = containment.find_containment(parts)
-    scenes.report_findings(lint.lint(parts, tree))
+    scenes.report_meshes(parts, tree, rule=rule)
     geometry = build_geometry(parts, tree.parents, rule=rule)
     return KnownScene(
         name=scene.resolve().name,

@@ -2,15 +2,22 @@
 
 from collections.abc import Sequence
 
-from refref_jax.data import lint
+from refref_jax.data import lint, rule_advice
+from refref_jax.data.containment import Containment
+from refref_jax.data.meshes import MeshPart
 
 
-def report_findings(findings: Sequence[lint.Finding]) -> None:
-    """Prints what a lint found.
+def report_meshes(parts: Sequence[MeshPart], tree: Containment, *, rule: str) -> None:
+    """Prints which rule the meshes need, and what a lint finds in them.
 
     Raises:
       ValueError: if some of it must be mended first.
     """
+    findings = lint.lint(parts, tree)
+    if rule == "priority":
+        findings += rule_advice.examine_priorities(parts, tree)
+    if parts:
+        print(rule_advice.advise(parts, tree))
     errors = [finding for finding in findings if finding.severity == "error"]
     for finding in findings:
         if finding not in errors:

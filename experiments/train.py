@@ -14,7 +14,7 @@ from absl import flags
 
 from experiments import commands, scenes
 from experiments.presets import PRESETS, bounds
-from refref_jax.data import background, containment, lint, local_layout, meshes
+from refref_jax.data import background, containment, local_layout, meshes
 from refref_jax.data.batches import PixelSampler, check_batch
 from refref_jax.data.geometry import build_geometry
 from refref_jax.optics.budgets import BUDGETS
@@ -128,7 +128,7 @@ def plan_from_flags() -> Plan:
             "meshes of the objects, or use --paths=straight."
         )
     tree = containment.find_containment(parts)
-    scenes.report_findings(lint.lint(parts, tree))
+    scenes.report_meshes(parts, tree, rule=_RULE.value)
     space = background.space(scene) if _BACKGROUND.value == "auto" else _BACKGROUND.value
     preset = PRESETS[_PRESET.value]
     radius = _RADIUS.value or (background.half_extent(scene) if space == "bounded" else None)

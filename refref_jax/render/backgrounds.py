@@ -137,14 +137,14 @@ def cube_radiance(
     wall's border where it misses the cube. The image repeats over a wall's border for the last half
     of a texel, as Cycles has it. A zero direction sees the first wall where it stands.
     """
-    gaps = background.half_extent - _dot(background.normals, origin[None])
-    distances = numerics.time_to_close(gaps, _dot(background.normals, direction[None]))
+    gaps = background.half_extent - numerics.dot(background.normals, origin[None])
+    distances = numerics.time_to_close(gaps, numerics.dot(background.normals, direction[None]))
     wall = jnp.argmin(distances)
     reached = jnp.isfinite(distances[wall])
     distance = jnp.where(reached, distances[wall], 0.0)
     point = (origin + distance * direction) / background.half_extent
-    u = jnp.clip(0.5 * (_dot(point, background.u_axes[wall]) + 1.0), 0.0, 1.0)
-    v = jnp.clip(0.5 * (_dot(point, background.v_axes[wall]) + 1.0), 0.0, 1.0)
+    u = jnp.clip(0.5 * (numerics.dot(point, background.u_axes[wall]) + 1.0), 0.0, 1.0)
+    v = jnp.clip(0.5 * (numerics.dot(point, background.v_axes[wall]) + 1.0), 0.0, 1.0)
     height, width = background.texture.texels.shape[-3:-1]
     rows, columns = _repeated((1.0 - v) * height - 0.5, height), _repeated(u * width - 0.5, width)
     return _interpolate(background.texture, (wall,), rows, columns)
@@ -159,8 +159,8 @@ def sphere_radiance(
     that is nearest to the origin, or where its line left. Gradients are finite everywhere; where
     the line only touches the sphere the distance to it has gradient 0 (`numerics.safe_sqrt`).
     """
-    along = _dot(origin, direction)
-    beyond = _dot(origin, origin) - jnp.square(background.radius)
+    along = numerics.dot(origin, direction)
+    beyond = numerics.dot(origin, origin) - jnp.square(background.radius)
     half_chord = numerics.safe_sqrt(jnp.square(along) - beyond)
     return _look(background.texture, origin + (half_chord - along) * direction)
 
@@ -219,8 +219,3 @@ def _interpolate(
 
 def _mix(low: Float[Array, "3"], high: Float[Array, "3"], at: _Neighbours) -> Float[Array, "3"]:
     return low + at.fraction * (high - low)
-
-
-def _dot(a: Float[Array, "*shape 3"], b: Float[Array, "*shape 3"]) -> Float[Array, "*shape"]:
-    """Returns scalar products in full precision; matrix units round to fewer bits."""
-    return jnp.sum(a * b, axis=-1)
