@@ -9,7 +9,6 @@ the mask against ray casts and against time. Casts, paths and seconds are of one
 """
 
 import csv
-import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -94,11 +93,10 @@ def main() -> None:
 
 def settings() -> list[Setting]:
     """Returns all budgets to try; equal ones are listed in both sweeps."""
-    tree = BUDGETS["tree"]
     cuts = sorted(_numbers("cuts", _CUTS.value, float), reverse=True)
     bends = sorted(_numbers("bends", _BENDS.value, int))
-    swept = [("cut", f"{cut:g}", dataclasses.replace(tree, cut=cut)) for cut in cuts]
-    swept += [("bends", str(n), dataclasses.replace(tree, bends=n)) for n in bends]
+    swept = [("cut", f"{cut:g}", known_scenes.make_budget("tree", cut=cut)) for cut in cuts]
+    swept += [("bends", str(n), known_scenes.make_budget("tree", bends=n)) for n in bends]
     points = [("budget", name, BUDGETS[name]) for name in ("straight", "paper")]
     return [Setting(*each) for each in points + swept]
 

@@ -10,7 +10,6 @@ took, without compiling, reading and writing; and `lost_energy`, the share of li
 room.
 """
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -58,13 +57,16 @@ _JSON = flags.DEFINE_string("json", None, "File for the measures; {out}/metrics.
 
 _VIEWS_IN_COMPARISON = 4
 
+# A share of light that 8 bits may show.
+_WORTH_A_WARNING = 1e-3
+
 # By what a file of ours is known.
 _KEYS = {"scene", "paths", "views", "casts_per_pixel"}
 
 
 def main() -> None:
     """Renders and measures the chosen views."""
-    budget = _budget()
+    budget = known_scenes.make_budget(_PATHS.value, cut=_CUT.value, bends=_BENDS.value)
     side = known_scenes.side_of(_RAYS.value)
     scene = known_scenes.read_scene(
         Path(_SCENE.value),
@@ -134,12 +136,6 @@ def summarise(
     }
 
 
-def _budget() -> Budget:
-    given = {"cut": _CUT.value, "bends": _BENDS.value}
-    given = {name: value for name, value in given.items() if value is not None}
-    return dataclasses.replace(BUDGETS[_PATHS.value], **given)
-
-
 def _prepare(out: Path, metrics_file: Path) -> None:
     """Makes room for results; those of an earlier call go first, and it is said."""
     if metrics_file.exists() and not _is_ours(metrics_file):
@@ -171,6 +167,11 @@ def _report(summary: dict[str, Any]) -> None:
         print(f"{key:>16}  {summary[key]:.3f}")
     print(f"{'seconds':>16}  {summary['seconds']:.2f}")
     print(f"{'lost_energy':>16}  {summary['lost_energy']:.2g}")
+    if summary["lost_energy"] > _WORTH_A_WARNING:
+        print(
+            "warning: some light found no room, and is missing from the pictures. Give a larger "
+            "--cut, or fewer --bends."
+        )
 
 
 if __name__ == "__main__":

@@ -7,13 +7,17 @@ from typing import NamedTuple
 import matplotlib
 
 matplotlib.use("Agg")
-from matplotlib import pyplot, ticker
+from matplotlib import patheffects, pyplot, ticker
 from matplotlib.lines import Line2D
 
 # Okabe and Ito's colours, which all eyes tell apart.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _MARKERS = {"straight": "s", "paper": "D"}
 _GREY = "#777777"
+
+# Of a label, in pixels of the screen.
+_LABEL_WIDTH = 34.0
+_LABEL_HEIGHT = 13.0
 
 _SWEEPS = {
     "cut": "cut: smallest throughput followed",
@@ -92,6 +96,10 @@ def _write_sweep(folder: Path, trials: Sequence[Trial], sweep: str) -> Path:
         handles=_legend(colours), loc="outside lower center", ncols=len(scenes) + 2, frameon=False
     )
     path = folder / f"path_trade_off_{sweep}.png"
+    figure.canvas.draw()  # places the axes, so that labels know where they are
+    for axis, (cost, (_, scale)) in zip(axes, _COSTS.items(), strict=True):
+        swept = [trial for trial in trials if trial.sweep == sweep]
+        _label_points(axis, swept, cost, scale, colours)
     figure.savefig(path, dpi=130)
     pyplot.close(figure)
     return path
@@ -104,18 +112,6 @@ def _draw_scene(
     x = [scale * getattr(trial, cost) for trial in line]
     y = [trial.psnr_masked for trial in line]
     axis.plot(x, y, "-o", color=colour, markersize=4.5, linewidth=1.8, zorder=3)
-    for i, trial in enumerate(line):
-        # Where the curve is flat neighbours would overwrite each other's labels.
-        near = i > 0 and abs(y[i] - y[i - 1]) < 0.7 and i < len(line) - 1
-        if not near:
-            axis.annotate(
-                trial.name,
-                (x[i], y[i]),
-                xytext=(5, -11),
-                textcoords="offset points",
-                fontsize=7.5,
-                color=colour,
-            )
     for trial in trials:
         if trial.sweep == "budget":
             axis.plot(
@@ -128,6 +124,32 @@ def _draw_scene(
                 markersize=7,
                 zorder=4,
             )
+
+
+def _label_points(
+    axis: pyplot.Axes, trials: Sequence[Trial], cost: str, scale: float, colours: dict[str, str]
+) -> None:
+    """Labels points with the option's value, but none where another label is."""
+    taken: list[tuple[float, float]] = []
+    # The ends of the lines first: what lies between them can be guessed.
+    lines = [[trial for trial in trials if trial.scene == scene] for scene in colours]
+    ends = [trial for line in lines for trial in (line[0], line[-1])]
+    for trial in ends + [trial for line in lines for trial in line[1:-1]]:
+        point = (scale * getattr(trial, cost), trial.psnr_masked)
+        x, y = axis.transData.transform(point)
+        if any(abs(x - a) < _LABEL_WIDTH and abs(y - b) < _LABEL_HEIGHT for a, b in taken):
+            continue
+        taken.append((x, y))
+        axis.annotate(
+            trial.name,
+            point,
+            xytext=(6, -9),
+            textcoords="offset points",
+            fontsize=8,
+            color=colours[trial.scene],
+            path_effects=[patheffects.withStroke(linewidth=1.5, foreground="white")],
+            zorder=5,
+        )
 
 
 def _fixed(trials: Sequence[Trial], sweep: str) -> str:

@@ -137,8 +137,9 @@ def cube_radiance(
     wall's border where it misses the cube. The image repeats over a wall's border for the last half
     of a texel, as Cycles has it. A zero direction sees the first wall where it stands.
     """
-    gaps = background.half_extent - numerics.dot(background.normals, origin[None])
-    distances = numerics.time_to_close(gaps, numerics.dot(background.normals, direction[None]))
+    dot_all = jax.vmap(numerics.dot, in_axes=(0, None))
+    gaps = background.half_extent - dot_all(background.normals, origin)
+    distances = numerics.time_to_close(gaps, dot_all(background.normals, direction))
     wall = jnp.argmin(distances)
     reached = jnp.isfinite(distances[wall])
     distance = jnp.where(reached, distances[wall], 0.0)

@@ -1,6 +1,7 @@
 """The commands that need no learning, on a few views of the bundled scene."""
 
 import csv
+import dataclasses
 import json
 import shutil
 
@@ -10,6 +11,7 @@ import pytest
 
 from experiments import known_scenes
 from refref_jax.data import files
+from refref_jax.render import BUDGETS
 from tests.experiments.command import ROOT, run_command
 
 _SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
@@ -167,6 +169,18 @@ def test_rays_make_a_square_grid(rays, side):
 def test_rays_that_do_not(rays):
     with pytest.raises(ValueError, match="square"):
         known_scenes.side_of(rays)
+
+
+def test_a_budget_keeps_what_is_not_given_and_grows_below_its_cut():
+    tree = BUDGETS["tree"]
+    assert known_scenes.make_budget("tree") == tree
+    assert known_scenes.make_budget("tree", cut=0.1, bends=3) == dataclasses.replace(
+        tree, cut=0.1, bends=3
+    )
+    fine = known_scenes.make_budget("tree", cut=tree.cut / 4.0)
+    assert fine.paths_per_ray == 2.0 * tree.paths_per_ray and fine.bends == tree.bends
+    # Never without bound.
+    assert known_scenes.make_budget("tree", cut=0.0).paths_per_ray < 10.0 * tree.paths_per_ray
 
 
 def test_measures_over_no_pixel_are_left_out():
