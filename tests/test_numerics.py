@@ -335,6 +335,57 @@ def test_renormalize_check_grads():
 
 # --- transformations ---
 
+
+@pytest.mark.parametrize(
+    ("gap", "speed", "expected"),
+    [
+        (3.0, 2.0, 1.5),
+        (0.0, 2.0, 0.0),
+        (-1.0, 2.0, 0.0),
+        (3.0, 0.0, np.inf),
+        (3.0, -2.0, np.inf),
+        (0.0, 0.0, np.inf),
+        (3.0, 1e-13, np.inf),
+    ],
+)
+def test_time_to_close_by_hand(gap, speed, expected):
+    found = numerics.time_to_close(jnp.float32(gap), jnp.float32(speed))
+    np.testing.assert_allclose(found, np.float32(expected), rtol=_ROUNDING)
+
+
+def test_gradients_of_time_to_close_are_finite():
+    gap, speed = np.meshgrid([-1.0, 0.0, 1e-20, 1.0, 1e6], [-1.0, 0.0, 1e-13, 1e-11, 1.0])
+    derive = jax.vmap(jax.grad(numerics.time_to_close, (0, 1)))
+    by_gap, by_speed = derive(*(jnp.asarray(x.ravel(), jnp.float32) for x in (gap, speed)))
+    assert gradients.all_finite((by_gap, by_speed))
+    still = (speed.ravel() < 1e-12) | (gap.ravel() <= 0.0)
+    assert np.all(np.asarray(by_gap)[still] == 0.0) and np.all(np.asarray(by_speed)[still] == 0.0)
+
+
+def test_time_to_close_check_grads():
+    gradients.assert_numerical(numerics.time_to_close, [0.3, 2.0], [1.5, 0.2], order=2)
+
+
+def test_safe_atan2_is_numpy_s_over_all_magnitudes():
+    y, x = np.meshgrid(_LATTICE, _LATTICE)
+    found = np.asarray(jax.jit(numerics.safe_atan2)(jnp.asarray(y), jnp.asarray(x)))
+    away = np.hypot(y.astype(float), x) > 2e-12
+    np.testing.assert_allclose(found[away], np.arctan2(y, x)[away], rtol=1e-6, atol=1e-37)
+    assert np.all(found[np.hypot(y.astype(float), x) < 5e-13] == 0.0)
+
+
+@pytest.mark.parametrize("magnitude", [0.0, 1e-38, 1e-20, 1e-13, 1e-11, 1.0, 1e30])
+def test_gradients_of_safe_atan2_are_finite_and_end_at_the_origin(magnitude):
+    y, x = jnp.float32(magnitude), jnp.float32(-magnitude)
+    by_y, by_x = jax.grad(numerics.safe_atan2, (0, 1))(y, x)
+    expected = -0.5 / magnitude if magnitude > 1e-12 else 0.0
+    np.testing.assert_allclose([by_y, by_x], [expected, expected], rtol=1e-5, atol=1e-37)
+
+
+def test_safe_atan2_check_grads():
+    gradients.assert_numerical(numerics.safe_atan2, [0.3, -2.0, 1.0], [1.5, 0.2, -1.0])
+
+
 _VECTORS = np.concatenate([_DIRECTIONS, np.zeros((1, 3), np.float32)])
 _SCALARS = np.array([-1.0, 0.0, 1e-20, 0.5, 3.0, 1e20], np.float32)
 
@@ -342,6 +393,8 @@ _CASES = {
     "safe_sqrt": (numerics.safe_sqrt, (_SCALARS,)),
     "safe_divide": (numerics.safe_divide, (_SCALARS[::-1], _SCALARS)),
     "safe_reciprocal": (numerics.safe_reciprocal, (_SCALARS,)),
+    "time_to_close": (numerics.time_to_close, (_SCALARS[::-1], _SCALARS)),
+    "safe_atan2": (numerics.safe_atan2, (_SCALARS[::-1], _SCALARS)),
     "length": (numerics.length, (_VECTORS,)),
     "normalize": (numerics.normalize, (_VECTORS,)),
     "offset_origin": (
