@@ -1,6 +1,6 @@
 """Closest hits of more rays than should be prepared at once."""
 
-from typing import Protocol
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -13,23 +13,13 @@ TILE = 2**16
 """Rays that are traced at once by default."""
 
 
-class Trace(Protocol):
-    """A function that finds closest hits, as `bvh.closest_hits` does."""
-
-    def __call__(
-        self, bvh: BVH, rays: Rays, *, limits: Float[Array, " rays"], leaving: Int[Array, " rays"]
-    ) -> Hits:
-        """Finds the closest hit of each ray."""
-        ...
-
-
 def closest_hits_in_tiles(
     bvh: BVH,
     rays: Rays,
     *,
     limits: Float[Array, " rays"],
     leaving: Int[Array, " rays"],
-    trace: Trace = closest_hits,
+    trace: Callable[..., Hits] = closest_hits,
     tile: int = TILE,
 ) -> Hits:
     """Finds the same hits as `trace` on all rays, tile after tile.
