@@ -118,7 +118,7 @@ def length(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
     Components are scaled by the largest first, so that neither 1e30 overflows nor 1e-30
     vanishes. The zero vector has length 0 and gradient 0.
     """
-    scale = _largest_component(vector)
+    scale = _scale(vector)
     return scale * safe_sqrt(_sum_components(jnp.square(vector / scale[..., None])))
 
 
@@ -127,7 +127,7 @@ def normalize(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape n"]:
 
     Scaled like `length`, so any representable magnitude is normalised to rounding error.
     """
-    scaled = vector / _largest_component(vector)[..., None]
+    scaled = vector / _scale(vector)[..., None]
     norm = length(scaled)[..., None]
     return scaled * safe_divide(jnp.ones_like(norm), norm)
 
@@ -146,14 +146,19 @@ def _sum_components(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
     return functools.reduce(operator.add, (vector[..., i] for i in range(vector.shape[-1])))
 
 
-def _largest_component(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
-    """Returns the largest absolute component, 1 for the zero vector, as a constant scale.
+def largest_component(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
+    """Returns the largest absolute component over the last axis, as a constant without gradient."""
+    size = jax.lax.stop_gradient(jnp.abs(vector))
+    return functools.reduce(jnp.maximum, (size[..., i] for i in range(size.shape[-1])))
+
+
+def _scale(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
+    """Returns the largest absolute component, and 1 for the zero vector.
 
     Held at 8.5e37 in float32: compilers divide by a scale by multiplying with its reciprocal, which
     must stay a normal number.
     """
-    size = jax.lax.stop_gradient(jnp.abs(vector))
-    largest = functools.reduce(jnp.maximum, (size[..., i] for i in range(size.shape[-1])))
+    largest = largest_component(vector)
     held = jnp.minimum(largest, 1.0 / jnp.finfo(vector.dtype).tiny)
     return jnp.where(largest > 0, held, 1.0)
 

@@ -71,5 +71,5 @@ def surface_point(
         geometric_normal=geometric,
         shading_normal=jnp.where(opposed, geometric, shading),
         part=surfaces.parts[slot],
-        scale=jnp.max(jnp.abs(corners)),
+        scale=numerics.largest_component(corners.reshape(9)),
     )

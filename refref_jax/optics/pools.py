@@ -58,6 +58,13 @@ def append(pool: Pool, block: Records, keep: Bool[Array, " block"]) -> Pool:
     return Pool(items, pool.count + jnp.sum(keep, dtype=jnp.int32))
 
 
+def pop(pool: Pool, size: int) -> tuple[Pool, Pool]:
+    """Takes up to `size` of the last records off a pool; returns the rest, and what was taken."""
+    start = jnp.maximum(pool.count - size, 0)
+    taken = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, size, 0), pool.items)
+    return Pool(pool.items, start), Pool(taken, pool.count - start)
+
+
 def shed(
     pool: Pool, lost: Float[Array, "rays 3"], capacity: int
 ) -> tuple[Pool, Float[Array, "rays 3"]]:

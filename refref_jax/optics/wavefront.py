@@ -33,7 +33,7 @@ from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_tree import NO_SEGMENT, Ends, PathTree, Segments
 from refref_jax.optics.pools import Pool
 
-BLOCK = 8192
+BLOCK = 4096
 """Rays cast in a round. A larger one serves an accelerator, at the price of memory."""
 
 
@@ -73,9 +73,16 @@ class _Children(NamedTuple):
 
 
 class _Walk(NamedTuple):
-    """State of the loop."""
+    """State of the loop.
+
+    Attributes:
+      stack: rays that are to be cast later.
+      next: the block that is cast next.
+      tree: what is known by now.
+    """
 
     stack: Pool
+    next: Pool
     tree: PathTree
 
 
@@ -112,16 +119,16 @@ def _follow(
 
     def advance(walk: _Walk) -> _Walk:
         walk = jax.lax.while_loop(
-            lambda walk: (walk.stack.count > 0) & fits(walk),
+            lambda walk: (walk.next.count > 0) & fits(walk),
             lambda walk: _round(geometry, walk, budget, block, room),
             walk,
         )
         stack, lost = pools.shed(walk.stack, walk.tree.lost, room.live)
         ends, lost = pools.shed(walk.tree.ends, lost, room.paths)
-        return _Walk(stack, walk.tree._replace(ends=ends, lost=lost))
+        return _Walk(stack, walk.next, walk.tree._replace(ends=ends, lost=lost))
 
     start = _begin(rays, inside, block, room)
-    return jax.lax.while_loop(lambda walk: walk.stack.count > 0, advance, start).tree
+    return jax.lax.while_loop(lambda walk: walk.next.count > 0, advance, start).tree
 
 
 @_follow.defjvp
@@ -150,16 +157,13 @@ def _begin(rays: Rays, inside: Int[Array, "rays slots"], block: int, room: Room)
         lost=jnp.zeros_like(rays.origins),
         casts=jnp.zeros((), jnp.int32),
     )
-    return _Walk(pools.fill(_Live(state, order, order), count, room.live + 2 * block), tree)
+    stack = pools.fill(_Live(state, order, order), count, room.live + 2 * block)
+    return _Walk(*pools.pop(stack, block), tree)
 
 
 def _round(geometry: Geometry, walk: _Walk, budget: Budget, block: int, room: Room) -> _Walk:
     """Casts one block, ends paths, and puts the children on the stack."""
-    start = jnp.maximum(walk.stack.count - block, 0)
-    live = jax.tree.map(
-        lambda x: jax.lax.dynamic_slice_in_dim(x, start, block, 0), walk.stack.items
-    )
-    alive = start + jnp.arange(block) < walk.stack.count
+    live, alive = walk.next.items, jnp.arange(block) < walk.next.count
     hits = _cast(geometry, live.state, alive)
     arrival = jax.vmap(branching.arrive, in_axes=(None, 0, 0, 0))(
         geometry, live.state, hits.slots, hits.barycentrics
@@ -174,7 +178,8 @@ def _round(geometry: Geometry, walk: _Walk, budget: Budget, block: int, room: Ro
         live.state, arrival, hits.slots
     )
     tree, children = _log(tree, _children(live, branches, arrival, bending, budget), room)
-    return _push(tree, Pool(walk.stack.items, start), children, budget)
+    tree, stack = _push(tree, walk.stack, children, budget)
+    return _Walk(*pools.pop(stack, block), tree)
 
 
 def _cast(geometry: Geometry, state: RayState, alive: Bool[Array, " block"]) -> bvh.Hits:
@@ -232,13 +237,15 @@ def _log(tree: PathTree, children: _Children, room: Room) -> tuple[PathTree, _Ch
     return tree._replace(segments=log, lost=lost), children
 
 
-def _push(tree: PathTree, stack: Pool, children: _Children, budget: Budget) -> _Walk:
+def _push(
+    tree: PathTree, stack: Pool, children: _Children, budget: Budget
+) -> tuple[PathTree, Pool]:
     """Puts children on the stack, and ends those that are not traced."""
     live = children.live
     if budget.reflections == "first":
         status = jnp.full_like(live.rays, PathStatus.NOT_TRACED)
         tree = _end(tree, live, status, children.exists & ~children.traced)
-    return _Walk(pools.append(stack, live, children.exists & children.traced), tree)
+    return tree, pools.append(stack, live, children.exists & children.traced)
 
 
 def _end(
