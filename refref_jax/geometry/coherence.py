@@ -87,8 +87,8 @@ def _key(
 ) -> UInt32[Array, ""]:
     """Returns the key of one ray in the box of its scene."""
     reciprocal = numerics.safe_reciprocal(direction)
-    ahead = jnp.where(direction < 0.0, lower, upper)
-    leaving = origin + jnp.min((ahead - origin) * reciprocal) * direction
+    x, y, z = (jnp.where(direction < 0.0, lower, upper) - origin) * reciprocal
+    leaving = origin + jnp.minimum(jnp.minimum(x, y), z) * direction
     octant = boxes.octant(direction).astype(jnp.uint32)
     start = _morton(origin, lower, upper, _ORIGIN_BITS)
     end = _morton(leaving, lower, upper, _EXIT_BITS)
@@ -103,7 +103,7 @@ def _morton(
     A point outside the box counts as on its nearest face.
     """
     scaled = (point - lower) * numerics.safe_divide(jnp.ones_like(lower), upper - lower)
-    cell = jnp.clip(scaled * 2**bits, 0, 2**bits - 1).astype(jnp.uint32)
+    cell = jnp.clip(scaled * 2**bits, 0, 2**bits - 1).astype(jnp.int32).astype(jnp.uint32)
     code = jnp.zeros((), jnp.uint32)
     for axis in range(3):
         for bit in range(bits):

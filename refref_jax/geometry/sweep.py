@@ -33,11 +33,12 @@ def best_splits(
     owner = np.repeat(np.arange(counts.size), counts)
     taken = np.arange(owner.size) - first[owner] + 1
     remaining = counts[owner] - taken
+    scene = lower.min(axis=0).astype(np.float64), upper.max(axis=0).astype(np.float64)
     leaves_left, leaves_right = -(-taken // LEAF_SIZE), -(-remaining // LEAF_SIZE)
     cheapest = np.full(counts.size, np.inf)
     left, axis = np.zeros_like(counts), np.zeros_like(counts)
     for direction, order in enumerate(orders):
-        area_left, area_right = _areas(order, owner, lower, upper)
+        area_left, area_right = _areas(lower[order], upper[order], owner, scene)
         cost = area_left * leaves_left
         cost[:-1] += area_right[1:] * leaves_right[:-1]
         cost[remaining == 0] = np.inf
@@ -54,18 +55,17 @@ def best_splits(
 
 
 def _areas(
-    order: Int[np.ndarray, " faces"],
+    lower: Float[np.ndarray, "faces 3"],
+    upper: Float[np.ndarray, "faces 3"],
     owner: Int[np.ndarray, " faces"],
-    lower: Float[np.ndarray, "all 3"],
-    upper: Float[np.ndarray, "all 3"],
+    scene: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
 ) -> tuple[Float[np.ndarray, " faces"], Float[np.ndarray, " faces"]]:
     """Returns half the area of the box around each node's faces up to, and from, every face."""
-    base, top = lower.min(axis=0).astype(np.float64), upper.max(axis=0).astype(np.float64)
     before, after = [], []
     for axis in range(3):
-        span = top[axis] - base[axis]
-        high = upper[order, axis] - base[axis]
-        low = top[axis] - lower[order, axis]
+        base, top = scene[0][axis], scene[1][axis]
+        span = top - base
+        high, low = upper[:, axis] - base, top - lower[:, axis]
         before.append(_running(high, owner, span) + _running(low, owner, span) - span)
         back = owner[-1] - owner[::-1]
         from_end = _running(high[::-1], back, span) + _running(low[::-1], back, span) - span

@@ -80,7 +80,7 @@ def test_rays_parallel_to_an_axis_hit_whatever_the_sign_of_zero(zero, axis):
 
 @pytest.mark.parametrize("target", ["vertices", "edges", "inner vertices"])
 def test_rays_at_vertices_and_edges_do_not_leak(target):
-    """Embree's default mode loses 5-7 % of the rays at vertices."""
+    """Embree's default mode loses half a percent of the rays at vertices."""
     mesh = trimesh.creation.icosphere(subdivisions=5)
     points = mesh.vertices
     if target == "edges":
