@@ -69,6 +69,19 @@ class PathTree(NamedTuple):
     casts: Int[Array, ""]
 
 
+def name_media(
+    tree: PathTree,
+    segments: Int[Array, " n"],
+    media: Int[Array, " n"],
+    which: Bool[Array, " n"],
+) -> PathTree:
+    """Notes the media that some segments run through."""
+    log = tree.segments.items
+    target = jnp.where(which, segments, log.media.shape[0])
+    log = log._replace(media=log.media.at[target].set(media, mode="drop"))
+    return tree._replace(segments=tree.segments._replace(items=log))
+
+
 def listed(tree: PathTree, capacity: int) -> Ends:
     """Returns the ends of a tree in a list of that capacity; slots past the last are empty."""
     ends = jax.tree.map(lambda x: x[:capacity], tree.ends.items)

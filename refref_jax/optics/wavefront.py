@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.geometry import bvh
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import branching, budgets, media, pools
+from refref_jax.optics import branching, budgets, media, path_tree, pools
 from refref_jax.optics.branching import Arrival, Branches, RayState
 from refref_jax.optics.branching import Geometry as Geometry
 from refref_jax.optics.budgets import Budget, Room
@@ -172,7 +172,9 @@ def _round(geometry: Geometry, walk: _Walk, budget: Budget, block: int, room: Ro
     status = jax.vmap(functools.partial(branching.ending, budget))(live.state, arrival, hit)
     bending = hit & (status == PathStatus.EMPTY)
     tree = walk.tree._replace(casts=walk.tree.casts + jnp.sum(alive, dtype=jnp.int32))
-    tree = _name_first_medium(tree, live, arrival, hit)
+    medium = arrival.interaction.sides.medium_near
+    # Only its first surface tells what a camera is in.
+    tree = path_tree.name_media(tree, live.segments, medium, hit & (live.state.bends == 0))
     tree = _end(tree, live, status, alive & ~bending)
     branches = jax.vmap(functools.partial(branching.branch, budget))(
         live.state, arrival, hits.slots
@@ -189,17 +191,6 @@ def _cast(geometry: Geometry, state: RayState, alive: Bool[Array, " block"]) -> 
         limits=jnp.where(alive, jnp.inf, -1.0).astype(state.tau.dtype),
         leaving=state.leaving,
     )
-
-
-def _name_first_medium(
-    tree: PathTree, live: _Live, arrival: Arrival, hit: Bool[Array, " block"]
-) -> PathTree:
-    """Notes the medium of camera rays, which only their first surface tells."""
-    log = tree.segments.items
-    nowhere = log.media.shape[0]
-    target = jnp.where(hit & (live.state.bends == 0), live.segments, nowhere)
-    named = log.media.at[target].set(arrival.interaction.sides.medium_near, mode="drop")
-    return tree._replace(segments=tree.segments._replace(items=log._replace(media=named)))
 
 
 def _children(

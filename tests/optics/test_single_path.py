@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from refref_jax.optics import path_tracing
+from refref_jax.optics import branching, path_tracing
 from refref_jax.optics.budgets import PAPER, TREE, Budget
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.single_path import follow_branch
@@ -33,7 +34,7 @@ def _all_branches(geometry, rays, budget):
 
 def _bodies():
     return {
-        "ball": scenes.ball(1.0, subdivisions=3),
+        "ball": scenes.ball(1.0, subdivisions=2),
         "box": scenes.box((1.0, 1.2, 1.4)),
         "tinted box": scenes.box()._replace(tint=(0.5, 0.8, 0.9), absorption=(1.0, 0.2, 0.0)),
     }
@@ -117,13 +118,13 @@ _CASES = {
         [False, True, False],
     ),
     "ball": (
-        lambda: scenes.ball(1.0, subdivisions=3),
+        lambda: scenes.ball(1.0, subdivisions=2),
         [-4.0, 0.31, 0.17],
         [1.0, 0.02, 0.01],
         [False, False],
     ),
     "ball, reflected inside": (
-        lambda: scenes.ball(1.0, subdivisions=3),
+        lambda: scenes.ball(1.0, subdivisions=2),
         [-4.0, 0.31, 0.17],
         [1.0, 0.02, 0.01],
         [False, True, False],
@@ -145,38 +146,41 @@ def _exit(geometry, ray, reflects):
     return path.points[last], path.directions[last], path.tau[last], path.weights
 
 
+class _Knobs(NamedTuple):
+    """All that a path may be differentiated with respect to."""
+
+    index: jax.Array
+    corners: jax.Array
+    normals: jax.Array
+    origin: jax.Array
+
+
 @pytest.mark.parametrize("case", list(_CASES))
-@pytest.mark.parametrize("of", ["index", "corners", "normals", "ray"])
-def test_gradients_agree_with_differences(case, of):
+def test_gradients_agree_with_differences(case):
     make, origin, direction, reflects = _CASES[case]
     with jax.enable_x64(True):
         geometry, ray = _double((scenes.geometry(make()), _ray(origin, direction)))
-        surfaces = geometry.surfaces
+        surfaces, interfaces = geometry
 
-        def moved(x):
-            if of == "index":
-                media = geometry.interfaces._replace(index_inside=x)
-                return geometry._replace(interfaces=media), ray
-            if of == "corners":
-                tree = surfaces.bvh._replace(triangles=x)
-                return geometry._replace(surfaces=surfaces._replace(bvh=tree)), ray
-            if of == "normals":
-                return geometry._replace(surfaces=surfaces._replace(normals=x)), ray
-            return geometry, ray._replace(origins=ray.origins + x)
+        def run(knobs):
+            tree = surfaces.bvh._replace(triangles=knobs.corners)
+            moved = branching.Geometry(
+                surfaces._replace(bvh=tree, normals=knobs.normals),
+                interfaces._replace(index_inside=knobs.index),
+            )
+            return _exit(moved, ray._replace(origins=knobs.origin), reflects)
 
-        start = {
-            "index": geometry.interfaces.index_inside,
-            "corners": surfaces.bvh.triangles,
-            "normals": surfaces.normals,
-            "ray": jnp.zeros(3, jnp.float64),
-        }[of]
-        path = follow_branch(
-            geometry, ray, jnp.asarray(reflects), budget=Budget(len(reflects), "all")
+        start = _Knobs(
+            interfaces.index_inside, surfaces.bvh.triangles, surfaces.normals, ray.origins
         )
-        assert path.bends == len(reflects) and path.statuses == PathStatus.ESCAPED
-        run = jax.jit(lambda x: _exit(*moved(x), reflects))
+        run = jax.jit(run)
         check_grads(run, (start,), order=1, modes=["fwd", "rev"], eps=1e-6, atol=1e-6, rtol=1e-5)
-        assert np.any(np.asarray(jax.jacrev(lambda x: run(x)[0])(start)) != 0.0)
+        gradient = jax.grad(lambda knobs: sum(jnp.sum(x) for x in run(knobs)))(start)
+        # A flat prism's path does not depend on its normals' length along themselves.
+        assert all(np.any(np.asarray(x) != 0.0) for x in gradient)
+        budget = Budget(len(reflects), "all")
+        path = follow_branch(geometry, ray, jnp.asarray(reflects), budget=budget)
+        assert path.bends == len(reflects) and path.statuses == PathStatus.ESCAPED
 
 
 def test_the_gradient_of_a_slab_is_the_closed_form():
