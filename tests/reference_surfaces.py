@@ -75,7 +75,7 @@ def join(parts: list[Part]) -> Surfaces:
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.sqrt(np.einsum("...i,...i->...", vectors, vectors))[..., None]
 
 
 def face_normals(corners: np.ndarray) -> np.ndarray:

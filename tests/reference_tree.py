@@ -78,7 +78,7 @@ def trace(
     count = len(origins)
     index = np.arange(count)
     none = np.full(count, -1)
-    live = Live(origins, directions, none, index, np.ones((count, 3)), np.zeros(count, int))
+    live = Live(origins, directions, none, index, np.ones_like(directions), np.zeros(count, int))
     ends, casts = [], 0
     if rule.bends == 0:
         ends, live = [(live, np.full(count, OUT_OF_BENDS))], _take(live, index[:0])
@@ -128,7 +128,8 @@ def _children(
         "first": np.where(live.bends == 0, split.reflectance, 0.0),
         "all": conserving_share(tinted.max(-1), split.reflectance, rule.cut),
     }
-    share = np.where(split.reflectance == 1.0, 1.0, followed[rule.reflections])[:, None]
+    share = np.where(split.reflectance == 1.0, 1.0, followed[rule.reflections])
+    share = share.astype(tinted.dtype)[:, None]
 
     def child(directions: np.ndarray, weights: np.ndarray) -> Live:
         return Live(split.points, directions, triangles, live.rays, weights, live.bends + 1)
@@ -156,13 +157,13 @@ def meet(surfaces: Surfaces, directions: np.ndarray, hits: Hits) -> Split:
     """
     corners = surfaces.corners[hits.triangles]
     u, v = hits.barycentrics.T
-    blend = np.stack([1.0 - u - v, u, v], axis=-1)[..., None]
+    blend = np.stack([1.0 - u - v, u, v], axis=-1)
     geometric = face_normals(corners)
-    shading = unit(np.sum(blend * surfaces.normals[hits.triangles], axis=1))
+    shading = unit(np.einsum("ij,ijk->ik", blend, surfaces.normals[hits.triangles]))
     opposed = _dot(shading, geometric) <= 0.0
     shading = np.where(opposed, geometric, shading)
     entering = _dot(directions, geometric) < 0.0
-    side = np.where(entering, 1.0, -1.0)
+    side = np.where(entering, 1.0, -1.0).astype(directions.dtype)
     part = surfaces.parts[hits.triangles][:, None]
     inside, outside = surfaces.inside[part], surfaces.outside[part]
     near, far = np.where(entering, outside, inside), np.where(entering, inside, outside)
@@ -175,11 +176,11 @@ def meet(surfaces: Surfaces, directions: np.ndarray, hits: Hits) -> Split:
     reflectance, reflected, refracted = (
         np.where(good, a, b) for a, b in zip(smooth, flat, strict=True)
     )
-    return Split(np.sum(blend * corners, axis=1), reflectance[:, 0], reflected, refracted)
+    return Split(np.einsum("ij,ijk->ik", blend, corners), reflectance[:, 0], reflected, refracted)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.sum(a * b, axis=-1, keepdims=True)
+    return np.einsum("...i,...i->...", a, b)[..., None]
 
 
 def _bend(directions: np.ndarray, normals: np.ndarray, near: np.ndarray, far: np.ndarray) -> tuple:
