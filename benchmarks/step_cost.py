@@ -38,7 +38,7 @@ class _Method:
         frames = local_layout.read_frames(scene, "train")
         space, radius = background.space(scene), background.half_extent(scene)
         model = preset.model(bounds(frames.cameras, space=space, radius=radius), "field")
-        parts = meshes.read_meshes(scene)
+        parts = meshes.without_colour(meshes.read_meshes(scene))
         parents = containment.find_containment(parts).parents
         config = TrainingConfig(
             scene=SceneConfig(str(scene), "nested", ()),

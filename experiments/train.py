@@ -46,8 +46,9 @@ _INTERIOR = flags.DEFINE_enum(
 _RULE = flags.DEFINE_enum(
     "rule",
     "nested",
-    ["nested", "facing"],
-    "What lies outside each mesh: the part around it, or always air (as Cycles does it).",
+    ["nested", "facing", "priority"],
+    "What lies outside each mesh: the part around it, always air (as Cycles does it), or, where "
+    "meshes overlap, the one with the highest 'priority' in scene.json.",
 )
 _IOR = flags.DEFINE_multi_string(
     "ior", [], "Index of refraction of a material or a mesh, as glass=1.52. May be repeated."
@@ -144,7 +145,8 @@ def plan_from_flags() -> Plan:
         seed=_SEED.value,
     )
     model = SavedModel(preset.model(extent, _INTERIOR.value), BUDGETS[_PATHS.value])
-    return Plan(config, model, build_geometry(parts, tree.parents, rule=_RULE.value))
+    clear = meshes.without_colour(parts)  # the field learns the colour of the objects
+    return Plan(config, model, build_geometry(clear, tree.parents, rule=_RULE.value))
 
 
 def train(run: Path) -> bool:

@@ -95,22 +95,35 @@ def _largest_component(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape
     return jnp.where(largest > 0, held, 1.0)
 
 
-def offset_origin(
-    point: Float[Array, "3"],
-    direction: Float[Array, "3"],
-    normal: Float[Array, "3"],
-    scale: Float[Array, ""],
-) -> Float[Array, "3"]:
-    """Returns where to restart a ray that leaves a surface, just off it on the ray's own side.
+def exponential_decay(
+    rate: Float[Array, "*rates"], length: Float[Array, ""]
+) -> Float[Array, "*rates"]:
+    """Returns `exp(-rate * length)`, also over an infinite length.
 
-    The step is along the geometric `normal` (unit, either side) and proportional to `scale`,
-    the largest coordinate that took part in computing `point`, because that sets the rounding
-    error. At coordinates near 2 it is 2e-6 in float32: it clears the surface, and no wall worth
-    modelling is that thin.
+    There a rate of 0 leaves everything and any other leaves nothing, both with gradient 0; the
+    plain formula has NaN in the value of the first and in the gradient of the second. Over a
+    finite length the gradients are the true ones, also at rate 0.
+    """
+    endless = jnp.isinf(length)
+    decay = jnp.exp(-rate * jnp.where(endless, 0.0, length))
+    return jnp.where(endless, jnp.where(rate > 0, 0.0, 1.0), decay)
+
+
+def offset_origin(
+    point: Float[Array, "3"], towards: Float[Array, "3"], scale: Float[Array, ""]
+) -> Float[Array, "3"]:
+    """Returns where to restart a ray that leaves a surface, just off it.
+
+    The step is proportional to `scale`, the largest coordinate that took part in computing
+    `point`, because that sets the rounding error. At coordinates near 2 it is 2e-6 in float32: it
+    clears the surface, and no wall worth modelling is that thin.
+
+    Args:
+      point: on the surface.
+      towards: unit geometric normal on the side that the ray leaves to.
+      scale: largest absolute coordinate involved, at least 0.
 
     Source: after Waechter and Binder, A Fast and Robust Method for Avoiding
     Self-Intersection, Ray Tracing Gems (2019), ch. 6.
     """
-    step = _OFFSET_IN_ULPS * jnp.finfo(point.dtype).eps * scale
-    side = jnp.where(jnp.dot(direction, normal) >= 0, 1.0, -1.0)
-    return point + step * side.astype(point.dtype) * normal
+    return point + _OFFSET_IN_ULPS * jnp.finfo(point.dtype).eps * scale * towards

@@ -344,3 +344,41 @@ _CASES = {
 def test_transformations_change_nothing(name, transformation):
     function, batches = _CASES[name]
     transformation(function, tuple(jnp.asarray(np.ascontiguousarray(x)) for x in batches))
+
+
+# --- exponential_decay ---
+
+
+def _decay_gradients(rate, length):
+    arguments = jnp.float32(rate), jnp.float32(length)
+    return jax.grad(numerics.exponential_decay, argnums=(0, 1))(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("rate", "length", "expected"),
+    [
+        (0.0, 3.0, 1.0),
+        (2.0, 0.0, 1.0),
+        (2.0, 0.5, np.exp(-1.0)),
+        (0.0, np.inf, 1.0),
+        (1e-30, np.inf, 0.0),
+        (1e30, 1e30, 0.0),
+    ],
+)
+def test_decay_by_hand(rate, length, expected):
+    found = numerics.exponential_decay(jnp.float32(rate), jnp.float32(length))
+    np.testing.assert_allclose(found, expected, rtol=_ROUNDING)
+
+
+@pytest.mark.parametrize("length", [0.0, 1.0, 1e30, np.inf])
+@pytest.mark.parametrize("rate", [0.0, 1e-30, 1.0, 1e30])
+def test_gradients_of_decay_are_finite(rate, length):
+    assert np.all(np.isfinite(_decay_gradients(rate, length)))
+
+
+def test_decay_has_its_true_gradients_without_absorption():
+    np.testing.assert_allclose(_decay_gradients(0.0, 0.7), [-0.7, 0.0], rtol=_ROUNDING)
+
+
+def test_decay_passes_nan_on():
+    assert np.isnan(numerics.exponential_decay(jnp.float32(1.0), jnp.float32(np.nan)))

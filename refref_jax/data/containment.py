@@ -11,9 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from refref_jax.data.errors import SceneError
 from refref_jax.data.meshes import MeshPart
 from refref_jax.geometry.corner_normals import face_normals
 from refref_jax.optics.interface_rules import NO_PARENT
+from refref_jax.optics.media import EMPTY_SLOT, SLOTS
 
 # Faces of a part that are tested against each other part.
 _PROBES = 64
@@ -54,6 +56,31 @@ def find_containment(parts: Sequence[MeshPart]) -> Containment:
         around = np.flatnonzero(contains[:, inner])
         parents.append(int(min(around, key=volumes.__getitem__)) if around.size else NO_PARENT)
     return Containment(tuple(parents), tuple(sorted(overlaps)))
+
+
+def parts_around(
+    parts: Sequence[MeshPart], points: Float[np.ndarray, "points 3"]
+) -> Int[np.ndarray, "points slots"]:
+    """Returns the interior list of rays that start at points: the parts that contain each.
+
+    For the rule `priority`, see `optics.media`; the other rules need none.
+
+    Raises:
+      SceneError: if a list is too short for the parts around a point.
+    """
+    inside = np.zeros((len(points), max(len(parts), SLOTS)), bool)
+    for number, part in enumerate(parts):
+        inside[:, number] = np.abs(winding_number(part, points)) > 0.5
+    if np.any(crowded := inside.sum(axis=1) > SLOTS):
+        point = int(np.argmax(crowded))
+        names = ", ".join(parts[number].name for number in np.flatnonzero(inside[point]))
+        raise SceneError(
+            f"More than {SLOTS} parts contain the point {points[point].tolist()}: {names}. Move "
+            "the camera, or join parts that are of one material."
+        )
+    order = np.argsort(~inside, axis=1, kind="stable")[:, :SLOTS]
+    listed = np.take_along_axis(inside, order, axis=1)
+    return np.where(listed, order, EMPTY_SLOT).astype(np.int32)
 
 
 def winding_number(

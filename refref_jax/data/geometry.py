@@ -5,7 +5,8 @@ from typing import Literal
 
 import numpy as np
 
-from refref_jax.data.meshes import MeshPart, Shading
+from refref_jax.data.meshes import MeshPart
+from refref_jax.data.part_descriptions import Shading
 from refref_jax.geometry.corner_normals import CREASE_ANGLE, corner_normals
 from refref_jax.geometry.surface_build import build_surfaces
 from refref_jax.optics.interface_rules import RULES
@@ -15,7 +16,10 @@ _CREASE_ANGLES: dict[Shading, float] = {"auto": CREASE_ANGLE, "smooth": np.pi, "
 
 
 def build_geometry(
-    parts: Sequence[MeshPart], parents: Sequence[int], *, rule: Literal["nested", "facing"]
+    parts: Sequence[MeshPart],
+    parents: Sequence[int],
+    *,
+    rule: Literal["nested", "facing", "priority"],
 ) -> Geometry:
     """Builds surfaces and interfaces of all parts.
 
@@ -35,4 +39,11 @@ def build_geometry(
         np.concatenate([np.zeros((0, 3, 3)), *normals]),
         np.concatenate([np.zeros(0, np.int64), *owners]),
     )
-    return Geometry(surfaces, RULES[rule]([part.index for part in parts], parents))
+    interfaces = RULES[rule](
+        [part.index for part in parts],
+        parents,
+        tints=[part.tint for part in parts],
+        absorptions=[part.absorption for part in parts],
+        priorities=[part.priority for part in parts],
+    )
+    return Geometry(surfaces, interfaces)

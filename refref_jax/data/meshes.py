@@ -1,21 +1,29 @@
 """Reads the meshes of a scene and decides what they are made of (NumPy only).
 
 One PLY file is one part. Its material is the last word of the file's own name that the table of
-indices knows: `perfume_red_glass.ply` is glass. An optional `scene.json` may say for each mesh
-whether it was shaded smooth.
+indices knows: `perfume_red_glass.ply` is glass. An optional `scene.json` may say more of each mesh
+(see `part_descriptions`). The index of refraction is, in this order, the one that the user gives,
+that of `scene.json`, and that of the table: what was rendered beats what a name suggests, and
+what is asked for by hand beats both.
 """
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
 from refref_jax.data.errors import SceneError
+from refref_jax.data.part_descriptions import (
+    Colour,
+    PartDescription,
+    Shading,
+    read_part_descriptions,
+)
+from refref_jax.optics.interface_rules import CLEAR, NO_ABSORPTION
 
 INDEX_OF_REFRACTION: dict[str, float] = {
     "glass": 1.5,
@@ -30,8 +38,6 @@ INDEX_OF_REFRACTION: dict[str, float] = {
 
 _LONGEST_HEADER = 1 << 16
 
-Shading = Literal["auto", "smooth", "flat"]
-
 
 class MeshPart(NamedTuple):
     """One closed surface and its material.
@@ -42,6 +48,9 @@ class MeshPart(NamedTuple):
       faces: counter-clockwise seen from outside.
       index: index of refraction inside.
       shading: `smooth`, `flat`, or `auto` for smooth up to the crease angle.
+      tint: factor of linear RGB light at every reflection and every crossing of the surface.
+      absorption: of the medium inside, linear RGB, per world unit.
+      priority: where bodies overlap under the rule `priority`, the highest wins.
     """
 
     name: str
@@ -49,6 +58,9 @@ class MeshPart(NamedTuple):
     faces: Int[np.ndarray, "faces 3"]
     index: float
     shading: Shading
+    tint: Colour = CLEAR
+    absorption: Colour = NO_ABSORPTION
+    priority: int = 0
 
 
 def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> list[MeshPart]:
@@ -56,12 +68,12 @@ def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> l
 
     Args:
       scene: the scene folder; its meshes are `meshes/*.ply`. None of them is no part.
-      indices: indices of refraction that replace or extend the table, by material or, for one
-        part alone, by file stem.
+      indices: indices of refraction that replace or extend the table and `scene.json`, by
+        material or, for one part alone, by file stem.
 
     Raises:
-      SceneError: if a mesh is broken or empty, if its material is unknown, or if an index is
-        not positive or names nothing.
+      SceneError: if a mesh is broken or empty, if its material is unknown, if an index is not
+        positive or names nothing, or if `scene.json` is wrong.
     """
     overrides = dict(indices or {})
     for name, index in overrides.items():
@@ -74,8 +86,18 @@ def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> l
     files = folder.iterdir() if folder.is_dir() else ()
     paths = sorted(path for path in files if path.suffix.lower() == ".ply")
     _check_overrides(overrides, paths)
-    shading = _read_shading(scene / "scene.json")
-    return [_read_part(path, overrides, shading.get(path.name, "auto")) for path in paths]
+    described = read_part_descriptions(scene / "scene.json")
+    unknown = PartDescription()
+    return [_read_part(path, overrides, described.get(path.name, unknown)) for path in paths]
+
+
+def without_colour(parts: Sequence[MeshPart]) -> list[MeshPart]:
+    """Returns the parts with clear surfaces and media.
+
+    For fields that learn the colour of glass from images, as the paper's oracle does: a tint that
+    is already on the light paths would be counted twice.
+    """
+    return [part._replace(tint=CLEAR, absorption=NO_ABSORPTION) for part in parts]
 
 
 def read_mesh(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
@@ -111,18 +133,20 @@ def _declared_faces(path: Path) -> int:
     return int(found.group(1)) if found else 0
 
 
-def _read_part(path: Path, overrides: Mapping[str, float], shading: Shading) -> MeshPart:
-    index = _index(path, overrides)
+def _read_part(path: Path, overrides: Mapping[str, float], described: PartDescription) -> MeshPart:
+    index = _index(path, overrides, described)
     vertices, faces = read_mesh(path)
-    return MeshPart(path.stem, vertices, faces, index, shading)
+    return MeshPart(path.stem, vertices, faces, index, *described[1:])
 
 
-def _index(path: Path, overrides: Mapping[str, float]) -> float:
-    """Returns the index of the part's own override, or of its material."""
+def _index(path: Path, overrides: Mapping[str, float], described: PartDescription) -> float:
+    """Returns the index of the part's own override, or of its material, see the module."""
     if path.stem in overrides:
         return overrides[path.stem]
     table = INDEX_OF_REFRACTION | dict(overrides)
     material = _material(path, table)
+    if described.index is not None and material not in overrides:
+        return described.index
     if material is None:
         raise SceneError(
             f"The material of {path} is unknown: no word of its name is one of "
@@ -148,20 +172,3 @@ def _check_overrides(overrides: Mapping[str, float], paths: Sequence[Path]) -> N
                 f"{', '.join(path.name for path in paths) or 'none'}: use one of their names, "
                 "without .ply, or a material in it."
             )
-
-
-def _read_shading(path: Path) -> dict[str, Shading]:
-    """Returns the shading of each mesh file that `scene.json` describes."""
-    if not path.is_file():
-        return {}
-    try:
-        parts = json.loads(path.read_text(encoding="utf-8")).get("parts", [])
-        return {
-            Path(part["mesh"]).name: "smooth" if part["smooth_normals"] else "flat"
-            for part in parts
-            if "smooth_normals" in part
-        }
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise SceneError(
-            f"{path} can not be understood ({error}). Correct it, or remove it: it is optional."
-        ) from error

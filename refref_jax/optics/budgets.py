@@ -1,10 +1,15 @@
-"""How much of the light is followed.
+"""How much of the light is followed, and how much room it gets.
 
-The paper's oracle follows one path of at most 10 bends, refracted wherever it can be and totally
-reflected elsewhere, and one reflection at the first surface, which it does not trace any
-further. A plain NeRF follows no bend at all.
+At every interface light splits into a reflected and a transmitted part, so a camera ray grows a
+tree of paths. A budget says which branches are followed:
 
-Source: paper (arXiv 2505.05848), section 4.
+- `STRAIGHT`: none; light ignores the objects, as in a plain NeRF.
+- `PAPER`: the paper's oracle. One path of at most 10 bends, refracted wherever it can be and
+  totally reflected elsewhere, without loss, and one reflection at the first surface, which is not
+  traced any further.
+- `TREE`: every branch that carries at least 2 % of its pixel's light.
+
+Source: paper (arXiv 2505.05848), section 4, for the first two.
 """
 
 import dataclasses
@@ -16,33 +21,81 @@ from typing import Literal
 class Budget:
     """Which light to follow.
 
+    The capacity factors bound memory, per camera ray of a pool. What does not fit is the least
+    light there is, and it is returned as lost; see `wavefront`.
+
     Attributes:
-      bends: most refractions and total reflections of a path.
-      reflections: `first` adds the reflection at the first surface.
+      bends: most refractions and reflections of a path.
+      reflections: `none` follows total reflections only; `first` adds the reflection at the first
+        surface, untraced; `all` follows every reflection.
+      total_reflection: `followed`, or `ended`: a path that meets one then goes on along its last
+        direction, as in the paper's ablation.
+      cut: smallest throughput worth following, by the largest of its RGB. A weaker branch leaves
+        its share to its sibling, so no energy is lost.
+      live_per_ray: room for rays that are still to be cast.
+      segments_per_ray: room for segments of paths, beyond the camera rays themselves.
+      paths_per_ray: room for finished paths.
     """
 
     bends: int
-    reflections: Literal["none", "first"]
+    reflections: Literal["none", "first", "all"]
+    total_reflection: Literal["followed", "ended"] = "followed"
+    cut: float = 0.0
+    live_per_ray: float = 4.0
+    segments_per_ray: float = 16.0
+    paths_per_ray: float = 4.0
+
+    def __post_init__(self) -> None:
+        """Checks what tracing relies on."""
+        if self.bends < 0:
+            raise ValueError(f"A path can not have {self.bends} bends. Give 0 or more.")
+        if not 0.0 <= self.cut < 1.0:
+            raise ValueError(
+                f"The cut is a share of a pixel's light, in [0, 1), not {self.cut}. Give 0.02 for "
+                "2 %."
+            )
+        if self.reflections not in ("none", "first", "all"):
+            raise ValueError(
+                f"The reflections are 'none', 'first' or 'all', not {self.reflections!r}. Choose "
+                "one."
+            )
+        if self.total_reflection not in ("followed", "ended"):
+            raise ValueError(
+                "Total reflection is 'followed' or 'ended', not "
+                f"{self.total_reflection!r}. Choose one."
+            )
+        for name in ("live_per_ray", "segments_per_ray", "paths_per_ray"):
+            if not 1.0 <= getattr(self, name) < math.inf:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)}, but every ray needs room for itself. Give a "
+                    "number of at least 1."
+                )
 
 
-STRAIGHT = Budget(bends=0, reflections="none")
-PAPER = Budget(bends=10, reflections="first")
+STRAIGHT = Budget(bends=0, reflections="none", live_per_ray=1.0, paths_per_ray=1.0)
+PAPER = Budget(
+    bends=10,
+    reflections="first",
+    live_per_ray=1.0,
+    segments_per_ray=11.0,
+    paths_per_ray=2.0,
+)
+TREE = Budget(bends=24, reflections="all", cut=0.02)
 
-BUDGETS = {"straight": STRAIGHT, "paper": PAPER}
+BUDGETS = {"straight": STRAIGHT, "paper": PAPER, "tree": TREE}
 
 
-def capacity_for(budget: Budget, rays: int, hit_fraction: float) -> int:
-    """Returns a room for reflections that batches of a scene practically never outgrow.
+def capacity_for(budget: Budget, rays: int, *, mean: float, deviation: float) -> int:
+    """Returns a room for the paths of a batch that batches of a scene practically never outgrow.
 
-    Six standard deviations above the mean number of hits in a random batch, rounded up to 64.
+    Six standard deviations above the mean number of paths of a random batch, rounded up to 64.
 
     Args:
       budget: which light to follow.
       rays: rays in a batch.
-      hit_fraction: share of the scene's camera rays that meet a surface.
+      mean: mean number of paths of the scene's camera rays.
+      deviation: its standard deviation over rays.
     """
-    if budget.reflections == "none":
-        return 0
-    spread = math.sqrt(rays * hit_fraction * (1.0 - hit_fraction))
-    needed = rays * hit_fraction + 6.0 * spread
-    return min(rays, 64 * math.ceil(needed / 64))
+    most = math.ceil(rays * budget.paths_per_ray)
+    needed = rays * mean + 6.0 * math.sqrt(rays) * deviation
+    return max(rays, min(most, 64 * math.ceil(needed / 64)))

@@ -6,6 +6,7 @@ starts again; the shading normal bends it.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -20,23 +21,22 @@ class Interaction(NamedTuple):
     Attributes:
       position: the point on the interface.
       reflectance: Fresnel's `R`, 1 in total internal reflection.
-      reflected: mirrored unit direction.
-      direction: where the energy-carrying ray goes on: refracted, or mirrored in total internal
-        reflection; unit.
-      restart: origin of the ray that goes on, just off the surface.
-      medium: the medium it goes on in.
-      medium_before: the medium it came through.
       total: whether reflection is total.
+      reflected: mirrored unit direction.
+      transmitted: refracted unit direction; finite, without meaning, if reflection is total.
+      restart_reflected: origin of the mirrored ray, just off the surface.
+      restart_transmitted: origin of the refracted ray, just off the surface on its other side.
+      sides: the media on both sides.
     """
 
     position: Float[Array, "3"]
     reflectance: Float[Array, ""]
-    reflected: Float[Array, "3"]
-    direction: Float[Array, "3"]
-    restart: Float[Array, "3"]
-    medium: Int[Array, ""]
-    medium_before: Int[Array, ""]
     total: Bool[Array, ""]
+    reflected: Float[Array, "3"]
+    transmitted: Float[Array, "3"]
+    restart_reflected: Float[Array, "3"]
+    restart_transmitted: Float[Array, "3"]
+    sides: media.Crossing
 
 
 class _Split(NamedTuple):
@@ -49,9 +49,12 @@ class _Split(NamedTuple):
 
 
 def meet(
-    point: SurfacePoint, interfaces: media.Interfaces, direction: Float[Array, "3"]
+    point: SurfacePoint,
+    interfaces: media.Interfaces,
+    inside: Int[Array, " slots"],
+    direction: Float[Array, "3"],
 ) -> Interaction:
-    """Follows a ray through an interface.
+    """Follows a ray to an interface and beyond it.
 
     Where the shading normal would send either ray to the wrong side of the triangle, both
     follow the geometric normal instead.
@@ -59,10 +62,11 @@ def meet(
     Args:
       point: where the ray meets the surface.
       interfaces: the scene's interfaces.
+      inside: the parts that the ray is in (see `media`).
       direction: unit direction of the incident ray.
     """
     entering = jnp.dot(direction, point.geometric_normal) < 0.0
-    sides = media.crossing(interfaces, point.part, entering)
+    sides = media.crossing(interfaces, inside, point.part, entering)
     outward = jnp.where(entering, 1.0, -1.0).astype(direction.dtype)
     geometric, shading = outward * point.geometric_normal, outward * point.shading_normal
 
@@ -73,19 +77,16 @@ def meet(
         & (jnp.dot(smooth.reflected, geometric) > 0.0)
         & (smooth.total | (jnp.dot(smooth.refracted, geometric) < 0.0))
     )
-    reflected = jnp.where(valid, smooth.reflected, flat.reflected)
-    refracted = jnp.where(valid, smooth.refracted, flat.refracted)
-    total = jnp.where(valid, smooth.total, flat.total)
-    onward = jnp.where(total, reflected, refracted)
+    split = jax.tree.map(lambda a, b: jnp.where(valid, a, b), smooth, flat)
     return Interaction(
         position=point.position,
-        reflectance=jnp.where(valid, smooth.reflectance, flat.reflectance),
-        reflected=reflected,
-        direction=onward,
-        restart=numerics.offset_origin(point.position, onward, geometric, point.scale),
-        medium=jnp.where(total, sides.medium_near, sides.medium_far),
-        medium_before=sides.medium_near,
-        total=total,
+        reflectance=split.reflectance,
+        total=split.total,
+        reflected=split.reflected,
+        transmitted=split.refracted,
+        restart_reflected=numerics.offset_origin(point.position, geometric, point.scale),
+        restart_transmitted=numerics.offset_origin(point.position, -geometric, point.scale),
+        sides=sides,
     )
 
 

@@ -29,6 +29,8 @@ class PathStatus(enum.IntEnum):
     """The path would meet another interface, but its budget of bends is spent."""
     NOT_TRACED = 4
     """The last direction was not traced against the objects (the paper's reflected ray)."""
+    TOTALLY_REFLECTED = 5
+    """The path met a total reflection, which its budget does not follow."""
 
 
 class LightPaths(NamedTuple):
@@ -60,6 +62,30 @@ class LightPaths(NamedTuple):
     statuses: Int[Array, " paths"]
 
 
+class PathEnds(NamedTuple):
+    """The last segments of light paths: all that a known background needs.
+
+    Attributes:
+      origins: start of the last segment, world units; finite but meaningless in empty slots.
+      directions: its unit direction; likewise.
+      tau: arc length from the camera to its start.
+      media: its medium (see `media`).
+      rays: index of the ray that a path belongs to.
+      weights: share of the path in its ray's linear RGB; 0 in empty slots.
+      bends: number of refractions and reflections.
+      statuses: a `PathStatus`.
+    """
+
+    origins: Float[Array, "paths 3"]
+    directions: Float[Array, "paths 3"]
+    tau: Float[Array, " paths"]
+    media: Int[Array, " paths"]
+    rays: Int[Array, " paths"]
+    weights: Float[Array, "paths 3"]
+    bends: Int[Array, " paths"]
+    statuses: Int[Array, " paths"]
+
+
 def straight(rays: Rays) -> LightPaths:
     """Returns one straight path a ray, with full weight: the light paths of a plain NeRF."""
     count = rays.radii.shape[0]
@@ -77,6 +103,21 @@ def straight(rays: Rays) -> LightPaths:
     )
 
 
-def exists(paths: LightPaths) -> Bool[Array, " paths"]:
+def straight_ends(rays: Rays) -> PathEnds:
+    """Returns the only segments of `straight`'s paths."""
+    paths = straight(rays)
+    return PathEnds(
+        origins=rays.origins,
+        directions=rays.directions,
+        tau=paths.tau[:, 0],
+        media=paths.media[:, 0],
+        rays=paths.rays,
+        weights=paths.weights,
+        bends=paths.bends,
+        statuses=paths.statuses,
+    )
+
+
+def exists(paths: LightPaths | PathEnds) -> Bool[Array, " paths"]:
     """Returns which slots hold a path."""
     return paths.statuses != PathStatus.EMPTY

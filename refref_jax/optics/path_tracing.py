@@ -1,146 +1,208 @@
 """The light paths of batches of rays under a budget.
 
-Rays are followed in one large pool (see `wavefront`); then each batch packs its refracted paths
-and the reflections worth keeping into one list of fixed capacity. Rays that miss the objects
-have no reflection and take no room for one.
+Rays are followed in one large pool (see `wavefront`); then each batch packs its paths into a list
+of fixed capacity, in the order of its rays, each ray's heaviest path first.
 
 To differentiation, light paths are constants: parameters of fields have gradients along them, but
-rays and geometry have none, and asking for one is an error. The loops have no reverse mode, and the
-hits that they find are constants besides.
+rays and geometry have none, and asking for one is an error (see `single_path` for these).
 
 Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
 """
 
-import functools
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from refref_jax import numerics
 from refref_jax.geometry.rays import Rays
+from refref_jax.optics import media, path_tree
 from refref_jax.optics.budgets import Budget
-from refref_jax.optics.light_paths import LightPaths, PathStatus, straight
-from refref_jax.optics.wavefront import Followed, Geometry, follow
+from refref_jax.optics.light_paths import (
+    LightPaths,
+    PathEnds,
+    PathStatus,
+    exists,
+    straight,
+    straight_ends,
+)
+from refref_jax.optics.path_tree import Ends, PathTree
+from refref_jax.optics.wavefront import BLOCK, Geometry, follow
 
 
 class Traced(NamedTuple):
-    """Light paths of a batch of rays.
+    """The light paths of one batch of rays.
 
     Attributes:
-      paths: the paths.
-      dropped: the share of each ray's light that found no room in the list. Its refracted path
-        carries it instead, so that weights still sum to 1.
+      paths: the paths, in the order of their rays, each ray's heaviest first; empty slots last.
+      lost: the share of each ray's linear RGB that found no room. Weights and losses of a ray sum
+        to 1, less what tints and absorption took.
     """
 
     paths: LightPaths
-    dropped: Float[Array, " rays"]
+    lost: Float[Array, "rays 3"]
 
 
-def trace(geometry: Geometry, rays: Rays, *, budget: Budget, capacity: int) -> Traced:
+class TracedEnds(NamedTuple):
+    """The last segments of the light paths of some rays.
+
+    Attributes:
+      ends: one record a path.
+      lost: as in `Traced`.
+      casts: number of rays that were cast.
+    """
+
+    ends: PathEnds
+    lost: Float[Array, "rays 3"]
+    casts: Int[Array, ""]
+
+
+class Survey(NamedTuple):
+    """How many paths the rays of a scene have.
+
+    Attributes:
+      mean: mean number of paths of a ray.
+      deviation: its standard deviation over rays.
+      hit_fraction: share of rays that meet a surface.
+    """
+
+    mean: Float[Array, ""]
+    deviation: Float[Array, ""]
+    hit_fraction: Float[Array, ""]
+
+
+def trace_ends(
+    geometry: Geometry,
+    rays: Rays,
+    *,
+    budget: Budget,
+    inside: Int[Array, "rays slots"] | None = None,
+    block: int = BLOCK,
+) -> TracedEnds:
+    """Traces rays, and keeps only where their paths end.
+
+    Args:
+      geometry: the scene.
+      rays: camera rays.
+      budget: which light to follow.
+      inside: the parts that each camera is in, for the rule `priority` (see
+        `data.containment`); by default none. The other rules find out by themselves.
+      block: rays cast at once, see `wavefront`.
+    """
+    if budget.bends == 0:
+        ends = straight_ends(rays)
+        return TracedEnds(ends, jnp.zeros_like(rays.origins), jnp.zeros((), jnp.int32))
+    tree = follow(geometry, rays, _inside(geometry, rays, inside), budget=budget, block=block)
+    ends = path_tree.listed(tree, math.ceil(rays.radii.shape[0] * budget.paths_per_ray))
+    last = path_tree.last_segments(tree.segments.items, ends)
+    return TracedEnds(last, tree.lost, tree.casts)
+
+
+def trace(
+    geometry: Geometry,
+    rays: Rays,
+    *,
+    budget: Budget,
+    capacity: int,
+    inside: Int[Array, "rays slots"] | None = None,
+) -> Traced:
     """Traces one batch of rays.
 
     Args:
       geometry: the scene.
-      rays: camera rays, outside every body.
+      rays: camera rays.
       budget: which light to follow.
-      capacity: room for reflections, at most the number of rays; see `budgets.capacity_for`.
+      capacity: room for paths; see `budgets.capacity_for`. Not used if the budget has no bends.
+      inside: as for `trace_ends`.
     """
     batch = jax.tree.map(lambda x: x[None], rays)
-    traced = trace_batches(geometry, batch, budget=budget, capacity=capacity)
+    if inside is not None:
+        inside = inside[None]
+    traced = trace_batches(geometry, batch, budget=budget, capacity=capacity, inside=inside)
     return jax.tree.map(lambda x: x[0], traced)
 
 
-def trace_batches(geometry: Geometry, rays: Rays, *, budget: Budget, capacity: int) -> Traced:
+def trace_batches(
+    geometry: Geometry,
+    rays: Rays,
+    *,
+    budget: Budget,
+    capacity: int,
+    inside: Int[Array, "batches rays slots"] | None = None,
+) -> Traced:
     """Traces many batches in one pool, which amortises the latency of the traversal's loop.
 
     Args:
       geometry: the scene.
-      rays: camera rays `[batches, rays]`, outside every body.
+      rays: camera rays `[batches, rays]`.
       budget: which light to follow.
-      capacity: room for reflections in each batch, at most its number of rays.
+      capacity: room for the paths of each batch; not used if the budget has no bends.
+      inside: as for `trace_ends`.
 
     Returns:
       The paths of each batch, stacked; `rays` counts within a batch.
     """
     if budget.bends == 0:
-        return jax.vmap(lambda batch: Traced(straight(batch), jnp.zeros_like(batch.radii)))(rays)
-    return _trace_batches(budget, capacity, geometry, rays)
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _trace_batches(budget: Budget, capacity: int, geometry: Geometry, rays: Rays) -> Traced:
-    shape = rays.radii.shape
-    pool = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
-    followed = follow(geometry, pool, bends=budget.bends)
-    batches = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), followed)
-    return jax.vmap(lambda batch: pack(batch, budget=budget, capacity=capacity))(batches)
-
-
-@_trace_batches.defjvp
-def _refuse_gradients(budget: Budget, capacity: int, primals: object, tangents: object) -> None:
-    del budget, capacity, primals, tangents
-    raise TypeError(
-        "Light paths have no derivatives with respect to rays or geometry here: they would be "
-        "silently wrong. Differentiate with respect to the parameters of the fields only, or hold "
-        "rays and geometry constant with jax.lax.stop_gradient."
+        return jax.vmap(lambda batch: Traced(straight(batch), jnp.zeros_like(batch.origins)))(rays)
+    batches, count = rays.radii.shape
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
+    if inside is not None:
+        inside = inside.reshape(-1, inside.shape[-1])
+    tree = follow(geometry, flat, _inside(geometry, flat, inside), budget=budget)
+    ends, lost = _pack(tree, batches, count, capacity)
+    paths = path_tree.polylines(
+        tree.segments.items, ends, flat.radii[ends.rays], bends=budget.bends
     )
+    paths = jax.tree.map(lambda x: x.reshape(batches, capacity, *x.shape[1:]), paths)
+    return Traced(paths._replace(rays=paths.rays % count), lost.reshape(batches, count, 3))
 
 
-def pack(followed: Followed, *, budget: Budget, capacity: int) -> Traced:
-    """Joins refracted paths and first reflections of a batch into one list.
-
-    The list holds the refracted paths first, in the order of the rays, then `capacity` slots
-    for reflections, the strongest first. Weights are `1 - R` and `R` (paper, Fresnel blend).
-    Where the first surface reflects totally, the followed path is that reflection already.
-
-    Args:
-      followed: the batch.
-      budget: which light to follow.
-      capacity: room for reflections; not used unless the budget asks for them.
-    """
-    count = followed.hit.shape[0]
-    order = jnp.arange(count, dtype=jnp.int32)
-    refracted = followed.paths._replace(rays=order)
-    if budget.reflections == "none":
-        return Traced(refracted, jnp.zeros_like(refracted.radii))
-    partial = followed.hit & ~followed.first.total
-    strength = jnp.where(partial, followed.first.reflectance, -1.0)
-    strength_kept, kept = jax.lax.top_k(strength, capacity)
-    share_kept = jnp.maximum(strength_kept, 0.0)
-    share = jnp.zeros_like(strength).at[kept].set(share_kept)
-    refracted = refracted._replace(weights=refracted.weights * (1.0 - share)[:, None])
-    reflected = _reflections(followed, kept, share_kept, strength_kept >= 0.0)
-    joined = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), refracted, reflected)
-    return Traced(joined, jnp.maximum(strength, 0.0) - share)
+def survey(geometry: Geometry, rays: Rays, *, budget: Budget) -> Survey:
+    """Measures what batches of a scene's rays need room for."""
+    count = rays.radii.shape[0]
+    ends = trace_ends(geometry, rays, budget=budget).ends
+    one = exists(ends).astype(jnp.float32)
+    paths = jax.ops.segment_sum(one, ends.rays, num_segments=count)
+    missing = jnp.sum(ends.statuses == PathStatus.MISSED, dtype=jnp.float32)
+    return Survey(jnp.mean(paths), jnp.std(paths), 1.0 - missing / count)
 
 
-def _reflections(
-    followed: Followed,
-    rays: Int[Array, " kept"],
-    share: Float[Array, " kept"],
-    real: Bool[Array, " kept"],
-) -> LightPaths:
-    """Returns the paths that some rays take by reflection at their first surface."""
-    first = jax.tree.map(lambda x: x[rays], followed.first)
-    camera = jax.tree.map(lambda x: x[rays], followed.paths)
-    is_start = jnp.arange(camera.tau.shape[1]) == 0
+def _inside(
+    geometry: Geometry, rays: Rays, inside: Int[Array, "rays slots"] | None
+) -> Int[Array, "rays slots"]:
+    if inside is not None:
+        return inside
+    nowhere = media.nowhere(geometry.interfaces)
+    return jnp.broadcast_to(nowhere, (rays.radii.shape[0], nowhere.shape[0]))
 
-    def two_segments(before: Array, after: Array) -> Array:
-        mask = is_start.reshape(1, -1, *[1] * (before.ndim - 1))
-        return jnp.where(mask, before[:, None], after[:, None])
 
-    origin = camera.points[:, 0]
-    tau = two_segments(jnp.zeros_like(share), numerics.length(first.position - origin))
-    return LightPaths(
-        points=two_segments(origin, first.position),
-        directions=two_segments(camera.directions[:, 0], first.reflected),
-        tau=jnp.where(jnp.arange(tau.shape[1])[None] <= 1, tau, jnp.inf),
-        media=two_segments(first.medium_before, first.medium_before),
-        rays=rays.astype(jnp.int32),
-        weights=jnp.broadcast_to(share[:, None], origin.shape),
-        radii=camera.radii,
-        bends=jnp.ones_like(camera.bends),
-        statuses=jnp.where(real, PathStatus.NOT_TRACED, PathStatus.EMPTY).astype(jnp.int32),
-    )
+def _pack(
+    tree: PathTree, batches: int, rays: int, capacity: int
+) -> tuple[Ends, Float[Array, "all_rays 3"]]:
+    """Sorts paths into one list a batch, joined end to end; returns the light lost by now."""
+    slots = tree.ends.items.rays.shape[0]
+    ends = path_tree.listed(tree, slots)
+    weight = jnp.max(ends.weights, axis=-1)
+    # The slots past the last path form a batch of their own.
+    batch = jnp.where(jnp.arange(slots) < tree.ends.count, ends.rays // rays, batches)
+    strongest_first = jnp.lexsort((-weight, batch))
+    rank = _rank_in_group(batch[strongest_first], batches)
+    fits = jnp.zeros(slots, bool).at[strongest_first].set(rank < capacity) & (batch < batches)
+    group = jnp.where(fits, batch, batches)
+    order = jnp.lexsort((-weight, ends.rays, group))
+    place = group[order] * capacity + _rank_in_group(group[order], batches)
+    target = jnp.where(fits[order], place, batches * capacity)
+    source = jnp.full(batches * capacity, slots).at[target].set(order, mode="drop")
+    homes = jnp.repeat(jnp.arange(batches, dtype=jnp.int32) * rays, capacity)
+    packed = jax.tree.map(lambda x: x[jnp.minimum(source, slots - 1)], ends)
+    packed = path_tree.emptied(packed, source == slots)
+    packed = packed._replace(rays=jnp.where(source == slots, homes, packed.rays))
+    left_over = jnp.where(fits[:, None], 0.0, ends.weights)
+    return packed, tree.lost.at[ends.rays].add(left_over)
+
+
+def _rank_in_group(group: Int[Array, " n"], groups: int) -> Int[Array, " n"]:
+    """Returns the place of each record among its group's, for records sorted by group."""
+    begin = jnp.searchsorted(group, jnp.arange(groups + 1, dtype=group.dtype))
+    return jnp.arange(group.shape[0], dtype=begin.dtype) - begin[group]

@@ -6,6 +6,7 @@ two. This is one of the two modules that call `jax.jit`.
 """
 
 import functools
+import math
 from typing import NamedTuple
 
 import jax
@@ -68,7 +69,8 @@ def render_rays(model: Model, rays: Rays) -> Rendering:
       rays: `[n]` camera rays.
     """
     count = rays.radii.shape[0]
-    traced = path_tracing.trace(model.geometry, rays, budget=model.budget, capacity=count)
+    capacity = math.ceil(count * model.budget.paths_per_ray)
+    traced = path_tracing.trace(model.geometry, rays, budget=model.budget, capacity=capacity)
     tile = _sort(traced.paths, count, count)
     empty = jax.tree.map(jnp.zeros_like, _blank(count))
     return _finish(_add(model.params, tile.paths, tile.heaviest, empty, config=model.config))
@@ -123,7 +125,8 @@ def _blank(count: int) -> Rendering:
 
 @functools.partial(jax.jit, static_argnames="budget")
 def _trace_tile(geometry: Geometry, rays: Rays, real: Int[Array, ""], *, budget: Budget) -> _Tile:
-    traced = path_tracing.trace(geometry, rays, budget=budget, capacity=TILE)
+    capacity = math.ceil(TILE * budget.paths_per_ray)
+    traced = path_tracing.trace(geometry, rays, budget=budget, capacity=capacity)
     return _sort(traced.paths, TILE, real)
 
 

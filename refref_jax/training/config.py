@@ -15,7 +15,7 @@ class SceneConfig:
     """
 
     path: str
-    rule: Literal["nested", "facing"]
+    rule: Literal["nested", "facing", "priority"]
     indices: tuple[tuple[str, float], ...]
 
 

@@ -28,7 +28,7 @@ class Setup(NamedTuple):
       budget: which light is followed.
       geometry: what bends it.
       sampler: where the pixels come from.
-      capacity: room for reflections in a batch.
+      capacity: room for the paths of a batch.
       hit_fraction: share of the pixels that see an object, 0 if no light is bent.
     """
 
@@ -48,13 +48,14 @@ def set_up(
     geometry: Geometry,
     sampler: PixelSampler,
 ) -> Setup:
-    """Moves the geometry to the device, and measures how many rays meet it."""
+    """Moves the geometry to the device, and measures how many paths it makes of a ray."""
     geometry = jax.tree.map(jnp.asarray, geometry)
-    fraction = 0.0
-    if budget.bends > 0:
-        fraction = float(steps.hit_fraction(geometry, sampler.survey(_SURVEY).rays))
-    capacity = capacity_for(budget, config.batch, fraction)
-    return Setup(config, model, budget, geometry, sampler, capacity, fraction)
+    found = steps.survey_paths(geometry, sampler.survey(_SURVEY).rays, budget=budget)
+    capacity = capacity_for(
+        budget, config.batch, mean=float(found.mean), deviation=float(found.deviation)
+    )
+    hit_fraction = float(found.hit_fraction)
+    return Setup(config, model, budget, geometry, sampler, capacity, hit_fraction)
 
 
 def run_steps(

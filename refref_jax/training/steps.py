@@ -17,8 +17,8 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.light_paths import LightPaths
-from refref_jax.optics.path_tracing import Traced
-from refref_jax.optics.wavefront import Geometry, follow
+from refref_jax.optics.path_tracing import Survey, Traced
+from refref_jax.optics.wavefront import Geometry
 from refref_jax.render import pixels
 from refref_jax.render.config import ModelConfig
 from refref_jax.render.model import Params
@@ -51,7 +51,7 @@ class StepReport(NamedTuple):
       interlevel: unweighted interlevel loss.
       distortion: unweighted distortion loss.
       hash_decay: unweighted hash decay.
-      dropped: mean share of a ray's light that found no room among the batch's paths.
+      lost: mean share of a ray's light that found no room among the batch's paths.
     """
 
     loss: Float[Array, ""]
@@ -59,7 +59,7 @@ class StepReport(NamedTuple):
     interlevel: Float[Array, ""]
     distortion: Float[Array, ""]
     hash_decay: Float[Array, ""]
-    dropped: Float[Array, ""]
+    lost: Float[Array, ""]
 
 
 @functools.partial(jax.jit, static_argnames=("budget", "capacity"))
@@ -68,10 +68,10 @@ def trace_pool(geometry: Geometry, rays: Rays, *, budget: Budget, capacity: int)
     return path_tracing.trace_batches(geometry, rays, budget=budget, capacity=capacity)
 
 
-@jax.jit
-def hit_fraction(geometry: Geometry, rays: Rays) -> Float[Array, ""]:
-    """Returns the share of rays `[rays]` that meet a surface."""
-    return jnp.mean(follow(geometry, rays, bends=1).hit.astype(jnp.float32))
+@functools.partial(jax.jit, static_argnames="budget")
+def survey_paths(geometry: Geometry, rays: Rays, *, budget: Budget) -> Survey:
+    """Measures how many paths the rays `[rays]` of a scene have; see `path_tracing.survey`."""
+    return path_tracing.survey(geometry, rays, budget=budget)
 
 
 @functools.partial(jax.jit, static_argnames=("config", "model"), donate_argnames="state")
@@ -129,7 +129,7 @@ def _measure(
         + config.hash_decay * decay
     )
     psnr = -10.0 * jnp.log10(mse)
-    return StepReport(loss, psnr, interlevel, distortion, decay, jnp.mean(traced.dropped))
+    return StepReport(loss, psnr, interlevel, distortion, decay, jnp.mean(traced.lost))
 
 
 def _path_losses(

@@ -5,9 +5,16 @@ import pytest
 import trimesh
 
 from refref_jax.data import containment
-from refref_jax.data.containment import find_containment, signed_volume, winding_number
+from refref_jax.data.containment import (
+    find_containment,
+    parts_around,
+    signed_volume,
+    winding_number,
+)
 from refref_jax.data.meshes import read_meshes
 from refref_jax.optics.interface_rules import NO_PARENT
+from refref_jax.optics.media import EMPTY_SLOT, SLOTS
+from tests.data.expectations import scene_error
 from tests.data.solids import as_part, ball, box, inverted, joined, shell
 
 # Sums of solid angles in double precision.
@@ -215,3 +222,44 @@ def test_an_open_box_still_contains_what_is_deep_inside():
 def test_bundled_ball_contains_a_small_one(ball_scene):
     found = find_containment([*read_meshes(ball_scene), ball(radius=1.2)])
     assert found == ((NO_PARENT, 0), ())
+
+
+# Points within parts.
+
+
+def test_the_parts_around_points():
+    parts = [ball(radius=2.0), box(size=(2.0, 2.0, 2.0)), ball(centre=(2.0, 0.0, 0.0))]
+    points = np.array([[0.0, 0.0, 0.0], [0.9, 0.9, 0.0], [1.5, 0.0, 0.0], [2.5, 0.0, 0.0]])
+    points = np.concatenate([points, [[9.0, 0.0, 0.0]]])
+    found = parts_around(parts, points)
+    free = EMPTY_SLOT
+    expected = [
+        [0, 1, free, free],
+        [0, 1, free, free],
+        [0, 2, free, free],
+        [2, free, free, free],
+        [free, free, free, free],
+    ]
+    np.testing.assert_array_equal(found, expected)
+    assert found.dtype == np.int32
+    turned = parts_around([inverted(part) for part in parts], points)
+    np.testing.assert_array_equal(turned, expected)
+
+
+def test_the_last_of_many_parts_is_listed():
+    parts = [ball(centre=(9.0 * i, 0.0, 0.0)) for i in range(6)]
+    found = parts_around(parts, np.array([[45.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    np.testing.assert_array_equal(found[:, 0], [5, 0])
+    np.testing.assert_array_equal(found[:, 1:], EMPTY_SLOT)
+
+
+def test_no_part_is_around_points_of_an_empty_scene():
+    np.testing.assert_array_equal(parts_around([], np.zeros((2, 3))), np.full((2, SLOTS), -1))
+    assert parts_around([ball()], np.zeros((0, 3))).shape == (0, SLOTS)
+
+
+def test_too_many_parts_around_a_point():
+    parts = [ball(f"layer{i}_glass", radius=1.0 + i) for i in range(SLOTS + 1)]
+    assert np.all(parts_around(parts[:SLOTS], np.zeros((1, 3))) != EMPTY_SLOT)
+    with scene_error("[0.0, 0.0, 0.0]", "layer0_glass", "layer4_glass", "Move the camera"):
+        parts_around(parts, np.array([[20.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))

@@ -101,7 +101,30 @@ def test_a_scene_without_parts_has_one_interface_that_does_nothing():
     assert geometry.surfaces.parts.shape == geometry.surfaces.normals.shape[:1]
 
 
-@pytest.mark.parametrize("rule", ["nested", "facing"])
+def test_a_scene_without_parts_can_be_ranked():
+    geometry = build_geometry([], [], rule="priority")
+    np.testing.assert_array_equal(geometry.interfaces.priority, [0])
+
+
+def test_media_of_the_priority_rule():
+    bubble, cup, drink = _nested()
+    parts = [bubble._replace(priority=3), cup._replace(priority=1), drink._replace(priority=2)]
+    interfaces = _build(parts, rule="priority").interfaces
+    np.testing.assert_array_equal(interfaces.priority, [2, 0, 1])
+    np.testing.assert_allclose(interfaces.index_inside, [1.0, 1.5, 1.333], rtol=_SINGLE)
+
+
+@pytest.mark.parametrize("rule", ["nested", "facing", "priority"])
+def test_colours_reach_the_interfaces(rule):
+    bubble, cup, drink = _nested()
+    drink = drink._replace(tint=(0.5, 0.8, 0.95), absorption=(0.0, 1.0, 2.0))
+    interfaces = _build([bubble, cup, drink], rule=rule).interfaces
+    np.testing.assert_allclose(interfaces.tint[2], [0.5, 0.8, 0.95], rtol=_SINGLE)
+    np.testing.assert_array_equal(interfaces.tint[:2], 1.0)
+    np.testing.assert_array_equal(interfaces.absorption, [[0.0] * 3, [0.0] * 3, [0.0, 1.0, 2.0]])
+
+
+@pytest.mark.parametrize("rule", ["nested", "facing", "priority"])
 def test_a_part_alone_is_surrounded_by_air(rule):
     interfaces = build_geometry([ball()], [NO_PARENT], rule=rule).interfaces
     np.testing.assert_array_equal(interfaces.index_outside, [1.0])

@@ -221,6 +221,95 @@ def test_broken_scene_json(make_scene, content):
         meshes.read_meshes(scene)
 
 
+def _described(make_scene, **values):
+    scene = make_scene("cup_glass.ply")
+    content = {"parts": [{"mesh": "meshes/cup_glass.ply", **values}]}
+    (scene / "scene.json").write_text(json.dumps(content), encoding="utf-8")
+    return scene
+
+
+def test_scene_json_gives_colour_and_priority(make_scene):
+    colours = {"colour_per_interface": [0.5, 0, 1], "absorption": [0, 7, 0.1]}
+    [part] = meshes.read_meshes(_described(make_scene, **colours, priority=-3))
+    assert (part.tint, part.absorption, part.priority) == ((0.5, 0.0, 1.0), (0.0, 7.0, 0.1), -3)
+    assert (part.index, part.shading) == (1.5, "auto")
+
+
+def test_a_part_is_clear_unless_scene_json_says_otherwise(make_scene):
+    [part] = meshes.read_meshes(_described(make_scene))
+    assert (part.tint, part.absorption, part.priority) == ((1.0,) * 3, (0.0,) * 3, 0)
+
+
+def test_colour_can_be_left_to_the_field(make_scene):
+    scene = _described(make_scene, colour_per_interface=[0.5] * 3, absorption=[1] * 3, priority=2)
+    [coloured] = meshes.read_meshes(scene)
+    [clear] = meshes.without_colour([coloured])
+    assert (clear.tint, clear.absorption, clear.priority) == ((1.0,) * 3, (0.0,) * 3, 2)
+    np.testing.assert_array_equal(clear.vertices, coloured.vertices)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "index"), [({}, 1.44), ({"glass": 1.6}, 1.6), ({"cup_glass": 1.7}, 1.7)]
+)
+def test_the_index_of_scene_json_stands_between_the_table_and_the_user(
+    make_scene, overrides, index
+):
+    assert _index(_described(make_scene, ior_inside=1.44), overrides) == index
+
+
+def test_scene_json_makes_a_material_known(make_scene):
+    scene = make_scene("cup.ply")
+    content = {"parts": [{"mesh": "cup.ply", "ior_inside": 2}]}
+    (scene / "scene.json").write_text(json.dumps(content), encoding="utf-8")
+    assert _index(scene) == 2.0
+
+
+@pytest.mark.parametrize("key", ["colour_per_interface", "absorption"])
+@pytest.mark.parametrize(
+    "value",
+    [
+        [1, 1],
+        [1] * 4,
+        [1, 1, -0.1],
+        [1, 1, np.nan],
+        [1, 1, np.inf],
+        [1, 1, 10**400],
+        [1, 1, "1"],
+        [1, 1, True],
+        0.5,
+        "red",
+        None,
+        {"r": 1},
+    ],
+    ids=lambda value: str(value)[:20],
+)
+def test_a_colour_that_is_none(make_scene, key, value):
+    with scene_error("scene.json", "cup_glass.ply", key, "Give three numbers"):
+        meshes.read_meshes(_described(make_scene, **{key: value}))
+
+
+def test_a_surface_adds_no_light(make_scene):
+    with scene_error("colour_per_interface", "from 0 to 1", "adds light"):
+        meshes.read_meshes(_described(make_scene, colour_per_interface=[1.0, 1.01, 1.0]))
+
+
+@pytest.mark.parametrize("value", [0, -1.5, np.nan, np.inf, "1.5", None, True, [1.5]], ids=str)
+def test_an_index_of_scene_json_that_is_none(make_scene, value):
+    with scene_error("scene.json", "cup_glass.ply", "ior_inside", "Give a positive number"):
+        meshes.read_meshes(_described(make_scene, ior_inside=value))
+
+
+@pytest.mark.parametrize("value", [1.5, 2.0, "2", None, True, [1], np.nan], ids=str)
+def test_a_priority_that_is_none(make_scene, value):
+    with scene_error("scene.json", "cup_glass.ply", "priority", "Give a whole number"):
+        meshes.read_meshes(_described(make_scene, priority=value))
+
+
+def test_shading_is_true_or_false(make_scene):
+    with scene_error("smooth_normals", "'false'", "Give true or false"):
+        meshes.read_meshes(_described(make_scene, smooth_normals="false"))
+
+
 def test_bundled_ball(ball_scene):
     [part] = meshes.read_meshes(ball_scene)
     assert (part.name, part.index, part.shading) == ("ball_body_glass", 1.5, "smooth")

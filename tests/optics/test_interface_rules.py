@@ -5,7 +5,7 @@ import pytest
 
 from refref_jax.optics import interface_rules
 from refref_jax.optics.interface_rules import NO_PARENT
-from refref_jax.optics.media import AMBIENT, crossing
+from refref_jax.optics.media import AMBIENT, crossing, nowhere
 
 # Glass holds water, and the water holds a bubble of air.
 _INDICES = (1.5, 1.333, 1.0)
@@ -29,14 +29,53 @@ def test_facing_takes_air_everywhere_but_knows_the_media():
 @pytest.mark.parametrize("rule", interface_rules.RULES.values())
 def test_a_scene_without_parts_can_be_indexed(rule):
     interfaces = rule((), ())
-    assert all(len(field) == 1 for field in interfaces)
+    ranked = 1 if rule is interface_rules.priority else 0
+    assert [len(field) for field in interfaces] == [1, 1, 1, 1, 1, ranked]
+    np.testing.assert_array_equal(interfaces.tint, 1.0)
+    np.testing.assert_array_equal(interfaces.absorption, 0.0)
 
 
 @pytest.mark.parametrize("entering", [True, False])
 def test_a_crossing_exchanges_the_sides(entering):
     interfaces = interface_rules.nested(_INDICES, _PARENTS)
-    found = crossing(jax.tree.map(jnp.asarray, interfaces), jnp.int32(1), jnp.asarray(entering))
+    interfaces = jax.tree.map(jnp.asarray, interfaces)
+    found = crossing(interfaces, nowhere(interfaces), jnp.int32(1), jnp.asarray(entering))
     inside, outside = (1.333, 2), (1.5, 1)
     near, far = (outside, inside) if entering else (inside, outside)
     assert (float(found.index_near), int(found.medium_near)) == pytest.approx(near)
     assert (float(found.index_far), int(found.medium_far)) == pytest.approx(far)
+
+
+@pytest.mark.parametrize("rule", interface_rules.RULES.values())
+def test_colours_belong_to_their_parts(rule):
+    tints, absorptions = np.linspace(0.1, 0.9, 9).reshape(3, 3), np.arange(9.0).reshape(3, 3)
+    interfaces = rule(_INDICES, _PARENTS, tints=tints.tolist(), absorptions=absorptions.tolist())
+    np.testing.assert_allclose(interfaces.tint, tints, rtol=1e-6)
+    np.testing.assert_array_equal(interfaces.absorption, absorptions)
+    clear = rule(_INDICES, _PARENTS)
+    np.testing.assert_array_equal(clear.tint, np.ones((3, 3)))
+    np.testing.assert_array_equal(clear.absorption, np.zeros((3, 3)))
+
+
+@pytest.mark.parametrize(
+    ("priorities", "order"),
+    [
+        ([3, 1, 2], [2, 0, 1]),
+        # Of equal ones the first is the higher, so all places differ.
+        ([0, 0, 0], [2, 1, 0]),
+        ([1, 5, 1], [1, 2, 0]),
+        (None, [2, 1, 0]),
+        ([-(10**12), 10**12, 0], [0, 2, 1]),
+    ],
+)
+def test_priorities_are_ranked_the_highest_first(priorities, order):
+    interfaces = interface_rules.priority(_INDICES, _PARENTS, priorities=priorities)
+    np.testing.assert_array_equal(interfaces.priority, order)
+    assert interfaces.priority.dtype == np.int32
+
+
+@pytest.mark.parametrize("rule", ["nested", "facing"])
+def test_other_rules_take_no_notice_of_priorities(rule):
+    made = interface_rules.RULES[rule](_INDICES, _PARENTS, priorities=[3, 2, 1])
+    for field, other in zip(made, interface_rules.RULES[rule](_INDICES, _PARENTS), strict=True):
+        np.testing.assert_array_equal(field, other)
