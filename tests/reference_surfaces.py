@@ -11,6 +11,11 @@ import trimesh
 _EMBREE_OFFSET = 2e-6
 
 
+# How far beyond its edges a triangle is still met, as a barycentric coordinate: no ray slips
+# between two triangles.
+_EDGE = 1e-12
+
+
 class Surfaces(NamedTuple):
     """Triangles of all parts, and what each part is made of.
 
@@ -122,7 +127,8 @@ class BruteForce:
     def __call__(self, origins: np.ndarray, directions: np.ndarray, leaving: np.ndarray) -> Hits:
         """Returns the closest hits of rays, never on the triangle that they leave (-1: none)."""
         t, uv = in_plane(self._corners[None], origins[:, None], directions[:, None])
-        inside = (uv.min(-1) >= 0.0) & (uv.sum(-1) <= 1.0) & (t > 0.0)
+        within = (uv.min(-1) >= -_EDGE) & (uv.sum(-1) <= 1.0 + _EDGE)
+        inside = within & (t > 0.0)
         inside &= np.arange(len(self._corners)) != leaving[:, None]
         t = np.where(inside, t, np.inf)
         best = np.argmin(t, axis=1)
