@@ -146,19 +146,25 @@ class Embree:
 
         self._corners = surfaces.corners
         self._normals = face_normals(surfaces.corners)
-        self._scene = EmbreeScene(robust=True)
-        TriangleMesh(self._scene, surfaces.corners.astype(np.float32))
+        self.scene = EmbreeScene(robust=True)
+        TriangleMesh(self.scene, surfaces.corners.astype(np.float32))
+
+    def off_surface(
+        self, origins: np.ndarray, directions: np.ndarray, leaving: np.ndarray
+    ) -> np.ndarray:
+        """Returns origins just off the triangles that rays leave, on the rays' side."""
+        normals = self._normals[leaving]
+        side = np.sign(np.einsum("ij,ij->i", normals, directions)).astype(origins.dtype)
+        step = np.where(leaving < 0, 0.0, _EMBREE_OFFSET * np.abs(origins).max(-1) * side)
+        return origins + step.astype(origins.dtype)[:, None] * normals
 
     def __call__(self, origins: np.ndarray, directions: np.ndarray, leaving: np.ndarray) -> Hits:
         """Returns the closest hits of rays, never on the triangle that they leave (-1: none)."""
         count = len(origins)
         hits = Hits(np.full(count, np.inf), np.full(count, -1), np.zeros((count, 2)))
-        aside = np.sum(self._normals[leaving] * directions, -1, keepdims=True)
-        step = _EMBREE_OFFSET * np.abs(origins).max(-1, keepdims=True)
-        away = np.where(leaving[:, None] < 0, 0.0, step * np.sign(aside) * self._normals[leaving])
-        starts, waiting = origins + away, np.arange(count)
+        starts, waiting = self.off_surface(origins, directions, leaving), np.arange(count)
         while len(waiting):
-            found = self._scene.run(
+            found = self.scene.run(
                 starts[waiting].astype(np.float32), directions[waiting].astype(np.float32), output=1
             )
             met = found["primID"] >= 0
@@ -169,5 +175,6 @@ class Embree:
                 kept[waiting[real]] = value[real]
             # A hit that float64 does not confirm is passed, and the ray cast on from behind it.
             waiting, near = waiting[~real], near[~real]
-            starts[waiting] += (near + 2.0 * step[waiting, 0])[:, None] * directions[waiting]
+            past = near + 2.0 * _EMBREE_OFFSET * np.abs(starts[waiting]).max(-1)
+            starts[waiting] += past[:, None] * directions[waiting]
         return hits
