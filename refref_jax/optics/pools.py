@@ -5,13 +5,23 @@ writes one block, so a pool holds as many slots beyond its capacity as a block i
 appends then sheds what is too much: the least light.
 """
 
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 _Items = TypeVar("_Items")
+
+
+class Carrier(Protocol):
+    """Records of light."""
+
+    weights: Float[Array, "n 3"]
+    rays: Int[Array, " n"]
+
+
+_Carriers = TypeVar("_Carriers", bound=Carrier)
 
 
 class Pool(NamedTuple, Generic[_Items]):
@@ -24,18 +34,6 @@ class Pool(NamedTuple, Generic[_Items]):
 
     items: _Items
     count: Int[Array, ""]
-
-
-class Shedding(NamedTuple, Generic[_Items]):
-    """What shedding leaves.
-
-    Attributes:
-      pool: the records that stay, in their order.
-      dropped: which slots of the pool before held a record that has gone.
-    """
-
-    pool: Pool[_Items]
-    dropped: Bool[Array, " slots"]
 
 
 def append(pool: Pool[_Items], block: _Items, keep: Bool[Array, " block"]) -> Pool[_Items]:
@@ -55,26 +53,42 @@ def append(pool: Pool[_Items], block: _Items, keep: Bool[Array, " block"]) -> Po
     return Pool(items, pool.count + jnp.sum(keep, dtype=jnp.int32))
 
 
-def shed(pool: Pool[_Items], strength: Float[Array, " slots"], capacity: int) -> Shedding[_Items]:
+def shed(
+    pool: Pool[_Carriers], lost: Float[Array, "rays 3"], capacity: int
+) -> tuple[Pool[_Carriers], Float[Array, "rays 3"]]:
     """Drops the weakest records until a capacity is kept. Costs next to nothing if it is.
 
     Args:
-      pool: the records.
-      strength: of each slot.
+      pool: records with fields `weights` (linear RGB) and `rays` (index of the camera ray).
+      lost: light that each ray has lost so far.
       capacity: most records to keep.
+
+    Returns:
+      The pool, in its order, and what the rays have lost by now.
     """
 
-    def drop(pool: Pool[_Items]) -> Shedding[_Items]:
-        filled = jnp.arange(strength.shape[0]) < pool.count
-        kept = strongest(filled, strength, jnp.int32(capacity))
+    def drop(
+        pool: Pool[_Carriers], lost: Float[Array, "rays 3"]
+    ) -> tuple[Pool[_Carriers], Float[Array, "rays 3"]]:
+        weights, rays = pool.items.weights, pool.items.rays
+        filled = jnp.arange(rays.shape[0]) < pool.count
+        kept = strongest(filled, jnp.max(weights, axis=-1), jnp.int32(capacity))
         order = front_first(kept)
         items = jax.tree.map(lambda x: x[order], pool.items)
-        return Shedding(Pool(items, jnp.sum(kept, dtype=jnp.int32)), filled & ~kept)
+        lost = lose(lost, rays, weights, filled & ~kept)
+        return Pool(items, jnp.sum(kept, dtype=jnp.int32)), lost
 
-    def leave(pool: Pool[_Items]) -> Shedding[_Items]:
-        return Shedding(pool, jnp.zeros(strength.shape, bool))
+    return jax.lax.cond(pool.count > capacity, drop, lambda *same: same, pool, lost)
 
-    return jax.lax.cond(pool.count > capacity, drop, leave, pool)
+
+def lose(
+    lost: Float[Array, "rays 3"],
+    rays: Int[Array, " n"],
+    weights: Float[Array, "n 3"],
+    dropped: Bool[Array, " n"],
+) -> Float[Array, "rays 3"]:
+    """Adds the light of dropped records to their rays' losses."""
+    return lost.at[rays].add(jnp.where(dropped[:, None], weights, 0.0))
 
 
 def strongest(

@@ -88,6 +88,14 @@ class _Met(NamedTuple):
     kept: Float[Array, "block 3"]
 
 
+class _Room(NamedTuple):
+    """Most records that each list keeps."""
+
+    live: int
+    segments: int
+    paths: int
+
+
 class _Walk(NamedTuple):
     """State of the loop."""
 
@@ -137,12 +145,26 @@ def follow(
 def _follow(
     budget: Budget, block: int, geometry: Geometry, rays: Rays, inside: Int[Array, "rays slots"]
 ) -> PathTree:
-    block = max(1, min(block, rays.radii.shape[0]))
-    return jax.lax.while_loop(
-        lambda walk: walk.stack.count > 0,
-        lambda walk: _round(geometry, walk, budget, block),
-        _begin(rays, inside, budget, block),
-    ).tree
+    count = rays.radii.shape[0]
+    block = max(1, min(block, count))
+    room = _room(budget, count)
+
+    def fits(walk: _Walk) -> Bool[Array, ""]:
+        return (walk.stack.count <= room.live) & (walk.tree.ends.count <= room.paths)
+
+    def advance(walk: _Walk) -> _Walk:
+        """Goes on round by round until there is too much of something, or all is done."""
+        walk = jax.lax.while_loop(
+            lambda walk: (walk.stack.count > 0) & fits(walk),
+            lambda walk: _round(geometry, walk, budget, block, room),
+            walk,
+        )
+        stack, lost = pools.shed(walk.stack, walk.tree.lost, room.live)
+        ends, lost = pools.shed(walk.tree.ends, lost, room.paths)
+        return _Walk(stack, walk.tree._replace(ends=ends, lost=lost))
+
+    start = _begin(rays, inside, block, room)
+    return jax.lax.while_loop(lambda walk: walk.stack.count > 0, advance, start).tree
 
 
 @_follow.defjvp
@@ -155,7 +177,7 @@ def _refuse_gradients(budget: Budget, block: int, primals: object, tangents: obj
     )
 
 
-def _begin(rays: Rays, inside: Int[Array, "rays slots"], budget: Budget, block: int) -> _Walk:
+def _begin(rays: Rays, inside: Int[Array, "rays slots"], block: int, room: _Room) -> _Walk:
     """Puts the camera rays on the stack and their segments into the log."""
     count = rays.radii.shape[0]
     integers = jnp.arange(count, dtype=jnp.int32)
@@ -178,24 +200,20 @@ def _begin(rays: Rays, inside: Int[Array, "rays slots"], budget: Budget, block: 
     ends = Ends(integers, integers, live.weights, live.bends, integers)
     # Beyond its capacity each list has room for what one round may append.
     tree = PathTree(
-        segments=_pool(segments, count, _segment_room(budget, count) + 2 * block),
-        ends=_pool(ends, 0, _path_room(budget, count) + 3 * block),
+        segments=_pool(segments, count, room.segments + 2 * block),
+        ends=_pool(ends, 0, room.paths + 3 * block),
         lost=jnp.zeros_like(rays.origins),
         casts=jnp.zeros((), jnp.int32),
     )
-    return _Walk(_pool(live, count, _live_room(budget, count) + 2 * block), tree)
+    return _Walk(_pool(live, count, room.live + 2 * block), tree)
 
 
-def _live_room(budget: Budget, rays: int) -> int:
-    return math.ceil(rays * budget.live_per_ray)
-
-
-def _segment_room(budget: Budget, rays: int) -> int:
-    return math.ceil(rays * (1.0 + budget.segments_per_ray))
-
-
-def _path_room(budget: Budget, rays: int) -> int:
-    return math.ceil(rays * budget.paths_per_ray)
+def _room(budget: Budget, rays: int) -> _Room:
+    return _Room(
+        live=math.ceil(rays * budget.live_per_ray),
+        segments=math.ceil(rays * (1.0 + budget.segments_per_ray)),
+        paths=math.ceil(rays * budget.paths_per_ray),
+    )
 
 
 def _pool(items: NamedTuple, count: int, slots: int) -> Pool:
@@ -207,7 +225,7 @@ def _pool(items: NamedTuple, count: int, slots: int) -> Pool:
     return Pool(jax.tree.map(pad, items), jnp.int32(count))
 
 
-def _round(geometry: Geometry, walk: _Walk, budget: Budget, block: int) -> _Walk:
+def _round(geometry: Geometry, walk: _Walk, budget: Budget, block: int, room: _Room) -> _Walk:
     """Casts one block, ends paths, and puts the children on the stack."""
     start = jnp.maximum(walk.stack.count - block, 0)
     live = jax.tree.map(
@@ -227,7 +245,7 @@ def _round(geometry: Geometry, walk: _Walk, budget: Budget, block: int) -> _Walk
     tree = walk.tree._replace(casts=walk.tree.casts + jnp.sum(alive, dtype=jnp.int32))
     tree = _name_first_medium(tree, live, met, hit)
     tree = _end(tree, live, status, alive & ~bending)
-    tree, children = _log(tree, _branch(live, met, hits.slots, bending, budget), budget)
+    tree, children = _log(tree, _branch(live, met, hits.slots, bending, budget), room)
     return _push(tree, Pool(walk.stack.items, start), children, budget)
 
 
@@ -319,35 +337,27 @@ def _join(first: _Items, second: _Items) -> _Items:
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
 
 
-def _log(tree: PathTree, children: _Children, budget: Budget) -> tuple[PathTree, _Children]:
+def _log(tree: PathTree, children: _Children, room: _Room) -> tuple[PathTree, _Children]:
     """Logs the segments of children; drops the weakest of them if the log is full."""
     live = children.live
-    room = _segment_room(budget, tree.lost.shape[0]) - tree.segments.count
-    kept = pools.strongest(children.exists, jnp.max(live.weights, axis=-1), room)
+    left = room.segments - tree.segments.count
+    kept = pools.strongest(children.exists, jnp.max(live.weights, axis=-1), left)
     index = tree.segments.count + jnp.cumsum(kept, dtype=jnp.int32) - 1
     logged = Segments(live.segments, live.points, live.directions, live.tau, children.media)
     tree = tree._replace(
         segments=pools.append(tree.segments, logged, kept),
-        lost=_add(tree.lost, live, children.exists & ~kept),
+        lost=pools.lose(tree.lost, live.rays, live.weights, children.exists & ~kept),
     )
     return tree, children._replace(live=live._replace(segments=index), exists=kept)
 
 
 def _push(tree: PathTree, stack: Pool[_Live], children: _Children, budget: Budget) -> _Walk:
     """Puts children on the stack, and ends those that are not traced."""
-    live, rays = children.live, tree.lost.shape[0]
+    live = children.live
     if budget.reflections == "first":
         status = jnp.full_like(live.rays, PathStatus.NOT_TRACED)
         tree = _end(tree, live, status, children.exists & ~children.traced)
-    stack = pools.append(stack, live, children.exists & children.traced)
-    strength = jnp.max(stack.items.weights, axis=-1)
-    left = pools.shed(stack, strength, _live_room(budget, rays))
-    lost = _add(tree.lost, stack.items, left.dropped)
-    ends = pools.shed(
-        tree.ends, jnp.max(tree.ends.items.weights, axis=-1), _path_room(budget, rays)
-    )
-    lost = _add(lost, tree.ends.items, ends.dropped)
-    return _Walk(left.pool, tree._replace(ends=ends.pool, lost=lost))
+    return _Walk(pools.append(stack, live, children.exists & children.traced), tree)
 
 
 def _end(
@@ -356,10 +366,3 @@ def _end(
     """Ends some rays as paths."""
     block = Ends(live.segments, live.rays, live.weights, live.bends, status)
     return tree._replace(ends=pools.append(tree.ends, block, ending))
-
-
-def _add(
-    lost: Float[Array, "rays 3"], records: _Live | Ends, dropped: Bool[Array, " n"]
-) -> Float[Array, "rays 3"]:
-    """Adds the light of dropped records to their rays' losses."""
-    return lost.at[records.rays].add(jnp.where(dropped[:, None], records.weights, 0.0))
