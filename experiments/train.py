@@ -14,7 +14,7 @@ from absl import flags
 
 from experiments import commands
 from experiments.presets import PRESETS, bounds
-from refref_jax.data import background, containment, lint, local_layout, meshes
+from refref_jax.data import background, containment, lint, local_layout, meshes, rule_advice
 from refref_jax.data.batches import PixelSampler, check_batch
 from refref_jax.data.geometry import build_geometry
 from refref_jax.optics.budgets import BUDGETS
@@ -128,7 +128,7 @@ def plan_from_flags() -> Plan:
             "meshes of the objects, or use --paths=straight."
         )
     tree = containment.find_containment(parts)
-    _report_findings(lint.lint(parts, tree))
+    _report_meshes(parts, tree)
     space = background.space(scene) if _BACKGROUND.value == "auto" else _BACKGROUND.value
     preset = PRESETS[_PRESET.value]
     radius = _RADIUS.value or (background.half_extent(scene) if space == "bounded" else None)
@@ -214,7 +214,12 @@ def _log(run: Path, step: int, report: StepReport, rate: float, seconds: float) 
     run_folder.append_metrics(run, line)
 
 
-def _report_findings(findings: list[lint.Finding]) -> None:
+def _report_meshes(parts: list[meshes.MeshPart], tree: containment.Containment) -> None:
+    findings = lint.lint(parts, tree)
+    if _RULE.value == "priority":
+        findings += rule_advice.examine_priorities(parts, tree)
+    if parts:
+        print(rule_advice.advise(parts, tree))
     errors = [finding for finding in findings if finding.severity == "error"]
     for finding in findings:
         if finding not in errors:

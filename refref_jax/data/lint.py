@@ -1,7 +1,10 @@
-"""Examines the meshes of a scene before anything is traced (NumPy only)."""
+"""Examines the meshes of a scene before anything is traced (NumPy only).
+
+Each part by itself; `lint_pairs` looks at how parts lie to each other, and `rule_advice` says
+which interface rule that asks for.
+"""
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Int
@@ -9,52 +12,23 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from refref_jax.data.containment import Containment, beside_faces, winding_number
+from refref_jax.data.findings import Finding
+from refref_jax.data.lint_pairs import lint_pairs
 from refref_jax.data.meshes import MeshPart
 from refref_jax.geometry.corner_normals import is_degenerate
-from refref_jax.optics.interface_rules import NO_PARENT
 
 # -1 in front of an inverted closed piece; a lone open sheet gives -1/2.
 _WOUND_BACKWARDS = -0.75
 
 
-class Finding(NamedTuple):
-    """Something about a mesh that a user should know.
-
-    Attributes:
-      severity: an `error` makes light paths wrong; a `warning` may; a `note` does not.
-      part: name of the part.
-      message: what it is, and what to do.
-    """
-
-    severity: Literal["error", "warning", "note"]
-    part: str
-    message: str
-
-    def __str__(self) -> str:
-        return f"{self.severity}: {self.part}: {self.message}"
-
-
 def lint(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
-    """Reports on every part: closed, outward, without waste, and where it lies."""
+    """Reports on every part (closed, outward, without waste), and on how they lie to each other."""
     findings = []
-    for i, part in enumerate(parts):
+    for part in parts:
         findings += _edges(part)
         findings += _faces(part)
         findings += _bodies(part)
-        parent = containment.parents[i]
-        if parent != NO_PARENT:
-            findings.append(Finding("note", part.name, f"lies inside {parts[parent].name}."))
-    for inner, outer in containment.overlaps:
-        findings.append(
-            Finding(
-                "warning",
-                parts[inner].name,
-                f"cuts or touches {parts[outer].name}. The rules 'nested' and 'facing' ask for "
-                "bodies that are apart or strictly inside one another: leave a gap, or model "
-                "the surface between them as one interface.",
-            )
-        )
-    return findings
+    return findings + lint_pairs(parts, containment)
 
 
 def _bodies(part: MeshPart) -> list[Finding]:

@@ -65,7 +65,7 @@ def surface_point(
     geometric = triangles.geometric_normal(corners)
     blended = triangles.interpolate(surfaces.normals[slot], barycentric)
     shading = numerics.normalize(blended)
-    opposed = jnp.dot(shading, geometric) <= 0.0
+    opposed = numerics.dot(shading, geometric) <= 0.0
     return SurfacePoint(
         position=triangles.interpolate(corners, barycentric),
         geometric_normal=geometric,

@@ -14,7 +14,7 @@ Source: paper (arXiv 2505.05848), section 4, for the first two.
 
 import dataclasses
 import math
-from typing import Literal
+from typing import Literal, NamedTuple
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,6 +72,20 @@ class Budget:
                 )
 
 
+class Room(NamedTuple):
+    """Most records that the lists of a pool keep, by the capacity factors of its budget.
+
+    Attributes:
+      live: rays that are still to be cast.
+      segments: of paths, camera rays included.
+      paths: finished ones.
+    """
+
+    live: int
+    segments: int
+    paths: int
+
+
 STRAIGHT = Budget(bends=0, reflections="none", live_per_ray=1.0, paths_per_ray=1.0)
 PAPER = Budget(
     bends=10,
@@ -85,6 +99,15 @@ TREE = Budget(bends=24, reflections="all", cut=0.02)
 BUDGETS = {"straight": STRAIGHT, "paper": PAPER, "tree": TREE}
 
 
+def room(budget: Budget, rays: int) -> Room:
+    """Returns the room that a budget gives a pool of rays."""
+    return Room(
+        live=math.ceil(rays * budget.live_per_ray),
+        segments=math.ceil(rays * (1.0 + budget.segments_per_ray)),
+        paths=math.ceil(rays * budget.paths_per_ray),
+    )
+
+
 def capacity_for(budget: Budget, rays: int, *, mean: float, deviation: float) -> int:
     """Returns a room for the paths of a batch that batches of a scene practically never outgrow.
 
@@ -96,6 +119,6 @@ def capacity_for(budget: Budget, rays: int, *, mean: float, deviation: float) ->
       mean: mean number of paths of the scene's camera rays.
       deviation: its standard deviation over rays.
     """
-    most = math.ceil(rays * budget.paths_per_ray)
+    most = room(budget, rays).paths
     needed = rays * mean + 6.0 * math.sqrt(rays) * deviation
     return max(rays, min(most, 64 * math.ceil(needed / 64)))

@@ -29,7 +29,7 @@ def reflectance(
     parallel = _amplitude(index_far * beta, index_near * gamma)
     perpendicular = _amplitude(index_near * beta, index_far * gamma)
     partial = 0.5 * (jnp.square(parallel) + jnp.square(perpendicular))
-    return jnp.where(total, 1.0, partial)
+    return jnp.where(total, 1.0, jnp.where(index_near == index_far, 0.0, partial))
 
 
 def _amplitude(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:

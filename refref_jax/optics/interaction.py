@@ -6,7 +6,6 @@ starts again; the shading normal bends it.
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -39,15 +38,6 @@ class Interaction(NamedTuple):
     sides: media.Crossing
 
 
-class _Split(NamedTuple):
-    """The two rays that leave an interface under one choice of normal."""
-
-    reflected: Float[Array, "3"]
-    refracted: Float[Array, "3"]
-    reflectance: Float[Array, ""]
-    total: Bool[Array, ""]
-
-
 def meet(
     point: SurfacePoint,
     interfaces: media.Interfaces,
@@ -65,40 +55,41 @@ def meet(
       inside: the parts that the ray is in (see `media`).
       direction: unit direction of the incident ray.
     """
-    entering = jnp.dot(direction, point.geometric_normal) < 0.0
+    entering = numerics.dot(direction, point.geometric_normal) < 0.0
     sides = media.crossing(interfaces, inside, point.part, entering)
     outward = jnp.where(entering, 1.0, -1.0).astype(direction.dtype)
     geometric, shading = outward * point.geometric_normal, outward * point.shading_normal
 
-    smooth = _split(direction, shading, sides)
-    flat = _split(direction, geometric, sides)
-    valid = (
-        (jnp.dot(direction, shading) < 0.0)
-        & (jnp.dot(smooth.reflected, geometric) > 0.0)
-        & (smooth.total | (jnp.dot(smooth.refracted, geometric) < 0.0))
-    )
-    split = jax.tree.map(lambda a, b: jnp.where(valid, a, b), smooth, flat)
+    normal = jnp.where(_keeps_sides(direction, shading, geometric, sides), shading, geometric)
+    near, far = sides.index_near, sides.index_far
+    beta = -numerics.dot(direction, normal)
+    # Lengths are renormalised, or rounding would add up over bends.
     return Interaction(
         position=point.position,
-        reflectance=split.reflectance,
-        total=split.total,
-        reflected=split.reflected,
-        transmitted=split.refracted,
+        reflectance=fresnel.reflectance(beta, near, far),
+        total=snell.transmission(beta, near, far).total,
+        reflected=numerics.renormalize(snell.reflect(direction, normal)),
+        transmitted=numerics.renormalize(snell.refract(direction, normal, near, far)),
         restart_reflected=numerics.offset_origin(point.position, geometric, point.scale),
         restart_transmitted=numerics.offset_origin(point.position, -geometric, point.scale),
         sides=sides,
     )
 
 
-def _split(
-    direction: Float[Array, "3"], normal: Float[Array, "3"], sides: media.Crossing
-) -> _Split:
-    """Reflects and refracts; lengths are renormalised, or rounding would add up over bends."""
-    beta = -jnp.dot(direction, normal)
+def _keeps_sides(
+    direction: Float[Array, "3"],
+    shading: Float[Array, "3"],
+    geometric: Float[Array, "3"],
+    sides: media.Crossing,
+) -> Bool[Array, ""]:
+    """Returns whether the shading normal sends both rays to their own side of the triangle."""
     near, far = sides.index_near, sides.index_far
-    return _Split(
-        reflected=numerics.normalize(snell.reflect(direction, normal)),
-        refracted=numerics.normalize(snell.refract(direction, normal, near, far)),
-        reflectance=fresnel.reflectance(beta, near, far),
-        total=snell.transmission(beta, near, far).total,
+    beta = -numerics.dot(direction, shading)
+    total = snell.transmission(beta, near, far).total
+    reflected = snell.reflect(direction, shading)
+    refracted = snell.refract(direction, shading, near, far)
+    return (
+        (beta > 0.0)
+        & (numerics.dot(reflected, geometric) > 0.0)
+        & (total | (numerics.dot(refracted, geometric) < 0.0))
     )

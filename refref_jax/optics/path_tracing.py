@@ -9,7 +9,6 @@ rays and geometry have none, and asking for one is an error (see `single_path` f
 Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
 """
 
-import math
 from typing import NamedTuple
 
 import jax
@@ -18,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import media, path_tree
-from refref_jax.optics.budgets import Budget
+from refref_jax.optics.budgets import Budget, room
 from refref_jax.optics.light_paths import (
     LightPaths,
     PathEnds,
@@ -94,7 +93,7 @@ def trace_ends(
         ends = straight_ends(rays)
         return TracedEnds(ends, jnp.zeros_like(rays.origins), jnp.zeros((), jnp.int32))
     tree = follow(geometry, rays, _inside(geometry, rays, inside), budget=budget, block=block)
-    ends = path_tree.listed(tree, math.ceil(rays.radii.shape[0] * budget.paths_per_ray))
+    ends = path_tree.listed(tree, room(budget, rays.radii.shape[0]).paths)
     last = path_tree.last_segments(tree.segments.items, ends)
     return TracedEnds(last, tree.lost, tree.casts)
 
@@ -148,7 +147,7 @@ def trace_batches(
     batches, count = rays.radii.shape
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
     if inside is not None:
-        inside = inside.reshape(-1, inside.shape[-1])
+        inside = inside.reshape(batches * count, inside.shape[-1])
     tree = follow(geometry, flat, _inside(geometry, flat, inside), budget=budget)
     ends, lost = _pack(tree, batches, count, capacity)
     paths = path_tree.polylines(

@@ -63,8 +63,8 @@ class PathTree(NamedTuple):
       casts: number of rays that were cast.
     """
 
-    segments: Pool[Segments]
-    ends: Pool[Ends]
+    segments: Pool
+    ends: Pool
     lost: Float[Array, "rays 3"]
     casts: Int[Array, ""]
 

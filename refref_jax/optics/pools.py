@@ -5,26 +5,17 @@ writes one block, so a pool holds as many slots beyond its capacity as a block i
 appends then sheds what is too much: the least light.
 """
 
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-_Items = TypeVar("_Items")
+Records = Any
+"""A NamedTuple of arrays with one leading axis; of light, with `weights` and `rays`."""
 
 
-class Carrier(Protocol):
-    """Records of light."""
-
-    weights: Float[Array, "n 3"]
-    rays: Int[Array, " n"]
-
-
-_Carriers = TypeVar("_Carriers", bound=Carrier)
-
-
-class Pool(NamedTuple, Generic[_Items]):
+class Pool(NamedTuple):
     """Records in a row.
 
     Attributes:
@@ -32,11 +23,25 @@ class Pool(NamedTuple, Generic[_Items]):
       count: how many of them are there.
     """
 
-    items: _Items
+    items: Records
     count: Int[Array, ""]
 
 
-def append(pool: Pool[_Items], block: _Items, keep: Bool[Array, " block"]) -> Pool[_Items]:
+def fill(items: Records, count: int, slots: int) -> Pool:
+    """Returns a pool with some slots, whose first `count` hold the records given."""
+
+    def pad(x: Array) -> Array:
+        return jnp.concatenate([x, jnp.zeros((slots - x.shape[0], *x.shape[1:]), x.dtype)])
+
+    return Pool(jax.tree.map(pad, items), jnp.int32(count))
+
+
+def join(first: Records, second: Records) -> Records:
+    """Returns two blocks of records as one."""
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
+
+
+def append(pool: Pool, block: Records, keep: Bool[Array, " block"]) -> Pool:
     """Appends those records of a block that are to be kept, in their order.
 
     Args:
@@ -54,8 +59,8 @@ def append(pool: Pool[_Items], block: _Items, keep: Bool[Array, " block"]) -> Po
 
 
 def shed(
-    pool: Pool[_Carriers], lost: Float[Array, "rays 3"], capacity: int
-) -> tuple[Pool[_Carriers], Float[Array, "rays 3"]]:
+    pool: Pool, lost: Float[Array, "rays 3"], capacity: int
+) -> tuple[Pool, Float[Array, "rays 3"]]:
     """Drops the weakest records until a capacity is kept. Costs next to nothing if it is.
 
     Args:
@@ -67,9 +72,7 @@ def shed(
       The pool, in its order, and what the rays have lost by now.
     """
 
-    def drop(
-        pool: Pool[_Carriers], lost: Float[Array, "rays 3"]
-    ) -> tuple[Pool[_Carriers], Float[Array, "rays 3"]]:
+    def drop(pool: Pool, lost: Float[Array, "rays 3"]) -> tuple[Pool, Float[Array, "rays 3"]]:
         weights, rays = pool.items.weights, pool.items.rays
         filled = jnp.arange(rays.shape[0]) < pool.count
         kept = strongest(filled, jnp.max(weights, axis=-1), jnp.int32(capacity))

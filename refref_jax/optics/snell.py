@@ -49,7 +49,7 @@ def reflect(direction: Float[Array, "3"], normal: Float[Array, "3"]) -> Float[Ar
 
     Source: paper, law of reflection; also its total internal reflection.
     """
-    return direction - 2.0 * jnp.dot(direction, normal) * normal
+    return direction - 2.0 * numerics.dot(direction, normal) * normal
 
 
 def refract(
@@ -72,6 +72,6 @@ def refract(
     Source: paper, Snell's law in vector form (Born and Wolf).
     """
     alpha = index_near / index_far
-    beta = -jnp.dot(direction, normal)
+    beta = -numerics.dot(direction, normal)
     gamma = transmission(beta, index_near, index_far).cosine
     return alpha * direction + (alpha * beta - gamma) * normal

@@ -20,6 +20,7 @@ class Shares(NamedTuple):
 
 def shares(
     budget: Budget,
+    *,
     reflectance: Float[Array, ""],
     total: Bool[Array, ""],
     first: Bool[Array, ""],

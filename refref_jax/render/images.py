@@ -6,7 +6,6 @@ two. This is one of the two modules that call `jax.jit`.
 """
 
 import functools
-import math
 from typing import NamedTuple
 
 import jax
@@ -16,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.budgets import Budget
+from refref_jax.optics.budgets import Budget, room
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.optics.wavefront import Geometry
 from refref_jax.render import colour, pixels
@@ -69,7 +68,7 @@ def render_rays(model: Model, rays: Rays) -> Rendering:
       rays: `[n]` camera rays.
     """
     count = rays.radii.shape[0]
-    capacity = math.ceil(count * model.budget.paths_per_ray)
+    capacity = room(model.budget, count).paths
     traced = path_tracing.trace(model.geometry, rays, budget=model.budget, capacity=capacity)
     tile = _sort(traced.paths, count, count)
     empty = jax.tree.map(jnp.zeros_like, _blank(count))
@@ -125,7 +124,7 @@ def _blank(count: int) -> Rendering:
 
 @functools.partial(jax.jit, static_argnames="budget")
 def _trace_tile(geometry: Geometry, rays: Rays, real: Int[Array, ""], *, budget: Budget) -> _Tile:
-    capacity = math.ceil(TILE * budget.paths_per_ray)
+    capacity = room(budget, TILE).paths
     traced = path_tracing.trace(geometry, rays, budget=budget, capacity=capacity)
     return _sort(traced.paths, TILE, real)
 

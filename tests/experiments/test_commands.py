@@ -63,6 +63,7 @@ def test_a_mesh_that_no_camera_sees_is_warned_about(tmp_path):
     trimesh.load(path).apply_translation([500.0, 0.0, 0.0]).export(path)
     result = run_command("train", f"--scene={scene}", f"--out={tmp_path / 'run'}", *TINY)
     assert "no pixel sees the meshes" in result.stdout
+    assert "advice: rule nested: there is one part" in result.stdout
 
 
 def test_an_interrupted_run_is_saved_and_goes_on(tmp_path):

@@ -1,0 +1,147 @@
+"""One ray arrives at a surface and leaves it as two. Both tracers are made of these steps.
+
+Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from refref_jax import numerics
+from refref_jax.geometry import surfaces
+from refref_jax.geometry.bvh import NO_SLOT
+from refref_jax.optics import interaction, media, splitting
+from refref_jax.optics.budgets import Budget
+from refref_jax.optics.light_paths import PathStatus
+
+
+class Geometry(NamedTuple):
+    """All that light meets: surfaces, and the interfaces that they stand for."""
+
+    surfaces: surfaces.Surfaces
+    interfaces: media.Interfaces
+
+
+class RayState(NamedTuple):
+    """A ray on its way.
+
+    Attributes:
+      origin: where to cast from, just off the surface, world units.
+      point: start of the current segment, on the surface.
+      direction: unit.
+      tau: arc length from the camera to `point`.
+      weight: share of the camera ray's linear RGB.
+      bends: number of bends so far.
+      leaving: triangle slot that the segment starts on.
+      inside: the parts that the ray is in (see `media`).
+    """
+
+    origin: Float[Array, "*rays 3"]
+    point: Float[Array, "*rays 3"]
+    direction: Float[Array, "*rays 3"]
+    tau: Float[Array, "*rays"]
+    weight: Float[Array, "*rays 3"]
+    bends: Int[Array, "*rays"]
+    leaving: Int[Array, "*rays"]
+    inside: Int[Array, "*rays slots"]
+
+
+class Arrival(NamedTuple):
+    """What a ray meets.
+
+    Attributes:
+      interaction: what the surface does to it.
+      length: of the segment that ends there.
+      weight: the ray's light after the medium on the way, and the surface's tint.
+    """
+
+    interaction: interaction.Interaction
+    length: Float[Array, "*rays"]
+    weight: Float[Array, "*rays 3"]
+
+
+class Branches(NamedTuple):
+    """The two rays that leave a surface; a branch of no weight is not followed."""
+
+    reflected: RayState
+    transmitted: RayState
+
+
+def begin(
+    origin: Float[Array, "3"], direction: Float[Array, "3"], inside: Int[Array, " slots"]
+) -> RayState:
+    """Returns a camera ray before its first surface."""
+    return RayState(
+        origin=origin,
+        point=origin,
+        direction=direction,
+        tau=jnp.zeros_like(origin[0]),
+        weight=jnp.ones_like(origin),
+        bends=jnp.zeros((), jnp.int32),
+        leaving=jnp.full((), NO_SLOT, jnp.int32),
+        inside=inside,
+    )
+
+
+def arrive(
+    geometry: Geometry, state: RayState, slot: Int[Array, ""], barycentric: Float[Array, "2"]
+) -> Arrival:
+    """Follows a ray to a point of a triangle; without meaning for `NO_SLOT`, but finite."""
+    point = surfaces.surface_point(geometry.surfaces, slot, barycentric)
+    # Or XLA would gather the triangle anew for every result that depends on it.
+    point = jax.lax.optimization_barrier(point)
+    met = interaction.meet(point, geometry.interfaces, state.inside, state.direction)
+    length = numerics.length(met.position - state.point)
+    passed = media.transmittance(geometry.interfaces, met.sides.medium_near, length)
+    return Arrival(met, length, state.weight * passed * met.sides.tint)
+
+
+def ending(
+    budget: Budget, state: RayState, arrival: Arrival, hit: Bool[Array, ""]
+) -> Int[Array, ""]:
+    """Returns the status of a path that ends here; `EMPTY` if it bends and goes on.
+
+    Args:
+      budget: which light to follow.
+      state: the ray.
+      arrival: what it meets.
+      hit: whether it meets anything.
+    """
+    missed = jnp.where(state.bends > 0, PathStatus.ESCAPED, PathStatus.MISSED)
+    met = jnp.where(state.bends < budget.bends, PathStatus.EMPTY, PathStatus.OUT_OF_BENDS)
+    if budget.total_reflection == "ended":
+        met = jnp.where(arrival.interaction.total, PathStatus.TOTALLY_REFLECTED, met)
+    return jnp.where(hit, met, missed).astype(jnp.int32)
+
+
+def branch(budget: Budget, state: RayState, arrival: Arrival, slot: Int[Array, ""]) -> Branches:
+    """Returns both rays that leave the surface, with their shares of the light."""
+    met = arrival.interaction
+    share = splitting.shares(
+        budget,
+        reflectance=met.reflectance,
+        total=met.total,
+        first=state.bends == 0,
+        strength=jnp.max(arrival.weight),
+    )
+    after = state._replace(
+        point=met.position,
+        tau=state.tau + arrival.length,
+        bends=state.bends + 1,
+        leaving=slot,
+    )
+    return Branches(
+        reflected=after._replace(
+            origin=met.restart_reflected,
+            direction=met.reflected,
+            weight=arrival.weight * share.reflected,
+        ),
+        transmitted=after._replace(
+            origin=met.restart_transmitted,
+            direction=met.transmitted,
+            weight=arrival.weight * share.transmitted,
+            inside=met.sides.inside_after,
+        ),
+    )

@@ -1,0 +1,165 @@
+"""One light path, differentiable: the scan.
+
+The same steps as the wavefront's, for one ray along one branch of its tree. Which triangles are met
+is found without gradients; where each is met is computed anew from its corners. So positions,
+directions, arc lengths and weights of a path have gradients with respect to indices of refraction,
+tints, absorption, corners, normals and the ray.
+
+The gradient is that of this path as it is: the same triangles in the same order, and the same
+branches. It does not see that light moves to another triangle or falls below the cut. At the
+critical angle refraction and reflectance have a gradient that grows without bound; at it and
+beyond it the derivatives of the refracted ray are 0 (see `snell.transmission`), and those of the
+totally reflected ray are its own.
+
+Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
+"""
+
+import functools
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from refref_jax.geometry import triangles
+from refref_jax.geometry.bvh import NO_SLOT
+from refref_jax.geometry.closest_hit import closest_slot
+from refref_jax.geometry.rays import Rays
+from refref_jax.optics import branching, media
+from refref_jax.optics.branching import Arrival, Geometry, RayState
+from refref_jax.optics.budgets import Budget
+from refref_jax.optics.light_paths import LightPaths, PathStatus
+
+_Record = TypeVar("_Record")
+
+
+class _Segment(NamedTuple):
+    """One segment of the path.
+
+    Attributes:
+      state: the ray on it.
+      medium: it runs through; known from the surface at its end, or else from the one before.
+      used: whether the path comes so far.
+    """
+
+    state: RayState
+    medium: Int[Array, ""]
+    used: Bool[Array, ""]
+
+
+class _Walk(NamedTuple):
+    """State of the scan.
+
+    Attributes:
+      state: the ray.
+      medium: that it is in, as far as its last surface tells.
+      traced: whether it is to be cast; not the paper's first reflection.
+      status: `EMPTY` as long as the path goes on.
+    """
+
+    state: RayState
+    medium: Int[Array, ""]
+    traced: Bool[Array, ""]
+    status: Int[Array, ""]
+
+
+def follow_branch(
+    geometry: Geometry,
+    ray: Rays,
+    reflects: Bool[Array, " bends"],
+    inside: Int[Array, " slots"] | None = None,
+    *,
+    budget: Budget,
+) -> LightPaths:
+    """Follows one ray along one branch.
+
+    Args:
+      geometry: the scene.
+      ray: one camera ray.
+      reflects: for each bend whether to take the reflected branch; where reflection is total it is
+        taken in any case. All false is the main path.
+      inside: the parts that the camera is in, for the rule `priority` (see `media`).
+      budget: which light to follow; its `bends` must be the number of `reflects`.
+
+    Returns:
+      One path. Its weight is 0 where the budget does not follow the branch: where its light went
+      to the sibling.
+
+    Raises:
+      ValueError: if `reflects` has not one entry a bend.
+    """
+    if reflects.shape[0] != budget.bends:
+        raise ValueError(
+            f"There are {reflects.shape[0]} choices for {budget.bends} bends. Give one choice for "
+            "each bend of the budget."
+        )
+    if inside is None:
+        inside = media.nowhere(geometry.interfaces)
+    start = _Walk(
+        branching.begin(ray.origins, ray.directions, inside),
+        jnp.int32(media.AMBIENT),
+        jnp.asarray(True),
+        jnp.int32(PathStatus.EMPTY),
+    )
+    # One step more than bends: the last one only sees whether the path escapes.
+    choices = jnp.append(reflects, False)
+    advance = functools.partial(_advance, geometry, budget)
+    end, segments = jax.lax.scan(advance, start, choices)
+    return _record(ray, end, segments)
+
+
+def _advance(
+    geometry: Geometry, budget: Budget, walk: _Walk, reflect: Bool[Array, ""]
+) -> tuple[_Walk, _Segment]:
+    """Casts the ray; ends the path, or takes one of the two branches."""
+    state, alive = walk.state, walk.status == PathStatus.EMPTY
+    limit = jnp.where(alive & walk.traced, jnp.inf, -1.0).astype(state.tau.dtype)
+    slot = closest_slot(geometry.surfaces.bvh, state.origin, state.direction, limit, state.leaving)
+    hit = slot != NO_SLOT
+    arrival = _arrive(geometry, state, slot, hit)
+    ended = jnp.where(
+        walk.traced, branching.ending(budget, state, arrival, hit), PathStatus.NOT_TRACED
+    )
+    status = jnp.where(alive, ended, walk.status).astype(jnp.int32)
+    met, sides = arrival.interaction, arrival.interaction.sides
+    mirrored = reflect | met.total
+    branches = branching.branch(budget, state, arrival, slot)
+    bent = _Walk(
+        state=_either(mirrored, branches.reflected, branches.transmitted),
+        medium=jnp.where(mirrored, sides.medium_near, sides.medium_far),
+        traced=~(reflect & ~met.total & (budget.reflections == "first")),
+        status=status,
+    )
+    segment = _Segment(state, jnp.where(hit, sides.medium_near, walk.medium), alive)
+    going_on = status == PathStatus.EMPTY
+    return _either(going_on, bent, walk._replace(status=status)), segment
+
+
+def _either(which: Bool[Array, ""], first: _Record, second: _Record) -> _Record:
+    return jax.tree.map(lambda a, b: jnp.where(which, a, b), first, second)
+
+
+def _arrive(
+    geometry: Geometry, state: RayState, slot: Int[Array, ""], hit: Bool[Array, ""]
+) -> Arrival:
+    """Recomputes where the ray meets the triangle that was found, with gradients."""
+    corners = geometry.surfaces.bvh.triangles[slot]
+    found = triangles.intersect(state.origin, state.direction, corners).barycentric
+    # A ray that meets nothing looks at some triangle: no gradient may come of it.
+    barycentric = jnp.where(hit, found, 1.0 / 3.0)
+    return branching.arrive(geometry, state, slot, barycentric)
+
+
+def _record(ray: Rays, end: _Walk, segments: _Segment) -> LightPaths:
+    used = segments.used
+    return LightPaths(
+        points=segments.state.point,
+        directions=segments.state.direction,
+        tau=jnp.where(used, segments.state.tau, jnp.inf),
+        media=jnp.where(used, segments.medium, media.AMBIENT),
+        rays=jnp.zeros_like(end.status),
+        weights=end.state.weight,
+        radii=ray.radii,
+        bends=end.state.bends,
+        statuses=end.status,
+    )
