@@ -100,7 +100,8 @@ def trace_in_double(geometry, rays, *, budget):
     geometry, rays = (jax.tree.map(np.asarray, x) for x in (geometry, rays))
     # What was of length 1 in single precision is not in double, and no index would matter more.
     rays = rays._replace(directions=reference_surfaces.unit(rays.directions.astype(float)))
-    with jax.enable_x64(True):
+    # Integers are 64 bits wide then, and meet those of the scene.
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
         return trace(*(jax.tree.map(widen, x) for x in (geometry, rays)), budget=budget)
 
 
