@@ -1,8 +1,10 @@
 """What all commands share: how they start, stop, and report errors and progress."""
 
+import math
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from absl import app, logging
 from rich.progress import (
@@ -38,6 +40,17 @@ def run(main: Callable[[], None]) -> None:
             sys.exit(INTERRUPTED)
 
     app.run(guarded)
+
+
+def string_safe(value: Any) -> Any:
+    """Replaces numbers that JSON does not know by their names."""
+    if isinstance(value, dict):
+        return {key: string_safe(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [string_safe(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value
 
 
 class Interrupt:

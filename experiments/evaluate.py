@@ -4,7 +4,6 @@ python -m experiments.evaluate --run=runs/ball --split=test
 """
 
 import json
-import math
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -61,7 +60,7 @@ def main() -> None:
         "per_image": per_image,
     }
     summary["results"]["seconds_per_image"] = summary["results"].pop("seconds")
-    text = json.dumps(_string_safe(summary), indent=2, allow_nan=False)
+    text = json.dumps(commands.string_safe(summary), indent=2, allow_nan=False)
     (out / "metrics.json").write_text(text + "\n", encoding="utf-8")
     figures.write_comparison(out / "comparison.png", views)
     for key, value in summary["results"].items():
@@ -142,17 +141,6 @@ def measure(seen: Rendering, truth: Truth, i: int) -> dict[str, float | None]:
 def _mean(per_image: list[dict[str, Any]], key: str) -> float | None:
     values = [image[key] for image in per_image if image[key] is not None]
     return float(np.mean(values)) if values else None
-
-
-def _string_safe(value: Any) -> Any:
-    """Replaces numbers that JSON does not know by their names."""
-    if isinstance(value, dict):
-        return {key: _string_safe(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_string_safe(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    return value
 
 
 if __name__ == "__main__":

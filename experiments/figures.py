@@ -24,41 +24,48 @@ class Comparison(NamedTuple):
       name: of the view.
       target: true sRGB in `[0, 1]`.
       rgb: rendered sRGB in `[0, 1]`.
-      distance: rendered distance, world units.
+      distance: rendered distance, world units; `None` for all views, or for none.
     """
 
     name: str
     target: Float[np.ndarray, "h w 3"]
     rgb: Float[np.ndarray, "h w 3"]
-    distance: Float[np.ndarray, "h w"]
+    distance: Float[np.ndarray, "h w"] | None = None
 
 
 def write_comparison(path: Path, views: Sequence[Comparison]) -> None:
-    """Draws views as rows: ground truth, render, error, distance.
+    """Draws views as rows: ground truth, render, error, and distance if there is one.
 
     Distances share one scale, from 0 to the largest finite one.
     """
-    titles = ("ground truth", "render", f"error x {_ERROR_GAIN:g}", "distance")
+    titles = ["ground truth", "render", f"error x {_ERROR_GAIN:g}"]
+    distances = [view.distance for view in views if view.distance is not None]
+    titles += ["distance"] * bool(distances)
     figure, axes = pyplot.subplots(
         len(views),
         len(titles),
-        figsize=(_INCHES * len(titles) + _INCHES_OF_THE_SCALE, _INCHES * len(views) + 0.4),
+        figsize=(
+            _INCHES * len(titles) + _INCHES_OF_THE_SCALE * bool(distances),
+            _INCHES * len(views) + 0.4,
+        ),
         squeeze=False,
         layout="constrained",
     )
-    farthest = max(_largest_finite(view.distance) for view in views)
     for row, view in zip(axes, views, strict=True):
         row[0].imshow(view.target)
         row[1].imshow(view.rgb)
         row[2].imshow(np.clip(np.abs(view.rgb - view.target) * _ERROR_GAIN, 0.0, 1.0))
-        shown = row[3].imshow(view.distance, cmap=_COLOUR_MAP, vmin=0.0, vmax=farthest)
         row[0].set_ylabel(view.name)
         for axis in row:
             axis.set_xticks([])
             axis.set_yticks([])
     for axis, title in zip(axes[0], titles, strict=True):
         axis.set_title(title)
-    figure.colorbar(shown, ax=axes[:, 3], shrink=0.6, label="world units")
+    if distances:
+        farthest = max(map(_largest_finite, distances))
+        for axis, distance in zip(axes[:, 3], distances, strict=True):
+            shown = axis.imshow(distance, cmap=_COLOUR_MAP, vmin=0.0, vmax=farthest)
+        figure.colorbar(shown, ax=axes[:, 3], shrink=0.6, label="world units")
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
 

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import jax
 from absl import flags
 
-from experiments import commands
+from experiments import commands, scenes
 from experiments.presets import PRESETS, bounds
-from refref_jax.data import background, containment, lint, local_layout, meshes, rule_advice
+from refref_jax.data import background, containment, local_layout, meshes
 from refref_jax.data.batches import PixelSampler, check_batch
 from refref_jax.data.geometry import build_geometry
 from refref_jax.optics.budgets import BUDGETS
@@ -120,7 +120,7 @@ def plan_from_flags() -> Plan:
     scene = Path(_SCENE.value).resolve()
     local_layout.check_scene(scene)
     frames = local_layout.read_frames(scene, "train")
-    indices = _parse_indices(_IOR.value)
+    indices = scenes.parse_indices(_IOR.value)
     parts = meshes.read_meshes(scene, indices=indices)
     if not parts and _PATHS.value != "straight":
         raise ValueError(
@@ -128,7 +128,7 @@ def plan_from_flags() -> Plan:
             "meshes of the objects, or use --paths=straight."
         )
     tree = containment.find_containment(parts)
-    _report_meshes(parts, tree)
+    scenes.report_meshes(parts, tree, rule=_RULE.value)
     space = background.space(scene) if _BACKGROUND.value == "auto" else _BACKGROUND.value
     preset = PRESETS[_PRESET.value]
     radius = _RADIUS.value or (background.half_extent(scene) if space == "bounded" else None)
@@ -212,34 +212,6 @@ def _log(run: Path, step: int, report: StepReport, rate: float, seconds: float) 
     values = {name: float(value) for name, value in report._asdict().items()}
     line = {"step": step, **values, "rays_per_second": rate, "seconds": seconds}
     run_folder.append_metrics(run, line)
-
-
-def _report_meshes(parts: list[meshes.MeshPart], tree: containment.Containment) -> None:
-    findings = lint.lint(parts, tree)
-    if _RULE.value == "priority":
-        findings += rule_advice.examine_priorities(parts, tree)
-    if parts:
-        print(rule_advice.advise(parts, tree))
-    errors = [finding for finding in findings if finding.severity == "error"]
-    for finding in findings:
-        if finding not in errors:
-            print(finding)
-    if errors:
-        told = "\n".join(f"  {finding.part}: {finding.message}" for finding in errors)
-        raise ValueError(f"the meshes must be mended first.\n{told}")
-
-
-def _parse_indices(words: list[str]) -> dict[str, float]:
-    indices = {}
-    for word in words:
-        name, separator, number = word.partition("=")
-        try:
-            indices[name] = float(number)
-        except ValueError:
-            separator = ""
-        if not separator or not name:
-            raise ValueError(f"--ior={word} is not NAME=NUMBER. Write as in --ior=glass=1.52.")
-    return indices
 
 
 if __name__ == "__main__":

@@ -67,6 +67,42 @@ def safe_reciprocal(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return 1.0 / held
 
 
+def time_to_close(
+    gap: Float[Array, "*shape"], speed: Float[Array, "*shape"]
+) -> Float[Array, "*shape"]:
+    """Returns `gap / speed`: when a gap closes that shrinks at a speed.
+
+    `inf` with gradient 0 where the speed is not above 1e-12, and 0 with gradient 0 where the gap
+    is closed already. Elsewhere the gradient is at most 1e12 times the quotient's own size.
+    """
+    closing = speed > _SMALLEST_COMPONENT
+    left = jnp.where(gap > 0, gap, 0.0)
+    return jnp.where(closing, left / jnp.where(closing, speed, 1.0), jnp.inf)
+
+
+@jax.custom_jvp
+def safe_atan2(y: Float[Array, "*shape"], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Returns `atan2(y, x)`, and 0 with gradient 0 where the point is within 1e-12 of the origin.
+
+    The gradient is formed from the unit vector, never from squares that vanish, and is at most
+    1e12: it is unbounded, like `1 / sqrt(x^2 + y^2)`, as the origin is approached.
+    """
+    near = length(jnp.stack([x, y], axis=-1)) < _SMALLEST_COMPONENT
+    return jnp.where(near, 0.0, jnp.arctan2(y, jnp.where(near, 1.0, x)))
+
+
+@safe_atan2.defjvp
+def _safe_atan2_jvp(
+    primals: tuple[Array, Array], tangents: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    y, x = primals
+    radius = length(jnp.stack([x, y], axis=-1))
+    near = radius < _SMALLEST_COMPONENT
+    held = jnp.where(near, 1.0, radius)
+    turn = ((x / held) * tangents[0] - (y / held) * tangents[1]) / held
+    return safe_atan2(y, x), jnp.where(near, 0.0, turn)
+
+
 def dot(a: Float[Array, "*shape n"], b: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
     """Returns the scalar product over the last axis, for vectors of few components.
 

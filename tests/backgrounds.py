@@ -1,22 +1,29 @@
-"""The exact background of a bundled scene, for tests that need no learning."""
+"""Known backgrounds in NumPy and float64, written from the text of `scene.json`.
+
+Independent of `refref_jax.render.backgrounds`, which is tested against this.
+"""
 
 import json
 
 import imageio.v3 as iio
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from tests import reference
 
 
 class CubeBackground:
-    """Six textured walls, as `scene.json` describes them; linear RGB."""
+    """Six textured walls, as `scene.json` describes them; linear RGB.
+
+    Cycles interpolates 8-bit images before it decodes them, and repeats them.
+    """
 
     def __init__(self, scene):
         background = json.loads((scene / "scene.json").read_text())["background"]
         self.half_extent = background["half_extent"]
         self.faces = [
             (
-                reference.srgb_to_linear(iio.imread(scene / face["image"])[..., :3] / 255.0),
+                iio.imread(scene / face["image"])[..., :3] / 255.0,
                 *(np.array(face[key]) for key in ("normal", "u_axis", "v_axis")),
             )
             for face in background["faces"].values()
@@ -30,22 +37,27 @@ class CubeBackground:
             towards = directions @ normal
             with np.errstate(divide="ignore", invalid="ignore"):
                 t = (self.half_extent - origins @ normal) / towards
-            nearer = (towards > 0) & (t < distance)
-            points = (origins + np.where(nearer, t, 0.0)[:, None] * directions) / self.half_extent
+            nearer = np.flatnonzero((towards > 0) & (t < distance))
+            points = (origins + t[:, None] * directions)[nearer] / self.half_extent
             u, v = 0.5 * (points @ u_axis + 1.0), 0.5 * (points @ v_axis + 1.0)
-            rgb = np.where(nearer[:, None], _bilinear(texture, u, v), rgb)
-            distance = np.where(nearer, t, distance)
+            rgb[nearer] = reference.srgb_to_linear(bilinear(texture, u, v, rows="wrap"))
+            distance[nearer] = t[nearer]
         return rgb, distance
 
 
-def _bilinear(texture, u, v):
-    """Samples a texture whose first row is its top, `v = 0` its bottom; edges are extended."""
+def look_at_environment(texture, directions):
+    """Returns what unit directions see of an equirectangular image."""
+    x, y, z = directions.T
+    u = (0.5 - np.arctan2(y, x) / (2.0 * np.pi)) % 1.0
+    return bilinear(texture, u, 0.5 + np.arcsin(z) / np.pi, rows="edge")
+
+
+def bilinear(texture, u, v, *, rows):
+    """Samples a texture whose first row is its top, `v = 0` its bottom; columns wrap around."""
     height, width, _ = texture.shape
-    x = np.clip(u * width - 0.5, 0.0, width - 1.0)
-    y = np.clip((1.0 - v) * height - 0.5, 0.0, height - 1.0)
-    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
-    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    fx, fy = (x - left)[:, None], (y - top)[:, None]
-    upper = (1 - fx) * texture[top, left] + fx * texture[top, right]
-    lower = (1 - fx) * texture[bottom, left] + fx * texture[bottom, right]
-    return (1 - fy) * upper + fy * lower
+    padded = np.pad(texture, ((1, 1), (0, 0), (0, 0)), mode=rows)
+    padded = np.pad(padded, ((0, 0), (1, 1), (0, 0)), mode="wrap")
+    places = np.stack([(1.0 - v) * height + 0.5, u * width + 0.5])
+    return np.stack(
+        [map_coordinates(channel, places, order=1) for channel in padded.T.swapaxes(1, 2)], -1
+    )

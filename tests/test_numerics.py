@@ -272,56 +272,119 @@ _NORMALS = np.array(
 _STEP_BOUNDS_IN_ULPS = (7.0, 9.0)
 
 
-def _offset(point, direction, normal, scale):
-    return _offset_origin(*(jnp.asarray(x, jnp.float32) for x in (point, direction, normal, scale)))
+def _offset(point, towards, scale):
+    return _offset_origin(*(jnp.asarray(x, jnp.float32) for x in (point, towards, scale)))
 
 
 @pytest.mark.parametrize("coordinate", [1e-3, 1e-1, 1.0, 2.0, 1e2, 1e4, 1e6])
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_offset_origin_steps_off_the_surface_on_the_side_of_the_ray(coordinate, side):
+def test_offset_origin_steps_off_the_surface(coordinate, side):
     low, high = (bound * _EPSILON * coordinate for bound in _STEP_BOUNDS_IN_ULPS)
     points = np.float32(coordinate) * np.array(
         [[1.0, 1.0, 1.0], [-1.0, 0.3, 0.0], [0.0, 0.7, -1.0]], np.float32
     )
-    slant = np.array([0.3, 0.2, -0.4])
     for point, normal in itertools.product(points, _NORMALS):
-        across = slant - np.dot(slant, normal) * normal
-        moved = _offset(point, side * normal + across, normal, coordinate)
-        step = np.asarray(moved, np.float64) - point
+        step = np.asarray(_offset(point, side * normal, coordinate), np.float64) - point
         assert low <= side * np.dot(step, normal) <= high
         assert np.linalg.norm(step) <= high
 
 
 def test_offset_origin_at_the_size_of_a_scene():
-    moved = _offset([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], 2.0)
+    moved = _offset([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 2.0)
     np.testing.assert_allclose(moved, [0.0, 0.0, 1.9e-6], rtol=0.01)
-
-
-def test_offset_origin_does_not_depend_on_which_way_the_normal_points():
-    point, direction = [0.4, -0.3, 1.0], [0.1, 0.8, 0.59]
-    for normal in _NORMALS:
-        np.testing.assert_array_equal(
-            _offset(point, direction, normal, 1.0), _offset(point, direction, -normal, 1.0)
-        )
 
 
 def test_offset_origin_with_no_scale_is_the_point():
     point = np.array([0.4, -0.3, 1.0], np.float32)
-    np.testing.assert_array_equal(_offset(point, [1.0, 0.0, 0.0], _NORMALS[3], 0.0), point)
-
-
-def test_offset_origin_of_a_grazing_ray_goes_along_the_normal():
-    moved = _offset([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], 1.0)
-    assert moved[2] > 0.0
+    np.testing.assert_array_equal(_offset(point, _NORMALS[3], 0.0), point)
 
 
 def test_offset_origin_moves_with_its_point():
-    rest = (jnp.array([0.0, 0.6, 0.8]), jnp.asarray(_NORMALS[2]), jnp.float32(1.0))
+    rest = (jnp.asarray(_NORMALS[2]), jnp.float32(1.0))
     jacobian = jax.jacrev(numerics.offset_origin)(jnp.ones(3), *rest)
     np.testing.assert_array_equal(jacobian, np.eye(3))
 
 
+# --- dot, renormalize ---
+
+
+def test_dot_is_the_scalar_product():
+    a, b = np.random.default_rng(0).normal(size=(2, 50, 3)).astype(np.float32)
+    np.testing.assert_allclose(
+        numerics.dot(jnp.asarray(a), jnp.asarray(b)), np.sum(a * b, axis=-1), atol=1e-6
+    )
+    gradients.assert_numerical(lambda x: numerics.dot(x, jnp.asarray(b[0])), [a[0], a[1]])
+
+
+@pytest.mark.parametrize("error", [-1e-3, -1e-6, 0.0, 1e-6, 1e-3])
+def test_renormalize_mends_the_length_of_a_unit_vector(error):
+    unit = np.array([0.6, 0.0, -0.8], np.float32)
+    mended = numerics.renormalize(jnp.asarray((1.0 + error) * unit, jnp.float32))
+    np.testing.assert_allclose(mended, unit, atol=1.6 * error**2 + 2.0 * _EPSILON)
+
+
+def test_renormalize_stays_finite_where_a_vector_is_not_unit():
+    for vector in (np.zeros(3), np.full(3, 1e3), np.full(3, 1e-30)):
+        value = numerics.renormalize(jnp.asarray(vector, jnp.float32))
+        assert np.all(np.isfinite(value))
+
+
+def test_renormalize_check_grads():
+    gradients.assert_numerical(numerics.renormalize, [[0.6, 0.0, -0.8], [0.0, 1.0, 0.0]])
+
+
 # --- transformations ---
+
+
+@pytest.mark.parametrize(
+    ("gap", "speed", "expected"),
+    [
+        (3.0, 2.0, 1.5),
+        (0.0, 2.0, 0.0),
+        (-1.0, 2.0, 0.0),
+        (3.0, 0.0, np.inf),
+        (3.0, -2.0, np.inf),
+        (0.0, 0.0, np.inf),
+        (3.0, 1e-13, np.inf),
+    ],
+)
+def test_time_to_close_by_hand(gap, speed, expected):
+    found = numerics.time_to_close(jnp.float32(gap), jnp.float32(speed))
+    np.testing.assert_allclose(found, np.float32(expected), rtol=_ROUNDING)
+
+
+def test_gradients_of_time_to_close_are_finite():
+    gap, speed = np.meshgrid([-1.0, 0.0, 1e-20, 1.0, 1e6], [-1.0, 0.0, 1e-13, 1e-11, 1.0])
+    derive = jax.vmap(jax.grad(numerics.time_to_close, (0, 1)))
+    by_gap, by_speed = derive(*(jnp.asarray(x.ravel(), jnp.float32) for x in (gap, speed)))
+    assert gradients.all_finite((by_gap, by_speed))
+    still = (speed.ravel() < 1e-12) | (gap.ravel() <= 0.0)
+    assert np.all(np.asarray(by_gap)[still] == 0.0) and np.all(np.asarray(by_speed)[still] == 0.0)
+
+
+def test_time_to_close_check_grads():
+    gradients.assert_numerical(numerics.time_to_close, [0.3, 2.0], [1.5, 0.2], order=2)
+
+
+def test_safe_atan2_is_numpy_s_over_all_magnitudes():
+    y, x = np.meshgrid(_LATTICE, _LATTICE)
+    found = np.asarray(jax.jit(numerics.safe_atan2)(jnp.asarray(y), jnp.asarray(x)))
+    away = np.hypot(y.astype(float), x) > 2e-12
+    np.testing.assert_allclose(found[away], np.arctan2(y, x)[away], rtol=1e-6, atol=1e-37)
+    assert np.all(found[np.hypot(y.astype(float), x) < 5e-13] == 0.0)
+
+
+@pytest.mark.parametrize("magnitude", [0.0, 1e-38, 1e-20, 1e-13, 1e-11, 1.0, 1e30])
+def test_gradients_of_safe_atan2_are_finite_and_end_at_the_origin(magnitude):
+    y, x = jnp.float32(magnitude), jnp.float32(-magnitude)
+    by_y, by_x = jax.grad(numerics.safe_atan2, (0, 1))(y, x)
+    expected = -0.5 / magnitude if magnitude > 1e-12 else 0.0
+    np.testing.assert_allclose([by_y, by_x], [expected, expected], rtol=1e-5, atol=1e-37)
+
+
+def test_safe_atan2_check_grads():
+    gradients.assert_numerical(numerics.safe_atan2, [0.3, -2.0, 1.0], [1.5, 0.2, -1.0])
+
 
 _VECTORS = np.concatenate([_DIRECTIONS, np.zeros((1, 3), np.float32)])
 _SCALARS = np.array([-1.0, 0.0, 1e-20, 0.5, 3.0, 1e20], np.float32)
@@ -330,11 +393,13 @@ _CASES = {
     "safe_sqrt": (numerics.safe_sqrt, (_SCALARS,)),
     "safe_divide": (numerics.safe_divide, (_SCALARS[::-1], _SCALARS)),
     "safe_reciprocal": (numerics.safe_reciprocal, (_SCALARS,)),
+    "time_to_close": (numerics.time_to_close, (_SCALARS[::-1], _SCALARS)),
+    "safe_atan2": (numerics.safe_atan2, (_SCALARS[::-1], _SCALARS)),
     "length": (numerics.length, (_VECTORS,)),
     "normalize": (numerics.normalize, (_VECTORS,)),
     "offset_origin": (
         numerics.offset_origin,
-        (_VECTORS, _VECTORS[::-1], np.roll(_VECTORS, 1, axis=0), abs(_SCALARS)),
+        (_VECTORS, _VECTORS[::-1], abs(_SCALARS)),
     ),
 }
 

@@ -1,17 +1,43 @@
-"""Whether a scene's background is near or infinitely far, and where it stands (NumPy only).
+"""What is behind the objects of a scene: near or infinitely far, and how it looks (NumPy only).
 
 `scene.json` may tell; the data set's own scenes have none.
+
+    "background": {"type": "cube", "half_extent": 7.3, "faces": {NAME: {"image": FILE,
+                   "normal": [x, y, z], "u_axis": [x, y, z], "v_axis": [x, y, z]}, ...}}
+    "background": {"type": "sphere", "radius": 7.3, "image": FILE}
+    "background": {"type": "env", "image": FILE}
+
+An image is a PNG of 8-bit sRGB, or an EXR of linear RGB; its name counts from the scene's folder.
+How it lies on its wall is told in `render.backgrounds`.
 """
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from refref_jax.data import transforms
+import numpy as np
+from jaxtyping import Float
+
+from refref_jax.data import files, transforms
 from refref_jax.data.errors import SceneError
+from refref_jax.render.backgrounds import (
+    Background,
+    CubeBackground,
+    Environment,
+    LinearTexture,
+    SphereBackground,
+    SrgbTexture,
+    Texture,
+)
 from refref_jax.sampling.domains import Space
 
 _FILE = "scene.json"
+_WALLS = 6
+
+# Axes are written with six digits or more.
+_AXES_TOLERANCE = 1e-3
+
 _SPACES: dict[str, Space] = {"cube": "bounded", "sphere": "bounded", "env": "unbounded"}
 
 
@@ -35,14 +61,107 @@ def space(scene: Path) -> Space:
 def half_extent(scene: Path) -> float | None:
     """Returns half the edge of the cube that the walls form, if `scene.json` tells it."""
     extent = _background(scene).get("half_extent")
-    if extent is None:
-        return None
-    if not isinstance(extent, (int, float)) or not 0.0 < extent < math.inf:
+    return None if extent is None else _positive(extent, "half_extent", scene)
+
+
+def read_background(scene: Path) -> Background:
+    """Reads the background that `scene.json` describes, with its images.
+
+    Returns:
+      A record of NumPy arrays.
+
+    Raises:
+      SceneError: if the file does not tell the background, or an image is missing or broken.
+    """
+    record = _background(scene)
+    kind = record.get("type")
+    if not isinstance(kind, str) or kind not in _READERS:
         raise SceneError(
-            f"The half_extent of the background is {extent!r} in {scene / _FILE}. Give a positive "
-            "number, or remove it: it is optional."
+            f"The background is not known: {scene / _FILE} gives it no type of "
+            f"{', '.join(_READERS)}. Describe it there, or use a scene that does."
         )
-    return float(extent)
+    return _READERS[kind](record, scene)
+
+
+def _read_cube(record: dict[str, Any], scene: Path) -> CubeBackground:
+    path = scene / _FILE
+    half = _positive(transforms.get(record, "half_extent", path), "half_extent", scene)
+    faces = transforms.get(record, "faces", path)
+    if not isinstance(faces, dict) or len(faces) != _WALLS:
+        raise SceneError(f"The faces of the background are not six in {path}. Describe each wall.")
+    walls = list(faces.values())
+    axes = np.stack([_axes(wall, name, path) for name, wall in faces.items()])
+    towards = axes[:, 0] @ axes[:, 0].T
+    if np.max(np.abs(np.sort(towards, axis=1) - [-1.0, 0.0, 0.0, 0.0, 0.0, 1.0])) > _AXES_TOLERANCE:
+        raise SceneError(
+            f"The normals of the faces do not make a cube in {path}. Give six, two along each of "
+            "three perpendicular axes."
+        )
+    axes = axes.astype(np.float32)
+    texture = _stack([_read_texture(wall, scene) for wall in walls], path)
+    return CubeBackground(texture, axes[:, 0], axes[:, 1], axes[:, 2], np.float32(half))
+
+
+def _read_sphere(record: dict[str, Any], scene: Path) -> SphereBackground:
+    radius = _positive(transforms.get(record, "radius", scene / _FILE), "radius", scene)
+    return SphereBackground(_read_texture(record, scene), np.float32(radius))
+
+
+def _read_environment(record: dict[str, Any], scene: Path) -> Environment:
+    return Environment(_read_texture(record, scene))
+
+
+_READERS: dict[str, Callable[[dict[str, Any], Path], Background]] = {
+    "cube": _read_cube,
+    "sphere": _read_sphere,
+    "env": _read_environment,
+}
+
+
+def _read_texture(record: Any, scene: Path) -> Texture:
+    """Reads the image that a record names: EXR as linear, all else as 8-bit sRGB."""
+    path = scene / transforms.get_text(record, "image", scene / _FILE)
+    if path.suffix.lower() != ".exr":
+        return SrgbTexture((files.read_rgb(path) / 255.0).astype(np.float32))
+    texels = files.read_exr(path)
+    if texels.ndim != 3:
+        raise SceneError(f"{path} has one channel, but a background has three. Export R, G and B.")
+    if not np.all(np.isfinite(texels)):
+        raise SceneError(f"{path} has a colour that is not finite. Export it again.")
+    return LinearTexture(texels)
+
+
+def _stack(textures: list[Texture], path: Path) -> Texture:
+    kinds = {type(texture) for texture in textures}
+    if len(kinds) > 1 or len({texture.texels.shape for texture in textures}) > 1:
+        raise SceneError(
+            f"The images of the faces in {path} differ in size or format. Give all walls images of "
+            "one size, all PNG or all EXR."
+        )
+    return kinds.pop()(np.stack([texture.texels for texture in textures]))
+
+
+def _axes(wall: Any, name: str, path: Path) -> Float[np.ndarray, "3 3"]:
+    """Returns the normal, u axis and v axis of a wall as rows: unit and perpendicular."""
+    values = [transforms.get(wall, key, path) for key in ("normal", "u_axis", "v_axis")]
+    try:
+        axes = np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        axes = np.empty(0)
+    if axes.shape != (3, 3) or not np.max(np.abs(axes @ axes.T - np.eye(3))) < _AXES_TOLERANCE:
+        raise SceneError(
+            f"The normal, u_axis and v_axis of face {name!r} are not perpendicular unit vectors in "
+            f"{path}. Correct them."
+        )
+    return axes
+
+
+def _positive(value: Any, name: str, scene: Path) -> float:
+    if not isinstance(value, (int, float)) or not 0.0 < value < math.inf:
+        raise SceneError(
+            f"The {name} of the background is {value!r} in {scene / _FILE}. Give a positive number."
+        )
+    return float(value)
 
 
 def _background(scene: Path) -> dict[str, Any]:

@@ -70,6 +70,32 @@ def image_rays(cameras: Cameras, camera: int) -> Rays:
     return pixel_rays(cameras, np.full(row.shape, camera), row, column)
 
 
+def supersample(cameras: Cameras, side: int) -> Cameras:
+    """Returns the same cameras with every pixel cut into `side x side` smaller ones.
+
+    Args:
+      cameras: the cameras.
+      side: small pixels along each edge of a pixel, at least 1.
+    """
+    return cameras._replace(
+        width=side * cameras.width, height=side * cameras.height, focal=side * cameras.focal
+    )
+
+
+def box_filter(
+    pixels: Float[np.ndarray, "height width *channels"], side: int
+) -> Float[np.ndarray, "h w *channels"]:
+    """Averages the small pixels of `supersample` into pixels; colours must be linear.
+
+    Args:
+      pixels: of a supersampled camera.
+      side: as given to `supersample`.
+    """
+    height, width, *channels = pixels.shape
+    blocks = pixels.reshape(height // side, side, width // side, side, *channels)
+    return blocks.mean(axis=(1, 3))
+
+
 def orbit(frames: int, *, distance: float, elevation: float, size: int, angle_x: float) -> Cameras:
     """Returns cameras on a circle around the origin that look at it, with z up.
 

@@ -89,7 +89,7 @@ def trace_ends(
         `data.containment`); by default none. The other rules find out by themselves.
       block: rays cast at once, see `wavefront`.
     """
-    if budget.bends == 0:
+    if _needs_no_tracing(rays, budget):
         ends = straight_ends(rays)
         return TracedEnds(ends, jnp.zeros_like(rays.origins), jnp.zeros((), jnp.int32))
     tree = follow(geometry, rays, _inside(geometry, rays, inside), budget=budget, block=block)
@@ -112,7 +112,8 @@ def trace(
       geometry: the scene.
       rays: camera rays.
       budget: which light to follow.
-      capacity: room for paths; see `budgets.capacity_for`. Not used if the budget has no bends.
+      capacity: room for paths; see `budgets.capacity_for`. Not used if there are no bends to
+        follow, or no rays.
       inside: as for `trace_ends`.
     """
     batch = jax.tree.map(lambda x: x[None], rays)
@@ -136,13 +137,14 @@ def trace_batches(
       geometry: the scene.
       rays: camera rays `[batches, rays]`.
       budget: which light to follow.
-      capacity: room for the paths of each batch; not used if the budget has no bends.
+      capacity: room for the paths of each batch; not used if there are no bends to follow, or no
+        rays.
       inside: as for `trace_ends`.
 
     Returns:
       The paths of each batch, stacked; `rays` counts within a batch.
     """
-    if budget.bends == 0:
+    if _needs_no_tracing(rays, budget):
         return jax.vmap(lambda batch: Traced(straight(batch), jnp.zeros_like(batch.origins)))(rays)
     batches, count = rays.radii.shape
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
@@ -167,6 +169,10 @@ def survey(geometry: Geometry, rays: Rays, *, budget: Budget) -> Survey:
     return Survey(jnp.mean(paths), jnp.std(paths), 1.0 - missing / count)
 
 
+def _needs_no_tracing(rays: Rays, budget: Budget) -> bool:
+    return budget.bends == 0 or rays.radii.size == 0
+
+
 def _inside(
     geometry: Geometry, rays: Rays, inside: Int[Array, "rays slots"] | None
 ) -> Int[Array, "rays slots"]:
@@ -184,24 +190,24 @@ def _pack(
     ends = path_tree.listed(tree, slots)
     weight = jnp.max(ends.weights, axis=-1)
     # The slots past the last path form a batch of their own.
-    batch = jnp.where(jnp.arange(slots) < tree.ends.count, ends.rays // rays, batches)
+    lanes = jnp.arange(slots, dtype=jnp.int32)
+    batch = jnp.where(lanes < tree.ends.count, ends.rays // rays, batches)
     strongest_first = jnp.lexsort((-weight, batch))
     rank = _rank_in_group(batch[strongest_first], batches)
     fits = jnp.zeros(slots, bool).at[strongest_first].set(rank < capacity) & (batch < batches)
     group = jnp.where(fits, batch, batches)
-    order = jnp.lexsort((-weight, ends.rays, group))
+    order = jnp.lexsort((-weight, ends.rays, group)).astype(jnp.int32)
     place = group[order] * capacity + _rank_in_group(group[order], batches)
     target = jnp.where(fits[order], place, batches * capacity)
-    source = jnp.full(batches * capacity, slots).at[target].set(order, mode="drop")
-    homes = jnp.repeat(jnp.arange(batches, dtype=jnp.int32) * rays, capacity)
+    source = jnp.full(batches * capacity, slots, jnp.int32).at[target].set(order, mode="drop")
     packed = jax.tree.map(lambda x: x[jnp.minimum(source, slots - 1)], ends)
-    packed = path_tree.emptied(packed, source == slots)
-    packed = packed._replace(rays=jnp.where(source == slots, homes, packed.rays))
+    home = jnp.repeat(jnp.arange(batches, dtype=jnp.int32) * rays, capacity)
     left_over = jnp.where(fits[:, None], 0.0, ends.weights)
-    return packed, tree.lost.at[ends.rays].add(left_over)
+    lost = tree.lost.at[ends.rays].add(left_over)
+    return path_tree.emptied(packed, source == slots, home), lost
 
 
 def _rank_in_group(group: Int[Array, " n"], groups: int) -> Int[Array, " n"]:
     """Returns the place of each record among its group's, for records sorted by group."""
-    begin = jnp.searchsorted(group, jnp.arange(groups + 1, dtype=group.dtype))
-    return jnp.arange(group.shape[0], dtype=begin.dtype) - begin[group]
+    begin = jnp.searchsorted(group, jnp.arange(groups + 1, dtype=jnp.int32)).astype(jnp.int32)
+    return jnp.arange(group.shape[0], dtype=jnp.int32) - begin[group]

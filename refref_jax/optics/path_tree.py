@@ -72,14 +72,15 @@ class PathTree(NamedTuple):
 def listed(tree: PathTree, capacity: int) -> Ends:
     """Returns the ends of a tree in a list of that capacity; slots past the last are empty."""
     ends = jax.tree.map(lambda x: x[:capacity], tree.ends.items)
-    return emptied(ends, jnp.arange(capacity) >= tree.ends.count)
+    lanes = jnp.arange(capacity, dtype=jnp.int32)
+    return emptied(ends, lanes >= tree.ends.count, jnp.zeros_like(lanes))
 
 
-def emptied(ends: Ends, empty: Bool[Array, " paths"]) -> Ends:
-    """Takes the paths out of some slots, and leaves harmless values there."""
+def emptied(ends: Ends, empty: Bool[Array, " paths"], home: Int[Array, " paths"]) -> Ends:
+    """Takes the paths out of some slots; these then look along the camera ray `home`."""
     return Ends(
-        segments=jnp.where(empty, 0, ends.segments),
-        rays=jnp.where(empty, 0, ends.rays),
+        segments=jnp.where(empty, home, ends.segments),
+        rays=jnp.where(empty, home, ends.rays),
         weights=jnp.where(empty[:, None], 0.0, ends.weights),
         bends=jnp.where(empty, 0, ends.bends),
         statuses=jnp.where(empty, PathStatus.EMPTY, ends.statuses).astype(jnp.int32),

@@ -87,9 +87,7 @@ def follow(
     budget: Budget,
     block: int = BLOCK,
 ) -> PathTree:
-    """Follows each ray along all branches of a budget.
-
-    The loop ends, since every child has one bend more than its parent.
+    """Follows each ray along all branches; every child has one bend more than its parent.
 
     Args:
       geometry: the scene.
@@ -113,7 +111,6 @@ def _follow(
         return (walk.stack.count <= room.live) & (walk.tree.ends.count <= room.paths)
 
     def advance(walk: _Walk) -> _Walk:
-        """Goes on round by round until there is too much of something, or all is done."""
         walk = jax.lax.while_loop(
             lambda walk: (walk.stack.count > 0) & fits(walk),
             lambda walk: _round(geometry, walk, budget, block, room),
@@ -229,11 +226,10 @@ def _log(tree: PathTree, children: _Children, room: Room) -> tuple[PathTree, _Ch
     index = tree.segments.count + jnp.cumsum(kept, dtype=jnp.int32) - 1
     state = live.state
     logged = Segments(live.segments, state.point, state.direction, state.tau, children.media)
-    tree = tree._replace(
-        segments=pools.append(tree.segments, logged, kept),
-        lost=pools.lose(tree.lost, live.rays, live.weights, children.exists & ~kept),
-    )
-    return tree, children._replace(live=live._replace(segments=index), exists=kept)
+    log = pools.append(tree.segments, logged, kept)
+    lost = pools.lose(tree.lost, live.rays, live.weights, children.exists & ~kept)
+    children = children._replace(live=live._replace(segments=index), exists=kept)
+    return tree._replace(segments=log, lost=lost), children
 
 
 def _push(tree: PathTree, stack: Pool, children: _Children, budget: Budget) -> _Walk:

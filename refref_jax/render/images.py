@@ -2,7 +2,7 @@
 
 An image is traced in tiles. The paths of a tile are sorted so that the slots without a path come
 last, and are then rendered chunk by chunk: a pixel that misses the objects costs one path, not
-two. This is one of the two modules that call `jax.jit`.
+two. This is one of the modules that call `jax.jit`.
 """
 
 import functools

@@ -1,6 +1,6 @@
 """One training step, and the tracing of the light paths that many steps use.
 
-This is one of the two modules that call `jax.jit`.
+This is one of the modules that call `jax.jit`.
 """
 
 import functools

@@ -6,11 +6,13 @@ import pytest
 
 from refref_jax.data.cameras import (
     Cameras,
+    box_filter,
     focal_length,
     image_rays,
     orbit,
     pixel_rays,
     planar_depth_to_distance,
+    supersample,
 )
 
 # Rays are stored in single precision, whose rounding is 6e-8.
@@ -224,3 +226,26 @@ def test_orbit_sees_a_point_above_the_origin_in_the_upper_half():
         row, column = np.unravel_index(nearest, (9, 9))
         assert row < 4
         assert column == 4
+
+
+def test_small_pixels_surround_the_pixel_that_they_make():
+    cameras = _cameras(8, 6, 5.0, (_TURNED,))
+    fine = supersample(cameras, 3)
+    assert (fine.width, fine.height, fine.focal) == (24, 18, 15.0)
+    coarse, small = image_rays(cameras, 0), image_rays(fine, 0)
+    # The middle one of 3 x 3 is the pixel's own ray, and its cone a third as wide.
+    np.testing.assert_allclose(small.directions[1::3, 1::3], coarse.directions, atol=_SINGLE)
+    np.testing.assert_allclose(small.radii[1::3, 1::3], coarse.radii / 3.0, rtol=1e-6)
+    np.testing.assert_array_equal(small.origins[1::3, 1::3], coarse.origins)
+
+
+def test_the_box_filter_averages_each_pixel_s_own_block():
+    pixels = np.arange(6 * 4 * 3, dtype=float).reshape(6, 4, 3)
+    found = box_filter(pixels, 2)
+    assert found.shape == (3, 2, 3)
+    for row in range(3):
+        for column in range(2):
+            block = pixels[2 * row : 2 * row + 2, 2 * column : 2 * column + 2]
+            np.testing.assert_allclose(found[row, column], block.reshape(-1, 3).mean(axis=0))
+    np.testing.assert_array_equal(box_filter(pixels, 1), pixels)
+    assert box_filter(pixels[..., 0], 2).shape == (3, 2)

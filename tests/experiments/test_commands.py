@@ -146,7 +146,9 @@ def test_mistakes_end_with_one_line_that_says_what_to_do(tmp_path, command, opti
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("command", ["train", "evaluate", "render"])
+@pytest.mark.parametrize(
+    "command", ["train", "evaluate", "render", "render_known", "path_trade_off"]
+)
 def test_help_explains_every_option(command):
     result = subprocess.run(
         [sys.executable, "-m", f"experiments.{command}", "--help"],

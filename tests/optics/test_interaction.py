@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from refref_jax.geometry.surfaces import SurfacePoint
-from refref_jax.optics import interaction, interface_rules
+from refref_jax.optics import interaction, interface_rules, media
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import AMBIENT
 
@@ -22,33 +22,34 @@ def _meet(direction, shading=(0.0, 0.0, 1.0)):
         scale=jnp.float32(1.0),
     )
     unit = np.asarray(direction) / np.linalg.norm(direction)
-    return interaction.meet(point, _GLASS, jnp.asarray(unit, jnp.float32))
+    nowhere = media.nowhere(_GLASS)
+    return interaction.meet(point, _GLASS, nowhere, jnp.asarray(unit, jnp.float32))
 
 
 def test_entering_glass():
     met = _meet([0.0, 0.0, -1.0])
-    np.testing.assert_allclose(met.direction, [0, 0, -1], atol=1e-6)
+    np.testing.assert_allclose(met.transmitted, [0, 0, -1], atol=1e-6)
     np.testing.assert_allclose(met.reflected, [0, 0, 1], atol=1e-6)
     assert met.reflectance == pytest.approx(0.04, abs=1e-6)
-    assert (int(met.medium_before), int(met.medium)) == (AMBIENT, 1)
-    assert met.restart[2] < 0.0
+    assert (int(met.sides.medium_near), int(met.sides.medium_far)) == (AMBIENT, 1)
+    assert met.restart_transmitted[2] < 0.0 < met.restart_reflected[2]
 
 
 def test_leaving_glass():
     met = _meet([0.3, 0.0, 1.0])
-    assert (int(met.medium_before), int(met.medium)) == (1, AMBIENT)
+    assert (int(met.sides.medium_near), int(met.sides.medium_far)) == (1, AMBIENT)
     sine = 1.5 * 0.3 / np.hypot(0.3, 1.0)
-    np.testing.assert_allclose(met.direction, [sine, 0, np.sqrt(1 - sine**2)], atol=1e-6)
-    assert met.restart[2] > 0.0
+    np.testing.assert_allclose(met.transmitted, [sine, 0, np.sqrt(1 - sine**2)], atol=1e-6)
+    assert met.restart_reflected[2] < 0.0 < met.restart_transmitted[2]
 
 
-def test_total_reflection_stays_inside():
+def test_total_reflection_has_no_other_branch():
     met = _meet([1.0, 0.0, 0.5])
     assert met.total
     assert met.reflectance == 1.0
-    np.testing.assert_allclose(met.direction, met.reflected)
-    assert (int(met.medium_before), int(met.medium)) == (1, 1)
-    assert met.direction[2] < 0.0 and met.restart[2] < 0.0
+    np.testing.assert_allclose(met.reflected, np.array([1.0, 0.0, -0.5]) / np.hypot(1.0, 0.5))
+    assert met.restart_reflected[2] < 0.0
+    assert np.all(np.isfinite(met.transmitted))
 
 
 @pytest.mark.parametrize("lean", [0.0, 0.1, -0.1, 1.0, -1.0, 10.0])
@@ -56,14 +57,13 @@ def test_total_reflection_stays_inside():
 def test_no_ray_leaves_on_the_wrong_side_however_the_shading_normal_leans(lean, slope):
     met = _meet([1.0, 0.0, slope], shading=(lean, 0.0, 1.0))
     incident = -np.sign(slope)
-    onward = incident if met.total else -incident
     assert np.sign(met.reflected[2]) == incident
-    assert np.sign(met.direction[2]) == onward
-    for unit in (met.reflected, met.direction):
+    assert met.total or np.sign(met.transmitted[2]) == -incident
+    for unit in (met.reflected,) if met.total else (met.reflected, met.transmitted):
         assert np.linalg.norm(unit) == pytest.approx(1.0, abs=1e-6)
     assert 0.0 <= met.reflectance <= 1.0
 
 
 def test_the_shading_normal_bends_the_ray():
     flat, leaning = _meet([0.2, 0.0, -1.0]), _meet([0.2, 0.0, -1.0], shading=(0.1, 0.0, 1.0))
-    assert np.linalg.norm(flat.direction - leaning.direction) > 0.02
+    assert np.linalg.norm(flat.transmitted - leaning.transmitted) > 0.02

@@ -10,7 +10,7 @@ import pytest
 from refref_jax.data.containment import parts_around
 from refref_jax.optics import media, path_tracing
 from refref_jax.optics.budgets import TREE, Budget
-from refref_jax.optics.light_paths import PathStatus, exists
+from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.media import AMBIENT, EMPTY_SLOT
 from tests import reference, scenes
 from tests.reference import Sphere
@@ -46,7 +46,7 @@ def _trace(geometry, rays, *, inside=None, budget=_REFRACTED):
 def _paths(geometry, rays, **options):
     """Returns the paths there are."""
     paths = _trace(geometry, rays, **options).paths
-    return jax.tree.map(lambda x: x[exists(paths)], paths)
+    return jax.tree.map(lambda x: x[paths.statuses != PathStatus.EMPTY], paths)
 
 
 def _ranked(part, priority, **values):

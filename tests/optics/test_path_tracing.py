@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from refref_jax.optics import path_tracing
-from refref_jax.optics.budgets import PAPER, STRAIGHT, Budget, capacity_for
+from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE, Budget, capacity_for, room
 from refref_jax.optics.light_paths import PathStatus, straight
 from refref_jax.optics.media import AMBIENT
 from tests import reference, scenes
@@ -25,13 +25,19 @@ def _trace_jitted(geometry, rays, *, budget, capacity):
 
 
 def _trace(geometry, rays, *, budget=PAPER, capacity=None):
-    capacity = len(rays.radii) if capacity is None else capacity
+    capacity = room(budget, len(rays.radii)).paths if capacity is None else capacity
     traced = _trace_jitted(geometry, rays, budget=budget, capacity=capacity)
     return jax.tree.map(np.asarray, traced)
 
 
+def _existing(paths):
+    return jax.tree.map(lambda x: x[paths.statuses != PathStatus.EMPTY], paths)
+
+
 def _refracted(geometry, rays, bends=10):
-    return _trace(geometry, rays, budget=Budget(bends, "none")).paths
+    """Returns the one path of each ray, in the order of the rays."""
+    budget = Budget(bends, "none", live_per_ray=1.0, paths_per_ray=1.0)
+    return _trace(geometry, rays, budget=budget).paths
 
 
 @functools.cache
@@ -132,11 +138,12 @@ def test_media_are_named_along_the_path():
 def test_equal_indices_are_invisible():
     geometry = scenes.geometry(scenes.ball(1.0, index=1.0, subdivisions=3))
     rays = scenes.rays([[-4.0, y, 0.0] for y in (0.0, 0.5, 0.9)], [1.0, 0.0, 0.0])
-    traced = _trace(geometry, rays)
-    paths = jax.tree.map(lambda x: x[:3], traced.paths)
-    for i in range(3):
-        np.testing.assert_allclose(paths.directions[i, paths.bends[i]], [1, 0, 0], atol=1e-6)
-    np.testing.assert_allclose(paths.weights, 1.0, atol=1e-6)
+    for budget in (PAPER, TREE):
+        paths = _existing(_trace(geometry, rays, budget=budget).paths)
+        np.testing.assert_array_equal(paths.rays, [0, 1, 2])
+        for i in range(3):
+            np.testing.assert_allclose(paths.directions[i, paths.bends[i]], [1, 0, 0], atol=1e-6)
+        np.testing.assert_array_equal(paths.weights, 1.0)
 
 
 def test_light_paths_are_reversible():
@@ -220,7 +227,7 @@ def test_fresnel_uses_the_index_of_the_part_that_was_hit():
     paths = _trace(scenes.geometry(diamond, glass), rays).paths
     np.testing.assert_allclose(1.0 - paths.weights[0], (1.418 / 3.418) ** 2, atol=1e-6)
     # The ball's shading normal there is off by the mesh, not by much.
-    np.testing.assert_allclose(1.0 - paths.weights[1], 0.04, atol=1e-4)
+    np.testing.assert_allclose(1.0 - paths.weights[2], 0.04, atol=1e-4)
 
 
 def _many_rays():
@@ -229,32 +236,39 @@ def _many_rays():
     return scenes.rays([-4.0, 0.0, 0.0], targets + np.array([4.0, 0.0, 0.0]))
 
 
-@pytest.mark.parametrize("capacity", [0, 5, 64])
-def test_weights_of_every_ray_sum_to_one_at_any_capacity(capacity):
-    geometry = scenes.geometry(scenes.ball(1.0))
-    full = _trace(geometry, _many_rays())
-    traced = _trace(geometry, _many_rays(), capacity=capacity)
-    sums = np.zeros((64, 3))
+@pytest.mark.parametrize("budget", [PAPER, TREE])
+@pytest.mark.parametrize("capacity", [1, 64, 70, 200])
+def test_weights_and_losses_of_every_ray_sum_to_one_at_any_capacity(budget, capacity):
+    traced = _trace(
+        scenes.geometry(scenes.ball(1.0)), _many_rays(), budget=budget, capacity=capacity
+    )
+    sums = traced.lost.copy()
     np.add.at(sums, traced.paths.rays, traced.paths.weights)
     np.testing.assert_allclose(sums, 1.0, atol=1e-6)
-    share = full.paths.weights[64:, 0].sum()
-    kept = traced.paths.weights[64:, 0].sum()
-    np.testing.assert_allclose(traced.dropped.sum(), share - kept, atol=1e-5)
-    assert (traced.dropped.max() > 0) == (capacity == 5 or capacity == 0)
+    assert (traced.lost.max() > 0.0) == (capacity < 100)
 
 
-def test_the_strongest_reflections_are_kept():
+def test_the_strongest_paths_are_kept():
     geometry = scenes.geometry(scenes.ball(1.0))
-    full = _trace(geometry, _many_rays()).paths.weights[64:, 0]
-    kept = _trace(geometry, _many_rays(), capacity=5).paths.weights[64:, 0]
-    np.testing.assert_allclose(kept, np.sort(full)[::-1][:5])
+    full = _trace(geometry, _many_rays()).paths.weights[:, 0]
+    kept = _trace(geometry, _many_rays(), capacity=70).paths.weights[:, 0]
+    np.testing.assert_allclose(np.sort(kept)[::-1], np.sort(full)[::-1][:70])
+
+
+def test_paths_come_in_the_order_of_their_rays_the_heaviest_first():
+    paths = _trace(scenes.geometry(scenes.ball(1.0)), _many_rays(), budget=TREE).paths
+    exists = paths.statuses != PathStatus.EMPTY
+    assert np.all(np.diff(exists.astype(int)) <= 0)
+    rays, weights = paths.rays[exists], paths.weights[exists, 0]
+    assert np.all(np.diff(rays) >= 0)
+    assert np.all(np.diff(weights)[np.diff(rays) == 0] <= 0.0)
 
 
 def test_tracing_in_a_pool_equals_tracing_batch_by_batch():
     geometry = scenes.geometry(scenes.ball(1.0))
     rays = _many_rays()
     batches = jax.tree.map(lambda x: x.reshape(4, 16, *x.shape[1:]), rays)
-    trace_pool = jax.jit(functools.partial(path_tracing.trace_batches, budget=PAPER, capacity=16))
+    trace_pool = jax.jit(functools.partial(path_tracing.trace_batches, budget=PAPER, capacity=32))
     pool = trace_pool(geometry, batches)
     for i in range(4):
         batch = jax.tree.map(lambda x, i=i: x[i], batches)
@@ -266,14 +280,22 @@ def test_the_straight_budget_ignores_the_objects():
     rays = _many_rays()
     traced = _trace(scenes.geometry(scenes.ball(1.0)), rays, budget=STRAIGHT, capacity=0)
     jax.tree.map(np.testing.assert_array_equal, traced.paths, straight(rays))
-    assert np.all(traced.dropped == 0.0)
+    assert np.all(traced.lost == 0.0)
 
 
-def test_an_empty_scene_bends_nothing():
-    traced = _trace(scenes.geometry(), _many_rays())
+@pytest.mark.parametrize("budget", [PAPER, TREE])
+def test_an_empty_scene_bends_nothing(budget):
+    traced = _trace(scenes.geometry(), _many_rays(), budget=budget)
     assert np.all(traced.paths.statuses[:64] == PathStatus.MISSED)
     assert np.all(traced.paths.statuses[64:] == PathStatus.EMPTY)
     assert all(np.all(np.isfinite(x)) for x in (traced.paths.points, traced.paths.weights))
+
+
+def test_no_rays_have_no_paths():
+    rays = jax.tree.map(lambda x: x[:0], _many_rays())
+    traced = path_tracing.trace(scenes.geometry(scenes.ball(1.0)), rays, budget=TREE, capacity=8)
+    assert traced.paths.statuses.shape == (0,)
+    assert path_tracing.trace_ends(scenes.geometry(), rays, budget=TREE).casts == 0
 
 
 def test_a_camera_inside_glass_starts_in_its_medium():
@@ -326,15 +348,26 @@ def test_in_double_precision_a_slab_is_exact():
         )
 
 
-def test_capacity_covers_the_hits_of_random_batches():
+def test_capacity_covers_the_paths_of_random_batches():
     generator = np.random.default_rng(0)
     for rays, fraction in [(1024, 0.2), (64, 0.5), (4096, 0.01)]:
-        capacity = capacity_for(PAPER, rays, fraction)
-        assert capacity <= rays
-        assert generator.binomial(rays, fraction, 10_000).max() <= capacity
-    assert capacity_for(STRAIGHT, 1024, 0.5) == 0
-    assert capacity_for(PAPER, 100, 1.0) == 100
-    assert capacity_for(PAPER, 100, 0.0) == 0
+        deviation = np.sqrt(fraction * (1.0 - fraction))
+        capacity = capacity_for(PAPER, rays, mean=1.0 + fraction, deviation=deviation)
+        assert capacity <= 2 * rays
+        assert rays + generator.binomial(rays, fraction, 10_000).max() <= capacity
+    assert capacity_for(STRAIGHT, 1000, mean=1.0, deviation=0.0) == 1000
+    assert capacity_for(PAPER, 100, mean=2.0, deviation=0.0) == 200
+
+
+def test_a_survey_counts_paths_and_hits():
+    rays = _many_rays()
+    ball = scenes.geometry(scenes.ball(1.0))
+    found = jax.jit(functools.partial(path_tracing.survey, budget=PAPER))(ball, rays)
+    paths = _existing(_trace(ball, rays).paths)
+    counts = np.bincount(paths.rays, minlength=64)
+    assert float(found.mean) == pytest.approx(counts.mean())
+    assert float(found.deviation) == pytest.approx(counts.std(), abs=1e-6)
+    assert float(found.hit_fraction) == pytest.approx(np.mean(counts == 2))
 
 
 def test_light_that_escapes_a_closed_body_has_left_its_medium():
@@ -362,7 +395,7 @@ def test_derivatives_of_light_paths_are_refused(derivative, of):
         moved = rays._replace(origins=rays.origins + x) if of == "rays" else rays
         surfaces = glass.surfaces._replace(normals=glass.surfaces.normals + x)
         shaped = glass._replace(surfaces=surfaces) if of == "geometry" else glass
-        return path_tracing.trace(shaped, moved, budget=PAPER, capacity=1).paths.points[0, 2, 1]
+        return path_tracing.trace(shaped, moved, budget=PAPER, capacity=2).paths.points[0, 2, 1]
 
     with pytest.raises(TypeError, match="no derivatives"):
         derivative(exit_height)(jnp.float32(0.0))

@@ -1,0 +1,172 @@
+"""Measures what light paths cost and what they give: the speed-accuracy curve.
+
+python -m experiments.path_trade_off --scenes=experiments/data/cube_smcvx_ball --out=runs/trade_off
+
+Renders views of scenes with a known background, as `experiments.render_known` does, once for every
+value of --cuts at the tree's bends, once for every value of --bends at its cut, and with the
+straight and the paper's paths. Writes a CSV, one row a rendering, and two figures: decibels inside
+the mask against ray casts and against time. Casts, paths and seconds are of one camera ray a pixel.
+"""
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from absl import flags
+
+from experiments import commands, known_scenes, scenes, trade_off_figures
+from experiments.known_scenes import KnownScene
+from experiments.trade_off_figures import Trial
+from refref_jax.data import local_layout
+from refref_jax.optics.budgets import BUDGETS, Budget
+from refref_jax.optics.interface_rules import RULES
+
+_SCENES = flags.DEFINE_list("scenes", None, "Folders of scenes, with commas.", required=True)
+_CUTS = flags.DEFINE_list(
+    "cuts",
+    ["0.2", "0.1", "0.05", "0.04", "0.03", "0.02", "0.01", "0.005", "0.002"],
+    "Smallest throughputs worth following.",
+)
+_BENDS = flags.DEFINE_list(
+    "bends", ["1", "2", "4", "6", "10", "16", "24", "32"], "Most bends of a path."
+)
+_RAYS = flags.DEFINE_integer(
+    "rays_per_pixel", 9, "Rays in each pixel, a square: 1, 4, 9, 16. They are averaged."
+)
+_SPLIT = flags.DEFINE_enum("split", "test", list(local_layout.SPLITS), "Views to render.")
+_VIEWS = flags.DEFINE_string("views", "0,10", "Numbers of views of the split, as 0,10, or all.")
+_RULE = flags.DEFINE_enum(
+    "rule",
+    "nested",
+    list(RULES),
+    "What lies outside each mesh: the part around it, always air (as Cycles does it), or, of "
+    "meshes that overlap, the one with the highest 'priority' in scene.json.",
+)
+_IOR = flags.DEFINE_multi_string(
+    "ior", [], "Index of refraction of a material or a mesh, as glass=1.52. May be repeated."
+)
+_OUT = flags.DEFINE_string("out", None, "Folder to write to.", required=True)
+
+
+class Setting(NamedTuple):
+    """One light budget of a sweep.
+
+    Attributes:
+      sweep: what it varies, `cut` or `bends`; `budget` for a point alone.
+      name: how figures call it.
+      budget: which light is followed.
+    """
+
+    sweep: str
+    name: str
+    budget: Budget
+
+
+def main() -> None:
+    """Renders all scenes with all budgets."""
+    plan = settings()
+    side = known_scenes.side_of(_RAYS.value)
+    # All scenes first: a broken one is named before anything is rendered.
+    chosen = [_read(Path(scene)) for scene in _SCENES.value]
+    out = Path(_OUT.value)
+    out.mkdir(parents=True, exist_ok=True)
+    table = out / "path_trade_off.csv"
+    if table.exists():
+        print(f"Replacing the results of an earlier call in {out}.")
+    trials: list[Trial] = []
+    with commands.ProgressBar("trade-off", len(chosen) * len(plan)) as bar:
+        for trial in measure_all(chosen, plan, side):
+            trials.append(trial)
+            _write(table, trials)
+            bar.show(
+                len(trials),
+                f"{trial.scene} {trial.name}: {trial.psnr_masked:.1f} dB, "
+                f"{trial.casts_per_pixel:.2f} casts",
+            )
+    pictures = trade_off_figures.write(out, trials)
+    print(f"Figures:  {', '.join(map(str, pictures))}")
+    print(f"Measures: {table}")
+    print("Next: choose a cut, and render with python -m experiments.render_known --cut=...")
+
+
+def settings() -> list[Setting]:
+    """Returns all budgets to try; equal ones are listed in both sweeps."""
+    cuts = sorted(_numbers("cuts", _CUTS.value, float), reverse=True)
+    bends = sorted(_numbers("bends", _BENDS.value, int))
+    swept = [("cut", f"{cut:g}", known_scenes.make_budget("tree", cut=cut)) for cut in cuts]
+    swept += [("bends", str(n), known_scenes.make_budget("tree", bends=n)) for n in bends]
+    points = [("budget", name, BUDGETS[name]) for name in ("straight", "paper")]
+    return [Setting(*each) for each in points + swept]
+
+
+def measure_all(chosen: list[KnownScene], plan: list[Setting], side: int) -> Iterator[Trial]:
+    """Renders every scene with every budget; equal budgets are rendered once."""
+    for scene in chosen:
+        known: dict[Budget, Trial] = {}
+        for setting in plan:
+            if setting.budget not in known:
+                known[setting.budget] = measure_one(scene, setting, side)
+            yield known[setting.budget]._replace(sweep=setting.sweep, name=setting.name)
+
+
+def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
+    """Renders all views of a scene with one budget."""
+    known_scenes.warm_up(scene, setting.budget)
+    views, measures = [], []
+    for i in range(len(scene.indices)):
+        view = known_scenes.render_view(scene, i, budget=setting.budget, side=side)
+        views.append(view)
+        measures.append(known_scenes.measure(scene, i, view.rgb))
+    pixels = scene.frames.cameras.height * scene.frames.cameras.width * side**2
+    return Trial(
+        scene=scene.name,
+        sweep=setting.sweep,
+        name=setting.name,
+        cut=setting.budget.cut,
+        bends=setting.budget.bends,
+        psnr=known_scenes.mean_of(measures, "psnr"),
+        psnr_masked=known_scenes.mean_of(measures, "psnr_masked"),
+        psnr_outside=known_scenes.mean_of(measures, "psnr_outside"),
+        casts_per_pixel=float(np.mean([view.casts for view in views])),
+        paths_per_pixel=float(np.mean([view.paths for view in views])),
+        seconds_per_pixel=sum(view.seconds for view in views) / (pixels * len(views)),
+        lost_energy=float(np.mean([view.lost for view in views])),
+    )
+
+
+def _read(folder: Path) -> KnownScene:
+    scene = known_scenes.read_scene(
+        folder,
+        split=_SPLIT.value,
+        views=_VIEWS.value,
+        rule=_RULE.value,
+        indices=scenes.parse_indices(_IOR.value),
+    )
+    if scene.masks is None:
+        raise ValueError(
+            f"The views of {folder} have no masks, inside which the error is measured. Add "
+            "mask_file_path to each frame of its transforms file."
+        )
+    return scene
+
+
+def _numbers(option: str, words: list[str], kind: type) -> list:
+    try:
+        return [kind(word) for word in words]
+    except ValueError as error:
+        raise ValueError(
+            f"--{option}={','.join(words)} is not a list of numbers. Write them with commas."
+        ) from error
+
+
+def _write(path: Path, trials: list[Trial]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(Trial._fields)
+        writer.writerows(trials)
+
+
+if __name__ == "__main__":
+    commands.run(main)

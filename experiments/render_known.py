@@ -1,0 +1,178 @@
+"""Renders a scene whose background is known, with no learning, and measures it.
+
+python -m experiments.render_known --scene=experiments/data/cube_smcvx_ball --out=runs/known
+
+`scene.json` must tell the background. What is left of the error is that of the light paths. The
+JSON holds, for each view and as the mean over views, the PSNR in dB over the image, inside the
+mask and outside; `casts_per_pixel` and `paths_per_pixel`, which count ray casts and light paths of
+one camera ray, so that they do not depend on --rays_per_pixel; `seconds`, that rendering all views
+took, without compiling, reading and writing; and `lost_energy`, the share of light that found no
+room.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from absl import flags
+
+from experiments import commands, figures, known_scenes, scenes
+from experiments.known_scenes import KnownScene, View
+from refref_jax.data import files, local_layout
+from refref_jax.optics.budgets import BUDGETS, Budget
+from refref_jax.optics.interface_rules import RULES
+
+_SCENE = flags.DEFINE_string("scene", None, "Folder of the scene.", required=True)
+_PATHS = flags.DEFINE_enum(
+    "paths",
+    "tree",
+    list(BUDGETS),
+    "Light paths: 'straight' ignores the objects; 'paper' bends up to 10 times and reflects at the "
+    "first surface; 'tree' follows every branch that carries light.",
+)
+_CUT = flags.DEFINE_float(
+    "cut", None, "Smallest throughput worth following, in [0, 1); that of --paths if not given."
+)
+_BENDS = flags.DEFINE_integer(
+    "bends", None, "Most refractions and reflections of a path; that of --paths if not given."
+)
+_RAYS = flags.DEFINE_integer(
+    "rays_per_pixel", 9, "Rays in each pixel, a square: 1, 4, 9, 16. They are averaged."
+)
+_SPLIT = flags.DEFINE_enum("split", "test", list(local_layout.SPLITS), "Views to render.")
+_VIEWS = flags.DEFINE_string("views", "all", "Numbers of views of the split, as 0,10,20, or all.")
+_RULE = flags.DEFINE_enum(
+    "rule",
+    "nested",
+    list(RULES),
+    "What lies outside each mesh: the part around it, always air (as Cycles does it), or, of "
+    "meshes that overlap, the one with the highest 'priority' in scene.json.",
+)
+_IOR = flags.DEFINE_multi_string(
+    "ior", [], "Index of refraction of a material or a mesh, as glass=1.52. May be repeated."
+)
+_OUT = flags.DEFINE_string("out", None, "Folder to write the pictures to.", required=True)
+_JSON = flags.DEFINE_string("json", None, "File for the measures; {out}/metrics.json by default.")
+
+_VIEWS_IN_COMPARISON = 4
+
+# A share of light that 8 bits may show.
+_WORTH_A_WARNING = 1e-3
+
+# By what a file of ours is known.
+_KEYS = {"scene", "paths", "views", "casts_per_pixel"}
+
+
+def main() -> None:
+    """Renders and measures the chosen views."""
+    budget = known_scenes.make_budget(_PATHS.value, cut=_CUT.value, bends=_BENDS.value)
+    side = known_scenes.side_of(_RAYS.value)
+    scene = known_scenes.read_scene(
+        Path(_SCENE.value),
+        split=_SPLIT.value,
+        views=_VIEWS.value,
+        rule=_RULE.value,
+        indices=scenes.parse_indices(_IOR.value),
+    )
+    out = Path(_OUT.value)
+    metrics_file = Path(_JSON.value) if _JSON.value else out / "metrics.json"
+    _prepare(out, metrics_file)
+    views, measures = render(scene, budget, side, out)
+    shown = np.unique(np.linspace(0, len(views) - 1, _VIEWS_IN_COMPARISON).astype(int))
+    figures.write_comparison(
+        out / "comparison.png",
+        [
+            figures.Comparison(scene.frames.names[i], scene.images[i] / 255.0, views[i].rgb)
+            for i in shown
+        ],
+    )
+    summary = summarise(scene, budget, views, measures)
+    text = json.dumps(commands.string_safe(summary), indent=2, allow_nan=False)
+    metrics_file.write_text(text + "\n", encoding="utf-8")
+    _report(summary)
+    print(f"Pictures: {out / 'comparison.png'}, {out / 'rgb'}")
+    print(f"Metrics:  {metrics_file}")
+    print(
+        f"Next: python -m experiments.path_trade_off --scenes={_SCENE.value} "
+        f"--out={out / 'trade_off'}"
+    )
+
+
+def render(
+    scene: KnownScene, budget: Budget, side: int, out: Path
+) -> tuple[list[View], list[dict[str, Any]]]:
+    """Renders and measures all views, and writes the pictures."""
+    views, measures = [], []
+    print(f"Compiling for {scene.name}, {_PATHS.value} ...", flush=True)
+    known_scenes.warm_up(scene, budget)
+    with commands.ProgressBar("render", len(scene.indices)) as bar:
+        for i, (index, name) in enumerate(zip(scene.indices, scene.frames.names, strict=True)):
+            view = known_scenes.render_view(scene, i, budget=budget, side=side)
+            files.write_rgb(out / "rgb" / f"{name}.png", view.rgb)
+            measured = known_scenes.measure(scene, i, view.rgb)
+            views.append(view)
+            measures.append({"index": index, "name": name, **measured})
+            bar.show(i + 1, f"{name}  PSNR {measured['psnr']:.2f}")
+    return views, measures
+
+
+def summarise(
+    scene: KnownScene, budget: Budget, views: list[View], measures: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """Returns what the JSON holds."""
+    keys = ("psnr", "psnr_masked", "psnr_outside")
+    return {
+        "scene": scene.name,
+        "paths": _PATHS.value,
+        "cut": budget.cut,
+        "bends": budget.bends,
+        "views": measures,
+        "mean": {key: known_scenes.mean_of(measures, key) for key in keys},
+        "casts_per_pixel": float(np.mean([view.casts for view in views])),
+        "paths_per_pixel": float(np.mean([view.paths for view in views])),
+        "seconds": sum(view.seconds for view in views),
+        "lost_energy": float(np.mean([view.lost for view in views])),
+    }
+
+
+def _prepare(out: Path, metrics_file: Path) -> None:
+    """Makes room for results; those of an earlier call go first, and it is said."""
+    if metrics_file.exists() and not _is_ours(metrics_file):
+        raise ValueError(
+            f"{metrics_file} exists and is not of this command. Remove it, or give another --json."
+        )
+    (out / "rgb").mkdir(parents=True, exist_ok=True)
+    metrics_file.parent.mkdir(parents=True, exist_ok=True)
+    earlier = [*(out / "rgb").glob("*.png"), *[metrics_file] * metrics_file.exists()]
+    if earlier:
+        print(f"Replacing the results of an earlier rendering in {out}.")
+    for path in earlier:
+        path.unlink()
+
+
+def _is_ours(path: Path) -> bool:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        return False
+    return isinstance(content, dict) and set(content) >= _KEYS
+
+
+def _report(summary: dict[str, Any]) -> None:
+    for key in ("psnr", "psnr_masked", "psnr_outside"):
+        value = summary["mean"][key]
+        print(f"{key:>16}  {'-' if value is None else format(value, '.2f') + ' dB'}")
+    for key in ("casts_per_pixel", "paths_per_pixel"):
+        print(f"{key:>16}  {summary[key]:.3f}")
+    print(f"{'seconds':>16}  {summary['seconds']:.2f}")
+    print(f"{'lost_energy':>16}  {summary['lost_energy']:.2g}")
+    if summary["lost_energy"] > _WORTH_A_WARNING:
+        print(
+            "warning: some light found no room, and is missing from the pictures. Give a larger "
+            "--cut, or fewer --bends."
+        )
+
+
+if __name__ == "__main__":
+    commands.run(main)

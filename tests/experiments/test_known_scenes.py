@@ -1,0 +1,199 @@
+"""The commands that need no learning, on a few views of the bundled scene."""
+
+import csv
+import dataclasses
+import json
+import shutil
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from experiments import known_scenes
+from refref_jax.data import files
+from refref_jax.render import BUDGETS
+from tests.experiments.command import ROOT, run_command
+
+_SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
+_QUICK = ("--views=0,10", "--rays_per_pixel=1")
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    """The folder of a rendering with the tree, and what was printed."""
+    out = tmp_path_factory.mktemp("known") / "tree"
+    result = run_command(
+        "render_known", f"--scene={_SCENE}", "--paths=tree", f"--out={out}", *_QUICK
+    )
+    return out, result.stdout
+
+
+def test_a_rendering_is_measured_and_pictured(rendered):
+    out, printed = rendered
+    summary = json.loads((out / "metrics.json").read_text())
+    assert set(summary) == {
+        "scene",
+        "paths",
+        "cut",
+        "bends",
+        "views",
+        "mean",
+        "casts_per_pixel",
+        "paths_per_pixel",
+        "seconds",
+        "lost_energy",
+    }
+    assert (summary["scene"], summary["paths"]) == ("cube_smcvx_ball", "tree")
+    assert (summary["cut"], summary["bends"]) == (0.02, 24)
+    assert [view["index"] for view in summary["views"]] == [0, 10]
+    # The prototype's counts; those of one camera ray.
+    assert summary["casts_per_pixel"] == pytest.approx(2.22, rel=0.1)
+    assert summary["paths_per_pixel"] == pytest.approx(1.48, rel=0.1)
+    assert summary["seconds"] > 0.0 and 0.0 <= summary["lost_energy"] < 1e-3
+    for view in summary["views"]:
+        picture = files.read_rgb(out / "rgb" / f"{view['name']}.png") / 255.0
+        target = files.read_rgb(_SCENE / "test" / f"{view['name']}.png") / 255.0
+        mask = files.read_mask(_SCENE / "mask" / "test" / f"{view['name']}.png")
+        # The picture on disk is the one that was measured.
+        for key, where in (("psnr", mask | True), ("psnr_masked", mask), ("psnr_outside", ~mask)):
+            found = -10.0 * np.log10(np.mean((picture - target)[where] ** 2))
+            assert view[key] == pytest.approx(found, abs=0.1)
+    for key in ("psnr", "psnr_masked", "psnr_outside"):
+        values = [view[key] for view in summary["views"]]
+        assert summary["mean"][key] == pytest.approx(np.mean(values))
+    # One ray a pixel: what is left is mostly aliasing.
+    assert summary["mean"]["psnr_masked"] > 25.0
+    assert iio.imread(out / "comparison.png").ndim == 3
+    assert str(out / "metrics.json") in printed and "path_trade_off" in printed
+
+
+def test_results_are_replaced_with_a_word_and_other_files_not_at_all(rendered, tmp_path):
+    out, _ = rendered
+    ours = tmp_path / "again"
+    shutil.copytree(out, ours)
+    (ours / "notes.txt").write_text("mine")
+    measures = tmp_path / "measures.json"
+    options = (f"--scene={_SCENE}", "--paths=straight", f"--out={ours}", "--rays_per_pixel=4")
+    result = run_command("render_known", *options, "--views=3", f"--json={measures}")
+    assert "Replacing" in result.stdout
+    assert {path.name for path in (ours / "rgb").iterdir()} == {"r_003.png"}
+    assert (ours / "notes.txt").read_text() == "mine"
+    summary = json.loads(measures.read_text())
+    assert summary["casts_per_pixel"] == 0.0 and summary["paths_per_pixel"] == 1.0
+    measures.write_text("{}")
+    refused = run_command("render_known", *options, f"--json={measures}", fails=True)
+    assert "not of this command" in refused.stderr and measures.read_text() == "{}"
+
+
+def test_the_curve_has_a_row_for_every_setting(tmp_path):
+    out = tmp_path / "curve"
+    result = run_command(
+        "path_trade_off",
+        f"--scenes={_SCENE}",
+        f"--out={out}",
+        "--views=0",
+        "--rays_per_pixel=1",
+        "--cuts=0.2,0.02",
+        "--bends=24",
+    )
+    with (out / "path_trade_off.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["sweep"], row["name"]) for row in rows] == [
+        ("budget", "straight"),
+        ("budget", "paper"),
+        ("cut", "0.2"),
+        ("cut", "0.02"),
+        ("bends", "24"),
+    ]
+    decibels, casts = (
+        [float(row[key]) for row in rows] for key in ("psnr_masked", "casts_per_pixel")
+    )
+    assert decibels[0] < decibels[1] < decibels[3] and casts[0] == 0.0
+    assert casts[2] < casts[3] == casts[4]
+    assert all(float(row["seconds_per_pixel"]) > 0.0 for row in rows)
+    for sweep in ("cut", "bends"):
+        assert iio.imread(out / f"path_trade_off_{sweep}.png").ndim == 3
+    assert str(out / "path_trade_off.csv") in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--scene=nowhere",), "nowhere/transforms_test.json does not exist"),
+        (("--rays_per_pixel=5",), "square"),
+        (("--views=0,99",), "no view 99"),
+        (("--cut=1.5",), "cut"),
+        (("--out=README.md/x",), "README.md"),
+    ],
+)
+def test_mistakes_end_with_one_line_before_anything_is_written(tmp_path, options, message):
+    given = {"--scene": _SCENE, "--out": tmp_path / "out"}
+    given |= dict(option.split("=", 1) for option in options)
+    words = [f"{name}={value}" for name, value in given.items()]
+    refused = run_command("render_known", *words, fails=True)
+    assert message in refused.stderr and "Traceback" not in refused.stderr
+    assert len(refused.stderr.strip().splitlines()) == 1
+    assert "Compiling" not in refused.stdout
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [((f"--scenes={_SCENE},nowhere",), "nowhere"), (("--cuts=a",), "list of numbers")],
+)
+def test_a_curve_of_nothing_is_refused(tmp_path, options, message):
+    out = f"--out={tmp_path / 'out'}"
+    refused = run_command("path_trade_off", f"--scenes={_SCENE}", out, *options, fails=True)
+    assert message in refused.stderr and len(refused.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"), [("first", "--views=0,10,20"), ("1,1", "twice"), ("-1", "from 0 to 4")]
+)
+def test_views_that_do_not_exist(text, message):
+    with pytest.raises(ValueError, match=message):
+        known_scenes.parse_views(text, 5)
+
+
+def test_views_keep_their_order():
+    assert known_scenes.parse_views("3,0", 5) == (3, 0)
+    assert known_scenes.parse_views("all", 3) == (0, 1, 2)
+
+
+@pytest.mark.parametrize(("rays", "side"), [(1, 1), (4, 2), (9, 3), (16, 4), (49, 7)])
+def test_rays_make_a_square_grid(rays, side):
+    assert known_scenes.side_of(rays) == side
+
+
+@pytest.mark.parametrize("rays", [-4, 0, 2, 8, 10])
+def test_rays_that_do_not(rays):
+    with pytest.raises(ValueError, match="square"):
+        known_scenes.side_of(rays)
+
+
+def test_a_budget_keeps_what_is_not_given_and_grows_below_its_cut():
+    tree = BUDGETS["tree"]
+    assert known_scenes.make_budget("tree") == tree
+    assert known_scenes.make_budget("tree", cut=0.1, bends=3) == dataclasses.replace(
+        tree, cut=0.1, bends=3
+    )
+    fine = known_scenes.make_budget("tree", cut=tree.cut / 4.0)
+    assert fine.paths_per_ray == 2.0 * tree.paths_per_ray and fine.bends == tree.bends
+    # Never without bound.
+    assert known_scenes.make_budget("tree", cut=0.0).paths_per_ray < 10.0 * tree.paths_per_ray
+
+
+def test_measures_over_no_pixel_are_left_out():
+    views = [{"psnr": 30.0, "psnr_masked": None}, {"psnr": 40.0, "psnr_masked": 20.0}]
+    assert known_scenes.mean_of(views, "psnr") == 35.0
+    assert known_scenes.mean_of(views, "psnr_masked") == 20.0
+    assert known_scenes.mean_of(views[:1], "psnr_masked") is None
+
+
+def test_a_scene_without_a_known_background_is_named(tmp_path):
+    scene = tmp_path / "scene"
+    shutil.copytree(_SCENE, scene)
+    (scene / "scene.json").unlink()
+    out = tmp_path / "out"
+    refused = run_command("render_known", f"--scene={scene}", f"--out={out}", fails=True)
+    assert "The background is not known" in refused.stderr and not out.exists()

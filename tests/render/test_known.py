@@ -1,0 +1,121 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.data.cameras import image_rays
+from refref_jax.data.containment import parts_around
+from refref_jax.geometry.rays import Rays
+from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE
+from refref_jax.render import known, radiance_of, render_known
+from refref_jax.render.backgrounds import Environment, LinearTexture
+from tests import reference, scenes
+from tests.small_model import CAMERAS
+
+_BALL = scenes.ball(1.3, subdivisions=2)
+
+
+def _environment(seed=0):
+    return _environment_of(np.random.default_rng(seed).uniform(size=(8, 16, 3)))
+
+
+def _environment_of(texels):
+    return radiance_of(Environment(LinearTexture(jnp.asarray(texels, jnp.float32))))
+
+
+# As an environment it needs no compiling of its own.
+_WHITE = _environment_of(np.ones((8, 16, 3)))
+
+
+@pytest.fixture(scope="module")
+def geometry():
+    return scenes.geometry(_BALL)
+
+
+@pytest.fixture(scope="module")
+def rays():
+    return image_rays(CAMERAS, 0)
+
+
+@pytest.fixture(scope="module")
+def whole(geometry, rays):
+    return render_known(geometry, _environment(), rays, budget=TREE, tile=256)
+
+
+def test_straight_rays_see_the_background_itself(geometry, rays):
+    radiance = _environment()
+    seen = render_known(geometry, radiance, rays, budget=STRAIGHT, tile=100)
+    flat = (jnp.asarray(x.reshape(-1, 3)) for x in rays[:2])
+    expected = jax.vmap(radiance)(*flat).reshape(seen.linear.shape)
+    np.testing.assert_allclose(seen.linear, expected, rtol=1e-5)
+    assert seen.casts == 0 and np.all(seen.paths == 1) and np.all(seen.lost == 0.0)
+
+
+def test_an_image_has_the_shape_of_its_rays(whole):
+    assert whole.rgb.shape == whole.linear.shape == whole.lost.shape == (16, 16, 3)
+    assert whole.paths.shape == (16, 16)
+    srgb = np.clip(reference.linear_to_srgb(whole.linear), 0.0, 1.0)
+    np.testing.assert_allclose(whole.rgb, srgb, atol=1e-6)
+    # The corners miss the ball; its middle is seen along several paths.
+    assert whole.paths[0, 0] == 1 and whole.paths[8, 8] > 1
+
+
+@pytest.mark.parametrize("budget", [STRAIGHT, PAPER, TREE], ids=["straight", "paper", "tree"])
+def test_the_size_of_a_tile_does_not_matter(geometry, rays, budget):
+    one = render_known(geometry, _environment(), rays, budget=budget, tile=256)
+    pieces = render_known(geometry, _environment(), rays, budget=budget, tile=100)
+    np.testing.assert_allclose(pieces.linear, one.linear, atol=1e-5)
+    np.testing.assert_array_equal(pieces.paths, one.paths)
+    assert pieces.casts == one.casts
+
+
+@pytest.mark.parametrize("budget", [PAPER, TREE], ids=["paper", "tree"])
+def test_clear_glass_before_white_is_white(geometry, rays, budget):
+    seen = render_known(geometry, _WHITE, rays, budget=budget, tile=256)
+    np.testing.assert_allclose(seen.linear + seen.lost, 1.0, atol=1e-5)
+
+
+def test_lost_light_is_told(geometry, rays):
+    tight = dataclasses.replace(TREE, cut=0.0, bends=6, paths_per_ray=1.0)
+    seen = render_known(geometry, _WHITE, rays, budget=tight, tile=256)
+    assert np.max(seen.lost) > 0.0
+    np.testing.assert_allclose(seen.linear + seen.lost, 1.0, atol=1e-5)
+
+
+def test_a_function_of_the_user_s_sees_origins_and_directions(geometry, rays):
+    seen = render_known(geometry, lambda o, d: o / 10.0 + d + 2.0, rays, budget=STRAIGHT, tile=256)
+    np.testing.assert_allclose(seen.linear, rays.origins / 10.0 + rays.directions + 2.0, rtol=1e-6)
+
+
+def test_backgrounds_are_arguments_of_one_program(geometry, rays):
+    first = render_known(geometry, _environment(1), rays, budget=TREE, tile=256)
+    compiled = known._render_tile._cache_size()
+    second = render_known(geometry, _environment(2), rays, budget=TREE, tile=256)
+    assert known._render_tile._cache_size() == compiled
+    assert np.max(np.abs(first.linear - second.linear)) > 0.1
+
+
+def test_no_rays_give_an_empty_rendering(geometry):
+    none = Rays(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
+    seen = render_known(geometry, _WHITE, none, budget=TREE)
+    assert seen.linear.shape == (0, 3) and seen.paths.shape == (0,) and seen.casts == 0
+
+
+def test_a_tile_without_rays_is_refused(geometry, rays):
+    with pytest.raises(ValueError, match="Give 1 or more"):
+        render_known(geometry, _WHITE, rays, budget=TREE, tile=0)
+
+
+def test_a_camera_inside_a_body_is_told_by_the_rule_of_priorities():
+    geometry = scenes.geometry(_BALL, rule="priority")
+    rays = scenes.rays([[0.0, 0.0, 0.0]] * 3, np.eye(3))
+    inside = parts_around([_BALL], np.asarray(rays.origins))
+    budget = dataclasses.replace(TREE, reflections="none")
+    # Seen from its centre a ball bends nothing, so directions stay as they are.
+    seen = render_known(
+        geometry, lambda o, d: d + 1.0 + 0.0 * o, rays, budget=budget, inside=inside, tile=4
+    )
+    np.testing.assert_allclose(seen.linear, 1.0 + np.eye(3), atol=0.05)
+    assert seen.casts == 6
