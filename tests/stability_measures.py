@@ -8,6 +8,7 @@ import numpy as np
 
 from tests import stability_cases as cases
 from tests import stability_laws as laws
+from tests import stability_light as light
 from tests.stability_laws import Found
 
 
@@ -55,12 +56,12 @@ MEASURES = [
     Measure("spheres of 80 triangles and more", "rad", cases.sizes, 5e-6),
     Measure("1,310,720 triangles", "rad", cases.a_million_triangles, 5e-6, slow=True),
     Measure("through vertices and edges", "share of rays", cases.vertices_and_edges, 1e-3),
-    Measure("in faces and along edges", "light", cases.edge_on, 1e-5),
-    Measure("starting on surfaces", "light", cases.on_surfaces, 1e-5),
-    Measure("nested and overlapping bodies", "light", cases.nested_and_overlapping, 1e-5),
-    Measure("broken meshes", "light", cases.broken_meshes, 1e-5),
-    Measure("whispering gallery", "light", cases.whispering_gallery, 1e-5),
-    Measure("index-matched bodies", "unit", cases.index_matched, 1e-5),
-    Measure("there and back", "rad", cases.reversibility, 1e-4),
-    Measure("white furnace, also overflowing", "light", cases.white_furnace, 1e-5),
+    Measure("in faces and along edges", "light", light.edge_on, 1e-5),
+    Measure("starting on surfaces", "light", light.on_surfaces, 1e-5),
+    Measure("nested and overlapping bodies", "light", light.nested_and_overlapping, 1e-5),
+    Measure("broken meshes", "light", light.broken_meshes, 1e-5),
+    Measure("whispering gallery", "light", light.whispering_gallery, 1e-5),
+    Measure("index-matched bodies", "unit", light.index_matched, 1e-5),
+    Measure("there and back", "rad", light.reversibility, 1e-4),
+    Measure("white furnace, also overflowing", "light", light.white_furnace, 1e-5),
 ]
