@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.geometry import bvh, bvh_build
+from refref_jax.geometry import bvh, bvh_build, lockstep_traversal
 from refref_jax.geometry.rays import Rays
 from tests import reference
 
@@ -17,7 +17,10 @@ _DISTANCE_TOLERANCE = 2e-5
 @functools.partial(jax.jit, static_argnames="lockstep")
 def _trace(tree, origins, directions, limits, leaving, *, lockstep=False):
     if lockstep:
-        return bvh._hits_in_lockstep(tree, origins, directions, limits, leaving)
+        nodes = tree.nodes.reshape(-1, 8)
+        walk = jax.vmap(lockstep_traversal.trace_ray, in_axes=(None, None, 0, 0, 0, 0))
+        found = walk(nodes, tree.facets, origins, directions, limits, leaving)
+        return bvh._finish(tree, origins, directions, *found)
     rays = Rays(origins, directions, jnp.zeros(len(origins)))
     return bvh.closest_hits(tree, rays, limits=limits, leaving=leaving)
 
@@ -145,8 +148,10 @@ def test_packets_and_lockstep_give_the_same_hits(count):
     origins, directions = _random_rays(count)
     packets = _closest(triangles, origins, directions)
     lockstep = _closest(triangles, origins, directions, lockstep=True)
-    for ours, theirs in zip(packets, lockstep, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
+    np.testing.assert_array_equal(packets[1], lockstep[1])
+    # Multiply-adds are fused differently: the last places differ.
+    np.testing.assert_allclose(packets[0], lockstep[0], rtol=2e-6)
+    np.testing.assert_allclose(packets[2], lockstep[2], atol=2e-5)
 
 
 def test_an_empty_scene_is_missed():
@@ -171,8 +176,10 @@ def test_degenerate_and_duplicate_triangles_do_no_harm():
 def test_triangles_in_one_place_still_make_a_tree():
     triangles = np.repeat(_soup(1), 50, axis=0)
     tree, _ = bvh_build.build(triangles.astype(np.float32))
-    assert tree.leaves[:, 1].max() <= bvh.LEAF_SIZE
-    assert tree.leaves[:, 1].sum() == 50
+    starts = np.sort(tree.nodes[0, :-1, 7])
+    counts = np.diff(np.append(starts[starts > 0], 51))
+    assert counts.sum() == 50
+    assert counts.max() <= bvh.LEAF_SIZE
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e3, -1e4])
@@ -228,17 +235,25 @@ def test_barycentrics_give_back_the_hit_point():
 def test_the_tree_holds_every_face_once_and_bounds_it(faces):
     triangles = _soup(faces).astype(np.float32)
     tree, slots = bvh_build.build(triangles)
-    held = np.concatenate([np.arange(f, f + n) for f, n in tree.leaves])
-    np.testing.assert_array_equal(np.sort(held), np.arange(faces))
     np.testing.assert_array_equal(np.sort(slots[:faces]), np.arange(faces))
-    for node, (first, count) in enumerate(tree.leaves):
-        below = slice(node, tree.skips[node])
-        slots_below = np.concatenate([np.arange(f, f + n) for f, n in tree.leaves[below]])
-        corners = tree.triangles[slots_below].reshape(-1, 3)
-        np.testing.assert_array_equal(tree.boxes[node, 0], corners.min(axis=0))
-        np.testing.assert_array_equal(tree.boxes[node, 1], corners.max(axis=0))
-        assert (count > 0) == (tree.skips[node] == node + 1)
-        assert first + count <= faces
+    for octant, table in enumerate(tree.nodes):
+        rows = table[:-1]
+        skips, leaves = rows[:, 6] - octant * len(table), rows[:, 7]
+        starts = np.sort(leaves[leaves > 0] - 1)
+        counts = np.diff(np.append(starts, faces))
+        assert starts[0] == 0
+        assert counts.min() >= 1 and counts.max() <= bvh.LEAF_SIZE
+        corners = rows[:, :6].copy().view(np.float32).reshape(-1, 2, 3)
+        held = dict(zip(starts, counts, strict=True))
+        for node, (entry, exit) in enumerate(corners):
+            below = leaves[node : skips[node]]
+            runs = [np.arange(s, s + held[s]) for s in below[below > 0] - 1]
+            points = tree.triangles[np.concatenate(runs)].reshape(-1, 3)
+            lower, upper = np.minimum(entry, exit), np.maximum(entry, exit)
+            assert np.all(lower < points.min(axis=0)) and np.all(points.max(axis=0) < upper)
+            np.testing.assert_allclose([lower, upper], [points.min(0), points.max(0)], atol=1e-6)
+            assert (leaves[node] > 0) == (skips[node] == node + 1)
+        assert table[-1, 7] == -1
 
 
 def test_a_coordinate_that_is_not_finite_is_an_error():

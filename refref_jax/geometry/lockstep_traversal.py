@@ -1,0 +1,86 @@
+"""Closest hits with every ray walking alone and all in lock-step, for an accelerator.
+
+One loop, whose state is a row of the node table and the hit so far: under `vmap` it becomes one
+loop over all rays, which ends with the slowest of them.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from refref_jax.geometry import boxes, facets, node_table
+
+
+class _Walk(NamedTuple):
+    """State of a ray's walk: the next node, and the closest hit so far."""
+
+    node: Int[Array, ""]
+    distance: Float[Array, ""]
+    slot: Int[Array, ""]
+
+
+def trace_ray(
+    nodes: Int[Array, "rows 8"],
+    triangles: Float[Array, "slots 12"],
+    origin: Float[Array, "3"],
+    direction: Float[Array, "3"],
+    limit: Float[Array, ""],
+    leaving: Int[Array, ""],
+) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """Traces one ray.
+
+    Args:
+      nodes: the tables of all octants, one after the other.
+      triangles: facets by slot.
+      origin: start of the ray.
+      direction: unit vector.
+      limit: farthest distance of interest, negative for a ray that is not to be traced.
+      leaving: slot that the ray can not hit.
+
+    Returns:
+      The distance of the closest hit, else the limit, and its slot, else `NONE`.
+    """
+    slabs = boxes.slabs(origin, direction)
+    rows = nodes.shape[0] // node_table.OCTANTS
+    root = boxes.octant(direction) * rows
+    end = root + rows - 1
+
+    def advance(walk: _Walk) -> _Walk:
+        node = node_table.read_node(nodes, walk.node)
+        hit = boxes.overlaps(slabs, node.entry, node.exit, walk.distance)
+        tested = hit & (node.leaf > 0)
+        distance, slot = jax.lax.cond(
+            tested,
+            lambda: _test_leaf(triangles, origin, direction, leaving, node.leaf - 1, walk),
+            lambda: (walk.distance, walk.slot),
+        )
+        return _Walk(jnp.where(hit, walk.node + 1, node.skip), distance, slot)
+
+    start = _Walk(
+        jnp.where(limit >= 0.0, root, end), limit, jnp.full_like(leaving, node_table.NONE)
+    )
+    walk = jax.lax.while_loop(lambda walk: walk.node < end, advance, start)
+    return walk.distance, walk.slot
+
+
+def _test_leaf(
+    triangles: Float[Array, "slots 12"],
+    origin: Float[Array, "3"],
+    direction: Float[Array, "3"],
+    leaving: Int[Array, ""],
+    first: Int[Array, ""],
+    walk: _Walk,
+) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """Keeps the closer of the hit so far and those of one leaf; ties go to the lower slot."""
+    distance, slot = walk.distance, walk.slot
+    for offset in range(node_table.LEAF_SIZE):
+        candidate = first + offset
+        facet = node_table.read_row(triangles, candidate)
+        found = facets.distance(origin, direction, facet)
+        closer = (found < distance) | ((found == distance) & (candidate < slot))
+        closer = closer & (candidate != leaving)
+        distance = jnp.where(closer, found, distance)
+        slot = jnp.where(closer, candidate, slot)
+    return distance, slot

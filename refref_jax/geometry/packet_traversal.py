@@ -1,0 +1,196 @@
+"""Closest hits by packets of rays that walk the tree together, for a CPU.
+
+A packet shares one node index and descends where any of its rays hits. Its rays are arranged
+component by component, so that XLA turns each operation of the one-ray functions in `boxes` and
+`facets` into one vector instruction. Packets run one after the other; one without a live ray
+costs next to nothing.
+
+A packet takes the node table of its rays' octant. Where its rays are of several octants it walks
+once for each, with the others asleep.
+
+Source: Wald et al., Interactive Rendering with Coherent Ray Tracing (2001), for packets; Smits,
+Efficiency Issues for Ray Tracing (1998), for skip pointers.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from refref_jax.geometry import boxes, facets, node_table
+from refref_jax.geometry.native_loop import native_loop
+
+PACKET = 16
+"""Rays in a packet: two vectors of eight, which hide each other's latency."""
+
+_DONE = node_table.OCTANTS
+"""In place of the octant of a ray that needs no walk any more."""
+
+
+class Packet(NamedTuple):
+    """Rays that walk together, or many packets of them along a leading axis.
+
+    Attributes:
+      origins, directions: of the rays.
+      slabs: the rays prepared for boxes.
+      octants: of the directions, `_DONE` for a ray that is not to be traced.
+      limits: farthest distance of interest.
+      leaving: slot that a ray can not hit.
+    """
+
+    origins: Float[Array, "*packets 3 rays"]
+    directions: Float[Array, "*packets 3 rays"]
+    slabs: boxes.Slabs
+    octants: Int[Array, "*packets rays"]
+    limits: Float[Array, "*packets rays"]
+    leaving: Int[Array, "*packets rays"]
+
+
+class Closest(NamedTuple):
+    """The closest hit so far: its distance, at first the limit, and its slot, at first `NONE`."""
+
+    distances: Float[Array, "*packets rays"]
+    slots: Int[Array, "*packets rays"]
+
+
+class _Rounds(NamedTuple):
+    """State of a packet's walks: the next octant, the octants left to do, the hits so far."""
+
+    octant: Int[Array, ""]
+    octants: Int[Array, " rays"]
+    closest: Closest
+
+
+class _Walk(NamedTuple):
+    """State of one walk: the next node, the leaf at hand (0 for none), the hits so far."""
+
+    node: Int[Array, ""]
+    leaf: Int[Array, ""]
+    closest: Closest
+
+
+@native_loop
+def trace(
+    nodes: Int[Array, "rows 8"], triangles: Float[Array, "slots 12"], packets: Packet
+) -> Closest:
+    """Traces packet after packet.
+
+    Args:
+      nodes: the tables of all octants, one after the other.
+      triangles: facets by slot.
+      packets: any number, along the leading axis.
+    """
+    return jax.lax.map(lambda packet: _trace_packet(nodes, triangles, packet), packets)
+
+
+def _trace_packet(nodes: Int[Array, "rows 8"], triangles: Array, packet: Packet) -> Closest:
+    """Walks once for each octant that the packet's rays have."""
+
+    def walk_octant(rounds: _Rounds) -> _Rounds:
+        octant, octants, closest = rounds
+        awake = octants == octant
+        reach = jnp.where(awake, closest.distances, -1.0)
+        walked = _walk(nodes, triangles, packet, octant, Closest(reach, closest.slots))
+        distances = jnp.where(awake, walked.distances, closest.distances)
+        left = jnp.where(awake, _DONE, octants)
+        return _Rounds(jnp.min(left), left, Closest(distances, walked.slots))
+
+    nothing = Closest(packet.limits, jnp.full_like(packet.leaving, node_table.NONE))
+    start = _Rounds(jnp.min(packet.octants), packet.octants, nothing)
+    return jax.lax.while_loop(lambda rounds: rounds.octant < _DONE, walk_octant, start).closest
+
+
+def _walk(
+    nodes: Int[Array, "rows 8"],
+    triangles: Float[Array, "slots 12"],
+    packet: Packet,
+    octant: Int[Array, ""],
+    closest: Closest,
+) -> Closest:
+    """Walks the table of one octant, at most one visit a node, and tests the leaves it meets.
+
+    The loop over nodes between two leaves changes nothing but two numbers; the hits stay where
+    they are.
+    """
+
+    def find_leaf(node: Array, reach: Array) -> tuple[Array, Array]:
+        return jax.lax.while_loop(
+            lambda state: state[1] == 0,
+            lambda state: _visit_two(nodes, packet.slabs, reach, state[0]),
+            (node, jnp.zeros_like(node)),
+        )
+
+    def advance(walk: _Walk) -> _Walk:
+        closest = _test_leaf(triangles, packet, walk.leaf - 1, walk.closest)
+        return _Walk(*find_leaf(walk.node, closest.distances), closest)
+
+    root = octant * (nodes.shape[0] // node_table.OCTANTS)
+    start = _Walk(*find_leaf(root, closest.distances), closest)
+    return jax.lax.while_loop(lambda walk: walk.leaf > 0, advance, start).closest
+
+
+def _visit_two(
+    nodes: Int[Array, "rows 8"],
+    slabs: boxes.Slabs,
+    reach: Float[Array, " rays"],
+    index: Int[Array, ""],
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """Visits a node and the one after it; the second visit does not count after a leaf.
+
+    A visit waits for the one before it, not for the processor's units: two in one pass of the
+    loop are a tenth faster than two passes.
+    """
+    after, leaf = _visit(nodes, slabs, reach, index)
+    then, next_leaf = _visit(nodes, slabs, reach, after)
+    return jnp.where(leaf != 0, after, then), jnp.where(leaf != 0, leaf, next_leaf)
+
+
+def _visit(
+    nodes: Int[Array, "rows 8"],
+    slabs: boxes.Slabs,
+    reach: Float[Array, " rays"],
+    index: Int[Array, ""],
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """Returns the node to visit after this one, and the leaf that this one is if it was hit.
+
+    The end of the table is always returned, so that a walk ends whatever the rays are.
+    """
+    node = node_table.read_node(nodes, index)
+    overlap = jax.vmap(boxes.overlaps, in_axes=(-1, None, None, 0))(
+        slabs, node.entry, node.exit, reach
+    )
+    hit = jnp.any(overlap)
+    leaf = jnp.where(hit, node.leaf, jnp.minimum(node.leaf, 0))
+    return jnp.where(hit, index + 1, node.skip), leaf
+
+
+def _test_leaf(
+    triangles: Float[Array, "slots 12"],
+    packet: Packet,
+    first: Int[Array, ""],
+    closest: Closest,
+) -> Closest:
+    """Keeps the closer of the hits so far and those of one leaf's triangles.
+
+    The triangles are tested independently of each other and compared afterwards. Of two at one
+    distance the lower slot wins, whatever the order of the walk.
+    """
+    best = None
+    for offset in range(node_table.LEAF_SIZE):
+        slot = first + offset
+        facet = node_table.read_row(triangles, slot)
+        distances = jax.vmap(facets.distance, in_axes=(-1, -1, None))(
+            packet.origins, packet.directions, facet
+        )
+        found = Closest(
+            jnp.where(packet.leaving == slot, jnp.inf, distances),
+            jnp.broadcast_to(slot, distances.shape),
+        )
+        best = found if best is None else _closer(found, best, found.distances < best.distances)
+    tied = (best.distances == closest.distances) & (best.slots < closest.slots)
+    return _closer(best, closest, (best.distances < closest.distances) | tied)
+
+
+def _closer(a: Closest, b: Closest, take: Array) -> Closest:
+    return Closest(*(jnp.where(take, x, y) for x, y in zip(a, b, strict=True)))

@@ -1,0 +1,89 @@
+"""The surface area heuristic over every split of every node of a level (NumPy only).
+
+A split sends the first `n` of a node's faces, in the order of their centroids along an axis, to
+the left. Its cost is `area(left) leaves(left) + area(right) leaves(right)`, with the number of full
+leaves that a side needs in place of its faces, since a leaf is tested as a whole.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from refref_jax.geometry.bvh import LEAF_SIZE
+
+
+def best_splits(
+    orders: list[Int[np.ndarray, " faces"]],
+    counts: Int[np.ndarray, " nodes"],
+    lower: Float[np.ndarray, "all 3"],
+    upper: Float[np.ndarray, "all 3"],
+) -> tuple[Int[np.ndarray, " nodes"], Int[np.ndarray, " nodes"]]:
+    """Finds the cheapest split of each node.
+
+    Args:
+      orders: faces by centroid along each axis, node after node.
+      counts: faces of each node, at least two.
+      lower: lower corner of every face's box.
+      upper: upper corner.
+
+    Returns:
+      How many faces go left, and along which axis. Of equally cheap splits along an axis the one
+      nearest to the middle is taken.
+    """
+    first = np.cumsum(counts) - counts
+    owner = np.repeat(np.arange(counts.size), counts)
+    taken = np.arange(owner.size) - first[owner] + 1
+    remaining = counts[owner] - taken
+    leaves_left, leaves_right = -(-taken // LEAF_SIZE), -(-remaining // LEAF_SIZE)
+    cheapest = np.full(counts.size, np.inf)
+    left, axis = np.zeros_like(counts), np.zeros_like(counts)
+    for direction, order in enumerate(orders):
+        area_left, area_right = _areas(order, owner, lower, upper)
+        cost = area_left * leaves_left
+        cost[:-1] += area_right[1:] * leaves_right[:-1]
+        cost[remaining == 0] = np.inf
+        lowest = np.minimum.reduceat(cost, first)
+        tied = np.flatnonzero(cost <= lowest[owner] * (1 + 1e-9))
+        off_middle = np.abs(taken[tied] - remaining[tied])
+        nearest = tied[np.lexsort((off_middle, owner[tied]))]
+        _, index = np.unique(owner[nearest], return_index=True)
+        better = lowest < cheapest
+        cheapest = np.where(better, lowest, cheapest)
+        left = np.where(better, taken[nearest[index]], left)
+        axis = np.where(better, direction, axis)
+    return left, axis
+
+
+def _areas(
+    order: Int[np.ndarray, " faces"],
+    owner: Int[np.ndarray, " faces"],
+    lower: Float[np.ndarray, "all 3"],
+    upper: Float[np.ndarray, "all 3"],
+) -> tuple[Float[np.ndarray, " faces"], Float[np.ndarray, " faces"]]:
+    """Returns half the area of the box around each node's faces up to, and from, every face."""
+    base, top = lower.min(axis=0).astype(np.float64), upper.max(axis=0).astype(np.float64)
+    before, after = [], []
+    for axis in range(3):
+        span = top[axis] - base[axis]
+        high = upper[order, axis] - base[axis]
+        low = top[axis] - lower[order, axis]
+        before.append(_running(high, owner, span) + _running(low, owner, span) - span)
+        back = owner[-1] - owner[::-1]
+        from_end = _running(high[::-1], back, span) + _running(low[::-1], back, span) - span
+        after.append(from_end[::-1])
+    return _half_area(*before), _half_area(*after)
+
+
+def _running(
+    values: Float[np.ndarray, " faces"], owner: Int[np.ndarray, " faces"], span: float
+) -> Float[np.ndarray, " faces"]:
+    """Returns the largest value so far within each owner's run; values are in `[0, span]`.
+
+    Every owner gets a storey of its own, above those before it, so that one accumulation serves
+    all. In double precision this costs `owners * span` units in the last place: nothing.
+    """
+    storey = owner * (2.0 * span)
+    return np.maximum.accumulate(values + storey) - storey
+
+
+def _half_area(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    return x * y + y * z + z * x

@@ -1,0 +1,213 @@
+"""All branches of light: closed forms, conservation, and lists that are too small."""
+
+import dataclasses
+import functools
+
+import jax
+import numpy as np
+import pytest
+
+from refref_jax.optics import path_tracing
+from refref_jax.optics.budgets import PAPER, TREE, Budget, room
+from refref_jax.optics.light_paths import PathStatus
+from tests import scenes
+
+_GLASS = 0.04
+"""Fresnel's R of glass head-on."""
+
+
+@functools.partial(jax.jit, static_argnames=("budget", "block"))
+def _trace_ends(geometry, rays, *, budget, block=8192):
+    return path_tracing.trace_ends(geometry, rays, budget=budget, block=block)
+
+
+def _ends(geometry, rays, **options):
+    traced = jax.tree.map(np.asarray, _trace_ends(geometry, rays, **options))
+    there = traced.ends.statuses != PathStatus.EMPTY
+    return jax.tree.map(lambda x: x[there], traced.ends), traced
+
+
+def _slab(**changes):
+    part = scenes.box((20.0, 20.0, 0.5), index=1.5)._replace(**changes)
+    return scenes.geometry(part)
+
+
+def _down():
+    return scenes.rays([0.3, 0.2, 3.0], [0.0, 0.0, -1.0])
+
+
+def _towards_a_ball(count=64):
+    generator = np.random.default_rng(1)
+    targets = generator.uniform(-0.7, 0.7, (count, 3))
+    return scenes.rays([-4.0, 0.0, 0.0], targets + np.array([4.0, 0.0, 0.0]))
+
+
+def _sums(ends, traced):
+    sums = traced.lost.copy()
+    np.add.at(sums, ends.rays, ends.weights)
+    return sums
+
+
+def test_a_slab_sends_light_both_ways_by_the_geometric_series():
+    # One ray has more paths than the mean ray of an image.
+    budget = Budget(5, "all", live_per_ray=20.0, segments_per_ray=40.0, paths_per_ray=20.0)
+    ends, traced = _ends(_slab(), _down(), budget=budget)
+    r, t = _GLASS, 1.0 - _GLASS
+    # Out by the top: at once, after 1 and after 3 inner reflections; by the bottom: after 0 and 2.
+    escaped = ends.statuses == PathStatus.ESCAPED
+    up = np.sort(ends.weights[escaped & (ends.directions[:, 2] > 0), 0])
+    down = np.sort(ends.weights[escaped & (ends.directions[:, 2] < 0), 0])
+    np.testing.assert_allclose(up, [t * t * r**3, t * t * r, r], rtol=1e-4)
+    np.testing.assert_allclose(down, [t * t * r * r, t * t], rtol=1e-4)
+    trapped = ends.weights[ends.statuses == PathStatus.OUT_OF_BENDS, 0]
+    np.testing.assert_allclose(trapped, [t * r**4], rtol=1e-4)
+    assert traced.casts == 11
+    np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-6)
+
+
+def test_a_cut_branch_leaves_its_share_to_its_sibling():
+    ends, traced = _ends(_slab(), _down(), budget=Budget(5, "all", cut=0.039))
+    # The inner reflection, 0.96 * 0.04, is below the cut: what enters leaves below, whole.
+    np.testing.assert_allclose(np.sort(ends.weights[:, 0]), [0.04, 0.96], atol=1e-6)
+    assert traced.casts == 4
+    ends, _ = _ends(_slab(), _down(), budget=Budget(5, "all", cut=0.041))
+    np.testing.assert_array_equal(ends.weights, 1.0)
+
+
+def test_where_both_branches_are_below_the_cut_the_stronger_one_takes_all():
+    ends, _ = _ends(_slab(tint=(0.4, 0.3, 0.2)), _down(), budget=Budget(5, "all", cut=0.5))
+    np.testing.assert_allclose(ends.weights, [[0.16, 0.09, 0.04]], rtol=1e-5)
+    assert ends.directions[0, 2] < 0.0
+
+
+def test_the_tint_colours_every_crossing_and_every_reflection():
+    tint = np.array([0.5, 0.8, 0.95])
+    ends, _ = _ends(_slab(tint=tuple(tint)), _down(), budget=Budget(3, "all"))
+    r, t = _GLASS, 1.0 - _GLASS
+    expected = {1: r * tint, 2: t * t * tint**2, 3: t * t * r * tint**3}
+    for bends, weight in expected.items():
+        escaped = (ends.bends == bends) & (ends.statuses == PathStatus.ESCAPED)
+        np.testing.assert_allclose(ends.weights[escaped], weight[None], rtol=1e-4)
+
+
+def test_absorption_takes_light_by_the_length_of_the_way_inside():
+    absorption = np.array([0.0, 1.0, 3.0])
+    ends, _ = _ends(_slab(absorption=tuple(absorption)), _down(), budget=Budget(3, "none"))
+    np.testing.assert_allclose(ends.weights[0], np.exp(-0.5 * absorption), rtol=1e-5)
+    slanted = scenes.rays([0.0, 0.0, 3.0], [0.6, 0.0, -0.8])
+    ends, _ = _ends(_slab(absorption=tuple(absorption)), slanted, budget=Budget(3, "none"))
+    length = 0.5 / np.sqrt(1.0 - (0.6 / 1.5) ** 2)
+    np.testing.assert_allclose(ends.weights[0], np.exp(-length * absorption), rtol=1e-5)
+
+
+def test_an_opaque_tint_leaves_no_path():
+    ends, traced = _ends(_slab(tint=(0.0, 0.0, 0.0)), _down(), budget=TREE)
+    assert len(ends.rays) == 0
+    assert np.all(traced.lost == 0.0)
+
+
+def test_a_total_reflection_may_end_the_path():
+    geometry = scenes.geometry(scenes.right_prism())
+    rays = scenes.rays([-2.0, 0.1, 0.3], [1.0, 0.0, 0.0])
+    budget = Budget(10, "none", total_reflection="ended")
+    ends, _ = _ends(geometry, rays, budget=budget)
+    assert ends.statuses[0] == PathStatus.TOTALLY_REFLECTED
+    np.testing.assert_allclose(ends.directions[0], [1.0, 0.0, 0.0], atol=1e-6)
+    followed, _ = _ends(geometry, rays, budget=Budget(10, "none"))
+    assert followed.statuses[0] == PathStatus.ESCAPED
+    np.testing.assert_allclose(followed.directions[0], [0.0, 0.0, -1.0], atol=1e-6)
+
+
+def test_light_that_goes_round_inside_a_ball_ends_by_its_budget():
+    geometry = scenes.geometry(scenes.ball(1.0, subdivisions=4))
+    inside = scenes.rays([0.98, 0.0, 0.0], [0.0, 1.0, 0.0])
+    ends, traced = _ends(geometry, inside, budget=TREE)
+    assert ends.statuses.tolist() == [PathStatus.OUT_OF_BENDS]
+    assert ends.bends[0] == TREE.bends
+    assert traced.casts == TREE.bends + 1
+
+
+@pytest.mark.parametrize("budget", [PAPER, TREE, Budget(6, "all"), Budget(6, "all", cut=0.3)])
+def test_untinted_light_is_conserved(budget):
+    ends, traced = _ends(scenes.geometry(scenes.ball(1.0)), _towards_a_ball(), budget=budget)
+    np.testing.assert_array_equal(traced.lost, 0.0)
+    np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("short_of", ["live_per_ray", "segments_per_ray", "paths_per_ray"])
+def test_a_list_that_is_too_small_drops_the_least_light_and_returns_it(short_of):
+    generous = Budget(6, "all", live_per_ray=50.0, segments_per_ray=90.0, paths_per_ray=50.0)
+    scarce = dataclasses.replace(generous, **{short_of: 1.5})
+    geometry, rays = scenes.geometry(scenes.ball(1.0)), _towards_a_ball()
+    full, nothing_lost = _ends(geometry, rays, budget=generous)
+    ends, traced = _ends(geometry, rays, budget=scarce)
+    assert np.all(nothing_lost.lost == 0.0)
+    assert traced.lost.max() > 0.0
+    np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-5)
+    if short_of == "paths_per_ray":
+        assert len(ends.rays) == room(scarce, 64).paths
+        strongest = np.sort(full.weights[:, 0])[::-1][: len(ends.rays)]
+        np.testing.assert_allclose(np.sort(ends.weights[:, 0])[::-1], strongest, rtol=1e-5)
+
+
+def _by_ray(ends):
+    order = np.lexsort((ends.directions[:, 0], -ends.weights[:, 0], ends.rays))
+    return jax.tree.map(lambda x: x[order], ends)
+
+
+@pytest.mark.parametrize("block", [1, 7, 64])
+def test_the_block_of_a_round_changes_nothing(block):
+    geometry = scenes.geometry(scenes.box((1.0, 1.2, 1.4)))
+    rays = _towards_a_ball(32)
+    expected, all_at_once = _ends(geometry, rays, budget=TREE)
+    found, in_blocks = _ends(geometry, rays, budget=TREE, block=block)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), _by_ray(found), _by_ray(expected)
+    )
+    assert in_blocks.casts == all_at_once.casts
+
+
+def test_ends_are_the_last_segments_of_the_paths():
+    geometry, rays = scenes.geometry(scenes.ball(1.0)), _towards_a_ball()
+    ends, _ = _ends(geometry, rays, budget=TREE)
+    trace = functools.partial(path_tracing.trace, budget=TREE, capacity=len(ends.rays))
+    paths = jax.tree.map(np.asarray, jax.jit(trace)(geometry, rays).paths)
+    each = np.arange(len(paths.bends))
+    lines = ends._replace(
+        origins=paths.points[each, paths.bends],
+        directions=paths.directions[each, paths.bends],
+        tau=paths.tau[each, paths.bends],
+        media=paths.media[each, paths.bends],
+        rays=paths.rays,
+        weights=paths.weights,
+        bends=paths.bends,
+        statuses=paths.statuses,
+    )
+    jax.tree.map(np.testing.assert_array_equal, _by_ray(lines), _by_ray(ends))
+
+
+def test_budgets_refuse_what_makes_no_sense():
+    for options, reason in [
+        ({"bends": -1}, "bends"),
+        ({"cut": 1.0}, "cut"),
+        ({"cut": -0.1}, "cut"),
+        ({"cut": float("nan")}, "cut"),
+        ({"reflections": "some"}, "reflections"),
+        ({"total_reflection": "maybe"}, "Total reflection"),
+        ({"paths_per_ray": 0.5}, "paths_per_ray"),
+        ({"live_per_ray": float("inf")}, "live_per_ray"),
+    ]:
+        with pytest.raises(ValueError, match=reason):
+            Budget(**{"bends": 3, "reflections": "all", **options})
+
+
+def test_nothing_is_nan_for_rays_that_meet_nothing_or_start_on_a_surface():
+    geometry = scenes.geometry(scenes.box())
+    rays = scenes.rays(
+        [[0.5, 0.1, 0.2], [0.5, 0.5, 0.5], [9.0, 0.0, 0.0], [0.0, 0.0, 0.0]],
+        [[1.0, 0.0, 0.0], [-1.0, -1.0, -1.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]],
+    )
+    with jax.debug_nans(True):
+        ends, traced = _ends(geometry, rays, budget=TREE)
+    np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-5)
+    assert all(np.all(np.isfinite(x)) for x in (ends.origins, ends.directions, ends.tau))
