@@ -1,0 +1,41 @@
+"""Errors at the extremes stay within their bounds, on a coarse lattice (docs/stability.md)."""
+
+import numpy as np
+import pytest
+
+from tests import stability_cases, stability_laws
+from tests.stability_measures import MEASURES
+
+
+def _case(measure):
+    return pytest.param(measure, id=measure.name, marks=[pytest.mark.slow] if measure.slow else [])
+
+
+@pytest.mark.parametrize("measure", [_case(measure) for measure in MEASURES])
+def test_the_worst_error_is_within_its_bound(measure):
+    found = measure.run(1)
+    assert found.cases > 0
+    assert found.worst <= measure.bound
+
+
+def test_the_lattice_reaches_what_it_claims():
+    cases = stability_laws.lattice(2)
+    cosine = -np.sum(cases.normals * cases.directions, axis=-1)
+    assert np.sum(cases.near == cases.far) > 10
+    assert cosine.min() < 1.1e-6
+    squared = 1.0 - (cases.near / cases.far) ** 2 * (1.0 - cosine**2)
+    assert np.sum(np.abs(squared) < 1e-5) > 10 and np.any(squared < 0)
+    assert (cases.near / cases.far).min() == pytest.approx(0.4)
+    assert (cases.near / cases.far).max() == pytest.approx(2.5)
+
+
+def test_needles_are_closed_and_thin():
+    body = stability_cases.paths.needles(2e-6)
+    edges = np.sort(body.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    assert np.all(np.unique(edges, axis=0, return_counts=True)[1] == 2)
+    corners = body.vertices[body.faces]
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
+    area = 0.5 * np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
+    )
+    assert np.max(sides.max(axis=1) ** 2 / (2.0 * area)) > 0.99e6
