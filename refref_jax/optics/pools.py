@@ -81,7 +81,7 @@ def shed(
 
     def drop(pool: Pool, lost: Float[Array, "rays 3"]) -> tuple[Pool, Float[Array, "rays 3"]]:
         weights, rays = pool.items.weights, pool.items.rays
-        filled = jnp.arange(rays.shape[0]) < pool.count
+        filled = jnp.arange(rays.shape[0], dtype=jnp.int32) < pool.count
         kept = strongest(filled, jnp.max(weights, axis=-1), jnp.int32(capacity))
         order = front_first(kept)
         items = jax.tree.map(lambda x: x[order], pool.items)

@@ -163,7 +163,7 @@ def _begin(rays: Rays, inside: Int[Array, "rays slots"], block: int, room: Room)
 
 def _round(geometry: Geometry, walk: _Walk, budget: Budget, block: int, room: Room) -> _Walk:
     """Casts one block, ends paths, and puts the children on the stack."""
-    live, alive = walk.next.items, jnp.arange(block) < walk.next.count
+    live, alive = walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
     hits = _cast(geometry, live.state, alive)
     arrival = jax.vmap(branching.arrive, in_axes=(None, 0, 0, 0))(
         geometry, live.state, hits.slots, hits.barycentrics
