@@ -70,8 +70,9 @@ def overlaps(
     """
     # Written out by components and with `where` instead of `minimum`, which would propagate NaN:
     # in a packet each line is then one instruction for eight rays.
-    enter_x, enter_y, enter_z = entry * ray.reciprocals - ray.entries
-    leave_x, leave_y, leave_z = exit * ray.reciprocals - ray.exits
+    kind = ray.reciprocals.dtype  # boxes are in single precision, whatever the rays are
+    enter_x, enter_y, enter_z = entry.astype(kind) * ray.reciprocals - ray.entries
+    leave_x, leave_y, leave_z = exit.astype(kind) * ray.reciprocals - ray.exits
     near = _larger(_larger(enter_x, enter_y), _larger(enter_z, jnp.zeros_like(enter_z)))
     far = _smaller(_smaller(leave_x, leave_y), leave_z) * _FAR_PADDING
     return near <= _smaller(far, limit)

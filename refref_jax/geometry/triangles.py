@@ -43,13 +43,13 @@ def intersect(
     edge_b = triangle[1] - triangle[0]
     edge_c = triangle[2] - triangle[0]
     p = jnp.cross(direction, edge_c)
-    determinant = jnp.dot(edge_b, p)
+    determinant = numerics.dot(edge_b, p)
     inverse = numerics.safe_divide(jnp.ones_like(determinant), determinant)
     to_origin = origin - triangle[0]
     q = jnp.cross(to_origin, edge_b)
-    u = jnp.dot(to_origin, p) * inverse
-    v = jnp.dot(direction, q) * inverse
-    distance = jnp.dot(edge_c, q) * inverse
+    u = numerics.dot(to_origin, p) * inverse
+    v = numerics.dot(direction, q) * inverse
+    distance = numerics.dot(edge_c, q) * inverse
     inside = (u >= -EDGE_TOLERANCE) & (v >= -EDGE_TOLERANCE) & (u + v <= 1.0 + EDGE_TOLERANCE)
     hit = (determinant != 0) & inside & (distance > 0)
     return Intersection(jnp.where(hit, distance, jnp.inf), jnp.stack([u, v]))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
-from refref_jax.geometry import surfaces
+from refref_jax.geometry import surfaces, triangles
 from refref_jax.geometry.bvh import NO_SLOT
 from refref_jax.optics import interaction, media, splitting
 from refref_jax.optics.budgets import Budget
@@ -85,10 +85,16 @@ def begin(
     )
 
 
-def arrive(
-    geometry: Geometry, state: RayState, slot: Int[Array, ""], barycentric: Float[Array, "2"]
-) -> Arrival:
-    """Follows a ray to a point of a triangle; without meaning for `NO_SLOT`, but finite."""
+def arrive(geometry: Geometry, state: RayState, slot: Int[Array, ""]) -> Arrival:
+    """Follows a ray to the triangle that it meets; without meaning for `NO_SLOT`, but finite.
+
+    Where it meets the triangle is computed anew, from the corners as they are: so it has gradients,
+    and the precision of the corners rather than that of the search.
+    """
+    corners = geometry.surfaces.bvh.triangles[slot]
+    found = triangles.intersect(state.origin, state.direction, corners).barycentric
+    # A ray that meets nothing looks at some triangle: neither value nor gradient may come of it.
+    barycentric = jnp.where(slot == NO_SLOT, 1.0 / 3.0, found)
     point = surfaces.surface_point(geometry.surfaces, slot, barycentric)
     # Or XLA would gather the triangle anew for every result that depends on it.
     point = jax.lax.optimization_barrier(point)

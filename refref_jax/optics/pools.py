@@ -110,8 +110,9 @@ def strongest(
     """
 
     def choose(mask: Bool[Array, " n"]) -> Bool[Array, " n"]:
-        order = jnp.argsort(jnp.where(mask, -strength, jnp.inf), stable=True)
-        rank = jnp.zeros_like(order).at[order].set(jnp.arange(mask.shape[0], dtype=order.dtype))
+        order = jnp.argsort(jnp.where(mask, -strength, jnp.inf), stable=True).astype(jnp.int32)
+        places = jnp.arange(mask.shape[0], dtype=jnp.int32)
+        rank = jnp.zeros_like(order).at[order].set(places)
         return mask & (rank < room)
 
     fits = jnp.sum(mask, dtype=jnp.int32) <= room

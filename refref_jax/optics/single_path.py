@@ -21,12 +21,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from refref_jax.geometry import triangles
 from refref_jax.geometry.bvh import NO_SLOT
 from refref_jax.geometry.closest_hit import closest_slot
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import branching, media
-from refref_jax.optics.branching import Arrival, Geometry, RayState
+from refref_jax.optics.branching import Geometry, RayState
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.light_paths import LightPaths, PathStatus
 
@@ -116,7 +115,7 @@ def _advance(
     limit = jnp.where(alive & walk.traced, jnp.inf, -1.0).astype(state.tau.dtype)
     slot = closest_slot(geometry.surfaces.bvh, state.origin, state.direction, limit, state.leaving)
     hit = slot != NO_SLOT
-    arrival = _arrive(geometry, state, slot, hit)
+    arrival = branching.arrive(geometry, state, slot)
     ended = jnp.where(
         walk.traced, branching.ending(budget, state, arrival, hit), PathStatus.NOT_TRACED
     )
@@ -137,17 +136,6 @@ def _advance(
 
 def _either(which: Bool[Array, ""], first: _Record, second: _Record) -> _Record:
     return jax.tree.map(lambda a, b: jnp.where(which, a, b), first, second)
-
-
-def _arrive(
-    geometry: Geometry, state: RayState, slot: Int[Array, ""], hit: Bool[Array, ""]
-) -> Arrival:
-    """Recomputes where the ray meets the triangle that was found, with gradients."""
-    corners = geometry.surfaces.bvh.triangles[slot]
-    found = triangles.intersect(state.origin, state.direction, corners).barycentric
-    # A ray that meets nothing looks at some triangle: no gradient may come of it.
-    barycentric = jnp.where(hit, found, 1.0 / 3.0)
-    return branching.arrive(geometry, state, slot, barycentric)
 
 
 def _record(ray: Rays, end: _Walk, segments: _Segment) -> LightPaths:

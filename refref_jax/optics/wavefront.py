@@ -165,9 +165,8 @@ def _round(geometry: Geometry, walk: _Walk, budget: Budget, block: int, room: Ro
     """Casts one block, ends paths, and puts the children on the stack."""
     live, alive = walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
     hits = _cast(geometry, live.state, alive)
-    arrival = jax.vmap(branching.arrive, in_axes=(None, 0, 0, 0))(
-        geometry, live.state, hits.slots, hits.barycentrics
-    )
+    arrive = jax.vmap(branching.arrive, in_axes=(None, 0, 0))
+    arrival = arrive(geometry, live.state, hits.slots)
     hit = alive & jnp.isfinite(hits.distances)
     status = jax.vmap(functools.partial(branching.ending, budget))(live.state, arrival, hit)
     bending = hit & (status == PathStatus.EMPTY)
