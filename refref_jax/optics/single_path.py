@@ -66,9 +66,9 @@ def follow_branch(
     geometry: Geometry,
     ray: Rays,
     reflects: Bool[Array, " bends"],
-    inside: Int[Array, " slots"] | None = None,
     *,
     budget: Budget,
+    inside: Int[Array, " slots"] | None = None,
 ) -> LightPaths:
     """Follows one ray along one branch.
 
@@ -77,8 +77,8 @@ def follow_branch(
       ray: one camera ray.
       reflects: for each bend whether to take the reflected branch; where reflection is total it is
         taken in any case. All false is the main path.
-      inside: the parts that the camera is in, for the rule `priority` (see `media`).
       budget: which light to follow; its `bends` must be the number of `reflects`.
+      inside: the parts that the camera is in, for the rule `priority` (see `media`).
 
     Returns:
       One path. Its weight is 0 where the budget does not follow the branch: where its light went

