@@ -92,6 +92,7 @@ def follow_branch(
             f"There are {reflects.shape[0]} choices for {budget.bends} bends. Give one choice for "
             "each bend of the budget."
         )
+    geometry, ray, reflects = jax.tree.map(jnp.asarray, (geometry, ray, reflects))
     if inside is None:
         inside = media.nowhere(geometry.interfaces)
     start = _Walk(
