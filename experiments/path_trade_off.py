@@ -19,9 +19,7 @@ from absl import flags
 from experiments import commands, known_scenes, scenes, trade_off_figures
 from experiments.known_scenes import KnownScene
 from experiments.trade_off_figures import Trial
-from refref_jax.data import local_layout
 from refref_jax.optics.budgets import BUDGETS, Budget
-from refref_jax.optics.interface_rules import RULES
 
 _SCENES = flags.DEFINE_list("scenes", None, "Folders of scenes, with commas.", required=True)
 _CUTS = flags.DEFINE_list(
@@ -32,21 +30,9 @@ _CUTS = flags.DEFINE_list(
 _BENDS = flags.DEFINE_list(
     "bends", ["1", "2", "4", "6", "10", "16", "24", "32"], "Most bends of a path."
 )
-_RAYS = flags.DEFINE_integer(
-    "rays_per_pixel", 9, "Rays in each pixel, a square: 1, 4, 9, 16. They are averaged."
-)
-_SPLIT = flags.DEFINE_enum("split", "test", list(local_layout.SPLITS), "Views to render.")
 _VIEWS = flags.DEFINE_string("views", "0,10", "Numbers of views of the split, as 0,10, or all.")
-_RULE = flags.DEFINE_enum(
-    "rule",
-    "nested",
-    list(RULES),
-    "What lies outside each mesh: the part around it, always air (as Cycles does it), or, of "
-    "meshes that overlap, the one with the highest 'priority' in scene.json.",
-)
-_IOR = flags.DEFINE_multi_string(
-    "ior", [], "Index of refraction of a material or a mesh, as glass=1.52. May be repeated."
-)
+flags.adopt_module_key_flags(scenes)
+flags.adopt_module_key_flags(known_scenes)
 _OUT = flags.DEFINE_string("out", None, "Folder to write to.", required=True)
 
 
@@ -67,7 +53,7 @@ class Setting(NamedTuple):
 def main() -> None:
     """Renders all scenes with all budgets."""
     plan = settings()
-    side = known_scenes.side_of(_RAYS.value)
+    side = known_scenes.side_of(known_scenes.RAYS_PER_PIXEL.value)
     # All scenes first: a broken one is named before anything is rendered.
     chosen = [_read(Path(scene)) for scene in _SCENES.value]
     out = Path(_OUT.value)
@@ -139,10 +125,10 @@ def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
 def _read(folder: Path) -> KnownScene:
     scene = known_scenes.read_scene(
         folder,
-        split=_SPLIT.value,
+        split=known_scenes.SPLIT.value,
         views=_VIEWS.value,
-        rule=_RULE.value,
-        indices=scenes.parse_indices(_IOR.value),
+        rule=scenes.RULE.value,
+        indices=scenes.given_indices(),
     )
     if scene.masks is None:
         raise ValueError(

@@ -19,9 +19,8 @@ from absl import flags
 
 from experiments import commands, figures, known_scenes, scenes
 from experiments.known_scenes import KnownScene, View
-from refref_jax.data import files, local_layout
+from refref_jax.data import files
 from refref_jax.optics.budgets import BUDGETS, Budget
-from refref_jax.optics.interface_rules import RULES
 
 _SCENE = flags.DEFINE_string("scene", None, "Folder of the scene.", required=True)
 _PATHS = flags.DEFINE_enum(
@@ -37,21 +36,9 @@ _CUT = flags.DEFINE_float(
 _BENDS = flags.DEFINE_integer(
     "bends", None, "Most refractions and reflections of a path; that of --paths if not given."
 )
-_RAYS = flags.DEFINE_integer(
-    "rays_per_pixel", 9, "Rays in each pixel, a square: 1, 4, 9, 16. They are averaged."
-)
-_SPLIT = flags.DEFINE_enum("split", "test", list(local_layout.SPLITS), "Views to render.")
 _VIEWS = flags.DEFINE_string("views", "all", "Numbers of views of the split, as 0,10,20, or all.")
-_RULE = flags.DEFINE_enum(
-    "rule",
-    "nested",
-    list(RULES),
-    "What lies outside each mesh: the part around it, always air (as Cycles does it), or, of "
-    "meshes that overlap, the one with the highest 'priority' in scene.json.",
-)
-_IOR = flags.DEFINE_multi_string(
-    "ior", [], "Index of refraction of a material or a mesh, as glass=1.52. May be repeated."
-)
+flags.adopt_module_key_flags(scenes)
+flags.adopt_module_key_flags(known_scenes)
 _OUT = flags.DEFINE_string("out", None, "Folder to write the pictures to.", required=True)
 _JSON = flags.DEFINE_string("json", None, "File for the measures; {out}/metrics.json by default.")
 
@@ -67,13 +54,13 @@ _KEYS = {"scene", "paths", "views", "casts_per_pixel"}
 def main() -> None:
     """Renders and measures the chosen views."""
     budget = known_scenes.make_budget(_PATHS.value, cut=_CUT.value, bends=_BENDS.value)
-    side = known_scenes.side_of(_RAYS.value)
+    side = known_scenes.side_of(known_scenes.RAYS_PER_PIXEL.value)
     scene = known_scenes.read_scene(
         Path(_SCENE.value),
-        split=_SPLIT.value,
+        split=known_scenes.SPLIT.value,
         views=_VIEWS.value,
-        rule=_RULE.value,
-        indices=scenes.parse_indices(_IOR.value),
+        rule=scenes.RULE.value,
+        indices=scenes.given_indices(),
     )
     out = Path(_OUT.value)
     metrics_file = Path(_JSON.value) if _JSON.value else out / "metrics.json"

@@ -1,10 +1,24 @@
-"""What commands that read a scene's meshes share: the options' meaning, and the lint's report."""
+"""What commands that read a scene's meshes share: their options, and the lint's report."""
 
 from collections.abc import Sequence
+
+from absl import flags
 
 from refref_jax.data import lint, rule_advice
 from refref_jax.data.containment import Containment
 from refref_jax.data.meshes import MeshPart
+from refref_jax.optics.interface_rules import RULES
+
+RULE = flags.DEFINE_enum(
+    "rule",
+    "nested",
+    list(RULES),
+    "What lies outside each mesh: the part around it, always air (as Cycles does it), or, of "
+    "meshes that overlap, the one with the highest 'priority' in scene.json.",
+)
+IOR = flags.DEFINE_multi_string(
+    "ior", [], "Index of refraction of a material or a mesh, as glass=1.52. May be repeated."
+)
 
 
 def report_meshes(parts: Sequence[MeshPart], tree: Containment, *, rule: str) -> None:
@@ -27,14 +41,14 @@ def report_meshes(parts: Sequence[MeshPart], tree: Containment, *, rule: str) ->
         raise ValueError(f"the meshes must be mended first.\n{told}")
 
 
-def parse_indices(words: Sequence[str]) -> dict[str, float]:
+def given_indices() -> dict[str, float]:
     """Returns the indices of refraction that `--ior=NAME=NUMBER` options give.
 
     Raises:
       ValueError: if one is not of that form.
     """
     indices = {}
-    for word in words:
+    for word in IOR.value:
         name, separator, number = word.partition("=")
         try:
             indices[name] = float(number)

@@ -43,16 +43,7 @@ _INTERIOR = flags.DEFINE_enum(
     ["field", "clear"],
     "'field' also learns what is inside the objects; 'clear' takes them to be clear.",
 )
-_RULE = flags.DEFINE_enum(
-    "rule",
-    "nested",
-    ["nested", "facing", "priority"],
-    "What lies outside each mesh: the part around it, always air (as Cycles does it), or, where "
-    "meshes overlap, the one with the highest 'priority' in scene.json.",
-)
-_IOR = flags.DEFINE_multi_string(
-    "ior", [], "Index of refraction of a material or a mesh, as glass=1.52. May be repeated."
-)
+flags.adopt_module_key_flags(scenes)
 _BACKGROUND = flags.DEFINE_enum(
     "background",
     "auto",
@@ -84,7 +75,18 @@ class Plan(NamedTuple):
 
 
 # What a run is begun with, and can not change when it is resumed.
-_SETTLED = (_PRESET, _PATHS, _INTERIOR, _RULE, _IOR, _BACKGROUND, _RADIUS, _STEPS, _BATCH, _SEED)
+_SETTLED = (
+    _PRESET,
+    _PATHS,
+    _INTERIOR,
+    scenes.RULE,
+    scenes.IOR,
+    _BACKGROUND,
+    _RADIUS,
+    _STEPS,
+    _BATCH,
+    _SEED,
+)
 
 
 def main() -> None:
@@ -120,7 +122,7 @@ def plan_from_flags() -> Plan:
     scene = Path(_SCENE.value).resolve()
     local_layout.check_scene(scene)
     frames = local_layout.read_frames(scene, "train")
-    indices = scenes.parse_indices(_IOR.value)
+    indices = scenes.given_indices()
     parts = meshes.read_meshes(scene, indices=indices)
     if not parts and _PATHS.value != "straight":
         raise ValueError(
@@ -128,7 +130,7 @@ def plan_from_flags() -> Plan:
             "meshes of the objects, or use --paths=straight."
         )
     tree = containment.find_containment(parts)
-    scenes.report_meshes(parts, tree, rule=_RULE.value)
+    scenes.report_meshes(parts, tree, rule=scenes.RULE.value)
     space = background.space(scene) if _BACKGROUND.value == "auto" else _BACKGROUND.value
     preset = PRESETS[_PRESET.value]
     radius = _RADIUS.value or (background.half_extent(scene) if space == "bounded" else None)
@@ -136,7 +138,7 @@ def plan_from_flags() -> Plan:
     check_batch(frames.cameras, _BATCH.value or preset.batch)
     schedule = preset.schedule.over(_STEPS.value or preset.schedule.steps)
     config = TrainingConfig(
-        scene=SceneConfig(str(scene), _RULE.value, tuple(sorted(indices.items()))),
+        scene=SceneConfig(str(scene), scenes.RULE.value, tuple(sorted(indices.items()))),
         paths=_PATHS.value,
         loss=preset.loss,
         schedule=schedule,
@@ -146,7 +148,7 @@ def plan_from_flags() -> Plan:
     )
     model = SavedModel(preset.model(extent, _INTERIOR.value), BUDGETS[_PATHS.value])
     clear = meshes.without_colour(parts)  # the field learns the colour of the objects
-    return Plan(config, model, build_geometry(clear, tree.parents, rule=_RULE.value))
+    return Plan(config, model, build_geometry(clear, tree.parents, rule=scenes.RULE.value))
 
 
 def train(run: Path) -> bool:
