@@ -33,7 +33,7 @@ _ROUNDS = flags.DEFINE_integer("rounds", 15, "Timed repeats of every case.")
 _MESHES = flags.DEFINE_list("meshes", [], "Meshes to trace; all by default.")
 _ANY_SPEED = flags.DEFINE_bool("any_speed", False, "Assert nothing about the speed.")
 
-_SIDE = 256
+_SIDE = 512
 _COUNT = _SIDE * _SIDE
 
 # The camera: where it stands, and half the width of its image at unit distance.
