@@ -40,55 +40,63 @@ def _order_by_digits(keys: UInt32[Array, " numbers"], bits: int) -> Int[Array, "
     passes = -(-bits // _DIGIT_BITS)
     width = -(-bits // passes)
     for low in range(0, bits, width):
-        digits = ((keys >> low) & (2**width - 1)).astype(jnp.uint32)
-        if low > 0:
-            digits = digits.at[order].get(mode="promise_in_bounds", unique_indices=True)
-        totals = _count(digits, jnp.zeros(2**width, jnp.int32))
-        order = _place(digits, order, jnp.cumsum(totals) - totals)
+        shift = jnp.uint32(low)
+        totals = _count(keys, shift, jnp.zeros(2**width, jnp.int32))
+        order = _place(keys, shift, order, jnp.cumsum(totals) - totals)
     return order
 
 
 @native_loop
 def _count(
-    digits: UInt32[Array, " numbers"], zeros: Int[Array, " values"]
-) -> Int[Array, " values"]:
+    keys: UInt32[Array, " numbers"], shift: UInt32[Array, ""], zeros: Int[Array, " digits"]
+) -> Int[Array, " digits"]:
     """Returns how often each digit occurs."""
 
     def count(index: Array, totals: Array) -> Array:
-        return _increase(totals, _read(digits, index.astype(jnp.uint32)))
+        return _increase(totals, _digit(_read(keys, index), shift, totals))
 
-    return jax.lax.fori_loop(0, digits.shape[0], count, zeros)
+    return jax.lax.fori_loop(0, keys.shape[0], count, zeros)
 
 
 @native_loop
 def _place(
-    digits: UInt32[Array, " numbers"],
-    values: Int[Array, " numbers"],
-    starts: Int[Array, " values"],
+    keys: UInt32[Array, " numbers"],
+    shift: UInt32[Array, ""],
+    order: Int[Array, " numbers"],
+    starts: Int[Array, " digits"],
 ) -> Int[Array, " numbers"]:
-    """Returns the values in order of their digits; those of one digit go from its start on."""
+    """Returns the numbers of the keys by digit; those of one digit go from its start on."""
 
     def place(index: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         ends, placed = state
-        index = index.astype(jnp.uint32)
-        digit = _read(digits, index)
+        number = _read(order, index)
+        digit = _digit(_read(keys, number), shift, ends)
         # The place is read from the counters after their update: if the old ones were still in
         # use, XLA would copy all of them for every number.
         ends = _increase(ends, digit)
-        target = (_read(ends, digit) - 1).astype(jnp.uint32)
-        return ends, _write(placed, target, _read(values, index))
+        return ends, _write(placed, _read(ends, digit) - 1, number)
 
-    start = (starts, jnp.zeros_like(values))
-    return jax.lax.fori_loop(0, digits.shape[0], place, start)[1]
-
-
-def _increase(counters: Int[Array, " values"], which: UInt32[Array, ""]) -> Int[Array, " values"]:
-    return _write(counters, which, _read(counters, which) + 1)
+    start = (starts, jnp.zeros_like(order))
+    return jax.lax.fori_loop(0, keys.shape[0], place, start)[1]
 
 
-def _read(values: Array, index: UInt32[Array, ""]) -> Array:
-    return jax.lax.dynamic_slice(values, (index,), (1,), allow_negative_indices=False)[0]
+def _digit(
+    key: UInt32[Array, ""], shift: UInt32[Array, ""], counters: Int[Array, " digits"]
+) -> Int[Array, ""]:
+    """Returns the digit of a key that begins at the bit `shift`."""
+    # Cut out before the loops, XLA would compute the keys anew for every pass.
+    return ((key >> shift) & (counters.shape[0] - 1)).astype(jnp.int32)
 
 
-def _write(values: Array, index: UInt32[Array, ""], value: Array) -> Array:
-    return jax.lax.dynamic_update_slice(values, value[None], (index,), allow_negative_indices=False)
+def _increase(counters: Int[Array, " digits"], digit: Int[Array, ""]) -> Int[Array, " digits"]:
+    return _write(counters, digit, _read(counters, digit) + 1)
+
+
+def _read(values: Array, index: Int[Array, ""]) -> Array:
+    start = (index.astype(jnp.uint32),)
+    return jax.lax.dynamic_slice(values, start, (1,), allow_negative_indices=False)[0]
+
+
+def _write(values: Array, index: Int[Array, ""], value: Array) -> Array:
+    start = (index.astype(jnp.uint32),)
+    return jax.lax.dynamic_update_slice(values, value[None], start, allow_negative_indices=False)
