@@ -64,6 +64,7 @@ def _split_all(
 ) -> tuple[list[Level], Int[np.ndarray, " faces"]]:
     """Splits until every node fits a leaf; returns the levels and the faces in leaf order."""
     centroids = 0.5 * lower + 0.5 * upper
+    scene = lower.min(axis=0).astype(np.float64), upper.max(axis=0).astype(np.float64)
     orders = [np.argsort(centroids[:, axis], kind="stable") for axis in range(3)]
     final = np.empty(len(lower), np.int64)
     level = Level(np.array([0]), np.array([len(lower)]), np.array([-1]))
@@ -77,7 +78,7 @@ def _split_all(
         if split.size == 0:
             return levels, final
         orders = [order[~small] for order in orders]
-        left, axis = best_splits(orders, counts[split], lower, upper)
+        left, axis = best_splits(orders, counts[split], lower, upper, scene)
         orders = _partition(orders, counts[split], left, axis)
         level.child[split] = 2 * np.arange(split.size)
         middle = level.start[split] + left

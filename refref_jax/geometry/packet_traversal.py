@@ -24,7 +24,7 @@ from refref_jax.geometry.native_loop import native_loop
 PACKET = 16
 """Rays in a packet: two vectors of eight, which hide each other's latency."""
 
-_VISITS = 3
+_VISITS = 2
 """Nodes visited in one pass of the loop."""
 
 _DONE = node_table.OCTANTS
@@ -142,7 +142,7 @@ def _visit_some(
     """Visits a node and those after it; what comes after a leaf does not count.
 
     A visit waits for the one before it, not for the processor's units, so some in one pass of the
-    loop are a tenth faster than a pass for each.
+    loop are up to a tenth faster than a pass for each.
     """
     index, leaf = _visit(nodes, slabs, reach, index)
     for _ in range(_VISITS - 1):

@@ -16,6 +16,7 @@ def best_splits(
     counts: Int[np.ndarray, " nodes"],
     lower: Float[np.ndarray, "all 3"],
     upper: Float[np.ndarray, "all 3"],
+    scene: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
 ) -> tuple[Int[np.ndarray, " nodes"], Int[np.ndarray, " nodes"]]:
     """Finds the cheapest split of each node.
 
@@ -24,6 +25,7 @@ def best_splits(
       counts: faces of each node, at least two.
       lower: lower corner of every face's box.
       upper: upper corner.
+      scene: lower and upper corner of the box around all faces, in double precision.
 
     Returns:
       How many faces go left, and along which axis. Of equally cheap splits along an axis the one
@@ -33,7 +35,6 @@ def best_splits(
     owner = np.repeat(np.arange(counts.size), counts)
     taken = np.arange(owner.size) - first[owner] + 1
     remaining = counts[owner] - taken
-    scene = lower.min(axis=0).astype(np.float64), upper.max(axis=0).astype(np.float64)
     leaves_left, leaves_right = -(-taken // LEAF_SIZE), -(-remaining // LEAF_SIZE)
     cheapest = np.full(counts.size, np.inf)
     left, axis = np.zeros_like(counts), np.zeros_like(counts)
