@@ -52,6 +52,7 @@ class Setting(NamedTuple):
 
 def main() -> None:
     """Renders all scenes with all budgets."""
+    _check_scenes()
     plan = settings()
     side = known_scenes.side_of(known_scenes.RAYS_PER_PIXEL.value)
     # All scenes first: a broken one is named before anything is rendered.
@@ -75,6 +76,18 @@ def main() -> None:
     print(f"Figures:  {', '.join(map(str, pictures))}")
     print(f"Measures: {table}")
     print("Next: choose a cut, and render with python -m experiments.render_known --cut=...")
+
+
+def _check_scenes() -> None:
+    """Refuses no scene at all, and names that plot and table could not tell apart."""
+    names = [Path(scene).resolve().name for scene in _SCENES.value]
+    if not names:
+        raise ValueError("No scene is given. Add --scenes=FOLDER,FOLDER.")
+    if len(set(names)) < len(names):
+        raise ValueError(
+            f"Two of the scenes have the same name: {', '.join(names)}. Rename a folder, or leave "
+            "one out."
+        )
 
 
 def settings() -> list[Setting]:

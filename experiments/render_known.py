@@ -47,6 +47,9 @@ _VIEWS_IN_COMPARISON = 4
 # A share of light that 8 bits may show.
 _WORTH_A_WARNING = 1e-3
 
+# Marks a folder whose pictures this command wrote, and may replace.
+_OWN = ".render_known"
+
 # By what a file of ours is known.
 _KEYS = {"scene", "paths", "views", "casts_per_pixel"}
 
@@ -131,11 +134,22 @@ def _prepare(out: Path, metrics_file: Path) -> None:
         )
     (out / "rgb").mkdir(parents=True, exist_ok=True)
     metrics_file.parent.mkdir(parents=True, exist_ok=True)
-    earlier = [*(out / "rgb").glob("*.png"), *[metrics_file] * metrics_file.exists()]
-    if earlier:
+    known = out / _OWN
+    strangers = sorted((out / "rgb").glob("*.png"))
+    if strangers and not known.exists():
+        raise ValueError(
+            f"{out / 'rgb'} holds pictures that are not of this command, as {strangers[0].name}. "
+            "Give another --out, or remove them."
+        )
+    known.touch()
+    # A file that can not be written is found now, not after the rendering.
+    with metrics_file.open("a", encoding="utf-8"):
+        pass
+    if strangers:
         print(f"Replacing the results of an earlier rendering in {out}.")
-    for path in earlier:
+    for path in strangers:
         path.unlink()
+    metrics_file.unlink()
 
 
 def _is_ours(path: Path) -> bool:
@@ -157,7 +171,7 @@ def _report(summary: dict[str, Any]) -> None:
     if summary["lost_energy"] > _WORTH_A_WARNING:
         print(
             "warning: some light found no room, and is missing from the pictures. Give a larger "
-            "--cut, or fewer --bends."
+            "--cut or fewer --bends, or, as a library, a Budget with larger capacity factors."
         )
 
 

@@ -32,6 +32,8 @@ def report_meshes(parts: Sequence[MeshPart], tree: Containment, *, rule: str) ->
         findings += rule_advice.examine_priorities(parts, tree)
     if parts:
         print(rule_advice.advise(parts, tree))
+    else:
+        print("note: there are no meshes, so all light goes straight.")
     errors = [finding for finding in findings if finding.severity == "error"]
     for finding in findings:
         if finding not in errors:

@@ -69,9 +69,10 @@ def write(folder: Path, trials: Sequence[Trial]) -> list[Path]:
       trials: of all scenes.
 
     Returns:
-      The files.
+      The files, none of a sweep that was not made.
     """
-    return [_write_sweep(folder, trials, sweep) for sweep in _SWEEPS]
+    made = {trial.sweep for trial in trials}
+    return [_write_sweep(folder, trials, sweep) for sweep in _SWEEPS if sweep in made]
 
 
 def _write_sweep(folder: Path, trials: Sequence[Trial], sweep: str) -> Path:

@@ -10,14 +10,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
+import numpy as np
 from absl import flags
 
 from experiments import commands, scenes
 from experiments.presets import PRESETS, bounds
 from refref_jax.data import background, containment, local_layout, meshes
 from refref_jax.data.batches import PixelSampler, check_batch
+from refref_jax.data.cameras import Cameras
 from refref_jax.data.geometry import build_geometry
 from refref_jax.optics.budgets import BUDGETS
+from refref_jax.optics.media import EMPTY_SLOT
 from refref_jax.optics.wavefront import Geometry
 from refref_jax.render import saved
 from refref_jax.render.saved import SavedModel
@@ -115,6 +118,15 @@ def _refuse_options(run: Path) -> None:
         )
 
 
+def _refuse_cameras_inside(parts: list[meshes.MeshPart], cameras: Cameras) -> None:
+    """Refuses cameras whose rays would have to know at once what they are in."""
+    if np.any(containment.parts_around(parts, cameras.poses[:, :, 3]) != EMPTY_SLOT):
+        raise ValueError(
+            "A camera stands inside a mesh, which training can not follow under --rule=priority. "
+            "Use --rule=nested, or move the camera."
+        )
+
+
 def plan_from_flags() -> Plan:
     """Reads and checks the scene, and resolves all options."""
     if _SCENE.value is None:
@@ -131,6 +143,8 @@ def plan_from_flags() -> Plan:
         )
     tree = containment.find_containment(parts)
     scenes.report_meshes(parts, tree, rule=scenes.RULE.value)
+    if scenes.RULE.value == "priority":
+        _refuse_cameras_inside(parts, frames.cameras)
     space = background.space(scene) if _BACKGROUND.value == "auto" else _BACKGROUND.value
     preset = PRESETS[_PRESET.value]
     radius = _RADIUS.value or (background.half_extent(scene) if space == "bounded" else None)

@@ -12,13 +12,16 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from refref_jax.data.errors import SceneError
+from refref_jax.data.facing_walls import spread_points
 from refref_jax.data.meshes import MeshPart
-from refref_jax.geometry.corner_normals import face_normals
+from refref_jax.geometry.corner_normals import face_normals, is_degenerate
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import EMPTY_SLOT, SLOTS
 
-# Faces of a part that are tested against each other part.
-_PROBES = 64
+# Points of a part that are tested against each other part: more against a coarse one, where they
+# cost little, and where a few of its faces may be cut without their middles being inside.
+_FEWEST_PROBES, _MOST_PROBES = 64, 2048
+_PROBED_PAIRS = 1 << 21
 
 # How far off a face its probes lie, on both sides, as a share of the part's size. Bodies that are
 # closer than that touch.
@@ -47,7 +50,7 @@ def find_containment(parts: Sequence[MeshPart]) -> Containment:
     contains = np.zeros((count, count), bool)
     overlaps = set()
     for inner, outer in itertools.permutations(range(count), 2):
-        inside = np.abs(winding_number(parts[outer], _probes(parts[inner]))) > 0.5
+        inside = np.abs(winding_number(parts[outer], _probes(parts[inner], parts[outer]))) > 0.5
         contains[outer, inner] = inside.all()
         if inside.any() and not inside.all():
             overlaps.add((min(inner, outer), max(inner, outer)))
@@ -119,10 +122,14 @@ def signed_volume(part: MeshPart) -> float:
     return float(np.sum(a * np.cross(b, c)) / 6.0)
 
 
-def _probes(part: MeshPart) -> Float[np.ndarray, "probes 3"]:
-    """Returns points just inside and outside of faces spread evenly over the list."""
-    chosen = np.unique(np.linspace(0, len(part.faces) - 1, _PROBES).astype(np.int64))
-    return np.concatenate([beside_faces(part, chosen, -1.0), beside_faces(part, chosen, 1.0)])
+def _probes(part: MeshPart, other: MeshPart) -> Float[np.ndarray, "probes 3"]:
+    """Returns points just inside and outside of a surface, spread evenly over it."""
+    count = int(np.clip(_PROBED_PAIRS // len(other.faces), _FEWEST_PROBES, _MOST_PROBES))
+    corners = part.vertices[part.faces]
+    faces, points = spread_points(corners[~is_degenerate(corners)], count)
+    normals = face_normals(corners[~is_degenerate(corners)])[faces]
+    step = _GAP * np.max(np.ptp(part.vertices, axis=0)) * normals
+    return np.concatenate([points - step, points + step])
 
 
 def _solid_angles(

@@ -66,8 +66,8 @@ def sample_surface(part: MeshPart) -> SampledSurface:
     """Samples a part, the same way every time."""
     corners = part.vertices[part.faces]
     corners = corners[~is_degenerate(corners)]
-    faces, points = _spread(corners, _SAMPLES)
-    target_faces, targets = _spread(corners, _TARGETS)
+    faces, points = spread_points(corners, _SAMPLES)
+    target_faces, targets = spread_points(corners, _TARGETS)
     return SampledSurface(
         corners=corners,
         normals=face_normals(corners),
@@ -102,7 +102,7 @@ def diagonal(parts: Sequence[MeshPart]) -> float:
     return float(min(np.linalg.norm(np.ptp(part.vertices, axis=0)) for part in parts))
 
 
-def _spread(
+def spread_points(
     corners: Float[np.ndarray, "faces 3 3"], count: int
 ) -> tuple[Int[np.ndarray, " samples"], Float[np.ndarray, "samples 3"]]:
     """Spreads points evenly over an area; none if there are no triangles."""

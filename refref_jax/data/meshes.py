@@ -73,7 +73,8 @@ def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> l
 
     Raises:
       SceneError: if a mesh is broken or empty, if its material is unknown, if an index is not
-        positive or names nothing, or if `scene.json` is wrong.
+        positive or names nothing, or if `scene.json` is wrong or describes a mesh that is missing
+        among others.
     """
     overrides = dict(indices or {})
     for name, index in overrides.items():
@@ -87,6 +88,12 @@ def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> l
     paths = sorted(path for path in files if path.suffix.lower() == ".ply")
     _check_overrides(overrides, paths)
     described = read_part_descriptions(scene / "scene.json")
+    missing = sorted(set(described) - {path.name for path in paths})
+    if missing and paths:
+        raise SceneError(
+            f"{scene / 'scene.json'} describes {missing[0]}, but {folder} does not hold it. "
+            "Restore the mesh, or remove its description."
+        )
     unknown = PartDescription()
     return [_read_part(path, overrides, described.get(path.name, unknown)) for path in paths]
 

@@ -22,7 +22,8 @@ class Budget:
     """Which light to follow.
 
     The capacity factors bound memory, per camera ray of a pool. What does not fit is the least
-    light there is, and it is returned as lost; see `wavefront`.
+    light there is, and it is returned as lost; see `wavefront`. The defaults are generous for
+    images of which glass fills a part; a pool of few rays that all meet much glass may need more.
 
     Attributes:
       bends: most refractions and reflections of a path.
@@ -41,9 +42,9 @@ class Budget:
     reflections: Literal["none", "first", "all"]
     total_reflection: Literal["followed", "ended"] = "followed"
     cut: float = 0.0
-    live_per_ray: float = 4.0
-    segments_per_ray: float = 16.0
-    paths_per_ray: float = 4.0
+    live_per_ray: float = 6.0
+    segments_per_ray: float = 24.0
+    paths_per_ray: float = 8.0
 
     def __post_init__(self) -> None:
         """Checks what tracing relies on."""

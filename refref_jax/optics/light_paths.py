@@ -28,7 +28,8 @@ class PathStatus(enum.IntEnum):
     OUT_OF_BENDS = 3
     """The path would meet another interface, but its budget of bends is spent."""
     NOT_TRACED = 4
-    """The last direction was not traced against the objects (the paper's reflected ray)."""
+    """The last direction was not traced against the objects: the paper's reflected ray, and every
+    ray of a budget without bends."""
     TOTALLY_REFLECTED = 5
     """The path met a total reflection, which its budget does not follow."""
 
@@ -99,7 +100,7 @@ def straight(rays: Rays) -> LightPaths:
         weights=jnp.ones_like(rays.directions),
         radii=rays.radii,
         bends=jnp.zeros_like(integers),
-        statuses=jnp.full_like(integers, PathStatus.MISSED),
+        statuses=jnp.full_like(integers, PathStatus.NOT_TRACED),
     )
 
 

@@ -165,7 +165,8 @@ def survey(geometry: Geometry, rays: Rays, *, budget: Budget) -> Survey:
     ends = trace_ends(geometry, rays, budget=budget).ends
     one = exists(ends).astype(jnp.float32)
     paths = jax.ops.segment_sum(one, ends.rays, num_segments=count)
-    missing = jnp.sum(ends.statuses == PathStatus.MISSED, dtype=jnp.float32)
+    untraced = (ends.statuses == PathStatus.NOT_TRACED) & (ends.bends == 0)
+    missing = jnp.sum((ends.statuses == PathStatus.MISSED) | untraced, dtype=jnp.float32)
     return Survey(jnp.mean(paths), jnp.std(paths), 1.0 - missing / count)
 
 

@@ -52,7 +52,7 @@ class _Walk(NamedTuple):
     Attributes:
       state: the ray.
       medium: that it is in, as far as its last surface tells.
-      traced: whether it is to be cast; not the paper's first reflection.
+      traced: whether it is to be cast; not the paper's first reflection, nor without any bends.
       status: `EMPTY` as long as the path goes on.
     """
 
@@ -98,7 +98,7 @@ def follow_branch(
     start = _Walk(
         branching.begin(ray.origins, ray.directions, inside),
         jnp.int32(media.AMBIENT),
-        jnp.asarray(True),
+        jnp.asarray(budget.bends > 0),
         jnp.int32(PathStatus.EMPTY),
     )
     # One step more than bends: the last one only sees whether the path escapes.

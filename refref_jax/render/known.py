@@ -30,6 +30,8 @@ from refref_jax.render.backgrounds import Radiance
 TILE = 65536
 """Rays traced at once."""
 
+_SMALLEST_TILE = 1024
+
 # Paths that are looked up at once.
 _CHUNK = 4096
 
@@ -83,7 +85,8 @@ def render_known(
       budget: which light to follow.
       inside: the parts that each ray starts in, for the rule `priority` (see
         `data.containment.parts_around`); by default none.
-      tile: rays traced at once: the option to lower when memory runs out.
+      tile: rays traced at once: the option to lower when memory runs out. A budget's room is that
+        of its tile: the fewer rays share it, the sooner light is lost.
 
     Raises:
       ValueError: if a tile holds no ray.
@@ -94,8 +97,10 @@ def render_known(
         radiance = jax.tree_util.Partial(radiance)  # a leaf is no argument of a compiled function
     rays, inside = jax.tree.map(np.asarray, (rays, inside))
     shape = rays.radii.shape
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), (rays, inside))
     count = rays.radii.size
+    # Few rays need no large tile, but a budget's room must not be that of a ray or two.
+    tile = min(tile, max(_SMALLEST_TILE, 1 << max(count - 1, 0).bit_length()))
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), (rays, inside))
     # On the device once, not once a tile.
     geometry, radiance = jax.device_put((geometry, radiance))
     tiles = [jax.device_get(_blank())]

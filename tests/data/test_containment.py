@@ -263,3 +263,17 @@ def test_too_many_parts_around_a_point():
     assert np.all(parts_around(parts[:SLOTS], np.zeros((1, 3))) != EMPTY_SLOT)
     with scene_error("[0.0, 0.0, 0.0]", "layer0_glass", "layer4_glass", "Move the camera"):
         parts_around(parts, np.array([[20.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        # Two corners that share a tenth of an edge; a cross, whose middles lie outside each other.
+        (box("a"), box("b", centre=(0.9, 0.9, 0.9))),
+        (box("a", size=(2.0, 0.3, 0.3)), box("b", size=(0.3, 2.0, 0.31))),
+    ],
+)
+def test_coarse_bodies_that_cut_each_other_are_found(first, second):
+    found = find_containment([first, second])
+    assert found.overlaps == ((0, 1),)
+    assert found.parents == (NO_PARENT, NO_PARENT)

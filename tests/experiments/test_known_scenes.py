@@ -85,6 +85,17 @@ def test_results_are_replaced_with_a_word_and_other_files_not_at_all(rendered, t
     assert "not of this command" in refused.stderr and measures.read_text() == "{}"
 
 
+def test_pictures_of_others_are_not_deleted(tmp_path):
+    picture = tmp_path / "rgb" / "mine.png"
+    picture.parent.mkdir()
+    picture.write_bytes(b"not ours")
+    result = run_command(
+        "render_known", f"--scene={_SCENE}", f"--out={tmp_path}", *_QUICK, fails=True
+    )
+    assert "not of this command" in result.stderr
+    assert picture.read_bytes() == b"not ours"
+
+
 def test_the_curve_has_a_row_for_every_setting(tmp_path):
     out = tmp_path / "curve"
     result = run_command(

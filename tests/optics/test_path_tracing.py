@@ -276,6 +276,13 @@ def test_tracing_in_a_pool_equals_tracing_batch_by_batch():
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, atol=1e-6), pool, single)
 
 
+def test_no_mesh_of_a_straight_ray_is_said_to_be_missed():
+    traced = _trace(scenes.geometry(scenes.ball(1.0)), _many_rays(), budget=STRAIGHT)
+    assert np.all(traced.paths.statuses == PathStatus.NOT_TRACED)
+    found = path_tracing.survey(scenes.geometry(), _many_rays(), budget=STRAIGHT)
+    assert (float(found.mean), float(found.hit_fraction)) == (1.0, 0.0)
+
+
 def test_the_straight_budget_ignores_the_objects():
     rays = _many_rays()
     traced = _trace(scenes.geometry(scenes.ball(1.0)), rays, budget=STRAIGHT, capacity=0)

@@ -12,7 +12,7 @@ import pytest
 from jax.test_util import check_grads
 
 from refref_jax.optics import branching, path_tracing
-from refref_jax.optics.budgets import PAPER, TREE, Budget
+from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE, Budget
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.single_path import follow_branch
 from tests import scenes
@@ -82,6 +82,14 @@ def test_the_choices_must_fit_the_budget():
     ray = jax.tree.map(lambda x: x[0], scenes.rays([-4.0, 0.0, 0.0], [1.0, 0.0, 0.0]))
     with pytest.raises(ValueError, match="3 choices for 10 bends"):
         follow_branch(scenes.geometry(scenes.box()), ray, jnp.zeros(3, bool), budget=PAPER)
+
+
+def test_without_bends_nothing_is_traced():
+    ray = jax.tree.map(lambda x: x[0], scenes.rays([-4.0, 0.0, 0.0], [1.0, 0.0, 0.0]))
+    nowhere = jnp.zeros(0, bool)
+    path = follow_branch(scenes.geometry(scenes.box()), ray, nowhere, budget=STRAIGHT)
+    assert (int(path.statuses), int(path.bends)) == (PathStatus.NOT_TRACED, 0)
+    np.testing.assert_array_equal(path.weights, 1.0)
 
 
 def test_a_path_that_is_cut_weighs_nothing():
