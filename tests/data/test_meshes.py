@@ -181,6 +181,14 @@ def test_parts_are_ordered_by_name_and_other_files_are_left_alone(make_scene):
     assert [p.name for p in meshes.read_meshes(scene)] == ["C_glass", "a_glass", "b_glass"]
 
 
+def test_a_described_mesh_that_is_missing_is_named(make_scene):
+    content = {"parts": [{"mesh": "meshes/other_glass.ply"}, {"mesh": "meshes/ball_glass.ply"}]}
+    scene = make_scene("ball_glass.ply")
+    (scene / "scene.json").write_text(json.dumps(content), encoding="utf-8")
+    with scene_error("other_glass.ply", "Restore the mesh"):
+        meshes.read_meshes(scene)
+
+
 @pytest.mark.parametrize(
     ("content", "shading"),
     [
@@ -188,7 +196,6 @@ def test_parts_are_ordered_by_name_and_other_files_are_left_alone(make_scene):
         ({}, "auto"),
         ({"parts": []}, "auto"),
         ({"parts": [{"mesh": "meshes/ball_glass.ply"}]}, "auto"),
-        ({"parts": [{"mesh": "meshes/other_glass.ply", "smooth_normals": True}]}, "auto"),
         ({"parts": [{"mesh": "meshes/ball_glass.ply", "smooth_normals": True}]}, "smooth"),
         ({"parts": [{"mesh": "ball_glass.ply", "smooth_normals": False}]}, "flat"),
     ],
