@@ -17,3 +17,9 @@ def test_the_snippets_of_the_readme_run(trained, tmp_path, monkeypatch, capsys):
         exec(compile(snippet, "README.md", "exec"), namespace)
     printed = capsys.readouterr().out
     assert "(128, 128, 3)" in printed
+
+
+def test_every_local_link_of_the_readme_exists():
+    links = re.findall(r"\]\(([^)#:]+)\)", (ROOT / "README.md").read_text())
+    assert "docs/stability.md" in links
+    assert [link for link in links if not (ROOT / link).exists()] == []
