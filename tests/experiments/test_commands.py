@@ -158,6 +158,8 @@ def test_help_explains_every_option(command):
         check=False,
     )
     source = (ROOT / "experiments" / f"{command}.py").read_text()
+    for shared in re.findall(r"adopt_module_key_flags\((\w+)\)", source):
+        source += (ROOT / "experiments" / f"{shared}.py").read_text()
     names = re.findall(r'flags\.DEFINE_\w+\(\s*"(\w+)"', source)
     assert len(names) >= 6
     for name in names:
