@@ -93,6 +93,7 @@ def _tiny_model(bounds_: Bounds, interior: Interior) -> ModelConfig:
         samples=20,
         multisamples=1,
         interior=interior,
+        footprint="cone",
         dilation=0.0,
         **dataclasses.asdict(bounds_),
     )
@@ -116,6 +117,7 @@ def _paper_model(bounds_: Bounds, interior: Interior) -> ModelConfig:
         samples=32,
         multisamples=6,
         interior=interior,
+        footprint="cone",
         dilation=0.5,
         **dataclasses.asdict(bounds_),
     )

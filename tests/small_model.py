@@ -20,6 +20,7 @@ MODEL = ModelConfig(
     samples=6,
     multisamples=1,
     interior="field",
+    footprint="cone",
     near=0.05,
     far=15.0,
     radius=7.5,

@@ -1,13 +1,15 @@
 """Static description of a model: what is sampled, how often, and by which fields."""
 
 import dataclasses
-from typing import Literal
+from typing import Literal, get_args
 
 from refref_jax.fields.density_field import DensityFieldConfig
 from refref_jax.fields.radiance_field import RadianceFieldConfig
 from refref_jax.sampling.domains import Space
 
-Interior = Literal["field", "clear"]
+Interior = Literal["field", "clear", "absorbing"]
+
+Footprint = Literal["cone", "differential"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +35,10 @@ class ModelConfig:
       samples: intervals of the final round.
       multisamples: points that stand for an interval's cone, 1 or 6.
       interior: `field` also samples inside the objects (the paper); `clear` takes nothing to be
-        there, which holds for clear glass and costs no samples.
+        there, which holds for clear glass and costs no samples; `absorbing` too takes no samples
+        there, but light is dimmed on its way by the colours of media and interfaces.
+      footprint: `cone` widens a pixel's footprint with arc length as if the path were straight
+        (the paper); `differential` follows it through every bend by its derivatives.
       near: distance of the first sample from the camera, world units.
       far: distance of the last from the last bend, or from the camera on a straight path; the
         background is opaque there. In a bounded scene a path ends already where it leaves the
@@ -51,6 +56,7 @@ class ModelConfig:
     samples: int
     multisamples: int
     interior: Interior
+    footprint: Footprint
     near: float
     far: float
     radius: float
@@ -68,11 +74,11 @@ class ModelConfig:
             )
         if not self.radius > 0.0:
             raise ValueError(f"The radius must be positive, not {self.radius}. Correct it.")
-        if self.space not in ("bounded", "unbounded"):
-            raise ValueError(
-                f"The space is 'bounded' or 'unbounded', not {self.space!r}. Choose one."
-            )
-        if self.interior not in ("field", "clear"):
-            raise ValueError(
-                f"The interior is 'field' or 'clear', not {self.interior!r}. Choose one."
-            )
+        _check_choice("space", self.space, get_args(Space))
+        _check_choice("interior", self.interior, get_args(Interior))
+        _check_choice("footprint", self.footprint, get_args(Footprint))
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"The {name} is one of {', '.join(choices)}, not {value!r}. Choose one.")
