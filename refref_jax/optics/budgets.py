@@ -33,6 +33,8 @@ class Budget:
         direction, as in the paper's ablation.
       cut: smallest throughput worth following, by the largest of its RGB. A weaker branch leaves
         its share to its sibling, so no energy is lost.
+      reentry: `impossible` promises that a ray which has left the objects meets none again, as
+        around one convex body: it is not cast again.
       live_per_ray: room for rays that are still to be cast.
       segments_per_ray: room for segments of paths, beyond the camera rays themselves.
       paths_per_ray: room for finished paths.
@@ -42,6 +44,7 @@ class Budget:
     reflections: Literal["none", "first", "all"]
     total_reflection: Literal["followed", "ended"] = "followed"
     cut: float = 0.0
+    reentry: Literal["possible", "impossible"] = "possible"
     live_per_ray: float = 6.0
     segments_per_ray: float = 24.0
     paths_per_ray: float = 8.0
@@ -64,6 +67,10 @@ class Budget:
             raise ValueError(
                 "Total reflection is 'followed' or 'ended', not "
                 f"{self.total_reflection!r}. Choose one."
+            )
+        if self.reentry not in ("possible", "impossible"):
+            raise ValueError(
+                f"Re-entry is 'possible' or 'impossible', not {self.reentry!r}. Choose one."
             )
         for name in ("live_per_ray", "segments_per_ray", "paths_per_ray"):
             if not 1.0 <= getattr(self, name) < math.inf:
