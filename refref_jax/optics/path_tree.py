@@ -137,7 +137,7 @@ def polylines(
     walk = _walk_back(segments, ends, detail, parts if detail.tally == "parts" else 0)
     # Picked from the last to the first, at the right of their row.
     count = jnp.minimum(walk.found, detail.most)
-    lanes = jnp.arange(detail.most, dtype=jnp.int32)
+    lanes = jnp.arange(detail.most, dtype=jnp.int32)[None]
     used = lanes < count[:, None]
     place = jnp.where(used, lanes + detail.most - count[:, None], detail.most - 1)
     picked = jnp.take_along_axis(walk.picked, place, axis=-1)
@@ -185,8 +185,8 @@ class _Walk(NamedTuple):
 def _walk_back(segments: Segments, ends: Ends, detail: Detail, tallied: int) -> _Walk:
     count = ends.segments.shape[0]
     none = jnp.zeros_like(segments.tau, shape=(count, tallied))
-    lanes = jnp.arange(detail.most, dtype=jnp.int32)
-    names = jnp.arange(tallied, dtype=jnp.int32)
+    lanes = jnp.arange(detail.most, dtype=jnp.int32)[None]
+    names = jnp.arange(tallied, dtype=jnp.int32)[None]
 
     def step(walk: _Walk) -> _Walk:
         going = walk.segment != NO_SEGMENT
@@ -201,10 +201,10 @@ def _walk_back(segments: Segments, ends: Ends, detail: Detail, tallied: int) -> 
         return _Walk(
             segment=jnp.where(going, segments.parents[at], NO_SEGMENT),
             stop=tau,
-            found=walk.found + wanted,
+            found=walk.found + wanted.astype(jnp.int32),
             picked=jnp.where(here, at[:, None], walk.picked),
             stops=jnp.where(here, walk.stop[:, None], walk.stops),
-            meetings=walk.meetings + met,
+            meetings=walk.meetings + met.astype(none.dtype),
             passages=walk.passages + jnp.where(through, length[:, None], 0.0),
         )
 

@@ -24,7 +24,7 @@ class Params(NamedTuple):
 
     proposals: tuple[density_field.Params, ...]
     field: radiance_field.Params
-    dyes: Dyes | None
+    dyes: Dyes | None = None
 
 
 class Model(NamedTuple):

@@ -59,24 +59,47 @@ def set_up(
 
 
 def run_steps(
-    setup: Setup, state: TrainState, until: int
+    setup: Setup, state: TrainState, until: int, *, stride: int = 1
 ) -> Iterator[tuple[TrainState, steps.StepReport]]:
-    """Yields the state and the report after every step up to `until`.
+    """Takes all steps up to `until`; yields the state and the report after every `stride` of them.
 
-    A state is consumed by the step that follows it: copy what is to be kept. Starting from a
+    A state is consumed by the steps that follow it: copy what is to be kept. Starting from a
     restored state continues exactly where its run would have gone on.
+
+    The light paths of the next pool are asked for before the steps of this one are, so that they
+    can be traced meanwhile; there are never more than two pools.
+
+    Args:
+      setup: the run.
+      state: where to begin.
+      until: number of the last step.
+      stride: steps that the device takes without a word to the host. Besides at its multiples the
+        state is seen at the end of every pool, and at the end.
     """
     config = setup.config
     step = int(state.step)
-    while step < until:
-        first = step - step % config.pool
-        pool = _trace(setup, first)
-        for batch in range(step - first, min(config.pool, until - first)):
-            state, report = steps.train_step(
-                state, pool, np.int32(batch), config=config, model=setup.model
+    for first, pool in _pools(setup, step, until):
+        end = min(first + config.pool, until)
+        while step < end:
+            last = min(step + stride - step % stride, end)
+            batches = np.int32(step - first), np.int32(last - first)
+            state, report = steps.train_steps(
+                state, pool, *batches, config=config, model=setup.model
             )
-            step += 1
+            step = last
             yield state, report
+
+
+def _pools(setup: Setup, step: int, until: int) -> Iterator[tuple[int, steps.Pool]]:
+    """Yields the pools of some steps with the number of steps before each, one traced ahead."""
+    size = setup.config.pool
+    firsts = range(step - step % size, until, size)
+    ahead = (_trace(setup, first) for first in firsts)
+    pool = next(ahead, None)
+    for first in firsts:
+        following = next(ahead, None)
+        yield first, pool
+        pool = following
 
 
 def _trace(setup: Setup, first: int) -> steps.Pool:

@@ -80,23 +80,45 @@ def survey_paths(geometry: Geometry, rays: Rays, *, budget: Budget) -> Survey:
 
 
 @functools.partial(jax.jit, static_argnames=("config", "model"), donate_argnames="state")
-def train_step(
+def train_steps(
     state: TrainState,
     pool: Pool,
-    batch: Int[Array, ""],
+    first: Int[Array, ""],
+    last: Int[Array, ""],
     *,
     config: TrainingConfig,
     model: ModelConfig,
 ) -> tuple[TrainState, StepReport]:
-    """Takes one step on one batch of a pool.
+    """Takes steps on consecutive batches of a pool, without a word to the host in between.
 
     Args:
       state: consumed: its buffers are reused for the result.
       pool: light paths and colours.
-      batch: which of the pool's batches.
+      first: the pool's batch of the first step.
+      last: the batch after that of the last step; any number of steps is one compiled program.
       config: the run.
       model: the model.
+
+    Returns:
+      The state after the last step, and what that step measured.
     """
+    step = functools.partial(_step, pool=pool, config=config, model=model)
+    shapes = jax.eval_shape(step, state, first)[1]
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return jax.lax.fori_loop(
+        first, last, lambda batch, carry: step(carry[0], batch), (state, blank)
+    )
+
+
+def _step(
+    state: TrainState,
+    batch: Int[Array, ""],
+    *,
+    pool: Pool,
+    config: TrainingConfig,
+    model: ModelConfig,
+) -> tuple[TrainState, StepReport]:
+    """Takes one step."""
     traced, rgb = jax.tree.map(lambda x: x[batch], pool)
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
     jitter = pixels.random_jitter(key, model, traced.paths.radii.shape[0])

@@ -28,9 +28,8 @@ _INTERVALS = [
 
 @functools.partial(jax.jit, static_argnames="count")
 def _sample(line, start, end, rotation=0.0, radius=_RADIUS, *, count=6):
-    return cones.multisamples(
-        line, *(jnp.float32(x) for x in (radius, start, end, rotation)), count=count
-    )
+    line = line._replace(radius=jnp.float32(radius))
+    return cones.multisamples(line, *(jnp.float32(x) for x in (start, end, rotation)), count=count)
 
 
 _basis = jax.jit(orthonormal_basis)
@@ -208,7 +207,8 @@ def test_the_cone_grows_inside_an_object_also_where_no_sample_falls():
 @jax.jit
 def _gradients(line, start, end):
     def total(radius, start, end, rotation):
-        positions, scales = cones.multisamples(line, radius, start, end, rotation, count=6)
+        wide = line._replace(radius=radius)
+        positions, scales = cones.multisamples(wide, start, end, rotation, count=6)
         return jnp.sum(positions) + jnp.sum(scales)
 
     arguments = jnp.float32(1e-3), start, end, jnp.float32(0.3)
@@ -275,7 +275,8 @@ def test_multisamples_check_grads(count):
 
     def sample(radius, start, end, rotation):
         wide = jax.tree.map(lambda x: x if x.dtype == bool else x.astype(jnp.float64), line)
-        return tuple(cones.multisamples(wide, radius, start, end, rotation, count=count))
+        wide = wide._replace(radius=radius)
+        return tuple(cones.multisamples(wide, start, end, rotation, count=count))
 
     gradients.assert_numerical(sample, _RADIUS, 1.0, 2.5, 0.3)
 
@@ -287,10 +288,10 @@ def test_orthonormal_basis_check_grads():
 
 _CASES = {
     "six": lambda path, start, end: cones.multisamples(
-        polylines.whole_path(path), path.radii, start, end, 0.5 * start, count=6
+        polylines.whole_path(path), start, end, 0.5 * start, count=6
     ),
     "one": lambda path, start, end: cones.multisamples(
-        polylines.outside_path(path), path.radii, start, end, 0.5 * start, count=1
+        polylines.outside_path(path), start, end, 0.5 * start, count=1
     ),
     "orthonormal_basis": lambda path, start, end: orthonormal_basis(path.directions[0]),
 }

@@ -262,6 +262,7 @@ def test_point_at_check_grads():
             directions=directions,
             knots=line.knots.astype(jnp.float64),
             arcs=line.arcs.astype(jnp.float64),
+            radius=line.radius.astype(jnp.float64),
         )
         return polylines.point_at(wide, t).position
 

@@ -1,0 +1,122 @@
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.optics import path_tracing
+from refref_jax.optics.budgets import PAPER, TREE, Budget
+from refref_jax.optics.details import Detail, everything
+from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics.media import AMBIENT
+from tests import scenes
+
+_CAPACITY = 256
+
+
+@functools.partial(jax.jit, static_argnames=("budget", "detail"))
+def _trace(geometry, rays, *, budget=TREE, detail=None):
+    return path_tracing.trace(geometry, rays, budget=budget, capacity=_CAPACITY, detail=detail)
+
+
+def _rays(count=40):
+    rng = np.random.default_rng(3)
+    origins = rng.normal(size=(count, 3))
+    origins *= 4.0 / np.linalg.norm(origins, axis=-1, keepdims=True)
+    return scenes.rays(origins, rng.normal(size=(count, 3)) * 0.5 - origins)
+
+
+def _two_balls():
+    """Two balls with a gap between them: light may leave one and enter the other."""
+    return scenes.geometry(
+        scenes.ball(0.6, subdivisions=2, centre=(0.8, 0.0, 0.0), name="left_glass"),
+        scenes.ball(0.6, subdivisions=2, centre=(-0.8, 0.0, 0.0), name="right_water", index=1.33),
+    )
+
+
+def _slow_outside(paths, index):
+    """Returns the indices of the segments of one path that run outside, and its last one."""
+    bends = int(paths.bends[index])
+    return [i for i in range(bends + 1) if paths.media[index, i] == AMBIENT or i == bends]
+
+
+def test_only_segments_outside_are_kept():
+    whole = _trace(_two_balls(), _rays()).paths
+    kept = _trace(_two_balls(), _rays(), detail=Detail("outside", 6)).paths
+    np.testing.assert_array_equal(whole.bends, kept.bends)
+    np.testing.assert_array_equal(whole.weights, kept.weights)
+    seen = set()
+    for index in range(_CAPACITY):
+        wanted = _slow_outside(whole, index)
+        seen.add(len(wanted))
+        assert np.isfinite(kept.tau[index]).sum() == len(wanted)
+        for place, segment in enumerate(wanted):
+            for name in ("points", "directions", "tau", "ends", "media"):
+                np.testing.assert_array_equal(
+                    getattr(kept, name)[index, place], getattr(whole, name)[index, segment]
+                )
+    assert seen >= {1, 2, 3}
+
+
+def test_of_too_many_segments_the_first_and_the_last_ones_are_kept():
+    whole = _trace(_two_balls(), _rays()).paths
+    kept = _trace(_two_balls(), _rays(), detail=Detail("outside", 2)).paths
+    for index in range(_CAPACITY):
+        wanted = _slow_outside(whole, index)
+        ends = wanted if len(wanted) < 2 else [wanted[0], wanted[-1]]
+        got = kept.tau[index][np.isfinite(kept.tau[index])]
+        np.testing.assert_array_equal(got, whole.tau[index][np.array(ends)])
+
+
+@pytest.mark.parametrize("budget", [PAPER, TREE])
+def test_segments_end_where_the_next_ones_begin(budget):
+    paths = _trace(_two_balls(), _rays(), budget=budget, detail=everything(budget.bends)).paths
+    used = np.isfinite(paths.tau)
+    following = np.append(paths.tau[:, 1:], np.full((_CAPACITY, 1), np.inf), axis=1)
+    np.testing.assert_array_equal(paths.ends[used], following[used])
+    assert np.all(np.isinf(paths.ends[~used]))
+
+
+def test_meetings_and_passages_are_those_of_the_whole_path():
+    """Tints and absorption are put on the paths afterwards, and come to what tracing puts on."""
+    budget = Budget(bends=3, reflections="all")  # no cut: colours do not change what is followed
+    geometry = _two_balls()
+    tint = jnp.array([[0.9, 0.5, 0.7], [0.6, 0.95, 1.0]])
+    absorption = jnp.array([[0.1, 0.0, 2.0], [0.3, 0.4, 0.0]])
+    dyed = geometry._replace(
+        interfaces=geometry.interfaces._replace(tint=tint, absorption=absorption)
+    )
+    detail = Detail("outside", 4, tally="parts")
+    white = _trace(geometry, _rays(), budget=budget, detail=detail).paths
+    coloured = _trace(dyed, _rays(), budget=budget).paths
+    factor = np.exp(
+        np.asarray(white.meetings) @ np.log(tint) - np.asarray(white.passages) @ absorption
+    )
+    # A path that ran out of bends inside a body goes on through it, and is not dimmed there.
+    np.testing.assert_allclose(white.weights * factor, coloured.weights, atol=2e-6)
+    assert white.meetings.max() == 3.0 and white.passages.max() > 1.0
+
+
+def test_nothing_is_tallied_unless_asked():
+    paths = _trace(_two_balls(), _rays()).paths
+    assert paths.meetings.shape == paths.passages.shape == (_CAPACITY, 0)
+
+
+def test_a_promise_of_no_reentry_changes_casts_only():
+    ball = scenes.geometry(scenes.ball(1.0, subdivisions=3))
+    never = Budget(bends=24, reflections="all", cut=0.02, reentry="impossible")
+    a, b = (path_tracing.trace_ends(ball, _rays(), budget=budget) for budget in (TREE, never))
+
+    def sorted_weights(traced):
+        escaped = traced.ends.statuses == PathStatus.ESCAPED
+        return np.sort(np.asarray(traced.ends.weights)[np.asarray(escaped), 0])
+
+    np.testing.assert_allclose(sorted_weights(a), sorted_weights(b), atol=1e-6)
+    escaped = int(np.sum(a.ends.statuses == PathStatus.ESCAPED))
+    assert int(a.casts) - int(b.casts) == escaped > 40
+
+
+def test_a_detail_without_room_is_refused():
+    with pytest.raises(ValueError, match="at least one segment"):
+        Detail("outside", 0)
