@@ -94,6 +94,7 @@ def _tiny_model(bounds_: Bounds, interior: Interior) -> ModelConfig:
         multisamples=1,
         interior=interior,
         footprint="cone",
+        learned_tints=0,
         dilation=0.0,
         **dataclasses.asdict(bounds_),
     )
@@ -118,6 +119,7 @@ def _paper_model(bounds_: Bounds, interior: Interior) -> ModelConfig:
         multisamples=6,
         interior=interior,
         footprint="cone",
+        learned_tints=0,
         dilation=0.5,
         **dataclasses.asdict(bounds_),
     )

@@ -39,6 +39,7 @@ class ModelConfig:
         there, but light is dimmed on its way by the colours of media and interfaces.
       footprint: `cone` widens a pixel's footprint with arc length as if the path were straight
         (the paper); `differential` follows it through every bend by its derivatives.
+      learned_tints: number of parts whose tint and absorption are learned, all of them or 0.
       near: distance of the first sample from the camera, world units.
       far: distance of the last from the last bend, or from the camera on a straight path; the
         background is opaque there. In a bounded scene a path ends already where it leaves the
@@ -57,6 +58,7 @@ class ModelConfig:
     multisamples: int
     interior: Interior
     footprint: Footprint
+    learned_tints: int
     near: float
     far: float
     radius: float
@@ -74,6 +76,11 @@ class ModelConfig:
             )
         if not self.radius > 0.0:
             raise ValueError(f"The radius must be positive, not {self.radius}. Correct it.")
+        if self.learned_tints < 0:
+            raise ValueError(
+                f"The tints of {self.learned_tints} parts can not be learned. Give the number of "
+                "parts, or 0."
+            )
         _check_choice("space", self.space, get_args(Space))
         _check_choice("interior", self.interior, get_args(Interior))
         _check_choice("footprint", self.footprint, get_args(Footprint))
