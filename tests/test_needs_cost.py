@@ -19,6 +19,7 @@ from refref_jax.optics import path_tracing
 from refref_jax.optics.budgets import TREE
 from refref_jax.optics.media import SLOTS
 from refref_jax.render import pixels, transport
+from refref_jax.render.config import path_detail
 from refref_jax.render.model import init_params
 from refref_jax.training import steps
 from tests import made_paths, scenes
@@ -41,7 +42,8 @@ def _operations(text):
 def _training_programs(geometry, budget):
     """Returns the operations of all programs of a run that know of the meshes."""
     batches = jax.tree.map(lambda x: x[None], _RAYS)
-    trace = steps.trace_pool.lower(geometry, batches, budget=budget, capacity=2048)
+    detail = path_detail(dataclasses.replace(MODEL, interior="clear"), budget)
+    trace = steps.trace_pool.lower(geometry, batches, budget=budget, capacity=2048, detail=detail)
     survey = steps.survey_paths.lower(geometry, _RAYS, budget=budget)
     return _operations(trace.as_text()) + _operations(survey.as_text())
 
