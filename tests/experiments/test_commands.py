@@ -89,7 +89,7 @@ def test_evaluation_writes_images_metrics_and_a_comparison(trained):
     assert str(out / "comparison.png") in result.stdout
     summary = json.loads((out / "metrics.json").read_text())
     assert summary["scene"] == "cube_smcvx_ball"
-    assert summary["method"] == "oracle"
+    assert summary["method"] == "tree"
     assert summary["step"] == 6
     assert set(summary["results"]) == {
         "psnr",
