@@ -25,7 +25,7 @@ def test_training_writes_a_readable_run(trained):
         assert {"step", "loss", "psnr", "rays_per_second", "seconds"} <= set(line)
         assert np.all(np.isfinite(list(line.values())))
     config = json.loads((trained / "config.json").read_text())
-    assert config["paths"] == "paper" and config["schedule"]["steps"] == 6
+    assert config["paths"] == "tree" and config["schedule"]["steps"] == 6
     assert {path.name for path in (trained / "checkpoints").iterdir()} == {"3", "6"}
 
 
@@ -89,7 +89,7 @@ def test_evaluation_writes_images_metrics_and_a_comparison(trained):
     assert str(out / "comparison.png") in result.stdout
     summary = json.loads((out / "metrics.json").read_text())
     assert summary["scene"] == "cube_smcvx_ball"
-    assert summary["method"] == "oracle"
+    assert summary["method"] == "tree"
     assert summary["step"] == 6
     assert set(summary["results"]) == {
         "psnr",
