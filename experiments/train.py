@@ -28,6 +28,9 @@ _LOG_EVERY = flags.DEFINE_integer("log_every", 50, "Steps between two lines of m
 _CHECKPOINT_EVERY = flags.DEFINE_integer("checkpoint_every", 500, "Steps between checkpoints.", 1)
 _KEEP = flags.DEFINE_integer("keep", 2, "Newest checkpoints to keep.", 1)
 
+# Steps that the device takes without the host, which sees an interrupt only between them.
+_MOST_STEPS = 10
+
 
 def main() -> None:
     """Plans a run, or finds the one to resume, and trains it."""
@@ -91,8 +94,9 @@ def _train(run: Path, setup: loop.Setup, state: TrainState, checkpoints: Checkpo
     start = last = time.monotonic()
     logged = step
     with commands.ProgressBar("train", total, step) as bar:
-        for stepped, report in loop.run_steps(setup, state, total):
-            step += 1
+        stride = _stride(_LOG_EVERY.value, _CHECKPOINT_EVERY.value)
+        for stepped, report in loop.run_steps(setup, state, total, stride=stride):
+            step = int(stepped.step)
             if step % _LOG_EVERY.value == 0 or step == total:
                 report = jax.device_get(report)
                 now = time.monotonic()
@@ -107,6 +111,12 @@ def _train(run: Path, setup: loop.Setup, state: TrainState, checkpoints: Checkpo
     if step < total:
         print(f"Stopped at step {step}. Continue with --resume --out={run}.")
     return step == total
+
+
+def _stride(*periods: int) -> int:
+    """Returns how many steps to take at a time: as many as fit into all periods, but few."""
+    whole = math.gcd(*periods)
+    return max(steps for steps in range(1, _MOST_STEPS + 1) if whole % steps == 0)
 
 
 def _log(run: Path, step: int, report: StepReport, rate: float, seconds: float) -> None:

@@ -21,58 +21,22 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from refref_jax.geometry import bvh
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import branching, budgets, footprints, media, path_tree, pools
-from refref_jax.optics.branching import Arrival, Branches, RayState
+from refref_jax.optics import branching, budgets, footprints, media, offspring, path_tree, pools
 from refref_jax.optics.branching import Geometry as Geometry
+from refref_jax.optics.branching import RayState
 from refref_jax.optics.budgets import Budget, Room
 from refref_jax.optics.footprints import Footprint
 from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics.offspring import Live
 from refref_jax.optics.path_tree import NO_SEGMENT, Ends, PathTree, Segments
 from refref_jax.optics.pools import Pool
 
 BLOCK = 4096
 """Rays cast in a round. A larger one serves an accelerator, at the price of memory."""
-
-
-class _Live(NamedTuple):
-    """Rays that are to be cast.
-
-    Attributes:
-      state: the rays on their way.
-      rays: index of each one's camera ray.
-      segments: index of its current segment.
-    """
-
-    state: RayState
-    rays: Int[Array, " live"]
-    segments: Int[Array, " live"]
-
-    @property
-    def weights(self) -> Float[Array, "live 3"]:
-        """The light that they carry."""
-        return self.state.weight
-
-
-class _Children(NamedTuple):
-    """The branches of a block, reflected ones first.
-
-    Attributes:
-      live: the branches; the index of their segment is their parent's until it is logged.
-      media: medium of each one's segment.
-      parts: part that each one leaves.
-      exists: which there are.
-      traced: which are followed further.
-    """
-
-    live: _Live
-    media: Int[Array, " branches"]
-    parts: Int[Array, " branches"]
-    exists: Bool[Array, " branches"]
-    traced: Bool[Array, " branches"]
 
 
 class _Walk(NamedTuple):
@@ -175,7 +139,7 @@ def _begin(
         lost=jnp.zeros_like(rays.origins),
         casts=jnp.zeros((), jnp.int32),
     )
-    stack = pools.fill(_Live(state, order, order), count, room.live + 2 * block)
+    stack = pools.fill(Live(state, order, order), count, room.live + 2 * block)
     return _Walk(*pools.pop(stack, block), tree)
 
 
@@ -192,12 +156,13 @@ def _round(geometry: Geometry, walk: _Walk, budget: Budget, block: int, room: Ro
     medium = arrival.interaction.sides.medium_near
     # Only its first surface tells what a camera is in.
     tree = path_tree.name_media(tree, live.segments, medium, hit & (live.state.bends == 0))
-    tree = _end(tree, live, status, alive & ~bending)
+    tree = offspring.end(tree, live, status, alive & ~bending)
     branches = jax.vmap(functools.partial(branching.branch, budget))(
         live.state, arrival, hits.slots
     )
-    tree, children = _log(tree, _children(live, branches, arrival, bending, budget), room)
-    tree, stack = _push(tree, walk.stack, children, budget)
+    children = offspring.children_of(live, branches, arrival, bending, budget)
+    tree, children = offspring.log(tree, children, room)
+    tree, stack = offspring.push(tree, walk.stack, children, budget)
     return _Walk(*pools.pop(stack, block), tree)
 
 
@@ -208,71 +173,3 @@ def _cast(geometry: Geometry, state: RayState, alive: Bool[Array, " block"]) -> 
         limits=jnp.where(alive, jnp.inf, -1.0).astype(state.tau.dtype),
         leaving=state.leaving,
     )
-
-
-def _children(
-    live: _Live,
-    branches: Branches,
-    arrival: Arrival,
-    bending: Bool[Array, " block"],
-    budget: Budget,
-) -> _Children:
-    """Lists the branches of the rays that bend."""
-    sides = arrival.interaction.sides
-    states = pools.join(branches.reflected, branches.transmitted)
-    mediums = pools.join(sides.medium_near, sides.medium_far)
-    untraced = ~arrival.interaction.total & (budget.reflections == "first")
-    traced = pools.join(~untraced, jnp.ones_like(bending))
-    if budget.reentry == "impossible":
-        traced &= mediums != media.AMBIENT
-    return _Children(
-        live=_Live(
-            states, pools.join(live.rays, live.rays), pools.join(live.segments, live.segments)
-        ),
-        media=mediums,
-        parts=pools.join(sides.part, sides.part),
-        exists=pools.join(bending, bending) & (jnp.max(states.weight, axis=-1) > 0.0),
-        traced=traced,
-    )
-
-
-def _log(tree: PathTree, children: _Children, room: Room) -> tuple[PathTree, _Children]:
-    """Logs the segments of children; drops the weakest of them if the log is full."""
-    live = children.live
-    left = room.segments - tree.segments.count
-    kept = pools.strongest(children.exists, jnp.max(live.weights, axis=-1), left)
-    index = tree.segments.count + jnp.cumsum(kept, dtype=jnp.int32) - 1
-    state = live.state
-    logged = Segments(
-        live.segments,
-        state.point,
-        state.direction,
-        state.tau,
-        children.media,
-        children.parts,
-        state.spread,
-    )
-    log = pools.append(tree.segments, logged, kept)
-    lost = pools.lose(tree.lost, live.rays, live.weights, children.exists & ~kept)
-    children = children._replace(live=live._replace(segments=index), exists=kept)
-    return tree._replace(segments=log, lost=lost), children
-
-
-def _push(
-    tree: PathTree, stack: Pool, children: _Children, budget: Budget
-) -> tuple[PathTree, Pool]:
-    """Puts children on the stack, and ends those that are not traced."""
-    live = children.live
-    if budget.reflections == "first" or budget.reentry == "impossible":
-        escapes = (budget.reentry == "impossible") & (children.media == media.AMBIENT)
-        status = jnp.where(escapes, PathStatus.ESCAPED, PathStatus.NOT_TRACED).astype(jnp.int32)
-        tree = _end(tree, live, status, children.exists & ~children.traced)
-    return tree, pools.append(stack, live, children.exists & children.traced)
-
-
-def _end(
-    tree: PathTree, live: _Live, status: Int[Array, " n"], ending: Bool[Array, " n"]
-) -> PathTree:
-    """Ends some rays as paths."""
-    block = Ends(live.segments, live.rays, live.weights, live.state.bends, status)
-    return tree._replace(ends=pools.append(tree.ends, block, ending))
