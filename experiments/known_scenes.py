@@ -134,21 +134,6 @@ def parse_views(text: str, count: int) -> tuple[int, ...]:
     return views
 
 
-def side_of(rays_per_pixel: int) -> int:
-    """Returns how many rays a pixel has along each edge.
-
-    Raises:
-      ValueError: if they do not make a square grid.
-    """
-    side = math.isqrt(max(rays_per_pixel, 0))
-    if side < 1 or side**2 != rays_per_pixel:
-        raise ValueError(
-            f"{rays_per_pixel} rays a pixel do not make a square grid. Give 1, 4, 9, 16 or another "
-            "square."
-        )
-    return side
-
-
 def make_budget(paths: str, *, cut: float | None = None, bends: int | None = None) -> Budget:
     """Returns a budget by name, with another cut or number of bends, and room for what that takes.
 

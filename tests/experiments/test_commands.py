@@ -90,7 +90,7 @@ def test_evaluation_writes_images_metrics_and_a_comparison(trained):
     summary = json.loads((out / "metrics.json").read_text())
     assert summary["scene"] == "cube_smcvx_ball"
     assert summary["method"] == "oracle"
-    assert summary["step"] == 6
+    assert summary["step"] == 6 and summary["rays_per_pixel"] == 1
     assert set(summary["results"]) == {
         "psnr",
         "psnr_masked",
@@ -115,7 +115,14 @@ def test_evaluation_writes_images_metrics_and_a_comparison(trained):
 
 
 def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
-    run_command("render", f"--run={trained}", "--views=orbit", "--frames=2", "--size=24")
+    run_command(
+        "render",
+        f"--run={trained}",
+        "--views=orbit",
+        "--frames=2",
+        "--size=24",
+        "--rays_per_pixel=4",
+    )
     out = trained / "render" / "orbit"
     assert {path.name for path in (out / "rgb").iterdir()} == {"r_000.png", "r_001.png"}
     assert files.read_exr(out / "distance" / "r_001.exr").shape == (24, 24)
@@ -133,7 +140,9 @@ def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
         ("train", ("--scene=experiments/data/cube_smcvx_ball", "--batch=99999999"), "batch"),
         ("train", ("--scene=experiments/data/cube_smcvx_ball", "--out=README.md/x"), "README.md"),
         ("evaluate", ("--run=nowhere",), "nowhere/config.json does not exist"),
+        ("evaluate", ("--run=nowhere", "--rays_per_pixel=8"), "Give 4 or 9"),
         ("render", ("--run=nowhere",), "nowhere/model.json does not exist"),
+        ("render", ("--run=nowhere", "--rays_per_pixel=0"), "Give 1."),
     ],
 )
 def test_mistakes_end_with_one_line_that_says_what_to_do(tmp_path, command, options, message):
