@@ -1,11 +1,11 @@
 """Presets: how large a model is and how long it is trained.
 
-| preset  | for                    | samples      | points | hash levels x features, finest, entries |
-|---------|------------------------|--------------|--------|-----------------------------------------|
-| `tiny`  | two CPU cores, minutes | 32 + 20      | 1      | 6 x 4, 512, 2^17                        |
-| `small` | a laptop, a small GPU  | 48 + 32      | 1      | 8 x 4, 2048, 2^19                       |
-| `paper` | a GPU, as published    | 64 + 64 + 32 | 6      | 10 x 4, 8192, 2^21                      |
-| `best`  | a large GPU            | 64 + 64 + 32 | 6      | 10 x 4, 8192, 2^21                      |
+| preset  | for                    | samples      | points | hash levels x features, finest, size |
+|---------|------------------------|--------------|--------|--------------------------------------|
+| `tiny`  | two CPU cores, minutes | 32 + 20      | 1      | 6 x 4, 512, 2^17                     |
+| `small` | a laptop, a small GPU  | 48 + 32      | 1      | 8 x 4, 2048, 2^19                    |
+| `paper` | a GPU, as published    | 64 + 64 + 32 | 6      | 10 x 4, 8192, 2^21                   |
+| `best`  | a large GPU            | 64 + 64 + 32 | 6      | 10 x 4, 8192, 2^21                   |
 
 | preset  | network of colour | rays a step | steps  | footprint    |
 |---------|-------------------|-------------|--------|--------------|
@@ -14,9 +14,9 @@
 | `paper` | 2 x 256           | 4,096       | 25,000 | cone         |
 | `best`  | 2 x 256           | 16,384      | 25,000 | differential |
 
-Points are those that stand for an interval's cone, `--multisamples`. What depends on the scene is no
-preset's: give `paper` the options `--paths=paper --interior=field` to have the published set-up in
-full, and leave both out for the others.
+Points are those that stand for an interval's cone, `--multisamples`; the size is the entries of a
+level. What depends on the scene is no preset's: give `paper` the options `--paths=paper
+--interior=field` to have the published set-up in full, and leave both out for the others.
 
 `small` lies between its neighbours in every number. `best` samples as the paper does and differs in
 what a pixel sees and how often: footprints follow the bends, and a step has four times the rays, at
