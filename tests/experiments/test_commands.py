@@ -10,11 +10,13 @@ import time
 from pathlib import Path
 
 import imageio.v3 as iio
+import jax
 import numpy as np
 import pytest
 import trimesh
 
 from refref_jax.data import files
+from refref_jax.render import load_model
 from tests.experiments.command import ROOT, TINY, run_command
 
 
@@ -112,6 +114,12 @@ def test_evaluation_writes_images_metrics_and_a_comparison(trained):
         psnr = -10 * np.log10(np.mean((rgb / 255.0 - target) ** 2))
         assert psnr == pytest.approx(image["psnr"], abs=0.05)
     assert iio.imread(out / "comparison.png").ndim == 3
+
+
+def test_a_loaded_model_compiles_an_image_once(trained):
+    # What is bound to a device compiles the first chunk of an image and the others apart.
+    params = load_model(trained).params
+    assert not any(leaf.committed for leaf in jax.tree.leaves(params))
 
 
 def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
