@@ -12,25 +12,14 @@ command. Times are of this machine: leave it alone meanwhile.
 repeated, and take any option of `experiments.train`, and rays_per_pixel.
 """
 
-import hashlib
 import signal
 import sys
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from absl import flags
 
-from experiments import (
-    commands,
-    pareto_figure,
-    trade_points,
-    trade_report,
-    trade_table,
-    trained_runs,
-)
-from experiments.trade_points import BASE, Point
-from experiments.trade_table import Row
-from experiments.trained_runs import RunFailedError
+from experiments import commands, sweeps, trade_points
+from experiments.trade_points import Point
 
 _SCENE = flags.DEFINE_string("scene", None, "Folder of the scene.", required=True)
 _OUT = flags.DEFINE_string("out", None, "Folder of the sweep.", required=True)
@@ -51,9 +40,6 @@ _POINTS = flags.DEFINE_list("points", None, "Only these points, and the base, as
 _LIMIT = flags.DEFINE_integer("limit", None, "Only this many test images, evenly spread.", 1)
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "List the points, and measure nothing.")
 
-Measure = Callable[[Point], Row]
-"""Trains and evaluates a point, or raises `RunFailedError`."""
-
 
 def main() -> None:
     """Measures all points and writes the report."""
@@ -68,7 +54,9 @@ def main() -> None:
     # A sweep that is killed takes the training that it waits for with it.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     limit = () if _LIMIT.value is None else (f"--limit={_LIMIT.value}",)
-    failed = sweep(points, out, lambda point: measure(point, scene, out / "runs", limit))
+    failed = sweeps.sweep(
+        points, out, lambda point: sweeps.measure(point, scene, out / "runs", limit)
+    )
     print(f"Table:  {out / 'trade_off.csv'}")
     print(f"Figure: {out / 'trade_off.png'}")
     print(f"Report: {out / 'trade_off.md'}")
@@ -100,81 +88,6 @@ def points_from_flags() -> list[Point]:
         knobs=_KNOBS.value,
     )
     return points if _POINTS.value is None else trade_points.choose(points, _POINTS.value)
-
-
-def sweep(points: Sequence[Point], out: Path, measure_: Measure) -> dict[str, str]:
-    """Measures points, and writes table, figure and report after each.
-
-    Args:
-      points: the base first.
-      out: folder to write to.
-      measure_: measures one point.
-
-    Returns:
-      Why points failed, by name: they are left out, and the others go on.
-
-    Raises:
-      ValueError: if the base point failed, with which all are compared.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    rows: list[Row] = []
-    failed: dict[str, str] = {}
-    with commands.ProgressBar("trade-off", len(points)) as bar:
-        for done, point in enumerate(points, 1):
-            try:
-                rows.append(measure_(point))
-            except RunFailedError as error:
-                if point.name == BASE:
-                    raise ValueError(
-                        f"The base point failed: {error}. Mend that, or give another --base."
-                    ) from error
-                failed[point.name] = str(error)
-                bar.show(done, f"{point.name} failed")
-                continue
-            _write(out, rows)
-            bar.show(done, f"{point.name}: {rows[-1].quality:.2f} dB")
-    return failed
-
-
-def measure(point: Point, scene: Path, runs: Path, limit: Sequence[str] = ()) -> Row:
-    """Trains and evaluates a point, or reads what was measured before.
-
-    Points that differ in evaluation alone share a training.
-
-    Args:
-      point: the point.
-      scene: folder of the scene.
-      runs: folder of the trainings.
-      limit: options that choose the images of the evaluation.
-    """
-    run = runs / run_name(point, scene)
-    cost = trained_runs.train(run, scene=scene, options=point.training)
-    gain = trained_runs.evaluate(run, scene=scene, options=(*point.evaluation, *limit))
-    return Row(
-        scene=scene.resolve().name,
-        name=point.name,
-        knob=point.knob,
-        value=point.value,
-        training=" ".join(point.training),
-        evaluation=" ".join(point.evaluation),
-        **vars(cost),
-        **vars(gain),
-    )
-
-
-def run_name(point: Point, scene: Path) -> str:
-    """Returns the name of a training's folder, another for each scene and set of options."""
-    text = " ".join((str(scene.resolve()), *point.training))
-    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
-    shared = not point.knob or point.knob in trade_points.OF_EVALUATION
-    return f"{BASE if shared else point.name}-{digest}"
-
-
-def _write(out: Path, rows: Sequence[Row]) -> None:
-    trade_table.write(out / "trade_off.csv", rows)
-    pareto_figure.write(out / "trade_off.png", rows)
-    text = trade_report.markdown(rows)
-    (out / "trade_off.md").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":
