@@ -1,7 +1,5 @@
 """Scenes with a known background: read, rendered and measured, with nothing learned."""
 
-import dataclasses
-import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,7 +15,7 @@ from refref_jax import metrics
 from refref_jax.data import background, cameras, containment, local_layout, meshes
 from refref_jax.data.geometry import build_geometry
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics.budgets import BUDGETS, Budget
+from refref_jax.optics.budgets import Budget
 from refref_jax.optics.media import interior_slots
 from refref_jax.optics.wavefront import Geometry
 from refref_jax.render import colour
@@ -28,9 +26,6 @@ RAYS_PER_PIXEL = flags.DEFINE_integer(
     "rays_per_pixel", 9, "Rays in each pixel, a square: 1, 4, 9, 16. They are averaged."
 )
 SPLIT = flags.DEFINE_enum("split", "test", list(local_layout.SPLITS), "Views to render.")
-
-# Room is not given for smaller cuts, which would take any amount of memory.
-_SMALLEST_CUT_WITH_ROOM = 5e-4
 
 
 class KnownScene(NamedTuple):
@@ -132,27 +127,6 @@ def parse_views(text: str, count: int) -> tuple[int, ...]:
     if len(set(views)) < len(views):
         raise ValueError(f"--views={text} names a view twice. Name each once.")
     return views
-
-
-def make_budget(paths: str, *, cut: float | None = None, bends: int | None = None) -> Budget:
-    """Returns a budget by name, with another cut or number of bends, and room for what that takes.
-
-    Below the named budget's own cut room grows as the inverse square root of the cut, which a flask
-    of three media needs; what finds no room nevertheless is told as lost.
-
-    Args:
-      paths: a name in `BUDGETS`.
-      cut: smallest throughput worth following; the budget's own if `None`.
-      bends: most bends; the budget's own if `None`.
-    """
-    budget = BUDGETS[paths]
-    given = {"cut": cut, "bends": bends}
-    changed = dataclasses.replace(budget, **{k: v for k, v in given.items() if v is not None})
-    if not changed.cut < budget.cut:
-        return changed
-    growth = math.sqrt(budget.cut / max(changed.cut, _SMALLEST_CUT_WITH_ROOM))
-    rooms = ("live_per_ray", "segments_per_ray", "paths_per_ray")
-    return dataclasses.replace(changed, **{room: growth * getattr(budget, room) for room in rooms})
 
 
 def warm_up(scene: KnownScene, budget: Budget) -> None:

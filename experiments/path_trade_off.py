@@ -16,7 +16,14 @@ from typing import NamedTuple
 import numpy as np
 from absl import flags
 
-from experiments import commands, known_scenes, scenes, supersampling, trade_off_figures
+from experiments import (
+    commands,
+    known_scenes,
+    named_budgets,
+    scenes,
+    supersampling,
+    trade_off_figures,
+)
 from experiments.known_scenes import KnownScene
 from experiments.trade_off_figures import Trial
 from refref_jax.optics.budgets import BUDGETS, Budget
@@ -94,8 +101,8 @@ def settings() -> list[Setting]:
     """Returns all budgets to try; equal ones are listed in both sweeps."""
     cuts = sorted(_numbers("cuts", _CUTS.value, float), reverse=True)
     bends = sorted(_numbers("bends", _BENDS.value, int))
-    swept = [("cut", f"{cut:g}", known_scenes.make_budget("tree", cut=cut)) for cut in cuts]
-    swept += [("bends", str(n), known_scenes.make_budget("tree", bends=n)) for n in bends]
+    swept = [("cut", f"{cut:g}", named_budgets.make_budget("tree", cut=cut)) for cut in cuts]
+    swept += [("bends", str(n), named_budgets.make_budget("tree", bends=n)) for n in bends]
     points = [("budget", name, BUDGETS[name]) for name in ("straight", "paper")]
     return [Setting(*each) for each in points + swept]
 

@@ -114,6 +114,7 @@ def _tiny_model(bounds_: Bounds, interior: Interior) -> ModelConfig:
         multisamples=1,
         interior=interior,
         footprint="cone",
+        learned_tints=0,
         dilation=0.0,
         **dataclasses.asdict(bounds_),
     )
@@ -138,6 +139,7 @@ def _paper_model(bounds_: Bounds, interior: Interior) -> ModelConfig:
         multisamples=6,
         interior=interior,
         footprint="cone",
+        learned_tints=0,
         dilation=0.5,
         **dataclasses.asdict(bounds_),
     )
@@ -161,6 +163,7 @@ def _small_model(bounds_: Bounds, interior: Interior) -> ModelConfig:
         multisamples=1,
         interior=interior,
         footprint="cone",
+        learned_tints=0,
         dilation=0.0,
         **dataclasses.asdict(bounds_),
     )

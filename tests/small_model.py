@@ -21,6 +21,7 @@ MODEL = ModelConfig(
     multisamples=1,
     interior="field",
     footprint="cone",
+    learned_tints=0,
     near=0.05,
     far=15.0,
     radius=7.5,

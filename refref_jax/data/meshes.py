@@ -51,6 +51,7 @@ class MeshPart(NamedTuple):
       tint: factor of linear RGB light at every reflection and every crossing of the surface.
       absorption: of the medium inside, linear RGB, per world unit.
       priority: where bodies overlap under the rule `priority`, the highest wins.
+      colour_known: whether `scene.json` tells tint or absorption; else they are a mere default.
     """
 
     name: str
@@ -61,6 +62,7 @@ class MeshPart(NamedTuple):
     tint: Colour = CLEAR
     absorption: Colour = NO_ABSORPTION
     priority: int = 0
+    colour_known: bool = False
 
 
 def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> list[MeshPart]:

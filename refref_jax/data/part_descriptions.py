@@ -30,6 +30,8 @@ class PartDescription(NamedTuple):
       tint: factor of linear RGB light at every reflection and every crossing, 0 to 1.
       absorption: of the medium inside, linear RGB, per world unit.
       priority: of overlapping bodies the highest wins.
+      colour_known: whether tint or absorption were told; then what is not told of the two takes no
+        light.
     """
 
     index: float | None = None
@@ -37,6 +39,7 @@ class PartDescription(NamedTuple):
     tint: Colour = (1.0, 1.0, 1.0)
     absorption: Colour = (0.0, 0.0, 0.0)
     priority: int = 0
+    colour_known: bool = False
 
 
 def read_part_descriptions(path: Path) -> dict[str, PartDescription]:
@@ -81,6 +84,7 @@ def _describe(where: str, part: dict[str, Any]) -> PartDescription:
         found["priority"] = part["priority"]
         if not isinstance(part["priority"], int) or isinstance(part["priority"], bool):
             raise _refusal(where, part, "priority", "a whole number; the highest wins")
+    found["colour_known"] = "tint" in found or "absorption" in found
     return PartDescription(**found)
 
 

@@ -6,7 +6,7 @@ Source: Barron et al., Mip-NeRF 360 (2022), section 3; Zip-NeRF (2023) for the h
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, Literal
 
 import flax.linen as nn
 import jax
@@ -30,10 +30,12 @@ class DensityFieldConfig:
     Attributes:
       grid: the hash grid.
       width: units of the hidden layer.
+      precision: of the field's arithmetic.
     """
 
     grid: HashGridConfig
     width: int
+    precision: Literal["float32", "bfloat16"] = "float32"
 
 
 def init(key: Array, config: DensityFieldConfig) -> Params:

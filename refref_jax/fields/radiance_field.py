@@ -7,7 +7,7 @@ the local direction); Zip-NeRF (2023) for the hash grid and the bottleneck.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -36,6 +36,7 @@ class RadianceFieldConfig:
       bottleneck: features that the density network hands to the colour network.
       colour_width: units of the colour network's hidden layers.
       colour_depth: number of those layers.
+      precision: of the field's arithmetic.
     """
 
     grid: HashGridConfig
@@ -43,6 +44,7 @@ class RadianceFieldConfig:
     bottleneck: int
     colour_width: int
     colour_depth: int
+    precision: Literal["float32", "bfloat16"] = "float32"
 
 
 class Radiance(NamedTuple):

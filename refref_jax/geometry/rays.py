@@ -6,6 +6,7 @@ is arc length, never depth along an optical axis.
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
@@ -22,3 +23,19 @@ class Rays(NamedTuple):
     origins: Float[Array, "*rays 3"]
     directions: Float[Array, "*rays 3"]
     radii: Float[Array, "*rays"]
+
+
+def orthonormal_basis(
+    direction: Float[Array, "3"],
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Returns two unit vectors that complete a unit vector to a right-handed basis.
+
+    Source: Duff et al., Building an Orthonormal Basis, Revisited (2017).
+    """
+    x, y, z = direction
+    sign = jnp.copysign(jnp.ones_like(z), z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    right = jnp.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
+    up = jnp.stack([b, sign + y * y * a, -y])
+    return right, up

@@ -12,8 +12,10 @@ from jaxtyping import Array, Bool, Float, Int
 from refref_jax import numerics
 from refref_jax.geometry import surfaces, triangles
 from refref_jax.geometry.bvh import NO_SLOT
-from refref_jax.optics import interaction, media, splitting
+from refref_jax.geometry.rays import Rays
+from refref_jax.optics import footprints, interaction, media, splitting
 from refref_jax.optics.budgets import Budget
+from refref_jax.optics.footprints import Bend, Spread
 from refref_jax.optics.light_paths import PathStatus
 
 
@@ -36,6 +38,7 @@ class RayState(NamedTuple):
       bends: number of bends so far.
       leaving: triangle slot that the segment starts on.
       inside: the parts that the ray is in (see `media`).
+      spread: of the current segment (see `footprints`).
     """
 
     origin: Float[Array, "*rays 3"]
@@ -46,6 +49,7 @@ class RayState(NamedTuple):
     bends: Int[Array, "*rays"]
     leaving: Int[Array, "*rays"]
     inside: Int[Array, "*rays slots"]
+    spread: Spread
 
 
 class Arrival(NamedTuple):
@@ -55,11 +59,15 @@ class Arrival(NamedTuple):
       interaction: what the surface does to it.
       length: of the segment that ends there.
       weight: the ray's light after the medium on the way, and the surface's tint.
+      reflected: spread of the reflected ray.
+      transmitted: spread of the transmitted ray.
     """
 
     interaction: interaction.Interaction
     length: Float[Array, "*rays"]
     weight: Float[Array, "*rays 3"]
+    reflected: Spread
+    transmitted: Spread
 
 
 class Branches(NamedTuple):
@@ -69,19 +77,18 @@ class Branches(NamedTuple):
     transmitted: RayState
 
 
-def begin(
-    origin: Float[Array, "3"], direction: Float[Array, "3"], inside: Int[Array, " slots"]
-) -> RayState:
+def begin(ray: Rays, inside: Int[Array, " slots"], spread: Spread) -> RayState:
     """Returns a camera ray before its first surface."""
     return RayState(
-        origin=origin,
-        point=origin,
-        direction=direction,
-        tau=jnp.zeros_like(origin[0]),
-        weight=jnp.ones_like(origin),
+        origin=ray.origins,
+        point=ray.origins,
+        direction=ray.directions,
+        tau=jnp.zeros_like(ray.radii),
+        weight=jnp.ones_like(ray.origins),
         bends=jnp.zeros((), jnp.int32),
         leaving=jnp.full((), NO_SLOT, jnp.int32),
         inside=inside,
+        spread=spread,
     )
 
 
@@ -91,17 +98,27 @@ def arrive(geometry: Geometry, state: RayState, slot: Int[Array, ""]) -> Arrival
     Where it meets the triangle is computed anew, from the corners as they are: so it has gradients,
     and the precision of the corners rather than that of the search.
     """
-    corners = geometry.surfaces.bvh.triangles[slot]
-    found = triangles.intersect(state.origin, state.direction, corners).barycentric
-    # A ray that meets nothing looks at some triangle: neither value nor gradient may come of it.
-    barycentric = jnp.where(slot == NO_SLOT, 1.0 / 3.0, found)
-    point = surfaces.surface_point(geometry.surfaces, slot, barycentric)
-    # Or XLA would gather the triangle anew for every result that depends on it.
-    point = jax.lax.optimization_barrier(point)
-    met = interaction.meet(point, geometry.interfaces, state.inside, state.direction)
+
+    def surface(
+        origin: Float[Array, "3"], direction: Float[Array, "3"]
+    ) -> tuple[Bend, interaction.Interaction]:
+        corners = geometry.surfaces.bvh.triangles[slot]
+        found = triangles.intersect(origin, direction, corners).barycentric
+        # A ray that meets nothing looks at some triangle: no value nor gradient may come of it.
+        barycentric = jnp.where(slot == NO_SLOT, 1.0 / 3.0, found)
+        point = surfaces.surface_point(geometry.surfaces, slot, barycentric)
+        # Or XLA would gather the triangle anew for every result that depends on it.
+        point = jax.lax.optimization_barrier(point)
+        met = interaction.meet(point, geometry.interfaces, state.inside, direction)
+        return Bend(met.position, met.reflected, met.transmitted), met
+
+    met, reflected, transmitted = footprints.bend(
+        surface, state.origin, state.direction, state.spread
+    )
     length = numerics.length(met.position - state.point)
     passed = media.transmittance(geometry.interfaces, met.sides.medium_near, length)
-    return Arrival(met, length, state.weight * passed * met.sides.tint)
+    weight = state.weight * passed * met.sides.tint
+    return Arrival(met, length, weight, reflected, transmitted)
 
 
 def ending(
@@ -143,11 +160,13 @@ def branch(budget: Budget, state: RayState, arrival: Arrival, slot: Int[Array, "
             origin=met.restart_reflected,
             direction=met.reflected,
             weight=arrival.weight * share.reflected,
+            spread=arrival.reflected,
         ),
         transmitted=after._replace(
             origin=met.restart_transmitted,
             direction=met.transmitted,
             weight=arrival.weight * share.transmitted,
             inside=met.sides.inside_after,
+            spread=arrival.transmitted,
         ),
     )

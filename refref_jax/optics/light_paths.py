@@ -9,10 +9,13 @@ Letters, as in the paper (section 4.2): a path has points `p_0 .. p_K`, unit dir
 import enum
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.geometry.rays import Rays
+from refref_jax.optics import footprints
+from refref_jax.optics.footprints import Spread
 from refref_jax.optics.media import AMBIENT
 
 
@@ -38,29 +41,39 @@ class LightPaths(NamedTuple):
     """The light paths of a batch of rays, padded to the same number of segments.
 
     A ray may have any number of paths, in any order. Its colour is the sum of its paths'
-    colours times their weights.
+    colours times their weights. Segments inside the objects may be left out (see `details`): then
+    the next one starts later than the one before it ends.
 
     Attributes:
       points: start of each segment, world units; finite but meaningless where unused.
       directions: unit direction of each segment; likewise.
       tau: arc length at the start of each segment, increasing from 0; `inf` where unused.
+      ends: arc length at the end of each segment; `inf` for the last, and where unused.
       media: medium of each segment (see `media`).
+      spreads: derivatives of each segment across the pixel, if they are carried (see
+        `footprints`).
       rays: index of the ray that a path belongs to.
       weights: share of the path in its ray's linear RGB.
       radii: footprint of the ray's pixel as a cone radius at unit distance.
       bends: number of refractions and reflections.
       statuses: a `PathStatus`.
+      meetings: how often the path met each part, if that is tallied (see `details`).
+      passages: how far it went through each part's medium, world units; likewise.
     """
 
     points: Float[Array, "paths segments 3"]
     directions: Float[Array, "paths segments 3"]
     tau: Float[Array, "paths segments"]
+    ends: Float[Array, "paths segments"]
     media: Int[Array, "paths segments"]
+    spreads: Spread
     rays: Int[Array, " paths"]
     weights: Float[Array, "paths 3"]
     radii: Float[Array, " paths"]
     bends: Int[Array, " paths"]
     statuses: Int[Array, " paths"]
+    meetings: Float[Array, "paths tallied"]
+    passages: Float[Array, "paths tallied"]
 
 
 class PathEnds(NamedTuple):
@@ -95,12 +108,16 @@ def straight(rays: Rays) -> LightPaths:
         points=rays.origins[:, None],
         directions=rays.directions[:, None],
         tau=jnp.zeros_like(rays.radii)[:, None],
+        ends=jnp.full_like(rays.radii, jnp.inf)[:, None],
         media=jnp.full((count, 1), AMBIENT, jnp.int32),
+        spreads=jax.vmap(jax.vmap(footprints.nothing))(rays.origins[:, None]),
         rays=integers,
         weights=jnp.ones_like(rays.directions),
         radii=rays.radii,
         bends=jnp.zeros_like(integers),
         statuses=jnp.full_like(integers, PathStatus.NOT_TRACED),
+        meetings=jnp.zeros_like(rays.origins, shape=(count, 0)),
+        passages=jnp.zeros_like(rays.origins, shape=(count, 0)),
     )
 
 

@@ -73,6 +73,7 @@ class Crossing(NamedTuple):
       medium_near: medium on the incident side.
       medium_far: medium on the other side.
       tint: factor of linear RGB light, reflected or transmitted.
+      part: the part whose surface it is, or `EMPTY_SLOT` if it is outranked.
       inside_after: interior list on the other side; a reflected ray keeps its own.
     """
 
@@ -81,6 +82,7 @@ class Crossing(NamedTuple):
     medium_near: Int[Array, ""]
     medium_far: Int[Array, ""]
     tint: Float[Array, "3"]
+    part: Int[Array, ""]
     inside_after: Int[Array, " slots"]
 
 
@@ -122,6 +124,7 @@ def crossing(
         medium_near=medium_near,
         medium_far=medium_far,
         tint=jnp.where(outranked, 1.0, interfaces.tint[part]),
+        part=jnp.where(outranked, EMPTY_SLOT, part),
         inside_after=jnp.where(entering, within, without),
     )
 
@@ -160,6 +163,7 @@ def _declared_crossing(
         medium_near=jnp.where(entering, without, within),
         medium_far=jnp.where(entering, within, without),
         tint=interfaces.tint[part],
+        part=part,
         inside_after=inside,
     )
 

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import media, path_tree
+from refref_jax.optics import details, media, packing, path_tree
 from refref_jax.optics.budgets import Budget, room
+from refref_jax.optics.details import Detail
 from refref_jax.optics.light_paths import (
     LightPaths,
     PathEnds,
@@ -26,7 +27,6 @@ from refref_jax.optics.light_paths import (
     straight,
     straight_ends,
 )
-from refref_jax.optics.path_tree import Ends, PathTree
 from refref_jax.optics.wavefront import BLOCK, Geometry, follow
 
 
@@ -104,6 +104,7 @@ def trace(
     *,
     budget: Budget,
     capacity: int,
+    detail: Detail | None = None,
     inside: Int[Array, "rays slots"] | None = None,
 ) -> Traced:
     """Traces one batch of rays.
@@ -114,12 +115,15 @@ def trace(
       budget: which light to follow.
       capacity: room for paths; see `budgets.capacity_for`. Not used if there are no bends to
         follow, or no rays.
+      detail: what to keep of the paths; by default every segment, and nothing besides.
       inside: as for `trace_ends`.
     """
     batch = jax.tree.map(lambda x: x[None], rays)
     if inside is not None:
         inside = inside[None]
-    traced = trace_batches(geometry, batch, budget=budget, capacity=capacity, inside=inside)
+    traced = trace_batches(
+        geometry, batch, budget=budget, capacity=capacity, detail=detail, inside=inside
+    )
     return jax.tree.map(lambda x: x[0], traced)
 
 
@@ -129,6 +133,7 @@ def trace_batches(
     *,
     budget: Budget,
     capacity: int,
+    detail: Detail | None = None,
     inside: Int[Array, "batches rays slots"] | None = None,
 ) -> Traced:
     """Traces many batches in one pool, which amortises the latency of the traversal's loop.
@@ -139,6 +144,7 @@ def trace_batches(
       budget: which light to follow.
       capacity: room for the paths of each batch; not used if there are no bends to follow, or no
         rays.
+      detail: as for `trace`.
       inside: as for `trace_ends`.
 
     Returns:
@@ -150,10 +156,16 @@ def trace_batches(
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
     if inside is not None:
         inside = inside.reshape(batches * count, inside.shape[-1])
-    tree = follow(geometry, flat, _inside(geometry, flat, inside), budget=budget)
-    ends, lost = _pack(tree, batches, count, capacity)
+    detail = detail or details.everything(budget.bends)
+    inside = _inside(geometry, flat, inside)
+    tree = follow(geometry, flat, inside, budget=budget, footprint=detail.footprint)
+    ends, lost = packing.pack(tree, batches, count, capacity)
     paths = path_tree.polylines(
-        tree.segments.items, ends, flat.radii[ends.rays], bends=budget.bends
+        tree.segments.items,
+        ends,
+        flat.radii[ends.rays],
+        detail=detail,
+        parts=geometry.interfaces.index_inside.shape[0],
     )
     paths = jax.tree.map(lambda x: x.reshape(batches, capacity, *x.shape[1:]), paths)
     return Traced(paths._replace(rays=paths.rays % count), lost.reshape(batches, count, 3))
@@ -181,34 +193,3 @@ def _inside(
         return inside
     nowhere = media.nowhere(geometry.interfaces)
     return jnp.broadcast_to(nowhere, (rays.radii.shape[0], nowhere.shape[0]))
-
-
-def _pack(
-    tree: PathTree, batches: int, rays: int, capacity: int
-) -> tuple[Ends, Float[Array, "all_rays 3"]]:
-    """Sorts paths into one list a batch, joined end to end; returns the light lost by now."""
-    slots = tree.ends.items.rays.shape[0]
-    ends = path_tree.listed(tree, slots)
-    weight = jnp.max(ends.weights, axis=-1)
-    # The slots past the last path form a batch of their own.
-    lanes = jnp.arange(slots, dtype=jnp.int32)
-    batch = jnp.where(lanes < tree.ends.count, ends.rays // rays, batches)
-    strongest_first = jnp.lexsort((-weight, batch))
-    rank = _rank_in_group(batch[strongest_first], batches)
-    fits = jnp.zeros(slots, bool).at[strongest_first].set(rank < capacity) & (batch < batches)
-    group = jnp.where(fits, batch, batches)
-    order = jnp.lexsort((-weight, ends.rays, group)).astype(jnp.int32)
-    place = group[order] * capacity + _rank_in_group(group[order], batches)
-    target = jnp.where(fits[order], place, batches * capacity)
-    source = jnp.full(batches * capacity, slots, jnp.int32).at[target].set(order, mode="drop")
-    packed = jax.tree.map(lambda x: x[jnp.minimum(source, slots - 1)], ends)
-    home = jnp.repeat(jnp.arange(batches, dtype=jnp.int32) * rays, capacity)
-    left_over = jnp.where(fits[:, None], 0.0, ends.weights)
-    lost = tree.lost.at[ends.rays].add(left_over)
-    return path_tree.emptied(packed, source == slots, home), lost
-
-
-def _rank_in_group(group: Int[Array, " n"], groups: int) -> Int[Array, " n"]:
-    """Returns the place of each record among its group's, for records sorted by group."""
-    begin = jnp.searchsorted(group, jnp.arange(groups + 1, dtype=jnp.int32)).astype(jnp.int32)
-    return jnp.arange(group.shape[0], dtype=jnp.int32) - begin[group]

@@ -10,7 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from refref_jax.optics.details import Detail
+from refref_jax.optics.footprints import Spread
 from refref_jax.optics.light_paths import LightPaths, PathEnds, PathStatus
+from refref_jax.optics.media import AMBIENT
 from refref_jax.optics.pools import Pool
 
 NO_SEGMENT = -1
@@ -26,6 +29,8 @@ class Segments(NamedTuple):
       directions: unit direction.
       tau: arc length from the camera to the start.
       media: medium (see `media`).
+      parts: the part whose surface it leaves, or `media.EMPTY_SLOT`.
+      spreads: its derivatives across the pixel (see `footprints`).
     """
 
     parents: Int[Array, " segments"]
@@ -33,6 +38,8 @@ class Segments(NamedTuple):
     directions: Float[Array, "segments 3"]
     tau: Float[Array, " segments"]
     media: Int[Array, " segments"]
+    parts: Int[Array, " segments"]
+    spreads: Spread
 
 
 class Ends(NamedTuple):
@@ -116,35 +123,99 @@ def last_segments(segments: Segments, ends: Ends) -> PathEnds:
 
 
 def polylines(
-    segments: Segments, ends: Ends, radii: Float[Array, " paths"], *, bends: int
+    segments: Segments, ends: Ends, radii: Float[Array, " paths"], *, detail: Detail, parts: int
 ) -> LightPaths:
-    """Returns the paths in full, padded to `bends + 1` segments.
+    """Returns paths with the segments that are wanted of them.
 
     Args:
       segments: the log.
       ends: of the wanted paths.
       radii: footprint of each path's pixel.
-      bends: most bends of any path.
+      detail: which segments, and whether parts are tallied.
+      parts: number of parts that can be met.
     """
-
-    def step(segment: Int[Array, " paths"], place: Int[Array, ""]) -> tuple[Array, Segments]:
-        """Reads one segment of every path, from the last place to the first."""
-        used = place <= ends.bends
-        read = jax.tree.map(lambda x: x[segment], segments)
-        read = read._replace(tau=jnp.where(used, read.tau, jnp.inf))
-        return jnp.where(used, read.parents, segment), read
-
-    places = jnp.arange(bends, -1, -1, dtype=jnp.int32)
-    _, read = jax.lax.scan(step, ends.segments, places)
-    read = jax.tree.map(lambda x: jnp.moveaxis(x[::-1], 0, 1), read)
+    walk = _walk_back(segments, ends, detail, parts if detail.tally == "parts" else 0)
+    # Picked from the last to the first, at the right of their row.
+    count = jnp.minimum(walk.found, detail.most)
+    lanes = jnp.arange(detail.most, dtype=jnp.int32)
+    used = lanes < count[:, None]
+    place = jnp.where(used, lanes + detail.most - count[:, None], detail.most - 1)
+    picked = jnp.take_along_axis(walk.picked, place, axis=-1)
+    stop = jnp.take_along_axis(walk.stops, place, axis=-1)
+    read = jax.tree.map(lambda x: x[picked], segments)
     return LightPaths(
         points=read.points,
         directions=read.directions,
-        tau=read.tau,
-        media=jnp.where(jnp.isfinite(read.tau), read.media, 0),
+        tau=jnp.where(used, read.tau, jnp.inf),
+        ends=jnp.where(used, stop, jnp.inf),
+        media=jnp.where(used, read.media, AMBIENT),
+        spreads=read.spreads,
         rays=ends.rays,
         weights=ends.weights,
         radii=radii,
         bends=ends.bends,
         statuses=ends.statuses,
+        meetings=walk.meetings,
+        passages=walk.passages,
     )
+
+
+class _Walk(NamedTuple):
+    """State of the walk from the last segment of each path to its first.
+
+    Attributes:
+      segment: where each path is, `NO_SEGMENT` if it is done.
+      stop: arc length at which that segment ends.
+      found: number of wanted segments by now.
+      picked: the wanted segments, from the right; the first of a path takes the leftmost place.
+      stops: where they end.
+      meetings: tallied by now.
+      passages: tallied by now.
+    """
+
+    segment: Int[Array, " paths"]
+    stop: Float[Array, " paths"]
+    found: Int[Array, " paths"]
+    picked: Int[Array, "paths most"]
+    stops: Float[Array, "paths most"]
+    meetings: Float[Array, "paths tallied"]
+    passages: Float[Array, "paths tallied"]
+
+
+def _walk_back(segments: Segments, ends: Ends, detail: Detail, tallied: int) -> _Walk:
+    count = ends.segments.shape[0]
+    none = jnp.zeros_like(segments.tau, shape=(count, tallied))
+    lanes = jnp.arange(detail.most, dtype=jnp.int32)
+    names = jnp.arange(tallied, dtype=jnp.int32)
+
+    def step(walk: _Walk) -> _Walk:
+        going = walk.segment != NO_SEGMENT
+        at = jnp.maximum(walk.segment, 0)
+        tau, medium = segments.tau[at], segments.media[at]
+        wanted = going & ((detail.segments == "all") | (medium == AMBIENT) | jnp.isinf(walk.stop))
+        here = wanted[:, None] & (lanes == jnp.maximum(detail.most - 1 - walk.found, 0)[:, None])
+        # The last segment never ends, and is not a passage.
+        length = jnp.where(going & jnp.isfinite(walk.stop), walk.stop - tau, 0.0)
+        met = (going & (segments.parts[at] >= 0))[:, None] & (names == segments.parts[at][:, None])
+        through = names + 1 == medium[:, None]
+        return _Walk(
+            segment=jnp.where(going, segments.parents[at], NO_SEGMENT),
+            stop=tau,
+            found=walk.found + wanted,
+            picked=jnp.where(here, at[:, None], walk.picked),
+            stops=jnp.where(here, walk.stop[:, None], walk.stops),
+            meetings=walk.meetings + met,
+            passages=walk.passages + jnp.where(through, length[:, None], 0.0),
+        )
+
+    start = _Walk(
+        segment=ends.segments,
+        stop=jnp.full_like(none, jnp.inf, shape=(count,)),
+        found=jnp.zeros_like(ends.segments),
+        picked=jnp.zeros((count, detail.most), jnp.int32),
+        stops=jnp.full_like(none, jnp.inf, shape=(count, detail.most)),
+        meetings=none,
+        passages=none,
+    )
+    # Every segment has one bend more than its parent, so this ends.
+    return jax.lax.while_loop(lambda walk: jnp.any(walk.segment != NO_SEGMENT), step, start)

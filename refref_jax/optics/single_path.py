@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Int
 from refref_jax.geometry.bvh import NO_SLOT
 from refref_jax.geometry.closest_hit import closest_slot
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import branching, media
+from refref_jax.optics import branching, footprints, media
 from refref_jax.optics.branching import Geometry, RayState
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.light_paths import LightPaths, PathStatus
@@ -96,7 +96,7 @@ def follow_branch(
     if inside is None:
         inside = media.nowhere(geometry.interfaces)
     start = _Walk(
-        branching.begin(ray.origins, ray.directions, inside),
+        branching.begin(ray, inside, footprints.nothing(ray.origins)),
         jnp.int32(media.AMBIENT),
         jnp.asarray(budget.bends > 0),
         jnp.int32(PathStatus.EMPTY),
@@ -141,14 +141,20 @@ def _either(which: Bool[Array, ""], first: _Record, second: _Record) -> _Record:
 
 def _record(ray: Rays, end: _Walk, segments: _Segment) -> LightPaths:
     used = segments.used
+    tau = jnp.where(used, segments.state.tau, jnp.inf)
+    none = jnp.zeros_like(tau, shape=(0,))
     return LightPaths(
         points=segments.state.point,
         directions=segments.state.direction,
-        tau=jnp.where(used, segments.state.tau, jnp.inf),
+        tau=tau,
+        ends=jnp.append(tau[1:], jnp.inf),
+        spreads=segments.state.spread,
         media=jnp.where(used, segments.medium, media.AMBIENT),
         rays=jnp.zeros_like(end.status),
         weights=end.state.weight,
         radii=ray.radii,
         bends=end.state.bends,
         statuses=end.status,
+        meetings=none,
+        passages=none,
     )

@@ -25,10 +25,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.geometry import bvh
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import branching, budgets, media, path_tree, pools
+from refref_jax.optics import branching, budgets, footprints, media, path_tree, pools
 from refref_jax.optics.branching import Arrival, Branches, RayState
 from refref_jax.optics.branching import Geometry as Geometry
 from refref_jax.optics.budgets import Budget, Room
+from refref_jax.optics.footprints import Footprint
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_tree import NO_SEGMENT, Ends, PathTree, Segments
 from refref_jax.optics.pools import Pool
@@ -62,12 +63,14 @@ class _Children(NamedTuple):
     Attributes:
       live: the branches; the index of their segment is their parent's until it is logged.
       media: medium of each one's segment.
+      parts: part that each one leaves.
       exists: which there are.
       traced: which are followed further.
     """
 
     live: _Live
     media: Int[Array, " branches"]
+    parts: Int[Array, " branches"]
     exists: Bool[Array, " branches"]
     traced: Bool[Array, " branches"]
 
@@ -92,6 +95,7 @@ def follow(
     inside: Int[Array, "rays slots"],
     *,
     budget: Budget,
+    footprint: Footprint = "cone",
     block: int = BLOCK,
 ) -> PathTree:
     """Follows each ray along all branches; every child has one bend more than its parent.
@@ -101,14 +105,20 @@ def follow(
       rays: any number of camera rays.
       inside: the parts that each camera is in (see `media.nowhere`).
       budget: which light to follow, with at least one bend.
+      footprint: whether to carry derivatives across the pixel.
       block: rays cast in a round.
     """
-    return _follow(budget, block, geometry, rays, inside)
+    return _follow(budget, footprint, block, geometry, rays, inside)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
 def _follow(
-    budget: Budget, block: int, geometry: Geometry, rays: Rays, inside: Int[Array, "rays slots"]
+    budget: Budget,
+    footprint: Footprint,
+    block: int,
+    geometry: Geometry,
+    rays: Rays,
+    inside: Int[Array, "rays slots"],
 ) -> PathTree:
     count = rays.radii.shape[0]
     block = max(1, min(block, count))
@@ -127,13 +137,15 @@ def _follow(
         ends, lost = pools.shed(walk.tree.ends, lost, room.paths)
         return _Walk(stack, walk.next, walk.tree._replace(ends=ends, lost=lost))
 
-    start = _begin(rays, inside, block, room)
+    start = _begin(rays, inside, footprint, block, room)
     return jax.lax.while_loop(lambda walk: walk.next.count > 0, advance, start).tree
 
 
 @_follow.defjvp
-def _refuse_gradients(budget: Budget, block: int, primals: object, tangents: object) -> None:
-    del budget, block, primals, tangents
+def _refuse_gradients(
+    budget: Budget, footprint: Footprint, block: int, primals: object, tangents: object
+) -> None:
+    del budget, footprint, block, primals, tangents
     raise TypeError(
         "Light paths of the wavefront have no derivatives with respect to rays or geometry: they "
         "would be silently wrong. Use optics.single_path for these, or hold rays and geometry "
@@ -141,14 +153,20 @@ def _refuse_gradients(budget: Budget, block: int, primals: object, tangents: obj
     )
 
 
-def _begin(rays: Rays, inside: Int[Array, "rays slots"], block: int, room: Room) -> _Walk:
+def _begin(
+    rays: Rays, inside: Int[Array, "rays slots"], footprint: Footprint, block: int, room: Room
+) -> _Walk:
     """Puts the camera rays on the stack and their segments into the log."""
     count = rays.radii.shape[0]
     order = jnp.arange(count, dtype=jnp.int32)
-    state = jax.vmap(branching.begin)(rays.origins, rays.directions, inside)
+    spread = jax.vmap(lambda ray: footprints.begin(ray, footprint))(rays)
+    state = jax.vmap(branching.begin)(rays, inside, spread)
     ambient = jnp.full_like(order, media.AMBIENT)
     first = jnp.full_like(order, NO_SEGMENT)
-    segments = Segments(first, state.point, state.direction, state.tau, ambient)
+    nowhere = jnp.full_like(order, media.EMPTY_SLOT)
+    segments = Segments(
+        first, state.point, state.direction, state.tau, ambient, nowhere, state.spread
+    )
     ends = Ends(order, order, state.weight, order, order)
     # Beyond its capacity each list has room for what one round may append.
     tree = PathTree(
@@ -202,14 +220,19 @@ def _children(
     """Lists the branches of the rays that bend."""
     sides = arrival.interaction.sides
     states = pools.join(branches.reflected, branches.transmitted)
+    mediums = pools.join(sides.medium_near, sides.medium_far)
     untraced = ~arrival.interaction.total & (budget.reflections == "first")
+    traced = pools.join(~untraced, jnp.ones_like(bending))
+    if budget.reentry == "impossible":
+        traced &= mediums != media.AMBIENT
     return _Children(
         live=_Live(
             states, pools.join(live.rays, live.rays), pools.join(live.segments, live.segments)
         ),
-        media=pools.join(sides.medium_near, sides.medium_far),
+        media=mediums,
+        parts=pools.join(sides.part, sides.part),
         exists=pools.join(bending, bending) & (jnp.max(states.weight, axis=-1) > 0.0),
-        traced=pools.join(~untraced, jnp.ones_like(bending)),
+        traced=traced,
     )
 
 
@@ -220,7 +243,15 @@ def _log(tree: PathTree, children: _Children, room: Room) -> tuple[PathTree, _Ch
     kept = pools.strongest(children.exists, jnp.max(live.weights, axis=-1), left)
     index = tree.segments.count + jnp.cumsum(kept, dtype=jnp.int32) - 1
     state = live.state
-    logged = Segments(live.segments, state.point, state.direction, state.tau, children.media)
+    logged = Segments(
+        live.segments,
+        state.point,
+        state.direction,
+        state.tau,
+        children.media,
+        children.parts,
+        state.spread,
+    )
     log = pools.append(tree.segments, logged, kept)
     lost = pools.lose(tree.lost, live.rays, live.weights, children.exists & ~kept)
     children = children._replace(live=live._replace(segments=index), exists=kept)
@@ -232,8 +263,9 @@ def _push(
 ) -> tuple[PathTree, Pool]:
     """Puts children on the stack, and ends those that are not traced."""
     live = children.live
-    if budget.reflections == "first":
-        status = jnp.full_like(live.rays, PathStatus.NOT_TRACED)
+    if budget.reflections == "first" or budget.reentry == "impossible":
+        escapes = (budget.reentry == "impossible") & (children.media == media.AMBIENT)
+        status = jnp.where(escapes, PathStatus.ESCAPED, PathStatus.NOT_TRACED).astype(jnp.int32)
         tree = _end(tree, live, status, children.exists & ~children.traced)
     return tree, pools.append(stack, live, children.exists & children.traced)
 

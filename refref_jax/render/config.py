@@ -5,11 +5,19 @@ from typing import Literal, get_args
 
 from refref_jax.fields.density_field import DensityFieldConfig
 from refref_jax.fields.radiance_field import RadianceFieldConfig
+from refref_jax.optics.budgets import Budget
+from refref_jax.optics.details import Detail
+from refref_jax.optics.footprints import Footprint
 from refref_jax.sampling.domains import Space
 
 Interior = Literal["field", "clear", "absorbing"]
 
-Footprint = Literal["cone", "differential"]
+# Before a convex body, and after it.
+_CONVEX_LEGS = 2
+
+# Between bodies that light leaves and enters again there are more, but few: with four places,
+# 0.04 % of the light of a torus has one left out, which is then taken to be empty.
+_MOST_LEGS = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +47,7 @@ class ModelConfig:
         there, but light is dimmed on its way by the colours of media and interfaces.
       footprint: `cone` widens a pixel's footprint with arc length as if the path were straight
         (the paper); `differential` follows it through every bend by its derivatives.
+      learned_tints: number of parts whose tint and absorption are learned, all of them or 0.
       near: distance of the first sample from the camera, world units.
       far: distance of the last from the last bend, or from the camera on a straight path; the
         background is opaque there. In a bounded scene a path ends already where it leaves the
@@ -57,6 +66,7 @@ class ModelConfig:
     multisamples: int
     interior: Interior
     footprint: Footprint
+    learned_tints: int
     near: float
     far: float
     radius: float
@@ -74,9 +84,23 @@ class ModelConfig:
             )
         if not self.radius > 0.0:
             raise ValueError(f"The radius must be positive, not {self.radius}. Correct it.")
+        if self.learned_tints < 0:
+            raise ValueError(
+                f"{self.learned_tints} parts can not have learned tints. Give their number, or 0."
+            )
         _check_choice("space", self.space, get_args(Space))
         _check_choice("interior", self.interior, get_args(Interior))
         _check_choice("footprint", self.footprint, get_args(Footprint))
+
+
+def path_detail(config: ModelConfig, budget: Budget) -> Detail:
+    """Returns what a model needs to know of its light paths."""
+    tally = "parts" if config.learned_tints else "none"
+    most = budget.bends + 1
+    if config.interior == "field":
+        return Detail("all", most, config.footprint, tally)
+    legs = _CONVEX_LEGS if budget.reentry == "impossible" else _MOST_LEGS
+    return Detail("outside", min(legs, most), config.footprint, tally)
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:

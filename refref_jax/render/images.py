@@ -16,10 +16,11 @@ from jaxtyping import Array, Bool, Float, Int
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.budgets import Budget, room
+from refref_jax.optics.details import Detail
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.optics.wavefront import Geometry
-from refref_jax.render import colour, pixels
-from refref_jax.render.config import ModelConfig
+from refref_jax.render import colour, dyes, pixels
+from refref_jax.render.config import ModelConfig, path_detail
 from refref_jax.render.model import Model, Params
 
 TILE = 16384
@@ -72,7 +73,10 @@ def render_rays(model: Model, rays: Rays) -> Rendering:
     """
     count = rays.radii.shape[0]
     capacity = room(model.budget, count).paths
-    traced = path_tracing.trace(model.geometry, rays, budget=model.budget, capacity=capacity)
+    detail = path_detail(model.config, model.budget)
+    traced = path_tracing.trace(
+        model.geometry, rays, budget=model.budget, capacity=capacity, detail=detail
+    )
     tile = _sort(traced.paths, count, count)
     empty = jax.tree.map(jnp.zeros_like, _blank(count))
     return _finish(_add(model.params, tile.paths, tile.heaviest, empty, config=model.config))
@@ -113,7 +117,8 @@ def _slice_rays(rays: Rays, start: int) -> Rays:
 
 
 def _render_tile(model: Model, rays: Rays, real: int, chunk: int) -> Rendering:
-    tile = _trace_tile(model.geometry, rays, real, budget=model.budget)
+    detail = path_detail(model.config, model.budget)
+    tile = _trace_tile(model.geometry, rays, real, budget=model.budget, detail=detail)
     sums = _blank(TILE)
     for start in range(0, int(tile.count), chunk):
         sums = _render_chunk(model.params, tile, sums, start, config=model.config, chunk=chunk)
@@ -125,10 +130,12 @@ def _blank(count: int) -> Rendering:
     return Rendering(black, zeros, zeros, zeros, black)
 
 
-@functools.partial(jax.jit, static_argnames="budget")
-def _trace_tile(geometry: Geometry, rays: Rays, real: Int[Array, ""], *, budget: Budget) -> _Tile:
+@functools.partial(jax.jit, static_argnames=("budget", "detail"))
+def _trace_tile(
+    geometry: Geometry, rays: Rays, real: Int[Array, ""], *, budget: Budget, detail: Detail
+) -> _Tile:
     capacity = room(budget, TILE).paths
-    traced = path_tracing.trace(geometry, rays, budget=budget, capacity=capacity)
+    traced = path_tracing.trace(geometry, rays, budget=budget, capacity=capacity, detail=detail)
     return _sort(traced.paths, TILE, real)
 
 
@@ -185,6 +192,7 @@ def _add(
     jitter = pixels.no_jitter(config, paths.radii.shape[0])
     one = jnp.ones_like(paths.radii[0])
     seen = pixels.render_paths(params, config, paths, jitter, anneal=one).composite
+    paths = dyes.dye(params.dyes, paths, radius=config.radius)
     share = jnp.mean(paths.weights, axis=-1)
     rays = sums.distance.shape[0]
     # An index past the end drops the write.

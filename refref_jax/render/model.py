@@ -8,7 +8,9 @@ from jaxtyping import Array
 from refref_jax.fields import density_field, radiance_field
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.wavefront import Geometry
+from refref_jax.render import dyes
 from refref_jax.render.config import ModelConfig
+from refref_jax.render.dyes import Dyes
 
 
 class Params(NamedTuple):
@@ -17,10 +19,12 @@ class Params(NamedTuple):
     Attributes:
       proposals: parameters of each proposal round's density field.
       field: parameters of the radiance field.
+      dyes: colours of the parts, if they are learned.
     """
 
     proposals: tuple[density_field.Params, ...]
     field: radiance_field.Params
+    dyes: Dyes | None
 
 
 class Model(NamedTuple):
@@ -46,4 +50,5 @@ def init_params(key: Array, config: ModelConfig) -> Params:
         density_field.init(proposal_key, proposal.field)
         for proposal_key, proposal in zip(keys, config.proposals, strict=True)
     )
-    return Params(proposals, radiance_field.init(field_key, config.field))
+    colours = dyes.init(config.learned_tints) if config.learned_tints else None
+    return Params(proposals, radiance_field.init(field_key, config.field), colours)

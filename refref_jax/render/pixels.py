@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from refref_jax.optics.light_paths import LightPaths
-from refref_jax.render import colour, transport
+from refref_jax.render import colour, dyes, transport
 from refref_jax.render.config import ModelConfig
 from refref_jax.render.model import Params
 from refref_jax.render.transport import Jitter, PathRadiance
@@ -49,6 +49,7 @@ def render_pixels(
       anneal: see `transport.path_radiance`.
     """
     seen = render_paths(params, config, paths, jitter, anneal=anneal)
+    paths = dyes.dye(params.dyes, paths, radius=config.radius)
     linear = jax.ops.segment_sum(paths.weights * seen.composite.rgb, paths.rays, num_segments=rays)
     return Pixels(colour.linear_to_srgb(linear), seen)
 

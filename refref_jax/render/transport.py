@@ -103,13 +103,13 @@ def path_radiance(
     histograms = []
     for level, proposal in enumerate(config.proposals):
         s = _resample(config, histograms, jitter.offsets[level], anneal, proposal.samples)
-        samples = _place(config, line, warp, path.radii, s, jitter.rotations[level])
+        samples = _place(config, line, warp, s, jitter.rotations[level])
         see = jax.vmap(density_field.density, in_axes=(None, None, 0))
         density = see(params.proposals[level], proposal.field, samples.gaussians)
         histograms.append(Histogram(s, _weigh(config, density, samples.t)))
 
     s = _resample(config, histograms, jitter.offsets[-1], anneal, config.samples)
-    samples = _place(config, line, warp, path.radii, s, jitter.rotations[-1])
+    samples = _place(config, line, warp, s, jitter.rotations[-1])
     middles = 0.5 * (samples.t[1:] + samples.t[:-1])
     points = jax.vmap(polylines.point_at, in_axes=(None, 0))(line, middles)
     see = jax.vmap(radiance_field.radiance, in_axes=(None, None, 0, 0))
@@ -148,9 +148,9 @@ def domain(config: ModelConfig) -> domains.Domain:
 
 
 def _polyline(config: ModelConfig, path: LightPaths) -> Polyline:
-    if config.interior == "clear":
-        return polylines.outside_path(path)
-    return polylines.whole_path(path)
+    if config.interior == "field":
+        return polylines.whole_path(path)
+    return polylines.outside_path(path)
 
 
 def _resample(
@@ -180,7 +180,6 @@ def _place(
     config: ModelConfig,
     line: Polyline,
     warp: warps.DistanceWarp,
-    radius: Float[Array, ""],
     s: Float[Array, " edges"],
     rotation: Float[Array, ""],
 ) -> _Round:
@@ -189,7 +188,7 @@ def _place(
     turns = rotation + _PATTERN_TURN * (jnp.arange(t.shape[0] - 1, dtype=t.dtype) % 2)
 
     def cone(start: Array, end: Array, turn: Array) -> Gaussians:
-        world = cones.multisamples(line, radius, start, end, turn, count=config.multisamples)
+        world = cones.multisamples(line, start, end, turn, count=config.multisamples)
         return domains.to_unit_cube(domain(config), world)
 
     return _Round(s, t, jax.vmap(cone)(t[:-1], t[1:], turns))

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from refref_jax import numerics
 from refref_jax.sampling.polylines import Polyline, point_at
 
 # Zip-NeRF's hexagon: each triangle of points turns once, the second one shifted by half a turn.
@@ -41,7 +42,6 @@ class Gaussians(NamedTuple):
 
 def multisamples(
     line: Polyline,
-    radius: Float[Array, ""],
     start: Float[Array, ""],
     end: Float[Array, ""],
     rotation: Float[Array, ""],
@@ -56,7 +56,6 @@ def multisamples(
 
     Args:
       line: the path.
-      radius: cone radius at unit arc length.
       start: coordinate of the interval's start.
       end: coordinate of its end, not below `start`.
       rotation: turns the pattern about the centre line, radians.
@@ -68,7 +67,7 @@ def multisamples(
     if count == 1:
         t = _frustum_mean(start, end)
         point = point_at(line, t)
-        return Gaussians(point.position[None], (0.5 * radius * point.arc)[None])
+        return Gaussians(point.position[None], (0.5 * _mean_radius(point.footprint))[None])
     if count != len(_HEXAGON):
         raise ValueError(
             f"There is no cone pattern of {count} points. Use 1 (on the centre line) or 6 "
@@ -78,28 +77,17 @@ def multisamples(
 
     def one_sample(t: Float[Array, ""], angle: Float[Array, ""]) -> Gaussians:
         point = point_at(line, t)
-        across = radius * point.arc / math.sqrt(2.0)
-        right, up = orthonormal_basis(point.direction)
-        offset = across * (jnp.cos(angle) * right + jnp.sin(angle) * up)
-        return Gaussians(point.position + offset, _HEXAGON_SCALE * across)
+        right, up = point.footprint / math.sqrt(2.0)
+        offset = jnp.cos(angle) * right + jnp.sin(angle) * up
+        scale = _HEXAGON_SCALE / math.sqrt(2.0) * _mean_radius(point.footprint)
+        return Gaussians(point.position + offset, scale)
 
     return jax.vmap(one_sample)(_hexagon_distances(start, end), angles)
 
 
-def orthonormal_basis(
-    direction: Float[Array, "3"],
-) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Returns two unit vectors that complete a unit vector to a right-handed basis.
-
-    Source: Duff et al., Building an Orthonormal Basis, Revisited (2017).
-    """
-    x, y, z = direction
-    sign = jnp.copysign(jnp.ones_like(z), z)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    right = jnp.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
-    up = jnp.stack([b, sign + y * y * a, -y])
-    return right, up
+def _mean_radius(footprint: Float[Array, "2 3"]) -> Float[Array, ""]:
+    """Returns the radius of the disc that has an ellipse's second moments on average."""
+    return numerics.length(footprint.reshape(6)) / math.sqrt(2.0)
 
 
 def _frustum_mean(start: Float[Array, ""], end: Float[Array, ""]) -> Float[Array, ""]:

@@ -7,9 +7,13 @@ with its inner segments shrunk to length zero, so that no sample can fall inside
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from refref_jax.geometry.rays import orthonormal_basis
+from refref_jax.optics import footprints
+from refref_jax.optics.footprints import Spread
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.optics.media import AMBIENT
 
@@ -25,6 +29,8 @@ class Polyline(NamedTuple):
       arcs: arc length from the camera to the start of each segment.
       outside: whether the segment runs outside the objects. The last segment always counts as
         outside: a path that ran out of bends ends on the background like any other.
+      spreads: derivatives of each segment across the pixel, if they are carried.
+      radius: of the pixel's cone at unit distance.
     """
 
     points: Float[Array, "segments 3"]
@@ -32,6 +38,8 @@ class Polyline(NamedTuple):
     knots: Float[Array, " segments"]
     arcs: Float[Array, " segments"]
     outside: Bool[Array, " segments"]
+    spreads: Spread
+    radius: Float[Array, ""]
 
 
 class PolylinePoint(NamedTuple):
@@ -42,27 +50,34 @@ class PolylinePoint(NamedTuple):
       direction: unit direction of travel there.
       arc: arc length from the camera.
       outside: whether it lies outside the objects.
+      footprint: half axes of the pixel's footprint, across the direction, world units.
     """
 
     position: Float[Array, "3"]
     direction: Float[Array, "3"]
     arc: Float[Array, ""]
     outside: Bool[Array, ""]
+    footprint: Float[Array, "2 3"]
 
 
 def whole_path(path: LightPaths) -> Polyline:
     """Returns one light path with arc length as its coordinate."""
     used = jnp.isfinite(path.tau)
     return Polyline(
-        path.points, path.directions, path.tau, jnp.where(used, path.tau, 0.0), _outside(path)
+        points=path.points,
+        directions=path.directions,
+        knots=path.tau,
+        arcs=jnp.where(used, path.tau, 0.0),
+        outside=_outside(path),
+        spreads=path.spreads,
+        radius=path.radii,
     )
 
 
 def outside_path(path: LightPaths) -> Polyline:
     """Returns one light path whose coordinate stands still inside the objects."""
     line = whole_path(path)
-    ends = jnp.append(path.tau[1:], jnp.inf)
-    lengths = jnp.where(jnp.isfinite(ends) & line.outside, ends - line.arcs, 0.0)
+    lengths = jnp.where(jnp.isfinite(path.ends) & line.outside, path.ends - line.arcs, 0.0)
     # Summed anew for each segment, in one order: a segment without length then starts exactly
     # where the next one does. A running sum rounds them apart, and a sample falls between.
     earlier = jnp.tril(jnp.ones((lengths.size, lengths.size), bool), k=-1)
@@ -79,11 +94,13 @@ def point_at(line: Polyline, t: Float[Array, ""]) -> PolylinePoint:
     segment = segment_at(line, t)
     along = t - line.knots[segment]
     direction = line.directions[segment]
+    arc = line.arcs[segment] + along
     return PolylinePoint(
         position=line.points[segment] + along * direction,
         direction=direction,
-        arc=line.arcs[segment] + along,
+        arc=arc,
         outside=line.outside[segment],
+        footprint=_footprint(line, segment, along, arc),
     )
 
 
@@ -92,6 +109,16 @@ def segment_at(line: Polyline, t: Float[Array, ""]) -> Int[Array, ""]:
     return jnp.sum(line.knots[1:] <= t, dtype=jnp.int32)
 
 
+def _footprint(
+    line: Polyline, segment: Int[Array, ""], along: Float[Array, ""], arc: Float[Array, ""]
+) -> Float[Array, "2 3"]:
+    """Returns the half axes of a footprint; those of the unbent cone if no spread is carried."""
+    direction = line.directions[segment]
+    if line.spreads.points.shape[-2] == 0:
+        return line.radius * arc * jnp.stack(orthonormal_basis(direction))
+    spread = jax.tree.map(lambda x: x[segment], line.spreads)
+    return footprints.across(spread, along, direction)
+
+
 def _outside(path: LightPaths) -> Bool[Array, " segments"]:
-    is_last = jnp.arange(path.tau.shape[0]) == path.bends
-    return (path.media == AMBIENT) | is_last
+    return (path.media == AMBIENT) | jnp.isinf(path.ends)

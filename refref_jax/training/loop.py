@@ -10,7 +10,7 @@ import numpy as np
 from refref_jax.data.batches import PixelSampler
 from refref_jax.optics.budgets import Budget, capacity_for
 from refref_jax.optics.wavefront import Geometry
-from refref_jax.render.config import ModelConfig
+from refref_jax.render.config import ModelConfig, path_detail
 from refref_jax.training import steps
 from refref_jax.training.config import TrainingConfig
 from refref_jax.training.state import TrainState
@@ -82,6 +82,10 @@ def run_steps(
 def _trace(setup: Setup, first: int) -> steps.Pool:
     drawn = setup.sampler.draw(first, setup.config.pool)
     traced = steps.trace_pool(
-        setup.geometry, drawn.rays, budget=setup.budget, capacity=setup.capacity
+        setup.geometry,
+        drawn.rays,
+        budget=setup.budget,
+        capacity=setup.capacity,
+        detail=path_detail(setup.model, setup.budget),
     )
     return steps.Pool(traced, jnp.asarray(drawn.rgb))

@@ -16,6 +16,7 @@ from refref_jax.fields import hash_grid
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.budgets import Budget
+from refref_jax.optics.details import Detail
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.optics.path_tracing import Survey, Traced
 from refref_jax.optics.wavefront import Geometry
@@ -62,10 +63,14 @@ class StepReport(NamedTuple):
     lost: Float[Array, ""]
 
 
-@functools.partial(jax.jit, static_argnames=("budget", "capacity"))
-def trace_pool(geometry: Geometry, rays: Rays, *, budget: Budget, capacity: int) -> Traced:
+@functools.partial(jax.jit, static_argnames=("budget", "capacity", "detail"))
+def trace_pool(
+    geometry: Geometry, rays: Rays, *, budget: Budget, capacity: int, detail: Detail
+) -> Traced:
     """Traces the rays `[batches, rays]` of many batches; see `path_tracing.trace_batches`."""
-    return path_tracing.trace_batches(geometry, rays, budget=budget, capacity=capacity)
+    return path_tracing.trace_batches(
+        geometry, rays, budget=budget, capacity=capacity, detail=detail
+    )
 
 
 @functools.partial(jax.jit, static_argnames="budget")

@@ -9,7 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from experiments import known_scenes
+from experiments import known_scenes, named_budgets
 from refref_jax.data import files
 from refref_jax.render import BUDGETS
 from tests.experiments.command import ROOT, run_command
@@ -173,14 +173,14 @@ def test_views_keep_their_order():
 
 def test_a_budget_keeps_what_is_not_given_and_grows_below_its_cut():
     tree = BUDGETS["tree"]
-    assert known_scenes.make_budget("tree") == tree
-    assert known_scenes.make_budget("tree", cut=0.1, bends=3) == dataclasses.replace(
+    assert named_budgets.make_budget("tree") == tree
+    assert named_budgets.make_budget("tree", cut=0.1, bends=3) == dataclasses.replace(
         tree, cut=0.1, bends=3
     )
-    fine = known_scenes.make_budget("tree", cut=tree.cut / 4.0)
+    fine = named_budgets.make_budget("tree", cut=tree.cut / 4.0)
     assert fine.paths_per_ray == 2.0 * tree.paths_per_ray and fine.bends == tree.bends
     # Never without bound.
-    assert known_scenes.make_budget("tree", cut=0.0).paths_per_ray < 10.0 * tree.paths_per_ray
+    assert named_budgets.make_budget("tree", cut=0.0).paths_per_ray < 10.0 * tree.paths_per_ray
 
 
 def test_measures_over_no_pixel_are_left_out():

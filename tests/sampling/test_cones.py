@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from refref_jax.geometry.rays import orthonormal_basis
 from refref_jax.sampling import cones, polylines
 from tests import gradients, made_paths, reference_sampling, transformations
 
@@ -32,7 +33,7 @@ def _sample(line, start, end, rotation=0.0, radius=_RADIUS, *, count=6):
     )
 
 
-_basis = jax.jit(cones.orthonormal_basis)
+_basis = jax.jit(orthonormal_basis)
 
 
 def _straight(direction=(0.0, 0.0, 1.0)):
@@ -257,7 +258,7 @@ def test_orthonormal_basis_by_hand():
         np.testing.assert_array_equal(up, [0.0, sign, 0.0])
 
 
-_basis_jacobian = jax.jit(jax.jacfwd(cones.orthonormal_basis))
+_basis_jacobian = jax.jit(jax.jacfwd(orthonormal_basis))
 
 
 @pytest.mark.parametrize("direction", [*_AXES, *_LEVEL, *_NEAR_POLES])
@@ -281,7 +282,7 @@ def test_multisamples_check_grads(count):
 
 def test_orthonormal_basis_check_grads():
     for direction in (_OCTANTS[0], _OCTANTS[-1]):
-        gradients.assert_numerical(cones.orthonormal_basis, direction)
+        gradients.assert_numerical(orthonormal_basis, direction)
 
 
 _CASES = {
@@ -291,7 +292,7 @@ _CASES = {
     "one": lambda path, start, end: cones.multisamples(
         polylines.outside_path(path), path.radii, start, end, 0.5 * start, count=1
     ),
-    "orthonormal_basis": lambda path, start, end: cones.orthonormal_basis(path.directions[0]),
+    "orthonormal_basis": lambda path, start, end: orthonormal_basis(path.directions[0]),
 }
 
 

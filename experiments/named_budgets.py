@@ -1,0 +1,30 @@
+"""Budgets of light by name, as commands take them."""
+
+import dataclasses
+import math
+
+from refref_jax.optics.budgets import BUDGETS, Budget
+
+# Room is not given for smaller cuts, which would take any amount of memory.
+_SMALLEST_CUT_WITH_ROOM = 5e-4
+
+
+def make_budget(paths: str, *, cut: float | None = None, bends: int | None = None) -> Budget:
+    """Returns a budget by name, with another cut or number of bends, and room for what that takes.
+
+    Below the named budget's own cut room grows as the inverse square root of the cut, which a flask
+    of three media needs; what finds no room nevertheless is told as lost.
+
+    Args:
+      paths: a name in `BUDGETS`.
+      cut: smallest throughput worth following; the budget's own if `None`.
+      bends: most bends; the budget's own if `None`.
+    """
+    budget = BUDGETS[paths]
+    given = {"cut": cut, "bends": bends}
+    changed = dataclasses.replace(budget, **{k: v for k, v in given.items() if v is not None})
+    if not changed.cut < budget.cut:
+        return changed
+    growth = math.sqrt(budget.cut / max(changed.cut, _SMALLEST_CUT_WITH_ROOM))
+    rooms = ("live_per_ray", "segments_per_ray", "paths_per_ray")
+    return dataclasses.replace(changed, **{room: growth * getattr(budget, room) for room in rooms})

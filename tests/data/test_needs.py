@@ -1,0 +1,208 @@
+import numpy as np
+import pytest
+import trimesh
+
+from refref_jax.data import containment, meshes
+from refref_jax.data.cameras import orbit
+from refref_jax.data.convexity import is_convex
+from refref_jax.data.needs import describe, find_needs
+from tests.data import solids
+
+_CAMERAS = orbit(4, distance=4.0, elevation=0.3, size=8, angle_x=1.0)
+
+
+def _needs(*parts, rule="nested", space="bounded", cameras=_CAMERAS):
+    tree = containment.find_containment(parts)
+    return find_needs(parts, tree, cameras, rule=rule, space=space)
+
+
+def _clear(part):
+    return part._replace(colour_known=True)
+
+
+def _made(mesh):
+    return solids.as_part(mesh, "solid_glass")
+
+
+def _turned(mesh, dtype=np.float32):
+    """The mesh in an arbitrary attitude, rounded as a file rounds it, equal corners merged."""
+    axis = np.array([0.36, 0.48, 0.8])
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, axis))
+    return _made(trimesh.Trimesh(mesh.vertices.astype(dtype), mesh.faces))
+
+
+def _subdivided_box():
+    mesh = trimesh.creation.box()
+    for _ in range(4):
+        mesh = mesh.subdivide()
+    return mesh
+
+
+def _dented(depth):
+    """A ball one of whose vertices is pushed in: at 0.2 % a little beyond its neighbours."""
+    part = _made(trimesh.creation.icosphere(subdivisions=5))
+    vertices = part.vertices.copy()
+    vertices[7] *= 1.0 - depth
+    return part._replace(vertices=vertices)
+
+
+def _prism(*corners):
+    """A prism over a polygon in the plane z = 0, of unit height."""
+    polygon = np.asarray(corners, np.float64)
+    count = len(polygon)
+    vertices = np.concatenate([np.c_[polygon, np.zeros(count)], np.c_[polygon, np.ones(count)]])
+    # Fans from the first corner, which must see all others.
+    fan = [(0, i, i + 1) for i in range(1, count - 1)]
+    bottom = [(a, c, b) for a, b, c in fan]
+    top = [(a + count, b + count, c + count) for a, b, c in fan]
+    ring = [(i, (i + 1) % count) for i in range(count)]
+    sides = [(i, j, j + count) for i, j in ring] + [(i, j + count, i + count) for i, j in ring]
+    return solids.as_part(trimesh.Trimesh(vertices, bottom + top + sides), "prism_glass")
+
+
+_L_SHAPE = ((1.0, 1.0), (0.0, 2.0), (0.0, 0.0), (2.0, 0.0), (2.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        solids.ball(),
+        solids.box(size=(1.0, 1e-3, 30.0)),
+        _made(trimesh.creation.icosphere(subdivisions=0)),
+        _made(trimesh.creation.uv_sphere(count=[24, 24])),
+        _turned(_subdivided_box()),
+        _turned(trimesh.creation.cylinder(radius=1.0, height=0.2, sections=64)),
+        _turned(trimesh.creation.icosphere(subdivisions=4)),
+        _prism((0.0, 0.0), (1.0, 0.0), (0.3, 0.8)),
+        solids.ball(radius=1e-3, centre=(5.0, 5.0, 5.0)),
+    ],
+)
+def test_convex_bodies(part):
+    assert is_convex(part)
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        _made(trimesh.creation.torus(1.0, 0.3)),
+        _prism(*_L_SHAPE),
+        _dented(0.002),
+        _dented(1.0),
+        solids.shell(),
+        # All corners lie on the hull, and the faces between the boxes do not.
+        solids.joined("two_glass", solids.box(), solids.box(centre=(2.0, 0.0, 0.0))),
+        solids.inverted(solids.box()),
+    ],
+)
+def test_bodies_that_are_not_convex(part):
+    assert not is_convex(part)
+
+
+def test_an_edge_that_is_bent_inwards_is_not_convex_with_all_corners_on_the_hull():
+    # Of the square on the right, slightly twisted, one diagonal bulges and the other is a valley.
+    vertices = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
+    vertices[7, 0] += 0.1
+    hull = trimesh.convex.convex_hull(vertices)
+    assert is_convex(_made(hull))
+    faces = [tuple(face) for face in hull.faces.tolist()]
+    pair = [face for face in faces if set(face) <= {4, 5, 6, 7}]
+    shared = set(pair[0]) & set(pair[1])
+    assert len(pair) == 2 and len(shared) == 2
+    flipped = {
+        frozenset((4, 5, 7)): [(4, 6, 5), (5, 6, 7)],
+        frozenset((4, 6, 7)): [(4, 6, 5), (5, 6, 7)],
+        frozenset((4, 5, 6)): [(4, 6, 7), (4, 7, 5)],
+        frozenset((5, 6, 7)): [(4, 6, 7), (4, 7, 5)],
+    }[frozenset(pair[0])]
+    valley = [face for face in faces if face not in pair] + flipped
+    assert not is_convex(_made(trimesh.Trimesh(hull.vertices, valley, process=False)))
+
+
+def test_an_open_surface_is_not_convex():
+    ball = solids.ball()
+    assert not is_convex(ball._replace(faces=ball.faces[1:]))
+
+
+def test_a_flat_sheet_and_a_doubled_ball_are_not_convex():
+    square = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+    both_sides = np.array([[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 3, 2]])
+    sheet = meshes.MeshPart("sheet_glass", square, both_sides, 1.5, "flat")
+    assert not is_convex(sheet)
+    assert not is_convex(solids.joined("twice_glass", solids.ball(), solids.ball()))
+
+
+def test_light_leaves_one_convex_body_for_good():
+    needs = _needs(_clear(solids.ball()))
+    assert (needs.parts, needs.bodies, needs.convex) == (1, 1, True)
+    assert needs.reentry == "impossible"
+    assert describe(needs) == (
+        "this scene needs: 1 clear convex body, no re-entry, bounded background, no tint"
+    )
+
+
+def test_parts_inside_a_convex_body_do_not_bring_light_back():
+    parts = [solids.ball(), solids.ball("inner_water", radius=0.5)]
+    assert _needs(*parts).reentry == "impossible"
+    assert _needs(*parts, rule="facing").reentry == "impossible"
+    # Priorities may turn the order around.
+    assert _needs(*parts, rule="priority").reentry == "possible"
+    assert _needs(parts[0], rule="priority").reentry == "impossible"
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [solids.ball(), solids.ball("far_glass", centre=(2.5, 0.0, 0.0))],
+        [solids.ball(), solids.ball("cut_glass", centre=(1.0, 0.0, 0.0))],
+        [solids.shell()],
+        [_made(trimesh.creation.torus(1.0, 0.3))],
+    ],
+)
+def test_light_may_come_back_to_several_bodies_and_hollow_ones(parts):
+    assert _needs(*parts).reentry == "possible"
+
+
+def test_nothing_is_promised_to_a_camera_inside():
+    inside = _CAMERAS._replace(poses=0.1 * _CAMERAS.poses)
+    assert _needs(solids.ball(), cameras=inside).reentry == "possible"
+
+
+def test_what_is_known_of_colours_decides_on_the_interior():
+    ball, inner = solids.ball(), solids.ball("inner_water", radius=0.5)
+    assert _needs(_clear(ball))[4:6] == ("clear", "none")
+    assert _needs(ball)[4:6] == ("absorbing", "learned")
+    assert _needs(_clear(ball), inner)[4:6] == ("absorbing", "learned")
+    tinted = _clear(inner)._replace(tint=(0.5, 1.0, 1.0))
+    assert _needs(_clear(ball), tinted)[4:6] == ("absorbing", "given")
+    dark = _clear(inner)._replace(absorption=(0.0, 0.0, 0.1))
+    assert _needs(_clear(ball), dark)[4:6] == ("absorbing", "given")
+
+
+def test_a_scene_is_described_in_one_line():
+    wine = solids.ball("wine_water", radius=1.7)._replace(tint=(0.5, 1.0, 1.0))
+    tinted = describe(_needs(_clear(solids.shell()), _clear(wine), space="unbounded"))
+    assert tinted == (
+        "this scene needs: 2 parts in 1 body that is not convex, re-entry, unbounded background, "
+        "tints and absorption (given)"
+    )
+    apart = [solids.box(), solids.box("other_glass", centre=(3.0, 0.0, 0.0))]
+    assert "2 bodies, re-entry" in describe(_needs(*apart))
+    assert "2 clear bodies" in describe(_needs(*map(_clear, apart)))
+    nested = describe(_needs(solids.ball(), solids.ball("inner_water", radius=0.5)))
+    assert "2 parts in 1 convex body, no re-entry" in nested and "(to be learned)" in nested
+    torus = _made(trimesh.creation.torus(1.0, 0.3))
+    assert "1 body that is not convex, re-entry" in describe(_needs(torus))
+
+
+def test_no_mesh_needs_no_tracer():
+    needs = _needs(space="unbounded")
+    assert (needs.parts, needs.bodies, needs.interior, needs.tints) == (0, 0, "none", "none")
+    assert "no meshes: no tracer" in describe(needs)
+
+
+def test_a_scene_tells_whether_its_colours_are_known(ball_scene):
+    (part,) = meshes.read_meshes(ball_scene)
+    assert part.colour_known
+    assert describe(_needs(part)) == (
+        "this scene needs: 1 clear convex body, no re-entry, bounded background, no tint"
+    )

@@ -1,0 +1,161 @@
+"""What a scene does not need costs nothing: counts of compiled operations, samples and casts."""
+
+import collections
+import dataclasses
+import functools
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import extend
+
+from experiments.choices import Wishes, choose
+from refref_jax.data import containment, local_layout, meshes
+from refref_jax.data.cameras import image_rays
+from refref_jax.data.geometry import build_geometry
+from refref_jax.data.needs import find_needs
+from refref_jax.optics import path_tracing
+from refref_jax.optics.budgets import TREE
+from refref_jax.optics.media import SLOTS
+from refref_jax.render import pixels, transport
+from refref_jax.render.config import path_detail
+from refref_jax.render.model import init_params
+from refref_jax.sampling import domains
+from refref_jax.training import steps
+from tests import made_paths, scenes
+from tests.small_model import CAMERAS, MODEL
+
+_RAYS = jax.tree.map(lambda x: jnp.asarray(x).reshape(-1, *x.shape[2:]), image_rays(CAMERAS, 0))
+_BALL = scenes.ball(1.3, subdivisions=2)
+
+
+def _needs(*parts, rule="nested"):
+    tree = containment.find_containment(parts)
+    return find_needs(parts, tree, CAMERAS, rule=rule, space="bounded")
+
+
+def _operations(text):
+    """Counts the operations of a lowered program by name."""
+    return collections.Counter(re.findall(r"stablehlo\.(\w+)", text))
+
+
+def _training_programs(geometry, budget):
+    """Returns the operations of all programs of a run that know of the meshes."""
+    batches = jax.tree.map(lambda x: x[None], _RAYS)
+    detail = path_detail(dataclasses.replace(MODEL, interior="clear"), budget)
+    trace = steps.trace_pool.lower(geometry, batches, budget=budget, capacity=2048, detail=detail)
+    survey = steps.survey_paths.lower(geometry, _RAYS, budget=budget)
+    return _operations(trace.as_text()) + _operations(survey.as_text())
+
+
+def test_no_mesh_compiles_no_tracer():
+    empty = choose(_needs(), Wishes()).budget
+    tracer = _training_programs(scenes.geometry(_BALL), TREE)
+    nothing = _training_programs(scenes.geometry(), empty)
+    assert nothing["while"] == 0 < tracer["while"]
+    assert nothing["gather"] + nothing["sort"] == 0
+    assert sum(nothing.values()) < 0.05 * sum(tracer.values())
+
+
+def _render_operations(model):
+    """Returns the operations of rendering some straight paths."""
+    paths = path_tracing.trace(
+        scenes.geometry(), _RAYS, budget=choose(_needs(), Wishes()).budget, capacity=256
+    ).paths
+    params = jax.eval_shape(functools.partial(init_params, config=model), jax.random.key(0))
+    jitter = pixels.no_jitter(model, paths.radii.shape[0])
+    anneal = jnp.ones(())
+
+    def render(params):
+        return pixels.render_paths(params, model, paths, jitter, anneal=anneal)
+
+    return _operations(jax.jit(render).lower(params).as_text())
+
+
+def test_bounded_space_is_not_contracted(monkeypatch):
+    unbounded = _render_operations(dataclasses.replace(MODEL, space="unbounded"))
+
+    def refuse(x):
+        raise AssertionError(f"{x} is contracted")
+
+    monkeypatch.setattr(domains, "contract", refuse)
+    monkeypatch.setattr(domains, "shrinkage", refuse)
+    bounded = _render_operations(MODEL)
+    rounds = len(MODEL.proposals) + 1
+    # Each round contracts positions, and shrinks the Gaussians by powers of their distance.
+    for operation in ("sqrt", "power"):
+        assert unbounded[operation] >= bounded[operation] + rounds
+
+
+def _carried_lists(geometry):
+    """Returns the shapes of all interior lists that the tracer's loops carry."""
+    traced = functools.partial(path_tracing.trace_ends, budget=TREE)
+    shapes = []
+
+    def visit(jaxpr):
+        for equation in jaxpr.eqns:
+            if equation.primitive.name == "while":
+                shapes.extend(variable.aval for variable in equation.outvars)
+            for inner in extend.core.jaxprs_in_params(equation.params):
+                visit(inner)
+
+    visit(jax.make_jaxpr(traced)(geometry, _RAYS).jaxpr)
+    integers = [shape.shape for shape in shapes if shape.dtype == jnp.int32]
+    return [shape for shape in integers if len(shape) == 2]
+
+
+def test_only_overlapping_bodies_make_rays_carry_lists():
+    parts = [_BALL, scenes.ball(0.5, subdivisions=1, name="inner_water")]
+    lists = {
+        rule: _carried_lists(scenes.geometry(*parts, rule=rule)) for rule in ("nested", "priority")
+    }
+    assert any(columns == SLOTS for _, columns in lists["priority"])
+    assert lists["nested"] and all(columns != SLOTS for _, columns in lists["nested"])
+
+
+def _samples_inside(model):
+    """Counts the final samples that a path takes inside an object, on half of its way."""
+    path = made_paths.path((2.0, 3.0), [(0.0, 0.0, -1.0)] * 3, (0, 1, 0), origin=(0.0, 0.0, 3.0))
+    params = init_params(jax.random.key(0), model)
+    jitter = transport.Jitter(
+        jnp.zeros(transport.rounds(model)), jnp.zeros(transport.rounds(model))
+    )
+
+    @jax.jit
+    def outside(params, path):
+        return transport.path_radiance(params, model, path, jitter, jnp.zeros(())).outside
+
+    return int(np.sum(~np.asarray(outside(params, path))))
+
+
+def test_only_a_field_inside_takes_samples_there():
+    counts = {
+        interior: _samples_inside(dataclasses.replace(MODEL, interior=interior))
+        for interior in ("field", "clear", "absorbing")
+    }
+    assert counts["field"] > 0 == counts["clear"] == counts["absorbing"]
+
+
+def test_light_that_leaves_the_bundled_ball_for_good_is_cast_less_often(ball_scene):
+    parts = meshes.read_meshes(ball_scene)
+    tree = containment.find_containment(parts)
+    cameras = local_layout.read_frames(ball_scene, "train").cameras
+    found = find_needs(parts, tree, cameras, rule="nested", space="bounded")
+    geometry = jax.tree.map(jnp.asarray, build_geometry(parts, tree.parents, rule="nested"))
+    rays = jax.tree.map(
+        lambda x: jnp.asarray(x[::8, ::8]).reshape(-1, *x.shape[2:]), image_rays(cameras, 0)
+    )
+    count = rays.radii.shape[0]
+
+    def trace(budget):
+        traced = jax.jit(functools.partial(path_tracing.trace_ends, budget=budget))(geometry, rays)
+        ends = traced.ends
+        light = ends.weights[:, :1] * ends.directions
+        return int(traced.casts), jax.ops.segment_sum(light, ends.rays, num_segments=count)
+
+    spared, light = trace(choose(found, Wishes()).budget)
+    casts, expected = trace(choose(found, Wishes(reentry="possible")).budget)
+    # A path of a ball is cast once for each of its bends, and once more only to find nothing.
+    assert spared < 0.8 * casts
+    np.testing.assert_allclose(light, expected, atol=1e-5)
