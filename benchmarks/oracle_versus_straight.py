@@ -7,12 +7,11 @@ and asserts the margins: 8 dB inside the mask and 5 dB over the image on the bun
 that the oracle wins inside the mask on any other.
 """
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 
 from absl import app, flags
+
+from experiments import trained_runs
 
 _BUNDLED = "cube_smcvx_ball"
 
@@ -42,20 +41,13 @@ def main(arguments: list[str]) -> None:
 
 def _measure(scene: Path, name: str, paths: str) -> dict[str, float]:
     """Trains and evaluates one method; a finished run is used again."""
-    run = Path(_OUT.value) / scene.name / name
+    run = Path(_OUT.value) / scene.resolve().name / name
     options = [f"--preset={_PRESET.value}", f"--interior={_INTERIOR.value}", f"--paths={paths}"]
     if _STEPS.value:
         options.append(f"--steps={_STEPS.value}")
-    _command("train", f"--scene={scene}", f"--out={run}", "--resume", *options)
-    _command("evaluate", f"--run={run}", "--split=test", f"--scene={scene}")
-    results = json.loads((run / "eval" / "test" / "metrics.json").read_text())["results"]
-    last = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])
-    return results | {"train_seconds": last["seconds"], "steps": last["step"]}
-
-
-def _command(name: str, *options: str) -> None:
-    print(f"$ python -m experiments.{name} {' '.join(options)}", flush=True)
-    subprocess.run([sys.executable, "-m", f"experiments.{name}", *options], check=True)
+    print(f"{scene.resolve().name}: {name} ...", flush=True)
+    cost = trained_runs.train(run, scene=scene, options=options)
+    return vars(cost) | vars(trained_runs.evaluate(run, scene=scene))
 
 
 def _print_table(scene: str, results: dict[str, dict[str, float]]) -> None:

@@ -1,6 +1,9 @@
 """Renders a split of a scene with a trained model, and measures it.
 
-python -m experiments.evaluate --run=runs/ball --split=test
+python -m experiments.evaluate --run=runs/ball --split=test --rays_per_pixel=4
+
+With several rays a pixel colours are averaged as linear light, and a pixel's distance is the median
+of its rays'; see `experiments.supersampling`.
 """
 
 import json
@@ -12,11 +15,10 @@ import numpy as np
 from absl import flags
 from jaxtyping import Bool, Float, UInt8
 
-from experiments import commands, figures
+from experiments import commands, figures, supersampling
 from refref_jax import metrics
 from refref_jax.data import files, local_layout
-from refref_jax.data.cameras import image_rays
-from refref_jax.render import Model, Rendering, load_model, render_image
+from refref_jax.render import Model, Rendering, load_model
 from refref_jax.render.saved import latest_step
 from refref_jax.training import run_folder
 
@@ -25,6 +27,9 @@ _SPLIT = flags.DEFINE_enum("split", "test", list(local_layout.SPLITS), "Images t
 _STEP = flags.DEFINE_integer("step", None, "Checkpoint to use; the newest if not given.", 0)
 _SCENE = flags.DEFINE_string("scene", None, "Folder of the scene, if it has moved.")
 _LIMIT = flags.DEFINE_integer("limit", None, "Only this many images, evenly spread.", 1)
+_RAYS_PER_PIXEL = flags.DEFINE_integer(
+    "rays_per_pixel", 1, "Rays in each pixel, a square: 1, 4, 9, 16. They are averaged."
+)
 _CHUNK = flags.DEFINE_integer("chunk", 4096, "Paths at once: lower it if memory runs out.", 1)
 
 _METHODS = {"paper": "oracle"}
@@ -43,6 +48,7 @@ class Truth(NamedTuple):
 
 def main() -> None:
     """Evaluates a run."""
+    side = supersampling.side_of(_RAYS_PER_PIXEL.value)
     run = Path(_RUN.value)
     config = run_folder.read_config(run)
     # Resolved first, and once: training may be going on.
@@ -51,11 +57,12 @@ def main() -> None:
     scene = Path(_SCENE.value or config.scene.path)
     truth = read_truth(scene, _SPLIT.value)
     out = run / "eval" / _SPLIT.value
-    per_image, views = evaluate(model, truth, out)
+    per_image, views = evaluate(model, truth, out, side)
     summary = {
         "scene": scene.name,
         "method": _METHODS.get(config.paths, config.paths),
         "step": step,
+        "rays_per_pixel": _RAYS_PER_PIXEL.value,
         "results": {key: _mean(per_image, key) for key in per_image[0] if key != "name"},
         "per_image": per_image,
     }
@@ -82,7 +89,7 @@ def read_truth(scene: Path, split: str) -> Truth:
 
 
 def evaluate(
-    model: Model, truth: Truth, out: Path
+    model: Model, truth: Truth, out: Path, side: int
 ) -> tuple[list[dict[str, Any]], list[figures.Comparison]]:
     """Renders and measures each image, and writes what was rendered.
 
@@ -96,13 +103,13 @@ def evaluate(
     chosen = np.unique(np.linspace(0, count - 1, min(_LIMIT.value or count, count)).astype(int))
     shown = set(chosen[np.linspace(0, chosen.size - 1, _VIEWS_IN_COMPARISON).astype(int)])
     per_image, views = [], []
-    # The first rendering also compiles; it is not the one that is timed.
-    render_image(model, image_rays(truth.frames.cameras, 0), chunk=_CHUNK.value)
+    cameras, chunk = truth.frames.cameras, _CHUNK.value
+    supersampling.warm_up(model, cameras, chunk=chunk)
     with commands.ProgressBar("evaluate", chosen.size) as bar:
         for i in chosen:
             name = truth.frames.names[i]
             start = time.monotonic()
-            seen = render_image(model, image_rays(truth.frames.cameras, i), chunk=_CHUNK.value)
+            seen = supersampling.render_view(model, cameras, i, side=side, chunk=chunk)
             seconds = time.monotonic() - start
             files.write_rgb(out / "rgb" / f"{name}.png", seen.rgb)
             files.write_exr(out / "distance" / f"{name}.exr", seen.distance)

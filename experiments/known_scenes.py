@@ -1,6 +1,5 @@
 """Scenes with a known background: read, rendered and measured, with nothing learned."""
 
-import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -128,21 +127,6 @@ def parse_views(text: str, count: int) -> tuple[int, ...]:
     if len(set(views)) < len(views):
         raise ValueError(f"--views={text} names a view twice. Name each once.")
     return views
-
-
-def side_of(rays_per_pixel: int) -> int:
-    """Returns how many rays a pixel has along each edge.
-
-    Raises:
-      ValueError: if they do not make a square grid.
-    """
-    side = math.isqrt(max(rays_per_pixel, 0))
-    if side < 1 or side**2 != rays_per_pixel:
-        raise ValueError(
-            f"{rays_per_pixel} rays a pixel do not make a square grid. Give 1, 4, 9, 16 or another "
-            "square."
-        )
-    return side
 
 
 def warm_up(scene: KnownScene, budget: Budget) -> None:

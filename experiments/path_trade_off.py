@@ -16,7 +16,14 @@ from typing import NamedTuple
 import numpy as np
 from absl import flags
 
-from experiments import commands, known_scenes, named_budgets, scenes, trade_off_figures
+from experiments import (
+    commands,
+    known_scenes,
+    named_budgets,
+    scenes,
+    supersampling,
+    trade_off_figures,
+)
 from experiments.known_scenes import KnownScene
 from experiments.trade_off_figures import Trial
 from refref_jax.optics.budgets import BUDGETS, Budget
@@ -54,7 +61,7 @@ def main() -> None:
     """Renders all scenes with all budgets."""
     _check_scenes()
     plan = settings()
-    side = known_scenes.side_of(known_scenes.RAYS_PER_PIXEL.value)
+    side = supersampling.side_of(known_scenes.RAYS_PER_PIXEL.value)
     # All scenes first: a broken one is named before anything is rendered.
     chosen = [_read(Path(scene)) for scene in _SCENES.value]
     out = Path(_OUT.value)

@@ -9,10 +9,10 @@ from pathlib import Path
 import imageio.v3 as iio
 from absl import flags
 
-from experiments import commands, figures
+from experiments import commands, figures, supersampling
 from refref_jax.data import files, local_layout
-from refref_jax.data.cameras import Cameras, image_rays, orbit
-from refref_jax.render import load_model, render_image
+from refref_jax.data.cameras import Cameras, orbit
+from refref_jax.render import load_model
 from refref_jax.training import run_folder
 
 _RUN = flags.DEFINE_string("run", None, "Folder of a trained run.", required=True)
@@ -28,11 +28,15 @@ _FOV = flags.DEFINE_float("fov", 66.785, "Horizontal field of view of an orbit, 
 _DISTANCE = flags.DEFINE_float("distance", 4.0, "Distance of an orbit from the origin.", 1e-3)
 _ELEVATION = flags.DEFINE_float("elevation", 20.0, "Elevation of an orbit, degrees.", -89, 89)
 _FPS = flags.DEFINE_float("fps", 15.0, "Frames a second of the GIF.", 0.1)
+_RAYS_PER_PIXEL = flags.DEFINE_integer(
+    "rays_per_pixel", 1, "Rays in each pixel, a square: 1, 4, 9, 16. They are averaged."
+)
 _CHUNK = flags.DEFINE_integer("chunk", 4096, "Paths at once: lower it if memory runs out.", 1)
 
 
 def main() -> None:
     """Renders the chosen cameras."""
+    side, chunk = supersampling.side_of(_RAYS_PER_PIXEL.value), _CHUNK.value
     run = Path(_RUN.value)
     model = load_model(run, step=_STEP.value)
     cameras, names = _cameras(run)
@@ -42,7 +46,7 @@ def main() -> None:
     frames, distances = [], []
     with commands.ProgressBar("render", len(names)) as bar:
         for i, name in enumerate(names):
-            seen = render_image(model, image_rays(cameras, i), chunk=_CHUNK.value)
+            seen = supersampling.render_view(model, cameras, i, side=side, chunk=chunk)
             files.write_rgb(out / "rgb" / f"{name}.png", seen.rgb)
             files.write_exr(out / "distance" / f"{name}.exr", seen.distance)
             frames.append(files.to_bytes(seen.rgb))

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from absl import flags
 
-from experiments import commands, figures, known_scenes, named_budgets, scenes
+from experiments import commands, figures, known_scenes, named_budgets, scenes, supersampling
 from experiments.known_scenes import KnownScene, View
 from refref_jax.data import files
 from refref_jax.optics.budgets import BUDGETS, Budget
@@ -57,7 +57,7 @@ _KEYS = {"scene", "paths", "views", "casts_per_pixel"}
 def main() -> None:
     """Renders and measures the chosen views."""
     budget = named_budgets.make_budget(_PATHS.value, cut=_CUT.value, bends=_BENDS.value)
-    side = known_scenes.side_of(known_scenes.RAYS_PER_PIXEL.value)
+    side = supersampling.side_of(known_scenes.RAYS_PER_PIXEL.value)
     scene = known_scenes.read_scene(
         Path(_SCENE.value),
         split=known_scenes.SPLIT.value,

@@ -10,14 +10,16 @@ matplotlib.use("Agg")
 from matplotlib import patheffects, pyplot, ticker
 from matplotlib.lines import Line2D
 
-# Okabe and Ito's colours, which all eyes tell apart.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe and Ito's colours, which all eyes tell apart."""
+
+LABEL_HEIGHT = 13.0
+"""Of a label, in pixels of the screen."""
+
 _MARKERS = {"straight": "s", "paper": "D"}
 _GREY = "#777777"
 
-# Of a label, in pixels of the screen.
 _LABEL_WIDTH = 34.0
-_LABEL_HEIGHT = 13.0
 
 _SWEEPS = {
     "cut": "cut: smallest throughput followed",
@@ -77,7 +79,7 @@ def write(folder: Path, trials: Sequence[Trial]) -> list[Path]:
 
 def _write_sweep(folder: Path, trials: Sequence[Trial], sweep: str) -> Path:
     scenes = list(dict.fromkeys(trial.scene for trial in trials))
-    colours = {scene: _COLOURS[i % len(_COLOURS)] for i, scene in enumerate(scenes)}
+    colours = {scene: COLOURS[i % len(COLOURS)] for i, scene in enumerate(scenes)}
     figure, axes = pyplot.subplots(1, 2, figsize=(12.0, 5.4), sharey=True, layout="constrained")
     for axis, (cost, (label, scale)) in zip(axes, _COSTS.items(), strict=True):
         for scene in scenes:
@@ -86,7 +88,7 @@ def _write_sweep(folder: Path, trials: Sequence[Trial], sweep: str) -> Path:
         axis.set_xlabel(f"{label} (one camera ray)")
         axis.set_xscale("log" if cost == "seconds_per_pixel" else "linear")
         if cost == "seconds_per_pixel":
-            _label_plainly(axis.xaxis)
+            label_plainly(axis.xaxis)
         axis.grid(True, color="#e6e6e6", linewidth=0.8)
         axis.set_axisbelow(True)
         axis.spines[["top", "right"]].set_visible(False)
@@ -138,7 +140,7 @@ def _label_points(
     for trial in ends + [trial for line in lines for trial in line[1:-1]]:
         point = (scale * getattr(trial, cost), trial.psnr_masked)
         x, y = axis.transData.transform(point)
-        if any(abs(x - a) < _LABEL_WIDTH and abs(y - b) < _LABEL_HEIGHT for a, b in taken):
+        if any(abs(x - a) < _LABEL_WIDTH and abs(y - b) < LABEL_HEIGHT for a, b in taken):
             continue
         taken.append((x, y))
         axis.annotate(
@@ -169,7 +171,8 @@ def _legend(colours: dict[str, str]) -> list[Line2D]:
     return scenes + points
 
 
-def _label_plainly(axis: matplotlib.axis.Axis) -> None:
+def label_plainly(axis: matplotlib.axis.Axis) -> None:
+    """Labels a logarithmic axis with plain numbers."""
     axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(ticker.StrMethodFormatter("{x:g}"))
     axis.set_minor_formatter(ticker.NullFormatter())

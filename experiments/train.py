@@ -127,6 +127,9 @@ def _log(run: Path, step: int, report: StepReport, rate: float, seconds: float) 
         )
     values = {name: float(value) for name, value in report._asdict().items()}
     line = {"step": step, **values, "rays_per_second": rate, "seconds": seconds}
+    # A CPU keeps no such record.
+    if (memory := jax.local_devices()[0].memory_stats()) is not None:
+        line["peak_device_bytes"] = memory["peak_bytes_in_use"]
     run_folder.append_metrics(run, line)
 
 

@@ -39,12 +39,15 @@ class Rendering(NamedTuple):
         camera in world units.
       mean_distance: its mean distance.
       accumulation: share of light accounted for, 1 with an opaque background.
+      linear: the colours as linear RGB, not clipped: what is averaged where several rays share a
+        pixel.
     """
 
     rgb: Float[Array, "*rays 3"]
     distance: Float[Array, "*rays"]
     mean_distance: Float[Array, "*rays"]
     accumulation: Float[Array, "*rays"]
+    linear: Float[Array, "*rays 3"]
 
 
 class _Tile(NamedTuple):
@@ -123,8 +126,8 @@ def _render_tile(model: Model, rays: Rays, real: int, chunk: int) -> Rendering:
 
 
 def _blank(count: int) -> Rendering:
-    zeros = jnp.zeros(count)
-    return Rendering(jnp.zeros((count, 3)), zeros, zeros, zeros)
+    zeros, black = jnp.zeros(count), jnp.zeros((count, 3))
+    return Rendering(black, zeros, zeros, zeros, black)
 
 
 @functools.partial(jax.jit, static_argnames=("budget", "detail"))
@@ -194,8 +197,8 @@ def _add(
     rays = sums.distance.shape[0]
     # An index past the end drops the write.
     target = jnp.where(heaviest, paths.rays, rays)
-    return Rendering(
-        rgb=sums.rgb.at[paths.rays].add(paths.weights * seen.rgb),
+    return sums._replace(
+        linear=sums.linear.at[paths.rays].add(paths.weights * seen.rgb),
         distance=sums.distance.at[target].set(seen.median, mode="drop"),
         mean_distance=sums.mean_distance.at[target].set(seen.mean, mode="drop"),
         accumulation=sums.accumulation.at[paths.rays].add(share * seen.accumulation),
@@ -203,4 +206,4 @@ def _add(
 
 
 def _finish(sums: Rendering) -> Rendering:
-    return sums._replace(rgb=jnp.clip(colour.linear_to_srgb(sums.rgb), 0.0, 1.0))
+    return sums._replace(rgb=jnp.clip(colour.linear_to_srgb(sums.linear), 0.0, 1.0))

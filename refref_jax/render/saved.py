@@ -13,6 +13,7 @@ import zipfile
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
@@ -81,7 +82,10 @@ def load_model(run: str | os.PathLike[str], *, step: int | None = None) -> Model
     with open_checkpoints(run) as manager:
         step = find_step(manager, run, step)
         params = restore(manager, step, {PARAMS_ITEM: shapes})[PARAMS_ITEM]
-    return Model(saved.config, saved.budget, load_geometry(run), Params(*params))
+    # What is restored is bound to a device, and so is all that is made of it. The sums with which
+    # an image begins are not, and the chunk that they go to would be compiled for itself.
+    unbound = jax.tree.map(jnp.asarray, jax.device_get(params))
+    return Model(saved.config, saved.budget, load_geometry(run), Params(*unbound))
 
 
 def latest_step(run: Path) -> int:

@@ -171,17 +171,6 @@ def test_views_keep_their_order():
     assert known_scenes.parse_views("all", 3) == (0, 1, 2)
 
 
-@pytest.mark.parametrize(("rays", "side"), [(1, 1), (4, 2), (9, 3), (16, 4), (49, 7)])
-def test_rays_make_a_square_grid(rays, side):
-    assert known_scenes.side_of(rays) == side
-
-
-@pytest.mark.parametrize("rays", [-4, 0, 2, 8, 10])
-def test_rays_that_do_not(rays):
-    with pytest.raises(ValueError, match="square"):
-        known_scenes.side_of(rays)
-
-
 def test_a_budget_keeps_what_is_not_given_and_grows_below_its_cut():
     tree = BUDGETS["tree"]
     assert named_budgets.make_budget("tree") == tree

@@ -1,0 +1,153 @@
+"""Claim: with the same training, following the tree beats the paper's paths inside the object.
+
+    python -m benchmarks.tree_versus_paper [--scenes=FOLDER,FOLDER] [--curve_steps=500,1000,2500]
+
+Trains both on the same scenes, pixels and steps, evaluates both on the test split, and prints a
+table. With --curve_steps both are also trained for each of those numbers of steps, apart from each
+other since the schedule of the learning rate depends on them, and the gap over steps is drawn.
+
+Asserted is that the tree wins inside the mask on every scene; that it wins by 2.5 dB on average, if
+the scenes are all four of the ball, torus, flask and pyramid and the training is the full one of
+the preset `tiny`; and that the mean gap is larger after the most steps of the curve than after the
+fewest. What is finished is not trained again.
+"""
+
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib
+from absl import app, flags
+
+from experiments import trained_runs
+from experiments.presets import PRESETS
+from experiments.trained_runs import Evaluation, Training
+
+matplotlib.use("Agg")
+from matplotlib import pyplot
+
+_SCENES = flags.DEFINE_list("scenes", ["experiments/data/cube_smcvx_ball"], "Folders of scenes.")
+_PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Preset of all trainings.")
+_STEPS = flags.DEFINE_integer("steps", None, "Training steps; the preset's if not given.", 1)
+_CURVE_STEPS = flags.DEFINE_list("curve_steps", [], "Numbers of steps of the curve.")
+_INTERIOR = flags.DEFINE_string("interior", "field", "Interior model of all trainings.")
+_LIMIT = flags.DEFINE_integer("limit", None, "Only this many test images, evenly spread.", 1)
+_OUT = flags.DEFINE_string("out", "runs/tree_versus_paper", "Where to write the runs.")
+
+_OBJECTS = {"ball", "torus", "flask", "pyramid"}
+_MEAN_GAIN = 2.5
+
+
+class Duel(NamedTuple):
+    """Both trainings of a scene, and what they gave.
+
+    Attributes:
+      scene: name of its folder.
+      steps: of both.
+      cost: of the paper's training and the tree's.
+      result: of the paper's and the tree's evaluation.
+    """
+
+    scene: str
+    steps: int
+    cost: tuple[Training, Training]
+    result: tuple[Evaluation, Evaluation]
+
+    @property
+    def gain(self) -> float:
+        """Decibels of the tree over the paper inside the mask."""
+        return self.result[1].psnr_masked - self.result[0].psnr_masked
+
+
+def main(arguments: list[str]) -> None:
+    del arguments
+    full = _STEPS.value or PRESETS[_PRESET.value].schedule.steps
+    scenes = [Path(scene) for scene in _SCENES.value]
+    counts = sorted({full, *map(int, _CURVE_STEPS.value)})
+    duels = [fight(scene, steps) for steps in counts for scene in scenes]
+    print(table(duels))
+    if len(counts) > 1:
+        picture = Path(_OUT.value) / "tree_versus_paper.png"
+        draw(picture, duels)
+        print(f"\nCurve: {picture}")
+    check(duels, full=full, tiny=_PRESET.value == "tiny" and _STEPS.value is None)
+
+
+def fight(scene: Path, steps: int) -> Duel:
+    """Trains and evaluates both on a scene; what is finished is used again."""
+    limit = [] if _LIMIT.value is None else [f"--limit={_LIMIT.value}"]
+    costs, results = [], []
+    for paths in ("paper", "tree"):
+        name = f"{_PRESET.value}_{_INTERIOR.value}_{paths}_{steps}"
+        run = Path(_OUT.value) / scene.resolve().name / name
+        options = [f"--preset={_PRESET.value}", f"--interior={_INTERIOR.value}"]
+        options += [f"--paths={paths}", f"--steps={steps}"]
+        print(f"{scene.resolve().name}: {paths}, {steps} steps ...", flush=True)
+        costs.append(trained_runs.train(run, scene=scene, options=options))
+        results.append(trained_runs.evaluate(run, scene=scene, options=limit))
+    return Duel(scene.resolve().name, steps, tuple(costs), tuple(results))
+
+
+def table(duels: Sequence[Duel]) -> str:
+    """Returns all duels as a Markdown table."""
+    lines = [
+        "",
+        "| scene | steps | paper: PSNR / in mask | tree: PSNR / in mask | gain in mask "
+        "| training, s: paper, tree |",
+        "|---|---|---|---|---|---|",
+    ]
+    for duel in duels:
+        paper, tree = (f"{each.psnr:.2f} / {each.psnr_masked:.2f}" for each in duel.result)
+        seconds = ", ".join(f"{each.train_seconds:.0f}" for each in duel.cost)
+        lines.append(
+            f"| {duel.scene} | {duel.steps} | {paper} | {tree} | {duel.gain:+.2f} | {seconds} |"
+        )
+    lines += [
+        f"| mean | {steps} | | | {mean_gain(duels, steps):+.2f} | |"
+        for steps in dict.fromkeys(duel.steps for duel in duels)
+    ]
+    return "\n".join(lines)
+
+
+def mean_gain(duels: Sequence[Duel], steps: int) -> float:
+    """Returns the mean gain over scenes after so many steps."""
+    return statistics.mean(duel.gain for duel in duels if duel.steps == steps)
+
+
+def draw(path: Path, duels: Sequence[Duel]) -> None:
+    """Draws the gain over steps, a line a scene and one for their mean."""
+    figure, axis = pyplot.subplots(figsize=(7.0, 4.5), layout="constrained")
+    for scene in dict.fromkeys(duel.scene for duel in duels):
+        own = [duel for duel in duels if duel.scene == scene]
+        axis.plot([d.steps for d in own], [d.gain for d in own], "-o", label=scene)
+    steps = list(dict.fromkeys(duel.steps for duel in duels))
+    axis.plot(steps, [mean_gain(duels, n) for n in steps], "--", color="black", label="mean")
+    axis.axhline(0.0, color="#999999", linewidth=0.8)
+    axis.set_xscale("log")
+    axis.set_xticks(steps, map(str, steps))
+    axis.minorticks_off()
+    axis.set_xlabel("training steps")
+    axis.set_ylabel("tree over paper inside the mask, dB")
+    axis.grid(True, color="#e6e6e6", linewidth=0.8)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.legend(frameon=False)
+    figure.savefig(path, dpi=130)
+    pyplot.close(figure)
+
+
+def check(duels: Sequence[Duel], *, full: int, tiny: bool) -> None:
+    """Asserts the claim, as far as the scenes and steps that were given tell."""
+    final = [duel for duel in duels if duel.steps == full]
+    for duel in final:
+        assert duel.gain > 0.0, f"the tree does not beat the paper on {duel.scene}"
+    objects = {duel.scene.rpartition("_")[2] for duel in final}
+    if tiny and objects == _OBJECTS:
+        assert mean_gain(final, full) >= _MEAN_GAIN
+    counts = sorted({duel.steps for duel in duels})
+    if len(counts) > 1:
+        assert mean_gain(duels, counts[-1]) > mean_gain(duels, counts[0])
+
+
+if __name__ == "__main__":
+    app.run(main)

@@ -1,0 +1,99 @@
+"""The figure of a sweep: PSNR against time, the points named, and the front that none beats."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from experiments import trade_off_figures, trade_table
+from experiments.trade_off_figures import COLOURS, LABEL_HEIGHT, pyplot
+from experiments.trade_table import Row
+
+_COSTS: dict[str, Callable[[Row], float]] = {
+    "time of a step, ms": lambda row: 1e3 * row.seconds_per_step,
+    "time of all steps, s": lambda row: row.stepping,
+}
+
+_FRONT = "#999999"
+_MARKERS = "osD^vP"
+
+# Of a letter of a label, in pixels of the figure.
+_LETTER_WIDTH = 6.5
+
+
+def write(path: Path, rows: Sequence[Row]) -> None:
+    """Draws the points of a sweep against both costs.
+
+    Args:
+      path: of the picture.
+      rows: of one scene, with the base.
+    """
+    knobs = list(dict.fromkeys(row.knob for row in rows))
+    styles = {
+        knob: (COLOURS[i % len(COLOURS)], _MARKERS[i // len(COLOURS) % len(_MARKERS)])
+        for i, knob in enumerate(knobs)
+    }
+    figure, axes = pyplot.subplots(1, 2, figsize=(14.0, 6.4), sharey=True, layout="constrained")
+    for axis, (label, cost) in zip(axes, _COSTS.items(), strict=True):
+        front = trade_table.pareto(rows, cost)
+        axis.step(
+            [cost(row) for row in front],
+            [row.quality for row in front],
+            color=_FRONT,
+            linewidth=1.5,
+            where="post",
+            label="none better",
+        )
+        for knob, (colour, marker) in styles.items():
+            own = [row for row in rows if row.knob == knob]
+            axis.plot(
+                [cost(row) for row in own],
+                [row.quality for row in own],
+                marker,
+                color=colour,
+                markersize=9 if not knob else 6,
+                label=knob or "base",
+            )
+        axis.set_xscale("log")
+        axis.set_xlabel(label)
+        axis.grid(True, color="#e6e6e6", linewidth=0.8)
+        axis.set_axisbelow(True)
+        axis.spines[["top", "right"]].set_visible(False)
+        trade_off_figures.label_plainly(axis.xaxis)
+    masked = all(row.psnr_masked is not None for row in rows)
+    axes[0].set_ylabel("PSNR inside the mask, dB" if masked else "PSNR, dB")
+    figure.suptitle(f"{rows[0].scene}: one option changed at a time")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=7, frameon=False)
+    figure.canvas.draw()  # places the axes, so that labels know where they are
+    for axis, cost in zip(axes, _COSTS.values(), strict=True):
+        _label_points(axis, rows, cost, styles)
+    figure.savefig(path, dpi=130)
+    pyplot.close(figure)
+
+
+def _label_points(
+    axis: pyplot.Axes,
+    rows: Sequence[Row],
+    cost: Callable[[Row], float],
+    styles: dict[str, tuple[str, str]],
+) -> None:
+    """Names the points by their values, those of the front first; none where another name is."""
+    front = trade_table.pareto(rows, cost)
+    taken: list[tuple[float, float, float]] = []
+    for row in [*front, *(row for row in rows if row not in front)]:
+        name = row.value or row.name
+        point = (cost(row), row.quality)
+        x, y = axis.transData.transform(point)
+        width = _LETTER_WIDTH * len(name)
+        if any(
+            abs(y - b) < LABEL_HEIGHT and x < a + other and a < x + width for a, b, other in taken
+        ):
+            continue
+        taken.append((x, y, width))
+        axis.annotate(
+            name,
+            point,
+            xytext=(6, -9),
+            textcoords="offset points",
+            fontsize=8,
+            color=styles[row.knob][0],
+        )

@@ -1,0 +1,50 @@
+"""Recommends options of training for the time that there is.
+
+python -m experiments.recommend --scene=experiments/data/cube_smcvx_ball --minutes=5
+
+Reads the table that `experiments.trade_off` measured, times a short training of its base point on
+this machine, and scales the table's times by the ratio. Printed are the options that gave the
+highest PSNR inside the mask of those that fit, and the next cheaper and dearer ones. Only what was
+measured is recommended: PSNR is that of the table's scene, and nothing between or beyond its points
+is guessed.
+"""
+
+from pathlib import Path
+
+from absl import flags
+
+from experiments import commands, recommendations, trade_table
+from refref_jax.data import local_layout
+
+_BUNDLED = Path(__file__).parent / "data" / "trade_off.csv"
+
+_SCENE = flags.DEFINE_string("scene", None, "Folder of the scene to train on.", required=True)
+_MINUTES = flags.DEFINE_float(
+    "minutes", None, "Time for training and evaluation.", 0.0, required=True
+)
+_TABLE = flags.DEFINE_string("table", str(_BUNDLED), "Table of a sweep, trade_off.csv.")
+_TIMED_STEPS = flags.DEFINE_integer(
+    "timed_steps", 96, "Steps of the timing; the first third, which compiles, is left out.", 6
+)
+
+
+def main() -> None:
+    """Times this machine and prints the recommendation."""
+    rows = trade_table.read(Path(_TABLE.value))
+    scene = Path(_SCENE.value)
+    images = len(local_layout.read_frames(scene, "test").names)
+    base = trade_table.base_of(rows)
+    print(f"Timing {_TIMED_STEPS.value} steps of the table's base point ...", flush=True)
+    timing = recommendations.time_machine(scene, base, _TIMED_STEPS.value)
+    machine = recommendations.compare(timing, base, images)
+    print(
+        f"A step takes {1e3 * timing.seconds_per_step:.1f} ms here and "
+        f"{1e3 * base.seconds_per_step:.1f} ms in the table: times are scaled by "
+        f"{machine.ratio:.2f}. Starting and compiling takes {machine.startup:.0f} s."
+    )
+    choice = recommendations.choose(rows, machine, 60.0 * _MINUTES.value)
+    print("\n".join(recommendations.told(choice, machine, scene)))
+
+
+if __name__ == "__main__":
+    commands.run(main)

@@ -1,0 +1,95 @@
+"""Sweeps: points are measured one by one, and written as a table, a figure and a report."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from experiments import (
+    commands,
+    pareto_figure,
+    trade_points,
+    trade_report,
+    trade_table,
+    trained_runs,
+)
+from experiments.trade_points import BASE, Point
+from experiments.trade_table import Row
+from experiments.trained_runs import RunFailedError
+
+Measure = Callable[[Point], Row]
+"""Trains and evaluates a point, or raises `RunFailedError`."""
+
+
+def sweep(points: Sequence[Point], out: Path, measure_: Measure) -> dict[str, str]:
+    """Measures points, and writes table, figure and report after each.
+
+    Args:
+      points: the base first.
+      out: folder to write to.
+      measure_: measures one point.
+
+    Returns:
+      Why points failed, by name: they are left out, and the others go on.
+
+    Raises:
+      ValueError: if the base point failed, with which all are compared.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    rows: list[Row] = []
+    failed: dict[str, str] = {}
+    with commands.ProgressBar("trade-off", len(points)) as bar:
+        for done, point in enumerate(points, 1):
+            try:
+                rows.append(measure_(point))
+            except RunFailedError as error:
+                if point.name == BASE:
+                    raise ValueError(
+                        f"The base point failed: {error}. Mend that, or give another --base."
+                    ) from error
+                failed[point.name] = str(error)
+                bar.show(done, f"{point.name} failed")
+                continue
+            _write(out, rows)
+            bar.show(done, f"{point.name}: {rows[-1].quality:.2f} dB")
+    return failed
+
+
+def measure(point: Point, scene: Path, runs: Path, limit: Sequence[str] = ()) -> Row:
+    """Trains and evaluates a point, or reads what was measured before.
+
+    Points that differ in evaluation alone share a training.
+
+    Args:
+      point: the point.
+      scene: folder of the scene.
+      runs: folder of the trainings.
+      limit: options that choose the images of the evaluation.
+    """
+    run = runs / run_name(point, scene)
+    cost = trained_runs.train(run, scene=scene, options=point.training)
+    gain = trained_runs.evaluate(run, scene=scene, options=(*point.evaluation, *limit))
+    return Row(
+        scene=scene.resolve().name,
+        name=point.name,
+        knob=point.knob,
+        value=point.value,
+        training=" ".join(point.training),
+        evaluation=" ".join(point.evaluation),
+        **vars(cost),
+        **vars(gain),
+    )
+
+
+def run_name(point: Point, scene: Path) -> str:
+    """Returns the name of a training's folder, another for each scene and set of options."""
+    text = " ".join((str(scene.resolve()), *point.training))
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    shared = not point.knob or point.knob in trade_points.OF_EVALUATION
+    return f"{BASE if shared else point.name}-{digest}"
+
+
+def _write(out: Path, rows: Sequence[Row]) -> None:
+    trade_table.write(out / "trade_off.csv", rows)
+    pareto_figure.write(out / "trade_off.png", rows)
+    text = trade_report.markdown(rows)
+    (out / "trade_off.md").write_text(text, encoding="utf-8")

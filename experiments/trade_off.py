@@ -1,0 +1,94 @@
+"""Measures the trade of speed for accuracy: trains around a base point, one option at a time.
+
+python -m experiments.trade_off --scene=experiments/data/cube_smcvx_ball --out=runs/trade_off
+
+Every point is trained from the same seed by `experiments.train` and measured by
+`experiments.evaluate`, each in a process of its own. Written are trade_off.csv, one row a point;
+trade_off.png, PSNR inside the mask against time; and trade_off.md, tables of what to turn first.
+Points that are finished are not measured again, and one that was interrupted goes on: repeat the
+command. Times are of this machine: leave it alone meanwhile.
+
+--base=NAME=VALUE changes the base, --values=NAME=A/B what is tried of an option. Both may be
+repeated, and take any option of `experiments.train`, and rays_per_pixel.
+"""
+
+import signal
+import sys
+from pathlib import Path
+
+from absl import flags
+
+from experiments import commands, sweeps, trade_points
+from experiments.trade_points import Point
+
+_SCENE = flags.DEFINE_string("scene", None, "Folder of the scene.", required=True)
+_OUT = flags.DEFINE_string("out", None, "Folder of the sweep.", required=True)
+_PRESET = flags.DEFINE_string("preset", "tiny", "Preset of the base point.")
+_SEED = flags.DEFINE_integer("seed", 0, "Seed of all trainings.", 0, 2**32 - 1)
+_STEPS = flags.DEFINE_list(
+    "steps",
+    [],
+    "Steps of the base point, then those of further trainings of it; by default the preset's, and "
+    "a quarter, half and twice of them.",
+)
+_BASE = flags.DEFINE_multi_string("base", [], "Option of the base, as cut=0.05. May be repeated.")
+_VALUES = flags.DEFINE_multi_string(
+    "values", [], "Values to try of an option, as cut=0.1/0.05. May be repeated."
+)
+_KNOBS = flags.DEFINE_list("knobs", None, "Only these options are tried; all if not given.")
+_POINTS = flags.DEFINE_list("points", None, "Only these points, and the base, as cut=0.1.")
+_LIMIT = flags.DEFINE_integer("limit", None, "Only this many test images, evenly spread.", 1)
+_DRY_RUN = flags.DEFINE_bool("dry_run", False, "List the points, and measure nothing.")
+
+
+def main() -> None:
+    """Measures all points and writes the report."""
+    points = points_from_flags()
+    if _DRY_RUN.value:
+        for point in points:
+            print(f"{point.name:24} {' '.join((*point.training, *point.evaluation))}")
+        return
+    scene, out = Path(_SCENE.value), Path(_OUT.value)
+    if not scene.is_dir():
+        raise ValueError(f"{scene} is no folder. Give that of a scene.")
+    # A sweep that is killed takes the training that it waits for with it.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    limit = () if _LIMIT.value is None else (f"--limit={_LIMIT.value}",)
+    failed = sweeps.sweep(
+        points, out, lambda point: sweeps.measure(point, scene, out / "runs", limit)
+    )
+    print(f"Table:  {out / 'trade_off.csv'}")
+    print(f"Figure: {out / 'trade_off.png'}")
+    print(f"Report: {out / 'trade_off.md'}")
+    print(
+        f"Next: python -m experiments.recommend --scene={scene} --minutes=5 "
+        f"--table={out / 'trade_off.csv'}"
+    )
+    for name, reason in failed.items():
+        print(f"failed: {name}: {reason}", file=sys.stderr)
+    if failed:
+        sys.exit(1)
+
+
+def points_from_flags() -> list[Point]:
+    """Returns the points that the options ask for."""
+    try:
+        steps = [int(word) for word in _STEPS.value]
+    except ValueError as error:
+        raise ValueError(
+            f"--steps={','.join(_STEPS.value)} is not a list of numbers. Write as in "
+            "--steps=2500,1000."
+        ) from error
+    points = trade_points.sweep(
+        preset=_PRESET.value,
+        seed=_SEED.value,
+        steps=steps,
+        base=trade_points.parse_base(_BASE.value),
+        values=trade_points.parse_values(_VALUES.value),
+        knobs=_KNOBS.value,
+    )
+    return points if _POINTS.value is None else trade_points.choose(points, _POINTS.value)
+
+
+if __name__ == "__main__":
+    commands.run(main)

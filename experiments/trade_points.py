@@ -1,0 +1,177 @@
+"""The points of a sweep, as data: a base, and around it one option changed at a time.
+
+A *knob* is an option of `experiments.train`, or `rays_per_pixel`, one of `experiments.evaluate`. A
+point is named after the knob and its value, as `cut=0.01`; commas become `+`, so that points can be
+listed.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from experiments.presets import PRESETS, Bounds
+
+BASE = "base"
+
+OF_EVALUATION = ("rays_per_pixel",)
+"""Knobs that training knows nothing of."""
+
+_BASE_OPTIONS = {"paths": "tree"}
+
+# What the options are called of which no preset and no --base tells the value.
+_DEFAULTS = {"cut": "0.02", "precision": "float32", "rays_per_pixel": "1"}
+
+_ANY_BOUNDS = Bounds(near=0.05, far=20.0, radius=7.3, space="bounded")
+
+
+class Point(NamedTuple):
+    """One training and one evaluation.
+
+    Attributes:
+      name: `base`, or knob and value.
+      knob: the option that is changed; empty for the base.
+      value: of the knob; empty for the base.
+      training: options of `experiments.train`, as `--name=value`, without scene and folder.
+      evaluation: options of `experiments.evaluate`.
+    """
+
+    name: str
+    knob: str
+    value: str
+    training: tuple[str, ...]
+    evaluation: tuple[str, ...]
+
+
+def sweep(
+    *,
+    preset: str,
+    seed: int = 0,
+    steps: Sequence[int] = (),
+    base: Mapping[str, str] | None = None,
+    values: Mapping[str, Sequence[str]] | None = None,
+    knobs: Sequence[str] | None = None,
+) -> list[Point]:
+    """Returns the base and all points around it; a point that equals the base is left out.
+
+    Args:
+      preset: of the base.
+      seed: of all trainings.
+      steps: the base's first, then those of further trainings; by default the preset's own, and a
+        quarter, half and twice of them. One number alone leaves the steps as they are.
+      base: options of the base, over the preset's.
+      values: of a knob, in place of those of `default_values`; new knobs are added.
+      knobs: only these; all if `None`.
+
+    Raises:
+      ValueError: if a preset or knob does not exist.
+    """
+    if preset not in PRESETS:
+        raise ValueError(f"There is no preset {preset}. Choose from {', '.join(PRESETS)}.")
+    usual = PRESETS[preset].schedule.steps
+    first, *others = steps or (usual, usual // 4, usual // 2, 2 * usual)
+    base = _BASE_OPTIONS | dict(base or {})
+    options = {"preset": preset, "seed": str(seed), "steps": str(first)} | base
+    swept = default_values(preset) | {"steps": tuple(map(str, others))} | dict(values or {})
+    if knobs is not None:
+        if unknown := [knob for knob in knobs if knob not in swept]:
+            raise ValueError(
+                f"There is no knob {unknown[0]}. Choose from {', '.join(swept)}, or give its "
+                f"values with --values={unknown[0]}=A/B."
+            )
+        swept = {knob: swept[knob] for knob in knobs}
+    known = own_values(preset) | _DEFAULTS | options
+    points = [_point(options, "", "")]
+    points += [
+        _point(options, knob, value)
+        for knob, alternatives in swept.items()
+        for value in alternatives
+        if value != known.get(knob)
+    ]
+    return points
+
+
+def own_values(preset: str) -> dict[str, str]:
+    """Returns what the knobs of a model are in a preset."""
+    model = PRESETS[preset].model(_ANY_BOUNDS, "field")
+    rounds = [*(proposal.samples for proposal in model.proposals), model.samples]
+    return {
+        "samples": ",".join(map(str, rounds)),
+        "multisamples": str(model.multisamples),
+        "entries": str(model.field.grid.entries.bit_length() - 1),
+        "finest": str(model.field.grid.finest),
+        "footprint": model.footprint,
+    }
+
+
+def default_values(preset: str) -> dict[str, tuple[str, ...]]:
+    """Returns what is tried of each knob, around a preset: a little less, and more."""
+    own = own_values(preset)
+    rounds = [int(count) for count in own["samples"].split(",")]
+    entries, finest = int(own["entries"]), int(own["finest"])
+    return {
+        "paths": ("straight", "paper", "tree"),
+        "cut": ("0.1", "0.05", "0.02", "0.01", "0.005"),
+        "samples": tuple(
+            ",".join(str(round(share * count)) for count in rounds) for share in (0.5, 0.75, 1.5, 2)
+        ),
+        "multisamples": ("1", "6"),
+        "entries": tuple(str(entries + more) for more in (-3, -2, -1, 1, 2)),
+        "finest": tuple(str(round(share * finest)) for share in (0.25, 0.5, 2, 4)),
+        "interior": ("field", "clear", "absorbing"),
+        "footprint": ("cone", "differential"),
+        "precision": ("float32", "bfloat16"),
+        "rays_per_pixel": ("1", "4", "9"),
+    }
+
+
+def choose(points: Sequence[Point], names: Sequence[str]) -> list[Point]:
+    """Returns the points of these names, and the base, with which they are compared.
+
+    Raises:
+      ValueError: if there is no such point.
+    """
+    known = [point.name for point in points]
+    if unknown := [name for name in names if name not in known]:
+        raise ValueError(f"There is no point {unknown[0]}. Choose from {', '.join(known)}.")
+    return [point for point in points if point.name in {BASE, *names}]
+
+
+def parse_base(words: Sequence[str]) -> dict[str, str]:
+    """Returns the options that words as `cut=0.05` or `samples=48,32` give.
+
+    Raises:
+      ValueError: if one is not of that form.
+    """
+    options = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not (name and equals and value):
+            raise ValueError(f"--base={word} is not NAME=VALUE. Write as in --base=cut=0.05.")
+        options[name] = value
+    return options
+
+
+def parse_values(words: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Returns the values of knobs that words as `cut=0.1/0.05` or `samples=16,10/48,32` give.
+
+    Raises:
+      ValueError: if one is not of that form.
+    """
+    values = {}
+    for word in words:
+        name, equals, given = word.partition("=")
+        values[name] = tuple(value for value in given.split("/") if value)
+        if not (name and equals and values[name]):
+            raise ValueError(f"--values={word} is not NAME=A/B. Write as in --values=cut=0.1/0.05.")
+    return values
+
+
+def _point(base: Mapping[str, str], knob: str, value: str) -> Point:
+    options = {**base, knob: value} if knob else dict(base)
+    evaluation = {name: options.pop(name) for name in OF_EVALUATION if name in options}
+    return Point(
+        name=f"{knob}={value}".replace(",", "+") if knob else BASE,
+        knob=knob,
+        value=value,
+        training=tuple(f"--{name}={each}" for name, each in options.items()),
+        evaluation=tuple(f"--{name}={each}" for name, each in evaluation.items()),
+    )

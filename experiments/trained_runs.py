@@ -1,0 +1,217 @@
+"""Trains and evaluates runs through the command line, and says what they cost and gave.
+
+Each training and each evaluation is a process of its own: as a user has it, with nothing compiled
+before, and with a peak of memory that is its own. What has been measured is kept beside the run, in
+`measured.json`, and is not measured again while its options are the same.
+"""
+
+import dataclasses
+import itertools
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+_MEASURED = "measured.json"
+
+# Steps between two lines of metrics: whole pools of 32 batches, so that each interval has its share
+# of the tracing.
+_LOG_EVERY = 64
+
+# ru_maxrss is in KiB, but in bytes on macOS.
+_RSS_UNIT = 1.0 if sys.platform == "darwin" else 1024.0
+_MIB = 2.0**20
+
+
+class RunFailedError(Exception):
+    """A training or evaluation ended with an error; the text is its last line and where to read."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Training:
+    """What a training cost.
+
+    Attributes:
+      steps: of it.
+      seconds_per_step: median over its intervals, without the first, which also compiles.
+      rays_per_second: batch over that.
+      train_seconds: of all its steps, compiling included.
+      startup_seconds: of its process beside the steps at that pace: starting, reading, compiling,
+        saving. Too little if the training was resumed.
+      peak_host_mib: largest resident set of its process.
+      peak_device_mib: largest memory of its accelerator; `None` where there is none.
+    """
+
+    steps: int
+    seconds_per_step: float
+    rays_per_second: float
+    train_seconds: float
+    startup_seconds: float
+    peak_host_mib: float
+    peak_device_mib: float | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """What an evaluation gave: means over images; `None` for what the scene does not tell.
+
+    Attributes:
+      psnr: over the image, dB.
+      psnr_masked: inside the mask.
+      ssim: structural similarity.
+      distance_mae: error of the distance, world units.
+      distance_mae_masked: inside the mask.
+      seconds_per_image: of rendering, without compiling.
+      images: how many were rendered.
+    """
+
+    psnr: float
+    psnr_masked: float | None
+    ssim: float
+    distance_mae: float | None
+    distance_mae_masked: float | None
+    seconds_per_image: float
+    images: int
+
+
+def train(
+    run: Path, *, scene: Path, options: Sequence[str], log_every: int | None = None
+) -> Training:
+    """Trains a run, or goes on with it, or reads what it cost if it is finished.
+
+    Args:
+      run: its folder.
+      scene: the scene.
+      options: further ones of `experiments.train`; those that decide the result.
+      log_every: steps of an interval that is timed; about a quarter of a short training if `None`.
+
+    Raises:
+      RunFailedError: if training ends with an error.
+    """
+    asked = [f"scene={scene.resolve()}", *options]
+    known = _read(run)
+    if known.get("asked") == asked:
+        return Training(**known["training"])
+    steps = _steps_in(options)
+    every = log_every or min(_LOG_EVERY, max(1, (steps or 4 * _LOG_EVERY) // 4))
+    command = [f"--scene={scene}", f"--out={run}", "--resume", f"--log_every={every}", *options]
+    wall, peak = _command("train", *command, log=run.with_name(f"{run.name}.log"))
+    training = read_training(run, wall=wall, peak_host_mib=peak)
+    _write(run, {"asked": asked, "training": dataclasses.asdict(training)})
+    return training
+
+
+def evaluate(
+    run: Path, *, scene: Path, options: Sequence[str] = (), split: str = "test"
+) -> Evaluation:
+    """Evaluates a trained run, or reads what an evaluation with the same options gave.
+
+    Raises:
+      RunFailedError: if it ends with an error.
+    """
+    known = _read(run)
+    key = " ".join([f"--split={split}", *options])
+    if key not in known.get("evaluations", {}):
+        command = [f"--run={run}", f"--scene={scene}", *key.split()]
+        _command("evaluate", *command, log=run.with_name(f"{run.name}.log"))
+        summary = json.loads((run / "eval" / split / "metrics.json").read_text("utf-8"))
+        names = {field.name for field in dataclasses.fields(Evaluation)}
+        values = {name: _number(x) for name, x in summary["results"].items() if name in names}
+        known.setdefault("evaluations", {})[key] = values | {"images": len(summary["per_image"])}
+        _write(run, known)
+    return Evaluation(**known["evaluations"][key])
+
+
+def read_training(run: Path, *, wall: float, peak_host_mib: float) -> Training:
+    """Reads what a finished training cost from its metrics.
+
+    Args:
+      run: its folder.
+      wall: seconds that its process took.
+      peak_host_mib: largest resident set of that process.
+    """
+    text = (run / "metrics.jsonl").read_text("utf-8")
+    lines = [json.loads(line) for line in text.splitlines()]
+    last = lines[-1]
+    pace = seconds_per_step(lines)
+    batch = json.loads((run / "config.json").read_text("utf-8"))["batch"]
+    device = last.get("peak_device_bytes")
+    return Training(
+        steps=last["step"],
+        seconds_per_step=pace,
+        rays_per_second=batch / pace,
+        train_seconds=last["seconds"],
+        startup_seconds=max(0.0, wall - last["step"] * pace),
+        peak_host_mib=peak_host_mib,
+        peak_device_mib=None if device is None else device / _MIB,
+    )
+
+
+def seconds_per_step(lines: Sequence[dict[str, Any]]) -> float:
+    """Returns the median pace between lines of metrics; the first interval also compiles.
+
+    A training of one line has no other, and its pace includes compiling.
+    """
+    pairs = itertools.pairwise(lines)
+    paces = [(b["seconds"] - a["seconds"]) / (b["step"] - a["step"]) for a, b in pairs]
+    return statistics.median(paces) if paces else lines[0]["seconds"] / lines[0]["step"]
+
+
+def _command(name: str, *options: str, log: Path) -> tuple[float, float]:
+    """Runs a command and returns its seconds and the peak of its memory in MiB.
+
+    If this process is interrupted, the command is asked to stop, and may save before it does.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    start = time.monotonic()
+    with log.open("a", encoding="utf-8") as file:
+        print(f"$ python -m experiments.{name} {' '.join(options)}", file=file, flush=True)
+        process = subprocess.Popen(
+            [sys.executable, "-m", f"experiments.{name}", *options],
+            stdout=file,
+            stderr=subprocess.STDOUT,
+        )
+        try:
+            _, status, usage = os.wait4(process.pid, 0)
+        except KeyboardInterrupt:
+            process.terminate()
+            process.wait()
+            raise
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode != 0:
+        raise RunFailedError(f"experiments.{name}: {_complaint(log)} (all of it: {log})")
+    return time.monotonic() - start, usage.ru_maxrss * _RSS_UNIT / _MIB
+
+
+def _complaint(log: Path) -> str:
+    """Returns the last line of a log that tells an error, or else its last line."""
+    lines = [line for line in log.read_text("utf-8").splitlines() if line.strip()]
+    told = [line for line in lines if "rror" in line]
+    return (told or lines)[-1].strip()
+
+
+def _steps_in(options: Sequence[str]) -> int | None:
+    given = [option.partition("=")[2] for option in options if option.startswith("--steps=")]
+    return int(given[-1]) if given else None
+
+
+def _number(value: Any) -> Any:
+    """Undoes `commands.string_safe`."""
+    return float(value) if isinstance(value, str) else value
+
+
+def _read(run: Path) -> dict[str, Any]:
+    path = run / _MEASURED
+    return json.loads(path.read_text("utf-8")) if path.is_file() else {}
+
+
+def _write(run: Path, record: dict[str, Any]) -> None:
+    path = run / _MEASURED
+    rewritten = path.with_suffix(".tmp")
+    rewritten.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    rewritten.replace(path)

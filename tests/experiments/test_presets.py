@@ -1,0 +1,41 @@
+"""The presets: every one makes a model, and they grow."""
+
+import dataclasses
+import json
+
+import pytest
+
+from experiments.presets import PRESETS, Bounds
+
+_BOUNDS = Bounds(near=0.05, far=16.0, radius=7.3, space="bounded")
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_makes_a_model_of_its_scene(name):
+    preset = PRESETS[name]
+    model = preset.model(_BOUNDS, "clear")
+    assert model.interior == "clear" and model.radius == 7.3
+    assert len(preset.loss.blurs) == len(model.proposals)
+    assert preset.schedule.warmup < preset.schedule.steps and preset.schedule.end > 0.0
+    json.dumps(dataclasses.asdict(model))
+
+
+def test_small_lies_between_tiny_and_paper():
+    def sizes(name):
+        preset = PRESETS[name]
+        model = preset.model(_BOUNDS, "field")
+        grid = model.field.grid
+        numbers = (grid.levels, grid.finest, grid.entries, model.samples, model.field.colour_width)
+        return (*numbers, preset.batch, preset.schedule.steps)
+
+    for less, middle, more in zip(sizes("tiny"), sizes("small"), sizes("paper"), strict=True):
+        assert less < middle <= more
+
+
+def test_best_samples_as_the_paper_does_and_sees_through_bends():
+    best, paper = (PRESETS[name].model(_BOUNDS, "field") for name in ("best", "paper"))
+    assert best.footprint == "differential" and paper.footprint == "cone"
+    assert [p.samples for p in best.proposals] == [p.samples for p in paper.proposals]
+    # As many rays are traced at once.
+    assert PRESETS["best"].batch * PRESETS["best"].pool == 131_072
+    assert PRESETS["paper"].batch * PRESETS["paper"].pool == 131_072

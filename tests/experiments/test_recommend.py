@@ -1,0 +1,71 @@
+"""Recommendations from a table; nothing is trained here."""
+
+import pytest
+
+from experiments import recommendations
+from experiments.recommendations import Machine
+from experiments.trained_runs import Training
+from tests.experiments.command import ROOT, run_command
+from tests.experiments.made_rows import made_row
+
+# Twice as fast as the table's machine; both commands together start for 20 s.
+_MACHINE = Machine(ratio=0.5, startup=10.0, images=20)
+
+# 1000 steps, 20 images of 1 s: 0.5 * (1000 * pace + 20) + 20 seconds.
+_ROWS = [
+    made_row("steps=250", pace=0.1, steps=250, quality=20.0),
+    made_row("base", pace=0.1, quality=25.0),
+    made_row("finest=64", pace=0.12, quality=22.0),
+    made_row("samples=48+30", pace=0.2, quality=27.0),
+]
+
+
+def test_the_time_is_that_of_steps_and_images_on_this_machine():
+    assert recommendations.seconds_of(_ROWS[1], _MACHINE) == pytest.approx(80.0)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "cheaper", "best", "dearer"),
+    [
+        (45.0, None, "steps=250", "base"),
+        (80.1, "steps=250", "base", "samples=48+30"),
+        (129.0, "steps=250", "base", "samples=48+30"),
+        (1e6, "base", "samples=48+30", None),
+    ],
+)
+def test_the_best_that_fits_is_chosen(seconds, cheaper, best, dearer):
+    choice = recommendations.choose(_ROWS, _MACHINE, seconds)
+    names = [row and row.name for row in (choice.cheaper, choice.best, choice.dearer)]
+    assert names == [cheaper, best, dearer]
+
+
+def test_too_little_time_is_refused_with_what_is_needed():
+    # 0.5 * (25 + 20) + 20 = 42.5 s.
+    with pytest.raises(ValueError, match=r"less than 0\.7 minutes here \(steps=250\)"):
+        recommendations.choose(_ROWS, _MACHINE, 42.0)
+
+
+def test_the_machine_is_compared_by_the_base():
+    timing = Training(96, 0.3, 3413.0, 60.0, 31.0, 900.0, None)
+    machine = recommendations.compare(timing, made_row(pace=0.1), 40)
+    assert machine.ratio == pytest.approx(3.0)
+    assert machine.startup == 31.0 and machine.images == 40
+
+
+def test_what_is_told_can_be_pasted(tmp_path):
+    rows = [made_row("rays_per_pixel=4", evaluation="--rays_per_pixel=4")]
+    choice = recommendations.choose(rows, _MACHINE, 1e6)
+    text = "\n".join(recommendations.told(choice, _MACHINE, tmp_path / "ball"))
+    train = f"python -m experiments.train --scene={tmp_path / 'ball'} --out=runs/ball"
+    assert f"{train} --preset=tiny --steps=1000" in text
+    assert "experiments.evaluate --run=runs/ball --split=test --rays_per_pixel=4" in text
+    assert "1.3 minutes, 25.0 dB inside the mask on cube_smcvx_ball" in text
+    assert "nothing was measured that gives more" in text and "takes less time" in text
+
+
+def test_a_missing_table_is_named(tmp_path):
+    scene = ROOT / "experiments" / "data" / "cube_smcvx_ball"
+    options = (f"--scene={scene}", "--minutes=5", f"--table={tmp_path / 'none.csv'}")
+    result = run_command("recommend", *options, fails=True)
+    assert "none.csv" in result.stderr and "experiments.trade_off" in result.stderr
+    assert "Traceback" not in result.stderr

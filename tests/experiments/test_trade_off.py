@@ -1,0 +1,267 @@
+"""The sweep: its points, its table, and what it makes of measurements. Nothing is trained here."""
+
+import dataclasses
+import subprocess
+
+import imageio.v3 as iio
+import pytest
+
+from experiments import sweeps, trade_points, trade_report, trade_table, trained_runs
+from experiments.trade_points import BASE
+from experiments.trained_runs import RunFailedError
+from tests.experiments.command import ROOT, run_command
+from tests.experiments.made_rows import made_row
+
+_SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
+
+
+def test_every_point_changes_one_option_of_the_base():
+    base, *others = trade_points.sweep(preset="tiny", base={"interior": "clear"})
+    assert base.name == BASE and "--interior=clear" in base.training
+    for point in others:
+        ours, theirs = (set(p.training) | set(p.evaluation) for p in (base, point))
+        assert len(theirs - ours) == 1 and len(ours - theirs) <= 1, point.name
+        assert f"--{point.knob}={point.value}" in theirs
+
+
+def test_no_point_is_the_base_and_none_comes_twice():
+    points = trade_points.sweep(preset="tiny")
+    options = [(p.training, p.evaluation) for p in points]
+    assert len(set(options)) == len(options)
+    names = {point.name for point in points}
+    # What the preset, the budget and evaluation have anyway.
+    assert not names & {"samples=32+20", "finest=512", "entries=17", "cut=0.02", "paths=tree"}
+    assert names >= {"samples=48+30", "entries=18", "precision=bfloat16", "rays_per_pixel=4"}
+
+
+def test_rays_per_pixel_are_evaluations_alone():
+    points = {point.name: point for point in trade_points.sweep(preset="tiny")}
+    nine = points["rays_per_pixel=9"]
+    assert nine.training == points[BASE].training and nine.evaluation == ("--rays_per_pixel=9",)
+    names = {name: sweeps.run_name(point, _SCENE) for name, point in points.items()}
+    assert names["rays_per_pixel=9"] == names[BASE]  # trained once
+    assert len(set(names.values())) == len(names) - 2
+    assert sweeps.run_name(points[BASE], ROOT) != names[BASE]
+
+
+def test_the_lists_of_a_knob_can_be_replaced_and_knobs_added():
+    values = trade_points.parse_values(["samples=16,10/8,4", "batch=256"])
+    knobs = ("samples", "batch", "steps")
+    points = trade_points.sweep(preset="tiny", values=values, knobs=knobs)
+    assert {point.name for point in points[1:]} == {
+        "samples=16+10",
+        "samples=8+4",
+        "batch=256",
+        "steps=625",
+        "steps=1250",
+        "steps=5000",
+    }
+
+
+def test_steps_are_the_bases_and_those_of_more_trainings():
+    points = trade_points.sweep(preset="tiny", steps=[300, 100], knobs=["steps"])
+    assert [point.name for point in points] == [BASE, "steps=100"]
+    assert "--steps=300" in points[0].training
+    assert len(trade_points.sweep(preset="tiny", steps=[300], knobs=["steps"])) == 1
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: trade_points.sweep(preset="huge"), "Choose from tiny, small, paper, best"),
+        (lambda: trade_points.sweep(preset="tiny", knobs=["colour"]), "--values=colour=A/B"),
+        (lambda: trade_points.parse_base(["cut"]), "NAME=VALUE"),
+        (lambda: trade_points.parse_values(["cut="]), "NAME=A/B"),
+        (lambda: trade_points.choose(trade_points.sweep(preset="tiny"), ["cut=1"]), "cut=1"),
+    ],
+)
+def test_what_does_not_exist_is_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ((f"--scene={_SCENE}", "--steps=many"), "list of numbers"),
+        (("--scene=nowhere",), "nowhere is no folder"),
+    ],
+)
+def test_mistakes_end_before_anything_is_trained(tmp_path, options, message):
+    out = tmp_path / "out"
+    result = run_command("trade_off", f"--out={out}", *options, fails=True)
+    assert message in result.stderr and "Traceback" not in result.stderr
+    assert not out.exists()
+
+
+def test_a_table_is_read_as_it_was_written(tmp_path):
+    rows = [made_row(), dataclasses.replace(made_row("cut=0.1"), psnr_masked=None)]
+    trade_table.write(tmp_path / "t.csv", rows)
+    assert trade_table.read(tmp_path / "t.csv") == rows
+    assert rows[1].quality == rows[1].psnr == 28.0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [(None, "experiments.trade_off"), ("a,b\n1,2\n", "not a table"), ("", "no row of the base")],
+)
+def test_a_table_that_is_none_is_named(tmp_path, text, message):
+    path = tmp_path / "table.csv"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        trade_table.read(path)
+
+
+def test_the_front_holds_what_nothing_beats():
+    rows = [
+        made_row("a=1", pace=0.1, quality=20.0),
+        made_row("a=2", pace=0.2, quality=25.0),
+        made_row("a=3", pace=0.2, quality=24.0),
+        made_row("a=4", pace=0.3, quality=25.0),
+        made_row("a=5", pace=0.4, quality=26.0),
+    ]
+    front = trade_table.pareto(rows, lambda row: row.stepping)
+    assert [row.name for row in front] == ["a=1", "a=2", "a=5"]
+
+
+def _measured():
+    return [
+        made_row(),
+        made_row("free=1", pace=0.09, quality=26.0),
+        made_row("dear=1", pace=0.2, quality=27.0),
+        made_row("fair=1", pace=0.11, quality=26.0),
+        made_row("fair=2", pace=0.15, quality=26.5),
+        made_row("noise=1", pace=0.1, quality=25.2),
+        made_row("less=1", pace=0.05, quality=24.9),
+        made_row("less=2", pace=0.04, quality=20.0),
+        made_row("rays_per_pixel=4", image=4.0, quality=25.9),
+    ]
+
+
+def test_what_to_turn_first_is_what_is_free_then_what_gives_most_for_its_time():
+    found = trade_table.turns(_measured())
+    worth = trade_table.worth_turning(found)
+    assert [turn.row.name for turn in worth] == ["free=1", "fair=1", "dear=1", "rays_per_pixel=4"]
+    assert worth[1].gain == pytest.approx(1.0) and worth[1].percent == pytest.approx(10.0)
+    # Of rendering: training takes as long as the base's.
+    assert worth[3].percent == pytest.approx(300.0)
+
+
+def test_what_saves_time_is_named_once_a_knob():
+    saving = trade_table.worth_saving(trade_table.turns(_measured()))
+    assert [turn.row.name for turn in saving] == ["less=1"]
+
+
+def test_the_report_marks_the_front_and_sorts_by_time():
+    text = trade_report.markdown(_measured())
+    lines = [line for line in text.splitlines() if line.startswith(("| ● |", "|  |"))]
+    assert [line.split("|")[2].strip() for line in lines][:3] == ["less=2", "less=1", "free=1"]
+    assert [line.split("|")[1].strip() for line in lines][:5] == ["●", "●", "●", "", ""]
+    assert "| `--fair=1` | +1.00 | +10 % | 0.100 |" in text
+    assert "| `--free=1` | +1.00 | -10 % | free |" in text
+
+
+def test_a_sweep_writes_everything_and_outlives_a_point_that_fails(tmp_path):
+    points = trade_points.sweep(preset="tiny", knobs=["cut", "paths"])
+
+    def measure(point):
+        if point.name == "cut=0.05":
+            raise RunFailedError("out of memory")
+        return made_row(point.name, pace=0.1 + 0.01 * len(point.name), quality=20.0)
+
+    failed = sweeps.sweep(points, tmp_path / "out", measure)
+    assert failed == {"cut=0.05": "out of memory"}
+    rows = trade_table.read(tmp_path / "out" / "trade_off.csv")
+    assert [row.name for row in rows] == [p.name for p in points if p.name != "cut=0.05"]
+    assert "paths=straight" in (tmp_path / "out" / "trade_off.md").read_text()
+    assert iio.imread(tmp_path / "out" / "trade_off.png").shape[1] > 1000
+
+
+def test_a_sweep_without_its_base_ends(tmp_path):
+    def measure(point):
+        raise RunFailedError("unknown flag")
+
+    with pytest.raises(ValueError, match="unknown flag"):
+        sweeps.sweep(trade_points.sweep(preset="tiny"), tmp_path, measure)
+
+
+def test_the_pace_is_the_median_without_the_interval_that_compiles():
+    seconds = [30.0, 31.0, 32.0, 50.0, 51.0]
+    lines = [{"step": 10 * i, "seconds": s} for i, s in enumerate(seconds, 1)]
+    assert trained_runs.seconds_per_step(lines) == pytest.approx(0.1)
+    assert trained_runs.seconds_per_step(lines[:1]) == pytest.approx(3.0)
+
+
+_STUB = """
+import json, pathlib, sys
+options = dict(word.lstrip("-").partition("=")[::2] for word in sys.argv[2:])
+command, run = sys.argv[1], pathlib.Path(options.get("out") or options["run"])
+with (run.parent / "calls.txt").open("a") as file:
+    file.write(command + "\\n")
+if options.get("cut") == "2":
+    sys.exit("error: The cut is a share, not 2. Give 0.02.")
+run.mkdir(exist_ok=True)
+if command == "train":
+    lines = [{"step": n, "seconds": 5.0 + 0.5 * n, "peak_device_bytes": 2**30} for n in (1, 2, 4)]
+    (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\\n" for line in lines))
+    (run / "config.json").write_text('{"batch": 100}')
+else:
+    results = {"psnr": "inf", "psnr_masked": None, "ssim": 1.0, "distance_mae": 0.1}
+    results |= {"distance_mae_masked": None, "seconds_per_image": 2.0}
+    (run / "eval" / "test").mkdir(parents=True, exist_ok=True)
+    text = json.dumps({"results": results, "per_image": [1, 2]})
+    (run / "eval" / "test" / "metrics.json").write_text(text)
+"""
+
+
+@pytest.fixture
+def stub(tmp_path, monkeypatch):
+    """Stands in for the commands; writes their names into `calls.txt`."""
+    (tmp_path / "stub.py").write_text(_STUB)
+    start = subprocess.Popen
+
+    def popen(command, **options):
+        name = command[2].removeprefix("experiments.")
+        return start([command[0], str(tmp_path / "stub.py"), name, *command[3:]], **options)
+
+    monkeypatch.setattr(trained_runs.subprocess, "Popen", popen)
+    return tmp_path / "runs"
+
+
+def test_a_point_is_measured_once(stub):
+    points = {p.name: p for p in trade_points.sweep(preset="tiny", steps=[4])}
+    row = sweeps.measure(points[BASE], _SCENE, stub)
+    assert (row.steps, row.seconds_per_step, row.rays_per_second) == (4, 0.5, 200.0)
+    assert row.train_seconds == 7.0 and row.peak_device_mib == 1024.0
+    assert 1.0 < row.peak_host_mib < 10_000.0
+    assert (row.psnr, row.psnr_masked, row.images) == (float("inf"), None, 2)
+    assert sweeps.measure(points[BASE], _SCENE, stub) == row
+    sweeps.measure(points["rays_per_pixel=4"], _SCENE, stub)
+    sweeps.measure(points[BASE], _SCENE, stub, ["--limit=1"])
+    sweeps.measure(points["cut=0.1"], _SCENE, stub)
+    calls = (stub / "calls.txt").read_text().split()
+    assert calls == ["train", "evaluate", "evaluate", "evaluate", "train", "evaluate"]
+
+
+def test_a_failure_tells_its_last_word_and_is_tried_again(stub):
+    values = {"cut": ("2",)}
+    point = trade_points.sweep(preset="tiny", values=values, knobs=["cut"])[1]
+    for _ in range(2):
+        with pytest.raises(RunFailedError, match=r"The cut is a share, not 2.*\.log"):
+            sweeps.measure(point, _SCENE, stub)
+    assert (stub / "calls.txt").read_text().split() == ["train", "train"]
+
+
+@pytest.mark.slow
+def test_a_real_sweep_of_three_steps(tmp_path):
+    options = (f"--scene={_SCENE}", f"--out={tmp_path}", "--steps=3", "--limit=1")
+    options += ("--base=interior=field", "--base=batch=64", "--points=paths=straight,paths=paper")
+    result = run_command("trade_off", *options)
+    assert "experiments.recommend" in result.stdout
+    rows = trade_table.read(tmp_path / "trade_off.csv")
+    assert [row.name for row in rows] == [BASE, "paths=straight", "paths=paper"]
+    assert all(row.steps == 3 and row.psnr_masked > 5.0 for row in rows)
+    before = (tmp_path / "trade_off.csv").read_text()
+    run_command("trade_off", *options)
+    assert (tmp_path / "trade_off.csv").read_text() == before
