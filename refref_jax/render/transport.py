@@ -100,15 +100,19 @@ def path_radiance(
     """
     line = _polyline(config, path)
     warp = distance_warp(config, line)
+    # No interval straddles an interface, as far as there are edges enough.
+    bends = warps.to_unit(warp, line.knots[1:])
     histograms = []
     for level, proposal in enumerate(config.proposals):
         s = _resample(config, histograms, jitter.offsets[level], anneal, proposal.samples)
+        s = stepfun.snap(s, bends)
         samples = _place(config, line, warp, s, jitter.rotations[level])
         see = jax.vmap(density_field.density, in_axes=(None, None, 0))
         density = see(params.proposals[level], proposal.field, samples.gaussians)
         histograms.append(Histogram(s, _weigh(config, density, samples.t)))
 
     s = _resample(config, histograms, jitter.offsets[-1], anneal, config.samples)
+    s = stepfun.snap(s, bends)
     samples = _place(config, line, warp, s, jitter.rotations[-1])
     middles = 0.5 * (samples.t[1:] + samples.t[:-1])
     points = jax.vmap(polylines.point_at, in_axes=(None, 0))(line, middles)

@@ -66,6 +66,34 @@ def sample_edges(
     return jnp.concatenate([first, middles, last], axis=-1)
 
 
+def snap(
+    edges: Float[Array, "*batch edges"], knots: Float[Array, "*batch knots"]
+) -> Float[Array, "*batch edges"]:
+    """Moves edges onto knots, so that no interval has a knot inside.
+
+    Every knot draws its nearest inner edge; of two knots that draw the same one the first has it.
+    Edges stay in order, and the outermost two stay where they are. Knots at them or beyond have no
+    effect.
+
+    Args:
+      edges: in order.
+      knots: in any order, finite.
+    """
+    inner = edges.shape[-1] - 2
+    if inner < 1 or knots.shape[-1] == 0:
+        return edges
+    # Of equal edges a knot draws the one on its own side, so that they stay in order.
+    right = count_below(edges[..., 1:-1], knots)
+    nearer = knots - take(edges, right) < take(edges, right + 1) - knots
+    drawn = jnp.where((right == inner) | (nearer & (right > 0)), right - 1, right)
+    within = (knots > edges[..., :1]) & (knots < edges[..., -1:])
+    lanes = jnp.arange(inner, dtype=drawn.dtype).reshape(*(1,) * (knots.ndim - 1), inner, 1)
+    draws = (drawn[..., None, :] == lanes) & within[..., None, :]
+    first = jnp.argmax(draws, axis=-1)
+    moved = jnp.where(jnp.any(draws, axis=-1), take(knots, first), edges[..., 1:-1])
+    return jnp.concatenate([edges[..., :1], moved, edges[..., -1:]], axis=-1)
+
+
 def dilate(
     edges: Float[Array, "*batch edges"], weights: Float[Array, "*batch edges-1"], amount: float
 ) -> tuple[Float[Array, "*batch k"], Float[Array, "*batch k-1"]]:

@@ -409,3 +409,47 @@ _CASES = {
 @pytest.mark.parametrize("name", _CASES)
 def test_transformations_change_nothing(name, transformation):
     transformation(_CASES[name], _batch())
+
+
+# --- snap ---
+
+_snap = jax.jit(stepfun.snap)
+
+
+def test_snap_by_hand():
+    edges = jnp.array([0.0, 0.2, 0.5, 0.7, 1.0])
+    np.testing.assert_array_equal(
+        _snap(edges, jnp.array([0.56, 0.05])), np.float32([0.0, 0.05, 0.56, 0.7, 1.0])
+    )
+
+
+def test_knots_outside_and_at_the_ends_draw_nothing():
+    edges = jnp.array([0.1, 0.2, 0.9])
+    np.testing.assert_array_equal(_snap(edges, jnp.array([0.0, 0.1, 0.9, 1.0])), edges)
+    np.testing.assert_array_equal(_snap(edges, jnp.zeros(0)), edges)
+    np.testing.assert_array_equal(_snap(edges[::2], jnp.array([0.5])), edges[::2])
+
+
+def test_of_two_knots_that_draw_one_edge_the_first_has_it():
+    edges = jnp.array([0.0, 0.5, 1.0])
+    for knots in ([0.4, 0.55], [0.55, 0.4]):
+        np.testing.assert_array_equal(_snap(edges, jnp.array(knots))[1], np.float32(knots[0]))
+
+
+@pytest.mark.parametrize("knots", [1, 3, 24])
+def test_snapped_edges_stay_in_order_and_hold_the_knots(knots):
+    rng = np.random.default_rng(knots)
+    edges = np.sort(rng.uniform(size=(200, 21)).astype(np.float32), axis=-1)
+    edges[:50, 3:6] = edges[:50, 3:4]  # intervals of no width
+    at = rng.uniform(-0.1, 1.1, size=(200, knots)).astype(np.float32)
+    snapped = np.asarray(_snap(jnp.asarray(edges), jnp.asarray(at)))
+    assert np.all(np.diff(snapped, axis=-1) >= 0.0)
+    for row, knot, result in zip(edges, at, snapped, strict=True):
+        inner = [k for k in knot if row[0] < k < row[-1]]
+        for k in inner:
+            # It is an edge now, or another knot was there first: its nearest edge is one.
+            nearest = row[1:-1][np.argmin(np.abs(row[1:-1] - k))]
+            there = result[1:-1][np.abs(row[1:-1] - nearest) == 0.0]
+            assert k in result or np.isin(there, knot).any()
+        kept = result == row
+        assert np.isin(result[~kept], knot).all() and (~kept).sum() <= len(inner)
