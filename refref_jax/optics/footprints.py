@@ -106,4 +106,5 @@ def across(
       direction: of the segment.
     """
     moved = spread.points + along * spread.directions
-    return moved - numerics.dot(moved, direction)[:, None] * direction
+    rows = jnp.broadcast_to(direction, moved.shape)
+    return moved - numerics.dot(moved, rows)[:, None] * rows

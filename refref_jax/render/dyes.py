@@ -34,7 +34,7 @@ class Dyes(NamedTuple):
 
 def init(parts: int) -> Dyes:
     """Returns the colours of parts that are nearly clear."""
-    return Dyes(*[jnp.full((parts, 3), _INITIAL)] * 2)
+    return Dyes(jnp.full((parts, 3), _INITIAL), jnp.full((parts, 3), _INITIAL))
 
 
 def tints(dyes: Dyes) -> Float[Array, "parts 3"]:
