@@ -13,7 +13,7 @@ RUN := $(VENV)/bin/python -m
 demo: $(READY)
 	$(RUN) experiments.train --scene=experiments/data/cube_smcvx_ball --preset=tiny \
 		--out=runs/demo --resume
-	$(RUN) experiments.evaluate --run=runs/demo --split=test
+	$(RUN) experiments.evaluate --run=runs/demo --split=test --rays_per_pixel=4
 	@echo "Look at runs/demo/eval/test/comparison.png"
 
 test: $(READY)

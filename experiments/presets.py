@@ -9,8 +9,8 @@
 
 | preset  | network of colour | rays a step | steps  | footprint    |
 |---------|-------------------|-------------|--------|--------------|
-| `tiny`  | 1 x 32            | 1,024       | 2,500  | cone         |
-| `small` | 1 x 64            | 2,048       | 8,000  | cone         |
+| `tiny`  | 1 x 32            | 1,024       | 2,500  | differential |
+| `small` | 1 x 64            | 2,048       | 8,000  | differential |
 | `paper` | 2 x 256           | 4,096       | 25,000 | cone         |
 | `best`  | 2 x 256           | 16,384      | 25,000 | differential |
 
@@ -113,7 +113,7 @@ def _tiny_model(bounds_: Bounds, interior: Interior) -> ModelConfig:
         samples=20,
         multisamples=1,
         interior=interior,
-        footprint="cone",
+        footprint="differential",
         learned_tints=0,
         dilation=0.0,
         **dataclasses.asdict(bounds_),
@@ -162,7 +162,7 @@ def _small_model(bounds_: Bounds, interior: Interior) -> ModelConfig:
         samples=32,
         multisamples=1,
         interior=interior,
-        footprint="cone",
+        footprint="differential",
         learned_tints=0,
         dilation=0.0,
         **dataclasses.asdict(bounds_),

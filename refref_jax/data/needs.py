@@ -64,8 +64,9 @@ def find_needs(
     """
     outermost = [parts[i] for i, parent in enumerate(tree.parents) if parent == NO_PARENT]
     convex = len(outermost) == 1 and _is_one_convex_body(outermost[0], parts)
-    overlapping = rule == "priority" and len(parts) > 1
-    leaves_for_good = convex and not overlapping and not _any_inside(cameras, outermost[0])
+    # Other rules may say of a ray between two parts that it is outside of all.
+    told_apart = rule == "nested" or len(parts) == 1
+    leaves_for_good = convex and told_apart and not _any_inside(cameras, outermost[0])
     return Needs(
         parts=len(parts),
         bodies=len(outermost),
