@@ -31,7 +31,8 @@ _SCENES = flags.DEFINE_list("scenes", ["experiments/data/cube_smcvx_ball"], "Fol
 _PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Preset of all trainings.")
 _STEPS = flags.DEFINE_integer("steps", None, "Training steps; the preset's if not given.", 1)
 _CURVE_STEPS = flags.DEFINE_list("curve_steps", [], "Numbers of steps of the curve.")
-_INTERIOR = flags.DEFINE_string("interior", "field", "Interior model of all trainings.")
+_INTERIOR = flags.DEFINE_string("interior", "auto", "Interior model of all trainings.")
+_RAYS_PER_PIXEL = flags.DEFINE_integer("rays_per_pixel", 4, "Rays a pixel in evaluation.", 1)
 _LIMIT = flags.DEFINE_integer("limit", None, "Only this many test images, evenly spread.", 1)
 _OUT = flags.DEFINE_string("out", "runs/tree_versus_paper", "Where to write the runs.")
 
@@ -76,7 +77,9 @@ def main(arguments: list[str]) -> None:
 
 def fight(scene: Path, steps: int) -> Duel:
     """Trains and evaluates both on a scene; what is finished is used again."""
-    limit = [] if _LIMIT.value is None else [f"--limit={_LIMIT.value}"]
+    looks = [f"--rays_per_pixel={_RAYS_PER_PIXEL.value}"]
+    if _LIMIT.value is not None:
+        looks.append(f"--limit={_LIMIT.value}")
     costs, results = [], []
     for paths in ("paper", "tree"):
         name = f"{_PRESET.value}_{_INTERIOR.value}_{paths}_{steps}"
@@ -85,7 +88,7 @@ def fight(scene: Path, steps: int) -> Duel:
         options += [f"--paths={paths}", f"--steps={steps}"]
         print(f"{scene.resolve().name}: {paths}, {steps} steps ...", flush=True)
         costs.append(trained_runs.train(run, scene=scene, options=options))
-        results.append(trained_runs.evaluate(run, scene=scene, options=limit))
+        results.append(trained_runs.evaluate(run, scene=scene, options=looks))
     return Duel(scene.resolve().name, steps, tuple(costs), tuple(results))
 
 
