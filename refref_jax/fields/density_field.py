@@ -13,7 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from refref_jax.fields import precision
 from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid
+from refref_jax.fields.precision import Precision, check_precision
 from refref_jax.sampling.cones import Gaussians
 
 Params = Any
@@ -30,10 +32,16 @@ class DensityFieldConfig:
     Attributes:
       grid: the hash grid.
       width: units of the hidden layer.
+      precision: of tables and matrix products.
     """
 
     grid: HashGridConfig
     width: int
+    precision: Precision = "float32"
+
+    def __post_init__(self) -> None:
+        """Checks the choice."""
+        check_precision(self.precision)
 
 
 def init(key: Array, config: DensityFieldConfig) -> Params:
@@ -63,6 +71,8 @@ class _DensityField(nn.Module):
 
     @nn.compact
     def __call__(self, gaussians: Gaussians) -> Float[Array, ""]:
-        features = MultisampledGrid(self.config.grid)(gaussians)
-        hidden = nn.relu(nn.Dense(self.config.width)(features))
-        return activate_density(nn.Dense(1)(hidden)[0])
+        config = self.config
+        dense = precision.dense(config.precision)
+        features = MultisampledGrid(config.grid, config.precision)(gaussians)
+        hidden = nn.relu(dense(config.width)(features))
+        return activate_density(dense(1)(hidden)[0])
