@@ -14,14 +14,8 @@ import jax
 import numpy as np
 from absl import app, flags
 
-from experiments.presets import PRESETS, bounds
-from refref_jax.data import background, containment, local_layout, meshes
-from refref_jax.data.batches import PixelSampler
-from refref_jax.data.geometry import build_geometry
-from refref_jax.optics.budgets import BUDGETS
+from benchmarks.training_setup import set_up_training
 from refref_jax.training import loop
-from refref_jax.training.config import SceneConfig, TrainingConfig
-from refref_jax.training.state import init_state
 
 _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folder of the scene.")
 _PRESET = flags.DEFINE_string("preset", "tiny", "Preset of both models.")
@@ -34,27 +28,7 @@ class _Method:
     """One model in training, stepped a pool at a time."""
 
     def __init__(self, scene: Path, paths: str) -> None:
-        preset = PRESETS[_PRESET.value]
-        frames = local_layout.read_frames(scene, "train")
-        space, radius = background.space(scene), background.half_extent(scene)
-        model = preset.model(bounds(frames.cameras, space=space, radius=radius), "field")
-        parts = meshes.without_colour(meshes.read_meshes(scene))
-        parents = containment.find_containment(parts).parents
-        config = TrainingConfig(
-            scene=SceneConfig(str(scene), "nested", ()),
-            paths=paths,
-            loss=preset.loss,
-            schedule=preset.schedule,
-            batch=preset.batch,
-            pool=preset.pool,
-            seed=0,
-        )
-        sampler = PixelSampler(
-            local_layout.read_images(frames), frames.cameras, seed=0, batch=config.batch
-        )
-        geometry = build_geometry(parts, parents, rule="nested")
-        self._setup = loop.set_up(config, model, BUDGETS[paths], geometry, sampler)
-        self._state = init_state(0, model, config.schedule)
+        self._setup, self._state = set_up_training(scene, preset=_PRESET.value, paths=paths)
 
     def seconds_per_step(self) -> float:
         """Takes the steps of one pool and returns the mean time of a step."""

@@ -170,7 +170,17 @@ def _small_model(bounds_: Bounds, interior: Interior) -> ModelConfig:
 
 
 def _best_model(bounds_: Bounds, interior: Interior) -> ModelConfig:
-    return dataclasses.replace(_paper_model(bounds_, interior), footprint="differential")
+    paper = _paper_model(bounds_, interior)
+    half = [
+        dataclasses.replace(each, field=dataclasses.replace(each.field, precision="bfloat16"))
+        for each in paper.proposals
+    ]
+    return dataclasses.replace(
+        paper,
+        proposals=tuple(half),
+        field=dataclasses.replace(paper.field, precision="bfloat16"),
+        footprint="differential",
+    )
 
 
 PRESETS = {

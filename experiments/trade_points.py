@@ -18,7 +18,7 @@ OF_EVALUATION = ("rays_per_pixel",)
 _BASE_OPTIONS = {"paths": "tree"}
 
 # What the options are called of which no preset and no --base tells the value.
-_DEFAULTS = {"cut": "0.02", "precision": "float32", "rays_per_pixel": "1"}
+_DEFAULTS = {"cut": "0.02", "rays_per_pixel": "1"}
 
 _ANY_BOUNDS = Bounds(near=0.05, far=20.0, radius=7.3, space="bounded")
 
@@ -99,6 +99,7 @@ def own_values(preset: str) -> dict[str, str]:
         "entries": str(model.field.grid.entries.bit_length() - 1),
         "finest": str(model.field.grid.finest),
         "footprint": model.footprint,
+        "precision": model.field.precision,
     }
 
 

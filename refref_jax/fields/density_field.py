@@ -6,14 +6,16 @@ Source: Barron et al., Mip-NeRF 360 (2022), section 3; Zip-NeRF (2023) for the h
 """
 
 import dataclasses
-from typing import Any, Literal
+from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from refref_jax.fields import precision
 from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid
+from refref_jax.fields.precision import Precision, check_precision
 from refref_jax.sampling.cones import Gaussians
 
 Params = Any
@@ -30,12 +32,16 @@ class DensityFieldConfig:
     Attributes:
       grid: the hash grid.
       width: units of the hidden layer.
-      precision: of the field's arithmetic.
+      precision: of tables and matrix products.
     """
 
     grid: HashGridConfig
     width: int
-    precision: Literal["float32", "bfloat16"] = "float32"
+    precision: Precision = "float32"
+
+    def __post_init__(self) -> None:
+        """Checks the choice."""
+        check_precision(self.precision)
 
 
 def init(key: Array, config: DensityFieldConfig) -> Params:
@@ -65,6 +71,8 @@ class _DensityField(nn.Module):
 
     @nn.compact
     def __call__(self, gaussians: Gaussians) -> Float[Array, ""]:
-        features = MultisampledGrid(self.config.grid)(gaussians)
-        hidden = nn.relu(nn.Dense(self.config.width)(features))
-        return activate_density(nn.Dense(1)(hidden)[0])
+        config = self.config
+        dense = precision.dense(config.precision)
+        features = MultisampledGrid(config.grid, config.precision)(gaussians)
+        hidden = nn.relu(dense(config.width)(features))
+        return activate_density(dense(1)(hidden)[0])

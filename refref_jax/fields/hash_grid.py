@@ -9,22 +9,18 @@ for the down-weighting.
 """
 
 import dataclasses
-import itertools
 import math
 from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, UInt32
+from jaxtyping import Array, Float
 
 from refref_jax import numerics
+from refref_jax.fields.interpolation import interpolate
+from refref_jax.fields.precision import Precision
 from refref_jax.sampling.cones import Gaussians
-
-# The primes of Instant NGP's spatial hash.
-_PRIMES = (1, 2654435761, 805459861)
-
-_CORNERS = tuple(itertools.product((0, 1), repeat=3))
 
 _INITIAL_RANGE = 1e-4
 
@@ -77,23 +73,16 @@ def tables(params: Any) -> list[Float[Array, "_ _"]]:
     return [leaf for path, leaf in leaves if _TABLE in jax.tree_util.keystr(path)]
 
 
-def vertex_index(vertex: UInt32[Array, "3"], resolution: int, entries: int) -> UInt32[Array, ""]:
-    """Returns the table entry of a grid vertex, `0 .. resolution` along each axis.
-
-    Dense where every vertex has an entry of its own, hashed where not.
-    """
-    side = resolution + 1
-    if side**3 <= entries:
-        strides = jnp.array((1, side, side * side), jnp.uint32)
-        return jnp.sum(vertex * strides, dtype=jnp.uint32)
-    x, y, z = vertex * jnp.array(_PRIMES, jnp.uint32)
-    return (x ^ y ^ z) & jnp.uint32(entries - 1)
-
-
 class HashGrid(nn.Module):
-    """The tables, as a linen module over one Gaussian."""
+    """The tables, as a linen module over one Gaussian.
+
+    Attributes:
+      config: the grid's shape.
+      precision: in which entries are read.
+    """
 
     config: HashGridConfig
+    precision: Precision = "float32"
 
     @nn.compact
     def __call__(
@@ -109,20 +98,29 @@ class HashGrid(nn.Module):
         for level, resolution in enumerate(resolutions(self.config)):
             size = min(self.config.entries, (resolution + 1) ** 3)
             table = self.param(f"{_TABLE}{level:02d}", _initialise, (size, self.config.features))
-            levels.append(_interpolate(table, position, resolution) * fading(scale, resolution))
+            features = interpolate(table, position, resolution=resolution, precision=self.precision)
+            levels.append(features * fading(scale, resolution))
         return jnp.concatenate(levels)
 
 
 class MultisampledGrid(nn.Module):
-    """A hash grid over the multisamples of one interval: the mean of their features."""
+    """A hash grid over the multisamples of one interval: the mean of their features.
+
+    Attributes:
+      config: the grid's shape.
+      precision: as for `HashGrid`.
+    """
 
     config: HashGridConfig
+    precision: Precision = "float32"
 
     @nn.compact
     def __call__(self, gaussians: Gaussians) -> Float[Array, " features"]:
         """Returns the mean features of Gaussians in the unit cube."""
         every = nn.vmap(HashGrid, variable_axes={"params": None}, split_rngs={"params": False})
-        features = every(self.config, name="grid")(gaussians.positions, gaussians.scales)
+        features = every(self.config, self.precision, name="grid")(
+            gaussians.positions, gaussians.scales
+        )
         return jnp.mean(features, axis=0)
 
 
@@ -136,18 +134,3 @@ def fading(scale: Float[Array, ""], resolution: int) -> Float[Array, ""]:
 
 def _initialise(key: Array, shape: tuple[int, int]) -> Float[Array, "entries features"]:
     return jax.random.uniform(key, shape, minval=-_INITIAL_RANGE, maxval=_INITIAL_RANGE)
-
-
-def _interpolate(
-    table: Float[Array, "entries features"], position: Float[Array, "3"], resolution: int
-) -> Float[Array, " features"]:
-    """Blends the entries at the eight corners of a point's cell (trilinear)."""
-    scaled = position * resolution
-    cell = jnp.clip(jnp.floor(scaled), 0, resolution - 1)
-    corners = cell.astype(jnp.uint32)[None] + jnp.array(_CORNERS, jnp.uint32)
-    entries = jax.vmap(lambda corner: vertex_index(corner, resolution, table.shape[0]))(corners)
-    # The corners of one axis after the other, in the order of `_CORNERS`.
-    x, y, z = jnp.stack([1.0 - (scaled - cell), scaled - cell], axis=1)
-    weights = x[:, None, None] * y[None, :, None] * z[None, None, :]
-    rows = table.at[entries].get(mode="promise_in_bounds")
-    return weights.reshape(-1) @ rows

@@ -7,16 +7,18 @@ the local direction); Zip-NeRF (2023) for the hash grid and the bottleneck.
 """
 
 import dataclasses
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from refref_jax.fields import precision
 from refref_jax.fields.density_field import activate_density
 from refref_jax.fields.encodings import spherical_harmonics
 from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid
+from refref_jax.fields.precision import Precision, check_precision
 from refref_jax.sampling.cones import Gaussians
 
 Params = Any
@@ -36,7 +38,7 @@ class RadianceFieldConfig:
       bottleneck: features that the density network hands to the colour network.
       colour_width: units of the colour network's hidden layers.
       colour_depth: number of those layers.
-      precision: of the field's arithmetic.
+      precision: of tables and matrix products.
     """
 
     grid: HashGridConfig
@@ -44,7 +46,11 @@ class RadianceFieldConfig:
     bottleneck: int
     colour_width: int
     colour_depth: int
-    precision: Literal["float32", "bfloat16"] = "float32"
+    precision: Precision = "float32"
+
+    def __post_init__(self) -> None:
+        """Checks the choice."""
+        check_precision(self.precision)
 
 
 class Radiance(NamedTuple):
@@ -88,12 +94,13 @@ class _RadianceField(nn.Module):
     @nn.compact
     def __call__(self, gaussians: Gaussians, direction: Float[Array, "3"]) -> Radiance:
         config = self.config
-        features = MultisampledGrid(config.grid)(gaussians)
-        hidden = nn.relu(nn.Dense(config.density_width)(features))
-        raw = nn.Dense(1 + config.bottleneck)(hidden)
+        dense = precision.dense(config.precision)
+        features = MultisampledGrid(config.grid, config.precision)(gaussians)
+        hidden = nn.relu(dense(config.density_width)(features))
+        raw = dense(1 + config.bottleneck)(hidden)
         hidden = jnp.concatenate([raw[1:], spherical_harmonics(direction)])
         for _ in range(config.colour_depth):
-            hidden = nn.relu(nn.Dense(config.colour_width)(hidden))
-        rgb = jax.nn.sigmoid(nn.Dense(3)(hidden))
+            hidden = nn.relu(dense(config.colour_width)(hidden))
+        rgb = jax.nn.sigmoid(dense(3)(hidden))
         padded = rgb * (1.0 + 2.0 * _COLOUR_PADDING) - _COLOUR_PADDING
         return Radiance(activate_density(raw[0]), padded)

@@ -1,3 +1,4 @@
+import dataclasses
 import functools
 import itertools
 
@@ -9,6 +10,7 @@ import pytest
 from refref_jax.fields import density_field, radiance_field
 from refref_jax.fields.density_field import DensityFieldConfig
 from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid, tables
+from refref_jax.fields.precision import check_precision
 from refref_jax.fields.radiance_field import RadianceFieldConfig
 from refref_jax.sampling.cones import Gaussians
 from tests import gradients, reference_sampling, transformations
@@ -253,3 +255,52 @@ def test_transformations_change_nothing(name, transformation):
     gaussians = jax.tree.map(lambda *x: jnp.stack(x), *(_gaussians(seed=seed) for seed in range(3)))
     directions = jnp.stack([_direction(seed) for seed in range(3)])
     transformation(_CASES[name], (gaussians, directions))
+
+
+# --- bfloat16 ---
+
+# Eight bits, lost in the table, in the factors of up to five layers, and in their sums.
+_HALF = 0.05
+
+
+def _taught(name, precision, params, gaussians):
+    """Returns what a field answers and its gradient, of the sum of the answer."""
+    field, config = _FIELDS[name]
+    config = dataclasses.replace(config, precision=precision)
+
+    def total(params):
+        if name == "density":
+            seen = [field.density(params, config, gaussians)]
+        else:
+            seen = list(field.radiance(params, config, gaussians, _direction()))
+        return sum(map(jnp.sum, seen)), seen
+
+    slopes, seen = jax.jit(jax.grad(total, has_aux=True))(params)
+    return jax.tree.leaves(seen), slopes
+
+
+@pytest.mark.parametrize("name", _FIELDS)
+def test_half_precision_is_near_single_precision(name):
+    single, single_slopes = _taught(name, "float32", _parameters(name), _gaussians())
+    half, half_slopes = _taught(name, "bfloat16", _parameters(name), _gaussians())
+    for a, b in zip(half, single, strict=True):
+        assert a.dtype == jnp.float32
+        np.testing.assert_allclose(a, b, rtol=_HALF, atol=_HALF)
+    for a, b in zip(jax.tree.leaves(half_slopes), jax.tree.leaves(single_slopes), strict=True):
+        assert a.dtype == jnp.float32
+        assert np.linalg.norm(a - b) <= _HALF * (np.linalg.norm(b) + 1.0)
+    assert any((np.asarray(a) != np.asarray(b)).any() for a, b in zip(half, single, strict=True))
+
+
+@pytest.mark.parametrize("name", _FIELDS)
+@pytest.mark.parametrize("size", [0.0, 1e4])
+@pytest.mark.parametrize("scale", [0.0, 1e30])
+def test_half_precision_is_finite(name, size, scale):
+    params = jax.tree.map(lambda x: jnp.asarray(size * np.asarray(x)), _parameters(name))
+    seen, slopes = _taught(name, "bfloat16", params, _gaussians(scale=scale))
+    assert gradients.all_finite(seen) and gradients.all_finite(slopes)
+
+
+def test_unknown_precisions_are_refused():
+    with pytest.raises(ValueError, match=r"one of float32, bfloat16, not 'half'\. Choose one\."):
+        check_precision("half")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.special
 
-from refref_jax.fields import hash_grid
+from refref_jax.fields import hash_grid, vertices
 from refref_jax.fields.hash_grid import HashGrid, HashGridConfig, MultisampledGrid
 from refref_jax.sampling.cones import Gaussians
 from tests import gradients, reference_sampling, transformations
@@ -116,31 +116,31 @@ def _vertex(*coordinates):
 
 
 def test_vertex_index_of_a_dense_level_by_hand():
-    assert hash_grid.vertex_index(_vertex(1, 2, 3), 4, 128) == 1 + 2 * 5 + 3 * 25
+    assert vertices.vertex_index(_vertex(1, 2, 3), 4, 128) == 1 + 2 * 5 + 3 * 25
 
 
 def test_vertex_index_of_a_hashed_level_by_hand():
     # 1 xor 2654435761 * 2 xor 805459861 * 3, each modulo 2^32; then the last eight bits.
     expected = (1 ^ (2654435761 * 2 % 2**32) ^ (805459861 * 3 % 2**32)) % 256
-    assert hash_grid.vertex_index(_vertex(1, 2, 3), 16, 256) == expected
+    assert vertices.vertex_index(_vertex(1, 2, 3), 16, 256) == expected
 
 
 @pytest.mark.parametrize(
     ("resolution", "entries"), [(5, 256), (18, 256), (18, 8192), (8192, 2**16)]
 )
 def test_vertex_index_against_python_integers(resolution, entries):
-    vertices = np.random.default_rng(0).integers(0, resolution + 1, size=(40, 3))
-    vertices[:2] = [[0, 0, 0], [resolution] * 3]
-    expected = [reference_sampling.vertex_entry(v, resolution, entries) for v in vertices]
-    index = jax.vmap(lambda v: hash_grid.vertex_index(v, resolution, entries))
-    got = index(jnp.asarray(vertices, jnp.uint32))
+    drawn = np.random.default_rng(0).integers(0, resolution + 1, size=(40, 3))
+    drawn[:2] = [[0, 0, 0], [resolution] * 3]
+    expected = [reference_sampling.vertex_entry(v, resolution, entries) for v in drawn]
+    index = jax.vmap(lambda v: vertices.vertex_index(v, resolution, entries))
+    got = index(jnp.asarray(drawn, jnp.uint32))
     np.testing.assert_array_equal(got, expected)
     assert max(expected) < entries
 
 
 def test_vertices_of_a_dense_level_have_entries_of_their_own():
-    vertices = np.array(list(itertools.product(range(6), repeat=3)), np.uint32)
-    got = jax.vmap(lambda v: hash_grid.vertex_index(v, 5, 256))(jnp.asarray(vertices))
+    every = np.array(list(itertools.product(range(6), repeat=3)), np.uint32)
+    got = jax.vmap(lambda v: vertices.vertex_index(v, 5, 256))(jnp.asarray(every))
     np.testing.assert_array_equal(np.sort(got), np.arange(216))
 
 
