@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, UInt8
 from experiments import commands, figures, supersampling
 from refref_jax import metrics
 from refref_jax.data import files, local_layout
-from refref_jax.render import Model, Rendering, load_model
+from refref_jax.render import Model, Rendering, dyes, load_model
 from refref_jax.render.saved import latest_step
 from refref_jax.training import run_folder
 
@@ -64,6 +64,7 @@ def main() -> None:
         "step": step,
         "rays_per_pixel": _RAYS_PER_PIXEL.value,
         "results": {key: _mean(per_image, key) for key in per_image[0] if key != "name"},
+        "learned": learned_colours(model),
         "per_image": per_image,
     }
     summary["results"]["seconds_per_image"] = summary["results"].pop("seconds")
@@ -75,6 +76,18 @@ def main() -> None:
     print(f"Pictures: {out / 'comparison.png'}, {out / 'rgb'}, {out / 'distance'}")
     print(f"Metrics:  {out / 'metrics.json'}")
     print(f"Next: python -m experiments.render --run={run} --views=orbit")
+
+
+def learned_colours(model: Model) -> dict[str, Any] | None:
+    """Returns tints and absorptions of all parts, in the order of their file names, if learned."""
+    colours = model.params.dyes
+    if colours is None:
+        return None
+    absorptions = dyes.absorptions(colours, model.config.radius)
+    return {
+        "tints": np.asarray(dyes.tints(colours), float).round(4).tolist(),
+        "absorptions": np.asarray(absorptions, float).round(4).tolist(),
+    }
 
 
 def read_truth(scene: Path, split: str) -> Truth:

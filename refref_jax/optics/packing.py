@@ -5,10 +5,13 @@ A batch keeps its strongest paths, in the order of its rays, each ray's heaviest
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from refref_jax.optics import path_tree
+from refref_jax.optics import path_tree, pools
 from refref_jax.optics.path_tree import Ends, PathTree
+
+# An index past any list: writing there is dropped.
+_NOWHERE = 2**31 - 1
 
 
 def pack(
@@ -25,25 +28,38 @@ def pack(
     Returns:
       The lists, joined end to end, and the light that each ray has lost by now.
     """
-    slots = tree.ends.items.rays.shape[0]
-    ends = path_tree.listed(tree, slots)
+    room = min(batches * capacity, tree.ends.items.rays.shape[0])
+    pool, lost = pools.shed(tree.ends, tree.lost, room)
+    ends = path_tree.listed(tree._replace(ends=pool), room)
     weight = jnp.max(ends.weights, axis=-1)
     # The slots past the last path form a batch of their own.
-    lanes = jnp.arange(slots, dtype=jnp.int32)
-    batch = jnp.where(lanes < tree.ends.count, ends.rays // rays, batches)
-    strongest_first = jnp.lexsort((-weight, batch))
-    rank = _rank_in_group(batch[strongest_first], batches)
-    fits = jnp.zeros(slots, bool).at[strongest_first].set(rank < capacity) & (batch < batches)
-    group = jnp.where(fits, batch, batches)
-    order = jnp.lexsort((-weight, ends.rays, group)).astype(jnp.int32)
-    place = group[order] * capacity + _rank_in_group(group[order], batches)
-    target = jnp.where(fits[order], place, batches * capacity)
-    source = jnp.full(batches * capacity, slots, jnp.int32).at[target].set(order, mode="drop")
-    packed = jax.tree.map(lambda x: x[jnp.minimum(source, slots - 1)], ends)
+    lanes = jnp.arange(room, dtype=jnp.int32)
+    batch = jnp.where(lanes < pool.count, ends.rays // rays, batches)
+    fits = _strongest_of_each(batch, weight, batches, capacity)
+    order = jnp.lexsort((-weight, jnp.where(fits, ends.rays, batches * rays))).astype(jnp.int32)
+    group = jnp.where(fits, batch, batches)[order]
+    target = jnp.where(fits[order], group * capacity + _rank_in_group(group, batches), _NOWHERE)
+    source = jnp.full(batches * capacity, room, jnp.int32).at[target].set(order, mode="drop")
+    packed = jax.tree.map(lambda x: x[jnp.minimum(source, room - 1)], ends)
     home = jnp.repeat(jnp.arange(batches, dtype=jnp.int32) * rays, capacity)
-    left_over = jnp.where(fits[:, None], 0.0, ends.weights)
-    lost = tree.lost.at[ends.rays].add(left_over)
-    return path_tree.emptied(packed, source == slots, home), lost
+    lost = pools.lose(lost, ends.rays, ends.weights, ~fits)
+    return path_tree.emptied(packed, source == room, home), lost
+
+
+def _strongest_of_each(
+    batch: Int[Array, " paths"], weight: Float[Array, " paths"], batches: int, capacity: int
+) -> Bool[Array, " paths"]:
+    """Returns which paths are among the strongest of their batch; sorts only if there is a need."""
+
+    def choose(batch: Int[Array, " paths"]) -> Bool[Array, " paths"]:
+        order = jnp.lexsort((-weight, batch))
+        rank = _rank_in_group(batch[order], batches)
+        return jnp.zeros_like(batch, bool).at[order].set(rank < capacity)
+
+    real = batch < batches
+    counts = jax.ops.segment_sum(jnp.ones_like(batch), batch, num_segments=batches + 1)
+    crowded = jnp.any(counts[:batches] > capacity)
+    return real & jax.lax.cond(crowded, choose, lambda batch: jnp.ones_like(batch, bool), batch)
 
 
 def _rank_in_group(group: Int[Array, " n"], groups: int) -> Int[Array, " n"]:
