@@ -361,7 +361,10 @@ def test_capacity_covers_the_paths_of_random_batches():
         deviation = np.sqrt(fraction * (1.0 - fraction))
         capacity = capacity_for(PAPER, rays, mean=1.0 + fraction, deviation=deviation)
         assert capacity <= 2 * rays
-        assert rays + generator.binomial(rays, fraction, 10_000).max() <= capacity
+        excess = rays + generator.binomial(rays, fraction, 100_000) - capacity
+        # The paths of one batch in a thousand do not fit, and then only a few of them.
+        assert np.mean(excess > 0) <= 2e-3
+        assert excess.max() <= 0.01 * rays + 0.05 * rays * fraction
     assert capacity_for(STRAIGHT, 1000, mean=1.0, deviation=0.0) == 1000
     assert capacity_for(PAPER, 100, mean=2.0, deviation=0.0) == 200
 
