@@ -2,7 +2,7 @@
 
 The part of a field whose cost is memory: every point reads eight rows that lie anywhere, and in
 the backward pass adds to eight. Both are primitives of their own, since XLA makes poor loops of
-them on a CPU: a gather finds its row anew for each feature, and a scatter-add is a call a row. A
+them on a CPU, two to three times slower than a loop over points that finds its rows once. A
 CPU runs `vertex_loops`; other devices take the formulas `_gathered` and `_scattered`, and so does
 what is seldom asked for (derivatives by the position, many tables at once).
 
