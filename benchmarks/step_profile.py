@@ -1,4 +1,4 @@
-"""Claim: tracing light paths takes at most a tenth of a training step along the path tree.
+"""Claim: tracing light paths takes at most a quarter of a training step along the path tree.
 
     python -m benchmarks.step_profile [--scene=FOLDER] [--preset=tiny] [--paths=tree] [--rounds=N]
 
@@ -37,7 +37,7 @@ _PRESET = flags.DEFINE_string("preset", "tiny", "Preset of the model.")
 _PATHS = flags.DEFINE_enum("paths", "tree", ["straight", "paper", "tree"], "Light paths.")
 _ROUNDS = flags.DEFINE_integer("rounds", 8, "How often everything is timed.")
 
-_LIMIT = 0.1
+_LIMIT = 0.25
 
 _COPIED = 1 << 26
 """Floats of the copy by which memory is measured: more than any cache holds."""
