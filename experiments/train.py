@@ -130,7 +130,8 @@ def _log(run: Path, step: int, report: StepReport, rate: float, seconds: float) 
     # A CPU keeps no such record.
     if (memory := jax.local_devices()[0].memory_stats()) is not None:
         line["peak_device_bytes"] = memory["peak_bytes_in_use"]
-    run_folder.append_metrics(run, line)
+    # The PSNR of a batch that is met exactly is infinite.
+    run_folder.append_metrics(run, commands.string_safe(line))
 
 
 if __name__ == "__main__":

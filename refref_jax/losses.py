@@ -1,5 +1,10 @@
 """Training losses. Each takes one path or one batch of colours and returns a scalar.
 
+Colours are compared as they are rendered, without clipping: one below black or above white has the
+gradient that draws it back, and a black pixel has the slope 12.92 of the transfer function (see
+`render.colour`). Fields give colours in `[-0.001, 1.001]`, so that black and white lie where their
+sigmoid still has a slope.
+
 Letters: `s` is the normalised distance along a path, `w` its weights (see `sampling.stepfun`).
 """
 

@@ -38,11 +38,13 @@ def alpha_weights(
     """Returns the weights `w_i`, which sum to at most 1.
 
     Finite in value and gradient for any density and length in `[0, inf)` whose product does
-    not overflow; the product may be infinite as long as it is not `0 * inf`.
+    not overflow; the product may be infinite as long as it is not `0 * inf`. Edges that are a
+    rounding error apart may come out of order: a length below 0 counts as 0, since a solid would
+    make a weight of minus infinity of it.
 
     Source: paper, volume rendering equation.
     """
-    depth = density * lengths
+    depth = density * jnp.where(lengths < 0.0, 0.0, lengths)
     before = jnp.concatenate([jnp.zeros_like(depth[:1]), jnp.cumsum(depth[:-1])])
     return jnp.exp(-before) * -jnp.expm1(-depth)
 

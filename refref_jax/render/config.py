@@ -48,7 +48,7 @@ class ModelConfig:
       footprint: `cone` widens a pixel's footprint with arc length as if the path were straight
         (the paper); `differential` follows it through every bend by its derivatives.
       learned_tints: number of parts whose tint and absorption are learned, all of them or 0.
-      near: distance of the first sample from the camera, world units.
+      near: distance of the first sample from the camera, world units; 0 begins at the camera.
       far: distance of the last from the last bend, or from the camera on a straight path; the
         background is opaque there. In a bounded scene a path ends already where it leaves the
         cube, and `far` only serves paths that do not meet it.
@@ -77,9 +77,9 @@ class ModelConfig:
         """Checks what sampling relies on."""
         if not self.proposals:
             raise ValueError("A model needs at least one proposal round. Add one.")
-        if not 0.0 < self.near < self.far:
+        if not 0.0 <= self.near < self.far:
             raise ValueError(
-                f"The distances must satisfy 0 < near < far; got near = {self.near} and far = "
+                f"The distances must satisfy 0 <= near < far; got near = {self.near} and far = "
                 f"{self.far}. Correct them."
             )
         if not self.radius > 0.0:

@@ -26,6 +26,9 @@ from refref_jax.sampling.polylines import Polyline
 # Least widening of a proposal, in units of the whole path (Mip-NeRF 360, supplement).
 _DILATION_BIAS = 0.0025
 
+# Least length of a path, in units of the scene's radius: four digits of `s` remain in float32.
+_SHORTEST = 1e-3
+
 # Adjacent cone patterns are turned against each other by this angle (Zip-NeRF, supplement).
 _PATTERN_TURN = jnp.pi / 6.0
 
@@ -142,7 +145,7 @@ def distance_warp(config: ModelConfig, line: Polyline) -> warps.DistanceWarp:
     leave = domains.exit_distance(domain(config), line.points[last], line.directions[last])
     far = line.knots[last] + jnp.minimum(leave, config.far)
     # A camera on the very face of the cube still leaves room for samples.
-    far = jnp.maximum(far, 2.0 * config.near)
+    far = jnp.maximum(far, config.near + _SHORTEST * config.radius)
     return warps.DistanceWarp(config.near, far, config.radius)
 
 

@@ -108,6 +108,6 @@ def _hexagon_distances(start: Float[Array, ""], end: Float[Array, ""]) -> Float[
 def _middle_and_ratio(
     start: Float[Array, ""], end: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Returns the middle of an interval and its half-width as a share of it."""
+    """Returns the middle of an interval and its half-width as a share of it, 0 at the apex."""
     mean = 0.5 * (start + end)
-    return mean, 0.5 * (end - start) / mean
+    return mean, numerics.safe_divide(0.5 * (end - start), mean)

@@ -19,7 +19,7 @@ class DistanceWarp(NamedTuple):
     """The interval of distances that is sampled, and the length that sets its scale.
 
     Attributes:
-      near: distance at `s = 0`, world units, > 0.
+      near: distance at `s = 0`, world units, at least 0.
       far: distance at `s = 1`, world units, > near; may differ from path to path.
       unit: the scene's size, world units; steps start to grow at about this distance.
     """
@@ -30,7 +30,7 @@ class DistanceWarp(NamedTuple):
 
 
 def to_distance(warp: DistanceWarp, s: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Maps `s` in `[0, 1]` to a distance in `[near, far]`, increasing.
+    """Maps `s` in `[0, 1]` to a distance in `[near, far]`, increasing but for rounding error.
 
     The transformed distance is interpolated from both of its ends, so that `s = 1` gives `far`
     to rounding error although the transform flattens out there.

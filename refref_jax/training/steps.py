@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from refref_jax import losses
+from refref_jax import losses, numerics
 from refref_jax.fields import hash_grid
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
@@ -174,7 +174,9 @@ def _path_losses(
 
 
 def _mean_where(mask: Bool[Array, " n"], values: Float[Array, " n"]) -> Float[Array, ""]:
-    return jnp.sum(jnp.where(mask, values, 0.0)) / jnp.sum(mask)
+    """Returns the mean of the values that count; 0, with gradient 0, if there are none."""
+    count = jnp.sum(mask, dtype=values.dtype)
+    return numerics.safe_divide(jnp.sum(jnp.where(mask, values, 0.0)), count)
 
 
 def _anneal(step: Int[Array, ""], steps: int) -> Float[Array, ""]:

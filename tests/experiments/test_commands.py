@@ -24,7 +24,7 @@ def test_training_writes_a_readable_run(trained):
     lines = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [2, 4, 6]
     for line in lines:
-        assert {"step", "loss", "psnr", "rays_per_second", "seconds"} <= set(line)
+        assert {"step", "loss", "psnr", "lost", "rays_per_second", "seconds"} <= set(line)
         assert np.all(np.isfinite(list(line.values())))
     config = json.loads((trained / "config.json").read_text())
     assert config["paths"] == "tree" and config["schedule"]["steps"] == 6

