@@ -38,6 +38,9 @@ from refref_jax.optics.pools import Pool
 BLOCK = 4096
 """Rays cast in a round. A larger one serves an accelerator, at the price of memory."""
 
+# From so many blocks of rays on the last ones are cast in smaller blocks: a second loop to compile.
+_MANY_BLOCKS = 2
+
 
 class _Walk(NamedTuple):
     """State of the loop.
@@ -87,13 +90,33 @@ def _follow(
     count = rays.radii.shape[0]
     block = max(1, min(block, count))
     room = budgets.room(budget, count)
+    walk = _begin(rays, inside, footprint, block, room)
+    if count < _MANY_BLOCKS * block:
+        return _work_off(geometry, walk, budget, block, room, least=1).tree
+    # The few rays that go deepest would cast a whole block each round.
+    walk = _work_off(geometry, walk, budget, block, room, least=block // 4)
+    stack = pools.append(
+        walk.stack, walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
+    )
+    small = block // 16
+    walk = _Walk(*pools.pop(stack, small), walk.tree)
+    return _work_off(geometry, walk, budget, small, room, least=1).tree
+
+
+def _work_off(
+    geometry: Geometry, walk: _Walk, budget: Budget, block: int, room: Room, *, least: int
+) -> _Walk:
+    """Casts blocks until fewer than `least` rays are left."""
+
+    def unfinished(walk: _Walk) -> Bool[Array, ""]:
+        return walk.next.count + walk.stack.count >= least
 
     def fits(walk: _Walk) -> Bool[Array, ""]:
         return (walk.stack.count <= room.live) & (walk.tree.ends.count <= room.paths)
 
     def advance(walk: _Walk) -> _Walk:
         walk = jax.lax.while_loop(
-            lambda walk: (walk.next.count > 0) & fits(walk),
+            lambda walk: unfinished(walk) & fits(walk),
             lambda walk: _round(geometry, walk, budget, block, room),
             walk,
         )
@@ -101,8 +124,7 @@ def _follow(
         ends, lost = pools.shed(walk.tree.ends, lost, room.paths)
         return _Walk(stack, walk.next, walk.tree._replace(ends=ends, lost=lost))
 
-    start = _begin(rays, inside, footprint, block, room)
-    return jax.lax.while_loop(lambda walk: walk.next.count > 0, advance, start).tree
+    return jax.lax.while_loop(unfinished, advance, walk)
 
 
 @_follow.defjvp
