@@ -1,7 +1,9 @@
 """Which pixels a training step sees (NumPy only).
 
-A batch depends on the seed and on the step alone, so a run that is resumed at a step sees the
-very pixels that it would have seen. Within an epoch no pixel comes twice.
+Pixels are dealt to batches once, at random; every epoch sees all batches, in an order of its own.
+So what is made of a batch, its light paths, serves for every epoch. Which batch a step sees depends
+on the seed and on the step alone, so a run that is resumed sees the very pixels that it would have
+seen. Within an epoch no pixel comes twice, but for those that fill up the last batch.
 """
 
 from typing import NamedTuple
@@ -42,7 +44,8 @@ def check_batch(cameras: Cameras, batch: int) -> None:
 class PixelSampler:
     """Draws batches of pixels from a set of images.
 
-    Only the current epoch's permutation is kept; it is a function of the seed and the epoch.
+    Attributes:
+      batches: number of batches of an epoch.
     """
 
     def __init__(
@@ -70,20 +73,28 @@ class PixelSampler:
                 f"The images are {images.shape}, but the cameras ask for {expected}. Give one "
                 "image a camera, in its size."
             )
+        check_batch(cameras, batch)
         self._pixels = images.reshape(-1, 3)
         self._cameras = cameras
         self._seed = seed
         self._batch = batch
-        self._epoch, self._order = -1, np.empty(0, np.uint32)
-        check_batch(cameras, batch)
+        self.batches = -(-len(self._pixels) // batch)
+        self._order = self._generator(0).permutation(len(self._pixels)).astype(np.uint32)
 
-    @property
-    def _steps_per_epoch(self) -> int:
-        return len(self._pixels) // self._batch
+    def numbers(self, first: int, steps: int) -> Int[np.ndarray, " steps"]:
+        """Returns the batches that steps `first .. first + steps - 1` see."""
+        epoch, place = np.divmod(np.arange(first, first + steps), self.batches)
+        found = np.empty(steps, np.int32)
+        for each in np.unique(epoch):
+            # The number 0 is that of the deal.
+            order = self._generator(int(each) + 1).permutation(self.batches)
+            found[epoch == each] = order[place[epoch == each]]
+        return found
 
-    def draw(self, first: int, steps: int) -> PixelBatch:
-        """Returns the batches of steps `first .. first + steps - 1`, as `[steps, batch]`."""
-        return self.look_up(np.stack([self._indices(first + i) for i in range(steps)]))
+    def draw(self, numbers: Int[np.ndarray, " n"]) -> PixelBatch:
+        """Returns some batches, as `[n, batch]`."""
+        place = np.int64(self._batch) * numbers[:, None] + np.arange(self._batch)
+        return self.look_up(self._order[place % len(self._order)].astype(np.int64))
 
     def survey(self, count: int) -> PixelBatch:
         """Returns `count` pixels drawn at random, always the same ones."""
@@ -96,11 +107,5 @@ class PixelSampler:
         )
         return PixelBatch(pixel_rays(self._cameras, frame, row, column), self._pixels[index])
 
-    def _indices(self, step: int) -> Int[np.ndarray, " batch"]:
-        epoch, position = divmod(step, self._steps_per_epoch)
-        if epoch != self._epoch:
-            generator = np.random.Generator(np.random.Philox(key=[self._seed, epoch]))
-            self._order = generator.permutation(len(self._pixels)).astype(np.uint32)
-            self._epoch = epoch
-        start = position * self._batch
-        return self._order[start : start + self._batch].astype(np.int64)
+    def _generator(self, number: int) -> np.random.Generator:
+        return np.random.Generator(np.random.Philox(key=[self._seed, number]))

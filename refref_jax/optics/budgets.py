@@ -119,9 +119,9 @@ def room(budget: Budget, rays: int) -> Room:
 def capacity_for(budget: Budget, rays: int, *, mean: float, deviation: float) -> int:
     """Returns the room for the paths of a batch of a scene.
 
-    One standard deviation above the mean number of paths of a random batch, rounded up to 32. A
-    batch in six loses its weakest paths: of 1,024 rays that meet a ball, three paths of 2 % of their
-    ray's light on average, a ten-thousandth of all. A step costs as much as its room, so that
+    One standard deviation above the mean number of paths of a random batch, rounded up to 8. A
+    batch in six loses its weakest paths: of 1,024 rays that meet a ball, three paths of 2 % of
+    their ray's light on average, a ten-thousandth of all. A step costs as much as its room, so that
     room for all of them would cost 6 % of it.
 
     Args:
@@ -132,4 +132,4 @@ def capacity_for(budget: Budget, rays: int, *, mean: float, deviation: float) ->
     """
     most = room(budget, rays).paths
     needed = rays * mean + math.sqrt(rays) * deviation
-    return max(rays, min(most, 32 * math.ceil(needed / 32)))
+    return max(rays, min(most, 8 * math.ceil(needed / 8)))

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from refref_jax.data.batches import PixelSampler
 from refref_jax.optics.budgets import Budget, capacity_for
@@ -17,6 +18,9 @@ from refref_jax.training.state import TrainState
 
 # Pixels by which the share that meets an object is estimated.
 _SURVEY = 1 << 15
+
+# Memory for the light paths of all pixels.
+_MOST_BYTES = 1 << 29
 
 
 class Setup(NamedTuple):
@@ -30,6 +34,7 @@ class Setup(NamedTuple):
       sampler: where the pixels come from.
       capacity: room for the paths of a batch.
       hit_fraction: share of the pixels that see an object, 0 if no light is bent.
+      epoch: all batches, traced once and for all; `None` if they are traced as they come.
     """
 
     config: TrainingConfig
@@ -39,6 +44,7 @@ class Setup(NamedTuple):
     sampler: PixelSampler
     capacity: int
     hit_fraction: float
+    epoch: steps.Pool | None = None
 
 
 def set_up(
@@ -48,14 +54,19 @@ def set_up(
     geometry: Geometry,
     sampler: PixelSampler,
 ) -> Setup:
-    """Moves the geometry to the device, and measures how many paths it makes of a ray."""
+    """Moves the geometry to the device, and measures how many paths it makes of a ray.
+
+    Light paths of all pixels are kept if the run sees them more than once and they take at most
+    half a gibibyte.
+    """
     geometry = jax.tree.map(jnp.asarray, geometry)
     found = steps.survey_paths(geometry, sampler.survey(_SURVEY).rays, budget=budget)
     capacity = capacity_for(
         budget, config.batch, mean=float(found.mean), deviation=float(found.deviation)
     )
     hit_fraction = float(found.hit_fraction)
-    return Setup(config, model, budget, geometry, sampler, capacity, hit_fraction)
+    setup = Setup(config, model, budget, geometry, sampler, capacity, hit_fraction)
+    return setup._replace(epoch=_trace_epoch(setup))
 
 
 def run_steps(
@@ -94,7 +105,7 @@ def _pools(setup: Setup, step: int, until: int) -> Iterator[tuple[int, steps.Poo
     """Yields the pools of some steps with the number of steps before each, one traced ahead."""
     size = setup.config.pool
     firsts = range(step - step % size, until, size)
-    ahead = (_trace(setup, first) for first in firsts)
+    ahead = (_pool(setup, first) for first in firsts)
     pool = next(ahead, None)
     for first in firsts:
         following = next(ahead, None)
@@ -102,8 +113,17 @@ def _pools(setup: Setup, step: int, until: int) -> Iterator[tuple[int, steps.Poo
         pool = following
 
 
-def _trace(setup: Setup, first: int) -> steps.Pool:
-    drawn = setup.sampler.draw(first, setup.config.pool)
+def _pool(setup: Setup, first: int) -> steps.Pool:
+    """Returns the pool of the steps that follow the first so many."""
+    numbers = setup.sampler.numbers(first, setup.config.pool)
+    if setup.epoch is not None:
+        return setup.epoch._replace(order=jnp.asarray(numbers))
+    return trace_batches(setup, numbers)
+
+
+def trace_batches(setup: Setup, numbers: Int[np.ndarray, " batches"]) -> steps.Pool:
+    """Traces some batches of a run, to be seen in their order."""
+    drawn = setup.sampler.draw(numbers)
     traced = steps.trace_pool(
         setup.geometry,
         drawn.rays,
@@ -111,4 +131,22 @@ def _trace(setup: Setup, first: int) -> steps.Pool:
         capacity=setup.capacity,
         detail=path_detail(setup.model, setup.budget),
     )
-    return steps.Pool(traced, jnp.asarray(drawn.rgb))
+    order = jnp.arange(len(numbers), dtype=jnp.int32)
+    return steps.Pool(traced, jnp.asarray(drawn.rgb), order)
+
+
+def _trace_epoch(setup: Setup) -> steps.Pool | None:
+    """Traces all batches once and for all, if their paths are worth keeping and fit in memory.
+
+    They are traced pool by pool, so that training is the same whether they are kept or not.
+    """
+    config, batches = setup.config, setup.sampler.batches
+    pools = range(0, batches, config.pool)
+    if config.schedule.steps <= batches:
+        return None
+    one = jax.eval_shape(lambda: trace_batches(setup, np.arange(config.pool)))
+    bytes_ = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(one))
+    if bytes_ * len(pools) > _MOST_BYTES:
+        return None
+    traced = [trace_batches(setup, np.arange(first, first + config.pool)) for first in pools]
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:batches], *traced)

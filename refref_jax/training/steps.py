@@ -32,15 +32,17 @@ _ANNEAL_SLOPE = 10.0
 
 
 class Pool(NamedTuple):
-    """The light paths and true colours of many batches.
+    """The light paths and true colours of many batches, and of some steps which they see.
 
     Attributes:
       traced: paths, stacked by batch.
       rgb: 8-bit sRGB.
+      order: the batch of each step.
     """
 
     traced: Traced
     rgb: UInt8[Array, "batches rays 3"]
+    order: Int[Array, " steps"]
 
 
 class StepReport(NamedTuple):
@@ -89,13 +91,13 @@ def train_steps(
     config: TrainingConfig,
     model: ModelConfig,
 ) -> tuple[TrainState, StepReport]:
-    """Takes steps on consecutive batches of a pool, without a word to the host in between.
+    """Takes consecutive steps of a pool, without a word to the host in between.
 
     Args:
       state: consumed: its buffers are reused for the result.
       pool: light paths and colours.
-      first: the pool's batch of the first step.
-      last: the batch after that of the last step; any number of steps is one compiled program.
+      first: place of the first step in the pool's order.
+      last: place after that of the last step; any number of steps is one compiled program.
       config: the run.
       model: the model.
 
@@ -106,20 +108,21 @@ def train_steps(
     shapes = jax.eval_shape(step, state, first)[1]
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     return jax.lax.fori_loop(
-        first, last, lambda batch, carry: step(carry[0], batch), (state, blank)
+        first, last, lambda place, carry: step(carry[0], place), (state, blank)
     )
 
 
 def _step(
     state: TrainState,
-    batch: Int[Array, ""],
+    place: Int[Array, ""],
     *,
     pool: Pool,
     config: TrainingConfig,
     model: ModelConfig,
 ) -> tuple[TrainState, StepReport]:
     """Takes one step."""
-    traced, rgb = jax.tree.map(lambda x: x[batch], pool)
+    batch = pool.order[place]
+    traced, rgb = jax.tree.map(lambda x: x[batch], (pool.traced, pool.rgb))
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
     jitter = pixels.random_jitter(key, model, traced.paths.radii.shape[0])
     anneal = _anneal(state.step, config.schedule.anneal)

@@ -81,8 +81,14 @@ def _step(case, batch, params, target, *, step=2):
     params = jax.tree.map(jnp.array, params)
     state = TrainState(jnp.int32(step), params, _begin(params))
     first = np.int32(names.index(batch))
+    order = jnp.arange(len(names), dtype=jnp.int32)
     state, report = steps.train_steps(
-        state, steps.Pool(traced, jnp.asarray(rgb)), first, first + 1, config=config, model=model
+        state,
+        steps.Pool(traced, jnp.asarray(rgb), order),
+        first,
+        first + 1,
+        config=config,
+        model=model,
     )
     gradient = jax.tree.map(lambda x: x / _ADAM, state.optimizer[0].mu)
     return gradient, state.params, jax.device_get(report)

@@ -96,8 +96,32 @@ def test_one_pool_is_traced_ahead_and_no_more(monkeypatch):
         traced.append(len(traced)) or trace_pool(*arguments, **options)
     )
     monkeypatch.setattr(steps, "trace_pool", noted)
-    counts = [len(traced) for _ in loop.run_steps(_setup(), _start(), 12)]
+    setup = _setup()._replace(epoch=None)
+    traced.clear()
+    counts = [len(traced) for _ in loop.run_steps(setup, _start(), 12)]
     assert counts == [2] * 4 + [3] * 8
+
+
+def test_paths_that_are_kept_train_like_paths_that_are_traced_anew():
+    schedule = dataclasses.replace(CONFIG.schedule, steps=34)
+    setup = _setup(dataclasses.replace(CONFIG, schedule=schedule))
+    assert setup.epoch is not None and setup.epoch.rgb.shape[0] == setup.sampler.batches
+    until = setup.sampler.batches + 2  # into the second epoch
+    kept, kept_reports = _train(setup, _start(), until)
+    traced, traced_reports = _train(setup._replace(epoch=None), _start(), until)
+    _assert_identical(kept, traced)
+    _assert_identical(kept_reports, traced_reports)
+
+
+def test_paths_are_not_kept_for_a_run_of_one_epoch():
+    schedule = dataclasses.replace(CONFIG.schedule, steps=1)
+    assert _setup(dataclasses.replace(CONFIG, schedule=schedule)).epoch is None
+
+
+def test_paths_that_would_fill_the_memory_are_not_kept(monkeypatch):
+    schedule = dataclasses.replace(CONFIG.schedule, steps=34)
+    monkeypatch.setattr(loop, "_MOST_BYTES", 1000)
+    assert _setup(dataclasses.replace(CONFIG, schedule=schedule)).epoch is None
 
 
 def test_the_same_seed_gives_the_same_run_and_another_one_does_not():
@@ -146,13 +170,13 @@ def test_any_budget_can_be_trained_along(budget):
     setup = _setup(budget=budget)
     assert CONFIG.batch <= setup.capacity <= room(budget, CONFIG.batch).paths
     _, reports = _train(setup, _start(), 2)
-    assert all(np.isfinite(report.loss) and report.lost == 0.0 for report in reports)
+    assert all(np.isfinite(report.loss) and report.lost < 1e-3 for report in reports)
 
 
 def test_light_is_lost_only_where_paths_have_too_little_room():
     setup = _setup()
     assert setup.capacity > CONFIG.batch
-    rays, detail = setup.sampler.draw(0, CONFIG.pool).rays, path_detail(MODEL, PAPER)
+    rays, detail = setup.sampler.draw(np.arange(CONFIG.pool)).rays, path_detail(MODEL, PAPER)
     room = {"roomy": setup.capacity, "tight": CONFIG.batch}
     lost = {
         name: steps.trace_pool(
