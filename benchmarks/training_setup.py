@@ -46,4 +46,4 @@ def set_up_training(scene: Path, *, preset: str, paths: str) -> tuple[loop.Setup
 
 def trace_pool(setup: loop.Setup) -> Pool:
     """Draws and traces the first pool of a run, as its loop does."""
-    return loop.trace_batches(setup, setup.sampler.numbers(0, setup.config.pool))
+    return loop.trace_batches(setup, setup.sampler.numbers(0, setup.config.pool).tolist())

@@ -187,7 +187,12 @@ PRESETS = {
     "tiny": Preset(
         model=_tiny_model,
         loss=LossConfig(
-            data="mse", interlevel=0.01, blurs=(0.03,), distortion=0.01, hash_decay=0.1
+            data="mse",
+            interlevel=0.01,
+            blurs=(0.03,),
+            distortion=0.01,
+            hash_decay=0.1,
+            dye_decay=1e-3,
         ),
         schedule=ScheduleConfig(steps=2500, warmup=100, peak=1e-2, end=1e-3, anneal=250),
         batch=1024,
@@ -196,7 +201,12 @@ PRESETS = {
     "small": Preset(
         model=_small_model,
         loss=LossConfig(
-            data="mse", interlevel=0.01, blurs=(0.03,), distortion=0.01, hash_decay=0.1
+            data="mse",
+            interlevel=0.01,
+            blurs=(0.03,),
+            distortion=0.01,
+            hash_decay=0.1,
+            dye_decay=1e-3,
         ),
         schedule=ScheduleConfig(steps=8000, warmup=300, peak=1e-2, end=1e-3, anneal=500),
         batch=2048,
@@ -205,7 +215,12 @@ PRESETS = {
     "paper": Preset(
         model=_paper_model,
         loss=LossConfig(
-            data="mse", interlevel=0.01, blurs=(0.03, 0.003), distortion=0.01, hash_decay=0.1
+            data="mse",
+            interlevel=0.01,
+            blurs=(0.03, 0.003),
+            distortion=0.01,
+            hash_decay=0.1,
+            dye_decay=1e-3,
         ),
         schedule=ScheduleConfig(steps=25_000, warmup=1000, peak=8e-3, end=1e-3, anneal=1000),
         batch=4096,
@@ -214,7 +229,12 @@ PRESETS = {
     "best": Preset(
         model=_best_model,
         loss=LossConfig(
-            data="mse", interlevel=0.01, blurs=(0.03, 0.003), distortion=0.01, hash_decay=0.1
+            data="mse",
+            interlevel=0.01,
+            blurs=(0.03, 0.003),
+            distortion=0.01,
+            hash_decay=0.1,
+            dye_decay=1e-3,
         ),
         schedule=ScheduleConfig(steps=25_000, warmup=1000, peak=1e-2, end=1e-3, anneal=1000),
         batch=16_384,

@@ -14,6 +14,19 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 _LOOSE = ("training", "experiments", "test_metrics.py")
 
 
+# Compiled programs are mapped into memory one by one, and Linux allows a process 65,530 mappings:
+# past them LLVM aborts.
+_MOST_MAPPINGS = 30_000
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_mappings():
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_text().splitlines()) > _MOST_MAPPINGS:
+        jax.clear_caches()
+
+
 @pytest.fixture(autouse=True)
 def _strict_dtypes(request):
     path = Path(request.fspath)

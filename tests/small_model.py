@@ -34,7 +34,9 @@ SAVED = SavedModel(MODEL, PAPER)
 CONFIG = TrainingConfig(
     scene=SceneConfig("nowhere", "nested", ()),
     paths="paper",
-    loss=LossConfig(data="mse", interlevel=0.01, blurs=(0.01,), distortion=0.01, hash_decay=0.1),
+    loss=LossConfig(
+        data="mse", interlevel=0.01, blurs=(0.01,), distortion=0.01, hash_decay=0.1, dye_decay=1e-3
+    ),
     schedule=ScheduleConfig(steps=12, warmup=2, peak=1e-2, end=1e-3, anneal=4),
     batch=32,
     pool=4,

@@ -52,6 +52,17 @@ def absorptions(dyes: Dyes, radius: float) -> Float[Array, "parts 3"]:
     return jax.nn.softplus(dyes.absorption) / radius
 
 
+def optical_density(dyes: Dyes | None) -> Float[Array, ""]:
+    """Returns the mean density of all surfaces and of all media over a scene radius; 0 for none.
+
+    A little of it in a loss settles what images leave open: a tint at both ends of a passage looks
+    much like absorption between them, and takes far less density.
+    """
+    if dyes is None:
+        return jnp.zeros(())
+    return jnp.mean(jax.nn.softplus(dyes.density)) + jnp.mean(jax.nn.softplus(dyes.absorption))
+
+
 def dye(dyes: Dyes | None, paths: LightPaths, *, radius: float) -> LightPaths:
     """Dims the light of paths by the colours of what they passed.
 

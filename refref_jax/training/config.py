@@ -29,6 +29,7 @@ class LossConfig:
       blurs: half-width of its blur for each proposal round, in normalised distance.
       distortion: weight of the corrected distortion loss.
       hash_decay: weight of the decay of the hash grids.
+      dye_decay: weight of the optical density of learned colours.
     """
 
     data: Literal["mse", "charbonnier"]
@@ -36,6 +37,7 @@ class LossConfig:
     blurs: tuple[float, ...]
     distortion: float
     hash_decay: float
+    dye_decay: float
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,12 +1,11 @@
 """The loop over training steps: draws pixels, traces them in pools, and steps."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
 
 from refref_jax.data.batches import PixelSampler
 from refref_jax.optics.budgets import Budget, capacity_for
@@ -118,12 +117,12 @@ def _pool(setup: Setup, first: int) -> steps.Pool:
     numbers = setup.sampler.numbers(first, setup.config.pool)
     if setup.epoch is not None:
         return setup.epoch._replace(order=jnp.asarray(numbers))
-    return trace_batches(setup, numbers)
+    return trace_batches(setup, numbers.tolist())
 
 
-def trace_batches(setup: Setup, numbers: Int[np.ndarray, " batches"]) -> steps.Pool:
+def trace_batches(setup: Setup, numbers: Sequence[int]) -> steps.Pool:
     """Traces some batches of a run, to be seen in their order."""
-    drawn = setup.sampler.draw(numbers)
+    drawn = setup.sampler.draw(np.asarray(numbers))
     traced = steps.trace_pool(
         setup.geometry,
         drawn.rays,
@@ -131,8 +130,8 @@ def trace_batches(setup: Setup, numbers: Int[np.ndarray, " batches"]) -> steps.P
         capacity=setup.capacity,
         detail=path_detail(setup.model, setup.budget),
     )
-    order = jnp.arange(len(numbers), dtype=jnp.int32)
-    return steps.Pool(traced, jnp.asarray(drawn.rgb), order)
+    order = np.arange(len(numbers), dtype=np.int32)
+    return steps.Pool(traced, *jax.device_put((drawn.rgb, order)))
 
 
 def _trace_epoch(setup: Setup) -> steps.Pool | None:
@@ -144,9 +143,9 @@ def _trace_epoch(setup: Setup) -> steps.Pool | None:
     pools = range(0, batches, config.pool)
     if config.schedule.steps <= batches:
         return None
-    one = jax.eval_shape(lambda: trace_batches(setup, np.arange(config.pool)))
+    one = jax.eval_shape(lambda: trace_batches(setup, range(config.pool)))
     bytes_ = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(one))
     if bytes_ * len(pools) > _MOST_BYTES:
         return None
-    traced = [trace_batches(setup, np.arange(first, first + config.pool)) for first in pools]
+    traced = [trace_batches(setup, range(first, first + config.pool)) for first in pools]
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:batches], *traced)

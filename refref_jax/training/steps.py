@@ -20,7 +20,7 @@ from refref_jax.optics.details import Detail
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.optics.path_tracing import Survey, Traced
 from refref_jax.optics.wavefront import Geometry
-from refref_jax.render import pixels
+from refref_jax.render import dyes, pixels
 from refref_jax.render.config import ModelConfig
 from refref_jax.render.model import Params
 from refref_jax.render.transport import PathRadiance
@@ -157,6 +157,7 @@ def _measure(
         + config.interlevel * interlevel
         + config.distortion * distortion
         + config.hash_decay * decay
+        + config.dye_decay * dyes.optical_density(params.dyes)
     )
     psnr = -10.0 * jnp.log10(mse)
     return StepReport(loss, psnr, interlevel, distortion, decay, jnp.mean(traced.lost))

@@ -34,6 +34,12 @@ def test_light_is_dimmed_at_every_meeting_and_along_every_passage():
         np.testing.assert_allclose(got, expected, rtol=2e-6)
 
 
+def test_optical_density_by_hand():
+    made = Dyes(jnp.log(jnp.expm1(jnp.array([[0.5, 1.0, 1.5]]))), jnp.full((1, 3), -200.0))
+    np.testing.assert_allclose(dyes.optical_density(made), 1.0, rtol=1e-6)
+    assert dyes.optical_density(None) == 0.0
+
+
 def test_without_dyes_paths_stay_as_they_are():
     paths = _paths([[1.0]], [[2.0]])
     assert dyes.dye(None, paths, radius=_RADIUS) is paths

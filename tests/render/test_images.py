@@ -6,6 +6,7 @@ import pytest
 from refref_jax.data.cameras import image_rays
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.budgets import PAPER, STRAIGHT
+from refref_jax.optics.details import everything
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.render import Model, images, init_params, render_image, render_rays
 from tests import scenes
@@ -90,15 +91,19 @@ def test_a_chunk_of_nothing_is_refused(model, rays):
 
 def test_rays_that_only_fill_up_a_tile_are_not_rendered(model, rays):
     flat = Rays(*(x.reshape(256, *x.shape[2:]) for x in rays))
-    tile = images._trace_tile(model.geometry, images._slice_rays(flat, 0), 256, budget=STRAIGHT)
+    tile = images._trace_tile(
+        model.geometry, images._slice_rays(flat, 0), 256, budget=STRAIGHT, detail=everything(0)
+    )
     assert int(tile.count) == 256
 
 
 def test_rays_that_miss_pay_nothing_for_reflection(model, rays):
     flat = Rays(*(x.reshape(256, *x.shape[2:]) for x in rays))
     tile = images._slice_rays(flat, 0)
-    paper = images._trace_tile(model.geometry, tile, 256, budget=PAPER)
-    straight = images._trace_tile(model.geometry, tile, 256, budget=STRAIGHT)
+    paper = images._trace_tile(
+        model.geometry, tile, 256, budget=PAPER, detail=everything(PAPER.bends)
+    )
+    straight = images._trace_tile(model.geometry, tile, 256, budget=STRAIGHT, detail=everything(0))
     # Of the tile's rays, some meet the ball.
     count = int(paper.count)
     reflections = np.asarray(paper.paths.statuses)[:count] == PathStatus.NOT_TRACED
