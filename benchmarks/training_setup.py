@@ -1,12 +1,14 @@
 """A training run on a scene, set up as `experiments.train` does, for benchmarks to step."""
 
+import dataclasses
 from pathlib import Path
 
+from experiments import choices
+from experiments.choices import Wishes
 from experiments.presets import PRESETS, bounds
-from refref_jax.data import background, containment, local_layout, meshes
+from refref_jax.data import background, containment, local_layout, meshes, needs
 from refref_jax.data.batches import PixelSampler
 from refref_jax.data.geometry import build_geometry
-from refref_jax.optics.budgets import BUDGETS
 from refref_jax.training import loop
 from refref_jax.training.config import SceneConfig, TrainingConfig
 from refref_jax.training.state import TrainState, init_state
@@ -14,7 +16,7 @@ from refref_jax.training.steps import Pool
 
 
 def set_up_training(scene: Path, *, preset: str, paths: str) -> tuple[loop.Setup, TrainState]:
-    """Returns a run that has not begun, without absorption and tints.
+    """Returns a run that has not begun, and models of the scene what it needs.
 
     Args:
       scene: folder of the scene.
@@ -24,9 +26,16 @@ def set_up_training(scene: Path, *, preset: str, paths: str) -> tuple[loop.Setup
     chosen = PRESETS[preset]
     frames = local_layout.read_frames(scene, "train")
     space, radius = background.space(scene), background.half_extent(scene)
-    model = chosen.model(bounds(frames.cameras, space=space, radius=radius), "field")
-    parts = meshes.without_colour(meshes.read_meshes(scene))
-    parents = containment.find_containment(parts).parents
+    parts = meshes.read_meshes(scene)
+    tree = containment.find_containment(parts)
+    found = needs.find_needs(parts, tree, frames.cameras, rule="nested", space=space)
+    choice = choices.choose(found, Wishes(paths=paths))
+    extent = bounds(frames.cameras, space=space, radius=radius if space == "bounded" else None)
+    model = dataclasses.replace(
+        chosen.model(extent, choice.interior), learned_tints=choice.learned_tints
+    )
+    if choice.tints != "given":
+        parts = meshes.without_colour(parts)
     config = TrainingConfig(
         scene=SceneConfig(str(scene), "nested", ()),
         paths=paths,
@@ -39,8 +48,8 @@ def set_up_training(scene: Path, *, preset: str, paths: str) -> tuple[loop.Setup
     sampler = PixelSampler(
         local_layout.read_images(frames), frames.cameras, seed=0, batch=config.batch
     )
-    geometry = build_geometry(parts, parents, rule="nested")
-    setup = loop.set_up(config, model, BUDGETS[paths], geometry, sampler)
+    geometry = build_geometry(parts, tree.parents, rule="nested")
+    setup = loop.set_up(config, model, choice.budget, geometry, sampler)
     return setup, init_state(0, model, config.schedule)
 
 
