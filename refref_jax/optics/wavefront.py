@@ -39,7 +39,7 @@ BLOCK = 4096
 """Rays cast in a round. A larger one serves an accelerator, at the price of memory."""
 
 # From so many blocks of rays on the last ones are cast in smaller blocks: a second loop to compile.
-_MANY_BLOCKS = 2
+_MANY_BLOCKS = 6
 
 
 class _Walk(NamedTuple):

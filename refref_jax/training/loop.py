@@ -16,7 +16,7 @@ from refref_jax.training.config import TrainingConfig
 from refref_jax.training.state import TrainState
 
 # Pixels by which the share that meets an object is estimated.
-_SURVEY = 1 << 15
+_SURVEY = 1 << 14
 
 # Memory for the light paths of all pixels.
 _MOST_BYTES = 1 << 29

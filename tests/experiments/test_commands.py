@@ -71,6 +71,7 @@ def test_a_mesh_that_no_camera_sees_is_warned_about(tmp_path):
 def test_an_interrupted_run_is_saved_and_goes_on(tmp_path):
     run = tmp_path / "run"
     options = ["--scene=experiments/data/cube_smcvx_ball", "--batch=64", f"--out={run}"]
+    options.append("--paths=straight")  # the rest is the same, and compiles sooner
     command = [sys.executable, "-m", "experiments.train", *options, "--log_every=1"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         while not (run / "metrics.jsonl").exists() and process.poll() is None:

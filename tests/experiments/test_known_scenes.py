@@ -96,6 +96,7 @@ def test_pictures_of_others_are_not_deleted(tmp_path):
     assert picture.read_bytes() == b"not ours"
 
 
+@pytest.mark.slow
 def test_the_curve_has_a_row_for_every_setting(tmp_path):
     out = tmp_path / "curve"
     result = run_command(
