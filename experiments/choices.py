@@ -109,7 +109,7 @@ def report(config: TrainingConfig, model: SavedModel, chosen: Choices) -> list[s
     if budget.bends == 0:
         del lines[1]
     options = ["  ".join(f"--{name}" for name in names.split()) for _, names in lines]
-    return [f"  {text:<46}{names}" for (text, _), names in zip(lines, options, strict=True)]
+    return [f"  {text:<46}  {names}" for (text, _), names in zip(lines, options, strict=True)]
 
 
 def _needed_interior(needs: Needs, wishes: Wishes, budget: Budget) -> Interior:
