@@ -46,6 +46,7 @@ def test_a_finished_run_is_neither_repeated_nor_overwritten(trained):
     assert "--seed would have no effect" in ignored.stderr
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_with_a_scene_that_has_moved(trained, tmp_path):
     run, scene = tmp_path / "run", tmp_path / "moved"
     shutil.copytree(trained, run)
