@@ -1,4 +1,4 @@
-# One command from a fresh clone: `make demo` trains and shows the oracle, `make test` tests.
+# One command from a fresh clone: `make demo` trains and shows a model, `make test` tests.
 # Both create .venv first, and may be repeated.
 
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \

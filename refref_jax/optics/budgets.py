@@ -120,9 +120,8 @@ def capacity_for(budget: Budget, rays: int, *, mean: float, deviation: float) ->
     """Returns the room for the paths of a batch of a scene.
 
     One standard deviation above the mean number of paths of a random batch, rounded up to 8. A
-    batch in six loses its weakest paths: of 1,024 rays that meet a ball, three paths of 2 % of
-    their ray's light on average, a ten-thousandth of all. A step costs as much as its room, so that
-    room for all of them would cost 6 % of it.
+    batch in six loses its weakest paths, and training logs their light. A step costs as much as its
+    room, so that room for all of them would cost 6 % of it.
 
     Args:
       budget: which light to follow.
