@@ -40,6 +40,7 @@ BLOCK = 4096
 
 # From so many blocks of rays on the last ones are cast in smaller blocks: a second loop to compile.
 _MANY_BLOCKS = 6
+_SMALLER = 16
 
 
 class _Walk(NamedTuple):
@@ -91,14 +92,14 @@ def _follow(
     block = max(1, min(block, count))
     room = budgets.room(budget, count)
     walk = _begin(rays, inside, footprint, block, room)
-    if count < _MANY_BLOCKS * block:
+    if count < _MANY_BLOCKS * block or block < _SMALLER:
         return _work_off(geometry, walk, budget, block, room, least=1).tree
     # The few rays that go deepest would cast a whole block each round.
     walk = _work_off(geometry, walk, budget, block, room, least=block // 4)
     stack = pools.append(
         walk.stack, walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
     )
-    small = block // 16
+    small = block // _SMALLER
     walk = _Walk(*pools.pop(stack, small), walk.tree)
     return _work_off(geometry, walk, budget, small, room, least=1).tree
 
