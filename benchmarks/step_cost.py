@@ -53,7 +53,7 @@ class _Method:
         tracing = (time.perf_counter() - begin) / pool
         start = int(self._state.step)
         begin = time.perf_counter()
-        steps = loop.run_steps(self._setup, self._state, start + 2 * pool, stride=_STRIDE)
+        steps = loop.run_steps(self._setup, self._state, start + 2 * pool, every=(_STRIDE,))
         for state, _ in steps:
             self._state = state
         jax.block_until_ready(self._state)

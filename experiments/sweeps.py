@@ -20,13 +20,16 @@ Measure = Callable[[Point], Row]
 """Trains and evaluates a point, or raises `RunFailedError`."""
 
 
-def sweep(points: Sequence[Point], out: Path, measure_: Measure) -> dict[str, str]:
+def sweep(
+    points: Sequence[Point], out: Path, measure_: Measure, earlier: Sequence[Row] = ()
+) -> dict[str, str]:
     """Measures points, and writes table, figure and report after each.
 
     Args:
       points: the base first.
       out: folder to write to.
       measure_: measures one point.
+      earlier: rows that stay in the table, if they were measured on as many images.
 
     Returns:
       Why points failed, by name: they are left out, and the others go on.
@@ -35,12 +38,12 @@ def sweep(points: Sequence[Point], out: Path, measure_: Measure) -> dict[str, st
       ValueError: if the base point failed, with which all are compared.
     """
     out.mkdir(parents=True, exist_ok=True)
-    rows: list[Row] = []
+    rows = {row.name: row for row in earlier}
     failed: dict[str, str] = {}
     with commands.ProgressBar("trade-off", len(points)) as bar:
         for done, point in enumerate(points, 1):
             try:
-                rows.append(measure_(point))
+                row = measure_(point)
             except RunFailedError as error:
                 if point.name == BASE:
                     raise ValueError(
@@ -49,9 +52,29 @@ def sweep(points: Sequence[Point], out: Path, measure_: Measure) -> dict[str, st
                 failed[point.name] = str(error)
                 bar.show(done, f"{point.name} failed")
                 continue
-            _write(out, rows)
-            bar.show(done, f"{point.name}: {rows[-1].quality:.2f} dB")
+            rows = {each.name: each for each in rows.values() if each.images == row.images}
+            rows[row.name] = row
+            _write(out, list(rows.values()))
+            bar.show(done, f"{point.name}: {row.quality:.2f} dB")
     return failed
+
+
+def earlier_rows(out: Path, base: Point, scene: Path) -> list[Row]:
+    """Returns what sweeps around the same base have measured into a folder.
+
+    Raises:
+      ValueError: if they were around another base, or of another scene.
+    """
+    table = out / "trade_off.csv"
+    if not table.exists():
+        return []
+    rows = trade_table.read(table)
+    found, new = trade_table.base_of(rows), (" ".join(base.training), " ".join(base.evaluation))
+    if (found.scene, found.training, found.evaluation) != (scene.resolve().name, *new):
+        raise ValueError(
+            f"{table} is of {found.scene}, around {found.training}. Give another --out."
+        )
+    return rows
 
 
 def measure(point: Point, scene: Path, runs: Path, limit: Sequence[str] = ()) -> Row:

@@ -55,7 +55,10 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     limit = () if _LIMIT.value is None else (f"--limit={_LIMIT.value}",)
     failed = sweeps.sweep(
-        points, out, lambda point: sweeps.measure(point, scene, out / "runs", limit)
+        points,
+        out,
+        lambda point: sweeps.measure(point, scene, out / "runs", limit),
+        sweeps.earlier_rows(out, points[0], scene),
     )
     print(f"Table:  {out / 'trade_off.csv'}")
     print(f"Figure: {out / 'trade_off.png'}")

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from experiments.presets import PRESETS, Bounds
+from refref_jax.optics.budgets import BUDGETS
 
 BASE = "base"
 
@@ -17,8 +18,9 @@ OF_EVALUATION = ("rays_per_pixel",)
 
 _BASE_OPTIONS = {"paths": "tree"}
 
-# What the options are called of which no preset and no --base tells the value.
-_DEFAULTS = {"cut": "0.02", "rays_per_pixel": "1"}
+_OF_BENT_LIGHT = ("cut", "bends")
+
+_NOT_OF_BASE = ("preset", "seed", "steps")
 
 _ANY_BOUNDS = Bounds(near=0.05, far=20.0, radius=7.3, space="bounded")
 
@@ -52,6 +54,8 @@ def sweep(
 ) -> list[Point]:
     """Returns the base and all points around it; a point that equals the base is left out.
 
+    Straight light has no cut and no bends, so that neither is given beside it.
+
     Args:
       preset: of the base.
       seed: of all trainings.
@@ -62,10 +66,14 @@ def sweep(
       knobs: only these; all if `None`.
 
     Raises:
-      ValueError: if a preset or knob does not exist.
+      ValueError: if a preset or knob does not exist, or the base has options of its own.
     """
     if preset not in PRESETS:
         raise ValueError(f"There is no preset {preset}. Choose from {', '.join(PRESETS)}.")
+    if misplaced := [name for name in _NOT_OF_BASE if name in (base or {})]:
+        raise ValueError(
+            f"--base={misplaced[0]}=... would be at odds with the points. Use --{misplaced[0]}."
+        )
     usual = PRESETS[preset].schedule.steps
     first, *others = steps or (usual, usual // 4, usual // 2, 2 * usual)
     base = _BASE_OPTIONS | dict(base or {})
@@ -78,19 +86,20 @@ def sweep(
                 f"values with --values={unknown[0]}=A/B."
             )
         swept = {knob: swept[knob] for knob in knobs}
-    known = own_values(preset) | _DEFAULTS | options
+    known = own_values(preset, base["paths"]) | options
     points = [_point(options, "", "")]
     points += [
         _point(options, knob, value)
         for knob, alternatives in swept.items()
         for value in alternatives
-        if value != known.get(knob)
+        if not _same(value, known.get(knob))
+        and not (base["paths"] == "straight" and knob in _OF_BENT_LIGHT)
     ]
     return points
 
 
-def own_values(preset: str) -> dict[str, str]:
-    """Returns what the knobs of a model are in a preset."""
+def own_values(preset: str, paths: str = "tree") -> dict[str, str]:
+    """Returns what the knobs are in a preset, with a budget of paths, if no option changes them."""
     model = PRESETS[preset].model(_ANY_BOUNDS, "field")
     rounds = [*(proposal.samples for proposal in model.proposals), model.samples]
     return {
@@ -100,24 +109,31 @@ def own_values(preset: str) -> dict[str, str]:
         "finest": str(model.field.grid.finest),
         "footprint": model.footprint,
         "precision": model.field.precision,
+        "cut": str(BUDGETS[paths].cut),
+        "bends": str(BUDGETS[paths].bends),
+        "rays_per_pixel": "1",
     }
 
 
 def default_values(preset: str) -> dict[str, tuple[str, ...]]:
-    """Returns what is tried of each knob, around a preset: a little less, and more."""
+    """Returns what is tried of each knob, around a preset: a little less, and more.
+
+    Of interiors it is the paper's field; the base has what the scene needs.
+    """
     own = own_values(preset)
     rounds = [int(count) for count in own["samples"].split(",")]
     entries, finest = int(own["entries"]), int(own["finest"])
     return {
         "paths": ("straight", "paper", "tree"),
         "cut": ("0.1", "0.05", "0.02", "0.01", "0.005"),
+        "bends": ("2", "6", "10", "24"),
         "samples": tuple(
             ",".join(str(round(share * count)) for count in rounds) for share in (0.5, 0.75, 1.5, 2)
         ),
         "multisamples": ("1", "6"),
         "entries": tuple(str(entries + more) for more in (-3, -2, -1, 1, 2)),
         "finest": tuple(str(round(share * finest)) for share in (0.25, 0.5, 2, 4)),
-        "interior": ("field", "clear", "absorbing"),
+        "interior": ("field",),
         "footprint": ("cone", "differential"),
         "precision": ("float32", "bfloat16"),
         "rays_per_pixel": ("1", "4", "9"),
@@ -168,6 +184,8 @@ def parse_values(words: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 def _point(base: Mapping[str, str], knob: str, value: str) -> Point:
     options = {**base, knob: value} if knob else dict(base)
+    if options["paths"] == "straight":
+        options = {name: each for name, each in options.items() if name not in _OF_BENT_LIGHT}
     evaluation = {name: options.pop(name) for name in OF_EVALUATION if name in options}
     return Point(
         name=f"{knob}={value}".replace(",", "+") if knob else BASE,
@@ -176,3 +194,13 @@ def _point(base: Mapping[str, str], knob: str, value: str) -> Point:
         training=tuple(f"--{name}={each}" for name, each in options.items()),
         evaluation=tuple(f"--{name}={each}" for name, each in evaluation.items()),
     )
+
+
+def _same(value: str, other: str | None) -> bool:
+    """Returns whether two values are the same words, or the same numbers."""
+    try:
+        return other is not None and [*map(float, value.split(","))] == [
+            *map(float, other.split(","))
+        ]
+    except ValueError:
+        return value == other

@@ -74,11 +74,13 @@ class Turn(NamedTuple):
 
 
 def write(path: Path, rows: Sequence[Row]) -> None:
-    """Writes a table as CSV; what is not known stays empty."""
-    with path.open("w", newline="", encoding="utf-8") as file:
+    """Writes a table as CSV, all or nothing; what is not known stays empty."""
+    partial = path.with_suffix(".partial")
+    with partial.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(field.name for field in dataclasses.fields(Row))
         writer.writerows(dataclasses.astuple(row) for row in rows)
+    partial.replace(path)
 
 
 def read(path: Path) -> list[Row]:

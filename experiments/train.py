@@ -94,8 +94,8 @@ def _train(run: Path, setup: loop.Setup, state: TrainState, checkpoints: Checkpo
     start = last = time.monotonic()
     logged = step
     with commands.ProgressBar("train", total, step) as bar:
-        stride = _stride(_LOG_EVERY.value, _CHECKPOINT_EVERY.value)
-        for stepped, report in loop.run_steps(setup, state, total, stride=stride):
+        every = (_MOST_STEPS, _LOG_EVERY.value, _CHECKPOINT_EVERY.value)
+        for stepped, report in loop.run_steps(setup, state, total, every=every):
             step = int(stepped.step)
             if step % _LOG_EVERY.value == 0 or step == total:
                 report = jax.device_get(report)
@@ -111,12 +111,6 @@ def _train(run: Path, setup: loop.Setup, state: TrainState, checkpoints: Checkpo
     if step < total:
         print(f"Stopped at step {step}. Continue with --resume --out={run}.")
     return step == total
-
-
-def _stride(*periods: int) -> int:
-    """Returns how many steps to take at a time: as many as fit into all periods, but few."""
-    whole = math.gcd(*periods)
-    return max(steps for steps in range(1, _MOST_STEPS + 1) if whole % steps == 0)
 
 
 def _log(run: Path, step: int, report: StepReport, rate: float, seconds: float) -> None:

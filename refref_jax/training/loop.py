@@ -69,9 +69,9 @@ def set_up(
 
 
 def run_steps(
-    setup: Setup, state: TrainState, until: int, *, stride: int = 1
+    setup: Setup, state: TrainState, until: int, *, every: Sequence[int] = (1,)
 ) -> Iterator[tuple[TrainState, steps.StepReport]]:
-    """Takes all steps up to `until`; yields the state and the report after every `stride` of them.
+    """Takes all steps up to `until`; yields the state and the report every so many of them.
 
     A state is consumed by the steps that follow it: copy what is to be kept. Starting from a
     restored state continues exactly where its run would have gone on.
@@ -83,15 +83,15 @@ def run_steps(
       setup: the run.
       state: where to begin.
       until: number of the last step.
-      stride: steps that the device takes without a word to the host. Besides at its multiples the
-        state is seen at the end of every pool, and at the end.
+      every: the state is seen at the multiples of each of these numbers, at the end of every pool,
+        and at the end; in between the device takes steps without a word to the host.
     """
     config = setup.config
     step = int(state.step)
     for first, pool in _pools(setup, step, until):
         end = min(first + config.pool, until)
         while step < end:
-            last = min(step + stride - step % stride, end)
+            last = min(end, *(step + period - step % period for period in every))
             batches = np.int32(step - first), np.int32(last - first)
             state, report = steps.train_steps(
                 state, pool, *batches, config=config, model=setup.model

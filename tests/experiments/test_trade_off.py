@@ -31,7 +31,19 @@ def test_no_point_is_the_base_and_none_comes_twice():
     names = {point.name for point in points}
     # What the preset, the budget and evaluation have anyway.
     assert not names & {"samples=32+20", "finest=512", "entries=17", "cut=0.02", "paths=tree"}
+    assert "bends=24" not in names and "bends=10" in names
     assert names >= {"samples=48+30", "entries=18", "precision=bfloat16", "rays_per_pixel=4"}
+    equal = {"cut": ("0.020", "0.1"), "samples": ("32, 20",)}
+    points = trade_points.sweep(preset="tiny", values=equal, knobs=["cut", "samples"])
+    assert [point.name for point in points] == [BASE, "cut=0.1"]
+
+
+def test_straight_light_has_neither_cut_nor_bends():
+    points = trade_points.sweep(preset="tiny", base={"cut": "0.05"}, knobs=["paths", "bends"])
+    straight = next(point for point in points if point.name == "paths=straight")
+    assert not [word for word in straight.training if "cut" in word or "bends" in word]
+    points = trade_points.sweep(preset="tiny", base={"paths": "straight"})
+    assert not {"cut", "bends"} & {point.knob for point in points}
 
 
 def test_rays_per_pixel_are_evaluations_alone():
@@ -70,6 +82,7 @@ def test_steps_are_the_bases_and_those_of_more_trainings():
     [
         (lambda: trade_points.sweep(preset="huge"), "Choose from tiny, small, paper, best"),
         (lambda: trade_points.sweep(preset="tiny", knobs=["colour"]), "--values=colour=A/B"),
+        (lambda: trade_points.sweep(preset="tiny", base={"steps": "9"}), "Use --steps"),
         (lambda: trade_points.parse_base(["cut"]), "NAME=VALUE"),
         (lambda: trade_points.parse_values(["cut="]), "NAME=A/B"),
         (lambda: trade_points.choose(trade_points.sweep(preset="tiny"), ["cut=1"]), "cut=1"),
@@ -176,6 +189,27 @@ def test_a_sweep_writes_everything_and_outlives_a_point_that_fails(tmp_path):
     assert [row.name for row in rows] == [p.name for p in points if p.name != "cut=0.05"]
     assert "paths=straight" in (tmp_path / "out" / "trade_off.md").read_text()
     assert iio.imread(tmp_path / "out" / "trade_off.png").shape[1] > 1000
+
+
+def test_a_sweep_adds_to_the_one_before_it_around_the_same_base(tmp_path):
+    def measure(point):
+        options = " ".join(point.training), " ".join(point.evaluation)
+        row = made_row(point.name)
+        return dataclasses.replace(
+            row, scene=_SCENE.name, training=options[0], evaluation=options[1]
+        )
+
+    for knobs in (["cut"], ["paths"]):
+        points = trade_points.sweep(preset="tiny", knobs=knobs)
+        earlier = sweeps.earlier_rows(tmp_path, points[0], _SCENE)
+        sweeps.sweep(points, tmp_path, measure, earlier)
+    names = [row.name for row in trade_table.read(tmp_path / "trade_off.csv")]
+    assert names[0] == BASE and {"cut=0.1", "paths=straight"} < set(names)
+    other = trade_points.sweep(preset="tiny", base={"batch": "64"})[0]
+    with pytest.raises(ValueError, match="another --out"):
+        sweeps.earlier_rows(tmp_path, other, _SCENE)
+    with pytest.raises(ValueError, match="another --out"):
+        sweeps.earlier_rows(tmp_path, points[0], ROOT)
 
 
 def test_a_sweep_without_its_base_ends(tmp_path):

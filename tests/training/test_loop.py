@@ -60,31 +60,31 @@ def test_a_resumed_run_continues_bit_for_bit(tmp_path, pause):
     _assert_identical(early + late, reports)
 
 
-@pytest.mark.parametrize("stride", [3, 4, 10])
-def test_steps_taken_at_once_are_the_same_steps(stride):
+@pytest.mark.parametrize("every", [(3,), (4,), (10, 5)])
+def test_steps_taken_at_once_are_the_same_steps(every):
     one_by_one = {
         int(state.step): jax.device_get((state, report))
         for state, report in loop.run_steps(_setup(), _start(), 12)
     }
     seen = {
         int(state.step): jax.device_get((state, report))
-        for state, report in loop.run_steps(_setup(), _start(), 12, stride=stride)
+        for state, report in loop.run_steps(_setup(), _start(), 12, every=every)
     }
-    # Pools of four steps end a stride early.
-    assert list(seen) == sorted({*range(stride, 13, stride), 4, 8, 12})
+    # Pools have four steps.
+    assert list(seen) == [n for n in range(1, 13) if any(n % period == 0 for period in (*every, 4))]
     for step, found in seen.items():
         _assert_identical(found, one_by_one[step])
 
 
 def test_a_run_resumed_within_a_pool_may_take_other_strides(tmp_path):
     whole, _ = _train(_setup(), _start(), 11)
-    for state, _ in loop.run_steps(_setup(), _start(), 6, stride=4):
+    for state, _ in loop.run_steps(_setup(), _start(), 6, every=(4,)):
         paused = state
     with Checkpoints(tmp_path, keep=1) as checkpoints:
         checkpoints.save(paused)
         resumed = checkpoints.restore(_start())
     assert int(resumed.step) == 6
-    for state, _ in loop.run_steps(_setup(), resumed, 11, stride=5):
+    for state, _ in loop.run_steps(_setup(), resumed, 11, every=(5,)):
         last = state
     _assert_identical(last, whole)
 
