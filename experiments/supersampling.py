@@ -81,6 +81,7 @@ def average(fine: Rendering, side: int) -> Rendering:
         mean_distance=cameras.box_filter(fine.mean_distance, side),
         accumulation=cameras.box_filter(fine.accumulation, side),
         linear=linear,
+        lost=cameras.box_filter(fine.lost, side),
     )
 
 

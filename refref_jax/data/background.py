@@ -59,9 +59,11 @@ def space(scene: Path) -> Space:
 
 
 def half_extent(scene: Path) -> float | None:
-    """Returns half the edge of the cube that the walls form, if `scene.json` tells it."""
-    extent = _background(scene).get("half_extent")
-    return None if extent is None else _positive(extent, "half_extent", scene)
+    """Returns half the edge of the cube that the walls form, or around a sphere, if it is told."""
+    record = _background(scene)
+    key = "radius" if record.get("type") == "sphere" else "half_extent"
+    extent = record.get(key)
+    return None if extent is None else _positive(extent, key, scene)
 
 
 def read_background(scene: Path) -> Background:

@@ -1,6 +1,8 @@
 """Packs the paths of many batches into lists of equal length.
 
-A batch keeps its strongest paths, in the order of its rays, each ray's heaviest first.
+A batch keeps its strongest paths, in the order of its rays, each ray's heaviest first. Where all
+batches together have more paths than there is room for, the weakest of all go before that, since
+every slot takes part in the sorting.
 """
 
 import jax

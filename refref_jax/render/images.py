@@ -18,8 +18,9 @@ from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.budgets import Budget, room
 from refref_jax.optics.details import Detail
 from refref_jax.optics.light_paths import LightPaths
+from refref_jax.optics.path_tracing import Traced
 from refref_jax.optics.wavefront import Geometry
-from refref_jax.render import colour, dyes, pixels
+from refref_jax.render import colour, dyes, pixels, tiles
 from refref_jax.render.config import ModelConfig, path_detail
 from refref_jax.render.model import Model, Params
 
@@ -41,6 +42,7 @@ class Rendering(NamedTuple):
       accumulation: share of light accounted for, 1 with an opaque background.
       linear: the colours as linear RGB, not clipped: what is averaged where several rays share a
         pixel.
+      lost: share of a ray's light that no path carries, for want of room.
     """
 
     rgb: Float[Array, "*rays 3"]
@@ -48,6 +50,7 @@ class Rendering(NamedTuple):
     mean_distance: Float[Array, "*rays"]
     accumulation: Float[Array, "*rays"]
     linear: Float[Array, "*rays 3"]
+    lost: Float[Array, "*rays 3"]
 
 
 class _Tile(NamedTuple):
@@ -57,11 +60,13 @@ class _Tile(NamedTuple):
       paths: the light paths.
       heaviest: whether a path carries most of its ray's light.
       count: number of paths that exist.
+      lost: see `Rendering`.
     """
 
     paths: LightPaths
     heaviest: Bool[Array, " paths"]
     count: Int[Array, ""]
+    lost: Float[Array, "rays 3"]
 
 
 def render_rays(model: Model, rays: Rays) -> Rendering:
@@ -69,7 +74,8 @@ def render_rays(model: Model, rays: Rays) -> Rendering:
 
     Args:
       model: the scene.
-      rays: `[n]` camera rays.
+      rays: `[n]` camera rays. They share the room of the budget: the fewer they are, the sooner
+        light is lost.
     """
     count = rays.radii.shape[0]
     capacity = room(model.budget, count).paths
@@ -77,9 +83,9 @@ def render_rays(model: Model, rays: Rays) -> Rendering:
     traced = path_tracing.trace(
         model.geometry, rays, budget=model.budget, capacity=capacity, detail=detail
     )
-    tile = _sort(traced.paths, count, count)
-    empty = jax.tree.map(jnp.zeros_like, _blank(count))
-    return _finish(_add(model.params, tile.paths, tile.heaviest, empty, config=model.config))
+    tile = _sort(traced, count)
+    sums = _blank(count)._replace(lost=tile.lost)
+    return _finish(_add(model.params, tile.paths, tile.heaviest, sums, config=model.config))
 
 
 def render_image(model: Model, rays: Rays, *, chunk: int = CHUNK) -> Rendering:
@@ -102,24 +108,19 @@ def render_image(model: Model, rays: Rays, *, chunk: int = CHUNK) -> Rendering:
     shape = rays.radii.shape
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), rays)
     count = flat.radii.shape[0]
-    tiles = [jax.tree.map(np.asarray, _blank(0))]
+    parts = [jax.tree.map(np.asarray, _blank(0))]
     for start in range(0, count, TILE):
-        tile = _render_tile(model, _slice_rays(flat, start), min(TILE, count - start), chunk)
-        tiles.append(jax.tree.map(np.asarray, tile))
-    joined = jax.tree.map(lambda *parts: np.concatenate(parts), *tiles)
+        tile, _ = tiles.cut_out(flat, None, start, TILE)
+        part = _render_tile(model, tile, min(TILE, count - start), chunk)
+        parts.append(jax.tree.map(np.asarray, part))
+    joined = jax.tree.map(lambda *each: np.concatenate(each), *parts)
     return jax.tree.map(lambda x: x[:count].reshape((*shape, *x.shape[1:])), joined)
-
-
-def _slice_rays(rays: Rays, start: int) -> Rays:
-    """Returns one tile of rays; the last one is filled up by repeating a ray."""
-    index = np.minimum(np.arange(start, start + TILE), rays.radii.shape[0] - 1)
-    return jax.tree.map(lambda x: x[index], rays)
 
 
 def _render_tile(model: Model, rays: Rays, real: int, chunk: int) -> Rendering:
     detail = path_detail(model.config, model.budget)
     tile = _trace_tile(model.geometry, rays, real, budget=model.budget, detail=detail)
-    sums = _blank(TILE)
+    sums = _blank(TILE)._replace(lost=tile.lost)
     for start in range(0, int(tile.count), chunk):
         sums = _render_chunk(model.params, tile, sums, start, config=model.config, chunk=chunk)
     return _finish_tile(sums)
@@ -127,7 +128,7 @@ def _render_tile(model: Model, rays: Rays, real: int, chunk: int) -> Rendering:
 
 def _blank(count: int) -> Rendering:
     zeros, black = jnp.zeros(count), jnp.zeros((count, 3))
-    return Rendering(black, zeros, zeros, zeros, black)
+    return Rendering(black, zeros, zeros, zeros, linear=black, lost=black)
 
 
 @functools.partial(jax.jit, static_argnames=("budget", "detail"))
@@ -136,7 +137,7 @@ def _trace_tile(
 ) -> _Tile:
     capacity = room(budget, TILE).paths
     traced = path_tracing.trace(geometry, rays, budget=budget, capacity=capacity, detail=detail)
-    return _sort(traced.paths, TILE, real)
+    return _sort(traced, real)
 
 
 @functools.partial(jax.jit, static_argnames=("config", "chunk"))
@@ -163,21 +164,21 @@ def _finish_tile(sums: Rendering) -> Rendering:
     return _finish(sums)
 
 
-def _sort(paths: LightPaths, rays: int, real: int | Int[Array, ""]) -> _Tile:
+def _sort(traced: Traced, real: int | Int[Array, ""]) -> _Tile:
     """Moves the paths that exist to the front and marks the heaviest of each ray.
 
     Args:
-      paths: of a tile.
-      rays: size of the tile.
+      traced: the light of a tile.
       real: how many of its rays are not there to fill it up.
     """
+    paths, rays = traced.paths, traced.lost.shape[0]
     exists = light_paths.exists(paths) & (paths.rays < real)
     order = jnp.argsort(~exists, stable=True)
     weight = jnp.mean(paths.weights, axis=-1)
     most = jax.ops.segment_max(weight, paths.rays, num_segments=rays)
     heaviest = exists & (weight >= most[paths.rays])
     sorted_paths = jax.tree.map(lambda x: x[order], paths)
-    return _Tile(sorted_paths, heaviest[order], jnp.sum(exists))
+    return _Tile(sorted_paths, heaviest[order], jnp.sum(exists), traced.lost)
 
 
 def _add(
@@ -190,7 +191,7 @@ def _add(
 ) -> Rendering:
     """Adds some paths to the linear colours and distances of their rays."""
     jitter = pixels.no_jitter(config, paths.radii.shape[0])
-    one = jnp.ones_like(paths.radii[0])
+    one = jnp.ones((), paths.radii.dtype)
     seen = pixels.render_paths(params, config, paths, jitter, anneal=one).composite
     paths = dyes.dye(params.dyes, paths, radius=config.radius)
     share = jnp.mean(paths.weights, axis=-1)

@@ -22,9 +22,8 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.light_paths import PathEnds
-from refref_jax.optics.media import EMPTY_SLOT
 from refref_jax.optics.wavefront import Geometry
-from refref_jax.render import colour
+from refref_jax.render import colour, tiles
 from refref_jax.render.backgrounds import Radiance
 
 TILE = 65536
@@ -34,9 +33,6 @@ _SMALLEST_TILE = 1024
 
 # Paths that are looked up at once.
 _CHUNK = 4096
-
-# Where a tile is filled up, a ray starts this far out and goes away: it meets nothing.
-_OUT_OF_REACH = 1e9
 
 
 class KnownRendering(NamedTuple):
@@ -103,27 +99,15 @@ def render_known(
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), (rays, inside))
     # On the device once, not once a tile.
     geometry, radiance = jax.device_put((geometry, radiance))
-    tiles = [jax.device_get(_blank())]
+    parts = [jax.device_get(_blank())]
     for start in range(0, count, tile):
-        part = _slice_rays(*flat, start, tile)
-        tiles.append(jax.device_get(_render_tile(geometry, radiance, *part, budget=budget)))
-    casts = sum(int(each.casts) for each in tiles)
-    fields = [np.concatenate(field)[:count] for field in zip(*(t[:-1] for t in tiles), strict=True)]
+        part = tiles.cut_out(*flat, start, tile)
+        parts.append(jax.device_get(_render_tile(geometry, radiance, *part, budget=budget)))
+    casts = sum(int(each.casts) for each in parts)
+    fields = [np.concatenate(field)[:count] for field in zip(*(p[:-1] for p in parts), strict=True)]
     fields = [field.reshape(*shape, *field.shape[1:]) for field in fields]
     # Each ray that fills up the last tile misses, which takes one cast if any are made.
     return KnownRendering(*fields, casts - (-count % tile) * (budget.bends > 0))
-
-
-def _slice_rays(
-    rays: Rays, inside: Int[np.ndarray, "rays slots"] | None, start: int, tile: int
-) -> tuple[Rays, Int[np.ndarray, "tile slots"] | None]:
-    """Returns one tile of rays, filled up with rays that meet nothing."""
-    part, within = jax.tree.map(lambda x: x[start : start + tile], (rays, inside))
-    missing = tile - part.radii.shape[0]
-    away = np.tile(np.eye(3, dtype=part.directions.dtype)[:1], (missing, 1))
-    filling = Rays(_OUT_OF_REACH * away, away, np.ones(missing, part.radii.dtype))
-    nowhere = jax.tree.map(lambda x: np.full((missing, x.shape[1]), EMPTY_SLOT, x.dtype), within)
-    return jax.tree.map(lambda a, b: np.concatenate([a, b]), (part, within), (filling, nowhere))
 
 
 def _blank() -> _Tile:

@@ -82,6 +82,10 @@ def test_scene_json_tells_where_the_walls_stand(tmp_path, ball_scene):
     assert half_extent(_scene(tmp_path / "a", {"background": {"half_extent": 3}})) == 3.0
     assert half_extent(_scene(tmp_path / "b", {"background": {"type": "cube"}})) is None
     assert half_extent(_scene(tmp_path / "c")) is None
+    # The cube around a sphere.
+    assert (
+        half_extent(_scene(tmp_path / "d", {"background": {"type": "sphere", "radius": 5}})) == 5.0
+    )
 
 
 @pytest.mark.parametrize("wrong", ["7", 0, -1.0, [7.3]])

@@ -36,7 +36,8 @@ def test_rays_that_do_not_are_told_the_nearest_squares(rays, nearest):
 def _fine(linear, distance):
     linear, distance = (np.asarray(x, np.float32) for x in (linear, distance))
     rgb = np.repeat(linear[..., None], 3, axis=-1)
-    return Rendering(np.zeros_like(rgb), distance, distance, np.ones_like(distance), rgb)
+    black = np.zeros_like(rgb)
+    return Rendering(black, distance, distance, np.ones_like(distance), rgb, black)
 
 
 def test_half_a_pixel_of_white_is_more_than_half_of_its_code():

@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -5,7 +7,7 @@ import pytest
 
 from refref_jax.data.cameras import image_rays
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics.budgets import PAPER, STRAIGHT
+from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE
 from refref_jax.optics.details import everything
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.render import Model, images, init_params, render_image, render_rays
@@ -49,6 +51,23 @@ def test_rendering_in_one_piece_gives_the_same(model, rays, whole):
     single = jax.jit(lambda params: render_rays(model._replace(params=params), flat))
     for ours, expected in zip(single(model.params), whole, strict=True):
         np.testing.assert_allclose(ours, expected.reshape(ours.shape), atol=2e-5)
+
+
+def test_one_ray_through_glass_has_the_room_of_its_tile(model, rays, monkeypatch):
+    monkeypatch.setattr(images, "TILE", 64)
+    images._trace_tile.clear_cache()
+    # Room for three paths a ray in two tiles of three: 64 copies of one ray would lose light.
+    scarce = dataclasses.replace(TREE, paths_per_ray=1.5)
+    middle = jax.tree.map(lambda x: x[8, 8:9], rays)
+    seen = render_image(model._replace(budget=scarce), middle)
+    images._trace_tile.clear_cache()
+    np.testing.assert_array_equal(seen.lost, 0.0)
+    np.testing.assert_allclose(seen.accumulation, 1.0, atol=1e-5)
+
+
+def test_no_rays_at_all(model):
+    none = jax.tree.map(lambda x: x[:0], image_rays(CAMERAS, 0))
+    assert render_image(model, none).rgb.shape == (0, 16, 3)
 
 
 def test_an_image_of_several_tiles(model, rays, whole, monkeypatch):
