@@ -34,6 +34,7 @@ _TOLERANCE = 0.05
 def main(arguments: list[str]) -> None:
     del arguments
     scene = Path(_SCENE.value)
+    trained_runs.check_masks(scene)
     results = {name: _measure(scene, name, options) for name, options in _INTERIORS.items()}
     print("| interior | PSNR | PSNR in mask | ms a step |")
     print("|---|---|---|---|")

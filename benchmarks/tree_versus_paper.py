@@ -66,6 +66,8 @@ def main(arguments: list[str]) -> None:
     full = _STEPS.value or PRESETS[_PRESET.value].schedule.steps
     scenes = [Path(scene) for scene in _SCENES.value]
     counts = sorted({full, *map(int, _CURVE_STEPS.value)})
+    for scene in scenes:
+        trained_runs.check_masks(scene)
     duels = [fight(scene, steps) for steps in counts for scene in scenes]
     print(table(duels))
     if len(counts) > 1:

@@ -66,10 +66,6 @@ def choose(needs: Needs, wishes: Wishes) -> Choices:
             "Add .ply files of the objects to the scene's folder meshes, or use --paths=straight."
         )
     paths = wishes.paths or ("tree" if needs.parts else "straight")
-    if paths == "straight" and (wishes.cut is not None or wishes.bends is not None):
-        raise ValueError(
-            "Straight light has no --cut and no --bends. Leave them out, or use --paths=tree."
-        )
     budget = make_budget(paths, cut=wishes.cut, bends=wishes.bends)
     if budget.bends:
         budget = dataclasses.replace(budget, reentry=wishes.reentry or needs.reentry)

@@ -2,12 +2,11 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
+from refref_jax.fields.precision import Precision
 from refref_jax.fields.radiance_field import RadianceFieldConfig
 from refref_jax.render.config import Footprint, ModelConfig
-
-Precision = Literal["float32", "bfloat16"]
 
 # Points of the cone patterns, see `sampling.cones`.
 _PATTERNS = (1, 6)

@@ -19,8 +19,15 @@ def make_budget(paths: str, *, cut: float | None = None, bends: int | None = Non
       paths: a name in `BUDGETS`.
       cut: smallest throughput worth following; the budget's own if `None`.
       bends: most bends; the budget's own if `None`.
+
+    Raises:
+      ValueError: if light is straight and has a cut or bends nevertheless.
     """
     budget = BUDGETS[paths]
+    if budget.bends == 0 and not cut is bends is None:
+        raise ValueError(
+            f"--paths={paths} has no --cut and no --bends. Leave them out, or use --paths=tree."
+        )
     given = {"cut": cut, "bends": bends}
     changed = dataclasses.replace(budget, **{k: v for k, v in given.items() if v is not None})
     if not changed.cut < budget.cut:

@@ -3,8 +3,8 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from experiments import trade_off_figures, trade_table
-from experiments.trade_off_figures import COLOURS, LABEL_HEIGHT, pyplot
+from experiments import path_figures, trade_table
+from experiments.path_figures import COLOURS, LABEL_HEIGHT, pyplot
 from experiments.trade_table import Row
 
 _COSTS: dict[str, Callable[[Row], float]] = {
@@ -57,7 +57,7 @@ def write(path: Path, rows: Sequence[Row]) -> None:
         axis.grid(True, color="#e6e6e6", linewidth=0.8)
         axis.set_axisbelow(True)
         axis.spines[["top", "right"]].set_visible(False)
-        trade_off_figures.label_plainly(axis.xaxis)
+        path_figures.label_plainly(axis.xaxis)
     masked = all(row.psnr_masked is not None for row in rows)
     axes[0].set_ylabel("PSNR inside the mask, dB" if masked else "PSNR, dB")
     figure.suptitle(f"{rows[0].scene}: one option changed at a time")

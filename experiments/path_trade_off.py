@@ -20,12 +20,12 @@ from experiments import (
     commands,
     known_scenes,
     named_budgets,
+    path_figures,
     scenes,
     supersampling,
-    trade_off_figures,
 )
 from experiments.known_scenes import KnownScene
-from experiments.trade_off_figures import Trial
+from experiments.path_figures import Trial
 from refref_jax.optics.budgets import BUDGETS, Budget
 
 _SCENES = flags.DEFINE_list("scenes", None, "Folders of scenes, with commas.", required=True)
@@ -79,7 +79,7 @@ def main() -> None:
                 f"{trial.scene} {trial.name}: {trial.psnr_masked:.1f} dB, "
                 f"{trial.casts_per_pixel:.2f} casts",
             )
-    pictures = trade_off_figures.write(out, trials)
+    pictures = path_figures.write(out, trials)
     print(f"Figures:  {', '.join(map(str, pictures))}")
     print(f"Measures: {table}")
     print("Next: choose a cut, and render with python -m experiments.render_known --cut=...")

@@ -41,7 +41,7 @@ def _all_points(rows: Sequence[Row]) -> str:
             f"{1e3 * row.seconds_per_step:.1f}",
             f"{row.rays_per_second:.0f}",
             f"{row.stepping:.0f}",
-            f"{row.peak_host_mib:.0f}",
+            _or_dash(row.peak_host_mib, ".0f"),
             _or_dash(row.peak_device_mib, ".0f"),
             _or_dash(row.psnr_masked, ".2f"),
             f"{row.psnr:.2f}",
@@ -58,7 +58,7 @@ def _first_table(found: Sequence[Turn]) -> str:
         return f"No option gains more than {NOISE:g} dB."
     lines = ["| option | gain, dB | more time | dB for each percent |", "|---|---|---|---|"]
     for turn in found:
-        rate = "free" if turn.percent <= 0.0 else f"{turn.gain / turn.percent:.3f}"
+        rate = "free" if trade_table.is_free(turn) else f"{turn.gain / turn.percent:.3f}"
         lines.append(f"| `--{_option(turn)}` | {turn.gain:+.2f} | {_time(turn)} | {rate} |")
     return "\n".join(lines)
 

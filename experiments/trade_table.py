@@ -12,6 +12,9 @@ from experiments.trade_points import BASE, OF_EVALUATION
 NOISE = 0.3
 """Decibels by which trainings differ that differ in nothing that matters; see `BUILD_NOTES.md`."""
 
+TIME_NOISE = 3.0
+"""Percent of time that say nothing, on a machine that was left alone."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Row:
@@ -37,7 +40,7 @@ class Row:
     rays_per_second: float
     train_seconds: float
     startup_seconds: float
-    peak_host_mib: float
+    peak_host_mib: float | None
     peak_device_mib: float | None
     psnr: float
     psnr_masked: float | None
@@ -143,7 +146,14 @@ def worth_turning(found: Sequence[Turn]) -> list[Turn]:
     Those that take no more time come first, by gain; then by decibels for a percent of time.
     """
     gaining = [turn for turn in found if turn.gain > NOISE]
-    return _best_of_each(gaining, lambda turn: _rate(turn.gain, turn.percent))
+    return _best_of_each(
+        gaining, lambda turn: _rate(turn.gain, 0.0 if is_free(turn) else turn.percent)
+    )
+
+
+def is_free(turn: Turn) -> bool:
+    """Returns whether a turn takes no more time than two measurements of the same differ by."""
+    return turn.percent <= TIME_NOISE
 
 
 def worth_saving(found: Sequence[Turn]) -> list[Turn]:
@@ -151,7 +161,7 @@ def worth_saving(found: Sequence[Turn]) -> list[Turn]:
 
     Those that lose no more than noise come first, by time saved; then by percent for a decibel.
     """
-    saving = [turn for turn in found if turn.percent < -1.0 and turn.gain <= NOISE]
+    saving = [turn for turn in found if turn.percent < -TIME_NOISE and turn.gain <= NOISE]
 
     def worth(turn: Turn) -> tuple[bool, float]:
         return _rate(-turn.percent, -turn.gain if turn.gain < -NOISE else 0.0)

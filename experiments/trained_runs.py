@@ -9,6 +9,8 @@ import dataclasses
 import itertools
 import json
 import os
+import re
+import signal
 import statistics
 import subprocess
 import sys
@@ -16,6 +18,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from refref_jax.data import local_layout
 
 _MEASURED = "measured.json"
 
@@ -43,7 +47,7 @@ class Training:
       train_seconds: of all its steps, compiling included.
       startup_seconds: of its process beside the steps at that pace: starting, reading, compiling,
         saving. Too little if the training was resumed.
-      peak_host_mib: largest resident set of its process.
+      peak_host_mib: largest resident set of its process; `None` if it had ended before, unmeasured.
       peak_device_mib: largest memory of its accelerator; `None` where there is none.
     """
 
@@ -52,7 +56,7 @@ class Training:
     rays_per_second: float
     train_seconds: float
     startup_seconds: float
-    peak_host_mib: float
+    peak_host_mib: float | None
     peak_device_mib: float | None
 
 
@@ -100,7 +104,10 @@ def train(
     steps = _steps_in(options)
     every = log_every or min(_LOG_EVERY, max(1, (steps or 4 * _LOG_EVERY) // 4))
     command = [f"--scene={scene}", f"--out={run}", "--resume", f"--log_every={every}", *options]
+    trained_before = _has_ended(run, steps)
     wall, peak = _command("train", *command, log=run.with_name(f"{run.name}.log"))
+    if trained_before:
+        wall, peak = 0.0, None
     training = read_training(run, wall=wall, peak_host_mib=peak)
     _write(run, {"asked": asked, "training": dataclasses.asdict(training)})
     return training
@@ -127,16 +134,28 @@ def evaluate(
     return Evaluation(**known["evaluations"][key])
 
 
-def read_training(run: Path, *, wall: float, peak_host_mib: float) -> Training:
+def check_masks(scene: Path, split: str = "test") -> None:
+    """Refuses a scene whose images have no masks, before anything is trained.
+
+    Raises:
+      ValueError: naming the scene.
+    """
+    if local_layout.read_frames(scene, split).masks is None:
+        raise ValueError(
+            f"The {split} images of {scene} have no masks. Add mask_file_path to their frames: "
+            "what is compared is inside them."
+        )
+
+
+def read_training(run: Path, *, wall: float, peak_host_mib: float | None) -> Training:
     """Reads what a finished training cost from its metrics.
 
     Args:
       run: its folder.
       wall: seconds that its process took.
-      peak_host_mib: largest resident set of that process.
+      peak_host_mib: largest resident set of that process, if that is known.
     """
-    text = (run / "metrics.jsonl").read_text("utf-8")
-    lines = [json.loads(line) for line in text.splitlines()]
+    lines = _metrics(run)
     last = lines[-1]
     pace = seconds_per_step(lines)
     batch = json.loads((run / "config.json").read_text("utf-8"))["batch"]
@@ -168,6 +187,7 @@ def _command(name: str, *options: str, log: Path) -> tuple[float, float]:
     If this process is interrupted, the command is asked to stop, and may save before it does.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
+    written = log.stat().st_size if log.exists() else 0
     start = time.monotonic()
     with log.open("a", encoding="utf-8") as file:
         print(f"$ python -m experiments.{name} {' '.join(options)}", file=file, flush=True)
@@ -184,15 +204,29 @@ def _command(name: str, *options: str, log: Path) -> tuple[float, float]:
             raise
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode != 0:
-        raise RunFailedError(f"experiments.{name}: {_complaint(log)} (all of it: {log})")
+        reason = _complaint(log.read_bytes()[written:].decode("utf-8"), process.returncode)
+        raise RunFailedError(f"experiments.{name}: {reason} (all of it: {log})")
     return time.monotonic() - start, usage.ru_maxrss * _RSS_UNIT / _MIB
 
 
-def _complaint(log: Path) -> str:
-    """Returns the last line of a log that tells an error, or else its last line."""
-    lines = [line for line in log.read_text("utf-8").splitlines() if line.strip()]
-    told = [line for line in lines if "rror" in line]
-    return (told or lines)[-1].strip()
+def _complaint(printed: str, code: int) -> str:
+    """Returns the last line that tells an error, or what else a command ended with."""
+    lines = [line.strip() for line in printed.splitlines() if line.strip()]
+    told = [line for line in lines if re.search(r"(^e|E)rror: ", line)]
+    if told:
+        return told[-1]
+    return f"killed by {signal.Signals(-code).name}" if code < 0 else lines[-1]
+
+
+def _has_ended(run: Path, steps: int | None) -> bool:
+    """Returns whether a run of so many steps is finished, so that training it takes no time."""
+    lines = _metrics(run) if (run / "metrics.jsonl").is_file() else []
+    return bool(lines) and lines[-1]["step"] == steps
+
+
+def _metrics(run: Path) -> list[dict[str, Any]]:
+    text = (run / "metrics.jsonl").read_text("utf-8")
+    return [json.loads(line) for line in text.splitlines()]
 
 
 def _steps_in(options: Sequence[str]) -> int | None:

@@ -4,6 +4,8 @@ import shutil
 import tempfile
 from pathlib import Path
 
+from tests import code_generator
+
 # Several processes share an accelerator.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
@@ -12,6 +14,7 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="refref_jax_tests_")
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 os.environ.setdefault("JAX_PERSISTENT_COMPILATION_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+os.environ["XLA_FLAGS"] = code_generator.faster(os.environ.get("XLA_FLAGS", ""))
 
 import jax
 import pytest

@@ -60,8 +60,8 @@ def begin(ray: Rays, footprint: Footprint) -> Spread:
     """Returns the spread of a camera ray: all rays of a pixel start in one point."""
     if footprint == "cone":
         return nothing(ray.origins)
-    across = ray.radii * jnp.stack(orthonormal_basis(ray.directions))
-    return Spread(jnp.zeros_like(across), across)
+    sides = ray.radii * jnp.stack(orthonormal_basis(ray.directions))
+    return Spread(jnp.zeros_like(sides), sides)
 
 
 def nothing(like: Float[Array, "3"]) -> Spread:

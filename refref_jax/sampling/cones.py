@@ -1,8 +1,9 @@
 """Multisamples of a pixel's cone, placed around the bent centre line of a light path.
 
 An interval of a path is a conical frustum. It is sampled at a few points, each an isotropic
-Gaussian, so that a field can blur what is finer than the pixel's footprint. The cone grows with
-arc length as if the path were straight; its pattern is carried along the bends.
+Gaussian, so that a field can blur what is finer than the pixel's footprint. Without derivatives of
+the path, the cone grows with arc length as if it were straight, and its pattern is carried along
+the bends; with them (`optics.footprints`) it is as wide as they say.
 
 Source: Barron et al., Zip-NeRF (2023), section 2; paper (arXiv 2505.05848), supplement, for the
 bent centre line.

@@ -15,7 +15,7 @@ from refref_jax.training import steps
 from refref_jax.training.config import TrainingConfig
 from refref_jax.training.state import TrainState
 
-# Pixels by which the share that meets an object is estimated.
+# Pixels by which the room for a batch's paths is measured.
 _SURVEY = 1 << 14
 
 # Memory for the light paths of all pixels.
@@ -56,7 +56,7 @@ def set_up(
     """Moves the geometry to the device, and measures how many paths it makes of a ray.
 
     Light paths of all pixels are kept if the run sees them more than once and they take at most
-    half a gibibyte.
+    half a gibibyte; while they are joined, three times that is in use.
     """
     geometry = jax.tree.map(jnp.asarray, geometry)
     found = steps.survey_paths(geometry, sampler.survey(_SURVEY).rays, budget=budget)
@@ -137,7 +137,8 @@ def trace_batches(setup: Setup, numbers: Sequence[int]) -> steps.Pool:
 def _trace_epoch(setup: Setup) -> steps.Pool | None:
     """Traces all batches once and for all, if their paths are worth keeping and fit in memory.
 
-    They are traced pool by pool, so that training is the same whether they are kept or not.
+    They are traced pool by pool, with a pool's room for paths. Training is the same whether they
+    are kept or not as long as a pool has that room: when not kept, its batches are others.
     """
     config, batches = setup.config, setup.sampler.batches
     pools = range(0, batches, config.pool)

@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests import code_generator
+
 ROOT = Path(__file__).parents[2]
 
 # Options of a training that takes seconds.
@@ -15,6 +17,7 @@ def run_command(command, *options, fails=False):
     result = subprocess.run(
         [sys.executable, "-m", f"experiments.{command}", *map(str, options)],
         cwd=ROOT,
+        env=code_generator.of_users(),
         capture_output=True,
         text=True,
         check=False,

@@ -87,6 +87,8 @@ def test_doubtful_wishes_are_granted_with_a_word():
         (_EMPTY, Wishes(paths="tree"), "no meshes"),
         (_CLEAR, Wishes(cut=2.0), "The cut"),
         (_CLEAR, Wishes(bends=-1), "bends"),
+        (_CLEAR, Wishes(paths="straight", bends=10), "no --cut and no --bends"),
+        (_CLEAR, Wishes(paths="straight", cut=0.02), "no --cut and no --bends"),
     ],
 )
 def test_wishes_that_contradict_are_refused(needs, wishes, message):

@@ -287,6 +287,27 @@ def test_a_failure_tells_its_last_word_and_is_tried_again(stub):
     assert (stub / "calls.txt").read_text().split() == ["train", "train"]
 
 
+def test_the_complaint_is_that_of_the_last_attempt(tmp_path, stub):
+    point = trade_points.sweep(preset="tiny", values={"cut": ("2",)}, knobs=["cut"])[1]
+    log = stub / f"{sweeps.run_name(point, _SCENE)}.log"
+    log.parent.mkdir()
+    log.write_text("error: an older one\n")
+    with pytest.raises(RunFailedError, match="The cut is a share"):
+        sweeps.measure(point, _SCENE, stub)
+    mirror = "$ python -m experiments.train --scene=mirror\nCompiling\n"
+    assert trained_runs._complaint(mirror, 1) == "Compiling"
+    assert trained_runs._complaint(mirror, -9) == "killed by SIGKILL"
+    assert trained_runs._complaint("ValueError: no\nbye\n", 1) == "ValueError: no"
+
+
+def test_a_training_that_ended_unmeasured_has_no_peak(stub):
+    point = trade_points.sweep(preset="tiny", steps=[4])[0]
+    first = sweeps.measure(point, _SCENE, stub)
+    (stub / sweeps.run_name(point, _SCENE) / "measured.json").unlink()
+    again = sweeps.measure(point, _SCENE, stub)
+    assert again.peak_host_mib is None and again.seconds_per_step == first.seconds_per_step
+
+
 @pytest.mark.slow
 def test_a_real_sweep_of_three_steps(tmp_path):
     options = (f"--scene={_SCENE}", f"--out={tmp_path}", "--steps=3", "--limit=1")

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+from tests import code_generator
+
 _PREAMBLE = """
 import jax, jax.numpy as jnp, numpy as np
 from refref_jax.geometry import bvh, bvh_build
@@ -56,6 +58,7 @@ def test_the_traversal_compiles_in_any_context():
     ]
     result = subprocess.run(
         [sys.executable, "-c", "\n".join([_PREAMBLE, *checks])],
+        env=code_generator.of_users(),
         capture_output=True,
         text=True,
         check=False,
