@@ -10,7 +10,7 @@ import numpy as np
 from absl import flags
 from jaxtyping import Bool, Float, Int, UInt8
 
-from experiments import scenes
+from experiments import mesh_report
 from refref_jax import metrics
 from refref_jax.data import background, cameras, containment, local_layout, meshes
 from refref_jax.data.geometry import build_geometry
@@ -90,7 +90,7 @@ def read_scene(
     frames = _choose(frames, chosen)
     parts = meshes.read_meshes(scene, indices=indices)
     tree = containment.find_containment(parts)
-    scenes.report_meshes(parts, tree, rule=rule)
+    mesh_report.report_meshes(parts, tree, rule=rule)
     geometry = build_geometry(parts, tree.parents, rule=rule)
     return KnownScene(
         name=scene.resolve().name,

@@ -1,27 +1,15 @@
-"""What a run of training is to be: from options and the scene's needs to a resolved plan."""
+"""The options of training, and the run that they ask for."""
 
-import dataclasses
 from pathlib import Path
-from typing import NamedTuple
 
-import numpy as np
 from absl import flags
 
-from experiments import choices, model_options, scenes
-from experiments.choices import Choices, Wishes
+from experiments import model_options, planning, scenes
+from experiments.choices import Wishes
 from experiments.model_options import ModelOptions
-from experiments.presets import PRESETS, bounds
-from refref_jax.data import background, containment, local_layout, meshes, needs
-from refref_jax.data.batches import check_batch
-from refref_jax.data.cameras import Cameras
-from refref_jax.data.geometry import build_geometry
+from experiments.planning import Plan, Request
+from experiments.presets import PRESETS
 from refref_jax.optics.budgets import BUDGETS
-from refref_jax.optics.media import EMPTY_SLOT
-from refref_jax.optics.wavefront import Geometry
-from refref_jax.render.config import ModelConfig
-from refref_jax.render.saved import SavedModel
-from refref_jax.sampling.domains import Space
-from refref_jax.training.config import SceneConfig, TrainingConfig
 
 SCENE = flags.DEFINE_string("scene", None, "Folder of the scene to train on.")
 _PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Size of the model and its training.")
@@ -136,36 +124,24 @@ SETTLED = (
 """Options that a run is begun with, and can not change when it is resumed."""
 
 
-class Plan(NamedTuple):
-    """A run before it begins."""
-
-    config: TrainingConfig
-    model: SavedModel
-    geometry: Geometry
-
-
 def plan_from_flags() -> Plan:
-    """Reads and checks the scene, resolves all options, and prints what it comes to."""
+    """Plans the run that the options ask for, and prints what it comes to."""
     if SCENE.value is None:
         raise ValueError("No scene is given. Add --scene=FOLDER.")
-    scene = Path(SCENE.value).resolve()
-    local_layout.check_scene(scene)
-    frames = local_layout.read_frames(scene, "train")
-    parts = meshes.read_meshes(scene, indices=scenes.given_indices())
-    tree = containment.find_containment(parts)
-    scenes.report_meshes(parts, tree, rule=scenes.RULE.value)
-    if scenes.RULE.value == "priority":
-        _refuse_cameras_inside(parts, frames.cameras)
-    space = background.space(scene) if _BACKGROUND.value == "auto" else _BACKGROUND.value
-    found = needs.find_needs(parts, tree, frames.cameras, rule=scenes.RULE.value, space=space)
-    chosen = choices.choose(found, _wishes())
-    config = _training(scene, frames.cameras, chosen)
-    model = SavedModel(_model(scene, frames.cameras, space, chosen), chosen.budget)
-    print(
-        "\n".join([needs.describe(found), *choices.report(config, model, chosen), *chosen.warnings])
+    request = Request(
+        scene=Path(SCENE.value).resolve(),
+        preset=_PRESET.value,
+        wishes=_wishes(),
+        options=_options(),
+        rule=scenes.RULE.value,
+        indices=scenes.given_indices(),
+        space=None if _BACKGROUND.value == "auto" else _BACKGROUND.value,
+        radius=_RADIUS.value,
+        steps=_STEPS.value,
+        batch=_BATCH.value,
+        seed=_SEED.value,
     )
-    coloured = parts if chosen.tints == "given" else meshes.without_colour(parts)
-    return Plan(config, model, build_geometry(coloured, tree.parents, rule=scenes.RULE.value))
+    return planning.make_plan(request)
 
 
 def _wishes() -> Wishes:
@@ -174,28 +150,8 @@ def _wishes() -> Wishes:
     return Wishes(paths=_PATHS.value, cut=_CUT.value, bends=_BENDS.value, **decided)
 
 
-def _training(scene: Path, cameras: Cameras, chosen: Choices) -> TrainingConfig:
-    preset = PRESETS[_PRESET.value]
-    batch = _BATCH.value or preset.batch
-    check_batch(cameras, batch)
-    indices = tuple(sorted(scenes.given_indices().items()))
-    return TrainingConfig(
-        scene=SceneConfig(str(scene), scenes.RULE.value, indices),
-        paths=chosen.paths,
-        loss=preset.loss,
-        schedule=preset.schedule.over(_STEPS.value or preset.schedule.steps),
-        batch=batch,
-        pool=preset.pool,
-        seed=_SEED.value,
-    )
-
-
-def _model(scene: Path, cameras: Cameras, space: Space, chosen: Choices) -> ModelConfig:
-    radius = _RADIUS.value or (background.half_extent(scene) if space == "bounded" else None)
-    extent = bounds(cameras, space=space, radius=radius)
-    model = PRESETS[_PRESET.value].model(extent, chosen.interior)
-    model = dataclasses.replace(model, learned_tints=chosen.learned_tints)
-    options = ModelOptions(
+def _options() -> ModelOptions:
+    return ModelOptions(
         samples=None if _SAMPLES.value is None else model_options.parse_samples(_SAMPLES.value),
         multisamples=_MULTISAMPLES.value,
         entries=_ENTRIES.value,
@@ -203,13 +159,3 @@ def _model(scene: Path, cameras: Cameras, space: Space, chosen: Choices) -> Mode
         precision=_PRECISION.value,
         footprint=_FOOTPRINT.value,
     )
-    return model_options.override(model, options, preset=_PRESET.value)
-
-
-def _refuse_cameras_inside(parts: list[meshes.MeshPart], cameras: Cameras) -> None:
-    """Refuses cameras whose rays would have to know at once what they are in."""
-    if np.any(containment.parts_around(parts, cameras.poses[:, :, 3]) != EMPTY_SLOT):
-        raise ValueError(
-            "A camera stands inside a mesh, which training can not follow under --rule=priority. "
-            "Use --rule=nested, or move the camera."
-        )

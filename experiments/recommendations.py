@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments import trade_table, trained_runs
+from experiments.child_process import RunFailedError
 from experiments.trade_table import Row
-from experiments.trained_runs import RunFailedError, Training
+from experiments.trained_runs import Training
 
 
 @dataclasses.dataclass(frozen=True)

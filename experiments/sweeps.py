@@ -12,9 +12,9 @@ from experiments import (
     trade_table,
     trained_runs,
 )
+from experiments.child_process import RunFailedError
 from experiments.trade_points import BASE, Point
 from experiments.trade_table import Row
-from experiments.trained_runs import RunFailedError
 
 Measure = Callable[[Point], Row]
 """Trains and evaluates a point, or raises `RunFailedError`."""

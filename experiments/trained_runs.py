@@ -8,17 +8,12 @@ before, and with a peak of memory that is its own. What has been measured is kep
 import dataclasses
 import itertools
 import json
-import os
-import re
-import signal
 import statistics
-import subprocess
-import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from experiments import child_process
 from refref_jax.data import local_layout
 
 _MEASURED = "measured.json"
@@ -27,13 +22,7 @@ _MEASURED = "measured.json"
 # of the tracing.
 _LOG_EVERY = 64
 
-# ru_maxrss is in KiB, but in bytes on macOS.
-_RSS_UNIT = 1.0 if sys.platform == "darwin" else 1024.0
 _MIB = 2.0**20
-
-
-class RunFailedError(Exception):
-    """A training or evaluation ended with an error; the text is its last line and where to read."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +94,7 @@ def train(
     every = log_every or min(_LOG_EVERY, max(1, (steps or 4 * _LOG_EVERY) // 4))
     command = [f"--scene={scene}", f"--out={run}", "--resume", f"--log_every={every}", *options]
     trained_before = _has_ended(run, steps)
-    wall, peak = _command("train", *command, log=run.with_name(f"{run.name}.log"))
+    wall, peak = child_process.run("train", *command, log=run.with_name(f"{run.name}.log"))
     if trained_before:
         wall, peak = 0.0, None
     training = read_training(run, wall=wall, peak_host_mib=peak)
@@ -125,7 +114,7 @@ def evaluate(
     key = " ".join([f"--split={split}", *options])
     if key not in known.get("evaluations", {}):
         command = [f"--run={run}", f"--scene={scene}", *key.split()]
-        _command("evaluate", *command, log=run.with_name(f"{run.name}.log"))
+        child_process.run("evaluate", *command, log=run.with_name(f"{run.name}.log"))
         summary = json.loads((run / "eval" / split / "metrics.json").read_text("utf-8"))
         names = {field.name for field in dataclasses.fields(Evaluation)}
         values = {name: _number(x) for name, x in summary["results"].items() if name in names}
@@ -179,43 +168,6 @@ def seconds_per_step(lines: Sequence[dict[str, Any]]) -> float:
     pairs = itertools.pairwise(lines)
     paces = [(b["seconds"] - a["seconds"]) / (b["step"] - a["step"]) for a, b in pairs]
     return statistics.median(paces) if paces else lines[0]["seconds"] / lines[0]["step"]
-
-
-def _command(name: str, *options: str, log: Path) -> tuple[float, float]:
-    """Runs a command and returns its seconds and the peak of its memory in MiB.
-
-    If this process is interrupted, the command is asked to stop, and may save before it does.
-    """
-    log.parent.mkdir(parents=True, exist_ok=True)
-    written = log.stat().st_size if log.exists() else 0
-    start = time.monotonic()
-    with log.open("a", encoding="utf-8") as file:
-        print(f"$ python -m experiments.{name} {' '.join(options)}", file=file, flush=True)
-        process = subprocess.Popen(
-            [sys.executable, "-m", f"experiments.{name}", *options],
-            stdout=file,
-            stderr=subprocess.STDOUT,
-        )
-        try:
-            _, status, usage = os.wait4(process.pid, 0)
-        except KeyboardInterrupt:
-            process.terminate()
-            process.wait()
-            raise
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode != 0:
-        reason = _complaint(log.read_bytes()[written:].decode("utf-8"), process.returncode)
-        raise RunFailedError(f"experiments.{name}: {reason} (all of it: {log})")
-    return time.monotonic() - start, usage.ru_maxrss * _RSS_UNIT / _MIB
-
-
-def _complaint(printed: str, code: int) -> str:
-    """Returns the last line that tells an error, or what else a command ended with."""
-    lines = [line.strip() for line in printed.splitlines() if line.strip()]
-    told = [line for line in lines if re.search(r"(^e|E)rror: ", line)]
-    if told:
-        return told[-1]
-    return f"killed by {signal.Signals(-code).name}" if code < 0 else lines[-1]
 
 
 def _has_ended(run: Path, steps: int | None) -> bool:

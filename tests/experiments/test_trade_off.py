@@ -6,9 +6,9 @@ import subprocess
 import imageio.v3 as iio
 import pytest
 
-from experiments import sweeps, trade_points, trade_report, trade_table, trained_runs
+from experiments import child_process, sweeps, trade_points, trade_report, trade_table, trained_runs
+from experiments.child_process import RunFailedError
 from experiments.trade_points import BASE
-from experiments.trained_runs import RunFailedError
 from tests.experiments.command import ROOT, run_command
 from tests.experiments.made_rows import made_row
 
@@ -259,7 +259,7 @@ def stub(tmp_path, monkeypatch):
         name = command[2].removeprefix("experiments.")
         return start([command[0], str(tmp_path / "stub.py"), name, *command[3:]], **options)
 
-    monkeypatch.setattr(trained_runs.subprocess, "Popen", popen)
+    monkeypatch.setattr(child_process.subprocess, "Popen", popen)
     return tmp_path / "runs"
 
 
@@ -295,9 +295,9 @@ def test_the_complaint_is_that_of_the_last_attempt(tmp_path, stub):
     with pytest.raises(RunFailedError, match="The cut is a share"):
         sweeps.measure(point, _SCENE, stub)
     mirror = "$ python -m experiments.train --scene=mirror\nCompiling\n"
-    assert trained_runs._complaint(mirror, 1) == "Compiling"
-    assert trained_runs._complaint(mirror, -9) == "killed by SIGKILL"
-    assert trained_runs._complaint("ValueError: no\nbye\n", 1) == "ValueError: no"
+    assert child_process._complaint(mirror, 1) == "Compiling"
+    assert child_process._complaint(mirror, -9) == "killed by SIGKILL"
+    assert child_process._complaint("ValueError: no\nbye\n", 1) == "ValueError: no"
 
 
 def test_a_training_that_ended_unmeasured_has_no_peak(stub):
