@@ -17,15 +17,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import matplotlib
 from absl import app, flags
 
 from experiments import trained_runs
+from experiments.plotting import pyplot, style
 from experiments.presets import PRESETS
 from experiments.trained_runs import Evaluation, Training
-
-matplotlib.use("Agg")
-from matplotlib import pyplot
 
 _SCENES = flags.DEFINE_list("scenes", ["experiments/data/cube_smcvx_ball"], "Folders of scenes.")
 _PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Preset of all trainings.")
@@ -134,8 +131,7 @@ def draw(path: Path, duels: Sequence[Duel]) -> None:
     axis.minorticks_off()
     axis.set_xlabel("training steps")
     axis.set_ylabel("tree over paper inside the mask, dB")
-    axis.grid(True, color="#e6e6e6", linewidth=0.8)
-    axis.spines[["top", "right"]].set_visible(False)
+    style(axis)
     axis.legend(frameon=False)
     figure.savefig(path, dpi=130)
     pyplot.close(figure)

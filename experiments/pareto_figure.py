@@ -3,8 +3,8 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from experiments import path_figures, trade_table
-from experiments.path_figures import COLOURS, LABEL_HEIGHT, pyplot
+from experiments import trade_table
+from experiments.plotting import COLOURS, LABEL_HEIGHT, label_plainly, pyplot, style
 from experiments.trade_table import Row
 
 _COSTS: dict[str, Callable[[Row], float]] = {
@@ -33,31 +33,7 @@ def write(path: Path, rows: Sequence[Row]) -> None:
     }
     figure, axes = pyplot.subplots(1, 2, figsize=(14.0, 6.4), sharey=True, layout="constrained")
     for axis, (label, cost) in zip(axes, _COSTS.items(), strict=True):
-        front = trade_table.pareto(rows, cost)
-        axis.step(
-            [cost(row) for row in front],
-            [row.quality for row in front],
-            color=_FRONT,
-            linewidth=1.5,
-            where="post",
-            label="none better",
-        )
-        for knob, (colour, marker) in styles.items():
-            own = [row for row in rows if row.knob == knob]
-            axis.plot(
-                [cost(row) for row in own],
-                [row.quality for row in own],
-                marker,
-                color=colour,
-                markersize=9 if not knob else 6,
-                label=knob or "base",
-            )
-        axis.set_xscale("log")
-        axis.set_xlabel(label)
-        axis.grid(True, color="#e6e6e6", linewidth=0.8)
-        axis.set_axisbelow(True)
-        axis.spines[["top", "right"]].set_visible(False)
-        path_figures.label_plainly(axis.xaxis)
+        _draw(axis, rows, label, cost, styles)
     masked = all(row.psnr_masked is not None for row in rows)
     axes[0].set_ylabel("PSNR inside the mask, dB" if masked else "PSNR, dB")
     figure.suptitle(f"{rows[0].scene}: one option changed at a time")
@@ -68,6 +44,38 @@ def write(path: Path, rows: Sequence[Row]) -> None:
         _label_points(axis, rows, cost, styles)
     figure.savefig(path, dpi=130)
     pyplot.close(figure)
+
+
+def _draw(
+    axis: pyplot.Axes,
+    rows: Sequence[Row],
+    label: str,
+    cost: Callable[[Row], float],
+    styles: dict[str, tuple[str, str]],
+) -> None:
+    front = trade_table.pareto(rows, cost)
+    axis.step(
+        [cost(row) for row in front],
+        [row.quality for row in front],
+        color=_FRONT,
+        linewidth=1.5,
+        where="post",
+        label="none better",
+    )
+    for knob, (colour, marker) in styles.items():
+        own = [row for row in rows if row.knob == knob]
+        axis.plot(
+            [cost(row) for row in own],
+            [row.quality for row in own],
+            marker,
+            color=colour,
+            markersize=9 if not knob else 6,
+            label=knob or "base",
+        )
+    axis.set_xscale("log")
+    axis.set_xlabel(label)
+    style(axis)
+    label_plainly(axis.xaxis)
 
 
 def _label_points(

@@ -4,17 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import matplotlib
-
-matplotlib.use("Agg")
-from matplotlib import patheffects, pyplot, ticker
+from matplotlib import patheffects
 from matplotlib.lines import Line2D
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe and Ito's colours, which all eyes tell apart."""
-
-LABEL_HEIGHT = 13.0
-"""Of a label, in pixels of the screen."""
+from experiments.plotting import COLOURS, LABEL_HEIGHT, label_plainly, pyplot, style
 
 _MARKERS = {"straight": "s", "paper": "D"}
 _GREY = "#777777"
@@ -89,9 +82,7 @@ def _write_sweep(folder: Path, trials: Sequence[Trial], sweep: str) -> Path:
         axis.set_xscale("log" if cost == "seconds_per_pixel" else "linear")
         if cost == "seconds_per_pixel":
             label_plainly(axis.xaxis)
-        axis.grid(True, color="#e6e6e6", linewidth=0.8)
-        axis.set_axisbelow(True)
-        axis.spines[["top", "right"]].set_visible(False)
+        style(axis)
     axes[0].set_ylabel("PSNR inside the mask, dB")
     fixed = _fixed(trials, sweep)
     figure.suptitle(f"{_SWEEPS[sweep]}, as labelled{fixed}", fontsize=12)
@@ -169,10 +160,3 @@ def _legend(colours: dict[str, str]) -> list[Line2D]:
         for name, m in _MARKERS.items()
     ]
     return scenes + points
-
-
-def label_plainly(axis: matplotlib.axis.Axis) -> None:
-    """Labels a logarithmic axis with plain numbers."""
-    axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(ticker.StrMethodFormatter("{x:g}"))
-    axis.set_minor_formatter(ticker.NullFormatter())
