@@ -10,9 +10,17 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE
 from refref_jax.optics.details import everything
 from refref_jax.optics.light_paths import PathStatus
-from refref_jax.render import Model, images, init_params, render_image, render_rays
+from refref_jax.render import Model, images, init_params, render_image, render_rays, tiles
 from tests import scenes
 from tests.small_model import CAMERAS, MODEL
+
+
+@pytest.fixture(scope="module", autouse=True)
+def tile():
+    """One image fills a tile: more rays would only take longer."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(images, "TILE", 256)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -65,11 +73,6 @@ def test_one_ray_through_glass_has_the_room_of_its_tile(model, rays, monkeypatch
     np.testing.assert_allclose(seen.accumulation, 1.0, atol=1e-5)
 
 
-def test_no_rays_at_all(model):
-    none = jax.tree.map(lambda x: x[:0], image_rays(CAMERAS, 0))
-    assert render_image(model, none).rgb.shape == (0, 16, 3)
-
-
 def test_an_image_of_several_tiles(model, rays, whole, monkeypatch):
     monkeypatch.setattr(images, "TILE", 100)
     images._trace_tile.clear_cache()
@@ -109,21 +112,19 @@ def test_a_chunk_of_nothing_is_refused(model, rays):
 
 
 def test_rays_that_only_fill_up_a_tile_are_not_rendered(model, rays):
-    flat = Rays(*(x.reshape(256, *x.shape[2:]) for x in rays))
-    tile = images._trace_tile(
-        model.geometry, images._slice_rays(flat, 0), 256, budget=STRAIGHT, detail=everything(0)
-    )
-    assert int(tile.count) == 256
+    flat = Rays(*(x.reshape(256, *x.shape[2:])[:200] for x in rays))
+    full, _ = tiles.cut_out(flat, None, 0, 256)
+    assert full.radii.shape == (256,)
+    tile = images._trace_tile(model.geometry, full, 200, budget=STRAIGHT, detail=everything(0))
+    assert int(tile.count) == 200
 
 
 def test_rays_that_miss_pay_nothing_for_reflection(model, rays):
     flat = Rays(*(x.reshape(256, *x.shape[2:]) for x in rays))
-    tile = images._slice_rays(flat, 0)
     paper = images._trace_tile(
-        model.geometry, tile, 256, budget=PAPER, detail=everything(PAPER.bends)
+        model.geometry, flat, 256, budget=PAPER, detail=everything(PAPER.bends)
     )
-    straight = images._trace_tile(model.geometry, tile, 256, budget=STRAIGHT, detail=everything(0))
-    # Of the tile's rays, some meet the ball.
+    straight = images._trace_tile(model.geometry, flat, 256, budget=STRAIGHT, detail=everything(0))
     count = int(paper.count)
     reflections = np.asarray(paper.paths.statuses)[:count] == PathStatus.NOT_TRACED
     hits = np.sum((np.asarray(paper.paths.bends)[:count] > 0) & ~reflections)
