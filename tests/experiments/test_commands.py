@@ -60,6 +60,7 @@ def test_a_run_goes_on_with_a_scene_that_has_moved(trained, tmp_path):
     assert {path.name for path in (run / "checkpoints").iterdir()} == {"3", "6"}
 
 
+@pytest.mark.slow
 def test_a_mesh_that_no_camera_sees_is_warned_about(tmp_path):
     scene = tmp_path / "scene"
     shutil.copytree(ROOT / "experiments" / "data" / "cube_smcvx_ball", scene)
