@@ -2,7 +2,7 @@
 
 import pytest
 
-from experiments import recommendations
+from experiments import recommendations, trade_table
 from experiments.recommendations import Machine
 from experiments.trained_runs import Training
 from tests.experiments.command import ROOT, run_command
@@ -50,6 +50,14 @@ def test_the_machine_is_compared_by_the_base():
     machine = recommendations.compare(timing, made_row(pace=0.1), 40)
     assert machine.ratio == pytest.approx(3.0)
     assert machine.startup == 31.0 and machine.images == 40
+
+
+def test_the_bundled_table_is_a_whole_sweep():
+    rows = trade_table.read(ROOT / "experiments" / "data" / "trade_off.csv")
+    assert {row.scene for row in rows} == {"cube_smcvx_ball"}
+    assert {row.knob for row in rows} >= {"", "paths", "cut", "samples", "steps", "rays_per_pixel"}
+    choice = recommendations.choose(rows, _MACHINE, 600.0)
+    assert choice.best.quality > 37.0
 
 
 def test_what_is_told_can_be_pasted(tmp_path):
