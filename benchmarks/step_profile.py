@@ -1,4 +1,4 @@
-"""Profiles a training step: how much of it are tracing, gathers, networks, and the optimiser.
+"""Claim: tracing paths anew takes at most a quarter of a training step along the path tree.
 
     python -m benchmarks.step_profile [--scene=FOLDER] [--preset=tiny] [--paths=tree] [--rounds=N]
 
@@ -37,6 +37,8 @@ _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folde
 _PRESET = flags.DEFINE_string("preset", "tiny", "Preset of the model.")
 _PATHS = flags.DEFINE_enum("paths", "tree", ["straight", "paper", "tree"], "Light paths.")
 _ROUNDS = flags.DEFINE_integer("rounds", 8, "How often everything is timed.")
+
+_LIMIT = 0.25
 
 _COPIED = 1 << 26
 """Floats of the copy by which memory is measured: more than any cache holds."""
@@ -259,6 +261,8 @@ def main(arguments: list[str]) -> None:
     for name, passes in (("gathers", 1), ("scatter-adds", 2)):
         speed = passes * moved / (1e-3 * np.median(taken[name]))
         print(f"{name}: {speed / 1e9:.1f} GB/s, {speed / copied:.2f} of a copy")
+    share = np.median(taken["tracing"] / taken["step"])
+    assert share <= _LIMIT, f"tracing takes {share:.2f} of a step, more than {_LIMIT}"
 
 
 if __name__ == "__main__":

@@ -40,6 +40,8 @@ BLOCK = 4096
 
 # From so many blocks of rays on the last ones are cast in smaller blocks: a second loop to compile.
 _MANY_BLOCKS = 6
+
+# How many times smaller; blocks of fewer rays have no such part.
 _SMALLER = 16
 
 

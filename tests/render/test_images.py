@@ -64,7 +64,7 @@ def test_rendering_in_one_piece_gives_the_same(model, rays, whole):
 def test_one_ray_through_glass_has_the_room_of_its_tile(model, rays, monkeypatch):
     monkeypatch.setattr(images, "TILE", 64)
     images._trace_tile.clear_cache()
-    # Room for three paths a ray in two tiles of three: 64 copies of one ray would lose light.
+    # The ray has two paths. 64 copies of it would have to share the room of 96, and lose 4 %.
     scarce = dataclasses.replace(TREE, paths_per_ray=1.5)
     middle = jax.tree.map(lambda x: x[8, 8:9], rays)
     seen = render_image(model._replace(budget=scarce), middle)
