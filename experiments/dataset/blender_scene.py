@@ -1,0 +1,178 @@
+"""Builds a scene folder in Blender and sets Cycles up (bpy, NumPy and the standard library only).
+
+`scene.json` tells all: parts, indices of refraction, background, bounces. Positions are world
+units, z up; images lie on walls as `refref_jax.render.backgrounds` has it.
+
+Blender runs this file by its path, in an environment of its own, so it imports nothing of the
+package.
+"""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import blender_materials
+import bpy
+import mathutils
+import numpy as np
+
+# Within this distance of the camera nothing is seen, nor beyond that one, world units.
+_NEAR, _FAR = 1e-3, 1e6
+
+# A sphere of 327,680 triangles, which follows the round one within 5e-5 world units.
+_SUBDIVISIONS = 7
+
+
+def build(folder: Path, record: dict[str, Any]) -> None:
+    """Replaces whatever Blender holds by a scene, without a camera's pose.
+
+    Args:
+      folder: of the scene, which file names count from.
+      record: the content of its `scene.json`.
+    """
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    _set_up_cycles(scene, record["render"]["bounces"])
+    _set_up_output(scene, record["size"])
+    for number, part in enumerate(record["parts"], start=1):
+        vertices, faces = read_ply(folder / part["mesh"])
+        material = blender_materials.glass(part)
+        body = _add_mesh(part["mesh"], vertices, faces, material, smooth=part["smooth_normals"])
+        body.pass_index = number
+    _BACKGROUNDS[record["background"]["type"]](folder, record["background"])
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    camera.data.sensor_fit = "HORIZONTAL"
+    camera.data.clip_start, camera.data.clip_end = _NEAR, _FAR
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+
+
+def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Reads a mesh as `meshes_written` writes it: floats `[v, 3]` and corners `[f, 3]`."""
+    header, body = path.read_bytes().split(b"end_header\n", 1)
+    counts = {}
+    for line in header.decode("ascii").splitlines():
+        if line.startswith("element "):
+            _, name, count = line.split()
+            counts[name] = int(count)
+    vertices = np.frombuffer(body, "<f4", 3 * counts["vertex"]).reshape(-1, 3)
+    face = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
+    faces = np.frombuffer(body, face, counts["face"], offset=vertices.nbytes)["corners"]
+    return vertices, faces
+
+
+def _set_up_cycles(scene: Any, bounces: int) -> None:
+    """Leaves nothing of what makes pictures nicer and wrong, see the comments of each."""
+    scene.render.engine = "CYCLES"
+    scene.render.use_persistent_data = True
+    cycles = scene.cycles
+    cycles.device = "CPU"
+    cycles.use_auto_tile = False
+    # The same number of samples everywhere, and no guess of what more of them would show.
+    cycles.use_adaptive_sampling = False
+    cycles.use_denoising = False
+    cycles.sampling_pattern = "TABULATED_SOBOL"
+    cycles.use_light_tree = False
+    # Energy is kept: nothing is clamped or blurred, and no chain of reflections goes black early.
+    cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0.0
+    cycles.blur_glossy = 0.0
+    cycles.caustics_reflective = cycles.caustics_refractive = True
+    for kind in ("max", "diffuse", "glossy", "transmission", "volume", "transparent_max"):
+        setattr(cycles, f"{kind}_bounces", bounces)
+    # A pixel is the mean over its square.
+    cycles.pixel_filter_type = "BOX"
+
+
+def _set_up_output(scene: Any, size: int) -> None:
+    """Writes square float EXRs that hold linear light, planar depth, normal and object index."""
+    render = scene.render
+    render.resolution_x = render.resolution_y = size
+    render.resolution_percentage = 100
+    render.use_compositing = render.use_sequencer = False
+    render.dither_intensity = 0.0
+    scene.view_settings.view_transform = "Standard"
+    settings = render.image_settings
+    settings.media_type = "MULTI_LAYER_IMAGE"
+    settings.file_format = "OPEN_EXR_MULTILAYER"
+    settings.color_depth = "32"
+    settings.exr_codec = "NONE"
+    layer = scene.view_layers[0]
+    layer.use_pass_z = layer.use_pass_normal = layer.use_pass_object_index = True
+
+
+def _add_mesh(
+    name: str, vertices: np.ndarray, faces: np.ndarray, material: Any, *, smooth: bool
+) -> Any:
+    """Adds polygons, all with the same number of corners, as an object of one material."""
+    mesh = bpy.data.meshes.new(name)
+    corners = faces.shape[1]
+    mesh.vertices.add(len(vertices))
+    mesh.vertices.foreach_set("co", np.ascontiguousarray(vertices, np.float32).ravel())
+    mesh.loops.add(faces.size)
+    mesh.loops.foreach_set("vertex_index", np.ascontiguousarray(faces, np.int32).ravel())
+    mesh.polygons.add(len(faces))
+    starts = np.arange(0, faces.size, corners, dtype=np.int32)
+    mesh.polygons.foreach_set("loop_start", starts)
+    mesh.polygons.foreach_set("use_smooth", np.full(len(faces), smooth))
+    mesh.materials.append(material)
+    mesh.update(calc_edges=True)
+    if mesh.validate():
+        raise ValueError(f"{name} has faces that Blender does not accept. Make the mesh again.")
+    added = bpy.data.objects.new(name, mesh)
+    bpy.context.scene.collection.objects.link(added)
+    return added
+
+
+def _add_cube(folder: Path, record: dict[str, Any]) -> None:
+    _set_world(None)
+    half = record["half_extent"]
+    for name, wall in record["faces"].items():
+        normal, u_axis, v_axis = (np.array(wall[key]) for key in ("normal", "u_axis", "v_axis"))
+        uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        places = 2.0 * uv - 1.0
+        vertices = half * (normal + places[:, :1] * u_axis + places[:, 1:] * v_axis)
+        material = blender_materials.wall(folder / wall["image"])
+        plane = _add_mesh(name, vertices, np.array([[0, 1, 2, 3]]), material, smooth=False)
+        layer = plane.data.uv_layers.new(name="uv")
+        layer.data.foreach_set("uv", uv.astype(np.float32).ravel())
+
+
+def _add_sphere(folder: Path, record: dict[str, Any]) -> None:
+    _set_world(None)
+    bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=_SUBDIVISIONS, radius=1.0)
+    sphere = bpy.context.object
+    directions = np.empty(3 * len(sphere.data.vertices), np.float32)
+    sphere.data.vertices.foreach_get("co", directions)
+    directions = directions.reshape(-1, 3)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    # Corners lie as much beyond the round sphere as the middles of the largest triangle within.
+    corners = np.empty(3 * len(sphere.data.polygons), np.int32)
+    sphere.data.loops.foreach_get("vertex_index", corners)
+    middles = directions[corners.reshape(-1, 3)].mean(axis=1)
+    inset = 1.0 - np.linalg.norm(middles, axis=1).min()
+    scale = record["radius"] * (1.0 + 0.5 * inset)
+    sphere.data.vertices.foreach_set("co", (scale * directions).ravel())
+    sphere.data.materials.append(blender_materials.sphere(folder / record["image"]))
+
+
+def _add_environment(folder: Path, record: dict[str, Any]) -> None:
+    _set_world(folder / record["image"])
+
+
+def _set_world(image: Path | None) -> None:
+    bpy.context.scene.world = blender_materials.world(image)
+
+
+_BACKGROUNDS = {"cube": _add_cube, "sphere": _add_sphere, "env": _add_environment}
+
+
+def place_camera(pose: list[list[float]], angle_x: float) -> None:
+    """Moves the camera.
+
+    Args:
+      pose: camera-to-world, 4 x 4; the camera looks along -z, y up.
+      angle_x: horizontal field of view in radians.
+    """
+    camera = bpy.context.scene.camera
+    camera.matrix_world = mathutils.Matrix(pose)
+    camera.data.lens = 0.5 * camera.data.sensor_width / math.tan(0.5 * angle_x)

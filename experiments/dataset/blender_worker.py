@@ -1,0 +1,85 @@
+"""Renders views in Blender for another process (bpy, NumPy and the standard library only).
+
+PYTHON_OF_BLENDER experiments/dataset/blender_worker.py --threads=2
+
+Jobs come as lines of JSON on standard input, one answer a job goes to standard output. First of all
+it says `{"blender": VERSION}`. A job is a `workers.Job`; its answer `{}` once its files are
+whole, or `{"error": TEXT}`. Two multi-layer EXRs are written: `colour`, of all samples, and
+`geometry`, whose single sample goes through the middles of pixels, so that depth, normal and object
+index belong to one ray and are not mixed.
+
+The worker ends when its input does, in the middle of a rendering too: whoever asked is gone.
+"""
+
+import argparse
+import json
+import os
+import queue
+import sys
+import threading
+from pathlib import Path
+from typing import Any, TextIO
+
+
+def main() -> None:
+    """Renders until there are no more jobs."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--threads", type=int, required=True)
+    threads = parser.parse_args().threads
+    answers = _take_over_output()
+    jobs: queue.SimpleQueue[str] = queue.SimpleQueue()
+    threading.Thread(target=_read, args=(jobs,), daemon=True).start()
+    # Late, since Blender may print already.
+    import blender_scene
+    import bpy
+
+    _say(answers, {"blender": bpy.app.version_string})
+    built = ""
+    while True:
+        job = json.loads(jobs.get())
+        try:
+            if built != job["scene"]:
+                built = ""
+                folder = Path(job["scene"])
+                record = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
+                blender_scene.build(folder, record)
+                bpy.context.scene.render.threads_mode = "FIXED"
+                bpy.context.scene.render.threads = threads
+                built = job["scene"]
+            blender_scene.place_camera(job["pose"], job["angle_x"])
+            _render(bpy, job["colour"], job["samples"], job["seed"])
+            _render(bpy, job["geometry"], 1, job["seed"])
+            _say(answers, {})
+        except Exception as error:  # whatever Blender runs into is for the other side to judge
+            _say(answers, {"error": f"{type(error).__name__}: {error}"})
+
+
+def _render(bpy: Any, path: str, samples: int, seed: int) -> None:
+    scene = bpy.context.scene
+    scene.cycles.samples = samples
+    scene.cycles.seed = seed
+    scene.render.filepath = path
+    scene.render.use_file_extension = False
+    bpy.ops.render.render(write_still=True)
+
+
+def _take_over_output() -> TextIO:
+    """Returns what standard output was, and sends all that Blender prints to standard error."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    return answers
+
+
+def _read(jobs: "queue.SimpleQueue[str]") -> None:
+    for line in sys.stdin:
+        jobs.put(line)
+    os._exit(0)
+
+
+def _say(answers: TextIO, answer: dict[str, Any]) -> None:
+    answers.write(json.dumps(answer) + "\n")
+    answers.flush()
+
+
+if __name__ == "__main__":
+    main()
