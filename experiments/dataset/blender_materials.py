@@ -39,7 +39,7 @@ def glass(part: dict[str, Any]) -> Any:
 
 def wall(image: Path) -> Any:
     """Returns a glowing wall with an image that lies by the mesh's UVs."""
-    material, nodes, links = _new_material(image.name)
+    material, nodes, _ = _new_material(image.name)
     texture = nodes.new("ShaderNodeTexImage")
     texture.image = _load(image)
     texture.interpolation = "Linear"

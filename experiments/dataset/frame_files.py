@@ -1,0 +1,179 @@
+"""The files of one rendered view (NumPy only).
+
+A file is written under another name, in the same folder, and gets its own when it is whole. So a
+view is done when all of its files are there.
+"""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import imageio.v3 as iio
+import numpy as np
+import OpenEXR
+from jaxtyping import Bool, Float, UInt8
+
+from experiments.dataset.cameras import Split
+from refref_jax.data import files
+
+_UNFINISHED = ".unfinished"
+
+# The published depth maps: white is 1 world unit, black 11.5 or more.
+_NEAREST_DEPTH, _DEPTH_RANGE = 1.0, 10.5
+
+# Where the straight and the curved part of sRGB's transfer function meet, linear.
+_KNEE = 0.0031308
+
+_LAYER = "ViewLayer."
+
+
+class FrameFiles(NamedTuple):
+    """Where the files of a view are.
+
+    Attributes:
+      image: 8-bit sRGB.
+      mask: 255 where the object is.
+      depth_8_bit: inverted planar depth, see `to_published_depth`.
+      depth: float planar depth.
+      normal: float normals in world space.
+      linear: linear RGB in half precision, of some splits.
+    """
+
+    image: Path
+    mask: Path
+    depth_8_bit: Path
+    depth: Path
+    normal: Path
+    linear: Path
+
+
+class Rendering(NamedTuple):
+    """What Blender renders of a view. All but the colours belong to the middle of each pixel.
+
+    Attributes:
+      linear: linear RGB, the mean over each pixel's square.
+      depth: planar, world units, of the first surface, be it the object or a wall; 1e10 where
+        nothing is met.
+      normal: shading normal in world space where the object is met first, towards the camera's
+        side; else 0.
+      mask: whether the object is met first.
+    """
+
+    linear: Float[np.ndarray, "h w 3"]
+    depth: Float[np.ndarray, "h w"]
+    normal: Float[np.ndarray, "h w 3"]
+    mask: Bool[np.ndarray, "h w"]
+
+
+def relative(split: Split, number: int) -> FrameFiles:
+    """Returns the files of a view, as they count from the scene's folder."""
+    place = Path(split) / f"r_{number:03d}.png"
+    return FrameFiles(
+        image=place,
+        mask="mask" / place,
+        depth_8_bit="depth" / place,
+        depth="depth" / place.with_suffix(".exr"),
+        normal="normal" / place.with_suffix(".exr"),
+        linear=place.with_suffix(".exr"),
+    )
+
+
+def is_done(scene: Path, split: Split, number: int, *, linear: bool) -> bool:
+    """Returns whether a view is rendered.
+
+    Args:
+      scene: its folder.
+      split: of the view.
+      number: of the view.
+      linear: whether the linear image belongs to it.
+    """
+    wanted = relative(split, number) if linear else relative(split, number)[:-1]
+    return all((scene / path).is_file() for path in wanted)
+
+
+def write(scene: Path, split: Split, number: int, rendering: Rendering, *, linear: bool) -> None:
+    """Writes the files of a view; arguments as of `is_done`."""
+    named = relative(split, number)
+    _write(scene / named.image, _png(to_srgb(rendering.linear)))
+    _write(scene / named.mask, _png(np.where(rendering.mask, 255, 0).astype(np.uint8)))
+    _write(scene / named.depth_8_bit, _png(to_published_depth(rendering.depth)))
+    _write(scene / named.depth, _exr("Z", rendering.depth))
+    _write(scene / named.normal, _exr("RGB", rendering.normal))
+    if linear:
+        # Half precision ends at 65504.
+        half = np.minimum(rendering.linear, np.finfo(np.float16).max).astype(np.float16)
+        _write(scene / named.linear, _exr("RGB", half))
+
+
+def remove_unfinished(scene: Path) -> None:
+    """Removes files that an interrupted command left half-written."""
+    for path in scene.rglob(f"*{_UNFINISHED}"):
+        path.unlink()
+
+
+def read_rendering(colour: Path, geometry: Path) -> Rendering:
+    """Reads the two files that `blender_worker` writes of a view.
+
+    Raises:
+      SceneError: if a file is missing or broken.
+      ValueError: if a colour is not finite.
+    """
+    linear = _read_layers(colour)["Combined"][..., :3]
+    if not np.all(np.isfinite(linear)):
+        raise ValueError(f"{colour} has colours that are not finite. Look at the scene in Blender.")
+    layers = _read_layers(geometry)
+    mask = layers["Object Index.X"] > 0.0
+    normal = np.stack([layers[f"Normal.{axis}"] for axis in "XYZ"], axis=-1)
+    return Rendering(linear, layers["Depth.Z"], np.where(mask[..., None], normal, 0.0), mask)
+
+
+def to_srgb(linear: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """Encodes linear light by the sRGB transfer function, clipped, as 8 bits.
+
+    Blender's view transform Standard gives the same numbers, but for a rounding.
+
+    Source: IEC 61966-2-1.
+    """
+    light = np.clip(linear, 0.0, 1.0).astype(np.float64)
+    curved = 1.055 * np.maximum(light, _KNEE) ** (1.0 / 2.4) - 0.055
+    return files.to_bytes(np.where(light > _KNEE, curved, 12.92 * light))
+
+
+def to_published_depth(depth: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """Encodes planar depth, world units, in 8 bits: 255 at 1, 0 at 11.5 and beyond."""
+    return files.to_bytes(1.0 - (depth.astype(np.float64) - _NEAREST_DEPTH) / _DEPTH_RANGE)
+
+
+def _read_layers(path: Path) -> dict[str, np.ndarray]:
+    """Returns the channels of all parts of an EXR."""
+    with OpenEXR.File(str(path)) as file:
+        return {
+            name.removeprefix(_LAYER): channel.pixels.astype(np.float32)
+            for part in file.parts
+            for name, channel in part.channels.items()
+        }
+
+
+def _png(pixels: UInt8[np.ndarray, "h w *channels"]) -> Callable[[Path], None]:
+    return lambda path: iio.imwrite(path, pixels, plugin="pillow", extension=".png")
+
+
+def _exr(name: str, pixels: np.ndarray) -> Callable[[Path], None]:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+
+    def write_to(path: Path) -> None:
+        with OpenEXR.File(header, {name: np.ascontiguousarray(pixels)}) as file:
+            file.write(str(path))
+
+    return write_to
+
+
+def _write(path: Path, write_to: Callable[[Path], None]) -> None:
+    """Writes a file that is never seen half-written, even if the machine stops."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(path.name + _UNFINISHED)
+    write_to(unfinished)
+    with unfinished.open("rb") as file:
+        os.fsync(file.fileno())
+    unfinished.replace(path)

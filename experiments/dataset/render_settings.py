@@ -1,0 +1,108 @@
+"""With what settings scenes are rendered (NumPy only)."""
+
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+from experiments.dataset.cameras import SPLITS, Split
+
+Rule = Literal["nested", "facing"]
+"""What lies outside a part: the part around it, or always air, as in Blender without care."""
+
+LinearImages = Literal["all", "test", "none"]
+"""Which splits keep their images as linear EXRs too."""
+
+GENERATOR = 1
+"""Version of the generator. It grows when a scene of the same settings would look different."""
+
+BLENDER = "5.0.1"
+"""Version of Blender; another one's pixels may differ."""
+
+_RENDER: dict[str, Any] = {
+    "bounces": 64,
+    "pixel_filter": "box, 1 pixel wide",
+    "view_transform": "Standard: the sRGB transfer function, clipped",
+    "adaptive_sampling": False,
+    "denoising": False,
+    "clamping": False,
+    "filter_glossy": 0.0,
+    "caustics": True,
+    "seed": "first 8 bytes of SHA-256 of 'SCENE\\0SPLIT\\0NAME\\0', big-endian, modulo 2^31",
+    "depth_mask_normal": "of the first surface on the ray through a pixel's middle",
+}
+
+
+class PerSplit(NamedTuple):
+    """A number for each split."""
+
+    train: int
+    val: int
+    test: int
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """What decides a scene's files, besides its name.
+
+    Attributes:
+      size: width and height of images in pixels.
+      spp: samples a pixel.
+      views: poses of each split.
+      rule: what lies outside a part.
+      linear: which splits keep linear EXRs.
+      preview: whether of all views only `preview_view` is rendered.
+    """
+
+    size: int
+    spp: PerSplit
+    views: PerSplit
+    rule: Rule = "nested"
+    linear: LinearImages = "test"
+    preview: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuses what has no meaning.
+
+        Raises:
+          ValueError: if a number is too small, or there is no view at all.
+        """
+        for name, number in [("size", self.size), *zip(_SPP, self.spp, strict=True)]:
+            if number < 1:
+                raise ValueError(f"The {name} is {number}. Give 1 or more.")
+        if min(self.views) < 0 or not any(self.views):
+            raise ValueError(
+                f"The views of train, val and test are {', '.join(map(str, self.views))}. Give "
+                "numbers that are not negative, and at least one view."
+            )
+        if self.preview and not self.views.test:
+            raise ValueError("A preview shows a test view, but there is none. Give --test_views.")
+
+    def numbers(self, split: Split) -> tuple[int, ...]:
+        """Returns the numbers of the views of a split that are rendered."""
+        if self.preview:
+            return (preview_view(self.views.test),) if split == "test" else ()
+        return tuple(range(getattr(self.views, split)))
+
+    def keeps_linear(self, split: Split) -> bool:
+        """Returns whether the images of a split are kept as linear EXRs."""
+        return self.linear in ("all", split)
+
+    def record(self) -> dict[str, Any]:
+        """Returns what `scene.json` says of the settings."""
+        return {
+            "renderer": f"Blender Cycles {BLENDER}",
+            "size": self.size,
+            "spp": self.spp._asdict(),
+            "views": {split: list(self.numbers(split)) for split in SPLITS}
+            if self.preview
+            else self.views._asdict(),
+            "rule": self.rule,
+            "render": {"generator": GENERATOR, **_RENDER, "linear_images": self.linear},
+        }
+
+
+_SPP = ("spp of train", "spp of val", "spp of test")
+
+
+def preview_view(count: int) -> int:
+    """Returns the number of the test view that a preview shows: seen from somewhat above."""
+    return (count - 1) * 6 // 10

@@ -1,0 +1,114 @@
+"""Makes the folder of a scene, ready to be rendered, and recognises one (NumPy only).
+
+    {scene}/meshes/{object}_{part}_{material}.ply    binary, single precision
+    {scene}/background/                              what the record names
+    {scene}/transforms_{train,val,test}.json         poses and file names, of splits with views
+    {scene}/scene.json                               see `scene_record`
+
+A folder appears under its name when all of that is in it, so one that is there is whole.
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import trimesh
+
+from experiments.dataset import backgrounds, cameras, frame_files, scene_record
+from experiments.dataset.parts import Part
+from experiments.dataset.render_settings import RenderSettings
+from experiments.dataset.scenes import Scene
+from experiments.dataset.seeds import seed_of
+
+_RECORD = "scene.json"
+
+
+def make(
+    folder: Path,
+    scene: Scene,
+    settings: RenderSettings,
+    *,
+    parts: Callable[[], Sequence[Part]],
+    scratch: Path,
+) -> None:
+    """Makes the folder of a scene if it is not there.
+
+    Args:
+      folder: to make.
+      scene: which.
+      settings: of the rendering.
+      parts: makes those of the object.
+      scratch: an existing folder in the same file system, where it is put together.
+    """
+    if folder.exists():
+        return
+    draft = scratch / scene.name
+    (draft / "meshes").mkdir(parents=True)
+    made = parts()
+    for part in made:
+        mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
+        content = trimesh.exchange.ply.export_ply(mesh, vertex_normal=False)
+        (draft / "meshes" / scene_record.mesh_name(scene, part)).write_bytes(content)
+    seed = seed_of(scene.name, "background")
+    background = backgrounds.write_background(draft, scene.kind, seed=seed, size=None)
+    for split in cameras.SPLITS:
+        if settings.numbers(split):
+            _write_json(draft / f"transforms_{split}.json", _transforms(scene, settings, split))
+    record = scene_record.describe(scene, made, background, settings)
+    _write_json(draft / _RECORD, record)
+    draft.rename(folder)
+
+
+def check(folder: Path, scene: Scene, settings: RenderSettings) -> None:
+    """Checks that a folder, if it is there, is that of a scene with these settings.
+
+    Raises:
+      ValueError: if it is not.
+    """
+    if not folder.exists():
+        return
+    path = folder / _RECORD
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        different = _difference(found, scene_record.identify(scene, settings), "")
+    except (OSError, ValueError, AttributeError) as error:
+        raise ValueError(
+            f"{folder} exists, but is no scene of this command ({error}). Give another --out, or "
+            "remove it."
+        ) from error
+    if different:
+        raise ValueError(
+            f"{path} has other settings: {different}. Give the same ones to go on, or another "
+            "--out."
+        )
+
+
+def _difference(found: Any, wanted: Any, name: str) -> str:
+    """Returns the first value that differs, in words, or nothing."""
+    if isinstance(wanted, dict):
+        for key, value in wanted.items():
+            if different := _difference(found.get(key), value, f"{name} {key}"):
+                return different
+        return ""
+    return "" if found == wanted else f"the{name} is {found}, not {wanted}"
+
+
+def _transforms(scene: Scene, settings: RenderSettings, split: cameras.Split) -> dict[str, Any]:
+    poses = cameras.split_poses(scene.name, split, getattr(settings.views, split))
+    frames = []
+    for number in settings.numbers(split):
+        named = frame_files.relative(split, number)
+        frames.append(
+            {
+                "file_path": f"./{named.image.with_suffix('')}",
+                "mask_file_path": f"./{named.mask}",
+                "depth_file_path": f"./{named.depth_8_bit}",
+                "transform_matrix": poses[number].tolist(),
+            }
+        )
+    return {"camera_angle_x": cameras.ANGLE_X, "frames": frames}
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")

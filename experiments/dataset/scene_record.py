@@ -1,0 +1,106 @@
+"""What `scene.json` says of a scene (NumPy only).
+
+Of each part it says what is inside and outside of its surface, as Blender gets it: under the rule
+`nested` outside is the innermost part around it, else air; under `facing` it is always air.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from experiments.dataset.cameras import CAMERA_RADIUS
+from experiments.dataset.parts import NO_ABSORPTION, Part
+from experiments.dataset.render_settings import RenderSettings, Rule
+from experiments.dataset.scenes import Scene
+from refref_jax.data.containment import find_containment
+from refref_jax.data.meshes import INDEX_OF_REFRACTION, MeshPart
+from refref_jax.optics.interface_rules import NO_PARENT
+
+_AIR = "air"
+
+
+def describe(
+    scene: Scene, parts: Sequence[Part], background: dict[str, Any], settings: RenderSettings
+) -> dict[str, Any]:
+    """Returns the content of `scene.json`.
+
+    Args:
+      scene: which.
+      parts: of its object.
+      background: its record, as `refref_jax.data.background` reads it.
+      settings: of the rendering.
+
+    Raises:
+      ValueError: if parts cut each other, or one that absorbs has another inside.
+    """
+    outside = _materials_outside(scene, parts, settings.rule)
+    return {
+        **identify(scene, settings),
+        "parts": [
+            _describe_part(scene, part, around) for part, around in zip(parts, outside, strict=True)
+        ],
+        "ior": INDEX_OF_REFRACTION,
+        "camera_radius": CAMERA_RADIUS,
+        "background": background,
+    }
+
+
+def identify(scene: Scene, settings: RenderSettings) -> dict[str, Any]:
+    """Returns what of `scene.json` is known before anything is made."""
+    return {"scene": scene.name, "category": scene.category, **settings.record()}
+
+
+def mesh_name(scene: Scene, part: Part) -> str:
+    """Returns the file name of a part's mesh."""
+    return f"{scene.object}_{part.name}_{part.material}.ply"
+
+
+def _describe_part(scene: Scene, part: Part, outside: str) -> dict[str, Any]:
+    description = {
+        "mesh": f"meshes/{mesh_name(scene, part)}",
+        "inside": part.material,
+        "outside": outside,
+        "ior_inside": INDEX_OF_REFRACTION[part.material],
+        "ior_outside": INDEX_OF_REFRACTION[outside],
+        "smooth_normals": part.smooth,
+        "colour_per_interface": list(part.tint),
+        "watertight": _is_closed(part),
+        "faces": len(part.faces),
+    }
+    if part.absorption != NO_ABSORPTION:
+        description["absorption"] = list(part.absorption)
+    return description
+
+
+def _materials_outside(scene: Scene, parts: Sequence[Part], rule: Rule) -> list[str]:
+    tree = find_containment([_mesh_part(part) for part in parts])
+    if tree.overlaps:
+        first, second = (parts[number].name for number in tree.overlaps[0])
+        raise ValueError(
+            f"The parts {first} and {second} of {scene.object} cut each other. Part them by a gap."
+        )
+    for parent in tree.parents:
+        if parent != NO_PARENT and parts[parent].absorption != NO_ABSORPTION:
+            raise ValueError(
+                f"The part {parts[parent].name} of {scene.object} absorbs light, and has another "
+                "part inside, where Blender would go on absorbing. Give its surface a tint instead."
+            )
+    if rule == "facing":
+        return [_AIR] * len(parts)
+    return [_AIR if parent == NO_PARENT else parts[parent].material for parent in tree.parents]
+
+
+def _mesh_part(part: Part) -> MeshPart:
+    index = INDEX_OF_REFRACTION[part.material]
+    return MeshPart(
+        part.name, part.vertices, part.faces, index, "smooth" if part.smooth else "flat"
+    )
+
+
+def _is_closed(part: Part) -> bool:
+    """Returns whether every edge belongs to two faces, once in each direction."""
+    start, end = part.faces.ravel(), np.roll(part.faces, -1, axis=1).ravel()
+    edges = start.astype(np.int64) * len(part.vertices) + end
+    mirrored = end.astype(np.int64) * len(part.vertices) + start
+    return bool(len(np.unique(edges)) == len(edges) and set(edges) == set(mirrored))

@@ -1,0 +1,105 @@
+"""The views of scenes: which are missing, and what is to be rendered for each (NumPy only)."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import NamedTuple
+
+from experiments.dataset import cameras, frame_files, scene_folders
+from experiments.dataset.cameras import Split
+from experiments.dataset.parts import Object, Part
+from experiments.dataset.render_settings import RenderSettings
+from experiments.dataset.scenes import Scene
+from experiments.dataset.seeds import seed_of
+from experiments.dataset.workers import Job, Task
+
+# What Blender takes.
+_SEEDS = 1 << 31
+
+_DETAIL = 1.0
+
+
+class View(NamedTuple):
+    """One image.
+
+    Attributes:
+      scene: that it is of.
+      split: that it belongs to.
+      number: in the split.
+    """
+
+    scene: Scene
+    split: Split
+    number: int
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"{self.scene.name} {self.split} {self.number}"
+
+
+def all_views(chosen: Sequence[Scene], settings: RenderSettings) -> list[View]:
+    """Returns all views of some scenes."""
+    return [
+        View(scene, split, number)
+        for scene in chosen
+        for split in cameras.SPLITS
+        for number in settings.numbers(split)
+    ]
+
+
+def is_done(out: Path, view: View, settings: RenderSettings) -> bool:
+    """Returns whether a view is rendered."""
+    linear = settings.keeps_linear(view.split)
+    return frame_files.is_done(out / view.scene.name, view.split, view.number, linear=linear)
+
+
+def seed(view: View) -> int:
+    """Returns the seed that Blender renders a view with."""
+    return seed_of(view.scene.name, view.split, f"r_{view.number:03d}") % _SEEDS
+
+
+def tasks(
+    out: Path,
+    views: Sequence[View],
+    settings: RenderSettings,
+    *,
+    objects: Mapping[str, Object],
+    scratch: Path,
+) -> Iterator[Task]:
+    """Yields what is to be rendered; the folder of a scene is made when its first view comes.
+
+    Args:
+      out: folder of the scenes.
+      views: to render; those of one scene follow each other.
+      settings: of the rendering.
+      objects: by name.
+      scratch: existing folder for what is half made.
+    """
+
+    # Scenes that follow each other share their object.
+    @lru_cache(maxsize=1)
+    def make(name: str) -> Sequence[Part]:
+        return objects[name].make(_DETAIL)
+
+    for view in views:
+        scene, folder = view.scene, out / view.scene.name
+        parts = partial(make, scene.object)
+        scene_folders.make(folder, scene, settings, parts=parts, scratch=scratch)
+        poses = cameras.split_poses(scene.name, view.split, getattr(settings.views, view.split))
+        job = Job(
+            scene=str(folder.absolute()),
+            pose=poses[view.number].tolist(),
+            angle_x=cameras.ANGLE_X,
+            samples=getattr(settings.spp, view.split),
+            seed=seed(view),
+        )
+        yield Task(view.name, job, partial(_finish, folder, view, settings))
+
+
+def _finish(
+    folder: Path, view: View, settings: RenderSettings, colour: Path, geometry: Path
+) -> None:
+    rendering = frame_files.read_rendering(colour, geometry)
+    linear = settings.keeps_linear(view.split)
+    frame_files.write(folder, view.split, view.number, rendering, linear=linear)
