@@ -1,14 +1,17 @@
 # One command from a fresh clone: `make demo` trains and shows a model, `make test` tests.
-# Both create .venv first, and may be repeated.
+# Both create .venv first, and may be repeated. `make dataset-env` installs Blender, which
+# `python -m experiments.dataset.make` renders with, beside it.
 
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 
 VENV := .venv
 READY := $(VENV)/.ready
+BLENDER_VENV := .venv-dataset
+BLENDER_READY := $(BLENDER_VENV)/.ready
 RUN := $(VENV)/bin/python -m
 
-.PHONY: demo test test-slow lint format clean
+.PHONY: demo test test-slow lint format clean dataset-env
 
 demo: $(READY)
 	$(RUN) experiments.train --scene=experiments/data/cube_smcvx_ball --preset=tiny \
@@ -30,12 +33,27 @@ format: $(READY)
 	$(RUN) ruff check --fix .
 	$(RUN) ruff format .
 
+dataset-env: $(BLENDER_READY)
+	@echo "Blender is in $(BLENDER_VENV). Next: $(RUN) experiments.dataset.make --help"
+
 clean:
-	rm -rf $(VENV) .pytest_cache .ruff_cache *.egg-info
+	rm -rf $(VENV) $(BLENDER_VENV) .pytest_cache .ruff_cache *.egg-info
 
 $(READY): pyproject.toml
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: install it first."; exit 1; }
 	@$(PYTHON) -m venv $(VENV) || { echo "The venv module is missing: on Debian, install \
 	python3-venv."; exit 1; }
-	$(RUN) pip install --quiet --disable-pip-version-check --editable ".[experiments,test,dev]"
+	$(RUN) pip install --quiet --disable-pip-version-check --editable \
+	".[dataset,parquet,experiments,test,dev]"
+	@touch $@
+
+# An environment of its own: Blender's module runs in Python 3.11 alone, and with NumPy 1, which
+# JAX no longer takes.
+$(BLENDER_READY):
+	@command -v python3.11 >/dev/null || { echo "Blender's module runs in Python 3.11 alone: \
+	install that version beside your own, so that there is a command python3.11."; exit 1; }
+	@python3.11 -m venv $(BLENDER_VENV) || { echo "The venv module is missing: on Debian, install \
+	python3.11-venv."; exit 1; }
+	$(BLENDER_VENV)/bin/python -m pip install --quiet --disable-pip-version-check "bpy==5.0.1" \
+	"numpy<2"
 	@touch $@

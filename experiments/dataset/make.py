@@ -27,7 +27,7 @@ from experiments.dataset import (
     catalogue,
     contact_sheet,
     frame_files,
-    scene_folders,
+    scene_setup,
     scenes,
     views,
 )
@@ -89,7 +89,7 @@ def main() -> None:
         )
     out = Path(_OUT.value) / "preview" if _PREVIEW.value else Path(_OUT.value)
     for scene in chosen:
-        scene_folders.check(out / scene.name, scene, settings)
+        scene_setup.check(out / scene.name, scene, settings)
     out.mkdir(parents=True, exist_ok=True)
     with _alone_in(out) as scratch:
         for scene in chosen:

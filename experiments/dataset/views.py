@@ -5,7 +5,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
-from experiments.dataset import cameras, frame_files, scene_folders
+from experiments.dataset import cameras, frame_files, scene_setup
 from experiments.dataset.cameras import Split
 from experiments.dataset.parts import Object, Part
 from experiments.dataset.render_settings import RenderSettings
@@ -85,7 +85,7 @@ def tasks(
     for view in views:
         scene, folder = view.scene, out / view.scene.name
         parts = partial(make, scene.object)
-        scene_folders.make(folder, scene, settings, parts=parts, scratch=scratch)
+        scene_setup.make(folder, scene, settings, parts=parts, scratch=scratch)
         poses = cameras.split_poses(scene.name, view.split, getattr(settings.views, view.split))
         job = Job(
             scene=str(folder.absolute()),
