@@ -47,7 +47,9 @@ def main() -> None:
                 bpy.context.scene.render.threads = threads
                 built = job["scene"]
             blender_scene.place_camera(job["pose"], job["angle_x"])
+            blender_scene.filter_over(blender_scene.WHOLE_PIXEL)
             _render(bpy, job["colour"], job["samples"], job["seed"])
+            blender_scene.filter_over(blender_scene.MIDDLE)
             _render(bpy, job["geometry"], 1, job["seed"])
             _say(answers, {})
         except Exception as error:  # whatever Blender runs into is for the other side to judge

@@ -9,14 +9,8 @@ where it stopped: the result is the same, to the bit. What is there already is n
 `--preview` renders one test view of each scene instead, into {out}/preview, and contact sheets.
 """
 
-import contextlib
-import fcntl
-import os
-import shutil
 import sys
-import tempfile
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from absl import flags
@@ -27,13 +21,11 @@ from experiments.dataset import (
     catalogue,
     contact_sheet,
     frame_files,
-    scene_setup,
+    production,
     scenes,
-    views,
 )
 from experiments.dataset.render_settings import PerSplit, RenderSettings
 from experiments.dataset.scenes import Scene
-from experiments.dataset.workers import Pool
 
 _OUT = flags.DEFINE_string("out", None, "Folder that gets a folder for each scene.", required=True)
 _SCENES = flags.DEFINE_string(
@@ -71,8 +63,6 @@ _BLENDER = flags.DEFINE_string(
     "blender", ".venv-dataset/bin/python", "Python of the environment that has Blender."
 )
 
-_SCRATCH = ".scratch"
-
 # Pixels of a picture on a contact sheet.
 _TILE = 200
 
@@ -88,13 +78,16 @@ def main() -> None:
             "the Python of an environment that has bpy 5.0.1 as --blender."
         )
     out = Path(_OUT.value) / "preview" if _PREVIEW.value else Path(_OUT.value)
-    for scene in chosen:
-        scene_setup.check(out / scene.name, scene, settings)
-    out.mkdir(parents=True, exist_ok=True)
-    with _alone_in(out) as scratch:
-        for scene in chosen:
-            frame_files.remove_unfinished(out / scene.name)
-        whole = _render(out, chosen, settings, blender, scratch)
+    interrupt = commands.Interrupt()
+    whole = production.produce(
+        out,
+        chosen,
+        settings,
+        objects=catalogue.OBJECTS,
+        blender=blender,
+        workers=_WORKERS.value,
+        stopped=lambda: interrupt.requested,
+    )
     if not whole:
         print("Stopped. The same command goes on from here.")
         sys.exit(commands.INTERRUPTED)
@@ -118,56 +111,6 @@ def _settings() -> RenderSettings:
         linear=_EXR.value,
         preview=_PREVIEW.value,
     )
-
-
-@contextlib.contextmanager
-def _alone_in(out: Path) -> Iterator[Path]:
-    """Gives an empty folder for files that come and go to the only command that works in `out`.
-
-    It stays behind where an error ends the command, for the logs in it.
-
-    Raises:
-      ValueError: if another command works there.
-    """
-    lock = os.open(out, os.O_RDONLY)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise ValueError(
-            f"Another command makes scenes in {out}. Wait for it, or give another --out."
-        ) from error
-    scratch = out / _SCRATCH
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir(exist_ok=True)
-    # A process of a killed command may still be about to write: the name is new every time.
-    yield Path(tempfile.mkdtemp(dir=scratch)).absolute()
-    shutil.rmtree(scratch, ignore_errors=True)
-    os.close(lock)
-
-
-def _render(
-    out: Path, chosen: Sequence[Scene], settings: RenderSettings, blender: Path, scratch: Path
-) -> bool:
-    """Renders all views that are not done; returns whether none is left."""
-    wanted = views.all_views(chosen, settings)
-    missing = [view for view in wanted if not views.is_done(out, view, settings)]
-    if not missing:
-        print(f"Nothing to do: all {len(wanted)} views are there.")
-        return True
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    count = min(_WORKERS.value or cores, len(missing))
-    tasks = views.tasks(out, missing, settings, objects=catalogue.OBJECTS, scratch=scratch)
-    threads = max(1, cores // count)
-    pool = Pool(tasks, blender=blender, scratch=scratch, workers=count, threads=threads)
-    interrupt = commands.Interrupt()
-    started, there, done = time.monotonic(), len(wanted) - len(missing), 0
-    with commands.ProgressBar("render", len(wanted), there) as bar, pool:
-        for done, task in enumerate(pool.run(), start=1):
-            pace = (time.monotonic() - started) / done
-            bar.show(there + done, f"{task.name}  {pace:.1f} s a view")
-            if interrupt.requested:
-                pool.stop()
-    return done == len(missing)
 
 
 def _write_contact_sheets(out: Path, chosen: Sequence[Scene], settings: RenderSettings) -> None:

@@ -46,10 +46,7 @@ def make(
     draft = scratch / scene.name
     (draft / "meshes").mkdir(parents=True)
     made = parts()
-    for part in made:
-        mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
-        content = trimesh.exchange.ply.export_ply(mesh, vertex_normal=False)
-        (draft / "meshes" / scene_record.mesh_name(scene, part)).write_bytes(content)
+    write_meshes(draft, scene, made)
     seed = seed_of(scene.name, "background")
     background = backgrounds.write_background(draft, scene.kind, seed=seed, size=None)
     for split in cameras.SPLITS:
@@ -58,6 +55,14 @@ def make(
     record = scene_record.describe(scene, made, background, settings)
     _write_json(draft / _RECORD, record)
     draft.rename(folder)
+
+
+def write_meshes(folder: Path, scene: Scene, parts: Sequence[Part]) -> None:
+    """Writes the parts of a scene into its folder, which has one for meshes."""
+    for part in parts:
+        mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
+        content = trimesh.exchange.ply.export_ply(mesh, vertex_normal=False)
+        (folder / "meshes" / scene_record.mesh_name(scene, part)).write_bytes(content)
 
 
 def check(folder: Path, scene: Scene, settings: RenderSettings) -> None:

@@ -16,7 +16,8 @@ from typing import NamedTuple
 
 from experiments.dataset.render_settings import BLENDER
 
-_SCRIPT = Path(__file__).with_name("blender_worker.py")
+SCRIPT = Path(__file__).with_name("blender_worker.py")
+"""What a process of Blender runs."""
 
 
 class Job(NamedTuple):
@@ -170,7 +171,7 @@ class Pool:
           threads: of each.
         """
         self._tasks, self._taking = iter(tasks), threading.Lock()
-        self._command = [str(blender), str(_SCRIPT)]
+        self._command = [str(blender), str(SCRIPT)]
         self._scratch, self._workers, self._threads = scratch, workers, threads
         self._done: queue.SimpleQueue[Task | Exception | None] = queue.SimpleQueue()
         self._stopping = threading.Event()

@@ -1,21 +1,20 @@
-"""Runs `experiments.dataset.make` on small objects, and kills it at a chosen moment.
+"""Makes small scenes, and is killed at chosen moments."""
 
-KILL is `MOMENT:NUMBER`: the process, or with GROUP set all of its group, is killed when it comes to
-that moment for the NUMBER-th time.
-"""
-
-import json
+import dataclasses
 import os
 import signal
+import sys
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import trimesh
 
-from experiments import commands
-from experiments.dataset import backgrounds, catalogue, frame_files, make, scene_setup
+from experiments.dataset import backgrounds, frame_files, production, scene_record, scenes
 from experiments.dataset.parts import Object, Part
+from experiments.dataset.render_settings import PerSplit, RenderSettings
+
+SETTINGS = RenderSettings(size=6, spp=PerSplit(2, 2, 4), views=PerSplit(3, 1, 2))
 
 
 def box(edge, name="body", material="glass", **options):
@@ -59,33 +58,58 @@ def write_background(scene, kind, *, seed, size):
     return {"type": "cube", "half_extent": 7.3, "faces": faces}
 
 
-def _killing(moment, function):
-    wanted, number = os.environ.get("KILL", ":0").split(":")
+def make(out, blender, names="*_box,env_mmncvx_box_full", *, workers=2, **changes):
+    """Makes small scenes, and returns whether all of it is there."""
+    backgrounds.write_background = write_background
+    chosen = scenes.choose(names, SMALL_OBJECTS)
+    settings = dataclasses.replace(SETTINGS, **changes)
+    return production.produce(
+        Path(out),
+        chosen,
+        settings,
+        objects=SMALL_OBJECTS,
+        blender=Path(blender),
+        workers=workers,
+        stopped=lambda: False,
+    )
+
+
+def _kill_at(moment, number):
+    """Kills this process when it comes to a moment for the number-th time."""
     left = int(number)
+    module, name = _MOMENTS[moment]
+    function = getattr(module, name)
 
     def killing(*arguments, **options):
         nonlocal left
-        left -= moment == wanted
-        if moment == wanted and left == 0:
-            if "GROUP" in os.environ:
-                os.killpg(0, signal.SIGKILL)
+        left -= 1
+        if left == 0:
             os.kill(os.getpid(), signal.SIGKILL)
         return function(*arguments, **options)
 
-    return killing
+    setattr(module, name, killing)
 
 
-def main():
-    catalogue.OBJECTS = SMALL_OBJECTS
-    backgrounds.write_background = _killing("background", write_background)
-    Path.rename = _killing("rename", Path.rename)
-    Path.replace = _killing("replace", Path.replace)
-    frame_files.read_rendering = _killing("read", frame_files.read_rendering)
-    json.dumps = _killing("json", json.dumps)
-    make.main()
+_MOMENTS = {
+    "mesh": (trimesh.exchange.ply, "export_ply"),
+    "record": (scene_record, "describe"),
+    "rename": (Path, "rename"),
+    "read": (frame_files, "read_rendering"),
+    "replace": (Path, "replace"),
+}
 
 
-assert scene_setup.backgrounds is backgrounds
+def main(out, blender, *moments):
+    """Makes small scenes again and again, and kills each making at its moment, as `replace:3`."""
+    for moment in moments:
+        child = os.fork()
+        if child == 0:
+            _kill_at(*moment.split(":"))
+            make(out, blender)
+            os._exit(0)
+        _, status = os.waitpid(child, 0)
+        assert os.waitstatus_to_exitcode(status) == -signal.SIGKILL, moment
+
 
 if __name__ == "__main__":
-    commands.run(main)
+    main(*sys.argv[1:])

@@ -1,4 +1,4 @@
-"""The command, with a process that stands in for Blender: what it leaves behind, and goes on with.
+"""What making scenes leaves behind, and goes on with; another process stands in for Blender.
 
 Whether Blender renders what is asked for is told by `test_blender_worker`.
 """
@@ -13,21 +13,14 @@ import numpy as np
 import pytest
 
 from experiments.dataset import render_settings
+from experiments.dataset.render_settings import PerSplit
+from experiments.dataset.workers import BlenderError
 from refref_jax.data import background, containment, files, local_layout, meshes
 from tests import code_generator
 from tests.experiments.command import ROOT
-from tests.experiments.dataset import fake_blender
+from tests.experiments.dataset import fake_blender, small_dataset
+from tests.experiments.dataset.small_dataset import make
 
-_OPTIONS = (
-    "--scenes=*_box,env_mmncvx_box_full",
-    "--size=6",
-    "--spp=2",
-    "--test_spp=4",
-    "--train_views=3",
-    "--val_views=1",
-    "--test_views=2",
-    "--workers=2",
-)
 _SCENES = ["cube_smcvx_box", "env_mmncvx_box_full", "env_smcvx_box", "sphere_smcvx_box"]
 _FILES_OF_A_FRAME = 5
 
@@ -40,29 +33,10 @@ def blender(tmp_path_factory):
     return path
 
 
-def _make(out, blender, *options, status=0, **environment):
-    result = subprocess.run(
-        [
-            *(sys.executable, "-m", "tests.experiments.dataset.small_dataset"),
-            *(f"--out={out}", f"--blender={blender}", *_OPTIONS, *options),
-        ],
-        cwd=ROOT,
-        env={**code_generator.of_users(), **environment},
-        capture_output=True,
-        text=True,
-        check=False,
-        start_new_session=True,
-    )
-    assert result.returncode == status, result.stdout + result.stderr
-    assert "Traceback" not in result.stderr
-    return result
-
-
 @pytest.fixture(scope="module")
 def made(tmp_path_factory, blender):
     out = tmp_path_factory.mktemp("made") / "dataset"
-    result = _make(out, blender)
-    assert f"experiments.dataset.check {out}" in result.stdout
+    assert make(out, blender)
     return out
 
 
@@ -83,82 +57,106 @@ def test_nothing_else_is_left(made):
     assert len(one) == 6 * _FILES_OF_A_FRAME + 2 + 3 + 1 + 2
 
 
-# What was killed leaves in turn: no scene, half a scene, a scene without its name, a frame without
-# all its files, and several frames.
-_MOMENTS = ["background:1", "json:3", "rename:1", "replace:1", "replace:9", "read:4", "rename:2"]
+# Killed at these moments it leaves: no scene, half a scene, one without its name, a view without
+# files, one without all files, several views.
+_MOMENTS = ["mesh:1", "record:1", "rename:1", "read:1", "replace:3", "replace:20", "rename:2"]
 
 
 def test_a_killed_command_goes_on_to_the_same_bits(tmp_path, blender, made):
-    for number, moment in enumerate(_MOMENTS):
-        group = {"GROUP": "1"} if number % 2 else {}
-        _make(tmp_path, blender, status=-9, KILL=moment, **group)
-        assert [path for path in tmp_path.rglob("*") if ".scratch" in str(path)]
-    _make(tmp_path, blender, "--workers=1")
+    subprocess.run(
+        [sys.executable, small_dataset.__file__, tmp_path, blender, *_MOMENTS],
+        cwd=ROOT,
+        env={**code_generator.of_users(), "PYTHONPATH": str(ROOT)},
+        check=True,
+    )
+    assert (tmp_path / ".scratch").exists() and (tmp_path / "cube_smcvx_box").exists()
+    assert make(tmp_path, blender, workers=1)
     assert _contents(tmp_path) == _contents(made)
 
 
-def test_what_is_half_written_is_written_again_and_what_is_whole_is_not(tmp_path, blender, made):
-    _make(tmp_path, blender)
+def test_what_is_half_written_is_written_again_and_what_is_whole_is_not(
+    tmp_path, blender, made, capsys
+):
+    make(tmp_path, blender)
     scene = tmp_path / "env_smcvx_box"
     (scene / "depth" / "train" / "r_001.exr").unlink()
     (scene / "train" / "r_001.png.unfinished").write_bytes(b"\x89PNG")
     (scene / "train" / "r_002.png").write_bytes(b"kept")
-    result = _make(tmp_path, blender)
-    assert "24/24" in result.stdout and "env_smcvx_box train 1" in result.stdout
+    capsys.readouterr()
+    make(tmp_path, blender)
+    assert "24/24  env_smcvx_box train 1" in capsys.readouterr().out
     contents = _contents(tmp_path)
     assert contents.pop("env_smcvx_box/train/r_002.png") == b"kept"
     assert contents.items() <= _contents(made).items()
-    assert "Nothing to do" in _make(tmp_path, blender).stdout
+    assert make(tmp_path, blender) and "Nothing to do" in capsys.readouterr().out
 
 
-def test_a_process_that_dies_is_reported_and_replaced_once(tmp_path, blender, made):
+def test_a_process_that_dies_is_reported_and_replaced_once(
+    tmp_path, blender, made, capsys, monkeypatch
+):
     dies = tmp_path / "dies"
     dies.mkdir()
+    monkeypatch.setenv("FAKE_DIES", str(dies))
     (dies / "once").touch()
-    result = _make(tmp_path / "out", blender, FAKE_DIES=str(dies))
-    assert "killed by SIGKILL" in result.stderr and "Once more" in result.stderr
+    make(tmp_path / "out", blender)
+    assert "killed by SIGKILL" in capsys.readouterr().err
     assert _contents(tmp_path / "out") == _contents(made)
-    for name in "abcd":
-        (dies / name).touch()
-    result = _make(tmp_path / "twice", blender, "--workers=1", status=2, FAKE_DIES=str(dies))
-    assert "ended twice while it rendered cube_smcvx_box train 0" in result.stderr
-    log = result.stderr.split("See ")[1].split(";")[0]
-    assert "chatter" in open(log).read()
-    _make(tmp_path / "twice", blender)  # dies once more at most, in each of two processes
+    (dies / "once").touch()
+    (dies / "twice").touch()
+    with pytest.raises(BlenderError, match=r"ended twice .* cube_smcvx_box train 0"):
+        make(tmp_path / "twice", blender, workers=1)
+    (log,) = (tmp_path / "twice").glob(".scratch/*/worker_0.log")
+    assert "chatter" in log.read_text()
+    make(tmp_path / "twice", blender)
     assert _contents(tmp_path / "twice") == _contents(made)
 
 
-def test_what_blender_complains_of_is_told(tmp_path, blender):
-    result = _make(tmp_path, blender, status=2, FAKE_ERROR="1")
-    assert "can not render cube_smcvx_box" in result.stderr and "no light" in result.stderr
-    result = _make(tmp_path, blender, status=2, FAKE_VERSION="4.2.0")
-    assert "Blender 4.2.0" in result.stderr and "make dataset-env" in result.stderr
-    result = _make(tmp_path, tmp_path / "nowhere", status=2)
-    assert "make dataset-env" in result.stderr
-    result = _make(tmp_path, "/bin/false", status=2)
-    assert "does not start: status 1" in result.stderr
+def test_what_blender_complains_of_is_told(tmp_path, blender, monkeypatch):
+    with pytest.raises(BlenderError, match="does not start: status 1"):
+        make(tmp_path, "/bin/false")
+    monkeypatch.setenv("FAKE_ERROR", "1")
+    with pytest.raises(BlenderError, match=r"can not render cube_smcvx_box .*no light"):
+        make(tmp_path, blender)
+    monkeypatch.setenv("FAKE_VERSION", "4.2.0")
+    with pytest.raises(BlenderError, match=r"Blender 4\.2\.0.*make dataset-env"):
+        make(tmp_path, blender)
 
 
-def test_other_settings_are_refused(made, blender):
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"size": 7}, "the size is 6, not 7"),
+        ({"spp": PerSplit(3, 2, 4)}, "the spp train is 2, not 3"),
+        ({"views": PerSplit(3, 2, 2)}, "the views val is 1, not 2"),
+        ({"rule": "facing"}, "the rule is nested, not facing"),
+        ({"linear": "all"}, "the render linear_images is test, not all"),
+        ({"preview": True}, "the views train is 3, not"),
+    ],
+)
+def test_other_settings_are_refused(made, blender, changes, said):
     before = _contents(made)
-    for option, said in [
-        ("--size=7", "the size is 6, not 7"),
-        ("--spp=3", "the spp train is 2, not 3"),
-        ("--val_views=2", "the views val is 1, not 2"),
-        ("--rule=facing", "the rule is nested, not facing"),
-        ("--exr=all", "the render linear_images is test, not all"),
-    ]:
-        result = _make(made, blender, option, status=2)
-        assert said in result.stderr and "another --out" in result.stderr
+    with pytest.raises(ValueError, match=f"{said}.*another --out"):
+        make(made, blender, **changes)
     assert _contents(made) == before
 
 
 def test_a_strange_folder_is_left_alone(tmp_path, blender):
     (tmp_path / "env_smcvx_box").mkdir()
-    result = _make(tmp_path, blender, status=2)
-    assert "no scene of this command" in result.stderr
+    with pytest.raises(ValueError, match="no scene of this command"):
+        make(tmp_path, blender)
     assert os.listdir(tmp_path) == ["env_smcvx_box"]
     assert not os.listdir(tmp_path / "env_smcvx_box")
+
+
+def test_two_commands_never_work_in_one_folder(tmp_path, blender, monkeypatch):
+    def again(*arguments, **options):
+        with pytest.raises(ValueError, match="Another command"):
+            make(tmp_path, blender)
+        return write_background(*arguments, **options)
+
+    write_background = small_dataset.write_background
+    monkeypatch.setattr(small_dataset, "write_background", again)
+    assert make(tmp_path, blender, "env_smcvx_box")
 
 
 def test_the_library_reads_what_was_made(made):
@@ -216,22 +214,19 @@ def test_views_differ_in_pose_and_noise(made):
 
 
 def test_the_rule_facing_gives_every_part_air_outside(tmp_path, blender):
-    _make(tmp_path, blender, "--scenes=env_mmncvx_box_full", "--rule=facing", "--exr=none")
-    record = json.loads((tmp_path / "env_mmncvx_box_full" / "scene.json").read_text())
+    make(tmp_path, blender, "env_mmncvx_box_full", rule="facing", linear="none")
+    scene = tmp_path / "env_mmncvx_box_full"
+    record = json.loads((scene / "scene.json").read_text())
     assert [part["outside"] for part in record["parts"]] == ["air", "air"]
     assert [part["ior_outside"] for part in record["parts"]] == [1.0, 1.0]
-    assert not [name for name in _contents(tmp_path) if name.endswith("test/r_000.exr")][2:]
+    assert not list((scene / "test").glob("*.exr"))
 
 
-def test_a_preview_is_one_view_a_scene_and_a_sheet(tmp_path, blender):
-    _make(tmp_path, blender, "--preview")
-    out = tmp_path / "preview"
-    sheets = sorted(path.name for path in out.glob("*.png"))
-    assert sheets == [f"contact_sheet_{kind}.png" for kind in ("cube", "env", "sphere")]
-    # Two objects stand before the environment, side by side.
-    sizes = {name: iio.imread(out / name).shape for name in sheets}
-    assert sizes["contact_sheet_env.png"][1] > 1.5 * sizes["contact_sheet_cube.png"][1]
-    frames = local_layout.read_frames(out / "env_smcvx_box", "test")
-    assert frames.names == ("r_000",)
-    assert not (out / "env_smcvx_box" / "transforms_train.json").exists()
-    assert "Nothing to do" in _make(tmp_path, blender, "--preview").stdout
+def test_a_preview_is_a_test_view_as_it_is_in_the_whole(tmp_path, blender, made):
+    views = PerSplit(3, 1, 2)
+    assert render_settings.preview_view(views.test) == 0
+    make(tmp_path, blender, preview=True)
+    assert local_layout.read_frames(tmp_path / "env_smcvx_box", "test").names == ("r_000",)
+    assert not (tmp_path / "env_smcvx_box" / "transforms_train.json").exists()
+    image = "env_smcvx_box/test/r_000.png"
+    assert _contents(tmp_path)[image] == _contents(made)[image]

@@ -1,0 +1,186 @@
+"""What Blender renders, against what is known. Needs `make dataset-env`."""
+
+import json
+import math
+import subprocess
+import time
+
+import imageio.v3 as iio
+import jax
+import numpy as np
+import pytest
+import trimesh
+
+from experiments.dataset import cameras, frame_files, workers
+from experiments.dataset.parts import Part
+from refref_jax.data.background import read_background
+from refref_jax.data.cameras import box_filter, image_rays, supersample
+from refref_jax.render.backgrounds import radiance_of
+from tests.experiments.command import ROOT
+from tests.experiments.dataset import small_dataset
+from tests.experiments.dataset.blender_rooms import Blender, cameras_at, pose, write_room
+
+_PYTHON = ROOT / ".venv-dataset" / "bin" / "python"
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not _PYTHON.exists(), reason="Blender is missing: make dataset-env"),
+]
+
+
+@pytest.fixture(scope="module")
+def blender(tmp_path_factory):
+    process = Blender(_PYTHON, tmp_path_factory.mktemp("scratch"))
+    yield process
+    process.close()
+
+
+def _ball(radius, name="body", material="glass", **options):
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    return Part(name, material, np.array(mesh.vertices), np.array(mesh.faces), **options)
+
+
+def _psnr(a, b):
+    return -10.0 * math.log10(np.mean((a - b) ** 2))
+
+
+@pytest.mark.parametrize("kind", ["cube", "sphere", "env"])
+def test_every_background_lies_as_the_library_has_it(tmp_path, blender, kind):
+    room = write_room(tmp_path / "room", kind)
+    radiance = jax.jit(jax.vmap(radiance_of(jax.device_put(read_background(room)))))
+    for number in (0, 3, 9):
+        rendering = blender.render(room, pose(number), samples=64)
+        rays = image_rays(supersample(cameras_at(pose(number)), 5), 0)
+        seen = radiance(rays.origins.reshape(-1, 3), rays.directions.reshape(-1, 3))
+        wanted = box_filter(np.asarray(seen).reshape(*rays.origins.shape), 5)
+        assert _psnr(rendering.linear, wanted) > 45.0
+        assert not rendering.mask.any() and not rendering.normal.any()
+
+
+@pytest.mark.parametrize(("kind", "smooth"), [("cube", True), ("sphere", False), ("env", True)])
+def test_depth_mask_and_normal_are_those_of_rays_through_middles(tmp_path, blender, kind, smooth):
+    part = _ball(1.7, smooth=smooth)
+    room = write_room(tmp_path / "room", kind, [part])
+    rendering = blender.render(room, pose(7), seed=5)
+    rays = image_rays(cameras_at(pose(7)), 0)
+    # Blender holds vertices in single precision.
+    vertices = part.vertices.astype(np.float32).astype(np.float64)
+    mesh = trimesh.Trimesh(vertices, part.faces, process=False)
+    origins, directions = (array.reshape(-1, 3).astype(np.float64) for array in rays[:2])
+    points, ray, face = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
+    mask = np.zeros(len(origins), bool)
+    mask[ray] = True
+    np.testing.assert_array_equal(rendering.mask.ravel(), mask)
+    distances = _distances_to_walls(kind, origins, directions)
+    distances[ray] = np.linalg.norm(points - origins[ray], axis=1)
+    depth = distances * (directions @ -pose(7)[:3, 2])
+    np.testing.assert_allclose(rendering.depth.ravel(), np.minimum(depth, 1e10), atol=1e-4)
+    normals = mesh.face_normals[face]
+    if smooth:
+        weights = trimesh.triangles.points_to_barycentric(mesh.triangles[face], points)
+        normals = np.einsum("fk,fkc->fc", weights, mesh.vertex_normals[part.faces[face]])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    np.testing.assert_allclose(rendering.normal.reshape(-1, 3)[ray], normals, atol=2e-3)
+    assert not rendering.normal[~rendering.mask].any()
+
+
+def _distances_to_walls(kind, origins, directions):
+    if kind == "env":
+        return np.full(len(origins), np.inf)
+    if kind == "cube":
+        with np.errstate(divide="ignore"):
+            return np.min((7.3 * np.sign(directions) - origins) / directions, axis=1)
+    along = np.sum(origins * directions, axis=1)
+    return np.sqrt(along**2 - np.sum(origins**2, axis=1) + 7.3**2) - along
+
+
+def test_absorption_follows_beer_and_lambert(tmp_path, blender):
+    absorption = (0.8, 0.25, 0.0)
+    # Of index 1 it neither bends nor reflects.
+    part = small_dataset.box(2.0, "body", "air", absorption=absorption)
+    room = write_room(tmp_path / "room", "cube", [part], white=True)
+    rendering = blender.render(room, pose(2), samples=256)
+    rays = image_rays(supersample(cameras_at(pose(2)), 8), 0)
+    near, far = np.sort([(side - rays.origins) / rays.directions for side in (-1.0, 1.0)], axis=0)
+    length = np.maximum(far.min(axis=-1) - near.max(axis=-1), 0.0)
+    wanted = box_filter(np.exp(-length[..., None] * np.array(absorption)), 8)
+    assert wanted.min() < 0.1
+    assert _psnr(rendering.linear, wanted) > 45.0
+    np.testing.assert_allclose(rendering.linear.mean((0, 1)), wanted.mean((0, 1)), rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("rule", "inner", "clear"), [("nested", "glass", True), ("facing", "glass", False)]
+)
+def test_an_interface_between_equal_media_is_seen_under_facing_alone(
+    tmp_path, blender, rule, inner, clear
+):
+    shell, body = _ball(1.8, "shell"), _ball(1.2, "core", inner)
+    alone = write_room(tmp_path / "alone", "cube", [shell])
+    both = write_room(tmp_path / "both", "cube", [shell, body], rule=rule)
+    images = [blender.render(room, pose(4), samples=256).linear for room in (alone, both)]
+    assert (_psnr(*images) > 38.0) == clear
+    assert _psnr(*images) > 30.0 or not clear
+
+
+def test_a_tint_multiplies_at_both_crossings(tmp_path, blender):
+    part = small_dataset.box(2.0, "body", "air", tint=(0.5, 0.9, 1.0))
+    room = write_room(tmp_path / "room", "env", [part], white=True)
+    rendering = blender.render(room, pose(2), samples=16)
+    middle = rendering.linear[20:28, 20:28]
+    np.testing.assert_allclose(middle, np.broadcast_to([0.25, 0.81, 1.0], middle.shape), atol=1e-3)
+
+
+def test_threads_and_order_do_not_show(tmp_path, blender):
+    parts = [_ball(1.8, "shell"), _ball(1.3, "liquid", "water", absorption=(0.1, 0.4, 0.0))]
+    rooms = [write_room(tmp_path / kind, kind, parts) for kind in ("cube", "env")]
+    calls = [(room, number) for room in rooms for number in (0, 5)]
+    first = [blender.render(room, pose(n), samples=9, seed=n) for room, n in calls]
+    other = Blender(_PYTHON, tmp_path, threads=1)
+    second = [other.render(room, pose(n), samples=9, seed=n) for room, n in calls[::-1]][::-1]
+    other.close()
+    for a, b in zip(first, second, strict=True):
+        assert all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+    assert not np.array_equal(first[0].linear, first[1].linear)
+
+
+def test_our_encoding_is_blenders_standard_view(tmp_path):
+    """Blender writes a ramp as PNG, and we encode it."""
+    script = """
+import sys, bpy, numpy as np
+scene = bpy.context.scene
+scene.view_settings.view_transform = "Standard"
+scene.render.image_settings.file_format = "PNG"
+scene.render.dither_intensity = 0.0
+ramp = bpy.data.images.new("ramp", 4096, 1, float_buffer=True)
+ramp.colorspace_settings.name = "Linear Rec.709"
+pixels = np.ones((4096, 4), np.float32)
+pixels[:, :3] = np.linspace(-0.1, 1.3, 4096)[:, None]
+ramp.pixels.foreach_set(pixels.ravel())
+ramp.save_render(sys.argv[1], scene=scene)
+"""
+    path = tmp_path / "ramp.png"
+    subprocess.run([_PYTHON, "-c", script, path], check=True, capture_output=True)
+    theirs = iio.imread(path)[0, :, 0].astype(int)
+    ours = frame_files.to_srgb(np.linspace(-0.1, 1.3, 4096).astype(np.float32)).astype(int)
+    assert np.max(np.abs(ours - theirs)) <= 1
+    assert np.mean(ours != theirs) < 0.01
+
+
+def test_a_process_ends_when_nobody_listens(tmp_path):
+    room = write_room(tmp_path / "room", "env", [_ball(1.8)])
+    command = [_PYTHON, workers.SCRIPT, "--threads=1"]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen(command, **pipes, encoding="utf-8") as process:
+        assert json.loads(process.stdout.readline())["blender"] == "5.0.1"
+        for samples in (1, 1 << 22):
+            job = workers.Job(str(room), pose(0).tolist(), cameras.ANGLE_X, samples, 0)
+            files = {"colour": f"{tmp_path}/colour.exr", "geometry": f"{tmp_path}/geometry.exr"}
+            print(json.dumps(job._asdict() | files), file=process.stdin, flush=True)
+            if samples == 1:
+                assert process.stdout.readline() == "{}\n"
+        # It takes hours to render this one.
+        time.sleep(1.0)
+        process.stdin.close()
+        assert process.wait(timeout=60) == 0
+        assert process.stdout.read() == ""

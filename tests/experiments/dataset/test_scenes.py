@@ -1,0 +1,102 @@
+import pytest
+
+from experiments.dataset import catalogue, objects, scenes
+from experiments.dataset.parts import Object
+from experiments.dataset.render_settings import PerSplit, RenderSettings
+from experiments.dataset.scenes import Scene
+
+_OBJECTS = {
+    name: Object(name, category, lambda detail: [])
+    for name, category in [
+        ("ball", "smcvx"),
+        ("ball_coloured", "smcvx"),
+        ("torus", "smncvx"),
+        ("vial", "mmncvx"),
+    ]
+}
+
+
+def _names(text):
+    return [scene.name for scene in scenes.choose(text, _OBJECTS)]
+
+
+def test_names_hold_background_category_and_object():
+    assert Scene("sphere", "smcvx", "ball_coloured").name == "sphere_smcvx_ball_coloured"
+    assert len(_names("all")) == 3 * len(_OBJECTS)
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("env_mmncvx_vial", ["env_mmncvx_vial"]),
+        ("torus", ["cube_smncvx_torus", "sphere_smncvx_torus", "env_smncvx_torus"]),
+        ("env_*_ball*", ["env_smcvx_ball", "env_smcvx_ball_coloured"]),
+        ("cube_smncvx_*, cube_smcvx_ball", ["cube_smcvx_ball", "cube_smncvx_torus"]),
+        ("cube_smcvx_ball,cube_*_ball", ["cube_smcvx_ball"]),
+    ],
+)
+def test_names_objects_and_wildcards_choose_in_one_order(text, names):
+    assert _names(text) == names
+
+
+@pytest.mark.parametrize("text", ["cube_smcvx_torus", "", "ball,,torus", "Ball"])
+def test_a_name_that_fits_nothing_is_told(text):
+    with pytest.raises(ValueError, match="Choose from"):
+        scenes.choose(text, _OBJECTS)
+    with pytest.raises(ValueError, match="cube_smncvx_torus"):
+        scenes.choose("cube_smcvx_torus", _OBJECTS)
+
+
+def test_the_catalogue_holds_objects_under_their_names():
+    assert catalogue.gather() == catalogue.OBJECTS
+    categories = [item.category for item in catalogue.OBJECTS.values()]
+    assert categories == sorted(categories, key=["smcvx", "smncvx", "mmncvx"].index)
+    assert all(name == item.name for name, item in catalogue.OBJECTS.items())
+
+
+def test_two_objects_of_one_name_are_refused(tmp_path, monkeypatch):
+    for name in ("first", "second"):
+        text = "from experiments.dataset.parts import Object\n"
+        text += "OBJECTS = (Object('same', 'smcvx', lambda detail: []),)\n"
+        (tmp_path / f"{name}_made_for_a_test.py").write_text(text)
+    monkeypatch.setattr(objects, "__path__", [str(tmp_path)])
+    with pytest.raises(ValueError, match="called same"):
+        catalogue.gather()
+
+
+def _settings(**changes):
+    return RenderSettings(
+        **{"size": 8, "spp": PerSplit(1, 1, 1), "views": PerSplit(2, 0, 6), **changes}
+    )
+
+
+def test_views_are_numbered_from_zero():
+    settings = _settings()
+    numbers = [settings.numbers(split) for split in ("train", "val", "test")]
+    assert numbers == [(0, 1), (), (0, 1, 2, 3, 4, 5)]
+    settings = _settings(preview=True)
+    numbers = [settings.numbers(split) for split in ("train", "val", "test")]
+    assert numbers == [(), (), (3,)]
+
+
+@pytest.mark.parametrize(
+    ("linear", "kept"), [("all", [True, True]), ("test", [False, True]), ("none", [False, False])]
+)
+def test_linear_images_are_kept_of_the_chosen_splits(linear, kept):
+    settings = _settings(linear=linear)
+    assert [settings.keeps_linear(split) for split in ("train", "test")] == kept
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"size": 0}, "The size is 0"),
+        ({"spp": PerSplit(1, 1, 0)}, "The spp of test is 0"),
+        ({"views": PerSplit(0, 0, 0)}, "at least one view"),
+        ({"views": PerSplit(1, -1, 0)}, "not negative"),
+        ({"views": PerSplit(1, 1, 0), "preview": True}, "--test_views"),
+    ],
+)
+def test_settings_without_meaning_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        _settings(**changes)
