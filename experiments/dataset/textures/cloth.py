@@ -8,7 +8,7 @@ from experiments.dataset.textures.fields import (
     Picture,
     coordinates,
     fbm,
-    mix,
+    blend,
     noise,
     random_of,
     smooth,
@@ -34,7 +34,7 @@ def jacquard(n: int) -> Picture:
     warp = chosen(random_of(i // 7, 11), "#f1e3c6", "#e9c46a", "#f4a261", "#f7ead2", "#dfa08a")
     weft = chosen(random_of(j // 4, 12), "#264653", "#9b2335", "#1d3557", "#2a7f78", "#6d2e46",
                   "#33415c")
-    yarn = mix(weft, warp, over)
+    yarn = blend(weft, warp, over)
     yarn = yarn * (0.8 + 0.35 * random_of(np.where(over, i, j + 997), 13))[..., None]
     along, across = np.where(over, v, u), np.where(over, u, v)
     twist = np.sin(2.0 * np.pi * (2.0 * along + 1.3 * across) * np.where(over, 1.0, -1.0))
@@ -80,7 +80,7 @@ def tartan(n: int) -> Picture:
     rim = np.minimum(np.minimum(u, 1.0 - u), np.minimum(v, 1.0 - v))
     along = np.where(np.minimum(u, 1.0 - u) < np.minimum(v, 1.0 - v), v, u)
     stitch = smooth(0.010, 0.006, np.abs(rim - 0.035)) * (np.abs(along * 22.0 % 1.0 - 0.5) < 0.3)
-    cloth = mix(cloth, colour("#f3e7cb"), 0.9 * stitch)
+    cloth = blend(cloth, colour("#f3e7cb"), 0.9 * stitch)
     puff = 0.010 * np.sqrt(np.clip(rim * 2.0, 0.0, 1.0)) + 0.0015 * fbm(n, 9, 4, octaves=3)
     quilt = np.minimum(np.abs((u + v) * 3.0 % 1.0 - 0.5), np.abs((u - v) * 3.0 % 1.0 - 0.5))
     puff = puff + 0.003 * np.sqrt(np.clip(quilt * 4.0, 0.0, 1.0))

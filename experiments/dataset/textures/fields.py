@@ -52,19 +52,10 @@ def fbm(
 
     Octaves that the samples can not show are left out. The variance is 1 of all octaves together.
     """
-    return sum(
-        (weight * noise(n, each, seed + octave))
-        for octave, each, weight in _octaves(n, frequency, octaves, gain)
-    )
-
-
-def ridges(n: int, frequency: int, seed: int, *, octaves: int = 5, gain: float = 0.5) -> Field:
-    """Returns octaves of `1 - |noise|`: sharp crests, about 0 to 1."""
-    total = sum(
-        weight * (1.0 - np.abs(noise(n, each, seed + octave)))
-        for octave, each, weight in _octaves(n, frequency, octaves, gain)
-    )
-    return total / sum(gain**octave for octave in range(octaves)) * _norm(octaves, gain)
+    total = np.zeros((n, n), np.float32)
+    for octave, lattice, weight in _octaves(n, frequency, octaves, gain):
+        total += np.float32(weight) * noise(n, lattice, seed + octave)
+    return total
 
 
 def lookup(field: Float[np.ndarray, "h w *channels"], u: Field, v: Field) -> np.ndarray:
@@ -87,15 +78,9 @@ def smooth(low: float, high: float, values: np.ndarray) -> np.ndarray:
     return t * t * (3.0 - 2.0 * t)
 
 
-def mix(low: np.ndarray, high: np.ndarray, share: np.ndarray | float) -> np.ndarray:
-    """Returns `low` where the share is 0 and `high` where it is 1.
-
-    A share of one dimension less than the colours is one for all channels.
-    """
-    share = np.asarray(share, np.float32)
-    if share.ndim == 2 and max(np.ndim(low), np.ndim(high)) != 2:
-        share = share[..., None]
-    return low + share * (high - low)
+def blend(low: np.ndarray, high: np.ndarray, share: np.ndarray | float) -> np.ndarray:
+    """Returns the colours `low` where the share is 0, and `high` where it is 1."""
+    return low + np.asarray(share, np.float32)[..., None] * (high - low)
 
 
 def random_of(index: Int[np.ndarray, "*shape"], seed: int) -> Float[np.ndarray, "*shape"]:

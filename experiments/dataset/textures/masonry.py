@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from jaxtyping import Float
 from PIL import Image, ImageDraw
 
 from experiments.dataset.textures.cells import voronoi
@@ -12,13 +13,13 @@ from experiments.dataset.textures.fields import (
     coordinates,
     fbm,
     lookup,
-    mix,
+    blend,
     noise,
     random_of,
     smooth,
 )
 from experiments.dataset.textures.shading import chosen, colour, graded, hollows, lit
-from experiments.dataset.textures.stamps import Place, stamp
+from experiments.dataset.textures.stamps import Place, Samples, stamp
 
 
 def brick(n: int) -> Picture:
@@ -40,11 +41,11 @@ def brick(n: int) -> Picture:
     kinds = ("#8e3b2a", "#a84e34", "#6f2c25", "#b8613f", "#54292a", "#c98b5c", "#7d4436", "#3f2a2e")
     clay = chosen(random_of(index, 1), *kinds) * (0.75 + 0.5 * random_of(index, 2))[..., None]
     clay = clay * (1.0 + 0.11 * grain + 0.10 * stains)[..., None]
-    clay = mix(clay, colour("#e2d6c4"), 0.55 * smooth(0.9, 2.2, stains + 0.7 * grain))
+    clay = blend(clay, colour("#e2d6c4"), 0.55 * smooth(0.9, 2.2, stains + 0.7 * grain))
     mortar = colour("#b9ac97") * (0.8 + 0.14 * fbm(n, 200, 51, octaves=2, gain=0.9))[..., None]
-    wall = mix(mortar, clay, cover)
+    wall = blend(mortar, clay, cover)
     moss = smooth(0.6, 1.7, -stains + 0.5 * rough) * (1.0 - 0.6 * cover)
-    wall = mix(wall, colour("#4a5a24") * (1.0 + 0.25 * grain)[..., None], moss)
+    wall = blend(wall, colour("#4a5a24") * (1.0 + 0.25 * grain)[..., None], moss)
     pits = smooth(1.5, 2.3, grain)
     tilt = u * (random_of(index, 3) - 0.5) + v * (random_of(index, 4) - 0.5)
     height = 0.006 * cover * (1.0 + 0.5 * tilt) + 0.0005 * rough + 0.0003 * grain - 0.001 * pits
@@ -69,7 +70,7 @@ def cobbles(n: int) -> Picture:
     stone = stone + (0.22 * vein * (random_of(cells.index, 6) > 0.6))[..., None]
     damp = fbm(n, 4, 91, octaves=5)
     sand = graded(damp + 0.4 * grain, (-1.5, "#2b2620"), (0.2, "#5d5140"), (1.0, "#4d5b27"))
-    road = mix(sand, stone, smooth(0.0, 0.05, border))
+    road = blend(sand, stone, smooth(0.0, 0.05, border))
     height = 0.013 * dome + 0.0009 * rough + 0.0003 * grain
     road = lit(road, height, gloss=0.55, shininess=26.0)
     return road * hollows(height, 0.012, strength=1.5)[..., None]
@@ -87,7 +88,7 @@ def pebbles(n: int) -> Picture:
                             np.full(55, 0.056)])
     for size in sizes * rng.uniform(0.8, 1.25, sizes.size):
         middle, angle = rng.random(2) * 1.1 - 0.05, rng.uniform(0.0, 2.0 * math.pi)
-        _pebble(shore, Place(*middle, size, angle), rng, colour(kinds[rng.integers(len(kinds))]),
+        _pebble(shore, Place(*middle.tolist(), float(size), angle), rng, colour(kinds[rng.integers(len(kinds))]),
                 (grain, bands))
     return shore
 
@@ -99,24 +100,24 @@ def _pebble(shore: Picture, place: Place, rng: np.random.Generator, base: np.nda
     squash, power = rng.uniform(0.55, 0.85), rng.uniform(2.0, 2.7)
     stripes, speckles = rng.random() < 0.4, rng.random() < 0.5
     pitch, phase, tilt = rng.uniform(2.0, 7.0), rng.uniform(0.0, 9.0), rng.uniform(-0.6, 0.6)
-    other = mix(base, colour("#f2ede2"), 0.7) if base.mean() < 0.6 else 0.55 * base
+    other = blend(base, colour("#f2ede2"), 0.7) if base.mean() < 0.6 else 0.55 * base
     shade = rng.uniform(0.8, 1.15)
-    at = rng.random(2)
+    at = rng.random(2).tolist()
 
     def distance(u: Field, v: Field) -> Field:
         rim = (np.abs(u) ** power + np.abs(v / squash) ** power) ** (1.0 / power)
         return (rim - 1.0) * squash
 
-    def paint(u: Field, v: Field, outside: Field) -> Picture:
+    def paint(u: Samples, v: Samples, outside: Samples) -> Float[np.ndarray, "samples 3"]:
         scale = 1.2 * place.size
         fine = lookup(grain, at[0] + scale * u, at[1] + scale * v)
         broad = lookup(bands, at[1] + scale * u, at[0] + scale * v)
         skin = base * (shade + 0.08 * broad + 0.06 * fine)[..., None]
         if stripes:
             wave = np.sin(pitch * (v + tilt * u + 0.12 * broad) + phase)
-            skin = mix(skin, other, 0.75 * smooth(0.45, 0.8, wave))
+            skin = blend(skin, other, 0.75 * smooth(0.45, 0.8, wave))
         if speckles:
-            skin = mix(skin, other, 0.6 * smooth(0.8, 1.3, fine))
+            skin = blend(skin, other, 0.6 * smooth(0.8, 1.3, fine))
         inward = np.clip(1.0 + outside / squash, 0.0, 1.0) ** 2
         height = np.sqrt(np.maximum(1.0 - inward, 0.0))
         cos, sin = math.cos(place.angle), math.sin(place.angle)
@@ -151,7 +152,7 @@ def shingles(n: int) -> Picture:
         share = 0.45 * random_of(index, 1) + 0.55 * wave
         glaze = chosen(np.clip(share, 0.0, 0.999), *kinds)
         glaze = glaze * (0.7 + 0.4 * random_of(index, 2) + 0.12 * run + 0.06 * grain)[..., None]
-        glaze = mix(glaze, colour("#e9dcae"), 0.7 * smooth(0.05, 0.02, np.abs(rim - 0.14)))
+        glaze = blend(glaze, colour("#e9dcae"), 0.7 * smooth(0.05, 0.02, np.abs(rim - 0.14)))
         veins = np.cos(np.arctan2(u, 2.3 - v) * 22.0)
         glaze = glaze * (1.0 + 0.13 * veins * smooth(0.2, 0.4, rim))[..., None]
         local = 0.010 * np.sqrt(np.clip(rim, 0.0, 0.35)) + 0.008 * (v - 2.0) + 0.004 * bow
@@ -188,6 +189,6 @@ def terrazzo(n: int) -> Picture:
     turn = 6.283 * random_of(chip, 4)
     veins = lookup(clouds, 3.0 * (x * np.cos(turn) + y) + random_of(chip, 5), 3.0 * y + turn)
     stone = stone * (1.0 + 0.16 * veins + 0.05 * grain)[..., None]
-    stone = mix(stone, colour("#f6f1e4"), 0.55 * smooth(0.10, 0.02, np.abs(veins)))
+    stone = blend(stone, colour("#f6f1e4"), 0.55 * smooth(0.10, 0.02, np.abs(veins)))
     cement = colour("#d6cdbd") * (0.92 + 0.07 * grain + 0.03 * clouds)[..., None]
-    return mix(cement, stone, (chip > 0).astype(np.float32))
+    return blend(cement, stone, (chip > 0).astype(np.float32))

@@ -10,7 +10,7 @@ from experiments.dataset.textures.fields import (
     coordinates,
     fbm,
     lookup,
-    mix,
+    blend,
     noise,
     random_of,
     smooth,
@@ -30,8 +30,8 @@ def marble(n: int) -> Picture:
     breaks = shards.border + 0.006 * fbm(n, 30, 91, octaves=4)
     stone = stone * (0.72 + 0.5 * random_of(shards.index, 2))[..., None]
     rose = (random_of(shards.index, 3) > 0.8) * 0.75
-    stone = mix(stone, graded(body, (-2.0, "#4a1c28"), (0.0, "#8d4a4c"), (2.0, "#e3b5a4")), rose)
-    stone = mix(stone, colour("#eef0e4"), 0.85 * smooth(0.007, 0.002, breaks))
+    stone = blend(stone, graded(body, (-2.0, "#4a1c28"), (0.0, "#8d4a4c"), (2.0, "#e3b5a4")), rose)
+    stone = blend(stone, colour("#eef0e4"), 0.85 * smooth(0.007, 0.002, breaks))
     for turns, width, tone in (
         ((5, 2), 0.03, "#f4efe3"), ((-4, 7), 0.03, "#d9e4d6"), ((9, 5), 0.02, "#cfa04c"),
         ((-13, 10), 0.06, "#081813"), ((11, 14), 0.05, "#f2f5ea"), ((-15, 19), 0.05, "#e4eedd"),
@@ -40,7 +40,7 @@ def marble(n: int) -> Picture:
         bend = lookup(fbm(n, 4, seed, octaves=7, gain=0.55), u, v)
         crack = np.abs(np.sin(np.pi * (turns[0] * x + turns[1] * y + (0.8 + 0.09 * abs(turns[0])) * bend)))
         swell = np.clip(0.35 + 0.9 * noise(n, 6, seed + 9), 0.02, 2.0)
-        stone = mix(stone, colour(tone), 0.9 * smooth(width, 0.15 * width, crack / swell))
+        stone = blend(stone, colour(tone), 0.9 * smooth(width, 0.15 * width, crack / swell))
     fine = fbm(n, 150, 81, octaves=2, gain=0.9)
     return stone * (1.0 + 0.08 * fine)[..., None]
 
@@ -64,10 +64,10 @@ def rust(n: int) -> Picture:
     sea = graded(fbm(n, 6, 51, octaves=5), (-2.0, "#0d4a57"), (0.0, "#1b7f86"), (2.0, "#57b3a8"))
     primer = colour("#c9bfa6") * (0.9 + 0.06 * grain)[..., None]
     band = smooth(0.004, -0.004, np.abs(y - 0.5) - 0.1)
-    sea = mix(sea, colour("#d8d2bd") * (0.95 + 0.04 * grain)[..., None], band)
+    sea = blend(sea, colour("#d8d2bd") * (0.95 + 0.04 * grain)[..., None], band)
     top, under = smooth(0.45, 0.38, edge), smooth(0.75, 0.66, edge)
-    hull = mix(mix(metal, primer, under), sea, top)
-    hull = mix(hull, colour("#7a3413"), 0.75 * smooth(0.6, 2.0, runs))
+    hull = blend(blend(metal, primer, under), sea, top)
+    hull = blend(hull, colour("#7a3413"), 0.75 * smooth(0.6, 2.0, runs))
     height = 0.0026 * top + 0.0018 * under + 0.0006 * grain * (1.0 - 0.8 * top)
     height += 0.003 * smooth(0.0, 0.004, seam) + 0.004 * np.sqrt(
         np.clip(1.0 - (rivet / 0.0062) ** 2, 0.0, 1.0))
@@ -87,7 +87,7 @@ def turing(n: int) -> Picture:
                   (0.15, "#ee6a4c"), (0.5, "#f8c46a"), (1.0, "#fff4d6"))
     cool = graded(grown, (-1.0, "#03252e"), (-0.4, "#0b5d66"), (0.1, "#36a08f"),
                   (0.5, "#b9dfae"), (1.0, "#fbfbe3"))
-    reef = mix(tone, cool, smooth(-0.5, 0.6, fbm(n, 3, 5, octaves=4) + 0.5 * (scale - 1.5)))
+    reef = blend(tone, cool, smooth(-0.5, 0.6, fbm(n, 3, 5, octaves=4) + 0.5 * (scale - 1.5)))
     grain = fbm(n, 100, 15, octaves=4, gain=0.8)
     height = 0.011 * grown + 0.00035 * grain
     reef = lit(reef * (1.0 + 0.04 * grain)[..., None], height, gloss=0.3, shininess=24.0)

@@ -3,15 +3,19 @@
 import math
 
 import numpy as np
+from jaxtyping import Float
 
-from experiments.dataset.textures.fields import Field, Picture, fbm, lookup, mix, smooth
+from experiments.dataset.textures.fields import Field, Picture, fbm, lookup, blend, smooth
 from experiments.dataset.textures.shading import colour, colours, graded
-from experiments.dataset.textures.stamps import Place, stamp
+from experiments.dataset.textures.stamps import Place, Samples, stamp
 
 _FALLEN = ("#b5341c", "#d9731a", "#e8a723", "#8c2318", "#c9581f", "#7a4a1e", "#a8842c", "#6b7a2a",
            "#e0c04a", "#5a2a1a", "#94a83a")
 _PETALS = ("#e63946", "#f4d35e", "#f6f1eb", "#9d4edd", "#ff7096", "#3a86c8", "#ff9f1c", "#c9184a",
            "#b8c0ff", "#ffe8d6")
+
+# Of half a leaf of maple: angle and length of its lobes.
+_LOBES = ((0.0, 1.22), (0.8, 1.05), (1.72, 0.72))
 
 
 def leaves(n: int) -> Picture:
@@ -23,28 +27,29 @@ def leaves(n: int) -> Picture:
     for depth, size in enumerate(sizes):
         middle, angle = rng.random(2) * 1.12 - 0.06, rng.uniform(0.0, 2.0 * math.pi)
         tone = colour(_FALLEN[rng.integers(len(_FALLEN))]) * (0.55 + 0.5 * depth / sizes.size)
-        _leaf(wood, Place(*middle, size, angle), tone, rng, cloud)
+        _leaf(wood, Place(*middle.tolist(), float(size), angle), tone, rng, cloud)
     return wood
 
 
 def _leaf(wood: Picture, place: Place, tone: np.ndarray, rng: np.random.Generator, cloud: Field
           ) -> None:
     """Lays a leaf: its stalk at `u = -1`; lobed as of a maple, or an oval."""
-    lobes, wide = int(rng.choice([0, 0, 5, 7])), rng.uniform(0.42, 0.62)
+    maple, wide = rng.random() < 0.5, rng.uniform(0.42, 0.62)
     teeth, curl = rng.uniform(14.0, 26.0), rng.uniform(-0.25, 0.25)
-    at, veins = rng.random(2), rng.integers(6, 9)
-    light = rng.uniform(-1.0, 1.0, 2)
+    at, veins = rng.random(2).tolist(), int(rng.integers(6, 9))
+    light = rng.uniform(-1.0, 1.0, 2).tolist()
     accent = colour(_FALLEN[rng.integers(len(_FALLEN))])
 
     def distance(u: Field, v: Field) -> Field:
         v = v - curl * u * u
-        if lobes:
-            turn = np.arctan2(v, u + 0.25)
-            spread = np.abs(np.cos(0.5 * lobes * turn))
-            rim = 0.36 + 0.5 * spread**1.6 * (0.75 + 0.25 * np.cos(turn))
-            rim = rim + 0.045 * np.abs(np.sin(teeth * 0.5 * turn)) - 0.5 * np.exp(
-                -((np.abs(turn) - np.pi) / 0.4) ** 2)
-            blade = np.hypot(u + 0.25, v) - rim
+        if maple:
+            turn = np.abs(np.arctan2(v, u + 0.3))
+            rim = np.full_like(u, 0.2)
+            for axis, length in _LOBES:
+                peak = np.maximum(1.0 - np.abs(turn - axis) / 0.48, 0.0)
+                rim = np.maximum(rim, 0.2 + (length - 0.2) * peak**0.85)
+            rim = rim * (1.0 + 0.13 * np.abs(np.sin(teeth * 0.5 * turn)))
+            blade = 0.6 * (np.hypot(u + 0.3, v) - rim)
         else:
             share = np.clip(0.5 * (u + 0.85) / 0.925, 0.0, 1.0)
             half = wide * np.sin(np.pi * share**0.8) * (1.0 - 0.25 * share)
@@ -53,24 +58,26 @@ def _leaf(wood: Picture, place: Place, tone: np.ndarray, rng: np.random.Generato
         stalk = np.maximum(np.abs(v) - 0.022, np.maximum(-1.1 - u, u))
         return np.minimum(blade, stalk)
 
-    def paint(u: Field, v: Field, outside: Field) -> Picture:
+    def paint(u: Samples, v: Samples, outside: Samples) -> Float[np.ndarray, "samples 3"]:
         bent = v - curl * u * u
-        if lobes:
-            turn = np.arctan2(bent, u + 0.25)
-            fold = np.abs(np.sin(0.5 * lobes * turn + 0.5 * np.pi * (lobes % 2 == 0)))
-            fold = np.abs(np.cos(0.5 * lobes * turn)) if lobes % 2 else 1.0 - fold
-            rib = (1.0 - np.abs(np.cos(0.5 * lobes * turn))) * np.hypot(u + 0.25, bent) * 1.4
+        if maple:
+            turn = np.abs(np.arctan2(bent, u + 0.3))
+            away = np.minimum.reduce([np.abs(turn - axis) for axis, _ in _LOBES])
+            fold = np.clip(1.0 - away / 0.45, 0.0, 1.0)
+            radius = np.hypot(u + 0.3, bent)
+            rib = radius * away
+            rib = np.minimum(rib, 0.01 + 0.3 * np.abs((radius * 7.0 - 3.0 * away) % 1.0 - 0.5))
         else:
             side = np.abs(bent)
             fold = np.abs(((u - 0.8 * side) * veins * 0.5) % 1.0 - 0.5) * 2.0
             rib = np.minimum(np.abs(bent), 0.045 + (1.0 - fold) * 0.12)
         spots = lookup(cloud, at[0] + 0.16 * u, at[1] + 0.16 * v)
         fine = lookup(cloud, at[1] + 0.7 * u, at[0] + 0.7 * v)
-        skin = mix(tone, accent, 0.55 * smooth(0.2, 1.4, spots))
+        skin = blend(tone, accent, 0.55 * smooth(0.2, 1.4, spots))
         skin = skin * (0.92 + 0.14 * fine + 0.12 * np.sign(bent) * light[0])[..., None]
         skin = skin * (1.0 + 0.22 * (light[1] * u + light[0] * v) + 0.14 * (fold - 0.5))[..., None]
-        skin = mix(skin, 1.35 * tone + 0.12, 0.8 * smooth(0.035, 0.012, rib))
-        skin = mix(skin, colour("#3a1f0e"), 0.75 * smooth(1.2, 1.9, spots + 0.3 * fine))
+        skin = blend(skin, 1.35 * tone + 0.12, 0.8 * smooth(0.035, 0.012, rib))
+        skin = blend(skin, colour("#3a1f0e"), 0.75 * smooth(1.2, 1.9, spots + 0.3 * fine))
         return skin * (0.8 + 0.2 * smooth(0.0, -0.08, outside))[..., None]
 
     stamp(wood, place, distance, paint)
@@ -86,11 +93,11 @@ def flowers(n: int) -> Picture:
         middle, angle = rng.random(2) * 1.1 - 0.05, rng.uniform(0.0, 2.0 * math.pi)
         green = colours("#1f6b2a", "#4f9a35", "#88b84a", "#2c7f5a", "#b5c95a")[rng.integers(5)]
         size = rng.uniform(0.03, 0.06)
-        _blade(meadow, Place(*middle, size, angle), green * (0.5 + 0.55 * depth / 900.0), rng)
+        _blade(meadow, Place(*middle.tolist(), float(size), angle), green * (0.5 + 0.55 * depth / 900.0), rng)
     sizes = np.linspace(0.016, 0.058, 400) * rng.uniform(0.75, 1.25, 400)
     for size in sizes:
         middle, angle = rng.random(2) * 1.1 - 0.05, rng.uniform(0.0, 2.0 * math.pi)
-        _flower(meadow, Place(*middle, size, angle), rng, cloud)
+        _flower(meadow, Place(*middle.tolist(), float(size), angle), rng, cloud)
     return meadow
 
 
@@ -100,7 +107,7 @@ def _blade(meadow: Picture, place: Place, tone: np.ndarray, rng: np.random.Gener
     def distance(u: Field, v: Field) -> Field:
         return np.abs(v - bend * (u * u - 0.3)) - wide * (1.0 - np.abs(u) ** 1.7)
 
-    def paint(u: Field, v: Field, outside: Field) -> Picture:
+    def paint(u: Samples, v: Samples, outside: Samples) -> Float[np.ndarray, "samples 3"]:
         side = v - bend * (u * u - 0.3)
         light = 0.85 + 0.25 * np.sign(side) + 0.25 * u + 0.3 * smooth(0.02, 0.0, np.abs(side))
         stripes = 0.06 * np.sin(side * 110.0)
@@ -114,9 +121,9 @@ def _flower(meadow: Picture, place: Place, rng: np.random.Generator, cloud: Fiel
     petals, sharp = int(rng.choice([5, 6, 8, 12, 17])), rng.uniform(0.45, 1.1)
     heart = rng.uniform(0.16, 0.34)
     base = colour(_PETALS[rng.integers(len(_PETALS))])
-    inner = mix(base, colour(_PETALS[rng.integers(len(_PETALS))]), 0.75)
+    inner = blend(base, colour(_PETALS[rng.integers(len(_PETALS))]), 0.75)
     disc = colours("#f2b705", "#3a2416", "#f6e27a", "#5a3e1b")[rng.integers(4)]
-    at = rng.random(2)
+    at = rng.random(2).tolist()
 
     def whorl(u: Field, v: Field, shift: float) -> Field:
         turn = np.arctan2(v, u) + shift
@@ -126,7 +133,7 @@ def _flower(meadow: Picture, place: Place, rng: np.random.Generator, cloud: Fiel
         rim = np.maximum(whorl(u, v, 0.0), 0.9 * whorl(u, v, np.pi / petals))
         return 0.7 * (np.hypot(u, v) - rim)
 
-    def paint(u: Field, v: Field, outside: Field) -> Picture:
+    def paint(u: Samples, v: Samples, outside: Samples) -> Float[np.ndarray, "samples 3"]:
         radius, turn = np.hypot(u, v), np.arctan2(v, u)
         upper = whorl(u, v, 0.0) - radius
         behind = upper < 0.0
@@ -136,11 +143,11 @@ def _flower(meadow: Picture, place: Place, rng: np.random.Generator, cloud: Fiel
         light = 0.45 + 0.42 * fold + 0.25 * radius + lines - 0.25 * behind
         light = light - 0.3 * smooth(0.06, 0.0, np.abs(upper)) * behind
         light = light - 0.12 * (0.63 * u + 0.77 * v)
-        skin = mix(inner, base, smooth(heart, 0.75, radius)) * light[..., None]
+        skin = blend(inner, base, smooth(heart, 0.75, radius)) * light[..., None]
         florets = np.cos(42.0 * u) * np.cos(42.0 * v)
         dome = 0.75 + 0.3 * florets - 0.9 * (u + v) * heart / 0.3
         middle = disc * (dome * (1.0 - 0.35 * smooth(0.6, 1.0, radius / heart)))[..., None]
         skin = skin * (1.0 - 0.5 * smooth(1.45, 1.0, radius / heart))[..., None]
-        return mix(skin, middle, smooth(heart, heart - 0.04, radius))
+        return blend(skin, middle, smooth(heart, heart - 0.04, radius))
 
     stamp(meadow, place, distance, paint, shadow=0.6)

@@ -10,13 +10,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from experiments.dataset.textures.fields import Field, Picture, smooth
+from experiments.dataset.textures.fields import Field, smooth
 
 Distance = Callable[[Field, Field], Field]
 """From `u` and `v` to the distance outside of the outline, negative within, in the stamp's unit."""
 
-Paint = Callable[[Field, Field, Field], Picture]
-"""From `u`, `v` and the distance to colours."""
+Samples = Float[np.ndarray, "samples"]
+
+Paint = Callable[[Samples, Samples, Samples], Float[np.ndarray, "samples 3"]]
+"""From `u`, `v` and the distance of samples within to colours."""
 
 
 class Place(NamedTuple):
@@ -64,16 +66,19 @@ def stamp(
     x = ((np.arange(left, right, dtype=np.float32) + 0.5) / n - place.x)[None] / place.size
     y = ((np.arange(top, bottom, dtype=np.float32) + 0.5) / n - place.y)[:, None] / place.size
     cos, sin = math.cos(place.angle), math.sin(place.angle)
-    target = picture[top:bottom, left:right]
-    if shadow:
-        sx, sy = x - _SHADOW[0], y - _SHADOW[1]
-        beneath = distance(cos * sx + sin * sy, cos * sy - sin * sx)
-        target *= (1.0 - shadow * smooth(0.12, -0.06, beneath))[..., None]
     u, v = cos * x + sin * y, cos * y - sin * x
     outside = distance(u, v)
-    sample = 1.0 / (n * place.size)
-    cover = np.clip(0.5 - outside / sample, 0.0, 1.0)[..., None]
-    target += cover * (paint(u, v, outside) - target)
+    target = picture[top:bottom, left:right]
+    if shadow:
+        # The shadow is the outline moved by whole samples.
+        right_by, down_by = (int(round(each * place.size * n)) for each in _SHADOW)
+        beneath = outside[: -down_by or None, : -right_by or None]
+        target[down_by:, right_by:] *= (1.0 - shadow * smooth(0.12, -0.06, beneath))[..., None]
+    cover = np.clip(0.5 - outside * (n * place.size), 0.0, 1.0)
+    row, column = np.nonzero(cover)
+    within = u[row, column], v[row, column], outside[row, column]
+    below = target[row, column]
+    target[row, column] = below + cover[row, column, None] * (paint(*within) - below)
 
 
 def _range(low: float, high: float, n: int) -> tuple[int, int]:

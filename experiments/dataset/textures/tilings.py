@@ -13,7 +13,7 @@ from experiments.dataset.textures.fields import (
     coordinates,
     fbm,
     lookup,
-    mix,
+    blend,
     noise,
     random_of,
     smooth,
@@ -57,7 +57,7 @@ def stained_glass(n: int) -> Picture:
     flow = lookup(streak, a * np.cos(own) + b * np.sin(own), b * np.cos(own) - a * np.sin(own))
     glow = 0.92 + 0.23 * flow + 0.08 * swirl + 0.30 * smooth(0.0, 0.05, border)
     glow = glow * (0.72 + 0.5 * random_of(piece, 6))
-    glass = mix(glass * glow[..., None], colour("#fff3cf"), 0.35 * smooth(0.9, 2.0, flow))
+    glass = blend(glass * glow[..., None], colour("#fff3cf"), 0.35 * smooth(0.9, 2.0, flow))
     bubbles = voronoi(x, y, (70, 70), 9)
     dot = np.hypot(bubbles.dx, bubbles.dy) * 70.0 / (0.05 + 0.13 * random_of(bubbles.index, 7))
     glass = glass * (1.0 + 0.35 * (dot < 1.0) * (random_of(bubbles.index, 8) > 0.6))[..., None]
@@ -66,14 +66,14 @@ def stained_glass(n: int) -> Picture:
     height = 0.006 * np.sqrt(np.clip(1.0 - (border / 0.0045) ** 2, 0.0, 1.0))
     height = height + 0.0008 * flow + 0.0003 * swirl
     metal = colour("#2b2d31") * (1.0 + 0.15 * fbm(n, 120, 28, octaves=3))[..., None]
-    return lit(mix(glass, metal, lead), height, gloss=0.16)
+    return lit(blend(glass, metal, lead), height, gloss=0.16)
 
 
 def mosaic(n: int) -> Picture:
     """A Roman pavement: a guilloche around waves and a sun, of stones set by hand."""
     x, y = coordinates(n)
-    stones = 66
-    wobble = 0.0035
+    stones = 86
+    wobble = 0.0028
     cells = voronoi(x + wobble * noise(n, 9, 1), y + wobble * noise(n, 9, 2), (stones, stones), 4,
                     jitter=0.34)
     picture = _cartoon(x - cells.dx, y - cells.dy)
@@ -82,12 +82,12 @@ def mosaic(n: int) -> Picture:
     grain = fbm(n, 120, 8, octaves=3, gain=0.85)
     rough = fbm(n, 30, 9, octaves=4)
     stone = (stone + hue) * (1.0 + 0.10 * grain + 0.05 * rough)[..., None]
-    cover = smooth(0.0009, 0.0021, cells.border + 0.0003 * rough)
+    cover = smooth(0.0006, 0.0015, cells.border + 0.0003 * rough)
     grout = colour("#8d8473") * (0.8 + 0.12 * grain)[..., None]
     tilt = ((random_of(cells.index, 11) - 0.5) * cells.dx
             + (random_of(cells.index, 12) - 0.5) * cells.dy)
-    height = 0.0022 * smooth(0.0005, 0.0035, cells.border) + 0.30 * tilt + 0.0001 * grain
-    floor = lit(mix(grout, stone, cover), height, gloss=0.22, shininess=50.0)
+    height = 0.0022 * smooth(0.0003, 0.0026, cells.border) + 0.30 * tilt + 0.0001 * grain
+    floor = lit(blend(grout, stone, cover), height, gloss=0.22, shininess=50.0)
     return 1.08 * floor * hollows(height, 0.004, strength=1.2)[..., None]
 
 
@@ -139,21 +139,21 @@ def truchet(n: int) -> Picture:
     ground = np.where(divided[..., None], colour("#0f3d5e"), paper)
     ink = np.where(divided[..., None], colour("#f0c75e"), colour("#155e8a"))
     blossom = np.cos(8.0 * ring) * 0.5 + np.cos(40.0 * arc)
-    ground = mix(ground, chosen(random_of(tile, 4), "#c8502f", "#d98b2b", "#2f7f6e", "#7a2f58"),
+    ground = blend(ground, chosen(random_of(tile, 4), "#c8502f", "#d98b2b", "#2f7f6e", "#7a2f58"),
                  smooth(0.35, 0.5, blossom) * (arc < 0.30))
-    picture = mix(ground, ink, smooth(0.01, -0.01, band))
+    picture = blend(ground, ink, smooth(0.01, -0.01, band))
     dots = np.cos(ring * 16.0) - 30.0 * np.abs(band + 0.166)
     trim = np.where(divided[..., None], colour("#a8321f"), colour("#f6d57a"))
-    picture = mix(picture, trim, smooth(-0.1, 0.1, dots - 0.2) * (band < -0.02))
-    picture = mix(picture, colour("#0b1f33"), smooth(0.022, 0.012, np.abs(band)))
-    picture = mix(picture, trim, smooth(0.012, 0.006, np.abs(np.abs(band + 0.166) - 0.115)))
+    picture = blend(picture, trim, smooth(-0.1, 0.1, dots - 0.2) * (band < -0.02))
+    picture = blend(picture, colour("#0b1f33"), smooth(0.022, 0.012, np.abs(band)))
+    picture = blend(picture, trim, smooth(0.012, 0.006, np.abs(np.abs(band + 0.166) - 0.115)))
     grain, cloud = fbm(n, 50, 5, octaves=5, gain=0.7), fbm(n, 8, 6, octaves=5)
     picture = picture * (0.84 + 0.22 * random_of(tile, 8) + 0.035 * grain + 0.05 * cloud)[..., None]
     cracks = voronoi(x + 0.004 * cloud, y + 0.002 * grain, (60, 60), 7)
     picture = picture * (1.0 - 0.28 * smooth(0.0007, 0.0002, cracks.border))[..., None]
     rim = (0.5 - np.maximum(np.abs(u), np.abs(v))) / count
     joint = smooth(0.0022, 0.0010, rim)
-    picture = mix(picture, colour("#6e655a") * (1.0 + 0.15 * grain)[..., None], joint)
+    picture = blend(picture, colour("#6e655a") * (1.0 + 0.15 * grain)[..., None], joint)
     height = 0.003 * smooth(0.0, 0.006, rim) + 0.0007 * smooth(0.02, -0.06, band) / count * 12.0
     height += 0.04 * ((random_of(tile, 9) - 0.5) * u + (random_of(tile, 10) - 0.5) * v) / count
     return lit(picture, height + 0.0001 * grain, gloss=0.28, shininess=60.0)
@@ -161,7 +161,7 @@ def truchet(n: int) -> Picture:
 
 def penrose(n: int) -> Picture:
     """Penrose's rhombs in coloured stone, with inlaid arcs that continue from tile to tile."""
-    pieces = _rhombs(7)
+    pieces = _rhombs(5)
     scale = 0.82
     index = Image.new("I", (n, n), 0)
     draw = ImageDraw.Draw(index)
@@ -201,7 +201,7 @@ def _inlaid(n: int, stone: Picture, piece: np.ndarray, lines: np.ndarray) -> Pic
     x, y = coordinates(n)
     veins = lookup(cloud, 2.0 * x + random_of(piece, 4), 2.0 * y + random_of(piece, 5))
     stone = stone * (0.8 + 0.35 * random_of(piece, 6) + 0.14 * veins + 0.06 * grain)[..., None]
-    stone = mix(stone, colour("#f4e8cf"), 0.5 * smooth(0.07, 0.01, np.abs(veins)))
+    stone = blend(stone, colour("#f4e8cf"), 0.5 * smooth(0.07, 0.01, np.abs(veins)))
     brass = graded(cloud, (-2.0, "#8a6a2b"), (0.0, "#d9b65a"), (2.0, "#fff0b8"))
     pearl = colour("#f2eee6") * (0.9 + 0.08 * veins)[..., None]
     stone = np.where((lines == 160)[..., None], brass, stone)

@@ -9,7 +9,7 @@ from experiments.dataset.textures.fields import (
     coordinates,
     fbm,
     lookup,
-    mix,
+    blend,
     noise,
     random_of,
     smooth,
@@ -55,7 +55,7 @@ def parquet(n: int) -> Picture:
                    "#8f5530", "#e0b67c")
     deep = chosen(random_of(board, 1), "#7a4a22", "#5d2f17", "#8f6230", "#3b1d10", "#6b3c1c",
                   "#4a2413", "#94673a")
-    wood = mix(light, deep, dark) * (0.86 + 0.28 * random_of(board, 2))[..., None]
+    wood = blend(light, deep, dark) * (0.86 + 0.28 * random_of(board, 2))[..., None]
     wood = wood * smooth(0.0, 0.06, rim)[..., None] ** 0.6
     scratches = smooth(2.3, 3.0, noise(n, (30, 400), 7)) + smooth(2.3, 3.0, noise(n, (400, 30), 8))
     wood = wood + (0.12 * scratches)[..., None]
@@ -75,7 +75,7 @@ def planks(n: int) -> Picture:
     bend = 0.35 * np.exp(-3.0 * knot) * np.sign(knot_x)
     dark = grain_of(n, 0.7 * y, (u + bend) / count, board)
     rings = 0.5 + 0.4 * np.sin(26.0 * knot + 3.0 * dark)
-    dark = mix(dark, rings, smooth(0.7, 0.3, knot))
+    dark = dark + smooth(0.7, 0.3, knot) * (rings - dark)
     dark = np.where(knot < 0.16, 0.95, dark)
     bare = graded(dark, (0.0, "#b9a78d"), (0.45, "#8a765c"), (1.0, "#3a2c20"))
     paints = ("#1f7a8c", "#e1dcc8", "#bf3b2b", "#e0a52e", "#2b4c7e", "#5a8f5b", "#d9764a", "#86b9b0")
@@ -86,12 +86,12 @@ def planks(n: int) -> Picture:
     cover, under = smooth(0.55, 0.48, flakes + worn - 0.5), smooth(0.9, 0.8, flakes + worn - 0.5)
     strokes = fbm(n, (70, 4), 55, octaves=5, gain=0.75)
     hue = 0.92 + 0.10 * strokes + 0.12 * (0.5 - dark) + 0.08 * noise(n, 9, 66)
-    wood = mix(mix(bare, older * 0.8 * hue[..., None], under), paint * hue[..., None], cover)
+    wood = blend(blend(bare, older * 0.8 * hue[..., None], under), paint * hue[..., None], cover)
     rust = np.exp(-90.0 * np.maximum(y % 0.25 - 0.06, 0.0)) * np.exp(-((u - 0.5) / 0.07) ** 2)
     rust = rust * (y % 0.25 > 0.055) * 0.8
-    wood = mix(wood, colour("#6b3414"), rust)
+    wood = blend(wood, colour("#6b3414"), rust)
     nail = np.hypot((u - 0.5) / count, y % 0.25 - 0.055)
-    wood = mix(wood, colour("#2c2723"), smooth(0.0056, 0.0042, nail))
+    wood = blend(wood, colour("#2c2723"), smooth(0.0056, 0.0042, nail))
     gap = smooth(0.0, 0.035, np.minimum(u, 1.0 - u))
     height = 0.007 * gap + 0.0011 * cover + 0.0007 * under - 0.0006 * dark + 0.00018 * strokes
     height += 0.0015 * smooth(0.0056, 0.002, nail)
