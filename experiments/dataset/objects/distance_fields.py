@@ -191,6 +191,21 @@ def revolution(profile: Float[np.ndarray, "corners 2"]) -> Field:
     return Field(distance, (0.0, 0.0, float(middle)), float(reach))
 
 
+def revolution_wall(curve: Float[np.ndarray, "points 2"], thickness: float) -> Field:
+    """A wall along an open curve of (distance from the z axis, z), turned around that axis.
+
+    Its edge is a half circle: the wall is all that is within half a thickness of the curve.
+    """
+
+    def distance(points: Points) -> Distances:
+        flat = np.stack([np.hypot(points[:, 0], points[:, 1]), points[:, 2]], axis=-1)
+        return _to_segments(flat, curve[:-1], curve[1:]) - 0.5 * thickness
+
+    middle = 0.5 * (curve[:, 1].min() + curve[:, 1].max())
+    reach = np.max(np.hypot(curve[:, 0], curve[:, 1] - middle)) + 0.5 * thickness
+    return Field(distance, (0.0, 0.0, float(middle)), float(reach))
+
+
 def _to_segments(
     points: Float[np.ndarray, "points 2"],
     starts: Float[np.ndarray, "segments 2"],
