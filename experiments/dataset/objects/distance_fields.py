@@ -19,9 +19,11 @@ Vector = Sequence[float]
 # Points of one block: few enough that a block's intermediate arrays stay in a core's cache.
 _BLOCK = 1 << 14
 
-# Newton's method for the nearest point of an ellipsoid, and the least share of its radii that
+# Newton's steps to the nearest point of an ellipsoid, the last of which may be so small (squared
+# world units); and the least share of its radii that
 # coordinates are taken for: at the centre of symmetry there are several nearest points.
 _ELLIPSOID_STEPS = 12
+_ELLIPSOID_TOLERANCE = 1e-13
 _NEAR_CENTRE = 1e-4
 
 # Segments of a tube around the one of the nearest joint that are looked at.
@@ -78,17 +80,22 @@ def ellipsoid(centre: Vector, radii: Vector) -> Field:
     """
     middle, axes = np.asarray(centre, float), np.asarray(radii, float)
     _require(bool(np.all(axes > 0.0)), f"The radii {radii} of an ellipsoid are not all positive.")
+    column = axes[:, None]
 
     def distance(points: Points) -> Distances:
-        y = np.maximum(np.abs(points - middle), _NEAR_CENTRE * axes)
-        t = np.max(axes * y - axes**2, axis=-1)
+        # Coordinates come first, so that sums run over whole arrays.
+        y = np.maximum(np.abs((points - middle).T), _NEAR_CENTRE * column)
+        t = np.max(column * y - column**2, axis=0, initial=-np.inf)
         for _ in range(_ELLIPSOID_STEPS):
-            shift = t[:, None] + axes**2
-            squares = (axes * y / shift) ** 2
-            total = np.sum(squares, axis=-1)
-            t += (np.sqrt(total) - 1.0) * total / np.sum(squares / shift, axis=-1)
-        nearest = axes**2 * y / (t[:, None] + axes**2)
-        return np.copysign(np.linalg.norm(nearest - y, axis=-1), t)
+            shift = t + column**2
+            squares = (column * y / shift) ** 2
+            total = np.sum(squares, axis=0)
+            step = (np.sqrt(total) - 1.0) * total / np.sum(squares / shift, axis=0)
+            t += step
+            if np.all(np.abs(step) < _ELLIPSOID_TOLERANCE):
+                break
+        nearest = column**2 * y / (t + column**2)
+        return np.copysign(np.sqrt(np.sum((nearest - y) ** 2, axis=0)), t)
 
     return Field(distance, _triple(middle), float(axes.max()))
 

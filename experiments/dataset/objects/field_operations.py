@@ -47,7 +47,15 @@ def union(*fields: Field, blend: float = 0.0) -> Field:
 
 def subtraction(solid: Field, tool: Field, *, blend: float = 0.0) -> Field:
     """Returns a solid without what lies in another, rounded at the new edge."""
-    return solid._replace(distance=lambda p: -smooth_minimum(-solid(p), tool(p), blend))
+    centre = np.asarray(tool.centre)
+
+    def distance(points: Points) -> Distances:
+        beyond = -solid(points)
+        near = np.linalg.norm(points - centre, axis=-1) - tool.radius < beyond + blend
+        beyond[near] = smooth_minimum(beyond[near], tool(points[near]), blend)
+        return -beyond
+
+    return solid._replace(distance=distance)
 
 
 def intersection(solid: Field, other: Field, *, blend: float = 0.0) -> Field:

@@ -9,13 +9,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from experiments.dataset.objects.distance_fields import Field, evaluate
+from experiments.dataset.objects.distance_fields import Field
 from experiments.dataset.objects.field_operations import gridded, intersection, offset
-from experiments.dataset.objects.isosurface import isosurface, largest_piece
+from experiments.dataset.objects.isosurface import isosurface, largest_piece, sample
 from experiments.dataset.parts import CLEAR, NO_ABSORPTION, RADIUS, Category, Colour, Object, Part
 
 WALL = 0.09
 """Least thickness of the glass around a core."""
+
+# Of the cube that is looked at, beyond the largest radius: figures are scaled only afterwards.
+_MARGIN = 0.4
 
 # At detail 1.
 _SPACING = 0.036
@@ -109,13 +112,12 @@ def filled_glass(
 
 def core(body: Field, wall: float) -> Field:
     """Returns what lies deeper in a 1-Lipschitz field than a wall, with its details smoothed."""
-    ticks = np.arange(-RADIUS - 0.4, RADIUS + 0.4, _CORE_SPACING)
-    points = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1)
-    values = evaluate(body, points.reshape(-1, 3)).reshape(points.shape[:3]) + wall
+    deep = offset(body, -wall)
+    values, low = sample(deep, spacing=_CORE_SPACING, half_extent=RADIUS + _MARGIN)
     smoothed = gaussian_filter(values, _CORE_SMOOTHING / _CORE_SPACING)
-    rounded = gridded(smoothed, points[0, 0, 0], _CORE_SPACING)
+    rounded = gridded(smoothed, low, _CORE_SPACING)
     # What the smoothing fills of a fold is too near to the surface.
-    deeper = intersection(rounded, offset(body, -wall), blend=_CORE_BLEND)
+    deeper = intersection(rounded, deep, blend=_CORE_BLEND)
     return deeper._replace(centre=body.centre, radius=body.radius)
 
 
