@@ -1,0 +1,125 @@
+"""Magnifier, skull-shaped bottle, and an abstract sculpture: one piece of glass each (NumPy only).
+
+Fields are those of `distance_fields`; z is up, faces look to -y.
+"""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from experiments.dataset.objects.distance_fields import (
+    Field,
+    ellipsoid,
+    revolution,
+    sphere,
+    torus,
+    tube,
+)
+from experiments.dataset.objects.field_operations import (
+    both_sides,
+    intersection,
+    moved,
+    offset,
+    subtraction,
+    turned,
+    union,
+)
+from experiments.dataset.objects.formed import single_glass
+from experiments.dataset.objects.space_curves import limb
+
+# The lens: its radius, and its thickness in the middle.
+_LENS_RADIUS, _LENS_THICKNESS = 0.98, 0.42
+
+_SKULL_WALL = 0.13
+
+# The knot: radius of the ring that it winds around, how far from it, and the tube's radius, which
+# swells three times on its way.
+_KNOT_RING, _KNOT_AWAY, _KNOT_TUBE, _KNOT_SWELL = 1.15, 0.5, 0.27, 0.06
+_KNOT_POINTS = 360
+
+
+def _magnifier() -> Field:
+    # Two caps of a sphere, each as high as half of the lens.
+    half = 0.5 * _LENS_THICKNESS
+    curvature = (_LENS_RADIUS**2 + half**2) / (2.0 * half)
+    caps = [sphere((0.0, side * (curvature - half), 0.0), curvature) for side in (-1.0, 1.0)]
+    lens = intersection(*caps)
+    rim = turned(torus(1.02, 0.13), Rotation.from_euler("x", 90.0, degrees=True))
+    collar = limb((0.0, 0.0, -1.1, 0.13), (0.0, 0.0, -1.45, 0.1))
+    profile = [(0.0, -2.9), (0.12, -2.88), (0.19, -2.75), (0.2, -2.4), (0.15, -1.75), (0.13, -1.4)]
+    handle = revolution(np.array([*profile, (0.0, -1.4)]))
+    grip = union(collar, offset(handle, 0.02), blend=0.1)
+    disc = union(lens, rim, blend=0.06)
+    return moved(union(disc, grip, blend=0.1), (0.0, 0.0, 0.9))
+
+
+def _skull_bottle() -> Field:
+    cranium = union(
+        ellipsoid((0.0, 0.22, 0.34), (0.84, 1.04, 0.82)),
+        ellipsoid((0.0, -0.3, 0.24), (0.7, 0.64, 0.6)),
+        blend=0.2,
+    )
+    face = union(
+        cranium,
+        ellipsoid((0.0, -0.5, -0.42), (0.46, 0.44, 0.5)),
+        ellipsoid((0.0, -0.66, -0.64), (0.4, 0.36, 0.32)),
+        ellipsoid((0.0, -0.66, -1.0), (0.36, 0.3, 0.2)),
+        *both_sides(
+            ellipsoid((0.48, -0.66, -0.22), (0.2, 0.2, 0.15)),
+            limb((0.7, 0.1, -0.12, 0.08), (0.7, -0.25, -0.18, 0.09), (0.56, -0.6, -0.22, 0.11)),
+            limb((0.58, 0.05, -0.35, 0.13), (0.5, -0.15, -0.85, 0.15), (0.26, -0.6, -1.0, 0.16)),
+            limb((0.62, -0.62, 0.14, 0.09), (0.36, -0.84, 0.27, 0.1), (0.1, -0.92, 0.2, 0.1)),
+        ),
+        blend=0.2,
+    )
+    features = both_sides(
+        ellipsoid((0.34, -0.94, 0.0), (0.24, 0.34, 0.21)),
+        limb((0.03, -1.1, -0.14, 0.06), (0.1, -1.02, -0.36, 0.095)),
+        ellipsoid((0.98, -0.35, 0.22), (0.16, 0.4, 0.34)),
+    )
+    carved = subtraction(face, union(*features), blend=0.12)
+    carved = subtraction(carved, _between_teeth(), blend=0.06)
+    flat = Field(lambda p: -1.12 - p[:, 2], (0.0, 0.0, 0.0), np.inf)
+    skull = intersection(carved, flat, blend=0.12)
+    neck = union(
+        limb((0.0, 0.2, 1.0, 0.27), (0.0, 0.2, 1.55, 0.24)),
+        moved(torus(0.2, 0.09), (0.0, 0.2, 1.66)),
+        blend=0.1,
+    )
+    room = union(
+        ellipsoid((0.0, 0.22, 0.32), (0.7, 0.9, 0.68)),
+        ellipsoid((0.0, -0.25, -0.45), (0.36, 0.42, 0.52)),
+        blend=0.25,
+    )
+    inside = intersection(room, offset(skull, -_SKULL_WALL), blend=0.1)
+    bore = limb((0.0, 0.2, 0.8, 0.14), (0.0, 0.2, 2.1, 0.14))
+    whole = union(skull, neck, blend=0.2)
+    return subtraction(whole, union(inside, bore, blend=0.15), blend=0.05)
+
+
+def _between_teeth() -> Field:
+    """Returns grooves: between the rows of teeth, and between the teeth of both."""
+    row = limb((-0.36, -0.8, -0.76, 0.03), (0.0, -1.06, -0.78, 0.03), (0.36, -0.8, -0.76, 0.03))
+    gaps = []
+    for x in np.linspace(-0.27, 0.27, 6).tolist():
+        y = -1.07 + 0.9 * x**2 + 0.02
+        gaps.append(
+            limb((x, y + 0.04, -0.58, 0.025), (x, y, -0.78, 0.028), (x, y + 0.06, -0.98, 0.025))
+        )
+    return union(row, *gaps)
+
+
+def _generic_sculpture() -> Field:
+    turn = 2.0 * np.pi * np.arange(_KNOT_POINTS + 1) / _KNOT_POINTS
+    away = _KNOT_RING + _KNOT_AWAY * np.cos(3.0 * turn)
+    curve = np.stack(
+        [away * np.cos(2.0 * turn), _KNOT_AWAY * np.sin(3.0 * turn), away * np.sin(2.0 * turn)],
+        axis=-1,
+    )
+    return tube(curve, _KNOT_TUBE + _KNOT_SWELL * np.cos(3.0 * turn))
+
+
+OBJECTS = (
+    single_glass("magnifier", _magnifier, radius=1.9, thinnest=0.12),
+    single_glass("skull_bottle", _skull_bottle, radius=1.7, thinnest=0.09, fineness=1.15),
+    single_glass("generic_sculpture", _generic_sculpture, radius=1.75, thinnest=0.12),
+)

@@ -1,0 +1,252 @@
+"""Signed distances to solids: negative inside, zero on the surface, in world units (NumPy only).
+
+A *field* is a function from points to signed distances. Those of this module are exact, so their
+gradient has norm 1 wherever there is one nearest point, and none of them changes faster than 1 per
+unit (it is 1-Lipschitz). `field_operations` combines them, and keeps the latter.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+Points = Float[np.ndarray, "points 3"]
+Distances = Float[np.ndarray, " points"]
+Vector = Sequence[float]
+
+# Points of one block: few enough that a block's intermediate arrays stay in a core's cache.
+_BLOCK = 1 << 14
+
+# Newton's steps to the nearest point of an ellipsoid, the last of which may be so small (squared
+# world units); and the least share of its radii that
+# coordinates are taken for: at the centre of symmetry there are several nearest points.
+_ELLIPSOID_STEPS = 12
+_ELLIPSOID_TOLERANCE = 1e-13
+_NEAR_CENTRE = 1e-4
+
+# Segments of a tube around the one of the nearest joint that are looked at.
+_AROUND_JOINT = (-2, -1, 0, 1)
+
+# Larger shares of a segment for the change of radius: one end would nearly swallow the other.
+_STEEPEST = 0.999
+
+
+class Field(NamedTuple):
+    """A signed distance, and a ball that holds the solid.
+
+    Attributes:
+      distance: from points to signed distances.
+      centre: of the ball.
+      radius: of the ball; outside of it, distances are at least those to the ball. May be `inf`.
+    """
+
+    distance: Callable[[Points], Distances]
+    centre: tuple[float, float, float]
+    radius: float
+
+    def __call__(self, points: Points) -> Distances:
+        """Returns signed distances of points."""
+        return self.distance(points)
+
+
+def evaluate(field: Field, points: Points) -> Distances:
+    """Returns signed distances of many points, block by block."""
+    starts = range(0, len(points), _BLOCK)
+    values = [field(points[start : start + _BLOCK]) for start in starts]
+    return np.concatenate(values) if values else np.zeros(0)
+
+
+def gradient(field: Field, points: Points, *, step: float = 1e-5) -> Points:
+    """Returns gradients by central differences over twice a step."""
+    shifts = step * np.eye(3)
+    slopes = [evaluate(field, points + s) - evaluate(field, points - s) for s in shifts]
+    return np.stack(slopes, axis=-1) / (2.0 * step)
+
+
+def sphere(centre: Vector, radius: float) -> Field:
+    """A ball."""
+    middle = np.asarray(centre, float)
+    return Field(lambda p: np.linalg.norm(p - middle, axis=-1) - radius, _triple(middle), radius)
+
+
+def ellipsoid(centre: Vector, radii: Vector) -> Field:
+    """An ellipsoid along the axes.
+
+    Source: Eberly, Distance from a Point to an Ellipsoid (2013), with the reciprocal of the secular
+    equation as Moré and Sorensen (1983) solve theirs: it is concave, so that Newton's steps from
+    the left never pass its root.
+    """
+    middle, axes = np.asarray(centre, float), np.asarray(radii, float)
+    _require(bool(np.all(axes > 0.0)), f"The radii {radii} of an ellipsoid are not all positive.")
+    column = axes[:, None]
+
+    def distance(points: Points) -> Distances:
+        # Coordinates come first, so that sums run over whole arrays.
+        y = np.maximum(np.abs((points - middle).T), _NEAR_CENTRE * column)
+        t = np.max(column * y - column**2, axis=0, initial=-np.inf)
+        for _ in range(_ELLIPSOID_STEPS):
+            shift = t + column**2
+            squares = (column * y / shift) ** 2
+            total = np.sum(squares, axis=0)
+            step = (np.sqrt(total) - 1.0) * total / np.sum(squares / shift, axis=0)
+            t += step
+            if np.all(np.abs(step) < _ELLIPSOID_TOLERANCE):
+                break
+        nearest = column**2 * y / (t + column**2)
+        return np.copysign(np.sqrt(np.sum((nearest - y) ** 2, axis=0)), t)
+
+    return Field(distance, _triple(middle), float(axes.max()))
+
+
+def round_cone(start: Vector, end: Vector, start_radius: float, end_radius: float) -> Field:
+    """The hull of two balls; a capsule if they are equal.
+
+    Raises:
+      ValueError: if one ball lies in the other.
+    """
+    return tube(np.array([start, end], float), np.array([start_radius, end_radius], float))
+
+
+def tube(
+    curve: Float[np.ndarray, "joints 3"], radii: Float[np.ndarray, " joints"] | float
+) -> Field:
+    """All balls that roll along a polyline while their radius changes from joint to joint.
+
+    Exact for a tube that does not bend within a few of its segments by more than its radius
+    allows; see `space_curves` for smooth polylines.
+
+    Raises:
+      ValueError: if the radius changes faster than the curve goes on.
+    """
+    radius = np.broadcast_to(np.asarray(radii, float), len(curve))
+    along = np.diff(curve, axis=0)
+    length = np.linalg.norm(along, axis=-1)
+    slope = -np.diff(radius) / length
+    _require(
+        bool(np.all(np.abs(slope) < _STEEPEST)),
+        "The radius of a tube changes faster than its curve goes on.",
+    )
+    axes, skew = along / length[:, None], slope / np.sqrt(1.0 - slope**2)
+    tree = KDTree(curve)
+
+    def segment(points: Points, i: Int[np.ndarray, " points"]) -> Distances:
+        offset = points - curve[i]
+        height = np.einsum("pc,pc->p", offset, axes[i])
+        wide = np.sqrt(np.maximum(np.einsum("pc,pc->p", offset, offset) - height**2, 0.0))
+        # Where the rolling ball comes nearest.
+        at = np.clip(height - wide * skew[i], 0.0, length[i])
+        return np.hypot(height - at, wide) - radius[i] + slope[i] * at
+
+    def distance(points: Points) -> Distances:
+        if len(curve) == 2:
+            return segment(points, np.zeros(len(points), np.int64))
+        joint = tree.query(points)[1]
+        around = [np.clip(joint + step, 0, len(length) - 1) for step in _AROUND_JOINT]
+        return np.min([segment(points, i) for i in around], axis=0)
+
+    middle = 0.5 * (curve.min(axis=0) + curve.max(axis=0))
+    reach = np.max(np.linalg.norm(curve - middle, axis=-1) + radius)
+    return Field(distance, _triple(middle), float(reach))
+
+
+def box(half_extents: Vector, rounding: float = 0.0) -> Field:
+    """A box around the origin, along the axes, whose edges are rounded within it."""
+    core = np.asarray(half_extents, float) - rounding
+    _require(bool(np.all(core >= 0.0)), f"A box of {half_extents} has no room for its rounding.")
+
+    def distance(points: Points) -> Distances:
+        beyond = np.abs(points) - core
+        outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
+        return outside + np.minimum(np.max(beyond, axis=-1), 0.0) - rounding
+
+    return Field(distance, (0.0, 0.0, 0.0), float(np.linalg.norm(half_extents)))
+
+
+def torus(radius: float, thickness: float) -> Field:
+    """A ring around the z axis: a circle of radius `thickness`, led around one of `radius`."""
+
+    def distance(points: Points) -> Distances:
+        away = np.hypot(points[:, 0], points[:, 1]) - radius
+        return np.hypot(away, points[:, 2]) - thickness
+
+    return Field(distance, (0.0, 0.0, 0.0), radius + thickness)
+
+
+def revolution(profile: Float[np.ndarray, "corners 2"]) -> Field:
+    """A polygon of (distance from the z axis, z), turned around that axis.
+
+    Its edges may lie on the axis; none of its corners may lie beyond. Either sense of rotation.
+
+    Raises:
+      ValueError: if a corner lies beyond the axis.
+    """
+    _require(bool(np.all(profile[:, 0] >= 0.0)), "A profile crosses the axis it is turned around.")
+    ends = np.roll(profile, -1, axis=0)
+    # What lies on the axis is no surface.
+    real = (profile[:, 0] > 0.0) | (ends[:, 0] > 0.0)
+
+    def distance(points: Points) -> Distances:
+        flat = np.stack([np.hypot(points[:, 0], points[:, 1]), points[:, 2]], axis=-1)
+        away = _to_segments(flat, profile[real], ends[real])
+        return np.where(_in_polygon(flat, profile, ends), -away, away)
+
+    low, high = profile[:, 1].min(), profile[:, 1].max()
+    middle = 0.5 * (low + high)
+    reach = np.max(np.hypot(profile[:, 0], profile[:, 1] - middle))
+    return Field(distance, (0.0, 0.0, float(middle)), float(reach))
+
+
+def revolution_wall(curve: Float[np.ndarray, "points 2"], thickness: float) -> Field:
+    """A wall along an open curve of (distance from the z axis, z), turned around that axis.
+
+    Its edge is a half circle: the wall is all that is within half a thickness of the curve.
+    """
+
+    def distance(points: Points) -> Distances:
+        flat = np.stack([np.hypot(points[:, 0], points[:, 1]), points[:, 2]], axis=-1)
+        return _to_segments(flat, curve[:-1], curve[1:]) - 0.5 * thickness
+
+    middle = 0.5 * (curve[:, 1].min() + curve[:, 1].max())
+    reach = np.max(np.hypot(curve[:, 0], curve[:, 1] - middle)) + 0.5 * thickness
+    return Field(distance, (0.0, 0.0, float(middle)), float(reach))
+
+
+def _to_segments(
+    points: Float[np.ndarray, "points 2"],
+    starts: Float[np.ndarray, "segments 2"],
+    ends: Float[np.ndarray, "segments 2"],
+) -> Distances:
+    nearest = np.full(len(points), np.inf)
+    for start, along in zip(starts, ends - starts, strict=True):
+        offset = points - start
+        share = np.clip(offset @ along / (along @ along), 0.0, 1.0)
+        across = offset - share[:, None] * along
+        nearest = np.minimum(nearest, np.einsum("pc,pc->p", across, across))
+    return np.sqrt(nearest)
+
+
+def _in_polygon(
+    points: Float[np.ndarray, "points 2"],
+    starts: Float[np.ndarray, "segments 2"],
+    ends: Float[np.ndarray, "segments 2"],
+) -> np.ndarray:
+    """Returns which points a polygon surrounds: rays outwards cross it an odd number of times."""
+    inside = np.zeros(len(points), bool)
+    x, y = points.T
+    for (ax, ay), (bx, by) in zip(starts, ends, strict=True):
+        if ay != by:
+            spans = (ay > y) != (by > y)
+            inside ^= spans & (x < ax + (y - ay) / (by - ay) * (bx - ax))
+    return inside
+
+
+def _require(holds: bool, problem: str) -> None:
+    if not holds:
+        raise ValueError(f"{problem} Give other measures.")
+
+
+def _triple(vector: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z

@@ -1,0 +1,134 @@
+"""Makes parts of fields (see `distance_fields`), and sets objects in the middle (NumPy only).
+
+*Core*: in a figure of clear glass, a smaller one of another medium, as of a bottle in the shape of
+an animal that is filled with tinted spirit.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from experiments.dataset.objects.distance_fields import Field
+from experiments.dataset.objects.field_operations import gridded, intersection, offset
+from experiments.dataset.objects.isosurface import isosurface, largest_piece, sample
+from experiments.dataset.parts import CLEAR, NO_ABSORPTION, RADIUS, Category, Colour, Object, Part
+
+WALL = 0.09
+"""Least thickness of the glass around a core."""
+
+# Of the cube that is looked at, beyond the largest radius: figures are scaled only afterwards.
+_MARGIN = 0.4
+
+# At detail 1.
+_SPACING = 0.036
+
+# A wall is sure to be found where the grid has a point in it.
+_OF_THINNEST = 0.75
+
+# A core's grid, the width of the Gaussian that smooths it there, and the edge between what that
+# gives and the least wall.
+_CORE_SPACING = 0.07
+_CORE_SMOOTHING = 0.09
+_CORE_BLEND = 0.06
+
+
+def spacing(detail: float, *, thinnest: float) -> float:
+    """Returns the spacing of the grid for a detail, world units.
+
+    Args:
+      detail: 1 for rendering.
+      thinnest: thickness of the thinnest wall, neck or gap.
+    """
+    return min(_SPACING / detail, _OF_THINNEST * thinnest)
+
+
+def single_glass(
+    name: str,
+    field: Callable[[], Field],
+    *,
+    radius: float,
+    thinnest: float,
+    fineness: float = 1.0,
+    tint: Colour = CLEAR,
+) -> Object:
+    """Returns an object that is one piece of glass.
+
+    Args:
+      name: of the object.
+      field: makes its solid.
+      radius: to the farthest point, once the object is centred.
+      thinnest: see `spacing`.
+      fineness: a factor of the detail, for shapes with small features.
+      tint: see `Part`.
+    """
+
+    def make(detail: float) -> list[Part]:
+        step = spacing(fineness * detail, thinnest=thinnest)
+        surface = isosurface(field(), spacing=step)
+        return centred([Part("body", "glass", *surface, tint=tint)], radius)
+
+    return Object(name, "smncvx", make)
+
+
+def filled_glass(
+    name: str,
+    field: Callable[[], Field],
+    *,
+    radius: float,
+    thinnest: float,
+    medium: str,
+    tint: Colour = CLEAR,
+    absorption: Colour = NO_ABSORPTION,
+    wall: float = WALL,
+    fineness: float = 1.0,
+) -> Object:
+    """Returns an object of clear glass around a core.
+
+    Args:
+      name: of the object.
+      field: makes its solid.
+      radius: to the farthest point, once the object is centred.
+      thinnest: see `spacing`.
+      medium: a material, of the core.
+      tint: of the core's surface.
+      absorption: in the core.
+      wall: least thickness of the glass around it.
+      fineness: a factor of the detail.
+    """
+    category: Category = "mmncvx"
+
+    def make(detail: float) -> list[Part]:
+        step = spacing(fineness * detail, thinnest=thinnest)
+        body = field()
+        outer = isosurface(body, spacing=step)
+        inner = largest_piece(isosurface(core(body, wall), spacing=step))
+        shell = Part("body", "glass", *outer)
+        filling = Part("core", medium, *inner, tint=tint, absorption=absorption)
+        return centred([shell, filling], radius)
+
+    return Object(name, category, make)
+
+
+def core(body: Field, wall: float) -> Field:
+    """Returns what lies deeper in a 1-Lipschitz field than a wall, with its details smoothed."""
+    deep = offset(body, -wall)
+    values, low = sample(deep, spacing=_CORE_SPACING, half_extent=RADIUS + _MARGIN)
+    smoothed = gaussian_filter(values, _CORE_SMOOTHING / _CORE_SPACING)
+    rounded = gridded(smoothed, low, _CORE_SPACING)
+    # What the smoothing fills of a fold is too near to the surface.
+    deeper = intersection(rounded, deep, blend=_CORE_BLEND)
+    return deeper._replace(centre=body.centre, radius=body.radius)
+
+
+def centred(parts: Sequence[Part], radius: float) -> list[Part]:
+    """Returns parts moved and scaled: in the middle of their box, and as far as a radius.
+
+    Args:
+      parts: of one object.
+      radius: to the farthest vertex.
+    """
+    points = np.concatenate([part.vertices for part in parts])
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    scale = radius / np.max(np.linalg.norm(points - middle, axis=-1))
+    return [part._replace(vertices=scale * (part.vertices - middle)) for part in parts]

@@ -1,0 +1,168 @@
+"""The surface of a field (see `distance_fields`) as triangles (NumPy only).
+
+Marching cubes gives the right topology, but slivers. So its vertices are spread evenly along the
+surface, and put on the zero set by Newton steps along the gradient.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import maximum_filter
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
+
+from experiments.dataset.objects.distance_fields import Distances, Field, Points, evaluate
+from experiments.dataset.parts import RADIUS
+
+# Fine cells along the edge of a coarse one; and how many of its edges from the surface a coarse
+# corner is looked around: sqrt(3) / 2 for a 1-Lipschitz field, and more for one that is nearly so.
+_COARSE = 4
+_NEAR = 1.5
+
+# Values this close to zero, in cells, are pushed away from it, so that no two vertices of marching
+# cubes meet in a corner of the grid and no face is degenerate.
+_CLEARANCE = 0.1
+
+# Steps towards the mean of the neighbours, the share of the way that each goes, and the longest
+# one in cells; and Newton steps after the last.
+_RELAXATIONS = 8
+_SHARE = 0.5
+_LONGEST = 0.3
+_NEWTON_STEPS = 3
+
+# Of the differences that the gradient is made of, in cells.
+_DIFFERENCE = 1e-3
+
+
+class Surface(NamedTuple):
+    """Triangles.
+
+    Attributes:
+      vertices: world units.
+      faces: counter-clockwise seen from outside, closed.
+    """
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+
+
+def isosurface(field: Field, *, spacing: float, half_extent: float = RADIUS + 0.4) -> Surface:
+    """Returns the zero set of a field: closed, outward, evenly triangulated.
+
+    Args:
+      field: negative inside.
+      spacing: of the grid, and about the length of an edge. The thinnest wall should be thicker.
+      half_extent: of the cube around the origin that is looked at.
+
+    Raises:
+      ValueError: if there is no surface in the cube, or it leaves the cube.
+    """
+    values, low = sample(field, spacing=spacing, half_extent=half_extent)
+    shell = np.ones(values.shape, bool)
+    shell[1:-1, 1:-1, 1:-1] = False
+    if not np.any(values < 0.0) or np.any(values[shell] < 0.0):
+        raise ValueError(
+            f"No closed surface lies within {half_extent} of the origin. Check the measures of "
+            "the solid."
+        )
+    clearance = _CLEARANCE * spacing
+    values = np.copysign(np.maximum(np.abs(values), clearance), values)
+    vertices, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")
+    vertices = low + spacing * vertices.astype(np.float64)
+    return Surface(settle(field, vertices, faces, spacing=spacing), faces.astype(np.int64))
+
+
+def sample(
+    field: Field, *, spacing: float, half_extent: float
+) -> tuple[Float[np.ndarray, "n n n"], Float[np.ndarray, "3"]]:
+    """Returns a field's values on a grid, exact near the surface, and the grid's first point.
+
+    Elsewhere they are those of a coarser grid, of the right sign. The field must not change much
+    faster than 1 per unit.
+    """
+    cells = int(np.ceil(2.0 * half_extent / (_COARSE * spacing)))
+    low = np.full(3, -0.5 * cells * _COARSE * spacing)
+    ticks = low[0] + spacing * np.arange(cells * _COARSE + 1)
+    corners = _on_grid(field, ticks[::_COARSE])
+    close = maximum_filter(np.abs(corners) < _NEAR * _COARSE * spacing, size=2, origin=-1)
+    looked_at = np.zeros((len(ticks),) * 3, bool)
+    # A cell's own points, and those on its far sides.
+    looked_at[:-1, :-1, :-1] = _spread(close[:-1, :-1, :-1], _COARSE)
+    looked_at = maximum_filter(looked_at, size=2)
+    nearest = np.rint(np.arange(len(ticks)) / _COARSE).astype(np.int64)
+    values = corners[np.ix_(nearest, nearest, nearest)]
+    at = np.argwhere(looked_at)
+    values[looked_at] = evaluate(field, low + spacing * at)
+    return values, low
+
+
+def settle(
+    field: Field, vertices: Points, faces: Int[np.ndarray, "faces 3"], *, spacing: float
+) -> Points:
+    """Returns vertices near a zero set, spread evenly and put on it."""
+    mean = _mean_of_neighbours(len(vertices), faces)
+    for _ in range(_RELAXATIONS):
+        vertices, normals = _towards_zero(field, vertices, spacing)
+        step = _SHARE * (mean @ vertices - vertices)
+        step -= np.einsum("vc,vc->v", step, normals)[:, None] * normals
+        vertices = vertices + _shortened(step, _LONGEST * spacing)
+    for _ in range(_NEWTON_STEPS):
+        vertices, _ = _towards_zero(field, vertices, spacing)
+    return vertices
+
+
+def largest_piece(surface: Surface) -> Surface:
+    """Returns the connected piece with most vertices."""
+    labels = _pieces(surface)
+    return without(surface, labels != np.argmax(np.bincount(labels)))
+
+
+def without(surface: Surface, dropped: Bool[np.ndarray, " vertices"]) -> Surface:
+    """Returns a surface less all faces that have a dropped vertex."""
+    faces = surface.faces[~np.any(dropped[surface.faces], axis=1)]
+    used, numbers = np.unique(faces, return_inverse=True)
+    return Surface(surface.vertices[used], numbers.reshape(-1, 3))
+
+
+def _pieces(surface: Surface) -> Int[np.ndarray, " vertices"]:
+    count = len(surface.vertices)
+    first, second = surface.faces[:, [0, 1]].ravel(), surface.faces[:, [1, 2]].ravel()
+    graph = coo_array((np.ones(first.size, bool), (first, second)), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
+
+
+def _on_grid(field: Field, ticks: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n n"]:
+    points = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1)
+    return evaluate(field, points.reshape(-1, 3)).reshape(points.shape[:3])
+
+
+def _spread(cells: Bool[np.ndarray, "n n n"], times: int) -> Bool[np.ndarray, "m m m"]:
+    for axis in range(3):
+        cells = np.repeat(cells, times, axis=axis)
+    return cells
+
+
+def _towards_zero(field: Field, vertices: Points, spacing: float) -> tuple[Points, Points]:
+    """Makes a Newton step along the gradient; returns the vertices, and its direction."""
+    value, step = evaluate(field, vertices), _DIFFERENCE * spacing
+    slope = np.stack([evaluate(field, vertices + step * e) - value for e in np.eye(3)], axis=-1)
+    slope /= step
+    squared = np.sum(slope**2, axis=-1, keepdims=True)
+    # At a kink of the field the differences may cancel; such a vertex waits for its neighbours.
+    squared = np.where(squared > 0.01, squared, np.inf)
+    move = _shortened(-value[:, None] * slope / squared, _LONGEST * spacing)
+    return vertices + move, slope / np.sqrt(squared)
+
+
+def _shortened(steps: Points, longest: float) -> Points:
+    length: Distances = np.linalg.norm(steps, axis=-1, keepdims=True)
+    return steps * np.minimum(1.0, longest / np.maximum(length, 1e-300))
+
+
+def _mean_of_neighbours(count: int, faces: Int[np.ndarray, "faces 3"]) -> csr_array:
+    rows, columns = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
+    # Of a closed surface, every edge comes once in each direction.
+    links = coo_array((np.ones(rows.size), (rows, columns)), shape=(count, count)).tocsr()
+    return csr_array(links.multiply(1.0 / links.sum(axis=1)[:, None]))

@@ -1,0 +1,47 @@
+"""Smooth polylines through a few joints, for tubes and profiles (NumPy only)."""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import PchipInterpolator, make_interp_spline
+
+from experiments.dataset.objects.distance_fields import Field, tube
+
+# Points of a curve between two of its joints.
+_BETWEEN = 8
+
+
+def through(
+    joints: Float[np.ndarray, "joints dimensions"], *, between: int = _BETWEEN
+) -> Float[np.ndarray, "points dimensions"]:
+    """Returns points of the smooth curve through some joints, which are among them.
+
+    Args:
+      joints: two or more; with two, the curve is straight.
+      between: pieces of the curve from each joint to the next.
+    """
+    at = _parameters(joints)
+    spline = make_interp_spline(at, joints, k=min(3, len(joints) - 1))
+    return spline(_refined(at, between))
+
+
+def limb(*joints: tuple[float, float, float, float]) -> Field:
+    """Returns a tube along the smooth curve through joints.
+
+    Args:
+      *joints: positions and radii, as (x, y, z, radius). Between them, no radius is larger or
+        smaller than at both of its neighbours.
+    """
+    table = np.asarray(joints, float)
+    at = _parameters(table[:, :3])
+    radii = PchipInterpolator(at, table[:, 3])(_refined(at, _BETWEEN))
+    return tube(through(table[:, :3]), radii)
+
+
+def _parameters(joints: Float[np.ndarray, "joints dimensions"]) -> Float[np.ndarray, " joints"]:
+    """Returns the centripetal parameters of joints, which keep a spline from making loops."""
+    steps = np.sqrt(np.linalg.norm(np.diff(joints, axis=0), axis=-1))
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _refined(at: Float[np.ndarray, " joints"], between: int) -> Float[np.ndarray, " points"]:
+    return np.interp(np.arange(between * (len(at) - 1) + 1) / between, np.arange(len(at)), at)
