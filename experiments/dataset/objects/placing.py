@@ -1,0 +1,38 @@
+"""Moves bodies and puts them side by side (NumPy only)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from experiments.dataset.parts import Part
+
+Mesh = tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]
+
+
+def merged(meshes: Sequence[Mesh]) -> Mesh:
+    """Returns meshes as one of several pieces."""
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes[:-1])])
+    return (
+        np.concatenate([vertices for vertices, _ in meshes]),
+        np.concatenate([faces + start for (_, faces), start in zip(meshes, starts, strict=True)]),
+    )
+
+
+def moved(parts: Sequence[Part], by: tuple[float, float, float]) -> list[Part]:
+    """Returns parts moved by a vector, in world units."""
+    return [part._replace(vertices=part.vertices + np.asarray(by)) for part in parts]
+
+
+def tilted(parts: Sequence[Part], *, axis: str, degrees: float) -> list[Part]:
+    """Returns parts turned around an axis of the world, `x`, `y` or `z`, through the origin."""
+    matrix = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+    return [part._replace(vertices=part.vertices @ matrix.T) for part in parts]
+
+
+def centred(parts: Sequence[Part]) -> list[Part]:
+    """Returns parts moved so that the box around all of them has its middle at the origin."""
+    vertices = np.concatenate([part.vertices for part in parts])
+    middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    return [part._replace(vertices=part.vertices - middle) for part in parts]
