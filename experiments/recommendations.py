@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments import trade_table, trained_runs
-from refref_jax.data import scene_names
 from experiments.child_process import RunFailedError
 from experiments.trade_table import Row
 from experiments.trained_runs import Training
+from refref_jax.data import scene_names
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """How commands open the scene that an option names: a folder, or `hf:CONFIG/SCENE`."""
 
+import contextlib
 import warnings
 from pathlib import Path
 
@@ -16,20 +17,17 @@ def opened(source: str | Path) -> Path:
     Raises:
       ValueError: if there is none, or it is broken, see `scene_source.open_scene`.
     """
-    bars: list[commands.ProgressBar] = []
+    bar: commands.ProgressBar | None = None
 
     def show(done: int, total: int) -> None:
-        if not bars:
-            bars.append(commands.ProgressBar(f"unpack {Path(source).name}", total).__enter__())
-        bars[0].show(done, "images")
+        nonlocal bar
+        if bar is None:
+            bar = bars.enter_context(commands.ProgressBar(f"unpack {Path(source).name}", total))
+        bar.show(done, "images")
 
-    with warnings.catch_warnings(record=True) as caught:
+    with contextlib.ExitStack() as bars, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", scene_source.SceneWarning)
-        try:
-            scene = scene_source.open_scene(source, progress=show)
-        finally:
-            for bar in bars:
-                bar.__exit__()
+        scene = scene_source.open_scene(source, progress=show)
     for warning in caught:
         print(f"warning: {warning.message}")
     return scene

@@ -177,7 +177,7 @@ def _index(path: Path, overrides: Mapping[str, float], described: PartDescriptio
     if path.stem in overrides:
         return overrides[path.stem]
     table = INDEX_OF_REFRACTION | dict(overrides)
-    material = _material(path, table)
+    material = material_of(path, table)
     if described.index is not None and material not in overrides:
         return described.index
     if material is None:
@@ -189,15 +189,15 @@ def _index(path: Path, overrides: Mapping[str, float], described: PartDescriptio
     return table[material]
 
 
-def _material(path: Path, table: Mapping[str, float]) -> str | None:
-    """Returns the last word of a file's name that the table knows."""
+def material_of(path: Path, table: Mapping[str, float] = INDEX_OF_REFRACTION) -> str | None:
+    """Returns the material of a mesh file: the last word of its name that the table knows."""
     known = [word for word in path.stem.split("_") if word in table]
     return known[-1] if known else None
 
 
 def _check_overrides(overrides: Mapping[str, float], paths: Sequence[Path]) -> None:
     table = INDEX_OF_REFRACTION | dict(overrides)
-    known = {path.stem for path in paths} | {_material(path, table) for path in paths}
+    known = {path.stem for path in paths} | {material_of(path, table) for path in paths}
     for name in overrides:
         if name not in known:
             raise SceneError(

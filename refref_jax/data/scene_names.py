@@ -98,18 +98,18 @@ def parse(name: str) -> SceneName:
     Raises:
       SceneError: if it is none.
     """
-    background, _, rest = name.partition("_")
-    category, _, thing = rest.partition("_")
     if is_name(name):
-        return SceneName(background, category, thing)
-    wanted = SceneName(
-        nearest(background, BACKGROUNDS) or "cube",
-        nearest(category, CATEGORIES) or "smcvx",
-        Path(thing).name or "ball",
-    )
+        return SceneName(*name.split("_", 2))
+    words = Path(name).name.split("_")
+    background, category = nearest(words[0], BACKGROUNDS), None
+    words = words[background is not None :]
+    if words:
+        category = nearest(words[0], CATEGORIES)
+        words = words[category is not None :]
+    wanted = SceneName(background or "cube", category or "smcvx", "_".join(words) or "ball")
     raise SceneError(
         f"{name!r} is no name of a scene, which is {{{','.join(BACKGROUNDS)}}}_"
-        f"{{{','.join(CATEGORIES)}}}_{{object}}. Write it as in {wanted}."
+        f"{{{','.join(CATEGORIES)}}}_{{object}}. Name it as in {wanted}."
     )
 
 
