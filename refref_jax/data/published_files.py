@@ -14,7 +14,7 @@ import importlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from refref_jax.data import scene_names
 from refref_jax.data.errors import SceneError
@@ -28,27 +28,12 @@ _FOLDERS = ("data", *CONFIGS, "mesh_files", "scene_files")
 _SHARD = re.compile(rf"({'|'.join(_FOLDERS[:-2])})/(.+)-(\d+)-of-(\d+)\.parquet")
 
 
-class Repository(Protocol):
-    """Files of the data set.
+class LocalCopy:
+    """Folders that together hold what the published repositories do, or a part of it.
 
     Attributes:
       where: how messages call it.
     """
-
-    where: str
-
-    def names(self) -> list[str]:
-        """Returns the names of all files."""
-
-    def fetch(self, name: str) -> Path:
-        """Returns where a file is on this machine, downloading it if need be."""
-
-    def key(self, scene: SceneName) -> str:
-        """Returns a name of a folder, another one where the scene's files are others."""
-
-
-class LocalCopy:
-    """Folders that together hold what the published repositories do, or a part of it."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         """Lists the files.
@@ -69,15 +54,15 @@ class LocalCopy:
                     self._paths.setdefault(path.relative_to(folder).as_posix(), path)
 
     def names(self) -> list[str]:
-        """See `Repository`."""
+        """Returns the names of all files."""
         return sorted(self._paths)
 
     def fetch(self, name: str) -> Path:
-        """See `Repository`."""
+        """Returns where a file is."""
         return self._paths[name]
 
     def key(self, scene: SceneName) -> str:
-        """See `Repository`."""
+        """Returns a name of a folder, another one where the scene's files are others."""
         names = [*find_shards(self, scene), *find_others(self, scene).values()]
         stats = [(self._paths[name].resolve(), self._paths[name].stat()) for name in names]
         text = "\n".join(f"{path} {stat.st_size} {stat.st_mtime_ns}" for path, stat in stats)
@@ -85,7 +70,11 @@ class LocalCopy:
 
 
 class Hub:
-    """The published repositories, downloaded file by file."""
+    """The published repositories, downloaded file by file.
+
+    Attributes:
+      where: how messages call it.
+    """
 
     where = "huggingface.co"
 
@@ -105,7 +94,7 @@ class Hub:
         self._owners: dict[str, str] = {}
 
     def names(self) -> list[str]:
-        """See `Repository`."""
+        """Returns the names of all files."""
         for repository in REPOSITORIES if not self._owners else ():
             for name in self._try(
                 self._hub.HfApi().list_repo_files, repository, repo_type="dataset"
@@ -114,13 +103,13 @@ class Hub:
         return sorted(self._owners)
 
     def fetch(self, name: str) -> Path:
-        """See `Repository`."""
+        """Returns where a file is on this machine, and downloads it if need be."""
         self.names()
         download = self._hub.hf_hub_download
         return Path(self._try(download, self._owners[name], name, repo_type="dataset"))
 
     def key(self, scene: SceneName) -> str:
-        """See `Repository`: one alone, so that what is unpacked is read without a network."""
+        """Returns a name of a folder: always one, so that it can be found without a network."""
         del scene
         return "huggingface"
 
@@ -133,6 +122,9 @@ class Hub:
                 f"({type(error).__name__}: {error}). Check the connection, or set REFREF_HF to the "
                 "folder of a local copy."
             ) from error
+
+
+Repository = LocalCopy | Hub
 
 
 def scenes_in(repository: Repository) -> list[SceneName]:
@@ -154,8 +146,8 @@ def find_shards(repository: Repository, scene: SceneName) -> list[str]:
         if match and match[2] == str(scene) and match[1] in ("data", scene.config):
             sets.setdefault((match[1], int(match[4])), {})[int(match[3])] = name
     if not sets:
-        near = scene_names.nearest(str(scene), map(str, scenes_in(repository)))
-        advice = f"Did you mean {scene_names.parse(near).source}?" if near else "Copy it there."
+        near = _nearest(scene, scenes_in(repository))
+        advice = f"Did you mean {near.source}?" if near else "Copy it there."
         raise SceneError(f"There is no scene {scene} in {repository.where}. {advice}")
     (_, count), shards = next(iter(sets.items()))
     if len(sets) > 1:
@@ -169,6 +161,13 @@ def find_shards(repository: Repository, scene: SceneName) -> list[str]:
             "missing. Copy it again."
         )
     return [shards[i] for i in range(count)]
+
+
+def _nearest(scene: SceneName, scenes: Sequence[SceneName]) -> SceneName | None:
+    """Returns a scene with an object of that or a similar name, before that background if any."""
+    thing = scene_names.nearest(scene.object, {each.object for each in scenes})
+    found = [each for each in scenes if each.object == thing]
+    return max(found, key=lambda each: each.background == scene.background, default=None)
 
 
 def find_others(repository: Repository, scene: SceneName) -> dict[str, str]:
