@@ -112,6 +112,6 @@ def _wanted(found: dict[str, _T], chosen: Sequence[str] | None, place: str) -> l
     for name in chosen or ():
         if name not in found:
             near = scene_names.nearest(name, found)
-            advice = f"Did you mean {near}?" if near else f"There are {', '.join(found)}."
+            advice = f"The nearest there is {near}." if near else f"There are {', '.join(found)}."
             raise SceneError(f"There is no scene {name} in {place}. {advice}")
     return [found[name] for name in (found if chosen is None else dict.fromkeys(chosen))]

@@ -147,7 +147,7 @@ def find_shards(repository: Repository, scene: SceneName) -> list[str]:
             sets.setdefault((match[1], int(match[4])), {})[int(match[3])] = name
     if not sets:
         near = _nearest(scene, scenes_in(repository))
-        advice = f"Did you mean {near.source}?" if near else "Copy it there."
+        advice = f"The nearest there is {near.source}." if near else "Copy it there."
         raise SceneError(f"There is no scene {scene} in {repository.where}. {advice}")
     (_, count), shards = next(iter(sets.items()))
     if len(sets) > 1:

@@ -1,5 +1,6 @@
 import os
 import sys
+import tempfile
 import time
 import types
 import warnings
@@ -7,8 +8,9 @@ import warnings
 import pytest
 import trimesh
 
-from refref_jax.data import background, local_layout, meshes, parquet_scenes, scene_source
+from refref_jax.data import background, local_layout, meshes, parquet_scenes
 from refref_jax.data.scene_source import SceneWarning, open_scene
+from tests.data.abandoned_folder import AbandonedFolder
 from tests.data.expectations import scene_error
 from tests.data.small_parquet import CONFIG, NAME, write_copy
 from tests.data.small_scenes import truncate, write_scene
@@ -120,7 +122,7 @@ def test_a_scene_that_was_unpacked_in_part_is_never_used(copy, tmp_path, monkeyp
 
     with monkeypatch.context() as context:
         # As after kill -9: nothing is cleaned up.
-        context.setattr(scene_source.tempfile, "TemporaryDirectory", _Abandoned)
+        context.setattr(tempfile, "TemporaryDirectory", AbandonedFolder)
         with pytest.raises(PowerFailure):
             open_scene(_SOURCE, progress=fail)
     (abandoned,) = (tmp_path / "cache").glob("*/.unpacking-*")
@@ -134,18 +136,6 @@ def test_a_scene_that_was_unpacked_in_part_is_never_used(copy, tmp_path, monkeyp
     scene.rename(scene.with_name("away"))
     open_scene(_SOURCE)
     assert not abandoned.exists()
-
-
-class _Abandoned:
-    def __init__(self, prefix, dir):
-        self.name = dir / f"{prefix}1"
-
-    def __enter__(self):
-        self.name.mkdir()
-        return str(self.name)
-
-    def __exit__(self, *exception):
-        pass
 
 
 def test_a_scene_that_another_process_has_unpacked_meanwhile_is_used(copy):
@@ -170,7 +160,7 @@ def test_a_broken_file_leaves_nothing_behind(copy, tmp_path):
 @pytest.mark.parametrize(
     ("source", "words"),
     [
-        ("hf:cubebg_single-convex/cube_smcvx_bal", (f"Did you mean {_SOURCE}?",)),
+        ("hf:cubebg_single-convex/cube_smcvx_bal", (f"The nearest there is {_SOURCE}.",)),
         ("hf:cubebg_single-convex/cube_smcvx_xylophone", ("no scene", "Copy it there")),
         ("hf:cubebg_single-convx/cube_smcvx_ball", ("Write cubebg_single-convex",)),
         ("hf:spherebg_single-convex/cube_smcvx_ball", (_SOURCE,)),
