@@ -106,7 +106,8 @@ def _write_shard(
     pose = pyarrow.list_(pyarrow.list_(pyarrow.float64()))
     types = dict.fromkeys(IMAGE_COLUMNS, image) | {POSE_COLUMN: pose}
     schema = pyarrow.schema(types, metadata=metadata)
-    with parquet.ParquetWriter(path, schema) as file:
+    # No two images are equal: there is nothing to look up.
+    with parquet.ParquetWriter(path, schema, use_dictionary=False) as file:
         for start in range(0, len(rows), _ROWS_OF_A_GROUP):
             group = []
             for split, frame in rows[start : start + _ROWS_OF_A_GROUP]:
