@@ -15,9 +15,9 @@ import numpy as np
 from absl import flags
 from jaxtyping import Bool, Float, UInt8
 
-from experiments import commands, figures, supersampling
+from experiments import commands, figures, scene_option, supersampling
 from refref_jax import metrics
-from refref_jax.data import files, local_layout
+from refref_jax.data import files, local_layout, scene_names
 from refref_jax.render import Model, Rendering, dyes, load_model
 from refref_jax.render.saved import latest_step
 from refref_jax.training import run_folder
@@ -25,7 +25,7 @@ from refref_jax.training import run_folder
 _RUN = flags.DEFINE_string("run", None, "Folder of a trained run.", required=True)
 _SPLIT = flags.DEFINE_enum("split", "test", list(local_layout.SPLITS), "Images to render.")
 _STEP = flags.DEFINE_integer("step", None, "Checkpoint to use; the newest if not given.", 0)
-_SCENE = flags.DEFINE_string("scene", None, "Folder of the scene, if it has moved.")
+_SCENE = flags.DEFINE_string("scene", None, f"The scene, if it has moved: {scene_option.FORMS}.")
 _LIMIT = flags.DEFINE_integer("limit", None, "Only this many images, evenly spread.", 1)
 _RAYS_PER_PIXEL = flags.DEFINE_integer(
     "rays_per_pixel", 1, "Rays in each pixel, a square: 1, 4, 9, 16. They are averaged."
@@ -54,12 +54,12 @@ def main() -> None:
     # Resolved first, and once: training may be going on.
     step = _STEP.value if _STEP.value is not None else latest_step(run)
     model = load_model(run, step=step)
-    scene = Path(_SCENE.value or config.scene.path)
+    scene = scene_option.opened(_SCENE.value or config.scene.path)
     truth = read_truth(scene, _SPLIT.value)
     out = run / "eval" / _SPLIT.value
     per_image, views = evaluate(model, truth, out, side)
     summary = {
-        "scene": scene.name,
+        "scene": scene_names.of_folder(scene),
         "method": _METHODS.get(config.paths, config.paths),
         "step": step,
         "rays_per_pixel": _RAYS_PER_PIXEL.value,

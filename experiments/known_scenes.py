@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from experiments import mesh_report
 from refref_jax import metrics
-from refref_jax.data import background, cameras, containment, local_layout, meshes
+from refref_jax.data import background, cameras, containment, local_layout, meshes, scene_names
 from refref_jax.data.geometry import build_geometry
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.budgets import Budget
@@ -93,7 +93,7 @@ def read_scene(
     mesh_report.report_meshes(parts, tree, rule=rule)
     geometry = build_geometry(parts, tree.parents, rule=rule)
     return KnownScene(
-        name=scene.resolve().name,
+        name=scene_names.of_folder(scene),
         geometry=jax.device_put(geometry),
         radiance=jax.device_put(radiance_of(background.read_background(scene))),
         frames=frames,

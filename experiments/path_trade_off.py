@@ -21,14 +21,18 @@ from experiments import (
     known_scenes,
     named_budgets,
     path_figures,
+    scene_option,
     scenes,
     supersampling,
 )
 from experiments.known_scenes import KnownScene
 from experiments.path_figures import Trial
+from refref_jax.data import scene_names
 from refref_jax.optics.budgets import BUDGETS, Budget
 
-_SCENES = flags.DEFINE_list("scenes", None, "Folders of scenes, with commas.", required=True)
+_SCENES = flags.DEFINE_list(
+    "scenes", None, f"Scenes, with commas: each {scene_option.FORMS}.", required=True
+)
 _CUTS = flags.DEFINE_list(
     "cuts",
     ["0.2", "0.1", "0.05", "0.04", "0.03", "0.02", "0.01", "0.005", "0.002"],
@@ -59,11 +63,11 @@ class Setting(NamedTuple):
 
 def main() -> None:
     """Renders all scenes with all budgets."""
-    _check_scenes()
+    folders = _open_scenes()
     plan = settings()
     side = supersampling.side_of(known_scenes.RAYS_PER_PIXEL.value)
     # All scenes first: a broken one is named before anything is rendered.
-    chosen = [_read(Path(scene)) for scene in _SCENES.value]
+    chosen = [_read(folder) for folder in folders]
     out = Path(_OUT.value)
     out.mkdir(parents=True, exist_ok=True)
     table = out / "path_trade_off.csv"
@@ -85,9 +89,10 @@ def main() -> None:
     print("Next: choose a cut, and render with python -m experiments.render_known --cut=...")
 
 
-def _check_scenes() -> None:
+def _open_scenes() -> list[Path]:
     """Refuses no scene at all, and names that plot and table could not tell apart."""
-    names = [Path(scene).resolve().name for scene in _SCENES.value]
+    folders = [scene_option.opened(scene) for scene in _SCENES.value]
+    names = [scene_names.of_folder(folder) for folder in folders]
     if not names:
         raise ValueError("No scene is given. Add --scenes=FOLDER,FOLDER.")
     if len(set(names)) < len(names):
@@ -95,6 +100,7 @@ def _check_scenes() -> None:
             f"Two of the scenes have the same name: {', '.join(names)}. Rename a folder, or leave "
             "one out."
         )
+    return folders
 
 
 def settings() -> list[Setting]:

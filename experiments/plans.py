@@ -1,17 +1,15 @@
 """The options of training, and the run that they ask for."""
 
-from pathlib import Path
-
 from absl import flags
 
-from experiments import model_options, planning, scenes
+from experiments import model_options, planning, scene_option, scenes
 from experiments.choices import Wishes
 from experiments.model_options import ModelOptions
 from experiments.planning import Plan, Request
 from experiments.presets import PRESETS
 from refref_jax.optics.budgets import BUDGETS
 
-SCENE = flags.DEFINE_string("scene", None, "Folder of the scene to train on.")
+SCENE = flags.DEFINE_string("scene", None, f"The scene to train on: {scene_option.FORMS}.")
 _PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Size of the model and its training.")
 _PATHS = flags.DEFINE_enum(
     "paths",
@@ -129,7 +127,7 @@ def plan_from_flags() -> Plan:
     if SCENE.value is None:
         raise ValueError("No scene is given. Add --scene=FOLDER.")
     request = Request(
-        scene=Path(SCENE.value).resolve(),
+        scene=scene_option.opened(SCENE.value).resolve(),
         preset=_PRESET.value,
         wishes=_wishes(),
         options=_options(),

@@ -13,12 +13,14 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import commands, recommendations, trade_table
+from experiments import commands, recommendations, scene_option, trade_table
 from refref_jax.data import local_layout
 
 _BUNDLED = Path(__file__).parent / "data" / "trade_off.csv"
 
-_SCENE = flags.DEFINE_string("scene", None, "Folder of the scene to train on.", required=True)
+_SCENE = flags.DEFINE_string(
+    "scene", None, f"The scene to train on: {scene_option.FORMS}.", required=True
+)
 _MINUTES = flags.DEFINE_float(
     "minutes", None, "Time for training and evaluation.", 0.0, required=True
 )
@@ -31,7 +33,7 @@ _TIMED_STEPS = flags.DEFINE_integer(
 def main() -> None:
     """Times this machine and prints the recommendation."""
     rows = trade_table.read(Path(_TABLE.value))
-    scene = Path(_SCENE.value)
+    scene = scene_option.opened(_SCENE.value)
     images = len(local_layout.read_frames(scene, "test").names)
     base = trade_table.base_of(rows)
     print(f"Timing {_TIMED_STEPS.value} steps of the table's base point ...", flush=True)

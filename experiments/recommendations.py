@@ -9,6 +9,7 @@ from experiments import trade_table, trained_runs
 from experiments.child_process import RunFailedError
 from experiments.trade_table import Row
 from experiments.trained_runs import Training
+from refref_jax.data import scene_names
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,7 +109,7 @@ def choose(rows: Sequence[Row], machine: Machine, seconds: float) -> Choice:
 def told(choice: Choice, machine: Machine, scene: Path) -> list[str]:
     """Returns the recommendation, line by line."""
     best = choice.best
-    out = f"runs/{scene.resolve().name}"
+    out = f"runs/{scene_names.of_folder(scene)}"
     evaluation = f" {best.evaluation}" if best.evaluation else ""
     lines = [
         "",

@@ -9,7 +9,7 @@ from pathlib import Path
 import imageio.v3 as iio
 from absl import flags
 
-from experiments import commands, figures, supersampling
+from experiments import commands, figures, scene_option, supersampling
 from refref_jax.data import files, local_layout
 from refref_jax.data.cameras import Cameras, orbit
 from refref_jax.render import load_model
@@ -20,7 +20,7 @@ _VIEWS = flags.DEFINE_enum(
     "views", "orbit", ["orbit", *local_layout.SPLITS], "Cameras: an orbit, or those of a split."
 )
 _STEP = flags.DEFINE_integer("step", None, "Checkpoint to use; the newest if not given.", 0)
-_SCENE = flags.DEFINE_string("scene", None, "Folder of the scene, if it has moved.")
+_SCENE = flags.DEFINE_string("scene", None, f"The scene, if it has moved: {scene_option.FORMS}.")
 _OUT = flags.DEFINE_string("out", None, "Where to write; {run}/render/{views} if not given.")
 _FRAMES = flags.DEFINE_integer("frames", 60, "Frames of an orbit.", 1)
 _SIZE = flags.DEFINE_integer("size", 200, "Width and height of an orbit's frames, pixels.", 1)
@@ -69,7 +69,7 @@ def _cameras(run: Path) -> tuple[Cameras, tuple[str, ...]]:
             angle_x=math.radians(_FOV.value),
         )
         return cameras, tuple(f"r_{i:03d}" for i in range(_FRAMES.value))
-    scene = Path(_SCENE.value or run_folder.read_config(run).scene.path)
+    scene = scene_option.opened(_SCENE.value or run_folder.read_config(run).scene.path)
     frames = local_layout.read_frames(scene, _VIEWS.value)
     return frames.cameras, frames.names
 

@@ -17,12 +17,20 @@ from typing import Any
 import numpy as np
 from absl import flags
 
-from experiments import commands, figures, known_scenes, named_budgets, scenes, supersampling
+from experiments import (
+    commands,
+    figures,
+    known_scenes,
+    named_budgets,
+    scene_option,
+    scenes,
+    supersampling,
+)
 from experiments.known_scenes import KnownScene, View
 from refref_jax.data import files
 from refref_jax.optics.budgets import BUDGETS, Budget
 
-_SCENE = flags.DEFINE_string("scene", None, "Folder of the scene.", required=True)
+_SCENE = flags.DEFINE_string("scene", None, f"The scene: {scene_option.FORMS}.", required=True)
 _PATHS = flags.DEFINE_enum(
     "paths",
     "tree",
@@ -59,7 +67,7 @@ def main() -> None:
     budget = named_budgets.make_budget(_PATHS.value, cut=_CUT.value, bends=_BENDS.value)
     side = supersampling.side_of(known_scenes.RAYS_PER_PIXEL.value)
     scene = known_scenes.read_scene(
-        Path(_SCENE.value),
+        scene_option.opened(_SCENE.value),
         split=known_scenes.SPLIT.value,
         views=_VIEWS.value,
         rule=scenes.RULE.value,

@@ -15,6 +15,7 @@ from experiments import (
 from experiments.child_process import RunFailedError
 from experiments.trade_points import BASE, Point
 from experiments.trade_table import Row
+from refref_jax.data import scene_names
 
 Measure = Callable[[Point], Row]
 """Trains and evaluates a point, or raises `RunFailedError`."""
@@ -70,7 +71,7 @@ def earlier_rows(out: Path, base: Point, scene: Path) -> list[Row]:
         return []
     rows = trade_table.read(table)
     found, new = trade_table.base_of(rows), (" ".join(base.training), " ".join(base.evaluation))
-    if (found.scene, found.training, found.evaluation) != (scene.resolve().name, *new):
+    if (found.scene, found.training, found.evaluation) != (scene_names.of_folder(scene), *new):
         raise ValueError(
             f"{table} is of {found.scene}, around {found.training}. Give another --out."
         )
@@ -92,7 +93,7 @@ def measure(point: Point, scene: Path, runs: Path, limit: Sequence[str] = ()) ->
     cost = trained_runs.train(run, scene=scene, options=point.training)
     gain = trained_runs.evaluate(run, scene=scene, options=(*point.evaluation, *limit))
     return Row(
-        scene=scene.resolve().name,
+        scene=scene_names.of_folder(scene),
         name=point.name,
         knob=point.knob,
         value=point.value,

@@ -18,10 +18,10 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import commands, sweeps, trade_points
+from experiments import commands, scene_option, sweeps, trade_points
 from experiments.trade_points import Point
 
-_SCENE = flags.DEFINE_string("scene", None, "Folder of the scene.", required=True)
+_SCENE = flags.DEFINE_string("scene", None, f"The scene: {scene_option.FORMS}.", required=True)
 _OUT = flags.DEFINE_string("out", None, "Folder of the sweep.", required=True)
 _PRESET = flags.DEFINE_string("preset", "tiny", "Preset of the base point.")
 _SEED = flags.DEFINE_integer("seed", 0, "Seed of all trainings.", 0, 2**32 - 1)
@@ -48,7 +48,7 @@ def main() -> None:
         for point in points:
             print(f"{point.name:24} {' '.join((*point.training, *point.evaluation))}")
         return
-    scene, out = Path(_SCENE.value), Path(_OUT.value)
+    scene, out = scene_option.opened(_SCENE.value), Path(_OUT.value)
     if not scene.is_dir():
         raise ValueError(f"{scene} is no folder. Give that of a scene.")
     # A sweep that is killed takes the training that it waits for with it.
@@ -64,7 +64,7 @@ def main() -> None:
     print(f"Figure: {out / 'trade_off.png'}")
     print(f"Report: {out / 'trade_off.md'}")
     print(
-        f"Next: python -m experiments.recommend --scene={scene} --minutes=5 "
+        f"Next: python -m experiments.recommend --scene={_SCENE.value} --minutes=5 "
         f"--table={out / 'trade_off.csv'}"
     )
     for name, reason in failed.items():

@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 from absl import flags
 
-from experiments import commands, plans, scenes
+from experiments import commands, plans, scene_option, scenes
 from refref_jax.data import local_layout
 from refref_jax.data.batches import PixelSampler
 from refref_jax.render import saved
@@ -69,7 +69,7 @@ def train(run: Path) -> bool:
         if checkpoints.newest() == config.schedule.steps:
             print(f"{run} is trained already: {config.schedule.steps} steps.")
             return True
-        scene = Path(plans.SCENE.value or config.scene.path)
+        scene = scene_option.opened(plans.SCENE.value or config.scene.path)
         frames = local_layout.read_frames(scene, "train")
         sampler = PixelSampler(
             local_layout.read_images(frames), frames.cameras, seed=config.seed, batch=config.batch

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from refref_jax.data import files, transforms
+from refref_jax.data import files, scene_names, transforms
 from refref_jax.data.errors import SceneError
 from refref_jax.render.backgrounds import (
     Background,
@@ -44,12 +44,13 @@ _SPACES: dict[str, Space] = {"cube": "bounded", "sphere": "bounded", "env": "unb
 def space(scene: Path) -> Space:
     """Returns `unbounded` if the background is an environment map.
 
-    `scene.json` decides if it names the background; otherwise the folder's name does, which
-    begins with `env` in the data set, and with `cube` or `sphere` where there are walls.
+    `scene.json` decides if it names the background; otherwise the scene's name does, which begins
+    with `env` in the data set, and with `cube` or `sphere` where there are walls.
     """
     kind = _background(scene).get("type")
     if kind is None:
-        return "unbounded" if scene.resolve().name.split("_")[0] == "env" else "bounded"
+        name = scene_names.of_folder(scene)
+        return "unbounded" if name.split("_")[0] == "env" else "bounded"
     if not isinstance(kind, str) or kind not in _SPACES:
         raise SceneError(
             f"The type of the background is {kind!r} in {scene / _FILE}, not one of "

@@ -16,6 +16,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
+from refref_jax.data import scene_names
 from refref_jax.data.errors import SceneError
 from refref_jax.data.part_descriptions import (
     Colour,
@@ -69,7 +70,7 @@ def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> l
     """Reads all parts of a scene, ordered by name.
 
     Args:
-      scene: the scene folder; its meshes are `meshes/*.ply`. None of them is no part.
+      scene: the scene folder, see `mesh_files`. No file is no part.
       indices: indices of refraction that replace or extend the table and `scene.json`, by
         material or, for one part alone, by file stem.
 
@@ -85,19 +86,42 @@ def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> l
                 f"The index of refraction of {name!r} is {index}. Give a positive number, such as "
                 "1.5 for glass."
             )
-    folder = scene / "meshes"
-    files = folder.iterdir() if folder.is_dir() else ()
-    paths = sorted(path for path in files if path.suffix.lower() == ".ply")
+    paths = mesh_files(scene)
     _check_overrides(overrides, paths)
     described = read_part_descriptions(scene / "scene.json")
     missing = sorted(set(described) - {path.name for path in paths})
     if missing and paths:
         raise SceneError(
-            f"{scene / 'scene.json'} describes {missing[0]}, but {folder} does not hold it. "
-            "Restore the mesh, or remove its description."
+            f"{scene / 'scene.json'} describes {missing[0]}, but {paths[0].parent} does not hold "
+            "it. Restore the mesh, or remove its description."
         )
     unknown = PartDescription()
     return [_read_part(path, overrides, described.get(path.name, unknown)) for path in paths]
+
+
+def mesh_files(scene: Path) -> list[Path]:
+    """Returns the mesh files of a scene, ordered by name.
+
+    They are `meshes/*.ply` in its folder. If a folder of the raw release has none, they are
+    `mesh_files/{category}/{object}_{material}.ply` beside `image_data`.
+    """
+    folder, stems = scene / "meshes", None
+    if not folder.is_dir() and (name := scene_names.of_raw_folder(scene)) is not None:
+        places = [above / "mesh_files" for above in scene.resolve().parents[2:4]]
+        category = scene_names.CATEGORIES[name.category]
+        folder = next((each for each in places if each.is_dir()), folder) / category
+        stems = published_stems(name.object)
+    found = folder.iterdir() if folder.is_dir() else ()
+    paths = sorted(path for path in found if path.suffix.lower() == ".ply")
+    return [path for path in paths if stems is None or path.stem in stems]
+
+
+def published_stems(thing: str) -> set[str]:
+    """Returns the published names of an object's meshes, without their ending: one a material.
+
+    The whole name counts: ball_coloured_glass.ply is not of the object ball.
+    """
+    return {f"{thing}_{material}" for material in INDEX_OF_REFRACTION}
 
 
 def without_colour(parts: Sequence[MeshPart]) -> list[MeshPart]:
@@ -153,7 +177,7 @@ def _index(path: Path, overrides: Mapping[str, float], described: PartDescriptio
     if path.stem in overrides:
         return overrides[path.stem]
     table = INDEX_OF_REFRACTION | dict(overrides)
-    material = _material(path, table)
+    material = material_of(path, table)
     if described.index is not None and material not in overrides:
         return described.index
     if material is None:
@@ -165,15 +189,15 @@ def _index(path: Path, overrides: Mapping[str, float], described: PartDescriptio
     return table[material]
 
 
-def _material(path: Path, table: Mapping[str, float]) -> str | None:
-    """Returns the last word of a file's name that the table knows."""
+def material_of(path: Path, table: Mapping[str, float] = INDEX_OF_REFRACTION) -> str | None:
+    """Returns the material of a mesh file: the last word of its name that the table knows."""
     known = [word for word in path.stem.split("_") if word in table]
     return known[-1] if known else None
 
 
 def _check_overrides(overrides: Mapping[str, float], paths: Sequence[Path]) -> None:
     table = INDEX_OF_REFRACTION | dict(overrides)
-    known = {path.stem for path in paths} | {_material(path, table) for path in paths}
+    known = {path.stem for path in paths} | {material_of(path, table) for path in paths}
     for name in overrides:
         if name not in known:
             raise SceneError(

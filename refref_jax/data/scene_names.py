@@ -1,0 +1,157 @@
+"""Names of scenes and configurations in the published data set (NumPy only).
+
+    cube_smcvx_ball              a scene: background, category, object
+    cubebg_single-convex         its configuration on Hugging Face: background, category
+    textured_cube_scene/single-convex/ball          its folder in the raw release; an object's
+                                 folder ends with _sphere or _hdr before these backgrounds
+
+The parser's errors suggest the nearest names.
+"""
+
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from refref_jax.data.errors import SceneError
+
+
+class _Background(NamedTuple):
+    """What a kind of background is called: in configurations, and in the raw release."""
+
+    config: str
+    raw_folders: tuple[str, ...]
+    raw_suffix: str
+
+
+_BACKGROUNDS: dict[str, _Background] = {
+    "cube": _Background("cubebg", ("textured_cube_scene",), ""),
+    "sphere": _Background("spherebg", ("textured_sphere_scene",), "_sphere"),
+    "env": _Background(
+        "envbg", ("environment_map_scene", "env_map_scene", "HDR_map_scene"), "_hdr"
+    ),
+}
+
+BACKGROUNDS = tuple(_BACKGROUNDS)
+"""Kinds of background, as scenes' names begin."""
+
+CATEGORIES: dict[str, str] = {
+    "smcvx": "single-convex",
+    "smncvx": "single-non-convex",
+    "mmncvx": "multiple-non-convex",
+}
+"""Categories of objects: as in scenes' names, and as in configurations and folders."""
+
+CONFIGS = tuple(
+    f"{background.config}_{category}"
+    for background in _BACKGROUNDS.values()
+    for category in CATEGORIES.values()
+)
+"""The nine configurations."""
+
+
+class SceneName(NamedTuple):
+    """The published name of a scene.
+
+    Attributes:
+      background: `cube`, `sphere` or `env`.
+      category: `smcvx`, `smncvx` or `mmncvx`.
+      object: as in the data set, with underscores.
+    """
+
+    background: str
+    category: str
+    object: str
+
+    def __str__(self) -> str:
+        return "_".join(self)
+
+    @property
+    def config(self) -> str:
+        """The configuration on Hugging Face that the scene is of."""
+        return f"{_BACKGROUNDS[self.background].config}_{CATEGORIES[self.category]}"
+
+    @property
+    def source(self) -> str:
+        """The scene as commands take it."""
+        return f"hf:{self.config}/{self}"
+
+    @property
+    def raw_folder(self) -> str:
+        """The scene's folder below `image_data` of the raw release."""
+        background = _BACKGROUNDS[self.background]
+        place = f"{background.raw_folders[0]}/{CATEGORIES[self.category]}"
+        return f"{place}/{self.object}{background.raw_suffix}"
+
+
+def is_name(name: str) -> bool:
+    """Returns whether a scene may be called so."""
+    background, _, rest = name.partition("_")
+    category, _, thing = rest.partition("_")
+    known = background in _BACKGROUNDS and category in CATEGORIES
+    return known and bool(thing) and Path(thing).name == thing
+
+
+def parse(name: str) -> SceneName:
+    """Returns the parts of a scene's name.
+
+    Raises:
+      SceneError: if it is none.
+    """
+    if is_name(name):
+        return SceneName(*name.split("_", 2))
+    words = Path(name).name.split("_")
+    background, category = nearest(words[0], BACKGROUNDS), None
+    words = words[background is not None :]
+    if words:
+        category = nearest(words[0], CATEGORIES)
+        words = words[category is not None :]
+    wanted = SceneName(background or "cube", category or "smcvx", "_".join(words) or "ball")
+    raise SceneError(
+        f"{name!r} is no name of a scene, which is {{{','.join(BACKGROUNDS)}}}_"
+        f"{{{','.join(CATEGORIES)}}}_{{object}}. Name it as in {wanted}."
+    )
+
+
+def parse_source(source: str) -> SceneName:
+    """Returns the scene of `hf:CONFIG/SCENE`.
+
+    Raises:
+      SceneError: if it is not of that form, if there is no such configuration, or if the scene is
+        of another.
+    """
+    config, separator, text = source.removeprefix("hf:").partition("/")
+    if not separator:
+        example = parse(config) if is_name(config) else SceneName("cube", "smcvx", "ball")
+        raise SceneError(f"{source} is not hf:CONFIG/SCENE. Write it as in {example.source}.")
+    if config not in CONFIGS:
+        raise SceneError(
+            f"{config!r} is no configuration of the data set. Write "
+            f"{nearest(config, CONFIGS) or 'one of ' + ', '.join(CONFIGS)}."
+        )
+    name = parse(text)
+    if name.config != config:
+        raise SceneError(f"The scene {name} is not in {config}. Write {name.source}.")
+    return name
+
+
+def of_raw_folder(scene: Path) -> SceneName | None:
+    """Returns the scene of a folder in the raw release, or `None` for another folder."""
+    folder = scene.resolve()
+    categories = {long: short for short, long in CATEGORIES.items()}
+    category = categories.get(folder.parent.name)
+    for kind, background in _BACKGROUNDS.items():
+        if category is not None and folder.parent.parent.name in background.raw_folders:
+            return SceneName(kind, category, folder.name.removesuffix(background.raw_suffix))
+    return None
+
+
+def of_folder(scene: Path) -> str:
+    """Returns how a scene's folder is called: its name, or in the raw release the published one."""
+    return str(of_raw_folder(scene) or scene.resolve().name)
+
+
+def nearest(word: str, words: Iterable[str]) -> str | None:
+    """Returns the most similar of some words, or `None` if none is similar."""
+    found = difflib.get_close_matches(word, list(words), 1)
+    return found[0] if found else None
