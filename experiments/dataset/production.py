@@ -1,0 +1,111 @@
+"""Makes what is missing of scenes, alone in their folder (NumPy only)."""
+
+import contextlib
+import fcntl
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from experiments import commands
+from experiments.dataset import frame_files, scene_setup, views
+from experiments.dataset.parts import Object
+from experiments.dataset.render_settings import RenderSettings
+from experiments.dataset.scenes import Scene
+from experiments.dataset.workers import Pool
+
+_SCRATCH = ".scratch"
+
+
+def produce(
+    out: Path,
+    chosen: Sequence[Scene],
+    settings: RenderSettings,
+    *,
+    objects: Mapping[str, Object],
+    blender: Path,
+    workers: int | None,
+    stopped: Callable[[], bool],
+) -> bool:
+    """Makes folders and views that are not there, and returns whether none is left.
+
+    Args:
+      out: folder of the scenes; made if it is not there.
+      chosen: scenes to make; those of one object follow each other.
+      settings: of the rendering.
+      objects: by name.
+      blender: Python that has bpy.
+      workers: number of processes of Blender, or one for each core.
+      stopped: whether the user wants to end; it is asked after every view.
+
+    Raises:
+      ValueError: if there is something else in a scene's place, if another command works in the
+        folder, or if Blender fails.
+    """
+    for scene in chosen:
+        scene_setup.check(out / scene.name, scene, settings)
+    out.mkdir(parents=True, exist_ok=True)
+    with _alone_in(out) as scratch:
+        for scene in chosen:
+            frame_files.remove_unfinished(out / scene.name)
+        wanted = views.all_views(chosen, settings)
+        missing = [view for view in wanted if not views.is_done(out, view, settings)]
+        if not missing:
+            print(f"Nothing to do: all {len(wanted)} views are there.")
+            return True
+        cores = _cores()
+        count = min(workers or cores, len(missing))
+        pool = Pool(
+            views.tasks(out, missing, settings, objects=objects, scratch=scratch),
+            blender=blender,
+            scratch=scratch,
+            workers=count,
+            threads=max(1, cores // count),
+        )
+        done = _render(pool, len(wanted) - len(missing), len(wanted), stopped)
+        return done == len(missing)
+
+
+def _render(pool: Pool, there: int, total: int, stopped: Callable[[], bool]) -> int:
+    """Renders, and returns how many views were."""
+    started, done = time.monotonic(), 0
+    with commands.ProgressBar("render", total, there) as bar, pool:
+        for done, task in enumerate(pool.run(), start=1):
+            pace = (time.monotonic() - started) / done
+            bar.show(there + done, f"{task.name}  {pace:.1f} s a view")
+            if stopped():
+                pool.stop()
+    return done
+
+
+@contextlib.contextmanager
+def _alone_in(out: Path) -> Iterator[Path]:
+    """Gives an empty folder for files that come and go to the only command that works in `out`.
+
+    It stays behind where an error ends the command, for the logs in it.
+    """
+    lock = os.open(out, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ValueError(
+                f"Another command makes scenes in {out}. Wait for it, or give another --out."
+            ) from error
+        scratch = out / _SCRATCH
+        shutil.rmtree(scratch, ignore_errors=True)
+        scratch.mkdir(exist_ok=True)
+        # A process of a killed command may still be about to write: the name is new every time.
+        yield Path(tempfile.mkdtemp(dir=scratch)).absolute()
+        shutil.rmtree(scratch, ignore_errors=True)
+    finally:
+        os.close(lock)
+
+
+def _cores() -> int:
+    """Returns how many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
