@@ -25,7 +25,7 @@ from experiments.dataset import (
     scenes,
 )
 from experiments.dataset.render_settings import PerSplit, RenderSettings
-from experiments.dataset.scenes import Scene
+from refref_jax.data.scene_names import BACKGROUNDS, SceneName
 
 _OUT = flags.DEFINE_string("out", None, "Folder that gets a folder for each scene.", required=True)
 _SCENES = flags.DEFINE_string(
@@ -93,7 +93,7 @@ def main() -> None:
         sys.exit(commands.INTERRUPTED)
     if _PREVIEW.value:
         _write_contact_sheets(out, chosen, settings)
-    print(f"Scenes: {out / chosen[0].name}" + f" and {len(chosen) - 1} more" * (len(chosen) > 1))
+    print(f"Scenes: {out / str(chosen[0])}" + f" and {len(chosen) - 1} more" * (len(chosen) > 1))
     print(f"Next: python -m experiments.dataset.check {out}")
 
 
@@ -113,12 +113,12 @@ def _settings() -> RenderSettings:
     )
 
 
-def _write_contact_sheets(out: Path, chosen: Sequence[Scene], settings: RenderSettings) -> None:
+def _write_contact_sheets(out: Path, chosen: Sequence[SceneName], settings: RenderSettings) -> None:
     """Writes a sheet for each kind of background."""
     (number,) = settings.numbers("test")
     image = frame_files.relative("test", number).image
-    for kind in scenes.KINDS:
-        pictures = [(s.object, out / s.name / image) for s in chosen if s.kind == kind]
+    for kind in BACKGROUNDS:
+        pictures = [(s.object, out / str(s) / image) for s in chosen if s.background == kind]
         if pictures:
             path = out / f"contact_sheet_{kind}.png"
             contact_sheet.write(path, pictures, tile=_TILE)

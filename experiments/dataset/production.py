@@ -13,15 +13,15 @@ from experiments import commands
 from experiments.dataset import frame_files, scene_setup, views
 from experiments.dataset.parts import Object
 from experiments.dataset.render_settings import RenderSettings
-from experiments.dataset.scenes import Scene
 from experiments.dataset.workers import Pool
+from refref_jax.data.scene_names import SceneName
 
 _SCRATCH = ".scratch"
 
 
 def produce(
     out: Path,
-    chosen: Sequence[Scene],
+    chosen: Sequence[SceneName],
     settings: RenderSettings,
     *,
     objects: Mapping[str, Object],
@@ -45,11 +45,11 @@ def produce(
         folder, or if Blender fails.
     """
     for scene in chosen:
-        scene_setup.check(out / scene.name, scene, settings)
+        scene_setup.check(out / str(scene), scene, settings)
     out.mkdir(parents=True, exist_ok=True)
     with _alone_in(out) as scratch:
         for scene in chosen:
-            frame_files.remove_unfinished(out / scene.name)
+            frame_files.remove_unfinished(out / str(scene))
         wanted = views.all_views(chosen, settings)
         missing = [view for view in wanted if not views.is_done(out, view, settings)]
         if not missing:

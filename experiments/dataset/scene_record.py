@@ -12,16 +12,16 @@ import numpy as np
 from experiments.dataset.cameras import CAMERA_RADIUS
 from experiments.dataset.parts import NO_ABSORPTION, Part
 from experiments.dataset.render_settings import RenderSettings, Rule
-from experiments.dataset.scenes import Scene
 from refref_jax.data.containment import find_containment
 from refref_jax.data.meshes import INDEX_OF_REFRACTION, MeshPart
+from refref_jax.data.scene_names import SceneName
 from refref_jax.optics.interface_rules import NO_PARENT
 
 _AIR = "air"
 
 
 def describe(
-    scene: Scene, parts: Sequence[Part], background: dict[str, Any], settings: RenderSettings
+    scene: SceneName, parts: Sequence[Part], background: dict[str, Any], settings: RenderSettings
 ) -> dict[str, Any]:
     """Returns the content of `scene.json`.
 
@@ -46,17 +46,17 @@ def describe(
     }
 
 
-def identify(scene: Scene, settings: RenderSettings) -> dict[str, Any]:
+def identify(scene: SceneName, settings: RenderSettings) -> dict[str, Any]:
     """Returns what of `scene.json` is known before anything is made."""
-    return {"scene": scene.name, "category": scene.category, **settings.record()}
+    return {"scene": str(scene), "category": scene.category, **settings.record()}
 
 
-def mesh_name(scene: Scene, part: Part) -> str:
+def mesh_name(scene: SceneName, part: Part) -> str:
     """Returns the file name of a part's mesh."""
     return f"{scene.object}_{part.name}_{part.material}.ply"
 
 
-def _describe_part(scene: Scene, part: Part, outside: str) -> dict[str, Any]:
+def _describe_part(scene: SceneName, part: Part, outside: str) -> dict[str, Any]:
     description = {
         "mesh": f"meshes/{mesh_name(scene, part)}",
         "inside": part.material,
@@ -73,7 +73,7 @@ def _describe_part(scene: Scene, part: Part, outside: str) -> dict[str, Any]:
     return description
 
 
-def _materials_outside(scene: Scene, parts: Sequence[Part], rule: Rule) -> list[str]:
+def _materials_outside(scene: SceneName, parts: Sequence[Part], rule: Rule) -> list[str]:
     tree = find_containment([_mesh_part(part) for part in parts])
     if tree.overlaps:
         first, second = (parts[number].name for number in tree.overlaps[0])

@@ -18,15 +18,15 @@ import trimesh
 from experiments.dataset import backgrounds, cameras, frame_files, scene_record
 from experiments.dataset.parts import Part
 from experiments.dataset.render_settings import RenderSettings
-from experiments.dataset.scenes import Scene
 from experiments.dataset.seeds import seed_of
+from refref_jax.data.scene_names import SceneName
 
 _RECORD = "scene.json"
 
 
 def make(
     folder: Path,
-    scene: Scene,
+    scene: SceneName,
     settings: RenderSettings,
     *,
     parts: Callable[[], Sequence[Part]],
@@ -43,12 +43,12 @@ def make(
     """
     if folder.exists():
         return
-    draft = scratch / scene.name
+    draft = scratch / str(scene)
     (draft / "meshes").mkdir(parents=True)
     made = parts()
     write_meshes(draft, scene, made)
-    seed = seed_of(scene.name, "background")
-    background = backgrounds.write_background(draft, scene.kind, seed=seed, size=None)
+    seed = seed_of(str(scene), "background")
+    background = backgrounds.write_background(draft, scene.background, seed=seed, size=None)
     for split in cameras.SPLITS:
         if settings.numbers(split):
             _write_json(draft / f"transforms_{split}.json", _transforms(scene, settings, split))
@@ -57,7 +57,7 @@ def make(
     draft.rename(folder)
 
 
-def write_meshes(folder: Path, scene: Scene, parts: Sequence[Part]) -> None:
+def write_meshes(folder: Path, scene: SceneName, parts: Sequence[Part]) -> None:
     """Writes the parts of a scene into its folder, which has one for meshes."""
     for part in parts:
         mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
@@ -65,7 +65,7 @@ def write_meshes(folder: Path, scene: Scene, parts: Sequence[Part]) -> None:
         (folder / "meshes" / scene_record.mesh_name(scene, part)).write_bytes(content)
 
 
-def check(folder: Path, scene: Scene, settings: RenderSettings) -> None:
+def check(folder: Path, scene: SceneName, settings: RenderSettings) -> None:
     """Checks that a folder, if it is there, is that of a scene with these settings.
 
     Raises:
@@ -99,8 +99,8 @@ def _difference(found: Any, wanted: Any, name: str) -> str:
     return "" if found == wanted else f"the{name} is {found}, not {wanted}"
 
 
-def _transforms(scene: Scene, settings: RenderSettings, split: cameras.Split) -> dict[str, Any]:
-    poses = cameras.split_poses(scene.name, split, getattr(settings.views, split))
+def _transforms(scene: SceneName, settings: RenderSettings, split: cameras.Split) -> dict[str, Any]:
+    poses = cameras.split_poses(str(scene), split, getattr(settings.views, split))
     frames = []
     for number in settings.numbers(split):
         named = frame_files.relative(split, number)

@@ -9,9 +9,9 @@ from experiments.dataset import cameras, frame_files, scene_setup
 from experiments.dataset.cameras import Split
 from experiments.dataset.parts import Object, Part
 from experiments.dataset.render_settings import RenderSettings
-from experiments.dataset.scenes import Scene
 from experiments.dataset.seeds import seed_of
 from experiments.dataset.workers import Job, Task
+from refref_jax.data.scene_names import SceneName
 
 # What Blender takes.
 _SEEDS = 1 << 31
@@ -28,17 +28,17 @@ class View(NamedTuple):
       number: in the split.
     """
 
-    scene: Scene
+    scene: SceneName
     split: Split
     number: int
 
     @property
     def name(self) -> str:
         """For people."""
-        return f"{self.scene.name} {self.split} {self.number}"
+        return f"{self.scene} {self.split} {self.number}"
 
 
-def all_views(chosen: Sequence[Scene], settings: RenderSettings) -> list[View]:
+def all_views(chosen: Sequence[SceneName], settings: RenderSettings) -> list[View]:
     """Returns all views of some scenes."""
     return [
         View(scene, split, number)
@@ -51,12 +51,12 @@ def all_views(chosen: Sequence[Scene], settings: RenderSettings) -> list[View]:
 def is_done(out: Path, view: View, settings: RenderSettings) -> bool:
     """Returns whether a view is rendered."""
     linear = settings.keeps_linear(view.split)
-    return frame_files.is_done(out / view.scene.name, view.split, view.number, linear=linear)
+    return frame_files.is_done(out / str(view.scene), view.split, view.number, linear=linear)
 
 
 def seed(view: View) -> int:
     """Returns the seed that Blender renders a view with."""
-    return seed_of(view.scene.name, view.split, f"r_{view.number:03d}") % _SEEDS
+    return seed_of(str(view.scene), view.split, f"r_{view.number:03d}") % _SEEDS
 
 
 def tasks(
@@ -83,10 +83,10 @@ def tasks(
         return objects[name].make(_DETAIL)
 
     for view in views:
-        scene, folder = view.scene, out / view.scene.name
+        scene, folder = view.scene, out / str(view.scene)
         parts = partial(make, scene.object)
         scene_setup.make(folder, scene, settings, parts=parts, scratch=scratch)
-        poses = cameras.split_poses(scene.name, view.split, getattr(settings.views, view.split))
+        poses = cameras.split_poses(str(scene), view.split, getattr(settings.views, view.split))
         job = Job(
             scene=str(folder.absolute()),
             pose=poses[view.number].tolist(),

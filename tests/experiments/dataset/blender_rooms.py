@@ -7,9 +7,9 @@ import numpy as np
 from experiments.dataset import cameras, frame_files, scene_record, scene_setup, workers
 from experiments.dataset.frame_files import Rendering
 from experiments.dataset.render_settings import PerSplit, RenderSettings
-from experiments.dataset.scenes import Scene
 from refref_jax.data import files
 from refref_jax.data.cameras import Cameras, focal_length
+from refref_jax.data.scene_names import SceneName
 from tests.experiments.dataset import small_dataset
 
 SIZE = 48
@@ -39,7 +39,7 @@ def write_room(folder, kind, parts=(), *, white=False, rule="nested"):
     if kind == "sphere":
         files.write_rgb(folder / background["image"], np.ones_like(image) if white else image)
     settings = RenderSettings(SIZE, PerSplit(1, 1, 1), PerSplit(1, 1, 1), rule=rule)
-    scene = Scene(kind, "smcvx", "known")
+    scene = SceneName(kind, "smcvx", "known")
     scene_setup.write_meshes(folder, scene, parts)
     record = scene_record.describe(scene, parts, background, settings)
     (folder / "scene.json").write_text(json.dumps(record))

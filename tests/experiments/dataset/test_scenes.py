@@ -3,7 +3,6 @@ import pytest
 from experiments.dataset import catalogue, objects, scenes
 from experiments.dataset.parts import Object
 from experiments.dataset.render_settings import PerSplit, RenderSettings
-from experiments.dataset.scenes import Scene
 
 _OBJECTS = {
     name: Object(name, category, lambda detail: [])
@@ -12,17 +11,19 @@ _OBJECTS = {
         ("ball_coloured", "smcvx"),
         ("torus", "smncvx"),
         ("vial", "mmncvx"),
+        ("cube_coloured", "smcvx"),
     ]
 }
 
 
 def _names(text):
-    return [scene.name for scene in scenes.choose(text, _OBJECTS)]
+    return [str(scene) for scene in scenes.choose(text, _OBJECTS)]
 
 
-def test_names_hold_background_category_and_object():
-    assert Scene("sphere", "smcvx", "ball_coloured").name == "sphere_smcvx_ball_coloured"
-    assert len(_names("all")) == 3 * len(_OBJECTS)
+def test_every_object_stands_before_every_background():
+    names = _names("all")
+    assert len(set(names)) == 3 * len(_OBJECTS)
+    assert names[:3] == ["cube_smcvx_ball", "sphere_smcvx_ball", "env_smcvx_ball"]
 
 
 @pytest.mark.parametrize(
@@ -31,6 +32,8 @@ def test_names_hold_background_category_and_object():
         ("env_mmncvx_vial", ["env_mmncvx_vial"]),
         ("torus", ["cube_smncvx_torus", "sphere_smncvx_torus", "env_smncvx_torus"]),
         ("env_*_ball*", ["env_smcvx_ball", "env_smcvx_ball_coloured"]),
+        ("cube_*x_c*", ["cube_smcvx_cube_coloured"]),
+        ("cube_co*", [f"{kind}_smcvx_cube_coloured" for kind in ("cube", "sphere", "env")]),
         ("cube_smncvx_*, cube_smcvx_ball", ["cube_smcvx_ball", "cube_smncvx_torus"]),
         ("cube_smcvx_ball,cube_*_ball", ["cube_smcvx_ball"]),
     ],
