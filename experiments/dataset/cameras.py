@@ -68,7 +68,7 @@ def helix_poses(count: int) -> Float[np.ndarray, "count 4 4"]:
 
 
 def _look_at_origin(
-    azimuth: Float[np.ndarray, "count"], elevation: Float[np.ndarray, "count"]
+    azimuth: Float[np.ndarray, " count"], elevation: Float[np.ndarray, " count"]
 ) -> Float[np.ndarray, "count 4 4"]:
     """Returns the poses; at a pole the azimuth alone decides what is right."""
     cos_a, sin_a, zero = np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)

@@ -25,9 +25,7 @@ class Cells(NamedTuple):
     dy: Field
 
 
-def voronoi(
-    x: Field, y: Field, shape: tuple[int, int], seed: int, *, jitter: float = 0.9
-) -> Cells:
+def voronoi(x: Field, y: Field, shape: tuple[int, int], seed: int, *, jitter: float = 0.9) -> Cells:
     """Returns the cells of one seed in each node of a lattice.
 
     Args:
@@ -63,8 +61,11 @@ def _nearest_two(x: Field, y: Field, offsets: Float[np.ndarray, "ny nx 2"]) -> C
             distance = dx * dx + dy * dy
             nearest = distance < first
             nearer = ~nearest & (distance < second)
-            for old, leader, new in ((second, first, distance), (second_x, first_x, dx),
-                                     (second_y, first_y, dy)):
+            for old, leader, new in (
+                (second, first, distance),
+                (second_x, first_x, dx),
+                (second_y, first_y, dy),
+            ):
                 np.copyto(old, leader, where=nearest)
                 np.copyto(old, new, where=nearer)
                 np.copyto(leader, new, where=nearest)

@@ -6,14 +6,14 @@ from jaxtyping import Float, Int
 from experiments.dataset.textures.fields import (
     Field,
     Picture,
+    blend,
     coordinates,
     fbm,
-    blend,
     noise,
     random_of,
     smooth,
 )
-from experiments.dataset.textures.shading import chosen, colour, colours, hollows, lit
+from experiments.dataset.textures.shading import chosen, colour, colours, lit
 
 
 def jacquard(n: int) -> Picture:
@@ -32,8 +32,9 @@ def jacquard(n: int) -> Picture:
     # Where the pattern lifts the warp it floats over three of four wefts.
     over = np.where(lifted, (i + 2 * j) % 4 != 0, (i + 2 * j) % 4 == 0) ^ (plain & ((a + b) == 14))
     warp = chosen(random_of(i // 7, 11), "#f1e3c6", "#e9c46a", "#f4a261", "#f7ead2", "#dfa08a")
-    weft = chosen(random_of(j // 4, 12), "#264653", "#9b2335", "#1d3557", "#2a7f78", "#6d2e46",
-                  "#33415c")
+    weft = chosen(
+        random_of(j // 4, 12), "#264653", "#9b2335", "#1d3557", "#2a7f78", "#6d2e46", "#33415c"
+    )
     yarn = blend(weft, warp, over)
     yarn = yarn * (0.8 + 0.35 * random_of(np.where(over, i, j + 997), 13))[..., None]
     along, across = np.where(over, v, u), np.where(over, u, v)
@@ -93,10 +94,12 @@ def _stripes(thread: Int[np.ndarray, "h w"], kind: Int[np.ndarray, "h w"]) -> np
     """Returns the yarn of each thread: a sett of 60, mirrored, other widths for other clans."""
     widths = np.random.default_rng(3).integers(3, 14, (len(_SETTS), 9))
     order = np.array([0, 2, 1, 3, 1, 2, 0, 4, 0])
-    setts = np.stack([
-        np.resize(np.repeat(order, each)[: 60 if each.sum() >= 60 else None], 60)
-        for each in widths
-    ])
+    setts = np.stack(
+        [
+            np.resize(np.repeat(order, each)[: 60 if each.sum() >= 60 else None], 60)
+            for each in widths
+        ]
+    )
     position = thread % 120
     position = np.where(position < 60, position, 119 - position)
     return kind * 5 + setts[kind, position]
@@ -112,8 +115,17 @@ def carpet(n: int) -> Picture:
     i = np.floor((x + wave) * _KNOTS).astype(np.int32).clip(0, _KNOTS - 1)
     j = np.floor((y - wave) * _KNOTS).astype(np.int32).clip(0, _KNOTS - 1)
     dye = _woven()[j, i]
-    wool = colours("#7a1420", "#12203f", "#e9d8b4", "#c58a2b", "#2f5e58", "#a8402c", "#0d1120",
-                   "#d9a9a0", "#5a7fa0")[dye]
+    wool = colours(
+        "#7a1420",
+        "#12203f",
+        "#e9d8b4",
+        "#c58a2b",
+        "#2f5e58",
+        "#a8402c",
+        "#0d1120",
+        "#d9a9a0",
+        "#5a7fa0",
+    )[dye]
     knot = j * _KNOTS + i
     abrash = noise(n, (2, 26), 7)  # the bands of one vat of dye and the next
     fuzz = fbm(n, 130, 5, octaves=3, gain=0.9)
@@ -139,8 +151,18 @@ def _woven() -> Int[np.ndarray, "knots knots"]:
     dye = np.where(petals > 0, np.array([0, 2, 3, 8, 1])[petals], dye)
     # The medallion: lobed rings.
     lobes = 0.46 + 0.045 * np.cos(16.0 * turn) + 0.04 * np.cos(8.0 * turn) ** 3
-    for share, tone in ((1.0, 6), (0.965, 3), (0.92, 1), (0.70, 2), (0.66, 5), (0.44, 6),
-                        (0.41, 4), (0.24, 3), (0.18, 0), (0.09, 2)):
+    for share, tone in (
+        (1.0, 6),
+        (0.965, 3),
+        (0.92, 1),
+        (0.70, 2),
+        (0.66, 5),
+        (0.44, 6),
+        (0.41, 4),
+        (0.24, 3),
+        (0.18, 0),
+        (0.09, 2),
+    ):
         dye = np.where(radius < share * lobes, tone, dye)
     ring = (radius > 0.70 * lobes) & (radius < 0.92 * lobes)
     dye = np.where(ring & (np.cos(16.0 * turn) * np.cos(60.0 * radius) > 0.3), 7, dye)
@@ -157,8 +179,15 @@ def _borders(
     dye: Int[np.ndarray, "k k"], out: Float[np.ndarray, "k k"], along: Float[np.ndarray, "k k"]
 ) -> Int[np.ndarray, "k k"]:
     """Returns the carpet with its stripes: guards, the main border with palmettes, a fringe."""
-    for low, tone in ((0.775, 6), (0.785, 2), (0.815, 6), (0.825, 1), (0.935, 6), (0.945, 3),
-                      (0.975, 0)):
+    for low, tone in (
+        (0.775, 6),
+        (0.785, 2),
+        (0.815, 6),
+        (0.825, 1),
+        (0.935, 6),
+        (0.945, 3),
+        (0.975, 0),
+    ):
         dye = np.where(out > low, tone, dye)
     guard = ((out > 0.785) & (out < 0.815)) | ((out > 0.945) & (out < 0.975))
     dye = np.where(guard & ((along * 30.0 + out * 33.0) % 1.0 < 0.45), 5, dye)

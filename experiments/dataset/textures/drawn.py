@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool
 from PIL import Image, ImageDraw
 
 from experiments.dataset.textures.fields import (
@@ -15,8 +15,8 @@ from experiments.dataset.textures.fields import (
     noise,
     smooth,
 )
-from experiments.dataset.textures.printed import Box, write
-from experiments.dataset.textures.shading import colour, colours, graded, hollows, lit
+from experiments.dataset.textures.shading import colour, graded, hollows, lit
+from experiments.dataset.textures.writing import Box, write
 
 
 def contours(n: int) -> Picture:
@@ -25,31 +25,35 @@ def contours(n: int) -> Picture:
     ground = fbm(n, 3, 13, octaves=8, gain=0.5)
     ground = ground + 0.35 * np.abs(fbm(n, 5, 23, octaves=6, gain=0.5))
     sea = -0.25
-    tint = graded(ground, (-2.2, "#0d3b66"), (-0.9, "#2a75a9"), (sea - 0.001, "#9fd3e6"),
-                  (sea, "#7fae5c"), (0.3, "#c9d48a"), (0.8, "#efd9a0"), (1.3, "#d69a5e"),
-                  (1.8, "#a05a3c"), (2.3, "#f7f3ec"))
+    tint = graded(
+        ground,
+        (-2.2, "#0d3b66"),
+        (-0.9, "#2a75a9"),
+        (sea - 0.001, "#9fd3e6"),
+        (sea, "#7fae5c"),
+        (0.3, "#c9d48a"),
+        (0.8, "#efd9a0"),
+        (1.3, "#d69a5e"),
+        (1.8, "#a05a3c"),
+        (2.3, "#f7f3ec"),
+    )
     slope_y, slope_x = np.gradient(ground * 1.0, 1.0 / n)
     steep = np.hypot(slope_x, slope_y)
     relief = np.where(ground > sea, ground, sea - 0.15 * (sea - ground))
     sheet = lit(tint, 0.013 * relief.astype(np.float32))
     woods = noise(n, 90, 3) + 1.1 * fbm(n, 7, 43, octaves=4) - 1.4 * np.abs(ground - 0.35)
     sheet = blend(sheet, colour("#2f6b3a"), 0.75 * smooth(0.55, 0.75, woods) * (ground > sea))
-    for step, width, tone, strength in ((0.08, 0.0007, "#6b3f22", 0.65),
-                                        (0.4, 0.0016, "#4a2614", 0.9)):
+    for step, width, tone, strength in (
+        (0.08, 0.0007, "#6b3f22", 0.65),
+        (0.4, 0.0016, "#4a2614", 0.9),
+    ):
         away = np.abs((ground - sea) / step - np.round((ground - sea) / step)) * step
         line = smooth(1.3, 0.5, away / np.maximum(steep, 1.5) / width)
         ink = np.where((ground > sea)[..., None], colour(tone), colour("#0e4f7d"))
         sheet = blend(sheet, ink, strength * line)
     shore = np.abs(ground - sea) / np.maximum(steep, 1.0)
     sheet = blend(sheet, colour("#0b2f4a"), smooth(0.0026, 0.0012, shore))
-    for seed, width, tone in ((61, 0.0030, "#b3261e"), (71, 0.0022, "#f2b632"), (81, 0.0018,
-                                                                              "#222222")):
-        field = fbm(n, 4, seed, octaves=4, gain=0.4) + 0.25 * ground
-        across = np.gradient(field, 1.0 / n)
-        road = np.abs(field) / np.maximum(np.hypot(*across), 1.0)
-        casing = smooth(1.7, 1.3, road / width) * (ground > sea)
-        sheet = blend(sheet, colour("#2b1a12"), casing)
-        sheet = blend(sheet, colour(tone), smooth(1.0, 0.7, road / width) * (ground > sea))
+    sheet = _roads(sheet, ground, ground > sea)
     lines = np.minimum(np.abs(x * 8.0 - np.round(x * 8.0)), np.abs(y * 8.0 - np.round(y * 8.0)))
     sheet = blend(sheet, colour("#17324d"), 0.5 * smooth(0.012, 0.006, lines))
     names = _names(n)
@@ -57,6 +61,23 @@ def contours(n: int) -> Picture:
     creases = np.minimum(np.abs(x * 4.0 - np.round(x * 4.0)), np.abs(y * 3.0 - np.round(y * 3.0)))
     paper = 0.97 + 0.035 * fbm(n, 150, 5, octaves=2, gain=0.9) - 0.12 * smooth(0.02, 0.0, creases)
     return sheet * paper[..., None]
+
+
+def _roads(sheet: Picture, ground: Field, land: Bool[np.ndarray, "n n"]) -> Picture:
+    """Returns a map with three kinds of roads, which go about mountains."""
+    n = ground.shape[0]
+    for seed, width, tone in (
+        (61, 0.0030, "#b3261e"),
+        (71, 0.0022, "#f2b632"),
+        (81, 0.0018, "#222222"),
+    ):
+        field = fbm(n, 4, seed, octaves=4, gain=0.4) + 0.25 * ground
+        across = np.gradient(field, 1.0 / n)
+        road = np.abs(field) / np.maximum(np.hypot(*across), 1.0)
+        casing = smooth(1.7, 1.3, road / width) * land
+        sheet = blend(sheet, colour("#2b1a12"), casing)
+        sheet = blend(sheet, colour(tone), smooth(1.0, 0.7, road / width) * land)
+    return sheet
 
 
 def _names(n: int) -> Field:
@@ -85,10 +106,12 @@ def circuit(n: int) -> Picture:
         _bus(traces, rng, pitch)
     for _ in range(420):
         x, y = (np.round(rng.random(2) * 128) * pitch).tolist()
-        traces.ellipse((x - 0.62 * pitch, y - 0.62 * pitch, x + 0.62 * pitch, y + 0.62 * pitch),
-                       fill=255)
-        traces.ellipse((x - 0.28 * pitch, y - 0.28 * pitch, x + 0.28 * pitch, y + 0.28 * pitch),
-                       fill=20)
+        traces.ellipse(
+            (x - 0.62 * pitch, y - 0.62 * pitch, x + 0.62 * pitch, y + 0.62 * pitch), fill=255
+        )
+        traces.ellipse(
+            (x - 0.28 * pitch, y - 0.28 * pitch, x + 0.28 * pitch, y + 0.28 * pitch), fill=20
+        )
     for _ in range(150):
         _component(draw, rise, rng, pitch)
     taken: list[Box] = []
@@ -97,8 +120,14 @@ def circuit(n: int) -> Picture:
     metal, body = np.asarray(copper, np.float32) / 255.0, np.asarray(parts, np.float32) / 255.0
     high = np.asarray(raised, np.float32) / 255.0
     grain, weave = fbm(n, 90, 3, octaves=4, gain=0.8), fbm(n, 5, 13, octaves=5)
-    lacquer = graded(metal + 0.05 * weave, (0.0, "#07331f"), (0.4, "#0d5a35"), (0.8, "#2e9a5a"),
-                     (0.95, "#e3bd58"), (1.0, "#ffe9a3"))
+    lacquer = graded(
+        metal + 0.05 * weave,
+        (0.0, "#07331f"),
+        (0.4, "#0d5a35"),
+        (0.8, "#2e9a5a"),
+        (0.95, "#e3bd58"),
+        (1.0, "#ffe9a3"),
+    )
     x, y = coordinates(n)
     cloth = np.sin(x * 1300.0) * np.sin(y * 1300.0)
     lacquer = lacquer * (1.0 + 0.05 * grain + 0.04 * cloth)[..., None]
@@ -131,8 +160,9 @@ def _bus(draw: ImageDraw.ImageDraw, rng: np.random.Generator, pitch: float) -> N
             draw.ellipse((x - r, y - r, x + r, y + r), fill=255)
 
 
-def _component(draw: ImageDraw.ImageDraw, rise: ImageDraw.ImageDraw, rng: np.random.Generator,
-               pitch: float) -> None:
+def _component(
+    draw: ImageDraw.ImageDraw, rise: ImageDraw.ImageDraw, rng: np.random.Generator, pitch: float
+) -> None:
     """Draws a resistor, a capacitor or a can, with its pads."""
     x, y = (np.round(rng.random(2) * 128) * pitch).tolist()
     kind, lies = rng.integers(4), rng.random() < 0.5
@@ -150,106 +180,58 @@ def _component(draw: ImageDraw.ImageDraw, rise: ImageDraw.ImageDraw, rng: np.ran
     tone = ((30, 30, 34), (150, 105, 60), (190, 160, 110))[kind]
     draw.rectangle((x - ca, y - cb, x + ca, y + cb), fill=tone)
     rise.rectangle((x - a, y - b, x + a, y + b), fill=90)
-    write(draw, (x - a, y + b + 0.4 * pitch, x + 3.5 * pitch, y + b + 1.5 * pitch), rng,
-          (235, 238, 230), weight=0.16)
+    write(
+        draw,
+        (x - a, y + b + 0.4 * pitch, x + 3.5 * pitch, y + b + 1.5 * pitch),
+        rng,
+        (235, 238, 230),
+        weight=0.16,
+    )
 
 
-def _chip(draw: ImageDraw.ImageDraw, rise: ImageDraw.ImageDraw, rng: np.random.Generator,
-          pitch: float, taken: list[Box]) -> None:
+def _chip(
+    draw: ImageDraw.ImageDraw,
+    rise: ImageDraw.ImageDraw,
+    rng: np.random.Generator,
+    pitch: float,
+    taken: list[Box],
+) -> None:
     """Draws a chip with legs, a dot and three lines of lettering, if its place is not taken."""
     x, y = (np.round(rng.random(2) * 128) * pitch).tolist()
     wide, high = (rng.integers(5, 17, 2) * pitch).tolist()
     room = 2.5 * pitch
-    if any(x - room < right and left < x + wide + room and y - room < bottom and top < y + high + room
-           for left, top, right, bottom in taken):
+    if any(
+        x - room < right and left < x + wide + room and y - room < bottom and top < y + high + room
+        for left, top, right, bottom in taken
+    ):
         return
     taken.append((x, y, x + wide, y + high))
     legs = np.arange(0.6, 200.0)
-    for reach_x, reach_y in ((1.3 * pitch, 0.0), (0.0, 1.3 * pitch) if rng.random() < 0.6 else
-                             (1.3 * pitch, 0.0)):
+    for reach_x, reach_y in (
+        (1.3 * pitch, 0.0),
+        (0.0, 1.3 * pitch) if rng.random() < 0.6 else (1.3 * pitch, 0.0),
+    ):
         length = high if reach_x else wide
         for leg in legs[legs * pitch < length] * pitch:
             half = 0.27 * pitch
-            box = ((x - reach_x, y + leg - half, x + wide + reach_x, y + leg + half) if reach_x
-                   else (x + leg - half, y - reach_y, x + leg + half, y + high + reach_y))
+            box = (
+                (x - reach_x, y + leg - half, x + wide + reach_x, y + leg + half)
+                if reach_x
+                else (x + leg - half, y - reach_y, x + leg + half, y + high + reach_y)
+            )
             draw.rectangle(box, fill=(222, 220, 208))
             rise.rectangle(box, fill=60)
     draw.rectangle((x, y, x + wide, y + high), fill=(34, 35, 40))
     rise.rectangle((x, y, x + wide, y + high), fill=190)
-    draw.ellipse((x + pitch * 0.6, y + pitch * 0.6, x + pitch * 1.5, y + pitch * 1.5),
-                 fill=(90, 92, 98))
+    draw.ellipse(
+        (x + pitch * 0.6, y + pitch * 0.6, x + pitch * 1.5, y + pitch * 1.5), fill=(90, 92, 98)
+    )
     for line in range(3):
         top = y + (0.3 + 0.22 * line) * high
-        write(draw, (x + 0.15 * wide, top, x + 0.9 * wide, top + min(0.13 * high, 1.6 * pitch)),
-              rng, (206, 208, 204), weight=0.15)
-
-
-def painting(n: int) -> Picture:
-    """A starry night over hills in oil: the strokes follow the whirls of the sky."""
-    rng = np.random.default_rng(17)
-    image = Image.new("RGB", (n, n), (18, 26, 60))
-    draw = ImageDraw.Draw(image)
-    grid = 384
-    scene, flow = _night(grid)
-    for count, length, width, spread in ((2600, 0.075, 0.016, 0.05), (9000, 0.045, 0.008, 0.08),
-                                         (26000, 0.028, 0.0042, 0.12)):
-        starts = rng.random((count, 2))
-        tints = rng.normal(0.0, spread, (count, 1)) + rng.normal(0.0, 0.5 * spread, (count, 3))
-        for (x, y), tint in zip(starts, tints, strict=True):
-            path = _follow(flow, x, y, length)
-            i, j = int(y * grid), int(x * grid)
-            tone = tuple(int(each) for each in np.clip((scene[i, j] + tint) * 255.0, 0, 255))
-            draw.line((path * n).ravel().tolist(), fill=tone, width=max(int(width * n), 1),
-                      joint="curve")
-    canvas = np.asarray(image, np.float32) / 255.0
-    grey = canvas @ np.array([0.3, 0.5, 0.2], np.float32)
-    weave, grain = fbm(n, 170, 4, octaves=2, gain=0.9), fbm(n, 12, 14, octaves=5)
-    height = 0.0045 * grey + 0.0002 * weave
-    canvas = canvas * (1.0 + 0.03 * weave + 0.02 * grain)[..., None]
-    return lit(canvas, height.astype(np.float32), gloss=0.08, shininess=20.0)
-
-
-def _night(grid: int) -> tuple[Picture, Float[np.ndarray, "grid grid 2"]]:
-    """Returns what is painted, and the unit direction of strokes."""
-    x, y = coordinates(grid)
-    potential = 0.05 * fbm(grid, 3, 2, octaves=3)
-    glow = np.zeros_like(x)
-    stars = ((0.18, 0.16, 0.075), (0.42, 0.10, 0.045), (0.80, 0.17, 0.11), (0.60, 0.30, 0.05),
-             (0.30, 0.38, 0.055), (0.08, 0.45, 0.04), (0.93, 0.44, 0.05), (0.52, 0.48, 0.035))
-    rings = np.zeros_like(x)
-    for a, b, size in stars:
-        away = np.hypot(x - a, y - b)
-        potential += 0.16 * size / 0.07 * np.exp(-away / (1.4 * size))
-        glow += np.exp(-(away / (0.42 * size)) ** 2)
-        rings += np.exp(-away / size) * (0.5 + 0.5 * np.cos(away / size * 9.0))
-    swirl = np.sin(26.0 * potential + 9.0 * y)
-    sky = graded(swirl, (-1.0, "#0c1445"), (-0.2, "#1f4aa0"), (0.4, "#3f87c9"), (1.0, "#a9d6e5"))
-    sky = blend(sky, colour("#f2c230"), np.clip(1.1 * rings, 0.0, 0.9))
-    sky = blend(sky, colour("#fff6c8"), np.clip(glow, 0.0, 1.0))
-    ridge = 0.62 + 0.05 * np.sin(7.0 * x + 0.6) + 0.03 * np.sin(17.0 * x) + 0.02 * noise(grid, 6, 8)
-    folds = np.sin(60.0 * (y - ridge) + 9.0 * np.sin(6.0 * x) + 4.0 * noise(grid, 5, 9))
-    hills = graded(folds, (-1.0, "#0b2b2e"), (-0.2, "#1f5a4a"), (0.5, "#5d8a3a"), (1.0, "#d6b84a"))
-    scene = np.where((y > ridge)[..., None], hills, sky)
-    town = (noise(grid, 48, 10) > 1.5) & (y > ridge + 0.05) & (y < ridge + 0.2)
-    scene = np.where(town[..., None], colours("#ffd166")[0], scene)
-    cypress = np.abs(x - 0.13 - 0.02 * np.sin(24.0 * y)) < 0.055 * np.sqrt(
-        np.clip((y - 0.28) / 0.7, 0.0, 1.0))
-    dark = graded(np.sin(90.0 * x + 14.0 * np.sin(13.0 * y)), (-1.0, "#0a1512"), (1.0, "#3b5a2a"))
-    scene = np.where(cypress[..., None], dark, scene)
-    hill_potential = 0.03 * folds + (y - ridge)
-    slope_y, slope_x = np.gradient(np.where(y > ridge, hill_potential, potential + 0.12 * y))
-    along = np.stack([slope_y, -slope_x], -1)
-    along = np.where(cypress[..., None], np.array([0.15, -1.0]), along)
-    return scene, along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
-
-
-def _follow(flow: Float[np.ndarray, "grid grid 2"], x: float, y: float, length: float
-            ) -> Float[np.ndarray, "5 2"]:
-    """Returns four steps along the flow."""
-    grid = flow.shape[0]
-    path = [(x, y)]
-    for _ in range(4):
-        along = flow[min(max(int(y * grid), 0), grid - 1), min(max(int(x * grid), 0), grid - 1)]
-        x, y = x + 0.25 * length * along[0], y + 0.25 * length * along[1]
-        path.append((x, y))
-    return np.array(path)
+        write(
+            draw,
+            (x + 0.15 * wide, top, x + 0.9 * wide, top + min(0.13 * high, 1.6 * pitch)),
+            rng,
+            (206, 208, 204),
+            weight=0.15,
+        )

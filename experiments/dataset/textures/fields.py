@@ -59,7 +59,7 @@ def fbm(
 
 
 def lookup(field: Float[np.ndarray, "h w *channels"], u: Field, v: Field) -> np.ndarray:
-    """Returns a periodic field at `x = u`, `y = v`, bilinear; both are given in float32 or 64."""
+    """Returns a periodic field at `x = u`, `y = v`, bilinear; of any shape."""
     height, width = field.shape[:2]
     at = np.stack([v * height - 0.5, u * width - 0.5])
     options = {"order": 1, "mode": "grid-wrap", "prefilter": False}
@@ -70,6 +70,11 @@ def lookup(field: Float[np.ndarray, "h w *channels"], u: Field, v: Field) -> np.
         for each in range(field.shape[2])
     ]
     return np.stack(channels, -1)
+
+
+def reflected(position: np.ndarray) -> np.ndarray:
+    """Returns positions from 0 to 1, folded at both ends: for pictures that do not repeat."""
+    return 1.0 - np.abs(position % 2.0 - 1.0)
 
 
 def smooth(low: float, high: float, values: np.ndarray) -> np.ndarray:

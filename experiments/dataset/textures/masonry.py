@@ -10,10 +10,10 @@ from experiments.dataset.textures.cells import voronoi
 from experiments.dataset.textures.fields import (
     Field,
     Picture,
+    blend,
     coordinates,
     fbm,
     lookup,
-    blend,
     noise,
     random_of,
     smooth,
@@ -82,19 +82,42 @@ def pebbles(n: int) -> Picture:
     grain, bands = fbm(n, 128, 1, octaves=3, gain=0.8), fbm(n, 16, 9, octaves=5)
     sand = graded(grain + bands, (-2.5, "#3c3027"), (0.0, "#8f7a5f"), (2.5, "#d9c8a4"))
     shore = np.ascontiguousarray(sand)
-    kinds = ("#d8d0c0", "#7d3b2b", "#40464a", "#8f9a94", "#b98c5a", "#56624f", "#a5673f", "#23262b",
-             "#c9b7a8", "#5c4a60", "#e8e4da", "#6e7f8c")
-    sizes = np.concatenate([np.full(900, 0.012), np.full(620, 0.02), np.full(240, 0.034),
-                            np.full(55, 0.056)])
+    kinds = (
+        "#d8d0c0",
+        "#7d3b2b",
+        "#40464a",
+        "#8f9a94",
+        "#b98c5a",
+        "#56624f",
+        "#a5673f",
+        "#23262b",
+        "#c9b7a8",
+        "#5c4a60",
+        "#e8e4da",
+        "#6e7f8c",
+    )
+    sizes = np.concatenate(
+        [np.full(900, 0.012), np.full(620, 0.02), np.full(240, 0.034), np.full(55, 0.056)]
+    )
     for size in sizes * rng.uniform(0.8, 1.25, sizes.size):
-        middle, angle = rng.random(2) * 1.1 - 0.05, rng.uniform(0.0, 2.0 * math.pi)
-        _pebble(shore, Place(*middle.tolist(), float(size), angle), rng, colour(kinds[rng.integers(len(kinds))]),
-                (grain, bands))
+        middle, angle = rng.random(2), rng.uniform(0.0, 2.0 * math.pi)
+        _pebble(
+            shore,
+            Place(*middle.tolist(), float(size), angle),
+            rng,
+            colour(kinds[rng.integers(len(kinds))]),
+            (grain, bands),
+        )
     return shore
 
 
-def _pebble(shore: Picture, place: Place, rng: np.random.Generator, base: np.ndarray,
-            fields: tuple[Field, Field]) -> None:
+def _pebble(
+    shore: Picture,
+    place: Place,
+    rng: np.random.Generator,
+    base: np.ndarray,
+    fields: tuple[Field, Field],
+) -> None:
     """Lays one pebble with stripes, speckles or neither; the light comes as in `shading.lit`."""
     grain, bands = fields
     squash, power = rng.uniform(0.55, 0.85), rng.uniform(2.0, 2.7)
@@ -167,8 +190,21 @@ def shingles(n: int) -> Picture:
 def terrazzo(n: int) -> Picture:
     """Chips of marble of all sizes and colours, ground flat in a pale cement."""
     rng = np.random.default_rng(8)
-    kinds = ("#c8553d", "#2d3142", "#e8b04a", "#588b8b", "#f28f3b", "#8d6a9f", "#1f5673", "#93b5c6",
-             "#6b4226", "#f5ead6", "#3c6e47", "#d98f9b", "#111418")
+    kinds = (
+        "#c8553d",
+        "#2d3142",
+        "#e8b04a",
+        "#588b8b",
+        "#f28f3b",
+        "#8d6a9f",
+        "#1f5673",
+        "#93b5c6",
+        "#6b4226",
+        "#f5ead6",
+        "#3c6e47",
+        "#d98f9b",
+        "#111418",
+    )
     grain, clouds = fbm(n, 160, 3, octaves=2, gain=0.9), fbm(n, 6, 13, octaves=6, gain=0.6)
     image = Image.new("I", (n, n), 0)
     draw = ImageDraw.Draw(image)

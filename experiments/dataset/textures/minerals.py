@@ -7,10 +7,10 @@ from experiments.dataset.textures.cells import voronoi
 from experiments.dataset.textures.fields import (
     Field,
     Picture,
+    blend,
     coordinates,
     fbm,
     lookup,
-    blend,
     noise,
     random_of,
     smooth,
@@ -24,8 +24,15 @@ def marble(n: int) -> Picture:
     fold_x, fold_y = fbm(n, 3, 1, octaves=5), fbm(n, 3, 11, octaves=5)
     u, v = x + 0.07 * fold_x, y + 0.07 * fold_y
     body = lookup(fbm(n, 4, 21, octaves=8, gain=0.62), u, v)
-    stone = graded(body, (-2.2, "#06130f"), (-0.8, "#0f2f27"), (0.1, "#23574a"),
-                   (0.9, "#4f8a74"), (1.7, "#a9c9b4"), (2.4, "#e9efe2"))
+    stone = graded(
+        body,
+        (-2.2, "#06130f"),
+        (-0.8, "#0f2f27"),
+        (0.1, "#23574a"),
+        (0.9, "#4f8a74"),
+        (1.7, "#a9c9b4"),
+        (2.4, "#e9efe2"),
+    )
     shards = voronoi(u + 0.02 * fold_y, v, (7, 7), 5)
     breaks = shards.border + 0.006 * fbm(n, 30, 91, octaves=4)
     stone = stone * (0.72 + 0.5 * random_of(shards.index, 2))[..., None]
@@ -33,12 +40,18 @@ def marble(n: int) -> Picture:
     stone = blend(stone, graded(body, (-2.0, "#4a1c28"), (0.0, "#8d4a4c"), (2.0, "#e3b5a4")), rose)
     stone = blend(stone, colour("#eef0e4"), 0.85 * smooth(0.007, 0.002, breaks))
     for turns, width, tone in (
-        ((5, 2), 0.03, "#f4efe3"), ((-4, 7), 0.03, "#d9e4d6"), ((9, 5), 0.02, "#cfa04c"),
-        ((-13, 10), 0.06, "#081813"), ((11, 14), 0.05, "#f2f5ea"), ((-15, 19), 0.05, "#e4eedd"),
+        ((5, 2), 0.03, "#f4efe3"),
+        ((-4, 7), 0.03, "#d9e4d6"),
+        ((9, 5), 0.02, "#cfa04c"),
+        ((-13, 10), 0.06, "#081813"),
+        ((11, 14), 0.05, "#f2f5ea"),
+        ((-15, 19), 0.05, "#e4eedd"),
     ):
         seed = 31 + turns[1]
         bend = lookup(fbm(n, 4, seed, octaves=7, gain=0.55), u, v)
-        crack = np.abs(np.sin(np.pi * (turns[0] * x + turns[1] * y + (0.8 + 0.09 * abs(turns[0])) * bend)))
+        crack = np.abs(
+            np.sin(np.pi * (turns[0] * x + turns[1] * y + (0.8 + 0.09 * abs(turns[0])) * bend))
+        )
         swell = np.clip(0.35 + 0.9 * noise(n, 6, seed + 9), 0.02, 2.0)
         stone = blend(stone, colour(tone), 0.9 * smooth(width, 0.15 * width, crack / swell))
     fine = fbm(n, 150, 81, octaves=2, gain=0.9)
@@ -52,15 +65,26 @@ def rust(n: int) -> Picture:
     grain = fbm(n, 60, 21, octaves=5, gain=0.75)
     row = np.floor(y * 5.0)
     along = x * 3.0 + 0.5 * (row % 2)
-    seam = np.minimum(np.abs(y * 5.0 - np.round(y * 5.0)) / 5.0,
-                      np.abs(along - np.round(along)) / 3.0)
+    seam = np.minimum(
+        np.abs(y * 5.0 - np.round(y * 5.0)) / 5.0, np.abs(along - np.round(along)) / 3.0
+    )
     pitch = 1.0 / 45.0
-    rivet = np.hypot((x / pitch) % 1.0 - 0.5, (np.abs(y * 5.0 - np.round(y * 5.0)) / 5.0 - 0.014)
-                     / pitch) * pitch
+    rivet = (
+        np.hypot(
+            (x / pitch) % 1.0 - 0.5, (np.abs(y * 5.0 - np.round(y * 5.0)) / 5.0 - 0.014) / pitch
+        )
+        * pitch
+    )
     edge = decay + 0.8 * np.exp(-seam / 0.02) + 0.25 * grain
     runs = fbm(n, (110, 3), 31, octaves=4, gain=0.7) + 0.7 * decay
-    metal = graded(grain + 0.6 * noise(n, 14, 41), (-2.6, "#1d0d08"), (-1.0, "#4c1f10"),
-                   (0.2, "#8a3d16"), (1.2, "#c46a22"), (2.4, "#e8a04a"))
+    metal = graded(
+        grain + 0.6 * noise(n, 14, 41),
+        (-2.6, "#1d0d08"),
+        (-1.0, "#4c1f10"),
+        (0.2, "#8a3d16"),
+        (1.2, "#c46a22"),
+        (2.4, "#e8a04a"),
+    )
     sea = graded(fbm(n, 6, 51, octaves=5), (-2.0, "#0d4a57"), (0.0, "#1b7f86"), (2.0, "#57b3a8"))
     primer = colour("#c9bfa6") * (0.9 + 0.06 * grain)[..., None]
     band = smooth(0.004, -0.004, np.abs(y - 0.5) - 0.1)
@@ -70,7 +94,8 @@ def rust(n: int) -> Picture:
     hull = blend(hull, colour("#7a3413"), 0.75 * smooth(0.6, 2.0, runs))
     height = 0.0026 * top + 0.0018 * under + 0.0006 * grain * (1.0 - 0.8 * top)
     height += 0.003 * smooth(0.0, 0.004, seam) + 0.004 * np.sqrt(
-        np.clip(1.0 - (rivet / 0.0062) ** 2, 0.0, 1.0))
+        np.clip(1.0 - (rivet / 0.0062) ** 2, 0.0, 1.0)
+    )
     return lit(hull, height, gloss=0.12) * hollows(height, 0.006, strength=1.2)[..., None]
 
 
@@ -83,10 +108,23 @@ def turing(n: int) -> Picture:
     grown, scale = _grow(320, 90)
     zoom = [np.clip(each, -4.0, 4.0) for each in _resampled(np.stack([grown, scale]), n)]
     grown, scale = zoom
-    tone = graded(grown, (-1.0, "#10122e"), (-0.55, "#31245f"), (-0.15, "#a3306a"),
-                  (0.15, "#ee6a4c"), (0.5, "#f8c46a"), (1.0, "#fff4d6"))
-    cool = graded(grown, (-1.0, "#03252e"), (-0.4, "#0b5d66"), (0.1, "#36a08f"),
-                  (0.5, "#b9dfae"), (1.0, "#fbfbe3"))
+    tone = graded(
+        grown,
+        (-1.0, "#10122e"),
+        (-0.55, "#31245f"),
+        (-0.15, "#a3306a"),
+        (0.15, "#ee6a4c"),
+        (0.5, "#f8c46a"),
+        (1.0, "#fff4d6"),
+    )
+    cool = graded(
+        grown,
+        (-1.0, "#03252e"),
+        (-0.4, "#0b5d66"),
+        (0.1, "#36a08f"),
+        (0.5, "#b9dfae"),
+        (1.0, "#fbfbe3"),
+    )
     reef = blend(tone, cool, smooth(-0.5, 0.6, fbm(n, 3, 5, octaves=4) + 0.5 * (scale - 1.5)))
     grain = fbm(n, 100, 15, octaves=4, gain=0.8)
     height = 0.011 * grown + 0.00035 * grain

@@ -1,4 +1,4 @@
-"""Spheres painted in space: nebula, agate, clouds of a planet, leaded glass, coral, canyon."""
+"""Spheres of matter: agate, leaded glass, coral, sandstone."""
 
 import numpy as np
 
@@ -15,36 +15,12 @@ from experiments.dataset.textures.sphere_fields import (
 )
 
 
-def nebula(height: int) -> Picture:
-    """Clouds of gas, dust lanes and the band of a galaxy, sown with stars of all sizes."""
-    points = directions(height)
-    fold = np.stack([fbm3(points, 1.6, each, octaves=5) for each in (1, 11, 21)], -1)
-    bent = points + 0.22 * fold
-    gas, dust = fbm3(bent, 2.2, 31, octaves=8, gain=0.6), fbm3(bent, 3.5, 41, octaves=8, gain=0.6)
-    axis = np.array([0.35, -0.55, 0.76], np.float32)
-    band = np.exp(-(((points + 0.05 * fold) @ axis) / 0.24) ** 2)
-    tone = graded(gas + 0.8 * band, (-1.8, "#050817"), (-0.4, "#16224f"), (0.5, "#4b2f86"),
-                  (1.3, "#c43d7f"), (2.0, "#ff8f6b"), (2.8, "#ffe6b8"))
-    teal = graded(dust, (-0.5, "#04121c"), (0.6, "#0e5a6e"), (1.6, "#3fd0c0"), (2.6, "#e2fff2"))
-    sky = 1.0 - (1.0 - tone) * (1.0 - 0.75 * teal * smooth(-0.6, 1.2, fold[..., 0])[..., None])
-    lanes = smooth(0.3, 1.2, fbm3(bent, 5.0, 51, octaves=7, gain=0.65)) * (0.35 + 0.65 * band)
-    sky = sky * (1.0 - 0.8 * lanes)[..., None]
-    for count, seed, size in ((9000, 5, 0.0016), (1600, 6, 0.0026), (160, 7, 0.0052)):
-        stars = cells3(points, count, seed)
-        size = max(size, 1.1 * np.pi / height)
-        bright = random_of(stars.index, seed) ** 2.0
-        warmth = graded(random_of(stars.index, seed + 9), (0.0, "#9bb8ff"), (0.5, "#ffffff"),
-                        (1.0, "#ffcf9b"))
-        glow = np.exp(-((stars.away / size) ** 2)) + 0.12 * np.exp(-stars.away / (3.0 * size))
-        sky = sky + warmth * (1.3 * (0.25 + bright) * glow)[..., None]
-    return np.clip(sky, 0.0, 1.0)
-
-
 def agate(height: int) -> Picture:
     """Agates and malachite: many nests of thin bands, with quartz where they meet."""
     points = directions(height)
-    bent = points + 0.10 * np.stack([fbm3(points, 2.5, each, octaves=3) for each in (1, 11, 21)],
-                                    -1)
+    bent = points + 0.10 * np.stack(
+        [fbm3(points, 2.5, each, octaves=3) for each in (1, 11, 21)], -1
+    )
     nests = cells3(bent, 34, 3)
     rough = fbm3(points, 9.0, 41, octaves=5, gain=0.4)
     depth = nests.border + 0.004 * rough + 0.010 * fbm3(points, 4.0, 51, octaves=2)
@@ -72,45 +48,31 @@ def agate(height: int) -> Picture:
     return lit_sphere(stone, 0.004 * tone * (1.0 - core) + 0.01 * facet * core, strength=0.7)
 
 
-def planet(height: int) -> Picture:
-    """The bands, festoons and storms of a giant planet's clouds."""
-    points = directions(height)
-    _, elevation = angles(height)
-    z = points[..., 2]
-    stretched = points * np.array([1.0, 1.0, 3.2], np.float32)
-    swirl = fbm3(stretched, 2.2, 1, octaves=7, gain=0.58)
-    storms = cells3(stretched / np.linalg.norm(stretched, axis=-1, keepdims=True), 46, 3)
-    strong = (random_of(storms.index, 4) > 0.6) * (0.5 + random_of(storms.index, 5))
-    ring = storms.away / (0.06 + 0.13 * random_of(storms.index, 6))
-    eye = strong * np.exp(-ring * ring)
-    drift = 0.075 * swirl * (0.55 + np.abs(np.cos(9.0 * z))) + 0.10 * eye * np.cos(9.0 * ring)
-    level = z + drift
-    bands = noise3(np.stack([0.0 * level, 0.0 * level + 0.3, level], -1), 9.0, 11)
-    bands = bands + 0.7 * noise3(np.stack([0.0 * level, 0.0 * level + 0.6, level], -1), 26.0, 12)
-    warped = np.stack([points[..., 0] + drift, points[..., 1] - drift, 5.0 * level], -1)
-    threads = fbm3(warped, 9.0, 21, octaves=6, gain=0.7)
-    tone = graded(bands + 0.45 * threads, (-2.6, "#2b1720"), (-1.3, "#7a2f2a"), (-0.3, "#c9713f"),
-                  (0.4, "#e8b77e"), (1.1, "#f6e6c8"), (1.9, "#8fb3b5"), (2.8, "#2f5d73"))
-    tone = blend(tone, colour("#c8391f"), 0.75 * smooth(0.35, 0.8, eye))
-    tone = blend(tone, colour("#fff3e0"), smooth(0.12, 0.03, np.abs(eye - 0.33)) * 0.7)
-    poles = smooth(0.85, 1.25, np.abs(elevation) + 0.06 * swirl)
-    tone = blend(tone, graded(threads, (-2.0, "#0f2036"), (0.3, "#2f5f8a"), (2.0, "#b8d8e8")), poles)
-    return lit_sphere(tone, 0.004 * swirl + 0.003 * threads, strength=0.5)
-
-
 def lantern(height: int) -> Picture:
     """A globe of leaded glass: large panes of colour, small ones between, jewels at the joints."""
     points = directions(height)
-    bent = points + 0.02 * np.stack([fbm3(points, 5.0, each, octaves=2) for each in (1, 11, 21)],
-                                    -1)
+    bent = points + 0.02 * np.stack(
+        [fbm3(points, 5.0, each, octaves=2) for each in (1, 11, 21)], -1
+    )
     panes, splits = cells3(bent, 150, 3), cells3(bent, 1500, 4)
     split = random_of(panes.index, 5) < 0.5
     border = np.where(split, np.minimum(splits.border, panes.border), panes.border)
     piece = np.where(split, splits.index + 1000, panes.index)
     family = random_of(panes.index, 6)
     share = (0.6 * family + 0.4 * random_of(piece, 7)) % 1.0
-    glass = chosen(share, "#0b3fa8", "#1aa7c4", "#0f7a4d", "#a3c94a", "#f2b705", "#ef7b2d",
-                   "#b3122a", "#8c1c5a", "#5b1a8a", "#e9dfc0")
+    glass = chosen(
+        share,
+        "#0b3fa8",
+        "#1aa7c4",
+        "#0f7a4d",
+        "#a3c94a",
+        "#f2b705",
+        "#ef7b2d",
+        "#b3122a",
+        "#8c1c5a",
+        "#5b1a8a",
+        "#e9dfc0",
+    )
     streaks = fbm3(bent * np.array([1.0, 2.5, 1.0], np.float32), 7.0, 31, octaves=6, gain=0.62)
     ripple = fbm3(points, 40.0, 41, octaves=4, gain=0.7)
     glow = 0.68 + 0.22 * streaks + 0.09 * ripple + 2.6 * np.clip(border, 0.0, 0.12)
@@ -134,21 +96,40 @@ def lantern(height: int) -> Picture:
 def coral(height: int) -> Picture:
     """Brain coral: winding ridges in a few scales and colours, with polyps."""
     points = directions(height)
-    bent = points + 0.05 * np.stack([fbm3(points, 3.0, each, octaves=3) for each in (1, 11, 21)],
-                                    -1)
+    bent = points + 0.05 * np.stack(
+        [fbm3(points, 3.0, each, octaves=3) for each in (1, 11, 21)], -1
+    )
     region = fbm3(points, 1.7, 31, octaves=4)
     share = smooth(-0.15, 0.15, region)
     wide, fine = waves3(bent, 46.0, 41), waves3(bent, 82.0, 43)
     winding = np.abs(wide + share * (fine - wide))
-    ridge = smooth(1.0, 0.05, winding)
+    ridge = smooth(1.35, 0.15, winding)
     grain = fbm3(points, 50.0, 61, octaves=4, gain=0.8)
     tone = ridge + 0.10 * grain
-    reds = graded(tone, (0.0, "#2a0a2e"), (0.3, "#8c1f54"), (0.6, "#e8505b"), (0.85, "#f9a36b"),
-                  (1.05, "#fff0cf"))
-    blues = graded(tone, (0.0, "#04182e"), (0.3, "#0d5c75"), (0.6, "#2fae9e"), (0.85, "#a9dd8a"),
-                   (1.05, "#fbfbd8"))
-    golds = graded(tone, (0.0, "#1d1330"), (0.3, "#5b3a8c"), (0.6, "#b87fd0"), (0.85, "#f5c86a"),
-                   (1.05, "#fffbe0"))
+    reds = graded(
+        tone,
+        (0.0, "#2a0a2e"),
+        (0.3, "#8c1f54"),
+        (0.6, "#e8505b"),
+        (0.85, "#f9a36b"),
+        (1.05, "#fff0cf"),
+    )
+    blues = graded(
+        tone,
+        (0.0, "#04182e"),
+        (0.3, "#0d5c75"),
+        (0.6, "#2fae9e"),
+        (0.85, "#a9dd8a"),
+        (1.05, "#fbfbd8"),
+    )
+    golds = graded(
+        tone,
+        (0.0, "#1d1330"),
+        (0.3, "#5b3a8c"),
+        (0.6, "#b87fd0"),
+        (0.85, "#f5c86a"),
+        (1.05, "#fffbe0"),
+    )
     other = fbm3(points, 1.5, 71, octaves=4)
     reef = blend(blend(reds, blues, share), golds, smooth(0.35, 0.6, other))
     polyps = cells3(points, 9000, 5)
@@ -161,32 +142,55 @@ def coral(height: int) -> Picture:
     return lit_sphere(reef, 0.022 * ridge + 0.0012 * grain + 0.01 * region)
 
 
+_SANDSTONE = (
+    (-2.6, "#4a1620"),
+    (-1.2, "#93331f"),
+    (-0.2, "#cb6a35"),
+    (0.7, "#eba663"),
+    (1.6, "#f7d9a8"),
+    (2.6, "#fff3df"),
+)
+
+
 def canyon(height: int) -> Picture:
     """A slot canyon: strata of sandstone that light falls into from above, sand on its floor."""
     points = directions(height)
     _, elevation = angles(height)
-    fold = fbm3(points, 1.8, 1, octaves=6, gain=0.5)
-    carved = np.abs(fbm3(points, 2.6, 11, octaves=4, gain=0.45))
-    level = points[..., 2] + 0.11 * fold - 0.08 * carved
+    fold = fbm3(points, 1.3, 1, octaves=4, gain=0.4)
+    carved = np.abs(
+        fbm3(points * np.array([1.0, 1.0, 0.45], np.float32), 2.4, 11, octaves=3, gain=0.4)
+    )
+    level = points[..., 2] + 0.06 * fold - 0.05 * carved
+    level = level + 0.012 * fbm3(points, 9.0, 15, octaves=4)
     still = np.zeros_like(level)
     broad = noise3(np.stack([still, still, level], -1), 7.0, 21)
     strata = noise3(np.stack([still + 0.4, still, level], -1), 24.0, 22)
     fine = noise3(np.stack([0.2 * points[..., 0], 0.2 * points[..., 1], level], -1), 75.0, 23)
-    crossed = noise3(np.stack([0.5 * points[..., 0], 0.2 * points[..., 1],
-                               level + 0.3 * points[..., 1]], -1), 48.0, 24)
+    crossed = noise3(
+        np.stack([0.5 * points[..., 0], 0.2 * points[..., 1], level + 0.3 * points[..., 1]], -1),
+        48.0,
+        24,
+    )
     grain = fbm3(points, 70.0, 31, octaves=3, gain=0.8)
     tone = broad + 0.65 * strata + 0.4 * fine + 0.25 * crossed + 0.12 * grain
-    rock = graded(tone, (-2.6, "#4a1620"), (-1.2, "#93331f"), (-0.2, "#cb6a35"), (0.7, "#eba663"),
-                  (1.6, "#f7d9a8"), (2.6, "#fff3df"))
-    varnish = smooth(0.7, 1.6, fbm3(points * np.array([1.0, 1.0, 0.12], np.float32), 16.0, 41,
-                                    octaves=4, gain=0.65))
+    rock = graded(tone, *_SANDSTONE)
+    varnish = smooth(
+        0.7,
+        1.6,
+        fbm3(points * np.array([1.0, 1.0, 0.12], np.float32), 16.0, 41, octaves=4, gain=0.65),
+    )
     rock = blend(rock, colour("#2b1420"), 0.7 * varnish)
-    rock = lit_sphere(rock, 0.014 * broad + 0.008 * strata + 0.004 * fine - 0.07 * carved
-                      + 0.002 * grain)
+    rock = lit_sphere(
+        rock, 0.006 * broad + 0.004 * strata + 0.002 * fine - 0.12 * carved + 0.001 * grain
+    )
     rock = rock * (0.62 + 0.5 * smooth(-0.9, 0.9, elevation + 0.2 * fold))[..., None]
-    sand = graded(np.sin(60.0 * points[..., 0] + 9.0 * fbm3(points, 5.0, 51, octaves=4)) + grain,
-                  (-2.0, "#8a4a2c"), (0.0, "#c98a5a"), (2.0, "#f0c79a"))
+    sand = graded(
+        np.sin(60.0 * points[..., 0] + 9.0 * fbm3(points, 5.0, 51, octaves=4)) + grain,
+        (-2.0, "#8a4a2c"),
+        (0.0, "#c98a5a"),
+        (2.0, "#f0c79a"),
+    )
     rock = blend(rock, sand, smooth(-0.95, -1.05, elevation + 0.12 * fold))
-    sky = graded(fbm3(points, 3.0, 61, octaves=6), (-1.5, "#1d5fa8"), (0.5, "#4a93d6"),
-                 (1.4, "#dfeefa"))
-    return blend(rock, sky, smooth(1.15, 1.17, elevation + 0.16 * fold + 0.1 * carved))
+    sky = fbm3(points, 3.0, 61, octaves=6)
+    sky = graded(sky, (-1.5, "#1d5fa8"), (0.5, "#4a93d6"), (1.4, "#dfeefa"))
+    return blend(rock, sky, smooth(0.98, 1.0, elevation + 0.16 * fold + 0.3 * carved))

@@ -5,14 +5,35 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from experiments.dataset.textures.fields import Field, Picture, fbm, lookup, blend, smooth
+from experiments.dataset.textures.fields import Field, Picture, blend, fbm, lookup, smooth
 from experiments.dataset.textures.shading import colour, colours, graded
 from experiments.dataset.textures.stamps import Place, Samples, stamp
 
-_FALLEN = ("#b5341c", "#d9731a", "#e8a723", "#8c2318", "#c9581f", "#7a4a1e", "#a8842c", "#6b7a2a",
-           "#e0c04a", "#5a2a1a", "#94a83a")
-_PETALS = ("#e63946", "#f4d35e", "#f6f1eb", "#9d4edd", "#ff7096", "#3a86c8", "#ff9f1c", "#c9184a",
-           "#b8c0ff", "#ffe8d6")
+_FALLEN = (
+    "#b5341c",
+    "#d9731a",
+    "#e8a723",
+    "#8c2318",
+    "#c9581f",
+    "#7a4a1e",
+    "#a8842c",
+    "#6b7a2a",
+    "#e0c04a",
+    "#5a2a1a",
+    "#94a83a",
+)
+_PETALS = (
+    "#e63946",
+    "#f4d35e",
+    "#f6f1eb",
+    "#9d4edd",
+    "#ff7096",
+    "#3a86c8",
+    "#ff9f1c",
+    "#c9184a",
+    "#b8c0ff",
+    "#ffe8d6",
+)
 
 # Of half a leaf of maple: angle and length of its lobes.
 _LOBES = ((0.0, 1.22), (0.8, 1.05), (1.72, 0.72))
@@ -22,17 +43,20 @@ def leaves(n: int) -> Picture:
     """Leaves of maple, beech and birch, the upper ones larger, on dark soil."""
     rng = np.random.default_rng(31)
     cloud = fbm(n, 8, 4, octaves=7, gain=0.7)
-    wood = np.ascontiguousarray(graded(cloud, (-2.0, "#14100a"), (0.3, "#3a2a1a"), (2.0, "#6b5232")))
+    wood = np.ascontiguousarray(
+        graded(cloud, (-2.0, "#14100a"), (0.3, "#3a2a1a"), (2.0, "#6b5232"))
+    )
     sizes = np.linspace(0.028, 0.060, 950) * rng.uniform(0.8, 1.2, 950)
     for depth, size in enumerate(sizes):
-        middle, angle = rng.random(2) * 1.12 - 0.06, rng.uniform(0.0, 2.0 * math.pi)
+        middle, angle = rng.random(2), rng.uniform(0.0, 2.0 * math.pi)
         tone = colour(_FALLEN[rng.integers(len(_FALLEN))]) * (0.55 + 0.5 * depth / sizes.size)
         _leaf(wood, Place(*middle.tolist(), float(size), angle), tone, rng, cloud)
     return wood
 
 
-def _leaf(wood: Picture, place: Place, tone: np.ndarray, rng: np.random.Generator, cloud: Field
-          ) -> None:
+def _leaf(
+    wood: Picture, place: Place, tone: np.ndarray, rng: np.random.Generator, cloud: Field
+) -> None:
     """Lays a leaf: its stalk at `u = -1`; lobed as of a maple, or an oval."""
     maple, wide = rng.random() < 0.5, rng.uniform(0.42, 0.62)
     teeth, curl = rng.uniform(14.0, 26.0), rng.uniform(-0.25, 0.25)
@@ -42,19 +66,7 @@ def _leaf(wood: Picture, place: Place, tone: np.ndarray, rng: np.random.Generato
 
     def distance(u: Field, v: Field) -> Field:
         v = v - curl * u * u
-        if maple:
-            turn = np.abs(np.arctan2(v, u + 0.3))
-            rim = np.full_like(u, 0.2)
-            for axis, length in _LOBES:
-                peak = np.maximum(1.0 - np.abs(turn - axis) / 0.48, 0.0)
-                rim = np.maximum(rim, 0.2 + (length - 0.2) * peak**0.85)
-            rim = rim * (1.0 + 0.13 * np.abs(np.sin(teeth * 0.5 * turn)))
-            blade = 0.6 * (np.hypot(u + 0.3, v) - rim)
-        else:
-            share = np.clip(0.5 * (u + 0.85) / 0.925, 0.0, 1.0)
-            half = wide * np.sin(np.pi * share**0.8) * (1.0 - 0.25 * share)
-            half = half + 0.02 * np.abs(np.sin(teeth * u)) * (half > 0.02)
-            blade = np.abs(v) - half
+        blade = _maple(u, v, teeth) if maple else _oval(u, v, teeth, wide)
         stalk = np.maximum(np.abs(v) - 0.022, np.maximum(-1.1 - u, u))
         return np.minimum(blade, stalk)
 
@@ -83,20 +95,42 @@ def _leaf(wood: Picture, place: Place, tone: np.ndarray, rng: np.random.Generato
     stamp(wood, place, distance, paint)
 
 
+def _maple(u: Field, v: Field, teeth: float) -> Field:
+    turn = np.abs(np.arctan2(v, u + 0.3))
+    rim = np.full_like(u, 0.2)
+    for axis, length in _LOBES:
+        peak = np.maximum(1.0 - np.abs(turn - axis) / 0.48, 0.0)
+        rim = np.maximum(rim, 0.2 + (length - 0.2) * peak**0.85)
+    rim = rim * (1.0 + 0.13 * np.abs(np.sin(teeth * 0.5 * turn)))
+    return 0.6 * (np.hypot(u + 0.3, v) - rim)
+
+
+def _oval(u: Field, v: Field, teeth: float, wide: float) -> Field:
+    share = np.clip(0.5 * (u + 0.85) / 0.925, 0.0, 1.0)
+    half = wide * np.sin(np.pi * share**0.8) * (1.0 - 0.25 * share)
+    return np.abs(v) - half - 0.02 * np.abs(np.sin(teeth * u)) * (half > 0.02)
+
+
 def flowers(n: int) -> Picture:
     """A meadow from above: blades of grass, daisies, poppies and asters."""
     rng = np.random.default_rng(54)
     cloud = fbm(n, 8, 14, octaves=7, gain=0.7)
-    meadow = np.ascontiguousarray(graded(cloud, (-2.0, "#06140a"), (0.5, "#163a1a"),
-                                         (2.0, "#2f5a22")))
+    meadow = np.ascontiguousarray(
+        graded(cloud, (-2.0, "#06140a"), (0.5, "#163a1a"), (2.0, "#2f5a22"))
+    )
     for depth in range(900):
-        middle, angle = rng.random(2) * 1.1 - 0.05, rng.uniform(0.0, 2.0 * math.pi)
+        middle, angle = rng.random(2), rng.uniform(0.0, 2.0 * math.pi)
         green = colours("#1f6b2a", "#4f9a35", "#88b84a", "#2c7f5a", "#b5c95a")[rng.integers(5)]
         size = rng.uniform(0.03, 0.06)
-        _blade(meadow, Place(*middle.tolist(), float(size), angle), green * (0.5 + 0.55 * depth / 900.0), rng)
+        _blade(
+            meadow,
+            Place(*middle.tolist(), float(size), angle),
+            green * (0.5 + 0.55 * depth / 900.0),
+            rng,
+        )
     sizes = np.linspace(0.016, 0.058, 400) * rng.uniform(0.75, 1.25, 400)
     for size in sizes:
-        middle, angle = rng.random(2) * 1.1 - 0.05, rng.uniform(0.0, 2.0 * math.pi)
+        middle, angle = rng.random(2), rng.uniform(0.0, 2.0 * math.pi)
         _flower(meadow, Place(*middle.tolist(), float(size), angle), rng, cloud)
     return meadow
 

@@ -3,14 +3,24 @@
 A room is a box or a cylinder around the eye; its walls are papered with the pictures of `faces`.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
-from experiments.dataset.textures import cloth, drawn, masonry, minerals, plants, printed
-from experiments.dataset.textures import tilings, timber
+from experiments.dataset.textures import (
+    books,
+    cloth,
+    drawn,
+    masonry,
+    minerals,
+    painted,
+    penrose_tiles,
+    plants,
+    posters,
+    tilings,
+    timber,
+)
 from experiments.dataset.textures.fields import (
     Field,
     Picture,
@@ -18,10 +28,11 @@ from experiments.dataset.textures.fields import (
     fbm,
     lookup,
     random_of,
+    reflected,
     smooth,
 )
 from experiments.dataset.textures.shading import chosen, colour, graded
-from experiments.dataset.textures.sphere_fields import angles, directions, fbm3
+from experiments.dataset.textures.sphere_fields import directions, fbm3
 
 
 class Seen(NamedTuple):
@@ -56,8 +67,9 @@ def box_room(height: int, half: tuple[float, float], floor: float, ceiling: floa
     points = directions(height)
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     tiny = np.float32(1e-6)
-    scale = np.stack([np.abs(x) / half[0], np.abs(y) / half[1],
-                      np.where(z > 0.0, z / ceiling, -z / floor)])
+    scale = np.stack(
+        [np.abs(x) / half[0], np.abs(y) / half[1], np.where(z > 0.0, z / ceiling, -z / floor)]
+    )
     far = 1.0 / np.maximum(scale.max(0), tiny)
     side = scale.argmax(0)
     a, b, c = x * far, y * far, z * far
@@ -67,8 +79,10 @@ def box_room(height: int, half: tuple[float, float], floor: float, ceiling: floa
     level = wall >= 4
     across, up = np.where(level, a, sign), np.where(level, b, c)
     width = np.where(level | (side == 1), half[0], half[1]).astype(np.float32)
-    gaps = np.sort(np.stack([half[0] - np.abs(a), half[1] - np.abs(b),
-                             np.minimum(c + floor, ceiling - c)]), axis=0)
+    gaps = np.sort(
+        np.stack([half[0] - np.abs(a), half[1] - np.abs(b), np.minimum(c + floor, ceiling - c)]),
+        axis=0,
+    )
     return Seen(wall, across, up, width, gaps[1], far)
 
 
@@ -83,27 +97,34 @@ def library(height: int) -> Picture:
     """A library: books up to a coffered ceiling of wood, a carpet, and windows at its ends."""
     seen = box_room(height, (4.0, 3.0), 1.6, 2.6)
     size = height // 2
-    books, rug, wood = printed.bookshelf(size), cloth.carpet(size), timber.parquet(size)
-    picture = lookup(books, seen.across / 4.2 + 0.23 * seen.wall, 0.381 - seen.up / 4.2)
+    spines, rug, wood = books.bookshelf(size), cloth.carpet(size), timber.parquet(size)
+    picture = lookup(spines, seen.across / 4.2 + 0.23 * seen.wall, 0.381 - seen.up / 4.2)
     picture = picture * 1.15
     pillar = np.abs((seen.across / seen.half * 2.0) % 1.0 - 0.5) * seen.half / 2.0
     grain = timber.grain_of(size, *(_unit(size)), np.zeros((size, size), np.int32))
-    oak = graded(lookup(grain, 0.3 * seen.up, 0.5 * seen.across), (0.0, "#9a6636"),
-                 (0.5, "#6b4020"), (1.0, "#2e1a0c"))
+    oak = graded(
+        lookup(grain, 0.3 * seen.up, 0.5 * seen.across),
+        (0.0, "#9a6636"),
+        (0.5, "#6b4020"),
+        (1.0, "#2e1a0c"),
+    )
     flute = 0.75 + 0.35 * np.cos(pillar * 110.0)
     picture = np.where((pillar < 0.11)[..., None], oak * flute[..., None], picture)
     ends = (seen.wall % 2 == 0) & (seen.wall < 4)
     window = np.maximum(np.abs(seen.across) / 0.95, np.abs(seen.up - 0.5) / 1.35)
     panes = np.minimum(np.abs(seen.across * 3.2 % 1.0 - 0.5), np.abs(seen.up * 3.2 % 1.0 - 0.5))
-    glass = lookup(tilings.stained_glass(size), seen.across / 2.4 + 0.5, 0.5 - (seen.up - 0.5) / 2.8)
+    glass = lookup(
+        tilings.stained_glass(size), seen.across / 2.4 + 0.5, 0.5 - (seen.up - 0.5) / 2.8
+    )
     glass = blend(colour("#20160d") * np.ones(3), 1.5 * glass, smooth(0.46, 0.44, panes))
     view = blend(oak, glass, smooth(1.0, 0.98, window))
     picture = np.where((ends & (window < 1.12))[..., None], view, picture)
-    level = lookup(wood, seen.across / 3.0, seen.up / 3.0)
+    level = lookup(wood, reflected(seen.across / 2.9), reflected(seen.up / 2.9))
     on_rug = np.maximum(np.abs(seen.across) / 2.7, np.abs(seen.up) / 1.9)
     mat = lookup(rug, 0.5 + seen.across / 5.4, 0.5 + seen.up / 3.8)
-    picture = np.where((seen.wall == 4)[..., None],
-                       np.where((on_rug < 1.0)[..., None], mat, level), picture)
+    picture = np.where(
+        (seen.wall == 4)[..., None], np.where((on_rug < 1.0)[..., None], mat, level), picture
+    )
     coffer = np.maximum(np.abs(seen.across % 1.0 - 0.5), np.abs(seen.up % 1.0 - 0.5))
     ceiling = oak * (1.25 - 0.8 * smooth(0.40, 0.34, coffer))[..., None]
     rose = np.hypot(seen.across % 1.0 - 0.5, seen.up % 1.0 - 0.5)
@@ -119,32 +140,48 @@ def _unit(n: int) -> tuple[Field, Field]:
     return tuple(np.meshgrid(ticks, ticks))
 
 
+_WORKS = (
+    painted.painting,
+    drawn.contours,
+    plants.flowers,
+    minerals.turing,
+    tilings.mosaic,
+    cloth.tartan,
+    plants.leaves,
+    penrose_tiles.penrose,
+    posters.posters,
+    minerals.marble,
+    cloth.carpet,
+    masonry.pebbles,
+)
+
+
 def gallery(height: int) -> Picture:
     """A gallery: paintings in gilded frames, two rows on silk, a skylight over polished oak."""
     seen = box_room(height, (4.2, 3.2), 1.5, 2.4)
     size = max(height // 4, 64)
-    makers = (drawn.painting, drawn.contours, plants.flowers, minerals.turing, tilings.mosaic,
-              cloth.tartan, plants.leaves, tilings.penrose, printed.posters, minerals.marble,
-              cloth.carpet, masonry.pebbles)
-    works = np.concatenate([make(size) for make in makers])
     columns = np.where(seen.half > 3.5, 5, 4)
     place = (seen.across / seen.half + 1.0) * 0.5 * columns
     column = np.clip(np.floor(place), 0, columns - 1).astype(np.int32)
     rows = (seen.up + 1.0) / 1.62
     row = np.clip(np.floor(rows), 0, 1).astype(np.int32)
     pitch = 2.0 * seen.half / columns
-    index = seen.wall * 12 + row * 5 + column
+    index = seen.wall * 12 + row * columns + column
     wide = pitch * (0.34 + 0.09 * random_of(index, 2))
     high = 0.45 + 0.22 * random_of(index, 3)
     u, v = (place - column - 0.5) * pitch / wide, (rows - row - 0.5) * 1.62 / high
     rim = np.minimum((1.0 - np.abs(u)) * wide, (1.0 - np.abs(v)) * high)
-    work = (index * 7 + index // 5) % len(makers)
-    inner = lookup(works, 0.5 + 0.48 * u, (work + 0.5 - 0.48 * v) / len(makers))
+    work = (seen.wall * 9 + row * columns + column + 4 * row) % len(_WORKS)
+    works = np.concatenate([make(size) for make in _WORKS])
+    inner = lookup(works, 0.5 + 0.48 * u, (work + 0.5 - 0.48 * v) / len(_WORKS))
     inner = inner * 1.1
     silk = fbm(size, 6, 5, octaves=6)
     damask = np.cos(9.0 * seen.across) * np.cos(9.0 * seen.up) + 0.5 * np.cos(27.0 * seen.across)
-    wall = blend(colour("#7a1f2b"), colour("#a8443a"), smooth(-0.1, 0.1, damask + 0.15 * lookup(
-        silk, seen.across, seen.up)))
+    wall = blend(
+        colour("#7a1f2b"),
+        colour("#a8443a"),
+        smooth(-0.1, 0.1, damask + 0.15 * lookup(silk, seen.across, seen.up)),
+    )
     wall = wall * (1.0 - 0.45 * smooth(-0.14, 0.0, rim) * (rim < 0.0))[..., None]
     ornament = 0.75 + 0.25 * np.cos(rim * 90.0) * np.cos(55.0 * (u * wide + v * high))
     gilt = graded(ornament, (0.4, "#5a3a12"), (0.75, "#c9993f"), (1.0, "#ffe7a0"))
@@ -152,18 +189,26 @@ def gallery(height: int) -> Picture:
     dado = (seen.up < -1.06) | (seen.up > 2.26)
     moulding = 0.6 + 0.4 * np.cos(seen.up * 80.0) + 0.12 * np.cos(40.0 * seen.across)
     picture = np.where(dado[..., None], colour("#d8c9a8") * moulding[..., None], picture)
-    oak = lookup(timber.parquet(2 * size), seen.across / 3.2, seen.up / 3.2)
+    oak = lookup(
+        timber.parquet(2 * size),
+        reflected(seen.across / 2.8 + 0.37),
+        reflected(seen.up / 2.8 + 0.61),
+    )
     picture = np.where((seen.wall == 4)[..., None], oak, picture)
-    return _shaded(_skylight(picture, seen), seen, lamp=5.5, corners=0.3)
+    return _skylight(_shaded(picture, seen, lamp=5.5, corners=0.3), seen)
 
 
 def _skylight(picture: Picture, seen: Seen) -> Picture:
     """Returns a room with a glazed ceiling, clouds beyond it, in a stuccoed border."""
     clouds = fbm(512, 4, 9, octaves=7, gain=0.6)
-    sky = graded(lookup(clouds, seen.across / 7.0, seen.up / 7.0), (-1.2, "#4d8fd1"),
-                 (0.3, "#9cc6ea"), (1.2, "#ffffff"))
+    sky = graded(
+        lookup(clouds, seen.across / 7.0, seen.up / 7.0),
+        (-1.2, "#4d8fd1"),
+        (0.3, "#9cc6ea"),
+        (1.2, "#f4f8fb"),
+    )
     bars = np.minimum(np.abs(seen.across / 0.6 % 1.0 - 0.5), np.abs(seen.up / 0.9 % 1.0 - 0.5))
-    sky = blend(sky * 1.2, colour("#3a3f45"), smooth(0.45, 0.47, 0.5 - bars + 0.0))
+    sky = blend(sky, colour("#3a3f45"), smooth(0.05, 0.03, bars))
     rim = np.minimum(3.3 - np.abs(seen.across), 2.3 - np.abs(seen.up))
     leaf = 0.75 + 0.25 * np.cos(24.0 * seen.across) * np.cos(24.0 * seen.up)
     stucco = graded(leaf, (0.5, "#b09a70"), (0.8, "#efe3c6"), (1.0, "#fff9ea"))
@@ -205,131 +250,3 @@ def courtyard(height: int) -> Picture:
     clouds = fbm3(directions(height), 3.0, 71, octaves=7, gain=0.58)
     sky = graded(clouds, (-1.0, "#2f72bf"), (0.3, "#79b1e3"), (0.9, "#f4f6f8"), (1.8, "#ffffff"))
     return np.where((seen.wall == 5)[..., None], sky, picture)
-
-
-def rotunda(height: int) -> Picture:
-    """A domed hall: arcades with mosaics, a frieze, a coffered dome, and a pavement of rhombs."""
-    azimuth, elevation = angles(height)
-    size = height // 2
-    turn = azimuth / (2.0 * math.pi) + 0.5
-    up = np.tan(np.clip(elevation, -1.54, 1.54)) * 3.0
-    bay = turn * 12.0
-    number = np.floor(bay).astype(np.int32) % 12
-    u = (bay - np.floor(bay) - 0.5) * (2.0 * math.pi * 3.0 / 12.0)
-    arch = np.where(up < 0.4, np.abs(u) - 0.5, np.hypot(u, up - 0.4) - 0.5)
-    tile = lookup(tilings.truchet(size), turn * 6.0, -up / 3.14)
-    marble = lookup(minerals.marble(size), turn * 4.0, -up / 4.7)
-    inner = [lookup(make(size), 0.5 + u / 1.1, 0.62 - (up + 0.3) / 2.4)
-             for make in (tilings.mosaic, tilings.stained_glass, drawn.painting)]
-    wall = np.where((arch < 0.0)[..., None], np.choose((number % 3)[..., None], inner), tile)
-    band = (arch > 0.0) & (arch < 0.16) & (up > -1.5)
-    stripes = np.floor(np.where(up < 0.4, up * 7.0, np.arctan2(up - 0.4, u) * 5.1)) % 2
-    voussoir = np.where(stripes[..., None] > 0, colour("#a23b2a"), colour("#efe2c4"))
-    wall = np.where(band[..., None], voussoir, wall)
-    pillar = (np.abs(np.abs(u) - 0.785) < 0.10) & (up < 0.95)
-    round_ = np.sqrt(np.clip(1.0 - ((0.785 - np.abs(u)) / 0.10) ** 2, 0.0, 1.0))
-    wall = np.where(pillar[..., None], marble * (0.35 + 1.0 * round_)[..., None], wall)
-    frieze = (up > 0.98) & (up < 1.45)
-    wave = np.sin(turn * 2.0 * math.pi * 48.0 + 4.0 * np.sin((up - 0.98) * 13.0))
-    knots = graded(wave, (-1.0, "#0f2f57"), (-0.3, "#1b5f8c"), (0.2, "#e3b34c"), (0.9, "#fff0c0"))
-    wall = np.where(frieze[..., None], knots, wall)
-    wall = np.where((np.abs(up - 0.98) < 0.025)[..., None], colour("#f4e6bd"), wall)
-    picture = np.where((up > 1.45)[..., None], _dome(azimuth, elevation), wall)
-    reach = 1.6 / np.tan(np.clip(-elevation, 0.02, 1.57))
-    x, y = reach * np.cos(azimuth), reach * np.sin(azimuth)
-    floor = lookup(tilings.penrose(size), 0.5 + x / 4.0, 0.5 + y / 4.0)
-    star = np.cos(12.0 * azimuth) * 0.1 + 0.8
-    medal = lookup(tilings.mosaic(size), 0.5 + x / 2.2, 0.5 + y / 2.2)
-    floor = np.where((reach < star)[..., None], medal, floor)
-    picture = np.where((up < -1.6)[..., None], floor, picture)
-    shade = 1.0 - 0.35 * np.exp(-np.abs(up + 1.6) / 0.2) - 0.3 * np.exp(-np.abs(up - 1.45) / 0.1)
-    return picture * (1.12 * shade)[..., None]
-
-
-def _dome(azimuth: Float[np.ndarray, "h w"], elevation: Float[np.ndarray, "h w"]) -> Picture:
-    """Returns a dome of coffers in rings, each with a star, around an opening to the sky."""
-    low = math.atan(1.45 / 3.0)
-    share = (elevation - low) / (0.5 * math.pi - low)
-    # Rings get lower towards the top as the coffers get narrower.
-    ring_at = 6.0 * (1.0 - np.sqrt(np.clip(1.0 - share, 0.0, 1.0))) / (1.0 - math.sqrt(0.08))
-    ring = np.floor(ring_at).astype(np.int32)
-    bay = (azimuth / (2.0 * math.pi) + 0.5) * 24.0 + 0.5 * (ring % 2)
-    u, v = bay - np.floor(bay) - 0.5, ring_at - ring - 0.5
-    coffer = np.maximum(np.abs(u), np.abs(v))
-    index = ring * 37 + np.floor(bay).astype(np.int32) % 24 % 4
-    field = chosen(random_of(index, 3), "#12356b", "#1d6b63", "#7a1f33", "#3b2a6b", "#b5651d")
-    star = np.hypot(u, v) - 0.16 - 0.10 * np.cos(8.0 * np.arctan2(v, u))
-    field = blend(field, colour("#f6d98b"), smooth(0.02, -0.02, star))
-    field = blend(field, colour("#8a2f1f"), smooth(0.02, -0.02, star + 0.12))
-    ribs = graded(coffer + 0.05 * np.cos(60.0 * (u + v)), (0.38, "#7a5a2a"), (0.43, "#f3dca0"),
-                  (0.5, "#b08b4a"))
-    dome = np.where((coffer > 0.38)[..., None], ribs, field)
-    dome = dome * (1.1 - 0.5 * (v + 0.5) * (coffer <= 0.38))[..., None]
-    sky = graded(v, (-0.5, "#9fd0f5"), (0.5, "#dff0ff"))
-    return np.where((share > 0.92)[..., None], sky, dome)
-
-
-def tent(height: int) -> Picture:
-    """A circus tent: striped canvas with stars, pennants, garlands of lamps, tiers of people."""
-    azimuth, elevation = angles(height)
-    points = directions(height)
-    size = height // 2
-    turn = azimuth / (2.0 * math.pi) + 0.5
-    stripe = turn * 32.0
-    index = np.floor(stripe).astype(np.int32) % 32
-    u = stripe - np.floor(stripe) - 0.5
-    tones = chosen((index % 4 + 0.5) / 4.0, "#b81f2d", "#f4e4bd", "#1c4f8c", "#f0b429")
-    folds = fbm3(points, 6.0, 3, octaves=6, gain=0.6)
-    weave = lookup(fbm(size, 90, 5, octaves=3, gain=0.9), turn * 4.0, elevation)
-    canvas = tones * (0.78 + 0.28 * np.cos(np.pi * u) + 0.07 * folds + 0.06 * weave)[..., None]
-    ring = elevation * 5.2
-    v = ring - np.floor(ring) - 0.5
-    star = np.hypot(u * np.cos(elevation) * 0.9, v * 0.8)
-    star = star - 0.13 - 0.06 * np.cos(5.0 * np.arctan2(v, u) + 1.57)
-    canvas = np.where((star < 0.0)[..., None], tones[..., ::-1] * 0.9 + 0.1, canvas)
-    sag = 0.06 * np.abs(np.sin(16.0 * azimuth))
-    for level, count in ((0.28, 96), (0.72, 64)):
-        height_of = level - sag * (1.0 + level)
-        lamp = np.hypot((turn * count % 1.0 - 0.5) * 6.283 / count * np.cos(level),
-                        elevation - height_of)
-        canvas = blend(canvas, colour("#2b1a12"), smooth(0.006, 0.003, np.abs(elevation - height_of)))
-        canvas = canvas + colour("#ffcf70") * (0.9 * np.exp(-lamp / 0.012))[..., None]
-    pennant = (elevation < 0.20) & (elevation > 0.06 + 0.28 * np.abs(turn * 64.0 % 1.0 - 0.5))
-    flags = chosen(random_of(np.floor(turn * 64.0).astype(np.int32), 7), "#e63946", "#ffd166",
-                   "#06a77d", "#3a6ea5", "#f4f1de", "#8e44ad")
-    canvas = np.where(pennant[..., None], flags * (0.9 + 0.1 * weave)[..., None], canvas)
-    crowd = _crowd(turn, elevation)
-    picture = np.where((elevation < 0.06)[..., None], np.where(pennant[..., None], canvas, crowd),
-                       canvas)
-    reach = 1.0 / np.tan(np.clip(-elevation, 0.02, 1.57))
-    x, y = reach * np.cos(azimuth), reach * np.sin(azimuth)
-    saw = lookup(masonry.terrazzo(size), x / 2.6, y / 2.6) * colour("#e3b273")
-    rug = lookup(cloth.carpet(size), 0.5 + x / 1.5, 0.5 + y / 1.5)
-    ground = np.where((np.maximum(np.abs(x), np.abs(y)) < 0.75)[..., None], rug, saw)
-    kerb = (reach > 1.45) & (reach < 1.8)
-    blocks = np.where(np.floor(turn * 48.0)[..., None] % 2 > 0, colour("#d62828"), colour("#fcf3dc"))
-    ground = np.where(kerb[..., None], blocks, ground)
-    return np.where((elevation < -0.5)[..., None], ground, picture)
-
-
-def _crowd(turn: Field, elevation: Field) -> Picture:
-    """Returns tiers of spectators: heads over shoulders, each in other colours."""
-    picture = np.ones((*turn.shape, 3), np.float32) * colour("#1d130f")
-    tiers = 11
-    for tier in range(tiers):
-        base = 0.045 - 0.05 * tier
-        seats = turn * 110.0 + 0.5 * (tier % 2)
-        index = tier * 131 + np.floor(seats).astype(np.int32) % 110
-        u = (seats - np.floor(seats) - 0.5) * 6.283 / 110.0
-        v = elevation - base + 0.012 * random_of(index, 9)
-        shirt = chosen(random_of(index, 1), "#c1121f", "#1d4e89", "#e9c46a", "#2a9d8f", "#f1faee",
-                       "#6d597a", "#264653", "#e76f51", "#3d3d3d")
-        skin = chosen(random_of(index, 2), "#f1c9a5", "#c98f66", "#8d5a3b", "#5a3825")
-        hair = chosen(random_of(index, 3), "#1c120c", "#5a3a1e", "#b98a4a", "#8a8a88", "#c1121f")
-        light = (1.1 - 0.045 * tier) * (0.8 + 8.0 * u)[..., None]
-        body = (np.hypot(u / 0.023, (v + 0.035) / 0.034) < 1.0) | (v < -0.035)
-        head = np.hypot(u / 0.0125, (v - 0.009) / 0.015)
-        picture = np.where(body[..., None], shirt * light, picture)
-        picture = np.where((head < 1.0)[..., None], skin * light, picture)
-        picture = np.where(((head < 1.05) & (v > 0.013))[..., None], hair * light, picture)
-    return picture

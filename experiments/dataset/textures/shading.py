@@ -37,9 +37,7 @@ def chosen(share: np.ndarray, *codes: str) -> np.ndarray:
     return colours(*codes)[index]
 
 
-def lit(
-    picture: Picture, height: Field, *, gloss: float = 0.0, shininess: float = 30.0
-) -> Picture:
+def lit(picture: Picture, height: Field, *, gloss: float = 0.0, shininess: float = 30.0) -> Picture:
     """Returns a picture as a relief in light from the upper left; what is flat is unchanged.
 
     Args:
@@ -72,3 +70,9 @@ def hollows(height: Field, radius: float, *, strength: float) -> Field:
 def vignette(x: Field, y: Field, *, strength: float) -> Field:
     """Returns a factor that falls towards the corners by `strength`."""
     return 1.0 - strength * smooth(0.3, 0.75, np.hypot(x - 0.5, y - 0.5))
+
+
+def linear(picture: np.ndarray) -> np.ndarray:
+    """Returns linear RGB of sRGB values."""
+    low = picture / 12.92
+    return np.where(picture <= 0.04045, low, ((np.maximum(picture, 0.0) + 0.055) / 1.055) ** 2.4)

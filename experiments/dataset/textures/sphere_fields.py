@@ -110,7 +110,8 @@ def cells3(points: Directions, count: int, seed: int) -> SphereCells:
     between = np.linalg.norm(seeds[index[..., 1]] - seeds[index[..., 0]], axis=-1)
     border = (distance[..., 1] ** 2 - distance[..., 0] ** 2) / (2.0 * between)
     return SphereCells(
-        index[..., 0].astype(np.int32), border.astype(np.float32),
+        index[..., 0].astype(np.int32),
+        border.astype(np.float32),
         distance[..., 0].astype(np.float32),
     )
 

@@ -15,7 +15,7 @@ from experiments.dataset.textures.fields import Field, smooth
 Distance = Callable[[Field, Field], Field]
 """From `u` and `v` to the distance outside of the outline, negative within, in the stamp's unit."""
 
-Samples = Float[np.ndarray, "samples"]
+Samples = Float[np.ndarray, " samples"]
 
 Paint = Callable[[Samples, Samples, Samples], Float[np.ndarray, "samples 3"]]
 """From `u`, `v` and the distance of samples within to colours."""
@@ -48,7 +48,7 @@ def stamp(
     *,
     shadow: float = 0.55,
 ) -> None:
-    """Lays a stamp on a picture, in place; what lies beyond the border is cut off.
+    """Lays a stamp on a picture, in place; beyond a border it goes on at the opposite one.
 
     Args:
       picture: to lay on.
@@ -57,6 +57,22 @@ def stamp(
       paint: its colours.
       shadow: how much darker it gets beneath, 0 to 1.
     """
+    reach = _MARGIN * place.size
+    for right in (-1.0, 0.0, 1.0):
+        for down in (-1.0, 0.0, 1.0):
+            x, y = place.x + right, place.y + down
+            if -reach < x < 1.0 + reach and -reach < y < 1.0 + reach:
+                _lay(picture, place._replace(x=x, y=y), distance, paint, shadow)
+
+
+def _lay(
+    picture: Float[np.ndarray, "n n 3"],
+    place: Place,
+    distance: Distance,
+    paint: Paint,
+    shadow: float,
+) -> None:
+    """Lays a stamp, in place; what lies beyond the border is cut off."""
     n = picture.shape[0]
     reach = _MARGIN * place.size
     left, right = _range(place.x - reach, place.x + reach, n)
@@ -71,7 +87,7 @@ def stamp(
     target = picture[top:bottom, left:right]
     if shadow:
         # The shadow is the outline moved by whole samples.
-        right_by, down_by = (int(round(each * place.size * n)) for each in _SHADOW)
+        right_by, down_by = (round(each * place.size * n) for each in _SHADOW)
         beneath = outside[: -down_by or None, : -right_by or None]
         target[down_by:, right_by:] *= (1.0 - shadow * smooth(0.12, -0.06, beneath))[..., None]
     cover = np.clip(0.5 - outside * (n * place.size), 0.0, 1.0)
@@ -82,4 +98,4 @@ def stamp(
 
 
 def _range(low: float, high: float, n: int) -> tuple[int, int]:
-    return max(int(math.floor(low * n)), 0), min(int(math.ceil(high * n)), n)
+    return max(math.floor(low * n), 0), min(math.ceil(high * n), n)

@@ -1,29 +1,60 @@
 """Surfaces put together of pieces: leaded glass, mosaic, Truchet tiles, Penrose's rhombs."""
 
-import math
-
 import numpy as np
-from jaxtyping import Complex, Float
-from PIL import Image, ImageDraw
+from jaxtyping import Int
 
 from experiments.dataset.textures.cells import voronoi
 from experiments.dataset.textures.fields import (
     Field,
     Picture,
+    blend,
     coordinates,
     fbm,
     lookup,
-    blend,
     noise,
     random_of,
     smooth,
 )
-from experiments.dataset.textures.shading import chosen, colour, colours, graded, hollows, lit
+from experiments.dataset.textures.shading import chosen, colour, graded, hollows, lit
 
 
 def stained_glass(n: int) -> Picture:
     """A rose window: rings of petals, and beyond them shards, of streaky glass in lead."""
     x, y = coordinates(n)
+    a, b = x - 0.5, y - 0.5
+    border, piece = _rose(x, y)
+    glasses = (
+        "#0b3fa8",
+        "#b3122a",
+        "#f2b705",
+        "#0f7a4d",
+        "#5b1a8a",
+        "#1aa7c4",
+        "#e4572e",
+        "#e8dfb0",
+        "#102a6b",
+        "#8c1c5a",
+    )
+    glass = chosen(random_of(piece, 4), *glasses)
+    streak = fbm(n, (5, 26), 8, octaves=6, gain=0.62)
+    swirl = fbm(n, 30, 18, octaves=4, gain=0.7)
+    own = 6.283 * random_of(piece, 5)
+    flow = lookup(streak, a * np.cos(own) + b * np.sin(own), b * np.cos(own) - a * np.sin(own))
+    glow = 0.92 + 0.23 * flow + 0.08 * swirl + 0.30 * smooth(0.0, 0.05, border)
+    glow = glow * (0.72 + 0.5 * random_of(piece, 6))
+    glass = blend(glass * glow[..., None], colour("#fff3cf"), 0.35 * smooth(0.9, 2.0, flow))
+    bubbles = voronoi(x, y, (70, 70), 9)
+    dot = np.hypot(bubbles.dx, bubbles.dy) * 70.0 / (0.05 + 0.13 * random_of(bubbles.index, 7))
+    glass = glass * (1.0 + 0.35 * (dot < 1.0) * (random_of(bubbles.index, 8) > 0.6))[..., None]
+    lead = smooth(0.0008, -0.0008, border - 0.0039)
+    height = 0.006 * np.sqrt(np.clip(1.0 - (border / 0.0045) ** 2, 0.0, 1.0))
+    height = height + 0.0008 * flow + 0.0003 * swirl
+    metal = colour("#2b2d31") * (1.0 + 0.15 * fbm(n, 120, 28, octaves=3))[..., None]
+    return lit(blend(glass, metal, lead), height, gloss=0.16)
+
+
+def _rose(x: Field, y: Field) -> tuple[Field, Int[np.ndarray, "h w"]]:
+    """Returns the distance to the nearest lead, and which kind of piece each sample lies in."""
     a, b = x - 0.5, y - 0.5
     radius, turn = np.hypot(a, b), np.arctan2(b, a) / (2.0 * np.pi)
     border, piece = np.full(x.shape, np.inf, np.float32), np.zeros(x.shape, np.int32)
@@ -41,32 +72,17 @@ def stained_glass(n: int) -> Picture:
         here = np.minimum(np.minimum(side, rim), arch)
         index = ring * 400 + np.floor(sector).astype(np.int32) % count * 4
         # Every other petal has the same glass, and the arch another.
-        index = ring * 40 + (index // 4 % 2) * 8 + (
-            (radius - (low + 0.68 * (high - low)) > bow) & (ring > 1)) * 3
+        index = (
+            ring * 40
+            + (index // 4 % 2) * 8
+            + ((radius - (low + 0.68 * (high - low)) > bow) & (ring > 1)) * 3
+        )
         border, piece = np.where(inside, here, border), np.where(inside, index, piece)
     shards = voronoi(x, y, (13, 13), 3, jitter=0.95)
     outer = radius >= rings[-1]
     border = np.where(outer, np.minimum(shards.border, radius - rings[-1]), border)
     piece = np.where(outer, 1000 + shards.index, piece)
-    glasses = ("#0b3fa8", "#b3122a", "#f2b705", "#0f7a4d", "#5b1a8a", "#1aa7c4", "#e4572e",
-               "#e8dfb0", "#102a6b", "#8c1c5a")
-    glass = chosen(random_of(piece, 4), *glasses)
-    streak = fbm(n, (5, 26), 8, octaves=6, gain=0.62)
-    swirl = fbm(n, 30, 18, octaves=4, gain=0.7)
-    own = 6.283 * random_of(piece, 5)
-    flow = lookup(streak, a * np.cos(own) + b * np.sin(own), b * np.cos(own) - a * np.sin(own))
-    glow = 0.92 + 0.23 * flow + 0.08 * swirl + 0.30 * smooth(0.0, 0.05, border)
-    glow = glow * (0.72 + 0.5 * random_of(piece, 6))
-    glass = blend(glass * glow[..., None], colour("#fff3cf"), 0.35 * smooth(0.9, 2.0, flow))
-    bubbles = voronoi(x, y, (70, 70), 9)
-    dot = np.hypot(bubbles.dx, bubbles.dy) * 70.0 / (0.05 + 0.13 * random_of(bubbles.index, 7))
-    glass = glass * (1.0 + 0.35 * (dot < 1.0) * (random_of(bubbles.index, 8) > 0.6))[..., None]
-    width = np.where(outer, 0.0042, 0.0036)
-    lead = smooth(0.0008, -0.0008, border - width)
-    height = 0.006 * np.sqrt(np.clip(1.0 - (border / 0.0045) ** 2, 0.0, 1.0))
-    height = height + 0.0008 * flow + 0.0003 * swirl
-    metal = colour("#2b2d31") * (1.0 + 0.15 * fbm(n, 120, 28, octaves=3))[..., None]
-    return lit(blend(glass, metal, lead), height, gloss=0.16)
+    return border, piece
 
 
 def mosaic(n: int) -> Picture:
@@ -74,8 +90,9 @@ def mosaic(n: int) -> Picture:
     x, y = coordinates(n)
     stones = 86
     wobble = 0.0028
-    cells = voronoi(x + wobble * noise(n, 9, 1), y + wobble * noise(n, 9, 2), (stones, stones), 4,
-                    jitter=0.34)
+    cells = voronoi(
+        x + wobble * noise(n, 9, 1), y + wobble * noise(n, 9, 2), (stones, stones), 4, jitter=0.34
+    )
     picture = _cartoon(x - cells.dx, y - cells.dy)
     stone = picture * (0.72 + 0.5 * random_of(cells.index, 3))[..., None]
     hue = 0.10 * (np.stack([random_of(cells.index, each) for each in (5, 6, 7)], -1) - 0.5)
@@ -84,8 +101,9 @@ def mosaic(n: int) -> Picture:
     stone = (stone + hue) * (1.0 + 0.10 * grain + 0.05 * rough)[..., None]
     cover = smooth(0.0006, 0.0015, cells.border + 0.0003 * rough)
     grout = colour("#8d8473") * (0.8 + 0.12 * grain)[..., None]
-    tilt = ((random_of(cells.index, 11) - 0.5) * cells.dx
-            + (random_of(cells.index, 12) - 0.5) * cells.dy)
+    tilt = (random_of(cells.index, 11) - 0.5) * cells.dx + (
+        random_of(cells.index, 12) - 0.5
+    ) * cells.dy
     height = 0.0022 * smooth(0.0003, 0.0026, cells.border) + 0.30 * tilt + 0.0001 * grain
     floor = lit(blend(grout, stone, cover), height, gloss=0.22, shininess=50.0)
     return 1.08 * floor * hollows(height, 0.004, strength=1.2)[..., None]
@@ -98,8 +116,14 @@ def _cartoon(x: Field, y: Field) -> Picture:
     sea = np.sin(2.0 * np.pi * (9.0 * y + 0.55 * np.sin(2.0 * np.pi * 4.0 * x + 5.0 * y)))
     picture = graded(sea, (-1.0, "#123c69"), (-0.3, "#1f7a8c"), (0.4, "#8ecae6"), (0.8, "#f1faee"))
     rays = 0.30 + 0.05 * np.cos(16.0 * turn + 2.0 * np.sin(14.0 * radius))
-    for share, code in ((1.12, "#2b1d16"), (1.05, "#e9c46a"), (0.85, "#c1440e"), (0.72, "#f4a261"),
-                        (0.60, "#2b1d16"), (0.55, "#f3e5c0")):
+    for share, code in (
+        (1.12, "#2b1d16"),
+        (1.05, "#e9c46a"),
+        (0.85, "#c1440e"),
+        (0.72, "#f4a261"),
+        (0.60, "#2b1d16"),
+        (0.55, "#f3e5c0"),
+    ):
         picture = np.where((radius < share * rays)[..., None], colour(code), picture)
     whorl = np.cos(5.0 * turn + 38.0 * radius)
     core = graded(whorl, (-1.0, "#8c1c13"), (0.0, "#d9822b"), (1.0, "#f8e9c0"))
@@ -139,8 +163,11 @@ def truchet(n: int) -> Picture:
     ground = np.where(divided[..., None], colour("#0f3d5e"), paper)
     ink = np.where(divided[..., None], colour("#f0c75e"), colour("#155e8a"))
     blossom = np.cos(8.0 * ring) * 0.5 + np.cos(40.0 * arc)
-    ground = blend(ground, chosen(random_of(tile, 4), "#c8502f", "#d98b2b", "#2f7f6e", "#7a2f58"),
-                 smooth(0.35, 0.5, blossom) * (arc < 0.30))
+    ground = blend(
+        ground,
+        chosen(random_of(tile, 4), "#c8502f", "#d98b2b", "#2f7f6e", "#7a2f58"),
+        smooth(0.35, 0.5, blossom) * (arc < 0.30),
+    )
     picture = blend(ground, ink, smooth(0.01, -0.01, band))
     dots = np.cos(ring * 16.0) - 30.0 * np.abs(band + 0.166)
     trim = np.where(divided[..., None], colour("#a8321f"), colour("#f6d57a"))
@@ -157,87 +184,3 @@ def truchet(n: int) -> Picture:
     height = 0.003 * smooth(0.0, 0.006, rim) + 0.0007 * smooth(0.02, -0.06, band) / count * 12.0
     height += 0.04 * ((random_of(tile, 9) - 0.5) * u + (random_of(tile, 10) - 0.5) * v) / count
     return lit(picture, height + 0.0001 * grain, gloss=0.28, shininess=60.0)
-
-
-def penrose(n: int) -> Picture:
-    """Penrose's rhombs in coloured stone, with inlaid arcs that continue from tile to tile."""
-    pieces = _rhombs(5)
-    scale = 0.82
-    index = Image.new("I", (n, n), 0)
-    draw = ImageDraw.Draw(index)
-    across = Image.new("L", (n, n), 0)
-    inlay = ImageDraw.Draw(across)
-    kinds = []
-    for number, (thick, corners) in enumerate(pieces, start=1):
-        points = (np.stack([corners.real, corners.imag], -1) * scale + 0.5) * n
-        draw.polygon([tuple(point) for point in points], fill=number)
-        middle = points.mean(0)
-        edge = np.linalg.norm(points[1] - points[0])
-        shrunk = middle + 0.93 * (points - middle)
-        inlay.polygon([tuple(point) for point in shrunk], fill=60)
-        for corner, tone in ((0, 160), (2, 255)):
-            radius = edge * ((0.30 if corner else 0.55) if thick else 0.28)
-            box = [*(points[corner] - radius), *(points[corner] + radius)]
-            ends = [points[(corner + each) % 4] - points[corner] for each in (1, 3)]
-            turns = [math.degrees(math.atan2(end[1], end[0])) for end in ends]
-            span = (turns[1] - turns[0]) % 360.0
-            start, stop = (turns if span < 180.0 else turns[::-1])
-            stop = start + (stop - start) % 360.0
-            inlay.arc(box, start, stop, fill=tone, width=max(int(0.09 * edge), 1))
-        direction = np.angle(corners[2] - corners[0]) / math.pi % 1.0
-        kinds.append((thick, round(direction * 10) % 10, np.abs(corners.mean())))
-    piece, lines = np.asarray(index).astype(np.int64), np.asarray(across)
-    thick, direction, far = (np.array([0, *each]) for each in zip(*kinds, strict=True))
-    warm = colours("#b8432f", "#d9822b", "#8c2f39", "#e3b04b", "#a65a3a")
-    cold = colours("#1d4e89", "#2a9d8f", "#264653", "#5b8e7d", "#3d348b")
-    step = (direction.astype(int) + (far * 9.0).astype(int)) % 5
-    stone = np.where(thick[:, None] > 0, warm[step], cold[step])[piece]
-    return _inlaid(n, stone, piece, lines)
-
-
-def _inlaid(n: int, stone: Picture, piece: np.ndarray, lines: np.ndarray) -> Picture:
-    """Returns tiles with their joints (0), arcs (160, 255) and grain."""
-    grain, cloud = fbm(n, 80, 2, octaves=4, gain=0.75), fbm(n, 6, 3, octaves=7, gain=0.6)
-    x, y = coordinates(n)
-    veins = lookup(cloud, 2.0 * x + random_of(piece, 4), 2.0 * y + random_of(piece, 5))
-    stone = stone * (0.8 + 0.35 * random_of(piece, 6) + 0.14 * veins + 0.06 * grain)[..., None]
-    stone = blend(stone, colour("#f4e8cf"), 0.5 * smooth(0.07, 0.01, np.abs(veins)))
-    brass = graded(cloud, (-2.0, "#8a6a2b"), (0.0, "#d9b65a"), (2.0, "#fff0b8"))
-    pearl = colour("#f2eee6") * (0.9 + 0.08 * veins)[..., None]
-    stone = np.where((lines == 160)[..., None], brass, stone)
-    stone = np.where((lines == 255)[..., None], pearl, stone)
-    joint = lines == 0
-    stone = np.where(joint[..., None], colour("#17130f") * np.ones(3), stone)
-    height = np.where(joint, -0.0018, 0.0) + np.where(lines > 60, 0.0006, 0.0) + 0.0001 * grain
-    return lit(stone, height.astype(np.float32), gloss=0.2, shininess=45.0)
-
-
-def _rhombs(times: int) -> list[tuple[bool, Complex[np.ndarray, "4"]]]:
-    """Returns thick and thin rhombs within the unit square's reach.
-
-    Robinson's triangles (de Bruijn 1981), halved `times` times by the golden ratio: each triangle
-    is half a rhomb, which is completed by mirroring it at its base.
-    """
-    golden = (1.0 + math.sqrt(5.0)) / 2.0
-    turn = math.pi / 10.0
-    halves: list[tuple[bool, complex, complex, complex]] = []
-    for each in range(10):
-        b, c = (complex(math.cos(at), math.sin(at)) for at in
-                ((2 * each - 1) * turn, (2 * each + 1) * turn))
-        halves.append((False, 0j, *((c, b) if each % 2 == 0 else (b, c))))
-    for _ in range(times):
-        finer = []
-        for thick, a, b, c in halves:
-            if thick:
-                q, r = b + (a - b) / golden, b + (c - b) / golden
-                finer += [(True, r, c, a), (True, q, r, b), (False, r, q, a)]
-            else:
-                p = a + (b - a) / golden
-                finer += [(False, c, p, b), (True, p, c, a)]
-        halves = finer
-    whole: dict[tuple[float, float], tuple[bool, Float[np.ndarray, "4"]]] = {}
-    for thick, a, b, c in halves:
-        middle = (b + c) / 2.0
-        key = (round(middle.real, 6), round(middle.imag, 6))
-        whole[key] = (thick, np.array([a, b, b + c - a, c]))
-    return list(whole.values())

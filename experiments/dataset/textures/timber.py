@@ -6,10 +6,10 @@ from jaxtyping import Int
 from experiments.dataset.textures.fields import (
     Field,
     Picture,
+    blend,
     coordinates,
     fbm,
     lookup,
-    blend,
     noise,
     random_of,
     smooth,
@@ -51,10 +51,26 @@ def parquet(n: int) -> Picture:
     across = np.where(lies, fb, fa)
     rim = np.minimum(np.minimum(along, length - along), np.minimum(across, 1.0 - across))
     dark = grain_of(n, along / blocks, across / blocks, board)
-    light = chosen(random_of(board, 1), "#c89158", "#a9683a", "#d9ab6c", "#7a4526", "#b97a45",
-                   "#8f5530", "#e0b67c")
-    deep = chosen(random_of(board, 1), "#7a4a22", "#5d2f17", "#8f6230", "#3b1d10", "#6b3c1c",
-                  "#4a2413", "#94673a")
+    light = chosen(
+        random_of(board, 1),
+        "#c89158",
+        "#a9683a",
+        "#d9ab6c",
+        "#7a4526",
+        "#b97a45",
+        "#8f5530",
+        "#e0b67c",
+    )
+    deep = chosen(
+        random_of(board, 1),
+        "#7a4a22",
+        "#5d2f17",
+        "#8f6230",
+        "#3b1d10",
+        "#6b3c1c",
+        "#4a2413",
+        "#94673a",
+    )
     wood = blend(light, deep, dark) * (0.86 + 0.28 * random_of(board, 2))[..., None]
     wood = wood * smooth(0.0, 0.06, rim)[..., None] ** 0.6
     scratches = smooth(2.3, 3.0, noise(n, (30, 400), 7)) + smooth(2.3, 3.0, noise(n, (400, 30), 8))
@@ -71,14 +87,23 @@ def planks(n: int) -> Picture:
     count = 13
     board = np.floor(x * count).astype(np.int32)
     u = x * count - board
-    knot_x, knot_y, knot = _knots(board, u, y)
+    knot_x, knot = _knots(board, u, y)
     bend = 0.35 * np.exp(-3.0 * knot) * np.sign(knot_x)
     dark = grain_of(n, 0.7 * y, (u + bend) / count, board)
     rings = 0.5 + 0.4 * np.sin(26.0 * knot + 3.0 * dark)
     dark = dark + smooth(0.7, 0.3, knot) * (rings - dark)
     dark = np.where(knot < 0.16, 0.95, dark)
     bare = graded(dark, (0.0, "#b9a78d"), (0.45, "#8a765c"), (1.0, "#3a2c20"))
-    paints = ("#1f7a8c", "#e1dcc8", "#bf3b2b", "#e0a52e", "#2b4c7e", "#5a8f5b", "#d9764a", "#86b9b0")
+    paints = (
+        "#1f7a8c",
+        "#e1dcc8",
+        "#bf3b2b",
+        "#e0a52e",
+        "#2b4c7e",
+        "#5a8f5b",
+        "#d9764a",
+        "#86b9b0",
+    )
     paint = chosen(random_of(board + 3, 4), *paints)
     older = chosen(random_of(board + 3, 9), *paints[3:], *paints[:3])
     flakes = fbm(n, (14, 5), 33, octaves=7, gain=0.72) + 0.9 * (0.5 - dark)
@@ -87,7 +112,7 @@ def planks(n: int) -> Picture:
     strokes = fbm(n, (70, 4), 55, octaves=5, gain=0.75)
     hue = 0.92 + 0.10 * strokes + 0.12 * (0.5 - dark) + 0.08 * noise(n, 9, 66)
     wood = blend(blend(bare, older * 0.8 * hue[..., None], under), paint * hue[..., None], cover)
-    rust = np.exp(-90.0 * np.maximum(y % 0.25 - 0.06, 0.0)) * np.exp(-((u - 0.5) / 0.07) ** 2)
+    rust = np.exp(-90.0 * np.maximum(y % 0.25 - 0.06, 0.0)) * np.exp(-(((u - 0.5) / 0.07) ** 2))
     rust = rust * (y % 0.25 > 0.055) * 0.8
     wood = blend(wood, colour("#6b3414"), rust)
     nail = np.hypot((u - 0.5) / count, y % 0.25 - 0.055)
@@ -99,15 +124,15 @@ def planks(n: int) -> Picture:
     return boards * hollows(height, 0.006, strength=0.7)[..., None]
 
 
-def _knots(board: Int[np.ndarray, "h w"], u: Field, y: Field) -> tuple[Field, Field, Field]:
-    """Returns the way from the nearest of three knots a board, and its length: 1 is 0.4 widths."""
+def _knots(board: Int[np.ndarray, "h w"], u: Field, y: Field) -> tuple[Field, Field]:
+    """Returns how far right the nearest of three knots a board is, and how far: 1 is 0.4 widths."""
     nearest = np.full(u.shape, np.inf, np.float32)
-    nearest_x, nearest_y = np.zeros_like(nearest), np.zeros_like(nearest)
+    nearest_x = np.zeros_like(nearest)
     for each in range(3):
         dx = (u - 0.2 - 0.6 * random_of(board, 70 + each)) / 0.4
         dy = (y - (each + random_of(board, 80 + each)) / 3.0) * 13.0 / 0.7
         distance = np.hypot(dx, dy)
         nearer = distance < nearest
         nearest = np.where(nearer, distance, nearest)
-        nearest_x, nearest_y = np.where(nearer, dx, nearest_x), np.where(nearer, dy, nearest_y)
-    return nearest_x, nearest_y, nearest
+        nearest_x = np.where(nearer, dx, nearest_x)
+    return nearest_x, nearest

@@ -1,0 +1,136 @@
+"""Writes the background of a scene, and describes it as `refref_jax.data.background` reads it.
+
+A *kind* is `cube` (six different of the 24 faces), `sphere` (one of the 13) or `env` (one of the
+environments). An equirectangular image has +x in its middle column and -x at its seam: a unit
+direction lies at `u = 0.5 - atan2(y, x) / (2 pi)`, `v = 0.5 + asin(z) / pi`, `v` from the bottom.
+A wall's point lies at `half_extent (normal + (2u - 1) u_axis + (2v - 1) v_axis)`.
+"""
+
+import functools
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from experiments.dataset.landscapes import ENVIRONMENTS, make_environment
+from experiments.dataset.textures.faces import FACES, SIZE, make_face
+from experiments.dataset.textures.spheres import HEIGHT, SPHERES, make_sphere
+from refref_jax.data import files
+
+Kind = Literal["cube", "sphere", "env"]
+
+KINDS: tuple[Kind, ...] = ("cube", "sphere", "env")
+
+HALF_EXTENT = 7.3
+"""Of the cube, and radius of the sphere, world units."""
+
+FOLDER = "background"
+
+# Names of walls, with normal, u axis and v axis.
+_WALLS: dict[str, tuple[tuple[float, ...], ...]] = {
+    "+x": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    "-x": ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
+    "+y": ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "-y": ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "+z": ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    "-z": ((0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.0, -1.0, 0.0)),
+}
+
+_WALL_MAPPING = (
+    "point = half_extent*(normal + (2u-1)*u_axis + (2v-1)*v_axis); v = 0 is the image's bottom "
+    "row; texels are sRGB"
+)
+_AROUND = (
+    "u = 0.5 - atan2(y, x)/(2 pi) mod 1, v = 0.5 + asin(z)/pi for a unit direction {where}; v = 0 "
+    "is the image's bottom row; bilinear; {texels}"
+)
+_SPHERE_MAPPING = _AROUND.format(where="from the origin to the wall", texels="texels are sRGB")
+_ENVIRONMENT_MAPPING = _AROUND.format(where="", texels="linear RGB, infinitely distant").replace(
+    " ;", ";"
+)
+
+
+def write_background(
+    scene: Path, kind: Kind, *, seed: int, size: int | None = None
+) -> dict[str, Any]:
+    """Writes the images of a background into `scene/background/`.
+
+    Each file appears whole or not at all. The images of a name and size are always the same, and
+    are made once in a process.
+
+    Args:
+      scene: its folder; is made if need be.
+      kind: of background.
+      seed: decides which pictures; any integer that is not negative.
+      size: rows of each image; 1024 if `None`.
+
+    Returns:
+      The record `background` of `scene.json`; `texture` in it names the picture.
+
+    Raises:
+      ValueError: if there is no such kind, or the size is below 16.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"There is no background {kind!r}. Choose from {', '.join(KINDS)}.")
+    rng = np.random.default_rng(seed)
+    (scene / FOLDER).mkdir(parents=True, exist_ok=True)
+    return {"cube": _write_cube, "sphere": _write_sphere, "env": _write_environment}[kind](
+        scene, rng, size
+    )
+
+
+def _write_cube(scene: Path, rng: np.random.Generator, size: int | None) -> dict[str, Any]:
+    names = rng.choice(list(FACES), len(_WALLS), replace=False).tolist()
+    faces = {}
+    for (wall, (normal, u_axis, v_axis)), name in zip(_WALLS.items(), names, strict=True):
+        image = f"{FOLDER}/face_{wall}.png"
+        _replace(scene / image, files.write_rgb, _face(name, size or SIZE) / 255.0)
+        faces[wall] = {
+            "image": image,
+            "normal": list(normal),
+            "u_axis": list(u_axis),
+            "v_axis": list(v_axis),
+            "texture": name,
+        }
+    return {"type": "cube", "half_extent": HALF_EXTENT, "faces": faces, "mapping": _WALL_MAPPING}
+
+
+def _write_sphere(scene: Path, rng: np.random.Generator, size: int | None) -> dict[str, Any]:
+    name, image = str(rng.choice(list(SPHERES))), f"{FOLDER}/sphere.png"
+    _replace(scene / image, files.write_rgb, _sphere(name, size or HEIGHT) / 255.0)
+    record = {"type": "sphere", "radius": HALF_EXTENT, "image": image, "texture": name}
+    return record | {"mapping": _SPHERE_MAPPING}
+
+
+def _write_environment(scene: Path, rng: np.random.Generator, size: int | None) -> dict[str, Any]:
+    name, image = str(rng.choice(list(ENVIRONMENTS))), f"{FOLDER}/env.exr"
+    _replace(scene / image, files.write_exr, _environment(name, size or HEIGHT))
+    return {"type": "env", "image": image, "texture": name, "mapping": _ENVIRONMENT_MAPPING}
+
+
+def _replace(
+    path: Path, write: Callable[[Path, np.ndarray], None], pixels: Float[np.ndarray, "h w 3"]
+) -> None:
+    """Writes a file beside its place, and moves it there when it is whole."""
+    whole = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    write(whole, pixels)
+    os.replace(whole, path)
+
+
+# Bytes, since a worker keeps the pictures of all its scenes.
+@functools.cache
+def _face(name: str, size: int) -> UInt8[np.ndarray, "size size 3"]:
+    return files.to_bytes(make_face(name, size))
+
+
+@functools.cache
+def _sphere(name: str, height: int) -> UInt8[np.ndarray, "height width 3"]:
+    return files.to_bytes(make_sphere(name, height))
+
+
+@functools.cache
+def _environment(name: str, height: int) -> Float[np.ndarray, "height width 3"]:
+    return make_environment(name, height)

@@ -1,0 +1,89 @@
+"""The pool of square pictures for the walls of cubes."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from experiments.dataset.textures import (
+    books,
+    cloth,
+    drawn,
+    masonry,
+    minerals,
+    painted,
+    penrose_tiles,
+    plants,
+    posters,
+    tilings,
+    timber,
+)
+from experiments.dataset.textures.fields import Picture
+
+SIZE = 1024
+"""Usual samples a side."""
+
+
+class Face(NamedTuple):
+    """How a picture is made.
+
+    Attributes:
+      paint: from samples a side to sRGB values, which may lie a little outside 0 to 1.
+      samples: per pixel a side. Pictures made of stamps have soft outlines anyway.
+    """
+
+    paint: Callable[[int], Picture]
+    samples: int = 2
+
+
+FACES: dict[str, Face] = {
+    "brick": Face(masonry.brick),
+    "cobbles": Face(masonry.cobbles),
+    "pebbles": Face(masonry.pebbles, samples=1),
+    "shingles": Face(masonry.shingles),
+    "terrazzo": Face(masonry.terrazzo),
+    "parquet": Face(timber.parquet),
+    "planks": Face(timber.planks),
+    "marble": Face(minerals.marble),
+    "rust": Face(minerals.rust),
+    "turing": Face(minerals.turing),
+    "jacquard": Face(cloth.jacquard),
+    "tartan": Face(cloth.tartan),
+    "carpet": Face(cloth.carpet),
+    "stained_glass": Face(tilings.stained_glass),
+    "mosaic": Face(tilings.mosaic),
+    "truchet": Face(tilings.truchet),
+    "penrose": Face(penrose_tiles.penrose),
+    "leaves": Face(plants.leaves, samples=1),
+    "flowers": Face(plants.flowers, samples=1),
+    "bookshelf": Face(books.bookshelf),
+    "posters": Face(posters.posters),
+    "contours": Face(drawn.contours),
+    "circuit": Face(drawn.circuit),
+    "painting": Face(painted.painting),
+}
+
+
+def make_face(name: str, size: int = SIZE) -> Float[np.ndarray, "size size 3"]:
+    """Returns a picture, sRGB from 0 to 1 in float32, row 0 at the top.
+
+    Args:
+      name: one of `FACES`.
+      size: samples a side, 16 or more.
+
+    Raises:
+      ValueError: if there is no such picture, or the size is too small.
+    """
+    if name not in FACES:
+        raise ValueError(f"There is no face {name!r}. Choose from {', '.join(FACES)}.")
+    require_size(size)
+    face = FACES[name]
+    fine = np.clip(face.paint(size * face.samples), 0.0, 1.0).astype(np.float32)
+    return fine.reshape(size, face.samples, size, face.samples, 3).mean((1, 3))
+
+
+def require_size(size: int) -> None:
+    """Raises ValueError if a picture of so few samples would show nothing."""
+    if size < 16:
+        raise ValueError(f"A picture of {size} samples shows nothing. Ask for 16 or more.")
