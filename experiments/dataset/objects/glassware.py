@@ -17,18 +17,14 @@ MARK_SPACING = 0.3
 
 def beaker(*, level: float, wall: float = 0.052, film: float = FILM) -> Filled:
     """Returns a low beaker, 2.72 high, as the Griffin beakers of 250 ml: 70 mm wide, 95 mm high."""
-    outline = region(
-        filleted((0, 0), (1.0, 0, 0.16), (1.0, 2.5, 0.3), (1.09, 2.72), (0, 2.72))
-    )
+    outline = region(filleted((0, 0), (1.0, 0, 0.16), (1.0, 2.5, 0.3), (1.09, 2.72), (0, 2.72)))
     space = space_in(outline, wall=wall, corner=0.12, mouth=open_mouth(outline, wall=wall))
     return filled(outline, space, level=level, rim=0.45 * wall, film=film)
 
 
 def conical_flask(*, level: float, wall: float = 0.052, film: float = FILM) -> Filled:
     """Returns an Erlenmeyer flask, 3.2 high, as those of 250 ml: 85 mm wide, 145 mm high."""
-    outline = region(
-        filleted((0, 0), (1.02, 0, 0.14), (0.35, 2.3, 0.4), (0.35, 3.2), (0, 3.2))
-    )
+    outline = region(filleted((0, 0), (1.02, 0, 0.14), (0.35, 2.3, 0.4), (0.35, 3.2), (0, 3.2)))
     return _beaded(outline, 0.4, level, wall, film)
 
 
@@ -48,12 +44,12 @@ def test_tube(*, level: float, wall: float = 0.05, film: float = FILM) -> Filled
 
 
 def graduated_cylinder(*, level: float, wall: float = 0.05, film: float = FILM) -> Filled:
-    """Returns a graduated cylinder, 3.6 high, with raised rings; `hexagonal_foot` shapes its foot."""
+    """Returns a graduated cylinder, 3.6 high, with raised rings; see `hexagonal_foot`."""
     outline = region(
         filleted(
             (0, 0),
-            (0.74, 0, 0.05),
-            (0.74, 0.16, 0.06),
+            (0.7, 0, 0.05),
+            (0.7, 0.16, 0.06),
             (0.42, 0.24, 0.1),
             (0.34, 0.42, 0.12),
             (0.34, 3.46, 0.2),

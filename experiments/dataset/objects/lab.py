@@ -1,7 +1,5 @@
 """Glassware of a laboratory, each with a liquid."""
 
-import numpy as np
-
 from experiments.dataset.objects.glassware import (
     beaker,
     conical_flask,
@@ -39,7 +37,7 @@ def _make_round_bottom_flask(detail: float) -> list[Part]:
 
 
 def _make_graduated_cylinder(detail: float) -> list[Part]:
-    cut = sampling(detail, segments=72)
+    cut = sampling(0.85 * detail, segments=76)
     turned = Turned(section_angles(polygon(6, 0.2), cut), hexagonal_foot)
     return centred(vessel(graduated_cylinder(level=2.25), cut, liquid=_PINK, turned=turned))
 

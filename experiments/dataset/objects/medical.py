@@ -8,20 +8,18 @@ from experiments.dataset.objects.regions import Region, box, region, ring, round
 from experiments.dataset.objects.revolve import (
     Turned,
     Values,
+    even_angles,
     faded,
     ramp,
     round_about,
-    sectioned,
     waves,
+    within,
 )
 from experiments.dataset.objects.vessels import (
-    GLASS,
-    Filled,
     Look,
     body,
     cap,
     filled,
-    hollow,
     open_mouth,
     sealed,
     space_in,
@@ -71,12 +69,12 @@ def _make_vial(detail: float) -> list[Part]:
     mouth = open_mouth(outline, wall=0.06)
     space = space_in(outline, wall=0.06, floor=0.1, corner=0.1, mouth=mouth)
     cut = sampling(detail)
-    lid = cap(0.7, low=2.66, high=3.26, bore=0.56, ceiling=3.04, edge=0.04)
-    knurled = faded(waves(36, 0.045), lambda r, z: ramp(r, 0.6, 0.68))
+    lid = cap(0.7, low=2.66, high=3.26, bore=0.572, ceiling=3.052, edge=0.04)
+    knurled = faded(waves(24, 0.05), lambda r, z: ramp(r, 0.6, 0.68))
     return centred(
         [
             *vessel(filled(outline, space, level=1.75, rim=0.026), cut, liquid=_CYAN),
-            body("cap", _CAP, lid, cut, turned=Turned(_even(cut.segments * 2), knurled)),
+            body("cap", _CAP, lid, cut, turned=Turned(even_angles(cut, lobes=24), knurled)),
         ]
     )
 
@@ -87,7 +85,7 @@ def _make_syringe(detail: float) -> list[Part]:
     barrel, space = _barrel()
     shapes = filled(barrel, space, level=0.98, rim=0.024, meniscus=0.03)
     grip = round_about(cut)._replace(warp=_finger_grip)
-    cross = faded(waves(4, 0.4, sharpness=-0.3), lambda r, z: _between(z, 1.3, 2.72))
+    cross = faded(waves(4, 0.4, sharpness=-0.3), lambda r, z: within(z, 1.3, 2.72, soft=0.12))
     parts = [
         body("barrel", _PLASTIC, shapes.glass, cut, turned=grip),
         body("liquid", _CLEAR_BLUE, shapes.liquid, cut),
@@ -126,14 +124,6 @@ def _finger_grip(angle: Values, r: Values, z: Values) -> Values:
     """Warps the flange to an oval; the barrel stays round."""
     beyond = np.maximum(r - 0.34, 0.0)
     return r - beyond * 0.8 * np.sin(angle) ** 2
-
-
-def _between(z: Values, low: float, high: float) -> Values:
-    return ramp(z, low, low + 0.12) * (1.0 - ramp(z, high - 0.12, high))
-
-
-def _even(count: int) -> Values:
-    return np.arange(count) * (2.0 * np.pi / count)
 
 
 OBJECTS = (

@@ -20,6 +20,12 @@ def merged(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
+def united(parts: Sequence[Part]) -> Part:
+    """Returns parts of one look, which are apart, as one part with the name of the first."""
+    vertices, faces = merged([(part.vertices, part.faces) for part in parts])
+    return parts[0]._replace(vertices=vertices, faces=faces)
+
+
 def moved(parts: Sequence[Part], by: tuple[float, float, float]) -> list[Part]:
     """Returns parts moved by a vector, in world units."""
     return [part._replace(vertices=part.vertices + np.asarray(by)) for part in parts]

@@ -78,7 +78,8 @@ def filleted(*corners: Corner) -> Curve:
     ways = sides / lengths[:, None]
     turns = np.zeros(len(points))
     turns[1:-1] = np.arctan2(
-        ways[:-1, 0] * ways[1:, 1] - ways[:-1, 1] * ways[1:, 0], np.sum(ways[:-1] * ways[1:], axis=1)
+        ways[:-1, 0] * ways[1:, 1] - ways[:-1, 1] * ways[1:, 0],
+        np.sum(ways[:-1] * ways[1:], axis=1),
     )
     used = radii * np.abs(np.tan(turns / 2.0))
     if np.any(crowded := used[:-1] + used[1:] > lengths * (1.0 + 1e-9)):

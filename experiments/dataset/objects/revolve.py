@@ -39,7 +39,13 @@ class Turned(NamedTuple):
 
 def round_about(cut: Sampling) -> Turned:
     """Returns what turns a profile into a surface of revolution."""
-    return Turned(np.arange(cut.segments) * (_TAU / cut.segments))
+    return Turned(even_angles(cut))
+
+
+def even_angles(cut: Sampling, *, lobes: int = 1) -> Float[np.ndarray, " segments"]:
+    """Returns evenly spaced angles, as many for each of some lobes, and enough to show them."""
+    count = lobes * int(np.ceil(max(cut.segments / lobes, 6.0)))
+    return np.arange(count) * (_TAU / count)
 
 
 def sectioned(cut: Sampling, section: Section, *, twist: float = 0.0) -> Turned:
@@ -61,6 +67,11 @@ def ramp(value: Values, low: float, high: float) -> Values:
     """Returns 0 below a range, 1 above it, and a smooth step between."""
     share = np.clip((value - low) / (high - low), 0.0, 1.0)
     return share * share * share * (10.0 - 15.0 * share + 6.0 * share * share)
+
+
+def within(value: Values, low: float, high: float, *, soft: float) -> Values:
+    """Returns 1 in a range, 0 outside of it, and a smooth step over a length inside its ends."""
+    return ramp(value, low, low + soft) * (1.0 - ramp(value, high - soft, high))
 
 
 def polygon(sides: int, corner: float) -> Section:
@@ -103,9 +114,14 @@ def waves(count: int, depth: float, *, sharpness: float = 0.0) -> Section:
     return factor
 
 
-def ellipse(ratio: float) -> Section:
-    """Returns an ellipse of half axis 1 along angle 0, and `ratio` across."""
-    return lambda angle: 1.0 / np.hypot(np.cos(angle), np.sin(angle) / ratio)
+def stretched(section: Section, ratio: float) -> Section:
+    """Returns a section that is made wider across angle 0 by a ratio, or narrower below 1."""
+
+    def factor(angle: Values) -> Values:
+        along, across = np.cos(angle), np.sin(angle) / ratio
+        return section(np.arctan2(across, along)) / np.hypot(along, across)
+
+    return factor
 
 
 def section_angles(section: Section, cut: Sampling) -> Float[np.ndarray, " segments"]:

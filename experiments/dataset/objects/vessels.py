@@ -6,7 +6,6 @@ the space; a sealed one is solid but for the liquid and the air in it, with a fi
 every surface lies strictly inside another or apart from it, and light is bent as in the real thing.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +19,6 @@ from experiments.dataset.objects.regions import (
     box,
     offset,
     profiles,
-    region,
     rounded,
     top,
 )
