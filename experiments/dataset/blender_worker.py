@@ -62,7 +62,10 @@ def _render(bpy: Any, path: str, samples: int, seed: int) -> None:
     scene.cycles.seed = seed
     scene.render.filepath = path
     scene.render.use_file_extension = False
+    Path(path).unlink(missing_ok=True)
     bpy.ops.render.render(write_still=True)
+    if not Path(path).is_file():
+        raise OSError(f"Blender did not write {path}")
 
 
 def _take_over_output() -> TextIO:

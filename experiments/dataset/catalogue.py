@@ -2,20 +2,28 @@
 
 import importlib
 import pkgutil
+from pathlib import Path
 
 from experiments.dataset import objects
-from experiments.dataset.parts import Object
+from experiments.dataset.objects import monkey
+from experiments.dataset.parts import Object, Part
+
+SUZANNE = Path(__file__).parents[2] / "build" / "suzanne.npz"
+"""Where the monkey's mesh is, when `blender_meshes` has made it."""
+
+_ORDER = {"smcvx": 0, "smncvx": 1, "mmncvx": 2}
 
 
 def gather() -> dict[str, Object]:
     """Returns the objects by name, ordered by category and name.
 
-    They are the tuples `OBJECTS` of the modules; a module without one only lends to others.
+    They are the tuples `OBJECTS` of the modules, and the monkey, which can only be made when its
+    mesh is there. A module without such a tuple lends to others.
 
     Raises:
       ValueError: if two objects have one name.
     """
-    found: dict[str, Object] = {}
+    found = {"monkey": Object("monkey", "smncvx", _make_monkey)}
     for module in pkgutil.iter_modules(objects.__path__, f"{objects.__name__}."):
         for item in getattr(importlib.import_module(module.name), "OBJECTS", ()):
             if item.name in found:
@@ -26,7 +34,9 @@ def gather() -> dict[str, Object]:
     return dict(sorted(found.items(), key=lambda pair: (_ORDER[pair[1].category], pair[0])))
 
 
-_ORDER = {"smcvx": 0, "smncvx": 1, "mmncvx": 2}
+def _make_monkey(detail: float) -> list[Part]:
+    return monkey.monkey(monkey.load_suzanne(SUZANNE)).make(detail)
+
 
 OBJECTS: dict[str, Object] = gather()
 """Every object by its name."""

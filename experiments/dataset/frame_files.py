@@ -116,8 +116,7 @@ def read_rendering(colour: Path, geometry: Path) -> Rendering:
     """Reads the two files that `blender_worker` writes of a view.
 
     Raises:
-      SceneError: if a file is missing or broken.
-      ValueError: if a colour is not finite.
+      ValueError: if a file is missing or broken, or a colour is not finite.
     """
     linear = _read_layers(colour)["Combined"][..., :3]
     if not np.all(np.isfinite(linear)):
@@ -147,12 +146,18 @@ def to_published_depth(depth: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, 
 
 def _read_layers(path: Path) -> dict[str, np.ndarray]:
     """Returns the channels of all parts of an EXR."""
-    with OpenEXR.File(str(path)) as file:
-        return {
-            name.removeprefix(_LAYER): channel.pixels.astype(np.float32)
-            for part in file.parts
-            for name, channel in part.channels.items()
-        }
+    try:
+        with OpenEXR.File(str(path)) as file:
+            return {
+                name.removeprefix(_LAYER): channel.pixels.astype(np.float32)
+                for part in file.parts
+                for name, channel in part.channels.items()
+            }
+    except Exception as error:  # OpenEXR raises what its C++ core does
+        raise ValueError(
+            f"{path} can not be read ({error}). Look whether the disk is full; the same command "
+            "goes on where this one stopped."
+        ) from error
 
 
 def _png(pixels: UInt8[np.ndarray, "h w *channels"]) -> Callable[[Path], None]:

@@ -17,6 +17,7 @@ from absl import flags
 
 from experiments import commands
 from experiments.dataset import (
+    blender_meshes,
     cameras,
     catalogue,
     contact_sheet,
@@ -78,6 +79,8 @@ def main() -> None:
             "the Python of an environment that has bpy 5.0.1 as --blender."
         )
     out = Path(_OUT.value) / "preview" if _PREVIEW.value else Path(_OUT.value)
+    if any(scene.object == "monkey" for scene in chosen):
+        blender_meshes.export_monkey(catalogue.SUZANNE, blender=blender)
     interrupt = commands.Interrupt()
     whole = production.produce(
         out,

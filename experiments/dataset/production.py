@@ -13,7 +13,7 @@ from experiments import commands
 from experiments.dataset import frame_files, scene_setup, views
 from experiments.dataset.parts import Object
 from experiments.dataset.render_settings import RenderSettings
-from experiments.dataset.workers import Pool
+from experiments.dataset.worker_pool import Pool
 from refref_jax.data.scene_names import SceneName
 
 _SCRATCH = ".scratch"

@@ -1,16 +1,12 @@
-"""Runs Blender in processes of its own, and gives them views to render.
+"""Blender in a process of its own, which renders one view after the other.
 
-What is spoken with them is told in `blender_worker`. Which process renders a view, and when, does
-not show in it.
+What is spoken with it is told in `blender_worker`.
 """
 
 import json
-import queue
 import signal
 import subprocess
-import sys
-import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -150,105 +146,3 @@ class Worker:
         lines = self.log.read_text(encoding="utf-8", errors="replace").split("\n")
         said = [line.strip() for line in lines if line.strip()]
         return f"{how}, having said: {said[-1]}" if said else how
-
-
-class Pool:
-    """Processes that share the views between them.
-
-    Used as a context, it leaves no process behind.
-    """
-
-    def __init__(
-        self, tasks: Iterable[Task], *, blender: Path, scratch: Path, workers: int, threads: int
-    ) -> None:
-        """Describes a pool; `run` starts it.
-
-        Args:
-          tasks: views, taken one by one as processes get free, from several threads in turn.
-          blender: Python that has bpy.
-          scratch: existing folder for files that come and go.
-          workers: number of processes.
-          threads: of each.
-        """
-        self._tasks, self._taking = iter(tasks), threading.Lock()
-        self._command = [str(blender), str(SCRIPT)]
-        self._scratch, self._workers, self._threads = scratch, workers, threads
-        self._done: queue.SimpleQueue[Task | Exception | None] = queue.SimpleQueue()
-        self._stopping = threading.Event()
-        self._alive: dict[str, Worker] = {}
-        self._changing = threading.Lock()
-
-    def run(self) -> Iterator[Task]:
-        """Renders all views, and yields each when it is finished.
-
-        Raises:
-          BlenderError: if a view can not be rendered; a process that dies is replaced once.
-          ValueError: whatever taking a task raises.
-        """
-        for number in range(self._workers):
-            threading.Thread(target=self._work, args=(f"worker_{number}",), daemon=True).start()
-        working = self._workers
-        while working:
-            done = self._done.get()
-            if done is None:
-                working -= 1
-            elif isinstance(done, Exception):
-                raise done
-            else:
-                yield done
-
-    def stop(self) -> None:
-        """Lets `run` end after the views that are being rendered."""
-        self._stopping.set()
-
-    def __enter__(self) -> "Pool":
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.stop()
-        with self._changing:
-            for worker in self._alive.values():
-                worker.kill()
-            self._alive.clear()
-
-    def _work(self, name: str) -> None:
-        """Renders views one after the other, until there are no more."""
-        try:
-            worker = self._start(name)
-            while (task := self._take()) is not None:
-                try:
-                    worker.render(task)
-                except WorkerDiedError as error:
-                    if self._stopping.is_set():
-                        break
-                    print(f"{task.name}: Blender ended, {error}. Once more.", file=sys.stderr)
-                    worker = self._start(name)
-                    self._render_again(worker, task)
-                self._done.put(task)
-        except Exception as error:  # is raised where the results are awaited
-            self._done.put(error)
-        self._done.put(None)
-
-    def _render_again(self, worker: Worker, task: Task) -> None:
-        try:
-            worker.render(task)
-        except WorkerDiedError as error:
-            raise BlenderError(
-                f"Blender ended twice while it rendered {task.name}: {error}. See {worker.log}; "
-                "the same command goes on where this one stopped."
-            ) from error
-
-    def _start(self, name: str) -> Worker:
-        with self._changing:
-            if self._stopping.is_set():
-                raise BlenderError("No process is started any more. Start the command again.")
-            worker = Worker(self._command, scratch=self._scratch, name=name, threads=self._threads)
-            self._alive[name] = worker
-        worker.check_version()
-        return worker
-
-    def _take(self) -> Task | None:
-        if self._stopping.is_set():
-            return None
-        with self._taking:
-            return next(self._tasks, None)

@@ -1,5 +1,6 @@
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from experiments.dataset import frame_files
 from refref_jax.data import files
@@ -33,3 +34,9 @@ def test_half_precision_does_not_overflow(tmp_path):
     assert not frame_files.is_done(tmp_path, "test", 8, linear=False)
     written = files.read_exr(tmp_path / "test" / "r_007.exr")
     assert np.all(written == 65504.0)
+
+
+def test_a_broken_rendering_is_told(tmp_path):
+    (tmp_path / "colour.exr").write_bytes(b"v/1\x01")
+    with pytest.raises(ValueError, match=r"colour\.exr can not be read .*goes on"):
+        frame_files.read_rendering(tmp_path / "colour.exr", tmp_path / "geometry.exr")

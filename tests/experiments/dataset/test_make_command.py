@@ -1,5 +1,8 @@
 """The command's options, before and after anything is rendered."""
 
+import pytest
+
+from experiments.dataset import blender_meshes
 from tests.experiments.command import run_command
 
 
@@ -12,3 +15,12 @@ def test_mistakes_end_before_anything_is_made(tmp_path):
         result = run_command("dataset.make", f"--out={out}", *options, fails=True)
         assert said in result.stderr and "Traceback" not in result.stderr
     assert not out.exists()
+
+
+def test_a_monkey_that_is_there_is_kept_and_one_that_can_not_be_made_is_told(tmp_path):
+    path = tmp_path / "build" / "monkey.npz"
+    with pytest.raises(ValueError, match=r"monkey's mesh .*make dataset-env"):
+        blender_meshes.export_monkey(path, blender="/bin/false")
+    path.write_bytes(b"kept")
+    blender_meshes.export_monkey(path, blender="/bin/false")
+    assert path.read_bytes() == b"kept"

@@ -1,0 +1,29 @@
+"""Gets from Blender the one mesh that is its own: the monkey's."""
+
+import subprocess
+from pathlib import Path
+
+_SCRIPT = Path(__file__).with_name("export_monkey.py")
+
+
+def export_monkey(path: Path, *, blender: Path) -> None:
+    """Writes the monkey's mesh, if it is not there.
+
+    Args:
+      path: of the file, as `catalogue.SUZANNE`.
+      blender: Python that has bpy.
+
+    Raises:
+      ValueError: if Blender fails.
+    """
+    if path.exists():
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    command = [str(blender), str(_SCRIPT), str(path)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode != 0:
+        said = (result.stderr.strip().splitlines() or ["nothing"])[-1]
+        raise ValueError(
+            f"Blender can not write its monkey's mesh to {path} ({said}). Run make dataset-env, or "
+            "leave the monkey out."
+        )
