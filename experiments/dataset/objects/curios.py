@@ -55,7 +55,7 @@ def _magnifier() -> Field:
 def _skull_bottle() -> Field:
     cranium = union(
         ellipsoid((0.0, 0.22, 0.34), (0.84, 1.04, 0.82)),
-        ellipsoid((0.0, -0.3, 0.24), (0.7, 0.64, 0.6)),
+        ellipsoid((0.0, -0.25, 0.32), (0.68, 0.58, 0.56)),
         blend=0.2,
     )
     face = union(
@@ -64,15 +64,16 @@ def _skull_bottle() -> Field:
         ellipsoid((0.0, -0.66, -0.64), (0.4, 0.36, 0.32)),
         ellipsoid((0.0, -0.66, -1.0), (0.36, 0.3, 0.2)),
         *both_sides(
-            ellipsoid((0.48, -0.66, -0.22), (0.2, 0.2, 0.15)),
-            limb((0.7, 0.1, -0.12, 0.08), (0.7, -0.25, -0.18, 0.09), (0.56, -0.6, -0.22, 0.11)),
+            ellipsoid((0.45, -0.7, -0.27), (0.18, 0.18, 0.13)),
+            limb((0.7, 0.1, -0.12, 0.08), (0.7, -0.25, -0.2, 0.08), (0.54, -0.58, -0.27, 0.09)),
             limb((0.58, 0.05, -0.35, 0.13), (0.5, -0.15, -0.85, 0.15), (0.26, -0.6, -1.0, 0.16)),
-            limb((0.62, -0.62, 0.14, 0.09), (0.36, -0.84, 0.27, 0.1), (0.1, -0.92, 0.2, 0.1)),
+            limb((0.62, -0.54, 0.2, 0.08), (0.36, -0.74, 0.36, 0.09), (0.1, -0.8, 0.28, 0.09)),
+            limb((0.09, -0.78, 0.28, 0.09), (0.07, -0.95, -0.02, 0.07)),
         ),
         blend=0.2,
     )
     features = both_sides(
-        ellipsoid((0.34, -0.94, 0.0), (0.24, 0.34, 0.21)),
+        ellipsoid((0.34, -0.92, 0.05), (0.23, 0.4, 0.23)),
         limb((0.03, -1.1, -0.14, 0.06), (0.1, -1.02, -0.36, 0.095)),
         ellipsoid((0.98, -0.35, 0.22), (0.16, 0.4, 0.34)),
     )
@@ -98,18 +99,19 @@ def _skull_bottle() -> Field:
 
 def _between_teeth() -> Field:
     """Returns grooves: between the rows of teeth, and between the teeth of both."""
-    row = limb((-0.36, -0.8, -0.76, 0.03), (0.0, -1.06, -0.78, 0.03), (0.36, -0.8, -0.76, 0.03))
+    row = limb((-0.36, -0.8, -0.76, 0.035), (0.0, -1.06, -0.78, 0.035), (0.36, -0.8, -0.76, 0.035))
     gaps = []
     for x in np.linspace(-0.27, 0.27, 6).tolist():
         y = -1.07 + 0.9 * x**2 + 0.02
         gaps.append(
-            limb((x, y + 0.04, -0.58, 0.025), (x, y, -0.78, 0.028), (x, y + 0.06, -0.98, 0.025))
+            limb((x, y + 0.04, -0.58, 0.032), (x, y, -0.78, 0.036), (x, y + 0.06, -0.98, 0.032))
         )
     return union(row, *gaps)
 
 
 def _generic_sculpture() -> Field:
-    turn = 2.0 * np.pi * np.arange(_KNOT_POINTS + 1) / _KNOT_POINTS
+    # A few points come twice, so that there are neighbours on both sides of the seam.
+    turn = 2.0 * np.pi * np.arange(-4, _KNOT_POINTS + 5) / _KNOT_POINTS
     away = _KNOT_RING + _KNOT_AWAY * np.cos(3.0 * turn)
     curve = np.stack(
         [away * np.cos(2.0 * turn), _KNOT_AWAY * np.sin(3.0 * turn), away * np.sin(2.0 * turn)],

@@ -17,7 +17,7 @@ from experiments.dataset.parts import CLEAR, NO_ABSORPTION, RADIUS, Category, Co
 WALL = 0.09
 """Least thickness of the glass around a core."""
 
-# Of the cube that is looked at, beyond the largest radius: figures are scaled only afterwards.
+# Of the cube that is looked at, beyond the largest radius: solids are scaled only afterwards.
 _MARGIN = 0.4
 
 # At detail 1.
@@ -26,11 +26,13 @@ _SPACING = 0.036
 # A wall is sure to be found where the grid has a point in it.
 _OF_THINNEST = 0.75
 
-# A core's grid, the width of the Gaussian that smooths it there, and the edge between what that
-# gives and the least wall.
-_CORE_SPACING = 0.07
-_CORE_SMOOTHING = 0.09
-_CORE_BLEND = 0.06
+# Widths of the Gaussians that round all of a solid, and a core; and of the grids for that.
+_SOFTNESS, _SOFT_SPACING = 0.032, 0.04
+_CORE_SOFTNESS, _CORE_SPACING = 0.09, 0.07
+
+# A core is made this much smaller at first, since smoothing fills folds, and is cut back to the
+# least wall where it does more so, with this blending length.
+_CORE_RESERVE, _CORE_BLEND = 0.025, 0.06
 
 
 def spacing(detail: float, *, thinnest: float) -> float:
@@ -65,7 +67,7 @@ def single_glass(
 
     def make(detail: float) -> list[Part]:
         step = spacing(fineness * detail, thinnest=thinnest)
-        surface = isosurface(field(), spacing=step)
+        surface = isosurface(softened(field()), spacing=step)
         return centred([Part("body", "glass", *surface, tint=tint)], radius)
 
     return Object(name, "smncvx", make)
@@ -100,7 +102,7 @@ def filled_glass(
 
     def make(detail: float) -> list[Part]:
         step = spacing(fineness * detail, thinnest=thinnest)
-        body = field()
+        body = softened(field())
         outer = isosurface(body, spacing=step)
         inner = largest_piece(isosurface(core(body, wall), spacing=step))
         shell = Part("body", "glass", *outer)
@@ -110,15 +112,23 @@ def filled_glass(
     return Object(name, category, make)
 
 
+def softened(solid: Field) -> Field:
+    """Returns a solid without creases and fissures, which a mesh could not follow."""
+    return _blurred(solid, width=_SOFTNESS, grid=_SOFT_SPACING)
+
+
 def core(body: Field, wall: float) -> Field:
-    """Returns what lies deeper in a 1-Lipschitz field than a wall, with its details smoothed."""
-    deep = offset(body, -wall)
-    values, low = sample(deep, spacing=_CORE_SPACING, half_extent=RADIUS + _MARGIN)
-    smoothed = gaussian_filter(values, _CORE_SMOOTHING / _CORE_SPACING)
-    rounded = gridded(smoothed, low, _CORE_SPACING)
-    # What the smoothing fills of a fold is too near to the surface.
-    deeper = intersection(rounded, deep, blend=_CORE_BLEND)
-    return deeper._replace(centre=body.centre, radius=body.radius)
+    """Returns what lies deeper in a 1-Lipschitz field than a wall, without its details."""
+    reserved = offset(body, -wall - _CORE_RESERVE)
+    rounded = _blurred(reserved, width=_CORE_SOFTNESS, grid=_CORE_SPACING)
+    return intersection(rounded, offset(body, -wall), blend=_CORE_BLEND)
+
+
+def _blurred(solid: Field, *, width: float, grid: float) -> Field:
+    values, low = sample(solid, spacing=grid, half_extent=RADIUS + _MARGIN)
+    # Where samples stop to be exact is many widths from the surface.
+    field = gridded(gaussian_filter(values, width / grid), low, grid)
+    return field._replace(centre=solid.centre, radius=solid.radius)
 
 
 def centred(parts: Sequence[Part], radius: float) -> list[Part]:

@@ -27,10 +27,10 @@ _CLEARANCE = 0.1
 
 # Steps towards the mean of the neighbours, the share of the way that each goes, and the longest
 # one in cells; and Newton steps after the last.
-_RELAXATIONS = 8
+_RELAXATIONS = 6
 _SHARE = 0.5
 _LONGEST = 0.3
-_NEWTON_STEPS = 3
+_NEWTON_STEPS = 2
 
 # Of the differences that the gradient is made of, in cells.
 _DIFFERENCE = 1e-3

@@ -16,9 +16,9 @@ from experiments.dataset.objects.space_curves import limb, through
 # Along the spine: angle (degrees), distance from the axis, height, and radius of the body.
 _SPINE = np.array(
     [
-        (-84.0, 1.16, 0.1, 0.2),
-        (-62.0, 1.2, 0.2, 0.23),
-        (-35.0, 1.16, 0.16, 0.28),
+        (-84.0, 1.18, -0.06, 0.2),
+        (-62.0, 1.2, 0.04, 0.23),
+        (-35.0, 1.16, 0.08, 0.28),
         (-5.0, 1.02, 0.06, 0.4),
         (35.0, 0.92, 0.04, 0.52),
         (80.0, 0.9, 0.06, 0.58),
@@ -26,9 +26,9 @@ _SPINE = np.array(
         (165.0, 1.02, -0.06, 0.44),
         (200.0, 1.12, -0.2, 0.31),
         (232.0, 1.2, -0.32, 0.22),
-        (262.0, 1.24, -0.38, 0.17),
-        (290.0, 1.28, -0.4, 0.13),
-        (316.0, 1.42, -0.4, 0.09),
+        (262.0, 1.25, -0.37, 0.19),
+        (290.0, 1.3, -0.4, 0.15),
+        (316.0, 1.44, -0.41, 0.1),
         (336.0, 1.6, -0.38, 0.05),
     ]
 )
@@ -60,7 +60,7 @@ def _spikes() -> list[Field]:
         root = away * out + np.array([0.0, 0.0, height]) + 0.85 * radius * up
         size = 0.5 + radius
         tip = root + _SPIKE_LENGTH * size * up / np.linalg.norm(up)
-        spikes.append(limb((*root, 0.16 * size), (*tip, 0.035)))
+        spikes.append(limb((*root, 0.16 * size), (*tip, 0.05)))
     return spikes
 
 
@@ -104,7 +104,7 @@ def _head() -> Field:
     head = union(skull, *horns, blend=0.06)
     # Its muzzle, at -y, comes to point along the ring, over the tail.
     head = turned(head, Rotation.from_euler("z", -80.0, degrees=True))
-    return moved(head, (0.02, -1.2, 0.12))
+    return moved(head, (0.02, -1.22, -0.03))
 
 
 def _arrow() -> Field:
