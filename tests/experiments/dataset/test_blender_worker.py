@@ -104,7 +104,7 @@ def test_absorption_follows_beer_and_lambert(tmp_path, blender):
     near, far = np.sort([(side - rays.origins) / rays.directions for side in (-1.0, 1.0)], axis=0)
     length = np.maximum(far.min(axis=-1) - near.max(axis=-1), 0.0)
     wanted = box_filter(np.exp(-length[..., None] * np.array(absorption)), 8)
-    assert wanted.min() < 0.1
+    assert wanted.min() < 0.2
     assert _psnr(rendering.linear, wanted) > 45.0
     np.testing.assert_allclose(rendering.linear.mean((0, 1)), wanted.mean((0, 1)), rtol=1e-3)
 
