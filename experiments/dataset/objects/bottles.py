@@ -46,7 +46,9 @@ def _make_cola_bottle(detail: float) -> list[Part]:
     space = space_in(outline, wall=0.055, floor=0.16, corner=0.15, mouth=0.17)
     lip = rounded(box(0.27, 3.46, 3.66) + box(0.255, 3.36, 3.42), convex=0.02)
     shape = hollow(outline + lip, space, rim=0.025, inner=0.03)
-    turned = Turned(even_angles(cut, lobes=10), faded(waves(10, 0.1, sharpness=-0.4), _fluted))
+    turned = Turned(
+        even_angles(cut, lobes=10, each=14), faded(waves(10, 0.085, sharpness=-0.3), _fluted)
+    )
     return centred([body("body", _COLA_GREEN, shape, cut, turned=turned)])
 
 
@@ -79,12 +81,16 @@ def _make_plastic_bottle(detail: float) -> list[Part]:
     shape = hollow(outline + collar, space, rim=0.024, inner=0.03)
     lid = cap(0.31, low=3.12, high=3.62, bore=0.25, ceiling=3.55, edge=0.025)
     foot = faded(waves(5, 0.16), lambda r, z: ramp(r, 0.1, 0.35) * (1.0 - ramp(z, 0.0, 0.42)))
-    knurled = faded(waves(20, 0.06), lambda r, z: ramp(r, 0.27, 0.3))
+    knurled = faded(waves(20, 0.05), _side_of_cap)
     parts = [
         body("body", _PLASTIC, shape, cut, turned=Turned(even_angles(cut, lobes=5), foot)),
-        body("cap", _PLASTIC, lid, cut, turned=Turned(even_angles(cut, lobes=20), knurled)),
+        body("cap", _PLASTIC, lid, cut, turned=Turned(even_angles(cut, lobes=20, each=8), knurled)),
     ]
     return centred([united(parts)])
+
+
+def _side_of_cap(r: Values, z: Values) -> Values:
+    return ramp(r, 0.255, 0.305) * within(z, 3.13, 3.6, soft=0.08)
 
 
 def _make_star_shaped_bottle(detail: float) -> list[Part]:
@@ -93,8 +99,8 @@ def _make_star_shaped_bottle(detail: float) -> list[Part]:
     outline = region(
         filleted(
             (0, 0),
-            (1.1, 0, 0.12),
-            (1.2, 2.15, 0.28),
+            (1.05, 0, 0.12),
+            (1.16, 2.15, 0.28),
             (0.34, 2.6, 0.16),
             (0.27, 3.3),
             (0, 3.3),

@@ -153,8 +153,8 @@ def _make_crystal_vase(detail: float) -> list[Part]:
         outer = np.interp(z, side[:, 1], side[:, 0])
         return ramp(r / outer, 0.86, 0.97) * within(z, 0.12, 2.9, soft=0.3)
 
-    cuts = waves(14, 0.13, sharpness=-0.5)
-    turned = Turned(even_angles(cut, lobes=14), faded(cuts, share), twist=0.32)
+    cuts = waves(14, 0.11, sharpness=0.2)
+    turned = Turned(even_angles(cut, lobes=14, each=16), faded(cuts, share), twist=0.32)
     return centred([body("body", GLASS, shape, cut, turned=turned)])
 
 

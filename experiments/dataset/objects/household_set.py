@@ -1,6 +1,6 @@
 """Four small vessels side by side: a drink, soap, honey, and a scent."""
 
-from experiments.dataset.objects.placing import centred, moved
+from experiments.dataset.objects.placing import centred, enlarged, moved
 from experiments.dataset.objects.profiles import Sampling, arc, filleted, sampling
 from experiments.dataset.objects.regions import box, region, ring, rounded
 from experiments.dataset.objects.revolve import Turned, faded, polygon, ramp, section_angles
@@ -98,12 +98,13 @@ def _flacon(cut: Sampling) -> list[Part]:
 def _make_household_item_set(detail: float) -> list[Part]:
     cut = sampling(detail, segments=64)
     placed = [
-        (_tumbler(cut, detail), (0.42, 0.66)),
+        (_tumbler(cut, detail), (0.4, 0.66)),
         (_dispenser(cut), (-0.68, 0.42)),
         (_jar(cut), (-0.34, -0.72)),
         (_flacon(cut), (0.7, -0.55)),
     ]
-    return centred([part for parts, (x, y) in placed for part in moved(parts, (x, y, 0.0))])
+    together = [part for parts, (x, y) in placed for part in moved(parts, (x, y, 0.0))]
+    return enlarged(centred(together), 1.12)
 
 
 OBJECTS = (Object("household_item_set", "mmncvx", _make_household_item_set),)

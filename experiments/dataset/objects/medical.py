@@ -70,22 +70,28 @@ def _make_vial(detail: float) -> list[Part]:
     space = space_in(outline, wall=0.06, floor=0.1, corner=0.1, mouth=mouth)
     cut = sampling(detail)
     lid = cap(0.7, low=2.66, high=3.26, bore=0.572, ceiling=3.052, edge=0.04)
-    knurled = faded(waves(24, 0.05), lambda r, z: ramp(r, 0.6, 0.68))
+    knurled = faded(waves(20, 0.045), _side_of_cap)
     return centred(
         [
             *vessel(filled(outline, space, level=1.75, rim=0.026), cut, liquid=_CYAN),
-            body("cap", _CAP, lid, cut, turned=Turned(even_angles(cut, lobes=24), knurled)),
+            body(
+                "cap", _CAP, lid, cut, turned=Turned(even_angles(cut, lobes=20, each=12), knurled)
+            ),
         ]
     )
 
 
+def _side_of_cap(r: Values, z: Values) -> Values:
+    return ramp(r, 0.6, 0.69) * within(z, 2.68, 3.24, soft=0.1)
+
+
 def _make_syringe(detail: float) -> list[Part]:
     """Half full, needle down, tilted."""
-    cut = sampling(detail, segments=64)
+    cut = sampling(detail, segments=80)
     barrel, space = _barrel()
     shapes = filled(barrel, space, level=0.98, rim=0.024, meniscus=0.03)
     grip = round_about(cut)._replace(warp=_finger_grip)
-    cross = faded(waves(4, 0.4, sharpness=-0.3), lambda r, z: within(z, 1.3, 2.72, soft=0.12))
+    cross = faded(waves(4, 0.36), lambda r, z: within(z, 1.3, 2.72, soft=0.12))
     parts = [
         body("barrel", _PLASTIC, shapes.glass, cut, turned=grip),
         body("liquid", _CLEAR_BLUE, shapes.liquid, cut),
@@ -123,7 +129,7 @@ def _plunger() -> Region:
 def _finger_grip(angle: Values, r: Values, z: Values) -> Values:
     """Warps the flange to an oval; the barrel stays round."""
     beyond = np.maximum(r - 0.34, 0.0)
-    return r - beyond * 0.8 * np.sin(angle) ** 2
+    return r - beyond * 0.6 * np.sin(angle) ** 2
 
 
 OBJECTS = (

@@ -37,6 +37,11 @@ def tilted(parts: Sequence[Part], *, axis: str, degrees: float) -> list[Part]:
     return [part._replace(vertices=part.vertices @ matrix.T) for part in parts]
 
 
+def enlarged(parts: Sequence[Part], factor: float) -> list[Part]:
+    """Returns parts scaled about the origin, and the gaps between them with them."""
+    return [part._replace(vertices=part.vertices * factor) for part in parts]
+
+
 def centred(parts: Sequence[Part]) -> list[Part]:
     """Returns parts moved so that the box around all of them has its middle at the origin."""
     vertices = np.concatenate([part.vertices for part in parts])

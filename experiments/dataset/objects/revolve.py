@@ -42,20 +42,17 @@ def round_about(cut: Sampling) -> Turned:
     return Turned(even_angles(cut))
 
 
-def even_angles(cut: Sampling, *, lobes: int = 1) -> Float[np.ndarray, " segments"]:
-    """Returns evenly spaced angles, as many for each of some lobes, and enough to show them."""
-    count = lobes * int(np.ceil(max(cut.segments / lobes, 6.0)))
+def even_angles(cut: Sampling, *, lobes: int = 1, each: int = 8) -> Float[np.ndarray, " segments"]:
+    """Returns evenly spaced angles.
+
+    Args:
+      cut: how finely; a round body has that many.
+      lobes: of the section, each of which gets as many.
+      each: edges of a lobe where a round body has 96 in all; at least 6 are left of them.
+    """
+    share = max(cut.segments / lobes, each * cut.segments / 96.0, 6.0)
+    count = lobes * int(np.ceil(share))
     return np.arange(count) * (_TAU / count)
-
-
-def sectioned(cut: Sampling, section: Section, *, twist: float = 0.0) -> Turned:
-    """Returns what turns a profile into a body with one section at all heights."""
-    return Turned(section_angles(section, cut), scaled(section), twist)
-
-
-def scaled(section: Section) -> Warp:
-    """Returns the warp that has a section everywhere."""
-    return lambda angle, r, z: r * section(angle)
 
 
 def faded(section: Section, share: Callable[[Values, Values], Values]) -> Warp:

@@ -1,0 +1,170 @@
+import numpy as np
+import pytest
+import trimesh
+
+from experiments.dataset.objects.profiles import Sampling, arc, resampled, sampling, smooth
+from experiments.dataset.objects.regions import profiles, ring
+from experiments.dataset.objects.revolve import (
+    Turned,
+    even_angles,
+    faded,
+    polygon,
+    ramp,
+    revolve,
+    round_about,
+    section_angles,
+    stretched,
+    waves,
+    within,
+)
+
+_FINE = Sampling(edge=0.02, turn=0.03, segments=360)
+_ANGLES = np.linspace(0.0, 2.0 * np.pi, 721)
+
+
+def _mesh(profile, turned=None, cut=_FINE):
+    curve = resampled(np.asarray(profile, np.float64), cut)
+    vertices, faces = revolve(curve, round_about(cut) if turned is None else turned)
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def _closed_and_outward(mesh):
+    return mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0.0
+
+
+# Closed forms.
+
+
+def test_a_sphere():
+    mesh = _mesh(arc((0.0, 0.0), 1.5, -90.0, 90.0))
+    assert _closed_and_outward(mesh)
+    assert mesh.volume == pytest.approx(4.0 / 3.0 * np.pi * 1.5**3, rel=1e-3)
+    assert mesh.area == pytest.approx(4.0 * np.pi * 1.5**2, rel=1e-3)
+
+
+def test_a_cone():
+    mesh = _mesh([(0.0, 0.0), (1.2, 0.0), (0.0, 0.9)])
+    assert _closed_and_outward(mesh)
+    assert mesh.volume == pytest.approx(np.pi * 1.2**2 * 0.9 / 3.0, rel=1e-3)
+
+
+def test_a_torus_by_pappus():
+    [loop] = profiles(ring(1.1, 0.3, 0.5))
+    mesh = _mesh(loop)
+    assert _closed_and_outward(mesh) and mesh.euler_number == 0
+    assert mesh.volume == pytest.approx(2.0 * np.pi * 1.1 * np.pi * 0.25**2, rel=1e-3)
+    assert mesh.area == pytest.approx(2.0 * np.pi * 1.1 * 2.0 * np.pi * 0.25, rel=1e-3)
+
+
+def test_a_smooth_body_by_pappus():
+    curve = smooth([(0.0, 0.0), (0.8, 0.5), (0.4, 1.3), (0.6, 1.8), (0.0, 2.2)])
+    r, z = curve.T
+    expected = np.pi * np.sum(0.5 * (r[1:] ** 2 + r[:-1] ** 2) * np.diff(z))
+    assert _mesh(curve).volume == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_profile_that_goes_down_encloses_a_cavity():
+    assert _mesh(arc((0.0, 0.0), 1.0, 90.0, -90.0)).volume < 0.0
+
+
+def test_a_square_section_is_a_box_with_rounded_edges():
+    corner = 0.2
+    section = polygon(4, corner)
+    turned = Turned(section_angles(section, _FINE), faded(section, lambda r, z: np.ones_like(r)))
+    mesh = _mesh([(0.0, 0.0), (1.0, 0.0), (1.0, 1.5), (0.0, 1.5)], turned)
+    assert _closed_and_outward(mesh)
+    np.testing.assert_allclose(mesh.extents, [2.0, 2.0, 1.5], rtol=1e-6)
+    assert mesh.volume == pytest.approx(1.5 * (4.0 - (4.0 - np.pi) * corner**2), rel=1e-3)
+
+
+def test_a_twist_turns_sections_and_keeps_the_volume():
+    section = waves(3, 0.2)
+    angles = section_angles(section, _FINE)
+    profile = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
+    warp = faded(section, lambda r, z: np.ones_like(r))
+    plain, twisted = _mesh(profile, Turned(angles, warp)), _mesh(profile, Turned(angles, warp, 0.7))
+    assert twisted.volume == pytest.approx(plain.volume, rel=1e-3)
+    highest = twisted.vertices[np.isclose(twisted.vertices[:, 2], 1.0)]
+    ridge = highest[np.argmax(np.hypot(*highest[:, :2].T))]
+    assert np.arctan2(ridge[1], ridge[0]) % (2.0 * np.pi / 3.0) == pytest.approx(0.7, abs=0.02)
+
+
+# Sections.
+
+
+@pytest.mark.parametrize("sides", [3, 4, 6, 12])
+def test_a_polygon_has_flat_sides_and_round_corners(sides):
+    corner = 0.3
+    factor = polygon(sides, corner)(_ANGLES)
+    points = factor[:, None] * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+    ways = 2.0 * np.pi * np.arange(sides) / sides
+    reach = np.max(points @ np.stack([np.cos(ways), np.sin(ways)]), axis=1)
+    # A rounded polygon is all that lies within the corner radius of a smaller one.
+    farthest = (1.0 - corner) / np.cos(np.pi / sides) + corner
+    assert factor.max() == pytest.approx(farthest, rel=1e-3) and factor.min() == pytest.approx(1.0)
+    assert np.all(reach <= 1.0 + 1e-12) and np.mean(reach > 1.0 - 1e-12) > 0.2
+
+
+def test_waves_lie_between_ridge_and_valley():
+    for sharpness in (-0.5, 0.0, 0.5):
+        factor = waves(5, 0.3, sharpness=sharpness)(_ANGLES)
+        assert factor[0] == 1.0 == factor.max() and factor.min() == pytest.approx(0.7)
+    narrow, wide = (np.mean(waves(5, 0.3, sharpness=s)(_ANGLES)) for s in (0.5, -0.5))
+    assert narrow < 0.85 < wide
+
+
+def test_stretching_makes_an_ellipse_of_a_circle():
+    factor = stretched(np.ones_like, 0.5)(_ANGLES)
+    x, y = factor * np.cos(_ANGLES), factor * np.sin(_ANGLES)
+    np.testing.assert_allclose(x**2 + (y / 0.5) ** 2, 1.0, rtol=1e-12)
+
+
+def test_angles_crowd_at_corners_and_go_around_once():
+    angles = section_angles(polygon(4, 0.1), sampling(1.0))
+    steps = np.diff(angles)
+    assert np.all(steps > 0.0) and angles[0] >= 0.0 and angles[-1] < 2.0 * np.pi
+    corner = np.abs(angles[:-1] % (0.5 * np.pi) - 0.25 * np.pi) < 0.05
+    assert steps[corner].mean() < 0.5 * steps[~corner].mean()
+
+
+def test_even_angles_divide_among_lobes():
+    cut = sampling(1.0)
+    assert len(even_angles(cut)) == cut.segments == 96
+    assert len(even_angles(cut, lobes=7)) % 7 == 0
+    assert len(even_angles(cut, lobes=20, each=12)) == 240
+    assert len(even_angles(sampling(0.3), lobes=20, each=12)) == 120
+
+
+def test_ramps_are_smooth_and_monotone():
+    values = np.linspace(-1.0, 2.0, 301)
+    steps = ramp(values, 0.0, 1.0)
+    assert steps[0] == 0.0 and steps[-1] == 1.0 and np.all(np.diff(steps) >= 0.0)
+    assert ramp(np.array(0.5), 0.0, 1.0) == pytest.approx(0.5)
+    inside = within(np.array([0.0, 0.1, 0.5, 0.9, 1.0]), 0.0, 1.0, soft=0.1)
+    np.testing.assert_allclose(inside, [0.0, 1.0, 1.0, 1.0, 0.0], atol=1e-12)
+
+
+# Meshes.
+
+
+def test_poles_are_fans_and_no_vertex_comes_twice():
+    cut = Sampling(edge=0.3, turn=0.3, segments=24)
+    mesh = _mesh(arc((0.0, 0.0), 1.0, -90.0, 90.0), cut=cut)
+    uses = np.bincount(mesh.faces.ravel())
+    poles = np.flatnonzero(np.hypot(*mesh.vertices[:, :2].T) == 0.0)
+    assert list(uses[poles]) == [24, 24] and uses.max() == 24
+    assert len(np.unique(mesh.vertices.round(9), axis=0)) == len(mesh.vertices)
+
+
+@pytest.mark.parametrize(
+    "profile",
+    [
+        [(0.0, 0.0), (1.0, 0.5), (0.0, 1.0), (1.0, 1.5), (0.0, 2.0)],
+        [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)],
+        [(0.2, 0.0), (1.0, 0.0), (0.0, 1.0)],
+    ],
+    ids=["touches-the-axis", "ends-off-it", "begins-off-it"],
+)
+def test_profiles_that_bound_no_body_are_refused(profile):
+    with pytest.raises(ValueError, match="touches the axis between its ends, or ends beside it"):
+        revolve(np.array(profile), round_about(_FINE))
