@@ -65,7 +65,7 @@ def _skull_bottle() -> Field:
         ellipsoid((0.0, -0.66, -1.0), (0.36, 0.3, 0.2)),
         *both_sides(
             ellipsoid((0.45, -0.7, -0.27), (0.18, 0.18, 0.13)),
-            limb((0.7, 0.1, -0.12, 0.08), (0.7, -0.25, -0.2, 0.08), (0.54, -0.58, -0.27, 0.09)),
+            limb((0.66, 0.1, -0.12, 0.09), (0.64, -0.25, -0.2, 0.1), (0.52, -0.58, -0.27, 0.1)),
             limb((0.58, 0.05, -0.35, 0.13), (0.5, -0.15, -0.85, 0.15), (0.26, -0.6, -1.0, 0.16)),
             limb((0.62, -0.54, 0.2, 0.08), (0.36, -0.74, 0.36, 0.09), (0.1, -0.8, 0.28, 0.09)),
             limb((0.09, -0.78, 0.28, 0.09), (0.07, -0.95, -0.02, 0.07)),
@@ -121,7 +121,7 @@ def _generic_sculpture() -> Field:
 
 
 OBJECTS = (
-    single_glass("magnifier", _magnifier, radius=1.9, thinnest=0.12),
-    single_glass("skull_bottle", _skull_bottle, radius=1.7, thinnest=0.09, fineness=1.15),
-    single_glass("generic_sculpture", _generic_sculpture, radius=1.75, thinnest=0.12),
+    single_glass("magnifier", _magnifier, radius=1.9, thinnest=0.12, fineness=1.5),
+    single_glass("skull_bottle", _skull_bottle, radius=1.7, thinnest=0.09, fineness=1.05),
+    single_glass("generic_sculpture", _generic_sculpture, radius=1.75, thinnest=0.12, fineness=0.9),
 )

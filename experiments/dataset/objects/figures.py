@@ -124,7 +124,7 @@ def _into_folds(points: Points) -> Points:
 
 
 OBJECTS = (
-    single_glass("man_sculpture", _man, radius=1.9, thinnest=0.1, fineness=1.2),
+    single_glass("man_sculpture", _man, radius=1.9, thinnest=0.1, fineness=1.4),
     filled_glass(
         "woman_sculpture",
         _woman,
@@ -132,6 +132,6 @@ OBJECTS = (
         thinnest=0.1,
         medium="perfume",
         absorption=(0.1, 1.1, 0.7),
-        fineness=1.2,
+        fineness=1.4,
     ),
 )

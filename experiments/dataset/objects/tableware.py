@@ -89,7 +89,7 @@ def _teacup() -> Field:
     )
     ring = revolution_wall(np.array([(0.68, -0.64), (0.69, -0.74)]), 0.09)
     saucer = union(revolution_wall(dish, 0.08), ring, blend=0.06)
-    # The cup's foot ends at -0.55, and the dish below it lies at most at -0.576.
+    # Without the gap, the cup's foot would end at -0.55; the dish under it ends at -0.57.
     return union(moved(cup, (0.0, 0.0, _GAP)), saucer)
 
 
@@ -173,8 +173,8 @@ def _to_a_lip(points: Points) -> Points:
 
 
 OBJECTS = (
-    single_glass("teapot", _teapot, radius=1.85, thinnest=0.07),
-    single_glass("teacup", _teacup, radius=1.75, thinnest=0.08),
-    single_glass("water_pitcher", _pitcher, radius=1.85, thinnest=0.09),
-    single_glass("wisolt_kettle", _kettle, radius=1.85, thinnest=0.075),
+    single_glass("teapot", _teapot, radius=1.85, thinnest=0.08, fineness=0.95),
+    single_glass("teacup", _teacup, radius=1.75, thinnest=0.08, fineness=0.9),
+    single_glass("water_pitcher", _pitcher, radius=1.85, thinnest=0.09, fineness=0.95),
+    single_glass("wisolt_kettle", _kettle, radius=1.85, thinnest=0.08, fineness=0.95),
 )
