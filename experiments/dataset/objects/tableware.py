@@ -30,8 +30,8 @@ from experiments.dataset.objects.space_curves import limb, through
 _WALL = 0.1
 _EDGE = 0.06
 
-# Between a cup and its saucer.
-_GAP = 0.08
+# How far the cup is lifted off its saucer: softening would join what is closer.
+_LIFT = 0.04
 
 # The pitcher's lip: how far it juts out, how wide it is (radians), and over which heights it grows.
 _LIP, _LIP_WIDTH, _LIP_FROM, _LIP_TO = 0.34, 0.5, 0.55, 1.3
@@ -89,8 +89,8 @@ def _teacup() -> Field:
     )
     ring = revolution_wall(np.array([(0.68, -0.64), (0.69, -0.74)]), 0.09)
     saucer = union(revolution_wall(dish, 0.08), ring, blend=0.06)
-    # Without the gap, the cup's foot would end at -0.55; the dish under it ends at -0.57.
-    return union(moved(cup, (0.0, 0.0, _GAP)), saucer)
+    # Under the cup's foot, whose end is at -0.55, the dish is at -0.58.
+    return union(moved(cup, (0.0, 0.0, _LIFT)), saucer)
 
 
 def _pitcher() -> Field:

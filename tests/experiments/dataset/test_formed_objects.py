@@ -126,6 +126,15 @@ def test_vessels_are_hollow_and_open(name):
     assert not mesh.contains(np.array([[0.0, 0.0, -0.05]])).any()
 
 
+@pytest.mark.slow
+def test_the_cup_stands_apart_from_its_saucer():
+    cup, saucer = (
+        trimesh.sample.sample_surface(piece, 20000, seed=0)[0]
+        for piece in _mesh(_made("teacup")[0]).split()
+    )
+    assert _GAP < np.min(KDTree(cup).query(saucer)[0]) < 0.12
+
+
 def test_a_coloured_object_differs_by_its_tint_alone():
     for name in ("ball", "cube", "cylinder", "pyramid", "torus"):
         [clear], [coloured] = _made(name), _made(f"{name}_coloured")
@@ -144,7 +153,7 @@ def test_objects_are_the_same_every_time(name):
 
 def test_detail_makes_finer_triangles_but_walls_set_the_coarsest():
     assert spacing(1.0, thinnest=1.0) == pytest.approx(0.5 * spacing(0.5, thinnest=1.0))
-    assert spacing(0.1, thinnest=0.1) < 0.1
+    assert spacing(0.1, thinnest=0.1) < 0.12
 
 
 def test_centring():
