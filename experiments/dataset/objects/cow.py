@@ -92,6 +92,12 @@ def _tail() -> Field:
 
 OBJECTS = (
     filled_glass(
-        "cow", _cow, radius=1.9, thinnest=0.1, medium="alcohol", absorption=(0.9, 0.25, 0.5)
+        "cow",
+        _cow,
+        radius=1.9,
+        thinnest=0.1,
+        medium="alcohol",
+        absorption=(0.9, 0.25, 0.5),
+        fineness=1.2,
     ),
 )

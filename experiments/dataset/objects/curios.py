@@ -65,16 +65,16 @@ def _skull_bottle() -> Field:
         ellipsoid((0.0, -0.66, -1.0), (0.36, 0.3, 0.2)),
         *both_sides(
             ellipsoid((0.45, -0.7, -0.27), (0.18, 0.18, 0.13)),
-            limb((0.7, 0.1, -0.12, 0.08), (0.7, -0.25, -0.2, 0.08), (0.54, -0.58, -0.27, 0.09)),
+            limb((0.66, 0.1, -0.12, 0.09), (0.64, -0.25, -0.2, 0.1), (0.52, -0.58, -0.27, 0.1)),
             limb((0.58, 0.05, -0.35, 0.13), (0.5, -0.15, -0.85, 0.15), (0.26, -0.6, -1.0, 0.16)),
             limb((0.62, -0.54, 0.2, 0.08), (0.36, -0.74, 0.36, 0.09), (0.1, -0.8, 0.28, 0.09)),
-            limb((0.09, -0.78, 0.28, 0.09), (0.07, -0.95, -0.02, 0.07)),
+            limb((0.09, -0.78, 0.28, 0.09), (0.06, -0.82, 0.1, 0.07)),
         ),
         blend=0.2,
     )
     features = both_sides(
         ellipsoid((0.34, -0.92, 0.05), (0.23, 0.4, 0.23)),
-        limb((0.03, -1.1, -0.14, 0.06), (0.1, -1.02, -0.36, 0.095)),
+        limb((0.04, -0.98, -0.08, 0.1), (0.12, -0.97, -0.36, 0.15)),
         ellipsoid((0.98, -0.35, 0.22), (0.16, 0.4, 0.34)),
     )
     carved = subtraction(face, union(*features), blend=0.12)
@@ -99,12 +99,12 @@ def _skull_bottle() -> Field:
 
 def _between_teeth() -> Field:
     """Returns grooves: between the rows of teeth, and between the teeth of both."""
-    row = limb((-0.36, -0.8, -0.76, 0.035), (0.0, -1.06, -0.78, 0.035), (0.36, -0.8, -0.76, 0.035))
+    row = limb((-0.36, -0.76, -0.76, 0.05), (0.0, -1.0, -0.78, 0.05), (0.36, -0.76, -0.76, 0.05))
     gaps = []
     for x in np.linspace(-0.27, 0.27, 6).tolist():
-        y = -1.07 + 0.9 * x**2 + 0.02
+        y = 0.9 * x**2 - 1.0
         gaps.append(
-            limb((x, y + 0.04, -0.58, 0.032), (x, y, -0.78, 0.036), (x, y + 0.06, -0.98, 0.032))
+            limb((x, y - 0.01, -0.6, 0.042), (x, y, -0.78, 0.045), (x, y + 0.03, -0.94, 0.042))
         )
     return union(row, *gaps)
 
@@ -121,7 +121,7 @@ def _generic_sculpture() -> Field:
 
 
 OBJECTS = (
-    single_glass("magnifier", _magnifier, radius=1.9, thinnest=0.12),
-    single_glass("skull_bottle", _skull_bottle, radius=1.7, thinnest=0.09, fineness=1.15),
-    single_glass("generic_sculpture", _generic_sculpture, radius=1.75, thinnest=0.12),
+    single_glass("magnifier", _magnifier, radius=1.9, thinnest=0.12, fineness=1.5),
+    single_glass("skull_bottle", _skull_bottle, radius=1.7, thinnest=0.09, fineness=1.05),
+    single_glass("generic_sculpture", _generic_sculpture, radius=1.75, thinnest=0.12, fineness=0.9),
 )

@@ -124,10 +124,8 @@ def tube(
     along = np.diff(curve, axis=0)
     length = np.linalg.norm(along, axis=-1)
     slope = -np.diff(radius) / length
-    _require(
-        bool(np.all(np.abs(slope) < _STEEPEST)),
-        "The radius of a tube changes faster than its curve goes on.",
-    )
+    gentle = bool(np.all(np.abs(slope) < _STEEPEST))
+    _require(gentle, "The radius of a tube changes faster than its curve goes on.")
     axes, skew = along / length[:, None], slope / np.sqrt(1.0 - slope**2)
     tree = KDTree(curve)
 

@@ -24,8 +24,8 @@ _WAIST, _HEM = 0.25, -1.6
 
 def _man() -> Field:
     torso = union(
-        ellipsoid((0.02, 0.02, 0.08), (0.31, 0.23, 0.24)),
-        limb((0.01, 0.0, 0.1, 0.25), (0.0, -0.02, 0.42, 0.23), (-0.01, 0.02, 0.7, 0.27)),
+        ellipsoid((0.02, 0.02, 0.08), (0.31, 0.22, 0.26)),
+        limb((0.01, 0.0, 0.1, 0.26), (0.0, -0.02, 0.4, 0.27), (-0.01, 0.02, 0.7, 0.3)),
         ellipsoid((0.0, 0.02, 0.7), (0.4, 0.25, 0.34)),
         limb((-0.42, 0.04, 0.9, 0.16), (0.0, 0.05, 0.97, 0.15), (0.42, 0.04, 0.95, 0.16)),
         *both_sides(
@@ -124,7 +124,7 @@ def _into_folds(points: Points) -> Points:
 
 
 OBJECTS = (
-    single_glass("man_sculpture", _man, radius=1.9, thinnest=0.1, fineness=1.2),
+    single_glass("man_sculpture", _man, radius=1.9, thinnest=0.1, fineness=1.4),
     filled_glass(
         "woman_sculpture",
         _woman,
@@ -132,6 +132,6 @@ OBJECTS = (
         thinnest=0.1,
         medium="perfume",
         absorption=(0.1, 1.1, 0.7),
-        fineness=1.2,
+        fineness=1.4,
     ),
 )

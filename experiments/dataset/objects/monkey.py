@@ -1,6 +1,6 @@
 """Blender's monkey, Suzanne, as one closed body (NumPy only).
 
-Blender makes the mesh (`export_monkey`), from which `load_suzanne` and `monkey` make the object.
+Blender makes the mesh (`export_monkey`), and `monkey(load_suzanne(path))` the object of it.
 Its head has open eye sockets, in which eyes sit that are open at the back: each of the three is
 closed where it is open, and they are united with rounded seams.
 """

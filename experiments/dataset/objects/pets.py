@@ -138,12 +138,30 @@ def _dog() -> Field:
 
 OBJECTS = (
     filled_glass(
-        "cat", _cat, radius=1.75, thinnest=0.1, medium="alcohol", absorption=(0.1, 0.6, 1.6)
+        "cat",
+        _cat,
+        radius=1.75,
+        thinnest=0.1,
+        medium="alcohol",
+        absorption=(0.1, 0.6, 1.6),
+        fineness=1.2,
     ),
     filled_glass(
-        "fox", _fox, radius=1.9, thinnest=0.1, medium="perfume", absorption=(0.05, 0.9, 2.2)
+        "fox",
+        _fox,
+        radius=1.9,
+        thinnest=0.1,
+        medium="perfume",
+        absorption=(0.05, 0.9, 2.2),
+        fineness=1.4,
     ),
     filled_glass(
-        "dog", _dog, radius=1.85, thinnest=0.11, medium="water", absorption=(1.5, 0.5, 0.08)
+        "dog",
+        _dog,
+        radius=1.85,
+        thinnest=0.11,
+        medium="water",
+        absorption=(1.5, 0.5, 0.08),
+        fineness=1.3,
     ),
 )

@@ -30,8 +30,8 @@ from experiments.dataset.objects.space_curves import limb, through
 _WALL = 0.1
 _EDGE = 0.06
 
-# Between a cup and its saucer.
-_GAP = 0.08
+# How far the cup is lifted off its saucer: softening would join what is closer.
+_LIFT = 0.04
 
 # The pitcher's lip: how far it juts out, how wide it is (radians), and over which heights it grows.
 _LIP, _LIP_WIDTH, _LIP_FROM, _LIP_TO = 0.34, 0.5, 0.55, 1.3
@@ -89,8 +89,8 @@ def _teacup() -> Field:
     )
     ring = revolution_wall(np.array([(0.68, -0.64), (0.69, -0.74)]), 0.09)
     saucer = union(revolution_wall(dish, 0.08), ring, blend=0.06)
-    # The cup's foot ends at -0.55, and the dish below it lies at most at -0.576.
-    return union(moved(cup, (0.0, 0.0, _GAP)), saucer)
+    # Under the cup's foot, whose end is at -0.55, the dish is at -0.58.
+    return union(moved(cup, (0.0, 0.0, _LIFT)), saucer)
 
 
 def _pitcher() -> Field:
@@ -173,8 +173,8 @@ def _to_a_lip(points: Points) -> Points:
 
 
 OBJECTS = (
-    single_glass("teapot", _teapot, radius=1.85, thinnest=0.07),
-    single_glass("teacup", _teacup, radius=1.75, thinnest=0.08),
-    single_glass("water_pitcher", _pitcher, radius=1.85, thinnest=0.09),
-    single_glass("wisolt_kettle", _kettle, radius=1.85, thinnest=0.075),
+    single_glass("teapot", _teapot, radius=1.85, thinnest=0.08, fineness=0.95),
+    single_glass("teacup", _teacup, radius=1.75, thinnest=0.08, fineness=0.9),
+    single_glass("water_pitcher", _pitcher, radius=1.85, thinnest=0.09, fineness=0.95),
+    single_glass("wisolt_kettle", _kettle, radius=1.85, thinnest=0.08, fineness=0.95),
 )
