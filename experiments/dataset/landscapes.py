@@ -201,8 +201,11 @@ def _ground(azimuth: Field, elevation: Field, eye: float) -> tuple[Field, Field,
 
 def _around(azimuth: Field, frequency: float, seed: int) -> Field:
     """Returns noise along the horizon, without a seam."""
-    ring = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)], -1)
-    return fbm3(ring, frequency, seed, octaves=5, gain=0.5)
+    rows = azimuth.shape[0]
+    turn = np.linspace(-math.pi, math.pi, 4 * rows, endpoint=False)[None]
+    ring = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], -1).astype(np.float32)
+    line = fbm3(ring, frequency, seed, octaves=5, gain=0.5, rows=rows)
+    return np.interp(azimuth, turn[0], line[0], period=2.0 * math.pi).astype(np.float32)
 
 
 def _horizon(sky: Picture) -> Float[np.ndarray, "3"]:

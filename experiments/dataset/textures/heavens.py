@@ -45,7 +45,7 @@ def nebula(height: int) -> Picture:
             random_of(stars.index, seed + 9), (0.0, "#9bb8ff"), (0.5, "#ffffff"), (1.0, "#ffcf9b")
         )
         glow = np.exp(-((stars.away / size) ** 2)) + 0.12 * np.exp(-stars.away / (3.0 * size))
-        sky = sky + warmth * (1.3 * dimmed * (0.25 + bright) * glow)[..., None]
+        sky = sky + warmth * (2.2 * dimmed * (0.25 + bright) * glow)[..., None]
     return np.clip(sky, 0.0, 1.0)
 
 

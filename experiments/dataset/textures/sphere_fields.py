@@ -57,10 +57,16 @@ def noise3(points: Directions, frequency: float, seed: int) -> Field:
 
 
 def fbm3(
-    points: Directions, frequency: float, seed: int, *, octaves: int = 6, gain: float = 0.5
+    points: Directions,
+    frequency: float,
+    seed: int,
+    *,
+    octaves: int = 6,
+    gain: float = 0.5,
+    rows: int | None = None,
 ) -> Field:
-    """Returns octaves of noise, as far as the samples can show them."""
-    finest = points.shape[0] / math.pi / 2.0
+    """Returns octaves of noise, as far as a picture of so many rows (those of `points`) shows."""
+    finest = (rows or points.shape[0]) / math.pi / 2.0
     total = np.zeros(points.shape[:2], np.float32)
     for octave in range(octaves):
         if frequency * 2.0**octave <= finest:
