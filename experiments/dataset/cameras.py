@@ -23,7 +23,7 @@ Split = Literal["train", "val", "test"]
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
-_TURNS = 3
+_TURNS = 3  # of the helix
 _LOWEST, _HIGHEST = -10.0, 65.0  # degrees
 
 
@@ -52,7 +52,7 @@ def random_poses(count: int, *, seed: int) -> Float[np.ndarray, "count 4 4"]:
     _require_positive(count)
     height, turn = np.random.default_rng(seed).random((count, 2)).T
     # Equal heights bound equal areas of a sphere (Archimedes).
-    return _look_at_origin(2.0 * math.pi * turn, np.arcsin(2.0 * height - 1.0))
+    return look_at_origin(2.0 * math.pi * turn, np.arcsin(2.0 * height - 1.0))
 
 
 def helix_poses(count: int) -> Float[np.ndarray, "count 4 4"]:
@@ -64,13 +64,18 @@ def helix_poses(count: int) -> Float[np.ndarray, "count 4 4"]:
     _require_positive(count)
     share = np.linspace(0.0, 1.0, count)
     elevation = _LOWEST + (_HIGHEST - _LOWEST) * share
-    return _look_at_origin(2.0 * math.pi * _TURNS * share, np.radians(elevation))
+    return look_at_origin(2.0 * math.pi * _TURNS * share, np.radians(elevation))
 
 
-def _look_at_origin(
+def look_at_origin(
     azimuth: Float[np.ndarray, " count"], elevation: Float[np.ndarray, " count"]
 ) -> Float[np.ndarray, "count 4 4"]:
-    """Returns the poses; at a pole the azimuth alone decides what is right."""
+    """Returns the poses that look from the sphere at the origin, z up.
+
+    Args:
+      azimuth: radians. At a pole it alone decides what is right.
+      elevation: radians.
+    """
     cos_a, sin_a, zero = np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)
     cos_e, sin_e = np.cos(elevation), np.sin(elevation)
     right = np.stack([-sin_a, cos_a, zero], -1)

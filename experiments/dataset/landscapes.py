@@ -13,6 +13,7 @@ from jaxtyping import Float
 from experiments.dataset.houses import row_of_houses
 from experiments.dataset.sky import SUN_RADIANCE, Weather, sky_of, sun_direction
 from experiments.dataset.textures import masonry, plants
+from experiments.dataset.textures.faces import require_size
 from experiments.dataset.textures.fields import (
     Field,
     Picture,
@@ -23,7 +24,7 @@ from experiments.dataset.textures.fields import (
     smooth,
 )
 from experiments.dataset.textures.shading import colour, graded, linear
-from experiments.dataset.textures.sphere_fields import angles, directions, fbm3
+from experiments.dataset.textures.sphere_fields import angles, averaged, directions, fbm3
 
 _SOFT = 256  # rows from which pictures of the ground are as fine as they get
 
@@ -178,13 +179,14 @@ def make_environment(name: str, height: int) -> Float[np.ndarray, "h w 3"]:
     """Returns an environment of `[height, 2 height]` samples, linear RGB in float32.
 
     Raises:
-      ValueError: if there is none of this name.
+      ValueError: if there is none of this name, or the height is too small.
     """
     if name not in ENVIRONMENTS:
         raise ValueError(
             f"There is no environment {name!r}. Choose from {', '.join(ENVIRONMENTS)}."
         )
-    return ENVIRONMENTS[name](height)
+    require_size(height)
+    return averaged(ENVIRONMENTS[name], height)
 
 
 def _finished(picture: Picture) -> Float[np.ndarray, "h w 3"]:
@@ -199,8 +201,11 @@ def _ground(azimuth: Field, elevation: Field, eye: float) -> tuple[Field, Field,
 
 def _around(azimuth: Field, frequency: float, seed: int) -> Field:
     """Returns noise along the horizon, without a seam."""
-    ring = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)], -1)
-    return fbm3(ring, frequency, seed, octaves=5, gain=0.5)
+    rows = azimuth.shape[0]
+    turn = np.linspace(-math.pi, math.pi, 4 * rows, endpoint=False)[None]
+    ring = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], -1).astype(np.float32)
+    line = fbm3(ring, frequency, seed, octaves=5, gain=0.5, rows=rows)
+    return np.interp(azimuth, turn[0], line[0], period=2.0 * math.pi).astype(np.float32)
 
 
 def _horizon(sky: Picture) -> Float[np.ndarray, "3"]:

@@ -156,7 +156,9 @@ def _canvas(
             canvas, colour("#2b1a12"), smooth(0.006, 0.003, np.abs(elevation - height_of))
         )
         canvas = canvas + colour("#ffcf70") * (0.9 * np.exp(-lamp / 0.012))[..., None]
-    return canvas
+    # Where stripes would get finer than samples a ring holds the cloth.
+    crown = graded(np.cos(70.0 * elevation), (-1.0, "#5a1420"), (0.0, "#c99a3a"), (0.7, "#fff0c0"))
+    return blend(canvas, crown, smooth(1.30, 1.32, elevation))
 
 
 def _crowd(turn: Field, elevation: Field) -> Picture:

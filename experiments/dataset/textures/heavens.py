@@ -37,13 +37,15 @@ def nebula(height: int) -> Picture:
     sky = sky * (1.0 - 0.8 * lanes)[..., None]
     for count, seed, size in ((9000, 5, 0.0016), (1600, 6, 0.0026), (160, 7, 0.0052)):
         stars = cells3(points, count, seed)
-        size = max(size, 1.1 * np.pi / height)
+        # What is smaller than a sample is as much dimmer.
+        shown = max(size, 1.1 * np.pi / height)
+        dimmed, size = (size / shown) ** 2, shown
         bright = random_of(stars.index, seed) ** 2.0
         warmth = graded(
             random_of(stars.index, seed + 9), (0.0, "#9bb8ff"), (0.5, "#ffffff"), (1.0, "#ffcf9b")
         )
         glow = np.exp(-((stars.away / size) ** 2)) + 0.12 * np.exp(-stars.away / (3.0 * size))
-        sky = sky + warmth * (1.3 * (0.25 + bright) * glow)[..., None]
+        sky = sky + warmth * (2.2 * dimmed * (0.25 + bright) * glow)[..., None]
     return np.clip(sky, 0.0, 1.0)
 
 

@@ -1,5 +1,7 @@
 """What weather and pressure paint: marble, rust, and the patterns of reaction and diffusion."""
 
+import functools
+
 import numpy as np
 import scipy.ndimage
 
@@ -132,6 +134,7 @@ def turing(n: int) -> Picture:
     return reef * hollows(height, 0.01, strength=0.8)[..., None]
 
 
+@functools.cache
 def _grow(side: int, steps: int) -> tuple[Field, Field]:
     """Returns the pattern, -1 to 1, and which of the scales each point followed last."""
     state = np.random.default_rng(12).uniform(-1.0, 1.0, (side, side)).astype(np.float32)

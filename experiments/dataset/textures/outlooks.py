@@ -54,8 +54,13 @@ def skyline(height: int) -> Picture:
     lit = graded(glow, (0.0, "#ffd9a0"), (0.3, "#f58fa8"), (0.8, "#6f6fc0"), (1.5, "#39437f"))
     sky = blend(sky, lit, smooth(0.1, 1.6, clouds))
     stars = cells3(points, 5200, 5)
+    # What is smaller than a sample is as much dimmer.
     size = max(0.0028, 1.2 * math.pi / height)
-    shine = (0.2 + random_of(stars.index, 6)) * np.exp(-((stars.away / size) ** 2))
+    shine = (
+        (0.0028 / size) ** 2
+        * (0.2 + random_of(stars.index, 6))
+        * np.exp(-((stars.away / size) ** 2))
+    )
     shine = shine * smooth(0.25, 0.7, mirrored) * smooth(1.0, -0.2, clouds) * ~below
     sky = sky + shine[..., None] * colour("#fff5e0")
     sky = _fireworks(_moon(sky, bent, mirrored), bent, mirrored)

@@ -28,13 +28,12 @@ def painting(n: int) -> Picture:
     ):
         starts = rng.random((count, 2))
         tints = rng.normal(0.0, spread, (count, 1)) + rng.normal(0.0, 0.5 * spread, (count, 3))
-        for (x, y), tint in zip(starts, tints, strict=True):
-            path = _follow(flow, x, y, length)
-            i, j = int(y * grid), int(x * grid)
-            tone = tuple(int(each) for each in np.clip((scene[i, j] + tint) * 255.0, 0, 255))
-            draw.line(
-                (path * n).ravel().tolist(), fill=tone, width=max(int(width * n), 1), joint="curve"
-            )
+        paths = _follow(flow, starts, length) * n
+        x, y = (starts * grid).astype(int).T
+        tones = np.clip((scene[y, x] + tints) * 255.0, 0, 255).astype(int)
+        thick = max(int(width * n), 1)
+        for path, tone in zip(paths.reshape(count, -1).tolist(), tones.tolist(), strict=True):
+            draw.line(path, fill=tuple(tone), width=thick, joint="curve")
     canvas = np.asarray(image, np.float32) / 255.0
     grey = canvas @ np.array([0.3, 0.5, 0.2], np.float32)
     weave, grain = fbm(n, 170, 4, octaves=2, gain=0.9), fbm(n, 12, 14, octaves=5)
@@ -87,13 +86,12 @@ def _night(grid: int) -> tuple[Picture, Float[np.ndarray, "grid grid 2"]]:
 
 
 def _follow(
-    flow: Float[np.ndarray, "grid grid 2"], x: float, y: float, length: float
-) -> Float[np.ndarray, "5 2"]:
-    """Returns four steps along the flow."""
+    flow: Float[np.ndarray, "grid grid 2"], starts: Float[np.ndarray, "strokes 2"], length: float
+) -> Float[np.ndarray, "strokes 5 2"]:
+    """Returns where strokes go: four steps along the flow from each start."""
     grid = flow.shape[0]
-    path = [(x, y)]
+    path = [starts]
     for _ in range(4):
-        along = flow[min(max(int(y * grid), 0), grid - 1), min(max(int(x * grid), 0), grid - 1)]
-        x, y = x + 0.25 * length * along[0], y + 0.25 * length * along[1]
-        path.append((x, y))
-    return np.array(path)
+        column, row = np.clip((path[-1] * grid).astype(int), 0, grid - 1).T
+        path.append(path[-1] + 0.25 * length * flow[row, column])
+    return np.stack(path, axis=1)

@@ -1,7 +1,4 @@
-"""Rooms seen from their middle: a library, a gallery, a courtyard, a rotunda, a circus tent.
-
-A room is a box or a cylinder around the eye; its walls are papered with the pictures of `faces`.
-"""
+"""Square rooms seen from their middle, papered with pictures of `faces`."""
 
 from typing import NamedTuple
 

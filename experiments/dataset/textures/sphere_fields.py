@@ -7,12 +7,14 @@ unit of length.
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import scipy.ndimage
 import scipy.spatial
 from jaxtyping import Float, Int
+from PIL import Image
 
 from experiments.dataset.textures.fields import Field, Picture
 
@@ -55,10 +57,16 @@ def noise3(points: Directions, frequency: float, seed: int) -> Field:
 
 
 def fbm3(
-    points: Directions, frequency: float, seed: int, *, octaves: int = 6, gain: float = 0.5
+    points: Directions,
+    frequency: float,
+    seed: int,
+    *,
+    octaves: int = 6,
+    gain: float = 0.5,
+    rows: int | None = None,
 ) -> Field:
-    """Returns octaves of noise, as far as the samples can show them."""
-    finest = points.shape[0] / math.pi / 2.0
+    """Returns octaves of noise, as far as a picture of so many rows (those of `points`) shows."""
+    finest = (rows or points.shape[0]) / math.pi / 2.0
     total = np.zeros(points.shape[:2], np.float32)
     for octave in range(octaves):
         if frequency * 2.0**octave <= finest:
@@ -81,6 +89,18 @@ def waves3(points: Directions, number: float, seed: int) -> Field:
     for wave, phase in zip(towards, rng.uniform(0.0, 2.0 * math.pi, 28), strict=True):
         total += np.cos(points @ wave.astype(np.float32) + np.float32(phase))
     return total / np.float32(math.sqrt(14.0))
+
+
+def averaged(paint: Callable[[int], Picture], height: int) -> Float[np.ndarray, "height width 3"]:
+    """Returns a picture that is painted with half as many rows and columns again, and averaged."""
+    fine = paint((3 * height + 1) // 2).astype(np.float32)
+    channels = [
+        Image.fromarray(np.ascontiguousarray(fine[..., each])).resize(
+            (2 * height, height), Image.Resampling.BOX
+        )
+        for each in range(3)
+    ]
+    return np.stack([np.asarray(channel) for channel in channels], -1)
 
 
 class SphereCells(NamedTuple):

@@ -1,0 +1,161 @@
+"""Daylight and landscapes: the model's values, blue above, brightest at the sun, exposed."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from experiments.dataset import sky
+from experiments.dataset.landscapes import ENVIRONMENTS, make_environment
+from experiments.dataset.textures.sphere_fields import directions
+
+_ROWS = 96
+_WEATHER = sky.Weather(math.radians(40.0), math.radians(45.0), 3.0, 0.4, 5)
+
+
+@pytest.fixture(scope="module")
+def environments():
+    return {name: make_environment(name, _ROWS) for name in ENVIRONMENTS}
+
+
+def _luminance(picture):
+    return picture @ np.array(sky.LUMINANCE)
+
+
+def _towards(azimuth, elevation):
+    azimuth, elevation = math.radians(azimuth), math.radians(elevation)
+    around = math.cos(elevation)
+    return np.array(
+        [[[around * math.cos(azimuth), around * math.sin(azimuth), math.sin(elevation)]]],
+        np.float32,
+    )
+
+
+def _chromaticity(rgb):
+    xyz = np.linalg.inv(
+        [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
+    ) @ np.ravel(rgb)
+    return xyz[:2] / xyz.sum()
+
+
+def test_the_zenith_has_the_models_chromaticity():
+    # Of turbidity 3 and a sun 45 degrees high, by the polynomials of the paper.
+    zenith = sky.clear_sky(_towards(0.0, 90.0), _WEATHER)
+    np.testing.assert_allclose(_chromaticity(zenith), [0.24568, 0.25148], atol=2e-4)
+
+
+def test_the_horizon_has_the_models_luminance():
+    # Perez's function away from the sun and at the zenith, with his coefficients for turbidity 3.
+    a, b, c, d, e = -0.9269, -0.6387, 5.2570, -2.2153, 0.1693
+
+    def perez(cos_theta, gamma):
+        around = 1 + c * math.exp(d * gamma) + e * math.cos(gamma) ** 2
+        return (1 + a * math.exp(b / cos_theta)) * around
+
+    bright = [
+        _luminance(sky.clear_sky(_towards(azimuth, elevation), _WEATHER)).item()
+        for azimuth, elevation in ((220.0, 15.0), (0.0, 90.0))
+    ]
+    expected = perez(math.sin(math.radians(15.0)), math.radians(120.0)) / perez(
+        1.0, math.radians(45.0)
+    )
+    assert bright[0] / bright[1] == pytest.approx(expected, rel=2e-3)
+
+
+def test_the_zenith_is_bluer_than_the_horizon():
+    for turbidity in (2.0, 3.0, 5.0):
+        weather = _WEATHER._replace(turbidity=turbidity)
+        zenith = sky.clear_sky(_towards(0.0, 90.0), weather).ravel()
+        horizon = sky.clear_sky(_towards(220.0, 2.0), weather).ravel()
+        assert zenith[2] / zenith[0] > 1.3 * horizon[2] / horizon[0]
+
+
+def test_hazy_air_is_less_blue():
+    clear, hazy = (
+        sky.clear_sky(_towards(220.0, 60.0), _WEATHER._replace(turbidity=turbidity)).ravel()
+        for turbidity in (2.0, 6.0)
+    )
+    assert clear[2] / clear[0] > 1.2 * hazy[2] / hazy[0]
+
+
+def test_a_clear_sky_has_the_median_luminance_it_is_exposed_for():
+    points = directions(128)[:64]
+    bright = _luminance(sky.clear_sky(points, _WEATHER)).ravel()
+    weight = np.sqrt(1.0 - points[..., 2].ravel() ** 2)
+    darker = weight[bright < 0.33].sum() / weight.sum()
+    assert darker == pytest.approx(0.5, abs=0.02)
+
+
+def test_the_sky_is_brightest_at_the_sun():
+    points = directions(180)
+    picture = sky.sky_of(points, _WEATHER)
+    brightest = np.unravel_index(np.argmax(_luminance(picture)), picture.shape[:2])
+    cosine = points[brightest] @ sky.sun_direction(_WEATHER)
+    assert math.degrees(math.acos(min(cosine, 1.0))) < 2.0
+    assert picture.max() == pytest.approx(sky.SUN_RADIANCE, rel=0.05)
+
+
+def test_clouds_cover_what_is_asked():
+    points = directions(64)[:28]
+    free, some, all_over = (
+        sky.sky_of(points, _WEATHER._replace(clouds=clouds))
+        - sky.sky_of(points, _WEATHER._replace(clouds=-9.0))
+        for clouds in (-9.0, 0.45, 2.0)
+    )
+    covered = [np.mean(np.abs(each).max(-1) > 0.02) for each in (free, some, all_over)]
+    assert covered[0] == 0.0 and 0.1 < covered[1] < 0.9 and covered[2] > 0.95
+
+
+def test_environments_are_finite_and_bounded(environments):
+    assert len(environments) >= 3
+    for name, picture in environments.items():
+        assert picture.shape == (_ROWS, 2 * _ROWS, 3) and picture.dtype == np.float32, name
+        assert np.all(np.isfinite(picture)) and np.all(picture >= 0.0), name
+        assert picture.max() <= sky.SUN_RADIANCE, name
+
+
+def test_environments_have_a_sun_in_one_place(environments):
+    points = directions(_ROWS)
+    for name, picture in environments.items():
+        bright = _luminance(picture)
+        assert bright.max() > 5.0, name
+        sun = points[bright > 0.6 * bright.max()]
+        middle = sun.mean(0) / np.linalg.norm(sun.mean(0))
+        assert middle[2] > 0.2 and np.all(sun @ middle > math.cos(math.radians(5.0))), name
+
+
+def test_most_of_the_upper_half_is_well_exposed(environments):
+    for name, picture in environments.items():
+        bright = _luminance(picture[: _ROWS // 2])
+        assert np.mean((bright > 0.1) & (bright < 1.0)) > 0.8, name
+
+
+def test_sky_above_is_blue_and_the_ground_has_texture(environments):
+    for name, picture in environments.items():
+        top = np.median(picture[: _ROWS // 8], axis=(0, 1))
+        assert top[2] > 1.3 * top[0], name
+        ground = _luminance(picture[-_ROWS // 3 : -_ROWS // 12])
+        assert ground.std() > 0.2 * ground.mean(), name
+
+
+def test_environments_have_no_seam(environments):
+    for name, picture in environments.items():
+        steps = np.abs(np.roll(picture, -1, axis=1) - picture).mean((0, 2))
+        assert steps[-1] < 1.5 * np.quantile(steps[:-1], 0.9), name
+
+
+def test_environments_differ_and_each_is_always_the_same(environments):
+    for one, other in itertools.combinations(environments.values(), 2):
+        assert np.abs(np.minimum(one, 1.0) - np.minimum(other, 1.0)).mean() > 0.05
+    np.testing.assert_array_equal(make_environment("dunes", _ROWS), environments["dunes"])
+
+
+def test_wrong_input_is_told():
+    with pytest.raises(ValueError, match=r"no environment 'moon'\. Choose from meadow"):
+        make_environment("moon", 64)
+    with pytest.raises(ValueError, match=r"shows nothing\. Ask for 16"):
+        make_environment("lake", 8)
+    for changes in ({"elevation": -0.1}, {"turbidity": 1.0}):
+        with pytest.raises(ValueError, match="no sky for a sun at"):
+            sky.clear_sky(directions(16), _WEATHER._replace(**changes))

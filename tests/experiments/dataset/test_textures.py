@@ -1,0 +1,173 @@
+"""The pool of pictures: rich, different from each other, the same every time, without seams."""
+
+import itertools
+
+import numpy as np
+import pytest
+import scipy.ndimage
+
+from experiments.dataset.textures import cells, fields, shading, sphere_fields
+from experiments.dataset.textures.faces import FACES, make_face
+from experiments.dataset.textures.spheres import SPHERES, make_sphere
+
+_FACE, _SPHERE = 96, 64
+
+
+@pytest.fixture(scope="module")
+def faces():
+    return {name: make_face(name, _FACE) for name in FACES}
+
+
+@pytest.fixture(scope="module")
+def spheres():
+    return {name: make_sphere(name, _SPHERE) for name in SPHERES}
+
+
+def _luminance(picture):
+    return picture @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+
+
+def _blocks(grey, side):
+    rows, columns = (length // side for length in grey.shape)
+    return grey[: rows * side, : columns * side].reshape(rows, side, columns, side).swapaxes(1, 2)
+
+
+def test_the_pool_has_24_faces_and_13_spheres():
+    assert len(FACES) == 24 and len(SPHERES) == 13
+
+
+def test_pictures_are_srgb_in_range(faces, spheres):
+    for name, picture in faces.items():
+        assert picture.shape == (_FACE, _FACE, 3) and picture.dtype == np.float32, name
+    for name, picture in spheres.items():
+        assert picture.shape == (_SPHERE, 2 * _SPHERE, 3) and picture.dtype == np.float32, name
+    for name, picture in (faces | spheres).items():
+        assert np.all(picture >= 0.0) and np.all(picture <= 1.0), name
+        assert 0.15 < picture.mean() < 0.75, name
+
+
+def test_no_picture_is_flat_at_any_scale(faces, spheres):
+    for name, picture in (faces | spheres).items():
+        grey = _luminance(picture)
+        fine = grey - scipy.ndimage.gaussian_filter(grey, 1.5)
+        assert grey.std() > 0.12, name
+        assert fine.std() > 0.04, name
+        assert _blocks(grey, 8).mean((2, 3)).std() > 0.025, name
+
+
+def test_faces_have_detail_nearly_everywhere(faces):
+    for name, picture in faces.items():
+        local = _blocks(_luminance(picture), 12).std((2, 3))
+        assert np.quantile(local, 0.1) > 0.03, name
+
+
+def test_pictures_have_colours(faces, spheres):
+    for name, picture in (faces | spheres).items():
+        chroma = picture.max(-1) - picture.min(-1)
+        assert chroma.mean() > 0.05, name
+
+
+def test_pictures_differ_from_each_other(faces, spheres):
+    for pool in (faces, spheres):
+        for (one, first), (other, second) in itertools.combinations(pool.items(), 2):
+            assert np.abs(first - second).mean() > 0.1, (one, other)
+
+
+@pytest.mark.parametrize("name", ["brick", "leaves", "circuit", "posters", "penrose"])
+def test_a_face_is_always_the_same(faces, name):
+    np.testing.assert_array_equal(make_face(name, _FACE), faces[name])
+
+
+@pytest.mark.parametrize("name", ["nebula", "lantern", "skyline"])
+def test_a_sphere_is_always_the_same(spheres, name):
+    np.testing.assert_array_equal(make_sphere(name, _SPHERE), spheres[name])
+
+
+@pytest.mark.parametrize("name", ["carpet", "cobbles", "planks", "rust"])
+def test_more_samples_show_the_same(faces, name):
+    finer = make_face(name, 2 * _FACE).reshape(_FACE, 2, _FACE, 2, 3).mean((1, 3))
+    broad = [scipy.ndimage.gaussian_filter(each, (4, 4, 0)) for each in (finer, faces[name])]
+    assert np.corrcoef(*(each.ravel() for each in broad))[0, 1] > 0.97
+
+
+def test_spheres_have_no_seam(spheres):
+    for name, picture in spheres.items():
+        steps = np.abs(np.roll(picture, -1, axis=1) - picture).mean((0, 2))
+        assert steps[-1] < 1.5 * np.quantile(steps[:-1], 0.9), name
+
+
+def test_spheres_are_smooth_around_their_poles(spheres):
+    for name, picture in spheres.items():
+        steps = np.abs(np.roll(picture, -1, axis=1) - picture).mean((1, 2))
+        # A row at a pole is as long as a few samples of the equator.
+        assert max(steps[0], steps[-1]) < 0.75 * steps[_SPHERE // 4 : -_SPHERE // 4].max(), name
+
+
+def test_noise_is_normal_and_periodic():
+    field = fields.noise(512, 64, 3)
+    assert abs(field.mean()) < 0.05 and field.std() == pytest.approx(1.0, abs=0.05)
+    steps = np.abs(np.roll(field, -1, axis=1) - field).mean(0)
+    assert steps[-1] < 1.5 * steps.max()
+    assert fields.fbm(512, 32, 3, octaves=4).std() == pytest.approx(1.0, abs=0.05)
+    points = sphere_fields.directions(128)
+    assert sphere_fields.noise3(points, 12.0, 5).std() == pytest.approx(1.0, abs=0.15)
+    assert sphere_fields.waves3(points, 40.0, 5).std() == pytest.approx(1.0, abs=0.15)
+
+
+def test_octaves_that_the_samples_can_not_show_are_left_out():
+    assert not np.any(fields.fbm(16, 64, 3))
+    # Only the first can be shown; it is the weaker the more there would be.
+    one, three = (fields.fbm(16, 8, 3, octaves=octaves) for octaves in (1, 3))
+    np.testing.assert_allclose(three, one / np.sqrt(1 + 0.25 + 0.0625), rtol=1e-4)
+
+
+def test_cells_are_those_of_the_nearest_seed():
+    x, y = fields.coordinates(40)
+    found = cells.voronoi(x, y, (5, 4), 9, jitter=0.8)
+    offsets = (np.random.default_rng(9).random((4, 5, 2), np.float32) - 0.5) * 0.8 + 0.5
+    column, row = np.meshgrid(np.arange(5), np.arange(4))
+    seeds = np.stack([(column + offsets[..., 0]) / 5, (row + offsets[..., 1]) / 4], -1)
+    shifts = np.array(list(itertools.product((-1, 0, 1), repeat=2)))
+    copies = (seeds.reshape(-1, 1, 2) + shifts).reshape(-1, 2)
+    points = np.stack([x, y], -1)[..., None, :]
+    distance = np.linalg.norm(points - copies, axis=-1)
+    order = np.argsort(distance, axis=-1)
+    np.testing.assert_array_equal(found.index, order[..., 0] // len(shifts))
+    first, second = (copies[order[..., each]] for each in (0, 1))
+    np.testing.assert_allclose(np.hypot(found.dx, found.dy), distance.min(-1), atol=1e-5)
+    # The border is half-way between both seeds.
+    normal = (second - first) / np.linalg.norm(second - first, axis=-1, keepdims=True)
+    expected = np.sum((0.5 * (first + second) - points[..., 0, :]) * normal, axis=-1)
+    np.testing.assert_allclose(found.border, expected, atol=1e-5)
+
+
+def test_the_middle_column_looks_along_x_and_the_top_row_up():
+    points = sphere_fields.directions(64)
+    np.testing.assert_allclose(points[32, 63:65].mean(0), [1.0, 0.0, 0.0], atol=0.03)
+    np.testing.assert_allclose(points[32, 31:33].mean(0), [0.0, 1.0, 0.0], atol=0.03)
+    np.testing.assert_allclose(points[0].mean(0), [0.0, 0.0, 1.0], atol=0.03)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=-1), 1.0, atol=1e-6)
+
+
+def test_a_flat_relief_is_as_it_was_and_slopes_are_lit_from_the_upper_left():
+    grey = np.full((32, 32, 3), 0.5, np.float32)
+    flat = np.zeros((32, 32), np.float32)
+    np.testing.assert_allclose(shading.lit(grey, flat), grey, atol=1e-6)
+    x, _ = fields.coordinates(32)
+    assert np.all(shading.lit(grey, 0.5 * x) > 0.55)
+    assert np.all(shading.lit(grey, -0.5 * x) < 0.45)
+
+
+def test_linear_colours_are_those_of_the_standard():
+    values = np.array([0.0, 0.04045, 0.5, 1.0])
+    np.testing.assert_allclose(shading.linear(values), [0.0, 0.0031308, 0.2140411, 1.0], atol=1e-6)
+
+
+def test_wrong_names_and_sizes_are_told():
+    with pytest.raises(ValueError, match=r"no face 'checkerboard'\. Choose from brick"):
+        make_face("checkerboard")
+    with pytest.raises(ValueError, match=r"no sphere 'moon'\. Choose from nebula"):
+        make_sphere("moon")
+    for make, name in ((make_face, "brick"), (make_sphere, "nebula")):
+        with pytest.raises(ValueError, match=r"8 samples shows nothing\. Ask for 16"):
+            make(name, 8)
