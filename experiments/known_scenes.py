@@ -193,13 +193,14 @@ def measure(
     Of sRGB in `[0, 1]`, not rounded, against the 8-bit image; `None` over no pixel.
     """
     target = (scene.images[view] / 255.0).astype(np.float32)
-    result: dict[str, float | None] = {"psnr": float(metrics.psnr(rgb, target))}
+    pair = jax.device_put((rgb, target))
+    result: dict[str, float | None] = {"psnr": float(metrics.psnr(*pair))}
     masks = {"psnr_masked": None, "psnr_outside": None}
     if scene.masks is not None:
         masks = {"psnr_masked": scene.masks[view], "psnr_outside": ~scene.masks[view]}
     for key, mask in masks.items():
         known = mask is not None and mask.any()
-        result[key] = float(metrics.psnr_masked(rgb, target, mask)) if known else None
+        result[key] = float(metrics.psnr_masked(*pair, jax.device_put(mask))) if known else None
     return result
 
 
