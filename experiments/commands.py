@@ -20,18 +20,26 @@ INTERRUPTED = 130
 """Status of a command that was stopped by Ctrl-C, as shells have it."""
 
 
-def run(main: Callable[[], None]) -> None:
+def run(main: Callable[..., None], *, arguments: Sequence[str] = ()) -> None:
     """Runs a command; an error of the user's input ends it with one line and status 2.
 
     So do files that can not be read or written. Ctrl-C ends it with status 130.
+
+    Args:
+      main: the command; its parameters are its arguments, as text.
+      arguments: what each argument is called, as `FOLDER`; all must be given.
     """
 
-    def guarded(arguments: Sequence[str]) -> None:
+    def guarded(words: Sequence[str]) -> None:
         logging.set_verbosity(logging.ERROR)
-        if len(arguments) > 1:
-            sys.exit(f"Unexpected arguments {arguments[1:]}. Options begin with --; see --help.")
+        given = words[1:]
+        if len(given) > len(arguments):
+            extra = list(given[len(arguments) :])
+            sys.exit(f"Unexpected arguments {extra}. Options begin with --; see --help.")
+        if len(given) < len(arguments):
+            sys.exit(f"{arguments[len(given)]} is missing. Give {' '.join(arguments)}; see --help.")
         try:
-            main()
+            main(*given)
         except (ValueError, OSError) as error:
             print(f"error: {error}", file=sys.stderr)
             sys.exit(2)

@@ -13,7 +13,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from experiments import mesh_report
 from refref_jax import metrics
 from refref_jax.data import background, cameras, containment, local_layout, meshes, scene_names
+from refref_jax.data.containment import Containment
 from refref_jax.data.geometry import build_geometry
+from refref_jax.data.meshes import MeshPart
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.media import interior_slots
@@ -87,17 +89,42 @@ def read_scene(
     """
     frames = local_layout.read_frames(scene, split)
     chosen = parse_views(views, len(frames.names))
-    frames = _choose(frames, chosen)
     parts = meshes.read_meshes(scene, indices=indices)
     tree = containment.find_containment(parts)
     mesh_report.report_meshes(parts, tree, rule=rule)
+    return build_scene(scene, parts, tree, frames=frames, chosen=chosen, rule=rule)
+
+
+def build_scene(
+    scene: Path,
+    parts: Sequence[MeshPart],
+    tree: Containment,
+    *,
+    frames: local_layout.Frames,
+    chosen: Sequence[int],
+    rule: str,
+) -> KnownScene:
+    """Makes a scene of meshes that were examined before.
+
+    Args:
+      scene: the scene folder, for its background.
+      parts: its meshes.
+      tree: how they lie in one another.
+      frames: a split of it.
+      chosen: views of the split.
+      rule: what lies outside each mesh.
+
+    Raises:
+      ValueError: if the background is not known, or a picture is missing or broken.
+    """
+    frames = _choose(frames, chosen)
     geometry = build_geometry(parts, tree.parents, rule=rule)
     return KnownScene(
         name=scene_names.of_folder(scene),
         geometry=jax.device_put(geometry),
         radiance=jax.device_put(radiance_of(background.read_background(scene))),
         frames=frames,
-        indices=chosen,
+        indices=tuple(chosen),
         images=local_layout.read_images(frames),
         masks=local_layout.read_masks(frames) if frames.masks else None,
         inside=(
@@ -148,7 +175,7 @@ def render_view(scene: KnownScene, view: int, *, budget: Budget, side: int) -> V
     start = time.monotonic()
     seen = _render(scene, view, rays, budget)
     seconds = time.monotonic() - start
-    linear = cameras.box_filter(seen.linear, side)
+    linear = jax.device_put(cameras.box_filter(seen.linear, side))
     return View(
         rgb=np.clip(np.asarray(colour.linear_to_srgb(linear)), 0.0, 1.0),
         casts=seen.casts / seen.paths.size,
@@ -166,13 +193,14 @@ def measure(
     Of sRGB in `[0, 1]`, not rounded, against the 8-bit image; `None` over no pixel.
     """
     target = (scene.images[view] / 255.0).astype(np.float32)
-    result: dict[str, float | None] = {"psnr": float(metrics.psnr(rgb, target))}
+    pair = jax.device_put((rgb, target))
+    result: dict[str, float | None] = {"psnr": float(metrics.psnr(*pair))}
     masks = {"psnr_masked": None, "psnr_outside": None}
     if scene.masks is not None:
         masks = {"psnr_masked": scene.masks[view], "psnr_outside": ~scene.masks[view]}
     for key, mask in masks.items():
         known = mask is not None and mask.any()
-        result[key] = float(metrics.psnr_masked(rgb, target, mask)) if known else None
+        result[key] = float(metrics.psnr_masked(*pair, jax.device_put(mask))) if known else None
     return result
 
 

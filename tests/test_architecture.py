@@ -29,7 +29,13 @@ _SCRIPTS = sorted((_ROOT / "experiments").glob("*.py"))
 _LONGEST_MODULE = 250
 _LONGEST_FUNCTION = 45
 
-_MAY_JIT = {"render/images.py", "render/known.py", "training/steps.py", "geometry/native_loop.py"}
+_MAY_JIT = {
+    "render/images.py",
+    "render/known.py",
+    "render/first_surface.py",
+    "training/steps.py",
+    "geometry/native_loop.py",
+}
 
 _VAGUE_NAMES = {"utils", "util", "misc", "helpers", "common", "math"}
 

@@ -125,6 +125,15 @@ def planar_depth_to_distance(
     return (depth / cosine).astype(np.float32)
 
 
+def distance_to_planar_depth(
+    cameras: Cameras, distance: Float[np.ndarray, "*images h w"]
+) -> Float[np.ndarray, "*images h w"]:
+    """Converts distance along each pixel's unit ray to depth along the optical axis."""
+    row, column = np.indices((cameras.height, cameras.width))
+    _, cosine = _unit_directions(cameras, row, column)
+    return (distance * cosine).astype(np.float32)
+
+
 def _unit_directions(
     cameras: Cameras, row: Int[np.ndarray, "*shape"], column: Int[np.ndarray, "*shape"]
 ) -> tuple[Float[np.ndarray, "*shape 3"], Float[np.ndarray, "*shape"]]:

@@ -7,6 +7,7 @@ import pytest
 from refref_jax.data.cameras import (
     Cameras,
     box_filter,
+    distance_to_planar_depth,
     focal_length,
     image_rays,
     orbit,
@@ -183,6 +184,14 @@ def test_points_of_one_planar_depth_lie_in_one_plane():
     points = rays.origins + distance[..., None] * rays.directions
     axis = -_TURNED[:, 2]
     np.testing.assert_allclose((points - _TURNED[:, 3]) @ axis, 2.5, rtol=1e-6)
+
+
+def test_planar_depth_and_distance_are_each_others_inverse():
+    cameras = _cameras(7, 5, 3.0)
+    depth = np.random.default_rng(1).uniform(0.1, 20.0, (5, 7))
+    depth[0, 0] = np.inf
+    distance = planar_depth_to_distance(cameras, depth)
+    np.testing.assert_allclose(distance_to_planar_depth(cameras, distance), depth, rtol=_SINGLE)
 
 
 def test_a_miss_stays_infinitely_far():

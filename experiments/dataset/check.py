@@ -1,0 +1,122 @@
+"""Checks scenes that were made: files, meshes, and pictures against our own light paths.
+
+python -m experiments.dataset.check runs/dataset --views=3
+
+Each scene's meshes are linted and all of its images opened. Some of its test views are rendered
+again, `render_known --paths=tree`, and compared with the image; depth map, mask and normals are
+compared with the first surface that rays meet. {out}/check.html shows it all, {out}/check.json has
+the figures; {out} is the folder itself by default. A scene that does not hold makes the command end
+with status 1.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from absl import flags
+
+from experiments import commands, known_scenes, supersampling
+from experiments.dataset import checks
+from experiments.dataset.check_page import SceneReport, write_page
+from refref_jax.optics.budgets import BUDGETS
+
+_SCENES = flags.DEFINE_list("scenes", None, "Only these scenes of the folder, by name.")
+_VIEWS = flags.DEFINE_integer("views", 3, "Test views to compare, evenly spread; 0 for none.", 0)
+_OUT = flags.DEFINE_string("out", None, "Folder to write the report to.")
+flags.declare_key_flag("rays_per_pixel")
+
+_SHOWN_COMPLAINTS = 3
+
+
+def main(folder: str) -> None:
+    """Checks every scene of a folder, and writes the report."""
+    side = supersampling.side_of(known_scenes.RAYS_PER_PIXEL.value)
+    checked = Path(folder)
+    scenes = find_scenes(checked, _SCENES.value)
+    out = Path(_OUT.value) if _OUT.value else checked
+    out.mkdir(parents=True, exist_ok=True)
+    reports = []
+    with commands.ProgressBar("check", len(scenes)) as bar:
+        for done, scene in enumerate(scenes, 1):
+            reports.append(check_scene(scene, views=_VIEWS.value, side=side))
+            bar.show(done, _summary(reports[-1]))
+    page, figures = out / "check.html", out / "check.json"
+    page.write_text(write_page(reports, title=f"Check of {checked.resolve().name}"), "utf-8")
+    content = commands.string_safe([_record(report) for report in reports])
+    figures.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", "utf-8")
+    bad = [report for report in reports if report.complaints]
+    for report in bad:
+        for complaint in report.complaints[:_SHOWN_COMPLAINTS]:
+            print(f"{report.name}: {complaint}")
+    print(f"{len(reports) - len(bad)} of {len(reports)} scenes hold.")
+    print(f"Report:  {page}")
+    print(f"Figures: {figures}")
+    print(f"Next: python -m experiments.train --scene={scenes[0]} --out=runs/{scenes[0].name}")
+    if bad:
+        sys.exit(1)
+
+
+def find_scenes(folder: Path, names: list[str] | None) -> list[Path]:
+    """Returns the scenes of a folder, or the folder itself if it is one.
+
+    Raises:
+      ValueError: if there is none, or not that of a name.
+    """
+    if (folder / "transforms_train.json").is_file():
+        found = [folder]
+    else:
+        found = sorted(path.parent for path in folder.glob("*/transforms_train.json"))
+    if not found:
+        raise ValueError(
+            f"{folder} holds no scene: no folder in it has a transforms_train.json. Give a scene, "
+            "or the folder that `experiments.dataset.make --out` wrote."
+        )
+    if missing := sorted(set(names or ()) - {path.resolve().name for path in found}):
+        raise ValueError(f"{folder} holds no scene {missing[0]}. See the names of its folders.")
+    return [path for path in found if names is None or path.resolve().name in names]
+
+
+def check_scene(scene: Path, *, views: int, side: int) -> SceneReport:
+    """Checks one scene.
+
+    Args:
+      scene: its folder.
+      views: test views to compare, evenly spread.
+      side: rays along each edge of a pixel.
+    """
+    name = scene.resolve().name
+    findings = checks.check_files(scene)
+    made_of, about_meshes = checks.check_meshes(scene)
+    findings += about_meshes
+    compared = []
+    if views and made_of and not any(each.severity == "error" for each in findings):
+        known = checks.read_views(scene, made_of, count=views)
+        compared = [
+            checks.compare_view(known, i, budget=BUDGETS["tree"], side=side)
+            for i in range(len(known.indices))
+        ]
+    convex = "smcvx" in name.split("_")
+    notes = [str(each) for each in findings if each.severity == "note"]
+    return SceneReport(name, checks.complaints(convex, findings, compared), notes, compared)
+
+
+def _summary(report: SceneReport) -> str:
+    if report.complaints:
+        return f"{report.name}  does not hold"
+    if not report.views:
+        return f"{report.name}  holds"
+    return f"{report.name}  {min(view.psnr_masked for view in report.views):.1f} dB in the mask"
+
+
+def _record(report: SceneReport) -> dict[str, Any]:
+    pictures = {"target", "rgb"}
+    views = [
+        {key: value for key, value in view._asdict().items() if key not in pictures}
+        for view in report.views
+    ]
+    return {**report._asdict(), "views": views}
+
+
+if __name__ == "__main__":
+    commands.run(main, arguments=("FOLDER",))

@@ -1,0 +1,218 @@
+"""What must hold of a scene that was rendered: files, meshes, and pictures against our own tracer.
+
+Two renderers that share nothing but the scene's files agree, or one of them is wrong. Colours are
+compared inside the mask, where light went through the object. Depths are compared away from
+*silhouettes*: pixels whose centre is within a pixel or two of an edge of the object, or of one part
+before another, see one or the other by rounding.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from experiments import known_scenes
+from experiments.known_scenes import KnownScene
+from refref_jax.data import (
+    cameras,
+    containment,
+    files,
+    lint,
+    local_layout,
+    meshes,
+    transforms,
+)
+from refref_jax.data.containment import Containment
+from refref_jax.data.findings import Finding
+from refref_jax.data.meshes import MeshPart
+from refref_jax.optics.budgets import Budget
+from refref_jax.render.first_surface import FirstSurface, find_first_surface
+
+PSNR = 33.0
+"""Least PSNR inside the mask, dB, of the rendering against the image."""
+
+PSNR_CONVEX = 40.0
+"""The same for convex objects, whose light paths are short."""
+
+DEPTH = 1e-3
+"""Largest difference of planar depth, world units, away from silhouettes."""
+
+DEPTH_SHARE = 0.999
+"""Least share of pixels within it."""
+
+MASK_SHARE = 0.002
+"""Largest share of an image's pixels where mask and traced silhouette differ."""
+
+# Pixels around a silhouette that are left out of depths and normals.
+_MARGIN = 2
+
+# Planar depths of neighbours that differ by more lie on either side of an inner silhouette.
+_STEP = 0.2
+
+
+class Meshes(NamedTuple):
+    """The meshes of a scene, and how they lie in one another."""
+
+    parts: list[MeshPart]
+    tree: Containment
+
+
+class View(NamedTuple):
+    """One view, rendered by both.
+
+    Attributes:
+      name: of the frame.
+      target: the image, sRGB in `[0, 1]`.
+      rgb: our rendering.
+      psnr: over the whole image, dB.
+      psnr_masked: inside the mask.
+      lost: share of light that found no room.
+      mask_share: share of pixels where mask and traced silhouette differ.
+      depth_share: share of pixels away from silhouettes whose depths agree; NaN without a map.
+      depth_error: the 99.9th percentile of the depths' difference there, world units.
+      normal_degrees: mean angle of the first surface's normals there; NaN without a map.
+    """
+
+    name: str
+    target: Float[np.ndarray, "h w 3"]
+    rgb: Float[np.ndarray, "h w 3"]
+    psnr: float
+    psnr_masked: float
+    lost: float
+    mask_share: float
+    depth_share: float
+    depth_error: float
+    normal_degrees: float
+
+
+def check_files(scene: Path) -> list[Finding]:
+    """Reads every file that the transforms name, and every EXR and mesh beside them."""
+    try:
+        local_layout.check_scene(scene)
+        for path in sorted(scene.glob("**/*.exr")):
+            files.read_exr(path)
+    except ValueError as error:
+        return [Finding("error", scene.name, str(error))]
+    return []
+
+
+def check_meshes(scene: Path) -> tuple[Meshes | None, list[Finding]]:
+    """Reads and lints the meshes of a scene; there are none to use if they can not be read."""
+    try:
+        parts = meshes.read_meshes(scene)
+    except ValueError as error:
+        return None, [Finding("error", scene.name, str(error))]
+    if not parts:
+        return None, [Finding("error", scene.name, "there are no meshes. Make the scene again.")]
+    tree = containment.find_containment(parts)
+    return Meshes(parts, tree), lint.lint(parts, tree)
+
+
+def read_views(scene: Path, made_of: Meshes, *, count: int) -> KnownScene:
+    """Reads some test views of a scene, evenly spread, and all that rendering them takes.
+
+    By the rule that `scene.json` names, or `nested`.
+    """
+    frames = local_layout.read_frames(scene, "test")
+    last = len(frames.names) - 1
+    spread = np.linspace(0, last, min(count, last + 1)).round().astype(int)
+    chosen = tuple(int(i) for i in np.unique(spread))
+    path = scene / "scene.json"
+    rule = transforms.read_json(path).get("rule", "nested") if path.is_file() else "nested"
+    return known_scenes.build_scene(scene, *made_of, frames=frames, chosen=chosen, rule=rule)
+
+
+def compare_view(scene: KnownScene, index: int, *, budget: Budget, side: int) -> View:
+    """Renders one of a scene's views and compares all that is known of it."""
+    rendered = known_scenes.render_view(scene, index, budget=budget, side=side)
+    measured = known_scenes.measure(scene, index, rendered.rgb)
+    first = find_first_surface(
+        scene.geometry.surfaces, cameras.image_rays(scene.frames.cameras, index)
+    )
+    depth = cameras.distance_to_planar_depth(scene.frames.cameras, first.distances)
+    hit = np.isfinite(depth)
+    mask = scene.masks[index] if scene.masks is not None else hit
+    inner = away_from_silhouettes(mask, depth)
+    errors = _depth_errors(scene, index, depth, inner)
+    return View(
+        name=scene.frames.names[index],
+        target=scene.images[index] / 255.0,
+        rgb=rendered.rgb,
+        psnr=_number(measured, "psnr"),
+        psnr_masked=_number(measured, "psnr_masked"),
+        lost=rendered.lost,
+        mask_share=float(np.mean(mask != hit)),
+        depth_share=float(np.mean(errors <= DEPTH)) if errors.size else np.nan,
+        depth_error=float(np.quantile(errors, DEPTH_SHARE)) if errors.size else np.nan,
+        normal_degrees=_normal_degrees(scene, index, first, inner),
+    )
+
+
+def away_from_silhouettes(
+    mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Returns the pixels of an object that no silhouette is near.
+
+    Args:
+      mask: of the object.
+      depth: traced planar depth of the first surface; `inf` where there is none.
+    """
+    finite = np.isfinite(depth)
+    filled = np.where(finite, depth, 0.0)
+    steps = ndimage.maximum_filter(filled, 3) - ndimage.minimum_filter(filled, 3) > _STEP
+    near = ndimage.binary_dilation(steps | ~finite | ~mask, iterations=_MARGIN)
+    return finite & mask & ~near
+
+
+def complaints(convex: bool, findings: Sequence[Finding], views: Sequence[View]) -> list[str]:
+    """Returns what does not hold of a scene, in words; nothing if it may be used.
+
+    Args:
+      convex: whether its object is convex, so that more is asked.
+      findings: about its files and meshes; notes are no complaint.
+      views: those that were compared.
+    """
+    least = PSNR_CONVEX if convex else PSNR
+    found = [f"{each.part}: {each.message}" for each in findings if each.severity != "note"]
+    for view in views:
+        if not view.psnr_masked >= least:
+            found.append(f"{view.name}: {view.psnr_masked:.1f} dB in the mask, not {least:g}")
+        if not view.mask_share <= MASK_SHARE:
+            found.append(f"{view.name}: the mask differs in {view.mask_share:.2%} of pixels")
+        if view.depth_share < DEPTH_SHARE:
+            found.append(
+                f"{view.name}: depths agree to {DEPTH:g} in {view.depth_share:.2%} of pixels only"
+            )
+    return found
+
+
+def _number(measured: Mapping[str, float | None], key: str) -> float:
+    value = measured[key]
+    return np.nan if value is None else value
+
+
+def _depth_errors(
+    scene: KnownScene,
+    index: int,
+    traced: Float[np.ndarray, "h w"],
+    inner: Bool[np.ndarray, "h w"],
+) -> Float[np.ndarray, " pixels"]:
+    """Returns the differences from the float map; none if there is no such map."""
+    depths = scene.frames.depths
+    if depths is None or depths[index].suffix != ".exr":
+        return np.zeros(0)
+    return np.abs(traced[inner] - files.read_depth(depths[index])[inner])
+
+
+def _normal_degrees(
+    scene: KnownScene, index: int, first: FirstSurface, inner: Bool[np.ndarray, "h w"]
+) -> float:
+    image = scene.frames.images[index]
+    path = image.parents[1] / "normal" / image.parent.name / f"{image.stem}.exr"
+    if not path.is_file() or not inner.any():
+        return np.nan
+    cosine = np.sum(files.read_exr(path) * first.normals, axis=-1)[inner]
+    return float(np.degrees(np.mean(np.arccos(np.clip(cosine, -1.0, 1.0)))))

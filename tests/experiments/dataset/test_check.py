@@ -1,0 +1,132 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+import trimesh
+
+from experiments.dataset import check, checks
+from experiments.dataset.check_page import SceneReport, mean, write_page
+from refref_jax.data.findings import Finding
+from tests.experiments.command import ROOT, run_command
+
+_SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
+
+
+def _view(**changes):
+    grey = np.full((4, 4, 3), 0.5)
+    numbers = {
+        "psnr": 50.0,
+        "psnr_masked": 45.0,
+        "lost": 0.0,
+        "mask_share": 0.0,
+        "depth_share": 1.0,
+        "depth_error": 1e-5,
+        "normal_degrees": 0.01,
+    }
+    return checks.View(name="r_000", target=grey, rgb=grey, **numbers | changes)
+
+
+@pytest.fixture
+def copy(tmp_path):
+    """The bundled scene with two frames a split."""
+    scene = tmp_path / "scenes" / "cube_smcvx_ball"
+    shutil.copytree(_SCENE, scene)
+    for path in scene.glob("transforms_*.json"):
+        content = json.loads(path.read_text())
+        content["frames"] = content["frames"][:2]
+        path.write_text(json.dumps(content))
+    return scene
+
+
+def test_pixels_near_a_silhouette_are_left_out_by_hand():
+    depth = np.full((11, 11), np.inf)
+    depth[1:10, 1:10] = 3.0
+    inner = checks.away_from_silhouettes(np.isfinite(depth), depth)
+    # The step at the border reaches one pixel inwards; the margin goes two farther.
+    assert inner.sum() == 9 and inner[4:7, 4:7].all()
+    depth[:, 5] = np.where(np.isfinite(depth[:, 5]), 2.0, np.inf)  # a thin part before another
+    assert not checks.away_from_silhouettes(np.isfinite(depth), depth).any()
+
+
+def test_a_slope_is_no_silhouette_and_a_mask_that_lacks_pixels_counts():
+    depth = np.tile(3.0 + 0.05 * np.arange(20), (20, 1))
+    hit = np.ones_like(depth, bool)
+    assert checks.away_from_silhouettes(hit, depth).all()
+    hit[10, 10] = False
+    assert not checks.away_from_silhouettes(hit, depth)[9:12, 9:12].any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "convex", "message"),
+    [
+        ({}, True, None),
+        ({"psnr_masked": 39.0}, True, "39.0 dB in the mask, not 40"),
+        ({"psnr_masked": 39.0}, False, None),
+        ({"psnr_masked": 32.9}, False, "not 33"),
+        ({"psnr_masked": np.nan}, False, "nan dB"),
+        ({"mask_share": 0.003}, False, "0.30% of pixels"),
+        ({"depth_share": 0.99}, False, "99.00% of pixels only"),
+        ({"depth_share": np.nan}, False, None),
+    ],
+)
+def test_what_does_not_hold_is_told(changes, convex, message):
+    found = checks.complaints(convex, [], [_view(**changes)])
+    assert not found if message is None else len(found) == 1 and message in found[0]
+
+
+def test_findings_are_complaints_unless_they_are_notes():
+    findings = [Finding(severity, "cup", "is odd") for severity in ("note", "warning", "error")]
+    assert checks.complaints(False, findings, []) == ["cup: is odd"] * 2
+
+
+def test_the_bundled_scene_agrees_with_cycles(copy):
+    report = check.check_scene(copy, views=1, side=3)
+    assert report.complaints == [] and len(report.views) == 1
+    assert report.views[0].psnr_masked > checks.PSNR_CONVEX
+    assert report.views[0].depth_error < 2e-4
+
+
+def test_a_mesh_that_is_not_where_it_was_rendered_is_found(copy):
+    path = next((copy / "meshes").iterdir())
+    trimesh.load(path).apply_translation([0.0, 0.0, 0.04]).export(path)
+    told = " ".join(check.check_scene(copy, views=1, side=3).complaints)
+    assert "dB in the mask" in told and "the mask differs" in told and "depths agree" in told
+
+
+def test_a_broken_scene_is_reported_and_the_others_go_on(copy):
+    other = copy.parent / "cube_smcvx_other"
+    shutil.copytree(copy, other)
+    picture = other / "mask" / "val" / "r_001.png"
+    picture.write_bytes(picture.read_bytes()[:60])
+    out = copy.parents[1] / "report"
+    result = run_command("dataset.check", copy.parent, "--views=0", f"--out={out}", fails=True)
+    assert result.returncode == 1 and "1 of 2 scenes hold" in result.stdout
+    assert str(picture) in result.stdout and str(out / "check.html") in result.stdout
+    figures = {report["name"]: report for report in json.loads((out / "check.json").read_text())}
+    assert figures["cube_smcvx_ball"]["complaints"] == []
+    assert str(picture) in figures["cube_smcvx_other"]["complaints"][0]
+
+
+def test_wrong_folders_and_names_are_told(tmp_path, copy):
+    with pytest.raises(ValueError, match="holds no scene"):
+        check.find_scenes(tmp_path / "nowhere", None)
+    with pytest.raises(ValueError, match="cube_smcvx_bal"):
+        check.find_scenes(copy.parent, ["cube_smcvx_bal"])
+    assert check.find_scenes(copy, None) == [copy]
+    assert check.find_scenes(copy.parent, ["cube_smcvx_ball"]) == [copy]
+
+
+def test_the_page_stands_alone_and_shows_failures_first():
+    good = SceneReport("good", [], ["a <note>"], [_view()])
+    bad = SceneReport("bad & broken", ["a < b"], [], [_view(depth_share=np.nan)])
+    page = write_page([good, bad], title="Scenes")
+    assert page.count("<section") == 2 and page.count("data:image/png;base64,") == 6
+    assert page.index("<h2>bad &amp; broken") < page.index("<h2>good")
+    assert "a &lt; b" in page and "a &lt;note&gt;" in page and "1 do not hold" in page
+    assert "http" not in page and 'src="/' not in page
+
+
+def test_a_mean_leaves_out_what_is_not_known():
+    assert mean([1.0, np.nan, 3.0]) == 2.0
+    assert np.isnan(mean([np.nan])) and np.isnan(mean([]))
