@@ -11,7 +11,6 @@ interval: one batch of a thousand pixels says too little.
 Started again, it goes on where it was interrupted.
 """
 
-import json
 import math
 import statistics
 from collections.abc import Sequence
@@ -26,6 +25,7 @@ from experiments import trained_runs
 from experiments.named_budgets import BUDGETS
 from experiments.presets import PRESETS
 from refref_jax.render.saved import load_model
+from refref_jax.training import run_folder
 
 _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folder of the scene.")
 _PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Preset of all trainings.")
@@ -54,7 +54,7 @@ def main(arguments: list[str]) -> None:
         check_finite(_train("float32", _STEPS.value))
     if _CURVE_STEPS.value:
         runs = [_train(precision, _CURVE_STEPS.value) for precision in _PRECISIONS]
-        compare(*[curve(read_metrics(run), _CURVE_STEPS.value) for run in runs])
+        compare(*[curve(run_folder.read_metrics(run), _CURVE_STEPS.value) for run in runs])
 
 
 def _train(precision: str, steps: int) -> Path:
@@ -69,14 +69,9 @@ def _train(precision: str, steps: int) -> Path:
     return run
 
 
-def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """Reads the lines of metrics of a run."""
-    return [json.loads(line) for line in (run / "metrics.jsonl").read_text("utf-8").splitlines()]
-
-
 def check_finite(run: Path) -> None:
     """Asserts that all metrics of a run, and the parameters of its last checkpoint, are finite."""
-    lines = read_metrics(run)
+    lines = run_folder.read_metrics(run)
     for line in lines:
         broken = [name for name, value in line.items() if not math.isfinite(float(value))]
         assert not broken, f"step {line['step']}: {', '.join(broken)} not finite"

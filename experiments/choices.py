@@ -14,6 +14,12 @@ from refref_jax.training.config import TrainingConfig
 Tints = Literal["none", "given", "learned"]
 
 
+_OF_BENT_LIGHT = ("interior", "reentry")
+
+# A field is everywhere where light goes straight.
+_ANYWAY = ("field", "possible")
+
+
 class Wishes(NamedTuple):
     """What options ask for; `None` leaves the choice to the scene's needs.
 
@@ -69,6 +75,8 @@ def choose(needs: Needs, wishes: Wishes) -> Choices:
     budget = make_budget(paths, cut=wishes.cut, bends=wishes.bends)
     if budget.bends:
         budget = dataclasses.replace(budget, reentry=wishes.reentry or needs.reentry)
+    elif asked := [name for name in _OF_BENT_LIGHT if getattr(wishes, name) is not None]:
+        _check_straight(paths, asked[0], getattr(wishes, asked[0]))
     interior = wishes.interior or _needed_interior(needs, wishes, budget)
     tints = _tints(needs, wishes, interior, budget)
     return Choices(
@@ -79,6 +87,19 @@ def choose(needs: Needs, wishes: Wishes) -> Choices:
         learned_tints=needs.parts if tints == "learned" else 0,
         warnings=tuple(_doubts(needs, wishes)),
     )
+
+
+def _check_straight(paths: str, name: str, value: str) -> None:
+    """Refuses a wish about the inside of objects where light goes straight through them.
+
+    Raises:
+      ValueError: unless it asks for what there is anyway.
+    """
+    if value not in _ANYWAY:
+        raise ValueError(
+            f"--{name}={value} has no effect: light that goes straight (--paths={paths}) knows of "
+            "no objects. Leave it out, or use --paths=tree with meshes."
+        )
 
 
 def report(config: TrainingConfig, model: SavedModel, chosen: Choices) -> list[str]:
@@ -92,8 +113,8 @@ def report(config: TrainingConfig, model: SavedModel, chosen: Choices) -> list[s
         (f"interior {shape.interior}{tints}", "interior tints"),
         (f"{shape.space}, radius {shape.radius:g}", "background radius"),
         (
-            f"samples {','.join(map(str, samples_of(shape)))} of "
-            f"{shape.multisamples} points, footprint {shape.footprint}",
+            f"samples {','.join(map(str, samples_of(shape)))} of {shape.multisamples} point"
+            f"{'s' * (shape.multisamples > 1)}, {shape.footprint}",
             "samples multisamples footprint",
         ),
         (

@@ -1,6 +1,7 @@
 """What all commands share: how they start, stop, and report errors and progress."""
 
 import math
+import shlex
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -48,6 +49,11 @@ def run(main: Callable[..., None], *, arguments: Sequence[str] = ()) -> None:
             sys.exit(INTERRUPTED)
 
     app.run(guarded)
+
+
+def shell(name: str, *options: str) -> str:
+    """Returns the line that runs a command of `experiments`, quoted so that it can be pasted."""
+    return shlex.join(["python", "-m", f"experiments.{name}", *options])
 
 
 def string_safe(value: Any) -> Any:

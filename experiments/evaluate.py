@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from absl import flags
 from jaxtyping import Bool, Float, UInt8
@@ -35,6 +36,9 @@ _CHUNK = flags.DEFINE_integer("chunk", 4096, "Paths at once: lower it if memory 
 _METHODS = {"paper": "oracle"}
 
 _VIEWS_IN_COMPARISON = 4
+
+# A share of light that 8 bits may show.
+_WORTH_A_WARNING = 1e-3
 
 
 class Truth(NamedTuple):
@@ -73,9 +77,14 @@ def main() -> None:
     figures.write_comparison(out / "comparison.png", views)
     for key, value in summary["results"].items():
         print(f"{key:>22}  {'-' if value is None else format(value, '.4f')}")
+    if summary["results"]["lost"] > _WORTH_A_WARNING:
+        print(
+            "warning: some light found no room, and is missing from the pictures. Train with a "
+            "larger --cut or fewer --bends."
+        )
     print(f"Pictures: {out / 'comparison.png'}, {out / 'rgb'}, {out / 'distance'}")
     print(f"Metrics:  {out / 'metrics.json'}")
-    print(f"Next: python -m experiments.render --run={run} --views=orbit")
+    print(f"Next: {commands.shell('render', f'--run={run}', '--views=orbit')}")
 
 
 def learned_colours(model: Model) -> dict[str, Any] | None:
@@ -135,26 +144,30 @@ def evaluate(
 
 
 def measure(seen: Rendering, truth: Truth, i: int) -> dict[str, float | None]:
-    """Returns all metrics of one image; `None` for what the scene does not tell."""
-    target = (truth.images[i] / 255.0).astype(np.float32)
+    """Returns all metrics of one image; `None` for what the scene does not tell.
+
+    `lost` is the share of light that found no room.
+    """
+    target = jax.device_put((truth.images[i] / 255.0).astype(np.float32))
+    rgb, distance = jax.device_put((seen.rgb, seen.distance))
     result = {
-        "psnr": metrics.psnr(seen.rgb, target),
+        "psnr": metrics.psnr(rgb, target),
         "psnr_masked": None,
-        "ssim": metrics.ssim(seen.rgb, target),
+        "ssim": metrics.ssim(rgb, target),
         "distance_mae": None,
         "distance_mae_masked": None,
+        "lost": np.mean(seen.lost),
     }
-    mask = None if truth.masks is None else truth.masks[i]
-    if mask is not None:
-        result["psnr_masked"] = metrics.psnr_masked(seen.rgb, target, mask)
+    mask = np.zeros(target.shape[:2], bool) if truth.masks is None else truth.masks[i]
+    if mask.any():
+        result["psnr_masked"] = metrics.psnr_masked(rgb, target, jax.device_put(mask))
     if truth.distances is not None:
-        distance = truth.distances[i]
-        known = np.isfinite(distance)
-        result["distance_mae"] = metrics.mean_absolute_error(seen.distance, distance, known)
-        if mask is not None:
-            result["distance_mae_masked"] = metrics.mean_absolute_error(
-                seen.distance, distance, known & mask
-            )
+        known = np.isfinite(truth.distances[i])
+        wanted = jax.device_put(truth.distances[i])
+        for key, area in {"distance_mae": known, "distance_mae_masked": known & mask}.items():
+            if area.any():
+                area = jax.device_put(area)
+                result[key] = metrics.mean_absolute_error(distance, wanted, area)
     return {key: None if value is None else float(value) for key, value in result.items()}
 
 

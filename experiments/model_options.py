@@ -41,7 +41,7 @@ def parse_samples(words: Sequence[str]) -> tuple[int, ...]:
     Raises:
       ValueError: if one is not a positive whole number.
     """
-    if not all(word.strip().isdecimal() and int(word) > 0 for word in words):
+    if not words or not all(word.strip().isdecimal() and int(word) > 0 for word in words):
         raise ValueError(
             f"--samples={','.join(words)} is not a list of positive numbers. Write as in "
             "--samples=32,20."

@@ -24,7 +24,7 @@ def make_budget(paths: str, *, cut: float | None = None, bends: int | None = Non
       ValueError: if light is straight and has a cut or bends nevertheless.
     """
     budget = BUDGETS[paths]
-    if budget.bends == 0 and not cut is bends is None:
+    if budget.bends == 0 and (cut is not None or bends is not None):
         raise ValueError(
             f"--paths={paths} has no --cut and no --bends. Leave them out, or use --paths=tree."
         )

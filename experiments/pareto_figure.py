@@ -15,6 +15,10 @@ _COSTS: dict[str, Callable[[Row], float]] = {
 _FRONT = "#999999"
 _MARKERS = "osD^vP"
 
+# Decibels below the best beyond which a point stands at the figure's foot, with its number: it
+# would press all others together.
+_DEPTH = 10.0
+
 # Of a letter of a label, in pixels of the figure.
 _LETTER_WIDTH = 6.5
 
@@ -31,9 +35,10 @@ def write(path: Path, rows: Sequence[Row]) -> None:
         knob: (COLOURS[i % len(COLOURS)], _MARKERS[i // len(COLOURS) % len(_MARKERS)])
         for i, knob in enumerate(knobs)
     }
+    foot = max(row.quality for row in rows) - _DEPTH
     figure, axes = pyplot.subplots(1, 2, figsize=(14.0, 6.4), sharey=True, layout="constrained")
     for axis, (label, cost) in zip(axes, _COSTS.items(), strict=True):
-        _draw(axis, rows, label, cost, styles)
+        _draw(axis, rows, label, cost, styles, foot)
     masked = all(row.psnr_masked is not None for row in rows)
     axes[0].set_ylabel("PSNR inside the mask, dB" if masked else "PSNR, dB")
     figure.suptitle(f"{rows[0].scene}: one option changed at a time")
@@ -41,7 +46,7 @@ def write(path: Path, rows: Sequence[Row]) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=7, frameon=False)
     figure.canvas.draw()  # places the axes, so that labels know where they are
     for axis, cost in zip(axes, _COSTS.values(), strict=True):
-        _label_points(axis, rows, cost, styles)
+        _label_points(axis, rows, cost, styles, foot)
     figure.savefig(path, dpi=130)
     pyplot.close(figure)
 
@@ -52,11 +57,12 @@ def _draw(
     label: str,
     cost: Callable[[Row], float],
     styles: dict[str, tuple[str, str]],
+    foot: float,
 ) -> None:
     front = trade_table.pareto(rows, cost)
     axis.step(
         [cost(row) for row in front],
-        [row.quality for row in front],
+        [max(row.quality, foot) for row in front],
         color=_FRONT,
         linewidth=1.5,
         where="post",
@@ -66,7 +72,7 @@ def _draw(
         own = [row for row in rows if row.knob == knob]
         axis.plot(
             [cost(row) for row in own],
-            [row.quality for row in own],
+            [max(row.quality, foot) for row in own],
             marker,
             color=colour,
             markersize=9 if not knob else 6,
@@ -83,13 +89,15 @@ def _label_points(
     rows: Sequence[Row],
     cost: Callable[[Row], float],
     styles: dict[str, tuple[str, str]],
+    foot: float,
 ) -> None:
     """Names the points by their values, those of the front first; none where another name is."""
     front = trade_table.pareto(rows, cost)
     taken: list[tuple[float, float, float]] = []
-    for row in [*front, *(row for row in rows if row not in front)]:
-        name = row.value or row.name
-        point = (cost(row), row.quality)
+    named_first = [trade_table.base_of(rows), *front]
+    for row in [*named_first, *(row for row in rows if row not in named_first)]:
+        name = (row.value or row.name) + f" ({row.quality:.1f} dB)" * (row.quality < foot)
+        point = (cost(row), max(row.quality, foot))
         x, y = axis.transData.transform(point)
         width = _LETTER_WIDTH * len(name)
         if any(

@@ -88,7 +88,12 @@ def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
       cameras: of the training images.
       space: `unbounded` if the background is infinitely far.
       radius: overrides the default of `ModelConfig.radius`.
+
+    Raises:
+      ValueError: if the radius is not positive and finite.
     """
+    if radius is not None and not 0.0 < radius < math.inf:
+        raise ValueError(f"--radius={radius} is no radius. Give a positive number, in world units.")
     farthest = float(np.max(np.linalg.norm(cameras.poses[:, :, 3], axis=-1)))
     if space == "unbounded":
         return Bounds(_NEAR, _FAR_UNBOUNDED, radius or 1.25 * farthest, space)

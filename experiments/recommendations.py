@@ -5,11 +5,14 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments import trade_table, trained_runs
+from experiments import combinations, commands, trade_table, trained_runs
 from experiments.child_process import RunFailedError
 from experiments.trade_table import Row
 from experiments.trained_runs import Training
 from refref_jax.data import scene_names
+
+# Times that differ by no more are the same.
+_SAME_TIME = 1.0 + trade_table.TIME_NOISE / 100.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,17 +32,20 @@ class Machine:
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """What to train with.
+    """What to train with. Differences below `trade_table.NOISE` decide nothing.
 
     Attributes:
-      best: the best that fits.
-      cheaper: the next below it that nothing beats; `None` if there is none.
-      dearer: the next above it, which does not fit; `None` if nothing better was measured.
+      best: the cheapest of those that fit and that none beats; the base, if it is as good.
+      cheaper: the best that takes less time; `None` if there is none.
+      dearer: the cheapest that gives more, which does not fit; `None` if none was measured.
+      combined: what single turns are expected to give together, if that is more than the best;
+        it was not measured.
     """
 
     best: Row
     cheaper: Row | None
     dearer: Row | None
+    combined: Row | None
 
 
 def time_machine(scene: Path, base: Row, steps: int) -> Training:
@@ -85,39 +91,49 @@ def seconds_of(row: Row, machine: Machine) -> float:
 
 
 def choose(rows: Sequence[Row], machine: Machine, seconds: float) -> Choice:
-    """Returns the point with the highest PSNR that fits, and its neighbours on the Pareto front.
+    """Returns the point with the highest PSNR that fits, and its neighbours.
 
     Raises:
       ValueError: if none fits.
     """
-    front = trade_table.pareto(rows, lambda row: seconds_of(row, machine))
-    fitting = [row for row in front if seconds_of(row, machine) <= seconds]
+
+    def cost(row: Row) -> float:
+        return seconds_of(row, machine)
+
+    front = trade_table.pareto(rows, cost)
+    fitting = [row for row in front if cost(row) <= seconds]
     if not fitting:
-        least = seconds_of(front[0], machine)
         raise ValueError(
-            f"No measured point takes less than {least / 60:.1f} minutes here ({front[0].name}). "
-            "Give more time, or a table with smaller points."
+            f"No measured point takes less than {cost(front[0]) / 60:.1f} minutes here "
+            f"({front[0].name}). Give more time, or a table with smaller points."
         )
-    at = len(fitting) - 1
+    enough = fitting[-1].quality - trade_table.NOISE
+    best = next(row for row in fitting if row.quality >= enough)
+    base = trade_table.base_of(rows)
+    if base.quality >= enough and cost(base) <= min(seconds, cost(best) * _SAME_TIME):
+        best = base
+    more = best.quality + trade_table.NOISE
+    cheaper = [row for row in front if cost(row) * _SAME_TIME < cost(best)]
+    combined = combinations.combine(rows, cost, seconds)
     return Choice(
-        best=front[at],
-        cheaper=front[at - 1] if at else None,
-        dearer=front[at + 1] if at + 1 < len(front) else None,
+        best=best,
+        cheaper=cheaper[-1] if cheaper else None,
+        dearer=next((row for row in front if row.quality > more and cost(row) > seconds), None),
+        combined=combined if combined.quality > more else None,
     )
 
 
 def told(choice: Choice, machine: Machine, scene: Path) -> list[str]:
     """Returns the recommendation, line by line."""
-    best = choice.best
-    out = f"runs/{scene_names.of_folder(scene)}"
-    evaluation = f" {best.evaluation}" if best.evaluation else ""
-    lines = [
-        "",
-        f"Use {best.name}: {_expected(best, machine)}.",
-        f"  python -m experiments.train --scene={scene} --out={out} {best.training}",
-        f"  python -m experiments.evaluate --run={out} --split=test{evaluation}",
-        "",
-    ]
+    lines = ["", f"Use {choice.best.name}: {_expected(choice.best, machine)}."]
+    lines += [*_commands(choice.best, scene), ""]
+    if choice.combined is not None:
+        lines += [
+            f"Worth trying, by adding up single turns, not measured together: "
+            f"{choice.combined.name}: {_expected(choice.combined, machine)}.",
+            *_commands(choice.combined, scene),
+            "",
+        ]
     for label, row in (("Cheaper", choice.cheaper), ("Dearer", choice.dearer)):
         if row is not None:
             options = " ".join(filter(None, (row.training, row.evaluation)))
@@ -126,10 +142,17 @@ def told(choice: Choice, machine: Machine, scene: Path) -> list[str]:
         lines.append("Cheaper: nothing was measured that takes less time.")
     if choice.dearer is None:
         lines.append(
-            "Dearer: nothing was measured that gives more, so the time beyond it is of no use "
-            "here. A sweep with longer or larger points may tell of some."
+            "Dearer: the table has no single point that gives more. Longer trainings and larger "
+            "models were not measured: python -m experiments.trade_off can."
         )
     return lines
+
+
+def _commands(row: Row, scene: Path) -> list[str]:
+    run = f"runs/{scene_names.of_folder(scene)}"
+    train = commands.shell("train", f"--scene={scene}", f"--out={run}", *row.training.split())
+    evaluate = commands.shell("evaluate", f"--run={run}", "--split=test", *row.evaluation.split())
+    return [f"  {train}", f"  {evaluate}"]
 
 
 def _expected(row: Row, machine: Machine) -> str:

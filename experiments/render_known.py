@@ -91,10 +91,8 @@ def main() -> None:
     _report(summary)
     print(f"Pictures: {out / 'comparison.png'}, {out / 'rgb'}")
     print(f"Metrics:  {metrics_file}")
-    print(
-        f"Next: python -m experiments.path_trade_off --scenes={_SCENE.value} "
-        f"--out={out / 'trade_off'}"
-    )
+    options = (f"--scenes={_SCENE.value}", f"--out={out / 'trade_off'}")
+    print(f"Next: {commands.shell('path_trade_off', *options)}")
 
 
 def render(

@@ -30,7 +30,7 @@ def sweep(
       points: the base first.
       out: folder to write to.
       measure_: measures one point.
-      earlier: rows that stay in the table, if they were measured on as many images.
+      earlier: rows that stay in the table; see `earlier_rows`.
 
     Returns:
       Why points failed, by name: they are left out, and the others go on.
@@ -53,18 +53,23 @@ def sweep(
                 failed[point.name] = str(error)
                 bar.show(done, f"{point.name} failed")
                 continue
-            rows = {each.name: each for each in rows.values() if each.images == row.images}
             rows[row.name] = row
             _write(out, list(rows.values()))
             bar.show(done, f"{point.name}: {row.quality:.2f} dB")
     return failed
 
 
-def earlier_rows(out: Path, base: Point, scene: Path) -> list[Row]:
+def earlier_rows(out: Path, base: Point, scene: Path, *, images: int) -> list[Row]:
     """Returns what sweeps around the same base have measured into a folder.
 
+    Args:
+      out: folder of the sweeps.
+      base: the base point.
+      scene: folder of the scene.
+      images: that an evaluation renders.
+
     Raises:
-      ValueError: if they were around another base, or of another scene.
+      ValueError: if they were around another base, of another scene, or on other images.
     """
     table = out / "trade_off.csv"
     if not table.exists():
@@ -74,6 +79,13 @@ def earlier_rows(out: Path, base: Point, scene: Path) -> list[Row]:
     if (found.scene, found.training, found.evaluation) != (scene_names.of_folder(scene), *new):
         raise ValueError(
             f"{table} is of {found.scene}, around {found.training}. Give another --out."
+        )
+    if not (out / "runs" / run_name(base, scene)).is_dir():
+        raise ValueError(f"{table} is of another folder named {found.scene}. Give another --out.")
+    if found.images != images:
+        raise ValueError(
+            f"{table} was measured on {found.images} images, and this sweep would be on {images}. "
+            f"Give --limit={found.images}, or another --out."
         )
     return rows
 

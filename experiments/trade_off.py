@@ -20,6 +20,7 @@ from absl import flags
 
 from experiments import commands, scene_option, sweeps, trade_points
 from experiments.trade_points import Point
+from refref_jax.data import local_layout
 
 _SCENE = flags.DEFINE_string("scene", None, f"The scene: {scene_option.FORMS}.", required=True)
 _OUT = flags.DEFINE_string("out", None, "Folder of the sweep.", required=True)
@@ -54,19 +55,19 @@ def main() -> None:
     # A sweep that is killed takes the training that it waits for with it.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     limit = () if _LIMIT.value is None else (f"--limit={_LIMIT.value}",)
+    images = len(local_layout.read_frames(scene, "test").names)
+    images = min(images, _LIMIT.value or images)
     failed = sweeps.sweep(
         points,
         out,
         lambda point: sweeps.measure(point, scene, out / "runs", limit),
-        sweeps.earlier_rows(out, points[0], scene),
+        sweeps.earlier_rows(out, points[0], scene, images=images),
     )
     print(f"Table:  {out / 'trade_off.csv'}")
     print(f"Figure: {out / 'trade_off.png'}")
     print(f"Report: {out / 'trade_off.md'}")
-    print(
-        f"Next: python -m experiments.recommend --scene={_SCENE.value} --minutes=5 "
-        f"--table={out / 'trade_off.csv'}"
-    )
+    options = (f"--scene={_SCENE.value}", "--minutes=5", f"--table={out / 'trade_off.csv'}")
+    print(f"Next: {commands.shell('recommend', *options)}")
     for name, reason in failed.items():
         print(f"failed: {name}: {reason}", file=sys.stderr)
     if failed:
@@ -82,6 +83,8 @@ def points_from_flags() -> list[Point]:
             f"--steps={','.join(_STEPS.value)} is not a list of numbers. Write as in "
             "--steps=2500,1000."
         ) from error
+    if any(count < 1 for count in steps):
+        raise ValueError(f"--steps={','.join(_STEPS.value)} has no training. Give 1 or more.")
     points = trade_points.sweep(
         preset=_PRESET.value,
         seed=_SEED.value,

@@ -18,9 +18,9 @@ OF_EVALUATION = ("rays_per_pixel",)
 
 _BASE_OPTIONS = {"paths": "tree"}
 
-_OF_BENT_LIGHT = ("cut", "bends")
+_OF_BENT_LIGHT = ("cut", "bends", "interior", "reentry", "tints")
 
-_NOT_OF_BASE = ("preset", "seed", "steps")
+_NOT_OF_BASE = ("preset", "seed", "steps", "scene", "out", "resume", "run", "limit")
 
 _ANY_BOUNDS = Bounds(near=0.05, far=20.0, radius=7.3, space="bounded")
 
@@ -54,7 +54,7 @@ def sweep(
 ) -> list[Point]:
     """Returns the base and all points around it; a point that equals the base is left out.
 
-    Straight light has no cut and no bends, so that neither is given beside it.
+    Straight light has no cut, no bends and no inside, so that none of them is given beside it.
 
     Args:
       preset: of the base.
@@ -74,6 +74,8 @@ def sweep(
         raise ValueError(
             f"--base={misplaced[0]}=... would be at odds with the points. Use --{misplaced[0]}."
         )
+    if (paths := (base or {}).get("paths", "tree")) not in BUDGETS:
+        raise ValueError(f"There are no --base=paths={paths}. Choose from {', '.join(BUDGETS)}.")
     usual = PRESETS[preset].schedule.steps
     first, *others = steps or (usual, usual // 4, usual // 2, 2 * usual)
     base = _BASE_OPTIONS | dict(base or {})

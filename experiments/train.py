@@ -15,7 +15,7 @@ from experiments import commands, plans, scene_option, scenes
 from refref_jax.data import local_layout
 from refref_jax.data.batches import PixelSampler
 from refref_jax.render import saved
-from refref_jax.training import loop, run_folder
+from refref_jax.training import loop, run_folder, run_lock
 from refref_jax.training.checkpoints import Checkpoints
 from refref_jax.training.state import TrainState, init_state
 from refref_jax.training.steps import StepReport
@@ -35,6 +35,14 @@ _MOST_STEPS = 10
 def main() -> None:
     """Plans a run, or finds the one to resume, and trains it."""
     run = Path(_OUT.value)
+    if not _begin(run):
+        sys.exit(commands.INTERRUPTED)
+    print(f"Run: {run}  (metrics.jsonl, checkpoints/)")
+    print(f"Next: {commands.shell('evaluate', f'--run={run}', '--split=test')}")
+
+
+def _begin(run: Path) -> bool:
+    """Begins a run, or goes on with it; returns whether it has reached its last step."""
     resuming = _RESUME.value and run_folder.exists(run)
     if not resuming:
         run_folder.create(run, *plans.plan_from_flags())
@@ -42,10 +50,8 @@ def main() -> None:
         run_folder.check_unchanged(run, *plans.plan_from_flags())
     else:
         _refuse_options(run)
-    if not train(run):
-        sys.exit(commands.INTERRUPTED)
-    print(f"Run: {run}  (metrics.jsonl, checkpoints/)")
-    print(f"Next: python -m experiments.evaluate --run={run} --split=test")
+    with run_lock.hold(run):
+        return train(run)
 
 
 def _refuse_options(run: Path) -> None:

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from experiments import child_process
-from refref_jax.data import local_layout
+from refref_jax.data import local_layout, transforms
+from refref_jax.training import run_folder
 
 _MEASURED = "measured.json"
 
@@ -144,7 +145,7 @@ def read_training(run: Path, *, wall: float, peak_host_mib: float | None) -> Tra
       wall: seconds that its process took.
       peak_host_mib: largest resident set of that process, if that is known.
     """
-    lines = _metrics(run)
+    lines = run_folder.read_metrics(run)
     last = lines[-1]
     pace = seconds_per_step(lines)
     batch = json.loads((run / "config.json").read_text("utf-8"))["batch"]
@@ -172,13 +173,8 @@ def seconds_per_step(lines: Sequence[dict[str, Any]]) -> float:
 
 def _has_ended(run: Path, steps: int | None) -> bool:
     """Returns whether a run of so many steps is finished, so that training it takes no time."""
-    lines = _metrics(run) if (run / "metrics.jsonl").is_file() else []
+    lines = run_folder.read_metrics(run)
     return bool(lines) and lines[-1]["step"] == steps
-
-
-def _metrics(run: Path) -> list[dict[str, Any]]:
-    text = (run / "metrics.jsonl").read_text("utf-8")
-    return [json.loads(line) for line in text.splitlines()]
 
 
 def _steps_in(options: Sequence[str]) -> int | None:
@@ -193,7 +189,7 @@ def _number(value: Any) -> Any:
 
 def _read(run: Path) -> dict[str, Any]:
     path = run / _MEASURED
-    return json.loads(path.read_text("utf-8")) if path.is_file() else {}
+    return transforms.read_json(path) if path.is_file() else {}
 
 
 def _write(run: Path, record: dict[str, Any]) -> None:

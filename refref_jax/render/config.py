@@ -1,6 +1,7 @@
 """Static description of a model: what is sampled, how often, and by which fields."""
 
 import dataclasses
+import math
 from typing import Literal, get_args
 
 from refref_jax.fields.density_field import DensityFieldConfig
@@ -82,8 +83,10 @@ class ModelConfig:
                 f"The distances must satisfy 0 <= near < far; got near = {self.near} and far = "
                 f"{self.far}. Correct them."
             )
-        if not self.radius > 0.0:
-            raise ValueError(f"The radius must be positive, not {self.radius}. Correct it.")
+        if not 0.0 < self.radius < math.inf:
+            raise ValueError(
+                f"The radius must be positive and finite, not {self.radius}. Correct it."
+            )
         if self.learned_tints < 0:
             raise ValueError(
                 f"{self.learned_tints} parts can not have learned tints. Give their number, or 0."

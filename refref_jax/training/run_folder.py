@@ -33,13 +33,15 @@ def create(run: Path, config: TrainingConfig, model: SavedModel, geometry: Geome
     """Opens a new run; the configuration comes last, so that a half-made folder is no run.
 
     Raises:
-      ValueError: if the folder holds a run already.
+      ValueError: if the folder holds a run already, or is a file.
     """
     if found := [name for name in _LEFT_BEHIND if (run / name).exists()]:
         raise ValueError(
             f"{run} holds a run already, or what is left of one ({', '.join(found)}). Continue it "
             "with --resume, or give another --out."
         )
+    if run.exists() and not run.is_dir():
+        raise ValueError(f"{run} is a file, but a run needs a folder. Give another --out.")
     run.mkdir(parents=True, exist_ok=True)
     saved.save_scene(run, model, geometry)
     configuration.write(run / _CONFIG, config)
@@ -90,15 +92,22 @@ def rewind_metrics(run: Path, step: int) -> float:
     path = run / _METRICS
     if not path.is_file():
         return 0.0
-    kept = [line for line in _read_metrics(path) if line["step"] <= step]
+    kept = [line for line in read_metrics(run) if line["step"] <= step]
     rewritten = path.with_suffix(".tmp")
     rewritten.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
     rewritten.replace(path)
     return kept[-1]["seconds"] if kept else 0.0
 
 
-def _read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Reads all lines; the last one may be half written, where a run was killed."""
+def read_metrics(run: Path) -> list[dict[str, Any]]:
+    """Reads all lines; the last one may be half written, where a run was killed: it is left out.
+
+    Raises:
+      ValueError: if another line is broken.
+    """
+    path = run / _METRICS
+    if not path.is_file():
+        return []
     texts = path.read_text(encoding="utf-8").splitlines()
     lines = []
     for number, text in enumerate(texts, 1):

@@ -104,6 +104,7 @@ def test_evaluation_writes_images_metrics_and_a_comparison(trained):
         "ssim",
         "distance_mae",
         "distance_mae_masked",
+        "lost",
         "seconds_per_image",
     }
     assert len(summary["per_image"]) == 2

@@ -56,6 +56,27 @@ def test_needs_choose_unless_options_do(needs, wishes, expected):
     assert chosen.warnings == ()
 
 
+@pytest.mark.parametrize(
+    ("wishes", "option"),
+    [
+        (Wishes(paths="straight", interior="absorbing"), "--interior=absorbing"),
+        (Wishes(paths="straight", interior="clear"), "--interior=clear"),
+        (Wishes(bends=0, interior="clear"), "--interior=clear"),
+        (Wishes(paths="straight", reentry="impossible"), "--reentry=impossible"),
+    ],
+)
+def test_straight_light_has_no_inside(wishes, option):
+    with pytest.raises(ValueError, match=f"{option} has no effect"):
+        choose(_TINTED, wishes)
+    with pytest.raises(ValueError, match="has no effect"):
+        choose(_EMPTY, wishes._replace(bends=None, paths=None))
+
+
+def test_what_straight_light_has_anyway_may_be_asked_for():
+    wishes = Wishes(paths="straight", interior="field", reentry="possible")
+    assert choose(_TINTED, wishes).interior == "field"
+
+
 def test_the_budget_promises_what_the_scene_keeps():
     assert choose(_CLEAR, Wishes()).budget == dataclasses.replace(TREE, reentry="impossible")
     assert choose(_TINTED, Wishes()).budget == TREE

@@ -20,6 +20,8 @@ def test_every_point_changes_one_option_of_the_base():
     assert base.name == BASE and "--interior=clear" in base.training
     for point in others:
         ours, theirs = (set(p.training) | set(p.evaluation) for p in (base, point))
+        if point.name == "paths=straight":  # which has no inside
+            ours.remove("--interior=clear")
         assert len(theirs - ours) == 1 and len(ours - theirs) <= 1, point.name
         assert f"--{point.knob}={point.value}" in theirs
 
@@ -193,6 +195,7 @@ def test_a_sweep_writes_everything_and_outlives_a_point_that_fails(tmp_path):
 
 def test_a_sweep_adds_to_the_one_before_it_around_the_same_base(tmp_path):
     def measure(point):
+        (tmp_path / "runs" / sweeps.run_name(point, _SCENE)).mkdir(parents=True, exist_ok=True)
         options = " ".join(point.training), " ".join(point.evaluation)
         row = made_row(point.name)
         return dataclasses.replace(
@@ -201,15 +204,36 @@ def test_a_sweep_adds_to_the_one_before_it_around_the_same_base(tmp_path):
 
     for knobs in (["cut"], ["paths"]):
         points = trade_points.sweep(preset="tiny", knobs=knobs)
-        earlier = sweeps.earlier_rows(tmp_path, points[0], _SCENE)
+        earlier = sweeps.earlier_rows(tmp_path, points[0], _SCENE, images=20)
         sweeps.sweep(points, tmp_path, measure, earlier)
     names = [row.name for row in trade_table.read(tmp_path / "trade_off.csv")]
     assert names[0] == BASE and {"cut=0.1", "paths=straight"} < set(names)
     other = trade_points.sweep(preset="tiny", base={"batch": "64"})[0]
     with pytest.raises(ValueError, match="another --out"):
-        sweeps.earlier_rows(tmp_path, other, _SCENE)
+        sweeps.earlier_rows(tmp_path, other, _SCENE, images=20)
     with pytest.raises(ValueError, match="another --out"):
-        sweeps.earlier_rows(tmp_path, points[0], ROOT)
+        sweeps.earlier_rows(tmp_path, points[0], ROOT, images=20)
+    # Measured on other images they could not stand in one table.
+    with pytest.raises(ValueError, match="on 20 images, and this sweep would be on 5"):
+        sweeps.earlier_rows(tmp_path, points[0], _SCENE, images=5)
+    # A folder of that name, elsewhere, is another scene.
+    namesake = tmp_path / _SCENE.name
+    namesake.mkdir()
+    with pytest.raises(ValueError, match="another folder named"):
+        sweeps.earlier_rows(tmp_path, points[0], namesake, images=20)
+
+
+@pytest.mark.parametrize(
+    ("base", "message"),
+    [
+        ({"paths": "foo"}, "no --base=paths=foo"),
+        ({"out": "x"}, "--out"),
+        ({"scene": "x"}, "--scene"),
+    ],
+)
+def test_a_base_that_points_can_not_have_is_refused(base, message):
+    with pytest.raises(ValueError, match=message):
+        trade_points.sweep(preset="tiny", base=base)
 
 
 def test_a_sweep_without_its_base_ends(tmp_path):
