@@ -52,7 +52,8 @@ def main(folder: str) -> None:
     print(f"{len(reports) - len(bad)} of {len(reports)} scenes hold.")
     print(f"Report:  {page}")
     print(f"Figures: {figures}")
-    print(f"Next: python -m experiments.train --scene={scenes[0]} --out=runs/{scenes[0].name}")
+    options = (f"--scene={scenes[0]}", f"--out=runs/{scenes[0].resolve().name}")
+    print(f"Next: {commands.shell('train', *options)}")
     if bad:
         sys.exit(1)
 
