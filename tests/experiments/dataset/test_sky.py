@@ -3,12 +3,14 @@
 import itertools
 import math
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from experiments.dataset import sky
 from experiments.dataset.landscapes import ENVIRONMENTS, make_environment
 from experiments.dataset.textures.sphere_fields import directions
+from refref_jax.render.backgrounds import Environment, LinearTexture, environment_radiance
 
 _ROWS = 96
 _WEATHER = sky.Weather(math.radians(40.0), math.radians(45.0), 3.0, 0.4, 5)
@@ -94,6 +96,14 @@ def test_the_sky_is_brightest_at_the_sun():
     cosine = points[brightest] @ sky.sun_direction(_WEATHER)
     assert math.degrees(math.acos(min(cosine, 1.0))) < 2.0
     assert picture.max() == pytest.approx(sky.SUN_RADIANCE, rel=0.05)
+
+
+def test_the_library_sees_the_sun_where_it_stands():
+    environment = Environment(LinearTexture(jnp.asarray(sky.sky_of(directions(180), _WEATHER))))
+    towards, origin = jnp.asarray(sky.sun_direction(_WEATHER)), jnp.zeros(3)
+    assert np.all(environment_radiance(environment, origin, towards) > 0.7 * sky.SUN_RADIANCE)
+    mirrored = towards * jnp.array([1.0, -1.0, 1.0])
+    assert np.all(environment_radiance(environment, origin, mirrored) < 2.0)
 
 
 def test_clouds_cover_what_is_asked():
