@@ -9,13 +9,6 @@ from jaxtyping import Float, Int
 Category = Literal["smcvx", "smncvx", "mmncvx"]
 """Single material and convex, single and not convex, multiple materials and not convex."""
 
-CATEGORIES: dict[Category, str] = {
-    "smcvx": "single-convex",
-    "smncvx": "single-non-convex",
-    "mmncvx": "multiple-non-convex",
-}
-"""The categories' names in the published layouts."""
-
 RADIUS = 2.0
 """No vertex of any object is farther from the origin, world units."""
 
