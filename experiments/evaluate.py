@@ -9,17 +9,15 @@ of its rays'; see `experiments.supersampling`.
 import json
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import numpy as np
 from absl import flags
-from jaxtyping import Bool, Float, UInt8
 
-from experiments import commands, figures, scene_option, supersampling
-from refref_jax import metrics
+from experiments import commands, figures, measures, scene_option, supersampling
+from experiments.measures import Truth
 from refref_jax.data import files, local_layout, scene_names
-from refref_jax.render import Model, Rendering, dyes, load_model
+from refref_jax.render import Model, dyes, load_model
 from refref_jax.render.saved import latest_step
 from refref_jax.training import run_folder
 
@@ -41,15 +39,6 @@ _VIEWS_IN_COMPARISON = 4
 _WORTH_A_WARNING = 1e-3
 
 
-class Truth(NamedTuple):
-    """What a split says of its images; masks and distances may be missing."""
-
-    frames: local_layout.Frames
-    images: UInt8[np.ndarray, "frames h w 3"]
-    masks: Bool[np.ndarray, "frames h w"] | None
-    distances: Float[np.ndarray, "frames h w"] | None
-
-
 def main() -> None:
     """Evaluates a run."""
     side = supersampling.side_of(_RAYS_PER_PIXEL.value)
@@ -59,7 +48,7 @@ def main() -> None:
     step = _STEP.value if _STEP.value is not None else latest_step(run)
     model = load_model(run, step=step)
     scene = scene_option.opened(_SCENE.value or config.scene.path)
-    truth = read_truth(scene, _SPLIT.value)
+    truth = measures.read_truth(scene, _SPLIT.value)
     out = run / "eval" / _SPLIT.value
     per_image, views = evaluate(model, truth, out, side)
     summary = {
@@ -67,7 +56,7 @@ def main() -> None:
         "method": _METHODS.get(config.paths, config.paths),
         "step": step,
         "rays_per_pixel": _RAYS_PER_PIXEL.value,
-        "results": {key: _mean(per_image, key) for key in per_image[0] if key != "name"},
+        "results": {key: measures.mean(per_image, key) for key in per_image[0] if key != "name"},
         "learned": learned_colours(model),
         "per_image": per_image,
     }
@@ -99,17 +88,6 @@ def learned_colours(model: Model) -> dict[str, Any] | None:
     }
 
 
-def read_truth(scene: Path, split: str) -> Truth:
-    """Reads all that a split has."""
-    frames = local_layout.read_frames(scene, split)
-    return Truth(
-        frames,
-        local_layout.read_images(frames),
-        local_layout.read_masks(frames) if frames.masks else None,
-        local_layout.read_distances(frames) if frames.depths else None,
-    )
-
-
 def evaluate(
     model: Model, truth: Truth, out: Path, side: int
 ) -> tuple[list[dict[str, Any]], list[figures.Comparison]]:
@@ -135,45 +113,13 @@ def evaluate(
             seconds = time.monotonic() - start
             files.write_rgb(out / "rgb" / f"{name}.png", seen.rgb)
             files.write_exr(out / "distance" / f"{name}.exr", seen.distance)
-            per_image.append({"name": name, **measure(seen, truth, i), "seconds": seconds})
+            measured = measures.measure(seen, truth, i)
+            per_image.append({"name": name, **measured, "seconds": seconds})
             if i in shown:
                 target = truth.images[i] / 255.0
                 views.append(figures.Comparison(name, target, seen.rgb, seen.distance))
             bar.show(len(per_image), f"{name}  PSNR {per_image[-1]['psnr']:.2f}")
     return per_image, views
-
-
-def measure(seen: Rendering, truth: Truth, i: int) -> dict[str, float | None]:
-    """Returns all metrics of one image; `None` for what the scene does not tell.
-
-    `lost` is the share of light that found no room.
-    """
-    target = jax.device_put((truth.images[i] / 255.0).astype(np.float32))
-    rgb, distance = jax.device_put((seen.rgb, seen.distance))
-    result = {
-        "psnr": metrics.psnr(rgb, target),
-        "psnr_masked": None,
-        "ssim": metrics.ssim(rgb, target),
-        "distance_mae": None,
-        "distance_mae_masked": None,
-        "lost": np.mean(seen.lost),
-    }
-    mask = np.zeros(target.shape[:2], bool) if truth.masks is None else truth.masks[i]
-    if mask.any():
-        result["psnr_masked"] = metrics.psnr_masked(rgb, target, jax.device_put(mask))
-    if truth.distances is not None:
-        known = np.isfinite(truth.distances[i])
-        wanted = jax.device_put(truth.distances[i])
-        for key, area in {"distance_mae": known, "distance_mae_masked": known & mask}.items():
-            if area.any():
-                area = jax.device_put(area)
-                result[key] = metrics.mean_absolute_error(distance, wanted, area)
-    return {key: None if value is None else float(value) for key, value in result.items()}
-
-
-def _mean(per_image: list[dict[str, Any]], key: str) -> float | None:
-    values = [image[key] for image in per_image if image[key] is not None]
-    return float(np.mean(values)) if values else None
 
 
 if __name__ == "__main__":

@@ -58,8 +58,10 @@ MEASURES = [
     Measure("through vertices and edges", "share of rays", cases.vertices_and_edges, 1e-3),
     Measure("in faces and along edges", "light", light.edge_on, 1e-5),
     Measure("starting on surfaces", "light", light.on_surfaces, 1e-5),
-    Measure("nested and overlapping bodies", "light", light.nested_and_overlapping, 1e-5),
-    Measure("broken meshes", "light", light.broken_meshes, 1e-5),
+    Measure(
+        "nested and overlapping bodies", "light", light.nested_and_overlapping, 1e-5, slow=True
+    ),
+    Measure("broken meshes", "light", light.broken_meshes, 1e-5, slow=True),
     Measure("whispering gallery", "light", light.whispering_gallery, 1e-5),
     Measure("index-matched bodies", "unit", light.index_matched, 1e-5),
     Measure("there and back", "rad", light.reversibility, 1e-4),

@@ -17,9 +17,8 @@ from typing import Any
 from absl import flags
 
 from experiments import commands, known_scenes, supersampling
-from experiments.dataset import checks
+from experiments.dataset import scene_check
 from experiments.dataset.check_page import SceneReport, write_page
-from refref_jax.optics.budgets import BUDGETS
 
 _SCENES = flags.DEFINE_list("scenes", None, "Only these scenes of the folder, by name.")
 _VIEWS = flags.DEFINE_integer("views", 3, "Test views to compare, evenly spread; 0 for none.", 0)
@@ -33,13 +32,13 @@ def main(folder: str) -> None:
     """Checks every scene of a folder, and writes the report."""
     side = supersampling.side_of(known_scenes.RAYS_PER_PIXEL.value)
     checked = Path(folder)
-    scenes = find_scenes(checked, _SCENES.value)
+    scenes = scene_check.find_scenes(checked, _SCENES.value)
     out = Path(_OUT.value) if _OUT.value else checked
     out.mkdir(parents=True, exist_ok=True)
     reports = []
     with commands.ProgressBar("check", len(scenes)) as bar:
         for done, scene in enumerate(scenes, 1):
-            reports.append(check_scene(scene, views=_VIEWS.value, side=side))
+            reports.append(scene_check.check_scene(scene, views=_VIEWS.value, side=side))
             bar.show(done, _summary(reports[-1]))
     page, figures = out / "check.html", out / "check.json"
     page.write_text(write_page(reports, title=f"Check of {checked.resolve().name}"), "utf-8")
@@ -56,50 +55,6 @@ def main(folder: str) -> None:
     print(f"Next: {commands.shell('train', *options)}")
     if bad:
         sys.exit(1)
-
-
-def find_scenes(folder: Path, names: list[str] | None) -> list[Path]:
-    """Returns the scenes of a folder, or the folder itself if it is one.
-
-    Raises:
-      ValueError: if there is none, or not that of a name.
-    """
-    if (folder / "transforms_train.json").is_file():
-        found = [folder]
-    else:
-        found = sorted(path.parent for path in folder.glob("*/transforms_train.json"))
-    if not found:
-        raise ValueError(
-            f"{folder} holds no scene: no folder in it has a transforms_train.json. Give a scene, "
-            "or the folder that `experiments.dataset.make --out` wrote."
-        )
-    if missing := sorted(set(names or ()) - {path.resolve().name for path in found}):
-        raise ValueError(f"{folder} holds no scene {missing[0]}. See the names of its folders.")
-    return [path for path in found if names is None or path.resolve().name in names]
-
-
-def check_scene(scene: Path, *, views: int, side: int) -> SceneReport:
-    """Checks one scene.
-
-    Args:
-      scene: its folder.
-      views: test views to compare, evenly spread.
-      side: rays along each edge of a pixel.
-    """
-    name = scene.resolve().name
-    findings = checks.check_files(scene)
-    made_of, about_meshes = checks.check_meshes(scene)
-    findings += about_meshes
-    compared = []
-    if views and made_of and not any(each.severity == "error" for each in findings):
-        known = checks.read_views(scene, made_of, count=views)
-        compared = [
-            checks.compare_view(known, i, budget=BUDGETS["tree"], side=side)
-            for i in range(len(known.indices))
-        ]
-    convex = "smcvx" in name.split("_")
-    notes = [str(each) for each in findings if each.severity == "note"]
-    return SceneReport(name, checks.complaints(convex, findings, compared), notes, compared)
 
 
 def _summary(report: SceneReport) -> str:

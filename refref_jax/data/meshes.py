@@ -177,7 +177,7 @@ def _index(path: Path, overrides: Mapping[str, float], described: PartDescriptio
     if path.stem in overrides:
         return overrides[path.stem]
     table = INDEX_OF_REFRACTION | dict(overrides)
-    material = material_of(path, table)
+    material = material_of(path, table=table)
     if described.index is not None and material not in overrides:
         return described.index
     if material is None:
@@ -189,7 +189,7 @@ def _index(path: Path, overrides: Mapping[str, float], described: PartDescriptio
     return table[material]
 
 
-def material_of(path: Path, table: Mapping[str, float] = INDEX_OF_REFRACTION) -> str | None:
+def material_of(path: Path, *, table: Mapping[str, float] = INDEX_OF_REFRACTION) -> str | None:
     """Returns the material of a mesh file: the last word of its name that the table knows."""
     known = [word for word in path.stem.split("_") if word in table]
     return known[-1] if known else None
@@ -197,7 +197,7 @@ def material_of(path: Path, table: Mapping[str, float] = INDEX_OF_REFRACTION) ->
 
 def _check_overrides(overrides: Mapping[str, float], paths: Sequence[Path]) -> None:
     table = INDEX_OF_REFRACTION | dict(overrides)
-    known = {path.stem for path in paths} | {material_of(path, table) for path in paths}
+    known = {path.stem for path in paths} | {material_of(path, table=table) for path in paths}
     for name in overrides:
         if name not in known:
             raise SceneError(

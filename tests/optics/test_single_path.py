@@ -41,7 +41,9 @@ def _bodies():
     }
 
 
-@pytest.mark.parametrize("body", list(_bodies()))
+@pytest.mark.parametrize(
+    "body", ["ball", "tinted box", pytest.param("box", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize(
     "budget",
     [

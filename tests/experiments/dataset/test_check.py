@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from experiments.dataset import check, checks
+from experiments.dataset import checks, scene_check
 from experiments.dataset.check_page import SceneReport, mean, write_page
 from refref_jax.data.findings import Finding
 from tests.experiments.command import ROOT, run_command
@@ -81,7 +81,7 @@ def test_findings_are_complaints_unless_they_are_notes():
 
 
 def test_the_bundled_scene_agrees_with_cycles(copy):
-    report = check.check_scene(copy, views=1, side=3)
+    report = scene_check.check_scene(copy, views=1, side=3)
     assert report.complaints == [] and len(report.views) == 1
     assert report.views[0].psnr_masked > checks.PSNR_CONVEX
     assert report.views[0].depth_error < 2e-4
@@ -90,7 +90,7 @@ def test_the_bundled_scene_agrees_with_cycles(copy):
 def test_a_mesh_that_is_not_where_it_was_rendered_is_found(copy):
     path = next((copy / "meshes").iterdir())
     trimesh.load(path).apply_translation([0.0, 0.0, 0.04]).export(path)
-    told = " ".join(check.check_scene(copy, views=1, side=3).complaints)
+    told = " ".join(scene_check.check_scene(copy, views=1, side=3).complaints)
     assert "dB in the mask" in told and "the mask differs" in told and "depths agree" in told
 
 
@@ -110,11 +110,11 @@ def test_a_broken_scene_is_reported_and_the_others_go_on(copy):
 
 def test_wrong_folders_and_names_are_told(tmp_path, copy):
     with pytest.raises(ValueError, match="holds no scene"):
-        check.find_scenes(tmp_path / "nowhere", None)
+        scene_check.find_scenes(tmp_path / "nowhere", None)
     with pytest.raises(ValueError, match="cube_smcvx_bal"):
-        check.find_scenes(copy.parent, ["cube_smcvx_bal"])
-    assert check.find_scenes(copy, None) == [copy]
-    assert check.find_scenes(copy.parent, ["cube_smcvx_ball"]) == [copy]
+        scene_check.find_scenes(copy.parent, ["cube_smcvx_bal"])
+    assert scene_check.find_scenes(copy, None) == [copy]
+    assert scene_check.find_scenes(copy.parent, ["cube_smcvx_ball"]) == [copy]
 
 
 def test_the_page_stands_alone_and_shows_failures_first():

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from experiments.dataset import (
-    convert,
+    conversion,
     dataset_card,
     layout_parquet,
     published_meshes,
@@ -40,7 +40,7 @@ def _convert(source, layout, out):
     out.mkdir(parents=True, exist_ok=True)
     scenes = scene_folders.find(str(source))
     steps = []
-    left = [convert.convert(each, layout, out, step=lambda: steps.append(0)) for each in scenes]
+    left = [conversion.convert(each, layout, out, step=lambda: steps.append(0)) for each in scenes]
     unpacked = sum(each.images for each in scenes if each.copy is not None)
     assert len(steps) == unpacked + sum(each.images for each in scenes)
     return sum(left, start=type(left[0])())
@@ -158,7 +158,7 @@ def test_names_of_the_raw_release(ball, tmp_path):
     ],
 )
 def test_folders_of_the_raw_release(tmp_path, name, folder):
-    assert convert.folder_of(name, "raw", tmp_path) == tmp_path / "image_data" / folder
+    assert conversion.folder_of(name, "raw", tmp_path) == tmp_path / "image_data" / folder
 
 
 def test_the_schema_of_hugging_face(ball, tmp_path):
@@ -275,12 +275,12 @@ def test_an_interrupted_conversion_leaves_no_scene_and_can_be_repeated(
         # As after kill -9: nothing is cleaned up.
         context.setattr(tempfile, "TemporaryDirectory", AbandonedFolder)
         with pytest.raises(KeyboardInterrupt):
-            convert.convert(scene, layout, out, step=fail)
-    assert not convert.is_there(_NAME, layout, out)
+            conversion.convert(scene, layout, out, step=fail)
+    assert not conversion.is_there(_NAME, layout, out)
     with scene_error("holds no scene"):
         scene_folders.find(str(out))
-    convert.convert(scene, layout, out, step=lambda: None)
-    assert convert.is_there(_NAME, layout, out)
+    conversion.convert(scene, layout, out, step=lambda: None)
+    assert conversion.is_there(_NAME, layout, out)
     assert [each.name for each in scene_folders.find(str(out))] == [_NAME]
 
 
@@ -290,7 +290,7 @@ def test_nothing_is_overwritten(ball, tmp_path, layout):
     _convert(ball, layout, tmp_path / "out")
     scenes = scene_folders.find(str(ball.parent))
     with pytest.raises(ValueError, match=r"1 of the 2 scenes already.*--scenes=cube_smcvx_cube"):
-        convert.check_room(scenes, layout, tmp_path / "out")
+        conversion.check_room(scenes, layout, tmp_path / "out")
 
 
 def test_scenes_are_chosen_by_name(ball):
@@ -306,7 +306,7 @@ def test_scenes_are_chosen_by_name(ball):
 def test_a_name_that_the_published_layouts_do_not_know(ball, tmp_path, layout):
     toy = ball.rename(ball.with_name("toy"))
     with scene_error("'toy' is no name", "cube_smcvx_toy"):
-        convert.check_room(scene_folders.find(str(toy)), layout, tmp_path)
+        conversion.check_room(scene_folders.find(str(toy)), layout, tmp_path)
     _convert(toy, "local", tmp_path / "out")
     assert _files(tmp_path / "out" / "toy") == _files(toy)
 

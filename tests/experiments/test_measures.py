@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from experiments import evaluate
+from experiments import measures
 from refref_jax.data.local_layout import Frames
 from refref_jax.render import Rendering
 from tests.small_model import CAMERAS
@@ -15,7 +15,7 @@ def _seen(rgb, distance=1.0, lost=0.0):
 
 def _truth(masks, distances):
     images = np.zeros((1, 16, 16, 3), np.uint8)
-    return evaluate.Truth(Frames(("a",), (), None, None, CAMERAS), images, masks, distances)
+    return measures.Truth(Frames(("a",), (), None, None, CAMERAS), images, masks, distances)
 
 
 _GREY = np.full((16, 16, 3), np.float32(0.1))
@@ -26,7 +26,7 @@ def test_all_measures_by_hand():
     mask[0, :2] = True
     distances = np.full((1, 16, 16), np.float32(1.0))
     seen = _seen(_GREY, distance=3.0, lost=0.25)
-    found = evaluate.measure(seen, _truth(mask, distances), 0)
+    found = measures.measure(seen, _truth(mask, distances), 0)
     assert found["psnr"] == found["psnr_masked"] == pytest.approx(20.0, abs=1e-4)
     assert found["distance_mae"] == found["distance_mae_masked"] == pytest.approx(2.0)
     assert found["lost"] == 0.25
@@ -35,7 +35,7 @@ def test_all_measures_by_hand():
 def test_what_is_over_no_pixel_is_left_out_and_spoils_no_mean():
     nothing = np.zeros((1, 16, 16), bool)
     misses = np.full((1, 16, 16), np.float32(np.inf))
-    found = evaluate.measure(_seen(_GREY), _truth(nothing, misses), 0)
+    found = measures.measure(_seen(_GREY), _truth(nothing, misses), 0)
     assert found["psnr_masked"] is found["distance_mae"] is found["distance_mae_masked"] is None
-    assert evaluate._mean([found, found | {"psnr_masked": 30.0}], "psnr_masked") == 30.0
-    assert evaluate._mean([found], "psnr_masked") is None
+    assert measures.mean([found, found | {"psnr_masked": 30.0}], "psnr_masked") == 30.0
+    assert measures.mean([found], "psnr_masked") is None

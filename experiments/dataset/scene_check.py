@@ -1,0 +1,51 @@
+"""Checks one scene of the data set, and finds those of a folder; see `check`."""
+
+from pathlib import Path
+
+from experiments.dataset import checks
+from experiments.dataset.check_page import SceneReport
+from refref_jax.optics.budgets import BUDGETS
+
+
+def find_scenes(folder: Path, names: list[str] | None) -> list[Path]:
+    """Returns the scenes of a folder, or the folder itself if it is one.
+
+    Raises:
+      ValueError: if there is none, or not that of a name.
+    """
+    if (folder / "transforms_train.json").is_file():
+        found = [folder]
+    else:
+        found = sorted(path.parent for path in folder.glob("*/transforms_train.json"))
+    if not found:
+        raise ValueError(
+            f"{folder} holds no scene: no folder in it has a transforms_train.json. Give a scene, "
+            "or the folder that `experiments.dataset.make --out` wrote."
+        )
+    if missing := sorted(set(names or ()) - {path.resolve().name for path in found}):
+        raise ValueError(f"{folder} holds no scene {missing[0]}. See the names of its folders.")
+    return [path for path in found if names is None or path.resolve().name in names]
+
+
+def check_scene(scene: Path, *, views: int, side: int) -> SceneReport:
+    """Checks one scene.
+
+    Args:
+      scene: its folder.
+      views: test views to compare, evenly spread.
+      side: rays along each edge of a pixel.
+    """
+    name = scene.resolve().name
+    findings = checks.check_files(scene)
+    made_of, about_meshes = checks.check_meshes(scene)
+    findings += about_meshes
+    compared = []
+    if views and made_of and not any(each.severity == "error" for each in findings):
+        known = checks.read_views(scene, made_of, count=views)
+        compared = [
+            checks.compare_view(known, i, budget=BUDGETS["tree"], side=side)
+            for i in range(len(known.indices))
+        ]
+    convex = "smcvx" in name.split("_")
+    notes = [str(each) for each in findings if each.severity == "note"]
+    return SceneReport(name, checks.complaints(convex, findings, compared), notes, compared)
