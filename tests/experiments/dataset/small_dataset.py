@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 from pathlib import Path
+from unittest import mock
 
 import imageio.v3 as iio
 import numpy as np
@@ -60,18 +61,18 @@ def write_background(scene, kind, *, seed, size):
 
 def make(out, blender, names="*_box,env_mmncvx_box_full", *, workers=2, **changes):
     """Makes small scenes, and returns whether all of it is there."""
-    backgrounds.write_background = write_background
     chosen = scenes.choose(names, SMALL_OBJECTS)
     settings = dataclasses.replace(SETTINGS, **changes)
-    return production.produce(
-        Path(out),
-        chosen,
-        settings,
-        objects=SMALL_OBJECTS,
-        blender=Path(blender),
-        workers=workers,
-        stopped=lambda: False,
-    )
+    with mock.patch.object(backgrounds, "write_background", write_background):
+        return production.produce(
+            Path(out),
+            chosen,
+            settings,
+            objects=SMALL_OBJECTS,
+            blender=Path(blender),
+            workers=workers,
+            stopped=lambda: False,
+        )
 
 
 def _kill_at(moment, number):
