@@ -59,7 +59,7 @@ def _psnr(image, target, mask):
         # A float64 prototype reached 31.3 dB with the paper's paths and 44.4 with the tree, over
         # four views of 200 x 200 pixels.
         (STRAIGHT, 8.0, 13.0),
-        (Budget(10, "none"), 20.0, 25.0),
+        pytest.param(Budget(10, "none"), 20.0, 25.0, marks=pytest.mark.slow),
         (PAPER, 27.0, 33.0),
         (TREE, 41.5, 48.0),
     ],
