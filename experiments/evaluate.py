@@ -56,7 +56,7 @@ def main() -> None:
         "method": _METHODS.get(config.paths, config.paths),
         "step": step,
         "rays_per_pixel": _RAYS_PER_PIXEL.value,
-        "results": {key: measures.mean(per_image, key) for key in per_image[0] if key != "name"},
+        "results": {key: measures.mean_of(per_image, key) for key in per_image[0] if key != "name"},
         "learned": learned_colours(model),
         "per_image": per_image,
     }

@@ -204,12 +204,6 @@ def measure(
     return result
 
 
-def mean_of(measures: Sequence[Mapping[str, float | None]], key: str) -> float | None:
-    """Returns the mean of a measure over the views that have it."""
-    values = [measure[key] for measure in measures if measure[key] is not None]
-    return float(np.mean(values)) if values else None
-
-
 def _render(scene: KnownScene, view: int, rays: Rays, budget: Budget) -> KnownRendering:
     inside = scene.inside
     if inside is not None:

@@ -1,5 +1,6 @@
 """What is measured of a rendered image, against what a scene tells of it."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -60,7 +61,7 @@ def measure(seen: Rendering, truth: Truth, i: int) -> dict[str, float | None]:
     return {key: None if value is None else float(value) for key, value in result.items()}
 
 
-def mean(per_image: list[dict[str, Any]], key: str) -> float | None:
+def mean_of(per_image: Sequence[Mapping[str, Any]], key: str) -> float | None:
     """Returns the mean of a measure over the images that have it."""
     values = [image[key] for image in per_image if image[key] is not None]
     return float(np.mean(values)) if values else None

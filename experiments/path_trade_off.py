@@ -26,6 +26,7 @@ from experiments import (
     supersampling,
 )
 from experiments.known_scenes import KnownScene
+from experiments.measures import mean_of
 from experiments.path_figures import Trial
 from refref_jax.data import scene_names
 from refref_jax.optics.budgets import BUDGETS, Budget
@@ -138,9 +139,9 @@ def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
         name=setting.name,
         cut=setting.budget.cut,
         bends=setting.budget.bends,
-        psnr=known_scenes.mean_of(measures, "psnr"),
-        psnr_masked=known_scenes.mean_of(measures, "psnr_masked"),
-        psnr_outside=known_scenes.mean_of(measures, "psnr_outside"),
+        psnr=mean_of(measures, "psnr"),
+        psnr_masked=mean_of(measures, "psnr_masked"),
+        psnr_outside=mean_of(measures, "psnr_outside"),
         casts_per_pixel=float(np.mean([view.casts for view in views])),
         paths_per_pixel=float(np.mean([view.paths for view in views])),
         seconds_per_pixel=sum(view.seconds for view in views) / (pixels * len(views)),

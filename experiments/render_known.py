@@ -27,6 +27,7 @@ from experiments import (
     supersampling,
 )
 from experiments.known_scenes import KnownScene, View
+from experiments.measures import mean_of
 from refref_jax.data import files
 from refref_jax.optics.budgets import BUDGETS, Budget
 
@@ -124,7 +125,7 @@ def summarise(
         "cut": budget.cut,
         "bends": budget.bends,
         "views": measures,
-        "mean": {key: known_scenes.mean_of(measures, key) for key in keys},
+        "mean": {key: mean_of(measures, key) for key in keys},
         "casts_per_pixel": float(np.mean([view.casts for view in views])),
         "paths_per_pixel": float(np.mean([view.paths for view in views])),
         "seconds": sum(view.seconds for view in views),

@@ -1,7 +1,6 @@
 """Makes what is missing of scenes, alone in their folder (NumPy only)."""
 
 import contextlib
-import fcntl
 import os
 import shutil
 import tempfile
@@ -15,6 +14,7 @@ from experiments.dataset.parts import Object
 from experiments.dataset.render_settings import RenderSettings
 from experiments.dataset.worker_pool import Pool
 from refref_jax.data.scene_names import SceneName
+from refref_jax.training import run_lock
 
 _SCRATCH = ".scratch"
 
@@ -86,22 +86,13 @@ def _alone_in(out: Path) -> Iterator[Path]:
 
     It stays behind where an error ends the command, for the logs in it.
     """
-    lock = os.open(out, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ValueError(
-                f"Another command makes scenes in {out}. Wait for it, or give another --out."
-            ) from error
+    with run_lock.hold(out):
         scratch = out / _SCRATCH
         shutil.rmtree(scratch, ignore_errors=True)
         scratch.mkdir(exist_ok=True)
         # A process of a killed command may still be about to write: the name is new every time.
         yield Path(tempfile.mkdtemp(dir=scratch)).absolute()
         shutil.rmtree(scratch, ignore_errors=True)
-    finally:
-        os.close(lock)
 
 
 def _cores() -> int:

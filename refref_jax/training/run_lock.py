@@ -1,7 +1,8 @@
-"""One process at a time trains a run.
+"""One process at a time works in a folder: trains a run, or makes scenes.
 
-The lock is the operating system's: it ends with the process that holds it, however that ends. Where
-there is none of the kind (Windows), nothing is locked.
+The lock is the operating system's, on the folder itself: it leaves no file behind, and ends with
+the process that holds it, however that ends. Where there is none of the kind (Windows), nothing is
+locked.
 """
 
 import contextlib
@@ -14,33 +15,28 @@ try:
 except ImportError:  # pragma: no cover
     fcntl = None
 
-_FILE = ".lock"
-
 
 @contextlib.contextmanager
-def hold(run: Path) -> Iterator[None]:
-    """Keeps other processes from training a run, for as long as the context lasts.
+def hold(folder: Path) -> Iterator[None]:
+    """Keeps other processes out of a folder, for as long as the context lasts.
 
     Args:
-      run: its folder.
+      folder: of a run, or of anything that this is asked for.
 
     Raises:
-      ValueError: if another process trains it.
+      ValueError: if another process holds it.
     """
-    with (run / _FILE).open("a+", encoding="utf-8") as file:
-        if fcntl is not None:
-            _lock(file.fileno(), run)
-        file.truncate(0)
-        file.write(str(os.getpid()))
-        file.flush()
+    if fcntl is None:
         yield
-
-
-def _lock(descriptor: int, run: Path) -> None:
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        holder = (run / _FILE).read_text("utf-8").strip()
-        raise ValueError(
-            f"Another process ({holder or 'unknown'}) trains {run}. Wait until it ends, or stop it."
-        ) from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ValueError(
+                f"Another process works in {folder}. Wait until it ends, or stop it."
+            ) from error
+        yield
+    finally:
+        os.close(descriptor)

@@ -9,7 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from experiments import known_scenes, named_budgets
+from experiments import known_scenes, measures, named_budgets
 from refref_jax.data import files
 from refref_jax.render import BUDGETS
 from tests.experiments.command import ROOT, run_command
@@ -186,9 +186,9 @@ def test_a_budget_keeps_what_is_not_given_and_grows_below_its_cut():
 
 def test_measures_over_no_pixel_are_left_out():
     views = [{"psnr": 30.0, "psnr_masked": None}, {"psnr": 40.0, "psnr_masked": 20.0}]
-    assert known_scenes.mean_of(views, "psnr") == 35.0
-    assert known_scenes.mean_of(views, "psnr_masked") == 20.0
-    assert known_scenes.mean_of(views[:1], "psnr_masked") is None
+    assert measures.mean_of(views, "psnr") == 35.0
+    assert measures.mean_of(views, "psnr_masked") == 20.0
+    assert measures.mean_of(views[:1], "psnr_masked") is None
 
 
 def test_a_scene_without_a_known_background_is_named(tmp_path):

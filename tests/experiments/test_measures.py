@@ -37,5 +37,5 @@ def test_what_is_over_no_pixel_is_left_out_and_spoils_no_mean():
     misses = np.full((1, 16, 16), np.float32(np.inf))
     found = measures.measure(_seen(_GREY), _truth(nothing, misses), 0)
     assert found["psnr_masked"] is found["distance_mae"] is found["distance_mae_masked"] is None
-    assert measures.mean([found, found | {"psnr_masked": 30.0}], "psnr_masked") == 30.0
-    assert measures.mean([found], "psnr_masked") is None
+    assert measures.mean_of([found, found | {"psnr_masked": 30.0}], "psnr_masked") == 30.0
+    assert measures.mean_of([found], "psnr_masked") is None

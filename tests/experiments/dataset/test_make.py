@@ -150,7 +150,7 @@ def test_a_strange_folder_is_left_alone(tmp_path, blender):
 
 def test_two_commands_never_work_in_one_folder(tmp_path, blender, monkeypatch):
     def again(*arguments, **options):
-        with pytest.raises(ValueError, match="Another command"):
+        with pytest.raises(ValueError, match="Another process"):
             make(tmp_path, blender)
         return write_background(*arguments, **options)
 
