@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from experiments.dataset.landscapes import ENVIRONMENTS, make_environment
-from experiments.dataset.textures.faces import FACES, SIZE, make_face
-from experiments.dataset.textures.spheres import HEIGHT, SPHERES, make_sphere
+from experiments.dataset.textures.faces import FACES, make_face
+from experiments.dataset.textures.spheres import SPHERES, make_sphere
 from refref_jax.data import files
 
 Kind = Literal["cube", "sphere", "env"]
@@ -53,9 +53,7 @@ _ENVIRONMENT_MAPPING = _AROUND.format(where="", texels="linear RGB, infinitely d
 )
 
 
-def write_background(
-    scene: Path, kind: Kind, *, seed: int, size: int | None = None
-) -> dict[str, Any]:
+def write_background(scene: Path, kind: Kind, *, seed: int, size: int) -> dict[str, Any]:
     """Writes the images of a background into `scene/background/`.
 
     Each file appears whole or not at all. The images of a name and size are always the same, and
@@ -65,7 +63,7 @@ def write_background(
       scene: its folder; is made if need be.
       kind: of background.
       seed: decides which pictures; any integer that is not negative.
-      size: rows of each image; 1024 if `None`.
+      size: rows of each image, 16 or more.
 
     Returns:
       The record `background` of `scene.json`; `texture` in it names the picture.
@@ -82,12 +80,12 @@ def write_background(
     )
 
 
-def _write_cube(scene: Path, rng: np.random.Generator, size: int | None) -> dict[str, Any]:
+def _write_cube(scene: Path, rng: np.random.Generator, size: int) -> dict[str, Any]:
     names = rng.choice(list(FACES), len(_WALLS), replace=False).tolist()
     faces = {}
     for (wall, (normal, u_axis, v_axis)), name in zip(_WALLS.items(), names, strict=True):
         image = f"{FOLDER}/face_{wall}.png"
-        _replace(scene / image, files.write_rgb, _face(name, size or SIZE) / 255.0)
+        _replace(scene / image, files.write_rgb, _face(name, size) / 255.0)
         faces[wall] = {
             "image": image,
             "normal": list(normal),
@@ -98,16 +96,16 @@ def _write_cube(scene: Path, rng: np.random.Generator, size: int | None) -> dict
     return {"type": "cube", "half_extent": HALF_EXTENT, "faces": faces, "mapping": _WALL_MAPPING}
 
 
-def _write_sphere(scene: Path, rng: np.random.Generator, size: int | None) -> dict[str, Any]:
+def _write_sphere(scene: Path, rng: np.random.Generator, size: int) -> dict[str, Any]:
     name, image = str(rng.choice(list(SPHERES))), f"{FOLDER}/sphere.png"
-    _replace(scene / image, files.write_rgb, _sphere(name, size or HEIGHT) / 255.0)
+    _replace(scene / image, files.write_rgb, _sphere(name, size) / 255.0)
     record = {"type": "sphere", "radius": HALF_EXTENT, "image": image, "texture": name}
     return record | {"mapping": _SPHERE_MAPPING}
 
 
-def _write_environment(scene: Path, rng: np.random.Generator, size: int | None) -> dict[str, Any]:
+def _write_environment(scene: Path, rng: np.random.Generator, size: int) -> dict[str, Any]:
     name, image = str(rng.choice(list(ENVIRONMENTS))), f"{FOLDER}/env.exr"
-    _replace(scene / image, files.write_exr, _environment(name, size or HEIGHT))
+    _replace(scene / image, files.write_exr, _environment(name, size))
     return {"type": "env", "image": image, "texture": name, "mapping": _ENVIRONMENT_MAPPING}
 
 

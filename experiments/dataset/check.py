@@ -54,8 +54,11 @@ def main(folder: str) -> None:
     print(f"{len(reports) - len(bad)} of {len(reports)} scenes hold.")
     print(f"Report:  {page}")
     print(f"Figures: {figures}")
-    options = (f"--scene={scenes[0]}", f"--out=runs/{scenes[0].resolve().name}")
-    print(f"Next: {commands.shell('train', *options)}")
+    if (scenes[0] / "transforms_train.json").is_file():
+        options = (f"--scene={scenes[0]}", f"--out=runs/{scenes[0].resolve().name}")
+        print(f"Next: {commands.shell('train', *options)}")
+    else:
+        print("Next: python -m experiments.dataset.make without --preview, for scenes to train on")
     if bad:
         sys.exit(1)
 

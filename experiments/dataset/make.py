@@ -25,7 +25,7 @@ from experiments.dataset import (
     production,
     scenes,
 )
-from experiments.dataset.render_settings import PerSplit, RenderSettings
+from experiments.dataset.render_settings import LEAST_TEXTURE, PerSplit, RenderSettings
 from refref_jax.data.scene_names import BACKGROUNDS, SceneName
 
 _OUT = flags.DEFINE_string("out", None, "Folder that gets a folder for each scene.", required=True)
@@ -55,6 +55,9 @@ _RULE = flags.DEFINE_enum(
     "nested",
     ["nested", "facing"],
     "What lies outside a part: the part around it, or always air, as in Blender without care.",
+)
+_TEXTURE_SIZE = flags.DEFINE_integer(
+    "texture_size", 1024, "Rows of each image of the background.", lower_bound=LEAST_TEXTURE
 )
 _EXR = flags.DEFINE_enum(
     "exr", "test", ["all", "test", "none"], "Splits whose images are kept as linear EXRs too."
@@ -111,6 +114,7 @@ def _settings() -> RenderSettings:
         spp=PerSplit(_SPP.value, _SPP.value, test_spp),
         views=PerSplit(*views),
         rule=_RULE.value,
+        texture_size=_TEXTURE_SIZE.value,
         linear=_EXR.value,
         preview=_PREVIEW.value,
     )

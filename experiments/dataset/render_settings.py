@@ -14,6 +14,9 @@ LinearImages = Literal["all", "test", "none"]
 GENERATOR = 1
 """Version of the generator. It grows when a scene of the same settings would look different."""
 
+LEAST_TEXTURE = 16
+"""Rows below which a texture shows nothing."""
+
 BLENDER = "5.0.1"
 """Version of Blender; another one's pixels may differ."""
 
@@ -48,6 +51,7 @@ class RenderSettings:
       spp: samples a pixel.
       views: poses of each split.
       rule: what lies outside a part.
+      texture_size: rows of each image of the background.
       linear: which splits keep linear EXRs.
       preview: whether of all views only `preview_view` is rendered.
     """
@@ -56,6 +60,7 @@ class RenderSettings:
     spp: PerSplit
     views: PerSplit
     rule: Rule = "nested"
+    texture_size: int = 1024
     linear: LinearImages = "test"
     preview: bool = False
 
@@ -68,6 +73,10 @@ class RenderSettings:
         for name, number in [("size", self.size), *zip(_SPP, self.spp, strict=True)]:
             if number < 1:
                 raise ValueError(f"The {name} is {number}. Give 1 or more.")
+        if self.texture_size < LEAST_TEXTURE:
+            raise ValueError(
+                f"The texture_size is {self.texture_size}. Give {LEAST_TEXTURE} or more."
+            )
         if min(self.views) < 0 or not any(self.views):
             raise ValueError(
                 f"The views of train, val and test are {', '.join(map(str, self.views))}. Give "
@@ -96,6 +105,7 @@ class RenderSettings:
             if self.preview
             else self.views._asdict(),
             "rule": self.rule,
+            "texture_size": self.texture_size,
             "render": {"generator": GENERATOR, **_RENDER, "linear_images": self.linear},
         }
 

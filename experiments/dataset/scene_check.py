@@ -6,6 +6,8 @@ from experiments.dataset import checks
 from experiments.dataset.check_page import SceneReport
 from refref_jax.optics.budgets import BUDGETS
 
+_TRANSFORMS = "transforms_*.json"
+
 
 def find_scenes(folder: Path, names: list[str] | None) -> list[Path]:
     """Returns the scenes of a folder, or the folder itself if it is one.
@@ -13,13 +15,13 @@ def find_scenes(folder: Path, names: list[str] | None) -> list[Path]:
     Raises:
       ValueError: if there is none, or not that of a name.
     """
-    if (folder / "transforms_train.json").is_file():
+    if any(folder.glob(_TRANSFORMS)):
         found = [folder]
     else:
-        found = sorted(path.parent for path in folder.glob("*/transforms_train.json"))
+        found = sorted({path.parent for path in folder.glob(f"*/{_TRANSFORMS}")})
     if not found:
         raise ValueError(
-            f"{folder} holds no scene: no folder in it has a transforms_train.json. Give a scene, "
+            f"{folder} holds no scene: no folder in it has a transforms_test.json. Give a scene, "
             "or the folder that `experiments.dataset.make --out` wrote."
         )
     if missing := sorted(set(names or ()) - {path.resolve().name for path in found}):

@@ -48,7 +48,9 @@ def make(
     made = parts()
     write_meshes(draft, scene, made)
     seed = seed_of(str(scene), "background")
-    background = backgrounds.write_background(draft, scene.background, seed=seed, size=None)
+    background = backgrounds.write_background(
+        draft, scene.background, seed=seed, size=settings.texture_size
+    )
     for split in cameras.SPLITS:
         if settings.numbers(split):
             _write_json(draft / f"transforms_{split}.json", _transforms(scene, settings, split))

@@ -10,7 +10,7 @@ A depth map named as PNG is read from the float EXR beside it when there is one.
 
 import collections
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -85,16 +85,18 @@ def read_frames(scene: Path, split: str) -> Frames:
     return result
 
 
-def check_scene(scene: Path) -> None:
+def check_scene(scene: Path, *, needed: Sequence[str] = ("train",)) -> None:
     """Reads every file of every split once, so that a broken one is found before it is needed.
 
-    The splits `val` and `test` may be missing.
+    Args:
+      scene: its folder.
+      needed: splits that may not be missing.
 
     Raises:
-      SceneError: at the first file that is broken.
+      SceneError: at the first file that is broken or missing.
     """
     for split in SPLITS:
-        if split == "train" or (scene / _transforms_name(split)).is_file():
+        if split in needed or (scene / _transforms_name(split)).is_file():
             frames = read_frames(scene, split)
             for readings in (_images(frames), _masks(frames), _depths(frames)):
                 collections.deque(readings, maxlen=0)

@@ -402,3 +402,5 @@ def test_checking_a_scene_does_without_val_and_test(tmp_path, ball_scene):
     for split in ("val", "test"):
         (scene / f"transforms_{split}.json").unlink()
     local_layout.check_scene(scene)
+    with scene_error("transforms_test.json"):
+        local_layout.check_scene(scene, needed=("test",))

@@ -87,6 +87,16 @@ def test_the_bundled_scene_agrees_with_cycles(copy):
     assert report.views[0].depth_error < 2e-4
 
 
+def test_a_preview_has_test_views_only(copy):
+    for split in ("train", "val"):
+        (copy / f"transforms_{split}.json").unlink()
+    assert scene_check.find_scenes(copy.parent, None) == [copy]
+    report = scene_check.check_scene(copy, views=0, side=1)
+    assert report.complaints == [] and report.views == []
+    shutil.rmtree(copy / "mask")
+    assert "mask" in scene_check.check_scene(copy, views=0, side=1).complaints[0]
+
+
 def test_a_mesh_that_is_not_where_it_was_rendered_is_found(copy):
     path = next((copy / "meshes").iterdir())
     trimesh.load(path).apply_translation([0.0, 0.0, 0.04]).export(path)

@@ -95,6 +95,7 @@ def test_linear_images_are_kept_of_the_chosen_splits(linear, kept):
     [
         ({"size": 0}, "The size is 0"),
         ({"spp": PerSplit(1, 1, 0)}, "The spp of test is 0"),
+        ({"texture_size": 15}, "The texture_size is 15"),
         ({"views": PerSplit(0, 0, 0)}, "at least one view"),
         ({"views": PerSplit(1, -1, 0)}, "not negative"),
         ({"views": PerSplit(1, 1, 0), "preview": True}, "--test_views"),
