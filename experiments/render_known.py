@@ -18,10 +18,10 @@ import numpy as np
 from absl import flags
 
 from experiments import (
+    budget_options,
     commands,
     figures,
     known_scenes,
-    named_budgets,
     scene_option,
     scenes,
     supersampling,
@@ -39,13 +39,8 @@ _PATHS = flags.DEFINE_enum(
     "Light paths: 'straight' ignores the objects; 'paper' bends up to 10 times and reflects at the "
     "first surface; 'tree' follows every branch that carries light.",
 )
-_CUT = flags.DEFINE_float(
-    "cut", None, "Smallest throughput worth following, in [0, 1); that of --paths if not given."
-)
-_BENDS = flags.DEFINE_integer(
-    "bends", None, "Most refractions and reflections of a path; that of --paths if not given."
-)
 _VIEWS = flags.DEFINE_string("views", "all", "Numbers of views of the split, as 0,10,20, or all.")
+flags.adopt_module_key_flags(budget_options)
 flags.adopt_module_key_flags(scenes)
 flags.adopt_module_key_flags(known_scenes)
 _OUT = flags.DEFINE_string("out", None, "Folder to write the pictures to.", required=True)
@@ -65,7 +60,7 @@ _KEYS = {"scene", "paths", "views", "casts_per_pixel"}
 
 def main() -> None:
     """Renders and measures the chosen views."""
-    budget = named_budgets.make_budget(_PATHS.value, cut=_CUT.value, bends=_BENDS.value)
+    budget = budget_options.chosen(_PATHS.value)
     side = supersampling.side_of(known_scenes.RAYS_PER_PIXEL.value)
     scene = known_scenes.read_scene(
         scene_option.opened(_SCENE.value),

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from experiments.dataset import checks
 from experiments.dataset.check_page import SceneReport
-from refref_jax.optics.budgets import BUDGETS
+from refref_jax.optics.budgets import Budget
 
 _TRANSFORMS = "transforms_*.json"
 
@@ -29,11 +29,12 @@ def find_scenes(folder: Path, names: list[str] | None) -> list[Path]:
     return [path for path in found if names is None or path.resolve().name in names]
 
 
-def check_scene(scene: Path, *, views: int, side: int) -> SceneReport:
+def check_scene(scene: Path, budget: Budget, *, views: int, side: int) -> SceneReport:
     """Checks one scene.
 
     Args:
       scene: its folder.
+      budget: which light to follow.
       views: test views to compare, evenly spread.
       side: rays along each edge of a pixel.
     """
@@ -45,7 +46,7 @@ def check_scene(scene: Path, *, views: int, side: int) -> SceneReport:
     if views and made_of and not any(each.severity == "error" for each in findings):
         known = checks.read_views(scene, made_of, count=views)
         compared = [
-            checks.compare_view(known, i, budget=BUDGETS["tree"], side=side)
+            checks.compare_view(known, i, budget=budget, side=side)
             for i in range(len(known.indices))
         ]
     convex = "smcvx" in name.split("_")

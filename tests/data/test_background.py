@@ -123,7 +123,7 @@ def _image(scene, name, value=0.25):
 def test_the_walls_of_the_bundled_scene(ball_scene):
     walls = read_background(ball_scene)
     assert isinstance(walls, CubeBackground) and isinstance(walls.texture, SrgbTexture)
-    assert walls.texture.texels.shape == (6, 512, 512, 3)
+    assert walls.texture.texels.shape == (6, 256, 256, 3)
     assert walls.half_extent == np.float32(7.3)
     np.testing.assert_array_equal(walls.normals[:2], [[1, 0, 0], [-1, 0, 0]])
     np.testing.assert_array_equal(walls.u_axes[:2], [[0, 1, 0], [0, -1, 0]])

@@ -16,7 +16,7 @@ from tests.data.small_scenes import (
 )
 
 # The bundled ball, and the sphere on which its cameras stand.
-_BALL_RADIUS, _CAMERA_DISTANCE = 1.3, 4.0
+_BALL_RADIUS, _CAMERA_DISTANCE = 1.4, 4.0
 
 # The rendered ball has 20480 flat triangles, which lie up to 3e-4 below the sphere.
 _FACETS = 1e-2

@@ -320,8 +320,8 @@ def test_shading_is_true_or_false(make_scene):
 def test_bundled_ball(ball_scene):
     [part] = meshes.read_meshes(ball_scene)
     assert (part.name, part.index, part.shading) == ("ball_body_glass", 1.5, "smooth")
-    assert part.faces.shape == (20480, 3)
-    np.testing.assert_allclose(np.linalg.norm(part.vertices, axis=1), 1.3, rtol=1e-6)
+    assert part.faces.shape == (46080, 3)
+    np.testing.assert_allclose(np.linalg.norm(part.vertices, axis=1), 1.4, rtol=1e-6)
 
 
 # Mesh files.

@@ -32,7 +32,10 @@ _IMAGES = sum(COUNTS.values())
 
 @pytest.fixture
 def ball(tmp_path):
-    return cut_ball(tmp_path / "scenes" / _NAME)
+    """A few frames of the bundled scene, of which one has a linear image."""
+    scene = cut_ball(tmp_path / "scenes" / _NAME)
+    shutil.copyfile(scene / "depth" / "test" / "r_000.exr", scene / "test" / "r_000.exr")
+    return scene
 
 
 def _convert(source, layout, out):
