@@ -21,6 +21,7 @@ _FLOORS = {
     "metrics": 6,
     "data": 7,
     "training": 8,
+    "reconstruct": 8,
 }
 
 _MODULES = sorted(_PACKAGE.rglob("*.py"))

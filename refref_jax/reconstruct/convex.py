@@ -1,0 +1,149 @@
+"""Bodies that are convex but for noise (NumPy only).
+
+Of a convex body the masks leave more than of any other, since its surface is where its tangent
+planes
+are: `from_tangents` intersects them, which restores the edges that a grid cuts off.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
+
+from refref_jax.geometry.corner_normals import face_normals
+from refref_jax.reconstruct.closest import ClosestSearch
+from refref_jax.reconstruct.smoothing import CREASE
+from refref_jax.reconstruct.triangles import (
+    Mesh,
+    diameter,
+    face_vectors,
+    make_mesh,
+    neighbours,
+    volume,
+)
+
+# How much larger the body of tangent planes may be than the hull before it is not believed: the
+# edges that a grid cuts off are less.
+_MOST_GROWTH = 0.03
+
+# Rings of faces around an edge that are still turned towards it.
+_RINGS = 3
+
+# Patches with a smaller share of the area are left out; and how far the faces of a flat one may lie
+# from its plane, as a share of the diameter.
+_SMALLEST_PATCH = 0.002
+_FLAT = 0.003
+
+# Share of a flat patch that lies so near, and how often its plane is fitted to that share.
+_MOSTLY = 0.85
+_FITS = 6
+
+# Corners of the intersection closer than this share of the diameter are one.
+_SAME = 1e-6
+
+
+def hull(mesh: Mesh) -> Mesh:
+    """Returns the convex hull of a mesh, closed and outward."""
+    return _of_points(mesh.vertices)
+
+
+def depth_below_hull(mesh: Mesh) -> float:
+    """Returns how far the deepest vertex lies below the convex hull, in world units."""
+    outer = hull(mesh)
+    return float(ClosestSearch(outer.vertices, outer.faces)(mesh.vertices).distances.max())
+
+
+def from_tangents(mesh: Mesh, *, crease_angle: float = CREASE) -> Mesh:
+    """Returns the intersection of the half-spaces behind a mesh's faces, but not those at edges.
+
+    A face that meets a neighbour at more than the crease angle belongs to an edge which the grid
+    has cut off: without it the planes beside it meet in the edge. A patch between edges that is
+    flat but for noise is one plane, of least squares. Where that adds more than a few percent to
+    the volume, or planes do not close, the result is the convex hull.
+
+    Args:
+      mesh: nearly convex, and smooth but for its edges: noise would carve it down.
+      crease_angle: radians.
+    """
+    plain = hull(mesh)
+    try:
+        points = _intersection(mesh, plain.vertices.mean(axis=0), crease_angle)
+        body = _of_points(points)
+    except QhullError:
+        return plain
+    growth = volume(body.vertices, body.faces) / volume(plain.vertices, plain.faces) - 1.0
+    return body if abs(growth) <= _MOST_GROWTH else plain
+
+
+def _intersection(
+    mesh: Mesh, inside: Float[np.ndarray, "3"], crease_angle: float
+) -> Float[np.ndarray, "n 3"]:
+    planes = _planes(mesh, _patches(mesh, crease_angle))
+    behind = planes[:, :3] @ inside + planes[:, 3] < 0.0
+    points = HalfspaceIntersection(planes[behind], inside).intersections
+    points = points[np.all(np.isfinite(points), axis=1)]
+    size = _SAME * diameter(mesh.vertices)
+    return size * np.unique(np.rint(points / size), axis=0)
+
+
+def _patches(mesh: Mesh, crease_angle: float) -> list[Int[np.ndarray, " faces"]]:
+    """Returns the faces of each smooth patch, without those near its edges."""
+    normals = face_normals(mesh.vertices[mesh.faces])
+    first, second, _ = neighbours(mesh.faces)
+    sharp = np.sum(normals[first] * normals[second], axis=-1) < np.cos(crease_angle)
+    dropped = np.zeros(len(mesh.faces), bool)
+    dropped[first[sharp]] = dropped[second[sharp]] = True
+    for _ in range(_RINGS):
+        dropped = np.isin(mesh.faces, mesh.faces[dropped]).any(axis=1)
+    joined = ~dropped[first] & ~dropped[second]
+    graph = coo_array(
+        (np.ones(joined.sum(), bool), (first[joined], second[joined])), shape=(len(dropped),) * 2
+    )
+    label = np.where(dropped, -1, connected_components(graph, directed=False)[1])
+    area = np.linalg.norm(face_vectors(mesh.vertices, mesh.faces), axis=-1)
+    shares = np.bincount(label + 1, area)[1:] / area.sum()
+    return [np.flatnonzero(label == i) for i in np.flatnonzero(shares > _SMALLEST_PATCH)]
+
+
+def _planes(mesh: Mesh, patches: list[Int[np.ndarray, " faces"]]) -> Float[np.ndarray, "planes 4"]:
+    """Returns one plane for each flat patch, and one for each face of the others."""
+    planes, tolerance = [np.zeros((0, 4))], _FLAT * diameter(mesh.vertices)
+    for patch in patches:
+        vectors = face_vectors(mesh.vertices, mesh.faces[patch])
+        area = np.linalg.norm(vectors, axis=-1)
+        middles = mesh.vertices[mesh.faces[patch]].mean(axis=1)
+        normal, centre, share = _flat_plane(middles, area, tolerance)
+        normal = np.sign(normal @ vectors.sum(axis=0)) * normal[None]
+        if share < _MOSTLY:
+            kept = area > 0.0
+            normal, centre = vectors[kept] / area[kept, None], middles[kept]
+        offset = -np.sum(normal * centre, axis=-1, keepdims=True)
+        planes.append(np.concatenate([normal, offset], axis=1))
+    return np.concatenate(planes)
+
+
+def _flat_plane(
+    points: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"], tolerance: float
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
+    """Returns the plane of most points: normal, a point of it, and the share near it."""
+    near = np.ones(len(points), bool)
+    for _ in range(_FITS):
+        some = weights * near
+        centre = some @ points / some.sum()
+        from_centre = points - centre
+        normal = np.linalg.eigh(from_centre.T @ (some[:, None] * from_centre))[1][:, 0]
+        away = np.abs(from_centre @ normal)
+        near = away <= max(tolerance, float(np.median(away)))
+    return normal, centre, float(weights[away <= tolerance].sum() / weights.sum())
+
+
+def _of_points(points: Float[np.ndarray, "n 3"]) -> Mesh:
+    found = ConvexHull(points)
+    faces = found.simplices.astype(np.int64)
+    corners = points[faces]
+    towards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inward = np.sum(towards * found.equations[:, :3], axis=-1) < 0.0
+    faces[inward] = faces[inward][:, ::-1]
+    used, numbers = np.unique(faces, return_inverse=True)
+    return make_mesh(points[used], numbers.reshape(-1, 3))

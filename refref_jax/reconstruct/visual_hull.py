@@ -1,0 +1,174 @@
+"""The largest body that fits a set of masks (NumPy only).
+
+A view carves away what projects outside of its mask. The hull's field at a point is the largest
+over views of the signed distance to the outline, in pixels, times planar depth over focal length:
+the zero set of that maximum is the exact hull, and near it the field is a distance in world units.
+
+The hull of finitely many views encloses the body: a ball becomes tangent cones. No view sees into a
+cavity, or into a dent that no line of sight grazes, and those stay filled.
+
+Outlines are known to a fraction of a pixel, and at every point the view that errs most inwards
+wins. So the hull would lie within the true one: by the error of one outline where a surface is
+smooth, and by twice that at an edge, which many views have on their outlines. A tolerance in pixels
+undoes it.
+
+Source: Laurentini, The Visual Hull Concept for Silhouette-Based Image Understanding (1994).
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import map_coordinates
+
+from refref_jax.data.cameras import Cameras
+from refref_jax.reconstruct.errors import ReconstructionError
+from refref_jax.reconstruct.grids import Box, Field, Grid, Points, Values, sample
+from refref_jax.reconstruct.silhouettes import BLUR, check_masks, signed_distances
+
+REACH = 2.1
+"""Half the edge of the cube around the origin in which a body is looked for, world units."""
+
+TOLERANCE = 0.05
+"""Pixels outside of an outline up to which nothing is carved: about half a standard error."""
+
+# What stands for a distance where there is no outline, so that a grid can be interpolated.
+_FAR = 4.0 * REACH
+
+# Cells along the cube's edge when a box is looked for, and how many of them are added around it.
+_SEARCH = 48
+_MARGIN = 1.0
+
+# Cells that are added around the box in the end, so that the surface stays within.
+_RIM = 3
+
+
+def carve(
+    masks: Bool[np.ndarray, "views h w"],
+    cameras: Cameras,
+    *,
+    resolution: int = 128,
+    box: Box | None = None,
+    outliers: int = 0,
+    tolerance: float = TOLERANCE,
+    blur: float = BLUR,
+) -> Grid:
+    """Returns the field of the masks' hull on a grid.
+
+    A point outside of a view's image or behind its camera is not carved by that view; a point that
+    no more views see than are passed over is empty.
+
+    `outliers` views may be wrong: at each point the that many largest values are passed over. A
+    mask that misses part of the body, or is shifted, then does no harm. It costs accuracy
+    everywhere: what only so many views see is no longer carved, so that the body grows between
+    tangent cones. Nor is it a vote among near views: masks that all err alike are believed.
+
+    Args:
+      masks: one a view, true where the object is seen.
+      cameras: of the masks, in the same order.
+      resolution: cells along the longest edge of the box.
+      box: where the body lies; found from the masks within `REACH` of the origin if not given.
+      outliers: values passed over at each point.
+      tolerance: pixels outside of an outline up to which nothing is carved, see the module.
+      blur: of the outlines in pixels, see `silhouettes`.
+
+    Raises:
+      ReconstructionError: if there is no mask, if a mask is empty or of another size, if as many
+        views are passed over as there are, or if nothing is left.
+    """
+    check_masks(masks, cameras)
+    if not 0 <= outliers < len(masks):
+        raise ReconstructionError(
+            f"{outliers} of {len(masks)} views are to be passed over. Pass over fewer, 0 or more."
+        )
+    field = hull_field(masks, cameras, outliers=outliers, tolerance=tolerance, blur=blur)
+    if box is None:
+        box = _find_box(field, masks, cameras)
+    spacing = float(np.max(box.high - box.low)) / (resolution - 2 * _RIM)
+    wide = Box(box.low - _RIM * spacing, box.high + _RIM * spacing)
+    grid = sample(field, wide, spacing=spacing)
+    if not np.any(grid.values < 0.0):
+        raise ReconstructionError(_explanation(masks, cameras, box))
+    return grid
+
+
+def hull_field(
+    masks: Bool[np.ndarray, "views h w"],
+    cameras: Cameras,
+    *,
+    outliers: int = 0,
+    tolerance: float = TOLERANCE,
+    blur: float = BLUR,
+) -> Field:
+    """Returns the field of the masks' hull as a function of points, see `carve`."""
+    images = [signed_distances(mask, blur=blur) - tolerance for mask in masks]
+
+    def field(points: Points) -> Values:
+        # The largest so far, in falling order.
+        largest = np.full((outliers + 1, len(points)), -np.inf)
+        for image, pose in zip(images, cameras.poses, strict=True):
+            value = view_values(image, pose, cameras, points)
+            for rank in range(outliers + 1):
+                value, largest[rank] = (
+                    np.minimum(largest[rank], value),
+                    np.maximum(largest[rank], value),
+                )
+        unseen = np.isneginf(largest[-1])
+        return np.where(unseen, _FAR, np.minimum(largest[-1], _FAR))
+
+    return field
+
+
+def view_values(
+    image: Float[np.ndarray, "h w"],
+    pose: Float[np.ndarray, "3 4"],
+    cameras: Cameras,
+    points: Points,
+) -> Values:
+    """Returns one view's signed distances in world units, `-inf` where it sees nothing."""
+    x, y, z = pose[:, :3].T @ (points.T - pose[:, 3:])
+    depth = np.where(z < 0.0, -z, np.inf)
+    column = cameras.focal * x / depth + 0.5 * cameras.width
+    row = -cameras.focal * y / depth + 0.5 * cameras.height
+    seen = (z < 0.0) & (column >= 0) & (column <= cameras.width)
+    seen &= (row >= 0) & (row <= cameras.height)
+    values = np.full(len(points), -np.inf)
+    if not np.all(np.isneginf(image)):
+        at = np.stack([row[seen], column[seen]]) - 0.5
+        pixels = map_coordinates(image, at, order=1, mode="nearest")
+        values[seen] = pixels * depth[seen] / cameras.focal
+    else:
+        values[seen] = -_FAR
+    return values
+
+
+def _find_box(field: Field, masks: np.ndarray, cameras: Cameras) -> Box:
+    """Returns a box around the body, which may touch the cube that is looked at."""
+    ends = np.full(3, REACH)
+    grid = sample(field, Box(-ends, ends), spacing=2.0 * REACH / _SEARCH)
+    # Within half a cell's diagonal of the surface, so that a thin body is not overlooked.
+    inside = np.argwhere(grid.values < 0.87 * grid.spacing)
+    if len(inside) == 0:
+        raise ReconstructionError(_explanation(masks, cameras, Box(-ends, ends)))
+    low = grid.low + grid.spacing * (inside.min(axis=0) - _MARGIN)
+    high = grid.low + grid.spacing * (inside.max(axis=0) + _MARGIN)
+    return Box(np.maximum(low, -ends), np.minimum(high, ends))
+
+
+def _explanation(masks: np.ndarray, cameras: Cameras, box: Box) -> str:
+    """Says which view removed the most of what all others leave."""
+    ticks = [np.linspace(low, high, 24) for low, high in zip(*box, strict=True)]
+    points = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+    images = (signed_distances(mask, blur=0.0) for mask in masks)
+    carved = np.stack(
+        [
+            view_values(image, pose, cameras, points) > 0.0
+            for image, pose in zip(images, cameras.poses, strict=True)
+        ]
+    )
+    alone = carved & (carved.sum(axis=0) == 1)
+    view = int(np.argmax(alone.sum(axis=1) + carved.mean(axis=1)))
+    return (
+        f"Nothing is left after carving with {len(masks)} masks between {np.round(box.low, 2)} and "
+        f"{np.round(box.high, 2)}. View {view} removed the most: {100.0 * carved[view].mean():.0f} "
+        f"% of the box, and {int(alone[view].sum())} of {len(points)} points that no other view "
+        "did. Check its mask and its pose, pass over outliers, or give a finer resolution."
+    )
