@@ -1,4 +1,4 @@
-"""The closest points of a mesh, exactly, and signed distances to it (NumPy only).
+"""The closest points of a mesh and signed distances to it, exact but far inside (NumPy only).
 
 Triangles are cut until all are small, which changes no surface, so that a tree of their middles
 finds the few that can hold the closest point: the distance to the nearest middle bounds it from
@@ -24,6 +24,10 @@ from refref_jax.reconstruct.triangles import Faces, Mesh, Vertices, diameter
 # Triangles that are looked at first, and how many times more in each further round.
 _FIRST = 8
 _GROWTH = 4
+
+# And at most. Where more could hold the closest point, which is about a medial axis, all are about
+# as near as the nearest middles, and those are believed.
+_MOST = 128
 
 # Points times triangles of one sweep.
 _SWEEP = 1 << 20
@@ -75,15 +79,16 @@ class ClosestSearch:
         found, distance = np.zeros(points.shape), np.full(len(points), np.inf)
         piece = np.zeros(len(points), np.int64)
         left, count = np.arange(len(points)), min(_FIRST, len(self._pieces))
+        most = min(_MOST, len(self._pieces))
         while len(left):
             done = []
             step = max(1, _SWEEP // count)
             for some in (left[i : i + step] for i in range(0, len(left), step)):
                 found[some], distance[some], piece[some], reach = self._nearest(points[some], count)
                 beyond = distance[some] + self._radius <= reach
-                done.append(beyond | (count == len(self._pieces)))
+                done.append(beyond | (count == most))
             left = left[~np.concatenate(done)]
-            count = min(_GROWTH * count, len(self._pieces))
+            count = min(_GROWTH * count, most)
         face = self._owner[piece]
         weights = points_to_barycentric(self._corners[face], found)
         return ClosestPoints(found, distance, face, weights)

@@ -23,6 +23,8 @@ from refref_jax.reconstruct.triangles import (
     volume,
 )
 
+FaceIndex = Int[np.ndarray, " pairs"]
+
 # How much larger the body of tangent planes may be than the hull before it is not believed: the
 # edges that a grid cuts off are less.
 _MOST_GROWTH = 0.03
@@ -67,6 +69,8 @@ def from_tangents(mesh: Mesh, *, crease_angle: float = CREASE) -> Mesh:
       crease_angle: radians.
     """
     plain = hull(mesh)
+    if not _sharp_pairs(mesh, crease_angle)[0].size:
+        return plain
     try:
         points = _intersection(mesh, plain.vertices.mean(axis=0), crease_angle)
         body = _of_points(points)
@@ -87,15 +91,13 @@ def _intersection(
     return size * np.unique(np.rint(points / size), axis=0)
 
 
-def _patches(mesh: Mesh, crease_angle: float) -> list[Int[np.ndarray, " faces"]]:
+def _patches(mesh: Mesh, crease_angle: float) -> list[Int[np.ndarray, " _"]]:
     """Returns the faces of each smooth patch, without those near its edges."""
-    normals = face_normals(mesh.vertices[mesh.faces])
-    first, second, _ = neighbours(mesh.faces)
-    sharp = np.sum(normals[first] * normals[second], axis=-1) < np.cos(crease_angle)
     dropped = np.zeros(len(mesh.faces), bool)
-    dropped[first[sharp]] = dropped[second[sharp]] = True
+    dropped[np.concatenate(_sharp_pairs(mesh, crease_angle))] = True
     for _ in range(_RINGS):
         dropped = np.isin(mesh.faces, mesh.faces[dropped]).any(axis=1)
+    first, second, _ = neighbours(mesh.faces)
     joined = ~dropped[first] & ~dropped[second]
     graph = coo_array(
         (np.ones(joined.sum(), bool), (first[joined], second[joined])), shape=(len(dropped),) * 2
@@ -106,7 +108,15 @@ def _patches(mesh: Mesh, crease_angle: float) -> list[Int[np.ndarray, " faces"]]
     return [np.flatnonzero(label == i) for i in np.flatnonzero(shares > _SMALLEST_PATCH)]
 
 
-def _planes(mesh: Mesh, patches: list[Int[np.ndarray, " faces"]]) -> Float[np.ndarray, "planes 4"]:
+def _sharp_pairs(mesh: Mesh, crease_angle: float) -> tuple[FaceIndex, FaceIndex]:
+    """Returns the pairs of neighbouring faces that meet at more than an angle."""
+    normals = face_normals(mesh.vertices[mesh.faces])
+    first, second, _ = neighbours(mesh.faces)
+    sharp = np.sum(normals[first] * normals[second], axis=-1) < np.cos(crease_angle)
+    return first[sharp], second[sharp]
+
+
+def _planes(mesh: Mesh, patches: list[Int[np.ndarray, " _"]]) -> Float[np.ndarray, "planes 4"]:
     """Returns one plane for each flat patch, and one for each face of the others."""
     planes, tolerance = [np.zeros((0, 4))], _FLAT * diameter(mesh.vertices)
     for patch in patches:

@@ -9,17 +9,21 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 
 Points = Float[np.ndarray, "points 3"]
 Values = Float[np.ndarray, " points"]
 Field = Callable[[Points], Values]
 
-# Fine cells along the edge of a coarse one; and how many of its edges from the surface a coarse
-# corner is looked around: sqrt(3) / 2 for a 1-Lipschitz field, and more for one that is nearly so.
+NEAR = 1.5
+"""Edges of a coarse cell from the surface within which a corner is looked around.
+
+An exact distance needs sqrt(3) / 2, and a field that is nearly one some more.
+"""
+
+# Fine cells along the edge of a coarse one.
 _COARSE = 4
-_NEAR = 1.5
 
 # Points of one sweep: bounds the memory of a field with many terms.
 _SWEEP = 1 << 18
@@ -51,7 +55,9 @@ class Grid(NamedTuple):
     spacing: float
 
 
-def sample(field: Field, box: Box, *, spacing: float, level: float = 0.0) -> Grid:
+def sample(
+    field: Field, box: Box, *, spacing: float, level: float = 0.0, near: float = NEAR
+) -> Grid:
     """Samples a field, finely only near one of its level sets.
 
     Far from it the values are those of a coarser grid: a feature thinner than its cells
@@ -63,14 +69,15 @@ def sample(field: Field, box: Box, *, spacing: float, level: float = 0.0) -> Gri
       box: is covered, and exceeded by less than 4 spacings on each side.
       spacing: of the fine grid.
       level: the value whose surroundings are sampled.
+      near: edges of a coarse cell within which of the surface a corner is looked around.
     """
     cells = np.maximum(np.ceil((box.high - box.low) / (_COARSE * spacing)), 1).astype(np.int64)
     low = 0.5 * (box.low + box.high) - 0.5 * cells * _COARSE * spacing
     shape = tuple(cells * _COARSE + 1)
     coarse = _evaluate(field, low, _COARSE * spacing, np.indices(cells + 1).reshape(3, -1).T)
     corners = coarse.reshape(cells + 1) - level
-    near = np.abs(corners) < _NEAR * _COARSE * spacing
-    close = maximum_filter(near, size=2, origin=-1)
+    close_corners = np.abs(corners) < near * _COARSE * spacing
+    close = maximum_filter(close_corners, size=2, origin=-1)
     # A field with a jump may cross the level with no corner near it.
     signs = np.sign(corners)
     close |= maximum_filter(signs, size=2, origin=-1) != minimum_filter(signs, size=2, origin=-1)
@@ -90,13 +97,20 @@ def interpolate(grid: Grid, points: Points) -> Values:
 
 
 def gradient(grid: Grid, points: Points) -> Points:
-    """Returns the field's gradient by central differences over two spacings."""
-    step = grid.spacing * np.eye(3)
-    across = [interpolate(grid, points + e) - interpolate(grid, points - e) for e in step]
-    return np.stack(across, axis=-1) / (2.0 * grid.spacing)
+    """Returns the field's gradient: central differences at grid points, linear between them."""
+    index = _index(grid, points)
+    return np.stack(
+        [
+            map_coordinates(slope, index, order=1, mode="nearest")
+            for slope in np.gradient(grid.values, grid.spacing)
+        ],
+        axis=-1,
+    )
 
 
-def _evaluate(field: Field, low: Values, spacing: float, index: np.ndarray) -> Values:
+def _evaluate(
+    field: Field, low: Float[np.ndarray, "3"], spacing: float, index: Int[np.ndarray, "points 3"]
+) -> Values:
     parts = [
         field(low + spacing * index[start : start + _SWEEP])
         for start in range(0, len(index), _SWEEP)
@@ -108,7 +122,7 @@ def _index(grid: Grid, points: Points) -> Float[np.ndarray, "3 points"]:
     return ((points - grid.low) / grid.spacing).T
 
 
-def _spread(cells: np.ndarray) -> np.ndarray:
+def _spread(cells: Bool[np.ndarray, "n m k"]) -> Bool[np.ndarray, "fn fm fk"]:
     for axis in range(3):
         cells = np.repeat(cells, _COARSE, axis=axis)
     return cells

@@ -10,10 +10,8 @@ Measured on discs of 34 pixels' radius and squares at all angles, in pixels: ste
 error; blur 1.5: 0.14, mean below 0.01, corners cut back by 0.5; blur 3: 0.10, 0.01 and 1.0.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_laplace
 
 from refref_jax.data.cameras import Cameras
@@ -74,7 +72,7 @@ def signed_distances(
     return smooth - 0.5 * blur**2 * gaussian_laplace(steps, blur, mode="nearest")
 
 
-def _listed(views: Sequence[int]) -> str:
+def _listed(views: Int[np.ndarray, " views"]) -> str:
     """Names the first few views."""
     names = ", ".join(str(view) for view in views[:5])
     return f"Views {names}{', ...' if len(views) > 5 else ''}: {len(views)}"

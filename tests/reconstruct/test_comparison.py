@@ -1,0 +1,63 @@
+import numpy as np
+import pytest
+import trimesh
+
+from refref_jax.data import local_layout, meshes
+from refref_jax.reconstruct.comparison import compare_meshes, silhouette_overlap, silhouettes
+from refref_jax.reconstruct.isosurface import find_isosurface
+from refref_jax.reconstruct.refinement import Refinement, refine
+from refref_jax.reconstruct.triangles import make_mesh
+from refref_jax.reconstruct.visual_hull import carve
+from tests.reconstruct import bodies
+
+
+def test_a_mesh_is_no_distance_from_itself():
+    mesh = bodies.fine_box()
+    found = compare_meshes(mesh, mesh, samples=2000)
+    assert found.chamfer < 1e-12 and found.furthest < 1e-12 and found.normal_error < 1e-4
+
+
+def test_concentric_balls_are_as_far_as_their_radii():
+    found = compare_meshes(bodies.icosphere(4, radius=1.1), bodies.icosphere(4), samples=2000)
+    diameter = 2.0 * np.sqrt(3.0)
+    assert found.chamfer == pytest.approx(0.1 / diameter, rel=0.02)
+    assert found.normal_error < 0.3
+
+
+def test_turned_normals_are_off_by_the_angle():
+    box = bodies.fine_box()
+    turn = trimesh.transformations.rotation_matrix(0.05, [0, 0, 1])[:3, :3]
+    found = compare_meshes(box._replace(normals=box.normals @ turn), box, samples=4000)
+    # Four of six faces turn.
+    assert found.normal_error == pytest.approx(np.degrees(0.05) * 4.0 / 6.0, rel=0.02)
+    assert found.normal_error_99 == pytest.approx(np.degrees(0.05))
+    assert found.chamfer < 1e-12
+
+
+def test_silhouettes_are_those_of_marched_rays():
+    cameras = bodies.cameras_around(3)
+    masks = bodies.masks_of(bodies.ball, cameras)
+    overlap = silhouette_overlap(bodies.icosphere(4), masks, cameras)
+    assert np.all(overlap > 0.985) and np.all(overlap <= 1.0)
+    assert np.all(silhouette_overlap(bodies.icosphere(4), ~masks, cameras) < 0.02)
+    nothing = bodies.icosphere(1, radius=0.1, centre=(50.0, 0.0, 0.0))
+    assert np.all(silhouette_overlap(nothing, np.zeros_like(masks), cameras) == 1.0)
+    assert silhouettes(bodies.icosphere(2), cameras).shape == masks.shape
+
+
+def test_the_bundled_ball_is_found_from_its_masks(ball_scene):
+    train, test = (local_layout.read_frames(ball_scene, split) for split in ("train", "test"))
+    grid = carve(local_layout.read_masks(train), train.cameras, resolution=64)
+    stages = refine(find_isosurface(grid), Refinement())
+    assert not any(stage.refused for stage in stages)
+    part = meshes.read_meshes(ball_scene)[0]
+    truth = make_mesh(part.vertices, part.faces)
+    found = compare_meshes(stages[-1].mesh, truth, samples=5000)
+    assert found.normal_error < 1.0 and found.chamfer < 1e-3
+    assert found.normal_error < 0.5 * compare_meshes(stages[0].mesh, truth).normal_error
+    overlap = silhouette_overlap(
+        stages[-1].mesh,
+        local_layout.read_masks(test)[:6],
+        test.cameras._replace(poses=test.cameras.poses[:6]),
+    )
+    assert overlap.mean() > 0.99
