@@ -62,7 +62,7 @@ def test_a_rendering_is_measured_and_pictured(rendered):
         values = [view[key] for view in summary["views"]]
         assert summary["mean"][key] == pytest.approx(np.mean(values))
     # One ray a pixel: what is left is mostly aliasing.
-    assert summary["mean"]["psnr_masked"] > 25.0
+    assert summary["mean"]["psnr_masked"] > 20.0
     assert iio.imread(out / "comparison.png").ndim == 3
     assert str(out / "metrics.json") in printed and "path_trade_off" in printed
 
