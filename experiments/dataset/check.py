@@ -27,7 +27,7 @@ _OUT = flags.DEFINE_string("out", None, "Folder to write the report to.")
 flags.adopt_module_key_flags(budget_options)
 # Diamond keeps light for so long that the tree's own cut loses 5 dB of 39, and what Cycles drops
 # after its 64 bounces another 6. Paths are to be judged here, not where they stop.
-flags.set_default(budget_options.CUT, 0.002)
+flags.set_default(budget_options.CUT, 0.004)
 flags.set_default(budget_options.BENDS, render_settings.BOUNCES)
 flags.declare_key_flag("rays_per_pixel")
 # What Cycles averages over hundreds of rays aliases with few: a wall of the generator is 41 dB off
