@@ -181,6 +181,9 @@ def test_a_budget_keeps_what_is_not_given_and_grows_below_its_cut():
     fine = named_budgets.make_budget("tree", cut=tree.cut / 4.0)
     assert fine.paths_per_ray == 2.0 * tree.paths_per_ray and fine.bends == tree.bends
     # Never without bound.
+    long = named_budgets.make_budget("tree", bends=2 * tree.bends)
+    assert long.segments_per_ray == 2.0 * tree.segments_per_ray
+    assert (long.paths_per_ray, long.live_per_ray) == (tree.paths_per_ray, tree.live_per_ray)
     assert named_budgets.make_budget("tree", cut=0.0).paths_per_ray < 10.0 * tree.paths_per_ray
 
 
