@@ -12,8 +12,9 @@ _SMALLEST_CUT_WITH_ROOM = 5e-4
 def make_budget(paths: str, *, cut: float | None = None, bends: int | None = None) -> Budget:
     """Returns a budget by name, with another cut or number of bends, and room for what that takes.
 
-    Below the named budget's own cut room grows as the inverse square root of the cut, which a flask
-    of three media needs; what finds no room nevertheless is told as lost.
+    Below the named budget's own cut room grows as the inverse square root of the cut, and that of
+    segments with the bends beyond its own: a flask of three media needs both. What finds no room
+    nevertheless is told as lost.
 
     Args:
       paths: a name in `BUDGETS`.
@@ -30,8 +31,11 @@ def make_budget(paths: str, *, cut: float | None = None, bends: int | None = Non
         )
     given = {"cut": cut, "bends": bends}
     changed = dataclasses.replace(budget, **{k: v for k, v in given.items() if v is not None})
+    if changed.bends > budget.bends:
+        longer = changed.bends / budget.bends * budget.segments_per_ray
+        changed = dataclasses.replace(changed, segments_per_ray=longer)
     if not changed.cut < budget.cut:
         return changed
     growth = math.sqrt(budget.cut / max(changed.cut, _SMALLEST_CUT_WITH_ROOM))
     rooms = ("live_per_ray", "segments_per_ray", "paths_per_ray")
-    return dataclasses.replace(changed, **{room: growth * getattr(budget, room) for room in rooms})
+    return dataclasses.replace(changed, **{room: growth * getattr(changed, room) for room in rooms})

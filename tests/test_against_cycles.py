@@ -18,8 +18,9 @@ from refref_jax.render import radiance_of, render_known
 from tests import reference
 from tests.backgrounds import CubeBackground
 
-# Rays a pixel along each axis: Cycles' pixels are box-filtered.
-_OVERSAMPLING = 6
+# Rays a pixel along each axis: Cycles' pixels are box-filtered. What the paper's paths lack is more
+# than what fewer rays alias.
+_FINE, _COARSE = 6, 3
 
 
 @functools.cache
@@ -35,7 +36,7 @@ def _trace(geometry, rays, *, budget):
 
 
 @functools.cache
-def _render(scene, view, budget, *, oversampling=_OVERSAMPLING):
+def _render(scene, view, budget, *, oversampling=_FINE):
     """Renders a view of the test split; returns sRGB, and casts and paths a camera ray."""
     frames = local_layout.read_frames(scene, "test")
     rays = cameras.image_rays(cameras.supersample(frames.cameras, oversampling), view)
@@ -57,7 +58,7 @@ def _psnr(image, target, mask):
     ("budget", "at_least", "at_most"),
     [
         (STRAIGHT, 8.0, 13.0),
-        pytest.param(Budget(10, "none"), 20.0, 25.0, marks=pytest.mark.slow),
+        pytest.param(Budget(10, "none"), 22.0, 28.0, marks=pytest.mark.slow),
         (PAPER, 27.0, 33.0),
         (TREE, 41.5, 48.0),
     ],
@@ -69,7 +70,8 @@ def test_the_glass_ball_is_as_good_as_its_path_model(ball_scene, budget, at_leas
     values = []
     for view in (0, 10):
         target = iio.imread(frames.images[view])[..., :3] / 255.0
-        image, *_ = _render(ball_scene, view, budget)
+        side = _FINE if budget == TREE else _COARSE
+        image, *_ = _render(ball_scene, view, budget, oversampling=side)
         values.append(_psnr(image, target, masks[view]))
         # Outside lie only camera and walls, and the half-covered pixels of the rim.
         assert _psnr(image, target, ~masks[view]) > 36.0

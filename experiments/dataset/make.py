@@ -73,6 +73,8 @@ _TILE = 200
 
 def main() -> None:
     """Makes what is missing of the chosen scenes."""
+    if not _OUT.value:
+        raise ValueError("--out is empty. Give the folder that gets a folder for each scene.")
     chosen = scenes.choose(_SCENES.value, catalogue.OBJECTS)
     settings = _settings()
     blender = Path(_BLENDER.value).absolute()

@@ -16,7 +16,7 @@ from experiments.dataset.worker_pool import Pool
 from refref_jax.data.scene_names import SceneName
 from refref_jax.training import run_lock
 
-_SCRATCH = ".scratch"
+_SCRATCH = ".refref_making"
 
 
 def produce(

@@ -20,8 +20,11 @@ LEAST_TEXTURE = 16
 BLENDER = "5.0.1"
 """Version of Blender; another one's pixels may differ."""
 
+BOUNCES = 64
+"""Of every kind, after which Cycles gives up a path."""
+
 _RENDER: dict[str, Any] = {
-    "bounces": 64,
+    "bounces": BOUNCES,
     "pixel_filter": "box, 1 pixel wide",
     "view_transform": "Standard: the sRGB transfer function, clipped",
     "adaptive_sampling": False,

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from experiments.dataset import checks
 from experiments.dataset.check_page import SceneReport
 from refref_jax.optics.budgets import Budget
@@ -51,4 +53,9 @@ def check_scene(scene: Path, budget: Budget, *, views: int, side: int) -> SceneR
         ]
     convex = "smcvx" in name.split("_")
     notes = [str(each) for each in findings if each.severity == "note"]
+    notes += [
+        f"{view.name}: no depth was compared, for want of a float map or of pixels away from edges"
+        for view in compared
+        if np.isnan(view.depth_share)
+    ]
     return SceneReport(name, checks.complaints(convex, findings, compared), notes, compared)

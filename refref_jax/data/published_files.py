@@ -46,8 +46,8 @@ class LocalCopy:
         for folder in folders:
             if not folder.is_dir():
                 raise SceneError(
-                    f"{folder} is no folder, but should hold a copy of the data set. Correct "
-                    "REFREF_HF."
+                    f"{folder} is no folder, but should hold a scene or a copy of the data set. "
+                    "Correct what named it: --scene, or REFREF_HF."
                 )
             for path in (path for place in _FOLDERS for path in (folder / place).rglob("*")):
                 if path.is_file():

@@ -139,6 +139,13 @@ def ending(
     return jnp.where(hit, met, missed).astype(jnp.int32)
 
 
+def shown(budget: Budget, weight: Float[Array, "3"], status: Int[Array, ""]) -> Float[Array, "3"]:
+    """Returns what of a path's light is shown when it ends with a status."""
+    if budget.unfinished == "kept":
+        return weight
+    return jnp.where(status == PathStatus.OUT_OF_BENDS, 0.0, weight)
+
+
 def branch(budget: Budget, state: RayState, arrival: Arrival, slot: Int[Array, ""]) -> Branches:
     """Returns both rays that leave the surface, with their shares of the light."""
     met = arrival.interaction

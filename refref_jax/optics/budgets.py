@@ -35,6 +35,8 @@ class Budget:
         its share to its sibling, so no energy is lost.
       reentry: `impossible` promises that a ray which has left the objects meets none again, as
         around one convex body: it is not cast again.
+      unfinished: light of paths that run out of bends. `kept` goes on along its last direction,
+        as in the paper; `dark` is lost, as in renderers that stop after a number of bounces.
       live_per_ray: room for rays that are still to be cast.
       segments_per_ray: room for segments of paths, beyond the camera rays themselves.
       paths_per_ray: room for finished paths.
@@ -45,6 +47,7 @@ class Budget:
     total_reflection: Literal["followed", "ended"] = "followed"
     cut: float = 0.0
     reentry: Literal["possible", "impossible"] = "possible"
+    unfinished: Literal["kept", "dark"] = "kept"
     live_per_ray: float = 6.0
     segments_per_ray: float = 24.0
     paths_per_ray: float = 8.0
@@ -71,6 +74,10 @@ class Budget:
         if self.reentry not in ("possible", "impossible"):
             raise ValueError(
                 f"Re-entry is 'possible' or 'impossible', not {self.reentry!r}. Choose one."
+            )
+        if self.unfinished not in ("kept", "dark"):
+            raise ValueError(
+                f"Unfinished light is 'kept' or 'dark', not {self.unfinished!r}. Choose one."
             )
         for name in ("live_per_ray", "segments_per_ray", "paths_per_ray"):
             if not 1.0 <= getattr(self, name) < math.inf:

@@ -3,12 +3,14 @@
 Letters as in `light_paths`.
 """
 
+import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from refref_jax.optics import media, pools
+from refref_jax.optics import branching, media, pools
 from refref_jax.optics.branching import Arrival, Branches, RayState
 from refref_jax.optics.budgets import Budget, Room
 from refref_jax.optics.light_paths import PathStatus
@@ -112,6 +114,20 @@ def push(tree: PathTree, stack: Pool, children: Children, budget: Budget) -> tup
         status = jnp.where(escapes, PathStatus.ESCAPED, PathStatus.NOT_TRACED).astype(jnp.int32)
         tree = end(tree, live, status, children.exists & ~children.traced)
     return tree, pools.append(stack, live, children.exists & children.traced)
+
+
+def end_by(
+    budget: Budget,
+    tree: PathTree,
+    live: Live,
+    status: Int[Array, " n"],
+    ending: Bool[Array, " n"],
+) -> PathTree:
+    """Ends some rays as paths; what the budget leaves dark of their light is lost."""
+    weights = jax.vmap(functools.partial(branching.shown, budget))(live.weights, status)
+    lost = pools.lose(tree.lost, live.rays, live.weights - weights, ending)
+    live = live._replace(state=live.state._replace(weight=weights))
+    return end(tree._replace(lost=lost), live, status, ending)
 
 
 def end(

@@ -105,7 +105,7 @@ def follow_branch(
     choices = jnp.append(reflects, False)
     advance = functools.partial(_advance, geometry, budget)
     end, segments = jax.lax.scan(advance, start, choices)
-    return _record(ray, end, segments)
+    return _record(budget, ray, end, segments)
 
 
 def _advance(
@@ -139,7 +139,7 @@ def _either(which: Bool[Array, ""], first: _Record, second: _Record) -> _Record:
     return jax.tree.map(lambda a, b: jnp.where(which, a, b), first, second)
 
 
-def _record(ray: Rays, end: _Walk, segments: _Segment) -> LightPaths:
+def _record(budget: Budget, ray: Rays, end: _Walk, segments: _Segment) -> LightPaths:
     used = segments.used
     tau = jnp.where(used, segments.state.tau, jnp.inf)
     none = jnp.zeros_like(tau, shape=(0,))
@@ -151,7 +151,7 @@ def _record(ray: Rays, end: _Walk, segments: _Segment) -> LightPaths:
         spreads=segments.state.spread,
         media=jnp.where(used, segments.medium, media.AMBIENT),
         rays=jnp.zeros_like(end.status),
-        weights=end.state.weight,
+        weights=branching.shown(budget, end.state.weight, end.status),
         radii=ray.radii,
         bends=end.state.bends,
         statuses=end.status,

@@ -181,7 +181,7 @@ def _round(geometry: Geometry, walk: _Walk, budget: Budget, block: int, room: Ro
     medium = arrival.interaction.sides.medium_near
     # Only its first surface tells what a camera is in.
     tree = path_tree.name_media(tree, live.segments, medium, hit & (live.state.bends == 0))
-    tree = offspring.end(tree, live, status, alive & ~bending)
+    tree = offspring.end_by(budget, tree, live, status, alive & ~bending)
     branches = jax.vmap(functools.partial(branching.branch, budget))(
         live.state, arrival, hits.slots
     )

@@ -54,9 +54,7 @@ class Refinement:
       denoising: diffusion length of the normals, which stops at creases, world units.
       crease: angle between neighbouring faces at which it stops, radians.
       smoothing: diffusion length of the vertices, which rounds creases too, world units.
-      convex_depth: a body no vertex of which lies deeper below its convex hull is made convex,
-      world
-        units.
+      convex_depth: a body is made convex if no vertex lies deeper below its hull, world units.
       rounding: radius to which convex edges are rounded, world units.
       spacing: of the grid of signed distances from which the surface is meshed anew, world units.
       volume_change: share of the volume that any stage may change.
@@ -101,8 +99,7 @@ def refine(mesh: Mesh, settings: Refinement) -> tuple[Stage, ...]:
 
     Raises:
       ReconstructionError: if the mesh is empty, open or turned inwards; or if it is to be meshed
-      anew
-        and scikit-image is not installed.
+        anew and scikit-image is not installed.
     """
     _check(mesh)
     stages = [Stage("pieces", keep_pieces(mesh, smallest=settings.smallest_piece), "")]

@@ -193,7 +193,7 @@ def test_a_scene_that_is_there_twice(copy):
 
 def test_a_copy_that_is_no_folder(copy, monkeypatch):
     monkeypatch.setenv("REFREF_HF", "nowhere")
-    with scene_error("nowhere is no folder", "Correct REFREF_HF"):
+    with scene_error("nowhere is no folder", "or REFREF_HF"):
         open_scene(_SOURCE)
 
 

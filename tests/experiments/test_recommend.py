@@ -100,7 +100,7 @@ def test_the_bundled_table_is_a_whole_sweep():
     assert {row.scene for row in rows} == {"cube_smcvx_ball"}
     assert {row.knob for row in rows} >= {"", "paths", "cut", "samples", "steps", "rays_per_pixel"}
     choice = recommendations.choose(rows, _MACHINE, 600.0)
-    assert choice.best.quality > 37.0
+    assert choice.best.quality > 30.0
 
 
 def test_what_is_told_can_be_pasted(tmp_path):

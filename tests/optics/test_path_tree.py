@@ -69,6 +69,17 @@ def test_a_slab_sends_light_both_ways_by_the_geometric_series():
     np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-6)
 
 
+def test_unfinished_light_is_lost_where_it_is_dark():
+    kept, _ = _ends(_slab(), _down(), budget=_generous(Budget(5, "all")))
+    ends, traced = _ends(_slab(), _down(), budget=_generous(Budget(5, "all", unfinished="dark")))
+    r, t = _GLASS, 1.0 - _GLASS
+    trapped = ends.statuses == PathStatus.OUT_OF_BENDS
+    assert trapped.sum() == 1 and not ends.weights[trapped].any()
+    np.testing.assert_array_equal(ends.weights[~trapped], kept.weights[~trapped])
+    np.testing.assert_allclose(traced.lost, t * r**4, rtol=1e-4)
+    np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-6)
+
+
 def test_a_cut_branch_leaves_its_share_to_its_sibling():
     ends, traced = _ends(_slab(), _down(), budget=Budget(5, "all", cut=0.039))
     # The inner reflection, 0.96 * 0.04, is below the cut: what enters leaves below, whole.

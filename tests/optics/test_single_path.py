@@ -94,6 +94,16 @@ def test_without_bends_nothing_is_traced():
     np.testing.assert_array_equal(path.weights, 1.0)
 
 
+@pytest.mark.parametrize(("unfinished", "weight"), [("kept", 0.96), ("dark", 0.0)])
+def test_a_path_that_runs_out_of_bends_is_as_bright_as_the_budget_says(unfinished, weight):
+    slab = scenes.geometry(scenes.box((20.0, 20.0, 0.5)))
+    budget = Budget(1, "all", unfinished=unfinished)
+    ray = _ray([0.3, 0.2, 3.0], [0.0, 0.0, -1.0])
+    path = follow_branch(slab, ray, jnp.zeros(1, bool), budget=budget)
+    assert path.statuses == PathStatus.OUT_OF_BENDS
+    np.testing.assert_allclose(path.weights, weight, rtol=1e-5)
+
+
 def test_a_path_that_is_cut_weighs_nothing():
     geometry = scenes.geometry(scenes.box((20.0, 20.0, 0.5)))
     ray = jax.tree.map(lambda x: x[0], scenes.rays([0.0, 0.1, 3.0], [0.0, 0.0, -1.0]))
@@ -154,7 +164,11 @@ class _Knobs(NamedTuple):
     origin: jax.Array
 
 
-@pytest.mark.parametrize("case", list(_CASES))
+# The slab has its closed form below as well.
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(c, marks=pytest.mark.slow) if c.startswith("slab") else c for c in _CASES],
+)
 def test_gradients_agree_with_differences(case):
     make, origin, direction, reflects = _CASES[case]
     with jax.enable_x64(True):

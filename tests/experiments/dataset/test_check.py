@@ -83,7 +83,7 @@ def test_findings_are_complaints_unless_they_are_notes():
 
 def test_the_bundled_scene_agrees_with_cycles(copy):
     report = scene_check.check_scene(copy, budgets.TREE, views=1, side=6)
-    assert report.complaints == [] and len(report.views) == 1
+    assert report.complaints == [] and report.notes == [] and len(report.views) == 1
     assert report.views[0].psnr_masked > checks.PSNR_CONVEX
     assert report.views[0].depth_error < 2e-4
 
@@ -96,6 +96,13 @@ def test_a_preview_has_test_views_only(copy):
     assert report.complaints == [] and report.views == []
     shutil.rmtree(copy / "mask")
     assert "mask" in scene_check.check_scene(copy, budgets.TREE, views=0, side=1).complaints[0]
+
+
+def test_a_view_without_float_depth_is_noted(copy):
+    for path in (copy / "depth" / "test").glob("*.exr"):
+        path.unlink()
+    report = scene_check.check_scene(copy, budgets.PAPER, views=1, side=1)
+    assert any("no depth was compared" in note for note in report.notes)
 
 
 def test_a_mesh_that_is_not_where_it_was_rendered_is_found(copy):

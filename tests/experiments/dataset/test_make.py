@@ -69,7 +69,7 @@ def test_a_killed_command_goes_on_to_the_same_bits(tmp_path, blender, made):
         env={**code_generator.of_users(), "PYTHONPATH": str(ROOT)},
         check=True,
     )
-    assert (tmp_path / ".scratch").exists() and (tmp_path / "cube_smcvx_box").exists()
+    assert (tmp_path / ".refref_making").exists() and (tmp_path / "cube_smcvx_box").exists()
     assert make(tmp_path, blender, workers=1)
     assert _contents(tmp_path) == _contents(made)
 
@@ -105,7 +105,7 @@ def test_a_process_that_dies_is_reported_and_replaced_once(
     (dies / "twice").touch()
     with pytest.raises(BlenderError, match=r"ended twice .* cube_smcvx_box train 0"):
         make(tmp_path / "twice", blender, workers=1)
-    (log,) = (tmp_path / "twice").glob(".scratch/*/worker_0.log")
+    (log,) = (tmp_path / "twice").glob(".refref_making/*/worker_0.log")
     assert "chatter" in log.read_text()
     make(tmp_path / "twice", blender)
     assert _contents(tmp_path / "twice") == _contents(made)
