@@ -42,7 +42,7 @@ def _bodies():
 
 
 @pytest.mark.parametrize(
-    "body", ["ball", "tinted box", pytest.param("box", marks=pytest.mark.slow)]
+    "body", ["tinted box", *(pytest.param(b, marks=pytest.mark.slow) for b in ("ball", "box"))]
 )
 @pytest.mark.parametrize(
     "budget",

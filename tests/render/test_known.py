@@ -62,7 +62,11 @@ def test_an_image_has_the_shape_of_its_rays(whole):
     assert whole.paths[0, 0] == 1 and whole.paths[8, 8] > 1
 
 
-@pytest.mark.parametrize("budget", [STRAIGHT, PAPER, TREE], ids=["straight", "paper", "tree"])
+@pytest.mark.parametrize(
+    "budget",
+    [STRAIGHT, pytest.param(PAPER, marks=pytest.mark.slow), TREE],
+    ids=["straight", "paper", "tree"],
+)
 def test_the_size_of_a_tile_does_not_matter(geometry, rays, budget):
     one = render_known(geometry, _environment(), rays, budget=budget, tile=256)
     pieces = render_known(geometry, _environment(), rays, budget=budget, tile=100)
