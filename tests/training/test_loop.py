@@ -165,7 +165,8 @@ def test_charbonnier_changes_the_loss_only():
     assert charbonnier.loss > mse.loss
 
 
-@pytest.mark.parametrize("budget", [STRAIGHT, TREE])
+# Other tests train along the tree as well.
+@pytest.mark.parametrize("budget", [STRAIGHT, pytest.param(TREE, marks=pytest.mark.slow)])
 def test_any_budget_can_be_trained_along(budget):
     setup = _setup(budget=budget)
     assert CONFIG.batch <= setup.capacity <= room(budget, CONFIG.batch).paths
