@@ -5,9 +5,9 @@ python -m experiments.dataset.check runs/dataset --views=3
 Each scene's meshes are linted and all of its images opened. Some of its test views are rendered
 again along the path tree, with a finer cut and more bends than `render_known --paths=tree` has by
 default, and without light of more bends than Cycles follows, and compared with the image; depth
-map, mask and normals are compared with the first surface that rays meet. {out}/check.html shows it all, {out}/check.json has
-the figures; {out} is the folder itself by default. A scene that does not hold makes the command end
-with status 1.
+map, mask and normals are compared with the first surface that rays meet. {out}/check.html shows
+it all, {out}/check.json has the figures; {out} is the folder itself by default. A scene that does
+not hold makes the command end with status 1.
 """
 
 import dataclasses
