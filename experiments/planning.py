@@ -99,6 +99,7 @@ def _training(request: Request, cameras: Cameras, chosen: Choices) -> TrainingCo
         schedule=preset.schedule.over(request.steps or preset.schedule.steps),
         batch=batch,
         pool=preset.pool,
+        pixels="all",
         seed=request.seed,
     )
 

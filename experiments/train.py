@@ -3,22 +3,13 @@
 python -m experiments.train --scene=experiments/data/cube_smcvx_ball --out=runs/ball
 """
 
-import math
 import sys
-import time
 from pathlib import Path
 
-import jax
 from absl import flags
 
-from experiments import commands, plans, scene_option, scenes
-from refref_jax.data import local_layout
-from refref_jax.data.batches import PixelSampler
-from refref_jax.render import saved
-from refref_jax.training import loop, run_folder, run_lock
-from refref_jax.training.checkpoints import Checkpoints
-from refref_jax.training.state import TrainState, init_state
-from refref_jax.training.steps import StepReport
+from experiments import commands, plans, scenes, trainer
+from refref_jax.training import run_folder, run_lock
 
 flags.adopt_module_key_flags(scenes)
 flags.adopt_module_key_flags(plans)
@@ -27,9 +18,6 @@ _RESUME = flags.DEFINE_bool("resume", False, "Continue the run in --out, if ther
 _LOG_EVERY = flags.DEFINE_integer("log_every", 50, "Steps between two lines of metrics.", 1)
 _CHECKPOINT_EVERY = flags.DEFINE_integer("checkpoint_every", 500, "Steps between checkpoints.", 1)
 _KEEP = flags.DEFINE_integer("keep", 2, "Newest checkpoints to keep.", 1)
-
-# Steps that the device takes without the host, which sees an interrupt only between them.
-_MOST_STEPS = 10
 
 
 def main() -> None:
@@ -51,7 +39,11 @@ def _begin(run: Path) -> bool:
     else:
         _refuse_options(run)
     with run_lock.hold(run):
-        return train(run)
+        return trainer.train(
+            run,
+            scene=plans.SCENE.value,
+            periods=trainer.Periods(_LOG_EVERY.value, _CHECKPOINT_EVERY.value, _KEEP.value),
+        )
 
 
 def _refuse_options(run: Path) -> None:
@@ -62,76 +54,6 @@ def _refuse_options(run: Path) -> None:
             f"{run} goes on with the options that it was begun with: {', '.join(given)} would have "
             "no effect. Leave it out, or add --scene to have all options compared."
         )
-
-
-def train(run: Path) -> bool:
-    """Trains the run of a folder from its newest checkpoint, or from the start.
-
-    Returns:
-      Whether it has reached its last step.
-    """
-    config, model = run_folder.read_config(run), saved.read_static(run)
-    with Checkpoints(run, keep=_KEEP.value) as checkpoints:
-        if checkpoints.newest() == config.schedule.steps:
-            print(f"{run} is trained already: {config.schedule.steps} steps.")
-            return True
-        scene = scene_option.opened(plans.SCENE.value or config.scene.path)
-        frames = local_layout.read_frames(scene, "train")
-        sampler = PixelSampler(
-            local_layout.read_images(frames), frames.cameras, seed=config.seed, batch=config.batch
-        )
-        geometry = saved.load_geometry(run)
-        setup = loop.set_up(config, model.config, model.budget, geometry, sampler)
-        if setup.hit_fraction == 0.0 and model.budget.bends > 0:
-            print(
-                "warning: no pixel sees the meshes, so no light is bent. Check that their units, "
-                "axes and position are those of the cameras."
-            )
-        state = init_state(config.seed, model.config, config.schedule)
-        if checkpoints.newest() is not None:
-            state = checkpoints.restore(state)
-        return _train(run, setup, state, checkpoints)
-
-
-def _train(run: Path, setup: loop.Setup, state: TrainState, checkpoints: Checkpoints) -> bool:
-    total, step = setup.config.schedule.steps, int(state.step)
-    earlier = run_folder.rewind_metrics(run, step)
-    interrupt = commands.Interrupt()
-    start = last = time.monotonic()
-    logged = step
-    with commands.ProgressBar("train", total, step) as bar:
-        every = (_MOST_STEPS, _LOG_EVERY.value, _CHECKPOINT_EVERY.value)
-        for stepped, report in loop.run_steps(setup, state, total, every=every):
-            step = int(stepped.step)
-            if step % _LOG_EVERY.value == 0 or step == total:
-                report = jax.device_get(report)
-                now = time.monotonic()
-                rate = setup.config.batch * (step - logged) / (now - last)
-                _log(run, step, report, rate, earlier + now - start)
-                bar.show(step, f"loss {report.loss:.5f}  PSNR {report.psnr:.2f}  {rate:.0f} rays/s")
-                last, logged = now, step
-            if step % _CHECKPOINT_EVERY.value == 0 or step == total or interrupt.requested:
-                checkpoints.save(stepped)
-            if interrupt.requested:
-                break
-    if step < total:
-        print(f"Stopped at step {step}. Continue with --resume --out={run}.")
-    return step == total
-
-
-def _log(run: Path, step: int, report: StepReport, rate: float, seconds: float) -> None:
-    if not math.isfinite(report.loss):
-        raise ValueError(
-            f"The loss is {report.loss} at step {step}. Evaluate the last checkpoint, which is "
-            "finite, or train again with another --seed and --out; and please report the scene."
-        )
-    values = {name: float(value) for name, value in report._asdict().items()}
-    line = {"step": step, **values, "rays_per_second": rate, "seconds": seconds}
-    # A CPU keeps no such record.
-    if (memory := jax.local_devices()[0].memory_stats()) is not None:
-        line["peak_device_bytes"] = memory["peak_bytes_in_use"]
-    # The PSNR of a batch that is met exactly is infinite.
-    run_folder.append_metrics(run, commands.string_safe(line))
 
 
 if __name__ == "__main__":

@@ -40,6 +40,7 @@ CONFIG = TrainingConfig(
     schedule=ScheduleConfig(steps=12, warmup=2, peak=1e-2, end=1e-3, anneal=4),
     batch=32,
     pool=4,
+    pixels="all",
     seed=0,
 )
 

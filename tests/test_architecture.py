@@ -36,6 +36,7 @@ _MAY_JIT = {
     "render/first_surface.py",
     "training/steps.py",
     "geometry/native_loop.py",
+    "reconstruct/photometry.py",
 }
 
 _VAGUE_NAMES = {"utils", "util", "misc", "helpers", "common", "math"}

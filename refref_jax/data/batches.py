@@ -9,7 +9,7 @@ seen. Within an epoch no pixel comes twice, but for those that fill up the last 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Bool, Int, UInt8
 
 from refref_jax.data.cameras import Cameras, pixel_rays
 from refref_jax.geometry.rays import Rays
@@ -55,6 +55,7 @@ class PixelSampler:
         *,
         seed: int,
         batch: int,
+        kept: Bool[np.ndarray, "frames h w"] | None = None,
     ) -> None:
         """Prepares to draw.
 
@@ -63,6 +64,7 @@ class PixelSampler:
           cameras: one an image.
           seed: of the order of pixels.
           batch: pixels a step.
+          kept: the pixels to draw from; all of them if not given.
 
         Raises:
           ValueError: if the images do not fit the cameras, or have fewer pixels than a batch.
@@ -74,12 +76,18 @@ class PixelSampler:
                 "image a camera, in its size."
             )
         check_batch(cameras, batch)
+        places = np.arange(images.size // 3) if kept is None else np.flatnonzero(kept)
+        if len(places) < batch:
+            raise ValueError(
+                f"Only {len(places)} pixels are left to draw from, fewer than a batch of {batch}. "
+                "Use a smaller batch, or check the masks."
+            )
         self._pixels = images.reshape(-1, 3)
         self._cameras = cameras
         self._seed = seed
         self._batch = batch
-        self.batches = -(-len(self._pixels) // batch)
-        self._order = self._generator(0).permutation(len(self._pixels)).astype(np.uint32)
+        self.batches = -(-len(places) // batch)
+        self._order = self._generator(0).permutation(places).astype(np.uint32)
 
     def numbers(self, first: int, steps: int) -> Int[np.ndarray, " steps"]:
         """Returns the batches that steps `first .. first + steps - 1` see."""

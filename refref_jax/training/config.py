@@ -76,6 +76,8 @@ class TrainingConfig:
       schedule: how.
       batch: rays a step.
       pool: batches whose light paths are traced at once.
+      pixels: which of them are learned from: `all`, or those of the `background` alone, a margin
+        away from the masks.
       seed: of the initial parameters, the order of pixels and the sampling.
     """
 
@@ -85,4 +87,5 @@ class TrainingConfig:
     schedule: ScheduleConfig
     batch: int
     pool: int
+    pixels: Literal["all", "background"]
     seed: int

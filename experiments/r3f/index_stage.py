@@ -1,0 +1,166 @@
+"""The stage of R3F that finds the index of refraction: a background, then a search.
+
+    {folder}/background/    a run: the field of what is behind the body, from pixels beside it
+    {folder}/index.png      the error over the index
+
+The background is learned along straight light from pixels that do not see the body, so that no
+wrong index can have spoilt it. Where the body fills all images there is none: give the index then.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from experiments import commands, plotting, presets, trainer
+from experiments.plotting import COLOURS, pyplot
+from refref_jax.data import background, local_layout, mask_margins
+from refref_jax.data.cameras import pixel_rays
+from refref_jax.data.geometry import build_geometry
+from refref_jax.geometry.surface_build import build_surfaces
+from refref_jax.optics.branching import Geometry
+from refref_jax.optics.budgets import STRAIGHT
+from refref_jax.optics.interface_rules import NO_PARENT, nested
+from refref_jax.reconstruct.index_search import (
+    IndexEstimate,
+    IndexSearch,
+    estimate_index,
+    most_looks,
+)
+from refref_jax.reconstruct.photometry import Evidence
+from refref_jax.reconstruct.triangles import Mesh
+from refref_jax.render import saved
+from refref_jax.render.config import ModelConfig
+from refref_jax.render.model import Model
+from refref_jax.render.saved import SavedModel
+from refref_jax.training import run_folder, run_lock
+from refref_jax.training.config import SceneConfig, TrainingConfig
+
+PRESET = "tiny"
+"""Of the background: its field is only looked at."""
+
+STEPS = 1000
+"""Of the background's training; the index no longer moves by a thousandth."""
+
+RAYS = 4096
+"""Pixels that the index is fitted to."""
+
+# What the body is told to be before its index is known.
+_BEFORE = 1.5
+
+
+def run(
+    scene: Path,
+    mesh: Mesh,
+    folder: Path,
+    *,
+    seed: int,
+    start: float | None = None,
+    steps: int = STEPS,
+    rays: int = RAYS,
+) -> IndexEstimate:
+    """Finds the index of refraction of a body; what is there of an earlier call is used.
+
+    Args:
+      scene: folder of the scene; its training images and masks are read.
+      mesh: the body.
+      folder: for the background's run and the figure.
+      seed: of everything random.
+      start: an index to descend from besides those of the search.
+      steps: of the background's training.
+      rays: pixels to fit.
+
+    Raises:
+      ValueError: if the scene has no masks, or no pixel beside them.
+      KeyboardInterrupt: if the background's training was stopped; it has been saved.
+    """
+    model = _learn_background(scene, folder / "background", seed=seed, steps=steps)
+    evidence, views = _look(scene, model, seed=seed, rays=rays)
+    search = IndexSearch()
+    with commands.ProgressBar("index", most_looks(search, start)) as bar:
+        found = estimate_index(
+            evidence,
+            geometry_of(mesh, _BEFORE),
+            views,
+            part=0,
+            config=model.config,
+            search=search,
+            start=start,
+            progress=lambda done, _: bar.show(done, "looks at the pixels, at most"),
+        )
+    draw(folder / "index.png", found)
+    return found
+
+
+def geometry_of(mesh: Mesh, index: float) -> Geometry:
+    """Returns one clear body in air, on the device."""
+    owners = np.zeros(len(mesh.faces), np.int64)
+    surfaces = build_surfaces(mesh.vertices[mesh.faces], mesh.normals, owners)
+    return jax.device_put(Geometry(surfaces, nested([index], [NO_PARENT])))
+
+
+def draw(path: Path, found: IndexEstimate) -> None:
+    """Draws the error over the index: the ladder, the ways down, and where they end."""
+    figure, axis = pyplot.subplots(figsize=(6.4, 3.6), layout="constrained")
+    axis.plot(*found.ladder, "o-", color=COLOURS[5], markersize=4, label="looked at")
+    for way, label in zip(found.descents[::-1], ["descents"] + [None] * 9, strict=False):
+        axis.plot(*way, ".-", color=COLOURS[1], linewidth=0.8, label=label)
+    axis.axvline(found.index, color=COLOURS[0], linewidth=1.0)
+    axis.set_title(f"index {found.index:.4f} ± {found.deviation:.4f}")
+    axis.set_xlabel("index of refraction")
+    axis.set_ylabel("mean error, sRGB")
+    axis.legend(frameon=False)
+    plotting.style(axis)
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+def _learn_background(scene: Path, folder: Path, *, seed: int, steps: int) -> Model:
+    if not run_folder.exists(folder):
+        config, model = _plan(scene, seed=seed, steps=steps)
+        nothing = build_geometry([], [], rule="nested")
+        run_folder.create(folder, config, SavedModel(model, STRAIGHT), nothing)
+    with run_lock.hold(folder):
+        if not trainer.train(folder, scene=str(scene)):
+            raise KeyboardInterrupt
+    return saved.load_model(folder)
+
+
+def _plan(scene: Path, *, seed: int, steps: int) -> tuple[TrainingConfig, ModelConfig]:
+    preset = presets.PRESETS[PRESET]
+    cameras = local_layout.read_frames(scene, "train").cameras
+    space = background.space(scene)
+    radius = background.half_extent(scene) if space == "bounded" else None
+    model = preset.model(presets.bounds(cameras, space=space, radius=radius), "clear")
+    config = TrainingConfig(
+        scene=SceneConfig(str(scene), "nested", ()),
+        paths="straight",
+        loss=preset.loss,
+        schedule=preset.schedule.over(steps),
+        batch=preset.batch,
+        pool=preset.pool,
+        pixels="background",
+        seed=seed,
+    )
+    return config, dataclasses.replace(model, footprint="cone")
+
+
+def _look(
+    scene: Path, model: Model, *, seed: int, rays: int
+) -> tuple[Evidence, Int[np.ndarray, " rays"]]:
+    """Returns pixels of the body spread evenly over the views, and the view of each."""
+    frames = local_layout.read_frames(scene, "train")
+    inside = mask_margins.well_inside(local_layout.read_masks(frames))
+    generator = np.random.default_rng(seed)
+    each = -(-rays // len(inside))
+    chosen = []
+    for view, mask in enumerate(inside):
+        places = np.flatnonzero(mask)
+        picked = generator.choice(places, min(each, len(places)), replace=False)
+        chosen.append(picked + view * mask.size)
+    view, row, column = np.unravel_index(np.concatenate(chosen), inside.shape)
+    rgb = local_layout.read_images(frames)[view, row, column].astype(np.float32) / 255.0
+    seen = pixel_rays(frames.cameras, view, row, column)
+    return Evidence(model.params, *jax.device_put((seen, rgb))), view

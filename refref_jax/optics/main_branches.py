@@ -1,0 +1,56 @@
+"""The few branches that carry most of a ray's light, with gradients.
+
+They are the main path, which is refracted wherever it can be, and the paths that are reflected
+once, at one of the first surfaces, and go on as the main path does. In clear glass all others
+together carry a hundredth of the light. What a budget's cut gives to siblings stays with these.
+
+A reflection that does not take place, because the path has left before, or because it is total and
+so the main path's own, is no path.
+
+Source: paper (arXiv 2505.05848), section 4.2; its two paths are the first two of these.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from refref_jax.geometry.rays import Rays
+from refref_jax.optics.branching import Geometry
+from refref_jax.optics.budgets import Budget
+from refref_jax.optics.light_paths import LightPaths, PathStatus
+from refref_jax.optics.single_path import follow_branch
+
+
+def follow_main_branches(
+    geometry: Geometry, ray: Rays, *, budget: Budget, reflections: int
+) -> LightPaths:
+    """Follows one ray along its main path, and along those that are reflected once.
+
+    Args:
+      geometry: the scene.
+      ray: one camera ray.
+      budget: which light to follow.
+      reflections: at how many of the first surfaces a reflection is followed.
+
+    Returns:
+      `1 + reflections` paths, the main one first; those that do not exist are `EMPTY`. All name
+      ray 0.
+
+    Raises:
+      ValueError: if there are more reflections than bends.
+    """
+    if not 0 <= reflections <= budget.bends:
+        raise ValueError(
+            f"{reflections} reflections do not fit into {budget.bends} bends. Ask for that many at "
+            "most, 0 or more."
+        )
+    first = jnp.arange(reflections)
+    once = first[:, None] == jnp.arange(budget.bends)
+    choices = jnp.concatenate([jnp.zeros_like(once, shape=(1, budget.bends)), once])
+    paths = jax.vmap(lambda choice: follow_branch(geometry, ray, choice, budget=budget))(choices)
+    # A main path that stays in its medium at a bend is reflected totally there.
+    total = paths.media[0, 1:] == paths.media[0, :-1]
+    real = jnp.append(True, (paths.bends[1:] > first) & ~total[:reflections])
+    return paths._replace(
+        statuses=jnp.where(real, paths.statuses, PathStatus.EMPTY),
+        weights=jnp.where(real[:, None], paths.weights, 0.0),
+    )

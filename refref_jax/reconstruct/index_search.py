@@ -1,0 +1,250 @@
+"""The index of refraction of a part, by descent from many starts on what its pixels should show.
+
+The error of the pixels over the index has one narrow valley, about 0.15 wide for a ball whose
+background is as fine as its images, and much wider for flat faces; beside it there are ripples. So
+the error is looked at on a ladder of indices first, and the descent begins at its best rungs, and
+at the index that the user expects. Descents go by the sign of the derivative, with steps that grow
+while it stays and shrink when it turns (resilient propagation): near the critical angle single rays
+have derivatives without bound, and no step may be as long as these say.
+
+The error bar comes from the curvature of the valley: views are put into groups, each group's
+parabola has its own bottom, and the bottoms scatter. What is wrong in the same way for all views,
+such as a body that is too large, is not in it.
+
+Source: Riedmiller and Braun, A Direct Adaptive Method for Faster Backpropagation Learning: the
+RPROP Algorithm (1993).
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from refref_jax.optics.branching import Geometry
+from refref_jax.reconstruct import photometry
+from refref_jax.reconstruct.errors import ReconstructionError
+from refref_jax.reconstruct.photometry import Evidence
+from refref_jax.render.config import ModelConfig
+
+LOWEST, HIGHEST = 1.01, 2.8
+"""Indices that are believed: those of transparent bodies in air."""
+
+# How steps change where the derivative keeps its sign, and where it does not (or the error grows).
+_GROW, _SHRINK = 1.3, 0.4
+
+# Half the width of the parabola that the error bar is taken from, and groups of views.
+_APART = 0.01
+_GROUPS = 10
+
+
+@dataclasses.dataclass(frozen=True)
+class IndexSearch:
+    """How an index is looked for.
+
+    Attributes:
+      lowest: rung of the ladder.
+      highest: rung of the ladder.
+      spacing: of the rungs; more than half a valley misses it.
+      descents: from how many of the best rungs to descend.
+      step: length of a descent's first step.
+      tolerance: length of the last one.
+      most: steps of a descent.
+    """
+
+    lowest: float = 1.2
+    highest: float = 2.5
+    spacing: float = 0.05
+    descents: int = 4
+    step: float = 0.02
+    tolerance: float = 2e-4
+    most: int = 25
+
+    def __post_init__(self) -> None:
+        """Checks the ladder."""
+        if not LOWEST <= self.lowest < self.highest <= HIGHEST:
+            raise ReconstructionError(
+                f"The index is looked for from {self.lowest} to {self.highest}. Look for it within "
+                f"{LOWEST} and {HIGHEST}."
+            )
+        if min(self.spacing, self.step, self.tolerance) <= 0.0 or min(self.descents, self.most) < 1:
+            raise ReconstructionError(
+                "Spacing, steps and their numbers must be positive. Correct the search."
+            )
+
+
+class Descent(NamedTuple):
+    """One way down.
+
+    Attributes:
+      indices: where it went, the start first and the lowest place last.
+      errors: mean error there.
+    """
+
+    indices: tuple[float, ...]
+    errors: tuple[float, ...]
+
+
+class IndexEstimate(NamedTuple):
+    """An index of refraction.
+
+    Attributes:
+      index: the best.
+      deviation: one standard deviation; `inf` if the error has no valley there.
+      error: mean error of the pixels there, sRGB.
+      ladder: indices and errors that were looked at first.
+      descents: from the best rungs, and from the user's start; the best one first.
+    """
+
+    index: float
+    deviation: float
+    error: float
+    ladder: Descent
+    descents: tuple[Descent, ...]
+
+
+def estimate_index(
+    evidence: Evidence,
+    geometry: Geometry,
+    views: Int[np.ndarray, " rays"],
+    *,
+    part: int,
+    config: ModelConfig,
+    search: IndexSearch = IndexSearch(),
+    start: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> IndexEstimate:
+    """Finds the index of refraction of one part with which its pixels are explained best.
+
+    Args:
+      evidence: pixels that see the part, and a field of what is behind it.
+      geometry: of the scene; the part's own index is not used.
+      views: the image of each ray, for the error bar.
+      part: number of the part.
+      config: of the field's model.
+      search: how.
+      start: an index that the user expects, from which to descend in any case.
+      progress: told the rungs and steps done, and how many there may be.
+
+    Raises:
+      ReconstructionError: if there is no pixel, or no error is finite.
+    """
+    if len(views) == 0:
+        raise ReconstructionError("No pixel sees the body. Check the masks and the cameras.")
+    rungs = _rungs(search)
+    show = _counter(progress, most_looks(search, start))
+
+    def errors(index: float) -> Float[np.ndarray, " rays"]:
+        return _errors(index, evidence, geometry, part=part, config=config)
+
+    def slope(index: float) -> tuple[float, float]:
+        show()
+        at = np.asarray(index, evidence.rgb.dtype)
+        found = photometry.slope_at_index(at, evidence, geometry, part=part, config=config)
+        return float(found.error), float(found.slope)
+
+    heights = []
+    for rung in rungs:
+        show()
+        heights.append(float(errors(rung).mean()))
+    if not np.any(np.isfinite(heights)):
+        raise ReconstructionError(
+            "No error of a pixel is finite. Check the field that the pixels are compared with."
+        )
+    starts = [rungs[i] for i in _lowest_rungs(heights, search.descents)]
+    starts += [] if start is None else [start]
+    ways = sorted((descend(slope, at, search) for at in starts), key=lambda way: way.errors[-1])
+    best = ways[0].indices[-1]
+    triple = np.stack([errors(best + shift) for shift in (-_APART, 0.0, _APART)])
+    deviation = scatter_of_bottoms(triple, views, _APART)
+    return IndexEstimate(best, deviation, ways[0].errors[-1], Descent(rungs, (*heights,)), (*ways,))
+
+
+def most_looks(search: IndexSearch, start: float | None = None) -> int:
+    """Returns how often the error of the pixels is looked at, at most."""
+    return len(_rungs(search)) + search.most * (search.descents + (start is not None))
+
+
+def descend(
+    slope: Callable[[float], tuple[float, float]], start: float, search: IndexSearch
+) -> Descent:
+    """Goes down from a start by the sign of the derivative.
+
+    Args:
+      slope: gives error and derivative at an index.
+      start: an index; moved into what is believed.
+      search: lengths of steps, and their number.
+    """
+    at = min(max(start, LOWEST), HIGHEST)
+    error, derivative = slope(at)
+    way, step = [(at, error)], search.step
+    for _ in range(search.most - 1):
+        if step < search.tolerance or derivative == 0.0 or not math.isfinite(derivative):
+            break
+        onward = min(max(at - math.copysign(step, derivative), LOWEST), HIGHEST)
+        there, turned = slope(onward)
+        if not there < error:
+            step *= _SHRINK
+            continue
+        step *= _GROW if turned * derivative > 0.0 else _SHRINK
+        at, error, derivative = onward, there, turned
+        way.append((at, error))
+    return Descent(*zip(*way, strict=True))
+
+
+def scatter_of_bottoms(
+    errors: Float[np.ndarray, "3 rays"], views: Int[np.ndarray, " rays"], apart: float
+) -> float:
+    """Returns the standard deviation of a valley's bottom, from those of groups of views.
+
+    Args:
+      errors: of each ray, `apart` below the bottom, there, and above.
+      views: of each ray; those of a view are of one group.
+      apart: in the index.
+    """
+    names, number = np.unique(views, return_inverse=True)
+    groups = min(_GROUPS, len(names))
+    counts = np.bincount(number % groups, minlength=groups)
+    below, here, above = (np.bincount(number % groups, each) / counts for each in errors)
+    whole = below.mean() + above.mean() - 2.0 * here.mean()
+    if groups < 2 or not whole > 0.0:
+        return math.inf
+    # The curvature of all groups together, since that of one may be none.
+    bottoms = -0.5 * apart * (above - below) / whole
+    return float(bottoms.std(ddof=1) / math.sqrt(groups))
+
+
+def _rungs(search: IndexSearch) -> tuple[float, ...]:
+    count = math.ceil((search.highest - search.lowest) / search.spacing - 1e-9)
+    return tuple(float(rung) for rung in np.linspace(search.lowest, search.highest, count + 1))
+
+
+def _lowest_rungs(heights: Sequence[float], count: int) -> list[int]:
+    """Returns the lowest rungs, of which no two are neighbours: these share their valley."""
+    chosen: list[int] = []
+    for rung in np.argsort(np.where(np.isfinite(heights), heights, np.inf), kind="stable"):
+        if len(chosen) < count and all(abs(int(rung) - other) > 1 for other in chosen):
+            chosen.append(int(rung))
+    return chosen
+
+
+def _errors(
+    index: float, evidence: Evidence, geometry: Geometry, *, part: int, config: ModelConfig
+) -> Float[np.ndarray, " rays"]:
+    at = np.asarray(index, evidence.rgb.dtype)
+    found = photometry.errors_at_index(at, evidence, geometry, part=part, config=config)
+    return np.asarray(found, np.float64)
+
+
+def _counter(progress: Callable[[int, int], None] | None, total: int) -> Callable[[], None]:
+    done = 0
+
+    def show() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, total)
+
+    return show
