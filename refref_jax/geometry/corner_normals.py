@@ -41,16 +41,25 @@ def corner_normals(
     flat = face_normals(corners)
     if crease_angle <= 0.0:
         return np.repeat(flat[:, None], 3, axis=1)
-    patch = _smooth_patches(faces, flat, crease_angle)
-    key = patch[:, None].astype(np.int64) * len(vertices) + faces
-    _, group = np.unique(key, return_inverse=True)
-    group = group.reshape(-1)
+    group = smooth_groups(vertices, faces, crease_angle=crease_angle).reshape(-1)
     weighted = (_corner_angles(corners)[..., None] * flat[:, None]).reshape(-1, 3)
     sums = np.stack([np.bincount(group, weighted[:, axis]) for axis in range(3)], axis=-1)
     averaged = _unit(sums)[group].reshape(-1, 3, 3)
     # Opposite faces may cancel at a corner: fall back to the face's own normal there.
     cancelled = np.all(averaged == 0.0, axis=-1, keepdims=True)
     return np.where(cancelled, flat[:, None], averaged)
+
+
+def smooth_groups(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    *,
+    crease_angle: float = CREASE_ANGLE,
+) -> Int[np.ndarray, "faces 3"]:
+    """Numbers the corners that share a normal: those at one vertex, of faces of one patch."""
+    patch = _smooth_patches(faces, face_normals(vertices[faces]), crease_angle)
+    key = patch[:, None].astype(np.int64) * len(vertices) + faces
+    return np.unique(key, return_inverse=True)[1].reshape(-1, 3)
 
 
 def face_normals(corners: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "faces 3"]:

@@ -44,7 +44,7 @@ def follow_main_branches(
             "most, 0 or more."
         )
     first = jnp.arange(reflections)
-    once = first[:, None] == jnp.arange(budget.bends)
+    once = first[:, None] == jnp.arange(budget.bends)[None]
     choices = jnp.concatenate([jnp.zeros_like(once, shape=(1, budget.bends)), once])
     paths = jax.vmap(lambda choice: follow_branch(geometry, ray, choice, budget=budget))(choices)
     # A main path that stays in its medium at a bend is reflected totally there.

@@ -136,3 +136,22 @@ def test_a_survey_is_always_the_same():
     _assert_same(survey, sampler.survey(200))
     _assert_same(survey, _sampler(seed=9, batch=2).survey(200))
     assert len(np.unique(_numbers(survey))) > _PIXELS // 2
+
+
+def test_only_kept_pixels_are_drawn():
+    kept = np.zeros((_FRAMES, _HEIGHT, _WIDTH), bool)
+    kept[1:, 1:3] = True
+    plain = _sampler()
+    images = plain.look_up(np.arange(_PIXELS)).rgb.reshape(_FRAMES, _HEIGHT, _WIDTH, 3)
+    sampler = PixelSampler(images, _cameras(), seed=1, batch=_BATCH, kept=kept)
+    assert sampler.batches == 3
+    seen = _numbers(_draw(sampler, 0, sampler.batches))
+    np.testing.assert_array_equal(np.unique(seen), np.flatnonzero(kept))
+
+
+def test_too_few_kept_pixels_are_refused():
+    kept = np.zeros((_FRAMES, _HEIGHT, _WIDTH), bool)
+    kept[0, 0] = True
+    images = np.zeros((_FRAMES, _HEIGHT, _WIDTH, 3), np.uint8)
+    with pytest.raises(ValueError, match="Only 5 pixels are left"):
+        PixelSampler(images, _cameras(), seed=1, batch=_BATCH, kept=kept)

@@ -1,0 +1,99 @@
+"""The main branches: those of the tree that carry most, each once."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.optics import path_tracing
+from refref_jax.optics.budgets import Budget
+from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics.main_branches import follow_main_branches
+from tests import scenes
+
+_BUDGET = Budget(bends=6, reflections="all", cut=0.02)
+
+
+def _follow(geometry, rays, reflections=3):
+    follow = functools.partial(
+        follow_main_branches, geometry, budget=_BUDGET, reflections=reflections
+    )
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(follow))(rays))
+
+
+def _towards(count, seed=3):
+    targets = np.random.default_rng(seed).uniform(-0.5, 0.5, (count, 3))
+    return scenes.rays([-4.0, 0.2, 0.1], targets - [-4.0, 0.2, 0.1])
+
+
+def test_a_slab_from_above_has_the_shares_of_fresnel():
+    geometry = scenes.geometry(scenes.box((4.0, 4.0, 1.0)))
+    found = _follow(geometry, scenes.rays([0.1, 0.2, 4.0], [0.0, 0.0, -1.0]))
+    part = 0.04
+    # A second reflection has 0.0369 of the light, and the third one 0.0015, below the cut.
+    expected = [(1 - part) ** 2, part, (1 - part) * part, 0.0]
+    np.testing.assert_allclose(found.weights[0, :, 0], expected, atol=1e-6)
+    assert list(found.bends[0, :3]) == [2, 1, 3]
+    assert found.statuses[0, 3] == PathStatus.EMPTY
+
+
+def test_they_are_the_branches_of_the_tree_and_nearly_all_of_its_light():
+    geometry = scenes.geometry(scenes.ball(1.0, subdivisions=3))
+    rays = _towards(64)
+    found = _follow(geometry, rays)
+    total = found.weights[..., 0].sum(axis=1)
+    assert np.all(total <= 1.0 + 1e-5) and total.mean() > 0.99
+    trace = jax.jit(functools.partial(path_tracing.trace, budget=_BUDGET, capacity=512))
+    tree = jax.tree.map(np.asarray, trace(geometry, rays).paths)
+    last = np.arange(64)[:, None], np.arange(4)[None], found.bends
+    for ray, branch in np.argwhere((found.statuses != PathStatus.EMPTY) & (total[:, None] > 0)):
+        if found.weights[ray, branch, 0] == 0.0:
+            continue
+        same = (tree.rays == ray) & (tree.bends == found.bends[ray, branch])
+        ends = tree.directions[same, found.bends[ray, branch]]
+        apart = np.abs(ends - found.directions[last][ray, branch]).max(axis=-1)
+        assert apart.min() < 1e-4
+
+
+def test_a_total_reflection_is_not_counted_twice():
+    # Through a leg of the prism onto its hypotenuse, at 45 degrees: beyond the critical angle.
+    geometry = scenes.geometry(scenes.right_prism())
+    found = _follow(geometry, scenes.rays([0.4, 0.0, -3.0], [0.0, 0.0, 1.0]))
+    assert found.bends[0, 0] == 3
+    assert found.statuses[0, 2] == PathStatus.EMPTY
+    assert found.weights[0, :, 0].sum() <= 1.0 + 1e-6
+
+
+def test_a_ray_that_misses_has_one_path():
+    geometry = scenes.geometry(scenes.ball(1.0, subdivisions=1))
+    found = _follow(geometry, scenes.rays([-4.0, 0.0, 0.0], [-1.0, 0.0, 0.0]))
+    assert list(found.statuses[0]) == [PathStatus.MISSED, *[PathStatus.EMPTY] * 3]
+
+
+def test_the_index_has_the_gradient_of_a_slab():
+    """Shift across a slab of thickness 1: `sin a - cos a sin b / cos b`, Snell's law for `b`."""
+    geometry = scenes.geometry(scenes.box((40.0, 40.0, 1.0)))
+    angle = 0.6
+    ray = jax.tree.map(
+        lambda x: x[0], scenes.rays([0.0, 0.0, 3.0], [np.sin(angle), 0.0, -np.cos(angle)])
+    )
+
+    def shift(index):
+        inside = jnp.full_like(geometry.interfaces.index_inside, index)
+        changed = geometry._replace(interfaces=geometry.interfaces._replace(index_inside=inside))
+        path = follow_main_branches(changed, ray, budget=_BUDGET, reflections=1)
+        return path.points[0, 2, 0]
+
+    def expected(index):
+        return np.tan(np.arcsin(np.sin(angle) / index)) + 2.5 * np.tan(angle)
+
+    value, slope = jax.jvp(shift, (jnp.float32(1.5),), (jnp.float32(1.0),))
+    assert value == pytest.approx(expected(1.5), abs=1e-5)
+    assert slope == pytest.approx((expected(1.5001) - expected(1.4999)) / 2e-4, rel=1e-3)
+
+
+def test_more_reflections_than_bends_are_refused():
+    with pytest.raises(ValueError, match="7 reflections do not fit into 6 bends"):
+        _follow(scenes.geometry(scenes.box()), _towards(1), reflections=7)
