@@ -142,7 +142,7 @@ def _spread(vertices: Vertices, count: int) -> Int[np.ndarray, " handles"]:
 
 
 def _hang(
-    vertices: Vertices, handles: Vertices
+    vertices: Vertices, handles: Float[np.ndarray, "handles 3"]
 ) -> tuple[Int[np.ndarray, "vertices nearest"], Float[np.ndarray, "vertices nearest"]]:
     """Returns the handles of each vertex, and their shares."""
     if len(handles) == len(vertices):

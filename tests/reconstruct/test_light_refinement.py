@@ -1,0 +1,83 @@
+"""Light through a body mends what its outlines can not tell."""
+
+import numpy as np
+import pytest
+
+from refref_jax.data.geometry import build_geometry
+from refref_jax.data.meshes import MeshPart
+from refref_jax.geometry.surface_build import build_surfaces
+from refref_jax.optics.branching import Geometry
+from refref_jax.reconstruct import photometry
+from refref_jax.reconstruct.comparison import compare_meshes
+from refref_jax.reconstruct.light_refinement import LightRefinement, refine_by_light
+from refref_jax.reconstruct.triangles import make_mesh
+from tests import scenes
+from tests.reconstruct import bodies, lit_scenes
+
+_TRUE = 1.5
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return bodies.icosphere(3)
+
+
+@pytest.fixture(scope="module")
+def evidence():
+    return lit_scenes.evidence(scenes.geometry(scenes.ball(1.0, subdivisions=4)), count=512)[0]
+
+
+def _dented(mesh):
+    """The ball with a broad bump of a hundredth of its radius."""
+    bump = 0.01 * np.exp(-np.sum((mesh.vertices - [0.0, 0.0, 1.0]) ** 2, axis=-1) / 0.3)
+    return make_mesh(mesh.vertices * (1.0 + bump)[:, None], mesh.faces)
+
+
+def _error(mesh, index, evidence):
+    part = MeshPart("ball_glass", mesh.vertices, mesh.faces, index, "auto")
+    interfaces = build_geometry([part], [-1], rule="nested").interfaces
+    owners = np.zeros(len(mesh.faces), np.int64)
+    surfaces = build_surfaces(mesh.vertices[mesh.faces], mesh.normals, owners)
+    found = photometry.errors_at_index(
+        np.float32(index),
+        evidence,
+        Geometry(surfaces, interfaces),
+        part=0,
+        config=lit_scenes.CONFIG,
+    )
+    return float(np.mean(found)), interfaces
+
+
+@pytest.mark.slow
+def test_a_bump_goes_and_the_index_comes_nearer(truth, evidence):
+    dented = _dented(truth)
+    before, interfaces = _error(dented, 1.51, evidence)
+    settings = LightRefinement(steps=60, rays=512, handles=48, stride=5e-4)
+    seen = []
+    found = refine_by_light(
+        dented,
+        1.51,
+        interfaces,
+        evidence,
+        config=lit_scenes.CONFIG,
+        settings=settings,
+        progress=lambda step, error: seen.append((step, error)),
+    )
+    after, _ = _error(found.mesh, found.index, evidence)
+    assert after < 0.6 * before
+    assert abs(found.index - _TRUE) < 0.01
+    better, worse = compare_meshes(found.mesh, truth), compare_meshes(dented, truth)
+    assert better.normal_error < worse.normal_error
+    assert [step for step, _ in seen] == list(range(1, 61)) and len(found.errors) == 60
+    assert 0.0 < found.furthest < 60 * 5e-4 * 2.0
+
+
+def test_a_step_moves_no_handle_further_than_a_stride(truth, evidence):
+    _, interfaces = _error(truth, _TRUE, evidence)
+    settings = LightRefinement(steps=1, rays=64, handles=16, stride=1e-3, index_stride=1e-3)
+    found = refine_by_light(
+        truth, _TRUE, interfaces, evidence, config=lit_scenes.CONFIG, settings=settings
+    )
+    assert 0.0 < found.furthest <= 1e-3 * np.sqrt(3.0) * 1.01
+    assert 0.0 < abs(found.index - _TRUE) <= 1.01e-3
+    assert np.all(np.isfinite(found.mesh.vertices)) and np.all(np.isfinite(found.mesh.normals))
