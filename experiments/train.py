@@ -1,6 +1,9 @@
 """Trains a model of a scene.
 
 python -m experiments.train --scene=experiments/data/cube_smcvx_ball --out=runs/ball
+
+With --method=r3f the object is reconstructed from images and masks first, into {out}/r3f, and the
+scene's own meshes are never read.
 """
 
 import math
@@ -11,7 +14,7 @@ from pathlib import Path
 import jax
 from absl import flags
 
-from experiments import commands, plans, scene_option, scenes
+from experiments import commands, plans, reconstruction_options, scene_option, scenes, training_body
 from refref_jax.data import local_layout
 from refref_jax.data.batches import PixelSampler
 from refref_jax.render import saved
@@ -22,6 +25,8 @@ from refref_jax.training.steps import StepReport
 
 flags.adopt_module_key_flags(scenes)
 flags.adopt_module_key_flags(plans)
+flags.adopt_module_key_flags(training_body)
+flags.adopt_module_key_flags(reconstruction_options)
 _OUT = flags.DEFINE_string("out", None, "Folder to write the run to.", required=True)
 _RESUME = flags.DEFINE_bool("resume", False, "Continue the run in --out, if there is one.")
 _LOG_EVERY = flags.DEFINE_integer("log_every", 50, "Steps between two lines of metrics.", 1)
@@ -45,9 +50,14 @@ def _begin(run: Path) -> bool:
     """Begins a run, or goes on with it; returns whether it has reached its last step."""
     resuming = _RESUME.value and run_folder.exists(run)
     if not resuming:
-        run_folder.create(run, *plans.plan_from_flags())
+        run_folder.check_free(run)
+        body = training_body.find(run, resume=_RESUME.value)
+        plan = plans.plan_from_flags(body=body)
+        training_body.note(run, body)
+        run_folder.create(run, *plan)
     elif plans.SCENE.value is not None:
-        run_folder.check_unchanged(run, *plans.plan_from_flags())
+        body = training_body.find(run, resume=True)
+        run_folder.check_unchanged(run, *plans.plan_from_flags(body=body))
     else:
         _refuse_options(run)
     with run_lock.hold(run):
@@ -56,7 +66,7 @@ def _begin(run: Path) -> bool:
 
 def _refuse_options(run: Path) -> None:
     """Refuses options that a resumed run would not heed."""
-    names = [holder.name for holder in plans.SETTLED]
+    names = [holder.name for holder in (*plans.SETTLED, *training_body.SETTLED)]
     if given := [f"--{name}" for name in names if flags.FLAGS[name].present]:
         raise ValueError(
             f"{run} goes on with the options that it was begun with: {', '.join(given)} would have "

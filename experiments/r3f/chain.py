@@ -42,6 +42,7 @@ def reconstruct(
         body fits the masks, or if the folder holds anything else.
     """
     import_skimage()
+    local_layout.read_masks(local_layout.read_frames(scene, "train"))
     asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene), config)
     found = records.begin(out, asked)
     with run_lock.hold(out):
@@ -83,14 +84,12 @@ def fingerprint(scene: Path) -> str:
     """Returns a hash of what a reconstruction is made from: training images, masks and poses.
 
     Raises:
-      ValueError: if a file is missing, or there are no masks.
+      ValueError: if a file is missing, or the transforms file is broken.
     """
     frames = local_layout.read_frames(scene, "train")
-    if frames.masks is None:
-        local_layout.read_masks(frames)  # raises, and says what to do
     found = hashlib.sha256(frames.cameras.poses.tobytes())
     found.update(repr(frames.cameras.focal).encode())
-    for path in (*frames.images, *frames.masks):
+    for path in (*frames.images, *(frames.masks or ())):
         found.update(hashlib.sha256(path.read_bytes()).digest())
     return found.hexdigest()
 

@@ -27,9 +27,7 @@ Masks = Bool[np.ndarray, "views h w"]
 
 
 def _hull(masks: Masks, cameras: Cameras, config: ReconstructionConfig) -> Grid:
-    return visual_hull.carve(
-        masks, cameras, resolution=config.resolution, outliers=config.outliers
-    )
+    return visual_hull.carve(masks, cameras, resolution=config.resolution, outliers=config.outliers)
 
 
 GEOMETRIES: dict[str, Callable[[Masks, Cameras, ReconstructionConfig], Grid]] = {"hull": _hull}

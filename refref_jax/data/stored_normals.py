@@ -1,9 +1,9 @@
 """Mesh files that keep the shading normals they were written with (NumPy only).
 
-A reconstructed surface knows its normals better than its triangles do: from the gradient of a field,
-or averaged within patches of its own. PLY keeps one normal a vertex, so a vertex is written once for
-each normal that faces have there; the reader of meshes merges equal positions again. Numbers are
-in double precision, and come back as they were.
+A reconstructed surface knows its normals better than its triangles do: from the gradient of a
+field, or averaged within patches of its own. PLY keeps one normal a vertex, so a vertex is written
+once for each normal that faces have there; the reader of meshes merges equal positions again.
+Numbers are in double precision, and come back as they were.
 
 Only a file with the very header that is written here is trusted: normals of other programs may be
 anything, and what such a program writes again has another header.

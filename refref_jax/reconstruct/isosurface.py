@@ -60,7 +60,9 @@ def march(values: np.ndarray, spacing: float) -> tuple[Vertices, Faces]:
     """
     clearance = CLEARANCE * spacing
     cleared = np.copysign(np.maximum(np.abs(values), clearance), values)
-    vertices, faces, _, _ = import_skimage().marching_cubes(cleared, 0.0, gradient_direction="descent")
+    vertices, faces, _, _ = import_skimage().marching_cubes(
+        cleared, 0.0, gradient_direction="descent"
+    )
     return spacing * vertices.astype(np.float64), faces.astype(np.int64)
 
 
