@@ -71,7 +71,7 @@ def draw_overlaps(path: Path, outlines: Sequence[Outline]) -> None:
     for axis, outline, window in zip(axes.flat, outlines, around, strict=False):
         axis.imshow(colour_overlap(outline, window), interpolation="nearest")
         axis.set_title(f"{outline.name}  {outline.overlap:.4f}", fontsize=6.5, pad=2.5)
-    named = {"in both": AGREES, "mask alone": MISSING, "silhouette alone": EXCESS}
+    named = {"in both": _tinted(), "mask alone": MISSING, "silhouette alone": EXCESS}
     figure.legend(
         handles=[Patch(color=colour, label=name) for name, colour in named.items()],
         loc="outside lower center",
@@ -92,7 +92,7 @@ def colour_overlap(outline: Outline, window: Window) -> Float[np.ndarray, "ph pw
     grey = np.mean(windows.shrink(image / 255.0, stride), axis=-1, keepdims=True)
     both = windows.shrink_any(mask & silhouette, stride)
     picture = np.repeat(1.0 - _CONTRAST * (1.0 - grey), 3, axis=-1)
-    picture[both] *= 1.0 - _TINT * (1.0 - np.asarray(to_rgb(AGREES)))
+    picture[both] *= _tinted()
     picture[windows.shrink_any(mask & ~silhouette, stride)] = to_rgb(MISSING)
     picture[windows.shrink_any(silhouette & ~mask, stride)] = to_rgb(EXCESS)
     return picture
@@ -132,6 +132,11 @@ def draw_errors(path: Path, outlines: Sequence[Outline]) -> None:
     axis.grid(False, axis="x")
     figure.savefig(path, dpi=DPI)
     pyplot.close(figure)
+
+
+def _tinted() -> Float[np.ndarray, "3"]:
+    """Returns the colour of agreement on white."""
+    return 1.0 - _TINT * (1.0 - np.asarray(to_rgb(AGREES)))
 
 
 def _share(pixels: Bool[np.ndarray, "h w"], outline: Outline) -> float:

@@ -43,7 +43,7 @@ FILE = "report.md"
 _ROWS = 3
 
 # Rows of pixels of a whole view of the surface, and what is shown around it, as a share of it.
-_HEIGHT = 360
+_HEIGHT = 300
 _MARGIN = 0.2
 
 _SPLITS = ("test", "val", "train")
@@ -137,7 +137,7 @@ def _read_truth(scene: Path) -> _Truth:
 
 def _surface_views(mesh: Mesh, truth: Mesh | None, frames: Frames) -> list[SurfaceView]:
     """Returns what a few cameras see, in windows around the object."""
-    chosen = np.unique(np.linspace(0, len(frames.names) - 1, _ROWS).astype(int))
+    chosen = np.unique(np.linspace(0, len(frames.names) - 1, _ROWS).astype(int)).tolist()
     images = local_layout.read_images(
         frames._replace(images=tuple(frames.images[i] for i in chosen))
     )
