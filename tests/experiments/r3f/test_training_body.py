@@ -33,31 +33,49 @@ def made(scene, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def found(scene, made, tmp_path_factory):
-    """What each training's options come to, by name; found in one process."""
+def runs(tmp_path_factory):
+    """Where trainings are begun."""
     runs = tmp_path_factory.mktemp("runs")
     (runs / "half" / "r3f").mkdir(parents=True)
-    r3f, given = "--method=r3f", f"--reconstruction={made}"
+    (runs / "killed" / "r3f").mkdir(parents=True)
+    return runs
+
+
+@pytest.fixture(scope="module")
+def found(scene, made, runs):
+    """What beginning each training came to, by name; all in one process, in this order."""
+    r3f, given = ("--method=r3f", _GRID, "--ior=1.5"), f"--reconstruction={made}"
     cases = {
-        "oracle": [],
-        "r3f": [r3f, _GRID, "--ior=1.5"],
-        "given": [given],
-        "other index": [given, "--method=r3f", "--ior=1.7"],
-        "half": [r3f, _GRID, "--ior=1.5"],
-        "no estimate": [r3f, _GRID],
-        "named index": [r3f, "--ior=glass=1.5"],
-        "two indices": [given, "--ior=1.5", "--ior=1.6"],
-        "no index": [r3f, "--ior=15"],
-        "no number": [r3f, "--ior=glass"],
-        "oracle too": [given, "--method=oracle"],
-        "no effect": [given, _GRID],
-        "no effect of oracle": [_GRID],
-        "straight": [r3f, "--paths=straight"],
-        "nothing there": ["--reconstruction=nowhere"],
+        "oracle": (),
+        "r3f": r3f,
+        "given": (given,),
+        "other index": (given, "--method=r3f", "--ior=1.7"),
+        "half": r3f,
+        "killed": (*r3f, "--resume"),
+        "named index": ("--method=r3f", "--ior=glass=1.5"),
+        "two indices": (given, "--ior=1.5", "--ior=1.6"),
+        "no index": ("--method=r3f", "--ior=15"),
+        "no number": ("--method=r3f", "--ior=glass"),
+        "oracle too": (given, "--method=oracle"),
+        "no effect": (given, _GRID),
+        "no effect of oracle": (_GRID,),
+        "straight": (*r3f, "--paths=straight"),
+        "nothing there": ("--reconstruction=nowhere",),
     }
-    sent = [[str(runs / name), f"--scene={scene}", *rest] for name, rest in cases.items()]
+    sent = [
+        [f"--out={runs / name}", f"--scene={scene}", *options] for name, options in cases.items()
+    ]
+    again = {
+        "r3f begun anew": ("r3f", f"--scene={scene}", *r3f),
+        "r3f resumed": ("r3f", f"--scene={scene}", *r3f, "--resume"),
+        "r3f resumed alone": ("r3f", "--resume"),
+        "r3f with another grid": ("r3f", f"--scene={scene}", *r3f[:2], "--ior=1.6", "--resume"),
+        "r3f by name alone": ("r3f", "--resume", "--method=r3f"),
+        "r3f with a given one": ("r3f", f"--scene={scene}", given, "--resume"),
+    }
+    sent += [[f"--out={runs / run}", *options] for run, *options in again.values()]
     result = subprocess.run(
-        [sys.executable, "-m", "tests.experiments.r3f.print_bodies"],
+        [sys.executable, "-m", "tests.experiments.r3f.print_beginnings"],
         cwd=ROOT,
         env=code_generator.of_users(),
         input=json.dumps(sent),
@@ -66,18 +84,18 @@ def found(scene, made, tmp_path_factory):
         check=False,
     )
     assert result.returncode == 0, result.stderr
-    return dict(zip(cases, json.loads(result.stdout), strict=True))
+    return dict(zip([*cases, *again], json.loads(result.stdout), strict=True))
 
 
 def test_the_broken_mesh_stops_the_oracle_alone(found):
     assert "ball_glass.ply can not be read" in found["oracle"]["error"]
-    for name in ("r3f", "given", "other index"):
+    for name in ("r3f", "killed", "given", "other index", "r3f resumed", "r3f resumed alone"):
         assert found[name]["error"] is None, name
 
 
 @pytest.mark.parametrize(("name", "index"), [("r3f", 1.5), ("given", 1.45), ("other index", 1.7)])
 def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
-    assert found[name]["body"] == "ball_glass"
+    assert found[name]["body"]["index"] == index
     assert found[name]["indices"] == [["ball_glass", index]]
     assert found[name]["inside"] == pytest.approx([index])
     assert found[name]["faces"] == records.read(made).geometry.faces
@@ -88,7 +106,6 @@ def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
     ("name", "message"),
     [
         ("half", "Continue with --resume"),
-        ("no estimate", "--ior=1.5"),
         ("named index", "--ior=glass=1.5, but there is one reconstructed body"),
         ("two indices", "Give its index alone, once"),
         ("no index", "--ior=15 is no index of refraction"),
@@ -98,36 +115,36 @@ def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
         ("no effect of oracle", "add --method=r3f"),
         ("straight", "--paths=straight knows of no objects"),
         ("nothing there", "nowhere holds no reconstruction"),
+        ("r3f begun anew", "holds a run already"),
+        ("r3f with another grid", "ior 1.5, not 1.6"),
+        ("r3f by name alone", "--method would have no effect"),
+        ("r3f with a given one", "begun with other options"),
     ],
 )
 def test_mistakes_are_told(found, name, message):
-    if name == "no estimate" and found[name]["error"] is None:
-        pytest.skip("there is an estimation now")
     assert message in found[name]["error"]
 
 
-def test_training_reconstructs_and_goes_on(scene, made, tmp_path):
-    run = tmp_path / "run"
-    options = (f"--scene={scene}", f"--out={run}", "--method=r3f", "--ior=1.45", _GRID)
-    small = ("--steps=2", "--batch=64", "--log_every=1", "--interior=clear", "--paths=paper")
-    run_command("train", *options, *small)
-    assert "r3f" in json.loads((run / "body.json").read_text())["reconstruction"]
-    mesh, index = "geometry/ball_glass.ply", "index.json"
-    for name in (mesh, index):  # what two processes made is the same to the bit
-        assert (run / "r3f" / name).read_bytes() == (made / name).read_bytes()
-    again = run_command("train", *options, *small, "--resume")
-    assert "trained already" in again.stdout and "left out" not in again.stdout
-    other = run_command("train", *options[:3], "--ior=1.6", _GRID, *small, "--resume", fails=True)
-    assert "ior 1.45, not 1.6" in other.stderr
-    ignored = run_command("train", f"--out={run}", "--resume", "--method=r3f", fails=True)
-    assert "--method would have no effect" in ignored.stderr
+def test_what_is_reconstructed_for_a_run_is_kept_and_not_made_again(found, runs, made):
+    for name in ("r3f", "killed"):
+        assert found[name]["body"]["reconstruction"] == str(runs / name / "r3f")
+        mesh = "geometry/ball_glass.ply"  # what two processes made is the same to the bit
+        assert (runs / name / "r3f" / mesh).read_bytes() == (made / mesh).read_bytes()
+        assert "hull of the training masks" in found[name]["printed"]
+    assert "hull of the training masks" not in found["r3f resumed"]["printed"]
+    assert found["given"]["body"]["reconstruction"] == str(made)
+    for name in ("straight", "no index", "nothing there", "oracle"):
+        assert not (runs / name).exists(), name
 
 
 @pytest.mark.slow
-def test_evaluation_names_the_method(scene, made, tmp_path):
+def test_a_reconstructed_body_is_trained_with_and_rendered(scene, tmp_path):
     run = tmp_path / "run"
-    small = ("--steps=2", "--batch=64", "--interior=clear", "--paths=paper")
-    run_command("train", f"--scene={scene}", f"--out={run}", f"--reconstruction={made}", *small)
+    options = [f"--scene={scene}", "--method=r3f", "--ior=1.45", _GRID, f"--out={run}"]
+    options += ["--steps=2", "--batch=64", "--interior=clear", "--paths=paper"]
+    run_command("train", *options)
+    again = run_command("train", *options, "--resume")
+    assert "trained already" in again.stdout
     run_command("evaluate", f"--run={run}", "--limit=1")
     metrics = json.loads((run / "eval" / "test" / "metrics.json").read_text())
     assert metrics["method"] == "r3f" and metrics["results"]["psnr_masked"] is not None
