@@ -121,7 +121,7 @@ def _describe_geometry(found: Reconstruction) -> str:
     facts = found.geometry
     told = [
         f"geometry: {facts.faces} faces from {facts.masks} masks of {facts.width} x "
-        f"{facts.height}; {', '.join(facts.stages)}"
+        f"{facts.height}; {', '.join(facts.stages) or 'not refined'}"
     ]
     told += [f"  left out {refused}" for refused in facts.refused]
     return "\n".join(told)

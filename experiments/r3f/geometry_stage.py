@@ -43,8 +43,10 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
     frames = local_layout.read_frames(scene, "train")
     masks = local_layout.read_masks(frames)
     grid = GEOMETRIES[config.geometry](masks, frames.cameras, config)
-    refined = refine(find_isosurface(grid), Refinement())
+    cut = find_isosurface(grid)
+    refined = refine(cut, Refinement())
     mesh = refined[-1].mesh
+    befores = [cut, *(stage.mesh for stage in refined)]
     name = f"{_object(scene)}_{MATERIAL}.ply"
     with stages.unfinished_folder(out / FOLDER) as folder:
         stored_normals.write_mesh(folder / name, *mesh)
@@ -57,7 +59,11 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
         faces=len(mesh.faces),
         volume=volume(mesh.vertices, mesh.faces),
         diameter=diameter(mesh.vertices),
-        stages=tuple(stage.name for stage in refined),
+        stages=tuple(
+            stage.name
+            for before, stage in zip(befores, refined, strict=False)
+            if not np.array_equal(before.vertices, stage.mesh.vertices)
+        ),
         refused=tuple(f"{stage.name}: {stage.refused}" for stage in refined if stage.refused),
     )
 

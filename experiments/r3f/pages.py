@@ -74,7 +74,11 @@ def _table(geometry: GeometryFacts, index: IndexFacts, facts: ReportFacts) -> st
 
 
 def _of_truth(facts: ReportFacts) -> str:
-    shown = "Normals are those of the camera's frame: right is red, up green, towards it blue."
+    shown = (
+        "No mask shows a cavity, a dent that no line of sight grazes, or what lies within glass: "
+        "the body is filled, with one index. Normals are those of the camera's frame: right is "
+        "red, up green, towards it blue."
+    )
     if facts.truth is None:
         return f"{facts.remark} {shown}"
     return (
@@ -96,7 +100,7 @@ def _making(found: Reconstruction) -> str:
         f"- `--geometry={config.geometry} --resolution={config.resolution} "
         f"--outliers={config.outliers} --seed={config.seed}`"
         + (f" `--ior={config.index:g}`" if config.index is not None else ""),
-        f"- refined: {', '.join(geometry.stages)}",
+        f"- refined: {', '.join(geometry.stages) or 'nothing to do'}",
         *(f"- left out {refused}" for refused in geometry.refused),
     ]
     return "\n".join(told)

@@ -52,8 +52,8 @@ class GeometryFacts:
       faces: of the mesh.
       volume: inside of it, cubed world units.
       diameter: diagonal of its box, world units.
-      stages: of the refinement.
-      refused: one sentence for each of them that was left out.
+      stages: of the refinement that changed something.
+      refused: those that were left out, and why.
     """
 
     mesh: str
