@@ -16,6 +16,7 @@ from absl import flags
 
 from experiments import commands, figures, measures, scene_option, supersampling
 from experiments.measures import Truth
+from experiments.r3f import provenance
 from refref_jax.data import files, local_layout, scene_names
 from refref_jax.render import Model, dyes, load_model
 from refref_jax.render.saved import latest_step
@@ -32,6 +33,7 @@ _RAYS_PER_PIXEL = flags.DEFINE_integer(
 _CHUNK = flags.DEFINE_integer("chunk", 4096, "Paths at once: lower it if memory runs out.", 1)
 
 _METHODS = {"paper": "oracle"}
+_RECONSTRUCTED = {"paper": "r3f", "tree": "r3f_tree"}
 
 _VIEWS_IN_COMPARISON = 4
 
@@ -53,7 +55,7 @@ def main() -> None:
     per_image, views = evaluate(model, truth, out, side)
     summary = {
         "scene": scene_names.of_folder(scene),
-        "method": _METHODS.get(config.paths, config.paths),
+        "method": _method(run, config.paths),
         "step": step,
         "rays_per_pixel": _RAYS_PER_PIXEL.value,
         "results": {key: measures.mean_of(per_image, key) for key in per_image[0] if key != "name"},
@@ -74,6 +76,12 @@ def main() -> None:
     print(f"Pictures: {out / 'comparison.png'}, {out / 'rgb'}, {out / 'distance'}")
     print(f"Metrics:  {out / 'metrics.json'}")
     print(f"Next: {commands.shell('render', f'--run={run}', '--views=orbit')}")
+
+
+def _method(run: Path, paths: str) -> str:
+    """Returns what a run's geometry and light paths are called together."""
+    names = _METHODS if provenance.read(run) is None else _RECONSTRUCTED
+    return names.get(paths, paths)
 
 
 def learned_colours(model: Model) -> dict[str, Any] | None:

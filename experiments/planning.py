@@ -1,7 +1,7 @@
 """What a run of training is to be: from what is asked and the scene's needs to a resolved plan."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ from refref_jax.data import background, containment, local_layout, meshes, needs
 from refref_jax.data.batches import check_batch
 from refref_jax.data.cameras import Cameras
 from refref_jax.data.geometry import build_geometry
+from refref_jax.data.meshes import MeshPart
 from refref_jax.optics.media import EMPTY_SLOT
 from refref_jax.optics.wavefront import Geometry
 from refref_jax.render.config import ModelConfig
@@ -38,6 +39,7 @@ class Request(NamedTuple):
       steps: training steps.
       batch: rays a step.
       seed: of everything random.
+      parts: the objects, where they are not to be read from the scene's meshes.
     """
 
     scene: Path
@@ -51,6 +53,7 @@ class Request(NamedTuple):
     steps: int | None = None
     batch: int | None = None
     seed: int = 0
+    parts: Sequence[MeshPart] | None = None
 
 
 class Plan(NamedTuple):
@@ -70,7 +73,9 @@ def make_plan(request: Request) -> Plan:
     scene, rule = request.scene, request.rule
     local_layout.check_scene(scene)
     cameras = local_layout.read_frames(scene, "train").cameras
-    parts = meshes.read_meshes(scene, indices=request.indices)
+    parts = request.parts
+    if parts is None:
+        parts = meshes.read_meshes(scene, indices=request.indices)
     tree = containment.find_containment(parts)
     mesh_report.report_meshes(parts, tree, rule=rule)
     if rule == "priority":
@@ -112,7 +117,7 @@ def _model(request: Request, cameras: Cameras, space: Space, chosen: Choices) ->
     return model_options.override(model, request.options, preset=request.preset)
 
 
-def _refuse_cameras_inside(parts: list[meshes.MeshPart], cameras: Cameras) -> None:
+def _refuse_cameras_inside(parts: Sequence[MeshPart], cameras: Cameras) -> None:
     """Refuses cameras whose rays would have to know at once what they are in."""
     if np.any(containment.parts_around(parts, cameras.poses[:, :, 3]) != EMPTY_SLOT):
         raise ValueError(

@@ -1,5 +1,7 @@
 """The options of training, and the run that they ask for."""
 
+from pathlib import Path
+
 from absl import flags
 
 from experiments import model_options, planning, scene_option, scenes
@@ -7,11 +9,12 @@ from experiments.choices import Wishes
 from experiments.model_options import ModelOptions
 from experiments.planning import Plan, Request
 from experiments.presets import PRESETS
+from refref_jax.data.meshes import MeshPart
 from refref_jax.optics.budgets import BUDGETS
 
 SCENE = flags.DEFINE_string("scene", None, f"The scene to train on: {scene_option.FORMS}.")
 _PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Size of the model and its training.")
-_PATHS = flags.DEFINE_enum(
+PATHS = flags.DEFINE_enum(
     "paths",
     None,
     list(BUDGETS),
@@ -95,11 +98,11 @@ _RADIUS = flags.DEFINE_float(
 )
 _STEPS = flags.DEFINE_integer("steps", None, "Training steps; the preset's if not given.", 1)
 _BATCH = flags.DEFINE_integer("batch", None, "Rays a step; the preset's if not given.", 1)
-_SEED = flags.DEFINE_integer("seed", 0, "Seed of everything random.", 0, 2**32 - 1)
+SEED = flags.DEFINE_integer("seed", 0, "Seed of everything random.", 0, 2**32 - 1)
 
 SETTLED = (
     _PRESET,
-    _PATHS,
+    PATHS,
     _CUT,
     _BENDS,
     _REENTRY,
@@ -117,27 +120,41 @@ SETTLED = (
     _RADIUS,
     _STEPS,
     _BATCH,
-    _SEED,
+    SEED,
 )
 """Options that a run is begun with, and can not change when it is resumed."""
 
 
-def plan_from_flags() -> Plan:
-    """Plans the run that the options ask for, and prints what it comes to."""
+def opened_scene() -> Path:
+    """Returns the folder of the scene that the options name.
+
+    Raises:
+      ValueError: if they name none, or it is broken.
+    """
     if SCENE.value is None:
         raise ValueError("No scene is given. Add --scene=FOLDER.")
+    return scene_option.opened(SCENE.value).resolve()
+
+
+def plan_from_flags(*, body: MeshPart | None = None) -> Plan:
+    """Plans the run that the options ask for, and prints what it comes to.
+
+    Args:
+      body: the reconstructed object; if `None`, the scene's own meshes are.
+    """
     request = Request(
-        scene=scene_option.opened(SCENE.value).resolve(),
+        scene=opened_scene(),
         preset=_PRESET.value,
         wishes=_wishes(),
         options=_options(),
         rule=scenes.RULE.value,
-        indices=scenes.given_indices(),
+        indices=scenes.given_indices() if body is None else {body.name: body.index},
         space=None if _BACKGROUND.value == "auto" else _BACKGROUND.value,
         radius=_RADIUS.value,
         steps=_STEPS.value,
         batch=_BATCH.value,
-        seed=_SEED.value,
+        seed=SEED.value,
+        parts=None if body is None else [body],
     )
     return planning.make_plan(request)
 
@@ -145,7 +162,7 @@ def plan_from_flags() -> Plan:
 def _wishes() -> Wishes:
     asked = {"reentry": _REENTRY.value, "interior": _INTERIOR.value, "tints": _TINTS.value}
     decided = {name: None if value == "auto" else value for name, value in asked.items()}
-    return Wishes(paths=_PATHS.value, cut=_CUT.value, bends=_BENDS.value, **decided)
+    return Wishes(paths=PATHS.value, cut=_CUT.value, bends=_BENDS.value, **decided)
 
 
 def _options() -> ModelOptions:

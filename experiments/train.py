@@ -1,6 +1,9 @@
 """Trains a model of a scene.
 
 python -m experiments.train --scene=experiments/data/cube_smcvx_ball --out=runs/ball
+
+With --method=r3f the object is reconstructed from images and masks first, into {out}/r3f, and the
+scene's own meshes are never read.
 """
 
 import sys
@@ -8,11 +11,13 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import commands, plans, scenes, trainer
+from experiments import commands, plans, reconstruction_options, scenes, trainer, training_body
 from refref_jax.training import run_folder, run_lock
 
 flags.adopt_module_key_flags(scenes)
 flags.adopt_module_key_flags(plans)
+flags.adopt_module_key_flags(training_body)
+flags.adopt_module_key_flags(reconstruction_options)
 _OUT = flags.DEFINE_string("out", None, "Folder to write the run to.", required=True)
 _RESUME = flags.DEFINE_bool("resume", False, "Continue the run in --out, if there is one.")
 _LOG_EVERY = flags.DEFINE_integer("log_every", 50, "Steps between two lines of metrics.", 1)
@@ -33,9 +38,14 @@ def _begin(run: Path) -> bool:
     """Begins a run, or goes on with it; returns whether it has reached its last step."""
     resuming = _RESUME.value and run_folder.exists(run)
     if not resuming:
-        run_folder.create(run, *plans.plan_from_flags())
+        run_folder.check_free(run)
+        body = training_body.find(run, resume=_RESUME.value)
+        plan = plans.plan_from_flags(body=body)
+        training_body.note(run, body)
+        run_folder.create(run, *plan)
     elif plans.SCENE.value is not None:
-        run_folder.check_unchanged(run, *plans.plan_from_flags())
+        body = training_body.find(run, resume=True)
+        run_folder.check_unchanged(run, *plans.plan_from_flags(body=body))
     else:
         _refuse_options(run)
     with run_lock.hold(run):
@@ -48,7 +58,7 @@ def _begin(run: Path) -> bool:
 
 def _refuse_options(run: Path) -> None:
     """Refuses options that a resumed run would not heed."""
-    names = [holder.name for holder in plans.SETTLED]
+    names = [holder.name for holder in (*plans.SETTLED, *training_body.SETTLED)]
     if given := [f"--{name}" for name in names if flags.FLAGS[name].present]:
         raise ValueError(
             f"{run} goes on with the options that it was begun with: {', '.join(given)} would have "

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.part_descriptions import Shading
@@ -29,10 +30,7 @@ def build_geometry(
       rule: what lies outside a part, see `optics.interface_rules`.
     """
     triangles = [part.vertices[part.faces] for part in parts]
-    normals = [
-        corner_normals(part.vertices, part.faces, crease_angle=_CREASE_ANGLES[part.shading])
-        for part in parts
-    ]
+    normals = [shading_normals(part) for part in parts]
     owners = [np.full(len(part.faces), i) for i, part in enumerate(parts)]
     surfaces = build_surfaces(
         np.concatenate([np.zeros((0, 3, 3)), *triangles]),
@@ -47,3 +45,10 @@ def build_geometry(
         priorities=[part.priority for part in parts],
     )
     return Geometry(surfaces, interfaces)
+
+
+def shading_normals(part: MeshPart) -> Float[np.ndarray, "faces 3 3"]:
+    """Returns the outward unit normals at the corners of a part's faces that bend light."""
+    if part.normals is not None:
+        return part.normals
+    return corner_normals(part.vertices, part.faces, crease_angle=_CREASE_ANGLES[part.shading])

@@ -5,6 +5,9 @@ indices knows: `perfume_red_glass.ply` is glass. An optional `scene.json` may sa
 (see `part_descriptions`). The index of refraction is, in this order, the one that the user gives,
 that of `scene.json`, and that of the table: what was rendered beats what a name suggests, and
 what is asked for by hand beats both.
+
+A reconstructed mesh brings its shading normals (see `stored_normals`); of any other they follow
+from its faces.
 """
 
 import re
@@ -16,7 +19,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
-from refref_jax.data import scene_names
+from refref_jax.data import scene_names, stored_normals
 from refref_jax.data.errors import SceneError
 from refref_jax.data.part_descriptions import (
     Colour,
@@ -53,6 +56,8 @@ class MeshPart(NamedTuple):
       absorption: of the medium inside, linear RGB, per world unit.
       priority: where bodies overlap under the rule `priority`, the highest wins.
       colour_known: whether `scene.json` tells tint or absorption; else they are a mere default.
+      normals: outward unit shading normals at the corners of the faces, or `None` if `shading`
+        decides them.
     """
 
     name: str
@@ -64,6 +69,7 @@ class MeshPart(NamedTuple):
     absorption: Colour = NO_ABSORPTION
     priority: int = 0
     colour_known: bool = False
+    normals: Float[np.ndarray, "faces 3 3"] | None = None
 
 
 def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> list[MeshPart]:
@@ -97,6 +103,15 @@ def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> l
         )
     unknown = PartDescription()
     return [_read_part(path, overrides, described.get(path.name, unknown)) for path in paths]
+
+
+def read_part(path: Path, *, index: float) -> MeshPart:
+    """Reads one mesh that belongs to no scene, of a known index of refraction.
+
+    Raises:
+      SceneError: if the file is broken, or has no triangle.
+    """
+    return _read_part(path, {path.stem: index}, PartDescription())
 
 
 def mesh_files(scene: Path) -> list[Path]:
@@ -169,7 +184,8 @@ def _declared_faces(path: Path) -> int:
 def _read_part(path: Path, overrides: Mapping[str, float], described: PartDescription) -> MeshPart:
     index = _index(path, overrides, described)
     vertices, faces = read_mesh(path)
-    return MeshPart(path.stem, vertices, faces, index, *described[1:])
+    normals = stored_normals.read_normals(path) if described.shading == "auto" else None
+    return MeshPart(path.stem, vertices, faces, index, *described[1:], normals)
 
 
 def _index(path: Path, overrides: Mapping[str, float], described: PartDescription) -> float:

@@ -60,7 +60,9 @@ def march(values: np.ndarray, spacing: float) -> tuple[Vertices, Faces]:
     """
     clearance = CLEARANCE * spacing
     cleared = np.copysign(np.maximum(np.abs(values), clearance), values)
-    vertices, faces, _, _ = _skimage().marching_cubes(cleared, 0.0, gradient_direction="descent")
+    vertices, faces, _, _ = import_skimage().marching_cubes(
+        cleared, 0.0, gradient_direction="descent"
+    )
     return spacing * vertices.astype(np.float64), faces.astype(np.int64)
 
 
@@ -87,7 +89,12 @@ def _normals(slopes: Points, vertices: Vertices, faces: Faces) -> np.ndarray:
     return np.where(agrees, unit, averaged)
 
 
-def _skimage() -> Any:
+def import_skimage() -> Any:
+    """Returns scikit-image's `measure`, so that its lack can be told before a grid is made.
+
+    Raises:
+      ReconstructionError: if scikit-image is not installed.
+    """
     try:
         import skimage.measure
     except ImportError as error:

@@ -35,6 +35,18 @@ def create(run: Path, config: TrainingConfig, model: SavedModel, geometry: Geome
     Raises:
       ValueError: if the folder holds a run already, or is a file.
     """
+    check_free(run)
+    run.mkdir(parents=True, exist_ok=True)
+    saved.save_scene(run, model, geometry)
+    configuration.write(run / _CONFIG, config)
+
+
+def check_free(run: Path) -> None:
+    """Checks that a run may be begun in a folder, which need not exist.
+
+    Raises:
+      ValueError: if the folder holds a run already, or is a file.
+    """
     if found := [name for name in _LEFT_BEHIND if (run / name).exists()]:
         raise ValueError(
             f"{run} holds a run already, or what is left of one ({', '.join(found)}). Continue it "
@@ -42,9 +54,6 @@ def create(run: Path, config: TrainingConfig, model: SavedModel, geometry: Geome
         )
     if run.exists() and not run.is_dir():
         raise ValueError(f"{run} is a file, but a run needs a folder. Give another --out.")
-    run.mkdir(parents=True, exist_ok=True)
-    saved.save_scene(run, model, geometry)
-    configuration.write(run / _CONFIG, config)
 
 
 def read_config(run: Path) -> TrainingConfig:

@@ -171,7 +171,16 @@ def test_mistakes_end_with_one_line_that_says_what_to_do(tmp_path, command, opti
 
 @pytest.mark.parametrize(
     "command",
-    ["train", "evaluate", "render", "render_known", "path_trade_off", "trade_off", "recommend"],
+    [
+        "train",
+        "evaluate",
+        "reconstruct",
+        "render",
+        "render_known",
+        "path_trade_off",
+        "trade_off",
+        "recommend",
+    ],
 )
 def test_help_explains_every_option(command):
     result = subprocess.run(

@@ -1,0 +1,141 @@
+"""Goes through the stages of R3F; what is finished is not done again."""
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+from experiments.r3f import geometry_stage, index_stage, records, report, stages
+from experiments.r3f.records import IndexFacts, Reconstruction, ReconstructionConfig
+from refref_jax import configuration
+from refref_jax.data import local_layout, scene_names
+from refref_jax.data.meshes import MeshPart
+from refref_jax.reconstruct.isosurface import import_skimage
+from refref_jax.training import run_lock
+
+INDEX_FILE = "index.json"
+_INDEX_FOLDER = "index"
+
+Say = Callable[[str], None]
+
+
+def reconstruct(
+    scene: Path,
+    out: Path,
+    config: ReconstructionConfig,
+    *,
+    compare: bool,
+    say: Say = print,
+) -> Reconstruction:
+    """Reconstructs a scene's object from images and masks, or goes on with it.
+
+    Args:
+      scene: its folder.
+      out: where to, see `records`.
+      config: what is asked for.
+      compare: whether the report may look at the scene's own meshes.
+      say: is told of every stage.
+
+    Raises:
+      ValueError: if the scene lacks what is needed, if what makes a surface is not installed, if no
+        body fits the masks, or if the folder holds anything else.
+    """
+    import_skimage()
+    local_layout.read_masks(local_layout.read_frames(scene, "train"))
+    asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene), config)
+    found = records.begin(out, asked)
+    with run_lock.hold(out):
+        found = records.read(out)  # another process may have finished it meanwhile
+        if found.geometry is None or not geometry_stage.is_there(out, found.geometry):
+            say(f"geometry: {config.geometry} of the training masks, {config.resolution} cells")
+            facts = geometry_stage.run(scene, out, config)
+            found = dataclasses.replace(found, geometry=facts, index=None, report=None)
+            records.write(out, found)
+        say(_describe_geometry(found))
+        if found.index is None:
+            found = dataclasses.replace(found, index=_index(scene, out, found), report=None)
+            records.write(out, found)
+        with stages.unfinished_file(out / INDEX_FILE) as path:
+            configuration.write(path, found.index)
+        say(describe_index(found.index))
+        if found.report is None or not report.is_there(out):
+            found = dataclasses.replace(found, report=report.run(scene, out, found, compare))
+            records.write(out, found)
+        say(_describe_report(found))
+    return found
+
+
+def read_part(out: Path) -> MeshPart:
+    """Reads the body of a finished reconstruction, with its index of refraction.
+
+    Raises:
+      ValueError: if the folder holds none, or one that is not finished.
+    """
+    found = records.read(out)
+    if found.geometry is None or found.index is None:
+        raise ValueError(
+            f"The reconstruction in {out} is not finished. Repeat the command that began it."
+        )
+    return geometry_stage.read_part(out, found.geometry, index=found.index.index)
+
+
+def fingerprint(scene: Path) -> str:
+    """Returns a hash of what a reconstruction is made from: training images, masks and poses.
+
+    Raises:
+      ValueError: if a file is missing, or the transforms file is broken.
+    """
+    frames = local_layout.read_frames(scene, "train")
+    found = hashlib.sha256(frames.cameras.poses.tobytes())
+    found.update(repr(frames.cameras.focal).encode())
+    for path in (*frames.images, *(frames.masks or ())):
+        found.update(hashlib.sha256(path.read_bytes()).digest())
+    return found.hexdigest()
+
+
+def describe_index(index: IndexFacts) -> str:
+    """Says in one line what the index is."""
+    if index.error is None:
+        return f"index of refraction: {index.index:g} ({index.source})"
+    return f"index of refraction: {index.index:.4f} +- {index.error:.4f} ({index.source})"
+
+
+def _index(scene: Path, out: Path, found: Reconstruction) -> IndexFacts:
+    config = found.config
+    if config.index is not None:
+        return IndexFacts("given", config.index, None, None)
+    folder = out / _INDEX_FOLDER
+    folder.mkdir(exist_ok=True)
+    mesh = geometry_stage.read_mesh(out, found.geometry)
+    estimate = index_stage.run(scene, mesh, folder, seed=config.seed)
+    if not math.isfinite(estimate.deviation):
+        raise ValueError(
+            f"The index of refraction was estimated as {estimate.index:.3f}, but no other would be "
+            f"worse (see {folder}). Give it, as in --ior=1.5."
+        )
+    return IndexFacts("estimated", estimate.index, estimate.deviation, estimate.error)
+
+
+def _describe_geometry(found: Reconstruction) -> str:
+    facts = found.geometry
+    told = [
+        f"geometry: {facts.faces} faces from {facts.masks} masks of {facts.width} x "
+        f"{facts.height}; {', '.join(facts.stages) or 'not refined'}"
+    ]
+    told += [f"  left out {refused}" for refused in facts.refused]
+    return "\n".join(told)
+
+
+def _describe_report(found: Reconstruction) -> str:
+    facts = found.report
+    told = [
+        f"silhouettes: overlap {facts.mean_overlap:.4f}, least {min(facts.overlaps):.4f}, of "
+        f"{len(facts.overlaps)} {facts.split} views"
+    ]
+    if facts.truth is not None:
+        told.append(
+            f"true surface: Chamfer distance {facts.truth.chamfer:.3%} of the diameter, normals "
+            f"{facts.truth.normal_error:.2f} degrees"
+        )
+    return "\n".join(told)

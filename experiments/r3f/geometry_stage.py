@@ -1,0 +1,90 @@
+"""The first stage of R3F: from the masks of the training views to a surface."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+
+from experiments.r3f import stages
+from experiments.r3f.records import GeometryFacts, ReconstructionConfig
+from refref_jax.data import local_layout, meshes, scene_names, stored_normals
+from refref_jax.data.cameras import Cameras
+from refref_jax.data.geometry import shading_normals
+from refref_jax.data.meshes import MeshPart
+from refref_jax.reconstruct import visual_hull
+from refref_jax.reconstruct.grids import Grid
+from refref_jax.reconstruct.isosurface import find_isosurface
+from refref_jax.reconstruct.refinement import Refinement, refine
+from refref_jax.reconstruct.triangles import Mesh, diameter, volume
+
+FOLDER = "geometry"
+
+MATERIAL = "glass"
+"""Ends the name of the mesh, which stands for nothing: what it is made of is its index."""
+
+Masks = Bool[np.ndarray, "views h w"]
+
+
+def _hull(masks: Masks, cameras: Cameras, config: ReconstructionConfig) -> Grid:
+    return visual_hull.carve(masks, cameras, resolution=config.resolution, outliers=config.outliers)
+
+
+GEOMETRIES: dict[str, Callable[[Masks, Cameras, ReconstructionConfig], Grid]] = {"hull": _hull}
+"""Ways from masks to a grid that is negative inside the body, by name."""
+
+
+def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
+    """Reconstructs the surface, and writes it to `{out}/geometry`.
+
+    Raises:
+      ValueError: if there are no masks, or no body fits them.
+    """
+    frames = local_layout.read_frames(scene, "train")
+    masks = local_layout.read_masks(frames)
+    grid = GEOMETRIES[config.geometry](masks, frames.cameras, config)
+    cut = find_isosurface(grid)
+    refined = refine(cut, Refinement())
+    mesh = refined[-1].mesh
+    befores = [cut, *(stage.mesh for stage in refined)]
+    name = f"{_object(scene)}_{MATERIAL}.ply"
+    with stages.unfinished_folder(out / FOLDER) as folder:
+        stored_normals.write_mesh(folder / name, *mesh)
+    return GeometryFacts(
+        mesh=name,
+        masks=len(masks),
+        width=frames.cameras.width,
+        height=frames.cameras.height,
+        vertices=len(mesh.vertices),
+        faces=len(mesh.faces),
+        volume=volume(mesh.vertices, mesh.faces),
+        diameter=diameter(mesh.vertices),
+        stages=tuple(
+            stage.name
+            for before, stage in zip(befores, refined, strict=False)
+            if not np.array_equal(before.vertices, stage.mesh.vertices)
+        ),
+        refused=tuple(f"{stage.name}: {stage.refused}" for stage in refined if stage.refused),
+    )
+
+
+def is_there(out: Path, facts: GeometryFacts) -> bool:
+    """Returns whether the surface is where it was written."""
+    return (out / FOLDER / facts.mesh).is_file()
+
+
+def read_part(out: Path, facts: GeometryFacts, *, index: float) -> MeshPart:
+    """Reads the surface as what light is traced through."""
+    return meshes.read_part(out / FOLDER / facts.mesh, index=index)
+
+
+def read_mesh(out: Path, facts: GeometryFacts) -> Mesh:
+    """Reads the surface; its vertices are in the order of the file's reader."""
+    part = read_part(out, facts, index=1.0)
+    return Mesh(part.vertices, part.faces, shading_normals(part))
+
+
+def _object(scene: Path) -> str:
+    """Returns what the object of a scene is called: the published name's, else the folder's."""
+    name = scene_names.of_folder(scene)
+    return scene_names.parse(name).object if scene_names.is_name(name) else name

@@ -1,0 +1,209 @@
+"""What a reconstruction is asked for, and what each of its stages found: `reconstruction.json`.
+
+    {out}/reconstruction.json        all of it, readable; written anew after every stage
+    {out}/geometry/*.ply             the surface, with its shading normals
+    {out}/index/                     what the estimation of the index keeps
+    {out}/index.json                 the index of refraction
+    {out}/pictures/*.png, report.md  the report
+
+A stage that is `None` is not finished. What is written holds no times, so that a reconstruction
+that was interrupted comes to the same files.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+from experiments.r3f import stages
+from refref_jax import configuration
+
+FILE = "reconstruction.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class ReconstructionConfig:
+    """What is asked for.
+
+    Attributes:
+      geometry: name of the way from masks to a grid, see `geometry_stage.GEOMETRIES`.
+      resolution: cells along the longest edge of the grid.
+      outliers: views that may be wrong.
+      index: the index of refraction, or `None` to estimate it.
+      seed: of everything random.
+    """
+
+    geometry: str
+    resolution: int
+    outliers: int
+    index: float | None
+    seed: int
+
+
+@dataclasses.dataclass(frozen=True)
+class GeometryFacts:
+    """What came of the geometry.
+
+    Attributes:
+      mesh: the file in the folder `geometry`.
+      masks: how many there were.
+      width: of the masks, pixels.
+      height: of the masks, pixels.
+      vertices: of the mesh.
+      faces: of the mesh.
+      volume: inside of it, cubed world units.
+      diameter: diagonal of its box, world units.
+      stages: of the refinement that changed something.
+      refused: those that were left out, and why.
+    """
+
+    mesh: str
+    masks: int
+    width: int
+    height: int
+    vertices: int
+    faces: int
+    volume: float
+    diameter: float
+    stages: tuple[str, ...]
+    refused: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class IndexFacts:
+    """The index of refraction.
+
+    Attributes:
+      source: whether it was given or estimated.
+      index: relative to air.
+      error: one standard deviation, of an estimate.
+      loss: photometric loss of an estimate.
+    """
+
+    source: Literal["given", "estimated"]
+    index: float
+    error: float | None
+    loss: float | None
+
+
+@dataclasses.dataclass(frozen=True)
+class DistanceFacts:
+    """How far the surface is from the true one, see `reconstruct.comparison.Distance`."""
+
+    chamfer: float
+    furthest: float
+    normal_error: float
+    normal_error_99: float
+
+
+@dataclasses.dataclass(frozen=True)
+class ReportFacts:
+    """What the report measured.
+
+    Attributes:
+      split: of the views that it looked at.
+      names: of the views.
+      overlaps: of mask and silhouette in each view: intersection over union.
+      truth: the distance to the true meshes, if there are any that may be looked at.
+      remark: why there is no such distance.
+    """
+
+    split: str
+    names: tuple[str, ...]
+    overlaps: tuple[float, ...]
+    truth: DistanceFacts | None
+    remark: str
+
+    @property
+    def mean_overlap(self) -> float:
+        """Of all views."""
+        return sum(self.overlaps) / len(self.overlaps)
+
+
+@dataclasses.dataclass(frozen=True)
+class Reconstruction:
+    """A reconstruction as far as it has got.
+
+    Attributes:
+      scene: how the scene is called.
+      inputs: fingerprint of the images, masks and poses that it is made from.
+      config: what was asked for.
+      geometry: the first stage.
+      index: the second.
+      report: the third.
+    """
+
+    scene: str
+    inputs: str
+    config: ReconstructionConfig
+    geometry: GeometryFacts | None = None
+    index: IndexFacts | None = None
+    report: ReportFacts | None = None
+
+
+def exists(out: Path) -> bool:
+    """Returns whether a folder holds a reconstruction, finished or not."""
+    return (out / FILE).is_file()
+
+
+def read(out: Path) -> Reconstruction:
+    """Reads how far a reconstruction has got.
+
+    Raises:
+      ValueError: if the folder holds none.
+    """
+    if not exists(out):
+        raise ValueError(
+            f"{out} holds no reconstruction. Give a folder that experiments.reconstruct wrote."
+        )
+    return configuration.read(out / FILE, Reconstruction)
+
+
+def write(out: Path, reconstruction: Reconstruction) -> None:
+    """Writes how far it has got, at once."""
+    with stages.unfinished_file(out / FILE) as path:
+        configuration.write(path, reconstruction)
+
+
+def begin(out: Path, asked: Reconstruction) -> Reconstruction:
+    """Opens a folder for a reconstruction, or finds how far it has got there.
+
+    Raises:
+      ValueError: if the folder holds anything else, or a reconstruction from other images or with
+        other options.
+    """
+    if not exists(out):
+        if out.exists() and not out.is_dir():
+            raise ValueError(f"{out} is a file, but a folder is needed. Give another --out.")
+        if out.is_dir() and any(out.iterdir()):
+            raise ValueError(
+                f"{out} holds something else than a reconstruction. Give a new folder as --out."
+            )
+        out.mkdir(parents=True, exist_ok=True)
+        write(out, asked)
+        return asked
+    begun = read(out)
+    if begun.inputs != asked.inputs:
+        raise ValueError(
+            f"{out} was made from other images, masks or poses, of {begun.scene}. Give the scene "
+            "that it was begun with, or another --out."
+        )
+    if changed := _changed(begun.config, asked.config):
+        raise ValueError(
+            f"{out} was begun with other options: {', '.join(changed)}. Give those again, or "
+            "another --out."
+        )
+    return begun
+
+
+def _changed(begun: ReconstructionConfig, asked: ReconstructionConfig) -> list[str]:
+    """Says which options differ, as they were; an index that is `None` is called estimated."""
+    before, now = dataclasses.asdict(begun), dataclasses.asdict(asked)
+    return [
+        f"{_OPTIONS.get(name, name)} {'estimated' if value is None else value}, not "
+        f"{'estimated' if now[name] is None else now[name]}"
+        for name, value in before.items()
+        if value != now[name]
+    ]
+
+
+_OPTIONS = {"index": "ior"}

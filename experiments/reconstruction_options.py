@@ -1,0 +1,48 @@
+"""The options of a reconstruction that all commands which make one share."""
+
+import math
+
+from absl import flags
+
+from experiments.r3f.geometry_stage import GEOMETRIES
+from experiments.r3f.records import ReconstructionConfig
+
+GEOMETRY = flags.DEFINE_enum(
+    "geometry", "hull", list(GEOMETRIES), "How a body is found from masks: their exact visual hull."
+)
+RESOLUTION = flags.DEFINE_integer(
+    "resolution", 128, "Cells along the longest edge of the grid that holds the body.", 16, 1024
+)
+OUTLIERS = flags.DEFINE_integer(
+    "outliers", 0, "Views whose masks may be wrong, at the cost of accuracy everywhere.", 0
+)
+
+_LARGEST_INDEX = 5.0
+
+
+def chosen(*, index: float | None, seed: int) -> ReconstructionConfig:
+    """Returns what the options ask for.
+
+    Args:
+      index: the index of refraction, or `None` to estimate it.
+      seed: of everything random.
+    """
+    return ReconstructionConfig(GEOMETRY.value, RESOLUTION.value, OUTLIERS.value, index, seed)
+
+
+def parse_index(word: str) -> float:
+    """Returns the index of refraction of `--ior=NUMBER`.
+
+    Raises:
+      ValueError: if it is none that a solid or liquid in air could have.
+    """
+    try:
+        index = float(word)
+    except ValueError:
+        index = math.nan
+    if not 1.0 < index < _LARGEST_INDEX:
+        raise ValueError(
+            f"--ior={word} is no index of refraction of one body in air. Give a number above 1 and "
+            f"below {_LARGEST_INDEX:g}, as in --ior=1.5, or leave it out to have it estimated."
+        )
+    return index

@@ -1,0 +1,45 @@
+"""Begins many trainings in one process, without a step, and prints what each came to.
+
+Reads a JSON list of lists of options; prints a JSON list of records.
+"""
+
+import contextlib
+import io
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+from absl import flags
+
+from experiments import train
+from experiments.r3f import provenance
+from refref_jax.render import saved
+from refref_jax.training import run_folder
+
+
+def _begin(options):
+    for name in flags.FLAGS:
+        flags.FLAGS[name].unparse()
+    flags.FLAGS(["train", *options])
+    run, printed = Path(flags.FLAGS.out), io.StringIO()
+    try:
+        with contextlib.redirect_stdout(printed):
+            train._begin(run)
+    except ValueError as error:
+        return {"error": str(error)}
+    geometry = saved.load_geometry(run)
+    body = provenance.read(run)
+    return {
+        "error": None,
+        "printed": printed.getvalue(),
+        "body": body and vars(body),
+        "indices": run_folder.read_config(run).scene.indices,
+        "faces": len(np.unique(geometry.surfaces.bvh.triangles.reshape(-1, 9), axis=0)),
+        "inside": geometry.interfaces.index_inside.tolist(),
+    }
+
+
+if __name__ == "__main__":
+    train.train = lambda run: True
+    json.dump([_begin(options) for options in json.load(sys.stdin)], sys.stdout)

@@ -1,0 +1,277 @@
+"""The stages of R3F on a small scene, in this process: results, repetition, interruption."""
+
+import dataclasses
+import functools
+import json
+import shutil
+import sys
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from experiments.r3f import chain, geometry_stage, index_stage, records, report, stages
+from experiments.r3f.index_stage import IndexEstimate
+from experiments.r3f.records import ReconstructionConfig
+from refref_jax.data import stored_normals
+from refref_jax.geometry.corner_normals import corner_normals
+from refref_jax.reconstruct.comparison import compare_meshes
+from tests.experiments.r3f.small_scene import RADIUS, without_masks, write_scene
+
+_CONFIG = ReconstructionConfig("hull", 20, 0, 1.5, 0)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_scene(tmp_path_factory.mktemp("scenes") / "cube_smcvx_ball")
+
+
+@pytest.fixture(scope="module")
+def whole(scene, tmp_path_factory):
+    """A reconstruction that nothing interrupted, compared with the truth."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "compare_meshes", functools.partial(compare_meshes, samples=2000))
+        patch.setattr(report, "_HEIGHT", 80)
+        out = tmp_path_factory.mktemp("whole") / "out"
+        _run(scene, out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def blind(scene, tmp_path_factory):
+    """The same, which has not looked at the scene's meshes."""
+    out = tmp_path_factory.mktemp("blind") / "out"
+    _run(scene, out, compare=False)
+    return out
+
+
+def _run(scene, out, config=_CONFIG, *, compare=True):
+    return chain.reconstruct(scene, out, config, compare=compare, say=lambda text: None)
+
+
+def _contents(out):
+    return {p.relative_to(out).as_posix(): p.read_bytes() for p in out.rglob("*") if p.is_file()}
+
+
+def test_a_ball_is_found_from_its_masks(whole):
+    found = records.read(whole)
+    assert found.scene == "cube_smcvx_ball" and found.config == _CONFIG
+    assert found.geometry.mesh == "ball_glass.ply" and found.geometry.masks == 24
+    assert found.geometry.refused == ()
+    assert found.geometry.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.04)
+    assert found.report.split == "test" and len(found.report.overlaps) == 5
+    assert found.report.mean_overlap > 0.97
+    assert found.report.truth.chamfer < 0.005 and found.report.truth.normal_error < 3.0
+    index = json.loads((whole / "index.json").read_text())
+    assert index == {"source": "given", "index": 1.5, "error": None, "loss": None}
+
+
+def test_the_surface_in_the_file_is_what_light_is_traced_through(
+    whole, monkeypatch, scene, tmp_path
+):
+    written = []
+    write = stored_normals.write_mesh
+
+    def keep(path, *mesh):
+        written.append(mesh)
+        write(path, *mesh)
+
+    monkeypatch.setattr(stored_normals, "write_mesh", keep)
+    geometry_stage.run(scene, tmp_path, _CONFIG)
+    (vertices, faces, normals), body = written[0], chain.read_part(whole)
+    np.testing.assert_array_equal(body.vertices[body.faces], vertices[faces])
+    np.testing.assert_array_equal(body.normals, normals)
+    assert body.index == 1.5
+    # Whoever reads positions alone comes to nearly the same normals.
+    by_crease = corner_normals(body.vertices, body.faces)
+    assert np.mean(np.sum(by_crease * normals, axis=-1)) > 0.999
+
+
+def test_pictures_show_something_in_the_size_of_their_views(whole):
+    shapes = {path.name: iio.imread(path).shape for path in (whole / "pictures").iterdir()}
+    assert set(shapes) == {"overlap.png", "iou.png", "surface.png"}
+    for name, (height, width, _) in shapes.items():
+        picture = iio.imread(whole / "pictures" / name)[..., :3].astype(float)
+        assert height > 200 and width > 400, name
+        assert picture.std() > 10.0 and np.mean(picture < 250.0) > 0.05, name
+    # Three views as rows of five pictures, with scales beside them; five thumbnails.
+    height, width, _ = shapes["surface.png"]
+    assert width / height == pytest.approx((5 * 2.4 + 1.5) / (3 * 2.4 + 0.4), rel=0.01)
+    assert shapes["overlap.png"][1] == pytest.approx(4 * 1.25 * 110, abs=2)
+
+
+def test_the_report_names_its_figures_and_finds_its_pictures(whole):
+    text = (whole / "report.md").read_text()
+    found = records.read(whole)
+    for figure in (f"{found.report.mean_overlap:.4f}", f"{found.report.truth.chamfer:.3%}", "1.5"):
+        assert figure in text
+    assert "--reconstruction=" in text and "Compared with ball_glass.ply" in text
+    links = [part.split(")")[0] for part in text.split("](")[1:]]
+    assert len(links) == 4 and all((whole / link).is_file() for link in links)
+
+
+def test_a_finished_reconstruction_is_not_done_again(scene, whole, monkeypatch):
+    before = _contents(whole)
+    for module in (geometry_stage, report):
+        monkeypatch.setattr(module, "run", None)  # would raise
+    _run(scene, whole)
+    assert _contents(whole) == before
+
+
+class _KilledError(BaseException):
+    """Nothing that is caught."""
+
+
+def _killing(function, *, after=False, calls=1):
+    """Returns the function until so many calls were made, of which the last one is killed."""
+    made = []
+
+    def killed(*arguments, **options):
+        made.append(arguments)
+        if len(made) == calls and not after:
+            raise _KilledError
+        result = function(*arguments, **options)
+        if len(made) == calls:
+            raise _KilledError
+        return result
+
+    return killed
+
+
+@pytest.mark.parametrize(
+    ("target", "options"),
+    [
+        ("experiments.r3f.geometry_stage.refine", {}),
+        ("refref_jax.data.stored_normals.write_mesh", {"after": True}),  # before it is renamed
+        ("experiments.r3f.geometry_stage.run", {"after": True}),  # renamed, not recorded
+        ("experiments.r3f.records.write", {"calls": 2, "after": True}),  # between two stages
+        ("experiments.r3f.surface_pictures.draw_surface", {"after": True}),
+        ("experiments.r3f.pages.markdown", {}),
+        ("experiments.r3f.records.write", {"calls": 4}),  # all done, not recorded
+    ],
+)
+def test_whatever_is_killed_comes_to_the_same_files(scene, blind, tmp_path, target, options):
+    out = tmp_path / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        module, _, name = target.rpartition(".")
+        patch.setattr(target, _killing(getattr(sys.modules[module], name), **options))
+        with pytest.raises(_KilledError):
+            _run(scene, out, compare=False)
+    assert _contents(out) != _contents(blind)
+    _run(scene, out, compare=False)
+    assert _contents(out) == _contents(blind)
+
+
+def test_a_stage_whose_files_were_removed_is_done_again(scene, blind, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(blind, out)
+    shutil.rmtree(out / "geometry")
+    shutil.rmtree(out / "pictures")
+    _run(scene, out, compare=False)
+    assert _contents(out) == _contents(blind)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"resolution": 24}, "resolution 20, not 24"),
+        ({"index": None}, "ior 1.5, not estimated"),
+        ({"index": 1.6, "seed": 3}, "ior 1.5, not 1.6, seed 0, not 3"),
+    ],
+)
+def test_other_options_are_refused_by_name(scene, whole, change, told):
+    before = _contents(whole)
+    with pytest.raises(ValueError, match=told):
+        _run(scene, whole, dataclasses.replace(_CONFIG, **change))
+    assert _contents(whole) == before
+
+
+def test_another_scene_is_refused_and_a_moved_one_is_not(scene, whole, tmp_path):
+    moved = tmp_path / "moved"
+    shutil.copytree(scene, moved)
+    _run(moved, whole)
+    changed = next((moved / "mask" / "train").iterdir())
+    iio.imwrite(changed, 255 - iio.imread(changed))
+    with pytest.raises(ValueError, match="other images, masks or poses"):
+        _run(moved, whole)
+
+
+def test_folders_of_other_things_are_left_alone(scene, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="something else than a reconstruction"):
+        _run(scene, tmp_path)
+    with pytest.raises(ValueError, match="is a file"):
+        _run(scene, tmp_path / "notes.txt")
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_what_is_missing_is_told_before_anything_is_written(scene, tmp_path, monkeypatch):
+    bare = tmp_path / "bare"
+    shutil.copytree(scene, bare)
+    with pytest.raises(ValueError, match=r"masks.*mask_file_path"):
+        _run(without_masks(bare), tmp_path / "out")
+    monkeypatch.setitem(sys.modules, "skimage.measure", None)
+    with pytest.raises(ValueError, match=r"pip install 'refref_jax\[r3f\]'"):
+        _run(scene, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("compare", "remark"), [(False, "were not read"), (True, "could not be read")]
+)
+def test_broken_meshes_of_the_scene_harm_nothing(scene, whole, tmp_path, compare, remark):
+    broken = tmp_path / "cube_smcvx_ball"
+    shutil.copytree(scene, broken)
+    (broken / "meshes" / "ball_glass.ply").write_bytes(b"broken")
+    found = _run(broken, tmp_path / "out", compare=compare)
+    assert found.report.truth is None and remark in found.report.remark
+    assert remark in (tmp_path / "out" / "report.md").read_text()
+    ours, theirs = _contents(tmp_path / "out"), _contents(whole)
+    assert ours["geometry/ball_glass.ply"] == theirs["geometry/ball_glass.ply"]
+    height, width, _ = iio.imread(tmp_path / "out" / "pictures" / "surface.png").shape
+    assert width / height == pytest.approx(2 * 2.4 / (3 * 2.4 + 0.4), rel=0.02)
+
+
+def test_an_index_that_is_not_given_is_estimated_once(scene, tmp_path, monkeypatch):
+    asked = []
+
+    def estimate(folder_of_scene, mesh, folder, *, seed):
+        assert folder_of_scene == scene and folder.is_dir() and len(mesh.faces) > 100
+        asked.append(seed)
+        return IndexEstimate(1.48, 0.01, 0.002)
+
+    monkeypatch.setattr(index_stage, "run", estimate)
+    config = dataclasses.replace(_CONFIG, index=None, seed=7)
+    for _ in range(2):
+        found = _run(scene, tmp_path / "out", config, compare=False)
+    assert asked == [7]
+    assert (found.index.source, found.index.index, found.index.error) == ("estimated", 1.48, 0.01)
+    assert "1.4800** ± 0.0100" in (tmp_path / "out" / "report.md").read_text()
+    assert chain.read_part(tmp_path / "out").index == 1.48
+
+
+def test_an_estimate_that_is_no_number_is_no_result(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(index_stage, "run", lambda *_, seed: IndexEstimate(1.5, np.nan, 0.1))
+    with pytest.raises(ValueError, match="--ior"):
+        _run(scene, tmp_path / "out", dataclasses.replace(_CONFIG, index=None))
+    with pytest.raises(ValueError, match="not finished"):
+        chain.read_part(tmp_path / "out")
+    with pytest.raises(ValueError, match="no reconstruction"):
+        chain.read_part(tmp_path)
+
+
+def test_a_target_appears_when_it_is_whole(tmp_path):
+    target = tmp_path / "folder"
+    for content in ("old", "new"):
+        with stages.unfinished_folder(target) as folder:
+            (folder / content).write_text(content)
+            assert not (target / content).exists()
+    assert [path.name for path in target.iterdir()] == ["new"]
+    with pytest.raises(_KilledError), stages.unfinished_folder(target) as folder:
+        (folder / "half").write_text("")
+        raise _KilledError
+    assert [path.name for path in target.iterdir()] == ["new"]
+    with pytest.raises(_KilledError), stages.unfinished_file(tmp_path / "file") as path:
+        path.write_text("half")
+        raise _KilledError
+    assert not (tmp_path / "file").exists()

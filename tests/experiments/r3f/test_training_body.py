@@ -1,0 +1,152 @@
+"""Training with a reconstructed body: which options ask for it, and that it never reads meshes."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from experiments.r3f import chain, records
+from experiments.r3f.records import ReconstructionConfig
+from tests import code_generator
+from tests.experiments.command import ROOT, run_command
+from tests.experiments.r3f.small_scene import write_scene
+
+_GRID = "--resolution=20"
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A scene whose mesh can not be read."""
+    scene = write_scene(tmp_path_factory.mktemp("scenes") / "cube_smcvx_ball")
+    (scene / "meshes" / "ball_glass.ply").write_bytes(b"broken")
+    return scene
+
+
+@pytest.fixture(scope="module")
+def made(scene, tmp_path_factory):
+    """A reconstruction of it."""
+    out = tmp_path_factory.mktemp("made") / "r3f"
+    config = ReconstructionConfig("hull", 20, 0, 1.45, 0)
+    chain.reconstruct(scene, out, config, compare=False, say=lambda text: None)
+    return out
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Where trainings are begun."""
+    runs = tmp_path_factory.mktemp("runs")
+    (runs / "half" / "r3f").mkdir(parents=True)
+    (runs / "killed" / "r3f").mkdir(parents=True)
+    return runs
+
+
+@pytest.fixture(scope="module")
+def found(scene, made, runs):
+    """What beginning each training came to, by name; all in one process, in this order."""
+    r3f, given = ("--method=r3f", _GRID, "--ior=1.5"), f"--reconstruction={made}"
+    cases = {
+        "oracle": (),
+        "r3f": r3f,
+        "given": (given,),
+        "other index": (given, "--method=r3f", "--ior=1.7"),
+        "half": r3f,
+        "killed": (*r3f, "--resume"),
+        "named index": ("--method=r3f", "--ior=glass=1.5"),
+        "two indices": (given, "--ior=1.5", "--ior=1.6"),
+        "no index": ("--method=r3f", "--ior=15"),
+        "no number": ("--method=r3f", "--ior=glass"),
+        "oracle too": (given, "--method=oracle"),
+        "no effect": (given, _GRID),
+        "no effect of oracle": (_GRID,),
+        "straight": (*r3f, "--paths=straight"),
+        "nothing there": ("--reconstruction=nowhere",),
+    }
+    sent = [
+        [f"--out={runs / name}", f"--scene={scene}", *options] for name, options in cases.items()
+    ]
+    again = {
+        "r3f begun anew": ("r3f", f"--scene={scene}", *r3f),
+        "r3f resumed": ("r3f", f"--scene={scene}", *r3f, "--resume"),
+        "r3f resumed alone": ("r3f", "--resume"),
+        "r3f with another grid": ("r3f", f"--scene={scene}", *r3f[:2], "--ior=1.6", "--resume"),
+        "r3f by name alone": ("r3f", "--resume", "--method=r3f"),
+        "r3f with a given one": ("r3f", f"--scene={scene}", given, "--resume"),
+    }
+    sent += [[f"--out={runs / run}", *options] for run, *options in again.values()]
+    result = subprocess.run(
+        [sys.executable, "-m", "tests.experiments.r3f.print_beginnings"],
+        cwd=ROOT,
+        env=code_generator.of_users(),
+        input=json.dumps(sent),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    return dict(zip([*cases, *again], json.loads(result.stdout), strict=True))
+
+
+def test_the_broken_mesh_stops_the_oracle_alone(found):
+    assert "ball_glass.ply can not be read" in found["oracle"]["error"]
+    for name in ("r3f", "killed", "given", "other index", "r3f resumed", "r3f resumed alone"):
+        assert found[name]["error"] is None, name
+
+
+@pytest.mark.parametrize(("name", "index"), [("r3f", 1.5), ("given", 1.45), ("other index", 1.7)])
+def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
+    assert found[name]["body"]["index"] == index
+    assert found[name]["indices"] == [["ball_glass", index]]
+    assert found[name]["inside"] == pytest.approx([index])
+    assert found[name]["faces"] == records.read(made).geometry.faces
+    assert "1 convex body" in found[name]["printed"]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("half", "Continue with --resume"),
+        ("named index", "--ior=glass=1.5, but there is one reconstructed body"),
+        ("two indices", "Give its index alone, once"),
+        ("no index", "--ior=15 is no index of refraction"),
+        ("no number", "--ior=glass is no index of refraction"),
+        ("oracle too", "--method=oracle takes the scene's own meshes"),
+        ("no effect", "--resolution would have no effect"),
+        ("no effect of oracle", "add --method=r3f"),
+        ("straight", "--paths=straight knows of no objects"),
+        ("nothing there", "nowhere holds no reconstruction"),
+        ("r3f begun anew", "holds a run already"),
+        ("r3f with another grid", "ior 1.5, not 1.6"),
+        ("r3f by name alone", "--method would have no effect"),
+        ("r3f with a given one", "begun with other options"),
+    ],
+)
+def test_mistakes_are_told(found, name, message):
+    assert message in found[name]["error"]
+
+
+def test_what_is_reconstructed_for_a_run_is_kept_and_not_made_again(found, runs, made):
+    for name in ("r3f", "killed"):
+        assert found[name]["body"]["reconstruction"] == str(runs / name / "r3f")
+        mesh = "geometry/ball_glass.ply"  # what two processes made is the same to the bit
+        assert (runs / name / "r3f" / mesh).read_bytes() == (made / mesh).read_bytes()
+        assert "hull of the training masks" in found[name]["printed"]
+    assert "hull of the training masks" not in found["r3f resumed"]["printed"]
+    assert found["given"]["body"]["reconstruction"] == str(made)
+    for name in ("straight", "no index", "nothing there", "oracle"):
+        assert not (runs / name).exists(), name
+
+
+@pytest.mark.slow
+def test_a_reconstructed_body_is_trained_with_and_rendered(scene, tmp_path):
+    run = tmp_path / "run"
+    options = [f"--scene={scene}", "--method=r3f", "--ior=1.45", _GRID, f"--out={run}"]
+    options += ["--steps=2", "--batch=64", "--interior=clear", "--paths=paper"]
+    run_command("train", *options)
+    again = run_command("train", *options, "--resume")
+    assert "trained already" in again.stdout
+    run_command("evaluate", f"--run={run}", "--limit=1")
+    metrics = json.loads((run / "eval" / "test" / "metrics.json").read_text())
+    assert metrics["method"] == "r3f" and metrics["results"]["psnr_masked"] is not None
+    run_command("render", f"--run={run}", "--frames=1", "--size=16")
+    assert (run / "render" / "orbit" / "rgb" / "r_000.png").is_file()
