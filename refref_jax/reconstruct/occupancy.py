@@ -1,9 +1,9 @@
 """A body from masks by an occupancy field that is trained on their silhouettes (host).
 
 The paper's way (UNISURF on masks), for which `visual_hull` is the exact and faster one. They differ
-in whom they believe. The hull believes every mask, so that the one that errs most inwards decides;
-the field weighs them. Between tangent cones, where the hull bulges, the smoothness of the field's
-normals decides. The hull takes seconds, keeps flat faces flat, and is the same every time.
+in what lies between tangent cones: there the hull bulges, and here the smoothness of the normals
+decides, so that round bodies come out rounder and flat faces less flat. Masks that err harm both: a
+ray that a mask says is empty empties all of itself in either.
 """
 
 from collections.abc import Callable
