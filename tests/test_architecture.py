@@ -35,6 +35,7 @@ _MAY_JIT = {
     "render/known.py",
     "render/first_surface.py",
     "training/steps.py",
+    "reconstruct/occupancy_training.py",
     "geometry/native_loop.py",
     "reconstruct/photometry.py",
 }

@@ -116,7 +116,8 @@ def read_masks(frames: Frames) -> Bool[np.ndarray, "frames h w"]:
     if frames.masks is None:
         raise SceneError(
             f"The frames of {frames.images[0].parent} have no masks. Add mask_file_path to each "
-            "frame of the transforms file."
+            "frame of the transforms file; docs/masks.md tells how to take over the masks of a "
+            "segmentation model."
         )
     return np.stack(list(_masks(frames)))
 

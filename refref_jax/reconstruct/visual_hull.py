@@ -81,7 +81,7 @@ def carve(
         )
     field = hull_field(masks, cameras, outliers=outliers, tolerance=tolerance, blur=blur)
     if box is None:
-        box = _find_box(field, masks, cameras)
+        box = find_box(field, masks, cameras)
     spacing = float(np.max(box.high - box.low)) / (resolution - 2 * _RIM)
     wide = Box(box.low - _RIM * spacing, box.high + _RIM * spacing)
     grid = sample(field, wide, spacing=spacing)
@@ -117,6 +117,28 @@ def hull_field(
     return field
 
 
+def find_box(field: Field, masks: Bool[np.ndarray, "views h w"], cameras: Cameras) -> Box:
+    """Returns a box around the body, which may touch the cube of `REACH` that is looked at.
+
+    Args:
+      field: the hull's, from `hull_field`.
+      masks: of which it is the hull.
+      cameras: of the masks.
+
+    Raises:
+      ReconstructionError: if nothing is left.
+    """
+    ends = np.full(3, REACH)
+    grid = sample(field, Box(-ends, ends), spacing=2.0 * REACH / _SEARCH)
+    # Within half a cell's diagonal of the surface, so that a thin body is not overlooked.
+    inside = np.argwhere(grid.values < 0.87 * grid.spacing)
+    if len(inside) == 0:
+        raise ReconstructionError(_explanation(masks, cameras, Box(-ends, ends)))
+    low = grid.low + grid.spacing * (inside.min(axis=0) - _MARGIN)
+    high = grid.low + grid.spacing * (inside.max(axis=0) + _MARGIN)
+    return Box(np.maximum(low, -ends), np.minimum(high, ends))
+
+
 def view_values(
     image: Float[np.ndarray, "h w"],
     pose: Float[np.ndarray, "3 4"],
@@ -138,19 +160,6 @@ def view_values(
     else:
         values[seen] = -_FAR
     return values
-
-
-def _find_box(field: Field, masks: np.ndarray, cameras: Cameras) -> Box:
-    """Returns a box around the body, which may touch the cube that is looked at."""
-    ends = np.full(3, REACH)
-    grid = sample(field, Box(-ends, ends), spacing=2.0 * REACH / _SEARCH)
-    # Within half a cell's diagonal of the surface, so that a thin body is not overlooked.
-    inside = np.argwhere(grid.values < 0.87 * grid.spacing)
-    if len(inside) == 0:
-        raise ReconstructionError(_explanation(masks, cameras, Box(-ends, ends)))
-    low = grid.low + grid.spacing * (inside.min(axis=0) - _MARGIN)
-    high = grid.low + grid.spacing * (inside.max(axis=0) + _MARGIN)
-    return Box(np.maximum(low, -ends), np.minimum(high, ends))
 
 
 def _explanation(masks: np.ndarray, cameras: Cameras, box: Box) -> str:

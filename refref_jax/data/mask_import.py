@@ -1,0 +1,92 @@
+"""Gives a scene without masks the masks of a segmentation model, in a copy (NumPy only).
+
+Which model is the user's affair: it is asked image by image, and answers with the pixels that show
+the object. `docs/masks.md` has examples.
+"""
+
+import json
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+from jaxtyping import Bool
+
+from refref_jax.data import files, local_layout, transforms
+from refref_jax.data.errors import SceneError
+
+Segment = Callable[[Path], Bool[np.ndarray, "h w"]]
+"""Takes the path of an image; returns which of its pixels show the object."""
+
+
+def add_masks(scene: Path, out: Path, segment: Segment) -> int:
+    """Writes a copy of a scene in which every frame of every split has a mask.
+
+    Masks go to `mask/` under the images' names, as the data set has them. The scene itself stays as
+    it is; masks that it has already are replaced in the copy. The copy appears when it is whole.
+
+    Args:
+      scene: a folder in the local layout.
+      out: the copy; must not exist, nor lie within the scene.
+      segment: is called once for each image.
+
+    Returns:
+      The number of masks.
+
+    Raises:
+      SceneError: if the copy exists, the scene is broken, or a mask is not a boolean one of its
+        image's size that marks something.
+    """
+    transforms.read_json(scene / "transforms_train.json")
+    if out.exists():
+        raise SceneError(f"{out} exists, and nothing is overwritten. Give a new folder.")
+    if scene.resolve() in out.resolve().parents:
+        raise SceneError(f"{out} lies within the scene {scene}. Give a folder beside it.")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as beside:
+        draft = Path(beside) / out.name
+        shutil.copytree(scene, draft)
+        paths = (draft / f"transforms_{split}.json" for split in local_layout.SPLITS)
+        count = sum(_add_to_split(scene, path, segment) for path in paths if path.is_file())
+        draft.rename(out)
+    return count
+
+
+def _add_to_split(scene: Path, path: Path, segment: Segment) -> int:
+    """Writes the masks of one split of the copy, and names them in its transforms file."""
+    content = transforms.read_json(path)
+    frames = transforms.get(content, "frames", path)
+    for frame in frames:
+        stem = transforms.get_text(frame, "file_path", path)
+        if Path(stem).is_absolute() or ".." in Path(stem).parts:
+            raise SceneError(
+                f"{path} names the image {stem}, which is not in the scene's folder. Move the "
+                "images there, and name them from there."
+            )
+        mask = _mask_of(scene / f"{stem}.png", segment)
+        name = Path("mask") / f"{stem}.png"
+        (path.parent / name).parent.mkdir(parents=True, exist_ok=True)
+        pixels = np.where(mask, 255, 0).astype(np.uint8)
+        iio.imwrite(path.parent / name, pixels, plugin="pillow", extension=".png")
+        frame["mask_file_path"] = f"./{name.as_posix()}"
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    return len(frames)
+
+
+def _mask_of(image: Path, segment: Segment) -> Bool[np.ndarray, "h w"]:
+    expected = files.read_rgb(image).shape[:2]
+    mask = np.asarray(segment(image))
+    if mask.dtype != bool or mask.shape != expected:
+        raise SceneError(
+            f"The mask of {image} is an array {mask.dtype}{list(mask.shape)}, not "
+            f"bool{list(expected)}. Compare the model's output with a threshold, and resize it to "
+            "the image without blending."
+        )
+    if not mask.any():
+        raise SceneError(
+            f"The mask of {image} marks nothing. Mark the object there by hand, or take the frame "
+            "out of the transforms file."
+        )
+    return mask

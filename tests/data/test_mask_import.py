@@ -1,0 +1,107 @@
+import json
+
+import numpy as np
+import pytest
+
+from refref_jax.data import files, local_layout
+from refref_jax.data.errors import SceneError
+from refref_jax.data.mask_import import add_masks
+from tests.data.small_scenes import HEIGHT, WIDTH, edit_transforms, write_scene
+
+
+def _without_masks(transforms):
+    for record in transforms["frames"]:
+        del record["mask_file_path"]
+
+
+@pytest.fixture
+def scene(tmp_path):
+    scene = write_scene(tmp_path / "own")
+    edit_transforms(scene, _without_masks)
+    return scene
+
+
+def _one_pixel(image):
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[3, int(image.stem[-1])] = True
+    return mask
+
+
+def _contents(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*.*")}
+
+
+def test_the_copy_has_the_masks_and_all_else(scene, tmp_path):
+    before = _contents(scene)
+    assert add_masks(scene, tmp_path / "new" / "copy", _one_pixel) == 2
+    frames = local_layout.read_frames(tmp_path / "new" / "copy", "train")
+    expected = [_one_pixel(image) for image in frames.images]
+    np.testing.assert_array_equal(local_layout.read_masks(frames), expected)
+    assert _contents(scene) == before
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["copy"]
+    np.testing.assert_array_equal(
+        local_layout.read_images(frames),
+        local_layout.read_images(local_layout.read_frames(scene, "train")),
+    )
+
+
+def test_the_model_sees_each_image_once(scene, tmp_path):
+    seen = []
+    add_masks(scene, tmp_path / "copy", lambda image: seen.append(image) or _one_pixel(image))
+    assert seen == [scene / "train" / "r_000.png", scene / "train" / "r_001.png"]
+
+
+def test_masks_of_before_are_replaced_in_the_copy_alone(tmp_path):
+    scene = write_scene(tmp_path / "own")
+    old = local_layout.read_masks(local_layout.read_frames(scene, "train"))
+    add_masks(scene, tmp_path / "copy", _one_pixel)
+    copied = local_layout.read_masks(local_layout.read_frames(tmp_path / "copy", "train"))
+    kept = local_layout.read_masks(local_layout.read_frames(scene, "train"))
+    np.testing.assert_array_equal(kept, old)
+    assert copied[0, 3, 0] and not copied[0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (np.zeros((HEIGHT, WIDTH), bool), "marks nothing"),
+        (np.ones((HEIGHT, WIDTH)), "Compare the model's output with a threshold"),
+        (np.ones((WIDTH, HEIGHT), bool), "resize it to the image"),
+    ],
+)
+def test_masks_that_will_not_do_leave_nothing_behind(scene, tmp_path, answer, message):
+    with pytest.raises(SceneError, match=message):
+        add_masks(scene, tmp_path / "copy", lambda image: answer)
+    assert [path.name for path in tmp_path.iterdir()] == ["own"]
+
+
+def test_nothing_is_overwritten(scene, tmp_path):
+    (tmp_path / "copy").mkdir()
+    with pytest.raises(SceneError, match=r"nothing is overwritten\. Give a new folder"):
+        add_masks(scene, tmp_path / "copy", _one_pixel)
+    with pytest.raises(SceneError, match="lies within the scene"):
+        add_masks(scene, scene / "copy", _one_pixel)
+    with pytest.raises(SceneError, match=r"transforms_train\.json does not exist"):
+        add_masks(tmp_path / "copy", tmp_path / "other", _one_pixel)
+
+
+@pytest.mark.parametrize("name", ["../elsewhere/r_000", "/elsewhere/r_000"])
+def test_images_outside_of_the_scene_are_refused(scene, tmp_path, name):
+    edit_transforms(scene, lambda content: content["frames"][0].update(file_path=name))
+    with pytest.raises(SceneError, match="is not in the scene's folder"):
+        add_masks(scene, tmp_path / "copy", _one_pixel)
+
+
+def test_a_scene_without_masks_says_where_to_get_them(scene):
+    with pytest.raises(SceneError, match=r"docs/masks\.md"):
+        local_layout.read_masks(local_layout.read_frames(scene, "train"))
+
+
+def test_the_example_of_the_document_names_files_as_they_are_read(scene, tmp_path):
+    add_masks(scene, tmp_path / "copy", _one_pixel)
+    record = json.loads((tmp_path / "copy" / "transforms_train.json").read_text())["frames"][0]
+    assert (record["file_path"], record["mask_file_path"]) == (
+        "./train/r_000",
+        "./mask/train/r_000.png",
+    )
+    assert files.read_mask(tmp_path / "copy" / record["mask_file_path"]).sum() == 1
