@@ -1,10 +1,11 @@
 """From a mesh cut out of a grid to one that light can be traced through (NumPy only).
 
 The stages, none of which needs a hand: all pieces but the largest go, unless they are large;
-ripples are smoothed; a body that is convex but for noise becomes so; edges are rounded; the surface
-is meshed anew from its signed distances. All lengths are in world units, so that a finer grid
-changes nothing but detail. A stage that would empty the body, turn it inside out, tear it or change
-its volume much is left out.
+ripples are smoothed; a body that is convex but for noise becomes so; a convex body that few corners
+describe is fitted to the outlines of the masks; edges are rounded; the surface is meshed anew from
+its signed distances. All lengths are in world units, so that a finer grid changes nothing but
+detail. A stage that would empty the body, turn it inside out, tear it or change its volume much is
+left out.
 
 The paper's recipe, by hand (arXiv 2505.05848, section on R3F): convex hull if no vertex lies
 further from it than an unstated threshold; MeshLab's removal of pieces below 90 % of the diameter,
@@ -20,10 +21,12 @@ from typing import NamedTuple
 import numpy as np
 
 from refref_jax.reconstruct.closest import signed_distance
-from refref_jax.reconstruct.convex import depth_below_hull, from_tangents
+from refref_jax.reconstruct.convex import depth_below_hull, from_tangents, is_convex
+from refref_jax.reconstruct.corners import MOST, fit_corners
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.grids import Box, sample
 from refref_jax.reconstruct.isosurface import find_isosurface
+from refref_jax.reconstruct.silhouettes import Views, check_masks
 from refref_jax.reconstruct.smoothing import CREASE, denoise, diffuse
 from refref_jax.reconstruct.triangles import (
     Mesh,
@@ -55,6 +58,7 @@ class Refinement:
       crease: angle between neighbouring faces at which it stops, radians.
       smoothing: diffusion length of the vertices, which rounds creases too, world units.
       convex_depth: a body is made convex if no vertex lies deeper below its hull, world units.
+      corners: as many as a convex body may have to be fitted to masks; 0 leaves the stage out.
       rounding: radius to which convex edges are rounded, world units.
       spacing: of the grid of signed distances from which the surface is meshed anew, world units.
       volume_change: share of the volume that any stage may change.
@@ -65,13 +69,19 @@ class Refinement:
     crease: float = CREASE
     smoothing: float = 0.0
     convex_depth: float = 0.04
+    corners: int = MOST
     rounding: float = 0.0
     spacing: float = 0.0
     volume_change: float = 0.05
 
 
 PAPER = Refinement(
-    denoising=0.0, smoothing=0.3, convex_depth=0.02, rounding=0.015, spacing=2.0 * 2.1 / 2**8
+    denoising=0.0,
+    smoothing=0.3,
+    convex_depth=0.02,
+    corners=0,
+    rounding=0.015,
+    spacing=2.0 * 2.1 / 2**8,
 )
 """The paper's recipe in lengths, without its shrinking: 100 steps of edges of 0.03 diffuse 0.3."""
 
@@ -90,24 +100,23 @@ class Stage(NamedTuple):
     refused: str
 
 
-def refine(mesh: Mesh, settings: Refinement) -> tuple[Stage, ...]:
+def refine(mesh: Mesh, settings: Refinement, *, views: Views | None = None) -> tuple[Stage, ...]:
     """Returns the mesh after each stage that the settings ask for; the last one is the result.
 
     Args:
       mesh: closed and outward, such as `isosurface.find_isosurface` returns.
       settings: see `Refinement`.
+      views: masks from which the mesh was made; without them no corners are fitted.
 
     Raises:
-      ReconstructionError: if the mesh is empty, open or turned inwards; or if it is to be meshed
-        anew and scikit-image is not installed.
+      ReconstructionError: if the mesh is empty, open or turned inwards; if it is to be meshed anew
+        and scikit-image is not installed; or if masks and cameras do not fit each other.
     """
     _check(mesh)
-    stages = [Stage("pieces", keep_pieces(mesh, smallest=settings.smallest_piece), "")]
-    for name, change in _changes(settings).items():
-        before = stages[-1].mesh
-        after = change(before)
-        refused = _objection(before, after, settings.volume_change)
-        stages.append(Stage(name, before if refused else after, refused))
+    first = keep_pieces(mesh, smallest=settings.smallest_piece)
+    stages = [Stage("pieces", first, "")]
+    for name, change in _changes(settings, first, views).items():
+        stages.append(_stage(name, stages[-1].mesh, change, settings.volume_change))
     return tuple(stages)
 
 
@@ -164,8 +173,10 @@ def remesh(mesh: Mesh, spacing: float, *, level: float = 0.0) -> Mesh:
     return find_isosurface(grid, level=level)
 
 
-def _changes(settings: Refinement) -> dict[str, Callable[[Mesh], Mesh]]:
-    """Returns the stages after the first, by name, in their order."""
+def _changes(
+    settings: Refinement, first: Mesh, views: Views | None
+) -> dict[str, Callable[[Mesh], Mesh]]:
+    """Returns the stages after the first, whose mesh is given, by name, in their order."""
     changes: dict[str, Callable[[Mesh], Mesh]] = {}
     if settings.denoising > 0.0:
         changes["denoised"] = lambda mesh: denoise(
@@ -175,6 +186,12 @@ def _changes(settings: Refinement) -> dict[str, Callable[[Mesh], Mesh]]:
         changes["smoothed"] = lambda mesh: diffuse(mesh, settings.smoothing)
     if settings.convex_depth > 0.0:
         changes["convex"] = lambda mesh: _made_convex(mesh, settings)
+    if settings.corners > 0 and views is not None:
+        check_masks(views.masks, views.cameras)
+        # Smoothing moves outlines, so corners are looked for on what was there before it.
+        changes["corners"] = lambda mesh: (
+            fit_corners(mesh, first, views, most=settings.corners) if is_convex(mesh) else mesh
+        )
     if settings.rounding > 0.0:
         changes["rounded"] = lambda mesh: _attempt(
             lambda: round_edges(mesh, settings.rounding), mesh
@@ -182,6 +199,16 @@ def _changes(settings: Refinement) -> dict[str, Callable[[Mesh], Mesh]]:
     if settings.spacing > 0.0:
         changes["remeshed"] = lambda mesh: _attempt(lambda: remesh(mesh, settings.spacing), mesh)
     return changes
+
+
+def _stage(name: str, before: Mesh, change: Callable[[Mesh], Mesh], most: float) -> Stage:
+    """Returns what a change makes of a mesh, or the mesh and why it would not do."""
+    try:
+        after = change(before)
+    except ReconstructionError as error:
+        return Stage(name, before, str(error))
+    refused = _objection(before, after, most)
+    return Stage(name, before if refused else after, refused)
 
 
 def _made_convex(mesh: Mesh, settings: Refinement) -> Mesh:
