@@ -13,7 +13,6 @@ which can remove the body; in Blender a bevel of 0.015, 100 smoothings of factor
 the body by a length that depends on its edges, and a remesh at octree depth 8.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -28,14 +27,13 @@ from refref_jax.reconstruct.grids import Box, sample
 from refref_jax.reconstruct.isosurface import find_isosurface
 from refref_jax.reconstruct.silhouettes import Views, check_masks
 from refref_jax.reconstruct.smoothing import CREASE, denoise, diffuse
+from refref_jax.reconstruct.soundness import check_body, objection
 from refref_jax.reconstruct.triangles import (
     Mesh,
     diameter,
     face_vectors,
-    is_closed,
     keep_faces,
     pieces,
-    volume,
 )
 
 # Spacings around a mesh that is sampled.
@@ -43,6 +41,10 @@ _RIM = 3
 
 # As exact distances ask for, with the neighbours that a gradient looks at.
 _NEAR = 1.1
+
+# How many times more the volume may change where outlines are held to the masks: that of a hull of
+# few views is far too large.
+_HELD = 4.0
 
 # A mesh is sampled at most this finely, in spacings along its diameter.
 _FINEST = 400
@@ -61,7 +63,8 @@ class Refinement:
       corners: as many as a convex body may have to be fitted to masks; 0 leaves the stage out.
       rounding: radius to which convex edges are rounded, world units.
       spacing: of the grid of signed distances from which the surface is meshed anew, world units.
-      volume_change: share of the volume that any stage may change.
+      volume_change: share of the volume that any stage may change; four times as much where
+        corners are fitted to masks.
     """
 
     smallest_piece: float = 0.02
@@ -112,11 +115,12 @@ def refine(mesh: Mesh, settings: Refinement, *, views: Views | None = None) -> t
       ReconstructionError: if the mesh is empty, open or turned inwards; if it is to be meshed anew
         and scikit-image is not installed; or if masks and cameras do not fit each other.
     """
-    _check(mesh)
+    check_body(mesh)
     first = keep_pieces(mesh, smallest=settings.smallest_piece)
     stages = [Stage("pieces", first, "")]
     for name, change in _changes(settings, first, views).items():
-        stages.append(_stage(name, stages[-1].mesh, change, settings.volume_change))
+        most = settings.volume_change * (_HELD if name == "corners" else 1.0)
+        stages.append(_stage(name, stages[-1].mesh, change, most))
     return tuple(stages)
 
 
@@ -207,7 +211,7 @@ def _stage(name: str, before: Mesh, change: Callable[[Mesh], Mesh], most: float)
         after = change(before)
     except ReconstructionError as error:
         return Stage(name, before, str(error))
-    refused = _objection(before, after, most)
+    refused = objection(before, after, most)
     return Stage(name, before if refused else after, refused)
 
 
@@ -224,34 +228,3 @@ def _attempt(change: Callable[[], Mesh], mesh: Mesh) -> Mesh:
         return change()
     except ReconstructionError:
         return Mesh(mesh.vertices[:0], mesh.faces[:0], mesh.normals[:0])
-
-
-def _objection(before: Mesh, after: Mesh, most: float) -> str:
-    """Returns why a stage's mesh is not taken, or nothing."""
-    if len(after.faces) == 0:
-        return "nothing would be left"
-    if not is_closed(after.faces) or not np.all(np.isfinite(after.vertices)):
-        return "the surface would be torn"
-    old, new = (volume(mesh.vertices, mesh.faces) for mesh in (before, after))
-    if not math.isclose(new, old, rel_tol=most):
-        return f"the volume would go from {old:.4g} to {new:.4g}"
-    if _count_pieces(after) > _count_pieces(before):
-        return "the body would fall apart"
-    return ""
-
-
-def _count_pieces(mesh: Mesh) -> int:
-    return len(np.unique(pieces(mesh.faces, len(mesh.vertices))[mesh.faces[:, 0]]))
-
-
-def _check(mesh: Mesh) -> None:
-    if len(mesh.faces) == 0:
-        raise ReconstructionError("The mesh is empty. Check the masks and the level of the grid.")
-    if not is_closed(mesh.faces):
-        raise ReconstructionError(
-            "The mesh is not closed. Cut it from a grid whose border is outside the body."
-        )
-    if volume(mesh.vertices, mesh.faces) <= 0.0:
-        raise ReconstructionError(
-            "The mesh is turned inwards. Exchange two corners of every face, or negate the grid."
-        )
