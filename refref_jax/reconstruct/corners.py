@@ -27,6 +27,7 @@ from refref_jax.reconstruct.convex import hull, of_points, weigh_facets
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.grids import Points, Values
 from refref_jax.reconstruct.outlines import (
+    Corners,
     Pixels,
     Samples,
     along_edges,
@@ -39,13 +40,14 @@ from refref_jax.reconstruct.outlines import (
 from refref_jax.reconstruct.silhouettes import BLUR, Views, signed_distances
 from refref_jax.reconstruct.triangles import Mesh
 
+Image = Float[np.ndarray, "h w"]
+
 MOST = 128
 """Corners of the body that is looked for."""
 
-# Pixels by which a point must stick out to become a corner, one round each; and the share of it by
-# which a corner must, to stay one.
+# Pixels by which a point must stick out to become a corner, and a corner to stay one, in one round
+# each.
 _TOLERANCES = (2.0, 1.0, 0.5, 0.3, 0.15)
-_KEPT = 1.0
 
 # The view that says how far a point sticks out, counted from the one that says most: so many less
 # one may be wrong.
@@ -54,8 +56,8 @@ _RANK = 3
 # Directions whose furthest points are the first corners.
 _FIRST = 12
 
-# Least squares: steps in each round, the longest one in pixels, that after which it ends, and how
-# much what no outline tells is held, as a share of what is told on the average.
+# Least squares: steps in each round, the longest one in pixels, that after which it ends, and the
+# share by which every coordinate is held, as if outlines told so much more of where it is.
 _STEPS = 12
 _LONGEST = 4.0
 _SHORTEST = 0.01
@@ -104,18 +106,23 @@ def fit_corners(mesh: Mesh, candidates: Mesh, views: Views, *, most: int = MOST)
     return body
 
 
-def _find(points: Points, views: Views, most: int) -> Points:
+def _find(points: Points, views: Views, most: int) -> Corners:
     """Returns the corners by the finest tolerance that asks for no more than so many."""
     images = [signed_distances(mask).astype(np.float32) for mask in views.masks]
     points = points[_on_outlines(points, views)]
     directions = np.random.default_rng(0).normal(size=(_FIRST, 3))
     corners = points[np.unique(np.argmax(points @ directions.T, axis=0))]
+    settled = False
     for tolerance in _TOLERANCES:
         more = _insert(corners, points, views, tolerance, most)
         if len(more) > most:
             break
-        moved = _move(more, views, images)
-        corners = _move(_prune(moved, views, _KEPT * tolerance), views, images)
+        if not settled or len(more) > len(corners):
+            more = _move(more, views, images)
+        corners = _prune(more, views, tolerance)
+        if len(corners) < len(more):
+            corners = _move(corners, views, images)
+        settled = True
     return corners
 
 
@@ -142,7 +149,9 @@ def _on_outlines(points: Points, views: Views) -> np.ndarray:
     return np.unique(np.concatenate([polygon(pixels) for pixels in _pixels(points, views)]))
 
 
-def _insert(corners: Points, points: Points, views: Views, tolerance: float, most: int) -> Points:
+def _insert(
+    corners: Corners, points: Points, views: Views, tolerance: float, most: int
+) -> Float[np.ndarray, "more 3"]:
     """Returns corners and the points that stick out of their hull, but one more than `most`."""
     images = _pixels(points, views)
     out = np.zeros((len(images), len(points)))
@@ -160,7 +169,7 @@ def _insert(corners: Points, points: Points, views: Views, tolerance: float, mos
     return corners
 
 
-def _prune(corners: Points, views: Views, tolerance: float) -> Points:
+def _prune(corners: Corners, views: Views, tolerance: float) -> Float[np.ndarray, "fewer 3"]:
     """Returns corners without those that stick out by less than a tolerance, one after another.
 
     Of two that are nearer to each other than the blur the middle is left.
@@ -185,7 +194,7 @@ def _prune(corners: Points, views: Views, tolerance: float) -> Points:
     return corners
 
 
-def _move(corners: Points, views: Views, images: Sequence[Float[np.ndarray, "h w"]]) -> Points:
+def _move(corners: Corners, views: Views, images: Sequence[Image]) -> Corners:
     """Returns corners moved until their hull's outlines are those of the masks (Gauss-Newton)."""
     pixel = _pixel(corners, views)
     longest = _LONGEST * pixel
@@ -205,9 +214,7 @@ def _move(corners: Points, views: Views, images: Sequence[Float[np.ndarray, "h w
     return corners
 
 
-def _equations(
-    corners: Points, views: Views, images: Sequence[Float[np.ndarray, "h w"]]
-) -> tuple[Values, csr_array]:
+def _equations(corners: Corners, views: Views, images: Sequence[Image]) -> tuple[Values, csr_array]:
     """Returns the distances of points on the outlines from the masks' in pixels, and their slopes.
 
     The slopes are those by all coordinates of all corners.
@@ -231,7 +238,7 @@ def _equations(
     return np.concatenate(distances), csr_array(vstack(slopes))
 
 
-def _look_up(image: Float[np.ndarray, "h w"], pixels: Pixels) -> tuple[Values, Pixels]:
+def _look_up(image: Image, pixels: Pixels) -> tuple[Values, Pixels]:
     """Returns an image's values between pixel centres, and their slopes over a pixel."""
     column, row = pixels.T - 0.5
 

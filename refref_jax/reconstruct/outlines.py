@@ -16,6 +16,8 @@ from refref_jax.reconstruct.grids import Points, Values
 from refref_jax.reconstruct.silhouettes import Views
 
 Pixels = Float[np.ndarray, "points 2"]
+Polygon = Float[np.ndarray, "corners 2"]
+Corners = Float[np.ndarray, "corners 3"]
 
 
 class Image(NamedTuple):
@@ -70,7 +72,7 @@ def polygon(pixels: Pixels) -> Int[np.ndarray, " corners"]:
     return ConvexHull(pixels).vertices.astype(np.int64)
 
 
-def excess(corners: Pixels, pixels: Pixels) -> Values:
+def excess(corners: Polygon, pixels: Pixels) -> Values:
     """Returns how far points lie outside of a convex polygon's nearest side, negative inside."""
     along = np.roll(corners, -1, axis=0) - corners
     outward = np.stack([along[:, 1], -along[:, 0]], axis=-1)
@@ -78,7 +80,7 @@ def excess(corners: Pixels, pixels: Pixels) -> Values:
     return np.max(pixels @ outward.T - np.sum(outward * corners, axis=-1), axis=1)
 
 
-def heights(corners: Pixels) -> Values:
+def heights(corners: Polygon) -> Float[np.ndarray, " corners"]:
     """Returns how far each corner lies from the line through its two neighbours."""
     before = np.roll(corners, 1, axis=0)
     across, side = np.roll(corners, -1, axis=0) - before, corners - before
@@ -86,7 +88,7 @@ def heights(corners: Pixels) -> Values:
     return np.abs(area) / np.linalg.norm(across, axis=-1)
 
 
-def along_edges(corners: Pixels, *, margin: float) -> Samples:
+def along_edges(corners: Polygon, *, margin: float) -> Samples:
     """Returns points on a polygon's edges, about one a pixel, some way from where it turns.
 
     Args:
@@ -108,7 +110,7 @@ def along_edges(corners: Pixels, *, margin: float) -> Samples:
     return Samples(pixels, edge, (edge + 1) % len(corners), shares)
 
 
-def overlap(corners: Points, views: Views) -> float:
+def overlap(corners: Corners, views: Views) -> float:
     """Returns the mean over views of the pixels in both mask and outline over those in either."""
     cameras = views.cameras
     shares = []
@@ -119,7 +121,7 @@ def overlap(corners: Points, views: Views) -> float:
     return float(np.mean(shares))
 
 
-def _fill(corners: Pixels, height: int, width: int) -> Bool[np.ndarray, "h w"]:
+def _fill(corners: Polygon, height: int, width: int) -> Bool[np.ndarray, "h w"]:
     """Returns which pixels have their centres in a convex polygon."""
     (x0, y0), (x1, y1) = corners.T, np.roll(corners, -1, axis=0).T
     row, column = np.arange(height)[:, None] + 0.5, np.arange(width) + 0.5
