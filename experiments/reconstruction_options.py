@@ -8,7 +8,11 @@ from experiments.r3f.geometry_stage import GEOMETRIES
 from experiments.r3f.records import ReconstructionConfig
 
 GEOMETRY = flags.DEFINE_enum(
-    "geometry", "hull", list(GEOMETRIES), "How a body is found from masks: their exact visual hull."
+    "geometry",
+    "hull",
+    list(GEOMETRIES),
+    "How a body is found from masks: as their exact visual hull, or by an occupancy field that is "
+    "trained on them.",
 )
 RESOLUTION = flags.DEFINE_integer(
     "resolution", 128, "Cells along the longest edge of the grid that holds the body.", 16, 1024

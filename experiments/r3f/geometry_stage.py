@@ -6,16 +6,19 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
+from experiments import commands
 from experiments.r3f import stages
 from experiments.r3f.records import GeometryFacts, ReconstructionConfig
 from refref_jax.data import local_layout, meshes, scene_names, stored_normals
 from refref_jax.data.cameras import Cameras
 from refref_jax.data.geometry import shading_normals
 from refref_jax.data.meshes import MeshPart
-from refref_jax.reconstruct import visual_hull
+from refref_jax.reconstruct import occupancy, visual_hull
 from refref_jax.reconstruct.grids import Grid
 from refref_jax.reconstruct.isosurface import find_isosurface
+from refref_jax.reconstruct.occupancy_config import OccupancyTrainingConfig
 from refref_jax.reconstruct.refinement import Refinement, refine
+from refref_jax.reconstruct.silhouettes import Views
 from refref_jax.reconstruct.triangles import Mesh, diameter, volume
 
 FOLDER = "geometry"
@@ -30,7 +33,23 @@ def _hull(masks: Masks, cameras: Cameras, config: ReconstructionConfig) -> Grid:
     return visual_hull.carve(masks, cameras, resolution=config.resolution, outliers=config.outliers)
 
 
-GEOMETRIES: dict[str, Callable[[Masks, Cameras, ReconstructionConfig], Grid]] = {"hull": _hull}
+def _occupancy(masks: Masks, cameras: Cameras, config: ReconstructionConfig) -> Grid:
+    settings = OccupancyTrainingConfig()
+    with commands.ProgressBar("occupancy", settings.steps) as bar:
+        return occupancy.fit(
+            masks,
+            cameras,
+            config=settings,
+            seed=config.seed,
+            resolution=config.resolution,
+            progress=lambda step, report: bar.show(step, f"loss {float(report.loss):.4f}"),
+        )
+
+
+GEOMETRIES: dict[str, Callable[[Masks, Cameras, ReconstructionConfig], Grid]] = {
+    "hull": _hull,
+    "occupancy": _occupancy,
+}
 """Ways from masks to a grid that is negative inside the body, by name."""
 
 
@@ -44,7 +63,7 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
     masks = local_layout.read_masks(frames)
     grid = GEOMETRIES[config.geometry](masks, frames.cameras, config)
     cut = find_isosurface(grid)
-    refined = refine(cut, Refinement())
+    refined = refine(cut, Refinement(), views=Views(masks, frames.cameras))
     mesh = refined[-1].mesh
     befores = [cut, *(stage.mesh for stage in refined)]
     name = f"{_object(scene)}_{MATERIAL}.ply"

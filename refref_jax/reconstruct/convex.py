@@ -1,9 +1,10 @@
 """Bodies that are convex but for noise (NumPy only).
 
 Of a convex body the masks leave more than of any other, since its surface is where its tangent
-planes
-are: `from_tangents` intersects them, which restores the edges that a grid cuts off.
+planes are: `from_tangents` intersects them, which restores the edges that a grid cuts off.
 """
+
+import math
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,7 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
-from refref_jax.geometry.corner_normals import face_normals
+from refref_jax.geometry.corner_normals import CREASE_ANGLE, face_normals
 from refref_jax.reconstruct.closest import ClosestSearch
 from refref_jax.reconstruct.smoothing import CREASE
 from refref_jax.reconstruct.triangles import (
@@ -44,10 +45,66 @@ _FITS = 6
 # Corners of the intersection closer than this share of the diameter are one.
 _SAME = 1e-6
 
+# Faces that meet at a smaller angle make one facet, radians.
+_COPLANAR = np.radians(3.0)
+
+# Of the volume, by which a convex body may differ from its hull.
+_ROUNDING = 1e-6
+
 
 def hull(mesh: Mesh) -> Mesh:
     """Returns the convex hull of a mesh, closed and outward."""
-    return _of_points(mesh.vertices)
+    return of_points(mesh.vertices)
+
+
+def of_points(points: Float[np.ndarray, "n 3"]) -> Mesh:
+    """Returns the convex hull of points, closed and outward.
+
+    Raises:
+      QhullError: if they lie in a plane.
+    """
+    found = ConvexHull(points)
+    faces = found.simplices.astype(np.int64)
+    corners = points[faces]
+    towards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inward = np.sum(towards * found.equations[:, :3], axis=-1) < 0.0
+    faces[inward] = faces[inward][:, ::-1]
+    used, numbers = np.unique(faces, return_inverse=True)
+    return make_mesh(points[used], numbers.reshape(-1, 3))
+
+
+def weigh_facets(mesh: Mesh, *, crease_angle: float = CREASE_ANGLE) -> Mesh:
+    """Returns a mesh of few corners whose normals are averaged by the areas of flat facets.
+
+    Averages by angle would bend the normals all over a large flat lid if it meets a narrow bevel at
+    less than the crease angle. Weighed by area, the bevel bends from the lid to the side.
+
+    Args:
+      mesh: convex.
+      crease_angle: radians, from which nothing is averaged.
+    """
+    normals = face_normals(mesh.vertices[mesh.faces])
+    first, second, _ = neighbours(mesh.faces)
+    flat = np.sum(normals[first] * normals[second], axis=-1) > np.cos(_COPLANAR)
+    graph = coo_array(
+        (np.ones(flat.sum(), bool), (first[flat], second[flat])), shape=(len(normals),) * 2
+    )
+    count, facet = connected_components(graph, directed=False)
+    vectors = face_vectors(mesh.vertices, mesh.faces)
+    of_facets = np.stack([np.bincount(facet, vectors[:, i], count) for i in range(3)], axis=-1)
+    unit = of_facets / np.linalg.norm(of_facets, axis=-1, keepdims=True)
+    averaged = unit @ unit.T > np.cos(crease_angle)
+    around = np.zeros((len(mesh.vertices), count), bool)
+    around[mesh.faces, facet[:, None]] = True
+    weighed = np.einsum("fkg,gc->fkc", around[mesh.faces] & averaged[facet][:, None], of_facets)
+    return mesh._replace(normals=weighed / np.linalg.norm(weighed, axis=-1, keepdims=True))
+
+
+def is_convex(mesh: Mesh) -> bool:
+    """Returns whether a mesh is its own convex hull but for rounding."""
+    outer = hull(mesh)
+    inside = volume(mesh.vertices, mesh.faces)
+    return math.isclose(inside, volume(outer.vertices, outer.faces), rel_tol=_ROUNDING)
 
 
 def depth_below_hull(mesh: Mesh) -> float:
@@ -73,7 +130,7 @@ def from_tangents(mesh: Mesh, *, crease_angle: float = CREASE) -> Mesh:
         return plain
     try:
         points = _intersection(mesh, plain.vertices.mean(axis=0), crease_angle)
-        body = _of_points(points)
+        body = of_points(points)
     except QhullError:
         return plain
     growth = volume(body.vertices, body.faces) / volume(plain.vertices, plain.faces) - 1.0
@@ -146,14 +203,3 @@ def _flat_plane(
         away = np.abs(from_centre @ normal)
         near = away <= max(tolerance, float(np.median(away)))
     return normal, centre, float(weights[away <= tolerance].sum() / weights.sum())
-
-
-def _of_points(points: Float[np.ndarray, "n 3"]) -> Mesh:
-    found = ConvexHull(points)
-    faces = found.simplices.astype(np.int64)
-    corners = points[faces]
-    towards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inward = np.sum(towards * found.equations[:, :3], axis=-1) < 0.0
-    faces[inward] = faces[inward][:, ::-1]
-    used, numbers = np.unique(faces, return_inverse=True)
-    return make_mesh(points[used], numbers.reshape(-1, 3))

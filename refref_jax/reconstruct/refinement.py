@@ -1,10 +1,11 @@
 """From a mesh cut out of a grid to one that light can be traced through (NumPy only).
 
 The stages, none of which needs a hand: all pieces but the largest go, unless they are large;
-ripples are smoothed; a body that is convex but for noise becomes so; edges are rounded; the surface
-is meshed anew from its signed distances. All lengths are in world units, so that a finer grid
-changes nothing but detail. A stage that would empty the body, turn it inside out, tear it or change
-its volume much is left out.
+ripples are smoothed; a body that is convex but for noise becomes so; a convex body that few corners
+describe is fitted to the outlines of the masks; edges are rounded; the surface is meshed anew from
+its signed distances. All lengths are in world units, so that a finer grid changes nothing but
+detail. A stage that would empty the body, turn it inside out, tear it or change its volume much is
+left out.
 
 The paper's recipe, by hand (arXiv 2505.05848, section on R3F): convex hull if no vertex lies
 further from it than an unstated threshold; MeshLab's removal of pieces below 90 % of the diameter,
@@ -12,7 +13,6 @@ which can remove the body; in Blender a bevel of 0.015, 100 smoothings of factor
 the body by a length that depends on its edges, and a remesh at octree depth 8.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -20,19 +20,20 @@ from typing import NamedTuple
 import numpy as np
 
 from refref_jax.reconstruct.closest import signed_distance
-from refref_jax.reconstruct.convex import depth_below_hull, from_tangents
+from refref_jax.reconstruct.convex import depth_below_hull, from_tangents, is_convex
+from refref_jax.reconstruct.corners import MOST, fit_corners
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.grids import Box, sample
 from refref_jax.reconstruct.isosurface import find_isosurface
+from refref_jax.reconstruct.silhouettes import Views, check_masks
 from refref_jax.reconstruct.smoothing import CREASE, denoise, diffuse
+from refref_jax.reconstruct.soundness import check_body, objection
 from refref_jax.reconstruct.triangles import (
     Mesh,
     diameter,
     face_vectors,
-    is_closed,
     keep_faces,
     pieces,
-    volume,
 )
 
 # Spacings around a mesh that is sampled.
@@ -40,6 +41,10 @@ _RIM = 3
 
 # As exact distances ask for, with the neighbours that a gradient looks at.
 _NEAR = 1.1
+
+# How many times more the volume may change where outlines are held to the masks: that of a hull of
+# few views is far too large.
+_HELD = 4.0
 
 # A mesh is sampled at most this finely, in spacings along its diameter.
 _FINEST = 400
@@ -55,9 +60,11 @@ class Refinement:
       crease: angle between neighbouring faces at which it stops, radians.
       smoothing: diffusion length of the vertices, which rounds creases too, world units.
       convex_depth: a body is made convex if no vertex lies deeper below its hull, world units.
+      corners: as many as a convex body may have to be fitted to masks; 0 leaves the stage out.
       rounding: radius to which convex edges are rounded, world units.
       spacing: of the grid of signed distances from which the surface is meshed anew, world units.
-      volume_change: share of the volume that any stage may change.
+      volume_change: share of the volume that any stage may change; four times as much where
+        corners are fitted to masks.
     """
 
     smallest_piece: float = 0.02
@@ -65,13 +72,19 @@ class Refinement:
     crease: float = CREASE
     smoothing: float = 0.0
     convex_depth: float = 0.04
+    corners: int = MOST
     rounding: float = 0.0
     spacing: float = 0.0
     volume_change: float = 0.05
 
 
 PAPER = Refinement(
-    denoising=0.0, smoothing=0.3, convex_depth=0.02, rounding=0.015, spacing=2.0 * 2.1 / 2**8
+    denoising=0.0,
+    smoothing=0.3,
+    convex_depth=0.02,
+    corners=0,
+    rounding=0.015,
+    spacing=2.0 * 2.1 / 2**8,
 )
 """The paper's recipe in lengths, without its shrinking: 100 steps of edges of 0.03 diffuse 0.3."""
 
@@ -90,24 +103,24 @@ class Stage(NamedTuple):
     refused: str
 
 
-def refine(mesh: Mesh, settings: Refinement) -> tuple[Stage, ...]:
+def refine(mesh: Mesh, settings: Refinement, *, views: Views | None = None) -> tuple[Stage, ...]:
     """Returns the mesh after each stage that the settings ask for; the last one is the result.
 
     Args:
       mesh: closed and outward, such as `isosurface.find_isosurface` returns.
       settings: see `Refinement`.
+      views: masks from which the mesh was made; without them no corners are fitted.
 
     Raises:
-      ReconstructionError: if the mesh is empty, open or turned inwards; or if it is to be meshed
-        anew and scikit-image is not installed.
+      ReconstructionError: if the mesh is empty, open or turned inwards; if it is to be meshed anew
+        and scikit-image is not installed; or if masks and cameras do not fit each other.
     """
-    _check(mesh)
-    stages = [Stage("pieces", keep_pieces(mesh, smallest=settings.smallest_piece), "")]
-    for name, change in _changes(settings).items():
-        before = stages[-1].mesh
-        after = change(before)
-        refused = _objection(before, after, settings.volume_change)
-        stages.append(Stage(name, before if refused else after, refused))
+    check_body(mesh)
+    first = keep_pieces(mesh, smallest=settings.smallest_piece)
+    stages = [Stage("pieces", first, "")]
+    for name, change in _changes(settings, first, views).items():
+        most = settings.volume_change * (_HELD if name == "corners" else 1.0)
+        stages.append(_stage(name, stages[-1].mesh, change, most))
     return tuple(stages)
 
 
@@ -164,8 +177,10 @@ def remesh(mesh: Mesh, spacing: float, *, level: float = 0.0) -> Mesh:
     return find_isosurface(grid, level=level)
 
 
-def _changes(settings: Refinement) -> dict[str, Callable[[Mesh], Mesh]]:
-    """Returns the stages after the first, by name, in their order."""
+def _changes(
+    settings: Refinement, first: Mesh, views: Views | None
+) -> dict[str, Callable[[Mesh], Mesh]]:
+    """Returns the stages after the first, whose mesh is given, by name, in their order."""
     changes: dict[str, Callable[[Mesh], Mesh]] = {}
     if settings.denoising > 0.0:
         changes["denoised"] = lambda mesh: denoise(
@@ -175,6 +190,12 @@ def _changes(settings: Refinement) -> dict[str, Callable[[Mesh], Mesh]]:
         changes["smoothed"] = lambda mesh: diffuse(mesh, settings.smoothing)
     if settings.convex_depth > 0.0:
         changes["convex"] = lambda mesh: _made_convex(mesh, settings)
+    if settings.corners > 0 and views is not None:
+        check_masks(views.masks, views.cameras)
+        # Smoothing moves outlines, so corners are looked for on what was there before it.
+        changes["corners"] = lambda mesh: (
+            fit_corners(mesh, first, views, most=settings.corners) if is_convex(mesh) else mesh
+        )
     if settings.rounding > 0.0:
         changes["rounded"] = lambda mesh: _attempt(
             lambda: round_edges(mesh, settings.rounding), mesh
@@ -182,6 +203,16 @@ def _changes(settings: Refinement) -> dict[str, Callable[[Mesh], Mesh]]:
     if settings.spacing > 0.0:
         changes["remeshed"] = lambda mesh: _attempt(lambda: remesh(mesh, settings.spacing), mesh)
     return changes
+
+
+def _stage(name: str, before: Mesh, change: Callable[[Mesh], Mesh], most: float) -> Stage:
+    """Returns what a change makes of a mesh, or the mesh and why it would not do."""
+    try:
+        after = change(before)
+    except ReconstructionError as error:
+        return Stage(name, before, str(error))
+    refused = objection(before, after, most)
+    return Stage(name, before if refused else after, refused)
 
 
 def _made_convex(mesh: Mesh, settings: Refinement) -> Mesh:
@@ -197,34 +228,3 @@ def _attempt(change: Callable[[], Mesh], mesh: Mesh) -> Mesh:
         return change()
     except ReconstructionError:
         return Mesh(mesh.vertices[:0], mesh.faces[:0], mesh.normals[:0])
-
-
-def _objection(before: Mesh, after: Mesh, most: float) -> str:
-    """Returns why a stage's mesh is not taken, or nothing."""
-    if len(after.faces) == 0:
-        return "nothing would be left"
-    if not is_closed(after.faces) or not np.all(np.isfinite(after.vertices)):
-        return "the surface would be torn"
-    old, new = (volume(mesh.vertices, mesh.faces) for mesh in (before, after))
-    if not math.isclose(new, old, rel_tol=most):
-        return f"the volume would go from {old:.4g} to {new:.4g}"
-    if _count_pieces(after) > _count_pieces(before):
-        return "the body would fall apart"
-    return ""
-
-
-def _count_pieces(mesh: Mesh) -> int:
-    return len(np.unique(pieces(mesh.faces, len(mesh.vertices))[mesh.faces[:, 0]]))
-
-
-def _check(mesh: Mesh) -> None:
-    if len(mesh.faces) == 0:
-        raise ReconstructionError("The mesh is empty. Check the masks and the level of the grid.")
-    if not is_closed(mesh.faces):
-        raise ReconstructionError(
-            "The mesh is not closed. Cut it from a grid whose border is outside the body."
-        )
-    if volume(mesh.vertices, mesh.faces) <= 0.0:
-        raise ReconstructionError(
-            "The mesh is turned inwards. Exchange two corners of every face, or negate the grid."
-        )

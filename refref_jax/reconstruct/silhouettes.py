@@ -10,6 +10,8 @@ Measured on discs of 34 pixels' radius and squares at all angles, in pixels: ste
 error; blur 1.5: 0.14, mean below 0.01, corners cut back by 0.5; blur 3: 0.10, 0.01 and 1.0.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_laplace
@@ -19,6 +21,18 @@ from refref_jax.reconstruct.errors import ReconstructionError
 
 BLUR = 1.5
 """Standard deviation in pixels of the average over an outline."""
+
+
+class Views(NamedTuple):
+    """What is seen of a body.
+
+    Attributes:
+      masks: one a camera, true where the body is seen.
+      cameras: of the masks, in the same order.
+    """
+
+    masks: Bool[np.ndarray, "views h w"]
+    cameras: Cameras
 
 
 def check_masks(masks: Bool[np.ndarray, "views h w"], cameras: Cameras) -> None:

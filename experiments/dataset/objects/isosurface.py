@@ -11,19 +11,15 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import maximum_filter
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
-from skimage.measure import marching_cubes
 
 from experiments.dataset.objects.distance_fields import Distances, Field, Points, evaluate
 from experiments.dataset.parts import RADIUS
+from refref_jax.reconstruct.isosurface import march
 
 # Fine cells along the edge of a coarse one; and how many of its edges from the surface a coarse
 # corner is looked around: sqrt(3) / 2 for a 1-Lipschitz field, and more for one that is nearly so.
 _COARSE = 4
 _NEAR = 1.5
-
-# Values this close to zero, in cells, are pushed away from it, so that no two vertices of marching
-# cubes meet in a corner of the grid and no face is degenerate.
-_CLEARANCE = 0.1
 
 # Steps towards the mean of the neighbours, the share of the way that each goes, the longest one in
 # cells, and how much more a neighbour weighs for an angle between the normals, per radian; and
@@ -69,11 +65,8 @@ def isosurface(field: Field, *, spacing: float, half_extent: float = RADIUS + 0.
             f"No closed surface lies within {half_extent} of the origin. Check the measures of "
             "the solid."
         )
-    clearance = _CLEARANCE * spacing
-    values = np.copysign(np.maximum(np.abs(values), clearance), values)
-    vertices, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")
-    vertices = low + spacing * vertices.astype(np.float64)
-    return Surface(settle(field, vertices, faces, spacing=spacing), faces.astype(np.int64))
+    vertices, faces = march(values, spacing)
+    return Surface(settle(field, low + vertices, faces, spacing=spacing), faces)
 
 
 def sample(
