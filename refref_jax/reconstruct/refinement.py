@@ -1,4 +1,4 @@
-"""From a mesh cut out of a grid to one that light can be traced through (NumPy only).
+"""From a mesh cut out of a grid to one that light can be traced through (host).
 
 The stages, none of which needs a hand: all pieces but the largest go, unless they are large;
 ripples are smoothed; a body that is convex but for noise becomes so; a convex body that few corners
@@ -22,11 +22,12 @@ import numpy as np
 from refref_jax.reconstruct.closest import signed_distance
 from refref_jax.reconstruct.convex import depth_below_hull, from_tangents, is_convex
 from refref_jax.reconstruct.corners import MOST, fit_corners
+from refref_jax.reconstruct.denoising import denoise_within
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.grids import Box, sample
 from refref_jax.reconstruct.isosurface import find_isosurface
 from refref_jax.reconstruct.silhouettes import Views, check_masks
-from refref_jax.reconstruct.smoothing import CREASE, denoise, diffuse
+from refref_jax.reconstruct.smoothing import CREASE, diffuse
 from refref_jax.reconstruct.soundness import check_body, objection
 from refref_jax.reconstruct.triangles import (
     Mesh,
@@ -56,7 +57,8 @@ class Refinement:
 
     Attributes:
       smallest_piece: share of the whole volume from which a piece is kept besides the largest.
-      denoising: diffusion length of the normals, which stops at creases, world units.
+      denoising: diffusion length of the normals, which stops at creases, world units; a half or a
+        quarter of it where masks show that more would move outlines.
       crease: angle between neighbouring faces at which it stops, radians.
       smoothing: diffusion length of the vertices, which rounds creases too, world units.
       convex_depth: a body is made convex if no vertex lies deeper below its hull, world units.
@@ -109,7 +111,8 @@ def refine(mesh: Mesh, settings: Refinement, *, views: Views | None = None) -> t
     Args:
       mesh: closed and outward, such as `isosurface.find_isosurface` returns.
       settings: see `Refinement`.
-      views: masks from which the mesh was made; without them no corners are fitted.
+      views: masks from which the mesh was made; without them no corners are fitted, and nothing
+        holds denoising back.
 
     Raises:
       ReconstructionError: if the mesh is empty, open or turned inwards; if it is to be meshed anew
@@ -183,8 +186,8 @@ def _changes(
     """Returns the stages after the first, whose mesh is given, by name, in their order."""
     changes: dict[str, Callable[[Mesh], Mesh]] = {}
     if settings.denoising > 0.0:
-        changes["denoised"] = lambda mesh: denoise(
-            mesh, settings.denoising, crease_angle=settings.crease
+        changes["denoised"] = lambda mesh: denoise_within(
+            mesh, settings.denoising, crease_angle=settings.crease, views=views
         )
     if settings.smoothing > 0.0:
         changes["smoothed"] = lambda mesh: diffuse(mesh, settings.smoothing)

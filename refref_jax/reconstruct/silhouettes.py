@@ -35,6 +35,12 @@ class Views(NamedTuple):
     cameras: Cameras
 
 
+def some_of(views: Views, count: int) -> Views:
+    """Returns so many views at most, evenly spread over their order."""
+    kept = np.unique(np.linspace(0, len(views.masks) - 1, count).astype(np.int64))
+    return Views(views.masks[kept], views.cameras._replace(poses=views.cameras.poses[kept]))
+
+
 def check_masks(masks: Bool[np.ndarray, "views h w"], cameras: Cameras) -> None:
     """Checks that there are masks, one a camera, of its size, and that each marks something.
 

@@ -6,11 +6,13 @@ import trimesh
 
 from refref_jax.geometry.corner_normals import face_normals
 from refref_jax.reconstruct import convex, refinement, smoothing
-from refref_jax.reconstruct.comparison import compare_meshes
+from refref_jax.reconstruct.comparison import compare_meshes, silhouette_overlap
+from refref_jax.reconstruct.denoising import denoise_within
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.grids import Box, sample
 from refref_jax.reconstruct.isosurface import find_isosurface
 from refref_jax.reconstruct.refinement import Refinement, keep_pieces, refine
+from refref_jax.reconstruct.silhouettes import Views, some_of
 from refref_jax.reconstruct.triangles import Mesh, is_closed, make_mesh, pieces, volume
 from tests.reconstruct import bodies
 
@@ -216,3 +218,31 @@ def test_meshes_that_bound_no_body_are_errors():
         refine(make_mesh(mesh.vertices, mesh.faces[1:]), Refinement())
     with pytest.raises(ReconstructionError, match="turned inwards"):
         refine(bodies.inverted(mesh), Refinement())
+
+
+def _finned(points):
+    """A ball with a fin as thin as denoising is long."""
+    fin = bodies.box(points, half=(1.0, 1.0, 0.06))
+    return np.minimum(bodies.ball(points, radius=0.6), fin)
+
+
+def test_denoising_goes_as_far_as_masks_allow():
+    cameras = bodies.cameras_around(8, size=96)
+    views = Views(bodies.masks_of(_finned, cameras, steps=200), cameras)
+    raw = _surface(_finned, spacing=0.05)
+    free = denoise_within(raw, 0.4, crease_angle=0.26, views=None)
+    held = denoise_within(raw, 0.4, crease_angle=0.26, views=views)
+    before, freely, within = (silhouette_overlap(m, *views).mean() for m in (raw, free, held))
+    assert freely < before - 0.05 and within > before - 0.01
+    half = denoise_within(raw, 0.2, crease_angle=0.26, views=None)
+    np.testing.assert_array_equal(held.vertices, half.vertices)
+    with pytest.raises(ReconstructionError, match="overlap with the masks would fall"):
+        denoise_within(raw, 0.4, crease_angle=1.0, views=views)
+
+
+def test_some_views_are_spread_over_all():
+    cameras = bodies.cameras_around(9, size=8)
+    views = Views(np.ones((9, 8, 8), bool), cameras)
+    few = some_of(views, 3)
+    np.testing.assert_array_equal(few.cameras.poses, cameras.poses[[0, 4, 8]])
+    assert len(some_of(views, 20).masks) == 9
