@@ -13,7 +13,7 @@ from pathlib import Path
 from absl import flags
 
 from experiments import commands, reconstruction_options, scene_option
-from experiments.r3f import chain, geometry_stage, report
+from experiments.r3f import body, chain, report
 
 _SCENE = flags.DEFINE_string(
     "scene", None, f"The scene to reconstruct: {scene_option.FORMS}.", required=True
@@ -37,7 +37,7 @@ def main() -> None:
         print("Stopped. The same command goes on.")
         raise
     print(f"Report:  {out / report.FILE}, {out / report.FOLDER}")
-    print(f"Surface: {out / geometry_stage.FOLDER / found.geometry.mesh}")
+    print(f"Surface: {body.surface_file(out, found)}")
     print(f"Index:   {out / chain.INDEX_FILE}")
     run = out.with_name(f"{out.name}_run")
     options = (f"--scene={_SCENE.value}", f"--reconstruction={out}", f"--out={run}")

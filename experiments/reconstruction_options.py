@@ -21,6 +21,14 @@ OUTLIERS = flags.DEFINE_integer(
     "outliers", 0, "Views whose masks may be wrong, at the cost of accuracy everywhere.", 0
 )
 
+LIGHT_STEPS = flags.DEFINE_integer(
+    "light_steps",
+    0,
+    "Steps by which the surface is refined by the light that went through it; 0 leaves it out. The "
+    "result is kept only if validation images are explained better.",
+    0,
+)
+
 _LARGEST_INDEX = 5.0
 
 
@@ -31,7 +39,9 @@ def chosen(*, index: float | None, seed: int) -> ReconstructionConfig:
       index: the index of refraction, or `None` to estimate it.
       seed: of everything random.
     """
-    return ReconstructionConfig(GEOMETRY.value, RESOLUTION.value, OUTLIERS.value, index, seed)
+    return ReconstructionConfig(
+        GEOMETRY.value, RESOLUTION.value, OUTLIERS.value, index, LIGHT_STEPS.value, seed
+    )
 
 
 def parse_index(word: str) -> float:

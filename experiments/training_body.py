@@ -29,6 +29,7 @@ SETTLED = (
     reconstruction_options.GEOMETRY,
     reconstruction_options.RESOLUTION,
     reconstruction_options.OUTLIERS,
+    reconstruction_options.LIGHT_STEPS,
 )
 """Options that a run is begun with, and can not change when it is resumed."""
 

@@ -6,8 +6,16 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
-from experiments.r3f import geometry_stage, index_stage, records, report, stages
-from experiments.r3f.records import IndexFacts, Reconstruction, ReconstructionConfig
+from experiments.r3f import (
+    body,
+    geometry_stage,
+    index_stage,
+    light_stage,
+    records,
+    report,
+    stages,
+)
+from experiments.r3f.records import IndexFacts, LightFacts, Reconstruction, ReconstructionConfig
 from refref_jax import configuration
 from refref_jax.data import local_layout, scene_names
 from refref_jax.data.meshes import MeshPart
@@ -42,7 +50,8 @@ def reconstruct(
         body fits the masks, or if the folder holds anything else.
     """
     import_skimage()
-    local_layout.read_masks(local_layout.read_frames(scene, "train"))
+    for split in ("train", "val")[: 1 + (config.light_steps > 0)]:
+        local_layout.read_masks(local_layout.read_frames(scene, split))
     asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene), config)
     found = records.begin(out, asked)
     with run_lock.hold(out):
@@ -50,7 +59,7 @@ def reconstruct(
         if found.geometry is None or not geometry_stage.is_there(out, found.geometry):
             say(f"geometry: {config.geometry} of the training masks, {config.resolution} cells")
             facts = geometry_stage.run(scene, out, config)
-            found = dataclasses.replace(found, geometry=facts, index=None, report=None)
+            found = dataclasses.replace(found, geometry=facts, index=None, light=None, report=None)
             records.write(out, found)
         say(_describe_geometry(found))
         if found.index is None:
@@ -59,6 +68,11 @@ def reconstruct(
         with stages.unfinished_file(out / INDEX_FILE) as path:
             configuration.write(path, found.index)
         say(describe_index(found.index))
+        if found.light is None and config.light_steps > 0:
+            found = dataclasses.replace(found, light=_light(scene, out, found), report=None)
+            records.write(out, found)
+        if found.light is not None:
+            say(_describe_light(found.light))
         if found.report is None or not report.is_there(out):
             found = dataclasses.replace(found, report=report.run(scene, out, found, compare))
             records.write(out, found)
@@ -73,11 +87,12 @@ def read_part(out: Path) -> MeshPart:
       ValueError: if the folder holds none, or one that is not finished.
     """
     found = records.read(out)
-    if found.geometry is None or found.index is None:
+    waits_for_light = found.config.light_steps > 0 and found.light is None
+    if found.geometry is None or found.index is None or waits_for_light:
         raise ValueError(
             f"The reconstruction in {out} is not finished. Repeat the command that began it."
         )
-    return geometry_stage.read_part(out, found.geometry, index=found.index.index)
+    return body.read_part(out, found)
 
 
 def fingerprint(scene: Path) -> str:
@@ -107,7 +122,7 @@ def _index(scene: Path, out: Path, found: Reconstruction) -> IndexFacts:
         return IndexFacts("given", config.index, None, None)
     folder = out / _INDEX_FOLDER
     folder.mkdir(exist_ok=True)
-    mesh = geometry_stage.read_mesh(out, found.geometry)
+    mesh = body.read_mesh(out, found)
     estimate = index_stage.run(scene, mesh, folder, seed=config.seed)
     if not math.isfinite(estimate.deviation):
         raise ValueError(
@@ -115,6 +130,28 @@ def _index(scene: Path, out: Path, found: Reconstruction) -> IndexFacts:
             f"worse (see {folder}). Give it, as in --ior=1.5."
         )
     return IndexFacts("estimated", estimate.index, estimate.deviation, estimate.error)
+
+
+def _light(scene: Path, out: Path, found: Reconstruction) -> LightFacts:
+    folder, seed = out / _INDEX_FOLDER, found.config.seed
+    folder.mkdir(exist_ok=True)
+    return light_stage.run(
+        scene,
+        body.read_mesh(out, found),
+        found.index.index,
+        index_stage.learn_background(scene, folder, seed=seed),
+        out / light_stage.FOLDER / found.geometry.mesh,
+        steps=found.config.light_steps,
+        seed=seed,
+    )
+
+
+def _describe_light(facts: LightFacts) -> str:
+    told = (
+        f"refinement by light: error of the validation views {facts.before:.4f} before, "
+        f"{facts.after:.4f} after {facts.steps} steps"
+    )
+    return f"{told}; kept" if facts.kept else f"{told}; left out"
 
 
 def _describe_geometry(found: Reconstruction) -> str:

@@ -9,17 +9,15 @@ from jaxtyping import Bool
 from experiments import commands
 from experiments.r3f import stages
 from experiments.r3f.records import GeometryFacts, ReconstructionConfig
-from refref_jax.data import local_layout, meshes, scene_names, stored_normals
+from refref_jax.data import local_layout, scene_names, stored_normals
 from refref_jax.data.cameras import Cameras
-from refref_jax.data.geometry import shading_normals
-from refref_jax.data.meshes import MeshPart
 from refref_jax.reconstruct import occupancy, visual_hull
 from refref_jax.reconstruct.grids import Grid
 from refref_jax.reconstruct.isosurface import find_isosurface
 from refref_jax.reconstruct.occupancy_config import OccupancyTrainingConfig
 from refref_jax.reconstruct.refinement import Refinement, refine
 from refref_jax.reconstruct.silhouettes import Views
-from refref_jax.reconstruct.triangles import Mesh, diameter, volume
+from refref_jax.reconstruct.triangles import diameter, volume
 
 FOLDER = "geometry"
 
@@ -90,17 +88,6 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
 def is_there(out: Path, facts: GeometryFacts) -> bool:
     """Returns whether the surface is where it was written."""
     return (out / FOLDER / facts.mesh).is_file()
-
-
-def read_part(out: Path, facts: GeometryFacts, *, index: float) -> MeshPart:
-    """Reads the surface as what light is traced through."""
-    return meshes.read_part(out / FOLDER / facts.mesh, index=index)
-
-
-def read_mesh(out: Path, facts: GeometryFacts) -> Mesh:
-    """Reads the surface; its vertices are in the order of the file's reader."""
-    part = read_part(out, facts, index=1.0)
-    return Mesh(part.vertices, part.faces, shading_normals(part))
 
 
 def _object(scene: Path) -> str:

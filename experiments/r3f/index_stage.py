@@ -10,26 +10,18 @@ wrong index can have spoilt it. Where the body fills all images there is none: g
 import dataclasses
 from pathlib import Path
 
-import jax
-import numpy as np
-from jaxtyping import Int
-
 from experiments import commands, plotting, presets, trainer
 from experiments.plotting import COLOURS, pyplot
-from refref_jax.data import background, local_layout, mask_margins
-from refref_jax.data.cameras import pixel_rays
+from experiments.r3f import body_pixels
+from refref_jax.data import background, local_layout
 from refref_jax.data.geometry import build_geometry
-from refref_jax.geometry.surface_build import build_surfaces
-from refref_jax.optics.branching import Geometry
 from refref_jax.optics.budgets import STRAIGHT
-from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.reconstruct.index_search import (
     IndexEstimate,
     IndexSearch,
     estimate_index,
     most_looks,
 )
-from refref_jax.reconstruct.photometry import Evidence
 from refref_jax.reconstruct.triangles import Mesh
 from refref_jax.render import saved
 from refref_jax.render.config import ModelConfig
@@ -76,13 +68,13 @@ def run(
       ValueError: if the scene has no masks, or no pixel beside them.
       KeyboardInterrupt: if the background's training was stopped; it has been saved.
     """
-    model = _learn_background(scene, folder / "background", seed=seed, steps=steps)
-    evidence, views = _look(scene, model, seed=seed, rays=rays)
+    model = learn_background(scene, folder, seed=seed, steps=steps)
+    evidence, views = body_pixels.look(scene, "train", model, seed=seed, rays=rays)
     search = IndexSearch()
     with commands.ProgressBar("index", most_looks(search, start)) as bar:
         found = estimate_index(
             evidence,
-            geometry_of(mesh, _BEFORE),
+            body_pixels.body_geometry(mesh, _BEFORE),
             views,
             part=0,
             config=model.config,
@@ -94,11 +86,28 @@ def run(
     return found
 
 
-def geometry_of(mesh: Mesh, index: float) -> Geometry:
-    """Returns one clear body in air, on the device."""
-    owners = np.zeros(len(mesh.faces), np.int64)
-    surfaces = build_surfaces(mesh.vertices[mesh.faces], mesh.normals, owners)
-    return jax.device_put(Geometry(surfaces, nested([index], [NO_PARENT])))
+def learn_background(scene: Path, folder: Path, *, seed: int, steps: int = STEPS) -> Model:
+    """Returns the field of what is behind the body; trains it first, or goes on with that.
+
+    Args:
+      scene: folder of the scene.
+      folder: of the stage.
+      seed: of everything random.
+      steps: of its training.
+
+    Raises:
+      ValueError: if the scene has no masks, or no pixel beside them.
+      KeyboardInterrupt: if its training was stopped; it has been saved.
+    """
+    run = folder / "background"
+    if not run_folder.exists(run):
+        config, model = _plan(scene, seed=seed, steps=steps)
+        nothing = build_geometry([], [], rule="nested")
+        run_folder.create(run, config, SavedModel(model, STRAIGHT), nothing)
+    with run_lock.hold(run):
+        if not trainer.train(run, scene=str(scene)):
+            raise KeyboardInterrupt
+    return saved.load_model(run)
 
 
 def draw(path: Path, found: IndexEstimate) -> None:
@@ -115,17 +124,6 @@ def draw(path: Path, found: IndexEstimate) -> None:
     plotting.style(axis)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
-
-
-def _learn_background(scene: Path, folder: Path, *, seed: int, steps: int) -> Model:
-    if not run_folder.exists(folder):
-        config, model = _plan(scene, seed=seed, steps=steps)
-        nothing = build_geometry([], [], rule="nested")
-        run_folder.create(folder, config, SavedModel(model, STRAIGHT), nothing)
-    with run_lock.hold(folder):
-        if not trainer.train(folder, scene=str(scene)):
-            raise KeyboardInterrupt
-    return saved.load_model(folder)
 
 
 def _plan(scene: Path, *, seed: int, steps: int) -> tuple[TrainingConfig, ModelConfig]:
@@ -145,22 +143,3 @@ def _plan(scene: Path, *, seed: int, steps: int) -> tuple[TrainingConfig, ModelC
         seed=seed,
     )
     return config, dataclasses.replace(model, footprint="cone")
-
-
-def _look(
-    scene: Path, model: Model, *, seed: int, rays: int
-) -> tuple[Evidence, Int[np.ndarray, " rays"]]:
-    """Returns pixels of the body spread evenly over the views, and the view of each."""
-    frames = local_layout.read_frames(scene, "train")
-    inside = mask_margins.well_inside(local_layout.read_masks(frames))
-    generator = np.random.default_rng(seed)
-    each = -(-rays // len(inside))
-    chosen = []
-    for view, mask in enumerate(inside):
-        places = np.flatnonzero(mask)
-        picked = generator.choice(places, min(each, len(places)), replace=False)
-        chosen.append(picked + view * mask.size)
-    view, row, column = np.unravel_index(np.concatenate(chosen), inside.shape)
-    rgb = local_layout.read_images(frames)[view, row, column].astype(np.float32) / 255.0
-    seen = pixel_rays(frames.cameras, view, row, column)
-    return Evidence(model.params, *jax.device_put((seen, rgb))), view

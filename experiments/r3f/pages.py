@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from experiments import commands
-from experiments.r3f.records import GeometryFacts, IndexFacts, Reconstruction, ReportFacts
+from experiments.r3f import body
+from experiments.r3f.records import IndexFacts, Reconstruction, ReportFacts
 
 _SPLITS = {
     "test": "test views, from which nothing was made",
@@ -25,7 +26,7 @@ def markdown(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
         f"# The object of {found.scene}, reconstructed",
         f"From {geometry.masks} masks of {geometry.width} x {geometry.height} pixels and their "
         f"poses; {_of_index(found.index)}.",
-        _table(geometry, found.index, facts),
+        _table(out, found, facts),
         f"## Silhouettes\n\nMeasured on {len(facts.overlaps)} {_SPLITS[facts.split]}. IoU is the "
         "pixels in both mask and silhouette over those in either.",
         "![Masks and silhouettes](pictures/overlap.png)",
@@ -47,10 +48,12 @@ def _of_index(index: IndexFacts) -> str:
     return "the index of refraction was estimated from their images"
 
 
-def _table(geometry: GeometryFacts, index: IndexFacts, facts: ReportFacts) -> str:
+def _table(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
+    geometry, index = found.geometry, found.index
     error = "" if index.error is None else f" ± {index.error:.4f} (one standard deviation)"
+    surface = body.surface_file(out, found).relative_to(out)
     rows = [
-        ("surface", f"[{geometry.mesh}](geometry/{geometry.mesh}), {geometry.faces:,} triangles"),
+        ("surface", f"[{geometry.mesh}]({surface}), {geometry.faces:,} triangles"),
         ("diameter, volume", f"{geometry.diameter:.3f}, {geometry.volume:.3f} (world units)"),
         ("index of refraction", f"**{index.index:.4f}**{error}, {index.source}"),
         (
@@ -58,6 +61,15 @@ def _table(geometry: GeometryFacts, index: IndexFacts, facts: ReportFacts) -> st
             f"**{facts.mean_overlap:.4f}**, {min(facts.overlaps):.4f}",
         ),
     ]
+    if found.light is not None:
+        light = found.light
+        kept = f"kept, with index {light.index:.4f}" if light.kept else "left out"
+        rows.append(
+            (
+                "error of validation views, by light",
+                f"{light.before:.4f} before, {light.after:.4f} after; {kept}",
+            )
+        )
     if facts.truth is not None:
         truth = facts.truth
         rows += [
@@ -98,7 +110,7 @@ def _making(found: Reconstruction) -> str:
     config, geometry = found.config, found.geometry
     told = [
         f"- `--geometry={config.geometry} --resolution={config.resolution} "
-        f"--outliers={config.outliers} --seed={config.seed}`"
+        f"--outliers={config.outliers} --light_steps={config.light_steps} --seed={config.seed}`"
         + (f" `--ior={config.index:g}`" if config.index is not None else ""),
         f"- refined: {', '.join(geometry.stages) or 'nothing to do'}",
         *(f"- left out {refused}" for refused in geometry.refused),

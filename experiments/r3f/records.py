@@ -29,6 +29,7 @@ class ReconstructionConfig:
       resolution: cells along the longest edge of the grid.
       outliers: views that may be wrong.
       index: the index of refraction, or `None` to estimate it.
+      light_steps: of the refinement by light; 0 leaves it out.
       seed: of everything random.
     """
 
@@ -36,6 +37,7 @@ class ReconstructionConfig:
     resolution: int
     outliers: int
     index: float | None
+    light_steps: int
     seed: int
 
 
@@ -86,6 +88,27 @@ class IndexFacts:
 
 
 @dataclasses.dataclass(frozen=True)
+class LightFacts:
+    """What came of the refinement by light.
+
+    Attributes:
+      steps: of the descent.
+      kept: whether the validation views are explained better.
+      before: mean error of their pixels before, sRGB.
+      after: and after.
+      index: of refraction, after.
+      furthest: that a part of the surface moved, world units.
+    """
+
+    steps: int
+    kept: bool
+    before: float
+    after: float
+    index: float
+    furthest: float
+
+
+@dataclasses.dataclass(frozen=True)
 class DistanceFacts:
     """How far the surface is from the true one, see `reconstruct.comparison.Distance`."""
 
@@ -129,7 +152,8 @@ class Reconstruction:
       config: what was asked for.
       geometry: the first stage.
       index: the second.
-      report: the third.
+      light: the third, if it is asked for.
+      report: the last.
     """
 
     scene: str
@@ -137,6 +161,7 @@ class Reconstruction:
     config: ReconstructionConfig
     geometry: GeometryFacts | None = None
     index: IndexFacts | None = None
+    light: LightFacts | None = None
     report: ReportFacts | None = None
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.r3f import (
-    geometry_stage,
+    body,
     overlap_pictures,
     pages,
     stages,
@@ -65,7 +65,7 @@ def run(scene: Path, out: Path, found: Reconstruction, compare: bool) -> ReportF
       found: what it came to.
       compare: whether the scene's own meshes may be looked at.
     """
-    mesh = geometry_stage.read_mesh(out, found.geometry)
+    mesh = body.read_mesh(out, found)
     split, frames = _frames(scene)
     outlines = _outlines(mesh, frames)
     truth = _read_truth(scene) if compare else _Truth(None, "The scene's meshes were not read.")

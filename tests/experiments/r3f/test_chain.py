@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from experiments.r3f import chain, geometry_stage, index_stage, records, report, stages
-from experiments.r3f.index_stage import IndexEstimate
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import stored_normals
 from refref_jax.geometry.corner_normals import corner_normals
 from refref_jax.reconstruct.comparison import compare_meshes
+from refref_jax.reconstruct.index_search import Descent, IndexEstimate
 from tests.experiments.r3f.small_scene import RADIUS, without_masks, write_scene
 
-_CONFIG = ReconstructionConfig("hull", 20, 0, 1.5, 0)
+_CONFIG = ReconstructionConfig("hull", 20, 0, 1.5, 0, 0)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,8 @@ def test_a_ball_is_found_from_its_masks(whole):
     found = records.read(whole)
     assert found.scene == "cube_smcvx_ball" and found.config == _CONFIG
     assert found.geometry.mesh == "ball_glass.ply" and found.geometry.masks == 24
-    assert found.geometry.refused == ()
+    # A ball has no corners.
+    assert [words.partition(":")[0] for words in found.geometry.refused] == ["corners"]
     assert found.geometry.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.04)
     assert found.report.split == "test" and len(found.report.overlaps) == 5
     assert found.report.mean_overlap > 0.97
@@ -232,13 +233,18 @@ def test_broken_meshes_of_the_scene_harm_nothing(scene, whole, tmp_path, compare
     assert width / height == pytest.approx(2 * 2.4 / (3 * 2.4 + 0.4), rel=0.02)
 
 
+def _estimate(index, deviation):
+    nowhere = Descent((index,), (0.02,))
+    return IndexEstimate(index, deviation, 0.02, nowhere, (nowhere,))
+
+
 def test_an_index_that_is_not_given_is_estimated_once(scene, tmp_path, monkeypatch):
     asked = []
 
     def estimate(folder_of_scene, mesh, folder, *, seed):
         assert folder_of_scene == scene and folder.is_dir() and len(mesh.faces) > 100
         asked.append(seed)
-        return IndexEstimate(1.48, 0.01, 0.002)
+        return _estimate(1.48, 0.01)
 
     monkeypatch.setattr(index_stage, "run", estimate)
     config = dataclasses.replace(_CONFIG, index=None, seed=7)
@@ -251,7 +257,7 @@ def test_an_index_that_is_not_given_is_estimated_once(scene, tmp_path, monkeypat
 
 
 def test_an_estimate_that_is_no_number_is_no_result(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(index_stage, "run", lambda *_, seed: IndexEstimate(1.5, np.nan, 0.1))
+    monkeypatch.setattr(index_stage, "run", lambda *_, seed: _estimate(1.5, np.inf))
     with pytest.raises(ValueError, match="--ior"):
         _run(scene, tmp_path / "out", dataclasses.replace(_CONFIG, index=None))
     with pytest.raises(ValueError, match="not finished"):

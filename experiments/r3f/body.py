@@ -1,0 +1,34 @@
+"""The reconstructed body as far as it has got: its newest surface, and its index of refraction."""
+
+from pathlib import Path
+
+from experiments.r3f import geometry_stage, light_stage
+from experiments.r3f.records import Reconstruction
+from refref_jax.data import meshes
+from refref_jax.data.geometry import shading_normals
+from refref_jax.data.meshes import MeshPart
+from refref_jax.reconstruct.triangles import Mesh
+
+
+def surface_file(out: Path, found: Reconstruction) -> Path:
+    """Returns where the surface is: refined by light, if that bettered it."""
+    refined = found.light is not None and found.light.kept
+    folder = light_stage.FOLDER if refined else geometry_stage.FOLDER
+    return out / folder / found.geometry.mesh
+
+
+def index(found: Reconstruction) -> float:
+    """Returns the index of refraction that goes with the surface."""
+    refined = found.light is not None and found.light.kept
+    return found.light.index if refined else found.index.index
+
+
+def read_part(out: Path, found: Reconstruction) -> MeshPart:
+    """Reads the body as what light is traced through."""
+    return meshes.read_part(surface_file(out, found), index=index(found))
+
+
+def read_mesh(out: Path, found: Reconstruction) -> Mesh:
+    """Reads the surface; its vertices are in the order of the file's reader."""
+    part = meshes.read_part(surface_file(out, found), index=1.0)
+    return Mesh(part.vertices, part.faces, shading_normals(part))

@@ -1,0 +1,77 @@
+"""The stage of R3F that refines the body by the light that went through it, if that is asked for.
+
+    {out}/light/{object}_{material}.ply    the refined surface
+
+It is kept only if it explains pixels better that it was not fitted to: those of the validation
+views. Scenes without such views are refused.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from experiments import commands
+from experiments.r3f import body_pixels, stages
+from experiments.r3f.body_pixels import BodyPixels
+from experiments.r3f.records import LightFacts
+from refref_jax.data import stored_normals
+from refref_jax.reconstruct import photometry
+from refref_jax.reconstruct.light_refinement import LightRefinement, refine_by_light
+from refref_jax.reconstruct.triangles import Mesh
+from refref_jax.render.model import Model
+
+FOLDER = "light"
+
+# Pixels that are descended on, and those that judge.
+_SEEN = 60_000
+_JUDGES = 8192
+
+
+def run(
+    scene: Path, mesh: Mesh, index: float, model: Model, target: Path, *, steps: int, seed: int
+) -> LightFacts:
+    """Refines a body, and writes it if it is better.
+
+    Args:
+      scene: its folder; training and validation images and masks are read.
+      mesh: the body.
+      index: its index of refraction.
+      model: of the background.
+      target: the file, in a folder of its own.
+      steps: of the descent.
+      seed: of everything random.
+
+    Raises:
+      ValueError: if there is no validation split with masks.
+    """
+    judges = body_pixels.look(scene, "val", model, seed=seed + 1, rays=_JUDGES)
+    seen = body_pixels.look(scene, "train", model, seed=seed, rays=_SEEN)
+    with commands.ProgressBar("light", steps) as bar:
+        found = refine_by_light(
+            mesh,
+            index,
+            body_pixels.body_geometry(mesh, index).interfaces,
+            seen.evidence,
+            config=model.config,
+            settings=LightRefinement(steps=steps, seed=seed),
+            progress=lambda step, error: bar.show(step, f"error {error:.4f}"),
+        )
+    before = _error(mesh, index, judges, model)
+    after = _error(found.mesh, found.index, judges, model)
+    kept = after < before
+    if kept:
+        with stages.unfinished_folder(target.parent) as folder:
+            stored_normals.write_mesh(folder / target.name, *found.mesh)
+    return LightFacts(steps, kept, before, after, found.index, found.furthest)
+
+
+def _error(mesh: Mesh, index: float, judges: BodyPixels, model: Model) -> float:
+    """Returns the mean error of the judging pixels, with the body's own tree."""
+    errors = photometry.errors_at_index(
+        np.float32(index),
+        judges.evidence,
+        body_pixels.body_geometry(mesh, index),
+        part=0,
+        config=model.config,
+    )
+    return float(np.mean(errors, dtype=np.float64))
