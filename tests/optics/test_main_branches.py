@@ -39,6 +39,7 @@ def test_a_slab_from_above_has_the_shares_of_fresnel():
     assert found.statuses[0, 3] == PathStatus.EMPTY
 
 
+@pytest.mark.slow
 def test_they_are_the_branches_of_the_tree_and_nearly_all_of_its_light():
     geometry = scenes.geometry(scenes.ball(1.0, subdivisions=3))
     rays = _towards(64)

@@ -49,7 +49,9 @@ def test_errors_vanish_at_the_truth_alone(ball, seen):
     assert min(mean(_TRUE - 0.02), mean(_TRUE + 0.02)) > 3.0 * mean(_TRUE)
 
 
-@pytest.mark.parametrize("index", [1.01, 1.3, 1.6, 2.8])
+@pytest.mark.parametrize(
+    "index", [1.01, 2.8, *(pytest.param(at, marks=pytest.mark.slow) for at in (1.3, 1.6))]
+)
 def test_the_slope_is_that_of_the_errors(ball, seen, index):
     evidence, _ = seen
     given = {"part": 0, "config": lit_scenes.CONFIG}
@@ -63,7 +65,9 @@ def test_the_slope_is_that_of_the_errors(ball, seen, index):
     assert float(found.slope) == pytest.approx((other - one) / 4e-3, rel=0.5, abs=0.1)
 
 
-@pytest.mark.parametrize("start", [None, 1.2, 2.0])
+@pytest.mark.parametrize(
+    "start", [1.2, *(pytest.param(at, marks=pytest.mark.slow) for at in (None, 2.0))]
+)
 def test_the_index_is_found_from_any_start(ball, seen, start):
     evidence, views = seen
     looks = []

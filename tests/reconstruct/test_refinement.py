@@ -226,6 +226,7 @@ def _finned(points):
     return np.minimum(bodies.ball(points, radius=0.6), fin)
 
 
+@pytest.mark.slow
 def test_denoising_goes_as_far_as_masks_allow():
     cameras = bodies.cameras_around(8, size=96)
     views = Views(bodies.masks_of(_finned, cameras, steps=200), cameras)

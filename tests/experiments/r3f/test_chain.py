@@ -5,17 +5,29 @@ import functools
 import json
 import shutil
 import sys
+from types import SimpleNamespace
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from experiments.r3f import chain, geometry_stage, index_stage, records, report, stages
+from experiments.r3f import (
+    body,
+    body_pixels,
+    chain,
+    geometry_stage,
+    index_stage,
+    light_stage,
+    records,
+    report,
+    stages,
+)
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import stored_normals
 from refref_jax.geometry.corner_normals import corner_normals
 from refref_jax.reconstruct.comparison import compare_meshes
 from refref_jax.reconstruct.index_search import Descent, IndexEstimate
+from refref_jax.reconstruct.light_refinement import Refined
 from tests.experiments.r3f.small_scene import RADIUS, without_masks, write_scene
 
 _CONFIG = ReconstructionConfig("hull", 20, 0, 1.5, 0, 0)
@@ -47,6 +59,10 @@ def blind(scene, tmp_path_factory):
 
 def _run(scene, out, config=_CONFIG, *, compare=True):
     return chain.reconstruct(scene, out, config, compare=compare, say=lambda text: None)
+
+
+def _slow(*values):
+    return pytest.param(*values, marks=pytest.mark.slow)
 
 
 def _contents(out):
@@ -143,12 +159,12 @@ def _killing(function, *, after=False, calls=1):
     ("target", "options"),
     [
         ("experiments.r3f.geometry_stage.refine", {}),
-        ("refref_jax.data.stored_normals.write_mesh", {"after": True}),  # before it is renamed
+        _slow("refref_jax.data.stored_normals.write_mesh", {"after": True}),  # before the renaming
         ("experiments.r3f.geometry_stage.run", {"after": True}),  # renamed, not recorded
-        ("experiments.r3f.records.write", {"calls": 2, "after": True}),  # between two stages
-        ("experiments.r3f.surface_pictures.draw_surface", {"after": True}),
+        _slow("experiments.r3f.records.write", {"calls": 2, "after": True}),  # between two stages
+        _slow("experiments.r3f.surface_pictures.draw_surface", {"after": True}),
         ("experiments.r3f.pages.markdown", {}),
-        ("experiments.r3f.records.write", {"calls": 4}),  # all done, not recorded
+        _slow("experiments.r3f.records.write", {"calls": 4}),  # all done, not recorded
     ],
 )
 def test_whatever_is_killed_comes_to_the_same_files(scene, blind, tmp_path, target, options):
@@ -254,6 +270,53 @@ def test_an_index_that_is_not_given_is_estimated_once(scene, tmp_path, monkeypat
     assert (found.index.source, found.index.index, found.index.error) == ("estimated", 1.48, 0.01)
     assert "1.4800** ± 0.0100" in (tmp_path / "out" / "report.md").read_text()
     assert chain.read_part(tmp_path / "out").index == 1.48
+
+
+@pytest.mark.parametrize(("after", "kept"), [(0.03, True), (0.05, False)])
+def test_light_is_kept_only_where_validation_views_say_so(
+    scene, whole, tmp_path, monkeypatch, after, kept
+):
+    """What learns and descends is tested elsewhere; here only what is done with its results."""
+    out, judged = tmp_path / "out", tmp_path / scene.name
+    shutil.copytree(whole, out)
+    shutil.copytree(scene, judged)
+    shutil.copy(judged / "transforms_test.json", judged / "transforms_val.json")
+    config = dataclasses.replace(_CONFIG, light_steps=7)
+    records.write(out, dataclasses.replace(records.read(out), config=config, report=None))
+    old = body.read_mesh(out, records.read(out))
+    looked, errors = [], [0.04, after]
+
+    def look(folder, split, model, *, seed, rays):
+        looked.append((split, seed))
+        return body_pixels.BodyPixels(SimpleNamespace(rgb=np.zeros(rays)), None)
+
+    def refine_by_light(mesh, index, interfaces, evidence, *, config, settings, progress):
+        assert settings.steps == 7 and index == 1.5 and interfaces.index_inside.shape == (1,)
+        return Refined(mesh._replace(vertices=1.01 * mesh.vertices), 1.51, (0.04,) * 7, 0.02)
+
+    monkeypatch.setattr(body_pixels, "look", look)
+    monkeypatch.setattr(light_stage, "refine_by_light", refine_by_light)
+    monkeypatch.setattr(light_stage, "_error", lambda *_: errors.pop(0))
+    background = SimpleNamespace(config=None)
+    monkeypatch.setattr(index_stage, "learn_background", lambda *_, seed: background)
+    for _ in range(2):
+        found = _run(judged, out, config, compare=False)
+    assert looked == [("val", 1), ("train", 0)]
+    facts = found.light
+    assert (facts.kept, facts.before, facts.after, facts.steps) == (kept, 0.04, after, 7)
+    part = chain.read_part(out)
+    grown = np.ptp(part.vertices) / np.ptp(old.vertices)
+    assert part.index == (1.51 if kept else 1.5) and grown == pytest.approx(1.01 if kept else 1.0)
+    told = (out / "report.md").read_text()
+    assert ("(light/ball_glass.ply)" in told) == kept and ("; left out" in told) != kept
+
+
+def test_light_asks_for_masks_of_validation_views(scene, tmp_path):
+    without = tmp_path / "cube_smcvx_ball"
+    shutil.copytree(scene, without)
+    with pytest.raises(ValueError, match="transforms_val"):
+        _run(without, tmp_path / "out", dataclasses.replace(_CONFIG, light_steps=1))
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_estimate_that_is_no_number_is_no_result(scene, tmp_path, monkeypatch):
