@@ -1,0 +1,70 @@
+"""Claim: the index of refraction is found within 0.005 with the true mesh, within 0.02 without.
+
+    python -m benchmarks.r3f_index [--scenes=FOLDER,FOLDER] [--starts=1.2,2.0] [--bodies=true,masks]
+
+For each scene of one body a background is learned beside it, and the index is looked for with the
+scene's own mesh and with the one that masks give, from every start. A table shows what was found, one
+standard deviation, and the truth, which is what the scene says of its mesh. What is learned or
+reconstructed is used again.
+"""
+
+import time
+from pathlib import Path
+
+from absl import app, flags
+
+from experiments.r3f import body, chain, index_stage
+from experiments.r3f.records import ReconstructionConfig
+from refref_jax.data import meshes
+from refref_jax.data.geometry import shading_normals
+from refref_jax.reconstruct.triangles import Mesh
+
+_BODIES = {"true": 0.005, "masks": 0.02}
+
+_SCENES = flags.DEFINE_list("scenes", ["experiments/data/cube_smcvx_ball"], "Folders of scenes.")
+_STARTS = flags.DEFINE_list("starts", ["1.2", "2.0"], "Indices to descend from, besides others.")
+_BODY = flags.DEFINE_list("bodies", list(_BODIES), "Meshes to look with: 'true', 'masks'.")
+_OUT = flags.DEFINE_string("out", "runs/r3f_index", "Where to write.")
+
+_CELLS = 128
+
+
+def main(arguments: list[str]) -> None:
+    del arguments
+    starts = [float(start) for start in _STARTS.value]
+    rows, wrong = [], []
+    for scene in map(Path, _SCENES.value):
+        name, out = scene.resolve().name, Path(_OUT.value) / scene.resolve().name
+        (part,) = meshes.read_meshes(scene)
+        for kind in _BODY.value:
+            mesh = _true_mesh(part) if kind == "true" else _mesh_of_masks(scene, out)
+            for start in starts:
+                begun = time.monotonic()
+                found = index_stage.run(scene, mesh, out, seed=0, start=start)
+                seconds = time.monotonic() - begun
+                rows.append(
+                    f"| {name} | {kind} | {start:g} | {found.index:.4f} ± {found.deviation:.4f} "
+                    f"| {part.index:g} | {seconds:.0f} |"
+                )
+                print(rows[-1], flush=True)
+                if abs(found.index - part.index) > _BODIES[kind]:
+                    wrong.append(rows[-1])
+    print("\n| scene | mesh | start | index | truth | seconds |\n|---|---|---|---|---|---|")
+    print("\n".join(rows))
+    assert not wrong, "\n".join(["the index is too far off:", *wrong])
+
+
+def _true_mesh(part: meshes.MeshPart) -> Mesh:
+    return Mesh(part.vertices, part.faces, shading_normals(part))
+
+
+def _mesh_of_masks(scene: Path, out: Path) -> Mesh:
+    """Reconstructs a body as the command does, with an index that nobody looks at."""
+    folder = out / "reconstruction"
+    config = ReconstructionConfig("hull", _CELLS, 0, 1.5, 0, 0)
+    found = chain.reconstruct(scene, folder, config, compare=True)
+    return body.read_mesh(folder, found)
+
+
+if __name__ == "__main__":
+    app.run(main)
