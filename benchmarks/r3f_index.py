@@ -3,8 +3,8 @@
     python -m benchmarks.r3f_index [--scenes=FOLDER,FOLDER] [--starts=1.2,2.0] [--bodies=true,masks]
 
 For each scene of one body a background is learned beside it, and the index is looked for with the
-scene's own mesh and with the one that masks give, from every start. A table shows what was found, one
-standard deviation, and the truth, which is what the scene says of its mesh. What is learned or
+scene's own mesh and with the one that masks give, from every start. A table shows what was found,
+one standard deviation, and the truth, which is what the scene says of its mesh. What is learned or
 reconstructed is used again.
 """
 
