@@ -61,7 +61,7 @@ def _true_mesh(part: meshes.MeshPart) -> Mesh:
 def _mesh_of_masks(scene: Path, out: Path) -> Mesh:
     """Reconstructs a body as the command does, with an index that nobody looks at."""
     folder = out / "reconstruction"
-    config = ReconstructionConfig("hull", _CELLS, 0, 1.5, 0, 0)
+    config = ReconstructionConfig("hull", _CELLS, 0, 1.5, None, None, 0, 0)
     found = chain.reconstruct(scene, folder, config, compare=True)
     return body.read_mesh(folder, found)
 

@@ -30,6 +30,7 @@ from refref_jax.reconstruct.grids import Grid
 from refref_jax.reconstruct.isosurface import find_isosurface
 from refref_jax.reconstruct.occupancy_config import OccupancyTrainingConfig
 from refref_jax.reconstruct.refinement import Refinement, refine
+from refref_jax.reconstruct.silhouettes import Views
 from refref_jax.reconstruct.triangles import Mesh, make_mesh, volume
 from refref_jax.reconstruct.visual_hull import carve
 
@@ -59,8 +60,10 @@ def main(arguments: list[str]) -> None:
     for kind in _MASKS.value:
         refined = {}
         for body, make in _bodies(kind).items():
-            mesh = find_isosurface(make(_altered(kind, masks), frames.cameras))
-            for stage, shown in (("raw", mesh), ("refined", refine(mesh, Refinement())[-1].mesh)):
+            views = Views(_altered(kind, masks), frames.cameras)
+            mesh = find_isosurface(make(*views))
+            better = refine(mesh, Refinement(), views=views)[-1].mesh
+            for stage, shown in (("raw", mesh), ("refined", better)):
                 refined[body] = _row((kind, body, stage), shown, truth, others)
         if kind == "given":
             _check(refined)

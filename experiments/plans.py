@@ -83,13 +83,13 @@ _PRECISION = flags.DEFINE_enum(
     "Arithmetic of the fields; the preset's if not given.",
 )
 flags.adopt_module_key_flags(scenes)
-_BACKGROUND = flags.DEFINE_enum(
+BACKGROUND = flags.DEFINE_enum(
     "background",
     "auto",
     ["auto", "bounded", "unbounded"],
     "Whether there are walls, or an environment infinitely far away.",
 )
-_RADIUS = flags.DEFINE_float(
+RADIUS = flags.DEFINE_float(
     "radius",
     None,
     "Half edge of the cube on whose faces a bounded scene's background stands (by default that of "
@@ -116,8 +116,8 @@ SETTLED = (
     _PRECISION,
     scenes.RULE,
     scenes.IOR,
-    _BACKGROUND,
-    _RADIUS,
+    BACKGROUND,
+    RADIUS,
     _STEPS,
     _BATCH,
     SEED,
@@ -149,14 +149,24 @@ def plan_from_flags(*, body: MeshPart | None = None) -> Plan:
         options=_options(),
         rule=scenes.RULE.value,
         indices=scenes.given_indices() if body is None else {body.name: body.index},
-        space=None if _BACKGROUND.value == "auto" else _BACKGROUND.value,
-        radius=_RADIUS.value,
+        space=None if BACKGROUND.value == "auto" else BACKGROUND.value,
+        radius=RADIUS.value,
         steps=_STEPS.value,
         batch=_BATCH.value,
         seed=SEED.value,
         parts=None if body is None else [body],
     )
     return planning.make_plan(request)
+
+
+def check_options() -> None:
+    """Refuses options that make no sense, before anything else is done.
+
+    Raises:
+      ValueError: if one does not.
+    """
+    _wishes()
+    _options()
 
 
 def _wishes() -> Wishes:

@@ -29,6 +29,7 @@ def main() -> None:
     """Plans a run, or finds the one to resume, and trains it."""
     run = Path(_OUT.value)
     if not _begin(run):
+        print(f"Continue with --resume --out={run}.")
         sys.exit(commands.INTERRUPTED)
     print(f"Run: {run}  (metrics.jsonl, checkpoints/)")
     print(f"Next: {commands.shell('evaluate', f'--run={run}', '--split=test')}")
@@ -39,6 +40,7 @@ def _begin(run: Path) -> bool:
     resuming = _RESUME.value and run_folder.exists(run)
     if not resuming:
         run_folder.check_free(run)
+        plans.check_options()
         body = training_body.find(run, resume=_RESUME.value)
         plan = plans.plan_from_flags(body=body)
         training_body.note(run, body)

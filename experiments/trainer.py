@@ -108,7 +108,7 @@ def _train(
             if interrupt.requested:
                 break
     if step < total:
-        print(f"Stopped at step {step}. Continue with --resume --out={run}.")
+        print(f"Stopped at step {step}.")
     return step == total
 
 

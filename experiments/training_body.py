@@ -56,7 +56,8 @@ def find(run: Path, *, resume: bool) -> MeshPart | None:
     out = _folder(run)
     if RECONSTRUCTION.value is not None:
         body = chain.read_part(out)
-        if chain.fingerprint(plans.opened_scene()) != records.read(out).inputs:
+        begun = records.read(out)
+        if chain.fingerprint(plans.opened_scene(), begun.config) != begun.inputs:
             print(
                 f"warning: {out} was reconstructed from other images, masks or poses than those of "
                 f"{plans.SCENE.value}. Make sure that it is the same object in the same place."
@@ -66,7 +67,12 @@ def find(run: Path, *, resume: bool) -> MeshPart | None:
         raise ValueError(
             f"{out} holds a reconstruction already. Continue with --resume, or give another --out."
         )
-    config = reconstruction_options.chosen(index=index, seed=plans.SEED.value)
+    config = reconstruction_options.chosen(
+        index=index,
+        background=plans.BACKGROUND.value,
+        radius=plans.RADIUS.value,
+        seed=plans.SEED.value,
+    )
     try:
         chain.reconstruct(plans.opened_scene(), out, config, compare=False)
     except KeyboardInterrupt:

@@ -37,6 +37,7 @@ _MAY_JIT = {
     "training/steps.py",
     "reconstruct/occupancy_training.py",
     "geometry/native_loop.py",
+    "reconstruct/light_refinement.py",
     "reconstruct/photometry.py",
 }
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from experiments.r3f import geometry_stage, light_stage
-from experiments.r3f.records import Reconstruction
+from experiments.r3f.records import IndexFacts, Reconstruction
 from refref_jax.data import meshes
 from refref_jax.data.geometry import shading_normals
 from refref_jax.data.meshes import MeshPart
@@ -17,15 +17,15 @@ def surface_file(out: Path, found: Reconstruction) -> Path:
     return out / folder / found.geometry.mesh
 
 
-def index(found: Reconstruction) -> float:
+def index_facts(found: Reconstruction) -> IndexFacts:
     """Returns the index of refraction that goes with the surface."""
-    refined = found.light is not None and found.light.kept
-    return found.light.index if refined else found.index.index
+    moved = found.light is not None and found.light.kept and found.index.source == "estimated"
+    return IndexFacts("refined", found.light.index, None, None) if moved else found.index
 
 
 def read_part(out: Path, found: Reconstruction) -> MeshPart:
     """Reads the body as what light is traced through."""
-    return meshes.read_part(surface_file(out, found), index=index(found))
+    return meshes.read_part(surface_file(out, found), index=index_facts(found).index)
 
 
 def read_mesh(out: Path, found: Reconstruction) -> Mesh:

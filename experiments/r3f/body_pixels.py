@@ -38,9 +38,17 @@ def look(scene: Path, split: str, model: Model, *, seed: int, rays: int) -> Body
       model: of the background.
       seed: of the choice.
       rays: how many, about; fewer where masks have no more.
+
+    Raises:
+      ValueError: if there are no masks, or they are too thin to have an inside.
     """
     frames = local_layout.read_frames(scene, split)
     inside = mask_margins.well_inside(local_layout.read_masks(frames))
+    if not inside.any():
+        raise ValueError(
+            f"No pixel of the {split} views of {scene} lies inside of a mask and off its outline. "
+            "Use larger images, or check the masks."
+        )
     generator = np.random.default_rng(seed)
     each = -(-rays // len(inside))
     chosen = []

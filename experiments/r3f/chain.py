@@ -50,9 +50,9 @@ def reconstruct(
         body fits the masks, or if the folder holds anything else.
     """
     import_skimage()
-    for split in ("train", "val")[: 1 + (config.light_steps > 0)]:
+    for split in _splits(config):
         local_layout.read_masks(local_layout.read_frames(scene, split))
-    asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene), config)
+    asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene, config), config)
     found = records.begin(out, asked)
     with run_lock.hold(out):
         found = records.read(out)  # another process may have finished it meanwhile
@@ -65,14 +65,10 @@ def reconstruct(
         if found.index is None:
             found = dataclasses.replace(found, index=_index(scene, out, found), report=None)
             records.write(out, found)
-        with stages.unfinished_file(out / INDEX_FILE) as path:
-            configuration.write(path, found.index)
         say(describe_index(found.index))
-        if found.light is None and config.light_steps > 0:
-            found = dataclasses.replace(found, light=_light(scene, out, found), report=None)
-            records.write(out, found)
-        if found.light is not None:
-            say(_describe_light(found.light))
+        found = _refined(scene, out, found, say)
+        with stages.unfinished_file(out / INDEX_FILE) as path:
+            configuration.write(path, body.index_facts(found))
         if found.report is None or not report.is_there(out):
             found = dataclasses.replace(found, report=report.run(scene, out, found, compare))
             records.write(out, found)
@@ -88,24 +84,33 @@ def read_part(out: Path) -> MeshPart:
     """
     found = records.read(out)
     waits_for_light = found.config.light_steps > 0 and found.light is None
-    if found.geometry is None or found.index is None or waits_for_light:
+    if (
+        found.geometry is None
+        or found.index is None
+        or waits_for_light
+        or not body.surface_file(out, found).is_file()
+    ):
         raise ValueError(
             f"The reconstruction in {out} is not finished. Repeat the command that began it."
         )
     return body.read_part(out, found)
 
 
-def fingerprint(scene: Path) -> str:
-    """Returns a hash of what a reconstruction is made from: training images, masks and poses.
+def fingerprint(scene: Path, config: ReconstructionConfig) -> str:
+    """Returns a hash of what a reconstruction is made from: images, masks and poses.
+
+    They are those of the training views; with light, those that judge it as well.
 
     Raises:
       ValueError: if a file is missing, or the transforms file is broken.
     """
-    frames = local_layout.read_frames(scene, "train")
-    found = hashlib.sha256(frames.cameras.poses.tobytes())
-    found.update(repr(frames.cameras.focal).encode())
-    for path in (*frames.images, *(frames.masks or ())):
-        found.update(hashlib.sha256(path.read_bytes()).digest())
+    found = hashlib.sha256()
+    for split in _splits(config):
+        frames = local_layout.read_frames(scene, split)
+        found.update(frames.cameras.poses.tobytes())
+        found.update(repr(frames.cameras.focal).encode())
+        for path in (*frames.images, *(frames.masks or ())):
+            found.update(hashlib.sha256(path.read_bytes()).digest())
     return found.hexdigest()
 
 
@@ -123,7 +128,9 @@ def _index(scene: Path, out: Path, found: Reconstruction) -> IndexFacts:
     folder = out / _INDEX_FOLDER
     folder.mkdir(exist_ok=True)
     mesh = body.read_mesh(out, found)
-    estimate = index_stage.run(scene, mesh, folder, seed=config.seed)
+    estimate = index_stage.run(
+        scene, mesh, folder, seed=config.seed, space=config.space, radius=config.radius
+    )
     if not math.isfinite(estimate.deviation):
         raise ValueError(
             f"The index of refraction was estimated as {estimate.index:.3f}, but no other would be "
@@ -132,14 +139,33 @@ def _index(scene: Path, out: Path, found: Reconstruction) -> IndexFacts:
     return IndexFacts("estimated", estimate.index, estimate.deviation, estimate.error)
 
 
+def _splits(config: ReconstructionConfig) -> tuple[str, ...]:
+    """Returns the splits that a reconstruction looks at, but for its report."""
+    return ("train", "val") if config.light_steps > 0 else ("train",)
+
+
+def _refined(scene: Path, out: Path, found: Reconstruction, say: Say) -> Reconstruction:
+    """Refines by light, if that is asked for and not done."""
+    there = found.light is not None and body.surface_file(out, found).is_file()
+    if found.config.light_steps > 0 and not there:
+        bare = dataclasses.replace(found, light=None, report=None)
+        found = dataclasses.replace(bare, light=_light(scene, out, bare))
+        records.write(out, found)
+    if found.light is not None:
+        say(_describe_light(found.light))
+    return found
+
+
 def _light(scene: Path, out: Path, found: Reconstruction) -> LightFacts:
     folder, seed = out / _INDEX_FOLDER, found.config.seed
     folder.mkdir(exist_ok=True)
     return light_stage.run(
         scene,
         body.read_mesh(out, found),
-        found.index.index,
-        index_stage.learn_background(scene, folder, seed=seed),
+        found.index,
+        index_stage.learn_background(
+            scene, folder, seed=seed, space=found.config.space, radius=found.config.radius
+        ),
         out / light_stage.FOLDER / found.geometry.mesh,
         steps=found.config.light_steps,
         seed=seed,

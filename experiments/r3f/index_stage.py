@@ -27,6 +27,7 @@ from refref_jax.render import saved
 from refref_jax.render.config import ModelConfig
 from refref_jax.render.model import Model
 from refref_jax.render.saved import SavedModel
+from refref_jax.sampling.domains import Space
 from refref_jax.training import run_folder, run_lock
 from refref_jax.training.config import SceneConfig, TrainingConfig
 
@@ -49,6 +50,8 @@ def run(
     folder: Path,
     *,
     seed: int,
+    space: Space | None = None,
+    radius: float | None = None,
     start: float | None = None,
     steps: int = STEPS,
     rays: int = RAYS,
@@ -60,6 +63,8 @@ def run(
       mesh: the body.
       folder: for the background's run and the figure.
       seed: of everything random.
+      space: whether there are walls; what the scene says if not given.
+      radius: of the walls' cube or the uncontracted ball, world units; likewise.
       start: an index to descend from besides those of the search.
       steps: of the background's training.
       rays: pixels to fit.
@@ -68,7 +73,7 @@ def run(
       ValueError: if the scene has no masks, or no pixel beside them.
       KeyboardInterrupt: if the background's training was stopped; it has been saved.
     """
-    model = learn_background(scene, folder, seed=seed, steps=steps)
+    model = learn_background(scene, folder, seed=seed, space=space, radius=radius, steps=steps)
     evidence, views = body_pixels.look(scene, "train", model, seed=seed, rays=rays)
     search = IndexSearch()
     with commands.ProgressBar("index", most_looks(search, start)) as bar:
@@ -86,13 +91,23 @@ def run(
     return found
 
 
-def learn_background(scene: Path, folder: Path, *, seed: int, steps: int = STEPS) -> Model:
+def learn_background(
+    scene: Path,
+    folder: Path,
+    *,
+    seed: int,
+    space: Space | None = None,
+    radius: float | None = None,
+    steps: int = STEPS,
+) -> Model:
     """Returns the field of what is behind the body; trains it first, or goes on with that.
 
     Args:
       scene: folder of the scene.
       folder: of the stage.
       seed: of everything random.
+      space: see `run`.
+      radius: likewise.
       steps: of its training.
 
     Raises:
@@ -101,7 +116,8 @@ def learn_background(scene: Path, folder: Path, *, seed: int, steps: int = STEPS
     """
     run = folder / "background"
     if not run_folder.exists(run):
-        config, model = _plan(scene, seed=seed, steps=steps)
+        extent = _bounds(scene, space, radius)
+        config, model = _plan(scene, extent, seed=seed, steps=steps)
         nothing = build_geometry([], [], rule="nested")
         run_folder.create(run, config, SavedModel(model, STRAIGHT), nothing)
     with run_lock.hold(run):
@@ -126,12 +142,18 @@ def draw(path: Path, found: IndexEstimate) -> None:
     pyplot.close(figure)
 
 
-def _plan(scene: Path, *, seed: int, steps: int) -> tuple[TrainingConfig, ModelConfig]:
-    preset = presets.PRESETS[PRESET]
+def _bounds(scene: Path, space: Space | None, radius: float | None) -> presets.Bounds:
     cameras = local_layout.read_frames(scene, "train").cameras
-    space = background.space(scene)
-    radius = background.half_extent(scene) if space == "bounded" else None
-    model = preset.model(presets.bounds(cameras, space=space, radius=radius), "clear")
+    space = space or background.space(scene)
+    told = background.half_extent(scene) if space == "bounded" else None
+    return presets.bounds(cameras, space=space, radius=radius or told)
+
+
+def _plan(
+    scene: Path, extent: presets.Bounds, *, seed: int, steps: int
+) -> tuple[TrainingConfig, ModelConfig]:
+    preset = presets.PRESETS[PRESET]
+    model = preset.model(extent, "clear")
     config = TrainingConfig(
         scene=SceneConfig(str(scene), "nested", ()),
         paths="straight",

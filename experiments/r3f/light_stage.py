@@ -3,9 +3,10 @@
     {out}/light/{object}_{material}.ply    the refined surface
 
 It is kept only if it explains pixels better that it was not fitted to: those of the validation
-views. Scenes without such views are refused.
+views, and only if it is still the same body. Scenes without such views are refused.
 """
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,11 @@ import numpy as np
 from experiments import commands
 from experiments.r3f import body_pixels, stages
 from experiments.r3f.body_pixels import BodyPixels
-from experiments.r3f.records import LightFacts
+from experiments.r3f.records import IndexFacts, LightFacts
 from refref_jax.data import stored_normals
 from refref_jax.reconstruct import photometry
 from refref_jax.reconstruct.light_refinement import LightRefinement, refine_by_light
+from refref_jax.reconstruct.soundness import objection
 from refref_jax.reconstruct.triangles import Mesh
 from refref_jax.render.model import Model
 
@@ -26,16 +28,19 @@ FOLDER = "light"
 _SEEN = 60_000
 _JUDGES = 8192
 
+# Share of the volume that light may change: it mends normals, not outlines.
+_VOLUME_CHANGE = 0.02
+
 
 def run(
-    scene: Path, mesh: Mesh, index: float, model: Model, target: Path, *, steps: int, seed: int
+    scene: Path, mesh: Mesh, known: IndexFacts, model: Model, target: Path, *, steps: int, seed: int
 ) -> LightFacts:
     """Refines a body, and writes it if it is better.
 
     Args:
       scene: its folder; training and validation images and masks are read.
       mesh: the body.
-      index: its index of refraction.
+      known: its index of refraction, which stays as it is if it was given.
       model: of the background.
       target: the file, in a folder of its own.
       steps: of the descent.
@@ -44,6 +49,9 @@ def run(
     Raises:
       ValueError: if there is no validation split with masks.
     """
+    index, settings = known.index, LightRefinement(steps=steps, seed=seed)
+    if known.source == "given":
+        settings = dataclasses.replace(settings, index_stride=0.0)
     judges = body_pixels.look(scene, "val", model, seed=seed + 1, rays=_JUDGES)
     seen = body_pixels.look(scene, "train", model, seed=seed, rays=_SEEN)
     with commands.ProgressBar("light", steps) as bar:
@@ -53,12 +61,12 @@ def run(
             body_pixels.body_geometry(mesh, index).interfaces,
             seen.evidence,
             config=model.config,
-            settings=LightRefinement(steps=steps, seed=seed),
+            settings=settings,
             progress=lambda step, error: bar.show(step, f"error {error:.4f}"),
         )
     before = _error(mesh, index, judges, model)
     after = _error(found.mesh, found.index, judges, model)
-    kept = after < before
+    kept = after < before and not objection(mesh, found.mesh, _VOLUME_CHANGE)
     if kept:
         with stages.unfinished_folder(target.parent) as folder:
             stored_normals.write_mesh(folder / target.name, *found.mesh)

@@ -49,7 +49,7 @@ def _of_index(index: IndexFacts) -> str:
 
 
 def _table(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
-    geometry, index = found.geometry, found.index
+    geometry, index = found.geometry, body.index_facts(found)
     error = "" if index.error is None else f" ± {index.error:.4f} (one standard deviation)"
     surface = body.surface_file(out, found).relative_to(out)
     rows = [

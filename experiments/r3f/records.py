@@ -3,7 +3,8 @@
     {out}/reconstruction.json        all of it, readable; written anew after every stage
     {out}/geometry/*.ply             the surface, with its shading normals
     {out}/index/                     what the estimation of the index keeps
-    {out}/index.json                 the index of refraction
+    {out}/light/*.ply                the surface refined by light, if that bettered it
+    {out}/index.json                 the index of refraction that goes with the surface
     {out}/pictures/*.png, report.md  the report
 
 A stage that is `None` is not finished. What is written holds no times, so that a reconstruction
@@ -16,6 +17,7 @@ from typing import Literal
 
 from experiments.r3f import stages
 from refref_jax import configuration
+from refref_jax.sampling.domains import Space
 
 FILE = "reconstruction.json"
 
@@ -29,6 +31,8 @@ class ReconstructionConfig:
       resolution: cells along the longest edge of the grid.
       outliers: views that may be wrong.
       index: the index of refraction, or `None` to estimate it.
+      space: whether there are walls, or `None` for what the scene says.
+      radius: of the walls' cube or the uncontracted ball, world units; `None` likewise.
       light_steps: of the refinement by light; 0 leaves it out.
       seed: of everything random.
     """
@@ -37,6 +41,8 @@ class ReconstructionConfig:
     resolution: int
     outliers: int
     index: float | None
+    space: Space | None
+    radius: float | None
     light_steps: int
     seed: int
 
@@ -75,13 +81,13 @@ class IndexFacts:
     """The index of refraction.
 
     Attributes:
-      source: whether it was given or estimated.
+      source: whether it was given or estimated, or found together with the surface by light.
       index: relative to air.
       error: one standard deviation, of an estimate.
       loss: photometric loss of an estimate.
     """
 
-    source: Literal["given", "estimated"]
+    source: Literal["given", "estimated", "refined"]
     index: float
     error: float | None
     loss: float | None
@@ -199,7 +205,9 @@ def begin(out: Path, asked: Reconstruction) -> Reconstruction:
     if not exists(out):
         if out.exists() and not out.is_dir():
             raise ValueError(f"{out} is a file, but a folder is needed. Give another --out.")
-        if out.is_dir() and any(out.iterdir()):
+        if out.is_dir() and any(
+            each.name != stages.beside(out / FILE).name for each in out.iterdir()
+        ):
             raise ValueError(
                 f"{out} holds something else than a reconstruction. Give a new folder as --out."
             )
@@ -212,23 +220,29 @@ def begin(out: Path, asked: Reconstruction) -> Reconstruction:
             f"{out} was made from other images, masks or poses, of {begun.scene}. Give the scene "
             "that it was begun with, or another --out."
         )
-    if changed := _changed(begun.config, asked.config):
+    if changed := _changed(begun, asked.config):
         raise ValueError(
             f"{out} was begun with other options: {', '.join(changed)}. Give those again, or "
             "another --out."
         )
+    if begun.config != asked.config:
+        begun = dataclasses.replace(begun, config=asked.config)
+        write(out, begun)
     return begun
 
 
-def _changed(begun: ReconstructionConfig, asked: ReconstructionConfig) -> list[str]:
-    """Says which options differ, as they were; an index that is `None` is called estimated."""
-    before, now = dataclasses.asdict(begun), dataclasses.asdict(asked)
+def _changed(begun: Reconstruction, asked: ReconstructionConfig) -> list[str]:
+    """Says which options of finished stages differ, as they were; `None` is called estimated."""
+    before, now = dataclasses.asdict(begun.config), dataclasses.asdict(asked)
     return [
         f"{_OPTIONS.get(name, name)} {'estimated' if value is None else value}, not "
         f"{'estimated' if now[name] is None else now[name]}"
         for name, value in before.items()
-        if value != now[name]
+        if value != now[name] and getattr(begun, _STAGES.get(name, "geometry")) is not None
     ]
 
 
-_OPTIONS = {"index": "ior"}
+_OPTIONS = {"index": "ior", "space": "background"}
+
+# The first stage that an option matters to, where that is not the geometry.
+_STAGES = {"index": "index", "space": "index", "radius": "index", "light_steps": "light"}

@@ -12,22 +12,23 @@ from pathlib import Path
 @contextlib.contextmanager
 def unfinished_folder(target: Path) -> Iterator[Path]:
     """Yields an empty folder that takes the place of the target when the context ends well."""
-    beside = _beside(target)
-    shutil.rmtree(beside, ignore_errors=True)
-    beside.mkdir()
-    yield beside
+    draft = beside(target)
+    shutil.rmtree(draft, ignore_errors=True)
+    draft.mkdir()
+    yield draft
     if target.exists():
         shutil.rmtree(target)
-    beside.rename(target)
+    draft.rename(target)
 
 
 @contextlib.contextmanager
 def unfinished_file(target: Path) -> Iterator[Path]:
     """Yields the path of a file that takes the place of the target when the context ends well."""
-    beside = _beside(target)
-    yield beside
-    beside.replace(target)
+    draft = beside(target)
+    yield draft
+    draft.replace(target)
 
 
-def _beside(target: Path) -> Path:
+def beside(target: Path) -> Path:
+    """Returns the name of a target as long as it is not whole."""
     return target.with_name(f".{target.name}.unfinished")

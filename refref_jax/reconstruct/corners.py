@@ -101,7 +101,7 @@ def fit_corners(mesh: Mesh, candidates: Mesh, views: Views, *, most: int = MOST)
     if new <= old:
         raise ReconstructionError(
             f"{len(body.vertices)} corners overlap with the masks by {new:.4f}, the mesh by "
-            f"{old:.4f}. Keep the mesh, which is rounder, or allow more than {most} corners."
+            f"{old:.4f}. Keep the mesh, which is rounder."
         )
     return body
 

@@ -37,6 +37,7 @@ _GROW, _SHRINK = 1.3, 0.4
 
 # Half the width of the parabola that the error bar is taken from, and groups of views.
 _APART = 0.01
+_PARABOLA = (-_APART, 0.0, _APART)
 _GROUPS = 10
 
 
@@ -131,12 +132,13 @@ def estimate_index(
     Raises:
       ReconstructionError: if there is no pixel, or no error is finite.
     """
-    if len(views) == 0:
+    if not len(views):
         raise ReconstructionError("No pixel sees the body. Check the masks and the cameras.")
     rungs = _rungs(search)
     show = _counter(progress, most_looks(search, start))
 
     def errors(index: float) -> Float[np.ndarray, " rays"]:
+        show()
         return _errors(index, evidence, geometry, part=part, config=config)
 
     def slope(index: float) -> tuple[float, float]:
@@ -145,26 +147,25 @@ def estimate_index(
         found = photometry.slope_at_index(at, evidence, geometry, part=part, config=config)
         return float(found.error), float(found.slope)
 
-    heights = []
-    for rung in rungs:
-        show()
-        heights.append(float(errors(rung).mean()))
+    heights = tuple(float(errors(rung).mean()) for rung in rungs)
     if not np.any(np.isfinite(heights)):
         raise ReconstructionError(
             "No error of a pixel is finite. Check the field that the pixels are compared with."
         )
     starts = [rungs[i] for i in _lowest_rungs(heights, search.descents)]
     starts += [] if start is None else [start]
-    ways = sorted((descend(slope, at, search) for at in starts), key=lambda way: way.errors[-1])
+    ways = [descend(slope, at, search) for at in starts]
+    ways.sort(key=lambda way: way.errors[-1] if math.isfinite(way.errors[-1]) else math.inf)
     best = ways[0].indices[-1]
-    triple = np.stack([errors(best + shift) for shift in (-_APART, 0.0, _APART)])
+    triple = np.stack([errors(best + shift) for shift in _PARABOLA])
     deviation = scatter_of_bottoms(triple, views, _APART)
-    return IndexEstimate(best, deviation, ways[0].errors[-1], Descent(rungs, (*heights,)), (*ways,))
+    return IndexEstimate(best, deviation, ways[0].errors[-1], Descent(rungs, heights), tuple(ways))
 
 
 def most_looks(search: IndexSearch, start: float | None = None) -> int:
     """Returns how often the error of the pixels is looked at, at most."""
-    return len(_rungs(search)) + search.most * (search.descents + (start is not None))
+    descents = search.descents + (start is not None)
+    return len(_rungs(search)) + search.most * descents + len(_PARABOLA)
 
 
 def descend(

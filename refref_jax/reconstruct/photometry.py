@@ -68,7 +68,15 @@ def errors(
       geometry: what bends their light.
       config: of the field's model; its footprint must be `cone`.
       budget: which light is followed, see `main_branches`.
+
+    Raises:
+      ValueError: if the model's footprint is another.
     """
+    if config.footprint != "cone":
+        raise ValueError(
+            f"The model's footprint is {config.footprint!r}, but single paths carry no derivatives "
+            "across the pixel. Train the background with 'cone'."
+        )
     count = evidence.rays.radii.shape[0]
     follow = functools.partial(
         follow_main_branches, geometry, budget=budget, reflections=REFLECTIONS

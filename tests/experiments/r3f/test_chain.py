@@ -23,14 +23,15 @@ from experiments.r3f import (
     stages,
 )
 from experiments.r3f.records import ReconstructionConfig
-from refref_jax.data import stored_normals
+from refref_jax.data import local_layout, stored_normals
 from refref_jax.geometry.corner_normals import corner_normals
 from refref_jax.reconstruct.comparison import compare_meshes
 from refref_jax.reconstruct.index_search import Descent, IndexEstimate
 from refref_jax.reconstruct.light_refinement import Refined
 from tests.experiments.r3f.small_scene import RADIUS, without_masks, write_scene
+from tests.reconstruct import bodies
 
-_CONFIG = ReconstructionConfig("hull", 20, 0, 1.5, 0, 0)
+_CONFIG = ReconstructionConfig("hull", 20, 0, 1.5, None, None, 0, 0)
 
 
 @pytest.fixture(scope="module")
@@ -257,13 +258,14 @@ def _estimate(index, deviation):
 def test_an_index_that_is_not_given_is_estimated_once(scene, tmp_path, monkeypatch):
     asked = []
 
-    def estimate(folder_of_scene, mesh, folder, *, seed):
+    def estimate(folder_of_scene, mesh, folder, *, seed, space, radius):
+        assert (space, radius) == ("unbounded", 2.5)
         assert folder_of_scene == scene and folder.is_dir() and len(mesh.faces) > 100
         asked.append(seed)
         return _estimate(1.48, 0.01)
 
     monkeypatch.setattr(index_stage, "run", estimate)
-    config = dataclasses.replace(_CONFIG, index=None, seed=7)
+    config = dataclasses.replace(_CONFIG, index=None, seed=7, space="unbounded", radius=2.5)
     for _ in range(2):
         found = _run(scene, tmp_path / "out", config, compare=False)
     assert asked == [7]
@@ -282,7 +284,8 @@ def test_light_is_kept_only_where_validation_views_say_so(
     shutil.copytree(scene, judged)
     shutil.copy(judged / "transforms_test.json", judged / "transforms_val.json")
     config = dataclasses.replace(_CONFIG, light_steps=7)
-    records.write(out, dataclasses.replace(records.read(out), config=config, report=None))
+    inputs = chain.fingerprint(judged, config)
+    records.write(out, dataclasses.replace(records.read(out), inputs=inputs, report=None))
     old = body.read_mesh(out, records.read(out))
     looked, errors = [], [0.04, after]
 
@@ -292,13 +295,14 @@ def test_light_is_kept_only_where_validation_views_say_so(
 
     def refine_by_light(mesh, index, interfaces, evidence, *, config, settings, progress):
         assert settings.steps == 7 and index == 1.5 and interfaces.index_inside.shape == (1,)
-        return Refined(mesh._replace(vertices=1.01 * mesh.vertices), 1.51, (0.04,) * 7, 0.02)
+        assert settings.index_stride == 0.0
+        return Refined(mesh._replace(vertices=1.001 * mesh.vertices), 1.5, (0.04,) * 7, 0.02)
 
     monkeypatch.setattr(body_pixels, "look", look)
     monkeypatch.setattr(light_stage, "refine_by_light", refine_by_light)
     monkeypatch.setattr(light_stage, "_error", lambda *_: errors.pop(0))
     background = SimpleNamespace(config=None)
-    monkeypatch.setattr(index_stage, "learn_background", lambda *_, seed: background)
+    monkeypatch.setattr(index_stage, "learn_background", lambda *_, **options: background)
     for _ in range(2):
         found = _run(judged, out, config, compare=False)
     assert looked == [("val", 1), ("train", 0)]
@@ -306,9 +310,58 @@ def test_light_is_kept_only_where_validation_views_say_so(
     assert (facts.kept, facts.before, facts.after, facts.steps) == (kept, 0.04, after, 7)
     part = chain.read_part(out)
     grown = np.ptp(part.vertices) / np.ptp(old.vertices)
-    assert part.index == (1.51 if kept else 1.5) and grown == pytest.approx(1.01 if kept else 1.0)
+    assert grown == pytest.approx(1.001 if kept else 1.0)
     told = (out / "report.md").read_text()
     assert ("(light/ball_glass.ply)" in told) == kept and ("; left out" in told) != kept
+    # The index was given, so that light leaves it alone.
+    assert json.loads((out / "index.json").read_text())["index"] == part.index == 1.5
+    if kept:
+        (out / "light" / "ball_glass.ply").unlink()
+        with pytest.raises(ValueError, match="not finished"):
+            chain.read_part(out)
+        errors += [0.04, after]
+        assert _run(judged, out, config, compare=False) == found
+
+
+def test_a_body_that_light_blew_up_is_left_out(scene, monkeypatch, tmp_path):
+    mesh = bodies.icosphere(2)
+    blown = Refined(mesh._replace(vertices=1.05 * mesh.vertices), 1.6, (0.04,), 0.05)
+    pixels = body_pixels.BodyPixels(SimpleNamespace(rgb=np.zeros(3)), None)
+    monkeypatch.setattr(body_pixels, "look", lambda *_, **options: pixels)
+    monkeypatch.setattr(light_stage, "refine_by_light", lambda *_, **options: blown)
+    errors = [0.04, 0.01]
+    monkeypatch.setattr(light_stage, "_error", lambda *_: errors.pop(0))
+    known, target = records.IndexFacts("estimated", 1.5, 0.01, 0.04), tmp_path / "a" / "b.ply"
+    facts = light_stage.run(
+        scene, mesh, known, SimpleNamespace(config=None), target, steps=1, seed=0
+    )
+    assert not facts.kept and facts.after < facts.before and not target.parent.exists()
+
+
+def test_options_may_change_until_a_stage_has_used_them(scene, tmp_path):
+    hopeless = dataclasses.replace(_CONFIG, outliers=24)
+    with pytest.raises(ValueError, match="Pass over fewer"):
+        _run(scene, tmp_path / "out", hopeless)
+    asked = records.Reconstruction("", chain.fingerprint(scene, _CONFIG), _CONFIG)
+    assert records.begin(tmp_path / "out", asked).config == _CONFIG
+
+
+def test_a_folder_that_was_killed_while_it_was_opened_is_taken(scene, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / ".reconstruction.json.unfinished").write_text("{")
+    asked = records.Reconstruction("", chain.fingerprint(scene, _CONFIG), _CONFIG)
+    assert records.begin(out, asked) == asked == records.read(out)
+
+
+def test_masks_without_an_inside_are_refused(scene, tmp_path):
+    thin = shutil.copytree(scene, tmp_path / scene.name)
+    for path in local_layout.read_frames(thin, "train").masks:
+        lone = np.zeros((40, 40), np.uint8)
+        lone[20, 20] = 255
+        iio.imwrite(path, lone)
+    with pytest.raises(ValueError, match="Use larger images"):
+        body_pixels.look(thin, "train", None, seed=0, rays=10)
 
 
 def test_light_asks_for_masks_of_validation_views(scene, tmp_path):
@@ -320,11 +373,15 @@ def test_light_asks_for_masks_of_validation_views(scene, tmp_path):
 
 
 def test_an_estimate_that_is_no_number_is_no_result(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(index_stage, "run", lambda *_, seed: _estimate(1.5, np.inf))
+    monkeypatch.setattr(index_stage, "run", lambda *_, **options: _estimate(1.5, np.inf))
     with pytest.raises(ValueError, match="--ior"):
         _run(scene, tmp_path / "out", dataclasses.replace(_CONFIG, index=None))
     with pytest.raises(ValueError, match="not finished"):
         chain.read_part(tmp_path / "out")
+    # What the message advises is taken in the same folder, and only then settled.
+    assert _run(scene, tmp_path / "out", _CONFIG).index.source == "given"
+    with pytest.raises(ValueError, match=r"ior 1.5, not 1.6"):
+        _run(scene, tmp_path / "out", dataclasses.replace(_CONFIG, index=1.6))
     with pytest.raises(ValueError, match="no reconstruction"):
         chain.read_part(tmp_path)
 
