@@ -1,5 +1,7 @@
 """Writes nested frozen dataclasses as JSON text, and reads them back exactly.
 
+A field with a default may be missing, as it is in files of versions that did not know it.
+
 Fields may be numbers, strings, booleans, `None`, other dataclasses, and tuples of these.
 """
 
@@ -24,7 +26,7 @@ def read(path: Path, kind: type[_Config]) -> _Config:
 
     Raises:
       ValueError: if the file is missing or not JSON, or a key is missing, unknown or of the
-        wrong type; the message names the file and the key.
+        wrong type; the message names the file and the key. A key with a default may be missing.
     """
     if not path.is_file():
         raise ValueError(f"{path} does not exist. Give a folder that a command wrote.")
@@ -63,8 +65,10 @@ def _build_dataclass(kind: Any, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
         raise ValueError(f"{where} is {value!r}, not an object")
     hints = typing.get_type_hints(kind)
-    names = [field.name for field in dataclasses.fields(kind)]
-    if missing := set(names) - set(value):
+    fields = dataclasses.fields(kind)
+    names = [field.name for field in fields if field.name in value]
+    needed = {field.name for field in fields if field.default is dataclasses.MISSING}
+    if missing := needed - set(value):
         raise ValueError(f"{where} lacks {', '.join(map(repr, sorted(missing)))}")
     if unknown := set(value) - set(names):
         raise ValueError(f"{where} has the unknown {', '.join(map(repr, sorted(unknown)))}")

@@ -210,3 +210,20 @@ def test_a_record_that_refuses_its_values_is_named(path):
     path.write_text('{"number": 3}', encoding="utf-8")
     with pytest.raises(ValueError, match=r"config\.json.*3 is odd"):
         configuration.read(path, _Even)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Grown:
+    steps: int
+    since: str = "begin"
+
+
+def test_a_key_that_has_a_default_may_be_missing_and_no_other(path):
+    path.write_text('{"steps": 3}')
+    assert configuration.read(path, _Grown) == _Grown(3, "begin")
+    path.write_text('{"since": "end"}')
+    with pytest.raises(ValueError, match="lacks 'steps'"):
+        configuration.read(path, _Grown)
+    path.write_text('{"steps": 3, "since": 4}')
+    with pytest.raises(ValueError, match="since"):
+        configuration.read(path, _Grown)

@@ -161,7 +161,7 @@ def _plan(
         schedule=preset.schedule.over(steps),
         batch=preset.batch,
         pool=preset.pool,
-        pixels="background",
         seed=seed,
+        pixels="background",
     )
     return config, dataclasses.replace(model, footprint="cone")

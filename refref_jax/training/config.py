@@ -76,9 +76,9 @@ class TrainingConfig:
       schedule: how.
       batch: rays a step.
       pool: batches whose light paths are traced at once.
+      seed: of the initial parameters, the order of pixels and the sampling.
       pixels: which of them are learned from: `all`, or those of the `background` alone, a margin
         away from the masks.
-      seed: of the initial parameters, the order of pixels and the sampling.
     """
 
     scene: SceneConfig
@@ -87,5 +87,5 @@ class TrainingConfig:
     schedule: ScheduleConfig
     batch: int
     pool: int
-    pixels: Literal["all", "background"]
     seed: int
+    pixels: Literal["all", "background"] = "all"
