@@ -76,7 +76,7 @@ def run(
     model = learn_background(scene, folder, seed=seed, space=space, radius=radius, steps=steps)
     evidence, views = body_pixels.look(scene, "train", model, seed=seed, rays=rays)
     search = IndexSearch()
-    with commands.ProgressBar("index", most_looks(search, start)) as bar:
+    with commands.ProgressBar("index", most_looks(search, start=start)) as bar:
         found = estimate_index(
             evidence,
             body_pixels.body_geometry(mesh, _BEFORE),

@@ -134,7 +134,7 @@ def estimate_index(
     if not len(views):
         raise ReconstructionError("No pixel sees the body. Check the masks and the cameras.")
     rungs = _rungs(search)
-    show = _counter(progress, most_looks(search, start))
+    show = _counter(progress, most_looks(search, start=start))
 
     def errors(index: float) -> Float[np.ndarray, " rays"]:
         show()
@@ -161,7 +161,7 @@ def estimate_index(
     return IndexEstimate(best, deviation, ways[0].errors[-1], Descent(rungs, heights), tuple(ways))
 
 
-def most_looks(search: IndexSearch, start: float | None = None) -> int:
+def most_looks(search: IndexSearch, *, start: float | None = None) -> int:
     """Returns how often the error of the pixels is looked at, at most."""
     descents = search.descents + (start is not None)
     return len(_rungs(search)) + search.most * descents + len(_PARABOLA)

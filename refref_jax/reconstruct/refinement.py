@@ -25,7 +25,7 @@ from refref_jax.reconstruct.corners import MOST, fit_corners
 from refref_jax.reconstruct.denoising import denoise_within
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.grids import Box, sample
-from refref_jax.reconstruct.isosurface import find_isosurface
+from refref_jax.reconstruct.isosurface import find_isosurface, import_skimage
 from refref_jax.reconstruct.silhouettes import Views, check_masks
 from refref_jax.reconstruct.smoothing import CREASE, diffuse
 from refref_jax.reconstruct.soundness import check_body, objection
@@ -119,6 +119,8 @@ def refine(mesh: Mesh, settings: Refinement, *, views: Views | None = None) -> t
         and scikit-image is not installed; or if masks and cameras do not fit each other.
     """
     check_body(mesh)
+    if max(settings.rounding, settings.spacing) > 0.0:
+        import_skimage()
     first = keep_pieces(mesh, smallest=settings.smallest_piece)
     stages = [Stage("pieces", first, "")]
     for name, change in _changes(settings, first, views).items():

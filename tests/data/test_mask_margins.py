@@ -11,7 +11,7 @@ def _masks():
 
 
 def test_margins_by_hand():
-    inside, outside = well_inside(_masks(), 1), well_outside(_masks(), 2)
+    inside, outside = well_inside(_masks(), margin=1), well_outside(_masks(), margin=2)
     expected = np.zeros((9, 9), bool)
     expected[3:6, 3:6] = True
     np.testing.assert_array_equal(inside[0], expected)
@@ -21,13 +21,13 @@ def test_margins_by_hand():
 
 
 def test_a_mask_at_the_rim_of_the_image_has_no_inside_there():
-    assert well_inside(np.ones((1, 5, 5), bool), 1).sum() == 9
+    assert well_inside(np.ones((1, 5, 5), bool), margin=1).sum() == 9
 
 
 @pytest.mark.parametrize("margin", [0, 1, 2])
 def test_inside_and_outside_never_meet(margin):
     masks = np.random.default_rng(0).uniform(size=(3, 16, 16)) < 0.3
-    inside, outside = well_inside(masks, margin), well_outside(masks, margin)
+    inside, outside = well_inside(masks, margin=margin), well_outside(masks, margin=margin)
     assert not np.any(inside & ~masks) and not np.any(outside & masks)
     if margin == 0:
         np.testing.assert_array_equal(inside, masks)

@@ -88,7 +88,7 @@ def test_the_index_is_found_from_any_start(ball, seen, start):
     assert len(found.descents) == 2 + (start is not None)
     assert start is None or start in [way.indices[0] for way in found.descents]
     assert [done for done, _ in looks] == list(range(1, len(looks) + 1))
-    assert len(looks) <= looks[0][1] == most_looks(search, start)
+    assert len(looks) <= looks[0][1] == most_looks(search, start=start)
 
 
 def test_no_pixels_and_no_light_are_refused(ball, seen):
