@@ -4,7 +4,7 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import model_options, planning, scene_option, scenes
+from experiments import model_options, planning, scene_option, scenes, space_options
 from experiments.choices import Wishes
 from experiments.model_options import ModelOptions
 from experiments.planning import Plan, Request
@@ -83,19 +83,7 @@ _PRECISION = flags.DEFINE_enum(
     "Arithmetic of the fields; the preset's if not given.",
 )
 flags.adopt_module_key_flags(scenes)
-BACKGROUND = flags.DEFINE_enum(
-    "background",
-    "auto",
-    ["auto", "bounded", "unbounded"],
-    "Whether there are walls, or an environment infinitely far away.",
-)
-RADIUS = flags.DEFINE_float(
-    "radius",
-    None,
-    "Half edge of the cube on whose faces a bounded scene's background stands (by default that of "
-    "scene.json, else 7.3), or radius of an unbounded scene's uncontracted ball, in world units.",
-    lower_bound=1e-6,
-)
+flags.adopt_module_key_flags(space_options)
 _STEPS = flags.DEFINE_integer("steps", None, "Training steps; the preset's if not given.", 1)
 _BATCH = flags.DEFINE_integer("batch", None, "Rays a step; the preset's if not given.", 1)
 SEED = flags.DEFINE_integer("seed", 0, "Seed of everything random.", 0, 2**32 - 1)
@@ -116,8 +104,8 @@ SETTLED = (
     _PRECISION,
     scenes.RULE,
     scenes.IOR,
-    BACKGROUND,
-    RADIUS,
+    space_options.BACKGROUND,
+    space_options.RADIUS,
     _STEPS,
     _BATCH,
     SEED,
@@ -149,8 +137,8 @@ def plan_from_flags(*, body: MeshPart | None = None) -> Plan:
         options=_options(),
         rule=scenes.RULE.value,
         indices=scenes.given_indices() if body is None else {body.name: body.index},
-        space=None if BACKGROUND.value == "auto" else BACKGROUND.value,
-        radius=RADIUS.value,
+        space=space_options.chosen_space(),
+        radius=space_options.RADIUS.value,
         steps=_STEPS.value,
         batch=_BATCH.value,
         seed=SEED.value,

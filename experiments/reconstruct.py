@@ -12,7 +12,7 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import commands, reconstruction_options, scene_option
+from experiments import commands, reconstruction_options, scene_option, space_options
 from experiments.r3f import body, chain, report
 
 _SCENE = flags.DEFINE_string(
@@ -23,24 +23,14 @@ _IOR = flags.DEFINE_string(
     "ior", None, "Index of refraction of the body, as 1.5; estimated if not given."
 )
 flags.adopt_module_key_flags(reconstruction_options)
-_BACKGROUND = flags.DEFINE_enum(
-    "background",
-    "auto",
-    ["auto", "bounded", "unbounded"],
-    "Whether there are walls, or an environment infinitely far away.",
-)
-_RADIUS = flags.DEFINE_float(
-    "radius", None, "Half edge of the walls' cube, or radius of an unbounded scene's ball.", 1e-6
-)
+flags.adopt_module_key_flags(space_options)
 _SEED = flags.DEFINE_integer("seed", 0, "Seed of everything random.", 0, 2**32 - 1)
 
 
 def main() -> None:
     """Reconstructs a scene, or goes on with it."""
     index = None if _IOR.value is None else reconstruction_options.parse_index(_IOR.value)
-    config = reconstruction_options.chosen(
-        index=index, background=_BACKGROUND.value, radius=_RADIUS.value, seed=_SEED.value
-    )
+    config = reconstruction_options.chosen(index=index, seed=_SEED.value)
     scene, out = scene_option.opened(_SCENE.value), Path(_OUT.value)
     try:
         found = chain.reconstruct(scene, out, config, compare=True)

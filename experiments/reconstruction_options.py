@@ -4,6 +4,7 @@ import math
 
 from absl import flags
 
+from experiments import space_options
 from experiments.r3f.geometry_stage import GEOMETRIES
 from experiments.r3f.records import ReconstructionConfig
 
@@ -32,25 +33,20 @@ LIGHT_STEPS = flags.DEFINE_integer(
 _LARGEST_INDEX = 5.0
 
 
-def chosen(
-    *, index: float | None, background: str, radius: float | None, seed: int
-) -> ReconstructionConfig:
+def chosen(*, index: float | None, seed: int) -> ReconstructionConfig:
     """Returns what the options ask for.
 
     Args:
       index: the index of refraction, or `None` to estimate it.
-      background: `bounded`, `unbounded`, or `auto` for what the scene says.
-      radius: of the walls' cube or the uncontracted ball, world units; `None` likewise.
       seed: of everything random.
     """
-    space = None if background == "auto" else background
     return ReconstructionConfig(
         GEOMETRY.value,
         RESOLUTION.value,
         OUTLIERS.value,
         index,
-        space,
-        radius,
+        space_options.chosen_space(),
+        space_options.RADIUS.value,
         LIGHT_STEPS.value,
         seed,
     )

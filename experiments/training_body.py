@@ -67,12 +67,7 @@ def find(run: Path, *, resume: bool) -> MeshPart | None:
         raise ValueError(
             f"{out} holds a reconstruction already. Continue with --resume, or give another --out."
         )
-    config = reconstruction_options.chosen(
-        index=index,
-        background=plans.BACKGROUND.value,
-        radius=plans.RADIUS.value,
-        seed=plans.SEED.value,
-    )
+    config = reconstruction_options.chosen(index=index, seed=plans.SEED.value)
     try:
         chain.reconstruct(plans.opened_scene(), out, config, compare=False)
     except KeyboardInterrupt:

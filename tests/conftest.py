@@ -23,7 +23,13 @@ import pytest
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # optax and dm-pix mix integers and floats; everything of ours must be explicit.
-_LOOSE = ("training", "experiments", "test_metrics.py", "test_light_refinement.py")
+_LOOSE = (
+    "training",
+    "experiments",
+    "test_metrics.py",
+    "test_light_refinement.py",
+    "test_index_stage.py",
+)
 
 
 # Compiled programs are mapped into memory one by one, and Linux allows a process 65,530 mappings:

@@ -11,7 +11,7 @@ The error bar comes from the curvature of the valley: views are put into groups,
 parabola has its own bottom, and the bottoms scatter. What is wrong in the same way for all views,
 such as a body that is too large, is not in it.
 
-Source: Riedmiller and Braun, A Direct Adaptive Method for Faster [...]: RPROP (1993).
+Source: Riedmiller and Braun (1993), resilient propagation (RPROP).
 """
 
 import dataclasses

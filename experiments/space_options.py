@@ -1,0 +1,24 @@
+"""Options that say where a scene's background stands, for scenes that do not."""
+
+from absl import flags
+
+from refref_jax.sampling.domains import Space
+
+BACKGROUND = flags.DEFINE_enum(
+    "background",
+    "auto",
+    ["auto", "bounded", "unbounded"],
+    "Whether there are walls, or an environment infinitely far away.",
+)
+RADIUS = flags.DEFINE_float(
+    "radius",
+    None,
+    "Half edge of the cube on whose faces a bounded scene's background stands (by default that of "
+    "scene.json, else 7.3), or radius of an unbounded scene's uncontracted ball, in world units.",
+    lower_bound=1e-6,
+)
+
+
+def chosen_space() -> Space | None:
+    """Returns what `--background` says, or `None` for what the scene does."""
+    return None if BACKGROUND.value == "auto" else BACKGROUND.value

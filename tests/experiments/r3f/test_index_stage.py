@@ -1,0 +1,40 @@
+"""The index's stage with nothing left out: a background is learned, and an index looked for."""
+
+import functools
+
+import numpy as np
+import pytest
+
+from experiments import trainer
+from experiments.r3f import index_stage
+from refref_jax.data import meshes
+from refref_jax.data.geometry import shading_normals
+from refref_jax.reconstruct.index_search import IndexSearch
+from refref_jax.reconstruct.triangles import Mesh
+from refref_jax.training import run_folder
+
+
+@pytest.mark.slow
+def test_a_background_is_learned_beside_the_body_and_once(ball_scene, tmp_path, monkeypatch):
+    (part,) = meshes.read_meshes(ball_scene)
+    mesh = Mesh(part.vertices, part.faces, shading_normals(part))
+    search = functools.partial(IndexSearch, 1.47, 1.53, spacing=0.03, descents=1, most=4)
+    monkeypatch.setattr(index_stage, "IndexSearch", search)
+    kept = []
+    sampler = trainer.PixelSampler
+
+    def note(*arguments, **options):
+        kept.append(options["kept"])
+        return sampler(*arguments, **options)
+
+    monkeypatch.setattr(trainer, "PixelSampler", note)
+    look = functools.partial(
+        index_stage.run, ball_scene, mesh, tmp_path, seed=3, start=1.49, steps=300, rays=512
+    )
+    first, again = look(), look()
+    assert first == again and len(kept) == 1
+    config = run_folder.read_config(tmp_path / "background")
+    assert (config.pixels, config.paths, config.seed) == ("background", "straight", 3)
+    assert 0.2 < kept[0].mean() < 0.95
+    assert first.index == pytest.approx(1.5, abs=0.01) and np.isfinite(first.deviation)
+    assert len(first.descents) == 2 and (tmp_path / "index.png").stat().st_size > 5000
