@@ -7,7 +7,7 @@ infinite or no number at all. Over images, DMAE and DRMSE are means of each imag
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from refref_jax.numerics import safe_sqrt
+from refref_jax.numerics import safe_divide, safe_sqrt
 
 
 def mean_absolute_error(
@@ -45,4 +45,4 @@ def _errors(
 
 def _mean_over(values: Float[Array, "h w"], mask: Bool[Array, "h w"]) -> Float[Array, ""]:
     count = jnp.sum(mask, dtype=values.dtype)
-    return jnp.where(count > 0, jnp.sum(values) / jnp.maximum(count, 1.0), jnp.nan)
+    return jnp.where(count > 0, safe_divide(jnp.sum(values), count), jnp.nan)
