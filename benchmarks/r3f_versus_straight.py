@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 from absl import app, flags
 
 from experiments import child_process, trained_runs
@@ -25,10 +24,7 @@ from experiments.presets import PRESETS
 from experiments.r3f import records
 from experiments.r3f.records import IndexFacts
 from experiments.trained_runs import Evaluation
-from refref_jax.data import files, local_layout, meshes, scene_names
-from refref_jax.data.cameras import image_rays
-from refref_jax.render import saved
-from refref_jax.render.first_surface import find_first_surface
+from refref_jax.data import meshes, scene_names
 
 _SCENES = flags.DEFINE_list("scenes", ["experiments/data/cube_smcvx_ball"], "Folders of scenes.")
 _PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Preset of all trainings.")
@@ -39,19 +35,6 @@ _OUT = flags.DEFINE_string("out", "runs/r3f_versus_straight", "Where to write th
 
 _GAIN = 3.0
 _INDEX_ERROR = 0.02
-
-
-class Measured(NamedTuple):
-    """What a training gave.
-
-    Attributes:
-      evaluation: of it.
-      distance_error: mean error of the distance to what is seen first, world units; `None` where
-        the scene does not tell.
-    """
-
-    evaluation: Evaluation
-    distance_error: float | None
 
 
 class Trial(NamedTuple):
@@ -69,19 +52,19 @@ class Trial(NamedTuple):
     scene: str
     index: IndexFacts
     true_index: float | None
-    straight: Measured
-    r3f: Measured
-    oracle: Measured
+    straight: Evaluation
+    r3f: Evaluation
+    oracle: Evaluation
 
     @property
     def gain(self) -> float:
         """Decibels of R3F over straight light inside the mask."""
-        return self.r3f.evaluation.psnr_masked - self.straight.evaluation.psnr_masked
+        return self.r3f.psnr_masked - self.straight.psnr_masked
 
     @property
     def shortfall(self) -> float:
         """Decibels of R3F below the oracle there."""
-        return self.oracle.evaluation.psnr_masked - self.r3f.evaluation.psnr_masked
+        return self.oracle.psnr_masked - self.r3f.psnr_masked
 
 
 def main(arguments: list[str]) -> None:
@@ -125,8 +108,8 @@ def table(trials: Sequence[Trial]) -> str:
     ]
     for trial in trials:
         for method in ("oracle", "r3f", "straight"):
-            found, away = getattr(trial, method)
-            error = "-" if away is None else f"{away:.3f}"
+            found = getattr(trial, method)
+            error = "-" if found.surface_mae is None else f"{found.surface_mae:.3f}"
             lines.append(
                 f"| {trial.scene} | {method} | {found.psnr:.2f} | {found.psnr_masked:.2f} "
                 f"| {found.ssim:.3f} | {error} | {_index(trial, method)} |"
@@ -151,7 +134,7 @@ def _is_convex(name: str) -> bool:
     return scene_names.is_name(name) and scene_names.parse(name).category == "smcvx"
 
 
-def _train(scene: Path, folder: Path, method: str, options: Sequence[str]) -> Measured:
+def _train(scene: Path, folder: Path, method: str, options: Sequence[str]) -> Evaluation:
     steps = _STEPS.value or PRESETS[_PRESET.value].schedule.steps
     run = folder / f"{_PRESET.value}_{method}_{steps}"
     print(f"{scene.resolve().name}: {method}, {steps} steps ...", flush=True)
@@ -160,30 +143,7 @@ def _train(scene: Path, folder: Path, method: str, options: Sequence[str]) -> Me
     looks = [f"--rays_per_pixel={_RAYS_PER_PIXEL.value}"]
     if _LIMIT.value is not None:
         looks.append(f"--limit={_LIMIT.value}")
-    found = trained_runs.evaluate(run, scene=scene, options=looks)
-    return Measured(found, _distance_error(run, scene, bent=method != "straight"))
-
-
-def _distance_error(run: Path, scene: Path, *, bent: bool) -> float | None:
-    """Measures the distances that an evaluation wrote, with the body's surface where it is met."""
-    frames = local_layout.read_frames(scene, "test")
-    if frames.depths is None:
-        return None
-    true = local_layout.read_distances(frames)
-    surfaces = saved.load_geometry(run).surfaces
-    errors = []
-    for i, name in enumerate(frames.names):
-        path = run / "eval" / "test" / "distance" / f"{name}.exr"
-        if not path.is_file():
-            continue
-        seen = files.read_depth(path)
-        if bent:
-            first = find_first_surface(surfaces, image_rays(frames.cameras, i)).distances
-            seen = np.where(np.isfinite(first), first, seen)
-        known = np.isfinite(true[i])
-        if known.any():
-            errors.append(np.abs(seen - true[i])[known].mean())
-    return float(np.mean(errors)) if errors else None
+    return trained_runs.evaluate(run, scene=scene, options=looks)
 
 
 def _index(trial: Trial, method: str) -> str:

@@ -3,7 +3,7 @@
 python -m experiments.evaluate --run=runs/ball --split=test --rays_per_pixel=4
 
 With several rays a pixel colours are averaged as linear light, and a pixel's distance is the median
-of its rays'; see `experiments.supersampling`.
+of its rays'; see `experiments.supersampling`. What each metric is tells `docs/metrics.md`.
 """
 
 import json
@@ -13,12 +13,22 @@ from typing import Any
 
 import numpy as np
 from absl import flags
+from jaxtyping import Float
 
-from experiments import commands, figures, measures, scene_option, supersampling
-from experiments.measures import Truth
+from experiments import (
+    commands,
+    figures,
+    measures,
+    perceptual_option,
+    scene_option,
+    supersampling,
+)
+from experiments.measures import Perceptual, Truth
 from experiments.r3f import provenance
 from refref_jax.data import files, local_layout, scene_names
+from refref_jax.data.cameras import Cameras, image_rays
 from refref_jax.render import Model, dyes, load_model
+from refref_jax.render.first_surface import find_first_surface
 from refref_jax.render.saved import latest_step
 from refref_jax.training import run_folder
 
@@ -31,6 +41,7 @@ _RAYS_PER_PIXEL = flags.DEFINE_integer(
     "rays_per_pixel", 1, "Rays in each pixel, a square: 1, 4, 9, 16. They are averaged."
 )
 _CHUNK = flags.DEFINE_integer("chunk", 4096, "Paths at once: lower it if memory runs out.", 1)
+flags.adopt_module_key_flags(perceptual_option)
 
 _METHODS = {"paper": "oracle"}
 _RECONSTRUCTED = {"paper": "r3f", "tree": "r3f_tree"}
@@ -45,6 +56,7 @@ def main() -> None:
     """Evaluates a run."""
     side = supersampling.side_of(_RAYS_PER_PIXEL.value)
     run = Path(_RUN.value)
+    perceptual = perceptual_option.chosen()
     config = run_folder.read_config(run)
     # Resolved first, and once: training may be going on.
     step = _STEP.value if _STEP.value is not None else latest_step(run)
@@ -52,7 +64,7 @@ def main() -> None:
     scene = scene_option.opened(_SCENE.value or config.scene.path)
     truth = measures.read_truth(scene, _SPLIT.value)
     out = run / "eval" / _SPLIT.value
-    per_image, views = evaluate(model, truth, out, side)
+    per_image, views = evaluate(model, truth, out, side, perceptual)
     summary = {
         "scene": scene_names.of_folder(scene),
         "method": _method(run, config.paths),
@@ -67,7 +79,7 @@ def main() -> None:
     (out / "metrics.json").write_text(text + "\n", encoding="utf-8")
     figures.write_comparison(out / "comparison.png", views)
     for key, value in summary["results"].items():
-        print(f"{key:>22}  {'-' if value is None else format(value, '.4f')}")
+        print(f"{key:>24}  {'-' if value is None else format(value, '.4f')}")
     if summary["results"]["lost"] > _WORTH_A_WARNING:
         print(
             "warning: some light found no room, and is missing from the pictures. Train with a "
@@ -97,7 +109,7 @@ def learned_colours(model: Model) -> dict[str, Any] | None:
 
 
 def evaluate(
-    model: Model, truth: Truth, out: Path, side: int
+    model: Model, truth: Truth, out: Path, side: int, perceptual: Perceptual
 ) -> tuple[list[dict[str, Any]], list[figures.Comparison]]:
     """Renders and measures each image, and writes what was rendered.
 
@@ -121,13 +133,21 @@ def evaluate(
             seconds = time.monotonic() - start
             files.write_rgb(out / "rgb" / f"{name}.png", seen.rgb)
             files.write_exr(out / "distance" / f"{name}.exr", seen.distance)
-            measured = measures.measure(seen, truth, i)
+            first = first_distances(model, cameras, i)
+            measured = measures.measure(seen, truth, i, first=first, perceptual=perceptual)
             per_image.append({"name": name, **measured, "seconds": seconds})
             if i in shown:
                 target = truth.images[i] / 255.0
                 views.append(figures.Comparison(name, target, seen.rgb, seen.distance))
             bar.show(len(per_image), f"{name}  PSNR {per_image[-1]['psnr']:.2f}")
     return per_image, views
+
+
+def first_distances(model: Model, cameras: Cameras, i: int) -> Float[np.ndarray, "h w"] | None:
+    """Returns the distance of the first surface that bends light, by the centres of pixels."""
+    if model.budget.bends == 0:
+        return None
+    return find_first_surface(model.geometry.surfaces, image_rays(cameras, i)).distances
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Sweeps: points are measured one by one, and written as a table, a figure and a report."""
 
+import dataclasses
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,6 +20,9 @@ from refref_jax.data import scene_names
 
 Measure = Callable[[Point], Row]
 """Trains and evaluates a point, or raises `RunFailedError`."""
+
+# An evaluation measures more than the table shows.
+_COLUMNS = {field.name for field in dataclasses.fields(Row)}
 
 
 def sweep(
@@ -112,7 +116,7 @@ def measure(point: Point, scene: Path, runs: Path, limit: Sequence[str] = ()) ->
         training=" ".join(point.training),
         evaluation=" ".join(point.evaluation),
         **vars(cost),
-        **vars(gain),
+        **{name: value for name, value in vars(gain).items() if name in _COLUMNS},
     )
 
 

@@ -54,23 +54,41 @@ class Training:
 class Evaluation:
     """What an evaluation gave: means over images; `None` for what the scene does not tell.
 
+    What has a default was not measured always: it is `None` where an evaluation is older than it.
+
     Attributes:
       psnr: over the image, dB.
       psnr_masked: inside the mask.
-      ssim: structural similarity.
-      distance_mae: error of the distance, world units.
+      ssim: structural similarity; `None` for images smaller than its window.
+      distance_mae: error of the distance, world units, by the median of the field's weights.
       distance_mae_masked: inside the mask.
       seconds_per_image: of rendering, without compiling.
       images: how many were rendered.
+      lpips: distance of the images to a network; `None` without its weights.
+      flip: difference of the images to an eye that flips between them; `None` if not installed.
+      distance_rmse: root of the mean square of the distance's error, and so on for what follows;
+        `experiments.measures` tells the three kinds of distances apart.
     """
 
     psnr: float
     psnr_masked: float | None
-    ssim: float
+    ssim: float | None
     distance_mae: float | None
     distance_mae_masked: float | None
     seconds_per_image: float
     images: int
+    lpips: float | None = None
+    flip: float | None = None
+    distance_rmse: float | None = None
+    distance_rmse_masked: float | None = None
+    surface_mae: float | None = None
+    surface_mae_masked: float | None = None
+    surface_rmse: float | None = None
+    surface_rmse_masked: float | None = None
+    substituted_mae: float | None = None
+    substituted_mae_masked: float | None = None
+    substituted_rmse: float | None = None
+    substituted_rmse_masked: float | None = None
 
 
 def train(

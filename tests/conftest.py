@@ -26,7 +26,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 _LOOSE = (
     "training",
     "experiments",
-    "test_metrics.py",
+    "test_colours.py",
     "test_light_refinement.py",
     "test_index_stage.py",
 )

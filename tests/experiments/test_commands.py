@@ -20,6 +20,10 @@ from refref_jax.render import load_model
 from tests import code_generator
 from tests.experiments.command import ROOT, TINY, run_command
 
+# The kinds of distances that an evaluation measures, and how.
+_DISTANCES = ("distance", "surface", "substituted")
+_ERRORS = ("mae", "mae_masked", "rmse", "rmse_masked")
+
 
 def test_training_writes_a_readable_run(trained):
     lines = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
@@ -102,11 +106,17 @@ def test_evaluation_writes_images_metrics_and_a_comparison(trained):
         "psnr",
         "psnr_masked",
         "ssim",
-        "distance_mae",
-        "distance_mae_masked",
+        "lpips",
+        "flip",
+        *(f"{kind}_{error}" for kind in _DISTANCES for error in _ERRORS),
         "lost",
         "seconds_per_image",
     }
+    # The body's mesh knows the distance to it, and the truth knows it altogether.
+    assert summary["results"]["surface_mae_masked"] < summary["results"]["distance_mae_masked"]
+    assert summary["results"]["surface_mae_masked"] < 0.1
+    assert summary["results"]["substituted_mae_masked"] == 0.0
+    assert summary["results"]["lpips"] is None and result.stdout.count("warning: LPIPS") == 1
     assert len(summary["per_image"]) == 2
     mean = np.mean([image["psnr"] for image in summary["per_image"]])
     np.testing.assert_allclose(summary["results"]["psnr"], mean)
@@ -155,6 +165,7 @@ def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
         ("train", ("--scene=experiments/data/cube_smcvx_ball", "--out=README.md/x"), "README.md"),
         ("evaluate", ("--run=nowhere",), "nowhere/config.json does not exist"),
         ("evaluate", ("--run=nowhere", "--rays_per_pixel=8"), "Give 4 or 9"),
+        ("evaluate", ("--run=nowhere", "--lpips_weights=none.npz"), "none.npz can not be read"),
         ("render", ("--run=nowhere",), "nowhere/model.json does not exist"),
         ("render", ("--run=nowhere", "--rays_per_pixel=0"), "Give 1."),
     ],
@@ -174,6 +185,7 @@ def test_mistakes_end_with_one_line_that_says_what_to_do(tmp_path, command, opti
     [
         "train",
         "evaluate",
+        "metrics",
         "reconstruct",
         "render",
         "render_known",

@@ -1,10 +1,22 @@
+import sys
+
+import jax
 import numpy as np
 import pytest
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from experiments import measures
+from experiments import measures, perceptual_option
+from experiments.measures import Perceptual
+from refref_jax import metrics
+from refref_jax.data import local_layout
 from refref_jax.data.local_layout import Frames
 from refref_jax.render import Rendering
+from tests import made_lpips
 from tests.small_model import CAMERAS
+
+_NOTHING = Perceptual()
+
+_KINDS = ("distance", "surface", "substituted")
 
 
 def _seen(rgb, distance=1.0, lost=0.0):
@@ -18,24 +30,153 @@ def _truth(masks, distances):
     return measures.Truth(Frames(("a",), (), None, None, CAMERAS), images, masks, distances)
 
 
+def _top_rows():
+    mask = np.zeros((1, 16, 16), bool)
+    mask[0, :4] = True
+    return mask
+
+
+def _ones():
+    return np.full((1, 16, 16), np.float32(1.0))
+
+
+def _measure(seen, truth, first=None, perceptual=_NOTHING):
+    return measures.measure(seen, truth, 0, first=first, perceptual=perceptual)
+
+
 _GREY = np.full((16, 16, 3), np.float32(0.1))
 
 
 def test_all_measures_by_hand():
-    mask = np.zeros((1, 16, 16), bool)
-    mask[0, :2] = True
-    distances = np.full((1, 16, 16), np.float32(1.0))
-    seen = _seen(_GREY, distance=3.0, lost=0.25)
-    found = measures.measure(seen, _truth(mask, distances), 0)
-    assert found["psnr"] == found["psnr_masked"] == pytest.approx(20.0, abs=1e-4)
+    found = _measure(_seen(_GREY, distance=3.0, lost=0.25), _truth(_top_rows(), _ones()))
+    assert found["psnr"] == pytest.approx(20.0, abs=1e-6)
+    assert found["psnr_masked"] == pytest.approx(20.0, abs=1e-6)
     assert found["distance_mae"] == found["distance_mae_masked"] == pytest.approx(2.0)
+    assert found["distance_rmse"] == found["distance_rmse_masked"] == pytest.approx(2.0)
     assert found["lost"] == 0.25
+    assert found["lpips"] is found["flip"] is None
+
+
+def test_the_three_kinds_of_distances_by_hand():
+    # The median is 2 too far everywhere. The first surface is met in two of the four rows of the
+    # mask, where it is 1 too near, and beside them in two rows of background, 3 too near.
+    first = np.full((16, 16), np.float32(np.inf))
+    first[:2], first[4:6] = 0.0, -2.0
+    found = _measure(_seen(_GREY, distance=3.0), _truth(_top_rows(), _ones()), first)
+    assert found["distance_mae"] == found["distance_mae_masked"] == pytest.approx(2.0)
+    assert found["surface_mae_masked"] == pytest.approx((2 * 1 + 2 * 2) / 4)
+    assert found["surface_rmse_masked"] == pytest.approx(np.sqrt((2 * 1 + 2 * 4) / 4))
+    assert found["surface_mae"] == pytest.approx((2 * 1 + 2 * 3 + 12 * 2) / 16)
+    assert found["surface_rmse"] == pytest.approx(np.sqrt((2 * 1 + 2 * 9 + 12 * 4) / 16))
+    assert found["substituted_mae_masked"] == found["substituted_rmse_masked"] == 0.0
+    assert found["substituted_mae"] == pytest.approx(12 * 2 / 16)
+    assert found["substituted_rmse"] == pytest.approx(np.sqrt(12 * 4 / 16))
+
+
+def test_straight_light_has_one_kind_of_distance():
+    found = _measure(_seen(_GREY, distance=3.0), _truth(_top_rows(), _ones()))
+    for key in ("mae", "mae_masked", "rmse", "rmse_masked"):
+        assert found[f"surface_{key}"] == found[f"substituted_{key}"] == found[f"distance_{key}"]
+
+
+def test_distances_that_are_not_known_count_nowhere():
+    distances = _ones()
+    distances[0, 0], distances[0, 10:] = np.inf, np.inf
+    first = np.full((16, 16), np.float32(1.5))
+    found = _measure(_seen(_GREY, distance=3.0), _truth(_top_rows(), distances), first)
+    assert found["distance_mae"] == pytest.approx(2.0)
+    assert found["surface_mae"] == found["surface_mae_masked"] == pytest.approx(0.5)
+    assert found["substituted_mae"] == pytest.approx(6 * 2 / 9)
+
+
+def test_without_a_mask_or_distances_nothing_of_them_is_measured():
+    first = np.full((16, 16), np.float32(1.0))
+    found = _measure(_seen(_GREY), _truth(None, _ones()), first)
+    masked = [key for key in found if key.endswith("_masked")]
+    assert len(masked) == 7 and all(found[key] is None for key in masked)
+    assert found["substituted_mae"] is None and found["surface_mae"] == 0.0
+    found = _measure(_seen(_GREY), _truth(_top_rows(), None), first)
+    assert all(found[key] is None for key in found if key.startswith(_KINDS))
 
 
 def test_what_is_over_no_pixel_is_left_out_and_spoils_no_mean():
     nothing = np.zeros((1, 16, 16), bool)
     misses = np.full((1, 16, 16), np.float32(np.inf))
-    found = measures.measure(_seen(_GREY), _truth(nothing, misses), 0)
-    assert found["psnr_masked"] is found["distance_mae"] is found["distance_mae_masked"] is None
+    found = _measure(_seen(_GREY), _truth(nothing, misses), np.ones((16, 16), np.float32))
+    assert found["psnr_masked"] is None
+    assert all(found[key] is None for key in found if key.startswith(_KINDS))
     assert measures.mean_of([found, found | {"psnr_masked": 30.0}], "psnr_masked") == 30.0
     assert measures.mean_of([found], "psnr_masked") is None
+
+
+def test_equal_images_are_infinitely_good():
+    black = np.zeros((16, 16, 3), np.float32)
+    found = _measure(_seen(black), _truth(_top_rows(), _ones()))
+    assert found["psnr"] == found["psnr_masked"] == np.inf
+    assert found["ssim"] == pytest.approx(1.0, abs=1e-9)
+    assert all(found[key] == 0.0 for key in found if key.startswith(_KINDS))
+    assert measures.mean_of([found, found | {"psnr": 30.0}], "psnr") == np.inf
+
+
+def test_an_image_too_small_for_a_window_has_no_ssim():
+    flat = np.full((10, 30, 3), np.float32(0.5))
+    found = measures.measure_colours(flat, np.zeros_like(flat), None, _NOTHING)
+    assert found["ssim"] is None
+    assert found["psnr"] == pytest.approx(-20.0 * np.log10(0.5))
+
+
+def test_psnr_and_ssim_of_photographs_are_those_of_scikit_image(ball_scene):
+    frames = local_layout.read_frames(ball_scene, "test")
+    first, second = (image / 255.0 for image in local_layout.read_images(frames)[:2])
+    noise = np.random.default_rng(0).normal(scale=0.02, size=first.shape)
+    for other in (second, np.clip(first + noise, 0.0, 1.0)):
+        found = measures.measure_colours(other.astype(np.float32), first, None, _NOTHING)
+        expected = peak_signal_noise_ratio(first, other, data_range=1.0)
+        assert found["psnr"] == pytest.approx(expected, abs=1e-5)
+        options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+        similar = structural_similarity(first, other, channel_axis=-1, data_range=1.0, **options)
+        assert found["ssim"] == pytest.approx(similar, abs=1e-5)
+
+
+def test_double_precision_ends_with_the_measuring():
+    _measure(_seen(_GREY), _truth(_top_rows(), _ones()))
+    assert not jax.config.jax_enable_x64
+
+
+def test_eyes_are_asked_where_they_are_at_hand(tmp_path):
+    lpips = metrics.load_lpips(made_lpips.write(tmp_path / "weights.npz"))
+    asked = []
+
+    def flip(rendered, target):
+        asked.append((rendered.shape, target.max()))
+        return 0.125
+
+    rng = np.random.default_rng(0)
+    rendered, target = rng.uniform(size=(2, 33, 31, 3)).astype(np.float32)
+    found = measures.measure_colours(rendered, target, None, Perceptual(lpips, flip))
+    expected = jax.jit(metrics.lpips)(lpips, *jax.device_put((rendered, target)))
+    assert found["lpips"] == pytest.approx(float(expected), rel=1e-5)
+    assert found["flip"] == 0.125 and asked == [((33, 31, 3), target.max())]
+    small = measures.measure_colours(rendered[:30], target[:30], None, Perceptual(lpips, flip))
+    assert small["lpips"] is None and small["flip"] == 0.125
+
+
+def test_what_is_not_at_hand_is_warned_of_once(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(perceptual_option, "LPIPS_WEIGHTS", _Flag(None))
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    assert perceptual_option.chosen() == Perceptual(None, None)
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith("warning: LPIPS") and "docs/metrics.md" in first
+    assert second.startswith("warning: FLIP") and "refref_jax[flip]" in second
+    monkeypatch.setattr(perceptual_option, "LPIPS_WEIGHTS", _Flag(str(tmp_path / "none.npz")))
+    with pytest.raises(ValueError, match=r"none\.npz can not be read"):
+        perceptual_option.chosen()
+    weights = made_lpips.write(tmp_path / "weights.npz")
+    monkeypatch.setattr(perceptual_option, "LPIPS_WEIGHTS", _Flag(str(weights)))
+    assert perceptual_option.chosen().lpips is not None
+    assert "LPIPS" not in capsys.readouterr().out
+
+
+class _Flag:
+    def __init__(self, value):
+        self.value = value

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from skimage.metrics import structural_similarity
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from refref_jax import metrics
 from tests import gradients, transformations
@@ -163,49 +163,60 @@ def test_ssim_is_finite_on_flat_images(value):
     assert np.isfinite(metrics.ssim(flat, target)) and np.isfinite(metrics.ssim(flat, flat))
 
 
-# --- distances ---
+# --- in double precision ---
 
 
-def test_mean_absolute_error_by_hand():
-    rendered = jnp.array([[1.0, 2.0], [3.0, 9.0]])
-    target = jnp.array([[1.5, 2.0], [2.0, 0.0]])
-    mask = jnp.array([[True, True], [True, False]])
-    np.testing.assert_allclose(metrics.mean_absolute_error(rendered, target, mask), 0.5)
+def _agreeing_images():
+    """Yields pairs of images that are rendered, noisy, unlike, dark, bright and flat."""
+    rng = np.random.default_rng(2)
+    ramp = np.indices((32, 40)).sum(axis=0)[..., None] / 70.0 * np.array([1.0, 0.5, 0.2])
+    noise = rng.normal(size=ramp.shape)
+    yield ramp, np.clip(ramp + 0.05 * noise, 0.0, 1.0)
+    yield rng.uniform(size=(2, 32, 40, 3))
+    yield np.full_like(ramp, 0.97), np.full_like(ramp, 0.96)
+    yield 0.9 + 1e-3 * noise, np.full_like(ramp, 0.9)
+    yield np.zeros_like(ramp), np.ones_like(ramp)
+    yield 1e-3 * ramp, np.zeros_like(ramp)
 
 
-def test_mean_absolute_error_against_float64():
-    rendered, target = (10.0 * image[..., 0] for image in _images())
-    mask = np.asarray(_mask())
-    pairs = zip(np.asarray(rendered)[mask], np.asarray(target)[mask], strict=True)
-    errors = [abs(float(a) - float(b)) for a, b in pairs]
-    got = metrics.mean_absolute_error(rendered, target, _mask())
-    np.testing.assert_allclose(got, np.mean(errors), rtol=1e-6)
+@pytest.mark.parametrize("pair", list(_agreeing_images()))
+def test_psnr_and_ssim_are_those_of_scikit_image(pair):
+    with jax.enable_x64(True):
+        arrays = jax.device_put(tuple(np.asarray(image, np.float64) for image in pair))
+        assert metrics.psnr(*arrays).dtype == np.float64
+        expected = peak_signal_noise_ratio(pair[1], pair[0], data_range=1.0)
+        np.testing.assert_allclose(metrics.psnr(*arrays), expected, atol=1e-5, rtol=0.0)
+        expected = _similarity(*pair)
+        np.testing.assert_allclose(metrics.ssim(*arrays), expected, atol=1e-5, rtol=0.0)
 
 
-@pytest.mark.parametrize("elsewhere", [np.inf, -np.inf, np.nan, 1e30])
-def test_mean_absolute_error_ignores_targets_outside_the_mask(elsewhere):
-    rendered, target = (image[..., 0] for image in _images())
-    missing = jnp.where(_mask(), target, elsewhere)
-    got = metrics.mean_absolute_error(rendered, missing, _mask())
-    assert got == metrics.mean_absolute_error(rendered, target, _mask())
+# --- small images ---
 
 
-def test_mean_absolute_error_ignores_a_rendering_that_sees_nothing_outside_the_mask():
-    rendered, target = (image[..., 0] for image in _images())
-    blind = jnp.where(_mask(), rendered, jnp.inf)
-    got = metrics.mean_absolute_error(blind, target, _mask())
-    assert got == metrics.mean_absolute_error(rendered, target, _mask())
+def test_ssim_of_the_smallest_image_is_that_of_its_one_window():
+    rng = np.random.default_rng(3)
+    edge = metrics.SMALLEST_FOR_SSIM
+    rendered, target = rng.uniform(size=(2, edge, edge, 3))
+    gauss = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+    window = np.outer(gauss, gauss)[..., None] / gauss.sum() ** 2
+
+    def mean(x):
+        return np.sum(window * x, axis=(0, 1))
+
+    a, b = mean(rendered), mean(target)
+    spread = mean(rendered**2) - a**2 + mean(target**2) - b**2
+    shared = mean(rendered * target) - a * b
+    by_channel = (2 * a * b + 1e-4) * (2 * shared + 9e-4)
+    by_channel /= (a**2 + b**2 + 1e-4) * (spread + 9e-4)
+    with jax.enable_x64(True):
+        got = metrics.ssim(*jax.device_put((rendered, target)))
+    np.testing.assert_allclose(got, by_channel.mean(), rtol=1e-9)
 
 
-def test_mean_absolute_error_over_nothing_is_undefined():
-    rendered, target = (image[..., 0] for image in _images())
-    assert np.isnan(metrics.mean_absolute_error(rendered, target, jnp.zeros_like(_mask())))
-
-
-def test_mean_absolute_error_of_a_constant_shift():
-    _, target = _images()
-    got = metrics.mean_absolute_error(target[..., 0] + 0.25, target[..., 0], _mask())
-    np.testing.assert_allclose(got, 0.25, rtol=1e-6)
+@pytest.mark.parametrize("shape", [(10, 40, 3), (40, 10, 3)])
+def test_an_image_smaller_than_the_window_has_no_ssim(shape):
+    with pytest.raises(ValueError, match="11 x 11"):
+        metrics.ssim(jnp.zeros(shape), jnp.zeros(shape))
 
 
 def test_metrics_check_grads():
@@ -219,10 +230,6 @@ _METRICS = {
     "psnr": (metrics.psnr, lambda a, b, mask: (a, b)),
     "psnr_masked": (metrics.psnr_masked, lambda a, b, mask: (a, b, mask)),
     "ssim": (metrics.ssim, lambda a, b, mask: (a, b)),
-    "mean_absolute_error": (
-        metrics.mean_absolute_error,
-        lambda a, b, mask: (a[..., 0], b[..., 0], mask),
-    ),
 }
 
 

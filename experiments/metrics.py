@@ -1,0 +1,55 @@
+"""Compares two folders of images, without any model: a table of all metrics, image by image.
+
+python -m experiments.metrics RENDERED TRUTH --masks=MASKS --out=metrics.json
+
+Files are paired by name. Images are 8-bit .png; where both folders hold .exr too, or only these,
+they are compared as distances along the ray: both in world units, as `evaluate` writes them. (A
+scene's own depth maps are planar, and not to be compared with those.) What each metric is tells
+`docs/metrics.md`.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from absl import flags
+
+from experiments import commands, folder_comparison, perceptual_option
+
+_MASKS = flags.DEFINE_string("masks", None, "Folder of masks, named as the images: 0 is outside.")
+_OUT = flags.DEFINE_string("out", None, "JSON file to write; nothing is written without it.")
+_OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace the file of --out if it exists.")
+flags.adopt_module_key_flags(perceptual_option)
+
+
+def main(rendered: str, truth: str) -> None:
+    """Compares the folders."""
+    out = None if _OUT.value is None else Path(_OUT.value)
+    if out is not None and out.exists() and not _OVERWRITE.value:
+        raise ValueError(f"{out} exists. Give another --out, or --overwrite to replace it.")
+    masks = None if _MASKS.value is None else Path(_MASKS.value)
+    pairs = folder_comparison.match(Path(rendered), Path(truth), masks)
+    perceptual = perceptual_option.chosen()
+    rows = []
+    with commands.ProgressBar("compare", len(pairs)) as bar:
+        for row in folder_comparison.compare(pairs, perceptual):
+            rows.append(row)
+            bar.show(len(rows), row[folder_comparison.NAME])
+    print(folder_comparison.table(rows))
+    if out is None:
+        again = commands.shell("metrics", rendered, truth, "--out=metrics.json")
+        print(f"Nothing was written. To keep all digits: {again}")
+        return
+    _write(out, {"rendered": rendered, "truth": truth, "masks": _MASKS.value}, rows)
+    print(f"Metrics: {out}")
+
+
+def _write(out: Path, given: dict[str, Any], rows: list[dict[str, Any]]) -> None:
+    summary = given | {"results": folder_comparison.summarise(rows), "per_image": rows}
+    text = json.dumps(commands.string_safe(summary), indent=2, allow_nan=False)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(text + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    commands.run(main, arguments=("RENDERED", "TRUTH"))

@@ -1,0 +1,116 @@
+"""Weights are converted as they are published: by PyTorch, by a stand-in, and without it."""
+
+import pickle
+import sys
+import types
+
+import numpy as np
+import pytest
+
+from experiments import state_dicts
+from refref_jax import metrics
+from tests import made_lpips
+from tests.experiments.command import run_command
+
+
+class _Tensor:
+    def __init__(self, values):
+        self._values = values
+
+    def detach(self):
+        return self
+
+    def numpy(self):
+        return self._values
+
+
+@pytest.fixture
+def stand_in(monkeypatch):
+    """Puts something in PyTorch's place; it loads what `answer` is set to."""
+    torch = types.ModuleType("torch")
+    torch.Tensor, torch.calls = _Tensor, []
+
+    def load(path, **options):
+        torch.calls.append((path, options))
+        if isinstance(torch.answer, Exception):
+            raise torch.answer
+        return torch.answer
+
+    torch.load = load
+    monkeypatch.setitem(sys.modules, "torch", torch)
+    return torch
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "weights.pth"
+    path.write_bytes(b"of another program")
+    return path
+
+
+def test_tensors_become_arrays_and_nothing_is_executed(stand_in, path):
+    values = np.arange(3.0)
+    stand_in.answer = {"features.0.bias": _Tensor(values), "epoch": 3}
+    found = state_dicts.read(path)
+    assert list(found) == ["features.0.bias"] and found["features.0.bias"] is values
+    assert stand_in.calls == [(path, {"map_location": "cpu", "weights_only": True})]
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        ([1, 2], "it holds no dict"),
+        (pickle.UnpicklingError("Weights only load failed"), "more than tensors"),
+        (RuntimeError("broken archive"), "broken archive"),
+    ],
+)
+def test_what_holds_no_weights_is_named(stand_in, path, answer, message):
+    stand_in.answer = answer
+    with pytest.raises(ValueError, match=message) as raised:
+        state_dicts.read(path)
+    assert str(path) in str(raised.value)
+
+
+def test_without_pytorch_it_is_said_what_to_do(monkeypatch, path):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(ValueError, match=r"pip install torch\), or give the same arrays as \.npz"):
+        state_dicts.read(path)
+    with pytest.raises(ValueError, match="does not exist"):
+        state_dicts.read(path.with_name("nowhere.pth"))
+
+
+def test_files_of_pytorch_itself(tmp_path):
+    torch = pytest.importorskip("torch")
+    alexnet, _ = made_lpips.state_dicts()
+    for form in (True, False):
+        path = tmp_path / f"{form}.pth"
+        tensors = {name: torch.nn.Parameter(torch.tensor(x)) for name, x in alexnet.items()}
+        torch.save(tensors, path, _use_new_zipfile_serialization=form)
+        found = state_dicts.read(path)
+        assert list(found) == list(alexnet)
+        for name, x in alexnet.items():
+            np.testing.assert_array_equal(found[name], x)
+    torch.save({"model": torch.nn.Linear(2, 2)}, path)
+    with pytest.raises(ValueError, match="more than tensors"):
+        state_dicts.read(path)
+
+
+def test_the_command_makes_a_file_that_lpips_reads(tmp_path):
+    alexnet, linear = made_lpips.state_dicts()
+    np.savez(tmp_path / "a.npz", **alexnet, **{"classifier.1.bias": np.zeros(4)})
+    np.savez(tmp_path / "l.npz", **linear)
+    out = tmp_path / "new" / "lpips.npz"
+    options = (f"--alexnet={tmp_path / 'a.npz'}", f"--lpips={tmp_path / 'l.npz'}", f"--out={out}")
+    assert str(out) in run_command("convert_lpips", *options).stdout
+    found = metrics.load_lpips(out)
+    np.testing.assert_array_equal(found.kernels[4], alexnet["features.10.weight"])
+    np.testing.assert_array_equal(found.channels[0], linear["lin0.model.1.weight"].reshape(-1))
+    with np.load(out) as file:
+        assert set(file.files) == {*alexnet, *linear}
+    content = out.read_bytes()
+    refused = run_command("convert_lpips", *options, fails=True)
+    assert "exists" in refused.stderr and out.read_bytes() == content
+    swapped = (f"--alexnet={tmp_path / 'l.npz'}", *options[1:2], f"--out={tmp_path / 'b.npz'}")
+    wrong = run_command("convert_lpips", *swapped, fails=True)
+    assert "l.npz has no features.0.weight; it has lin0.model.1.weight" in wrong.stderr
+    assert "Traceback" not in wrong.stderr and not (tmp_path / "b.npz").exists()
