@@ -18,6 +18,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from refref_jax import configuration
+from refref_jax.fields import registry
 from refref_jax.geometry.bvh import BVH
 from refref_jax.geometry.surfaces import Surfaces
 from refref_jax.optics.budgets import Budget
@@ -63,7 +64,7 @@ def save_scene(run: Path, saved: SavedModel, geometry: Geometry) -> None:
 
 def read_static(run: Path) -> SavedModel:
     """Reads the static half of a model."""
-    return configuration.read(run / _MODEL, SavedModel)
+    return configuration.read(run / _MODEL, SavedModel, variants=registry.variants())
 
 
 def load_model(run: str | os.PathLike[str], *, step: int | None = None) -> Model:
