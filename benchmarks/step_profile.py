@@ -100,7 +100,8 @@ def _loss(params: tuple, setup: loop.Setup, pool: tuple) -> jax.Array:
     """Returns a step's loss on the first batch of a pool."""
     model, config = setup.model, setup.config
     traced, rgb = jax.tree.map(lambda x: x[0], pool)
-    jitter = pixels.random_jitter(jax.random.key(0), model, traced.paths.radii.shape[0])
+    slots = jnp.arange(traced.paths.radii.shape[0])
+    jitter = pixels.random_jitter(jax.random.key(0), model, slots)
     seen = pixels.render_pixels(
         params, model, traced.paths, jitter, rays=rgb.shape[0], anneal=jnp.ones(())
     )

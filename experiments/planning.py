@@ -31,7 +31,6 @@ class Request(NamedTuple):
     Attributes:
       scene: folder of the scene.
       preset: name of a preset.
-      field: kind of the fields, see `fields.registry`.
       wishes: what is to be modelled of the light.
       options: what replaces parts of the preset's model.
       rule: what lies outside a mesh.
@@ -42,11 +41,11 @@ class Request(NamedTuple):
       batch: rays a step.
       seed: of everything random.
       parts: the objects, where they are not to be read from the scene's meshes.
+      field: kind of the fields, see `fields.registry`.
     """
 
     scene: Path
     preset: str
-    field: str = registry.USUAL
     wishes: Wishes = Wishes()
     options: ModelOptions = ModelOptions()
     rule: str = "nested"
@@ -57,6 +56,7 @@ class Request(NamedTuple):
     batch: int | None = None
     seed: int = 0
     parts: Sequence[MeshPart] | None = None
+    field: str = registry.USUAL
 
 
 class Plan(NamedTuple):

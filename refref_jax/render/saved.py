@@ -133,9 +133,19 @@ def find_step(manager: ocp.CheckpointManager, run: Path, step: int | None) -> in
 def restore(manager: ocp.CheckpointManager, step: int, items: dict) -> ocp.args.Composite:
     """Reads some items of a checkpoint into the shapes and types that are given.
 
+    Args:
+      manager: of the checkpoints.
+      step: of the checkpoint.
+      items: shapes by the name of the item. Those without a sharding are read onto one device, from
+        however many they were written.
+
     Raises:
       ValueError: if it is damaged.
     """
+    here = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    items = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding or here), items
+    )
     arguments = {name: ocp.args.StandardRestore(shapes) for name, shapes in items.items()}
     try:
         return manager.restore(step, args=ocp.args.Composite(**arguments))
