@@ -38,6 +38,11 @@ _KEEP = flags.DEFINE_integer("keep", 2, "Newest checkpoints to keep.", 1)
 def main() -> None:
     """Plans a run, or finds the one to resume, and trains it."""
     run = Path(_OUT.value)
+    if device_options.together() and training_body.reconstructs():
+        raise ValueError(
+            "Several processes do not reconstruct together. Run experiments.reconstruct on one "
+            "machine first, and give its folder as --reconstruction."
+        )
     device_options.connect()
     with device_options.first_speaks():
         if not _begin(run):
@@ -71,11 +76,6 @@ def _open(run: Path) -> None:
     """Plans a run and opens its folder; of several processes all plan, and the first opens."""
     run_folder.check_free(run)
     plans.check_options()
-    if device_options.together() and training_body.reconstructs():
-        raise ValueError(
-            "Several processes do not reconstruct together. Run experiments.reconstruct on one "
-            "machine first, and give its folder as --reconstruction."
-        )
     body = training_body.find(run, resume=_RESUME.value)
     plan = plans.plan_from_flags(body=body)
     devices.wait_for_all("all have planned, and nothing is written yet")
