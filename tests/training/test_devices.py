@@ -41,7 +41,10 @@ def _start(module, *arguments, flags=""):
 
 def _result(process):
     """Returns what a process printed last, which is JSON."""
-    printed, errors = process.communicate(timeout=900)
+    try:
+        printed, errors = process.communicate(timeout=1800)
+    finally:
+        process.kill()
     assert process.returncode == 0, errors
     # Gloo prints a line of its own.
     return json.loads(printed.splitlines()[-1])
@@ -64,12 +67,11 @@ def _in_two_processes(module, *arguments):
             process.kill()
 
 
-def _assert_same_curve(run, other):
-    a, b = np.array(run["reports"]), np.array(other["reports"])
-    assert a.shape == b.shape and len(a) > 1 and np.isfinite(a).all()
-    np.testing.assert_allclose(a, b, rtol=_ROUNDING, atol=1e-9)
-    np.testing.assert_allclose(run["params"], other["params"], rtol=_ROUNDING)
-    assert np.ptp(a[:, 0]) > 0.01
+def _assert_same_curve(reports, others):
+    reports, others = np.array(reports), np.array(others)
+    assert reports.shape == others.shape and np.isfinite(reports).all()
+    assert np.ptp(reports[:, 0]) > 1e-4
+    np.testing.assert_allclose(reports, others, rtol=_ROUNDING, atol=1e-9)
 
 
 # --- rows of devices ---
@@ -126,8 +128,7 @@ def test_a_mesh_of_one_device_trains_as_no_mesh():
         state = devices.put_everywhere(state, mesh=mesh)
         steps = loop.run_steps(setup, state, 12)
         curves.append([list(map(float, jax.device_get(report))) for _, report in steps])
-    np.testing.assert_allclose(curves[0], curves[1], rtol=1e-5, atol=1e-9)
-    assert np.ptp(np.array(curves)[0, :, 0]) > 0.01
+    _assert_same_curve(*curves)
 
 
 # --- many devices ---
@@ -135,29 +136,29 @@ def test_a_mesh_of_one_device_trains_as_no_mesh():
 
 @pytest.mark.slow
 def test_eight_devices_train_as_one_does(tmp_path):
-    bent = {"steps": 24, "budget": "paper"}
-    short = {"steps": 6, "budget": "paper"}
+    saved = str(tmp_path / "saved")
     runs = {
-        "one": {"devices": 1, **bent},
-        "eight": {"devices": 8, **bent},
-        "eight anew": {"devices": 8, **bent, "kept": False},
-        "five": {"devices": 5, **bent, "folder": str(tmp_path / "five")},
-        "paused": {"devices": 8, "steps": 4, "budget": "paper", "folder": str(tmp_path / "eight")},
-        "on one": {"devices": 1, **short, "resumed": str(tmp_path / "eight")},
-        "on five": {"devices": 5, **short, "resumed": str(tmp_path / "eight")},
+        "one": {"devices": 1, "steps": 26},
+        "eight": {"devices": 8, "steps": 24, "folder": saved},
+        "five": {"devices": 5, "steps": 24, "kept": False},
+        "on one": {"devices": 1, "steps": 26, "resumed": saved},
+        "on five": {"devices": 5, "steps": 26, "resumed": saved},
     }
+    runs = {name: {"budget": "paper", **options} for name, options in runs.items()}
     found = _result(_start("tests.training.sharded", json.dumps(runs), flags=_EIGHT))
     one = found["one"]
-    for name in ("eight", "eight anew", "five"):
-        _assert_same_curve(found[name], one)
+    for name, steps in {"eight": (0, 24), "five": (0, 24), "on one": (24, 26)}.items():
+        _assert_same_curve(found[name]["reports"], one["reports"][slice(*steps)])
+    _assert_same_curve(found["on five"]["reports"], one["reports"][24:])
+    for name in ("on one", "on five"):
+        np.testing.assert_allclose(found[name]["params"], one["params"], rtol=_ROUNDING)
     assert [found[name]["parts"] for name in ("one", "eight", "five")] == [1, 8, 5]
-    assert found["eight"]["kept"] and not found["eight anew"]["kept"]
+    assert [found[name]["kept"] for name in ("one", "eight", "five")] == [True, True, False]
     # Room for 48 paths of 32 rays, which five devices do not share evenly.
     assert [found[name]["slots"] for name in ("one", "eight", "five")] == [48, 48, 50]
-    np.testing.assert_allclose(found["eight"]["light"], one["light"], rtol=1e-6)
-    np.testing.assert_allclose(found["five"]["light"], one["light"], rtol=1e-6)
-    for name in ("on one", "on five"):
-        np.testing.assert_allclose(found[name]["reports"], one["reports"][4:6], rtol=_ROUNDING)
+    for name in ("eight", "five"):
+        light = found[name]["light"]
+        np.testing.assert_allclose(light, one["light"][: len(light)], rtol=1e-6)
 
 
 # --- several processes ---
@@ -182,7 +183,5 @@ def test_two_processes_train_as_one_does(tmp_path):
     first, second = _in_two_processes("tests.training.sharded", json.dumps(together))
     one = _result(_start("tests.training.sharded", json.dumps(alone)))["one"]
     assert first == second and first["two"]["parts"] == 2
-    for name, steps in (("two", slice(0, 24)), ("on", slice(24, 26))):
-        np.testing.assert_allclose(
-            first[name]["reports"], one["reports"][steps], rtol=_ROUNDING, atol=1e-9
-        )
+    _assert_same_curve(first["two"]["reports"], one["reports"][:24])
+    _assert_same_curve(first["on"]["reports"], one["reports"][24:])
