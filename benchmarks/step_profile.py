@@ -23,7 +23,7 @@ from absl import app, flags
 
 from benchmarks.training_setup import set_up_training, trace_pool
 from refref_jax import losses
-from refref_jax.fields import density_field, hash_grid, radiance_field
+from refref_jax.fields import hash_grid, registry
 from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid
 from refref_jax.render import pixels
 from refref_jax.render.config import ModelConfig
@@ -90,9 +90,9 @@ def _seen(params: tuple, config: ModelConfig, points: _Points) -> list[jax.Array
     for field, proposal, gaussians in zip(
         params.proposals, config.proposals, points.rounds[:-1], strict=True
     ):
-        density = functools.partial(density_field.density, field, proposal.field)
+        density = functools.partial(registry.density, field, proposal.field)
         found.append(jax.vmap(jax.vmap(density))(gaussians))
-    radiance = functools.partial(radiance_field.radiance, params.field, config.field)
+    radiance = functools.partial(registry.radiance, params.field, config.field)
     return [*found, *jax.vmap(jax.vmap(radiance))(points.rounds[-1], points.directions)]
 
 
@@ -100,7 +100,8 @@ def _loss(params: tuple, setup: loop.Setup, pool: tuple) -> jax.Array:
     """Returns a step's loss on the first batch of a pool."""
     model, config = setup.model, setup.config
     traced, rgb = jax.tree.map(lambda x: x[0], pool)
-    jitter = pixels.random_jitter(jax.random.key(0), model, traced.paths.radii.shape[0])
+    slots = jnp.arange(traced.paths.radii.shape[0])
+    jitter = pixels.random_jitter(jax.random.key(0), model, slots)
     seen = pixels.render_pixels(
         params, model, traced.paths, jitter, rays=rgb.shape[0], anneal=jnp.ones(())
     )

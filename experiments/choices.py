@@ -3,11 +3,11 @@
 import dataclasses
 from typing import Literal, NamedTuple
 
-from experiments.model_options import samples_of
+from experiments.model_options import grid_of, samples_of
 from experiments.named_budgets import make_budget
 from refref_jax.data.needs import Needs
 from refref_jax.optics.budgets import Budget
-from refref_jax.render.config import Interior
+from refref_jax.render.config import Interior, ModelConfig
 from refref_jax.render.saved import SavedModel
 from refref_jax.training.config import TrainingConfig
 
@@ -105,7 +105,6 @@ def _check_straight(paths: str, name: str, value: str) -> None:
 def report(config: TrainingConfig, model: SavedModel, chosen: Choices) -> list[str]:
     """Says what was resolved, a line for each choice with the options that change it."""
     budget, shape = model.budget, model.config
-    grid = shape.field.grid
     tints = f", tints {chosen.tints}" if chosen.tints != "none" else ""
     lines = [
         (f"paths {chosen.paths}, cut {budget.cut:g}, {budget.bends} bends", "paths cut bends"),
@@ -117,11 +116,7 @@ def report(config: TrainingConfig, model: SavedModel, chosen: Choices) -> list[s
             f"{'s' * (shape.multisamples > 1)}, {shape.footprint}",
             "samples multisamples footprint",
         ),
-        (
-            f"grid 2^{grid.entries.bit_length() - 1} entries, finest {grid.finest}, "
-            f"{shape.field.precision}",
-            "entries finest precision",
-        ),
+        _field_line(shape),
         (
             f"{config.schedule.steps} steps of {config.batch} rays, seed {config.seed}",
             "preset steps batch seed",
@@ -131,6 +126,15 @@ def report(config: TrainingConfig, model: SavedModel, chosen: Choices) -> list[s
         del lines[1]
     options = ["  ".join(f"--{name}" for name in names.split()) for _, names in lines]
     return [f"  {text:<46}  {names}" for (text, _), names in zip(lines, options, strict=True)]
+
+
+def _field_line(shape: ModelConfig) -> tuple[str, str]:
+    """Returns what the fields are, and the options that change it."""
+    field, grid = shape.field, grid_of(shape)
+    if grid is None:
+        return f"{field.kind}, {field.precision}", "field precision"
+    table = f"grid 2^{grid.entries.bit_length() - 1}, finest {grid.finest}"
+    return f"{field.kind}, {table}, {field.precision}", "field entries finest precision"
 
 
 def _needed_interior(needs: Needs, wishes: Wishes, budget: Budget) -> Interior:

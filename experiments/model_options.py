@@ -4,8 +4,10 @@ import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from refref_jax.fields.hash_grid import HashGridConfig
+from refref_jax.fields.kinds import RadianceConfig
+from refref_jax.fields.networks import GridRadianceConfig
 from refref_jax.fields.precision import Precision
-from refref_jax.fields.radiance_field import RadianceFieldConfig
 from refref_jax.render.config import Footprint, ModelConfig
 
 # Points of the cone patterns, see `sampling.cones`.
@@ -107,7 +109,19 @@ def _with_precision(model: ModelConfig, precision: Precision) -> ModelConfig:
     return dataclasses.replace(model, proposals=proposals, field=field)
 
 
-def _with_grid(field: RadianceFieldConfig, options: ModelOptions) -> RadianceFieldConfig:
+def grid_of(model: ModelConfig) -> HashGridConfig | None:
+    """Returns the hash grid of a model's radiance field, if fields of its kind have one."""
+    return model.field.grid if isinstance(model.field, GridRadianceConfig) else None
+
+
+def _with_grid(field: RadianceConfig, options: ModelOptions) -> RadianceConfig:
+    if options.entries is None and options.finest is None:
+        return field
+    if not isinstance(field, GridRadianceConfig):
+        raise ValueError(
+            f"--entries and --finest are of a hash grid, which fields of kind {field.kind} have "
+            "not. Leave them out."
+        )
     grid = field.grid
     if options.entries is not None:
         if not 1 <= options.entries <= _MOST_ENTRIES:

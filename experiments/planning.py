@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments import choices, mesh_report, model_options
+from experiments import choices, mesh_report, model_options, presets
 from experiments.choices import Choices, Wishes
 from experiments.model_options import ModelOptions
 from experiments.presets import PRESETS, bounds
@@ -16,6 +16,7 @@ from refref_jax.data.batches import check_batch
 from refref_jax.data.cameras import Cameras
 from refref_jax.data.geometry import build_geometry
 from refref_jax.data.meshes import MeshPart
+from refref_jax.fields import registry
 from refref_jax.optics.media import EMPTY_SLOT
 from refref_jax.optics.wavefront import Geometry
 from refref_jax.render.config import ModelConfig
@@ -40,6 +41,7 @@ class Request(NamedTuple):
       batch: rays a step.
       seed: of everything random.
       parts: the objects, where they are not to be read from the scene's meshes.
+      field: kind of the fields, see `fields.registry`.
     """
 
     scene: Path
@@ -54,6 +56,7 @@ class Request(NamedTuple):
     batch: int | None = None
     seed: int = 0
     parts: Sequence[MeshPart] | None = None
+    field: str = registry.USUAL
 
 
 class Plan(NamedTuple):
@@ -83,8 +86,8 @@ def make_plan(request: Request) -> Plan:
     space = request.space or background.space(scene)
     found = needs.find_needs(parts, tree, cameras, rule=rule, space=space)
     chosen = choices.choose(found, request.wishes)
-    config = _training(request, cameras, chosen)
     model = SavedModel(_model(request, cameras, space, chosen), chosen.budget)
+    config = _training(request, cameras, chosen, model.config)
     print(
         "\n".join([needs.describe(found), *choices.report(config, model, chosen), *chosen.warnings])
     )
@@ -92,7 +95,9 @@ def make_plan(request: Request) -> Plan:
     return Plan(config, model, build_geometry(coloured, tree.parents, rule=rule))
 
 
-def _training(request: Request, cameras: Cameras, chosen: Choices) -> TrainingConfig:
+def _training(
+    request: Request, cameras: Cameras, chosen: Choices, model: ModelConfig
+) -> TrainingConfig:
     preset = PRESETS[request.preset]
     batch = request.batch or preset.batch
     check_batch(cameras, batch)
@@ -100,7 +105,7 @@ def _training(request: Request, cameras: Cameras, chosen: Choices) -> TrainingCo
     return TrainingConfig(
         scene=SceneConfig(str(request.scene), request.rule, indices),
         paths=chosen.paths,
-        loss=preset.loss,
+        loss=presets.loss(model),
         schedule=preset.schedule.over(request.steps or preset.schedule.steps),
         batch=batch,
         pool=preset.pool,
@@ -112,7 +117,7 @@ def _training(request: Request, cameras: Cameras, chosen: Choices) -> TrainingCo
 def _model(request: Request, cameras: Cameras, space: Space, chosen: Choices) -> ModelConfig:
     told = background.half_extent(request.scene) if space == "bounded" else None
     extent = bounds(cameras, space=space, radius=request.radius or told)
-    model = PRESETS[request.preset].model(extent, chosen.interior)
+    model = PRESETS[request.preset].model(extent, chosen.interior, field=request.field)
     model = dataclasses.replace(model, learned_tints=chosen.learned_tints)
     return model_options.override(model, request.options, preset=request.preset)
 

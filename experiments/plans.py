@@ -10,10 +10,17 @@ from experiments.model_options import ModelOptions
 from experiments.planning import Plan, Request
 from experiments.presets import PRESETS
 from refref_jax.data.meshes import MeshPart
+from refref_jax.fields import registry
 from refref_jax.optics.budgets import BUDGETS
 
 SCENE = flags.DEFINE_string("scene", None, f"The scene to train on: {scene_option.FORMS}.")
 _PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Size of the model and its training.")
+_FIELD = flags.DEFINE_enum(
+    "field",
+    registry.USUAL,
+    list(registry.KINDS),
+    "Kind of the fields that are learned: Zip-NeRF's, or without its anti-aliasing Nerfacto's.",
+)
 PATHS = flags.DEFINE_enum(
     "paths",
     None,
@@ -90,6 +97,7 @@ SEED = flags.DEFINE_integer("seed", 0, "Seed of everything random.", 0, 2**32 - 
 
 SETTLED = (
     _PRESET,
+    _FIELD,
     PATHS,
     _CUT,
     _BENDS,
@@ -133,6 +141,7 @@ def plan_from_flags(*, body: MeshPart | None = None) -> Plan:
     request = Request(
         scene=opened_scene(),
         preset=_PRESET.value,
+        field=_FIELD.value,
         wishes=_wishes(),
         options=_options(),
         rule=scenes.RULE.value,

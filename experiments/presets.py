@@ -14,6 +14,9 @@
 | `paper` | 2 x 256           | 4,096       | 25,000 | cone         |
 | `best`  | 2 x 256           | 16,384      | 25,000 | differential |
 
+These are sizes of Zip-NeRF's fields (`fields/zipnerf.py`). Those of another kind, by `--field`, are
+in its own module; `paper` are the published ones.
+
 Points are those that stand for an interval's cone, `--multisamples`; the size is the entries of a
 level. What depends on the scene is no preset's: give `paper` the options `--paths=paper
 --interior=field` to have the published set-up in full, and leave both out for the others.
@@ -30,14 +33,11 @@ of as many rays, and takes as much memory, as one of `paper`.
 
 import dataclasses
 import math
-from collections.abc import Callable
 
 import numpy as np
 
 from refref_jax.data.cameras import Cameras
-from refref_jax.fields.density_field import DensityFieldConfig
-from refref_jax.fields.hash_grid import HashGridConfig
-from refref_jax.fields.radiance_field import RadianceFieldConfig
+from refref_jax.fields import registry
 from refref_jax.render.config import Interior, ModelConfig, ProposalConfig
 from refref_jax.sampling.domains import Space
 from refref_jax.training.config import LossConfig, ScheduleConfig
@@ -51,6 +51,9 @@ where the background is: a cube 3 % too large costs 2.7 dB, since its faces are 
 
 _NEAR = 0.05
 _FAR_UNBOUNDED = 1000.0
+
+# Blur of the interlevel loss in each proposal round (Zip-NeRF, supplement).
+_BLURS = (0.03, 0.003)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,18 +71,44 @@ class Preset:
     """One point of the trade between speed and accuracy.
 
     Attributes:
-      model: makes the model's configuration.
-      loss: what is minimised.
-      schedule: how.
+      size: of the fields, by its name in `fields.registry`.
+      schedule: how parameters move.
       batch: rays a step.
       pool: batches traced at once.
     """
 
-    model: Callable[[Bounds, Interior], ModelConfig]
-    loss: LossConfig
+    size: str
     schedule: ScheduleConfig
     batch: int
     pool: int
+
+    def model(
+        self, bounds_: Bounds, interior: Interior, *, field: str = registry.USUAL
+    ) -> ModelConfig:
+        """Returns a model of a scene, with fields of some kind.
+
+        Raises:
+          ValueError: if that kind has no such size.
+        """
+        sizes = registry.KINDS[field].sizes
+        if self.size not in sizes:
+            raise ValueError(
+                f"Fields of kind {field} have no size {self.size}. Use --preset with one of "
+                f"{', '.join(sizes)}."
+            )
+        size = sizes[self.size]
+        *counts, samples = size.samples
+        return ModelConfig(
+            proposals=tuple(map(ProposalConfig, size.proposals, counts)),
+            field=size.field,
+            samples=samples,
+            multisamples=size.multisamples,
+            interior=interior,
+            footprint=size.footprint,
+            learned_tints=0,
+            dilation=size.dilation,
+            **dataclasses.asdict(bounds_),
+        )
 
 
 def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
@@ -105,125 +134,43 @@ def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
     return Bounds(_NEAR, farthest + math.sqrt(3.0) * radius, radius, space)
 
 
-def _tiny_model(bounds_: Bounds, interior: Interior) -> ModelConfig:
-    proposal = DensityFieldConfig(
-        HashGridConfig(levels=4, coarsest=16, finest=64, entries=1 << 15, features=2), width=16
-    )
-    field = RadianceFieldConfig(
-        HashGridConfig(levels=6, coarsest=16, finest=512, entries=1 << 17, features=4),
-        density_width=32,
-        bottleneck=15,
-        colour_width=32,
-        colour_depth=1,
-    )
-    return ModelConfig(
-        proposals=(ProposalConfig(proposal, samples=32),),
-        field=field,
-        samples=20,
-        multisamples=1,
-        interior=interior,
-        footprint="differential",
-        learned_tints=0,
-        dilation=0.0,
-        **dataclasses.asdict(bounds_),
-    )
+def loss(model: ModelConfig) -> LossConfig:
+    """Returns what is minimised when a model is trained, the same for all presets.
 
-
-def _paper_model(bounds_: Bounds, interior: Interior) -> ModelConfig:
-    def proposal(levels: int, finest: int) -> ProposalConfig:
-        grid = HashGridConfig(levels, coarsest=16, finest=finest, entries=1 << 21, features=1)
-        return ProposalConfig(DensityFieldConfig(grid, width=64), samples=64)
-
-    field = RadianceFieldConfig(
-        HashGridConfig(levels=10, coarsest=16, finest=8192, entries=1 << 21, features=4),
-        density_width=64,
-        bottleneck=255,
-        colour_width=256,
-        colour_depth=2,
-    )
-    return ModelConfig(
-        proposals=(proposal(6, 512), proposal(8, 2048)),
-        field=field,
-        samples=32,
-        multisamples=6,
-        interior=interior,
-        footprint="cone",
-        learned_tints=0,
-        dilation=0.5,
-        **dataclasses.asdict(bounds_),
-    )
-
-
-def _small_model(bounds_: Bounds, interior: Interior) -> ModelConfig:
-    proposal = DensityFieldConfig(
-        HashGridConfig(levels=6, coarsest=16, finest=256, entries=1 << 17, features=2), width=32
-    )
-    field = RadianceFieldConfig(
-        HashGridConfig(levels=8, coarsest=16, finest=2048, entries=1 << 19, features=4),
-        density_width=64,
-        bottleneck=31,
-        colour_width=64,
-        colour_depth=1,
-    )
-    return ModelConfig(
-        proposals=(ProposalConfig(proposal, samples=48),),
-        field=field,
-        samples=32,
-        multisamples=1,
-        interior=interior,
-        footprint="differential",
-        learned_tints=0,
-        dilation=0.0,
-        **dataclasses.asdict(bounds_),
-    )
-
-
-def _best_model(bounds_: Bounds, interior: Interior) -> ModelConfig:
-    paper = _paper_model(bounds_, interior)
-    half = [
-        dataclasses.replace(each, field=dataclasses.replace(each.field, precision="bfloat16"))
-        for each in paper.proposals
-    ]
-    return dataclasses.replace(
-        paper,
-        proposals=tuple(half),
-        field=dataclasses.replace(paper.field, precision="bfloat16"),
-        footprint="differential",
-    )
-
-
-def _loss(*blurs: float) -> LossConfig:
-    """Returns the loss that all presets share, with the blur of each proposal round."""
+    The interlevel loss and its blurs are Zip-NeRF's for every kind of field.
+    """
+    finest = len(_BLURS) - 1
     return LossConfig(
-        data="mse", interlevel=0.01, blurs=blurs, distortion=0.01, hash_decay=0.1, dye_decay=1e-3
+        data="mse",
+        interlevel=0.01,
+        blurs=tuple(_BLURS[min(i, finest)] for i in range(len(model.proposals))),
+        distortion=0.01,
+        hash_decay=registry.KINDS[model.field.kind].hash_decay,
+        dye_decay=1e-3,
     )
 
 
 PRESETS = {
     "tiny": Preset(
-        model=_tiny_model,
-        loss=_loss(0.03),
+        size="tiny",
         schedule=ScheduleConfig(steps=2500, warmup=100, peak=1e-2, end=1e-3, anneal=250),
         batch=1024,
         pool=32,
     ),
     "small": Preset(
-        model=_small_model,
-        loss=_loss(0.03),
+        size="small",
         schedule=ScheduleConfig(steps=8000, warmup=300, peak=1e-2, end=1e-3, anneal=500),
         batch=2048,
         pool=32,
     ),
     "paper": Preset(
-        model=_paper_model,
-        loss=_loss(0.03, 0.003),
+        size="paper",
         schedule=ScheduleConfig(steps=25_000, warmup=1000, peak=8e-3, end=1e-3, anneal=1000),
         batch=4096,
         pool=32,
     ),
     "best": Preset(
-        model=_best_model,
-        loss=_loss(0.03, 0.003),
+        size="best",
         schedule=ScheduleConfig(steps=25_000, warmup=1000, peak=1e-2, end=1e-3, anneal=1000),
         batch=16_384,
         pool=8,

@@ -8,7 +8,9 @@ listed.
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from experiments import model_options
 from experiments.presets import PRESETS, Bounds
+from refref_jax.fields import registry
 from refref_jax.optics.budgets import BUDGETS
 
 BASE = "base"
@@ -80,7 +82,16 @@ def sweep(
     first, *others = steps or (usual, usual // 4, usual // 2, 2 * usual)
     base = _BASE_OPTIONS | dict(base or {})
     options = {"preset": preset, "seed": str(seed), "steps": str(first)} | base
-    swept = default_values(preset) | {"steps": tuple(map(str, others))} | dict(values or {})
+    field = base.get("field", registry.USUAL)
+    if field not in registry.KINDS:
+        raise ValueError(
+            f"There is no --base=field={field}. Choose from {', '.join(registry.KINDS)}."
+        )
+    swept = (
+        default_values(preset, field=field)
+        | {"steps": tuple(map(str, others))}
+        | dict(values or {})
+    )
     if knobs is not None:
         if unknown := [knob for knob in knobs if knob not in swept]:
             raise ValueError(
@@ -88,7 +99,7 @@ def sweep(
                 f"values with --values={unknown[0]}=A/B."
             )
         swept = {knob: swept[knob] for knob in knobs}
-    known = own_values(preset, base["paths"]) | options
+    known = own_values(preset, base["paths"], field=field) | options
     points = [_point(options, "", "")]
     points += [
         _point(options, knob, value)
@@ -100,15 +111,25 @@ def sweep(
     return points
 
 
-def own_values(preset: str, paths: str = "tree") -> dict[str, str]:
-    """Returns what the knobs are in a preset, with a budget of paths, if no option changes them."""
-    model = PRESETS[preset].model(_ANY_BOUNDS, "field")
-    rounds = [*(proposal.samples for proposal in model.proposals), model.samples]
+def own_values(preset: str, paths: str = "tree", *, field: str = registry.USUAL) -> dict[str, str]:
+    """Returns what the knobs are if no option changes them.
+
+    Args:
+      preset: a preset.
+      paths: name of a budget of paths.
+      field: kind of the fields.
+    """
+    model = PRESETS[preset].model(_ANY_BOUNDS, "field", field=field)
+    grid = model_options.grid_of(model)
+    of_grid = {}
+    if grid is not None:
+        entries = grid.entries.bit_length() - 1
+        of_grid = {"entries": str(entries), "finest": str(grid.finest)}
     return {
-        "samples": ",".join(map(str, rounds)),
+        "field": field,
+        "samples": ",".join(map(str, model_options.samples_of(model))),
         "multisamples": str(model.multisamples),
-        "entries": str(model.field.grid.entries.bit_length() - 1),
-        "finest": str(model.field.grid.finest),
+        **of_grid,
         "footprint": model.footprint,
         "precision": model.field.precision,
         "cut": str(BUDGETS[paths].cut),
@@ -117,14 +138,20 @@ def own_values(preset: str, paths: str = "tree") -> dict[str, str]:
     }
 
 
-def default_values(preset: str) -> dict[str, tuple[str, ...]]:
+def default_values(preset: str, *, field: str = registry.USUAL) -> dict[str, tuple[str, ...]]:
     """Returns what is tried of each knob, around a preset: a little less, and more.
 
     Of interiors it is the paper's field; the base has what the scene needs.
     """
-    own = own_values(preset)
+    own = own_values(preset, field=field)
     rounds = [int(count) for count in own["samples"].split(",")]
-    entries, finest = int(own["entries"]), int(own["finest"])
+    of_grid = {}
+    if "entries" in own:
+        entries, finest = int(own["entries"]), int(own["finest"])
+        of_grid = {
+            "entries": tuple(str(entries + more) for more in (-3, -2, -1, 1, 2)),
+            "finest": tuple(str(round(share * finest)) for share in (0.25, 0.5, 2, 4)),
+        }
     return {
         "paths": ("straight", "paper", "tree"),
         "cut": ("0.1", "0.05", "0.02", "0.01", "0.005"),
@@ -133,8 +160,7 @@ def default_values(preset: str) -> dict[str, tuple[str, ...]]:
             ",".join(str(round(share * count)) for count in rounds) for share in (0.5, 0.75, 1.5, 2)
         ),
         "multisamples": ("1", "6"),
-        "entries": tuple(str(entries + more) for more in (-3, -2, -1, 1, 2)),
-        "finest": tuple(str(round(share * finest)) for share in (0.25, 0.5, 2, 4)),
+        **of_grid,
         "interior": ("field",),
         "footprint": ("cone", "differential"),
         "precision": ("float32", "bfloat16"),

@@ -6,17 +6,27 @@ With --method=r3f the object is reconstructed from images and masks first, into 
 scene's own meshes are never read.
 """
 
+import contextlib
 import sys
 from pathlib import Path
 
 from absl import flags
 
-from experiments import commands, plans, reconstruction_options, scenes, trainer, training_body
-from refref_jax.training import run_folder, run_lock
+from experiments import (
+    commands,
+    device_options,
+    plans,
+    reconstruction_options,
+    scenes,
+    trainer,
+    training_body,
+)
+from refref_jax.training import devices, run_folder, run_lock
 
 flags.adopt_module_key_flags(scenes)
 flags.adopt_module_key_flags(plans)
 flags.adopt_module_key_flags(training_body)
+flags.adopt_module_key_flags(device_options)
 flags.adopt_module_key_flags(reconstruction_options)
 _OUT = flags.DEFINE_string("out", None, "Folder to write the run to.", required=True)
 _RESUME = flags.DEFINE_bool("resume", False, "Continue the run in --out, if there is one.")
@@ -28,34 +38,51 @@ _KEEP = flags.DEFINE_integer("keep", 2, "Newest checkpoints to keep.", 1)
 def main() -> None:
     """Plans a run, or finds the one to resume, and trains it."""
     run = Path(_OUT.value)
-    if not _begin(run):
-        print(f"Continue with --resume --out={run}.")
-        sys.exit(commands.INTERRUPTED)
-    print(f"Run: {run}  (metrics.jsonl, checkpoints/)")
-    print(f"Next: {commands.shell('evaluate', f'--run={run}', '--split=test')}")
+    if device_options.together() and training_body.reconstructs():
+        raise ValueError(
+            "Several processes do not reconstruct together. Run experiments.reconstruct on one "
+            "machine first, and give its folder as --reconstruction."
+        )
+    device_options.connect()
+    with device_options.first_speaks():
+        if not _begin(run):
+            print(f"Continue with --resume --out={run}.")
+            sys.exit(commands.INTERRUPTED)
+        print(f"Run: {run}  (metrics.jsonl, checkpoints/)")
+        print(f"Next: {commands.shell('evaluate', f'--run={run}', '--split=test')}")
 
 
 def _begin(run: Path) -> bool:
     """Begins a run, or goes on with it; returns whether it has reached its last step."""
+    mesh = device_options.mesh()
     resuming = _RESUME.value and run_folder.exists(run)
     if not resuming:
-        run_folder.check_free(run)
-        plans.check_options()
-        body = training_body.find(run, resume=_RESUME.value)
-        plan = plans.plan_from_flags(body=body)
-        training_body.note(run, body)
-        run_folder.create(run, *plan)
+        _open(run)
     elif plans.SCENE.value is not None:
         body = training_body.find(run, resume=True)
         run_folder.check_unchanged(run, *plans.plan_from_flags(body=body))
     else:
         _refuse_options(run)
-    with run_lock.hold(run):
+    with run_lock.hold(run) if devices.is_first() else contextlib.nullcontext():
         return trainer.train(
             run,
             scene=plans.SCENE.value,
             periods=trainer.Periods(_LOG_EVERY.value, _CHECKPOINT_EVERY.value, _KEEP.value),
+            mesh=mesh,
         )
+
+
+def _open(run: Path) -> None:
+    """Plans a run and opens its folder; of several processes all plan, and the first opens."""
+    run_folder.check_free(run)
+    plans.check_options()
+    body = training_body.find(run, resume=_RESUME.value)
+    plan = plans.plan_from_flags(body=body)
+    devices.wait_for_all("all have planned, and nothing is written yet")
+    if devices.is_first():
+        training_body.note(run, body)
+        run_folder.create(run, *plan)
+    devices.wait_for_all("the folder is there")
 
 
 def _refuse_options(run: Path) -> None:

@@ -3,19 +3,20 @@
 import math
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
+from jax.sharding import Mesh
 
 from experiments import commands, scene_option
 from refref_jax.data import local_layout, mask_margins
 from refref_jax.data.batches import PixelSampler
 from refref_jax.render import saved
-from refref_jax.training import loop, run_folder
+from refref_jax.training import devices, loop, run_folder
 from refref_jax.training.checkpoints import Checkpoints
 from refref_jax.training.config import TrainingConfig
+from refref_jax.training.objective import StepReport
 from refref_jax.training.state import TrainState, init_state
-from refref_jax.training.steps import StepReport
 
 # Steps that the device takes without the host, which sees an interrupt only between them.
 _MOST_STEPS = 10
@@ -38,15 +39,19 @@ class Periods(NamedTuple):
 USUAL = Periods()
 
 
-def train(run: Path, *, scene: str | None = None, periods: Periods = USUAL) -> bool:
+def train(
+    run: Path, *, scene: str | None = None, periods: Periods = USUAL, mesh: Mesh | None = None
+) -> bool:
     """Trains the run of a folder from its newest checkpoint, or from the start.
 
-    Ctrl-C saves a checkpoint, and ends it.
+    Ctrl-C saves a checkpoint, and ends it. Of several processes all take the same steps and end
+    together, and the first alone writes.
 
     Args:
       run: the folder.
       scene: where its scene is now, if it has moved.
       periods: of what is done every so many steps.
+      mesh: the devices that train together; `None` for one alone.
 
     Returns:
       Whether it has reached its last step.
@@ -58,13 +63,14 @@ def train(run: Path, *, scene: str | None = None, periods: Periods = USUAL) -> b
             return True
         sampler = _sampler(config, scene_option.opened(scene or config.scene.path))
         geometry = saved.load_geometry(run)
-        setup = loop.set_up(config, model.config, model.budget, geometry, sampler)
+        setup = loop.set_up(config, model.config, model.budget, geometry, sampler, mesh=mesh)
         if setup.hit_fraction == 0.0 and model.budget.bends > 0:
             print(
                 "warning: no pixel sees the meshes, so no light is bent. Check that their units, "
                 "axes and position are those of the cameras."
             )
         state = init_state(config.seed, model.config, config.schedule)
+        state = devices.put_everywhere(state, mesh=mesh)
         if checkpoints.newest() is not None:
             state = checkpoints.restore(state)
         return _train(run, setup, state, checkpoints, periods)
@@ -88,7 +94,8 @@ def _train(
     periods: Periods,
 ) -> bool:
     total, step = setup.config.schedule.steps, int(state.step)
-    earlier = run_folder.rewind_metrics(run, step)
+    writes = devices.is_first()
+    earlier = run_folder.rewind_metrics(run, step) if writes else 0.0
     interrupt = commands.Interrupt()
     start = last = time.monotonic()
     logged = step
@@ -100,19 +107,27 @@ def _train(
                 report = jax.device_get(report)
                 now = time.monotonic()
                 rate = setup.config.batch * (step - logged) / (now - last)
-                _log(run, step, report, rate, earlier + now - start)
+                line = _line(step, report, rate, earlier + now - start)
+                if writes:
+                    run_folder.append_metrics(run, line)
                 bar.show(step, f"loss {report.loss:.5f}  PSNR {report.psnr:.2f}  {rate:.0f} rays/s")
                 last, logged = now, step
-            if step % periods.checkpoint == 0 or step == total or interrupt.requested:
+            stopping = devices.any_process(interrupt.requested)
+            if step % periods.checkpoint == 0 or step == total or stopping:
                 checkpoints.save(stepped)
-            if interrupt.requested:
+            if stopping:
                 break
     if step < total:
         print(f"Stopped at step {step}.")
     return step == total
 
 
-def _log(run: Path, step: int, report: StepReport, rate: float, seconds: float) -> None:
+def _line(step: int, report: StepReport, rate: float, seconds: float) -> dict[str, Any]:
+    """Returns a line of metrics.
+
+    Raises:
+      ValueError: if the loss is not finite.
+    """
     if not math.isfinite(report.loss):
         raise ValueError(
             f"The loss is {report.loss} at step {step}. Evaluate the last checkpoint, which is "
@@ -124,4 +139,4 @@ def _log(run: Path, step: int, report: StepReport, rate: float, seconds: float) 
     if (memory := jax.local_devices()[0].memory_stats()) is not None:
         line["peak_device_bytes"] = memory["peak_bytes_in_use"]
     # The PSNR of a batch that is met exactly is infinite.
-    run_folder.append_metrics(run, commands.string_safe(line))
+    return commands.string_safe(line)

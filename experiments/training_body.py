@@ -37,6 +37,11 @@ FOLDER = "r3f"
 """Below the run's folder: what is reconstructed for it."""
 
 
+def reconstructs() -> bool:
+    """Returns whether the options ask for a body that is reconstructed first."""
+    return METHOD.value == "r3f" and RECONSTRUCTION.value is None
+
+
 def find(run: Path, *, resume: bool) -> MeshPart | None:
     """Returns the body that the options ask for, or `None` for the scene's own meshes.
 
@@ -105,19 +110,18 @@ def _check_options() -> None:
     Raises:
       ValueError: if there are any.
     """
-    reconstructs = METHOD.value == "r3f" and RECONSTRUCTION.value is None
     if METHOD.value == "oracle" and RECONSTRUCTION.value is not None and METHOD.present:
         raise ValueError(
             "--method=oracle takes the scene's own meshes, not a reconstruction. Leave out either "
             "--method or --reconstruction."
         )
     given = [f"--{holder.name}" for holder in SETTLED[2:] if flags.FLAGS[holder.name].present]
-    if given and not reconstructs:
+    if given and not reconstructs():
         raise ValueError(
             f"{', '.join(given)} would have no effect, since nothing is reconstructed. Leave it "
             "out, or add --method=r3f."
         )
-    if (reconstructs or RECONSTRUCTION.value) and plans.PATHS.value == "straight":
+    if (reconstructs() or RECONSTRUCTION.value) and plans.PATHS.value == "straight":
         raise ValueError(
             "--paths=straight knows of no objects, so that none has to be reconstructed. Leave out "
             "--method and --reconstruction, or use --paths=tree."

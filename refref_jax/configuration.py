@@ -2,17 +2,24 @@
 
 A field with a default may be missing, as it is in files of versions that did not know it.
 
-Fields may be numbers, strings, booleans, `None`, other dataclasses, and tuples of these.
+Fields may be numbers, strings, booleans, `None`, other dataclasses, and tuples of these. Where a
+field is annotated with a base class, its own key `kind` says which of that class's variants it is.
 """
 
 import dataclasses
 import json
 import types
 import typing
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 _Config = TypeVar("_Config")
+
+Variants = Mapping[type, Mapping[str, type]]
+"""The classes that may stand for a base class, by their key `kind`; the first is the default."""
+
+_KIND = "kind"
 
 
 def write(path: Path, config: Any) -> None:
@@ -21,8 +28,13 @@ def write(path: Path, config: Any) -> None:
     path.write_text(text, encoding="utf-8")
 
 
-def read(path: Path, kind: type[_Config]) -> _Config:
+def read(path: Path, kind: type[_Config], *, variants: Variants | None = None) -> _Config:
     """Reads a configuration of a known kind.
+
+    Args:
+      path: the file.
+      kind: class of the configuration.
+      variants: of the base classes within it.
 
     Raises:
       ValueError: if the file is missing or not JSON, or a key is missing, unknown or of the
@@ -31,7 +43,8 @@ def read(path: Path, kind: type[_Config]) -> _Config:
     if not path.is_file():
         raise ValueError(f"{path} does not exist. Give a folder that a command wrote.")
     try:
-        return _build(kind, json.loads(path.read_text(encoding="utf-8")), kind.__name__)
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return _build(kind, content, kind.__name__, variants or {})
     except (ValueError, TypeError) as error:
         raise ValueError(
             f"{path} does not hold a {kind.__name__} ({error}). Restore the file, or write it "
@@ -39,13 +52,13 @@ def read(path: Path, kind: type[_Config]) -> _Config:
         ) from error
 
 
-def _build(kind: Any, value: Any, where: str) -> Any:
+def _build(kind: Any, value: Any, where: str, variants: Variants) -> Any:
     """Converts parsed JSON to an annotated type."""
     if dataclasses.is_dataclass(kind):
-        return _build_dataclass(kind, value, where)
+        return _build_dataclass(kind, value, where, variants)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple:
-        return _build_tuple(arguments, value, where)
+        return _build_tuple(arguments, value, where, variants)
     if origin is typing.Literal:
         if not any(value == option and type(value) is type(option) for option in arguments):
             raise ValueError(f"{where} is {value!r}, not one of {arguments}")
@@ -53,7 +66,8 @@ def _build(kind: Any, value: Any, where: str) -> Any:
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None
-        return _build(next(a for a in arguments if a is not type(None)), value, where)
+        (other,) = (a for a in arguments if a is not type(None))
+        return _build(other, value, where, variants)
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if type(value) is not kind:
@@ -61,9 +75,10 @@ def _build(kind: Any, value: Any, where: str) -> Any:
     return value
 
 
-def _build_dataclass(kind: Any, value: Any, where: str) -> Any:
+def _build_dataclass(kind: Any, value: Any, where: str, variants: Variants) -> Any:
     if not isinstance(value, dict):
         raise ValueError(f"{where} is {value!r}, not an object")
+    kind = _variant(variants[kind], value, where) if kind in variants else kind
     hints = typing.get_type_hints(kind)
     fields = dataclasses.fields(kind)
     names = [field.name for field in fields if field.name in value]
@@ -72,10 +87,21 @@ def _build_dataclass(kind: Any, value: Any, where: str) -> Any:
         raise ValueError(f"{where} lacks {', '.join(map(repr, sorted(missing)))}")
     if unknown := set(value) - set(names):
         raise ValueError(f"{where} has the unknown {', '.join(map(repr, sorted(unknown)))}")
-    return kind(**{name: _build(hints[name], value[name], f"{where}.{name}") for name in names})
+    built = {n: _build(hints[n], value[n], f"{where}.{n}", variants) for n in names}
+    return kind(**built)
 
 
-def _build_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+def _variant(known: Mapping[str, type], value: dict[str, Any], where: str) -> type:
+    """Returns the class that a value's own key names, or the first."""
+    name = value.get(_KIND, next(iter(known)))
+    if not isinstance(name, str) or name not in known:
+        raise ValueError(f"{where}.{_KIND} is {name!r}, not one of {', '.join(known)}")
+    return known[name]
+
+
+def _build_tuple(
+    arguments: tuple[Any, ...], value: Any, where: str, variants: Variants
+) -> tuple[Any, ...]:
     if not isinstance(value, list):
         raise ValueError(f"{where} is {value!r}, not a list")
     if len(arguments) == 2 and arguments[1] is Ellipsis:
@@ -83,4 +109,6 @@ def _build_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[An
     if len(arguments) != len(value):
         raise ValueError(f"{where} has {len(value)} items, not {len(arguments)}")
     items = zip(arguments, value, strict=True)
-    return tuple(_build(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(items))
+    return tuple(
+        _build(kind, item, f"{where}[{i}]", variants) for i, (kind, item) in enumerate(items)
+    )

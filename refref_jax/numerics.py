@@ -19,6 +19,10 @@ from jaxtyping import Array, Float
 # have to travel 1e12 units before the difference shows.
 _SMALLEST_COMPONENT = 1e-12
 
+# Where `truncated_exponential` holds its value, and on either side its slope.
+_LARGEST_EXPONENT = 40.0
+_STEEPEST_EXPONENT = 15.0
+
 # Rounding in the barycentric evaluation of a hit is a few units in the last place of the
 # largest coordinate involved; eight of them clear it with room to spare.
 _OFFSET_IN_ULPS = 8.0
@@ -175,6 +179,28 @@ def exponential_decay(
     endless = jnp.isinf(length)
     decay = jnp.exp(-rate * jnp.where(endless, 0.0, length))
     return jnp.where(endless, jnp.where(rate > 0, 0.0, 1.0), decay)
+
+
+@jax.custom_jvp
+def truncated_exponential(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Returns `exp(x)`, held at `exp(40)`, with the slope held between `exp(-15)` and `exp(15)`.
+
+    As a density 2e17 is opaque over every length that a float tells from 0, and its product with
+    any length of a scene is a number. The slope is the true one for `|x| <= 15`; below, it never
+    vanishes, so that a field which has become empty can come back.
+
+    Source: the density of Nerfacto (`trunc_exp`, from torch-ngp), whose value is not held.
+    """
+    return jnp.exp(jnp.minimum(x, _LARGEST_EXPONENT))
+
+
+@truncated_exponential.defjvp
+def _truncated_exponential_jvp(
+    primals: tuple[Array], tangents: tuple[Array]
+) -> tuple[Array, Array]:
+    (x,), (tangent,) = primals, tangents
+    slope = jnp.exp(jnp.clip(x, -_STEEPEST_EXPONENT, _STEEPEST_EXPONENT))
+    return truncated_exponential(x), slope * tangent
 
 
 def offset_origin(

@@ -227,3 +227,51 @@ def test_a_key_that_has_a_default_may_be_missing_and_no_other(path):
     path.write_text('{"steps": 3, "since": 4}')
     with pytest.raises(ValueError, match="since"):
         configuration.read(path, _Grown)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Shape:
+    pass
+
+
+@dataclasses.dataclass(frozen=True)
+class _Ball(_Shape):
+    radius: float
+    kind: Literal["ball"] = "ball"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Box(_Shape):
+    size: tuple[float, float]
+    kind: Literal["box"] = "box"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Scene:
+    main: _Shape
+    others: tuple[_Shape, ...]
+    spare: _Shape | None
+
+
+_SHAPES = {_Shape: {"ball": _Ball, "box": _Box}}
+
+
+def test_the_key_kind_tells_variants_apart_and_the_first_is_the_default(path):
+    scene = _Scene(_Ball(1.5), (_Box((1.0, 2.0)), _Ball(0.5)), _Box((3.0, 4.0)))
+    configuration.write(path, scene)
+    assert configuration.read(path, _Scene, variants=_SHAPES) == scene
+    path.write_text('{"main": {"radius": 2}, "others": [], "spare": null}')
+    assert configuration.read(path, _Scene, variants=_SHAPES) == _Scene(_Ball(2.0), (), None)
+
+
+@pytest.mark.parametrize("kind", ['"cone"', "7", "null", "[]"])
+def test_a_variant_that_is_not_known_is_named(path, kind):
+    path.write_text(f'{{"main": {{"radius": 2, "kind": {kind}}}, "others": [], "spare": null}}')
+    with pytest.raises(ValueError, match=r"_Scene\.main\.kind is .*, not one of ball, box"):
+        configuration.read(path, _Scene, variants=_SHAPES)
+
+
+def test_the_keys_of_a_variant_are_its_own(path):
+    path.write_text('{"main": {"radius": 2, "kind": "box"}, "others": [], "spare": null}')
+    with pytest.raises(ValueError, match=r"_Scene\.main lacks 'size'"):
+        configuration.read(path, _Scene, variants=_SHAPES)

@@ -397,6 +397,7 @@ _CASES = {
     "safe_atan2": (numerics.safe_atan2, (_SCALARS[::-1], _SCALARS)),
     "length": (numerics.length, (_VECTORS,)),
     "normalize": (numerics.normalize, (_VECTORS,)),
+    "truncated_exponential": (numerics.truncated_exponential, (_SCALARS,)),
     "offset_origin": (
         numerics.offset_origin,
         (_VECTORS, _VECTORS[::-1], abs(_SCALARS)),
@@ -447,3 +448,37 @@ def test_decay_has_its_true_gradients_without_absorption():
 
 def test_decay_passes_nan_on():
     assert np.isnan(numerics.exponential_decay(jnp.float32(1.0), jnp.float32(np.nan)))
+
+
+# --- truncated_exponential ---
+
+
+@pytest.mark.parametrize(
+    ("x", "expected"), [(0.0, 1.0), (1.0, np.e), (-200.0, 0.0), (40.0, np.exp(40.0))]
+)
+def test_truncated_exponential_by_hand(x, expected):
+    found = numerics.truncated_exponential(jnp.float32(x))
+    np.testing.assert_allclose(found, expected, rtol=10 * _ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ("x", "slope"),
+    [
+        (0.0, 1.0),
+        (15.0, np.exp(15.0)),
+        (30.0, np.exp(15.0)),
+        (1e30, np.exp(15.0)),
+        (-30.0, np.exp(-15.0)),
+        (-1e30, np.exp(-15.0)),
+    ],
+)
+def test_truncated_exponential_is_finite_and_its_slope_never_vanishes(x, slope):
+    value, found = jax.value_and_grad(numerics.truncated_exponential)(jnp.float32(x))
+    np.testing.assert_allclose(value, np.exp(min(x, 40.0)), rtol=10 * _ROUNDING)
+    np.testing.assert_allclose(found, slope, rtol=10 * _ROUNDING)
+    # A density times any length of a scene is a number.
+    assert np.isfinite(np.float32(value) * np.float32(1e6))
+
+
+def test_truncated_exponential_check_grads():
+    gradients.assert_numerical(numerics.truncated_exponential, [0.3, -2.0, 3.0])

@@ -157,7 +157,7 @@ def _plan(
     config = TrainingConfig(
         scene=SceneConfig(str(scene), "nested", ()),
         paths="straight",
-        loss=preset.loss,
+        loss=presets.loss(model),
         schedule=preset.schedule.over(steps),
         batch=preset.batch,
         pool=preset.pool,

@@ -1,4 +1,4 @@
-"""The proposal field: density alone, cheap enough to be asked many times along a path.
+"""The proposal field of Zip-NeRF: density alone, cheap enough to be asked many times along a path.
 
 Plain functions over Gaussians in the unit cube; the linen module stays inside.
 
@@ -6,48 +6,30 @@ Source: Barron et al., Mip-NeRF 360 (2022), section 3; Zip-NeRF (2023) for the h
 """
 
 import dataclasses
-from typing import Any
+from typing import Literal
 
 import flax.linen as nn
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from refref_jax.fields import precision
-from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid
-from refref_jax.fields.precision import Precision, check_precision
+from refref_jax.fields.kinds import Params
+from refref_jax.fields.networks import GridDensityConfig, grid_network, nowhere
 from refref_jax.sampling.cones import Gaussians
-
-Params = Any
-"""A pytree of arrays, as `init` makes it."""
 
 # Where softplus starts to rise: an untrained field is thin, but not empty.
 _DENSITY_SHIFT = -1.0
 
 
 @dataclasses.dataclass(frozen=True)
-class DensityFieldConfig:
-    """Shape of a density field.
+class DensityFieldConfig(GridDensityConfig):
+    """Shape of a density field; see `GridDensityConfig`."""
 
-    Attributes:
-      grid: the hash grid.
-      width: units of the hidden layer.
-      precision: of tables and matrix products.
-    """
-
-    grid: HashGridConfig
-    width: int
-    precision: Precision = "float32"
-
-    def __post_init__(self) -> None:
-        """Checks the choice."""
-        check_precision(self.precision)
+    kind: Literal["zipnerf"] = dataclasses.field(default="zipnerf", kw_only=True)
 
 
 def init(key: Array, config: DensityFieldConfig) -> Params:
     """Returns new parameters."""
-    nowhere = Gaussians(jnp.zeros((1, 3)), jnp.zeros(1))
-    return _DensityField(config).init(key, nowhere)
+    return _DensityField(config).init(key, nowhere())
 
 
 def density(params: Params, config: DensityFieldConfig, gaussians: Gaussians) -> Float[Array, ""]:
@@ -72,7 +54,7 @@ class _DensityField(nn.Module):
     @nn.compact
     def __call__(self, gaussians: Gaussians) -> Float[Array, ""]:
         config = self.config
-        dense = precision.dense(config.precision)
-        features = MultisampledGrid(config.grid, config.precision)(gaussians)
-        hidden = nn.relu(dense(config.width)(features))
-        return activate_density(dense(1)(hidden)[0])
+        raw = grid_network(
+            gaussians, config.grid, width=config.width, outputs=1, precision=config.precision
+        )
+        return activate_density(raw[0])

@@ -136,6 +136,19 @@ def straight_ends(rays: Rays) -> PathEnds:
     )
 
 
+def filled_up(paths: LightPaths, *, multiple: int) -> LightPaths:
+    """Returns the paths with empty slots after them, so that their number is a multiple."""
+    count = paths.radii.shape[0]
+    room = -(-count // multiple) * multiple
+    # What is in an empty slot is finite: the last path again, which carries no light.
+    paths = jax.tree.map(lambda x: x[jnp.minimum(jnp.arange(room), count - 1)], paths)
+    real = jnp.arange(room) < count
+    return paths._replace(
+        weights=jnp.where(real[:, None], paths.weights, 0.0),
+        statuses=jnp.where(real, paths.statuses, PathStatus.EMPTY),
+    )
+
+
 def exists(paths: LightPaths | PathEnds) -> Bool[Array, " paths"]:
     """Returns which slots hold a path."""
     return paths.statuses != PathStatus.EMPTY

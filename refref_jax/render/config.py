@@ -4,8 +4,7 @@ import dataclasses
 import math
 from typing import Literal, get_args
 
-from refref_jax.fields.density_field import DensityFieldConfig
-from refref_jax.fields.radiance_field import RadianceFieldConfig
+from refref_jax.fields.kinds import DensityConfig, RadianceConfig
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.details import Detail
 from refref_jax.optics.footprints import Footprint
@@ -26,11 +25,11 @@ class ProposalConfig:
     """One round of proposal sampling.
 
     Attributes:
-      field: its density field.
+      field: its density field, of any kind.
       samples: intervals along a path.
     """
 
-    field: DensityFieldConfig
+    field: DensityConfig
     samples: int
 
 
@@ -40,7 +39,7 @@ class ModelConfig:
 
     Attributes:
       proposals: rounds of proposal sampling, coarse to fine; at least one.
-      field: the radiance field.
+      field: the radiance field, of any kind.
       samples: intervals of the final round.
       multisamples: points that stand for an interval's cone, 1 or 6.
       interior: `field` also samples inside the objects (the paper); `clear` takes nothing to be
@@ -62,7 +61,7 @@ class ModelConfig:
     """
 
     proposals: tuple[ProposalConfig, ...]
-    field: RadianceFieldConfig
+    field: RadianceConfig
     samples: int
     multisamples: int
     interior: Interior

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 from jaxtyping import Array
 
-from refref_jax.fields import density_field, radiance_field
+from refref_jax.fields import kinds, registry
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.wavefront import Geometry
 from refref_jax.render import dyes
@@ -22,8 +22,8 @@ class Params(NamedTuple):
       dyes: colours of the parts, if they are learned.
     """
 
-    proposals: tuple[density_field.Params, ...]
-    field: radiance_field.Params
+    proposals: tuple[kinds.Params, ...]
+    field: kinds.Params
     dyes: Dyes | None = None
 
 
@@ -47,8 +47,8 @@ def init_params(key: Array, config: ModelConfig) -> Params:
     """Returns new parameters for all fields of a model."""
     field_key, *keys = jax.random.split(key, 1 + len(config.proposals))
     proposals = tuple(
-        density_field.init(proposal_key, proposal.field)
+        registry.init_density(proposal_key, proposal.field)
         for proposal_key, proposal in zip(keys, config.proposals, strict=True)
     )
     colours = dyes.init(config.learned_tints) if config.learned_tints else None
-    return Params(proposals, radiance_field.init(field_key, config.field), colours)
+    return Params(proposals, registry.init_radiance(field_key, config.field), colours)

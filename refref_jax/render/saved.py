@@ -18,6 +18,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from refref_jax import configuration
+from refref_jax.fields import registry
 from refref_jax.geometry.bvh import BVH
 from refref_jax.geometry.surfaces import Surfaces
 from refref_jax.optics.budgets import Budget
@@ -63,7 +64,7 @@ def save_scene(run: Path, saved: SavedModel, geometry: Geometry) -> None:
 
 def read_static(run: Path) -> SavedModel:
     """Reads the static half of a model."""
-    return configuration.read(run / _MODEL, SavedModel)
+    return configuration.read(run / _MODEL, SavedModel, variants=registry.variants())
 
 
 def load_model(run: str | os.PathLike[str], *, step: int | None = None) -> Model:
@@ -132,9 +133,19 @@ def find_step(manager: ocp.CheckpointManager, run: Path, step: int | None) -> in
 def restore(manager: ocp.CheckpointManager, step: int, items: dict) -> ocp.args.Composite:
     """Reads some items of a checkpoint into the shapes and types that are given.
 
+    Args:
+      manager: of the checkpoints.
+      step: of the checkpoint.
+      items: shapes by the name of the item. Those without a sharding are read onto one device, from
+        however many they were written.
+
     Raises:
       ValueError: if it is damaged.
     """
+    here = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    items = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding or here), items
+    )
     arguments = {name: ocp.args.StandardRestore(shapes) for name, shapes in items.items()}
     try:
         return manager.restore(step, args=ocp.args.Composite(**arguments))

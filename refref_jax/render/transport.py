@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from refref_jax.fields import density_field, radiance_field
+from refref_jax.fields import registry
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.render import compositing
 from refref_jax.render.config import ModelConfig
@@ -110,7 +110,7 @@ def path_radiance(
         s = _resample(config, histograms, jitter.offsets[level], anneal, proposal.samples)
         s = stepfun.snap(s, bends)
         samples = _place(config, line, warp, s, jitter.rotations[level])
-        see = jax.vmap(density_field.density, in_axes=(None, None, 0))
+        see = jax.vmap(registry.density, in_axes=(None, None, 0))
         density = see(params.proposals[level], proposal.field, samples.gaussians)
         histograms.append(Histogram(s, _weigh(config, density, samples.t)))
 
@@ -119,7 +119,7 @@ def path_radiance(
     samples = _place(config, line, warp, s, jitter.rotations[-1])
     middles = 0.5 * (samples.t[1:] + samples.t[:-1])
     points = jax.vmap(polylines.point_at, in_axes=(None, 0))(line, middles)
-    see = jax.vmap(radiance_field.radiance, in_axes=(None, None, 0, 0))
+    see = jax.vmap(registry.radiance, in_axes=(None, None, 0, 0))
     seen = see(params.field, config.field, samples.gaussians, points.direction)
     weights = _weigh(config, seen.density, samples.t)
     composite = compositing.composite(weights, seen.rgb, samples.t)

@@ -60,12 +60,13 @@ class Checkpoints:
         """Reads the newest state.
 
         Args:
-          like: a state of the same run, or its shapes.
+          like: a state of the same run, or its shapes. What is read lies on the same devices, or
+            on the first one if `like` lies on none; which devices it was written from is no matter.
 
         Raises:
           ValueError: if there is no checkpoint.
         """
-        shapes = jax.eval_shape(lambda: like)
+        shapes = jax.tree.map(_abstract, like)
         step = find_step(self._manager, self._run, None)
         items = restore(
             self._manager,
@@ -74,6 +75,10 @@ class Checkpoints:
         )
         training = items[TRAINING_ITEM]
         return TrainState(training["step"], items[PARAMS_ITEM], training["optimizer"])
+
+
+def _abstract(leaf: jax.Array | jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding)
 
 
 def _training_item(state: TrainState) -> dict[str, Any]:

@@ -6,12 +6,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from refref_jax.data.batches import PixelSampler
 from refref_jax.optics.budgets import Budget, capacity_for
 from refref_jax.optics.wavefront import Geometry
 from refref_jax.render.config import ModelConfig, path_detail
-from refref_jax.training import steps
+from refref_jax.training import devices, steps
 from refref_jax.training.config import TrainingConfig
 from refref_jax.training.state import TrainState
 
@@ -34,6 +35,7 @@ class Setup(NamedTuple):
       capacity: room for the paths of a batch.
       hit_fraction: share of the pixels that see an object, 0 if no light is bent.
       epoch: all batches, traced once and for all; `None` if they are traced as they come.
+      mesh: the devices that train together; `None` for one alone.
     """
 
     config: TrainingConfig
@@ -44,6 +46,7 @@ class Setup(NamedTuple):
     capacity: int
     hit_fraction: float
     epoch: steps.Pool | None = None
+    mesh: Mesh | None = None
 
 
 def set_up(
@@ -52,19 +55,23 @@ def set_up(
     budget: Budget,
     geometry: Geometry,
     sampler: PixelSampler,
+    *,
+    mesh: Mesh | None = None,
 ) -> Setup:
-    """Moves the geometry to the device, and measures how many paths it makes of a ray.
+    """Moves the geometry to the devices, and measures how many paths it makes of a ray.
 
     Light paths of all pixels are kept if the run sees them more than once and they take at most
     half a gibibyte; while they are joined, three times that is in use.
     """
     geometry = jax.tree.map(jnp.asarray, geometry)
     found = steps.survey_paths(geometry, sampler.survey(_SURVEY).rays, budget=budget)
+    found = devices.as_in_the_first(jax.device_get(found))
     capacity = capacity_for(
         budget, config.batch, mean=float(found.mean), deviation=float(found.deviation)
     )
     hit_fraction = float(found.hit_fraction)
-    setup = Setup(config, model, budget, geometry, sampler, capacity, hit_fraction)
+    geometry = devices.put_everywhere(geometry, mesh=mesh)
+    setup = Setup(config, model, budget, geometry, sampler, capacity, hit_fraction, mesh=mesh)
     return setup._replace(epoch=_trace_epoch(setup))
 
 
@@ -81,7 +88,7 @@ def run_steps(
 
     Args:
       setup: the run.
-      state: where to begin.
+      state: where to begin; on all of the run's devices, if there are several.
       until: number of the last step.
       every: the state is seen at the multiples of each of these numbers, at the end of every pool,
         and at the end; in between the device takes steps without a word to the host.
@@ -94,7 +101,7 @@ def run_steps(
             last = min(end, *(step + period - step % period for period in every))
             batches = np.int32(step - first), np.int32(last - first)
             state, report = steps.train_steps(
-                state, pool, *batches, config=config, model=setup.model
+                state, pool, *batches, config=config, model=setup.model, mesh=setup.mesh
             )
             step = last
             yield state, report
@@ -116,7 +123,7 @@ def _pool(setup: Setup, first: int) -> steps.Pool:
     """Returns the pool of the steps that follow the first so many."""
     numbers = setup.sampler.numbers(first, setup.config.pool)
     if setup.epoch is not None:
-        return setup.epoch._replace(order=jnp.asarray(numbers))
+        return setup.epoch._replace(order=devices.put_everywhere(numbers, mesh=setup.mesh))
     return trace_batches(setup, numbers.tolist())
 
 
@@ -129,9 +136,10 @@ def trace_batches(setup: Setup, numbers: Sequence[int]) -> steps.Pool:
         budget=setup.budget,
         capacity=setup.capacity,
         detail=path_detail(setup.model, setup.budget),
+        mesh=setup.mesh,
     )
     order = np.arange(len(numbers), dtype=np.int32)
-    return steps.Pool(traced, *jax.device_put((drawn.rgb, order)))
+    return steps.Pool(traced, *devices.put_everywhere((drawn.rgb, order), mesh=setup.mesh))
 
 
 def _trace_epoch(setup: Setup) -> steps.Pool | None:

@@ -4,27 +4,27 @@ This is one of the modules that call `jax.jit`.
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float, Int, UInt8
 
-from refref_jax import losses, numerics
-from refref_jax.fields import hash_grid
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.details import Detail
-from refref_jax.optics.light_paths import LightPaths
 from refref_jax.optics.path_tracing import Survey, Traced
 from refref_jax.optics.wavefront import Geometry
-from refref_jax.render import dyes, pixels
+from refref_jax.render import pixels
 from refref_jax.render.config import ModelConfig
 from refref_jax.render.model import Params
-from refref_jax.render.transport import PathRadiance
-from refref_jax.training.config import LossConfig, TrainingConfig
+from refref_jax.training import objective
+from refref_jax.training.config import TrainingConfig
+from refref_jax.training.devices import AXIS
+from refref_jax.training.objective import StepReport, Totals
 from refref_jax.training.state import TrainState, optimizer
 
 # Slope of Schlick's bias function, by which trust in the proposals grows (Mip-NeRF 360).
@@ -45,34 +45,43 @@ class Pool(NamedTuple):
     order: Int[Array, " steps"]
 
 
-class StepReport(NamedTuple):
-    """What a step measured before it moved the parameters.
-
-    Attributes:
-      loss: what is minimised.
-      psnr: of the batch's sRGB colours, in dB.
-      interlevel: unweighted interlevel loss.
-      distortion: unweighted distortion loss.
-      hash_decay: unweighted hash decay.
-      lost: mean share of a ray's light that found no room among the batch's paths.
-    """
-
-    loss: Float[Array, ""]
-    psnr: Float[Array, ""]
-    interlevel: Float[Array, ""]
-    distortion: Float[Array, ""]
-    hash_decay: Float[Array, ""]
-    lost: Float[Array, ""]
+# How a pool lies on a mesh: of every batch each device has a share of the paths, and all colours.
+_SHARED = Pool(
+    traced=Traced(paths=PartitionSpec(None, AXIS), lost=PartitionSpec()),
+    rgb=PartitionSpec(),
+    order=PartitionSpec(),
+)
 
 
-@functools.partial(jax.jit, static_argnames=("budget", "capacity", "detail"))
+@functools.partial(jax.jit, static_argnames=("budget", "capacity", "detail", "mesh"))
 def trace_pool(
-    geometry: Geometry, rays: Rays, *, budget: Budget, capacity: int, detail: Detail
+    geometry: Geometry,
+    rays: Rays,
+    *,
+    budget: Budget,
+    capacity: int,
+    detail: Detail,
+    mesh: Mesh | None = None,
 ) -> Traced:
-    """Traces the rays `[batches, rays]` of many batches; see `path_tracing.trace_batches`."""
-    return path_tracing.trace_batches(
-        geometry, rays, budget=budget, capacity=capacity, detail=detail
+    """Traces the rays `[batches, rays]` of many batches; see `path_tracing.trace_batches`.
+
+    The devices of a mesh trace whole batches each, and are left with a share of every batch's
+    paths; a list is filled up with empty slots where it can not be shared evenly.
+    """
+    trace = functools.partial(
+        path_tracing.trace_batches, budget=budget, capacity=capacity, detail=detail
     )
+    if mesh is None:
+        return trace(geometry, rays)
+    batches = rays.radii.shape[0]
+    again = jnp.arange(-(-batches // mesh.size) * mesh.size) % batches
+    specs = PartitionSpec(), PartitionSpec(AXIS)
+    trace = jax.shard_map(trace, mesh=mesh, in_specs=specs, out_specs=specs[1], check_vma=False)
+    traced = trace(geometry, jax.tree.map(lambda x: x[again], rays))
+    paths, lost = jax.tree.map(lambda x: x[:batches], traced)
+    paths = jax.vmap(functools.partial(light_paths.filled_up, multiple=mesh.size))(paths)
+    shared = jax.tree.map(lambda spec: NamedSharding(mesh, spec), _SHARED.traced)
+    return jax.lax.with_sharding_constraint(Traced(paths, lost), shared)
 
 
 @functools.partial(jax.jit, static_argnames="budget")
@@ -81,7 +90,7 @@ def survey_paths(geometry: Geometry, rays: Rays, *, budget: Budget) -> Survey:
     return path_tracing.survey(geometry, rays, budget=budget)
 
 
-@functools.partial(jax.jit, static_argnames=("config", "model"), donate_argnames="state")
+@functools.partial(jax.jit, static_argnames=("config", "model", "mesh"), donate_argnames="state")
 def train_steps(
     state: TrainState,
     pool: Pool,
@@ -90,6 +99,7 @@ def train_steps(
     *,
     config: TrainingConfig,
     model: ModelConfig,
+    mesh: Mesh | None = None,
 ) -> tuple[TrainState, StepReport]:
     """Takes consecutive steps of a pool, without a word to the host in between.
 
@@ -100,11 +110,36 @@ def train_steps(
       last: place after that of the last step; any number of steps is one compiled program.
       config: the run.
       model: the model.
+      mesh: the devices among which the pool's paths are shared out, by `trace_pool`. Results
+        depend on them by rounding alone.
 
     Returns:
       The state after the last step, and what that step measured.
     """
-    step = functools.partial(_step, pool=pool, config=config, model=model)
+    take = functools.partial(_take_steps, config=config, model=model)
+    if mesh is not None:
+        whole = PartitionSpec()
+        take = jax.shard_map(
+            functools.partial(take, axis=AXIS),
+            mesh=mesh,
+            in_specs=(whole, _SHARED, whole, whole),
+            out_specs=whole,
+            check_vma=False,
+        )
+    return take(state, pool, first, last)
+
+
+def _take_steps(
+    state: TrainState,
+    pool: Pool,
+    first: Int[Array, ""],
+    last: Int[Array, ""],
+    *,
+    config: TrainingConfig,
+    model: ModelConfig,
+    axis: str | None = None,
+) -> tuple[TrainState, StepReport]:
+    step = functools.partial(_step, pool=pool, config=config, model=model, axis=axis)
     shapes = jax.eval_shape(step, state, first)[1]
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     return jax.lax.fori_loop(
@@ -119,68 +154,45 @@ def _step(
     pool: Pool,
     config: TrainingConfig,
     model: ModelConfig,
+    axis: str | None,
 ) -> tuple[TrainState, StepReport]:
-    """Takes one step."""
+    """Takes one step, with the paths that this device has of the batch."""
     batch = pool.order[place]
     traced, rgb = jax.tree.map(lambda x: x[batch], (pool.traced, pool.rgb))
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
-    jitter = pixels.random_jitter(key, model, traced.paths.radii.shape[0])
+    jitter = pixels.random_jitter(key, model, _slots(traced.paths.radii.shape[0], axis))
     anneal = _anneal(state.step, config.schedule.anneal)
 
-    def objective(params: Params) -> tuple[Float[Array, ""], StepReport]:
-        seen = pixels.render_pixels(
+    def look(params: Params) -> Totals:
+        light = pixels.gather_light(
             params, model, traced.paths, jitter, rays=rgb.shape[0], anneal=anneal
         )
+        return objective.total(light, traced.paths, config.loss)
+
+    def judge(params: Params, totals: Totals) -> tuple[Float[Array, ""], StepReport]:
         target = rgb.astype(jnp.float32) / 255.0
-        report = _measure(params, seen, target, traced, config.loss)
+        report = objective.measure(params, totals, target, traced.lost, config.loss)
         return report.loss, report
 
-    gradient, report = jax.grad(objective, has_aux=True)(state.params)
+    # In two halves, between which devices tell each other what their paths sum to.
+    totals, pull_back = jax.vjp(look, state.params)
+    slopes = jax.grad(judge, argnums=(0, 1), has_aux=True)
+    (by_params, by_totals), report = slopes(state.params, _sum_devices(totals, axis))
+    (through_paths,) = pull_back(by_totals)
+    gradient = jax.tree.map(jnp.add, by_params, _sum_devices(through_paths, axis))
     updates, moments = optimizer(config.schedule).update(gradient, state.optimizer, state.params)
     params = optax.apply_updates(state.params, updates)
     return TrainState(state.step + 1, params, moments), report
 
 
-def _measure(
-    params: Params,
-    seen: pixels.Pixels,
-    target: Float[Array, "rays 3"],
-    traced: Traced,
-    config: LossConfig,
-) -> StepReport:
-    mse = losses.mean_squared_error(seen.rgb, target)
-    data = mse if config.data == "mse" else losses.charbonnier(seen.rgb, target)
-    interlevel, distortion = _path_losses(seen.paths, traced.paths, config)
-    decay = losses.hash_decay(hash_grid.tables(params))
-    loss = (
-        data
-        + config.interlevel * interlevel
-        + config.distortion * distortion
-        + config.hash_decay * decay
-        + config.dye_decay * dyes.optical_density(params.dyes)
-    )
-    psnr = -10.0 * jnp.log10(mse)
-    return StepReport(loss, psnr, interlevel, distortion, decay, jnp.mean(traced.lost))
+def _slots(paths: int, axis: str | None) -> Int[Array, " paths"]:
+    """Returns the places that this device's paths have in the batch's list."""
+    slots = jnp.arange(paths, dtype=jnp.int32)
+    return slots if axis is None else slots + paths * jax.lax.axis_index(axis)
 
 
-def _path_losses(
-    seen: PathRadiance, paths: LightPaths, config: LossConfig
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Returns interlevel and distortion loss, averaged over the paths that exist."""
-    *proposals, final = seen.histograms
-    exists = light_paths.exists(paths)
-    interlevel = jnp.zeros(())
-    for proposal, blur in zip(proposals, config.blurs, strict=True):
-        per_path = jax.vmap(functools.partial(losses.interlevel, blur=blur))(final, proposal)
-        interlevel += _mean_where(exists, per_path)
-    distortion = jax.vmap(losses.distortion)(final, seen.outside)
-    return interlevel, _mean_where(exists, distortion)
-
-
-def _mean_where(mask: Bool[Array, " n"], values: Float[Array, " n"]) -> Float[Array, ""]:
-    """Returns the mean of the values that count; 0, with gradient 0, if there are none."""
-    count = jnp.sum(mask, dtype=values.dtype)
-    return numerics.safe_divide(jnp.sum(jnp.where(mask, values, 0.0)), count)
+def _sum_devices(tree: Any, axis: str | None) -> Any:
+    return tree if axis is None else jax.lax.psum(tree, axis)
 
 
 def _anneal(step: Int[Array, ""], steps: int) -> Float[Array, ""]:

@@ -27,6 +27,7 @@ def _resolve(options):
         "error": None,
         "printed": printed.getvalue(),
         "paths": config.paths,
+        "blurs": config.loss.blurs,
         "cut": model.budget.cut,
         "bends": model.budget.bends,
         "reentry": model.budget.reentry,

@@ -205,6 +205,7 @@ def test_scenes_and_options_become_plans(scene):
         (empty,),
         (empty, "--paths=tree"),
         (tinted, "--paths=paper", "--bends=4", "--samples=7,6", "--footprint=differential"),
+        (tinted, "--field=nerfacto", "--entries=12"),
     ]
     result = subprocess.run(
         [sys.executable, "-m", "tests.experiments.print_plans"],
@@ -215,7 +216,13 @@ def test_scenes_and_options_become_plans(scene):
         check=True,
     )
     plans = json.loads(result.stdout)
-    assert [plan["error"] is None for plan in plans] == [True] * 6 + [False, True, False, True]
+    assert [plan["error"] is None for plan in plans] == [True] * 6 + [
+        False,
+        True,
+        False,
+        True,
+        True,
+    ]
     assert "scene.json does not tell" in plans[6]["error"]
     assert "no meshes" in plans[8]["error"]
     defaults = [(plan["paths"], plan["interior"]) for plan in plans if plan["error"] is None]
@@ -228,17 +235,22 @@ def test_scenes_and_options_become_plans(scene):
         ("tree", "absorbing"),
         ("straight", "field"),
         ("paper", "absorbing"),
+        ("tree", "absorbing"),
     ]
     # Colours that are given lie on the paths; all others must not, or they would count twice.
     for number, plan in enumerate(plans):
         if plan["error"] is None:
-            given = number in (1, 9)
+            given = number in (1, 9, 10)
             np.testing.assert_array_equal(plan["tint"][0], tint if given else [1.0] * 3)
             np.testing.assert_array_equal(plan["absorption"][0], absorption if given else [0.0] * 3)
             assert plan["learned_tints"] == (1 if number in (2, 5) else 0)
     assert plans[0]["reentry"] == "impossible" and "no re-entry" in plans[0]["printed"]
     assert "no meshes: no tracer" in plans[7]["printed"]
     assert [plan["printed"].count("warning: ") for plan in (plans[1], plans[4])] == [0, 1]
+    nerfacto = plans[10]
+    assert (nerfacto["proposals"], nerfacto["samples"]) == ([48, 24], 16)
+    assert "nerfacto, grid 2^12, finest 512, float32" in nerfacto["printed"]
+    assert [plans[n]["blurs"] for n in (0, 10)] == [[0.03], [0.03, 0.003]]
     last = plans[9]
     assert (last["bends"], last["proposals"], last["samples"]) == (4, [7], 6)
     assert last["footprint"] == "differential"

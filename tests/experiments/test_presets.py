@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from experiments.presets import PRESETS, Bounds
+from experiments.presets import PRESETS, Bounds, loss
 
 _BOUNDS = Bounds(near=0.05, far=16.0, radius=7.3, space="bounded")
 
@@ -15,7 +15,7 @@ def test_a_preset_makes_a_model_of_its_scene(name):
     preset = PRESETS[name]
     model = preset.model(_BOUNDS, "clear")
     assert model.interior == "clear" and model.radius == 7.3
-    assert len(preset.loss.blurs) == len(model.proposals)
+    assert len(loss(model).blurs) == len(model.proposals)
     assert preset.schedule.warmup < preset.schedule.steps and preset.schedule.end > 0.0
     json.dumps(dataclasses.asdict(model))
 

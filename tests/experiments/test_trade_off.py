@@ -40,6 +40,21 @@ def test_no_point_is_the_base_and_none_comes_twice():
     assert [point.name for point in points] == [BASE, "cut=0.1"]
 
 
+def test_a_sweep_may_be_around_another_kind_of_field():
+    points = trade_points.sweep(
+        preset="tiny", base={"field": "nerfacto"}, knobs=["samples", "entries", "footprint"]
+    )
+    names = {point.name for point in points}
+    assert {"samples=24+12+8", "entries=18", "footprint=differential"} <= names
+    assert not names & {"samples=48+24+16", "entries=17", "footprint=cone"}
+    kinds = trade_points.sweep(
+        preset="tiny", values={"field": ("zipnerf", "nerfacto")}, knobs=["field"]
+    )
+    assert [point.name for point in kinds] == [BASE, "field=nerfacto"]
+    with pytest.raises(ValueError, match=r"no --base=field=voxels\. Choose from zipnerf, nerfacto"):
+        trade_points.sweep(preset="tiny", base={"field": "voxels"})
+
+
 def test_straight_light_has_neither_cut_nor_bends():
     points = trade_points.sweep(preset="tiny", base={"cut": "0.05"}, knobs=["paths", "bends"])
     straight = next(point for point in points if point.name == "paths=straight")

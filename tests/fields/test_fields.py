@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.fields import density_field, radiance_field
+from refref_jax.fields import density_field, radiance_field, registry
 from refref_jax.fields.density_field import DensityFieldConfig
 from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid, tables
+from refref_jax.fields.kinds import DensityConfig
+from refref_jax.fields.nerfacto import NerfactoConfig, NerfactoProposalConfig
 from refref_jax.fields.precision import check_precision
 from refref_jax.fields.radiance_field import RadianceFieldConfig
 from refref_jax.sampling.cones import Gaussians
@@ -27,7 +29,16 @@ _RADIANCE = RadianceFieldConfig(
 _CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)), np.float32)
 
 
-_FIELDS = {"density": (density_field, _DENSITY), "radiance": (radiance_field, _RADIANCE)}
+_CONFIGS = {
+    "density": _DENSITY,
+    "radiance": _RADIANCE,
+    "nerfacto density": NerfactoProposalConfig(_GRID, width=8),
+    "nerfacto radiance": NerfactoConfig(
+        _GRID, density_width=8, bottleneck=4, colour_width=8, colour_depth=2
+    ),
+}
+
+_RADIANCES = ("radiance", "nerfacto radiance")
 
 
 @jax.jit
@@ -38,8 +49,9 @@ def _untrained(seed):
 @functools.cache
 def _parameters(name):
     """Returns parameters as after training: large entries, and biases that are not 0."""
-    field, config = _FIELDS[name]
-    shapes = jax.eval_shape(lambda: field.init(jax.random.key(0), config))
+    config = _CONFIGS[name]
+    begin = registry.init_density if _is_density(config) else registry.init_radiance
+    shapes = jax.eval_shape(lambda: begin(jax.random.key(0), config))
     rng = np.random.default_rng(1)
     return jax.tree.map(lambda x: jnp.asarray(0.6 * rng.normal(size=x.shape), jnp.float32), shapes)
 
@@ -55,23 +67,26 @@ def _direction(seed=0):
     return jnp.asarray(vector / np.linalg.norm(vector), jnp.float32)
 
 
-@jax.jit
-def _density(params, gaussians):
-    return density_field.density(params, _DENSITY, gaussians)
+def _is_density(config):
+    return isinstance(config, DensityConfig)
 
 
-@jax.jit
-def _radiance(params, gaussians, direction):
-    return radiance_field.radiance(params, _RADIANCE, gaussians, direction)
+def _ask(params, config, gaussians, direction):
+    """Returns density, and colour if the field has one."""
+    if _is_density(config):
+        return (registry.density(params, config, gaussians),)
+    return registry.radiance(params, config, gaussians, direction)
+
+
+_asked = jax.jit(_ask, static_argnames="config")
 
 
 def _see(name, gaussians, direction=None, params=None):
     """Returns density, and colour if the field has one, as one array."""
     params = _parameters(name) if params is None else params
-    if name == "density":
-        return np.array([_density(params, gaussians)])
-    seen = _radiance(params, gaussians, _direction() if direction is None else direction)
-    return np.array([seen.density, *np.asarray(seen.rgb)])
+    direction = _direction() if direction is None else direction
+    seen = _asked(params, _CONFIGS[name], gaussians, direction)
+    return np.concatenate([np.atleast_1d(each) for each in seen])
 
 
 # --- density ---
@@ -96,7 +111,7 @@ def test_activate_density_check_grads():
     gradients.assert_numerical(density_field.activate_density, 0.7)
 
 
-@pytest.mark.parametrize("name", _FIELDS)
+@pytest.mark.parametrize("name", _CONFIGS)
 def test_density_is_never_negative(name):
     densities = np.array([_see(name, _gaussians(seed=seed))[0] for seed in range(10)])
     assert densities.min() >= 0.0
@@ -112,11 +127,12 @@ def test_an_untrained_field_is_thin_but_not_empty():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_colours_stay_within_their_padding(seed):
-    huge = jax.tree.map(lambda x: jnp.asarray(1e3 * np.asarray(x)), _parameters("radiance"))
-    for params in (_parameters("radiance"), huge):
-        rgb = _see("radiance", _gaussians(seed=seed), _direction(seed), params)[1:]
-        assert ((rgb >= -0.001 - 1e-6) & (rgb <= 1.001 + 1e-6)).all()
+@pytest.mark.parametrize(("name", "padding"), [("radiance", 0.001), ("nerfacto radiance", 0.0)])
+def test_colours_stay_within_their_padding(name, padding, seed):
+    huge = jax.tree.map(lambda x: jnp.asarray(1e3 * np.asarray(x)), _parameters(name))
+    for params in (_parameters(name), huge):
+        rgb = _see(name, _gaussians(seed=seed), _direction(seed), params)[1:]
+        assert ((rgb >= -padding - 1e-6) & (rgb <= 1.0 + padding + 1e-6)).all()
 
 
 def test_black_and_white_lie_within_reach():
@@ -127,14 +143,16 @@ def test_black_and_white_lie_within_reach():
     np.testing.assert_allclose(rgb, [1.001, 0.5, -0.001], atol=1e-6)
 
 
-def test_colour_depends_on_the_direction_and_density_does_not():
-    seen = np.array([_see("radiance", _gaussians(), _direction(seed)) for seed in range(5)])
+@pytest.mark.parametrize("name", _RADIANCES)
+def test_colour_depends_on_the_direction_and_density_does_not(name):
+    seen = np.array([_see(name, _gaussians(), _direction(seed)) for seed in range(5)])
     np.testing.assert_array_equal(seen[:, 0], seen[0, 0])
     assert (np.ptp(seen[:, 1:], axis=0) > 1e-3).all()
 
 
-def test_radiance_depends_on_the_position():
-    seen = np.array([_see("radiance", _gaussians(seed=seed)) for seed in range(5)])
+@pytest.mark.parametrize("name", _RADIANCES)
+def test_radiance_depends_on_the_position(name):
+    seen = np.array([_see(name, _gaussians(seed=seed)) for seed in range(5)])
     assert (np.ptp(seen, axis=0) > 1e-3).all()
 
 
@@ -152,29 +170,53 @@ def _mean_features(name, gaussians):
     return np.asarray(jax.jit(MultisampledGrid(_GRID).apply)(params, gaussians), np.float64)
 
 
-def test_the_density_network_against_numpy():
-    params, gaussians = _parameters("density"), _gaussians()
-    hidden = np.maximum(_dense(params, 0, _mean_features("density", gaussians)), 0.0)
+def _softplus(raw):
+    return np.logaddexp(0.0, raw - 1.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "activation"),
+    [("density", 0.01, _softplus), ("nerfacto density", 0.0, np.exp)],
+)
+def test_the_density_network_against_numpy(name, scale, activation):
+    # Nerfacto sees points, however wide its Gaussians are.
+    params, seen = _parameters(name), _gaussians(scale=scale)
+    hidden = np.maximum(_dense(params, 0, _mean_features(name, seen)), 0.0)
     raw = _dense(params, 1, hidden)[0]
-    np.testing.assert_allclose(
-        _see("density", gaussians)[0], np.logaddexp(0.0, raw - 1.0), rtol=_NETWORK
-    )
+    np.testing.assert_allclose(_see(name, _gaussians())[0], activation(raw), rtol=_NETWORK)
 
 
-def test_the_radiance_network_against_numpy():
-    params, gaussians, direction = _parameters("radiance"), _gaussians(), _direction()
-    hidden = np.maximum(_dense(params, 0, _mean_features("radiance", gaussians)), 0.0)
+@pytest.mark.parametrize(
+    ("name", "scale", "activation", "padding"),
+    [("radiance", 0.01, _softplus, 0.001), ("nerfacto radiance", 0.0, np.exp, 0.0)],
+)
+def test_the_radiance_network_against_numpy(name, scale, activation, padding):
+    params, direction = _parameters(name), _direction()
+    hidden = np.maximum(_dense(params, 0, _mean_features(name, _gaussians(scale=scale))), 0.0)
     raw = _dense(params, 1, hidden)
     hidden = np.concatenate([raw[1:], reference_sampling.spherical_harmonics(direction)])
     for layer in (2, 3):
         hidden = np.maximum(_dense(params, layer, hidden), 0.0)
-    rgb = 1.002 / (1.0 + np.exp(-_dense(params, 4, hidden))) - 0.001
-    got = _see("radiance", gaussians, direction)
-    np.testing.assert_allclose(got[0], np.logaddexp(0.0, raw[0] - 1.0), rtol=_NETWORK)
+    rgb = (1.0 + 2.0 * padding) / (1.0 + np.exp(-_dense(params, 4, hidden))) - padding
+    got = _see(name, _gaussians(), direction)
+    np.testing.assert_allclose(got[0], activation(raw[0]), rtol=_NETWORK)
     np.testing.assert_allclose(got[1:], rgb, atol=_NETWORK)
 
 
-@pytest.mark.parametrize("name", _FIELDS)
+@pytest.mark.parametrize("name", _CONFIGS)
+def test_only_fields_that_anti_alias_heed_the_width_of_a_pixel(name):
+    narrow, wide = (_see(name, _gaussians(scale=scale)) for scale in (0.0, 0.3))
+    assert np.array_equal(narrow, wide) == name.startswith("nerfacto")
+
+
+def test_an_untrained_nerfacto_is_as_dense_as_its_exponential_says():
+    config = _CONFIGS["nerfacto radiance"]
+    params = jax.jit(lambda: registry.init_radiance(jax.random.key(0), config))()
+    density = _see("nerfacto radiance", _gaussians(), params=params)[0]
+    np.testing.assert_allclose(density, 1.0, rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", _CONFIGS)
 def test_the_order_of_multisamples_does_not_matter(name):
     gaussians = _gaussians()
     order = [3, 1, 5, 0, 4, 2]
@@ -182,14 +224,14 @@ def test_the_order_of_multisamples_does_not_matter(name):
     np.testing.assert_allclose(_see(name, shuffled), _see(name, gaussians), rtol=_NETWORK)
 
 
-@pytest.mark.parametrize("name", _FIELDS)
+@pytest.mark.parametrize("name", _CONFIGS)
 def test_multisamples_at_one_place_are_that_place(name):
     one = _gaussians(count=1)
     six = jax.tree.map(lambda x: jnp.asarray(np.repeat(x, 6, axis=0)), one)
     np.testing.assert_allclose(_see(name, six), _see(name, one), rtol=_NETWORK)
 
 
-@pytest.mark.parametrize("name", _FIELDS)
+@pytest.mark.parametrize("name", _CONFIGS)
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0, 1e30])
 def test_fields_are_finite_at_the_corners_of_the_cube(name, scale):
     gaussians = Gaussians(jnp.asarray(_CORNERS[:6]), jnp.full(6, scale, jnp.float32))
@@ -203,7 +245,7 @@ def test_the_same_key_gives_the_same_field():
 
 
 def test_parameters_hold_the_tables_of_their_grids():
-    for name in _FIELDS:
+    for name in _CONFIGS:
         assert [table.shape for table in tables(_parameters(name))] == [(64, 2), (256, 2)]
 
 
@@ -213,15 +255,12 @@ def test_parameters_hold_the_tables_of_their_grids():
 @functools.cache
 def _gradient(name):
     def total(params, gaussians, direction):
-        if name == "density":
-            return density_field.density(params, _DENSITY, gaussians)
-        seen = radiance_field.radiance(params, _RADIANCE, gaussians, direction)
-        return seen.density + jnp.sum(seen.rgb)
+        return sum(map(jnp.sum, _ask(params, _CONFIGS[name], gaussians, direction)))
 
     return jax.jit(jax.grad(total, argnums=(0, 1, 2)))
 
 
-@pytest.mark.parametrize("name", _FIELDS)
+@pytest.mark.parametrize("name", _CONFIGS)
 @pytest.mark.parametrize("scale", [0.0, 0.01, 1e30])
 def test_gradients_are_finite_at_the_corners_of_the_cube(name, scale):
     for positions in (_CORNERS[:6], _CORNERS[2:]):
@@ -230,7 +269,7 @@ def test_gradients_are_finite_at_the_corners_of_the_cube(name, scale):
         assert gradients.all_finite(got)
 
 
-@pytest.mark.parametrize("name", _FIELDS)
+@pytest.mark.parametrize("name", _CONFIGS)
 def test_gradients_reach_every_layer_and_table(name):
     reached = jax.tree.map(lambda x: np.zeros(x.shape, bool), _parameters(name))
     for seed in range(8):
@@ -239,22 +278,13 @@ def test_gradients_reach_every_layer_and_table(name):
     assert all(leaf.any() for leaf in jax.tree.leaves(reached))
 
 
-_CASES = {
-    "density": lambda gaussians, direction: density_field.density(
-        _parameters("density"), _DENSITY, gaussians
-    ),
-    "radiance": lambda gaussians, direction: radiance_field.radiance(
-        _parameters("radiance"), _RADIANCE, gaussians, direction
-    ),
-}
-
-
 @pytest.mark.parametrize("transformation", transformations.ALL)
-@pytest.mark.parametrize("name", _CASES)
+@pytest.mark.parametrize("name", _CONFIGS)
 def test_transformations_change_nothing(name, transformation):
     gaussians = jax.tree.map(lambda *x: jnp.stack(x), *(_gaussians(seed=seed) for seed in range(3)))
     directions = jnp.stack([_direction(seed) for seed in range(3)])
-    transformation(_CASES[name], (gaussians, directions))
+    ask = functools.partial(_ask, _parameters(name), _CONFIGS[name])
+    transformation(ask, (gaussians, directions))
 
 
 # --- bfloat16 ---
@@ -265,21 +295,17 @@ _HALF = 0.05
 
 def _taught(name, precision, params, gaussians):
     """Returns what a field answers and its gradient, of the sum of the answer."""
-    field, config = _FIELDS[name]
-    config = dataclasses.replace(config, precision=precision)
+    config = dataclasses.replace(_CONFIGS[name], precision=precision)
 
     def total(params):
-        if name == "density":
-            seen = [field.density(params, config, gaussians)]
-        else:
-            seen = list(field.radiance(params, config, gaussians, _direction()))
+        seen = list(_ask(params, config, gaussians, _direction()))
         return sum(map(jnp.sum, seen)), seen
 
     slopes, seen = jax.jit(jax.grad(total, has_aux=True))(params)
     return jax.tree.leaves(seen), slopes
 
 
-@pytest.mark.parametrize("name", _FIELDS)
+@pytest.mark.parametrize("name", _CONFIGS)
 def test_half_precision_is_near_single_precision(name):
     single, single_slopes = _taught(name, "float32", _parameters(name), _gaussians())
     half, half_slopes = _taught(name, "bfloat16", _parameters(name), _gaussians())
@@ -292,7 +318,7 @@ def test_half_precision_is_near_single_precision(name):
     assert any((np.asarray(a) != np.asarray(b)).any() for a, b in zip(half, single, strict=True))
 
 
-@pytest.mark.parametrize("name", _FIELDS)
+@pytest.mark.parametrize("name", _CONFIGS)
 @pytest.mark.parametrize("size", [0.0, 1e4])
 @pytest.mark.parametrize("scale", [0.0, 1e30])
 def test_half_precision_is_finite(name, size, scale):

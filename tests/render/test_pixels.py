@@ -159,13 +159,21 @@ def test_random_jitter_fills_its_ranges():
 
 @functools.partial(jax.jit, static_argnums=1)
 def _draw(seed, paths):
-    return pixels.random_jitter(jax.random.key(seed), MODEL, paths)
+    return pixels.random_jitter(jax.random.key(seed), MODEL, jnp.arange(paths, dtype=jnp.int32))
 
 
 def test_random_jitter_follows_its_key():
     first, same, other = (_draw(seed, 6) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first.offsets, same.offsets)
     assert not np.array_equal(first.offsets, other.offsets)
+
+
+def test_the_jitter_of_a_slot_knows_nothing_of_the_others():
+    whole = _draw(3, 12)
+    key, some = jax.random.key(3), jnp.asarray([7, 2, 11], jnp.int32)
+    part = jax.jit(lambda slots: pixels.random_jitter(key, MODEL, slots))(some)
+    for each, of_all in zip(part, whole, strict=True):
+        np.testing.assert_array_equal(each, np.asarray(of_all)[[7, 2, 11]])
 
 
 def test_jitter_changes_the_picture_a_little():

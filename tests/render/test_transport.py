@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.fields import density_field, radiance_field
-from refref_jax.fields.radiance_field import Radiance
+from refref_jax.fields import registry
+from refref_jax.fields.kinds import Radiance
 from refref_jax.render import pixels, transport
 from refref_jax.render.model import Params, init_params
 from refref_jax.render.transport import Jitter
@@ -297,8 +297,8 @@ _compiled_planted = jax.jit(
 @pytest.fixture
 def plant(monkeypatch):
     """Returns a function that renders paths through a planted scene."""
-    monkeypatch.setattr(density_field, "density", _planted_density)
-    monkeypatch.setattr(radiance_field, "radiance", _planted_radiance)
+    monkeypatch.setattr(registry, "density", _planted_density)
+    monkeypatch.setattr(registry, "radiance", _planted_radiance)
 
     def render(scene, interior, *paths, anneal=1.0):
         config, paths = _fine(interior), _batch(*paths)

@@ -1,0 +1,173 @@
+"""Fields in the style of Nerfacto, for the paper's ablation "without Zip-NeRF".
+
+The same hash grids as Zip-NeRF's, read at points: no level fades where a pixel is wider than its
+cells, so nothing is anti-aliased, and an interval is one point on its path. Densities are
+exponentials of what the networks say, and colours a sigmoid of it.
+
+Nerfacto as published learns more, which belongs to photographs and not to the field: a code for
+each image, corrections of the cameras. These are left out. Its sampling, that is its first round
+evenly in a warped distance, and its loss on proposals are those of this library for every kind.
+Networks have biases, as in its PyTorch version.
+
+Source: Tancik et al., Nerfstudio (2023), section 4, and its code, `nerfstudio/models/nerfacto.py`,
+`fields/nerfacto_field.py` and `fields/density_fields.py` at commit 50e0e3c, for the size `paper`;
+the paper's own version of it (`YueYin27/nerfstudio_for_engn8501`) has the same numbers. There the
+untrained density is near 1, as it is here; later versions of Nerfacto begin at 0.01.
+"""
+
+import dataclasses
+from typing import Literal
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from refref_jax import numerics
+from refref_jax.fields.hash_grid import HashGridConfig
+from refref_jax.fields.kinds import FieldKind, FieldSize, Params, Radiance, in_half_precision
+from refref_jax.fields.networks import (
+    GridDensityConfig,
+    GridRadianceConfig,
+    colour,
+    grid_network,
+    nowhere,
+)
+from refref_jax.sampling.cones import Gaussians
+
+
+@dataclasses.dataclass(frozen=True)
+class NerfactoConfig(GridRadianceConfig):
+    """Shape of a radiance field; see `GridRadianceConfig`."""
+
+    kind: Literal["nerfacto"] = dataclasses.field(default="nerfacto", kw_only=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class NerfactoProposalConfig(GridDensityConfig):
+    """Shape of a density field; see `GridDensityConfig`."""
+
+    kind: Literal["nerfacto"] = dataclasses.field(default="nerfacto", kw_only=True)
+
+
+def init_radiance(key: Array, config: NerfactoConfig) -> Params:
+    """Returns new parameters of a radiance field."""
+    return _RadianceField(config).init(key, nowhere(), jnp.zeros(3))
+
+
+def radiance(
+    params: Params, config: NerfactoConfig, gaussians: Gaussians, direction: Float[Array, "3"]
+) -> Radiance:
+    """Returns density and colour of one interval of a path.
+
+    Args:
+      params: from `init_radiance`.
+      config: the same as there.
+      gaussians: points in the unit cube; how wide they are is not heeded.
+      direction: unit direction of travel at the interval, world frame.
+    """
+    return _RadianceField(config).apply(params, gaussians, direction)
+
+
+def init_density(key: Array, config: NerfactoProposalConfig) -> Params:
+    """Returns new parameters of a density field."""
+    return _DensityField(config).init(key, nowhere())
+
+
+def density(
+    params: Params, config: NerfactoProposalConfig, gaussians: Gaussians
+) -> Float[Array, ""]:
+    """Returns the density of one interval of a path, per scene radius.
+
+    Args:
+      params: from `init_density`.
+      config: the same as there.
+      gaussians: points in the unit cube; how wide they are is not heeded.
+    """
+    return _DensityField(config).apply(params, gaussians)
+
+
+def _points(gaussians: Gaussians) -> Gaussians:
+    """Returns Gaussians without width, for which no level fades."""
+    return gaussians._replace(scales=jnp.zeros_like(gaussians.scales))
+
+
+class _DensityField(nn.Module):
+    config: NerfactoProposalConfig
+
+    @nn.compact
+    def __call__(self, gaussians: Gaussians) -> Float[Array, ""]:
+        config = self.config
+        raw = grid_network(
+            _points(gaussians),
+            config.grid,
+            width=config.width,
+            outputs=1,
+            precision=config.precision,
+        )
+        return numerics.truncated_exponential(raw[0])
+
+
+class _RadianceField(nn.Module):
+    config: NerfactoConfig
+
+    @nn.compact
+    def __call__(self, gaussians: Gaussians, direction: Float[Array, "3"]) -> Radiance:
+        config = self.config
+        raw = grid_network(
+            _points(gaussians),
+            config.grid,
+            width=config.density_width,
+            outputs=1 + config.bottleneck,
+            precision=config.precision,
+        )
+        rgb = colour(raw[1:], direction, config)
+        return Radiance(numerics.truncated_exponential(raw[0]), rgb)
+
+
+def _proposal(*, levels: int, finest: int, entries: int) -> NerfactoProposalConfig:
+    grid = HashGridConfig(levels, coarsest=16, finest=finest, entries=entries, features=2)
+    return NerfactoProposalConfig(grid, width=16)
+
+
+_TINY = FieldSize(
+    field=NerfactoConfig(
+        HashGridConfig(levels=8, coarsest=16, finest=512, entries=1 << 17, features=2),
+        density_width=32,
+        bottleneck=15,
+        colour_width=32,
+        colour_depth=2,
+    ),
+    proposals=tuple(_proposal(levels=4, finest=finest, entries=1 << 15) for finest in (32, 64)),
+    samples=(48, 24, 16),
+    multisamples=1,
+    footprint="cone",
+    dilation=0.0,
+)
+
+_PAPER = FieldSize(
+    field=NerfactoConfig(
+        HashGridConfig(levels=16, coarsest=16, finest=2048, entries=1 << 19, features=2),
+        density_width=64,
+        bottleneck=15,
+        colour_width=64,
+        colour_depth=2,
+    ),
+    proposals=tuple(_proposal(levels=5, finest=finest, entries=1 << 17) for finest in (128, 256)),
+    samples=(256, 96, 48),
+    multisamples=1,
+    footprint="cone",
+    dilation=0.0,
+)
+
+_SMALL = _PAPER._replace(samples=(96, 48, 32))
+
+KIND = FieldKind(
+    radiance_config=NerfactoConfig,
+    init_radiance=init_radiance,
+    radiance=radiance,
+    density_config=NerfactoProposalConfig,
+    init_density=init_density,
+    density=density,
+    sizes={"tiny": _TINY, "small": _SMALL, "paper": _PAPER, "best": in_half_precision(_PAPER)},
+    hash_decay=0.0,
+)

@@ -1,0 +1,58 @@
+"""All kinds of field. Whoever asks a field asks here; the kind is told by the configuration.
+
+A new kind is a module with a `FieldKind`, and a line of `KINDS`.
+"""
+
+from collections.abc import Mapping
+
+from jaxtyping import Array, Float
+
+from refref_jax.fields import nerfacto, zipnerf
+from refref_jax.fields.kinds import (
+    DensityConfig,
+    FieldConfig,
+    FieldKind,
+    Params,
+    Radiance,
+    RadianceConfig,
+)
+from refref_jax.sampling.cones import Gaussians
+
+KINDS: dict[str, FieldKind] = {
+    "zipnerf": zipnerf.KIND,
+    "nerfacto": nerfacto.KIND,
+}
+
+USUAL = "zipnerf"
+"""The kind that is taken where none is named, as in the files of older runs."""
+
+
+def init_radiance(key: Array, config: RadianceConfig) -> Params:
+    """Returns new parameters of a radiance field."""
+    return KINDS[config.kind].init_radiance(key, config)
+
+
+def radiance(
+    params: Params, config: RadianceConfig, gaussians: Gaussians, direction: Float[Array, "3"]
+) -> Radiance:
+    """Returns density and colour of one interval of a path; see `FieldKind`."""
+    return KINDS[config.kind].radiance(params, config, gaussians, direction)
+
+
+def init_density(key: Array, config: DensityConfig) -> Params:
+    """Returns new parameters of a density field."""
+    return KINDS[config.kind].init_density(key, config)
+
+
+def density(params: Params, config: DensityConfig, gaussians: Gaussians) -> Float[Array, ""]:
+    """Returns the density of one interval of a path; see `FieldKind`."""
+    return KINDS[config.kind].density(params, config, gaussians)
+
+
+def variants() -> Mapping[type[FieldConfig], Mapping[str, type[FieldConfig]]]:
+    """Returns which classes stand for the shapes of fields, by kind, the usual one first."""
+    order = [USUAL, *(name for name in KINDS if name != USUAL)]
+    return {
+        RadianceConfig: {name: KINDS[name].radiance_config for name in order},
+        DensityConfig: {name: KINDS[name].density_config for name in order},
+    }

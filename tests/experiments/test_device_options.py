@@ -1,0 +1,102 @@
+"""The options of several devices and processes, and a training that one of them interrupts."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+from absl import flags
+from absl.testing import flagsaver
+
+from experiments import device_options
+from tests import code_generator
+from tests.experiments.command import ROOT, run_command
+
+
+@pytest.fixture(autouse=True)
+def _parsed():
+    flags.FLAGS.mark_as_parsed()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"devices": "many"}, "--devices=many is no number"),
+        ({"devices": "-1"}, "--devices=-1 is no number"),
+        ({"coordinator": "host:1"}, "Say how many with --processes"),
+        ({"process": 0}, "Say how many with --processes"),
+        ({"processes": 2, "process": 0}, "Give all of them the same --coordinator"),
+        ({"processes": 2, "process": 0, "coordinator": "host"}, "the same --coordinator"),
+        ({"processes": 2, "coordinator": "host:1"}, "Give this one --process with 0 to 1"),
+        ({"processes": 2, "process": 2, "coordinator": "host:1"}, "--process with 0 to 1"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(options, message):
+    with flagsaver.flagsaver(**options), pytest.raises(ValueError, match=message):
+        device_options.connect()
+
+
+def test_more_devices_than_there_are_are_refused():
+    with flagsaver.flagsaver(devices="4096"):
+        device_options.connect()
+        with pytest.raises(ValueError, match=r"--devices=4096, but there .* Give 1 to \d+, or all"):
+            device_options.mesh()
+
+
+def test_one_process_connects_to_nobody_and_speaks(capsys):
+    device_options.connect()
+    assert not device_options.together() and device_options.mesh() is None
+    with device_options.first_speaks():
+        print("heard")
+    assert capsys.readouterr().out == "heard\n"
+
+
+def test_several_processes_do_not_reconstruct(tmp_path):
+    options = ["--method=r3f", "--processes=2", "--coordinator=localhost:1", "--process=0"]
+    result = run_command("train", f"--out={tmp_path / 'run'}", *options, fails=True)
+    assert "Several processes do not reconstruct together" in result.stderr
+    assert "Traceback" not in result.stderr and not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_an_interrupt_of_one_process_saves_and_ends_both(tmp_path):
+    run = tmp_path / "run"
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port = listener.getsockname()[1]
+    options = ["--scene=experiments/data/cube_smcvx_ball", f"--out={run}", "--paths=straight"]
+    options += ["--batch=64", "--steps=400", "--log_every=1"]
+    together = ["--processes=2", f"--coordinator=127.0.0.1:{port}"]
+    started = [_start(*options, *together, f"--process={number}") for number in (0, 1)]
+    metrics = run / "metrics.jsonl"
+    try:
+        while not (metrics.exists() and metrics.read_text().count("\n") > 3):
+            assert started[0].poll() is None, started[0].communicate()
+            time.sleep(0.1)
+        started[1].send_signal(signal.SIGINT)
+        first, second = (process.communicate(timeout=300) for process in started)
+    finally:
+        for process in started:
+            process.kill()
+    assert [process.returncode for process in started] == [130, 130], first[1] + second[1]
+    # Gloo speaks for itself.
+    assert "Stopped at step" in first[0] and "Stopped at step" not in second[0]
+    (saved,) = (int(path.name) for path in (run / "checkpoints").iterdir())
+    assert 3 < saved < 400
+    run_command("train", f"--out={run}", "--resume")
+    steps = [json.loads(line)["step"] for line in metrics.read_text().splitlines()]
+    assert steps[:saved] == list(range(1, saved + 1)) and steps[-1] == 400
+
+
+def _start(*options):
+    return subprocess.Popen(
+        [sys.executable, "-m", "experiments.train", *map(str, options)],
+        cwd=ROOT,
+        env=code_generator.of_users(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
