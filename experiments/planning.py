@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -39,6 +39,7 @@ class Request(NamedTuple):
       steps: training steps.
       batch: rays a step.
       seed: of everything random.
+      distortion_over: which samples the distortion loss counts, see `LossConfig`.
       parts: the objects, where they are not to be read from the scene's meshes.
     """
 
@@ -53,6 +54,7 @@ class Request(NamedTuple):
     steps: int | None = None
     batch: int | None = None
     seed: int = 0
+    distortion_over: Literal["outside", "everywhere"] = "outside"
     parts: Sequence[MeshPart] | None = None
 
 
@@ -100,7 +102,7 @@ def _training(request: Request, cameras: Cameras, chosen: Choices) -> TrainingCo
     return TrainingConfig(
         scene=SceneConfig(str(request.scene), request.rule, indices),
         paths=chosen.paths,
-        loss=preset.loss,
+        loss=dataclasses.replace(preset.loss, distortion_over=request.distortion_over),
         schedule=preset.schedule.over(request.steps or preset.schedule.steps),
         batch=batch,
         pool=preset.pool,

@@ -173,7 +173,10 @@ def _path_losses(
     for proposal, blur in zip(proposals, config.blurs, strict=True):
         per_path = jax.vmap(functools.partial(losses.interlevel, blur=blur))(final, proposal)
         interlevel += _mean_where(exists, per_path)
-    distortion = jax.vmap(losses.distortion)(final, seen.outside)
+    counted = seen.outside
+    if config.distortion_over == "everywhere":
+        counted = jnp.ones_like(counted)
+    distortion = jax.vmap(losses.distortion)(final, counted)
     return interlevel, _mean_where(exists, distortion)
 
 
