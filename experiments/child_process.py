@@ -54,7 +54,7 @@ def run(name: str, *options: str, log: Path) -> tuple[float, float]:
     with log.open("a", encoding="utf-8") as file:
         print(f"$ python -m experiments.{name} {' '.join(options)}", file=file, flush=True)
         process = _start(
-            [sys.executable, "-m", f"experiments.{name}", *options],
+            command_line(name, options),
             stdin=subprocess.PIPE,
             stdout=file,
             stderr=subprocess.STDOUT,
@@ -75,6 +75,11 @@ def run(name: str, *options: str, log: Path) -> tuple[float, float]:
         reason = _complaint(log.read_bytes()[written:].decode("utf-8"), process.returncode)
         raise RunFailedError(f"experiments.{name}: {reason} (all of it: {log})")
     return time.monotonic() - start, usage.ru_maxrss * _RSS_UNIT / _MIB
+
+
+def command_line(name: str, options: Sequence[str]) -> list[str]:
+    """Returns what runs a command of `experiments`."""
+    return [sys.executable, "-m", f"experiments.{name}", *options]
 
 
 @contextlib.contextmanager

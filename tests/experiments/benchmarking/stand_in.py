@@ -51,7 +51,11 @@ def _train(run, options):
 
 
 def _evaluate(run, options):
-    words = (run / "trained_with").read_text()
+    words = " ".join(
+        word
+        for word in (run / "trained_with").read_text().split()
+        if word.partition("=")[0] not in ("out", "scene", "reconstruction", "log_every", "resume")
+    )
     base = int(hashlib.sha256(words.encode()).hexdigest()[:4], 16) / 6553.6
     scene = Path(options["scene"])
     names = [Path(frame["file_path"]).name for frame in _frames(scene)]
