@@ -23,6 +23,9 @@ _RSS_UNIT = 1.0 if sys.platform == "darwin" else 1024.0
 _MIB = 2.0**20
 
 
+# Seconds between two looks at a command.
+_POLL = 0.05
+
 _ROOT = Path(__file__).resolve().parents[1]
 
 # Of all threads: the commands that they wait for.
@@ -61,7 +64,7 @@ def run(name: str, *options: str, log: Path) -> tuple[float, float]:
             env=_environment(),
         )
         try:
-            _, status, usage = os.wait4(process.pid, 0)
+            status, usage = _wait(process)
         except KeyboardInterrupt:
             process.terminate()
             process.wait()
@@ -107,6 +110,18 @@ def _start(words: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
         process = subprocess.Popen(words, **options)
         _running.add(process)
     return process
+
+
+def _wait(process: subprocess.Popen[bytes]) -> tuple[int, Any]:
+    """Returns how a process ended, and what it used.
+
+    A wait that blocks would not notice the interruption of a task of Ray, which is no signal.
+    """
+    while True:
+        pid, status, usage = os.wait4(process.pid, os.WNOHANG)
+        if pid:
+            return status, usage
+        time.sleep(_POLL)
 
 
 def _environment() -> dict[str, str]:

@@ -54,8 +54,8 @@ Metrics = Mapping[str, float | None]
 
 
 def main_table(found: Sequence[Record]) -> Table:
-    """Returns the means of all methods by category and background."""
-    blocks = []
+    """Returns the means of all methods that are no ablations, by category and background."""
+    found, blocks = _without_ablations(found), []
     for category in (*CATEGORIES, published.ALL):
         for background in (*BACKGROUNDS, published.ALL):
             own = select(found, category, background)
@@ -68,7 +68,8 @@ def main_table(found: Sequence[Record]) -> Table:
 
 
 def top_views_table(found: Sequence[Record]) -> Table:
-    """Returns the means of all methods over the test views farthest from any training view."""
+    """Returns the same means over the test views farthest from any training view."""
+    found = _without_ablations(found)
     rows = _ours(found, quantities.TOP_VIEWS, top_metrics)
     rows += _theirs(published.TOP_VIEWS, published.ALL, published.ALL, quantities.TOP_VIEWS)
     marked = tables.mark(rows, columns(quantities.TOP_VIEWS))
@@ -125,6 +126,14 @@ def _ours(
         label = METHODS[name].label if name in METHODS else name
         rows.append(tables.row(label, "ours", len(own), cells))
     return rows
+
+
+def _without_ablations(found: Sequence[Record]) -> list[Record]:
+    return [
+        record
+        for record in found
+        if record.method not in METHODS or METHODS[record.method].group == "main"
+    ]
 
 
 def _theirs(table: str, category: str, background: str, wanted: Sequence[Quantity]) -> list[Row]:

@@ -31,7 +31,7 @@ class Published(NamedTuple):
       category: as in `scene_names.CATEGORIES`, or `ALL`.
       background: as in `scene_names.BACKGROUNDS`, or `ALL`.
       method: its name there.
-      numbers: by name, see `NUMBERS`; `None` where the paper has none.
+      numbers: as printed, by name, see `NUMBERS`; `None` where the paper has none.
       line: of the source.
     """
 
@@ -39,13 +39,13 @@ class Published(NamedTuple):
     category: str
     background: str
     method: str
-    numbers: dict[str, float | None]
+    numbers: dict[str, str | None]
     line: int
 
     def cell(self, quantity: Quantity) -> Cell:
         """Returns a number of the row as tables have it."""
-        known = None if quantity.published is None else self.numbers[quantity.published]
-        return NOTHING if known is None else Cell(known)
+        text = None if quantity.published is None else self.numbers[quantity.published]
+        return NOTHING if text is None else Cell(float(text), digits=len(text.partition(".")[2]))
 
 
 @functools.cache
@@ -58,7 +58,7 @@ def read() -> tuple[Published, ...]:
                 record["category"],
                 record["background"],
                 record["method"],
-                {name: None if record[name] == "--" else float(record[name]) for name in NUMBERS},
+                {name: None if record[name] == "--" else record[name] for name in NUMBERS},
                 int(record["line"]),
             )
             for record in csv.DictReader(file)

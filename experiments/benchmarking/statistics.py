@@ -13,11 +13,13 @@ class Cell(NamedTuple):
       mean: over scenes; `None` if no scene has the value.
       error: standard error of the mean over scenes; `None` for fewer than two.
       count: scenes that have the value.
+      digits: after the point, where they are not its column's: those that the paper prints.
     """
 
     mean: float | None = None
     error: float | None = None
     count: int = 0
+    digits: int | None = None
 
 
 NOTHING = Cell()
@@ -27,8 +29,8 @@ NOTHING = Cell()
 def mean_over_scenes(values: Iterable[float | None]) -> Cell:
     """Returns the mean of one value a scene.
 
-    The standard error is the standard deviation (with n - 1) over the square root of n; it is
-    infinite values' fate to have none.
+    The standard error is the standard deviation (with n - 1) over the square root of n. A mean that
+    is infinite, as the PSNR of equal images is, has none.
     """
     known = [value for value in values if value is not None]
     if not known:

@@ -97,13 +97,13 @@ def _summary(
     skipped: Sequence[Skipped],
 ) -> str:
     common = benchmark.settings
-    images = "all test images" if common.limit is None else f"{common.limit} test images"
+    images = "all test images" if common.limit is None else f"at most {common.limit} test images"
     lines = [
         "# Benchmark",
         "",
-        f"{len(found)} results of {len({record.scene for record in found})} scenes. Preset "
-        f"`{common.preset}`, {common.steps} steps, seed {common.seed}; {images} a scene, "
-        f"{common.rays_per_pixel} rays a pixel.",
+        f"Results: {len(found)}, scenes: {len({record.scene for record in found})}. Preset "
+        f"`{common.preset}`, steps: {common.steps}, seed: {common.seed}; {images} a scene, rays in "
+        f"a pixel: {common.rays_per_pixel}.",
         "",
     ]
     if failed:

@@ -137,7 +137,8 @@ def number(cell: Cell, column: Column) -> str:
     """Returns a mean as it is shown, without its error; `-` if it is not known."""
     if cell.mean is None:
         return "-"
-    return format(cell.mean, f"{'+' if column.signed else ''}.{column.digits}f")
+    digits = column.digits if cell.digits is None else cell.digits
+    return format(cell.mean, f"{'+' if column.signed else ''}.{digits}f")
 
 
 def error(cell: Cell, column: Column) -> str:

@@ -79,6 +79,10 @@ def _calls(tmp_path):
     return [line.split() for line in path.read_text().splitlines()] if path.exists() else []
 
 
+def _trainings(folder):
+    return [call for call in _calls(folder) if call[0] == "train"]
+
+
 def _wait_for(condition, seconds=_LONG):
     end = time.monotonic() + seconds
     while not (found := condition()):
@@ -111,12 +115,11 @@ _NEEDS_PROC = pytest.mark.skipif(not os.path.exists("/proc/self"), reason="looks
 
 
 def _kill(folder, scenes, *, victim, after):
-    """Starts the command, and kills it or its newest command when it has run so many."""
-    count = len(_calls(folder)) + after
-    process = _start(folder, scenes, "--methods=straight,tree", pace=0.3)
-    calls = _wait_for(lambda: len(_calls(folder)) > count and _calls(folder))
-    pid = int(calls[-1][2])
-    time.sleep(0.2)
+    """Starts the command, and kills it or what it runs, in the training after so many others."""
+    count = len(_trainings(folder)) + after
+    process = _start(folder, scenes, "--methods=straight,tree", pace=1.0)
+    pid = int(_wait_for(lambda: _trainings(folder)[count:])[0][2])
+    time.sleep(1.2)
     os.kill(process.pid if victim == "benchmark" else pid, signal.SIGKILL)
     # A command does not outlive its benchmark.
     _wait_for(lambda: not _is_running(pid))
@@ -129,7 +132,7 @@ def test_killed_while_it_trains_it_goes_on_and_its_command_ends_with_it(tmp_path
     counted = list((tmp_path / "out").glob("jobs/*/*/run/count"))
     assert len(counted) <= 1 and not list((tmp_path / "out").glob("jobs/*/*/result.json"))
     serve(tmp_path, scenes, "--methods=straight,tree")
-    trained = [call[1] for call in _calls(tmp_path) if call[0] == "train"]
+    trained = [call[1] for call in _trainings(tmp_path)]
     assert trained[0] == trained[1] and len(trained) == 5
 
 
@@ -155,7 +158,7 @@ def test_a_failure_is_listed_and_the_rest_goes_on(tmp_path, serve, scenes):
     assert "failed: cube_smcvx_ball/tree: experiments.train: error: The stand-in" in result.stderr
     assert "run.log" in result.stderr and "Traceback" not in result.stderr
     text = (tmp_path / "out" / summary.FILE).read_text()
-    assert "- cube_smcvx_ball/tree: experiments.train" in text and "3 results" in text
+    assert "- cube_smcvx_ball/tree: experiments.train" in text and "Results: 3," in text
     index = json.loads((tmp_path / "out" / summary.RESULTS).read_text())
     assert list(index["failed"]) == ["cube_smcvx_ball/tree"] and len(index["jobs"]) == 3
     before = len(_calls(tmp_path))
