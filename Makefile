@@ -1,6 +1,7 @@
 # One command from a fresh clone: `make demo` trains and shows a model, `make test` tests.
 # Both create .venv first, and may be repeated. `make dataset-env` installs Blender, which
-# `python -m experiments.dataset.make` renders with, beside it.
+# `python -m experiments.dataset.make` renders with, beside it. `make benchmark-small` needs both: it
+# renders six scenes and compares three methods on them, in less than 90 minutes on two cores.
 
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
@@ -11,7 +12,12 @@ BLENDER_VENV := .venv-dataset
 BLENDER_READY := $(BLENDER_VENV)/.ready
 RUN := $(VENV)/bin/python -m
 
-.PHONY: demo test test-slow lint format clean dataset-env
+# Two scenes of each category and each background: 50 training views of 100 x 100 and 8 test views.
+SMALL := runs/benchmark-small
+SMALL_SCENES := cube_smcvx_cylinder,env_smcvx_pyramid,cube_smncvx_torus,sphere_smncvx_teapot
+SMALL_SCENES := $(SMALL_SCENES),sphere_mmncvx_conical_flask,env_mmncvx_perfume_red
+
+.PHONY: demo test test-slow lint format clean dataset-env benchmark-small
 
 demo: $(READY)
 	$(RUN) experiments.train --scene=experiments/data/cube_smcvx_ball --preset=tiny \
@@ -35,6 +41,13 @@ format: $(READY)
 
 dataset-env: $(BLENDER_READY)
 	@echo "Blender is in $(BLENDER_VENV). Next: $(RUN) experiments.dataset.make --help"
+
+benchmark-small: $(READY) $(BLENDER_READY)
+	$(RUN) experiments.dataset.make --out=$(SMALL)/scenes --scenes=$(SMALL_SCENES) --size=100 \
+		--train_views=50 --val_views=1 --test_views=8 --spp=64 --test_spp=256 \
+		--texture_size=512 --exr=none --workers=2
+	$(RUN) experiments.benchmark --scenes='$(SMALL)/scenes/*' --methods=straight,oracle,tree \
+		--preset=tiny --steps=2000 --rays_per_pixel=4 --out=$(SMALL)/results
 
 clean:
 	rm -rf $(VENV) $(BLENDER_VENV) .pytest_cache .ruff_cache *.egg-info

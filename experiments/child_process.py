@@ -1,16 +1,37 @@
-"""Runs a command of `experiments` in a process of its own."""
+"""Runs a command of `experiments` in a process of its own.
 
+The command stops, and saves what it has, when this process ends, however that ends: its standard
+input is a pipe from here, which closes then; see `commands.run`.
+"""
+
+import contextlib
 import os
 import re
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
+
+from experiments import commands
 
 # ru_maxrss is in KiB, but in bytes on macOS.
 _RSS_UNIT = 1.0 if sys.platform == "darwin" else 1024.0
 _MIB = 2.0**20
+
+
+# Seconds between two looks at a command.
+_POLL = 0.05
+
+_ROOT = Path(__file__).resolve().parents[1]
+
+# Of all threads: the commands that they wait for.
+_running: set[subprocess.Popen[bytes]] = set()
+_lock = threading.Lock()
+_stopping = threading.Event()
 
 
 class RunFailedError(Exception):
@@ -35,22 +56,78 @@ def run(name: str, *options: str, log: Path) -> tuple[float, float]:
     start = time.monotonic()
     with log.open("a", encoding="utf-8") as file:
         print(f"$ python -m experiments.{name} {' '.join(options)}", file=file, flush=True)
-        process = subprocess.Popen(
-            [sys.executable, "-m", f"experiments.{name}", *options],
+        process = _start(
+            command_line(name, options),
+            stdin=subprocess.PIPE,
             stdout=file,
             stderr=subprocess.STDOUT,
+            env=_environment(),
         )
         try:
-            _, status, usage = os.wait4(process.pid, 0)
+            status, usage = _wait(process)
         except KeyboardInterrupt:
             process.terminate()
             process.wait()
             raise
+        finally:
+            with _lock:
+                _running.discard(process)
+            process.stdin.close()
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode != 0:
         reason = _complaint(log.read_bytes()[written:].decode("utf-8"), process.returncode)
         raise RunFailedError(f"experiments.{name}: {reason} (all of it: {log})")
     return time.monotonic() - start, usage.ru_maxrss * _RSS_UNIT / _MIB
+
+
+def command_line(name: str, options: Sequence[str]) -> list[str]:
+    """Returns what runs a command of `experiments`."""
+    return [sys.executable, "-m", f"experiments.{name}", *options]
+
+
+@contextlib.contextmanager
+def stopping() -> Iterator[None]:
+    """Asks all commands that threads of this process wait for to stop; in the context none starts.
+
+    Each may save before it ends, and its thread is told that it failed.
+    """
+    with _lock:
+        _stopping.set()
+        for process in _running:
+            with contextlib.suppress(ProcessLookupError):
+                # Not by `process`, which might take the status that its thread waits for.
+                os.kill(process.pid, signal.SIGTERM)
+    try:
+        yield
+    finally:
+        _stopping.clear()
+
+
+def _start(words: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
+    with _lock:
+        if _stopping.is_set():
+            raise RunFailedError("stopped before it began")
+        process = subprocess.Popen(words, **options)
+        _running.add(process)
+    return process
+
+
+def _wait(process: subprocess.Popen[bytes]) -> tuple[int, Any]:
+    """Returns how a process ended, and what it used.
+
+    A wait that blocks would not notice the interruption of a task of Ray, which is no signal.
+    """
+    while True:
+        pid, status, usage = os.wait4(process.pid, os.WNOHANG)
+        if pid:
+            return status, usage
+        time.sleep(_POLL)
+
+
+def _environment() -> dict[str, str]:
+    """Returns the environment of a command, which finds these modules wherever it is started."""
+    paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return os.environ | {commands.STOP_WITH_INPUT: "1", "PYTHONPATH": os.pathsep.join(paths)}
 
 
 def _complaint(printed: str, code: int) -> str:

@@ -1,9 +1,11 @@
 """What all commands share: how they start, stop, and report errors and progress."""
 
 import math
+import os
 import shlex
 import signal
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,6 +18,14 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+_NOT_FINITE = ("inf", "-inf", "nan")
+
+STOP_WITH_INPUT = "REFREF_STOP_WITH_INPUT"
+"""Variable of the environment: if it is set, a command stops when its standard input ends.
+
+Whoever starts a command so, and holds the other end, takes it along when it ends or is killed.
+"""
 
 INTERRUPTED = 130
 """Status of a command that was stopped by Ctrl-C, as shells have it."""
@@ -32,6 +42,8 @@ def run(main: Callable[..., None], *, arguments: Sequence[str] = ()) -> None:
     """
 
     def guarded(words: Sequence[str]) -> None:
+        if os.environ.pop(STOP_WITH_INPUT, ""):
+            threading.Thread(target=_stop_with_input, daemon=True).start()
         logging.set_verbosity(logging.ERROR)
         given = words[1:]
         if len(given) > len(arguments):
@@ -51,6 +63,13 @@ def run(main: Callable[..., None], *, arguments: Sequence[str] = ()) -> None:
     app.run(guarded)
 
 
+def _stop_with_input() -> None:
+    """Asks this process to stop, as `kill` would, when its standard input ends."""
+    while os.read(sys.stdin.fileno(), 1):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
 def shell(name: str, *options: str) -> str:
     """Returns the line that runs a command of `experiments`, quoted so that it can be pasted."""
     return shlex.join(["python", "-m", f"experiments.{name}", *options])
@@ -65,6 +84,15 @@ def string_safe(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return value
+
+
+def from_string_safe(value: Any) -> Any:
+    """Undoes `string_safe`."""
+    if isinstance(value, dict):
+        return {key: from_string_safe(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [from_string_safe(item) for item in value]
+    return float(value) if isinstance(value, str) and value in _NOT_FINITE else value
 
 
 class Interrupt:

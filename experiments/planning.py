@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -40,6 +40,7 @@ class Request(NamedTuple):
       steps: training steps.
       batch: rays a step.
       seed: of everything random.
+      distortion_over: which samples the distortion loss counts, see `LossConfig`.
       parts: the objects, where they are not to be read from the scene's meshes.
       field: kind of the fields, see `fields.registry`.
     """
@@ -55,6 +56,7 @@ class Request(NamedTuple):
     steps: int | None = None
     batch: int | None = None
     seed: int = 0
+    distortion_over: Literal["outside", "everywhere"] = "outside"
     parts: Sequence[MeshPart] | None = None
     field: str = registry.USUAL
 
@@ -105,7 +107,7 @@ def _training(
     return TrainingConfig(
         scene=SceneConfig(str(request.scene), request.rule, indices),
         paths=chosen.paths,
-        loss=presets.loss(model),
+        loss=dataclasses.replace(presets.loss(model), distortion_over=request.distortion_over),
         schedule=preset.schedule.over(request.steps or preset.schedule.steps),
         batch=batch,
         pool=preset.pool,

@@ -26,8 +26,9 @@ PATHS = flags.DEFINE_enum(
     None,
     list(BUDGETS),
     "Light paths: 'straight' ignores the objects; 'paper' bends up to 10 times and reflects at "
-    "the first surface; 'tree' follows every branch that carries light. By default 'tree' if there "
-    "are meshes, else 'straight'.",
+    "the first surface, with its ablations without that and without total reflection; 'tree' "
+    "follows every branch that carries light. By default 'tree' if there are meshes, else "
+    "'straight'.",
 )
 _CUT = flags.DEFINE_float(
     "cut", None, "Smallest throughput worth following, in [0, 1); that of --paths if not given."
@@ -89,6 +90,13 @@ _PRECISION = flags.DEFINE_enum(
     ["float32", "bfloat16"],
     "Arithmetic of the fields; the preset's if not given.",
 )
+_DISTORTION = flags.DEFINE_enum(
+    "distortion",
+    "outside",
+    ["outside", "everywhere"],
+    "Samples that the distortion loss draws together: those outside the objects (the paper's "
+    "correction), or all, as before it.",
+)
 flags.adopt_module_key_flags(scenes)
 flags.adopt_module_key_flags(space_options)
 _STEPS = flags.DEFINE_integer("steps", None, "Training steps; the preset's if not given.", 1)
@@ -110,6 +118,7 @@ SETTLED = (
     _ENTRIES,
     _FINEST,
     _PRECISION,
+    _DISTORTION,
     scenes.RULE,
     scenes.IOR,
     space_options.BACKGROUND,
@@ -151,6 +160,7 @@ def plan_from_flags(*, body: MeshPart | None = None) -> Plan:
         steps=_STEPS.value,
         batch=_BATCH.value,
         seed=SEED.value,
+        distortion_over=_DISTORTION.value,
         parts=None if body is None else [body],
     )
     return planning.make_plan(request)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments import child_process
+from experiments import child_process, commands
 from refref_jax.data import local_layout, transforms
 from refref_jax.training import run_folder
 
@@ -136,7 +136,8 @@ def evaluate(
         child_process.run("evaluate", *command, log=run.with_name(f"{run.name}.log"))
         summary = json.loads((run / "eval" / split / "metrics.json").read_text("utf-8"))
         names = {field.name for field in dataclasses.fields(Evaluation)}
-        values = {name: _number(x) for name, x in summary["results"].items() if name in names}
+        results = commands.from_string_safe(summary["results"])
+        values = {name: x for name, x in results.items() if name in names}
         known.setdefault("evaluations", {})[key] = values | {"images": len(summary["per_image"])}
         _write(run, known)
     return Evaluation(**known["evaluations"][key])
@@ -198,11 +199,6 @@ def _has_ended(run: Path, steps: int | None) -> bool:
 def _steps_in(options: Sequence[str]) -> int | None:
     given = [option.partition("=")[2] for option in options if option.startswith("--steps=")]
     return int(given[-1]) if given else None
-
-
-def _number(value: Any) -> Any:
-    """Undoes `commands.string_safe`."""
-    return float(value) if isinstance(value, str) else value
 
 
 def _read(run: Path) -> dict[str, Any]:

@@ -8,8 +8,10 @@ tree of paths. A budget says which branches are followed:
   totally reflected elsewhere, without loss, and one reflection at the first surface, which is not
   traced any further.
 - `TREE`: every branch that carries at least 2 % of its pixel's light.
+- `PAPER_NO_REFLECTION`, `PAPER_NO_TIR`: the paper's ablations: `PAPER` without the reflection at
+  the first surface, and with paths that go straight on where they would be reflected totally.
 
-Source: paper (arXiv 2505.05848), section 4, for the first two.
+Source: paper (arXiv 2505.05848), sections 4 and 5 (ablation study), for all but the tree.
 """
 
 import dataclasses
@@ -111,7 +113,16 @@ PAPER = Budget(
 )
 TREE = Budget(bends=24, reflections="all", cut=0.02)
 
-BUDGETS = {"straight": STRAIGHT, "paper": PAPER, "tree": TREE}
+PAPER_NO_REFLECTION = dataclasses.replace(PAPER, reflections="none")
+PAPER_NO_TIR = dataclasses.replace(PAPER, total_reflection="ended")
+
+BUDGETS = {
+    "straight": STRAIGHT,
+    "paper": PAPER,
+    "tree": TREE,
+    "paper_no_reflection": PAPER_NO_REFLECTION,
+    "paper_no_tir": PAPER_NO_TIR,
+}
 
 
 def room(budget: Budget, rays: int) -> Room:

@@ -27,9 +27,11 @@ class LossConfig:
       data: loss on sRGB colours.
       interlevel: weight of the anti-aliased interlevel loss.
       blurs: half-width of its blur for each proposal round, in normalised distance.
-      distortion: weight of the corrected distortion loss.
+      distortion: weight of the distortion loss.
       hash_decay: weight of the decay of the hash grids.
       dye_decay: weight of the optical density of learned colours.
+      distortion_over: which samples the distortion loss is summed over: those `outside` the
+        objects (the paper's correction), or `everywhere` (Mip-NeRF 360, the paper's ablation).
     """
 
     data: Literal["mse", "charbonnier"]
@@ -38,6 +40,7 @@ class LossConfig:
     distortion: float
     hash_decay: float
     dye_decay: float
+    distortion_over: Literal["outside", "everywhere"] = "outside"
 
 
 @dataclasses.dataclass(frozen=True)

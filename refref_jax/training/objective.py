@@ -64,7 +64,10 @@ def total(light: pixels.Light, paths: LightPaths, config: LossConfig) -> Totals:
     for proposal, blur in zip(proposals, config.blurs, strict=True):
         per_path = jax.vmap(functools.partial(losses.interlevel, blur=blur))(final, proposal)
         interlevel += _sum_where(exists, per_path)
-    distortion = jax.vmap(losses.distortion)(final, light.paths.outside)
+    counted = light.paths.outside
+    if config.distortion_over == "everywhere":
+        counted = jnp.ones_like(counted)
+    distortion = jax.vmap(losses.distortion)(final, counted)
     count = jnp.sum(exists, dtype=interlevel.dtype)
     return Totals(light.linear, interlevel, _sum_where(exists, distortion), count)
 

@@ -192,6 +192,7 @@ def test_mistakes_end_with_one_line_that_says_what_to_do(tmp_path, command, opti
         "path_trade_off",
         "trade_off",
         "recommend",
+        "benchmark",
     ],
 )
 def test_help_explains_every_option(command):

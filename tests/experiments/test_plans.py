@@ -206,6 +206,8 @@ def test_scenes_and_options_become_plans(scene):
         (empty, "--paths=tree"),
         (tinted, "--paths=paper", "--bends=4", "--samples=7,6", "--footprint=differential"),
         (tinted, "--field=nerfacto", "--entries=12"),
+        (clear, "--paths=paper_no_tir", "--distortion=everywhere"),
+        (clear, "--paths=paper_no_reflection"),
     ]
     result = subprocess.run(
         [sys.executable, "-m", "tests.experiments.print_plans"],
@@ -216,13 +218,7 @@ def test_scenes_and_options_become_plans(scene):
         check=True,
     )
     plans = json.loads(result.stdout)
-    assert [plan["error"] is None for plan in plans] == [True] * 6 + [
-        False,
-        True,
-        False,
-        True,
-        True,
-    ]
+    assert [number for number, plan in enumerate(plans) if plan["error"] is not None] == [6, 8]
     assert "scene.json does not tell" in plans[6]["error"]
     assert "no meshes" in plans[8]["error"]
     defaults = [(plan["paths"], plan["interior"]) for plan in plans if plan["error"] is None]
@@ -236,6 +232,8 @@ def test_scenes_and_options_become_plans(scene):
         ("straight", "field"),
         ("paper", "absorbing"),
         ("tree", "absorbing"),
+        ("paper_no_tir", "clear"),
+        ("paper_no_reflection", "clear"),
     ]
     # Colours that are given lie on the paths; all others must not, or they would count twice.
     for number, plan in enumerate(plans):
@@ -254,3 +252,9 @@ def test_scenes_and_options_become_plans(scene):
     last = plans[9]
     assert (last["bends"], last["proposals"], last["samples"]) == (4, [7], 6)
     assert last["footprint"] == "differential"
+    ablated = ("reflections", "total_reflection", "distortion_over")
+    assert [[plan[key] for key in ablated] for plan in (plans[9], *plans[11:])] == [
+        ["first", "followed", "outside"],
+        ["first", "ended", "everywhere"],
+        ["none", "followed", "outside"],
+    ]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from refref_jax.optics import path_tracing
-from refref_jax.optics.budgets import PAPER, TREE, Budget, room
+from refref_jax.optics.budgets import BUDGETS, PAPER, TREE, Budget, room
 from refref_jax.optics.light_paths import PathStatus
 from tests import scenes
 
@@ -131,6 +131,33 @@ def test_a_total_reflection_may_end_the_path():
     followed, _ = _ends(geometry, rays, budget=Budget(10, "none"))
     assert followed.statuses[0] == PathStatus.ESCAPED
     np.testing.assert_allclose(followed.directions[0], [0.0, 0.0, -1.0], atol=1e-6)
+
+
+def test_the_papers_ablations_differ_from_its_budget_in_one_thing_each():
+    changed = {
+        name: {
+            field.name
+            for field in dataclasses.fields(Budget)
+            if getattr(BUDGETS[name], field.name) != getattr(PAPER, field.name)
+        }
+        for name in ("paper_no_reflection", "paper_no_tir")
+    }
+    assert changed == {
+        "paper_no_reflection": {"reflections"},
+        "paper_no_tir": {"total_reflection"},
+    }
+    rays = scenes.rays([-2.0, 0.1, 0.3], [1.0, 0.0, 0.0])
+    followed = {
+        name: _ends(scenes.geometry(scenes.right_prism()), rays, budget=BUDGETS[name])[0]
+        for name in ("paper", *changed)
+    }
+    count = {name: len(ends.rays) for name, ends in followed.items()}
+    assert count == {"paper": 2, "paper_no_reflection": 1, "paper_no_tir": 2}
+    main = {name: ends.directions[np.argmax(ends.weights[:, 0])] for name, ends in followed.items()}
+    np.testing.assert_allclose(main["paper"], [0.0, 0.0, -1.0], atol=1e-6)
+    np.testing.assert_allclose(main["paper_no_reflection"], [0.0, 0.0, -1.0], atol=1e-6)
+    np.testing.assert_allclose(main["paper_no_tir"], [1.0, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(followed["paper_no_reflection"].weights, 1.0, atol=1e-6)
 
 
 def test_light_that_goes_round_inside_a_ball_ends_by_its_budget():

@@ -156,6 +156,20 @@ def test_reports_say_what_was_measured():
     assert report.lost == 0.0
 
 
+def test_the_ablation_counts_the_samples_inside_in_the_distortion_loss_alone():
+    loss = dataclasses.replace(CONFIG.loss, distortion_over="everywhere")
+    config = dataclasses.replace(CONFIG, loss=loss)
+    _, (corrected,) = _train(_setup(), _start(), 1)
+    _, (ablated,) = _train(_setup(config), _start(config), 1)
+    assert ablated.distortion > 1.02 * corrected.distortion > 0.0
+    np.testing.assert_allclose(ablated.interlevel, corrected.interlevel, rtol=1e-6)
+    np.testing.assert_allclose(
+        ablated.loss - corrected.loss,
+        CONFIG.loss.distortion * (ablated.distortion - corrected.distortion),
+        rtol=1e-2,  # of a difference in the fourth digit
+    )
+
+
 def test_charbonnier_changes_the_loss_only():
     loss = dataclasses.replace(CONFIG.loss, data="charbonnier")
     config = dataclasses.replace(CONFIG, loss=loss)

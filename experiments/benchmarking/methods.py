@@ -1,0 +1,139 @@
+"""The methods that a benchmark compares: what each is called, and the options that make it.
+
+A method is options of `experiments.train`, no more: adding one is adding a line here. `oracle` is
+the published method: `--paths=paper --interior=field`. Its ablations take one thing from it; those
+of `tree`, which is ours, change one thing of that.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Literal
+
+Need = Literal["meshes", "masks", "colours"]
+Group = Literal["main", "ablation of the oracle", "ablation of the tree"]
+
+RECONSTRUCTION = "reconstruction"
+"""What the methods that know no meshes share, a scene: no method may be called so."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """One way to learn a scene.
+
+    Attributes:
+      name: as commands take it, and as its folders are called.
+      label: as tables have it.
+      group: which comparison it belongs to.
+      train: options of `experiments.train`.
+      needs: what a scene must have: `meshes` of its objects, `masks` of its training images,
+        `colours` of all its parts in scene.json.
+      reconstructed: whether objects are those that R3F finds, in place of the scene's meshes.
+      published: the row of the paper's tables that is the same method, if there is one.
+    """
+
+    name: str
+    label: str
+    group: Group
+    train: tuple[str, ...]
+    needs: tuple[Need, ...] = ("meshes",)
+    reconstructed: bool = False
+    published: str | None = None
+
+
+_ORACLE = ("--paths=paper", "--interior=field")
+_TREE = ("--paths=tree",)
+
+
+def _over(options: Sequence[str], others: Sequence[str]) -> tuple[str, ...]:
+    """Returns options, of which others replace those of their name."""
+    return tuple({word.partition("=")[0]: word for word in (*options, *others)}.values())
+
+
+def _ablated(name: str, label: str, *options: str, published: str | None = None) -> Method:
+    """Returns the oracle with other options."""
+    train = _over(_ORACLE, options)
+    return Method(name, label, "ablation of the oracle", train, published=published)
+
+
+def _varied(name: str, label: str, *options: str, colours: tuple[Need, ...] = ()) -> Method:
+    """Returns the tree with other options."""
+    train = _over(_TREE, options)
+    return Method(name, label, "ablation of the tree", train, needs=("meshes", *colours))
+
+
+_ALL = (
+    Method("straight", "Straight (Zip-NeRF)", "main", ("--paths=straight",), (), False, "Zip-NeRF"),
+    Method("oracle", "Oracle (paper's paths)", "main", _ORACLE, published="Oracle"),
+    Method("tree", "Oracle (path tree)", "main", _TREE),
+    Method("r3f", "R3F (paper's paths)", "main", _ORACLE, ("masks",), True, "R3F"),
+    Method("r3f_tree", "R3F (path tree)", "main", _TREE, ("masks",), True),
+    _ablated(
+        "oracle_distortion",
+        "w/o corrected distortion loss",
+        "--distortion=everywhere",
+        published="w/o corrected distortion loss",
+    ),
+    _ablated(
+        "oracle_no_reflection",
+        "w/o first reflection",
+        "--paths=paper_no_reflection",
+        published="w/o first reflection",
+    ),
+    _ablated("oracle_no_tir", "w/o TIR", "--paths=paper_no_tir", published="w/o TIR"),
+    _ablated("oracle_nerfacto", "w/o Zip-NeRF", "--field=nerfacto", published="w/o Zip-NeRF"),
+    _ablated("oracle_2_bends", "no refraction past 2 bends", "--bends=2"),
+    _ablated("oracle_4_bends", "no refraction past 4 bends", "--bends=4"),
+    _varied("tree_paper_paths", "paper's paths", "--paths=paper"),
+    _varied("tree_field", "a learned field inside", "--interior=field"),
+    _varied("tree_clear", "nothing inside, no tint", "--interior=clear"),
+    _varied(
+        "tree_tints_given",
+        "absorbing inside, tints given",
+        "--interior=absorbing",
+        "--tints=given",
+        colours=("colours",),
+    ),
+    _varied(
+        "tree_tints_learned",
+        "absorbing inside, tints learned",
+        "--interior=absorbing",
+        "--tints=learned",
+    ),
+    _varied("tree_cone", "footprint: cone", "--footprint=cone"),
+    _varied("tree_differential", "footprint: differential", "--footprint=differential"),
+)
+
+METHODS: dict[str, Method] = {method.name: method for method in _ALL}
+"""Every method by its name, in the order of tables."""
+
+FULL: dict[Group, str] = {"ablation of the oracle": "oracle", "ablation of the tree": "tree"}
+"""The method that each group of ablations is compared with."""
+
+
+def parse(names: Sequence[str]) -> list[Method]:
+    """Returns methods by name, in the order of the table.
+
+    Args:
+      names: of methods; `main`, `ablations` or `all` stand for many.
+
+    Raises:
+      ValueError: if there is none, or no such one.
+    """
+    wanted = {name for word in names if word for name in _meaning(word.strip())}
+    if not wanted:
+        raise ValueError("--methods is empty. Name methods, as --methods=straight,oracle,tree.")
+    return [method for method in _ALL if method.name in wanted]
+
+
+def _meaning(word: str) -> list[str]:
+    groups = {
+        "main": [method.name for method in _ALL if method.group == "main"],
+        "ablations": [method.name for method in _ALL if method.group != "main"]
+        + ["oracle", "tree"],
+        "all": list(METHODS),
+    }
+    if word not in METHODS and word not in groups:
+        raise ValueError(
+            f"There is no method {word!r}. Choose from {', '.join((*METHODS, *groups))}."
+        )
+    return groups.get(word, [word])

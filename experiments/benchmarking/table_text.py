@@ -1,0 +1,100 @@
+"""Writes tables as people read them: Markdown, and LaTeX for a paper (with booktabs)."""
+
+from collections.abc import Sequence
+
+from experiments.benchmarking import tables
+from experiments.benchmarking.statistics import Cell
+from experiments.benchmarking.tables import Column, Mark, Row, Table
+
+_ARROWS = {"higher": " ↑", "lower": " ↓", None: ""}
+_LATEX_ARROWS = {"higher": r"$\uparrow$", "lower": r"$\downarrow$", None: ""}
+_MARKDOWN_MARKS: dict[Mark, tuple[str, str]] = {
+    "": ("", ""),
+    "best": ("**", "**"),
+    "second": ("<u>", "</u>"),
+}
+_LATEX_MARKS: dict[Mark, tuple[str, str]] = {
+    "": ("", ""),
+    "best": (r"\textbf{", "}"),
+    "second": (r"\underline{", "}"),
+}
+_LATEX_SPECIAL = {
+    "\\": r"\textbackslash{}",
+    "&": r"\&",
+    "%": r"\%",
+    "_": r"\_",
+    "#": r"\#",
+    "$": r"\$",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+}
+
+
+def markdown(table: Table) -> str:
+    """Returns a section: title, a table for each block, and notes."""
+    lines = [f"## {table.title}", ""]
+    for block in table.blocks:
+        heads = [f"{column.label}{_ARROWS[column.better]}" for column in table.columns]
+        lines += [
+            f"### {block.title[:1].upper()}{block.title[1:]}",
+            "",
+            _line(["method", "scenes", *heads]),
+            _line(["---", "---:", *["---:"] * len(heads)]),
+            *(_line(_markdown_row(row, table.columns)) for row in block.rows),
+            "",
+        ]
+    if not table.blocks:
+        lines += ["Nothing is measured yet.", ""]
+    return "\n".join([*lines, *(f"{note}\n" for note in table.notes)])
+
+
+def latex(table: Table) -> str:
+    """Returns a tabular, with the blocks below one another."""
+    count = len(table.columns) + 2
+    heads = [f"{column.latex}{_LATEX_ARROWS[column.better]}" for column in table.columns]
+    lines = [
+        f"% {table.title}. Published rows and columns: arXiv 2505.05848, on its data.",
+        rf"\begin{{tabular}}{{@{{}}l{'r' * (count - 1)}@{{}}}}",
+        r"\toprule",
+        " & ".join(["Method", "Scenes", *heads]) + r" \\",
+    ]
+    for block in table.blocks:
+        lines += [
+            r"\midrule",
+            rf"\multicolumn{{{count}}}{{@{{}}l}}{{{_escaped(block.title)}}} \\",
+            *(" & ".join(_latex_row(row, table.columns)) + r" \\" for row in block.rows),
+        ]
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+
+
+def _markdown_row(row: Row, columns: Sequence[Column]) -> list[str]:
+    label = f"{row.label}, *published*" if row.origin == "published" else row.label
+    cells = [
+        _marked(cell, column, _MARKDOWN_MARKS[mark], " ± {}")
+        for cell, column, mark in zip(row.cells, columns, row.marks, strict=True)
+    ]
+    return [label, "-" if row.scenes is None else str(row.scenes), *cells]
+
+
+def _latex_row(row: Row, columns: Sequence[Column]) -> list[str]:
+    label = _escaped(row.label) + (r" \emph{(published)}" if row.origin == "published" else "")
+    cells = [
+        _marked(cell, column, _LATEX_MARKS[mark], r" {{\tiny$\pm${}}}")
+        for cell, column, mark in zip(row.cells, columns, row.marks, strict=True)
+    ]
+    return [label, "--" if row.scenes is None else str(row.scenes), *cells]
+
+
+def _marked(cell: Cell, column: Column, around: tuple[str, str], deviation: str) -> str:
+    text = f"{around[0]}{tables.number(cell, column)}{around[1]}"
+    return text if cell.error is None else text + deviation.format(tables.error(cell, column))
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _escaped(text: str) -> str:
+    return "".join(_LATEX_SPECIAL.get(letter, letter) for letter in text)

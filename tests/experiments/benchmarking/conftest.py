@@ -1,0 +1,29 @@
+import sys
+from pathlib import Path
+
+import pytest
+
+from experiments import child_process
+from experiments.benchmarking import running
+
+_STAND_IN = Path(__file__).with_name("stand_in.py")
+
+
+def stand_in_line(name, options):
+    """Returns what runs the stand-in for a command of `experiments`."""
+    return [sys.executable, str(_STAND_IN), name, *options]
+
+
+def run_with_stand_in(out, job):
+    """Does a job with stand-ins for its commands, in whatever process."""
+    child_process.command_line = stand_in_line
+    return running.run(out, job)
+
+
+@pytest.fixture
+def stand_in(tmp_path, monkeypatch):
+    """Stands in for the commands; they write what they are called with into this file."""
+    calls = tmp_path / "calls.txt"
+    monkeypatch.setenv("CALLS", str(calls))
+    monkeypatch.setattr(child_process, "command_line", stand_in_line)
+    return calls

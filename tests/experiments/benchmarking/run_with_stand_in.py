@@ -1,0 +1,8 @@
+"""Runs `experiments.benchmark` with the stand-in for its commands, in a process to be killed."""
+
+from experiments import benchmark, child_process, commands
+from tests.experiments.benchmarking.conftest import stand_in_line
+
+if __name__ == "__main__":
+    child_process.command_line = stand_in_line
+    commands.run(benchmark.main)

@@ -1,0 +1,39 @@
+"""Runs `experiments.benchmark` again and again in one process, with stand-ins for its commands.
+
+Reads lines of JSON, `{"words": [...], "environment": {...}}`; answers each with one line,
+`{"status": 0, "stdout": "...", "stderr": "..."}`. Starting takes seconds, which are spent once so.
+"""
+
+import contextlib
+import io
+import json
+import os
+import sys
+
+from absl import flags
+
+from experiments import benchmark, child_process
+from tests.experiments.benchmarking.conftest import stand_in_line
+
+
+def _answer(request):
+    os.environ.update(request["environment"])
+    for name in flags.FLAGS:
+        flags.FLAGS[name].unparse()
+    out, err, status = io.StringIO(), io.StringIO(), 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            flags.FLAGS(["benchmark", *request["words"]])
+            benchmark.main()
+        except SystemExit as end:
+            status = end.code
+        except (ValueError, OSError) as error:  # as `commands.run` has it
+            print(f"error: {error}", file=sys.stderr)
+            status = 2
+    return {"status": status, "stdout": out.getvalue(), "stderr": err.getvalue()}
+
+
+if __name__ == "__main__":
+    child_process.command_line = stand_in_line
+    for line in sys.stdin:
+        print(json.dumps(_answer(json.loads(line))), flush=True)
