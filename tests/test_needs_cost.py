@@ -8,6 +8,7 @@ import re
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax import extend
 
 from experiments.choices import Wishes, choose
@@ -129,6 +130,7 @@ def _samples_inside(model):
     return int(np.sum(~np.asarray(outside(params, path))))
 
 
+@pytest.mark.slow
 def test_only_a_field_inside_takes_samples_there():
     counts = {
         interior: _samples_inside(dataclasses.replace(MODEL, interior=interior))
@@ -137,6 +139,7 @@ def test_only_a_field_inside_takes_samples_there():
     assert counts["field"] > 0 == counts["clear"] == counts["absorbing"]
 
 
+@pytest.mark.slow
 def test_light_that_leaves_the_bundled_ball_for_good_is_cast_less_often(ball_scene):
     parts = meshes.read_meshes(ball_scene)
     tree = containment.find_containment(parts)

@@ -17,7 +17,6 @@ import trimesh
 
 from refref_jax.data import files
 from refref_jax.render import load_model
-from tests import code_generator
 from tests.experiments.command import ROOT, TINY, run_command
 
 # The kinds of distances that an evaluation measures, and how.
@@ -80,7 +79,7 @@ def test_an_interrupted_run_is_saved_and_goes_on(tmp_path):
     options = ["--scene=experiments/data/cube_smcvx_ball", "--batch=64", f"--out={run}"]
     options.append("--paths=straight")  # the rest is the same, and compiles sooner
     command = [sys.executable, "-m", "experiments.train", *options, "--log_every=1"]
-    options = {"cwd": ROOT, "env": code_generator.of_users(), "text": True}
+    options = {"cwd": ROOT, "text": True}
     with subprocess.Popen(command, stdout=subprocess.PIPE, **options) as process:
         while not (run / "metrics.jsonl").exists() and process.poll() is None:
             time.sleep(0.1)

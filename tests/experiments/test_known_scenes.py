@@ -67,6 +67,7 @@ def test_a_rendering_is_measured_and_pictured(rendered):
     assert str(out / "metrics.json") in printed and "path_trade_off" in printed
 
 
+@pytest.mark.slow
 def test_results_are_replaced_with_a_word_and_other_files_not_at_all(rendered, tmp_path):
     out, _ = rendered
     ours = tmp_path / "again"

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 from tests import code_generator
 
 _PREAMBLE = """
@@ -50,6 +52,7 @@ _CONTEXTS = {
 }
 
 
+@pytest.mark.slow
 def test_the_traversal_compiles_in_any_context():
     checks = [
         f"print({name!r}, flush=True)\n"

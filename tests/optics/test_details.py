@@ -41,6 +41,7 @@ def _slow_outside(paths, index):
     return [i for i in range(bends + 1) if paths.media[index, i] == AMBIENT or i == bends]
 
 
+@pytest.mark.slow
 def test_only_segments_outside_are_kept():
     whole = _trace(_two_balls(), _rays()).paths
     kept = _trace(_two_balls(), _rays(), detail=Detail("outside", 6)).paths
@@ -78,6 +79,7 @@ def test_segments_end_where_the_next_ones_begin(budget):
     assert np.all(np.isinf(paths.ends[~used]))
 
 
+@pytest.mark.slow
 def test_meetings_and_passages_are_those_of_the_whole_path():
     """Tints and absorption are put on the paths afterwards, and come to what tracing puts on."""
     budget = Budget(bends=3, reflections="all")  # no cut: colours do not change what is followed

@@ -38,6 +38,7 @@ def _gram(axes):
 
 
 @pytest.mark.parametrize("t", [0.0, 0.5, 7.0])
+@pytest.mark.slow
 def test_a_ray_that_meets_nothing_has_the_footprint_of_its_cone(t):
     rays = scenes.rays([0.0, 0.0, -4.0], [0.3, 0.9, 0.2])
     bent = _one(_traced(_GLASS, rays), 0)

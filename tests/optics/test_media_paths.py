@@ -77,6 +77,7 @@ def _balls(priorities=(1, 2), **outer):
     return _ranked(glass, priorities[0], **outer), _ranked(water, priorities[1])
 
 
+@pytest.mark.slow
 def test_a_contained_body_of_higher_priority_is_the_nested_model():
     parts = _balls(tint=(0.9, 0.8, 0.7), absorption=(0.1, 0.2, 0.4))
     rays = scenes.rays(*_bundle(_RAYS))
@@ -155,6 +156,7 @@ def test_only_real_surfaces_tint_and_only_the_medium_that_is_there_absorbs():
 
 
 @pytest.mark.parametrize("swapped", [False, True])
+@pytest.mark.slow
 def test_water_that_overlaps_the_wall_of_a_hollow_ball(swapped):
     """The wall keeps its shape: as water within a hole of glass."""
     outer, hole = scenes.ball(1.0, subdivisions=5), scenes.ball(0.6, subdivisions=5)

@@ -104,6 +104,7 @@ def test_a_ball_of_glass():
     _check_against_spheres(geometry, [Sphere(1.0, 1.5, 1.0)], [0.0, 0.2, 0.5, 0.8], 2)
 
 
+@pytest.mark.slow
 def test_a_hollow_shell():
     shell = [Sphere(1.0, 1.5, 1.0), Sphere(0.6, 1.0, 1.5)]
     _check_against_spheres(_ball_in_ball("nested", 1.0), shell, [0.0, 0.2, 0.4], 4)
@@ -236,7 +237,10 @@ def _many_rays():
     return scenes.rays([-4.0, 0.0, 0.0], targets + np.array([4.0, 0.0, 0.0]))
 
 
-@pytest.mark.parametrize(("budget", "capacity"), [(TREE, 1), (PAPER, 70), (TREE, 200)])
+@pytest.mark.parametrize(
+    ("budget", "capacity"),
+    [(TREE, 1), pytest.param(PAPER, 70, marks=pytest.mark.slow), (TREE, 200)],
+)
 def test_weights_and_losses_of_every_ray_sum_to_one_at_any_capacity(budget, capacity):
     traced = _trace(
         scenes.geometry(scenes.ball(1.0)), _many_rays(), budget=budget, capacity=capacity
@@ -247,6 +251,7 @@ def test_weights_and_losses_of_every_ray_sum_to_one_at_any_capacity(budget, capa
     assert (traced.lost.max() > 0.0) == (capacity < 100)
 
 
+@pytest.mark.slow
 def test_the_strongest_paths_are_kept():
     geometry = scenes.geometry(scenes.ball(1.0))
     full = _trace(geometry, _many_rays(), capacity=200).paths.weights[:, 0]
@@ -263,6 +268,7 @@ def test_paths_come_in_the_order_of_their_rays_the_heaviest_first():
     assert np.all(np.diff(weights)[np.diff(rays) == 0] <= 0.0)
 
 
+@pytest.mark.slow
 def test_tracing_in_a_pool_equals_tracing_batch_by_batch():
     geometry = scenes.geometry(scenes.ball(1.0))
     rays = _many_rays()
@@ -289,7 +295,7 @@ def test_the_straight_budget_ignores_the_objects():
     assert np.all(traced.lost == 0.0)
 
 
-@pytest.mark.parametrize("budget", [PAPER, TREE])
+@pytest.mark.parametrize("budget", [pytest.param(PAPER, marks=pytest.mark.slow), TREE])
 def test_an_empty_scene_bends_nothing(budget):
     traced = _trace(scenes.geometry(), _many_rays(), budget=budget)
     assert np.all(traced.paths.statuses[:64] == PathStatus.MISSED)
@@ -368,6 +374,7 @@ def test_capacity_covers_the_paths_of_random_batches():
     assert capacity_for(PAPER, 100, mean=2.0, deviation=0.0) == 200
 
 
+@pytest.mark.slow
 def test_a_survey_counts_paths_and_hits():
     rays = _many_rays()
     ball = scenes.geometry(scenes.ball(1.0))

@@ -198,9 +198,8 @@ def _by_ray(ends):
     return jax.tree.map(lambda x: x[order], ends)
 
 
-@pytest.mark.parametrize(
-    "block", [7, *(pytest.param(block, marks=pytest.mark.slow) for block in (1, 64))]
-)
+@pytest.mark.parametrize("block", [1, 7, 64])
+@pytest.mark.slow
 def test_the_block_of_a_round_changes_nothing(block):
     geometry = scenes.geometry(scenes.box((1.0, 1.2, 1.4)))
     rays = _towards_a_ball(32)

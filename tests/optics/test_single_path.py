@@ -48,8 +48,13 @@ def _bodies():
     "budget",
     [
         Budget(_DEPTH, "all", cut=0.02),
-        Budget(_DEPTH, "first"),
-        Budget(_DEPTH, "none", total_reflection="ended"),
+        *(
+            pytest.param(budget, marks=pytest.mark.slow)
+            for budget in (
+                Budget(_DEPTH, "first"),
+                Budget(_DEPTH, "none", total_reflection="ended"),
+            )
+        ),
     ],
 )
 def test_both_tracers_find_the_same_paths(body, budget):
@@ -167,7 +172,7 @@ class _Knobs(NamedTuple):
 # The slab has its closed form below as well.
 @pytest.mark.parametrize(
     "case",
-    [pytest.param(c, marks=pytest.mark.slow) if c.startswith("slab") else c for c in _CASES],
+    [pytest.param(c, marks=pytest.mark.slow) if not c.startswith("prism") else c for c in _CASES],
 )
 def test_gradients_agree_with_differences(case):
     make, origin, direction, reflects = _CASES[case]
@@ -240,6 +245,7 @@ def test_rays_that_miss_have_no_gradient_of_the_scene():
     assert floats and all(np.all(x == 0.0) for x in floats)
 
 
+@pytest.mark.slow
 def test_an_index_can_be_found_by_descent():
     geometry = scenes.geometry(scenes.ball(1.0, subdivisions=4))
     rays = scenes.rays([[-4.0, y, 0.1] for y in np.linspace(-0.6, 0.6, 16)], [1.0, 0.0, 0.0])

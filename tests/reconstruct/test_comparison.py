@@ -34,6 +34,7 @@ def test_turned_normals_are_off_by_the_angle():
     assert found.chamfer < 1e-12
 
 
+@pytest.mark.slow
 def test_silhouettes_are_those_of_marched_rays():
     cameras = bodies.cameras_around(3)
     masks = bodies.masks_of(bodies.ball, cameras)

@@ -120,6 +120,7 @@ def test_a_box_gets_its_corners_and_overlaps_with_views_it_was_not_made_from():
     assert silhouette_overlap(stage.mesh, *others).mean() > 0.985
 
 
+@pytest.mark.slow
 def test_every_stage_by_its_default_gives_the_box_too():
     # At so few pixels the hull bulges by more than the default takes for noise.
     settings = Refinement(convex_depth=0.2)

@@ -49,9 +49,8 @@ def test_errors_vanish_at_the_truth_alone(ball, seen):
     assert min(mean(_TRUE - 0.02), mean(_TRUE + 0.02)) > 3.0 * mean(_TRUE)
 
 
-@pytest.mark.parametrize(
-    "index", [1.01, 2.8, *(pytest.param(at, marks=pytest.mark.slow) for at in (1.3, 1.6))]
-)
+@pytest.mark.parametrize("index", [1.01, 1.3, 1.6, 2.8])
+@pytest.mark.slow
 def test_the_slope_is_that_of_the_errors(ball, seen, index):
     evidence, _ = seen
     given = {"part": 0, "config": lit_scenes.CONFIG}

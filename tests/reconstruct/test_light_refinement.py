@@ -72,6 +72,7 @@ def test_a_bump_goes_and_the_index_comes_nearer(truth, evidence):
     assert 0.0 < found.furthest < 60 * 5e-4 * 2.0
 
 
+@pytest.mark.slow
 def test_a_step_moves_no_handle_further_than_a_stride(truth, evidence):
     _, interfaces = _error(truth, _TRUE, evidence)
     settings = LightRefinement(steps=1, rays=64, handles=16, stride=1e-3, index_stride=1e-3)

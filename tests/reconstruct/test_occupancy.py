@@ -85,6 +85,7 @@ def test_configurations_that_make_no_sense_are_refused():
 # --- training ---
 
 
+@pytest.mark.slow
 def test_a_small_ball_is_found_to_half_a_pixel():
     grid, _ = _fitted()
     mesh = find_isosurface(grid)

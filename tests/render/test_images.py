@@ -54,6 +54,7 @@ def test_the_size_of_a_chunk_does_not_matter(model, rays, whole, chunk):
         np.testing.assert_allclose(ours, expected, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_rendering_in_one_piece_gives_the_same(model, rays, whole):
     flat = Rays(*(jnp.asarray(x.reshape(256, *x.shape[2:])) for x in rays))
     single = jax.jit(lambda params: render_rays(model._replace(params=params), flat))
@@ -61,6 +62,7 @@ def test_rendering_in_one_piece_gives_the_same(model, rays, whole):
         np.testing.assert_allclose(ours, expected.reshape(ours.shape), atol=2e-5)
 
 
+@pytest.mark.slow
 def test_one_ray_through_glass_has_the_room_of_its_tile(model, rays, monkeypatch):
     monkeypatch.setattr(images, "TILE", 64)
     images._trace_tile.clear_cache()
@@ -73,6 +75,7 @@ def test_one_ray_through_glass_has_the_room_of_its_tile(model, rays, monkeypatch
     np.testing.assert_allclose(seen.accumulation, 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_image_of_several_tiles(model, rays, whole, monkeypatch):
     monkeypatch.setattr(images, "TILE", 100)
     images._trace_tile.clear_cache()

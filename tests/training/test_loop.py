@@ -124,6 +124,7 @@ def test_paths_that_would_fill_the_memory_are_not_kept(monkeypatch):
     assert _setup(dataclasses.replace(CONFIG, schedule=schedule)).epoch is None
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_run_and_another_one_does_not():
     _, reports = _train(_setup(), _start(), 3)
     _, again = _train(_setup(), _start(), 3)
@@ -156,6 +157,7 @@ def test_reports_say_what_was_measured():
     assert report.lost == 0.0
 
 
+@pytest.mark.slow
 def test_the_ablation_counts_the_samples_inside_in_the_distortion_loss_alone():
     loss = dataclasses.replace(CONFIG.loss, distortion_over="everywhere")
     config = dataclasses.replace(CONFIG, loss=loss)
@@ -170,6 +172,7 @@ def test_the_ablation_counts_the_samples_inside_in_the_distortion_loss_alone():
     )
 
 
+@pytest.mark.slow
 def test_charbonnier_changes_the_loss_only():
     loss = dataclasses.replace(CONFIG.loss, data="charbonnier")
     config = dataclasses.replace(CONFIG, loss=loss)
@@ -180,7 +183,8 @@ def test_charbonnier_changes_the_loss_only():
 
 
 # Other tests train along the tree as well.
-@pytest.mark.parametrize("budget", [STRAIGHT, pytest.param(TREE, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("budget", [STRAIGHT, TREE])
+@pytest.mark.slow
 def test_any_budget_can_be_trained_along(budget):
     setup = _setup(budget=budget)
     assert CONFIG.batch <= setup.capacity <= room(budget, CONFIG.batch).paths
@@ -188,6 +192,7 @@ def test_any_budget_can_be_trained_along(budget):
     assert all(np.isfinite(report.loss) and report.lost < 1e-3 for report in reports)
 
 
+@pytest.mark.slow
 def test_light_is_lost_only_where_paths_have_too_little_room():
     setup = _setup()
     assert setup.capacity > CONFIG.batch

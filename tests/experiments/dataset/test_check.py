@@ -98,6 +98,7 @@ def test_a_preview_has_test_views_only(copy):
     assert "mask" in scene_check.check_scene(copy, budgets.TREE, views=0, side=1).complaints[0]
 
 
+@pytest.mark.slow
 def test_a_view_without_float_depth_is_noted(copy):
     for path in (copy / "depth" / "test").glob("*.exr"):
         path.unlink()
@@ -105,6 +106,7 @@ def test_a_view_without_float_depth_is_noted(copy):
     assert any("no depth was compared" in note for note in report.notes)
 
 
+@pytest.mark.slow
 def test_a_mesh_that_is_not_where_it_was_rendered_is_found(copy):
     path = next((copy / "meshes").iterdir())
     trimesh.load(path).apply_translation([0.0, 0.0, 0.04]).export(path)

@@ -187,6 +187,7 @@ def test_open_pieces_are_closed():
         assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0.0
 
 
+@pytest.mark.slow
 def test_a_monkey_is_one_closed_body():
     entry = monkey.monkey(_head_with_open_eyes())
     assert (entry.name, entry.category) == ("monkey", "smncvx")

@@ -84,6 +84,7 @@ def test_a_ball_is_found_from_its_masks(whole):
     assert index == {"source": "given", "index": 1.5, "error": None, "loss": None}
 
 
+@pytest.mark.slow
 def test_the_surface_in_the_file_is_what_light_is_traced_through(
     whole, monkeypatch, scene, tmp_path
 ):
@@ -159,12 +160,12 @@ def _killing(function, *, after=False, calls=1):
 @pytest.mark.parametrize(
     ("target", "options"),
     [
-        ("experiments.r3f.geometry_stage.refine", {}),
+        _slow("experiments.r3f.geometry_stage.refine", {}),
         _slow("refref_jax.data.stored_normals.write_mesh", {"after": True}),  # before the renaming
         ("experiments.r3f.geometry_stage.run", {"after": True}),  # renamed, not recorded
         _slow("experiments.r3f.records.write", {"calls": 2, "after": True}),  # between two stages
         _slow("experiments.r3f.surface_pictures.draw_surface", {"after": True}),
-        ("experiments.r3f.pages.markdown", {}),
+        _slow("experiments.r3f.pages.markdown", {}),
         _slow("experiments.r3f.records.write", {"calls": 4}),  # all done, not recorded
     ],
 )
@@ -180,6 +181,7 @@ def test_whatever_is_killed_comes_to_the_same_files(scene, blind, tmp_path, targ
     assert _contents(out) == _contents(blind)
 
 
+@pytest.mark.slow
 def test_a_stage_whose_files_were_removed_is_done_again(scene, blind, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(blind, out)
@@ -372,6 +374,7 @@ def test_light_asks_for_masks_of_validation_views(scene, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_an_estimate_that_is_no_number_is_no_result(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(index_stage, "run", lambda *_, **options: _estimate(1.5, np.inf))
     with pytest.raises(ValueError, match="--ior"):

@@ -17,6 +17,7 @@ def scene(tmp_path_factory):
     return write_scene(tmp_path_factory.mktemp("scenes") / "cube_smcvx_ball", meshes=False)
 
 
+@pytest.mark.slow
 def test_the_command_tells_where_its_results_are(scene, tmp_path):
     out = tmp_path / "out"
     options = (f"--scene={scene}", f"--out={out}", "--ior=1.5", "--resolution=20")
