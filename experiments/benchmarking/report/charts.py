@@ -41,7 +41,7 @@ def training_charts(results: Sequence[Result]) -> Html:
         if curves:
             steps = {name: [(p.step, p.psnr) for p in curve] for name, curve in curves.items()}
             seconds = {name: [(p.seconds, p.psnr) for p in curve] for name, curve in curves.items()}
-            charts = _chart(steps, "steps"), _chart(seconds, "seconds of training")
+            charts = _chart(steps, "steps"), _chart(seconds, "seconds, compiling included; noisy")
             pairs.append(tag("div", legend(list(curves)), *charts, class_="charts"))
     if not pairs:
         return tag("p", "No training has left a curve.", class_="note")

@@ -8,6 +8,7 @@ from experiments import commands
 from experiments.benchmarking import records, settings, summary, table_data
 from experiments.benchmarking.jobs import Skipped
 from experiments.benchmarking.records import Record
+from experiments.benchmarking.settings import Settings
 from experiments.benchmarking.tables import Table
 from refref_jax.data import transforms
 
@@ -62,7 +63,7 @@ class Contents(NamedTuple):
       tables: all of them.
     """
 
-    settings: dict[str, Any]
+    settings: Settings
     labels: dict[str, str]
     scenes: tuple[Scene, ...]
     reconstructions: tuple[Record, ...]
@@ -89,7 +90,7 @@ def read(out: Path) -> Contents:
         results = [_result(job, moved) for job in content["jobs"]]
         labels = {name: method["label"] for name, method in content["methods"].items()}
         return Contents(
-            settings=dict(content["settings"]),
+            settings=Settings(**content["settings"]),
             labels=labels,
             scenes=_by_scene(results, list(labels)),
             reconstructions=tuple(

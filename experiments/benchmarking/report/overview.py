@@ -1,5 +1,6 @@
 """The first page of a report: scenes, tables, failure cases, and how it was measured."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 
 from experiments.benchmarking import comparisons
@@ -153,7 +154,7 @@ def _settings(contents: Contents) -> Html:
     everything = [*own, *contents.reconstructions]
     settings = [
         [name, "not set" if value is None else str(value)]
-        for name, value in contents.settings.items()
+        for name, value in dataclasses.asdict(contents.settings).items()
     ]
     versions = dict.fromkeys(
         ", ".join(f"{name} {version}" for name, version in record.versions.items())

@@ -73,7 +73,7 @@ def shown_views(scenes: tuple[Scene, ...], asked: int) -> int:
 def _introduction(everything: Contents, count: int, edge: int) -> str:
     results = sum(len(scene.results) for scene in everything.scenes)
     views = max((len(cases.view_names(scene)) for scene in everything.scenes), default=0)
-    preset, steps = everything.settings["preset"], everything.settings["steps"]
+    preset, steps = everything.settings.preset, everything.settings.steps
     return (
         f"Results: {results}, scenes: {len(everything.scenes)}; preset {preset}, {steps} steps. "
         f"Pictures: {min(count, views)} of at most {views} test views of a scene, three in five "

@@ -12,6 +12,12 @@ from experiments.benchmarking.report.contents import Scene
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.view_figures import NOT_HERE, TRUTH, Places, title
 
+_WHAT = (
+    "Error: mean over the channels of the absolute difference from the ground truth. Distance: of "
+    "the ground truth, to the first surface; of methods, the median of the field's weights along "
+    "the light's path, which clear glass does not stop. Grey: none."
+)
+
 
 class Page(NamedTuple):
     """The page of a scene.
@@ -59,6 +65,7 @@ def show(out: Path, scene: Scene, views: Sequence[str], *, edge: int, prefix: st
         tag("h2", scene.name),
         _numbers(scene),
         tag("h3", "Views"),
+        tag("p", _WHAT, class_="note"),
         tag("nav", *chosen, class_="views", aria_label="Views"),
         tag("div", _slider(methods), *articles, class_="pictures")
         if views

@@ -137,4 +137,5 @@ def _legends(scale: Scale | None) -> Html:
 
 def _legend(name: str, scale: Scale) -> Html:
     ramp = tag("span", class_="ramp", style=f"background:{pictures.gradient(scale)}")
-    return tag("p", f"{name}: {scale.low:.3g} ", ramp, f" {scale.high:.3g} and more")
+    bounds = tag("span", f"{scale.low:.3g} ", ramp, f" {scale.high:.3g} and more")
+    return tag("p", f"{name}: ", bounds)
