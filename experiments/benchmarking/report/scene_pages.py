@@ -7,7 +7,7 @@ from typing import NamedTuple
 from urllib.parse import quote
 
 from experiments.benchmarking.quantities import MAIN, Quantity, value
-from experiments.benchmarking.report import charts, seen, tables_shown, view_figures
+from experiments.benchmarking.report import charts, lines, seen, tables_shown, view_figures
 from experiments.benchmarking.report.contents import Scene
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.view_figures import NOT_HERE, TRUTH, Places, title
@@ -110,6 +110,7 @@ def _heading(quantity: Quantity) -> str:
 
 def _slider(methods: Sequence[str]) -> Html:
     """Returns the slider between two pictures; the script of the page fills and moves it."""
+    last = lines.families(methods)[0][-1]  # of the main methods, if there are any
 
     def choice(side: str, chosen: str) -> Html:
         options = [
@@ -134,5 +135,5 @@ def _slider(methods: Sequence[str]) -> Html:
         tag("p", NOT_HERE, class_="absent", hidden=True),
         class_="wipe",
     )
-    choices = tag("div", choice("left", TRUTH), choice("right", methods[-1]), class_="choices")
+    choices = tag("div", choice("left", TRUTH), choice("right", last), class_="choices")
     return tag("div", choices, wipe, handle, class_="slider", hidden=True)

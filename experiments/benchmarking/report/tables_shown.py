@@ -11,8 +11,8 @@ from experiments.benchmarking.tables import Block, Column, Mark, Row, Table
 
 _MARKS: dict[Mark, str | None] = {"": None, "best": "strong", "second": "u"}
 
-# Blocks that are open at first, where there are many: each category over all backgrounds.
-_MANY = 3
+# Blocks that are open at first: all of a few; of more, each category over all backgrounds.
+_FEW = 4
 _OPEN = {
     comparisons.describe(category, published.ALL)
     for category in (*comparisons.CATEGORIES, published.ALL)
@@ -29,7 +29,7 @@ _INLINE = (
 
 def show(table: Table) -> Html:
     """Returns a table of the benchmark: a part that folds for each block, and its notes."""
-    few = len(table.blocks) <= _MANY
+    few = len(table.blocks) <= _FEW
     blocks = [_block(table, block, few or block.title in _OPEN) for block in table.blocks]
     if not blocks:
         blocks = [tag("p", "Nothing is measured yet.", class_="note")]

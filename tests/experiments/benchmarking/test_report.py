@@ -259,6 +259,19 @@ def test_methods_that_this_version_does_not_know_are_shown_last(out, tmp_path):
     assert "of &lt;tomorrow&gt;" in text and "<tomorrow>" not in text
 
 
+def test_the_slider_begins_with_the_truth_and_the_last_main_method(out, tmp_path):
+    copy = _copy(out, tmp_path)
+    path = copy / summary.RESULTS
+    text = path.read_text().replace('"tree"', '"tree_cone"').replace('"straight"', '"tree"')
+    path.write_text(text)
+    (first, *_) = contents.read(copy).scenes
+    shown = scene_pages.show(copy, first, ["r_0"], edge=9, prefix="").html
+    options = named(elements(shown), "option")
+    assert [e.attributes["value"] for e in options] == ["truth", "tree", "tree_cone"] * 2
+    chosen = [e.attributes["value"] for e in options if "selected" in e.attributes]
+    assert chosen == ["truth", "tree"]
+
+
 def test_the_command_makes_it_again_with_the_tables(out, tmp_path):
     shutil.copytree(out, tmp_path / "copy")
     words = ["-m", "experiments.benchmark", f"--out={tmp_path / 'copy'}", "--tables_only"]

@@ -213,3 +213,14 @@ def test_notes_are_read_as_they_are_meant():
 def test_numbers_that_are_not_known_are_a_dash():
     shown = [tables_shown.number(value, 1) for value in (None, 1.25, math.inf)]
     assert shown == ["-", "1.2", "inf"]
+
+
+def test_of_many_blocks_those_over_all_backgrounds_are_open():
+    scenes = ("cube_smcvx_ball", "env_smncvx_torus")
+    results = [made_record(scene, "tree", psnr=30.0) for scene in scenes]
+    for shown, closed in ((results[:1], 0), (results, 4)):
+        table = comparisons.main_table(shown)
+        blocks = named(elements(tables_shown.show(table)), "details")
+        assert len(blocks) == len(table.blocks)
+        folded = ["".join(b.text) for b in blocks if "open" not in b.attributes]
+        assert len(folded) == closed and not any("all backgrounds" in text for text in folded)
