@@ -7,7 +7,8 @@ whatever way, the same command goes on where it was, and does only what is missi
 methods can be added later. What fails is listed, and the rest goes on. After every job
 {out}/summary.md is written anew: methods by category and background beside the paper's numbers, the
 test views farthest from the training views, and ablations; as Markdown, CSV, JSON and LaTeX in
-{out}/tables. --tables_only makes them again from the results that are there.
+{out}/tables. At the end {out}/report.html shows all of it, with pictures, in one page that needs no
+network. --tables_only makes tables and report again from the results that are there.
 
 Jobs are done on this machine, --jobs at once, or on a Ray cluster with --ray=ADDRESS, whose
 machines see --out, --scenes and these modules by the same paths. docs/benchmark.md says all.
@@ -32,6 +33,7 @@ from experiments.benchmarking import (
     summary,
 )
 from experiments.benchmarking.jobs import Job, Skipped
+from experiments.benchmarking.report import page
 from experiments.benchmarking.settings import Benchmark, Settings
 from experiments.presets import PRESETS
 from experiments.supersampling import side_of
@@ -68,15 +70,32 @@ _RAY = flags.DEFINE_string(
 _JOB_CPUS = flags.DEFINE_float("job_cpus", 1.0, "CPUs that a job takes of a cluster.", 0.0)
 _JOB_GPUS = flags.DEFINE_float("job_gpus", 0.0, "Accelerators that it takes.", 0.0)
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "List the jobs, and do nothing.")
-_TABLES_ONLY = flags.DEFINE_bool("tables_only", False, "Make the tables again, and do no job.")
+_TABLES_ONLY = flags.DEFINE_bool(
+    "tables_only", False, "Make the tables and the report again, and do no job."
+)
+_REPORT_VIEWS = flags.DEFINE_integer(
+    "report_views",
+    5,
+    "Test views of a scene in the report: three in five where methods fail most, the others spread "
+    "evenly.",
+    1,
+)
+_REPORT_EDGE = flags.DEFINE_integer(
+    "report_edge",
+    200,
+    "Longest edge of the report's pictures in pixels; larger ones are reduced.",
+    16,
+)
 
 
 def main() -> None:
-    """Does all jobs that are missing, and writes the tables."""
+    """Does all jobs that are missing, and writes the tables and the report."""
     out = Path(_OUT.value).absolute()
     if _TABLES_ONLY.value:
-        summary.write(out, settings.read(out), failed={}, skipped=())
-        _say_where(out)
+        benchmark = settings.read(out)
+        earlier_failed, earlier_skipped = summary.not_done(out)
+        summary.write(out, benchmark, failed=earlier_failed, skipped=earlier_skipped)
+        _finish(out)
         return
     scenes, chosen = scene_list.find(_SCENES.value), methods.parse(_METHODS.value)
     common = _settings()
@@ -95,7 +114,7 @@ def main() -> None:
         benchmark = settings.extended(out, benchmark)
         settings.write(out, benchmark)
         failed = _work(out, benchmark, missing, skipped)
-    _say_where(out)
+    _finish(out)
     for each in skipped:
         print(f"left out: {each.scene}/{each.method}: {each.reason}")
     for name, reason in failed.items():
@@ -172,10 +191,13 @@ def _duration(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{minutes} min"
 
 
-def _say_where(out: Path) -> None:
+def _finish(out: Path) -> None:
+    """Writes the report, and says where everything is."""
+    report = page.write(out, views=_REPORT_VIEWS.value, edge=_REPORT_EDGE.value)
     print(f"Summary: {out / summary.FILE}")
     print(f"Tables:  {out / summary.TABLES}")
     print(f"Results: {out / summary.RESULTS}")
+    print(f"Report:  {report} ({report.stat().st_size / 1e6:.1f} MB)")
     options = (f"--scenes={','.join(_SCENES.value)}", "--methods=ablations", f"--out={out}")
     if _SCENES.value:
         print(f"Next: {commands.shell('benchmark', *options)}")

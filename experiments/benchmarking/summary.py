@@ -7,6 +7,7 @@
 """
 
 import dataclasses
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -78,6 +79,28 @@ def write(
         "tables": {table.name: table_data.as_json(table) for table in made},
     }
     settings.write_json(out / RESULTS, commands.string_safe(index))
+
+
+def not_done(out: Path) -> tuple[dict[str, str], list[Skipped]]:
+    """Returns what failed and what was left out when the results were last written.
+
+    What has a result since is in neither. Nothing is told where no results were written, or where
+    they can not be read.
+    """
+    try:
+        index = json.loads((out / RESULTS).read_text("utf-8"))
+        skipped = [Skipped(**each) for each in index["skipped"]]
+        failed = dict(index["failed"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}, []
+
+    def is_done(name: str) -> bool:
+        return (out / jobs.FOLDER / name / jobs.RESULT).is_file()
+
+    return (
+        {name: reason for name, reason in failed.items() if not is_done(name)},
+        [each for each in skipped if not is_done(f"{each.scene}/{each.method}")],
+    )
 
 
 def all_tables(found: Sequence[Record]) -> list[Table]:

@@ -7,7 +7,8 @@ from typing import Any
 
 from experiments import commands
 from experiments.benchmarking.records import Record
-from experiments.benchmarking.tables import Table
+from experiments.benchmarking.statistics import Cell
+from experiments.benchmarking.tables import Block, Column, Row, Table
 
 _HEAD = (
     "table",
@@ -73,6 +74,24 @@ def as_json(table: Table) -> dict[str, Any]:
     )
 
 
+def from_json(record: dict[str, Any]) -> Table:
+    """Undoes `as_json`.
+
+    Raises:
+      KeyError, TypeError: if it is no table.
+    """
+    record = commands.from_string_safe(record)
+    return Table(
+        name=record["name"],
+        title=record["title"],
+        notes=tuple(record["notes"]),
+        columns=tuple(Column(**column) for column in record["columns"]),
+        blocks=tuple(
+            Block(block["title"], tuple(map(_row, block["rows"]))) for block in record["blocks"]
+        ),
+    )
+
+
 def scenes_csv(found: Sequence[Record]) -> str:
     """Returns a line for each result, with all of its metrics."""
     keys = sorted({key for record in found for key in record.metrics})
@@ -88,6 +107,12 @@ def scenes_csv(found: Sequence[Record]) -> str:
         for record in found
     ]
     return _csv([head, *rows])
+
+
+def _row(record: dict[str, Any]) -> Row:
+    cells = [Cell(**{key: cell[key] for key in Cell._fields}) for cell in record["cells"]]
+    marks = tuple(cell["mark"] for cell in record["cells"])
+    return Row(record["method"], record["origin"], record["scenes"], tuple(cells), marks)
 
 
 def _csv(rows: Sequence[Sequence[object]]) -> str:

@@ -36,7 +36,7 @@ def markdown(table: Table) -> str:
     """Returns a section: title, a table for each block, and notes."""
     lines = [f"## {table.title}", ""]
     for block in table.blocks:
-        heads = [f"{column.label}{_ARROWS[column.better]}" for column in table.columns]
+        heads = [heading(column) for column in table.columns]
         lines += [
             f"### {block.title[:1].upper()}{block.title[1:]}",
             "",
@@ -48,6 +48,11 @@ def markdown(table: Table) -> str:
     if not table.blocks:
         lines += ["Nothing is measured yet.", ""]
     return "\n".join([*lines, *(f"{note}\n" for note in table.notes)])
+
+
+def heading(column: Column) -> str:
+    """Returns what stands above a column: its label, and an arrow to what is better."""
+    return f"{column.label}{_ARROWS[column.better]}"
 
 
 def latex(table: Table) -> str:

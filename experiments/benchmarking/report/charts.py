@@ -1,0 +1,144 @@
+"""Charts of training as SVG in the page: PSNR over steps, and over seconds."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from experiments.benchmarking.report import lines
+from experiments.benchmarking.report.contents import Result
+from experiments.benchmarking.report.markup import Html, join, tag
+
+_WIDTH, _HEIGHT = 380.0, 230.0
+_LEFT, _TOP, _BOTTOM = 34.0, 26.0, 36.0
+_LETTER, _LINE = 6.6, 14.0
+_LONGEST_NAME = 14
+_TICKS = 5
+
+Points = Sequence[tuple[float, float]]
+
+
+class Span(NamedTuple):
+    """An axis: its range of values, on a range of the picture, with its ticks."""
+
+    low: float
+    high: float
+    start: float
+    end: float
+    ticks: tuple[float, ...]
+
+    def place(self, value: float) -> float:
+        """Returns where a value is."""
+        share = (value - self.low) / (self.high - self.low)
+        return round(self.start + share * (self.end - self.start), 1)
+
+
+def training_charts(results: Sequence[Result]) -> Html:
+    """Returns charts of all trainings of a scene, a pair for each family of methods."""
+    by_name = {result.record.method: result for result in results}
+    pairs = []
+    for names in lines.families(list(by_name)):
+        curves = {name: by_name[name].curve for name in names if len(by_name[name].curve) > 1}
+        if curves:
+            steps = {name: [(p.step, p.psnr) for p in curve] for name, curve in curves.items()}
+            seconds = {name: [(p.seconds, p.psnr) for p in curve] for name, curve in curves.items()}
+            charts = _chart(steps, "steps"), _chart(seconds, "seconds, compiling included; noisy")
+            pairs.append(tag("div", legend(list(curves)), *charts, class_="charts"))
+    if not pairs:
+        return tag("p", "No training has left a curve.", class_="note")
+    return join(pairs)
+
+
+def legend(methods: Sequence[str]) -> Html:
+    """Returns what lines of what looks are which methods."""
+    return tag("p", *(tag("span", swatch(name), " ", name) for name in methods), class_="legend")
+
+
+def swatch(method: str) -> Html:
+    """Returns a short piece of a method's line."""
+    line = tag("line", x1="0", y1="5", x2="22", y2="5", **_look(method))
+    return tag("svg", line, viewBox="0 0 22 10", width="22", height="10", aria_hidden="true")
+
+
+def ticks(low: float, high: float) -> tuple[float, ...]:
+    """Returns about five round numbers that hold a range between the first and the last."""
+    rough = max(high - low, 1e-6) / _TICKS
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= rough)
+    first, last = math.floor(low / step), math.ceil(high / step)
+    return tuple(round(i * step, 10) for i in range(first, max(last, first + 1) + 1))
+
+
+def _chart(curves: dict[str, Points], unit: str) -> Html:
+    """Returns one chart; what is not finite is left out."""
+    known = {
+        name: [point for point in points if all(map(math.isfinite, point))]
+        for name, points in curves.items()
+    }
+    known = {name: points for name, points in known.items() if points}
+    longest = max((len(_short(name)) for name in known), default=0)
+    right = _WIDTH - 10.0 - longest * _LETTER
+    across = _span([x for points in known.values() for x, _ in points] + [0.0], _LEFT, right)
+    up = _span([y for points in known.values() for _, y in points], _HEIGHT - _BOTTOM, _TOP)
+    title = f"PSNR of the training rays in dB over {unit}, of {', '.join(known)}"
+    drawn = [
+        tag(
+            "polyline",
+            points=" ".join(f"{across.place(x):g},{up.place(y):g}" for x, y in points),
+            **_look(name),
+        )
+        for name, points in known.items()
+    ]
+    last = {name: points[-1] for name, points in known.items()}
+    ends = {name: (across.place(x), up.place(y)) for name, (x, y) in last.items()}
+    return tag(
+        "svg",
+        _grid(across, up),
+        *drawn,
+        *_labels(ends),
+        tag("text", "PSNR, dB", x=4.0, y=11.0),
+        tag("text", unit, x=(across.start + across.end) / 2, y=_HEIGHT - 4.0, text_anchor="middle"),
+        viewBox=f"0 0 {_WIDTH:g} {_HEIGHT:g}",
+        role="img",
+        aria_label=title,
+        class_="chart",
+    )
+
+
+def _span(values: Sequence[float], start: float, end: float) -> Span:
+    marks = ticks(min(values, default=0.0), max(values, default=1.0))
+    return Span(marks[0], marks[-1], start, end, marks)
+
+
+def _grid(across: Span, up: Span) -> Html:
+    """Returns lines at the ticks of both axes, with their numbers."""
+    parts = []
+    for value in up.ticks:
+        y = up.place(value)
+        parts.append(tag("line", x1=across.start, x2=across.end, y1=y, y2=y, class_="grid"))
+        parts.append(tag("text", f"{value:g}", x=across.start - 5.0, y=y + 4.0, text_anchor="end"))
+    for value in across.ticks:
+        x = across.place(value)
+        parts.append(tag("text", f"{value:g}", x=x, y=up.start + 16.0, text_anchor="middle"))
+    return join(parts)
+
+
+def _labels(ends: dict[str, tuple[float, float]]) -> list[Html]:
+    """Returns the names of lines at their ends, moved apart where they are too near."""
+    heights, last = {}, -math.inf
+    for name, (_, y) in sorted(ends.items(), key=lambda item: item[1][1]):
+        heights[name] = last = max(y + 4.0, last + _LINE)
+    above = max(0.0, last - (_HEIGHT - _BOTTOM))
+    return [
+        tag("text", _short(name), x=ends[name][0] + 5.0, y=round(y - above, 1), class_="name")
+        for name, y in heights.items()
+    ]
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 1]}…"
+
+
+def _look(method: str) -> dict[str, str | None]:
+    line = lines.look(method)
+    colour = f"stroke:var(--c{line.colour})"
+    return {"style": colour, "stroke_dasharray": line.dash, "class_": "curve"}
