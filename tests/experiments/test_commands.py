@@ -195,13 +195,7 @@ def test_mistakes_end_with_one_line_that_says_what_to_do(tmp_path, command, opti
     ],
 )
 def test_help_explains_every_option(command):
-    result = subprocess.run(
-        [sys.executable, "-m", f"experiments.{command}", "--help"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    result = run_command(command, "--help", fails=True)  # absl has it so
     source = (ROOT / "experiments" / f"{command}.py").read_text()
     for shared in re.findall(r"adopt_module_key_flags\((\w+)\)", source):
         source += (ROOT / "experiments" / f"{shared}.py").read_text()

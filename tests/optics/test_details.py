@@ -60,6 +60,7 @@ def test_only_segments_outside_are_kept():
     assert seen >= {1, 2, 3}
 
 
+@pytest.mark.slow
 def test_of_too_many_segments_the_first_and_the_last_ones_are_kept():
     whole = _trace(_two_balls(), _rays()).paths
     kept = _trace(_two_balls(), _rays(), detail=Detail("outside", 2)).paths

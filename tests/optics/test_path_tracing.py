@@ -166,6 +166,7 @@ def test_light_paths_are_reversible():
     assert same.mean() > 0.97
 
 
+@pytest.mark.slow
 def test_points_directions_and_distances_agree():
     geometry = scenes.geometry(scenes.ball(1.0, subdivisions=4))
     rays = scenes.rays([[-4.0, y, 0.3] for y in np.linspace(-0.9, 0.9, 20)], [1.0, 0.0, 0.0])

@@ -211,6 +211,7 @@ def test_the_block_of_a_round_changes_nothing(block):
     assert in_blocks.casts == all_at_once.casts
 
 
+@pytest.mark.slow
 def test_ends_are_the_last_segments_of_the_paths():
     geometry, rays = scenes.geometry(scenes.ball(1.0)), _towards_a_ball()
     ends, _ = _ends(geometry, rays, budget=TREE)

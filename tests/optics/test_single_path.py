@@ -232,6 +232,7 @@ def test_gradients_at_the_critical_angle_are_finite():
         np.testing.assert_array_equal(slopes[np.array([3, 5])], 0.0)
 
 
+@pytest.mark.slow
 def test_rays_that_miss_have_no_gradient_of_the_scene():
     geometry = scenes.geometry(scenes.ball(1.0, subdivisions=1))
     ray = _ray([-4.0, 3.0, 0.0], [1.0, 0.0, 0.0])

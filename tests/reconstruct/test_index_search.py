@@ -35,6 +35,7 @@ def seen(ball):
     return lit_scenes.evidence(ball)
 
 
+@pytest.mark.slow
 def test_errors_vanish_at_the_truth_alone(ball, seen):
     evidence, _ = seen
 

@@ -97,6 +97,7 @@ def test_a_small_ball_is_found_to_half_a_pixel():
     assert volume(*mesh[:2]) == pytest.approx(_BALL, rel=0.06)
 
 
+@pytest.mark.slow
 def test_the_grid_is_a_distance_near_the_surface_and_negative_inside():
     grid, _ = _fitted()
     points = grid.low + grid.spacing * np.moveaxis(np.indices(grid.values.shape), 0, -1)

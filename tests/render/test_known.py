@@ -67,6 +67,7 @@ def test_an_image_has_the_shape_of_its_rays(whole):
     [STRAIGHT, pytest.param(PAPER, marks=pytest.mark.slow), TREE],
     ids=["straight", "paper", "tree"],
 )
+@pytest.mark.slow
 def test_the_size_of_a_tile_does_not_matter(geometry, rays, budget):
     one = render_known(geometry, _environment(), rays, budget=budget, tile=256)
     pieces = render_known(geometry, _environment(), rays, budget=budget, tile=100)

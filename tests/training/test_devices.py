@@ -119,6 +119,7 @@ def test_lists_are_filled_up_with_empty_slots(multiple, room):
     )
 
 
+@pytest.mark.slow
 def test_a_mesh_of_one_device_trains_as_no_mesh():
     geometry = scenes.geometry(scenes.ball(1.3, subdivisions=1))
     curves = []

@@ -102,6 +102,7 @@ def test_one_pool_is_traced_ahead_and_no_more(monkeypatch):
     assert counts == [2] * 4 + [3] * 8
 
 
+@pytest.mark.slow
 def test_paths_that_are_kept_train_like_paths_that_are_traced_anew():
     schedule = dataclasses.replace(CONFIG.schedule, steps=34)
     setup = _setup(dataclasses.replace(CONFIG, schedule=schedule))

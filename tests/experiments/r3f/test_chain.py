@@ -239,6 +239,7 @@ def test_what_is_missing_is_told_before_anything_is_written(scene, tmp_path, mon
 @pytest.mark.parametrize(
     ("compare", "remark"), [(False, "were not read"), (True, "could not be read")]
 )
+@pytest.mark.slow
 def test_broken_meshes_of_the_scene_harm_nothing(scene, whole, tmp_path, compare, remark):
     broken = tmp_path / "cube_smcvx_ball"
     shutil.copytree(scene, broken)
@@ -257,6 +258,7 @@ def _estimate(index, deviation):
     return IndexEstimate(index, deviation, 0.02, nowhere, (nowhere,))
 
 
+@pytest.mark.slow
 def test_an_index_that_is_not_given_is_estimated_once(scene, tmp_path, monkeypatch):
     asked = []
 

@@ -8,7 +8,6 @@ import pytest
 
 from experiments.r3f import chain, records
 from experiments.r3f.records import ReconstructionConfig
-from tests import code_generator
 from tests.experiments.command import ROOT, run_command
 from tests.experiments.r3f.small_scene import write_scene
 
@@ -77,7 +76,6 @@ def found(scene, made, runs):
     result = subprocess.run(
         [sys.executable, "-m", "tests.experiments.r3f.print_beginnings"],
         cwd=ROOT,
-        env=code_generator.of_users(),
         input=json.dumps(sent),
         capture_output=True,
         text=True,
