@@ -72,6 +72,7 @@ def test_of_too_many_segments_the_first_and_the_last_ones_are_kept():
 
 
 @pytest.mark.parametrize("budget", [pytest.param(PAPER, marks=pytest.mark.slow), TREE])
+@pytest.mark.slow
 def test_segments_end_where_the_next_ones_begin(budget):
     paths = _trace(_two_balls(), _rays(), budget=budget, detail=everything(budget.bends)).paths
     used = np.isfinite(paths.tau)

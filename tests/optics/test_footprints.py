@@ -50,6 +50,7 @@ def test_a_ray_that_meets_nothing_has_the_footprint_of_its_cone(t):
     )
 
 
+@pytest.mark.slow
 def test_a_slab_narrows_a_footprint_by_its_index():
     rays = scenes.rays([0.1, 0.05, -4.0], [0.0, 0.0, 1.0])
     paths = _traced(_SLAB, rays)

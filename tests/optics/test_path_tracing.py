@@ -260,6 +260,7 @@ def test_the_strongest_paths_are_kept():
     np.testing.assert_allclose(np.sort(kept)[::-1], np.sort(full)[::-1][:70])
 
 
+@pytest.mark.slow
 def test_paths_come_in_the_order_of_their_rays_the_heaviest_first():
     paths = _trace(scenes.geometry(scenes.ball(1.0)), _many_rays(), budget=TREE).paths
     exists = paths.statuses != PathStatus.EMPTY
@@ -296,7 +297,8 @@ def test_the_straight_budget_ignores_the_objects():
     assert np.all(traced.lost == 0.0)
 
 
-@pytest.mark.parametrize("budget", [pytest.param(PAPER, marks=pytest.mark.slow), TREE])
+@pytest.mark.parametrize("budget", [PAPER, TREE])
+@pytest.mark.slow
 def test_an_empty_scene_bends_nothing(budget):
     traced = _trace(scenes.geometry(), _many_rays(), budget=budget)
     assert np.all(traced.paths.statuses[:64] == PathStatus.MISSED)

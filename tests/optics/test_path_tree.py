@@ -133,6 +133,7 @@ def test_a_total_reflection_may_end_the_path():
     np.testing.assert_allclose(followed.directions[0], [0.0, 0.0, -1.0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_papers_ablations_differ_from_its_budget_in_one_thing_each():
     changed = {
         name: {

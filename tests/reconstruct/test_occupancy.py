@@ -109,6 +109,7 @@ def test_the_grid_is_a_distance_near_the_surface_and_negative_inside():
     assert np.all(grid.values[[0, -1]] > 0.0) and np.all(grid.values[:, :, [0, -1]] > 0.0)
 
 
+@pytest.mark.slow
 def test_progress_is_reported_and_made():
     _, reports = _fitted()
     assert [done for done, _ in reports] == [100, 200]

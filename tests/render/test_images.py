@@ -48,6 +48,7 @@ def test_an_image_has_the_shape_of_its_rays(whole):
 
 
 @pytest.mark.parametrize("chunk", [64, pytest.param(100, marks=pytest.mark.slow), 1000])
+@pytest.mark.slow
 def test_the_size_of_a_chunk_does_not_matter(model, rays, whole, chunk):
     pieces = render_image(model, rays, chunk=chunk)
     for ours, expected in zip(pieces, whole, strict=True):

@@ -142,6 +142,7 @@ def test_without_light_only_what_does_not_need_it_is_learned(batch):
         np.testing.assert_allclose(report.loss, expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_light_that_found_no_room_is_told():
     config, model, names, traced = _case("field", "float32")
     some = traced._replace(lost=traced.lost.at[:, 0].set(jnp.array([0.3, 0.6, 0.0])))
