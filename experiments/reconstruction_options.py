@@ -19,7 +19,7 @@ RESOLUTION = flags.DEFINE_integer(
     "resolution", 128, "Cells along the longest edge of the grid that holds the body.", 16, 1024
 )
 OUTLIERS = flags.DEFINE_integer(
-    "outliers", 0, "Views whose masks may be wrong, at the cost of accuracy everywhere.", 0
+    "outliers", 0, "Views whose masks may be wrong, at the cost of a hull's accuracy everywhere.", 0
 )
 
 LIGHT_STEPS = flags.DEFINE_integer(
@@ -39,7 +39,15 @@ def chosen(*, index: float | None, seed: int) -> ReconstructionConfig:
     Args:
       index: the index of refraction, or `None` to estimate it.
       seed: of everything random.
+
+    Raises:
+      ValueError: if one would have no effect.
     """
+    if OUTLIERS.value and GEOMETRY.value != "hull":
+        raise ValueError(
+            f"--outliers={OUTLIERS.value} has no effect on --geometry={GEOMETRY.value}, which "
+            "weighs all masks. Leave out one of them."
+        )
     return ReconstructionConfig(
         GEOMETRY.value,
         RESOLUTION.value,

@@ -1,5 +1,7 @@
 """Options that say where a scene's background stands, for scenes that do not."""
 
+import math
+
 from absl import flags
 
 from refref_jax.sampling.domains import Space
@@ -16,6 +18,11 @@ RADIUS = flags.DEFINE_float(
     "Half edge of the cube on whose faces a bounded scene's background stands (by default that of "
     "scene.json, else 7.3), or radius of an unbounded scene's uncontracted ball, in world units.",
     lower_bound=1e-6,
+)
+flags.register_validator(
+    "radius",
+    lambda radius: radius is None or math.isfinite(radius),
+    message="It is a finite number of world units.",
 )
 
 

@@ -60,9 +60,12 @@ def find(run: Path, *, resume: bool) -> MeshPart | None:
     index = _given_index()
     out = _folder(run)
     if RECONSTRUCTION.value is not None:
+        if out.resolve() == run.resolve():
+            raise ValueError(
+                f"--out={run} is the reconstruction itself. Give a folder of its own for the run."
+            )
         body = chain.read_part(out)
-        begun = records.read(out)
-        if chain.fingerprint(plans.opened_scene(), begun.config) != begun.inputs:
+        if chain.fingerprint(plans.opened_scene()) != records.read(out).inputs:
             print(
                 f"warning: {out} was reconstructed from other images, masks or poses than those of "
                 f"{plans.SCENE.value}. Make sure that it is the same object in the same place."

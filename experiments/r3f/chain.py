@@ -52,7 +52,7 @@ def reconstruct(
     import_skimage()
     for split in _splits(config):
         local_layout.read_masks(local_layout.read_frames(scene, split))
-    asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene, config), config)
+    asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene), config)
     found = records.begin(out, asked)
     with run_lock.hold(out):
         found = records.read(out)  # another process may have finished it meanwhile
@@ -96,21 +96,18 @@ def read_part(out: Path) -> MeshPart:
     return body.read_part(out, found)
 
 
-def fingerprint(scene: Path, config: ReconstructionConfig) -> str:
-    """Returns a hash of what a reconstruction is made from: images, masks and poses.
-
-    They are those of the training views; with light, those that judge it as well.
+def fingerprint(scene: Path) -> str:
+    """Returns a hash of what a reconstruction is made from: the training images, masks and poses.
 
     Raises:
       ValueError: if a file is missing, or the transforms file is broken.
     """
     found = hashlib.sha256()
-    for split in _splits(config):
-        frames = local_layout.read_frames(scene, split)
-        found.update(frames.cameras.poses.tobytes())
-        found.update(repr(frames.cameras.focal).encode())
-        for path in (*frames.images, *(frames.masks or ())):
-            found.update(hashlib.sha256(path.read_bytes()).digest())
+    frames = local_layout.read_frames(scene, "train")
+    found.update(frames.cameras.poses.tobytes())
+    found.update(repr(frames.cameras.focal).encode())
+    for path in (*frames.images, *(frames.masks or ())):
+        found.update(hashlib.sha256(path.read_bytes()).digest())
     return found.hexdigest()
 
 

@@ -111,15 +111,20 @@ def learn_background(
       steps: of its training.
 
     Raises:
-      ValueError: if the scene has no masks, or no pixel beside them.
+      ValueError: if the scene has no masks, or no pixel beside them, or if a background was begun
+        with other walls.
       KeyboardInterrupt: if its training was stopped; it has been saved.
     """
     run = folder / "background"
+    config, model = _plan(scene, _bounds(scene, space, radius), seed=seed, steps=steps)
+    wanted = SavedModel(model, STRAIGHT)
     if not run_folder.exists(run):
-        extent = _bounds(scene, space, radius)
-        config, model = _plan(scene, extent, seed=seed, steps=steps)
-        nothing = build_geometry([], [], rule="nested")
-        run_folder.create(run, config, SavedModel(model, STRAIGHT), nothing)
+        run_folder.create(run, config, wanted, build_geometry([], [], rule="nested"))
+    elif saved.read_static(run) != wanted:
+        raise ValueError(
+            f"{run} was begun with another --background or --radius than are given now. Give those "
+            "again, or remove that folder to have the background learned anew."
+        )
     with run_lock.hold(run):
         if not trainer.train(run, scene=str(scene)):
             raise KeyboardInterrupt

@@ -111,7 +111,9 @@ def _making(found: Reconstruction) -> str:
     told = [
         f"- `--geometry={config.geometry} --resolution={config.resolution} "
         f"--outliers={config.outliers} --light_steps={config.light_steps} --seed={config.seed}`"
-        + (f" `--ior={config.index:g}`" if config.index is not None else ""),
+        + (f" `--ior={config.index:g}`" if config.index is not None else "")
+        + (f" `--background={config.space}`" if config.space is not None else "")
+        + (f" `--radius={config.radius:g}`" if config.radius is not None else ""),
         f"- refined: {', '.join(geometry.stages) or 'nothing to do'}",
         *(f"- left out {refused}" for refused in geometry.refused),
     ]

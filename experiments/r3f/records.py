@@ -154,7 +154,7 @@ class Reconstruction:
 
     Attributes:
       scene: how the scene is called.
-      inputs: fingerprint of the images, masks and poses that it is made from.
+      inputs: fingerprint of the training images, masks and poses that it is made from.
       config: what was asked for.
       geometry: the first stage.
       index: the second.
@@ -232,14 +232,18 @@ def begin(out: Path, asked: Reconstruction) -> Reconstruction:
 
 
 def _changed(begun: Reconstruction, asked: ReconstructionConfig) -> list[str]:
-    """Says which options of finished stages differ, as they were; `None` is called estimated."""
+    """Says which options of finished stages differ, as they were."""
     before, now = dataclasses.asdict(begun.config), dataclasses.asdict(asked)
     return [
-        f"{_OPTIONS.get(name, name)} {'estimated' if value is None else value}, not "
-        f"{'estimated' if now[name] is None else now[name]}"
+        f"{_OPTIONS.get(name, name)} {_told(name, value)}, not {_told(name, now[name])}"
         for name, value in before.items()
         if value != now[name] and getattr(begun, _STAGES.get(name, "geometry")) is not None
     ]
+
+
+def _told(name: str, value: object) -> object:
+    """Says what an option is, or what stands for it where it is left out."""
+    return ("estimated" if name == "index" else "as the scene says") if value is None else value
 
 
 _OPTIONS = {"index": "ior", "space": "background"}

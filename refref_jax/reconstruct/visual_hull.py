@@ -30,6 +30,12 @@ REACH = 2.1
 TOLERANCE = 0.05
 """Pixels outside of an outline up to which nothing is carved: about half a standard error."""
 
+_LIMITLESS = (
+    "What {count} masks leave reaches out of the cube from -{reach} to {reach} around the origin, "
+    "in which a body is looked for. Give masks from other sides, if few views see it; else scale "
+    "and shift the poses, so that the object lies within."
+)
+
 # What stands for a distance where there is no outline, so that a grid can be interpolated.
 _FAR = 4.0 * REACH
 
@@ -72,12 +78,13 @@ def carve(
 
     Raises:
       ReconstructionError: if there is no mask, if a mask is empty or of another size, if as many
-        views are passed over as there are, or if nothing is left.
+        views are passed over as there are, if nothing is left, or if what is left reaches out of
+        the cube of `REACH` (as with one view).
     """
     check_masks(masks, cameras)
     if not 0 <= outliers < len(masks):
         raise ReconstructionError(
-            f"{outliers} of {len(masks)} views are to be passed over. Pass over fewer, 0 or more."
+            f"outliers={outliers}, but there are {len(masks)} views. Pass over fewer, 0 or more."
         )
     field = hull_field(masks, cameras, outliers=outliers, tolerance=tolerance, blur=blur)
     if box is None:
@@ -118,7 +125,7 @@ def hull_field(
 
 
 def find_box(field: Field, masks: Bool[np.ndarray, "views h w"], cameras: Cameras) -> Box:
-    """Returns a box around the body, which may touch the cube of `REACH` that is looked at.
+    """Returns a box around the body, which must lie within the cube of `REACH`.
 
     Args:
       field: the hull's, from `hull_field`.
@@ -126,7 +133,7 @@ def find_box(field: Field, masks: Bool[np.ndarray, "views h w"], cameras: Camera
       cameras: of the masks.
 
     Raises:
-      ReconstructionError: if nothing is left.
+      ReconstructionError: if nothing is left, or the body reaches out of the cube.
     """
     ends = np.full(3, REACH)
     grid = sample(field, Box(-ends, ends), spacing=2.0 * REACH / _SEARCH)
@@ -134,6 +141,8 @@ def find_box(field: Field, masks: Bool[np.ndarray, "views h w"], cameras: Camera
     inside = np.argwhere(grid.values < 0.87 * grid.spacing)
     if len(inside) == 0:
         raise ReconstructionError(_explanation(masks, cameras, Box(-ends, ends)))
+    if _reaches_border(grid):
+        raise ReconstructionError(_LIMITLESS.format(count=len(masks), reach=REACH))
     low = grid.low + grid.spacing * (inside.min(axis=0) - _MARGIN)
     high = grid.low + grid.spacing * (inside.max(axis=0) + _MARGIN)
     return Box(np.maximum(low, -ends), np.minimum(high, ends))
@@ -160,6 +169,15 @@ def view_values(
     else:
         values[seen] = -_FAR
     return values
+
+
+def _reaches_border(grid: Grid) -> bool:
+    """Returns whether a body goes on where its grid ends."""
+    return any(
+        bool(np.any(np.take(grid.values, end, axis=axis) < 0.0))
+        for axis in range(3)
+        for end in (0, -1)
+    )
 
 
 def _explanation(masks: np.ndarray, cameras: Cameras, box: Box) -> str:

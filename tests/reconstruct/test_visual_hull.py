@@ -174,6 +174,22 @@ def test_errors_say_what_to_do():
         carve(masks, cameras, outliers=30)
 
 
+@pytest.mark.parametrize("views", [1, 2])
+def test_a_body_that_too_few_views_bound_is_refused(views):
+    masks, cameras = _ball_views()
+    few = cameras._replace(poses=cameras.poses[:views])
+    with pytest.raises(ReconstructionError, match="masks from other sides"):
+        carve(masks[:views], few)
+
+
+def test_a_body_larger_than_where_it_is_looked_for_is_refused_and_not_cut_off():
+    masks, cameras = _ball_views()
+    poses = cameras.poses.copy()
+    poses[:, :, 3] *= 3.0
+    with pytest.raises(ReconstructionError, match=r"reaches out of the cube from -2\.1 to 2\.1"):
+        carve(masks, cameras._replace(poses=poses))
+
+
 def test_where_nothing_is_left_the_view_that_took_most_is_named():
     masks, cameras = _ball_views()
     wrong = masks.copy()

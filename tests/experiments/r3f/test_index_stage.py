@@ -38,3 +38,16 @@ def test_a_background_is_learned_beside_the_body_and_once(ball_scene, tmp_path, 
     assert 0.2 < kept[0].mean() < 0.95
     assert first.index == pytest.approx(1.5, abs=0.01) and np.isfinite(first.deviation)
     assert len(first.descents) == 2 and (tmp_path / "index.png").stat().st_size > 5000
+
+
+def test_a_background_that_was_begun_with_other_walls_is_not_taken(
+    ball_scene, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(trainer, "train", lambda run, *, scene: False)
+    learn = functools.partial(index_stage.learn_background, ball_scene, tmp_path, seed=3)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            learn(space="bounded", radius=5.0)
+    for space, radius in (("bounded", 9.0), ("unbounded", 5.0)):
+        with pytest.raises(ValueError, match="another --background or --radius"):
+            learn(space=space, radius=radius)

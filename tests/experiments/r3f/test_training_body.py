@@ -60,6 +60,7 @@ def found(scene, made, runs):
         "no effect of oracle": (_GRID,),
         "straight": (*r3f, "--paths=straight"),
         "nothing there": ("--reconstruction=nowhere",),
+        "outliers of no hull": (*r3f, "--geometry=occupancy", "--outliers=1"),
     }
     sent = [
         [f"--out={runs / name}", f"--scene={scene}", *options] for name, options in cases.items()
@@ -73,6 +74,7 @@ def found(scene, made, runs):
         "r3f with a given one": ("r3f", f"--scene={scene}", given, "--resume"),
     }
     sent += [[f"--out={runs / run}", *options] for run, *options in again.values()]
+    sent.append([f"--out={made}", f"--scene={scene}", given])
     result = subprocess.run(
         [sys.executable, "-m", "tests.experiments.r3f.print_beginnings"],
         cwd=ROOT,
@@ -82,7 +84,7 @@ def found(scene, made, runs):
         check=False,
     )
     assert result.returncode == 0, result.stderr
-    return dict(zip([*cases, *again], json.loads(result.stdout), strict=True))
+    return dict(zip([*cases, *again, "run in its body"], json.loads(result.stdout), strict=True))
 
 
 def test_the_broken_mesh_stops_the_oracle_alone(found):
@@ -113,6 +115,8 @@ def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
         ("no effect of oracle", "add --method=r3f"),
         ("straight", "--paths=straight knows of no objects"),
         ("nothing there", "nowhere holds no reconstruction"),
+        ("outliers of no hull", "--outliers=1 has no effect on --geometry=occupancy"),
+        ("run in its body", "is the reconstruction itself"),
         ("r3f begun anew", "holds a run already"),
         ("r3f with another grid", "ior 1.5, not 1.6"),
         ("r3f by name alone", "--method would have no effect"),
