@@ -52,6 +52,8 @@ def reconstruct(
     import_skimage()
     for split in _splits(config):
         local_layout.read_masks(local_layout.read_frames(scene, split))
+    # So that a broken one is told now, and not at the end.
+    local_layout.read_masks(report.judging_frames(scene)[1])
     asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene), config)
     found = records.begin(out, asked)
     with run_lock.hold(out):

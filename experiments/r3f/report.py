@@ -66,7 +66,7 @@ def run(scene: Path, out: Path, found: Reconstruction, compare: bool) -> ReportF
       compare: whether the scene's own meshes may be looked at.
     """
     mesh = body.read_mesh(out, found)
-    split, frames = _frames(scene)
+    split, frames = judging_frames(scene)
     outlines = _outlines(mesh, frames)
     truth = _read_truth(scene) if compare else _Truth(None, "The scene's meshes were not read.")
     facts = ReportFacts(
@@ -92,8 +92,11 @@ def is_there(out: Path) -> bool:
     return (out / FOLDER).is_dir() and (out / FILE).is_file()
 
 
-def _frames(scene: Path) -> tuple[str, Frames]:
-    """Returns the first split that has masks, those that nothing was made from first."""
+def judging_frames(scene: Path) -> tuple[str, Frames]:
+    """Returns the views that a report looks at, and their split.
+
+    They are of the first split that has masks, those that nothing was made from first.
+    """
     for split in _SPLITS[:-1]:
         if (scene / f"transforms_{split}.json").is_file():
             frames = local_layout.read_frames(scene, split)
