@@ -257,6 +257,7 @@ def test_three_balls_that_overlap(priorities):
 
 
 @pytest.mark.parametrize("priorities", [(3, 1), (1, 2)])
+@pytest.mark.slow
 def test_the_light_of_a_ray_is_shared_among_its_paths(priorities):
     glass = _ranked(scenes.box((1.0, 1.2, 0.8), index=1.5), priorities[0])
     water = _ranked(scenes.ball(0.6, index=1.333, centre=(0.4, 0.0, 0.2)), priorities[1])

@@ -118,6 +118,7 @@ def test_progress_is_reported_and_made():
     assert 0.0 <= last.wrong < 0.1 and last.loss < first.loss
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_grid_and_another_one_another():
     first, _ = _fitted()
     np.testing.assert_array_equal(first.values, _fit(*_ball_views(), seed=0).values)

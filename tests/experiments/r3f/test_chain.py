@@ -62,10 +62,6 @@ def _run(scene, out, config=_CONFIG, *, compare=True):
     return chain.reconstruct(scene, out, config, compare=compare, say=lambda text: None)
 
 
-def _slow(*values):
-    return pytest.param(*values, marks=pytest.mark.slow)
-
-
 def _contents(out):
     return {p.relative_to(out).as_posix(): p.read_bytes() for p in out.rglob("*") if p.is_file()}
 
@@ -160,15 +156,16 @@ def _killing(function, *, after=False, calls=1):
 @pytest.mark.parametrize(
     ("target", "options"),
     [
-        _slow("experiments.r3f.geometry_stage.refine", {}),
-        _slow("refref_jax.data.stored_normals.write_mesh", {"after": True}),  # before the renaming
+        ("experiments.r3f.geometry_stage.refine", {}),
+        ("refref_jax.data.stored_normals.write_mesh", {"after": True}),  # before the renaming
         ("experiments.r3f.geometry_stage.run", {"after": True}),  # renamed, not recorded
-        _slow("experiments.r3f.records.write", {"calls": 2, "after": True}),  # between two stages
-        _slow("experiments.r3f.surface_pictures.draw_surface", {"after": True}),
-        _slow("experiments.r3f.pages.markdown", {}),
-        _slow("experiments.r3f.records.write", {"calls": 4}),  # all done, not recorded
+        ("experiments.r3f.records.write", {"calls": 2, "after": True}),  # between two stages
+        ("experiments.r3f.surface_pictures.draw_surface", {"after": True}),
+        ("experiments.r3f.pages.markdown", {}),
+        ("experiments.r3f.records.write", {"calls": 4}),  # all done, not recorded
     ],
 )
+@pytest.mark.slow
 def test_whatever_is_killed_comes_to_the_same_files(scene, blind, tmp_path, target, options):
     out = tmp_path / "out"
     with pytest.MonkeyPatch.context() as patch:
