@@ -271,7 +271,9 @@ def test_an_index_that_is_not_given_is_estimated_once(scene, tmp_path, monkeypat
         found = _run(scene, tmp_path / "out", config, compare=False)
     assert asked == [7]
     assert (found.index.source, found.index.index, found.index.error) == ("estimated", 1.48, 0.01)
-    assert "1.4800** ± 0.0100" in (tmp_path / "out" / "report.md").read_text()
+    report = (tmp_path / "out" / "report.md").read_text()
+    assert "1.4800** ± 0.0100" in report
+    assert "`--background=unbounded` `--radius=2.5`" in report
     assert chain.read_part(tmp_path / "out").index == 1.48
 
 
