@@ -16,7 +16,6 @@ from absl import app, flags
 from experiments.r3f import body, chain, index_stage
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import meshes
-from refref_jax.data.geometry import shading_normals
 from refref_jax.reconstruct.triangles import Mesh
 
 _BODIES = {"true": 0.005, "masks": 0.02}
@@ -37,7 +36,7 @@ def main(arguments: list[str]) -> None:
         name, out = scene.resolve().name, Path(_OUT.value) / scene.resolve().name
         (part,) = meshes.read_meshes(scene)
         for kind in _BODY.value:
-            mesh = _true_mesh(part) if kind == "true" else _mesh_of_masks(scene, out)
+            mesh = body.mesh_of(part) if kind == "true" else _mesh_of_masks(scene, out)
             for start in starts:
                 begun = time.monotonic()
                 found = index_stage.run(scene, mesh, out, seed=0, start=start)
@@ -52,10 +51,6 @@ def main(arguments: list[str]) -> None:
     print("\n| scene | mesh | start | index | truth | seconds |\n|---|---|---|---|---|---|")
     print("\n".join(rows))
     assert not wrong, "\n".join(["the index is too far off:", *wrong])
-
-
-def _true_mesh(part: meshes.MeshPart) -> Mesh:
-    return Mesh(part.vertices, part.faces, shading_normals(part))
 
 
 def _mesh_of_masks(scene: Path, out: Path) -> Mesh:

@@ -30,5 +30,9 @@ def read_part(out: Path, found: Reconstruction) -> MeshPart:
 
 def read_mesh(out: Path, found: Reconstruction) -> Mesh:
     """Reads the surface; its vertices are in the order of the file's reader."""
-    part = meshes.read_part(surface_file(out, found), index=1.0)
+    return mesh_of(meshes.read_part(surface_file(out, found), index=1.0))
+
+
+def mesh_of(part: MeshPart) -> Mesh:
+    """Returns the surface of a part, with the normals that bend light."""
     return Mesh(part.vertices, part.faces, shading_normals(part))

@@ -186,6 +186,7 @@ def _describe_geometry(found: Reconstruction) -> str:
         f"{facts.height}; {', '.join(facts.stages) or 'not refined'}"
     ]
     told += [f"  left out {refused}" for refused in facts.refused]
+    told += [f"warning: {doubt}" for doubt in facts.doubts]
     return "\n".join(told)
 
 

@@ -1,17 +1,16 @@
 """The first stage of R3F: from the masks of the training views to a surface."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
 
 from experiments import commands
-from experiments.r3f import stages
+from experiments.r3f import doubts, stages
 from experiments.r3f.records import GeometryFacts, ReconstructionConfig
 from refref_jax.data import local_layout, scene_names, stored_normals
-from refref_jax.data.cameras import Cameras
 from refref_jax.reconstruct import occupancy, visual_hull
+from refref_jax.reconstruct.agreement import without_outliers
 from refref_jax.reconstruct.grids import Grid
 from refref_jax.reconstruct.isosurface import find_isosurface
 from refref_jax.reconstruct.occupancy_config import OccupancyTrainingConfig
@@ -24,19 +23,19 @@ FOLDER = "geometry"
 MATERIAL = "glass"
 """Ends the name of the mesh, which stands for nothing: what it is made of is its index."""
 
-Masks = Bool[np.ndarray, "views h w"]
+
+def _hull(views: Views, names: Sequence[str], config: ReconstructionConfig) -> Grid:
+    return visual_hull.carve(
+        *views, resolution=config.resolution, outliers=config.outliers, names=names
+    )
 
 
-def _hull(masks: Masks, cameras: Cameras, config: ReconstructionConfig) -> Grid:
-    return visual_hull.carve(masks, cameras, resolution=config.resolution, outliers=config.outliers)
-
-
-def _occupancy(masks: Masks, cameras: Cameras, config: ReconstructionConfig) -> Grid:
+def _occupancy(views: Views, names: Sequence[str], config: ReconstructionConfig) -> Grid:
+    del names
     settings = OccupancyTrainingConfig()
     with commands.ProgressBar("occupancy", settings.steps) as bar:
         return occupancy.fit(
-            masks,
-            cameras,
+            *views,
             config=settings,
             seed=config.seed,
             resolution=config.resolution,
@@ -44,11 +43,11 @@ def _occupancy(masks: Masks, cameras: Cameras, config: ReconstructionConfig) -> 
         )
 
 
-GEOMETRIES: dict[str, Callable[[Masks, Cameras, ReconstructionConfig], Grid]] = {
+GEOMETRIES: dict[str, Callable[[Views, Sequence[str], ReconstructionConfig], Grid]] = {
     "hull": _hull,
     "occupancy": _occupancy,
 }
-"""Ways from masks to a grid that is negative inside the body, by name."""
+"""Ways from masks, and what they are called, to a grid that is negative inside the body."""
 
 
 def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
@@ -58,10 +57,11 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
       ValueError: if there are no masks, or no body fits them.
     """
     frames = local_layout.read_frames(scene, "train")
-    masks = local_layout.read_masks(frames)
-    grid = GEOMETRIES[config.geometry](masks, frames.cameras, config)
-    cut = find_isosurface(grid)
-    refined = refine(cut, Refinement(), views=Views(masks, frames.cameras))
+    views = Views(local_layout.read_masks(frames), frames.cameras)
+    names = [path.relative_to(scene).as_posix() for path in frames.masks]
+    cut = find_isosurface(GEOMETRIES[config.geometry](views, names, config))
+    trusted = without_outliers(cut, views, config.outliers)
+    refined = refine(cut, Refinement(), views=trusted)
     mesh = refined[-1].mesh
     befores = [cut, *(stage.mesh for stage in refined)]
     name = f"{_object(scene)}_{MATERIAL}.ply"
@@ -69,7 +69,7 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
         stored_normals.write_mesh(folder / name, *mesh)
     return GeometryFacts(
         mesh=name,
-        masks=len(masks),
+        masks=len(views.masks),
         width=frames.cameras.width,
         height=frames.cameras.height,
         vertices=len(mesh.vertices),
@@ -82,6 +82,7 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
             if not np.array_equal(before.vertices, stage.mesh.vertices)
         ),
         refused=tuple(f"{stage.name}: {stage.refused}" for stage in refined if stage.refused),
+        doubts=doubts.about_masks(mesh, views, names, outliers=config.outliers),
     )
 
 

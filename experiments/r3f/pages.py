@@ -26,6 +26,7 @@ def markdown(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
         f"# The object of {found.scene}, reconstructed",
         f"From {geometry.masks} masks of {geometry.width} x {geometry.height} pixels and their "
         f"poses; {_of_index(found.index)}.",
+        *(f"**Doubtful:** {doubt}" for doubt in geometry.doubts),
         _table(out, found, facts),
         f"## Silhouettes\n\nMeasured on {len(facts.overlaps)} {_SPLITS[facts.split]}. IoU is the "
         "pixels in both mask and silhouette over those in either.",

@@ -62,6 +62,7 @@ class GeometryFacts:
       diameter: diagonal of its box, world units.
       stages: of the refinement that changed something.
       refused: those that were left out, and why.
+      doubts: what is wrong with masks, if anything seems so.
     """
 
     mesh: str
@@ -74,6 +75,7 @@ class GeometryFacts:
     diameter: float
     stages: tuple[str, ...]
     refused: tuple[str, ...]
+    doubts: tuple[str, ...]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,7 +26,6 @@ from experiments.r3f.windows import Window
 from refref_jax.data import containment, local_layout, meshes
 from refref_jax.data.cameras import Cameras, image_rays
 from refref_jax.data.errors import SceneError
-from refref_jax.data.geometry import shading_normals
 from refref_jax.data.local_layout import Frames
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surface_build import build_surfaces
@@ -34,7 +33,8 @@ from refref_jax.geometry.surfaces import Surfaces
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.reconstruct.closest import signed_distance
 from refref_jax.reconstruct.comparison import compare_meshes, silhouettes
-from refref_jax.reconstruct.triangles import Mesh, diameter
+from refref_jax.reconstruct.silhouettes import overlaps
+from refref_jax.reconstruct.triangles import Mesh, diameter, join
 from refref_jax.render.first_surface import FirstSurface, find_first_surface
 
 FOLDER = "pictures"
@@ -108,11 +108,10 @@ def judging_frames(scene: Path) -> tuple[str, Frames]:
 def _outlines(mesh: Mesh, frames: Frames) -> list[Outline]:
     masks, images = local_layout.read_masks(frames), local_layout.read_images(frames)
     seen = silhouettes(mesh, frames.cameras)
-    both = np.sum(seen & masks, axis=(1, 2))
-    either = np.sum(seen | masks, axis=(1, 2))
+    shares = overlaps(seen, masks)
     return [
-        Outline(*view, overlap=float(overlap))
-        for *view, overlap in zip(frames.names, images, masks, seen, both / either, strict=True)
+        Outline(*view, overlap=float(share))
+        for *view, share in zip(frames.names, images, masks, seen, shares, strict=True)
     ]
 
 
@@ -126,12 +125,7 @@ def _read_truth(scene: Path) -> _Truth:
         return _Truth(None, "The scene has no meshes to compare with.")
     parents = containment.find_containment(parts).parents
     outer = [part for part, parent in zip(parts, parents, strict=True) if parent == NO_PARENT]
-    starts = np.cumsum([0, *(len(part.vertices) for part in outer[:-1])])
-    joined = Mesh(
-        np.concatenate([part.vertices for part in outer]),
-        np.concatenate([part.faces + start for part, start in zip(outer, starts, strict=True)]),
-        np.concatenate([shading_normals(part) for part in outer]),
-    )
+    joined = join([body.mesh_of(part) for part in outer])
     names = ", ".join(f"{part.name}.ply" for part in outer)
     inner = len(parts) - len(outer)
     within = f"; {inner} more within {'it' if len(outer) == 1 else 'them'}" if inner else ""

@@ -70,6 +70,28 @@ def image_rays(cameras: Cameras, camera: int) -> Rays:
     return pixel_rays(cameras, np.full(row.shape, camera), row, column)
 
 
+class Projection(NamedTuple):
+    """Points as a camera sees them.
+
+    Attributes:
+      pixels: column and row; the image's centre where nothing is in front of the camera.
+      depths: along the camera's axis, world units, positive in front of it.
+    """
+
+    pixels: Float[np.ndarray, "points 2"]
+    depths: Float[np.ndarray, " points"]
+
+
+def project(
+    points: Float[np.ndarray, "points 3"], pose: Float[np.ndarray, "3 4"], cameras: Cameras
+) -> Projection:
+    """Returns where the camera of a pose sees points, world units."""
+    x, y, z = pose[:, :3].T @ (points.T - pose[:, 3:])
+    scale = np.divide(-cameras.focal, z, out=np.zeros_like(z), where=z < 0.0)
+    middle = 0.5 * np.array([cameras.width, cameras.height])
+    return Projection(middle + np.stack([scale * x, -scale * y], axis=-1), -z)
+
+
 def supersample(cameras: Cameras, side: int) -> Cameras:
     """Returns the same cameras with every pixel cut into `side x side` smaller ones.
 

@@ -72,8 +72,8 @@ def read_frames(scene: Path, split: str) -> Frames:
             for frame, stem in zip(frames, stems, strict=True)
         ]
     )
-    masks = _optional_files(scene, frames, "mask_file_path", path)
-    depths = _optional_files(scene, frames, "depth_file_path", path)
+    masks = _optional_files(scene, frames, stems, "mask_file_path", path)
+    depths = _optional_files(scene, frames, stems, "depth_file_path", path)
     result = Frames(
         names=tuple(image.stem for image in images),
         images=images,
@@ -162,11 +162,17 @@ def _transforms_name(split: str) -> str:
 
 
 def _optional_files(
-    scene: Path, frames: list[Any], key: str, path: Path
+    scene: Path, frames: list[Any], stems: list[str], key: str, path: Path
 ) -> tuple[Path, ...] | None:
     """Returns the files that all frames name under a key, or `None` if no frame does."""
-    if not any(isinstance(frame, dict) and key in frame for frame in frames):
+    lacking = [stem for frame, stem in zip(frames, stems, strict=True) if key not in frame]
+    if len(lacking) == len(frames):
         return None
+    if lacking:
+        raise SceneError(
+            f"The frame {lacking[0]} of {path} lacks {key!r}, as {len(lacking)} of {len(frames)} "
+            "frames do. Add it to these, or remove it from all."
+        )
     return tuple(scene / transforms.get_text(frame, key, path) for frame in frames)
 
 

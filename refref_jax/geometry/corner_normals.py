@@ -44,7 +44,7 @@ def corner_normals(
     group = smooth_groups(vertices, faces, crease_angle=crease_angle).reshape(-1)
     weighted = (_corner_angles(corners)[..., None] * flat[:, None]).reshape(-1, 3)
     sums = np.stack([np.bincount(group, weighted[:, axis]) for axis in range(3)], axis=-1)
-    averaged = _unit(sums)[group].reshape(-1, 3, 3)
+    averaged = unit_vectors(sums)[group].reshape(-1, 3, 3)
     # Opposite faces may cancel at a corner: fall back to the face's own normal there.
     cancelled = np.all(averaged == 0.0, axis=-1, keepdims=True)
     return np.where(cancelled, flat[:, None], averaged)
@@ -64,7 +64,7 @@ def smooth_groups(
 
 def face_normals(corners: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "faces 3"]:
     """Returns outward unit normals; zero for degenerate faces."""
-    normals = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    normals = unit_vectors(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     return np.where(is_degenerate(corners)[:, None], 0.0, normals)
 
 
@@ -74,6 +74,12 @@ def is_degenerate(corners: Float[np.ndarray, "faces 3 3"]) -> Bool[np.ndarray, "
     longest = np.max(np.sum(edges**2, axis=-1), axis=1)
     area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1)
     return area <= _DEGENERATE * longest
+
+
+def unit_vectors(vectors: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 3"]:
+    """Returns vectors of length one; zero stays zero."""
+    norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.divide(vectors, norm, out=np.zeros_like(vectors), where=norm > 0.0)
 
 
 def _smooth_patches(
@@ -100,11 +106,6 @@ def _smooth_patches(
 
 def _corner_angles(corners: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "faces 3"]:
     """Returns the angle of each face at each of its corners, in radians."""
-    forward = _unit(np.roll(corners, -1, axis=1) - corners)
-    backward = _unit(np.roll(corners, 1, axis=1) - corners)
+    forward = unit_vectors(np.roll(corners, -1, axis=1) - corners)
+    backward = unit_vectors(np.roll(corners, 1, axis=1) - corners)
     return np.arccos(np.clip(np.sum(forward * backward, axis=-1), -1.0, 1.0))
-
-
-def _unit(vectors: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 3"]:
-    norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.divide(vectors, norm, out=np.zeros_like(vectors), where=norm > 0.0)

@@ -7,8 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from refref_jax.data.cameras import Cameras, image_rays
+from refref_jax.geometry.corner_normals import unit_vectors
 from refref_jax.geometry.surface_build import build_surfaces
 from refref_jax.reconstruct.closest import ClosestSearch
+from refref_jax.reconstruct.silhouettes import overlaps
 from refref_jax.reconstruct.triangles import Mesh, diameter
 from refref_jax.render.first_surface import find_first_surface
 
@@ -48,7 +50,7 @@ def compare_meshes(mesh: Mesh, truth: Mesh, *, samples: int = SAMPLES, seed: int
     there, _ = _spread(truth, samples, generator)
     forth = ClosestSearch(truth.vertices, truth.faces)(points)
     back = ClosestSearch(mesh.vertices, mesh.faces)(there)
-    expected = _unit(np.einsum("nk,nkc->nc", forth.weights, truth.normals[forth.faces]))
+    expected = unit_vectors(np.einsum("nk,nkc->nc", forth.weights, truth.normals[forth.faces]))
     cosine = np.clip(np.sum(normals * expected, axis=-1), -1.0, 1.0)
     angles = np.degrees(np.arccos(cosine))
     size = diameter(truth.vertices)
@@ -68,10 +70,7 @@ def silhouette_overlap(
     A pixel is in the silhouette if the ray through its centre meets the mesh, as the data set's
     masks are made. A view in which both are empty counts 1.
     """
-    seen = silhouettes(mesh, cameras)
-    both = np.sum(seen & masks, axis=(1, 2))
-    either = np.sum(seen | masks, axis=(1, 2))
-    return np.where(either > 0, both / np.maximum(either, 1), 1.0)
+    return overlaps(silhouettes(mesh, cameras), masks)
 
 
 def silhouettes(mesh: Mesh, cameras: Cameras) -> Bool[np.ndarray, "views h w"]:
@@ -100,9 +99,4 @@ def _spread(
     root = np.sqrt(u)
     weights = np.stack([1.0 - root, root * (1.0 - v), root * v], axis=-1)
     points = np.einsum("nk,nkc->nc", weights, corners[face])
-    return points, _unit(np.einsum("nk,nkc->nc", weights, mesh.normals[face]))
-
-
-def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.divide(vectors, norm, out=np.zeros_like(vectors), where=norm > 0.0)
+    return points, unit_vectors(np.einsum("nk,nkc->nc", weights, mesh.normals[face]))

@@ -19,28 +19,28 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import map_coordinates
 from scipy.sparse import coo_array, csr_array, vstack
 from scipy.spatial import KDTree, QhullError
 
+from refref_jax.data.cameras import project
 from refref_jax.reconstruct.convex import hull, of_points, weigh_facets
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.grids import Points, Values
 from refref_jax.reconstruct.outlines import (
     Corners,
+    Image,
     Pixels,
     Samples,
     along_edges,
     excess,
     heights,
+    look_up,
     overlap,
     polygon,
-    project,
+    projection_slopes,
 )
-from refref_jax.reconstruct.silhouettes import BLUR, Views, signed_distances
+from refref_jax.reconstruct.silhouettes import BLUR, Views, signed_distances, views_at
 from refref_jax.reconstruct.triangles import Mesh
-
-Image = Float[np.ndarray, "h w"]
 
 MOST = 128
 """Corners of the body that is looked for."""
@@ -131,7 +131,7 @@ def _usable(points: Points, views: Views) -> Views:
     cameras = views.cameras
     seen = [np.all(project(points, pose, cameras).depths > 0.0) for pose in cameras.poses]
     kept = np.array(seen) & ~views.masks.all(axis=(1, 2)) & views.masks.any(axis=(1, 2))
-    return Views(views.masks[kept], cameras._replace(poses=cameras.poses[kept]))
+    return views_at(views, kept)
 
 
 def _pixels(points: Points, views: Views) -> list[Pixels]:
@@ -226,25 +226,14 @@ def _equations(corners: Corners, views: Views, images: Sequence[Image]) -> tuple
         samples = along_edges(seen.pixels[on], margin=_MARGIN * BLUR)
         inside = np.all((samples.pixels > 0.0) & (samples.pixels < image.shape[::-1]), axis=1)
         samples = Samples(*(part[inside] for part in samples))
-        distance, slope = _look_up(image, samples.pixels)
+        distance, slope = look_up(image, samples.pixels)
+        by_corner = projection_slopes(seen, pose, views.cameras)
         distances.append(distance)
         ends = on[np.stack([samples.first, samples.second], axis=-1)]
         shares = np.stack([1.0 - samples.shares, samples.shares], axis=-1)
-        values = np.einsum("nk,nekc,ne->nec", slope, seen.slopes[ends], shares)
+        values = np.einsum("nk,nekc,ne->nec", slope, by_corner[ends], shares)
         column = 3 * ends[..., None] + np.arange(3)
         row = np.broadcast_to(np.arange(len(ends))[:, None, None], values.shape)
         shape = (len(ends), corners.size)
         slopes.append(coo_array((values.ravel(), (row.ravel(), column.ravel())), shape=shape))
     return np.concatenate(distances), csr_array(vstack(slopes))
-
-
-def _look_up(image: Image, pixels: Pixels) -> tuple[Values, Pixels]:
-    """Returns an image's values between pixel centres, and their slopes over a pixel."""
-    column, row = pixels.T - 0.5
-
-    def value(down: float, right: float) -> Values:
-        return map_coordinates(image, [row + down, column + right], order=1, mode="nearest")
-
-    across = value(0.0, 0.5) - value(0.0, -0.5)
-    along = value(0.5, 0.0) - value(-0.5, 0.0)
-    return value(0.0, 0.0), np.stack([across, along], axis=-1)

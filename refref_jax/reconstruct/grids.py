@@ -91,6 +91,12 @@ def sample(
     return Grid(values, low, spacing)
 
 
+def lattice(box: Box, count: int) -> Points:
+    """Returns the points of a regular lattice over a box, so many along each edge."""
+    ticks = [np.linspace(low, high, count) for low, high in zip(*box, strict=True)]
+    return np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
 def interpolate(grid: Grid, points: Points) -> Values:
     """Returns the values between grid points, linear along each axis; the nearest ones outside."""
     return map_coordinates(grid.values, _index(grid, points), order=1, mode="nearest")

@@ -9,29 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import map_coordinates
 from scipy.spatial import ConvexHull
 
-from refref_jax.data.cameras import Cameras
-from refref_jax.reconstruct.grids import Points, Values
-from refref_jax.reconstruct.silhouettes import Views
+from refref_jax.data.cameras import Cameras, Projection, project
+from refref_jax.reconstruct.grids import Values
+from refref_jax.reconstruct.silhouettes import Views, overlaps
 
 Pixels = Float[np.ndarray, "points 2"]
 Polygon = Float[np.ndarray, "corners 2"]
+Image = Float[np.ndarray, "h w"]
 Corners = Float[np.ndarray, "corners 3"]
-
-
-class Image(NamedTuple):
-    """Points as a camera sees them.
-
-    Attributes:
-      pixels: column and row.
-      slopes: derivative of both by the points, pixels over world units.
-      depths: along the camera's axis, world units; nothing else counts where one is not positive.
-    """
-
-    pixels: Float[np.ndarray, "points 2"]
-    slopes: Float[np.ndarray, "points 2 3"]
-    depths: Float[np.ndarray, " points"]
 
 
 class Samples(NamedTuple):
@@ -50,17 +38,27 @@ class Samples(NamedTuple):
     shares: Float[np.ndarray, " points"]
 
 
-def project(points: Points, pose: Float[np.ndarray, "3 4"], cameras: Cameras) -> Image:
-    """Returns points as the camera of a pose sees them."""
-    x, y, z = pose[:, :3].T @ (points.T - pose[:, 3:])
-    inverse = np.divide(-1.0, z, out=np.zeros_like(z), where=z < 0.0)
-    scale = cameras.focal * inverse
-    half = 0.5 * np.array([cameras.width, cameras.height])
-    pixels = half + np.stack([scale * x, -scale * y], axis=-1)
-    zero = np.zeros_like(x)
-    right = np.stack([scale, zero, scale * inverse * x], axis=-1)
-    down = np.stack([zero, -scale, -scale * inverse * y], axis=-1)
-    return Image(pixels, np.stack([right, down], axis=1) @ pose[:, :3].T, -z)
+def projection_slopes(
+    seen: Projection, pose: Float[np.ndarray, "3 4"], cameras: Cameras
+) -> Float[np.ndarray, "points 2 3"]:
+    """Returns the derivatives of column and row by points, pixels over world units.
+
+    They are zero where nothing is in front of the camera.
+
+    Args:
+      seen: the points as the camera sees them.
+      pose: of the camera.
+      cameras: that it is one of.
+    """
+    middle = 0.5 * np.array([cameras.width, cameras.height])
+    x, y = ((seen.pixels - middle) / cameras.focal).T
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    in_camera = np.stack(
+        [np.stack([one, zero, x], axis=-1), np.stack([zero, -one, y], axis=-1)], axis=1
+    )
+    depths = seen.depths
+    scale = np.divide(cameras.focal, depths, out=np.zeros_like(depths), where=depths > 0.0)
+    return scale[:, None, None] * in_camera @ pose[:, :3].T
 
 
 def polygon(pixels: Pixels) -> Int[np.ndarray, " corners"]:
@@ -110,15 +108,24 @@ def along_edges(corners: Polygon, *, margin: float) -> Samples:
     return Samples(pixels, edge, (edge + 1) % len(corners), shares)
 
 
+def look_up(image: Image, pixels: Pixels) -> tuple[Values, Pixels]:
+    """Returns an image's values between pixel centres, and their slopes over a pixel."""
+    column, row = pixels.T - 0.5
+
+    def value(down: float, right: float) -> Values:
+        return map_coordinates(image, [row + down, column + right], order=1, mode="nearest")
+
+    across = value(0.0, 0.5) - value(0.0, -0.5)
+    along = value(0.5, 0.0) - value(-0.5, 0.0)
+    return value(0.0, 0.0), np.stack([across, along], axis=-1)
+
+
 def overlap(corners: Corners, views: Views) -> float:
-    """Returns the mean over views of the pixels in both mask and outline over those in either."""
+    """Returns the overlap of masks and outlines (IoU), mean over views."""
     cameras = views.cameras
-    shares = []
-    for mask, pose in zip(views.masks, cameras.poses, strict=True):
-        pixels = project(corners, pose, cameras).pixels
-        seen = _fill(pixels[polygon(pixels)], cameras.height, cameras.width)
-        shares.append(np.sum(seen & mask) / max(np.sum(seen | mask), 1))
-    return float(np.mean(shares))
+    images = (project(corners, pose, cameras).pixels for pose in cameras.poses)
+    seen = [_fill(pixels[polygon(pixels)], cameras.height, cameras.width) for pixels in images]
+    return float(np.mean(overlaps(np.stack(seen), views.masks)))
 
 
 def _fill(corners: Polygon, height: int, width: int) -> Bool[np.ndarray, "h w"]:

@@ -37,8 +37,24 @@ class Views(NamedTuple):
 
 def some_of(views: Views, count: int) -> Views:
     """Returns so many views at most, evenly spread over their order."""
-    kept = np.unique(np.linspace(0, len(views.masks) - 1, count).astype(np.int64))
+    return views_at(views, np.unique(np.linspace(0, len(views.masks) - 1, count).astype(np.int64)))
+
+
+def views_at(views: Views, kept: Int[np.ndarray, " kept"] | Bool[np.ndarray, " views"]) -> Views:
+    """Returns some of the views, by their numbers or by a flag for each."""
     return Views(views.masks[kept], views.cameras._replace(poses=views.cameras.poses[kept]))
+
+
+def overlaps(
+    seen: Bool[np.ndarray, "views h w"], masks: Bool[np.ndarray, "views h w"]
+) -> Float[np.ndarray, " views"]:
+    """Returns for each view the pixels in both of two masks over those in either (IoU).
+
+    A view in which both are empty counts 1.
+    """
+    both = np.sum(seen & masks, axis=(1, 2))
+    either = np.sum(seen | masks, axis=(1, 2))
+    return np.where(either > 0, both / np.maximum(either, 1), 1.0)
 
 
 def check_masks(masks: Bool[np.ndarray, "views h w"], cameras: Cameras) -> None:

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.linalg import cg
 
-from refref_jax.geometry.corner_normals import face_normals
+from refref_jax.geometry.corner_normals import face_normals, unit_vectors
 from refref_jax.reconstruct.triangles import (
     Faces,
     Mesh,
@@ -54,6 +54,12 @@ _HOLD = 4.0
 _NEAREST_MIDDLES = 0.2
 
 _VOLUME_STEPS = 4
+
+# The least area that a face counts for, as a share of the mean: one of none would have no normal.
+_LIGHTEST = 1e-6
+
+# Faces whose normal would turn by more, by its cosine, stay: the shortest arc is not known there.
+_TURNED_OVER = -0.9
 
 
 def diffuse(mesh: Mesh, length: float) -> Mesh:
@@ -98,10 +104,9 @@ def keep_volume(vertices: Vertices, faces: Faces, reference: Mesh) -> Vertices:
     wanted = volume(reference.vertices, reference.faces)
     for _ in range(_VOLUME_STEPS):
         outward = vertex_vectors(vertices, faces)
-        area = np.linalg.norm(outward, axis=-1, keepdims=True)
-        unit = np.divide(outward, area, out=np.zeros_like(outward), where=area > 0.0)
+        area = np.sum(np.linalg.norm(outward, axis=-1))
         missing = wanted - volume(vertices, faces)
-        vertices = vertices + missing / np.sum(area) * unit
+        vertices = vertices + missing / area * unit_vectors(outward)
     return vertices
 
 
@@ -161,14 +166,14 @@ def _diffused_normals(
     """Returns unit normals of faces after diffusion that creases hold up."""
     normals = face_normals(vertices[faces])
     mass = np.linalg.norm(face_vectors(vertices, faces), axis=-1)
-    mass = np.maximum(mass, 1e-6 * mass.mean())
+    mass = np.maximum(mass, _LIGHTEST * mass.mean())
     a, b, weight = _bond(vertices, faces)
     for _ in range(_STEPS):
         stiffness = _stiffness(
             a, b, weight * _closeness(normals[a], normals[b], crease_angle), len(faces)
         )
         normals = _implicit(stiffness, mass, normals, length / np.sqrt(_STEPS), steps=1)
-        normals = _unit(normals)
+        normals = unit_vectors(normals)
     return normals
 
 
@@ -229,14 +234,10 @@ def _turn(
     axis = np.cross(normals, onto)
     cosine = np.sum(normals * onto, axis=-1)
     # Rodrigues' formula for the shortest arc; faces turned right over, or without normal, stay.
-    share = np.divide(1.0, 1.0 + cosine, out=np.zeros_like(cosine), where=cosine > -0.9)
+    turns = cosine > _TURNED_OVER
+    share = np.divide(1.0, 1.0 + cosine, out=np.zeros_like(cosine), where=turns)
     from_middle = corners - middle
-    axis = np.where((cosine > -0.9)[:, None] & np.any(normals != 0.0, axis=1)[:, None], axis, 0.0)
+    axis = np.where(turns[:, None] & np.any(normals != 0.0, axis=1)[:, None], axis, 0.0)
     across = np.cross(axis[:, None], from_middle)
     twice = np.cross(axis[:, None], across)
     return middle + from_middle + across + share[:, None, None] * twice
-
-
-def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.divide(vectors, norm, out=np.zeros_like(vectors), where=norm > 0.0)

@@ -1,5 +1,6 @@
 """Closed triangle meshes: what is measured on them, and their pieces (NumPy only)."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -91,6 +92,16 @@ def pieces(faces: Faces, count: int) -> Int[np.ndarray, " vertices"]:
     first, second = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
     graph = coo_array((np.ones(first.size, bool), (first, second)), shape=(count, count))
     return connected_components(graph, directed=False)[1]
+
+
+def join(parts: Sequence[Mesh]) -> Mesh:
+    """Returns several meshes, one or more, as one."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    return Mesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)]),
+        np.concatenate([part.normals for part in parts]),
+    )
 
 
 def keep_faces(mesh: Mesh, kept: np.ndarray) -> Mesh:

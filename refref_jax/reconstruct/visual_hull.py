@@ -15,13 +15,15 @@ undoes it.
 Source: Laurentini, The Visual Hull Concept for Silhouette-Based Image Understanding (1994).
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import map_coordinates
 
-from refref_jax.data.cameras import Cameras
+from refref_jax.data.cameras import Cameras, project
 from refref_jax.reconstruct.errors import ReconstructionError
-from refref_jax.reconstruct.grids import Box, Field, Grid, Points, Values, sample
+from refref_jax.reconstruct.grids import Box, Field, Grid, Points, Values, lattice, sample
 from refref_jax.reconstruct.silhouettes import BLUR, check_masks, signed_distances
 
 REACH = 2.1
@@ -56,6 +58,7 @@ def carve(
     outliers: int = 0,
     tolerance: float = TOLERANCE,
     blur: float = BLUR,
+    names: Sequence[str] | None = None,
 ) -> Grid:
     """Returns the field of the masks' hull on a grid.
 
@@ -75,6 +78,7 @@ def carve(
       outliers: values passed over at each point.
       tolerance: pixels outside of an outline up to which nothing is carved, see the module.
       blur: of the outlines in pixels, see `silhouettes`.
+      names: what the masks are called in errors; their numbers if not given.
 
     Raises:
       ReconstructionError: if there is no mask, if a mask is empty or of another size, if as many
@@ -88,12 +92,12 @@ def carve(
         )
     field = hull_field(masks, cameras, outliers=outliers, tolerance=tolerance, blur=blur)
     if box is None:
-        box = find_box(field, masks, cameras)
+        box = find_box(field, masks, cameras, names=names)
     spacing = float(np.max(box.high - box.low)) / (resolution - 2 * _RIM)
     wide = Box(box.low - _RIM * spacing, box.high + _RIM * spacing)
     grid = sample(field, wide, spacing=spacing)
     if not np.any(grid.values < 0.0):
-        raise ReconstructionError(_explanation(masks, cameras, box))
+        raise ReconstructionError(_explanation(masks, cameras, box, names))
     return grid
 
 
@@ -124,13 +128,20 @@ def hull_field(
     return field
 
 
-def find_box(field: Field, masks: Bool[np.ndarray, "views h w"], cameras: Cameras) -> Box:
+def find_box(
+    field: Field,
+    masks: Bool[np.ndarray, "views h w"],
+    cameras: Cameras,
+    *,
+    names: Sequence[str] | None = None,
+) -> Box:
     """Returns a box around the body, which must lie within the cube of `REACH`.
 
     Args:
       field: the hull's, from `hull_field`.
       masks: of which it is the hull.
       cameras: of the masks.
+      names: what the masks are called in errors; their numbers if not given.
 
     Raises:
       ReconstructionError: if nothing is left, or the body reaches out of the cube.
@@ -140,7 +151,7 @@ def find_box(field: Field, masks: Bool[np.ndarray, "views h w"], cameras: Camera
     # Within half a cell's diagonal of the surface, so that a thin body is not overlooked.
     inside = np.argwhere(grid.values < 0.87 * grid.spacing)
     if len(inside) == 0:
-        raise ReconstructionError(_explanation(masks, cameras, Box(-ends, ends)))
+        raise ReconstructionError(_explanation(masks, cameras, Box(-ends, ends), names))
     if _reaches_border(grid):
         raise ReconstructionError(_LIMITLESS.format(count=len(masks), reach=REACH))
     low = grid.low + grid.spacing * (inside.min(axis=0) - _MARGIN)
@@ -155,20 +166,30 @@ def view_values(
     points: Points,
 ) -> Values:
     """Returns one view's signed distances in world units, `-inf` where it sees nothing."""
-    x, y, z = pose[:, :3].T @ (points.T - pose[:, 3:])
-    depth = np.where(z < 0.0, -z, np.inf)
-    column = cameras.focal * x / depth + 0.5 * cameras.width
-    row = -cameras.focal * y / depth + 0.5 * cameras.height
-    seen = (z < 0.0) & (column >= 0) & (column <= cameras.width)
+    (column, row), depth = (part.T for part in project(points, pose, cameras))
+    seen = (depth > 0.0) & (column >= 0) & (column <= cameras.width)
     seen &= (row >= 0) & (row <= cameras.height)
     values = np.full(len(points), -np.inf)
-    if not np.all(np.isneginf(image)):
+    if np.all(np.isneginf(image)):
+        values[seen] = -_FAR
+    else:
         at = np.stack([row[seen], column[seen]]) - 0.5
         pixels = map_coordinates(image, at, order=1, mode="nearest")
         values[seen] = pixels * depth[seen] / cameras.focal
-    else:
-        values[seen] = -_FAR
     return values
+
+
+def values_by_view(
+    masks: Bool[np.ndarray, "views h w"], cameras: Cameras, points: Points
+) -> Float[np.ndarray, "views points"]:
+    """Returns `view_values` of all views, of outlines as coarse as the masks' pixels."""
+    views = zip(masks, cameras.poses, strict=True)
+    return np.stack(
+        [
+            view_values(signed_distances(mask, blur=0.0), pose, cameras, points)
+            for mask, pose in views
+        ]
+    )
 
 
 def _reaches_border(grid: Grid) -> bool:
@@ -180,22 +201,20 @@ def _reaches_border(grid: Grid) -> bool:
     )
 
 
-def _explanation(masks: np.ndarray, cameras: Cameras, box: Box) -> str:
+def _explanation(
+    masks: Bool[np.ndarray, "views h w"],
+    cameras: Cameras,
+    box: Box,
+    names: Sequence[str] | None,
+) -> str:
     """Says which view removed the most of what all others leave."""
-    ticks = [np.linspace(low, high, 24) for low, high in zip(*box, strict=True)]
-    points = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-    images = (signed_distances(mask, blur=0.0) for mask in masks)
-    carved = np.stack(
-        [
-            view_values(image, pose, cameras, points) > 0.0
-            for image, pose in zip(images, cameras.poses, strict=True)
-        ]
-    )
+    carved = values_by_view(masks, cameras, lattice(box, 24)) > 0.0
     alone = carved & (carved.sum(axis=0) == 1)
     view = int(np.argmax(alone.sum(axis=1) + carved.mean(axis=1)))
+    name = f"View {view}" if names is None else names[view]
     return (
         f"Nothing is left after carving with {len(masks)} masks between {np.round(box.low, 2)} and "
-        f"{np.round(box.high, 2)}. View {view} removed the most: {100.0 * carved[view].mean():.0f} "
-        f"% of the box, and {int(alone[view].sum())} of {len(points)} points that no other view "
-        "did. Check its mask and its pose, pass over outliers, or give a finer resolution."
+        f"{np.round(box.high, 2)}. {name} removed the most: {carved[view].mean():.0%} of the box, "
+        f"and {int(alone[view].sum())} of {carved.shape[1]} points that no other view did. Check "
+        "its mask and its pose, pass over outliers, or give a finer resolution."
     )

@@ -244,6 +244,13 @@ def test_a_frame_that_lacks_what_others_have(scene, key):
         local_layout.read_frames(scene, "train")
 
 
+@pytest.mark.parametrize("key", ["mask_file_path", "depth_file_path"])
+def test_the_frame_that_lacks_a_file_is_named(scene, key):
+    edit_transforms(scene, _first_frame(**{key: None}))
+    with scene_error("The frame ./train/r_000 of", "1 of 2 frames"):
+        local_layout.read_frames(scene, "train")
+
+
 @pytest.mark.parametrize("record", ["./train/r_000", None, []])
 def test_a_frame_that_is_no_object(scene, record):
     edit_transforms(scene, lambda transforms: transforms["frames"].append(record))

@@ -197,3 +197,6 @@ def test_where_nothing_is_left_the_view_that_took_most_is_named():
     wrong[11, :3, :3] = True
     with pytest.raises(ReconstructionError, match="View 11 removed the most"):
         carve(wrong, cameras, resolution=48)
+    names = [f"mask/r_{view}.png" for view in range(30)]
+    with pytest.raises(ReconstructionError, match=r"mask/r_11\.png removed the most"):
+        carve(wrong, cameras, resolution=48, names=names)

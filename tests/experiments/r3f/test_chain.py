@@ -74,7 +74,7 @@ def test_a_ball_is_found_from_its_masks(whole):
     assert [words.partition(":")[0] for words in found.geometry.refused] == ["corners"]
     assert found.geometry.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.04)
     assert found.report.split == "test" and len(found.report.overlaps) == 5
-    assert found.report.mean_overlap > 0.97
+    assert found.report.mean_overlap > 0.97 and found.geometry.doubts == ()
     assert found.report.truth.chamfer < 0.005 and found.report.truth.normal_error < 3.0
     index = json.loads((whole / "index.json").read_text())
     assert index == {"source": "given", "index": 1.5, "error": None, "loss": None}
@@ -353,6 +353,35 @@ def test_a_folder_that_was_killed_while_it_was_opened_is_taken(scene, tmp_path):
     (out / ".reconstruction.json.unfinished").write_text("{")
     asked = records.Reconstruction("", chain.fingerprint(scene), _CONFIG)
     assert records.begin(out, asked) == asked == records.read(out)
+
+
+@pytest.mark.parametrize("outliers", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_wrong_mask_is_named_unless_one_may_be_wrong(scene, tmp_path, outliers):
+    spoilt = shutil.copytree(scene, tmp_path / scene.name)
+    wrong = local_layout.read_frames(spoilt, "train").masks[5]
+    half = iio.imread(wrong)
+    half[:, :20] = 0
+    iio.imwrite(wrong, half)
+    facts = geometry_stage.run(spoilt, tmp_path, dataclasses.replace(_CONFIG, outliers=outliers))
+    true = 4 / 3 * np.pi * RADIUS**3
+    if outliers:
+        assert facts.doubts == () and facts.volume == pytest.approx(true, rel=0.1)
+    else:
+        seen, taken = facts.doubts
+        assert "of 24 training masks overlap with the body by less than 0.9" in seen
+        name = wrong.relative_to(spoilt).as_posix()
+        assert taken.startswith(f"{name} alone carves away") and "--outliers=1" in taken
+        assert facts.volume < 0.7 * true
+
+
+def test_where_a_mask_removes_the_body_its_file_is_named(scene, tmp_path):
+    spoilt = shutil.copytree(scene, tmp_path / scene.name)
+    wrong = local_layout.read_frames(spoilt, "train").masks[5]
+    corner = np.zeros((40, 40), np.uint8)
+    corner[:3, :3] = 255
+    iio.imwrite(wrong, corner)
+    with pytest.raises(ValueError, match=f"{wrong.name} removed the most"):
+        _run(spoilt, tmp_path / "out")
 
 
 def test_masks_without_an_inside_are_refused(scene, tmp_path):
