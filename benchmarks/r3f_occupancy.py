@@ -25,6 +25,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from refref_jax.data import local_layout
 from refref_jax.data.cameras import Cameras
 from refref_jax.reconstruct import occupancy
+from refref_jax.reconstruct.agreement import without_outliers
 from refref_jax.reconstruct.comparison import Distance, compare_meshes, silhouette_overlap
 from refref_jax.reconstruct.grids import Grid
 from refref_jax.reconstruct.isosurface import find_isosurface
@@ -45,6 +46,9 @@ _STEPS = flags.DEFINE_integer("steps", OccupancyTrainingConfig().steps, "Steps o
 
 _TEST_VIEWS = 10
 
+_ONE_OUT = "hull, 1 out"
+_OUTLIERS = {_ONE_OUT: 1}
+
 # The field's distance over the hull's that still counts as near.
 _AS_NEAR = 1.25
 
@@ -62,7 +66,8 @@ def main(arguments: list[str]) -> None:
         for body, make in _bodies(kind).items():
             views = Views(_altered(kind, masks), frames.cameras)
             mesh = find_isosurface(make(*views))
-            better = refine(mesh, Refinement(), views=views)[-1].mesh
+            trusted = without_outliers(mesh, views, _OUTLIERS.get(body, 0))
+            better = refine(mesh, Refinement(), views=trusted)[-1].mesh
             for stage, shown in (("raw", mesh), ("refined", better)):
                 refined[body] = _row((kind, body, stage), shown, truth, others)
         if kind == "given":
@@ -74,11 +79,11 @@ def _bodies(kind: str) -> dict[str, Callable[[Masks, Cameras], Grid]]:
     config = OccupancyTrainingConfig(steps=_STEPS.value)
     bodies: dict[str, Callable[[Masks, Cameras], Grid]] = {
         "hull": lambda *views: carve(*views, resolution=resolution),
-        "hull, 1 out": lambda *views: carve(*views, resolution=resolution, outliers=1),
+        _ONE_OUT: lambda *views: carve(*views, resolution=resolution, outliers=1),
         "occupancy": lambda *views: occupancy.fit(*views, config=config, resolution=resolution),
     }
     if kind != "shifted":
-        del bodies["hull, 1 out"]
+        del bodies[_ONE_OUT]
     return bodies
 
 
