@@ -272,7 +272,7 @@ def test_the_light_of_a_ray_is_shared_among_its_paths(priorities):
 # A camera inside.
 
 
-@pytest.mark.parametrize("rule", ["nested", "priority"])
+@pytest.mark.parametrize("rule", [pytest.param("nested", marks=pytest.mark.slow), "priority"])
 @pytest.mark.parametrize(
     ("start", "slots"), [((0.1, 0.2, -0.1), {0, 1}), ((0.1, -0.8, 0.1), {0}), ((2.0, 0, 0), set())]
 )

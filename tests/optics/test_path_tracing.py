@@ -110,6 +110,7 @@ def test_a_hollow_shell():
     _check_against_spheres(_ball_in_ball("nested", 1.0), shell, [0.0, 0.2, 0.4], 4)
 
 
+@pytest.mark.slow
 def test_water_in_glass_bends_less_where_they_touch():
     nested = [Sphere(1.0, 1.5, 1.0), Sphere(0.6, 1.333, 1.5)]
     _check_against_spheres(_ball_in_ball("nested"), nested, [0.1, 0.3, 0.5], 4)

@@ -45,7 +45,8 @@ def _assert_identical(a, b):
         np.testing.assert_array_equal(x, y)
 
 
-@pytest.mark.parametrize("pause", [4, 6])
+# Within a pool, and between two.
+@pytest.mark.parametrize("pause", [6, pytest.param(4, marks=pytest.mark.slow)])
 def test_a_resumed_run_continues_bit_for_bit(tmp_path, pause):
     straight_through, reports = _train(_setup(), _start(), 12)
     first, early = _train(_setup(), _start(), pause)
