@@ -47,7 +47,7 @@ benchmark-small: $(READY) $(BLENDER_READY)
 		--train_views=50 --val_views=1 --test_views=8 --spp=64 --test_spp=256 \
 		--texture_size=512 --exr=none --workers=2
 	$(RUN) experiments.benchmark --scenes='$(SMALL)/scenes/*' --methods=straight,oracle,tree \
-		--preset=tiny --steps=2000 --rays_per_pixel=4 --out=$(SMALL)/results
+		--preset=tiny --steps=1250 --rays_per_pixel=4 --out=$(SMALL)/results
 
 clean:
 	rm -rf $(VENV) $(BLENDER_VENV) .pytest_cache .ruff_cache *.egg-info
