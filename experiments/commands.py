@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Self
 
 from absl import app, logging
 from rich.progress import (
@@ -96,13 +96,26 @@ def from_string_safe(value: Any) -> Any:
 
 
 class Interrupt:
-    """Notes that the user wants to stop, so that a step can be finished and saved."""
+    """Notes that the user wants to stop, so that a step can be finished and saved.
+
+    It has the signals of Ctrl-C and of `kill` as long as its context lasts.
+    """
 
     def __init__(self) -> None:
-        """Takes over the signals of Ctrl-C and of `kill`."""
+        """Nothing is requested yet."""
         self.requested = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        """Takes the signals over."""
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._request)
+            self._before[number] = signal.signal(number, self._request)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Gives the signals back."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
     def _request(self, number: int, frame: object) -> None:
         del frame

@@ -96,10 +96,9 @@ def _train(
     total, step = setup.config.schedule.steps, int(state.step)
     writes = devices.is_first()
     earlier = run_folder.rewind_metrics(run, step) if writes else 0.0
-    interrupt = commands.Interrupt()
     start = last = time.monotonic()
     logged = step
-    with commands.ProgressBar("train", total, step) as bar:
+    with commands.Interrupt() as interrupt, commands.ProgressBar("train", total, step) as bar:
         every = (_MOST_STEPS, periods.log, periods.checkpoint)
         for stepped, report in loop.run_steps(setup, state, total, every=every):
             step = int(stepped.step)

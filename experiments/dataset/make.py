@@ -86,16 +86,16 @@ def main() -> None:
     out = Path(_OUT.value) / "preview" if _PREVIEW.value else Path(_OUT.value)
     if any(scene.object == "monkey" for scene in chosen):
         blender_meshes.export_monkey(catalogue.SUZANNE, blender=blender)
-    interrupt = commands.Interrupt()
-    whole = production.produce(
-        out,
-        chosen,
-        settings,
-        objects=catalogue.OBJECTS,
-        blender=blender,
-        workers=_WORKERS.value,
-        stopped=lambda: interrupt.requested,
-    )
+    with commands.Interrupt() as interrupt:
+        whole = production.produce(
+            out,
+            chosen,
+            settings,
+            objects=catalogue.OBJECTS,
+            blender=blender,
+            workers=_WORKERS.value,
+            stopped=lambda: interrupt.requested,
+        )
     if not whole:
         print("Stopped. The same command goes on from here.")
         sys.exit(commands.INTERRUPTED)

@@ -51,7 +51,12 @@ def reconstruct(
     """
     import_skimage()
     for split in _splits(config):
-        local_layout.read_masks(local_layout.read_frames(scene, split))
+        masks = local_layout.read_masks(local_layout.read_frames(scene, split))
+        if config.outliers >= len(masks):
+            raise ValueError(
+                f"--outliers={config.outliers}, but there are {len(masks)} {split} masks. Give "
+                "fewer."
+            )
     # So that a broken one is told now, and not at the end.
     local_layout.read_masks(report.judging_frames(scene)[1])
     asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene), config)

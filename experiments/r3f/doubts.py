@@ -13,6 +13,9 @@ from refref_jax.reconstruct.triangles import Mesh
 # bodies some tens of pixels wide it is above 0.97.
 _AGREES = 0.9
 
+# Masks that are named.
+_NAMED = 5
+
 # The share of a body that no mask carves away alone, when it is right and there are many others.
 _MUCH = 0.05
 
@@ -29,12 +32,14 @@ def about_masks(
       outliers: as many as may disagree without a word.
     """
     overlaps = silhouette_overlap(mesh, *views)
-    count, least = int(np.sum(overlaps < _AGREES)), int(np.argmin(overlaps))
-    if count <= outliers:
+    doubtful = np.flatnonzero(overlaps < _AGREES)
+    if len(doubtful) <= outliers:
         return ()
+    worst = doubtful[np.argsort(overlaps[doubtful])][:_NAMED]
+    named = ", ".join(f"{names[view]} ({overlaps[view]:.2f})" for view in worst)
     told = (
-        f"{count} of {len(overlaps)} training masks overlap with the body by less than {_AGREES}, "
-        f"{names[least]} by {overlaps[least]:.2f}. Check the masks and the poses."
+        f"{len(doubtful)} of {len(overlaps)} training masks overlap with the body by less than "
+        f"{_AGREES}, least {named}. Check the masks and the poses."
     )
     shares = carved_alone(views)
     taker = int(np.argmax(shares))

@@ -58,7 +58,7 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
     """
     frames = local_layout.read_frames(scene, "train")
     views = Views(local_layout.read_masks(frames), frames.cameras)
-    names = [path.relative_to(scene).as_posix() for path in frames.masks]
+    names = [_within(path, scene).as_posix() for path in frames.masks]
     cut = find_isosurface(GEOMETRIES[config.geometry](views, names, config))
     trusted = without_outliers(cut, views, config.outliers)
     refined = refine(cut, Refinement(), views=trusted)
@@ -89,6 +89,11 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
 def is_there(out: Path, facts: GeometryFacts) -> bool:
     """Returns whether the surface is where it was written."""
     return (out / FOLDER / facts.mesh).is_file()
+
+
+def _within(path: Path, scene: Path) -> Path:
+    """Returns the path of a file from its scene on, which may lie elsewhere tomorrow."""
+    return path.relative_to(scene) if path.is_relative_to(scene) else path
 
 
 def _object(scene: Path) -> str:

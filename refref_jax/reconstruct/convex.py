@@ -42,6 +42,9 @@ _FLAT = 0.003
 _MOSTLY = 0.85
 _FITS = 6
 
+# Planes or corners of a body.
+_LEAST = 4
+
 # Corners of the intersection closer than this share of the diameter are one.
 _SAME = 1e-6
 
@@ -128,9 +131,9 @@ def from_tangents(mesh: Mesh, *, crease_angle: float = CREASE) -> Mesh:
     plain = hull(mesh)
     if not _sharp_pairs(mesh, crease_angle)[0].size:
         return plain
+    planes = _planes(mesh, _patches(mesh, crease_angle))
     try:
-        points = _intersection(mesh, plain.vertices.mean(axis=0), crease_angle)
-        body = of_points(points)
+        body = of_points(_intersection(planes, mesh, plain.vertices.mean(axis=0)))
     except QhullError:
         return plain
     growth = volume(body.vertices, body.faces) / volume(plain.vertices, plain.faces) - 1.0
@@ -138,12 +141,20 @@ def from_tangents(mesh: Mesh, *, crease_angle: float = CREASE) -> Mesh:
 
 
 def _intersection(
-    mesh: Mesh, inside: Float[np.ndarray, "3"], crease_angle: float
+    planes: Float[np.ndarray, "planes 4"], mesh: Mesh, inside: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n 3"]:
-    planes = _planes(mesh, _patches(mesh, crease_angle))
-    behind = planes[:, :3] @ inside + planes[:, 3] < 0.0
-    points = HalfspaceIntersection(planes[behind], inside).intersections
+    """Returns the corners of what lies behind planes, of those that a point inside is behind.
+
+    Raises:
+      QhullError: if the planes do not close.
+    """
+    planes = planes[planes[:, :3] @ inside + planes[:, 3] < 0.0]
+    if len(planes) < _LEAST:
+        raise QhullError(f"{len(planes)} planes close nothing")
+    points = HalfspaceIntersection(planes, inside).intersections
     points = points[np.all(np.isfinite(points), axis=1)]
+    if len(points) < _LEAST:
+        raise QhullError(f"{len(points)} corners are no body")
     size = _SAME * diameter(mesh.vertices)
     return size * np.unique(np.rint(points / size), axis=0)
 

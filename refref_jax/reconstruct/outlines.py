@@ -120,12 +120,12 @@ def look_up(image: Image, pixels: Pixels) -> tuple[Values, Pixels]:
     return value(0.0, 0.0), np.stack([across, along], axis=-1)
 
 
-def overlap(corners: Corners, views: Views) -> float:
-    """Returns the overlap of masks and outlines (IoU), mean over views."""
+def outline_overlaps(corners: Corners, views: Views) -> Float[np.ndarray, " views"]:
+    """Returns the overlap of mask and outline in each view (IoU)."""
     cameras = views.cameras
     images = (project(corners, pose, cameras).pixels for pose in cameras.poses)
     seen = [_fill(pixels[polygon(pixels)], cameras.height, cameras.width) for pixels in images]
-    return float(np.mean(overlaps(np.stack(seen), views.masks)))
+    return overlaps(np.stack(seen), views.masks)
 
 
 def _fill(corners: Polygon, height: int, width: int) -> Bool[np.ndarray, "h w"]:

@@ -57,18 +57,28 @@ def overlaps(
     return np.where(either > 0, both / np.maximum(either, 1), 1.0)
 
 
-def check_masks(masks: Bool[np.ndarray, "views h w"], cameras: Cameras) -> None:
+def check_masks(masks: np.ndarray, cameras: Cameras) -> None:
     """Checks that there are masks, one a camera, of its size, and that each marks something.
 
     Raises:
-      ReconstructionError: otherwise.
+      ReconstructionError: otherwise, if masks are no booleans, or if cameras are not finite.
     """
+    if masks.dtype != np.bool_:
+        raise ReconstructionError(
+            f"The masks are {masks.dtype}. Give booleans, as in masks > 127 of 8 bits."
+        )
     if len(masks) == 0:
         raise ReconstructionError("There is no mask. Give one for each camera, several in all.")
     if len(masks) != len(cameras.poses):
         raise ReconstructionError(
             f"There are {len(masks)} masks and {len(cameras.poses)} cameras. Give one mask for "
             "each camera."
+        )
+    broken = np.flatnonzero(~np.all(np.isfinite(cameras.poses), axis=(1, 2)))
+    if len(broken) or not 0.0 < cameras.focal < np.inf:
+        raise ReconstructionError(
+            f"Poses that are not finite: {len(broken)}, of cameras {broken[:5]}; the focal "
+            f"length is {cameras.focal}. Leave these views out, and give the length in pixels."
         )
     height, width = masks.shape[1:]
     if (height, width) != (cameras.height, cameras.width):

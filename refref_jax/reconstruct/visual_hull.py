@@ -32,6 +32,9 @@ REACH = 2.1
 TOLERANCE = 0.05
 """Pixels outside of an outline up to which nothing is carved: about half a standard error."""
 
+LEAST_RESOLUTION = 10
+"""Cells of a grid, of which some are its rim."""
+
 _LIMITLESS = (
     "What {count} masks leave reaches out of the cube from -{reach} to {reach} around the origin, "
     "in which a body is looked for. Give masks from other sides, if few views see it; else scale "
@@ -73,7 +76,7 @@ def carve(
     Args:
       masks: one a view, true where the object is seen.
       cameras: of the masks, in the same order.
-      resolution: cells along the longest edge of the box.
+      resolution: cells along the longest edge of the box, at least `LEAST_RESOLUTION`.
       box: where the body lies; found from the masks within `REACH` of the origin if not given.
       outliers: values passed over at each point.
       tolerance: pixels outside of an outline up to which nothing is carved, see the module.
@@ -81,14 +84,19 @@ def carve(
       names: what the masks are called in errors; their numbers if not given.
 
     Raises:
-      ReconstructionError: if there is no mask, if a mask is empty or of another size, if as many
-        views are passed over as there are, if nothing is left, or if what is left reaches out of
-        the cube of `REACH` (as with one view).
+      ReconstructionError: if there is no mask, if a mask is empty, of another size or no booleans,
+        if a pose is not finite, if as many views are passed over as there are, if the grid is too
+        coarse, if nothing is left, or if what is left reaches out of the cube of `REACH` (as with
+        one view).
     """
     check_masks(masks, cameras)
     if not 0 <= outliers < len(masks):
         raise ReconstructionError(
             f"outliers={outliers}, but there are {len(masks)} views. Pass over fewer, 0 or more."
+        )
+    if resolution < LEAST_RESOLUTION:
+        raise ReconstructionError(
+            f"resolution={resolution} is too coarse. Give {LEAST_RESOLUTION} cells or more."
         )
     field = hull_field(masks, cameras, outliers=outliers, tolerance=tolerance, blur=blur)
     if box is None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from refref_jax.reconstruct.agreement import carved_alone, without_outliers
+from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.silhouettes import Views
 from tests.reconstruct import bodies
 
@@ -39,6 +40,18 @@ def test_points_that_no_view_sees_count_for_nothing():
     few = _views()._replace(cameras=_views().cameras._replace(focal=4.0 * _views().cameras.focal))
     shares = carved_alone(few)
     assert np.all(np.isfinite(shares)) and shares.max() <= 1.0
+
+
+@pytest.mark.parametrize("count", [-1, 30])
+def test_no_more_views_can_be_left_out_than_there_are(count):
+    with pytest.raises(ReconstructionError, match="can not be left out"):
+        without_outliers(bodies.icosphere(1), _views(), count)
+
+
+def test_no_views_carve_nothing():
+    cameras = _views().cameras
+    with pytest.raises(ReconstructionError, match="There is no mask"):
+        carved_alone(Views(_views().masks[:0], cameras._replace(poses=cameras.poses[:0])))
 
 
 def test_the_view_that_overlaps_least_is_left_out():

@@ -7,9 +7,9 @@ import pytest
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.grids import Box, Grid, gradient, interpolate, sample
 from refref_jax.reconstruct.isosurface import find_isosurface
-from refref_jax.reconstruct.silhouettes import signed_distances
+from refref_jax.reconstruct.silhouettes import check_masks, signed_distances
 from refref_jax.reconstruct.triangles import volume
-from refref_jax.reconstruct.visual_hull import carve, hull_field
+from refref_jax.reconstruct.visual_hull import LEAST_RESOLUTION, carve, hull_field
 from tests.reconstruct import bodies
 
 _BOX = Box(np.full(3, -1.5), np.full(3, 1.5))
@@ -172,6 +172,18 @@ def test_errors_say_what_to_do():
         carve(masks & (~np.isin(np.arange(30), (0, 2)))[:, None, None], cameras)
     with pytest.raises(ReconstructionError, match="Pass over fewer"):
         carve(masks, cameras, outliers=30)
+    with pytest.raises(ReconstructionError, match="resolution=9 is too coarse"):
+        carve(masks, cameras, resolution=9)
+    with pytest.raises(ReconstructionError, match="masks are uint8"):
+        check_masks(masks.astype(np.uint8), cameras)
+    broken = cameras.poses.copy()
+    broken[3, 0, 3] = np.nan
+    with pytest.raises(ReconstructionError, match=r"not finite: 1, of cameras \[3\]"):
+        carve(masks, cameras._replace(poses=broken))
+
+
+def test_the_coarsest_grid_still_makes_a_body():
+    assert _volume(carve(*_ball_views(), resolution=LEAST_RESOLUTION)) > 0.5 * _BALL
 
 
 @pytest.mark.parametrize("views", [1, 2])

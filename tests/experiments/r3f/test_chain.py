@@ -340,11 +340,16 @@ def test_a_body_that_light_blew_up_is_left_out(scene, monkeypatch, tmp_path):
 
 
 def test_options_may_change_until_a_stage_has_used_them(scene, tmp_path):
-    hopeless = dataclasses.replace(_CONFIG, outliers=24)
-    with pytest.raises(ValueError, match="Pass over fewer"):
-        _run(scene, tmp_path / "out", hopeless)
     asked = records.Reconstruction("", chain.fingerprint(scene), _CONFIG)
+    other = dataclasses.replace(asked, config=dataclasses.replace(_CONFIG, outliers=3))
+    assert records.begin(tmp_path / "out", other).config.outliers == 3
     assert records.begin(tmp_path / "out", asked).config == _CONFIG
+
+
+def test_more_outliers_than_masks_are_refused_before_anything_is_written(scene, tmp_path):
+    with pytest.raises(ValueError, match="there are 24 train masks"):
+        _run(scene, tmp_path / "out", dataclasses.replace(_CONFIG, outliers=24))
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_that_was_killed_while_it_was_opened_is_taken(scene, tmp_path):
