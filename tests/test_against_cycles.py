@@ -59,7 +59,7 @@ def _psnr(image, target, mask):
     [
         (STRAIGHT, 8.0, 13.0),
         pytest.param(Budget(10, "none"), 22.0, 28.0, marks=pytest.mark.slow),
-        (PAPER, 27.0, 33.0),
+        pytest.param(PAPER, 27.0, 33.0, marks=pytest.mark.slow),
         (TREE, 41.5, 48.0),
     ],
     ids=["straight", "refraction", "paper", "tree"],

@@ -189,6 +189,7 @@ def scene(tmp_path_factory):
     return make
 
 
+@pytest.mark.slow
 def test_scenes_and_options_become_plans(scene):
     clear = scene("clear", colour_per_interface=[1, 1, 1])
     tint, absorption = [0.5, 0.75, 1.0], [0.0, 0.25, 0.0]

@@ -102,11 +102,13 @@ def test_meetings_and_passages_are_those_of_the_whole_path():
     assert white.meetings.max() == 3.0 and white.passages.max() > 1.0
 
 
+@pytest.mark.slow
 def test_nothing_is_tallied_unless_asked():
     paths = _trace(_two_balls(), _rays()).paths
     assert paths.meetings.shape == paths.passages.shape == (_CAPACITY, 0)
 
 
+@pytest.mark.slow
 def test_a_promise_of_no_reentry_changes_casts_only():
     ball = scenes.geometry(scenes.ball(1.0, subdivisions=3))
     never = Budget(bends=24, reflections="all", cut=0.02, reentry="impossible")

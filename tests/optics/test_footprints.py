@@ -62,6 +62,7 @@ def test_a_slab_narrows_a_footprint_by_its_index():
     )
 
 
+@pytest.mark.slow
 def test_a_mirror_leaves_a_footprint_as_wide_as_it_was():
     paths = _traced(_SLAB, scenes.rays([0.1, 0.05, -4.0], [0.3, 0.1, 1.0]))
     mirrored = next(i for i in range(64) if exists(paths)[i] and int(paths.bends[i]) == 1)

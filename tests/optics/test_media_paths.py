@@ -90,6 +90,7 @@ def test_a_contained_body_of_higher_priority_is_the_nested_model():
         np.testing.assert_allclose(getattr(ranked, name), getattr(nested, name), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_contained_body_of_lower_priority_is_invisible():
     geometry = scenes.geometry(*_balls((2, 1)), rule="priority")
     origins, directions = _bundle(_RAYS)
@@ -231,6 +232,7 @@ def _trace_balls(priorities, point, direction):
 
 
 @pytest.mark.parametrize("priorities", [(3, 2, 1), (1, 2, 3), (2, 3, 1)])
+@pytest.mark.slow
 def test_three_balls_that_overlap(priorities):
     balls = [
         _ranked(

@@ -148,6 +148,7 @@ def test_equal_indices_are_invisible():
         np.testing.assert_array_equal(paths.weights, 1.0)
 
 
+@pytest.mark.slow
 def test_light_paths_are_reversible():
     geometry = scenes.geometry(scenes.box((1.0, 1.2, 1.4), index=1.5))
     generator = np.random.default_rng(3)
@@ -241,7 +242,10 @@ def _many_rays():
 
 @pytest.mark.parametrize(
     ("budget", "capacity"),
-    [(TREE, 1), pytest.param(PAPER, 70, marks=pytest.mark.slow), (TREE, 200)],
+    [
+        (TREE, 1),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((PAPER, 70), (TREE, 200))),
+    ],
 )
 def test_weights_and_losses_of_every_ray_sum_to_one_at_any_capacity(budget, capacity):
     traced = _trace(
@@ -390,6 +394,7 @@ def test_a_survey_counts_paths_and_hits():
     assert float(found.hit_fraction) == pytest.approx(np.mean(counts == 2))
 
 
+@pytest.mark.slow
 def test_light_that_escapes_a_closed_body_has_left_its_medium():
     # Aimed next to the edges of a box: through a tolerant face light enters beside the body, and
     # never leaves it. Only rays as close to an edge as rounding may do so.

@@ -170,10 +170,8 @@ class _Knobs(NamedTuple):
 
 
 # The slab has its closed form below as well.
-@pytest.mark.parametrize(
-    "case",
-    [pytest.param(c, marks=pytest.mark.slow) if not c.startswith("prism") else c for c in _CASES],
-)
+@pytest.mark.parametrize("case", _CASES)
+@pytest.mark.slow
 def test_gradients_agree_with_differences(case):
     make, origin, direction, reflects = _CASES[case]
     with jax.enable_x64(True):

@@ -65,9 +65,8 @@ def test_the_slope_is_that_of_the_errors(ball, seen, index):
     assert float(found.slope) == pytest.approx((other - one) / 4e-3, rel=0.5, abs=0.1)
 
 
-@pytest.mark.parametrize(
-    "start", [1.2, *(pytest.param(at, marks=pytest.mark.slow) for at in (None, 2.0))]
-)
+@pytest.mark.parametrize("start", [None, 1.2, 2.0])
+@pytest.mark.slow
 def test_the_index_is_found_from_any_start(ball, seen, start):
     evidence, views = seen
     looks = []
@@ -91,6 +90,7 @@ def test_the_index_is_found_from_any_start(ball, seen, start):
     assert len(looks) <= looks[0][1] == most_looks(search, start=start)
 
 
+@pytest.mark.slow
 def test_no_pixels_and_no_light_are_refused(ball, seen):
     evidence, views = seen
     nothing = jax.tree.map(lambda x: x[:0], evidence.rays)

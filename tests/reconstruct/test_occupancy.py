@@ -125,6 +125,7 @@ def test_the_same_seed_gives_the_same_grid_and_another_one_another():
     assert not np.array_equal(first.values, _fit(*_ball_views(), seed=1).values)
 
 
+@pytest.mark.slow
 def test_one_view_and_one_without_an_outline_are_taken():
     masks, cameras = _ball_views()
     cameras = cameras._replace(poses=cameras.poses[:1])

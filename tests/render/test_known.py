@@ -76,7 +76,9 @@ def test_the_size_of_a_tile_does_not_matter(geometry, rays, budget):
     assert pieces.casts == one.casts
 
 
-@pytest.mark.parametrize("budget", [PAPER, TREE], ids=["paper", "tree"])
+@pytest.mark.parametrize(
+    "budget", [pytest.param(PAPER, marks=pytest.mark.slow), TREE], ids=["paper", "tree"]
+)
 def test_clear_glass_before_white_is_white(geometry, rays, budget):
     seen = render_known(geometry, _WHITE, rays, budget=budget, tile=256)
     np.testing.assert_allclose(seen.linear + seen.lost, 1.0, atol=1e-5)

@@ -61,7 +61,7 @@ _begin = jax.jit(optimizer(_SCHEDULE).init)
 _each_precision = pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 
 # A step takes seconds to compile: every run of the suite does the richest, and one in bfloat16.
-_OFTEN = [("absorbing", "float32"), ("field", "bfloat16")]
+_OFTEN = [("absorbing", "float32")]
 _each_case = pytest.mark.parametrize(
     ("name", "precision"),
     [

@@ -46,7 +46,8 @@ def _assert_identical(a, b):
 
 
 # Within a pool, and between two.
-@pytest.mark.parametrize("pause", [6, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("pause", [4, 6])
+@pytest.mark.slow
 def test_a_resumed_run_continues_bit_for_bit(tmp_path, pause):
     straight_through, reports = _train(_setup(), _start(), 12)
     first, early = _train(_setup(), _start(), pause)

@@ -81,6 +81,7 @@ def test_findings_are_complaints_unless_they_are_notes():
     assert checks.complaints(False, findings, []) == ["cup: is odd"] * 2
 
 
+@pytest.mark.slow
 def test_the_bundled_scene_agrees_with_cycles(copy):
     report = scene_check.check_scene(copy, budgets.TREE, views=1, side=6)
     assert report.complaints == [] and report.notes == [] and len(report.views) == 1
