@@ -1,4 +1,4 @@
-"""Renders the views of a split, or an orbit, as pictures, distance maps and a GIF.
+"""Renders the views of a split, or an orbit, as pictures, distance maps and videos.
 
 python -m experiments.render --run=runs/ball --views=orbit --frames=60
 """
@@ -6,10 +6,9 @@ python -m experiments.render --run=runs/ball --views=orbit --frames=60
 import math
 from pathlib import Path
 
-import imageio.v3 as iio
 from absl import flags
 
-from experiments import commands, figures, scene_option, supersampling
+from experiments import commands, figures, scene_option, supersampling, videos
 from refref_jax.data import files, local_layout
 from refref_jax.data.cameras import Cameras, orbit
 from refref_jax.render import load_model
@@ -27,7 +26,7 @@ _SIZE = flags.DEFINE_integer("size", 200, "Width and height of an orbit's frames
 _FOV = flags.DEFINE_float("fov", 66.785, "Horizontal field of view of an orbit, degrees.", 1, 179)
 _DISTANCE = flags.DEFINE_float("distance", 4.0, "Distance of an orbit from the origin.", 1e-3)
 _ELEVATION = flags.DEFINE_float("elevation", 20.0, "Elevation of an orbit, degrees.", -89, 89)
-_FPS = flags.DEFINE_float("fps", 15.0, "Frames a second of the GIF.", 0.1)
+_FPS = flags.DEFINE_float("fps", 15.0, "Frames a second of the videos.", 0.1)
 _RAYS_PER_PIXEL = flags.DEFINE_integer(
     "rays_per_pixel", 1, "Rays in each pixel, a square: 1, 4, 9, 16. They are averaged."
 )
@@ -53,9 +52,12 @@ def main() -> None:
             distances.append(seen.distance)
             bar.show(i + 1, name)
     coloured = figures.colour_distances(distances)
-    _write_gif(out / "rgb.gif", frames)
-    _write_gif(out / "distance.gif", coloured)
-    print(f"Pictures: {out / 'rgb.gif'}, {out / 'distance.gif'}, {out / 'rgb'}")
+    for name, video in (("rgb", frames), ("distance", coloured)):
+        for path in videos.write(out / name, video, fps=_FPS.value):
+            print(f"Video: {path}")
+    if not videos.has_ffmpeg():
+        print(f"Videos as mp4 too: {videos.INSTALL}")
+    print(f"Pictures: {out / 'rgb'}")
     print(f"Distance in world units: {out / 'distance'}")
 
 
@@ -72,10 +74,6 @@ def _cameras(run: Path) -> tuple[Cameras, tuple[str, ...]]:
     scene = scene_option.opened(_SCENE.value or run_folder.read_config(run).scene.path)
     frames = local_layout.read_frames(scene, _VIEWS.value)
     return frames.cameras, frames.names
-
-
-def _write_gif(path: Path, frames: list) -> None:
-    iio.imwrite(path, frames, plugin="pillow", extension=".gif", duration=1000 / _FPS.value, loop=0)
 
 
 if __name__ == "__main__":

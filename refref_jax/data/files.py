@@ -91,7 +91,17 @@ def write_exr(path: Path, pixels: Float[np.ndarray, "h w *channels"]) -> None:
 
 def write_rgb(path: Path, pixels: Float[np.ndarray, "h w 3"]) -> None:
     """Writes an sRGB image in `[0, 1]` as 8-bit PNG; values outside are clipped."""
-    iio.imwrite(path, to_bytes(pixels), plugin="pillow", extension=".png")
+    write_png(path, to_bytes(pixels))
+
+
+def write_mask(path: Path, mask: Bool[np.ndarray, "h w"]) -> None:
+    """Writes a mask as 8-bit PNG: white where it is true, black elsewhere."""
+    write_png(path, np.where(mask, 255, 0).astype(np.uint8))
+
+
+def write_png(path: Path, pixels: UInt8[np.ndarray, "h w *channels"]) -> None:
+    """Writes an 8-bit image as it is."""
+    iio.imwrite(path, pixels, plugin="pillow", extension=".png")
 
 
 def to_bytes(pixels: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:

@@ -10,7 +10,6 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-import imageio.v3 as iio
 import numpy as np
 from jaxtyping import Bool
 
@@ -68,8 +67,7 @@ def _add_to_split(scene: Path, path: Path, segment: Segment) -> int:
         mask = _mask_of(scene / f"{stem}.png", segment)
         name = Path("mask") / f"{stem}.png"
         (path.parent / name).parent.mkdir(parents=True, exist_ok=True)
-        pixels = np.where(mask, 255, 0).astype(np.uint8)
-        iio.imwrite(path.parent / name, pixels, plugin="pillow", extension=".png")
+        files.write_mask(path.parent / name, mask)
         frame["mask_file_path"] = f"./{name.as_posix()}"
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     return len(frames)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from experiments import videos
 from refref_jax.data import files
 from refref_jax.render import load_model
 from tests.experiments.command import ROOT, TINY, run_command
@@ -151,6 +152,8 @@ def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
     assert files.read_exr(out / "distance" / "r_001.exr").shape == (24, 24)
     assert iio.imread(out / "rgb.gif").shape[:3] == (2, 24, 24)
     assert iio.imread(out / "distance.gif").shape[1:] == (24, 24, 3)
+    if videos.has_ffmpeg():
+        assert iio.imread(out / "rgb.mp4", plugin="FFMPEG").shape == (2, 24, 24, 3)
 
 
 @pytest.mark.parametrize(
@@ -167,6 +170,9 @@ def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
         ("evaluate", ("--run=nowhere", "--lpips_weights=none.npz"), "none.npz can not be read"),
         ("render", ("--run=nowhere",), "nowhere/model.json does not exist"),
         ("render", ("--run=nowhere", "--rays_per_pixel=0"), "Give 1."),
+        ("export", ("--run=nowhere", "--what=mesh", "--out=x.ply"), "nowhere/model.json does not"),
+        ("export", ("--run=nowhere", "--what=body", "--out=x.ply"), "nowhere/geometry.npz can not"),
+        ("export", ("--run=nowhere", "--what=body", "--out=x.obj"), "ends with .ply"),
     ],
 )
 def test_mistakes_end_with_one_line_that_says_what_to_do(tmp_path, command, options, message):
@@ -188,6 +194,8 @@ def test_mistakes_end_with_one_line_that_says_what_to_do(tmp_path, command, opti
         "reconstruct",
         "render",
         "render_known",
+        "export",
+        "convert_nerfstudio",
         "path_trade_off",
         "trade_off",
         "recommend",

@@ -1,0 +1,164 @@
+"""Converts nerfstudio's captures (transforms.json) to scenes, and scenes to captures.
+
+python -m experiments.convert_nerfstudio --source=CAPTURE --out=SCENE --centre=auto --scale=auto
+python -m experiments.convert_nerfstudio --source=SCENE --out=CAPTURE --to=nerfstudio
+
+Captures of COLMAP come this way too, through nerfstudio's ns-process-data. `docs/data_formats.md`
+tells how, and what of a capture a scene can hold. Nothing is overwritten.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from absl import flags
+
+from experiments import commands
+from experiments.dataset.cameras import CAMERA_RADIUS
+from experiments.exchange import from_nerfstudio, to_nerfstudio
+from experiments.exchange.from_nerfstudio import Converted, View
+from refref_jax.data import nerfstudio, placement
+from refref_jax.data.placement import Placement
+from refref_jax.reconstruct.visual_hull import REACH
+
+_SOURCE = flags.DEFINE_string("source", None, "What to convert: a folder.", required=True)
+_OUT = flags.DEFINE_string("out", None, "Folder to write; must not exist.", required=True)
+_TO = flags.DEFINE_enum("to", "scene", ["scene", "nerfstudio"], "What to write.")
+_MASKS = flags.DEFINE_enum(
+    "masks",
+    "object",
+    ["object", "background", "none"],
+    "What is white in nerfstudio's masks: the object, or all but the object; none leaves them out. "
+    "nerfstudio ignores what is black.",
+)
+_TEST_EVERY = flags.DEFINE_integer(
+    "test_every", 8, "Each n-th image is for testing, if the capture has no lists.", 2
+)
+_WORLD = flags.DEFINE_enum(
+    "world",
+    "file",
+    ["file", "original"],
+    "Frame of the poses: the file's, or that of before its applied_transform (as COLMAP's).",
+)
+_CENTRE = flags.DEFINE_string(
+    "centre", "0,0,0", "What becomes the origin: x,y,z, or auto for where the optical axes meet."
+)
+_SCALE = flags.DEFINE_string(
+    "scale", "1", "Factor of all lengths, or auto: cameras are 4 from the origin on average."
+)
+
+
+def main() -> None:
+    """Converts one folder."""
+    if _TO.value == "scene":
+        _make_scene(Path(_SOURCE.value), Path(_OUT.value))
+    else:
+        _make_capture(Path(_SOURCE.value), Path(_OUT.value))
+
+
+def _make_scene(source: Path, out: Path) -> None:
+    capture = nerfstudio.read_capture(source)
+    poses = from_nerfstudio.positions(capture, original=_WORLD.value == "original")
+    where = _chosen_placement(poses)
+    poses = placement.place(poses, where)
+    splits = capture.splits or nerfstudio.every_nth(len(capture.frames), every=_TEST_EVERY.value)
+    views = {
+        split: [View(capture.frames[number], poses[number]) for number in numbers]
+        for split, numbers in splits.items()
+    }
+    total = sum(map(len, views.values()))
+    with commands.ProgressBar("convert", total) as bar:
+        steps = iter(range(1, total + 1))
+        written = from_nerfstudio.write_scene(
+            views, out, _MASKS.value, step=lambda: bar.show(next(steps), "images")
+        )
+    listed = {number for numbers in splits.values() for number in numbers}
+    _tell_splits(written)
+    _tell_left_out(capture, len(capture.frames) - len(listed))
+    _tell_placement(poses, where)
+    print(f"Scene:   {out}")
+    masked = next(iter(written.values())).masked is not None
+    run = ("reconstruct" if masked else "train", f"--scene={out}")
+    print(f"Next: {commands.shell(*run, '--background=unbounded', f'--out={out}_run')}")
+
+
+def _make_capture(source: Path, out: Path) -> None:
+    splits = to_nerfstudio.read_splits(source)
+    total = sum(len(frames.names) for frames in splits.values())
+    with commands.ProgressBar("convert", total) as bar:
+        steps = iter(range(1, total + 1))
+        to_nerfstudio.write_capture(
+            splits, out, _MASKS.value, step=lambda: bar.show(next(steps), "images")
+        )
+    for split, frames in splits.items():
+        print(f"{split}: {len(frames.names)} images")
+    if _MASKS.value != "none" and splits["train"].masks is not None:
+        kept = "the object alone" if _MASKS.value == "object" else "all but the object"
+        print(f"Masks: nerfstudio will train on {kept}; --masks=none for whole images.")
+    print("Left out: depth, meshes and scene.json, if there are any: the layout has no place.")
+    print(f"Capture: {out}")
+    print(f"Next: ns-train nerfacto --data {out}")
+
+
+def _chosen_placement(poses: np.ndarray) -> Placement:
+    if _CENTRE.value == "auto":
+        centre = placement.meeting_point(poses)
+    else:
+        centre = np.array([_number("centre", word) for word in _CENTRE.value.split(",")])
+        if centre.shape != (3,):
+            raise ValueError(f"--centre is {_CENTRE.value}. Give x,y,z, as 0,0.5,1, or auto.")
+    if _SCALE.value == "auto":
+        distance = np.linalg.norm(poses[:, :, 3] - centre, axis=-1).mean()
+        if distance == 0.0:
+            raise ValueError("All cameras stand in the centre. Give --scale a number.")
+        return Placement(centre, CAMERA_RADIUS / distance)
+    scale = _number("scale", _SCALE.value)
+    if not scale > 0.0:
+        raise ValueError(f"--scale is {scale:g}. Give a positive number, or auto.")
+    return Placement(centre, scale)
+
+
+def _number(flag: str, word: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise ValueError(f"--{flag} has {word!r}, which is no finite number. Give one, or auto.")
+    return value
+
+
+def _tell_splits(written: dict[str, Converted]) -> None:
+    for split, done in written.items():
+        columns, rows, _, stretch = done.lens
+        size, before = f"{columns.size} x {rows.size}", f"{done.before[0]} x {done.before[1]}"
+        cut = "" if size == before else f", cut from {before} around the principal point"
+        print(f"{split}: {done.frames} images of {size}{cut}")
+        if off := max(columns.shift, rows.shift) + stretch:
+            print(f"{split}: pixels are off by up to {off:.2f}, see docs/data_formats.md")
+        if done.masked is not None:
+            print(f"{split}: masks mark {100 * done.masked:.1f} % of the pixels as object")
+
+
+def _tell_left_out(capture: nerfstudio.Capture, unlisted: int) -> None:
+    if unlisted:
+        print(f"Left out: {unlisted} frames that are in no list of the capture.")
+    if capture.has_depth:
+        print("Left out: depth maps; they would serve evaluation alone.")
+    if "test" not in (capture.splits or {"test": ()}):
+        print("warning: there are no test images, so nothing can be evaluated on them.")
+
+
+def _tell_placement(poses: np.ndarray, where: Placement) -> None:
+    centre = ",".join(f"{value:.6g}" for value in where.centre)
+    print(f"World: x -> {where.scale:.6g} (x - ({centre})), which meshes have to go through too")
+    distances = np.linalg.norm(poses[:, :, 3], axis=-1)
+    print(f"Cameras: {distances.min():.3g} to {distances.max():.3g} from the origin")
+    if where.scale == 1.0 and not where.centre.any():
+        print(
+            f"R3F looks for the body within {REACH} units of the origin along each axis: "
+            "--centre and --scale move it there."
+        )
+
+
+if __name__ == "__main__":
+    commands.run(main)

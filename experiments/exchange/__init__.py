@@ -1,0 +1,1 @@
+"""Between our scenes and those of other programs."""

@@ -1,0 +1,1 @@
+"""Meshes and point clouds of trained runs, for other programs."""

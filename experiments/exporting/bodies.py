@@ -1,0 +1,69 @@
+"""Writes the bodies that bend light as PLY, with the normals that bend it.
+
+A run keeps them itself, in single precision; a reconstruction keeps its surface as a file.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from experiments.exporting.field_grid import split_parts
+from experiments.r3f import body, records
+from refref_jax.data import stored_normals
+from refref_jax.optics.wavefront import Geometry
+from refref_jax.reconstruct.triangles import Mesh
+from refref_jax.render.saved import load_geometry
+
+
+def write(run: Path, out: Path) -> list[Path]:
+    """Writes all bodies of a run, or of a reconstruction; each has a file of its own.
+
+    Args:
+      run: the folder.
+      out: of one body, its file; of several, their names are numbered: `out_0.ply`, `out_1.ply`.
+
+    Returns:
+      The files.
+
+    Raises:
+      ValueError: if it is no folder of a run, if there is no body, or a file exists.
+    """
+    if records.exists(run):
+        meshes = [body.read_mesh(run, _finished(run))]
+    else:
+        meshes = read_meshes(load_geometry(run))
+    if not meshes:
+        raise ValueError(
+            f"{run} has no body: it was trained along straight paths, or without meshes. Export "
+            "--what=mesh, or another run."
+        )
+    paths = [out]
+    if len(meshes) > 1:
+        paths = [out.with_stem(f"{out.stem}_{number}") for number in range(len(meshes))]
+    if existing := [path for path in paths if path.exists()]:
+        raise ValueError(f"{existing[0]} exists, and nothing is overwritten. Give another --out.")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    for path, mesh in zip(paths, meshes, strict=True):
+        stored_normals.write_mesh(path, *mesh)
+    return paths
+
+
+def read_meshes(geometry: Geometry) -> list[Mesh]:
+    """Returns the parts of a run's geometry in their order; vertices at one place are one."""
+    found = []
+    for surfaces, triangles in split_parts(geometry):
+        normals = surfaces.normals[: len(triangles)].astype(np.float64)
+        corners = surfaces.bvh.triangles[: len(triangles)].astype(np.float64)
+        vertices, index = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+        found.append(Mesh(vertices, index.reshape(-1, 3), normals))
+    return found
+
+
+def _finished(run: Path) -> records.Reconstruction:
+    found = records.read(run)
+    if found.geometry is None or found.index is None:
+        raise ValueError(
+            f"The reconstruction in {run} is not finished. Run `python -m experiments.reconstruct` "
+            "with the same options again: it goes on where it was stopped."
+        )
+    return found

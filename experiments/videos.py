@@ -1,0 +1,62 @@
+"""Writes pictures as a video: always as GIF, and as mp4 where there is an FFmpeg to do it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+from jaxtyping import UInt8
+
+INSTALL = "pip install 'refref_jax[video]'"
+"""What brings FFmpeg."""
+
+# Constant rate factor of H.264: lower is better; at 18 few see the loss.
+_QUALITY = "18"
+
+
+def has_ffmpeg() -> bool:
+    """Returns whether imageio can ask an FFmpeg."""
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        return False
+    try:
+        return bool(imageio_ffmpeg.get_ffmpeg_exe())
+    except RuntimeError:  # the package has no program for this machine, and there is none beside
+        return False
+
+
+def write(
+    stem: Path, frames: Sequence[UInt8[np.ndarray, "h w 3"]], *, fps: float
+) -> tuple[Path, ...]:
+    """Writes a video, replacing those of before.
+
+    Args:
+      stem: of the files' names; the endings are added.
+      frames: sRGB, all of one size.
+      fps: frames a second.
+
+    Returns:
+      The files: the GIF, and the mp4 if there is an FFmpeg.
+    """
+    gif, mp4 = (stem.with_name(f"{stem.name}.{ending}") for ending in ("gif", "mp4"))
+    iio.imwrite(gif, frames, plugin="pillow", extension=".gif", duration=1000.0 / fps, loop=0)
+    if not has_ffmpeg():
+        return (gif,)
+    iio.imwrite(
+        mp4,
+        np.stack([_even(frame) for frame in frames]),
+        plugin="FFMPEG",
+        extension=".mp4",
+        fps=fps,
+        codec="libx264",
+        macro_block_size=1,  # else pictures are resized to multiples of 16
+        output_params=["-crf", _QUALITY],
+    )
+    return gif, mp4
+
+
+def _even(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Repeats the last row and column of a picture of odd size: H.264 knows even ones only."""
+    height, width, _ = frame.shape
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

@@ -1,0 +1,225 @@
+"""The command that converts captures, as a user calls it, and what it refuses."""
+
+import shutil
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from experiments.exchange import from_nerfstudio, to_nerfstudio
+from experiments.exchange.from_nerfstudio import View
+from refref_jax.data import files, local_layout, nerfstudio
+from refref_jax.data.errors import SceneError
+from tests.data.small_captures import FOCAL, HEIGHT, WIDTH, edit, pixels_of, pose_of, write_capture
+from tests.data.small_scenes import write_scene
+from tests.experiments.command import run_command
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return write_capture(tmp_path / "capture")
+
+
+def _convert(folder, out, sense="object", numbers=None):
+    capture = nerfstudio.read_capture(folder)
+    chosen = range(len(capture.frames)) if numbers is None else numbers
+    views = [View(capture.frames[number], capture.frames[number].pose) for number in chosen]
+    return from_nerfstudio.write_scene({"train": views}, out, sense, step=lambda: None)["train"]
+
+
+def test_the_bundled_scene_comes_back_the_same(ball_scene, tmp_path):
+    splits = to_nerfstudio.read_splits(ball_scene)
+    splits = {
+        name: frames._replace(
+            names=frames.names[:3],
+            images=frames.images[:3],
+            masks=frames.masks[:3],
+            cameras=frames.cameras._replace(poses=frames.cameras.poses[:3]),
+        )
+        for name, frames in splits.items()
+    }
+    to_nerfstudio.write_capture(splits, tmp_path / "capture", "object", step=lambda: None)
+    capture = nerfstudio.read_capture(tmp_path / "capture")
+    views = {
+        split: [View(capture.frames[i], capture.frames[i].pose) for i in numbers]
+        for split, numbers in capture.splits.items()
+    }
+    from_nerfstudio.write_scene(views, tmp_path / "back", "object", step=lambda: None)
+    assert set(views) == set(splits) == {"train", "val", "test"}
+    for split, before in splits.items():
+        after = local_layout.read_frames(tmp_path / "back", split)
+        np.testing.assert_allclose(after.cameras.poses, before.cameras.poses, atol=1e-6)
+        assert after.cameras.focal == pytest.approx(before.cameras.focal, rel=1e-12)
+        assert [path.read_bytes() for path in after.images] == [
+            path.read_bytes() for path in before.images
+        ]
+        masks = local_layout.read_masks(after)
+        np.testing.assert_array_equal(masks, [files.read_mask(path) for path in before.masks])
+        assert 0.1 < masks.mean() < 0.4
+
+
+def test_the_command_both_ways(folder, tmp_path):
+    options = ("--centre=auto", "--scale=auto", "--test_every=4")
+    to_scene = (f"--source={folder}", f"--out={tmp_path / 'scene'}", *options)
+    result = run_command("convert_nerfstudio", *to_scene)
+    assert "train: 6 images of 12 x 10" in result.stdout and "test: 3 images" in result.stdout
+    assert "World: x -> 0.8 (x - (" in result.stdout  # from 5 units to the data set's 4
+    assert "Cameras: 4 to 4 from the origin" in result.stdout
+    assert "experiments.reconstruct" in result.stdout
+    local_layout.check_scene(tmp_path / "scene", needed=("train", "test"))
+    train = local_layout.read_frames(tmp_path / "scene", "train")
+    numbers = [1, 2, 3, 5, 6, 7]
+    expected = np.stack([pose_of(number)[:3] for number in numbers])
+    expected[..., 3] *= 0.8
+    np.testing.assert_allclose(train.cameras.poses, expected, atol=1e-9)
+    assert train.cameras.focal == pytest.approx(FOCAL)
+    np.testing.assert_array_equal(
+        local_layout.read_images(train), [pixels_of(number) for number in numbers]
+    )
+    again = run_command("convert_nerfstudio", *to_scene, fails=True)
+    assert "nothing is overwritten" in again.stderr and "Traceback" not in again.stderr
+    back = (f"--source={tmp_path / 'scene'}", f"--out={tmp_path / 'back'}", "--to=nerfstudio")
+    result = run_command("convert_nerfstudio", *back)
+    assert "train on the object alone" in result.stdout
+    assert "ns-train nerfacto --data" in result.stdout
+    assert len(nerfstudio.read_capture(tmp_path / "back").frames) == 9
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("--centre=1,2", "Give x,y,z"),
+        ("--centre=1,2,x", "has 'x', which is no finite number"),
+        ("--scale=-1", "Give a positive number, or auto"),
+        ("--source=nowhere", "Give the folder that holds transforms.json"),
+    ],
+)
+def test_mistakes_end_with_one_line(folder, tmp_path, option, message):
+    options = (f"--source={folder}", f"--out={tmp_path / 'out'}", option)
+    result = run_command("convert_nerfstudio", *options, fails=True)
+    assert message in result.stderr and len(result.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_original_world_is_that_of_before_the_applied_transform(folder):
+    motion = [[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]  # what ns-process-data does
+    edit(folder, lambda content: content.update(applied_transform=motion, applied_scale=2.0))
+    capture = nerfstudio.read_capture(folder)
+    kept = from_nerfstudio.positions(capture, original=False)
+    np.testing.assert_array_equal(kept[3], pose_of(3)[:3])
+    found = from_nerfstudio.positions(capture, original=True)
+    turned = np.array(motion)[:, :3] @ found[3]
+    turned[:, 3] *= 2.0
+    np.testing.assert_allclose(turned, pose_of(3)[:3], atol=1e-12)
+
+
+def _white_but_for(capture, *pixel):
+    for path in (capture / "masks").iterdir():
+        mask = np.ones((HEIGHT, WIDTH), bool)
+        mask[pixel] = False
+        files.write_mask(path, mask)
+
+
+def test_masks_mean_what_they_are_said_to(folder, tmp_path):
+    assert _convert(folder, tmp_path / "white").masked == pytest.approx(1.0 / 120.0)
+    frames = local_layout.read_frames(tmp_path / "white", "train")
+    assert np.argwhere(local_layout.read_masks(frames)[0]).tolist() == [[4, 5]]
+    _white_but_for(folder, 2, 3)
+    _convert(folder, tmp_path / "black", "background")
+    frames = local_layout.read_frames(tmp_path / "black", "train")
+    assert np.argwhere(local_layout.read_masks(frames)[0]).tolist() == [[2, 3]]
+    assert _convert(folder, tmp_path / "none", "none").masked is None
+    assert local_layout.read_frames(tmp_path / "none", "train").masks is None
+
+
+def test_what_masks_are_written_for_nerfstudio(tmp_path):
+    scene = write_scene(tmp_path / "scene")
+    splits = to_nerfstudio.read_splits(scene)
+    for sense, white in (("object", 1), ("background", 8 * 6 - 1)):
+        to_nerfstudio.write_capture(splits, tmp_path / sense, sense, step=lambda: None)
+        mask = iio.imread(tmp_path / sense / "masks" / "train_0.png", plugin="pillow")
+        assert mask.ndim == 2 and set(np.unique(mask)) == {0, 255}  # one channel, black and white
+        assert (mask == 255).sum() == white
+    to_nerfstudio.write_capture(splits, tmp_path / "none", "none", step=lambda: None)
+    assert not (tmp_path / "none" / "masks").exists()
+    with pytest.raises(SceneError, match="nothing is overwritten"):
+        to_nerfstudio.write_capture(splits, tmp_path / "none", "none", step=lambda: None)
+
+
+def test_images_are_cut_around_the_principal_point(folder, tmp_path):
+    edit(folder, lambda content: content.update(cx=4.9, cy=6.0))
+    done = _convert(folder, tmp_path / "scene")
+    assert (done.lens.columns.size, done.lens.rows.size) == (10, 8)
+    assert done.lens.columns.shift == pytest.approx(0.1) and done.lens.rows.shift == 0.0
+    frames = local_layout.read_frames(tmp_path / "scene", "train")
+    np.testing.assert_array_equal(local_layout.read_images(frames)[2], pixels_of(2)[2:, :10])
+    assert np.argwhere(local_layout.read_masks(frames)[0]).tolist() == [[2, 5]]
+    assert frames.cameras.focal == pytest.approx(FOCAL)  # of pixels, whatever is cut away
+
+
+def test_photographs_become_png(folder, tmp_path):
+    smooth = np.full((HEIGHT, WIDTH, 3), (200, 100, 50), np.uint8)
+    iio.imwrite(folder / "images" / "photo.jpg", smooth, plugin="pillow", quality=95)
+    edit(folder, lambda content: content["frames"][0].update(file_path="images/photo.jpg"))
+    _convert(folder, tmp_path / "scene")
+    read = local_layout.read_images(local_layout.read_frames(tmp_path / "scene", "train"))
+    photo = iio.imread(folder / "images" / "photo.jpg", plugin="pillow")
+    assert any(np.array_equal(photo, each) for each in read)
+
+
+def _tall(folder):
+    files.write_png(folder / "images" / "frame_00003.png", np.zeros((14, WIDTH, 3), np.uint8))
+
+    def change(content):
+        del content["w"], content["h"], content["cx"], content["cy"]
+
+    edit(folder, change)
+
+
+def _small_mask(folder):
+    files.write_mask(folder / "masks" / "frame_00003.png", np.ones((5, 6), bool))
+
+
+def _empty_mask(folder):
+    files.write_mask(folder / "masks" / "frame_00003.png", np.zeros((HEIGHT, WIDTH), bool))
+
+
+def _focals(values):
+    def change(content):
+        del content["fl_x"], content["fl_y"]
+        for record, value in zip(content["frames"], values, strict=True):
+            record["fl_x"] = value
+
+    return lambda folder: edit(folder, change)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (_tall, r"frame_00003\.png is 12 x 14 pixels, but images/frame_00000\.png is 12 x 10"),
+        (lambda folder: edit(folder, lambda c: c.update(fl_y=12.0)), "are not square: fl_x is 9"),
+        (_focals([9.0] * 8 + [12.0]), r"frame_00008\.png is 12 pixels, but the mean is 9\.33"),
+        (lambda folder: edit(folder, lambda c: c.update(cx=1.0)), r"point of .* is \(1, 5\), far"),
+        (_small_mask, r"frame_00003\.png is 6 x 5 pixels, but its image 12 x 10"),
+        (_empty_mask, r"frame_00003\.png marks no object, taking object for white"),
+    ],
+)
+def test_what_a_scene_can_not_hold_is_refused(folder, tmp_path, spoil, message):
+    spoil(folder)
+    with pytest.raises(SceneError, match=message):
+        _convert(folder, tmp_path / "scene")
+    assert [path.name for path in tmp_path.iterdir()] == ["capture"]
+
+
+def test_focal_lengths_that_differ_by_less_than_shows_share_their_mean(folder, tmp_path):
+    _focals([9.0] * 8 + [9.09])(folder)
+    done = _convert(folder, tmp_path / "scene")
+    assert done.lens.focal == pytest.approx(9.01)
+    assert done.lens.stretch == pytest.approx(0.08 / 9.01 * 6.0)  # at the image's border
+
+
+def test_a_capture_without_masks(folder, tmp_path):
+    shutil.rmtree(folder / "masks")
+    edit(folder, lambda content: [record.pop("mask_path") for record in content["frames"]])
+    assert _convert(folder, tmp_path / "scene").masked is None
+    assert local_layout.read_frames(tmp_path / "scene", "train").masks is None
