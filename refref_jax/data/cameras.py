@@ -127,6 +127,13 @@ def orbit(frames: int, *, distance: float, elevation: float, size: int, angle_x:
       elevation: angle above the horizontal plane in radians, strictly between -pi/2 and pi/2.
       size: width and height in pixels.
       angle_x: horizontal field of view in radians.
+
+    Example:
+      >>> import refref_jax
+      >>> cameras = refref_jax.orbit(8, distance=4.0, elevation=0.3, size=16, angle_x=1.2)
+      >>> rays = refref_jax.image_rays(cameras, 0)
+      >>> rays.directions.shape
+      (16, 16, 3)
     """
     azimuth = 2.0 * np.pi * np.arange(frames) / frames
     zero = np.zeros_like(azimuth)

@@ -37,6 +37,29 @@ def follow_main_branches(
 
     Raises:
       ValueError: if there are more reflections than bends.
+
+    Example:
+      A glass cube before a red wall, and how its colour changes with the index: more and more of
+      the black behind the camera is mirrored.
+
+      >>> import jax, numpy as np, trimesh
+      >>> import refref_jax
+      >>> from refref_jax.render import shade
+      >>> glass = refref_jax.single_body(trimesh.creation.box(), index=1.5)
+      >>> ray = refref_jax.Rays(np.array([-2.0, 0.1, 0.2]), np.array([1.0, 0.0, 0.0]), 1e-3)
+      >>> red = jax.numpy.array([1.0, 0.0, 0.0])
+      >>> wall = lambda origin, direction: jax.numpy.where(direction[0] > 0.0, red, 0.0)
+      >>> def colour(index):
+      ...     paths = refref_jax.follow_main_branches(
+      ...         refref_jax.with_index(glass, index),
+      ...         ray,
+      ...         budget=refref_jax.Budget(bends=2, reflections="all"),
+      ...         reflections=1,
+      ...     )
+      ...     return shade(paths, wall, rays=1)[0]
+      >>> value, slope = jax.jit(lambda n: jax.jvp(colour, (n,), (1.0,)))(1.5)
+      >>> print(np.round(value, 4), np.round(slope, 4))  # (4 n / (n + 1)^2)^2
+      [0.9216 0.     0.    ] [-0.2458  0.      0.    ]
     """
     if not 0 <= reflections <= budget.bends:
         raise ValueError(
