@@ -65,7 +65,14 @@ def pixel_rays(
 
 
 def image_rays(cameras: Cameras, camera: int) -> Rays:
-    """Returns the rays of all pixels of one camera, as `[height, width]`."""
+    """Returns the rays of all pixels of one camera, as `[height, width]`.
+
+    Example:
+      >>> import refref_jax
+      >>> cameras = refref_jax.orbit(1, distance=4.0, elevation=0.0, size=3, angle_x=1.2)
+      >>> refref_jax.image_rays(cameras, 0).directions[1, 1].tolist()  # the middle looks ahead
+      [-1.0, 0.0, 0.0]
+    """
     row, column = np.indices((cameras.height, cameras.width))
     return pixel_rays(cameras, np.full(row.shape, camera), row, column)
 

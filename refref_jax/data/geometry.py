@@ -74,9 +74,12 @@ def assemble(
       [1.0, 1.5]
     """
     tree = find_containment(parts)
-    findings = lint.lint(parts, tree)
     if rule == "priority":
+        # Bodies that overlap are what this rule is for.
+        findings = lint.lint(parts, tree._replace(overlaps=()))
         findings += rule_advice.examine_priorities(parts, tree)
+    else:
+        findings = lint.lint(parts, tree)
     refuse_errors(findings)
     for finding in findings:
         if finding.severity == "warning":

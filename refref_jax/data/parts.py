@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int
 
 from refref_jax.data import meshes
 from refref_jax.data.errors import SceneError
@@ -13,8 +12,8 @@ from refref_jax.data.meshes import MeshPart
 from refref_jax.data.part_descriptions import Colour, Shading
 from refref_jax.optics.interface_rules import CLEAR, NO_ABSORPTION
 
-Arrays = tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]
-"""Vertices in world units, and faces, counter-clockwise seen from outside."""
+Arrays = tuple[np.ndarray, np.ndarray]
+"""Vertices `[vertices, 3]` in world units; faces `[faces, 3]`, counter-clockwise from outside."""
 
 Mesh = str | os.PathLike[str] | trimesh.Trimesh | Arrays
 """What a part can be made of."""
