@@ -259,7 +259,7 @@ def _():
 def _():
     texels, directions = jnp.asarray(_TEXELS, jnp.float32), jnp.asarray(_DIRECTIONS, jnp.float32)
     mapped = jax.vmap(_look, in_axes=(None, 0))(texels, directions)
-    _same(mapped, [_look(texels, direction) for direction in directions])
+    _same(mapped, jnp.stack([_look(texels, direction) for direction in directions]))
 
 
 @_cell("radiance_of(...)", "grad")

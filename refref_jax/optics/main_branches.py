@@ -66,8 +66,8 @@ def follow_main_branches(
             f"{reflections} reflections do not fit into {budget.bends} bends. Ask for that many at "
             "most, 0 or more."
         )
-    first = jnp.arange(reflections)
-    once = first[:, None] == jnp.arange(budget.bends)[None]
+    first = jnp.arange(reflections, dtype=jnp.int32)
+    once = first[:, None] == jnp.arange(budget.bends, dtype=jnp.int32)[None]
     choices = jnp.concatenate([jnp.zeros_like(once, shape=(1, budget.bends)), once])
     paths = jax.vmap(lambda choice: follow_branch(geometry, ray, choice, budget=budget))(choices)
     # A main path that stays in its medium at a bend is reflected totally there.

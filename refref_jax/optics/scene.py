@@ -47,8 +47,8 @@ def with_index(geometry: Geometry, index: Float[ArrayLike, ""], *, part: int = 0
     new = jnp.asarray(index)
     interfaces = jax.tree.map(jnp.asarray, geometry.interfaces)
     # A number of Python's has no precision of its own.
-    if _is_real(new) and not new.weak_type:
-        interfaces = _in_precision(_highest((interfaces, new)), interfaces)
+    decisive = interfaces if new.weak_type else (interfaces, new)
+    interfaces = _in_precision(_highest(decisive), interfaces)
     parts = interfaces.index_inside.shape[0]
     if not 0 <= part < parts:
         raise ValueError(

@@ -22,7 +22,7 @@ def _paths():
     return paths._replace(
         directions=paths.directions.at[3].set(0.0),
         rays=jnp.array([1, 1, 0, 0], jnp.int32),
-        weights=jnp.array([0.75, 0.25, 0.5, 9.0])[:, None] * jnp.ones(3),
+        weights=jnp.array([0.75, 0.25, 0.5, 9.0])[:, None] * jnp.ones((1, 3)),
         statuses=paths.statuses.at[3].set(PathStatus.EMPTY),
     )
 
