@@ -13,7 +13,7 @@ from tests import scenes
 
 def _glass_with_a_bubble(rule="nested"):
     bubble = scenes.ball(0.3, index=1.0, subdivisions=1, name="bubble_air")
-    return assemble([scenes.box(), bubble], rule=rule)
+    return assemble([scenes.box(), bubble._replace(priority=1)], rule=rule)
 
 
 def test_an_index_is_changed_inside_and_where_it_lies_around_another():
