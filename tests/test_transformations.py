@@ -1,5 +1,6 @@
 """Every cell of the table of transformations in `docs/library.md`."""
 
+import dataclasses
 import functools
 from pathlib import Path
 
@@ -321,13 +322,13 @@ def _():
         _same(seen, expected, atol=1e-5)
 
 
-@_cell("init_params", "jit")
+@_cell("init_params", "jit", pytest.mark.slow)
 def _():
     compiled = jax.jit(functools.partial(init_params, config=MODEL))(jax.random.key(0))
     _same(compiled, _model().params)
 
 
-@_cell("init_params", "vmap")
+@_cell("init_params", "vmap", pytest.mark.slow)
 def _():
     keys = jnp.stack([jax.random.key(0), jax.random.key(1)])
     both = jax.vmap(functools.partial(init_params, config=MODEL))(keys)
@@ -347,7 +348,8 @@ def _():
 @_cell("init_params", "in double precision")
 def _():
     with jax.enable_x64(True):
-        assert _kinds(init_params(jax.random.key(0), MODEL)) == {jnp.dtype("float32")}
+        dyed = dataclasses.replace(MODEL, learned_tints=2)
+        assert _kinds(init_params(jax.random.key(0), dyed)) == {jnp.dtype("float32")}
 
 
 # --- what runs on the host ---
@@ -390,7 +392,7 @@ def _():
     np.testing.assert_allclose(seen[:, 0], [_THROUGH] * 3 + [1.0], rtol=1e-12)
 
 
-@_cell("render_image", "in double precision")
+@_cell("render_image", "in double precision", pytest.mark.slow)
 def _():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(images, "TILE", 4)
