@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from refref_jax.data import lint, rule_advice
 from refref_jax.data.containment import Containment
+from refref_jax.data.findings import refuse_errors
 from refref_jax.data.meshes import MeshPart
 
 
@@ -11,7 +12,7 @@ def report_meshes(parts: Sequence[MeshPart], tree: Containment, *, rule: str) ->
     """Prints which rule the meshes need, and what a lint finds in them.
 
     Raises:
-      ValueError: if some of it must be mended first.
+      SceneError: if some of it must be mended first.
     """
     findings = lint.lint(parts, tree)
     if rule == "priority":
@@ -20,10 +21,7 @@ def report_meshes(parts: Sequence[MeshPart], tree: Containment, *, rule: str) ->
         print(rule_advice.advise(parts, tree))
     else:
         print("note: there are no meshes, so all light goes straight.")
-    errors = [finding for finding in findings if finding.severity == "error"]
     for finding in findings:
-        if finding not in errors:
+        if finding.severity != "error":
             print(finding)
-    if errors:
-        told = "\n".join(f"  {finding.part}: {finding.message}" for finding in errors)
-        raise ValueError(f"the meshes must be mended first.\n{told}")
+    refuse_errors(findings)

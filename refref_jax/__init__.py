@@ -1,6 +1,76 @@
 """Radiance fields of scenes with glass and liquids, along the true, bent paths of light.
 
-`import refref_jax.render` for the library's public surface. Importing touches no device.
+The public names are those of this module, for bodies, rays and the paths of light, and those of
+`refref_jax.render`, for colours. `docs/library.md` lists all of them. They are imported when they
+are first used, so that importing the package costs nothing, and touches no device.
+
+>>> import trimesh
+>>> import refref_jax
+>>> ball = refref_jax.single_body(trimesh.creation.icosphere(), index=1.5)
+>>> cameras = refref_jax.orbit(8, distance=4.0, elevation=0.3, size=16, angle_x=1.2)
+>>> refref_jax.image_rays(cameras, 0).origins.shape
+(16, 16, 3)
 """
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # the same names for those who read types; a test compares the two lists
+    from refref_jax.data.cameras import Cameras as Cameras
+    from refref_jax.data.cameras import image_rays as image_rays
+    from refref_jax.data.cameras import orbit as orbit
+    from refref_jax.data.errors import SceneError as SceneError
+    from refref_jax.data.geometry import assemble as assemble
+    from refref_jax.data.geometry import single_body as single_body
+    from refref_jax.data.meshes import MeshPart as MeshPart
+    from refref_jax.data.meshes import read_meshes as read_meshes
+    from refref_jax.data.parts import make_part as make_part
+    from refref_jax.geometry.rays import Rays as Rays
+    from refref_jax.optics.budgets import BUDGETS as BUDGETS
+    from refref_jax.optics.budgets import Budget as Budget
+    from refref_jax.optics.light_paths import LightPaths as LightPaths
+    from refref_jax.optics.light_paths import PathStatus as PathStatus
+    from refref_jax.optics.main_branches import follow_main_branches as follow_main_branches
+    from refref_jax.optics.path_tracing import trace as trace
+    from refref_jax.optics.scene import Geometry as Geometry
+    from refref_jax.optics.scene import with_index as with_index
+    from refref_jax.optics.single_path import follow_branch as follow_branch
+
 __version__ = "0.1.0"
+
+_HOMES = {
+    "BUDGETS": "optics.budgets",
+    "Budget": "optics.budgets",
+    "Cameras": "data.cameras",
+    "Geometry": "optics.scene",
+    "LightPaths": "optics.light_paths",
+    "MeshPart": "data.meshes",
+    "PathStatus": "optics.light_paths",
+    "Rays": "geometry.rays",
+    "SceneError": "data.errors",
+    "assemble": "data.geometry",
+    "follow_branch": "optics.single_path",
+    "follow_main_branches": "optics.main_branches",
+    "image_rays": "data.cameras",
+    "make_part": "data.parts",
+    "orbit": "data.cameras",
+    "read_meshes": "data.meshes",
+    "single_body": "data.geometry",
+    "trace": "optics.path_tracing",
+    "with_index": "optics.scene",
+}
+"""The module that defines each public name."""
+
+
+def __getattr__(name: str) -> Any:
+    """Imports a public name when it is first asked for."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Lists what the module holds, and what it would import."""
+    return sorted({*globals(), *_HOMES})

@@ -65,7 +65,14 @@ def pixel_rays(
 
 
 def image_rays(cameras: Cameras, camera: int) -> Rays:
-    """Returns the rays of all pixels of one camera, as `[height, width]`."""
+    """Returns the rays of all pixels of one camera, as `[height, width]`.
+
+    Example:
+      >>> import refref_jax
+      >>> cameras = refref_jax.orbit(1, distance=4.0, elevation=0.0, size=3, angle_x=1.2)
+      >>> refref_jax.image_rays(cameras, 0).directions[1, 1].tolist()  # the middle looks ahead
+      [-1.0, 0.0, 0.0]
+    """
     row, column = np.indices((cameras.height, cameras.width))
     return pixel_rays(cameras, np.full(row.shape, camera), row, column)
 
@@ -127,6 +134,13 @@ def orbit(frames: int, *, distance: float, elevation: float, size: int, angle_x:
       elevation: angle above the horizontal plane in radians, strictly between -pi/2 and pi/2.
       size: width and height in pixels.
       angle_x: horizontal field of view in radians.
+
+    Example:
+      >>> import refref_jax
+      >>> cameras = refref_jax.orbit(8, distance=4.0, elevation=0.3, size=16, angle_x=1.2)
+      >>> rays = refref_jax.image_rays(cameras, 0)
+      >>> rays.directions.shape
+      (16, 16, 3)
     """
     azimuth = 2.0 * np.pi * np.arange(frames) / frames
     zero = np.zeros_like(azimuth)

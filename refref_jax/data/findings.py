@@ -1,6 +1,9 @@
 """What an examination of a scene's meshes has found."""
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
+
+from refref_jax.data.errors import SceneError
 
 
 class Finding(NamedTuple):
@@ -18,3 +21,15 @@ class Finding(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.severity}: {self.part}: {self.message}"
+
+
+def refuse_errors(findings: Sequence[Finding]) -> None:
+    """Stops at meshes whose light paths would be wrong.
+
+    Raises:
+      SceneError: if there is an error among the findings; it tells all of them.
+    """
+    errors = [finding for finding in findings if finding.severity == "error"]
+    if errors:
+        told = "\n".join(f"  {finding.part}: {finding.message}" for finding in errors)
+        raise SceneError(f"the meshes must be mended first.\n{told}")

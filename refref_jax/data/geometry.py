@@ -1,19 +1,90 @@
 """Assembles the meshes of a scene into what light paths are traced through (NumPy only)."""
 
+import warnings
 from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from refref_jax.data import lint, rule_advice
+from refref_jax.data.containment import find_containment
+from refref_jax.data.findings import refuse_errors
 from refref_jax.data.meshes import MeshPart
-from refref_jax.data.part_descriptions import Shading
+from refref_jax.data.part_descriptions import Colour, Shading
+from refref_jax.data.parts import Mesh, make_part
 from refref_jax.geometry.corner_normals import CREASE_ANGLE, corner_normals
 from refref_jax.geometry.surface_build import build_surfaces
-from refref_jax.optics.interface_rules import RULES
+from refref_jax.optics.interface_rules import CLEAR, NO_ABSORPTION, RULES
 from refref_jax.optics.wavefront import Geometry
 
 _CREASE_ANGLES: dict[Shading, float] = {"auto": CREASE_ANGLE, "smooth": np.pi, "flat": 0.0}
+
+
+def single_body(
+    mesh: Mesh,
+    *,
+    index: float,
+    shading: Shading = "auto",
+    tint: Colour = CLEAR,
+    absorption: Colour = NO_ABSORPTION,
+) -> Geometry:
+    """Returns a scene of one body in air; arguments as of `parts.make_part`.
+
+    Its arrays are NumPy's, which every function of light takes; `jax.device_put` moves them to an
+    accelerator once and for all.
+
+    Raises:
+      SceneError: as `make_part` and `assemble`.
+
+    Example:
+      >>> import trimesh
+      >>> import refref_jax
+      >>> glass = refref_jax.single_body(trimesh.creation.box(), index=1.5)
+      >>> glass.interfaces.index_inside.tolist()
+      [1.5]
+    """
+    part = make_part(mesh, index=index, shading=shading, tint=tint, absorption=absorption)
+    return assemble([part])
+
+
+def assemble(
+    parts: Sequence[MeshPart], *, rule: Literal["nested", "facing", "priority"] = "nested"
+) -> Geometry:
+    """Examines parts and builds the scene that they make; no part is an empty scene.
+
+    Args:
+      parts: of `make_part` or `meshes.read_meshes`.
+      rule: what lies outside a part: what it lies in (`nested`), always air (`facing`), or, where
+        parts overlap, the one of the highest priority (`priority`); see `optics.interface_rules`.
+
+    Returns:
+      NumPy arrays, as of `single_body`. Parts have the numbers of their places in `parts`.
+
+    Raises:
+      SceneError: if light paths would be wrong, as where faces point inwards. What may make them
+        wrong, such as a hole, is a Python warning.
+
+    Example:
+      >>> import trimesh
+      >>> import refref_jax
+      >>> cup = refref_jax.make_part(trimesh.creation.box([2.0, 2.0, 2.0]), index=1.5)
+      >>> water = refref_jax.make_part(trimesh.creation.icosphere(radius=0.5), index=1.333)
+      >>> refref_jax.assemble([cup, water]).interfaces.index_outside.tolist()  # air, and the cup
+      [1.0, 1.5]
+    """
+    tree = find_containment(parts)
+    if rule == "priority":
+        # Bodies that overlap are what this rule is for.
+        findings = lint.lint(parts, tree._replace(overlaps=()))
+        findings += rule_advice.examine_priorities(parts, tree)
+    else:
+        findings = lint.lint(parts, tree)
+    refuse_errors(findings)
+    for finding in findings:
+        if finding.severity == "warning":
+            warnings.warn(f"{finding.part} {finding.message}", stacklevel=2)
+    return build_geometry(parts, tree.parents, rule=rule)
 
 
 def build_geometry(

@@ -87,11 +87,7 @@ def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> l
     """
     overrides = dict(indices or {})
     for name, index in overrides.items():
-        if not index > 0.0 or not np.isfinite(index):
-            raise SceneError(
-                f"The index of refraction of {name!r} is {index}. Give a positive number, such as "
-                "1.5 for glass."
-            )
+        check_index(name, index)
     paths = mesh_files(scene)
     _check_overrides(overrides, paths)
     described = read_part_descriptions(scene / "scene.json")
@@ -105,13 +101,26 @@ def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> l
     return [_read_part(path, overrides, described.get(path.name, unknown)) for path in paths]
 
 
-def read_part(path: Path, *, index: float) -> MeshPart:
+def check_index(name: str, index: float) -> None:
+    """Refuses what is no index of refraction.
+
+    Raises:
+      SceneError: if the index is not a positive number.
+    """
+    if not index > 0.0 or not np.isfinite(index):
+        raise SceneError(
+            f"The index of refraction of {name!r} is {index}. Give a positive number, such as 1.5 "
+            "for glass."
+        )
+
+
+def read_part(path: Path, *, index: float, shading: Shading = "auto") -> MeshPart:
     """Reads one mesh that belongs to no scene, of a known index of refraction.
 
     Raises:
       SceneError: if the file is broken, or has no triangle.
     """
-    return _read_part(path, {path.stem: index}, PartDescription())
+    return _read_part(path, {path.stem: index}, PartDescription(shading=shading))
 
 
 def mesh_files(scene: Path) -> list[Path]:
@@ -162,15 +171,29 @@ def read_mesh(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 
         raise SceneError(
             f"{path} can not be read as a mesh ({error}). It may be truncated: export it again."
         ) from error
-    if len(faces) == 0:
-        raise SceneError(f"{path} has no triangles. Export the mesh again, or remove the file.")
-    if len(faces) < _declared_faces(path) or faces.min() < 0 or faces.max() >= len(vertices):
+    if len(faces) < _declared_faces(path) and len(faces):
         raise SceneError(
-            f"{path} has fewer faces than it declares, or faces without vertices. It may be "
-            "truncated: export it again."
+            f"{path} has fewer faces than it declares. It may be truncated: export it again."
+        )
+    return merge_corners(str(path), vertices, faces)
+
+
+def merge_corners(
+    name: str, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "f 3"]]:
+    """Checks the numbers of a mesh, and merges equal positions.
+
+    Raises:
+      SceneError: if there is no triangle, or one that has no vertices.
+    """
+    if len(faces) == 0:
+        raise SceneError(f"{name} has no triangles. Export the mesh again, or leave it out.")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise SceneError(
+            f"{name} has faces without vertices. It may be truncated: export it again."
         )
     if not np.all(np.isfinite(vertices)):
-        raise SceneError(f"{path} has a vertex that is not finite. Clean the mesh.")
+        raise SceneError(f"{name} has a vertex that is not finite. Clean the mesh.")
     vertices, index = np.unique(vertices, axis=0, return_inverse=True)
     return vertices, index.reshape(-1)[faces]
 

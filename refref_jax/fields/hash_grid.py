@@ -133,4 +133,7 @@ def fading(scale: Float[Array, ""], resolution: int) -> Float[Array, ""]:
 
 
 def _initialise(key: Array, shape: tuple[int, int]) -> Float[Array, "entries features"]:
-    return jax.random.uniform(key, shape, minval=-_INITIAL_RANGE, maxval=_INITIAL_RANGE)
+    # Fields are in single precision, also where JAX has doubles.
+    return jax.random.uniform(
+        key, shape, jnp.float32, minval=-_INITIAL_RANGE, maxval=_INITIAL_RANGE
+    )

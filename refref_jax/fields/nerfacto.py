@@ -51,7 +51,7 @@ class NerfactoProposalConfig(GridDensityConfig):
 
 def init_radiance(key: Array, config: NerfactoConfig) -> Params:
     """Returns new parameters of a radiance field."""
-    return _RadianceField(config).init(key, nowhere(), jnp.zeros(3))
+    return _RadianceField(config).init(key, nowhere(), jnp.zeros(3, jnp.float32))
 
 
 def radiance(

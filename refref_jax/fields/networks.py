@@ -51,7 +51,7 @@ class GridDensityConfig(DensityConfig):
 
 def nowhere() -> Gaussians:
     """Returns one point, with which a module's parameters are made."""
-    return Gaussians(jnp.zeros((1, 3)), jnp.zeros(1))
+    return Gaussians(jnp.zeros((1, 3), jnp.float32), jnp.zeros(1, jnp.float32))
 
 
 def grid_network(

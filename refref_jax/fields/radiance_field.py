@@ -31,7 +31,7 @@ class RadianceFieldConfig(GridRadianceConfig):
 
 def init(key: Array, config: RadianceFieldConfig) -> Params:
     """Returns new parameters."""
-    return _RadianceField(config).init(key, nowhere(), jnp.zeros(3))
+    return _RadianceField(config).init(key, nowhere(), jnp.zeros(3, jnp.float32))
 
 
 def radiance(

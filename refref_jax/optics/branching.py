@@ -17,13 +17,7 @@ from refref_jax.optics import footprints, interaction, media, splitting
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.footprints import Bend, Spread
 from refref_jax.optics.light_paths import PathStatus
-
-
-class Geometry(NamedTuple):
-    """All that light meets: surfaces, and the interfaces that they stand for."""
-
-    surfaces: surfaces.Surfaces
-    interfaces: media.Interfaces
+from refref_jax.optics.scene import Geometry as Geometry
 
 
 class RayState(NamedTuple):

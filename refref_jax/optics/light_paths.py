@@ -123,12 +123,18 @@ def straight(rays: Rays) -> LightPaths:
 
 def straight_ends(rays: Rays) -> PathEnds:
     """Returns the only segments of `straight`'s paths."""
-    paths = straight(rays)
+    return ends_of(straight(rays))
+
+
+def ends_of(paths: LightPaths) -> PathEnds:
+    """Returns the last segment of each path; of one that does not exist, some segment."""
+    used = jnp.sum(jnp.isfinite(paths.tau), axis=1, dtype=jnp.int32)
+    path, last = jnp.arange(used.shape[0], dtype=jnp.int32), jnp.maximum(used - 1, 0)
     return PathEnds(
-        origins=rays.origins,
-        directions=rays.directions,
-        tau=paths.tau[:, 0],
-        media=paths.media[:, 0],
+        origins=paths.points[path, last],
+        directions=paths.directions[path, last],
+        tau=paths.tau[path, last],
+        media=paths.media[path, last],
         rays=paths.rays,
         weights=paths.weights,
         bends=paths.bends,

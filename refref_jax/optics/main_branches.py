@@ -37,14 +37,37 @@ def follow_main_branches(
 
     Raises:
       ValueError: if there are more reflections than bends.
+
+    Example:
+      A glass cube before a red wall, and how its colour changes with the index: more and more of
+      the black behind the camera is mirrored.
+
+      >>> import jax, numpy as np, trimesh
+      >>> import refref_jax
+      >>> from refref_jax.render import shade
+      >>> glass = refref_jax.single_body(trimesh.creation.box(), index=1.5)
+      >>> ray = refref_jax.Rays(np.array([-2.0, 0.1, 0.2]), np.array([1.0, 0.0, 0.0]), 1e-3)
+      >>> red = jax.numpy.array([1.0, 0.0, 0.0])
+      >>> wall = lambda origin, direction: jax.numpy.where(direction[0] > 0.0, red, 0.0)
+      >>> def colour(index):
+      ...     paths = refref_jax.follow_main_branches(
+      ...         refref_jax.with_index(glass, index),
+      ...         ray,
+      ...         budget=refref_jax.Budget(bends=2, reflections="all"),
+      ...         reflections=1,
+      ...     )
+      ...     return shade(paths, wall, rays=1)[0]
+      >>> value, slope = jax.jit(lambda n: jax.jvp(colour, (n,), (1.0,)))(1.5)
+      >>> print(f"{value[0]:.4f} {slope[0]:.4f}")  # (4 n / (n + 1)^2)^2, and its derivative
+      0.9216 -0.2458
     """
     if not 0 <= reflections <= budget.bends:
         raise ValueError(
             f"{reflections} reflections do not fit into {budget.bends} bends. Ask for that many at "
             "most, 0 or more."
         )
-    first = jnp.arange(reflections)
-    once = first[:, None] == jnp.arange(budget.bends)[None]
+    first = jnp.arange(reflections, dtype=jnp.int32)
+    once = first[:, None] == jnp.arange(budget.bends, dtype=jnp.int32)[None]
     choices = jnp.concatenate([jnp.zeros_like(once, shape=(1, budget.bends)), once])
     paths = jax.vmap(lambda choice: follow_branch(geometry, ray, choice, budget=budget))(choices)
     # A main path that stays in its medium at a bend is reflected totally there.

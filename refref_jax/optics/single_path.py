@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Int
 from refref_jax.geometry.bvh import NO_SLOT
 from refref_jax.geometry.closest_hit import closest_slot
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import branching, footprints, media
+from refref_jax.optics import branching, footprints, media, scene
 from refref_jax.optics.branching import Geometry, RayState
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.light_paths import LightPaths, PathStatus
@@ -86,13 +86,30 @@ def follow_branch(
 
     Raises:
       ValueError: if `reflects` has not one entry a bend.
+
+    Example:
+      What a plane of glass lets through, and how that changes with the index `n`: the share is
+      `4 n / (n + 1)^2`, its derivative `4 (1 - n) / (n + 1)^3`.
+
+      >>> import jax, numpy as np, trimesh
+      >>> import refref_jax
+      >>> glass = refref_jax.single_body(trimesh.creation.box(), index=1.5)
+      >>> ray = refref_jax.Rays(np.array([-2.0, 0.1, 0.2]), np.array([1.0, 0.0, 0.0]), 1e-3)
+      >>> budget = refref_jax.Budget(bends=1, reflections="all")
+      >>> def transmitted(index):
+      ...     scene, straight_on = refref_jax.with_index(glass, index), jax.numpy.zeros(1, bool)
+      ...     return refref_jax.follow_branch(scene, ray, straight_on, budget=budget).weights[0]
+      >>> share, slope = jax.jit(jax.value_and_grad(transmitted))(1.5)
+      >>> print(f"{share:.4f} {slope:.4f}")
+      0.9600 -0.1280
     """
     if reflects.shape[0] != budget.bends:
         raise ValueError(
             f"There are {reflects.shape[0]} choices for {budget.bends} bends. Give one choice for "
             "each bend of the budget."
         )
-    geometry, ray, reflects = jax.tree.map(jnp.asarray, (geometry, ray, reflects))
+    reflects = jnp.asarray(reflects)
+    geometry, ray = scene.in_one_precision(geometry, ray)
     if inside is None:
         inside = media.nowhere(geometry.interfaces)
     start = _Walk(

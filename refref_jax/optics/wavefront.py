@@ -137,8 +137,8 @@ def _refuse_gradients(
     del budget, footprint, block, primals, tangents
     raise TypeError(
         "Light paths of the wavefront have no derivatives with respect to rays or geometry: they "
-        "would be silently wrong. Use optics.single_path for these, or hold rays and geometry "
-        "constant with jax.lax.stop_gradient."
+        "would be silently wrong. Use follow_branch or follow_main_branches for these, or hold "
+        "rays and geometry constant with jax.lax.stop_gradient."
     )
 
 

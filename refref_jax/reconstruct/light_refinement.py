@@ -21,8 +21,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
-from refref_jax.optics.branching import Geometry
 from refref_jax.optics.media import Interfaces
+from refref_jax.optics.scene import Geometry, with_index
 from refref_jax.reconstruct import deformation, photometry
 from refref_jax.reconstruct.deformation import Rig
 from refref_jax.reconstruct.photometry import Evidence
@@ -158,8 +158,8 @@ def _step(
 
     def objective(unknowns: _Unknowns) -> tuple[Float[Array, ""], Float[Array, ""]]:
         shifts = settings.stride * unknowns.shifts
-        now = photometry.with_index(interfaces, 0, index + settings.index_stride * unknowns.index)
-        geometry = Geometry(deformation.move(rig, shifts), now)
+        moved = Geometry(deformation.move(rig, shifts), interfaces)
+        geometry = with_index(moved, index + settings.index_stride * unknowns.index)
         error = jnp.mean(photometry.errors(some, geometry, config=config))
         prior = settings.evenness * deformation.unevenness(rig, shifts)
         return error + prior, error

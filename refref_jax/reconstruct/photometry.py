@@ -17,10 +17,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics.branching import Geometry
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.main_branches import follow_main_branches
-from refref_jax.optics.media import Interfaces
+from refref_jax.optics.scene import Geometry, with_index
 from refref_jax.render import pixels
 from refref_jax.render.config import ModelConfig
 from refref_jax.render.model import Params
@@ -93,18 +92,6 @@ def errors(
     return jnp.sqrt(difference + _NOISE**2) - _NOISE
 
 
-def with_index(interfaces: Interfaces, part: int, index: Float[Array, ""]) -> Interfaces:
-    """Returns interfaces in which one part has another index of refraction.
-
-    So it has wherever it lies outside of another part.
-    """
-    inside = interfaces.index_inside.at[part].set(index)
-    around = interfaces.medium_outside == 1 + part
-    return interfaces._replace(
-        index_inside=inside, index_outside=jnp.where(around, index, interfaces.index_outside)
-    )
-
-
 @functools.partial(jax.jit, static_argnames=("part", "config"))
 def errors_at_index(
     index: Float[Array, ""],
@@ -115,8 +102,7 @@ def errors_at_index(
     config: ModelConfig,
 ) -> Float[Array, " rays"]:
     """Returns `errors` with an index of refraction for one part."""
-    interfaces = with_index(geometry.interfaces, part, index)
-    return errors(evidence, geometry._replace(interfaces=interfaces), config=config)
+    return errors(evidence, with_index(geometry, index, part=part), config=config)
 
 
 @functools.partial(jax.jit, static_argnames=("part", "config"))

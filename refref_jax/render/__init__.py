@@ -1,19 +1,19 @@
-"""Rendering: from light paths to colours. The library's public surface.
+"""Rendering: from light paths to colours. Bodies, rays and paths are names of `refref_jax`.
 
-model = render.load_model("runs/demo")
-rays = render.Rays(origins, directions, radii)
-picture = render.render_image(model, rays)        # chunked and jitted
-seen = render.render_rays(model, rays)            # one pure function, jit it yourself
-
-Any function of one ray may stand in for the fields, such as a background that is known:
-
-radiance = render.radiance_of(background)         # or radiance(origin, direction) -> linear rgb
-seen = render.render_known(geometry, radiance, rays, budget=render.BUDGETS["tree"])
+A trained run is read by `load_model`; `render_image` renders it in pieces on the host, and
+`render_rays` as one pure function. Any function of one ray may stand in for the fields,
+`radiance(origin, direction)` to linear RGB, such as a background (`radiance_of`): `render_known`
+renders that in pieces, and `shade` is the pure function. `docs/library.md` shows all of them.
 """
 
 from refref_jax.geometry.rays import Rays as Rays
 from refref_jax.optics.budgets import BUDGETS as BUDGETS
 from refref_jax.optics.budgets import Budget as Budget
+from refref_jax.render.backgrounds import CubeBackground as CubeBackground
+from refref_jax.render.backgrounds import Environment as Environment
+from refref_jax.render.backgrounds import LinearTexture as LinearTexture
+from refref_jax.render.backgrounds import SphereBackground as SphereBackground
+from refref_jax.render.backgrounds import SrgbTexture as SrgbTexture
 from refref_jax.render.backgrounds import radiance_of as radiance_of
 from refref_jax.render.config import ModelConfig as ModelConfig
 from refref_jax.render.images import Rendering as Rendering
@@ -21,6 +21,7 @@ from refref_jax.render.images import render_image as render_image
 from refref_jax.render.images import render_rays as render_rays
 from refref_jax.render.known import KnownRendering as KnownRendering
 from refref_jax.render.known import render_known as render_known
+from refref_jax.render.known import shade as shade
 from refref_jax.render.model import Model as Model
 from refref_jax.render.model import Params as Params
 from refref_jax.render.model import init_params as init_params

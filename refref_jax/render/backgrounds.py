@@ -118,6 +118,13 @@ def radiance_of(background: Background) -> Radiance:
 
     The function is a pytree whose arrays are the background's, so that compiled programs take them
     as arguments.
+
+    Example:
+      >>> import jax.numpy as jnp
+      >>> from refref_jax.render import Environment, LinearTexture, radiance_of
+      >>> grey = radiance_of(Environment(LinearTexture(jnp.full((2, 4, 3), 0.5))))
+      >>> grey(jnp.zeros(3), jnp.array([0.0, 1.0, 0.0])).tolist()
+      [0.5, 0.5, 0.5]
     """
     functions = {
         CubeBackground: cube_radiance,

@@ -34,7 +34,9 @@ class Dyes(NamedTuple):
 
 def init(parts: int) -> Dyes:
     """Returns the colours of parts that are nearly clear."""
-    return Dyes(jnp.full((parts, 3), _INITIAL), jnp.full((parts, 3), _INITIAL))
+    # Two arrays, since training gives the buffers of both away.
+    initial = (jnp.full((parts, 3), _INITIAL, jnp.float32) for _ in Dyes._fields)
+    return Dyes(*initial)
 
 
 def tints(dyes: Dyes) -> Float[Array, "parts 3"]:

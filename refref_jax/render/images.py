@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.budgets import Budget, room
+from refref_jax.optics.budgets import Budget
 from refref_jax.optics.details import Detail
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.optics.path_tracing import Traced
@@ -29,6 +29,8 @@ TILE = 16384
 
 CHUNK = 4096
 """Paths rendered at once: the option to lower when memory runs out."""
+
+_INSTEAD = "Call it outside, or use render_rays, which is a pure function."
 
 
 class Rendering(NamedTuple):
@@ -72,19 +74,18 @@ class _Tile(NamedTuple):
 def render_rays(model: Model, rays: Rays) -> Rendering:
     """Renders rays in one piece: a pure function, to be jitted or differentiated by the caller.
 
+    A trained model is in single precision, and so is what it renders.
+
     Args:
       model: the scene.
       rays: `[n]` camera rays. They share the room of the budget: the fewer they are, the sooner
         light is lost.
     """
-    count = rays.radii.shape[0]
-    capacity = room(model.budget, count).paths
+    rays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), rays)
     detail = path_detail(model.config, model.budget)
-    traced = path_tracing.trace(
-        model.geometry, rays, budget=model.budget, capacity=capacity, detail=detail
-    )
-    tile = _sort(traced, count)
-    sums = _blank(count)._replace(lost=tile.lost)
+    traced = path_tracing.trace(model.geometry, rays, budget=model.budget, detail=detail)
+    tile = _sort(traced, traced.lost.shape[0])
+    sums = _blank(tile.lost)
     return _finish(_add(model.params, tile.paths, tile.heaviest, sums, config=model.config))
 
 
@@ -101,18 +102,19 @@ def render_image(model: Model, rays: Rays, *, chunk: int = CHUNK) -> Rendering:
 
     Raises:
       ValueError: if a chunk holds no path.
+      TypeError: if it is called in a function that JAX transforms.
     """
     if chunk < 1:
         raise ValueError(f"A chunk of {chunk} paths renders nothing. Give 1 or more.")
-    rays = jax.tree.map(np.asarray, rays)
+    rays = jax.tree.map(np.float32, tiles.fetch(rays, instead=_INSTEAD))
     shape = rays.radii.shape
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), rays)
     count = flat.radii.shape[0]
-    parts = [jax.tree.map(np.asarray, _blank(0))]
+    parts = [jax.device_get(_blank(jax.device_put(flat.origins[:0])))]
     for start in range(0, count, TILE):
         tile, _ = tiles.cut_out(flat, None, start, TILE)
         part = _render_tile(model, tile, min(TILE, count - start), chunk)
-        parts.append(jax.tree.map(np.asarray, part))
+        parts.append(tiles.fetch(part, instead=_INSTEAD))
     joined = jax.tree.map(lambda *each: np.concatenate(each), *parts)
     return jax.tree.map(lambda x: x[:count].reshape((*shape, *x.shape[1:])), joined)
 
@@ -120,23 +122,25 @@ def render_image(model: Model, rays: Rays, *, chunk: int = CHUNK) -> Rendering:
 def _render_tile(model: Model, rays: Rays, real: int, chunk: int) -> Rendering:
     detail = path_detail(model.config, model.budget)
     tile = _trace_tile(model.geometry, rays, real, budget=model.budget, detail=detail)
-    sums = _blank(TILE)._replace(lost=tile.lost)
-    for start in range(0, int(tile.count), chunk):
+    sums = _blank(tile.lost)
+    count = int(tiles.fetch(tile.count, instead=_INSTEAD))
+    for start in range(0, count, chunk):
         sums = _render_chunk(model.params, tile, sums, start, config=model.config, chunk=chunk)
     return _finish_tile(sums)
 
 
-def _blank(count: int) -> Rendering:
-    zeros, black = jnp.zeros(count), jnp.zeros((count, 3))
-    return Rendering(black, zeros, zeros, zeros, linear=black, lost=black)
+def _blank(lost: Float[Array, "rays 3"]) -> Rendering:
+    """Returns what rays see before any path is rendered."""
+    black = jnp.zeros_like(lost)
+    zeros = black[:, 0]
+    return Rendering(black, zeros, zeros, zeros, linear=black, lost=lost)
 
 
 @functools.partial(jax.jit, static_argnames=("budget", "detail"))
 def _trace_tile(
     geometry: Geometry, rays: Rays, real: Int[Array, ""], *, budget: Budget, detail: Detail
 ) -> _Tile:
-    capacity = room(budget, TILE).paths
-    traced = path_tracing.trace(geometry, rays, budget=budget, capacity=capacity, detail=detail)
+    traced = path_tracing.trace(geometry, rays, budget=budget, detail=detail)
     return _sort(traced, real)
 
 

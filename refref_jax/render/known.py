@@ -16,12 +16,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.budgets import Budget
-from refref_jax.optics.light_paths import PathEnds
+from refref_jax.optics.light_paths import LightPaths, PathEnds
 from refref_jax.optics.wavefront import Geometry
 from refref_jax.render import colour, tiles
 from refref_jax.render.backgrounds import Radiance
@@ -30,6 +30,10 @@ TILE = 65536
 """Rays traced at once."""
 
 _SMALLEST_TILE = 1024
+
+_INSTEAD = (
+    "Call it outside, or use trace or follow_main_branches and shade, which are pure functions."
+)
 
 # Paths that are looked up at once.
 _CHUNK = 4096
@@ -85,13 +89,27 @@ def render_known(
         of its tile: the fewer rays share it, the sooner light is lost.
 
     Raises:
-      ValueError: if a tile holds no ray.
+      ValueError: if a tile holds no ray, or the radiance function returns something else than
+        three numbers.
+      TypeError: if it is called in a function that JAX transforms; see `shade`.
+
+    Example:
+      >>> import trimesh
+      >>> import refref_jax
+      >>> from refref_jax.render import render_known
+      >>> glass = refref_jax.single_body(trimesh.creation.box(), index=1.5)
+      >>> camera = refref_jax.orbit(1, distance=4.0, elevation=0.3, size=4, angle_x=0.5)
+      >>> rays = refref_jax.image_rays(camera, 0)
+      >>> sky = lambda origin, direction: 0.5 + 0.5 * direction
+      >>> picture = render_known(glass, sky, rays, budget=refref_jax.BUDGETS["straight"])
+      >>> picture.rgb.shape, picture.casts
+      ((4, 4, 3), 0)
     """
     if tile < 1:
         raise ValueError(f"A tile of {tile} rays renders nothing. Give 1 or more.")
     if jax.tree.structure(radiance) == jax.tree.structure(0):
         radiance = jax.tree_util.Partial(radiance)  # a leaf is no argument of a compiled function
-    rays, inside = jax.tree.map(np.asarray, (rays, inside))
+    rays, inside = tiles.fetch((rays, inside), instead=_INSTEAD)
     shape = rays.radii.shape
     count = rays.radii.size
     # Few rays need no large tile, but a budget's room must not be that of a ray or two.
@@ -99,20 +117,65 @@ def render_known(
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), (rays, inside))
     # On the device once, not once a tile.
     geometry, radiance = jax.device_put((geometry, radiance))
-    parts = [jax.device_get(_blank())]
+    parts = []
     for start in range(0, count, tile):
         part = tiles.cut_out(*flat, start, tile)
-        parts.append(jax.device_get(_render_tile(geometry, radiance, *part, budget=budget)))
+        seen = _render_tile(geometry, radiance, *part, budget=budget)
+        parts.append(tiles.fetch(seen, instead=_INSTEAD))
     casts = sum(int(each.casts) for each in parts)
-    fields = [np.concatenate(field)[:count] for field in zip(*(p[:-1] for p in parts), strict=True)]
+    seen = [part[:-1] for part in parts or [_blank()]]
+    fields = [np.concatenate(field)[:count] for field in zip(*seen, strict=True)]
     fields = [field.reshape(*shape, *field.shape[1:]) for field in fields]
     # Each ray that fills up the last tile misses, which takes one cast if any are made.
     return KnownRendering(*fields, casts - (-count % tile) * (budget.bends > 0))
 
 
-def _blank() -> _Tile:
-    nothing = jnp.zeros((0, 3))
-    return _Tile(nothing, nothing, jnp.zeros(0, jnp.int32), nothing, casts=jnp.zeros((), jnp.int32))
+def shade(paths: LightPaths | PathEnds, radiance: Radiance, *, rays: int) -> Float[Array, "rays 3"]:
+    """Returns the linear RGB of rays: the sum over their paths of weight times what is seen.
+
+    A pure function, to be jitted, mapped and differentiated by the caller: with respect to what the
+    radiance function is made of, and to the paths, where these have gradients themselves
+    (`follow_branch`, `follow_main_branches`).
+
+    Args:
+      paths: of these rays, along one axis, or one path alone. Where `trace` or `follow_branch` was
+        mapped over, map this as well.
+      radiance: what a ray sees, `radiance(origin, direction)` to linear RGB; it is asked for the
+        last segment of every path.
+      rays: number of rays that the paths belong to.
+
+    Raises:
+      ValueError: if the paths have more than one axis, or the radiance function returns something
+        else than three numbers.
+
+    Example:
+      >>> import numpy as np
+      >>> import refref_jax
+      >>> from refref_jax.render import shade
+      >>> ray = refref_jax.Rays(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.full(1, 1e-3))
+      >>> empty = refref_jax.assemble([])
+      >>> paths = refref_jax.trace(empty, ray, budget=refref_jax.BUDGETS["straight"]).paths
+      >>> shade(paths, lambda origin, direction: 0.5 + 0.5 * direction, rays=1).tolist()
+      [[0.5, 0.5, 1.0]]
+    """
+    if paths.statuses.ndim > 1:
+        raise ValueError(
+            f"The paths have the axes {paths.statuses.shape}, where one is expected. Apply "
+            "jax.vmap to shade as well as to what has made them."
+        )
+    if paths.statuses.ndim == 0:
+        paths = jax.tree.map(lambda x: x[None], paths)
+    ends = light_paths.ends_of(paths) if isinstance(paths, LightPaths) else paths
+    exists = light_paths.exists(ends)
+    # An empty slot looks where the first path does, lest the radiance function see nonsense.
+    held = jnp.where(exists, jnp.arange(exists.shape[0], dtype=jnp.int32), 0)
+    ends = jax.tree.map(lambda x: x[held], ends)
+    return jax.ops.segment_sum(_light(radiance, ends, exists), ends.rays, num_segments=rays)
+
+
+def _blank() -> KnownRendering:
+    nothing = np.zeros((0, 3), np.float32)
+    return KnownRendering(nothing, nothing, np.zeros(0, np.int32), nothing, casts=0)
 
 
 @functools.partial(jax.jit, static_argnames="budget")
@@ -152,9 +215,21 @@ def _sum_light(radiance: Radiance, ends: PathEnds, rays: int) -> Float[Array, "r
         start, linear = state
         index = start + jnp.arange(chunk, dtype=jnp.int32)
         part = jax.tree.map(lambda x: x[jnp.minimum(index, slots - 1)], ends)
-        seen = jax.vmap(radiance)(part.origins, part.directions)
-        light = jnp.where((index < count)[:, None], part.weights * seen, 0.0)
+        light = _light(radiance, part, index < count)
         return start + chunk, linear.at[part.rays].add(light)
 
     begin = jnp.zeros((), jnp.int32), jnp.zeros((rays, 3), ends.weights.dtype)
     return jax.lax.while_loop(lambda state: state[0] < count, add, begin)[1]
+
+
+def _light(
+    radiance: Radiance, ends: PathEnds, real: Bool[Array, " paths"]
+) -> Float[Array, "paths 3"]:
+    """Returns what each path brings to its ray; those that are not real bring nothing."""
+    seen = jax.vmap(radiance)(ends.origins, ends.directions)
+    if seen.shape != ends.directions.shape:
+        raise ValueError(
+            f"The radiance function returned an array of shape {seen.shape[1:]} for one ray. "
+            "Return linear RGB, of shape (3,)."
+        )
+    return jnp.where(real[:, None], ends.weights * seen.astype(ends.weights.dtype), 0.0)

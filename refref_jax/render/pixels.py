@@ -111,6 +111,6 @@ def random_jitter(key: Array, config: ModelConfig, slots: Int[Array, " paths"]) 
 
 
 def no_jitter(config: ModelConfig, paths: int) -> Jitter:
-    """Returns the jitter of a rendering without noise."""
-    zeros = jnp.zeros((paths, transport.rounds(config)))
+    """Returns the jitter of a rendering without noise, in single precision as the fields are."""
+    zeros = jnp.zeros((paths, transport.rounds(config)), jnp.float32)
     return Jitter(zeros, zeros)

@@ -1,4 +1,9 @@
-"""Cuts rays into tiles of one size, so that what renders a tile is compiled once."""
+"""Cuts rays into tiles of one size, so that what renders a tile is compiled once.
+
+What goes tile by tile runs on the host, and compiles on its own.
+"""
+
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -10,6 +15,27 @@ from refref_jax.optics.media import EMPTY_SLOT
 # A ray that fills up a tile starts this far out and goes away: it meets nothing, and leaves the
 # room of the tile's budget to the others.
 _OUT_OF_REACH = 1e9
+
+
+_Tree = TypeVar("_Tree")
+
+
+def fetch(tree: _Tree, *, instead: str) -> _Tree:
+    """Returns NumPy arrays in place of all arrays.
+
+    Args:
+      tree: numbers and arrays.
+      instead: what the error tells to do.
+
+    Raises:
+      TypeError: if one of them has no value yet, because JAX transforms the calling function.
+    """
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree)):
+        raise TypeError(
+            "Pictures are rendered tile by tile on the host, which can not be part of a function "
+            f"that jit, vmap or grad transforms. {instead}"
+        )
+    return jax.tree.map(np.asarray, jax.device_get(tree))
 
 
 def cut_out(

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.optics.interface_rules import nested
 from refref_jax.reconstruct import photometry
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.index_search import (
@@ -154,14 +153,6 @@ def test_no_valley_has_no_error_bar(curvature):
 def test_one_view_has_no_error_bar():
     rows = np.stack([np.full(20, at**2) for at in (-0.01, 0.0, 0.01)])
     assert scatter_of_bottoms(rows, np.zeros(20, np.int64), 0.01) == math.inf
-
-
-def test_an_index_is_changed_inside_and_where_it_lies_around_another():
-    # A bubble inside of a glass ball.
-    interfaces = jax.device_put(nested([1.5, 1.0], [-1, 0]))
-    changed = photometry.with_index(interfaces, 0, jnp.float32(1.7))
-    np.testing.assert_allclose(changed.index_inside, [1.7, 1.0])
-    np.testing.assert_allclose(changed.index_outside, [1.0, 1.7])
 
 
 @pytest.mark.parametrize(

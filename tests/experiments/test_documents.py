@@ -1,12 +1,18 @@
-"""The README's library snippets run as they stand."""
+"""The library snippets of README and docs run as they stand, and no local link is broken."""
 
 import re
+
+import pytest
 
 from tests.experiments.command import ROOT
 
 
-def test_the_snippets_of_the_readme_run(trained, tmp_path, monkeypatch, capsys):
-    snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+@pytest.mark.parametrize(
+    ("page", "printed"),
+    [("README.md", "(128, 128, 3)"), ("docs/library.md", "(64, 3) (64, 3)")],
+)
+def test_the_snippets_of_a_page_run(page, printed, trained, tmp_path, monkeypatch, capsys):
+    snippets = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
     assert len(snippets) >= 2
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "demo").symlink_to(trained)
@@ -14,9 +20,8 @@ def test_the_snippets_of_the_readme_run(trained, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     namespace = {}
     for snippet in snippets:
-        exec(compile(snippet, "README.md", "exec"), namespace)
-    printed = capsys.readouterr().out
-    assert "(128, 128, 3)" in printed
+        exec(compile(snippet, page, "exec"), namespace)
+    assert printed in capsys.readouterr().out
 
 
 def test_every_local_link_of_the_readme_exists():
