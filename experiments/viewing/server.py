@@ -29,6 +29,9 @@ from refref_jax.geometry.rays import Rays
 
 _JPEG_QUALITY = 92
 
+# How near to a test view a browser's camera stays where it is.
+_NEAR = 10 * viewpoints.ROUNDING
+
 
 class Turns:
     """What pages share: whose turn it is to draw, and what is compiled."""
@@ -61,7 +64,9 @@ def serve(subject: Subject, *, host: str, port: int) -> viser.ViserServer:
 
     @server.on_client_connect
     def _(client: viser.ClientHandle) -> None:
-        pages[client.client_id] = Page(client, subject, turns)
+        page = pages[client.client_id] = Page(client, subject, turns)
+        if client.client_id not in server.get_clients():  # gone before its page was built
+            page.close()
 
     @server.on_client_disconnect
     def _(client: viser.ClientHandle) -> None:
@@ -135,7 +140,7 @@ class Page:
                 picture = self._draw(job, view, self._panel.choice())
             except Exception as error:  # the page stays open, and says why it shows nothing
                 traceback.print_exc()
-                self._panel.say(f"**{type(error).__name__}**: {error}")
+                self._say(f"**{type(error).__name__}**: {error}")
                 picture = np.zeros((2, 2, 3), np.uint8)
             if picture is not None and not self._closed:
                 self._client.scene.set_background_image(
@@ -162,7 +167,7 @@ class Page:
                 model, layer, rays, chunk=chunk, most=most, cancelled=lambda: self._stale(job)
             )
         if picture is not None:
-            self._panel.say(_sized(picture, job.stage + 1, len(self._subject.heights)))
+            self._say(_sized(picture, job.stage + 1, len(self._subject.heights)))
         return picture
 
     def _draw_error(self, job: Job, view: Viewpoint, model: Any, most: int) -> Picture | None:
@@ -181,16 +186,20 @@ class Page:
         picture, error = drawn
         decibels = -20.0 * math.log10(error) if error else math.inf
         name = frames.names[i]
-        self._panel.say(
+        self._say(
             f"test view **{name}**: {decibels:.1f} dB, errors x {layers.GAIN:g}. "
             + _sized(picture, job.stage + 1, len(self._subject.heights))
         )
         return viewpoints.letterbox(picture, view.aspect)
 
     def _go_to(self, view: Viewpoint) -> None:
-        """Moves the browser's camera, which is no change of what is seen."""
+        """Moves the browser's camera, which is no change of what is seen.
+
+        Browsers keep the horizon level, and answer with another pose if the view's is not: that is
+        not corrected again, or there would be no end.
+        """
         with self._event:
-            if viewpoints.is_same(view, self._view):
+            if viewpoints.is_same(view, self._view, within=_NEAR):
                 return
             self._view = view
         wxyz, position = viewpoints.to_browser(view.pose)
@@ -209,6 +218,10 @@ class Page:
         self._scenery.show_paths(pixel_paths.pieces(paths))
         self._panel.show_table(pixel_paths.describe(paths))
 
+    def _say(self, text: str) -> None:
+        if not self._closed:
+            self._panel.say(text)
+
     def _stale(self, job: Job) -> bool:
         with self._event:
             return self._closed or schedule.is_stale(self._state, job)
@@ -226,7 +239,8 @@ class Page:
             yield
             self._turns.compiled.add(what)
         finally:
-            notice.remove()
+            if not self._closed:
+                notice.remove()
 
 
 def _sized(picture: Picture, stage: int, stages: int) -> str:

@@ -5,6 +5,7 @@ import functools
 import math
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from experiments import named_budgets
@@ -88,7 +89,8 @@ def chosen_model(subject: Subject, choice: Choice) -> Model:
         return model
     interfaces = model.geometry.interfaces
     if choice.indices != first_choice(subject).indices:
-        interfaces = layers.with_indices(interfaces, choice.indices, subject.rule)
+        # On the device, as those of the model are: what is compiled serves both.
+        interfaces = jax.device_put(layers.with_indices(interfaces, choice.indices, subject.rule))
     budget = model.budget
     if (choice.cut, choice.bends) != (budget.cut, budget.bends):
         budget = named_budgets.vary(budget, cut=choice.cut, bends=choice.bends)

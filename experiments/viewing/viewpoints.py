@@ -25,8 +25,8 @@ ASPECT = 16 / 9
 
 _GREY = 96
 
-# Less than any hand moves a camera by.
-_ROUNDING = 1e-3
+ROUNDING = 1e-3
+"""What a browser may round a camera by, and less than any hand moves it by."""
 
 # Our axes are the browser's with y and z turned around.
 _TURN = np.diag([1.0, -1.0, -1.0])
@@ -96,10 +96,10 @@ def nearest(pose: Float[np.ndarray, "3 4"], views: Cameras) -> int:
     return int(np.argmin(apart + turned * np.linalg.norm(views.poses[:, :, 3], axis=-1)))
 
 
-def is_same(a: Viewpoint, b: Viewpoint) -> bool:
-    """Returns whether two cameras are one but for what a browser rounds."""
+def is_same(a: Viewpoint, b: Viewpoint, *, within: float = ROUNDING) -> bool:
+    """Returns whether two cameras are one, but for so much in every number."""
     numbers = [np.append(view.pose, [view.fov, view.aspect]) for view in (a, b)]
-    return bool(np.allclose(*numbers, rtol=0.0, atol=_ROUNDING))
+    return bool(np.allclose(*numbers, rtol=0.0, atol=within))
 
 
 def containing_fov(views: Cameras, aspect: float) -> float:

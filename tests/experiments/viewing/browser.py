@@ -18,7 +18,7 @@ CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
 )
 
-_PATIENCE = 60.0
+_PATIENCE = 300.0
 
 
 class Page:

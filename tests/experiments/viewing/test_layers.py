@@ -1,11 +1,15 @@
 """What is shown: colours by hand, the sum of the branches, bands that are called off."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 
 from experiments import figures
 from experiments.viewing import layers
+from experiments.viewing import subject as subjects
+from experiments.viewing.subject import Subject
 from refref_jax.data import files
 from refref_jax.data.cameras import image_rays
 from refref_jax.data.local_layout import read_frames
@@ -52,6 +56,22 @@ def test_the_two_branches_sum_to_the_picture(model):
     # The paper's reflection carries Fresnel's share of each pixel of the body, and it is small.
     assert (mirrored[~beside].mean(-1) > 0.0).all()
     assert mirrored[~beside].mean() < 0.3 * through[~beside].mean()
+
+
+def test_another_index_is_another_picture_of_the_same_programs(model):
+    subject = Subject("made", model, "nested", None, ("glass",), (9, 18), 4096)
+    first = subjects.first_choice(subject)
+    before = layers.draw(model, layers.RGB, _RAYS, **_OPTIONS)
+    programs = (images._trace_tile, images._render_chunk)
+    compiled = [program._cache_size() for program in programs]
+    other = subjects.chosen_model(subject, dataclasses.replace(first, indices=(1.2,)))
+    after = render_image(other, _RAYS)
+    for branch in ("both", "transmitted", "reflected"):
+        render_image(model, _RAYS, branch=branch)
+    assert [program._cache_size() for program in programs] == compiled
+    thin = render_image(other, _RAYS, branch="reflected").linear.mean()
+    thick = render_image(model, _RAYS, branch="reflected").linear.mean()
+    assert thin < 0.5 * thick and np.any(files.to_bytes(after.rgb) != before)
 
 
 def test_a_branch_that_is_none_is_refused(model):
