@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 from experiments.viewing import viewpoints
 from experiments.viewing.pixel_paths import Pieces
 from refref_jax.data.cameras import Cameras
+from refref_jax.geometry.bvh import LEAF_SIZE
 from refref_jax.geometry.surfaces import Surfaces
 
 _COLOURS = matplotlib.colormaps["plasma"]
@@ -106,11 +107,9 @@ class Scenery:
 
 def triangles_by_part(surfaces: Surfaces) -> dict[int, Float[np.ndarray, "faces 3 3"]]:
     """Returns the triangles of each part that has any, without the slots that pad their tree."""
-    corners, parts = np.asarray(surfaces.bvh.triangles), np.asarray(surfaces.parts)
-    edges = corners[:, 1:] - corners[:, :1]
-    real = np.any(np.cross(edges[:, 0], edges[:, 1]) != 0.0, axis=-1)
-    real &= np.all(np.isfinite(corners), axis=(1, 2))
-    return {int(part): corners[real & (parts == part)] for part in np.unique(parts[real])}
+    corners = np.asarray(surfaces.bvh.triangles)[:-LEAF_SIZE]
+    parts = np.asarray(surfaces.parts)[:-LEAF_SIZE]
+    return {int(part): corners[parts == part] for part in np.unique(parts)}
 
 
 def strength(shares: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -53,8 +53,9 @@ def test_the_tree_s_reflected_paths_set_out_as_the_single_reflection_does():
     budget = dataclasses.replace(TREE, bends=4, cut=1e-3)
     rays = scenes.rays([[-4.0, 0.2, 0.1]] * 5, [[4.0, y, 0.1] for y in np.linspace(-0.9, 0.5, 5)])
     trace = jax.jit(functools.partial(path_tracing.trace, budget=budget, capacity=256))
-    paths = jax.tree.map(np.asarray, trace(geometry, rays).paths)
-    mirrored, real = np.asarray(reflected_first(jax.device_put(paths))), exists(paths)
+    paths = trace(geometry, rays).paths
+    mirrored, real = np.asarray(reflected_first(paths)), np.asarray(exists(paths))
+    paths = jax.tree.map(np.asarray, paths)
     for i in range(5):
         ray = jax.tree.map(lambda x, i=i: x[i], rays)
         for choice in (True, False):

@@ -41,14 +41,13 @@ class Page:
                 return answer["result"]
 
     def evaluate(self, expression):
-        """Returns the value of a JavaScript expression."""
-        return self.send("Runtime.evaluate", expression=expression, returnByValue=True)["result"][
-            "value"
-        ]
+        """Returns the value of a JavaScript expression; `None` for none."""
+        answer = self.send("Runtime.evaluate", expression=expression, returnByValue=True)
+        return answer["result"].get("value")
 
     def text(self):
         """Returns what the page says."""
-        return self.evaluate("document.body.innerText")
+        return self.evaluate("document.body?.innerText") or ""
 
     def screenshot(self):
         """Returns what the page looks like, `[h, w, 3]` of 8 bits."""
