@@ -12,7 +12,10 @@ matplotlib.use("Agg")
 from matplotlib import pyplot
 
 _COLOUR_MAP = "turbo"
-_ERROR_GAIN = 4.0
+
+ERROR_GAIN = 4.0
+"""By how much errors of colours are amplified to be seen."""
+
 _INCHES = 2.4
 _INCHES_OF_THE_SCALE = 1.1
 
@@ -38,7 +41,7 @@ def write_comparison(path: Path, views: Sequence[Comparison]) -> None:
 
     Distances share one scale, from 0 to the largest finite one.
     """
-    titles = ["ground truth", "render", f"error x {_ERROR_GAIN:g}"]
+    titles = ["ground truth", "render", f"error x {ERROR_GAIN:g}"]
     distances = [view.distance for view in views if view.distance is not None]
     titles += ["distance"] * bool(distances)
     figure, axes = pyplot.subplots(
@@ -54,7 +57,7 @@ def write_comparison(path: Path, views: Sequence[Comparison]) -> None:
     for row, view in zip(axes, views, strict=True):
         row[0].imshow(view.target)
         row[1].imshow(view.rgb)
-        row[2].imshow(np.clip(np.abs(view.rgb - view.target) * _ERROR_GAIN, 0.0, 1.0))
+        row[2].imshow(amplified_error(view.rgb, view.target))
         row[0].set_ylabel(view.name)
         for axis in row:
             axis.set_xticks([])
@@ -70,11 +73,25 @@ def write_comparison(path: Path, views: Sequence[Comparison]) -> None:
     pyplot.close(figure)
 
 
+def amplified_error(
+    rgb: Float[np.ndarray, "h w 3"], target: Float[np.ndarray, "h w 3"]
+) -> Float[np.ndarray, "h w 3"]:
+    """Returns the absolute error of each channel times `ERROR_GAIN`, clipped to `[0, 1]`."""
+    return np.clip(np.abs(rgb - target) * ERROR_GAIN, 0.0, 1.0)
+
+
 def colour_distances(
-    distances: Sequence[Float[np.ndarray, "h w"]],
+    distances: Sequence[Float[np.ndarray, "h w"]], *, farthest: float | None = None
 ) -> list[UInt8[np.ndarray, "h w 3"]]:
-    """Colours distance maps on one scale, from 0 to the largest; misses are white."""
-    farthest = max(_largest_finite(distance) for distance in distances)
+    """Colours distance maps on one scale from 0; misses are white.
+
+    Args:
+      distances: the maps, world units.
+      farthest: end of the scale, beyond which its last colour stays; the largest finite distance
+        if not given.
+    """
+    if farthest is None:
+        farthest = max(_largest_finite(distance) for distance in distances)
     coloured = []
     for distance in distances:
         known = np.isfinite(distance)

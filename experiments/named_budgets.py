@@ -12,10 +12,6 @@ _SMALLEST_CUT_WITH_ROOM = 5e-4
 def make_budget(paths: str, *, cut: float | None = None, bends: int | None = None) -> Budget:
     """Returns a budget by name, with another cut or number of bends, and room for what that takes.
 
-    Below the named budget's own cut room grows as the inverse square root of the cut, and that of
-    segments with the bends beyond its own: a flask of three media needs both. What finds no room
-    nevertheless is told as lost.
-
     Args:
       paths: a name in `BUDGETS`.
       cut: smallest throughput worth following; the budget's own if `None`.
@@ -29,6 +25,21 @@ def make_budget(paths: str, *, cut: float | None = None, bends: int | None = Non
         raise ValueError(
             f"--paths={paths} has no --cut and no --bends. Leave them out, or use --paths=tree."
         )
+    return vary(budget, cut=cut, bends=bends)
+
+
+def vary(budget: Budget, *, cut: float | None = None, bends: int | None = None) -> Budget:
+    """Returns a budget with another cut or number of bends, and room for what that takes.
+
+    Below the budget's own cut room grows as the inverse square root of the cut, and that of
+    segments with the bends beyond its own: a flask of three media needs both. What finds no room
+    nevertheless is told as lost.
+
+    Args:
+      budget: one that bends light.
+      cut: smallest throughput worth following; the budget's own if `None`.
+      bends: most bends; the budget's own if `None`.
+    """
     given = {"cut": cut, "bends": bends}
     changed = dataclasses.replace(budget, **{k: v for k, v in given.items() if v is not None})
     if changed.bends > budget.bends:

@@ -6,7 +6,7 @@ two. This is one of the modules that call `jax.jit`.
 """
 
 import functools
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.details import Detail
+from refref_jax.optics.first_branches import Branch, reflected_first
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.optics.path_tracing import Traced
 from refref_jax.optics.wavefront import Geometry
@@ -31,6 +32,8 @@ CHUNK = 4096
 """Paths rendered at once: the option to lower when memory runs out."""
 
 _INSTEAD = "Call it outside, or use render_rays, which is a pure function."
+_BRANCHES: tuple[Branch, ...] = get_args(Branch)
+_ALL, _PASSED, _MIRRORED = range(len(_BRANCHES))
 
 
 class Rendering(NamedTuple):
@@ -56,12 +59,12 @@ class Rendering(NamedTuple):
 
 
 class _Tile(NamedTuple):
-    """The paths of a tile, those that exist first.
+    """The paths of a tile, those that are wanted first.
 
     Attributes:
       paths: the light paths.
       heaviest: whether a path carries most of its ray's light.
-      count: number of paths that exist.
+      count: number of paths that are wanted.
       lost: see `Rendering`.
     """
 
@@ -89,21 +92,27 @@ def render_rays(model: Model, rays: Rays) -> Rendering:
     return _finish(_add(model.params, tile.paths, tile.heaviest, sums, config=model.config))
 
 
-def render_image(model: Model, rays: Rays, *, chunk: int = CHUNK) -> Rendering:
+def render_image(
+    model: Model, rays: Rays, *, chunk: int = CHUNK, branch: Branch = "both"
+) -> Rendering:
     """Renders any number of rays in pieces of fixed size; 0 rays give an empty rendering.
 
     Args:
       model: the scene.
       rays: camera rays with any leading axes, usually `[height, width]`.
       chunk: paths rendered at once.
+      branch: the light of which paths, by what happened to them at the first surface: the linear
+        colours of `transmitted` and `reflected` sum to those of `both`. All three are one program.
 
     Returns:
       NumPy arrays, with the leading axes of the rays.
 
     Raises:
-      ValueError: if a chunk holds no path.
+      ValueError: if a chunk holds no path, or there is no such branch.
       TypeError: if it is called in a function that JAX transforms.
     """
+    if branch not in _BRANCHES:
+        raise ValueError(f"There is no branch {branch!r}. Choose one of {', '.join(_BRANCHES)}.")
     if chunk < 1:
         raise ValueError(f"A chunk of {chunk} paths renders nothing. Give 1 or more.")
     rays = jax.tree.map(np.float32, tiles.fetch(rays, instead=_INSTEAD))
@@ -113,15 +122,16 @@ def render_image(model: Model, rays: Rays, *, chunk: int = CHUNK) -> Rendering:
     parts = [jax.device_get(_blank(jax.device_put(flat.origins[:0])))]
     for start in range(0, count, TILE):
         tile, _ = tiles.cut_out(flat, None, start, TILE)
-        part = _render_tile(model, tile, min(TILE, count - start), chunk)
+        part = _render_tile(model, tile, min(TILE, count - start), chunk, branch)
         parts.append(tiles.fetch(part, instead=_INSTEAD))
     joined = jax.tree.map(lambda *each: np.concatenate(each), *parts)
     return jax.tree.map(lambda x: x[:count].reshape((*shape, *x.shape[1:])), joined)
 
 
-def _render_tile(model: Model, rays: Rays, real: int, chunk: int) -> Rendering:
+def _render_tile(model: Model, rays: Rays, real: int, chunk: int, branch: Branch) -> Rendering:
     detail = path_detail(model.config, model.budget)
-    tile = _trace_tile(model.geometry, rays, real, budget=model.budget, detail=detail)
+    which = _BRANCHES.index(branch)
+    tile = _trace_tile(model.geometry, rays, real, which, budget=model.budget, detail=detail)
     sums = _blank(tile.lost)
     count = int(tiles.fetch(tile.count, instead=_INSTEAD))
     for start in range(0, count, chunk):
@@ -138,10 +148,16 @@ def _blank(lost: Float[Array, "rays 3"]) -> Rendering:
 
 @functools.partial(jax.jit, static_argnames=("budget", "detail"))
 def _trace_tile(
-    geometry: Geometry, rays: Rays, real: Int[Array, ""], *, budget: Budget, detail: Detail
+    geometry: Geometry,
+    rays: Rays,
+    real: Int[Array, ""],
+    which: Int[Array, ""] = _ALL,
+    *,
+    budget: Budget,
+    detail: Detail,
 ) -> _Tile:
     traced = path_tracing.trace(geometry, rays, budget=budget, detail=detail)
-    return _sort(traced, real)
+    return _sort(traced, real, which)
 
 
 @functools.partial(jax.jit, static_argnames=("config", "chunk"))
@@ -168,15 +184,18 @@ def _finish_tile(sums: Rendering) -> Rendering:
     return _finish(sums)
 
 
-def _sort(traced: Traced, real: int | Int[Array, ""]) -> _Tile:
-    """Moves the paths that exist to the front and marks the heaviest of each ray.
+def _sort(traced: Traced, real: int | Int[Array, ""], which: int | Int[Array, ""] = _ALL) -> _Tile:
+    """Moves the paths that are wanted to the front and marks the heaviest of each ray.
 
     Args:
       traced: the light of a tile.
       real: how many of its rays are not there to fill it up.
+      which: place in `_BRANCHES` of those that are wanted.
     """
     paths, rays = traced.paths, traced.lost.shape[0]
+    mirrored = jnp.where(reflected_first(paths), _MIRRORED, _PASSED)
     exists = light_paths.exists(paths) & (paths.rays < real)
+    exists &= (which == _ALL) | (which == mirrored)
     order = jnp.argsort(~exists, stable=True)
     weight = jnp.mean(paths.weights, axis=-1)
     most = jax.ops.segment_max(weight, paths.rays, num_segments=rays)

@@ -1,0 +1,110 @@
+"""Looks at a trained run in a browser: orbit, layers, and the light paths of any pixel.
+
+python -m experiments.view --run=runs/ball
+
+Bodies may be given other indices of refraction, and light another cut or more bends; the fields
+stay as they were trained. `docs/viewer.md` tells what is shown.
+"""
+
+import threading
+from pathlib import Path
+
+from absl import flags
+
+from experiments import commands, scene_option
+from experiments.viewing import subject as subjects
+from refref_jax.data.errors import SceneError
+from refref_jax.render import load_model
+from refref_jax.training import run_folder
+
+_RUN = flags.DEFINE_string("run", None, "Folder of a trained run.", required=True)
+_STEP = flags.DEFINE_integer("step", None, "Checkpoint to use; the newest if not given.", 0)
+_SCENE = flags.DEFINE_string(
+    "scene",
+    None,
+    f"The scene, for its test views: {scene_option.FORMS}. That of the run, if not given and still "
+    "there.",
+)
+_HOST = flags.DEFINE_string(
+    "host", "127.0.0.1", "Address to listen on; 0.0.0.0 lets in everyone who reaches this machine."
+)
+_PORT = flags.DEFINE_integer(
+    "port", 8080, "Port; if it is taken, the next one that is free.", 1, 65535
+)
+_HEIGHTS = flags.DEFINE_list(
+    "heights",
+    ["36", "90", "180"],
+    "Heights of the pictures in pixels: while the camera moves, and then one after the other. "
+    "Widths are 16/9 of them.",
+)
+_CHUNK = flags.DEFINE_integer("chunk", 4096, "Paths at once: lower it if memory runs out.", 1)
+
+
+def main() -> None:
+    """Serves a run until it is interrupted."""
+    heights = read_heights(_HEIGHTS.value)
+    try:
+        from experiments.viewing import server as serving
+    except ModuleNotFoundError as error:
+        if error.name != "viser":
+            raise
+        raise ValueError("The viewer needs viser. Run pip install 'refref_jax[viewer]'.") from error
+    subject = read_subject(heights)
+    server = serving.serve(subject, host=_HOST.value, port=_PORT.value)
+    print(f"Look at http://{_HOST.value}:{server.get_port()}", flush=True)
+    if subject.frames is None:
+        print("There are no test views, and no errors to show: give the scene as --scene.")
+    print("The first picture is compiled first. Ctrl-C ends this.", flush=True)
+    try:
+        threading.Event().wait()
+    finally:
+        server.stop()
+
+
+def read_heights(words: list[str]) -> tuple[int, ...]:
+    """Returns the heights of pictures.
+
+    Raises:
+      ValueError: if they are not two numbers or more that grow.
+    """
+    try:
+        heights = tuple(int(word) for word in words)
+    except ValueError:
+        heights = ()
+    if len(heights) < 2 or heights[0] < 1 or list(heights) != sorted(set(heights)):
+        raise ValueError(
+            f"--heights={','.join(words)} are not two or more whole numbers that grow. Write "
+            "as in --heights=36,90,180."
+        )
+    return heights
+
+
+def read_subject(heights: tuple[int, ...]) -> subjects.Subject:
+    """Reads the run, and its scene where there is one."""
+    run = Path(_RUN.value)
+    config = run_folder.read_config(run)
+    scene = _scene(config.scene.path)
+    model = load_model(run, step=_STEP.value)
+    return subjects.Subject(
+        name=run.resolve().name,
+        model=model,
+        rule=config.scene.rule,
+        frames=None if scene is None else subjects.read_test_views(scene),
+        parts=subjects.part_names(scene, len(model.geometry.interfaces.index_inside)),
+        heights=heights,
+        chunk=_CHUNK.value,
+    )
+
+
+def _scene(trained_on: str) -> Path | None:
+    if _SCENE.value is not None:
+        return scene_option.opened(_SCENE.value)
+    try:
+        return scene_option.opened(trained_on)
+    except (SceneError, OSError) as error:
+        print(f"warning: the scene of the run can not be read: {error}")
+        return None
+
+
+if __name__ == "__main__":
+    commands.run(main)

@@ -1,0 +1,176 @@
+"""What is shown: colours by hand, the sum of the branches, bands that are called off."""
+
+import dataclasses
+
+import jax
+import jaxtyping
+import numpy as np
+import pytest
+
+from experiments import figures
+from experiments.viewing import layers
+from experiments.viewing import subject as subjects
+from experiments.viewing.subject import Subject
+from refref_jax.data import files
+from refref_jax.data.cameras import image_rays
+from refref_jax.data.local_layout import read_frames
+from refref_jax.optics.budgets import PAPER, STRAIGHT
+from refref_jax.optics.interface_rules import RULES
+from refref_jax.render import Model, images, init_params, render_image
+from tests import scenes
+from tests.small_model import CAMERAS, MODEL
+
+_RAYS = image_rays(CAMERAS, 0)
+_OPTIONS = {"chunk": 4096, "most": 256, "cancelled": lambda: False}
+
+
+@pytest.fixture(scope="module")
+def model():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(images, "TILE", 256)
+        params = init_params(jax.random.key(0), MODEL)
+        yield Model(MODEL, PAPER, scenes.geometry(scenes.ball(1.3, subdivisions=2)), params)
+
+
+def test_a_model_offers_what_it_has(model):
+    assert layers.offered(model, truth=True) == (
+        "rgb",
+        "refraction only",
+        "reflection only",
+        "distance",
+        "normals",
+        "mask",
+        "error",
+    )
+    straight = model._replace(budget=STRAIGHT)
+    assert layers.offered(straight, truth=False) == ("rgb", "distance")
+
+
+def test_the_two_branches_sum_to_the_picture(model):
+    both, through, mirrored = (
+        render_image(model, _RAYS, branch=branch).linear
+        for branch in ("both", "transmitted", "reflected")
+    )
+    np.testing.assert_allclose(through + mirrored, both, atol=1e-6)
+    beside = layers.draw(model, layers.MASK, _RAYS, **_OPTIONS)[..., 0] == 0
+    assert beside.any() and not mirrored[beside].any()
+    # The paper's reflection carries Fresnel's share of each pixel of the body, and it is small.
+    assert (mirrored[~beside].mean(-1) > 0.0).all()
+    assert mirrored[~beside].mean() < 0.3 * through[~beside].mean()
+
+
+def test_another_index_is_another_picture_of_the_same_programs(model):
+    subject = Subject("made", model, "nested", None, ("glass",), (9, 18), 4096)
+    first = subjects.first_choice(subject)
+    before = layers.draw(model, layers.RGB, _RAYS, **_OPTIONS)
+    programs = (images._trace_tile, images._render_chunk)
+    compiled = [program._cache_size() for program in programs]
+    other = subjects.chosen_model(subject, dataclasses.replace(first, indices=(1.2,)))
+    after = render_image(other, _RAYS)
+    for branch in ("both", "transmitted", "reflected"):
+        render_image(model, _RAYS, branch=branch)
+    assert [program._cache_size() for program in programs] == compiled
+    thin = render_image(other, _RAYS, branch="reflected").linear.mean()
+    thick = render_image(model, _RAYS, branch="reflected").linear.mean()
+    assert thin < 0.5 * thick and np.any(files.to_bytes(after.rgb) != before)
+
+
+def test_a_branch_that_is_none_is_refused(model):
+    # The check of types, which runs in tests alone, is quicker to refuse it.
+    with pytest.raises((ValueError, jaxtyping.TypeCheckError), match="refracted"):
+        render_image(model, _RAYS, branch="refracted")
+
+
+def test_the_mask_is_the_disc_of_the_ball(model):
+    mask = layers.draw(model, layers.MASK, _RAYS, **_OPTIONS)
+    assert mask.dtype == np.uint8 and set(np.unique(mask)) == {0, 255}
+    # A ray meets a ball of 1.3 around the origin if it passes nearer than that.
+    nearest = np.linalg.norm(np.cross(_RAYS.origins, _RAYS.directions), axis=-1)
+    np.testing.assert_array_equal(mask[nearest < 1.26], 255)
+    np.testing.assert_array_equal(mask[nearest > 1.3], 0)
+
+
+def test_normals_are_those_of_the_ball_in_colour(model):
+    drawn = layers.draw(model, layers.NORMALS, _RAYS, **_OPTIONS)
+    along = np.einsum("...i,...i->...", _RAYS.origins, _RAYS.directions)
+    across = np.sum(np.square(_RAYS.origins), axis=-1) - along**2
+    inner = across < 1.0
+    points = _RAYS.origins + (-along - np.sqrt(1.69 - across, where=inner, out=0 * across))[
+        ..., None
+    ] * (_RAYS.directions)
+    expected = 127.5 * (points[inner] / 1.3 + 1.0)
+    assert np.abs(drawn[inner] - expected).max() < 4.0  # of a ball of triangles
+    assert (drawn[across > 1.69] == 255).all()
+
+
+def test_cropped_windows_share_the_program_of_surfaces(model):
+    whole = layers.draw(model, layers.MASK, _RAYS, **_OPTIONS)
+    part = type(_RAYS)(*(x[4:11] for x in _RAYS))
+    np.testing.assert_array_equal(layers.draw(model, layers.MASK, part, **_OPTIONS), whole[4:11])
+
+
+def test_distances_have_one_scale_from_everywhere(model):
+    drawn = layers.draw(model, layers.DISTANCE, _RAYS, **_OPTIONS)
+    seen = render_image(model, _RAYS).distance
+    expected = figures.colour_distances([seen], farthest=2.0 * MODEL.radius)[0]
+    np.testing.assert_array_equal(drawn, expected)
+
+
+def test_a_drawing_that_is_called_off_ends_at_the_next_band(model, monkeypatch):
+    rendered = []
+
+    def render(model, rays, **_):
+        rendered.append(rays.radii.shape)
+        return images._blank(0)._replace(rgb=np.zeros((*rays.radii.shape, 3)))
+
+    monkeypatch.setattr(layers.images, "TILE", 64)  # bands of four rows
+    monkeypatch.setattr(layers, "render_image", render)
+    options = _OPTIONS | {"cancelled": lambda: len(rendered) == 2}
+    assert layers.draw(model, layers.RGB, _RAYS, **options) is None
+    assert rendered == [(4, 16), (4, 16)]
+    options = _OPTIONS | {"cancelled": lambda: True}
+    assert layers.draw(model, layers.NORMALS, _RAYS, **options) is None
+
+
+def test_bands_are_joined_in_order(model, monkeypatch):
+    monkeypatch.setattr(layers.images, "TILE", 48)  # bands of three rows, the last of one
+    monkeypatch.setattr(
+        layers,
+        "render_image",
+        lambda model, rays, **_: images._blank(0)._replace(rgb=0.5 + 0.5 * rays.directions),
+    )
+    drawn = layers.draw(model, layers.RGB, _RAYS, **_OPTIONS)
+    np.testing.assert_array_equal(drawn, files.to_bytes(0.5 + 0.5 * _RAYS.directions))
+
+
+def test_an_error_is_that_of_the_pixels_that_are_drawn(model, ball_scene, monkeypatch):
+    frames = read_frames(ball_scene, "test")
+    pixels = layers.view_pixels(frames, 2, 128 * 128 // 4)
+    assert pixels.target.shape == (64, 64, 3)
+    true = files.read_rgb(frames.images[2]) / 255.0
+    np.testing.assert_allclose(pixels.target, true[1::2, 1::2], atol=1e-6)
+    every = layers.view_pixels(frames, 2, 10**6)
+    np.testing.assert_array_equal(every.rays.directions, image_rays(frames.cameras, 2).directions)
+    np.testing.assert_array_equal(every.rays.directions[1::2, 1::2], pixels.rays.directions)
+    monkeypatch.setattr(layers.images, "TILE", 64 * 64)  # one band
+    off = np.float32(0.1) * (pixels.target < 0.8)
+    monkeypatch.setattr(
+        layers,
+        "render_image",
+        lambda model, rays, **_: images._blank(0)._replace(rgb=pixels.target + off),
+    )
+    options = {"chunk": 4096, "cancelled": lambda: False}
+    picture, error = layers.draw_error(model, pixels, **options)
+    assert error == pytest.approx(0.1 * np.sqrt(np.mean(off > 0.0)), rel=1e-4)
+    assert set(np.unique(picture)) == {0, 102}  # 0.1 times 4, of 255
+    assert layers.draw_error(model, pixels, chunk=1, cancelled=lambda: True) is None
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_other_indices_are_those_of_the_rule(rule):
+    made = RULES[rule]([1.5, 1.33], [-1, 0], tints=[[0.9, 1.0, 1.0]] * 2, priorities=[1, 2])
+    changed = layers.with_indices(made, (1.6, 1.4), rule)
+    expected = RULES[rule]([1.6, 1.4], [-1, 0], tints=[[0.9, 1.0, 1.0]] * 2, priorities=[1, 2])
+    for ours, theirs in zip(changed, expected, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+        assert ours.dtype == theirs.dtype

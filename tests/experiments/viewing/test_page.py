@@ -1,0 +1,113 @@
+"""The viewer in headless Chromium: it opens, draws, and a click draws light paths."""
+
+import dataclasses
+import socket
+
+import jax
+import numpy as np
+import pytest
+
+from experiments.viewing import subject as subjects
+from refref_jax.data import local_layout
+from refref_jax.optics.budgets import TREE
+from refref_jax.render import Model, images, init_params
+from tests import scenes
+from tests.small_model import MODEL
+
+serving = pytest.importorskip("experiments.viewing.server", exc_type=ModuleNotFoundError)
+browser = pytest.importorskip("tests.experiments.viewing.browser", exc_type=ModuleNotFoundError)
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(browser.CHROMIUM is None, reason="there is no Chromium"),
+]
+
+_SIZE = (1000, 640)
+
+# A pixel of the ball beside its middle, where light bends; one beside the ball.
+_OF_THE_BALL, _BESIDE = (440, 290), (60, 600)
+
+# Programs are compiled on the way.
+_PATIENCE = 600.0
+
+
+@pytest.fixture
+def subject(ball_scene, monkeypatch):
+    monkeypatch.setattr(images, "TILE", 1024)
+    params = init_params(jax.random.key(0), MODEL)
+    budget = dataclasses.replace(TREE, bends=4, reentry="impossible")
+    config = dataclasses.replace(MODEL, interior="clear")
+    model = Model(config, budget, scenes.geometry(scenes.ball(1.4, subdivisions=3)), params)
+    frames = local_layout.read_frames(ball_scene, "test")
+    return subjects.Subject("made", model, "nested", frames, ("ball_glass",), (18, 36), 1024)
+
+
+@pytest.fixture
+def server(subject):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    server = serving.serve(subject, host="127.0.0.1", port=port)
+    yield server
+    server.stop()
+
+
+def _wait_for(page, words):
+    browser.until(lambda: words in page.text(), words, patience=_PATIENCE)
+
+
+def _choose(page, old, new):
+    """Opens the list that shows one word and takes another."""
+    page.evaluate(f"[...document.querySelectorAll('input')].find(x => x.value === '{old}').click()")
+    option = f"[...document.querySelectorAll('[role=option]')].find(x => x.innerText === '{new}')"
+    browser.until(lambda: page.evaluate(f"{option} !== undefined"), new)
+    page.evaluate(f"{option}.click()")
+
+
+def _yellow(picture):
+    """Returns how many pixels have the colour of strong light."""
+    return np.sum((picture[..., 0] > 200) & (picture[..., 1] > 200) & (picture[..., 2] < 100))
+
+
+def _canvas(page):
+    """Returns what is left of the panel."""
+    return page.screenshot()[:, : _SIZE[0] // 2]
+
+
+def test_it_opens_and_draws_and_a_click_draws_light_paths(subject, server, tmp_path):
+    address = f"http://127.0.0.1:{server.get_port()}"
+    with browser.opened(address, tmp_path / "profile", size=_SIZE) as page:
+        _wait_for(page, "size 2 of 2")
+        (client,) = server.get_clients().values()
+
+        _choose(page, "rgb", "normals")
+        _wait_for(page, "56 x 36 pixels, size 2 of 2")
+        browser.until(lambda: len(np.unique(_canvas(page))) > 100, "the canvas has colours")
+        drawn = _canvas(page)
+        x, y = _BESIDE
+        assert (drawn[y, x] > 245).all()  # no surface there
+        x, y = _OF_THE_BALL
+        assert np.ptp(drawn[y, x].astype(int)) > 20 and _yellow(drawn) < 20
+
+        page.click(*_OF_THE_BALL)
+        _wait_for(page, "left the objects")
+        lines = [client.scene.get_handle_by_name(f"/paths/{i}") for i in range(4)]
+        segments = np.concatenate([line.points for line in lines if line is not None])
+        assert len(segments) >= 4  # in, through, out, and mirrored
+        eye = np.asarray(client.camera.position)
+        assert np.linalg.norm(segments - eye, axis=-1).min() < 0.05
+        assert np.abs(segments).max() < MODEL.radius + 0.01
+        browser.until(lambda: _yellow(_canvas(page)) > 50, "lines of strong light")
+
+        page.drag((300, 500), (420, 460))
+        _wait_for(page, "size 2 of 2")
+        moved = np.asarray(client.camera.position)
+        assert np.linalg.norm(moved - eye) > 0.3
+
+        _choose(page, "normals", "error")
+        _wait_for(page, "test view")
+        views = subject.frames.cameras.poses[:, :, 3]
+        gaps = np.linalg.norm(views - client.camera.position, axis=-1)
+        assert gaps.min() < 0.01
+        assert f"test view {subject.frames.names[gaps.argmin()]}" in page.text()
+        assert page.complaints == []

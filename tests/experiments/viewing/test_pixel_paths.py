@@ -1,0 +1,168 @@
+"""The light paths of one pixel: a slab by hand, a ball against the tracer, tables and pieces."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from experiments.viewing import pixel_paths, scenery
+from experiments.viewing.pixel_paths import PixelPaths
+from refref_jax.geometry.rays import Rays
+from refref_jax.optics.budgets import STRAIGHT, TREE
+from refref_jax.optics.light_paths import PathStatus
+from refref_jax.render import Model, init_params
+from tests import scenes
+from tests.small_model import MODEL
+
+_BUDGET = dataclasses.replace(TREE, bends=6, cut=1e-3)
+
+
+def _ray(origin, direction):
+    direction = np.asarray(direction, np.float64)
+    return Rays(np.asarray(origin), direction / np.linalg.norm(direction), np.float64(1e-3))
+
+
+@pytest.fixture(scope="module")
+def slab():
+    return scenes.geometry(scenes.box((8.0, 8.0, 1.0)))
+
+
+@pytest.fixture(scope="module")
+def straight_down(slab):
+    return pixel_paths.trace_pixel(
+        slab, _ray((0.1, 0.2, 4.0), (0.0, 0.0, -1.0)), budget=_BUDGET, reach=2.0
+    )
+
+
+def test_a_slab_seen_head_on_has_the_paths_of_a_textbook(straight_down):
+    paths, r = straight_down, 0.04  # ((1.5 - 1) / (1.5 + 1))^2
+    x = (0.1, 0.2)
+    through, mirrored, twice = paths.polylines[:3]
+    np.testing.assert_allclose(through, [[*x, 4.0], [*x, 0.5], [*x, -0.5], [*x, -2.5]], atol=1e-5)
+    # Of nearly equal weight are the outer mirror's path and the one of the back wall.
+    assert np.allclose(mirrored, [[*x, 4.0], [*x, 0.5], [*x, 2.5]], atol=1e-5)
+    assert np.allclose(twice, [[*x, 4.0], [*x, 0.5], [*x, -0.5], [*x, 0.5], [*x, 2.5]], atol=1e-5)
+    expected = [(1 - r) ** 2, r, r * (1 - r) ** 2]
+    np.testing.assert_allclose(paths.weights[:3].mean(-1), expected, rtol=0.05)
+    assert paths.bends[:3].tolist() == [2, 1, 3]
+    assert set(paths.statuses) <= {PathStatus.ESCAPED, PathStatus.OUT_OF_BENDS}
+    np.testing.assert_allclose(paths.weights.sum(0) + paths.lost, 1.0, atol=1e-5)
+    assert np.all(np.diff(paths.weights.mean(-1)) <= 0.0)
+
+
+def test_pieces_are_the_tree_with_each_segment_once(straight_down):
+    pieces = pixel_paths.pieces(straight_down)
+    first = np.flatnonzero(pieces.ends[:, 0, 2] == 4.0)
+    assert first.size == 1 and pieces.shares[first[0]] == pytest.approx(1.0, abs=1e-5)
+    keys = {piece.tobytes() for piece in pieces.ends}
+    assert len(keys) == len(pieces.ends)
+    # What reaches a point goes on from there: light is neither made nor lost on the way.
+    for ends, share in zip(pieces.ends, pieces.shares, strict=True):
+        after = [
+            other
+            for start, other in zip(pieces.ends[:, 0], pieces.shares, strict=True)
+            if start.tobytes() == ends[1].tobytes()
+        ]
+        assert not after or sum(after) >= share - 1e-6
+    last = [line[-2:] for line in straight_down.polylines]
+    total = sum(
+        pieces.shares[i]
+        for i in range(len(keys))
+        if any(np.array_equal(pieces.ends[i], x) for x in last)
+    )
+    assert total == pytest.approx(straight_down.weights.mean(-1).sum(), abs=1e-5)
+
+
+def test_a_ray_that_meets_nothing_is_one_straight_line(slab):
+    paths = pixel_paths.trace_pixel(
+        slab, _ray((0.0, 0.0, 4.0), (0.0, 0.0, 1.0)), budget=_BUDGET, reach=2.0
+    )
+    assert paths.statuses == (PathStatus.MISSED,) and paths.bends.tolist() == [0]
+    np.testing.assert_allclose(paths.polylines[0], [[0, 0, 4], [0, 0, 6]], atol=1e-6)
+    np.testing.assert_array_equal(paths.weights, [[1.0, 1.0, 1.0]])
+
+
+def test_in_a_bounded_scene_last_segments_end_at_its_walls(slab):
+    params = init_params(jax.random.key(0), MODEL)
+    model = Model(MODEL, STRAIGHT, slab, params)
+    paths = pixel_paths.trace_pixel(model, _ray((0.5, 0.0, 4.0), (0.0, 0.0, -1.0)))
+    np.testing.assert_allclose(paths.polylines[0], [[0.5, 0, 4], [0.5, 0, -7.5]], atol=1e-5)
+    assert paths.statuses == (PathStatus.NOT_TRACED,)
+    # From outside, away from the walls, none is met.
+    paths = pixel_paths.trace_pixel(model, _ray((0.0, 0.0, 9.0), (0.0, 0.0, 1.0)), reach=1.5)
+    np.testing.assert_allclose(paths.polylines[0][-1], [0.0, 0.0, 10.5], atol=1e-5)
+
+
+def test_geometry_alone_needs_a_budget(slab):
+    with pytest.raises(ValueError, match="Give a budget"):
+        pixel_paths.trace_pixel(slab, _ray((0, 0, 4), (0, 0, 1)))
+
+
+def _made(shares):
+    lines = tuple(np.array([[0, 0, 0], [0, 0, 1 + i]], np.float32) for i in range(len(shares)))
+    weights = np.repeat(np.asarray(shares, np.float32)[:, None], 3, axis=1)
+    statuses = (PathStatus.ESCAPED,) * (len(shares) - 1) + (PathStatus.OUT_OF_BENDS,)
+    bends = np.arange(len(shares), dtype=np.int32)
+    return PixelPaths(lines, weights, statuses, bends, np.full(3, 0.01, np.float32))
+
+
+def test_the_table_says_number_status_and_weights():
+    table = pixel_paths.describe(_made([0.8, 0.15, 0.03, 0.01]), most=3)
+    assert "**4 light paths**" in table
+    assert "| 1 | 80.00 % | 0.800, 0.800, 0.800 | 0 | left the objects |" in table
+    assert table.count("\n| ") == 4 and "and 1 more, 1 % together" in table
+    assert "1 % of the light found no room" in table
+    one = pixel_paths.describe(_made([1.0])._replace(lost=np.zeros(3)))
+    assert "**1 light path**" in one and "ran out of bends" in one and "room" not in one
+    assert set(pixel_paths.ENDINGS) == set(PathStatus) - {PathStatus.EMPTY}
+
+
+def test_strong_light_is_thick_and_yellow_and_weak_light_thin_and_blue():
+    shares = np.array([1e-5, 1e-3, 0.0316228, 1.0, 2.0])
+    np.testing.assert_allclose(scenery.strength(shares), [0.0, 0.0, 0.5, 1.0, 1.0], atol=1e-6)
+    weak, *_, strong = scenery.colour(shares).astype(int)
+    assert weak[2] > 100 > weak[1] and strong[0] > 200 and strong[1] > 200 and strong[2] < 100
+
+
+class _Scene:
+    """Takes notes of what is added to it."""
+
+    def __init__(self):
+        self.nodes = {}
+
+    def add_line_segments(self, name, points, colors, *, thickness, thickness_units):
+        assert points.shape == colors.shape and thickness_units == "screen"
+        self.nodes[name] = (points, thickness)
+        return _Node(lambda: self.nodes.pop(name))
+
+    def add_mesh_simple(self, name, vertices, faces, **_):
+        self.nodes[name] = vertices[faces]
+        return _Node(lambda: None)
+
+
+class _Node:
+    def __init__(self, remove):
+        self.remove, self.visible = remove, False
+
+
+def test_the_scene_shows_each_piece_once_and_nothing_of_the_last_pixel(straight_down, slab):
+    scene = _Scene()
+    made = scenery.Scenery(scene, slab.surfaces, None)
+    np.testing.assert_allclose(
+        np.sort(scene.nodes.pop("/bodies/0").reshape(-1, 3), axis=0),
+        np.sort(
+            np.asarray(scenes.box((8.0, 8.0, 1.0)).vertices)[scenes.box().faces].reshape(-1, 3), 0
+        ),
+        atol=1e-6,
+    )
+    pieces = pixel_paths.pieces(straight_down)
+    for _ in range(2):
+        made.show_paths(pieces)
+        lines = [points for points, _ in scene.nodes.values()]
+        assert sum(map(len, lines)) == len(pieces.ends)
+    thickness = {points[0].tobytes(): thick for points, thick in scene.nodes.values()}
+    strongest = pieces.ends[np.argmax(pieces.shares)].tobytes()
+    assert thickness[strongest] == max(scenery.THICKNESSES)
+    made.remove_paths()
+    assert scene.nodes == {}

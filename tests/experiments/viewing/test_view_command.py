@@ -1,0 +1,106 @@
+"""`experiments.view` refuses mistakes before it compiles anything, and what is chosen is shown."""
+
+import dataclasses
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from experiments.viewing import layers
+from experiments.viewing import subject as subjects
+from experiments.viewing.subject import Subject
+from refref_jax.data import local_layout
+from refref_jax.optics.budgets import STRAIGHT, TREE
+from refref_jax.render import Model, init_params
+from tests import scenes
+from tests.experiments.command import ROOT, run_command
+from tests.small_model import MODEL
+
+
+def _subject(budget=TREE, frames=None):
+    parts = scenes.geometry(scenes.ball(1.0, subdivisions=1), scenes.ball(0.5, subdivisions=1))
+    model = Model(
+        MODEL, budget, parts, jax.eval_shape(lambda: init_params(jax.random.key(0), MODEL))
+    )
+    return Subject("made", model, "nested", frames, ("glass", "bubble"), (36, 90), 4096)
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("--heights=90,36", "--heights=90,36 are not two or more whole numbers that grow"),
+        ("--heights=36", "--heights=36 are not"),
+        ("--heights=small,large", "--heights=36,90,180"),
+    ],
+)
+def test_mistaken_heights_are_refused(tmp_path, option, words):
+    result = run_command("view", f"--run={tmp_path}", option, fails=True)
+    assert words in result.stderr and "Traceback" not in result.stderr
+
+
+def test_a_folder_that_is_no_run_is_named(tmp_path):
+    pytest.importorskip("viser")
+    result = run_command("view", f"--run={tmp_path / 'none'}", fails=True)
+    assert "none" in result.stderr and "Traceback" not in result.stderr
+
+
+def test_without_viser_it_says_what_to_install(tmp_path):
+    code = (
+        "import runpy, sys\n"
+        "sys.modules['viser'] = None\n"
+        f"sys.argv = ['view', '--run={tmp_path}']\n"
+        "runpy.run_module('experiments.view', run_name='__main__', alter_sys=True)"
+    )
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 2
+    assert "pip install 'refref_jax[viewer]'" in result.stderr
+
+
+def test_the_first_choice_is_the_model_as_it_was_trained():
+    subject = _subject()
+    choice = subjects.first_choice(subject)
+    assert choice.layer == layers.RGB and choice.indices == (1.5, 1.5)
+    model = subjects.chosen_model(subject, choice)
+    assert model.budget is subject.model.budget and model.geometry == subject.model.geometry
+
+
+def test_another_index_changes_arrays_and_nothing_that_is_compiled():
+    subject = _subject()
+    choice = dataclasses.replace(subjects.first_choice(subject), indices=(1.7, 1.2))
+    model = subjects.chosen_model(subject, choice)
+    assert model.budget == subject.model.budget
+    np.testing.assert_array_equal(model.geometry.interfaces.index_inside, np.float32([1.7, 1.2]))
+    np.testing.assert_array_equal(model.geometry.interfaces.index_outside, np.float32([1.0, 1.7]))
+    before, after = (jax.tree.map(np.shape, x.geometry) for x in (subject.model, model))
+    assert before == after
+    types = (jax.tree.map(lambda x: x.dtype, each.geometry) for each in (subject.model, model))
+    assert len({tuple(jax.tree.leaves(each)) for each in types}) == 1
+
+
+def test_another_cut_and_other_bends_are_another_budget_with_room_for_them():
+    subject = _subject()
+    first = subjects.first_choice(subject)
+    finer = subjects.chosen_model(subject, dataclasses.replace(first, cut=0.005, bends=32)).budget
+    assert (finer.cut, finer.bends) == (0.005, 32)
+    assert finer.paths_per_ray == pytest.approx(2.0 * TREE.paths_per_ray)
+    straight = _subject(STRAIGHT)
+    choice = subjects.first_choice(straight)
+    assert subjects.chosen_model(straight, choice) is straight.model
+
+
+def test_parts_have_the_names_of_their_meshes_where_these_are_known(ball_scene):
+    assert subjects.part_names(ball_scene, 1) == ("ball_body_glass",)
+    assert subjects.part_names(ball_scene, 2) == ("part 1", "part 2")
+    assert subjects.part_names(None, 1) == ("part 1",)
+
+
+def test_a_page_begins_at_the_first_test_view_or_beside_the_origin(ball_scene):
+    frames = local_layout.read_frames(ball_scene, "test")
+    view = subjects.first_viewpoint(_subject(frames=frames))
+    np.testing.assert_array_equal(view.pose, frames.cameras.poses[0])
+    alone = subjects.first_viewpoint(_subject()).pose
+    assert np.linalg.norm(alone[:, 3]) == pytest.approx(4.0)
+    np.testing.assert_allclose(alone[:, 2], alone[:, 3] / 4.0, atol=1e-12)  # looks at the origin
