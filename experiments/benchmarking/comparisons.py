@@ -7,14 +7,14 @@
 A number is the mean over a scene's images, then over scenes; its error is over scenes.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from experiments.benchmarking import pose_space, published, quantities, tables
 from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.quantities import Quantity
-from experiments.benchmarking.records import OTHER, Record
+from experiments.benchmarking.records import OTHER, Metrics, Record
 from experiments.benchmarking.statistics import mean_over
 from experiments.benchmarking.tables import Block, Column, Row, Table
 
@@ -61,8 +61,6 @@ _DRMSE = (
     "*of the image* is ours alone."
 )
 
-Metrics = Mapping[str, float | None]
-
 
 def main_table(found: Sequence[Record]) -> Table:
     """Returns the means of all methods that are no ablations, by category and background."""
@@ -90,8 +88,8 @@ def top_views_table(found: Sequence[Record]) -> Table:
 
 def top_metrics(record: Record) -> Metrics:
     """Returns the means over the views of a result that are farthest from any training view."""
-    apart = np.array([image["pose_distance"] for image in record.per_image])
-    views = [record.per_image[i] for i in pose_space.farthest(apart, TOP)]
+    apart = np.array([image.pose_distance for image in record.per_image])
+    views = [record.per_image[i].metrics for i in pose_space.farthest(apart, TOP)]
     keys = [key for key in record.metrics if all(key in view for view in views)]
     return {key: mean_over([view[key] for view in views]).mean for key in keys}
 
@@ -130,21 +128,18 @@ def _ours(
 ) -> list[Row]:
     """Returns a row for each method with results, in the order of the methods."""
     rows = []
-    for name in _ordered({record.method for record in found}):
+    for name, method in METHODS.items():
         own = [record for record in found if record.method == name]
+        if not own:
+            continue
         known = [(metrics(record), record.background) for record in own]
         cells = [mean_over(quantities.value(each, *pair) for pair in known) for each in wanted]
-        label = METHODS[name].label if name in METHODS else name
-        rows.append(tables.row(label, "ours", len(own), cells))
+        rows.append(tables.row(method.label, "ours", len(own), cells))
     return rows
 
 
 def _without_ablations(found: Sequence[Record]) -> list[Record]:
-    return [
-        record
-        for record in found
-        if record.method not in METHODS or METHODS[record.method].group == "main"
-    ]
+    return [record for record in found if METHODS[record.method].group == "main"]
 
 
 def _theirs(table: str, category: str, background: str, wanted: Sequence[Quantity]) -> list[Row]:
@@ -165,8 +160,3 @@ def _table(
     whole = Table(name, title, notes, columns(wanted), tuple(blocks))
     kept = [each.label for each in wanted if each.published is not None]
     return tables.without_empty_columns(whole, kept)
-
-
-def _ordered(names: set[str]) -> list[str]:
-    known = [name for name in METHODS if name in names]
-    return [*known, *sorted(names - set(known))]

@@ -19,6 +19,7 @@ from experiments.benchmarking import (
     tables,
 )
 from experiments.benchmarking.methods import METHODS
+from experiments.benchmarking.records import Image
 from experiments.benchmarking.statistics import NOTHING, Cell, mean_over
 from experiments.benchmarking.tables import Column
 from refref_jax.data import scene_names
@@ -153,7 +154,7 @@ def test_equal_numbers_share_a_mark_and_lower_may_be_better():
 
 def test_top_views_are_means_over_the_five_farthest():
     views = [
-        {"name": str(i), "pose_distance": d, "psnr": 10.0 * d, "psnr_masked": None if i else 5.0}
+        Image(str(i), d, None, {"psnr": 10.0 * d, "psnr_masked": None if i else 5.0})
         for i, d in enumerate([0.1, 0.6, 0.2, 0.5, 0.3, 0.4, 0.0])
     ]
     record = made_record("cube_smcvx_ball", "tree", psnr=1.0, psnr_masked=1.0)
