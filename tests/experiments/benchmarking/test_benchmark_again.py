@@ -90,9 +90,17 @@ def test_the_next_command_has_all_that_was_asked_for_and_can_be_given(tmp_path, 
     (line,) = [line for line in answer.stdout.splitlines() if line.startswith("Next: ")]
     words = shlex.split(line)[4:]
     assert set(given) | {"--steps=5", "--methods=ablations", scenes} < set(words)
-    answer = serve(tmp_path, *words)
-    assert "Next:" not in answer.stdout  # the ablations are done
-    assert len([call for call in calls(tmp_path) if call[0] == "train"]) > 20
+    listed = serve(tmp_path, *words, "--dry_run").stdout
+    assert "cube_smcvx_ball/oracle_no_tir" in listed and "28 jobs, 28 to do." in listed
+
+
+def test_after_ablations_none_are_proposed(tmp_path, serve, scenes):
+    for path in (tmp_path / "scenes").glob("*/transforms_test.json"):
+        path.unlink()
+    answer = serve(tmp_path, scenes, "--methods=ablations")
+    assert "its test views can not be read" in answer.stdout
+    assert "Next:" not in answer.stdout and not calls(tmp_path)
+    assert "Next:" in serve(tmp_path, scenes, "--methods=tree,tree_cone").stdout
 
 
 @pytest.mark.parametrize("kind", ["text", "zeros"])
