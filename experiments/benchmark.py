@@ -22,7 +22,7 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import commands
+from experiments import commands, perceptual_option
 from experiments.benchmarking import (
     engines,
     jobs,
@@ -33,8 +33,10 @@ from experiments.benchmarking import (
     summary,
 )
 from experiments.benchmarking.jobs import Job, Skipped
+from experiments.benchmarking.methods import Method
 from experiments.benchmarking.report import page
 from experiments.benchmarking.settings import Benchmark, Settings
+from experiments.perceptual_option import LPIPS_WEIGHTS
 from experiments.presets import PRESETS
 from experiments.supersampling import side_of
 from refref_jax.training import run_lock
@@ -60,9 +62,6 @@ _RAYS_PER_PIXEL = flags.DEFINE_integer(
     "rays_per_pixel", 4, "Rays in each pixel of an evaluation, a square: 1, 4, 9, 16."
 )
 _SEED = flags.DEFINE_integer("seed", 0, "Seed of everything random.", 0, 2**32 - 1)
-_LPIPS_WEIGHTS = flags.DEFINE_string(
-    "lpips_weights", None, "Weights of LPIPS, as experiments.evaluate takes them."
-)
 _JOBS = flags.DEFINE_integer("jobs", 1, "Jobs at once on this machine.", 1)
 _RAY = flags.DEFINE_string(
     "ray", None, "Address of a Ray cluster that does the jobs, or 'local' to start one here."
@@ -86,25 +85,31 @@ _REPORT_EDGE = flags.DEFINE_integer(
     "Longest edge of the report's pictures in pixels; larger ones are reduced.",
     16,
 )
+flags.adopt_module_key_flags(perceptual_option)
+
+# What decides results, and who does the jobs.
+_OF_JOBS = (
+    *(_PRESET, _STEPS, _LIMIT, _RAYS_PER_PIXEL, _SEED, LPIPS_WEIGHTS),
+    *(_JOBS, _RAY, _JOB_CPUS, _JOB_GPUS),
+)
 
 
 def main() -> None:
     """Does all jobs that are missing, and writes the tables and the report."""
     out = Path(_OUT.value).absolute()
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out} is a file, but a folder is needed. Give another --out.")
     if _TABLES_ONLY.value:
-        benchmark = settings.read(out)
-        earlier_failed, earlier_skipped = summary.not_done(out)
-        summary.write(out, benchmark, failed=earlier_failed, skipped=earlier_skipped)
-        _finish(out)
+        _make_tables(out)
         return
     scenes, chosen = scene_list.find(_SCENES.value), methods.parse(_METHODS.value)
-    common = _settings()
+    weights = perceptual_option.checked()
+    common = _settings(weights)
     benchmark = settings.extended(out, settings.asked(common, scenes, chosen))
-    weights = _LPIPS_WEIGHTS.value and str(Path(_LPIPS_WEIGHTS.value).absolute())
-    planned, skipped = jobs.plan(scenes, chosen, common, lpips_weights=weights)
-    missing = [job for job in planned if not jobs.is_done(out, job)]
+    file = None if weights is None else str(weights.absolute())
+    planned, skipped = jobs.plan(scenes, chosen, common, lpips_weights=file)
     if _DRY_RUN.value:
-        _list(planned, missing, skipped)
+        _list(out, planned, skipped)
         return
     # A benchmark that is killed takes the commands that it waits for with it.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -113,10 +118,12 @@ def main() -> None:
         # Another process may have added to it meanwhile.
         benchmark = settings.extended(out, benchmark)
         settings.write(out, benchmark)
-        failed = _work(out, benchmark, missing, skipped)
-    _finish(out)
+        failed = _work(out, benchmark, planned, skipped)
+        _finish(out)
+    if line := _next(out, chosen):
+        print(f"Next: {line}")
     for each in skipped:
-        print(f"left out: {each.scene}/{each.method}: {each.reason}")
+        print(f"left out: {each.name}: {each.reason}")
     for name, reason in failed.items():
         print(f"failed: {name}: {reason}", file=sys.stderr)
     if failed:
@@ -124,34 +131,62 @@ def main() -> None:
         sys.exit(1)
 
 
-def _settings() -> Settings:
-    """Returns what the options fix for all results.
+def _make_tables(out: Path) -> None:
+    """Writes tables and report of the results that are there.
 
     Raises:
-      ValueError: if one makes no sense.
+      ValueError: if an option is given that this does not use, there is no benchmark, or another
+        process works in it.
+    """
+    unused = [f"--{each.name}" for each in (_SCENES, _METHODS, *_OF_JOBS, _DRY_RUN) if each.present]
+    if unused:
+        raise ValueError(
+            f"--tables_only does not use {', '.join(unused)}: tables are of the results that are "
+            "there. Leave out the one or the other."
+        )
+    benchmark = settings.read(out)
+    with run_lock.hold(out):
+        failed, skipped = summary.not_done(out)
+        summary.write(out, benchmark, failed=failed, skipped=skipped)
+        _finish(out)
+
+
+def _settings(weights: Path | None) -> Settings:
+    """Returns what the options fix for all results.
+
+    Args:
+      weights: of LPIPS.
+
+    Raises:
+      ValueError: if an option makes no sense.
     """
     side_of(_RAYS_PER_PIXEL.value)
-    weights = _LPIPS_WEIGHTS.value
-    if weights is not None and not Path(weights).is_file():
-        raise ValueError(f"There is no file {weights}. Give the weights of LPIPS, or leave it out.")
     return Settings(
         preset=_PRESET.value,
         steps=_STEPS.value or PRESETS[_PRESET.value].schedule.steps,
         limit=_LIMIT.value,
         rays_per_pixel=_RAYS_PER_PIXEL.value,
         seed=_SEED.value,
-        lpips=None if weights is None else settings.digest(Path(weights)),
+        lpips=None if weights is None else settings.digest(weights),
     )
 
 
 def _work(
-    out: Path, benchmark: Benchmark, missing: Sequence[Job], skipped: Sequence[Skipped]
+    out: Path, benchmark: Benchmark, planned: Sequence[Job], skipped: Sequence[Skipped]
 ) -> dict[str, str]:
-    """Does jobs, and writes the summary after each; returns why some failed."""
+    """Does the jobs that are missing, and writes the summary after each; returns why some failed.
+
+    What failed or was left out before stays in the summary, as far as it is not planned now.
+    """
     failed: dict[str, str] = {}
-    summary.write(out, benchmark, failed=failed, skipped=skipped)
+    now = {each.name for each in (*planned, *skipped)}
+    failed_before, skipped_before = summary.not_done(out)
+    others = {name: reason for name, reason in failed_before.items() if name not in now}
+    left_out = [*(each for each in skipped_before if each.name not in now), *skipped]
+    summary.write(out, benchmark, failed=others, skipped=left_out)
+    missing = [job for job in planned if not jobs.is_done(out, job)]
     if not missing:
-        print("All jobs are done already.")
+        print("All jobs are done already." if planned else "All jobs are left out.")
         return failed
     engine = _engine(out)
     start, count = time.monotonic(), 0
@@ -162,7 +197,7 @@ def _work(
             count += 1
             if reason is not None:
                 failed[job.name] = reason
-            summary.write(out, benchmark, failed=failed, skipped=skipped)
+            summary.write(out, benchmark, failed=others | failed, skipped=left_out)
             left = (time.monotonic() - start) / count * (len(missing) - count)
             end = "failed" if reason is not None else "done"
             bar.show(count, f"{job.name} {end}, about {_duration(left)} left")
@@ -177,13 +212,13 @@ def _engine(out: Path) -> engines.Engine:
     return engines.RayEngine(out, _RAY.value, cpus=_JOB_CPUS.value, gpus=_JOB_GPUS.value)
 
 
-def _list(planned: Sequence[Job], missing: Sequence[Job], skipped: Sequence[Skipped]) -> None:
-    for job in planned:
-        state = "to do" if job in missing else "done"
-        print(f"{state:6} {job.name:48} {' '.join(job.train)}".rstrip())
+def _list(out: Path, planned: Sequence[Job], skipped: Sequence[Skipped]) -> None:
+    done = [jobs.is_done(out, job) for job in planned]
+    for job, is_done in zip(planned, done, strict=True):
+        print(f"{'done' if is_done else 'to do':6} {job.name:48} {' '.join(job.train)}".rstrip())
     for each in skipped:
-        print(f"{'out':6} {each.scene}/{each.method}: {each.reason}")
-    print(f"{len(planned)} jobs, {len(missing)} to do.")
+        print(f"{'out':6} {each.name}: {each.reason}")
+    print(f"{len(planned)} jobs, {done.count(False)} to do.")
 
 
 def _duration(seconds: float) -> str:
@@ -198,9 +233,16 @@ def _finish(out: Path) -> None:
     print(f"Tables:  {out / summary.TABLES}")
     print(f"Results: {out / summary.RESULTS}")
     print(f"Report:  {report} ({report.stat().st_size / 1e6:.1f} MB)")
-    options = (f"--scenes={','.join(_SCENES.value)}", "--methods=ablations", f"--out={out}")
-    if _SCENES.value:
-        print(f"Next: {commands.shell('benchmark', *options)}")
+
+
+def _next(out: Path, done: Sequence[Method]) -> str | None:
+    """Returns the command that adds the ablations to a benchmark, unless they were done."""
+    if {each.name for each in methods.parse(["ablations"])} <= {each.name for each in done}:
+        return None
+    options = (*_OF_JOBS, _REPORT_VIEWS, _REPORT_EDGE)
+    given = [each.serialize() for each in options if each.value != each.default]
+    scenes = f"--scenes={','.join(_SCENES.value)}"
+    return commands.shell("benchmark", scenes, "--methods=ablations", f"--out={out}", *given)
 
 
 if __name__ == "__main__":

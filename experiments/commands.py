@@ -19,7 +19,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-_NOT_FINITE = ("inf", "-inf", "nan")
+NOT_FINITE = ("inf", "-inf", "nan")
+"""Names of the numbers that JSON does not know."""
 
 STOP_WITH_INPUT = "REFREF_STOP_WITH_INPUT"
 """Variable of the environment: if it is set, a command stops when its standard input ends.
@@ -92,7 +93,7 @@ def from_string_safe(value: Any) -> Any:
         return {key: from_string_safe(item) for key, item in value.items()}
     if isinstance(value, list):
         return [from_string_safe(item) for item in value]
-    return float(value) if isinstance(value, str) and value in _NOT_FINITE else value
+    return float(value) if isinstance(value, str) and value in NOT_FINITE else value
 
 
 class Interrupt:

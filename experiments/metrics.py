@@ -15,6 +15,7 @@ from typing import Any
 from absl import flags
 
 from experiments import commands, folder_comparison, perceptual_option
+from experiments.perceptual_option import LPIPS_WEIGHTS
 
 _MASKS = flags.DEFINE_string("masks", None, "Folder of masks, named as the images: 0 is outside.")
 _OUT = flags.DEFINE_string("out", None, "JSON file to write; nothing is written without it.")
@@ -37,11 +38,16 @@ def main(rendered: str, truth: str) -> None:
             bar.show(len(rows), row[folder_comparison.NAME])
     print(folder_comparison.table(rows))
     if out is None:
-        again = commands.shell("metrics", rendered, truth, "--out=metrics.json")
-        print(f"Nothing was written. To keep all digits: {again}")
+        print(f"Nothing was written. To keep all digits: {_again(rendered, truth)}")
         return
     _write(out, {"rendered": rendered, "truth": truth, "masks": _MASKS.value}, rows)
     print(f"Metrics: {out}")
+
+
+def _again(rendered: str, truth: str) -> str:
+    """Returns the same command, with a file to write."""
+    given = [each.serialize() for each in (_MASKS, LPIPS_WEIGHTS) if each.value is not None]
+    return commands.shell("metrics", rendered, truth, *given, "--out=metrics.json")
 
 
 def _write(out: Path, given: dict[str, Any], rows: list[dict[str, Any]]) -> None:

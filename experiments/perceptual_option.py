@@ -21,17 +21,40 @@ def chosen() -> Perceptual:
     Raises:
       ValueError: if the file is not one of weights.
     """
-    lpips, flip = None, metrics.flip
-    if LPIPS_WEIGHTS.value is None:
-        print(
-            "warning: LPIPS is not measured, for it needs weights that are published elsewhere. "
-            "docs/metrics.md tells how to get them, and --lpips_weights takes them."
-        )
-    else:
-        lpips = metrics.load_lpips(Path(LPIPS_WEIGHTS.value))
+    path = _named()
+    lpips = None if path is None else metrics.load_lpips(path)
+    return Perceptual(lpips, metrics.flip if _has_flip() else None)
+
+
+def checked() -> Path | None:
+    """Returns the file of LPIPS's weights, if one is given, and warns as `chosen` does.
+
+    For a command that leaves measuring to others, and takes no device from them.
+
+    Raises:
+      ValueError: if the file is not one of weights.
+    """
+    path = _named()
+    if path is not None:
+        metrics.read_lpips(path)
+    _has_flip()
+    return path
+
+
+def _named() -> Path | None:
+    if LPIPS_WEIGHTS.value is not None:
+        return Path(LPIPS_WEIGHTS.value)
+    print(
+        "warning: LPIPS is not measured, for it needs weights that are published elsewhere. "
+        "docs/metrics.md tells how to get them, and --lpips_weights takes them."
+    )
+    return None
+
+
+def _has_flip() -> bool:
     try:
         metrics.import_flip()
     except ValueError as error:
         print(f"warning: {error}")
-        flip = None
-    return Perceptual(lpips, flip)
+        return False
+    return True

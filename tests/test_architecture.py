@@ -25,7 +25,7 @@ _FLOORS = {
 }
 
 _MODULES = sorted(_PACKAGE.rglob("*.py"))
-_SCRIPTS = sorted((_ROOT / "experiments").glob("*.py"))
+_SCRIPTS = sorted((_ROOT / "experiments").rglob("*.py"))
 
 _LONGEST_MODULE = 250
 _LONGEST_FUNCTION = 45

@@ -4,13 +4,14 @@ Differences are those of each scene, from the method that nothing is taken from,
 scenes that both have; the paper's stand beside them.
 """
 
+import math
 from collections.abc import Sequence
 
 from experiments.benchmarking import comparisons, published, quantities, tables
 from experiments.benchmarking.methods import FULL, METHODS, Group, Method
 from experiments.benchmarking.quantities import Quantity
 from experiments.benchmarking.records import Record
-from experiments.benchmarking.statistics import NOTHING, Cell, mean_over_scenes
+from experiments.benchmarking.statistics import NOTHING, Cell, mean_over
 from experiments.benchmarking.tables import Block, Column, Row, Table
 
 _PAPERS_SCENES = ("smcvx", "cube")
@@ -20,7 +21,9 @@ _DIFFERENCES = (quantities.PSNR, quantities.PSNR_MASKED)
 _NOTES = (
     "Ablations change one thing of the method in the first row of their block. Means over images, "
     "then over scenes, ± the standard error over scenes; Δ is the mean over the scenes that both "
-    "have of the difference to the first row, in dB. What is not known is -.",
+    "have of the difference to the first row, in dB. What is not known is -. All else, the "
+    "footprint included, is the preset's for every row; Nerfacto's fields bring their own sizes, "
+    "samples and footprint (a cone).",
     "*Published* columns are the paper's own (arXiv 2505.05848, ablation study: convex objects of "
     "a single material, cube backgrounds), measured on its data, which is not ours.",
     "DMAE is the substituted one, see the table of methods.",
@@ -47,9 +50,14 @@ def difference(found: Sequence[Record], method: str, full: str, quantity: Quanti
     }
     scenes = sorted({record.scene for record in found})
     pairs = [(known.get((scene, method)), known.get((scene, full))) for scene in scenes]
-    return mean_over_scenes(
-        None if ours is None or theirs is None else ours - theirs for ours, theirs in pairs
-    )
+    return mean_over(_apart(*pair) for pair in pairs)
+
+
+def _apart(ours: float | None, theirs: float | None) -> float | None:
+    """Returns a difference; of what is infinite in both nothing is known."""
+    if ours is None or theirs is None or (math.isinf(ours) and ours == theirs):
+        return None
+    return ours - theirs
 
 
 def _rows(found: Sequence[Record], group: Group, *, with_published: bool) -> tuple[Row, ...]:
@@ -74,9 +82,7 @@ def _row(
     cells: list[Cell] = []
     for each in quantities.ABLATIONS:
         cells.append(
-            mean_over_scenes(
-                quantities.value(each, record.metrics, record.background) for record in own
-            )
+            mean_over(quantities.value(each, record.metrics, record.background) for record in own)
         )
         if each in _DIFFERENCES:
             cells.append(

@@ -7,16 +7,15 @@
 A number is the mean over a scene's images, then over scenes; its error is over scenes.
 """
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from experiments.benchmarking import pose_space, published, quantities, tables
 from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.quantities import Quantity
-from experiments.benchmarking.records import OTHER, Record
-from experiments.benchmarking.statistics import mean_over_scenes
+from experiments.benchmarking.records import OTHER, Metrics, Record
+from experiments.benchmarking.statistics import mean_over
 from experiments.benchmarking.tables import Block, Column, Row, Table
 
 TOP = 5
@@ -49,8 +48,18 @@ _SUBSTITUTED = (
     "code had: they are 0 there by definition for methods that know objects, and do not rank. "
     "Before natural backgrounds all distances are those inside the mask."
 )
-
-Metrics = Mapping[str, float | None]
+_FARTHEST = (
+    f"Of each scene the {TOP} rendered test views that are farthest from any training view. The "
+    "paper defines no distance of poses; here it is sqrt(|c - c'|²/s² + a²) of positions c, the "
+    "angle a between the cameras' axes, and the mean distance s of the training cameras from the "
+    "origin."
+)
+_DRMSE = (
+    "The paper does not say over which pixels its DRMSE is. It is beside ours *in the mask*, for "
+    "it is hardly over the image: its Oracle has 0.00 here, its DMAE over the image is 0.04 before "
+    "cubes and 0.15 in spheres, and no root mean square is below the mean of the same pixels. That "
+    "*of the image* is ours alone."
+)
 
 
 def main_table(found: Sequence[Record]) -> Table:
@@ -63,7 +72,7 @@ def main_table(found: Sequence[Record]) -> Table:
                 rows = _ours(own, quantities.MAIN, lambda record: record.metrics)
                 rows += _theirs(published.MAIN, category, background, quantities.MAIN)
                 title = describe(category, background)
-                blocks.append(Block(title, tables.mark(rows, columns(quantities.MAIN))))
+                blocks.append(_marked(title, rows, quantities.MAIN, own))
     return _table("main", "Methods by category and background", (), quantities.MAIN, blocks)
 
 
@@ -72,23 +81,17 @@ def top_views_table(found: Sequence[Record]) -> Table:
     found = _without_ablations(found)
     rows = _ours(found, quantities.TOP_VIEWS, top_metrics)
     rows += _theirs(published.TOP_VIEWS, published.ALL, published.ALL, quantities.TOP_VIEWS)
-    marked = tables.mark(rows, columns(quantities.TOP_VIEWS))
-    note = (
-        f"Of each scene the {TOP} rendered test views that are farthest from any training view. "
-        "The paper defines no distance of poses; here it is sqrt(|c - c'|²/s² + a²) of positions "
-        "c, the angle a between the cameras' axes, and the mean distance s of the training cameras "
-        "from the origin."
-    )
-    blocks = [Block("all scenes", marked)] if found else []
-    return _table("top_views", "Farthest test views", (note,), quantities.TOP_VIEWS, blocks)
+    blocks = [_marked("all scenes", rows, quantities.TOP_VIEWS, found)] if found else []
+    notes = (_FARTHEST, _DRMSE)
+    return _table("top_views", "Farthest test views", notes, quantities.TOP_VIEWS, blocks)
 
 
 def top_metrics(record: Record) -> Metrics:
     """Returns the means over the views of a result that are farthest from any training view."""
-    apart = np.array([image["pose_distance"] for image in record.per_image])
-    views = [record.per_image[i] for i in pose_space.farthest(apart, TOP)]
+    apart = np.array([image.pose_distance for image in record.per_image])
+    views = [record.per_image[i].metrics for i in pose_space.farthest(apart, TOP)]
     keys = [key for key in record.metrics if all(key in view for view in views)]
-    return {key: _mean([view[key] for view in views]) for key in keys}
+    return {key: mean_over([view[key] for view in views]).mean for key in keys}
 
 
 def select(found: Sequence[Record], category: str, background: str) -> list[Record]:
@@ -112,28 +115,31 @@ def columns(wanted: Sequence[Quantity]) -> tuple[Column, ...]:
     return tuple(Column(each.label, each.latex, each.better, each.digits) for each in wanted)
 
 
+def _marked(
+    title: str, rows: Sequence[Row], wanted: Sequence[Quantity], found: Sequence[Record]
+) -> Block:
+    """Returns a block of rows whose best are marked, among those that have all of its scenes."""
+    scenes = len({record.scene for record in found})
+    return Block(title, tables.mark(rows, columns(wanted), scenes))
+
+
 def _ours(
     found: Sequence[Record], wanted: Sequence[Quantity], metrics: Callable[[Record], Metrics]
 ) -> list[Row]:
     """Returns a row for each method with results, in the order of the methods."""
     rows = []
-    for name in _ordered({record.method for record in found}):
+    for name, method in METHODS.items():
         own = [record for record in found if record.method == name]
+        if not own:
+            continue
         known = [(metrics(record), record.background) for record in own]
-        cells = [
-            mean_over_scenes(quantities.value(each, *pair) for pair in known) for each in wanted
-        ]
-        label = METHODS[name].label if name in METHODS else name
-        rows.append(tables.row(label, "ours", len(own), cells))
+        cells = [mean_over(quantities.value(each, *pair) for pair in known) for each in wanted]
+        rows.append(tables.row(method.label, "ours", len(own), cells))
     return rows
 
 
 def _without_ablations(found: Sequence[Record]) -> list[Record]:
-    return [
-        record
-        for record in found
-        if record.method not in METHODS or METHODS[record.method].group == "main"
-    ]
+    return [record for record in found if METHODS[record.method].group == "main"]
 
 
 def _theirs(table: str, category: str, background: str, wanted: Sequence[Quantity]) -> list[Row]:
@@ -154,13 +160,3 @@ def _table(
     whole = Table(name, title, notes, columns(wanted), tuple(blocks))
     kept = [each.label for each in wanted if each.published is not None]
     return tables.without_empty_columns(whole, kept)
-
-
-def _ordered(names: set[str]) -> list[str]:
-    known = [name for name in METHODS if name in names]
-    return [*known, *sorted(names - set(known))]
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return math.fsum(known) / len(known) if known else None

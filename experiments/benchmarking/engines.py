@@ -20,9 +20,6 @@ Run = Callable[[Path, Job], str | None]
 class Engine(Protocol):
     """What does jobs."""
 
-    workers: int
-    """Jobs at once, as far as that is known."""
-
     def submit(self, job: Job) -> None:
         """Takes a job."""
 
@@ -44,7 +41,6 @@ class LocalEngine:
           workers: how many.
           run: what they do.
         """
-        self.workers = workers
         self._out, self._run = out, run
         self._pool = futures.ThreadPoolExecutor(workers)
         self._taken: dict[futures.Future[str | None], Job] = {}
@@ -91,7 +87,6 @@ class RayEngine:
         resources = self._ray.cluster_resources()
         counts = [resources.get("CPU", 0.0) / cpus] if cpus else []
         counts += [resources.get("GPU", 0.0) / gpus] if gpus else []
-        self.workers = max(1, int(min(counts, default=1.0)))
         if any(count < 1.0 for count in counts):
             self._ray.shutdown()
             raise ValueError(

@@ -10,13 +10,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from experiments.benchmarking.methods import RECONSTRUCTION, Method, Need
+from experiments.benchmarking.methods import RECONSTRUCTION, Method, Need, same_as
 from experiments.benchmarking.settings import Scene, Settings
-from refref_jax.data import meshes, transforms
+from refref_jax.data import local_layout, meshes, transforms
 from refref_jax.data.part_descriptions import read_part_descriptions
 
 FOLDER = "jobs"
 RESULT = "result.json"
+
+SPLIT = "test"
+"""The views that are evaluated."""
 
 
 class Job(NamedTuple):
@@ -25,6 +28,7 @@ class Job(NamedTuple):
     Attributes:
       scene: name of the scene.
       path: its folder.
+      fingerprint: of its files when this was planned.
       method: name of the method, or `RECONSTRUCTION`.
       train: options of training; none of a reconstruction.
       reconstructed: whether it takes the objects that the scene's reconstruction found.
@@ -34,6 +38,7 @@ class Job(NamedTuple):
 
     scene: str
     path: str
+    fingerprint: str
     method: str
     train: tuple[str, ...]
     reconstructed: bool
@@ -52,11 +57,16 @@ class Job(NamedTuple):
 
 
 class Skipped(NamedTuple):
-    """A method that a scene lacks something for."""
+    """A method that is left out on a scene, and why."""
 
     scene: str
     method: str
     reason: str
+
+    @property
+    def name(self) -> str:
+        """What its job would be called."""
+        return f"{self.scene}/{self.method}"
 
 
 _LACKING: dict[Need, str] = {
@@ -75,25 +85,40 @@ def plan(
 ) -> tuple[list[Job], list[Skipped]]:
     """Returns all jobs, scene by scene, and what is left out for want of something.
 
-    A reconstruction comes before the jobs that wait for it. A scene that is broken is left to them:
-    each will fail, and say why.
+    A reconstruction comes before the jobs that wait for it. A scene whose test views can not be
+    read is left out, for it could be trained on and not be evaluated. One that is broken otherwise
+    is left to its jobs: each will fail, and say why.
     """
     jobs: list[Job] = []
     skipped: list[Skipped] = []
     for scene in scenes:
-        lacks = _lacking_or_broken(scene, methods)
-        possible = [method for method in methods if not lacks & set(method.needs)]
-        for method in methods:
-            if missing := [_LACKING[need] for need in method.needs if need in lacks]:
-                skipped.append(Skipped(scene.name, method.name, missing[0]))
-        common = {"settings": settings, "lpips_weights": lpips_weights}
+        place = (scene.name, scene.path, scene.fingerprint)
+        reasons = _reasons(scene, methods, settings.preset)
+        skipped += [Skipped(scene.name, name, reason) for name, reason in reasons.items()]
+        possible = [method for method in methods if method.name not in reasons]
         if any(method.reconstructed for method in possible):
-            jobs.append(Job(scene.name, scene.path, RECONSTRUCTION, (), False, **common))
+            jobs.append(Job(*place, RECONSTRUCTION, (), False, settings, lpips_weights))
         jobs += [
-            Job(scene.name, scene.path, method.name, method.train, method.reconstructed, **common)
-            for method in possible
+            Job(*place, each.name, each.train, each.reconstructed, settings, lpips_weights)
+            for each in possible
         ]
     return jobs, skipped
+
+
+def options(method: str, train: Sequence[str], settings: Settings) -> dict[str, list[str]]:
+    """Returns what decides a job's result: the options of its commands, by command.
+
+    Args:
+      method: name, or `RECONSTRUCTION`.
+      train: options of the method.
+      settings: of the benchmark.
+    """
+    if method == RECONSTRUCTION:
+        return {"reconstruct": [f"--seed={settings.seed}"]}
+    return {
+        "train": [*settings.training(), *train],
+        "evaluate": list(settings.evaluation()),
+    }
 
 
 def lacking(scene: Path, needs: set[Need]) -> set[Need]:
@@ -124,6 +149,22 @@ def folder(out: Path, job: Job) -> Path:
 def is_done(out: Path, job: Job) -> bool:
     """Returns whether a job has left its result."""
     return (folder(out, job) / RESULT).is_file()
+
+
+def _reasons(scene: Scene, methods: Sequence[Method], preset: str) -> dict[str, str]:
+    """Returns why methods are left out, by name."""
+    try:
+        local_layout.read_frames(Path(scene.path), SPLIT)
+    except ValueError as error:
+        return {method.name: f"its {SPLIT} views can not be read: {error}" for method in methods}
+    lacks = _lacking_or_broken(scene, methods)
+    reasons = {}
+    for method in methods:
+        if missing := [_LACKING[need] for need in method.needs if need in lacks]:
+            reasons[method.name] = missing[0]
+        elif full := same_as(method, preset):
+            reasons[method.name] = f"in the preset {preset} it is {full} again"
+    return reasons
 
 
 def _lacking_or_broken(scene: Scene, methods: Sequence[Method]) -> set[Need]:

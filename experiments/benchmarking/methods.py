@@ -1,13 +1,20 @@
 """The methods that a benchmark compares: what each is called, and the options that make it.
 
-A method is options of `experiments.train`, no more: adding one is adding a line here. `oracle` is
-the published method: `--paths=paper --interior=field`. Its ablations take one thing from it; those
-of `tree`, which is ours, change one thing of that.
+A method is options of `experiments.train`, no more: adding one is adding a line here. Everything
+else is the preset's, for all methods alike: sizes, schedule, and the footprint too. So `oracle`,
+`--paths=paper --interior=field`, has the published light paths and field, and is the published
+method in full in the preset `paper` alone: the others are smaller, or have differential footprints
+where the paper's are cones. Ablations of `oracle` take one thing from it; those of `tree`, which is
+ours, change one thing of that, and one that the preset has already is left out, see `same_as`.
+Nerfacto's fields (`oracle_nerfacto`) bring their own sizes, samples and footprint, a cone.
 """
 
 import dataclasses
 from collections.abc import Sequence
 from typing import Literal
+
+from experiments.presets import PRESETS
+from refref_jax.fields import registry
 
 Need = Literal["meshes", "masks", "colours"]
 Group = Literal["main", "ablation of the oracle", "ablation of the tree"]
@@ -108,6 +115,13 @@ METHODS: dict[str, Method] = {method.name: method for method in _ALL}
 
 FULL: dict[Group, str] = {"ablation of the oracle": "oracle", "ablation of the tree": "tree"}
 """The method that each group of ablations is compared with."""
+
+
+def same_as(method: Method, preset: str) -> str | None:
+    """Returns which method an ablation is again, where its footprint is the preset's already."""
+    chosen = dict(word.lstrip("-").split("=", 1) for word in method.train).get("footprint")
+    size = registry.KINDS[registry.USUAL].sizes[PRESETS[preset].size]
+    return FULL[method.group] if chosen == size.footprint else None
 
 
 def parse(names: Sequence[str]) -> list[Method]:

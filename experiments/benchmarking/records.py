@@ -1,24 +1,75 @@
-"""The results of a benchmark's jobs, each one JSON file that says all there is to say of it.
+"""What a job of a benchmark leaves: a result, which says all there is to say of it."""
 
-Tables are made of these files alone. A job's folder can be copied to another machine's benchmark
-of the same settings, to merge what both have measured.
-
-docs/benchmark.md has the schema.
-"""
-
-import dataclasses
-import json
-from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments import commands
-from experiments.benchmarking import jobs, settings
 from experiments.benchmarking.methods import RECONSTRUCTION
 from experiments.benchmarking.settings import Settings
 from refref_jax.data import scene_names
 
 OTHER = "other"
 """Category or background of a scene that has no name of the data set's form."""
+
+Metrics = dict[str, float | None]
+"""Measured numbers, by the names of docs/metrics.md; `None` for what is not known."""
+
+
+class Image(NamedTuple):
+    """What was measured of a test view.
+
+    Attributes:
+      name: of the view.
+      pose_distance: from the nearest training view, see `pose_space`.
+      seconds: that it was rendered in, if that was measured.
+      metrics: of it.
+    """
+
+    name: str
+    pose_distance: float
+    seconds: float | None
+    metrics: Metrics
+
+
+class Costs(NamedTuple):
+    """What a job took; `None` where it was not measured. See `trained_runs.Training`.
+
+    Attributes:
+      steps: of training.
+      seconds_per_step: median.
+      rays_per_second: of training.
+      train_seconds: of all steps.
+      startup_seconds: of training's process besides.
+      peak_host_mib: most memory of training's process, or of a reconstruction's.
+      peak_device_mib: most memory of its accelerator.
+      seconds_per_image: of rendering.
+      seconds: of a reconstruction's last process.
+    """
+
+    steps: float | None = None
+    seconds_per_step: float | None = None
+    rays_per_second: float | None = None
+    train_seconds: float | None = None
+    startup_seconds: float | None = None
+    peak_host_mib: float | None = None
+    peak_device_mib: float | None = None
+    seconds_per_image: float | None = None
+    seconds: float | None = None
+
+
+class Truth(NamedTuple):
+    """True files of a view, from `scene_path`; `None` for what the scene lacks."""
+
+    rgb: str
+    mask: str | None
+    distance: str | None
+
+
+class View(NamedTuple):
+    """Files of a view: the true ones, and what was rendered, from the job's folder."""
+
+    name: str
+    truth: Truth
+    rgb: str
+    distance: str
 
 
 class Record(NamedTuple):
@@ -29,13 +80,14 @@ class Record(NamedTuple):
       category: `smcvx`, `smncvx`, `mmncvx`, or `OTHER`.
       background: `cube`, `sphere`, `env`, or `OTHER`.
       method: name, or `RECONSTRUCTION`.
+      fingerprint: of the scene's files, see `fingerprints`.
       options: of its commands, by command.
       settings: of the benchmark.
-      metrics: means over the images, by name; `None` for what is not known.
-      per_image: the same of each image, with its `name` and `pose_distance`.
+      metrics: means over the images.
+      per_image: of each image.
       costs: what it took.
       versions: of what it ran with.
-      views: files of each image, relative to `scene_path` (truth) and the job's folder (rendered).
+      views: files of each image.
       scene_path: where the scene was.
       facts: what was found besides: learned colours, index of refraction.
     """
@@ -44,56 +96,16 @@ class Record(NamedTuple):
     category: str
     background: str
     method: str
+    fingerprint: str
     options: dict[str, list[str]]
-    settings: dict[str, Any]
-    metrics: dict[str, float | None]
-    per_image: list[dict[str, Any]]
-    costs: dict[str, Any]
+    settings: Settings
+    metrics: Metrics
+    per_image: list[Image]
+    costs: Costs
     versions: dict[str, str | None]
-    views: list[dict[str, Any]]
+    views: list[View]
     scene_path: str
     facts: dict[str, Any]
-
-
-def write(folder: Path, record: Record) -> None:
-    """Writes the result of a job, all or nothing."""
-    settings.write_json(folder / jobs.RESULT, commands.string_safe(record._asdict()))
-
-
-def read(path: Path) -> Record:
-    """Reads the result of a job.
-
-    Raises:
-      ValueError: if it is none.
-    """
-    try:
-        return Record(**commands.from_string_safe(json.loads(path.read_text("utf-8"))))
-    except (ValueError, TypeError) as error:
-        raise ValueError(
-            f"{path} is not the result of a job ({error}). Remove it, and repeat the command."
-        ) from error
-
-
-def read_all(out: Path, common: Settings) -> list[Record]:
-    """Reads all results of a benchmark, ordered by scene and method.
-
-    Raises:
-      ValueError: if one is broken, lies in another's folder, or was made with other settings.
-    """
-    found = []
-    for path in sorted((out / jobs.FOLDER).glob(f"*/*/{jobs.RESULT}")):
-        record = read(path)
-        if (record.scene, record.method) != (path.parts[-3], path.parts[-2]):
-            raise ValueError(
-                f"{path} is the result of {record.scene}/{record.method}. Move its folder there."
-            )
-        if record.settings != dataclasses.asdict(common):
-            raise ValueError(
-                f"{path} was made with other settings than those of {out / settings.FILE}, so that "
-                "it does not compare. Take its folder out."
-            )
-        found.append(record)
-    return found
 
 
 def compared(found: list[Record]) -> list[Record]:

@@ -9,6 +9,7 @@ import dataclasses
 import json
 import time
 import traceback
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +17,16 @@ import jax
 import numpy as np
 
 import refref_jax
-from experiments import child_process, commands, trained_runs
-from experiments.benchmarking import jobs, pose_space, records
-from experiments.benchmarking.jobs import Job
+from experiments import child_process, trained_runs
+from experiments.benchmarking import fingerprints, jobs, pose_space, record_files, records
+from experiments.benchmarking.jobs import SPLIT, Job
 from experiments.benchmarking.methods import RECONSTRUCTION
-from experiments.benchmarking.records import Record
+from experiments.benchmarking.record_json import number
+from experiments.benchmarking.records import Costs, Image, Record, Truth, View
 from experiments.child_process import RunFailedError
 from experiments.r3f import records as reconstructions
 from refref_jax.data import local_layout
 from refref_jax.training import run_lock
-
-SPLIT = "test"
 
 # Seconds that a command which outlived its benchmark may take to save and end.
 _PATIENCE = 120.0
@@ -46,9 +46,11 @@ def run(out: Path, job: Job) -> str | None:
         return None
     folder = jobs.folder(out, job)
     try:
+        _check_scene(job)
         folder.mkdir(parents=True, exist_ok=True)
         record = _reconstruct(job, folder) if job.method == RECONSTRUCTION else _learn(job, folder)
-        records.write(folder, record)
+        _check_scene(job)
+        record_files.write(folder, record)
     except (RunFailedError, ValueError, OSError) as error:
         return str(error)
     except Exception as error:  # The others go on, whatever this is.
@@ -75,48 +77,60 @@ def wait_until_free(folder: Path, patience: float = _PATIENCE) -> None:
             time.sleep(0.2)
 
 
+def _check_scene(job: Job) -> None:
+    """Refuses to measure a scene whose files are no longer those that the job was planned for."""
+    if fingerprints.fingerprint(Path(job.path)) != job.fingerprint:
+        raise ValueError(
+            f"Cameras, meshes, images or scene.json of {job.path} have changed since the benchmark "
+            "was begun. Restore them, or begin another benchmark."
+        )
+
+
 def _reconstruct(job: Job, folder: Path) -> Record:
     out = folder / "run"
     wait_until_free(out)
-    options = [f"--seed={job.settings.seed}"]
-    command = [f"--scene={job.path}", f"--out={out}", *options]
+    options = jobs.options(job.method, job.train, job.settings)
+    command = [f"--scene={job.path}", f"--out={out}", *options["reconstruct"]]
     seconds, peak = child_process.run("reconstruct", *command, log=folder / "run.log")
     found = reconstructions.read(out)
     return _record(job)._replace(
-        options={"reconstruct": options},
-        costs={"seconds": seconds, "peak_host_mib": peak},
+        options=options,
+        costs=Costs(seconds=seconds, peak_host_mib=peak),
         facts={"index": dataclasses.asdict(found.index)},
     )
 
 
 def _learn(job: Job, folder: Path) -> Record:
     run_, scene = folder / "run", Path(job.path)
-    train = [*job.settings.training(), *job.train]
+    options = jobs.options(job.method, job.train, job.settings)
     objects = []
     if job.reconstructed:
         objects = [f"--reconstruction={folder.parent / RECONSTRUCTION / 'run'}"]
-    evaluate = list(job.settings.evaluation())
     weights = [] if job.lpips_weights is None else [f"--lpips_weights={job.lpips_weights}"]
     wait_until_free(run_)
-    cost = trained_runs.train(run_, scene=scene, options=[*train, *objects])
-    trained_runs.evaluate(run_, scene=scene, options=[*evaluate, *weights], split=SPLIT)
-    summary = commands.from_string_safe(
-        json.loads((run_ / "eval" / SPLIT / "metrics.json").read_text("utf-8"))
-    )
-    costs = dataclasses.asdict(cost)
+    cost = trained_runs.train(run_, scene=scene, options=[*options["train"], *objects])
+    trained_runs.evaluate(run_, scene=scene, options=[*options["evaluate"], *weights], split=SPLIT)
+    summary = json.loads((run_ / "eval" / SPLIT / "metrics.json").read_text("utf-8"))
+    metrics = {key: number(value, key) for key, value in summary["results"].items()}
     # Tables are of what does not change from one time to the next.
-    costs["seconds_per_image"] = summary["results"].pop("seconds_per_image")
+    seconds = metrics.pop("seconds_per_image")
     frames, apart = _frames(scene)
+    per_image = [_image(image, apart) for image in summary["per_image"]]
     return _record(job)._replace(
-        options={"train": train, "evaluate": evaluate},
-        metrics=summary["results"],
-        per_image=[
-            {**image, "pose_distance": apart[image["name"]]} for image in summary["per_image"]
-        ],
-        costs=costs,
-        views=[_view(image["name"], frames, scene) for image in summary["per_image"]],
+        options=options,
+        metrics=metrics,
+        per_image=per_image,
+        costs=Costs(**dataclasses.asdict(cost), seconds_per_image=seconds),
+        views=[_view(image.name, frames, scene) for image in per_image],
         facts={key: summary[key] for key in ("learned",) if summary.get(key) is not None},
     )
+
+
+def _image(told: dict[str, Any], apart: Mapping[str, float]) -> Image:
+    """Returns what an evaluation says of an image, and how far it is from the training views."""
+    metrics = {key: number(value, key) for key, value in told.items() if key != "name"}
+    name, seconds = told["name"], metrics.pop("seconds", None)
+    return Image(name, apart[name], seconds, metrics)
 
 
 def _record(job: Job) -> Record:
@@ -127,11 +141,12 @@ def _record(job: Job) -> Record:
         category=category,
         background=background,
         method=job.method,
+        fingerprint=job.fingerprint,
         options={},
-        settings=dataclasses.asdict(job.settings),
+        settings=job.settings,
         metrics={},
         per_image=[],
-        costs={},
+        costs=Costs(),
         versions={"jax": jax.__version__, "refref_jax": refref_jax.__version__},
         views=[],
         scene_path=job.path,
@@ -149,20 +164,20 @@ def _frames(scene: Path) -> tuple[local_layout.Frames, dict[str, float]]:
     }
 
 
-def _view(name: str, frames: local_layout.Frames, scene: Path) -> dict[str, Any]:
+def _view(name: str, frames: local_layout.Frames, scene: Path) -> View:
     """Returns where the files of a view are; see docs/benchmark.md."""
     i = frames.names.index(name)
 
     def of_scene(paths: tuple[Path, ...] | None) -> str | None:
         return None if paths is None else str(paths[i].relative_to(scene))
 
-    return {
-        "name": name,
-        "truth": {
-            "rgb": of_scene(frames.images),
-            "mask": of_scene(frames.masks),
-            "distance": of_scene(frames.depths),
-        },
-        "rgb": f"run/eval/{SPLIT}/rgb/{name}.png",
-        "distance": f"run/eval/{SPLIT}/distance/{name}.exr",
-    }
+    return View(
+        name,
+        Truth(
+            rgb=str(frames.images[i].relative_to(scene)),
+            mask=of_scene(frames.masks),
+            distance=of_scene(frames.depths),
+        ),
+        rgb=f"run/eval/{SPLIT}/rgb/{name}.png",
+        distance=f"run/eval/{SPLIT}/distance/{name}.exr",
+    )

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments import scene_option
-from experiments.benchmarking import settings
+from experiments.benchmarking import fingerprints
 from experiments.benchmarking.settings import Scene
 from refref_jax.data import scene_names
 
@@ -33,7 +33,7 @@ def find(words: Sequence[str]) -> list[Scene]:
             raise ValueError(
                 f"Both {found[name].path} and {folder} are named {name}. Rename one of them."
             )
-        found[name] = Scene(name, str(folder), settings.fingerprint(folder))
+        found[name] = Scene(name, str(folder), fingerprints.fingerprint(folder))
     return [found[name] for name in sorted(found)]
 
 

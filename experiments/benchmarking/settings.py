@@ -56,7 +56,7 @@ class Scene:
     Attributes:
       name: unique in the benchmark.
       path: absolute path of its folder, where it was last.
-      fingerprint: hash of its transforms files, which say its cameras and files.
+      fingerprint: hash of its files, see `fingerprints`.
     """
 
     name: str
@@ -125,8 +125,9 @@ def extended(out: Path, more: Benchmark) -> Benchmark:
         known = begun.scenes.get(name, scene)
         if known.fingerprint != scene.fingerprint:
             raise ValueError(
-                f"{out} has another scene named {name}: that of {known.path} has other cameras "
-                f"than {scene.path}. Rename the folder, or give another --out."
+                f"{out} was begun with another scene named {name}: that of {known.path} had other "
+                f"cameras, meshes, images or scene.json than {scene.path} has now. Restore or "
+                "rename the folder, or give another --out."
             )
     for name, options in more.methods.items():
         known = begun.methods.get(name, options)
@@ -142,14 +143,6 @@ def write(out: Path, benchmark: Benchmark) -> None:
     """Writes what a benchmark is begun with; its folder is made."""
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / FILE, dataclasses.asdict(benchmark))
-
-
-def fingerprint(scene: Path) -> str:
-    """Returns a hash of a scene's transforms files, which say its cameras and files."""
-    found = hashlib.sha256()
-    for path in sorted(scene.glob("transforms_*.json")):
-        found.update(path.read_bytes())
-    return found.hexdigest()[:16]
 
 
 def digest(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""Means over scenes, with their standard errors; what is not known is never counted."""
+"""Means over scenes or views, with their standard errors; what is not known is never counted."""
 
 import math
 import statistics
@@ -26,14 +26,15 @@ NOTHING = Cell()
 """What is not known."""
 
 
-def mean_over_scenes(values: Iterable[float | None]) -> Cell:
-    """Returns the mean of one value a scene.
+def mean_over(values: Iterable[float | None]) -> Cell:
+    """Returns the mean of one value a scene, or a view.
 
     The standard error is the standard deviation (with n - 1) over the square root of n. A mean that
-    is infinite, as the PSNR of equal images is, has none.
+    is infinite, as the PSNR of equal images is, has none. Of `inf` and `-inf` together no mean is
+    known; one `nan` makes a mean `nan`.
     """
     known = [value for value in values if value is not None]
-    if not known:
+    if not known or {math.inf, -math.inf} <= set(known):
         return NOTHING
     mean = math.fsum(known) / len(known) if all(map(math.isfinite, known)) else sum(known)
     if len(known) < 2 or not math.isfinite(mean):

@@ -1,6 +1,7 @@
 """Writes what a benchmark has come to so far, from its results alone; each file all or nothing.
 
-{out}/summary.md                         all tables, what failed and what was left out
+{out}/summary.md                         all tables, what failed, what was left out, what has no
+                                         result yet
 {out}/tables/{table}.{md,csv,json,tex}   each table
 {out}/tables/scenes.csv                  all metrics of each scene and method
 {out}/results.json                       what a report needs, see docs/benchmark.md
@@ -17,6 +18,8 @@ from experiments.benchmarking import (
     ablations,
     comparisons,
     jobs,
+    record_files,
+    record_json,
     records,
     settings,
     table_data,
@@ -35,6 +38,9 @@ FILE, RESULTS, TABLES = "summary.md", "results.json", "tables"
 # Points of a curve of training: as many as a figure shows.
 _MOST_POINTS = 200
 
+# Scenes without a result that summary.md names for each method; results.json has all.
+_MOST_NAMES = 10
+
 
 def write(
     out: Path,
@@ -52,20 +58,15 @@ def write(
       skipped: what was left out.
 
     Raises:
-      ValueError: if a result is broken, or of other settings.
+      ValueError: if a result is broken, or does not compare with the others.
     """
-    everything = records.read_all(out, benchmark.settings)
+    everything = record_files.read_all(out, benchmark)
     found = records.compared(everything)
     made = all_tables(found)
-    (out / TABLES).mkdir(exist_ok=True)
-    for table in made:
-        path = out / TABLES / table.name
-        _write_text(path.with_suffix(".md"), table_text.markdown(table))
-        _write_text(path.with_suffix(".tex"), table_text.latex(table))
-        _write_text(path.with_suffix(".csv"), table_data.as_csv(table))
-        settings.write_json(path.with_suffix(".json"), table_data.as_json(table))
-    _write_text(out / TABLES / "scenes.csv", table_data.scenes_csv(found))
-    _write_text(out / FILE, _summary(benchmark, found, made, failed, skipped))
+    missing = _missing(out, benchmark, failed, skipped)
+    _write_tables(out / TABLES, made, found)
+    lines = [*_heading(benchmark, found), *_not_done(failed, skipped, missing)]
+    _write_text(out / FILE, "\n".join([*lines, *map(table_text.markdown, made)]))
     index = {
         "settings": dataclasses.asdict(benchmark.settings),
         "methods": {
@@ -76,9 +77,21 @@ def write(
         "jobs": [_indexed(out, record) for record in everything],
         "failed": dict(failed),
         "skipped": [each._asdict() for each in skipped],
+        "missing": [f"{scene}/{method}" for scene, method in missing],
         "tables": {table.name: table_data.as_json(table) for table in made},
     }
     settings.write_json(out / RESULTS, commands.string_safe(index))
+
+
+def _write_tables(folder: Path, made: Sequence[Table], found: Sequence[Record]) -> None:
+    folder.mkdir(exist_ok=True)
+    for table in made:
+        path = folder / table.name
+        _write_text(path.with_suffix(".md"), table_text.markdown(table))
+        _write_text(path.with_suffix(".tex"), table_text.latex(table))
+        _write_text(path.with_suffix(".csv"), table_data.as_csv(table))
+        settings.write_json(path.with_suffix(".json"), table_data.as_json(table))
+    _write_text(folder / "scenes.csv", table_data.scenes_csv(found))
 
 
 def not_done(out: Path) -> tuple[dict[str, str], list[Skipped]]:
@@ -94,12 +107,9 @@ def not_done(out: Path) -> tuple[dict[str, str], list[Skipped]]:
     except (OSError, ValueError, KeyError, TypeError):
         return {}, []
 
-    def is_done(name: str) -> bool:
-        return (out / jobs.FOLDER / name / jobs.RESULT).is_file()
-
     return (
-        {name: reason for name, reason in failed.items() if not is_done(name)},
-        [each for each in skipped if not is_done(f"{each.scene}/{each.method}")],
+        {name: reason for name, reason in failed.items() if not _has_result(out, name)},
+        [each for each in skipped if not _has_result(out, each.name)],
     )
 
 
@@ -112,42 +122,73 @@ def all_tables(found: Sequence[Record]) -> list[Table]:
     ]
 
 
-def _summary(
-    benchmark: Benchmark,
-    found: Sequence[Record],
-    made: Sequence[Table],
-    failed: Mapping[str, str],
-    skipped: Sequence[Skipped],
-) -> str:
+def _has_result(out: Path, name: str) -> bool:
+    return (out / jobs.FOLDER / name / jobs.RESULT).is_file()
+
+
+def _missing(
+    out: Path, benchmark: Benchmark, failed: Mapping[str, str], skipped: Sequence[Skipped]
+) -> list[tuple[str, str]]:
+    """Returns the scenes and methods of a benchmark that have no result, for no reason known."""
+    told = {*failed, *(each.name for each in skipped)}
+    return [
+        (scene, method)
+        for method in METHODS
+        if method in benchmark.methods
+        for scene in sorted(benchmark.scenes)
+        if (name := f"{scene}/{method}") not in told and not _has_result(out, name)
+    ]
+
+
+def _heading(benchmark: Benchmark, found: Sequence[Record]) -> list[str]:
     common = benchmark.settings
     images = "all test images" if common.limit is None else f"at most {common.limit} test images"
-    lines = [
+    versions = sorted({tuple(sorted(record.versions.items())) for record in found})
+    told = (", ".join(f"{name} {version}" for name, version in each) for each in versions)
+    several = ["Measured by several versions, which may differ: " + "; ".join(told) + ".", ""]
+    return [
         "# Benchmark",
         "",
         f"Results: {len(found)}, scenes: {len({record.scene for record in found})}. Preset "
         f"`{common.preset}`, steps: {common.steps}, seed: {common.seed}; {images} a scene, rays in "
         f"a pixel: {common.rays_per_pixel}.",
         "",
+        *(several if len(versions) > 1 else ()),
     ]
-    if failed:
-        lines += ["Failed:", "", *(f"- {name}: {why}" for name, why in failed.items()), ""]
-    if skipped:
-        lines += ["Left out:", ""]
-        lines += [f"- {each.scene}/{each.method}: {each.reason}" for each in skipped] + [""]
-    return "\n".join([*lines, *map(table_text.markdown, made)])
+
+
+def _not_done(
+    failed: Mapping[str, str], skipped: Sequence[Skipped], missing: Sequence[tuple[str, str]]
+) -> list[str]:
+    without: dict[str, list[str]] = {}
+    for scene, method in missing:
+        without.setdefault(method, []).append(scene)
+    parts = {
+        "Failed:": [f"{name}: {reason}" for name, reason in failed.items()],
+        "Left out:": [f"{each.name}: {each.reason}" for each in skipped],
+        "No result yet, of the scenes and methods asked for:": [
+            f"{method}, scenes: {len(scenes)}: {', '.join(scenes[:_MOST_NAMES])}"
+            + (", ..." if len(scenes) > _MOST_NAMES else "")
+            for method, scenes in without.items()
+        ],
+    }
+    lines = []
+    for title, items in parts.items():
+        if items:
+            lines += [title, "", *(f"- {table_text.in_markdown(item)}" for item in items), ""]
+    return lines
 
 
 def _indexed(out: Path, record: Record) -> dict[str, Any]:
     """Returns a result with the paths of its pictures from `out`, and its curve of training."""
     folder = Path(jobs.FOLDER) / record.scene / record.method
     views = [
-        {**view, "rgb": str(folder / view["rgb"]), "distance": str(folder / view["distance"])}
+        view._replace(rgb=str(folder / view.rgb), distance=str(folder / view.distance))
         for view in record.views
     ]
     return {
-        **record._asdict(),
+        **record_json.to_json(record._replace(views=views)),
         "folder": str(folder),
-        "views": views,
         "curve": _curve(out / folder / "run"),
     }
 

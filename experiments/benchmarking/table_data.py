@@ -80,7 +80,6 @@ def from_json(record: dict[str, Any]) -> Table:
     Raises:
       KeyError, TypeError: if it is no table.
     """
-    record = commands.from_string_safe(record)
     return Table(
         name=record["name"],
         title=record["title"],
@@ -110,7 +109,10 @@ def scenes_csv(found: Sequence[Record]) -> str:
 
 
 def _row(record: dict[str, Any]) -> Row:
-    cells = [Cell(**{key: cell[key] for key in Cell._fields}) for cell in record["cells"]]
+    cells = [
+        Cell(**commands.from_string_safe({key: cell[key] for key in Cell._fields}))
+        for cell in record["cells"]
+    ]
     marks = tuple(cell["mark"] for cell in record["cells"])
     return Row(record["method"], record["origin"], record["scenes"], tuple(cells), marks)
 

@@ -1,5 +1,6 @@
 """Writes tables as people read them: Markdown, and LaTeX for a paper (with booktabs)."""
 
+import re
 from collections.abc import Sequence
 
 from experiments.benchmarking import tables
@@ -31,6 +32,12 @@ _LATEX_SPECIAL = {
     "^": r"\textasciicircum{}",
 }
 
+# Underscores between letters and digits are letters; elsewhere they may begin emphasis.
+_MARKDOWN_SPECIAL = re.compile(r"[\\|<>*`\[\]&]|(?<![^\W_])_|_(?![^\W_])")
+
+# What the notes of tables are written with.
+_MARKS = re.compile(r"\*+|</?u>|`")
+
 
 def markdown(table: Table) -> str:
     """Returns a section: title, a table for each block, and notes."""
@@ -38,7 +45,7 @@ def markdown(table: Table) -> str:
     for block in table.blocks:
         heads = [heading(column) for column in table.columns]
         lines += [
-            f"### {block.title[:1].upper()}{block.title[1:]}",
+            f"### {in_markdown(block.title[:1].upper() + block.title[1:])}",
             "",
             _line(["method", "scenes", *heads]),
             _line(["---", "---:", *["---:"] * len(heads)]),
@@ -50,17 +57,23 @@ def markdown(table: Table) -> str:
     return "\n".join([*lines, *(f"{note}\n" for note in table.notes)])
 
 
+def in_markdown(text: str) -> str:
+    """Returns text of one line that Markdown shows as it is, in a table's cell too."""
+    return _MARKDOWN_SPECIAL.sub(lambda found: f"\\{found[0]}", " ".join(text.split()))
+
+
 def heading(column: Column) -> str:
     """Returns what stands above a column: its label, and an arrow to what is better."""
     return f"{column.label}{_ARROWS[column.better]}"
 
 
 def latex(table: Table) -> str:
-    """Returns a tabular, with the blocks below one another."""
+    """Returns a tabular, with the blocks below one another, and the notes in comments."""
     count = len(table.columns) + 2
     heads = [f"{column.latex}{_LATEX_ARROWS[column.better]}" for column in table.columns]
     lines = [
         f"% {table.title}. Published rows and columns: arXiv 2505.05848, on its data.",
+        *(f"% {_MARKS.sub('', note)}" for note in table.notes),
         rf"\begin{{tabular}}{{@{{}}l{'r' * (count - 1)}@{{}}}}",
         r"\toprule",
         " & ".join(["Method", "Scenes", *heads]) + r" \\",
@@ -75,7 +88,7 @@ def latex(table: Table) -> str:
 
 
 def _markdown_row(row: Row, columns: Sequence[Column]) -> list[str]:
-    label = f"{row.label}, *published*" if row.origin == "published" else row.label
+    label = in_markdown(row.label) + (", *published*" if row.origin == "published" else "")
     cells = [
         _marked(cell, column, _MARKDOWN_MARKS[mark], " ± {}")
         for cell, column, mark in zip(row.cells, columns, row.marks, strict=True)

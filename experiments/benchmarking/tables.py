@@ -1,7 +1,7 @@
 """What a table is, before it is written: blocks of rows, ours and the paper's, in columns.
 
-`mark` finds the best and the second best of a block's own rows. Rows that lack scenes which others
-have are left out of that, and so are the paper's, which are of other data.
+`mark` finds the best and the second best of a block's own rows. Rows that lack a scene of the block
+are left out of that, and so are the paper's, which are of other data.
 """
 
 import math
@@ -80,17 +80,22 @@ def row(label: str, origin: Origin, scenes: int | None, cells: Sequence[Cell]) -
     return Row(label, origin, scenes, tuple(cells), ("",) * len(cells))
 
 
-def mark(rows: Sequence[Row], columns: Sequence[Column]) -> tuple[Row, ...]:
+def mark(rows: Sequence[Row], columns: Sequence[Column], scenes: int) -> tuple[Row, ...]:
     """Marks the best of our rows, and the second best of three or more, by the digits shown.
 
-    Equal numbers share a mark.
+    Equal numbers share a mark. Numbers that lack a scene, and `nan`, are not compared.
+
+    Args:
+      rows: of one block.
+      columns: of the table.
+      scenes: of the block, whichever rows have them.
     """
     marks = [list(row.marks) for row in rows]
     for j, column in enumerate(columns):
-        ours = [i for i, row in enumerate(rows) if row.origin == "ours" and row.cells[j].count]
-        most = max((rows[i].cells[j].count for i in ours), default=0)
         shown = {
-            i: _shown(rows[i].cells[j], column) for i in ours if rows[i].cells[j].count == most
+            i: _shown(row.cells[j], column)
+            for i, row in enumerate(rows)
+            if row.origin == "ours" and _compares(row.cells[j], scenes)
         }
         ranked = sorted(set(shown.values()), reverse=column.better == "higher")
         if column.better is None or len(shown) < 2:
@@ -144,6 +149,10 @@ def number(cell: Cell, column: Column) -> str:
 def error(cell: Cell, column: Column) -> str:
     """Returns a standard error as it is shown; `-` if there is none."""
     return "-" if cell.error is None else format(cell.error, f".{column.digits}f")
+
+
+def _compares(cell: Cell, scenes: int) -> bool:
+    return cell.mean is not None and cell.count == scenes and not math.isnan(cell.mean)
 
 
 def _shown(cell: Cell, column: Column) -> float:

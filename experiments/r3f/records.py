@@ -185,9 +185,7 @@ def read(out: Path) -> Reconstruction:
       ValueError: if the folder holds none.
     """
     if not exists(out):
-        raise ValueError(
-            f"{out} holds no reconstruction. Give a folder that experiments.reconstruct wrote."
-        )
+        raise ValueError(f"{out} holds no reconstruction. Give one of experiments.reconstruct.")
     return configuration.read(out / FILE, Reconstruction)
 
 
@@ -207,9 +205,8 @@ def begin(out: Path, asked: Reconstruction) -> Reconstruction:
     if not exists(out):
         if out.exists() and not out.is_dir():
             raise ValueError(f"{out} is a file, but a folder is needed. Give another --out.")
-        if out.is_dir() and any(
-            each.name != stages.beside(out / FILE).name for each in out.iterdir()
-        ):
+        draft = stages.beside(out / FILE)
+        if out.is_dir() and any(each != draft for each in out.iterdir()):
             raise ValueError(
                 f"{out} holds something else than a reconstruction. Give a new folder as --out."
             )
@@ -249,6 +246,5 @@ def _told(name: str, value: object) -> object:
 
 
 _OPTIONS = {"index": "ior", "space": "background"}
-
 # The first stage that an option matters to, where that is not the geometry.
 _STAGES = {"index": "index", "space": "index", "radius": "index", "light_steps": "light"}

@@ -16,3 +16,4 @@ from refref_jax.metrics.lpips_network import SMALLEST_FOR_LPIPS as SMALLEST_FOR_
 from refref_jax.metrics.lpips_network import LpipsParams as LpipsParams
 from refref_jax.metrics.lpips_network import lpips as lpips
 from refref_jax.metrics.lpips_weights import load_lpips as load_lpips
+from refref_jax.metrics.lpips_weights import read_lpips as read_lpips

@@ -8,7 +8,6 @@ A file is a `.npz` of the arrays of two published state dicts, under their own n
 so that each can be compared with where it came from. `docs/metrics.md` tells how to make one.
 """
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -43,23 +42,15 @@ _NAMES_SHOWN = 4
 
 
 def load_lpips(path: Path) -> LpipsParams:
-    """Loads weights for `lpips`.
+    """Loads weights for `lpips` onto the default device.
 
     Args:
       path: a `.npz` with the names above.
 
     Raises:
-      ValueError: if it can not be read, or an array is missing or has another shape.
+      ValueError: as `read_lpips`.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile) as error:
-        raise ValueError(
-            f"{path} can not be read as the weights of LPIPS ({error}). Make it with python -m "
-            "experiments.convert_lpips, see docs/metrics.md."
-        ) from error
-    chosen = choose(arrays, ALEXNET_SHAPES | LINEAR_SHAPES, source=str(path))
+    chosen = read_lpips(path)
     return jax.device_put(
         LpipsParams(
             kernels=tuple(chosen[name] for name in _KERNELS),
@@ -67,6 +58,30 @@ def load_lpips(path: Path) -> LpipsParams:
             channels=tuple(chosen[name].reshape(-1) for name in _CHANNELS),
         )
     )
+
+
+def read_lpips(path: Path) -> dict[str, np.ndarray]:
+    """Reads and checks weights for `lpips`, and touches no device.
+
+    Args:
+      path: a `.npz` with the names above.
+
+    Returns:
+      The arrays under these names, in single precision.
+
+    Raises:
+      ValueError: if it can not be read, or an array is missing, has another shape, or numbers that
+        can not be, see `choose`.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except Exception as error:  # NumPy raises what zipfile, zlib and Python's tokenizer do
+        raise ValueError(
+            f"{path} can not be read as the weights of LPIPS ({error}). Make it with python -m "
+            "experiments.convert_lpips, see docs/metrics.md."
+        ) from error
+    return choose(arrays, ALEXNET_SHAPES | LINEAR_SHAPES, source=str(path))
 
 
 def choose(
@@ -81,7 +96,8 @@ def choose(
 
     Raises:
       ValueError: if one is missing, has another shape, or has numbers that can not be: such that
-        are not finite, or negative weights of channels, which LPIPS was trained not to have.
+        are not finite in single precision, weights that are all zero, or negative weights of
+        channels, which LPIPS was trained not to have.
     """
     missing = [name for name in shapes if name not in arrays]
     if missing:
@@ -90,6 +106,7 @@ def choose(
             f"{source} has no {missing[0]}; it has {have or 'nothing'}. Give the state dict of "
             "which docs/metrics.md tells."
         )
+    chosen = {}
     for name, shape in shapes.items():
         found = arrays[name]
         if found.shape != shape:
@@ -97,14 +114,27 @@ def choose(
                 f"{name} in {source} has the shape {found.shape}, not {shape}. It is of another "
                 "network: LPIPS is measured with AlexNet here."
             )
-        if not np.issubdtype(found.dtype, np.floating) or not np.all(np.isfinite(found)):
+        is_floating = np.issubdtype(found.dtype, np.floating)
+        with np.errstate(over="ignore"):  # what is too large becomes infinite, and is refused
+            chosen[name] = found.astype(np.float32) if is_floating else found
+        if not is_floating or not np.all(np.isfinite(chosen[name])):
             raise ValueError(
-                f"{name} in {source} has entries that are no finite numbers. Copy or convert the "
-                "file again."
+                f"{name} in {source} has entries that are no finite numbers in single precision. "
+                "Copy or convert the file again."
             )
-        if name in _CHANNELS and np.any(found < 0):
-            raise ValueError(
-                f"{name} in {source} has negative weights, which LPIPS does not have. These may "
-                "be weights that no training has touched: take the published file, version 0.1."
-            )
-    return {name: arrays[name].astype(np.float32) for name in shapes}
+        _check_trained(chosen[name], name, source)
+    return chosen
+
+
+def _check_trained(found: np.ndarray, name: str, source: str) -> None:
+    """Refuses weights that no training left."""
+    if name not in _BIASES and not np.any(found):
+        raise ValueError(
+            f"{name} in {source} has no weight but zero, so that nothing would be measured. Take "
+            "the published file."
+        )
+    if name in _CHANNELS and np.any(found < 0):
+        raise ValueError(
+            f"{name} in {source} has negative weights, which LPIPS does not have. These may be "
+            "weights that no training has touched: take the published file, version 0.1."
+        )

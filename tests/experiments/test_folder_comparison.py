@@ -8,6 +8,7 @@ import pytest
 from experiments import folder_comparison
 from experiments.measures import Perceptual
 from refref_jax.data import files
+from tests import made_lpips
 from tests.data.small_scenes import truncate, write_grey
 from tests.experiments.command import run_command
 
@@ -164,13 +165,15 @@ def test_the_command_prints_a_table_and_writes_only_what_is_asked(folders, masks
 
 
 @pytest.mark.slow
-def test_the_command_overwrites_when_asked_and_writes_nothing_unasked(folders, tmp_path):
-    out = tmp_path / "metrics.json"
+def test_the_command_overwrites_when_asked_and_writes_nothing_unasked(folders, masks, tmp_path):
+    out, weights = tmp_path / "metrics.json", made_lpips.write(tmp_path / "weights.npz")
     out.write_text("{}")
     run_command("metrics", *folders, f"--out={out}", "--overwrite")
     assert json.loads(out.read_text())["masks"] is None
     before = sorted(tmp_path.rglob("*"))
-    printed = run_command("metrics", *folders).stdout
-    assert "--out=metrics.json" in printed and sorted(tmp_path.rglob("*")) == before
+    options = [f"--masks={masks}", f"--lpips_weights={weights}"]
+    printed = run_command("metrics", *folders, *options).stdout
+    again = f"{folders[0]} {folders[1]} {options[0]} {options[1]} --out=metrics.json"
+    assert again in printed and sorted(tmp_path.rglob("*")) == before
     missing = run_command("metrics", folders[0], fails=True)
     assert "TRUTH is missing" in missing.stderr

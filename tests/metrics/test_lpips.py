@@ -1,5 +1,7 @@
 """LPIPS against a second implementation in NumPy, and its weights as they are read from files."""
 
+import zipfile
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -164,7 +166,10 @@ def _with(name, change):
         (_with("lin0.model.1.weight", lambda x: x.reshape(-1)), "of another network"),
         (_with("features.3.bias", lambda x: x * np.nan), "no finite numbers"),
         (_with("features.3.bias", lambda x: x.astype(np.int32)), "no finite numbers"),
+        (_with("features.3.bias", lambda x: x.astype(np.float64) + 1e300), "in single precision"),
         (_with("lin1.model.1.weight", lambda x: x - 0.5), "negative weights"),
+        (_with("lin3.model.1.weight", np.zeros_like), "no weight but zero"),
+        (_with("features.6.weight", np.zeros_like), "no weight but zero"),
     ],
 )
 def test_weights_of_something_else_are_refused(tmp_path, spoil, message):
@@ -185,7 +190,9 @@ def test_half_precision_is_read_as_single(tmp_path):
     assert metrics.load_lpips(path).kernels[0].dtype == jnp.float32
 
 
-@pytest.mark.parametrize("kind", ["missing", "text", "empty", "npy", "cut off"])
+@pytest.mark.parametrize(
+    "kind", ["missing", "text", "empty", "npy", "cut off", "inflated", "header"]
+)
 def test_a_file_of_something_else_is_named(tmp_path, kind):
     path = tmp_path / "weights.npz"
     if kind == "text":
@@ -198,6 +205,21 @@ def test_a_file_of_something_else_is_named(tmp_path, kind):
     elif kind == "cut off":
         content = made_lpips.write(path).read_bytes()
         path.write_bytes(content[: len(content) // 2])
+    elif kind == "inflated":
+        np.savez_compressed(path, x=np.arange(1000.0))
+        content = bytearray(path.read_bytes())
+        content[200:300] = bytes(100)
+        path.write_bytes(content)
+    elif kind == "header":
+        with zipfile.ZipFile(path, "w") as file:
+            file.writestr("x.npy", np.lib.format.magic(1, 0) + b"\x02\x00((")
     with pytest.raises(ValueError, match=r"experiments\.convert_lpips") as raised:
         metrics.load_lpips(path)
     assert str(path) in str(raised.value)
+
+
+def test_weights_are_checked_without_a_device(tmp_path, monkeypatch):
+    path = made_lpips.write(tmp_path / "weights.npz")
+    monkeypatch.setattr(jax, "device_put", None)
+    found = metrics.read_lpips(path)
+    assert len(found) == 15 and {x.dtype for x in found.values()} == {np.dtype(np.float32)}

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from experiments.benchmarking.records import Record
+from experiments.benchmarking.records import Metrics, Record
 from experiments.benchmarking.report.contents import Scene
 
 # Of a scene's views, the share that is chosen because methods fail there.
@@ -79,7 +79,7 @@ def choose_views(scene: Scene, count: int) -> list[str]:
 def view_names(scene: Scene) -> list[str]:
     """Returns the names of all views of a scene, in their order."""
     return list(
-        dict.fromkeys(view["name"] for result in scene.results for view in result.record.views)
+        dict.fromkeys(view.name for result in scene.results for view in result.record.views)
     )
 
 
@@ -88,16 +88,16 @@ def _cases(record: Record) -> list[Case]:
         Case(
             record.scene,
             record.method,
-            image["name"],
-            _known(image, "psnr_masked"),
-            _known(image, "psnr"),
+            image.name,
+            _known(image.metrics, "psnr_masked"),
+            _known(image.metrics, "psnr"),
         )
         for image in record.per_image
     ]
 
 
-def _known(image: dict[str, Any], key: str) -> float | None:
-    value = image.get(key)
+def _known(metrics: Metrics, key: str) -> float | None:
+    value = metrics.get(key)
     return None if value is None or math.isnan(value) else value
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from experiments import commands
-from experiments.benchmarking import records, settings, summary, table_data
+from experiments.benchmarking import record_json, records, settings, summary, table_data
 from experiments.benchmarking.jobs import Skipped
 from experiments.benchmarking.records import Record
 from experiments.benchmarking.settings import Settings
@@ -60,6 +60,7 @@ class Contents(NamedTuple):
       reconstructions: what methods of R3F share, a scene.
       failed: why jobs failed, by `scene/method`.
       skipped: what was left out.
+      missing: jobs that were asked for and have no result, for no reason known.
       tables: all of them.
     """
 
@@ -69,6 +70,7 @@ class Contents(NamedTuple):
     reconstructions: tuple[Record, ...]
     failed: dict[str, str]
     skipped: tuple[Skipped, ...]
+    missing: tuple[str, ...]
     tables: tuple[Table, ...]
 
 
@@ -84,7 +86,7 @@ def read(out: Path) -> Contents:
     path = out / summary.RESULTS
     if not path.is_file():
         raise ValueError(f"{out} has no {path.name}. Make it with --tables_only.")
-    content = commands.from_string_safe(transforms.read_json(path))
+    content = transforms.read_json(path)
     moved = {name: Path(scene.path) for name, scene in settings.read(out).scenes.items()}
     try:
         results = [_result(job, moved) for job in content["jobs"]]
@@ -98,20 +100,21 @@ def read(out: Path) -> Contents:
             ),
             failed=dict(content["failed"]),
             skipped=tuple(Skipped(**each) for each in content["skipped"]),
+            missing=tuple(content["missing"]),
             tables=tuple(map(table_data.from_json, content["tables"].values())),
         )
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(
             f"{path} is not that of a benchmark ({error!r}). Make it again with --tables_only."
         ) from error
 
 
 def _result(job: dict[str, Any], moved: dict[str, Path]) -> Result:
-    record = Record(**{key: job[key] for key in Record._fields})
+    record = record_json.from_json(job)
     was = Path(record.scene_path)
     curve = tuple(
         Point(point["step"], point["seconds"], point["psnr"])
-        for point in job["curve"]
+        for point in commands.from_string_safe(job["curve"])
         if {"step", "seconds", "psnr"} <= set(point)
     )
     return Result(record, curve, (moved.get(record.scene, was), was))

@@ -1,12 +1,14 @@
 """The first page of a report: scenes, tables, failure cases, and how it was measured."""
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 
 from experiments.benchmarking import comparisons
 from experiments.benchmarking.quantities import PSNR, PSNR_MASKED
 from experiments.benchmarking.records import Record
 from experiments.benchmarking.report import cases, charts, tables_shown
+from experiments.benchmarking.report.cases import Case
 from experiments.benchmarking.report.contents import Contents, Scene
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.scene_pages import address, thumbnail
@@ -87,7 +89,7 @@ def _scores(scene: Scene, methods: Sequence[str]) -> list[str]:
     quantity = PSNR_MASKED if masked else PSNR
     numbers = {name: metrics.get(quantity.key) for name, metrics in found.items()}
     shown = {name: tables_shown.number(value, quantity.digits) for name, value in numbers.items()}
-    known = [value for value in numbers.values() if value is not None]
+    known = [value for value in numbers.values() if value is not None and not math.isnan(value)]
     best = tables_shown.number(max(known), quantity.digits) if len(known) > 1 else None
     cells = [shown.get(name, "-") for name in methods]
     return [tag("strong", cell) if cell == best else cell for cell in cells]
@@ -108,30 +110,7 @@ def _failures(scenes: Sequence[Scene], places: Mapping[str, Places]) -> Html:
         tag("option", "all methods", value=""),
         *(tag("option", n, value=n) for n in methods),
     ]
-    rows = []
-    for case in found:
-        own = places[case.scene]
-        is_shown = any(view == case.view for view, _, _ in own)
-        link = address(case.scene, case.view if is_shown else None)
-        pictures = [
-            thumbnail(own, case.view, TRUTH, IMAGE),
-            thumbnail(own, case.view, case.method, IMAGE),
-            thumbnail(own, case.view, case.method, ERROR),
-        ]
-        rows.append(
-            tag(
-                "li",
-                tag("a", join(pictures), f"{case.scene}, {case.view}", href=link),
-                tag("span", charts.swatch(case.method), " ", case.method),
-                tag(
-                    "span",
-                    f"{tables_shown.number(case.psnr_masked, 1)} dB in mask, "
-                    f"{tables_shown.number(case.psnr, 1)} dB",
-                ),
-                None if is_shown else tag("small", "not among the views of this report"),
-                data_method=case.method,
-            )
-        )
+    rows = [_case(case, places[case.scene]) for case in found]
     note = (
         f"The {_MOST_CASES} views of each method with the lowest PSNR inside the mask, the worst "
         "first; views without it come last, by the PSNR of the image. Pictures: ground truth, "
@@ -141,12 +120,36 @@ def _failures(scenes: Sequence[Scene], places: Mapping[str, Places]) -> Html:
     return join([tag("p", note, class_="note"), choice, tag("ol", *rows, class_="cases")])
 
 
+def _case(case: Case, places: Places) -> Html:
+    """Returns a line of the failures, with pictures where the report has the view."""
+    is_shown = any(view == case.view for view, _, _ in places)
+    link = address(case.scene, case.view if is_shown else None)
+    pictures = [
+        thumbnail(places, case.view, TRUTH, IMAGE),
+        thumbnail(places, case.view, case.method, IMAGE),
+        thumbnail(places, case.view, case.method, ERROR),
+    ]
+    return tag(
+        "li",
+        tag("a", join(pictures), f"{case.scene}, {case.view}", href=link),
+        tag("span", charts.swatch(case.method), " ", case.method),
+        tag(
+            "span",
+            f"{tables_shown.number(case.psnr_masked, 1)} dB in mask, "
+            f"{tables_shown.number(case.psnr, 1)} dB",
+        ),
+        None if is_shown else tag("small", "not among the views of this report"),
+        data_method=case.method,
+    )
+
+
 def _not_done(contents: Contents) -> Html:
     failed = [[f"failed: {name}", reason] for name, reason in contents.failed.items()]
-    left_out = [[f"left out: {e.scene}/{e.method}", e.reason] for e in contents.skipped]
-    if not failed and not left_out:
-        return tag("p", "No job failed and none was left out, as far as was tried.", class_="note")
-    return tables_shown.grid(["job", "reason"], [*failed, *left_out])
+    left_out = [[f"left out: {each.name}", each.reason] for each in contents.skipped]
+    missing = [[f"not done: {name}", "it has no result yet"] for name in contents.missing]
+    if not (found := [*failed, *left_out, *missing]):
+        return tag("p", "All jobs that were asked for are done.", class_="note")
+    return tables_shown.grid(["job", "reason"], found)
 
 
 def _settings(contents: Contents) -> Html:
@@ -183,11 +186,11 @@ def _settings(contents: Contents) -> Html:
 
 
 def _costs(found: Sequence[Record]) -> Html:
-    kept = [key for key in _COSTS if any(r.costs.get(key) is not None for r in found)]
+    kept = [key for key in _COSTS if any(getattr(r.costs, key) is not None for r in found)]
     rows = [
         [
             f"{record.scene}/{record.method}",
-            *(tables_shown.number(record.costs.get(key), _COSTS[key][1]) for key in kept),
+            *(tables_shown.number(getattr(record.costs, key), _COSTS[key][1]) for key in kept),
         ]
         for record in found
     ]

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from experiments.benchmarking.jobs import SPLIT
+from experiments.benchmarking.records import Truth
 from experiments.benchmarking.report.contents import Scene
-from experiments.benchmarking.running import SPLIT
 from refref_jax.data import cameras, files, transforms
 from refref_jax.data.cameras import Cameras
 from refref_jax.data.errors import SceneError
@@ -58,15 +59,15 @@ def read_view(out: Path, scene: Scene, name: str) -> View:
         result.record.method: view
         for result in scene.results
         for view in result.record.views
-        if view["name"] == name
+        if view.name == name
     }
     roots = dict.fromkeys(root for result in scene.results for root in result.roots)
-    told = next(iter(files_of.values()))["truth"]
+    told = next(iter(files_of.values())).truth
     truth, mask = _truth(list(roots), told)
     rendered = {
         method: Image(
-            _known(files.read_rgb, out / view["rgb"]),
-            _known(files.read_exr, out / view["distance"]),
+            _known(files.read_rgb, out / view.rgb),
+            _known(files.read_exr, out / view.distance),
         )
         for method, view in files_of.items()
     }
@@ -81,16 +82,14 @@ def read_view(out: Path, scene: Scene, name: str) -> View:
     return View(name, truth, mask, rendered)
 
 
-def _truth(
-    roots: Sequence[Path], told: dict[str, Any]
-) -> tuple[Image, Bool[np.ndarray, "h w"] | None]:
+def _truth(roots: Sequence[Path], told: Truth) -> tuple[Image, Bool[np.ndarray, "h w"] | None]:
     """Returns the true image and the mask, from the first folder that has the image."""
-    root = next((root for root in roots if (root / told["rgb"]).is_file()), None)
+    root = next((root for root in roots if (root / told.rgb).is_file()), None)
     if root is None:
         return Image(None, None), None
-    rgb = _known(files.read_rgb, root / told["rgb"])
-    mask = told["mask"] and _known(files.read_mask, root / told["mask"])
-    depth = told["distance"] and _known(files.read_depth, root / told["distance"])
+    rgb = _known(files.read_rgb, root / told.rgb)
+    mask = told.mask and _known(files.read_mask, root / told.mask)
+    depth = told.distance and _known(files.read_depth, root / told.distance)
     return Image(rgb, None if depth is None else _distance(root, depth)), mask
 
 

@@ -119,11 +119,13 @@ def _caption(scene: Scene, view: str, method: str) -> Html | None:
         for result in scene.results
         if result.record.method == method
         for image in result.record.per_image
-        if image["name"] == view
+        if image.name == view
     ]
     if not images:
         return None
-    psnr, masked = (tables_shown.number(images[0].get(key), 1) for key in ("psnr", "psnr_masked"))
+    psnr, masked = (
+        tables_shown.number(images[0].metrics.get(key), 1) for key in ("psnr", "psnr_masked")
+    )
     return join([tag("small", f"PSNR {psnr} dB"), " ", tag("small", f"in mask {masked} dB")])
 
 

@@ -5,6 +5,8 @@ import pytest
 
 from experiments import child_process
 from experiments.benchmarking import running
+from tests.experiments.benchmarking.made_scenes import write_scene
+from tests.experiments.benchmarking.serving import Server
 
 _STAND_IN = Path(__file__).with_name("stand_in.py")
 
@@ -27,3 +29,19 @@ def stand_in(tmp_path, monkeypatch):
     monkeypatch.setenv("CALLS", str(calls))
     monkeypatch.setattr(child_process, "command_line", stand_in_line)
     return calls
+
+
+@pytest.fixture(scope="module")
+def serve():
+    """Runs the command in a process that is started once."""
+    server = Server()
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def scenes(tmp_path):
+    """Writes two scenes, and returns the option that names them."""
+    for name in ("cube_smcvx_ball", "env_mmncvx_cup"):
+        write_scene(tmp_path / "scenes" / name)
+    return f"--scenes={tmp_path / 'scenes' / '*'}"

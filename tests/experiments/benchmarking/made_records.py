@@ -1,9 +1,8 @@
 """Results of jobs whose tables can be reckoned by hand."""
 
-import dataclasses
-
-from experiments.benchmarking import records
-from experiments.benchmarking.records import Record
+from experiments.benchmarking import jobs, records
+from experiments.benchmarking.methods import METHODS
+from experiments.benchmarking.records import Costs, Image, Record
 from experiments.benchmarking.settings import Settings
 
 SETTINGS = Settings(preset="tiny", steps=6, limit=None, rays_per_pixel=1, seed=0, lpips=None)
@@ -17,11 +16,12 @@ def made_record(scene, method, **metrics):
         category=category,
         background=background,
         method=method,
-        options={"train": [], "evaluate": []},
-        settings=dataclasses.asdict(SETTINGS),
+        fingerprint="",
+        options=jobs.options(method, METHODS[method].train if method in METHODS else (), SETTINGS),
+        settings=SETTINGS,
         metrics=metrics,
-        per_image=[{"name": "r_0", "pose_distance": 0.1, **metrics}],
-        costs={},
+        per_image=[Image("r_0", 0.1, None, metrics)],
+        costs=Costs(),
         versions={},
         views=[],
         scene_path="/nowhere",

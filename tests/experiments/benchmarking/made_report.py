@@ -5,8 +5,10 @@ import json
 import imageio.v3 as iio
 import numpy as np
 
-from experiments.benchmarking import jobs, records, settings, summary
+from experiments.benchmarking import jobs, record_files, settings, summary
 from experiments.benchmarking.jobs import Skipped
+from experiments.benchmarking.methods import METHODS
+from experiments.benchmarking.records import Costs, Image, Truth, View
 from experiments.benchmarking.settings import Benchmark, Scene
 from refref_jax.data import files
 from tests.experiments.benchmarking.made_records import SETTINGS, made_record
@@ -33,7 +35,7 @@ def write(folder, scenes, *, methods=("straight", "tree"), views=3, size=12, tru
         _write_scene(folder / f"scene_{i}", images)
         for method in methods:
             _write_job(out, name, folder / f"scene_{i}", method, images)
-    benchmark = Benchmark(SETTINGS, known, {name: () for name in methods})
+    benchmark = Benchmark(SETTINGS, known, {name: METHODS[name].train for name in methods})
     settings.write(out, benchmark)
     failed = {f"{scenes[0]}/r3f": "experiments.train: error: <b>no</b> & never"}
     skipped = [Skipped(scenes[0], "r3f_tree", "its training images have no masks")]
@@ -91,31 +93,26 @@ def _write_job(out, scene, path, method, images):
     ]
     (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     per_image = [
-        {"name": f"r_{i}", "pose_distance": 0.1, "psnr": 30.0, "psnr_masked": QUALITY[method] + i}
+        Image(f"r_{i}", 0.1, None, {"psnr": 30.0, "psnr_masked": QUALITY[method] + i})
         for i in range(len(images))
     ]
     record = made_record(scene, method, psnr=30.0, psnr_masked=QUALITY[method])
-    records.write(
+    record_files.write(
         folder,
         record._replace(
             per_image=per_image,
             scene_path=str(path),
             views=[_view(i) for i in range(len(images))],
-            options={"train": ["--steps=6"], "evaluate": ["--rays_per_pixel=1"]},
-            costs={"steps": 6, "seconds_per_step": 0.125},
+            costs=Costs(steps=6, seconds_per_step=0.125),
             versions={"jax": "0.0", "refref_jax": "0.0"},
         ),
     )
 
 
 def _view(i):
-    return {
-        "name": f"r_{i}",
-        "truth": {
-            "rgb": f"test/r_{i}.png",
-            "mask": f"mask/r_{i}.png",
-            "distance": f"depth/r_{i}.exr",
-        },
-        "rgb": f"run/eval/test/rgb/r_{i}.png",
-        "distance": f"run/eval/test/distance/r_{i}.exr",
-    }
+    return View(
+        f"r_{i}",
+        Truth(f"test/r_{i}.png", f"mask/r_{i}.png", f"depth/r_{i}.exr"),
+        rgb=f"run/eval/test/rgb/r_{i}.png",
+        distance=f"run/eval/test/distance/r_{i}.exr",
+    )

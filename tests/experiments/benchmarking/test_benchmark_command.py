@@ -8,79 +8,32 @@ import signal
 import subprocess
 import sys
 import time
-from typing import NamedTuple
 
 import pytest
 
 from experiments.benchmarking import engines, jobs, summary
 from refref_jax.training import run_lock
-from tests.experiments.benchmarking.made_scenes import write_scene
+from tests.experiments.benchmarking.serving import MODULES, calls, environment
 from tests.experiments.command import ROOT
 
 _BUNDLED = f"--scenes={ROOT / 'experiments' / 'data' / 'cube_smcvx_ball'}"
-_MODULES = "tests.experiments.benchmarking"
-
-
-class Answer(NamedTuple):
-    """What a command came to."""
-
-    status: int
-    stdout: str
-    stderr: str
-
-
-@pytest.fixture(scope="module")
-def serve():
-    """Runs the command in a process that is started once."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", f"{_MODULES}.serve_with_stand_in"],
-        cwd=ROOT,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-
-    def run(folder, *options, status=0, fail="^$"):
-        words = [f"--out={folder / 'out'}", "--steps=5", *map(str, options)]
-        environment = {"CALLS": str(folder / "calls.txt"), "PACE": "0", "FAIL": fail}
-        print(json.dumps({"words": words, "environment": environment}), file=process.stdin)
-        process.stdin.flush()
-        answer = Answer(**json.loads(process.stdout.readline()))
-        assert answer.status == status, answer
-        return answer
-
-    yield run
-    process.stdin.close()
-    process.wait(60.0)
-    process.stdout.close()
-
-
-@pytest.fixture
-def scenes(tmp_path):
-    for name in ("cube_smcvx_ball", "env_mmncvx_cup"):
-        write_scene(tmp_path / "scenes" / name)
-    return f"--scenes={tmp_path / 'scenes' / '*'}"
 
 
 def _start(tmp_path, *options, pace):
     """Starts the command in a process of its own."""
-    words = [sys.executable, "-m", f"{_MODULES}.run_with_stand_in", f"--out={tmp_path / 'out'}"]
-    environment = os.environ | {"CALLS": str(tmp_path / "calls.txt"), "PACE": str(pace)}
+    words = [sys.executable, "-m", f"{MODULES}.run_with_stand_in", f"--out={tmp_path / 'out'}"]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    return subprocess.Popen([*words, "--steps=5", *options], cwd=ROOT, env=environment, **quiet)
+    return subprocess.Popen(
+        [*words, "--steps=5", *options], cwd=ROOT, env=environment(tmp_path, pace), **quiet
+    )
 
 
 # Seconds that a busy machine may take to start Python.
 _LONG = 300.0
 
 
-def _calls(tmp_path):
-    path = tmp_path / "calls.txt"
-    return [line.split() for line in path.read_text().splitlines()] if path.exists() else []
-
-
 def _trainings(folder):
-    return [call for call in _calls(folder) if call[0] == "train"]
+    return [call for call in calls(folder) if call[0] == "train"]
 
 
 def _wait_for(condition, seconds=_LONG):
@@ -148,9 +101,9 @@ def test_killed_at_any_time_it_comes_to_the_same_tables(tmp_path, serve, scenes)
     _kill(cut, scenes, victim="benchmark", after=0)
     serve(cut, scenes, "--methods=straight,tree")
     assert _texts(cut / "out") == _texts(whole / "out")
-    calls = len(_calls(cut))
+    count = len(calls(cut))
     assert "All jobs are done already" in serve(cut, scenes, "--methods=straight,tree").stdout
-    assert len(_calls(cut)) == calls
+    assert len(calls(cut)) == count
 
 
 def test_a_failure_is_listed_and_the_rest_goes_on(tmp_path, serve, scenes):
@@ -161,10 +114,10 @@ def test_a_failure_is_listed_and_the_rest_goes_on(tmp_path, serve, scenes):
     assert "- cube_smcvx_ball/tree: experiments.train" in text and "Results: 3," in text
     index = json.loads((tmp_path / "out" / summary.RESULTS).read_text())
     assert list(index["failed"]) == ["cube_smcvx_ball/tree"] and len(index["jobs"]) == 3
-    before = len(_calls(tmp_path))
+    before = len(calls(tmp_path))
     result = serve(tmp_path, scenes, "--methods=straight,tree")
     # It was not trained, so that both commands are run, and no other.
-    assert [call[:2] for call in _calls(tmp_path)[before:]] == [
+    assert [call[:2] for call in calls(tmp_path)[before:]] == [
         ["train", "cube_smcvx_ball/tree"],
         ["evaluate", "cube_smcvx_ball/tree"],
     ]
@@ -212,18 +165,18 @@ def test_two_do_not_work_in_one_folder(tmp_path, serve, scenes):
     (tmp_path / "out").mkdir()
     with run_lock.hold(tmp_path / "out"):
         result = serve(tmp_path, scenes, "--methods=tree", status=2)
-    assert "Another process works in" in result.stderr and not _calls(tmp_path)
+    assert "Another process works in" in result.stderr and not calls(tmp_path)
 
 
 @pytest.mark.slow
 def test_a_kill_that_can_be_caught_waits_for_the_command(tmp_path, scenes):
     process = _start(tmp_path, scenes, "--methods=tree", pace=0.3)
-    (call,) = _wait_for(lambda: _calls(tmp_path))
+    (call,) = _wait_for(lambda: calls(tmp_path))
     process.send_signal(signal.SIGTERM)
     assert process.wait(_LONG) == 130
     with pytest.raises(ProcessLookupError):
         os.kill(int(call[2]), 0)
-    assert len(_calls(tmp_path)) == 1
+    assert len(calls(tmp_path)) == 1
 
 
 def test_a_dry_run_lists_and_does_nothing(tmp_path, serve, scenes):
@@ -233,7 +186,7 @@ def test_a_dry_run_lists_and_does_nothing(tmp_path, serve, scenes):
     assert lines[-1] == "7 jobs, 7 to do."
     assert any("cube_smcvx_ball/tree" in line and "--paths=tree" in line for line in lines)
     assert any("env_mmncvx_cup/tree: it has no meshes" in line for line in lines)
-    assert not (tmp_path / "out").exists() and not _calls(tmp_path)
+    assert not (tmp_path / "out").exists() and not calls(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -242,7 +195,7 @@ def test_a_dry_run_lists_and_does_nothing(tmp_path, serve, scenes):
         (("--scenes=nowhere/*",), "names no scene"),
         (("--methods=magic", _BUNDLED), "There is no method 'magic'"),
         (("--rays_per_pixel=3", _BUNDLED), "3 rays a pixel do not make a square"),
-        (("--lpips_weights=none.npz", _BUNDLED), "There is no file none.npz"),
+        (("--lpips_weights=none.npz", _BUNDLED), "none.npz can not be read as the weights"),
         (("--tables_only",), "holds no benchmark"),
     ],
 )

@@ -5,7 +5,15 @@ import json
 
 import pytest
 
-from experiments.benchmarking import jobs, methods, records, running, scene_list, settings
+from experiments.benchmarking import (
+    jobs,
+    methods,
+    record_files,
+    records,
+    running,
+    scene_list,
+    settings,
+)
 from experiments.benchmarking.methods import METHODS, RECONSTRUCTION
 from refref_jax.training import run_lock
 from tests.experiments.benchmarking.made_records import SETTINGS
@@ -20,6 +28,10 @@ def _scenes(tmp_path, *names, **options):
 
 def _chosen(text):
     return methods.parse(text.split(","))
+
+
+def _benchmark(common=SETTINGS):
+    return settings.asked(common, [], [])
 
 
 def _calls(stand_in):
@@ -143,7 +155,7 @@ def test_a_job_leaves_a_result_that_says_all_and_is_done_once(tmp_path, stand_in
     assert running.run(out, job) is None and jobs.is_done(out, job)
     assert running.run(out, job) is None
     assert _calls(stand_in) == [f"train {job.name}", f"evaluate {job.name}"]
-    (record,) = records.read_all(out, common)
+    (record,) = record_files.read_all(out, _benchmark(common))
     assert (record.category, record.background, record.method) == ("smcvx", "env", "tree_cone")
     assert record.options["train"] == [
         "--preset=tiny",
@@ -154,16 +166,16 @@ def test_a_job_leaves_a_result_that_says_all_and_is_done_once(tmp_path, stand_in
     ]
     assert record.options["evaluate"] == ["--rays_per_pixel=1", "--limit=6"]
     assert record.metrics["lpips"] is None and record.metrics["distance_mae_masked"] == float("inf")
-    assert record.costs["steps"] == 6 and record.costs["seconds_per_image"] == 2.0
-    assert record.costs["peak_host_mib"] > 1.0
+    assert record.costs.steps == 6 and record.costs.seconds_per_image == 2.0
+    assert record.costs.peak_host_mib > 1.0
     assert set(record.versions) == {"jax", "refref_jax"}
     # Ever farther from the training view at their start, by 0.5 / 22.4 of a radius.
-    apart = [image["pose_distance"] for image in record.per_image]
+    apart = [image.pose_distance for image in record.per_image]
     scale = (500.0**0.5 + 501.0**0.5) / 2.0
     assert apart == pytest.approx([0.5 * i / scale for i in range(6)])
     view = record.views[2]
-    assert view["rgb"] == "run/eval/test/rgb/r_002.png"
-    truth = tmp_path / "scenes" / "env_smcvx_ball" / view["truth"]["rgb"]
+    assert view.rgb == "run/eval/test/rgb/r_002.png"
+    truth = tmp_path / "scenes" / "env_smcvx_ball" / view.truth.rgb
     assert truth.is_file() and truth.name == "r_002.png"
 
 
@@ -174,13 +186,13 @@ def test_results_of_other_settings_or_places_are_refused(tmp_path, stand_in):
     running.run(out, job)
     path = jobs.folder(out, job) / jobs.RESULT
     with pytest.raises(ValueError, match="made with other settings"):
-        records.read_all(out, dataclasses.replace(SETTINGS, seed=1))
+        record_files.read_all(out, _benchmark(dataclasses.replace(SETTINGS, seed=1)))
     path.parent.rename(path.parent.with_name("straight"))
     with pytest.raises(ValueError, match="is the result of cube_smcvx_ball/tree"):
-        records.read_all(out, SETTINGS)
+        record_files.read_all(out, _benchmark())
     (path.parent.with_name("straight") / jobs.RESULT).write_text("{")
     with pytest.raises(ValueError, match="is not the result of a job"):
-        records.read_all(out, SETTINGS)
+        record_files.read_all(out, _benchmark())
 
 
 def test_a_reconstruction_is_given_to_the_methods_that_wait_for_it(tmp_path, stand_in):
@@ -191,10 +203,10 @@ def test_a_reconstruction_is_given_to_the_methods_that_wait_for_it(tmp_path, sta
     folder = jobs.folder(out, planned[0])
     words = (jobs.folder(out, planned[1]) / "run" / "trained_with").read_text()
     assert f"reconstruction={folder / 'run'}" in words
-    everything = records.read_all(out, SETTINGS)
+    everything = record_files.read_all(out, _benchmark())
     assert [record.method for record in records.compared(everything)] == ["r3f"]
     (found,) = [record for record in everything if record.method == RECONSTRUCTION]
-    assert found.facts["index"]["index"] == 1.5 and found.costs["seconds"] > 0.0
+    assert found.facts["index"]["index"] == 1.5 and found.costs.seconds > 0.0
     # Where the reconstruction lies is not of the result, which may move.
     assert str(tmp_path) not in json.dumps([record.options for record in everything])
 

@@ -11,7 +11,9 @@ import sys
 import pytest
 from PIL import Image
 
-from experiments.benchmarking import jobs, records, summary
+from experiments.benchmarking import jobs, record_files, summary
+from experiments.benchmarking.records import Image as Measured
+from experiments.benchmarking.records import Truth, View
 from experiments.benchmarking.report import cases, contents, overview, page, scene_pages
 from experiments.benchmarking.report.contents import Result, Scene
 from tests.experiments.benchmarking import made_report
@@ -159,11 +161,12 @@ def test_a_scene_that_has_moved_is_found_where_it_is_now(out, tmp_path):
 def _result(scene, method, **values):
     """A result with a PSNR inside the mask for each view, by its name."""
     per_image = [
-        {"name": name, "psnr": 40.0, "psnr_masked": value} for name, value in values.items()
+        Measured(name, 0.1, None, {"psnr": 40.0, "psnr_masked": value})
+        for name, value in values.items()
     ]
     known = [value for value in values.values() if value is not None]
     record = made_record(scene, method, psnr_masked=sum(known) / max(1, len(known)))
-    views = [{"name": name} for name in values]
+    views = [View(name, Truth("", None, None), "", "") for name in values]
     return Result(record._replace(per_image=per_image, views=views), (), ())
 
 
@@ -213,7 +216,7 @@ def test_a_report_of_many_scenes_shows_fewer_views_and_never_none():
         (None, "has no results.json. Make it with --tables_only."),
         ("{", "is not valid JSON"),
         ("{}", "is not that of a benchmark (KeyError('jobs')"),
-        ('{"jobs": [{}]}', "is not that of a benchmark (KeyError('scene')"),
+        ('{"jobs": [{}]}', "is not that of a benchmark (ValueError('the file lacks scene')"),
     ],
 )
 def test_broken_results_are_named(out, tmp_path, text, message):
@@ -240,7 +243,7 @@ def test_what_failed_before_is_known_until_it_is_done(out, tmp_path):
     for method in ("r3f", "r3f_tree"):
         folder = copy / jobs.FOLDER / "cube_smcvx_ball" / method
         folder.mkdir()
-        records.write(folder, made_record("cube_smcvx_ball", method))
+        record_files.write(folder, made_record("cube_smcvx_ball", method))
     assert summary.not_done(copy) == ({}, [])
     assert summary.not_done(tmp_path / "nowhere") == ({}, [])
 

@@ -14,7 +14,7 @@ from tests.experiments.benchmarking.made_records import SETTINGS
 
 
 def made_job(scene, method, *, reconstructed=False):
-    return Job(scene, "/nowhere", method, (), reconstructed, SETTINGS, None)
+    return Job(scene, "/nowhere", "", method, (), reconstructed, SETTINGS, None)
 
 
 _WITH_RECONSTRUCTION = [
