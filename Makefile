@@ -1,7 +1,7 @@
 # One command from a fresh clone: `make demo` trains and shows a model, `make test` tests.
 # Both create .venv first, and may be repeated. `make dataset-env` installs Blender, which
 # `python -m experiments.dataset.make` renders with, beside it. `make benchmark-small` needs both: it
-# renders six scenes and compares three methods on them, in less than 90 minutes on two cores.
+# renders six scenes and compares three methods on them; docs/benchmark.md says how long that takes.
 
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
