@@ -100,20 +100,20 @@ def read_frame(content: dict[str, Any], record: Any, path: Path) -> CaptureFrame
     )
 
 
-def read_number(records: Sequence[dict[str, Any]], key: str, path: Path) -> float | None:
+def read_number(records: Sequence[dict[str, Any]], name: str, path: Path) -> float | None:
     """Returns a finite number that one of some records has, or `None`.
 
     Raises:
       SceneError: if it is none, or if two records contradict each other.
     """
-    values = [record[key] for record in records if key in record]
+    values = [record[name] for record in records if name in record]
     for value in values:
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if not is_number or not math.isfinite(value):
-            raise SceneError(f"{key} is {value!r} in {path}. Give a finite number.")
+            raise SceneError(f"{name} is {value!r} in {path}. Give a finite number.")
     if len(set(values)) > 1:
         raise SceneError(
-            f"{key} is {values[0]} for all frames of {path}, and {values[1]} in one of them. "
+            f"{name} is {values[0]} for all frames of {path}, and {values[1]} in one of them. "
             "Remove one of the two."
         )
     return float(values[0]) if values else None

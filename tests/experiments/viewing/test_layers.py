@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
@@ -30,6 +31,10 @@ def model():
         patch.setattr(images, "TILE", 256)
         params = init_params(jax.random.key(0), MODEL)
         yield Model(MODEL, PAPER, scenes.geometry(scenes.ball(1.3, subdivisions=2)), params)
+
+
+def _blank():
+    return images._blank(jnp.zeros((0, 3)))
 
 
 def test_a_model_offers_what_it_has(model):
@@ -121,7 +126,7 @@ def test_a_drawing_that_is_called_off_ends_at_the_next_band(model, monkeypatch):
 
     def render(model, rays, **_):
         rendered.append(rays.radii.shape)
-        return images._blank(0)._replace(rgb=np.zeros((*rays.radii.shape, 3)))
+        return _blank()._replace(rgb=np.zeros((*rays.radii.shape, 3)))
 
     monkeypatch.setattr(layers.images, "TILE", 64)  # bands of four rows
     monkeypatch.setattr(layers, "render_image", render)
@@ -137,7 +142,7 @@ def test_bands_are_joined_in_order(model, monkeypatch):
     monkeypatch.setattr(
         layers,
         "render_image",
-        lambda model, rays, **_: images._blank(0)._replace(rgb=0.5 + 0.5 * rays.directions),
+        lambda model, rays, **_: _blank()._replace(rgb=0.5 + 0.5 * rays.directions),
     )
     drawn = layers.draw(model, layers.RGB, _RAYS, **_OPTIONS)
     np.testing.assert_array_equal(drawn, files.to_bytes(0.5 + 0.5 * _RAYS.directions))
@@ -157,7 +162,7 @@ def test_an_error_is_that_of_the_pixels_that_are_drawn(model, ball_scene, monkey
     monkeypatch.setattr(
         layers,
         "render_image",
-        lambda model, rays, **_: images._blank(0)._replace(rgb=pixels.target + off),
+        lambda model, rays, **_: _blank()._replace(rgb=pixels.target + off),
     )
     options = {"chunk": 4096, "cancelled": lambda: False}
     picture, error = layers.draw_error(model, pixels, **options)
