@@ -412,6 +412,7 @@ def _table():
     return {(row[0], column): cell for row in rows for column, cell in zip(head, row, strict=True)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("check", _CHECKS.values())
 def test_what_a_cell_says(check):
     check()
