@@ -52,7 +52,7 @@ def run(
     index, settings = known.index, LightRefinement(steps=steps, seed=seed)
     if known.source == "given":
         settings = dataclasses.replace(settings, index_stride=0.0)
-    judges = body_pixels.look(scene, "val", model, seed=seed + 1, rays=_JUDGES)
+    judges = find_judges(scene, model, seed=seed)
     seen = body_pixels.look(scene, "train", model, seed=seed, rays=_SEEN)
     with commands.ProgressBar("light", steps) as bar:
         found = refine_by_light(
@@ -64,8 +64,8 @@ def run(
             settings=settings,
             progress=lambda step, error: bar.show(step, f"error {error:.4f}"),
         )
-    before = _error(mesh, index, judges, model)
-    after = _error(found.mesh, found.index, judges, model)
+    before = judge(mesh, index, judges, model)
+    after = judge(found.mesh, found.index, judges, model)
     kept = after < before and not objection(mesh, found.mesh, _VOLUME_CHANGE)
     if kept:
         with stages.unfinished_folder(target.parent) as folder:
@@ -73,8 +73,17 @@ def run(
     return LightFacts(steps, kept, before, after, found.index, found.furthest)
 
 
-def _error(mesh: Mesh, index: float, judges: BodyPixels, model: Model) -> float:
-    """Returns the mean error of the judging pixels, with the body's own tree."""
+def find_judges(scene: Path, model: Model, *, seed: int) -> BodyPixels:
+    """Returns the pixels of the validation views that a refinement is judged by.
+
+    Raises:
+      ValueError: if there is no validation split with masks.
+    """
+    return body_pixels.look(scene, "val", model, seed=seed + 1, rays=_JUDGES)
+
+
+def judge(mesh: Mesh, index: float, judges: BodyPixels, model: Model) -> float:
+    """Returns the mean error of the judging pixels in sRGB, with the body's own tree."""
     errors = photometry.errors_at_index(
         np.float32(index),
         judges.evidence,

@@ -16,14 +16,17 @@ from tests.small_model import MODEL
 CONFIG = dataclasses.replace(MODEL, interior="clear")
 
 
-def params():
-    """A field of patches, a few units wide, that differ in every colour."""
+def params(*, contrast=1.0):
+    """A field of patches, a few units wide, that differ in every colour.
+
+    A contrast of 1 is faint, 0.02 around a mean of 0.7; of 3 it is that of a picture, 0.3.
+    """
     plain = init_params(jax.random.key(3), CONFIG)
     noise = jax.random.key(4)
 
     def louder(path, leaf):
         table = leaf.ndim == 2 and leaf.shape[-1] == 2
-        return jax.random.normal(noise, leaf.shape) if table else leaf
+        return contrast * (jax.random.normal(noise, leaf.shape) if table else leaf)
 
     return plain._replace(field=jax.tree_util.tree_map_with_path(louder, plain.field))
 
@@ -39,9 +42,9 @@ def pixels(count=256, *, views=8, reach=0.75, seed=0):
     return scenes.rays(eyes[view], targets - eyes[view]), view
 
 
-def evidence(geometry, *, count=256, seed=0):
+def evidence(geometry, *, count=256, seed=0, contrast=1.0):
     """Pixels as the tree of light paths shows them."""
     rays, view = pixels(count, seed=seed)
-    field = params()
+    field = params(contrast=contrast)
     seen = jax.jit(lambda rays: render_rays(Model(CONFIG, TREE, geometry, field), Rays(*rays)).rgb)
     return Evidence(field, rays, jnp.asarray(seen(rays))), view
