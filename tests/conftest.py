@@ -53,6 +53,14 @@ def _strict_dtypes(request):
         yield
 
 
+@pytest.fixture(scope="module")
+def _compiled_lightly():
+    """Takes a third off the time of a module that compiles much and computes little."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 @pytest.fixture
 def ball_scene() -> Path:
     """The bundled scene: a glass ball between textured walls, rendered by Blender Cycles."""

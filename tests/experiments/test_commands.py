@@ -75,6 +75,7 @@ def test_a_mesh_that_no_camera_sees_is_warned_about(tmp_path):
     assert "advice: rule nested: there is one part" in result.stdout
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_saved_and_goes_on(tmp_path):
     run = tmp_path / "run"
     options = ["--scene=experiments/data/cube_smcvx_ball", "--batch=64", f"--out={run}"]

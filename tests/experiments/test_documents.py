@@ -9,7 +9,11 @@ from tests.experiments.command import ROOT
 
 @pytest.mark.parametrize(
     ("page", "printed"),
-    [("README.md", "(128, 128, 3)"), ("docs/library.md", "(64, 3) (64, 3)")],
+    [
+        ("README.md", "(128, 128, 3)"),
+        # Its functions have examples of their own, which are always tested.
+        pytest.param("docs/library.md", "(64, 3) (64, 3)", marks=pytest.mark.slow),
+    ],
 )
 def test_the_snippets_of_a_page_run(page, printed, trained, tmp_path, monkeypatch, capsys):
     snippets = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)

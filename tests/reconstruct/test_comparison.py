@@ -46,6 +46,7 @@ def test_silhouettes_are_those_of_marched_rays():
     assert silhouettes(bodies.icosphere(2), cameras).shape == masks.shape
 
 
+@pytest.mark.slow
 def test_the_bundled_ball_is_found_from_its_masks(ball_scene):
     train, test = (local_layout.read_frames(ball_scene, split) for split in ("train", "test"))
     grid = carve(local_layout.read_masks(train), train.cameras, resolution=64)

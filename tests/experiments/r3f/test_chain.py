@@ -301,7 +301,7 @@ def test_light_is_kept_only_where_validation_views_say_so(
 
     monkeypatch.setattr(body_pixels, "look", look)
     monkeypatch.setattr(light_stage, "refine_by_light", refine_by_light)
-    monkeypatch.setattr(light_stage, "_error", lambda *_: errors.pop(0))
+    monkeypatch.setattr(light_stage, "judge", lambda *_: errors.pop(0))
     background = SimpleNamespace(config=None)
     monkeypatch.setattr(index_stage, "learn_background", lambda *_, **options: background)
     for _ in range(2):
@@ -331,7 +331,7 @@ def test_a_body_that_light_blew_up_is_left_out(scene, monkeypatch, tmp_path):
     monkeypatch.setattr(body_pixels, "look", lambda *_, **options: pixels)
     monkeypatch.setattr(light_stage, "refine_by_light", lambda *_, **options: blown)
     errors = [0.04, 0.01]
-    monkeypatch.setattr(light_stage, "_error", lambda *_: errors.pop(0))
+    monkeypatch.setattr(light_stage, "judge", lambda *_: errors.pop(0))
     known, target = records.IndexFacts("estimated", 1.5, 0.01, 0.04), tmp_path / "a" / "b.ply"
     facts = light_stage.run(
         scene, mesh, known, SimpleNamespace(config=None), target, steps=1, seed=0
