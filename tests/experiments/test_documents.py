@@ -65,6 +65,16 @@ def test_every_section_of_the_method_names_a_function_and_a_test():
 
 
 @pytest.mark.parametrize("page", _PAGES)
+def test_formulas_are_such_that_github_draws_them(page):
+    text = (ROOT / page).read_text()
+    assert len(re.findall(r"^\$\$$", text, re.MULTILINE)) == text.count("$$")
+    for formula in re.findall(r"\$\$(.*?)\$\$", text, re.DOTALL):
+        # Markdown takes these for its own, and GitHub refuses the last.
+        for wrong in (r"^\s*$\n.", r"^[-+*] ", r"\\[,;!{}]", "<", r"\\operatorname"):
+            assert not re.search(wrong, formula.strip(), re.MULTILINE), formula
+
+
+@pytest.mark.parametrize("page", _PAGES)
 def test_every_command_on_a_page_exists(page):
     text = (ROOT / page).read_text()
     modules = set(re.findall(r"python -m ((?:experiments|benchmarks)\.[a-z0-9_.]*[a-z0-9])", text))
