@@ -37,10 +37,8 @@ def choose(text: str, objects: Mapping[str, Object]) -> list[SceneName]:
         fitting = fitting or [s for s in scenes if fnmatch.fnmatchcase(s.object, pattern)]
         if not fitting:
             names = [*map(str, scenes), *objects]
-            near = difflib.get_close_matches(pattern, names, n=3) or names[:3]
-            raise ValueError(
-                f"No scene or object is called {pattern!r}. Choose from names as "
-                f"{', '.join(near)}, or all."
-            )
+            near = difflib.get_close_matches(pattern, names, n=3)
+            meant = f"Did you mean {' or '.join(near)}?" if near else f"Names are as {names[0]}."
+            raise ValueError(f"No scene or object is called {pattern!r}. {meant} All are: all.")
         chosen.update(fitting)
     return [scene for scene in scenes if scene in chosen]
