@@ -247,8 +247,4 @@ def _next(out: Path, done: Sequence[Method]) -> str:
 
 
 if __name__ == "__main__":
-    commands.run(
-        main,
-        first=("scenes", "methods", "preset", "steps", "jobs", "dry_run"),
-        again="it goes on; jobs that are done are not done again.",
-    )
+    commands.run(main, again="it goes on; jobs that are done are not done again.")

@@ -60,12 +60,8 @@ def fresh_file(path: Path, *, overwrite: bool) -> Iterator[Path]:
     """
     check_file(path, overwrite=overwrite)
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = stages.beside(path)
-    try:
+    with stages.unfinished_file(path) as draft:
         yield draft
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 def check_file(path: Path, *, overwrite: bool) -> None:
