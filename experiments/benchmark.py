@@ -154,14 +154,11 @@ def _make_tables(out: Path) -> None:
         failed, skipped = summary.not_done(out)
         summary.write(out, benchmark, failed=failed, skipped=skipped)
         _finish(out)
+    print(f"Next: open {out / page.FILE} in a browser, or add scenes or methods with --scenes.")
 
 
 def _settings(weights: Path | None) -> Settings:
-    """Returns what the options fix for all results.
-
-    Args:
-      weights: of LPIPS.
-    """
+    """Returns what the options fix for all results, measured with these weights of LPIPS."""
     return settings.Settings(
         preset=_PRESET.value,
         steps=_STEPS.value or presets.PRESETS[_PRESET.value].schedule.steps,
@@ -239,7 +236,7 @@ def _finish(out: Path) -> None:
 def _next(out: Path, done: Sequence[Method]) -> str:
     """Returns the command that adds the ablations to a benchmark, or another if they are done."""
     if {each.name for each in methods.parse(["ablations"])} <= {each.name for each in done}:
-        return f"look at {out / page.FILE}, or add scenes with the same command and more --scenes"
+        return f"open {out / page.FILE} in a browser, or add scenes or methods"
     deciding = (*_OF_JOBS, _REPORT_VIEWS, _REPORT_EDGE)
     given = [each.serialize() for each in deciding if each.value != each.default]
     scenes = f"--scenes={','.join(_SCENES.value)}"

@@ -1,6 +1,6 @@
 """Measures what light paths cost and what they give: the speed-accuracy curve.
 
-python -m experiments.path_trade_off --scenes=experiments/data/cube_smcvx_ball --out=runs/trade_off
+python -m experiments.path_trade_off --scenes=experiments/data/cube_smcvx_ball --out=runs/paths
 
 Renders views of scenes with a known background, as `experiments.render_known` does, once for every
 value of --cuts at the tree's bends, once for every value of --bends at its cut, and with the

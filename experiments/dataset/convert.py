@@ -1,4 +1,4 @@
-"""Converts scenes between the layouts of the data set; images are carried byte for byte.
+r"""Converts scenes between the layouts of the data set; images are carried byte for byte.
 
 python -m experiments.dataset.convert --scene=experiments/data/cube_smcvx_ball --to=parquet \
     --out=converted

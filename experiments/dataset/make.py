@@ -95,8 +95,6 @@ def main() -> None:
     out = Path(_OUT.value) / "preview" if _PREVIEW.value else Path(_OUT.value)
     if any(scene.object == "monkey" for scene in chosen):
         blender_meshes.export_monkey(catalogue.SUZANNE, blender=blender)
-    out.mkdir(parents=True, exist_ok=True)
-    output_folders.note(out, __name__)
     with commands.Interrupt() as interrupt:
         whole = production.produce(
             out,
@@ -107,6 +105,7 @@ def main() -> None:
             workers=_WORKERS.value,
             stopped=lambda: interrupt.requested,
         )
+    output_folders.note(out, __name__)
     if not whole:
         print("Stopped. The same command goes on from here.")
         sys.exit(commands.INTERRUPTED)

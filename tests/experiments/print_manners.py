@@ -10,6 +10,7 @@ import contextlib
 import io
 import json
 import os
+import re
 import runpy
 import sys
 
@@ -35,12 +36,22 @@ def _answer(main, settings, words):
     return {"status": status, "out": out.getvalue(), "err": err.getvalue()}
 
 
+def _right_value(flag):
+    """Returns a value that an option takes."""
+    if choices := getattr(flag.parser, "enum_values", None):
+        return choices[0]
+    if isinstance(flag.parser, flags.IntegerParser | flags.FloatParser):
+        return 1
+    endings = re.findall(r"PLY|\.npz", flag.help)
+    return "x." + endings[0].strip(".").lower() if endings else "x"
+
+
 def _options(module):
     return {
         name: {
             "choices": getattr(flag.parser, "enum_values", []),
             "required": command_help.is_required(flag),
-            "boolean": bool(flag.boolean),
+            "value": _right_value(flag),
         }
         for name, flag in command_help.options_of(module).items()
     }
@@ -48,7 +59,9 @@ def _options(module):
 
 def _wrong(options, arguments):
     """Returns words with one mistake each, and what is to be suggested."""
-    given = [f"--{name}=x" for name, option in options.items() if option["required"]]
+    given = [
+        f"--{name}={option['value']}" for name, option in options.items() if option["required"]
+    ]
     longest = max(options, key=len)
     yield [f"--{longest[:-2]}{longest[-1]}=1"], f"Did you mean --{longest}?"
     yield [*given, *["x" for _ in arguments], f"{longest}=1"], f"Did you mean --{longest}=1?"
@@ -57,7 +70,10 @@ def _wrong(options, arguments):
             value = max(option["choices"], key=len)
             yield [f"--{name}={value[:-2]}{value[-1]}"], f"Did you mean {value}?"
         elif option["required"]:
-            yield [word for word in given if word != f"--{name}=x"], f"--{name} must be given"
+            yield (
+                [word for word in given if not word.startswith(f"--{name}=")],
+                f"--{name} must be given",
+            )
 
 
 def _try(command, cases):

@@ -126,6 +126,13 @@ def test_mistakes_are_told_with_what_was_meant_before_jax_is_imported(tried, com
 
 
 @pytest.mark.parametrize("command", _COMMANDS)
+def test_a_command_tells_what_to_run_next(tried, command):
+    source = (ROOT / "experiments" / f"{command.replace('.', '/')}.py").read_text("utf-8")
+    # `recommend` prints nothing else, and from where the recommendation is made.
+    assert '"Next' in source or "Next, " in source or command == "recommend"
+
+
+@pytest.mark.parametrize("command", _COMMANDS)
 def test_no_option_is_taken_and_not_heeded(tried, command):
     assert tried[0][command]["stray"] == []
 
