@@ -34,7 +34,7 @@ def fresh(out: Path, *, module: str, writes: Sequence[str], overwrite: bool) -> 
       ValueError: if there is anything in the place that may not be replaced.
     """
     earlier = replaceable(out, module=module, writes=writes, overwrite=overwrite)
-    draft = stages.beside(out)
+    draft = stages.beside(out.resolve())  # which has a name, even if it is `.`
     draft.parent.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir()

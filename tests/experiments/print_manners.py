@@ -57,14 +57,18 @@ def _options(module):
     }
 
 
+def _right(options, arguments):
+    """Returns words with which a command begins."""
+    required = [f"--{name}={each['value']}" for name, each in options.items() if each["required"]]
+    return [*required, *("x" for _ in arguments)]
+
+
 def _wrong(options, arguments):
     """Returns words with one mistake each, and what is to be suggested."""
-    given = [
-        f"--{name}={option['value']}" for name, option in options.items() if option["required"]
-    ]
+    given = _right(options, arguments)
     longest = max(options, key=len)
     yield [f"--{longest[:-2]}{longest[-1]}=1"], f"Did you mean --{longest}?"
-    yield [*given, *["x" for _ in arguments], f"{longest}=1"], f"Did you mean --{longest}=1?"
+    yield [*given, f"{longest}=1"], f"Did you mean --{longest}=1?"
     for name, option in options.items():
         if option["choices"]:
             value = max(option["choices"], key=len)
@@ -76,13 +80,24 @@ def _wrong(options, arguments):
             )
 
 
+def _interrupted(main, settings, words):
+    """Returns what a command answers to Ctrl-C."""
+
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    stop.__module__ = main.__module__
+    return _answer(stop, settings, words)
+
+
 def _try(command, cases):
     found = {}
 
     def record(main, **settings):
         module = sys.modules[main.__module__]
         options = _options(module)
-        wrong = list(_wrong(options, settings.get("arguments", ())))
+        arguments = settings.get("arguments", ())
+        wrong = list(_wrong(options, arguments))
         # What is defined in a module whose options nobody adopted would be taken, and not heeded.
         known = {flag.name for flag in flags.FLAGS.get_key_flags_for_module(module)}
         stray = [
@@ -100,6 +115,7 @@ def _try(command, cases):
             help=_answer(main, settings, ["--help"]),
             full=_answer(main, settings, ["--helpfull"]),
             wrong=[(meant, _answer(main, settings, words)) for words, meant in wrong],
+            interrupted=_interrupted(main, settings, _right(options, arguments)),
             jax="jax" in sys.modules,
             cases=[_answer(main, settings, words) for words in cases],
             jax_after_cases="jax" in sys.modules,

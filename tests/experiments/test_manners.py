@@ -6,7 +6,8 @@ import sys
 
 import pytest
 
-from experiments import choosable, command_help, command_line, presets
+from experiments import choosable, command_help, command_line, commands, presets
+from experiments.late_imports import late
 from experiments.r3f.geometry_stage import GEOMETRIES
 from refref_jax.data import local_layout
 from refref_jax.fields import registry
@@ -126,10 +127,17 @@ def test_mistakes_are_told_with_what_was_meant_before_jax_is_imported(tried, com
 
 
 @pytest.mark.parametrize("command", _COMMANDS)
-def test_a_command_tells_what_to_run_next(tried, command):
+def test_a_command_tells_what_to_run_next(command):
     source = (ROOT / "experiments" / f"{command.replace('.', '/')}.py").read_text("utf-8")
     # `recommend` prints nothing else, and from where the recommendation is made.
     assert '"Next' in source or "Next, " in source or command == "recommend"
+
+
+@pytest.mark.parametrize("command", _COMMANDS)
+def test_an_interrupt_is_130_and_says_how_to_go_on(tried, command):
+    answer = tried[0][command]
+    assert answer["interrupted"]["status"] == commands.INTERRUPTED == 130
+    assert answer["interrupted"]["err"] == f"Interrupted. {answer['settings']['again']}\n"
 
 
 @pytest.mark.parametrize("command", _COMMANDS)
@@ -167,6 +175,15 @@ def test_names_of_what_can_be_chosen_are_those_that_exist():
     assert (registry.USUAL, *(x for x in registry.KINDS if x != registry.USUAL)) == choosable.FIELDS
     assert tuple(RULES) == choosable.RULES
     assert tuple(GEOMETRIES) == choosable.GEOMETRIES
+
+
+def test_a_late_module_is_imported_when_it_is_used(monkeypatch):
+    monkeypatch.delitem(sys.modules, "colorsys", raising=False)
+    module = late("colorsys")
+    assert "colorsys" not in sys.modules
+    assert module.ONE_THIRD == 1.0 / 3.0 and "colorsys" in sys.modules
+    monkeypatch.setattr(module, "ONE_THIRD", 2)
+    assert sys.modules["colorsys"].ONE_THIRD == 2
 
 
 def test_what_was_meant():
