@@ -52,6 +52,7 @@ def _options(module):
             "choices": getattr(flag.parser, "enum_values", []),
             "required": command_help.is_required(flag),
             "value": _right_value(flag),
+            "default": flag.default,
         }
         for name, flag in command_help.options_of(module).items()
     }
