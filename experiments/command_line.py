@@ -21,10 +21,17 @@ _HELP = ("--help", "-help", "-h", "--helpshort")
 _HELP_FULL = ("--helpfull", "-helpfull")
 
 
-def did_you_mean(word: str, names: Iterable[str], *, shown: str = "{}") -> str:
-    """Returns ` Did you mean NAME?`, or nothing if no name is like the word."""
-    near = difflib.get_close_matches(word, list(names), n=1)
-    return f" Did you mean {shown.format(near[0])}?" if near else ""
+def did_you_mean(word: str, names: Iterable[str], *, shown: str = "{}", most: int = 1) -> str:
+    """Returns ` Did you mean NAME?`, or nothing if no name is like the word.
+
+    Args:
+      word: what was given.
+      names: what could have been.
+      shown: how a name is shown.
+      most: names that are suggested.
+    """
+    near = difflib.get_close_matches(word, list(names), n=most)
+    return f" Did you mean {' or '.join(map(shown.format, near))}?" if near else ""
 
 
 def check(holder: flags.FlagHolder, refuse: Callable[[Any], Any]) -> None:
