@@ -66,12 +66,10 @@ def read(words: Sequence[str], module: ModuleType, *, first: Sequence[str], agai
     """
     asked = set(words[1 : words.index("--") if "--" in words else len(words)])
     if asked & {*_HELP, *_HELP_FULL}:
-        full = bool(asked & set(_HELP_FULL))
-        _show(
-            command_help.full_text(module, again)
-            if full
-            else command_help.help_text(module, first, again)
-        )
+        if asked & set(_HELP_FULL):
+            _show(command_help.full_text(module, again))
+        else:
+            _show(command_help.help_text(module, first, again))
         sys.exit(0)
     try:
         return flags.FLAGS(words)
