@@ -22,7 +22,7 @@ SMALL_SCENES := $(SMALL_SCENES),sphere_mmncvx_conical_flask,env_mmncvx_perfume_r
 demo: $(READY)
 	$(RUN) experiments.train --scene=experiments/data/cube_smcvx_ball --preset=tiny \
 		--out=runs/demo --resume
-	$(RUN) experiments.evaluate --run=runs/demo --split=test --rays_per_pixel=4
+	$(RUN) experiments.evaluate --run=runs/demo --split=test --rays_per_pixel=4 --overwrite
 	@echo "Look at runs/demo/eval/test/comparison.png"
 
 test: $(READY)

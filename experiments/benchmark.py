@@ -14,32 +14,39 @@ Jobs are done on this machine, --jobs at once, or on a Ray cluster with --ray=AD
 machines see --out, --scenes and these modules by the same paths. docs/benchmark.md says all.
 """
 
+from __future__ import annotations
+
 import signal
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import commands, perceptual_option
-from experiments.benchmarking import (
-    engines,
-    jobs,
-    methods,
-    scene_list,
-    schedule,
-    settings,
-    summary,
-)
-from experiments.benchmarking.jobs import Job, Skipped
+from experiments import command_line, commands, options, perceptual_option
+from experiments.benchmarking import methods
 from experiments.benchmarking.methods import Method
-from experiments.benchmarking.report import page
-from experiments.benchmarking.settings import Benchmark, Settings
+from experiments.late_imports import late
 from experiments.perceptual_option import LPIPS_WEIGHTS
-from experiments.presets import PRESETS
-from experiments.supersampling import side_of
 from refref_jax.training import run_lock
+
+if TYPE_CHECKING:
+    from experiments import presets
+    from experiments.benchmarking import engines, jobs, scene_list, schedule, settings, summary
+    from experiments.benchmarking.jobs import Job, Skipped
+    from experiments.benchmarking.report import page
+    from experiments.benchmarking.settings import Benchmark, Settings
+else:
+    presets = late("experiments.presets")
+    engines = late("experiments.benchmarking.engines")
+    jobs = late("experiments.benchmarking.jobs")
+    scene_list = late("experiments.benchmarking.scene_list")
+    schedule = late("experiments.benchmarking.schedule")
+    settings = late("experiments.benchmarking.settings")
+    summary = late("experiments.benchmarking.summary")
+    page = late("experiments.benchmarking.report.page")
 
 _SCENES = flags.DEFINE_list(
     "scenes",
@@ -52,16 +59,15 @@ _METHODS = flags.DEFINE_list(
     ["straight", "oracle", "tree"],
     f"Methods: {', '.join(methods.METHODS)}; main, ablations and all stand for many.",
 )
-_OUT = flags.DEFINE_string("out", None, "Folder of the benchmark.", required=True)
-_PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Preset of all trainings.")
+command_line.check(_METHODS, methods.parse)
+_OUT = options.out("Folder of the benchmark.")
+_PRESET = options.preset("Preset of all trainings.")
 _STEPS = flags.DEFINE_integer(
     "steps", None, "Steps of each training; the preset's if not given.", 1
 )
-_LIMIT = flags.DEFINE_integer("limit", None, "Only this many test images, evenly spread.", 1)
-_RAYS_PER_PIXEL = flags.DEFINE_integer(
-    "rays_per_pixel", 4, "Rays in each pixel of an evaluation, a square: 1, 4, 9, 16."
-)
-_SEED = flags.DEFINE_integer("seed", 0, "Seed of everything random.", 0, 2**32 - 1)
+_LIMIT = options.limit()
+_RAYS_PER_PIXEL = options.rays_per_pixel(4)
+_SEED = options.seed()
 _JOBS = flags.DEFINE_integer("jobs", 1, "Jobs at once on this machine.", 1)
 _RAY = flags.DEFINE_string(
     "ray", None, "Address of a Ray cluster that does the jobs, or 'local' to start one here."
@@ -120,8 +126,7 @@ def main() -> None:
         settings.write(out, benchmark)
         failed = _work(out, benchmark, planned, skipped)
         _finish(out)
-    if line := _next(out, chosen):
-        print(f"Next: {line}")
+    print(f"Next: {_next(out, chosen)}")
     for each in skipped:
         print(f"left out: {each.name}: {each.reason}")
     for name, reason in failed.items():
@@ -149,21 +154,14 @@ def _make_tables(out: Path) -> None:
         failed, skipped = summary.not_done(out)
         summary.write(out, benchmark, failed=failed, skipped=skipped)
         _finish(out)
+    print(f"Next: open {out / page.FILE} in a browser, or add scenes or methods with --scenes.")
 
 
 def _settings(weights: Path | None) -> Settings:
-    """Returns what the options fix for all results.
-
-    Args:
-      weights: of LPIPS.
-
-    Raises:
-      ValueError: if an option makes no sense.
-    """
-    side_of(_RAYS_PER_PIXEL.value)
-    return Settings(
+    """Returns what the options fix for all results, measured with these weights of LPIPS."""
+    return settings.Settings(
         preset=_PRESET.value,
-        steps=_STEPS.value or PRESETS[_PRESET.value].schedule.steps,
+        steps=_STEPS.value or presets.PRESETS[_PRESET.value].schedule.steps,
         limit=_LIMIT.value,
         rays_per_pixel=_RAYS_PER_PIXEL.value,
         seed=_SEED.value,
@@ -235,15 +233,15 @@ def _finish(out: Path) -> None:
     print(f"Report:  {report} ({report.stat().st_size / 1e6:.1f} MB)")
 
 
-def _next(out: Path, done: Sequence[Method]) -> str | None:
-    """Returns the command that adds the ablations to a benchmark, unless they were done."""
+def _next(out: Path, done: Sequence[Method]) -> str:
+    """Returns the command that adds the ablations to a benchmark, or another if they are done."""
     if {each.name for each in methods.parse(["ablations"])} <= {each.name for each in done}:
-        return None
-    options = (*_OF_JOBS, _REPORT_VIEWS, _REPORT_EDGE)
-    given = [each.serialize() for each in options if each.value != each.default]
+        return f"open {out / page.FILE} in a browser, or add scenes or methods"
+    deciding = (*_OF_JOBS, _REPORT_VIEWS, _REPORT_EDGE)
+    given = [each.serialize() for each in deciding if each.value != each.default]
     scenes = f"--scenes={','.join(_SCENES.value)}"
     return commands.shell("benchmark", scenes, "--methods=ablations", f"--out={out}", *given)
 
 
 if __name__ == "__main__":
-    commands.run(main)
+    commands.run(main, again="it goes on; jobs that are done are not done again.")

@@ -7,17 +7,17 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from absl import app, logging
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+
+from experiments import command_line
+from experiments.late_imports import late
+
+if TYPE_CHECKING:
+    from rich import progress
+else:
+    progress = late("rich.progress")
 
 NOT_FINITE = ("inf", "-inf", "nan")
 """Names of the numbers that JSON does not know."""
@@ -32,36 +32,44 @@ INTERRUPTED = 130
 """Status of a command that was stopped by Ctrl-C, as shells have it."""
 
 
-def run(main: Callable[..., None], *, arguments: Sequence[str] = ()) -> None:
+def run(
+    main: Callable[..., None],
+    *,
+    arguments: Sequence[str] = (),
+    first: Sequence[str] = (),
+    again: str = "",
+) -> None:
     """Runs a command; an error of the user's input ends it with one line and status 2.
 
-    So do files that can not be read or written. Ctrl-C ends it with status 130.
+    So do files that can not be read or written. Ctrl-C ends it with status 130. It begins with the
+    options that hold, of which those of its module and those that this adopts are the command's.
 
     Args:
       main: the command; its parameters are its arguments, as text.
       arguments: what each argument is called, as `FOLDER`; all must be given.
+      first: names of the options that decide most, which --help tells first.
+      again: what happens when the same command is given again, after it was done or interrupted.
     """
+    module = sys.modules[main.__module__]
+
+    def parse(words: Sequence[str]) -> list[str]:
+        return command_line.read(words, module, first=first, again=again)
 
     def guarded(words: Sequence[str]) -> None:
         if os.environ.pop(STOP_WITH_INPUT, ""):
             threading.Thread(target=_stop_with_input, daemon=True).start()
         logging.set_verbosity(logging.ERROR)
-        given = words[1:]
-        if len(given) > len(arguments):
-            extra = list(given[len(arguments) :])
-            sys.exit(f"Unexpected arguments {extra}. Options begin with --; see --help.")
-        if len(given) < len(arguments):
-            sys.exit(f"{arguments[len(given)]} is missing. Give {' '.join(arguments)}; see --help.")
+        command_line.refuse_words(module, words[1:], arguments)
+        print(command_line.echo(module, words[1:]), flush=True)
         try:
-            main(*given)
+            main(*words[1:])
         except (ValueError, OSError) as error:
-            print(f"error: {error}", file=sys.stderr)
-            sys.exit(2)
+            command_line.fail(str(error))
         except KeyboardInterrupt:
-            print("Interrupted.", file=sys.stderr)
+            print(f"Interrupted. {again}".rstrip(), file=sys.stderr)
             sys.exit(INTERRUPTED)
 
-    app.run(guarded)
+    app.run(guarded, flags_parser=parse)
 
 
 def _stop_with_input() -> None:
@@ -138,13 +146,13 @@ class ProgressBar:
           total: number of steps.
           done: steps already done.
         """
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[text]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
+        self._bar = progress.Progress(
+            progress.TextColumn("{task.description}"),
+            progress.BarColumn(),
+            progress.MofNCompleteColumn(),
+            progress.TextColumn("{task.fields[text]}"),
+            progress.TimeElapsedColumn(),
+            progress.TimeRemainingColumn(),
             disable=not sys.stdout.isatty(),
         )
         self._task = self._bar.add_task(label, total=total, completed=done, text="")

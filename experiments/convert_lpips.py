@@ -7,13 +7,25 @@ published. `.pth` files are read by PyTorch, which this package does not need ot
 files with the same names are read without it.
 """
 
-from pathlib import Path
+from __future__ import annotations
 
-import numpy as np
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 from absl import flags
 
-from experiments import commands, state_dicts
-from refref_jax.metrics import lpips_weights
+from experiments import command_line, commands, options, output_folders
+from experiments.late_imports import late
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from experiments import state_dicts
+    from refref_jax.metrics import lpips_weights
+else:
+    np = late("numpy")
+    state_dicts = late("experiments.state_dicts")
+    lpips_weights = late("refref_jax.metrics.lpips_weights")
 
 _ALEXNET = flags.DEFINE_string(
     "alexnet", None, "State dict of torchvision's AlexNet, .pth or .npz.", required=True
@@ -21,27 +33,39 @@ _ALEXNET = flags.DEFINE_string(
 _LPIPS = flags.DEFINE_string(
     "lpips", None, "State dict of LPIPS with AlexNet, version 0.1, .pth or .npz.", required=True
 )
-_OUT = flags.DEFINE_string("out", None, "The .npz to write; must not exist.", required=True)
+_OUT = options.out("The .npz to write.")
+_OVERWRITE = options.overwrite("the file if it exists")
 
 
 def main() -> None:
     """Converts the weights."""
     out = Path(_OUT.value)
-    if out.suffix != ".npz":
-        raise ValueError(f"--out={out} does not end in .npz. Give a name that does.")
-    if out.exists():
-        raise ValueError(f"{out} exists. Remove it, or give another --out.")
+    output_folders.check_file(out, overwrite=_OVERWRITE.value)
     arrays = {}
     for path, shapes in (
         (Path(_ALEXNET.value), lpips_weights.ALEXNET_SHAPES),
         (Path(_LPIPS.value), lpips_weights.LINEAR_SHAPES),
     ):
         arrays |= lpips_weights.choose(state_dicts.read(path), shapes, source=str(path))
-    out.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(out, **arrays)
+    with output_folders.fresh_file(out, overwrite=_OVERWRITE.value) as draft:
+        _write(draft, arrays)
     print(f"Weights: {out}")
     print("Next: give it as --lpips_weights to experiments.evaluate or experiments.metrics.")
 
 
+def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    # NumPy appends .npz to names, but not to files.
+    with path.open("wb") as file:
+        np.savez(file, **arrays)
+
+
+def _refuse_other_files(out: str | None) -> None:
+    if out is not None and not out.endswith(".npz"):
+        raise ValueError(f"--out={out} does not end in .npz. Give a name that does.")
+
+
+command_line.check(_OUT, _refuse_other_files)
+
+
 if __name__ == "__main__":
-    commands.run(main)
+    commands.run(main, again="it converts anew; --overwrite replaces the file.")

@@ -7,21 +7,35 @@ Captures of COLMAP come this way too, through nerfstudio's ns-process-data. `doc
 tells how, and what of a capture a scene can hold. Nothing is overwritten.
 """
 
-from pathlib import Path
+from __future__ import annotations
 
-import numpy as np
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 from absl import flags
 
-from experiments import commands
-from experiments.dataset.cameras import CAMERA_RADIUS
-from experiments.exchange import from_nerfstudio, to_nerfstudio
-from experiments.exchange.from_nerfstudio import Converted, View
-from refref_jax.data import nerfstudio, placement
-from refref_jax.data.placement import Placement
-from refref_jax.reconstruct.visual_hull import REACH
+from experiments import command_line, commands, options
+from experiments.late_imports import late
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from experiments.dataset import cameras
+    from experiments.exchange import from_nerfstudio, to_nerfstudio
+    from refref_jax.data import nerfstudio, placement
+    from refref_jax.reconstruct import visual_hull
+else:
+    np = late("numpy")
+    cameras = late("experiments.dataset.cameras")
+    from_nerfstudio = late("experiments.exchange.from_nerfstudio")
+    to_nerfstudio = late("experiments.exchange.to_nerfstudio")
+    nerfstudio = late("refref_jax.data.nerfstudio")
+    placement = late("refref_jax.data.placement")
+    visual_hull = late("refref_jax.reconstruct.visual_hull")
 
 _SOURCE = flags.DEFINE_string("source", None, "What to convert: a folder.", required=True)
-_OUT = flags.DEFINE_string("out", None, "Folder to write; must not exist.", required=True)
+_OUT = options.out("Folder to write; must not exist.")
 _TO = flags.DEFINE_enum("to", "scene", ["scene", "nerfstudio"], "What to write.")
 _MASKS = flags.DEFINE_enum(
     "masks",
@@ -62,7 +76,7 @@ def _make_scene(source: Path, out: Path) -> None:
     poses = placement.place(poses, where)
     splits = capture.splits or nerfstudio.every_nth(len(capture.frames), every=_TEST_EVERY.value)
     views = {
-        split: [View(capture.frames[number], poses[number]) for number in numbers]
+        split: [from_nerfstudio.View(capture.frames[number], poses[number]) for number in numbers]
         for split, numbers in splits.items()
     }
     total = sum(map(len, views.values()))
@@ -99,35 +113,57 @@ def _make_capture(source: Path, out: Path) -> None:
     print(f"Next: ns-train nerfacto --data {out}")
 
 
-def _chosen_placement(poses: np.ndarray) -> Placement:
-    if _CENTRE.value == "auto":
-        centre = placement.meeting_point(poses)
-    else:
-        centre = np.array([_number("centre", word) for word in _CENTRE.value.split(",")])
-        if centre.shape != (3,):
-            raise ValueError(f"--centre is {_CENTRE.value}. Give x,y,z, as 0,0.5,1, or auto.")
-    if _SCALE.value == "auto":
+def _chosen_placement(poses: np.ndarray) -> placement.Placement:
+    given = read_centre(_CENTRE.value)
+    centre = placement.meeting_point(poses) if given is None else np.array(given)
+    scale = read_scale(_SCALE.value)
+    if scale is None:
         distance = np.linalg.norm(poses[:, :, 3] - centre, axis=-1).mean()
         if distance == 0.0:
             raise ValueError("All cameras stand in the centre. Give --scale a number.")
-        return Placement(centre, CAMERA_RADIUS / distance)
-    scale = _number("scale", _SCALE.value)
+        return placement.Placement(centre, cameras.CAMERA_RADIUS / distance)
+    return placement.Placement(centre, scale)
+
+
+def read_centre(word: str) -> list[float] | None:
+    """Returns the point that an option means; `None` for auto.
+
+    Raises:
+      ValueError: if it is no point.
+    """
+    if word == "auto":
+        return None
+    centre = [_number("centre", each) for each in word.split(",")]
+    if len(centre) != 3:
+        raise ValueError(f"--centre is {word}. Give x,y,z, as 0,0.5,1, or auto.")
+    return centre
+
+
+def read_scale(word: str) -> float | None:
+    """Returns the factor that an option means; `None` for auto.
+
+    Raises:
+      ValueError: if it is not positive.
+    """
+    if word == "auto":
+        return None
+    scale = _number("scale", word)
     if not scale > 0.0:
         raise ValueError(f"--scale is {scale:g}. Give a positive number, or auto.")
-    return Placement(centre, scale)
+    return scale
 
 
 def _number(flag: str, word: str) -> float:
     try:
         value = float(word)
     except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
+        value = math.nan
+    if not math.isfinite(value):
         raise ValueError(f"--{flag} has {word!r}, which is no finite number. Give one, or auto.")
     return value
 
 
-def _tell_splits(written: dict[str, Converted]) -> None:
+def _tell_splits(written: dict[str, from_nerfstudio.Converted]) -> None:
     for split, done in written.items():
         columns, rows, _, stretch = done.lens
         size, before = f"{columns.size} x {rows.size}", f"{done.before[0]} x {done.before[1]}"
@@ -148,17 +184,21 @@ def _tell_left_out(capture: nerfstudio.Capture, unlisted: int) -> None:
         print("warning: there are no test images, so nothing can be evaluated on them.")
 
 
-def _tell_placement(poses: np.ndarray, where: Placement) -> None:
+def _tell_placement(poses: np.ndarray, where: placement.Placement) -> None:
     centre = ",".join(f"{value:.6g}" for value in where.centre)
     print(f"World: x -> {where.scale:.6g} (x - ({centre})), which meshes have to go through too")
     distances = np.linalg.norm(poses[:, :, 3], axis=-1)
     print(f"Cameras: {distances.min():.3g} to {distances.max():.3g} from the origin")
     if where.scale == 1.0 and not where.centre.any():
         print(
-            f"R3F looks for the body within {REACH} units of the origin along each axis: "
-            "--centre and --scale move it there."
+            f"R3F looks for the body within {visual_hull.REACH} units of the origin along each "
+            "axis: --centre and --scale move it there."
         )
 
 
+command_line.check(_CENTRE, read_centre)
+command_line.check(_SCALE, read_scale)
+
+
 if __name__ == "__main__":
-    commands.run(main)
+    commands.run(main, again="it is refused, for a converted folder is never replaced.")

@@ -10,15 +10,26 @@ The scene is read by every process, and the run is written by the first: both fo
 the same place on all machines, which a file system that they share sees to.
 """
 
+from __future__ import annotations
+
 import contextlib
 import os
 import re
-from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 from absl import flags
-from jax.sharding import Mesh
 
-from refref_jax.training import devices
+from experiments import command_line
+from experiments.late_imports import late
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from jax.sharding import Mesh
+
+    from refref_jax.training import devices
+else:
+    devices = late("refref_jax.training.devices")
 
 _DEVICES = flags.DEFINE_string(
     "devices",
@@ -30,6 +41,7 @@ _COORDINATOR = flags.DEFINE_string(
 )
 _PROCESSES = flags.DEFINE_integer("processes", 1, "Processes that train together.", 1)
 _PROCESS = flags.DEFINE_integer("process", None, "Number of this process, from 0.", 0)
+command_line.check(_DEVICES, lambda value: _number(value))
 
 
 def together() -> bool:
@@ -43,7 +55,6 @@ def connect() -> None:
     Raises:
       ValueError: if options are missing or wrong, or the others are not found.
     """
-    _number_of_devices()  # refuses what is no number before the others are looked for
     coordinator, process = _COORDINATOR.value, _PROCESS.value
     if not together():
         if coordinator is not None or process is not None:
@@ -71,7 +82,7 @@ def mesh() -> Mesh | None:
     Raises:
       ValueError: if there are not as many.
     """
-    return devices.row(_number_of_devices())
+    return devices.row(_number(_DEVICES.value))
 
 
 @contextlib.contextmanager
@@ -84,9 +95,10 @@ def first_speaks() -> Iterator[None]:
         yield
 
 
-def _number_of_devices() -> int | None:
-    if _DEVICES.value == "all":
+def _number(word: str) -> int | None:
+    """Returns how many devices a word means; `None` for all."""
+    if word == "all":
         return None
-    if not _DEVICES.value.isdecimal():
-        raise ValueError(f"--devices={_DEVICES.value} is no number of devices. Give one, or all.")
-    return int(_DEVICES.value)
+    if not word.isdecimal():
+        raise ValueError(f"--devices={word} is no number of devices. Give one, or all.")
+    return int(word)

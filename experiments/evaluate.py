@@ -6,42 +6,52 @@ With several rays a pixel colours are averaged as linear light, and a pixel's di
 of its rays'; see `experiments.supersampling`. What each metric is tells `docs/metrics.md`.
 """
 
+from __future__ import annotations
+
 import json
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from absl import flags
-from jaxtyping import Float
 
-from experiments import (
-    commands,
-    figures,
-    measures,
-    perceptual_option,
-    scene_option,
-    supersampling,
-)
-from experiments.measures import Perceptual, Truth
-from experiments.r3f import provenance
-from refref_jax.data import files, local_layout, scene_names
-from refref_jax.data.cameras import Cameras, image_rays
-from refref_jax.render import Model, dyes, load_model
-from refref_jax.render.first_surface import find_first_surface
-from refref_jax.render.saved import latest_step
-from refref_jax.training import run_folder
+from experiments import commands, options, output_folders, perceptual_option, scene_option
+from experiments.late_imports import late
 
-_RUN = flags.DEFINE_string("run", None, "Folder of a trained run.", required=True)
-_SPLIT = flags.DEFINE_enum("split", "test", list(local_layout.SPLITS), "Images to render.")
-_STEP = flags.DEFINE_integer("step", None, "Checkpoint to use; the newest if not given.", 0)
-_SCENE = flags.DEFINE_string("scene", None, f"The scene, if it has moved: {scene_option.FORMS}.")
-_LIMIT = flags.DEFINE_integer("limit", None, "Only this many images, evenly spread.", 1)
-_RAYS_PER_PIXEL = flags.DEFINE_integer(
-    "rays_per_pixel", 1, "Rays in each pixel, a square: 1, 4, 9, 16. They are averaged."
-)
-_CHUNK = flags.DEFINE_integer("chunk", 4096, "Paths at once: lower it if memory runs out.", 1)
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float
+
+    from experiments import figures, measures, supersampling
+    from experiments.r3f import provenance
+    from refref_jax.data import cameras, files, scene_names
+    from refref_jax.render import Model, dyes, first_surface, saved
+    from refref_jax.training import run_folder
+else:
+    np = late("numpy")
+    figures = late("experiments.figures")
+    measures = late("experiments.measures")
+    supersampling = late("experiments.supersampling")
+    provenance = late("experiments.r3f.provenance")
+    cameras = late("refref_jax.data.cameras")
+    files = late("refref_jax.data.files")
+    scene_names = late("refref_jax.data.scene_names")
+    dyes = late("refref_jax.render.dyes")
+    first_surface = late("refref_jax.render.first_surface")
+    saved = late("refref_jax.render.saved")
+    run_folder = late("refref_jax.training.run_folder")
+
+_RUN = options.run()
+_SPLIT = options.split("Images to render.")
+_RAYS_PER_PIXEL = options.rays_per_pixel(1)
+_LIMIT = options.limit()
+_STEP = options.step()
+_SCENE = options.moved_scene()
+_CHUNK = options.chunk()
+_OVERWRITE = options.overwrite("an earlier evaluation of that split")
 flags.adopt_module_key_flags(perceptual_option)
+
+_WRITES = ("rgb", "distance", "metrics.json", "comparison.png")
 
 _METHODS = {"paper": "oracle"}
 _RECONSTRUCTED = {"paper": "r3f", "tree": "r3f_tree"}
@@ -54,30 +64,29 @@ _WORTH_A_WARNING = 1e-3
 
 def main() -> None:
     """Evaluates a run."""
-    side = supersampling.side_of(_RAYS_PER_PIXEL.value)
     run = Path(_RUN.value)
+    out = run / "eval" / _SPLIT.value
+    place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
+    output_folders.replaceable(out, **place)
     perceptual = perceptual_option.chosen()
     config = run_folder.read_config(run)
     # Resolved first, and once: training may be going on.
-    step = _STEP.value if _STEP.value is not None else latest_step(run)
-    model = load_model(run, step=step)
+    step = _STEP.value if _STEP.value is not None else saved.latest_step(run)
+    model = saved.load_model(run, step=step)
     scene = scene_option.opened(_SCENE.value or config.scene.path)
     truth = measures.read_truth(scene, _SPLIT.value)
-    out = run / "eval" / _SPLIT.value
-    per_image, views = evaluate(model, truth, out, side, perceptual)
-    summary = {
+    told = {
         "scene": scene_names.of_folder(scene),
         "method": _method(run, config.paths),
         "step": step,
         "rays_per_pixel": _RAYS_PER_PIXEL.value,
-        "results": {key: measures.mean_of(per_image, key) for key in per_image[0] if key != "name"},
-        "learned": learned_colours(model),
-        "per_image": per_image,
     }
-    summary["results"]["seconds_per_image"] = summary["results"].pop("seconds")
-    text = json.dumps(commands.string_safe(summary), indent=2, allow_nan=False)
-    (out / "metrics.json").write_text(text + "\n", encoding="utf-8")
-    figures.write_comparison(out / "comparison.png", views)
+    with output_folders.fresh(out, **place) as draft:
+        per_image, views = evaluate(model, truth, draft, perceptual)
+        summary = told | _summary(per_image, model)
+        text = json.dumps(commands.string_safe(summary), indent=2, allow_nan=False)
+        (draft / "metrics.json").write_text(text + "\n", encoding="utf-8")
+        figures.write_comparison(draft / "comparison.png", views)
     for key, value in summary["results"].items():
         print(f"{key:>24}  {'-' if value is None else format(value, '.4f')}")
     if summary["results"]["lost"] > _WORTH_A_WARNING:
@@ -88,6 +97,13 @@ def main() -> None:
     print(f"Pictures: {out / 'comparison.png'}, {out / 'rgb'}, {out / 'distance'}")
     print(f"Metrics:  {out / 'metrics.json'}")
     print(f"Next: {commands.shell('render', f'--run={run}', '--views=orbit')}")
+
+
+def _summary(per_image: list[dict[str, Any]], model: Model) -> dict[str, Any]:
+    """Returns the means over all images, what the model has learned of colours, and each image."""
+    results = {key: measures.mean_of(per_image, key) for key in per_image[0] if key != "name"}
+    results["seconds_per_image"] = results.pop("seconds")
+    return {"results": results, "learned": learned_colours(model), "per_image": per_image}
 
 
 def _method(run: Path, paths: str) -> str:
@@ -109,31 +125,27 @@ def learned_colours(model: Model) -> dict[str, Any] | None:
 
 
 def evaluate(
-    model: Model, truth: Truth, out: Path, side: int, perceptual: Perceptual
+    model: Model, truth: measures.Truth, out: Path, perceptual: measures.Perceptual
 ) -> tuple[list[dict[str, Any]], list[figures.Comparison]]:
-    """Renders and measures each image, and writes what was rendered.
-
-    Pictures of an earlier evaluation go first, so that all of a folder are of one checkpoint.
-    """
-    for folder, kind in (("rgb", "*.png"), ("distance", "*.exr")):
-        (out / folder).mkdir(parents=True, exist_ok=True)
-        for earlier in (out / folder).glob(kind):
-            earlier.unlink()
+    """Renders and measures each image, and writes what was rendered."""
+    for folder in ("rgb", "distance"):
+        (out / folder).mkdir()
     count = len(truth.images)
     chosen = np.unique(np.linspace(0, count - 1, min(_LIMIT.value or count, count)).astype(int))
     shown = set(chosen[np.linspace(0, chosen.size - 1, _VIEWS_IN_COMPARISON).astype(int)])
     per_image, views = [], []
-    cameras, chunk = truth.frames.cameras, _CHUNK.value
-    supersampling.warm_up(model, cameras, chunk=chunk)
+    seen_by, chunk = truth.frames.cameras, _CHUNK.value
+    side = options.side_of(_RAYS_PER_PIXEL.value)
+    supersampling.warm_up(model, seen_by, chunk=chunk)
     with commands.ProgressBar("evaluate", chosen.size) as bar:
         for i in chosen:
             name = truth.frames.names[i]
             start = time.monotonic()
-            seen = supersampling.render_view(model, cameras, i, side=side, chunk=chunk)
+            seen = supersampling.render_view(model, seen_by, i, side=side, chunk=chunk)
             seconds = time.monotonic() - start
             files.write_rgb(out / "rgb" / f"{name}.png", seen.rgb)
             files.write_exr(out / "distance" / f"{name}.exr", seen.distance)
-            first = first_distances(model, cameras, i)
+            first = first_distances(model, seen_by, i)
             measured = measures.measure(seen, truth, i, first=first, perceptual=perceptual)
             per_image.append({"name": name, **measured, "seconds": seconds})
             if i in shown:
@@ -143,12 +155,15 @@ def evaluate(
     return per_image, views
 
 
-def first_distances(model: Model, cameras: Cameras, i: int) -> Float[np.ndarray, "h w"] | None:
+def first_distances(
+    model: Model, seen_by: cameras.Cameras, i: int
+) -> Float[np.ndarray, "h w"] | None:
     """Returns the distance of the first surface that bends light, by the centres of pixels."""
     if model.budget.bends == 0:
         return None
-    return find_first_surface(model.geometry.surfaces, image_rays(cameras, i)).distances
+    rays = cameras.image_rays(seen_by, i)
+    return first_surface.find_first_surface(model.geometry.surfaces, rays).distances
 
 
 if __name__ == "__main__":
-    commands.run(main)
+    commands.run(main, again="it evaluates anew; --overwrite replaces the results.")

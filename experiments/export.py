@@ -8,24 +8,40 @@ python -m experiments.export --run=runs/ball --what=mesh --out=ball.ply
     body      the bodies: those of R3F, or the scene's meshes; with the normals that bend light
 
 Of body, --run may be a reconstruction's folder as well. In clear glass a field learns nothing, so
-mesh and points show what is around the bodies. Nothing is overwritten.
+mesh and points show what is around the bodies.
 """
 
-from pathlib import Path
+from __future__ import annotations
 
-import numpy as np
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 from absl import flags
 
-from experiments import commands
-from experiments.exporting import bodies, field_grid, surfaces
-from refref_jax.data import files
-from refref_jax.reconstruct.isosurface import import_skimage
-from refref_jax.render import Model, load_model
+from experiments import command_line, commands, options, output_folders
+from experiments.late_imports import late
 
-_RUN = flags.DEFINE_string("run", None, "Folder of a trained run.", required=True)
+if TYPE_CHECKING:
+    import numpy as np
+
+    from experiments.exporting import bodies, field_grid, surfaces
+    from refref_jax.data import files
+    from refref_jax.reconstruct import isosurface
+    from refref_jax.render import Model, saved
+else:
+    np = late("numpy")
+    bodies = late("experiments.exporting.bodies")
+    field_grid = late("experiments.exporting.field_grid")
+    surfaces = late("experiments.exporting.surfaces")
+    files = late("refref_jax.data.files")
+    isosurface = late("refref_jax.reconstruct.isosurface")
+    saved = late("refref_jax.render.saved")
+
+_RUN = options.run()
 _WHAT = flags.DEFINE_enum("what", None, ["mesh", "points", "body"], "What to write.", required=True)
-_OUT = flags.DEFINE_string("out", None, "The PLY file; must not exist.", required=True)
-_STEP = flags.DEFINE_integer("step", None, "Checkpoint to use; the newest if not given.", 0)
+_OUT = options.out("The PLY file.")
+_OVERWRITE = options.overwrite("the file, or those of several bodies")
+_STEP = options.step()
 _LEVEL = flags.DEFINE_float(
     "level", 10.0, "Density of the surface per world unit; 10 halves light in 0.07 units.", 1e-6
 )
@@ -41,21 +57,26 @@ _BOX = flags.DEFINE_float(
 def main() -> None:
     """Writes one file, or one for each body."""
     run, out = Path(_RUN.value), Path(_OUT.value)
-    if out.suffix.lower() != ".ply":
-        raise ValueError(f"--out is {out}, which is no PLY file. Give a name that ends with .ply.")
-    if out.exists():
-        raise ValueError(f"{out} exists, and nothing is overwritten. Give another --out.")
+    output_folders.check_file(out, overwrite=_OVERWRITE.value)
     if _WHAT.value == "body":
-        written = bodies.write(run, out)
+        written = bodies.write(run, out, overwrite=_OVERWRITE.value)
     else:
-        written = _write_field(load_model(run, step=_STEP.value), out)
+        written = _write_field(saved.load_model(run, step=_STEP.value), out)
     for path in written:
         print(f"Wrote:  {path}")
-    print("Open it with Blender, MeshLab or CloudCompare: z is up.")
+    print("Next: open it with Blender, MeshLab or CloudCompare: z is up.")
+
+
+def _refuse_other_files(out: str | None) -> None:
+    if out is not None and not out.lower().endswith(".ply"):
+        raise ValueError(f"--out is {out}, which is no PLY file. Give a name that ends with .ply.")
+
+
+command_line.check(_OUT, _refuse_other_files)
 
 
 def _write_field(model: Model, out: Path) -> list[Path]:
-    import_skimage()  # so that its lack is told before the work
+    isosurface.import_skimage()  # so that its lack is told before the work
     is_bounded = model.config.space == "bounded"
     half = _BOX.value or model.config.radius
     if is_bounded:
@@ -74,17 +95,17 @@ def _write_field(model: Model, out: Path) -> list[Path]:
     if is_bounded and half == model.config.radius:
         density = surfaces.with_walls(density, level=_LEVEL.value)
         print("Walls:  the box's faces, on which the model is opaque")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    if _WHAT.value == "mesh":
-        surface = surfaces.find_surface(density, level=_LEVEL.value)
-        colours = _colours(model, surface.vertices, surface.normals, density.spacing)
-        surfaces.write_surface(out, surface, colours)
-        print(f"Mesh:   {len(surface.vertices)} vertices, {len(surface.faces)} faces")
-    else:
-        points = surfaces.find_points(density, level=_LEVEL.value)
-        colours = _colours(model, points.points, points.normals, density.spacing)
-        surfaces.write_points(out, points, colours)
-        print(f"Points: {len(points.points)}")
+    with output_folders.fresh_file(out, overwrite=_OVERWRITE.value) as draft:
+        if _WHAT.value == "mesh":
+            surface = surfaces.find_surface(density, level=_LEVEL.value)
+            colours = _colours(model, surface.vertices, surface.normals, density.spacing)
+            surfaces.write_surface(draft, surface, colours)
+            print(f"Mesh:   {len(surface.vertices)} vertices, {len(surface.faces)} faces")
+        else:
+            points = surfaces.find_points(density, level=_LEVEL.value)
+            colours = _colours(model, points.points, points.normals, density.spacing)
+            surfaces.write_points(draft, points, colours)
+            print(f"Points: {len(points.points)}")
     return [out]
 
 
@@ -95,4 +116,4 @@ def _colours(model: Model, points: np.ndarray, normals: np.ndarray, spacing: flo
 
 
 if __name__ == "__main__":
-    commands.run(main)
+    commands.run(main, again="it exports anew; --overwrite replaces the files.")

@@ -6,31 +6,41 @@ The masks are named as the images: that of {scene}/train/r_000.png is {masks}/tr
 the same size; what is not black shows the object. `docs/masks.md` tells how models make them.
 """
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
 from absl import flags
-from jaxtyping import Bool
 
-from experiments import commands
-from refref_jax.data import files, mask_import
-from refref_jax.data.errors import SceneError
+from experiments import commands, options
+from experiments.late_imports import late
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Bool
+
+    from refref_jax.data import errors, files, mask_import
+else:
+    errors = late("refref_jax.data.errors")
+    files = late("refref_jax.data.files")
+    mask_import = late("refref_jax.data.mask_import")
 
 _SCENE = flags.DEFINE_string("scene", None, "The scene, in the local layout.", required=True)
 _MASKS = flags.DEFINE_string("masks", None, "Folder of the masks.", required=True)
-_OUT = flags.DEFINE_string("out", None, "The copy to write; must not exist.", required=True)
+_OUT = options.out("The copy to write; must not exist.")
 
 
 def main() -> None:
     """Writes the copy."""
     scene, masks, out = Path(_SCENE.value), Path(_MASKS.value), Path(_OUT.value)
     if not masks.is_dir():
-        raise SceneError(f"{masks} is no folder. Give the folder that holds the masks.")
+        raise errors.SceneError(f"{masks} is no folder. Give the folder that holds the masks.")
 
     def read(image: Path) -> Bool[np.ndarray, "h w"]:
         path = masks / image.relative_to(scene)
         if not path.is_file():
-            raise SceneError(
+            raise errors.SceneError(
                 f"There is no mask of {image}: {path} does not exist. Save it there, or take the "
                 "frame out of the transforms file."
             )
@@ -39,7 +49,8 @@ def main() -> None:
     count = mask_import.add_masks(scene, out, read)
     print(f"Masks: {count}")
     print(f"Scene: {out}")
+    print(f"Next: {commands.shell('reconstruct', f'--scene={out}', f'--out={out}_r3f')}")
 
 
 if __name__ == "__main__":
-    commands.run(main)
+    commands.run(main, again="it is refused, for a copy is never replaced.")

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from absl import flags
 from jaxtyping import Bool, Float, Int, UInt8
 
 from experiments import mesh_report
@@ -23,11 +22,6 @@ from refref_jax.optics.wavefront import Geometry
 from refref_jax.render import colour
 from refref_jax.render.backgrounds import Radiance, radiance_of
 from refref_jax.render.known import TILE, KnownRendering, render_known
-
-RAYS_PER_PIXEL = flags.DEFINE_integer(
-    "rays_per_pixel", 9, "Rays in each pixel, a square: 1, 4, 9, 16. They are averaged."
-)
-SPLIT = flags.DEFINE_enum("split", "test", list(local_layout.SPLITS), "Views to render.")
 
 
 class KnownScene(NamedTuple):

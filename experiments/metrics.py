@@ -10,24 +10,30 @@ scene's own depth maps are planar, and not to be compared with those.) What each
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from absl import flags
 
-from experiments import commands, folder_comparison, perceptual_option
+from experiments import commands, options, output_folders, perceptual_option
+from experiments.late_imports import late
 from experiments.perceptual_option import LPIPS_WEIGHTS
+
+if TYPE_CHECKING:
+    from experiments import folder_comparison
+else:
+    folder_comparison = late("experiments.folder_comparison")
 
 _MASKS = flags.DEFINE_string("masks", None, "Folder of masks, named as the images: 0 is outside.")
 _OUT = flags.DEFINE_string("out", None, "JSON file to write; nothing is written without it.")
-_OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace the file of --out if it exists.")
+_OVERWRITE = options.overwrite("the file of --out if it exists")
 flags.adopt_module_key_flags(perceptual_option)
 
 
 def main(rendered: str, truth: str) -> None:
     """Compares the folders."""
     out = None if _OUT.value is None else Path(_OUT.value)
-    if out is not None and out.exists() and not _OVERWRITE.value:
-        raise ValueError(f"{out} exists. Give another --out, or --overwrite to replace it.")
+    if out is not None:
+        output_folders.check_file(out, overwrite=_OVERWRITE.value)
     masks = None if _MASKS.value is None else Path(_MASKS.value)
     pairs = folder_comparison.match(Path(rendered), Path(truth), masks)
     perceptual = perceptual_option.chosen()
@@ -38,10 +44,11 @@ def main(rendered: str, truth: str) -> None:
             bar.show(len(rows), row[folder_comparison.NAME])
     print(folder_comparison.table(rows))
     if out is None:
-        print(f"Nothing was written. To keep all digits: {_again(rendered, truth)}")
+        print(f"Nothing was written. Next, to keep all digits: {_again(rendered, truth)}")
         return
     _write(out, {"rendered": rendered, "truth": truth, "masks": _MASKS.value}, rows)
     print(f"Metrics: {out}")
+    print("Next: the same for other renderings with another --out, and compare the two.")
 
 
 def _again(rendered: str, truth: str) -> str:
@@ -53,9 +60,13 @@ def _again(rendered: str, truth: str) -> str:
 def _write(out: Path, given: dict[str, Any], rows: list[dict[str, Any]]) -> None:
     summary = given | {"results": folder_comparison.summarise(rows), "per_image": rows}
     text = json.dumps(commands.string_safe(summary), indent=2, allow_nan=False)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(text + "\n", encoding="utf-8")
+    with output_folders.fresh_file(out, overwrite=_OVERWRITE.value) as path:
+        path.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
-    commands.run(main, arguments=("RENDERED", "TRUTH"))
+    commands.run(
+        main,
+        arguments=("RENDERED", "TRUTH"),
+        again="it compares anew; --overwrite replaces the file of --out.",
+    )

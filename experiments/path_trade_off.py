@@ -1,6 +1,6 @@
 """Measures what light paths cost and what they give: the speed-accuracy curve.
 
-python -m experiments.path_trade_off --scenes=experiments/data/cube_smcvx_ball --out=runs/trade_off
+python -m experiments.path_trade_off --scenes=experiments/data/cube_smcvx_ball --out=runs/paths
 
 Renders views of scenes with a known background, as `experiments.render_known` does, once for every
 value of --cuts at the tree's bends, once for every value of --bends at its cut, and with the
@@ -8,31 +8,43 @@ straight and the paper's paths. Writes a CSV, one row a rendering, and two figur
 the mask against ray casts and against time. Casts, paths and seconds are of one camera ray a pixel.
 """
 
+from __future__ import annotations
+
 import csv
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
 from absl import flags
 
 from experiments import (
+    command_line,
     commands,
-    known_scenes,
+    known_options,
     named_budgets,
-    path_figures,
+    options,
+    output_folders,
     scene_option,
     scenes,
-    supersampling,
 )
-from experiments.known_scenes import KnownScene
-from experiments.measures import mean_of
-from experiments.path_figures import Trial
+from experiments.late_imports import late
 from refref_jax.data import scene_names
 from refref_jax.optics.budgets import BUDGETS, Budget
 
+if TYPE_CHECKING:
+    import numpy as np
+
+    from experiments import known_scenes, measures, path_figures
+    from experiments.known_scenes import KnownScene
+    from experiments.path_figures import Trial
+else:
+    np = late("numpy")
+    known_scenes = late("experiments.known_scenes")
+    measures = late("experiments.measures")
+    path_figures = late("experiments.path_figures")
+
 _SCENES = flags.DEFINE_list(
-    "scenes", None, f"Scenes, with commas: each {scene_option.FORMS}.", required=True
+    "scenes", None, f"Scenes, with commas: each {options.SCENE_FORMS}.", required=True
 )
 _CUTS = flags.DEFINE_list(
     "cuts",
@@ -44,8 +56,12 @@ _BENDS = flags.DEFINE_list(
 )
 _VIEWS = flags.DEFINE_string("views", "0,10", "Numbers of views of the split, as 0,10, or all.")
 flags.adopt_module_key_flags(scenes)
-flags.adopt_module_key_flags(known_scenes)
-_OUT = flags.DEFINE_string("out", None, "Folder to write to.", required=True)
+flags.adopt_module_key_flags(known_options)
+_OUT = options.out("Folder to write to.")
+_OVERWRITE = options.overwrite("the curves of an earlier call")
+
+_TABLE = "path_trade_off.csv"
+_WRITES = (_TABLE, *(f"path_trade_off_{sweep}.png" for sweep in ("cut", "bends")))
 
 
 class Setting(NamedTuple):
@@ -64,30 +80,35 @@ class Setting(NamedTuple):
 
 def main() -> None:
     """Renders all scenes with all budgets."""
+    out = Path(_OUT.value)
+    place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
+    output_folders.replaceable(out, **place)
     folders = _open_scenes()
     plan = settings()
-    side = supersampling.side_of(known_scenes.RAYS_PER_PIXEL.value)
     # All scenes first: a broken one is named before anything is rendered.
     chosen = [_read(folder) for folder in folders]
-    out = Path(_OUT.value)
-    out.mkdir(parents=True, exist_ok=True)
-    table = out / "path_trade_off.csv"
-    if table.exists():
-        print(f"Replacing the results of an earlier call in {out}.")
+    with output_folders.fresh(out, **place) as draft:
+        trials = _measure(chosen, plan)
+        _write(draft / _TABLE, trials)
+        pictures = [out / path.name for path in path_figures.write(draft, trials)]
+    print(f"Figures:  {', '.join(map(str, pictures))}")
+    print(f"Measures: {out / _TABLE}")
+    print("Next: choose a cut, and render with python -m experiments.render_known --cut=...")
+
+
+def _measure(chosen: list[KnownScene], plan: list[Setting]) -> list[Trial]:
+    """Measures all there is to, with a bar of progress."""
     trials: list[Trial] = []
+    side = options.side_of(known_options.RAYS_PER_PIXEL.value)
     with commands.ProgressBar("trade-off", len(chosen) * len(plan)) as bar:
         for trial in measure_all(chosen, plan, side):
             trials.append(trial)
-            _write(table, trials)
             bar.show(
                 len(trials),
                 f"{trial.scene} {trial.name}: {trial.psnr_masked:.1f} dB, "
                 f"{trial.casts_per_pixel:.2f} casts",
             )
-    pictures = path_figures.write(out, trials)
-    print(f"Figures:  {', '.join(map(str, pictures))}")
-    print(f"Measures: {table}")
-    print("Next: choose a cut, and render with python -m experiments.render_known --cut=...")
+    return trials
 
 
 def _open_scenes() -> list[Path]:
@@ -127,21 +148,21 @@ def measure_all(chosen: list[KnownScene], plan: list[Setting], side: int) -> Ite
 def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
     """Renders all views of a scene with one budget."""
     known_scenes.warm_up(scene, setting.budget)
-    views, measures = [], []
+    views, measured = [], []
     for i in range(len(scene.indices)):
         view = known_scenes.render_view(scene, i, budget=setting.budget, side=side)
         views.append(view)
-        measures.append(known_scenes.measure(scene, i, view.rgb))
+        measured.append(known_scenes.measure(scene, i, view.rgb))
     pixels = scene.frames.cameras.height * scene.frames.cameras.width * side**2
-    return Trial(
+    return path_figures.Trial(
         scene=scene.name,
         sweep=setting.sweep,
         name=setting.name,
         cut=setting.budget.cut,
         bends=setting.budget.bends,
-        psnr=mean_of(measures, "psnr"),
-        psnr_masked=mean_of(measures, "psnr_masked"),
-        psnr_outside=mean_of(measures, "psnr_outside"),
+        psnr=measures.mean_of(measured, "psnr"),
+        psnr_masked=measures.mean_of(measured, "psnr_masked"),
+        psnr_outside=measures.mean_of(measured, "psnr_outside"),
         casts_per_pixel=float(np.mean([view.casts for view in views])),
         paths_per_pixel=float(np.mean([view.paths for view in views])),
         seconds_per_pixel=sum(view.seconds for view in views) / (pixels * len(views)),
@@ -152,7 +173,7 @@ def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
 def _read(folder: Path) -> KnownScene:
     scene = known_scenes.read_scene(
         folder,
-        split=known_scenes.SPLIT.value,
+        split=known_options.SPLIT.value,
         views=_VIEWS.value,
         rule=scenes.RULE.value,
         indices=scenes.given_indices(),
@@ -174,12 +195,16 @@ def _numbers(option: str, words: list[str], kind: type) -> list:
         ) from error
 
 
+command_line.check(_CUTS, lambda words: _numbers("cuts", words, float))
+command_line.check(_BENDS, lambda words: _numbers("bends", words, int))
+
+
 def _write(path: Path, trials: list[Trial]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(Trial._fields)
+        writer.writerow(path_figures.Trial._fields)
         writer.writerows(trials)
 
 
 if __name__ == "__main__":
-    commands.run(main)
+    commands.run(main, again="it measures anew; --overwrite replaces the curves.")

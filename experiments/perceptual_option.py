@@ -1,11 +1,20 @@
 """What commands measure with as eyes do: the option of LPIPS's weights, and what is installed."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments.measures import Perceptual
-from refref_jax import metrics
+from experiments.late_imports import late
+
+if TYPE_CHECKING:
+    from experiments import measures
+    from refref_jax import metrics
+else:
+    measures = late("experiments.measures")
+    metrics = late("refref_jax.metrics")
 
 LPIPS_WEIGHTS = flags.DEFINE_string(
     "lpips_weights",
@@ -15,7 +24,7 @@ LPIPS_WEIGHTS = flags.DEFINE_string(
 )
 
 
-def chosen() -> Perceptual:
+def chosen() -> measures.Perceptual:
     """Returns what is at hand, and warns of what is not, once.
 
     Raises:
@@ -23,7 +32,7 @@ def chosen() -> Perceptual:
     """
     path = _named()
     lpips = None if path is None else metrics.load_lpips(path)
-    return Perceptual(lpips, metrics.flip if _has_flip() else None)
+    return measures.Perceptual(lpips, metrics.flip if _has_flip() else None)
 
 
 def checked() -> Path | None:

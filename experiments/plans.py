@@ -1,24 +1,30 @@
 """The options of training, and the run that they ask for."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import model_options, planning, scene_option, scenes, space_options
-from experiments.choices import Wishes
-from experiments.model_options import ModelOptions
-from experiments.planning import Plan, Request
-from experiments.presets import PRESETS
-from refref_jax.data.meshes import MeshPart
-from refref_jax.fields import registry
+from experiments import choosable, options, scene_option, scenes, space_options
+from experiments.late_imports import late
 from refref_jax.optics.budgets import BUDGETS
 
-SCENE = flags.DEFINE_string("scene", None, f"The scene to train on: {scene_option.FORMS}.")
-_PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Size of the model and its training.")
+if TYPE_CHECKING:
+    from experiments import choices, model_options, planning
+    from refref_jax.data.meshes import MeshPart
+else:
+    choices = late("experiments.choices")
+    model_options = late("experiments.model_options")
+    planning = late("experiments.planning")
+
+SCENE = flags.DEFINE_string("scene", None, f"The scene to train on: {options.SCENE_FORMS}.")
+_PRESET = options.preset("Size of the model and its training.")
 _FIELD = flags.DEFINE_enum(
     "field",
-    registry.USUAL,
-    list(registry.KINDS),
+    choosable.FIELDS[0],
+    choosable.FIELDS,
     "Kind of the fields that are learned: Zip-NeRF's, or without its anti-aliasing Nerfacto's.",
 )
 PATHS = flags.DEFINE_enum(
@@ -101,7 +107,7 @@ flags.adopt_module_key_flags(scenes)
 flags.adopt_module_key_flags(space_options)
 _STEPS = flags.DEFINE_integer("steps", None, "Training steps; the preset's if not given.", 1)
 _BATCH = flags.DEFINE_integer("batch", None, "Rays a step; the preset's if not given.", 1)
-SEED = flags.DEFINE_integer("seed", 0, "Seed of everything random.", 0, 2**32 - 1)
+SEED = options.seed()
 
 SETTLED = (
     _PRESET,
@@ -141,13 +147,13 @@ def opened_scene() -> Path:
     return scene_option.opened(SCENE.value).resolve()
 
 
-def plan_from_flags(*, body: MeshPart | None = None) -> Plan:
+def plan_from_flags(*, body: MeshPart | None = None) -> planning.Plan:
     """Plans the run that the options ask for, and prints what it comes to.
 
     Args:
       body: the reconstructed object; if `None`, the scene's own meshes are.
     """
-    request = Request(
+    request = planning.Request(
         scene=opened_scene(),
         preset=_PRESET.value,
         field=_FIELD.value,
@@ -176,14 +182,14 @@ def check_options() -> None:
     _options()
 
 
-def _wishes() -> Wishes:
+def _wishes() -> choices.Wishes:
     asked = {"reentry": _REENTRY.value, "interior": _INTERIOR.value, "tints": _TINTS.value}
     decided = {name: None if value == "auto" else value for name, value in asked.items()}
-    return Wishes(paths=PATHS.value, cut=_CUT.value, bends=_BENDS.value, **decided)
+    return choices.Wishes(paths=PATHS.value, cut=_CUT.value, bends=_BENDS.value, **decided)
 
 
-def _options() -> ModelOptions:
-    return ModelOptions(
+def _options() -> model_options.ModelOptions:
+    return model_options.ModelOptions(
         samples=None if _SAMPLES.value is None else model_options.parse_samples(_SAMPLES.value),
         multisamples=_MULTISAMPLES.value,
         entries=_ENTRIES.value,

@@ -10,17 +10,24 @@ is guessed.
 """
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import commands, recommendations, scene_option, trade_table
-from refref_jax.data import local_layout
+from experiments import commands, options, scene_option
+from experiments.late_imports import late
+
+if TYPE_CHECKING:
+    from experiments import recommendations, trade_table
+    from refref_jax.data import local_layout
+else:
+    recommendations = late("experiments.recommendations")
+    trade_table = late("experiments.trade_table")
+    local_layout = late("refref_jax.data.local_layout")
 
 _BUNDLED = Path(__file__).parent / "data" / "trade_off.csv"
 
-_SCENE = flags.DEFINE_string(
-    "scene", None, f"The scene to train on: {scene_option.FORMS}.", required=True
-)
+_SCENE = options.scene("The scene to train on")
 _MINUTES = flags.DEFINE_float(
     "minutes", None, "Time for training and evaluation.", 0.0, required=True
 )
@@ -49,4 +56,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    commands.run(main)
+    commands.run(main, again="it times this machine anew; nothing is written.")

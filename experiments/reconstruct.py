@@ -9,41 +9,57 @@ goes on where it was stopped.
 """
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import commands, reconstruction_options, scene_option, space_options
-from experiments.r3f import body, chain, report
-
-_SCENE = flags.DEFINE_string(
-    "scene", None, f"The scene to reconstruct: {scene_option.FORMS}.", required=True
+from experiments import (
+    command_line,
+    commands,
+    options,
+    reconstruction_options,
+    scene_option,
+    space_options,
 )
-_OUT = flags.DEFINE_string("out", None, "Folder to write to.", required=True)
+from experiments.late_imports import late
+
+if TYPE_CHECKING:
+    from experiments.r3f import body, chain, report
+else:
+    body = late("experiments.r3f.body")
+    chain = late("experiments.r3f.chain")
+    report = late("experiments.r3f.report")
+
+_SCENE = options.scene("The scene to reconstruct")
+_OUT = options.out("Folder to write to.")
 _IOR = flags.DEFINE_string(
     "ior", None, "Index of refraction of the body, as 1.5; estimated if not given."
 )
 flags.adopt_module_key_flags(reconstruction_options)
 flags.adopt_module_key_flags(space_options)
-_SEED = flags.DEFINE_integer("seed", 0, "Seed of everything random.", 0, 2**32 - 1)
+_SEED = options.seed()
+
+
+def _parse(word: str | None) -> float | None:
+    return None if word is None else reconstruction_options.parse_index(word)
+
+
+command_line.check(_IOR, _parse)
 
 
 def main() -> None:
     """Reconstructs a scene, or goes on with it."""
-    index = None if _IOR.value is None else reconstruction_options.parse_index(_IOR.value)
+    index = _parse(_IOR.value)
     config = reconstruction_options.chosen(index=index, seed=_SEED.value)
     scene, out = scene_option.opened(_SCENE.value), Path(_OUT.value)
-    try:
-        found = chain.reconstruct(scene, out, config, compare=True)
-    except KeyboardInterrupt:
-        print("Stopped. The same command goes on.")
-        raise
+    found = chain.reconstruct(scene, out, config, compare=True)
     print(f"Report:  {out / report.FILE}, {out / report.FOLDER}")
     print(f"Surface: {body.surface_file(out, found)}")
     print(f"Index:   {out / chain.INDEX_FILE}")
     run = out.with_name(f"{out.name}_run")
-    options = (f"--scene={_SCENE.value}", f"--reconstruction={out}", f"--out={run}")
-    print(f"Next: {commands.shell('train', *options)}")
+    given = (f"--scene={_SCENE.value}", f"--reconstruction={out}", f"--out={run}")
+    print(f"Next: {commands.shell('train', *given)}")
 
 
 if __name__ == "__main__":
-    commands.run(main)
+    commands.run(main, again="it goes on where it was stopped; what is finished stays.")

@@ -1,17 +1,24 @@
 """The options of a reconstruction that all commands which make one share."""
 
+from __future__ import annotations
+
 import math
+from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import space_options
-from experiments.r3f.geometry_stage import GEOMETRIES
-from experiments.r3f.records import ReconstructionConfig
+from experiments import choosable, space_options
+from experiments.late_imports import late
+
+if TYPE_CHECKING:
+    from experiments.r3f import records
+else:
+    records = late("experiments.r3f.records")
 
 GEOMETRY = flags.DEFINE_enum(
     "geometry",
     "hull",
-    list(GEOMETRIES),
+    choosable.GEOMETRIES,
     "How a body is found from masks: as their exact visual hull, or by an occupancy field that is "
     "trained on them.",
 )
@@ -33,7 +40,7 @@ LIGHT_STEPS = flags.DEFINE_integer(
 _LARGEST_INDEX = 5.0
 
 
-def chosen(*, index: float | None, seed: int) -> ReconstructionConfig:
+def chosen(*, index: float | None, seed: int) -> records.ReconstructionConfig:
     """Returns what the options ask for.
 
     Args:
@@ -48,7 +55,7 @@ def chosen(*, index: float | None, seed: int) -> ReconstructionConfig:
             f"--outliers={OUTLIERS.value} has no effect on --geometry={GEOMETRY.value}, which "
             "weighs all masks. Leave out one of them."
         )
-    return ReconstructionConfig(
+    return records.ReconstructionConfig(
         GEOMETRY.value,
         RESOLUTION.value,
         OUTLIERS.value,

@@ -10,28 +10,41 @@ took, without compiling, reading and writing; and `lost_energy`, the share of li
 room.
 """
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from absl import flags
 
 from experiments import (
     budget_options,
     commands,
-    figures,
-    known_scenes,
+    known_options,
+    options,
+    output_folders,
     scene_option,
     scenes,
-    supersampling,
 )
-from experiments.known_scenes import KnownScene, View
-from experiments.measures import mean_of
-from refref_jax.data import files
+from experiments.late_imports import late
 from refref_jax.optics.budgets import BUDGETS, Budget
 
-_SCENE = flags.DEFINE_string("scene", None, f"The scene: {scene_option.FORMS}.", required=True)
+if TYPE_CHECKING:
+    import numpy as np
+
+    from experiments import figures, known_scenes, measures
+    from experiments.known_scenes import KnownScene, View
+    from refref_jax.data import files
+else:
+    np = late("numpy")
+    figures = late("experiments.figures")
+    known_scenes = late("experiments.known_scenes")
+    measures = late("experiments.measures")
+    files = late("refref_jax.data.files")
+
+_SCENE = options.scene("The scene")
+_OUT = options.out("Folder to write the pictures to.")
 _PATHS = flags.DEFINE_enum(
     "paths",
     "tree",
@@ -42,17 +55,16 @@ _PATHS = flags.DEFINE_enum(
 _VIEWS = flags.DEFINE_string("views", "all", "Numbers of views of the split, as 0,10,20, or all.")
 flags.adopt_module_key_flags(budget_options)
 flags.adopt_module_key_flags(scenes)
-flags.adopt_module_key_flags(known_scenes)
-_OUT = flags.DEFINE_string("out", None, "Folder to write the pictures to.", required=True)
+flags.adopt_module_key_flags(known_options)
 _JSON = flags.DEFINE_string("json", None, "File for the measures; {out}/metrics.json by default.")
+_OVERWRITE = options.overwrite("an earlier rendering in that folder")
 
 _VIEWS_IN_COMPARISON = 4
 
 # A share of light that 8 bits may show.
 _WORTH_A_WARNING = 1e-3
 
-# Marks a folder whose pictures this command wrote, and may replace.
-_OWN = ".render_known"
+_WRITES = ("rgb", "comparison.png", "metrics.json")
 
 # By what a file of ours is known.
 _KEYS = {"scene", "paths", "views", "casts_per_pixel"}
@@ -60,57 +72,60 @@ _KEYS = {"scene", "paths", "views", "casts_per_pixel"}
 
 def main() -> None:
     """Renders and measures the chosen views."""
+    out = Path(_OUT.value)
+    place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
+    output_folders.replaceable(out, **place)
+    metrics_file = None if _JSON.value is None else Path(_JSON.value)
+    _check(metrics_file)
     budget = budget_options.chosen(_PATHS.value)
-    side = supersampling.side_of(known_scenes.RAYS_PER_PIXEL.value)
     scene = known_scenes.read_scene(
         scene_option.opened(_SCENE.value),
-        split=known_scenes.SPLIT.value,
+        split=known_options.SPLIT.value,
         views=_VIEWS.value,
         rule=scenes.RULE.value,
         indices=scenes.given_indices(),
     )
-    out = Path(_OUT.value)
-    metrics_file = Path(_JSON.value) if _JSON.value else out / "metrics.json"
-    _prepare(out, metrics_file)
-    views, measures = render(scene, budget, side, out)
-    shown = np.unique(np.linspace(0, len(views) - 1, _VIEWS_IN_COMPARISON).astype(int))
-    figures.write_comparison(
-        out / "comparison.png",
-        [
-            figures.Comparison(scene.frames.names[i], scene.images[i] / 255.0, views[i].rgb)
-            for i in shown
-        ],
-    )
-    summary = summarise(scene, budget, views, measures)
-    text = json.dumps(commands.string_safe(summary), indent=2, allow_nan=False)
-    metrics_file.write_text(text + "\n", encoding="utf-8")
+    with output_folders.fresh(out, **place) as draft:
+        summary = render(scene, budget, draft)
+        text = json.dumps(commands.string_safe(summary), indent=2, allow_nan=False) + "\n"
+        if metrics_file is None:
+            (draft / "metrics.json").write_text(text, encoding="utf-8")
+    if metrics_file is not None:
+        with output_folders.fresh_file(metrics_file, overwrite=_OVERWRITE.value) as path:
+            path.write_text(text, encoding="utf-8")
     _report(summary)
     print(f"Pictures: {out / 'comparison.png'}, {out / 'rgb'}")
-    print(f"Metrics:  {metrics_file}")
-    options = (f"--scenes={_SCENE.value}", f"--out={out / 'trade_off'}")
-    print(f"Next: {commands.shell('path_trade_off', *options)}")
+    print(f"Metrics:  {metrics_file or out / 'metrics.json'}")
+    given = (f"--scenes={_SCENE.value}", f"--out={out}_trade_off")
+    print(f"Next: {commands.shell('path_trade_off', *given)}")
 
 
-def render(
-    scene: KnownScene, budget: Budget, side: int, out: Path
-) -> tuple[list[View], list[dict[str, Any]]]:
-    """Renders and measures all views, and writes the pictures."""
-    views, measures = [], []
+def render(scene: KnownScene, budget: Budget, out: Path) -> dict[str, Any]:
+    """Renders and measures all views, writes the pictures, and returns what the JSON holds."""
+    views, measured = [], []
+    side = options.side_of(known_options.RAYS_PER_PIXEL.value)
+    (out / "rgb").mkdir()
     print(f"Compiling for {scene.name}, {_PATHS.value} ...", flush=True)
     known_scenes.warm_up(scene, budget)
     with commands.ProgressBar("render", len(scene.indices)) as bar:
         for i, (index, name) in enumerate(zip(scene.indices, scene.frames.names, strict=True)):
             view = known_scenes.render_view(scene, i, budget=budget, side=side)
             files.write_rgb(out / "rgb" / f"{name}.png", view.rgb)
-            measured = known_scenes.measure(scene, i, view.rgb)
+            found = known_scenes.measure(scene, i, view.rgb)
             views.append(view)
-            measures.append({"index": index, "name": name, **measured})
-            bar.show(i + 1, f"{name}  PSNR {measured['psnr']:.2f}")
-    return views, measures
+            measured.append({"index": index, "name": name, **found})
+            bar.show(i + 1, f"{name}  PSNR {found['psnr']:.2f}")
+    shown = np.unique(np.linspace(0, len(views) - 1, _VIEWS_IN_COMPARISON).astype(int))
+    compared = [
+        figures.Comparison(scene.frames.names[i], scene.images[i] / 255.0, views[i].rgb)
+        for i in shown
+    ]
+    figures.write_comparison(out / "comparison.png", compared)
+    return summarise(scene, budget, views, measured)
 
 
 def summarise(
-    scene: KnownScene, budget: Budget, views: list[View], measures: list[dict[str, Any]]
+    scene: KnownScene, budget: Budget, views: list[View], measured: list[dict[str, Any]]
 ) -> dict[str, Any]:
     """Returns what the JSON holds."""
     keys = ("psnr", "psnr_masked", "psnr_outside")
@@ -119,8 +134,8 @@ def summarise(
         "paths": _PATHS.value,
         "cut": budget.cut,
         "bends": budget.bends,
-        "views": measures,
-        "mean": {key: mean_of(measures, key) for key in keys},
+        "views": measured,
+        "mean": {key: measures.mean_of(measured, key) for key in keys},
         "casts_per_pixel": float(np.mean([view.casts for view in views])),
         "paths_per_pixel": float(np.mean([view.paths for view in views])),
         "seconds": sum(view.seconds for view in views),
@@ -128,30 +143,15 @@ def summarise(
     }
 
 
-def _prepare(out: Path, metrics_file: Path) -> None:
-    """Makes room for results; those of an earlier call go first, and it is said."""
-    if metrics_file.exists() and not _is_ours(metrics_file):
+def _check(metrics_file: Path | None) -> None:
+    """Refuses a file for the measures that holds anything else."""
+    if metrics_file is None:
+        return
+    if metrics_file.is_file() and not _is_ours(metrics_file):
         raise ValueError(
             f"{metrics_file} exists and is not of this command. Remove it, or give another --json."
         )
-    (out / "rgb").mkdir(parents=True, exist_ok=True)
-    metrics_file.parent.mkdir(parents=True, exist_ok=True)
-    known = out / _OWN
-    strangers = sorted((out / "rgb").glob("*.png"))
-    if strangers and not known.exists():
-        raise ValueError(
-            f"{out / 'rgb'} holds pictures that are not of this command, as {strangers[0].name}. "
-            "Give another --out, or remove them."
-        )
-    known.touch()
-    # A file that can not be written is found now, not after the rendering.
-    with metrics_file.open("a", encoding="utf-8"):
-        pass
-    if strangers:
-        print(f"Replacing the results of an earlier rendering in {out}.")
-    for path in strangers:
-        path.unlink()
-    metrics_file.unlink()
+    output_folders.check_file(metrics_file, overwrite=_OVERWRITE.value)
 
 
 def _is_ours(path: Path) -> bool:
@@ -178,4 +178,8 @@ def _report(summary: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    commands.run(main)
+    commands.run(
+        main,
+        first=("paths", "cut", "bends", "rays_per_pixel", "views", "split"),
+        again="it renders anew; --overwrite replaces the results.",
+    )

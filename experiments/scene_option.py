@@ -3,12 +3,15 @@
 import contextlib
 import warnings
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from experiments import commands
-from refref_jax.data import scene_source
+from experiments.late_imports import late
 
-FORMS = "a folder, or hf:CONFIG/SCENE of the published data set"
-"""What an option may name."""
+if TYPE_CHECKING:
+    from refref_jax.data import scene_source
+else:
+    scene_source = late("refref_jax.data.scene_source")
 
 
 def opened(source: str | Path) -> Path:

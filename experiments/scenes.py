@@ -2,12 +2,12 @@
 
 from absl import flags
 
-from refref_jax.optics.interface_rules import RULES
+from experiments import choosable
 
 RULE = flags.DEFINE_enum(
     "rule",
     "nested",
-    list(RULES),
+    choosable.RULES,
     "What lies outside each mesh: the part around it, always air (as Cycles does it), or, of "
     "meshes that overlap, the one with the highest 'priority' in scene.json.",
 )

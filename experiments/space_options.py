@@ -1,10 +1,14 @@
 """Options that say where a scene's background stands, for scenes that do not."""
 
+from __future__ import annotations
+
 import math
+from typing import TYPE_CHECKING
 
 from absl import flags
 
-from refref_jax.sampling.domains import Space
+if TYPE_CHECKING:
+    from refref_jax.sampling.domains import Space
 
 BACKGROUND = flags.DEFINE_enum(
     "background",

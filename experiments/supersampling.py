@@ -5,7 +5,6 @@ much smaller, so the fields are asked for finer detail too. Colours are averaged
 encoded afterwards: what a camera does, and what the true images were made with.
 """
 
-import math
 from collections.abc import Iterator
 
 import jax
@@ -19,19 +18,6 @@ from refref_jax.render import Model, Rendering, colour, render_image
 
 RAYS_OF_A_BAND = 1 << 18
 """Most rays that are held at once, where a row of pixels has no more."""
-
-
-def side_of(rays_per_pixel: int) -> int:
-    """Returns how many rays a pixel has along each edge.
-
-    Raises:
-      ValueError: if they do not make a square grid.
-    """
-    side = math.isqrt(max(rays_per_pixel, 0))
-    if side >= 1 and side**2 == rays_per_pixel:
-        return side
-    nearest = " or ".join(str(s**2) for s in (side, side + 1) if s)
-    raise ValueError(f"{rays_per_pixel} rays a pixel do not make a square grid. Give {nearest}.")
 
 
 def render_view(

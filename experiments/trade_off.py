@@ -12,20 +12,31 @@ command. Times are of this machine: leave it alone meanwhile.
 repeated, and take any option of `experiments.train`, and rays_per_pixel.
 """
 
+from __future__ import annotations
+
 import signal
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import commands, scene_option, sweeps, trade_points
-from experiments.trade_points import Point
-from refref_jax.data import local_layout
+from experiments import command_line, commands, options, output_folders, scene_option
+from experiments.late_imports import late
 
-_SCENE = flags.DEFINE_string("scene", None, f"The scene: {scene_option.FORMS}.", required=True)
-_OUT = flags.DEFINE_string("out", None, "Folder of the sweep.", required=True)
-_PRESET = flags.DEFINE_string("preset", "tiny", "Preset of the base point.")
-_SEED = flags.DEFINE_integer("seed", 0, "Seed of all trainings.", 0, 2**32 - 1)
+if TYPE_CHECKING:
+    from experiments import sweeps, trade_points
+    from experiments.trade_points import Point
+    from refref_jax.data import local_layout
+else:
+    sweeps = late("experiments.sweeps")
+    trade_points = late("experiments.trade_points")
+    local_layout = late("refref_jax.data.local_layout")
+
+_SCENE = options.scene("The scene")
+_OUT = options.out("Folder of the sweep.")
+_PRESET = options.preset("Preset of the base point.")
+_SEED = options.seed("Seed of all trainings.")
 _STEPS = flags.DEFINE_list(
     "steps",
     [],
@@ -38,7 +49,7 @@ _VALUES = flags.DEFINE_multi_string(
 )
 _KNOBS = flags.DEFINE_list("knobs", None, "Only these options are tried; all if not given.")
 _POINTS = flags.DEFINE_list("points", None, "Only these points, and the base, as cut=0.1.")
-_LIMIT = flags.DEFINE_integer("limit", None, "Only this many test images, evenly spread.", 1)
+_LIMIT = options.limit()
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "List the points, and measure nothing.")
 
 
@@ -57,17 +68,20 @@ def main() -> None:
     limit = () if _LIMIT.value is None else (f"--limit={_LIMIT.value}",)
     images = len(local_layout.read_frames(scene, "test").names)
     images = min(images, _LIMIT.value or images)
+    earlier = sweeps.earlier_rows(out, points[0], scene, images=images)
+    out.mkdir(parents=True, exist_ok=True)
+    output_folders.note(out, __name__)
     failed = sweeps.sweep(
         points,
         out,
         lambda point: sweeps.measure(point, scene, out / "runs", limit),
-        sweeps.earlier_rows(out, points[0], scene, images=images),
+        earlier,
     )
     print(f"Table:  {out / 'trade_off.csv'}")
     print(f"Figure: {out / 'trade_off.png'}")
     print(f"Report: {out / 'trade_off.md'}")
-    options = (f"--scene={_SCENE.value}", "--minutes=5", f"--table={out / 'trade_off.csv'}")
-    print(f"Next: {commands.shell('recommend', *options)}")
+    given = (f"--scene={_SCENE.value}", "--minutes=5", f"--table={out / 'trade_off.csv'}")
+    print(f"Next: {commands.shell('recommend', *given)}")
     for name, reason in failed.items():
         print(f"failed: {name}: {reason}", file=sys.stderr)
     if failed:
@@ -76,19 +90,10 @@ def main() -> None:
 
 def points_from_flags() -> list[Point]:
     """Returns the points that the options ask for."""
-    try:
-        steps = [int(word) for word in _STEPS.value]
-    except ValueError as error:
-        raise ValueError(
-            f"--steps={','.join(_STEPS.value)} is not a list of numbers. Write as in "
-            "--steps=2500,1000."
-        ) from error
-    if any(count < 1 for count in steps):
-        raise ValueError(f"--steps={','.join(_STEPS.value)} has no training. Give 1 or more.")
     points = trade_points.sweep(
         preset=_PRESET.value,
         seed=_SEED.value,
-        steps=steps,
+        steps=read_steps(_STEPS.value),
         base=trade_points.parse_base(_BASE.value),
         values=trade_points.parse_values(_VALUES.value),
         knobs=_KNOBS.value,
@@ -96,5 +101,25 @@ def points_from_flags() -> list[Point]:
     return points if _POINTS.value is None else trade_points.choose(points, _POINTS.value)
 
 
+def read_steps(words: list[str]) -> list[int]:
+    """Returns the numbers of steps that an option lists.
+
+    Raises:
+      ValueError: if one is no positive whole number.
+    """
+    try:
+        steps = [int(word) for word in words]
+    except ValueError as error:
+        raise ValueError(
+            f"--steps={','.join(words)} is not a list of numbers. Write as in --steps=2500,1000."
+        ) from error
+    if any(count < 1 for count in steps):
+        raise ValueError(f"--steps={','.join(words)} has no training. Give 1 or more.")
+    return steps
+
+
+command_line.check(_STEPS, read_steps)
+
+
 if __name__ == "__main__":
-    commands.run(main)
+    commands.run(main, again="it goes on; points that are finished are not measured again.")

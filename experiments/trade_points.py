@@ -8,7 +8,7 @@ listed.
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from experiments import model_options
+from experiments import command_line, model_options
 from experiments.presets import PRESETS, Bounds
 from refref_jax.fields import registry
 from refref_jax.optics.budgets import BUDGETS
@@ -95,7 +95,8 @@ def sweep(
     if knobs is not None:
         if unknown := [knob for knob in knobs if knob not in swept]:
             raise ValueError(
-                f"There is no knob {unknown[0]}. Choose from {', '.join(swept)}, or give its "
+                f"There is no knob {unknown[0]}.{command_line.did_you_mean(unknown[0], swept)} "
+                f"Choose from {', '.join(swept)}, or give its "
                 f"values with --values={unknown[0]}=A/B."
             )
         swept = {knob: swept[knob] for knob in knobs}
@@ -176,7 +177,8 @@ def choose(points: Sequence[Point], names: Sequence[str]) -> list[Point]:
     """
     known = [point.name for point in points]
     if unknown := [name for name in names if name not in known]:
-        raise ValueError(f"There is no point {unknown[0]}. Choose from {', '.join(known)}.")
+        near = command_line.did_you_mean(unknown[0], known)
+        raise ValueError(f"There is no point {unknown[0]}.{near} Choose from {', '.join(known)}.")
     return [point for point in points if point.name in {BASE, *names}]
 
 

@@ -9,26 +9,37 @@ scene's own meshes are never read.
 import contextlib
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from absl import flags
 
 from experiments import (
     commands,
     device_options,
+    options,
     plans,
     reconstruction_options,
     scenes,
-    trainer,
     training_body,
 )
-from refref_jax.training import devices, run_folder, run_lock
+from experiments.late_imports import late
+
+if TYPE_CHECKING:
+    from experiments import trainer
+    from refref_jax.training import devices, run_folder, run_lock
+else:
+    trainer = late("experiments.trainer")
+    devices = late("refref_jax.training.devices")
+    run_folder = late("refref_jax.training.run_folder")
+    run_lock = late("refref_jax.training.run_lock")
+
+_OUT = options.out("Folder to write the run to.")
 
 flags.adopt_module_key_flags(scenes)
 flags.adopt_module_key_flags(plans)
 flags.adopt_module_key_flags(training_body)
 flags.adopt_module_key_flags(device_options)
 flags.adopt_module_key_flags(reconstruction_options)
-_OUT = flags.DEFINE_string("out", None, "Folder to write the run to.", required=True)
 _RESUME = flags.DEFINE_bool("resume", False, "Continue the run in --out, if there is one.")
 _LOG_EVERY = flags.DEFINE_integer("log_every", 50, "Steps between two lines of metrics.", 1)
 _CHECKPOINT_EVERY = flags.DEFINE_integer("checkpoint_every", 500, "Steps between checkpoints.", 1)
@@ -46,7 +57,7 @@ def main() -> None:
     device_options.connect()
     with device_options.first_speaks():
         if not _begin(run):
-            print(f"Continue with --resume --out={run}.")
+            print(f"Continue with {commands.shell('train', f'--out={run}', '--resume')}")
             sys.exit(commands.INTERRUPTED)
         print(f"Run: {run}  (metrics.jsonl, checkpoints/)")
         print(f"Next: {commands.shell('evaluate', f'--run={run}', '--split=test')}")
@@ -96,4 +107,12 @@ def _refuse_options(run: Path) -> None:
 
 
 if __name__ == "__main__":
-    commands.run(main)
+    commands.run(
+        main,
+        first=(
+            *("scene", "preset", "steps", "paths", "cut", "bends", "interior", "ior", "rule"),
+            *("background", "radius", "samples", "entries", "batch", "method", "reconstruction"),
+            *("resume", "seed", "devices"),
+        ),
+        again="a run is never replaced; --resume goes on with it.",
+    )

@@ -132,7 +132,8 @@ def evaluate(
     known = _read(run)
     key = " ".join([f"--split={split}", *options])
     if key not in known.get("evaluations", {}):
-        command = [f"--run={run}", f"--scene={scene}", *key.split()]
+        # One with other options may be there.
+        command = [f"--run={run}", f"--scene={scene}", *key.split(), "--overwrite"]
         child_process.run("evaluate", *command, log=run.with_name(f"{run.name}.log"))
         summary = json.loads((run / "eval" / split / "metrics.json").read_text("utf-8"))
         names = {field.name for field in dataclasses.fields(Evaluation)}

@@ -1,13 +1,22 @@
 """Which body a training bends light with: the scene's meshes, or one that is reconstructed."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from absl import flags
 
 from experiments import plans, reconstruction_options, scenes
-from experiments.r3f import chain, provenance, records
-from experiments.r3f.provenance import Provenance
-from refref_jax.data.meshes import MeshPart
+from experiments.late_imports import late
+
+if TYPE_CHECKING:
+    from experiments.r3f import chain, provenance, records
+    from refref_jax.data.meshes import MeshPart
+else:
+    chain = late("experiments.r3f.chain")
+    provenance = late("experiments.r3f.provenance")
+    records = late("experiments.r3f.records")
 
 METHOD = flags.DEFINE_enum(
     "method",
@@ -86,7 +95,7 @@ def find(run: Path, *, resume: bool) -> MeshPart | None:
 
 def note(run: Path, body: MeshPart | None) -> None:
     """Notes in the run's folder where its body comes from."""
-    found = None if body is None else Provenance(str(_folder(run).resolve()), body.index)
+    found = None if body is None else provenance.Provenance(str(_folder(run).resolve()), body.index)
     provenance.write(run, found)
 
 

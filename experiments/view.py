@@ -6,24 +6,35 @@ Bodies may be given other indices of refraction, and light another cut or more b
 stay as they were trained. `docs/viewer.md` tells what is shown.
 """
 
+from __future__ import annotations
+
 import threading
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import commands, scene_option
-from experiments.viewing import subject as subjects
-from refref_jax.data.errors import SceneError
-from refref_jax.render import load_model
-from refref_jax.training import run_folder
+from experiments import command_line, commands, options, scene_option
+from experiments.late_imports import late
 
-_RUN = flags.DEFINE_string("run", None, "Folder of a trained run.", required=True)
-_STEP = flags.DEFINE_integer("step", None, "Checkpoint to use; the newest if not given.", 0)
+if TYPE_CHECKING:
+    from experiments.viewing import subject as subjects
+    from refref_jax.data import errors
+    from refref_jax.render import saved
+    from refref_jax.training import run_folder
+else:
+    subjects = late("experiments.viewing.subject")
+    errors = late("refref_jax.data.errors")
+    saved = late("refref_jax.render.saved")
+    run_folder = late("refref_jax.training.run_folder")
+
+_RUN = options.run()
+_STEP = options.step()
 _SCENE = flags.DEFINE_string(
     "scene",
     None,
-    f"The scene, for its test views: {scene_option.FORMS}. That of the run, if not given and still "
-    "there.",
+    f"The scene, for its test views: {options.SCENE_FORMS}. That of the run, if not given and "
+    "still there.",
 )
 _HOST = flags.DEFINE_string(
     "host", "127.0.0.1", "Address to listen on; 0.0.0.0 lets in everyone who reaches this machine."
@@ -37,7 +48,7 @@ _HEIGHTS = flags.DEFINE_list(
     "Heights of the pictures in pixels: while the camera moves, and then one after the other. "
     "Widths are 16/9 of them.",
 )
-_CHUNK = flags.DEFINE_integer("chunk", 4096, "Paths at once: lower it if memory runs out.", 1)
+_CHUNK = options.chunk()
 
 
 def main() -> None:
@@ -59,6 +70,8 @@ def main() -> None:
         threading.Event().wait()
     finally:
         server.stop()
+        given = (f"--run={_RUN.value}", "--what=mesh", f"--out={_RUN.value}.ply")
+        print(f"Next: {commands.shell('export', *given)}")
 
 
 def read_heights(words: list[str]) -> tuple[int, ...]:
@@ -79,12 +92,15 @@ def read_heights(words: list[str]) -> tuple[int, ...]:
     return heights
 
 
+command_line.check(_HEIGHTS, read_heights)
+
+
 def read_subject(heights: tuple[int, ...]) -> subjects.Subject:
     """Reads the run, and its scene where there is one."""
     run = Path(_RUN.value)
     config = run_folder.read_config(run)
     scene = _scene(config.scene.path)
-    model = load_model(run, step=_STEP.value)
+    model = saved.load_model(run, step=_STEP.value)
     return subjects.Subject(
         name=run.resolve().name,
         model=model,
@@ -101,10 +117,10 @@ def _scene(trained_on: str) -> Path | None:
         return scene_option.opened(_SCENE.value)
     try:
         return scene_option.opened(trained_on)
-    except (SceneError, OSError) as error:
+    except (errors.SceneError, OSError) as error:
         print(f"warning: the scene of the run can not be read: {error}")
         return None
 
 
 if __name__ == "__main__":
-    commands.run(main)
+    commands.run(main, again="it shows the run again; nothing is written.")

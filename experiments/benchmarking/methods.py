@@ -11,10 +11,17 @@ Nerfacto's fields (`oracle_nerfacto`) bring their own sizes, samples and footpri
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from experiments.presets import PRESETS
-from refref_jax.fields import registry
+from experiments import command_line
+from experiments.late_imports import late
+
+if TYPE_CHECKING:
+    from experiments import presets
+    from refref_jax.fields import registry
+else:
+    presets = late("experiments.presets")
+    registry = late("refref_jax.fields.registry")
 
 Need = Literal["meshes", "masks", "colours"]
 Group = Literal["main", "ablation of the oracle", "ablation of the tree"]
@@ -120,7 +127,7 @@ FULL: dict[Group, str] = {"ablation of the oracle": "oracle", "ablation of the t
 def same_as(method: Method, preset: str) -> str | None:
     """Returns which method an ablation is again, where its footprint is the preset's already."""
     chosen = dict(word.lstrip("-").split("=", 1) for word in method.train).get("footprint")
-    size = registry.KINDS[registry.USUAL].sizes[PRESETS[preset].size]
+    size = registry.KINDS[registry.USUAL].sizes[presets.PRESETS[preset].size]
     return FULL[method.group] if chosen == size.footprint else None
 
 
@@ -147,7 +154,9 @@ def _meaning(word: str) -> list[str]:
         "all": list(METHODS),
     }
     if word not in METHODS and word not in groups:
+        names = (*METHODS, *groups)
+        near = command_line.did_you_mean(word, names)
         raise ValueError(
-            f"There is no method {word!r}. Choose from {', '.join((*METHODS, *groups))}."
+            f"There is no method {word!r} for --methods.{near} Choose from {', '.join(names)}."
         )
     return groups.get(word, [word])

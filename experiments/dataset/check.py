@@ -1,6 +1,6 @@
 """Checks scenes that were made: files, meshes, and pictures against our own light paths.
 
-python -m experiments.dataset.check runs/dataset --views=3
+python -m experiments.dataset.check runs/dataset --limit=3
 
 Each scene's meshes are linted and all of its images opened. Some of its test views are rendered
 again along the path tree, with a finer cut and more bends than `render_known --paths=tree` has by
@@ -10,51 +10,65 @@ it all, {out}/check.json has the figures; {out} is the folder itself by default.
 not hold makes the command end with status 1.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from absl import flags
 
-from experiments import budget_options, commands, known_scenes, supersampling
-from experiments.dataset import render_settings, scene_check
-from experiments.dataset.check_page import SceneReport, write_page
+from experiments import budget_options, commands, options, output_folders
+from experiments.dataset import render_settings
+from experiments.late_imports import late
+
+if TYPE_CHECKING:
+    from experiments.dataset import check_page, scene_check
+    from experiments.dataset.check_page import SceneReport
+else:
+    check_page = late("experiments.dataset.check_page")
+    scene_check = late("experiments.dataset.scene_check")
 
 _SCENES = flags.DEFINE_list("scenes", None, "Only these scenes of the folder, by name.")
-_VIEWS = flags.DEFINE_integer("views", 3, "Test views to compare, evenly spread; 0 for none.", 0)
-_OUT = flags.DEFINE_string("out", None, "Folder to write the report to.")
+_LIMIT = flags.DEFINE_integer("limit", 3, "Only this many test images, evenly spread; 0: none.", 0)
+flags.DEFINE_alias("views", "limit")
+_OUT = flags.DEFINE_string("out", None, "Folder of the report; FOLDER if not given.")
+_OVERWRITE = options.overwrite("the report of an earlier check")
 flags.adopt_module_key_flags(budget_options)
 # Diamond keeps light for so long that the tree's own cut loses 5 dB of 39, and what Cycles drops
 # after its 64 bounces another 6. Paths are to be judged here, not where they stop.
 flags.set_default(budget_options.CUT, 0.004)
 flags.set_default(budget_options.BENDS, render_settings.BOUNCES)
-flags.declare_key_flag("rays_per_pixel")
 # What Cycles averages over hundreds of rays aliases with few: a wall of the generator is 41 dB off
 # with 25 rays a pixel of 200 x 200, and 48 with 100.
-flags.set_default(known_scenes.RAYS_PER_PIXEL, 100)
+_RAYS_PER_PIXEL = options.rays_per_pixel(100)
 
 _SHOWN_COMPLAINTS = 3
 
 
 def main(folder: str) -> None:
     """Checks every scene of a folder, and writes the report."""
-    side = supersampling.side_of(known_scenes.RAYS_PER_PIXEL.value)
     budget = dataclasses.replace(budget_options.chosen("tree"), unfinished="dark")
-    checked = Path(folder)
-    scenes = scene_check.find_scenes(checked, _SCENES.value)
+    checked, side = Path(folder), options.side_of(_RAYS_PER_PIXEL.value)
     out = Path(_OUT.value) if _OUT.value else checked
-    out.mkdir(parents=True, exist_ok=True)
+    page, figures = out / "check.html", out / "check.json"
+    for path in (page, figures):
+        output_folders.check_file(path, overwrite=_OVERWRITE.value)
+    scenes = scene_check.find_scenes(checked, _SCENES.value)
     reports = []
     with commands.ProgressBar("check", len(scenes)) as bar:
         for done, scene in enumerate(scenes, 1):
-            reports.append(scene_check.check_scene(scene, budget, views=_VIEWS.value, side=side))
+            reports.append(scene_check.check_scene(scene, budget, views=_LIMIT.value, side=side))
             bar.show(done, _summary(reports[-1]))
-    page, figures = out / "check.html", out / "check.json"
-    page.write_text(write_page(reports, title=f"Check of {checked.resolve().name}"), "utf-8")
     content = commands.string_safe([_record(report) for report in reports])
-    figures.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", "utf-8")
+    for path, text in (
+        (page, check_page.write_page(reports, title=f"Check of {checked.resolve().name}")),
+        (figures, json.dumps(content, indent=2, allow_nan=False) + "\n"),
+    ):
+        with output_folders.fresh_file(path, overwrite=_OVERWRITE.value) as draft:
+            draft.write_text(text, "utf-8")
     bad = [report for report in reports if report.complaints]
     for report in bad:
         for complaint in report.complaints[:_SHOWN_COMPLAINTS]:
@@ -63,8 +77,8 @@ def main(folder: str) -> None:
     print(f"Report:  {page}")
     print(f"Figures: {figures}")
     if (scenes[0] / "transforms_train.json").is_file():
-        options = (f"--scene={scenes[0]}", f"--out=runs/{scenes[0].resolve().name}")
-        print(f"Next: {commands.shell('train', *options)}")
+        given = (f"--scene={scenes[0]}", f"--out=runs/{scenes[0].resolve().name}")
+        print(f"Next: {commands.shell('train', *given)}")
     else:
         print("Next: python -m experiments.dataset.make without --preview, for scenes to train on")
     if bad:
@@ -89,4 +103,9 @@ def _record(report: SceneReport) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    commands.run(main, arguments=("FOLDER",))
+    commands.run(
+        main,
+        arguments=("FOLDER",),
+        first=("limit", "rays_per_pixel", "scenes"),
+        again="it checks anew; --overwrite replaces the report.",
+    )

@@ -1,4 +1,4 @@
-"""Converts scenes between the layouts of the data set; images are carried byte for byte.
+r"""Converts scenes between the layouts of the data set; images are carried byte for byte.
 
 python -m experiments.dataset.convert --scene=experiments/data/cube_smcvx_ball --to=parquet \
     --out=converted
@@ -14,18 +14,26 @@ left out, and it is said. What `scene.json` names is kept beside them.
 
 import collections
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import commands, scene_option
-from experiments.dataset import conversion, dataset_card, scene_folders
-from refref_jax.data import parquet_scenes, scene_names
+from experiments import commands, options
+from experiments.late_imports import late
+from refref_jax.data import scene_names
 
-_SCENE = flags.DEFINE_string(
-    "scene", None, f"What to convert: {scene_option.FORMS}, or a folder of scenes.", required=True
-)
+if TYPE_CHECKING:
+    from experiments.dataset import conversion, dataset_card, scene_folders
+    from refref_jax.data import parquet_scenes
+else:
+    conversion = late("experiments.dataset.conversion")
+    dataset_card = late("experiments.dataset.dataset_card")
+    scene_folders = late("experiments.dataset.scene_folders")
+    parquet_scenes = late("refref_jax.data.parquet_scenes")
+
+_SCENE = options.scene("What to convert, one scene or a folder of them")
 _TO = flags.DEFINE_enum("to", None, ["local", "raw", "parquet"], "Layout to write.", required=True)
-_OUT = flags.DEFINE_string("out", None, "Folder to write to.", required=True)
+_OUT = options.out("Folder to write to.")
 _SCENES = flags.DEFINE_list("scenes", None, "Only these scenes of a folder; all if not given.")
 
 
@@ -66,4 +74,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    commands.run(main)
+    commands.run(main, again="scenes that are there are refused, and never replaced.")

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments import command_line
 from experiments.dataset import checks
 from experiments.dataset.check_page import SceneReport
 from refref_jax.optics.budgets import Budget
@@ -26,8 +27,12 @@ def find_scenes(folder: Path, names: list[str] | None) -> list[Path]:
             f"{folder} holds no scene: no folder in it has a transforms_test.json. Give a scene, "
             "or the folder that `experiments.dataset.make --out` wrote."
         )
-    if missing := sorted(set(names or ()) - {path.resolve().name for path in found}):
-        raise ValueError(f"{folder} holds no scene {missing[0]}. See the names of its folders.")
+    there = {path.resolve().name for path in found}
+    if missing := sorted(set(names or ()) - there):
+        near = command_line.did_you_mean(missing[0], sorted(there))
+        raise ValueError(
+            f"{folder} holds no scene {missing[0]}.{near or ' See the names of its folders.'}"
+        )
     return [path for path in found if names is None or path.resolve().name in names]
 
 

@@ -1,9 +1,9 @@
 """The scenes of the data set: every object before every kind of background."""
 
-import difflib
 import fnmatch
 from collections.abc import Mapping
 
+from experiments import command_line
 from experiments.dataset.parts import Object
 from refref_jax.data.scene_names import BACKGROUNDS, SceneName
 
@@ -37,10 +37,10 @@ def choose(text: str, objects: Mapping[str, Object]) -> list[SceneName]:
         fitting = fitting or [s for s in scenes if fnmatch.fnmatchcase(s.object, pattern)]
         if not fitting:
             names = [*map(str, scenes), *objects]
-            near = difflib.get_close_matches(pattern, names, n=3) or names[:3]
+            near = command_line.did_you_mean(pattern, names, most=3)
             raise ValueError(
-                f"No scene or object is called {pattern!r}. Choose from names as "
-                f"{', '.join(near)}, or all."
+                f"No scene or object is called {pattern!r}.{near or f' Names are as {names[0]}.'} "
+                "All of them: all."
             )
         chosen.update(fitting)
     return [scene for scene in scenes if scene in chosen]

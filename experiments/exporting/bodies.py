@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments import output_folders
 from experiments.exporting.field_grid import split_parts
 from experiments.r3f import body, records
 from refref_jax.data import stored_normals
@@ -15,18 +16,20 @@ from refref_jax.reconstruct.triangles import Mesh
 from refref_jax.render.saved import load_geometry
 
 
-def write(run: Path, out: Path) -> list[Path]:
+def write(run: Path, out: Path, *, overwrite: bool) -> list[Path]:
     """Writes all bodies of a run, or of a reconstruction; each has a file of its own.
 
     Args:
       run: the folder.
       out: of one body, its file; of several, their names are numbered: `out_0.ply`, `out_1.ply`.
+      overwrite: whether files may be replaced.
 
     Returns:
       The files.
 
     Raises:
-      ValueError: if it is no folder of a run, if there is no body, or a file exists.
+      ValueError: if it is no folder of a run, if there is no body, or a file may not be
+        replaced.
     """
     if records.exists(run):
         meshes = [body.read_mesh(run, _finished(run))]
@@ -40,11 +43,11 @@ def write(run: Path, out: Path) -> list[Path]:
     paths = [out]
     if len(meshes) > 1:
         paths = [out.with_stem(f"{out.stem}_{number}") for number in range(len(meshes))]
-    if existing := [path for path in paths if path.exists()]:
-        raise ValueError(f"{existing[0]} exists, and nothing is overwritten. Give another --out.")
-    out.parent.mkdir(parents=True, exist_ok=True)
+    for path in paths:
+        output_folders.check_file(path, overwrite=overwrite)
     for path, mesh in zip(paths, meshes, strict=True):
-        stored_normals.write_mesh(path, *mesh)
+        with output_folders.fresh_file(path, overwrite=overwrite) as draft:
+            stored_normals.write_mesh(draft, *mesh)
     return paths
 
 

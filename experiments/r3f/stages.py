@@ -1,6 +1,7 @@
 """How a stage leaves its result: under another name first, and under its own when it is whole.
 
-Whoever is killed in between leaves what the next attempt removes.
+An error, or Ctrl-C, leaves nothing of it. Whoever is killed in between leaves what the next attempt
+removes.
 """
 
 import contextlib
@@ -15,18 +16,24 @@ def unfinished_folder(target: Path) -> Iterator[Path]:
     draft = beside(target)
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir()
-    yield draft
-    if target.exists():
-        shutil.rmtree(target)
-    draft.rename(target)
+    try:
+        yield draft
+        if target.exists():
+            shutil.rmtree(target)
+        draft.rename(target)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
 
 
 @contextlib.contextmanager
 def unfinished_file(target: Path) -> Iterator[Path]:
     """Yields the path of a file that takes the place of the target when the context ends well."""
     draft = beside(target)
-    yield draft
-    draft.replace(target)
+    try:
+        yield draft
+        draft.replace(target)
+    finally:
+        draft.unlink(missing_ok=True)
 
 
 def beside(target: Path) -> Path:

@@ -184,31 +184,3 @@ def test_mistakes_end_with_one_line_that_says_what_to_do(tmp_path, command, opti
     assert "Traceback" not in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        "train",
-        "evaluate",
-        "metrics",
-        "reconstruct",
-        "render",
-        "render_known",
-        "export",
-        "convert_nerfstudio",
-        "path_trade_off",
-        "trade_off",
-        "recommend",
-        "benchmark",
-    ],
-)
-def test_help_explains_every_option(command):
-    result = run_command(command, "--help", fails=True)  # absl has it so
-    source = (ROOT / "experiments" / f"{command}.py").read_text()
-    for shared in re.findall(r"adopt_module_key_flags\((\w+)\)", source):
-        source += (ROOT / "experiments" / f"{shared}.py").read_text()
-    names = re.findall(r'flags\.DEFINE_\w+\(\s*"(\w+)"', source)
-    assert len(names) >= 4
-    for name in names:
-        assert re.search(rf"--(\[no\])?{name}:", result.stdout), name

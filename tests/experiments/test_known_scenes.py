@@ -68,21 +68,27 @@ def test_a_rendering_is_measured_and_pictured(rendered):
 
 
 @pytest.mark.slow
-def test_results_are_replaced_with_a_word_and_other_files_not_at_all(rendered, tmp_path):
+def test_results_are_replaced_when_asked_and_other_files_not_at_all(rendered, tmp_path):
     out, _ = rendered
     ours = tmp_path / "again"
     shutil.copytree(out, ours)
     (ours / "notes.txt").write_text("mine")
     measures = tmp_path / "measures.json"
     options = (f"--scene={_SCENE}", "--paths=straight", f"--out={ours}", "--rays_per_pixel=4")
-    result = run_command("render_known", *options, "--views=3", f"--json={measures}")
-    assert "Replacing" in result.stdout
+    refused = run_command("render_known", *options, fails=True)
+    assert "--overwrite" in refused.stderr and (ours / "metrics.json").exists()
+    options += ("--overwrite", "--views=3", f"--json={measures}")
+    run_command("render_known", *options)
     assert {path.name for path in (ours / "rgb").iterdir()} == {"r_003.png"}
+    assert not (ours / "metrics.json").exists()  # it was of what is replaced
     assert (ours / "notes.txt").read_text() == "mine"
     summary = json.loads(measures.read_text())
     assert summary["casts_per_pixel"] == 0.0 and summary["paths_per_pixel"] == 1.0
+    noted = json.loads((ours / "command.json").read_text())
+    assert noted["command"] == "experiments.render_known"
+    assert noted["options"]["paths"] == "straight" and noted["options"]["rule"] == "nested"
     measures.write_text("{}")
-    refused = run_command("render_known", *options, f"--json={measures}", fails=True)
+    refused = run_command("render_known", *options, fails=True)
     assert "not of this command" in refused.stderr and measures.read_text() == "{}"
 
 

@@ -12,7 +12,7 @@ import sys
 
 from absl import flags
 
-from experiments import benchmark, child_process
+from experiments import benchmark, child_process, command_line
 from tests.experiments.benchmarking.conftest import stand_in_line
 
 
@@ -23,7 +23,8 @@ def _answer(request):
     out, err, status = io.StringIO(), io.StringIO(), 0
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            flags.FLAGS(["benchmark", *request["words"]])
+            words = ["benchmark", *request["words"]]
+            command_line.read(words, benchmark, first=(), again="")
             benchmark.main()
         except SystemExit as end:
             status = end.code

@@ -170,16 +170,16 @@ def test_bodies_keep_their_normals_and_corners():
 def test_a_run_s_bodies_are_files_that_are_read_again(tmp_path, monkeypatch):
     geometry = scenes.geometry(solids.box(centre=(3.0, 0.0, 0.0)), solids.ball())
     monkeypatch.setattr(bodies, "load_geometry", lambda run: geometry)
-    written = bodies.write(tmp_path, tmp_path / "new" / "body.ply")
+    written = bodies.write(tmp_path, tmp_path / "new" / "body.ply", overwrite=False)
     assert [path.name for path in written] == ["body_0.ply", "body_1.ply"]
     part = meshes.read_part(written[1], index=1.5)
     np.testing.assert_array_equal(part.normals, stored_normals.read_normals(written[1]))
     assert len(part.faces) == 320
-    with pytest.raises(ValueError, match=r"body_0\.ply exists, and nothing is overwritten"):
-        bodies.write(tmp_path, tmp_path / "new" / "body.ply")
+    with pytest.raises(ValueError, match=r"body_0\.ply exists.* --overwrite"):
+        bodies.write(tmp_path, tmp_path / "new" / "body.ply", overwrite=False)
     monkeypatch.setattr(bodies, "load_geometry", lambda run: scenes.geometry())
     with pytest.raises(ValueError, match="has no body"):
-        bodies.write(tmp_path, tmp_path / "none.ply")
+        bodies.write(tmp_path, tmp_path / "none.ply", overwrite=False)
 
 
 def test_colours_go_by_the_side_that_is_looked_at(model):
@@ -197,7 +197,9 @@ def test_the_command_writes_the_bodies_of_a_run(trained, tmp_path):
     read = trimesh.load(tmp_path / "body.ply")
     assert read.volume == pytest.approx(4.0 / 3.0 * np.pi * 1.4**3, rel=0.01)  # the bundled ball
     again = run_command("export", *options, fails=True)
-    assert "nothing is overwritten" in again.stderr and "Traceback" not in again.stderr
+    assert "--overwrite to replace it" in again.stderr and "Traceback" not in again.stderr
+    run_command("export", *options, "--overwrite")
+    assert {path.name for path in tmp_path.iterdir()} == {"body.ply"}
 
 
 @pytest.mark.slow
