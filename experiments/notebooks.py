@@ -160,6 +160,7 @@ def _run_cells(notebook: nbformat.NotebookNode, name: str, copy: Path, cell_seco
         kernel_name="python3",
         record_timing=False,
         coalesce_streams=True,
+        extra_arguments=["--log-level=ERROR"],
         resources={"metadata": {"path": str(copy / "experiments" / "colab")}},
     )
     number = {i: n for n, i in enumerate(_code_cells(notebook), start=1)}
