@@ -2,6 +2,7 @@
 # Both create .venv first, and may be repeated. `make dataset-env` installs Blender, which
 # `python -m experiments.dataset.make` renders with, beside it. `make benchmark-small` needs both: it
 # renders six scenes and compares three methods on them; docs/benchmark.md says how long that takes.
+# `make notebooks` executes those of experiments/colab and stores them with what they print and draw.
 
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
@@ -17,7 +18,7 @@ SMALL := runs/benchmark-small
 SMALL_SCENES := cube_smcvx_cylinder,env_smcvx_pyramid,cube_smncvx_torus,sphere_smncvx_teapot
 SMALL_SCENES := $(SMALL_SCENES),sphere_mmncvx_conical_flask,env_mmncvx_perfume_red
 
-.PHONY: demo test test-slow lint format clean dataset-env benchmark-small
+.PHONY: demo test test-slow lint format clean notebooks dataset-env benchmark-small
 
 demo: $(READY)
 	$(RUN) experiments.train --scene=experiments/data/cube_smcvx_ball --preset=tiny \
@@ -38,6 +39,9 @@ lint: $(READY)
 format: $(READY)
 	$(RUN) ruff check --fix .
 	$(RUN) ruff format .
+
+notebooks: $(READY)
+	$(RUN) experiments.notebooks --write
 
 dataset-env: $(BLENDER_READY)
 	@echo "Blender is in $(BLENDER_VENV). Next: $(RUN) experiments.dataset.make --help"
