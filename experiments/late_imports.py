@@ -53,14 +53,15 @@ def _import(name: str) -> ModuleType:
 @contextlib.contextmanager
 def _interrupted_afterwards() -> Iterator[None]:
     """Puts Ctrl-C off: JAX's compiled modules crash where it meets them while they are imported."""
-    if threading.current_thread() is not threading.main_thread():
+    raises = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not raises or threading.current_thread() is not threading.main_thread():
         yield
         return
     met: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, frame: met.append(number))
+    signal.signal(signal.SIGINT, lambda number, frame: met.append(number))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     if met:
         raise KeyboardInterrupt
