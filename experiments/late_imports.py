@@ -10,7 +10,13 @@ them is imported. Who reads types, and who checks them, is shown plain imports:
         trainer = late("experiments.trainer")
 """
 
+import contextlib
 import importlib
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from types import ModuleType
 from typing import Any
 
 
@@ -28,10 +34,34 @@ class _Late:
         object.__setattr__(self, "_name", name)
 
     def __getattr__(self, attribute: str) -> Any:
-        return getattr(importlib.import_module(self._name), attribute)
+        return getattr(_import(self._name), attribute)
 
     def __setattr__(self, attribute: str, value: Any) -> None:
-        setattr(importlib.import_module(self._name), attribute, value)
+        setattr(_import(self._name), attribute, value)
 
     def __repr__(self) -> str:
         return f"late({self._name!r})"
+
+
+def _import(name: str) -> ModuleType:
+    if name in sys.modules:
+        return importlib.import_module(name)
+    with _interrupted_afterwards():
+        return importlib.import_module(name)
+
+
+@contextlib.contextmanager
+def _interrupted_afterwards() -> Iterator[None]:
+    """Puts Ctrl-C off: JAX's compiled modules crash where it meets them while they are imported."""
+    raises = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not raises or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    met: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, frame: met.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if met:
+        raise KeyboardInterrupt

@@ -114,5 +114,5 @@ if __name__ == "__main__":
             *("background", "radius", "samples", "entries", "batch", "method", "reconstruction"),
             *("resume", "seed", "devices"),
         ),
-        again="a run is never replaced; --resume goes on with it.",
+        again="a run is never replaced; the same command with --resume goes on with it.",
     )

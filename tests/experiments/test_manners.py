@@ -1,6 +1,7 @@
 """What all commands have in common: help, mistakes, and that nothing is replaced unasked."""
 
 import json
+import signal
 import subprocess
 import sys
 
@@ -185,6 +186,17 @@ def test_a_late_module_is_imported_when_it_is_used(monkeypatch):
     assert module.ONE_THIRD == 1.0 / 3.0 and "colorsys" in sys.modules
     monkeypatch.setattr(module, "ONE_THIRD", 2)
     assert sys.modules["colorsys"].ONE_THIRD == 2
+
+
+def test_an_interrupt_waits_until_a_module_is_imported(tmp_path, monkeypatch):
+    text = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nwhole = True\n"
+    (tmp_path / "interrupted_import.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        _ = late("interrupted_import").whole
+    assert sys.modules.pop("interrupted_import").whole
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_what_was_meant():
