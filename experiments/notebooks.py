@@ -9,6 +9,9 @@ notebooks before it are written by then. The extra `notebooks` has what this nee
 `experiments` and `r3f` what the notebooks need.
 """
 
+from __future__ import annotations
+
+import importlib.util
 import os
 import shutil
 import sys
@@ -16,20 +19,21 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from absl import flags
 
 from experiments import commands
+from experiments.late_imports import late
 
-try:
+if TYPE_CHECKING:
     import nbclient
     import nbformat
-    from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
-except ModuleNotFoundError as error:
-    if error.name not in ("nbclient", "nbformat"):
-        raise
-    sys.exit(f"error: {error.name} is missing. Run pip install 'refref_jax[notebooks]'.")
+    from nbclient import exceptions
+else:
+    nbclient = late("nbclient")
+    nbformat = late("nbformat")
+    exceptions = late("nbclient.exceptions")
 
 _WRITE = flags.DEFINE_bool("write", False, "Write the notebooks back, with their outputs.")
 _ONLY = flags.DEFINE_list("only", [], "Names of the notebooks to execute; all if not given.")
@@ -54,6 +58,9 @@ _LINES_OF_AN_ERROR = 15
 
 def main() -> None:
     """Executes the chosen notebooks."""
+    for name in ("nbclient", "nbformat", "ipykernel"):
+        if importlib.util.find_spec(name) is None:
+            raise ValueError(f"{name} is missing. Run pip install 'refref_jax[notebooks]'.")
     paths = find(_ONLY.value)
     for path in paths:
         start = time.monotonic()
@@ -169,7 +176,11 @@ def _run_cells(notebook: nbformat.NotebookNode, name: str, copy: Path, cell_seco
         try:
             # The reader's own settings of IPython have no say.
             client.execute(env={**os.environ, "IPYTHONDIR": str(copy / "ipython")})
-        except (CellExecutionError, CellTimeoutError, DeadKernelError) as error:
+        except (
+            exceptions.CellExecutionError,
+            exceptions.CellTimeoutError,
+            exceptions.DeadKernelError,
+        ) as error:
             cell = notebook.cells[current[-1]]
             raise ValueError(_explain(name, number[current[-1]], cell, error)) from error
 
@@ -198,9 +209,9 @@ def _code_cells(notebook: nbformat.NotebookNode) -> list[int]:
 
 def _explain(name: str, number: int, cell: nbformat.NotebookNode, error: Exception) -> str:
     """Says which cell failed, how, and what it had printed last."""
-    if isinstance(error, CellExecutionError):
+    if isinstance(error, exceptions.CellExecutionError):
         what = f"{error.ename}: {error.evalue}"
-    elif isinstance(error, CellTimeoutError):
+    elif isinstance(error, exceptions.CellTimeoutError):
         what = "it took too long; --cell_seconds gives it more"
     else:
         what = "the kernel died, perhaps for want of memory"
@@ -210,4 +221,4 @@ def _explain(name: str, number: int, cell: nbformat.NotebookNode, error: Excepti
 
 
 if __name__ == "__main__":
-    commands.run(main)
+    commands.run(main, again="it executes them anew; only --write replaces what is stored.")

@@ -91,4 +91,4 @@ def judge(mesh: Mesh, index: float, judges: BodyPixels, model: Model) -> float:
         part=0,
         config=model.config,
     )
-    return float(np.mean(errors, dtype=np.float64))
+    return float(np.asarray(errors, np.float64).mean())

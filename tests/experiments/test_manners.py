@@ -28,6 +28,7 @@ _IN_THE_WAY = {
     "render": (["--run=x", "--out=FOLDER"], "rgb.gif"),
     "render_known": (["--scene=x", "--out=FOLDER"], "rgb/mine.png"),
     "path_trade_off": (["--scenes=x", "--out=FOLDER"], "path_trade_off.csv"),
+    "glass_figures": (["--scene=x", "--out=FOLDER"], "glass_fan.jpg"),
     "metrics": (["x", "y", "--out=FOLDER/metrics.json"], "metrics.json"),
     "export": (["--run=x", "--what=mesh", "--out=FOLDER/a.ply"], "a.ply"),
     "convert_lpips": (["--alexnet=x", "--lpips=x", "--out=FOLDER/a.npz"], "a.npz"),
