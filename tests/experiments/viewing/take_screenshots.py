@@ -1,0 +1,52 @@
+"""Takes the pictures of docs/viewer.md, of a viewer that runs.
+
+    python -m experiments.view --run=runs/demo --heights=36,180,540
+    python -m tests.experiments.viewing.take_screenshots http://127.0.0.1:8080 docs
+
+`viewer_rgb.jpg` is the page as it opens; `viewer_paths.jpg` after a click on the body and a turn of
+the camera, so that the paths are seen from beside.
+"""
+
+import sys
+import tempfile
+from pathlib import Path
+
+import imageio.v3 as iio
+
+from tests.experiments.viewing import browser
+
+_SIZE = (1280, 720)
+_PATIENCE = 600.0
+
+# Left of the middle of what the panel leaves free, on the body; and a quarter turn.
+_CLICK = (400, 400)
+_TURN = ((300, 560), (620, 520))
+
+
+def main(address: str, out: str) -> None:
+    """Opens the page, and keeps it twice."""
+    with (
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
+        browser.opened(address, Path(profile), size=_SIZE) as page,
+    ):
+        _wait_for(page, "size 3 of 3")
+        _keep(page, Path(out) / "viewer_rgb.jpg")
+        page.click(*_CLICK)
+        _wait_for(page, "left the objects")
+        page.drag(*_TURN)
+        browser.until(lambda: "size 3 of 3" not in page.text(), "a new picture is begun")
+        _wait_for(page, "size 3 of 3")
+        _keep(page, Path(out) / "viewer_paths.jpg")
+
+
+def _wait_for(page: browser.Page, words: str) -> None:
+    browser.until(lambda: words in page.text(), words, patience=_PATIENCE)
+
+
+def _keep(page: browser.Page, path: Path) -> None:
+    iio.imwrite(path, page.screenshot(), quality=88)
+    print(path)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
