@@ -99,8 +99,8 @@ def test_after_ablations_none_are_proposed(tmp_path, serve, scenes):
         path.unlink()
     answer = serve(tmp_path, scenes, "--methods=ablations")
     assert "its test views can not be read" in answer.stdout
-    assert "Next:" not in answer.stdout and not calls(tmp_path)
-    assert "Next:" in serve(tmp_path, scenes, "--methods=tree,tree_cone").stdout
+    assert "Next: open " in answer.stdout and not calls(tmp_path)
+    assert "--methods=ablations" in serve(tmp_path, scenes, "--methods=tree,tree_cone").stdout
 
 
 @pytest.mark.parametrize("kind", ["text", "zeros"])
