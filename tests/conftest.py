@@ -54,9 +54,14 @@ def _strict_dtypes(request):
 
 
 @pytest.fixture(scope="module")
-def _compiled_lightly():
-    """Takes a third off the time of a module that compiles much and computes little."""
-    jax.config.update("jax_disable_most_optimizations", True)
+def _compiled_lightly(request):
+    """Takes a third off the time of a module that compiles much and computes little.
+
+    Not where slow tests are run: these compile as for users, and those modules' others too by
+    `pytest -m "slow or not slow"`.
+    """
+    lightly = request.config.getoption("markexpr") == "not slow"
+    jax.config.update("jax_disable_most_optimizations", lightly)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
 

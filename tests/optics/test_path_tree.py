@@ -12,6 +12,8 @@ from refref_jax.optics.budgets import BUDGETS, PAPER, TREE, Budget, room
 from refref_jax.optics.light_paths import PathStatus
 from tests import scenes
 
+pytestmark = pytest.mark.usefixtures("_compiled_lightly")
+
 _GLASS = 0.04
 """Fresnel's R of glass head-on."""
 

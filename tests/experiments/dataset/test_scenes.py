@@ -44,7 +44,7 @@ def test_names_objects_and_wildcards_choose_in_one_order(text, names):
 
 @pytest.mark.parametrize("text", ["cube_smcvx_torus", "", "ball,,torus", "Ball"])
 def test_a_name_that_fits_nothing_is_told(text):
-    with pytest.raises(ValueError, match="Choose from"):
+    with pytest.raises(ValueError, match="All of them: all"):
         scenes.choose(text, _OBJECTS)
     with pytest.raises(ValueError, match="cube_smncvx_torus"):
         scenes.choose("cube_smcvx_torus", _OBJECTS)
