@@ -9,6 +9,7 @@ the camera, so that the paths are seen from beside.
 
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -18,9 +19,12 @@ from tests.experiments.viewing import browser
 _SIZE = (1280, 720)
 _PATIENCE = 600.0
 
-# Left of the middle of what the panel leaves free, on the body; and a quarter turn.
-_CLICK = (400, 400)
-_TURN = ((300, 560), (620, 520))
+# On the bundled ball, left of its middle; and a turn, begun beside it.
+_CLICK = (540, 300)
+_TURN = ((200, 600), (480, 560))
+
+# Tells that the browser draws without a GPU, which headless ones do.
+_CLOSE_NOTICE = "document.querySelector('[class*=Notification-closeButton]')?.click()"
 
 
 def main(address: str, out: str) -> None:
@@ -30,6 +34,8 @@ def main(address: str, out: str) -> None:
         browser.opened(address, Path(profile), size=_SIZE) as page,
     ):
         _wait_for(page, "size 3 of 3")
+        page.evaluate(_CLOSE_NOTICE)
+        time.sleep(1.0)  # it fades
         _keep(page, Path(out) / "viewer_rgb.jpg")
         page.click(*_CLICK)
         _wait_for(page, "left the objects")
