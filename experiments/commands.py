@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 from absl import app, logging
 
 from experiments import command_line
-from experiments.late_imports import late
+from experiments.late_imports import INTERRUPTED, late
 
 if TYPE_CHECKING:
     from rich import progress
@@ -27,9 +27,6 @@ STOP_WITH_INPUT = "REFREF_STOP_WITH_INPUT"
 
 Whoever starts a command so, and holds the other end, takes it along when it ends or is killed.
 """
-
-INTERRUPTED = 130
-"""Status of a command that was stopped by Ctrl-C, as shells have it."""
 
 
 def run(
@@ -65,11 +62,12 @@ def run(
             main(*words[1:])
         except (ValueError, OSError) as error:
             command_line.fail(str(error))
-        except KeyboardInterrupt:
-            print(f"Interrupted. {again}".rstrip(), file=sys.stderr)
-            sys.exit(INTERRUPTED)
 
-    app.run(guarded, flags_parser=parse)
+    try:
+        app.run(guarded, flags_parser=parse)
+    except KeyboardInterrupt:
+        print(f"Interrupted. {again[:1].upper()}{again[1:]}".rstrip(), file=sys.stderr)
+        sys.exit(INTERRUPTED)
 
 
 def _stop_with_input() -> None:
@@ -130,7 +128,8 @@ class Interrupt:
         del frame
         self.requested = True
         signal.signal(number, signal.SIG_DFL)
-        print("Stopping after this step; once more to stop at once.", flush=True)
+        # Not `print`: the signal may have come while something was being printed.
+        os.write(1, b"Stopping after this step; once more to stop at once.\n")
 
 
 class ProgressBar:

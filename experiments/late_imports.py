@@ -12,12 +12,16 @@ them is imported. Who reads types, and who checks them, is shown plain imports:
 
 import contextlib
 import importlib
+import os
 import signal
 import sys
 import threading
 from collections.abc import Iterator
 from types import ModuleType
 from typing import Any
+
+INTERRUPTED = 130
+"""Status of a command that was stopped by Ctrl-C, as shells have it."""
 
 
 def late(name: str) -> Any:
@@ -52,16 +56,27 @@ def _import(name: str) -> ModuleType:
 
 @contextlib.contextmanager
 def _interrupted_afterwards() -> Iterator[None]:
-    """Puts Ctrl-C off: JAX's compiled modules crash where it meets them while they are imported."""
+    """Puts Ctrl-C off: JAX's compiled modules crash where it meets them while they are imported.
+
+    The second ends the process at once: nothing has been begun yet.
+    """
     raises = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if not raises or threading.current_thread() is not threading.main_thread():
         yield
         return
     met: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, frame: met.append(number))
+
+    def note(number: int, frame: object) -> None:
+        del frame
+        if met:
+            os._exit(INTERRUPTED)
+        met.append(number)
+        os.write(2, b"Stopping when JAX is imported; once more to stop at once.\n")
+
+    signal.signal(signal.SIGINT, note)
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    if met:
-        raise KeyboardInterrupt
+        if met:
+            raise KeyboardInterrupt

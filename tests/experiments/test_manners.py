@@ -139,7 +139,8 @@ def test_a_command_tells_what_to_run_next(command):
 def test_an_interrupt_is_130_and_says_how_to_go_on(tried, command):
     answer = tried[0][command]
     assert answer["interrupted"]["status"] == commands.INTERRUPTED == 130
-    assert answer["interrupted"]["err"] == f"Interrupted. {answer['settings']['again']}\n"
+    again = answer["settings"]["again"]
+    assert answer["interrupted"]["err"] == f"Interrupted. {again[0].upper()}{again[1:]}\n"
 
 
 @pytest.mark.parametrize("command", _COMMANDS)
