@@ -11,7 +11,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @pytest.mark.parametrize("number", _SIGNALS)
-def test_a_signal_is_noted_and_the_signals_are_given_back(number, capsys):
+def test_a_signal_is_noted_and_the_signals_are_given_back(number, capfd):
     before = [signal.getsignal(each) for each in _SIGNALS]
     with commands.Interrupt() as interrupt:
         assert not interrupt.requested
@@ -19,7 +19,7 @@ def test_a_signal_is_noted_and_the_signals_are_given_back(number, capsys):
         assert interrupt.requested
         # The next one ends the process.
         assert signal.getsignal(number) is signal.SIG_DFL
-    assert "Stopping after this step" in capsys.readouterr().out
+    assert "Stopping after this step" in capfd.readouterr().out
     assert [signal.getsignal(each) for each in _SIGNALS] == before
 
 
