@@ -10,6 +10,8 @@ from refref_jax.geometry import bvh, bvh_build, lockstep_traversal
 from refref_jax.geometry.rays import Rays
 from tests import reference
 
+pytestmark = pytest.mark.usefixtures("_compiled_lightly")
+
 # Distances are float32 sums of terms near 10.
 _DISTANCE_TOLERANCE = 2e-5
 
