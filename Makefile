@@ -27,7 +27,7 @@ demo: $(READY)
 	@echo "Look at runs/demo/eval/test/comparison.png"
 
 test: $(READY)
-	$(RUN) pytest --numprocesses=auto --maxprocesses=4 --dist=loadscope
+	$(RUN) pytest --numprocesses=auto --maxprocesses=4 --dist=loadscope --no-loadscope-reorder
 
 test-slow: $(READY)
 	$(RUN) pytest -m slow

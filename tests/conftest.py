@@ -32,6 +32,29 @@ _LOOSE = (
 )
 
 
+# Modules of more than half a minute: a worker that comes to one last keeps the others waiting.
+_LONGEST = (
+    "test_documents.py",
+    "test_path_tracing.py",
+    "test_path_tree.py",
+    "test_stability.py",
+    "test_loop.py",
+    "test_chain.py",
+    "test_bvh.py",
+    "test_corners.py",
+    "test_refinement.py",
+    "test_training_body.py",
+    "test_coherence.py",
+    "test_fields.py",
+    "test_extremes.py",
+    "test_occupancy.py",
+)
+
+
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: item.path.name not in _LONGEST)
+
+
 # Compiled programs are mapped into memory one by one, and Linux allows a process 65,530 mappings:
 # past them LLVM aborts.
 _MOST_MAPPINGS = 30_000

@@ -14,6 +14,7 @@ _PAGES = ["README.md", *sorted(f"docs/{page.name}" for page in (ROOT / "docs").g
 _LINK = re.compile(r"\[(?P<text>[^\]]*)\]\((?P<file>[^)#:\s]*)(?:#(?P<heading>[^)\s]*))?\)")
 
 
+@pytest.mark.usefixtures("_compiled_lightly")
 @pytest.mark.parametrize(
     ("page", "printed"),
     [

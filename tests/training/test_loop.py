@@ -64,7 +64,7 @@ def test_a_resumed_run_continues_bit_for_bit(tmp_path, pause):
     _assert_identical(early + late, reports)
 
 
-@pytest.mark.parametrize("every", [(3,), (4,), (10, 5)])
+@pytest.mark.parametrize("every", [pytest.param((3,), marks=pytest.mark.slow), (4,), (10, 5)])
 def test_steps_taken_at_once_are_the_same_steps(every):
     one_by_one = {
         int(state.step): jax.device_get((state, report))
