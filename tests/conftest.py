@@ -76,14 +76,27 @@ def _strict_dtypes(request):
         yield
 
 
-@pytest.fixture(scope="module")
-def _compiled_lightly(request):
-    """Takes a third off the time of a module that compiles much and computes little.
+# Modules that compute more than they compile.
+_COMPUTING = (
+    "test_against_cycles.py",
+    "test_tree_against_reference.py",
+    "test_chain.py",
+    "test_corners.py",
+    "test_refinement.py",
+    "test_light_refinement.py",
+    "test_index_stage.py",
+)
 
-    Not where slow tests are run: these compile as for users, and those modules' others too by
-    `pytest -m "slow or not slow"`.
+
+@pytest.fixture(autouse=True, scope="module")
+def _compiled_lightly(request):
+    """Compiles without LLVM's optimisations, which takes a quarter off the suite's time.
+
+    Not where slow tests are run: these compile as for users, and the others too by
+    `pytest -m "slow or not slow"`. Commands never compile so.
     """
-    lightly = request.config.getoption("markexpr") == "not slow"
+    quick = request.config.getoption("markexpr") == "not slow"
+    lightly = quick and request.path.name not in _COMPUTING
     jax.config.update("jax_disable_most_optimizations", lightly)
     yield
     jax.config.update("jax_disable_most_optimizations", False)

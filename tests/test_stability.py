@@ -6,8 +6,6 @@ import pytest
 from tests import stability_cases, stability_laws
 from tests.stability_measures import MEASURES
 
-pytestmark = pytest.mark.usefixtures("_compiled_lightly")
-
 
 def _case(measure):
     return pytest.param(measure, id=measure.name, marks=[pytest.mark.slow] if measure.slow else [])

@@ -14,14 +14,11 @@ _PAGES = ["README.md", *sorted(f"docs/{page.name}" for page in (ROOT / "docs").g
 _LINK = re.compile(r"\[(?P<text>[^\]]*)\]\((?P<file>[^)#:\s]*)(?:#(?P<heading>[^)\s]*))?\)")
 
 
-@pytest.mark.usefixtures("_compiled_lightly")
+# Slow, since their functions have examples of their own, which are always tested.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("page", "printed"),
-    [
-        ("README.md", "(128, 128, 3)"),
-        # Its functions have examples of their own, which are always tested.
-        pytest.param("docs/library.md", "(64, 3) (64, 3)", marks=pytest.mark.slow),
-    ],
+    [("README.md", "(128, 128, 3)"), ("docs/library.md", "(64, 3) (64, 3)")],
 )
 def test_the_snippets_of_a_page_run(page, printed, trained, tmp_path, monkeypatch, capsys):
     snippets = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)

@@ -130,7 +130,7 @@ def test_a_notebook_runs_in_a_copy_and_is_tidied(tmp_path, capsys):
     [
         ("print('before')\nraise KeyError('lamp')", r"(?s)cell1.*KeyError: 'lamp'.*before"),
         ("%%bash\necho reason >&2\nexit 3", r"(?s)cell1.*CalledProcessError.*reason"),
-        ("import time; time.sleep(90)", "cell1.*too long"),
+        pytest.param("import time; time.sleep(90)", "cell1.*too long", marks=pytest.mark.slow),
         ("import os; os._exit(1)", "cell1.*died"),
     ],
     ids=["error", "command", "time", "death"],

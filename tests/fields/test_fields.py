@@ -17,8 +17,6 @@ from refref_jax.fields.radiance_field import RadianceFieldConfig
 from refref_jax.sampling.cones import Gaussians
 from tests import gradients, reference_sampling, transformations
 
-pytestmark = pytest.mark.usefixtures("_compiled_lightly")
-
 # Two small matrix products in float32.
 _NETWORK = 1e-5
 

@@ -10,8 +10,6 @@ from refref_jax.geometry import bvh, bvh_build, lockstep_traversal
 from refref_jax.geometry.rays import Rays
 from tests import reference
 
-pytestmark = pytest.mark.usefixtures("_compiled_lightly")
-
 # Distances are float32 sums of terms near 10.
 _DISTANCE_TOLERANCE = 2e-5
 
@@ -144,7 +142,16 @@ def test_hits_agree_with_embree(aim):
     assert close.mean() >= 0.999 if aim in ("random", "axes") else close.mean() >= 0.97
 
 
-@pytest.mark.parametrize("count", [1, 15, 16, 17, 100])
+@pytest.mark.parametrize(
+    "count",
+    [
+        1,
+        pytest.param(15, marks=pytest.mark.slow),
+        16,
+        17,
+        pytest.param(100, marks=pytest.mark.slow),
+    ],
+)
 def test_packets_and_lockstep_give_the_same_hits(count):
     triangles = _soup(60)
     origins, directions = _random_rays(count)

@@ -68,7 +68,10 @@ def test_sorted_rays_find_the_same_hits(tree):
 
 
 @pytest.mark.parametrize("trace", [bvh.closest_hits, coherence.closest_hits_sorted])
-@pytest.mark.parametrize("count", [100, 128, 600])
+@pytest.mark.parametrize(
+    "count",
+    [pytest.param(100, marks=pytest.mark.slow), pytest.param(128, marks=pytest.mark.slow), 600],
+)
 def test_tiles_find_the_same_hits(tree, trace, count):
     rays, arguments = _rays(count), _arguments(count)
     hits = jax.jit(

@@ -93,6 +93,7 @@ def test_images_that_hardly_differ_against_numpy(params):
     np.testing.assert_allclose(_distance(params, rendered, target), expected, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_equal_images_are_at_no_distance_and_no_slope(params):
     image, _ = _images()
     assert metrics.lpips(params, image, image) == 0.0

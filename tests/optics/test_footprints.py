@@ -12,8 +12,6 @@ from refref_jax.optics.single_path import follow_branch
 from refref_jax.sampling import polylines
 from tests import scenes
 
-pytestmark = pytest.mark.usefixtures("_compiled_lightly")
-
 _RADIUS = 1e-3  # of every ray of tests.scenes
 _GLASS = scenes.geometry(scenes.ball(1.0, subdivisions=3))
 _SLAB = scenes.geometry(scenes.box((10.0, 10.0, 0.6)))

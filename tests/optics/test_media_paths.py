@@ -15,8 +15,6 @@ from refref_jax.optics.media import AMBIENT, EMPTY_SLOT
 from tests import reference, scenes
 from tests.reference import Sphere
 
-pytestmark = pytest.mark.usefixtures("_compiled_lightly")
-
 # Planar bodies are exact: what is left is float32 rounding near coordinates of 4.
 _PLANAR_TOLERANCE = 5e-6
 

@@ -12,8 +12,6 @@ from refref_jax.optics.budgets import BUDGETS, PAPER, TREE, Budget, room
 from refref_jax.optics.light_paths import PathStatus
 from tests import scenes
 
-pytestmark = pytest.mark.usefixtures("_compiled_lightly")
-
 _GLASS = 0.04
 """Fresnel's R of glass head-on."""
 
@@ -172,7 +170,15 @@ def test_light_that_goes_round_inside_a_ball_ends_by_its_budget():
     assert traced.casts == TREE.bends + 1
 
 
-@pytest.mark.parametrize("budget", [PAPER, TREE, Budget(6, "all"), Budget(6, "all", cut=0.3)])
+@pytest.mark.parametrize(
+    "budget",
+    [
+        PAPER,
+        TREE,
+        pytest.param(Budget(6, "all"), marks=pytest.mark.slow),
+        Budget(6, "all", cut=0.3),
+    ],
+)
 def test_untinted_light_is_conserved(budget):
     geometry = scenes.geometry(scenes.ball(1.0))
     ends, traced = _ends(geometry, _towards_a_ball(), budget=_generous(budget))

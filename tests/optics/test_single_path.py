@@ -17,8 +17,6 @@ from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.single_path import follow_branch
 from tests import scenes
 
-pytestmark = pytest.mark.usefixtures("_compiled_lightly")
-
 _DEPTH = 4
 
 

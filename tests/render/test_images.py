@@ -14,8 +14,6 @@ from refref_jax.render import Model, images, init_params, render_image, render_r
 from tests import scenes
 from tests.small_model import CAMERAS, MODEL
 
-pytestmark = pytest.mark.usefixtures("_compiled_lightly")
-
 
 @pytest.fixture(scope="module", autouse=True)
 def tile():

@@ -15,8 +15,6 @@ from refref_jax.render.transport import Jitter
 from tests import gradients, made_paths, reference_sampling
 from tests.small_model import MODEL
 
-pytestmark = pytest.mark.usefixtures("_compiled_lightly")
-
 # Colours of a few float32 products, sums and one power.
 _COLOUR = 1e-5
 

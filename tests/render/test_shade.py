@@ -14,8 +14,6 @@ from refref_jax.optics.light_paths import PathStatus
 from refref_jax.render import render_known, shade
 from tests import gradients, scenes
 
-pytestmark = pytest.mark.usefixtures("_compiled_lightly")
-
 
 def _paths():
     """Two straight paths of ray 1, one of ray 0, and an empty slot that looks nowhere."""

@@ -17,8 +17,6 @@ from refref_jax.sampling import polylines, warps
 from tests import made_paths, reference_sampling
 from tests.small_model import MODEL
 
-pytestmark = pytest.mark.usefixtures("_compiled_lightly")
-
 # Sums of weights, and edges that are found by inverting a cumulative sum.
 _SUMMATION = 5e-6
 

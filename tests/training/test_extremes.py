@@ -153,6 +153,7 @@ def test_light_that_found_no_room_is_told():
     assert report.lost == 0.0
 
 
+@pytest.mark.slow
 def test_a_perfect_batch_has_an_infinite_psnr_that_harms_nothing():
     case = _case("field", "float32")
     params = extremes.parameters(case[1])["trained"]

@@ -18,8 +18,6 @@ from refref_jax.training.state import init_state
 from tests import scenes, small_model
 from tests.small_model import CONFIG, MODEL, SAVED
 
-pytestmark = pytest.mark.usefixtures("_compiled_lightly")
-
 _GEOMETRY = scenes.geometry(scenes.ball(1.3, subdivisions=2))
 
 
