@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from experiments import presets
     from experiments.benchmarking import engines, jobs, scene_list, schedule, settings, summary
     from experiments.benchmarking.jobs import Job, Skipped
-    from experiments.benchmarking.report import page
+    from experiments.benchmarking.report import page, sheet
     from experiments.benchmarking.settings import Benchmark, Settings
 else:
     presets = late("experiments.presets")
@@ -225,12 +225,14 @@ def _duration(seconds: float) -> str:
 
 
 def _finish(out: Path) -> None:
-    """Writes the report, and says where everything is."""
+    """Writes report and picture, and says where everything is."""
     report = page.write(out, views=_REPORT_VIEWS.value, edge=_REPORT_EDGE.value)
     print(f"Summary: {out / summary.FILE}")
     print(f"Tables:  {out / summary.TABLES}")
     print(f"Results: {out / summary.RESULTS}")
     print(f"Report:  {report} ({report.stat().st_size / 1e6:.1f} MB)")
+    if pictures := sheet.write(out):
+        print(f"Picture: {pictures}")
 
 
 def _next(out: Path, done: Sequence[Method]) -> str:

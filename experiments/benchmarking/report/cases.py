@@ -1,4 +1,4 @@
-"""Which views a report shows: where methods fail most, and some spread evenly."""
+"""Which views are shown: where methods fail most, some spread evenly, and one that is typical."""
 
 import math
 from collections.abc import Sequence
@@ -76,6 +76,30 @@ def choose_views(scene: Scene, count: int) -> list[str]:
     return [name for name in names if name in spread or name in worst]
 
 
+def typical_view(scene: Scene) -> str | None:
+    """Returns the name of the view in the middle, ordered by the mean of all methods.
+
+    Views that a method has no PSNR of come last, so that they are in the middle only where most
+    views are such; `None` if there are no views.
+    """
+    values: dict[str, list[float | None]] = {name: [] for name in view_names(scene)}
+    for result in scene.results:
+        for case in _cases(result.record):
+            values[case.view].append(case.psnr_masked)
+    ranked = sorted(values, key=lambda name: _mean(values[name]))
+    return ranked[(len(ranked) - 1) // 2] if ranked else None
+
+
+def psnr_masked(scene: Scene, method: str, view: str) -> float | None:
+    """Returns the PSNR inside the mask of a method's view, dB; `None` if it is not known."""
+    known = {
+        (case.method, case.view): case.psnr_masked
+        for result in scene.results
+        for case in _cases(result.record)
+    }
+    return known.get((method, view))
+
+
 def view_names(scene: Scene) -> list[str]:
     """Returns the names of all views of a scene, in their order."""
     return list(
@@ -109,6 +133,11 @@ def _badness(case: Case) -> tuple[bool, float, bool, float]:
         case.psnr is None,
         case.psnr or 0.0,
     )
+
+
+def _mean(values: Sequence[float | None]) -> float:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known and len(known) == len(values) else math.inf
 
 
 def _mean_badness(record: Record) -> float:
