@@ -8,7 +8,7 @@ methods can be added later. What fails is listed, and the rest goes on. After ev
 {out}/summary.md is written anew: methods by category and background beside the paper's numbers, the
 test views farthest from the training views, and ablations; as Markdown, CSV, JSON and LaTeX in
 {out}/tables. At the end {out}/report.html shows all of it, with pictures, in one page that needs no
-network. --tables_only makes tables and report again from the results that are there.
+network, and {out}/pictures.jpg a typical view of each scene. --tables_only makes these again.
 
 Jobs are done on this machine, --jobs at once, or on a Ray cluster with --ray=ADDRESS, whose
 machines see --out, --scenes and these modules by the same paths. docs/benchmark.md says all.
@@ -47,6 +47,7 @@ else:
     settings = late("experiments.benchmarking.settings")
     summary = late("experiments.benchmarking.summary")
     page = late("experiments.benchmarking.report.page")
+    sheet = late("experiments.benchmarking.report.sheet")
 
 _SCENES = flags.DEFINE_list(
     "scenes",

@@ -284,6 +284,7 @@ def test_the_command_makes_it_again_with_the_tables(out, tmp_path):
     )
     report = tmp_path / "copy" / page.FILE
     assert f"Report:  {report} (" in result.stdout
+    assert f"Picture: {tmp_path / 'copy' / 'pictures.jpg'}" in result.stdout
     found = elements(report.read_text("utf-8"))
     assert len(named(found, "article")) == len(_SCENES)
     assert "r3f_tree" in "".join(named(found, "section", id="jobs")[0].text)  # not forgotten
