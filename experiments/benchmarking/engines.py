@@ -4,6 +4,7 @@ An engine takes jobs, and gives each back when it is done, with the reason if it
 `running.run`, and none knows of what a job waits for; see `schedule`.
 """
 
+import socket
 from collections.abc import Callable
 from concurrent import futures
 from pathlib import Path
@@ -12,6 +13,9 @@ from typing import Any, Protocol
 from experiments import child_process
 from experiments.benchmarking import running
 from experiments.benchmarking.jobs import Job
+
+# Ray itself tries for many minutes, while nobody is told.
+_SECONDS_TO_ANSWER = 10.0
 
 Run = Callable[[Path, Job], str | None]
 """Does a job of the benchmark in a folder; returns why it failed, or `None`."""
@@ -141,6 +145,7 @@ def connect(ray: Any, address: str) -> None:
     """
     root = str(Path(__file__).resolve().parents[2])
     try:
+        _await_answer(address)
         ray.init(
             address=address,
             runtime_env={"env_vars": {"PYTHONPATH": root}},
@@ -148,8 +153,15 @@ def connect(ray: Any, address: str) -> None:
             logging_level="error",
             log_to_driver=False,
         )
-    except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         raise ValueError(
             f"There is no Ray cluster at {address} ({error}). Start one with ray start --head, and "
             "give what it prints, or --ray=local."
         ) from error
+
+
+def _await_answer(address: str) -> None:
+    """Raises an `OSError` if nothing listens at `host:port` or `ray://host:port`."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdigit():
+        socket.create_connection((host.strip("[]"), int(port)), _SECONDS_TO_ANSWER).close()

@@ -210,7 +210,6 @@ def test_without_ray_its_option_says_what_to_install(monkeypatch):
         engines.import_ray()
 
 
-@pytest.mark.slow
 def test_no_cluster_at_an_address_is_said(tmp_path, serve, scenes):
     pytest.importorskip("ray")
     result = serve(tmp_path, scenes, "--methods=straight", "--ray=127.0.0.1:1", status=2)
