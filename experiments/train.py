@@ -49,6 +49,8 @@ _KEEP = flags.DEFINE_integer("keep", 2, "Newest checkpoints to keep.", 1)
 def main() -> None:
     """Plans a run, or finds the one to resume, and trains it."""
     run = Path(_OUT.value)
+    plans.check_options(resume=_RESUME.value)
+    training_body.check_options()
     if device_options.together() and training_body.reconstructs():
         raise ValueError(
             "Several processes do not reconstruct together. Run experiments.reconstruct on one "
@@ -86,7 +88,6 @@ def _begin(run: Path) -> bool:
 def _open(run: Path) -> None:
     """Plans a run and opens its folder; of several processes all plan, and the first opens."""
     run_folder.check_free(run)
-    plans.check_options()
     body = training_body.find(run, resume=_RESUME.value)
     plan = plans.plan_from_flags(body=body)
     devices.wait_for_all("all have planned, and nothing is written yet")

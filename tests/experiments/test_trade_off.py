@@ -114,7 +114,7 @@ def test_what_does_not_exist_is_named(make, message):
     ("options", "message"),
     [
         ((f"--scene={_SCENE}", "--steps=many"), "list of numbers"),
-        (("--scene=nowhere",), "nowhere is no folder"),
+        (("--scene=nowhere",), "nowhere/transforms_train.json does not exist"),
     ],
 )
 def test_mistakes_end_before_anything_is_trained(tmp_path, options, message):
