@@ -23,7 +23,7 @@ CONFIG = "config.json"
 """What makes a folder that of a run."""
 
 _METRICS = "metrics.jsonl"
-_LEFT_BEHIND = (CONFIG, _METRICS, saved.CHECKPOINTS)
+_LEFT_BEHIND = (_METRICS, saved.CHECKPOINTS)
 
 
 def exists(run: Path) -> bool:
@@ -49,10 +49,14 @@ def check_free(run: Path) -> None:
     Raises:
       ValueError: if the folder holds a run already, or is a file.
     """
-    if found := [name for name in _LEFT_BEHIND if (run / name).exists()]:
+    if exists(run):
         raise ValueError(
-            f"{run} holds a run already, or what is left of one ({', '.join(found)}). Continue it "
-            "with --resume, or give another --out."
+            f"{run} holds a run already. Continue it with --resume, or give another --out."
+        )
+    if found := [str(run / name) for name in _LEFT_BEHIND if (run / name).exists()]:
+        raise ValueError(
+            f"{run} holds what is left of a run that can not be continued, for its {CONFIG} is "
+            f"missing. Remove {' and '.join(found)}, or give another --out."
         )
     if run.exists() and not run.is_dir():
         raise ValueError(f"{run} is a file, but a run needs a folder. Give another --out.")

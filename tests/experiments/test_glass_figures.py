@@ -54,6 +54,20 @@ def test_a_torus_has_two_outlines():
     assert reach == pytest.approx([0.7, 1.3], abs=0.02)
 
 
+def test_an_open_mesh_has_one_outline_from_end_to_end():
+    # Three quarters of a tube's wall, whose gap is behind, so that its first point is no end.
+    angles = np.linspace(-0.75 * np.pi, 0.75 * np.pi, 40) + np.pi
+    ring = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    vertices = np.concatenate([np.insert(ring, 2, z, axis=-1) for z in (-1.0, 1.0)])
+    first = np.arange(39)
+    faces = np.concatenate([first[:, None] + [0, 1, 40], first[:, None] + [1, 41, 40]])
+    tube = trimesh.Trimesh(vertices, faces, process=False)
+    (outline,) = cross_sections.outlines_of([_part(tube)])
+    found = np.unwrap(np.arctan2(-outline[:, 1], -outline[:, 0]))
+    assert np.all(np.diff(found) > 0.0) or np.all(np.diff(found) < 0.0)
+    assert sorted(found[[0, -1]]) == pytest.approx([-0.75 * np.pi, 0.75 * np.pi], abs=1e-4)
+
+
 def test_what_the_plane_misses_is_refused():
     above = trimesh.creation.box().apply_translation([0.0, 0.0, 2.0])
     with pytest.raises(SceneError, match="around the origin"):
