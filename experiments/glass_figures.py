@@ -89,4 +89,4 @@ def _drawers(folder: Path, indices: dict[str, float]) -> dict[str, Callable[[Pat
 
 
 if __name__ == "__main__":
-    commands.run(main, again="it refuses to replace its figures, unless --overwrite is given.")
+    commands.run(main, again="a figure is replaced only with --overwrite, and the others stay.")
