@@ -114,8 +114,7 @@ def _measure(chosen: list[KnownScene], plan: list[Setting]) -> list[Trial]:
 
 def _open_scenes() -> list[Path]:
     """Refuses no scene at all, and names that plot and table could not tell apart."""
-    for scene in _SCENES.value:
-        scene_option.check(scene)
+    scene_option.check_all(_SCENES.value)
     folders = [scene_option.opened(scene) for scene in _SCENES.value]
     names = [scene_names.of_folder(folder) for folder in folders]
     if not names:

@@ -1,7 +1,9 @@
 """How commands open the scene that an option names: a folder, or `hf:CONFIG/SCENE`."""
 
 import contextlib
+import glob
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,6 +39,23 @@ def check(source: str | Path | None) -> None:
         raise SceneError(
             f"{folder / 'transforms_train.json'} does not exist. Give a scene: {SCENE_FORMS}."
         )
+
+
+def check_all(sources: Sequence[str]) -> None:
+    """Refuses as `check` does, and passes over what is empty or has wildcards."""
+    for source in sources:
+        if source and not glob.has_magic(source):
+            check(source)
+
+
+def check_place(place: str) -> None:
+    """Refuses a place of one scene or of many that is no folder, nor `hf:...`.
+
+    Raises:
+      SceneError: if it is none.
+    """
+    if not place.startswith("hf:") and not Path(place).is_dir():
+        raise SceneError(f"{place} is no folder. Give one that exists.")
 
 
 def opened(source: str | Path) -> Path:

@@ -104,10 +104,17 @@ _MISTAKES = {
     "import_masks": {
         "--out=OUT --scene=nowhere --masks=x": "nowhere/transforms_train.json does not exist"
     },
-    "benchmark": {"--out=OUT --methods=tree,strait": "Did you mean straight?"},
+    "benchmark": {
+        "--out=OUT --methods=tree,strait": "Did you mean straight?",
+        "--out=OUT --scenes=SCENE,nowhere": "nowhere/transforms_train.json does not exist",
+    },
+    "dataset.convert": {"--scene=nowhere --to=raw --out=OUT": "nowhere is no folder."},
     "dataset.make": {"--out=OUT --scenes=cube_smcvx_bal": "Did you mean cube_smcvx_ball"},
-    "dataset.check": {"x --cut=2": "Give 0.02 for 2 %."},
-    "convert_nerfstudio": {"--source=x --out=OUT --scale=-1": "Give a positive number"},
+    "dataset.check": {"x --cut=2": "Give 0.02 for 2 %.", "nowhere": "nowhere is no folder."},
+    "convert_nerfstudio": {
+        "--source=x --out=OUT --scale=-1": "Give a positive number",
+        "--source=nowhere --out=OUT": "nowhere is no folder.",
+    },
 }
 
 
