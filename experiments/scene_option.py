@@ -35,7 +35,7 @@ def check(source: str | Path | None) -> None:
         scene_names.parse_source(str(source))
         return
     folder = Path(source)
-    if not any(any(folder.glob(each)) for each in ("transforms_*.json", "data/*.parquet")):
+    if not any(any(folder.glob(each)) for each in ("transforms_*.json", "*/*.parquet")):
         raise SceneError(
             f"{folder / 'transforms_train.json'} does not exist. Give a scene: {SCENE_FORMS}."
         )
