@@ -58,8 +58,8 @@ def main() -> None:
     """Writes one file, or one for each body."""
     run, out = Path(_RUN.value), Path(_OUT.value)
     output_folders.check_file(out, overwrite=_OVERWRITE.value)
-    bodies_too = (run_option.RECONSTRUCTION,) if _WHAT.value == "body" else ()
-    run_option.check(run, holds=(run_option.RUN, *bodies_too))
+    others = (run_option.RECONSTRUCTION,) if _WHAT.value == "body" else ()
+    run_option.check(run, holds=(run_option.RUN, *others))
     if _WHAT.value == "body":
         written = bodies.write(run, out, overwrite=_OVERWRITE.value)
     else:
