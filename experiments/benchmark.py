@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import command_line, commands, options, perceptual_option
+from experiments import command_line, commands, options, perceptual_option, scene_option
 from experiments.benchmarking import methods
 from experiments.benchmarking.methods import Method
 from experiments.late_imports import late
@@ -109,6 +109,7 @@ def main() -> None:
     if _TABLES_ONLY.value:
         _make_tables(out)
         return
+    scene_option.check_all(_SCENES.value)
     scenes, chosen = scene_list.find(_SCENES.value), methods.parse(_METHODS.value)
     weights = perceptual_option.checked()
     common = _settings(weights)

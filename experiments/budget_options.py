@@ -2,7 +2,7 @@
 
 from absl import flags
 
-from experiments import named_budgets
+from experiments import command_line, named_budgets
 from refref_jax.optics.budgets import Budget
 
 CUT = flags.DEFINE_float(
@@ -11,6 +11,8 @@ CUT = flags.DEFINE_float(
 BENDS = flags.DEFINE_integer(
     "bends", None, "Most refractions and reflections of a path; that of --paths if not given."
 )
+command_line.check(CUT, lambda cut: named_budgets.make_budget("tree", cut=cut))
+command_line.check(BENDS, lambda bends: named_budgets.make_budget("tree", bends=bends))
 
 
 def chosen(paths: str) -> Budget:

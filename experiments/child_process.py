@@ -52,10 +52,10 @@ def run(name: str, *options: str, log: Path) -> tuple[float, float]:
       RunFailedError: if it ends with an error, or is killed.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
-    written = log.stat().st_size if log.exists() else 0
     start = time.monotonic()
     with log.open("a", encoding="utf-8") as file:
         print(f"$ python -m experiments.{name} {' '.join(options)}", file=file, flush=True)
+        written = file.tell()
         process = _start(
             command_line(name, options),
             stdin=subprocess.PIPE,
@@ -136,4 +136,6 @@ def _complaint(printed: str, code: int) -> str:
     told = [line for line in lines if re.search(r"(^e|E)rror: ", line)]
     if told:
         return told[-1]
-    return f"killed by {signal.Signals(-code).name}" if code < 0 else lines[-1]
+    if code < 0:
+        return f"killed by {signal.Signals(-code).name}"
+    return lines[-1] if lines else f"ended with status {code}, and printed nothing"

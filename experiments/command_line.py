@@ -146,6 +146,8 @@ def _explained(error: flags.Error, module: ModuleType) -> str:
         ]
         told = " ".join(f"Give --{each.name}: {command_help.meaning(each)}" for each in missing)
         return f"{', '.join(f'--{each.name}' for each in missing)} must be given. {told}"
+    if found := re.fullmatch(r"Missing value for flag -*(.*)", str(error)):
+        return f"--{found[1]} has no value. Give it as in --{found[1]}=VALUE."
     found = re.fullmatch(r"flag --(\w+)=(.*?): (.*)", str(error), re.DOTALL)
     if found is None or found[1] not in options:
         return str(error)
@@ -153,8 +155,21 @@ def _explained(error: flags.Error, module: ModuleType) -> str:
     if choices := getattr(options[name].parser, "enum_values", None):
         near = did_you_mean(value, choices)
         return f"--{name}={value} is none of {', '.join(choices)}.{near}"
+    parser = options[name].parser
     if reason.startswith(("invalid literal", "could not convert")):
-        whole = "whole " if isinstance(options[name].parser, flags.IntegerParser) else ""
+        whole = "whole " if isinstance(parser, flags.IntegerParser) else ""
         return f"--{name}={value} is no {whole}number. Give one."
+    if reason.endswith(f" is not {parser.syntactic_help}"):
+        return f"--{name}={value} is out of range. Give {_range(parser)}."
+    if options[name].boolean and "Non-boolean" in reason:
+        return f"--{name}={value} is neither true nor false. Give --{name} or --no{name}."
     # A reason that names the option says what is wrong with it in full.
     return reason if f"--{name}" in reason else f"--{name}={value}: {reason}"
+
+
+def _range(parser: flags.FloatParser | flags.IntegerParser) -> str:
+    """Returns which numbers an option takes, one end of which has a bound at least."""
+    least, most = parser.lower_bound, parser.upper_bound
+    if least is not None and most is not None:
+        return f"{least} to {most}"
+    return f"{least} or more" if most is None else f"{most} or less"

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, Self
 
 from absl import app, logging
 
-from experiments import command_line
-from experiments.late_imports import INTERRUPTED, late
+from experiments import command_line, first_interrupt
+from experiments.first_interrupt import INTERRUPTED
+from experiments.late_imports import late
 
 if TYPE_CHECKING:
     from rich import progress
@@ -64,6 +65,7 @@ def run(
             command_line.fail(str(error))
 
     try:
+        first_interrupt.give_back()
         app.run(guarded, flags_parser=parse)
     except KeyboardInterrupt:
         print(f"Interrupted. {again[:1].upper()}{again[1:]}".rstrip(), file=sys.stderr)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import command_line, commands, options
+from experiments import command_line, commands, options, scene_option
 from experiments.late_imports import late
 
 if TYPE_CHECKING:
@@ -63,6 +63,7 @@ _SCALE = flags.DEFINE_string(
 
 def main() -> None:
     """Converts one folder."""
+    scene_option.check_place(_SOURCE.value)
     if _TO.value == "scene":
         _make_scene(Path(_SOURCE.value), Path(_OUT.value))
     else:

@@ -50,7 +50,10 @@ class Panel(NamedTuple):
 
 
 def outlines_of(parts: Sequence[MeshPart]) -> list[Outline]:
-    """Returns the closed outlines of all parts in the plane, world units.
+    """Returns the outlines of all parts in the plane, world units.
+
+    Those of a closed mesh go round, their last point beside the first; that of an open one goes
+    from one end to the other.
 
     Raises:
       SceneError: if the plane meets none of them.
@@ -113,8 +116,11 @@ def _outlines(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"])
         near[first].append(second)
         near[second].append(first)
     loops, left = [], set(range(len(nodes)))
-    while left:
-        loop = [left.pop()]
+    for start in sorted(left, key=lambda node: len(near[node]) > 1):  # from an end, if there is
+        if start not in left:
+            continue
+        left.remove(start)
+        loop = [start]
         while further := [node for node in near[loop[-1]] if node in left]:
             loop.append(further[0])
             left.remove(further[0])

@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 from absl import flags
 
-from experiments import commands, options, output_folders, perceptual_option, scene_option
+from experiments import (
+    commands,
+    options,
+    output_folders,
+    perceptual_option,
+    run_option,
+    scene_option,
+)
 from experiments.late_imports import late
 
 if TYPE_CHECKING:
@@ -68,6 +75,8 @@ def main() -> None:
     out = run / "eval" / _SPLIT.value
     place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
     output_folders.replaceable(out, **place)
+    run_option.check(run)
+    scene_option.check(_SCENE.value)
     perceptual = perceptual_option.chosen()
     config = run_folder.read_config(run)
     # Resolved first, and once: training may be going on.

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import command_line, commands, options, output_folders
+from experiments import command_line, commands, options, output_folders, run_option
 from experiments.late_imports import late
 
 if TYPE_CHECKING:
@@ -58,6 +58,8 @@ def main() -> None:
     """Writes one file, or one for each body."""
     run, out = Path(_RUN.value), Path(_OUT.value)
     output_folders.check_file(out, overwrite=_OVERWRITE.value)
+    others = (run_option.RECONSTRUCTION,) if _WHAT.value == "body" else ()
+    run_option.check(run, holds=(run_option.RUN, *others))
     if _WHAT.value == "body":
         written = bodies.write(run, out, overwrite=_OVERWRITE.value)
     else:

@@ -51,7 +51,8 @@ def main() -> None:
         "overwrite": _OVERWRITE.value,
     }
     output_folders.replaceable(out, **place)
-    draw = _drawers(scene_option.opened(_SCENE.value))
+    indices = scenes.given_indices()
+    draw = _drawers(scene_option.opened(_SCENE.value), indices)
     with (
         output_folders.fresh(out, **place) as draft,
         commands.ProgressBar("draw", len(wanted)) as bar,
@@ -63,7 +64,7 @@ def main() -> None:
     print(f"Next: {commands.shell('render_known', f'--scene={_SCENE.value}', '--out=runs/known')}")
 
 
-def _drawers(folder: Path) -> dict[str, Callable[[Path], None]]:
+def _drawers(folder: Path, indices: dict[str, float]) -> dict[str, Callable[[Path], None]]:
     """Reads a scene, and returns what draws each figure into a file."""
     walls = background.read_background(folder)
     if not isinstance(walls, backgrounds.CubeBackground):
@@ -76,7 +77,7 @@ def _drawers(folder: Path) -> dict[str, Callable[[Path], None]]:
         split=known_options.SPLIT.value,
         views=str(_VIEW.value),
         rule=scenes.RULE.value,
-        indices=scenes.given_indices(),
+        indices=indices,
     )
     side = options.side_of(known_options.RAYS_PER_PIXEL.value)
     return {
@@ -88,4 +89,4 @@ def _drawers(folder: Path) -> dict[str, Callable[[Path], None]]:
 
 
 if __name__ == "__main__":
-    commands.run(main, again="it refuses to replace its figures, unless --overwrite is given.")
+    commands.run(main, again="a figure is replaced only with --overwrite, and the others stay.")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import commands, options
+from experiments import commands, options, scene_option
 from experiments.late_imports import late
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ _OUT = options.out("The copy to write; must not exist.")
 def main() -> None:
     """Writes the copy."""
     scene, masks, out = Path(_SCENE.value), Path(_MASKS.value), Path(_OUT.value)
+    scene_option.check(scene)
     if not masks.is_dir():
         raise errors.SceneError(f"{masks} is no folder. Give the folder that holds the masks.")
 

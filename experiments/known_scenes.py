@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from experiments import mesh_report
+from experiments import mesh_report, view_numbers
 from refref_jax import metrics
 from refref_jax.data import background, cameras, containment, local_layout, meshes, scene_names
 from refref_jax.data.containment import Containment
@@ -82,7 +82,7 @@ def read_scene(
       ValueError: if anything is missing or broken, or there is no such view.
     """
     frames = local_layout.read_frames(scene, split)
-    chosen = parse_views(views, len(frames.names))
+    chosen = view_numbers.choose(views, len(frames.names))
     parts = meshes.read_meshes(scene, indices=indices)
     tree = containment.find_containment(parts)
     mesh_report.report_meshes(parts, tree, rule=rule)
@@ -127,27 +127,6 @@ def build_scene(
             else None
         ),
     )
-
-
-def parse_views(text: str, count: int) -> tuple[int, ...]:
-    """Returns the views that an option names, in its order.
-
-    Raises:
-      ValueError: if one is not a number, does not exist or comes twice.
-    """
-    if text == "all":
-        return tuple(range(count))
-    try:
-        views = tuple(int(word) for word in text.split(","))
-    except ValueError as error:
-        raise ValueError(
-            f"--views={text} is neither 'all' nor a list of numbers. Write as in --views=0,10,20."
-        ) from error
-    if wrong := [view for view in views if not 0 <= view < count]:
-        raise ValueError(f"The split has no view {wrong[0]}. Choose from 0 to {count - 1}.")
-    if len(set(views)) < len(views):
-        raise ValueError(f"--views={text} names a view twice. Name each once.")
-    return views
 
 
 def warm_up(scene: KnownScene, budget: Budget) -> None:

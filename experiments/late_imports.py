@@ -20,8 +20,7 @@ from collections.abc import Iterator
 from types import ModuleType
 from typing import Any
 
-INTERRUPTED = 130
-"""Status of a command that was stopped by Ctrl-C, as shells have it."""
+from experiments.first_interrupt import INTERRUPTED
 
 
 def late(name: str) -> Any:

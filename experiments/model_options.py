@@ -1,14 +1,24 @@
-"""Options that replace parts of a preset's model: where its speed can be traded for accuracy."""
+"""Options that replace parts of a preset's model: where its speed can be traded for accuracy.
+
+What is wrong whatever the preset is refused by functions that need no JAX, as soon as it is read.
+"""
+
+from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from refref_jax.fields.hash_grid import HashGridConfig
-from refref_jax.fields.kinds import RadianceConfig
-from refref_jax.fields.networks import GridRadianceConfig
-from refref_jax.fields.precision import Precision
-from refref_jax.render.config import Footprint, ModelConfig
+from experiments.late_imports import late
+
+if TYPE_CHECKING:
+    from refref_jax.fields import networks
+    from refref_jax.fields.hash_grid import HashGridConfig
+    from refref_jax.fields.kinds import RadianceConfig
+    from refref_jax.fields.precision import Precision
+    from refref_jax.render.config import Footprint, ModelConfig
+else:
+    networks = late("refref_jax.fields.networks")
 
 # Points of the cone patterns, see `sampling.cones`.
 _PATTERNS = (1, 6)
@@ -51,6 +61,32 @@ def parse_samples(words: Sequence[str]) -> tuple[int, ...]:
     return tuple(int(word) for word in words)
 
 
+def check_multisamples(points: int | None) -> None:
+    """Refuses a number of points that no pattern has.
+
+    Raises:
+      ValueError: if there is no such pattern.
+    """
+    if points is not None and points not in _PATTERNS:
+        raise ValueError(
+            f"--multisamples={points} is no pattern of points. Give 1 (on the centre line) or 6 "
+            "(Zip-NeRF's hexagon)."
+        )
+
+
+def check_entries(entries: int | None) -> None:
+    """Refuses a size that no table of a hash grid has.
+
+    Raises:
+      ValueError: if it is none.
+    """
+    if entries is not None and not 1 <= entries <= _MOST_ENTRIES:
+        raise ValueError(
+            f"--entries={entries} is the base-2 logarithm of a table's size. Give 1 to "
+            f"{_MOST_ENTRIES}, such as 17 for 131,072 entries."
+        )
+
+
 def override(model: ModelConfig, options: ModelOptions, *, preset: str) -> ModelConfig:
     """Returns a preset's model with what is asked of it.
 
@@ -64,12 +100,8 @@ def override(model: ModelConfig, options: ModelOptions, *, preset: str) -> Model
     """
     if options.samples is not None:
         model = _with_samples(model, options.samples, preset)
+    check_multisamples(options.multisamples)
     if options.multisamples is not None:
-        if options.multisamples not in _PATTERNS:
-            raise ValueError(
-                f"--multisamples={options.multisamples} is no pattern of points. Give 1 (on the "
-                "centre line) or 6 (Zip-NeRF's hexagon)."
-            )
         model = dataclasses.replace(model, multisamples=options.multisamples)
     if options.footprint is not None:
         model = dataclasses.replace(model, footprint=options.footprint)
@@ -111,24 +143,20 @@ def _with_precision(model: ModelConfig, precision: Precision) -> ModelConfig:
 
 def grid_of(model: ModelConfig) -> HashGridConfig | None:
     """Returns the hash grid of a model's radiance field, if fields of its kind have one."""
-    return model.field.grid if isinstance(model.field, GridRadianceConfig) else None
+    return model.field.grid if isinstance(model.field, networks.GridRadianceConfig) else None
 
 
 def _with_grid(field: RadianceConfig, options: ModelOptions) -> RadianceConfig:
     if options.entries is None and options.finest is None:
         return field
-    if not isinstance(field, GridRadianceConfig):
+    if not isinstance(field, networks.GridRadianceConfig):
         raise ValueError(
             f"--entries and --finest are of a hash grid, which fields of kind {field.kind} have "
             "not. Leave them out."
         )
     grid = field.grid
+    check_entries(options.entries)
     if options.entries is not None:
-        if not 1 <= options.entries <= _MOST_ENTRIES:
-            raise ValueError(
-                f"--entries={options.entries} is the base-2 logarithm of a table's size. Give 1 to "
-                f"{_MOST_ENTRIES}, such as 17 for 131,072 entries."
-            )
         grid = dataclasses.replace(grid, entries=1 << options.entries)
     if options.finest is not None:
         if options.finest < grid.coarsest:

@@ -11,6 +11,7 @@ notebooks before it are written by then. The extra `notebooks` has what this nee
 
 from __future__ import annotations
 
+import atexit
 import importlib.util
 import os
 import shutil
@@ -179,8 +180,14 @@ def _run_cells(notebook: nbformat.NotebookNode, name: str, copy: Path, cell_seco
         except (
             exceptions.CellExecutionError,
             exceptions.CellTimeoutError,
-            exceptions.DeadKernelError,
+            RuntimeError,  # of a kernel that is dead, before the first cell or later
         ) as error:
+            if not current:
+                atexit.unregister(client._cleanup_kernel)  # which fails where none has started
+                raise ValueError(
+                    f"{name}: the kernel ended before the first cell ({error}). Try python -m "
+                    "ipykernel_launcher, which says why."
+                ) from error
             cell = notebook.cells[current[-1]]
             raise ValueError(_explain(name, number[current[-1]], cell, error)) from error
 

@@ -26,6 +26,7 @@ from experiments import (
     output_folders,
     scene_option,
     scenes,
+    view_numbers,
 )
 from experiments.late_imports import late
 from refref_jax.data import scene_names
@@ -55,6 +56,7 @@ _BENDS = flags.DEFINE_list(
     "bends", ["1", "2", "4", "6", "10", "16", "24", "32"], "Most bends of a path."
 )
 _VIEWS = flags.DEFINE_string("views", "0,10", "Numbers of views of the split, as 0,10, or all.")
+command_line.check(_VIEWS, view_numbers.parse)
 flags.adopt_module_key_flags(scenes)
 flags.adopt_module_key_flags(known_options)
 _OUT = options.out("Folder to write to.")
@@ -83,10 +85,9 @@ def main() -> None:
     out = Path(_OUT.value)
     place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
     output_folders.replaceable(out, **place)
-    folders = _open_scenes()
-    plan = settings()
+    plan, indices = settings(), scenes.given_indices()
     # All scenes first: a broken one is named before anything is rendered.
-    chosen = [_read(folder) for folder in folders]
+    chosen = [_read(folder, indices) for folder in _open_scenes()]
     with output_folders.fresh(out, **place) as draft:
         trials = _measure(chosen, plan)
         _write(draft / _TABLE, trials)
@@ -113,6 +114,7 @@ def _measure(chosen: list[KnownScene], plan: list[Setting]) -> list[Trial]:
 
 def _open_scenes() -> list[Path]:
     """Refuses no scene at all, and names that plot and table could not tell apart."""
+    scene_option.check_all(_SCENES.value)
     folders = [scene_option.opened(scene) for scene in _SCENES.value]
     names = [scene_names.of_folder(folder) for folder in folders]
     if not names:
@@ -170,13 +172,13 @@ def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
     )
 
 
-def _read(folder: Path) -> KnownScene:
+def _read(folder: Path, indices: dict[str, float]) -> KnownScene:
     scene = known_scenes.read_scene(
         folder,
         split=known_options.SPLIT.value,
         views=_VIEWS.value,
         rule=scenes.RULE.value,
-        indices=scenes.given_indices(),
+        indices=indices,
     )
     if scene.masks is None:
         raise ValueError(

@@ -7,16 +7,24 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import choosable, options, scene_option, scenes, space_options
+from experiments import (
+    budget_options,
+    choosable,
+    command_line,
+    model_options,
+    options,
+    scene_option,
+    scenes,
+    space_options,
+)
 from experiments.late_imports import late
 from refref_jax.optics.budgets import BUDGETS
 
 if TYPE_CHECKING:
-    from experiments import choices, model_options, planning
+    from experiments import choices, planning
     from refref_jax.data.meshes import MeshPart
 else:
     choices = late("experiments.choices")
-    model_options = late("experiments.model_options")
     planning = late("experiments.planning")
 
 SCENE = flags.DEFINE_string("scene", None, f"The scene to train on: {options.SCENE_FORMS}.")
@@ -36,12 +44,7 @@ PATHS = flags.DEFINE_enum(
     "follows every branch that carries light. By default 'tree' if there are meshes, else "
     "'straight'.",
 )
-_CUT = flags.DEFINE_float(
-    "cut", None, "Smallest throughput worth following, in [0, 1); that of --paths if not given."
-)
-_BENDS = flags.DEFINE_integer(
-    "bends", None, "Most refractions and reflections of a path; that of --paths if not given."
-)
+flags.adopt_module_key_flags(budget_options)
 _REENTRY = flags.DEFINE_enum(
     "reentry",
     "auto",
@@ -109,12 +112,21 @@ _STEPS = flags.DEFINE_integer("steps", None, "Training steps; the preset's if no
 _BATCH = flags.DEFINE_integer("batch", None, "Rays a step; the preset's if not given.", 1)
 SEED = options.seed()
 
+
+def _parse_samples(words: list[str] | None) -> tuple[int, ...] | None:
+    return None if words is None else model_options.parse_samples(words)
+
+
+command_line.check(_SAMPLES, _parse_samples)
+command_line.check(_MULTISAMPLES, model_options.check_multisamples)
+command_line.check(_ENTRIES, model_options.check_entries)
+
 SETTLED = (
     _PRESET,
     _FIELD,
     PATHS,
-    _CUT,
-    _BENDS,
+    budget_options.CUT,
+    budget_options.BENDS,
     _REENTRY,
     _INTERIOR,
     _TINTS,
@@ -172,25 +184,32 @@ def plan_from_flags(*, body: MeshPart | None = None) -> planning.Plan:
     return planning.make_plan(request)
 
 
-def check_options() -> None:
-    """Refuses options that make no sense, before anything else is done.
+def check_options(*, resume: bool) -> None:
+    """Refuses what can be told of the options alone, before anything is imported.
+
+    Args:
+      resume: whether a run may be gone on with, which knows its scene.
 
     Raises:
-      ValueError: if one does not.
+      ValueError: if one makes no sense, or there is no scene.
     """
-    _wishes()
-    _options()
+    if PATHS.value is not None:
+        budget_options.chosen(PATHS.value)
+    scene_option.check(SCENE.value)
+    if SCENE.value is None and not resume:
+        raise ValueError("No scene is given. Add --scene=FOLDER, or --resume to go on with a run.")
 
 
 def _wishes() -> choices.Wishes:
     asked = {"reentry": _REENTRY.value, "interior": _INTERIOR.value, "tints": _TINTS.value}
     decided = {name: None if value == "auto" else value for name, value in asked.items()}
-    return choices.Wishes(paths=PATHS.value, cut=_CUT.value, bends=_BENDS.value, **decided)
+    followed = {"cut": budget_options.CUT.value, "bends": budget_options.BENDS.value}
+    return choices.Wishes(paths=PATHS.value, **followed, **decided)
 
 
 def _options() -> model_options.ModelOptions:
     return model_options.ModelOptions(
-        samples=None if _SAMPLES.value is None else model_options.parse_samples(_SAMPLES.value),
+        samples=_parse_samples(_SAMPLES.value),
         multisamples=_MULTISAMPLES.value,
         entries=_ENTRIES.value,
         finest=_FINEST.value,

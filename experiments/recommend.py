@@ -39,6 +39,7 @@ _TIMED_STEPS = flags.DEFINE_integer(
 
 def main() -> None:
     """Times this machine and prints the recommendation."""
+    scene_option.check(_SCENE.value)
     rows = trade_table.read(Path(_TABLE.value))
     scene = scene_option.opened(_SCENE.value)
     images = len(local_layout.read_frames(scene, "test").names)

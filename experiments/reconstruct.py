@@ -49,6 +49,7 @@ command_line.check(_IOR, _parse)
 
 def main() -> None:
     """Reconstructs a scene, or goes on with it."""
+    scene_option.check(_SCENE.value)
     index = _parse(_IOR.value)
     config = reconstruction_options.chosen(index=index, seed=_SEED.value)
     scene, out = scene_option.opened(_SCENE.value), Path(_OUT.value)

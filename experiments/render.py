@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import choosable, commands, options, output_folders, scene_option
+from experiments import choosable, commands, options, output_folders, run_option, scene_option
 from experiments.late_imports import late
 
 if TYPE_CHECKING:
@@ -55,6 +55,8 @@ def main() -> None:
     out = Path(_OUT.value) if _OUT.value else run / "render" / _VIEWS.value
     place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
     output_folders.replaceable(out, **place)
+    run_option.check(run)
+    scene_option.check(_SCENE.value)
     model = saved.load_model(run, step=_STEP.value)
     seen_by, names = _cameras(run)
     with output_folders.fresh(out, **place) as draft:

@@ -20,12 +20,14 @@ from absl import flags
 
 from experiments import (
     budget_options,
+    command_line,
     commands,
     known_options,
     options,
     output_folders,
     scene_option,
     scenes,
+    view_numbers,
 )
 from experiments.late_imports import late
 from refref_jax.optics.budgets import BUDGETS, Budget
@@ -53,6 +55,7 @@ _PATHS = flags.DEFINE_enum(
     "first surface; 'tree' follows every branch that carries light.",
 )
 _VIEWS = flags.DEFINE_string("views", "all", "Numbers of views of the split, as 0,10,20, or all.")
+command_line.check(_VIEWS, view_numbers.parse)
 flags.adopt_module_key_flags(budget_options)
 flags.adopt_module_key_flags(scenes)
 flags.adopt_module_key_flags(known_options)
@@ -78,12 +81,13 @@ def main() -> None:
     metrics_file = None if _JSON.value is None else Path(_JSON.value)
     _check(metrics_file)
     budget = budget_options.chosen(_PATHS.value)
+    indices, folder = scenes.given_indices(), scene_option.opened(_SCENE.value)
     scene = known_scenes.read_scene(
-        scene_option.opened(_SCENE.value),
+        folder,
         split=known_options.SPLIT.value,
         views=_VIEWS.value,
         rule=scenes.RULE.value,
-        indices=scenes.given_indices(),
+        indices=indices,
     )
     with output_folders.fresh(out, **place) as draft:
         summary = render(scene, budget, draft)

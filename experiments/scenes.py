@@ -1,5 +1,7 @@
 """Options that commands which read a scene's meshes share."""
 
+import math
+
 from absl import flags
 
 from experiments import choosable
@@ -20,15 +22,19 @@ def given_indices() -> dict[str, float]:
     """Returns the indices of refraction that `--ior=NAME=NUMBER` options give.
 
     Raises:
-      ValueError: if one is not of that form.
+      ValueError: if one is not of that form, or no index.
     """
-    indices = {}
-    for word in IOR.value:
-        name, separator, number = word.partition("=")
-        try:
-            indices[name] = float(number)
-        except ValueError:
-            separator = ""
-        if not separator or not name:
-            raise ValueError(f"--ior={word} is not NAME=NUMBER. Write as in --ior=glass=1.52.")
-    return indices
+    return dict(map(_parse, IOR.value))
+
+
+def _parse(word: str) -> tuple[str, float]:
+    name, _, number = word.partition("=")
+    try:
+        index = float(number)
+    except ValueError:
+        index = math.nan
+    if not name or not 0.0 < index < math.inf:
+        raise ValueError(
+            f"--ior={word} is not NAME=NUMBER with a positive number. Write as in --ior=glass=1.52."
+        )
+    return name, index

@@ -55,14 +55,13 @@ _DRY_RUN = flags.DEFINE_bool("dry_run", False, "List the points, and measure not
 
 def main() -> None:
     """Measures all points and writes the report."""
+    scene_option.check(_SCENE.value)
     points = points_from_flags()
     if _DRY_RUN.value:
         for point in points:
             print(f"{point.name:24} {' '.join((*point.training, *point.evaluation))}")
         return
     scene, out = scene_option.opened(_SCENE.value), Path(_OUT.value)
-    if not scene.is_dir():
-        raise ValueError(f"{scene} is no folder. Give that of a scene.")
     # A sweep that is killed takes the training that it waits for with it.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     limit = () if _LIMIT.value is None else (f"--limit={_LIMIT.value}",)

@@ -49,11 +49,7 @@ _KEEP = flags.DEFINE_integer("keep", 2, "Newest checkpoints to keep.", 1)
 def main() -> None:
     """Plans a run, or finds the one to resume, and trains it."""
     run = Path(_OUT.value)
-    if device_options.together() and training_body.reconstructs():
-        raise ValueError(
-            "Several processes do not reconstruct together. Run experiments.reconstruct on one "
-            "machine first, and give its folder as --reconstruction."
-        )
+    check_options()
     device_options.connect()
     with device_options.first_speaks():
         if not _begin(run):
@@ -61,6 +57,21 @@ def main() -> None:
             sys.exit(commands.INTERRUPTED)
         print(f"Run: {run}  (metrics.jsonl, checkpoints/)")
         print(f"Next: {commands.shell('evaluate', f'--run={run}', '--split=test')}")
+
+
+def check_options() -> None:
+    """Refuses what can be told of the options alone, before anything is imported.
+
+    Raises:
+      ValueError: if there is any.
+    """
+    if device_options.together() and training_body.reconstructs():
+        raise ValueError(
+            "Several processes do not reconstruct together. Run experiments.reconstruct on one "
+            "machine first, and give its folder as --reconstruction."
+        )
+    plans.check_options(resume=_RESUME.value)
+    training_body.check_options()
 
 
 def _begin(run: Path) -> bool:
@@ -86,7 +97,6 @@ def _begin(run: Path) -> bool:
 def _open(run: Path) -> None:
     """Plans a run and opens its folder; of several processes all plan, and the first opens."""
     run_folder.check_free(run)
-    plans.check_options()
     body = training_body.find(run, resume=_RESUME.value)
     plan = plans.plan_from_flags(body=body)
     devices.wait_for_all("all have planned, and nothing is written yet")

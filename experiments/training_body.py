@@ -61,9 +61,8 @@ def find(run: Path, *, resume: bool) -> MeshPart | None:
       resume: whether what is there may be gone on with.
 
     Raises:
-      ValueError: if the options contradict each other, or there is no such body.
+      ValueError: if there is no such body.
     """
-    _check_options()
     if METHOD.value == "oracle" and RECONSTRUCTION.value is None:
         return None
     index = _given_index()
@@ -116,12 +115,16 @@ def _given_index() -> float | None:
     return reconstruction_options.parse_index(words[0])
 
 
-def _check_options() -> None:
-    """Refuses options that contradict each other, or would have no effect.
+def check_options() -> None:
+    """Refuses options that contradict each other, or would have no effect, before any import.
 
     Raises:
-      ValueError: if there are any.
+      ValueError: if there are any, or an index is none.
     """
+    if METHOD.value == "oracle" and RECONSTRUCTION.value is None:
+        scenes.given_indices()
+    else:
+        _given_index()
     if METHOD.value == "oracle" and RECONSTRUCTION.value is not None and METHOD.present:
         raise ValueError(
             "--method=oracle takes the scene's own meshes, not a reconstruction. Leave out either "

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import command_line, commands, options, scene_option
+from experiments import command_line, commands, options, run_option, scene_option
 from experiments.late_imports import late
 
 if TYPE_CHECKING:
@@ -54,6 +54,8 @@ _CHUNK = options.chunk()
 def main() -> None:
     """Serves a run until it is interrupted."""
     heights = read_heights(_HEIGHTS.value)
+    run_option.check(Path(_RUN.value))
+    scene_option.check(_SCENE.value)
     try:
         from experiments.viewing import server as serving
     except ModuleNotFoundError as error:

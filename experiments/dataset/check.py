@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from absl import flags
 
-from experiments import budget_options, commands, options, output_folders
+from experiments import budget_options, commands, options, output_folders, scene_option
 from experiments.dataset import render_settings
 from experiments.late_imports import late
 
@@ -56,6 +56,7 @@ def main(folder: str) -> None:
     page, figures = out / "check.html", out / "check.json"
     for path in (page, figures):
         output_folders.check_file(path, overwrite=_OVERWRITE.value)
+    scene_option.check_place(folder)
     scenes = scene_check.find_scenes(checked, _SCENES.value)
     reports = []
     with commands.ProgressBar("check", len(scenes)) as bar:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import commands, options
+from experiments import commands, options, scene_option
 from experiments.late_imports import late
 from refref_jax.data import scene_names
 
@@ -39,6 +39,7 @@ _SCENES = flags.DEFINE_list("scenes", None, "Only these scenes of a folder; all 
 
 def main() -> None:
     """Converts all scenes that the options name."""
+    scene_option.check_place(_SCENE.value)
     layout, out = _TO.value, Path(_OUT.value)
     if layout == "parquet":
         parquet_scenes.import_parquet()  # before anything is read

@@ -19,14 +19,16 @@ from refref_jax.render import saved
 from refref_jax.render.saved import SavedModel
 from refref_jax.training.config import TrainingConfig
 
-_CONFIG = "config.json"
+CONFIG = "config.json"
+"""What makes a folder that of a run."""
+
 _METRICS = "metrics.jsonl"
-_LEFT_BEHIND = (_CONFIG, _METRICS, saved.CHECKPOINTS)
+_LEFT_BEHIND = (_METRICS, saved.CHECKPOINTS)
 
 
 def exists(run: Path) -> bool:
     """Returns whether a folder holds a run."""
-    return (run / _CONFIG).is_file()
+    return (run / CONFIG).is_file()
 
 
 def create(run: Path, config: TrainingConfig, model: SavedModel, geometry: Geometry) -> None:
@@ -38,7 +40,7 @@ def create(run: Path, config: TrainingConfig, model: SavedModel, geometry: Geome
     check_free(run)
     run.mkdir(parents=True, exist_ok=True)
     saved.save_scene(run, model, geometry)
-    configuration.write(run / _CONFIG, config)
+    configuration.write(run / CONFIG, config)
 
 
 def check_free(run: Path) -> None:
@@ -47,10 +49,14 @@ def check_free(run: Path) -> None:
     Raises:
       ValueError: if the folder holds a run already, or is a file.
     """
-    if found := [name for name in _LEFT_BEHIND if (run / name).exists()]:
+    if exists(run):
         raise ValueError(
-            f"{run} holds a run already, or what is left of one ({', '.join(found)}). Continue it "
-            "with --resume, or give another --out."
+            f"{run} holds a run already. Continue it with --resume, or give another --out."
+        )
+    if found := [str(run / name) for name in _LEFT_BEHIND if (run / name).exists()]:
+        raise ValueError(
+            f"{run} holds what is left of a run that can not be continued, for its {CONFIG} is "
+            f"missing. Remove {' and '.join(found)}, or give another --out."
         )
     if run.exists() and not run.is_dir():
         raise ValueError(f"{run} is a file, but a run needs a folder. Give another --out.")
@@ -58,7 +64,7 @@ def check_free(run: Path) -> None:
 
 def read_config(run: Path) -> TrainingConfig:
     """Reads the configuration of a run."""
-    return configuration.read(run / _CONFIG, TrainingConfig)
+    return configuration.read(run / CONFIG, TrainingConfig)
 
 
 def check_unchanged(

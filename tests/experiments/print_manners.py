@@ -53,6 +53,7 @@ def _options(module):
             "required": command_help.is_required(flag),
             "value": _right_value(flag),
             "default": flag.default,
+            "least": getattr(flag.parser, "lower_bound", None),
         }
         for name, flag in command_help.options_of(module).items()
     }
@@ -79,6 +80,8 @@ def _wrong(options, arguments):
                 [word for word in given if not word.startswith(f"--{name}=")],
                 f"--{name} must be given",
             )
+        if option["least"] is not None:
+            yield [*given, f"--{name}={option['least'] - 1}"], "is out of range. Give "
 
 
 def _interrupted(main, settings, words):

@@ -168,17 +168,21 @@ def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
         ("train", ("--scene=experiments/data/cube_smcvx_ball", "--out=README.md/x"), "README.md"),
         ("evaluate", ("--run=nowhere",), "nowhere/config.json does not exist"),
         ("evaluate", ("--run=nowhere", "--rays_per_pixel=8"), "Give 4 or 9"),
-        ("evaluate", ("--run=nowhere", "--lpips_weights=none.npz"), "none.npz can not be read"),
-        ("render", ("--run=nowhere",), "nowhere/model.json does not exist"),
+        ("evaluate", ("--run=RUN", "--lpips_weights=none.npz"), "none.npz can not be read"),
+        ("render", ("--run=RUN",), "run/model.json does not exist"),
         ("render", ("--run=nowhere", "--rays_per_pixel=0"), "Give 1."),
-        ("export", ("--run=nowhere", "--what=mesh", "--out=x.ply"), "nowhere/model.json does not"),
-        ("export", ("--run=nowhere", "--what=body", "--out=x.ply"), "nowhere/geometry.npz can not"),
+        ("export", ("--run=RUN", "--what=mesh", "--out=x.ply"), "run/model.json does not"),
+        ("export", ("--run=RUN", "--what=body", "--out=x.ply"), "run/geometry.npz can not"),
         ("export", ("--run=nowhere", "--what=body", "--out=x.obj"), "ends with .ply"),
     ],
 )
 def test_mistakes_end_with_one_line_that_says_what_to_do(tmp_path, command, options, message):
     if command == "train":
         options = (f"--out={tmp_path / 'out'}", *options)
+    run = tmp_path / "run"  # which is none, but for one file
+    run.mkdir()
+    (run / "config.json").write_text("{}")
+    options = [word.replace("RUN", str(run)) for word in options]
     result = run_command(command, *options, fails=True)
     assert message in result.stderr
     assert "Traceback" not in result.stderr

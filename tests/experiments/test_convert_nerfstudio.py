@@ -91,7 +91,7 @@ def test_the_command_both_ways(folder, tmp_path):
         ("--centre=1,2", "Give x,y,z"),
         ("--centre=1,2,x", "has 'x', which is no finite number"),
         ("--scale=-1", "Give a positive number, or auto"),
-        ("--source=nowhere", "Give the folder that holds transforms.json"),
+        ("--source=nowhere", "nowhere is no folder"),
     ],
 )
 def test_mistakes_end_with_one_line(folder, tmp_path, option, message):

@@ -1,5 +1,8 @@
 """The figures of docs/glass.md: what is drawn of bodies and paths, and the command once."""
 
+import subprocess
+import sys
+
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -52,6 +55,20 @@ def test_a_torus_has_two_outlines():
     outlines = cross_sections.outlines_of([_part(trimesh.creation.torus(1.0, 0.3))])
     reach = sorted(np.linalg.norm(outline, axis=-1).max() for outline in outlines)
     assert reach == pytest.approx([0.7, 1.3], abs=0.02)
+
+
+def test_an_open_mesh_has_one_outline_from_end_to_end():
+    # Three quarters of a tube's wall, whose gap is behind, so that its first point is no end.
+    angles = np.linspace(-0.75 * np.pi, 0.75 * np.pi, 40) + np.pi
+    ring = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    vertices = np.concatenate([np.insert(ring, 2, z, axis=-1) for z in (-1.0, 1.0)])
+    first = np.arange(39)
+    faces = np.concatenate([first[:, None] + [0, 1, 40], first[:, None] + [1, 41, 40]])
+    tube = trimesh.Trimesh(vertices, faces, process=False)
+    (outline,) = cross_sections.outlines_of([_part(tube)])
+    found = np.unwrap(np.arctan2(-outline[:, 1], -outline[:, 0]))
+    assert np.all(np.diff(found) > 0.0) or np.all(np.diff(found) < 0.0)
+    assert sorted(found[[0, -1]]) == pytest.approx([-0.75 * np.pi, 0.75 * np.pi], abs=1e-4)
 
 
 def test_what_the_plane_misses_is_refused():
@@ -107,6 +124,34 @@ def test_every_drawing_is_a_picture_with_something_in_it(tmp_path):
         picture = iio.imread(path)
         assert picture.shape[0] > 300 and picture.shape[1] > 600
         assert picture.min() < 64 and picture.max() > 240 and picture.std() > 5.0
+
+
+_STAND_IN = """
+import sys
+from pathlib import Path
+from absl import flags
+from experiments import glass_figures
+draw = {name: lambda path: path.write_text("drawn") for name in glass_figures.FIGURES}
+glass_figures._drawers = lambda folder, indices: draw
+glass_figures.scene_option.opened = Path  # so that JAX is not imported
+flags.FLAGS(["glass_figures", *sys.argv[1:]])
+glass_figures.main()
+"""
+
+
+def test_one_figure_is_drawn_anew_and_the_others_stay(tmp_path):
+    def draw(*options):
+        words = [sys.executable, "-c", _STAND_IN, f"--scene={_SCENE}", f"--out={tmp_path}"]
+        subprocess.run([*words, *options], check=True, cwd=ROOT, capture_output=True)
+        return {path.name: path.read_text() for path in tmp_path.glob("*.jpg")}
+
+    names = {f"glass_{name}.jpg" for name in ("views", "fan", "tree", "distances")}
+    assert draw("--figure=fan") == {"glass_fan.jpg": "drawn"}
+    assert set(draw("--figure=views", "--figure=tree", "--figure=distances")) == names
+    for name in names:
+        (tmp_path / name).write_text("old")
+    changed = draw("--figure=tree", "--overwrite")
+    assert changed == dict.fromkeys(names, "old") | {"glass_tree.jpg": "drawn"}
 
 
 @pytest.mark.slow

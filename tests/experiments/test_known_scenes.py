@@ -9,7 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from experiments import known_scenes, measures, named_budgets
+from experiments import measures, named_budgets, view_numbers
 from refref_jax.data import files
 from refref_jax.render import BUDGETS
 from tests.experiments.command import ROOT, run_command
@@ -138,7 +138,7 @@ def test_the_curve_has_a_row_for_every_setting(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--scene=nowhere",), "nowhere/transforms_test.json does not exist"),
+        (("--scene=nowhere",), "nowhere/transforms_train.json does not exist"),
         (("--rays_per_pixel=5",), "square"),
         (("--views=0,99",), "no view 99"),
         (("--cut=1.5",), "cut"),
@@ -167,16 +167,17 @@ def test_a_curve_of_nothing_is_refused(tmp_path, options, message):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"), [("first", "--views=0,10,20"), ("1,1", "twice"), ("-1", "from 0 to 4")]
+    ("text", "message"),
+    [("first", "--views=0,10,20"), ("1,1", "twice"), ("-1", "list of numbers"), ("5", "0 to 4")],
 )
 def test_views_that_do_not_exist(text, message):
     with pytest.raises(ValueError, match=message):
-        known_scenes.parse_views(text, 5)
+        view_numbers.choose(text, 5)
 
 
 def test_views_keep_their_order():
-    assert known_scenes.parse_views("3,0", 5) == (3, 0)
-    assert known_scenes.parse_views("all", 3) == (0, 1, 2)
+    assert view_numbers.choose("3, 0", 5) == (3, 0)
+    assert view_numbers.choose("all", 3) == (0, 1, 2)
 
 
 def test_a_budget_keeps_what_is_not_given_and_grows_below_its_cut():

@@ -7,12 +7,14 @@ import sys
 
 import pytest
 
-from experiments import choosable, command_help, command_line, commands, presets
+from experiments import choosable, command_help, command_line, commands, presets, run_option
 from experiments.late_imports import late
+from experiments.r3f import records
 from experiments.r3f.geometry_stage import GEOMETRIES
 from refref_jax.data import local_layout
 from refref_jax.fields import registry
 from refref_jax.optics.interface_rules import RULES
+from refref_jax.training import run_folder
 from tests.experiments.command import ROOT
 
 _SCRIPTS = [
@@ -20,6 +22,7 @@ _SCRIPTS = [
     for path in (ROOT / "experiments").rglob("*.py")
     if "\n    commands.run(" in path.read_text("utf-8")
 ]
+_SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
 _COMMANDS = sorted(".".join(path.parts) for path in _SCRIPTS)
 
 # Of commands with --overwrite: words that name FOLDER, and what is in the way there.
@@ -35,17 +38,83 @@ _IN_THE_WAY = {
     "dataset.check": (["FOLDER"], "check.html"),
 }
 
-# Lists of names, which absl does not know the values of.
-_WRONG_NAMES = {
-    "benchmark": (["--out=x", "--methods=tree,strait"], "Did you mean straight?"),
-    "dataset.make": (["--out=x", "--scenes=cube_smcvx_bal"], "Did you mean cube_smcvx_ball"),
-    "evaluate": (["--run=x", "--rays_per_pixel=8"], "Give 4 or 9."),
-    "train": (["--out=x", "--devices=two"], "Give one, or all."),
-    "reconstruct": (["--scene=x", "--out=x", "--ior=0.5"], "--ior=0.5 is no index"),
-    "trade_off": (["--scene=x", "--out=x", "--steps=0,1"], "Give 1 or more."),
-    "view": (["--run=x", "--heights=2,1"], "whole numbers that grow"),
-    "export": (["--run=x", "--what=body", "--out=a.obj"], "ends with .ply"),
-    "convert_nerfstudio": (["--source=x", "--out=x", "--scale=-1"], "Give a positive number"),
+_OF_THE_SCENE = {
+    "--cut=1": "--cut=1.0: The cut is a share of a pixel's light",
+    "--bends=-1": "can not have -1 bends. Give 0 or more.",
+    "--samples=4,0": "Write as in --samples=32,20.",
+    "--multisamples=3": "Give 1 (on the centre line) or 6",
+    "--entries=40": "Give 1 to 31",
+    "--paths=straight --cut=0.1": "Leave them out, or use --paths=tree.",
+    "--ior=1.5": "Write as in --ior=glass=1.52.",
+    "--ior=glass=-1": "with a positive number",
+    "--method=r3f --ior=glass=1.5": "Give its index alone",
+    "--resolution=32": "or add --method=r3f.",
+    "--resume=maybe": "Give --resume or --noresume.",
+    "--steps": "--steps has no value. Give it as in --steps=VALUE.",
+    "--devices=two": "Give one, or all.",
+}
+
+# What absl does not know the values of, and what is not there; of each command, with its refusal.
+_MISTAKES = {
+    "train": {
+        "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
+        "--out=OUT --scene=hf:cubebg/cube_smcvx_ball": "no configuration of the data set",
+        "--out=OUT": "Add --scene=FOLDER, or --resume",
+        **{f"--out=OUT --scene=SCENE {words}": told for words, told in _OF_THE_SCENE.items()},
+    },
+    "evaluate": {
+        "--run=x --rays_per_pixel=8": "Give 4 or 9.",
+        "--run=nowhere": "nowhere/config.json does not exist",
+    },
+    "render": {"--run=nowhere": "nowhere/config.json does not exist"},
+    "render_known": {
+        "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
+        "--out=OUT --scene=SCENE --cut=-0.5": "Give 0.02 for 2 %.",
+        "--out=OUT --scene=SCENE --ior=glass": "Write as in --ior=glass=1.52.",
+        "--out=OUT --scene=SCENE --views=1,1": "names a view twice",
+    },
+    "path_trade_off": {
+        "--out=OUT --scenes=SCENE,nowhere": "nowhere/transforms_train.json does not exist",
+        "--out=OUT --scenes=SCENE --cuts=2": "Give 0.02 for 2 %.",
+        "--out=OUT --scenes=SCENE --ior=glass=x": "Write as in --ior=glass=1.52.",
+        "--out=OUT --scenes=SCENE --views=a": "as in --views=0,10,20",
+    },
+    "glass_figures": {
+        "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
+        "--out=OUT --scene=SCENE --ior==1.5": "Write as in --ior=glass=1.52.",
+    },
+    "view": {
+        "--run=x --heights=2,1": "whole numbers that grow",
+        "--run=nowhere": "nowhere/config.json does not exist",
+    },
+    "export": {
+        "--run=x --what=body --out=a.obj": "ends with .ply",
+        "--run=nowhere --what=mesh --out=OUT.ply": "nowhere/config.json does not exist",
+        "--run=nowhere --what=body --out=OUT.ply": "nowhere/config.json does not exist",
+    },
+    "reconstruct": {
+        "--out=OUT --scene=x --ior=0.5": "--ior=0.5 is no index",
+        "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
+    },
+    "trade_off": {
+        "--out=OUT --scene=x --steps=0,1": "Give 1 or more.",
+        "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
+    },
+    "recommend": {"--scene=nowhere --minutes=1": "nowhere/transforms_train.json does not exist"},
+    "import_masks": {
+        "--out=OUT --scene=nowhere --masks=x": "nowhere/transforms_train.json does not exist"
+    },
+    "benchmark": {
+        "--out=OUT --methods=tree,strait": "Did you mean straight?",
+        "--out=OUT --scenes=SCENE,nowhere": "nowhere/transforms_train.json does not exist",
+    },
+    "dataset.convert": {"--scene=nowhere --to=raw --out=OUT": "nowhere is no folder."},
+    "dataset.make": {"--out=OUT --scenes=cube_smcvx_bal": "Did you mean cube_smcvx_ball"},
+    "dataset.check": {"x --cut=2": "Give 0.02 for 2 %.", "nowhere": "nowhere is no folder."},
+    "convert_nerfstudio": {
+        "--source=x --out=OUT --scale=-1": "Give a positive number",
+        "--source=nowhere --out=OUT": "nowhere is no folder.",
+    },
 }
 
 
@@ -53,8 +122,9 @@ _WRONG_NAMES = {
 def tried(tmp_path_factory):
     """What each command answered, and the folder that held what was in its way."""
     cases, folders = {}, {}
+    out = tmp_path_factory.mktemp("mistakes") / "out"
     for command in _COMMANDS:
-        cases[command] = [_WRONG_NAMES[command][0]] if command in _WRONG_NAMES else []
+        cases[command] = [_words(line, out) for line in _MISTAKES.get(command, ())]
         if command in _IN_THE_WAY:
             words, name = _IN_THE_WAY[command]
             folder = folders[command] = tmp_path_factory.mktemp(command)
@@ -70,7 +140,12 @@ def tried(tmp_path_factory):
         check=False,
     )
     assert done.returncode == 0, done.stderr
+    assert not list(out.parent.iterdir())
     return json.loads(done.stdout), folders
+
+
+def _words(line, out):
+    return line.replace("OUT", str(out)).replace("SCENE", str(_SCENE)).split()
 
 
 def _refusal(answer):
@@ -83,7 +158,7 @@ def _refusal(answer):
 
 def test_all_commands_are_found():
     assert {"train", "evaluate", "view", "dataset.make", "benchmark"} <= set(_COMMANDS)
-    assert set(_IN_THE_WAY) | set(_WRONG_NAMES) <= set(_COMMANDS)
+    assert set(_IN_THE_WAY) | set(_MISTAKES) <= set(_COMMANDS)
 
 
 @pytest.mark.parametrize("command", _COMMANDS)
@@ -122,7 +197,7 @@ def test_full_help_explains_every_option(tried, command):
 def test_mistakes_are_told_with_what_was_meant_before_jax_is_imported(tried, command):
     answer = tried[0][command]
     assert len(answer["wrong"]) >= 2
-    for meant, refused in answer["wrong"]:
+    for meant, refused in answer["wrong"]:  # and say what to do, of numbers out of range too
         assert meant in _refusal(refused)
         assert not refused["out"]
     assert not answer["jax"]
@@ -148,10 +223,12 @@ def test_no_option_is_taken_and_not_heeded(tried, command):
     assert tried[0][command]["stray"] == []
 
 
-@pytest.mark.parametrize("command", sorted(_WRONG_NAMES))
-def test_wrong_names_and_numbers_are_told_before_jax_is_imported(tried, command):
-    answer = tried[0][command]
-    assert _WRONG_NAMES[command][1] in _refusal(answer["cases"][0])
+@pytest.mark.parametrize("command", sorted(_MISTAKES))
+def test_wrong_values_and_what_is_not_there_are_told_before_jax_is_imported(tried, command):
+    answer, mistakes = tried[0][command], _MISTAKES[command].items()
+    for (line, told), refused in zip(mistakes, answer["cases"], strict=False):
+        assert told in _refusal(refused), line
+        assert "warning" not in refused["out"]
     assert not answer["jax_after_cases"]
 
 
@@ -174,6 +251,7 @@ def test_what_is_there_is_refused_before_anything_is_done(tried, command):
 
 
 def test_names_of_what_can_be_chosen_are_those_that_exist():
+    assert (run_option.RUN, run_option.RECONSTRUCTION) == (run_folder.CONFIG, records.FILE)
     assert tuple(presets.PRESETS) == choosable.PRESETS
     assert choosable.SPLITS == local_layout.SPLITS
     assert (registry.USUAL, *(x for x in registry.KINDS if x != registry.USUAL)) == choosable.FIELDS

@@ -141,6 +141,17 @@ def test_what_fails_is_named_with_its_cell(tmp_path, source, said):
         notebooks.execute(path, cell_seconds=10)
 
 
+def test_a_kernel_that_does_not_start_is_told(tmp_path, monkeypatch):
+    kernel = tmp_path / "kernels" / "python3"
+    kernel.mkdir(parents=True)
+    words = {"argv": ["false"], "display_name": "Python 3", "language": "python"}
+    (kernel / "kernel.json").write_text(json.dumps(words))
+    monkeypatch.setenv("JUPYTER_PATH", str(tmp_path))
+    path = _write_notebook(tmp_path / "dead.ipynb", "1")
+    with pytest.raises(ValueError, match=r"dead: the kernel ended before the first cell .*died"):
+        notebooks.execute(path, cell_seconds=10)
+
+
 def test_a_notebook_too_large_is_not_written(tmp_path):
     path = _write_notebook(tmp_path / "large.ipynb", "1")
     before = path.read_bytes()

@@ -1,6 +1,8 @@
 """Results are whole or not there, and only what a command noted as its own is replaced."""
 
+import errno
 import json
+import os
 
 import pytest
 
@@ -14,11 +16,19 @@ def options(monkeypatch):
     monkeypatch.setattr(command_line, "resolved", lambda module: {"chunk": 4096, "step": None})
 
 
-def _write(out, names, *, overwrite):
-    with output_folders.fresh(out, module=__name__, writes=_WRITES, overwrite=overwrite) as draft:
+def _fresh(out, *, writes=_WRITES, overwrite=False):
+    return output_folders.fresh(out, module=__name__, writes=writes, overwrite=overwrite)
+
+
+def _write(out, names, *, writes=_WRITES, overwrite):
+    with _fresh(out, writes=writes, overwrite=overwrite) as draft:
         for name in names:
             (draft / name).parent.mkdir(exist_ok=True)
             (draft / name).write_text("new")
+
+
+def _noted(out):
+    return json.loads((out / output_folders.NOTE).read_text())["files"]
 
 
 def _files(folder):
@@ -72,10 +82,9 @@ def test_a_file_that_came_meanwhile_stays(tmp_path):
     out = tmp_path / "out"
     with (
         pytest.raises(ValueError, match="not of this command"),
-        output_folders.fresh(out, module=__name__, writes=_WRITES, overwrite=True) as draft,
+        _fresh(out, overwrite=True) as draft,
     ):
         (draft / "metrics.json").write_text("new")
-        out.mkdir()
         (out / "metrics.json").write_text("mine")
     assert _files(tmp_path) == {"out/metrics.json"}
     assert (out / "metrics.json").read_text() == "mine"
@@ -86,10 +95,7 @@ def test_an_interruption_leaves_what_was_there(tmp_path, error):
     out = tmp_path / "out"
     _write(out, ["metrics.json"], overwrite=False)
     before = (out / output_folders.NOTE).read_bytes()
-    with (
-        pytest.raises(error),
-        output_folders.fresh(out, module=__name__, writes=_WRITES, overwrite=True) as draft,
-    ):
+    with pytest.raises(error), _fresh(out, overwrite=True) as draft:
         (draft / "rgb").mkdir()
         (draft / "rgb" / "0.png").write_text("half")
         raise error
@@ -99,6 +105,103 @@ def test_an_interruption_leaves_what_was_there(tmp_path, error):
         path.write_text("half")
         raise error
     assert not (out / "x").exists() and _files(out) == {"metrics.json", "command.json"}
+
+
+def test_an_interruption_leaves_no_empty_folder_but_one_that_was_there(tmp_path):
+    (tmp_path / "there").mkdir()
+    for name in ("made", "there"):
+        with pytest.raises(KeyboardInterrupt), _fresh(tmp_path / name) as draft:
+            (draft / "metrics.json").write_text("half")
+            raise KeyboardInterrupt
+    assert [path.name for path in tmp_path.iterdir()] == ["there"]
+
+
+def test_two_calls_at_once_do_not_share_a_folder(tmp_path):
+    out = tmp_path / "out"
+    with _fresh(out) as draft:
+        (draft / "metrics.json").write_text("first")
+        with pytest.raises(ValueError, match="Another process works in"):
+            _write(out, ["metrics.json"], overwrite=True)
+    assert (out / "metrics.json").read_text() == "first"
+    _write(out, ["metrics.json"], overwrite=True)
+
+
+def test_who_waited_for_another_looks_again(tmp_path, monkeypatch):
+    out, hold = tmp_path / "out", output_folders.run_lock.hold
+
+    def hold_after_another(folder):
+        monkeypatch.setattr(output_folders.run_lock, "hold", hold)
+        _write(out, ["metrics.json"], overwrite=False)
+        return hold(folder)
+
+    monkeypatch.setattr(output_folders.run_lock, "hold", hold_after_another)
+    with pytest.raises(ValueError, match="Give --overwrite"), _fresh(out):
+        raise AssertionError("worked in vain")
+    assert _files(out) == {"metrics.json", "command.json"}
+
+
+def test_a_product_of_its_own_is_added_or_replaced_alone(tmp_path):
+    out = tmp_path / "out"
+    _write(out, ["fan.jpg"], writes=["fan.jpg"], overwrite=False)
+    _write(out, ["tree.jpg"], writes=["tree.jpg"], overwrite=False)
+    (out / "fan.jpg").write_text("old")
+    (out / "tree.jpg").write_text("old")
+    with pytest.raises(ValueError, match=r"\(tree.jpg, \.\.\.\). Give --overwrite"):
+        _write(out, ["tree.jpg"], writes=["tree.jpg"], overwrite=False)
+    _write(out, ["tree.jpg"], writes=["tree.jpg"], overwrite=True)
+    assert (out / "fan.jpg").read_text() == "old" and (out / "tree.jpg").read_text() == "new"
+    assert _noted(out) == ["fan.jpg", "tree.jpg"]
+
+
+def test_a_foreign_file_beside_an_own_note_is_told_before_the_work(tmp_path):
+    out = tmp_path / "out"
+    _write(out, ["metrics.json"], overwrite=False)
+    (out / "rgb").mkdir()
+    with pytest.raises(ValueError, match=r"out/rgb is not of this command"):
+        output_folders.replaceable(out, module=__name__, writes=_WRITES, overwrite=True)
+
+
+def test_an_own_note_of_files_that_are_gone_is_no_obstacle(tmp_path):
+    out = tmp_path / "out"
+    _write(out, ["rgb/0.png", "metrics.json"], overwrite=False)
+    (out / "rgb" / "0.png").unlink()
+    (out / "metrics.json").unlink()
+    _write(out, ["metrics.json"], overwrite=False)
+    assert _noted(out) == ["metrics.json"]
+
+
+def test_who_is_stopped_while_files_are_moved_owns_all_of_them(tmp_path, monkeypatch):
+    out, replace = tmp_path / "out", os.replace
+    _write(out, ["rgb/0.png", "metrics.json"], overwrite=False)
+
+    def replace_one(source, target):
+        replace(source, target)
+        if target.parent.name == "rgb":
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(os, "replace", replace_one)
+        _write(out, ["rgb/1.png", "rgb/2.png"], overwrite=True)
+    # Nothing old is gone, and all of it can be replaced.
+    assert {"rgb/0.png", "metrics.json", "command.json"} < _files(out) and len(_files(out)) == 4
+    _write(out, ["rgb/1.png", "rgb/2.png"], overwrite=True)
+    assert _files(out) == {"rgb/1.png", "rgb/2.png", "command.json"}
+    assert _noted(out) == ["rgb/1.png", "rgb/2.png"]
+
+
+def test_the_folder_may_be_a_mount(tmp_path, monkeypatch):
+    out, replace = tmp_path / "out", os.replace
+    out.mkdir()
+
+    def replace_within(source, target):
+        if out in source.parents and out in target.parents:
+            replace(source, target)
+        else:
+            raise OSError(errno.EXDEV, "Invalid cross-device link")
+
+    monkeypatch.setattr(os, "replace", replace_within)
+    _write(out, ["rgb/0.png", "metrics.json"], overwrite=False)
+    assert _files(out) == {"rgb/0.png", "metrics.json", "command.json"}
 
 
 def test_files_and_folders_are_not_taken_for_each_other(tmp_path):

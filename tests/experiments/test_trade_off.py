@@ -114,7 +114,7 @@ def test_what_does_not_exist_is_named(make, message):
     ("options", "message"),
     [
         ((f"--scene={_SCENE}", "--steps=many"), "list of numbers"),
-        (("--scene=nowhere",), "nowhere is no folder"),
+        (("--scene=nowhere",), "nowhere/transforms_train.json does not exist"),
     ],
 )
 def test_mistakes_end_before_anything_is_trained(tmp_path, options, message):
@@ -337,6 +337,14 @@ def test_the_complaint_is_that_of_the_last_attempt(tmp_path, stub):
     assert child_process._complaint(mirror, 1) == "Compiling"
     assert child_process._complaint(mirror, -9) == "killed by SIGKILL"
     assert child_process._complaint("ValueError: no\nbye\n", 1) == "ValueError: no"
+    assert child_process._complaint("", 3) == "ended with status 3, and printed nothing"
+
+
+def test_who_says_nothing_is_not_told_by_the_command_itself(tmp_path, monkeypatch):
+    monkeypatch.setattr(child_process, "command_line", lambda name, options: ["false"])
+    with pytest.raises(RunFailedError, match=r"train: ended with status 1, and printed nothing"):
+        child_process.run("train", log=tmp_path / "log")
+    assert (tmp_path / "log").read_text() == "$ python -m experiments.train \n"
 
 
 def test_a_training_that_ended_unmeasured_has_no_peak(stub):

@@ -25,6 +25,7 @@ def _begin(options):
     run, printed = Path(flags.FLAGS.out), io.StringIO()
     try:
         with contextlib.redirect_stdout(printed):
+            train.check_options()
             train._begin(run)
     except ValueError as error:
         return {"error": str(error)}

@@ -47,6 +47,7 @@ def test_a_folder_that_is_no_run_is_named(tmp_path):
 
 
 def test_without_viser_it_says_what_to_install(tmp_path):
+    (tmp_path / "config.json").write_text("{}")  # as the folder of a run has
     code = (
         "import runpy, sys\n"
         "sys.modules['viser'] = None\n"
