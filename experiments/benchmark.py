@@ -233,8 +233,7 @@ def _finish(out: Path) -> None:
     print(f"Tables:  {out / summary.TABLES}")
     print(f"Results: {out / summary.RESULTS}")
     print(f"Report:  {report} ({report.stat().st_size / 1e6:.1f} MB)")
-    if pictures := sheet.write(out):
-        print(f"Picture: {pictures}")
+    print(f"Picture: {sheet.write(out) or 'none, for the scenes are gone'}")
 
 
 def _next(out: Path, done: Sequence[Method]) -> str:
