@@ -55,6 +55,16 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: item.path.name not in _LONGEST)
 
 
+def pytest_configure(config):
+    # Of commands; `_compiled_lightly` is for the suite's own processes.
+    if _is_quick(config):
+        os.environ[code_generator.LIGHTLY] = "1"
+
+
+def _is_quick(config):
+    return config.getoption("markexpr") == "not slow"
+
+
 # Compiled programs are mapped into memory one by one, and Linux allows a process 65,530 mappings:
 # past them LLVM aborts.
 _MOST_MAPPINGS = 30_000
@@ -92,11 +102,9 @@ _COMPUTING = (
 def _compiled_lightly(request):
     """Compiles without LLVM's optimisations, which takes a quarter off the suite's time.
 
-    Not where slow tests are run: these compile as for users, and the others too by
-    `pytest -m "slow or not slow"`. Commands never compile so.
+    Not where slow tests are run, nor by `pytest -m "slow or not slow"`.
     """
-    quick = request.config.getoption("markexpr") == "not slow"
-    lightly = quick and request.path.name not in _COMPUTING
+    lightly = _is_quick(request.config) and request.path.name not in _COMPUTING
     jax.config.update("jax_disable_most_optimizations", lightly)
     yield
     jax.config.update("jax_disable_most_optimizations", False)

@@ -16,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 
 # Options of a training that takes seconds.
-TINY = ("--steps=6", "--batch=64", "--log_every=2", "--checkpoint_every=3")
+TINY = ("--steps=6", "--batch=64", "--log_every=3", "--checkpoint_every=3")
 
 _forks = multiprocessing.get_context("forkserver")
 _forks.set_forkserver_preload(

@@ -4,13 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from tests import code_generator
 from tests.experiments.command import ROOT, TINY, run_command
 
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory) -> Path:
-    """A run of six steps on the bundled scene, made once, as users make it.
+    """A run of six steps on the bundled scene, made once.
 
     All processes of the suite read the same: nothing may be written into it but evaluations.
     """
@@ -23,7 +22,7 @@ def trained(tmp_path_factory) -> Path:
         if not (run.parent / "done").exists():
             scene = ROOT / "experiments" / "data" / "cube_smcvx_ball"
             options = (f"--scene={scene}", f"--out={run}", *TINY)
-            result = run_command("train", *options, env=code_generator.of_users())
+            result = run_command("train", *options)
             assert "experiments.evaluate" in result.stdout
             (run.parent / "done").touch()
     return run

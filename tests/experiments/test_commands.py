@@ -18,6 +18,7 @@ import trimesh
 from experiments import videos
 from refref_jax.data import files
 from refref_jax.render import load_model
+from tests import code_generator
 from tests.experiments.command import ROOT, TINY, run_command
 
 # The kinds of distances that an evaluation measures, and how.
@@ -27,7 +28,7 @@ _ERRORS = ("mae", "mae_masked", "rmse", "rmse_masked")
 
 def test_training_writes_a_readable_run(trained):
     lines = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines] == [2, 4, 6]
+    assert [line["step"] for line in lines] == [3, 6]
     for line in lines:
         assert {"step", "loss", "psnr", "lost", "rays_per_second", "seconds"} <= set(line)
         assert np.all(np.isfinite(list(line.values())))
@@ -49,6 +50,20 @@ def test_a_finished_run_is_neither_repeated_nor_overwritten(trained):
     assert "other options" in changed.stderr
     ignored = run_command("train", f"--out={trained}", "--resume", "--seed=3", fails=True)
     assert "--seed would have no effect" in ignored.stderr
+
+
+@pytest.mark.slow
+def test_as_users_compile_it_a_training_is_the_same(trained, tmp_path):
+    scene = json.loads((trained / "config.json").read_text())["scene"]["path"]
+    options = (f"--scene={scene}", f"--out={tmp_path / 'run'}", *TINY)
+    run_command("train", *options, env=code_generator.of_users())
+    ours, theirs = (
+        [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+        for run in (trained, tmp_path / "run")
+    )
+    assert [line["step"] for line in ours] == [line["step"] for line in theirs] == [3, 6]
+    for mine, other in zip(ours, theirs, strict=True):
+        assert mine["loss"] == pytest.approx(other["loss"], rel=1e-3)
 
 
 @pytest.mark.slow
