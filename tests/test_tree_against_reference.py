@@ -35,7 +35,7 @@ _VIEWS = (0, 10)
 
 _RULES = [
     (budgets.STRAIGHT, reference_tree.STRAIGHT),
-    (budgets.PAPER, reference_tree.PAPER),
+    pytest.param(budgets.PAPER, reference_tree.PAPER, marks=pytest.mark.slow),
     (budgets.TREE, reference_tree.TREE),
 ]
 

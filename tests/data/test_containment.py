@@ -143,8 +143,14 @@ def test_one_part():
     assert find_containment([ball()]) == ((NO_PARENT,), ())
 
 
-@pytest.mark.parametrize("turn", [lambda part: part, inverted, _moved, _shuffled])
-@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
+_TURNS = (lambda part: part, inverted, _moved, _shuffled)
+
+
+# Every order, and every turn by turns.
+@pytest.mark.parametrize(
+    ("order", "turn"),
+    list(zip(itertools.permutations(range(3)), itertools.cycle(_TURNS), strict=False)),
+)
 def test_each_of_three_nested_parts_lies_in_the_next(order, turn):
     parts = [ball(radius=0.5, centre=(0.2, 0.0, 0.0)), box(size=(2.0, 2.0, 2.0)), ball(radius=3.0)]
     parents = [1, 2, NO_PARENT]

@@ -97,7 +97,10 @@ def test_a_gradient_does_not_depend_on_the_table(level):
     np.testing.assert_array_equal(first, huge)
 
 
-@pytest.mark.parametrize(("level", "order"), [("dense", 2), ("hashed", 1)])
+@pytest.mark.parametrize(
+    ("level", "order"),
+    [pytest.param("dense", 2, marks=pytest.mark.slow), ("dense", 1), ("hashed", 1)],
+)
 def test_derivatives_by_table_and_position(level, order):
     def blend(table, points):
         return interpolation.interpolate(

@@ -164,7 +164,7 @@ _EVERY_STAGE = Refinement(
 @pytest.mark.parametrize(
     "mesh",
     [
-        bodies.icosphere(3),
+        pytest.param(bodies.icosphere(3), marks=pytest.mark.slow),
         bodies.joined(bodies.icosphere(3), bodies.icosphere(1, radius=0.1, centre=(1.3, 0, 0))),
         bodies.as_mesh(trimesh.creation.box((1.6, 1.6, 0.05)).subdivide_to_size(0.15)),
         _shaken(_surface(bodies.torus, 0.1), 0.004),

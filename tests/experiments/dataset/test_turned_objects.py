@@ -67,6 +67,7 @@ def test_parts_are_closed_outward_and_without_waste(made):
         assert len(np.unique(part.vertices, axis=0)) == len(part.vertices), part.name
 
 
+@pytest.mark.slow
 def test_no_surface_folds_over_itself(made):
     """In front of each face is the outside, behind it the inside."""
     _, _, meshes, _ = made
