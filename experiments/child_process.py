@@ -54,7 +54,7 @@ def run(name: str, *options: str, log: Path) -> tuple[float, float]:
     log.parent.mkdir(parents=True, exist_ok=True)
     start = time.monotonic()
     with log.open("a", encoding="utf-8") as file:
-        print(f"$ python -m experiments.{name} {' '.join(options)}", file=file, flush=True)
+        print(f"$ {commands.shell(name, *options)}", file=file, flush=True)
         written = file.tell()
         process = _start(
             command_line(name, options),

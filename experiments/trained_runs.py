@@ -130,10 +130,11 @@ def evaluate(
       RunFailedError: if it ends with an error.
     """
     known = _read(run)
-    key = " ".join([f"--split={split}", *options])
+    asked = [f"--split={split}", *options]
+    key = " ".join(asked)
     if key not in known.get("evaluations", {}):
         # One with other options may be there.
-        command = [f"--run={run}", f"--scene={scene}", *key.split(), "--overwrite"]
+        command = [f"--run={run}", f"--scene={scene}", *asked, "--overwrite"]
         child_process.run("evaluate", *command, log=run.with_name(f"{run.name}.log"))
         summary = json.loads((run / "eval" / split / "metrics.json").read_text("utf-8"))
         names = {field.name for field in dataclasses.fields(Evaluation)}
