@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments import child_process, commands
+from refref_jax import drafts
 from refref_jax.data import local_layout, transforms
 from refref_jax.training import run_folder
 
@@ -209,7 +210,5 @@ def _read(run: Path) -> dict[str, Any]:
 
 
 def _write(run: Path, record: dict[str, Any]) -> None:
-    path = run / _MEASURED
-    rewritten = path.with_suffix(".tmp")
-    rewritten.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-    rewritten.replace(path)
+    with drafts.unfinished_file(run / _MEASURED) as draft:
+        draft.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
