@@ -16,7 +16,6 @@ machines see --out, --scenes and these modules by the same paths. docs/benchmark
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from collections.abc import Sequence
@@ -120,7 +119,7 @@ def main() -> None:
         _list(out, planned, skipped)
         return
     # A benchmark that is killed takes the commands that it waits for with it.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    commands.stop_at_kill()
     out.mkdir(parents=True, exist_ok=True)
     with run_lock.hold(out):
         # Another process may have added to it meanwhile.

@@ -1,7 +1,9 @@
 """Runs a command of `experiments` in a process of its own.
 
 The command stops, and saves what it has, when this process ends, however that ends: its standard
-input is a pipe from here, which closes then; see `commands.run`.
+input is a pipe from here, which closes then; see `commands.run`. It is in a session of its own, so
+that Ctrl-C, a terminal that is closed, and what is sent to the group of this process reach it
+through this process alone.
 """
 
 import contextlib
@@ -62,6 +64,7 @@ def run(name: str, *options: str, log: Path) -> tuple[float, float]:
             stdout=file,
             stderr=subprocess.STDOUT,
             env=_environment(),
+            start_new_session=True,
         )
         try:
             status, usage = _wait(process)
