@@ -235,8 +235,10 @@ def test_a_mistake_of_ours_is_a_reason_too(tmp_path, stand_in, monkeypatch):
     assert str(log) in reason and "Traceback" in log.read_text()
 
 
-def test_a_job_waits_for_who_still_works_in_its_run(tmp_path):
+def test_a_job_waits_for_who_still_works_in_its_run(tmp_path, capsys):
     running.wait_until_free(tmp_path / "nothing")
     running.wait_until_free(tmp_path)
     with run_lock.hold(tmp_path), pytest.raises(ValueError, match="Another process works"):
         running.wait_until_free(tmp_path, patience=0.3)
+    line = f"Waiting until the process ends that works in {tmp_path} yet.\n"
+    assert capsys.readouterr().out == line
