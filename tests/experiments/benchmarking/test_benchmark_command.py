@@ -137,7 +137,8 @@ def test_scenes_and_methods_are_added_and_settings_stay(tmp_path, serve, scenes)
     ]
     before = (tmp_path / "out" / "benchmark.json").read_text()
     result = serve(tmp_path, scenes, "--methods=tree", "--seed=1", status=2)
-    assert "was begun with seed 0, and now it is to be 1" in result.stderr
+    assert "was begun with seed 0, and is now asked for with seed 1" in result.stderr
+    assert "Evaluating again" not in result.stderr
     assert (tmp_path / "out" / "benchmark.json").read_text() == before
 
 
