@@ -108,6 +108,7 @@ def main() -> None:
     if _TABLES_ONLY.value:
         _make_tables(out)
         return
+    _check_engine()
     scene_option.check_all(_SCENES.value)
     scenes, chosen = scene_list.find(_SCENES.value), methods.parse(_METHODS.value)
     weights = perceptual_option.checked()
@@ -170,6 +171,17 @@ def _settings(weights: Path | None) -> Settings:
         seed=_SEED.value,
         lpips=None if weights is None else settings.digest(weights),
     )
+
+
+def _check_engine() -> None:
+    """Refuses options that who does the jobs would not heed."""
+    unheeded = (_JOB_CPUS, _JOB_GPUS) if _RAY.value is None else (_JOBS,)
+    if given := [f"--{each.name}" for each in unheeded if each.present]:
+        who = "without --ray" if _RAY.value is None else "on a Ray cluster"
+        raise ValueError(
+            f"{', '.join(given)} would have no effect {who}. Leave it out, or "
+            + ("add --ray=ADDRESS." if _RAY.value is None else "leave out --ray.")
+        )
 
 
 def _engine(out: Path) -> engines.Engine:

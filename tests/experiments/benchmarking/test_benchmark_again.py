@@ -93,7 +93,7 @@ def test_the_next_command_has_all_that_was_asked_for_and_can_be_given(tmp_path, 
     words = shlex.split(line)[4:]
     assert set(given) | {"--steps=5", "--methods=ablations", scenes} < set(words)
     listed = serve(tmp_path, *words, "--dry_run").stdout
-    assert "cube_smcvx_ball/oracle_no_tir" in listed and "28 jobs, 28 to do." in listed
+    assert "cube_smcvx_ball/oracle_no_tir" in listed and "26 jobs, 26 to do." in listed
 
 
 def test_after_ablations_none_are_proposed(tmp_path, serve, scenes):
