@@ -16,9 +16,8 @@ machines see --out, --scenes and these modules by the same paths. docs/benchmark
 
 from __future__ import annotations
 
-import signal
+import functools
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,18 +33,18 @@ from refref_jax.training import run_lock
 
 if TYPE_CHECKING:
     from experiments import presets
-    from experiments.benchmarking import engines, jobs, scene_list, schedule, settings, summary
+    from experiments.benchmarking import engines, jobs, scene_list, settings, summary, working
     from experiments.benchmarking.jobs import Job, Skipped
     from experiments.benchmarking.report import page, sheet
-    from experiments.benchmarking.settings import Benchmark, Settings
+    from experiments.benchmarking.settings import Settings
 else:
     presets = late("experiments.presets")
     engines = late("experiments.benchmarking.engines")
     jobs = late("experiments.benchmarking.jobs")
     scene_list = late("experiments.benchmarking.scene_list")
-    schedule = late("experiments.benchmarking.schedule")
     settings = late("experiments.benchmarking.settings")
     summary = late("experiments.benchmarking.summary")
+    working = late("experiments.benchmarking.working")
     page = late("experiments.benchmarking.report.page")
     sheet = late("experiments.benchmarking.report.sheet")
 
@@ -109,6 +108,7 @@ def main() -> None:
     if _TABLES_ONLY.value:
         _make_tables(out)
         return
+    _check_engine()
     scene_option.check_all(_SCENES.value)
     scenes, chosen = scene_list.find(_SCENES.value), methods.parse(_METHODS.value)
     weights = perceptual_option.checked()
@@ -120,13 +120,15 @@ def main() -> None:
         _list(out, planned, skipped)
         return
     # A benchmark that is killed takes the commands that it waits for with it.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    commands.stop_at_kill()
     out.mkdir(parents=True, exist_ok=True)
     with run_lock.hold(out):
         # Another process may have added to it meanwhile.
         benchmark = settings.extended(out, benchmark)
         settings.write(out, benchmark)
-        failed = _work(out, benchmark, planned, skipped)
+        failed = working.work(
+            out, benchmark, planned, skipped, engine=functools.partial(_engine, out)
+        )
         _finish(out)
     print(f"Next: {_next(out, chosen)}")
     for each in skipped:
@@ -171,39 +173,15 @@ def _settings(weights: Path | None) -> Settings:
     )
 
 
-def _work(
-    out: Path, benchmark: Benchmark, planned: Sequence[Job], skipped: Sequence[Skipped]
-) -> dict[str, str]:
-    """Does the jobs that are missing, and writes the summary after each; returns why some failed.
-
-    What failed or was left out before stays in the summary, as far as it is not planned now.
-    """
-    failed: dict[str, str] = {}
-    now = {each.name for each in (*planned, *skipped)}
-    failed_before, skipped_before = summary.not_done(out)
-    others = {name: reason for name, reason in failed_before.items() if name not in now}
-    left_out = [*(each for each in skipped_before if each.name not in now), *skipped]
-    summary.write(out, benchmark, failed=others, skipped=left_out)
-    missing = [job for job in planned if not jobs.is_done(out, job)]
-    if not missing:
-        print("All jobs are done already." if planned else "All jobs are left out.")
-        return failed
-    engine = _engine(out)
-    start, count = time.monotonic(), 0
-    with commands.ProgressBar("benchmark", len(missing)) as bar:
-
-        def done(job: Job, reason: str | None) -> None:
-            nonlocal count
-            count += 1
-            if reason is not None:
-                failed[job.name] = reason
-            summary.write(out, benchmark, failed=others | failed, skipped=left_out)
-            left = (time.monotonic() - start) / count * (len(missing) - count)
-            end = "failed" if reason is not None else "done"
-            bar.show(count, f"{job.name} {end}, about {_duration(left)} left")
-
-        schedule.work(missing, engine, done)
-    return failed
+def _check_engine() -> None:
+    """Refuses options that who does the jobs would not heed."""
+    unheeded = (_JOB_CPUS, _JOB_GPUS) if _RAY.value is None else (_JOBS,)
+    if given := [f"--{each.name}" for each in unheeded if each.present]:
+        who = "without --ray" if _RAY.value is None else "on a Ray cluster"
+        raise ValueError(
+            f"{', '.join(given)} would have no effect {who}. Leave it out, or "
+            + ("add --ray=ADDRESS." if _RAY.value is None else "leave out --ray.")
+        )
 
 
 def _engine(out: Path) -> engines.Engine:
@@ -219,11 +197,6 @@ def _list(out: Path, planned: Sequence[Job], skipped: Sequence[Skipped]) -> None
     for each in skipped:
         print(f"{'out':6} {each.name}: {each.reason}")
     print(f"{len(planned)} jobs, {done.count(False)} to do.")
-
-
-def _duration(seconds: float) -> str:
-    minutes = round(seconds / 60.0)
-    return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{minutes} min"
 
 
 def _finish(out: Path) -> None:

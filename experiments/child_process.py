@@ -1,7 +1,9 @@
 """Runs a command of `experiments` in a process of its own.
 
 The command stops, and saves what it has, when this process ends, however that ends: its standard
-input is a pipe from here, which closes then; see `commands.run`.
+input is a pipe from here, which closes then; see `commands.run`. It is in a session of its own, so
+that Ctrl-C, a terminal that is closed, and what is sent to the group of this process reach it
+through this process alone.
 """
 
 import contextlib
@@ -54,7 +56,7 @@ def run(name: str, *options: str, log: Path) -> tuple[float, float]:
     log.parent.mkdir(parents=True, exist_ok=True)
     start = time.monotonic()
     with log.open("a", encoding="utf-8") as file:
-        print(f"$ python -m experiments.{name} {' '.join(options)}", file=file, flush=True)
+        print(f"$ {commands.shell(name, *options)}", file=file, flush=True)
         written = file.tell()
         process = _start(
             command_line(name, options),
@@ -62,6 +64,7 @@ def run(name: str, *options: str, log: Path) -> tuple[float, float]:
             stdout=file,
             stderr=subprocess.STDOUT,
             env=_environment(),
+            start_new_session=True,
         )
         try:
             status, usage = _wait(process)

@@ -79,6 +79,21 @@ def _stop_with_input() -> None:
     os.kill(os.getpid(), signal.SIGTERM)
 
 
+def stop_at_kill() -> None:
+    """Has `kill` raise `KeyboardInterrupt` as Ctrl-C does, once: more of them are the same wish.
+
+    A group of processes is often told twice: by who ends the group, and by one of its members.
+    """
+
+    def stop(number: int, frame: object) -> None:
+        del frame
+        # Not SIG_IGN, which a process that is started now would have too.
+        signal.signal(number, lambda *_: None)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, stop)
+
+
 def shell(name: str, *options: str) -> str:
     """Returns the line that runs a command of `experiments`, quoted so that it can be pasted."""
     return shlex.join(["python", "-m", f"experiments.{name}", *options])
@@ -107,7 +122,9 @@ def from_string_safe(value: Any) -> Any:
 class Interrupt:
     """Notes that the user wants to stop, so that a step can be finished and saved.
 
-    It has the signals of Ctrl-C and of `kill` as long as its context lasts.
+    It has the signals of Ctrl-C and of `kill` as long as its context lasts. A second Ctrl-C ends
+    the process at once. A second `kill` is the same wish as the first, for it may come from
+    somebody else: `timeout` sends two, to its command and to the group that this is in.
     """
 
     def __init__(self) -> None:
@@ -128,10 +145,14 @@ class Interrupt:
 
     def _request(self, number: int, frame: object) -> None:
         del frame
+        more = b"."
+        if number == signal.SIGINT:
+            signal.signal(number, signal.SIG_DFL)
+            more = b"; once more to stop at once."
+        if number == signal.SIGINT or not self.requested:
+            # Not `print`: the signal may have come while something was being printed.
+            os.write(1, b"Stopping after this step" + more + b"\n")
         self.requested = True
-        signal.signal(number, signal.SIG_DFL)
-        # Not `print`: the signal may have come while something was being printed.
-        os.write(1, b"Stopping after this step; once more to stop at once.\n")
 
 
 class ProgressBar:

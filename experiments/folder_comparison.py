@@ -4,9 +4,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-from jaxtyping import Bool, Shaped
-
 from experiments import measures
 from experiments.measures import Perceptual
 from refref_jax.data import files
@@ -45,7 +42,8 @@ def match(rendered: Path, target: Path, masks: Path | None) -> list[Pair]:
       masks: a folder of 8-bit masks named as the images, or `None`.
 
     Raises:
-      SceneError: if a folder is missing or empty, or they do not hold the same names.
+      SceneError: if a folder is missing or empty, they do not hold the same names, or the sizes of
+        two that are paired differ.
     """
     images = _paired(rendered, target, ".png")
     distances = _paired(rendered, target, ".exr")
@@ -63,6 +61,8 @@ def match(rendered: Path, target: Path, masks: Path | None) -> list[Pair]:
                 "--masks."
             )
         pairs.append(Pair(name, images.get(name), distances.get(name), mask))
+    for pair in pairs:
+        _check_sizes(pair)
     return pairs
 
 
@@ -70,18 +70,16 @@ def compare(pairs: Sequence[Pair], perceptual: Perceptual) -> Iterator[dict[str,
     """Yields the measures of each pair, `None` where it has none.
 
     Raises:
-      SceneError: if a file is broken, or the sizes of two differ.
+      SceneError: if a file is broken.
     """
     for pair in pairs:
         mask = None if pair.mask is None else files.read_mask(pair.mask)
         row: dict[str, Any] = {NAME: pair.name}
         if pair.images is not None:
             rendered, target = (files.read_rgb(path) / 255.0 for path in pair.images)
-            _check_sizes(pair.images, (rendered, target), pair.mask, mask)
             row |= measures.measure_colours(rendered, target, mask, perceptual)
         if pair.distances is not None:
             seen, true = (files.read_depth(path) for path in pair.distances)
-            _check_sizes(pair.distances, (seen, true), pair.mask, mask)
             row |= measures.measure_distances("distance", seen, true, mask)
         yield row
 
@@ -129,22 +127,19 @@ def _paired(rendered: Path, target: Path, ending: str) -> dict[str, tuple[Path, 
     return {name: (a[name], b[name]) for name in a}
 
 
-def _check_sizes(
-    paths: tuple[Path, Path],
-    pixels: tuple[Shaped[np.ndarray, "..."], Shaped[np.ndarray, "..."]],
-    mask_path: Path | None,
-    mask: Bool[np.ndarray, "h w"] | None,
-) -> None:
-    sizes = {path: x.shape[:2] for path, x in zip(paths, pixels, strict=True)}
-    if mask_path is not None and mask is not None:
-        sizes[mask_path] = mask.shape
-    first, (height, width) = next(iter(sizes.items()))
-    for path, (other_height, other_width) in sizes.items():
-        if (other_height, other_width) != (height, width):
-            raise SceneError(
-                f"{path} is {other_width} x {other_height} pixels, but {first} is {width} x "
-                f"{height}. Give images of one size."
-            )
+def _check_sizes(pair: Pair) -> None:
+    masks = () if pair.mask is None else (pair.mask,)
+    for kind in (pair.images, pair.distances):
+        if kind is None:
+            continue
+        sizes = {path: files.read_size(path) for path in (*kind, *masks)}
+        first, (height, width) = next(iter(sizes.items()))
+        for path, (other_height, other_width) in sizes.items():
+            if (other_height, other_width) != (height, width):
+                raise SceneError(
+                    f"{path} is {other_width} x {other_height} pixels, but {first} is {width} x "
+                    f"{height}. Give images of one size."
+                )
 
 
 def _text(value: float | None) -> str:

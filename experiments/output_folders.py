@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments import command_line
-from experiments.r3f import stages
+from refref_jax import drafts
 from refref_jax.training import run_lock
 
 NOTE = "command.json"
@@ -62,7 +62,7 @@ def fresh_file(path: Path, *, overwrite: bool) -> Iterator[Path]:
     """
     check_file(path, overwrite=overwrite)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with stages.unfinished_file(path) as draft:
+    with drafts.unfinished_file(path) as draft:
         yield draft
 
 
@@ -86,7 +86,7 @@ def note(out: Path, module: str, files: Iterable[Path] = ()) -> None:
         "options": command_line.resolved(command),
         "files": [path.as_posix() for path in sorted(files)],
     }
-    with stages.unfinished_file(out / NOTE) as path:
+    with drafts.unfinished_file(out / NOTE) as path:
         path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 

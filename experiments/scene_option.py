@@ -44,8 +44,15 @@ def check(source: str | Path | None) -> None:
 def check_all(sources: Sequence[str]) -> None:
     """Refuses as `check` does, and passes over what is empty or has wildcards."""
     for source in sources:
-        if source and not glob.has_magic(source):
+        if source and not has_wildcards(source):
             check(source)
+
+
+def has_wildcards(source: str) -> bool:
+    """Returns whether a name stands for many; one that exists as it is, is itself."""
+    if source.startswith("hf:"):
+        return False
+    return glob.has_magic(source) and not Path(source).exists()
 
 
 def check_place(place: str) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from experiments.trade_points import BASE, OF_EVALUATION
+from refref_jax import drafts
 
 NOISE = 0.3
 """Decibels by which trainings differ that differ in nothing that matters; see `BUILD_NOTES.md`."""
@@ -78,12 +79,13 @@ class Turn(NamedTuple):
 
 def write(path: Path, rows: Sequence[Row]) -> None:
     """Writes a table as CSV, all or nothing; what is not known stays empty."""
-    partial = path.with_suffix(".partial")
-    with partial.open("w", newline="", encoding="utf-8") as file:
+    with (
+        drafts.unfinished_file(path) as draft,
+        draft.open("w", newline="", encoding="utf-8") as file,
+    ):
         writer = csv.writer(file)
         writer.writerow(field.name for field in dataclasses.fields(Row))
         writer.writerows(dataclasses.astuple(row) for row in rows)
-    partial.replace(path)
 
 
 def read(path: Path) -> list[Row]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments import child_process, commands
+from refref_jax import drafts
 from refref_jax.data import local_layout, transforms
 from refref_jax.training import run_folder
 
@@ -130,10 +131,11 @@ def evaluate(
       RunFailedError: if it ends with an error.
     """
     known = _read(run)
-    key = " ".join([f"--split={split}", *options])
+    asked = [f"--split={split}", *options]
+    key = " ".join(asked)
     if key not in known.get("evaluations", {}):
         # One with other options may be there.
-        command = [f"--run={run}", f"--scene={scene}", *key.split(), "--overwrite"]
+        command = [f"--run={run}", f"--scene={scene}", *asked, "--overwrite"]
         child_process.run("evaluate", *command, log=run.with_name(f"{run.name}.log"))
         summary = json.loads((run / "eval" / split / "metrics.json").read_text("utf-8"))
         names = {field.name for field in dataclasses.fields(Evaluation)}
@@ -208,7 +210,5 @@ def _read(run: Path) -> dict[str, Any]:
 
 
 def _write(run: Path, record: dict[str, Any]) -> None:
-    path = run / _MEASURED
-    rewritten = path.with_suffix(".tmp")
-    rewritten.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-    rewritten.replace(path)
+    with drafts.unfinished_file(run / _MEASURED) as draft:
+        draft.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")

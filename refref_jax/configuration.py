@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+from refref_jax import drafts
+
 _Config = TypeVar("_Config")
 
 Variants = Mapping[type, Mapping[str, type]]
@@ -23,9 +25,10 @@ _KIND = "kind"
 
 
 def write(path: Path, config: Any) -> None:
-    """Writes a configuration as readable text."""
+    """Writes a configuration as readable text, all or nothing."""
     text = json.dumps(dataclasses.asdict(config), indent=2) + "\n"
-    path.write_text(text, encoding="utf-8")
+    with drafts.unfinished_file(path) as draft:
+        draft.write_text(text, encoding="utf-8")
 
 
 def read(path: Path, kind: type[_Config], *, variants: Variants | None = None) -> _Config:

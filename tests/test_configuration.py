@@ -275,3 +275,21 @@ def test_the_keys_of_a_variant_are_its_own(path):
     path.write_text('{"main": {"radius": 2, "kind": "box"}, "others": [], "spare": null}')
     with pytest.raises(ValueError, match=r"_Scene\.main lacks 'size'"):
         configuration.read(path, _Scene, variants=_SHAPES)
+
+
+@pytest.mark.parametrize("before", [None, _Even(2)])
+def test_who_is_stopped_while_writing_leaves_what_was_there(tmp_path, monkeypatch, before):
+    path = tmp_path / "config.json"
+    if before is not None:
+        configuration.write(path, before)
+    write_text = type(path).write_text
+
+    def write_half(self, text, **options):
+        write_text(self, text[: len(text) // 2], **options)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(type(path), "write_text", write_half)
+        configuration.write(path, _Even(4))
+    assert [each.name for each in tmp_path.iterdir()] == ([] if before is None else ["config.json"])
+    assert before is None or configuration.read(path, _Even) == before

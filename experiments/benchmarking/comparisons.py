@@ -40,16 +40,17 @@ _THEIRS = (
 )
 _MEANS = (
     "Mean over the images of a scene, then over scenes; ± is the standard error over scenes. What "
-    "is not known is - and is not counted. Best **bold**, second best <u>underlined</u>, among our "
-    "methods that have all scenes of a block."
+    "is not known is - and is not counted. Best **bold**, and of three or more second best "
+    "<u>underlined</u>, among our methods that have all scenes of a block."
 )
 _SUBSTITUTED = (
     "Substituted distances have the true ones inside the mask, as the first release of the paper's "
-    "code had: they are 0 there by definition for methods that know objects, and do not rank. "
+    "code had: they are 0 there by definition for methods that know objects, and do not rank. The "
+    "paper's stand in their column, for they come nearest; which kind they are is not known. "
     "Before natural backgrounds all distances are those inside the mask."
 )
 _FARTHEST = (
-    f"Of each scene the {TOP} rendered test views that are farthest from any training view. The "
+    "Of each scene the {views} rendered test views that are farthest from any training view. The "
     "paper defines no distance of poses; here it is sqrt(|c - c'|²/s² + a²) of positions c, the "
     "angle a between the cameras' axes, and the mean distance s of the training cameras from the "
     "origin."
@@ -82,8 +83,15 @@ def top_views_table(found: Sequence[Record]) -> Table:
     rows = _ours(found, quantities.TOP_VIEWS, top_metrics)
     rows += _theirs(published.TOP_VIEWS, published.ALL, published.ALL, quantities.TOP_VIEWS)
     blocks = [_marked("all scenes", rows, quantities.TOP_VIEWS, found)] if found else []
-    notes = (_FARTHEST, _DRMSE)
+    notes = (_FARTHEST.format(views=_views(found)), _DRMSE)
     return _table("top_views", "Farthest test views", notes, quantities.TOP_VIEWS, blocks)
+
+
+def _views(found: Sequence[Record]) -> str:
+    """Returns how many of the farthest views there were, up to `TOP` of each scene."""
+    counts = {min(TOP, len(record.per_image)) for record in found} or {TOP}
+    least, most = min(counts), max(counts)
+    return str(most) if least == most else f"{least} to {most}"
 
 
 def top_metrics(record: Record) -> Metrics:

@@ -10,10 +10,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from experiments.benchmarking.methods import RECONSTRUCTION, Method, Need, same_as
+from experiments.benchmarking.methods import RECONSTRUCTION, Method, Need, same_as, same_inside
 from experiments.benchmarking.settings import Scene, Settings
 from refref_jax.data import local_layout, meshes, transforms
-from refref_jax.data.part_descriptions import read_part_descriptions
+from refref_jax.data.needs import find_tints
+from refref_jax.data.part_descriptions import PartDescription, read_part_descriptions
 
 FOLDER = "jobs"
 RESULT = "result.json"
@@ -157,14 +158,28 @@ def _reasons(scene: Scene, methods: Sequence[Method], preset: str) -> dict[str, 
         local_layout.read_frames(Path(scene.path), SPLIT)
     except ValueError as error:
         return {method.name: f"its {SPLIT} views can not be read: {error}" for method in methods}
-    lacks = _lacking_or_broken(scene, methods)
+    lacks, inside = _lacking_or_broken(scene, methods), _inside(Path(scene.path))
     reasons = {}
     for method in methods:
         if missing := [_LACKING[need] for need in method.needs if need in lacks]:
             reasons[method.name] = missing[0]
         elif full := same_as(method, preset):
             reasons[method.name] = f"in the preset {preset} it is {full} again"
+        elif full := same_inside(method, inside):
+            told = ", ".join(f"{name} {value}" for name, value in inside.items())
+            reasons[method.name] = f"in this scene it is {full} again ({told})"
     return reasons
+
+
+def _inside(scene: Path) -> dict[str, str]:
+    """Returns what a scene needs inside its objects, as options; nothing if it is broken."""
+    try:
+        described = read_part_descriptions(scene / "scene.json")
+        parts = [described.get(p.name, PartDescription()) for p in meshes.mesh_files(scene)]
+    except ValueError:
+        return {}
+    tints = find_tints(parts)
+    return {"interior": "clear"} if tints == "none" else {"interior": "absorbing", "tints": tints}
 
 
 def _lacking_or_broken(scene: Scene, methods: Sequence[Method]) -> set[Need]:

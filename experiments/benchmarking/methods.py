@@ -5,12 +5,13 @@ else is the preset's, for all methods alike: sizes, schedule, and the footprint 
 `--paths=paper --interior=field`, has the published light paths and field, and is the published
 method in full in the preset `paper` alone: the others are smaller, or have differential footprints
 where the paper's are cones. Ablations of `oracle` take one thing from it; those of `tree`, which is
-ours, change one thing of that, and one that the preset has already is left out, see `same_as`.
-Nerfacto's fields (`oracle_nerfacto`) bring their own sizes, samples and footprint, a cone.
+ours, change one thing of that, and one that the preset has already is left out (`same_as`), as is
+one that a scene comes to anyway (`same_inside`). Nerfacto's fields (`oracle_nerfacto`) bring their
+own sizes, samples and footprint, a cone.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Literal
 
 from experiments import command_line
@@ -120,15 +121,33 @@ _ALL = (
 METHODS: dict[str, Method] = {method.name: method for method in _ALL}
 """Every method by its name, in the order of tables."""
 
+_OF_INSIDE = ("interior", "tints")
+
 FULL: dict[Group, str] = {"ablation of the oracle": "oracle", "ablation of the tree": "tree"}
 """The method that each group of ablations is compared with."""
 
 
 def same_as(method: Method, preset: str) -> str | None:
     """Returns which method an ablation is again, where its footprint is the preset's already."""
-    chosen = dict(word.lstrip("-").split("=", 1) for word in method.train).get("footprint")
+    chosen = _options_of(method).get("footprint")
     size = registry.KINDS[registry.USUAL].sizes[presets.PRESETS[preset].size]
     return FULL[method.group] if chosen == size.footprint else None
+
+
+def same_inside(method: Method, inside: Mapping[str, str]) -> str | None:
+    """Returns which method an ablation is again in a scene that needs this inside anyway.
+
+    Args:
+      method: the ablation.
+      inside: options of training that the scene's objects come to, of those in `_OF_INSIDE`.
+    """
+    given = _options_of(method)
+    chosen = {name: given[name] for name in _OF_INSIDE if name in given}
+    return FULL[method.group] if chosen and chosen == inside else None
+
+
+def _options_of(method: Method) -> dict[str, str]:
+    return dict(word.lstrip("-").split("=", 1) for word in method.train)
 
 
 def parse(names: Sequence[str]) -> list[Method]:

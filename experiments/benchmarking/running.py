@@ -28,8 +28,9 @@ from experiments.r3f import records as reconstructions
 from refref_jax.data import local_layout
 from refref_jax.training import run_lock
 
-# Seconds that a command which outlived its benchmark may take to save and end.
-_PATIENCE = 120.0
+# Seconds that a command which outlived its benchmark may take to save and end: where others work
+# too, compiling alone takes minutes, and what compiles does not look up.
+_PATIENCE = 600.0
 
 
 def run(out: Path, job: Job) -> str | None:
@@ -61,12 +62,12 @@ def run(out: Path, job: Job) -> str | None:
 
 
 def wait_until_free(folder: Path, patience: float = _PATIENCE) -> None:
-    """Waits while a process that an earlier benchmark left behind works in a folder.
+    """Waits while a process that an earlier benchmark left behind works in a folder, and says so.
 
     Raises:
       ValueError: if it still does after so many seconds.
     """
-    end = time.monotonic() + patience
+    end, said = time.monotonic() + patience, False
     while folder.is_dir():
         try:
             with run_lock.hold(folder):
@@ -74,6 +75,9 @@ def wait_until_free(folder: Path, patience: float = _PATIENCE) -> None:
         except ValueError:
             if time.monotonic() > end:
                 raise
+            if not said:
+                print(f"Waiting until the process ends that works in {folder} yet.", flush=True)
+                said = True
             time.sleep(0.2)
 
 

@@ -38,7 +38,7 @@ def find(words: Sequence[str]) -> list[Scene]:
 
 
 def _folders(word: str) -> list[Path]:
-    if glob.has_magic(word) and not word.startswith("hf:"):
+    if scene_option.has_wildcards(word):
         return [Path(path) for path in sorted(glob.glob(word)) if _is_scene(Path(path))]
     folder = scene_option.opened(word)
     if not _is_scene(folder):

@@ -13,10 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from experiments.benchmarking.methods import Method
-from experiments.r3f import stages
+from refref_jax import drafts
 from refref_jax.data import transforms
 
 FILE = "benchmark.json"
+
+# Settings that no training depends on.
+_OF_EVALUATION = ("limit", "rays_per_pixel", "lpips")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,7 +156,7 @@ def digest(path: Path) -> str:
 
 def write_json(path: Path, content: Any) -> None:
     """Writes a JSON file, all or nothing."""
-    with stages.unfinished_file(path) as draft:
+    with drafts.unfinished_file(path) as draft:
         draft.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
@@ -162,7 +165,22 @@ def _check_settings(out: Path, begun: Settings, now: Settings) -> None:
         before, after = getattr(begun, field.name), getattr(now, field.name)
         if before != after:
             option = "lpips_weights" if field.name == "lpips" else field.name
+            again = ""
+            if field.name in _OF_EVALUATION:
+                again = (
+                    " To evaluate what is trained once more, without training it again, see "
+                    "'Evaluating again' in docs/benchmark.md."
+                )
             raise ValueError(
-                f"{out} was begun with {field.name} {before}, and now it is to be {after}: results "
-                f"would not compare. Leave --{option} as it was, or give another --out."
+                f"{out} was begun {_told(field.name, before)}, and is now asked for "
+                f"{_told(field.name, after)}: results would not compare. Leave --{option} as it "
+                f"was, or give another --out.{again}"
             )
+
+
+def _told(name: str, value: int | str | None) -> str:
+    if value is None:
+        return "without LPIPS" if name == "lpips" else f"without --{name}"
+    if name == "lpips":
+        return f"with the weights of LPIPS whose SHA-256 begins with {str(value)[:8]}"
+    return f"with {name} {value}"

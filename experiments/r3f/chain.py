@@ -13,7 +13,6 @@ from experiments.r3f import (
     light_stage,
     records,
     report,
-    stages,
 )
 from experiments.r3f.records import IndexFacts, LightFacts, Reconstruction, ReconstructionConfig
 from refref_jax import configuration
@@ -74,8 +73,7 @@ def reconstruct(
             records.write(out, found)
         say(describe_index(found.index))
         found = _refined(scene, out, found, say)
-        with stages.unfinished_file(out / INDEX_FILE) as path:
-            configuration.write(path, body.index_facts(found))
+        configuration.write(out / INDEX_FILE, body.index_facts(found))
         if found.report is None or not report.is_there(out):
             found = dataclasses.replace(found, report=report.run(scene, out, found, compare))
             records.write(out, found)

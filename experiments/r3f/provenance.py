@@ -3,7 +3,6 @@
 import dataclasses
 from pathlib import Path
 
-from experiments.r3f import stages
 from refref_jax import configuration
 
 _FILE = "body.json"
@@ -28,8 +27,7 @@ def write(run: Path, provenance: Provenance | None) -> None:
         (run / _FILE).unlink(missing_ok=True)
         return
     run.mkdir(parents=True, exist_ok=True)
-    with stages.unfinished_file(run / _FILE) as path:
-        configuration.write(path, provenance)
+    configuration.write(run / _FILE, provenance)
 
 
 def read(run: Path) -> Provenance | None:

@@ -15,8 +15,7 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from experiments.r3f import stages
-from refref_jax import configuration
+from refref_jax import configuration, drafts
 from refref_jax.sampling.domains import Space
 
 FILE = "reconstruction.json"
@@ -191,8 +190,7 @@ def read(out: Path) -> Reconstruction:
 
 def write(out: Path, reconstruction: Reconstruction) -> None:
     """Writes how far it has got, at once."""
-    with stages.unfinished_file(out / FILE) as path:
-        configuration.write(path, reconstruction)
+    configuration.write(out / FILE, reconstruction)
 
 
 def begin(out: Path, asked: Reconstruction) -> Reconstruction:
@@ -205,7 +203,7 @@ def begin(out: Path, asked: Reconstruction) -> Reconstruction:
     if not exists(out):
         if out.exists() and not out.is_dir():
             raise ValueError(f"{out} is a file, but a folder is needed. Give another --out.")
-        draft = stages.beside(out / FILE)
+        draft = drafts.beside(out / FILE)
         if out.is_dir() and any(each != draft for each in out.iterdir()):
             raise ValueError(
                 f"{out} holds something else than a reconstruction. Give a new folder as --out."

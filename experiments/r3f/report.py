@@ -15,7 +15,6 @@ from experiments.r3f import (
     body,
     overlap_pictures,
     pages,
-    stages,
     surface_pictures,
     windows,
 )
@@ -23,6 +22,7 @@ from experiments.r3f.overlap_pictures import Outline
 from experiments.r3f.records import DistanceFacts, Reconstruction, ReportFacts
 from experiments.r3f.surface_pictures import SurfaceView
 from experiments.r3f.windows import Window
+from refref_jax import drafts
 from refref_jax.data import containment, local_layout, meshes
 from refref_jax.data.cameras import Cameras, image_rays
 from refref_jax.data.errors import SceneError
@@ -76,13 +76,13 @@ def run(scene: Path, out: Path, found: Reconstruction, compare: bool) -> ReportF
         truth=truth.mesh and DistanceFacts(*compare_meshes(mesh, truth.mesh)),
         remark=truth.remark,
     )
-    with stages.unfinished_folder(out / FOLDER) as folder:
+    with drafts.unfinished_folder(out / FOLDER) as folder:
         overlap_pictures.draw_overlaps(folder / "overlap.png", outlines)
         overlap_pictures.draw_errors(folder / "iou.png", outlines)
         surface_pictures.draw_surface(
             folder / "surface.png", _surface_views(mesh, truth.mesh, frames)
         )
-    with stages.unfinished_file(out / FILE) as page:
+    with drafts.unfinished_file(out / FILE) as page:
         page.write_text(pages.markdown(out, found, facts), encoding="utf-8")
     return facts
 

@@ -64,6 +64,23 @@ def read_depth(path: Path) -> Float[np.ndarray, "h w"]:
     return (_NEAREST_DEPTH + _DEPTH_RANGE * (1.0 - grey / 255.0)).astype(np.float32)
 
 
+def read_size(path: Path) -> tuple[int, int]:
+    """Returns height and width of an image or EXR in pixels, without reading its pixels."""
+    _require(path)
+    if path.suffix != ".exr":
+        try:
+            return iio.improps(path, plugin="pillow").shape[:2]
+        except Exception as error:  # as in `_read_png`
+            raise _unreadable_image(path, error) from error
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            low, high = file.header()["dataWindow"]
+    except Exception as error:  # as in `read_exr`
+        raise _unreadable_exr(path, error) from error
+    width, height = high - low + 1
+    return int(height), int(width)
+
+
 def read_exr(path: Path) -> Float[np.ndarray, "h w *channels"]:
     """Reads the first part of an EXR: `[h, w]` for one channel, `[h, w, 3]` for RGB."""
     _require(path)
@@ -71,7 +88,7 @@ def read_exr(path: Path) -> Float[np.ndarray, "h w *channels"]:
         with OpenEXR.File(str(path)) as file:
             channels = {name: channel.pixels for name, channel in file.channels().items()}
     except Exception as error:  # OpenEXR raises what its C++ core does
-        raise SceneError(f"{path} can not be read as EXR ({error}). Export it again.") from error
+        raise _unreadable_exr(path, error) from error
     if set(channels) == {"RGB"}:
         return channels["RGB"].astype(np.float32)
     if len(channels) == 1 and next(iter(channels.values())).ndim == 2:
@@ -114,10 +131,7 @@ def _read_png(path: Path) -> UInt8[np.ndarray, "h w *channels"]:
     try:
         pixels = iio.imread(path, plugin="pillow")
     except Exception as error:  # Pillow raises OSError, SyntaxError and its own
-        raise SceneError(
-            f"{path} can not be read as an image ({error}). It may be truncated: copy or render "
-            "it again."
-        ) from error
+        raise _unreadable_image(path, error) from error
     if pixels.dtype == bool:
         pixels = pixels.astype(np.uint8) * 255
     if pixels.dtype != np.uint8 or _has_sixteen_bits(path):
@@ -126,6 +140,17 @@ def _read_png(path: Path) -> UInt8[np.ndarray, "h w *channels"]:
             "used."
         )
     return pixels
+
+
+def _unreadable_image(path: Path, error: Exception) -> SceneError:
+    return SceneError(
+        f"{path} can not be read as an image ({error}). It may be truncated: copy or render it "
+        "again."
+    )
+
+
+def _unreadable_exr(path: Path, error: Exception) -> SceneError:
+    return SceneError(f"{path} can not be read as EXR ({error}). Export it again.")
 
 
 def _has_sixteen_bits(path: Path) -> bool:

@@ -13,6 +13,7 @@ from refref_jax.data.cameras import Cameras
 from refref_jax.data.containment import Containment, winding_number
 from refref_jax.data.convexity import encloses, is_convex
 from refref_jax.data.meshes import MeshPart
+from refref_jax.data.part_descriptions import PartDescription
 from refref_jax.optics.interface_rules import CLEAR, NO_ABSORPTION, NO_PARENT
 from refref_jax.sampling.domains import Space
 
@@ -73,7 +74,7 @@ def find_needs(
         convex=convex,
         reentry="impossible" if leaves_for_good or not parts else "possible",
         interior=_interior(parts),
-        tints=_tints(parts),
+        tints=find_tints(parts),
         space=space,
     )
 
@@ -113,17 +114,20 @@ def _any_inside(cameras: Cameras, body: MeshPart) -> bool:
     return bool(np.any(np.abs(winding) > 0.5))
 
 
-def _takes_light(part: MeshPart) -> bool:
+def _takes_light(part: MeshPart | PartDescription) -> bool:
     return tuple(part.tint) != CLEAR or tuple(part.absorption) != NO_ABSORPTION
 
 
 def _interior(parts: Sequence[MeshPart]) -> Literal["none", "clear", "absorbing"]:
     if not parts:
         return "none"
-    return "clear" if _tints(parts) == "none" else "absorbing"
+    return "clear" if find_tints(parts) == "none" else "absorbing"
 
 
-def _tints(parts: Sequence[MeshPart]) -> Literal["none", "given", "learned"]:
+def find_tints(
+    parts: Sequence[MeshPart | PartDescription],
+) -> Literal["none", "given", "learned"]:
+    """Returns where the colours of parts, or of what is known of them, come from; see `Needs`."""
     if not all(part.colour_known for part in parts):
         return "learned"
     return "given" if any(map(_takes_light, parts)) else "none"

@@ -130,6 +130,22 @@ def test_folders_that_do_not_fit_are_named(folders, spoil, message):
         _compared(*folders)
 
 
+def test_all_sizes_are_looked_at_before_anything_is_compared(folders, masks):
+    for folder in folders:
+        for name in ("r_000", "r_001"):
+            _write_distance(folder, name, 1.0)
+    assert len(folder_comparison.match(*folders, masks)) == 2
+    _write_distance(folders[0], "r_001", 1.0, size=(12, 17))
+    with pytest.raises(ValueError, match=r"r_001\.exr is 17 x 13 pixels, but .* is 17 x 12"):
+        folder_comparison.match(*folders, masks)
+    write_grey(masks / "r_001.png", np.zeros((5, 4)))
+    with pytest.raises(ValueError, match=r"masks/r_001\.png is 4 x 5 pixels"):
+        folder_comparison.match(*folders, masks)
+    (folders[0] / "r_001.exr").write_text("no EXR")
+    with pytest.raises(ValueError, match=r"rendered/r_001\.exr can not be read as EXR"):
+        folder_comparison.match(*folders, None)
+
+
 def test_many_missing_names_are_counted(folders):
     for i in range(3):
         _write(folders[0], f"s_{i}", 0.1)

@@ -189,6 +189,31 @@ def test_who_is_stopped_while_files_are_moved_owns_all_of_them(tmp_path, monkeyp
     assert _noted(out) == ["rgb/1.png", "rgb/2.png"]
 
 
+@pytest.mark.parametrize("moved", [1, 2])  # the note, or the first result too
+def test_who_is_killed_while_the_first_files_are_moved_can_be_repeated(
+    tmp_path, monkeypatch, moved
+):
+    out, replace, count = tmp_path / "out", os.replace, 0
+
+    def replace_some(source, target):
+        nonlocal count
+        replace(source, target)
+        count += 1
+        if count == moved:
+            raise KeyboardInterrupt
+
+    names = ["rgb/0.png", "rgb/1.png", "metrics.json"]
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(os, "replace", replace_some)
+        # Who is killed tidies nothing up.
+        patch.setattr(output_folders.shutil, "rmtree", lambda *folders, **options: None)
+        _write(out, names, overwrite=False)
+    assert (out / ".unfinished").is_dir() and len(_files(out) & set(names)) == moved - 1
+    _write(out, names, overwrite=True)
+    assert _files(out) == {*names, "command.json"} and _noted(out) == sorted(names)
+    assert not (out / ".unfinished").exists()
+
+
 def test_the_folder_may_be_a_mount(tmp_path, monkeypatch):
     out, replace = tmp_path / "out", os.replace
     out.mkdir()

@@ -1,6 +1,7 @@
 """The sweep: its points, its table, and what it makes of measurements. Nothing is trained here."""
 
 import dataclasses
+import json
 import subprocess
 
 import imageio.v3 as iio
@@ -272,6 +273,7 @@ options = dict(word.lstrip("-").partition("=")[::2] for word in sys.argv[2:])
 command, run = sys.argv[1], pathlib.Path(options.get("out") or options["run"])
 with (run.parent / "calls.txt").open("a") as file:
     file.write(command + "\\n")
+(run.parent / "words.json").write_text(json.dumps(sys.argv[2:]))
 if options.get("cut") == "2":
     sys.exit("error: The cut is a share, not 2. Give 0.02.")
 run.mkdir(exist_ok=True)
@@ -344,7 +346,18 @@ def test_who_says_nothing_is_not_told_by_the_command_itself(tmp_path, monkeypatc
     monkeypatch.setattr(child_process, "command_line", lambda name, options: ["false"])
     with pytest.raises(RunFailedError, match=r"train: ended with status 1, and printed nothing"):
         child_process.run("train", log=tmp_path / "log")
-    assert (tmp_path / "log").read_text() == "$ python -m experiments.train \n"
+    assert (tmp_path / "log").read_text() == "$ python -m experiments.train\n"
+
+
+def test_an_option_with_a_space_stays_one_and_its_line_can_be_pasted(stub):
+    point = trade_points.sweep(preset="tiny", steps=[4])[0]
+    sweeps.measure(point, _SCENE, stub, ["--lpips_weights=a b.npz"])
+    assert json.loads((stub / "words.json").read_text())[-2:] == [
+        "--lpips_weights=a b.npz",
+        "--overwrite",
+    ]
+    log = (stub / f"{sweeps.run_name(point, _SCENE)}.log").read_text()
+    assert " '--lpips_weights=a b.npz' --overwrite" in log
 
 
 def test_a_training_that_ended_unmeasured_has_no_peak(stub):

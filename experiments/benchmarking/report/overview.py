@@ -71,7 +71,8 @@ def _scenes(contents: Contents, places: Mapping[str, Places]) -> Html:
         ]
         for scene in contents.scenes
     ]
-    heads = ["scene", *methods, "category", "background"]
+    labels = [contents.labels.get(name, name) for name in methods]
+    heads = ["scene", *labels, "category", "background"]
     note = (
         "PSNR inside the object's mask in dB, mean over a scene's images; of the whole image "
         "where there are no masks. The best is bold. A scene leads to its views."

@@ -12,7 +12,7 @@ from experiments.benchmarking.report.contents import Contents, Scene
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.scene_pages import Page
 from experiments.plotting import COLOURS
-from experiments.r3f import stages
+from refref_jax import drafts
 
 FILE = "report.html"
 
@@ -59,7 +59,7 @@ def write(out: Path, *, views: int, edge: int) -> Path:
         *(page.html for page in pages.values()),
     ]
     path = out / FILE
-    with stages.unfinished_file(path) as draft:
+    with drafts.unfinished_file(path) as draft:
         draft.write_text(_document("Benchmark", join(body)), encoding="utf-8")
     return path
 

@@ -19,6 +19,8 @@ from pathlib import Path
 
 def main():
     command, words = sys.argv[1], sys.argv[2:]
+    if stray := [word for word in words if not word.startswith("--")]:
+        sys.exit(f"error: {stray[0]} is no option.")
     options = dict(word.lstrip("-").partition("=")[::2] for word in words)
     run = Path(options.get("out") or options["run"])
     if os.environ.get("REFREF_STOP_WITH_INPUT"):

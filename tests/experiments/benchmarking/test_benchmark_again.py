@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import shutil
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from experiments.benchmarking import jobs, summary
 from refref_jax.training import run_lock
 from tests import made_lpips
 from tests.experiments.benchmarking.serving import calls
+from tests.experiments.command import ROOT
 
 
 def _ball(tmp_path):
@@ -91,7 +93,7 @@ def test_the_next_command_has_all_that_was_asked_for_and_can_be_given(tmp_path, 
     words = shlex.split(line)[4:]
     assert set(given) | {"--steps=5", "--methods=ablations", scenes} < set(words)
     listed = serve(tmp_path, *words, "--dry_run").stdout
-    assert "cube_smcvx_ball/oracle_no_tir" in listed and "28 jobs, 28 to do." in listed
+    assert "cube_smcvx_ball/oracle_no_tir" in listed and "26 jobs, 26 to do." in listed
 
 
 def test_after_ablations_none_are_proposed(tmp_path, serve, scenes):
@@ -115,6 +117,35 @@ def test_broken_weights_are_refused_before_anything_is_fixed(tmp_path, serve, sc
     assert str(path) in answer.stderr and not (tmp_path / "out").exists()
     made_lpips.write(path)
     serve(tmp_path, scenes, "--methods=straight", f"--lpips_weights={path}")
+
+
+def test_what_is_trained_is_evaluated_again_in_a_copy_without_results(tmp_path, serve, scenes):
+    """As docs/benchmark.md has it."""
+    serve(tmp_path, scenes, "--methods=straight,r3f")
+    weights = made_lpips.write(tmp_path / "weights.npz")
+    new = ["--methods=straight,r3f", scenes, f"--lpips_weights={weights}", "--limit=2"]
+    refused = serve(tmp_path, *new[:3], status=2).stderr
+    assert "was begun without LPIPS, and is now asked for with the weights of LPIPS" in refused
+    assert "'Evaluating again' in docs/benchmark.md" in refused
+    assert "was begun without --limit, and" in serve(tmp_path, scenes, new[3], status=2).stderr
+    copy = tmp_path / "again"
+    shutil.copytree(tmp_path / "out", copy)
+    (copy / "benchmark.json").unlink()
+    for path in copy.glob("jobs/*/*/result.json"):
+        path.unlink()
+    before = len(calls(tmp_path))
+    serve(tmp_path, *new, f"--out={copy}")
+    done = [call[:2] for call in calls(tmp_path)[before:]]
+    # A reconstruction and its training are looked at again, for their folder is another.
+    assert [name for name, job in done if job.endswith("straight")] == ["evaluate"] * 2
+    for path in copy.glob("jobs/*/straight/result.json"):
+        old = json.loads((tmp_path / "out" / path.relative_to(copy)).read_text())
+        now = json.loads(path.read_text())
+        assert now["settings"]["lpips"] is not None and len(now["per_image"]) == 2
+        assert now["costs"] == old["costs"] and len(old["per_image"]) == 7
+    assert len(list(copy.glob("jobs/*/r3f/result.json"))) == 2
+    text = (ROOT / "docs" / "benchmark.md").read_text()
+    assert "## Evaluating again" in text and "-name result.json -delete" in text
 
 
 def test_without_weights_that_is_said_once(tmp_path, serve, scenes):

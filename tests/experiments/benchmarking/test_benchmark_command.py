@@ -137,7 +137,8 @@ def test_scenes_and_methods_are_added_and_settings_stay(tmp_path, serve, scenes)
     ]
     before = (tmp_path / "out" / "benchmark.json").read_text()
     result = serve(tmp_path, scenes, "--methods=tree", "--seed=1", status=2)
-    assert "was begun with seed 0, and now it is to be 1" in result.stderr
+    assert "was begun with seed 0, and is now asked for with seed 1" in result.stderr
+    assert "Evaluating again" not in result.stderr
     assert (tmp_path / "out" / "benchmark.json").read_text() == before
 
 
@@ -193,6 +194,10 @@ def test_a_dry_run_lists_and_does_nothing(tmp_path, serve, scenes):
     ("options", "message"),
     [
         (("--scenes=nowhere/*",), "names no scene"),
+        (("--scenes=nowhere",), "nowhere/transforms_train.json does not exist"),
+        (("--jobs=2", "--ray=local", _BUNDLED), "--jobs would have no effect on a Ray cluster"),
+        (("--job_gpus=1", _BUNDLED), "--job_gpus would have no effect without --ray"),
+        (("--job_cpus=1", "--job_gpus=1", _BUNDLED), "--job_cpus, --job_gpus would have no"),
         (("--methods=magic", _BUNDLED), "There is no method 'magic'"),
         (("--rays_per_pixel=3", _BUNDLED), "3 rays a pixel do not make a square"),
         (("--lpips_weights=none.npz", _BUNDLED), "none.npz can not be read as the weights"),

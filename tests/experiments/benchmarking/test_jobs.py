@@ -2,9 +2,11 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import pytest
 
+from experiments import scene_option
 from experiments.benchmarking import (
     jobs,
     methods,
@@ -84,6 +86,29 @@ def test_what_a_scene_lacks_is_skipped_and_said(tmp_path):
             assert reason in each.reason
 
 
+def test_an_ablation_that_a_scene_comes_to_anyway_is_left_out(tmp_path):
+    insides = ["tree_clear", "tree_tints_given", "tree_tints_learned"]
+    chosen = _chosen(",".join(["tree", "tree_field", *insides]))
+    for folder, colour, same, told in [
+        ("clear", [1.0, 1.0, 1.0], "tree_clear", "(interior clear)"),
+        ("tinted", [0.9, 1.0, 1.0], "tree_tints_given", "(interior absorbing, tints given)"),
+        ("untold", None, "tree_tints_learned", "(interior absorbing, tints learned)"),
+    ]:
+        (scene,) = _scenes(tmp_path / folder, "cube_smcvx_ball", colours=colour is not None)
+        path = Path(scene.path) / "scene.json"
+        content = json.loads(path.read_text())
+        if colour is not None:
+            content["parts"][0]["colour_per_interface"] = colour
+            path.write_text(json.dumps(content))
+        planned, skipped = jobs.plan([scene], chosen, SETTINGS)
+        reasons = {each.method: each.reason for each in skipped}
+        assert reasons[same] == f"in this scene it is tree again {told}"
+        left = {"tree", "tree_field", *insides} - set(reasons)
+        assert {job.method for job in planned} == left >= {"tree", "tree_field"}
+        # Given colours that are not told are wanting.
+        assert set(reasons) - {same} <= ({"tree_tints_given"} if colour is None else set())
+
+
 def test_a_broken_scene_is_left_to_its_jobs(tmp_path):
     scenes = _scenes(tmp_path, "cube_smcvx_ball")
     (tmp_path / "scenes" / "cube_smcvx_ball" / "scene.json").write_text("{")
@@ -102,12 +127,26 @@ def test_scenes_are_found_by_wildcards_and_folders(tmp_path):
     assert records.category_and_background("mine") == (records.OTHER, records.OTHER)
     for words, message in [
         ([str(tmp_path / "*" / "cube_*")], "are named cube_smcvx_ball"),
-        ([str(tmp_path / "a" / "preview")], "no transforms_train.json"),
+        ([str(tmp_path / "a" / "preview")], r"preview/transforms_train\.json does not exist"),
+        ([str(tmp_path / "nope")], r"nope/transforms_train\.json does not exist"),
         ([str(tmp_path / "c*")], "names no scene"),
         ([], "names no scene"),
     ]:
         with pytest.raises(ValueError, match=message):
             scene_list.find(words)
+
+
+def test_a_folder_whose_name_looks_like_wildcards_is_taken_as_it_is(tmp_path):
+    for name in ("ball[1]", "ball1"):
+        write_scene(tmp_path / name)
+    (found,) = scene_list.find([str(tmp_path / "ball[1]")])
+    assert found.path == str(tmp_path / "ball[1]")
+    (tmp_path / "ball[1]").rename(tmp_path / "other")
+    (found,) = scene_list.find([str(tmp_path / "ball[1]")])  # a wildcard
+    assert found.path == str(tmp_path / "ball1")
+    (tmp_path / "no[1]scene").mkdir()
+    with pytest.raises(ValueError, match=r"scene/transforms_train\.json does not exist"):
+        scene_option.check_all([str(tmp_path / "no[1]scene")])
 
 
 def test_a_benchmark_grows_but_does_not_change(tmp_path):
@@ -123,8 +162,8 @@ def test_a_benchmark_grows_but_does_not_change(tmp_path):
     moved = dataclasses.replace(ball, path="/moved")
     assert settings.extended(out, settings.asked(SETTINGS, [moved], [])).scenes[ball.name] == moved
     for changed, message in [
-        ({"steps": 7}, "begun with steps 6, and now it is to be 7.*--steps"),
-        ({"limit": 3}, "limit None"),
+        ({"steps": 7}, "begun with steps 6, and is now asked for with steps 7.*--steps"),
+        ({"limit": 3}, "begun without --limit"),
         ({"lpips": "abc"}, "--lpips_weights"),
     ]:
         other = dataclasses.replace(SETTINGS, **changed)
@@ -235,8 +274,10 @@ def test_a_mistake_of_ours_is_a_reason_too(tmp_path, stand_in, monkeypatch):
     assert str(log) in reason and "Traceback" in log.read_text()
 
 
-def test_a_job_waits_for_who_still_works_in_its_run(tmp_path):
+def test_a_job_waits_for_who_still_works_in_its_run(tmp_path, capsys):
     running.wait_until_free(tmp_path / "nothing")
     running.wait_until_free(tmp_path)
     with run_lock.hold(tmp_path), pytest.raises(ValueError, match="Another process works"):
         running.wait_until_free(tmp_path, patience=0.3)
+    line = f"Waiting until the process ends that works in {tmp_path} yet.\n"
+    assert capsys.readouterr().out == line

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from experiments.benchmarking import jobs, record_files, summary
+from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.records import Image as Measured
 from experiments.benchmarking.records import Truth, View
 from experiments.benchmarking.report import cases, contents, overview, page, scene_pages
@@ -106,6 +107,12 @@ def test_tables_mark_the_best_and_label_what_is_published(found):
     assert "<u>" not in text and "**" not in text and "measured on its data" in text
     assert "28.00" in {"".join(e.text) for e in named(found, "strong")}
     assert "Nothing is measured yet" in text  # of ablations
+
+
+def test_scenes_are_listed_under_the_labels_of_the_tables(found):
+    (section,) = named(found, "section", id="scenes")
+    text = "".join(section.text)
+    assert all(METHODS[name].label in text for name in ("straight", "tree"))
 
 
 def test_what_failed_and_was_left_out_is_told(found):

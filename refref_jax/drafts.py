@@ -1,4 +1,4 @@
-"""How a stage leaves its result: under another name first, and under its own when it is whole.
+"""Files and folders that appear whole: they are written under another name first.
 
 An error, or Ctrl-C, leaves nothing of it. Whoever is killed in between leaves what the next attempt
 removes.

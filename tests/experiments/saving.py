@@ -1,0 +1,32 @@
+"""Waits until it is to stop, takes half a second more, and then saves, as a training does.
+
+python -m tests.experiments.saving --folder=...
+"""
+
+import os
+import time
+from pathlib import Path
+
+from absl import flags
+
+from experiments import commands
+
+_FOLDER = flags.DEFINE_string("folder", None, "Where it writes.")
+
+
+def main():
+    folder = Path(_FOLDER.value)
+    end = time.monotonic() + 60.0
+    with commands.Interrupt() as interrupt:
+        (folder / "pid").write_text(str(os.getpid()))
+        (folder / "ready").touch()
+        while not interrupt.requested and time.monotonic() < end:
+            time.sleep(0.02)
+        time.sleep(0.5)
+        with (folder / "saved").open("a") as file:
+            file.write("saved\n")
+    (folder / "ended").touch()
+
+
+if __name__ == "__main__":
+    commands.run(main)

@@ -1,0 +1,33 @@
+"""Waits for a command in a thread, as the benchmark does, and stops it when it is to stop itself.
+
+python -m tests.experiments.waiting FOLDER
+"""
+
+import contextlib
+import sys
+import threading
+from pathlib import Path
+
+from experiments import child_process, commands
+
+
+def _command_line(name, options):
+    return [sys.executable, "-m", f"tests.experiments.{name}", *options]
+
+
+def _work(folder):
+    with contextlib.suppress(child_process.RunFailedError):
+        child_process.run("saving", f"--folder={folder}", log=folder / "run.log")
+
+
+if __name__ == "__main__":
+    child_process.command_line = _command_line
+    commands.stop_at_kill()
+    worker = threading.Thread(target=_work, args=[Path(sys.argv[1])])
+    try:
+        worker.start()
+        worker.join()
+    except KeyboardInterrupt:
+        with child_process.stopping():
+            worker.join()
+        sys.exit(commands.INTERRUPTED)
