@@ -4,6 +4,7 @@ python -m tests.experiments.waiting FOLDER
 """
 
 import contextlib
+import signal
 import sys
 import threading
 from pathlib import Path
@@ -21,6 +22,9 @@ def _work(folder):
 
 
 if __name__ == "__main__":
+    # As at a terminal: who is started in the background, or by nohup, ignores them.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     child_process.command_line = _command_line
     commands.stop_at_kill()
     worker = threading.Thread(target=_work, args=[Path(sys.argv[1])])
