@@ -69,7 +69,10 @@ def run(
         app.run(guarded, flags_parser=parse)
     except KeyboardInterrupt:
         print(f"Interrupted. {again[:1].upper()}{again[1:]}".rstrip(), file=sys.stderr)
-        sys.exit(INTERRUPTED)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        # Not `sys.exit`: XLA may be compiling on other threads, and crashes when Python goes.
+        os._exit(INTERRUPTED)
 
 
 def _stop_with_input() -> None:

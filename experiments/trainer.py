@@ -44,8 +44,8 @@ def train(
 ) -> bool:
     """Trains the run of a folder from its newest checkpoint, or from the start.
 
-    Ctrl-C saves a checkpoint, and ends it. Of several processes all take the same steps and end
-    together, and the first alone writes.
+    Ctrl-C saves a checkpoint, and ends it; before the first step it ends all. Of several processes
+    all take the same steps and end together, and the first alone writes.
 
     Args:
       run: the folder.
@@ -55,9 +55,13 @@ def train(
 
     Returns:
       Whether it has reached its last step.
+
+    Raises:
+      KeyboardInterrupt: if it was interrupted before it took a step.
     """
     config, model = run_folder.read_config(run), saved.read_static(run)
-    with Checkpoints(run, keep=periods.keep) as checkpoints:
+    # From here on, for Python loses a Ctrl-C that meets JAX while it collects garbage.
+    with Checkpoints(run, keep=periods.keep) as checkpoints, commands.Interrupt() as interrupt:
         if checkpoints.newest() == config.schedule.steps:
             print(f"{run} is trained already: {config.schedule.steps} steps.")
             return True
@@ -73,7 +77,9 @@ def train(
         state = devices.put_everywhere(state, mesh=mesh)
         if checkpoints.newest() is not None:
             state = checkpoints.restore(state)
-        return _train(run, setup, state, checkpoints, periods)
+        if devices.any_process(interrupt.requested):
+            raise KeyboardInterrupt  # there is nothing to save yet
+        return _train(run, setup, state, checkpoints, periods, interrupt)
 
 
 def _sampler(config: TrainingConfig, scene: Path) -> PixelSampler:
@@ -92,13 +98,14 @@ def _train(
     state: TrainState,
     checkpoints: Checkpoints,
     periods: Periods,
+    interrupt: commands.Interrupt,
 ) -> bool:
     total, step = setup.config.schedule.steps, int(state.step)
     writes = devices.is_first()
     earlier = run_folder.rewind_metrics(run, step) if writes else 0.0
     start = last = time.monotonic()
     logged = step
-    with commands.Interrupt() as interrupt, commands.ProgressBar("train", total, step) as bar:
+    with commands.ProgressBar("train", total, step) as bar:
         every = (_MOST_STEPS, periods.log, periods.checkpoint)
         for stepped, report in loop.run_steps(setup, state, total, every=every):
             step = int(stepped.step)

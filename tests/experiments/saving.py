@@ -1,4 +1,4 @@
-"""Waits until it is to stop, takes half a second more, and then saves, as a training does.
+"""Waits until it is to stop, takes a second more, and then saves, as a training does.
 
 python -m tests.experiments.saving --folder=...
 """
@@ -22,7 +22,7 @@ def main():
         (folder / "ready").touch()
         while not interrupt.requested and time.monotonic() < end:
             time.sleep(0.02)
-        time.sleep(0.5)
+        time.sleep(1.0)  # in which a busy machine comes to tell it again
         with (folder / "saved").open("a") as file:
             file.write("saved\n")
     (folder / "ended").touch()

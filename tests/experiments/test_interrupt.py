@@ -4,10 +4,11 @@ import os
 import signal
 import subprocess
 import sys
+import types
 
 import pytest
 
-from experiments import commands, first_interrupt
+from experiments import commands, first_interrupt, trainer
 from tests.experiments.command import ROOT
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -34,6 +35,36 @@ def test_the_signals_are_given_back_after_an_error():
     with pytest.raises(ZeroDivisionError), commands.Interrupt():
         raise ZeroDivisionError
     assert [signal.getsignal(each) for each in _SIGNALS] == before
+
+
+def test_before_its_first_step_a_training_ends_with_nothing_saved(tmp_path, monkeypatch, capfd):
+    def set_up(*arguments, **options):
+        os.kill(os.getpid(), signal.SIGINT)
+        return types.SimpleNamespace(hit_fraction=1.0)
+
+    known = types.SimpleNamespace(
+        schedule=types.SimpleNamespace(steps=5),
+        scene=types.SimpleNamespace(path="scene"),
+        budget=types.SimpleNamespace(bends=1),
+        config=None,
+        seed=0,
+    )
+    for module, name in (
+        (trainer.run_folder, "read_config"),
+        (trainer.saved, "read_static"),
+        (trainer.saved, "load_geometry"),
+        (trainer.scene_option, "opened"),
+        (trainer, "_sampler"),
+        (trainer, "init_state"),
+        (trainer.devices, "put_everywhere"),
+    ):
+        monkeypatch.setattr(module, name, lambda *arguments, **options: known)
+    monkeypatch.setattr(trainer.loop, "set_up", set_up)
+    monkeypatch.setattr(trainer, "_train", lambda *arguments: pytest.fail("it has begun"))
+    with pytest.raises(KeyboardInterrupt):
+        trainer.train(tmp_path)
+    assert "Stopping after this step" in capfd.readouterr().out
+    assert not any((tmp_path / "checkpoints").iterdir())
 
 
 # Starts a command as a shell does, or a script in the background, which has it ignore Ctrl-C.

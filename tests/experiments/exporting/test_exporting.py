@@ -209,7 +209,8 @@ def test_the_command_writes_the_walls_of_a_run(trained, tmp_path):
         options = (f"--run={trained}", f"--what={what}", f"--out={out}", "--resolution=8")
         assert "from -7.3 to 7.3" in run_command("export", *options).stdout
         read = trimesh.load(out, process=False)
-        assert np.abs(read.vertices).max(axis=-1).min() > 7.2
-        assert np.abs(read.vertices).max() == pytest.approx(7.3, abs=1e-4)
+        # Where a field is denser than the level at its walls, the surface is a little within them.
+        outermost = np.abs(read.vertices).max(axis=-1)
+        assert outermost.min() > 7.2 and outermost.max() < 7.3 + 1e-4
         colours = read.visual.vertex_colors if what == "mesh" else read.colors
         assert len(np.unique(colours, axis=0)) > 10

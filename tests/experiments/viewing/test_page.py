@@ -64,9 +64,12 @@ def _choose(page, old, new):
     page.evaluate(f"{option}.click()")
 
 
-def _yellow(picture):
-    """Returns how many pixels have the colour of strong light."""
-    return np.sum((picture[..., 0] > 200) & (picture[..., 1] > 200) & (picture[..., 2] < 100))
+def _drawn_light(before, after):
+    """Returns how many pixels have come to the pale yellow of strong light."""
+    before, after = before.astype(int), after.astype(int)
+    changed = np.abs(after - before).max(axis=-1) > 20
+    strong = after[..., :2].min(axis=-1)
+    return np.sum(changed & (strong > 190) & (after[..., 2] < strong - 40))
 
 
 def _canvas(page):
@@ -86,7 +89,8 @@ def test_it_opens_and_draws_and_a_click_draws_light_paths(subject, server, tmp_p
         browser.until(lambda: (_canvas(page)[y, x] > 245).all(), "white where no surface is")
         drawn = _canvas(page)
         x, y = _OF_THE_BALL
-        assert np.ptp(drawn[y, x].astype(int)) > 20 and _yellow(drawn) < 20
+        assert np.ptp(drawn[y, x].astype(int)) > 20
+        assert _drawn_light(drawn, _canvas(page)) == 0
 
         page.click(*_OF_THE_BALL)
         _wait_for(page, "left the objects")
@@ -96,7 +100,7 @@ def test_it_opens_and_draws_and_a_click_draws_light_paths(subject, server, tmp_p
         eye = np.asarray(client.camera.position)
         assert np.linalg.norm(segments - eye, axis=-1).min() < 0.05
         assert np.abs(segments).max() < MODEL.radius + 0.01
-        browser.until(lambda: _yellow(_canvas(page)) > 50, "lines of strong light")
+        browser.until(lambda: _drawn_light(drawn, _canvas(page)) > 50, "lines of strong light")
 
         page.drag((300, 500), (420, 460))
         _wait_for(page, "size 2 of 2")
