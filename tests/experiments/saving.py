@@ -1,4 +1,6 @@
-"""Waits until it is to stop, takes a second more, and then saves, as a training does.
+"""Waits until it is to stop, ends its step, and then saves, as a training does.
+
+The step ends half a second after there is a file `go`.
 
 python -m tests.experiments.saving --folder=...
 """
@@ -22,10 +24,12 @@ def main():
         (folder / "ready").touch()
         while not interrupt.requested and time.monotonic() < end:
             time.sleep(0.02)
-        time.sleep(1.0)  # in which a busy machine comes to tell it again
+        while not (folder / "go").exists() and time.monotonic() < end:
+            time.sleep(0.02)
+        time.sleep(0.5)
         with (folder / "saved").open("a") as file:
             file.write("saved\n")
-    (folder / "ended").touch()
+        (folder / "ended").touch()
 
 
 if __name__ == "__main__":

@@ -59,6 +59,7 @@ def test_whoever_is_waited_for_saves_once(tmp_path, stop, status):
     _wait_for((tmp_path / "ready").exists)
     saving = int((tmp_path / "pid").read_text())
     stop(waiting.pid, saving)
+    (tmp_path / "go").touch()
     assert waiting.wait(_LONG) == status
     _wait_for((tmp_path / "ended").exists)
     assert (tmp_path / "saved").read_text() == "saved\n"
