@@ -61,7 +61,7 @@ def main() -> None:
     """Executes the chosen notebooks."""
     for name in ("nbclient", "nbformat", "ipykernel"):
         if importlib.util.find_spec(name) is None:
-            raise ValueError(f"{name} is missing. Run pip install 'refref_jax[notebooks]'.")
+            raise ValueError(f"{name} is missing. Run pip install -e '.[notebooks]'.")
     paths = find(_ONLY.value)
     for path in paths:
         start = time.monotonic()

@@ -7,7 +7,7 @@ import imageio.v3 as iio
 import numpy as np
 from jaxtyping import UInt8
 
-INSTALL = "pip install 'refref_jax[video]'"
+INSTALL = "pip install -e '.[video]'"
 """What brings FFmpeg."""
 
 # Constant rate factor of H.264: lower is better; at 18 few see the loss.

@@ -61,7 +61,7 @@ def main() -> None:
     except ModuleNotFoundError as error:
         if error.name != "viser":
             raise
-        raise ValueError("The viewer needs viser. Run pip install 'refref_jax[viewer]'.") from error
+        raise ValueError("The viewer needs viser. Run pip install -e '.[viewer]'.") from error
     subject = read_subject(heights)
     server = serving.serve(subject, host=_HOST.value, port=_PORT.value)
     print(f"Look at http://{_HOST.value}:{server.get_port()}", flush=True)

@@ -131,7 +131,7 @@ def import_ray() -> Any:
         import ray
     except ImportError as error:
         raise ValueError(
-            "Ray is not installed. Run pip install 'refref_jax[cluster]', or leave out --ray to do "
+            "Ray is not installed. Run pip install -e '.[cluster]', or leave out --ray to do "
             "the jobs on this machine."
         ) from error
     return ray

@@ -148,7 +148,7 @@ def describe(paths: PixelPaths, *, most: int = 12) -> str:
     lines = [
         f"**{count} light path{'s' * (count != 1)}**",
         "",
-        "| path | share | R, G, B | bends | it |",
+        "| path | share | R, G, B | bends | ended |",
         "|---|---|---|---|---|",
     ]
     lines += [_row(paths, i) for i in range(min(most, count))]

@@ -118,7 +118,7 @@ def import_parquet() -> Any:
     except ImportError as error:
         raise SceneError(
             "Parquet files are read by pyarrow, which is not installed. Install it: "
-            "pip install 'refref_jax[parquet]'."
+            "pip install -e '.[parquet]'."
         ) from error
     return pyarrow.parquet
 

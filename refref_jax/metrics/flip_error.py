@@ -1,6 +1,6 @@
 """FLIP: how much two images differ to an eye that flips between them (NumPy only).
 
-Measured by the authors' own program, which is an extra: `pip install 'refref_jax[flip]'`.
+Measured by the authors' own program, which is an extra: `pip install -e '.[flip]'`.
 
 Source: Andersson, Nilsson, Akenine-Möller, Oskarsson, Åström, Fairchild, FLIP: A Difference
 Evaluator for Alternating Images, Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020.
@@ -42,6 +42,6 @@ def import_flip() -> Any:
     except ImportError as error:
         raise ValueError(
             "FLIP is measured by flip-evaluator, which is not installed. Install it: "
-            "pip install 'refref_jax[flip]'."
+            "pip install -e '.[flip]'."
         ) from error
     return flip_evaluator

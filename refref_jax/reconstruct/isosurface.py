@@ -100,6 +100,6 @@ def import_skimage() -> Any:
     except ImportError as error:
         raise ReconstructionError(
             "Surfaces are found by scikit-image, which is not installed. Install it: "
-            "pip install 'refref_jax[r3f]'."
+            "pip install -e '.[r3f]'."
         ) from error
     return skimage.measure

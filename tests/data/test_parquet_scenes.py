@@ -144,5 +144,5 @@ def test_without_pyarrow(tmp_path, monkeypatch):
     shards = write_copy(tmp_path, rows=3)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
-    with scene_error("pyarrow", "pip install 'refref_jax[parquet]'"):
+    with scene_error("pyarrow", "pip install -e '.[parquet]'"):
         parquet_scenes.read_contents(shards)

@@ -167,7 +167,7 @@ def test_what_is_not_at_hand_is_warned_of_once(monkeypatch, capsys, tmp_path):
     assert perceptual_option.chosen() == Perceptual(None, None)
     first, second = capsys.readouterr().out.splitlines()
     assert first.startswith("warning: LPIPS") and "docs/metrics.md" in first
-    assert second.startswith("warning: FLIP") and "refref_jax[flip]" in second
+    assert second.startswith("warning: FLIP") and "pip install -e '.[flip]'" in second
     monkeypatch.setattr(perceptual_option, "LPIPS_WEIGHTS", _Flag(str(tmp_path / "none.npz")))
     with pytest.raises(ValueError, match=r"none\.npz can not be read"):
         perceptual_option.chosen()

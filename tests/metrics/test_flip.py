@@ -48,5 +48,5 @@ def test_a_single_pixel_has_a_value():
 
 def test_without_the_program_it_is_said_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
-    with pytest.raises(ValueError, match=r"pip install 'refref_jax\[flip\]'"):
+    with pytest.raises(ValueError, match=r"pip install -e '.\[flip\]'"):
         metrics.flip(*_images())

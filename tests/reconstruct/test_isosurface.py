@@ -60,7 +60,7 @@ def test_a_grid_without_a_body_is_an_error():
 
 def test_a_missing_package_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "skimage.measure", None)
-    with pytest.raises(ReconstructionError, match=r"refref_jax\[r3f\]"):
+    with pytest.raises(ReconstructionError, match=r"\[r3f\]"):
         find_isosurface(_sampled(bodies.ball, spacing=0.2))
 
 

@@ -211,7 +211,7 @@ def test_mistakes_end_before_anything_is_done(tmp_path, serve, options, message)
 
 def test_without_ray_its_option_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ValueError, match=r"pip install 'refref_jax\[cluster\]'"):
+    with pytest.raises(ValueError, match=r"pip install -e '.\[cluster\]'"):
         engines.import_ray()
 
 

@@ -344,7 +344,7 @@ def test_without_pyarrow_folders_are_converted(ball, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     _convert(ball, "raw", tmp_path / "raw")
-    with scene_error("pyarrow", "pip install 'refref_jax[parquet]'"):
+    with scene_error("pyarrow", "pip install -e '.[parquet]'"):
         _convert(ball, "parquet", tmp_path / "copy")
 
 

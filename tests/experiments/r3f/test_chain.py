@@ -228,7 +228,7 @@ def test_what_is_missing_is_told_before_anything_is_written(scene, tmp_path, mon
     with pytest.raises(ValueError, match=r"masks.*mask_file_path"):
         _run(without_masks(bare), tmp_path / "out")
     monkeypatch.setitem(sys.modules, "skimage.measure", None)
-    with pytest.raises(ValueError, match=r"pip install 'refref_jax\[r3f\]'"):
+    with pytest.raises(ValueError, match=r"pip install -e '.\[r3f\]'"):
         _run(scene, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

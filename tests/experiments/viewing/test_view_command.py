@@ -57,7 +57,7 @@ def test_without_viser_it_says_what_to_install(tmp_path):
     command = [sys.executable, "-c", code]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == 2
-    assert "pip install 'refref_jax[viewer]'" in result.stderr
+    assert "pip install -e '.[viewer]'" in result.stderr
 
 
 def test_the_first_choice_is_the_model_as_it_was_trained():
