@@ -13,6 +13,7 @@ import os
 import re
 import runpy
 import sys
+from unittest import mock
 
 import numpy  # noqa: F401  so that it is imported once
 from absl import app, flags
@@ -91,7 +92,8 @@ def _interrupted(main, settings, words):
         raise KeyboardInterrupt
 
     stop.__module__ = main.__module__
-    return _answer(stop, settings, words)
+    with mock.patch.object(os, "_exit", sys.exit):  # this process goes on
+        return _answer(stop, settings, words)
 
 
 def _try(command, cases):
