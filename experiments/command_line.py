@@ -9,9 +9,10 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
+from pathlib import Path
 from types import ModuleType
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from absl import flags
 
@@ -115,15 +116,40 @@ def resolved(module: ModuleType) -> dict[str, Any]:
     return {name: flag.value for name, flag in command_help.options_of(module).items()}
 
 
-def echo(module: ModuleType, arguments: Sequence[str]) -> str:
-    """Returns the command as it was given, and below it the options that hold by default."""
+class Settled(NamedTuple):
+    """Options that an earlier call has settled.
+
+    Attributes:
+      names: of the options.
+      file: that tells what they are.
+    """
+
+    names: Collection[str]
+    file: Path
+
+
+def echo(module: ModuleType, arguments: Sequence[str], settled: Settled | None = None) -> str:
+    """Returns the command as it was given, and below it the options that hold by default.
+
+    Args:
+      module: of the command.
+      arguments: what was given besides options.
+      settled: options that hold as an earlier call has them, and not by default.
+    """
     options = command_help.options_of(module).values()
+    elsewhere = settled.names if settled else ()
     # What has no value, or an empty one, changes nothing.
-    rest = [each for each in options if not each.present and each.value not in (None, [], False)]
+    rest = [
+        each
+        for each in options
+        if not (each.present or each.name in elsewhere or each.value in (None, [], False))
+    ]
     given = [*map(shlex.quote, arguments), *(_written(each) for each in options if each.present)]
     lines = command_help.wrapped(" ".join((name_of(module), *given)), "", "  ")
     if rest:
         lines += command_help.wrapped(" ".join(map(_written, rest)), "  by default: ", "    ")
+    if settled:
+        lines.append(f"  all others as it was begun: {shlex.quote(str(settled.file))}")
     return "\n".join(lines)
 
 

@@ -36,6 +36,7 @@ def run(
     arguments: Sequence[str] = (),
     first: Sequence[str] = (),
     again: str = "",
+    settled: Callable[[], command_line.Settled | None] = lambda: None,
 ) -> None:
     """Runs a command; an error of the user's input ends it with one line and status 2.
 
@@ -47,6 +48,7 @@ def run(
       arguments: what each argument is called, as `FOLDER`; all must be given.
       first: names of the options that decide most, which --help tells first.
       again: what happens when the same command is given again, after it was done or interrupted.
+      settled: tells which options an earlier call has settled, if it has.
     """
     module = sys.modules[main.__module__]
 
@@ -58,7 +60,7 @@ def run(
             threading.Thread(target=_stop_with_input, daemon=True).start()
         logging.set_verbosity(logging.ERROR)
         command_line.refuse_words(module, words[1:], arguments)
-        print(command_line.echo(module, words[1:]), flush=True)
+        print(command_line.echo(module, words[1:], settled()), flush=True)
         try:
             main(*words[1:])
         except (ValueError, OSError) as error:

@@ -12,6 +12,7 @@ room.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,6 +55,13 @@ _PATHS = flags.DEFINE_enum(
     "Light paths: 'straight' ignores the objects; 'paper' bends up to 10 times and reflects at the "
     "first surface; 'tree' follows every branch that carries light.",
 )
+_UNFINISHED = flags.DEFINE_enum(
+    "unfinished",
+    "kept",
+    ["kept", "dark"],
+    "Light that has no bend left: 'kept' goes on along its last direction; 'dark' is not shown, as "
+    "in renderers that stop after so many bounces.",
+)
 _VIEWS = flags.DEFINE_string("views", "all", "Numbers of views of the split, as 0,10,20, or all.")
 command_line.check(_VIEWS, view_numbers.parse)
 flags.adopt_module_key_flags(budget_options)
@@ -80,7 +88,7 @@ def main() -> None:
     output_folders.replaceable(out, **place)
     metrics_file = None if _JSON.value is None else Path(_JSON.value)
     _check(metrics_file)
-    budget = budget_options.chosen(_PATHS.value)
+    budget = _chosen_budget()
     indices, folder = scenes.given_indices(), scene_option.opened(_SCENE.value)
     scene = known_scenes.read_scene(
         folder,
@@ -138,6 +146,7 @@ def summarise(
         "paths": _PATHS.value,
         "cut": budget.cut,
         "bends": budget.bends,
+        "unfinished": budget.unfinished,
         "views": measured,
         "mean": {key: measures.mean_of(measured, key) for key in keys},
         "casts_per_pixel": float(np.mean([view.casts for view in views])),
@@ -145,6 +154,15 @@ def summarise(
         "seconds": sum(view.seconds for view in views),
         "lost_energy": float(np.mean([view.lost for view in views])),
     }
+
+
+def _chosen_budget() -> Budget:
+    if _PATHS.value == "straight" and _UNFINISHED.value == "dark":
+        raise ValueError(
+            "--paths=straight bends no light, so none is unfinished. Leave --unfinished out, or "
+            "use --paths=tree."
+        )
+    return dataclasses.replace(budget_options.chosen(_PATHS.value), unfinished=_UNFINISHED.value)
 
 
 def _check(metrics_file: Path | None) -> None:
@@ -184,6 +202,6 @@ def _report(summary: dict[str, Any]) -> None:
 if __name__ == "__main__":
     commands.run(
         main,
-        first=("paths", "cut", "bends", "rays_per_pixel", "views", "split"),
+        first=("paths", "cut", "bends", "unfinished", "rays_per_pixel", "views", "split"),
         again="it renders anew; --overwrite replaces the results.",
     )

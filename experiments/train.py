@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING
 from absl import flags
 
 from experiments import (
+    command_line,
     commands,
     device_options,
     options,
     plans,
     reconstruction_options,
+    run_option,
     scenes,
     training_body,
 )
@@ -106,10 +108,21 @@ def _open(run: Path) -> None:
     devices.wait_for_all("the folder is there")
 
 
+def _settled() -> command_line.Settled | None:
+    """Returns the options of the run that is resumed, unless all are given and compared."""
+    begun = Path(_OUT.value) / run_option.RUN
+    if not _RESUME.value or plans.SCENE.value is not None or not begun.is_file():
+        return None
+    return command_line.Settled(_settled_names(), begun)
+
+
+def _settled_names() -> list[str]:
+    return [holder.name for holder in (*plans.SETTLED, *training_body.SETTLED)]
+
+
 def _refuse_options(run: Path) -> None:
     """Refuses options that a resumed run would not heed."""
-    names = [holder.name for holder in (*plans.SETTLED, *training_body.SETTLED)]
-    if given := [f"--{name}" for name in names if flags.FLAGS[name].present]:
+    if given := [f"--{name}" for name in _settled_names() if flags.FLAGS[name].present]:
         raise ValueError(
             f"{run} goes on with the options that it was begun with: {', '.join(given)} would have "
             "no effect. Leave it out, or add --scene to have all options compared."
@@ -125,4 +138,5 @@ if __name__ == "__main__":
             *("resume", "seed", "devices"),
         ),
         again="a run is never replaced; the same command with --resume goes on with it.",
+        settled=_settled,
     )

@@ -60,7 +60,7 @@ def pixel_rays(
     return Rays(
         np.ascontiguousarray(pose[..., 3], np.float32),
         directions.astype(np.float32),
-        (width * 2.0 / math.sqrt(12.0)).astype(np.float32),
+        np.asarray(width * 2.0 / math.sqrt(12.0), np.float32),  # also that of a single ray
     )
 
 
@@ -177,5 +177,5 @@ def _unit_directions(
     x = (column + 0.5 - 0.5 * cameras.width) / cameras.focal
     y = -(row + 0.5 - 0.5 * cameras.height) / cameras.focal
     planar = np.stack([x, y, -np.ones_like(x)], axis=-1)
-    norm = np.linalg.norm(planar, axis=-1)
-    return planar / norm[..., None], 1.0 / norm
+    norm = np.linalg.norm(planar, axis=-1, keepdims=True)
+    return planar / norm, (1.0 / norm)[..., 0]

@@ -114,11 +114,11 @@ def test_rays_agree_with_a_scalar_reference(pose):
         np.testing.assert_array_equal(rays.origins[row, column], pose[:, 3])
 
 
-@pytest.mark.parametrize("shape", [(5,), (2, 3), (0,)])
+@pytest.mark.parametrize("shape", [(5,), (2, 3), (0,), ()])
 def test_pixels_may_have_any_shape(shape):
     cameras = _cameras(4, 4, 4.0)
     zero = np.zeros(shape, np.int64)
-    rays = pixel_rays(cameras, zero, zero + 1, zero + 2)
+    rays = pixel_rays(cameras, zero, np.full(shape, 1), np.full(shape, 2))
     assert rays.origins.shape == rays.directions.shape == (*shape, 3)
     assert rays.radii.shape == shape
     assert {rays.origins.dtype, rays.directions.dtype, rays.radii.dtype} == {np.dtype(np.float32)}

@@ -36,6 +36,7 @@ def test_a_rendering_is_measured_and_pictured(rendered):
         "paths",
         "cut",
         "bends",
+        "unfinished",
         "views",
         "mean",
         "casts_per_pixel",
@@ -44,7 +45,7 @@ def test_a_rendering_is_measured_and_pictured(rendered):
         "lost_energy",
     }
     assert (summary["scene"], summary["paths"]) == ("cube_smcvx_ball", "tree")
-    assert (summary["cut"], summary["bends"]) == (0.02, 24)
+    assert (summary["cut"], summary["bends"], summary["unfinished"]) == (0.02, 24, "kept")
     assert [view["index"] for view in summary["views"]] == [0, 10]
     # Those of one camera ray, as `test_against_cycles` has them.
     assert summary["casts_per_pixel"] == pytest.approx(2.45, rel=0.02)
@@ -101,6 +102,22 @@ def test_pictures_of_others_are_not_deleted(tmp_path):
     )
     assert "not of this command" in result.stderr
     assert picture.read_bytes() == b"not ours"
+
+
+@pytest.mark.slow
+def test_light_that_has_no_bend_left_may_be_dark(tmp_path):
+    out = tmp_path / "dark"
+    options = (f"--scene={_SCENE}", "--paths=paper", "--bends=1", "--unfinished=dark")
+    run_command("render_known", *options, f"--out={out}", "--views=3", "--rays_per_pixel=1")
+    summary = json.loads((out / "metrics.json").read_text())
+    assert (summary["bends"], summary["unfinished"]) == (1, "dark")
+    mask = files.read_mask(_SCENE / "mask" / "test" / "r_003.png")
+    picture = files.read_rgb(out / "rgb" / "r_003.png") / 255.0
+    truth = files.read_rgb(_SCENE / "test" / "r_003.png") / 255.0
+    # What entered the ball ends inside: a few per cent of light, the first reflection, are seen.
+    assert np.median(picture[mask]) < 0.5 * np.median(truth[mask])
+    # Around it nothing bends, so nothing is unfinished.
+    assert summary["views"][0]["psnr_outside"] > 25.0
 
 
 @pytest.mark.slow

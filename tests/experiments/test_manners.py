@@ -71,6 +71,7 @@ _MISTAKES = {
         "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
         "--out=OUT --scene=SCENE --cut=-0.5": "Give 0.02 for 2 %.",
         "--out=OUT --scene=SCENE --ior=glass": "Write as in --ior=glass=1.52.",
+        "--out=OUT --scene=SCENE --paths=straight --unfinished=dark": "none is unfinished",
         "--out=OUT --scene=SCENE --views=1,1": "names a view twice",
     },
     "path_trade_off": {
