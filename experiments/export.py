@@ -2,7 +2,7 @@
 
 python -m experiments.export --run=runs/ball --what=mesh --out=ball.ply
 
-    mesh      where the field's density crosses --level, and the walls of a bounded scene, with
+    mesh      where the field's density crosses --level, and walls where the scene has some, with
               normals and colours
     points    the same surfaces as points of a grid
     body      the bodies: those of R3F, or the scene's meshes; with the normals that bend light
@@ -79,12 +79,12 @@ command_line.check(_OUT, _refuse_other_files)
 
 def _write_field(model: Model, out: Path) -> list[Path]:
     isosurface.import_skimage()  # so that its lack is told before the work
-    is_bounded = model.config.space == "bounded"
-    half = _BOX.value or model.config.radius
-    if is_bounded:
-        half = min(half, model.config.radius)  # there is nothing beyond
+    space, radius = model.config.space, model.config.radius
+    half = _BOX.value or radius
+    if space != "unbounded":
+        half = min(half, radius)  # there is nothing beyond
     print(f"Box:    from {-half:g} to {half:g} along each axis, {_RESOLUTION.value} cells")
-    if not is_bounded:
+    if space == "unbounded":
         print("        The scene goes on beyond it: a larger --box shows more of it.")
     with commands.ProgressBar("density", _RESOLUTION.value + 1) as bar:
         density = field_grid.sample_density(
@@ -94,9 +94,12 @@ def _write_field(model: Model, out: Path) -> list[Path]:
             resolution=_RESOLUTION.value,
             step=lambda done, total: bar.show(done, "slices"),
         )
-    if is_bounded and half == model.config.radius:
+    if space == "bounded" and half == radius:
         density = surfaces.with_walls(density, level=_LEVEL.value)
         print("Walls:  the box's faces, on which the model is opaque")
+    if space == "spherical":
+        density = surfaces.with_sphere(density, level=_LEVEL.value, radius=radius)
+        print(f"Walls:  the sphere of radius {radius:g}, on which the model is opaque")
     with output_folders.fresh_file(out, overwrite=_OVERWRITE.value) as draft:
         if _WHAT.value == "mesh":
             surface = surfaces.find_surface(density, level=_LEVEL.value)

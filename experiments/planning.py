@@ -117,7 +117,7 @@ def _training(
 
 
 def _model(request: Request, cameras: Cameras, space: Space, chosen: Choices) -> ModelConfig:
-    told = background.half_extent(request.scene) if space == "bounded" else None
+    told = background.half_extent(request.scene) if space != "unbounded" else None
     extent = bounds(cameras, space=space, radius=request.radius or told)
     model = PRESETS[request.preset].model(extent, chosen.interior, field=request.field)
     model = dataclasses.replace(model, learned_tints=chosen.learned_tints)

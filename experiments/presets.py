@@ -114,12 +114,13 @@ class Preset:
 def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
     """Returns the bounds of a scene.
 
-    A bounded scene reaches from any camera to the farthest corner of its cube. An unbounded one
-    keeps the cameras, and all between them, uncontracted.
+    A bounded scene reaches from any camera to the farthest corner of its cube, a spherical one to
+    the far side of its sphere. An unbounded one keeps the cameras, and all between them,
+    uncontracted.
 
     Args:
       cameras: of the training images.
-      space: `unbounded` if the background is infinitely far.
+      space: `unbounded` if the background is infinitely far, `spherical` if it is a sphere.
       radius: overrides the default of `ModelConfig.radius`.
 
     Raises:
@@ -131,7 +132,8 @@ def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
     if space == "unbounded":
         return Bounds(_NEAR, _FAR_UNBOUNDED, radius or 1.25 * farthest, space)
     radius = radius or _WALLS
-    return Bounds(_NEAR, farthest + math.sqrt(3.0) * radius, radius, space)
+    reach = radius if space == "spherical" else math.sqrt(3.0) * radius
+    return Bounds(_NEAR, farthest + reach, radius, space)
 
 
 def loss(model: ModelConfig) -> LossConfig:

@@ -13,14 +13,15 @@ if TYPE_CHECKING:
 BACKGROUND = flags.DEFINE_enum(
     "background",
     "auto",
-    ["auto", "bounded", "unbounded"],
-    "Whether there are walls, or an environment infinitely far away.",
+    ["auto", "bounded", "spherical", "unbounded"],
+    "Whether there are walls, a cube of them or a sphere, or an environment infinitely far away.",
 )
 RADIUS = flags.DEFINE_float(
     "radius",
     None,
-    "Half edge of the cube on whose faces a bounded scene's background stands (by default that of "
-    "scene.json, else 7.3), or radius of an unbounded scene's uncontracted ball, in world units.",
+    "Half edge of the cube, or radius of the sphere, on which the background stands (by default "
+    "that of scene.json, else 7.3), or radius of an unbounded scene's uncontracted ball, in world "
+    "units.",
     lower_bound=1e-6,
 )
 flags.register_validator(

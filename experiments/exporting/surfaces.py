@@ -62,6 +62,25 @@ def with_walls(density: Grid, *, level: float) -> Grid:
     return density._replace(values=np.maximum(values, density.values))
 
 
+def with_sphere(density: Grid, *, level: float, radius: float) -> Grid:
+    """Returns the density with a surface on a sphere around the origin, as `with_walls` has it.
+
+    Args:
+      density: per world unit.
+      level: of the surface.
+      radius: of the sphere, on which a spherical model ends, world units.
+    """
+    axes = [
+        low + density.spacing * np.arange(count)
+        for low, count in zip(density.low, density.values.shape, strict=True)
+    ]
+    squares = [np.square(axis) for axis in np.meshgrid(*axes, indexing="ij", sparse=True)]
+    beyond = (np.sqrt(sum(squares)) - radius) / density.spacing
+    # In the logarithm, in which surfaces are looked for, the distance to the sphere.
+    walls = level * np.exp(np.clip(beyond, -2.0 * _RANGE, 2.0 * _RANGE))
+    return density._replace(values=np.maximum(walls, density.values).astype(density.values.dtype))
+
+
 def find_surface(density: Grid, *, level: float) -> DensitySurface:
     """Returns the surface on which the density has a level, both per world unit.
 

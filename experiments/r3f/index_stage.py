@@ -150,7 +150,7 @@ def draw(path: Path, found: IndexEstimate) -> None:
 def _bounds(scene: Path, space: Space | None, radius: float | None) -> presets.Bounds:
     cameras = local_layout.read_frames(scene, "train").cameras
     space = space or background.space(scene)
-    told = background.half_extent(scene) if space == "bounded" else None
+    told = background.half_extent(scene) if space != "unbounded" else None
     return presets.bounds(cameras, space=space, radius=radius or told)
 
 

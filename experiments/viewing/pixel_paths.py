@@ -92,8 +92,8 @@ def trace_pixel(
     """Follows one ray along all branches that a budget follows.
 
     Args:
-      scene: a model, or geometry alone. A model's learned colours dim its paths, and in a bounded
-        scene last segments are drawn to its walls.
+      scene: a model, or geometry alone. A model's learned colours dim its paths, and where
+        there are walls last segments are drawn to them.
       ray: one camera ray, with a unit direction.
       budget: which light to follow; that of the model if not given.
       reach: length of the last segment where no walls end it, world units.

@@ -38,14 +38,15 @@ _WALLS = 6
 # Axes are written with six digits or more.
 _AXES_TOLERANCE = 1e-3
 
-_SPACES: dict[str, Space] = {"cube": "bounded", "sphere": "bounded", "env": "unbounded"}
+_SPACES: dict[str, Space] = {"cube": "bounded", "sphere": "spherical", "env": "unbounded"}
 
 
 def space(scene: Path) -> Space:
-    """Returns `unbounded` if the background is an environment map.
+    """Returns `unbounded` if the background is an environment map, `spherical` if it is a sphere.
 
     `scene.json` decides if it names the background; otherwise the scene's name does, which begins
-    with `env` in the data set, and with `cube` or `sphere` where there are walls.
+    with `env` in the data set, and with `cube` or `sphere` where there are walls. That is not
+    enough to know of a sphere where it stands, and a cube around it is taken.
     """
     kind = _background(scene).get("type")
     if kind is None:
@@ -60,7 +61,7 @@ def space(scene: Path) -> Space:
 
 
 def half_extent(scene: Path) -> float | None:
-    """Returns half the edge of the cube that the walls form, or around a sphere, if it is told."""
+    """Returns half the edge of the cube that the walls form, or their sphere's radius, if told."""
     record = _background(scene)
     key = "radius" if record.get("type") == "sphere" else "half_extent"
     extent = record.get(key)

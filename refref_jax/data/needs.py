@@ -30,7 +30,7 @@ class Needs(NamedTuple):
         colours are known and take no light, else `absorbing`.
       tints: colours of interfaces and media: `none` to heed, `given` by `scene.json` for every
         part, or to be `learned` since it does not tell them.
-      space: `unbounded` if the background is infinitely far away.
+      space: `unbounded` if the background is infinitely far away, `spherical` if it is a sphere.
     """
 
     parts: int

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from refref_jax import numerics
 from refref_jax.render import colour
+from refref_jax.sampling import domains
 
 Radiance = Callable[[Float[Array, "3"], Float[Array, "3"]], Float[Array, "3"]]
 """What one ray sees: from origin and unit direction, world units, to linear RGB."""
@@ -167,10 +168,8 @@ def sphere_radiance(
     that is nearest to the origin, or where its line left. Gradients are finite everywhere; where
     the line only touches the sphere the distance to it has gradient 0 (`numerics.safe_sqrt`).
     """
-    along = numerics.dot(origin, direction)
-    beyond = numerics.dot(origin, origin) - jnp.square(background.radius)
-    half_chord = numerics.safe_sqrt(jnp.square(along) - beyond)
-    return _look(background.texture, origin + (half_chord - along) * direction)
+    middle, half = domains.chord(background.radius, origin, direction)
+    return _look(background.texture, origin + (middle + half) * direction)
 
 
 def environment_radiance(

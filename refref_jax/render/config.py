@@ -50,12 +50,13 @@ class ModelConfig:
       learned_tints: number of parts whose tint and absorption are learned, all of them or 0.
       near: distance of the first sample from the camera, world units; 0 begins at the camera.
       far: distance of the last from the last bend, or from the camera on a straight path; the
-        background is opaque there. In a bounded scene a path ends already where it leaves the
-        cube, and `far` only serves paths that do not meet it.
-      radius: half edge of a bounded scene's cube, or radius of an unbounded scene's
-        uncontracted ball, world units, around the origin. Walls should stand on the faces of
-        the cube: between walls and faces the field has to guess.
-      space: `bounded` by the cube, or `unbounded`: beyond the ball it is contracted.
+        background is opaque there. In a bounded or spherical scene a path ends already where it
+        leaves that, and `far` only serves paths that do not meet it.
+      radius: half edge of a bounded scene's cube, or radius of a spherical scene or of an
+        unbounded scene's uncontracted ball, world units, around the origin. Walls should stand on
+        the faces of the cube: between walls and faces the field has to guess.
+      space: `bounded` by the cube, `spherical`: by the ball, or `unbounded`: beyond the ball it
+        is contracted.
       dilation: widening of a proposal before it is sampled, as a share of its mean bin width; 0
         for none.
     """

@@ -136,7 +136,7 @@ def rounds(config: ModelConfig) -> int:
 
 
 def distance_warp(config: ModelConfig, line: Polyline) -> warps.DistanceWarp:
-    """Returns the distance warp of a path: it ends where a bounded scene's cube does.
+    """Returns the distance warp of a path: it ends where a scene that is not unbounded does.
 
     The farthest distance counts from the last bend, so that a path that was turned around many
     times still reaches the background.
@@ -144,7 +144,7 @@ def distance_warp(config: ModelConfig, line: Polyline) -> warps.DistanceWarp:
     last = jnp.sum(jnp.isfinite(line.knots)) - 1
     leave = domains.exit_distance(domain(config), line.points[last], line.directions[last])
     far = line.knots[last] + jnp.minimum(leave, config.far)
-    # A camera on the very face of the cube still leaves room for samples.
+    # A camera on the very wall still leaves room for samples.
     far = jnp.maximum(far, config.near + _SHORTEST * config.radius)
     return warps.DistanceWarp(config.near, far, config.radius)
 

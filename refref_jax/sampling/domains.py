@@ -1,7 +1,8 @@
 """From world space to the unit cube that a field is stored in.
 
-A bounded scene is a cube, scaled. An unbounded one is contracted: a ball around the origin stays
-as it is and all of the space beyond it is squeezed into a shell of the same thickness.
+A bounded scene is a cube, scaled, and a spherical one the ball in it. An unbounded one is
+contracted: a ball around the origin stays as it is and all of the space beyond it is squeezed into
+a shell of the same thickness.
 
 Source: Barron et al., Mip-NeRF 360 (2022), Eq 10; Zip-NeRF (2023), section 2, for the scale of a
 contracted Gaussian.
@@ -15,16 +16,17 @@ from jaxtyping import Array, Float
 from refref_jax import numerics
 from refref_jax.sampling.cones import Gaussians
 
-Space = Literal["bounded", "unbounded"]
+Space = Literal["bounded", "spherical", "unbounded"]
 
 
 class Domain(NamedTuple):
     """The part of space that a field stores.
 
     Attributes:
-      radius: half edge of a bounded scene's cube, or radius of an unbounded scene's
-        uncontracted ball; world units.
-      space: whether all there is lies in the cube, or space beyond the ball is contracted.
+      radius: half edge of a bounded scene's cube, or radius of a spherical scene or of an
+        unbounded scene's uncontracted ball; world units.
+      space: whether all there is lies in the cube, or in the ball, or space beyond the ball is
+        contracted.
     """
 
     radius: float
@@ -34,7 +36,7 @@ class Domain(NamedTuple):
 def to_unit_cube(domain: Domain, gaussian: Gaussians) -> Gaussians:
     """Maps world-space Gaussians to `[0, 1]^3`; scales become fractions of the cube's edge.
 
-    Points outside a bounded scene's cube are moved to its nearest face.
+    Points outside the cube of a scene that is not unbounded are moved to its nearest face.
     """
     positions = gaussian.positions / domain.radius
     scales = gaussian.scales / domain.radius
@@ -46,20 +48,42 @@ def to_unit_cube(domain: Domain, gaussian: Gaussians) -> Gaussians:
 def exit_distance(
     domain: Domain, origin: Float[Array, "3"], direction: Float[Array, "3"]
 ) -> Float[Array, ""]:
-    """Returns how far a ray goes before it leaves a bounded scene's cube for good.
+    """Returns how far a ray goes before it leaves a bounded scene's cube, or the ball, for good.
 
-    `inf` for a ray that never meets the cube and in an unbounded scene. The gradient is not
-    meant to be used: which face is left changes abruptly.
+    `inf` for a ray that never meets it and in an unbounded scene. The gradient is not meant to be
+    used: which face is left changes abruptly.
 
-    Source: the slab method, Kay and Kajiya (1986).
+    Source: for the cube the slab method, Kay and Kajiya (1986).
     """
     if domain.space == "unbounded":
         return jnp.full_like(origin[0], jnp.inf)
+    if domain.space == "spherical":
+        middle, half = chord(domain.radius, origin, direction)
+        return jnp.where((half > 0.0) & (middle + half >= 0.0), middle + half, jnp.inf)
     inverse = numerics.safe_reciprocal(direction)
     first = (-domain.radius - origin) * inverse
     second = (domain.radius - origin) * inverse
     enter, leave = jnp.max(jnp.minimum(first, second)), jnp.min(jnp.maximum(first, second))
     return jnp.where((enter <= leave) & (leave >= 0.0), leave, jnp.inf)
+
+
+def chord(
+    radius: float | Float[Array, ""], origin: Float[Array, "3"], direction: Float[Array, "3"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Returns which part of a line lies in a sphere around the origin.
+
+    Args:
+      radius: of the sphere, world units.
+      origin: a point of the line.
+      direction: of the line, unit.
+
+    Returns:
+      From the point to the chord's middle, and half the chord: 0 of a line that misses the sphere,
+      whose middle is its point nearest to the origin.
+    """
+    along = numerics.dot(origin, direction)
+    beyond = numerics.dot(origin, origin) - jnp.square(radius)
+    return -along, numerics.safe_sqrt(jnp.square(along) - beyond)
 
 
 def contract(x: Float[Array, "*shape 3"]) -> Float[Array, "*shape 3"]:

@@ -49,7 +49,7 @@ def test_a_relative_path_is_resolved(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("kind", "expected"), [("env", "unbounded"), ("cube", "bounded"), ("sphere", "bounded")]
+    ("kind", "expected"), [("env", "unbounded"), ("cube", "bounded"), ("sphere", "spherical")]
 )
 @pytest.mark.parametrize("name", ["env_ball", "cube_ball"])
 def test_scene_json_decides_before_the_name(tmp_path, name, kind, expected):
@@ -82,7 +82,7 @@ def test_scene_json_tells_where_the_walls_stand(tmp_path, ball_scene):
     assert half_extent(_scene(tmp_path / "a", {"background": {"half_extent": 3}})) == 3.0
     assert half_extent(_scene(tmp_path / "b", {"background": {"type": "cube"}})) is None
     assert half_extent(_scene(tmp_path / "c")) is None
-    # The cube around a sphere.
+    # The radius of a sphere.
     assert (
         half_extent(_scene(tmp_path / "d", {"background": {"type": "sphere", "radius": 5}})) == 5.0
     )

@@ -194,6 +194,10 @@ def test_a_scene_is_described_in_one_line():
     assert "1 body that is not convex, re-entry" in describe(_needs(torus))
 
 
+def test_a_spherical_background_is_told():
+    assert "spherical background" in describe(_needs(solids.ball(), space="spherical"))
+
+
 def test_no_mesh_needs_no_tracer():
     needs = _needs(space="unbounded")
     assert (needs.parts, needs.bodies, needs.interior, needs.tints) == (0, 0, "none", "none")

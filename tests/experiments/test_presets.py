@@ -5,7 +5,8 @@ import json
 
 import pytest
 
-from experiments.presets import PRESETS, Bounds, loss
+from experiments.presets import PRESETS, Bounds, bounds, loss
+from refref_jax.data.cameras import orbit
 
 _BOUNDS = Bounds(near=0.05, far=16.0, radius=7.3, space="bounded")
 
@@ -39,3 +40,11 @@ def test_best_samples_as_the_paper_does_and_sees_through_bends():
     # As many rays are traced at once.
     assert PRESETS["best"].batch * PRESETS["best"].pool == 131_072
     assert PRESETS["paper"].batch * PRESETS["paper"].pool == 131_072
+
+
+def test_bounds_reach_the_far_wall():
+    cameras = orbit(4, distance=4.0, elevation=0.3, size=8, angle_x=1.0)
+    cube = bounds(cameras, space="bounded", radius=2.0)
+    sphere = bounds(cameras, space="spherical", radius=2.0)
+    assert (cube.radius, sphere.radius, sphere.space) == (2.0, 2.0, "spherical")
+    assert cube.far == pytest.approx(4.0 + 2.0 * 3.0**0.5) and sphere.far == pytest.approx(6.0)

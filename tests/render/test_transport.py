@@ -103,6 +103,13 @@ def test_a_path_ends_on_the_walls_of_a_bounded_scene(interior):
     np.testing.assert_allclose(np.max(abs(end)), MODEL.radius, rtol=_SUMMATION)
 
 
+@pytest.mark.parametrize("interior", _MODELS)
+def test_a_path_ends_on_the_sphere_of_a_spherical_scene(interior):
+    config = dataclasses.replace(_MODELS[interior], space="spherical")
+    end = _walk(_bent(), float(_warp(config, _bent()).far), interior=interior)[0]
+    np.testing.assert_allclose(np.linalg.norm(end), MODEL.radius, rtol=_SUMMATION)
+
+
 def test_a_path_that_is_turned_around_again_and_again_still_reaches_the_walls():
     path = made_paths.path([5.0, 5.0, 5.0], [[0, 0, 1], [0, 0, -1]] * 2, [0, 1, 1, 0])
     warp = _warp(_FIELD, path)

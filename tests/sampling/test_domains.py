@@ -83,6 +83,50 @@ def test_exit_lies_on_a_face_and_nothing_beyond_it_inside(radius):
         np.testing.assert_allclose(np.max(abs(end)), radius, rtol=1e-5)
 
 
+_SPHERICAL = Domain(radius=2.0, space="spherical")
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction", "expected"),
+    [
+        ((0, 0, 0), (1, 1, 1), 2.0),
+        ((1, 0, 0), (1, 0, 0), 1.0),
+        ((0, 1, 0), (1, 0, 0), np.sqrt(3.0)),
+        ((-5, 0, 0), (1, 0, 0), 7.0),  # enters and leaves
+        ((2, 0, 0), (-1, 0, 0), 4.0),  # starts on the sphere
+        ((2, 0, 0), (1, 0, 0), 0.0),  # and leaves at once
+        ((0, 0, 2), (1, 0, 0), np.inf),  # only touches
+        ((5, 0, 0), (1, 0, 0), np.inf),  # behind
+        ((5, 5, 0), (1, -0.1, 0), np.inf),  # past
+    ],
+)
+def test_exit_distance_of_a_ball_by_hand(origin, direction, expected):
+    got = _exit_distance(
+        _SPHERICAL, *(jnp.asarray(x, jnp.float32) for x in (origin, _unit(direction)))
+    )
+    np.testing.assert_allclose(got, expected, rtol=_ROUNDING)
+
+
+@pytest.mark.parametrize("radius", [1e-3, 7.3, 1e6])
+def test_exit_lies_on_the_sphere(radius):
+    rng = np.random.default_rng(3)
+    domain = Domain(radius=radius, space="spherical")
+    for _ in range(20):
+        origin = rng.uniform(0.0, radius) * _unit(rng.normal(size=3))
+        direction = _unit(rng.normal(size=3))
+        given = (jnp.asarray(x, jnp.float32) for x in (origin, direction))
+        end = origin + float(_exit_distance(domain, *given)) * direction
+        np.testing.assert_allclose(np.linalg.norm(end), radius, rtol=1e-6)
+
+
+def test_gradients_of_an_exit_are_finite_everywhere():
+    for origin in ([0.0, 0.0, 0.0], [0.0, 0.0, 2.0], [0.0, 0.0, 3.0], [0.0, 1.9999999, 0.0]):
+        for space in ("bounded", "spherical"):
+            domain = Domain(radius=2.0, space=space)
+            gradient = jax.grad(lambda x, d=domain: domains.exit_distance(d, x, jnp.eye(3)[0]))
+            assert np.isfinite(gradient(jnp.array(origin))).all()
+
+
 def test_an_unbounded_scene_is_never_left():
     domain = Domain(radius=2.0, space="unbounded")
     assert np.isinf(_exit_distance(domain, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])))

@@ -49,7 +49,7 @@ def test_a_sphere_comes_back(tmp_path):
     assert isinstance(read, SphereBackground) and read.radius == np.float32(7.3)
     assert read.texture.texels.shape == (_SIZE, 2 * _SIZE, 3)
     assert record["texture"] in SPHERES and record["type"] == "sphere"
-    assert background.half_extent(tmp_path) == 7.3 and background.space(tmp_path) == "bounded"
+    assert background.half_extent(tmp_path) == 7.3 and background.space(tmp_path) == "spherical"
 
 
 def test_an_environment_comes_back_exactly(tmp_path):

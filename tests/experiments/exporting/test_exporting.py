@@ -154,6 +154,22 @@ def test_walls_are_where_a_bounded_model_ends():
         surfaces.find_points(dense, level=5.0)
 
 
+def test_a_spherical_model_ends_on_its_sphere():
+    empty = Grid(np.zeros((33, 33, 33)), np.full(3, -2.0), 0.125)
+    room = surfaces.with_sphere(empty, level=5.0, radius=1.7)
+    found = surfaces.find_surface(room, level=5.0)
+    distances = np.linalg.norm(found.vertices, axis=-1)
+    # A tenth of a cell is what marching cubes may move a vertex by.
+    np.testing.assert_allclose(distances, 1.7, atol=0.0125)
+    inwards = -found.vertices / distances[:, None]
+    assert np.sum(found.normals * inwards, axis=-1).min() > 0.98
+    solid = Grid(np.full((33, 33, 33), 9.0, np.float32), empty.low, 0.125)
+    kept = surfaces.with_sphere(solid, level=5.0, radius=1.7).values
+    # What the field has within is not touched, and walls are nowhere thinner than the level.
+    assert kept.dtype == np.float32 and kept.min() == 9.0
+    assert room.values[0, 0, 0] > 5.0 and room.values[16, 16, 16] < 5.0 * np.exp(-5.9)
+
+
 def test_bodies_keep_their_normals_and_corners():
     sharp, round_ = solids.box("box_glass", centre=(3.0, 0.0, 0.0)), solids.ball("ball_glass")
     geometry = scenes.geometry(sharp, round_)
