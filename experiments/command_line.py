@@ -10,7 +10,6 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Collection, Iterable, Sequence
-from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, NoReturn
 
@@ -121,11 +120,11 @@ class Settled(NamedTuple):
 
     Attributes:
       names: of the options.
-      file: that tells what they are.
+      told: what tells how they are.
     """
 
     names: Collection[str]
-    file: Path
+    told: str
 
 
 def echo(module: ModuleType, arguments: Sequence[str], settled: Settled | None = None) -> str:
@@ -149,7 +148,7 @@ def echo(module: ModuleType, arguments: Sequence[str], settled: Settled | None =
     if rest:
         lines += command_help.wrapped(" ".join(map(_written, rest)), "  by default: ", "    ")
     if settled:
-        lines.append(f"  all others as it was begun: {shlex.quote(str(settled.file))}")
+        lines.append(f"  all others as it was begun: {settled.told}")
     return "\n".join(lines)
 
 

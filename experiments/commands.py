@@ -60,8 +60,8 @@ def run(
             threading.Thread(target=_stop_with_input, daemon=True).start()
         logging.set_verbosity(logging.ERROR)
         command_line.refuse_words(module, words[1:], arguments)
-        print(command_line.echo(module, words[1:], settled()), flush=True)
         try:
+            print(command_line.echo(module, words[1:], settled()), flush=True)
             main(*words[1:])
         except (ValueError, OSError) as error:
             command_line.fail(str(error))

@@ -13,6 +13,7 @@ mesh and points show what is around the bodies.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -97,7 +98,7 @@ def _write_field(model: Model, out: Path) -> list[Path]:
     if space == "bounded" and half == radius:
         density = surfaces.with_walls(density, level=_LEVEL.value)
         print("Walls:  the box's faces, on which the model is opaque")
-    if space == "spherical":
+    if space == "spherical" and math.sqrt(3.0) * half > radius:
         density = surfaces.with_sphere(density, level=_LEVEL.value, radius=radius)
         print(f"Walls:  the sphere of radius {radius:g}, on which the model is opaque")
     with output_folders.fresh_file(out, overwrite=_OVERWRITE.value) as draft:

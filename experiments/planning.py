@@ -36,7 +36,7 @@ class Request(NamedTuple):
       rule: what lies outside a mesh.
       indices: indices of refraction by material or mesh, over those of the scene.
       space: whether there are walls.
-      radius: of the walls' cube, or of the uncontracted ball, world units.
+      radius: of the walls' cube or sphere, or of the uncontracted ball, world units.
       steps: training steps.
       batch: rays a step.
       seed: of everything random.

@@ -43,7 +43,7 @@ from refref_jax.sampling.domains import Space
 from refref_jax.training.config import LossConfig, ScheduleConfig
 
 _WALLS = 7.3
-"""Half edge of a bounded scene's cube, world units, if nothing tells: the data set's walls.
+"""Half edge of a bounded scene's cube, or radius of a sphere, if nothing tells: the data set's.
 
 Paths end there, on an opaque background. Of all the ways to choose an end this one alone knows
 where the background is: a cube 3 % too large costs 2.7 dB, since its faces are taken for walls.

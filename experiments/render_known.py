@@ -7,7 +7,7 @@ JSON holds, for each view and as the mean over views, the PSNR in dB over the im
 mask and outside; `casts_per_pixel` and `paths_per_pixel`, which count ray casts and light paths of
 one camera ray, so that they do not depend on --rays_per_pixel; `seconds`, that rendering all views
 took, without compiling, reading and writing; and `lost_energy`, the share of light that found no
-room.
+room, or has no bend left and is `dark`.
 """
 
 from __future__ import annotations
@@ -192,7 +192,9 @@ def _report(summary: dict[str, Any]) -> None:
         print(f"{key:>16}  {summary[key]:.3f}")
     print(f"{'seconds':>16}  {summary['seconds']:.2f}")
     print(f"{'lost_energy':>16}  {summary['lost_energy']:.2g}")
-    if summary["lost_energy"] > _WORTH_A_WARNING:
+    if summary["unfinished"] == "dark":
+        print("lost_energy is that of light that has no bend left, and what found no room if any.")
+    elif summary["lost_energy"] > _WORTH_A_WARNING:
         print(
             "warning: some light found no room, and is missing from the pictures. Give a larger "
             "--cut or fewer --bends, or, as a library, a Budget with larger capacity factors."

@@ -110,10 +110,10 @@ def _open(run: Path) -> None:
 
 def _settled() -> command_line.Settled | None:
     """Returns the options of the run that is resumed, unless all are given and compared."""
-    begun = Path(_OUT.value) / run_option.RUN
-    if not _RESUME.value or plans.SCENE.value is not None or not begun.is_file():
+    run = Path(_OUT.value)
+    if not _RESUME.value or plans.SCENE.value is not None or not (run / run_option.RUN).is_file():
         return None
-    return command_line.Settled(_settled_names(), begun)
+    return command_line.Settled(_settled_names(), f"{run_option.RUN} and model.json in {run}")
 
 
 def _settled_names() -> list[str]:

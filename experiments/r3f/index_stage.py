@@ -64,7 +64,7 @@ def run(
       folder: for the background's run and the figure.
       seed: of everything random.
       space: whether there are walls; what the scene says if not given.
-      radius: of the walls' cube or the uncontracted ball, world units; likewise.
+      radius: of the walls' cube or sphere or the uncontracted ball, world units; likewise.
       start: an index to descend from besides those of the search.
       steps: of the background's training.
       rays: pixels to fit.

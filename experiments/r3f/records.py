@@ -31,7 +31,7 @@ class ReconstructionConfig:
       outliers: views that may be wrong.
       index: the index of refraction, or `None` to estimate it.
       space: whether there are walls, or `None` for what the scene says.
-      radius: of the walls' cube or the uncontracted ball, world units; `None` likewise.
+      radius: of the walls' cube or sphere or the uncontracted ball, world units; `None` likewise.
       light_steps: of the refinement by light; 0 leaves it out.
       seed: of everything random.
     """

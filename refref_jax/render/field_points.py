@@ -43,12 +43,14 @@ def look_up(
     Args:
       params: the model's parameters.
       config: the model.
-      point: world units; outside of a bounded scene's cube the nearest face is looked at.
+      point: world units; behind a scene's walls the nearest point of them is looked at.
       direction: of travel of the light path that looks, unit.
       width: edge of the cell that the point stands for, world units: finer detail is blurred.
     """
     # A cube's standard deviation along each axis.
     scale = jnp.full((1,), width, point.dtype) / jnp.sqrt(jnp.asarray(12.0, point.dtype))
-    cell = domains.to_unit_cube(transport.domain(config), Gaussians(point[None], scale))
+    domain = transport.domain(config)
+    held = domains.nearest_within(domain, point)
+    cell = domains.to_unit_cube(domain, Gaussians(held[None], scale))
     seen = registry.radiance(params.field, config.field, cell, direction)
     return FieldPoint(seen.density / config.radius, seen.rgb)

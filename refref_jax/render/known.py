@@ -46,7 +46,7 @@ class KnownRendering(NamedTuple):
       rgb: sRGB in `[0, 1]`.
       linear: the same light as linear RGB, not clipped.
       paths: number of light paths that carry a ray's colour.
-      lost: share of a ray's light that no path carries, for want of room.
+      lost: share of a ray's light that no path carries, for want of room or left dark.
       casts: closest-hit queries, all rays together.
     """
 

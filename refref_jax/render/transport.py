@@ -143,7 +143,7 @@ def distance_warp(config: ModelConfig, line: Polyline) -> warps.DistanceWarp:
     """
     last = jnp.sum(jnp.isfinite(line.knots)) - 1
     leave = domains.exit_distance(domain(config), line.points[last], line.directions[last])
-    far = line.knots[last] + jnp.minimum(leave, config.far)
+    far = line.knots[last] + jnp.where(jnp.isfinite(leave), leave, config.far)
     # A camera on the very wall still leaves room for samples.
     far = jnp.maximum(far, config.near + _SHORTEST * config.radius)
     return warps.DistanceWarp(config.near, far, config.radius)

@@ -45,6 +45,15 @@ def to_unit_cube(domain: Domain, gaussian: Gaussians) -> Gaussians:
     return Gaussians(jnp.clip(0.5 * positions + 0.5, 0.0, 1.0), 0.5 * scales)
 
 
+def nearest_within(domain: Domain, point: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Returns the point of the domain that is nearest to a point: that itself, if it is within."""
+    if domain.space == "unbounded":
+        return point
+    if domain.space == "spherical":
+        return point * (domain.radius / jnp.maximum(numerics.length(point), domain.radius))
+    return jnp.clip(point, -domain.radius, domain.radius)
+
+
 def exit_distance(
     domain: Domain, origin: Float[Array, "3"], direction: Float[Array, "3"]
 ) -> Float[Array, ""]:

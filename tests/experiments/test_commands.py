@@ -41,7 +41,7 @@ def test_a_finished_run_is_neither_repeated_nor_overwritten(trained):
     before = (trained / "metrics.jsonl").read_text()
     told = run_command("train", f"--out={trained}", "--resume").stdout
     # The preset's name is what it was, which this call does not know.
-    assert f"  all others as it was begun: {trained / 'config.json'}" in told
+    assert f"  all others as it was begun: config.json and model.json in {trained}" in told
     assert "--preset" not in told and "--devices=1" in told
     assert (trained / "metrics.jsonl").read_text() == before
     scene = json.loads((trained / "config.json").read_text())["scene"]["path"]

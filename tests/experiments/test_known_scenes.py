@@ -108,7 +108,9 @@ def test_pictures_of_others_are_not_deleted(tmp_path):
 def test_light_that_has_no_bend_left_may_be_dark(tmp_path):
     out = tmp_path / "dark"
     options = (f"--scene={_SCENE}", "--paths=paper", "--bends=1", "--unfinished=dark")
-    run_command("render_known", *options, f"--out={out}", "--views=3", "--rays_per_pixel=1")
+    options = (*options, f"--out={out}", "--views=3", "--rays_per_pixel=1")
+    told = run_command("render_known", *options).stdout
+    assert "light that has no bend left" in told and "found no room, and" not in told
     summary = json.loads((out / "metrics.json").read_text())
     assert (summary["bends"], summary["unfinished"]) == (1, "dark")
     mask = files.read_mask(_SCENE / "mask" / "test" / "r_003.png")

@@ -110,6 +110,15 @@ def test_a_path_ends_on_the_sphere_of_a_spherical_scene(interior):
     np.testing.assert_allclose(np.linalg.norm(end), MODEL.radius, rtol=_SUMMATION)
 
 
+@pytest.mark.parametrize("space", ["bounded", "spherical"])
+def test_a_camera_farther_out_than_all_of_training_sees_the_far_wall(space):
+    config = dataclasses.replace(_FIELD, space=space)
+    towards, origin = (0.0, 0.0, 1.0), (0.0, 0.0, -3.0 * MODEL.far)
+    path = made_paths.path([], [towards], [0], origin=origin, segments=_SEGMENTS)
+    expected = 3.0 * MODEL.far + MODEL.radius
+    np.testing.assert_allclose(_warp(config, path).far, expected, rtol=_SUMMATION)
+
+
 def test_a_path_that_is_turned_around_again_and_again_still_reaches_the_walls():
     path = made_paths.path([5.0, 5.0, 5.0], [[0, 0, 1], [0, 0, -1]] * 2, [0, 1, 1, 0])
     warp = _warp(_FIELD, path)
@@ -128,7 +137,7 @@ def test_a_path_of_an_unbounded_scene_ends_far_away():
     ("origin", "direction", "far"),
     [
         ((0.0, 0.0, 9.0), (0.0, 0.0, 1.0), MODEL.far),  # starts and stays outside the walls
-        ((0.0, 0.0, -9.0), (0.0, 0.0, 1.0), MODEL.far),  # its exit lies past the far distance
+        ((0.0, 0.0, -9.0), (0.0, 0.0, 1.0), 9.0 + MODEL.radius),  # past the far distance
         ((0.0, 0.0, MODEL.radius), (0.0, 0.0, 1.0), 0.0575),  # starts on a wall
     ],
 )

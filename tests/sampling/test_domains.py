@@ -127,6 +127,24 @@ def test_gradients_of_an_exit_are_finite_everywhere():
             assert np.isfinite(gradient(jnp.array(origin))).all()
 
 
+@pytest.mark.parametrize(
+    ("space", "point", "expected"),
+    [
+        ("bounded", (3.0, -1.0, -5.0), (2.0, -1.0, -2.0)),
+        ("spherical", (0.0, 3.0, 4.0), (0.0, 1.2, 1.6)),
+        ("spherical", (1.0, 1.0, 1.0), (1.0, 1.0, 1.0)),
+        ("spherical", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        ("unbounded", (0.0, 3.0, 4.0), (0.0, 3.0, 4.0)),
+    ],
+)
+def test_the_nearest_point_within_by_hand(space, point, expected):
+    domain = Domain(radius=2.0, space=space)
+    got = domains.nearest_within(domain, jnp.array(point))
+    np.testing.assert_allclose(got, expected, rtol=_ROUNDING)
+    jacobian = jax.jacrev(lambda x: domains.nearest_within(domain, x))(jnp.array(point))
+    assert np.isfinite(jacobian).all()
+
+
 def test_an_unbounded_scene_is_never_left():
     domain = Domain(radius=2.0, space="unbounded")
     assert np.isinf(_exit_distance(domain, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])))
