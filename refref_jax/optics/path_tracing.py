@@ -35,8 +35,8 @@ class Traced(NamedTuple):
 
     Attributes:
       paths: the paths, in the order of their rays, each ray's heaviest first; empty slots last.
-      lost: the share of each ray's linear RGB that found no room, or is dark. Weights and losses sum
-        to 1, less what tints and absorption took.
+      lost: the share of each ray's linear RGB that found no room, or is dark. Weights and losses
+        of a ray sum to 1, less what tints and absorption took.
     """
 
     paths: LightPaths
