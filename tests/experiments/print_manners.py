@@ -115,7 +115,7 @@ def _try(command, cases):
         ]
         found.update(
             options=options,
-            settings=settings,
+            settings={name: each for name, each in settings.items() if not callable(each)},
             documented=module.__doc__,
             stray=stray,
             help=_answer(main, settings, ["--help"]),
