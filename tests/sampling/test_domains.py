@@ -41,6 +41,7 @@ def _cube(domain, positions, scales=None):
 # --- where a ray leaves ---
 
 _BOUNDED = Domain(radius=2.0, space="bounded")
+_SPHERICAL = Domain(radius=2.0, space="spherical")
 
 _exit_distance = jax.jit(domains.exit_distance, static_argnums=0)
 
@@ -48,6 +49,11 @@ _exit_distance = jax.jit(domains.exit_distance, static_argnums=0)
 def _unit(vector):
     vector = np.asarray(vector, np.float64)
     return vector / np.linalg.norm(vector)
+
+
+def _assert_exit(domain, origin, direction, expected):
+    ray = (jnp.asarray(x, jnp.float32) for x in (origin, _unit(direction)))
+    np.testing.assert_allclose(_exit_distance(domain, *ray), expected, rtol=_ROUNDING)
 
 
 @pytest.mark.parametrize(
@@ -66,10 +72,7 @@ def _unit(vector):
     ],
 )
 def test_exit_distance_by_hand(origin, direction, expected):
-    got = _exit_distance(
-        _BOUNDED, *(jnp.asarray(x, jnp.float32) for x in (origin, _unit(direction)))
-    )
-    np.testing.assert_allclose(got, expected, rtol=_ROUNDING)
+    _assert_exit(_BOUNDED, origin, direction, expected)
 
 
 @pytest.mark.parametrize("radius", [1e-3, 7.3, 1e6])
@@ -81,9 +84,6 @@ def test_exit_lies_on_a_face_and_nothing_beyond_it_inside(radius):
         t = _exit_distance(domain, *(jnp.asarray(x, jnp.float32) for x in (origin, direction)))
         end = origin + float(t) * direction
         np.testing.assert_allclose(np.max(abs(end)), radius, rtol=1e-5)
-
-
-_SPHERICAL = Domain(radius=2.0, space="spherical")
 
 
 @pytest.mark.parametrize(
@@ -101,10 +101,7 @@ _SPHERICAL = Domain(radius=2.0, space="spherical")
     ],
 )
 def test_exit_distance_of_a_ball_by_hand(origin, direction, expected):
-    got = _exit_distance(
-        _SPHERICAL, *(jnp.asarray(x, jnp.float32) for x in (origin, _unit(direction)))
-    )
-    np.testing.assert_allclose(got, expected, rtol=_ROUNDING)
+    _assert_exit(_SPHERICAL, origin, direction, expected)
 
 
 @pytest.mark.parametrize("radius", [1e-3, 7.3, 1e6])
