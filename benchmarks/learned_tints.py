@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from absl import app, flags
 
-from experiments import trained_runs
+from experiments.runs import measured_runs as trained_runs
 from refref_jax.data import meshes
 
 _SCENE = flags.DEFINE_string("scene", None, "Folder of a tinted scene.", required=True)

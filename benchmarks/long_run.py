@@ -21,11 +21,11 @@ import jax
 import numpy as np
 from absl import app, flags, logging
 
-from experiments import trained_runs
-from experiments.named_budgets import BUDGETS
-from experiments.presets import PRESETS
+from experiments.runs import measured_runs as trained_runs
+from experiments.runs.named_budgets import BUDGETS
 from refref_jax.render.saved import load_model
 from refref_jax.training import run_folder
+from refref_jax.training.presets import PRESETS
 
 _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folder of the scene.")
 _PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Preset of all trainings.")

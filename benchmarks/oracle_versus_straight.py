@@ -11,7 +11,7 @@ from pathlib import Path
 
 from absl import app, flags
 
-from experiments import trained_runs
+from experiments.runs import measured_runs as trained_runs
 
 _BUNDLED = "cube_smcvx_ball"
 

@@ -20,7 +20,7 @@ import numpy as np
 import trimesh
 from absl import app, flags
 
-from refref_jax.data.cameras import Cameras, focal_length
+from refref_jax.geometry.cameras import Cameras, focal_length
 from refref_jax.reconstruct.comparison import (
     Distance,
     compare_meshes,

@@ -23,7 +23,7 @@ from jaxtyping import Bool
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from refref_jax.data import local_layout
-from refref_jax.data.cameras import Cameras
+from refref_jax.geometry.cameras import Cameras
 from refref_jax.reconstruct import occupancy
 from refref_jax.reconstruct.agreement import without_outliers
 from refref_jax.reconstruct.comparison import Distance, compare_meshes, silhouette_overlap

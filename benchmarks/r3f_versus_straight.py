@@ -19,12 +19,13 @@ from typing import NamedTuple
 
 from absl import app, flags
 
-from experiments import child_process, trained_runs
-from experiments.presets import PRESETS
+from experiments.cli import subprocesses as child_process
 from experiments.r3f import records
 from experiments.r3f.records import IndexFacts
-from experiments.trained_runs import Evaluation
+from experiments.runs import measured_runs as trained_runs
+from experiments.runs.measured_runs import Evaluation
 from refref_jax.data import meshes, scene_names
+from refref_jax.training.presets import PRESETS
 
 _SCENES = flags.DEFINE_list("scenes", ["experiments/data/cube_smcvx_ball"], "Folders of scenes.")
 _PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Preset of all trainings.")

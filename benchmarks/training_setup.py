@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from experiments import planning
-from experiments.choices import Wishes
-from experiments.planning import Request
+from experiments.runs import planning
+from experiments.runs.choices import Wishes
+from experiments.runs.planning import Request
 from refref_jax.data import local_layout
 from refref_jax.data.batches import PixelSampler
 from refref_jax.training import loop

@@ -19,10 +19,10 @@ from typing import NamedTuple
 
 from absl import app, flags
 
-from experiments import trained_runs
-from experiments.plotting import pyplot, style
-from experiments.presets import PRESETS
-from experiments.trained_runs import Evaluation, Training
+from experiments.figures.style import pyplot, style
+from experiments.runs import measured_runs as trained_runs
+from experiments.runs.measured_runs import Evaluation, Training
+from refref_jax.training.presets import PRESETS
 
 _SCENES = flags.DEFINE_list("scenes", ["experiments/data/cube_smcvx_ball"], "Folders of scenes.")
 _PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Preset of all trainings.")

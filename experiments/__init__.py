@@ -3,6 +3,6 @@
 import sys
 
 if sys.argv[0] == "-m":  # as long as Python looks for the command that it was asked to run
-    from experiments import first_interrupt
+    from experiments.cli import first_interrupt
 
     first_interrupt.take()

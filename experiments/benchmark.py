@@ -24,21 +24,21 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import command_line, commands, options, perceptual_option, scene_option
 from experiments.benchmarking import methods
 from experiments.benchmarking.methods import Method
-from experiments.late_imports import late
-from experiments.perceptual_option import LPIPS_WEIGHTS
+from experiments.cli import command_line, commands, options, perceptual_option, scene_option
+from experiments.cli.late_imports import late
+from experiments.cli.perceptual_option import LPIPS_WEIGHTS
 from refref_jax.training import run_lock
 
 if TYPE_CHECKING:
-    from experiments import presets
     from experiments.benchmarking import engines, jobs, scene_list, settings, summary, working
     from experiments.benchmarking.jobs import Job, Skipped
     from experiments.benchmarking.report import page, sheet
     from experiments.benchmarking.settings import Settings
+    from refref_jax.training import presets
 else:
-    presets = late("experiments.presets")
+    presets = late("refref_jax.training.presets")
     engines = late("experiments.benchmarking.engines")
     jobs = late("experiments.benchmarking.jobs")
     scene_list = late("experiments.benchmarking.scene_list")

@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import command_line, commands, options, output_folders
-from experiments.late_imports import late
+from experiments.cli import command_line, commands, options, output_folders
+from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from experiments import state_dicts
+    from experiments.runs import state_dicts
     from refref_jax.metrics import lpips_weights
 else:
     np = late("numpy")
-    state_dicts = late("experiments.state_dicts")
+    state_dicts = late("experiments.runs.state_dicts")
     lpips_weights = late("refref_jax.metrics.lpips_weights")
 
 _ALEXNET = flags.DEFINE_string(

@@ -15,23 +15,25 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import command_line, commands, options, scene_option
-from experiments.late_imports import late
+from experiments.cli import command_line, commands, options, scene_option
+from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
     import numpy as np
 
     from experiments.dataset import cameras
-    from experiments.exchange import from_nerfstudio, to_nerfstudio
-    from refref_jax.data import nerfstudio, placement
+    from refref_jax.data.nerfstudio import capture as nerfstudio
+    from refref_jax.data.nerfstudio import exporting as to_nerfstudio
+    from refref_jax.data.nerfstudio import importing as from_nerfstudio
+    from refref_jax.data.nerfstudio import placement
     from refref_jax.reconstruct import visual_hull
 else:
     np = late("numpy")
     cameras = late("experiments.dataset.cameras")
-    from_nerfstudio = late("experiments.exchange.from_nerfstudio")
-    to_nerfstudio = late("experiments.exchange.to_nerfstudio")
-    nerfstudio = late("refref_jax.data.nerfstudio")
-    placement = late("refref_jax.data.placement")
+    from_nerfstudio = late("refref_jax.data.nerfstudio.importing")
+    to_nerfstudio = late("refref_jax.data.nerfstudio.exporting")
+    nerfstudio = late("refref_jax.data.nerfstudio.capture")
+    placement = late("refref_jax.data.nerfstudio.placement")
     visual_hull = late("refref_jax.reconstruct.visual_hull")
 
 _SOURCE = flags.DEFINE_string("source", None, "What to convert: a folder.", required=True)

@@ -3,7 +3,7 @@
 python -m experiments.evaluate --run=runs/ball --split=test --rays_per_pixel=4
 
 With several rays a pixel colours are averaged as linear light, and a pixel's distance is the median
-of its rays'; see `experiments.supersampling`. What each metric is tells `docs/metrics.md`.
+of its rays'; see `refref_jax.render.supersampling`. What each metric is tells `docs/metrics.md`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from absl import flags
 
-from experiments import (
+from experiments.cli import (
     commands,
     options,
     output_folders,
@@ -23,24 +23,26 @@ from experiments import (
     run_option,
     scene_option,
 )
-from experiments.late_imports import late
+from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
-    from experiments import figures, measures, supersampling
+    from experiments.figures import comparison as figures
     from experiments.r3f import provenance
-    from refref_jax.data import cameras, files, scene_names
-    from refref_jax.render import Model, dyes, first_surface, saved
+    from refref_jax.data import files, scene_names
+    from refref_jax.geometry import cameras
+    from refref_jax.render import Model, dyes, first_surface, saved, supersampling
+    from refref_jax.training import evaluation as measures
     from refref_jax.training import run_folder
 else:
     np = late("numpy")
-    figures = late("experiments.figures")
-    measures = late("experiments.measures")
-    supersampling = late("experiments.supersampling")
+    figures = late("experiments.figures.comparison")
+    measures = late("refref_jax.training.evaluation")
+    supersampling = late("refref_jax.render.supersampling")
     provenance = late("experiments.r3f.provenance")
-    cameras = late("refref_jax.data.cameras")
+    cameras = late("refref_jax.geometry.cameras")
     files = late("refref_jax.data.files")
     scene_names = late("refref_jax.data.scene_names")
     dyes = late("refref_jax.render.dyes")

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import command_line, commands, options, output_folders, run_option
-from experiments.late_imports import late
+from experiments.cli import command_line, commands, options, output_folders, run_option
+from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
     import numpy as np

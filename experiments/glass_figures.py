@@ -15,16 +15,17 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import commands, known_options, options, output_folders, scene_option, scenes
-from experiments.late_imports import late
+from experiments.cli import commands, known_options, options, output_folders, scene_option, scenes
+from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
-    from experiments import glass_contents, known_scenes
+    from experiments.figures import glass_contents
+    from experiments.runs import known_scene as known_scenes
     from refref_jax.data import background
     from refref_jax.render import backgrounds
 else:
-    glass_contents = late("experiments.glass_contents")
-    known_scenes = late("experiments.known_scenes")
+    glass_contents = late("experiments.figures.glass_contents")
+    known_scenes = late("experiments.runs.known_scene")
     background = late("refref_jax.data.background")
     backgrounds = late("refref_jax.render.backgrounds")
 

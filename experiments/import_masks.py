@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import commands, options, scene_option
-from experiments.late_imports import late
+from experiments.cli import commands, options, scene_option
+from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
     import numpy as np

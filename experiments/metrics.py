@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 from absl import flags
 
-from experiments import commands, options, output_folders, perceptual_option
-from experiments.late_imports import late
-from experiments.perceptual_option import LPIPS_WEIGHTS
+from experiments.cli import commands, options, output_folders, perceptual_option
+from experiments.cli.late_imports import late
+from experiments.cli.perceptual_option import LPIPS_WEIGHTS
 
 if TYPE_CHECKING:
-    from experiments import folder_comparison
+    from experiments.runs import image_folders as folder_comparison
 else:
-    folder_comparison = late("experiments.folder_comparison")
+    folder_comparison = late("experiments.runs.image_folders")
 
 _MASKS = flags.DEFINE_string("masks", None, "Folder of masks, named as the images: 0 is outside.")
 _OUT = flags.DEFINE_string("out", None, "JSON file to write; nothing is written without it.")

@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING, Any
 
 from absl import flags
 
-from experiments import commands
-from experiments.late_imports import late
+from experiments.cli import commands
+from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
     import nbclient

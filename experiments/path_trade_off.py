@@ -17,32 +17,34 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from absl import flags
 
-from experiments import (
+from experiments.cli import (
     command_line,
     commands,
     known_options,
-    named_budgets,
     options,
     output_folders,
     scene_option,
     scenes,
     view_numbers,
 )
-from experiments.late_imports import late
+from experiments.cli.late_imports import late
+from experiments.runs import named_budgets
 from refref_jax.data import scene_names
 from refref_jax.optics.budgets import BUDGETS, Budget
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from experiments import known_scenes, measures, path_figures
-    from experiments.known_scenes import KnownScene
-    from experiments.path_figures import Trial
+    from experiments.runs import known_scene as known_scenes
+    from experiments.runs.known_scene import KnownScene
+    from experiments.sweeps import path_figures
+    from experiments.sweeps.path_figures import Trial
+    from refref_jax.training import evaluation as measures
 else:
     np = late("numpy")
-    known_scenes = late("experiments.known_scenes")
-    measures = late("experiments.measures")
-    path_figures = late("experiments.path_figures")
+    known_scenes = late("experiments.runs.known_scene")
+    measures = late("refref_jax.training.evaluation")
+    path_figures = late("experiments.sweeps.path_figures")
 
 _SCENES = flags.DEFINE_list(
     "scenes", None, f"Scenes, with commas: each {options.SCENE_FORMS}.", required=True

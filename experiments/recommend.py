@@ -14,15 +14,16 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import commands, options, scene_option
-from experiments.late_imports import late
+from experiments.cli import commands, options, scene_option
+from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
-    from experiments import recommendations, trade_table
+    from experiments.sweeps import recommendations
+    from experiments.sweeps import table as trade_table
     from refref_jax.data import local_layout
 else:
-    recommendations = late("experiments.recommendations")
-    trade_table = late("experiments.trade_table")
+    recommendations = late("experiments.sweeps.recommendations")
+    trade_table = late("experiments.sweeps.table")
     local_layout = late("refref_jax.data.local_layout")
 
 _BUNDLED = Path(__file__).parent / "data" / "trade_off.csv"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import (
+from experiments.cli import (
     command_line,
     commands,
     options,
@@ -21,7 +21,7 @@ from experiments import (
     scene_option,
     space_options,
 )
-from experiments.late_imports import late
+from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
     from experiments.r3f import body, chain, report

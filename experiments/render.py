@@ -11,19 +11,21 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import choosable, commands, options, output_folders, run_option, scene_option
-from experiments.late_imports import late
+from experiments.cli import choosable, commands, options, output_folders, run_option, scene_option
+from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
-    from experiments import figures, supersampling, videos
-    from refref_jax.data import cameras, files, local_layout
-    from refref_jax.render import Model, saved
+    from experiments.figures import comparison as figures
+    from experiments.figures import video as videos
+    from refref_jax.data import files, local_layout
+    from refref_jax.geometry import cameras
+    from refref_jax.render import Model, saved, supersampling
     from refref_jax.training import run_folder
 else:
-    figures = late("experiments.figures")
-    supersampling = late("experiments.supersampling")
-    videos = late("experiments.videos")
-    cameras = late("refref_jax.data.cameras")
+    figures = late("experiments.figures.comparison")
+    supersampling = late("refref_jax.render.supersampling")
+    videos = late("experiments.figures.video")
+    cameras = late("refref_jax.geometry.cameras")
     files = late("refref_jax.data.files")
     local_layout = late("refref_jax.data.local_layout")
     saved = late("refref_jax.render.saved")

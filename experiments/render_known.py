@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from absl import flags
 
-from experiments import (
+from experiments.cli import (
     budget_options,
     command_line,
     commands,
@@ -30,20 +30,22 @@ from experiments import (
     scenes,
     view_numbers,
 )
-from experiments.late_imports import late
+from experiments.cli.late_imports import late
 from refref_jax.optics.budgets import BUDGETS, Budget
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from experiments import figures, known_scenes, measures
-    from experiments.known_scenes import KnownScene, View
+    from experiments.figures import comparison as figures
+    from experiments.runs import known_scene as known_scenes
+    from experiments.runs.known_scene import KnownScene, View
     from refref_jax.data import files
+    from refref_jax.training import evaluation as measures
 else:
     np = late("numpy")
-    figures = late("experiments.figures")
-    known_scenes = late("experiments.known_scenes")
-    measures = late("experiments.measures")
+    figures = late("experiments.figures.comparison")
+    known_scenes = late("experiments.runs.known_scene")
+    measures = late("refref_jax.training.evaluation")
     files = late("refref_jax.data.files")
 
 _SCENE = options.scene("The scene")

@@ -21,16 +21,17 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import command_line, commands, options, output_folders, scene_option
-from experiments.late_imports import late
+from experiments.cli import command_line, commands, options, output_folders, scene_option
+from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
-    from experiments import sweeps, trade_points
-    from experiments.trade_points import Point
+    from experiments.sweeps import points as trade_points
+    from experiments.sweeps import sweep as sweeps
+    from experiments.sweeps.points import Point
     from refref_jax.data import local_layout
 else:
-    sweeps = late("experiments.sweeps")
-    trade_points = late("experiments.trade_points")
+    sweeps = late("experiments.sweeps.sweep")
+    trade_points = late("experiments.sweeps.points")
     local_layout = late("refref_jax.data.local_layout")
 
 _SCENE = options.scene("The scene")

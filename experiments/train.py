@@ -13,24 +13,24 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import (
+from experiments.cli import (
     command_line,
     commands,
     device_options,
     options,
-    plans,
     reconstruction_options,
     run_option,
     scenes,
-    training_body,
 )
-from experiments.late_imports import late
+from experiments.cli.late_imports import late
+from experiments.r3f import training_body
+from experiments.runs import plans
 
 if TYPE_CHECKING:
-    from experiments import trainer
+    from experiments.runs import trainer
     from refref_jax.training import devices, run_folder, run_lock
 else:
-    trainer = late("experiments.trainer")
+    trainer = late("experiments.runs.trainer")
     devices = late("refref_jax.training.devices")
     run_folder = late("refref_jax.training.run_folder")
     run_lock = late("refref_jax.training.run_lock")

@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import command_line, commands, options, run_option, scene_option
-from experiments.late_imports import late
+from experiments.cli import command_line, commands, options, run_option, scene_option
+from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
-    from experiments.viewing import subject as subjects
+    from experiments.viewer import subject as subjects
     from refref_jax.data import errors
     from refref_jax.render import saved
     from refref_jax.training import run_folder
 else:
-    subjects = late("experiments.viewing.subject")
+    subjects = late("experiments.viewer.subject")
     errors = late("refref_jax.data.errors")
     saved = late("refref_jax.render.saved")
     run_folder = late("refref_jax.training.run_folder")
@@ -57,7 +57,7 @@ def main() -> None:
     run_option.check(Path(_RUN.value))
     scene_option.check(_SCENE.value)
     try:
-        from experiments.viewing import server as serving
+        from experiments.viewer import server as serving
     except ModuleNotFoundError as error:
         if error.name != "viser":
             raise

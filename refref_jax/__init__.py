@@ -16,15 +16,15 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # the same names for those who read types; a test compares the two lists
-    from refref_jax.data.cameras import Cameras as Cameras
-    from refref_jax.data.cameras import image_rays as image_rays
-    from refref_jax.data.cameras import orbit as orbit
     from refref_jax.data.errors import SceneError as SceneError
     from refref_jax.data.geometry import assemble as assemble
     from refref_jax.data.geometry import single_body as single_body
     from refref_jax.data.meshes import MeshPart as MeshPart
     from refref_jax.data.meshes import read_meshes as read_meshes
     from refref_jax.data.parts import make_part as make_part
+    from refref_jax.geometry.cameras import Cameras as Cameras
+    from refref_jax.geometry.cameras import image_rays as image_rays
+    from refref_jax.geometry.cameras import orbit as orbit
     from refref_jax.geometry.rays import Rays as Rays
     from refref_jax.optics.budgets import BUDGETS as BUDGETS
     from refref_jax.optics.budgets import Budget as Budget
@@ -41,7 +41,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "BUDGETS": "optics.budgets",
     "Budget": "optics.budgets",
-    "Cameras": "data.cameras",
+    "Cameras": "geometry.cameras",
     "Geometry": "optics.scene",
     "LightPaths": "optics.light_paths",
     "MeshPart": "data.meshes",
@@ -51,9 +51,9 @@ _HOMES = {
     "assemble": "data.geometry",
     "follow_branch": "optics.single_path",
     "follow_main_branches": "optics.main_branches",
-    "image_rays": "data.cameras",
+    "image_rays": "geometry.cameras",
     "make_part": "data.parts",
-    "orbit": "data.cameras",
+    "orbit": "geometry.cameras",
     "read_meshes": "data.meshes",
     "single_body": "data.geometry",
     "trace": "optics.path_tracing",

@@ -6,6 +6,7 @@ removes.
 
 import contextlib
 import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,6 +24,17 @@ def unfinished_folder(target: Path) -> Iterator[Path]:
         draft.rename(target)
     finally:
         shutil.rmtree(draft, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def appearing(target: Path) -> Iterator[Path]:
+    """Yields an empty folder that becomes the target at the end, unless there is an error."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".converting-", dir=target.parent) as place:
+        folder = Path(place) / target.name
+        folder.mkdir()
+        yield folder
+        folder.rename(target)
 
 
 @contextlib.contextmanager

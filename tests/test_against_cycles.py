@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
-from refref_jax.data import background, cameras, containment, local_layout, meshes
+from refref_jax.data import background, containment, local_layout, meshes
 from refref_jax.data.geometry import build_geometry
+from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
 from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE, Budget

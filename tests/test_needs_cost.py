@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from jax import extend
 
-from experiments.choices import Wishes, choose
+from experiments.runs.choices import Wishes, choose
 from refref_jax.data import containment, local_layout, meshes
-from refref_jax.data.cameras import image_rays
 from refref_jax.data.geometry import build_geometry
 from refref_jax.data.needs import find_needs
+from refref_jax.geometry.cameras import image_rays
 from refref_jax.optics import path_tracing
 from refref_jax.optics.budgets import TREE
 from refref_jax.optics.media import SLOTS

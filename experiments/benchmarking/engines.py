@@ -10,9 +10,9 @@ from concurrent import futures
 from pathlib import Path
 from typing import Any, Protocol
 
-from experiments import child_process
 from experiments.benchmarking import running
 from experiments.benchmarking.jobs import Job
+from experiments.cli import subprocesses as child_process
 
 # Ray itself tries for many minutes, while nobody is told.
 _SECONDS_TO_ANSWER = 10.0

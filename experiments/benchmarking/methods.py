@@ -14,14 +14,14 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Literal
 
-from experiments import command_line
-from experiments.late_imports import late
+from experiments.cli import command_line
+from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
-    from experiments import presets
     from refref_jax.fields import registry
+    from refref_jax.training import presets
 else:
-    presets = late("experiments.presets")
+    presets = late("refref_jax.training.presets")
     registry = late("refref_jax.fields.registry")
 
 Need = Literal["meshes", "masks", "colours"]

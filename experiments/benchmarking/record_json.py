@@ -8,9 +8,9 @@ import dataclasses
 import math
 from typing import Any
 
-from experiments import commands
 from experiments.benchmarking.records import Costs, Image, Record, Truth, View
 from experiments.benchmarking.settings import Settings
+from experiments.cli import commands
 
 
 def to_json(record: Record) -> dict[str, Any]:

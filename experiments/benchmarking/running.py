@@ -17,14 +17,15 @@ import jax
 import numpy as np
 
 import refref_jax
-from experiments import child_process, trained_runs
 from experiments.benchmarking import fingerprints, jobs, pose_space, record_files, records
 from experiments.benchmarking.jobs import SPLIT, Job
 from experiments.benchmarking.methods import RECONSTRUCTION
 from experiments.benchmarking.record_json import number
 from experiments.benchmarking.records import Costs, Image, Record, Truth, View
-from experiments.child_process import RunFailedError
+from experiments.cli import subprocesses as child_process
+from experiments.cli.subprocesses import RunFailedError
 from experiments.r3f import records as reconstructions
+from experiments.runs import measured_runs as trained_runs
 from refref_jax.data import local_layout
 from refref_jax.training import run_lock
 

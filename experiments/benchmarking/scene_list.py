@@ -4,9 +4,9 @@ import glob
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments import scene_option
 from experiments.benchmarking import fingerprints
 from experiments.benchmarking.settings import Scene
+from experiments.cli import scene_option
 from refref_jax.data import scene_names
 
 

@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments import commands
 from experiments.benchmarking import (
     ablations,
     comparisons,
@@ -30,6 +29,7 @@ from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.records import Record
 from experiments.benchmarking.settings import Benchmark
 from experiments.benchmarking.tables import Table
+from experiments.cli import commands
 from refref_jax import drafts
 from refref_jax.training import run_folder
 

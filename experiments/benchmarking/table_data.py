@@ -5,10 +5,10 @@ import io
 from collections.abc import Sequence
 from typing import Any
 
-from experiments import commands
 from experiments.benchmarking.records import Record
 from experiments.benchmarking.statistics import Cell
 from experiments.benchmarking.tables import Block, Column, Row, Table
+from experiments.cli import commands
 
 _HEAD = (
     "table",

@@ -4,11 +4,11 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from experiments import commands
 from experiments.benchmarking import jobs, schedule, summary
 from experiments.benchmarking.engines import Engine
 from experiments.benchmarking.jobs import Job, Skipped
 from experiments.benchmarking.settings import Benchmark
+from experiments.cli import commands
 
 
 def work(

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any
 
 from absl import flags
 
-from experiments import budget_options, commands, options, output_folders, scene_option
+from experiments.cli import budget_options, commands, options, output_folders, scene_option
+from experiments.cli.late_imports import late
 from experiments.dataset import render_settings
-from experiments.late_imports import late
 
 if TYPE_CHECKING:
     from experiments.dataset import check_page, scene_check

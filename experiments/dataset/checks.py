@@ -14,20 +14,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from experiments import known_scenes
-from experiments.known_scenes import KnownScene
-from refref_jax.data import (
-    cameras,
-    containment,
-    files,
-    lint,
-    local_layout,
-    meshes,
-    transforms,
-)
+from experiments.runs import known_scene as known_scenes
+from experiments.runs.known_scene import KnownScene
+from refref_jax.data import containment, files, lint, local_layout, meshes, transforms
 from refref_jax.data.containment import Containment
 from refref_jax.data.findings import Finding
 from refref_jax.data.meshes import MeshPart
+from refref_jax.geometry import cameras
 from refref_jax.optics.budgets import Budget
 from refref_jax.render.first_surface import FirstSurface, find_first_surface
 

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import commands, options, scene_option
-from experiments.late_imports import late
+from experiments.cli import commands, options, scene_option
+from experiments.cli.late_imports import late
 from refref_jax.data import scene_names
 
 if TYPE_CHECKING:

@@ -1,13 +1,12 @@
 """Writes a scene as a folder, with plain names or those of the raw release; files byte for byte."""
 
-import contextlib
 import shutil
-import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from experiments.dataset.scene_contents import Frame, SceneContents
+from refref_jax import drafts
 from refref_jax.data import file_names
 from refref_jax.data.file_names import FrameFiles, Naming
 
@@ -25,7 +24,7 @@ def write(
       naming: of the frames' files.
       step: is called for every image.
     """
-    with appearing(target) as scene:
+    with drafts.appearing(target) as scene:
         for split, (frames, header) in contents.splits.items():
             records = []
             for number, frame in enumerate(frames):
@@ -34,17 +33,6 @@ def write(
             file_names.write_transforms(scene, split, header | {"frames": records})
         for place, path in contents.extras.items():
             _copy(path, scene / place)
-
-
-@contextlib.contextmanager
-def appearing(target: Path) -> Iterator[Path]:
-    """Yields an empty folder that becomes the target at the end, unless there is an error."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".converting-", dir=target.parent) as beside:
-        folder = Path(beside) / target.name
-        folder.mkdir()
-        yield folder
-        folder.rename(target)
 
 
 def _write_frame(frame: Frame, scene: Path, files: FrameFiles) -> dict[str, Any]:

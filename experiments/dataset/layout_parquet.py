@@ -13,8 +13,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.dataset import layout_folders, scene_contents
+from experiments.dataset import scene_contents
 from experiments.dataset.scene_contents import Frame, SceneContents
+from refref_jax import drafts
 from refref_jax.data import parquet_scenes
 from refref_jax.data.errors import SceneError
 from refref_jax.data.parquet_scenes import IMAGE_COLUMNS, POSE_COLUMN
@@ -135,7 +136,7 @@ def _write_extras(extras: dict[str, Path], folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     if not extras:
         return
-    with layout_folders.appearing(folder) as beside:
+    with drafts.appearing(folder) as beside:
         for place, path in extras.items():
             (beside / place).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, beside / place)

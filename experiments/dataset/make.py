@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments import choosable, command_line, commands, options, output_folders
+from experiments.cli import choosable, command_line, commands, options, output_folders
+from experiments.cli.late_imports import late
 from experiments.dataset.render_settings import LEAST_TEXTURE, PerSplit, RenderSettings
-from experiments.late_imports import late
 from refref_jax.data.scene_names import BACKGROUNDS, SceneName
 
 if TYPE_CHECKING:

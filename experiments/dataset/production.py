@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from experiments import commands
+from experiments.cli import commands
 from experiments.dataset import frame_files, scene_setup, views
 from experiments.dataset.parts import Object
 from experiments.dataset.render_settings import RenderSettings

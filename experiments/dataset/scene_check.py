@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import command_line
+from experiments.cli import command_line
 from experiments.dataset import checks
 from experiments.dataset.check_page import SceneReport
 from refref_jax.optics.budgets import Budget

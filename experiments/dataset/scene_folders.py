@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
-from experiments import scene_option
+from experiments.cli import scene_option
 from experiments.dataset import scene_contents
 from refref_jax.data import parquet_scenes, published_files, scene_names, scene_source
 from refref_jax.data.errors import SceneError

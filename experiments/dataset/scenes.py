@@ -3,7 +3,7 @@
 import fnmatch
 from collections.abc import Mapping
 
-from experiments import command_line
+from experiments.cli import command_line
 from experiments.dataset.parts import Object
 from refref_jax.data.scene_names import BACKGROUNDS, SceneName
 

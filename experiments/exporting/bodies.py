@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import output_folders
+from experiments.cli import output_folders
 from experiments.exporting.field_grid import split_parts
 from experiments.r3f import body, records
 from refref_jax.data import stored_normals

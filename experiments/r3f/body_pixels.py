@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int
 
 from refref_jax.data import local_layout, mask_margins
-from refref_jax.data.cameras import pixel_rays
+from refref_jax.geometry.cameras import pixel_rays
 from refref_jax.geometry.surface_build import build_surfaces
 from refref_jax.optics.branching import Geometry
 from refref_jax.optics.interface_rules import NO_PARENT, nested

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import commands
+from experiments.cli import commands
 from experiments.r3f import doubts
 from experiments.r3f.records import GeometryFacts, ReconstructionConfig
 from refref_jax import drafts

@@ -10,9 +10,11 @@ wrong index can have spoilt it. Where the body fills all images there is none: g
 import dataclasses
 from pathlib import Path
 
-from experiments import commands, plotting, presets, trainer
-from experiments.plotting import COLOURS, pyplot
+from experiments.cli import commands
+from experiments.figures import style as plotting
+from experiments.figures.style import COLOURS, pyplot
 from experiments.r3f import body_pixels
+from experiments.runs import trainer
 from refref_jax.data import background, local_layout
 from refref_jax.data.geometry import build_geometry
 from refref_jax.optics.budgets import STRAIGHT
@@ -28,7 +30,7 @@ from refref_jax.render.config import ModelConfig
 from refref_jax.render.model import Model
 from refref_jax.render.saved import SavedModel
 from refref_jax.sampling.domains import Space
-from refref_jax.training import run_folder, run_lock
+from refref_jax.training import presets, run_folder, run_lock
 from refref_jax.training.config import SceneConfig, TrainingConfig
 
 PRESET = "tiny"

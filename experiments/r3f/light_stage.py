@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import commands
+from experiments.cli import commands
 from experiments.r3f import body_pixels
 from experiments.r3f.body_pixels import BodyPixels
 from experiments.r3f.records import IndexFacts, LightFacts

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Patch
 
-from experiments.plotting import COLOURS, pyplot, style
+from experiments.figures.style import COLOURS, pyplot, style
 from experiments.r3f import windows
 from experiments.r3f.windows import Window
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from experiments import commands
+from experiments.cli import commands
 from experiments.r3f import body
 from experiments.r3f.records import IndexFacts, Reconstruction, ReportFacts
 

@@ -24,9 +24,9 @@ from experiments.r3f.surface_pictures import SurfaceView
 from experiments.r3f.windows import Window
 from refref_jax import drafts
 from refref_jax.data import containment, local_layout, meshes
-from refref_jax.data.cameras import Cameras, image_rays
 from refref_jax.data.errors import SceneError
 from refref_jax.data.local_layout import Frames
+from refref_jax.geometry.cameras import Cameras, image_rays
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surface_build import build_surfaces
 from refref_jax.geometry.surfaces import Surfaces

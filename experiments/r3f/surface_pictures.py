@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, TwoSlopeNorm
 
-from experiments.plotting import pyplot
+from experiments.figures.style import pyplot
 
 DPI = 110
 

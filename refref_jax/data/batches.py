@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
-from refref_jax.data.cameras import Cameras, pixel_rays
+from refref_jax.geometry.cameras import Cameras, pixel_rays
 from refref_jax.geometry.rays import Rays
 
 

@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from refref_jax.data import files, transforms
-from refref_jax.data.cameras import Cameras, focal_length, planar_depth_to_distance
 from refref_jax.data.errors import SceneError
+from refref_jax.geometry.cameras import Cameras, focal_length, planar_depth_to_distance
 
 SPLITS = ("train", "val", "test")
 

@@ -9,11 +9,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from refref_jax.data.cameras import Cameras
 from refref_jax.data.containment import Containment, winding_number
 from refref_jax.data.convexity import encloses, is_convex
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.part_descriptions import PartDescription
+from refref_jax.geometry.cameras import Cameras
 from refref_jax.optics.interface_rules import CLEAR, NO_ABSORPTION, NO_PARENT
 from refref_jax.sampling.domains import Space
 

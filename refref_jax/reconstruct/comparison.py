@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from refref_jax.data.cameras import Cameras, image_rays
+from refref_jax.geometry.cameras import Cameras, image_rays
 from refref_jax.geometry.corner_normals import unit_vectors
 from refref_jax.geometry.surface_build import build_surfaces
 from refref_jax.reconstruct.closest import ClosestSearch

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from scipy.sparse import coo_array, csr_array, vstack
 from scipy.spatial import KDTree, QhullError
 
-from refref_jax.data.cameras import project
+from refref_jax.geometry.cameras import project
 from refref_jax.reconstruct.convex import hull, of_points, weigh_facets
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.grids import Points, Values

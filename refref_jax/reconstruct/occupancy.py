@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from refref_jax.data.cameras import Cameras, image_rays
+from refref_jax.geometry.cameras import Cameras, image_rays
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.grids import Box, Grid, Points
 from refref_jax.reconstruct.occupancy_field import OccupancyFieldConfig, Params

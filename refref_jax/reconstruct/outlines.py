@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import map_coordinates
 from scipy.spatial import ConvexHull
 
-from refref_jax.data.cameras import Cameras, Projection, project
+from refref_jax.geometry.cameras import Cameras, Projection, project
 from refref_jax.reconstruct.grids import Values
 from refref_jax.reconstruct.silhouettes import Views, overlaps
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_laplace
 
-from refref_jax.data.cameras import Cameras
+from refref_jax.geometry.cameras import Cameras
 from refref_jax.reconstruct.errors import ReconstructionError
 
 BLUR = 1.5

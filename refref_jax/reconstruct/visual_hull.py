@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import map_coordinates
 
-from refref_jax.data.cameras import Cameras, project
+from refref_jax.geometry.cameras import Cameras, project
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.grids import Box, Field, Grid, Points, Values, lattice, sample
 from refref_jax.reconstruct.silhouettes import BLUR, check_masks, signed_distances

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from refref_jax.data.batches import PixelSampler
-from refref_jax.data.cameras import orbit, pixel_rays
+from refref_jax.geometry.cameras import orbit, pixel_rays
 
 _FRAMES, _HEIGHT, _WIDTH, _BATCH = 3, 4, 5, 8
 

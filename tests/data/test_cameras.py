@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from refref_jax.data.cameras import (
+from refref_jax.geometry.cameras import (
     Cameras,
     box_filter,
     distance_to_planar_depth,

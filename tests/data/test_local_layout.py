@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from refref_jax.data import files, local_layout
-from refref_jax.data.cameras import image_rays, planar_depth_to_distance
+from refref_jax.geometry.cameras import image_rays, planar_depth_to_distance
 from tests.data.expectations import scene_error
 from tests.data.small_scenes import (
     HEIGHT,

@@ -3,9 +3,9 @@ import pytest
 import trimesh
 
 from refref_jax.data import containment, meshes
-from refref_jax.data.cameras import orbit
 from refref_jax.data.convexity import is_convex
 from refref_jax.data.needs import describe, find_needs
+from refref_jax.geometry.cameras import orbit
 from tests.data import solids
 
 _CAMERAS = orbit(4, distance=4.0, elevation=0.3, size=8, angle_x=1.0)

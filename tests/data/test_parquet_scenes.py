@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from refref_jax.data import local_layout, parquet_scenes
-from refref_jax.data.cameras import focal_length, planar_depth_to_distance
 from refref_jax.data.parquet_scenes import METADATA_KEY, Contents
+from refref_jax.geometry.cameras import focal_length, planar_depth_to_distance
 from tests.data.expectations import scene_error
 from tests.data.small_parquet import row, write_copy
 from tests.data.small_scenes import HEIGHT, WIDTH, truncate

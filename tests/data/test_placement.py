@@ -1,9 +1,14 @@
 import numpy as np
 import pytest
 
-from refref_jax.data.cameras import orbit
 from refref_jax.data.errors import SceneError
-from refref_jax.data.placement import Placement, meeting_point, place, undo_motion
+from refref_jax.data.nerfstudio.placement import (
+    Placement,
+    meeting_point,
+    place,
+    undo_motion,
+)
+from refref_jax.geometry.cameras import orbit
 from tests.data.small_captures import pose_of
 
 _CENTRE = np.array([0.4, -1.0, 2.0])

@@ -1,6 +1,6 @@
 """Rows of a table as a sweep would measure them, with costs and gains that are easy to reckon."""
 
-from experiments.trade_table import Row
+from experiments.sweeps.table import Row
 
 
 def made_row(name="base", *, pace=0.1, quality=25.0, steps=1000, image=1.0, evaluation=""):

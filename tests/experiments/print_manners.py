@@ -18,7 +18,7 @@ from unittest import mock
 import numpy  # noqa: F401  so that it is imported once
 from absl import app, flags
 
-from experiments import command_help, commands
+from experiments.cli import command_help, commands
 
 _run = commands.run
 

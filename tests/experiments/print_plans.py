@@ -10,7 +10,7 @@ import sys
 
 from absl import flags
 
-from experiments import plans
+from experiments.runs import plans
 
 
 def _resolve(options):

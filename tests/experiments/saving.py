@@ -11,7 +11,7 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import commands
+from experiments.cli import commands
 
 _FOLDER = flags.DEFINE_string("folder", None, "Where it writes.")
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from experiments import videos
+from experiments.figures import video as videos
 from refref_jax.data import files
 from refref_jax.render import load_model
 from tests import code_generator

@@ -7,7 +7,7 @@ import types
 import numpy as np
 import pytest
 
-from experiments import state_dicts
+from experiments.runs import state_dicts
 from refref_jax import metrics
 from tests import made_lpips
 from tests.experiments.command import run_command

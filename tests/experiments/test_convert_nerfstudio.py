@@ -6,10 +6,12 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from experiments.exchange import from_nerfstudio, to_nerfstudio
-from experiments.exchange.from_nerfstudio import View
-from refref_jax.data import files, local_layout, nerfstudio
+from refref_jax.data import files, local_layout
 from refref_jax.data.errors import SceneError
+from refref_jax.data.nerfstudio import capture as nerfstudio
+from refref_jax.data.nerfstudio import exporting as to_nerfstudio
+from refref_jax.data.nerfstudio import importing as from_nerfstudio
+from refref_jax.data.nerfstudio.importing import View
 from tests.data.small_captures import FOCAL, HEIGHT, WIDTH, edit, pixels_of, pose_of, write_capture
 from tests.data.small_scenes import write_scene
 from tests.experiments.command import run_command

@@ -11,7 +11,7 @@ import pytest
 from absl import flags
 from absl.testing import flagsaver
 
-from experiments import device_options
+from experiments.cli import device_options
 from tests import code_generator
 from tests.experiments.command import ROOT, run_command
 

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from experiments import folder_comparison
-from experiments.measures import Perceptual
+from experiments.runs import image_folders as folder_comparison
 from refref_jax.data import files
+from refref_jax.training.evaluation import Perceptual
 from tests import made_lpips
 from tests.data.small_scenes import truncate, write_grey
 from tests.experiments.command import run_command

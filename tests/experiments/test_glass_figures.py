@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from experiments import cross_sections, glass_drawings
-from experiments.cross_sections import Panel
-from experiments.glass_drawings import Shown
-from experiments.viewing.pixel_paths import PixelPaths
+from experiments.figures import cross_sections, glass_drawings
+from experiments.figures.cross_sections import Panel
+from experiments.figures.glass_drawings import Shown
 from refref_jax.data.errors import SceneError
 from refref_jax.data.meshes import MeshPart
 from refref_jax.optics.light_paths import PathStatus
+from refref_jax.render.pixel_paths import PixelPaths
 from tests.experiments.command import ROOT, run_command
 
 _SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"

@@ -8,7 +8,8 @@ import types
 
 import pytest
 
-from experiments import commands, first_interrupt, trainer
+from experiments.cli import commands, first_interrupt
+from experiments.runs import trainer
 from tests.experiments.command import ROOT
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)

@@ -9,9 +9,11 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from experiments import measures, named_budgets, view_numbers
+from experiments.cli import view_numbers
+from experiments.runs import named_budgets
 from refref_jax.data import files
 from refref_jax.render import BUDGETS
+from refref_jax.training import evaluation as measures
 from tests.experiments.command import ROOT, run_command
 
 _SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"

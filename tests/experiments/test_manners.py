@@ -7,14 +7,14 @@ import sys
 
 import pytest
 
-from experiments import choosable, command_help, command_line, commands, presets, run_option
-from experiments.late_imports import late
+from experiments.cli import choosable, command_help, command_line, commands, run_option
+from experiments.cli.late_imports import late
 from experiments.r3f import records
 from experiments.r3f.geometry_stage import GEOMETRIES
 from refref_jax.data import local_layout
 from refref_jax.fields import registry
 from refref_jax.optics.interface_rules import RULES
-from refref_jax.training import run_folder
+from refref_jax.training import presets, run_folder
 from tests.experiments.command import ROOT
 
 _SCRIPTS = [

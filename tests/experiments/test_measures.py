@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from experiments import measures, perceptual_option
-from experiments.measures import Perceptual
+from experiments.cli import perceptual_option
 from refref_jax import metrics
 from refref_jax.data import local_layout
 from refref_jax.data.local_layout import Frames
 from refref_jax.render import Rendering
+from refref_jax.training import evaluation as measures
+from refref_jax.training.evaluation import Perceptual
 from tests import made_lpips
 from tests.small_model import CAMERAS
 

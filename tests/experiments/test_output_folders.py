@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from experiments import command_line, output_folders
+from experiments.cli import command_line, output_folders
 
 _WRITES = ("rgb", "metrics.json")
 

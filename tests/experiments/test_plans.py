@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from experiments import choices, model_options
-from experiments.choices import Wishes, choose
-from experiments.model_options import ModelOptions, override, parse_samples
+from experiments.runs import choices, model_options
+from experiments.runs.choices import Wishes, choose
+from experiments.runs.model_options import ModelOptions, override, parse_samples
 from refref_jax.data.needs import Needs
 from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE
 from tests.experiments.command import ROOT

@@ -5,8 +5,8 @@ import json
 
 import pytest
 
-from experiments.presets import PRESETS, Bounds, bounds, loss
-from refref_jax.data.cameras import orbit
+from refref_jax.geometry.cameras import orbit
+from refref_jax.training.presets import PRESETS, Bounds, bounds, loss
 
 _BOUNDS = Bounds(near=0.05, far=16.0, radius=7.3, space="bounded")
 

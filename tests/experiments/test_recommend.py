@@ -2,9 +2,10 @@
 
 import pytest
 
-from experiments import recommendations, trade_table
-from experiments.recommendations import Machine
-from experiments.trained_runs import Training
+from experiments.runs.measured_runs import Training
+from experiments.sweeps import recommendations
+from experiments.sweeps import table as trade_table
+from experiments.sweeps.recommendations import Machine
 from tests.experiments.command import ROOT, run_command
 from tests.experiments.made_rows import made_row
 

@@ -1,7 +1,7 @@
 import pytest
 from absl import flags
 
-from experiments import space_options
+from experiments.cli import space_options
 
 
 @pytest.mark.parametrize("radius", ["inf", "nan", "0", "-3"])

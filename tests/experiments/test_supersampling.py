@@ -4,10 +4,10 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import options, supersampling
-from refref_jax.data import cameras
+from experiments.cli import options
+from refref_jax.geometry import cameras
 from refref_jax.optics.budgets import STRAIGHT
-from refref_jax.render import Model, Rendering, init_params, render_image
+from refref_jax.render import Model, Rendering, init_params, render_image, supersampling
 from tests import scenes
 from tests.small_model import CAMERAS, MODEL
 

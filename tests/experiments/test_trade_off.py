@@ -7,9 +7,14 @@ import subprocess
 import imageio.v3 as iio
 import pytest
 
-from experiments import child_process, sweeps, trade_points, trade_report, trade_table, trained_runs
-from experiments.child_process import RunFailedError
-from experiments.trade_points import BASE
+from experiments.cli import subprocesses as child_process
+from experiments.cli.subprocesses import RunFailedError
+from experiments.runs import measured_runs as trained_runs
+from experiments.sweeps import points as trade_points
+from experiments.sweeps import report as trade_report
+from experiments.sweeps import sweep as sweeps
+from experiments.sweeps import table as trade_table
+from experiments.sweeps.points import BASE
 from tests.experiments.command import ROOT, run_command
 from tests.experiments.made_rows import made_row
 

@@ -4,7 +4,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from experiments import videos
+from experiments.figures import video as videos
 
 
 def _frames(height=23, width=25, count=5):

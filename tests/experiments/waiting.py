@@ -9,7 +9,8 @@ import sys
 import threading
 from pathlib import Path
 
-from experiments import child_process, commands
+from experiments.cli import commands
+from experiments.cli import subprocesses as child_process
 
 
 def _command_line(name, options):

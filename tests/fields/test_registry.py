@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import model_options
-from experiments.model_options import ModelOptions
-from experiments.presets import PRESETS, Bounds, loss
+from experiments.runs import model_options
+from experiments.runs.model_options import ModelOptions
 from refref_jax import configuration
 from refref_jax.fields import hash_grid, nerfacto, registry
 from refref_jax.fields.kinds import DensityConfig, FieldKind, FieldSize, Radiance, RadianceConfig
@@ -21,6 +20,7 @@ from refref_jax.render import saved
 from refref_jax.render.images import render_rays
 from refref_jax.render.model import Model, init_params
 from refref_jax.render.saved import SavedModel
+from refref_jax.training.presets import PRESETS, Bounds, loss
 from tests import scenes, small_model
 
 _BOUNDS = Bounds(near=0.05, far=16.0, radius=7.3, space="bounded")

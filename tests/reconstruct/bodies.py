@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-from refref_jax.data.cameras import Cameras, focal_length
+from refref_jax.geometry.cameras import Cameras, focal_length
 from refref_jax.reconstruct.triangles import make_mesh
 
 ANGLE = 1.1656107902526855

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.ndimage import binary_dilation, binary_erosion
 
-from refref_jax.data.cameras import project
+from refref_jax.geometry.cameras import project
 from refref_jax.geometry.corner_normals import face_normals
 from refref_jax.reconstruct import convex, outlines
 from refref_jax.reconstruct.comparison import silhouette_overlap

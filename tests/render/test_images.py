@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.data.cameras import image_rays
+from refref_jax.geometry.cameras import image_rays
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE
 from refref_jax.optics.details import everything

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.data.cameras import image_rays
 from refref_jax.data.containment import parts_around
+from refref_jax.geometry.cameras import image_rays
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE
 from refref_jax.render import known, radiance_of, render_known

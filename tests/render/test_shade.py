@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.data.cameras import image_rays, orbit
+from refref_jax.geometry.cameras import image_rays, orbit
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.budgets import TREE
 from refref_jax.optics.light_paths import PathStatus

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments import commands
 from experiments.benchmarking import record_json, records, settings, summary, table_data
 from experiments.benchmarking.jobs import Skipped
 from experiments.benchmarking.records import Record
 from experiments.benchmarking.settings import Settings
 from experiments.benchmarking.tables import Table
+from experiments.cli import commands
 from refref_jax.data import transforms
 
 

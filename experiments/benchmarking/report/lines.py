@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from experiments.benchmarking.methods import FULL, METHODS
-from experiments.plotting import COLOURS
+from experiments.figures.style import COLOURS
 
 _DASHES = (None, "7 3", "2 3")
 

@@ -6,12 +6,12 @@ load nothing from anywhere. Its pages are told apart by the address' end, as #sc
 
 from pathlib import Path
 
-from experiments import commands
 from experiments.benchmarking.report import cases, contents, overview, scene_pages
 from experiments.benchmarking.report.contents import Contents, Scene
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.scene_pages import Page
-from experiments.plotting import COLOURS
+from experiments.cli import commands
+from experiments.figures.style import COLOURS
 from refref_jax import drafts
 
 FILE = "report.html"

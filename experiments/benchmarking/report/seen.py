@@ -10,9 +10,10 @@ from jaxtyping import Bool, Float, UInt8
 from experiments.benchmarking.jobs import SPLIT
 from experiments.benchmarking.records import Truth
 from experiments.benchmarking.report.contents import Scene
-from refref_jax.data import cameras, files, transforms
-from refref_jax.data.cameras import Cameras
+from refref_jax.data import files, transforms
 from refref_jax.data.errors import SceneError
+from refref_jax.geometry import cameras
+from refref_jax.geometry.cameras import Cameras
 
 T = TypeVar("T")
 

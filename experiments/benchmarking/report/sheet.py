@@ -6,7 +6,7 @@ from pathlib import Path
 from experiments.benchmarking.report import cases, contents, seen
 from experiments.benchmarking.report.contents import Scene
 from experiments.benchmarking.report.seen import View
-from experiments.plotting import pyplot
+from experiments.figures.style import pyplot
 from refref_jax import drafts
 
 FILE = "pictures.jpg"

@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments import child_process
 from experiments.benchmarking import running
+from experiments.cli import subprocesses as child_process
 from tests.experiments.benchmarking.made_scenes import write_scene
 from tests.experiments.benchmarking.serving import Server
 

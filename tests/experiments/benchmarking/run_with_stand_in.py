@@ -1,6 +1,8 @@
 """Runs `experiments.benchmark` with the stand-in for its commands, in a process to be killed."""
 
-from experiments import benchmark, child_process, commands
+from experiments import benchmark
+from experiments.cli import commands
+from experiments.cli import subprocesses as child_process
 from tests.experiments.benchmarking.conftest import stand_in_line
 
 if __name__ == "__main__":

@@ -12,7 +12,9 @@ import sys
 
 from absl import flags
 
-from experiments import benchmark, child_process, command_line
+from experiments import benchmark
+from experiments.cli import command_line
+from experiments.cli import subprocesses as child_process
 from tests.experiments.benchmarking.conftest import stand_in_line
 
 

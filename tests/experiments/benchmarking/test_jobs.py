@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from experiments import scene_option
 from experiments.benchmarking import (
     jobs,
     methods,
@@ -17,6 +16,7 @@ from experiments.benchmarking import (
     settings,
 )
 from experiments.benchmarking.methods import METHODS, RECONSTRUCTION
+from experiments.cli import scene_option
 from refref_jax.training import run_lock
 from tests.experiments.benchmarking.made_records import SETTINGS
 from tests.experiments.benchmarking.made_scenes import write_scene

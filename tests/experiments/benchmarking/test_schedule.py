@@ -4,12 +4,12 @@ import threading
 
 import pytest
 
-from experiments import child_process
 from experiments.benchmarking import schedule
 from experiments.benchmarking.engines import LocalEngine
 from experiments.benchmarking.jobs import Job
 from experiments.benchmarking.methods import RECONSTRUCTION
-from experiments.child_process import RunFailedError
+from experiments.cli import subprocesses as child_process
+from experiments.cli.subprocesses import RunFailedError
 from tests.experiments.benchmarking.made_records import SETTINGS
 
 

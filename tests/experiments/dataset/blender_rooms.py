@@ -8,8 +8,8 @@ from experiments.dataset import cameras, frame_files, scene_record, scene_setup,
 from experiments.dataset.frame_files import Rendering
 from experiments.dataset.render_settings import PerSplit, RenderSettings
 from refref_jax.data import files
-from refref_jax.data.cameras import Cameras, focal_length
 from refref_jax.data.scene_names import SceneName
+from refref_jax.geometry.cameras import Cameras, focal_length
 from tests.experiments.dataset import small_dataset
 
 SIZE = 48

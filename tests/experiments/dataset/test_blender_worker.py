@@ -14,7 +14,7 @@ import trimesh
 from experiments.dataset import cameras, frame_files, workers
 from experiments.dataset.parts import Part
 from refref_jax.data.background import read_background
-from refref_jax.data.cameras import box_filter, image_rays, supersample
+from refref_jax.geometry.cameras import box_filter, image_rays, supersample
 from refref_jax.render.backgrounds import radiance_of
 from tests.experiments.command import ROOT
 from tests.experiments.dataset import small_dataset

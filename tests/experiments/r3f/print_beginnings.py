@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 from absl import flags
 
-from experiments import train, trainer
+from experiments import train
 from experiments.r3f import provenance
+from experiments.runs import trainer
 from refref_jax.render import saved
 from refref_jax.training import run_folder
 

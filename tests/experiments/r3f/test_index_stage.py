@@ -5,8 +5,8 @@ import functools
 import numpy as np
 import pytest
 
-from experiments import trainer
 from experiments.r3f import body, index_stage
+from experiments.runs import trainer
 from refref_jax.data import meshes
 from refref_jax.reconstruct.index_search import IndexSearch
 from refref_jax.training import run_folder

@@ -8,13 +8,13 @@ import jaxtyping
 import numpy as np
 import pytest
 
-from experiments import figures
-from experiments.viewing import layers
-from experiments.viewing import subject as subjects
-from experiments.viewing.subject import Subject
+from experiments.figures import comparison as figures
+from experiments.viewer import layers
+from experiments.viewer import subject as subjects
+from experiments.viewer.subject import Subject
 from refref_jax.data import files
-from refref_jax.data.cameras import image_rays
 from refref_jax.data.local_layout import read_frames
+from refref_jax.geometry.cameras import image_rays
 from refref_jax.optics.budgets import PAPER, STRAIGHT
 from refref_jax.optics.interface_rules import RULES
 from refref_jax.render import Model, images, init_params, render_image

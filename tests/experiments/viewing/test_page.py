@@ -7,14 +7,14 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.viewing import subject as subjects
+from experiments.viewer import subject as subjects
 from refref_jax.data import local_layout
 from refref_jax.optics.budgets import TREE
 from refref_jax.render import Model, images, init_params
 from tests import scenes
 from tests.small_model import MODEL
 
-serving = pytest.importorskip("experiments.viewing.server", exc_type=ModuleNotFoundError)
+serving = pytest.importorskip("experiments.viewer.server", exc_type=ModuleNotFoundError)
 browser = pytest.importorskip("tests.experiments.viewing.browser", exc_type=ModuleNotFoundError)
 
 pytestmark = [

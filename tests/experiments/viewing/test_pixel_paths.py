@@ -6,12 +6,12 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.viewing import pixel_paths, scenery
-from experiments.viewing.pixel_paths import PixelPaths
+from experiments.viewer import scenery
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.budgets import STRAIGHT, TREE
 from refref_jax.optics.light_paths import PathStatus
-from refref_jax.render import Model, init_params
+from refref_jax.render import Model, init_params, pixel_paths
+from refref_jax.render.pixel_paths import PixelPaths
 from tests import scenes
 from tests.small_model import MODEL
 

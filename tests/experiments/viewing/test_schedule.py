@@ -2,8 +2,8 @@
 
 import random
 
-from experiments.viewing import schedule
-from experiments.viewing.schedule import STILL, Job, State
+from experiments.viewer import schedule
+from experiments.viewer.schedule import STILL, Job, State
 
 
 def test_nothing_is_drawn_before_a_change():

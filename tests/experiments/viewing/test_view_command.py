@@ -8,9 +8,9 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.viewing import layers
-from experiments.viewing import subject as subjects
-from experiments.viewing.subject import Subject
+from experiments.viewer import layers
+from experiments.viewer import subject as subjects
+from experiments.viewer.subject import Subject
 from refref_jax.data import local_layout
 from refref_jax.optics.budgets import STRAIGHT, TREE
 from refref_jax.render import Model, init_params

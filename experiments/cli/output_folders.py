@@ -1,0 +1,192 @@
+"""Where commands write: whole or not at all, and never over what is not their own.
+
+A command writes its files into a draft inside its folder, which no other process may write to
+meanwhile, and moves them to their places when it has ended well. With them goes `command.json`: the
+command, all options of its last call, and the files that are its own. Only with --overwrite, and
+only files that are listed there, are replaced, and of these only those by whose names the call
+itself writes. Whatever else lies in the folder stays.
+"""
+
+import contextlib
+import json
+import shutil
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments.cli import command_line
+from refref_jax import drafts
+from refref_jax.training import run_lock
+
+NOTE = "command.json"
+
+# Inside the folder, which may be a mount: files are moved within one file system.
+_DRAFT = ".unfinished"
+
+
+@contextlib.contextmanager
+def fresh(out: Path, *, module: str, writes: Sequence[str], overwrite: bool) -> Iterator[Path]:
+    """Yields an empty folder, whose files come to `out` when the context ends well.
+
+    Args:
+      out: folder of the command, which may hold other things too.
+      module: `__name__` of the command, whose options are noted.
+      writes: names in the folder that this call of the command gives to what it writes.
+      overwrite: whether results of an earlier call may be replaced.
+
+    Raises:
+      ValueError: if there is anything in the place that may not be replaced, or another process
+        writes there.
+    """
+    replaceable(out, module=module, writes=writes, overwrite=overwrite)
+    with _held(out):
+        # Looked at again: another process may have written meanwhile.
+        earlier = replaceable(out, module=module, writes=writes, overwrite=overwrite)
+        draft = out / _DRAFT
+        shutil.rmtree(draft, ignore_errors=True)
+        draft.mkdir()
+        try:
+            yield draft
+            _take_place(draft, out, module, earlier)
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def fresh_file(path: Path, *, overwrite: bool) -> Iterator[Path]:
+    """Yields the path of a file that takes the place of `path` when the context ends well.
+
+    Raises:
+      ValueError: if there is something already, and it is not to be replaced.
+    """
+    check_file(path, overwrite=overwrite)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with drafts.unfinished_file(path) as draft:
+        yield draft
+
+
+def check_file(path: Path, *, overwrite: bool) -> None:
+    """Refuses to replace a file without being asked to, and a folder at all.
+
+    Raises:
+      ValueError: if there is one.
+    """
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder, and a file is to be written. Give another name.")
+    if path.exists() and not overwrite:
+        raise ValueError(f"{path} exists. Give another --out, or --overwrite to replace it.")
+
+
+def note(out: Path, module: str, files: Iterable[Path] = ()) -> None:
+    """Notes a command, its options, and the files that it has written, in its folder."""
+    command = sys.modules[module]
+    content = {
+        "command": command_line.name_of(command),
+        "options": command_line.resolved(command),
+        "files": [path.as_posix() for path in sorted(files)],
+    }
+    with drafts.unfinished_file(out / NOTE) as path:
+        path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def replaceable(out: Path, *, module: str, writes: Sequence[str], overwrite: bool) -> set[Path]:
+    """Returns the files of earlier calls that may be replaced, by their places in it; see `fresh`.
+
+    Commands ask it before they do anything else, so that none works in vain.
+
+    Raises:
+      ValueError: if there is anything in the place that may not be replaced.
+    """
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out} is a file, and a folder is needed. Give another --out.")
+    noted = _noted(out, module)
+    own = set() if noted is None else {NOTE, *(path.parts[0] for path in noted)}
+    _refuse_strangers(out, [name for name in (*writes, NOTE) if name not in own])
+    there = {path for path in _present(out, noted) if path.parts[0] in writes}
+    if there and not overwrite:
+        shown = ", ".join(path.as_posix() for path in sorted(there)[:2])
+        raise ValueError(
+            f"{out} holds the results of an earlier call ({shown}, ...). Give --overwrite to "
+            "replace them, or another --out."
+        )
+    return there
+
+
+@contextlib.contextmanager
+def _held(out: Path) -> Iterator[None]:
+    """Keeps other processes out of a folder, which is made, and removed if it stays empty."""
+    existed = out.exists()
+    out.mkdir(parents=True, exist_ok=True)
+    with run_lock.hold(out):
+        try:
+            yield
+        finally:
+            if not existed:
+                _remove_empty(out)
+
+
+def _take_place(draft: Path, out: Path, module: str, earlier: set[Path]) -> None:
+    """Moves new files to their places, and removes those of `earlier` that are none of them.
+
+    Whenever it is killed, the note names all files that are the command's.
+    """
+    new = {path.relative_to(draft) for path in draft.rglob("*") if path.is_file()}
+    _refuse_strangers(out, sorted(new - earlier))
+    kept = _present(out, _noted(out, module)) - earlier
+    note(out, module, new | earlier | kept)
+    for path in new:
+        (out / path).parent.mkdir(parents=True, exist_ok=True)
+        (draft / path).replace(out / path)
+    _remove(out, earlier - new)
+    note(out, module, new | kept)
+
+
+def _refuse_strangers(out: Path, names: Iterable[Path | str]) -> None:
+    if strangers := [out / name for name in names if (out / name).exists()]:
+        raise ValueError(
+            f"{strangers[0]} is not of this command, as far as {NOTE} beside it tells. Remove it, "
+            "or give another --out: --overwrite replaces nothing of others."
+        )
+
+
+def _remove(out: Path, files: set[Path]) -> None:
+    """Removes files, and the folders that are empty then."""
+    for path in files:
+        (out / path).unlink(missing_ok=True)
+    folders = {parent for path in files for parent in path.parents} - {Path()}
+    for folder in sorted(folders, reverse=True):  # those inside others first
+        _remove_empty(out / folder)
+
+
+def _remove_empty(folder: Path) -> None:
+    with contextlib.suppress(OSError):
+        folder.rmdir()
+
+
+def _noted(out: Path, module: str) -> set[Path] | None:
+    """Returns the files that a command's note lists; `None` if there is no note of it."""
+    noted = _read(out / NOTE)
+    if noted is None or noted["command"] != command_line.name_of(sys.modules[module]):
+        return None
+    return {Path(name) for name in noted["files"]}
+
+
+def _present(out: Path, files: set[Path] | None) -> set[Path]:
+    return {path for path in files or () if (out / path).is_file()}
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    """Returns what a folder's note says; `None` if there is none, or it is another's."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        valid = isinstance(content["command"], str) and all(
+            isinstance(name, str)
+            and Path(name).parts
+            and not Path(name).is_absolute()
+            and ".." not in Path(name).parts
+            for name in content["files"]
+        )
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return content if valid else None

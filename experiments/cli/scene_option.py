@@ -1,0 +1,88 @@
+"""How commands open the scene that an option names: a folder, or `hf:CONFIG/SCENE`."""
+
+import contextlib
+import glob
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from experiments.cli import commands
+from experiments.cli.late_imports import late
+from experiments.cli.options import SCENE_FORMS
+from refref_jax.data import scene_names
+from refref_jax.data.errors import SceneError
+
+if TYPE_CHECKING:
+    from refref_jax.data import scene_source
+else:
+    scene_source = late("refref_jax.data.scene_source")
+
+
+def check(source: str | Path | None) -> None:
+    """Refuses what is no scene at first sight, before anything that reads one is imported.
+
+    Args:
+      source: what the option names; `None` if it names nothing.
+
+    Raises:
+      SceneError: if there is no such folder, or neither views nor parquet files are in it, or
+        `hf:...` is no name of the data set.
+    """
+    if source is None:
+        return
+    if str(source).startswith("hf:"):
+        scene_names.parse_source(str(source))
+        return
+    folder = Path(source)
+    if not any(any(folder.glob(each)) for each in ("transforms_*.json", "*/*.parquet")):
+        raise SceneError(
+            f"{folder / 'transforms_train.json'} does not exist. Give a scene: {SCENE_FORMS}."
+        )
+
+
+def check_all(sources: Sequence[str]) -> None:
+    """Refuses as `check` does, and passes over what is empty or has wildcards."""
+    for source in sources:
+        if source and not has_wildcards(source):
+            check(source)
+
+
+def has_wildcards(source: str) -> bool:
+    """Returns whether a name stands for many; one that exists as it is, is itself."""
+    if source.startswith("hf:"):
+        return False
+    return glob.has_magic(source) and not Path(source).exists()
+
+
+def check_place(place: str) -> None:
+    """Refuses a place of one scene or of many that is no folder, nor `hf:...`.
+
+    Raises:
+      SceneError: if it is none.
+    """
+    if not place.startswith("hf:") and not Path(place).is_dir():
+        raise SceneError(f"{place} is no folder. Give one that exists.")
+
+
+def opened(source: str | Path) -> Path:
+    """Returns the folder of a scene; one in parquet files is unpacked, with a bar of progress.
+
+    Raises:
+      SceneError: if there is none, or it is broken, see `scene_source.open_scene`.
+    """
+    check(source)
+    bar: commands.ProgressBar | None = None
+
+    def show(done: int, total: int) -> None:
+        nonlocal bar
+        if bar is None:
+            bar = bars.enter_context(commands.ProgressBar(f"unpack {Path(source).name}", total))
+        bar.show(done, "images")
+
+    with contextlib.ExitStack() as bars, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", scene_source.SceneWarning)
+        scene = scene_source.open_scene(source, progress=show)
+    for warning in caught:
+        print(f"warning: {warning.message}")
+    return scene

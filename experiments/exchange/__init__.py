@@ -1,1 +1,0 @@
-"""Between our scenes and those of other programs."""

@@ -1,0 +1,1 @@
+"""Training runs: how they are configured, trained, measured and compared."""

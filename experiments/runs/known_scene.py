@@ -1,0 +1,199 @@
+"""Scenes with a known background: read, rendered and measured, with nothing learned."""
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from experiments.cli import view_numbers
+from experiments.runs import mesh_report
+from refref_jax import metrics
+from refref_jax.data import background, containment, local_layout, meshes, scene_names
+from refref_jax.data.containment import Containment
+from refref_jax.data.geometry import build_geometry
+from refref_jax.data.meshes import MeshPart
+from refref_jax.geometry import cameras
+from refref_jax.geometry.rays import Rays
+from refref_jax.optics.budgets import Budget
+from refref_jax.optics.media import interior_slots
+from refref_jax.optics.wavefront import Geometry
+from refref_jax.render import colour
+from refref_jax.render.backgrounds import Radiance, radiance_of
+from refref_jax.render.known import TILE, KnownRendering, render_known
+
+
+class KnownScene(NamedTuple):
+    """A scene and some views of it.
+
+    Attributes:
+      name: of its folder.
+      geometry: what bends light.
+      radiance: what is behind.
+      frames: the chosen views.
+      indices: number of each in its split.
+      images: true images of the views, 8-bit sRGB.
+      masks: object masks, or `None` where the split has none.
+      inside: the parts that each view's camera is in; `None` where the rule keeps no list of them.
+    """
+
+    name: str
+    geometry: Geometry
+    radiance: Radiance
+    frames: local_layout.Frames
+    indices: tuple[int, ...]
+    images: UInt8[np.ndarray, "views h w 3"]
+    masks: Bool[np.ndarray, "views h w"] | None
+    inside: Int[np.ndarray, "views slots"] | None
+
+
+class View(NamedTuple):
+    """One rendered view.
+
+    Attributes:
+      rgb: sRGB in `[0, 1]`.
+      casts: closest-hit queries a camera ray.
+      paths: light paths a camera ray.
+      lost: share of the light that was lost for want of room, mean over rays and channels.
+      seconds: that rendering took.
+    """
+
+    rgb: Float[np.ndarray, "h w 3"]
+    casts: float
+    paths: float
+    lost: float
+    seconds: float
+
+
+def read_scene(
+    scene: Path, *, split: str, views: str, rule: str, indices: Mapping[str, float]
+) -> KnownScene:
+    """Reads all that rendering and measuring some views takes.
+
+    Args:
+      scene: the scene folder.
+      split: `train`, `val` or `test`.
+      views: numbers of views in the split, as `0,10,20`, or `all`.
+      rule: what lies outside each mesh, see `optics.interface_rules`.
+      indices: as for `meshes.read_meshes`.
+
+    Raises:
+      ValueError: if anything is missing or broken, or there is no such view.
+    """
+    frames = local_layout.read_frames(scene, split)
+    chosen = view_numbers.choose(views, len(frames.names))
+    parts = meshes.read_meshes(scene, indices=indices)
+    tree = containment.find_containment(parts)
+    mesh_report.report_meshes(parts, tree, rule=rule)
+    return build_scene(scene, parts, tree, frames=frames, chosen=chosen, rule=rule)
+
+
+def build_scene(
+    scene: Path,
+    parts: Sequence[MeshPart],
+    tree: Containment,
+    *,
+    frames: local_layout.Frames,
+    chosen: Sequence[int],
+    rule: str,
+) -> KnownScene:
+    """Makes a scene of meshes that were examined before.
+
+    Args:
+      scene: the scene folder, for its background.
+      parts: its meshes.
+      tree: how they lie in one another.
+      frames: a split of it.
+      chosen: views of the split.
+      rule: what lies outside each mesh.
+
+    Raises:
+      ValueError: if the background is not known, or a picture is missing or broken.
+    """
+    frames = _choose(frames, chosen)
+    geometry = build_geometry(parts, tree.parents, rule=rule)
+    return KnownScene(
+        name=scene_names.of_folder(scene),
+        geometry=jax.device_put(geometry),
+        radiance=jax.device_put(radiance_of(background.read_background(scene))),
+        frames=frames,
+        indices=tuple(chosen),
+        images=local_layout.read_images(frames),
+        masks=local_layout.read_masks(frames) if frames.masks else None,
+        inside=(
+            containment.parts_around(parts, frames.cameras.poses[:, :, 3])
+            if interior_slots(geometry.interfaces)
+            else None
+        ),
+    )
+
+
+def warm_up(scene: KnownScene, budget: Budget) -> None:
+    """Renders one tile, so that what is timed afterwards has been compiled."""
+    rays = cameras.pixel_rays(scene.frames.cameras, *np.zeros((3, TILE), np.int64))
+    _render(scene, 0, rays, budget)
+
+
+def render_view(scene: KnownScene, view: int, *, budget: Budget, side: int) -> View:
+    """Renders a view with `side x side` rays in every pixel, averaged as linear light.
+
+    Args:
+      scene: the scene.
+      view: which of the chosen views.
+      budget: which light to follow.
+      side: rays along each edge of a pixel.
+    """
+    rays = cameras.image_rays(cameras.supersample(scene.frames.cameras, side), view)
+    start = time.monotonic()
+    seen = _render(scene, view, rays, budget)
+    seconds = time.monotonic() - start
+    linear = jax.device_put(cameras.box_filter(seen.linear, side))
+    return View(
+        rgb=np.clip(np.asarray(colour.linear_to_srgb(linear)), 0.0, 1.0),
+        casts=seen.casts / seen.paths.size,
+        paths=float(np.mean(seen.paths)),
+        lost=float(np.mean(seen.lost)),
+        seconds=seconds,
+    )
+
+
+def measure(
+    scene: KnownScene, view: int, rgb: Float[np.ndarray, "h w 3"]
+) -> dict[str, float | None]:
+    """Returns the PSNR over the image, inside the mask and outside, in dB.
+
+    Of sRGB in `[0, 1]`, not rounded, against the 8-bit image; `None` over no pixel.
+    """
+    target = (scene.images[view] / 255.0).astype(np.float32)
+    pair = jax.device_put((rgb, target))
+    result: dict[str, float | None] = {"psnr": float(metrics.psnr(*pair))}
+    masks = {"psnr_masked": None, "psnr_outside": None}
+    if scene.masks is not None:
+        masks = {"psnr_masked": scene.masks[view], "psnr_outside": ~scene.masks[view]}
+    for key, mask in masks.items():
+        known = mask is not None and mask.any()
+        result[key] = float(metrics.psnr_masked(*pair, jax.device_put(mask))) if known else None
+    return result
+
+
+def _render(scene: KnownScene, view: int, rays: Rays, budget: Budget) -> KnownRendering:
+    inside = scene.inside
+    if inside is not None:
+        inside = np.broadcast_to(inside[view], (*rays.radii.shape, inside.shape[1]))
+    return render_known(scene.geometry, scene.radiance, rays, budget=budget, inside=inside)
+
+
+def _choose(frames: local_layout.Frames, chosen: Sequence[int]) -> local_layout.Frames:
+    def choose(items: tuple[Path, ...]) -> tuple[Path, ...]:
+        return tuple(items[i] for i in chosen)
+
+    return local_layout.Frames(
+        names=tuple(frames.names[i] for i in chosen),
+        images=choose(frames.images),
+        masks=frames.masks and choose(frames.masks),
+        depths=frames.depths and choose(frames.depths),
+        cameras=frames.cameras._replace(poses=frames.cameras.poses[list(chosen)]),
+    )

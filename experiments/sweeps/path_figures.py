@@ -1,0 +1,162 @@
+"""Figures of the speed-accuracy curve of light paths, drawn with matplotlib."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from matplotlib import patheffects
+from matplotlib.lines import Line2D
+
+from experiments.figures.style import COLOURS, LABEL_HEIGHT, label_plainly, pyplot, style
+
+_MARKERS = {"straight": "s", "paper": "D"}
+_GREY = "#777777"
+
+_LABEL_WIDTH = 34.0
+
+_SWEEPS = {
+    "cut": "cut: smallest throughput followed",
+    "bends": "bends: most of a path",
+}
+_COSTS = {
+    "casts_per_pixel": ("ray casts per pixel", 1.0),
+    "seconds_per_pixel": ("time per pixel, µs", 1e6),
+}
+
+
+class Trial(NamedTuple):
+    """What one budget cost and gave on one scene: means over its views, one ray a pixel.
+
+    Attributes:
+      scene: its name.
+      sweep: which option is varied: `cut`, `bends`, or `budget` for a point alone.
+      name: value of that option, or name of the budget.
+      cut: smallest throughput followed.
+      bends: most bends.
+      psnr: over the image, dB.
+      psnr_masked: inside the mask.
+      psnr_outside: outside the mask.
+      casts_per_pixel: closest-hit queries.
+      paths_per_pixel: light paths.
+      seconds_per_pixel: of rendering.
+      lost_energy: share of light that found no room.
+    """
+
+    scene: str
+    sweep: str
+    name: str
+    cut: float
+    bends: int
+    psnr: float | None
+    psnr_masked: float
+    psnr_outside: float | None
+    casts_per_pixel: float
+    paths_per_pixel: float
+    seconds_per_pixel: float
+    lost_energy: float
+
+
+def write(folder: Path, trials: Sequence[Trial]) -> list[Path]:
+    """Draws each sweep against casts and against time, one line a scene.
+
+    Args:
+      folder: where to write.
+      trials: of all scenes.
+
+    Returns:
+      The files, none of a sweep that was not made.
+    """
+    made = {trial.sweep for trial in trials}
+    return [_write_sweep(folder, trials, sweep) for sweep in _SWEEPS if sweep in made]
+
+
+def _write_sweep(folder: Path, trials: Sequence[Trial], sweep: str) -> Path:
+    scenes = list(dict.fromkeys(trial.scene for trial in trials))
+    colours = {scene: COLOURS[i % len(COLOURS)] for i, scene in enumerate(scenes)}
+    figure, axes = pyplot.subplots(1, 2, figsize=(12.0, 5.4), sharey=True, layout="constrained")
+    for axis, (cost, (label, scale)) in zip(axes, _COSTS.items(), strict=True):
+        for scene in scenes:
+            own = [trial for trial in trials if trial.scene == scene]
+            _draw_scene(axis, own, sweep, cost, scale, colours[scene])
+        axis.set_xlabel(f"{label} (one camera ray)")
+        axis.set_xscale("log" if cost == "seconds_per_pixel" else "linear")
+        if cost == "seconds_per_pixel":
+            label_plainly(axis.xaxis)
+        style(axis)
+    axes[0].set_ylabel("PSNR inside the mask, dB")
+    fixed = _fixed(trials, sweep)
+    figure.suptitle(f"{_SWEEPS[sweep]}, as labelled{fixed}", fontsize=12)
+    figure.legend(
+        handles=_legend(colours), loc="outside lower center", ncols=len(scenes) + 2, frameon=False
+    )
+    path = folder / f"path_trade_off_{sweep}.png"
+    figure.canvas.draw()  # places the axes, so that labels know where they are
+    for axis, (cost, (_, scale)) in zip(axes, _COSTS.items(), strict=True):
+        swept = [trial for trial in trials if trial.sweep == sweep]
+        _label_points(axis, swept, cost, scale, colours)
+    figure.savefig(path, dpi=130)
+    pyplot.close(figure)
+    return path
+
+
+def _draw_scene(
+    axis: pyplot.Axes, trials: Sequence[Trial], sweep: str, cost: str, scale: float, colour: str
+) -> None:
+    line = [trial for trial in trials if trial.sweep == sweep]
+    x = [scale * getattr(trial, cost) for trial in line]
+    y = [trial.psnr_masked for trial in line]
+    axis.plot(x, y, "-o", color=colour, markersize=4.5, linewidth=1.8, zorder=3)
+    for trial in trials:
+        if trial.sweep == "budget":
+            axis.plot(
+                scale * getattr(trial, cost),
+                trial.psnr_masked,
+                _MARKERS[trial.name],
+                color=colour,
+                markerfacecolor="white",
+                markeredgewidth=1.8,
+                markersize=7,
+                zorder=4,
+            )
+
+
+def _label_points(
+    axis: pyplot.Axes, trials: Sequence[Trial], cost: str, scale: float, colours: dict[str, str]
+) -> None:
+    """Labels points with the option's value, but none where another label is."""
+    taken: list[tuple[float, float]] = []
+    # The ends of the lines first: what lies between them can be guessed.
+    lines = [[trial for trial in trials if trial.scene == scene] for scene in colours]
+    ends = [trial for line in lines for trial in (line[0], line[-1])]
+    for trial in ends + [trial for line in lines for trial in line[1:-1]]:
+        point = (scale * getattr(trial, cost), trial.psnr_masked)
+        x, y = axis.transData.transform(point)
+        if any(abs(x - a) < _LABEL_WIDTH and abs(y - b) < LABEL_HEIGHT for a, b in taken):
+            continue
+        taken.append((x, y))
+        axis.annotate(
+            trial.name,
+            point,
+            xytext=(6, -9),
+            textcoords="offset points",
+            fontsize=8,
+            color=colours[trial.scene],
+            path_effects=[patheffects.withStroke(linewidth=1.5, foreground="white")],
+            zorder=5,
+        )
+
+
+def _fixed(trials: Sequence[Trial], sweep: str) -> str:
+    """Returns what all trials of a sweep have in common."""
+    other = "bends" if sweep == "cut" else "cut"
+    values = {getattr(trial, other) for trial in trials if trial.sweep == sweep}
+    return f"; {other} {values.pop():g}" if len(values) == 1 else ""
+
+
+def _legend(colours: dict[str, str]) -> list[Line2D]:
+    scenes = [Line2D([], [], color=c, marker="o", label=scene) for scene, c in colours.items()]
+    points = [
+        Line2D([], [], color=_GREY, marker=m, markerfacecolor="white", linestyle="", label=name)
+        for name, m in _MARKERS.items()
+    ]
+    return scenes + points

@@ -1,0 +1,237 @@
+"""The points of a sweep, as data: a base, and around it one option changed at a time.
+
+A *knob* is an option of `experiments.train`, or `rays_per_pixel`, one of `experiments.evaluate`. A
+point is named after the knob and its value, as `cut=0.01`; commas become `+`, so that points can be
+listed.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from experiments.cli import command_line
+from experiments.runs import model_options
+from refref_jax.fields import registry
+from refref_jax.optics.budgets import BUDGETS
+from refref_jax.training.presets import PRESETS, Bounds
+
+BASE = "base"
+
+OF_EVALUATION = ("rays_per_pixel",)
+"""Knobs that training knows nothing of."""
+
+_BASE_OPTIONS = {"paths": "tree"}
+
+_OF_BENT_LIGHT = ("cut", "bends", "interior", "reentry", "tints")
+
+_NOT_OF_BASE = ("preset", "seed", "steps", "scene", "out", "resume", "run", "limit")
+
+_ANY_BOUNDS = Bounds(near=0.05, far=20.0, radius=7.3, space="bounded")
+
+
+class Point(NamedTuple):
+    """One training and one evaluation.
+
+    Attributes:
+      name: `base`, or knob and value.
+      knob: the option that is changed; empty for the base.
+      value: of the knob; empty for the base.
+      training: options of `experiments.train`, as `--name=value`, without scene and folder.
+      evaluation: options of `experiments.evaluate`.
+    """
+
+    name: str
+    knob: str
+    value: str
+    training: tuple[str, ...]
+    evaluation: tuple[str, ...]
+
+
+def sweep(
+    *,
+    preset: str,
+    seed: int = 0,
+    steps: Sequence[int] = (),
+    base: Mapping[str, str] | None = None,
+    values: Mapping[str, Sequence[str]] | None = None,
+    knobs: Sequence[str] | None = None,
+) -> list[Point]:
+    """Returns the base and all points around it; a point that equals the base is left out.
+
+    Straight light has no cut, no bends and no inside, so that none of them is given beside it.
+
+    Args:
+      preset: of the base.
+      seed: of all trainings.
+      steps: the base's first, then those of further trainings; by default the preset's own, and a
+        quarter, half and twice of them. One number alone leaves the steps as they are.
+      base: options of the base, over the preset's.
+      values: of a knob, in place of those of `default_values`; new knobs are added.
+      knobs: only these; all if `None`.
+
+    Raises:
+      ValueError: if a preset or knob does not exist, or the base has options of its own.
+    """
+    if preset not in PRESETS:
+        raise ValueError(f"There is no preset {preset}. Choose from {', '.join(PRESETS)}.")
+    if misplaced := [name for name in _NOT_OF_BASE if name in (base or {})]:
+        raise ValueError(
+            f"--base={misplaced[0]}=... would be at odds with the points. Use --{misplaced[0]}."
+        )
+    if (paths := (base or {}).get("paths", "tree")) not in BUDGETS:
+        raise ValueError(f"There are no --base=paths={paths}. Choose from {', '.join(BUDGETS)}.")
+    usual = PRESETS[preset].schedule.steps
+    first, *others = steps or (usual, usual // 4, usual // 2, 2 * usual)
+    base = _BASE_OPTIONS | dict(base or {})
+    options = {"preset": preset, "seed": str(seed), "steps": str(first)} | base
+    field = base.get("field", registry.USUAL)
+    if field not in registry.KINDS:
+        raise ValueError(
+            f"There is no --base=field={field}. Choose from {', '.join(registry.KINDS)}."
+        )
+    swept = (
+        default_values(preset, field=field)
+        | {"steps": tuple(map(str, others))}
+        | dict(values or {})
+    )
+    if knobs is not None:
+        if unknown := [knob for knob in knobs if knob not in swept]:
+            raise ValueError(
+                f"There is no knob {unknown[0]}.{command_line.did_you_mean(unknown[0], swept)} "
+                f"Choose from {', '.join(swept)}, or give its "
+                f"values with --values={unknown[0]}=A/B."
+            )
+        swept = {knob: swept[knob] for knob in knobs}
+    known = own_values(preset, base["paths"], field=field) | options
+    points = [_point(options, "", "")]
+    points += [
+        _point(options, knob, value)
+        for knob, alternatives in swept.items()
+        for value in alternatives
+        if not _same(value, known.get(knob))
+        and not (base["paths"] == "straight" and knob in _OF_BENT_LIGHT)
+    ]
+    return points
+
+
+def own_values(preset: str, paths: str = "tree", *, field: str = registry.USUAL) -> dict[str, str]:
+    """Returns what the knobs are if no option changes them.
+
+    Args:
+      preset: a preset.
+      paths: name of a budget of paths.
+      field: kind of the fields.
+    """
+    model = PRESETS[preset].model(_ANY_BOUNDS, "field", field=field)
+    grid = model_options.grid_of(model)
+    of_grid = {}
+    if grid is not None:
+        entries = grid.entries.bit_length() - 1
+        of_grid = {"entries": str(entries), "finest": str(grid.finest)}
+    return {
+        "field": field,
+        "samples": ",".join(map(str, model_options.samples_of(model))),
+        "multisamples": str(model.multisamples),
+        **of_grid,
+        "footprint": model.footprint,
+        "precision": model.field.precision,
+        "cut": str(BUDGETS[paths].cut),
+        "bends": str(BUDGETS[paths].bends),
+        "rays_per_pixel": "1",
+    }
+
+
+def default_values(preset: str, *, field: str = registry.USUAL) -> dict[str, tuple[str, ...]]:
+    """Returns what is tried of each knob, around a preset: a little less, and more.
+
+    Of interiors it is the paper's field; the base has what the scene needs.
+    """
+    own = own_values(preset, field=field)
+    rounds = [int(count) for count in own["samples"].split(",")]
+    of_grid = {}
+    if "entries" in own:
+        entries, finest = int(own["entries"]), int(own["finest"])
+        of_grid = {
+            "entries": tuple(str(entries + more) for more in (-3, -2, -1, 1, 2)),
+            "finest": tuple(str(round(share * finest)) for share in (0.25, 0.5, 2, 4)),
+        }
+    return {
+        "paths": ("straight", "paper", "tree"),
+        "cut": ("0.1", "0.05", "0.02", "0.01", "0.005"),
+        "bends": ("2", "6", "10", "24"),
+        "samples": tuple(
+            ",".join(str(round(share * count)) for count in rounds) for share in (0.5, 0.75, 1.5, 2)
+        ),
+        "multisamples": ("1", "6"),
+        **of_grid,
+        "interior": ("field",),
+        "footprint": ("cone", "differential"),
+        "precision": ("float32", "bfloat16"),
+        "rays_per_pixel": ("1", "4", "9"),
+    }
+
+
+def choose(points: Sequence[Point], names: Sequence[str]) -> list[Point]:
+    """Returns the points of these names, and the base, with which they are compared.
+
+    Raises:
+      ValueError: if there is no such point.
+    """
+    known = [point.name for point in points]
+    if unknown := [name for name in names if name not in known]:
+        near = command_line.did_you_mean(unknown[0], known)
+        raise ValueError(f"There is no point {unknown[0]}.{near} Choose from {', '.join(known)}.")
+    return [point for point in points if point.name in {BASE, *names}]
+
+
+def parse_base(words: Sequence[str]) -> dict[str, str]:
+    """Returns the options that words as `cut=0.05` or `samples=48,32` give.
+
+    Raises:
+      ValueError: if one is not of that form.
+    """
+    options = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not (name and equals and value):
+            raise ValueError(f"--base={word} is not NAME=VALUE. Write as in --base=cut=0.05.")
+        options[name] = value
+    return options
+
+
+def parse_values(words: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Returns the values of knobs that words as `cut=0.1/0.05` or `samples=16,10/48,32` give.
+
+    Raises:
+      ValueError: if one is not of that form.
+    """
+    values = {}
+    for word in words:
+        name, equals, given = word.partition("=")
+        values[name] = tuple(value for value in given.split("/") if value)
+        if not (name and equals and values[name]):
+            raise ValueError(f"--values={word} is not NAME=A/B. Write as in --values=cut=0.1/0.05.")
+    return values
+
+
+def _point(base: Mapping[str, str], knob: str, value: str) -> Point:
+    options = {**base, knob: value} if knob else dict(base)
+    if options["paths"] == "straight":
+        options = {name: each for name, each in options.items() if name not in _OF_BENT_LIGHT}
+    evaluation = {name: options.pop(name) for name in OF_EVALUATION if name in options}
+    return Point(
+        name=f"{knob}={value}".replace(",", "+") if knob else BASE,
+        knob=knob,
+        value=value,
+        training=tuple(f"--{name}={each}" for name, each in options.items()),
+        evaluation=tuple(f"--{name}={each}" for name, each in evaluation.items()),
+    )
+
+
+def _same(value: str, other: str | None) -> bool:
+    """Returns whether two values are the same words, or the same numbers."""
+    try:
+        return other is not None and [*map(float, value.split(","))] == [
+            *map(float, other.split(","))
+        ]
+    except ValueError:
+        return value == other

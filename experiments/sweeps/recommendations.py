@@ -1,0 +1,164 @@
+"""What to train with in the time that there is, from a measured table; see `recommend`."""
+
+import dataclasses
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from experiments.cli import commands
+from experiments.cli.subprocesses import RunFailedError
+from experiments.runs import measured_runs as trained_runs
+from experiments.runs.measured_runs import Training
+from experiments.sweeps import combinations
+from experiments.sweeps import table as trade_table
+from experiments.sweeps.table import Row
+from refref_jax.data import scene_names
+
+# Times that differ by no more are the same.
+_SAME_TIME = 1.0 + trade_table.TIME_NOISE / 100.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Machine:
+    """How this machine compares with that of a table.
+
+    Attributes:
+      ratio: time of a step here over that in the table.
+      startup: seconds that a command takes beside its steps: starting, compiling, saving.
+      images: that an evaluation renders.
+    """
+
+    ratio: float
+    startup: float
+    images: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """What to train with. Differences below `trade_table.NOISE` decide nothing.
+
+    Attributes:
+      best: the cheapest of those that fit and that none beats; the base, if it is as good.
+      cheaper: the best that takes less time; `None` if there is none.
+      dearer: the cheapest that gives more, which does not fit; `None` if none was measured.
+      combined: what single turns are expected to give together, if that is more than the best;
+        it was not measured.
+    """
+
+    best: Row
+    cheaper: Row | None
+    dearer: Row | None
+    combined: Row | None
+
+
+def time_machine(scene: Path, base: Row, steps: int) -> Training:
+    """Trains the table's base point for a few steps, in a folder that is deleted again.
+
+    So few steps see no pixel twice, and keep no light paths: where the table's base does, a step is
+    taken to be up to a tenth slower here than it will be.
+    """
+    options = [word for word in base.training.split() if not word.startswith("--steps=")]
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            return trained_runs.train(
+                Path(folder) / "timing",
+                scene=scene,
+                options=[*options, f"--steps={steps}"],
+                log_every=steps // 3,
+            )
+        except RunFailedError as error:
+            # The log goes with the folder.
+            raise ValueError(
+                f"Timing the table's base point ({' '.join(options)}) failed: {error}. Give a "
+                "table whose base this scene can be trained with."
+            ) from error
+
+
+def compare(timing: Training, base: Row, images: int) -> Machine:
+    """Returns how this machine compares with the table's, by the same training on both."""
+    return Machine(
+        ratio=timing.seconds_per_step / base.seconds_per_step,
+        startup=timing.startup_seconds,
+        images=images,
+    )
+
+
+def seconds_of(row: Row, machine: Machine) -> float:
+    """Returns the seconds that training and evaluating a point are expected to take here.
+
+    Training and evaluation both start and compile, for as long as it took in the timing. Images
+    are taken to be of the size of the table's.
+    """
+    working = row.stepping + machine.images * row.seconds_per_image
+    return machine.ratio * working + 2.0 * machine.startup
+
+
+def choose(rows: Sequence[Row], machine: Machine, seconds: float) -> Choice:
+    """Returns the point with the highest PSNR that fits, and its neighbours.
+
+    Raises:
+      ValueError: if none fits.
+    """
+
+    def cost(row: Row) -> float:
+        return seconds_of(row, machine)
+
+    front = trade_table.pareto(rows, cost)
+    fitting = [row for row in front if cost(row) <= seconds]
+    if not fitting:
+        raise ValueError(
+            f"No measured point takes less than {cost(front[0]) / 60:.1f} minutes here "
+            f"({front[0].name}). Give more time, or a table with smaller points."
+        )
+    enough = fitting[-1].quality - trade_table.NOISE
+    best = next(row for row in fitting if row.quality >= enough)
+    base = trade_table.base_of(rows)
+    if base.quality >= enough and cost(base) <= min(seconds, cost(best) * _SAME_TIME):
+        best = base
+    more = best.quality + trade_table.NOISE
+    cheaper = [row for row in front if cost(row) * _SAME_TIME < cost(best)]
+    combined = combinations.combine(rows, cost, seconds)
+    return Choice(
+        best=best,
+        cheaper=cheaper[-1] if cheaper else None,
+        dearer=next((row for row in front if row.quality > more and cost(row) > seconds), None),
+        combined=combined if combined.quality > more else None,
+    )
+
+
+def told(choice: Choice, machine: Machine, scene: Path) -> list[str]:
+    """Returns the recommendation, line by line."""
+    lines = ["", f"Use {choice.best.name}: {_expected(choice.best, machine)}."]
+    lines += [*_commands(choice.best, scene), ""]
+    if choice.combined is not None:
+        lines += [
+            f"Worth trying, by adding up single turns, not measured together: "
+            f"{choice.combined.name}: {_expected(choice.combined, machine)}.",
+            *_commands(choice.combined, scene),
+            "",
+        ]
+    for label, row in (("Cheaper", choice.cheaper), ("Dearer", choice.dearer)):
+        if row is not None:
+            options = " ".join(filter(None, (row.training, row.evaluation)))
+            lines.append(f"{label}: {row.name}: {_expected(row, machine)}.\n  {options}")
+    if choice.cheaper is None:
+        lines.append("Cheaper: nothing was measured that takes less time.")
+    if choice.dearer is None:
+        lines.append(
+            "Dearer: the table has no single point that gives more. Longer trainings and larger "
+            "models were not measured: python -m experiments.trade_off can."
+        )
+    return lines
+
+
+def _commands(row: Row, scene: Path) -> list[str]:
+    run = f"runs/{scene_names.of_folder(scene)}"
+    train = commands.shell("train", f"--scene={scene}", f"--out={run}", *row.training.split())
+    evaluate = commands.shell("evaluate", f"--run={run}", "--split=test", *row.evaluation.split())
+    return [f"  {train}", f"  {evaluate}"]
+
+
+def _expected(row: Row, machine: Machine) -> str:
+    where = "" if row.psnr_masked is None else " inside the mask"
+    minutes = seconds_of(row, machine) / 60.0
+    return f"about {minutes:.1f} minutes, {row.quality:.1f} dB{where} on {row.scene}"

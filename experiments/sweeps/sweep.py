@@ -1,0 +1,133 @@
+"""Sweeps: points are measured one by one, and written as a table, a figure and a report."""
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from experiments.cli import commands
+from experiments.cli.subprocesses import RunFailedError
+from experiments.runs import measured_runs as trained_runs
+from experiments.sweeps import pareto_figure
+from experiments.sweeps import points as trade_points
+from experiments.sweeps import report as trade_report
+from experiments.sweeps import table as trade_table
+from experiments.sweeps.points import BASE, Point
+from experiments.sweeps.table import Row
+from refref_jax.data import scene_names
+
+Measure = Callable[[Point], Row]
+"""Trains and evaluates a point, or raises `RunFailedError`."""
+
+# An evaluation measures more than the table shows.
+_COLUMNS = {field.name for field in dataclasses.fields(Row)}
+
+
+def sweep(
+    points: Sequence[Point], out: Path, measure_: Measure, earlier: Sequence[Row] = ()
+) -> dict[str, str]:
+    """Measures points, and writes table, figure and report after each.
+
+    Args:
+      points: the base first.
+      out: folder to write to.
+      measure_: measures one point.
+      earlier: rows that stay in the table; see `earlier_rows`.
+
+    Returns:
+      Why points failed, by name: they are left out, and the others go on.
+
+    Raises:
+      ValueError: if the base point failed, with which all are compared.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    rows = {row.name: row for row in earlier}
+    failed: dict[str, str] = {}
+    with commands.ProgressBar("trade-off", len(points)) as bar:
+        for done, point in enumerate(points, 1):
+            try:
+                row = measure_(point)
+            except RunFailedError as error:
+                if point.name == BASE:
+                    raise ValueError(
+                        f"The base point failed: {error}. Mend that, or give another --base."
+                    ) from error
+                failed[point.name] = str(error)
+                bar.show(done, f"{point.name} failed")
+                continue
+            rows[row.name] = row
+            _write(out, list(rows.values()))
+            bar.show(done, f"{point.name}: {row.quality:.2f} dB")
+    return failed
+
+
+def earlier_rows(out: Path, base: Point, scene: Path, *, images: int) -> list[Row]:
+    """Returns what sweeps around the same base have measured into a folder.
+
+    Args:
+      out: folder of the sweeps.
+      base: the base point.
+      scene: folder of the scene.
+      images: that an evaluation renders.
+
+    Raises:
+      ValueError: if they were around another base, of another scene, or on other images.
+    """
+    table = out / "trade_off.csv"
+    if not table.exists():
+        return []
+    rows = trade_table.read(table)
+    found, new = trade_table.base_of(rows), (" ".join(base.training), " ".join(base.evaluation))
+    if (found.scene, found.training, found.evaluation) != (scene_names.of_folder(scene), *new):
+        raise ValueError(
+            f"{table} is of {found.scene}, around {found.training}. Give another --out."
+        )
+    if not (out / "runs" / run_name(base, scene)).is_dir():
+        raise ValueError(f"{table} is of another folder named {found.scene}. Give another --out.")
+    if found.images != images:
+        raise ValueError(
+            f"{table} was measured on {found.images} images, and this sweep would be on {images}. "
+            f"Give --limit={found.images}, or another --out."
+        )
+    return rows
+
+
+def measure(point: Point, scene: Path, runs: Path, limit: Sequence[str] = ()) -> Row:
+    """Trains and evaluates a point, or reads what was measured before.
+
+    Points that differ in evaluation alone share a training.
+
+    Args:
+      point: the point.
+      scene: folder of the scene.
+      runs: folder of the trainings.
+      limit: options that choose the images of the evaluation.
+    """
+    run = runs / run_name(point, scene)
+    cost = trained_runs.train(run, scene=scene, options=point.training)
+    gain = trained_runs.evaluate(run, scene=scene, options=(*point.evaluation, *limit))
+    return Row(
+        scene=scene_names.of_folder(scene),
+        name=point.name,
+        knob=point.knob,
+        value=point.value,
+        training=" ".join(point.training),
+        evaluation=" ".join(point.evaluation),
+        **vars(cost),
+        **{name: value for name, value in vars(gain).items() if name in _COLUMNS},
+    )
+
+
+def run_name(point: Point, scene: Path) -> str:
+    """Returns the name of a training's folder, another for each scene and set of options."""
+    text = " ".join((str(scene.resolve()), *point.training))
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    shared = not point.knob or point.knob in trade_points.OF_EVALUATION
+    return f"{BASE if shared else point.name}-{digest}"
+
+
+def _write(out: Path, rows: Sequence[Row]) -> None:
+    trade_table.write(out / "trade_off.csv", rows)
+    pareto_figure.write(out / "trade_off.png", rows)
+    text = trade_report.markdown(rows)
+    (out / "trade_off.md").write_text(text, encoding="utf-8")

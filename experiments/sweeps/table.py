@@ -1,0 +1,199 @@
+"""The measured trade of speed for accuracy: a table, what of it is worth having, and in words."""
+
+import csv
+import dataclasses
+import typing
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from experiments.sweeps.points import BASE, OF_EVALUATION
+from refref_jax import drafts
+
+NOISE = 0.3
+"""Decibels by which trainings differ that differ in nothing that matters; see `BUILD_NOTES.md`."""
+
+TIME_NOISE = 3.0
+"""Percent of time that say nothing, on a machine that was left alone."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """A point that was measured; the fields without a note are those of `trained_runs`.
+
+    Attributes:
+      scene: name of its folder.
+      name: of the point.
+      knob: the option that differs from the base; empty for the base.
+      value: of the knob.
+      training: options of `experiments.train`, with blanks between.
+      evaluation: options of `experiments.evaluate`.
+    """
+
+    scene: str
+    name: str
+    knob: str
+    value: str
+    training: str
+    evaluation: str
+    steps: int
+    seconds_per_step: float
+    rays_per_second: float
+    train_seconds: float
+    startup_seconds: float
+    peak_host_mib: float | None
+    peak_device_mib: float | None
+    psnr: float
+    psnr_masked: float | None
+    ssim: float
+    distance_mae: float | None
+    distance_mae_masked: float | None
+    seconds_per_image: float
+    images: int
+
+    @property
+    def quality(self) -> float:
+        """PSNR inside the mask in dB, or over the image where there are no masks."""
+        return self.psnr if self.psnr_masked is None else self.psnr_masked
+
+    @property
+    def stepping(self) -> float:
+        """Seconds of all steps, without compiling."""
+        return self.steps * self.seconds_per_step
+
+
+class Turn(NamedTuple):
+    """What changing one knob brings.
+
+    Attributes:
+      row: the changed point.
+      gain: dB over the base.
+      percent: of time that it takes more than the base: of training, or, if the knob is one of
+        evaluation, of rendering.
+    """
+
+    row: Row
+    gain: float
+    percent: float
+
+
+def write(path: Path, rows: Sequence[Row]) -> None:
+    """Writes a table as CSV, all or nothing; what is not known stays empty."""
+    with (
+        drafts.unfinished_file(path) as draft,
+        draft.open("w", newline="", encoding="utf-8") as file,
+    ):
+        writer = csv.writer(file)
+        writer.writerow(field.name for field in dataclasses.fields(Row))
+        writer.writerows(dataclasses.astuple(row) for row in rows)
+
+
+def read(path: Path) -> list[Row]:
+    """Reads a table that `write` wrote.
+
+    Raises:
+      ValueError: if there is none, or it is another.
+    """
+    if not path.is_file():
+        raise ValueError(
+            f"There is no table {path}. Measure one with python -m experiments.trade_off, and give "
+            "it with --table=DIR/trade_off.csv."
+        )
+    with path.open(newline="", encoding="utf-8") as file:
+        records = list(csv.DictReader(file))
+    kinds = typing.get_type_hints(Row)
+    try:
+        rows = [
+            Row(**{name: _parse(record[name], kind) for name, kind in kinds.items()})
+            for record in records
+        ]
+    except (KeyError, ValueError, TypeError) as error:
+        raise ValueError(
+            f"{path} is not a table of experiments.trade_off ({error!r}). Give one that is."
+        ) from error
+    if not any(row.name == BASE for row in rows):
+        raise ValueError(f"{path} has no row of the base point. Let the sweep measure it.")
+    return rows
+
+
+def pareto(rows: Sequence[Row], cost: Callable[[Row], float]) -> list[Row]:
+    """Returns the rows that no other row beats in cost and quality, cheapest first."""
+    front: list[Row] = []
+    for row in sorted(rows, key=lambda row: (cost(row), -row.quality)):
+        if not front or row.quality > front[-1].quality:
+            front.append(row)
+    return front
+
+
+def base_of(rows: Sequence[Row]) -> Row:
+    """Returns the row of the base point."""
+    return next(row for row in rows if row.name == BASE)
+
+
+def turns(rows: Sequence[Row]) -> list[Turn]:
+    """Returns what each knob brings, measured against the base."""
+    base = base_of(rows)
+    found = []
+    for row in rows:
+        if row.knob:
+            cost = _rendering if row.knob in OF_EVALUATION else _training
+            percent = 100.0 * (cost(row) / cost(base) - 1.0)
+            found.append(Turn(row, row.quality - base.quality, percent))
+    return found
+
+
+def worth_turning(found: Sequence[Turn]) -> list[Turn]:
+    """Returns the best turn of each knob that gains more than noise, what to turn first leading.
+
+    Those that take no more time come first, by gain; then by decibels for a percent of time.
+    """
+    gaining = [turn for turn in found if turn.gain > NOISE]
+    return _best_of_each(
+        gaining, lambda turn: _rate(turn.gain, 0.0 if is_free(turn) else turn.percent)
+    )
+
+
+def is_free(turn: Turn) -> bool:
+    """Returns whether a turn takes no more time than two measurements of the same differ by."""
+    return turn.percent <= TIME_NOISE
+
+
+def worth_saving(found: Sequence[Turn]) -> list[Turn]:
+    """Returns the best turn of each knob that saves time and gains nothing, cheapest leading.
+
+    Those that lose no more than noise come first, by time saved; then by percent for a decibel.
+    """
+    saving = [turn for turn in found if turn.percent < -TIME_NOISE and turn.gain <= NOISE]
+
+    def worth(turn: Turn) -> tuple[bool, float]:
+        return _rate(-turn.percent, -turn.gain if turn.gain < -NOISE else 0.0)
+
+    return _best_of_each(saving, worth)
+
+
+def _rate(gain: float, price: float) -> tuple[bool, float]:
+    """Returns what orders things by gain for a price; those that are free stand above all."""
+    return (True, gain) if price <= 0.0 else (False, gain / price)
+
+
+def _best_of_each(found: Sequence[Turn], worth: Callable[[Turn], tuple[bool, float]]) -> list[Turn]:
+    best: dict[str, Turn] = {}
+    for turn in sorted(found, key=worth, reverse=True):
+        best.setdefault(turn.row.knob, turn)
+    return list(best.values())
+
+
+def _training(row: Row) -> float:
+    return row.stepping
+
+
+def _rendering(row: Row) -> float:
+    return row.seconds_per_image
+
+
+def _parse(text: str, kind: object) -> object:
+    if kind is str:
+        return text
+    if kind is int:
+        return int(text)
+    return None if kind == float | None and text == "" else float(text)

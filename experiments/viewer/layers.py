@@ -1,0 +1,181 @@
+"""What the viewer can show of a model, and how it is coloured.
+
+- `rgb`: the picture.
+- `refraction only`, `reflection only`: two pictures whose linear colours sum to it. A light path
+  belongs to `reflection only` if it was mirrored at the *first* surface it met, and else, if it
+  went through that surface or met none, to `refraction only`; what became of it later does not
+  count.
+  So neither is what a budget with fewer reflections would show, which gives the share of what it
+  leaves out to what it keeps.
+- `distance`: the median of the field's weights along a pixel's heaviest path (see
+  `render.images.Rendering`), from 0 to a length that is fixed, so that colours mean the same from
+  everywhere.
+- `normals`, `mask`: of the first surface of the meshes, with no light. Normals point out of the
+  body and are coloured `(n + 1) / 2` by world axes.
+- `error`: of one test view, amplified as in `figures`, at its own pixels.
+
+Everything is drawn in bands of rows, between which a drawing can be called off.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from experiments.figures import comparison as figures
+from refref_jax.data import files
+from refref_jax.data.local_layout import Frames
+from refref_jax.geometry import cameras
+from refref_jax.geometry.rays import Rays
+from refref_jax.optics.first_branches import Branch
+from refref_jax.optics.interface_rules import RULES
+from refref_jax.optics.media import Interfaces
+from refref_jax.render import Model, images, render_image, tiles
+from refref_jax.render.first_surface import NO_PART, find_first_surface
+
+RGB, REFRACTION, REFLECTION = "rgb", "refraction only", "reflection only"
+DISTANCE, NORMALS, MASK, ERROR = "distance", "normals", "mask", "error"
+
+_BRANCHES: dict[str, Branch] = {RGB: "both", REFRACTION: "transmitted", REFLECTION: "reflected"}
+
+# Needs no light paths, only the meshes.
+OF_SURFACES = (NORMALS, MASK)
+
+_NOWHERE = 255
+
+GAIN = figures.ERROR_GAIN
+"""By how much errors are amplified."""
+
+Cancelled = Callable[[], bool]
+Picture = UInt8[np.ndarray, "h w 3"]
+
+
+class Pixels(NamedTuple):
+    """Some pixels of a test view, evenly spaced.
+
+    Attributes:
+      rays: through their centres, `[h, w]`.
+      target: their true sRGB in `[0, 1]`.
+    """
+
+    rays: Rays
+    target: Float[np.ndarray, "h w 3"]
+
+
+def offered(model: Model, *, truth: bool) -> tuple[str, ...]:
+    """Returns the layers that a model has.
+
+    Args:
+      model: the scene.
+      truth: whether there are test views.
+    """
+    bent = (REFRACTION, REFLECTION, DISTANCE, NORMALS, MASK)
+    return (RGB, *(bent if model.budget.bends else (DISTANCE,)), *((ERROR,) if truth else ()))
+
+
+def draw(
+    model: Model, layer: str, rays: Rays, *, chunk: int, most: int, cancelled: Cancelled
+) -> Picture | None:
+    """Draws a layer, all but `error`.
+
+    Args:
+      model: the scene.
+      layer: one of those of the module.
+      rays: `[h, w]`.
+      chunk: paths rendered at once.
+      most: pixels of the largest picture of this size: what is cropped of it is filled up, so
+        that windows of all shapes share one program.
+      cancelled: asked before every band.
+
+    Returns:
+      The picture, or `None` if it was called off.
+    """
+    if layer in OF_SURFACES:
+        return None if cancelled() else _draw_surface(model, layer, rays, most)
+    bands = []
+    for band in _bands(rays):
+        if cancelled():
+            return None
+        seen = render_image(model, band, chunk=chunk, branch=_BRANCHES.get(layer, "both"))
+        bands.append(seen.distance if layer == DISTANCE else seen.rgb)
+    whole = np.concatenate(bands)
+    if layer == DISTANCE:
+        # From wall to wall: nothing inside a bounded scene is much farther.
+        return figures.colour_distances([whole], farthest=2.0 * model.config.radius)[0]
+    return files.to_bytes(whole)
+
+
+def draw_error(
+    model: Model, pixels: Pixels, *, chunk: int, cancelled: Cancelled
+) -> tuple[Picture, float] | None:
+    """Draws the amplified error of a test view.
+
+    Returns:
+      The picture and the root mean square of the error itself, of sRGB in `[0, 1]`; `None` if it
+      was called off.
+    """
+    bands = []
+    for band in _bands(pixels.rays):
+        if cancelled():
+            return None
+        bands.append(render_image(model, band, chunk=chunk).rgb)
+    seen = np.concatenate(bands)
+    error = math.sqrt(float(np.mean(np.square(seen - pixels.target, dtype=np.float64))))
+    return files.to_bytes(figures.amplified_error(seen, pixels.target)), error
+
+
+def view_pixels(frames: Frames, i: int, most: int) -> Pixels:
+    """Returns every pixel of a test view, or every second, third, ... in each direction.
+
+    So no true colour is averaged, and a small picture's error is that of its pixels.
+
+    Args:
+      frames: of the split.
+      i: which view.
+      most: pixels that are wanted at most.
+    """
+    height, width = frames.cameras.height, frames.cameras.width
+    stride = max(1, math.ceil(math.sqrt(height * width / most)))
+    row, column = np.meshgrid(
+        np.arange(stride // 2, height, stride), np.arange(stride // 2, width, stride), indexing="ij"
+    )
+    rays = cameras.pixel_rays(frames.cameras, np.full(row.shape, i), row, column)
+    target = files.read_rgb(frames.images[i])[row, column] / np.float32(255.0)
+    return Pixels(rays, target)
+
+
+def with_indices(interfaces: Interfaces, indices: Sequence[float], rule: str) -> Interfaces:
+    """Returns interfaces with other indices of refraction, one a part, and all else as it was.
+
+    Args:
+      interfaces: of the scene.
+      indices: of the inside of each part; what follows for the outsides is the rule's to say.
+      rule: the scene's, a name in `interface_rules.RULES`.
+    """
+    parents = [int(medium) - 1 for medium in interfaces.medium_outside]
+    made = RULES[rule](indices, parents)
+    return interfaces._replace(index_inside=made.index_inside, index_outside=made.index_outside)
+
+
+def _draw_surface(model: Model, layer: str, rays: Rays, most: int) -> Picture:
+    shape = rays.radii.shape
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
+    filled, _ = tiles.cut_out(flat, None, 0, max(most, flat.radii.size))
+    met = find_first_surface(model.geometry.surfaces, filled)
+    count = flat.radii.size
+    found = (met.parts[:count] != NO_PART).reshape(*shape, 1)
+    if layer == MASK:
+        return np.broadcast_to(np.where(found, 255, 0), (*shape, 3)).astype(np.uint8)
+    normals = files.to_bytes(0.5 * (met.normals[:count].reshape(*shape, 3) + 1.0))
+    return np.where(found, normals, np.uint8(_NOWHERE))
+
+
+def _bands(rays: Rays) -> Iterator[Rays]:
+    """Yields some rows at a time, no more rays than are traced at once if a row has no more."""
+    height, width = rays.radii.shape
+    rows = max(1, images.TILE // width)
+    for start in range(0, height, rows):
+        yield Rays(*(x[start : start + rows] for x in rays))

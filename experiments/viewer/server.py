@@ -1,0 +1,249 @@
+"""The server of the viewer, and what it does for each page that is open.
+
+Every page has a camera, a panel and a scene of its own, and one thread that draws for it what
+`schedule` says. Pages take turns: one picture is drawn at a time.
+
+This is the only module that imports viser.
+"""
+
+import contextlib
+import io
+import math
+import threading
+import time
+import traceback
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import viser
+
+from experiments.viewer import layers, scenery, schedule, viewpoints
+from experiments.viewer import subject as subjects
+from experiments.viewer.layers import Picture
+from experiments.viewer.panel import Panel
+from experiments.viewer.schedule import Job, State
+from experiments.viewer.subject import Choice, Subject
+from experiments.viewer.viewpoints import Viewpoint
+from refref_jax.geometry.rays import Rays
+from refref_jax.render import pixel_paths
+
+_JPEG_QUALITY = 92
+
+# How near to a test view a browser's camera stays where it is.
+_NEAR = 10 * viewpoints.ROUNDING
+
+
+class Turns:
+    """What pages share: whose turn it is to draw, and what is compiled."""
+
+    def __init__(self) -> None:
+        """Begins with nothing compiled."""
+        self.drawing = threading.Lock()
+        self.tracing = threading.Lock()
+        self.compiled: set[Any] = set()
+
+
+def serve(subject: Subject, *, host: str, port: int) -> viser.ViserServer:
+    """Starts a server, which runs in threads of its own until it is stopped.
+
+    Args:
+      subject: what is looked at.
+      host: address that it listens on.
+      port: the first port to try; its own method `get_port` tells which it is.
+    """
+    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a box
+        server = viser.ViserServer(host=host, port=port, label=subject.name, verbose=False)
+    # Sharing would open the page to the internet, through a machine of viser's authors.
+    server.gui.configure_theme(show_share_button=False, show_logo=False)
+    view = subjects.first_viewpoint(subject)
+    position, back = view.pose[:, 3], view.pose[:, 2]
+    server.initial_camera.position = position
+    server.initial_camera.look_at = position - back * np.linalg.norm(position)
+    server.initial_camera.fov = view.fov
+    turns, pages = Turns(), {}
+
+    @server.on_client_connect
+    def _(client: viser.ClientHandle) -> None:
+        page = pages[client.client_id] = Page(client, subject, turns)
+        if client.client_id not in server.get_clients():  # gone before its page was built
+            page.close()
+
+    @server.on_client_disconnect
+    def _(client: viser.ClientHandle) -> None:
+        if page := pages.pop(client.client_id, None):
+            page.close()
+
+    return server
+
+
+class Page:
+    """One open page."""
+
+    def __init__(self, client: viser.ClientHandle, subject: Subject, turns: Turns) -> None:
+        """Builds panel and scene, and begins to draw."""
+        self._client, self._subject, self._turns = client, subject, turns
+        self._event = threading.Condition()
+        self._closed = False
+        self._state = State(stages=len(subject.heights))
+        self._view = self._viewpoint()
+        surfaces = subject.model.geometry.surfaces
+        self._scenery = scenery.Scenery(client.scene, surfaces, subject.views)
+        self._panel = Panel(
+            client.gui,
+            subject,
+            changed=self._change,
+            show_bodies=self._scenery.show_bodies,
+            show_cameras=self._scenery.show_cameras,
+            remove_paths=self._scenery.remove_paths,
+        )
+        client.camera.on_update(lambda _: self._look())
+        client.scene.on_click()(self._click)
+        threading.Thread(target=self._work, daemon=True).start()
+        self._change()
+
+    def close(self) -> None:
+        """Ends the page's thread."""
+        with self._event:
+            self._closed = True
+            self._event.notify()
+
+    def _viewpoint(self) -> Viewpoint:
+        camera = self._client.camera
+        aspect = camera.image_width / max(camera.image_height, 1) or viewpoints.ASPECT
+        return viewpoints.from_browser(camera.wxyz, camera.position, camera.fov, aspect)
+
+    def _look(self) -> None:
+        """Notes where the camera is; what a browser says again is no change."""
+        view = self._viewpoint()
+        with self._event:
+            if viewpoints.is_same(view, self._view):
+                return
+            self._view = view
+        self._change()
+
+    def _change(self) -> None:
+        with self._event:
+            self._state = schedule.changed(self._state, time.monotonic())
+            self._event.notify()
+
+    def _work(self) -> None:
+        while True:
+            with self._event:
+                if self._closed:
+                    return
+                now = time.monotonic()
+                job, view = schedule.next_job(self._state, now), self._view
+                if job is None:
+                    self._event.wait(schedule.wait(self._state, now))
+                    continue
+            try:
+                picture = self._draw(job, view, self._panel.choice())
+            except Exception as error:  # the page stays open, and says why it shows nothing
+                traceback.print_exc()
+                self._say(f"**{type(error).__name__}**: {error}")
+                picture = np.zeros((2, 2, 3), np.uint8)
+            if picture is not None and not self._closed:
+                self._client.scene.set_background_image(
+                    picture, format="jpeg", jpeg_quality=_JPEG_QUALITY
+                )
+                with self._event:
+                    self._state = schedule.finished(self._state, job)
+
+    def _draw(self, job: Job, view: Viewpoint, choice: Choice) -> Picture | None:
+        """Draws a job's picture; `None` if it was called off."""
+        model = subjects.chosen_model(self._subject, choice)
+        height, chunk = self._subject.heights[job.stage], self._subject.chunk
+        most = height * viewpoints.width_of(height)
+        layer, what = choice.layer, ("image", model.budget)
+        if layer == layers.ERROR and job.stage > 0:
+            return self._draw_error(job, view, model, most)
+        if layer == layers.ERROR:  # on the way to a view there is no error to show
+            layer = layers.RGB
+        if layer in layers.OF_SURFACES:
+            what = ("surfaces", most)
+        rays = viewpoints.window_rays(view, height)
+        with self._turns.drawing, self._compiling(what):
+            picture = layers.draw(
+                model, layer, rays, chunk=chunk, most=most, cancelled=lambda: self._stale(job)
+            )
+        if picture is not None:
+            self._say(_sized(picture, job.stage + 1, len(self._subject.heights)))
+        return picture
+
+    def _draw_error(self, job: Job, view: Viewpoint, model: Any, most: int) -> Picture | None:
+        """Goes to the nearest test view and draws its error, with bars beside it."""
+        frames = self._subject.frames
+        i = viewpoints.nearest(view.pose, frames.cameras)
+        fov = viewpoints.containing_fov(frames.cameras, view.aspect)
+        self._go_to(Viewpoint(frames.cameras.poses[i], fov, view.aspect))
+        pixels = layers.view_pixels(frames, i, most)
+        with self._turns.drawing, self._compiling(("image", model.budget)):
+            drawn = layers.draw_error(
+                model, pixels, chunk=self._subject.chunk, cancelled=lambda: self._stale(job)
+            )
+        if drawn is None:
+            return None
+        picture, error = drawn
+        decibels = -20.0 * math.log10(error) if error else math.inf
+        name = frames.names[i]
+        self._say(
+            f"test view **{name}**: {decibels:.1f} dB, errors x {layers.GAIN:g}. "
+            + _sized(picture, job.stage + 1, len(self._subject.heights))
+        )
+        return viewpoints.letterbox(picture, view.aspect)
+
+    def _go_to(self, view: Viewpoint) -> None:
+        """Moves the browser's camera, which is no change of what is seen.
+
+        Browsers keep the horizon level, and answer with another pose if the view's is not: that is
+        not corrected again, or there would be no end.
+        """
+        with self._event:
+            if viewpoints.is_same(view, self._view, within=_NEAR):
+                return
+            self._view = view
+        wxyz, position = viewpoints.to_browser(view.pose)
+        with self._client.atomic():
+            self._client.camera.position = position
+            self._client.camera.wxyz = wxyz
+            self._client.camera.fov = view.fov
+
+    def _click(self, event: viser.SceneClickEvent) -> None:
+        """Draws the light paths of the pixel that was clicked."""
+        model = subjects.chosen_model(self._subject, self._panel.choice())
+        direction = np.asarray(event.ray_direction)
+        ray = Rays(np.asarray(event.ray_origin), direction / np.linalg.norm(direction), 1e-3)
+        with self._turns.tracing, self._compiling(("pixel", model.budget)):
+            paths = pixel_paths.trace_pixel(model, ray)
+        self._scenery.show_paths(pixel_paths.pieces(paths))
+        self._panel.show_table(pixel_paths.describe(paths))
+
+    def _say(self, text: str) -> None:
+        if not self._closed:
+            self._panel.say(text)
+
+    def _stale(self, job: Job) -> bool:
+        with self._event:
+            return self._closed or schedule.is_stale(self._state, job)
+
+    @contextlib.contextmanager
+    def _compiling(self, what: Any) -> Iterator[None]:
+        """Tells the user while something is done for the first time, which takes a while."""
+        if what in self._turns.compiled:
+            yield
+            return
+        notice = self._client.add_notification(
+            "Compiling", "Once for these settings.", loading=True, with_close_button=False
+        )
+        try:
+            yield
+            self._turns.compiled.add(what)
+        finally:
+            if not self._closed:
+                notice.remove()
+
+
+def _sized(picture: Picture, stage: int, stages: int) -> str:
+    height, width, _ = picture.shape
+    return f"{width} x {height} pixels, size {stage} of {stages}"

@@ -1,1 +1,0 @@
-"""The viewer in a browser: what it shows, when it draws, and the server (`experiments.view`)."""

@@ -1,0 +1,1 @@
+"""Captures in nerfstudio's layout: read, turned into scenes, and written."""
