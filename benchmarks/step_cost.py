@@ -43,11 +43,11 @@ class _Method:
 
     def __init__(self, scene: Path, paths: str) -> None:
         self._setup, self._state = set_up_training(scene, preset=_PRESET.value, paths=paths)
-        self.paths_per_ray = self._setup.capacity / self._setup.config.batch
+        self.paths_per_ray = self._setup.capacity / self._setup.config.schedule.batch
 
     def cost(self) -> _Cost:
         """Traces a pool and takes the steps of two."""
-        pool, batches = self._setup.config.pool, self._setup.sampler.batches
+        pool, batches = self._setup.config.schedule.pool, self._setup.sampler.batches
         begin = time.perf_counter()
         jax.block_until_ready(loop.trace_batches(self._setup, range(pool)))
         tracing = (time.perf_counter() - begin) / pool

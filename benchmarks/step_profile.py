@@ -109,7 +109,7 @@ def _loss(params: tuple, setup: loop.Setup, pool: tuple) -> jax.Array:
     total += losses.hash_decay(hash_grid.tables(params))
     *proposals, final = seen.paths.histograms
     total += jnp.mean(jax.vmap(losses.distortion)(final, seen.paths.outside))
-    for proposal, blur in zip(proposals, config.loss.blurs, strict=True):
+    for proposal, blur in zip(proposals, config.losses.blurs, strict=True):
         total += _interlevel(final, proposal, blur)
     return total
 
@@ -147,7 +147,7 @@ class _Profile:
         for name, part in self.parts.items():
             begin = time.perf_counter()
             part()
-            steps = self.setup.config.pool if name in ("step", "tracing") else 1
+            steps = self.setup.config.schedule.pool if name in ("step", "tracing") else 1
             taken[name] = 1e3 * (time.perf_counter() - begin) / steps
         return taken
 
@@ -160,7 +160,7 @@ class _Profile:
         )
 
     def _pool_of_steps(self) -> None:
-        until = int(self._state.step) + self.setup.config.pool
+        until = int(self._state.step) + self.setup.config.schedule.pool
         for state, _ in loop.run_steps(self.setup, self._state, until):
             self._state = state
         jax.block_until_ready(self._state)
@@ -221,7 +221,7 @@ class _Profile:
         rng = np.random.default_rng(1)
         shapes = [gaussians.scales.shape[:2] for gaussians in self._points.rounds]
         weights = [jnp.asarray(rng.uniform(size=x) / x[1], jnp.float32) for x in shapes]
-        blurs = self.setup.config.loss.blurs
+        blurs = self.setup.config.losses.blurs
         return {"sampling": _compiled(jax.grad(lambda x: _sampling(x, blurs)), weights)}
 
 
@@ -256,7 +256,7 @@ def main(arguments: list[str]) -> None:
     for name, times in taken.items():
         share = np.median(times / taken["step"])
         print(f"{name:20s} {np.median(times):8.2f} ms  {100 * share:5.1f} % of a step")
-    rays = profile.setup.config.batch / np.median(taken["step"])
+    rays = profile.setup.config.schedule.batch / np.median(taken["step"])
     copied, moved = _copy_speed(), profile.row_bytes()
     print(f"{rays:.1f} thousand rays a second; a copy moves {copied / 1e9:.1f} GB/s")
     for name, passes in (("gathers", 1), ("scatter-adds", 2)):

@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-from experiments.runs import planning
-from experiments.runs.choices import Wishes
-from experiments.runs.planning import Request
 from refref_jax.data import local_layout
 from refref_jax.data.batches import PixelSampler
 from refref_jax.training import loop
+from refref_jax.training.config import TrainConfig
+from refref_jax.training.fit import prepare
 from refref_jax.training.state import TrainState, init_state
 from refref_jax.training.steps import Pool
 
@@ -20,14 +19,15 @@ def set_up_training(scene: Path, *, preset: str, paths: str) -> tuple[loop.Setup
       preset: name of a preset.
       paths: name of a budget.
     """
-    config, model, geometry = planning.make_plan(Request(scene, preset, Wishes(paths=paths)))
+    asked = TrainConfig().override(scene=str(scene), preset=preset, paths=paths)
+    (config, model, *_), geometry = prepare(asked)
     frames = local_layout.read_frames(scene, "train")
     images = local_layout.read_images(frames)
-    sampler = PixelSampler(images, frames.cameras, seed=config.seed, batch=config.batch)
+    sampler = PixelSampler(images, frames.cameras, seed=config.seed, batch=config.schedule.batch)
     setup = loop.set_up(config, model.config, model.budget, geometry, sampler)
     return setup, init_state(config.seed, model.config, config.schedule)
 
 
 def trace_pool(setup: loop.Setup) -> Pool:
     """Draws and traces the first pool of a run, as its loop does."""
-    return loop.trace_batches(setup, setup.sampler.numbers(0, setup.config.pool).tolist())
+    return loop.trace_batches(setup, setup.sampler.numbers(0, setup.config.schedule.pool).tolist())

@@ -28,8 +28,8 @@ from experiments.cli import (
     view_numbers,
 )
 from experiments.cli.late_imports import late
-from experiments.runs import named_budgets
 from refref_jax.data import scene_names
+from refref_jax.optics import budgets
 from refref_jax.optics.budgets import BUDGETS, Budget
 
 if TYPE_CHECKING:
@@ -133,8 +133,8 @@ def settings() -> list[Setting]:
     """Returns all budgets to try; equal ones are listed in both sweeps."""
     cuts = sorted(_numbers("cuts", _CUTS.value, float), reverse=True)
     bends = sorted(_numbers("bends", _BENDS.value, int))
-    swept = [("cut", f"{cut:g}", named_budgets.make_budget("tree", cut=cut)) for cut in cuts]
-    swept += [("bends", str(n), named_budgets.make_budget("tree", bends=n)) for n in bends]
+    swept = [("cut", f"{cut:g}", budgets.budget_of("tree", cut=cut)) for cut in cuts]
+    swept += [("bends", str(n), budgets.budget_of("tree", bends=n)) for n in bends]
     points = [("budget", name, BUDGETS[name]) for name in ("straight", "paper")]
     return [Setting(*each) for each in points + swept]
 

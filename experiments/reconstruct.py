@@ -51,7 +51,12 @@ def main() -> None:
     """Reconstructs a scene, or goes on with it."""
     scene_option.check(_SCENE.value)
     index = _parse(_IOR.value)
-    config = reconstruction_options.chosen(index=index, seed=_SEED.value)
+    config = reconstruction_options.chosen(
+        index=index,
+        seed=_SEED.value,
+        space=space_options.chosen_space(),
+        radius=space_options.RADIUS.value,
+    )
     scene, out = scene_option.opened(_SCENE.value), Path(_OUT.value)
     found = chain.reconstruct(scene, out, config, compare=True)
     print(f"Report:  {out / report.FILE}, {out / report.FOLDER}")

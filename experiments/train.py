@@ -1,12 +1,14 @@
 """Trains a model of a scene.
 
 python -m experiments.train --scene=experiments/data/cube_smcvx_ball --out=runs/ball
+python -m experiments.train --config=runs/ball/config.json --out=runs/again
 
 With --method=r3f the object is reconstructed from images and masks first, into {out}/r3f, and the
 scene's own meshes are never read.
 """
 
-import contextlib
+from __future__ import annotations
+
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,31 +16,22 @@ from typing import TYPE_CHECKING
 from absl import flags
 
 from experiments.cli import (
-    command_line,
     commands,
     device_options,
     options,
     reconstruction_options,
-    run_option,
-    scenes,
+    scene_option,
 )
-from experiments.cli.late_imports import late
+from experiments.cli import config as config_flags
 from experiments.r3f import training_body
-from experiments.runs import plans
+from refref_jax.optics.budgets import budget_of
 
 if TYPE_CHECKING:
-    from experiments.runs import trainer
-    from refref_jax.training import devices, run_folder, run_lock
-else:
-    trainer = late("experiments.runs.trainer")
-    devices = late("refref_jax.training.devices")
-    run_folder = late("refref_jax.training.run_folder")
-    run_lock = late("refref_jax.training.run_lock")
+    from refref_jax.training.config import TrainConfig
 
 _OUT = options.out("Folder to write the run to.")
-
-flags.adopt_module_key_flags(scenes)
-flags.adopt_module_key_flags(plans)
+_CONFIG = config_flags.define_flags()
+flags.adopt_module_key_flags(config_flags)
 flags.adopt_module_key_flags(training_body)
 flags.adopt_module_key_flags(device_options)
 flags.adopt_module_key_flags(reconstruction_options)
@@ -49,80 +42,107 @@ _KEEP = flags.DEFINE_integer("keep", 2, "Newest checkpoints to keep.", 1)
 
 
 def main() -> None:
-    """Plans a run, or finds the one to resume, and trains it."""
+    """Resolves a run, or finds the one to resume, and trains it."""
     run = Path(_OUT.value)
-    check_options()
+    check_flags()
     device_options.connect()
     with device_options.first_speaks():
-        if not _begin(run):
+        if not _train(run):
             print(f"Continue with {commands.shell('train', f'--out={run}', '--resume')}")
             sys.exit(commands.INTERRUPTED)
-        print(f"Run: {run}  (metrics.jsonl, checkpoints/)")
+        print(f"Run: {run}  (config.json, metrics.jsonl, checkpoints/)")
         print(f"Next: {commands.shell('evaluate', f'--run={run}', '--split=test')}")
 
 
-def check_options() -> None:
-    """Refuses what can be told of the options alone, before anything is imported.
+def check_flags() -> None:
+    """Refuses what can be told of the flags alone, before anything is imported.
 
     Raises:
-      ValueError: if there is any.
+      ValueError: if one makes no sense, or there is no scene.
     """
-    if device_options.together() and training_body.reconstructs():
+    given = _CONFIG["reconstruction"].value
+    if device_options.together() and training_body.reconstructs(given):
         raise ValueError(
             "Several processes do not reconstruct together. Run experiments.reconstruct on one "
             "machine first, and give its folder as --reconstruction."
         )
-    plans.check_options(resume=_RESUME.value)
-    training_body.check_options()
+    scene, config = _CONFIG["scene"].value, flags.FLAGS["config"].value
+    scene_option.check(scene)
+    if scene is None and config is None and not _RESUME.value:
+        raise ValueError(
+            "No scene is given. Add --scene=FOLDER or --config=FILE, or --resume to go on with a "
+            "run."
+        )
+    ior = _CONFIG["ior"].value or ()
+    training_body.check_flags(given, paths=_CONFIG["paths"].value, ior=ior)
+    if not training_body.is_reconstructed(given) and config is None:
+        asked = config_flags.chosen(_CONFIG).paths
+        if asked.name is not None:
+            budget_of(asked.name, cut=asked.cut, bends=asked.bends)
 
 
-def _begin(run: Path) -> bool:
+def _train(run: Path) -> bool:
     """Begins a run, or goes on with it; returns whether it has reached its last step."""
+    from refref_jax.training import fit, run_folder
+
     mesh = device_options.mesh()
     resuming = _RESUME.value and run_folder.exists(run)
     if not resuming:
-        _open(run)
-    elif plans.SCENE.value is not None:
-        body = training_body.find(run, resume=True)
-        run_folder.check_unchanged(run, *plans.plan_from_flags(body=body))
+        run_folder.check_free(run)
+    if not resuming or _CONFIG["scene"].value is not None:
+        _open(run, resuming=resuming)
     else:
-        _refuse_options(run)
-    with run_lock.hold(run) if devices.is_first() else contextlib.nullcontext():
-        return trainer.train(
+        _refuse_flags(run)
+    moved = _CONFIG["scene"].value
+    periods = fit.Periods(_LOG_EVERY.value, _CHECKPOINT_EVERY.value, _KEEP.value)
+    with commands.Interrupt() as interrupt, commands.ProgressBar("train", 0) as bar:
+        return fit.train(
             run,
-            scene=plans.SCENE.value,
-            periods=trainer.Periods(_LOG_EVERY.value, _CHECKPOINT_EVERY.value, _KEEP.value),
+            scene=None if moved is None else scene_option.opened(moved),
+            progress=bar.move,
+            stop=lambda: interrupt.requested,
+            periods=periods,
             mesh=mesh,
         )
 
 
-def _open(run: Path) -> None:
-    """Plans a run and opens its folder; of several processes all plan, and the first opens."""
-    run_folder.check_free(run)
-    body = training_body.find(run, resume=_RESUME.value)
-    plan = plans.plan_from_flags(body=body)
-    devices.wait_for_all("all have planned, and nothing is written yet")
+def _open(run: Path, *, resuming: bool) -> None:
+    """Resolves a run and opens its folder, or compares it with the one that is resumed."""
+    from refref_jax.training import devices, fit, run_folder
+
+    config = _asked_config()
+    part = training_body.find(run, config, ior=_CONFIG["ior"].value or (), resume=_RESUME.value)
+    given = config.scene.reconstruction
+    if part is not None:
+        made = str(training_body.folder(run, given).resolve())
+        config = config.override(ior=((part.name, part.index),), reconstruction=made)
+    resolved, scene = fit.prepare(config, parts=None if part is None else [part])
+    print(resolved.describe())
+    begun = resolved.config, resolved.model, scene
+    if resuming:
+        run_folder.check_unchanged(run, *begun)
+        return
+    devices.wait_for_all("all have planned")
     if devices.is_first():
-        training_body.note(run, body)
-        run_folder.create(run, *plan)
-    devices.wait_for_all("the folder is there")
+        training_body.note(run, part, given)
+    fit.begin(run, *begun)
 
 
-def _settled() -> command_line.Settled | None:
-    """Returns the options of the run that is resumed, unless all are given and compared."""
-    run = Path(_OUT.value)
-    if not _RESUME.value or plans.SCENE.value is not None or not (run / run_option.RUN).is_file():
-        return None
-    return command_line.Settled(_settled_names(), f"{run_option.RUN} and model.json in {run}")
+def _asked_config() -> TrainConfig:
+    """Returns what the flags ask for, with the folder of the scene."""
+    named = not training_body.is_reconstructed(_CONFIG["reconstruction"].value)
+    instead = {} if named or _CONFIG["ior"].value is None else {"ior": ()}
+    config = config_flags.chosen(_CONFIG, **instead)
+    if not config.scene.path:
+        raise ValueError("The configuration names no scene. Add --scene=FOLDER.")
+    scene = str(scene_option.opened(config.scene.path).resolve())
+    return config if scene == config.scene.path else config.override(scene=scene)
 
 
-def _settled_names() -> list[str]:
-    return [holder.name for holder in (*plans.SETTLED, *training_body.SETTLED)]
-
-
-def _refuse_options(run: Path) -> None:
-    """Refuses options that a resumed run would not heed."""
-    if given := [f"--{name}" for name in _settled_names() if flags.FLAGS[name].present]:
+def _refuse_flags(run: Path) -> None:
+    """Refuses flags that a resumed run would not heed."""
+    settled = [*_CONFIG, "config", *(holder.name for holder in training_body.FLAGS)]
+    if given := [f"--{name}" for name in settled if flags.FLAGS[name].present]:
         raise ValueError(
             f"{run} goes on with the options that it was begun with: {', '.join(given)} would have "
             "no effect. Leave it out, or add --scene to have all options compared."
@@ -132,11 +152,5 @@ def _refuse_options(run: Path) -> None:
 if __name__ == "__main__":
     commands.run(
         main,
-        first=(
-            *("scene", "preset", "steps", "paths", "cut", "bends", "interior", "ior", "rule"),
-            *("background", "radius", "samples", "entries", "batch", "method", "reconstruction"),
-            *("resume", "seed", "devices"),
-        ),
         again="a run is never replaced; the same command with --resume goes on with it.",
-        settled=_settled,
     )

@@ -31,6 +31,23 @@ def write(path: Path, config: Any) -> None:
         draft.write_text(text, encoding="utf-8")
 
 
+def parse_json(text: str) -> Any:
+    """Returns what a JSON text says, for files that may be anybody's.
+
+    Raises:
+      ValueError: if it is not JSON, holds a number that JSON does not know (NaN, Infinity), or is
+        nested too deeply to be read.
+    """
+    try:
+        return json.loads(text, parse_constant=_refuse_constant)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a number of JSON")
+
+
 def read(path: Path, kind: type[_Config], *, variants: Variants | None = None) -> _Config:
     """Reads a configuration of a known kind.
 
@@ -46,13 +63,22 @@ def read(path: Path, kind: type[_Config], *, variants: Variants | None = None) -
     if not path.is_file():
         raise ValueError(f"{path} does not exist. Give a folder that a command wrote.")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return _build(kind, content, kind.__name__, variants or {})
+        content = parse_json(path.read_text(encoding="utf-8"))
+        return build(content, kind, variants=variants)
     except (ValueError, TypeError) as error:
         raise ValueError(
             f"{path} does not hold a {kind.__name__} ({error}). Restore the file, or write it "
             "again with this version."
         ) from error
+
+
+def build(content: Any, kind: type[_Config], *, variants: Variants | None = None) -> _Config:
+    """Makes a configuration of what `parse_json` returns; see `read`.
+
+    Raises:
+      ValueError: naming the key.
+    """
+    return _build(kind, content, kind.__name__, variants or {})
 
 
 def _build(kind: Any, value: Any, where: str, variants: Variants) -> Any:

@@ -10,7 +10,13 @@ from refref_jax.geometry.cameras import orbit
 from refref_jax.optics.budgets import PAPER
 from refref_jax.render.config import ModelConfig, ProposalConfig
 from refref_jax.render.saved import SavedModel
-from refref_jax.training.config import LossConfig, SceneConfig, ScheduleConfig, TrainingConfig
+from refref_jax.training.config import (
+    LossConfig,
+    PathsConfig,
+    SceneConfig,
+    ScheduleConfig,
+    TrainConfig,
+)
 
 _GRID = HashGridConfig(levels=2, coarsest=4, finest=16, entries=1 << 10, features=2)
 
@@ -31,16 +37,13 @@ MODEL = ModelConfig(
 
 SAVED = SavedModel(MODEL, PAPER)
 
-CONFIG = TrainingConfig(
+CONFIG = TrainConfig(
     scene=SceneConfig("nowhere", "nested", ()),
-    paths="paper",
-    loss=LossConfig(
+    paths=PathsConfig("paper"),
+    losses=LossConfig(
         data="mse", interlevel=0.01, blurs=(0.01,), distortion=0.01, hash_decay=0.1, dye_decay=1e-3
     ),
-    schedule=ScheduleConfig(steps=12, warmup=2, peak=1e-2, end=1e-3, anneal=4),
-    batch=32,
-    pool=4,
-    pixels="all",
+    schedule=ScheduleConfig(steps=12, warmup=2, peak=1e-2, end=1e-3, anneal=4, batch=32, pool=4),
     seed=0,
 )
 
@@ -51,4 +54,4 @@ def sampler(seed=0):
     """Returns pixels of four images whose colours change smoothly."""
     frame, row, column = np.indices((4, 16, 16))
     images = np.stack([row * 16, column * 16, 60 * frame], axis=-1).astype(np.uint8)
-    return PixelSampler(images, CAMERAS, seed=seed, batch=CONFIG.batch)
+    return PixelSampler(images, CAMERAS, seed=seed, batch=CONFIG.schedule.batch)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from jax import extend
 
-from experiments.runs.choices import Wishes, choose
 from refref_jax.data import containment, local_layout, meshes
 from refref_jax.data.geometry import build_geometry
 from refref_jax.data.needs import find_needs
@@ -24,6 +23,8 @@ from refref_jax.render.config import path_detail
 from refref_jax.render.model import init_params
 from refref_jax.sampling import domains
 from refref_jax.training import steps
+from refref_jax.training.config import TrainConfig
+from refref_jax.training.resolve import SceneFacts, resolve
 from tests import made_paths, scenes
 from tests.small_model import CAMERAS, MODEL
 
@@ -34,6 +35,11 @@ _BALL = scenes.ball(1.3, subdivisions=2)
 def _needs(*parts, rule="nested"):
     tree = containment.find_containment(parts)
     return find_needs(parts, tree, CAMERAS, rule=rule, space="bounded")
+
+
+def _budget(found, **given):
+    facts = SceneFacts(found, CAMERAS, (), None, None, ())
+    return resolve(TrainConfig().override(**given), facts).model.budget
 
 
 def _operations(text):
@@ -51,7 +57,7 @@ def _training_programs(geometry, budget):
 
 
 def test_no_mesh_compiles_no_tracer():
-    empty = choose(_needs(), Wishes()).budget
+    empty = _budget(_needs())
     tracer = _training_programs(scenes.geometry(_BALL), TREE)
     nothing = _training_programs(scenes.geometry(), empty)
     assert nothing["while"] == 0 < tracer["while"]
@@ -62,7 +68,7 @@ def test_no_mesh_compiles_no_tracer():
 def _render_operations(model):
     """Returns the operations of rendering some straight paths."""
     paths = path_tracing.trace(
-        scenes.geometry(), _RAYS, budget=choose(_needs(), Wishes()).budget, capacity=256
+        scenes.geometry(), _RAYS, budget=_budget(_needs()), capacity=256
     ).paths
     params = jax.eval_shape(functools.partial(init_params, config=model), jax.random.key(0))
     jitter = pixels.no_jitter(model, paths.radii.shape[0])
@@ -157,8 +163,8 @@ def test_light_that_leaves_the_bundled_ball_for_good_is_cast_less_often(ball_sce
         light = ends.weights[:, :1] * ends.directions
         return int(traced.casts), jax.ops.segment_sum(light, ends.rays, num_segments=count)
 
-    spared, light = trace(choose(found, Wishes()).budget)
-    casts, expected = trace(choose(found, Wishes(reentry="possible")).budget)
+    spared, light = trace(_budget(found))
+    casts, expected = trace(_budget(found, reentry="possible"))
     # A path of a ball is cast once for each of its bends, and once more only to find nothing.
     assert spared < 0.8 * casts
     np.testing.assert_allclose(light, expected, atol=1e-5)

@@ -3,7 +3,7 @@
 from absl import flags
 
 from experiments.cli import command_line
-from experiments.runs import named_budgets
+from refref_jax.optics import budgets
 from refref_jax.optics.budgets import Budget
 
 CUT = flags.DEFINE_float(
@@ -12,10 +12,10 @@ CUT = flags.DEFINE_float(
 BENDS = flags.DEFINE_integer(
     "bends", None, "Most refractions and reflections of a path; that of --paths if not given."
 )
-command_line.check(CUT, lambda cut: named_budgets.make_budget("tree", cut=cut))
-command_line.check(BENDS, lambda bends: named_budgets.make_budget("tree", bends=bends))
+command_line.check(CUT, lambda cut: budgets.budget_of("tree", cut=cut))
+command_line.check(BENDS, lambda bends: budgets.budget_of("tree", bends=bends))
 
 
 def chosen(paths: str) -> Budget:
     """Returns the budget of a name, with the cut and the bends that were asked for."""
-    return named_budgets.make_budget(paths, cut=CUT.value, bends=BENDS.value)
+    return budgets.budget_of(paths, cut=CUT.value, bends=BENDS.value)

@@ -193,6 +193,13 @@ class ProgressBar:
     def __exit__(self, *exception: object) -> None:
         self._bar.stop()
 
+    def move(self, done: int, total: int, text: str) -> None:
+        """Moves the bar of work whose length was not known when it was started."""
+        if total != self._total:
+            self._total, self._printed = total, done
+            self._bar.update(self._task, total=total)
+        self.show(done, text)
+
     def show(self, done: int, text: str) -> None:
         """Moves the bar; on a plain output a line is printed every twentieth of the way."""
         self._bar.update(self._task, completed=done, text=text)

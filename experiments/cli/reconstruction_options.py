@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments.cli import choosable, space_options
+from experiments.cli import choosable
 from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
     from experiments.r3f import records
+    from refref_jax.choices import Space
 else:
     records = late("experiments.r3f.records")
 
@@ -40,12 +41,16 @@ LIGHT_STEPS = flags.DEFINE_integer(
 _LARGEST_INDEX = 5.0
 
 
-def chosen(*, index: float | None, seed: int) -> records.ReconstructionConfig:
+def chosen(
+    *, index: float | None, seed: int, space: Space | None, radius: float | None
+) -> records.ReconstructionConfig:
     """Returns what the options ask for.
 
     Args:
-      index: the index of refraction, or `None` to estimate it.
-      seed: of everything random.
+      index: index of refraction, or `None` to estimate it.
+      seed: seed of everything random.
+      space: where the background stands, or `None` for what the scene says.
+      radius: its half extent or radius, world units, or `None` likewise.
 
     Raises:
       ValueError: if one would have no effect.
@@ -60,8 +65,8 @@ def chosen(*, index: float | None, seed: int) -> records.ReconstructionConfig:
         RESOLUTION.value,
         OUTLIERS.value,
         index,
-        space_options.chosen_space(),
-        space_options.RADIUS.value,
+        space,
+        radius,
         LIGHT_STEPS.value,
         seed,
     )

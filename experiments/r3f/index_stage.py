@@ -14,8 +14,6 @@ from experiments.cli import commands
 from experiments.figures import style as plotting
 from experiments.figures.style import COLOURS, pyplot
 from experiments.r3f import body_pixels
-from experiments.runs import trainer
-from refref_jax.data import background, local_layout
 from refref_jax.data.geometry import build_geometry
 from refref_jax.optics.budgets import STRAIGHT
 from refref_jax.reconstruct.index_search import (
@@ -26,12 +24,12 @@ from refref_jax.reconstruct.index_search import (
 )
 from refref_jax.reconstruct.triangles import Mesh
 from refref_jax.render import saved
-from refref_jax.render.config import ModelConfig
 from refref_jax.render.model import Model
 from refref_jax.render.saved import SavedModel
 from refref_jax.sampling.domains import Space
-from refref_jax.training import presets, run_folder, run_lock
-from refref_jax.training.config import SceneConfig, TrainingConfig
+from refref_jax.training import fit, run_folder
+from refref_jax.training.config import TrainConfig
+from refref_jax.training.resolve import read_facts, resolve
 
 PRESET = "tiny"
 """Of the background: its field is only looked at."""
@@ -118,18 +116,37 @@ def learn_background(
       KeyboardInterrupt: if its training was stopped; it has been saved.
     """
     run = folder / "background"
-    config, model = _plan(scene, _bounds(scene, space, radius), seed=seed, steps=steps)
+    config = TrainConfig().override(
+        scene=str(scene),
+        pixels="background",
+        background=space,
+        radius=radius,
+        paths="straight",
+        preset=PRESET,
+        steps=steps,
+        seed=seed,
+    )
+    resolved = resolve(config, read_facts(config.scene, parts=()))
+    # Nothing is inside an object that is not there; straight rays are sampled all along either way.
+    model = dataclasses.replace(resolved.model.config, interior="clear")
     wanted = SavedModel(model, STRAIGHT)
     if not run_folder.exists(run):
-        run_folder.create(run, config, wanted, build_geometry([], [], rule="nested"))
+        empty = build_geometry([], [], rule="nested")
+        run_folder.create(run, resolved.config, wanted, empty)
     elif saved.read_static(run) != wanted:
         raise ValueError(
             f"{run} was begun with another --background or --radius than are given now. Give those "
             "again, or remove that folder to have the background learned anew."
         )
-    with run_lock.hold(run):
-        if not trainer.train(run, scene=str(scene)):
-            raise KeyboardInterrupt
+    with commands.Interrupt() as interrupt, commands.ProgressBar("train", steps) as bar:
+        ended = fit.train(
+            run,
+            scene=scene,
+            progress=lambda step, _, text: bar.show(step, text),
+            stop=lambda: interrupt.requested,
+        )
+    if not ended:
+        raise KeyboardInterrupt
     return saved.load_model(run)
 
 
@@ -147,28 +164,3 @@ def draw(path: Path, found: IndexEstimate) -> None:
     plotting.style(axis)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
-
-
-def _bounds(scene: Path, space: Space | None, radius: float | None) -> presets.Bounds:
-    cameras = local_layout.read_frames(scene, "train").cameras
-    space = space or background.space(scene)
-    told = background.half_extent(scene) if space != "unbounded" else None
-    return presets.bounds(cameras, space=space, radius=radius or told)
-
-
-def _plan(
-    scene: Path, extent: presets.Bounds, *, seed: int, steps: int
-) -> tuple[TrainingConfig, ModelConfig]:
-    preset = presets.PRESETS[PRESET]
-    model = preset.model(extent, "clear")
-    config = TrainingConfig(
-        scene=SceneConfig(str(scene), "nested", ()),
-        paths="straight",
-        loss=presets.loss(model),
-        schedule=preset.schedule.over(steps),
-        batch=preset.batch,
-        pool=preset.pool,
-        seed=seed,
-        pixels="background",
-    )
-    return config, dataclasses.replace(model, footprint="cone")

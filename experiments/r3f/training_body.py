@@ -1,144 +1,159 @@
-"""Which body a training bends light with: the scene's meshes, or one that is reconstructed."""
+"""The object of a training: the scene's meshes, or one reconstructed from images and masks."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments.cli import reconstruction_options, scenes
-from experiments.cli.late_imports import late
-from experiments.runs import plans
+from experiments.cli import reconstruction_options
+from refref_jax.training.config import TrainConfig
 
 if TYPE_CHECKING:
-    from experiments.r3f import chain, provenance, records
     from refref_jax.data.meshes import MeshPart
-else:
-    chain = late("experiments.r3f.chain")
-    provenance = late("experiments.r3f.provenance")
-    records = late("experiments.r3f.records")
 
 METHOD = flags.DEFINE_enum(
     "method",
     "oracle",
     ["oracle", "r3f"],
     "Where objects come from: the scene's meshes and their indices of refraction, or images and "
-    "masks alone, from which one body and its index are reconstructed into {out}/r3f. Then --ior "
-    "is that body's index, as 1.5; it is estimated if not given.",
+    "masks alone, from which one object and its index are reconstructed into {out}/r3f. Then --ior "
+    "is that object's index, as 1.5; it is estimated if not given.",
 )
-RECONSTRUCTION = flags.DEFINE_string(
-    "reconstruction",
-    None,
-    "Folder that experiments.reconstruct wrote: train with its body instead of the scene's meshes.",
-)
-
-SETTLED = (
+FLAGS = (
     METHOD,
-    RECONSTRUCTION,
     reconstruction_options.GEOMETRY,
     reconstruction_options.RESOLUTION,
     reconstruction_options.OUTLIERS,
     reconstruction_options.LIGHT_STEPS,
 )
-"""Options that a run is begun with, and can not change when it is resumed."""
+"""Flags that a run is begun with, and can not change when it is resumed."""
 
 FOLDER = "r3f"
 """Below the run's folder: what is reconstructed for it."""
 
 
-def reconstructs() -> bool:
-    """Returns whether the options ask for a body that is reconstructed first."""
-    return METHOD.value == "r3f" and RECONSTRUCTION.value is None
+def reconstructs(given: str | None) -> bool:
+    """Returns whether an object is reconstructed first.
+
+    Args:
+      given: folder of a reconstruction that is there already.
+    """
+    return METHOD.value == "r3f" and not given
 
 
-def find(run: Path, *, resume: bool) -> MeshPart | None:
-    """Returns the body that the options ask for, or `None` for the scene's own meshes.
+def is_reconstructed(given: str | None) -> bool:
+    """Returns whether the object is a reconstructed one."""
+    return METHOD.value == "r3f" or bool(given)
+
+
+def check_flags(given: str | None, *, paths: str | None, ior: Sequence[str]) -> None:
+    """Refuses flags that contradict each other, or would have no effect, before any import.
+
+    Args:
+      given: the value of --reconstruction.
+      paths: the value of --paths.
+      ior: the values of --ior.
+
+    Raises:
+      ValueError: if there are any, or an index is not one.
+    """
+    if is_reconstructed(given):
+        given_index(ior)
+    if METHOD.value == "oracle" and given and METHOD.present:
+        raise ValueError(
+            "--method=oracle takes the scene's own meshes, not a reconstruction. Leave out either "
+            "--method or --reconstruction."
+        )
+    idle = [f"--{holder.name}" for holder in FLAGS[1:] if holder.present]
+    if idle and not reconstructs(given):
+        raise ValueError(
+            f"{', '.join(idle)} would have no effect, since nothing is reconstructed. Leave it "
+            "out, or add --method=r3f."
+        )
+    if is_reconstructed(given) and paths == "straight":
+        raise ValueError(
+            "--paths=straight knows of no objects, so that none has to be reconstructed. Leave out "
+            "--method and --reconstruction, or use --paths=tree."
+        )
+
+
+def given_index(ior: Sequence[str]) -> float | None:
+    """Returns the index of `--ior=NUMBER`, if it is given.
+
+    Raises:
+      ValueError: if there are several, or one has a name.
+    """
+    if not ior:
+        return None
+    if len(ior) > 1 or "=" in ior[0]:
+        raise ValueError(
+            f"--ior={ior[-1]}, but there is one reconstructed object, without a name. Give its "
+            "index alone, once, as in --ior=1.5."
+        )
+    return reconstruction_options.parse_index(ior[0])
+
+
+def find(run: Path, config: TrainConfig, *, ior: Sequence[str], resume: bool) -> MeshPart | None:
+    """Returns the reconstructed object that is asked for, or `None` for the scene's meshes.
 
     It is reconstructed first, or as much of it as is not done yet.
 
     Args:
       run: the run's folder.
-      resume: whether what is there may be gone on with.
+      config: the configuration, with the folder of the scene.
+      ior: the values of --ior.
+      resume: whether what is there may be continued.
 
     Raises:
-      ValueError: if there is no such body.
+      ValueError: if there is no such object.
     """
-    if METHOD.value == "oracle" and RECONSTRUCTION.value is None:
+    given, scene = config.scene.reconstruction, Path(config.scene.path)
+    if not is_reconstructed(given):
         return None
-    index = _given_index()
-    out = _folder(run)
-    if RECONSTRUCTION.value is not None:
+    from experiments.r3f import chain, records
+
+    index, out = given_index(ior), folder(run, given)
+    if given:
         if out.resolve() == run.resolve():
             raise ValueError(
                 f"--out={run} is the reconstruction itself. Give a folder of its own for the run."
             )
-        body = chain.read_part(out)
-        if chain.fingerprint(plans.opened_scene()) != records.read(out).inputs:
+        part = chain.read_part(out)
+        if chain.fingerprint(scene) != records.read(out).inputs:
             print(
                 f"warning: {out} was reconstructed from other images, masks or poses than those of "
-                f"{plans.SCENE.value}. Make sure that it is the same object in the same place."
+                f"{scene}. Make sure that it is the same object in the same place."
             )
-        return body if index is None else body._replace(index=index)
+        index = index or dict(config.scene.indices).get(part.name)
+        return part if index is None else part._replace(index=index)
     if out.exists() and not resume:
         raise ValueError(
             f"{out} holds a reconstruction already. Continue with --resume, or give another --out."
         )
-    config = reconstruction_options.chosen(index=index, seed=plans.SEED.value)
+    asked = reconstruction_options.chosen(
+        index=index, seed=config.seed, space=config.scene.space, radius=config.scene.radius
+    )
     try:
-        chain.reconstruct(plans.opened_scene(), out, config, compare=False)
+        chain.reconstruct(scene, out, asked, compare=False)
     except KeyboardInterrupt:
         print("Stopped. Continue with the same command and --resume.")
         raise
     return chain.read_part(out)
 
 
-def note(run: Path, body: MeshPart | None) -> None:
-    """Notes in the run's folder where its body comes from."""
-    found = None if body is None else provenance.Provenance(str(_folder(run).resolve()), body.index)
-    provenance.write(run, found)
+def note(run: Path, part: MeshPart | None, given: str) -> None:
+    """Notes in the run's folder where its object comes from."""
+    from experiments.r3f import provenance
+
+    made = None
+    if part is not None:
+        made = provenance.Provenance(str(folder(run, given).resolve()), part.index)
+    provenance.write(run, made)
 
 
-def _folder(run: Path) -> Path:
-    return run / FOLDER if RECONSTRUCTION.value is None else Path(RECONSTRUCTION.value)
-
-
-def _given_index() -> float | None:
-    """Returns the index of `--ior=NUMBER`, if it is given."""
-    words = scenes.IOR.value
-    if not words:
-        return None
-    if len(words) > 1 or "=" in words[0]:
-        raise ValueError(
-            f"--ior={words[-1]}, but there is one reconstructed body, without a name. Give its "
-            "index alone, once, as in --ior=1.5."
-        )
-    return reconstruction_options.parse_index(words[0])
-
-
-def check_options() -> None:
-    """Refuses options that contradict each other, or would have no effect, before any import.
-
-    Raises:
-      ValueError: if there are any, or an index is none.
-    """
-    if METHOD.value == "oracle" and RECONSTRUCTION.value is None:
-        scenes.given_indices()
-    else:
-        _given_index()
-    if METHOD.value == "oracle" and RECONSTRUCTION.value is not None and METHOD.present:
-        raise ValueError(
-            "--method=oracle takes the scene's own meshes, not a reconstruction. Leave out either "
-            "--method or --reconstruction."
-        )
-    given = [f"--{holder.name}" for holder in SETTLED[2:] if flags.FLAGS[holder.name].present]
-    if given and not reconstructs():
-        raise ValueError(
-            f"{', '.join(given)} would have no effect, since nothing is reconstructed. Leave it "
-            "out, or add --method=r3f."
-        )
-    if (reconstructs() or RECONSTRUCTION.value) and plans.PATHS.value == "straight":
-        raise ValueError(
-            "--paths=straight knows of no objects, so that none has to be reconstructed. Leave out "
-            "--method and --reconstruction, or use --paths=tree."
-        )
+def folder(run: Path, given: str | None) -> Path:
+    """Returns the folder of a run's reconstruction."""
+    return Path(given) if given else run / FOLDER

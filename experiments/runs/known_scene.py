@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from experiments.cli import view_numbers
-from experiments.runs import mesh_report
 from refref_jax import metrics
-from refref_jax.data import background, containment, local_layout, meshes, scene_names
+from refref_jax.data import background, containment, local_layout, meshes, rule_advice, scene_names
 from refref_jax.data.containment import Containment
 from refref_jax.data.geometry import build_geometry
 from refref_jax.data.meshes import MeshPart
@@ -87,7 +86,7 @@ def read_scene(
     chosen = view_numbers.choose(views, len(frames.names))
     parts = meshes.read_meshes(scene, indices=indices)
     tree = containment.find_containment(parts)
-    mesh_report.report_meshes(parts, tree, rule=rule)
+    print("\n".join(rule_advice.check_meshes(parts, tree, rule=rule)))
     return build_scene(scene, parts, tree, frames=frames, chosen=chosen, rule=rule)
 
 

@@ -171,7 +171,7 @@ def read_training(run: Path, *, wall: float, peak_host_mib: float | None) -> Tra
     lines = run_folder.read_metrics(run)
     last = lines[-1]
     pace = seconds_per_step(lines)
-    batch = json.loads((run / "config.json").read_text("utf-8"))["batch"]
+    batch = run_folder.read_config(run).schedule.batch
     device = last.get("peak_device_bytes")
     return Training(
         steps=last["step"],

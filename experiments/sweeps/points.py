@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from experiments.cli import command_line
-from experiments.runs import model_options
 from refref_jax.fields import registry
 from refref_jax.optics.budgets import BUDGETS
+from refref_jax.training import resolve
 from refref_jax.training.presets import PRESETS, Bounds
 
 BASE = "base"
@@ -122,14 +122,14 @@ def own_values(preset: str, paths: str = "tree", *, field: str = registry.USUAL)
       field: kind of the fields.
     """
     model = PRESETS[preset].model(_ANY_BOUNDS, "field", field=field)
-    grid = model_options.grid_of(model)
+    grid = resolve.grid_of(model)
     of_grid = {}
     if grid is not None:
         entries = grid.entries.bit_length() - 1
         of_grid = {"entries": str(entries), "finest": str(grid.finest)}
     return {
         "field": field,
-        "samples": ",".join(map(str, model_options.samples_of(model))),
+        "samples": ",".join(map(str, resolve.samples_of(model))),
         "multisamples": str(model.multisamples),
         **of_grid,
         "footprint": model.footprint,

@@ -8,7 +8,6 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from experiments.runs import named_budgets
 from experiments.viewer import layers, viewpoints
 from refref_jax.data import local_layout, meshes
 from refref_jax.data.local_layout import Frames
@@ -94,7 +93,7 @@ def chosen_model(subject: Subject, choice: Choice) -> Model:
         interfaces = jax.device_put(layers.with_indices(interfaces, choice.indices, subject.rule))
     budget = model.budget
     if (choice.cut, choice.bends) != (budget.cut, budget.bends):
-        budget = named_budgets.vary(budget, cut=choice.cut, bends=choice.bends)
+        budget = dataclasses.replace(budget, cut=choice.cut, bends=choice.bends)
     return model._replace(geometry=model.geometry._replace(interfaces=interfaces), budget=budget)
 
 

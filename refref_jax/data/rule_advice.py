@@ -6,8 +6,9 @@ The rules are those of `optics.interface_rules`.
 from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple
 
+from refref_jax.data import lint
 from refref_jax.data.containment import Containment
-from refref_jax.data.findings import Finding
+from refref_jax.data.findings import Finding, refuse_errors
 from refref_jax.data.meshes import MeshPart
 from refref_jax.optics.interface_rules import NO_PARENT
 
@@ -53,6 +54,22 @@ def advise(parts: Sequence[MeshPart], containment: Containment) -> Advice:
         )
     lone = "there is one part" if len(parts) == 1 else f"all {len(parts)} parts lie apart"
     return Advice("nested", f"{lone}, so 'nested', 'facing' and 'priority' are the same.")
+
+
+def check_meshes(parts: Sequence[MeshPart], tree: Containment, *, rule: str) -> tuple[str, ...]:
+    """Returns which rule the meshes need, and what a lint finds in them.
+
+    Raises:
+      SceneError: if some of it must be mended first.
+    """
+    findings = lint.lint(parts, tree)
+    if rule == "priority":
+        findings += examine_priorities(parts, tree)
+    advice = "note: there are no meshes, so all light goes straight."
+    if parts:
+        advice = advise(parts, tree)
+    refuse_errors(findings)
+    return str(advice), *map(str, findings)
 
 
 def examine_priorities(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:

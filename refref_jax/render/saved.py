@@ -51,7 +51,7 @@ class SavedModel:
 
 def save_scene(run: Path, saved: SavedModel, geometry: Geometry) -> None:
     """Writes everything but the parameters into an existing folder."""
-    configuration.write(run / _MODEL, saved)
+    write_static(run, saved)
     surfaces, interfaces = geometry
     np.savez_compressed(
         run / _GEOMETRY,
@@ -60,6 +60,11 @@ def save_scene(run: Path, saved: SavedModel, geometry: Geometry) -> None:
         parts=surfaces.parts,
         **interfaces._asdict(),
     )
+
+
+def write_static(run: Path, saved: SavedModel) -> None:
+    """Writes the static half of a model into an existing folder."""
+    configuration.write(run / _MODEL, saved)
 
 
 def read_static(run: Path) -> SavedModel:

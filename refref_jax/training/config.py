@@ -1,65 +1,233 @@
-"""Static description of a training run."""
+"""The configuration of a training run: one small tree of frozen dataclasses.
+
+    config = TrainConfig().override(scene="scenes/ball", preset="small", steps=4000)
+
+Every value is reached by the name of its option, which is also the name of its command-line flag.
+`None` leaves a decision to the scene or the preset: `training.resolve` takes it, with a reason, and
+returns the same tree without `None`. That is what a run writes as `config.json`; a file in this
+form, complete or partial, begins a run again.
+
+Importing this module imports neither JAX nor the library's numerics.
+"""
 
 import dataclasses
-from typing import Literal
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from refref_jax.choices import (
+    DataLoss,
+    DistortionOver,
+    FieldName,
+    Footprint,
+    Interior,
+    Paths,
+    Pixels,
+    Precision,
+    PresetName,
+    Reentry,
+    Rule,
+    Space,
+    Tints,
+)
+
+# Points of the cone patterns, see `sampling.cones`.
+_PATTERNS = (1, 6)
+
+# More entries than a 32-bit hash tells apart serve nothing.
+_MOST_ENTRIES = 31
+
+
+def _option(default: Any = None, *, name: str = "", after: tuple[str, ...] = ()) -> Any:
+    """Declares a value of the configuration.
+
+    Args:
+      default: value if none is given; `None` for a decision of the scene or the preset.
+      name: name of the option where it is not that of the field.
+      after: options on which the decision depends. Overriding one of them takes it again.
+    """
+    return dataclasses.field(default=default, metadata={"name": name, "after": after})
 
 
 @dataclasses.dataclass(frozen=True)
 class SceneConfig:
-    """What is trained on.
+    """The scene that is trained on.
 
     Attributes:
-      path: the scene folder.
-      rule: what lies outside each mesh part, see `optics.interface_rules`.
-      indices: indices of refraction that replace the table's, by material or part.
+      path: Scene to train on: a folder, or hf:CONFIG/SCENE of the published data set.
+      rule: What lies outside each mesh: the part around it (nested), always air as in Cycles
+        (facing), or, of meshes that overlap, the one with the highest priority in scene.json.
+      indices: Index of refraction of a material or a mesh, over those of the table and of
+        scene.json.
+      space: Where the background stands: on a cube (bounded), on a sphere (spherical), or
+        infinitely far away (unbounded). By default as scene.json or the scene's name says.
+      radius: Half edge of the background's cube, or radius of its sphere (by default that of
+        scene.json, else 7.3), or radius of an unbounded scene's uncontracted ball, world units.
+      reconstruction: Folder that experiments.reconstruct wrote, whose object takes the place of the
+        scene's meshes.
+      pixels: Pixels that are learned from: all, or only those of the background, at least a margin
+        away from the masks.
     """
 
-    path: str
-    rule: Literal["nested", "facing", "priority"]
-    indices: tuple[tuple[str, float], ...]
+    path: str = _option("", name="scene")
+    rule: Rule = _option("nested")
+    indices: tuple[tuple[str, float], ...] = _option((), name="ior")
+    space: Space | None = _option(name="background", after=("scene",))
+    radius: float | None = _option(after=("scene", "background"))
+    reconstruction: str = _option("")
+    pixels: Pixels = _option("all")
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        if self.radius is not None and not 0.0 < self.radius < math.inf:
+            raise ValueError(
+                f"radius is {self.radius}, but it is a length. Give a positive, finite number of "
+                "world units."
+            )
+        for name, index in self.indices:
+            if not name or not 0.0 < index < math.inf:
+                raise ValueError(
+                    f"The index of refraction of {name!r} is {index}. Give a name, and a positive "
+                    "number."
+                )
+
+
+@dataclasses.dataclass(frozen=True)
+class PathsConfig:
+    """The light paths that are followed.
+
+    Attributes:
+      name: Light paths: straight ignores the objects; paper bends up to 10 times and reflects at
+        the first surface, with its ablations without that and without total internal reflection;
+        tree follows every branch that carries light. By default tree if there are meshes, else
+        straight.
+      cut: Smallest throughput worth following, in [0, 1); by default that of the paths.
+      bends: Most refractions and reflections of a path; by default that of the paths.
+      reentry: Whether light that has left the objects may meet them again; by default found from
+        the meshes.
+    """
+
+    name: Paths | None = _option(name="paths", after=("scene",))
+    cut: float | None = _option(after=("paths",))
+    bends: int | None = _option(after=("paths",))
+    reentry: Reentry | None = _option(after=("scene", "paths", "bends"))
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        if self.cut is not None and not 0.0 <= self.cut < 1.0:
+            raise ValueError(
+                f"The cut is a share of a pixel's light, in [0, 1), not {self.cut}. Give 0.02 for "
+                "2 %."
+            )
+        if self.bends is not None and self.bends < 0:
+            raise ValueError(f"A path can not have {self.bends} bends. Give 0 or more.")
+
+
+@dataclasses.dataclass(frozen=True)
+class FieldConfig:
+    """The fields, and how they are sampled; what is not given is the preset's.
+
+    Attributes:
+      preset: Size of the model and its training.
+      field: Kind of field: Zip-NeRF's, or without its anti-aliasing Nerfacto's.
+      interior: What is modelled inside the objects: a learned field (the paper), nothing (clear),
+        or interfaces and media that take light (absorbing). By default clear if scene.json says
+        that all is, else absorbing.
+      tints: Colours of interfaces and media of an absorbing interior: those of scene.json, or
+        learned; by default given if scene.json describes every part.
+      footprint: Footprint of a pixel: widened by arc length (cone), or followed through the bends
+        (differential).
+      samples: Samples along a path in each proposal round, then in the final one, as 32,20.
+      multisamples: Points that stand for a sample's cone, 1 or 6.
+      entries: Most entries of a level of the radiance field's hash grid, as base-2 logarithm.
+      finest: Cells a side of that grid's finest level.
+      precision: Arithmetic of the fields.
+    """
+
+    preset: PresetName = _option("tiny")
+    field: FieldName = _option("zipnerf")
+    interior: Interior | None = _option(after=("scene", "paths", "bends", "tints"))
+    tints: Tints | None = _option(after=("scene", "paths", "bends", "interior"))
+    footprint: Footprint | None = _option(after=("preset", "field"))
+    samples: tuple[int, ...] | None = _option(after=("preset", "field"))
+    multisamples: int | None = _option(after=("preset", "field"))
+    entries: int | None = _option(after=("preset", "field"))
+    finest: int | None = _option(after=("preset", "field"))
+    precision: Precision | None = _option(after=("preset", "field"))
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        if self.samples is not None and not (self.samples and min(self.samples) > 0):
+            raise ValueError(
+                f"samples is {self.samples}, not a list of positive numbers. Write as in "
+                "samples=32,20."
+            )
+        if self.multisamples not in (None, *_PATTERNS):
+            raise ValueError(
+                f"There is no pattern of multisamples={self.multisamples} points. Give 1 (on the "
+                "centre line) or 6 (Zip-NeRF's hexagon)."
+            )
+        if self.entries is not None and not 1 <= self.entries <= _MOST_ENTRIES:
+            raise ValueError(
+                f"entries is {self.entries}, but it is the base-2 logarithm of a table's size. "
+                f"Give 1 to {_MOST_ENTRIES}, such as 17 for 131,072 entries."
+            )
 
 
 @dataclasses.dataclass(frozen=True)
 class LossConfig:
-    """What is minimised: the data loss plus the weighted others.
+    """The training loss: the data loss plus the weighted others.
 
     Attributes:
-      data: loss on sRGB colours.
-      interlevel: weight of the anti-aliased interlevel loss.
-      blurs: half-width of its blur for each proposal round, in normalised distance.
-      distortion: weight of the distortion loss.
-      hash_decay: weight of the decay of the hash grids.
-      dye_decay: weight of the optical density of learned colours.
-      distortion_over: which samples the distortion loss is summed over: those `outside` the
-        objects (the paper's correction), or `everywhere` (Mip-NeRF 360, the paper's ablation).
+      data: Loss on sRGB colours.
+      interlevel: Weight of the anti-aliased interlevel loss.
+      blurs: Half-width of its blur for each proposal round, in normalised distance.
+      distortion: Weight of the distortion loss.
+      hash_decay: Weight of the decay of the hash grids; by default that of the kind of field.
+      dye_decay: Weight of the optical density of learned colours.
+      distortion_over: Samples that the distortion loss draws together: those outside the objects
+        (the paper's correction), or everywhere (Mip-NeRF 360, the paper's ablation).
     """
 
-    data: Literal["mse", "charbonnier"]
-    interlevel: float
-    blurs: tuple[float, ...]
-    distortion: float
-    hash_decay: float
-    dye_decay: float
-    distortion_over: Literal["outside", "everywhere"] = "outside"
+    data: DataLoss = _option("mse", name="data_loss")
+    interlevel: float = _option(0.01, name="interlevel_weight")
+    blurs: tuple[float, ...] | None = _option(after=("preset", "field", "samples"))
+    distortion: float = _option(0.01, name="distortion_weight")
+    hash_decay: float | None = _option(after=("field",))
+    dye_decay: float = _option(1e-3)
+    distortion_over: DistortionOver = _option("outside", name="distortion")
 
 
 @dataclasses.dataclass(frozen=True)
 class ScheduleConfig:
-    """How the parameters move.
+    """How the parameters move, and on how many rays; what is not given is the preset's.
 
     Attributes:
-      steps: steps until the learning rate has reached its end.
-      warmup: steps of linear warm-up.
-      peak: learning rate after the warm-up.
-      end: learning rate at the end; the decay between is exponential.
-      anneal: steps until the proposals are fully trusted.
+      steps: Training steps, after which the learning rate has reached its end.
+      warmup: Steps of linear warm-up; by default the preset's share of the steps.
+      peak: Learning rate after the warm-up.
+      end: Learning rate at the end; the decay between is exponential.
+      anneal: Steps until the proposals are fully trusted; by default the preset's share.
+      batch: Rays a step.
+      pool: Batches whose light paths are traced at once.
     """
 
-    steps: int
-    warmup: int
-    peak: float
-    end: float
-    anneal: int
+    steps: int | None = _option(after=("preset",))
+    warmup: int | None = _option(after=("preset", "steps"))
+    peak: float | None = _option(name="learning_rate", after=("preset",))
+    end: float | None = _option(name="final_learning_rate", after=("preset",))
+    anneal: int | None = _option(after=("preset", "steps"))
+    batch: int | None = _option(after=("preset",))
+    pool: int | None = _option(after=("preset",))
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        for name, least in [("steps", 1), ("batch", 1), ("pool", 1), ("warmup", 0), ("anneal", 0)]:
+            if (number := getattr(self, name)) is not None and number < least:
+                raise ValueError(f"{name} is {number}. Give {least} or more.")
+        for name in ("peak", "end"):
+            if (rate := getattr(self, name)) is not None and not 0.0 < rate < math.inf:
+                raise ValueError(f"The learning rate {name} is {rate}. Give a positive number.")
 
     def over(self, steps: int) -> "ScheduleConfig":
         """Returns the same schedule stretched over another number of steps."""
@@ -68,27 +236,89 @@ class ScheduleConfig:
         return dataclasses.replace(self, steps=steps, warmup=warmup, anneal=anneal)
 
 
-@dataclasses.dataclass(frozen=True)
-class TrainingConfig:
-    """A training run, together with the model's own configuration.
+class Option(NamedTuple):
+    """One value of the configuration.
 
     Attributes:
-      scene: what is trained on.
-      paths: name of the budget of light paths, see `optics.budgets`.
-      loss: what is minimised.
-      schedule: how.
-      batch: rays a step.
-      pool: batches whose light paths are traced at once.
-      seed: of the initial parameters, the order of pixels and the sampling.
-      pixels: which of them are learned from: `all`, or those of the `background` alone, a margin
-        away from the masks.
+      name: name of the option, and of its flag.
+      section: field of `TrainConfig` that holds it; empty for the seed.
+      field: its field there.
     """
 
-    scene: SceneConfig
-    paths: str
-    loss: LossConfig
-    schedule: ScheduleConfig
-    batch: int
-    pool: int
-    seed: int
-    pixels: Literal["all", "background"] = "all"
+    name: str
+    section: str
+    field: dataclasses.Field
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """A training run.
+
+    Attributes:
+      scene: The scene that is trained on.
+      paths: The light paths that are followed.
+      model: The fields, and how they are sampled.
+      losses: The training loss.
+      schedule: How the parameters move, and on how many rays.
+      seed: Seed of the initial parameters, the order of pixels and the sampling.
+    """
+
+    scene: SceneConfig = SceneConfig()
+    paths: PathsConfig = PathsConfig()
+    model: FieldConfig = FieldConfig()
+    losses: LossConfig = LossConfig()
+    schedule: ScheduleConfig = ScheduleConfig()
+    seed: int = 0
+
+    def override(self, **given: Any) -> "TrainConfig":
+        """Returns this configuration with other values, by the names of their options.
+
+        Decisions that depended on a value that changes are taken again, unless they are given too:
+        with another `paths` the cut is that of those paths, with other `steps` the warm-up is
+        stretched. What was never set does not count as a change.
+
+        Args:
+          **given: new values.
+
+        Raises:
+          ValueError: if there is no such option, or a value is out of range.
+        """
+        options = {option.name: option for option in options_of()}
+        if unknown := sorted(set(given) - set(options)):
+            raise ValueError(
+                f"There is no option {unknown[0]!r}. Choose from {', '.join(sorted(options))}."
+            )
+        before = {name: self.get(name) for name in options}
+        changed = {n for n, x in given.items() if before[n] not in (None, "", x)}
+        again = {
+            name: None
+            for name, option in options.items()
+            if changed & set(option.field.metadata.get("after", ()))
+        }
+        config = self
+        for name, value in (again | given).items():
+            config = config._with(options[name], value)
+        return config
+
+    def get(self, name: str) -> Any:
+        """Returns a value by the name of its option."""
+        (option,) = (each for each in options_of() if each.name == name)
+        section = getattr(self, option.section) if option.section else self
+        return getattr(section, option.field.name)
+
+    def _with(self, option: Option, value: Any) -> "TrainConfig":
+        if not option.section:
+            return dataclasses.replace(self, **{option.field.name: value})
+        section = getattr(self, option.section)
+        section = dataclasses.replace(section, **{option.field.name: value})
+        return dataclasses.replace(self, **{option.section: section})
+
+
+def options_of() -> Iterator[Option]:
+    """Yields all options of a training, in the order of the configuration."""
+    for field in dataclasses.fields(TrainConfig):
+        if dataclasses.is_dataclass(field.default):
+            for leaf in dataclasses.fields(field.default):
+                yield Option(leaf.metadata["name"] or leaf.name, field.name, leaf)
+        else:
+            yield Option(field.name, "", field)

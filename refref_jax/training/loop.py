@@ -13,7 +13,7 @@ from refref_jax.optics.budgets import Budget, capacity_for
 from refref_jax.optics.wavefront import Geometry
 from refref_jax.render.config import ModelConfig, path_detail
 from refref_jax.training import devices, steps
-from refref_jax.training.config import TrainingConfig
+from refref_jax.training.config import TrainConfig
 from refref_jax.training.state import TrainState
 
 # Pixels by which the room for a batch's paths is measured.
@@ -38,7 +38,7 @@ class Setup(NamedTuple):
       mesh: the devices that train together; `None` for one alone.
     """
 
-    config: TrainingConfig
+    config: TrainConfig
     model: ModelConfig
     budget: Budget
     geometry: Geometry
@@ -50,7 +50,7 @@ class Setup(NamedTuple):
 
 
 def set_up(
-    config: TrainingConfig,
+    config: TrainConfig,
     model: ModelConfig,
     budget: Budget,
     geometry: Geometry,
@@ -67,7 +67,7 @@ def set_up(
     found = steps.survey_paths(geometry, sampler.survey(_SURVEY).rays, budget=budget)
     found = devices.as_in_the_first(jax.device_get(found))
     capacity = capacity_for(
-        budget, config.batch, mean=float(found.mean), deviation=float(found.deviation)
+        budget, config.schedule.batch, mean=float(found.mean), deviation=float(found.deviation)
     )
     hit_fraction = float(found.hit_fraction)
     geometry = devices.put_everywhere(geometry, mesh=mesh)
@@ -96,7 +96,7 @@ def run_steps(
     config = setup.config
     step = int(state.step)
     for first, pool in _pools(setup, step, until):
-        end = min(first + config.pool, until)
+        end = min(first + config.schedule.pool, until)
         while step < end:
             last = min(end, *(step + period - step % period for period in every))
             batches = np.int32(step - first), np.int32(last - first)
@@ -109,7 +109,7 @@ def run_steps(
 
 def _pools(setup: Setup, step: int, until: int) -> Iterator[tuple[int, steps.Pool]]:
     """Yields the pools of some steps with the number of steps before each, one traced ahead."""
-    size = setup.config.pool
+    size = setup.config.schedule.pool
     firsts = range(step - step % size, until, size)
     ahead = (_pool(setup, first) for first in firsts)
     pool = next(ahead, None)
@@ -121,7 +121,7 @@ def _pools(setup: Setup, step: int, until: int) -> Iterator[tuple[int, steps.Poo
 
 def _pool(setup: Setup, first: int) -> steps.Pool:
     """Returns the pool of the steps that follow the first so many."""
-    numbers = setup.sampler.numbers(first, setup.config.pool)
+    numbers = setup.sampler.numbers(first, setup.config.schedule.pool)
     if setup.epoch is not None:
         return setup.epoch._replace(order=devices.put_everywhere(numbers, mesh=setup.mesh))
     return trace_batches(setup, numbers.tolist())
@@ -149,12 +149,12 @@ def _trace_epoch(setup: Setup) -> steps.Pool | None:
     are kept or not as long as a pool has that room: when not kept, its batches are others.
     """
     config, batches = setup.config, setup.sampler.batches
-    pools = range(0, batches, config.pool)
+    pools = range(0, batches, config.schedule.pool)
     if config.schedule.steps <= batches:
         return None
-    one = jax.eval_shape(lambda: trace_batches(setup, range(config.pool)))
+    one = jax.eval_shape(lambda: trace_batches(setup, range(config.schedule.pool)))
     bytes_ = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(one))
     if bytes_ * len(pools) > _MOST_BYTES:
         return None
-    traced = [trace_batches(setup, range(first, first + config.pool)) for first in pools]
+    traced = [trace_batches(setup, range(first, first + config.schedule.pool)) for first in pools]
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:batches], *traced)

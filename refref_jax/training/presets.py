@@ -72,15 +72,11 @@ class Preset:
 
     Attributes:
       size: of the fields, by its name in `fields.registry`.
-      schedule: how parameters move.
-      batch: rays a step.
-      pool: batches traced at once.
+      schedule: how parameters move, and on how many rays.
     """
 
     size: str
     schedule: ScheduleConfig
-    batch: int
-    pool: int
 
     def model(
         self, bounds_: Bounds, interior: Interior, *, field: str = registry.USUAL
@@ -93,7 +89,7 @@ class Preset:
         sizes = registry.KINDS[field].sizes
         if self.size not in sizes:
             raise ValueError(
-                f"Fields of kind {field} have no size {self.size}. Use --preset with one of "
+                f"Fields of kind {field} have no size {self.size}. Use a preset of "
                 f"{', '.join(sizes)}."
             )
         size = sizes[self.size]
@@ -127,7 +123,9 @@ def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
       ValueError: if the radius is not positive and finite.
     """
     if radius is not None and not 0.0 < radius < math.inf:
-        raise ValueError(f"--radius={radius} is no radius. Give a positive number, in world units.")
+        raise ValueError(
+            f"radius is {radius}, but it is a length. Give a positive number of world units."
+        )
     farthest = float(np.max(np.linalg.norm(cameras.poses[:, :, 3], axis=-1)))
     if space == "unbounded":
         return Bounds(_NEAR, _FAR_UNBOUNDED, radius or 1.25 * farthest, space)
@@ -155,26 +153,26 @@ def loss(model: ModelConfig) -> LossConfig:
 PRESETS = {
     "tiny": Preset(
         size="tiny",
-        schedule=ScheduleConfig(steps=2500, warmup=100, peak=1e-2, end=1e-3, anneal=250),
-        batch=1024,
-        pool=32,
+        schedule=ScheduleConfig(
+            steps=2500, warmup=100, peak=1e-2, end=1e-3, anneal=250, batch=1024, pool=32
+        ),
     ),
     "small": Preset(
         size="small",
-        schedule=ScheduleConfig(steps=8000, warmup=300, peak=1e-2, end=1e-3, anneal=500),
-        batch=2048,
-        pool=32,
+        schedule=ScheduleConfig(
+            steps=8000, warmup=300, peak=1e-2, end=1e-3, anneal=500, batch=2048, pool=32
+        ),
     ),
     "paper": Preset(
         size="paper",
-        schedule=ScheduleConfig(steps=25_000, warmup=1000, peak=8e-3, end=1e-3, anneal=1000),
-        batch=4096,
-        pool=32,
+        schedule=ScheduleConfig(
+            steps=25_000, warmup=1000, peak=8e-3, end=1e-3, anneal=1000, batch=4096, pool=32
+        ),
     ),
     "best": Preset(
         size="best",
-        schedule=ScheduleConfig(steps=25_000, warmup=1000, peak=1e-2, end=1e-3, anneal=1000),
-        batch=16_384,
-        pool=8,
+        schedule=ScheduleConfig(
+            steps=25_000, warmup=1000, peak=1e-2, end=1e-3, anneal=1000, batch=16_384, pool=8
+        ),
     ),
 }

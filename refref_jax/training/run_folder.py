@@ -1,6 +1,6 @@
 """What a run writes: configuration, model and metrics, all readable text.
 
-{run}/config.json      the resolved `TrainingConfig`
+{run}/config.json      the resolved `TrainConfig`
 {run}/model.json       see `render.saved`
 {run}/metrics.jsonl    one line for every logged step
 """
@@ -17,10 +17,14 @@ from refref_jax import configuration, drafts
 from refref_jax.optics.wavefront import Geometry
 from refref_jax.render import saved
 from refref_jax.render.saved import SavedModel
-from refref_jax.training.config import TrainingConfig
+from refref_jax.training import resolve
+from refref_jax.training.config import TrainConfig, options_of
 
 CONFIG = "config.json"
 """What makes a folder that of a run."""
+
+# Of configurations that earlier versions wrote, beside those that are still there.
+_KEYS_BEFORE = {"loss", "batch", "pool"}
 
 _METRICS = "metrics.jsonl"
 _LEFT_BEHIND = (_METRICS, saved.CHECKPOINTS)
@@ -31,7 +35,7 @@ def exists(run: Path) -> bool:
     return (run / CONFIG).is_file()
 
 
-def create(run: Path, config: TrainingConfig, model: SavedModel, geometry: Geometry) -> None:
+def create(run: Path, config: TrainConfig, model: SavedModel, geometry: Geometry) -> None:
     """Opens a new run; the configuration comes last, so that a half-made folder is no run.
 
     Raises:
@@ -50,45 +54,85 @@ def check_free(run: Path) -> None:
       ValueError: if the folder holds a run already, or is a file.
     """
     if exists(run):
-        raise ValueError(
-            f"{run} holds a run already. Continue it with --resume, or give another --out."
-        )
+        raise ValueError(f"{run} holds a run already. Resume it, or give another folder.")
     if found := [str(run / name) for name in _LEFT_BEHIND if (run / name).exists()]:
         raise ValueError(
             f"{run} holds what is left of a run that can not be continued, for its {CONFIG} is "
-            f"missing. Remove {' and '.join(found)}, or give another --out."
+            f"missing. Remove {' and '.join(found)}, or give another folder."
         )
     if run.exists() and not run.is_dir():
-        raise ValueError(f"{run} is a file, but a run needs a folder. Give another --out.")
+        raise ValueError(f"{run} is a file, but a run needs a folder. Give another one.")
 
 
-def read_config(run: Path) -> TrainingConfig:
-    """Reads the configuration of a run."""
-    return configuration.read(run / CONFIG, TrainingConfig)
+def read_config(run: Path) -> TrainConfig:
+    """Reads the configuration of a run, also of one that an earlier version wrote.
+
+    Raises:
+      ValueError: if the file is missing or damaged.
+    """
+    return read_config_file(run / CONFIG)
 
 
-def check_unchanged(
-    run: Path, config: TrainingConfig, model: SavedModel, geometry: Geometry
-) -> None:
+def read_config_file(path: Path) -> TrainConfig:
+    """Reads a configuration, complete or partial.
+
+    That of a run of an earlier version lacks what its model.json tells; it is added from there.
+
+    Raises:
+      ValueError: if the file is missing, or is not one.
+    """
+    try:
+        content = configuration.parse_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        content = None  # `read` says what is wrong
+    if not (isinstance(content, dict) and set(content) >= _KEYS_BEFORE):
+        return configuration.read(path, TrainConfig)
+    try:
+        config = configuration.build(_with_todays_keys(content), TrainConfig)
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(
+            f"{path} does not hold a TrainConfig of an earlier version ({error}). Restore the file."
+        ) from error
+    return resolve.as_trained(config, saved.read_static(path.parent))
+
+
+def _with_todays_keys(content: dict[str, Any]) -> dict[str, Any]:
+    """Returns what a configuration of an earlier version says, by the keys of this one."""
+    sizes = {name: content[name] for name in ("batch", "pool")}
+    return {
+        "scene": content["scene"] | {"pixels": content.get("pixels", "all")},
+        "paths": {"name": content["paths"]},
+        "losses": content["loss"],
+        "schedule": content["schedule"] | sizes,
+        "seed": content["seed"],
+    }
+
+
+def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, geometry: Geometry) -> None:
     """Checks that a run was made with this very configuration; only its scene may have moved.
 
     Raises:
       ValueError: if not.
     """
     begun = read_config(run)
-    moved = dataclasses.replace(
-        begun, scene=dataclasses.replace(begun.scene, path=config.scene.path)
-    )
+    scene = dataclasses.replace(begun.scene, path=config.scene.path)
+    moved = dataclasses.replace(begun, scene=scene)
     if moved != config or saved.read_static(run) != model:
+        differing = [
+            option.name
+            for option in options_of()
+            if moved.get(option.name) != config.get(option.name)
+        ]
         raise ValueError(
-            f"{run} was begun with other options than the ones given now. Give --out and "
-            "--resume alone to continue it as it was, or choose another --out."
+            f"{run} was begun with other options than the ones given now "
+            f"({', '.join(differing) or 'in the model'}). Resume it without options to continue it "
+            "as it was, or choose another folder."
         )
     pairs = zip(jax.tree.leaves(saved.load_geometry(run)), jax.tree.leaves(geometry), strict=True)
     if not all(np.array_equal(theirs, ours) for theirs, ours in pairs):
         raise ValueError(
             f"{run} was begun with other meshes than those of {config.scene.path}. Give the scene "
-            "that it was begun with, or choose another --out."
+            "that it was begun with, or choose another folder."
         )
 
 

@@ -22,7 +22,7 @@ from refref_jax.render import pixels
 from refref_jax.render.config import ModelConfig
 from refref_jax.render.model import Params
 from refref_jax.training import objective
-from refref_jax.training.config import TrainingConfig
+from refref_jax.training.config import TrainConfig
 from refref_jax.training.devices import AXIS
 from refref_jax.training.objective import StepReport, Totals
 from refref_jax.training.state import TrainState, optimizer
@@ -97,7 +97,7 @@ def train_steps(
     first: Int[Array, ""],
     last: Int[Array, ""],
     *,
-    config: TrainingConfig,
+    config: TrainConfig,
     model: ModelConfig,
     mesh: Mesh | None = None,
 ) -> tuple[TrainState, StepReport]:
@@ -135,7 +135,7 @@ def _take_steps(
     first: Int[Array, ""],
     last: Int[Array, ""],
     *,
-    config: TrainingConfig,
+    config: TrainConfig,
     model: ModelConfig,
     axis: str | None = None,
 ) -> tuple[TrainState, StepReport]:
@@ -152,7 +152,7 @@ def _step(
     place: Int[Array, ""],
     *,
     pool: Pool,
-    config: TrainingConfig,
+    config: TrainConfig,
     model: ModelConfig,
     axis: str | None,
 ) -> tuple[TrainState, StepReport]:
@@ -167,11 +167,11 @@ def _step(
         light = pixels.gather_light(
             params, model, traced.paths, jitter, rays=rgb.shape[0], anneal=anneal
         )
-        return objective.total(light, traced.paths, config.loss)
+        return objective.total(light, traced.paths, config.losses)
 
     def judge(params: Params, totals: Totals) -> tuple[Float[Array, ""], StepReport]:
         target = rgb.astype(jnp.float32) / 255.0
-        report = objective.measure(params, totals, target, traced.lost, config.loss)
+        report = objective.measure(params, totals, target, traced.lost, config.losses)
         return report.loss, report
 
     # In two halves, between which devices tell each other what their paths sum to.

@@ -9,7 +9,7 @@ import types
 import pytest
 
 from experiments.cli import commands, first_interrupt
-from experiments.runs import trainer
+from refref_jax.training import fit
 from tests.experiments.command import ROOT
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -51,19 +51,19 @@ def test_before_its_first_step_a_training_ends_with_nothing_saved(tmp_path, monk
         seed=0,
     )
     for module, name in (
-        (trainer.run_folder, "read_config"),
-        (trainer.saved, "read_static"),
-        (trainer.saved, "load_geometry"),
-        (trainer.scene_option, "opened"),
-        (trainer, "_sampler"),
-        (trainer, "init_state"),
-        (trainer.devices, "put_everywhere"),
+        (fit.run_folder, "read_config"),
+        (fit.saved, "read_static"),
+        (fit.saved, "load_geometry"),
+        (fit.scene_source, "open_scene"),
+        (fit, "_sampler"),
+        (fit, "init_state"),
+        (fit.devices, "put_everywhere"),
     ):
         monkeypatch.setattr(module, name, lambda *arguments, **options: known)
-    monkeypatch.setattr(trainer.loop, "set_up", set_up)
-    monkeypatch.setattr(trainer, "_train", lambda *arguments: pytest.fail("it has begun"))
-    with pytest.raises(KeyboardInterrupt):
-        trainer.train(tmp_path)
+    monkeypatch.setattr(fit.loop, "set_up", set_up)
+    monkeypatch.setattr(fit, "_take_steps", lambda *arguments: pytest.fail("it has begun"))
+    with pytest.raises(KeyboardInterrupt), commands.Interrupt() as interrupt:
+        fit.train(tmp_path, stop=lambda: interrupt.requested)
     assert "Stopping after this step" in capfd.readouterr().out
     assert not any((tmp_path / "checkpoints").iterdir())
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from experiments.cli import view_numbers
-from experiments.runs import named_budgets
 from refref_jax.data import files
+from refref_jax.optics import budgets
 from refref_jax.render import BUDGETS
 from refref_jax.training import evaluation as measures
 from tests.experiments.command import ROOT, run_command
@@ -203,17 +203,17 @@ def test_views_keep_their_order():
 
 def test_a_budget_keeps_what_is_not_given_and_grows_below_its_cut():
     tree = BUDGETS["tree"]
-    assert named_budgets.make_budget("tree") == tree
-    assert named_budgets.make_budget("tree", cut=0.1, bends=3) == dataclasses.replace(
+    assert budgets.budget_of("tree") == tree
+    assert budgets.budget_of("tree", cut=0.1, bends=3) == dataclasses.replace(
         tree, cut=0.1, bends=3
     )
-    fine = named_budgets.make_budget("tree", cut=tree.cut / 4.0)
+    fine = budgets.budget_of("tree", cut=tree.cut / 4.0)
     assert fine.paths_per_ray == 2.0 * tree.paths_per_ray and fine.bends == tree.bends
     # Never without bound.
-    long = named_budgets.make_budget("tree", bends=2 * tree.bends)
+    long = budgets.budget_of("tree", bends=2 * tree.bends)
     assert long.segments_per_ray == 2.0 * tree.segments_per_ray
     assert (long.paths_per_ray, long.live_per_ray) == (tree.paths_per_ray, tree.live_per_ray)
-    assert named_budgets.make_budget("tree", cut=0.0).paths_per_ray < 10.0 * tree.paths_per_ray
+    assert budgets.budget_of("tree", cut=0.0).paths_per_ray < 10.0 * tree.paths_per_ray
 
 
 def test_measures_over_no_pixel_are_left_out():

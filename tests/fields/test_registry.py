@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.runs import model_options
-from experiments.runs.model_options import ModelOptions
 from refref_jax import configuration
 from refref_jax.fields import hash_grid, nerfacto, registry
 from refref_jax.fields.kinds import DensityConfig, FieldKind, FieldSize, Radiance, RadianceConfig
@@ -20,7 +18,9 @@ from refref_jax.render import saved
 from refref_jax.render.images import render_rays
 from refref_jax.render.model import Model, init_params
 from refref_jax.render.saved import SavedModel
+from refref_jax.training.config import FieldConfig
 from refref_jax.training.presets import PRESETS, Bounds, loss
+from refref_jax.training.resolve import override_model, samples_of
 from tests import scenes, small_model
 
 _BOUNDS = Bounds(near=0.05, far=16.0, radius=7.3, space="bounded")
@@ -68,7 +68,7 @@ def fog(monkeypatch):
 
 def test_a_third_kind_is_rendered_saved_and_sized(fog, tmp_path):
     model = PRESETS["tiny"].model(_BOUNDS, "field", field="fog")
-    assert model_options.samples_of(model) == (8, 6, 4, 2)
+    assert samples_of(model) == (8, 6, 4, 2)
     assert loss(model).blurs == (0.03, 0.003, 0.003) and loss(model).hash_decay == 0.0
     static = SavedModel(model, STRAIGHT)
     geometry = scenes.geometry(scenes.ball(1.3, subdivisions=1))
@@ -85,10 +85,10 @@ def test_what_a_third_kind_has_not_is_refused(fog):
     with pytest.raises(ValueError, match=r"kind fog have no size paper\..* tiny"):
         PRESETS["paper"].model(_BOUNDS, "field", field="fog")
     model = PRESETS["tiny"].model(_BOUNDS, "field", field="fog")
-    for options in (ModelOptions(entries=12), ModelOptions(finest=64)):
-        with pytest.raises(ValueError, match="which fields of kind fog have not"):
-            model_options.override(model, options, preset="tiny")
-    assert model_options.override(model, ModelOptions(precision="bfloat16"), preset="tiny") != model
+    for options in (FieldConfig(entries=12), FieldConfig(finest=64)):
+        with pytest.raises(ValueError, match="which fields of kind fog do not have"):
+            override_model(model, options)
+    assert override_model(model, FieldConfig(precision="bfloat16")) != model
 
 
 # --- the kinds there are ---

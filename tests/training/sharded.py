@@ -31,7 +31,7 @@ def train(mesh, *, steps, budget, kept=True, folder=None, resumed=None):
     geometry = scenes.geometry(scenes.ball(1.3, subdivisions=2))
     setup = loop.set_up(config, MODEL, BUDGETS[budget], geometry, small_model.sampler(), mesh=mesh)
     setup = setup if kept else setup._replace(epoch=None)
-    pool = setup.epoch or loop.trace_batches(setup, range(config.pool))
+    pool = setup.epoch or loop.trace_batches(setup, range(config.schedule.pool))
     state = devices.put_everywhere(init_state(config.seed, MODEL, schedule), mesh=mesh)
     if resumed is not None:
         with Checkpoints(Path(resumed), keep=1) as checkpoints:

@@ -26,7 +26,7 @@ _ADAM = 0.1
 _SCHEDULE = dataclasses.replace(small_model.CONFIG.schedule, warmup=0)
 _CONFIG = dataclasses.replace(small_model.CONFIG, schedule=_SCHEDULE)
 _FORGIVING = dataclasses.replace(
-    _CONFIG, loss=dataclasses.replace(_CONFIG.loss, data="charbonnier")
+    _CONFIG, losses=dataclasses.replace(_CONFIG.losses, data="charbonnier")
 )
 
 # Between them all choices of interior, footprint, multisamples, space, dilation, loss, and near.
@@ -135,8 +135,8 @@ def test_without_light_only_what_does_not_need_it_is_learned(batch):
     assert not np.any(extremes.colour_bias(gradient))
     assert all(np.any(table) for table in hash_grid.tables(gradient))
     fading = dyes.optical_density(extremes.parameters(case[1])["trained"].dyes)
-    expected = (200 / 255.0) ** 2 + _CONFIG.loss.hash_decay * report.hash_decay
-    expected += _CONFIG.loss.dye_decay * fading
+    expected = (200 / 255.0) ** 2 + _CONFIG.losses.hash_decay * report.hash_decay
+    expected += _CONFIG.losses.dye_decay * fading
     if batch == "all empty":
         assert report.interlevel == report.distortion == 0.0
         np.testing.assert_allclose(report.loss, expected, rtol=1e-6)

@@ -148,7 +148,7 @@ def test_training_lowers_the_loss():
 
 def test_reports_say_what_was_measured():
     _, (report,) = _train(_setup(), _start(), 1)
-    weights = CONFIG.loss
+    weights = CONFIG.losses
     mse = 10.0 ** (-report.psnr / 10.0)
     expected = (
         mse
@@ -162,23 +162,23 @@ def test_reports_say_what_was_measured():
 
 @pytest.mark.slow
 def test_the_ablation_counts_the_samples_inside_in_the_distortion_loss_alone():
-    loss = dataclasses.replace(CONFIG.loss, distortion_over="everywhere")
-    config = dataclasses.replace(CONFIG, loss=loss)
+    loss = dataclasses.replace(CONFIG.losses, distortion_over="everywhere")
+    config = dataclasses.replace(CONFIG, losses=loss)
     _, (corrected,) = _train(_setup(), _start(), 1)
     _, (ablated,) = _train(_setup(config), _start(config), 1)
     assert ablated.distortion > 1.02 * corrected.distortion > 0.0
     np.testing.assert_allclose(ablated.interlevel, corrected.interlevel, rtol=1e-6)
     np.testing.assert_allclose(
         ablated.loss - corrected.loss,
-        CONFIG.loss.distortion * (ablated.distortion - corrected.distortion),
+        CONFIG.losses.distortion * (ablated.distortion - corrected.distortion),
         rtol=1e-2,  # of a difference in the fourth digit
     )
 
 
 @pytest.mark.slow
 def test_charbonnier_changes_the_loss_only():
-    loss = dataclasses.replace(CONFIG.loss, data="charbonnier")
-    config = dataclasses.replace(CONFIG, loss=loss)
+    loss = dataclasses.replace(CONFIG.losses, data="charbonnier")
+    config = dataclasses.replace(CONFIG, losses=loss)
     _, (mse,) = _train(_setup(), _start(), 1)
     _, (charbonnier,) = _train(_setup(config), _start(config), 1)
     np.testing.assert_allclose(charbonnier.psnr, mse.psnr, rtol=1e-6)
@@ -190,7 +190,7 @@ def test_charbonnier_changes_the_loss_only():
 @pytest.mark.slow
 def test_any_budget_can_be_trained_along(budget):
     setup = _setup(budget=budget)
-    assert CONFIG.batch <= setup.capacity <= room(budget, CONFIG.batch).paths
+    assert CONFIG.schedule.batch <= setup.capacity <= room(budget, CONFIG.schedule.batch).paths
     _, reports = _train(setup, _start(), 2)
     assert all(np.isfinite(report.loss) and report.lost < 1e-3 for report in reports)
 
@@ -198,9 +198,12 @@ def test_any_budget_can_be_trained_along(budget):
 @pytest.mark.slow
 def test_light_is_lost_only_where_paths_have_too_little_room():
     setup = _setup()
-    assert setup.capacity > CONFIG.batch
-    rays, detail = setup.sampler.draw(np.arange(CONFIG.pool)).rays, path_detail(MODEL, PAPER)
-    room = {"roomy": setup.capacity, "tight": CONFIG.batch}
+    assert setup.capacity > CONFIG.schedule.batch
+    rays, detail = (
+        setup.sampler.draw(np.arange(CONFIG.schedule.pool)).rays,
+        path_detail(MODEL, PAPER),
+    )
+    room = {"roomy": setup.capacity, "tight": CONFIG.schedule.batch}
     lost = {
         name: steps.trace_pool(
             setup.geometry, rays, budget=PAPER, capacity=capacity, detail=detail
@@ -214,7 +217,7 @@ def test_light_is_lost_only_where_paths_have_too_little_room():
 
 
 def test_straight_light_needs_no_room_for_other_paths():
-    assert _setup(budget=STRAIGHT).capacity == CONFIG.batch < _setup().capacity
+    assert _setup(budget=STRAIGHT).capacity == CONFIG.schedule.batch < _setup().capacity
 
 
 def test_only_the_newest_checkpoints_are_kept_and_none_twice(tmp_path):

@@ -14,9 +14,8 @@ from absl import flags
 
 from experiments import train
 from experiments.r3f import provenance
-from experiments.runs import trainer
 from refref_jax.render import saved
-from refref_jax.training import run_folder
+from refref_jax.training import fit, run_folder
 
 
 def _begin(options):
@@ -26,8 +25,8 @@ def _begin(options):
     run, printed = Path(flags.FLAGS.out), io.StringIO()
     try:
         with contextlib.redirect_stdout(printed):
-            train.check_options()
-            train._begin(run)
+            train.check_flags()
+            train._train(run)
     except ValueError as error:
         return {"error": str(error)}
     geometry = saved.load_geometry(run)
@@ -44,5 +43,5 @@ def _begin(options):
 
 if __name__ == "__main__":
     # What a beginning comes to is asked, not what is learned from there.
-    trainer.train = lambda run, **where: True
+    fit.train = lambda run, **where: True
     json.dump([_begin(options) for options in json.load(sys.stdin)], sys.stdout)

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from experiments.r3f import body, index_stage
-from experiments.runs import trainer
 from refref_jax.data import meshes
 from refref_jax.reconstruct.index_search import IndexSearch
-from refref_jax.training import run_folder
+from refref_jax.training import fit, run_folder
 
 
 @pytest.mark.slow
@@ -19,20 +18,20 @@ def test_a_background_is_learned_beside_the_body_and_once(ball_scene, tmp_path, 
     search = functools.partial(IndexSearch, 1.47, 1.53, spacing=0.03, descents=1, most=4)
     monkeypatch.setattr(index_stage, "IndexSearch", search)
     kept = []
-    sampler = trainer.PixelSampler
+    sampler = fit.PixelSampler
 
     def note(*arguments, **options):
         kept.append(options["kept"])
         return sampler(*arguments, **options)
 
-    monkeypatch.setattr(trainer, "PixelSampler", note)
+    monkeypatch.setattr(fit, "PixelSampler", note)
     look = functools.partial(
         index_stage.run, ball_scene, mesh, tmp_path, seed=3, start=1.49, steps=300, rays=512
     )
     first, again = look(), look()
     assert first == again and len(kept) == 1
     config = run_folder.read_config(tmp_path / "background")
-    assert (config.pixels, config.paths, config.seed) == ("background", "straight", 3)
+    assert (config.scene.pixels, config.paths.name, config.seed) == ("background", "straight", 3)
     assert 0.2 < kept[0].mean() < 0.95
     assert first.index == pytest.approx(1.5, abs=0.01) and np.isfinite(first.deviation)
     assert len(first.descents) == 2 and (tmp_path / "index.png").stat().st_size > 5000
@@ -41,7 +40,7 @@ def test_a_background_is_learned_beside_the_body_and_once(ball_scene, tmp_path, 
 def test_a_background_that_was_begun_with_other_walls_is_not_taken(
     ball_scene, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(trainer, "train", lambda run, *, scene: False)
+    monkeypatch.setattr(fit, "train", lambda run, **options: False)
     learn = functools.partial(index_stage.learn_background, ball_scene, tmp_path, seed=3)
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):

@@ -106,7 +106,7 @@ def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
     ("name", "message"),
     [
         ("half", "Continue with --resume"),
-        ("named index", "--ior=glass=1.5, but there is one reconstructed body"),
+        ("named index", "--ior=glass=1.5, but there is one reconstructed object"),
         ("two indices", "Give its index alone, once"),
         ("no index", "--ior=15 is no index of refraction"),
         ("no number", "--ior=glass is no index of refraction"),

@@ -1,0 +1,273 @@
+"""Trains a model of a scene, into a folder that can be resumed, evaluated and rendered.
+
+    config = TrainConfig().override(scene="experiments/data/cube_smcvx_ball", steps=50)
+    model = fit(config, out="runs/fifty")
+
+`fit` is made of three calls for those who need what lies between them: `prepare` resolves a
+configuration, `begin` opens the run's folder, and `train` takes the steps that are missing.
+"""
+
+import contextlib
+import math
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+from jax.sharding import Mesh
+
+from refref_jax.data import local_layout, mask_margins, scene_source
+from refref_jax.data.batches import PixelSampler
+from refref_jax.data.meshes import MeshPart
+from refref_jax.optics.scene import Geometry
+from refref_jax.render import saved
+from refref_jax.render.model import Model
+from refref_jax.training import devices, loop, run_folder, run_lock
+from refref_jax.training.checkpoints import Checkpoints
+from refref_jax.training.config import TrainConfig
+from refref_jax.training.objective import StepReport
+from refref_jax.training.resolve import Resolved, build_scene, read_facts, resolve
+from refref_jax.training.state import TrainState, init_state
+
+# Steps that the device takes without the host, which sees an interrupt only between them.
+_MOST_STEPS = 10
+
+Progress = Callable[[int, int, str], None]
+"""Is called with the steps taken, those of the whole run, and a line on the last one."""
+
+
+class Periods(NamedTuple):
+    """How often things are done.
+
+    Attributes:
+      log: steps between two lines of metrics.
+      checkpoint: steps between checkpoints.
+      keep: newest checkpoints to keep.
+    """
+
+    log: int = 50
+    checkpoint: int = 500
+    keep: int = 2
+
+
+USUAL = Periods()
+
+
+def fit(
+    config: TrainConfig | None = None,
+    *,
+    out: str | Path | None = None,
+    resume: bool = False,
+    progress: Progress = lambda step, total, text: None,
+    report: Callable[[str], None] = print,
+    periods: Periods = USUAL,
+    mesh: Mesh | None = None,
+) -> Model:
+    """Trains a model of a scene, or goes on with a run, and returns it.
+
+    The folder holds the complete configuration (`config.json`), which repeats the run: on a CPU bit
+    for bit.
+
+    Args:
+      config: the run; may be `None` for one that is resumed, and is else compared with it.
+      out: folder of the run, which must not hold one yet; a temporary one if `None`.
+      resume: whether to go on with the run in `out`, if there is one.
+      progress: is called every `periods.log` steps.
+      report: is given what was decided, and warnings, as lines of text.
+      periods: how often metrics and checkpoints are written.
+      mesh: devices that train together; `None` for one alone.
+
+    Raises:
+      ValueError: if the configuration, the scene or the folder is not what training needs.
+    """
+    with contextlib.ExitStack() as stack:
+        if out is None:
+            out = stack.enter_context(tempfile.TemporaryDirectory(prefix="refref_jax_"))
+        run = Path(out)
+        resuming = resume and run_folder.exists(run)
+        if config is None and not resuming:
+            raise ValueError(f"{run} holds no run to resume. Give a configuration.")
+        if not resuming:
+            run_folder.check_free(run)
+        if config is not None:
+            resolved, scene = prepare(config)
+            report(resolved.describe())
+            open_ = run_folder.check_unchanged if resuming else begin
+            open_(run, resolved.config, resolved.model, scene)
+        train(run, progress=progress, report=report, periods=periods, mesh=mesh)
+        return saved.load_model(run)
+
+
+def prepare(
+    config: TrainConfig,
+    *,
+    parts: Sequence[MeshPart] | None = None,
+    report: Callable[[str], None] = print,
+) -> tuple[Resolved, Geometry]:
+    """Reads the scene of a configuration and takes the decisions that are open.
+
+    Args:
+      config: the run.
+      parts: objects that take the place of the scene's own meshes.
+      report: is given what the checks of the scene found, as lines of text.
+
+    Raises:
+      ValueError: if there is no such scene, it is broken, or what is asked for can not be had.
+    """
+    if not config.scene.path:
+        raise ValueError("No scene is given. Set scene to a folder, or to hf:CONFIG/SCENE.")
+    if config.scene.reconstruction and parts is None:
+        raise ValueError(
+            f"The object of this configuration was reconstructed ({config.scene.reconstruction}), "
+            "and is not read here. Give its mesh as parts, or use experiments.train."
+        )
+    folder = scene_source.open_scene(config.scene.path).resolve()
+    config = config.override(scene=str(folder)) if config.scene.path != str(folder) else config
+    facts = read_facts(config.scene, parts=parts)
+    for note in facts.notes:
+        report(note)
+    resolved = resolve(config, facts)
+    report(facts.describe())
+    return resolved, build_scene(resolved, facts)
+
+
+def begin(run: Path, *resolved: Any) -> None:
+    """Opens a run's folder; of several processes the first does, when all are ready.
+
+    Args:
+      run: the folder.
+      *resolved: configuration, model and geometry, see `run_folder.create`.
+
+    Raises:
+      ValueError: if the folder holds a run already.
+    """
+    devices.wait_for_all("all have planned, and nothing is written yet")
+    if devices.is_first():
+        run_folder.create(run, *resolved)
+    devices.wait_for_all("the folder is there")
+
+
+def train(
+    run: Path,
+    *,
+    scene: str | Path | None = None,
+    progress: Progress = lambda step, total, text: None,
+    report: Callable[[str], None] = print,
+    stop: Callable[[], bool] = lambda: False,
+    periods: Periods = USUAL,
+    mesh: Mesh | None = None,
+) -> bool:
+    """Trains the run of a folder from its newest checkpoint, or from the start.
+
+    Of several processes all take the same steps and end together, and the first alone writes.
+
+    Args:
+      run: the folder.
+      scene: where its scene is now, if it has moved.
+      progress: is called every `periods.log` steps.
+      report: is given warnings, and how it ended, as lines of text.
+      stop: is asked between steps whether to save a checkpoint and end.
+      periods: how often metrics and checkpoints are written.
+      mesh: the devices that train together; `None` for one alone.
+
+    Returns:
+      Whether it has reached its last step.
+
+    Raises:
+      KeyboardInterrupt: if it was to stop before it took a step.
+    """
+    config, model = run_folder.read_config(run), saved.read_static(run)
+    lock = run_lock.hold(run) if devices.is_first() else contextlib.nullcontext()
+    with lock, Checkpoints(run, keep=periods.keep) as checkpoints:
+        if checkpoints.newest() == config.schedule.steps:
+            report(f"{run} is trained already: {config.schedule.steps} steps.")
+            return True
+        sampler = _sampler(config, scene_source.open_scene(scene or config.scene.path))
+        geometry = saved.load_geometry(run)
+        setup = loop.set_up(config, model.config, model.budget, geometry, sampler, mesh=mesh)
+        if setup.hit_fraction == 0.0 and model.budget.bends > 0:
+            report(
+                "warning: no pixel sees the meshes, so no light is bent. Check that their units, "
+                "axes and position are those of the cameras."
+            )
+        state = init_state(config.seed, model.config, config.schedule)
+        state = devices.put_everywhere(state, mesh=mesh)
+        if checkpoints.newest() is not None:
+            state = checkpoints.restore(state)
+        if devices.any_process(stop()):
+            raise KeyboardInterrupt  # there is nothing to save yet
+        step = _take_steps(run, setup, state, checkpoints, periods, progress, stop)
+    if step < config.schedule.steps:
+        report(f"Stopped at step {step}.")
+    return step == config.schedule.steps
+
+
+def _sampler(config: TrainConfig, scene: Path) -> PixelSampler:
+    """Reads the pixels that a run learns from."""
+    frames = local_layout.read_frames(scene, "train")
+    kept = None
+    if config.scene.pixels == "background":
+        kept = mask_margins.well_outside(local_layout.read_masks(frames))
+    images, batch = local_layout.read_images(frames), config.schedule.batch
+    return PixelSampler(images, frames.cameras, seed=config.seed, batch=batch, kept=kept)
+
+
+def _take_steps(
+    run: Path,
+    setup: loop.Setup,
+    state: TrainState,
+    checkpoints: Checkpoints,
+    periods: Periods,
+    progress: Progress,
+    stop: Callable[[], bool],
+) -> int:
+    """Takes the steps that are missing, and returns the number of the last."""
+    total, step = setup.config.schedule.steps, int(state.step)
+    writes = devices.is_first()
+    earlier = run_folder.rewind_metrics(run, step) if writes else 0.0
+    start = last = time.monotonic()
+    logged = step
+    progress(step, total, "")
+    every = (_MOST_STEPS, periods.log, periods.checkpoint)
+    for stepped, measured in loop.run_steps(setup, state, total, every=every):
+        step = int(stepped.step)
+        if step % periods.log == 0 or step == total:
+            measured = jax.device_get(measured)
+            now = time.monotonic()
+            rate = setup.config.schedule.batch * (step - logged) / (now - last)
+            line = _line(step, measured, rate, earlier + now - start)
+            if writes:
+                run_folder.append_metrics(run, line)
+            text = f"loss {measured.loss:.5f}  PSNR {measured.psnr:.2f}  {rate:.0f} rays/s"
+            progress(step, total, text)
+            last, logged = now, step
+        stopping = devices.any_process(stop())
+        if step % periods.checkpoint == 0 or step == total or stopping:
+            checkpoints.save(stepped)
+        if stopping:
+            break
+    return step
+
+
+def _line(step: int, measured: StepReport, rate: float, seconds: float) -> dict[str, Any]:
+    """Returns a line of metrics.
+
+    Raises:
+      ValueError: if the loss is not finite.
+    """
+    if not math.isfinite(measured.loss):
+        raise ValueError(
+            f"The loss is {measured.loss} at step {step}. Evaluate the last checkpoint, which is "
+            "finite, or train again with another seed into another folder; and please report the "
+            "scene."
+        )
+    values = {name: float(value) for name, value in measured._asdict().items()}
+    line = {"step": step, **values, "rays_per_second": rate, "seconds": seconds}
+    # A CPU keeps no such record.
+    if (memory := jax.local_devices()[0].memory_stats()) is not None:
+        line["peak_device_bytes"] = memory["peak_bytes_in_use"]
+    # JSON has no infinity, which the PSNR of a batch that is met exactly is.
+    finite = (x if not isinstance(x, float) or math.isfinite(x) else str(x) for x in line.values())
+    return dict(zip(line, finite, strict=True))

@@ -1,0 +1,417 @@
+"""Decides what a training models of its scene: only what the scene requires, unless told otherwise.
+
+    facts = read_facts(config.scene)      # reads and checks the scene (NumPy)
+    resolved = resolve(config, facts)     # takes every open decision, with a reason for each
+    print(resolved.describe())
+
+This is the one place where decisions are taken. The resolved configuration is complete, and
+resolving it again gives the same.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from refref_jax.data import background, containment, local_layout, meshes, needs, rule_advice
+from refref_jax.data.batches import check_batch
+from refref_jax.data.containment import Containment
+from refref_jax.data.geometry import build_geometry
+from refref_jax.data.meshes import MeshPart
+from refref_jax.data.needs import Needs
+from refref_jax.fields import networks
+from refref_jax.fields.hash_grid import HashGridConfig
+from refref_jax.fields.kinds import RadianceConfig
+from refref_jax.geometry.cameras import Cameras
+from refref_jax.optics.budgets import Budget, budget_of
+from refref_jax.optics.media import EMPTY_SLOT
+from refref_jax.optics.scene import Geometry
+from refref_jax.render.config import ModelConfig
+from refref_jax.render.saved import SavedModel
+from refref_jax.training import presets
+from refref_jax.training.config import FieldConfig, SceneConfig, TrainConfig, options_of
+
+# Why options have their values.
+_GIVEN = "given"
+_USUAL = "by default"
+
+
+class SceneFacts(NamedTuple):
+    """What a scene says of itself.
+
+    Attributes:
+      needs: what it requires, with the space of `SceneConfig` if that is given.
+      cameras: of the training images.
+      parts: the meshes.
+      tree: how they lie in one another.
+      half_extent: of the background's cube, or radius of its sphere, if scene.json tells it.
+      notes: what the checks of the meshes found.
+    """
+
+    needs: Needs
+    cameras: Cameras
+    parts: Sequence[MeshPart]
+    tree: Containment
+    half_extent: float | None
+    notes: tuple[str, ...]
+
+    def describe(self) -> str:
+        """Returns what the scene requires, in one line."""
+        return needs.describe(self.needs)
+
+
+class Resolved(NamedTuple):
+    """A training run with every decision taken.
+
+    Attributes:
+      config: the configuration, complete.
+      model: what is compiled of it: fields, sampling, and which light is followed.
+      reasons: why each option has its value, by its name.
+      warnings: what is doubtful about what was asked for.
+    """
+
+    config: TrainConfig
+    model: SavedModel
+    reasons: dict[str, str]
+    warnings: tuple[str, ...]
+
+    def describe(self) -> str:
+        """Returns the options by the reason for their values, a line for each reason."""
+        by_reason: dict[str, list[str]] = {}
+        for option in options_of():
+            value = self.config.get(option.name)
+            if value is not None and value != ():
+                text = f"{option.name}={_shown(value)}"
+                by_reason.setdefault(self.reasons[option.name], []).append(text)
+        lines = [f"  {reason}: {', '.join(values)}" for reason, values in by_reason.items()]
+        return "\n".join([*lines, *(f"warning: {each}" for each in self.warnings)])
+
+
+def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -> SceneFacts:
+    """Reads and checks a scene (a folder).
+
+    Args:
+      scene: the scene; its path is that of a folder.
+      parts: objects that take the place of the scene's own meshes.
+
+    Raises:
+      ValueError: if the scene is broken, or a camera stands where it can not be followed.
+    """
+    folder = Path(scene.path)
+    local_layout.check_scene(folder)
+    cameras = local_layout.read_frames(folder, "train").cameras
+    if parts is None:
+        parts = meshes.read_meshes(folder, indices=dict(scene.indices))
+    tree = containment.find_containment(parts)
+    notes = rule_advice.check_meshes(parts, tree, rule=scene.rule)
+    if scene.rule == "priority":
+        _refuse_cameras_inside(parts, cameras)
+    space = scene.space or background.space(folder)
+    found = needs.find_needs(parts, tree, cameras, rule=scene.rule, space=space)
+    extent = background.half_extent(folder) if space != "unbounded" else None
+    return SceneFacts(found, cameras, parts, tree, extent, notes)
+
+
+def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
+    """Takes every decision that a configuration leaves open.
+
+    Raises:
+      ValueError: if what is asked for contradicts itself, or is not known of the scene.
+    """
+    asked, found = config, facts.needs
+    reasons = _first_reasons(config)
+    budget, config = _resolve_paths(config, found, reasons)
+    config = _resolve_inside(config, found, budget, reasons)
+    model, config = _resolve_model(config, facts, reasons)
+    if budget.bends:
+        budget = dataclasses.replace(budget, reentry=config.paths.reentry)
+    config = _resolve_training(config, model, reasons)
+    check_batch(facts.cameras, config.schedule.batch)
+    return Resolved(config, SavedModel(model, budget), reasons, tuple(_doubts(asked, found)))
+
+
+def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
+    """Returns a configuration with what a saved model tells of its decisions.
+
+    For runs of earlier versions, whose configuration did not hold them. Which preset they began
+    with is not known, and all that follows from it is told by the model.
+    """
+    model, budget = saved.config, saved.budget
+    reasons: dict[str, str] = {}
+    grid = grid_of(model)
+    tints = "learned" if model.learned_tints else "given"
+    return _decide(
+        config,
+        reasons,
+        "the model",
+        background=model.space,
+        radius=model.radius,
+        cut=budget.cut,
+        bends=budget.bends,
+        reentry=budget.reentry if budget.bends else None,
+        interior=model.interior,
+        tints=tints if model.interior == "absorbing" and budget.bends else "none",
+        footprint=model.footprint,
+        samples=samples_of(model),
+        multisamples=model.multisamples,
+        entries=grid and grid.entries.bit_length() - 1,
+        finest=grid and grid.finest,
+        precision=model.field.precision,
+    )
+
+
+def build_scene(resolved: Resolved, facts: SceneFacts) -> Geometry:
+    """Returns what bends light; its parts have colours only where these are given."""
+    given = resolved.config.model.tints == "given"
+    parts = facts.parts if given else meshes.without_colour(facts.parts)
+    return build_geometry(parts, facts.tree.parents, rule=resolved.config.scene.rule)
+
+
+def samples_of(model: ModelConfig) -> tuple[int, ...]:
+    """Returns the samples of every proposal round, the final round's last."""
+    return (*(proposal.samples for proposal in model.proposals), model.samples)
+
+
+def grid_of(model: ModelConfig) -> HashGridConfig | None:
+    """Returns the hash grid of a model's radiance field, if fields of its kind have one."""
+    return model.field.grid if isinstance(model.field, networks.GridRadianceConfig) else None
+
+
+def _first_reasons(config: TrainConfig) -> dict[str, str]:
+    usual = TrainConfig()
+    return {
+        option.name: _USUAL if config.get(option.name) == usual.get(option.name) else _GIVEN
+        for option in options_of()
+    }
+
+
+def _decide(
+    config: TrainConfig, reasons: dict[str, str], why: str, /, **values: Any
+) -> TrainConfig:
+    """Fills in options that are open, and notes why."""
+    for name, value in values.items():
+        if config.get(name) is None and value is not None:
+            config = config.override(**{name: value})
+            reasons[name] = why
+    return config
+
+
+def _resolve_paths(
+    config: TrainConfig, found: Needs, reasons: dict[str, str]
+) -> tuple[Budget, TrainConfig]:
+    if found.parts == 0 and config.paths.name not in (None, "straight"):
+        raise ValueError(
+            f"There are no meshes, so there is nothing to bend light for paths={config.paths.name}."
+            " Add .ply files of the objects to the scene's folder meshes, or use paths=straight."
+        )
+    name, why = ("tree", "there are meshes") if found.parts else ("straight", "there are no meshes")
+    config = _decide(config, reasons, why, paths=name)
+    paths = config.paths
+    budget = budget_of(paths.name, cut=paths.cut, bends=paths.bends)
+    if budget.bends == 0:
+        _check_straight(config)
+        return budget, _decide(config, reasons, f"paths={paths.name}", cut=budget.cut, bends=0)
+    why = "light may meet the objects again"
+    if found.reentry == "impossible":
+        why = "light that has left one convex object meets none again"
+    config = _decide(config, reasons, why, reentry=found.reentry)
+    why = f"paths={paths.name}"
+    return budget, _decide(config, reasons, why, cut=budget.cut, bends=budget.bends)
+
+
+def _check_straight(config: TrainConfig) -> None:
+    """Refuses a wish about the inside of objects where light goes straight through them.
+
+    Raises:
+      ValueError: unless it asks for what there is anyway: a field everywhere.
+    """
+    asked = {"interior": config.model.interior, "reentry": config.paths.reentry}
+    for name, value in asked.items():
+        if value not in (None, "field", "possible"):
+            raise ValueError(
+                f"{name}={value} has no effect: light that goes straight "
+                f"(paths={config.paths.name}) knows of no objects. Leave it out, or use paths=tree "
+                "with meshes."
+            )
+
+
+def _resolve_inside(
+    config: TrainConfig, found: Needs, budget: Budget, reasons: dict[str, str]
+) -> TrainConfig:
+    """Decides what is modelled inside the objects, and where their colours come from."""
+    if budget.bends == 0:
+        interior, why = "field", "straight light ignores the objects"
+    elif found.interior == "clear" and config.model.tints != "learned":
+        interior, why = "clear", "scene.json says that the objects are clear"
+    else:
+        interior, why = "absorbing", "objects may take light"
+    config = _decide(config, reasons, why, interior=interior)
+    interior, tints = config.model.interior, config.model.tints
+    if interior != "absorbing" or budget.bends == 0:
+        given_as_clear = tints == "given" and found.tints == "none" and interior == "clear"
+        if tints not in (None, "none") and not given_as_clear:
+            raise ValueError(
+                f"tints={tints} has no effect with interior {interior} and at most {budget.bends} "
+                "bends. Leave it out, or use interior=absorbing and bent paths."
+            )
+        model = dataclasses.replace(config.model, tints=None)
+        config = dataclasses.replace(config, model=model)
+        return _decide(config, reasons, f"interior={interior}", tints="none")
+    if tints == "none":
+        raise ValueError(
+            "tints=none, but an absorbing interior has colours. Use tints=given or learned, or "
+            "interior=clear."
+        )
+    if tints == "given" and found.tints == "learned":
+        raise ValueError(
+            "tints=given, but scene.json does not tell colour_per_interface or absorption of every "
+            "part. Describe all of them there, or use tints=learned."
+        )
+    if found.tints == "learned":
+        why = "scene.json does not describe the colours of every part"
+        return _decide(config, reasons, why, tints="learned")
+    return _decide(config, reasons, "scene.json tells the colours", tints="given")
+
+
+def _resolve_model(
+    config: TrainConfig, facts: SceneFacts, reasons: dict[str, str]
+) -> tuple[ModelConfig, TrainConfig]:
+    scene, found = config.scene, facts.needs
+    config = _decide(config, reasons, "the scene", background=found.space)
+    extent = presets.bounds(
+        facts.cameras, space=found.space, radius=scene.radius or facts.half_extent
+    )
+    why = "scene.json" if facts.half_extent else "the data set's usual walls"
+    why = "the cameras" if found.space == "unbounded" else why
+    config = _decide(config, reasons, why, radius=extent.radius)
+    preset = presets.PRESETS[config.model.preset]
+    model = preset.model(extent, config.model.interior, field=config.model.field)
+    learned = found.parts if config.model.tints == "learned" else 0
+    model = override_model(dataclasses.replace(model, learned_tints=learned), config.model)
+    grid = grid_of(model)
+    config = _decide(
+        config,
+        reasons,
+        f"preset={config.model.preset}",
+        footprint=model.footprint,
+        samples=samples_of(model),
+        multisamples=model.multisamples,
+        entries=grid and grid.entries.bit_length() - 1,
+        finest=grid and grid.finest,
+        precision=model.field.precision,
+    )
+    return model, config
+
+
+def _resolve_training(
+    config: TrainConfig, model: ModelConfig, reasons: dict[str, str]
+) -> TrainConfig:
+    usual = presets.loss(model)
+    why = f"field={config.model.field}"
+    config = _decide(config, reasons, why, blurs=usual.blurs, hash_decay=usual.hash_decay)
+    preset = presets.PRESETS[config.model.preset]
+    schedule = preset.schedule.over(config.schedule.steps or preset.schedule.steps)
+    return _decide(
+        config,
+        reasons,
+        f"preset={config.model.preset}",
+        steps=schedule.steps,
+        warmup=schedule.warmup,
+        learning_rate=schedule.peak,
+        final_learning_rate=schedule.end,
+        anneal=schedule.anneal,
+        batch=schedule.batch,
+        pool=schedule.pool,
+    )
+
+
+def override_model(model: ModelConfig, asked: FieldConfig) -> ModelConfig:
+    """Returns a preset's model with what is asked of it; `None` leaves the preset's value.
+
+    Raises:
+      ValueError: if the model can not have that.
+    """
+    if asked.samples is not None:
+        model = _with_samples(model, asked.samples, asked.preset)
+    given = {"multisamples": asked.multisamples, "footprint": asked.footprint}
+    model = dataclasses.replace(model, **{n: x for n, x in given.items() if x is not None})
+    if asked.precision is not None:
+        proposals = tuple(
+            dataclasses.replace(
+                each, field=dataclasses.replace(each.field, precision=asked.precision)
+            )
+            for each in model.proposals
+        )
+        field = dataclasses.replace(model.field, precision=asked.precision)
+        model = dataclasses.replace(model, proposals=proposals, field=field)
+    return dataclasses.replace(model, field=_with_grid(model.field, asked))
+
+
+def _with_samples(model: ModelConfig, samples: tuple[int, ...], preset: str) -> ModelConfig:
+    rounds = len(model.proposals)
+    if len(samples) != rounds + 1:
+        raise ValueError(
+            f"samples={','.join(map(str, samples))} is for {len(samples) - 1} proposal rounds, but "
+            f"preset {preset} has {rounds}. Give {rounds + 1} numbers: one for each proposal "
+            "round, then the final round's."
+        )
+    proposals = tuple(
+        dataclasses.replace(proposal, samples=count)
+        for proposal, count in zip(model.proposals, samples[:-1], strict=True)
+    )
+    return dataclasses.replace(model, proposals=proposals, samples=samples[-1])
+
+
+def _with_grid(field: RadianceConfig, asked: FieldConfig) -> RadianceConfig:
+    if asked.entries is None and asked.finest is None:
+        return field
+    if not isinstance(field, networks.GridRadianceConfig):
+        raise ValueError(
+            f"entries and finest are of a hash grid, which fields of kind {field.kind} do not have."
+            " Leave them out."
+        )
+    grid = field.grid
+    if asked.entries is not None:
+        grid = dataclasses.replace(grid, entries=1 << asked.entries)
+    if asked.finest is not None:
+        if asked.finest < grid.coarsest:
+            raise ValueError(
+                f"finest={asked.finest} is coarser than the grid's first level of {grid.coarsest} "
+                "cells a side. Give at least that."
+            )
+        grid = dataclasses.replace(grid, finest=asked.finest)
+    return dataclasses.replace(field, grid=grid)
+
+
+def _doubts(asked: TrainConfig, found: Needs) -> list[str]:
+    doubts = []
+    if asked.model.interior == "clear" and found.tints == "given":
+        doubts.append(
+            "interior=clear, but scene.json gives the objects colours, which will be missing. Use "
+            "interior=absorbing."
+        )
+    if asked.paths.reentry == "impossible" and found.reentry == "possible":
+        doubts.append(
+            "reentry=impossible, but light that has left these objects may meet them again: it "
+            "will be followed no further. Leave it out."
+        )
+    return doubts
+
+
+def _refuse_cameras_inside(parts: Sequence[MeshPart], cameras: Cameras) -> None:
+    """Refuses cameras whose rays would have to know at once what they are in."""
+    if np.any(containment.parts_around(parts, cameras.poses[:, :, 3]) != EMPTY_SLOT):
+        raise ValueError(
+            "A camera stands inside a mesh, which training can not follow under rule=priority. Use "
+            "rule=nested, or move the camera."
+        )
+
+
+def _shown(value: Any) -> str:
+    """Returns a value as its flag takes it."""
+    if isinstance(value, tuple):
+        return ",".join(f"{x[0]}={x[1]:g}" if isinstance(x, tuple) else str(x) for x in value)
+    return f"{value:g}" if isinstance(value, float) and math.isfinite(value) else str(value)

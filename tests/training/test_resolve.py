@@ -1,0 +1,292 @@
+"""What training comes to: from what scenes require and options to a model."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from refref_jax import configuration
+from refref_jax.data.needs import Needs
+from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE, budget_of, capacity_factors
+from refref_jax.render import saved
+from refref_jax.training import run_folder
+from refref_jax.training.config import FieldConfig, TrainConfig, options_of
+from refref_jax.training.fit import prepare
+from refref_jax.training.resolve import SceneFacts, override_model, resolve, samples_of
+from tests.experiments.command import ROOT
+from tests.small_model import CAMERAS, MODEL
+
+_CLEAR = Needs(
+    parts=1,
+    bodies=1,
+    convex=True,
+    reentry="impossible",
+    interior="clear",
+    tints="none",
+    space="bounded",
+)
+_TINTED = _CLEAR._replace(
+    parts=3, convex=False, reentry="possible", interior="absorbing", tints="given"
+)
+_UNTOLD = _TINTED._replace(tints="learned")
+_EMPTY = _CLEAR._replace(parts=0, bodies=0, convex=False, interior="none")
+
+
+def _resolve(found, **given):
+    facts = SceneFacts(found, CAMERAS, (), None, None, ())
+    return resolve(TrainConfig().override(batch=64, **given), facts)
+
+
+@pytest.mark.parametrize(
+    ("found", "given", "expected"),
+    [
+        (_CLEAR, {}, ("tree", "clear", "none", 0)),
+        (_TINTED, {}, ("tree", "absorbing", "given", 0)),
+        (_UNTOLD, {}, ("tree", "absorbing", "learned", 3)),
+        (_EMPTY, {}, ("straight", "field", "none", 0)),
+        (_UNTOLD, {"paths": "paper"}, ("paper", "absorbing", "learned", 3)),
+        (_UNTOLD, {"paths": "straight"}, ("straight", "field", "none", 0)),
+        (_UNTOLD, {"bends": 0}, ("tree", "field", "none", 0)),
+        (_TINTED, {"tints": "learned"}, ("tree", "absorbing", "learned", 3)),
+        (_CLEAR, {"tints": "learned"}, ("tree", "absorbing", "learned", 1)),
+        (_CLEAR, {"interior": "absorbing"}, ("tree", "absorbing", "given", 0)),
+        (_CLEAR, {"interior": "field"}, ("tree", "field", "none", 0)),
+        (_UNTOLD, {"interior": "clear"}, ("tree", "clear", "none", 0)),
+    ],
+)
+def test_resolve_takes_what_the_scene_requires(found, given, expected):
+    made = _resolve(found, **given)
+    config, model = made.config, made.model.config
+    assert (config.paths.name, model.interior, config.model.tints, model.learned_tints) == expected
+    assert made.warnings == ()
+
+
+@pytest.mark.parametrize("found", [_CLEAR, _TINTED, _UNTOLD, _EMPTY])
+@pytest.mark.parametrize("given", [{}, {"paths": "straight"}, {"field": "nerfacto", "steps": 7}])
+def test_resolve_leaves_nothing_open_and_is_idempotent(found, given):
+    made = _resolve(found, **given)
+    straight = made.model.budget.bends == 0
+    for option in options_of():
+        left = straight and option.name == "reentry"
+        assert left == (made.config.get(option.name) is None), option.name
+        assert made.reasons[option.name]
+    again = resolve(made.config, SceneFacts(found, CAMERAS, (), None, None, ()))
+    assert (again.config, again.model) == (made.config, made.model)
+
+
+@pytest.mark.parametrize(
+    ("given", "option"),
+    [
+        ({"paths": "straight", "interior": "absorbing"}, "interior=absorbing"),
+        ({"paths": "straight", "interior": "clear"}, "interior=clear"),
+        ({"bends": 0, "interior": "clear"}, "interior=clear"),
+        ({"paths": "straight", "reentry": "impossible"}, "reentry=impossible"),
+    ],
+)
+def test_resolve_refuses_an_inside_for_straight_light(given, option):
+    with pytest.raises(ValueError, match=f"{option} has no effect"):
+        _resolve(_TINTED, **given)
+
+
+def test_resolve_grants_straight_light_what_it_has_anyway():
+    made = _resolve(_TINTED, paths="straight", interior="field", reentry="possible")
+    assert made.model.config.interior == "field" and made.model.budget == STRAIGHT
+
+
+def test_resolve_promises_in_the_budget_what_the_scene_keeps():
+    assert _resolve(_CLEAR).model.budget == dataclasses.replace(TREE, reentry="impossible")
+    assert _resolve(_TINTED).model.budget == TREE
+    paper = _resolve(_TINTED, paths="paper", bends=3).model.budget
+    assert paper == dataclasses.replace(PAPER, bends=3)
+    assert _resolve(_EMPTY).model.budget == STRAIGHT
+    assert _resolve(_CLEAR, reentry="possible").model.budget == TREE
+    assert _resolve(_TINTED, cut=0.005).model.budget.cut == 0.005
+
+
+def test_a_finer_cut_has_room_for_its_paths_however_it_is_made():
+    usual = capacity_factors(TREE)
+    for fine in (budget_of("tree", cut=TREE.cut / 4.0), dataclasses.replace(TREE, cut=0.005)):
+        assert capacity_factors(fine) == tuple(2.0 * x for x in usual)
+    longer = capacity_factors(dataclasses.replace(TREE, bends=48))
+    assert longer == usual._replace(segments_per_ray=2.0 * usual.segments_per_ray)
+    own = dataclasses.replace(TREE, paths_per_ray=3.0)
+    assert capacity_factors(dataclasses.replace(own, cut=0.005)).paths_per_ray == 3.0
+    # What an earlier version wrote out grows as well.
+    written = dataclasses.replace(TREE, live_per_ray=6.0, segments_per_ray=24.0, paths_per_ray=8.0)
+    assert capacity_factors(dataclasses.replace(written, cut=0.005)).paths_per_ray == 16.0
+
+
+def test_resolve_warns_of_what_is_doubtful():
+    made = _resolve(_TINTED, interior="clear", reentry="impossible")
+    assert made.model.config.interior == "clear" and made.model.budget.reentry == "impossible"
+    assert len(made.warnings) == 2 and made.describe().count("warning: ") == 2
+
+
+@pytest.mark.parametrize(
+    ("found", "given", "message"),
+    [
+        (_UNTOLD, {"tints": "given"}, "scene.json does not tell"),
+        (_TINTED, {"tints": "learned", "interior": "clear"}, "no effect with interior clear"),
+        (_TINTED, {"tints": "given", "interior": "field"}, "no effect with interior field"),
+        (_TINTED, {"tints": "given", "paths": "straight"}, "at most 0 bends"),
+        (_TINTED, {"tints": "none"}, "an absorbing interior has colours"),
+        (_EMPTY, {"tints": "learned"}, "no effect"),
+        (_EMPTY, {"paths": "tree"}, "no meshes"),
+        (_CLEAR, {"cut": 2.0}, "The cut"),
+        (_CLEAR, {"bends": -1}, "bends"),
+        (_CLEAR, {"paths": "straight", "bends": 10}, "no cut and no bends"),
+        (_CLEAR, {"paths": "straight", "cut": 0.02}, "no cut and no bends"),
+        (_CLEAR, {"dilation": 0.5}, "There is no option 'dilation'"),
+        (_CLEAR, {"samples": (32,)}, "is for 0 proposal rounds, but preset tiny has 1"),
+        (_CLEAR, {"samples": (32, 0)}, "not a list of positive numbers"),
+        (_CLEAR, {"multisamples": 3}, "multisamples=3"),
+        (_CLEAR, {"entries": 40}, "entries is 40"),
+        (_CLEAR, {"finest": 3}, "finest=3"),
+        (_CLEAR, {"radius": -1.0}, "radius is -1"),
+        (_CLEAR, {"steps": 0}, "steps is 0"),
+        (_CLEAR, {"learning_rate": float("nan")}, "learning rate peak is nan"),
+    ],
+)
+def test_resolve_refuses_what_can_not_be(found, given, message):
+    with pytest.raises(ValueError, match=message):
+        _resolve(found, **given)
+
+
+def test_override_takes_decisions_again_that_follow_from_a_change():
+    config = _resolve(_TINTED, scene="a", cut=0.01).config
+    paper = config.override(paths="paper")
+    assert (paper.paths.cut, paper.model.interior, paper.model.samples) == (None, None, (32, 20))
+    assert config.override(paths="tree", steps=2500) == config
+    shorter = config.override(steps=100).schedule
+    assert (shorter.warmup, shorter.anneal, shorter.peak) == (None, None, 1e-2)
+    assert config.override(steps=100, warmup=7).schedule.warmup == 7
+    # What was never set is no change.
+    assert TrainConfig().override(interior="field", scene="a").model.interior == "field"
+
+
+def test_override_model_replaces_one_thing_an_option():
+    asked = FieldConfig(
+        samples=(5, 4),
+        multisamples=6,
+        entries=8,
+        finest=32,
+        precision="bfloat16",
+        footprint="differential",
+    )
+    made = override_model(MODEL, asked)
+    assert samples_of(made) == (5, 4)
+    assert (made.multisamples, made.footprint) == (6, "differential")
+    assert (made.field.grid.entries, made.field.grid.finest) == (256, 32)
+    assert made.field.precision == made.proposals[0].field.precision == "bfloat16"
+    # The proposals keep their grids.
+    assert made.proposals[0].field.grid == MODEL.proposals[0].field.grid
+    assert override_model(MODEL, FieldConfig()) == MODEL
+
+
+def test_a_configuration_is_read_as_it_was_written(tmp_path):
+    config = _resolve(_TINTED, ior=(("glass", 1.52),), scene="a").config
+    configuration.write(tmp_path / "config.json", config)
+    assert run_folder.read_config_file(tmp_path / "config.json") == config
+    (tmp_path / "partial.json").write_text('{"paths": {"cut": 0.01}, "seed": 3}')
+    partial = run_folder.read_config_file(tmp_path / "partial.json")
+    assert partial == TrainConfig().override(cut=0.01, seed=3)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[" * 200_000, "nested too deeply"),
+        ('{"seed": NaN}', "NaN is not a number of JSON"),
+        ('{"seed": 0', "does not hold a TrainConfig"),
+        ('{"sead": 0}', "unknown 'sead'"),
+        ('{"paths": {"cut": 2}}', "The cut is a share"),
+        ("[]", "not an object"),
+        ('{"loss": 1, "batch": 2, "pool": 3}', "of an earlier version"),
+        ('{"loss": {}, "batch": 2, "pool": 3, "paths": []}', "of an earlier version"),
+        (b"\xff\xfe\x00", "does not hold a TrainConfig"),
+    ],
+)
+def test_a_file_that_is_no_configuration_is_refused_in_one_line(tmp_path, text, message):
+    path = tmp_path / "config.json"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ValueError, match=message) as caught:
+        run_folder.read_config_file(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_configuration_of_an_earlier_version_is_read(tmp_path):
+    resolved = _resolve(_TINTED, scene="a", paths="paper", steps=100, seed=3)
+    config, model = resolved.config, resolved.model
+    saved.write_static(tmp_path, model)
+    schedule, losses = vars(config.schedule), vars(config.losses)
+    before = {
+        "scene": {"path": "a", "rule": "nested", "indices": []},
+        "paths": "paper",
+        "loss": losses,
+        "schedule": {n: schedule[n] for n in ("steps", "warmup", "peak", "end", "anneal")},
+        "batch": schedule["batch"],
+        "pool": schedule["pool"],
+        "seed": 3,
+        "pixels": "all",
+    }
+    (tmp_path / "config.json").write_text(json.dumps(before))
+    assert run_folder.read_config(tmp_path) == config
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Makes scenes of the bundled one, whose part is described otherwise, or has no mesh."""
+    bundled = ROOT / "experiments" / "data" / "cube_smcvx_ball"
+
+    def make(name, *, mesh=True, **described):
+        folder = tmp_path_factory.mktemp("scenes") / name
+        folder.mkdir()
+        for path in bundled.iterdir():
+            if path.name not in ("scene.json", "meshes"):
+                (folder / path.name).symlink_to(path)
+        content = json.loads((bundled / "scene.json").read_text())
+        if mesh:
+            (folder / "meshes").symlink_to(bundled / "meshes")
+        content["parts"] = [{"mesh": "meshes/ball_body_glass.ply", **described}] if mesh else []
+        (folder / "scene.json").write_text(json.dumps(content))
+        return str(folder)
+
+    return make
+
+
+@pytest.mark.slow
+def test_prepare_resolves_scenes(scene):
+    tint, absorption = [0.5, 0.75, 1.0], [0.0, 0.25, 0.0]
+    tinted = scene("tinted", colour_per_interface=tint, absorption=absorption)
+    clear = scene("clear", colour_per_interface=[1, 1, 1])
+    untold, empty = scene("untold"), scene("empty", mesh=False)
+    cases = [
+        (clear, {}, ("tree", "clear")),
+        (tinted, {}, ("tree", "absorbing")),
+        (tinted, {"tints": "learned"}, ("tree", "absorbing")),
+        (tinted, {"interior": "field"}, ("tree", "field")),
+        (tinted, {"interior": "clear"}, ("tree", "clear")),
+        (untold, {}, ("tree", "absorbing")),
+        (empty, {}, ("straight", "field")),
+        (tinted, {"paths": "paper", "bends": 4, "samples": (7, 6)}, ("paper", "absorbing")),
+        (tinted, {"field": "nerfacto", "entries": 12}, ("tree", "absorbing")),
+        (clear, {"paths": "paper_no_tir", "distortion": "everywhere"}, ("paper_no_tir", "clear")),
+    ]
+    for place, given, expected in cases:
+        lines = []
+        config = TrainConfig().override(scene=place, **given)
+        made, geometry = prepare(config, report=lines.append)
+        assert (made.config.paths.name, made.config.model.interior) == expected
+        # Colours that are given lie on the paths; all others must not, or they would count twice.
+        on_paths = made.config.model.tints == "given"
+        assert on_paths == (expected[1] == "absorbing" and place == tinted and "tints" not in given)
+        if place != empty:
+            found = geometry.interfaces.tint[0], geometry.interfaces.absorption[0]
+            expected = (tint, absorption) if on_paths else ([1.0] * 3, [0.0] * 3)
+            np.testing.assert_array_equal(found, expected)
+        assert any("this scene" in line for line in lines)
+    with pytest.raises(ValueError, match="does not tell colour_per"):
+        prepare(TrainConfig().override(scene=untold, tints="given"))
+    with pytest.raises(ValueError, match="no meshes"):
+        prepare(TrainConfig().override(scene=empty, paths="tree"))
