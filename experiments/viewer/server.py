@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 import viser
 
-from experiments.viewer import layers, scenery, schedule, viewpoints
+from experiments.viewer import controls, layers, schedule, viewpoints
 from experiments.viewer import subject as subjects
+from experiments.viewer.controls import Panel
 from experiments.viewer.layers import Picture
-from experiments.viewer.panel import Panel
 from experiments.viewer.schedule import Job, State
 from experiments.viewer.subject import Choice, Subject
 from experiments.viewer.viewpoints import Viewpoint
@@ -88,7 +88,7 @@ class Page:
         self._state = State(stages=len(subject.heights))
         self._view = self._viewpoint()
         surfaces = subject.model.geometry.surfaces
-        self._scenery = scenery.Scenery(client.scene, surfaces, subject.views)
+        self._scenery = controls.Scenery(client.scene, surfaces, subject.views)
         self._panel = Panel(
             client.gui,
             subject,

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.viewer import scenery
+from experiments.viewer import controls
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.budgets import TREE
 from refref_jax.render import pixel_paths
@@ -26,8 +26,8 @@ def straight_down(slab):
 
 def test_strong_light_is_thick_and_yellow_and_weak_light_thin_and_blue():
     shares = np.array([1e-5, 1e-3, 0.0316228, 1.0, 2.0])
-    np.testing.assert_allclose(scenery.strength(shares), [0.0, 0.0, 0.5, 1.0, 1.0], atol=1e-6)
-    weak, *_, strong = scenery.colour(shares).astype(int)
+    np.testing.assert_allclose(controls.strength(shares), [0.0, 0.0, 0.5, 1.0, 1.0], atol=1e-6)
+    weak, *_, strong = controls.colour(shares).astype(int)
     assert weak[2] > 100 > weak[1] and strong[0] > 200 and strong[1] > 200 and strong[2] < 100
 
 
@@ -54,7 +54,7 @@ class _Node:
 
 def test_the_scene_shows_each_piece_once_and_nothing_of_the_last_pixel(straight_down, slab):
     scene = _Scene()
-    made = scenery.Scenery(scene, slab.surfaces, None)
+    made = controls.Scenery(scene, slab.surfaces, None)
     np.testing.assert_allclose(
         np.sort(scene.nodes.pop("/bodies/0").reshape(-1, 3), axis=0),
         np.sort(
@@ -69,6 +69,6 @@ def test_the_scene_shows_each_piece_once_and_nothing_of_the_last_pixel(straight_
         assert sum(map(len, lines)) == len(pieces.ends)
     thickness = {points[0].tobytes(): thick for points, thick in scene.nodes.values()}
     strongest = pieces.ends[np.argmax(pieces.shares)].tobytes()
-    assert thickness[strongest] == max(scenery.THICKNESSES)
+    assert thickness[strongest] == max(controls.THICKNESSES)
     made.remove_paths()
     assert scene.nodes == {}
