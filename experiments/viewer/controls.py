@@ -11,9 +11,8 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from experiments.viewer import subject as subjects
-from experiments.viewer import viewpoints
-from experiments.viewer.subject import Choice, Subject
+from experiments.viewer import session, viewpoints
+from experiments.viewer.session import Choice, Subject
 from refref_jax.geometry.bvh import LEAF_SIZE
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.surfaces import Surfaces
@@ -49,7 +48,7 @@ class Panel:
           show_cameras: shows or hides the test cameras.
           remove_paths: removes the light paths.
         """
-        first = subjects.first_choice(subject)
+        first = session.first_choice(subject)
         self._own = first.indices
         self._layer = gui.add_dropdown("layer", subject.layers, initial_value=first.layer)
         self._status = gui.add_markdown("")
@@ -114,8 +113,8 @@ class Panel:
                 )
             hint = "A new value is compiled once, which takes a while."
             for name, offered, own in (
-                ("cut", subjects.CUTS, first.cut),
-                ("bends", subjects.BENDS, first.bends),
+                ("cut", session.CUTS, first.cut),
+                ("bends", session.BENDS, first.bends),
             ):
                 values = [f"{x:g}" for x in np.unique([*offered, own])]
                 control = gui.add_dropdown(name, values, initial_value=f"{own:g}", hint=hint)
