@@ -11,7 +11,8 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from experiments.viewer import session, viewpoints
+from experiments.viewer import cameras as viewpoints
+from experiments.viewer import session
 from experiments.viewer.session import Choice, Subject
 from refref_jax.geometry.bvh import LEAF_SIZE
 from refref_jax.geometry.cameras import Cameras

@@ -18,11 +18,12 @@ from typing import Any
 import numpy as np
 import viser
 
-from experiments.viewer import controls, layers, session, viewpoints
+from experiments.viewer import cameras as viewpoints
+from experiments.viewer import controls, layers, session
+from experiments.viewer.cameras import Viewpoint
 from experiments.viewer.controls import Panel
 from experiments.viewer.layers import Picture
 from experiments.viewer.session import Choice, Job, State, Subject
-from experiments.viewer.viewpoints import Viewpoint
 from refref_jax.geometry.rays import Rays
 from refref_jax.render import pixel_paths
 

@@ -19,7 +19,8 @@ import jax
 import numpy as np
 
 from experiments.runs import named_budgets
-from experiments.viewer import layers, viewpoints
+from experiments.viewer import cameras as viewpoints
+from experiments.viewer import layers
 from refref_jax.data import local_layout, meshes
 from refref_jax.data.local_layout import Frames
 from refref_jax.geometry import cameras
