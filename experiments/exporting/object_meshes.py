@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.cli import output_folders
-from experiments.exporting.field_grid import split_parts
+from experiments.exporting.field_mesh import split_parts
 from experiments.r3f import body, records
 from refref_jax.data import stored_normals
 from refref_jax.optics.wavefront import Geometry
