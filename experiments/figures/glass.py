@@ -46,6 +46,15 @@ _FINER = 1e-3
 # Beyond any wall: last segments are cut where the picture ends.
 _FAR = 100.0
 
+_DPI = 150
+_QUALITY = 88
+
+_GLASS = {"facecolor": "#dcecf7", "edgecolor": "#5b8db8", "linewidth": 1.4, "zorder": 1}
+_SHARES = "plasma_r"
+_LEAST_SHARE = 1e-3
+_HUES = "turbo"
+_DISTANCES = "viridis"
+
 
 class Shown(NamedTuple):
     """One picture of a row.
@@ -161,16 +170,6 @@ def _walls(
 
 def _truth(scene: KnownScene) -> Shown:
     return Shown("true image", (scene.images[0] / 255.0).astype(np.float32))
-
-
-_DPI = 150
-_QUALITY = 88
-
-_GLASS = {"facecolor": "#dcecf7", "edgecolor": "#5b8db8", "linewidth": 1.4, "zorder": 1}
-_SHARES = "plasma_r"
-_LEAST_SHARE = 1e-3
-_HUES = "turbo"
-_DISTANCES = "viridis"
 
 
 def write_views(path: Path, views: Sequence[Shown]) -> None:

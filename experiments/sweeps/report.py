@@ -13,6 +13,21 @@ _HEAD = (
     "| SSIM | distance error | s an image |"
 )
 
+_COSTS: dict[str, Callable[[Row], float]] = {
+    "time of a step, ms": lambda row: 1e3 * row.seconds_per_step,
+    "time of all steps, s": lambda row: row.stepping,
+}
+
+_FRONT = "#999999"
+_MARKERS = "osD^vP"
+
+# Decibels below the best beyond which a point stands at the figure's foot, with its number: it
+# would press all others together.
+_DEPTH = 10.0
+
+# Of a letter of a label, in pixels of the figure.
+_LETTER_WIDTH = 6.5
+
 
 def markdown(rows: Sequence[Row]) -> str:
     """Returns the text of a report on a sweep; its figure is expected beside it."""
@@ -84,22 +99,6 @@ def _time(turn: Turn) -> str:
 
 def _or_dash(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
-
-
-_COSTS: dict[str, Callable[[Row], float]] = {
-    "time of a step, ms": lambda row: 1e3 * row.seconds_per_step,
-    "time of all steps, s": lambda row: row.stepping,
-}
-
-_FRONT = "#999999"
-_MARKERS = "osD^vP"
-
-# Decibels below the best beyond which a point stands at the figure's foot, with its number: it
-# would press all others together.
-_DEPTH = 10.0
-
-# Of a letter of a label, in pixels of the figure.
-_LETTER_WIDTH = 6.5
 
 
 def write_figure(path: Path, rows: Sequence[Row]) -> None:

@@ -25,6 +25,17 @@ _HINT = (
     "Click a pixel to draw its light paths. Yellow and thick is much light, blue and thin little."
 )
 
+_COLOURS = matplotlib.colormaps["plasma"]
+
+# Throughput at the ends of the scale of colours, which is logarithmic.
+_WEAKEST, _STRONGEST = 1e-3, 1.0
+
+THICKNESSES = (1.0, 2.0, 3.5, 5.5)
+"""Of lines, pixels, from weak to strong light: each stands for one share of the scale."""
+
+_BODY_COLOURS = ((110, 190, 235), (240, 170, 90), (140, 210, 130), (220, 130, 190))
+_OPACITY = 0.15
+
 
 class Panel:
     """The controls of one page, and what is chosen on them."""
@@ -120,18 +131,6 @@ class Panel:
                 values = [f"{x:g}" for x in np.unique([*offered, own])]
                 control = gui.add_dropdown(name, values, initial_value=f"{own:g}", hint=hint)
                 setattr(self, f"_{name}", control)
-
-
-_COLOURS = matplotlib.colormaps["plasma"]
-
-# Throughput at the ends of the scale of colours, which is logarithmic.
-_WEAKEST, _STRONGEST = 1e-3, 1.0
-
-THICKNESSES = (1.0, 2.0, 3.5, 5.5)
-"""Of lines, pixels, from weak to strong light: each stands for one share of the scale."""
-
-_BODY_COLOURS = ((110, 190, 235), (240, 170, 90), (140, 210, 130), (220, 130, 190))
-_OPACITY = 0.15
 
 
 class Scenery:

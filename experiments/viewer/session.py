@@ -36,6 +36,9 @@ BENDS = (2, 4, 6, 10, 24, 32)
 # Where there are no test views: as the data set's cameras stand.
 _DISTANCE, _ELEVATION, _FOV = 4.0, math.radians(20.0), math.radians(50.0)
 
+STILL = 0.25
+"""Seconds without a change after which a picture is refined."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Subject:
@@ -87,6 +90,34 @@ class Choice:
     bends: int
 
 
+class State(NamedTuple):
+    """What is known between two events.
+
+    Attributes:
+      stages: number of sizes.
+      change: number of the last change, counted from 1; 0 before any.
+      changed_at: time of the last change, seconds of any clock that runs evenly.
+      drawn: stages that are drawn of the last change.
+    """
+
+    stages: int
+    change: int = 0
+    changed_at: float = 0.0
+    drawn: int = 0
+
+
+class Job(NamedTuple):
+    """A picture to draw.
+
+    Attributes:
+      change: what it shows is as it was after this change, or later.
+      stage: its size.
+    """
+
+    change: int
+    stage: int
+
+
 def first_choice(subject: Subject) -> Choice:
     """Returns what is shown before anything is chosen: the model as it was trained."""
     indices = tuple(float(x) for x in np.asarray(subject.model.geometry.interfaces.index_inside))
@@ -127,38 +158,6 @@ def first_viewpoint(subject: Subject, aspect: float = viewpoints.ASPECT) -> view
         return viewpoints.Viewpoint(subject.views.poses[0], fov, aspect)
     pose = cameras.orbit(1, distance=_DISTANCE, elevation=_ELEVATION, size=1, angle_x=1.0).poses[0]
     return viewpoints.Viewpoint(pose, _FOV, aspect)
-
-
-STILL = 0.25
-"""Seconds without a change after which a picture is refined."""
-
-
-class State(NamedTuple):
-    """What is known between two events.
-
-    Attributes:
-      stages: number of sizes.
-      change: number of the last change, counted from 1; 0 before any.
-      changed_at: time of the last change, seconds of any clock that runs evenly.
-      drawn: stages that are drawn of the last change.
-    """
-
-    stages: int
-    change: int = 0
-    changed_at: float = 0.0
-    drawn: int = 0
-
-
-class Job(NamedTuple):
-    """A picture to draw.
-
-    Attributes:
-      change: what it shows is as it was after this change, or later.
-      stage: its size.
-    """
-
-    change: int
-    stage: int
 
 
 def changed(state: State, now: float) -> State:
