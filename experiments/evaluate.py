@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from experiments.figures import comparison as figures
-    from experiments.r3f import provenance
+    from experiments.r3f import object_source
     from refref_jax.data import files, scene_names
     from refref_jax.render import Model, saved
     from refref_jax.training import evaluation, run_folder
@@ -37,7 +37,7 @@ else:
     np = late("numpy")
     figures = late("experiments.figures.comparison")
     evaluation = late("refref_jax.training.evaluation")
-    provenance = late("experiments.r3f.provenance")
+    object_source = late("experiments.r3f.object_source")
     files = late("refref_jax.data.files")
     scene_names = late("refref_jax.data.scene_names")
     saved = late("refref_jax.render.saved")
@@ -104,7 +104,7 @@ def main() -> None:
 
 def _method(run: Path, paths: str) -> str:
     """Returns what a run's geometry and light paths are called together."""
-    names = _METHODS if provenance.read(run) is None else _RECONSTRUCTED
+    names = _METHODS if object_source.read(run) is None else _RECONSTRUCTED
     return names.get(paths, paths)
 
 

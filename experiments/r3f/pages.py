@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from experiments.cli import commands
-from experiments.r3f import body
+from experiments.r3f import object_source
 from experiments.r3f.records import IndexFacts, Reconstruction, ReportFacts
 
 _SPLITS = {
@@ -50,9 +50,9 @@ def _of_index(index: IndexFacts) -> str:
 
 
 def _table(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
-    geometry, index = found.geometry, body.index_facts(found)
+    geometry, index = found.geometry, object_source.index_facts(found)
     error = "" if index.error is None else f" ± {index.error:.4f} (one standard deviation)"
-    surface = body.surface_file(out, found).relative_to(out)
+    surface = object_source.surface_file(out, found).relative_to(out)
     rows = [
         ("surface", f"[{geometry.mesh}]({surface}), {geometry.faces:,} triangles"),
         ("diameter, volume", f"{geometry.diameter:.3f}, {geometry.volume:.3f} (world units)"),

@@ -11,13 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from experiments.r3f import (
-    body,
-    overlap_pictures,
-    pages,
-    surface_pictures,
-    windows,
-)
+from experiments.r3f import object_source, overlap_pictures, pages, surface_pictures, windows
 from experiments.r3f.overlap_pictures import Outline
 from experiments.r3f.records import DistanceFacts, Reconstruction, ReportFacts
 from experiments.r3f.surface_pictures import SurfaceView
@@ -65,7 +59,7 @@ def run(scene: Path, out: Path, found: Reconstruction, compare: bool) -> ReportF
       found: what it came to.
       compare: whether the scene's own meshes may be looked at.
     """
-    mesh = body.read_mesh(out, found)
+    mesh = object_source.read_mesh(out, found)
     split, frames = judging_frames(scene)
     outlines = _outlines(mesh, frames)
     truth = _read_truth(scene) if compare else _Truth(None, "The scene's meshes were not read.")
@@ -125,7 +119,7 @@ def _read_truth(scene: Path) -> _Truth:
         return _Truth(None, "The scene has no meshes to compare with.")
     parents = containment.find_containment(parts).parents
     outer = [part for part, parent in zip(parts, parents, strict=True) if parent == NO_PARENT]
-    joined = join([body.mesh_of(part) for part in outer])
+    joined = join([object_source.mesh_of(part) for part in outer])
     names = ", ".join(f"{part.name}.ply" for part in outer)
     inner = len(parts) - len(outer)
     within = f"; {inner} more within {'it' if len(outer) == 1 else 'them'}" if inner else ""

@@ -12,11 +12,12 @@ from experiments.cli.late_imports import late
 from experiments.runs import plans
 
 if TYPE_CHECKING:
-    from experiments.r3f import chain, provenance, records
+    from experiments.r3f import chain, records
+    from experiments.r3f import object_source as provenance
     from refref_jax.data.meshes import MeshPart
 else:
     chain = late("experiments.r3f.chain")
-    provenance = late("experiments.r3f.provenance")
+    provenance = late("experiments.r3f.object_source")
     records = late("experiments.r3f.records")
 
 METHOD = flags.DEFINE_enum(

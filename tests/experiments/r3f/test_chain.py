@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from experiments.r3f import (
-    body,
     body_pixels,
     chain,
     geometry_stage,
     index_stage,
     light_stage,
+    object_source,
     records,
     report,
 )
@@ -287,7 +287,7 @@ def test_light_is_kept_only_where_validation_views_say_so(
     shutil.copytree(scene, judged)
     shutil.copy(judged / "transforms_test.json", judged / "transforms_val.json")
     config = dataclasses.replace(_CONFIG, light_steps=7)
-    old = body.read_mesh(out, records.read(out))
+    old = object_source.read_mesh(out, records.read(out))
     looked, errors = [], [0.04, after]
 
     def look(folder, split, model, *, seed, rays):
