@@ -160,7 +160,7 @@ def _killing(function, *, after=False, calls=1):
         ("experiments.r3f.geometry_stage.run", {"after": True}),  # renamed, not recorded
         ("experiments.r3f.records.write", {"calls": 2, "after": True}),  # between two stages
         ("experiments.r3f.surface_pictures.draw_surface", {"after": True}),
-        ("experiments.r3f.pages.markdown", {}),
+        ("experiments.r3f.report.markdown", {}),
         ("experiments.r3f.records.write", {"calls": 4}),  # all done, not recorded
     ],
 )
