@@ -12,11 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.cli import commands
-from experiments.r3f import object_source, overlap_pictures, surface_pictures, windows
-from experiments.r3f.overlap_pictures import Outline
+from experiments.r3f import object_source, report_figures
 from experiments.r3f.records import DistanceFacts, IndexFacts, Reconstruction, ReportFacts
-from experiments.r3f.surface_pictures import SurfaceView
-from experiments.r3f.windows import Window
+from experiments.r3f.report_figures import Outline, SurfaceView, Window
 from refref_jax import drafts
 from refref_jax.data import containment, local_layout, meshes
 from refref_jax.data.errors import SceneError
@@ -78,9 +76,9 @@ def run(scene: Path, out: Path, found: Reconstruction, compare: bool) -> ReportF
         remark=truth.remark,
     )
     with drafts.unfinished_folder(out / FOLDER) as folder:
-        overlap_pictures.draw_overlaps(folder / "overlap.png", outlines)
-        overlap_pictures.draw_errors(folder / "iou.png", outlines)
-        surface_pictures.draw_surface(
+        report_figures.draw_overlaps(folder / "overlap.png", outlines)
+        report_figures.draw_errors(folder / "iou.png", outlines)
+        report_figures.draw_surface(
             folder / "surface.png", _surface_views(mesh, truth.mesh, frames)
         )
     with drafts.unfinished_file(out / FILE) as page:
@@ -154,7 +152,7 @@ def _surface_views(mesh: Mesh, truth: Mesh | None, frames: Frames) -> list[Surfa
             )
         views.append(view)
     seen = [np.any(view.normals != 0.0, axis=-1) for view in views]
-    around = windows.around(seen, margin=_MARGIN)
+    around = report_figures.windows_around(seen, margin=_MARGIN)
     return [_within(view, window) for view, window in zip(views, around, strict=True)]
 
 
@@ -172,7 +170,7 @@ def _within(view: SurfaceView, window: Window) -> SurfaceView:
     pictures_of_view = view._asdict()
     name = pictures_of_view.pop("name")
     parts = (
-        None if picture is None else windows.cut(picture, window)
+        None if picture is None else report_figures.cut_out(picture, window)
         for picture in pictures_of_view.values()
     )
     return SurfaceView(name, *parts)

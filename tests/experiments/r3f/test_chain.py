@@ -159,7 +159,7 @@ def _killing(function, *, after=False, calls=1):
         ("refref_jax.data.stored_normals.write_mesh", {"after": True}),  # before the renaming
         ("experiments.r3f.geometry_stage.run", {"after": True}),  # renamed, not recorded
         ("experiments.r3f.records.write", {"calls": 2, "after": True}),  # between two stages
-        ("experiments.r3f.surface_pictures.draw_surface", {"after": True}),
+        ("experiments.r3f.report_figures.draw_surface", {"after": True}),
         ("experiments.r3f.report.markdown", {}),
         ("experiments.r3f.records.write", {"calls": 4}),  # all done, not recorded
     ],
