@@ -26,18 +26,17 @@ from experiments.cli import (
 from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from experiments.figures import comparison as figures
     from experiments.r3f import object_source
+    from experiments.runs import evaluation as reporting
     from refref_jax.data import files, scene_names
     from refref_jax.render import Model, saved
     from refref_jax.training import evaluation, run_folder
 else:
-    np = late("numpy")
     figures = late("experiments.figures.comparison")
     evaluation = late("refref_jax.training.evaluation")
     object_source = late("experiments.r3f.object_source")
+    reporting = late("experiments.runs.evaluation")
     files = late("refref_jax.data.files")
     scene_names = late("refref_jax.data.scene_names")
     saved = late("refref_jax.render.saved")
@@ -57,11 +56,6 @@ _WRITES = ("rgb", "distance", "metrics.json", "comparison.png")
 
 _METHODS = {"paper": "oracle"}
 _RECONSTRUCTED = {"paper": "r3f", "tree": "r3f_tree"}
-
-_VIEWS_IN_COMPARISON = 4
-
-# A share of light that 8 bits may show.
-_WORTH_A_WARNING = 1e-3
 
 
 def main() -> None:
@@ -92,11 +86,9 @@ def main() -> None:
         figures.write_comparison(draft / "comparison.png", views)
     for key, value in summary["results"].items():
         print(f"{key:>24}  {'-' if value is None else format(value, '.4f')}")
-    if summary["results"]["lost"] > _WORTH_A_WARNING:
-        print(
-            "warning: some light found no room, and is missing from the pictures. Train with a "
-            "larger --cut or fewer --bends."
-        )
+    reporting.warn_of_lost_light(
+        summary["results"]["lost"], advice="Train with a larger --cut or fewer --bends."
+    )
     print(f"Pictures: {out / 'comparison.png'}, {out / 'rgb'}, {out / 'distance'}")
     print(f"Metrics:  {out / 'metrics.json'}")
     print(f"Next: {commands.shell('render', f'--run={run}', '--views=orbit')}")
@@ -121,7 +113,7 @@ def evaluate(
         seen = view.rendering
         files.write_rgb(out / "rgb" / f"{view.name}.png", seen.rgb)
         files.write_exr(out / "distance" / f"{view.name}.exr", seen.distance)
-        if view.place in np.linspace(0, view.count - 1, _VIEWS_IN_COMPARISON).astype(int):
+        if view.place in reporting.shown_views(view.count):
             target = view.target / 255.0
             views.append(figures.Comparison(view.name, target, seen.rgb, seen.distance))
 
