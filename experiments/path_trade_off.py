@@ -28,7 +28,7 @@ from experiments.cli import (
 from experiments.cli.late_imports import late
 from experiments.runs import named_budgets
 from refref_jax.data import scene_names
-from refref_jax.optics.budgets import BUDGETS
+from refref_jax.optics.budgets import BUDGETS, Budget
 
 if TYPE_CHECKING:
     from experiments.runs import known_scene as known_scenes
@@ -66,12 +66,11 @@ def main() -> None:
     out = Path(_OUT.value)
     place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
     output_folders.replaceable(out, **place)
-    folders, indices = _open_scenes(), scenes.given_indices()
-    plan = settings()
+    budgets, indices = chosen_budgets(), scenes.given_indices()
     # All scenes first: a broken one is named before anything is rendered.
-    chosen = [_read(folder, indices) for folder in folders]
+    chosen = [_read(folder, indices) for folder in _open_scenes()]
     with output_folders.fresh(out, **place) as draft:
-        trials = _measure(chosen, plan)
+        trials = _measure(chosen, [paths.Setting(*each) for each in budgets])
         paths.write_table(draft / _TABLE, trials)
         pictures = [out / path.name for path in paths.write_figures(draft, trials)]
     print(f"Figures:  {', '.join(map(str, pictures))}")
@@ -109,14 +108,14 @@ def _open_scenes() -> list[Path]:
     return folders
 
 
-def settings() -> list[Setting]:
-    """Returns all budgets to try; equal ones are listed in both sweeps."""
+def chosen_budgets() -> list[tuple[str, str, Budget]]:
+    """Returns sweep, name and budget of all settings to try; equal ones are in both sweeps."""
     cuts = sorted(_numbers("cuts", _CUTS.value, float), reverse=True)
     bends = sorted(_numbers("bends", _BENDS.value, int))
     swept = [("cut", f"{cut:g}", named_budgets.make_budget("tree", cut=cut)) for cut in cuts]
     swept += [("bends", str(n), named_budgets.make_budget("tree", bends=n)) for n in bends]
     points = [("budget", name, BUDGETS[name]) for name in ("straight", "paper")]
-    return [paths.Setting(*each) for each in points + swept]
+    return points + swept
 
 
 def _read(folder: Path, indices: dict[str, float]) -> KnownScene:
