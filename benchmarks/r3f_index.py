@@ -13,7 +13,7 @@ from pathlib import Path
 
 from absl import app, flags
 
-from experiments.r3f import body, chain, index_stage
+from experiments.r3f import chain, index_stage, object_source
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import meshes
 from refref_jax.reconstruct.triangles import Mesh
@@ -36,7 +36,7 @@ def main(arguments: list[str]) -> None:
         name, out = scene.resolve().name, Path(_OUT.value) / scene.resolve().name
         (part,) = meshes.read_meshes(scene)
         for kind in _BODY.value:
-            mesh = body.mesh_of(part) if kind == "true" else _mesh_of_masks(scene, out)
+            mesh = object_source.mesh_of(part) if kind == "true" else _mesh_of_masks(scene, out)
             for start in starts:
                 begun = time.monotonic()
                 found = index_stage.run(scene, mesh, out, seed=0, start=start)
@@ -58,7 +58,7 @@ def _mesh_of_masks(scene: Path, out: Path) -> Mesh:
     folder = out / "reconstruction"
     config = ReconstructionConfig("hull", _CELLS, 0, 1.5, None, None, 0, 0)
     found = chain.reconstruct(scene, folder, config, compare=True)
-    return body.read_mesh(folder, found)
+    return object_source.read_mesh(folder, found)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from absl import app, flags
 
-from experiments.r3f import body, chain, index_stage, light_stage
+from experiments.r3f import chain, index_stage, light_stage, object_source
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import meshes
 from refref_jax.reconstruct.comparison import Distance, compare_meshes
@@ -31,7 +31,7 @@ def main(arguments: list[str]) -> None:
     del arguments
     scene, out = Path(_SCENE.value), Path(_OUT.value)
     (part,) = meshes.read_meshes(scene)
-    truth = body.mesh_of(part)
+    truth = object_source.mesh_of(part)
     found = chain.reconstruct(scene, out, _config(), compare=False)
     masked = dataclasses.replace(found, light=None)
     model = index_stage.learn_background(scene, out / "index", seed=_SEED)
@@ -39,8 +39,8 @@ def main(arguments: list[str]) -> None:
     print("\n| body | error, sRGB | index | Chamfer, % | normals, degrees: mean, 99 % |")
     print("|---|---|---|---|---|")
     rows = {
-        "masks": (body.read_mesh(out, masked), masked.index.index),
-        "light": (body.read_mesh(out, found), body.index_facts(found).index),
+        "masks": (object_source.read_mesh(out, masked), masked.index.index),
+        "light": (object_source.read_mesh(out, found), object_source.index_facts(found).index),
         "true": (truth, part.index),
     }
     measured = {}

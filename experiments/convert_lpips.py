@@ -9,6 +9,8 @@ files with the same names are read without it.
 
 from __future__ import annotations
 
+import pickle
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,11 +22,9 @@ from experiments.cli.late_imports import late
 if TYPE_CHECKING:
     import numpy as np
 
-    from experiments.runs import state_dicts
     from refref_jax.metrics import lpips_weights
 else:
     np = late("numpy")
-    state_dicts = late("experiments.runs.state_dicts")
     lpips_weights = late("refref_jax.metrics.lpips_weights")
 
 _ALEXNET = flags.DEFINE_string(
@@ -46,11 +46,57 @@ def main() -> None:
         (Path(_ALEXNET.value), lpips_weights.ALEXNET_SHAPES),
         (Path(_LPIPS.value), lpips_weights.LINEAR_SHAPES),
     ):
-        arrays |= lpips_weights.choose(state_dicts.read(path), shapes, source=str(path))
+        arrays |= lpips_weights.choose(read_state_dict(path), shapes, source=str(path))
     with output_folders.fresh_file(out, overwrite=_OVERWRITE.value) as draft:
         _write(draft, arrays)
     print(f"Weights: {out}")
     print("Next: give it as --lpips_weights to experiments.evaluate or experiments.metrics.")
+
+
+def read_state_dict(path: Path) -> dict[str, np.ndarray]:
+    """Reads named arrays, from PyTorch's format or NumPy's.
+
+    Raises:
+      ValueError: if the file can not be read, or PyTorch is needed and not installed.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path} does not exist. docs/metrics.md tells where to get it.")
+    reader = _read_npz if path.suffix == ".npz" else _reader_of_torch(path)
+    try:
+        return reader(path)
+    except pickle.UnpicklingError as error:
+        raise ValueError(
+            f"{path} holds more than tensors, or is no such file. Give a state dict as it is "
+            "published, not a whole model."
+        ) from error
+    except Exception as error:  # PyTorch raises what its unpickler does
+        raise ValueError(
+            f"{path} can not be read as a state dict ({error}). Copy it again."
+        ) from error
+
+
+def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+def _reader_of_torch(path: Path) -> Callable[[Path], dict[str, np.ndarray]]:
+    try:
+        import torch
+    except ImportError as error:
+        raise ValueError(
+            f"{path} is read by PyTorch, which is not installed. Run this once where it is (pip "
+            "install torch), or give the same arrays as .npz."
+        ) from error
+
+    def read_torch(path: Path) -> dict[str, np.ndarray]:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(state, dict):
+            raise TypeError("it holds no dict")
+        tensors = {name: x for name, x in state.items() if isinstance(x, torch.Tensor)}
+        return {name: x.detach().numpy() for name, x in tensors.items()}
+
+    return read_torch
 
 
 def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:

@@ -21,7 +21,6 @@ from experiments.cli.late_imports import late
 if TYPE_CHECKING:
     import numpy as np
 
-    from experiments.dataset import cameras
     from refref_jax.data.nerfstudio import capture as nerfstudio
     from refref_jax.data.nerfstudio import exporting as to_nerfstudio
     from refref_jax.data.nerfstudio import importing as from_nerfstudio
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
     from refref_jax.reconstruct import visual_hull
 else:
     np = late("numpy")
-    cameras = late("experiments.dataset.cameras")
     from_nerfstudio = late("refref_jax.data.nerfstudio.importing")
     to_nerfstudio = late("refref_jax.data.nerfstudio.exporting")
     nerfstudio = late("refref_jax.data.nerfstudio.capture")
@@ -124,7 +122,7 @@ def _chosen_placement(poses: np.ndarray) -> placement.Placement:
         distance = np.linalg.norm(poses[:, :, 3] - centre, axis=-1).mean()
         if distance == 0.0:
             raise ValueError("All cameras stand in the centre. Give --scale a number.")
-        return placement.Placement(centre, cameras.CAMERA_RADIUS / distance)
+        return placement.Placement(centre, placement.USUAL_DISTANCE / distance)
     return placement.Placement(centre, scale)
 
 

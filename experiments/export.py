@@ -25,15 +25,14 @@ from experiments.cli.late_imports import late
 if TYPE_CHECKING:
     import numpy as np
 
-    from experiments.exporting import bodies, field_grid, surfaces
+    from experiments.exporting import field_mesh, object_meshes
     from refref_jax.data import files
     from refref_jax.reconstruct import isosurface
     from refref_jax.render import Model, saved
 else:
     np = late("numpy")
-    bodies = late("experiments.exporting.bodies")
-    field_grid = late("experiments.exporting.field_grid")
-    surfaces = late("experiments.exporting.surfaces")
+    object_meshes = late("experiments.exporting.object_meshes")
+    field_mesh = late("experiments.exporting.field_mesh")
     files = late("refref_jax.data.files")
     isosurface = late("refref_jax.reconstruct.isosurface")
     saved = late("refref_jax.render.saved")
@@ -62,7 +61,7 @@ def main() -> None:
     others = (run_option.RECONSTRUCTION,) if _WHAT.value == "body" else ()
     run_option.check(run, holds=(run_option.RUN, *others))
     if _WHAT.value == "body":
-        written = bodies.write(run, out, overwrite=_OVERWRITE.value)
+        written = object_meshes.write(run, out, overwrite=_OVERWRITE.value)
     else:
         written = _write_field(saved.load_model(run, step=_STEP.value), out)
     for path in written:
@@ -88,7 +87,7 @@ def _write_field(model: Model, out: Path) -> list[Path]:
     if space == "unbounded":
         print("        The scene goes on beyond it: a larger --box shows more of it.")
     with commands.ProgressBar("density", _RESOLUTION.value + 1) as bar:
-        density = field_grid.sample_density(
+        density = field_mesh.sample_density(
             model,
             np.full(3, -half),
             np.full(3, half),
@@ -96,21 +95,21 @@ def _write_field(model: Model, out: Path) -> list[Path]:
             step=lambda done, total: bar.show(done, "slices"),
         )
     if space == "bounded" and half == radius:
-        density = surfaces.with_walls(density, level=_LEVEL.value)
+        density = field_mesh.with_walls(density, level=_LEVEL.value)
         print("Walls:  the box's faces, on which the model is opaque")
     if space == "spherical" and math.sqrt(3.0) * half > radius:
-        density = surfaces.with_sphere(density, level=_LEVEL.value, radius=radius)
+        density = field_mesh.with_sphere(density, level=_LEVEL.value, radius=radius)
         print(f"Walls:  the sphere of radius {radius:g}, on which the model is opaque")
     with output_folders.fresh_file(out, overwrite=_OVERWRITE.value) as draft:
         if _WHAT.value == "mesh":
-            surface = surfaces.find_surface(density, level=_LEVEL.value)
+            surface = field_mesh.find_surface(density, level=_LEVEL.value)
             colours = _colours(model, surface.vertices, surface.normals, density.spacing)
-            surfaces.write_surface(draft, surface, colours)
+            field_mesh.write_surface(draft, surface, colours)
             print(f"Mesh:   {len(surface.vertices)} vertices, {len(surface.faces)} faces")
         else:
-            points = surfaces.find_points(density, level=_LEVEL.value)
+            points = field_mesh.find_points(density, level=_LEVEL.value)
             colours = _colours(model, points.points, points.normals, density.spacing)
-            surfaces.write_points(draft, points, colours)
+            field_mesh.write_points(draft, points, colours)
             print(f"Points: {len(points.points)}")
     return [out]
 
@@ -118,7 +117,7 @@ def _write_field(model: Model, out: Path) -> list[Path]:
 def _colours(model: Model, points: np.ndarray, normals: np.ndarray, spacing: float) -> np.ndarray:
     """Returns what is seen just below the surface by who looks straight at it, 8-bit sRGB."""
     below = points - 0.5 * spacing * normals
-    return files.to_bytes(field_grid.look_up_points(model, below, -normals, width=spacing)[1])
+    return files.to_bytes(field_mesh.look_up_points(model, below, -normals, width=spacing)[1])
 
 
 if __name__ == "__main__":

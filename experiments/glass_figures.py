@@ -19,12 +19,12 @@ from experiments.cli import commands, known_options, options, output_folders, sc
 from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
-    from experiments.figures import glass_contents
+    from experiments.figures import glass
     from experiments.runs import known_scene as known_scenes
     from refref_jax.data import background
     from refref_jax.render import backgrounds
 else:
-    glass_contents = late("experiments.figures.glass_contents")
+    glass = late("experiments.figures.glass")
     known_scenes = late("experiments.runs.known_scene")
     background = late("refref_jax.data.background")
     backgrounds = late("refref_jax.render.backgrounds")
@@ -82,10 +82,10 @@ def _drawers(folder: Path, indices: dict[str, float]) -> dict[str, Callable[[Pat
     )
     side = options.side_of(known_options.RAYS_PER_PIXEL.value)
     return {
-        "views": functools.partial(glass_contents.draw_views, scene, side=side),
-        "fan": functools.partial(glass_contents.draw_fan, scene, folder, half),
-        "tree": functools.partial(glass_contents.draw_tree, scene, folder),
-        "distances": functools.partial(glass_contents.draw_distances, scene, half),
+        "views": functools.partial(glass.draw_views, scene, side=side),
+        "fan": functools.partial(glass.draw_fan, scene, folder, half),
+        "tree": functools.partial(glass.draw_tree, scene, folder),
+        "distances": functools.partial(glass.draw_distances, scene, half),
     }
 
 

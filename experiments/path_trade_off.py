@@ -10,10 +10,8 @@ the mask against ray casts and against time. Casts, paths and seconds are of one
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from absl import flags
 
@@ -33,18 +31,13 @@ from refref_jax.optics import budgets
 from refref_jax.optics.budgets import BUDGETS, Budget
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from experiments.runs import known_scene as known_scenes
     from experiments.runs.known_scene import KnownScene
-    from experiments.sweeps import path_figures
-    from experiments.sweeps.path_figures import Trial
-    from refref_jax.training import evaluation as measures
+    from experiments.sweeps import paths
+    from experiments.sweeps.paths import Setting, Trial
 else:
-    np = late("numpy")
     known_scenes = late("experiments.runs.known_scene")
-    measures = late("refref_jax.training.evaluation")
-    path_figures = late("experiments.sweeps.path_figures")
+    paths = late("experiments.sweeps.paths")
 
 _SCENES = flags.DEFINE_list(
     "scenes", None, f"Scenes, with commas: each {options.SCENE_FORMS}.", required=True
@@ -68,32 +61,18 @@ _TABLE = "path_trade_off.csv"
 _WRITES = (_TABLE, *(f"path_trade_off_{sweep}.png" for sweep in ("cut", "bends")))
 
 
-class Setting(NamedTuple):
-    """One light budget of a sweep.
-
-    Attributes:
-      sweep: what it varies, `cut` or `bends`; `budget` for a point alone.
-      name: how figures call it.
-      budget: which light is followed.
-    """
-
-    sweep: str
-    name: str
-    budget: Budget
-
-
 def main() -> None:
     """Renders all scenes with all budgets."""
     out = Path(_OUT.value)
     place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
     output_folders.replaceable(out, **place)
-    plan, indices = settings(), scenes.given_indices()
+    budgets, indices = chosen_budgets(), scenes.given_indices()
     # All scenes first: a broken one is named before anything is rendered.
     chosen = [_read(folder, indices) for folder in _open_scenes()]
     with output_folders.fresh(out, **place) as draft:
-        trials = _measure(chosen, plan)
-        _write(draft / _TABLE, trials)
-        pictures = [out / path.name for path in path_figures.write(draft, trials)]
+        trials = _measure(chosen, [paths.Setting(*each) for each in budgets])
+        paths.write_table(draft / _TABLE, trials)
+        pictures = [out / path.name for path in paths.write_figures(draft, trials)]
     print(f"Figures:  {', '.join(map(str, pictures))}")
     print(f"Measures: {out / _TABLE}")
     print("Next: choose a cut, and render with python -m experiments.render_known --cut=...")
@@ -104,7 +83,7 @@ def _measure(chosen: list[KnownScene], plan: list[Setting]) -> list[Trial]:
     trials: list[Trial] = []
     side = options.side_of(known_options.RAYS_PER_PIXEL.value)
     with commands.ProgressBar("trade-off", len(chosen) * len(plan)) as bar:
-        for trial in measure_all(chosen, plan, side):
+        for trial in paths.measure_all(chosen, plan, side):
             trials.append(trial)
             bar.show(
                 len(trials),
@@ -129,49 +108,14 @@ def _open_scenes() -> list[Path]:
     return folders
 
 
-def settings() -> list[Setting]:
-    """Returns all budgets to try; equal ones are listed in both sweeps."""
+def chosen_budgets() -> list[tuple[str, str, Budget]]:
+    """Returns sweep, name and budget of all settings to try; equal ones are in both sweeps."""
     cuts = sorted(_numbers("cuts", _CUTS.value, float), reverse=True)
     bends = sorted(_numbers("bends", _BENDS.value, int))
     swept = [("cut", f"{cut:g}", budgets.budget_of("tree", cut=cut)) for cut in cuts]
     swept += [("bends", str(n), budgets.budget_of("tree", bends=n)) for n in bends]
     points = [("budget", name, BUDGETS[name]) for name in ("straight", "paper")]
-    return [Setting(*each) for each in points + swept]
-
-
-def measure_all(chosen: list[KnownScene], plan: list[Setting], side: int) -> Iterator[Trial]:
-    """Renders every scene with every budget; equal budgets are rendered once."""
-    for scene in chosen:
-        known: dict[Budget, Trial] = {}
-        for setting in plan:
-            if setting.budget not in known:
-                known[setting.budget] = measure_one(scene, setting, side)
-            yield known[setting.budget]._replace(sweep=setting.sweep, name=setting.name)
-
-
-def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
-    """Renders all views of a scene with one budget."""
-    known_scenes.warm_up(scene, setting.budget)
-    views, measured = [], []
-    for i in range(len(scene.indices)):
-        view = known_scenes.render_view(scene, i, budget=setting.budget, side=side)
-        views.append(view)
-        measured.append(known_scenes.measure(scene, i, view.rgb))
-    pixels = scene.frames.cameras.height * scene.frames.cameras.width * side**2
-    return path_figures.Trial(
-        scene=scene.name,
-        sweep=setting.sweep,
-        name=setting.name,
-        cut=setting.budget.cut,
-        bends=setting.budget.bends,
-        psnr=measures.mean_of(measured, "psnr"),
-        psnr_masked=measures.mean_of(measured, "psnr_masked"),
-        psnr_outside=measures.mean_of(measured, "psnr_outside"),
-        casts_per_pixel=float(np.mean([view.casts for view in views])),
-        paths_per_pixel=float(np.mean([view.paths for view in views])),
-        seconds_per_pixel=sum(view.seconds for view in views) / (pixels * len(views)),
-        lost_energy=float(np.mean([view.lost for view in views])),
-    )
+    return points + swept
 
 
 def _read(folder: Path, indices: dict[str, float]) -> KnownScene:
@@ -201,13 +145,6 @@ def _numbers(option: str, words: list[str], kind: type) -> list:
 
 command_line.check(_CUTS, lambda words: _numbers("cuts", words, float))
 command_line.check(_BENDS, lambda words: _numbers("bends", words, int))
-
-
-def _write(path: Path, trials: list[Trial]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(path_figures.Trial._fields)
-        writer.writerows(trials)
 
 
 if __name__ == "__main__":

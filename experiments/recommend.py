@@ -18,11 +18,11 @@ from experiments.cli import commands, options, scene_option
 from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
-    from experiments.sweeps import recommendations
+    from experiments.sweeps import recommend
     from experiments.sweeps import table as trade_table
     from refref_jax.data import local_layout
 else:
-    recommendations = late("experiments.sweeps.recommendations")
+    recommend = late("experiments.sweeps.recommend")
     trade_table = late("experiments.sweeps.table")
     local_layout = late("refref_jax.data.local_layout")
 
@@ -46,15 +46,15 @@ def main() -> None:
     images = len(local_layout.read_frames(scene, "test").names)
     base = trade_table.base_of(rows)
     print(f"Timing {_TIMED_STEPS.value} steps of the table's base point ...", flush=True)
-    timing = recommendations.time_machine(scene, base, _TIMED_STEPS.value)
-    machine = recommendations.compare(timing, base, images)
+    timing = recommend.time_machine(scene, base, _TIMED_STEPS.value)
+    machine = recommend.compare(timing, base, images)
     print(
         f"A step takes {1e3 * timing.seconds_per_step:.1f} ms here and "
         f"{1e3 * base.seconds_per_step:.1f} ms in the table: times are scaled by "
         f"{machine.ratio:.2f}. Starting and compiling takes {machine.startup:.0f} s."
     )
-    choice = recommendations.choose(rows, machine, 60.0 * _MINUTES.value)
-    print("\n".join(recommendations.told(choice, machine, scene)))
+    choice = recommend.choose(rows, machine, 60.0 * _MINUTES.value)
+    print("\n".join(recommend.told(choice, machine, scene)))
 
 
 if __name__ == "__main__":

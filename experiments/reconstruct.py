@@ -24,9 +24,9 @@ from experiments.cli import (
 from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
-    from experiments.r3f import body, chain, report
+    from experiments.r3f import chain, object_source, report
 else:
-    body = late("experiments.r3f.body")
+    object_source = late("experiments.r3f.object_source")
     chain = late("experiments.r3f.chain")
     report = late("experiments.r3f.report")
 
@@ -60,7 +60,7 @@ def main() -> None:
     scene, out = scene_option.opened(_SCENE.value), Path(_OUT.value)
     found = chain.reconstruct(scene, out, config, compare=True)
     print(f"Report:  {out / report.FILE}, {out / report.FOLDER}")
-    print(f"Surface: {body.surface_file(out, found)}")
+    print(f"Surface: {object_source.surface_file(out, found)}")
     print(f"Index:   {out / chain.INDEX_FILE}")
     run = out.with_name(f"{out.name}_run")
     given = (f"--scene={_SCENE.value}", f"--reconstruction={out}", f"--out={run}")

@@ -74,13 +74,15 @@ def main() -> None:
 
 def render(model: Model, seen_by: cameras.Cameras, names: tuple[str, ...], out: Path) -> list[str]:
     """Renders each view, writes pictures and videos, and returns the names of the videos."""
-    side, chunk = options.side_of(_RAYS_PER_PIXEL.value), _CHUNK.value
+    rays_per_pixel, chunk = _RAYS_PER_PIXEL.value, _CHUNK.value
     for folder in ("rgb", "distance"):
         (out / folder).mkdir()
     frames, distances = [], []
     with commands.ProgressBar("render", len(names)) as bar:
         for i, name in enumerate(names):
-            seen = supersampling.render_view(model, seen_by, i, side=side, chunk=chunk)
+            seen = supersampling.render_camera(
+                model, seen_by, i, rays_per_pixel=rays_per_pixel, chunk=chunk
+            )
             files.write_rgb(out / "rgb" / f"{name}.png", seen.rgb)
             files.write_exr(out / "distance" / f"{name}.exr", seen.distance)
             frames.append(files.to_bytes(seen.rgb))

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from experiments.figures import comparison as figures
+    from experiments.runs import evaluation as reporting
     from experiments.runs import known_scene as known_scenes
     from experiments.runs.known_scene import KnownScene, View
     from refref_jax.data import files
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 else:
     np = late("numpy")
     figures = late("experiments.figures.comparison")
+    reporting = late("experiments.runs.evaluation")
     known_scenes = late("experiments.runs.known_scene")
     measures = late("refref_jax.training.evaluation")
     files = late("refref_jax.data.files")
@@ -71,11 +73,6 @@ flags.adopt_module_key_flags(scenes)
 flags.adopt_module_key_flags(known_options)
 _JSON = flags.DEFINE_string("json", None, "File for the measures; {out}/metrics.json by default.")
 _OVERWRITE = options.overwrite("an earlier rendering in that folder")
-
-_VIEWS_IN_COMPARISON = 4
-
-# A share of light that 8 bits may show.
-_WORTH_A_WARNING = 1e-3
 
 _WRITES = ("rgb", "comparison.png", "metrics.json")
 
@@ -129,10 +126,9 @@ def render(scene: KnownScene, budget: Budget, out: Path) -> dict[str, Any]:
             views.append(view)
             measured.append({"index": index, "name": name, **found})
             bar.show(i + 1, f"{name}  PSNR {found['psnr']:.2f}")
-    shown = np.unique(np.linspace(0, len(views) - 1, _VIEWS_IN_COMPARISON).astype(int))
     compared = [
         figures.Comparison(scene.frames.names[i], scene.images[i] / 255.0, views[i].rgb)
-        for i in shown
+        for i in reporting.shown_views(len(views))
     ]
     figures.write_comparison(out / "comparison.png", compared)
     return summarise(scene, budget, views, measured)
@@ -196,10 +192,11 @@ def _report(summary: dict[str, Any]) -> None:
     print(f"{'lost_energy':>16}  {summary['lost_energy']:.2g}")
     if summary["unfinished"] == "dark":
         print("lost_energy is that of light that has no bend left, and what found no room if any.")
-    elif summary["lost_energy"] > _WORTH_A_WARNING:
-        print(
-            "warning: some light found no room, and is missing from the pictures. Give a larger "
-            "--cut or fewer --bends, or, as a library, a Budget with larger capacity factors."
+    else:
+        reporting.warn_of_lost_light(
+            summary["lost_energy"],
+            advice="Give a larger --cut or fewer --bends, or, as a library, a Budget with larger "
+            "capacity factors.",
         )
 
 

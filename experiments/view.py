@@ -18,12 +18,12 @@ from experiments.cli import command_line, commands, options, run_option, scene_o
 from experiments.cli.late_imports import late
 
 if TYPE_CHECKING:
-    from experiments.viewer import subject as subjects
+    from experiments.viewer import session as subjects
     from refref_jax.data import errors
     from refref_jax.render import saved
     from refref_jax.training import run_folder
 else:
-    subjects = late("experiments.viewer.subject")
+    subjects = late("experiments.viewer.session")
     errors = late("refref_jax.data.errors")
     saved = late("refref_jax.render.saved")
     run_folder = late("refref_jax.training.run_folder")

@@ -35,6 +35,7 @@ if TYPE_CHECKING:  # the same names for those who read types; a test compares th
     from refref_jax.optics.scene import Geometry as Geometry
     from refref_jax.optics.scene import with_index as with_index
     from refref_jax.optics.single_path import follow_branch as follow_branch
+    from refref_jax.training.evaluation import evaluate as evaluate
 
 __version__ = "0.1.0"
 
@@ -49,6 +50,7 @@ _HOMES = {
     "Rays": "geometry.rays",
     "SceneError": "data.errors",
     "assemble": "data.geometry",
+    "evaluate": "training.evaluation",
     "follow_branch": "optics.single_path",
     "follow_main_branches": "optics.main_branches",
     "image_rays": "geometry.cameras",

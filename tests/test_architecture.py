@@ -27,6 +27,7 @@ _FLOORS = {
 
 _MODULES = sorted(_PACKAGE.rglob("*.py"))
 _SCRIPTS = sorted((_ROOT / "experiments").rglob("*.py"))
+_BENCHMARKS = sorted((_ROOT / "benchmarks").rglob("*.py"))
 
 _LONGEST_MODULE = 500
 _LONGEST_FUNCTION = 45
@@ -60,6 +61,13 @@ def _imports(path):
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
+def _late_imports(path):
+    """Yields the names of modules that a command imports when they are first used."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "late":
+            yield ast.literal_eval(node.args[0])
+
+
 def _functions(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.FunctionDef):
@@ -89,6 +97,19 @@ def test_imports_fall(path):
             continue
         there = parts[1]
         assert there == here or _FLOORS[there] < _FLOORS[here], f"{_name(path)} imports {name}"
+
+
+@pytest.mark.parametrize("path", _MODULES, ids=_name)
+def test_the_library_imports_no_command(path):
+    assert not {name.split(".")[0] for name in _imports(path)} & {"experiments", "benchmarks"}
+
+
+def test_only_the_generator_imports_the_generator():
+    generator = _ROOT / "experiments" / "dataset"
+    for path in _SCRIPTS + _BENCHMARKS:
+        if not path.is_relative_to(generator):
+            for name in (*_imports(path), *_late_imports(path)):
+                assert not f"{name}.".startswith("experiments.dataset."), f"{path} imports {name}"
 
 
 def test_every_module_has_a_floor():

@@ -19,9 +19,11 @@ _NAMED = {f"refref_jax.{name}": getattr(refref_jax, name) for name in refref_jax
 # What reads a run of the user's, or renders one: `tests/experiments/test_documents.py` runs the
 # snippets of README and docs that do.
 _SHOWN_ELSEWHERE = {
+    "refref_jax.evaluate",
     "refref_jax.read_meshes",
     "refref_jax.render.init_params",
     "refref_jax.render.load_model",
+    "refref_jax.render.render_camera",
     "refref_jax.render.render_image",
     "refref_jax.render.render_rays",
 }

@@ -6,14 +6,7 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
-from experiments.r3f import (
-    body,
-    geometry_stage,
-    index_stage,
-    light_stage,
-    records,
-    report,
-)
+from experiments.r3f import geometry_stage, index_stage, light_stage, object_source, records, report
 from experiments.r3f.records import IndexFacts, LightFacts, Reconstruction, ReconstructionConfig
 from refref_jax import configuration
 from refref_jax.data import local_layout, scene_names
@@ -73,7 +66,7 @@ def reconstruct(
             records.write(out, found)
         say(describe_index(found.index))
         found = _refined(scene, out, found, say)
-        configuration.write(out / INDEX_FILE, body.index_facts(found))
+        configuration.write(out / INDEX_FILE, object_source.index_facts(found))
         if found.report is None or not report.is_there(out):
             found = dataclasses.replace(found, report=report.run(scene, out, found, compare))
             records.write(out, found)
@@ -93,12 +86,12 @@ def read_part(out: Path) -> MeshPart:
         found.geometry is None
         or found.index is None
         or waits_for_light
-        or not body.surface_file(out, found).is_file()
+        or not object_source.surface_file(out, found).is_file()
     ):
         raise ValueError(
             f"The reconstruction in {out} is not finished. Repeat the command that began it."
         )
-    return body.read_part(out, found)
+    return object_source.read_part(out, found)
 
 
 def fingerprint(scene: Path) -> str:
@@ -129,7 +122,7 @@ def _index(scene: Path, out: Path, found: Reconstruction) -> IndexFacts:
         return IndexFacts("given", config.index, None, None)
     folder = out / _INDEX_FOLDER
     folder.mkdir(exist_ok=True)
-    mesh = body.read_mesh(out, found)
+    mesh = object_source.read_mesh(out, found)
     estimate = index_stage.run(
         scene, mesh, folder, seed=config.seed, space=config.space, radius=config.radius
     )
@@ -148,7 +141,7 @@ def _splits(config: ReconstructionConfig) -> tuple[str, ...]:
 
 def _refined(scene: Path, out: Path, found: Reconstruction, say: Say) -> Reconstruction:
     """Refines by light, if that is asked for and not done."""
-    there = found.light is not None and body.surface_file(out, found).is_file()
+    there = found.light is not None and object_source.surface_file(out, found).is_file()
     if found.config.light_steps > 0 and not there:
         bare = dataclasses.replace(found, light=None, report=None)
         found = dataclasses.replace(bare, light=_light(scene, out, bare))
@@ -163,7 +156,7 @@ def _light(scene: Path, out: Path, found: Reconstruction) -> LightFacts:
     folder.mkdir(exist_ok=True)
     return light_stage.run(
         scene,
-        body.read_mesh(out, found),
+        object_source.read_mesh(out, found),
         found.index,
         index_stage.learn_background(
             scene, folder, seed=seed, space=found.config.space, radius=found.config.radius

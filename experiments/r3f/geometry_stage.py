@@ -1,4 +1,7 @@
-"""The first stage of R3F: from the masks of the training views to a surface."""
+"""The first stage of R3F: from the masks of the training views to a surface.
+
+`about_masks` names the masks that the surface does not agree with.
+"""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -6,23 +9,33 @@ from pathlib import Path
 import numpy as np
 
 from experiments.cli import commands
-from experiments.r3f import doubts
 from experiments.r3f.records import GeometryFacts, ReconstructionConfig
 from refref_jax import drafts
 from refref_jax.data import local_layout, scene_names, stored_normals
 from refref_jax.reconstruct import occupancy, visual_hull
-from refref_jax.reconstruct.agreement import without_outliers
+from refref_jax.reconstruct.agreement import carved_alone, without_outliers
+from refref_jax.reconstruct.comparison import silhouette_overlap
 from refref_jax.reconstruct.grids import Grid
 from refref_jax.reconstruct.isosurface import find_isosurface
 from refref_jax.reconstruct.occupancy_config import OccupancyTrainingConfig
 from refref_jax.reconstruct.refinement import Refinement, refine
 from refref_jax.reconstruct.silhouettes import Views
-from refref_jax.reconstruct.triangles import diameter, volume
+from refref_jax.reconstruct.triangles import Mesh, diameter, volume
 
 FOLDER = "geometry"
 
 MATERIAL = "glass"
 """Ends the name of the mesh, which stands for nothing: what it is made of is its index."""
+
+# The overlap of a mask and the body's silhouette below which they do not agree: of right masks of
+# bodies some tens of pixels wide it is above 0.97.
+_AGREES = 0.9
+
+# Masks that are named.
+_NAMED = 5
+
+# The share of a body that no mask carves away alone, when it is right and there are many others.
+_MUCH = 0.05
 
 
 def _hull(views: Views, names: Sequence[str], config: ReconstructionConfig) -> Grid:
@@ -83,7 +96,7 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
             if not np.array_equal(before.vertices, stage.mesh.vertices)
         ),
         refused=tuple(f"{stage.name}: {stage.refused}" for stage in refined if stage.refused),
-        doubts=doubts.about_masks(mesh, views, names, outliers=config.outliers),
+        doubts=about_masks(mesh, views, names, outliers=config.outliers),
     )
 
 
@@ -101,3 +114,35 @@ def _object(scene: Path) -> str:
     """Returns what the object of a scene is called: the published name's, else the folder's."""
     name = scene_names.of_folder(scene)
     return scene_names.parse(name).object if scene_names.is_name(name) else name
+
+
+def about_masks(
+    mesh: Mesh, views: Views, names: Sequence[str], *, outliers: int
+) -> tuple[str, ...]:
+    """Says which masks the body does not agree with, and which of them may have spoilt it.
+
+    Args:
+      mesh: the body.
+      views: all masks that it was made from.
+      names: what they are called.
+      outliers: as many as may disagree without a word.
+    """
+    overlaps = silhouette_overlap(mesh, *views)
+    doubtful = np.flatnonzero(overlaps < _AGREES)
+    if len(doubtful) <= outliers:
+        return ()
+    worst = doubtful[np.argsort(overlaps[doubtful])][:_NAMED]
+    named = ", ".join(f"{names[view]} ({overlaps[view]:.2f})" for view in worst)
+    told = (
+        f"{len(doubtful)} of {len(overlaps)} training masks overlap with the body by less than "
+        f"{_AGREES}, least {named}. Check the masks and the poses."
+    )
+    shares = carved_alone(views)
+    taker = int(np.argmax(shares))
+    if shares[taker] < _MUCH:
+        return (told,)
+    return (
+        told,
+        f"{names[taker]} alone carves away {shares[taker]:.0%} of what all others leave. If it is "
+        f"wrong, mend it or leave its frame out, or let --outliers={outliers + 1} masks be wrong.",
+    )

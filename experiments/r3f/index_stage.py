@@ -5,23 +5,34 @@
 
 The background is learned along straight light from pixels that do not see the body, so that no
 wrong index can have spoilt it. Where the body fills all images there is none: give the index then.
+`look` draws pixels that see the body, for this stage and for that of light.
 """
 
 import dataclasses
 from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Int
 
 from experiments.cli import commands
 from experiments.figures import style as plotting
 from experiments.figures.style import COLOURS, pyplot
-from experiments.r3f import body_pixels
+from refref_jax.data import local_layout, mask_margins
 from refref_jax.data.geometry import build_geometry
+from refref_jax.geometry.cameras import pixel_rays
+from refref_jax.geometry.surface_build import build_surfaces
+from refref_jax.optics.branching import Geometry
 from refref_jax.optics.budgets import STRAIGHT
+from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.reconstruct.index_search import (
     IndexEstimate,
     IndexSearch,
     estimate_index,
     most_looks,
 )
+from refref_jax.reconstruct.photometry import Evidence
 from refref_jax.reconstruct.triangles import Mesh
 from refref_jax.render import saved
 from refref_jax.render.model import Model
@@ -42,6 +53,58 @@ RAYS = 4096
 
 # What the body is told to be before its index is known.
 _BEFORE = 1.5
+
+
+class BodyPixels(NamedTuple):
+    """Some pixels of a split.
+
+    Attributes:
+      evidence: rays, colours and the field.
+      views: the image of each.
+    """
+
+    evidence: Evidence
+    views: Int[np.ndarray, " rays"]
+
+
+def look(scene: Path, split: str, model: Model, *, seed: int, rays: int) -> BodyPixels:
+    """Draws pixels well inside of a split's masks, spread evenly over its views.
+
+    Args:
+      scene: its folder.
+      split: of which images and masks are read.
+      model: of the background.
+      seed: of the choice.
+      rays: how many, about; fewer where masks have no more.
+
+    Raises:
+      ValueError: if there are no masks, or they are too thin to have an inside.
+    """
+    frames = local_layout.read_frames(scene, split)
+    inside = mask_margins.well_inside(local_layout.read_masks(frames))
+    if not inside.any():
+        raise ValueError(
+            f"No pixel of the {split} views of {scene} lies inside of a mask and off its outline. "
+            "Use larger images, or check the masks."
+        )
+    generator = np.random.default_rng(seed)
+    each = -(-rays // len(inside))
+    chosen = []
+    for view, mask in enumerate(inside):
+        places = np.flatnonzero(mask)
+        picked = generator.choice(places, min(each, len(places)), replace=False)
+        chosen.append(picked + view * mask.size)
+    view, row, column = np.unravel_index(np.concatenate(chosen), inside.shape)
+    rgb = local_layout.read_images(frames)[view, row, column].astype(np.float32) / 255.0
+    seen = pixel_rays(frames.cameras, view, row, column)
+    return BodyPixels(Evidence(model.params, *jax.device_put((seen, rgb))), view)
+
+
+def body_geometry(mesh: Mesh, index: float) -> Geometry:
+    """Returns one clear body in air, on the device."""
+    owners = np.zeros(len(mesh.faces), np.int64)
+    surfaces = build_surfaces(mesh.vertices[mesh.faces], mesh.normals, owners)
+    return jax.device_put(Geometry(surfaces, nested([index], [NO_PARENT])))
 
 
 def run(
@@ -74,12 +137,12 @@ def run(
       KeyboardInterrupt: if the background's training was stopped; it has been saved.
     """
     model = learn_background(scene, folder, seed=seed, space=space, radius=radius, steps=steps)
-    evidence, views = body_pixels.look(scene, "train", model, seed=seed, rays=rays)
+    evidence, views = look(scene, "train", model, seed=seed, rays=rays)
     search = IndexSearch()
     with commands.ProgressBar("index", most_looks(search, start=start)) as bar:
         found = estimate_index(
             evidence,
-            body_pixels.body_geometry(mesh, _BEFORE),
+            body_geometry(mesh, _BEFORE),
             views,
             part=0,
             config=model.config,

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from experiments.cli import commands
-from experiments.r3f import body_pixels
-from experiments.r3f.body_pixels import BodyPixels
+from experiments.r3f import index_stage
+from experiments.r3f.index_stage import BodyPixels
 from experiments.r3f.records import IndexFacts, LightFacts
 from refref_jax import drafts
 from refref_jax.data import stored_normals
@@ -54,12 +54,12 @@ def run(
     if known.source == "given":
         settings = dataclasses.replace(settings, index_stride=0.0)
     judges = find_judges(scene, model, seed=seed)
-    seen = body_pixels.look(scene, "train", model, seed=seed, rays=_SEEN)
+    seen = index_stage.look(scene, "train", model, seed=seed, rays=_SEEN)
     with commands.ProgressBar("light", steps) as bar:
         found = refine_by_light(
             mesh,
             index,
-            body_pixels.body_geometry(mesh, index).interfaces,
+            index_stage.body_geometry(mesh, index).interfaces,
             seen.evidence,
             config=model.config,
             settings=settings,
@@ -80,7 +80,7 @@ def find_judges(scene: Path, model: Model, *, seed: int) -> BodyPixels:
     Raises:
       ValueError: if there is no validation split with masks.
     """
-    return body_pixels.look(scene, "val", model, seed=seed + 1, rays=_JUDGES)
+    return index_stage.look(scene, "val", model, seed=seed + 1, rays=_JUDGES)
 
 
 def judge(mesh: Mesh, index: float, judges: BodyPixels, model: Model) -> float:
@@ -88,7 +88,7 @@ def judge(mesh: Mesh, index: float, judges: BodyPixels, model: Model) -> float:
     errors = photometry.errors_at_index(
         np.float32(index),
         judges.evidence,
-        body_pixels.body_geometry(mesh, index),
+        index_stage.body_geometry(mesh, index),
         part=0,
         config=model.config,
     )

@@ -1,4 +1,4 @@
-"""The last stage of R3F: what it came to, measured on views that it has not seen, and pictures.
+"""The last stage of R3F: a report in words and pictures, measured on views that it has not seen.
 
 Views of the test split are looked at, else of the validation split, else those that it was made
 from. Where the scene has meshes of its own, and they may be looked at, the surface is compared with
@@ -11,17 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from experiments.r3f import (
-    body,
-    overlap_pictures,
-    pages,
-    surface_pictures,
-    windows,
-)
-from experiments.r3f.overlap_pictures import Outline
-from experiments.r3f.records import DistanceFacts, Reconstruction, ReportFacts
-from experiments.r3f.surface_pictures import SurfaceView
-from experiments.r3f.windows import Window
+from experiments.cli import commands
+from experiments.r3f import object_source, report_figures
+from experiments.r3f.records import DistanceFacts, IndexFacts, Reconstruction, ReportFacts
+from experiments.r3f.report_figures import Outline, SurfaceView, Window
 from refref_jax import drafts
 from refref_jax.data import containment, local_layout, meshes
 from refref_jax.data.errors import SceneError
@@ -48,6 +41,12 @@ _MARGIN = 0.2
 
 _SPLITS = ("test", "val", "train")
 
+_SEEN_ON = {
+    "test": "test views, from which nothing was made",
+    "val": "validation views, from which nothing was made",
+    "train": "training views, the very ones that it was made from",
+}
+
 
 class _Truth(NamedTuple):
     """The scene's own outermost surface, or why it is not looked at."""
@@ -65,7 +64,7 @@ def run(scene: Path, out: Path, found: Reconstruction, compare: bool) -> ReportF
       found: what it came to.
       compare: whether the scene's own meshes may be looked at.
     """
-    mesh = body.read_mesh(out, found)
+    mesh = object_source.read_mesh(out, found)
     split, frames = judging_frames(scene)
     outlines = _outlines(mesh, frames)
     truth = _read_truth(scene) if compare else _Truth(None, "The scene's meshes were not read.")
@@ -77,13 +76,13 @@ def run(scene: Path, out: Path, found: Reconstruction, compare: bool) -> ReportF
         remark=truth.remark,
     )
     with drafts.unfinished_folder(out / FOLDER) as folder:
-        overlap_pictures.draw_overlaps(folder / "overlap.png", outlines)
-        overlap_pictures.draw_errors(folder / "iou.png", outlines)
-        surface_pictures.draw_surface(
+        report_figures.draw_overlaps(folder / "overlap.png", outlines)
+        report_figures.draw_errors(folder / "iou.png", outlines)
+        report_figures.draw_surface(
             folder / "surface.png", _surface_views(mesh, truth.mesh, frames)
         )
     with drafts.unfinished_file(out / FILE) as page:
-        page.write_text(pages.markdown(out, found, facts), encoding="utf-8")
+        page.write_text(markdown(out, found, facts), encoding="utf-8")
     return facts
 
 
@@ -125,7 +124,7 @@ def _read_truth(scene: Path) -> _Truth:
         return _Truth(None, "The scene has no meshes to compare with.")
     parents = containment.find_containment(parts).parents
     outer = [part for part, parent in zip(parts, parents, strict=True) if parent == NO_PARENT]
-    joined = join([body.mesh_of(part) for part in outer])
+    joined = join([object_source.mesh_of(part) for part in outer])
     names = ", ".join(f"{part.name}.ply" for part in outer)
     inner = len(parts) - len(outer)
     within = f"; {inner} more within {'it' if len(outer) == 1 else 'them'}" if inner else ""
@@ -153,7 +152,7 @@ def _surface_views(mesh: Mesh, truth: Mesh | None, frames: Frames) -> list[Surfa
             )
         views.append(view)
     seen = [np.any(view.normals != 0.0, axis=-1) for view in views]
-    around = windows.around(seen, margin=_MARGIN)
+    around = report_figures.windows_around(seen, margin=_MARGIN)
     return [_within(view, window) for view, window in zip(views, around, strict=True)]
 
 
@@ -171,7 +170,7 @@ def _within(view: SurfaceView, window: Window) -> SurfaceView:
     pictures_of_view = view._asdict()
     name = pictures_of_view.pop("name")
     parts = (
-        None if picture is None else windows.cut(picture, window)
+        None if picture is None else report_figures.cut_out(picture, window)
         for picture in pictures_of_view.values()
     )
     return SurfaceView(name, *parts)
@@ -194,3 +193,111 @@ def _resized(cameras: Cameras, height: int) -> Cameras:
     return cameras._replace(
         width=round(scale * cameras.width), height=height, focal=scale * cameras.focal
     )
+
+
+def markdown(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
+    """Returns the text of a report.
+
+    Args:
+      out: folder of the reconstruction; its pictures are expected in `pictures`.
+      found: geometry and index.
+      facts: what was measured of them.
+    """
+    geometry = found.geometry
+    parts = [
+        f"# The object of {found.scene}, reconstructed",
+        f"From {geometry.masks} masks of {geometry.width} x {geometry.height} pixels and their "
+        f"poses; {_of_index(found.index)}.",
+        *(f"**Doubtful:** {doubt}" for doubt in geometry.doubts),
+        _table(out, found, facts),
+        f"## Silhouettes\n\nMeasured on {len(facts.overlaps)} {_SEEN_ON[facts.split]}. IoU is the "
+        "pixels in both mask and silhouette over those in either.",
+        "![Masks and silhouettes](pictures/overlap.png)",
+        "![Errors of the silhouettes](pictures/iou.png)",
+        f"## Surface\n\n{_of_truth(facts)}",
+        "![Normals, and the distance to the true surface](pictures/surface.png)",
+        *_pictures_of_index(out),
+        "## How it was made\n\n" + _making(found),
+        "## Go on\n\n```bash\n"
+        + commands.shell("train", "--scene=SCENE", "--reconstruction=OUT", "--out=RUN")
+        + "\n```\n\nwith SCENE the scene's folder and OUT this one.",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _of_index(index: IndexFacts) -> str:
+    if index.source == "given":
+        return "the index of refraction was given"
+    return "the index of refraction was estimated from their images"
+
+
+def _table(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
+    geometry, index = found.geometry, object_source.index_facts(found)
+    error = "" if index.error is None else f" ± {index.error:.4f} (one standard deviation)"
+    surface = object_source.surface_file(out, found).relative_to(out)
+    rows = [
+        ("surface", f"[{geometry.mesh}]({surface}), {geometry.faces:,} triangles"),
+        ("diameter, volume", f"{geometry.diameter:.3f}, {geometry.volume:.3f} (world units)"),
+        ("index of refraction", f"**{index.index:.4f}**{error}, {index.source}"),
+        (
+            "silhouettes: mean IoU, least",
+            f"**{facts.mean_overlap:.4f}**, {min(facts.overlaps):.4f}",
+        ),
+    ]
+    if found.light is not None:
+        light = found.light
+        kept = f"kept, with index {light.index:.4f}" if light.kept else "left out"
+        rows.append(
+            (
+                "error of validation views, by light",
+                f"{light.before:.4f} before, {light.after:.4f} after; {kept}",
+            )
+        )
+    if facts.truth is not None:
+        truth = facts.truth
+        rows += [
+            (
+                "distance to the truth: mean (Chamfer), largest",
+                f"**{truth.chamfer:.3%}**, {truth.furthest:.2%} of the diameter",
+            ),
+            (
+                "angle to the true normals: mean, 99 of 100 below",
+                f"**{truth.normal_error:.2f}°**, {truth.normal_error_99:.1f}°",
+            ),
+        ]
+    return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)])
+
+
+def _of_truth(facts: ReportFacts) -> str:
+    shown = (
+        "No mask shows a cavity, a dent that no line of sight grazes, or what lies within glass: "
+        "the body is filled, with one index. Normals are those of the camera's frame: right is "
+        "red, up green, towards it blue."
+    )
+    if facts.truth is None:
+        return f"{facts.remark} {shown}"
+    return (
+        f"{facts.remark} {shown} Distances are those of the surface that is seen to the closest "
+        "point of the true one."
+    )
+
+
+def _pictures_of_index(out: Path) -> list[str]:
+    found = sorted((out / "index").glob("*.png"))
+    return ["## Index of refraction"] * bool(found) + [
+        f"![{path.stem.replace('_', ' ')}](index/{path.name})" for path in found
+    ]
+
+
+def _making(found: Reconstruction) -> str:
+    config, geometry = found.config, found.geometry
+    told = [
+        f"- `--geometry={config.geometry} --resolution={config.resolution} "
+        f"--outliers={config.outliers} --light_steps={config.light_steps} --seed={config.seed}`"
+        + (f" `--ior={config.index:g}`" if config.index is not None else "")
+        + (f" `--background={config.space}`" if config.space is not None else "")
+        + (f" `--radius={config.radius:g}`" if config.radius is not None else ""),
+        f"- refined: {', '.join(geometry.stages) or 'nothing to do'}",
+        *(f"- left out {refused}" for refused in geometry.refused),
+    ]
+    return "\n".join(told)

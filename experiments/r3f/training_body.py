@@ -146,12 +146,12 @@ def find(run: Path, config: TrainConfig, *, ior: Sequence[str], resume: bool) ->
 
 def note(run: Path, part: MeshPart | None, given: str) -> None:
     """Notes in the run's folder where its object comes from."""
-    from experiments.r3f import provenance
+    from experiments.r3f import object_source
 
     made = None
     if part is not None:
-        made = provenance.Provenance(str(folder(run, given).resolve()), part.index)
-    provenance.write(run, made)
+        made = object_source.Provenance(str(folder(run, given).resolve()), part.index)
+    object_source.write(run, made)
 
 
 def folder(run: Path, given: str | None) -> Path:

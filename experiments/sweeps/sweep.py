@@ -8,9 +8,8 @@ from pathlib import Path
 from experiments.cli import commands
 from experiments.cli.subprocesses import RunFailedError
 from experiments.runs import measured_runs as trained_runs
-from experiments.sweeps import pareto_figure
 from experiments.sweeps import points as trade_points
-from experiments.sweeps import report as trade_report
+from experiments.sweeps import report
 from experiments.sweeps import table as trade_table
 from experiments.sweeps.points import BASE, Point
 from experiments.sweeps.table import Row
@@ -128,6 +127,6 @@ def run_name(point: Point, scene: Path) -> str:
 
 def _write(out: Path, rows: Sequence[Row]) -> None:
     trade_table.write(out / "trade_off.csv", rows)
-    pareto_figure.write(out / "trade_off.png", rows)
-    text = trade_report.markdown(rows)
+    report.write_figure(out / "trade_off.png", rows)
+    text = report.markdown(rows)
     (out / "trade_off.md").write_text(text, encoding="utf-8")

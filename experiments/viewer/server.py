@@ -1,7 +1,7 @@
 """The server of the viewer, and what it does for each page that is open.
 
 Every page has a camera, a panel and a scene of its own, and one thread that draws for it what
-`schedule` says. Pages take turns: one picture is drawn at a time.
+`session` schedules. Pages take turns: one picture is drawn at a time.
 
 This is the only module that imports viser.
 """
@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 import viser
 
-from experiments.viewer import layers, scenery, schedule, viewpoints
-from experiments.viewer import subject as subjects
+from experiments.viewer import cameras as viewpoints
+from experiments.viewer import controls, layers, session
+from experiments.viewer.cameras import Viewpoint
+from experiments.viewer.controls import Panel
 from experiments.viewer.layers import Picture
-from experiments.viewer.panel import Panel
-from experiments.viewer.schedule import Job, State
-from experiments.viewer.subject import Choice, Subject
-from experiments.viewer.viewpoints import Viewpoint
+from experiments.viewer.session import Choice, Job, State, Subject
 from refref_jax.geometry.rays import Rays
 from refref_jax.render import pixel_paths
 
@@ -56,7 +55,7 @@ def serve(subject: Subject, *, host: str, port: int) -> viser.ViserServer:
         server = viser.ViserServer(host=host, port=port, label=subject.name, verbose=False)
     # Sharing would open the page to the internet, through a machine of viser's authors.
     server.gui.configure_theme(show_share_button=False, show_logo=False)
-    view = subjects.first_viewpoint(subject)
+    view = session.first_viewpoint(subject)
     position, back = view.pose[:, 3], view.pose[:, 2]
     server.initial_camera.position = position
     server.initial_camera.look_at = position - back * np.linalg.norm(position)
@@ -88,7 +87,7 @@ class Page:
         self._state = State(stages=len(subject.heights))
         self._view = self._viewpoint()
         surfaces = subject.model.geometry.surfaces
-        self._scenery = scenery.Scenery(client.scene, surfaces, subject.views)
+        self._scenery = controls.Scenery(client.scene, surfaces, subject.views)
         self._panel = Panel(
             client.gui,
             subject,
@@ -124,7 +123,7 @@ class Page:
 
     def _change(self) -> None:
         with self._event:
-            self._state = schedule.changed(self._state, time.monotonic())
+            self._state = session.changed(self._state, time.monotonic())
             self._event.notify()
 
     def _work(self) -> None:
@@ -133,9 +132,9 @@ class Page:
                 if self._closed:
                     return
                 now = time.monotonic()
-                job, view = schedule.next_job(self._state, now), self._view
+                job, view = session.next_job(self._state, now), self._view
                 if job is None:
-                    self._event.wait(schedule.wait(self._state, now))
+                    self._event.wait(session.wait(self._state, now))
                     continue
             try:
                 picture = self._draw(job, view, self._panel.choice())
@@ -148,11 +147,11 @@ class Page:
                     picture, format="jpeg", jpeg_quality=_JPEG_QUALITY
                 )
                 with self._event:
-                    self._state = schedule.finished(self._state, job)
+                    self._state = session.finished(self._state, job)
 
     def _draw(self, job: Job, view: Viewpoint, choice: Choice) -> Picture | None:
         """Draws a job's picture; `None` if it was called off."""
-        model = subjects.chosen_model(self._subject, choice)
+        model = session.chosen_model(self._subject, choice)
         height, chunk = self._subject.heights[job.stage], self._subject.chunk
         most = height * viewpoints.width_of(height)
         layer, what = choice.layer, ("image", model.budget)
@@ -211,7 +210,7 @@ class Page:
 
     def _click(self, event: viser.SceneClickEvent) -> None:
         """Draws the light paths of the pixel that was clicked."""
-        model = subjects.chosen_model(self._subject, self._panel.choice())
+        model = session.chosen_model(self._subject, self._panel.choice())
         direction = np.asarray(event.ray_direction)
         ray = Rays(np.asarray(event.ray_origin), direction / np.linalg.norm(direction), 1e-3)
         with self._turns.tracing, self._compiling(("pixel", model.budget)):
@@ -225,7 +224,7 @@ class Page:
 
     def _stale(self, job: Job) -> bool:
         with self._event:
-            return self._closed or schedule.is_stale(self._state, job)
+            return self._closed or session.is_stale(self._state, job)
 
     @contextlib.contextmanager
     def _compiling(self, what: Any) -> Iterator[None]:

@@ -1,9 +1,10 @@
 """Rendering: from light paths to colours. Bodies, rays and paths are names of `refref_jax`.
 
-A trained run is read by `load_model`; `render_image` renders it in pieces on the host, and
-`render_rays` as one pure function. Any function of one ray may stand in for the fields,
-`radiance(origin, direction)` to linear RGB, such as a background (`radiance_of`): `render_known`
-renders that in pieces, and `shade` is the pure function. `docs/library.md` shows all of them.
+A trained run is read by `load_model`; `render_camera` renders it from a camera and `render_image`
+along any rays, both in pieces on the host, and `render_rays` as one pure function. Any function of
+one ray may stand in for the fields, `radiance(origin, direction)` to linear RGB, such as a
+background (`radiance_of`): `render_known` renders that in pieces, and `shade` is the pure function.
+`docs/library.md` shows all of them.
 """
 
 from refref_jax.geometry.rays import Rays as Rays
@@ -26,3 +27,4 @@ from refref_jax.render.model import Model as Model
 from refref_jax.render.model import Params as Params
 from refref_jax.render.model import init_params as init_params
 from refref_jax.render.saved import load_model as load_model
+from refref_jax.render.supersampling import render_camera as render_camera

@@ -1,4 +1,6 @@
-"""What is measured of a rendered image, against what a scene tells of it.
+"""Evaluates a model: renders the images of a split, and measures them against the scene's own.
+
+`evaluate` does both; `measure` compares one image that was rendered already.
 
 Distances are of three kinds, told apart by name:
 
@@ -14,6 +16,7 @@ Distances are of three kinds, told apart by name:
 Straight light knows of no object: there, all three are the median, as for the paper's baselines.
 """
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +27,11 @@ from jaxtyping import Bool, Float, UInt8
 
 from refref_jax import metrics
 from refref_jax.data import local_layout
-from refref_jax.render import Rendering
+from refref_jax.geometry import cameras
+from refref_jax.geometry.cameras import Cameras
+from refref_jax.render import dyes, first_surface, supersampling
+from refref_jax.render.images import CHUNK, Rendering
+from refref_jax.render.model import Model
 
 Measured = dict[str, float | None]
 """Values by name; `None` where there is nothing to measure, or nothing to measure it with."""
@@ -52,6 +59,134 @@ class Perceptual(NamedTuple):
 
     lpips: metrics.LpipsParams | None = None
     flip: Callable[[np.ndarray, np.ndarray], float] | None = None
+
+
+_WITHOUT_EYES = Perceptual()
+
+
+class EvaluatedView(NamedTuple):
+    """An image that was rendered and measured, for a caller who wants to save it.
+
+    Attributes:
+      name: stem of the true image's file.
+      place: position among the images that are evaluated, from 0.
+      count: number of images that are evaluated.
+      target: true image, 8-bit sRGB.
+      rendering: rendered image.
+      measures: metrics of the image, and the `seconds` that rendering took.
+    """
+
+    name: str
+    place: int
+    count: int
+    target: UInt8[np.ndarray, "h w 3"]
+    rendering: Rendering
+    measures: Measured
+
+
+class Evaluation(NamedTuple):
+    """Metrics of a split.
+
+    Attributes:
+      results: means over the images that have a measure, and `seconds_per_image`.
+      learned: learned tints and absorptions, see `learned_colours`.
+      per_image: `name`, metrics and `seconds` of each image.
+    """
+
+    results: Measured
+    learned: dict[str, Any] | None
+    per_image: list[dict[str, Any]]
+
+
+def evaluate(
+    model: Model,
+    scene: Path | str,
+    *,
+    split: str = "test",
+    rays_per_pixel: int = 1,
+    limit: int | None = None,
+    chunk: int = CHUNK,
+    perceptual: Perceptual = _WITHOUT_EYES,
+    progress: Callable[[int, int, str], None] | None = None,
+    on_view: Callable[[EvaluatedView], None] | None = None,
+) -> Evaluation:
+    """Renders and measures the images of a split.
+
+    Compiling is not part of the seconds that are measured.
+
+    Args:
+      model: trained model, see `refref_jax.render.load_model`.
+      scene: scene folder.
+      split: `train`, `val` or `test`.
+      rays_per_pixel: number of rays in each pixel, a square.
+      limit: number of images to evaluate, evenly spread; all if not given.
+      chunk: number of paths rendered at once.
+      perceptual: perceptual metrics to compute in addition.
+      progress: function of the number of images done, their total, and a line of text; called
+        once before the first image and after each.
+      on_view: function that receives each image as soon as it is measured. No image is kept.
+
+    Raises:
+      SceneError: if a file of the split is missing or broken.
+      ValueError: if `limit` is below 1, or the rays of a pixel do not make a square grid.
+    """
+    if limit is not None and limit < 1:
+        raise ValueError(f"limit={limit} leaves no image to evaluate. Give 1 or more.")
+    supersampling.side_of(rays_per_pixel)
+    truth = read_truth(Path(scene), split)
+    chosen = _spread(len(truth.images), limit)
+    views = truth.frames.cameras
+    supersampling.warm_up(model, views, chunk=chunk)
+    if progress is not None:
+        progress(0, len(chosen), "")
+    per_image: list[dict[str, Any]] = []
+    for place, i in enumerate(chosen):
+        name, start = truth.frames.names[i], time.monotonic()
+        seen = supersampling.render_camera(
+            model, views, i, rays_per_pixel=rays_per_pixel, chunk=chunk
+        )
+        seconds = time.monotonic() - start
+        first = first_distances(model, views, i)
+        measured = measure(seen, truth, i, first=first, perceptual=perceptual)
+        measured["seconds"] = seconds
+        per_image.append({"name": name, **measured})
+        if on_view is not None:
+            target = truth.images[i]
+            on_view(EvaluatedView(name, place, len(chosen), target, seen, measured))
+        if progress is not None:
+            progress(place + 1, len(chosen), f"{name}  PSNR {measured['psnr']:.2f}")
+    results = {key: mean_of(per_image, key) for key in per_image[0] if key != "name"}
+    results["seconds_per_image"] = results.pop("seconds")
+    return Evaluation(results, learned_colours(model), per_image)
+
+
+def learned_colours(model: Model) -> dict[str, Any] | None:
+    """Returns tints and absorptions of all parts, in the order of their file names, if learned."""
+    colours = model.params.dyes
+    if colours is None:
+        return None
+    absorptions = dyes.absorptions(colours, model.config.radius)
+    return {
+        "tints": np.asarray(dyes.tints(colours), float).round(4).tolist(),
+        "absorptions": np.asarray(absorptions, float).round(4).tolist(),
+    }
+
+
+def first_distances(model: Model, views: Cameras, i: int) -> Float[np.ndarray, "h w"] | None:
+    """Returns the distance of the first surface that bends light along the rays of pixel centres.
+
+    Args:
+      model: the scene.
+      views: cameras.
+      i: index of the camera.
+
+    Returns:
+      Distances in world units, `inf` where there is no surface; `None` if light goes straight.
+    """
+    if model.budget.bends == 0:
+        return None
+    rays = cameras.image_rays(views, i)
+    return first_surface.find_first_surface(model.geometry.surfaces, rays).distances
 
 
 def read_truth(scene: Path, split: str) -> Truth:
@@ -156,6 +291,12 @@ def mean_of(per_image: Sequence[Mapping[str, Any]], key: str) -> float | None:
     """Returns the mean of a measure over the images that have it."""
     values = [image[key] for image in per_image if image[key] is not None]
     return float(np.mean(values)) if values else None
+
+
+def _spread(count: int, limit: int | None) -> list[int]:
+    """Returns indices of all images, or of so many of them, evenly spread."""
+    chosen = np.linspace(0, count - 1, min(limit or count, count)).astype(int)
+    return np.unique(chosen).tolist()
 
 
 def _distances(

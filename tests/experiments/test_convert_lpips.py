@@ -6,11 +6,16 @@ import types
 
 import numpy as np
 import pytest
+from absl import flags
 
-from experiments.runs import state_dicts
+from experiments import convert_lpips
 from refref_jax import metrics
 from tests import made_lpips
 from tests.experiments.command import run_command
+
+# The options of a command that is imported must not meet those of another.
+for _flag in flags.FLAGS.flags_by_module_dict()[convert_lpips.__name__]:
+    delattr(flags.FLAGS, _flag.name)
 
 
 class _Tensor:
@@ -51,7 +56,7 @@ def path(tmp_path):
 def test_tensors_become_arrays_and_nothing_is_executed(stand_in, path):
     values = np.arange(3.0)
     stand_in.answer = {"features.0.bias": _Tensor(values), "epoch": 3}
-    found = state_dicts.read(path)
+    found = convert_lpips.read_state_dict(path)
     assert list(found) == ["features.0.bias"] and found["features.0.bias"] is values
     assert stand_in.calls == [(path, {"map_location": "cpu", "weights_only": True})]
 
@@ -67,16 +72,16 @@ def test_tensors_become_arrays_and_nothing_is_executed(stand_in, path):
 def test_what_holds_no_weights_is_named(stand_in, path, answer, message):
     stand_in.answer = answer
     with pytest.raises(ValueError, match=message) as raised:
-        state_dicts.read(path)
+        convert_lpips.read_state_dict(path)
     assert str(path) in str(raised.value)
 
 
 def test_without_pytorch_it_is_said_what_to_do(monkeypatch, path):
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(ValueError, match=r"pip install torch\), or give the same arrays as \.npz"):
-        state_dicts.read(path)
+        convert_lpips.read_state_dict(path)
     with pytest.raises(ValueError, match="does not exist"):
-        state_dicts.read(path.with_name("nowhere.pth"))
+        convert_lpips.read_state_dict(path.with_name("nowhere.pth"))
 
 
 def test_files_of_pytorch_itself(tmp_path):
@@ -86,13 +91,13 @@ def test_files_of_pytorch_itself(tmp_path):
         path = tmp_path / f"{form}.pth"
         tensors = {name: torch.nn.Parameter(torch.tensor(x)) for name, x in alexnet.items()}
         torch.save(tensors, path, _use_new_zipfile_serialization=form)
-        found = state_dicts.read(path)
+        found = convert_lpips.read_state_dict(path)
         assert list(found) == list(alexnet)
         for name, x in alexnet.items():
             np.testing.assert_array_equal(found[name], x)
     torch.save({"model": torch.nn.Linear(2, 2)}, path)
     with pytest.raises(ValueError, match="more than tensors"):
-        state_dicts.read(path)
+        convert_lpips.read_state_dict(path)
 
 
 def test_the_command_makes_a_file_that_lpips_reads(tmp_path):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from experiments.figures import cross_sections, glass_drawings
+from experiments.figures import cross_sections, glass
 from experiments.figures.cross_sections import Panel
-from experiments.figures.glass_drawings import Shown
+from experiments.figures.glass import Shown
 from refref_jax.data.errors import SceneError
 from refref_jax.data.meshes import MeshPart
 from refref_jax.optics.light_paths import PathStatus
@@ -116,10 +116,10 @@ def test_every_drawing_is_a_picture_with_something_in_it(tmp_path):
     far[0, 1] = 2.0
     names = ("views", "fan", "tree", "distances")
     views, fan, tree, distances = (tmp_path / f"{name}.jpg" for name in names)
-    glass_drawings.write_views(views, [Shown("true", image), Shown("ours", 0.9 * image, 26.0)])
-    glass_drawings.write_fan(fan, panels, [outline], 3.0)
-    glass_drawings.write_tree(tree, panels, [outline])
-    glass_drawings.write_distances(distances, Shown("true", image), [("far", far)])
+    glass.write_views(views, [Shown("true", image), Shown("ours", 0.9 * image, 26.0)])
+    glass.write_fan(fan, panels, [outline], 3.0)
+    glass.write_tree(tree, panels, [outline])
+    glass.write_distances(distances, Shown("true", image), [("far", far)])
     for path in (views, fan, tree, distances):
         picture = iio.imread(path)
         assert picture.shape[0] > 300 and picture.shape[1] > 600

@@ -3,9 +3,9 @@
 import pytest
 
 from experiments.runs.measured_runs import Training
-from experiments.sweeps import recommendations
+from experiments.sweeps import recommend
 from experiments.sweeps import table as trade_table
-from experiments.sweeps.recommendations import Machine
+from experiments.sweeps.recommend import Machine
 from tests.experiments.command import ROOT, run_command
 from tests.experiments.made_rows import made_row
 
@@ -22,7 +22,7 @@ _ROWS = [
 
 
 def test_the_time_is_that_of_steps_and_images_on_this_machine():
-    assert recommendations.seconds_of(_ROWS[1], _MACHINE) == pytest.approx(80.0)
+    assert recommend.seconds_of(_ROWS[1], _MACHINE) == pytest.approx(80.0)
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ def test_the_time_is_that_of_steps_and_images_on_this_machine():
     ],
 )
 def test_the_best_that_fits_is_chosen(seconds, cheaper, best, dearer):
-    choice = recommendations.choose(_ROWS, _MACHINE, seconds)
+    choice = recommend.choose(_ROWS, _MACHINE, seconds)
     names = [row and row.name for row in (choice.cheaper, choice.best, choice.dearer)]
     assert names == [cheaper, best, dearer]
 
@@ -47,10 +47,10 @@ def test_noise_decides_nothing():
         made_row("finest=256", pace=0.3, quality=25.2),
     ]
     # A point that is as good and takes less time is better, unless the time is the same.
-    choice = recommendations.choose(rows, _MACHINE, 1e6)
+    choice = recommend.choose(rows, _MACHINE, 1e6)
     assert (choice.best.name, choice.cheaper, choice.dearer) == ("finest=64", None, None)
     near = [rows[0], made_row("finest=64", pace=0.0995, quality=24.9)]
-    assert recommendations.choose(near, _MACHINE, 1e6).best.name == "base"
+    assert recommend.choose(near, _MACHINE, 1e6).best.name == "base"
 
 
 def test_turns_are_combined_when_there_is_time_and_that_is_said(tmp_path):
@@ -63,7 +63,7 @@ def test_turns_are_combined_when_there_is_time_and_that_is_said(tmp_path):
         made_row("steps=2000", pace=0.1, steps=2000, quality=25.5),
         made_row("rays_per_pixel=4", quality=28.0, evaluation="--rays_per_pixel=4"),
     ]
-    choice = recommendations.choose(rows, _MACHINE, 1e6)
+    choice = recommend.choose(rows, _MACHINE, 1e6)
     together = choice.combined
     assert set(together.name.split()) >= {"entries=19", "steps=2000", "rays_per_pixel=4"}
     assert together.steps == 2000 and together.evaluation == "--rays_per_pixel=4"
@@ -71,27 +71,27 @@ def test_turns_are_combined_when_there_is_time_and_that_is_said(tmp_path):
     assert together.quality == pytest.approx(25.0 + 2.0 + 1.0 + 0.5 + 3.0, abs=0.51)
     assert "--steps=2000" in together.training and "--entries=19" in together.training
     assert together.training.count("--steps") == 1 and "--entries=20" not in together.training
-    text = " ".join(recommendations.told(choice, _MACHINE, tmp_path))
+    text = " ".join(recommend.told(choice, _MACHINE, tmp_path))
     assert "not measured together" in text
-    tight = recommendations.seconds_of(rows[-1], _MACHINE)
-    assert recommendations.choose(rows, _MACHINE, tight + 0.1).combined is None
+    tight = recommend.seconds_of(rows[-1], _MACHINE)
+    assert recommend.choose(rows, _MACHINE, tight + 0.1).combined is None
 
 
 def test_folders_with_blanks_can_be_pasted(tmp_path):
-    choice = recommendations.choose(_ROWS, _MACHINE, 1e6)
-    text = "\n".join(recommendations.told(choice, _MACHINE, tmp_path / "my ball"))
+    choice = recommend.choose(_ROWS, _MACHINE, 1e6)
+    text = "\n".join(recommend.told(choice, _MACHINE, tmp_path / "my ball"))
     assert f"'--scene={tmp_path / 'my ball'}' '--out=runs/my ball'" in text
 
 
 def test_too_little_time_is_refused_with_what_is_needed():
     # 0.5 * (25 + 20) + 20 = 42.5 s.
     with pytest.raises(ValueError, match=r"less than 0\.7 minutes here \(steps=250\)"):
-        recommendations.choose(_ROWS, _MACHINE, 42.0)
+        recommend.choose(_ROWS, _MACHINE, 42.0)
 
 
 def test_the_machine_is_compared_by_the_base():
     timing = Training(96, 0.3, 3413.0, 60.0, 31.0, 900.0, None)
-    machine = recommendations.compare(timing, made_row(pace=0.1), 40)
+    machine = recommend.compare(timing, made_row(pace=0.1), 40)
     assert machine.ratio == pytest.approx(3.0)
     assert machine.startup == 31.0 and machine.images == 40
 
@@ -100,14 +100,14 @@ def test_the_bundled_table_is_a_whole_sweep():
     rows = trade_table.read(ROOT / "experiments" / "data" / "trade_off.csv")
     assert {row.scene for row in rows} == {"cube_smcvx_ball"}
     assert {row.knob for row in rows} >= {"", "paths", "cut", "samples", "steps", "rays_per_pixel"}
-    choice = recommendations.choose(rows, _MACHINE, 600.0)
+    choice = recommend.choose(rows, _MACHINE, 600.0)
     assert choice.best.quality > 30.0
 
 
 def test_what_is_told_can_be_pasted(tmp_path):
     rows = [made_row("base", evaluation="--rays_per_pixel=4")]
-    choice = recommendations.choose(rows, _MACHINE, 1e6)
-    text = "\n".join(recommendations.told(choice, _MACHINE, tmp_path / "ball"))
+    choice = recommend.choose(rows, _MACHINE, 1e6)
+    text = "\n".join(recommend.told(choice, _MACHINE, tmp_path / "ball"))
     train = f"python -m experiments.train --scene={tmp_path / 'ball'} --out=runs/ball"
     assert f"{train} --preset=tiny --steps=1000" in text
     assert "experiments.evaluate --run=runs/ball --split=test --rays_per_pixel=4" in text

@@ -11,7 +11,7 @@ from experiments.cli import subprocesses as child_process
 from experiments.cli.subprocesses import RunFailedError
 from experiments.runs import measured_runs as trained_runs
 from experiments.sweeps import points as trade_points
-from experiments.sweeps import report as trade_report
+from experiments.sweeps import report
 from experiments.sweeps import sweep as sweeps
 from experiments.sweeps import table as trade_table
 from experiments.sweeps.points import BASE
@@ -190,7 +190,7 @@ def test_what_saves_time_is_named_once_a_knob():
 
 
 def test_the_report_marks_the_front_and_sorts_by_time():
-    text = trade_report.markdown(_measured())
+    text = report.markdown(_measured())
     lines = [line for line in text.splitlines() if line.startswith(("| ● |", "|  |"))]
     assert [line.split("|")[2].strip() for line in lines][:3] == ["less=2", "less=1", "free=1"]
     assert [line.split("|")[1].strip() for line in lines][:5] == ["●", "●", "●", "", ""]

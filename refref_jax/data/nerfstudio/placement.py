@@ -7,6 +7,9 @@ from jaxtyping import Float
 
 from refref_jax.data.errors import SceneError
 
+USUAL_DISTANCE = 4.0
+"""Distance of the data set's cameras from the origin, world units, for captures without a scale."""
+
 # Axes are taken for parallel if the meeting point moves more than this per unit of their shift.
 _WORST_CONDITION = 1e4
 

@@ -9,6 +9,7 @@ import scipy.stats
 
 from experiments.dataset import cameras
 from experiments.dataset.seeds import seed_of
+from refref_jax.data.nerfstudio import placement
 from tests.experiments.command import ROOT
 
 _BUNDLED = ROOT / "experiments" / "data" / "cube_smcvx_ball"
@@ -104,3 +105,7 @@ def test_wrong_input_is_told():
         with pytest.raises(ValueError, match=r"0 poses were asked for\. Ask for one or more"):
             make(0)
     assert cameras.helix_poses(1).shape == (1, 4, 4)
+
+
+def test_captures_are_scaled_to_the_distance_of_the_data_sets_cameras():
+    assert placement.USUAL_DISTANCE == cameras.CAMERA_RADIUS

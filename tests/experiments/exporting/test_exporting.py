@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from experiments.exporting import bodies, field_grid, surfaces
+from experiments.exporting import field_mesh, object_meshes
 from refref_jax.data import meshes, stored_normals
 from refref_jax.fields import registry
 from refref_jax.fields.kinds import Radiance, RadianceConfig
@@ -54,7 +54,7 @@ def model(monkeypatch):
 
 def _sampled(model, resolution=40, half=1.6):
     steps = []
-    grid = field_grid.sample_density(
+    grid = field_mesh.sample_density(
         model,
         np.full(3, -half),
         np.full(3, half),
@@ -68,13 +68,13 @@ def _sampled(model, resolution=40, half=1.6):
 def test_a_planted_ball_is_found_with_radius_volume_and_colours(model, tmp_path):
     grid = _sampled(model)
     assert grid.spacing == pytest.approx(0.08) and grid.values.shape == (41, 41, 41)
-    found = surfaces.find_surface(grid, level=_LEVEL)
+    found = field_mesh.find_surface(grid, level=_LEVEL)
     distances = np.linalg.norm(found.vertices - [0.2, 0.0, 0.0], axis=-1)
     np.testing.assert_allclose(distances, 1.0, atol=0.005)
     outwards = (found.vertices - [0.2, 0.0, 0.0]) / distances[:, None]
     assert np.sum(found.normals * outwards, axis=-1).min() > 0.98
-    _, colours = field_grid.look_up_points(model, found.vertices, -found.normals, width=0.08)
-    surfaces.write_surface(tmp_path / "ball.ply", found, np.rint(255 * colours).astype(np.uint8))
+    _, colours = field_mesh.look_up_points(model, found.vertices, -found.normals, width=0.08)
+    field_mesh.write_surface(tmp_path / "ball.ply", found, np.rint(255 * colours).astype(np.uint8))
     read = trimesh.load(tmp_path / "ball.ply", process=False)
     assert read.is_watertight
     assert read.volume == pytest.approx(4.0 / 3.0 * np.pi, rel=0.01)
@@ -86,14 +86,14 @@ def test_a_planted_ball_is_found_with_radius_volume_and_colours(model, tmp_path)
 
 def test_points_are_the_shell_of_the_ball(model, tmp_path):
     grid = _sampled(model)
-    found = surfaces.find_points(grid, level=_LEVEL)
+    found = field_mesh.find_points(grid, level=_LEVEL)
     distances = np.linalg.norm(found.points - [0.2, 0.0, 0.0], axis=-1)
     assert distances.max() <= 1.0 + 1e-6 and distances.min() > 1.0 - np.sqrt(3.0) * grid.spacing
     outwards = (found.points - [0.2, 0.0, 0.0]) / distances[:, None]
     assert np.sum(found.normals * outwards, axis=-1).min() > 0.9
-    _, colours = field_grid.look_up_points(model, found.points, -found.normals, width=0.08)
+    _, colours = field_mesh.look_up_points(model, found.points, -found.normals, width=0.08)
     eight = np.rint(255 * colours).astype(np.uint8)
-    surfaces.write_points(tmp_path / "ball.ply", found, eight)
+    field_mesh.write_points(tmp_path / "ball.ply", found, eight)
     read = trimesh.load(tmp_path / "ball.ply")
     assert isinstance(read, trimesh.PointCloud)
     np.testing.assert_allclose(read.vertices, found.points, atol=1e-6)
@@ -123,23 +123,23 @@ def test_a_cavity_is_inside_and_what_is_between_bodies_is_not():
         solids.ball("far_glass", radius=0.5, centre=(3.0, 0.0, 0.0)),
     )
     axes = [np.array([-1.2, -0.75, 0.0, 0.75, 1.75, 3.0, 3.9]), np.zeros(1), np.zeros(1)]
-    inside = field_grid.inside_bodies(geometry, axes)[:, 0, 0]
+    inside = field_mesh.inside_bodies(geometry, axes)[:, 0, 0]
     assert inside.tolist() == [False, True, True, True, False, True, False]
 
 
 def test_density_is_per_world_unit(model):
-    density, _ = field_grid.look_up_points(model, np.array([[1.2, 0.0, 0.0]]), None, width=0.1)
+    density, _ = field_mesh.look_up_points(model, np.array([[1.2, 0.0, 0.0]]), None, width=0.1)
     assert density[0] == pytest.approx(_LEVEL, rel=1e-4)
-    none, rgb = field_grid.look_up_points(model, np.zeros((0, 3)), None, width=0.1)
+    none, rgb = field_mesh.look_up_points(model, np.zeros((0, 3)), None, width=0.1)
     assert none.shape == (0,) and rgb.shape == (0, 3)
 
 
 def test_walls_are_where_a_bounded_model_ends():
     empty = Grid(np.zeros((9, 9, 9)), np.full(3, -2.0), 0.5)
     with pytest.raises(ValueError, match="below 5 per world unit in the whole box"):
-        surfaces.find_surface(empty, level=5.0)
-    room = surfaces.with_walls(empty, level=5.0)
-    found = surfaces.find_surface(room, level=5.0)
+        field_mesh.find_surface(empty, level=5.0)
+    room = field_mesh.with_walls(empty, level=5.0)
+    found = field_mesh.find_surface(room, level=5.0)
     largest = np.abs(found.vertices).max(axis=-1)
     assert largest.min() > 2.0 - 0.2 * 0.5 and largest.max() <= 2.0
     middles = found.vertices[np.abs(found.vertices[:, 0]) > 1.9]
@@ -147,24 +147,24 @@ def test_walls_are_where_a_bounded_model_ends():
     index = np.flatnonzero(np.abs(found.vertices[:, 0]) > 1.9)[flat]
     inwards = -np.sign(found.vertices[index, 0])
     np.testing.assert_allclose(found.normals[index, 0], inwards, atol=1e-6)
-    points = surfaces.find_points(room, level=5.0).points
+    points = field_mesh.find_points(room, level=5.0).points
     assert (np.abs(points).max(axis=-1) == 2.0).all()
     dense = Grid(np.full((4, 4, 4), 9.0), np.zeros(3), 1.0)
     with pytest.raises(ValueError, match="at least 5 per world unit in the whole box"):
-        surfaces.find_points(dense, level=5.0)
+        field_mesh.find_points(dense, level=5.0)
 
 
 def test_a_spherical_model_ends_on_its_sphere():
     empty = Grid(np.zeros((33, 33, 33)), np.full(3, -2.0), 0.125)
-    room = surfaces.with_sphere(empty, level=5.0, radius=1.7)
-    found = surfaces.find_surface(room, level=5.0)
+    room = field_mesh.with_sphere(empty, level=5.0, radius=1.7)
+    found = field_mesh.find_surface(room, level=5.0)
     distances = np.linalg.norm(found.vertices, axis=-1)
     # A tenth of a cell is what marching cubes may move a vertex by.
     np.testing.assert_allclose(distances, 1.7, atol=0.0125)
     inwards = -found.vertices / distances[:, None]
     assert np.sum(found.normals * inwards, axis=-1).min() > 0.98
     solid = Grid(np.full((33, 33, 33), 9.0, np.float32), empty.low, 0.125)
-    kept = surfaces.with_sphere(solid, level=5.0, radius=1.7).values
+    kept = field_mesh.with_sphere(solid, level=5.0, radius=1.7).values
     # What the field has within is not touched, and walls are nowhere thinner than the level.
     assert kept.dtype == np.float32 and kept.min() == 9.0
     assert room.values[0, 0, 0] > 5.0 and room.values[16, 16, 16] < 5.0 * np.exp(-5.9)
@@ -173,7 +173,7 @@ def test_a_spherical_model_ends_on_its_sphere():
 def test_bodies_keep_their_normals_and_corners():
     sharp, round_ = solids.box("box_glass", centre=(3.0, 0.0, 0.0)), solids.ball("ball_glass")
     geometry = scenes.geometry(sharp, round_)
-    box, ball = bodies.read_meshes(geometry)
+    box, ball = object_meshes.read_meshes(geometry)
     assert (len(box.vertices), len(box.faces)) == (8, 12)
     assert len(ball.vertices) == len(round_.vertices)
     assert trimesh.Trimesh(*box[:2]).volume == pytest.approx(1.0)
@@ -185,23 +185,23 @@ def test_bodies_keep_their_normals_and_corners():
 
 def test_a_run_s_bodies_are_files_that_are_read_again(tmp_path, monkeypatch):
     geometry = scenes.geometry(solids.box(centre=(3.0, 0.0, 0.0)), solids.ball())
-    monkeypatch.setattr(bodies, "load_geometry", lambda run: geometry)
-    written = bodies.write(tmp_path, tmp_path / "new" / "body.ply", overwrite=False)
+    monkeypatch.setattr(object_meshes, "load_geometry", lambda run: geometry)
+    written = object_meshes.write(tmp_path, tmp_path / "new" / "body.ply", overwrite=False)
     assert [path.name for path in written] == ["body_0.ply", "body_1.ply"]
     part = meshes.read_part(written[1], index=1.5)
     np.testing.assert_array_equal(part.normals, stored_normals.read_normals(written[1]))
     assert len(part.faces) == 320
     with pytest.raises(ValueError, match=r"body_0\.ply exists.* --overwrite"):
-        bodies.write(tmp_path, tmp_path / "new" / "body.ply", overwrite=False)
-    monkeypatch.setattr(bodies, "load_geometry", lambda run: scenes.geometry())
+        object_meshes.write(tmp_path, tmp_path / "new" / "body.ply", overwrite=False)
+    monkeypatch.setattr(object_meshes, "load_geometry", lambda run: scenes.geometry())
     with pytest.raises(ValueError, match="has no body"):
-        bodies.write(tmp_path, tmp_path / "none.ply", overwrite=False)
+        object_meshes.write(tmp_path, tmp_path / "none.ply", overwrite=False)
 
 
 def test_colours_go_by_the_side_that_is_looked_at(model):
     point = np.array([[1.2, 0.0, 0.0]])
-    _, front = field_grid.look_up_points(model, point, np.array([[-1.0, 0.0, 0.0]]), width=0.1)
-    _, back = field_grid.look_up_points(model, point, np.array([[1.0, 0.0, 0.0]]), width=0.1)
+    _, front = field_mesh.look_up_points(model, point, np.array([[-1.0, 0.0, 0.0]]), width=0.1)
+    _, back = field_mesh.look_up_points(model, point, np.array([[1.0, 0.0, 0.0]]), width=0.1)
     np.testing.assert_allclose(front, [[1.0, 0.0, 0.0]], atol=1e-6)
     np.testing.assert_allclose(back, [[1.055 * 0.2 ** (1 / 2.4) - 0.055, 0, 0]], atol=1e-5)
     assert jax.tree.leaves(model.params) == []

@@ -13,7 +13,7 @@ import numpy as np
 from absl import flags
 
 from experiments import train
-from experiments.r3f import provenance
+from experiments.r3f import object_source
 from refref_jax.render import saved
 from refref_jax.training import fit, run_folder
 
@@ -30,7 +30,7 @@ def _begin(options):
     except ValueError as error:
         return {"error": str(error)}
     geometry = saved.load_geometry(run)
-    body = provenance.read(run)
+    body = object_source.read(run)
     return {
         "error": None,
         "printed": printed.getvalue(),

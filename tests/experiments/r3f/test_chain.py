@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 
 from experiments.r3f import (
-    body,
-    body_pixels,
     chain,
     geometry_stage,
     index_stage,
     light_stage,
+    object_source,
     records,
     report,
 )
@@ -160,8 +159,8 @@ def _killing(function, *, after=False, calls=1):
         ("refref_jax.data.stored_normals.write_mesh", {"after": True}),  # before the renaming
         ("experiments.r3f.geometry_stage.run", {"after": True}),  # renamed, not recorded
         ("experiments.r3f.records.write", {"calls": 2, "after": True}),  # between two stages
-        ("experiments.r3f.surface_pictures.draw_surface", {"after": True}),
-        ("experiments.r3f.pages.markdown", {}),
+        ("experiments.r3f.report_figures.draw_surface", {"after": True}),
+        ("experiments.r3f.report.markdown", {}),
         ("experiments.r3f.records.write", {"calls": 4}),  # all done, not recorded
     ],
 )
@@ -287,19 +286,19 @@ def test_light_is_kept_only_where_validation_views_say_so(
     shutil.copytree(scene, judged)
     shutil.copy(judged / "transforms_test.json", judged / "transforms_val.json")
     config = dataclasses.replace(_CONFIG, light_steps=7)
-    old = body.read_mesh(out, records.read(out))
+    old = object_source.read_mesh(out, records.read(out))
     looked, errors = [], [0.04, after]
 
     def look(folder, split, model, *, seed, rays):
         looked.append((split, seed))
-        return body_pixels.BodyPixels(SimpleNamespace(rgb=np.zeros(rays)), None)
+        return index_stage.BodyPixels(SimpleNamespace(rgb=np.zeros(rays)), None)
 
     def refine_by_light(mesh, index, interfaces, evidence, *, config, settings, progress):
         assert settings.steps == 7 and index == 1.5 and interfaces.index_inside.shape == (1,)
         assert settings.index_stride == 0.0
         return Refined(mesh._replace(vertices=1.001 * mesh.vertices), 1.5, (0.04,) * 7, 0.02)
 
-    monkeypatch.setattr(body_pixels, "look", look)
+    monkeypatch.setattr(index_stage, "look", look)
     monkeypatch.setattr(light_stage, "refine_by_light", refine_by_light)
     monkeypatch.setattr(light_stage, "judge", lambda *_: errors.pop(0))
     background = SimpleNamespace(config=None)
@@ -327,8 +326,8 @@ def test_light_is_kept_only_where_validation_views_say_so(
 def test_a_body_that_light_blew_up_is_left_out(scene, monkeypatch, tmp_path):
     mesh = bodies.icosphere(2)
     blown = Refined(mesh._replace(vertices=1.05 * mesh.vertices), 1.6, (0.04,), 0.05)
-    pixels = body_pixels.BodyPixels(SimpleNamespace(rgb=np.zeros(3)), None)
-    monkeypatch.setattr(body_pixels, "look", lambda *_, **options: pixels)
+    pixels = index_stage.BodyPixels(SimpleNamespace(rgb=np.zeros(3)), None)
+    monkeypatch.setattr(index_stage, "look", lambda *_, **options: pixels)
     monkeypatch.setattr(light_stage, "refine_by_light", lambda *_, **options: blown)
     errors = [0.04, 0.01]
     monkeypatch.setattr(light_stage, "judge", lambda *_: errors.pop(0))
@@ -396,7 +395,7 @@ def test_masks_without_an_inside_are_refused(scene, tmp_path):
         lone[20, 20] = 255
         iio.imwrite(path, lone)
     with pytest.raises(ValueError, match="Use larger images"):
-        body_pixels.look(thin, "train", None, seed=0, rays=10)
+        index_stage.look(thin, "train", None, seed=0, rays=10)
 
 
 def test_light_asks_for_masks_of_validation_views(scene, tmp_path):

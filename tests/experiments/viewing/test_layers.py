@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from experiments.figures import comparison as figures
-from experiments.viewer import layers
-from experiments.viewer import subject as subjects
-from experiments.viewer.subject import Subject
+from experiments.viewer import layers, session
+from experiments.viewer.session import Subject
 from refref_jax.data import files
 from refref_jax.data.local_layout import read_frames
 from refref_jax.geometry.cameras import image_rays
@@ -66,11 +65,11 @@ def test_the_two_branches_sum_to_the_picture(model):
 
 def test_another_index_is_another_picture_of_the_same_programs(model):
     subject = Subject("made", model, "nested", None, ("glass",), (9, 18), 4096)
-    first = subjects.first_choice(subject)
+    first = session.first_choice(subject)
     before = layers.draw(model, layers.RGB, _RAYS, **_OPTIONS)
     programs = (images._trace_tile, images._render_chunk)
     compiled = [program._cache_size() for program in programs]
-    other = subjects.chosen_model(subject, dataclasses.replace(first, indices=(1.2,)))
+    other = session.chosen_model(subject, dataclasses.replace(first, indices=(1.2,)))
     after = render_image(other, _RAYS)
     for branch in ("both", "transmitted", "reflected"):
         render_image(model, _RAYS, branch=branch)

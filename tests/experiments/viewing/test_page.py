@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.viewer import subject as subjects
+from experiments.viewer import session
 from refref_jax.data import local_layout
 from refref_jax.optics.budgets import TREE
 from refref_jax.render import Model, images, init_params
@@ -39,7 +39,7 @@ def subject(ball_scene, monkeypatch):
     config = dataclasses.replace(MODEL, interior="clear")
     model = Model(config, budget, scenes.geometry(scenes.ball(1.4, subdivisions=3)), params)
     frames = local_layout.read_frames(ball_scene, "test")
-    return subjects.Subject("made", model, "nested", frames, ("ball_glass",), (18, 36), 1024)
+    return session.Subject("made", model, "nested", frames, ("ball_glass",), (18, 36), 1024)
 
 
 @pytest.fixture

@@ -8,9 +8,8 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.viewer import layers
-from experiments.viewer import subject as subjects
-from experiments.viewer.subject import Subject
+from experiments.viewer import layers, session
+from experiments.viewer.session import Subject
 from refref_jax.data import local_layout
 from refref_jax.optics.budgets import STRAIGHT, TREE
 from refref_jax.render import Model, init_params
@@ -62,16 +61,16 @@ def test_without_viser_it_says_what_to_install(tmp_path):
 
 def test_the_first_choice_is_the_model_as_it_was_trained():
     subject = _subject()
-    choice = subjects.first_choice(subject)
+    choice = session.first_choice(subject)
     assert choice.layer == layers.RGB and choice.indices == (1.5, 1.5)
-    model = subjects.chosen_model(subject, choice)
+    model = session.chosen_model(subject, choice)
     assert model.budget is subject.model.budget and model.geometry == subject.model.geometry
 
 
 def test_another_index_changes_arrays_and_nothing_that_is_compiled():
     subject = _subject()
-    choice = dataclasses.replace(subjects.first_choice(subject), indices=(1.7, 1.2))
-    model = subjects.chosen_model(subject, choice)
+    choice = dataclasses.replace(session.first_choice(subject), indices=(1.7, 1.2))
+    model = session.chosen_model(subject, choice)
     assert model.budget == subject.model.budget
     np.testing.assert_array_equal(model.geometry.interfaces.index_inside, np.float32([1.7, 1.2]))
     np.testing.assert_array_equal(model.geometry.interfaces.index_outside, np.float32([1.0, 1.7]))
@@ -83,25 +82,25 @@ def test_another_index_changes_arrays_and_nothing_that_is_compiled():
 
 def test_another_cut_and_other_bends_are_another_budget_with_room_for_them():
     subject = _subject()
-    first = subjects.first_choice(subject)
-    finer = subjects.chosen_model(subject, dataclasses.replace(first, cut=0.005, bends=32)).budget
+    first = session.first_choice(subject)
+    finer = session.chosen_model(subject, dataclasses.replace(first, cut=0.005, bends=32)).budget
     assert (finer.cut, finer.bends) == (0.005, 32)
     assert finer.paths_per_ray == pytest.approx(2.0 * TREE.paths_per_ray)
     straight = _subject(STRAIGHT)
-    choice = subjects.first_choice(straight)
-    assert subjects.chosen_model(straight, choice) is straight.model
+    choice = session.first_choice(straight)
+    assert session.chosen_model(straight, choice) is straight.model
 
 
 def test_parts_have_the_names_of_their_meshes_where_these_are_known(ball_scene):
-    assert subjects.part_names(ball_scene, 1) == ("ball_body_glass",)
-    assert subjects.part_names(ball_scene, 2) == ("part 1", "part 2")
-    assert subjects.part_names(None, 1) == ("part 1",)
+    assert session.part_names(ball_scene, 1) == ("ball_body_glass",)
+    assert session.part_names(ball_scene, 2) == ("part 1", "part 2")
+    assert session.part_names(None, 1) == ("part 1",)
 
 
 def test_a_page_begins_at_the_first_test_view_or_beside_the_origin(ball_scene):
     frames = local_layout.read_frames(ball_scene, "test")
-    view = subjects.first_viewpoint(_subject(frames=frames))
+    view = session.first_viewpoint(_subject(frames=frames))
     np.testing.assert_array_equal(view.pose, frames.cameras.poses[0])
-    alone = subjects.first_viewpoint(_subject()).pose
+    alone = session.first_viewpoint(_subject()).pose
     assert np.linalg.norm(alone[:, 3]) == pytest.approx(4.0)
     np.testing.assert_allclose(alone[:, 2], alone[:, 3] / 4.0, atol=1e-12)  # looks at the origin

@@ -1,19 +1,17 @@
-import sys
-
 import jax
 import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from experiments.cli import perceptual_option
 from refref_jax import metrics
 from refref_jax.data import local_layout
 from refref_jax.data.local_layout import Frames
-from refref_jax.render import Rendering
+from refref_jax.optics.budgets import STRAIGHT, TREE
+from refref_jax.render import Model, Rendering, init_params
 from refref_jax.training import evaluation as measures
 from refref_jax.training.evaluation import Perceptual
-from tests import made_lpips
-from tests.small_model import CAMERAS
+from tests import made_lpips, scenes
+from tests.small_model import CAMERAS, MODEL
 
 _NOTHING = Perceptual()
 
@@ -162,22 +160,46 @@ def test_eyes_are_asked_where_they_are_at_hand(tmp_path):
     assert small["lpips"] is None and small["flip"] == 0.125
 
 
-def test_what_is_not_at_hand_is_warned_of_once(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(perceptual_option, "LPIPS_WEIGHTS", _Flag(None))
-    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
-    assert perceptual_option.chosen() == Perceptual(None, None)
-    first, second = capsys.readouterr().out.splitlines()
-    assert first.startswith("warning: LPIPS") and "docs/metrics.md" in first
-    assert second.startswith("warning: FLIP") and "pip install -e '.[flip]'" in second
-    monkeypatch.setattr(perceptual_option, "LPIPS_WEIGHTS", _Flag(str(tmp_path / "none.npz")))
-    with pytest.raises(ValueError, match=r"none\.npz can not be read"):
-        perceptual_option.chosen()
-    weights = made_lpips.write(tmp_path / "weights.npz")
-    monkeypatch.setattr(perceptual_option, "LPIPS_WEIGHTS", _Flag(str(weights)))
-    assert perceptual_option.chosen().lpips is not None
-    assert "LPIPS" not in capsys.readouterr().out
+def _model(budget):
+    params = init_params(jax.random.key(0), MODEL)
+    return Model(MODEL, budget, scenes.geometry(scenes.ball(1.3, subdivisions=1)), params)
 
 
-class _Flag:
-    def __init__(self, value):
-        self.value = value
+def test_evaluating_is_rendering_and_measuring_view_by_view(ball_scene):
+    views, calls = [], []
+    found = measures.evaluate(
+        _model(STRAIGHT),
+        str(ball_scene),
+        limit=2,
+        progress=lambda *call: calls.append(call),
+        on_view=views.append,
+    )
+    truth = measures.read_truth(ball_scene, "test")
+    names = [truth.frames.names[0], truth.frames.names[-1]]
+    assert [view.name for view in views] == [image["name"] for image in found.per_image] == names
+    assert [(view.place, view.count) for view in views] == [(0, 2), (1, 2)]
+    assert [call[:2] for call in calls] == [(0, 2), (1, 2), (2, 2)]
+    assert calls[-1][2] == f"{names[1]}  PSNR {found.per_image[1]['psnr']:.2f}"
+    expected = measures.measure(views[1].rendering, truth, -1, first=None, perceptual=_NOTHING)
+    assert views[1].measures == expected | {"seconds": found.per_image[1]["seconds"]}
+    np.testing.assert_array_equal(views[1].target, truth.images[-1])
+    for key, value in found.results.items():
+        each = [image[key.replace("seconds_per_image", "seconds")] for image in found.per_image]
+        assert value == (None if None in each else pytest.approx(np.mean(each)))
+    assert "seconds" not in found.results and found.learned is None
+
+
+def test_surfaces_are_known_where_light_bends():
+    assert measures.first_distances(_model(STRAIGHT), CAMERAS, 0) is None
+    first = measures.first_distances(_model(TREE), CAMERAS, 0)
+    # A ball of radius 1.3, seen from a distance of 4; its facets lie a little deeper.
+    assert np.min(first) == pytest.approx(2.7, abs=0.15) and np.isinf(first[0, 0])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [({"limit": 0}, "Give 1 or more"), ({"rays_per_pixel": 3}, "Give 1 or 4")],
+)
+def test_wrong_arguments_are_refused_before_anything_is_read(wrong, says):
+    with pytest.raises(ValueError, match=says):
+        measures.evaluate(_model(STRAIGHT), "nowhere", **wrong)

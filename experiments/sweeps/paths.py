@@ -1,13 +1,19 @@
-"""Figures of the speed-accuracy curve of light paths, drawn with matplotlib."""
+"""The speed-accuracy curve of light paths: measured on scenes, as a table and as figures."""
 
-from collections.abc import Sequence
+import csv
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from matplotlib import patheffects
 from matplotlib.lines import Line2D
 
 from experiments.figures.style import COLOURS, LABEL_HEIGHT, label_plainly, pyplot, style
+from experiments.runs import known_scene as known_scenes
+from experiments.runs.known_scene import KnownScene
+from refref_jax.optics.budgets import Budget
+from refref_jax.training import evaluation as measures
 
 _MARKERS = {"straight": "s", "paper": "D"}
 _GREY = "#777777"
@@ -22,6 +28,20 @@ _COSTS = {
     "casts_per_pixel": ("ray casts per pixel", 1.0),
     "seconds_per_pixel": ("time per pixel, µs", 1e6),
 }
+
+
+class Setting(NamedTuple):
+    """One light budget of a sweep.
+
+    Attributes:
+      sweep: what it varies, `cut` or `bends`; `budget` for a point alone.
+      name: how figures call it.
+      budget: which light is followed.
+    """
+
+    sweep: str
+    name: str
+    budget: Budget
 
 
 class Trial(NamedTuple):
@@ -56,7 +76,50 @@ class Trial(NamedTuple):
     lost_energy: float
 
 
-def write(folder: Path, trials: Sequence[Trial]) -> list[Path]:
+def measure_all(chosen: list[KnownScene], plan: list[Setting], side: int) -> Iterator[Trial]:
+    """Renders every scene with every budget; equal budgets are rendered once."""
+    for scene in chosen:
+        known: dict[Budget, Trial] = {}
+        for setting in plan:
+            if setting.budget not in known:
+                known[setting.budget] = measure_one(scene, setting, side)
+            yield known[setting.budget]._replace(sweep=setting.sweep, name=setting.name)
+
+
+def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
+    """Renders all views of a scene with one budget."""
+    known_scenes.warm_up(scene, setting.budget)
+    views, measured = [], []
+    for i in range(len(scene.indices)):
+        view = known_scenes.render_view(scene, i, budget=setting.budget, side=side)
+        views.append(view)
+        measured.append(known_scenes.measure(scene, i, view.rgb))
+    pixels = scene.frames.cameras.height * scene.frames.cameras.width * side**2
+    return Trial(
+        scene=scene.name,
+        sweep=setting.sweep,
+        name=setting.name,
+        cut=setting.budget.cut,
+        bends=setting.budget.bends,
+        psnr=measures.mean_of(measured, "psnr"),
+        psnr_masked=measures.mean_of(measured, "psnr_masked"),
+        psnr_outside=measures.mean_of(measured, "psnr_outside"),
+        casts_per_pixel=float(np.mean([view.casts for view in views])),
+        paths_per_pixel=float(np.mean([view.paths for view in views])),
+        seconds_per_pixel=sum(view.seconds for view in views) / (pixels * len(views)),
+        lost_energy=float(np.mean([view.lost for view in views])),
+    )
+
+
+def write_table(path: Path, trials: Sequence[Trial]) -> None:
+    """Writes a CSV, one row a trial."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(Trial._fields)
+        writer.writerows(trials)
+
+
+def write_figures(folder: Path, trials: Sequence[Trial]) -> list[Path]:
     """Draws each sweep against casts and against time, one line a scene.
 
     Args:

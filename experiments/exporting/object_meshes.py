@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from experiments.cli import output_folders
-from experiments.exporting.field_grid import split_parts
-from experiments.r3f import body, records
+from experiments.exporting.field_mesh import split_parts
+from experiments.r3f import object_source, records
 from refref_jax.data import stored_normals
 from refref_jax.optics.wavefront import Geometry
 from refref_jax.reconstruct.triangles import Mesh
@@ -32,7 +32,7 @@ def write(run: Path, out: Path, *, overwrite: bool) -> list[Path]:
         replaced.
     """
     if records.exists(run):
-        meshes = [body.read_mesh(run, _finished(run))]
+        meshes = [object_source.read_mesh(run, _finished(run))]
     else:
         meshes = read_meshes(load_geometry(run))
     if not meshes:

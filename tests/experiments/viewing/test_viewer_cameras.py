@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from experiments.viewer import viewpoints
-from experiments.viewer.viewpoints import Viewpoint
+from experiments.viewer import cameras as viewpoints
+from experiments.viewer.cameras import Viewpoint
 from refref_jax.geometry.cameras import image_rays, orbit
 
 _ORBIT = orbit(8, distance=4.0, elevation=0.3, size=64, angle_x=1.1656)

@@ -4,10 +4,16 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.cli import options
 from refref_jax.geometry import cameras
 from refref_jax.optics.budgets import STRAIGHT
-from refref_jax.render import Model, Rendering, init_params, render_image, supersampling
+from refref_jax.render import (
+    Model,
+    Rendering,
+    init_params,
+    render_camera,
+    render_image,
+    supersampling,
+)
 from tests import scenes
 from tests.small_model import CAMERAS, MODEL
 
@@ -22,7 +28,7 @@ def model():
 
 @pytest.mark.parametrize(("rays", "side"), [(1, 1), (4, 2), (9, 3), (16, 4), (49, 7)])
 def test_rays_make_a_square_grid(rays, side):
-    assert options.side_of(rays) == side
+    assert supersampling.side_of(rays) == side
 
 
 @pytest.mark.parametrize(
@@ -30,7 +36,7 @@ def test_rays_make_a_square_grid(rays, side):
 )
 def test_rays_that_do_not_are_told_the_nearest_squares(rays, nearest):
     with pytest.raises(ValueError, match=nearest):
-        options.side_of(rays)
+        supersampling.side_of(rays)
 
 
 def _fine(linear, distance):
@@ -73,7 +79,7 @@ def test_each_block_of_small_pixels_makes_its_own_pixel():
 
 
 def test_one_ray_a_pixel_is_the_picture_itself(model):
-    seen = supersampling.render_view(model, CAMERAS, 0, side=1, chunk=_CHUNK)
+    seen = render_camera(model, CAMERAS, 0, chunk=_CHUNK)
     for ours, expected in zip(
         seen, render_image(model, cameras.image_rays(CAMERAS, 0), chunk=_CHUNK), strict=True
     ):
@@ -82,8 +88,13 @@ def test_one_ray_a_pixel_is_the_picture_itself(model):
 
 def test_bands_of_rows_make_the_same_picture(model):
     # 16 x 16 pixels of 4 rays: bands of 3 rows of pixels, of which the last holds one.
-    banded = supersampling.render_view(model, CAMERAS, 0, side=2, chunk=_CHUNK, band=200)
+    banded = render_camera(model, CAMERAS, 0, rays_per_pixel=4, chunk=_CHUNK, band=200)
     fine = render_image(model, cameras.image_rays(cameras.supersample(CAMERAS, 2), 0))
     assert banded.rgb.shape == (16, 16, 3) and banded.distance.shape == (16, 16)
     for ours, expected in zip(banded, supersampling.average(fine, 2), strict=True):
         np.testing.assert_allclose(ours, expected, atol=2e-5)
+
+
+def test_rays_that_make_no_square_grid_are_refused(model):
+    with pytest.raises(ValueError, match=r"8 rays a pixel .* Give 4 or 9"):
+        render_camera(model, CAMERAS, 0, rays_per_pixel=8)

@@ -1,13 +1,49 @@
-"""The reconstructed body as far as it has got: its newest surface, and its index of refraction."""
+"""Where the object of a run comes from: a reconstruction, as far as it has got.
 
+A run that was trained with a reconstructed object says so in `{run}/body.json`, which `write` and
+`read` are for. The other functions read the newest surface of a reconstruction, and its index of
+refraction.
+"""
+
+import dataclasses
 from pathlib import Path
 
 from experiments.r3f import geometry_stage, light_stage
 from experiments.r3f.records import IndexFacts, Reconstruction
+from refref_jax import configuration
 from refref_jax.data import meshes
 from refref_jax.data.geometry import shading_normals
 from refref_jax.data.meshes import MeshPart
 from refref_jax.reconstruct.triangles import Mesh
+
+_FILE = "body.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class Provenance:
+    """Of a body.
+
+    Attributes:
+      reconstruction: the folder that it was reconstructed into.
+      index: its index of refraction, as it was trained with.
+    """
+
+    reconstruction: str
+    index: float
+
+
+def write(run: Path, provenance: Provenance | None) -> None:
+    """Notes it in a run's folder, which is made; or that the body is the scene's own."""
+    if provenance is None:
+        (run / _FILE).unlink(missing_ok=True)
+        return
+    run.mkdir(parents=True, exist_ok=True)
+    configuration.write(run / _FILE, provenance)
+
+
+def read(run: Path) -> Provenance | None:
+    """Returns it, or `None` where the scene's own meshes bend light."""
+    return configuration.read(run / _FILE, Provenance) if (run / _FILE).is_file() else None
 
 
 def surface_file(out: Path, found: Reconstruction) -> Path:

@@ -6,7 +6,6 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.viewer import scenery
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.budgets import STRAIGHT, TREE
 from refref_jax.optics.light_paths import PathStatus
@@ -116,53 +115,3 @@ def test_the_table_says_number_status_and_weights():
     one = pixel_paths.describe(_made([1.0])._replace(lost=np.zeros(3)))
     assert "**1 light path**" in one and "ran out of bends" in one and "room" not in one
     assert set(pixel_paths.ENDINGS) == set(PathStatus) - {PathStatus.EMPTY}
-
-
-def test_strong_light_is_thick_and_yellow_and_weak_light_thin_and_blue():
-    shares = np.array([1e-5, 1e-3, 0.0316228, 1.0, 2.0])
-    np.testing.assert_allclose(scenery.strength(shares), [0.0, 0.0, 0.5, 1.0, 1.0], atol=1e-6)
-    weak, *_, strong = scenery.colour(shares).astype(int)
-    assert weak[2] > 100 > weak[1] and strong[0] > 200 and strong[1] > 200 and strong[2] < 100
-
-
-class _Scene:
-    """Takes notes of what is added to it."""
-
-    def __init__(self):
-        self.nodes = {}
-
-    def add_line_segments(self, name, points, colors, *, thickness, thickness_units):
-        assert points.shape == colors.shape and thickness_units == "screen"
-        self.nodes[name] = (points, thickness)
-        return _Node(lambda: self.nodes.pop(name))
-
-    def add_mesh_simple(self, name, vertices, faces, **_):
-        self.nodes[name] = vertices[faces]
-        return _Node(lambda: None)
-
-
-class _Node:
-    def __init__(self, remove):
-        self.remove, self.visible = remove, False
-
-
-def test_the_scene_shows_each_piece_once_and_nothing_of_the_last_pixel(straight_down, slab):
-    scene = _Scene()
-    made = scenery.Scenery(scene, slab.surfaces, None)
-    np.testing.assert_allclose(
-        np.sort(scene.nodes.pop("/bodies/0").reshape(-1, 3), axis=0),
-        np.sort(
-            np.asarray(scenes.box((8.0, 8.0, 1.0)).vertices)[scenes.box().faces].reshape(-1, 3), 0
-        ),
-        atol=1e-6,
-    )
-    pieces = pixel_paths.pieces(straight_down)
-    for _ in range(2):
-        made.show_paths(pieces)
-        lines = [points for points, _ in scene.nodes.values()]
-        assert sum(map(len, lines)) == len(pieces.ends)
-    thickness = {points[0].tobytes(): thick for points, thick in scene.nodes.values()}
-    strongest = pieces.ends[np.argmax(pieces.shares)].tobytes()
-    assert thickness[strongest] == max(scenery.THICKNESSES)
-    made.remove_paths()
-    assert scene.nodes == {}

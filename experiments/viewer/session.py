@@ -1,14 +1,25 @@
-"""What is looked at: a trained model, what its scene tells of it, and how finely it is drawn."""
+"""The state of a page: what is looked at, what was chosen, and which picture to draw next.
+
+The second part is a state machine without clock, threads or pictures. Everything that changes what
+is to be seen, a moving camera or a slider, is a *change*. Pictures are drawn in *stages*, small to
+large. While changes come, the first stage alone is drawn, again and again; `STILL` seconds after
+the last one the larger stages follow, one after the other.
+
+A change makes larger stages stale, and their drawing should stop. The first stage is never stale:
+it is drawn to its end and shown, or a camera that never rests would show nothing.
+"""
 
 import dataclasses
 import functools
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from experiments.viewer import layers, viewpoints
+from experiments.viewer import cameras as viewpoints
+from experiments.viewer import layers
 from refref_jax.data import local_layout, meshes
 from refref_jax.data.local_layout import Frames
 from refref_jax.geometry import cameras
@@ -23,6 +34,9 @@ BENDS = (2, 4, 6, 10, 24, 32)
 
 # Where there are no test views: as the data set's cameras stand.
 _DISTANCE, _ELEVATION, _FOV = 4.0, math.radians(20.0), math.radians(50.0)
+
+STILL = 0.25
+"""Seconds without a change after which a picture is refined."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,6 +89,34 @@ class Choice:
     bends: int
 
 
+class State(NamedTuple):
+    """What is known between two events.
+
+    Attributes:
+      stages: number of sizes.
+      change: number of the last change, counted from 1; 0 before any.
+      changed_at: time of the last change, seconds of any clock that runs evenly.
+      drawn: stages that are drawn of the last change.
+    """
+
+    stages: int
+    change: int = 0
+    changed_at: float = 0.0
+    drawn: int = 0
+
+
+class Job(NamedTuple):
+    """A picture to draw.
+
+    Attributes:
+      change: what it shows is as it was after this change, or later.
+      stage: its size.
+    """
+
+    change: int
+    stage: int
+
+
 def first_choice(subject: Subject) -> Choice:
     """Returns what is shown before anything is chosen: the model as it was trained."""
     indices = tuple(float(x) for x in np.asarray(subject.model.geometry.interfaces.index_inside))
@@ -115,3 +157,35 @@ def first_viewpoint(subject: Subject, aspect: float = viewpoints.ASPECT) -> view
         return viewpoints.Viewpoint(subject.views.poses[0], fov, aspect)
     pose = cameras.orbit(1, distance=_DISTANCE, elevation=_ELEVATION, size=1, angle_x=1.0).poses[0]
     return viewpoints.Viewpoint(pose, _FOV, aspect)
+
+
+def changed(state: State, now: float) -> State:
+    """Returns the state after a change at a time."""
+    return state._replace(change=state.change + 1, changed_at=now, drawn=0)
+
+
+def next_job(state: State, now: float) -> Job | None:
+    """Returns what to draw at a time, or `None` if there is nothing to draw yet."""
+    pause = wait(state, now)
+    return Job(state.change, state.drawn) if pause == 0.0 else None
+
+
+def wait(state: State, now: float) -> float | None:
+    """Returns in how many seconds there is something to draw; `None`: not before a change."""
+    if state.change == 0 or state.drawn >= state.stages:
+        return None
+    if state.drawn == 0:
+        return 0.0
+    return max(0.0, state.changed_at + STILL - now)
+
+
+def is_stale(state: State, job: Job) -> bool:
+    """Returns whether a job is not worth going on with."""
+    return job.stage > 0 and job.change != state.change
+
+
+def finished(state: State, job: Job) -> State:
+    """Returns the state after a job; one that a change has overtaken leaves the state as it is."""
+    if job.change != state.change:
+        return state
+    return state._replace(drawn=job.stage + 1)

@@ -1,0 +1,300 @@
+"""Density and colours of a trained run: sampled on a grid, as a surface or points, written as PLY.
+
+A surface of the density is where it crosses a level. It is looked for in the logarithm, since
+densities grow by factors, and stays open at the borders of the grid. Inside the objects there is no
+density where the model samples nothing there: what the field holds there was never learned.
+"""
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Int, UInt8
+
+from refref_jax.geometry.bvh import LEAF_SIZE
+from refref_jax.geometry.corner_normals import unit_vectors
+from refref_jax.geometry.rays import Rays
+from refref_jax.geometry.surface_build import build_surfaces
+from refref_jax.geometry.surfaces import Surfaces
+from refref_jax.optics.wavefront import Geometry
+from refref_jax.reconstruct import isosurface
+from refref_jax.reconstruct.grids import Grid
+from refref_jax.reconstruct.triangles import vertex_vectors
+from refref_jax.render import Model, colour
+from refref_jax.render.field_points import look_up
+from refref_jax.render.first_surface import find_first_surface
+
+CHUNK = 1 << 15
+"""Points looked up at once."""
+
+# A direction that lies in no face or edge of a made body.
+_ASKEW = np.array([0.48, 0.6, 0.64], np.float32)
+
+# A density this many factors of e from the level is as good as none, or as opaque as any.
+_RANGE = 3.0
+
+# Marching cubes keeps values a tenth of a cell off zero, as if they were distances. A density falls
+# by a factor of e in several cells: made steeper, its surface is moved less by that.
+_STEEPNESS = 4.0
+
+
+class DensitySurface(NamedTuple):
+    """Where the density crosses a level.
+
+    Attributes:
+      vertices: world units.
+      faces: counter-clockwise seen from where the density is lower.
+      normals: of the vertices, unit, towards lower density.
+    """
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    normals: Float[np.ndarray, "vertices 3"]
+
+
+class SurfacePoints(NamedTuple):
+    """Points of a grid on the near side of what is dense.
+
+    Attributes:
+      points: world units.
+      normals: unit, towards lower density.
+    """
+
+    points: Float[np.ndarray, "points 3"]
+    normals: Float[np.ndarray, "points 3"]
+
+
+def sample_density(
+    model: Model,
+    low: Float[np.ndarray, "3"],
+    high: Float[np.ndarray, "3"],
+    *,
+    resolution: int,
+    step: Callable[[int, int], None],
+) -> Grid:
+    """Samples the density in a box.
+
+    Args:
+      model: the trained model.
+      low: the box's least corner, world units.
+      high: its greatest corner.
+      resolution: cells along its longest edge.
+      step: is called after each slice, with the number of those done and of all.
+
+    Returns:
+      Density per world unit at the grid's points, 0 inside bodies that are not sampled.
+    """
+    spacing = float((high - low).max()) / resolution
+    counts = np.maximum(np.rint((high - low) / spacing), 1).astype(np.int64) + 1
+    axes = [low[i] + spacing * np.arange(counts[i]) for i in range(3)]
+    unknown = np.zeros(counts, bool)
+    if model.config.interior != "field":
+        unknown = inside_bodies(model.geometry, axes)
+    values = np.zeros(counts, np.float32)
+    for i, x in enumerate(axes[0]):
+        rows = np.argwhere(~unknown[i])
+        points = np.stack([np.full(len(rows), x), axes[1][rows[:, 0]], axes[2][rows[:, 1]]], -1)
+        density, _ = look_up_points(model, points, None, width=spacing)
+        values[i, rows[:, 0], rows[:, 1]] = density
+        step(i + 1, int(counts[0]))
+    return Grid(values, low, spacing)
+
+
+def look_up_points(
+    model: Model,
+    points: Float[np.ndarray, "n 3"],
+    directions: Float[np.ndarray, "n 3"] | None,
+    *,
+    width: float,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    """Returns density per world unit, and sRGB colour as it is seen along unit directions.
+
+    Args:
+      model: the trained model.
+      points: world units.
+      directions: of view; `None` where colours do not matter.
+      width: edge of the cell that a point stands for, world units.
+    """
+    if directions is None:
+        directions = np.tile(_ASKEW, (len(points), 1))
+    densities, colours = [np.zeros(0, np.float32)], [np.zeros((0, 3), np.float32)]
+    for start in range(0, len(points), CHUNK):
+        part = slice(start, start + CHUNK)
+        count = len(points[part])
+        # Filled up, so that nothing is compiled twice.
+        filled = [
+            np.pad(each[part].astype(np.float32), ((0, CHUNK - count), (0, 0)), mode="edge")
+            for each in (points, directions)
+        ]
+        density, rgb = jax.device_get(_chunk(model.params, *filled, model.config, width))
+        densities.append(density[:count])
+        colours.append(rgb[:count])
+    return np.concatenate(densities), np.concatenate(colours)
+
+
+@functools.partial(jax.jit, static_argnums=(3, 4))
+def _chunk(params, points, directions, config, width):
+    look = functools.partial(look_up, width=width)
+    seen = jax.vmap(look, in_axes=(None, None, 0, 0))(params, config, points, directions)
+    return seen.density, jnp.clip(colour.linear_to_srgb(seen.linear), 0.0, 1.0)
+
+
+def inside_bodies(
+    geometry: Geometry, axes: Sequence[Float[np.ndarray, " ticks"]]
+) -> Bool[np.ndarray, "nx ny nz"]:
+    """Returns which points of a grid lie inside any part of the geometry.
+
+    From within a closed surface every ray first meets its inner side. Three rays are cast for each
+    point of a part's box, and the majority counts: at a grazing hit a shading normal may mislead.
+
+    Args:
+      geometry: the bodies.
+      axes: coordinates of the grid along x, y and z, ascending.
+    """
+    inside = np.zeros([len(axis) for axis in axes], bool)
+    for surfaces, corners in split_parts(geometry):
+        low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+        near = tuple(
+            slice(*np.searchsorted(axis, (low[i], high[i]))) for i, axis in enumerate(axes)
+        )
+        ticks = [axis[part] for axis, part in zip(axes, near, strict=True)]
+        points = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).astype(np.float32)
+        votes = sum(
+            _meets_inner_side(surfaces, points, np.roll(_ASKEW, turn)).astype(np.int64)
+            for turn in range(3)
+        )
+        inside[near] |= votes >= 2
+    return inside
+
+
+def split_parts(
+    geometry: Geometry,
+) -> Iterator[tuple[Surfaces, Float[np.ndarray, "faces 3 3"]]]:
+    """Yields the surfaces of each part, and their triangles, in the order of their numbers."""
+    surfaces = jax.device_get(geometry.surfaces)
+    real = slice(None, -LEAF_SIZE)  # the last slots fill up the last leaf
+    triangles, owners = surfaces.bvh.triangles[real], surfaces.parts[real]
+    for part in np.unique(owners):
+        chosen = owners == part
+        normals = surfaces.normals[real][chosen]
+        yield build_surfaces(triangles[chosen], normals, owners[chosen]), triangles[chosen]
+
+
+def _meets_inner_side(
+    surfaces: Surfaces, points: Float[np.ndarray, "*n 3"], direction: Float[np.ndarray, "3"]
+) -> Bool[np.ndarray, "*n"]:
+    directions = np.broadcast_to(direction, points.shape)
+    rays = Rays(points, directions, np.zeros(points.shape[:-1], np.float32))
+    return find_first_surface(surfaces, rays).normals @ direction > 0.0
+
+
+def with_walls(density: Grid, *, level: float) -> Grid:
+    """Returns the density with a surface in the border of the grid.
+
+    For the cube of a bounded model: whatever light reaches its faces is seen there, as if they were
+    opaque, and a field that knows walls on them has no need of a density.
+    """
+    values = np.full_like(density.values, level)
+    within = (slice(1, -1),) * 3
+    values[within] = density.values[within]
+    return density._replace(values=np.maximum(values, density.values))
+
+
+def with_sphere(density: Grid, *, level: float, radius: float) -> Grid:
+    """Returns the density with a surface on a sphere around the origin, as `with_walls` has it.
+
+    Args:
+      density: per world unit.
+      level: of the surface.
+      radius: of the sphere, on which a spherical model ends, world units.
+    """
+    axes = [
+        low + density.spacing * np.arange(count)
+        for low, count in zip(density.low, density.values.shape, strict=True)
+    ]
+    squares = [np.square(axis) for axis in np.meshgrid(*axes, indexing="ij", sparse=True)]
+    beyond = (np.sqrt(sum(squares)) - radius) / density.spacing
+    # In the logarithm, in which surfaces are looked for, the distance to the sphere.
+    walls = level * np.exp(np.clip(beyond, -2.0 * _RANGE, 2.0 * _RANGE))
+    return density._replace(values=np.maximum(walls, density.values).astype(density.values.dtype))
+
+
+def find_surface(density: Grid, *, level: float) -> DensitySurface:
+    """Returns the surface on which the density has a level, both per world unit.
+
+    Raises:
+      ValueError: if it has that level nowhere, or scikit-image is not installed.
+    """
+    thinness = _thinness(density, level)
+    vertices, faces = isosurface.march(thinness, density.spacing)
+    vertices = density.low + vertices
+    return DensitySurface(vertices, faces, unit_vectors(vertex_vectors(vertices, faces)))
+
+
+def find_points(density: Grid, *, level: float) -> SurfacePoints:
+    """Returns the grid's points that have at least a level, and a neighbour with less.
+
+    Raises:
+      ValueError: if there is none.
+    """
+    thinness = _thinness(density, level)
+    dense = thinness <= 0.0
+    padded = np.pad(dense, 1, constant_values=True)  # beyond the grid nothing is known
+    middle = (slice(1, -1),) * 3
+    buried = np.ones_like(dense)
+    for axis in range(3):
+        for shift in (-1, 1):
+            buried &= np.roll(padded, shift, axis)[middle]
+    index = np.argwhere(dense & ~buried)
+    slopes = np.stack([slope[tuple(index.T)] for slope in np.gradient(thinness)], axis=-1)
+    return SurfacePoints(density.low + density.spacing * index, unit_vectors(slopes))
+
+
+def write_surface(path: Path, surface: DensitySurface, colours: UInt8[np.ndarray, "n 3"]) -> None:
+    """Writes a surface as PLY, with a normal and an sRGB colour a vertex."""
+    mesh = trimesh.Trimesh(
+        surface.vertices,
+        surface.faces,
+        vertex_normals=surface.normals,
+        vertex_colors=colours,
+        process=False,
+    )
+    path.write_bytes(mesh.export(file_type="ply", vertex_normal=True))
+
+
+def write_points(path: Path, points: SurfacePoints, colours: UInt8[np.ndarray, "n 3"]) -> None:
+    """Writes points as PLY, with a normal and an sRGB colour each."""
+    fields = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
+    fields += [(name, "u1") for name in ("red", "green", "blue")]
+    table = np.zeros(len(points.points), fields)
+    columns = np.concatenate([points.points, points.normals], axis=-1)
+    for i, (name, _) in enumerate(fields):
+        table[name] = columns[:, i] if i < 6 else colours[:, i - 6]
+    kinds = {"<f4": "float", "u1": "uchar"}
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(table)}",
+        *(f"property {kinds[kind]} {name}" for name, kind in fields),
+        "end_header",
+    ]
+    path.write_bytes(("\n".join(header) + "\n").encode() + table.tobytes())
+
+
+def _thinness(density: Grid, level: float) -> np.ndarray:
+    """Returns how far the density is below a level, as a steep kind of distance."""
+    ratio = np.maximum(density.values.astype(np.float64), np.exp(-_RANGE) * level) / level
+    found = -np.minimum(np.log(ratio), _RANGE) * _STEEPNESS * density.spacing
+    if not (found.min() <= 0.0 < found.max()):
+        raise ValueError(
+            f"The density is {'at least' if found.max() <= 0.0 else 'below'} {level:g} per world "
+            f"unit in the whole box (least {density.values.min():.3g}, most "
+            f"{density.values.max():.3g}). Give a --level in between, or another --box: what is "
+            "far in an unbounded scene lies beyond it."
+        )
+    return found
