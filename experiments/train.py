@@ -28,12 +28,13 @@ from experiments.runs import plans
 
 if TYPE_CHECKING:
     from experiments.runs import trainer
-    from refref_jax.training import devices, run_folder, run_lock
+    from refref_jax import atomic_files
+    from refref_jax.training import devices, run_folder
 else:
     trainer = late("experiments.runs.trainer")
+    atomic_files = late("refref_jax.atomic_files")
     devices = late("refref_jax.training.devices")
     run_folder = late("refref_jax.training.run_folder")
-    run_lock = late("refref_jax.training.run_lock")
 
 _OUT = options.out("Folder to write the run to.")
 
@@ -87,7 +88,7 @@ def _begin(run: Path) -> bool:
         run_folder.check_unchanged(run, *plans.plan_from_flags(body=body))
     else:
         _refuse_options(run)
-    with run_lock.hold(run) if devices.is_first() else contextlib.nullcontext():
+    with atomic_files.hold(run) if devices.is_first() else contextlib.nullcontext():
         return trainer.train(
             run,
             scene=plans.SCENE.value,

@@ -15,6 +15,7 @@ from experiments.figures import style as plotting
 from experiments.figures.style import COLOURS, pyplot
 from experiments.r3f import body_pixels
 from experiments.runs import trainer
+from refref_jax import atomic_files
 from refref_jax.data import background, local_layout
 from refref_jax.data.geometry import build_geometry
 from refref_jax.optics.budgets import STRAIGHT
@@ -30,7 +31,7 @@ from refref_jax.render.config import ModelConfig
 from refref_jax.render.model import Model
 from refref_jax.render.saved import SavedModel
 from refref_jax.sampling.domains import Space
-from refref_jax.training import presets, run_folder, run_lock
+from refref_jax.training import presets, run_folder
 from refref_jax.training.config import SceneConfig, TrainingConfig
 
 PRESET = "tiny"
@@ -127,7 +128,7 @@ def learn_background(
             f"{run} was begun with another --background or --radius than are given now. Give those "
             "again, or remove that folder to have the background learned anew."
         )
-    with run_lock.hold(run):
+    with atomic_files.hold(run):
         if not trainer.train(run, scene=str(scene)):
             raise KeyboardInterrupt
     return saved.load_model(run)

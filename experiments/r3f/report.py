@@ -22,7 +22,7 @@ from experiments.r3f.overlap_pictures import Outline
 from experiments.r3f.records import DistanceFacts, Reconstruction, ReportFacts
 from experiments.r3f.surface_pictures import SurfaceView
 from experiments.r3f.windows import Window
-from refref_jax import drafts
+from refref_jax import atomic_files
 from refref_jax.data import containment, local_layout, meshes
 from refref_jax.data.errors import SceneError
 from refref_jax.data.local_layout import Frames
@@ -76,13 +76,13 @@ def run(scene: Path, out: Path, found: Reconstruction, compare: bool) -> ReportF
         truth=truth.mesh and DistanceFacts(*compare_meshes(mesh, truth.mesh)),
         remark=truth.remark,
     )
-    with drafts.unfinished_folder(out / FOLDER) as folder:
+    with atomic_files.written_folder(out / FOLDER) as folder:
         overlap_pictures.draw_overlaps(folder / "overlap.png", outlines)
         overlap_pictures.draw_errors(folder / "iou.png", outlines)
         surface_pictures.draw_surface(
             folder / "surface.png", _surface_views(mesh, truth.mesh, frames)
         )
-    with drafts.unfinished_file(out / FILE) as page:
+    with atomic_files.written_file(out / FILE) as page:
         page.write_text(pages.markdown(out, found, facts), encoding="utf-8")
     return facts
 

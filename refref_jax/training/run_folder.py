@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from refref_jax import configuration, drafts
+from refref_jax import atomic_files, configuration
 from refref_jax.optics.wavefront import Geometry
 from refref_jax.render import saved
 from refref_jax.render.saved import SavedModel
@@ -108,7 +108,7 @@ def rewind_metrics(run: Path, step: int) -> float:
     if not path.is_file():
         return 0.0
     kept = [line for line in read_metrics(run) if line["step"] <= step]
-    with drafts.unfinished_file(path) as draft:
+    with atomic_files.written_file(path) as draft:
         draft.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
     return kept[-1]["seconds"] if kept else 0.0
 
