@@ -14,12 +14,12 @@
 | `paper` | 2 x 256           | 4,096       | 25,000 | cone         |
 | `best`  | 2 x 256           | 16,384      | 25,000 | differential |
 
-These are sizes of Zip-NeRF's fields (`fields/zipnerf.py`). Those of another kind, by `--field`, are
+These are sizes of Zip-NeRF's fields (`fields/zipnerf.py`). Those of another kind, by `field`, are
 in its own module; `paper` are the published ones.
 
-Points are those that stand for an interval's cone, `--multisamples`; the size is the entries of a
-level. What depends on the scene is no preset's: give `paper` the options `--paths=paper
---interior=field` to have the published set-up in full, and leave both out for the others.
+Points are those that stand for an interval's cone, `multisamples`; the size is the entries of a
+level. What depends on the scene is no preset's: give `paper` the budget `paper` and the
+interior `field` to have the published set-up in full, and leave both out for the others.
 
 On the bundled ball 1250 steps of 1024 rays give `tiny` 36.6 dB in the mask and `small` 37.9, at 3.1
 times the time of a step. `paper` and `best` take a GPU: a CPU's core needs 0.8 s for 256 of their
@@ -93,7 +93,7 @@ class Preset:
         sizes = registry.KINDS[field].sizes
         if self.size not in sizes:
             raise ValueError(
-                f"Fields of kind {field} have no size {self.size}. Use --preset with one of "
+                f"Fields of kind {field} have no size {self.size}. Take a preset of one of these: "
                 f"{', '.join(sizes)}."
             )
         size = sizes[self.size]
@@ -127,7 +127,7 @@ def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
       ValueError: if the radius is not positive and finite.
     """
     if radius is not None and not 0.0 < radius < math.inf:
-        raise ValueError(f"--radius={radius} is no radius. Give a positive number, in world units.")
+        raise ValueError(f"The radius {radius} is none. Give a positive number, in world units.")
     farthest = float(np.max(np.linalg.norm(cameras.poses[:, :, 3], axis=-1)))
     if space == "unbounded":
         return Bounds(_NEAR, _FAR_UNBOUNDED, radius or 1.25 * farthest, space)

@@ -50,16 +50,14 @@ def check_free(run: Path) -> None:
       ValueError: if the folder holds a run already, or is a file.
     """
     if exists(run):
-        raise ValueError(
-            f"{run} holds a run already. Continue it with --resume, or give another --out."
-        )
+        raise ValueError(f"{run} holds a run already. Resume it, or give another folder.")
     if found := [str(run / name) for name in _LEFT_BEHIND if (run / name).exists()]:
         raise ValueError(
             f"{run} holds what is left of a run that can not be continued, for its {CONFIG} is "
-            f"missing. Remove {' and '.join(found)}, or give another --out."
+            f"missing. Remove {' and '.join(found)}, or give another folder."
         )
     if run.exists() and not run.is_dir():
-        raise ValueError(f"{run} is a file, but a run needs a folder. Give another --out.")
+        raise ValueError(f"{run} is a file, but a run needs a folder. Give another folder.")
 
 
 def read_config(run: Path) -> TrainingConfig:
@@ -81,14 +79,14 @@ def check_unchanged(
     )
     if moved != config or saved.read_static(run) != model:
         raise ValueError(
-            f"{run} was begun with other options than the ones given now. Give --out and "
-            "--resume alone to continue it as it was, or choose another --out."
+            f"{run} was begun with other options than the ones given now. Resume it "
+            "without options to continue it as it was, or choose another folder."
         )
     pairs = zip(jax.tree.leaves(saved.load_geometry(run)), jax.tree.leaves(geometry), strict=True)
     if not all(np.array_equal(theirs, ours) for theirs, ours in pairs):
         raise ValueError(
             f"{run} was begun with other meshes than those of {config.scene.path}. Give the scene "
-            "that it was begun with, or choose another --out."
+            "that it was begun with, or choose another folder."
         )
 
 

@@ -72,5 +72,5 @@ def _check_masks(images: dict[str, list[str]], masks: dict[str, list[str]]) -> N
         lacking = next(split for split in images if split not in masks)
         raise SceneError(
             f"The {lacking} split has no masks, but another has, and nerfstudio wants all or none. "
-            "Give --masks=none, or add them."
+            "Give the sense none to leave them all out, or add them."
         )

@@ -177,7 +177,7 @@ def _write_split(
             if not mask.any():
                 raise SceneError(
                     f"The mask {view.frame.mask} marks no object, taking {sense} for white. Give "
-                    "another --masks, or leave the frame out."
+                    "another sense of masks, or leave the frame out."
                 )
             (scene / names.mask).parent.mkdir(parents=True, exist_ok=True)
             files.write_mask(scene / names.mask, mask)
