@@ -14,29 +14,33 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 try:
     import fcntl
 except ImportError:  # pragma: no cover
     fcntl = None
 
+Stop = Literal["process", "machine"]
+"""What may end while a file is written."""
+
 UNFINISHED = ".unfinished"
 """How names end of what is not whole yet."""
 
 
 @contextlib.contextmanager
-def written_file(target: Path, *, fsync: bool = False) -> Iterator[Path]:
+def written_file(target: Path, *, survives: Stop = "process") -> Iterator[Path]:
     """Yields the path of a file that takes the place of the target when the context ends well.
 
     Args:
       target: path of the file, in an existing folder.
-      fsync: whether the content is on the disk before the file gets its name, so that it is whole
-        even if the machine stops.
+      survives: whose sudden end the file is whole after. For that of the machine, the content is
+        synced to the disk before the file gets its name.
     """
     draft = beside(target)
     try:
         yield draft
-        if fsync:
+        if survives == "machine":
             with draft.open("rb") as file:
                 os.fsync(file.fileno())
         os.replace(draft, target)

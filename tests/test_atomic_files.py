@@ -71,10 +71,10 @@ def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
         fsync(descriptor)
 
     monkeypatch.setattr(os, "fsync", watched)
-    for flag in (False, True):
-        with atomic_files.written_file(target, fsync=flag) as draft:
+    for stop, times in (("process", 0), ("machine", 1)):
+        with atomic_files.written_file(target, survives=stop) as draft:
             draft.write_text("whole")
-        assert target.read_text() == "whole" and synced == [False] * flag
+        assert target.read_text() == "whole" and synced == [False] * times
         target.unlink()
     assert not list(tmp_path.iterdir())
 

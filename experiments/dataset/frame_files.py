@@ -175,5 +175,5 @@ def _exr(name: str, pixels: np.ndarray) -> Callable[[Path], None]:
 def _write(path: Path, write_to: Callable[[Path], None]) -> None:
     """Writes a file that is never seen half-written, even if the machine stops."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_files.written_file(path, fsync=True) as draft:
+    with atomic_files.written_file(path, survives="machine") as draft:
         write_to(draft)
