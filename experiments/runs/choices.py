@@ -1,18 +1,16 @@
 """What is modelled of the light in a scene: what it needs, unless an option says otherwise."""
 
 import dataclasses
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from experiments.runs.model_options import grid_of, samples_of
 from experiments.runs.named_budgets import make_budget
 from refref_jax.data.needs import Needs
-from refref_jax.optics.budgets import Budget
+from refref_jax.optics.budgets import Budget, Reentry
+from refref_jax.optics.part_choices import KnownTints, Tints
 from refref_jax.render.config import Interior, ModelConfig
 from refref_jax.render.saved import SavedModel
 from refref_jax.training.config import TrainingConfig
-
-Tints = Literal["none", "given", "learned"]
-
 
 _OF_BENT_LIGHT = ("interior", "reentry")
 
@@ -35,9 +33,9 @@ class Wishes(NamedTuple):
     paths: str | None = None
     cut: float | None = None
     bends: int | None = None
-    reentry: Literal["possible", "impossible"] | None = None
+    reentry: Reentry | None = None
     interior: Interior | None = None
-    tints: Literal["given", "learned"] | None = None
+    tints: KnownTints | None = None
 
 
 class Choices(NamedTuple):

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from refref_jax.render.config import ModelConfig
 from refref_jax.render.saved import SavedModel
 from refref_jax.sampling.domains import Space
 from refref_jax.training import presets
-from refref_jax.training.config import SceneConfig, TrainingConfig
+from refref_jax.training.config import DistortionOver, SceneConfig, TrainingConfig
 from refref_jax.training.presets import PRESETS, bounds
 
 
@@ -57,7 +57,7 @@ class Request(NamedTuple):
     steps: int | None = None
     batch: int | None = None
     seed: int = 0
-    distortion_over: Literal["outside", "everywhere"] = "outside"
+    distortion_over: DistortionOver = "outside"
     parts: Sequence[MeshPart] | None = None
     field: str = registry.USUAL
 

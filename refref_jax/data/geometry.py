@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -11,11 +10,12 @@ from refref_jax.data import lint, rule_advice
 from refref_jax.data.containment import find_containment
 from refref_jax.data.findings import refuse_errors
 from refref_jax.data.meshes import MeshPart
-from refref_jax.data.part_descriptions import Colour, Shading
+from refref_jax.data.part_descriptions import Shading
 from refref_jax.data.parts import Mesh, make_part
 from refref_jax.geometry.corner_normals import CREASE_ANGLE, corner_normals
 from refref_jax.geometry.surface_build import build_surfaces
-from refref_jax.optics.interface_rules import CLEAR, NO_ABSORPTION, RULES
+from refref_jax.optics.interface_rules import RULES
+from refref_jax.optics.part_choices import CLEAR, NO_ABSORPTION, Colour, RuleName
 from refref_jax.optics.wavefront import Geometry
 
 _CREASE_ANGLES: dict[Shading, float] = {"auto": CREASE_ANGLE, "smooth": np.pi, "flat": 0.0}
@@ -48,9 +48,7 @@ def single_body(
     return assemble([part])
 
 
-def assemble(
-    parts: Sequence[MeshPart], *, rule: Literal["nested", "facing", "priority"] = "nested"
-) -> Geometry:
+def assemble(parts: Sequence[MeshPart], *, rule: RuleName = "nested") -> Geometry:
     """Examines parts and builds the scene that they make; no part is an empty scene.
 
     Args:
@@ -91,7 +89,7 @@ def build_geometry(
     parts: Sequence[MeshPart],
     parents: Sequence[int],
     *,
-    rule: Literal["nested", "facing", "priority"],
+    rule: RuleName,
 ) -> Geometry:
     """Builds surfaces and interfaces of all parts.
 

@@ -22,12 +22,11 @@ from jaxtyping import Float, Int
 from refref_jax.data import scene_names, stored_normals
 from refref_jax.data.errors import SceneError
 from refref_jax.data.part_descriptions import (
-    Colour,
     PartDescription,
     Shading,
     read_part_descriptions,
 )
-from refref_jax.optics.interface_rules import CLEAR, NO_ABSORPTION
+from refref_jax.optics.part_choices import CLEAR, NO_ABSORPTION, Colour
 
 INDEX_OF_REFRACTION: dict[str, float] = {
     "glass": 1.5,

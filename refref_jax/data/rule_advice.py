@@ -4,12 +4,13 @@ The rules are those of `optics.interface_rules`.
 """
 
 from collections.abc import Iterator, Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from refref_jax.data.containment import Containment
 from refref_jax.data.findings import Finding
 from refref_jax.data.meshes import MeshPart
 from refref_jax.optics.interface_rules import NO_PARENT
+from refref_jax.optics.part_choices import RuleName
 
 # Parts that an explanation names before it only counts.
 _NAMED = 3
@@ -23,7 +24,7 @@ class Advice(NamedTuple):
       reason: why, and what to heed.
     """
 
-    rule: Literal["nested", "facing", "priority"]
+    rule: RuleName
     reason: str
 
     def __str__(self) -> str:

@@ -3,6 +3,11 @@
 import dataclasses
 from typing import Literal
 
+from refref_jax.optics.part_choices import RuleName
+
+DistortionOver = Literal["outside", "everywhere"]
+"""Samples that the distortion loss counts: those outside the objects, or all."""
+
 
 @dataclasses.dataclass(frozen=True)
 class SceneConfig:
@@ -15,7 +20,7 @@ class SceneConfig:
     """
 
     path: str
-    rule: Literal["nested", "facing", "priority"]
+    rule: RuleName
     indices: tuple[tuple[str, float], ...]
 
 
@@ -40,7 +45,7 @@ class LossConfig:
     distortion: float
     hash_decay: float
     dye_decay: float
-    distortion_over: Literal["outside", "everywhere"] = "outside"
+    distortion_over: DistortionOver = "outside"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,7 +16,7 @@ from experiments.dataset.objects import (
     medical,
     perfumes,
 )
-from experiments.dataset.parts import NO_ABSORPTION, RADIUS
+from experiments.dataset.parts import RADIUS
 from refref_jax.data.containment import (
     Containment,
     beside_faces,
@@ -27,6 +27,7 @@ from refref_jax.data.convexity import is_convex
 from refref_jax.data.lint import lint
 from refref_jax.data.meshes import INDEX_OF_REFRACTION, MeshPart
 from refref_jax.optics.interface_rules import NO_PARENT
+from refref_jax.optics.part_choices import NO_ABSORPTION
 
 _MODULES = (bottles, clear_glass, household, household_set, lab, medical, perfumes)
 _OBJECTS = [each for module in _MODULES for each in module.OBJECTS]
