@@ -10,8 +10,8 @@ from jaxtyping import Int
 from refref_jax.data import local_layout, mask_margins
 from refref_jax.geometry.cameras import pixel_rays
 from refref_jax.geometry.surface_build import build_surfaces
-from refref_jax.optics.branching import Geometry
 from refref_jax.optics.interface_rules import NO_PARENT, nested
+from refref_jax.optics.scene import Scene
 from refref_jax.reconstruct.photometry import Evidence
 from refref_jax.reconstruct.triangles import Mesh
 from refref_jax.render.model import Model
@@ -62,8 +62,8 @@ def look(scene: Path, split: str, model: Model, *, seed: int, rays: int) -> Body
     return BodyPixels(Evidence(model.params, *jax.device_put((seen, rgb))), view)
 
 
-def body_geometry(mesh: Mesh, index: float) -> Geometry:
+def body_geometry(mesh: Mesh, index: float) -> Scene:
     """Returns one clear body in air, on the device."""
     owners = np.zeros(len(mesh.faces), np.int64)
     surfaces = build_surfaces(mesh.vertices[mesh.faces], mesh.normals, owners)
-    return jax.device_put(Geometry(surfaces, nested([index], [NO_PARENT])))
+    return jax.device_put(Scene(surfaces, nested([index], [NO_PARENT])))

@@ -17,7 +17,7 @@ from refref_jax.data.meshes import MeshPart
 from refref_jax.fields import registry
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.optics.media import EMPTY_SLOT
-from refref_jax.optics.wavefront import Geometry
+from refref_jax.optics.scene import Scene
 from refref_jax.render.config import ModelConfig
 from refref_jax.render.saved import SavedModel
 from refref_jax.sampling.domains import Space
@@ -67,7 +67,7 @@ class Plan(NamedTuple):
 
     config: TrainingConfig
     model: SavedModel
-    geometry: Geometry
+    geometry: Scene
 
 
 def make_plan(request: Request) -> Plan:

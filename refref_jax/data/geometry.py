@@ -16,7 +16,7 @@ from refref_jax.geometry.corner_normals import CREASE_ANGLE, corner_normals
 from refref_jax.geometry.surface_build import build_surfaces
 from refref_jax.optics.interface_rules import RULES
 from refref_jax.optics.part_choices import CLEAR, NO_ABSORPTION, Colour, RuleName
-from refref_jax.optics.wavefront import Geometry
+from refref_jax.optics.scene import Scene
 
 _CREASE_ANGLES: dict[Shading, float] = {"auto": CREASE_ANGLE, "smooth": np.pi, "flat": 0.0}
 
@@ -28,7 +28,7 @@ def single_body(
     shading: Shading = "auto",
     tint: Colour = CLEAR,
     absorption: Colour = NO_ABSORPTION,
-) -> Geometry:
+) -> Scene:
     """Returns a scene of one body in air; arguments as of `parts.make_part`.
 
     Its arrays are NumPy's, which every function of light takes; `jax.device_put` moves them to an
@@ -48,7 +48,7 @@ def single_body(
     return assemble([part])
 
 
-def assemble(parts: Sequence[MeshPart], *, rule: RuleName = "nested") -> Geometry:
+def assemble(parts: Sequence[MeshPart], *, rule: RuleName = "nested") -> Scene:
     """Examines parts and builds the scene that they make; no part is an empty scene.
 
     Args:
@@ -90,7 +90,7 @@ def build_geometry(
     parents: Sequence[int],
     *,
     rule: RuleName,
-) -> Geometry:
+) -> Scene:
     """Builds surfaces and interfaces of all parts.
 
     Args:
@@ -113,7 +113,7 @@ def build_geometry(
         absorptions=[part.absorption for part in parts],
         priorities=[part.priority for part in parts],
     )
-    return Geometry(surfaces, interfaces)
+    return Scene(surfaces, interfaces)
 
 
 def shading_normals(part: MeshPart) -> Float[np.ndarray, "faces 3 3"]:

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from refref_jax import atomic_files, configuration
-from refref_jax.optics.wavefront import Geometry
+from refref_jax.optics.scene import Scene
 from refref_jax.render import saved
 from refref_jax.render.saved import SavedModel
 from refref_jax.training.config import TrainingConfig
@@ -31,7 +31,7 @@ def exists(run: Path) -> bool:
     return (run / CONFIG).is_file()
 
 
-def create(run: Path, config: TrainingConfig, model: SavedModel, geometry: Geometry) -> None:
+def create(run: Path, config: TrainingConfig, model: SavedModel, geometry: Scene) -> None:
     """Opens a new run; the configuration comes last, so that a half-made folder is no run.
 
     Raises:
@@ -65,9 +65,7 @@ def read_config(run: Path) -> TrainingConfig:
     return configuration.read(run / CONFIG, TrainingConfig)
 
 
-def check_unchanged(
-    run: Path, config: TrainingConfig, model: SavedModel, geometry: Geometry
-) -> None:
+def check_unchanged(run: Path, config: TrainingConfig, model: SavedModel, geometry: Scene) -> None:
     """Checks that a run was made with this very configuration; only its scene may have moved.
 
     Raises:
