@@ -29,7 +29,7 @@ from experiments.benchmarking.methods import Method
 from experiments.cli import command_line, commands, options, perceptual_option, scene_option
 from experiments.cli.late_imports import late
 from experiments.cli.perceptual_option import LPIPS_WEIGHTS
-from refref_jax.training import run_lock
+from refref_jax import atomic_files
 
 if TYPE_CHECKING:
     from experiments.benchmarking import engines, jobs, scene_list, settings, summary, working
@@ -122,7 +122,7 @@ def main() -> None:
     # A benchmark that is killed takes the commands that it waits for with it.
     commands.stop_at_kill()
     out.mkdir(parents=True, exist_ok=True)
-    with run_lock.hold(out):
+    with atomic_files.hold(out):
         # Another process may have added to it meanwhile.
         benchmark = settings.extended(out, benchmark)
         settings.write(out, benchmark)
@@ -154,7 +154,7 @@ def _make_tables(out: Path) -> None:
             "there. Leave out the one or the other."
         )
     benchmark = settings.read(out)
-    with run_lock.hold(out):
+    with atomic_files.hold(out):
         failed, skipped = summary.not_done(out)
         summary.write(out, benchmark, failed=failed, skipped=skipped)
         _finish(out)

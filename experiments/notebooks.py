@@ -26,6 +26,7 @@ from absl import flags
 
 from experiments.cli import commands
 from experiments.cli.late_imports import late
+from refref_jax import atomic_files
 
 if TYPE_CHECKING:
     import nbclient
@@ -126,9 +127,8 @@ def write(path: Path, notebook: nbformat.NotebookNode) -> None:
             f"{path.name} would have {len(text.encode()) / 1e6:.1f} MB, more than "
             f"{LARGEST / 1e6:.1f}. Draw its pictures smaller, or as JPEG."
         )
-    unfinished = path.with_suffix(".unfinished")
-    unfinished.write_text(text, encoding="utf-8")
-    unfinished.replace(path)
+    with atomic_files.written_file(path) as draft:
+        draft.write_text(text, encoding="utf-8")
 
 
 def as_text(notebook: nbformat.NotebookNode) -> str:

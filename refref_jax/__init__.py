@@ -32,7 +32,7 @@ if TYPE_CHECKING:  # the same names for those who read types; a test compares th
     from refref_jax.optics.light_paths import PathStatus as PathStatus
     from refref_jax.optics.main_branches import follow_main_branches as follow_main_branches
     from refref_jax.optics.path_tracing import trace as trace
-    from refref_jax.optics.scene import Geometry as Geometry
+    from refref_jax.optics.scene import Scene as Scene
     from refref_jax.optics.scene import with_index as with_index
     from refref_jax.optics.single_path import follow_branch as follow_branch
     from refref_jax.training.evaluation import evaluate as evaluate
@@ -43,11 +43,11 @@ _HOMES = {
     "BUDGETS": "optics.budgets",
     "Budget": "optics.budgets",
     "Cameras": "geometry.cameras",
-    "Geometry": "optics.scene",
     "LightPaths": "optics.light_paths",
     "MeshPart": "data.meshes",
     "PathStatus": "optics.light_paths",
     "Rays": "geometry.rays",
+    "Scene": "optics.scene",
     "SceneError": "data.errors",
     "assemble": "data.geometry",
     "evaluate": "training.evaluation",

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from refref_jax import drafts
+from refref_jax import atomic_files
 
 _Config = TypeVar("_Config")
 
@@ -27,7 +27,7 @@ _KIND = "kind"
 def write(path: Path, config: Any) -> None:
     """Writes a configuration as readable text, all or nothing."""
     text = json.dumps(dataclasses.asdict(config), indent=2) + "\n"
-    with drafts.unfinished_file(path) as draft:
+    with atomic_files.written_file(path) as draft:
         draft.write_text(text, encoding="utf-8")
 
 

@@ -10,8 +10,9 @@ _PACKAGE = _ROOT / "refref_jax"
 
 # A module may import from its own floor's package and from lower floors only.
 _FLOORS = {
+    "choices": 0,
     "numerics": 0,
-    "drafts": 0,
+    "atomic_files": 0,
     "configuration": 1,
     "geometry": 1,
     "optics": 2,

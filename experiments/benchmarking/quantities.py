@@ -13,6 +13,8 @@ So the one over the mask is beside the paper's, and the one over the image is ou
 from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
+Better = Literal["higher", "lower"]
+
 
 class Quantity(NamedTuple):
     """A column.
@@ -30,7 +32,7 @@ class Quantity(NamedTuple):
     label: str
     latex: str
     key: str
-    better: Literal["higher", "lower"] | None
+    better: Better | None
     digits: int
     by_mask: bool = False
     published: str | None = None

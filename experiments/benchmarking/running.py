@@ -26,8 +26,8 @@ from experiments.cli import subprocesses as child_process
 from experiments.cli.subprocesses import RunFailedError
 from experiments.r3f import records as reconstructions
 from experiments.runs import measured_runs as trained_runs
+from refref_jax import atomic_files
 from refref_jax.data import local_layout
-from refref_jax.training import run_lock
 
 # Seconds that a command which outlived its benchmark may take to save and end: where others work
 # too, compiling alone takes minutes, and what compiles does not look up.
@@ -71,7 +71,7 @@ def wait_until_free(folder: Path, patience: float = _PATIENCE) -> None:
     end, said = time.monotonic() + patience, False
     while folder.is_dir():
         try:
-            with run_lock.hold(folder):
+            with atomic_files.hold(folder):
                 return
         except ValueError:
             if time.monotonic() > end:

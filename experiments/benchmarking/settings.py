@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.benchmarking.methods import Method
-from refref_jax import drafts
+from refref_jax import atomic_files
 from refref_jax.data import transforms
 
 FILE = "benchmark.json"
@@ -156,7 +156,7 @@ def digest(path: Path) -> str:
 
 def write_json(path: Path, content: Any) -> None:
     """Writes a JSON file, all or nothing."""
-    with drafts.unfinished_file(path) as draft:
+    with atomic_files.written_file(path) as draft:
         draft.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 

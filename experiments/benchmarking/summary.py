@@ -30,7 +30,7 @@ from experiments.benchmarking.records import Record
 from experiments.benchmarking.settings import Benchmark
 from experiments.benchmarking.tables import Table
 from experiments.cli import commands
-from refref_jax import drafts
+from refref_jax import atomic_files
 from refref_jax.training import run_folder
 
 FILE, RESULTS, TABLES = "summary.md", "results.json", "tables"
@@ -203,5 +203,5 @@ def _curve(run: Path) -> list[dict[str, Any]]:
 
 
 def _write_text(path: Path, text: str) -> None:
-    with drafts.unfinished_file(path) as draft:
+    with atomic_files.written_file(path) as draft:
         draft.write_text(text, encoding="utf-8")

@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
+from experiments.benchmarking.quantities import Better
 from experiments.benchmarking.statistics import Cell
 
 Mark = Literal["", "best", "second"]
@@ -27,7 +28,7 @@ class Column(NamedTuple):
 
     label: str
     latex: str
-    better: Literal["higher", "lower"] | None
+    better: Better | None
     digits: int
     signed: bool = False
 

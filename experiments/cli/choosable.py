@@ -3,8 +3,12 @@
 Options are read, and wrong names refused, before that; a test holds these equal to the definitions.
 """
 
-SPLITS = ("train", "val", "test")
-"""`data.local_layout.SPLITS`."""
+from typing import get_args
+
+from refref_jax.choices import RuleName
+from refref_jax.data.file_names import SPLITS
+
+__all__ = ["FIELDS", "GEOMETRIES", "PRESETS", "RULES", "SPLITS"]
 
 PRESETS = ("tiny", "small", "paper", "best")
 """Of `refref_jax.training.presets.PRESETS`."""
@@ -12,7 +16,7 @@ PRESETS = ("tiny", "small", "paper", "best")
 FIELDS = ("zipnerf", "nerfacto")
 """Of `fields.registry.KINDS`, the usual one first."""
 
-RULES = ("nested", "facing", "priority")
+RULES: tuple[RuleName, ...] = get_args(RuleName)
 """Of `optics.interface_rules.RULES`."""
 
 GEOMETRIES = ("hull", "occupancy")

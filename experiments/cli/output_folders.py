@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.cli import command_line
-from refref_jax import drafts
-from refref_jax.training import run_lock
+from refref_jax import atomic_files
 
 NOTE = "command.json"
 
@@ -62,7 +61,7 @@ def fresh_file(path: Path, *, overwrite: bool) -> Iterator[Path]:
     """
     check_file(path, overwrite=overwrite)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with drafts.unfinished_file(path) as draft:
+    with atomic_files.written_file(path) as draft:
         yield draft
 
 
@@ -86,7 +85,7 @@ def note(out: Path, module: str, files: Iterable[Path] = ()) -> None:
         "options": command_line.resolved(command),
         "files": [path.as_posix() for path in sorted(files)],
     }
-    with drafts.unfinished_file(out / NOTE) as path:
+    with atomic_files.written_file(out / NOTE) as path:
         path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
@@ -118,7 +117,7 @@ def _held(out: Path) -> Iterator[None]:
     """Keeps other processes out of a folder, which is made, and removed if it stays empty."""
     existed = out.exists()
     out.mkdir(parents=True, exist_ok=True)
-    with run_lock.hold(out):
+    with atomic_files.hold(out):
         try:
             yield
         finally:
@@ -137,7 +136,7 @@ def _take_place(draft: Path, out: Path, module: str, earlier: set[Path]) -> None
     note(out, module, new | earlier | kept)
     for path in new:
         (out / path).parent.mkdir(parents=True, exist_ok=True)
-        (draft / path).replace(out / path)
+        atomic_files.move(draft / path, out / path)
     _remove(out, earlier - new)
     note(out, module, new | kept)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from absl import flags
 
 if TYPE_CHECKING:
-    from refref_jax.sampling.domains import Space
+    from refref_jax.choices import Space
 
 BACKGROUND = flags.DEFINE_enum(
     "background",

@@ -7,7 +7,6 @@ A wall's point lies at `half_extent (normal + (2u - 1) u_axis + (2v - 1) v_axis)
 """
 
 import functools
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +17,7 @@ from jaxtyping import Float, UInt8
 from experiments.dataset.landscapes import ENVIRONMENTS, make_environment
 from experiments.dataset.textures.faces import FACES, make_face
 from experiments.dataset.textures.spheres import SPHERES, make_sphere
+from refref_jax import atomic_files
 from refref_jax.data import files
 
 Kind = Literal["cube", "sphere", "env"]
@@ -113,9 +113,8 @@ def _replace(
     path: Path, write: Callable[[Path, np.ndarray], None], pixels: Float[np.ndarray, "h w 3"]
 ) -> None:
     """Writes a file beside its place, and moves it there when it is whole."""
-    whole = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    write(whole, pixels)
-    os.replace(whole, path)
+    with atomic_files.written_file(path) as draft:
+        write(draft, pixels)
 
 
 # Bytes, since a worker keeps the pictures of all its scenes.

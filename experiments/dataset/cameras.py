@@ -6,22 +6,18 @@ elevation from the horizon upwards.
 """
 
 import math
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from experiments.dataset.seeds import seed_of
+from refref_jax.data.file_names import SPLITS, Split
 
 ANGLE_X = 1.1656107902526855
 """Horizontal field of view of all cameras, radians: `camera_angle_x`."""
 
 CAMERA_RADIUS = 4.0
 """Distance of all cameras from the origin, world units."""
-
-Split = Literal["train", "val", "test"]
-
-SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 _TURNS = 3  # of the helix
 _LOWEST, _HIGHEST = -10.0, 65.0  # degrees

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from refref_jax import atomic_files
 from refref_jax.data import scene_names
 from refref_jax.data.scene_names import CONFIGS, SceneName
 
@@ -66,6 +67,5 @@ def names_in(out: Path) -> list[SceneName]:
 
 
 def _write(path: Path, text: str) -> None:
-    beside = path.with_name(f".{path.name}")
-    beside.write_text(text, encoding="utf-8")
-    beside.replace(path)
+    with atomic_files.written_file(path) as draft:
+        draft.write_text(text, encoding="utf-8")

@@ -8,8 +8,6 @@ from outside) after two Catmull-Clark subdivisions: a head with open eye sockets
 are open at their backs. `objects.monkey` makes one closed body of them.
 """
 
-import io
-import os
 import sys
 from pathlib import Path
 
@@ -34,16 +32,9 @@ def main() -> None:
     shape.vertices.foreach_get("co", vertices)
     faces = np.empty(3 * len(shape.loop_triangles), np.int32)
     shape.loop_triangles.foreach_get("vertices", faces)
-    _write(Path(sys.argv[1]), vertices=vertices.reshape(-1, 3), faces=faces.reshape(-1, 3))
-
-
-def _write(path: Path, **arrays: np.ndarray) -> None:
-    """Writes arrays to a file that appears only when it is whole."""
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(buffer.getvalue())
-    os.replace(part, path)
+    # A file that is open keeps its name, whatever that ends with.
+    with Path(sys.argv[1]).open("wb") as file:
+        np.savez(file, vertices=vertices.reshape(-1, 3), faces=faces.reshape(-1, 3))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ A file is written under another name, in the same folder, and gets its own when 
 view is done when all of its files are there.
 """
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -15,9 +14,8 @@ import OpenEXR
 from jaxtyping import Bool, Float, UInt8
 
 from experiments.dataset.cameras import Split
+from refref_jax import atomic_files
 from refref_jax.data import files
-
-_UNFINISHED = ".unfinished"
 
 # The published depth maps: white is 1 world unit, black 11.5 or more.
 _NEAREST_DEPTH, _DEPTH_RANGE = 1.0, 10.5
@@ -108,7 +106,7 @@ def write(scene: Path, split: Split, number: int, rendering: Rendering, *, linea
 
 def remove_unfinished(scene: Path) -> None:
     """Removes files that an interrupted command left half-written."""
-    for path in scene.rglob(f"*{_UNFINISHED}"):
+    for path in scene.rglob(f"*{atomic_files.UNFINISHED}"):
         path.unlink()
 
 
@@ -177,8 +175,5 @@ def _exr(name: str, pixels: np.ndarray) -> Callable[[Path], None]:
 def _write(path: Path, write_to: Callable[[Path], None]) -> None:
     """Writes a file that is never seen half-written, even if the machine stops."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(path.name + _UNFINISHED)
-    write_to(unfinished)
-    with unfinished.open("rb") as file:
-        os.fsync(file.fileno())
-    unfinished.replace(path)
+    with atomic_files.written_file(path, survives="machine") as draft:
+        write_to(draft)

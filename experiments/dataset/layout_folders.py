@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.dataset.scene_contents import Frame, SceneContents
-from refref_jax import drafts
+from refref_jax import atomic_files
 from refref_jax.data import file_names
 from refref_jax.data.file_names import FrameFiles, Naming
 
@@ -24,7 +24,7 @@ def write(
       naming: of the frames' files.
       step: is called for every image.
     """
-    with drafts.appearing(target) as scene:
+    with atomic_files.new_folder(target) as scene:
         for split, (frames, header) in contents.splits.items():
             records = []
             for number, frame in enumerate(frames):

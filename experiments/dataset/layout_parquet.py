@@ -15,7 +15,7 @@ from typing import Any
 
 from experiments.dataset import scene_contents
 from experiments.dataset.scene_contents import Frame, SceneContents
-from refref_jax import drafts
+from refref_jax import atomic_files
 from refref_jax.data import parquet_scenes
 from refref_jax.data.errors import SceneError
 from refref_jax.data.parquet_scenes import IMAGE_COLUMNS, POSE_COLUMN
@@ -65,7 +65,7 @@ def write(
             _write_shard(Path(beside) / shard, rows[first:last], metadata, step)
         _write_extras(kept, out / "scene_files" / str(name))
         for shard in shards:
-            (Path(beside) / shard).rename(out / "data" / shard)
+            atomic_files.move(Path(beside) / shard, out / "data" / shard)
     left = {place: path for place, path in contents.extras.items() if place not in kept}
     for split, frame in rows:
         for kind, path in (("image", frame.linear), ("depth", frame.float_depth)):
@@ -136,7 +136,7 @@ def _write_extras(extras: dict[str, Path], folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     if not extras:
         return
-    with drafts.appearing(folder) as beside:
+    with atomic_files.new_folder(folder) as beside:
         for place, path in extras.items():
             (beside / place).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, beside / place)

@@ -12,13 +12,14 @@ where it stopped: the result is the same, to the bit. What is there already is n
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 from absl import flags
 
 from experiments.cli import choosable, command_line, commands, options, output_folders
 from experiments.cli.late_imports import late
 from experiments.dataset.render_settings import LEAST_TEXTURE, PerSplit, RenderSettings
+from refref_jax.choices import TwoSidedRule
 from refref_jax.data.scene_names import BACKGROUNDS, SceneName
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ _WORKERS = flags.DEFINE_integer(
 _RULE = flags.DEFINE_enum(
     "rule",
     "nested",
-    ["nested", "facing"],
+    get_args(TwoSidedRule),
     "What lies outside a part: the part around it, or always air, as in Blender without care.",
 )
 _TEXTURE_SIZE = flags.DEFINE_integer(

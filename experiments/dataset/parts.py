@@ -6,16 +6,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
+
 Category = Literal["smcvx", "smncvx", "mmncvx"]
 """Single material and convex, single and not convex, multiple materials and not convex."""
 
 RADIUS = 2.0
 """No vertex of any object is farther from the origin, world units."""
-
-Colour = tuple[float, float, float]
-
-CLEAR: Colour = (1.0, 1.0, 1.0)
-NO_ABSORPTION: Colour = (0.0, 0.0, 0.0)
 
 
 class Part(NamedTuple):

@@ -13,8 +13,8 @@ from experiments.dataset import frame_files, scene_setup, views
 from experiments.dataset.parts import Object
 from experiments.dataset.render_settings import RenderSettings
 from experiments.dataset.worker_pool import Pool
+from refref_jax import atomic_files
 from refref_jax.data.scene_names import SceneName
-from refref_jax.training import run_lock
 
 _SCRATCH = ".refref_making"
 
@@ -86,7 +86,7 @@ def _alone_in(out: Path) -> Iterator[Path]:
 
     It stays behind where an error ends the command, for the logs in it.
     """
-    with run_lock.hold(out):
+    with atomic_files.hold(out):
         scratch = out / _SCRATCH
         shutil.rmtree(scratch, ignore_errors=True)
         scratch.mkdir(exist_ok=True)

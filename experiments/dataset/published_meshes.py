@@ -10,6 +10,7 @@ from pathlib import Path
 
 import trimesh
 
+from refref_jax import atomic_files
 from refref_jax.data import meshes
 from refref_jax.data.errors import SceneError
 from refref_jax.data.scene_names import CATEGORIES, SceneName
@@ -35,9 +36,8 @@ def write(parts: Sequence[Path], name: SceneName, out: Path) -> None:
         target, content = folder / f"{name.object}_{material}.ply", _merged(files)
         if not target.exists():
             folder.mkdir(parents=True, exist_ok=True)
-            beside = target.with_name(f".{target.name}")
-            beside.write_bytes(content)
-            beside.replace(target)
+            with atomic_files.written_file(target) as draft:
+                draft.write_bytes(content)
         elif target.read_bytes() != content:
             raise SceneError(
                 f"{target} is there already, but {name} has another mesh. Give another --out, or "

@@ -4,9 +4,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from experiments.dataset.cameras import SPLITS, Split
-
-Rule = Literal["nested", "facing"]
-"""What lies outside a part: the part around it, or always air, as in Blender without care."""
+from refref_jax.choices import TwoSidedRule
 
 LinearImages = Literal["all", "test", "none"]
 """Which splits keep their images as linear EXRs too."""
@@ -62,7 +60,7 @@ class RenderSettings:
     size: int
     spp: PerSplit
     views: PerSplit
-    rule: Rule = "nested"
+    rule: TwoSidedRule = "nested"
     texture_size: int = 1024
     linear: LinearImages = "test"
     preview: bool = False

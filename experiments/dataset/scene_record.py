@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from experiments.dataset.cameras import CAMERA_RADIUS
-from experiments.dataset.parts import NO_ABSORPTION, Part
-from experiments.dataset.render_settings import RenderSettings, Rule
+from experiments.dataset.parts import Part
+from experiments.dataset.render_settings import RenderSettings
+from refref_jax.choices import NO_ABSORPTION, TwoSidedRule
 from refref_jax.data.containment import find_containment
 from refref_jax.data.meshes import INDEX_OF_REFRACTION, MeshPart
 from refref_jax.data.scene_names import SceneName
@@ -73,7 +74,7 @@ def _describe_part(scene: SceneName, part: Part, outside: str) -> dict[str, Any]
     return description
 
 
-def _materials_outside(scene: SceneName, parts: Sequence[Part], rule: Rule) -> list[str]:
+def _materials_outside(scene: SceneName, parts: Sequence[Part], rule: TwoSidedRule) -> list[str]:
     tree = find_containment([_mesh_part(part) for part in parts])
     if tree.overlaps:
         first, second = (parts[number].name for number in tree.overlaps[0])

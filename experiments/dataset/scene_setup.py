@@ -19,6 +19,7 @@ from experiments.dataset import backgrounds, cameras, frame_files, scene_record
 from experiments.dataset.parts import Part
 from experiments.dataset.render_settings import RenderSettings
 from experiments.dataset.seeds import seed_of
+from refref_jax import atomic_files
 from refref_jax.data.scene_names import SceneName
 
 _RECORD = "scene.json"
@@ -56,7 +57,7 @@ def make(
             _write_json(draft / f"transforms_{split}.json", _transforms(scene, settings, split))
     record = scene_record.describe(scene, made, background, settings)
     _write_json(draft / _RECORD, record)
-    draft.rename(folder)
+    atomic_files.move(draft, folder)
 
 
 def write_meshes(folder: Path, scene: SceneName, parts: Sequence[Part]) -> None:

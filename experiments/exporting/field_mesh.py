@@ -21,7 +21,7 @@ from refref_jax.geometry.corner_normals import unit_vectors
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surface_build import build_surfaces
 from refref_jax.geometry.surfaces import Surfaces
-from refref_jax.optics.wavefront import Geometry
+from refref_jax.optics.scene import Scene
 from refref_jax.reconstruct import isosurface
 from refref_jax.reconstruct.grids import Grid
 from refref_jax.reconstruct.triangles import vertex_vectors
@@ -145,7 +145,7 @@ def _chunk(params, points, directions, config, width):
 
 
 def inside_bodies(
-    geometry: Geometry, axes: Sequence[Float[np.ndarray, " ticks"]]
+    geometry: Scene, axes: Sequence[Float[np.ndarray, " ticks"]]
 ) -> Bool[np.ndarray, "nx ny nz"]:
     """Returns which points of a grid lie inside any part of the geometry.
 
@@ -173,7 +173,7 @@ def inside_bodies(
 
 
 def split_parts(
-    geometry: Geometry,
+    geometry: Scene,
 ) -> Iterator[tuple[Surfaces, Float[np.ndarray, "faces 3 3"]]]:
     """Yields the surfaces of each part, and their triangles, in the order of their numbers."""
     surfaces = jax.device_get(geometry.surfaces)

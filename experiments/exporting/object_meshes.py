@@ -11,7 +11,7 @@ from experiments.cli import output_folders
 from experiments.exporting.field_mesh import split_parts
 from experiments.r3f import object_source, records
 from refref_jax.data import stored_normals
-from refref_jax.optics.wavefront import Geometry
+from refref_jax.optics.scene import Scene
 from refref_jax.reconstruct.triangles import Mesh
 from refref_jax.render.saved import load_geometry
 
@@ -51,7 +51,7 @@ def write(run: Path, out: Path, *, overwrite: bool) -> list[Path]:
     return paths
 
 
-def read_meshes(geometry: Geometry) -> list[Mesh]:
+def read_meshes(geometry: Scene) -> list[Mesh]:
     """Returns the parts of a run's geometry in their order; vertices at one place are one."""
     found = []
     for surfaces, triangles in split_parts(geometry):

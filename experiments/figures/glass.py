@@ -22,8 +22,8 @@ from refref_jax.data import meshes
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.branching import Geometry
 from refref_jax.optics.budgets import BUDGETS, Budget
+from refref_jax.optics.scene import Scene
 from refref_jax.render.first_surface import find_first_surface
 from refref_jax.render.pixel_paths import PixelPaths, trace_pixel
 from refref_jax.sampling import domains
@@ -154,7 +154,7 @@ def draw_distances(scene: KnownScene, half: float, path: Path) -> None:
 
 @functools.partial(jax.jit, static_argnames="half")
 def _walls(
-    geometry: Geometry, rays: Rays, half: float
+    geometry: Scene, rays: Rays, half: float
 ) -> tuple[Float[Array, " rays"], Float[Array, " rays"]]:
     """Returns how far light goes to the walls, straight on and refracted; arc length."""
     leave = jax.vmap(functools.partial(domains.exit_distance, Domain(half, "bounded")))

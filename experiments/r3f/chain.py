@@ -8,11 +8,10 @@ from pathlib import Path
 
 from experiments.r3f import geometry_stage, index_stage, light_stage, object_source, records, report
 from experiments.r3f.records import IndexFacts, LightFacts, Reconstruction, ReconstructionConfig
-from refref_jax import configuration
+from refref_jax import atomic_files, configuration
 from refref_jax.data import local_layout, scene_names
 from refref_jax.data.meshes import MeshPart
 from refref_jax.reconstruct.isosurface import import_skimage
-from refref_jax.training import run_lock
 
 INDEX_FILE = "index.json"
 _INDEX_FOLDER = "index"
@@ -53,7 +52,7 @@ def reconstruct(
     local_layout.read_masks(report.judging_frames(scene)[1])
     asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene), config)
     found = records.begin(out, asked)
-    with run_lock.hold(out):
+    with atomic_files.hold(out):
         found = records.read(out)  # another process may have finished it meanwhile
         if found.geometry is None or not geometry_stage.is_there(out, found.geometry):
             say(f"geometry: {config.geometry} of the training masks, {config.resolution} cells")

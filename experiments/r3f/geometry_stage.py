@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.cli import commands
 from experiments.r3f.records import GeometryFacts, ReconstructionConfig
-from refref_jax import drafts
+from refref_jax import atomic_files
 from refref_jax.data import local_layout, scene_names, stored_normals
 from refref_jax.reconstruct import occupancy, visual_hull
 from refref_jax.reconstruct.agreement import carved_alone, without_outliers
@@ -79,7 +79,7 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
     mesh = refined[-1].mesh
     befores = [cut, *(stage.mesh for stage in refined)]
     name = f"{_object(scene)}_{MATERIAL}.ply"
-    with drafts.unfinished_folder(out / FOLDER) as folder:
+    with atomic_files.written_folder(out / FOLDER) as folder:
         stored_normals.write_mesh(folder / name, *mesh)
     return GeometryFacts(
         mesh=name,

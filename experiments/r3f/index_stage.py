@@ -19,13 +19,14 @@ from jaxtyping import Int
 from experiments.cli import commands
 from experiments.figures import style as plotting
 from experiments.figures.style import COLOURS, pyplot
+from refref_jax.choices import Space
 from refref_jax.data import local_layout, mask_margins
 from refref_jax.data.geometry import build_geometry
 from refref_jax.geometry.cameras import pixel_rays
 from refref_jax.geometry.surface_build import build_surfaces
-from refref_jax.optics.branching import Geometry
 from refref_jax.optics.budgets import STRAIGHT
 from refref_jax.optics.interface_rules import NO_PARENT, nested
+from refref_jax.optics.scene import Scene
 from refref_jax.reconstruct.index_search import (
     IndexEstimate,
     IndexSearch,
@@ -37,7 +38,6 @@ from refref_jax.reconstruct.triangles import Mesh
 from refref_jax.render import saved
 from refref_jax.render.model import Model
 from refref_jax.render.saved import SavedModel
-from refref_jax.sampling.domains import Space
 from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.resolve import read_facts, resolve
@@ -100,11 +100,11 @@ def look(scene: Path, split: str, model: Model, *, seed: int, rays: int) -> Body
     return BodyPixels(Evidence(model.params, *jax.device_put((seen, rgb))), view)
 
 
-def body_geometry(mesh: Mesh, index: float) -> Geometry:
+def body_geometry(mesh: Mesh, index: float) -> Scene:
     """Returns one clear body in air, on the device."""
     owners = np.zeros(len(mesh.faces), np.int64)
     surfaces = build_surfaces(mesh.vertices[mesh.faces], mesh.normals, owners)
-    return jax.device_put(Geometry(surfaces, nested([index], [NO_PARENT])))
+    return jax.device_put(Scene(surfaces, nested([index], [NO_PARENT])))
 
 
 def run(

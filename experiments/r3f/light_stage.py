@@ -15,7 +15,7 @@ from experiments.cli import commands
 from experiments.r3f import index_stage
 from experiments.r3f.index_stage import BodyPixels
 from experiments.r3f.records import IndexFacts, LightFacts
-from refref_jax import drafts
+from refref_jax import atomic_files
 from refref_jax.data import stored_normals
 from refref_jax.reconstruct import photometry
 from refref_jax.reconstruct.light_refinement import LightRefinement, refine_by_light
@@ -69,7 +69,7 @@ def run(
     after = judge(found.mesh, found.index, judges, model)
     kept = after < before and not objection(mesh, found.mesh, _VOLUME_CHANGE)
     if kept:
-        with drafts.unfinished_folder(target.parent) as folder:
+        with atomic_files.written_folder(target.parent) as folder:
             stored_normals.write_mesh(folder / target.name, *found.mesh)
     return LightFacts(steps, kept, before, after, found.index, found.furthest)
 

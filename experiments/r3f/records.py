@@ -15,8 +15,8 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from refref_jax import configuration, drafts
-from refref_jax.sampling.domains import Space
+from refref_jax import atomic_files, configuration
+from refref_jax.choices import Space
 
 FILE = "reconstruction.json"
 
@@ -203,7 +203,7 @@ def begin(out: Path, asked: Reconstruction) -> Reconstruction:
     if not exists(out):
         if out.exists() and not out.is_dir():
             raise ValueError(f"{out} is a file, but a folder is needed. Give another --out.")
-        draft = drafts.beside(out / FILE)
+        draft = atomic_files.beside(out / FILE)
         if out.is_dir() and any(each != draft for each in out.iterdir()):
             raise ValueError(
                 f"{out} holds something else than a reconstruction. Give a new folder as --out."

@@ -15,7 +15,7 @@ from experiments.cli import commands
 from experiments.r3f import object_source, report_figures
 from experiments.r3f.records import DistanceFacts, IndexFacts, Reconstruction, ReportFacts
 from experiments.r3f.report_figures import Outline, SurfaceView, Window
-from refref_jax import drafts
+from refref_jax import atomic_files
 from refref_jax.data import containment, local_layout, meshes
 from refref_jax.data.errors import SceneError
 from refref_jax.data.local_layout import Frames
@@ -75,13 +75,13 @@ def run(scene: Path, out: Path, found: Reconstruction, compare: bool) -> ReportF
         truth=truth.mesh and DistanceFacts(*compare_meshes(mesh, truth.mesh)),
         remark=truth.remark,
     )
-    with drafts.unfinished_folder(out / FOLDER) as folder:
+    with atomic_files.written_folder(out / FOLDER) as folder:
         report_figures.draw_overlaps(folder / "overlap.png", outlines)
         report_figures.draw_errors(folder / "iou.png", outlines)
         report_figures.draw_surface(
             folder / "surface.png", _surface_views(mesh, truth.mesh, frames)
         )
-    with drafts.unfinished_file(out / FILE) as page:
+    with atomic_files.written_file(out / FILE) as page:
         page.write_text(markdown(out, found, facts), encoding="utf-8")
     return facts
 

@@ -19,7 +19,7 @@ from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.media import interior_slots
-from refref_jax.optics.wavefront import Geometry
+from refref_jax.optics.scene import Scene
 from refref_jax.render import colour
 from refref_jax.render.backgrounds import Radiance, radiance_of
 from refref_jax.render.known import TILE, KnownRendering, render_known
@@ -40,7 +40,7 @@ class KnownScene(NamedTuple):
     """
 
     name: str
-    geometry: Geometry
+    geometry: Scene
     radiance: Radiance
     frames: local_layout.Frames
     indices: tuple[int, ...]

@@ -15,7 +15,7 @@ from typing import Any
 
 from experiments.cli import commands
 from experiments.cli import subprocesses as child_process
-from refref_jax import drafts
+from refref_jax import atomic_files
 from refref_jax.data import local_layout, transforms
 from refref_jax.training import run_folder
 
@@ -211,5 +211,5 @@ def _read(run: Path) -> dict[str, Any]:
 
 
 def _write(run: Path, record: dict[str, Any]) -> None:
-    with drafts.unfinished_file(run / _MEASURED) as draft:
+    with atomic_files.written_file(run / _MEASURED) as draft:
         draft.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from experiments.sweeps.points import BASE, OF_EVALUATION
-from refref_jax import drafts
+from refref_jax import atomic_files
 
 NOISE = 0.3
 """Decibels by which trainings differ that differ in nothing that matters; see `BUILD_NOTES.md`."""
@@ -80,7 +80,7 @@ class Turn(NamedTuple):
 def write(path: Path, rows: Sequence[Row]) -> None:
     """Writes a table as CSV, all or nothing; what is not known stays empty."""
     with (
-        drafts.unfinished_file(path) as draft,
+        atomic_files.written_file(path) as draft,
         draft.open("w", newline="", encoding="utf-8") as file,
     ):
         writer = csv.writer(file)

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from refref_jax.choices import Space
 from refref_jax.data import files, scene_names, transforms
 from refref_jax.data.errors import SceneError
 from refref_jax.render.backgrounds import (
@@ -30,7 +31,6 @@ from refref_jax.render.backgrounds import (
     SrgbTexture,
     Texture,
 )
-from refref_jax.sampling.domains import Space
 
 _FILE = "scene.json"
 _WALLS = 6

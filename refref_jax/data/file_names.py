@@ -9,7 +9,11 @@
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
+
+from refref_jax.choices import Split
+
+SPLITS: tuple[Split, ...] = get_args(Split)
 
 TRANSFORMS = "transforms_{}.json"
 """Name of a split's transforms file."""

@@ -2,21 +2,21 @@
 
 import warnings
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour, RuleName
 from refref_jax.data import lint, rule_advice
 from refref_jax.data.containment import find_containment
 from refref_jax.data.findings import refuse_errors
 from refref_jax.data.meshes import MeshPart
-from refref_jax.data.part_descriptions import Colour, Shading
+from refref_jax.data.part_descriptions import Shading
 from refref_jax.data.parts import Mesh, make_part
 from refref_jax.geometry.corner_normals import CREASE_ANGLE, corner_normals
 from refref_jax.geometry.surface_build import build_surfaces
-from refref_jax.optics.interface_rules import CLEAR, NO_ABSORPTION, RULES
-from refref_jax.optics.wavefront import Geometry
+from refref_jax.optics.interface_rules import RULES
+from refref_jax.optics.scene import Scene
 
 _CREASE_ANGLES: dict[Shading, float] = {"auto": CREASE_ANGLE, "smooth": np.pi, "flat": 0.0}
 
@@ -28,7 +28,7 @@ def single_body(
     shading: Shading = "auto",
     tint: Colour = CLEAR,
     absorption: Colour = NO_ABSORPTION,
-) -> Geometry:
+) -> Scene:
     """Returns a scene of one body in air; arguments as of `parts.make_part`.
 
     Its arrays are NumPy's, which every function of light takes; `jax.device_put` moves them to an
@@ -48,9 +48,7 @@ def single_body(
     return assemble([part])
 
 
-def assemble(
-    parts: Sequence[MeshPart], *, rule: Literal["nested", "facing", "priority"] = "nested"
-) -> Geometry:
+def assemble(parts: Sequence[MeshPart], *, rule: RuleName = "nested") -> Scene:
     """Examines parts and builds the scene that they make; no part is an empty scene.
 
     Args:
@@ -91,8 +89,8 @@ def build_geometry(
     parts: Sequence[MeshPart],
     parents: Sequence[int],
     *,
-    rule: Literal["nested", "facing", "priority"],
-) -> Geometry:
+    rule: RuleName,
+) -> Scene:
     """Builds surfaces and interfaces of all parts.
 
     Args:
@@ -115,7 +113,7 @@ def build_geometry(
         absorptions=[part.absorption for part in parts],
         priorities=[part.priority for part in parts],
     )
-    return Geometry(surfaces, interfaces)
+    return Scene(surfaces, interfaces)
 
 
 def shading_normals(part: MeshPart) -> Float[np.ndarray, "faces 3 3"]:

@@ -19,9 +19,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from refref_jax.data import files, transforms
 from refref_jax.data.errors import SceneError
+from refref_jax.data.file_names import SPLITS
 from refref_jax.geometry.cameras import Cameras, focal_length, planar_depth_to_distance
-
-SPLITS = ("train", "val", "test")
 
 
 class Frames(NamedTuple):

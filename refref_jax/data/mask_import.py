@@ -6,13 +6,13 @@ the object. `docs/masks.md` has examples.
 
 import json
 import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
 
+from refref_jax import atomic_files
 from refref_jax.data import files, local_layout, transforms
 from refref_jax.data.errors import SceneError
 
@@ -43,13 +43,10 @@ def add_masks(scene: Path, out: Path, segment: Segment) -> int:
         raise SceneError(f"{out} exists, and nothing is overwritten. Give a new folder.")
     if scene.resolve() in out.resolve().parents:
         raise SceneError(f"{out} lies within the scene {scene}. Give a folder beside it.")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as beside:
-        draft = Path(beside) / out.name
-        shutil.copytree(scene, draft)
+    with atomic_files.new_folder(out) as draft:
+        shutil.copytree(scene, draft, dirs_exist_ok=True)
         paths = (draft / f"transforms_{split}.json" for split in local_layout.SPLITS)
         count = sum(_add_to_split(scene, path, segment) for path in paths if path.is_file())
-        draft.rename(out)
     return count
 
 

@@ -19,15 +19,14 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
+from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
 from refref_jax.data import scene_names, stored_normals
 from refref_jax.data.errors import SceneError
 from refref_jax.data.part_descriptions import (
-    Colour,
     PartDescription,
     Shading,
     read_part_descriptions,
 )
-from refref_jax.optics.interface_rules import CLEAR, NO_ABSORPTION
 
 INDEX_OF_REFRACTION: dict[str, float] = {
     "glass": 1.5,
@@ -223,7 +222,7 @@ def _index(path: Path, overrides: Mapping[str, float], described: PartDescriptio
         raise SceneError(
             f"The material of {path} is unknown: no word of its name is one of "
             f"{', '.join(sorted(table))}. Rename the file, as in {path.stem}_glass.ply, or give "
-            f"its index: --ior={path.stem}=1.5."
+            f"its index in the overrides, as {{'{path.stem}': 1.5}}."
         )
     return table[material]
 

@@ -9,13 +9,17 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from refref_jax.choices import CLEAR, NO_ABSORPTION, RuleName, Space, Tints
 from refref_jax.data.containment import Containment, winding_number
 from refref_jax.data.convexity import encloses, is_convex
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.part_descriptions import PartDescription
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.optics.interface_rules import CLEAR, NO_ABSORPTION, NO_PARENT
-from refref_jax.sampling.domains import Space
+from refref_jax.optics.budgets import Reentry
+from refref_jax.optics.interface_rules import NO_PARENT
+
+NeededInterior = Literal["none", "clear", "absorbing"]
+"""What is in the objects; `none` where there are none."""
 
 
 class Needs(NamedTuple):
@@ -36,9 +40,9 @@ class Needs(NamedTuple):
     parts: int
     bodies: int
     convex: bool
-    reentry: Literal["possible", "impossible"]
-    interior: Literal["none", "clear", "absorbing"]
-    tints: Literal["none", "given", "learned"]
+    reentry: Reentry
+    interior: NeededInterior
+    tints: Tints
     space: Space
 
 
@@ -47,7 +51,7 @@ def find_needs(
     tree: Containment,
     cameras: Cameras,
     *,
-    rule: Literal["nested", "facing", "priority"],
+    rule: RuleName,
     space: Space,
 ) -> Needs:
     """Finds what a scene requires.
@@ -118,7 +122,7 @@ def _takes_light(part: MeshPart | PartDescription) -> bool:
     return tuple(part.tint) != CLEAR or tuple(part.absorption) != NO_ABSORPTION
 
 
-def _interior(parts: Sequence[MeshPart]) -> Literal["none", "clear", "absorbing"]:
+def _interior(parts: Sequence[MeshPart]) -> NeededInterior:
     if not parts:
         return "none"
     return "clear" if find_tints(parts) == "none" else "absorbing"
@@ -126,7 +130,7 @@ def _interior(parts: Sequence[MeshPart]) -> Literal["none", "clear", "absorbing"
 
 def find_tints(
     parts: Sequence[MeshPart | PartDescription],
-) -> Literal["none", "given", "learned"]:
+) -> Tints:
     """Returns where the colours of parts, or of what is known of them, come from; see `Needs`."""
     if not all(part.colour_known for part in parts):
         return "learned"

@@ -15,10 +15,10 @@ import math
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
 from refref_jax.data.errors import SceneError
 
 Shading = Literal["auto", "smooth", "flat"]
-Colour = tuple[float, float, float]
 
 
 class PartDescription(NamedTuple):
@@ -36,8 +36,8 @@ class PartDescription(NamedTuple):
 
     index: float | None = None
     shading: Shading = "auto"
-    tint: Colour = (1.0, 1.0, 1.0)
-    absorption: Colour = (0.0, 0.0, 0.0)
+    tint: Colour = CLEAR
+    absorption: Colour = NO_ABSORPTION
     priority: int = 0
     colour_known: bool = False
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
 from refref_jax.data import meshes
 from refref_jax.data.errors import SceneError
 from refref_jax.data.meshes import MeshPart
-from refref_jax.data.part_descriptions import Colour, Shading
-from refref_jax.optics.interface_rules import CLEAR, NO_ABSORPTION
+from refref_jax.data.part_descriptions import Shading
 
 Arrays = tuple[np.ndarray, np.ndarray]
 """Vertices `[vertices, 3]` in world units; faces `[faces, 3]`, counter-clockwise from outside."""

@@ -47,7 +47,7 @@ class LocalCopy:
             if not folder.is_dir():
                 raise SceneError(
                     f"{folder} is no folder, but should hold a scene or a copy of the data set. "
-                    "Correct what named it: --scene, or REFREF_HF."
+                    "Correct what named it: the scene, or REFREF_HF."
                 )
             for path in (path for place in _FOLDERS for path in (folder / place).rglob("*")):
                 if path.is_file():

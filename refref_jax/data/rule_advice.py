@@ -4,8 +4,9 @@ The rules are those of `optics.interface_rules`.
 """
 
 from collections.abc import Iterator, Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
+from refref_jax.choices import RuleName
 from refref_jax.data import lint
 from refref_jax.data.containment import Containment
 from refref_jax.data.findings import Finding, refuse_errors
@@ -24,7 +25,7 @@ class Advice(NamedTuple):
       reason: why, and what to heed.
     """
 
-    rule: Literal["nested", "facing", "priority"]
+    rule: RuleName
     reason: str
 
     def __str__(self) -> str:

@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
+from refref_jax import atomic_files
 from refref_jax.data import parquet_scenes, published_files, scene_names
 from refref_jax.data.errors import SceneError
 from refref_jax.data.parquet_scenes import Progress
@@ -109,7 +110,7 @@ def _unpack_whole(repository: Repository, name: SceneName, scene: Path, progress
     with tempfile.TemporaryDirectory(prefix=_UNPACKING, dir=scene.parent) as beside:
         unpack_scene(repository, name, Path(beside) / scene.name, progress=progress)
         try:
-            (Path(beside) / scene.name).rename(scene)
+            atomic_files.move(Path(beside) / scene.name, scene)
         except OSError:
             if not scene.is_dir():  # otherwise another process was first, with the same files
                 raise

@@ -22,8 +22,8 @@ from jax.interpreters import ad, batching, mlir
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, UInt32
 
+from refref_jax.choices import Precision
 from refref_jax.fields import vertex_loops
-from refref_jax.fields.precision import Precision
 from refref_jax.fields.vertices import corners
 
 

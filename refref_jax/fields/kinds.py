@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 from jaxtyping import Array, Float
 
-from refref_jax.fields.precision import Precision, check_precision
-from refref_jax.optics.footprints import Footprint
+from refref_jax.choices import Footprint, Precision
+from refref_jax.fields.precision import check_precision
 from refref_jax.sampling.cones import Gaussians
 
 Params = Any

@@ -10,10 +10,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from refref_jax.choices import Precision
 from refref_jax.fields.encodings import spherical_harmonics
 from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid
 from refref_jax.fields.kinds import DensityConfig, RadianceConfig
-from refref_jax.fields.precision import Precision, dense
+from refref_jax.fields.precision import dense
 from refref_jax.sampling.cones import Gaussians
 
 

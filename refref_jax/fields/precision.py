@@ -9,14 +9,14 @@ Source: Micikevicius et al., Mixed Precision Training (2018), for the float32 ma
 
 import functools
 from collections.abc import Callable
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-Precision = Literal["float32", "bfloat16"]
+from refref_jax.choices import Precision
 
 
 def check_precision(precision: str) -> None:

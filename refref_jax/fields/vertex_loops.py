@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, UInt32
 
-from refref_jax.fields.precision import Precision
+from refref_jax.choices import Precision
 from refref_jax.fields.vertices import corners
 from refref_jax.geometry.native_loop import native_loop
 

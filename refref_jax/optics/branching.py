@@ -17,7 +17,7 @@ from refref_jax.optics import footprints, interaction, media, splitting
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.footprints import Bend, Spread
 from refref_jax.optics.light_paths import PathStatus
-from refref_jax.optics.scene import Geometry as Geometry
+from refref_jax.optics.scene import Scene
 
 
 class RayState(NamedTuple):
@@ -86,7 +86,7 @@ def begin(ray: Rays, inside: Int[Array, " slots"], spread: Spread) -> RayState:
     )
 
 
-def arrive(geometry: Geometry, state: RayState, slot: Int[Array, ""]) -> Arrival:
+def arrive(geometry: Scene, state: RayState, slot: Int[Array, ""]) -> Arrival:
     """Follows a ray to the triangle that it meets; without meaning for `NO_SLOT`, but finite.
 
     Where it meets the triangle is computed anew, from the corners as they are: so it has gradients,

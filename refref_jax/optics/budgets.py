@@ -16,7 +16,12 @@ Source: paper (arXiv 2505.05848), sections 4 and 5 (ablation study), for all but
 
 import dataclasses
 import math
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
+
+Reflections = Literal["none", "first", "all"]
+TotalReflection = Literal["followed", "ended"]
+Reentry = Literal["possible", "impossible"]
+Unfinished = Literal["kept", "dark"]
 
 # Bends and cut for which the capacity factors below were measured.
 _PAPER_BENDS = 10
@@ -55,11 +60,11 @@ class Budget:
     """
 
     bends: int
-    reflections: Literal["none", "first", "all"]
-    total_reflection: Literal["followed", "ended"] = "followed"
+    reflections: Reflections
+    total_reflection: TotalReflection = "followed"
     cut: float = 0.0
-    reentry: Literal["possible", "impossible"] = "possible"
-    unfinished: Literal["kept", "dark"] = "kept"
+    reentry: Reentry = "possible"
+    unfinished: Unfinished = "kept"
     live_per_ray: float | None = None
     segments_per_ray: float | None = None
     paths_per_ray: float | None = None
@@ -73,21 +78,21 @@ class Budget:
                 f"The cut is a share of a pixel's light, in [0, 1), not {self.cut}. Give 0.02 for "
                 "2 %."
             )
-        if self.reflections not in ("none", "first", "all"):
+        if self.reflections not in get_args(Reflections):
             raise ValueError(
                 f"The reflections are 'none', 'first' or 'all', not {self.reflections!r}. Choose "
                 "one."
             )
-        if self.total_reflection not in ("followed", "ended"):
+        if self.total_reflection not in get_args(TotalReflection):
             raise ValueError(
                 "Total reflection is 'followed' or 'ended', not "
                 f"{self.total_reflection!r}. Choose one."
             )
-        if self.reentry not in ("possible", "impossible"):
+        if self.reentry not in get_args(Reentry):
             raise ValueError(
                 f"Re-entry is 'possible' or 'impossible', not {self.reentry!r}. Choose one."
             )
-        if self.unfinished not in ("kept", "dark"):
+        if self.unfinished not in get_args(Unfinished):
             raise ValueError(
                 f"Unfinished light is 'kept' or 'dark', not {self.unfinished!r}. Choose one."
             )

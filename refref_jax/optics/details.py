@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Literal
 
-from refref_jax.optics.footprints import Footprint
+from refref_jax.choices import Footprint
 
 
 @dataclasses.dataclass(frozen=True)

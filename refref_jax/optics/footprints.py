@@ -13,17 +13,15 @@ Source: Igehy, Tracing Ray Differentials (1999).
 """
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from refref_jax import numerics
+from refref_jax.choices import Footprint
 from refref_jax.geometry.rays import Rays, orthonormal_basis
-
-Footprint = Literal["cone", "differential"]
-"""`cone` carries nothing along; `differential` carries the derivatives."""
 
 # Where a bundle is focused on the critical angle its derivatives have no bound. A footprint as
 # wide as this blurs all there is, and its square is still a number.

@@ -20,16 +20,11 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float, Int
 
+from refref_jax.choices import CLEAR, NO_ABSORPTION, RuleName
 from refref_jax.optics.media import AMBIENT, INDEX_OF_AIR, Interfaces
 
 NO_PARENT = -1
 """The parent of a part that no other part contains."""
-
-CLEAR = (1.0, 1.0, 1.0)
-"""The tint of an interface that takes no light."""
-
-NO_ABSORPTION = (0.0, 0.0, 0.0)
-"""The absorption of a medium that takes no light."""
 
 Colours = Sequence[Sequence[float]]
 """Linear RGB, one a part."""
@@ -105,7 +100,7 @@ def priority(
     return made._replace(priority=_order(priorities or [0] * len(made.index_inside)))
 
 
-RULES: dict[str, Rule] = {"nested": nested, "facing": facing, "priority": priority}
+RULES: dict[RuleName, Rule] = {"nested": nested, "facing": facing, "priority": priority}
 
 
 def _order(priorities: Sequence[int]) -> Int[np.ndarray, " parts"]:

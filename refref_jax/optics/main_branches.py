@@ -14,14 +14,14 @@ import jax
 import jax.numpy as jnp
 
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics.branching import Geometry
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.light_paths import LightPaths, PathStatus
+from refref_jax.optics.scene import Scene
 from refref_jax.optics.single_path import follow_branch
 
 
 def follow_main_branches(
-    geometry: Geometry, ray: Rays, *, budget: Budget, reflections: int
+    geometry: Scene, ray: Rays, *, budget: Budget, reflections: int
 ) -> LightPaths:
     """Follows one ray along its main path, and along those that are reflected once.
 

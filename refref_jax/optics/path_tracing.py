@@ -27,7 +27,8 @@ from refref_jax.optics.light_paths import (
     straight,
     straight_ends,
 )
-from refref_jax.optics.wavefront import BLOCK, Geometry, follow
+from refref_jax.optics.scene import Scene
+from refref_jax.optics.wavefront import BLOCK, follow
 
 
 class Traced(NamedTuple):
@@ -72,7 +73,7 @@ class Survey(NamedTuple):
 
 
 def trace_ends(
-    geometry: Geometry,
+    geometry: Scene,
     rays: Rays,
     *,
     budget: Budget,
@@ -100,7 +101,7 @@ def trace_ends(
 
 
 def trace(
-    geometry: Geometry,
+    geometry: Scene,
     rays: Rays,
     *,
     budget: Budget,
@@ -145,7 +146,7 @@ def trace(
 
 
 def trace_batches(
-    geometry: Geometry,
+    geometry: Scene,
     rays: Rays,
     *,
     budget: Budget,
@@ -189,7 +190,7 @@ def trace_batches(
     return Traced(paths._replace(rays=paths.rays % count), lost.reshape(batches, count, 3))
 
 
-def survey(geometry: Geometry, rays: Rays, *, budget: Budget) -> Survey:
+def survey(geometry: Scene, rays: Rays, *, budget: Budget) -> Survey:
     """Measures what batches of a scene's rays need room for."""
     count = rays.radii.shape[0]
     ends = trace_ends(geometry, rays, budget=budget).ends
@@ -205,7 +206,7 @@ def _needs_no_tracing(rays: Rays, budget: Budget) -> bool:
 
 
 def _inside(
-    geometry: Geometry, rays: Rays, inside: Int[Array, "rays slots"] | None
+    geometry: Scene, rays: Rays, inside: Int[Array, "rays slots"] | None
 ) -> Int[Array, "rays slots"]:
     if inside is not None:
         return inside

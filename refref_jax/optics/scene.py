@@ -14,14 +14,14 @@ from refref_jax.optics import media
 _Tree = TypeVar("_Tree")
 
 
-class Geometry(NamedTuple):
+class Scene(NamedTuple):
     """All that light meets: surfaces, and the interfaces that they stand for."""
 
     surfaces: surfaces.Surfaces
     interfaces: media.Interfaces
 
 
-def with_index(geometry: Geometry, index: Float[ArrayLike, ""], *, part: int = 0) -> Geometry:
+def with_index(geometry: Scene, index: Float[ArrayLike, ""], *, part: int = 0) -> Scene:
     """Returns a scene in which one part has another index of refraction.
 
     So it has wherever it lies around another part, if that part had its index outside before: not
@@ -64,7 +64,7 @@ def with_index(geometry: Geometry, index: Float[ArrayLike, ""], *, part: int = 0
     return geometry._replace(interfaces=changed)
 
 
-def in_one_precision(geometry: Geometry, rays: Rays) -> tuple[Geometry, Rays]:
+def in_one_precision(geometry: Scene, rays: Rays) -> tuple[Scene, Rays]:
     """Returns a scene and rays as JAX arrays of one precision, the highest of their numbers'.
 
     Scenes are built in single precision, so rays in double precision are traced in double

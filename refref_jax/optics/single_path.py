@@ -25,9 +25,10 @@ from refref_jax.geometry.bvh import NO_SLOT
 from refref_jax.geometry.closest_hit import closest_slot
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import branching, footprints, media, scene
-from refref_jax.optics.branching import Geometry, RayState
+from refref_jax.optics.branching import RayState
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.light_paths import LightPaths, PathStatus
+from refref_jax.optics.scene import Scene
 
 _Record = TypeVar("_Record")
 
@@ -63,7 +64,7 @@ class _Walk(NamedTuple):
 
 
 def follow_branch(
-    geometry: Geometry,
+    geometry: Scene,
     ray: Rays,
     reflects: Bool[Array, " bends"],
     *,
@@ -126,7 +127,7 @@ def follow_branch(
 
 
 def _advance(
-    geometry: Geometry, budget: Budget, walk: _Walk, reflect: Bool[Array, ""]
+    geometry: Scene, budget: Budget, walk: _Walk, reflect: Bool[Array, ""]
 ) -> tuple[_Walk, _Segment]:
     """Casts the ray; ends the path, or takes one of the two branches."""
     state, alive = walk.state, walk.status == PathStatus.EMPTY

@@ -23,17 +23,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from refref_jax.choices import Footprint
 from refref_jax.geometry import bvh
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import branching, budgets, footprints, media, offspring, path_tree, pools
-from refref_jax.optics.branching import Geometry as Geometry
 from refref_jax.optics.branching import RayState
 from refref_jax.optics.budgets import Budget, Room
-from refref_jax.optics.footprints import Footprint
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.offspring import Live
 from refref_jax.optics.path_tree import NO_SEGMENT, Ends, PathTree, Segments
 from refref_jax.optics.pools import Pool
+from refref_jax.optics.scene import Scene
 
 BLOCK = 4096
 """Rays cast in a round. A larger one serves an accelerator, at the price of memory."""
@@ -60,7 +60,7 @@ class _Walk(NamedTuple):
 
 
 def follow(
-    geometry: Geometry,
+    geometry: Scene,
     rays: Rays,
     inside: Int[Array, "rays slots"],
     *,
@@ -86,7 +86,7 @@ def _follow(
     budget: Budget,
     footprint: Footprint,
     block: int,
-    geometry: Geometry,
+    geometry: Scene,
     rays: Rays,
     inside: Int[Array, "rays slots"],
 ) -> PathTree:
@@ -107,7 +107,7 @@ def _follow(
 
 
 def _work_off(
-    geometry: Geometry, walk: _Walk, budget: Budget, block: int, room: Room, *, least: int
+    geometry: Scene, walk: _Walk, budget: Budget, block: int, room: Room, *, least: int
 ) -> _Walk:
     """Casts blocks until fewer than `least` rays are left."""
 
@@ -168,7 +168,7 @@ def _begin(
     return _Walk(*pools.pop(stack, block), tree)
 
 
-def _round(geometry: Geometry, walk: _Walk, budget: Budget, block: int, room: Room) -> _Walk:
+def _round(geometry: Scene, walk: _Walk, budget: Budget, block: int, room: Room) -> _Walk:
     """Casts one block, ends paths, and puts the children on the stack."""
     live, alive = walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
     hits = _cast(geometry, live.state, alive)
@@ -191,7 +191,7 @@ def _round(geometry: Geometry, walk: _Walk, budget: Budget, block: int, room: Ro
     return _Walk(*pools.pop(stack, block), tree)
 
 
-def _cast(geometry: Geometry, state: RayState, alive: Bool[Array, " block"]) -> bvh.Hits:
+def _cast(geometry: Scene, state: RayState, alive: Bool[Array, " block"]) -> bvh.Hits:
     return bvh.closest_hits(
         geometry.surfaces.bvh,
         Rays(state.origin, state.direction, jnp.zeros_like(state.tau)),

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from refref_jax.optics.branching import Geometry
+from refref_jax.optics.scene import Scene
 from refref_jax.reconstruct import photometry
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.photometry import Evidence
@@ -107,7 +107,7 @@ class IndexEstimate(NamedTuple):
 
 def estimate_index(
     evidence: Evidence,
-    geometry: Geometry,
+    geometry: Scene,
     views: Int[np.ndarray, " rays"],
     *,
     part: int,
@@ -231,7 +231,7 @@ def _lowest_rungs(heights: Sequence[float], count: int) -> list[int]:
 
 
 def _errors(
-    index: float, evidence: Evidence, geometry: Geometry, *, part: int, config: ModelConfig
+    index: float, evidence: Evidence, geometry: Scene, *, part: int, config: ModelConfig
 ) -> Float[np.ndarray, " rays"]:
     at = np.asarray(index, evidence.rgb.dtype)
     found = photometry.errors_at_index(at, evidence, geometry, part=part, config=config)

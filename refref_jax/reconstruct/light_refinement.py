@@ -22,7 +22,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from refref_jax.optics.media import Interfaces
-from refref_jax.optics.scene import Geometry, with_index
+from refref_jax.optics.scene import Scene, with_index
 from refref_jax.reconstruct import deformation, photometry
 from refref_jax.reconstruct.deformation import Rig
 from refref_jax.reconstruct.photometry import Evidence
@@ -158,7 +158,7 @@ def _step(
 
     def objective(unknowns: _Unknowns) -> tuple[Float[Array, ""], Float[Array, ""]]:
         shifts = settings.stride * unknowns.shifts
-        moved = Geometry(deformation.move(rig, shifts), interfaces)
+        moved = Scene(deformation.move(rig, shifts), interfaces)
         geometry = with_index(moved, index + settings.index_stride * unknowns.index)
         error = jnp.mean(photometry.errors(some, geometry, config=config))
         prior = settings.evenness * deformation.unevenness(rig, shifts)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.main_branches import follow_main_branches
-from refref_jax.optics.scene import Geometry, with_index
+from refref_jax.optics.scene import Scene, with_index
 from refref_jax.render import pixels
 from refref_jax.render.config import ModelConfig
 from refref_jax.render.model import Params
@@ -58,7 +58,7 @@ class Slope(NamedTuple):
 
 
 def errors(
-    evidence: Evidence, geometry: Geometry, *, config: ModelConfig, budget: Budget = TRACING
+    evidence: Evidence, geometry: Scene, *, config: ModelConfig, budget: Budget = TRACING
 ) -> Float[Array, " rays"]:
     """Returns each pixel's error in sRGB: Charbonnier's, of the length of the difference.
 
@@ -96,7 +96,7 @@ def errors(
 def errors_at_index(
     index: Float[Array, ""],
     evidence: Evidence,
-    geometry: Geometry,
+    geometry: Scene,
     *,
     part: int,
     config: ModelConfig,
@@ -109,7 +109,7 @@ def errors_at_index(
 def slope_at_index(
     index: Float[Array, ""],
     evidence: Evidence,
-    geometry: Geometry,
+    geometry: Scene,
     *,
     part: int,
     config: ModelConfig,

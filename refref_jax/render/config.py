@@ -2,15 +2,12 @@
 
 import dataclasses
 import math
-from typing import Literal, get_args
+from typing import get_args
 
+from refref_jax.choices import Footprint, Interior, Space
 from refref_jax.fields.kinds import DensityConfig, RadianceConfig
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.details import Detail
-from refref_jax.optics.footprints import Footprint
-from refref_jax.sampling.domains import Space
-
-Interior = Literal["field", "clear", "absorbing"]
 
 # Before a convex body, and after it.
 _CONVEX_LEGS = 2

@@ -20,7 +20,7 @@ from refref_jax.optics.details import Detail
 from refref_jax.optics.first_branches import Branch, reflected_first
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.optics.path_tracing import Traced
-from refref_jax.optics.wavefront import Geometry
+from refref_jax.optics.scene import Scene
 from refref_jax.render import colour, dyes, pixels, tiles
 from refref_jax.render.config import ModelConfig, path_detail
 from refref_jax.render.model import Model, Params
@@ -148,7 +148,7 @@ def _blank(lost: Float[Array, "rays 3"]) -> Rendering:
 
 @functools.partial(jax.jit, static_argnames=("budget", "detail"))
 def _trace_tile(
-    geometry: Geometry,
+    geometry: Scene,
     rays: Rays,
     real: Int[Array, ""],
     which: Int[Array, ""] = _ALL,

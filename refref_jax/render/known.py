@@ -22,7 +22,7 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.light_paths import LightPaths, PathEnds
-from refref_jax.optics.wavefront import Geometry
+from refref_jax.optics.scene import Scene
 from refref_jax.render import colour, tiles
 from refref_jax.render.backgrounds import Radiance
 
@@ -68,7 +68,7 @@ class _Tile(NamedTuple):
 
 
 def render_known(
-    geometry: Geometry,
+    geometry: Scene,
     radiance: Radiance,
     rays: Rays,
     *,
@@ -180,7 +180,7 @@ def _blank() -> KnownRendering:
 
 @functools.partial(jax.jit, static_argnames="budget")
 def _render_tile(
-    geometry: Geometry,
+    geometry: Scene,
     radiance: Radiance,
     rays: Rays,
     inside: Int[Array, "rays slots"] | None,

@@ -7,7 +7,7 @@ from jaxtyping import Array
 
 from refref_jax.fields import kinds, registry
 from refref_jax.optics.budgets import Budget
-from refref_jax.optics.wavefront import Geometry
+from refref_jax.optics.scene import Scene
 from refref_jax.render import dyes
 from refref_jax.render.config import ModelConfig
 from refref_jax.render.dyes import Dyes
@@ -39,7 +39,7 @@ class Model(NamedTuple):
 
     config: ModelConfig
     budget: Budget
-    geometry: Geometry
+    geometry: Scene
     params: Params
 
 

@@ -24,10 +24,10 @@ from jaxtyping import Array, Float, Int
 
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
-from refref_jax.optics.branching import Geometry
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.details import Detail
 from refref_jax.optics.light_paths import LightPaths, PathStatus
+from refref_jax.optics.scene import Scene
 from refref_jax.render import Model, dyes, transport
 from refref_jax.render.dyes import Dyes
 from refref_jax.sampling import domains
@@ -87,7 +87,7 @@ class _Traced(NamedTuple):
 
 
 def trace_pixel(
-    scene: Model | Geometry, ray: Rays, *, budget: Budget | None = None, reach: float = 4.0
+    scene: Model | Scene, ray: Rays, *, budget: Budget | None = None, reach: float = 4.0
 ) -> PixelPaths:
     """Follows one ray along all branches that a budget follows.
 
@@ -190,7 +190,7 @@ def _polylines(traced: _Traced, reach: float) -> PixelPaths:
 
 @functools.partial(jax.jit, static_argnames=("budget", "domain"))
 def _trace(
-    geometry: Geometry, ray: Rays, colours: Dyes | None, *, budget: Budget, domain: Domain | None
+    geometry: Scene, ray: Rays, colours: Dyes | None, *, budget: Budget, domain: Domain | None
 ) -> _Traced:
     tally = "none" if colours is None else "parts"
     traced = path_tracing.trace(

@@ -23,7 +23,7 @@ from refref_jax.geometry.bvh import BVH
 from refref_jax.geometry.surfaces import Surfaces
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.media import Interfaces
-from refref_jax.optics.wavefront import Geometry
+from refref_jax.optics.scene import Scene
 from refref_jax.render.config import ModelConfig
 from refref_jax.render.model import Model, Params, init_params
 
@@ -49,7 +49,7 @@ class SavedModel:
     budget: Budget
 
 
-def save_scene(run: Path, saved: SavedModel, geometry: Geometry) -> None:
+def save_scene(run: Path, saved: SavedModel, geometry: Scene) -> None:
     """Writes everything but the parameters into an existing folder."""
     write_static(run, saved)
     surfaces, interfaces = geometry
@@ -163,7 +163,7 @@ def restore(manager: ocp.CheckpointManager, step: int, items: dict) -> ocp.args.
         ) from error
 
 
-def load_geometry(run: Path) -> Geometry:
+def load_geometry(run: Path) -> Scene:
     """Reads the geometry that a run was made with.
 
     Raises:
@@ -180,7 +180,7 @@ def load_geometry(run: Path) -> Geometry:
             f"{path} can not be read ({_brief(error)}). Restore it, or train again into another "
             "folder."
         ) from error
-    return jax.tree.map(jax.numpy.asarray, Geometry(surfaces, interfaces))
+    return jax.tree.map(jax.numpy.asarray, Scene(surfaces, interfaces))
 
 
 def _brief(error: Exception) -> str:

@@ -8,15 +8,14 @@ Source: Barron et al., Mip-NeRF 360 (2022), Eq 10; Zip-NeRF (2023), section 2, f
 contracted Gaussian.
 """
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from refref_jax import numerics
+from refref_jax.choices import Space
 from refref_jax.sampling.cones import Gaussians
-
-Space = Literal["bounded", "spherical", "unbounded"]
 
 
 class Domain(NamedTuple):

@@ -47,7 +47,7 @@ class Checkpoints:
         if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(state.params)):
             raise ValueError(
                 f"Parameters are not finite at step {step}, so no checkpoint is written. Evaluate "
-                "an earlier one, or train again with another --seed and --out."
+                "an earlier one, or train again with another seed, in another folder."
             )
         items = {
             PARAMS_ITEM: ocp.args.StandardSave(state.params),

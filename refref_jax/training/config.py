@@ -25,11 +25,11 @@ from refref_jax.choices import (
     Pixels,
     Precision,
     PresetName,
-    Reentry,
-    Rule,
+    RuleName,
     Space,
     Tints,
 )
+from refref_jax.optics.budgets import Reentry
 
 # Points of the cone patterns, see `sampling.cones`.
 _PATTERNS = (1, 6)
@@ -70,7 +70,7 @@ class SceneConfig:
     """
 
     path: str = _option("", name="scene")
-    rule: Rule = _option("nested")
+    rule: RuleName = _option("nested")
     indices: tuple[tuple[str, float], ...] = _option((), name="ior")
     space: Space | None = _option(name="background", after=("scene",))
     radius: float | None = _option(after=("scene", "background"))

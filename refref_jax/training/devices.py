@@ -43,7 +43,7 @@ def connect(*, coordinator: str, processes: int, process: int) -> None:
         raise ValueError(
             f"The {processes} processes did not find each other at {coordinator} within "
             f"{_PATIENCE} s ({str(error).splitlines()[0]}). Start all of them, each with its own "
-            "--process, and check that the first one's host and port can be reached."
+            "process number, and check that the first one's host and port can be reached."
         ) from error
 
 
@@ -92,14 +92,14 @@ def row(count: int | None) -> Mesh | None:
     fewest, most = min(map(len, by_process)), max(map(len, by_process))
     if count is None and fewest < most:
         raise ValueError(
-            f"Processes have {fewest} to {most} devices, but share paths evenly. Give --devices a "
-            f"number up to {fewest}."
+            f"Processes have {fewest} to {most} devices, but share paths evenly. Give a count of "
+            f"devices up to {fewest}."
         )
     count = most if count is None else count
     if not 1 <= count <= fewest:
         raise ValueError(
-            f"--devices={count}, but there {'is 1 device' if fewest == 1 else f'are {fewest}'} of "
-            f"kind {jax.devices()[0].platform}. Give 1 to {fewest}, or all."
+            f"There {'is 1 device' if fewest == 1 else f'are {fewest} devices'} of kind "
+            f"{jax.devices()[0].platform}, not {count}. Give 1 to {fewest}, or all."
         )
     chosen = [device for each in by_process for device in each[:count]]
     return None if len(chosen) == 1 else Mesh(chosen, (AXIS,))

@@ -18,13 +18,14 @@ from typing import Any, NamedTuple
 import jax
 from jax.sharding import Mesh
 
+from refref_jax import atomic_files
 from refref_jax.data import local_layout, mask_margins, scene_source
 from refref_jax.data.batches import PixelSampler
 from refref_jax.data.meshes import MeshPart
-from refref_jax.optics.scene import Geometry
+from refref_jax.optics.scene import Scene
 from refref_jax.render import saved
 from refref_jax.render.model import Model
-from refref_jax.training import devices, loop, run_folder, run_lock
+from refref_jax.training import devices, loop, run_folder
 from refref_jax.training.checkpoints import Checkpoints
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.objective import StepReport
@@ -105,7 +106,7 @@ def prepare(
     *,
     parts: Sequence[MeshPart] | None = None,
     report: Callable[[str], None] = print,
-) -> tuple[Resolved, Geometry]:
+) -> tuple[Resolved, Scene]:
     """Reads the scene of a configuration and takes the decisions that are open.
 
     Args:
@@ -179,7 +180,7 @@ def train(
       KeyboardInterrupt: if it was to stop before it took a step.
     """
     config, model = run_folder.read_config(run), saved.read_static(run)
-    lock = run_lock.hold(run) if devices.is_first() else contextlib.nullcontext()
+    lock = atomic_files.hold(run) if devices.is_first() else contextlib.nullcontext()
     with lock, Checkpoints(run, keep=periods.keep) as checkpoints:
         if checkpoints.newest() == config.schedule.steps:
             report(f"{run} is trained already: {config.schedule.steps} steps.")

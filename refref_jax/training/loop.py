@@ -10,7 +10,7 @@ from jax.sharding import Mesh
 
 from refref_jax.data.batches import PixelSampler
 from refref_jax.optics.budgets import Budget, capacity_for
-from refref_jax.optics.wavefront import Geometry
+from refref_jax.optics.scene import Scene
 from refref_jax.render.config import ModelConfig, path_detail
 from refref_jax.training import devices, steps
 from refref_jax.training.config import TrainConfig
@@ -41,7 +41,7 @@ class Setup(NamedTuple):
     config: TrainConfig
     model: ModelConfig
     budget: Budget
-    geometry: Geometry
+    geometry: Scene
     sampler: PixelSampler
     capacity: int
     hit_fraction: float
@@ -53,7 +53,7 @@ def set_up(
     config: TrainConfig,
     model: ModelConfig,
     budget: Budget,
-    geometry: Geometry,
+    geometry: Scene,
     sampler: PixelSampler,
     *,
     mesh: Mesh | None = None,

@@ -14,12 +14,12 @@
 | `paper` | 2 x 256           | 4,096       | 25,000 | cone         |
 | `best`  | 2 x 256           | 16,384      | 25,000 | differential |
 
-These are sizes of Zip-NeRF's fields (`fields/zipnerf.py`). Those of another kind, by `--field`, are
+These are sizes of Zip-NeRF's fields (`fields/zipnerf.py`). Those of another kind, by `field`, are
 in its own module; `paper` are the published ones.
 
-Points are those that stand for an interval's cone, `--multisamples`; the size is the entries of a
-level. What depends on the scene is no preset's: give `paper` the options `--paths=paper
---interior=field` to have the published set-up in full, and leave both out for the others.
+Points are those that stand for an interval's cone, `multisamples`; the size is the entries of a
+level. What depends on the scene is no preset's: give `paper` the budget `paper` and the
+interior `field` to have the published set-up in full, and leave both out for the others.
 
 On the bundled ball 1250 steps of 1024 rays give `tiny` 36.6 dB in the mask and `small` 37.9, at 3.1
 times the time of a step. `paper` and `best` take a GPU: a CPU's core needs 0.8 s for 256 of their
@@ -36,10 +36,10 @@ import math
 
 import numpy as np
 
+from refref_jax.choices import Interior, Space
 from refref_jax.fields import registry
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.render.config import Interior, ModelConfig, ProposalConfig
-from refref_jax.sampling.domains import Space
+from refref_jax.render.config import ModelConfig, ProposalConfig
 from refref_jax.training.config import LossConfig, ScheduleConfig
 
 _WALLS = 7.3

@@ -28,7 +28,7 @@ from refref_jax.fields.kinds import RadianceConfig
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.optics.budgets import Budget, budget_of
 from refref_jax.optics.media import EMPTY_SLOT
-from refref_jax.optics.scene import Geometry
+from refref_jax.optics.scene import Scene
 from refref_jax.render.config import ModelConfig
 from refref_jax.render.saved import SavedModel
 from refref_jax.training import presets
@@ -163,7 +163,7 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
     )
 
 
-def build_scene(resolved: Resolved, facts: SceneFacts) -> Geometry:
+def build_scene(resolved: Resolved, facts: SceneFacts) -> Scene:
     """Returns what bends light; its parts have colours only where these are given."""
     given = resolved.config.model.tints == "given"
     parts = facts.parts if given else meshes.without_colour(facts.parts)

@@ -13,8 +13,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from refref_jax import configuration, drafts
-from refref_jax.optics.wavefront import Geometry
+from refref_jax import atomic_files, configuration
+from refref_jax.optics.scene import Scene
 from refref_jax.render import saved
 from refref_jax.render.saved import SavedModel
 from refref_jax.training import resolve
@@ -35,7 +35,7 @@ def exists(run: Path) -> bool:
     return (run / CONFIG).is_file()
 
 
-def create(run: Path, config: TrainConfig, model: SavedModel, geometry: Geometry) -> None:
+def create(run: Path, config: TrainConfig, model: SavedModel, geometry: Scene) -> None:
     """Opens a new run; the configuration comes last, so that a half-made folder is no run.
 
     Raises:
@@ -108,7 +108,7 @@ def _with_todays_keys(content: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, geometry: Geometry) -> None:
+def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, geometry: Scene) -> None:
     """Checks that a run was made with this very configuration; only its scene may have moved.
 
     Raises:
@@ -152,7 +152,7 @@ def rewind_metrics(run: Path, step: int) -> float:
     if not path.is_file():
         return 0.0
     kept = [line for line in read_metrics(run) if line["step"] <= step]
-    with drafts.unfinished_file(path) as draft:
+    with atomic_files.written_file(path) as draft:
         draft.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
     return kept[-1]["seconds"] if kept else 0.0
 

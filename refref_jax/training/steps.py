@@ -17,7 +17,7 @@ from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.details import Detail
 from refref_jax.optics.path_tracing import Survey, Traced
-from refref_jax.optics.wavefront import Geometry
+from refref_jax.optics.scene import Scene
 from refref_jax.render import pixels
 from refref_jax.render.config import ModelConfig
 from refref_jax.render.model import Params
@@ -55,7 +55,7 @@ _SHARED = Pool(
 
 @functools.partial(jax.jit, static_argnames=("budget", "capacity", "detail", "mesh"))
 def trace_pool(
-    geometry: Geometry,
+    geometry: Scene,
     rays: Rays,
     *,
     budget: Budget,
@@ -85,7 +85,7 @@ def trace_pool(
 
 
 @functools.partial(jax.jit, static_argnames="budget")
-def survey_paths(geometry: Geometry, rays: Rays, *, budget: Budget) -> Survey:
+def survey_paths(geometry: Scene, rays: Rays, *, budget: Budget) -> Survey:
     """Measures how many paths the rays `[rays]` of a scene have; see `path_tracing.survey`."""
     return path_tracing.survey(geometry, rays, budget=budget)
 

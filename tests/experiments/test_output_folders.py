@@ -127,14 +127,14 @@ def test_two_calls_at_once_do_not_share_a_folder(tmp_path):
 
 
 def test_who_waited_for_another_looks_again(tmp_path, monkeypatch):
-    out, hold = tmp_path / "out", output_folders.run_lock.hold
+    out, hold = tmp_path / "out", output_folders.atomic_files.hold
 
     def hold_after_another(folder):
-        monkeypatch.setattr(output_folders.run_lock, "hold", hold)
+        monkeypatch.setattr(output_folders.atomic_files, "hold", hold)
         _write(out, ["metrics.json"], overwrite=False)
         return hold(folder)
 
-    monkeypatch.setattr(output_folders.run_lock, "hold", hold_after_another)
+    monkeypatch.setattr(output_folders.atomic_files, "hold", hold_after_another)
     with pytest.raises(ValueError, match="Give --overwrite"), _fresh(out):
         raise AssertionError("worked in vain")
     assert _files(out) == {"metrics.json", "command.json"}

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from refref_jax.optics import branching, path_tracing
+from refref_jax.optics import path_tracing
 from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE, Budget
 from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics.scene import Scene
 from refref_jax.optics.single_path import follow_branch
 from tests import scenes
 
@@ -180,7 +181,7 @@ def test_gradients_agree_with_differences(case):
 
         def run(knobs):
             tree = surfaces.bvh._replace(triangles=knobs.corners)
-            moved = branching.Geometry(
+            moved = Scene(
                 surfaces._replace(bvh=tree, normals=knobs.normals),
                 interfaces._replace(index_inside=knobs.index),
             )

@@ -6,7 +6,7 @@ import pytest
 from refref_jax.data.geometry import build_geometry
 from refref_jax.data.meshes import MeshPart
 from refref_jax.geometry.surface_build import build_surfaces
-from refref_jax.optics.branching import Geometry
+from refref_jax.optics.scene import Scene
 from refref_jax.reconstruct import photometry
 from refref_jax.reconstruct.comparison import compare_meshes
 from refref_jax.reconstruct.light_refinement import LightRefinement, refine_by_light
@@ -42,7 +42,7 @@ def _error(mesh, index, evidence):
     found = photometry.errors_at_index(
         np.float32(index),
         evidence,
-        Geometry(surfaces, interfaces),
+        Scene(surfaces, interfaces),
         part=0,
         config=lit_scenes.CONFIG,
     )

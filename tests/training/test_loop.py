@@ -253,7 +253,7 @@ def test_a_run_folder_holds_everything_that_rendering_needs(tmp_path):
 
 def test_a_run_is_never_overwritten(tmp_path):
     run_folder.create(tmp_path, CONFIG, SAVED, _GEOMETRY)
-    with pytest.raises(ValueError, match="--resume"):
+    with pytest.raises(ValueError, match="Resume it"):
         run_folder.create(tmp_path, CONFIG, SAVED, _GEOMETRY)
     assert run_folder.read_config(tmp_path) == CONFIG
 

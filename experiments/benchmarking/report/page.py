@@ -12,7 +12,7 @@ from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.scene_pages import Page
 from experiments.cli import commands
 from experiments.figures.style import COLOURS
-from refref_jax import drafts
+from refref_jax import atomic_files
 
 FILE = "report.html"
 
@@ -59,7 +59,7 @@ def write(out: Path, *, views: int, edge: int) -> Path:
         *(page.html for page in pages.values()),
     ]
     path = out / FILE
-    with drafts.unfinished_file(path) as draft:
+    with atomic_files.written_file(path) as draft:
         draft.write_text(_document("Benchmark", join(body)), encoding="utf-8")
     return path
 

@@ -7,7 +7,7 @@ from experiments.benchmarking.report import cases, contents, seen
 from experiments.benchmarking.report.contents import Scene
 from experiments.benchmarking.report.seen import View
 from experiments.figures.style import pyplot
-from refref_jax import drafts
+from refref_jax import atomic_files
 
 FILE = "pictures.jpg"
 
@@ -77,7 +77,7 @@ def _draw(path: Path, columns: Sequence[tuple[Scene, View]], labels: dict[str, s
                 tile.set_frame_on(False)
     for tile, label in zip(axes[:, 0], ("ground truth", *labels.values()), strict=True):
         tile.set_ylabel(label, fontsize=8)
-    with drafts.unfinished_file(path) as draft:
+    with atomic_files.written_file(path) as draft:
         figure.savefig(draft, format="jpeg", dpi=_DOTS, pil_kwargs={"quality": 88})
     pyplot.close(figure)
 

@@ -12,7 +12,8 @@ from scipy.ndimage import gaussian_filter
 from experiments.dataset.objects.distance_fields import Field
 from experiments.dataset.objects.field_operations import gridded, intersection, offset
 from experiments.dataset.objects.isosurface import isosurface, largest_piece, sample
-from experiments.dataset.parts import CLEAR, NO_ABSORPTION, RADIUS, Category, Colour, Object, Part
+from experiments.dataset.parts import RADIUS, Category, Object, Part
+from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
 
 WALL = 0.09
 """Least thickness of the glass around a core."""

@@ -11,7 +11,8 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
-from experiments.dataset.parts import CLEAR, Colour, Object, Part
+from experiments.dataset.parts import Object, Part
+from refref_jax.choices import CLEAR, Colour
 
 GREEN: Colour = (0.72, 0.95, 0.80)
 ROSE: Colour = (1.0, 0.74, 0.80)

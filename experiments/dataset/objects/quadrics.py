@@ -12,7 +12,8 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from experiments.dataset.objects.isosurface import Surface
-from experiments.dataset.parts import CLEAR, Colour, Object, Part
+from experiments.dataset.parts import Object, Part
+from refref_jax.choices import CLEAR, Colour
 
 BLUE: Colour = (0.72, 0.86, 1.0)
 AMBER: Colour = (1.0, 0.85, 0.58)

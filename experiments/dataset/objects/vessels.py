@@ -23,7 +23,8 @@ from experiments.dataset.objects.regions import (
     top,
 )
 from experiments.dataset.objects.revolve import Turned, revolve, round_about
-from experiments.dataset.parts import CLEAR, NO_ABSORPTION, Colour, Part
+from experiments.dataset.parts import Part
+from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
 
 FILM = 0.016
 """Thickness of the glass between a liquid and the air over it, world units."""

@@ -99,7 +99,7 @@ def read_capture(source: Path) -> Capture:
 def every_nth(frames: int, *, every: int) -> dict[str, tuple[int, ...]]:
     """Returns splits of a capture that lists none: each n-th frame is test, the first included.
 
-    So does nerfstudio with `--eval-mode interval`.
+    So does nerfstudio in its evaluation mode `interval`.
 
     Args:
       frames: their number.

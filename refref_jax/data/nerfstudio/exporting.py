@@ -4,12 +4,12 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+from refref_jax import atomic_files
 from refref_jax.data import files, local_layout
 from refref_jax.data.errors import SceneError
 from refref_jax.data.local_layout import Frames
 from refref_jax.data.nerfstudio import capture as nerfstudio
 from refref_jax.data.nerfstudio.importing import Sense
-from refref_jax.drafts import appearing
 
 
 def read_splits(scene: Path) -> dict[str, Frames]:
@@ -41,7 +41,7 @@ def write_capture(
     digits = len(str(max(len(frames.names) for frames in splits.values())))
     images: dict[str, list[str]] = {}
     masks: dict[str, list[str]] = {}
-    with appearing(out) as folder:
+    with atomic_files.new_folder(out) as folder:
         for name in ("images", "masks"):
             (folder / name).mkdir()
         for split, frames in splits.items():
@@ -72,5 +72,5 @@ def _check_masks(images: dict[str, list[str]], masks: dict[str, list[str]]) -> N
         lacking = next(split for split in images if split not in masks)
         raise SceneError(
             f"The {lacking} split has no masks, but another has, and nerfstudio wants all or none. "
-            "Give --masks=none, or add them."
+            "Give the sense none to leave them all out, or add them."
         )

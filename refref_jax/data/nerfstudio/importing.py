@@ -14,13 +14,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from refref_jax import atomic_files
 from refref_jax.data import file_names, files
 from refref_jax.data.errors import SceneError
 from refref_jax.data.nerfstudio import capture as nerfstudio
 from refref_jax.data.nerfstudio import centring, placement
 from refref_jax.data.nerfstudio.centring import Windows
 from refref_jax.data.nerfstudio.frames import CaptureFrame
-from refref_jax.drafts import appearing
 
 Sense = Literal["object", "background", "none"]
 """What is white in nerfstudio's masks: the object, or all else; or there are to be none."""
@@ -106,7 +106,7 @@ def write_scene(
     if out.exists():
         raise SceneError(f"{out} exists, and nothing is overwritten. Give a new folder.")
     lenses = {split: _common_lens([view.frame for view in each]) for split, each in views.items()}
-    with appearing(out) as scene:
+    with atomic_files.new_folder(out) as scene:
         return {
             split: _write_split(each, split, scene, lenses[split], sense, step)
             for split, each in views.items()
@@ -177,7 +177,7 @@ def _write_split(
             if not mask.any():
                 raise SceneError(
                     f"The mask {view.frame.mask} marks no object, taking {sense} for white. Give "
-                    "another --masks, or leave the frame out."
+                    "another sense of masks, or leave the frame out."
                 )
             (scene / names.mask).parent.mkdir(parents=True, exist_ok=True)
             files.write_mask(scene / names.mask, mask)

@@ -61,6 +61,6 @@ def meeting_point(poses: Float[np.ndarray, "cameras 3 4"]) -> Float[np.ndarray, 
     if np.linalg.cond(total) > _WORST_CONDITION:
         raise SceneError(
             "All cameras look the same way, so nothing says where the middle of the scene is. Give "
-            "it, as in --centre=0.5,0,1.2."
+            "it as the centre, such as (0.5, 0, 1.2)."
         )
     return np.linalg.solve(total, np.einsum("nij,nj->i", across, poses[..., 3]))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.benchmarking import jobs, summary
-from refref_jax.training import run_lock
+from refref_jax import atomic_files
 from tests import made_lpips
 from tests.experiments.benchmarking.serving import calls
 from tests.experiments.command import ROOT
@@ -68,7 +68,7 @@ def test_results_of_several_versions_are_told(tmp_path, serve, scenes):
 
 def test_tables_are_not_made_while_another_works_there(tmp_path, serve, scenes):
     serve(tmp_path, scenes, "--methods=straight")
-    with run_lock.hold(tmp_path / "out"):
+    with atomic_files.hold(tmp_path / "out"):
         answer = serve(tmp_path, "--tables_only", status=2)
     assert "Another process works in" in answer.stderr
 

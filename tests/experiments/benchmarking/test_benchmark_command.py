@@ -12,7 +12,7 @@ import time
 import pytest
 
 from experiments.benchmarking import engines, jobs, summary
-from refref_jax.training import run_lock
+from refref_jax import atomic_files
 from tests.experiments.benchmarking.serving import MODULES, calls, environment
 from tests.experiments.command import ROOT
 
@@ -164,7 +164,7 @@ def test_results_of_two_machines_are_merged_by_copying(tmp_path, serve, scenes):
 
 def test_two_do_not_work_in_one_folder(tmp_path, serve, scenes):
     (tmp_path / "out").mkdir()
-    with run_lock.hold(tmp_path / "out"):
+    with atomic_files.hold(tmp_path / "out"):
         result = serve(tmp_path, scenes, "--methods=tree", status=2)
     assert "Another process works in" in result.stderr and not calls(tmp_path)
 

@@ -17,7 +17,7 @@ from experiments.benchmarking import (
 )
 from experiments.benchmarking.methods import METHODS, RECONSTRUCTION
 from experiments.cli import scene_option
-from refref_jax.training import run_lock
+from refref_jax import atomic_files
 from tests.experiments.benchmarking.made_records import SETTINGS
 from tests.experiments.benchmarking.made_scenes import write_scene
 
@@ -277,7 +277,7 @@ def test_a_mistake_of_ours_is_a_reason_too(tmp_path, stand_in, monkeypatch):
 def test_a_job_waits_for_who_still_works_in_its_run(tmp_path, capsys):
     running.wait_until_free(tmp_path / "nothing")
     running.wait_until_free(tmp_path)
-    with run_lock.hold(tmp_path), pytest.raises(ValueError, match="Another process works"):
+    with atomic_files.hold(tmp_path), pytest.raises(ValueError, match="Another process works"):
         running.wait_until_free(tmp_path, patience=0.3)
     line = f"Waiting until the process ends that works in {tmp_path} yet.\n"
     assert capsys.readouterr().out == line

@@ -14,6 +14,7 @@ import trimesh
 from experiments.dataset import backgrounds, frame_files, production, scene_record, scenes
 from experiments.dataset.parts import Object, Part
 from experiments.dataset.render_settings import PerSplit, RenderSettings
+from refref_jax import atomic_files
 
 SETTINGS = RenderSettings(size=6, spp=PerSplit(2, 2, 4), views=PerSplit(3, 1, 2))
 
@@ -94,9 +95,9 @@ def _kill_at(moment, number):
 _MOMENTS = {
     "mesh": (trimesh.exchange.ply, "export_ply"),
     "record": (scene_record, "describe"),
-    "rename": (Path, "rename"),
+    "rename": (atomic_files, "move"),
     "read": (frame_files, "read_rendering"),
-    "replace": (Path, "replace"),
+    "replace": (os, "replace"),
 }
 
 

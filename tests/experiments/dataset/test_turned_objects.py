@@ -16,7 +16,8 @@ from experiments.dataset.objects import (
     medical,
     perfumes,
 )
-from experiments.dataset.parts import NO_ABSORPTION, RADIUS
+from experiments.dataset.parts import RADIUS
+from refref_jax.choices import NO_ABSORPTION
 from refref_jax.data.containment import (
     Containment,
     beside_faces,

@@ -21,7 +21,6 @@ from experiments.r3f import (
     report,
 )
 from experiments.r3f.records import ReconstructionConfig
-from refref_jax import drafts
 from refref_jax.data import local_layout, stored_normals
 from refref_jax.geometry.corner_normals import corner_normals
 from refref_jax.reconstruct.comparison import compare_meshes
@@ -419,20 +418,3 @@ def test_an_estimate_that_is_no_number_is_no_result(scene, tmp_path, monkeypatch
         _run(scene, tmp_path / "out", dataclasses.replace(_CONFIG, index=1.6))
     with pytest.raises(ValueError, match="no reconstruction"):
         chain.read_part(tmp_path)
-
-
-def test_a_target_appears_when_it_is_whole(tmp_path):
-    target = tmp_path / "folder"
-    for content in ("old", "new"):
-        with drafts.unfinished_folder(target) as folder:
-            (folder / content).write_text(content)
-            assert not (target / content).exists()
-    assert [path.name for path in target.iterdir()] == ["new"]
-    with pytest.raises(_KilledError), drafts.unfinished_folder(target) as folder:
-        (folder / "half").write_text("")
-        raise _KilledError
-    assert [path.name for path in target.iterdir()] == ["new"]
-    with pytest.raises(_KilledError), drafts.unfinished_file(tmp_path / "file") as path:
-        path.write_text("half")
-        raise _KilledError
-    assert not (tmp_path / "file").exists()
