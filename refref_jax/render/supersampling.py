@@ -14,7 +14,7 @@ from jaxtyping import Float
 from refref_jax.geometry import cameras
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
-from refref_jax.render import Model, Rendering, colour, render_image
+from refref_jax.render import Model, Rendering, colour, render_image, tiles
 
 RAYS_OF_A_BAND = 1 << 18
 """Most rays that are held at once, where a row of pixels has no more."""
@@ -43,7 +43,7 @@ def render_view(
         average(render_image(model, rays, chunk=chunk), side)
         for rays in _bands(fine, view, rows=side * max(1, band // (side * fine.width)))
     ]
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *bands)
+    return tiles.join(bands)
 
 
 def warm_up(model: Model, views: Cameras, *, chunk: int) -> None:
