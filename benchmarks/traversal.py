@@ -27,7 +27,8 @@ from absl import app, flags
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from refref_jax.geometry import bvh, bvh_build, coherence
+from benchmarks import ray_sorting
+from refref_jax.geometry import bvh, bvh_build
 from refref_jax.geometry.rays import Rays
 
 _ROUNDS = flags.DEFINE_integer("rounds", 15, "Timed repeats of every case.")
@@ -181,7 +182,7 @@ def main(arguments: list[str]) -> None:
     del arguments
     if importlib.util.find_spec("mitsuba") is None:
         print("Mitsuba is not installed and is left out. `pip install mitsuba` adds it.")
-    plain, sorted_first = jax.jit(bvh.closest_hits), jax.jit(coherence.closest_hits_sorted)
+    plain, sorted_first = jax.jit(bvh.closest_hits), jax.jit(ray_sorting.closest_hits_sorted)
     print("mesh        build s  rays      Mrays/s  Embree  ratio  asked")
     missed = []
     for name in _MESHES.value or _ALL:

@@ -44,7 +44,6 @@ _LONGEST = (
     "test_corners.py",
     "test_refinement.py",
     "test_training_body.py",
-    "test_coherence.py",
     "test_fields.py",
     "test_extremes.py",
     "test_occupancy.py",

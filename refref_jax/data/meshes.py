@@ -222,7 +222,7 @@ def _index(path: Path, overrides: Mapping[str, float], described: PartDescriptio
         raise SceneError(
             f"The material of {path} is unknown: no word of its name is one of "
             f"{', '.join(sorted(table))}. Rename the file, as in {path.stem}_glass.ply, or give "
-            f"its index in the overrides, as {{'{path.stem}': 1.5}}."
+            f"its index in indices, as {{'{path.stem}': 1.5}}."
         )
     return table[material]
 

@@ -66,9 +66,8 @@ def closest_hits(
     flow: recompute the point from the slot and the barycentrics.
 
     Neighbours in the batch should be neighbours in space: on a CPU 16 of them share their way
-    through the tree. Pixels in tiles of 4 x 4 are so by nature; for rays in no order see
-    `coherence.closest_hits_sorted`, for more rays than should be in memory at once
-    `tiles.closest_hits_in_tiles`.
+    through the tree. Pixels in tiles of 4 x 4 are so by nature; for rays in no order
+    `benchmarks/ray_sorting.py` has a sort.
 
     Args:
       bvh: the scene.

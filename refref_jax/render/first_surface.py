@@ -21,7 +21,7 @@ TILE = 65536
 
 NO_PART = -1
 
-_SMALLEST_TILE = 1024
+_INSTEAD = "Call it outside, or cast single rays with bvh.closest_hits."
 
 
 class FirstSurface(NamedTuple):
@@ -51,15 +51,15 @@ def find_first_surface(surfaces: Surfaces, rays: Rays, *, tile: int = TILE) -> F
     """
     if tile < 1:
         raise ValueError(f"A tile of {tile} rays casts nothing. Give 1 or more.")
-    rays = jax.tree.map(np.asarray, rays)
-    shape, count = rays.radii.shape, rays.radii.size
-    tile = min(tile, max(_SMALLEST_TILE, 1 << max(count - 1, 0).bit_length()))
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), rays)
     surfaces = jax.device_put(surfaces)
-    starts = range(0, max(count, 1), tile)  # no ray makes one empty tile, which has the right types
-    parts = [jax.device_get(_cast(surfaces, tiles.cut_out(flat, None, i, tile)[0])) for i in starts]
-    fields = [np.concatenate(field)[:count] for field in zip(*parts, strict=True)]
-    return FirstSurface(*(field.reshape(*shape, *field.shape[1:]) for field in fields))
+    empty = np.zeros((0, 3), jax.dtypes.canonicalize_dtype(rays.radii.dtype))
+    return tiles.in_tiles(
+        lambda part, *_: FirstSurface(*_cast(surfaces, part)),
+        rays,
+        tile=tiles.size_for(rays.radii.size, most=tile),
+        nothing=FirstSurface(empty[:, 0], empty, np.zeros(0, np.int32)),
+        instead=_INSTEAD,
+    )
 
 
 @jax.jit

@@ -116,16 +116,14 @@ def render_image(
     if chunk < 1:
         raise ValueError(f"A chunk of {chunk} paths renders nothing. Give 1 or more.")
     rays = jax.tree.map(np.float32, tiles.fetch(rays, instead=_INSTEAD))
-    shape = rays.radii.shape
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), rays)
-    count = flat.radii.shape[0]
-    parts = [jax.device_get(_blank(jax.device_put(flat.origins[:0])))]
-    for start in range(0, count, TILE):
-        tile, _ = tiles.cut_out(flat, None, start, TILE)
-        part = _render_tile(model, tile, min(TILE, count - start), chunk, branch)
-        parts.append(tiles.fetch(part, instead=_INSTEAD))
-    joined = jax.tree.map(lambda *each: np.concatenate(each), *parts)
-    return jax.tree.map(lambda x: x[:count].reshape((*shape, *x.shape[1:])), joined)
+    nothing = jax.device_get(_blank(jax.device_put(np.zeros((0, 3), np.float32))))
+    return tiles.in_tiles(
+        lambda tile, _, real: _render_tile(model, tile, real, chunk, branch),
+        rays,
+        tile=TILE,
+        nothing=nothing,
+        instead=_INSTEAD,
+    )
 
 
 def _render_tile(model: Model, rays: Rays, real: int, chunk: int, branch: Branch) -> Rendering:

@@ -29,8 +29,6 @@ from refref_jax.render.backgrounds import Radiance
 TILE = 65536
 """Rays traced at once."""
 
-_SMALLEST_TILE = 1024
-
 _INSTEAD = (
     "Call it outside, or use trace or follow_main_branches and shade, which are pure functions."
 )
@@ -109,25 +107,26 @@ def render_known(
         raise ValueError(f"A tile of {tile} rays renders nothing. Give 1 or more.")
     if jax.tree.structure(radiance) == jax.tree.structure(0):
         radiance = jax.tree_util.Partial(radiance)  # a leaf is no argument of a compiled function
-    rays, inside = tiles.fetch((rays, inside), instead=_INSTEAD)
-    shape = rays.radii.shape
     count = rays.radii.size
-    # Few rays need no large tile, but a budget's room must not be that of a ray or two.
-    tile = min(tile, max(_SMALLEST_TILE, 1 << max(count - 1, 0).bit_length()))
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), (rays, inside))
+    tile = tiles.size_for(count, most=tile)
     # On the device once, not once a tile.
     geometry, radiance = jax.device_put((geometry, radiance))
-    parts = []
-    for start in range(0, count, tile):
-        part = tiles.cut_out(*flat, start, tile)
-        seen = _render_tile(geometry, radiance, *part, budget=budget)
-        parts.append(tiles.fetch(seen, instead=_INSTEAD))
-    casts = sum(int(each.casts) for each in parts)
-    seen = [part[:-1] for part in parts or [_blank()]]
-    fields = [np.concatenate(field)[:count] for field in zip(*seen, strict=True)]
-    fields = [field.reshape(*shape, *field.shape[1:]) for field in fields]
-    # Each ray that fills up the last tile misses, which takes one cast if any are made.
-    return KnownRendering(*fields, casts - (-count % tile) * (budget.bends > 0))
+    casts = []
+
+    def see(
+        rays: Rays, inside: Int[np.ndarray, "rays slots"] | None, real: int
+    ) -> tuple[Array | np.ndarray, ...]:
+        # Each ray that fills up a tile misses, which takes one cast if any are made.
+        seen = tiles.fetch(
+            _render_tile(geometry, radiance, rays, inside, budget=budget), instead=_INSTEAD
+        )
+        casts.append(int(seen.casts) - (tile - real) * (budget.bends > 0))
+        return seen[:-1]
+
+    fields = tiles.in_tiles(
+        see, rays, tile=tile, nothing=_blank()[:-1], instead=_INSTEAD, inside=inside
+    )
+    return KnownRendering(*fields, sum(casts))
 
 
 def shade(paths: LightPaths | PathEnds, radiance: Radiance, *, rays: int) -> Float[Array, "rays 3"]:

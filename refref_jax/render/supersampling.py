@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from refref_jax.geometry.cameras import Cameras, box_filter, pixel_rays, supersample
 from refref_jax.geometry.rays import Rays
-from refref_jax.render import colour
+from refref_jax.render import colour, tiles
 from refref_jax.render.images import CHUNK, Rendering, render_image
 from refref_jax.render.model import Model
 
@@ -56,7 +56,7 @@ def render_camera(
         average(render_image(model, rays, chunk=chunk), side)
         for rays in _bands(fine, view, rows=side * max(1, band // (side * fine.width)))
     ]
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *bands)
+    return tiles.join(bands)
 
 
 def side_of(rays_per_pixel: int) -> int:

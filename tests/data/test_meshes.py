@@ -102,7 +102,7 @@ def test_an_unknown_material_is_not_taken_from_the_folder(make_scene):
 def test_an_unknown_material_names_the_words_and_the_remedy(make_scene):
     scene = make_scene("ball_wood.ply")
     with scene_error(
-        "ball_wood.ply", *meshes.INDEX_OF_REFRACTION, "overrides, as {'ball_wood': 1.5}", "Rename"
+        "ball_wood.ply", *meshes.INDEX_OF_REFRACTION, "in indices, as {'ball_wood': 1.5}", "Rename"
     ):
         meshes.read_meshes(scene)
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.geometry import bvh, bvh_build, coherence
+from benchmarks import ray_sorting
+from refref_jax.geometry import bvh, bvh_build
 from refref_jax.geometry.rays import Rays
 from tests import reference
 
@@ -156,7 +157,7 @@ def test_duplicates_give_one_hit_whatever_their_order_and_the_company():
     extra = {"limits": jnp.full(200, jnp.inf), "leaving": jnp.full(200, -1, jnp.int32)}
     hits = _trace(tree, rays, **extra)
     # In another order every ray has other neighbours, and takes other turns with them.
-    again = jax.jit(coherence.closest_hits_sorted)(tree, rays, **extra)
+    again = jax.jit(ray_sorting.closest_hits_sorted)(tree, rays, **extra)
     np.testing.assert_array_equal(hits.slots, again.slots)
     assert np.all(np.asarray(hits.slots) >= 0)
 

@@ -8,7 +8,7 @@ import pytest
 _PROGRAM = """
 import resource
 import jax, jax.numpy as jnp, numpy as np, trimesh
-from refref_jax.geometry import bvh, bvh_build, tiles
+from refref_jax.geometry import bvh, bvh_build
 from refref_jax.geometry.rays import Rays
 triangles = trimesh.creation.icosphere(subdivisions=8).triangles.astype(np.float32)
 assert len(triangles) > 1e6
@@ -18,7 +18,7 @@ generator = np.random.default_rng(0)
 origins = jnp.asarray(generator.uniform(-0.5, 0.5, (count, 3)), jnp.float32)
 directions = generator.normal(size=(count, 3))
 directions = jnp.asarray(directions / np.linalg.norm(directions, axis=1)[:, None], jnp.float32)
-hits = jax.jit(tiles.closest_hits_in_tiles)(
+hits = jax.jit(bvh.closest_hits)(
     tree, Rays(origins, directions, jnp.zeros(count)),
     limits=jnp.full(count, jnp.inf), leaving=jnp.full(count, bvh.NO_SLOT, jnp.int32),
 )
