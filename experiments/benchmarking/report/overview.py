@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 
-from experiments.benchmarking import comparisons
+from experiments.benchmarking import paper_tables
 from experiments.benchmarking.quantities import PSNR, PSNR_MASKED
 from experiments.benchmarking.records import Record
 from experiments.benchmarking.report import cases, charts, tables_shown
@@ -66,8 +66,8 @@ def _scenes(contents: Contents, places: Mapping[str, Places]) -> Html:
         [
             tag("a", _first_picture(places[scene.name]), scene.name, href=address(scene.name)),
             *_scores(scene, methods),
-            comparisons.CATEGORIES.get(scene.category, scene.category),
-            comparisons.BACKGROUNDS.get(scene.background, scene.background),
+            paper_tables.CATEGORIES.get(scene.category, scene.category),
+            paper_tables.BACKGROUNDS.get(scene.background, scene.background),
         ]
         for scene in contents.scenes
     ]
