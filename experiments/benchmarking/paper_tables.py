@@ -15,12 +15,19 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from experiments.benchmarking import pose_space, published, quantities, tables
+from experiments.benchmarking import pose_space, published, tables
 from experiments.benchmarking.methods import FULL, METHODS, Group, Method
-from experiments.benchmarking.quantities import Quantity
 from experiments.benchmarking.records import OTHER, Metrics, Record
-from experiments.benchmarking.statistics import NOTHING, Cell, mean_over
-from experiments.benchmarking.tables import Block, Column, Row, Table
+from experiments.benchmarking.tables import (
+    NOTHING,
+    Block,
+    Cell,
+    Column,
+    Quantity,
+    Row,
+    Table,
+    mean_over,
+)
 
 TOP = 5
 """Test views of a scene that are farthest from its training views, as in the paper."""
@@ -68,7 +75,7 @@ _DRMSE = (
 
 _PAPERS_SCENES = ("smcvx", "cube")
 
-_DIFFERENCES = (quantities.PSNR, quantities.PSNR_MASKED)
+_DIFFERENCES = (tables.PSNR, tables.PSNR_MASKED)
 
 _NOTES = (
     "Ablations change one thing of the method in the first row of their block. Means over images, "
@@ -90,21 +97,21 @@ def main_table(found: Sequence[Record]) -> Table:
         for background in (*BACKGROUNDS, published.ALL):
             own = select(found, category, background)
             if own:
-                rows = _ours(own, quantities.MAIN, lambda record: record.metrics)
-                rows += _theirs(published.MAIN, category, background, quantities.MAIN)
+                rows = _ours(own, tables.MAIN, lambda record: record.metrics)
+                rows += _theirs(published.MAIN, category, background, tables.MAIN)
                 title = describe(category, background)
-                blocks.append(_marked(title, rows, quantities.MAIN, own))
-    return _table("main", "Methods by category and background", (), quantities.MAIN, blocks)
+                blocks.append(_marked(title, rows, tables.MAIN, own))
+    return _table("main", "Methods by category and background", (), tables.MAIN, blocks)
 
 
 def top_views_table(found: Sequence[Record]) -> Table:
     """Returns the same means over the test views farthest from any training view."""
     found = _without_ablations(found)
-    rows = _ours(found, quantities.TOP_VIEWS, top_metrics)
-    rows += _theirs(published.TOP_VIEWS, published.ALL, published.ALL, quantities.TOP_VIEWS)
-    blocks = [_marked("all scenes", rows, quantities.TOP_VIEWS, found)] if found else []
+    rows = _ours(found, tables.TOP_VIEWS, top_metrics)
+    rows += _theirs(published.TOP_VIEWS, published.ALL, published.ALL, tables.TOP_VIEWS)
+    blocks = [_marked("all scenes", rows, tables.TOP_VIEWS, found)] if found else []
     notes = (_FARTHEST.format(views=_views(found)), _DRMSE)
-    return _table("top_views", "Farthest test views", notes, quantities.TOP_VIEWS, blocks)
+    return _table("top_views", "Farthest test views", notes, tables.TOP_VIEWS, blocks)
 
 
 def _views(found: Sequence[Record]) -> str:
@@ -161,7 +168,7 @@ def _ours(
         if not own:
             continue
         known = [(metrics(record), record.background) for record in own]
-        cells = [mean_over(quantities.value(each, *pair) for pair in known) for each in wanted]
+        cells = [mean_over(tables.value(each, *pair) for pair in known) for each in wanted]
         rows.append(tables.row(method.label, "ours", len(own), cells))
     return rows
 
@@ -205,7 +212,7 @@ def ablation_table(found: Sequence[Record]) -> Table:
 def difference(found: Sequence[Record], method: str, full: str, quantity: Quantity) -> Cell:
     """Returns the mean difference of a quantity to that of a full method, over common scenes."""
     known = {
-        (record.scene, record.method): quantities.value(quantity, record.metrics, record.background)
+        (record.scene, record.method): tables.value(quantity, record.metrics, record.background)
         for record in found
     }
     scenes = sorted({record.scene for record in found})
@@ -240,9 +247,9 @@ def _row(
 ) -> Row:
     own = [record for record in found if record.method == method.name]
     cells: list[Cell] = []
-    for each in quantities.ABLATIONS:
+    for each in tables.ABLATIONS:
         cells.append(
-            mean_over(quantities.value(each, record.metrics, record.background) for record in own)
+            mean_over(tables.value(each, record.metrics, record.background) for record in own)
         )
         if each in _DIFFERENCES:
             cells.append(
@@ -256,7 +263,7 @@ def _row(
 
 def _columns() -> tuple[Column, ...]:
     columns = []
-    for each in quantities.ABLATIONS:
+    for each in tables.ABLATIONS:
         plain = Column(each.label, each.latex, each.better, each.digits)
         # Not our kind of it: which kind of distance the paper's is, is not known.
         name, latex = (text.partition(",")[0] for text in (each.label, each.latex))

@@ -6,8 +6,7 @@ from html import escape
 
 from experiments.benchmarking import paper_tables, published, table_text, tables
 from experiments.benchmarking.report.markup import Html, join, tag
-from experiments.benchmarking.statistics import Cell
-from experiments.benchmarking.tables import Block, Column, Mark, Row, Table
+from experiments.benchmarking.tables import Block, Cell, Column, Mark, Row, Table
 
 _MARKS: dict[Mark, str | None] = {"": None, "best": "strong", "second": "u"}
 

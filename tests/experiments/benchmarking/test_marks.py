@@ -4,10 +4,9 @@ import math
 
 import pytest
 
-from experiments.benchmarking import paper_tables, quantities, table_text, tables
+from experiments.benchmarking import paper_tables, table_text, tables
 from experiments.benchmarking.methods import METHODS
-from experiments.benchmarking.statistics import NOTHING, Cell, mean_over
-from experiments.benchmarking.tables import Column
+from experiments.benchmarking.tables import NOTHING, Cell, Column, mean_over
 from tests.experiments.benchmarking.made_records import made_record
 
 _PSNR = Column("PSNR", "PSNR", "higher", 2)
@@ -62,7 +61,7 @@ def test_differences_of_what_is_infinite_are_not_known(sign):
 
     def difference(*pairs):
         found = list(results(*pairs))
-        return paper_tables.difference(found, "oracle_no_tir", "oracle", quantities.PSNR)
+        return paper_tables.difference(found, "oracle_no_tir", "oracle", tables.PSNR)
 
     assert difference((inf, inf)) == NOTHING
     assert difference((inf, inf), (3.0, 1.0)) == Cell(2.0, None, 1)
