@@ -10,8 +10,7 @@ import functools
 from pathlib import Path
 from typing import NamedTuple
 
-from experiments.benchmarking.quantities import Quantity
-from experiments.benchmarking.statistics import NOTHING, Cell
+from experiments.benchmarking.tables import NOTHING, Cell, Quantity
 
 FILE = Path(__file__).with_name("published.csv")
 NUMBERS = ("psnr", "psnr_masked", "ssim", "lpips", "dmae", "drmse")

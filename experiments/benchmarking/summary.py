@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from experiments.benchmarking import (
-    ablations,
-    comparisons,
     jobs,
+    paper_tables,
     record_files,
     record_json,
     records,
@@ -116,9 +115,9 @@ def not_done(out: Path) -> tuple[dict[str, str], list[Skipped]]:
 def all_tables(found: Sequence[Record]) -> list[Table]:
     """Returns all tables of some results."""
     return [
-        comparisons.main_table(found),
-        comparisons.top_views_table(found),
-        ablations.ablation_table(found),
+        paper_tables.main_table(found),
+        paper_tables.top_views_table(found),
+        paper_tables.ablation_table(found),
     ]
 
 

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from experiments.benchmarking.records import Record
-from experiments.benchmarking.statistics import Cell
-from experiments.benchmarking.tables import Block, Column, Row, Table
+from experiments.benchmarking.tables import Block, Cell, Column, Row, Table
 from experiments.cli import commands
 
 _HEAD = (

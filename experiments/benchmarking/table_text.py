@@ -4,8 +4,7 @@ import re
 from collections.abc import Sequence
 
 from experiments.benchmarking import tables
-from experiments.benchmarking.statistics import Cell
-from experiments.benchmarking.tables import Column, Mark, Row, Table
+from experiments.benchmarking.tables import Cell, Column, Mark, Row, Table
 
 _ARROWS = {"higher": " ↑", "lower": " ↓", None: ""}
 _LATEX_ARROWS = {"higher": r"$\uparrow$", "lower": r"$\downarrow$", None: ""}

@@ -1,18 +1,132 @@
-"""What a table is, before it is written: blocks of rows, ours and the paper's, in columns.
+"""Tables before they are written: blocks of rows, ours and the paper's, in columns.
 
-`mark` finds the best and the second best of a block's own rows. Rows that lack a scene of the block
-are left out of that, and so are the paper's, which are of other data.
+`mean_over` makes a cell: a mean over scenes or views with its standard error; what is not known is
+never counted. `mark` finds the best and the second best of a block's own rows. Rows that lack a
+scene of the block are left out of that, and so are the paper's, which are of other data.
+
+A `Quantity` is what a column shows of a result, and in which way it is better. Distances are of
+three kinds, see docs/metrics.md. Those that are substituted, as the first release of the paper's
+code had them, are exact inside the mask, by definition, for methods that know objects: they do not
+rank. A distance's error is taken inside the mask before a natural background, which is infinitely
+far, and over the image elsewhere, as the paper's DMAE is.
+
+The paper does not say over which pixels its DRMSE is. Hardly over the image: the Oracle's is 0.00,
+its DMAE there is 0.04 (cubes) and 0.15 (spheres), and no RMSE is below the MAE of the same pixels.
+So the one over the mask is beside the paper's, and the one over the image is ours alone.
 """
 
 import math
-from collections.abc import Sequence
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
-from experiments.benchmarking.quantities import Better
-from experiments.benchmarking.statistics import Cell
-
+Better = Literal["higher", "lower"]
 Mark = Literal["", "best", "second"]
 Origin = Literal["ours", "published"]
+
+
+class Cell(NamedTuple):
+    """A number of a table.
+
+    Attributes:
+      mean: over scenes; `None` if no scene has the value.
+      error: standard error of the mean over scenes; `None` for fewer than two.
+      count: scenes that have the value.
+      digits: after the point, where they are not its column's: those that the paper prints.
+    """
+
+    mean: float | None = None
+    error: float | None = None
+    count: int = 0
+    digits: int | None = None
+
+
+NOTHING = Cell()
+"""What is not known."""
+
+
+def mean_over(values: Iterable[float | None]) -> Cell:
+    """Returns the mean of one value a scene, or a view.
+
+    The standard error is the standard deviation (with n - 1) over the square root of n. A mean that
+    is infinite, as the PSNR of equal images is, has none. Of `inf` and `-inf` together no mean is
+    known; one `nan` makes a mean `nan`.
+    """
+    known = [value for value in values if value is not None]
+    if not known or {math.inf, -math.inf} <= set(known):
+        return NOTHING
+    mean = math.fsum(known) / len(known) if all(map(math.isfinite, known)) else sum(known)
+    if len(known) < 2 or not math.isfinite(mean):
+        return Cell(mean, None, len(known))
+    return Cell(mean, statistics.stdev(known) / math.sqrt(len(known)), len(known))
+
+
+class Quantity(NamedTuple):
+    """A column.
+
+    Attributes:
+      label: of tables.
+      latex: the same in LaTeX.
+      key: of the metrics, and of the published rows.
+      better: `higher` or `lower`; `None` if it says nothing of how good a method is.
+      digits: after the point.
+      by_mask: whether it is taken inside the mask before a natural background.
+      published: its name in published.csv, if the paper has it.
+    """
+
+    label: str
+    latex: str
+    key: str
+    better: Better | None
+    digits: int
+    by_mask: bool = False
+    published: str | None = None
+
+
+PSNR = Quantity("PSNR", "PSNR", "psnr", "higher", 2, published="psnr")
+PSNR_MASKED = Quantity(
+    "masked PSNR", r"PSNR\textsubscript{M}", "psnr_masked", "higher", 2, published="psnr_masked"
+)
+SSIM = Quantity("SSIM", "SSIM", "ssim", "higher", 3, published="ssim")
+LPIPS = Quantity("LPIPS", "LPIPS", "lpips", "lower", 3, published="lpips")
+FLIP = Quantity("FLIP", "FLIP", "flip", "lower", 3)
+DMAE = Quantity("DMAE, substituted", "DMAE, substituted", "substituted_mae", None, 3, True, "dmae")
+DMAE_SURFACE = Quantity(
+    "DMAE, first surface", "DMAE, first surface", "surface_mae", "lower", 3, by_mask=True
+)
+DMAE_MEDIAN = Quantity("DMAE, median", "DMAE, median", "distance_mae", "lower", 3, by_mask=True)
+DRMSE_MASKED = Quantity(
+    "DRMSE, substituted, in the mask",
+    "DRMSE, substituted, in the mask",
+    "substituted_rmse_masked",
+    None,
+    3,
+    published="drmse",
+)
+DRMSE = Quantity(
+    "DRMSE, substituted, of the image",
+    "DRMSE, substituted, of the image",
+    "substituted_rmse",
+    None,
+    3,
+    by_mask=True,
+)
+DRMSE_SURFACE = Quantity(
+    "DRMSE, first surface", "DRMSE, first surface", "surface_rmse", "lower", 3, by_mask=True
+)
+DRMSE_MEDIAN = Quantity("DRMSE, median", "DRMSE, median", "distance_rmse", "lower", 3, by_mask=True)
+
+
+_OF_IMAGES = (PSNR, PSNR_MASKED, SSIM, LPIPS, FLIP)
+MAIN = (*_OF_IMAGES, DMAE, DMAE_SURFACE, DMAE_MEDIAN)
+TOP_VIEWS = (*_OF_IMAGES, DRMSE_MASKED, DRMSE, DRMSE_SURFACE, DRMSE_MEDIAN)
+ABLATIONS = (PSNR, PSNR_MASKED, SSIM, LPIPS, DMAE)
+
+
+def value(quantity: Quantity, metrics: Mapping[str, float | None], background: str) -> float | None:
+    """Returns a quantity of a result's metrics; `None` if it is not known."""
+    masked = quantity.by_mask and background == "env"
+    return metrics.get(f"{quantity.key}_masked" if masked else quantity.key)
 
 
 class Column(NamedTuple):

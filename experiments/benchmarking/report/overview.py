@@ -4,8 +4,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 
-from experiments.benchmarking import comparisons
-from experiments.benchmarking.quantities import PSNR, PSNR_MASKED
+from experiments.benchmarking import paper_tables
 from experiments.benchmarking.records import Record
 from experiments.benchmarking.report import cases, charts, tables_shown
 from experiments.benchmarking.report.cases import Case
@@ -13,6 +12,7 @@ from experiments.benchmarking.report.contents import Contents, Scene
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.scene_pages import address, thumbnail
 from experiments.benchmarking.report.view_figures import ERROR, IMAGE, TRUTH, Places
+from experiments.benchmarking.tables import PSNR, PSNR_MASKED
 
 # Failure cases of each method.
 _MOST_CASES = 10
@@ -66,8 +66,8 @@ def _scenes(contents: Contents, places: Mapping[str, Places]) -> Html:
         [
             tag("a", _first_picture(places[scene.name]), scene.name, href=address(scene.name)),
             *_scores(scene, methods),
-            comparisons.CATEGORIES.get(scene.category, scene.category),
-            comparisons.BACKGROUNDS.get(scene.background, scene.background),
+            paper_tables.CATEGORIES.get(scene.category, scene.category),
+            paper_tables.BACKGROUNDS.get(scene.background, scene.background),
         ]
         for scene in contents.scenes
     ]

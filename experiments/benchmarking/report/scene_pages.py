@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
 
-from experiments.benchmarking.quantities import MAIN, Quantity, value
 from experiments.benchmarking.report import charts, lines, seen, tables_shown, view_figures
 from experiments.benchmarking.report.contents import Scene
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.view_figures import NOT_HERE, TRUTH, Places, title
+from experiments.benchmarking.tables import MAIN, Quantity, value
 
 _WHAT = (
     "Error: mean over the channels of the absolute difference from the ground truth. Distance: of "

@@ -4,18 +4,17 @@ import re
 from collections.abc import Mapping, Sequence
 from html import escape
 
-from experiments.benchmarking import comparisons, published, table_text, tables
+from experiments.benchmarking import paper_tables, published, table_text, tables
 from experiments.benchmarking.report.markup import Html, join, tag
-from experiments.benchmarking.statistics import Cell
-from experiments.benchmarking.tables import Block, Column, Mark, Row, Table
+from experiments.benchmarking.tables import Block, Cell, Column, Mark, Row, Table
 
 _MARKS: dict[Mark, str | None] = {"": None, "best": "strong", "second": "u"}
 
 # Blocks that are open at first: all of a few; of more, each category over all backgrounds.
 _FEW = 4
 _OPEN = {
-    comparisons.describe(category, published.ALL)
-    for category in (*comparisons.CATEGORIES, published.ALL)
+    paper_tables.describe(category, published.ALL)
+    for category in (*paper_tables.CATEGORIES, published.ALL)
 }
 
 # What the notes of tables are written with.

@@ -4,10 +4,9 @@ import math
 
 import pytest
 
-from experiments.benchmarking import ablations, comparisons, quantities, table_text, tables
+from experiments.benchmarking import paper_tables, table_text, tables
 from experiments.benchmarking.methods import METHODS
-from experiments.benchmarking.statistics import NOTHING, Cell, mean_over
-from experiments.benchmarking.tables import Column
+from experiments.benchmarking.tables import NOTHING, Cell, Column, mean_over
 from tests.experiments.benchmarking.made_records import made_record
 
 _PSNR = Column("PSNR", "PSNR", "higher", 2)
@@ -30,13 +29,13 @@ def test_methods_that_lack_different_scenes_are_not_compared():
         made_record("cube_smcvx_cube", "tree", psnr=30.0),
         made_record("cube_smcvx_cone", "tree", psnr=30.0),
     ]
-    for table in (comparisons.main_table(results), comparisons.top_views_table(results)):
+    for table in (paper_tables.main_table(results), paper_tables.top_views_table(results)):
         assert set(_marks(table).values()) == {""}
     results += [
         made_record("cube_smcvx_cone", "oracle", psnr=20.0),
         made_record("cube_smcvx_ball", "tree", psnr=30.0),
     ]
-    for table in (comparisons.main_table(results), comparisons.top_views_table(results)):
+    for table in (paper_tables.main_table(results), paper_tables.top_views_table(results)):
         marks = _marks(table)
         assert marks[METHODS["tree"].label, "PSNR"] == "best"
         assert marks[METHODS["oracle"].label, "PSNR"] == ""
@@ -62,7 +61,7 @@ def test_differences_of_what_is_infinite_are_not_known(sign):
 
     def difference(*pairs):
         found = list(results(*pairs))
-        return ablations.difference(found, "oracle_no_tir", "oracle", quantities.PSNR)
+        return paper_tables.difference(found, "oracle_no_tir", "oracle", tables.PSNR)
 
     assert difference((inf, inf)) == NOTHING
     assert difference((inf, inf), (3.0, 1.0)) == Cell(2.0, None, 1)
@@ -77,7 +76,7 @@ def test_a_mean_of_opposite_infinities_is_not_known_and_of_nan_is_nan():
 
 def test_the_drmse_beside_the_papers_is_that_in_the_mask():
     metrics = {"substituted_rmse": 0.75, "substituted_rmse_masked": 0.0}
-    table = comparisons.top_views_table([made_record("cube_smcvx_ball", "tree", **metrics)])
+    table = paper_tables.top_views_table([made_record("cube_smcvx_ball", "tree", **metrics)])
     labels = [column.label for column in table.columns]
     masked = labels.index("DRMSE, substituted, in the mask")
     image = labels.index("DRMSE, substituted, of the image")
@@ -91,7 +90,7 @@ def test_the_drmse_beside_the_papers_is_that_in_the_mask():
 def test_latex_says_what_kind_of_distance_it_shows_and_has_the_notes():
     metrics = {"substituted_mae": 0.1, "substituted_rmse": 0.1, "substituted_rmse_masked": 0.0}
     found = [made_record("cube_smcvx_ball", "tree", psnr=1.0, **metrics)]
-    for table in (comparisons.main_table(found), comparisons.top_views_table(found)):
+    for table in (paper_tables.main_table(found), paper_tables.top_views_table(found)):
         comments = [line for line in table_text.latex(table).splitlines() if line[:1] == "%"]
         assert len(comments) == 1 + len(table.notes)
         assert not any("**" in line or "<u>" in line or "`" in line for line in comments)

@@ -7,10 +7,10 @@ import shutil
 import pytest
 
 from experiments.benchmarking import (
-    comparisons,
     fingerprints,
     jobs,
     methods,
+    paper_tables,
     record_files,
     record_json,
     running,
@@ -195,7 +195,7 @@ def test_a_scene_may_be_called_as_a_number_is(tmp_path):
     record = made_record("nan", "tree", **metrics)
     record = record._replace(per_image=[Image("inf", 0.5, 2.0, {**metrics, "ssim": 0.5})])
     assert _read(_written(tmp_path, record)) == [record]
-    assert comparisons.main_table([record]).blocks
+    assert paper_tables.main_table([record]).blocks
 
 
 def test_what_is_no_number_comes_back_and_is_not_the_best_of_a_report():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments.benchmarking import comparisons, table_data
+from experiments.benchmarking import paper_tables, table_data
 from experiments.benchmarking.methods import FULL, METHODS
 from experiments.benchmarking.report import charts, lines, pictures, tables_shown
 from experiments.benchmarking.report.contents import Point, Result
@@ -198,7 +198,7 @@ def test_a_table_is_the_same_after_json():
         made_record("cube_smcvx_cube", "oracle", psnr=34.0, psnr_masked=28.0),
         made_record("cube_smcvx_ball", "tree", psnr=31.0, psnr_masked=None),
     ]
-    for table in (comparisons.main_table(results), comparisons.main_table([])):
+    for table in (paper_tables.main_table(results), paper_tables.main_table([])):
         assert table_data.from_json(table_data.as_json(table)) == table
 
 
@@ -219,7 +219,7 @@ def test_of_many_blocks_those_over_all_backgrounds_are_open():
     scenes = ("cube_smcvx_ball", "env_smncvx_torus")
     results = [made_record(scene, "tree", psnr=30.0) for scene in scenes]
     for shown, closed in ((results[:1], 0), (results, 4)):
-        table = comparisons.main_table(shown)
+        table = paper_tables.main_table(shown)
         blocks = named(elements(tables_shown.show(table)), "details")
         assert len(blocks) == len(table.blocks)
         folded = ["".join(b.text) for b in blocks if "open" not in b.attributes]

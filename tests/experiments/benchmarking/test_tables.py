@@ -8,19 +8,10 @@ import math
 import numpy as np
 import pytest
 
-from experiments.benchmarking import (
-    ablations,
-    comparisons,
-    pose_space,
-    quantities,
-    table_data,
-    table_text,
-    tables,
-)
+from experiments.benchmarking import paper_tables, pose_space, table_data, table_text, tables
 from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.records import Image
-from experiments.benchmarking.statistics import NOTHING, Cell, mean_over
-from experiments.benchmarking.tables import Column
+from experiments.benchmarking.tables import NOTHING, Cell, Column, mean_over
 from tests.experiments.benchmarking.made_records import made_record
 
 
@@ -80,7 +71,7 @@ _RESULTS = [
 
 
 def test_the_main_table_by_hand():
-    table = comparisons.main_table(_RESULTS)
+    table = paper_tables.main_table(_RESULTS)
     assert [block.title for block in table.blocks] == [
         "convex, single material; cube background",
         "convex, single material; all backgrounds",
@@ -110,7 +101,7 @@ def test_the_main_table_by_hand():
 
 
 def test_the_papers_rows_are_beside_ours_and_never_marked():
-    table = comparisons.main_table(_RESULTS)
+    table = paper_tables.main_table(_RESULTS)
     rows = _block(table, "convex, single material; cube background")
     theirs = {label: row for (label, origin), row in rows.items() if origin == "published"}
     assert len(theirs) == 9 and all(row.scenes is None for row in theirs.values())
@@ -124,9 +115,9 @@ def test_the_papers_rows_are_beside_ours_and_never_marked():
 
 def test_distances_before_natural_backgrounds_are_those_in_the_mask():
     metrics = {"distance_mae": 500.0, "distance_mae_masked": 0.25}
-    assert quantities.value(quantities.DMAE_MEDIAN, metrics, "env") == 0.25
-    assert quantities.value(quantities.DMAE_MEDIAN, metrics, "cube") == 500.0
-    assert quantities.value(quantities.DMAE, metrics, "cube") is None
+    assert tables.value(tables.DMAE_MEDIAN, metrics, "env") == 0.25
+    assert tables.value(tables.DMAE_MEDIAN, metrics, "cube") == 500.0
+    assert tables.value(tables.DMAE, metrics, "cube") is None
 
 
 def test_equal_numbers_share_a_mark_and_lower_may_be_better():
@@ -157,10 +148,10 @@ def test_top_views_are_means_over_the_five_farthest():
     ]
     record = made_record("cube_smcvx_ball", "tree", psnr=1.0, psnr_masked=1.0)
     record = record._replace(per_image=views)
-    found = comparisons.top_metrics(record)
+    found = paper_tables.top_metrics(record)
     assert found["psnr"] == pytest.approx((6.0 + 5.0 + 4.0 + 3.0 + 2.0) / 5.0)
     assert found["psnr_masked"] is None  # the only view that has one is near
-    table = comparisons.top_views_table([record])
+    table = paper_tables.top_views_table([record])
     (block,) = table.blocks
     rows = {(row.label, row.origin): row for row in block.rows}
     assert rows[METHODS["tree"].label, "ours"].cells[0].mean == pytest.approx(4.0)
@@ -180,7 +171,7 @@ def test_the_farthest_views_are_as_many_as_there_were(views, told):
         )
         for scene, count in zip(("cube_smcvx_ball", "cube_smcvx_cube"), views, strict=False)
     ]
-    assert told in comparisons.top_views_table(found).notes[0]
+    assert told in paper_tables.top_views_table(found).notes[0]
 
 
 def test_ablations_are_differences_over_common_scenes_beside_the_papers():
@@ -191,7 +182,7 @@ def test_ablations_are_differences_over_common_scenes_beside_the_papers():
         made_record("env_smncvx_torus", "oracle_no_tir", psnr=10.0, psnr_masked=10.0),
         made_record("cube_smcvx_ball", "tree_cone", psnr=30.5, psnr_masked=29.0),
     ]
-    table = ablations.ablation_table(results)
+    table = paper_tables.ablation_table(results)
     assert [block.title for block in table.blocks] == [
         "ablation of the oracle; convex, single material; cube background",
         "ablation of the oracle; all categories; all backgrounds",
@@ -226,20 +217,20 @@ def test_ablations_are_differences_over_common_scenes_beside_the_papers():
 
 def test_ablations_are_in_their_own_table_alone():
     results = [*_RESULTS, made_record("cube_smcvx_ball", "oracle_no_tir", psnr=25.0)]
-    for table in (comparisons.main_table(results), comparisons.top_views_table(results)):
+    for table in (paper_tables.main_table(results), paper_tables.top_views_table(results)):
         labels = {row.label for block in table.blocks for row in block.rows}
         assert METHODS["oracle"].label in labels and "w/o TIR" not in labels
-    assert comparisons.main_table(results[-1:]).blocks == ()
+    assert paper_tables.main_table(results[-1:]).blocks == ()
 
 
 def test_without_ablations_their_table_says_that_nothing_is_measured():
-    table = ablations.ablation_table(_RESULTS)
+    table = paper_tables.ablation_table(_RESULTS)
     assert table.blocks == () and "Nothing is measured yet" in table_text.markdown(table)
-    assert comparisons.top_views_table([]).blocks == ()
+    assert paper_tables.top_views_table([]).blocks == ()
 
 
 def test_markdown_and_latex_mark_and_label():
-    table = comparisons.main_table(_RESULTS)
+    table = paper_tables.main_table(_RESULTS)
     text = table_text.markdown(table)
     line = next(line for line in text.splitlines() if line.startswith("| Oracle (path tree) |"))
     assert "| 2 | **33.50** ± 2.50 | **30.00** ± 0.00 | - | - | - |" in line
@@ -259,7 +250,7 @@ def test_markdown_and_latex_mark_and_label():
 
 
 def test_csv_and_json_have_every_number():
-    table = comparisons.main_table(_RESULTS)
+    table = paper_tables.main_table(_RESULTS)
     lines = list(csv.DictReader(io.StringIO(table_data.as_csv(table))))
     assert len(lines) == sum(len(block.rows) for block in table.blocks) * len(table.columns)
     (line,) = [
