@@ -13,52 +13,39 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from absl import flags
+from etils import epy
 
-from experiments.cli import (
-    commands,
-    options,
-    output_folders,
-    perceptual_option,
-    run_option,
-    scene_option,
-)
-from experiments.cli.late_imports import late
+from experiments.cli import app, outputs
+from experiments.cli import flags as cli_flags
+from experiments.cli import scenes as cli_scenes
+from experiments.cli.progress import ProgressBar
 
 if TYPE_CHECKING:
-    import numpy as np
     from jaxtyping import Float
+
+    from refref_jax.render import Model
+
+with epy.lazy_imports():
+    import numpy as np
 
     from experiments.figures import comparison as figures
     from experiments.r3f import provenance
+    from experiments.runs import perceptual as perceptual_metrics
     from refref_jax.data import files, scene_names
     from refref_jax.geometry import cameras
-    from refref_jax.render import Model, dyes, first_surface, saved, supersampling
+    from refref_jax.render import dyes, first_surface, saved, supersampling
     from refref_jax.training import evaluation as measures
     from refref_jax.training import run_folder
-else:
-    np = late("numpy")
-    figures = late("experiments.figures.comparison")
-    measures = late("refref_jax.training.evaluation")
-    supersampling = late("refref_jax.render.supersampling")
-    provenance = late("experiments.r3f.provenance")
-    cameras = late("refref_jax.geometry.cameras")
-    files = late("refref_jax.data.files")
-    scene_names = late("refref_jax.data.scene_names")
-    dyes = late("refref_jax.render.dyes")
-    first_surface = late("refref_jax.render.first_surface")
-    saved = late("refref_jax.render.saved")
-    run_folder = late("refref_jax.training.run_folder")
 
-_RUN = options.run()
-_SPLIT = options.split("Images to render.")
-_RAYS_PER_PIXEL = options.rays_per_pixel(1)
-_LIMIT = options.limit()
-_STEP = options.step()
-_SCENE = options.moved_scene()
-_CHUNK = options.chunk()
-_OVERWRITE = options.overwrite("an earlier evaluation of that split")
-flags.adopt_module_key_flags(perceptual_option)
+_RUN = cli_flags.run()
+_SPLIT = cli_flags.split("Images to render.")
+_RAYS_PER_PIXEL = cli_flags.rays_per_pixel(1)
+_LIMIT = cli_flags.limit()
+_STEP = cli_flags.step()
+_SCENE = cli_flags.scene("The scene, if it has moved", required=False)
+_CHUNK = cli_flags.chunk()
+_OVERWRITE = cli_flags.overwrite("an earlier evaluation of that split")
+_LPIPS_WEIGHTS = cli_flags.lpips_weights()
 
 _WRITES = ("rgb", "distance", "metrics.json", "comparison.png")
 
@@ -76,15 +63,15 @@ def main() -> None:
     run = Path(_RUN.value)
     out = run / "eval" / _SPLIT.value
     place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
-    output_folders.replaceable(out, **place)
-    run_option.check(run)
-    scene_option.check(_SCENE.value)
-    perceptual = perceptual_option.chosen()
+    outputs.replaceable(out, **place)
+    cli_flags.check_run(run)
+    cli_scenes.check(_SCENE.value)
+    perceptual = perceptual_metrics.chosen(_LPIPS_WEIGHTS.value)
     config = run_folder.read_config(run)
     # Resolved first, and once: training may be going on.
     step = _STEP.value if _STEP.value is not None else saved.latest_step(run)
     model = saved.load_model(run, step=step)
-    scene = scene_option.opened(_SCENE.value or config.scene.path)
+    scene = cli_scenes.opened(_SCENE.value or config.scene.path)
     truth = measures.read_truth(scene, _SPLIT.value)
     told = {
         "scene": scene_names.of_folder(scene),
@@ -92,10 +79,10 @@ def main() -> None:
         "step": step,
         "rays_per_pixel": _RAYS_PER_PIXEL.value,
     }
-    with output_folders.fresh(out, **place) as draft:
+    with outputs.fresh(out, **place) as draft:
         per_image, views = evaluate(model, truth, draft, perceptual)
         summary = told | _summary(per_image, model)
-        text = json.dumps(commands.string_safe(summary), indent=2, allow_nan=False)
+        text = json.dumps(app.string_safe(summary), indent=2, allow_nan=False)
         (draft / "metrics.json").write_text(text + "\n", encoding="utf-8")
         figures.write_comparison(draft / "comparison.png", views)
     for key, value in summary["results"].items():
@@ -107,7 +94,7 @@ def main() -> None:
         )
     print(f"Pictures: {out / 'comparison.png'}, {out / 'rgb'}, {out / 'distance'}")
     print(f"Metrics:  {out / 'metrics.json'}")
-    print(f"Next: {commands.shell('render', f'--run={run}', '--views=orbit')}")
+    print(f"Next: {app.shell('render', f'--run={run}', '--views=orbit')}")
 
 
 def _summary(per_image: list[dict[str, Any]], model: Model) -> dict[str, Any]:
@@ -146,9 +133,9 @@ def evaluate(
     shown = set(chosen[np.linspace(0, chosen.size - 1, _VIEWS_IN_COMPARISON).astype(int)])
     per_image, views = [], []
     seen_by, chunk = truth.frames.cameras, _CHUNK.value
-    side = options.side_of(_RAYS_PER_PIXEL.value)
+    side = cli_flags.side_of(_RAYS_PER_PIXEL.value)
     supersampling.warm_up(model, seen_by, chunk=chunk)
-    with commands.ProgressBar("evaluate", chosen.size) as bar:
+    with ProgressBar("evaluate", chosen.size) as bar:
         for i in chosen:
             name = truth.frames.names[i]
             start = time.monotonic()
@@ -177,4 +164,4 @@ def first_distances(
 
 
 if __name__ == "__main__":
-    commands.run(main, again="it evaluates anew; --overwrite replaces the results.")
+    app.run(main, again="it evaluates anew; --overwrite replaces the results.")

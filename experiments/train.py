@@ -9,39 +9,24 @@ scene's own meshes are never read.
 import contextlib
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import (
-    command_line,
-    commands,
-    device_options,
-    options,
-    reconstruction_options,
-    run_option,
-    scenes,
-)
-from experiments.cli.late_imports import late
+from experiments.cli import app
+from experiments.cli import flags as cli_flags
 from experiments.r3f import training_body
-from experiments.runs import plans
+from experiments.runs import plans, processes
 
-if TYPE_CHECKING:
+with epy.lazy_imports():
     from experiments.runs import trainer
     from refref_jax.training import devices, run_folder, run_lock
-else:
-    trainer = late("experiments.runs.trainer")
-    devices = late("refref_jax.training.devices")
-    run_folder = late("refref_jax.training.run_folder")
-    run_lock = late("refref_jax.training.run_lock")
 
-_OUT = options.out("Folder to write the run to.")
+_OUT = cli_flags.out("Folder to write the run to.")
 
-flags.adopt_module_key_flags(scenes)
 flags.adopt_module_key_flags(plans)
 flags.adopt_module_key_flags(training_body)
-flags.adopt_module_key_flags(device_options)
-flags.adopt_module_key_flags(reconstruction_options)
+_DEVICES = cli_flags.devices()
 _RESUME = flags.DEFINE_bool("resume", False, "Continue the run in --out, if there is one.")
 _LOG_EVERY = flags.DEFINE_integer("log_every", 50, "Steps between two lines of metrics.", 1)
 _CHECKPOINT_EVERY = flags.DEFINE_integer("checkpoint_every", 500, "Steps between checkpoints.", 1)
@@ -52,13 +37,13 @@ def main() -> None:
     """Plans a run, or finds the one to resume, and trains it."""
     run = Path(_OUT.value)
     check_options()
-    device_options.connect()
-    with device_options.first_speaks():
+    processes.connect(_DEVICES)
+    with processes.first_speaks():
         if not _begin(run):
-            print(f"Continue with {commands.shell('train', f'--out={run}', '--resume')}")
-            sys.exit(commands.INTERRUPTED)
+            print(f"Continue with {app.shell('train', f'--out={run}', '--resume')}")
+            sys.exit(app.INTERRUPTED)
         print(f"Run: {run}  (metrics.jsonl, checkpoints/)")
-        print(f"Next: {commands.shell('evaluate', f'--run={run}', '--split=test')}")
+        print(f"Next: {app.shell('evaluate', f'--run={run}', '--split=test')}")
 
 
 def check_options() -> None:
@@ -67,7 +52,7 @@ def check_options() -> None:
     Raises:
       ValueError: if there is any.
     """
-    if device_options.together() and training_body.reconstructs():
+    if processes.together(_DEVICES) and training_body.reconstructs():
         raise ValueError(
             "Several processes do not reconstruct together. Run experiments.reconstruct on one "
             "machine first, and give its folder as --reconstruction."
@@ -78,7 +63,7 @@ def check_options() -> None:
 
 def _begin(run: Path) -> bool:
     """Begins a run, or goes on with it; returns whether it has reached its last step."""
-    mesh = device_options.mesh()
+    mesh = processes.mesh(_DEVICES)
     resuming = _RESUME.value and run_folder.exists(run)
     if not resuming:
         _open(run)
@@ -108,14 +93,6 @@ def _open(run: Path) -> None:
     devices.wait_for_all("the folder is there")
 
 
-def _settled() -> command_line.Settled | None:
-    """Returns the options of the run that is resumed, unless all are given and compared."""
-    run = Path(_OUT.value)
-    if not _RESUME.value or plans.SCENE.value is not None or not (run / run_option.RUN).is_file():
-        return None
-    return command_line.Settled(_settled_names(), f"{run_option.RUN} and model.json in {run}")
-
-
 def _settled_names() -> list[str]:
     return [holder.name for holder in (*plans.SETTLED, *training_body.SETTLED)]
 
@@ -130,13 +107,7 @@ def _refuse_options(run: Path) -> None:
 
 
 if __name__ == "__main__":
-    commands.run(
+    app.run(
         main,
-        first=(
-            *("scene", "preset", "steps", "paths", "cut", "bends", "interior", "ior", "rule"),
-            *("background", "radius", "samples", "entries", "batch", "method", "reconstruction"),
-            *("resume", "seed", "devices"),
-        ),
         again="a run is never replaced; the same command with --resume goes on with it.",
-        settled=_settled,
     )

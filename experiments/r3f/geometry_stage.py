@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.cli import commands
+from experiments.cli.progress import ProgressBar
 from experiments.r3f import doubts
 from experiments.r3f.records import GeometryFacts, ReconstructionConfig
 from refref_jax import drafts
@@ -34,7 +34,7 @@ def _hull(views: Views, names: Sequence[str], config: ReconstructionConfig) -> G
 def _occupancy(views: Views, names: Sequence[str], config: ReconstructionConfig) -> Grid:
     del names
     settings = OccupancyTrainingConfig()
-    with commands.ProgressBar("occupancy", settings.steps) as bar:
+    with ProgressBar("occupancy", settings.steps) as bar:
         return occupancy.fit(
             *views,
             config=settings,

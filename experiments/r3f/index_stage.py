@@ -10,7 +10,7 @@ wrong index can have spoilt it. Where the body fills all images there is none: g
 import dataclasses
 from pathlib import Path
 
-from experiments.cli import commands
+from experiments.cli.progress import ProgressBar
 from experiments.figures import style as plotting
 from experiments.figures.style import COLOURS, pyplot
 from experiments.r3f import body_pixels
@@ -78,7 +78,7 @@ def run(
     model = learn_background(scene, folder, seed=seed, space=space, radius=radius, steps=steps)
     evidence, views = body_pixels.look(scene, "train", model, seed=seed, rays=rays)
     search = IndexSearch()
-    with commands.ProgressBar("index", most_looks(search, start=start)) as bar:
+    with ProgressBar("index", most_looks(search, start=start)) as bar:
         found = estimate_index(
             evidence,
             body_pixels.body_geometry(mesh, _BEFORE),

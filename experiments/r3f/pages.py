@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from experiments.cli import commands
+from experiments.cli import app
 from experiments.r3f import body
 from experiments.r3f.records import IndexFacts, Reconstruction, ReportFacts
 
@@ -37,7 +37,7 @@ def markdown(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
         *_pictures_of_index(out),
         "## How it was made\n\n" + _making(found),
         "## Go on\n\n```bash\n"
-        + commands.shell("train", "--scene=SCENE", "--reconstruction=OUT", "--out=RUN")
+        + app.shell("train", "--scene=SCENE", "--reconstruction=OUT", "--out=RUN")
         + "\n```\n\nwith SCENE the scene's folder and OUT this one.",
     ]
     return "\n\n".join(parts) + "\n"

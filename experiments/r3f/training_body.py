@@ -6,18 +6,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import reconstruction_options, scenes
-from experiments.cli.late_imports import late
-from experiments.runs import plans
+from experiments.cli import flags as cli_flags
+from experiments.runs import plans, refraction_indices
 
 if TYPE_CHECKING:
-    from experiments.r3f import chain, provenance, records
     from refref_jax.data.meshes import MeshPart
-else:
-    chain = late("experiments.r3f.chain")
-    provenance = late("experiments.r3f.provenance")
-    records = late("experiments.r3f.records")
+
+with epy.lazy_imports():
+    from experiments.r3f import chain, provenance, records
 
 METHOD = flags.DEFINE_enum(
     "method",
@@ -32,14 +30,12 @@ RECONSTRUCTION = flags.DEFINE_string(
     None,
     "Folder that experiments.reconstruct wrote: train with its body instead of the scene's meshes.",
 )
+_RECONSTRUCTED = cli_flags.reconstruction()
 
 SETTLED = (
     METHOD,
     RECONSTRUCTION,
-    reconstruction_options.GEOMETRY,
-    reconstruction_options.RESOLUTION,
-    reconstruction_options.OUTLIERS,
-    reconstruction_options.LIGHT_STEPS,
+    *_RECONSTRUCTED,
 )
 """Options that a run is begun with, and can not change when it is resumed."""
 
@@ -84,7 +80,7 @@ def find(run: Path, *, resume: bool) -> MeshPart | None:
         raise ValueError(
             f"{out} holds a reconstruction already. Continue with --resume, or give another --out."
         )
-    config = reconstruction_options.chosen(index=index, seed=plans.SEED.value)
+    config = _RECONSTRUCTED.chosen(index=index, seed=plans.SEED.value, space=plans.SPACE)
     try:
         chain.reconstruct(plans.opened_scene(), out, config, compare=False)
     except KeyboardInterrupt:
@@ -105,7 +101,7 @@ def _folder(run: Path) -> Path:
 
 def _given_index() -> float | None:
     """Returns the index of `--ior=NUMBER`, if it is given."""
-    words = scenes.IOR.value
+    words = plans.IOR.value
     if not words:
         return None
     if len(words) > 1 or "=" in words[0]:
@@ -113,7 +109,7 @@ def _given_index() -> float | None:
             f"--ior={words[-1]}, but there is one reconstructed body, without a name. Give its "
             "index alone, once, as in --ior=1.5."
         )
-    return reconstruction_options.parse_index(words[0])
+    return refraction_indices.parse(words[0])
 
 
 def check_options() -> None:
@@ -123,7 +119,7 @@ def check_options() -> None:
       ValueError: if there are any, or an index is none.
     """
     if METHOD.value == "oracle" and RECONSTRUCTION.value is None:
-        scenes.given_indices()
+        refraction_indices.parse_named(plans.IOR.value)
     else:
         _given_index()
     if METHOD.value == "oracle" and RECONSTRUCTION.value is not None and METHOD.present:

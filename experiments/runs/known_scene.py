@@ -9,8 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from experiments.cli import view_numbers
-from experiments.runs import mesh_report
+from experiments.runs import mesh_report, view_numbers
 from refref_jax import metrics
 from refref_jax.data import background, containment, local_layout, meshes, scene_names
 from refref_jax.data.containment import Containment

@@ -9,16 +9,16 @@ import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from experiments.cli.late_imports import late
+from etils import epy
 
 if TYPE_CHECKING:
-    from refref_jax.fields import networks
     from refref_jax.fields.hash_grid import HashGridConfig
     from refref_jax.fields.kinds import RadianceConfig
     from refref_jax.fields.precision import Precision
     from refref_jax.render.config import Footprint, ModelConfig
-else:
-    networks = late("refref_jax.fields.networks")
+
+with epy.lazy_imports():
+    from refref_jax.fields import networks
 
 # Points of the cone patterns, see `sampling.cones`.
 _PATTERNS = (1, 6)

@@ -6,33 +6,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import (
-    budget_options,
-    choosable,
-    command_line,
-    options,
-    scene_option,
-    scenes,
-    space_options,
-)
-from experiments.cli.late_imports import late
-from experiments.runs import model_options
+from experiments.cli import app
+from experiments.cli import flags as cli_flags
+from experiments.cli import scenes as cli_scenes
+from experiments.runs import model_options, refraction_indices
 from refref_jax.optics.budgets import BUDGETS
 
 if TYPE_CHECKING:
-    from experiments.runs import choices, planning
     from refref_jax.data.meshes import MeshPart
-else:
-    choices = late("experiments.runs.choices")
-    planning = late("experiments.runs.planning")
 
-SCENE = flags.DEFINE_string("scene", None, f"The scene to train on: {options.SCENE_FORMS}.")
-_PRESET = options.preset("Size of the model and its training.")
+with epy.lazy_imports():
+    from experiments.runs import choices, planning
+
+SCENE = cli_flags.scene("The scene to train on", required=False)
+_PRESET = cli_flags.preset("Size of the model and its training.")
 _FIELD = flags.DEFINE_enum(
     "field",
-    choosable.FIELDS[0],
-    choosable.FIELDS,
+    cli_flags.FIELDS[0],
+    cli_flags.FIELDS,
     "Kind of the fields that are learned: Zip-NeRF's, or without its anti-aliasing Nerfacto's.",
 )
 PATHS = flags.DEFINE_enum(
@@ -44,7 +37,7 @@ PATHS = flags.DEFINE_enum(
     "follows every branch that carries light. By default 'tree' if there are meshes, else "
     "'straight'.",
 )
-flags.adopt_module_key_flags(budget_options)
+BUDGET = cli_flags.budget()
 _REENTRY = flags.DEFINE_enum(
     "reentry",
     "auto",
@@ -106,27 +99,27 @@ _DISTORTION = flags.DEFINE_enum(
     "Samples that the distortion loss draws together: those outside the objects (the paper's "
     "correction), or all, as before it.",
 )
-flags.adopt_module_key_flags(scenes)
-flags.adopt_module_key_flags(space_options)
+_RULE = cli_flags.rule()
+IOR = cli_flags.ior()
+SPACE = cli_flags.space()
 _STEPS = flags.DEFINE_integer("steps", None, "Training steps; the preset's if not given.", 1)
 _BATCH = flags.DEFINE_integer("batch", None, "Rays a step; the preset's if not given.", 1)
-SEED = options.seed()
+SEED = cli_flags.seed()
 
 
 def _parse_samples(words: list[str] | None) -> tuple[int, ...] | None:
     return None if words is None else model_options.parse_samples(words)
 
 
-command_line.check(_SAMPLES, _parse_samples)
-command_line.check(_MULTISAMPLES, model_options.check_multisamples)
-command_line.check(_ENTRIES, model_options.check_entries)
+app.check(_SAMPLES, _parse_samples)
+app.check(_MULTISAMPLES, model_options.check_multisamples)
+app.check(_ENTRIES, model_options.check_entries)
 
 SETTLED = (
     _PRESET,
     _FIELD,
     PATHS,
-    budget_options.CUT,
-    budget_options.BENDS,
+    *BUDGET,
     _REENTRY,
     _INTERIOR,
     _TINTS,
@@ -137,10 +130,9 @@ SETTLED = (
     _FINEST,
     _PRECISION,
     _DISTORTION,
-    scenes.RULE,
-    scenes.IOR,
-    space_options.BACKGROUND,
-    space_options.RADIUS,
+    _RULE,
+    IOR,
+    *SPACE,
     _STEPS,
     _BATCH,
     SEED,
@@ -156,7 +148,7 @@ def opened_scene() -> Path:
     """
     if SCENE.value is None:
         raise ValueError("No scene is given. Add --scene=FOLDER.")
-    return scene_option.opened(SCENE.value).resolve()
+    return cli_scenes.opened(SCENE.value).resolve()
 
 
 def plan_from_flags(*, body: MeshPart | None = None) -> planning.Plan:
@@ -171,10 +163,12 @@ def plan_from_flags(*, body: MeshPart | None = None) -> planning.Plan:
         field=_FIELD.value,
         wishes=_wishes(),
         options=_options(),
-        rule=scenes.RULE.value,
-        indices=scenes.given_indices() if body is None else {body.name: body.index},
-        space=space_options.chosen_space(),
-        radius=space_options.RADIUS.value,
+        rule=_RULE.value,
+        indices=refraction_indices.parse_named(IOR.value)
+        if body is None
+        else {body.name: body.index},
+        space=SPACE.chosen(),
+        radius=SPACE.radius.value,
         steps=_STEPS.value,
         batch=_BATCH.value,
         seed=SEED.value,
@@ -194,8 +188,8 @@ def check_options(*, resume: bool) -> None:
       ValueError: if one makes no sense, or there is no scene.
     """
     if PATHS.value is not None:
-        budget_options.chosen(PATHS.value)
-    scene_option.check(SCENE.value)
+        BUDGET.chosen(PATHS.value)
+    cli_scenes.check(SCENE.value)
     if SCENE.value is None and not resume:
         raise ValueError("No scene is given. Add --scene=FOLDER, or --resume to go on with a run.")
 
@@ -203,7 +197,7 @@ def check_options(*, resume: bool) -> None:
 def _wishes() -> choices.Wishes:
     asked = {"reentry": _REENTRY.value, "interior": _INTERIOR.value, "tints": _TINTS.value}
     decided = {name: None if value == "auto" else value for name, value in asked.items()}
-    followed = {"cut": budget_options.CUT.value, "bends": budget_options.BENDS.value}
+    followed = {"cut": BUDGET.cut.value, "bends": BUDGET.bends.value}
     return choices.Wishes(paths=PATHS.value, **followed, **decided)
 
 
@@ -216,3 +210,8 @@ def _options() -> model_options.ModelOptions:
         precision=_PRECISION.value,
         footprint=_FOOTPRINT.value,
     )
+
+
+def _indices(body: MeshPart | None) -> dict[str, float]:
+    given = refraction_indices.parse_named
+    return given(IOR.value) if body is None else {body.name: body.index}

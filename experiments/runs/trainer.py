@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 import jax
 from jax.sharding import Mesh
 
-from experiments.cli import commands, scene_option
+from experiments.cli import app
+from experiments.cli import scenes as cli_scenes
+from experiments.cli.progress import ProgressBar
 from refref_jax.data import local_layout, mask_margins
 from refref_jax.data.batches import PixelSampler
 from refref_jax.render import saved
@@ -61,11 +63,11 @@ def train(
     """
     config, model = run_folder.read_config(run), saved.read_static(run)
     # From here on, for Python loses a Ctrl-C that meets JAX while it collects garbage.
-    with Checkpoints(run, keep=periods.keep) as checkpoints, commands.Interrupt() as interrupt:
+    with Checkpoints(run, keep=periods.keep) as checkpoints, app.Interrupt() as interrupt:
         if checkpoints.newest() == config.schedule.steps:
             print(f"{run} is trained already: {config.schedule.steps} steps.")
             return True
-        sampler = _sampler(config, scene_option.opened(scene or config.scene.path))
+        sampler = _sampler(config, cli_scenes.opened(scene or config.scene.path))
         geometry = saved.load_geometry(run)
         setup = loop.set_up(config, model.config, model.budget, geometry, sampler, mesh=mesh)
         if setup.hit_fraction == 0.0 and model.budget.bends > 0:
@@ -98,14 +100,14 @@ def _train(
     state: TrainState,
     checkpoints: Checkpoints,
     periods: Periods,
-    interrupt: commands.Interrupt,
+    interrupt: app.Interrupt,
 ) -> bool:
     total, step = setup.config.schedule.steps, int(state.step)
     writes = devices.is_first()
     earlier = run_folder.rewind_metrics(run, step) if writes else 0.0
     start = last = time.monotonic()
     logged = step
-    with commands.ProgressBar("train", total, step) as bar:
+    with ProgressBar("train", total, step) as bar:
         every = (_MOST_STEPS, periods.log, periods.checkpoint)
         for stepped, report in loop.run_steps(setup, state, total, every=every):
             step = int(stepped.step)
@@ -145,4 +147,4 @@ def _line(step: int, report: StepReport, rate: float, seconds: float) -> dict[st
     if (memory := jax.local_devices()[0].memory_stats()) is not None:
         line["peak_device_bytes"] = memory["peak_bytes_in_use"]
     # The PSNR of a batch that is met exactly is infinite.
-    return commands.string_safe(line)
+    return app.string_safe(line)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from experiments.cli import perceptual_option
+from experiments.runs import perceptual
 from refref_jax import metrics
 from refref_jax.data import local_layout
 from refref_jax.data.local_layout import Frames
@@ -163,21 +163,13 @@ def test_eyes_are_asked_where_they_are_at_hand(tmp_path):
 
 
 def test_what_is_not_at_hand_is_warned_of_once(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(perceptual_option, "LPIPS_WEIGHTS", _Flag(None))
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
-    assert perceptual_option.chosen() == Perceptual(None, None)
+    assert perceptual.chosen(None) == Perceptual(None, None)
     first, second = capsys.readouterr().out.splitlines()
     assert first.startswith("warning: LPIPS") and "docs/metrics.md" in first
     assert second.startswith("warning: FLIP") and "pip install -e '.[flip]'" in second
-    monkeypatch.setattr(perceptual_option, "LPIPS_WEIGHTS", _Flag(str(tmp_path / "none.npz")))
     with pytest.raises(ValueError, match=r"none\.npz can not be read"):
-        perceptual_option.chosen()
+        perceptual.chosen(str(tmp_path / "none.npz"))
     weights = made_lpips.write(tmp_path / "weights.npz")
-    monkeypatch.setattr(perceptual_option, "LPIPS_WEIGHTS", _Flag(str(weights)))
-    assert perceptual_option.chosen().lpips is not None
+    assert perceptual.chosen(str(weights)).lpips is not None
     assert "LPIPS" not in capsys.readouterr().out
-
-
-class _Flag:
-    def __init__(self, value):
-        self.value = value

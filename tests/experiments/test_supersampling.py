@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.cli import options
+from experiments.cli import flags as cli_flags
 from refref_jax.geometry import cameras
 from refref_jax.optics.budgets import STRAIGHT
 from refref_jax.render import Model, Rendering, init_params, render_image, supersampling
@@ -22,7 +22,7 @@ def model():
 
 @pytest.mark.parametrize(("rays", "side"), [(1, 1), (4, 2), (9, 3), (16, 4), (49, 7)])
 def test_rays_make_a_square_grid(rays, side):
-    assert options.side_of(rays) == side
+    assert cli_flags.side_of(rays) == side
 
 
 @pytest.mark.parametrize(
@@ -30,7 +30,7 @@ def test_rays_make_a_square_grid(rays, side):
 )
 def test_rays_that_do_not_are_told_the_nearest_squares(rays, nearest):
     with pytest.raises(ValueError, match=nearest):
-        options.side_of(rays)
+        cli_flags.side_of(rays)
 
 
 def _fine(linear, distance):
