@@ -22,13 +22,14 @@ from refref_jax.training import run_folder
 def _begin(options):
     for name in flags.FLAGS:
         flags.FLAGS[name].unparse()
-    flags.FLAGS(["train", *options])
-    run, printed = Path(flags.FLAGS.out), io.StringIO()
+    printed = io.StringIO()
     try:
+        flags.FLAGS(["train", *options])
+        run = Path(flags.FLAGS.out)
         with contextlib.redirect_stdout(printed):
             train.check_options()
             train._begin(run)
-    except ValueError as error:
+    except (ValueError, flags.Error) as error:
         return {"error": str(error)}
     geometry = saved.load_geometry(run)
     body = provenance.read(run)
