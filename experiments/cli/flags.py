@@ -257,7 +257,7 @@ def reconstruction() -> ReconstructionFlags:
 
 # ---- Devices and processes ----
 class DeviceFlags(NamedTuple):
-    """Flags that say which devices, and which processes, train together.; see `runs.processes`."""
+    """Flags that say which devices, and which processes, train together; see `runs.processes`."""
 
     devices: flags.FlagHolder[str]
     coordinator: flags.FlagHolder[str | None]
