@@ -22,7 +22,7 @@ import numpy as np
 from absl import app, flags, logging
 
 from experiments.runs import measured_runs as trained_runs
-from experiments.runs.named_budgets import BUDGETS
+from refref_jax.optics.budgets import BUDGETS
 from refref_jax.render.saved import load_model
 from refref_jax.training import run_folder
 from refref_jax.training.presets import PRESETS

@@ -23,30 +23,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from absl import flags
+from etils import epy
 
 from experiments.benchmarking import methods
 from experiments.benchmarking.methods import Method
-from experiments.cli import command_line, commands, options, perceptual_option, scene_option
-from experiments.cli.late_imports import late
-from experiments.cli.perceptual_option import LPIPS_WEIGHTS
+from experiments.cli import app
+from experiments.cli import flags as cli_flags
+from experiments.cli import scenes as cli_scenes
 from refref_jax import atomic_files
 
 if TYPE_CHECKING:
-    from experiments.benchmarking import engines, jobs, scene_list, settings, summary, working
     from experiments.benchmarking.jobs import Job, Skipped
-    from experiments.benchmarking.report import page, sheet
     from experiments.benchmarking.settings import Settings
+
+with epy.lazy_imports():
+    from experiments.benchmarking import engines, jobs, scene_list, settings, summary, working
+    from experiments.benchmarking.report import page, sheet
+    from experiments.runs import perceptual
     from refref_jax.training import presets
-else:
-    presets = late("refref_jax.training.presets")
-    engines = late("experiments.benchmarking.engines")
-    jobs = late("experiments.benchmarking.jobs")
-    scene_list = late("experiments.benchmarking.scene_list")
-    settings = late("experiments.benchmarking.settings")
-    summary = late("experiments.benchmarking.summary")
-    working = late("experiments.benchmarking.working")
-    page = late("experiments.benchmarking.report.page")
-    sheet = late("experiments.benchmarking.report.sheet")
 
 _SCENES = flags.DEFINE_list(
     "scenes",
@@ -59,15 +53,15 @@ _METHODS = flags.DEFINE_list(
     ["straight", "oracle", "tree"],
     f"Methods: {', '.join(methods.METHODS)}; main, ablations and all stand for many.",
 )
-command_line.check(_METHODS, methods.parse)
-_OUT = options.out("Folder of the benchmark.")
-_PRESET = options.preset("Preset of all trainings.")
+app.check(_METHODS, methods.parse)
+_OUT = cli_flags.out("Folder of the benchmark.")
+_PRESET = cli_flags.preset("Preset of all trainings.")
 _STEPS = flags.DEFINE_integer(
     "steps", None, "Steps of each training; the preset's if not given.", 1
 )
-_LIMIT = options.limit()
-_RAYS_PER_PIXEL = options.rays_per_pixel(4)
-_SEED = options.seed()
+_LIMIT = cli_flags.limit()
+_RAYS_PER_PIXEL = cli_flags.rays_per_pixel(4)
+_SEED = cli_flags.seed()
 _JOBS = flags.DEFINE_integer("jobs", 1, "Jobs at once on this machine.", 1)
 _RAY = flags.DEFINE_string(
     "ray", None, "Address of a Ray cluster that does the jobs, or 'local' to start one here."
@@ -91,11 +85,11 @@ _REPORT_EDGE = flags.DEFINE_integer(
     "Longest edge of the report's pictures in pixels; larger ones are reduced.",
     16,
 )
-flags.adopt_module_key_flags(perceptual_option)
+_LPIPS_WEIGHTS = cli_flags.lpips_weights()
 
 # What decides results, and who does the jobs.
 _OF_JOBS = (
-    *(_PRESET, _STEPS, _LIMIT, _RAYS_PER_PIXEL, _SEED, LPIPS_WEIGHTS),
+    *(_PRESET, _STEPS, _LIMIT, _RAYS_PER_PIXEL, _SEED, _LPIPS_WEIGHTS),
     *(_JOBS, _RAY, _JOB_CPUS, _JOB_GPUS),
 )
 
@@ -109,9 +103,9 @@ def main() -> None:
         _make_tables(out)
         return
     _check_engine()
-    scene_option.check_all(_SCENES.value)
+    cli_scenes.check_all(_SCENES.value)
     scenes, chosen = scene_list.find(_SCENES.value), methods.parse(_METHODS.value)
-    weights = perceptual_option.checked()
+    weights = perceptual.checked(_LPIPS_WEIGHTS.value)
     common = _settings(weights)
     benchmark = settings.extended(out, settings.asked(common, scenes, chosen))
     file = None if weights is None else str(weights.absolute())
@@ -120,7 +114,7 @@ def main() -> None:
         _list(out, planned, skipped)
         return
     # A benchmark that is killed takes the commands that it waits for with it.
-    commands.stop_at_kill()
+    app.stop_at_kill()
     out.mkdir(parents=True, exist_ok=True)
     with atomic_files.hold(out):
         # Another process may have added to it meanwhile.
@@ -216,8 +210,8 @@ def _next(out: Path, done: Sequence[Method]) -> str:
     deciding = (*_OF_JOBS, _REPORT_VIEWS, _REPORT_EDGE)
     given = [each.serialize() for each in deciding if each.value != each.default]
     scenes = f"--scenes={','.join(_SCENES.value)}"
-    return commands.shell("benchmark", scenes, "--methods=ablations", f"--out={out}", *given)
+    return app.shell("benchmark", scenes, "--methods=ablations", f"--out={out}", *given)
 
 
 if __name__ == "__main__":
-    commands.run(main, again="it goes on; jobs that are done are not done again.")
+    app.run(main, again="it goes on; jobs that are done are not done again.")

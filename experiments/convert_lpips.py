@@ -12,20 +12,17 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import command_line, commands, options, output_folders
-from experiments.cli.late_imports import late
+from experiments.cli import app, outputs
+from experiments.cli import flags as cli_flags
 
-if TYPE_CHECKING:
+with epy.lazy_imports():
     import numpy as np
 
     from refref_jax.metrics import lpips_weights
-else:
-    np = late("numpy")
-    lpips_weights = late("refref_jax.metrics.lpips_weights")
 
 _ALEXNET = flags.DEFINE_string(
     "alexnet", None, "State dict of torchvision's AlexNet, .pth or .npz.", required=True
@@ -33,21 +30,21 @@ _ALEXNET = flags.DEFINE_string(
 _LPIPS = flags.DEFINE_string(
     "lpips", None, "State dict of LPIPS with AlexNet, version 0.1, .pth or .npz.", required=True
 )
-_OUT = options.out("The .npz to write.")
-_OVERWRITE = options.overwrite("the file if it exists")
+_OUT = cli_flags.out("The .npz to write.")
+_OVERWRITE = cli_flags.overwrite("the file if it exists")
 
 
 def main() -> None:
     """Converts the weights."""
     out = Path(_OUT.value)
-    output_folders.check_file(out, overwrite=_OVERWRITE.value)
+    outputs.check_file(out, overwrite=_OVERWRITE.value)
     arrays = {}
     for path, shapes in (
         (Path(_ALEXNET.value), lpips_weights.ALEXNET_SHAPES),
         (Path(_LPIPS.value), lpips_weights.LINEAR_SHAPES),
     ):
         arrays |= lpips_weights.choose(read_state_dict(path), shapes, source=str(path))
-    with output_folders.fresh_file(out, overwrite=_OVERWRITE.value) as draft:
+    with outputs.fresh_file(out, overwrite=_OVERWRITE.value) as draft:
         _write(draft, arrays)
     print(f"Weights: {out}")
     print("Next: give it as --lpips_weights to experiments.evaluate or experiments.metrics.")
@@ -110,8 +107,8 @@ def _refuse_other_files(out: str | None) -> None:
         raise ValueError(f"--out={out} does not end in .npz. Give a name that does.")
 
 
-command_line.check(_OUT, _refuse_other_files)
+app.check(_OUT, _refuse_other_files)
 
 
 if __name__ == "__main__":
-    commands.run(main, again="it converts anew; --overwrite replaces the file.")
+    app.run(main, again="it converts anew; --overwrite replaces the file.")

@@ -11,14 +11,16 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import command_line, commands, options, scene_option
-from experiments.cli.late_imports import late
+from experiments.cli import app
+from experiments.cli import flags as cli_flags
+from experiments.cli import scenes as cli_scenes
+from experiments.cli.progress import ProgressBar
 
-if TYPE_CHECKING:
+with epy.lazy_imports():
     import numpy as np
 
     from refref_jax.data.nerfstudio import capture as nerfstudio
@@ -26,16 +28,9 @@ if TYPE_CHECKING:
     from refref_jax.data.nerfstudio import importing as from_nerfstudio
     from refref_jax.data.nerfstudio import placement
     from refref_jax.reconstruct import visual_hull
-else:
-    np = late("numpy")
-    from_nerfstudio = late("refref_jax.data.nerfstudio.importing")
-    to_nerfstudio = late("refref_jax.data.nerfstudio.exporting")
-    nerfstudio = late("refref_jax.data.nerfstudio.capture")
-    placement = late("refref_jax.data.nerfstudio.placement")
-    visual_hull = late("refref_jax.reconstruct.visual_hull")
 
 _SOURCE = flags.DEFINE_string("source", None, "What to convert: a folder.", required=True)
-_OUT = options.out("Folder to write; must not exist.")
+_OUT = cli_flags.out("Folder to write; must not exist.")
 _TO = flags.DEFINE_enum("to", "scene", ["scene", "nerfstudio"], "What to write.")
 _MASKS = flags.DEFINE_enum(
     "masks",
@@ -63,7 +58,7 @@ _SCALE = flags.DEFINE_string(
 
 def main() -> None:
     """Converts one folder."""
-    scene_option.check_place(_SOURCE.value)
+    cli_scenes.check_place(_SOURCE.value)
     if _TO.value == "scene":
         _make_scene(Path(_SOURCE.value), Path(_OUT.value))
     else:
@@ -81,7 +76,7 @@ def _make_scene(source: Path, out: Path) -> None:
         for split, numbers in splits.items()
     }
     total = sum(map(len, views.values()))
-    with commands.ProgressBar("convert", total) as bar:
+    with ProgressBar("convert", total) as bar:
         steps = iter(range(1, total + 1))
         written = from_nerfstudio.write_scene(
             views, out, _MASKS.value, step=lambda: bar.show(next(steps), "images")
@@ -93,13 +88,13 @@ def _make_scene(source: Path, out: Path) -> None:
     print(f"Scene:   {out}")
     masked = next(iter(written.values())).masked is not None
     run = ("reconstruct" if masked else "train", f"--scene={out}")
-    print(f"Next: {commands.shell(*run, '--background=unbounded', f'--out={out}_run')}")
+    print(f"Next: {app.shell(*run, '--background=unbounded', f'--out={out}_run')}")
 
 
 def _make_capture(source: Path, out: Path) -> None:
     splits = to_nerfstudio.read_splits(source)
     total = sum(len(frames.names) for frames in splits.values())
-    with commands.ProgressBar("convert", total) as bar:
+    with ProgressBar("convert", total) as bar:
         steps = iter(range(1, total + 1))
         to_nerfstudio.write_capture(
             splits, out, _MASKS.value, step=lambda: bar.show(next(steps), "images")
@@ -197,9 +192,9 @@ def _tell_placement(poses: np.ndarray, where: placement.Placement) -> None:
         )
 
 
-command_line.check(_CENTRE, read_centre)
-command_line.check(_SCALE, read_scale)
+app.check(_CENTRE, read_centre)
+app.check(_SCALE, read_scale)
 
 
 if __name__ == "__main__":
-    commands.run(main, again="it is refused, for a converted folder is never replaced.")
+    app.run(main, again="it is refused, for a converted folder is never replaced.")

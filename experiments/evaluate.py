@@ -13,44 +13,34 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from absl import flags
+from etils import epy
 
-from experiments.cli import (
-    commands,
-    options,
-    output_folders,
-    perceptual_option,
-    run_option,
-    scene_option,
-)
-from experiments.cli.late_imports import late
+from experiments.cli import app, outputs
+from experiments.cli import flags as cli_flags
+from experiments.cli import scenes as cli_scenes
+from experiments.cli.progress import ProgressBar
 
 if TYPE_CHECKING:
+    from refref_jax.render import Model
+
+with epy.lazy_imports():
     from experiments.figures import comparison as figures
     from experiments.r3f import object_source
     from experiments.runs import evaluation as reporting
+    from experiments.runs import perceptual as perceptual_metrics
     from refref_jax.data import files, scene_names
-    from refref_jax.render import Model, saved
+    from refref_jax.render import saved
     from refref_jax.training import evaluation, run_folder
-else:
-    figures = late("experiments.figures.comparison")
-    evaluation = late("refref_jax.training.evaluation")
-    object_source = late("experiments.r3f.object_source")
-    reporting = late("experiments.runs.evaluation")
-    files = late("refref_jax.data.files")
-    scene_names = late("refref_jax.data.scene_names")
-    saved = late("refref_jax.render.saved")
-    run_folder = late("refref_jax.training.run_folder")
 
-_RUN = options.run()
-_SPLIT = options.split("Images to render.")
-_RAYS_PER_PIXEL = options.rays_per_pixel(1)
-_LIMIT = options.limit()
-_STEP = options.step()
-_SCENE = options.moved_scene()
-_CHUNK = options.chunk()
-_OVERWRITE = options.overwrite("an earlier evaluation of that split")
-flags.adopt_module_key_flags(perceptual_option)
+_RUN = cli_flags.run()
+_SPLIT = cli_flags.split("Images to render.")
+_RAYS_PER_PIXEL = cli_flags.rays_per_pixel(1)
+_LIMIT = cli_flags.limit()
+_STEP = cli_flags.step()
+_SCENE = cli_flags.scene("The scene, if it has moved", required=False)
+_CHUNK = cli_flags.chunk()
+_OVERWRITE = cli_flags.overwrite("an earlier evaluation of that split")
+_LPIPS_WEIGHTS = cli_flags.lpips_weights()
 
 _WRITES = ("rgb", "distance", "metrics.json", "comparison.png")
 
@@ -63,25 +53,25 @@ def main() -> None:
     run = Path(_RUN.value)
     out = run / "eval" / _SPLIT.value
     place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
-    output_folders.replaceable(out, **place)
-    run_option.check(run)
-    scene_option.check(_SCENE.value)
-    perceptual = perceptual_option.chosen()
+    outputs.replaceable(out, **place)
+    cli_flags.check_run(run)
+    cli_scenes.check(_SCENE.value)
+    perceptual = perceptual_metrics.chosen(_LPIPS_WEIGHTS.value)
     config = run_folder.read_config(run)
     # Resolved first, and once: training may be going on.
     step = _STEP.value if _STEP.value is not None else saved.latest_step(run)
     model = saved.load_model(run, step=step)
-    scene = scene_option.opened(_SCENE.value or config.scene.path)
+    scene = cli_scenes.opened(_SCENE.value or config.scene.path)
     told = {
         "scene": scene_names.of_folder(scene),
         "method": _method(run, config.paths.name),
         "step": step,
         "rays_per_pixel": _RAYS_PER_PIXEL.value,
     }
-    with output_folders.fresh(out, **place) as draft:
+    with outputs.fresh(out, **place) as draft:
         found, views = evaluate(model, scene, draft, perceptual)
         summary = told | found._asdict()
-        text = json.dumps(commands.string_safe(summary), indent=2, allow_nan=False)
+        text = json.dumps(app.string_safe(summary), indent=2, allow_nan=False)
         (draft / "metrics.json").write_text(text + "\n", encoding="utf-8")
         figures.write_comparison(draft / "comparison.png", views)
     for key, value in summary["results"].items():
@@ -91,7 +81,7 @@ def main() -> None:
     )
     print(f"Pictures: {out / 'comparison.png'}, {out / 'rgb'}, {out / 'distance'}")
     print(f"Metrics:  {out / 'metrics.json'}")
-    print(f"Next: {commands.shell('render', f'--run={run}', '--views=orbit')}")
+    print(f"Next: {app.shell('render', f'--run={run}', '--views=orbit')}")
 
 
 def _method(run: Path, paths: str) -> str:
@@ -107,7 +97,7 @@ def evaluate(
     for folder in ("rgb", "distance"):
         (out / folder).mkdir()
     views: list[figures.Comparison] = []
-    bars: list[commands.ProgressBar] = []
+    bars: list[ProgressBar] = []
 
     def write(view: evaluation.EvaluatedView) -> None:
         seen = view.rendering
@@ -121,7 +111,7 @@ def evaluate(
 
         def progress(done: int, total: int, text: str) -> None:
             if not bars:
-                bars.append(stack.enter_context(commands.ProgressBar("evaluate", total)))
+                bars.append(stack.enter_context(ProgressBar("evaluate", total)))
             bars[0].show(done, text)
 
         found = evaluation.evaluate(
@@ -139,4 +129,4 @@ def evaluate(
 
 
 if __name__ == "__main__":
-    commands.run(main, again="it evaluates anew; --overwrite replaces the results.")
+    app.run(main, again="it evaluates anew; --overwrite replaces the results.")

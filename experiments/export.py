@@ -18,30 +18,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import command_line, commands, options, output_folders, run_option
-from experiments.cli.late_imports import late
+from experiments.cli import app, outputs
+from experiments.cli import flags as cli_flags
+from experiments.cli.progress import ProgressBar
 
 if TYPE_CHECKING:
+    from refref_jax.render import Model
+
+with epy.lazy_imports():
     import numpy as np
 
     from experiments.exporting import field_mesh, object_meshes
     from refref_jax.data import files
     from refref_jax.reconstruct import isosurface
-    from refref_jax.render import Model, saved
-else:
-    np = late("numpy")
-    object_meshes = late("experiments.exporting.object_meshes")
-    field_mesh = late("experiments.exporting.field_mesh")
-    files = late("refref_jax.data.files")
-    isosurface = late("refref_jax.reconstruct.isosurface")
-    saved = late("refref_jax.render.saved")
+    from refref_jax.render import saved
 
-_RUN = options.run()
+_RUN = cli_flags.run()
 _WHAT = flags.DEFINE_enum("what", None, ["mesh", "points", "body"], "What to write.", required=True)
-_OUT = options.out("The PLY file.")
-_OVERWRITE = options.overwrite("the file, or those of several bodies")
-_STEP = options.step()
+_OUT = cli_flags.out("The PLY file.")
+_OVERWRITE = cli_flags.overwrite("the file, or those of several bodies")
+_STEP = cli_flags.step()
 _LEVEL = flags.DEFINE_float(
     "level", 10.0, "Density of the surface per world unit; 10 halves light in 0.07 units.", 1e-6
 )
@@ -57,9 +55,9 @@ _BOX = flags.DEFINE_float(
 def main() -> None:
     """Writes one file, or one for each body."""
     run, out = Path(_RUN.value), Path(_OUT.value)
-    output_folders.check_file(out, overwrite=_OVERWRITE.value)
-    others = (run_option.RECONSTRUCTION,) if _WHAT.value == "body" else ()
-    run_option.check(run, holds=(run_option.RUN, *others))
+    outputs.check_file(out, overwrite=_OVERWRITE.value)
+    others = (cli_flags.RECONSTRUCTION,) if _WHAT.value == "body" else ()
+    cli_flags.check_run(run, holds=(cli_flags.RUN, *others))
     if _WHAT.value == "body":
         written = object_meshes.write(run, out, overwrite=_OVERWRITE.value)
     else:
@@ -74,7 +72,7 @@ def _refuse_other_files(out: str | None) -> None:
         raise ValueError(f"--out is {out}, which is no PLY file. Give a name that ends with .ply.")
 
 
-command_line.check(_OUT, _refuse_other_files)
+app.check(_OUT, _refuse_other_files)
 
 
 def _write_field(model: Model, out: Path) -> list[Path]:
@@ -86,7 +84,7 @@ def _write_field(model: Model, out: Path) -> list[Path]:
     print(f"Box:    from {-half:g} to {half:g} along each axis, {_RESOLUTION.value} cells")
     if space == "unbounded":
         print("        The scene goes on beyond it: a larger --box shows more of it.")
-    with commands.ProgressBar("density", _RESOLUTION.value + 1) as bar:
+    with ProgressBar("density", _RESOLUTION.value + 1) as bar:
         density = field_mesh.sample_density(
             model,
             np.full(3, -half),
@@ -100,7 +98,7 @@ def _write_field(model: Model, out: Path) -> list[Path]:
     if space == "spherical" and math.sqrt(3.0) * half > radius:
         density = field_mesh.with_sphere(density, level=_LEVEL.value, radius=radius)
         print(f"Walls:  the sphere of radius {radius:g}, on which the model is opaque")
-    with output_folders.fresh_file(out, overwrite=_OVERWRITE.value) as draft:
+    with outputs.fresh_file(out, overwrite=_OVERWRITE.value) as draft:
         if _WHAT.value == "mesh":
             surface = field_mesh.find_surface(density, level=_LEVEL.value)
             colours = _colours(model, surface.vertices, surface.normals, density.spacing)
@@ -121,4 +119,4 @@ def _colours(model: Model, points: np.ndarray, normals: np.ndarray, spacing: flo
 
 
 if __name__ == "__main__":
-    commands.run(main, again="it exports anew; --overwrite replaces the files.")
+    app.run(main, again="it exports anew; --overwrite replaces the files.")

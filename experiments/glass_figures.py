@@ -11,35 +11,35 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import commands, known_options, options, output_folders, scene_option, scenes
-from experiments.cli.late_imports import late
+from experiments.cli import app, outputs
+from experiments.cli import flags as cli_flags
+from experiments.cli import scenes as cli_scenes
+from experiments.cli.progress import ProgressBar
+from experiments.runs import refraction_indices
 
-if TYPE_CHECKING:
+with epy.lazy_imports():
     from experiments.figures import glass
     from experiments.runs import known_scene as known_scenes
     from refref_jax.data import background
     from refref_jax.render import backgrounds
-else:
-    glass = late("experiments.figures.glass")
-    known_scenes = late("experiments.runs.known_scene")
-    background = late("refref_jax.data.background")
-    backgrounds = late("refref_jax.render.backgrounds")
 
 FIGURES = ("views", "fan", "tree", "distances")
 
-_SCENE = options.scene("The scene")
-_OUT = options.out("Folder to write the figures to.")
+_SCENE = cli_flags.scene("The scene")
+_OUT = cli_flags.out("Folder to write the figures to.")
 _FIGURES = flags.DEFINE_multi_enum(
     "figure", list(FIGURES), list(FIGURES), "What to draw, all by default; may be repeated."
 )
 _VIEW = flags.DEFINE_integer("view", 0, "Number of the view of the split.", 0)
-flags.adopt_module_key_flags(scenes)
-flags.adopt_module_key_flags(known_options)
-_OVERWRITE = options.overwrite("the figures of an earlier call")
+_RULE = cli_flags.rule()
+_IOR = cli_flags.ior()
+_RAYS_PER_PIXEL = cli_flags.rays_per_pixel(9)
+_SPLIT = cli_flags.split("Views to render.")
+_OVERWRITE = cli_flags.overwrite("the figures of an earlier call")
 
 
 def main() -> None:
@@ -51,18 +51,18 @@ def main() -> None:
         "writes": tuple(wanted.values()),
         "overwrite": _OVERWRITE.value,
     }
-    output_folders.replaceable(out, **place)
-    indices = scenes.given_indices()
-    draw = _drawers(scene_option.opened(_SCENE.value), indices)
+    outputs.replaceable(out, **place)
+    indices = refraction_indices.parse_named(_IOR.value)
+    draw = _drawers(cli_scenes.opened(_SCENE.value), indices)
     with (
-        output_folders.fresh(out, **place) as draft,
-        commands.ProgressBar("draw", len(wanted)) as bar,
+        outputs.fresh(out, **place) as draft,
+        ProgressBar("draw", len(wanted)) as bar,
     ):
         for done, (name, file) in enumerate(wanted.items(), start=1):
             draw[name](draft / file)
             bar.show(done, name)
     print(f"Figures: {', '.join(str(out / file) for file in wanted.values())}")
-    print(f"Next: {commands.shell('render_known', f'--scene={_SCENE.value}', '--out=runs/known')}")
+    print(f"Next: {app.shell('render_known', f'--scene={_SCENE.value}', '--out=runs/known')}")
 
 
 def _drawers(folder: Path, indices: dict[str, float]) -> dict[str, Callable[[Path], None]]:
@@ -75,12 +75,12 @@ def _drawers(folder: Path, indices: dict[str, float]) -> dict[str, Callable[[Pat
     half = float(walls.half_extent)
     scene = known_scenes.read_scene(
         folder,
-        split=known_options.SPLIT.value,
+        split=_SPLIT.value,
         views=str(_VIEW.value),
-        rule=scenes.RULE.value,
+        rule=_RULE.value,
         indices=indices,
     )
-    side = options.side_of(known_options.RAYS_PER_PIXEL.value)
+    side = cli_flags.side_of(_RAYS_PER_PIXEL.value)
     return {
         "views": functools.partial(glass.draw_views, scene, side=side),
         "fan": functools.partial(glass.draw_fan, scene, folder, half),
@@ -90,4 +90,4 @@ def _drawers(folder: Path, indices: dict[str, float]) -> dict[str, Callable[[Pat
 
 
 if __name__ == "__main__":
-    commands.run(main, again="a figure is replaced only with --overwrite, and the others stay.")
+    app.run(main, again="a figure is replaced only with --overwrite, and the others stay.")

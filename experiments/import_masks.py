@@ -12,29 +12,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import commands, options, scene_option
-from experiments.cli.late_imports import late
+from experiments.cli import app
+from experiments.cli import flags as cli_flags
+from experiments.cli import scenes as cli_scenes
 
 if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Bool
 
+with epy.lazy_imports():
     from refref_jax.data import errors, files, mask_import
-else:
-    errors = late("refref_jax.data.errors")
-    files = late("refref_jax.data.files")
-    mask_import = late("refref_jax.data.mask_import")
 
 _SCENE = flags.DEFINE_string("scene", None, "The scene, in the local layout.", required=True)
 _MASKS = flags.DEFINE_string("masks", None, "Folder of the masks.", required=True)
-_OUT = options.out("The copy to write; must not exist.")
+_OUT = cli_flags.out("The copy to write; must not exist.")
 
 
 def main() -> None:
     """Writes the copy."""
     scene, masks, out = Path(_SCENE.value), Path(_MASKS.value), Path(_OUT.value)
-    scene_option.check(scene)
+    cli_scenes.check(scene)
     if not masks.is_dir():
         raise errors.SceneError(f"{masks} is no folder. Give the folder that holds the masks.")
 
@@ -50,8 +49,8 @@ def main() -> None:
     count = mask_import.add_masks(scene, out, read)
     print(f"Masks: {count}")
     print(f"Scene: {out}")
-    print(f"Next: {commands.shell('reconstruct', f'--scene={out}', f'--out={out}_r3f')}")
+    print(f"Next: {app.shell('reconstruct', f'--scene={out}', f'--out={out}_r3f')}")
 
 
 if __name__ == "__main__":
-    commands.run(main, again="it is refused, for a copy is never replaced.")
+    app.run(main, again="it is refused, for a copy is never replaced.")

@@ -10,35 +10,35 @@ scene's own depth maps are planar, and not to be compared with those.) What each
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import commands, options, output_folders, perceptual_option
-from experiments.cli.late_imports import late
-from experiments.cli.perceptual_option import LPIPS_WEIGHTS
+from experiments.cli import app, outputs
+from experiments.cli import flags as cli_flags
+from experiments.cli.progress import ProgressBar
 
-if TYPE_CHECKING:
+with epy.lazy_imports():
     from experiments.runs import image_folders as folder_comparison
-else:
-    folder_comparison = late("experiments.runs.image_folders")
+    from experiments.runs import perceptual as perceptual_metrics
 
 _MASKS = flags.DEFINE_string("masks", None, "Folder of masks, named as the images: 0 is outside.")
 _OUT = flags.DEFINE_string("out", None, "JSON file to write; nothing is written without it.")
-_OVERWRITE = options.overwrite("the file of --out if it exists")
-flags.adopt_module_key_flags(perceptual_option)
+_OVERWRITE = cli_flags.overwrite("the file of --out if it exists")
+_LPIPS_WEIGHTS = cli_flags.lpips_weights()
 
 
 def main(rendered: str, truth: str) -> None:
     """Compares the folders."""
     out = None if _OUT.value is None else Path(_OUT.value)
     if out is not None:
-        output_folders.check_file(out, overwrite=_OVERWRITE.value)
+        outputs.check_file(out, overwrite=_OVERWRITE.value)
     masks = None if _MASKS.value is None else Path(_MASKS.value)
     pairs = folder_comparison.match(Path(rendered), Path(truth), masks)
-    perceptual = perceptual_option.chosen()
+    perceptual = perceptual_metrics.chosen(_LPIPS_WEIGHTS.value)
     rows = []
-    with commands.ProgressBar("compare", len(pairs)) as bar:
+    with ProgressBar("compare", len(pairs)) as bar:
         for row in folder_comparison.compare(pairs, perceptual):
             rows.append(row)
             bar.show(len(rows), row[folder_comparison.NAME])
@@ -53,19 +53,19 @@ def main(rendered: str, truth: str) -> None:
 
 def _again(rendered: str, truth: str) -> str:
     """Returns the same command, with a file to write."""
-    given = [each.serialize() for each in (_MASKS, LPIPS_WEIGHTS) if each.value is not None]
-    return commands.shell("metrics", rendered, truth, *given, "--out=metrics.json")
+    given = [each.serialize() for each in (_MASKS, _LPIPS_WEIGHTS) if each.value is not None]
+    return app.shell("metrics", rendered, truth, *given, "--out=metrics.json")
 
 
 def _write(out: Path, given: dict[str, Any], rows: list[dict[str, Any]]) -> None:
     summary = given | {"results": folder_comparison.summarise(rows), "per_image": rows}
-    text = json.dumps(commands.string_safe(summary), indent=2, allow_nan=False)
-    with output_folders.fresh_file(out, overwrite=_OVERWRITE.value) as path:
+    text = json.dumps(app.string_safe(summary), indent=2, allow_nan=False)
+    with outputs.fresh_file(out, overwrite=_OVERWRITE.value) as path:
         path.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
-    commands.run(
+    app.run(
         main,
         arguments=("RENDERED", "TRUTH"),
         again="it compares anew; --overwrite replaces the file of --out.",

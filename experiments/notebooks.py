@@ -20,22 +20,19 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import commands
-from experiments.cli.late_imports import late
+from experiments.cli import app
+from experiments.cli.progress import ProgressBar
 from refref_jax import atomic_files
 
-if TYPE_CHECKING:
+with epy.lazy_imports():
     import nbclient
     import nbformat
     from nbclient import exceptions
-else:
-    nbclient = late("nbclient")
-    nbformat = late("nbformat")
-    exceptions = late("nbclient.exceptions")
 
 _WRITE = flags.DEFINE_bool("write", False, "Write the notebooks back, with their outputs.")
 _ONLY = flags.DEFINE_list("only", [], "Names of the notebooks to execute; all if not given.")
@@ -77,7 +74,7 @@ def main() -> None:
         print("Next: look at the pictures, and then git diff --stat")
     else:
         print("All ran; nothing was written.")
-        print(f"Next: {commands.shell('notebooks', '--write')}")
+        print(f"Next: {app.shell('notebooks', '--write')}")
 
 
 def find(names: Sequence[str], *, folder: Path = FOLDER) -> list[Path]:
@@ -172,7 +169,7 @@ def _run_cells(notebook: nbformat.NotebookNode, name: str, copy: Path, cell_seco
         resources={"metadata": {"path": str(copy / "experiments" / "colab")}},
     )
     number = {i: n for n, i in enumerate(_code_cells(notebook), start=1)}
-    with commands.ProgressBar(name, len(number)) as bar:
+    with ProgressBar(name, len(number)) as bar:
         current = _follow(client, lambda i, text: bar.show(number[i], text))
         try:
             # The reader's own settings of IPython have no say.
@@ -228,4 +225,4 @@ def _explain(name: str, number: int, cell: nbformat.NotebookNode, error: Excepti
 
 
 if __name__ == "__main__":
-    commands.run(main, again="it executes them anew; only --write replaces what is stored.")
+    app.run(main, again="it executes them anew; only --write replaces what is stored.")

@@ -14,33 +14,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import (
-    command_line,
-    commands,
-    known_options,
-    options,
-    output_folders,
-    scene_option,
-    scenes,
-    view_numbers,
-)
-from experiments.cli.late_imports import late
+from experiments.cli import app, outputs
+from experiments.cli import flags as cli_flags
+from experiments.cli import scenes as cli_scenes
+from experiments.cli.progress import ProgressBar
+from experiments.runs import refraction_indices
 from refref_jax.data import scene_names
 from refref_jax.optics import budgets
 from refref_jax.optics.budgets import BUDGETS, Budget
 
 if TYPE_CHECKING:
-    from experiments.runs import known_scene as known_scenes
     from experiments.runs.known_scene import KnownScene
-    from experiments.sweeps import paths
     from experiments.sweeps.paths import Setting, Trial
-else:
-    known_scenes = late("experiments.runs.known_scene")
-    paths = late("experiments.sweeps.paths")
+
+with epy.lazy_imports():
+    from experiments.runs import known_scene as known_scenes
+    from experiments.sweeps import paths
 
 _SCENES = flags.DEFINE_list(
-    "scenes", None, f"Scenes, with commas: each {options.SCENE_FORMS}.", required=True
+    "scenes", None, f"Scenes, with commas: each {cli_flags.SCENE_FORMS}.", required=True
 )
 _CUTS = flags.DEFINE_list(
     "cuts",
@@ -50,12 +44,13 @@ _CUTS = flags.DEFINE_list(
 _BENDS = flags.DEFINE_list(
     "bends", ["1", "2", "4", "6", "10", "16", "24", "32"], "Most bends of a path."
 )
-_VIEWS = flags.DEFINE_string("views", "0,10", "Numbers of views of the split, as 0,10, or all.")
-command_line.check(_VIEWS, view_numbers.parse)
-flags.adopt_module_key_flags(scenes)
-flags.adopt_module_key_flags(known_options)
-_OUT = options.out("Folder to write to.")
-_OVERWRITE = options.overwrite("the curves of an earlier call")
+_VIEWS = cli_flags.views("0,10")
+_RULE = cli_flags.rule()
+_IOR = cli_flags.ior()
+_RAYS_PER_PIXEL = cli_flags.rays_per_pixel(9)
+_SPLIT = cli_flags.split("Views to render.")
+_OUT = cli_flags.out("Folder to write to.")
+_OVERWRITE = cli_flags.overwrite("the curves of an earlier call")
 
 _TABLE = "path_trade_off.csv"
 _WRITES = (_TABLE, *(f"path_trade_off_{sweep}.png" for sweep in ("cut", "bends")))
@@ -65,11 +60,11 @@ def main() -> None:
     """Renders all scenes with all budgets."""
     out = Path(_OUT.value)
     place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
-    output_folders.replaceable(out, **place)
-    budgets, indices = chosen_budgets(), scenes.given_indices()
+    outputs.replaceable(out, **place)
+    budgets, indices = chosen_budgets(), refraction_indices.parse_named(_IOR.value)
     # All scenes first: a broken one is named before anything is rendered.
     chosen = [_read(folder, indices) for folder in _open_scenes()]
-    with output_folders.fresh(out, **place) as draft:
+    with outputs.fresh(out, **place) as draft:
         trials = _measure(chosen, [paths.Setting(*each) for each in budgets])
         paths.write_table(draft / _TABLE, trials)
         pictures = [out / path.name for path in paths.write_figures(draft, trials)]
@@ -81,8 +76,8 @@ def main() -> None:
 def _measure(chosen: list[KnownScene], plan: list[Setting]) -> list[Trial]:
     """Measures all there is to, with a bar of progress."""
     trials: list[Trial] = []
-    side = options.side_of(known_options.RAYS_PER_PIXEL.value)
-    with commands.ProgressBar("trade-off", len(chosen) * len(plan)) as bar:
+    side = cli_flags.side_of(_RAYS_PER_PIXEL.value)
+    with ProgressBar("trade-off", len(chosen) * len(plan)) as bar:
         for trial in paths.measure_all(chosen, plan, side):
             trials.append(trial)
             bar.show(
@@ -95,8 +90,8 @@ def _measure(chosen: list[KnownScene], plan: list[Setting]) -> list[Trial]:
 
 def _open_scenes() -> list[Path]:
     """Refuses no scene at all, and names that plot and table could not tell apart."""
-    scene_option.check_all(_SCENES.value)
-    folders = [scene_option.opened(scene) for scene in _SCENES.value]
+    cli_scenes.check_all(_SCENES.value)
+    folders = [cli_scenes.opened(scene) for scene in _SCENES.value]
     names = [scene_names.of_folder(folder) for folder in folders]
     if not names:
         raise ValueError("No scene is given. Add --scenes=FOLDER,FOLDER.")
@@ -121,9 +116,9 @@ def chosen_budgets() -> list[tuple[str, str, Budget]]:
 def _read(folder: Path, indices: dict[str, float]) -> KnownScene:
     scene = known_scenes.read_scene(
         folder,
-        split=known_options.SPLIT.value,
+        split=_SPLIT.value,
         views=_VIEWS.value,
-        rule=scenes.RULE.value,
+        rule=_RULE.value,
         indices=indices,
     )
     if scene.masks is None:
@@ -143,9 +138,9 @@ def _numbers(option: str, words: list[str], kind: type) -> list:
         ) from error
 
 
-command_line.check(_CUTS, lambda words: _numbers("cuts", words, float))
-command_line.check(_BENDS, lambda words: _numbers("bends", words, int))
+app.check(_CUTS, lambda words: _numbers("cuts", words, float))
+app.check(_BENDS, lambda words: _numbers("bends", words, int))
 
 
 if __name__ == "__main__":
-    commands.run(main, again="it measures anew; --overwrite replaces the curves.")
+    app.run(main, again="it measures anew; --overwrite replaces the curves.")

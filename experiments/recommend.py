@@ -10,25 +10,22 @@ is guessed.
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import commands, options, scene_option
-from experiments.cli.late_imports import late
+from experiments.cli import app
+from experiments.cli import flags as cli_flags
+from experiments.cli import scenes as cli_scenes
 
-if TYPE_CHECKING:
+with epy.lazy_imports():
     from experiments.sweeps import recommend
     from experiments.sweeps import table as trade_table
     from refref_jax.data import local_layout
-else:
-    recommend = late("experiments.sweeps.recommend")
-    trade_table = late("experiments.sweeps.table")
-    local_layout = late("refref_jax.data.local_layout")
 
 _BUNDLED = Path(__file__).parent / "data" / "trade_off.csv"
 
-_SCENE = options.scene("The scene to train on")
+_SCENE = cli_flags.scene("The scene to train on")
 _MINUTES = flags.DEFINE_float(
     "minutes", None, "Time for training and evaluation.", 0.0, required=True
 )
@@ -40,9 +37,9 @@ _TIMED_STEPS = flags.DEFINE_integer(
 
 def main() -> None:
     """Times this machine and prints the recommendation."""
-    scene_option.check(_SCENE.value)
+    cli_scenes.check(_SCENE.value)
     rows = trade_table.read(Path(_TABLE.value))
-    scene = scene_option.opened(_SCENE.value)
+    scene = cli_scenes.opened(_SCENE.value)
     images = len(local_layout.read_frames(scene, "test").names)
     base = trade_table.base_of(rows)
     print(f"Timing {_TIMED_STEPS.value} steps of the table's base point ...", flush=True)
@@ -58,4 +55,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    commands.run(main, again="it times this machine anew; nothing is written.")
+    app.run(main, again="it times this machine anew; nothing is written.")

@@ -10,33 +10,30 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import choosable, commands, options, output_folders, run_option, scene_option
-from experiments.cli.late_imports import late
+from experiments.cli import app, outputs
+from experiments.cli import flags as cli_flags
+from experiments.cli import scenes as cli_scenes
+from experiments.cli.progress import ProgressBar
 
 if TYPE_CHECKING:
+    from refref_jax.render import Model
+
+with epy.lazy_imports():
     from experiments.figures import comparison as figures
     from experiments.figures import video as videos
     from refref_jax.data import files, local_layout
     from refref_jax.geometry import cameras
-    from refref_jax.render import Model, saved, supersampling
+    from refref_jax.render import saved, supersampling
     from refref_jax.training import run_folder
-else:
-    figures = late("experiments.figures.comparison")
-    supersampling = late("refref_jax.render.supersampling")
-    videos = late("experiments.figures.video")
-    cameras = late("refref_jax.geometry.cameras")
-    files = late("refref_jax.data.files")
-    local_layout = late("refref_jax.data.local_layout")
-    saved = late("refref_jax.render.saved")
-    run_folder = late("refref_jax.training.run_folder")
 
-_RUN = options.run()
+_RUN = cli_flags.run()
 _VIEWS = flags.DEFINE_enum(
-    "views", "orbit", ["orbit", *choosable.SPLITS], "Cameras: an orbit, or those of a split."
+    "views", "orbit", ["orbit", *cli_flags.SPLITS], "Cameras: an orbit, or those of a split."
 )
-_STEP = options.step()
-_SCENE = options.moved_scene()
+_STEP = cli_flags.step()
+_SCENE = cli_flags.scene("The scene, if it has moved", required=False)
 _OUT = flags.DEFINE_string("out", None, "Where to write; {run}/render/{views} if not given.")
 _FRAMES = flags.DEFINE_integer("frames", 60, "Frames of an orbit.", 1)
 _SIZE = flags.DEFINE_integer("size", 200, "Width and height of an orbit's frames, pixels.", 1)
@@ -44,9 +41,9 @@ _FOV = flags.DEFINE_float("fov", 66.785, "Horizontal field of view of an orbit, 
 _DISTANCE = flags.DEFINE_float("distance", 4.0, "Distance of an orbit from the origin.", 1e-3)
 _ELEVATION = flags.DEFINE_float("elevation", 20.0, "Elevation of an orbit, degrees.", -89, 89)
 _FPS = flags.DEFINE_float("fps", 15.0, "Frames a second of the videos.", 0.1)
-_RAYS_PER_PIXEL = options.rays_per_pixel(1)
-_CHUNK = options.chunk()
-_OVERWRITE = options.overwrite("earlier pictures of these views")
+_RAYS_PER_PIXEL = cli_flags.rays_per_pixel(1)
+_CHUNK = cli_flags.chunk()
+_OVERWRITE = cli_flags.overwrite("earlier pictures of these views")
 
 _WRITES = ("rgb", "distance", "rgb.gif", "rgb.mp4", "distance.gif", "distance.mp4")
 
@@ -56,12 +53,12 @@ def main() -> None:
     run = Path(_RUN.value)
     out = Path(_OUT.value) if _OUT.value else run / "render" / _VIEWS.value
     place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
-    output_folders.replaceable(out, **place)
-    run_option.check(run)
-    scene_option.check(_SCENE.value)
+    outputs.replaceable(out, **place)
+    cli_flags.check_run(run)
+    cli_scenes.check(_SCENE.value)
     model = saved.load_model(run, step=_STEP.value)
     seen_by, names = _cameras(run)
-    with output_folders.fresh(out, **place) as draft:
+    with outputs.fresh(out, **place) as draft:
         written = render(model, seen_by, names, draft)
     for name in written:
         print(f"Video: {out / name}")
@@ -69,7 +66,7 @@ def main() -> None:
         print(f"Videos as mp4 too: {videos.INSTALL}")
     print(f"Pictures: {out / 'rgb'}")
     print(f"Distance in world units: {out / 'distance'}")
-    print(f"Next: {commands.shell('view', f'--run={run}')}")
+    print(f"Next: {app.shell('view', f'--run={run}')}")
 
 
 def render(model: Model, seen_by: cameras.Cameras, names: tuple[str, ...], out: Path) -> list[str]:
@@ -78,7 +75,7 @@ def render(model: Model, seen_by: cameras.Cameras, names: tuple[str, ...], out: 
     for folder in ("rgb", "distance"):
         (out / folder).mkdir()
     frames, distances = [], []
-    with commands.ProgressBar("render", len(names)) as bar:
+    with ProgressBar("render", len(names)) as bar:
         for i, name in enumerate(names):
             seen = supersampling.render_camera(
                 model, seen_by, i, rays_per_pixel=rays_per_pixel, chunk=chunk
@@ -106,14 +103,13 @@ def _cameras(run: Path) -> tuple[cameras.Cameras, tuple[str, ...]]:
             angle_x=math.radians(_FOV.value),
         )
         return around, tuple(f"r_{i:03d}" for i in range(_FRAMES.value))
-    scene = scene_option.opened(_SCENE.value or run_folder.read_config(run).scene.path)
+    scene = cli_scenes.opened(_SCENE.value or run_folder.read_config(run).scene.path)
     frames = local_layout.read_frames(scene, _VIEWS.value)
     return frames.cameras, frames.names
 
 
 if __name__ == "__main__":
-    commands.run(
+    app.run(
         main,
-        first=("views", "rays_per_pixel"),
         again="it renders anew; --overwrite replaces the pictures.",
     )

@@ -18,40 +18,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import (
-    budget_options,
-    command_line,
-    commands,
-    known_options,
-    options,
-    output_folders,
-    scene_option,
-    scenes,
-    view_numbers,
-)
-from experiments.cli.late_imports import late
+from experiments.cli import app, outputs
+from experiments.cli import flags as cli_flags
+from experiments.cli import scenes as cli_scenes
+from experiments.cli.progress import ProgressBar
+from experiments.runs import refraction_indices
 from refref_jax.optics.budgets import BUDGETS, Budget
 
 if TYPE_CHECKING:
+    from experiments.runs.known_scene import KnownScene, View
+
+with epy.lazy_imports():
     import numpy as np
 
     from experiments.figures import comparison as figures
     from experiments.runs import evaluation as reporting
     from experiments.runs import known_scene as known_scenes
-    from experiments.runs.known_scene import KnownScene, View
     from refref_jax.data import files
     from refref_jax.training import evaluation as measures
-else:
-    np = late("numpy")
-    figures = late("experiments.figures.comparison")
-    reporting = late("experiments.runs.evaluation")
-    known_scenes = late("experiments.runs.known_scene")
-    measures = late("refref_jax.training.evaluation")
-    files = late("refref_jax.data.files")
 
-_SCENE = options.scene("The scene")
-_OUT = options.out("Folder to write the pictures to.")
+_SCENE = cli_flags.scene("The scene")
+_OUT = cli_flags.out("Folder to write the pictures to.")
 _PATHS = flags.DEFINE_enum(
     "paths",
     "tree",
@@ -66,13 +55,14 @@ _UNFINISHED = flags.DEFINE_enum(
     "Light that has no bend left: 'kept' goes on along its last direction; 'dark' is not shown, as "
     "in renderers that stop after so many bounces.",
 )
-_VIEWS = flags.DEFINE_string("views", "all", "Numbers of views of the split, as 0,10,20, or all.")
-command_line.check(_VIEWS, view_numbers.parse)
-flags.adopt_module_key_flags(budget_options)
-flags.adopt_module_key_flags(scenes)
-flags.adopt_module_key_flags(known_options)
+_VIEWS = cli_flags.views("all")
+_BUDGET = cli_flags.budget()
+_RULE = cli_flags.rule()
+_IOR = cli_flags.ior()
+_RAYS_PER_PIXEL = cli_flags.rays_per_pixel(9)
+_SPLIT = cli_flags.split("Views to render.")
 _JSON = flags.DEFINE_string("json", None, "File for the measures; {out}/metrics.json by default.")
-_OVERWRITE = options.overwrite("an earlier rendering in that folder")
+_OVERWRITE = cli_flags.overwrite("an earlier rendering in that folder")
 
 _WRITES = ("rgb", "comparison.png", "metrics.json")
 
@@ -84,41 +74,41 @@ def main() -> None:
     """Renders and measures the chosen views."""
     out = Path(_OUT.value)
     place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
-    output_folders.replaceable(out, **place)
+    outputs.replaceable(out, **place)
     metrics_file = None if _JSON.value is None else Path(_JSON.value)
     _check(metrics_file)
     budget = _chosen_budget()
-    indices, folder = scenes.given_indices(), scene_option.opened(_SCENE.value)
+    indices, folder = refraction_indices.parse_named(_IOR.value), cli_scenes.opened(_SCENE.value)
     scene = known_scenes.read_scene(
         folder,
-        split=known_options.SPLIT.value,
+        split=_SPLIT.value,
         views=_VIEWS.value,
-        rule=scenes.RULE.value,
+        rule=_RULE.value,
         indices=indices,
     )
-    with output_folders.fresh(out, **place) as draft:
+    with outputs.fresh(out, **place) as draft:
         summary = render(scene, budget, draft)
-        text = json.dumps(commands.string_safe(summary), indent=2, allow_nan=False) + "\n"
+        text = json.dumps(app.string_safe(summary), indent=2, allow_nan=False) + "\n"
         if metrics_file is None:
             (draft / "metrics.json").write_text(text, encoding="utf-8")
     if metrics_file is not None:
-        with output_folders.fresh_file(metrics_file, overwrite=_OVERWRITE.value) as path:
+        with outputs.fresh_file(metrics_file, overwrite=_OVERWRITE.value) as path:
             path.write_text(text, encoding="utf-8")
     _report(summary)
     print(f"Pictures: {out / 'comparison.png'}, {out / 'rgb'}")
     print(f"Metrics:  {metrics_file or out / 'metrics.json'}")
     given = (f"--scenes={_SCENE.value}", f"--out={out}_trade_off")
-    print(f"Next: {commands.shell('path_trade_off', *given)}")
+    print(f"Next: {app.shell('path_trade_off', *given)}")
 
 
 def render(scene: KnownScene, budget: Budget, out: Path) -> dict[str, Any]:
     """Renders and measures all views, writes the pictures, and returns what the JSON holds."""
     views, measured = [], []
-    side = options.side_of(known_options.RAYS_PER_PIXEL.value)
+    side = cli_flags.side_of(_RAYS_PER_PIXEL.value)
     (out / "rgb").mkdir()
     print(f"Compiling for {scene.name}, {_PATHS.value} ...", flush=True)
     known_scenes.warm_up(scene, budget)
-    with commands.ProgressBar("render", len(scene.indices)) as bar:
+    with ProgressBar("render", len(scene.indices)) as bar:
         for i, (index, name) in enumerate(zip(scene.indices, scene.frames.names, strict=True)):
             view = known_scenes.render_view(scene, i, budget=budget, side=side)
             files.write_rgb(out / "rgb" / f"{name}.png", view.rgb)
@@ -160,7 +150,7 @@ def _chosen_budget() -> Budget:
             "--paths=straight bends no light, so none is unfinished. Leave --unfinished out, or "
             "use --paths=tree."
         )
-    return dataclasses.replace(budget_options.chosen(_PATHS.value), unfinished=_UNFINISHED.value)
+    return dataclasses.replace(_BUDGET.chosen(_PATHS.value), unfinished=_UNFINISHED.value)
 
 
 def _check(metrics_file: Path | None) -> None:
@@ -171,7 +161,7 @@ def _check(metrics_file: Path | None) -> None:
         raise ValueError(
             f"{metrics_file} exists and is not of this command. Remove it, or give another --json."
         )
-    output_folders.check_file(metrics_file, overwrite=_OVERWRITE.value)
+    outputs.check_file(metrics_file, overwrite=_OVERWRITE.value)
 
 
 def _is_ours(path: Path) -> bool:
@@ -201,8 +191,7 @@ def _report(summary: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    commands.run(
+    app.run(
         main,
-        first=("paths", "cut", "bends", "unfinished", "rays_per_pixel", "views", "split"),
         again="it renders anew; --overwrite replaces the results.",
     )

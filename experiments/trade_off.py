@@ -20,24 +20,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import command_line, commands, options, output_folders, scene_option
-from experiments.cli.late_imports import late
+from experiments.cli import app, outputs
+from experiments.cli import flags as cli_flags
+from experiments.cli import scenes as cli_scenes
 
 if TYPE_CHECKING:
+    from experiments.sweeps.points import Point
+
+with epy.lazy_imports():
     from experiments.sweeps import points as trade_points
     from experiments.sweeps import sweep as sweeps
-    from experiments.sweeps.points import Point
     from refref_jax.data import local_layout
-else:
-    sweeps = late("experiments.sweeps.sweep")
-    trade_points = late("experiments.sweeps.points")
-    local_layout = late("refref_jax.data.local_layout")
 
-_SCENE = options.scene("The scene")
-_OUT = options.out("Folder of the sweep.")
-_PRESET = options.preset("Preset of the base point.")
-_SEED = options.seed("Seed of all trainings.")
+_SCENE = cli_flags.scene("The scene")
+_OUT = cli_flags.out("Folder of the sweep.")
+_PRESET = cli_flags.preset("Preset of the base point.")
+_SEED = cli_flags.seed("Seed of all trainings.")
 _STEPS = flags.DEFINE_list(
     "steps",
     [],
@@ -50,19 +50,19 @@ _VALUES = flags.DEFINE_multi_string(
 )
 _KNOBS = flags.DEFINE_list("knobs", None, "Only these options are tried; all if not given.")
 _POINTS = flags.DEFINE_list("points", None, "Only these points, and the base, as cut=0.1.")
-_LIMIT = options.limit()
+_LIMIT = cli_flags.limit()
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "List the points, and measure nothing.")
 
 
 def main() -> None:
     """Measures all points and writes the report."""
-    scene_option.check(_SCENE.value)
+    cli_scenes.check(_SCENE.value)
     points = points_from_flags()
     if _DRY_RUN.value:
         for point in points:
             print(f"{point.name:24} {' '.join((*point.training, *point.evaluation))}")
         return
-    scene, out = scene_option.opened(_SCENE.value), Path(_OUT.value)
+    scene, out = cli_scenes.opened(_SCENE.value), Path(_OUT.value)
     # A sweep that is killed takes the training that it waits for with it.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     limit = () if _LIMIT.value is None else (f"--limit={_LIMIT.value}",)
@@ -70,7 +70,7 @@ def main() -> None:
     images = min(images, _LIMIT.value or images)
     earlier = sweeps.earlier_rows(out, points[0], scene, images=images)
     out.mkdir(parents=True, exist_ok=True)
-    output_folders.note(out, __name__)
+    outputs.note(out, __name__)
     failed = sweeps.sweep(
         points,
         out,
@@ -81,7 +81,7 @@ def main() -> None:
     print(f"Figure: {out / 'trade_off.png'}")
     print(f"Report: {out / 'trade_off.md'}")
     given = (f"--scene={_SCENE.value}", "--minutes=5", f"--table={out / 'trade_off.csv'}")
-    print(f"Next: {commands.shell('recommend', *given)}")
+    print(f"Next: {app.shell('recommend', *given)}")
     for name, reason in failed.items():
         print(f"failed: {name}: {reason}", file=sys.stderr)
     if failed:
@@ -118,8 +118,8 @@ def read_steps(words: list[str]) -> list[int]:
     return steps
 
 
-command_line.check(_STEPS, read_steps)
+app.check(_STEPS, read_steps)
 
 
 if __name__ == "__main__":
-    commands.run(main, again="it goes on; points that are finished are not measured again.")
+    app.run(main, again="it goes on; points that are finished are not measured again.")

@@ -11,30 +11,23 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments.cli import (
-    commands,
-    device_options,
-    options,
-    reconstruction_options,
-    scene_option,
-)
-from experiments.cli import config as config_flags
+from experiments.cli import app
+from experiments.cli import flags as cli_flags
+from experiments.cli import scenes as cli_scenes
+from experiments.cli.progress import ProgressBar
 from experiments.r3f import training_body
+from experiments.runs import config_flags, processes
 from refref_jax.optics.budgets import budget_of
+from refref_jax.training.config import TrainConfig
 
-if TYPE_CHECKING:
-    from refref_jax.training.config import TrainConfig
-
-_OUT = options.out("Folder to write the run to.")
+_OUT = cli_flags.out("Folder to write the run to.")
 _CONFIG = config_flags.define_flags()
 flags.adopt_module_key_flags(config_flags)
 flags.adopt_module_key_flags(training_body)
-flags.adopt_module_key_flags(device_options)
-flags.adopt_module_key_flags(reconstruction_options)
+_DEVICES = cli_flags.devices()
 _RESUME = flags.DEFINE_bool("resume", False, "Continue the run in --out, if there is one.")
 _LOG_EVERY = flags.DEFINE_integer("log_every", 50, "Steps between two lines of metrics.", 1)
 _CHECKPOINT_EVERY = flags.DEFINE_integer("checkpoint_every", 500, "Steps between checkpoints.", 1)
@@ -45,13 +38,13 @@ def main() -> None:
     """Resolves a run, or finds the one to resume, and trains it."""
     run = Path(_OUT.value)
     check_flags()
-    device_options.connect()
-    with device_options.first_speaks():
+    processes.connect(_DEVICES)
+    with processes.first_speaks():
         if not _train(run):
-            print(f"Continue with {commands.shell('train', f'--out={run}', '--resume')}")
-            sys.exit(commands.INTERRUPTED)
+            print(f"Continue with {app.shell('train', f'--out={run}', '--resume')}")
+            sys.exit(app.INTERRUPTED)
         print(f"Run: {run}  (config.json, metrics.jsonl, checkpoints/)")
-        print(f"Next: {commands.shell('evaluate', f'--run={run}', '--split=test')}")
+        print(f"Next: {app.shell('evaluate', f'--run={run}', '--split=test')}")
 
 
 def check_flags() -> None:
@@ -61,13 +54,13 @@ def check_flags() -> None:
       ValueError: if one makes no sense, or there is no scene.
     """
     given = _CONFIG["reconstruction"].value
-    if device_options.together() and training_body.reconstructs(given):
+    if processes.together(_DEVICES) and training_body.reconstructs(given):
         raise ValueError(
             "Several processes do not reconstruct together. Run experiments.reconstruct on one "
             "machine first, and give its folder as --reconstruction."
         )
     scene, config = _CONFIG["scene"].value, flags.FLAGS["config"].value
-    scene_option.check(scene)
+    cli_scenes.check(scene)
     if scene is None and config is None and not _RESUME.value:
         raise ValueError(
             "No scene is given. Add --scene=FOLDER or --config=FILE, or --resume to go on with a "
@@ -85,7 +78,7 @@ def _train(run: Path) -> bool:
     """Begins a run, or goes on with it; returns whether it has reached its last step."""
     from refref_jax.training import fit, run_folder
 
-    mesh = device_options.mesh()
+    mesh = processes.mesh(_DEVICES)
     resuming = _RESUME.value and run_folder.exists(run)
     if not resuming:
         run_folder.check_free(run)
@@ -95,10 +88,10 @@ def _train(run: Path) -> bool:
         _refuse_flags(run)
     moved = _CONFIG["scene"].value
     periods = fit.Periods(_LOG_EVERY.value, _CHECKPOINT_EVERY.value, _KEEP.value)
-    with commands.Interrupt() as interrupt, commands.ProgressBar("train", 0) as bar:
+    with app.Interrupt() as interrupt, ProgressBar("train", 0) as bar:
         return fit.train(
             run,
-            scene=None if moved is None else scene_option.opened(moved),
+            scene=None if moved is None else cli_scenes.opened(moved),
             progress=bar.move,
             stop=lambda: interrupt.requested,
             periods=periods,
@@ -135,7 +128,7 @@ def _asked_config() -> TrainConfig:
     config = config_flags.chosen(_CONFIG, **instead)
     if not config.scene.path:
         raise ValueError("The configuration names no scene. Add --scene=FOLDER.")
-    scene = str(scene_option.opened(config.scene.path).resolve())
+    scene = str(cli_scenes.opened(config.scene.path).resolve())
     return config if scene == config.scene.path else config.override(scene=scene)
 
 
@@ -150,7 +143,7 @@ def _refuse_flags(run: Path) -> None:
 
 
 if __name__ == "__main__":
-    commands.run(
+    app.run(
         main,
         again="a run is never replaced; the same command with --resume goes on with it.",
     )

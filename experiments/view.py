@@ -10,32 +10,23 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import command_line, commands, options, run_option, scene_option
-from experiments.cli.late_imports import late
+from experiments.cli import app
+from experiments.cli import flags as cli_flags
+from experiments.cli import scenes as cli_scenes
 
-if TYPE_CHECKING:
+with epy.lazy_imports():
     from experiments.viewer import session as subjects
     from refref_jax.data import errors
     from refref_jax.render import saved
     from refref_jax.training import run_folder
-else:
-    subjects = late("experiments.viewer.session")
-    errors = late("refref_jax.data.errors")
-    saved = late("refref_jax.render.saved")
-    run_folder = late("refref_jax.training.run_folder")
 
-_RUN = options.run()
-_STEP = options.step()
-_SCENE = flags.DEFINE_string(
-    "scene",
-    None,
-    f"The scene, for its test views: {options.SCENE_FORMS}. That of the run, if not given and "
-    "still there.",
-)
+_RUN = cli_flags.run()
+_STEP = cli_flags.step()
+_SCENE = cli_flags.scene("The scene of the test views, if it has moved", required=False)
 _HOST = flags.DEFINE_string(
     "host", "127.0.0.1", "Address to listen on; 0.0.0.0 lets in everyone who reaches this machine."
 )
@@ -48,14 +39,14 @@ _HEIGHTS = flags.DEFINE_list(
     "Heights of the pictures in pixels: while the camera moves, and then one after the other. "
     "Widths are 16/9 of them.",
 )
-_CHUNK = options.chunk()
+_CHUNK = cli_flags.chunk()
 
 
 def main() -> None:
     """Serves a run until it is interrupted."""
     heights = read_heights(_HEIGHTS.value)
-    run_option.check(Path(_RUN.value))
-    scene_option.check(_SCENE.value)
+    cli_flags.check_run(Path(_RUN.value))
+    cli_scenes.check(_SCENE.value)
     try:
         from experiments.viewer import server as serving
     except ModuleNotFoundError as error:
@@ -73,7 +64,7 @@ def main() -> None:
     finally:
         server.stop()
         given = (f"--run={_RUN.value}", "--what=mesh", f"--out={_RUN.value}.ply")
-        print(f"Next: {commands.shell('export', *given)}")
+        print(f"Next: {app.shell('export', *given)}")
 
 
 def read_heights(words: list[str]) -> tuple[int, ...]:
@@ -94,7 +85,7 @@ def read_heights(words: list[str]) -> tuple[int, ...]:
     return heights
 
 
-command_line.check(_HEIGHTS, read_heights)
+app.check(_HEIGHTS, read_heights)
 
 
 def read_subject(heights: tuple[int, ...]) -> subjects.Subject:
@@ -116,13 +107,13 @@ def read_subject(heights: tuple[int, ...]) -> subjects.Subject:
 
 def _scene(trained_on: str) -> Path | None:
     if _SCENE.value is not None:
-        return scene_option.opened(_SCENE.value)
+        return cli_scenes.opened(_SCENE.value)
     try:
-        return scene_option.opened(trained_on)
+        return cli_scenes.opened(trained_on)
     except (errors.SceneError, OSError) as error:
         print(f"warning: the scene of the run can not be read: {error}")
         return None
 
 
 if __name__ == "__main__":
-    commands.run(main, again="it shows the run again; nothing is written.")
+    app.run(main, again="it shows the run again; nothing is written.")

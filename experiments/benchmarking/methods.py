@@ -12,17 +12,15 @@ own sizes, samples and footprint, a cone.
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-from experiments.cli import command_line
-from experiments.cli.late_imports import late
+from etils import epy
 
-if TYPE_CHECKING:
+from experiments.cli import app
+
+with epy.lazy_imports():
     from refref_jax.fields import registry
     from refref_jax.training import presets
-else:
-    presets = late("refref_jax.training.presets")
-    registry = late("refref_jax.fields.registry")
 
 Need = Literal["meshes", "masks", "colours"]
 Group = Literal["main", "ablation of the oracle", "ablation of the tree"]
@@ -174,7 +172,7 @@ def _meaning(word: str) -> list[str]:
     }
     if word not in METHODS and word not in groups:
         names = (*METHODS, *groups)
-        near = command_line.did_you_mean(word, names)
+        near = app.did_you_mean(word, names)
         raise ValueError(
             f"There is no method {word!r} for --methods.{near} Choose from {', '.join(names)}."
         )

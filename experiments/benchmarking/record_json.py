@@ -10,12 +10,12 @@ from typing import Any
 
 from experiments.benchmarking.records import Costs, Image, Record, Truth, View
 from experiments.benchmarking.settings import Settings
-from experiments.cli import commands
+from experiments.cli import app
 
 
 def to_json(record: Record) -> dict[str, Any]:
     """Returns a result as JSON has it."""
-    return commands.string_safe(
+    return app.string_safe(
         record._asdict()
         | {
             "settings": dataclasses.asdict(record.settings),
@@ -72,7 +72,7 @@ def number(value: Any, what: str) -> float | None:
     Raises:
       ValueError: if it is anything else.
     """
-    if isinstance(value, str) and value in commands.NOT_FINITE:
+    if isinstance(value, str) and value in app.NOT_FINITE:
         return float(value)
     if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
         return value

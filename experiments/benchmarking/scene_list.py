@@ -6,7 +6,7 @@ from pathlib import Path
 
 from experiments.benchmarking import fingerprints
 from experiments.benchmarking.settings import Scene
-from experiments.cli import scene_option
+from experiments.cli import scenes as cli_scenes
 from refref_jax.data import scene_names
 
 
@@ -38,9 +38,9 @@ def find(words: Sequence[str]) -> list[Scene]:
 
 
 def _folders(word: str) -> list[Path]:
-    if scene_option.has_wildcards(word):
+    if cli_scenes.has_wildcards(word):
         return [Path(path) for path in sorted(glob.glob(word)) if _is_scene(Path(path))]
-    folder = scene_option.opened(word)
+    folder = cli_scenes.opened(word)
     if not _is_scene(folder):
         raise ValueError(
             f"{folder} is no scene: it holds no transforms_train.json. Give the folder of one."

@@ -28,7 +28,7 @@ from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.records import Record
 from experiments.benchmarking.settings import Benchmark
 from experiments.benchmarking.tables import Table
-from experiments.cli import commands
+from experiments.cli import app
 from refref_jax import atomic_files
 from refref_jax.training import run_folder
 
@@ -79,7 +79,7 @@ def write(
         "missing": [f"{scene}/{method}" for scene, method in missing],
         "tables": {table.name: table_data.as_json(table) for table in made},
     }
-    settings.write_json(out / RESULTS, commands.string_safe(index))
+    settings.write_json(out / RESULTS, app.string_safe(index))
 
 
 def _write_tables(folder: Path, made: Sequence[Table], found: Sequence[Record]) -> None:
@@ -194,7 +194,7 @@ def _indexed(out: Path, record: Record) -> dict[str, Any]:
 
 def _curve(run: Path) -> list[dict[str, Any]]:
     """Returns the metrics of a training, thinned to what a figure shows; the last stays."""
-    lines = commands.from_string_safe(run_folder.read_metrics(run))
+    lines = app.from_string_safe(run_folder.read_metrics(run))
     stride = max(1, -(-len(lines) // _MOST_POINTS))
     thinned = lines[::-1][::stride][::-1]
     keys = ("step", "loss", "psnr", "seconds")

@@ -7,7 +7,7 @@ from typing import Any
 
 from experiments.benchmarking.records import Record
 from experiments.benchmarking.tables import Block, Cell, Column, Row, Table
-from experiments.cli import commands
+from experiments.cli import app
 
 _HEAD = (
     "table",
@@ -45,7 +45,7 @@ def as_csv(table: Table) -> str:
 
 def as_json(table: Table) -> dict[str, Any]:
     """Returns a table as JSON has it."""
-    return commands.string_safe(
+    return app.string_safe(
         {
             "name": table.name,
             "title": table.title,
@@ -109,7 +109,7 @@ def scenes_csv(found: Sequence[Record]) -> str:
 
 def _row(record: dict[str, Any]) -> Row:
     cells = [
-        Cell(**commands.from_string_safe({key: cell[key] for key in Cell._fields}))
+        Cell(**app.from_string_safe({key: cell[key] for key in Cell._fields}))
         for cell in record["cells"]
     ]
     marks = tuple(cell["mark"] for cell in record["cells"])

@@ -8,7 +8,7 @@ from experiments.benchmarking import jobs, schedule, summary
 from experiments.benchmarking.engines import Engine
 from experiments.benchmarking.jobs import Job, Skipped
 from experiments.benchmarking.settings import Benchmark
-from experiments.cli import commands
+from experiments.cli.progress import ProgressBar
 
 
 def work(
@@ -44,7 +44,7 @@ def work(
     failed: dict[str, str] = {}
     start, count = time.monotonic(), 0
     doing = engine()
-    with commands.ProgressBar("benchmark", len(missing)) as bar:
+    with ProgressBar("benchmark", len(missing)) as bar:
 
         def done(job: Job, reason: str | None) -> None:
             nonlocal count

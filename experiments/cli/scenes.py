@@ -1,40 +1,77 @@
-"""Options that commands which read a scene's meshes share."""
+"""How commands open the scene that an option names: a folder, or `hf:CONFIG/SCENE`."""
 
-import math
+import contextlib
+import glob
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
 
-from absl import flags
+from etils import epy
 
-from experiments.cli import choosable
+from experiments.cli.flags import SCENE_FORMS
+from experiments.cli.progress import ProgressBar
+from refref_jax.data import scene_names
+from refref_jax.data.errors import SceneError
 
-RULE = flags.DEFINE_enum(
-    "rule",
-    "nested",
-    choosable.RULES,
-    "What lies outside each mesh: the part around it, always air (as Cycles does it), or, of "
-    "meshes that overlap, the one with the highest 'priority' in scene.json.",
-)
-IOR = flags.DEFINE_multi_string(
-    "ior", [], "Index of refraction of a material or a mesh, as glass=1.52. May be repeated."
-)
+with epy.lazy_imports():
+    from refref_jax.data import scene_source
 
 
-def given_indices() -> dict[str, float]:
-    """Returns the indices of refraction that `--ior=NAME=NUMBER` options give.
+def check(source: str | Path | None) -> None:
+    """Refuses what is no scene at first sight, before anything that reads one is imported.
 
     Raises:
-      ValueError: if one is not of that form, or no index.
+      SceneError: if there is no such folder, or neither views nor parquet files are in it, or
+        `hf:...` is no name of the data set.
     """
-    return dict(map(_parse, IOR.value))
-
-
-def _parse(word: str) -> tuple[str, float]:
-    name, _, number = word.partition("=")
-    try:
-        index = float(number)
-    except ValueError:
-        index = math.nan
-    if not name or not 0.0 < index < math.inf:
-        raise ValueError(
-            f"--ior={word} is not NAME=NUMBER with a positive number. Write as in --ior=glass=1.52."
+    if source is None:
+        return
+    if str(source).startswith("hf:"):
+        scene_names.parse_source(str(source))
+        return
+    folder = Path(source)
+    if not any(any(folder.glob(each)) for each in ("transforms_*.json", "*/*.parquet")):
+        raise SceneError(
+            f"{folder / 'transforms_train.json'} does not exist. Give a scene: {SCENE_FORMS}."
         )
-    return name, index
+
+
+def check_all(sources: Sequence[str]) -> None:
+    """Refuses as `check` does, and passes over what is empty or has wildcards."""
+    for source in sources:
+        if source and not has_wildcards(source):
+            check(source)
+
+
+def has_wildcards(source: str) -> bool:
+    """Returns whether a name stands for many; one that exists as it is, is itself."""
+    return not source.startswith("hf:") and glob.has_magic(source) and not Path(source).exists()
+
+
+def check_place(place: str) -> None:
+    """Refuses a place of one scene or of many that is neither a folder nor `hf:...`."""
+    if not place.startswith("hf:") and not Path(place).is_dir():
+        raise SceneError(f"{place} is no folder. Give one that exists.")
+
+
+def opened(source: str | Path) -> Path:
+    """Returns the folder of a scene; one in parquet files is unpacked, with a bar of progress.
+
+    Raises:
+      SceneError: if there is none, or it is broken, see `scene_source.open_scene`.
+    """
+    check(source)
+    bar: ProgressBar | None = None
+
+    def show(done: int, total: int) -> None:
+        nonlocal bar
+        if bar is None:
+            bar = bars.enter_context(ProgressBar(f"unpack {Path(source).name}", total))
+        bar.show(done, "images")
+
+    with contextlib.ExitStack() as bars, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", scene_source.SceneWarning)
+        scene = scene_source.open_scene(source, progress=show)
+    for warning in caught:
+        print(f"warning: {warning.message}")
+    return scene

@@ -1,7 +1,7 @@
 """Runs a command of `experiments` in a process of its own.
 
 The command stops, and saves what it has, when this process ends, however that ends: its standard
-input is a pipe from here, which closes then; see `commands.run`. It is in a session of its own, so
+input is a pipe from here, which closes then; see `app.run`. It is in a session of its own, so
 that Ctrl-C, a terminal that is closed, and what is sent to the group of this process reach it
 through this process alone.
 """
@@ -18,12 +18,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.cli import commands
+from experiments.cli import app
 
 # ru_maxrss is in KiB, but in bytes on macOS.
 _RSS_UNIT = 1.0 if sys.platform == "darwin" else 1024.0
 _MIB = 2.0**20
-
 
 # Seconds between two looks at a command.
 _POLL = 0.05
@@ -56,7 +55,7 @@ def run(name: str, *options: str, log: Path) -> tuple[float, float]:
     log.parent.mkdir(parents=True, exist_ok=True)
     start = time.monotonic()
     with log.open("a", encoding="utf-8") as file:
-        print(f"$ {commands.shell(name, *options)}", file=file, flush=True)
+        print(f"$ {app.shell(name, *options)}", file=file, flush=True)
         written = file.tell()
         process = _start(
             command_line(name, options),
@@ -130,7 +129,7 @@ def _wait(process: subprocess.Popen[bytes]) -> tuple[int, Any]:
 def _environment() -> dict[str, str]:
     """Returns the environment of a command, which finds these modules wherever it is started."""
     paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-    return os.environ | {commands.STOP_WITH_INPUT: "1", "PYTHONPATH": os.pathsep.join(paths)}
+    return os.environ | {app.STOP_WITH_INPUT: "1", "PYTHONPATH": os.pathsep.join(paths)}
 
 
 def _complaint(printed: str, code: int) -> str:

@@ -19,56 +19,56 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import budget_options, commands, options, output_folders, scene_option
-from experiments.cli.late_imports import late
+from experiments.cli import app, outputs
+from experiments.cli import flags as cli_flags
+from experiments.cli import scenes as cli_scenes
+from experiments.cli.progress import ProgressBar
 from experiments.dataset import render_settings
 
 if TYPE_CHECKING:
-    from experiments.dataset import check_page, scene_check
     from experiments.dataset.check_page import SceneReport
-else:
-    check_page = late("experiments.dataset.check_page")
-    scene_check = late("experiments.dataset.scene_check")
+
+with epy.lazy_imports():
+    from experiments.dataset import check_page, scene_check
 
 _SCENES = flags.DEFINE_list("scenes", None, "Only these scenes of the folder, by name.")
 _LIMIT = flags.DEFINE_integer("limit", 3, "Only this many test images, evenly spread; 0: none.", 0)
 flags.DEFINE_alias("views", "limit")
 _OUT = flags.DEFINE_string("out", None, "Folder of the report; FOLDER if not given.")
-_OVERWRITE = options.overwrite("the report of an earlier check")
-flags.adopt_module_key_flags(budget_options)
+_OVERWRITE = cli_flags.overwrite("the report of an earlier check")
 # Diamond keeps light for so long that the tree's own cut loses 5 dB of 39, and what Cycles drops
 # after its 64 bounces another 6. Paths are to be judged here, not where they stop.
-flags.set_default(budget_options.CUT, 0.004)
-flags.set_default(budget_options.BENDS, render_settings.BOUNCES)
+_BUDGET = cli_flags.budget(cut=0.004, bends=render_settings.BOUNCES)
 # What Cycles averages over hundreds of rays aliases with few: a wall of the generator is 41 dB off
 # with 25 rays a pixel of 200 x 200, and 48 with 100.
-_RAYS_PER_PIXEL = options.rays_per_pixel(100)
+_RAYS_PER_PIXEL = cli_flags.rays_per_pixel(100)
 
 _SHOWN_COMPLAINTS = 3
 
 
 def main(folder: str) -> None:
     """Checks every scene of a folder, and writes the report."""
-    budget = dataclasses.replace(budget_options.chosen("tree"), unfinished="dark")
-    checked, side = Path(folder), options.side_of(_RAYS_PER_PIXEL.value)
+    budget = dataclasses.replace(_BUDGET.chosen("tree"), unfinished="dark")
+    checked, side = Path(folder), cli_flags.side_of(_RAYS_PER_PIXEL.value)
     out = Path(_OUT.value) if _OUT.value else checked
     page, figures = out / "check.html", out / "check.json"
     for path in (page, figures):
-        output_folders.check_file(path, overwrite=_OVERWRITE.value)
-    scene_option.check_place(folder)
+        outputs.check_file(path, overwrite=_OVERWRITE.value)
+    cli_scenes.check_place(folder)
     scenes = scene_check.find_scenes(checked, _SCENES.value)
     reports = []
-    with commands.ProgressBar("check", len(scenes)) as bar:
+    with ProgressBar("check", len(scenes)) as bar:
         for done, scene in enumerate(scenes, 1):
             reports.append(scene_check.check_scene(scene, budget, views=_LIMIT.value, side=side))
             bar.show(done, _summary(reports[-1]))
-    content = commands.string_safe([_record(report) for report in reports])
+    content = app.string_safe([_record(report) for report in reports])
     for path, text in (
         (page, check_page.write_page(reports, title=f"Check of {checked.resolve().name}")),
         (figures, json.dumps(content, indent=2, allow_nan=False) + "\n"),
     ):
-        with output_folders.fresh_file(path, overwrite=_OVERWRITE.value) as draft:
+        with outputs.fresh_file(path, overwrite=_OVERWRITE.value) as draft:
             draft.write_text(text, "utf-8")
     bad = [report for report in reports if report.complaints]
     for report in bad:
@@ -79,7 +79,7 @@ def main(folder: str) -> None:
     print(f"Figures: {figures}")
     if (scenes[0] / "transforms_train.json").is_file():
         given = (f"--scene={scenes[0]}", f"--out=runs/{scenes[0].resolve().name}")
-        print(f"Next: {commands.shell('train', *given)}")
+        print(f"Next: {app.shell('train', *given)}")
     else:
         print("Next: python -m experiments.dataset.make without --preview, for scenes to train on")
     if bad:
@@ -104,9 +104,8 @@ def _record(report: SceneReport) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    commands.run(
+    app.run(
         main,
         arguments=("FOLDER",),
-        first=("limit", "rays_per_pixel", "scenes"),
         again="it checks anew; --overwrite replaces the report.",
     )

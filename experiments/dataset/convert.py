@@ -14,32 +14,29 @@ left out, and it is said. What `scene.json` names is kept beside them.
 
 import collections
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import commands, options, scene_option
-from experiments.cli.late_imports import late
+from experiments.cli import app
+from experiments.cli import flags as cli_flags
+from experiments.cli import scenes as cli_scenes
+from experiments.cli.progress import ProgressBar
 from refref_jax.data import scene_names
 
-if TYPE_CHECKING:
+with epy.lazy_imports():
     from experiments.dataset import conversion, dataset_card, scene_folders
     from refref_jax.data import parquet_scenes
-else:
-    conversion = late("experiments.dataset.conversion")
-    dataset_card = late("experiments.dataset.dataset_card")
-    scene_folders = late("experiments.dataset.scene_folders")
-    parquet_scenes = late("refref_jax.data.parquet_scenes")
 
-_SCENE = options.scene("What to convert, one scene or a folder of them")
+_SCENE = cli_flags.scene("What to convert, one scene or a folder of them")
 _TO = flags.DEFINE_enum("to", None, ["local", "raw", "parquet"], "Layout to write.", required=True)
-_OUT = options.out("Folder to write to.")
+_OUT = cli_flags.out("Folder to write to.")
 _SCENES = flags.DEFINE_list("scenes", None, "Only these scenes of a folder; all if not given.")
 
 
 def main() -> None:
     """Converts all scenes that the options name."""
-    scene_option.check_place(_SCENE.value)
+    cli_scenes.check_place(_SCENE.value)
     layout, out = _TO.value, Path(_OUT.value)
     if layout == "parquet":
         parquet_scenes.import_parquet()  # before anything is read
@@ -50,7 +47,7 @@ def main() -> None:
     done = 0
     # What is in parquet files is unpacked first.
     images = sum(scene.images * (1 if scene.copy is None else 2) for scene in scenes)
-    with commands.ProgressBar("convert", images) as bar:
+    with ProgressBar("convert", images) as bar:
         for scene in scenes:
 
             def step(name: str = scene.name) -> None:
@@ -75,4 +72,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    commands.run(main, again="scenes that are there are refused, and never replaced.")
+    app.run(main, again="scenes that are there are refused, and never replaced.")

@@ -12,17 +12,18 @@ where it stopped: the result is the same, to the bit. What is there already is n
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
 from absl import flags
+from etils import epy
 
-from experiments.cli import choosable, command_line, commands, options, output_folders
-from experiments.cli.late_imports import late
+from experiments.cli import app, outputs
+from experiments.cli import flags as cli_flags
 from experiments.dataset.render_settings import LEAST_TEXTURE, PerSplit, RenderSettings
 from refref_jax.choices import TwoSidedRule
 from refref_jax.data.scene_names import BACKGROUNDS, SceneName
 
-if TYPE_CHECKING:
+with epy.lazy_imports():
     from experiments.dataset import (
         blender_meshes,
         catalogue,
@@ -31,22 +32,15 @@ if TYPE_CHECKING:
         production,
         scenes,
     )
-else:
-    blender_meshes = late("experiments.dataset.blender_meshes")
-    catalogue = late("experiments.dataset.catalogue")
-    contact_sheet = late("experiments.dataset.contact_sheet")
-    frame_files = late("experiments.dataset.frame_files")
-    production = late("experiments.dataset.production")
-    scenes = late("experiments.dataset.scenes")
 
-_OUT = options.out("Folder that gets a folder for each scene.")
+_OUT = cli_flags.out("Folder that gets a folder for each scene.")
 _SCENES = flags.DEFINE_string(
     "scenes",
     "all",
     "all, or names parted by commas: scenes as cube_smcvx_ball, objects as ball for all their "
     "backgrounds, or either with wildcards as 'sphere_*'.",
 )
-command_line.check(_SCENES, lambda words: scenes.choose(words, catalogue.OBJECTS))
+app.check(_SCENES, lambda words: scenes.choose(words, catalogue.OBJECTS))
 _SIZE = flags.DEFINE_integer("size", 800, "Width and height of images in pixels.", lower_bound=1)
 _SPP = flags.DEFINE_integer("spp", 512, "Samples a pixel of train and val.", lower_bound=1)
 _TEST_SPP = flags.DEFINE_integer(
@@ -57,7 +51,7 @@ _SPLIT_VIEWS = {
     split: flags.DEFINE_integer(
         f"{split}_views", None, f"Views of {split}; those of --views if not given.", lower_bound=0
     )
-    for split in choosable.SPLITS
+    for split in cli_flags.SPLITS
 }
 _WORKERS = flags.DEFINE_integer(
     "workers", None, "Processes of Blender; one for each core if not given.", lower_bound=1
@@ -96,7 +90,7 @@ def main() -> None:
     out = Path(_OUT.value) / "preview" if _PREVIEW.value else Path(_OUT.value)
     if any(scene.object == "monkey" for scene in chosen):
         blender_meshes.export_monkey(catalogue.SUZANNE, blender=blender)
-    with commands.Interrupt() as interrupt:
+    with app.Interrupt() as interrupt:
         whole = production.produce(
             out,
             chosen,
@@ -106,21 +100,21 @@ def main() -> None:
             workers=_WORKERS.value,
             stopped=lambda: interrupt.requested,
         )
-    output_folders.note(out, __name__)
+    outputs.note(out, __name__)
     if not whole:
         print("Stopped. The same command goes on from here.")
-        sys.exit(commands.INTERRUPTED)
+        sys.exit(app.INTERRUPTED)
     if _PREVIEW.value:
         _write_contact_sheets(out, chosen, settings)
     print(f"Scenes: {out / str(chosen[0])}" + f" and {len(chosen) - 1} more" * (len(chosen) > 1))
-    print(f"Next: {commands.shell('dataset.check', str(out))}")
+    print(f"Next: {app.shell('dataset.check', str(out))}")
 
 
 def _settings() -> RenderSettings:
     test_spp = _SPP.value if _TEST_SPP.value is None else _TEST_SPP.value
     views = (
         _VIEWS.value if _SPLIT_VIEWS[split].value is None else _SPLIT_VIEWS[split].value
-        for split in choosable.SPLITS
+        for split in cli_flags.SPLITS
     )
     return RenderSettings(
         size=_SIZE.value,
@@ -146,8 +140,7 @@ def _write_contact_sheets(out: Path, chosen: Sequence[SceneName], settings: Rend
 
 
 if __name__ == "__main__":
-    commands.run(
+    app.run(
         main,
-        first=("scenes", "size", "views", "spp", "workers", "preview"),
         again="it goes on; views that are there are not rendered again.",
     )

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from experiments.cli import commands
+from experiments.cli.progress import ProgressBar
 from experiments.dataset import frame_files, scene_setup, views
 from experiments.dataset.parts import Object
 from experiments.dataset.render_settings import RenderSettings
@@ -71,7 +71,7 @@ def produce(
 def _render(pool: Pool, there: int, total: int, stopped: Callable[[], bool]) -> int:
     """Renders, and returns how many views were."""
     started, done = time.monotonic(), 0
-    with commands.ProgressBar("render", total, there) as bar, pool:
+    with ProgressBar("render", total, there) as bar, pool:
         for done, task in enumerate(pool.run(), start=1):
             pace = (time.monotonic() - started) / done
             bar.show(there + done, f"{task.name}  {pace:.1f} s a view")

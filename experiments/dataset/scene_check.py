@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.cli import command_line
+from experiments.cli import app
 from experiments.dataset import checks
 from experiments.dataset.check_page import SceneReport
 from refref_jax.optics.budgets import Budget
@@ -29,7 +29,7 @@ def find_scenes(folder: Path, names: list[str] | None) -> list[Path]:
         )
     there = {path.resolve().name for path in found}
     if missing := sorted(set(names or ()) - there):
-        near = command_line.did_you_mean(missing[0], sorted(there))
+        near = app.did_you_mean(missing[0], sorted(there))
         raise ValueError(
             f"{folder} holds no scene {missing[0]}.{near or ' See the names of its folders.'}"
         )

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
-from experiments.cli import scene_option
+from experiments.cli import scenes as cli_scenes
 from experiments.dataset import scene_contents
 from refref_jax.data import parquet_scenes, published_files, scene_names, scene_source
 from refref_jax.data.errors import SceneError
@@ -43,7 +43,7 @@ def find(place: str, chosen: Sequence[str] | None = None) -> list[FoundScene]:
       SceneError: if there are none, or not those that are wanted, or one is broken.
     """
     if place.startswith("hf:"):
-        return _chosen([_in_folder(scene_option.opened(place))], chosen, place)
+        return _chosen([_in_folder(cli_scenes.opened(place))], chosen, place)
     top = Path(place)
     if any(top.glob("transforms_*.json")):
         return _chosen([_in_folder(top)], chosen, place)

@@ -3,7 +3,7 @@
 import fnmatch
 from collections.abc import Mapping
 
-from experiments.cli import command_line
+from experiments.cli import app
 from experiments.dataset.parts import Object
 from refref_jax.data.scene_names import BACKGROUNDS, SceneName
 
@@ -37,7 +37,7 @@ def choose(text: str, objects: Mapping[str, Object]) -> list[SceneName]:
         fitting = fitting or [s for s in scenes if fnmatch.fnmatchcase(s.object, pattern)]
         if not fitting:
             names = [*map(str, scenes), *objects]
-            near = command_line.did_you_mean(pattern, names, most=3)
+            near = app.did_you_mean(pattern, names, most=3)
             raise ValueError(
                 f"No scene or object is called {pattern!r}.{near or f' Names are as {names[0]}.'} "
                 "All of them: all."

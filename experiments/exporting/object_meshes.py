@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.cli import output_folders
+from experiments.cli import outputs
 from experiments.exporting.field_mesh import split_parts
 from experiments.r3f import object_source, records
 from refref_jax.data import stored_normals
@@ -44,9 +44,9 @@ def write(run: Path, out: Path, *, overwrite: bool) -> list[Path]:
     if len(meshes) > 1:
         paths = [out.with_stem(f"{out.stem}_{number}") for number in range(len(meshes))]
     for path in paths:
-        output_folders.check_file(path, overwrite=overwrite)
+        outputs.check_file(path, overwrite=overwrite)
     for path, mesh in zip(paths, meshes, strict=True):
-        with output_folders.fresh_file(path, overwrite=overwrite) as draft:
+        with outputs.fresh_file(path, overwrite=overwrite) as draft:
             stored_normals.write_mesh(draft, *mesh)
     return paths
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.cli import commands
+from experiments.cli.progress import ProgressBar
 from experiments.r3f.records import GeometryFacts, ReconstructionConfig
 from refref_jax import atomic_files
 from refref_jax.data import local_layout, scene_names, stored_normals
@@ -47,7 +47,7 @@ def _hull(views: Views, names: Sequence[str], config: ReconstructionConfig) -> G
 def _occupancy(views: Views, names: Sequence[str], config: ReconstructionConfig) -> Grid:
     del names
     settings = OccupancyTrainingConfig()
-    with commands.ProgressBar("occupancy", settings.steps) as bar:
+    with ProgressBar("occupancy", settings.steps) as bar:
         return occupancy.fit(
             *views,
             config=settings,

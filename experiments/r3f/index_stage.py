@@ -16,7 +16,8 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from experiments.cli import commands
+from experiments.cli import app
+from experiments.cli.progress import ProgressBar
 from experiments.figures import style as plotting
 from experiments.figures.style import COLOURS, pyplot
 from refref_jax.choices import Space
@@ -139,7 +140,7 @@ def run(
     model = learn_background(scene, folder, seed=seed, space=space, radius=radius, steps=steps)
     evidence, views = look(scene, "train", model, seed=seed, rays=rays)
     search = IndexSearch()
-    with commands.ProgressBar("index", most_looks(search, start=start)) as bar:
+    with ProgressBar("index", most_looks(search, start=start)) as bar:
         found = estimate_index(
             evidence,
             body_geometry(mesh, _BEFORE),
@@ -201,7 +202,7 @@ def learn_background(
             f"{run} was begun with another --background or --radius than are given now. Give those "
             "again, or remove that folder to have the background learned anew."
         )
-    with commands.Interrupt() as interrupt, commands.ProgressBar("train", steps) as bar:
+    with app.Interrupt() as interrupt, ProgressBar("train", steps) as bar:
         ended = fit.train(
             run,
             scene=scene,

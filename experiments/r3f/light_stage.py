@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.cli import commands
+from experiments.cli.progress import ProgressBar
 from experiments.r3f import index_stage
 from experiments.r3f.index_stage import BodyPixels
 from experiments.r3f.records import IndexFacts, LightFacts
@@ -55,7 +55,7 @@ def run(
         settings = dataclasses.replace(settings, index_stride=0.0)
     judges = find_judges(scene, model, seed=seed)
     seen = index_stage.look(scene, "train", model, seed=seed, rays=_SEEN)
-    with commands.ProgressBar("light", steps) as bar:
+    with ProgressBar("light", steps) as bar:
         found = refine_by_light(
             mesh,
             index,

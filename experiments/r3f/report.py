@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from experiments.cli import commands
+from experiments.cli import app
 from experiments.r3f import object_source, report_figures
 from experiments.r3f.records import DistanceFacts, IndexFacts, Reconstruction, ReportFacts
 from experiments.r3f.report_figures import Outline, SurfaceView, Window
@@ -219,7 +219,7 @@ def markdown(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
         *_pictures_of_index(out),
         "## How it was made\n\n" + _making(found),
         "## Go on\n\n```bash\n"
-        + commands.shell("train", "--scene=SCENE", "--reconstruction=OUT", "--out=RUN")
+        + app.shell("train", "--scene=SCENE", "--reconstruction=OUT", "--out=RUN")
         + "\n```\n\nwith SCENE the scene's folder and OUT this one.",
     ]
     return "\n\n".join(parts) + "\n"

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments.cli import reconstruction_options
+from experiments.cli import flags as cli_flags
+from experiments.runs import refraction_indices
 from refref_jax.training.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -22,13 +23,8 @@ METHOD = flags.DEFINE_enum(
     "masks alone, from which one object and its index are reconstructed into {out}/r3f. Then --ior "
     "is that object's index, as 1.5; it is estimated if not given.",
 )
-FLAGS = (
-    METHOD,
-    reconstruction_options.GEOMETRY,
-    reconstruction_options.RESOLUTION,
-    reconstruction_options.OUTLIERS,
-    reconstruction_options.LIGHT_STEPS,
-)
+_RECONSTRUCTED = cli_flags.reconstruction()
+FLAGS = (METHOD, *_RECONSTRUCTED)
 """Flags that a run is begun with, and can not change when it is resumed."""
 
 FOLDER = "r3f"
@@ -93,7 +89,7 @@ def given_index(ior: Sequence[str]) -> float | None:
             f"--ior={ior[-1]}, but there is one reconstructed object, without a name. Give its "
             "index alone, once, as in --ior=1.5."
         )
-    return reconstruction_options.parse_index(ior[0])
+    return refraction_indices.parse(ior[0])
 
 
 def find(run: Path, config: TrainConfig, *, ior: Sequence[str], resume: bool) -> MeshPart | None:
@@ -133,7 +129,7 @@ def find(run: Path, config: TrainConfig, *, ior: Sequence[str], resume: bool) ->
         raise ValueError(
             f"{out} holds a reconstruction already. Continue with --resume, or give another --out."
         )
-    asked = reconstruction_options.chosen(
+    asked = _RECONSTRUCTED.chosen(
         index=index, seed=config.seed, space=config.scene.space, radius=config.scene.radius
     )
     try:

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from experiments.cli import view_numbers
+from experiments.runs import view_numbers
 from refref_jax import metrics
 from refref_jax.data import background, containment, local_layout, meshes, rule_advice, scene_names
 from refref_jax.data.containment import Containment

@@ -8,7 +8,7 @@ listed.
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from experiments.cli import command_line
+from experiments.cli import app
 from refref_jax.fields import registry
 from refref_jax.optics.budgets import BUDGETS
 from refref_jax.training import resolve
@@ -96,7 +96,7 @@ def sweep(
     if knobs is not None:
         if unknown := [knob for knob in knobs if knob not in swept]:
             raise ValueError(
-                f"There is no knob {unknown[0]}.{command_line.did_you_mean(unknown[0], swept)} "
+                f"There is no knob {unknown[0]}.{app.did_you_mean(unknown[0], swept)} "
                 f"Choose from {', '.join(swept)}, or give its "
                 f"values with --values={unknown[0]}=A/B."
             )
@@ -178,7 +178,7 @@ def choose(points: Sequence[Point], names: Sequence[str]) -> list[Point]:
     """
     known = [point.name for point in points]
     if unknown := [name for name in names if name not in known]:
-        near = command_line.did_you_mean(unknown[0], known)
+        near = app.did_you_mean(unknown[0], known)
         raise ValueError(f"There is no point {unknown[0]}.{near} Choose from {', '.join(known)}.")
     return [point for point in points if point.name in {BASE, *names}]
 

@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from experiments.cli import commands
+from experiments.cli import app
 from experiments.cli.subprocesses import RunFailedError
 from experiments.runs import measured_runs as trained_runs
 from experiments.runs.measured_runs import Training
@@ -159,8 +159,8 @@ def told(choice: Choice, machine: Machine, scene: Path) -> list[str]:
 
 def _commands(row: Row, scene: Path) -> list[str]:
     run = f"runs/{scene_names.of_folder(scene)}"
-    train = commands.shell("train", f"--scene={scene}", f"--out={run}", *row.training.split())
-    evaluate = commands.shell("evaluate", f"--run={run}", "--split=test", *row.evaluation.split())
+    train = app.shell("train", f"--scene={scene}", f"--out={run}", *row.training.split())
+    evaluate = app.shell("evaluate", f"--run={run}", "--split=test", *row.evaluation.split())
     return [f"  {train}", f"  {evaluate}"]
 
 

@@ -5,7 +5,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from experiments.cli import commands
+from experiments.cli.progress import ProgressBar
 from experiments.cli.subprocesses import RunFailedError
 from experiments.runs import measured_runs as trained_runs
 from experiments.sweeps import points as trade_points
@@ -42,7 +42,7 @@ def sweep(
     out.mkdir(parents=True, exist_ok=True)
     rows = {row.name: row for row in earlier}
     failed: dict[str, str] = {}
-    with commands.ProgressBar("trade-off", len(points)) as bar:
+    with ProgressBar("trade-off", len(points)) as bar:
         for done, point in enumerate(points, 1):
             try:
                 row = measure_(point)

@@ -287,9 +287,9 @@ def measure_distances(
     return result
 
 
-def mean_of(per_image: Sequence[Mapping[str, Any]], key: str) -> float | None:
+def mean_of(per_image: Sequence[Mapping[str, Any]], measure: str) -> float | None:
     """Returns the mean of a measure over the images that have it."""
-    values = [image[key] for image in per_image if image[key] is not None]
+    values = [image[measure] for image in per_image if image[measure] is not None]
     return float(np.mean(values)) if values else None
 
 

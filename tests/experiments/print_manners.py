@@ -16,17 +16,18 @@ import sys
 from unittest import mock
 
 import numpy  # noqa: F401  so that it is imported once
-from absl import app, flags
+from absl import app as absl_app
+from absl import flags
 
-from experiments.cli import command_help, commands
+from experiments.cli import app
 
-_run = commands.run
+_run = app.run
 
 
 def _answer(main, settings, words):
     for name in flags.FLAGS:
         flags.FLAGS[name].unparse()
-    app._run_init.done = app._register_and_parse_flags_with_usage.done = False
+    absl_app._run_init.done = absl_app._register_and_parse_flags_with_usage.done = False
     sys.argv[1:] = words
     out, err, status = io.StringIO(), io.StringIO(), None
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -47,16 +48,20 @@ def _right_value(flag):
     return "x." + endings[0].strip(".").lower() if endings else "x"
 
 
+def _is_required(flag):
+    return any("must have a value" in (each.message or "") for each in flag.validators)
+
+
 def _options(module):
     return {
         name: {
             "choices": getattr(flag.parser, "enum_values", []),
-            "required": command_help.is_required(flag),
+            "alias": flag.help.startswith("Alias for"),
+            "required": _is_required(flag),
             "value": _right_value(flag),
-            "default": flag.default,
             "least": getattr(flag.parser, "lower_bound", None),
         }
-        for name, flag in command_help.options_of(module).items()
+        for name, flag in app.flags_of(module).items()
     }
 
 
@@ -67,22 +72,21 @@ def _right(options, arguments):
 
 
 def _wrong(options, arguments):
-    """Returns words with one mistake each, and what is to be suggested."""
+    """Returns words with one mistake each, and what is to be told of it."""
     given = _right(options, arguments)
     longest = max(options, key=len)
-    yield [f"--{longest[:-2]}{longest[-1]}=1"], f"Did you mean --{longest}?"
+    yield [f"--{longest[:-2]}{longest[-1]}=1"], f" {longest}"
     yield [*given, f"{longest}=1"], f"Did you mean --{longest}=1?"
     for name, option in options.items():
         if option["choices"]:
-            value = max(option["choices"], key=len)
-            yield [f"--{name}={value[:-2]}{value[-1]}"], f"Did you mean {value}?"
+            yield [f"--{name}=zzz"], "value should be one of <"
         elif option["required"]:
             yield (
                 [word for word in given if not word.startswith(f"--{name}=")],
-                f"--{name} must be given",
+                f"Flag --{name} must have a value",
             )
-        if option["least"] is not None:
-            yield [*given, f"--{name}={option['least'] - 1}"], "is out of range. Give "
+        if option["least"] is not None and not option["alias"]:
+            yield [*given, f"--{name}={option['least'] - 1}"], f"flag --{name}="
 
 
 def _interrupted(main, settings, words):
@@ -115,11 +119,10 @@ def _try(command, cases):
         ]
         found.update(
             options=options,
-            settings={name: each for name, each in settings.items() if not callable(each)},
+            settings=settings,
             documented=module.__doc__,
             stray=stray,
             help=_answer(main, settings, ["--help"]),
-            full=_answer(main, settings, ["--helpfull"]),
             wrong=[(meant, _answer(main, settings, words)) for words, meant in wrong],
             interrupted=_interrupted(main, settings, _right(options, arguments)),
             jax="jax" in sys.modules,
@@ -127,7 +130,7 @@ def _try(command, cases):
             jax_after_cases="jax" in sys.modules,
         )
 
-    commands.run = record
+    app.run = record
     runpy.run_module(f"experiments.{command}", run_name="__main__", alter_sys=True)
     return found
 

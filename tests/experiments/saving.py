@@ -11,7 +11,7 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.cli import commands
+from experiments.cli import app
 
 _FOLDER = flags.DEFINE_string("folder", None, "Where it writes.")
 
@@ -19,7 +19,7 @@ _FOLDER = flags.DEFINE_string("folder", None, "Where it writes.")
 def main():
     folder = Path(_FOLDER.value)
     end = time.monotonic() + 60.0
-    with commands.Interrupt() as interrupt:
+    with app.Interrupt() as interrupt:
         (folder / "pid").write_text(str(os.getpid()))
         (folder / "ready").touch()
         while not interrupt.requested and time.monotonic() < end:
@@ -33,4 +33,4 @@ def main():
 
 
 if __name__ == "__main__":
-    commands.run(main)
+    app.run(main)

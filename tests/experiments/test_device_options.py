@@ -11,9 +11,12 @@ import pytest
 from absl import flags
 from absl.testing import flagsaver
 
-from experiments.cli import device_options
+from experiments.cli import flags as cli_flags
+from experiments.runs import processes
 from tests import code_generator
 from tests.experiments.command import ROOT, run_command
+
+_DEVICES = cli_flags.devices()
 
 
 @pytest.fixture(autouse=True)
@@ -28,35 +31,31 @@ def _parsed():
         ({"process": 0}, "Say how many with --processes"),
         ({"processes": 2, "process": 0}, "Give all of them the same --coordinator"),
         ({"processes": 2, "process": 0, "coordinator": "host"}, "the same --coordinator"),
-        ({"processes": 2, "coordinator": "host:1"}, "Give this one --process with 0 to 1"),
+        ({"processes": 2, "coordinator": "host:1"}, "Give this process --process with 0 to 1"),
         ({"processes": 2, "process": 2, "coordinator": "host:1"}, "--process with 0 to 1"),
+        ({"devices": "many"}, "devices=many: Give a number, or all"),
+        ({"devices": "-1"}, "devices=-1: Give a number, or all"),
     ],
 )
-def test_options_that_make_no_sense_are_refused(options, message):
-    with flagsaver.flagsaver(**options), pytest.raises(ValueError, match=message):
-        device_options.connect()
-
-
-@pytest.mark.parametrize("devices", ["many", "-1"])
-def test_what_is_no_number_of_devices_is_not_taken(devices):
+def test_options_that_make_no_sense_are_not_taken(options, message):
     with (
-        pytest.raises(flags.IllegalFlagValueError, match=f"--devices={devices} is no number"),
-        flagsaver.flagsaver(devices=devices),
+        pytest.raises(flags.IllegalFlagValueError, match=message),
+        flagsaver.flagsaver(**options),
     ):
         pass
 
 
 def test_more_devices_than_there_are_are_refused():
     with flagsaver.flagsaver(devices="4096"):
-        device_options.connect()
+        processes.connect(_DEVICES)
         with pytest.raises(ValueError, match=r"^There .*, not 4096\. Give 1 to \d+, or all"):
-            device_options.mesh()
+            processes.mesh(_DEVICES)
 
 
 def test_one_process_connects_to_nobody_and_speaks(capsys):
-    device_options.connect()
-    assert not device_options.together() and device_options.mesh() is None
-    with device_options.first_speaks():
+    processes.connect(_DEVICES)
+    assert not processes.together(_DEVICES) and processes.mesh(_DEVICES) is None
+    with processes.first_speaks():
         print("heard")
     assert capsys.readouterr().out == "heard\n"
 

@@ -133,7 +133,7 @@ from absl import flags
 from experiments import glass_figures
 draw = {name: lambda path: path.write_text("drawn") for name in glass_figures.FIGURES}
 glass_figures._drawers = lambda folder, indices: draw
-glass_figures.scene_option.opened = Path  # so that JAX is not imported
+glass_figures.cli_scenes.opened = Path  # so that JAX is not imported
 flags.FLAGS(["glass_figures", *sys.argv[1:]])
 glass_figures.main()
 """

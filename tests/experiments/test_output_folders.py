@@ -6,18 +6,13 @@ import os
 
 import pytest
 
-from experiments.cli import command_line, output_folders
+from experiments.cli import outputs
 
 _WRITES = ("rgb", "metrics.json")
 
 
-@pytest.fixture(autouse=True)
-def options(monkeypatch):
-    monkeypatch.setattr(command_line, "resolved", lambda module: {"chunk": 4096, "step": None})
-
-
 def _fresh(out, *, writes=_WRITES, overwrite=False):
-    return output_folders.fresh(out, module=__name__, writes=writes, overwrite=overwrite)
+    return outputs.fresh(out, module=__name__, writes=writes, overwrite=overwrite)
 
 
 def _write(out, names, *, writes=_WRITES, overwrite):
@@ -28,7 +23,7 @@ def _write(out, names, *, writes=_WRITES, overwrite):
 
 
 def _noted(out):
-    return json.loads((out / output_folders.NOTE).read_text())["files"]
+    return json.loads((out / outputs.NOTE).read_text())["files"]
 
 
 def _files(folder):
@@ -39,9 +34,9 @@ def test_what_is_written_appears_with_a_note(tmp_path):
     out = tmp_path / "a" / "out"
     _write(out, ["rgb/0.png", "metrics.json"], overwrite=False)
     assert _files(tmp_path / "a") == {"out/rgb/0.png", "out/metrics.json", "out/command.json"}
-    assert json.loads((out / output_folders.NOTE).read_text()) == {
+    assert json.loads((out / outputs.NOTE).read_text()) == {
         "command": __name__,
-        "options": {"chunk": 4096, "step": None},
+        "options": {},
         "files": ["metrics.json", "rgb/0.png"],
     }
 
@@ -71,7 +66,7 @@ def test_nothing_of_others_is_replaced_even_if_asked(tmp_path):
         {"command": __name__, "options": {}, "files": [str(tmp_path / "secret")]},
         ["no record"],
     ):
-        (out / output_folders.NOTE).write_text(json.dumps(note))
+        (out / outputs.NOTE).write_text(json.dumps(note))
         with pytest.raises(ValueError, match="not of this command"):
             _write(out, ["rgb/0.png"], overwrite=True)
     assert (out / "rgb" / "0.png").read_text() == "mine"
@@ -94,14 +89,14 @@ def test_a_file_that_came_meanwhile_stays(tmp_path):
 def test_an_interruption_leaves_what_was_there(tmp_path, error):
     out = tmp_path / "out"
     _write(out, ["metrics.json"], overwrite=False)
-    before = (out / output_folders.NOTE).read_bytes()
+    before = (out / outputs.NOTE).read_bytes()
     with pytest.raises(error), _fresh(out, overwrite=True) as draft:
         (draft / "rgb").mkdir()
         (draft / "rgb" / "0.png").write_text("half")
         raise error
     assert _files(tmp_path) == {"out/metrics.json", "out/command.json"}
-    assert (out / output_folders.NOTE).read_bytes() == before
-    with pytest.raises(error), output_folders.fresh_file(out / "x", overwrite=False) as path:
+    assert (out / outputs.NOTE).read_bytes() == before
+    with pytest.raises(error), outputs.fresh_file(out / "x", overwrite=False) as path:
         path.write_text("half")
         raise error
     assert not (out / "x").exists() and _files(out) == {"metrics.json", "command.json"}
@@ -127,14 +122,14 @@ def test_two_calls_at_once_do_not_share_a_folder(tmp_path):
 
 
 def test_who_waited_for_another_looks_again(tmp_path, monkeypatch):
-    out, hold = tmp_path / "out", output_folders.atomic_files.hold
+    out, hold = tmp_path / "out", outputs.atomic_files.hold
 
     def hold_after_another(folder):
-        monkeypatch.setattr(output_folders.atomic_files, "hold", hold)
+        monkeypatch.setattr(outputs.atomic_files, "hold", hold)
         _write(out, ["metrics.json"], overwrite=False)
         return hold(folder)
 
-    monkeypatch.setattr(output_folders.atomic_files, "hold", hold_after_another)
+    monkeypatch.setattr(outputs.atomic_files, "hold", hold_after_another)
     with pytest.raises(ValueError, match="Give --overwrite"), _fresh(out):
         raise AssertionError("worked in vain")
     assert _files(out) == {"metrics.json", "command.json"}
@@ -158,7 +153,7 @@ def test_a_foreign_file_beside_an_own_note_is_told_before_the_work(tmp_path):
     _write(out, ["metrics.json"], overwrite=False)
     (out / "rgb").mkdir()
     with pytest.raises(ValueError, match=r"out/rgb is not of this command"):
-        output_folders.replaceable(out, module=__name__, writes=_WRITES, overwrite=True)
+        outputs.replaceable(out, module=__name__, writes=_WRITES, overwrite=True)
 
 
 def test_an_own_note_of_files_that_are_gone_is_no_obstacle(tmp_path):
@@ -206,7 +201,7 @@ def test_who_is_killed_while_the_first_files_are_moved_can_be_repeated(
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(os, "replace", replace_some)
         # Who is killed tidies nothing up.
-        patch.setattr(output_folders.shutil, "rmtree", lambda *folders, **options: None)
+        patch.setattr(outputs.shutil, "rmtree", lambda *folders, **options: None)
         _write(out, names, overwrite=False)
     assert (out / ".unfinished").is_dir() and len(_files(out) & set(names)) == moved - 1
     _write(out, names, overwrite=True)
@@ -235,9 +230,9 @@ def test_files_and_folders_are_not_taken_for_each_other(tmp_path):
     with pytest.raises(ValueError, match="is a file, and a folder is needed"):
         _write(tmp_path / "file", [], overwrite=True)
     with pytest.raises(ValueError, match="is a folder, and a file"):
-        output_folders.check_file(tmp_path / "folder", overwrite=True)
+        outputs.check_file(tmp_path / "folder", overwrite=True)
     with pytest.raises(ValueError, match="--overwrite to replace it"):
-        output_folders.check_file(tmp_path / "file", overwrite=False)
-    with output_folders.fresh_file(tmp_path / "file", overwrite=True) as path:
+        outputs.check_file(tmp_path / "file", overwrite=False)
+    with outputs.fresh_file(tmp_path / "file", overwrite=True) as path:
         path.write_text("new")
     assert (tmp_path / "file").read_text() == "new"

@@ -1,12 +1,14 @@
 import pytest
 from absl import flags
 
-from experiments.cli import space_options
+from experiments.cli import flags as cli_flags
+
+_SPACE = cli_flags.space()
 
 
 @pytest.mark.parametrize("radius", ["inf", "nan", "0", "-3"])
 def test_a_radius_is_a_finite_positive_length(radius):
     values = flags.FlagValues()
-    values[space_options.RADIUS.name] = flags.FLAGS[space_options.RADIUS.name]
+    values[_SPACE.radius.name] = flags.FLAGS[_SPACE.radius.name]
     with pytest.raises(flags.IllegalFlagValueError):
         values(["program", f"--radius={radius}"])

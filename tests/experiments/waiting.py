@@ -9,7 +9,7 @@ import sys
 import threading
 from pathlib import Path
 
-from experiments.cli import commands
+from experiments.cli import app
 from experiments.cli import subprocesses as child_process
 
 
@@ -27,7 +27,7 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     child_process.command_line = _command_line
-    commands.stop_at_kill()
+    app.stop_at_kill()
     worker = threading.Thread(target=_work, args=[Path(sys.argv[1])])
     try:
         worker.start()
@@ -35,4 +35,4 @@ if __name__ == "__main__":
     except KeyboardInterrupt:
         with child_process.stopping():
             worker.join()
-        sys.exit(commands.INTERRUPTED)
+        sys.exit(app.INTERRUPTED)

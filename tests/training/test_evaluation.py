@@ -1,8 +1,11 @@
+import sys
+
 import jax
 import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+from experiments.runs import perceptual
 from refref_jax import metrics
 from refref_jax.data import local_layout
 from refref_jax.data.local_layout import Frames
@@ -203,3 +206,16 @@ def test_surfaces_are_known_where_light_bends():
 def test_wrong_arguments_are_refused_before_anything_is_read(wrong, says):
     with pytest.raises(ValueError, match=says):
         measures.evaluate(_model(STRAIGHT), "nowhere", **wrong)
+
+
+def test_what_is_not_at_hand_is_warned_of_once(monkeypatch, capsys, tmp_path):
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    assert perceptual.chosen(None) == Perceptual(None, None)
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith("warning: LPIPS") and "docs/metrics.md" in first
+    assert second.startswith("warning: FLIP") and "pip install -e '.[flip]'" in second
+    with pytest.raises(ValueError, match=r"none\.npz can not be read"):
+        perceptual.chosen(str(tmp_path / "none.npz"))
+    weights = made_lpips.write(tmp_path / "weights.npz")
+    assert perceptual.chosen(str(weights)).lpips is not None
+    assert "LPIPS" not in capsys.readouterr().out

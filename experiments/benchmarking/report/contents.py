@@ -9,7 +9,7 @@ from experiments.benchmarking.jobs import Skipped
 from experiments.benchmarking.records import Record
 from experiments.benchmarking.settings import Settings
 from experiments.benchmarking.tables import Table
-from experiments.cli import commands
+from experiments.cli import app
 from refref_jax.data import transforms
 
 
@@ -114,7 +114,7 @@ def _result(job: dict[str, Any], moved: dict[str, Path]) -> Result:
     was = Path(record.scene_path)
     curve = tuple(
         Point(point["step"], point["seconds"], point["psnr"])
-        for point in commands.from_string_safe(job["curve"])
+        for point in app.from_string_safe(job["curve"])
         if {"step", "seconds", "psnr"} <= set(point)
     )
     return Result(record, curve, (moved.get(record.scene, was), was))

@@ -10,7 +10,7 @@ from experiments.benchmarking.report import cases, contents, overview, scene_pag
 from experiments.benchmarking.report.contents import Contents, Scene
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.scene_pages import Page
-from experiments.cli import commands
+from experiments.cli.progress import ProgressBar
 from experiments.figures.style import COLOURS
 from refref_jax import atomic_files
 
@@ -44,7 +44,7 @@ def write(out: Path, *, views: int, edge: int) -> Path:
     everything = contents.read(out)
     count = shown_views(everything.scenes, views)
     pages: dict[str, Page] = {}
-    with commands.ProgressBar("report", len(everything.scenes)) as bar:
+    with ProgressBar("report", len(everything.scenes)) as bar:
         for i, scene in enumerate(everything.scenes):
             chosen = cases.choose_views(scene, count)
             pages[scene.name] = scene_pages.show(out, scene, chosen, edge=edge, prefix=f"s{i}")

@@ -13,7 +13,7 @@ import sys
 from absl import flags
 
 from experiments import benchmark
-from experiments.cli import command_line
+from experiments.cli import app
 from experiments.cli import subprocesses as child_process
 from tests.experiments.benchmarking.conftest import stand_in_line
 
@@ -25,12 +25,11 @@ def _answer(request):
     out, err, status = io.StringIO(), io.StringIO(), 0
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            words = ["benchmark", *request["words"]]
-            command_line.read(words, benchmark, first=(), again="")
+            app.parse(["benchmark", *request["words"]])
             benchmark.main()
         except SystemExit as end:
             status = end.code
-        except (ValueError, OSError) as error:  # as `commands.run` has it
+        except (ValueError, OSError) as error:  # as `app.run` has it
             print(f"error: {error}", file=sys.stderr)
             status = 2
     return {"status": status, "stdout": out.getvalue(), "stderr": err.getvalue()}

@@ -16,7 +16,7 @@ from experiments.benchmarking import (
     settings,
 )
 from experiments.benchmarking.methods import METHODS, RECONSTRUCTION
-from experiments.cli import scene_option
+from experiments.cli import scenes as cli_scenes
 from refref_jax import atomic_files
 from tests.experiments.benchmarking.made_records import SETTINGS
 from tests.experiments.benchmarking.made_scenes import write_scene
@@ -146,7 +146,7 @@ def test_a_folder_whose_name_looks_like_wildcards_is_taken_as_it_is(tmp_path):
     assert found.path == str(tmp_path / "ball1")
     (tmp_path / "no[1]scene").mkdir()
     with pytest.raises(ValueError, match=r"scene/transforms_train\.json does not exist"):
-        scene_option.check_all([str(tmp_path / "no[1]scene")])
+        cli_scenes.check_all([str(tmp_path / "no[1]scene")])
 
 
 def test_a_benchmark_grows_but_does_not_change(tmp_path):

@@ -21,9 +21,10 @@ from refref_jax.training import fit, run_folder
 def _begin(options):
     for name in flags.FLAGS:
         flags.FLAGS[name].unparse()
-    flags.FLAGS(["train", *options])
-    run, printed = Path(flags.FLAGS.out), io.StringIO()
+    printed = io.StringIO()
     try:
+        flags.FLAGS(["train", *options])
+        run = Path(flags.FLAGS.out)
         with contextlib.redirect_stdout(printed):
             train.check_flags()
             train._train(run)

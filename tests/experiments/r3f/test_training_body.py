@@ -115,7 +115,7 @@ def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
         ("no effect of oracle", "add --method=r3f"),
         ("straight", "--paths=straight knows of no objects"),
         ("nothing there", "nowhere holds no reconstruction"),
-        ("outliers of no hull", "--outliers=1 has no effect on --geometry=occupancy"),
+        ("outliers of no hull", "geometry=occupancy, outliers=1: --outliers has no effect"),
         ("run in its body", "is the reconstruction itself"),
         ("r3f begun anew", "holds a run already"),
         ("r3f with another grid", "ior 1.5, not 1.6"),

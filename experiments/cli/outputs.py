@@ -2,9 +2,9 @@
 
 A command writes its files into a draft inside its folder, which no other process may write to
 meanwhile, and moves them to their places when it has ended well. With them goes `command.json`: the
-command, all options of its last call, and the files that are its own. Only with --overwrite, and
-only files that are listed there, are replaced, and of these only those by whose names the call
-itself writes. Whatever else lies in the folder stays.
+command, all flags of its last call, and the files that are its own. Only with --overwrite are files
+replaced, of those that are listed there and that the call itself writes. Whatever else lies in the
+folder stays.
 """
 
 import contextlib
@@ -13,9 +13,8 @@ import shutil
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
-from experiments.cli import command_line
+from experiments.cli import app
 from refref_jax import atomic_files
 
 NOTE = "command.json"
@@ -30,35 +29,34 @@ def fresh(out: Path, *, module: str, writes: Sequence[str], overwrite: bool) -> 
 
     Args:
       out: folder of the command, which may hold other things too.
-      module: `__name__` of the command, whose options are noted.
-      writes: names in the folder that this call of the command gives to what it writes.
+      module: `__name__` of the command, whose flags are noted.
+      writes: names in the folder that this call of the command writes.
       overwrite: whether results of an earlier call may be replaced.
 
     Raises:
-      ValueError: if there is anything in the place that may not be replaced, or another process
-        writes there.
+      ValueError: if anything there may not be replaced, or another process writes there.
     """
-    replaceable(out, module=module, writes=writes, overwrite=overwrite)
-    with _held(out):
-        # Looked at again: another process may have written meanwhile.
-        earlier = replaceable(out, module=module, writes=writes, overwrite=overwrite)
-        draft = out / _DRAFT
-        shutil.rmtree(draft, ignore_errors=True)
-        draft.mkdir()
+    place = {"module": module, "writes": writes, "overwrite": overwrite}
+    replaceable(out, **place)
+    existed, draft = out.exists(), out / _DRAFT
+    out.mkdir(parents=True, exist_ok=True)
+    with atomic_files.hold(out):
         try:
+            # Looked at again: another process may have written meanwhile.
+            earlier = replaceable(out, **place)
+            shutil.rmtree(draft, ignore_errors=True)
+            draft.mkdir()
             yield draft
             _take_place(draft, out, module, earlier)
         finally:
             shutil.rmtree(draft, ignore_errors=True)
+            if not existed:
+                _remove_empty(out)
 
 
 @contextlib.contextmanager
 def fresh_file(path: Path, *, overwrite: bool) -> Iterator[Path]:
-    """Yields the path of a file that takes the place of `path` when the context ends well.
-
-    Raises:
-      ValueError: if there is something already, and it is not to be replaced.
-    """
+    """Yields the path of a file that takes the place of `path`, if that may be, at a good end."""
     check_file(path, overwrite=overwrite)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_files.written_file(path) as draft:
@@ -66,11 +64,7 @@ def fresh_file(path: Path, *, overwrite: bool) -> Iterator[Path]:
 
 
 def check_file(path: Path, *, overwrite: bool) -> None:
-    """Refuses to replace a file without being asked to, and a folder at all.
-
-    Raises:
-      ValueError: if there is one.
-    """
+    """Refuses, by a `ValueError`, to replace a file without being asked to, and a folder at all."""
     if path.is_dir():
         raise ValueError(f"{path} is a folder, and a file is to be written. Give another name.")
     if path.exists() and not overwrite:
@@ -81,8 +75,8 @@ def note(out: Path, module: str, files: Iterable[Path] = ()) -> None:
     """Notes a command, its options, and the files that it has written, in its folder."""
     command = sys.modules[module]
     content = {
-        "command": command_line.name_of(command),
-        "options": command_line.resolved(command),
+        "command": app.name_of(command),
+        "options": {name: flag.value for name, flag in app.flags_of(command).items()},
         "files": [path.as_posix() for path in sorted(files)],
     }
     with atomic_files.written_file(out / NOTE) as path:
@@ -92,10 +86,8 @@ def note(out: Path, module: str, files: Iterable[Path] = ()) -> None:
 def replaceable(out: Path, *, module: str, writes: Sequence[str], overwrite: bool) -> set[Path]:
     """Returns the files of earlier calls that may be replaced, by their places in it; see `fresh`.
 
-    Commands ask it before they do anything else, so that none works in vain.
-
-    Raises:
-      ValueError: if there is anything in the place that may not be replaced.
+    Commands ask it before they do anything else, so that none works in vain. A `ValueError` tells
+    what is in the place and may not be replaced.
     """
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out} is a file, and a folder is needed. Give another --out.")
@@ -110,19 +102,6 @@ def replaceable(out: Path, *, module: str, writes: Sequence[str], overwrite: boo
             "replace them, or another --out."
         )
     return there
-
-
-@contextlib.contextmanager
-def _held(out: Path) -> Iterator[None]:
-    """Keeps other processes out of a folder, which is made, and removed if it stays empty."""
-    existed = out.exists()
-    out.mkdir(parents=True, exist_ok=True)
-    with atomic_files.hold(out):
-        try:
-            yield
-        finally:
-            if not existed:
-                _remove_empty(out)
 
 
 def _take_place(draft: Path, out: Path, module: str, earlier: set[Path]) -> None:
@@ -165,27 +144,14 @@ def _remove_empty(folder: Path) -> None:
 
 def _noted(out: Path, module: str) -> set[Path] | None:
     """Returns the files that a command's note lists; `None` if there is no note of it."""
-    noted = _read(out / NOTE)
-    if noted is None or noted["command"] != command_line.name_of(sys.modules[module]):
+    try:
+        content = json.loads((out / NOTE).read_text(encoding="utf-8"))
+        command, files = content["command"], {Path(name) for name in content["files"]}
+    except (OSError, ValueError, KeyError, TypeError):
         return None
-    return {Path(name) for name in noted["files"]}
+    within = all(x.parts and not x.is_absolute() and ".." not in x.parts for x in files)
+    return files if within and command == app.name_of(sys.modules[module]) else None
 
 
 def _present(out: Path, files: set[Path] | None) -> set[Path]:
     return {path for path in files or () if (out / path).is_file()}
-
-
-def _read(path: Path) -> dict[str, Any] | None:
-    """Returns what a folder's note says; `None` if there is none, or it is another's."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        valid = isinstance(content["command"], str) and all(
-            isinstance(name, str)
-            and Path(name).parts
-            and not Path(name).is_absolute()
-            and ".." not in Path(name).parts
-            for name in content["files"]
-        )
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return content if valid else None

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from absl import flags
 
-from experiments.cli import command_line
+from experiments.cli import app
 from refref_jax.training import config as training_config
 from refref_jax.training.config import Option, TrainConfig
 
@@ -85,7 +85,7 @@ def _define(option: Option) -> flags.FlagHolder:
         define = {int: flags.DEFINE_integer, float: flags.DEFINE_float, str: flags.DEFINE_string}
         holder = define[kind](name, None, text)
     if name != "ior":  # which is written otherwise for a reconstructed object
-        command_line.check(holder, lambda value: _check(option, value))
+        app.check(holder, lambda value: _check(option, value))
     return holder
 
 
