@@ -35,7 +35,9 @@ if TYPE_CHECKING:  # the same names for those who read types; a test compares th
     from refref_jax.optics.scene import Scene as Scene
     from refref_jax.optics.scene import with_index as with_index
     from refref_jax.optics.single_path import follow_branch as follow_branch
+    from refref_jax.training.config import TrainConfig as TrainConfig
     from refref_jax.training.evaluation import evaluate as evaluate
+    from refref_jax.training.fit import fit as fit
 
 __version__ = "0.1.0"
 
@@ -49,8 +51,10 @@ _HOMES = {
     "Rays": "geometry.rays",
     "Scene": "optics.scene",
     "SceneError": "data.errors",
+    "TrainConfig": "training.config",
     "assemble": "data.geometry",
     "evaluate": "training.evaluation",
+    "fit": "training.fit",
     "follow_branch": "optics.single_path",
     "follow_main_branches": "optics.main_branches",
     "image_rays": "geometry.cameras",

@@ -106,7 +106,7 @@ def write_exr(path: Path, pixels: Float[np.ndarray, "h w *channels"]) -> None:
         file.write(str(path))
 
 
-def write_rgb(path: Path, pixels: Float[np.ndarray, "h w 3"]) -> None:
+def write_rgb(path: str | Path, pixels: Float[np.ndarray, "h w 3"]) -> None:
     """Writes an sRGB image in `[0, 1]` as 8-bit PNG; values outside are clipped."""
     write_png(path, to_bytes(pixels))
 
@@ -116,7 +116,7 @@ def write_mask(path: Path, mask: Bool[np.ndarray, "h w"]) -> None:
     write_png(path, np.where(mask, 255, 0).astype(np.uint8))
 
 
-def write_png(path: Path, pixels: UInt8[np.ndarray, "h w *channels"]) -> None:
+def write_png(path: str | Path, pixels: UInt8[np.ndarray, "h w *channels"]) -> None:
     """Writes an 8-bit image as it is."""
     iio.imwrite(path, pixels, plugin="pillow", extension=".png")
 

@@ -1,0 +1,104 @@
+"""Training by calls of the library: the script of the README, and what a run's files repeat."""
+
+import ast
+import re
+import types
+
+import imageio.v3 as iio
+import jax
+import numpy as np
+import pytest
+
+from refref_jax.render import saved
+from refref_jax.training import fit, run_folder
+from refref_jax.training.config import TrainConfig
+from tests.experiments.command import ROOT
+
+
+def _script():
+    snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    (script,) = (each for each in snippets if "refref_jax.fit(" in each)
+    return script
+
+
+@pytest.fixture(scope="module")
+def fifty(tmp_path_factory):
+    """The folder of the README's script, after it has run."""
+    folder = tmp_path_factory.mktemp("script")
+    (folder / "experiments").symlink_to(ROOT / "experiments")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        exec(compile(_script(), "README.md", "exec"), {})
+    return folder / "runs" / "fifty"
+
+
+def test_the_script_of_the_readme_is_short_and_imports_the_library_alone():
+    script = _script()
+    assert len(script.strip().splitlines()) <= 12 and "steps=50" in script
+    for node in ast.walk(ast.parse(script)):
+        if isinstance(node, ast.Import):
+            assert all(alias.name.split(".")[0] == "refref_jax" for alias in node.names)
+        if isinstance(node, ast.ImportFrom):
+            assert node.module.split(".")[0] == "refref_jax"
+
+
+def test_the_script_of_the_readme_trains_and_renders(fifty):
+    lines = run_folder.read_metrics(fifty)
+    assert lines[-1]["step"] == 50 and lines[-1]["psnr"] > 12.0
+    view = iio.imread(fifty / "view.png", plugin="pillow")
+    assert view.shape == (128, 128, 3) and view.std() > 10.0
+
+
+def test_the_configuration_of_a_run_repeats_it_bit_for_bit(fifty, tmp_path):
+    config = run_folder.read_config(fifty)
+    messages = []
+    model = fit.fit(config, out=tmp_path / "again", report=messages.append)
+    assert run_folder.read_config(tmp_path / "again") == config
+    first = saved.load_model(fifty)
+    assert (first.config, first.budget) == (model.config, model.budget)
+    pairs = zip(jax.tree.leaves(first.params), jax.tree.leaves(model.params), strict=True)
+    assert all(np.array_equal(ours, again) for ours, again in pairs)
+    assert any("given: scene=" in message for message in messages)
+    # Resumed, it is done; with another option it is refused.
+    done = fit.fit(config, out=tmp_path / "again", resume=True, report=messages.append)
+    assert "trained already" in messages[-1] and done.budget == model.budget
+    with pytest.raises(ValueError, match=r"other options than .* \(cut\)"):
+        fit.fit(config.override(cut=0.05), out=tmp_path / "again", resume=True)
+    with pytest.raises(ValueError, match="holds a run already"):
+        fit.fit(config, out=tmp_path / "again")
+
+
+def test_fit_refuses_what_names_no_run(tmp_path):
+    with pytest.raises(ValueError, match="holds no run to resume"):
+        fit.fit(out=tmp_path, resume=True)
+    with pytest.raises(ValueError, match="No scene is given"):
+        fit.fit(TrainConfig(), out=tmp_path / "run")
+    with pytest.raises(ValueError, match="was reconstructed"):
+        fit.fit(TrainConfig().override(scene="x", reconstruction="y"), out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_before_its_first_step_a_training_stops_with_nothing_saved(tmp_path, monkeypatch):
+    known = types.SimpleNamespace(
+        schedule=types.SimpleNamespace(steps=5),
+        scene=types.SimpleNamespace(path="scene"),
+        budget=types.SimpleNamespace(bends=1),
+        config=None,
+        seed=0,
+        hit_fraction=1.0,
+    )
+    for module, name in (
+        (fit.run_folder, "read_config"),
+        (fit.saved, "read_static"),
+        (fit.saved, "load_geometry"),
+        (fit.scene_source, "open_scene"),
+        (fit, "_sampler"),
+        (fit, "init_state"),
+        (fit.devices, "put_everywhere"),
+        (fit.loop, "set_up"),
+    ):
+        monkeypatch.setattr(module, name, lambda *arguments, **options: known)
+    monkeypatch.setattr(fit, "_take_steps", lambda *arguments: pytest.fail("it has begun"))
+    with pytest.raises(KeyboardInterrupt):
+        fit.train(tmp_path, stop=lambda: True)
+    assert not any((tmp_path / "checkpoints").iterdir())
