@@ -13,19 +13,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.benchmarking import (
-    jobs,
-    paper_tables,
-    record_files,
-    record_json,
-    records,
-    settings,
-    table_data,
-    table_text,
-)
+from experiments.benchmarking import jobs, paper_tables, results, settings, table_data, table_text
 from experiments.benchmarking.jobs import Skipped
 from experiments.benchmarking.methods import METHODS
-from experiments.benchmarking.records import Record
+from experiments.benchmarking.results import Record
 from experiments.benchmarking.settings import Benchmark
 from experiments.benchmarking.tables import Table
 from experiments.cli import commands
@@ -59,8 +50,8 @@ def write(
     Raises:
       ValueError: if a result is broken, or does not compare with the others.
     """
-    everything = record_files.read_all(out, benchmark)
-    found = records.compared(everything)
+    everything = results.read_all(out, benchmark)
+    found = results.compared(everything)
     made = all_tables(found)
     missing = _missing(out, benchmark, failed, skipped)
     _write_tables(out / TABLES, made, found)
@@ -186,7 +177,7 @@ def _indexed(out: Path, record: Record) -> dict[str, Any]:
         for view in record.views
     ]
     return {
-        **record_json.to_json(record._replace(views=views)),
+        **results.to_json(record._replace(views=views)),
         "folder": str(folder),
         "curve": _curve(out / folder / "run"),
     }

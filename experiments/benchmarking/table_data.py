@@ -5,7 +5,7 @@ import io
 from collections.abc import Sequence
 from typing import Any
 
-from experiments.benchmarking.records import Record
+from experiments.benchmarking.results import Record
 from experiments.benchmarking.tables import Block, Cell, Column, Row, Table
 from experiments.cli import commands
 

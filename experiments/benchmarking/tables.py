@@ -20,7 +20,6 @@ import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
-
 Mark = Literal["", "best", "second"]
 Origin = Literal["ours", "published"]
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments.benchmarking.records import Metrics, Record
 from experiments.benchmarking.report.contents import Scene
+from experiments.benchmarking.results import Metrics, Record
 
 # Of a scene's views, the share that is chosen because methods fail there.
 _WORST = 0.6

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.benchmarking import record_json, records, settings, summary, table_data
+from experiments.benchmarking import settings, summary, table_data
 from experiments.benchmarking.jobs import Skipped
-from experiments.benchmarking.records import Record
+from experiments.benchmarking.results import Record, compared, from_json
 from experiments.benchmarking.settings import Settings
 from experiments.benchmarking.tables import Table
 from experiments.cli import commands
@@ -96,7 +96,7 @@ def read(out: Path) -> Contents:
             labels=labels,
             scenes=_by_scene(results, list(labels)),
             reconstructions=tuple(
-                result.record for result in results if not records.compared([result.record])
+                result.record for result in results if not compared([result.record])
             ),
             failed=dict(content["failed"]),
             skipped=tuple(Skipped(**each) for each in content["skipped"]),
@@ -110,7 +110,7 @@ def read(out: Path) -> Contents:
 
 
 def _result(job: dict[str, Any], moved: dict[str, Path]) -> Result:
-    record = record_json.from_json(job)
+    record = from_json(job)
     was = Path(record.scene_path)
     curve = tuple(
         Point(point["step"], point["seconds"], point["psnr"])
@@ -125,7 +125,7 @@ def _by_scene(results: Sequence[Result], methods: Sequence[str]) -> tuple[Scene,
     order = {name: i for i, name in enumerate(methods)}
     own: dict[str, list[Result]] = {}
     for result in results:
-        if records.compared([result.record]):
+        if compared([result.record]):
             own.setdefault(result.record.scene, []).append(result)
     scenes = []
     for name in sorted(own):

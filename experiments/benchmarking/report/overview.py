@@ -5,13 +5,13 @@ import math
 from collections.abc import Mapping, Sequence
 
 from experiments.benchmarking import paper_tables
-from experiments.benchmarking.records import Record
 from experiments.benchmarking.report import cases, charts, tables_shown
 from experiments.benchmarking.report.cases import Case
 from experiments.benchmarking.report.contents import Contents, Scene
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.scene_pages import address, thumbnail
 from experiments.benchmarking.report.view_figures import ERROR, IMAGE, TRUTH, Places
+from experiments.benchmarking.results import Record
 from experiments.benchmarking.tables import PSNR, PSNR_MASKED
 
 # Failure cases of each method.

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from experiments.benchmarking.jobs import SPLIT
-from experiments.benchmarking.records import Truth
 from experiments.benchmarking.report.contents import Scene
+from experiments.benchmarking.results import Truth
 from refref_jax.data import files, transforms
 from refref_jax.data.errors import SceneError
 from refref_jax.geometry import cameras

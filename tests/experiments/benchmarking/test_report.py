@@ -11,12 +11,12 @@ import sys
 import pytest
 from PIL import Image
 
-from experiments.benchmarking import jobs, record_files, summary
+from experiments.benchmarking import jobs, results, summary
 from experiments.benchmarking.methods import METHODS
-from experiments.benchmarking.records import Image as Measured
-from experiments.benchmarking.records import Truth, View
 from experiments.benchmarking.report import cases, contents, overview, page, scene_pages
 from experiments.benchmarking.report.contents import Result, Scene
+from experiments.benchmarking.results import Image as Measured
+from experiments.benchmarking.results import Truth, View
 from tests.experiments.benchmarking import made_report
 from tests.experiments.benchmarking.made_records import made_record
 from tests.experiments.benchmarking.read_page import elements, named
@@ -250,7 +250,7 @@ def test_what_failed_before_is_known_until_it_is_done(out, tmp_path):
     for method in ("r3f", "r3f_tree"):
         folder = copy / jobs.FOLDER / "cube_smcvx_ball" / method
         folder.mkdir()
-        record_files.write(folder, made_record("cube_smcvx_ball", method))
+        results.write(folder, made_record("cube_smcvx_ball", method))
     assert summary.not_done(copy) == ({}, [])
     assert summary.not_done(tmp_path / "nowhere") == ({}, [])
 

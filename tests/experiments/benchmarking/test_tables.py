@@ -10,7 +10,7 @@ import pytest
 
 from experiments.benchmarking import paper_tables, pose_space, table_data, table_text, tables
 from experiments.benchmarking.methods import METHODS
-from experiments.benchmarking.records import Image
+from experiments.benchmarking.results import Image
 from experiments.benchmarking.tables import NOTHING, Cell, Column, mean_over
 from tests.experiments.benchmarking.made_records import made_record
 
