@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.benchmarking import settings, summary, table_data
+from experiments.benchmarking import settings, summary
 from experiments.benchmarking.jobs import Skipped
 from experiments.benchmarking.results import Record, compared, from_json
 from experiments.benchmarking.settings import Settings
@@ -101,7 +101,7 @@ def read(out: Path) -> Contents:
             failed=dict(content["failed"]),
             skipped=tuple(Skipped(**each) for each in content["skipped"]),
             missing=tuple(content["missing"]),
-            tables=tuple(map(table_data.from_json, content["tables"].values())),
+            tables=tuple(map(summary.table_from_json, content["tables"].values())),
         )
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(

@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from html import escape
 
-from experiments.benchmarking import paper_tables, published, table_text, tables
+from experiments.benchmarking import paper_tables, published, summary, tables
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.tables import Block, Cell, Column, Mark, Row, Table
 
@@ -67,7 +67,7 @@ def options(given: Mapping[str, Sequence[str]]) -> Html:
 
 
 def _block(table: Table, block: Block, is_open: bool) -> Html:
-    head = ["method", "scenes", *map(table_text.heading, table.columns)]
+    head = ["method", "scenes", *map(summary.heading, table.columns)]
     body = tag("tbody", *(_row(row, table.columns) for row in block.rows))
     title = tag("summary", f"{block.title[:1].upper()}{block.title[1:]}")
     return tag("details", title, _scrolled(head, body), open=is_open)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments.benchmarking import paper_tables, table_data
+from experiments.benchmarking import paper_tables, summary
 from experiments.benchmarking.methods import FULL, METHODS
 from experiments.benchmarking.report import charts, lines, pictures, tables_shown
 from experiments.benchmarking.report.contents import Point, Result
@@ -199,7 +199,7 @@ def test_a_table_is_the_same_after_json():
         made_record("cube_smcvx_ball", "tree", psnr=31.0, psnr_masked=None),
     ]
     for table in (paper_tables.main_table(results), paper_tables.main_table([])):
-        assert table_data.from_json(table_data.as_json(table)) == table
+        assert summary.table_from_json(summary.table_as_json(table)) == table
 
 
 def test_notes_are_read_as_they_are_meant():
