@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
 
-from experiments.benchmarking.report import charts, lines, seen, tables_shown, view_figures
+from experiments.benchmarking.report import charts, seen, tables_shown, view_figures
 from experiments.benchmarking.report.contents import Scene
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.view_figures import NOT_HERE, TRUTH, Places, title
@@ -110,7 +110,7 @@ def _heading(quantity: Quantity) -> str:
 
 def _slider(methods: Sequence[str]) -> Html:
     """Returns the slider between two pictures; the script of the page fills and moves it."""
-    last = lines.families(methods)[0][-1]  # of the main methods, if there are any
+    last = charts.families(methods)[0][-1]  # of the main methods, if there are any
 
     def choice(side: str, chosen: str) -> Html:
         options = [

@@ -12,7 +12,7 @@ from PIL import Image
 
 from experiments.benchmarking import paper_tables, summary
 from experiments.benchmarking.methods import FULL, METHODS
-from experiments.benchmarking.report import charts, lines, pictures, tables_shown
+from experiments.benchmarking.report import charts, pictures, tables_shown
 from experiments.benchmarking.report.contents import Point, Result
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.pictures import Scale
@@ -178,15 +178,15 @@ def test_without_curves_that_is_said():
 
 
 def test_a_method_has_one_look_and_no_two_of_a_chart_have_the_same():
-    for family in lines.families(list(METHODS)):
-        looks = [lines.look(name) for name in family]
+    for family in charts.families(list(METHODS)):
+        looks = [charts.look(name) for name in family]
         assert len(set(looks)) == len(looks)
-    families = lines.families(list(METHODS))
+    families = charts.families(list(METHODS))
     assert [family[0] for family in families[1:]] == ["oracle", "tree"]
     assert len(families) == 1 + len(FULL)
     assert sorted({name for family in families for name in family}) == sorted(METHODS)
-    assert lines.families(["tree", "of tomorrow"]) == [["tree", "of tomorrow"]]
-    assert lines.families([]) == []
+    assert charts.families(["tree", "of tomorrow"]) == [["tree", "of tomorrow"]]
+    assert charts.families([]) == []
 
 
 # --- tables ---
