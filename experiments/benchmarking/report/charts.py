@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from experiments.benchmarking.methods import FULL, METHODS
-from experiments.benchmarking.report.contents import Result
+from experiments.benchmarking.report.data import Result
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.figures.style import COLOURS
 

@@ -5,9 +5,8 @@ import math
 from collections.abc import Mapping, Sequence
 
 from experiments.benchmarking import paper_tables
-from experiments.benchmarking.report import cases, charts, tables_shown
-from experiments.benchmarking.report.cases import Case
-from experiments.benchmarking.report.contents import Contents, Scene
+from experiments.benchmarking.report import charts, data, tables_shown
+from experiments.benchmarking.report.data import Case, Contents, Scene
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.scene_pages import address, thumbnail
 from experiments.benchmarking.report.view_figures import ERROR, IMAGE, TRUTH, Places
@@ -103,7 +102,7 @@ def _first_picture(places: Places) -> Html | None:
 
 def _failures(scenes: Sequence[Scene], places: Mapping[str, Places]) -> Html:
     """Returns where each method fails most, with a filter that the page's script serves."""
-    found = cases.failures(scenes, _MOST_CASES)
+    found = data.failures(scenes, _MOST_CASES)
     if not found:
         return tag("p", "No view was measured.", class_="note")
     methods = list(dict.fromkeys(case.method for case in found))

@@ -6,8 +6,8 @@ load nothing from anywhere. Its pages are told apart by the address' end, as #sc
 
 from pathlib import Path
 
-from experiments.benchmarking.report import cases, contents, overview, scene_pages
-from experiments.benchmarking.report.contents import Contents, Scene
+from experiments.benchmarking.report import data, overview, scene_pages
+from experiments.benchmarking.report.data import Contents, Scene
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.scene_pages import Page
 from experiments.cli import commands
@@ -41,12 +41,12 @@ def write(out: Path, *, views: int, edge: int) -> Path:
     Raises:
       ValueError: if there are no results, or they are broken.
     """
-    everything = contents.read(out)
+    everything = data.read(out)
     count = shown_views(everything.scenes, views)
     pages: dict[str, Page] = {}
     with commands.ProgressBar("report", len(everything.scenes)) as bar:
         for i, scene in enumerate(everything.scenes):
-            chosen = cases.choose_views(scene, count)
+            chosen = data.choose_views(scene, count)
             pages[scene.name] = scene_pages.show(out, scene, chosen, edge=edge, prefix=f"s{i}")
             bar.show(i + 1, scene.name)
     body = [
@@ -72,7 +72,7 @@ def shown_views(scenes: tuple[Scene, ...], asked: int) -> int:
 
 def _introduction(everything: Contents, count: int, edge: int) -> str:
     results = sum(len(scene.results) for scene in everything.scenes)
-    views = max((len(cases.view_names(scene)) for scene in everything.scenes), default=0)
+    views = max((len(data.view_names(scene)) for scene in everything.scenes), default=0)
     preset, steps = everything.settings.preset, everything.settings.steps
     return (
         f"Results: {results}, scenes: {len(everything.scenes)}; preset {preset}, {steps} steps. "

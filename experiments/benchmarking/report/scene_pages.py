@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
 
-from experiments.benchmarking.report import charts, seen, tables_shown, view_figures
-from experiments.benchmarking.report.contents import Scene
+from experiments.benchmarking.report import charts, data, tables_shown, view_figures
+from experiments.benchmarking.report.data import Scene
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.view_figures import NOT_HERE, TRUTH, Places, title
 from experiments.benchmarking.tables import MAIN, Quantity, value
@@ -50,7 +50,7 @@ def show(out: Path, scene: Scene, views: Sequence[str], *, edge: int, prefix: st
     places: Places = {}
     articles = []
     for i, name in enumerate(views):
-        view = seen.read_view(out, scene, name)
+        view = data.read_view(out, scene, name)
         figures = view_figures.show(view, scene, edge, f"{prefix}v{i}")
         articles.append(figures.html)
         places |= figures.places

@@ -6,10 +6,9 @@ import numpy as np
 from jaxtyping import UInt8
 
 from experiments.benchmarking.report import pictures, tables_shown
-from experiments.benchmarking.report.contents import Scene
+from experiments.benchmarking.report.data import Scene, View
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.pictures import Scale
-from experiments.benchmarking.report.seen import View
 
 TRUTH = "truth"
 """What the true image is called, beside the names of methods."""

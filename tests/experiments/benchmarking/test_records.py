@@ -18,7 +18,7 @@ from experiments.benchmarking import (
 )
 from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.report import overview
-from experiments.benchmarking.report.contents import Result, Scene
+from experiments.benchmarking.report.data import Result, Scene
 from experiments.benchmarking.results import Image
 from tests.experiments.benchmarking.made_records import SETTINGS, made_record
 from tests.experiments.benchmarking.made_scenes import write_scene

@@ -13,7 +13,7 @@ from PIL import Image
 from experiments.benchmarking import paper_tables, summary
 from experiments.benchmarking.methods import FULL, METHODS
 from experiments.benchmarking.report import charts, pictures, tables_shown
-from experiments.benchmarking.report.contents import Point, Result
+from experiments.benchmarking.report.data import Point, Result
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.pictures import Scale
 from refref_jax.data import files
