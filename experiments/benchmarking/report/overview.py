@@ -5,11 +5,11 @@ import math
 from collections.abc import Mapping, Sequence
 
 from experiments.benchmarking import paper_tables
-from experiments.benchmarking.report import charts, data, tables_shown
+from experiments.benchmarking.report import charts, data, markup
 from experiments.benchmarking.report.data import Case, Contents, Scene
+from experiments.benchmarking.report.images import ERROR, IMAGE, TRUTH, Places
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.report.scene_pages import address, thumbnail
-from experiments.benchmarking.report.view_figures import ERROR, IMAGE, TRUTH, Places
 from experiments.benchmarking.results import Record
 from experiments.benchmarking.tables import PSNR, PSNR_MASKED
 
@@ -42,7 +42,7 @@ def show(contents: Contents, introduction: str, places: Mapping[str, Places]) ->
     """
     parts = {
         "scenes": ("Scenes", _scenes(contents, places)),
-        "tables": ("Tables", join(map(tables_shown.show, contents.tables))),
+        "tables": ("Tables", join(map(markup.show, contents.tables))),
         "failures": ("Failure cases", _failures(contents.scenes, places)),
         "jobs": ("Jobs not done", _not_done(contents)),
         "settings": ("Settings and costs", _settings(contents)),
@@ -76,7 +76,7 @@ def _scenes(contents: Contents, places: Mapping[str, Places]) -> Html:
         "PSNR inside the object's mask in dB, mean over a scene's images; of the whole image "
         "where there are no masks. The best is bold. A scene leads to its views."
     )
-    return join([tables_shown.grid(heads, rows), tag("p", note, class_="note")])
+    return join([markup.grid(heads, rows), tag("p", note, class_="note")])
 
 
 def _has_results(contents: Contents, method: str) -> bool:
@@ -88,9 +88,9 @@ def _scores(scene: Scene, methods: Sequence[str]) -> list[str]:
     masked = any(metrics.get(PSNR_MASKED.key) is not None for metrics in found.values())
     quantity = PSNR_MASKED if masked else PSNR
     numbers = {name: metrics.get(quantity.key) for name, metrics in found.items()}
-    shown = {name: tables_shown.number(value, quantity.digits) for name, value in numbers.items()}
+    shown = {name: markup.number(value, quantity.digits) for name, value in numbers.items()}
     known = [value for value in numbers.values() if value is not None and not math.isnan(value)]
-    best = tables_shown.number(max(known), quantity.digits) if len(known) > 1 else None
+    best = markup.number(max(known), quantity.digits) if len(known) > 1 else None
     cells = [shown.get(name, "-") for name in methods]
     return [tag("strong", cell) if cell == best else cell for cell in cells]
 
@@ -135,8 +135,7 @@ def _case(case: Case, places: Places) -> Html:
         tag("span", charts.swatch(case.method), " ", case.method),
         tag(
             "span",
-            f"{tables_shown.number(case.psnr_masked, 1)} dB in mask, "
-            f"{tables_shown.number(case.psnr, 1)} dB",
+            f"{markup.number(case.psnr_masked, 1)} dB in mask, {markup.number(case.psnr, 1)} dB",
         ),
         None if is_shown else tag("small", "not among the views of this report"),
         data_method=case.method,
@@ -149,7 +148,7 @@ def _not_done(contents: Contents) -> Html:
     missing = [[f"not done: {name}", "it has no result yet"] for name in contents.missing]
     if not (found := [*failed, *left_out, *missing]):
         return tag("p", "All jobs that were asked for are done.", class_="note")
-    return tables_shown.grid(["job", "reason"], found)
+    return markup.grid(["job", "reason"], found)
 
 
 def _settings(contents: Contents) -> Html:
@@ -168,14 +167,14 @@ def _settings(contents: Contents) -> Html:
     for name in dict.fromkeys(record.method for record in everything):
         given = next(record.options for record in everything if record.method == name)
         line = tag("span", charts.swatch(name), " ", name) if name in contents.labels else name
-        methods.append([line, contents.labels.get(name, "-"), tables_shown.options(given)])
+        methods.append([line, contents.labels.get(name, "-"), markup.options(given)])
     return join(
         [
             tag(
                 "div",
-                tables_shown.grid(["setting", "value"], settings),
+                markup.grid(["setting", "value"], settings),
                 tag("h3", "Methods"),
-                tables_shown.grid(["method", "label", "options"], methods),
+                markup.grid(["method", "label", "options"], methods),
                 id="configuration",
             ),
             tag("h3", "Costs"),
@@ -190,8 +189,8 @@ def _costs(found: Sequence[Record]) -> Html:
     rows = [
         [
             f"{record.scene}/{record.method}",
-            *(tables_shown.number(getattr(record.costs, key), _COSTS[key][1]) for key in kept),
+            *(markup.number(getattr(record.costs, key), _COSTS[key][1]) for key in kept),
         ]
         for record in found
     ]
-    return tables_shown.grid(["job", *(_COSTS[key][0] for key in kept)], rows)
+    return markup.grid(["job", *(_COSTS[key][0] for key in kept)], rows)

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
 
-from experiments.benchmarking.report import charts, data, tables_shown, view_figures
+from experiments.benchmarking.report import charts, data, images, markup
 from experiments.benchmarking.report.data import Scene
+from experiments.benchmarking.report.images import NOT_HERE, TRUTH, Places, title
 from experiments.benchmarking.report.markup import Html, join, tag
-from experiments.benchmarking.report.view_figures import NOT_HERE, TRUTH, Places, title
 from experiments.benchmarking.tables import MAIN, Quantity, value
 
 _WHAT = (
@@ -51,7 +51,7 @@ def show(out: Path, scene: Scene, views: Sequence[str], *, edge: int, prefix: st
     articles = []
     for i, name in enumerate(views):
         view = data.read_view(out, scene, name)
-        figures = view_figures.show(view, scene, edge, f"{prefix}v{i}")
+        figures = images.show(view, scene, edge, f"{prefix}v{i}")
         articles.append(figures.html)
         places |= figures.places
     methods = [result.record.method for result in scene.results]
@@ -93,7 +93,7 @@ def _numbers(scene: Scene) -> Html:
     kept = [j for j in range(len(MAIN)) if any(row[j] is not None for row in means.values())]
     head = ["method", *(_heading(MAIN[j]) for j in kept)]
     rows = [
-        [name, *(tables_shown.number(row[j], MAIN[j].digits) for j in kept)]
+        [name, *(markup.number(row[j], MAIN[j].digits) for j in kept)]
         for name, row in means.items()
     ]
     facts = [
@@ -101,7 +101,7 @@ def _numbers(scene: Scene) -> Html:
         for result in scene.results
         if result.record.facts
     ]
-    return join([tables_shown.grid(head, rows), *facts])
+    return join([markup.grid(head, rows), *facts])
 
 
 def _heading(quantity: Quantity) -> str:
