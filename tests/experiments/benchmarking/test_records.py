@@ -17,7 +17,7 @@ from experiments.benchmarking import (
     settings,
 )
 from experiments.benchmarking.methods import METHODS
-from experiments.benchmarking.report import overview
+from experiments.benchmarking.report import page
 from experiments.benchmarking.report.data import Result, Scene
 from experiments.benchmarking.results import Image
 from tests.experiments.benchmarking.made_records import SETTINGS, made_record
@@ -202,7 +202,7 @@ def test_what_is_no_number_comes_back_and_is_not_the_best_of_a_report():
     assert math.isnan(record.metrics["psnr_masked"]) and record.scene == "nan"
     others = [made_record("nan", name, psnr_masked=1.0 + i) for i, name in enumerate("ab")]
     scene = Scene("nan", "", "", tuple(Result(each, (), ()) for each in (record, *others)))
-    assert overview._scores(scene, ["tree", "a", "b"]) == ["nan", "1.00", "<strong>2.00</strong>"]
+    assert page._scores(scene, ["tree", "a", "b"]) == ["nan", "1.00", "<strong>2.00</strong>"]
 
 
 # --- what is planned ---

@@ -13,7 +13,7 @@ from PIL import Image
 
 from experiments.benchmarking import jobs, results, summary
 from experiments.benchmarking.methods import METHODS
-from experiments.benchmarking.report import data, overview, page, scene_pages
+from experiments.benchmarking.report import data, page
 from experiments.benchmarking.report.data import Result, Scene
 from experiments.benchmarking.results import Image as Measured
 from experiments.benchmarking.results import Truth, View
@@ -93,7 +93,7 @@ def test_identifiers_are_unique_and_links_lead_somewhere(found):
     assert len(set(names)) == len(names)
     copies = [e.attributes["data-copy"] for e in named(found, "img") if "data-copy" in e.attributes]
     assert copies and set(copies) <= set(names)
-    pages = {scene_pages.address(scene, view) for scene in _SCENES for view in ("r_0", "r_1", None)}
+    pages = {page.address(scene, view) for scene in _SCENES for view in ("r_0", "r_1", None)}
     links = {link.attributes["href"] for link in named(found, "a")}
     assert links <= pages | {f"#{name}" for name in names} and pages <= links
 
@@ -132,7 +132,7 @@ def test_odd_names_break_nothing(tmp_path):
     assert section.attributes["data-scene"] == _ODD
     assert len(named(found, "script")) == 1 and not named(found, "b")
     links = {link.attributes["href"] for link in named(found, "a")}
-    assert scene_pages.address(_ODD) in links and len(scene_pages.address(_ODD).split("/")) == 2
+    assert page.address(_ODD) in links and len(page.address(_ODD).split("/")) == 2
 
 
 def test_without_pictures_there_is_a_report_still(out, tmp_path):
@@ -265,7 +265,7 @@ def test_methods_that_this_version_does_not_know_are_shown_last(out, tmp_path):
     everything = data.read(copy)
     methods = [result.record.method for result in everything.scenes[0].results]
     assert methods == ["tree", "of <tomorrow>"]
-    text = overview.show(everything, "", {name: {} for name in _SCENES})
+    text = page.show_overview(everything, "", {name: {} for name in _SCENES})
     assert "of &lt;tomorrow&gt;" in text and "<tomorrow>" not in text
 
 
@@ -275,7 +275,7 @@ def test_the_slider_begins_with_the_truth_and_the_last_main_method(out, tmp_path
     text = path.read_text().replace('"tree"', '"tree_cone"').replace('"straight"', '"tree"')
     path.write_text(text)
     (first, *_) = data.read(copy).scenes
-    shown = scene_pages.show(copy, first, ["r_0"], edge=9, prefix="").html
+    shown = page.show_scene(copy, first, ["r_0"], edge=9, prefix="").html
     options = named(elements(shown), "option")
     assert [e.attributes["value"] for e in options] == ["truth", "tree", "tree_cone"] * 2
     chosen = [e.attributes["value"] for e in options if "selected" in e.attributes]
