@@ -17,7 +17,7 @@ import numpy as np
 
 from experiments.benchmarking import pose_space, published, tables
 from experiments.benchmarking.methods import FULL, METHODS, Group, Method
-from experiments.benchmarking.records import OTHER, Metrics, Record
+from experiments.benchmarking.results import OTHER, Metrics, Record
 from experiments.benchmarking.tables import (
     NOTHING,
     Block,

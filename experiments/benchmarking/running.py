@@ -17,11 +17,10 @@ import jax
 import numpy as np
 
 import refref_jax
-from experiments.benchmarking import fingerprints, jobs, pose_space, record_files, records
+from experiments.benchmarking import fingerprints, jobs, pose_space, results
 from experiments.benchmarking.jobs import SPLIT, Job
 from experiments.benchmarking.methods import RECONSTRUCTION
-from experiments.benchmarking.record_json import number
-from experiments.benchmarking.records import Costs, Image, Record, Truth, View
+from experiments.benchmarking.results import Costs, Image, Record, Truth, View, number
 from experiments.cli import subprocesses as child_process
 from experiments.cli.subprocesses import RunFailedError
 from experiments.r3f import records as reconstructions
@@ -52,7 +51,7 @@ def run(out: Path, job: Job) -> str | None:
         folder.mkdir(parents=True, exist_ok=True)
         record = _reconstruct(job, folder) if job.method == RECONSTRUCTION else _learn(job, folder)
         _check_scene(job)
-        record_files.write(folder, record)
+        results.write(folder, record)
     except (RunFailedError, ValueError, OSError) as error:
         return str(error)
     except Exception as error:  # The others go on, whatever this is.
@@ -140,7 +139,7 @@ def _image(told: dict[str, Any], apart: Mapping[str, float]) -> Image:
 
 def _record(job: Job) -> Record:
     """Returns what any result of a job has."""
-    category, background = records.category_and_background(job.scene)
+    category, background = results.category_and_background(job.scene)
     return Record(
         scene=job.scene,
         category=category,

@@ -5,29 +5,26 @@
 {out}/tables/{table}.{md,csv,json,tex}   each table
 {out}/tables/scenes.csv                  all metrics of each scene and method
 {out}/results.json                       what a report needs, see docs/benchmark.md
+
+Tables are written for programs, as CSV with a line for each number and as JSON, and for people, as
+Markdown and as LaTeX for a paper (with booktabs).
 """
 
+import csv
 import dataclasses
+import io
 import json
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.benchmarking import (
-    jobs,
-    paper_tables,
-    record_files,
-    record_json,
-    records,
-    settings,
-    table_data,
-    table_text,
-)
+from experiments.benchmarking import jobs, paper_tables, results, settings, tables
 from experiments.benchmarking.jobs import Skipped
 from experiments.benchmarking.methods import METHODS
-from experiments.benchmarking.records import Record
+from experiments.benchmarking.results import Record
 from experiments.benchmarking.settings import Benchmark
-from experiments.benchmarking.tables import Table
+from experiments.benchmarking.tables import Block, Cell, Column, Mark, Row, Table
 from experiments.cli import app
 from refref_jax import atomic_files
 from refref_jax.training import run_folder
@@ -39,6 +36,49 @@ _MOST_POINTS = 200
 
 # Scenes without a result that summary.md names for each method; results.json has all.
 _MOST_NAMES = 10
+
+_HEAD = (
+    "table",
+    "block",
+    "origin",
+    "method",
+    "quantity",
+    "mean",
+    "standard_error",
+    "scenes",
+    "mark",
+)
+
+_ARROWS = {"higher": " ↑", "lower": " ↓", None: ""}
+_LATEX_ARROWS = {"higher": r"$\uparrow$", "lower": r"$\downarrow$", None: ""}
+_MARKDOWN_MARKS: dict[Mark, tuple[str, str]] = {
+    "": ("", ""),
+    "best": ("**", "**"),
+    "second": ("<u>", "</u>"),
+}
+_LATEX_MARKS: dict[Mark, tuple[str, str]] = {
+    "": ("", ""),
+    "best": (r"\textbf{", "}"),
+    "second": (r"\underline{", "}"),
+}
+_LATEX_SPECIAL = {
+    "\\": r"\textbackslash{}",
+    "&": r"\&",
+    "%": r"\%",
+    "_": r"\_",
+    "#": r"\#",
+    "$": r"\$",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+}
+
+# Underscores between letters and digits are letters; elsewhere they may begin emphasis.
+_MARKDOWN_SPECIAL = re.compile(r"[\\|<>*`\[\]&]|(?<![^\W_])_|_(?![^\W_])")
+
+# What the notes of tables are written with.
+_MARKS = re.compile(r"\*+|</?u>|`")
 
 
 def write(
@@ -59,13 +99,13 @@ def write(
     Raises:
       ValueError: if a result is broken, or does not compare with the others.
     """
-    everything = record_files.read_all(out, benchmark)
-    found = records.compared(everything)
+    everything = results.read_all(out, benchmark)
+    found = results.compared(everything)
     made = all_tables(found)
     missing = _missing(out, benchmark, failed, skipped)
     _write_tables(out / TABLES, made, found)
     lines = [*_heading(benchmark, found), *_not_done(failed, skipped, missing)]
-    _write_text(out / FILE, "\n".join([*lines, *map(table_text.markdown, made)]))
+    _write_text(out / FILE, "\n".join([*lines, *map(markdown, made)]))
     index = {
         "settings": dataclasses.asdict(benchmark.settings),
         "methods": {
@@ -77,7 +117,7 @@ def write(
         "failed": dict(failed),
         "skipped": [each._asdict() for each in skipped],
         "missing": [f"{scene}/{method}" for scene, method in missing],
-        "tables": {table.name: table_data.as_json(table) for table in made},
+        "tables": {table.name: table_as_json(table) for table in made},
     }
     settings.write_json(out / RESULTS, app.string_safe(index))
 
@@ -86,11 +126,11 @@ def _write_tables(folder: Path, made: Sequence[Table], found: Sequence[Record]) 
     folder.mkdir(exist_ok=True)
     for table in made:
         path = folder / table.name
-        _write_text(path.with_suffix(".md"), table_text.markdown(table))
-        _write_text(path.with_suffix(".tex"), table_text.latex(table))
-        _write_text(path.with_suffix(".csv"), table_data.as_csv(table))
-        settings.write_json(path.with_suffix(".json"), table_data.as_json(table))
-    _write_text(folder / "scenes.csv", table_data.scenes_csv(found))
+        _write_text(path.with_suffix(".md"), markdown(table))
+        _write_text(path.with_suffix(".tex"), latex(table))
+        _write_text(path.with_suffix(".csv"), table_as_csv(table))
+        settings.write_json(path.with_suffix(".json"), table_as_json(table))
+    _write_text(folder / "scenes.csv", scenes_csv(found))
 
 
 def not_done(out: Path) -> tuple[dict[str, str], list[Skipped]]:
@@ -174,7 +214,7 @@ def _not_done(
     lines = []
     for title, items in parts.items():
         if items:
-            lines += [title, "", *(f"- {table_text.in_markdown(item)}" for item in items), ""]
+            lines += [title, "", *(f"- {in_markdown(item)}" for item in items), ""]
     return lines
 
 
@@ -186,7 +226,7 @@ def _indexed(out: Path, record: Record) -> dict[str, Any]:
         for view in record.views
     ]
     return {
-        **record_json.to_json(record._replace(views=views)),
+        **results.to_json(record._replace(views=views)),
         "folder": str(folder),
         "curve": _curve(out / folder / "run"),
     }
@@ -204,3 +244,186 @@ def _curve(run: Path) -> list[dict[str, Any]]:
 def _write_text(path: Path, text: str) -> None:
     with atomic_files.written_file(path) as draft:
         draft.write_text(text, encoding="utf-8")
+
+
+def table_as_csv(table: Table) -> str:
+    """Returns a line for each number of a table; what is not known is empty."""
+    rows = [
+        (
+            table.name,
+            block.title,
+            row.origin,
+            row.label,
+            column.label,
+            _text(cell.mean),
+            _text(cell.error),
+            cell.count or "",
+            mark,
+        )
+        for block in table.blocks
+        for row in block.rows
+        for column, cell, mark in zip(table.columns, row.cells, row.marks, strict=True)
+    ]
+    return _csv([_HEAD, *rows])
+
+
+def table_as_json(table: Table) -> dict[str, Any]:
+    """Returns a table as JSON has it."""
+    return app.string_safe(
+        {
+            "name": table.name,
+            "title": table.title,
+            "notes": list(table.notes),
+            "columns": [column._asdict() for column in table.columns],
+            "blocks": [
+                {
+                    "title": block.title,
+                    "rows": [
+                        {
+                            "method": row.label,
+                            "origin": row.origin,
+                            "scenes": row.scenes,
+                            "cells": [
+                                {**cell._asdict(), "mark": mark}
+                                for cell, mark in zip(row.cells, row.marks, strict=True)
+                            ],
+                        }
+                        for row in block.rows
+                    ],
+                }
+                for block in table.blocks
+            ],
+        }
+    )
+
+
+def table_from_json(record: dict[str, Any]) -> Table:
+    """Undoes `table_as_json`.
+
+    Raises:
+      KeyError, TypeError: if it is no table.
+    """
+    return Table(
+        name=record["name"],
+        title=record["title"],
+        notes=tuple(record["notes"]),
+        columns=tuple(Column(**column) for column in record["columns"]),
+        blocks=tuple(
+            Block(block["title"], tuple(map(_row, block["rows"]))) for block in record["blocks"]
+        ),
+    )
+
+
+def scenes_csv(found: Sequence[Record]) -> str:
+    """Returns a line for each result, with all of its metrics."""
+    keys = sorted({key for record in found for key in record.metrics})
+    head = ("scene", "category", "background", "method", *keys)
+    rows = [
+        (
+            record.scene,
+            record.category,
+            record.background,
+            record.method,
+            *(_text(record.metrics.get(key)) for key in keys),
+        )
+        for record in found
+    ]
+    return _csv([head, *rows])
+
+
+def _row(record: dict[str, Any]) -> Row:
+    cells = [
+        Cell(**app.from_string_safe({key: cell[key] for key in Cell._fields}))
+        for cell in record["cells"]
+    ]
+    marks = tuple(cell["mark"] for cell in record["cells"])
+    return Row(record["method"], record["origin"], record["scenes"], tuple(cells), marks)
+
+
+def _csv(rows: Sequence[Sequence[object]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
+def _text(value: float | None) -> str:
+    return "" if value is None else repr(float(value))
+
+
+def markdown(table: Table) -> str:
+    """Returns a section: title, a table for each block, and notes."""
+    lines = [f"## {table.title}", ""]
+    for block in table.blocks:
+        heads = [heading(column) for column in table.columns]
+        lines += [
+            f"### {in_markdown(block.title[:1].upper() + block.title[1:])}",
+            "",
+            _line(["method", "scenes", *heads]),
+            _line(["---", "---:", *["---:"] * len(heads)]),
+            *(_line(_markdown_row(row, table.columns)) for row in block.rows),
+            "",
+        ]
+    if not table.blocks:
+        lines += ["Nothing is measured yet.", ""]
+    return "\n".join([*lines, *(f"{note}\n" for note in table.notes)])
+
+
+def in_markdown(text: str) -> str:
+    """Returns text of one line that Markdown shows as it is, in a table's cell too."""
+    return _MARKDOWN_SPECIAL.sub(lambda found: f"\\{found[0]}", " ".join(text.split()))
+
+
+def heading(column: Column) -> str:
+    """Returns what stands above a column: its label, and an arrow to what is better."""
+    return f"{column.label}{_ARROWS[column.better]}"
+
+
+def latex(table: Table) -> str:
+    """Returns a tabular, with the blocks below one another, and the notes in comments."""
+    count = len(table.columns) + 2
+    heads = [f"{column.latex}{_LATEX_ARROWS[column.better]}" for column in table.columns]
+    lines = [
+        f"% {table.title}. Published rows and columns: arXiv 2505.05848, on its data.",
+        *(f"% {_MARKS.sub('', note)}" for note in table.notes),
+        rf"\begin{{tabular}}{{@{{}}l{'r' * (count - 1)}@{{}}}}",
+        r"\toprule",
+        " & ".join(["Method", "Scenes", *heads]) + r" \\",
+    ]
+    for block in table.blocks:
+        lines += [
+            r"\midrule",
+            rf"\multicolumn{{{count}}}{{@{{}}l}}{{{_escaped(block.title)}}} \\",
+            *(" & ".join(_latex_row(row, table.columns)) + r" \\" for row in block.rows),
+        ]
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+
+
+def _markdown_row(row: Row, columns: Sequence[Column]) -> list[str]:
+    label = in_markdown(row.label) + (", *published*" if row.origin == "published" else "")
+    cells = [
+        _marked(cell, column, _MARKDOWN_MARKS[mark], " ± {}")
+        for cell, column, mark in zip(row.cells, columns, row.marks, strict=True)
+    ]
+    return [label, "-" if row.scenes is None else str(row.scenes), *cells]
+
+
+def _latex_row(row: Row, columns: Sequence[Column]) -> list[str]:
+    label = _escaped(row.label) + (r" \emph{(published)}" if row.origin == "published" else "")
+    cells = [
+        _marked(cell, column, _LATEX_MARKS[mark], r" {{\tiny$\pm${}}}")
+        for cell, column, mark in zip(row.cells, columns, row.marks, strict=True)
+    ]
+    return [label, "--" if row.scenes is None else str(row.scenes), *cells]
+
+
+def _marked(cell: Cell, column: Column, around: tuple[str, str], deviation: str) -> str:
+    text = f"{around[0]}{tables.number(cell, column)}{around[1]}"
+    return text if cell.error is None else text + deviation.format(tables.error(cell, column))
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _escaped(text: str) -> str:
+    return "".join(_LATEX_SPECIAL.get(letter, letter) for letter in text)

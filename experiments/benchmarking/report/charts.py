@@ -1,12 +1,20 @@
-"""Charts of training as SVG in the page: PSNR over steps, and over seconds."""
+"""Charts of training as SVG in the page: PSNR over steps, and over seconds.
+
+The line of a method looks the same in every chart, whatever else is measured.
+"""
 
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from experiments.benchmarking.report import lines
-from experiments.benchmarking.report.contents import Result
+from experiments.benchmarking.methods import FULL, METHODS
+from experiments.benchmarking.report.data import Result
 from experiments.benchmarking.report.markup import Html, join, tag
+from experiments.figures.style import COLOURS
+
+_DASHES = (None, "7 3", "2 3")
+
+_MAIN = [method.name for method in METHODS.values() if method.group == "main"]
 
 _WIDTH, _HEIGHT = 380.0, 230.0
 _LEFT, _TOP, _BOTTOM = 34.0, 26.0, 36.0
@@ -15,6 +23,49 @@ _LONGEST_NAME = 14
 _TICKS = 5
 
 Points = Sequence[tuple[float, float]]
+
+
+class Line(NamedTuple):
+    """A line's looks.
+
+    Attributes:
+      colour: index into `figures.style.COLOURS`.
+      dash: as SVG has it; `None` for an unbroken line.
+    """
+
+    colour: int
+    dash: str | None
+
+
+def look(method: str) -> Line:
+    """Returns the looks of a method.
+
+    An ablation has none of the colour of the method that it is compared with, and is dashed where
+    the colours of its group are used up. Methods that this version does not know look alike.
+    """
+    if method not in METHODS:
+        return Line(len(COLOURS) - 1, _DASHES[-1])
+    if method in _MAIN:
+        return Line(_MAIN.index(method), None)
+    group = METHODS[method].group
+    full = look(FULL[group])
+    free = [i for i in range(len(COLOURS)) if i != full.colour]
+    place = [name for name in METHODS if METHODS[name].group == group].index(method)
+    return Line(free[place % len(free)], _DASHES[place // len(free)])
+
+
+def families(methods: Sequence[str]) -> list[list[str]]:
+    """Returns which methods share a chart: the main ones, and each kind of ablation with its own.
+
+    Args:
+      methods: names of all that there are, in their order.
+    """
+    groups = {name: METHODS[name].group if name in METHODS else "main" for name in methods}
+    found = [[name for name in methods if groups[name] == "main"]]
+    for kind, full in FULL.items():
+        if kind in groups.values():
+            found.append([name for name in methods if name == full or groups[name] == kind])
+    return [names for names in found if names]
 
 
 class Span(NamedTuple):
@@ -36,7 +87,7 @@ def training_charts(results: Sequence[Result]) -> Html:
     """Returns charts of all trainings of a scene, a pair for each family of methods."""
     by_name = {result.record.method: result for result in results}
     pairs = []
-    for names in lines.families(list(by_name)):
+    for names in families(list(by_name)):
         curves = {name: by_name[name].curve for name in names if len(by_name[name].curve) > 1}
         if curves:
             steps = {name: [(p.step, p.psnr) for p in curve] for name, curve in curves.items()}
@@ -139,6 +190,6 @@ def _short(name: str) -> str:
 
 
 def _look(method: str) -> dict[str, str | None]:
-    line = lines.look(method)
+    line = look(method)
     colour = f"stroke:var(--c{line.colour})"
     return {"style": colour, "stroke_dasharray": line.dash, "class_": "curve"}

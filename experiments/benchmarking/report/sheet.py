@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.benchmarking.report import cases, contents, seen
-from experiments.benchmarking.report.contents import Scene
-from experiments.benchmarking.report.seen import View
+from experiments.benchmarking.report import data
+from experiments.benchmarking.report.data import Scene, View
 from experiments.figures.style import pyplot
 from refref_jax import atomic_files
 
@@ -34,12 +33,12 @@ def write(out: Path) -> Path | None:
     Raises:
       ValueError: if there are no results, or they are broken.
     """
-    everything = contents.read(out)
+    everything = data.read(out)
     methods = list(everything.labels)[:_MOST_METHODS]
     columns = []
     for scene in _spread(everything.scenes, _MOST_SCENES):
-        name = cases.typical_view(scene)
-        view = None if name is None else seen.read_view(out, scene, name)
+        name = data.typical_view(scene)
+        view = None if name is None else data.read_view(out, scene, name)
         if view is not None and view.truth.rgb is not None:
             columns.append((scene, view))
     path = out / FILE
@@ -83,5 +82,5 @@ def _draw(path: Path, columns: Sequence[tuple[Scene, View]], labels: dict[str, s
 
 
 def _psnr(scene: Scene, method: str, view: str) -> str:
-    value = cases.psnr_masked(scene, method, view)
+    value = data.psnr_masked(scene, method, view)
     return "" if value is None else f"{value:.1f} dB"

@@ -1,8 +1,8 @@
 """Results of jobs whose tables can be reckoned by hand."""
 
-from experiments.benchmarking import jobs, records
+from experiments.benchmarking import jobs, results
 from experiments.benchmarking.methods import METHODS
-from experiments.benchmarking.records import Costs, Image, Record
+from experiments.benchmarking.results import Costs, Image, Record
 from experiments.benchmarking.settings import Settings
 
 SETTINGS = Settings(preset="tiny", steps=6, limit=None, rays_per_pixel=1, seed=0, lpips=None)
@@ -10,7 +10,7 @@ SETTINGS = Settings(preset="tiny", steps=6, limit=None, rays_per_pixel=1, seed=0
 
 def made_record(scene, method, **metrics):
     """A result with some metrics, and one image of the same."""
-    category, background = records.category_and_background(scene)
+    category, background = results.category_and_background(scene)
     return Record(
         scene=scene,
         category=category,

@@ -5,10 +5,10 @@ import json
 import imageio.v3 as iio
 import numpy as np
 
-from experiments.benchmarking import jobs, record_files, settings, summary
+from experiments.benchmarking import jobs, results, settings, summary
 from experiments.benchmarking.jobs import Skipped
 from experiments.benchmarking.methods import METHODS
-from experiments.benchmarking.records import Costs, Image, Truth, View
+from experiments.benchmarking.results import Costs, Image, Truth, View
 from experiments.benchmarking.settings import Benchmark, Scene
 from refref_jax.data import files
 from tests.experiments.benchmarking.made_records import SETTINGS, made_record
@@ -97,7 +97,7 @@ def _write_job(out, scene, path, method, images):
         for i in range(len(images))
     ]
     record = made_record(scene, method, psnr=30.0, psnr_masked=QUALITY[method])
-    record_files.write(
+    results.write(
         folder,
         record._replace(
             per_image=per_image,

@@ -6,15 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.benchmarking import (
-    jobs,
-    methods,
-    record_files,
-    records,
-    running,
-    scene_list,
-    settings,
-)
+from experiments.benchmarking import jobs, methods, results, running, scene_list, settings
 from experiments.benchmarking.methods import METHODS, RECONSTRUCTION
 from experiments.cli import scenes as cli_scenes
 from refref_jax import atomic_files
@@ -123,8 +115,8 @@ def test_scenes_are_found_by_wildcards_and_folders(tmp_path):
     (tmp_path / "a" / "preview").mkdir()
     found = scene_list.find([str(tmp_path / "a" / "*"), str(tmp_path / "a" / "mine")])
     assert [scene.name for scene in found] == ["cube_smcvx_ball", "mine"]
-    assert records.category_and_background("cube_smcvx_ball") == ("smcvx", "cube")
-    assert records.category_and_background("mine") == (records.OTHER, records.OTHER)
+    assert results.category_and_background("cube_smcvx_ball") == ("smcvx", "cube")
+    assert results.category_and_background("mine") == (results.OTHER, results.OTHER)
     for words, message in [
         ([str(tmp_path / "*" / "cube_*")], "are named cube_smcvx_ball"),
         ([str(tmp_path / "a" / "preview")], r"preview/transforms_train\.json does not exist"),
@@ -194,7 +186,7 @@ def test_a_job_leaves_a_result_that_says_all_and_is_done_once(tmp_path, stand_in
     assert running.run(out, job) is None and jobs.is_done(out, job)
     assert running.run(out, job) is None
     assert _calls(stand_in) == [f"train {job.name}", f"evaluate {job.name}"]
-    (record,) = record_files.read_all(out, _benchmark(common))
+    (record,) = results.read_all(out, _benchmark(common))
     assert (record.category, record.background, record.method) == ("smcvx", "env", "tree_cone")
     assert record.options["train"] == [
         "--preset=tiny",
@@ -225,13 +217,13 @@ def test_results_of_other_settings_or_places_are_refused(tmp_path, stand_in):
     running.run(out, job)
     path = jobs.folder(out, job) / jobs.RESULT
     with pytest.raises(ValueError, match="made with other settings"):
-        record_files.read_all(out, _benchmark(dataclasses.replace(SETTINGS, seed=1)))
+        results.read_all(out, _benchmark(dataclasses.replace(SETTINGS, seed=1)))
     path.parent.rename(path.parent.with_name("straight"))
     with pytest.raises(ValueError, match="is the result of cube_smcvx_ball/tree"):
-        record_files.read_all(out, _benchmark())
+        results.read_all(out, _benchmark())
     (path.parent.with_name("straight") / jobs.RESULT).write_text("{")
     with pytest.raises(ValueError, match="is not the result of a job"):
-        record_files.read_all(out, _benchmark())
+        results.read_all(out, _benchmark())
 
 
 def test_a_reconstruction_is_given_to_the_methods_that_wait_for_it(tmp_path, stand_in):
@@ -242,8 +234,8 @@ def test_a_reconstruction_is_given_to_the_methods_that_wait_for_it(tmp_path, sta
     folder = jobs.folder(out, planned[0])
     words = (jobs.folder(out, planned[1]) / "run" / "trained_with").read_text()
     assert f"reconstruction={folder / 'run'}" in words
-    everything = record_files.read_all(out, _benchmark())
-    assert [record.method for record in records.compared(everything)] == ["r3f"]
+    everything = results.read_all(out, _benchmark())
+    assert [record.method for record in results.compared(everything)] == ["r3f"]
     (found,) = [record for record in everything if record.method == RECONSTRUCTION]
     assert found.facts["index"]["index"] == 1.5 and found.costs.seconds > 0.0
     # Where the reconstruction lies is not of the result, which may move.

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from experiments.benchmarking import paper_tables, table_text, tables
+from experiments.benchmarking import paper_tables, summary, tables
 from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.tables import NOTHING, Cell, Column, mean_over
 from tests.experiments.benchmarking.made_records import made_record
@@ -91,19 +91,19 @@ def test_latex_says_what_kind_of_distance_it_shows_and_has_the_notes():
     metrics = {"substituted_mae": 0.1, "substituted_rmse": 0.1, "substituted_rmse_masked": 0.0}
     found = [made_record("cube_smcvx_ball", "tree", psnr=1.0, **metrics)]
     for table in (paper_tables.main_table(found), paper_tables.top_views_table(found)):
-        comments = [line for line in table_text.latex(table).splitlines() if line[:1] == "%"]
+        comments = [line for line in summary.latex(table).splitlines() if line[:1] == "%"]
         assert len(comments) == 1 + len(table.notes)
         assert not any("**" in line or "<u>" in line or "`" in line for line in comments)
         assert any("Substituted distances have the true ones" in line for line in comments)
-        heads = table_text.latex(table).splitlines()[len(comments) + 2]
+        heads = summary.latex(table).splitlines()[len(comments) + 2]
         assert "DMAE, substituted" in heads or "DRMSE, substituted" in heads
         assert "& DMAE &" not in heads and "& DRMSE &" not in heads
 
 
 def test_odd_names_break_no_row_of_markdown():
-    shown = table_text.in_markdown("a_b|<x> *c*\n_d_ `e`")
+    shown = summary.in_markdown("a_b|<x> *c*\n_d_ `e`")
     assert shown == r"a_b\|\<x\> \*c\* \_d\_ \`e\`"
-    assert table_text.in_markdown("cube_smcvx_ball/tree: --a_b") == "cube_smcvx_ball/tree: --a_b"
+    assert summary.in_markdown("cube_smcvx_ball/tree: --a_b") == "cube_smcvx_ball/tree: --a_b"
     row = tables.row("a|b", "ours", 1, [Cell(1.0, None, 1)])
     table = tables.Table("t", "T", (), (_PSNR,), (tables.Block("b", (row,)),))
-    assert r"| a\|b | 1 | 1.00 |" in table_text.markdown(table)
+    assert r"| a\|b | 1 | 1.00 |" in summary.markdown(table)

@@ -5,14 +5,7 @@ import time
 
 import pytest
 
-from experiments.benchmarking import (
-    jobs,
-    methods,
-    record_files,
-    scene_list,
-    schedule,
-    settings,
-)
+from experiments.benchmarking import jobs, methods, results, scene_list, schedule, settings
 from experiments.benchmarking.engines import LocalEngine, RayEngine
 from tests.experiments.benchmarking.conftest import run_with_stand_in
 from tests.experiments.benchmarking.made_records import SETTINGS
@@ -39,7 +32,7 @@ def _work(todo, engine):
 
 
 def _metrics(out):
-    found = record_files.read_all(out, settings.asked(SETTINGS, [], []))
+    found = results.read_all(out, settings.asked(SETTINGS, [], []))
     return {(record.scene, record.method): (record.metrics, record.per_image) for record in found}
 
 

@@ -11,16 +11,15 @@ from experiments.benchmarking import (
     jobs,
     methods,
     paper_tables,
-    record_files,
-    record_json,
+    results,
     running,
     scene_list,
     settings,
 )
 from experiments.benchmarking.methods import METHODS
-from experiments.benchmarking.records import Image
-from experiments.benchmarking.report import overview
-from experiments.benchmarking.report.contents import Result, Scene
+from experiments.benchmarking.report import page
+from experiments.benchmarking.report.data import Result, Scene
+from experiments.benchmarking.results import Image
 from tests.experiments.benchmarking.made_records import SETTINGS, made_record
 from tests.experiments.benchmarking.made_scenes import write_scene
 
@@ -106,12 +105,12 @@ def _written(tmp_path, record):
     out = tmp_path / "out"
     folder = out / jobs.FOLDER / record.scene / record.method
     folder.mkdir(parents=True)
-    record_files.write(folder, record)
+    results.write(folder, record)
     return out
 
 
 def _read(out, scenes=(), chosen=()):
-    return record_files.read_all(out, settings.asked(SETTINGS, scenes, chosen))
+    return results.read_all(out, settings.asked(SETTINGS, scenes, chosen))
 
 
 _TREE = made_record("cube_smcvx_ball", "tree", psnr=30.0)
@@ -152,7 +151,7 @@ def test_the_options_of_a_method_are_those_that_the_benchmark_was_begun_with(tmp
     begun = settings.asked(SETTINGS, [], [])
     begun.methods["tree"] = ("--paths=tree", "--cut=0.5")
     with pytest.raises(ValueError, match=r"here tree is train .*--cut=0\.5"):
-        record_files.read_all(out, begun)
+        results.read_all(out, begun)
 
 
 # --- contents ---
@@ -186,7 +185,7 @@ def test_contents_of_another_kind_are_named(tmp_path, spoil, message):
     spoil(content)
     path.write_text(json.dumps(content))
     with pytest.raises(ValueError, match="is not the result of a job") as caught:
-        record_files.read(path)
+        results.read(path)
     assert message in str(caught.value) and str(path) in str(caught.value)
 
 
@@ -199,13 +198,11 @@ def test_a_scene_may_be_called_as_a_number_is(tmp_path):
 
 
 def test_what_is_no_number_comes_back_and_is_not_the_best_of_a_report():
-    record = record_json.from_json(
-        record_json.to_json(made_record("nan", "tree", psnr_masked=math.nan))
-    )
+    record = results.from_json(results.to_json(made_record("nan", "tree", psnr_masked=math.nan)))
     assert math.isnan(record.metrics["psnr_masked"]) and record.scene == "nan"
     others = [made_record("nan", name, psnr_masked=1.0 + i) for i, name in enumerate("ab")]
     scene = Scene("nan", "", "", tuple(Result(each, (), ()) for each in (record, *others)))
-    assert overview._scores(scene, ["tree", "a", "b"]) == ["nan", "1.00", "<strong>2.00</strong>"]
+    assert page._scores(scene, ["tree", "a", "b"]) == ["nan", "1.00", "<strong>2.00</strong>"]
 
 
 # --- what is planned ---

@@ -11,12 +11,12 @@ import sys
 import pytest
 from PIL import Image
 
-from experiments.benchmarking import jobs, record_files, summary
+from experiments.benchmarking import jobs, results, summary
 from experiments.benchmarking.methods import METHODS
-from experiments.benchmarking.records import Image as Measured
-from experiments.benchmarking.records import Truth, View
-from experiments.benchmarking.report import cases, contents, overview, page, scene_pages
-from experiments.benchmarking.report.contents import Result, Scene
+from experiments.benchmarking.report import data, page
+from experiments.benchmarking.report.data import Result, Scene
+from experiments.benchmarking.results import Image as Measured
+from experiments.benchmarking.results import Truth, View
 from tests.experiments.benchmarking import made_report
 from tests.experiments.benchmarking.made_records import made_record
 from tests.experiments.benchmarking.read_page import elements, named
@@ -93,7 +93,7 @@ def test_identifiers_are_unique_and_links_lead_somewhere(found):
     assert len(set(names)) == len(names)
     copies = [e.attributes["data-copy"] for e in named(found, "img") if "data-copy" in e.attributes]
     assert copies and set(copies) <= set(names)
-    pages = {scene_pages.address(scene, view) for scene in _SCENES for view in ("r_0", "r_1", None)}
+    pages = {page.address(scene, view) for scene in _SCENES for view in ("r_0", "r_1", None)}
     links = {link.attributes["href"] for link in named(found, "a")}
     assert links <= pages | {f"#{name}" for name in names} and pages <= links
 
@@ -132,7 +132,7 @@ def test_odd_names_break_nothing(tmp_path):
     assert section.attributes["data-scene"] == _ODD
     assert len(named(found, "script")) == 1 and not named(found, "b")
     links = {link.attributes["href"] for link in named(found, "a")}
-    assert scene_pages.address(_ODD) in links and len(scene_pages.address(_ODD).split("/")) == 2
+    assert page.address(_ODD) in links and len(page.address(_ODD).split("/")) == 2
 
 
 def test_without_pictures_there_is_a_report_still(out, tmp_path):
@@ -184,7 +184,7 @@ def test_failures_are_sorted_by_the_error_in_the_mask():
             "y", "", "", (_result("y", "tree", a=25.0), _result("y", "straight", a=10.0, b=50.0))
         ),
     ]
-    ordered = [(case.scene, case.method, case.view) for case in cases.failures(scenes, 99)]
+    ordered = [(case.scene, case.method, case.view) for case in data.failures(scenes, 99)]
     assert ordered == [
         ("y", "straight", "a"),
         ("x", "tree", "b"),
@@ -194,8 +194,8 @@ def test_failures_are_sorted_by_the_error_in_the_mask():
         ("x", "tree", "c"),
     ]
     # At most so many of each method.
-    assert [case.view for case in cases.failures(scenes, 1)] == ["a", "b"]
-    assert cases.failures([], 9) == []
+    assert [case.view for case in data.failures(scenes, 1)] == ["a", "b"]
+    assert data.failures([], 9) == []
 
 
 def test_views_are_the_worst_of_each_method_in_turn_and_some_between():
@@ -203,10 +203,10 @@ def test_views_are_the_worst_of_each_method_in_turn_and_some_between():
     straight = _result("x", "straight", a=12.0, b=13.0, c=14.0, d=15.0, e=10.0, f=11.0, g=16.0)
     scene = Scene("x", "", "", (straight, tree))
     # Tree's worst, straight's, tree's second; then the first and the last of b, c, d, f.
-    assert cases.choose_views(scene, 5) == ["a", "b", "e", "f", "g"]
-    assert cases.choose_views(scene, 1) == ["g"]
-    assert cases.choose_views(scene, 99) == list("abcdefg")
-    assert cases.choose_views(Scene("x", "", "", (_result("x", "tree"),)), 5) == []
+    assert data.choose_views(scene, 5) == ["a", "b", "e", "f", "g"]
+    assert data.choose_views(scene, 1) == ["g"]
+    assert data.choose_views(scene, 99) == list("abcdefg")
+    assert data.choose_views(Scene("x", "", "", (_result("x", "tree"),)), 5) == []
 
 
 def test_a_report_of_many_scenes_shows_fewer_views_and_never_none():
@@ -250,7 +250,7 @@ def test_what_failed_before_is_known_until_it_is_done(out, tmp_path):
     for method in ("r3f", "r3f_tree"):
         folder = copy / jobs.FOLDER / "cube_smcvx_ball" / method
         folder.mkdir()
-        record_files.write(folder, made_record("cube_smcvx_ball", method))
+        results.write(folder, made_record("cube_smcvx_ball", method))
     assert summary.not_done(copy) == ({}, [])
     assert summary.not_done(tmp_path / "nowhere") == ({}, [])
 
@@ -262,10 +262,10 @@ def test_methods_that_this_version_does_not_know_are_shown_last(out, tmp_path):
     index = json.loads(path.read_text())
     del index["methods"]["of <tomorrow>"]
     path.write_text(json.dumps(index))
-    everything = contents.read(copy)
+    everything = data.read(copy)
     methods = [result.record.method for result in everything.scenes[0].results]
     assert methods == ["tree", "of <tomorrow>"]
-    text = overview.show(everything, "", {name: {} for name in _SCENES})
+    text = page.show_overview(everything, "", {name: {} for name in _SCENES})
     assert "of &lt;tomorrow&gt;" in text and "<tomorrow>" not in text
 
 
@@ -274,8 +274,8 @@ def test_the_slider_begins_with_the_truth_and_the_last_main_method(out, tmp_path
     path = copy / summary.RESULTS
     text = path.read_text().replace('"tree"', '"tree_cone"').replace('"straight"', '"tree"')
     path.write_text(text)
-    (first, *_) = contents.read(copy).scenes
-    shown = scene_pages.show(copy, first, ["r_0"], edge=9, prefix="").html
+    (first, *_) = data.read(copy).scenes
+    shown = page.show_scene(copy, first, ["r_0"], edge=9, prefix="").html
     options = named(elements(shown), "option")
     assert [e.attributes["value"] for e in options] == ["truth", "tree", "tree_cone"] * 2
     chosen = [e.attributes["value"] for e in options if "selected" in e.attributes]

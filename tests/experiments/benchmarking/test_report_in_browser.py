@@ -9,7 +9,7 @@ from html import unescape
 
 import pytest
 
-from experiments.benchmarking.report import page, scene_pages
+from experiments.benchmarking.report import page
 from tests.experiments.benchmarking import made_report
 
 _CHROMIUM = next(
@@ -117,8 +117,8 @@ def test_the_slider_moves_and_the_pages_change(tmp_path):
     out = made_report.write(tmp_path, _SCENES)
     html = page.write(out, views=3, edge=200).read_text("utf-8")
     addresses = {
-        "ball": scene_pages.address(_SCENES[0]),
-        "odd": scene_pages.address(_ODD, "r_1"),
+        "ball": page.address(_SCENES[0]),
+        "odd": page.address(_ODD, "r_1"),
     }
     act = _ACT.replace("ADDRESSES", json.dumps(addresses))
     html = html.replace("<title>", _LISTEN + "<title>", 1).replace("</body>", act + "</body>")

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments.benchmarking import paper_tables, table_data
+from experiments.benchmarking import paper_tables, summary
 from experiments.benchmarking.methods import FULL, METHODS
-from experiments.benchmarking.report import charts, lines, pictures, tables_shown
-from experiments.benchmarking.report.contents import Point, Result
+from experiments.benchmarking.report import charts, images, markup
+from experiments.benchmarking.report.data import Point, Result
+from experiments.benchmarking.report.images import Scale
 from experiments.benchmarking.report.markup import Html, join, tag
-from experiments.benchmarking.report.pictures import Scale
 from refref_jax.data import files
 from tests.experiments.benchmarking.made_records import made_record
 from tests.experiments.benchmarking.read_page import elements, named
@@ -46,14 +46,14 @@ def _decoded(picture):
 def test_pictures_are_reduced_and_never_enlarged():
     pixels = np.zeros((40, 100, 3), np.uint8)
     pixels[:, 50:] = 200
-    reduced = pictures.embed(pixels, 50)
+    reduced = images.embed(pixels, 50)
     assert (reduced.width, reduced.height) == (50, 20)
     shown = _decoded(reduced)
     assert shown.shape == (20, 50, 3)
     np.testing.assert_allclose(shown[:, 30:], 200.0, atol=4.0)
-    same = pictures.embed(pixels, 300)
+    same = images.embed(pixels, 300)
     assert (same.width, same.height) == (100, 40)
-    sliver = pictures.embed(np.zeros((1, 500, 3), np.uint8), 100)
+    sliver = images.embed(np.zeros((1, 500, 3), np.uint8), 100)
     assert (sliver.width, sliver.height) == (100, 1)
 
 
@@ -62,8 +62,8 @@ def test_six_scenes_of_a_hundred_pixels_are_less_than_six_megabytes(ball_scene):
     count, rgb = 6 * 8 * 3 * 4, files.read_rgb(ball_scene / "test/r_000.png")
     noise = np.random.default_rng(0).integers(0, 30, rgb.shape)
     noisy = np.clip(rgb.astype(int) + noise, 0, 255).astype(np.uint8)
-    for pixels in (rgb, pictures.error_map(noisy, rgb, 100)):
-        assert count * len(pictures.embed(pixels, 100).uri) < 6e6
+    for pixels in (rgb, images.error_map(noisy, rgb, 100)):
+        assert count * len(images.embed(pixels, 100).uri) < 6e6
 
 
 def test_an_error_has_the_colour_of_its_mean_over_channels():
@@ -71,12 +71,12 @@ def test_an_error_has_the_colour_of_its_mean_over_channels():
     rendered = target.copy()
     rendered[0, 0] = (0, 51, 0)  # a mean of 17/255 on a scale to 0.25
     rendered[1, 1] = 255
-    shown = pictures.error_map(rendered, target, 2)
+    shown = images.error_map(rendered, target, 2)
     colours = matplotlib.colormaps["magma"]
     expected = [[17 / 255 / 0.25, 0.0], [0.0, 1.0]]
     np.testing.assert_array_equal(shown, np.round(255.0 * colours(expected)[..., :3]))
     # Reduced to one pixel: the colour of the mean error, not the mean of colours.
-    one = pictures.error_map(rendered, target, 1)
+    one = images.error_map(rendered, target, 1)
     mean = (17.0 + 255.0) / 255.0 / 4.0
     np.testing.assert_allclose(one[0, 0], 255.0 * np.array(colours(mean / 0.25)[:3]), atol=2.0)
 
@@ -84,33 +84,33 @@ def test_an_error_has_the_colour_of_its_mean_over_channels():
 def test_distances_share_the_scale_of_the_true_ones():
     truth = np.linspace(2.0, 12.0, 101, dtype=np.float32).reshape(1, 101)
     wild = np.array([[0.0, 500.0]], np.float32)
-    scale = pictures.distance_scale(truth, [wild])
+    scale = images.distance_scale(truth, [wild])
     assert (scale.low, scale.high) == pytest.approx((2.1, 11.9), abs=1e-4)
     nowhere = np.full((1, 2), np.inf, np.float32)
-    assert pictures.distance_scale(nowhere, [wild])[:2] == pytest.approx((5.0, 495.0))
-    assert pictures.distance_scale(None, [nowhere]) is None
-    assert pictures.distance_scale(None, []) is None
-    flat = pictures.distance_scale(np.full((2, 2), 3.0, np.float32), [])
+    assert images.distance_scale(nowhere, [wild])[:2] == pytest.approx((5.0, 495.0))
+    assert images.distance_scale(None, [nowhere]) is None
+    assert images.distance_scale(None, []) is None
+    flat = images.distance_scale(np.full((2, 2), 3.0, np.float32), [])
     assert flat.high > flat.low == 3.0
 
 
 def test_what_is_beyond_a_scale_has_its_last_colour_and_what_is_not_finite_is_grey():
     scale = Scale(1.0, 3.0, "viridis")
     values = np.array([[0.0, 1.0, 2.0, 3.0, 9.0, np.inf, np.nan]], np.float32)
-    shown = pictures.distance_map(values, scale, 99)[0]
+    shown = images.distance_map(values, scale, 99)[0]
     colours = np.round(255.0 * matplotlib.colormaps["viridis"]([0.0, 0.0, 0.5, 1.0, 1.0])[:, :3])
     np.testing.assert_array_equal(shown[:5], colours)
     np.testing.assert_array_equal(shown[5:], 128)
     # Reduced, each distance is one that was there.
-    reduced = pictures.distance_map(np.tile([[1.0, 3.0]], (2, 4)).astype(np.float32), scale, 4)
+    reduced = images.distance_map(np.tile([[1.0, 3.0]], (2, 4)).astype(np.float32), scale, 4)
     assert {tuple(c) for c in reduced.reshape(-1, 3)} <= {tuple(colours[1]), tuple(colours[3])}
-    stops = re.findall(r"rgb\((\d+) (\d+) (\d+)\)", pictures.gradient(scale))
+    stops = re.findall(r"rgb\((\d+) (\d+) (\d+)\)", images.gradient(scale))
     np.testing.assert_array_equal(np.array([stops[0], stops[-1]], int), colours[[0, 3]])
 
 
 def test_outside_its_mask_the_truth_is_nearly_grey():
     pixels = np.full((1, 2, 3), 255, np.uint8)
-    shown = pictures.dim_outside(pixels, np.array([[True, False]]))
+    shown = images.dim_outside(pixels, np.array([[True, False]]))
     np.testing.assert_array_equal(shown[0, :, 0], [255, round(0.8 * 128 + 0.2 * 255)])
 
 
@@ -178,15 +178,15 @@ def test_without_curves_that_is_said():
 
 
 def test_a_method_has_one_look_and_no_two_of_a_chart_have_the_same():
-    for family in lines.families(list(METHODS)):
-        looks = [lines.look(name) for name in family]
+    for family in charts.families(list(METHODS)):
+        looks = [charts.look(name) for name in family]
         assert len(set(looks)) == len(looks)
-    families = lines.families(list(METHODS))
+    families = charts.families(list(METHODS))
     assert [family[0] for family in families[1:]] == ["oracle", "tree"]
     assert len(families) == 1 + len(FULL)
     assert sorted({name for family in families for name in family}) == sorted(METHODS)
-    assert lines.families(["tree", "of tomorrow"]) == [["tree", "of tomorrow"]]
-    assert lines.families([]) == []
+    assert charts.families(["tree", "of tomorrow"]) == [["tree", "of tomorrow"]]
+    assert charts.families([]) == []
 
 
 # --- tables ---
@@ -199,11 +199,11 @@ def test_a_table_is_the_same_after_json():
         made_record("cube_smcvx_ball", "tree", psnr=31.0, psnr_masked=None),
     ]
     for table in (paper_tables.main_table(results), paper_tables.main_table([])):
-        assert table_data.from_json(table_data.as_json(table)) == table
+        assert summary.table_from_json(summary.table_as_json(table)) == table
 
 
 def test_notes_are_read_as_they_are_meant():
-    shown = tables_shown.inline("a **b** *c* <u>d</u> `e` < 5 & |c - c'|²/s² <script>")
+    shown = markup.inline("a **b** *c* <u>d</u> `e` < 5 & |c - c'|²/s² <script>")
     assert shown == (
         "a <strong>b</strong> <em>c</em> <u>d</u> <code>e</code> &lt; 5 &amp; |c - c&#x27;|²/s² "
         "&lt;script&gt;"
@@ -211,7 +211,7 @@ def test_notes_are_read_as_they_are_meant():
 
 
 def test_numbers_that_are_not_known_are_a_dash():
-    shown = [tables_shown.number(value, 1) for value in (None, 1.25, math.inf)]
+    shown = [markup.number(value, 1) for value in (None, 1.25, math.inf)]
     assert shown == ["-", "1.2", "inf"]
 
 
@@ -220,7 +220,7 @@ def test_of_many_blocks_those_over_all_backgrounds_are_open():
     results = [made_record(scene, "tree", psnr=30.0) for scene in scenes]
     for shown, closed in ((results[:1], 0), (results, 4)):
         table = paper_tables.main_table(shown)
-        blocks = named(elements(tables_shown.show(table)), "details")
+        blocks = named(elements(markup.show(table)), "details")
         assert len(blocks) == len(table.blocks)
         folded = ["".join(b.text) for b in blocks if "open" not in b.attributes]
         assert len(folded) == closed and not any("all backgrounds" in text for text in folded)

@@ -6,7 +6,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from experiments.benchmarking.report import cases, contents, sheet
+from experiments.benchmarking.report import data, sheet
 from tests.experiments.benchmarking import made_report
 
 _SCENES = ("cube_smcvx_ball", "env_mmncvx_cup")
@@ -24,11 +24,11 @@ def out(tmp_path_factory):
 
 
 def test_the_view_in_the_middle_stands_for_a_scene(out):
-    for scene in contents.read(out).scenes:
+    for scene in data.read(out).scenes:
         # The views of each method are a decibel apart.
-        assert cases.typical_view(scene) == "r_1"
-        assert cases.psnr_masked(scene, "tree", "r_1") == made_report.QUALITY["tree"] + 1.0
-        assert cases.psnr_masked(scene, "oracle", "r_1") is None
+        assert data.typical_view(scene) == "r_1"
+        assert data.psnr_masked(scene, "tree", "r_1") == made_report.QUALITY["tree"] + 1.0
+        assert data.psnr_masked(scene, "oracle", "r_1") is None
 
 
 def test_each_scene_has_a_column_of_its_true_image_and_each_method(out):

@@ -8,9 +8,9 @@ import math
 import numpy as np
 import pytest
 
-from experiments.benchmarking import paper_tables, pose_space, table_data, table_text, tables
+from experiments.benchmarking import paper_tables, pose_space, summary, tables
 from experiments.benchmarking.methods import METHODS
-from experiments.benchmarking.records import Image
+from experiments.benchmarking.results import Image
 from experiments.benchmarking.tables import NOTHING, Cell, Column, mean_over
 from tests.experiments.benchmarking.made_records import made_record
 
@@ -225,20 +225,20 @@ def test_ablations_are_in_their_own_table_alone():
 
 def test_without_ablations_their_table_says_that_nothing_is_measured():
     table = paper_tables.ablation_table(_RESULTS)
-    assert table.blocks == () and "Nothing is measured yet" in table_text.markdown(table)
+    assert table.blocks == () and "Nothing is measured yet" in summary.markdown(table)
     assert paper_tables.top_views_table([]).blocks == ()
 
 
 def test_markdown_and_latex_mark_and_label():
     table = paper_tables.main_table(_RESULTS)
-    text = table_text.markdown(table)
+    text = summary.markdown(table)
     line = next(line for line in text.splitlines() if line.startswith("| Oracle (path tree) |"))
     assert "| 2 | **33.50** ± 2.50 | **30.00** ± 0.00 | - | - | - |" in line
     assert "| Oracle (paper's paths) | 2 | <u>32.00</u> ± 2.00 | 26.00 ± 2.00 |" in text
     assert "| Oracle, *published* | - | 31.64 | 25.37 | 0.96 |" in text
     assert "| method | scenes | PSNR ↑ | masked PSNR ↑ | SSIM ↑ | LPIPS ↓ |" in text
     assert "measured on its data, which is not ours" in " ".join(text.split())
-    tex = table_text.latex(table)
+    tex = summary.latex(table)
     assert r"\textbf{33.50} {\tiny$\pm$2.50}" in tex and r"\underline{32.00}" in tex
     assert r"Oracle \emph{(published)} & -- & 31.64" in tex
     assert tex.count(r"\begin{tabular}") == tex.count(r"\end{tabular}") == 1
@@ -246,12 +246,12 @@ def test_markdown_and_latex_mark_and_label():
     assert all(
         line.count("&") == width - 1 for line in tex.splitlines() if line.startswith("Oracle (path")
     )
-    assert table_text._escaped("a_b & 5%") == r"a\_b \& 5\%"
+    assert summary._escaped("a_b & 5%") == r"a\_b \& 5\%"
 
 
 def test_csv_and_json_have_every_number():
     table = paper_tables.main_table(_RESULTS)
-    lines = list(csv.DictReader(io.StringIO(table_data.as_csv(table))))
+    lines = list(csv.DictReader(io.StringIO(summary.table_as_csv(table))))
     assert len(lines) == sum(len(block.rows) for block in table.blocks) * len(table.columns)
     (line,) = [
         line
@@ -262,9 +262,9 @@ def test_csv_and_json_have_every_number():
     assert (line["mean"], line["standard_error"]) == ("33.5", "2.5")
     assert (line["scenes"], line["mark"], line["origin"]) == ("2", "best", "ours")
     assert {line["mean"] for line in lines if line["quantity"] == "LPIPS"} >= {"", "0.11"}
-    record = json.loads(json.dumps(table_data.as_json(table), allow_nan=False))
+    record = json.loads(json.dumps(summary.table_as_json(table), allow_nan=False))
     assert record["blocks"][0]["rows"][0]["cells"][0]["mean"] == 21.0
-    scenes = list(csv.DictReader(io.StringIO(table_data.scenes_csv(_RESULTS))))
+    scenes = list(csv.DictReader(io.StringIO(summary.scenes_csv(_RESULTS))))
     assert len(scenes) == len(_RESULTS) and scenes[4]["psnr_masked"] == ""
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from experiments.benchmarking import jobs, record_files, settings, summary, working
+from experiments.benchmarking import jobs, results, settings, summary, working
 from experiments.benchmarking.jobs import Job, Skipped
 from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.settings import Benchmark, Scene
@@ -30,7 +30,7 @@ class _Engine:
         record = made_record(job.scene, job.method, psnr=20.0)
         folder = jobs.folder(self._out, job)
         folder.mkdir(parents=True, exist_ok=True)
-        record_files.write(folder, record)
+        results.write(folder, record)
         return job, None
 
     def stop(self):

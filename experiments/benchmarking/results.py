@@ -1,0 +1,344 @@
+"""The results of a benchmark's jobs: records, their JSON, and the files that hold it.
+
+A record says all there is to say of a job. Its JSON is checked when it is read: docs/benchmark.md
+has the schema. Numbers that JSON does not know are written by name, "inf", "-inf" and "nan"; these
+are read as numbers where a number belongs, and nowhere else: a scene may be called nan.
+
+Tables are made of these files alone. A job's folder can be copied to another machine's benchmark
+of the same settings, to merge what both have measured: so each is compared with what the benchmark
+asks for when it is read.
+"""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from experiments.benchmarking import jobs, settings
+from experiments.benchmarking.methods import METHODS, RECONSTRUCTION
+from experiments.benchmarking.settings import Benchmark, Settings
+from experiments.cli import app
+from refref_jax.data import scene_names
+
+OTHER = "other"
+"""Category or background of a scene that has no name of the data set's form."""
+
+Metrics = dict[str, float | None]
+"""Measured numbers, by the names of docs/metrics.md; `None` for what is not known."""
+
+_TAKE_OUT = "Take its folder out, and repeat the command."
+
+
+class Image(NamedTuple):
+    """What was measured of a test view.
+
+    Attributes:
+      name: of the view.
+      pose_distance: from the nearest training view, see `pose_space`.
+      seconds: that it was rendered in, if that was measured.
+      metrics: of it.
+    """
+
+    name: str
+    pose_distance: float
+    seconds: float | None
+    metrics: Metrics
+
+
+class Costs(NamedTuple):
+    """What a job took; `None` where it was not measured. See `trained_runs.Training`.
+
+    Attributes:
+      steps: of training.
+      seconds_per_step: median.
+      rays_per_second: of training.
+      train_seconds: of all steps.
+      startup_seconds: of training's process besides.
+      peak_host_mib: most memory of training's process, or of a reconstruction's.
+      peak_device_mib: most memory of its accelerator.
+      seconds_per_image: of rendering.
+      seconds: of a reconstruction's last process.
+    """
+
+    steps: float | None = None
+    seconds_per_step: float | None = None
+    rays_per_second: float | None = None
+    train_seconds: float | None = None
+    startup_seconds: float | None = None
+    peak_host_mib: float | None = None
+    peak_device_mib: float | None = None
+    seconds_per_image: float | None = None
+    seconds: float | None = None
+
+
+class Truth(NamedTuple):
+    """True files of a view, from `scene_path`; `None` for what the scene lacks."""
+
+    rgb: str
+    mask: str | None
+    distance: str | None
+
+
+class View(NamedTuple):
+    """Files of a view: the true ones, and what was rendered, from the job's folder."""
+
+    name: str
+    truth: Truth
+    rgb: str
+    distance: str
+
+
+class Record(NamedTuple):
+    """What a job left, see docs/benchmark.md.
+
+    Attributes:
+      scene: name.
+      category: `smcvx`, `smncvx`, `mmncvx`, or `OTHER`.
+      background: `cube`, `sphere`, `env`, or `OTHER`.
+      method: name, or `RECONSTRUCTION`.
+      fingerprint: of the scene's files, see `fingerprints`.
+      options: of its commands, by command.
+      settings: of the benchmark.
+      metrics: means over the images.
+      per_image: of each image.
+      costs: what it took.
+      versions: of what it ran with.
+      views: files of each image.
+      scene_path: where the scene was.
+      facts: what was found besides: learned colours, index of refraction.
+    """
+
+    scene: str
+    category: str
+    background: str
+    method: str
+    fingerprint: str
+    options: dict[str, list[str]]
+    settings: Settings
+    metrics: Metrics
+    per_image: list[Image]
+    costs: Costs
+    versions: dict[str, str | None]
+    views: list[View]
+    scene_path: str
+    facts: dict[str, Any]
+
+
+def compared(found: list[Record]) -> list[Record]:
+    """Returns the results of methods, without those of reconstructions."""
+    return [record for record in found if record.method != RECONSTRUCTION]
+
+
+def category_and_background(scene: str) -> tuple[str, str]:
+    """Returns what a scene's name says it is."""
+    if not scene_names.is_name(scene):
+        return OTHER, OTHER
+    name = scene_names.parse(scene)
+    return name.category, name.background
+
+
+def to_json(record: Record) -> dict[str, Any]:
+    """Returns a result as JSON has it."""
+    return app.string_safe(
+        record._asdict()
+        | {
+            "settings": dataclasses.asdict(record.settings),
+            "per_image": [
+                {"name": image.name, "pose_distance": image.pose_distance}
+                | ({} if image.seconds is None else {"seconds": image.seconds})
+                | image.metrics
+                for image in record.per_image
+            ],
+            "costs": {
+                key: cost for key, cost in record.costs._asdict().items() if cost is not None
+            },
+            "views": [view._asdict() | {"truth": view.truth._asdict()} for view in record.views],
+        }
+    )
+
+
+def from_json(content: Any) -> Record:
+    """Undoes `to_json`. What else an object holds is passed over.
+
+    Raises:
+      ValueError: if something is missing or of another kind.
+    """
+    told = _object(content, "the file")
+    known = {key: _get(told, key, "the file") for key in Record._fields}
+    texts = ("scene", "category", "background", "method", "scene_path", "fingerprint")
+    given = _object(known["settings"], "settings")
+    try:
+        common = Settings(**given)
+    except TypeError as error:
+        raise ValueError(f"its settings are others: {error}") from error
+    return Record(
+        **{key: _text(known[key], key) for key in texts},
+        options={
+            command: [_text(word, f"options of {command}") for word in _list(words, command)]
+            for command, words in _object(known["options"], "options").items()
+        },
+        settings=common,
+        metrics=_numbers(known["metrics"], "metrics"),
+        per_image=[_image(each) for each in _list(known["per_image"], "per_image")],
+        costs=_costs(known["costs"]),
+        versions={
+            name: _text_or_none(version, f"versions.{name}")
+            for name, version in _object(known["versions"], "versions").items()
+        },
+        views=[_view(each) for each in _list(known["views"], "views")],
+        facts=_object(known["facts"], "facts"),
+    )
+
+
+def number(value: Any, what: str) -> float | None:
+    """Returns a number that JSON holds; what is not known is `None`.
+
+    Raises:
+      ValueError: if it is anything else.
+    """
+    if isinstance(value, str) and value in app.NOT_FINITE:
+        return float(value)
+    if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
+        return value
+    raise ValueError(f"{what} is {value!r}, which is no number")
+
+
+def _image(content: Any) -> Image:
+    told = dict(_object(content, "an image of per_image"))
+    name = _text(told.pop("name", None), "the name of an image")
+    apart = number(told.pop("pose_distance", None), f"pose_distance of {name}")
+    if apart is None or not math.isfinite(apart):
+        raise ValueError(f"pose_distance of {name} is {apart}, which is no distance")
+    seconds = number(told.pop("seconds", None), f"seconds of {name}")
+    return Image(name, apart, seconds, _numbers(told, name))
+
+
+def _costs(content: Any) -> Costs:
+    known = _numbers(content, "costs")
+    if unknown := set(known) - set(Costs._fields):
+        raise ValueError(f"costs has {sorted(unknown)[0]}, which is no cost")
+    return Costs(**known)
+
+
+def _view(content: Any) -> View:
+    told = _object(content, "a view")
+    name, rgb, distance = (
+        _text(told.get(key), f"{key} of a view") for key in ("name", "rgb", "distance")
+    )
+    truth = _object(told.get("truth"), f"truth of {name}")
+    files = (_text_or_none(truth.get(key), f"{key} of {name}") for key in ("mask", "distance"))
+    return View(name, Truth(_text(truth.get("rgb"), f"rgb of {name}"), *files), rgb, distance)
+
+
+def _numbers(content: Any, what: str) -> dict[str, float | None]:
+    return {key: number(value, f"{what}.{key}") for key, value in _object(content, what).items()}
+
+
+def _get(told: dict[str, Any], key: str, what: str) -> Any:
+    if key not in told:
+        raise ValueError(f"{what} lacks {key}")
+    return told[key]
+
+
+def _object(value: Any, what: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError(f"{what} is {value!r}, which is no object")
+    return value
+
+
+def _list(value: Any, what: str) -> list[Any]:
+    if not isinstance(value, list):
+        raise ValueError(f"{what} is {value!r}, which is no list")
+    return value
+
+
+def _text(value: Any, what: str) -> str:
+    if not isinstance(value, str):
+        raise ValueError(f"{what} is {value!r}, which is no text")
+    return value
+
+
+def _text_or_none(value: Any, what: str) -> str | None:
+    return None if value is None else _text(value, what)
+
+
+def write(folder: Path, record: Record) -> None:
+    """Writes the result of a job, all or nothing."""
+    settings.write_json(folder / jobs.RESULT, to_json(record))
+
+
+def read(path: Path) -> Record:
+    """Reads the result of a job.
+
+    Raises:
+      ValueError: if it is none.
+    """
+    try:
+        return from_json(json.loads(path.read_text("utf-8")))
+    except ValueError as error:
+        raise ValueError(
+            f"{path} is not the result of a job ({error}). Remove it, and repeat the command."
+        ) from error
+
+
+def read_all(out: Path, benchmark: Benchmark) -> list[Record]:
+    """Reads all results of a benchmark, ordered by scene and method.
+
+    Raises:
+      ValueError: if one is broken, lies in another's folder, or was made with other settings, with
+        a method that is another or not known, or of another scene of that name.
+    """
+    found: list[Record] = []
+    fingerprints = {name: scene.fingerprint for name, scene in benchmark.scenes.items()}
+    for path in sorted((out / jobs.FOLDER).glob(f"*/*/{jobs.RESULT}")):
+        record = read(path)
+        if (record.scene, record.method) != (path.parts[-3], path.parts[-2]):
+            raise ValueError(
+                f"{path} is the result of {record.scene}/{record.method}. Move its folder there."
+            )
+        _check_method(path, record, benchmark)
+        _check_scene(path, record, fingerprints.setdefault(record.scene, record.fingerprint))
+        found.append(record)
+    return found
+
+
+def _check_method(path: Path, record: Record, benchmark: Benchmark) -> None:
+    """Refuses a result that was not made as the benchmark has it."""
+    if record.settings != benchmark.settings:
+        raise ValueError(
+            f"{path} was made with other settings than those of {path.parents[3] / settings.FILE}, "
+            f"so that it does not compare. {_TAKE_OUT}"
+        )
+    if record.method not in (*METHODS, RECONSTRUCTION):
+        raise ValueError(
+            f"{path} is of the method {record.method}, which this version does not know. Use the "
+            "version that made it, or take its folder out."
+        )
+    train = benchmark.methods.get(record.method)
+    if train is None and record.method in METHODS:
+        train = METHODS[record.method].train
+    expected = jobs.options(record.method, train or (), benchmark.settings)
+    for command in sorted({*expected, *record.options}):
+        made, asked = record.options.get(command, []), expected.get(command, [])
+        if made != asked:
+            raise ValueError(
+                f"{path} was made by {command} {' '.join(made)}, and here {record.method} is "
+                f"{command} {' '.join(asked)}. {_TAKE_OUT}"
+            )
+
+
+def _check_scene(path: Path, record: Record, fingerprint: str) -> None:
+    """Refuses a result of another scene than that of its name."""
+    if record.fingerprint != fingerprint:
+        raise ValueError(
+            f"{path} is of another scene named {record.scene} (fingerprint {record.fingerprint}) "
+            f"than the benchmark's ({fingerprint}): cameras, meshes, scene.json or images differ. "
+            f"{_TAKE_OUT}"
+        )
+    kind = category_and_background(record.scene)
+    if (record.category, record.background) != kind:
+        raise ValueError(
+            f"{path} says that {record.scene} is {record.category} before {record.background}, its "
+            f"name says {' before '.join(kind)}. {_TAKE_OUT}"
+        )
