@@ -19,6 +19,7 @@ from experiments.cli import app, outputs
 from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
 from experiments.cli.progress import ProgressBar
+from refref_jax import configuration
 
 if TYPE_CHECKING:
     from refref_jax.render import Model
@@ -71,7 +72,7 @@ def main() -> None:
     with outputs.fresh(out, **place) as draft:
         found, views = evaluate(model, scene, draft, perceptual)
         summary = told | found._asdict()
-        text = json.dumps(app.string_safe(summary), indent=2, allow_nan=False)
+        text = json.dumps(configuration.string_safe(summary), indent=2, allow_nan=False)
         (draft / "metrics.json").write_text(text + "\n", encoding="utf-8")
         figures.write_comparison(draft / "comparison.png", views)
     for key, value in summary["results"].items():

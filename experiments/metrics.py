@@ -18,6 +18,7 @@ from etils import epy
 from experiments.cli import app, outputs
 from experiments.cli import flags as cli_flags
 from experiments.cli.progress import ProgressBar
+from refref_jax import configuration
 
 with epy.lazy_imports():
     from experiments.runs import image_folders as folder_comparison
@@ -59,7 +60,7 @@ def _again(rendered: str, truth: str) -> str:
 
 def _write(out: Path, given: dict[str, Any], rows: list[dict[str, Any]]) -> None:
     summary = given | {"results": folder_comparison.summarise(rows), "per_image": rows}
-    text = json.dumps(app.string_safe(summary), indent=2, allow_nan=False)
+    text = json.dumps(configuration.string_safe(summary), indent=2, allow_nan=False)
     with outputs.fresh_file(out, overwrite=_OVERWRITE.value) as path:
         path.write_text(text + "\n", encoding="utf-8")
 

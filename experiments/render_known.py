@@ -25,6 +25,7 @@ from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
 from experiments.cli.progress import ProgressBar
 from experiments.runs import refraction_indices
+from refref_jax import configuration
 from refref_jax.optics.budgets import BUDGETS, Budget
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ def main() -> None:
     )
     with outputs.fresh(out, **place) as draft:
         summary = render(scene, budget, draft)
-        text = json.dumps(app.string_safe(summary), indent=2, allow_nan=False) + "\n"
+        text = json.dumps(configuration.string_safe(summary), indent=2, allow_nan=False) + "\n"
         if metrics_file is None:
             (draft / "metrics.json").write_text(text, encoding="utf-8")
     if metrics_file is not None:

@@ -63,8 +63,8 @@ def check_flags() -> None:
     cli_scenes.check(scene)
     if scene is None and config is None and not _RESUME.value:
         raise ValueError(
-            "No scene is given. Add --scene=FOLDER or --config=FILE, or --resume to go on with a "
-            "run."
+            "No scene is given. Add --scene=FOLDER, or --resume to continue a run, or "
+            "--config=FILE."
         )
     ior = _CONFIG["ior"].value or ()
     training_body.check_flags(given, paths=_CONFIG["paths"].value, ior=ior)
@@ -80,6 +80,10 @@ def _train(run: Path) -> bool:
 
     mesh = processes.mesh(_DEVICES)
     resuming = _RESUME.value and run_folder.exists(run)
+    if run_folder.exists(run) and not resuming:
+        raise ValueError(
+            f"{run} holds a run already. Continue it with --resume, or give another --out."
+        )
     if not resuming:
         run_folder.check_free(run)
     if not resuming or _CONFIG["scene"].value is not None:

@@ -8,9 +8,10 @@ field is annotated with a base class, its own key `kind` says which of that clas
 
 import dataclasses
 import json
+import math
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,6 +23,10 @@ Variants = Mapping[type, Mapping[str, type]]
 """The classes that may stand for a base class, by their key `kind`; the first is the default."""
 
 _KIND = "kind"
+
+
+NOT_FINITE = ("inf", "-inf", "nan")
+"""Names of the numbers that JSON does not know."""
 
 
 def write(path: Path, config: Any) -> None:
@@ -46,6 +51,26 @@ def parse_json(text: str) -> Any:
 
 def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is not a number of JSON")
+
+
+def string_safe(value: Any) -> Any:
+    """Replaces numbers that JSON does not know by their names."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return _each(value, string_safe)
+
+
+def from_string_safe(value: Any) -> Any:
+    """Undoes `string_safe`."""
+    if isinstance(value, str) and value in NOT_FINITE:
+        return float(value)
+    return _each(value, from_string_safe)
+
+
+def _each(value: Any, change: Callable[[Any], Any]) -> Any:
+    if isinstance(value, dict):
+        return {key: change(item) for key, item in value.items()}
+    return [change(item) for item in value] if isinstance(value, list) else value
 
 
 def read(path: Path, kind: type[_Config], *, variants: Variants | None = None) -> _Config:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from experiments.benchmarking import jobs, settings
 from experiments.benchmarking.methods import METHODS, RECONSTRUCTION
 from experiments.benchmarking.settings import Benchmark, Settings
-from experiments.cli import app
+from refref_jax import configuration
 from refref_jax.data import scene_names
 
 OTHER = "other"
@@ -140,7 +140,7 @@ def category_and_background(scene: str) -> tuple[str, str]:
 
 def to_json(record: Record) -> dict[str, Any]:
     """Returns a result as JSON has it."""
-    return app.string_safe(
+    return configuration.string_safe(
         record._asdict()
         | {
             "settings": dataclasses.asdict(record.settings),
@@ -197,7 +197,7 @@ def number(value: Any, what: str) -> float | None:
     Raises:
       ValueError: if it is anything else.
     """
-    if isinstance(value, str) and value in app.NOT_FINITE:
+    if isinstance(value, str) and value in configuration.NOT_FINITE:
         return float(value)
     if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
         return value

@@ -25,8 +25,7 @@ from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.results import Record
 from experiments.benchmarking.settings import Benchmark
 from experiments.benchmarking.tables import Block, Cell, Column, Mark, Row, Table
-from experiments.cli import app
-from refref_jax import atomic_files
+from refref_jax import atomic_files, configuration
 from refref_jax.training import run_folder
 
 FILE, RESULTS, TABLES = "summary.md", "results.json", "tables"
@@ -119,7 +118,7 @@ def write(
         "missing": [f"{scene}/{method}" for scene, method in missing],
         "tables": {table.name: table_as_json(table) for table in made},
     }
-    settings.write_json(out / RESULTS, app.string_safe(index))
+    settings.write_json(out / RESULTS, configuration.string_safe(index))
 
 
 def _write_tables(folder: Path, made: Sequence[Table], found: Sequence[Record]) -> None:
@@ -234,7 +233,7 @@ def _indexed(out: Path, record: Record) -> dict[str, Any]:
 
 def _curve(run: Path) -> list[dict[str, Any]]:
     """Returns the metrics of a training, thinned to what a figure shows; the last stays."""
-    lines = app.from_string_safe(run_folder.read_metrics(run))
+    lines = configuration.from_string_safe(run_folder.read_metrics(run))
     stride = max(1, -(-len(lines) // _MOST_POINTS))
     thinned = lines[::-1][::stride][::-1]
     keys = ("step", "loss", "psnr", "seconds")
@@ -269,7 +268,7 @@ def table_as_csv(table: Table) -> str:
 
 def table_as_json(table: Table) -> dict[str, Any]:
     """Returns a table as JSON has it."""
-    return app.string_safe(
+    return configuration.string_safe(
         {
             "name": table.name,
             "title": table.title,
@@ -333,7 +332,7 @@ def scenes_csv(found: Sequence[Record]) -> str:
 
 def _row(record: dict[str, Any]) -> Row:
     cells = [
-        Cell(**app.from_string_safe({key: cell[key] for key in Cell._fields}))
+        Cell(**configuration.from_string_safe({key: cell[key] for key in Cell._fields}))
         for cell in record["cells"]
     ]
     marks = tuple(cell["mark"] for cell in record["cells"])

@@ -6,7 +6,6 @@ that a wrong flag is refused at once.
 """
 
 import difflib
-import math
 import os
 import shlex
 import signal
@@ -21,7 +20,6 @@ from absl import app, flags, logging
 INTERRUPTED = 130
 """Status of a command that was stopped by Ctrl-C, as shells have it."""
 
-NOT_FINITE = ("inf", "-inf", "nan")  # names of the numbers that JSON does not know
 
 STOP_WITH_INPUT = "REFREF_STOP_WITH_INPUT"
 """Variable of the environment: if it is set, a command stops when its standard input ends."""
@@ -170,23 +168,3 @@ class Interrupt:
             # Not `print`: the signal may have come while something was being printed.
             os.write(1, b"Stopping after this step" + more + b"\n")
         self.requested = True
-
-
-def string_safe(value: Any) -> Any:
-    """Replaces numbers that JSON does not know by their names."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    return _each(value, string_safe)
-
-
-def from_string_safe(value: Any) -> Any:
-    """Undoes `string_safe`."""
-    if isinstance(value, str) and value in NOT_FINITE:
-        return float(value)
-    return _each(value, from_string_safe)
-
-
-def _each(value: Any, change: Callable[[Any], Any]) -> Any:
-    if isinstance(value, dict):
-        return {key: change(item) for key, item in value.items()}
-    return [change(item) for item in value] if isinstance(value, list) else value

@@ -11,13 +11,14 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 from absl import flags
 from etils import epy
 
 from experiments.cli import app
 from experiments.runs import processes, view_numbers
+from refref_jax import choices
 from refref_jax.optics.budgets import Budget, budget_of
 
 with epy.lazy_imports():
@@ -25,11 +26,10 @@ with epy.lazy_imports():
 
 flags.disclaim_key_flags()
 
-# Choices whose definition imports JAX; a test holds these equal to the definitions.
-SPLITS = ("train", "val", "test")
-PRESETS = ("tiny", "small", "paper", "best")
-FIELDS = ("zipnerf", "nerfacto")
-RULES = ("nested", "facing", "priority")
+# Choices of the library; that of ways to a geometry is held equal to its definition by a test.
+SPLITS = get_args(choices.Split)
+PRESETS = get_args(choices.PresetName)
+RULES = get_args(choices.RuleName)
 GEOMETRIES = ("hull", "occupancy")
 
 SCENE_FORMS = "a folder, or hf:CONFIG/SCENE of the published data set"
@@ -197,7 +197,7 @@ def space() -> SpaceFlags:
     background = flags.DEFINE_enum(
         "background",
         "auto",
-        ["auto", "bounded", "spherical", "unbounded"],
+        ["auto", *get_args(choices.Space)],
         "Walls, a cube of them or a sphere, or an environment infinitely far away.",
     )
     radius = flags.DEFINE_float(

@@ -26,6 +26,7 @@ from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
 from experiments.cli.progress import ProgressBar
 from experiments.dataset import render_settings
+from refref_jax import configuration
 
 if TYPE_CHECKING:
     from experiments.dataset.check_page import SceneReport
@@ -63,7 +64,7 @@ def main(folder: str) -> None:
         for done, scene in enumerate(scenes, 1):
             reports.append(scene_check.check_scene(scene, budget, views=_LIMIT.value, side=side))
             bar.show(done, _summary(reports[-1]))
-    content = app.string_safe([_record(report) for report in reports])
+    content = configuration.string_safe([_record(report) for report in reports])
     for path, text in (
         (page, check_page.write_page(reports, title=f"Check of {checked.resolve().name}")),
         (figures, json.dumps(content, indent=2, allow_nan=False) + "\n"),

@@ -13,9 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.cli import app
 from experiments.cli import subprocesses as child_process
-from refref_jax import atomic_files
+from refref_jax import atomic_files, configuration
 from refref_jax.data import local_layout, transforms
 from refref_jax.training import run_folder
 
@@ -140,7 +139,7 @@ def evaluate(
         child_process.run("evaluate", *command, log=run.with_name(f"{run.name}.log"))
         summary = json.loads((run / "eval" / split / "metrics.json").read_text("utf-8"))
         names = {field.name for field in dataclasses.fields(Evaluation)}
-        results = app.from_string_safe(summary["results"])
+        results = configuration.from_string_safe(summary["results"])
         values = {name: x for name, x in results.items() if name in names}
         known.setdefault("evaluations", {})[key] = values | {"images": len(summary["per_image"])}
         _write(run, known)

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import jax
 from jax.sharding import Mesh
 
-from refref_jax import atomic_files
+from refref_jax import atomic_files, configuration
 from refref_jax.data import local_layout, mask_margins, scene_source
 from refref_jax.data.batches import PixelSampler
 from refref_jax.data.meshes import MeshPart
@@ -57,7 +57,7 @@ USUAL = Periods()
 
 
 def fit(
-    config: TrainConfig | None = None,
+    config: TrainConfig | None,
     *,
     out: str | Path | None = None,
     resume: bool = False,
@@ -72,7 +72,8 @@ def fit(
     for bit.
 
     Args:
-      config: the run; may be `None` for one that is resumed, and is else compared with it.
+      config: configuration of the run, with which a resumed run is compared; `None` to resume
+        it as it is.
       out: folder of the run, which must not hold one yet; a temporary one if `None`.
       resume: whether to go on with the run in `out`, if there is one.
       progress: is called every `periods.log` steps.
@@ -269,6 +270,5 @@ def _line(step: int, measured: StepReport, rate: float, seconds: float) -> dict[
     # A CPU keeps no such record.
     if (memory := jax.local_devices()[0].memory_stats()) is not None:
         line["peak_device_bytes"] = memory["peak_bytes_in_use"]
-    # JSON has no infinity, which the PSNR of a batch that is met exactly is.
-    finite = (x if not isinstance(x, float) or math.isfinite(x) else str(x) for x in line.values())
-    return dict(zip(line, finite, strict=True))
+    # The PSNR of a batch that is met exactly is infinite.
+    return configuration.string_safe(line)

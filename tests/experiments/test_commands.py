@@ -33,7 +33,7 @@ def test_training_writes_a_readable_run(trained):
         assert {"step", "loss", "psnr", "lost", "rays_per_second", "seconds"} <= set(line)
         assert np.all(np.isfinite(list(line.values())))
     config = json.loads((trained / "config.json").read_text())
-    assert config["paths"] == "tree" and config["schedule"]["steps"] == 6
+    assert config["paths"]["name"] == "tree" and config["schedule"]["steps"] == 6
     assert {path.name for path in (trained / "checkpoints").iterdir()} == {"3", "6"}
 
 

@@ -285,7 +285,7 @@ run.mkdir(exist_ok=True)
 if command == "train":
     lines = [{"step": n, "seconds": 5.0 + 0.5 * n, "peak_device_bytes": 2**30} for n in (1, 2, 4)]
     (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\\n" for line in lines))
-    (run / "config.json").write_text('{"batch": 100}')
+    (run / "config.json").write_text('{"schedule": {"batch": 100}}')
 else:
     results = {"psnr": "inf", "psnr_masked": None, "ssim": 1.0, "distance_mae": 0.1}
     results |= {"distance_mae_masked": None, "seconds_per_image": 2.0}

@@ -70,7 +70,7 @@ def test_the_configuration_of_a_run_repeats_it_bit_for_bit(fifty, tmp_path):
 
 def test_fit_refuses_what_names_no_run(tmp_path):
     with pytest.raises(ValueError, match="holds no run to resume"):
-        fit.fit(out=tmp_path, resume=True)
+        fit.fit(None, out=tmp_path, resume=True)
     with pytest.raises(ValueError, match="No scene is given"):
         fit.fit(TrainConfig(), out=tmp_path / "run")
     with pytest.raises(ValueError, match="was reconstructed"):

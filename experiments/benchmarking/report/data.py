@@ -17,7 +17,7 @@ from experiments.benchmarking.jobs import SPLIT, Skipped
 from experiments.benchmarking.results import Metrics, Record, Truth, compared, from_json
 from experiments.benchmarking.settings import Settings
 from experiments.benchmarking.tables import Table
-from experiments.cli import app
+from refref_jax import configuration
 from refref_jax.data import files, transforms
 from refref_jax.data.errors import SceneError
 from refref_jax.geometry import cameras
@@ -130,7 +130,7 @@ def _result(job: dict[str, Any], moved: dict[str, Path]) -> Result:
     was = Path(record.scene_path)
     curve = tuple(
         Point(point["step"], point["seconds"], point["psnr"])
-        for point in app.from_string_safe(job["curve"])
+        for point in configuration.from_string_safe(job["curve"])
         if {"step", "seconds", "psnr"} <= set(point)
     )
     return Result(record, curve, (moved.get(record.scene, was), was))

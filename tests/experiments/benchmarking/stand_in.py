@@ -48,7 +48,7 @@ def _train(run, options):
         _write(path, str(count))
     lines = [{"step": n, "seconds": 1.0 + n, "loss": 1.0 / n, "psnr": 9.0} for n in (1, steps)]
     (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    _write(run / "config.json", '{"batch": 100}')
+    _write(run / "config.json", '{"schedule": {"batch": 100}}')
     (run / "trained_with").write_text(" ".join(f"{k}={v}" for k, v in sorted(options.items())))
 
 
