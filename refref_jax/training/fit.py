@@ -13,7 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 from jax.sharding import Mesh
@@ -34,6 +34,8 @@ from refref_jax.training.state import TrainState, init_state
 
 # Steps that the device takes without the host, which sees an interrupt only between them.
 _MOST_STEPS = 10
+
+Existing = Literal["refuse", "resume"]
 
 Progress = Callable[[int, int, str], None]
 """Is called with the steps taken, those of the whole run, and a line on the last one."""
@@ -60,7 +62,7 @@ def fit(
     config: TrainConfig | None,
     *,
     out: str | Path | None = None,
-    resume: bool = False,
+    existing: Existing = "refuse",
     progress: Progress = lambda step, total, text: None,
     report: Callable[[str], None] = print,
     periods: Periods = USUAL,
@@ -75,7 +77,7 @@ def fit(
       config: configuration of the run, with which a resumed run is compared; `None` to resume
         it as it is.
       out: folder of the run, which must not hold one yet; a temporary one if `None`.
-      resume: whether to go on with the run in `out`, if there is one.
+      existing: whether a run that is in `out` already is refused, or resumed.
       progress: is called every `periods.log` steps.
       report: is given what was decided, and warnings, as lines of text.
       periods: how often metrics and checkpoints are written.
@@ -88,7 +90,7 @@ def fit(
         if out is None:
             out = stack.enter_context(tempfile.TemporaryDirectory(prefix="refref_jax_"))
         run = Path(out)
-        resuming = resume and run_folder.exists(run)
+        resuming = existing == "resume" and run_folder.exists(run)
         if config is None and not resuming:
             raise ValueError(f"{run} holds no run to resume. Give a configuration.")
         if not resuming:

@@ -60,17 +60,17 @@ def test_the_configuration_of_a_run_repeats_it_bit_for_bit(fifty, tmp_path):
     assert all(np.array_equal(ours, again) for ours, again in pairs)
     assert any("given: scene=" in message for message in messages)
     # Resumed, it is done; with another option it is refused.
-    done = fit.fit(config, out=tmp_path / "again", resume=True, report=messages.append)
+    done = fit.fit(config, out=tmp_path / "again", existing="resume", report=messages.append)
     assert "trained already" in messages[-1] and done.budget == model.budget
     with pytest.raises(ValueError, match=r"other options than .* \(cut\)"):
-        fit.fit(config.override(cut=0.05), out=tmp_path / "again", resume=True)
+        fit.fit(config.override(cut=0.05), out=tmp_path / "again", existing="resume")
     with pytest.raises(ValueError, match="holds a run already"):
         fit.fit(config, out=tmp_path / "again")
 
 
 def test_fit_refuses_what_names_no_run(tmp_path):
     with pytest.raises(ValueError, match="holds no run to resume"):
-        fit.fit(None, out=tmp_path, resume=True)
+        fit.fit(None, out=tmp_path, existing="resume")
     with pytest.raises(ValueError, match="No scene is given"):
         fit.fit(TrainConfig(), out=tmp_path / "run")
     with pytest.raises(ValueError, match="was reconstructed"):

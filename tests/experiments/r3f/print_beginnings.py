@@ -28,7 +28,7 @@ def _begin(options):
         with contextlib.redirect_stdout(printed):
             train.check_flags()
             train._train(run)
-    except ValueError as error:
+    except (ValueError, flags.Error) as error:
         return {"error": str(error)}
     geometry = saved.load_geometry(run)
     body = object_source.read(run)
