@@ -1,4 +1,5 @@
-# One command from a fresh clone: `make demo` trains and shows a model, `make test` tests.
+# One command from a fresh clone: `make demo` trains and shows a model, `make test` tests the library
+# and the commands, `make test-dataset` the generator of scenes.
 # Both create .venv first, and may be repeated. `make dataset-env` installs Blender, which
 # `python -m experiments.dataset.make` renders with, beside it. `make benchmark-small` needs both: it
 # renders six scenes and compares three methods on them; docs/benchmark.md says how long that takes.
@@ -18,7 +19,10 @@ SMALL := runs/benchmark-small
 SMALL_SCENES := cube_smcvx_cylinder,env_smcvx_pyramid,cube_smncvx_torus,sphere_smncvx_teapot
 SMALL_SCENES := $(SMALL_SCENES),sphere_mmncvx_conical_flask,env_mmncvx_perfume_red
 
-.PHONY: demo test test-slow lint format clean notebooks dataset-env benchmark-small
+PYTEST := $(RUN) pytest --numprocesses=auto --maxprocesses=4 --dist=loadscope --no-loadscope-reorder
+DATASET_TESTS := tests/experiments/dataset
+
+.PHONY: demo test test-dataset test-slow lint format clean notebooks dataset-env benchmark-small
 
 demo: $(READY)
 	$(RUN) experiments.train --scene=experiments/data/cube_smcvx_ball --preset=tiny \
@@ -27,7 +31,10 @@ demo: $(READY)
 	@echo "Look at runs/demo/eval/test/comparison.png"
 
 test: $(READY)
-	$(RUN) pytest --numprocesses=auto --maxprocesses=4 --dist=loadscope --no-loadscope-reorder
+	$(PYTEST) --ignore=$(DATASET_TESTS)
+
+test-dataset: $(READY)
+	$(PYTEST) $(DATASET_TESTS)
 
 test-slow: $(READY)
 	$(RUN) pytest -m slow

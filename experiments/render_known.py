@@ -167,7 +167,7 @@ def _check(metrics_file: Path | None) -> None:
 
 def _is_ours(path: Path) -> bool:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = configuration.parse_json(path.read_text(encoding="utf-8"))
     except ValueError:
         return False
     return isinstance(content, dict) and set(content) >= _KEYS

@@ -40,17 +40,19 @@ def parse_json(text: str) -> Any:
     """Returns what a JSON text says, for files that may be anybody's.
 
     Raises:
-      ValueError: if it is not JSON, holds a number that JSON does not know (NaN, Infinity), or is
-        nested too deeply to be read.
+      ValueError: if it is not JSON, holds NaN, or is nested too deeply to be read.
     """
     try:
-        return json.loads(text, parse_constant=_refuse_constant)
+        return json.loads(text, parse_constant=_constant)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
 
 
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a number of JSON")
+def _constant(name: str) -> float:
+    """Returns an infinity, which limits may be; Python writes it as `Infinity`."""
+    if name == "NaN":
+        raise ValueError("NaN is not a number")
+    return float(name)
 
 
 def string_safe(value: Any) -> Any:

@@ -7,11 +7,11 @@ not matter, nor does what else is in it.
 """
 
 import hashlib
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from refref_jax import configuration
 from refref_jax.data import meshes
 
 _LETTERS = 16
@@ -46,7 +46,7 @@ def _add(found: Any, name: str, content: bytes) -> None:
 def _images(transforms: Path) -> Iterator[str]:
     """Yields the files that a transforms file names, as far as it is one."""
     try:
-        frames = json.loads(transforms.read_text(encoding="utf-8"))["frames"]
+        frames = configuration.parse_json(transforms.read_text(encoding="utf-8"))["frames"]
     except (ValueError, KeyError, TypeError):
         return
     for frame in frames if isinstance(frames, list) else ():

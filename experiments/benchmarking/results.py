@@ -10,7 +10,6 @@ asks for when it is read.
 """
 
 import dataclasses
-import json
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -275,7 +274,7 @@ def read(path: Path) -> Record:
       ValueError: if it is none.
     """
     try:
-        return from_json(json.loads(path.read_text("utf-8")))
+        return from_json(configuration.parse_json(path.read_text("utf-8")))
     except ValueError as error:
         raise ValueError(
             f"{path} is not the result of a job ({error}). Remove it, and repeat the command."

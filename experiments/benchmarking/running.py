@@ -6,7 +6,6 @@ its result is not done again.
 """
 
 import dataclasses
-import json
 import time
 import traceback
 from collections.abc import Mapping
@@ -25,7 +24,7 @@ from experiments.cli import subprocesses as child_process
 from experiments.cli.subprocesses import RunFailedError
 from experiments.r3f import records as reconstructions
 from experiments.runs import measured_runs as trained_runs
-from refref_jax import atomic_files
+from refref_jax import atomic_files, configuration
 from refref_jax.data import local_layout
 
 # Seconds that a command which outlived its benchmark may take to save and end: where others work
@@ -114,7 +113,7 @@ def _learn(job: Job, folder: Path) -> Record:
     wait_until_free(run_)
     cost = trained_runs.train(run_, scene=scene, options=[*options["train"], *objects])
     trained_runs.evaluate(run_, scene=scene, options=[*options["evaluate"], *weights], split=SPLIT)
-    summary = json.loads((run_ / "eval" / SPLIT / "metrics.json").read_text("utf-8"))
+    summary = configuration.parse_json((run_ / "eval" / SPLIT / "metrics.json").read_text("utf-8"))
     metrics = {key: number(value, key) for key, value in summary["results"].items()}
     # Tables are of what does not change from one time to the next.
     seconds = metrics.pop("seconds_per_image")

@@ -13,7 +13,6 @@ Markdown and as LaTeX for a paper (with booktabs).
 import csv
 import dataclasses
 import io
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -139,7 +138,7 @@ def not_done(out: Path) -> tuple[dict[str, str], list[Skipped]]:
     they can not be read.
     """
     try:
-        index = json.loads((out / RESULTS).read_text("utf-8"))
+        index = configuration.parse_json((out / RESULTS).read_text("utf-8"))
         skipped = [Skipped(**each) for each in index["skipped"]]
         failed = dict(index["failed"])
     except (OSError, ValueError, KeyError, TypeError):

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from experiments.cli import app
-from refref_jax import atomic_files
+from refref_jax import atomic_files, configuration
 
 NOTE = "command.json"
 
@@ -145,7 +145,7 @@ def _remove_empty(folder: Path) -> None:
 def _noted(out: Path, module: str) -> set[Path] | None:
     """Returns the files that a command's note lists; `None` if there is no note of it."""
     try:
-        content = json.loads((out / NOTE).read_text(encoding="utf-8"))
+        content = configuration.parse_json((out / NOTE).read_text(encoding="utf-8"))
         command, files = content["command"], {Path(name) for name in content["files"]}
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -4,10 +4,10 @@ A frame is its image, mask and depth map; all other files are *extras*, by their
 folder: `scene.json`, meshes, textures, maps of floats.
 """
 
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from refref_jax import configuration
 from refref_jax.data import file_names, local_layout, meshes, transforms
 from refref_jax.data.errors import SceneError
 
@@ -125,7 +125,7 @@ def _scene_json(contents: SceneContents) -> Any:
     if path is None:
         return None
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return configuration.parse_json(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise SceneError(
             f"{path} is not valid JSON ({error}). Correct it, or remove it: it is optional."

@@ -19,7 +19,7 @@ from experiments.dataset import backgrounds, cameras, frame_files, scene_record
 from experiments.dataset.parts import Part
 from experiments.dataset.render_settings import RenderSettings
 from experiments.dataset.seeds import seed_of
-from refref_jax import atomic_files
+from refref_jax import atomic_files, configuration
 from refref_jax.data.scene_names import SceneName
 
 _RECORD = "scene.json"
@@ -78,7 +78,7 @@ def check(folder: Path, scene: SceneName, settings: RenderSettings) -> None:
         return
     path = folder / _RECORD
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = configuration.parse_json(path.read_text(encoding="utf-8"))
         different = _difference(found, scene_record.identify(scene, settings), "")
     except (OSError, ValueError, AttributeError) as error:
         raise ValueError(

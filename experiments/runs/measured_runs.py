@@ -137,7 +137,9 @@ def evaluate(
         # One with other options may be there.
         command = [f"--run={run}", f"--scene={scene}", *asked, "--overwrite"]
         child_process.run("evaluate", *command, log=run.with_name(f"{run.name}.log"))
-        summary = json.loads((run / "eval" / split / "metrics.json").read_text("utf-8"))
+        summary = configuration.parse_json(
+            (run / "eval" / split / "metrics.json").read_text("utf-8")
+        )
         names = {field.name for field in dataclasses.fields(Evaluation)}
         results = configuration.from_string_safe(summary["results"])
         values = {name: x for name, x in results.items() if name in names}

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from refref_jax import configuration
 from refref_jax.data import file_names, transforms
 from refref_jax.data.errors import SceneError
 from refref_jax.data.local_layout import SPLITS
@@ -195,7 +196,7 @@ def _thirds(rows: int, shard: Path) -> Contents:
 def _decoded(told: bytes, rows: int, shard: Path) -> Contents:
     """Returns what the metadata tells."""
     try:
-        record = json.loads(told)
+        record = configuration.parse_json(told)
         frames = {split: int(record["frames"].get(split, 0)) for split in SPLITS}
         angle = float(record["camera_angle_x"])
         valid = min(frames.values()) >= 0

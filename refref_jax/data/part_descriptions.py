@@ -10,11 +10,11 @@
 Only `mesh` is needed.
 """
 
-import json
 import math
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from refref_jax import configuration
 from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
 from refref_jax.data.errors import SceneError
 
@@ -51,7 +51,7 @@ def read_part_descriptions(path: Path) -> dict[str, PartDescription]:
     if not path.is_file():
         return {}
     try:
-        parts = json.loads(path.read_text(encoding="utf-8")).get("parts", [])
+        parts = configuration.parse_json(path.read_text(encoding="utf-8")).get("parts", [])
         named = {Path(part["mesh"]).name: dict(part) for part in parts}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise SceneError(

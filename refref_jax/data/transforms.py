@@ -3,13 +3,13 @@
 Every function raises a `SceneError` that names the file and says what to do.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from refref_jax import configuration
 from refref_jax.data.errors import SceneError
 
 # Poses are written with six digits or more; a larger deviation is a scale or a shear.
@@ -24,7 +24,7 @@ def read_json(path: Path) -> dict[str, Any]:
             "transforms_train.json, transforms_val.json and transforms_test.json."
         )
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = configuration.parse_json(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise SceneError(f"{path} is not valid JSON ({error}). Copy it again.") from error
     if not isinstance(content, dict):

@@ -167,7 +167,7 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
     lines = []
     for number, text in enumerate(texts, 1):
         try:
-            lines.append(json.loads(text))
+            lines.append(configuration.parse_json(text))
         except ValueError as error:
             if number == len(texts):
                 break

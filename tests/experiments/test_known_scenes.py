@@ -1,7 +1,6 @@
 """The commands that need no learning, on a few views of the bundled scene."""
 
 import csv
-import dataclasses
 import json
 import shutil
 
@@ -11,8 +10,6 @@ import pytest
 
 from experiments.runs import view_numbers
 from refref_jax.data import files
-from refref_jax.optics import budgets
-from refref_jax.render import BUDGETS
 from refref_jax.training import evaluation as measures
 from tests.experiments.command import ROOT, run_command
 
@@ -199,21 +196,6 @@ def test_views_that_do_not_exist(text, message):
 def test_views_keep_their_order():
     assert view_numbers.choose("3, 0", 5) == (3, 0)
     assert tuple(view_numbers.choose("all", 3)) == (0, 1, 2)
-
-
-def test_a_budget_keeps_what_is_not_given_and_grows_below_its_cut():
-    tree = BUDGETS["tree"]
-    assert budgets.budget_of("tree") == tree
-    assert budgets.budget_of("tree", cut=0.1, bends=3) == dataclasses.replace(
-        tree, cut=0.1, bends=3
-    )
-    fine = budgets.budget_of("tree", cut=tree.cut / 4.0)
-    assert fine.paths_per_ray == 2.0 * tree.paths_per_ray and fine.bends == tree.bends
-    # Never without bound.
-    long = budgets.budget_of("tree", bends=2 * tree.bends)
-    assert long.segments_per_ray == 2.0 * tree.segments_per_ray
-    assert (long.paths_per_ray, long.live_per_ray) == (tree.paths_per_ray, tree.live_per_ray)
-    assert budgets.budget_of("tree", cut=0.0).paths_per_ray < 10.0 * tree.paths_per_ray
 
 
 def test_measures_over_no_pixel_are_left_out():

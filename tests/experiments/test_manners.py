@@ -238,9 +238,6 @@ def test_names_of_what_can_be_chosen_are_those_that_exist():
     assert names == get_args(choices.FieldName)
     assert tuple(RULES) == get_args(choices.RuleName)
     assert tuple(BUDGETS) == get_args(choices.Paths)
-    assert local_layout.SPLITS == cli_flags.SPLITS
-    assert (registry.USUAL, *(x for x in registry.KINDS if x != registry.USUAL)) == cli_flags.FIELDS
-    assert tuple(RULES) == cli_flags.RULES
     assert tuple(GEOMETRIES) == cli_flags.GEOMETRIES
 
 

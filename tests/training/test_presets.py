@@ -27,10 +27,15 @@ def test_small_lies_between_tiny_and_paper():
         model = preset.model(_BOUNDS, "field")
         grid = model.field.grid
         numbers = (grid.levels, grid.finest, grid.entries, model.samples, model.field.colour_width)
-        return (*numbers, preset.batch, preset.schedule.steps)
+        return (*numbers, preset.schedule.batch, preset.schedule.steps)
 
     for less, middle, more in zip(sizes("tiny"), sizes("small"), sizes("paper"), strict=True):
         assert less < middle <= more
+
+
+def _rays_of_a_pool(name):
+    schedule = PRESETS[name].schedule
+    return schedule.batch * schedule.pool
 
 
 def test_best_samples_as_the_paper_does_and_sees_through_bends():
@@ -38,8 +43,8 @@ def test_best_samples_as_the_paper_does_and_sees_through_bends():
     assert best.footprint == "differential" and paper.footprint == "cone"
     assert [p.samples for p in best.proposals] == [p.samples for p in paper.proposals]
     # As many rays are traced at once.
-    assert PRESETS["best"].batch * PRESETS["best"].pool == 131_072
-    assert PRESETS["paper"].batch * PRESETS["paper"].pool == 131_072
+    assert _rays_of_a_pool("best") == 131_072
+    assert _rays_of_a_pool("paper") == 131_072
 
 
 def test_bounds_reach_the_far_wall():

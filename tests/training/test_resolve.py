@@ -110,6 +110,9 @@ def test_a_finer_cut_has_room_for_its_paths_however_it_is_made():
         assert capacity_factors(fine) == tuple(2.0 * x for x in usual)
     longer = capacity_factors(dataclasses.replace(TREE, bends=48))
     assert longer == usual._replace(segments_per_ray=2.0 * usual.segments_per_ray)
+    # Never without bound.
+    assert capacity_factors(budget_of("tree", cut=0.0)).paths_per_ray < 10.0 * usual.paths_per_ray
+    assert budget_of("tree", cut=0.1, bends=3) == dataclasses.replace(TREE, cut=0.1, bends=3)
     own = dataclasses.replace(TREE, paths_per_ray=3.0)
     assert capacity_factors(dataclasses.replace(own, cut=0.005)).paths_per_ray == 3.0
     # What an earlier version wrote out grows as well.
@@ -197,7 +200,7 @@ def test_a_configuration_is_read_as_it_was_written(tmp_path):
     ("text", "message"),
     [
         ("[" * 200_000, "nested too deeply"),
-        ('{"seed": NaN}', "NaN is not a number of JSON"),
+        ('{"seed": NaN}', "NaN is not a number"),
         ('{"seed": 0', "does not hold a TrainConfig"),
         ('{"sead": 0}', "unknown 'sead'"),
         ('{"paths": {"cut": 2}}', "The cut is a share"),

@@ -11,7 +11,7 @@ import pytest
 from experiments.viewer import layers, session
 from experiments.viewer.session import Subject
 from refref_jax.data import local_layout
-from refref_jax.optics.budgets import STRAIGHT, TREE
+from refref_jax.optics.budgets import STRAIGHT, TREE, capacity_factors
 from refref_jax.render import Model, init_params
 from tests import scenes
 from tests.experiments.command import ROOT, run_command
@@ -85,7 +85,8 @@ def test_another_cut_and_other_bends_are_another_budget_with_room_for_them():
     first = session.first_choice(subject)
     finer = session.chosen_model(subject, dataclasses.replace(first, cut=0.005, bends=32)).budget
     assert (finer.cut, finer.bends) == (0.005, 32)
-    assert finer.paths_per_ray == pytest.approx(2.0 * TREE.paths_per_ray)
+    paths = capacity_factors(finer).paths_per_ray
+    assert paths == pytest.approx(2.0 * capacity_factors(TREE).paths_per_ray)
     straight = _subject(STRAIGHT)
     choice = session.first_choice(straight)
     assert session.chosen_model(straight, choice) is straight.model
