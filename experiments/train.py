@@ -132,8 +132,7 @@ def _asked_config() -> TrainConfig:
     config = config_flags.chosen(_CONFIG, **instead)
     if not config.scene.path:
         raise ValueError("The configuration names no scene. Add --scene=FOLDER.")
-    scene = str(cli_scenes.opened(config.scene.path).resolve())
-    return config if scene == config.scene.path else config.override(scene=scene)
+    return config.at(str(cli_scenes.opened(config.scene.path).resolve()))
 
 
 def _refuse_flags(run: Path) -> None:

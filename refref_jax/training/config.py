@@ -300,6 +300,10 @@ class TrainConfig:
             config = config._with(options[name], value)
         return config
 
+    def at(self, scene: str) -> "TrainConfig":
+        """Returns this configuration for the same scene by another path; all decisions stay."""
+        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, path=scene))
+
     def get(self, name: str) -> Any:
         """Returns a value by the name of its option."""
         (option,) = (each for each in options_of() if each.name == name)

@@ -127,8 +127,7 @@ def prepare(
             f"The object of this configuration was reconstructed ({config.scene.reconstruction}), "
             "and is not read here. Give its mesh as parts, or use experiments.train."
         )
-    folder = scene_source.open_scene(config.scene.path).resolve()
-    config = config.override(scene=str(folder)) if config.scene.path != str(folder) else config
+    config = config.at(str(scene_source.open_scene(config.scene.path).resolve()))
     facts = read_facts(config.scene, parts=parts)
     for note in facts.notes:
         report(note)

@@ -5,7 +5,6 @@
 {run}/metrics.jsonl    one line for every logged step
 """
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -114,9 +113,7 @@ def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, geometry:
     Raises:
       ValueError: if not.
     """
-    begun = read_config(run)
-    scene = dataclasses.replace(begun.scene, path=config.scene.path)
-    moved = dataclasses.replace(begun, scene=scene)
+    moved = read_config(run).at(config.scene.path)
     if moved != config or saved.read_static(run) != model:
         differing = [
             option.name

@@ -68,6 +68,15 @@ def test_the_configuration_of_a_run_repeats_it_bit_for_bit(fifty, tmp_path):
         fit.fit(config, out=tmp_path / "again")
 
 
+def test_what_is_asked_for_stays_where_the_path_of_the_scene_is_made_absolute(monkeypatch):
+    monkeypatch.chdir(ROOT / "experiments" / "data")
+    asked = {"paths": "straight", "background": "spherical", "radius": 9.0}
+    config = TrainConfig().override(scene="cube_smcvx_ball", **asked)
+    made, _ = fit.prepare(config, report=lambda line: None)
+    assert {name: made.config.get(name) for name in asked} == asked
+    assert made.config.scene.path == str(ROOT / "experiments" / "data" / "cube_smcvx_ball")
+
+
 def test_fit_refuses_what_names_no_run(tmp_path):
     with pytest.raises(ValueError, match="holds no run to resume"):
         fit.fit(None, out=tmp_path, existing="resume")
