@@ -61,8 +61,11 @@ def chosen(holders: Mapping[str, flags.FlagHolder], **instead: Any) -> TrainConf
         from refref_jax.training import run_folder
 
         base = run_folder.read_config_file(Path(path))
-    values = {name: holder for name, holder in holders.items() if name not in instead}
-    return base.override(**given(values), **instead)
+    values = given({name: each for name, each in holders.items() if name not in instead})
+    scene = values.get("scene", "")
+    if base.scene.path and scene and Path(scene).resolve() == Path(base.scene.path).resolve():
+        del values["scene"]  # the same, by another path
+    return base.override(**values, **instead)
 
 
 def _define(option: Option) -> flags.FlagHolder:
