@@ -20,6 +20,7 @@ _NAMED = {f"refref_jax.{name}": getattr(refref_jax, name) for name in refref_jax
 # snippets of README and docs that do.
 _SHOWN_ELSEWHERE = {
     "refref_jax.evaluate",
+    "refref_jax.fit",
     "refref_jax.read_meshes",
     "refref_jax.render.init_params",
     "refref_jax.render.load_model",
