@@ -142,6 +142,8 @@ class FieldConfig:
       entries: Most entries of a level of the radiance field's hash grid, as base-2 logarithm.
       finest: Cells a side of that grid's finest level.
       precision: Arithmetic of the fields.
+      dilation: Widening of a proposal before it is sampled, as a share of its mean bin width; 0 for
+        none.
     """
 
     preset: PresetName = _option("tiny")
@@ -154,6 +156,7 @@ class FieldConfig:
     entries: int | None = _option(after=("preset", "field"))
     finest: int | None = _option(after=("preset", "field"))
     precision: Precision | None = _option(after=("preset", "field"))
+    dilation: float | None = _option(after=("preset", "field"))
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -167,6 +170,8 @@ class FieldConfig:
                 f"There is no pattern of multisamples={self.multisamples} points. Give 1 (on the "
                 "centre line) or 6 (Zip-NeRF's hexagon)."
             )
+        if self.dilation is not None and not 0.0 <= self.dilation < math.inf:
+            raise ValueError(f"dilation is {self.dilation}. Give 0 or a positive number.")
         if self.entries is not None and not 1 <= self.entries <= _MOST_ENTRIES:
             raise ValueError(
                 f"entries is {self.entries}, but it is the base-2 logarithm of a table's size. "

@@ -160,6 +160,7 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
         entries=grid and grid.entries.bit_length() - 1,
         finest=grid and grid.finest,
         precision=model.field.precision,
+        dilation=model.dilation,
     )
 
 
@@ -302,6 +303,7 @@ def _resolve_model(
         entries=grid and grid.entries.bit_length() - 1,
         finest=grid and grid.finest,
         precision=model.field.precision,
+        dilation=model.dilation,
     )
     return model, config
 
@@ -336,7 +338,8 @@ def override_model(model: ModelConfig, asked: FieldConfig) -> ModelConfig:
     """
     if asked.samples is not None:
         model = _with_samples(model, asked.samples, asked.preset)
-    given = {"multisamples": asked.multisamples, "footprint": asked.footprint}
+    names = ("multisamples", "footprint", "dilation")
+    given = {name: getattr(asked, name) for name in names}
     model = dataclasses.replace(model, **{n: x for n, x in given.items() if x is not None})
     if asked.precision is not None:
         proposals = tuple(

@@ -140,13 +140,14 @@ def test_resolve_warns_of_what_is_doubtful():
         (_CLEAR, {"bends": -1}, "bends"),
         (_CLEAR, {"paths": "straight", "bends": 10}, "no cut and no bends"),
         (_CLEAR, {"paths": "straight", "cut": 0.02}, "no cut and no bends"),
-        (_CLEAR, {"dilation": 0.5}, "There is no option 'dilation'"),
+        (_CLEAR, {"dilatation": 0.5}, "There is no option 'dilatation'"),
         (_CLEAR, {"samples": (32,)}, "is for 0 proposal rounds, but preset tiny has 1"),
         (_CLEAR, {"samples": (32, 0)}, "not a list of positive numbers"),
         (_CLEAR, {"multisamples": 3}, "multisamples=3"),
         (_CLEAR, {"entries": 40}, "entries is 40"),
         (_CLEAR, {"finest": 3}, "finest=3"),
         (_CLEAR, {"radius": -1.0}, "radius is -1"),
+        (_CLEAR, {"dilation": -0.5}, "dilation is -0.5"),
         (_CLEAR, {"steps": 0}, "steps is 0"),
         (_CLEAR, {"learning_rate": float("nan")}, "learning rate peak is nan"),
     ],
@@ -176,10 +177,11 @@ def test_override_model_replaces_one_thing_an_option():
         finest=32,
         precision="bfloat16",
         footprint="differential",
+        dilation=0.25,
     )
     made = override_model(MODEL, asked)
     assert samples_of(made) == (5, 4)
-    assert (made.multisamples, made.footprint) == (6, "differential")
+    assert (made.multisamples, made.footprint, made.dilation) == (6, "differential", 0.25)
     assert (made.field.grid.entries, made.field.grid.finest) == (256, 32)
     assert made.field.precision == made.proposals[0].field.precision == "bfloat16"
     # The proposals keep their grids.
