@@ -25,6 +25,7 @@ from refref_jax.data.meshes import MeshPart
 from refref_jax.optics.scene import Scene
 from refref_jax.render import saved
 from refref_jax.render.model import Model
+from refref_jax.render.saved import SavedModel
 from refref_jax.training import devices, loop, run_folder
 from refref_jax.training.checkpoints import Checkpoints
 from refref_jax.training.config import TrainConfig
@@ -136,19 +137,21 @@ def prepare(
     return resolved, build_scene(resolved, facts)
 
 
-def begin(run: Path, *resolved: Any) -> None:
+def begin(run: Path, config: TrainConfig, model: SavedModel, scene: Scene) -> None:
     """Opens a run's folder; of several processes the first does, when all are ready.
 
     Args:
       run: the folder.
-      *resolved: configuration, model and geometry, see `run_folder.create`.
+      config: complete configuration.
+      model: static half of the model.
+      scene: surfaces and interfaces that bend light.
 
     Raises:
       ValueError: if the folder holds a run already.
     """
     devices.wait_for_all("all have planned, and nothing is written yet")
     if devices.is_first():
-        run_folder.create(run, *resolved)
+        run_folder.create(run, config, model, scene)
     devices.wait_for_all("the folder is there")
 
 

@@ -10,6 +10,7 @@ resolving it again gives the same.
 
 import dataclasses
 import math
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,6 +34,9 @@ from refref_jax.render.config import ModelConfig
 from refref_jax.render.saved import SavedModel
 from refref_jax.training import presets
 from refref_jax.training.config import FieldConfig, SceneConfig, TrainConfig, options_of
+
+# Of what is printed.
+_COLUMNS = 100
 
 # Why options have their values.
 _GIVEN = "given"
@@ -83,10 +87,11 @@ class Resolved(NamedTuple):
         by_reason: dict[str, list[str]] = {}
         for option in options_of():
             value = self.config.get(option.name)
-            if value is not None and value != ():
+            if value not in (None, (), ""):
                 text = f"{option.name}={_shown(value)}"
                 by_reason.setdefault(self.reasons[option.name], []).append(text)
-        lines = [f"  {reason}: {', '.join(values)}" for reason, values in by_reason.items()]
+        texts = [f"{reason}: {', '.join(values)}" for reason, values in by_reason.items()]
+        lines = [line for text in texts for line in _wrapped(text)]
         return "\n".join([*lines, *(f"warning: {each}" for each in self.warnings)])
 
 
@@ -411,6 +416,17 @@ def _refuse_cameras_inside(parts: Sequence[MeshPart], cameras: Cameras) -> None:
             "A camera stands inside a mesh, which training can not follow under rule=priority. Use "
             "rule=nested, or move the camera."
         )
+
+
+def _wrapped(text: str) -> list[str]:
+    return textwrap.wrap(
+        text,
+        _COLUMNS,
+        initial_indent="  ",
+        subsequent_indent="    ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def _shown(value: Any) -> str:
