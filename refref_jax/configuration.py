@@ -36,23 +36,16 @@ def write(path: Path, config: Any) -> None:
         draft.write_text(text, encoding="utf-8")
 
 
-def parse_json(text: str) -> Any:
+def parse_json(text: str | bytes) -> Any:
     """Returns what a JSON text says, for files that may be anybody's.
 
     Raises:
-      ValueError: if it is not JSON, holds NaN, or is nested too deeply to be read.
+      ValueError: if it is not JSON, or is nested too deeply to be read.
     """
     try:
-        return json.loads(text, parse_constant=_constant)
+        return json.loads(text)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
-
-
-def _constant(name: str) -> float:
-    """Returns an infinity, which limits may be; Python writes it as `Infinity`."""
-    if name == "NaN":
-        raise ValueError("NaN is not a number")
-    return float(name)
 
 
 def string_safe(value: Any) -> Any:
@@ -126,6 +119,8 @@ def _build(kind: Any, value: Any, where: str, variants: Variants) -> Any:
         return _build(other, value, where, variants)
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
+    if value != value:
+        raise ValueError(f"{where} is NaN, not a number")
     if type(value) is not kind:
         raise ValueError(f"{where} is {value!r}, not of type {kind.__name__}")
     return value

@@ -44,10 +44,10 @@ _IN_THE_WAY = {
 _OF_THE_SCENE = {
     "--cut=1": "--cut=1.0: The cut is a share of a pixel's light",
     "--bends=-1": "can not have -1 bends. Give 0 or more.",
-    "--samples=4,0": "Write as in --samples=32,20.",
+    "--samples=4,0": "Write as in samples=32,20.",
     "--multisamples=3": "Give 1 (on the centre line) or 6",
     "--entries=40": "Give 1 to 31",
-    "--paths=straight --cut=0.1": "Leave them out, or use --paths=tree.",
+    "--paths=straight --cut=0.1": "Leave them out, or use paths=tree.",
     "--ior=1.5": "Write as in --ior=glass=1.52.",
     "--ior=glass=-1": "with a positive number",
     "--method=r3f --ior=glass=1.5": "Give its index alone",

@@ -202,7 +202,8 @@ def test_a_configuration_is_read_as_it_was_written(tmp_path):
     ("text", "message"),
     [
         ("[" * 200_000, "nested too deeply"),
-        ('{"seed": NaN}', "NaN is not a number"),
+        ('{"seed": NaN}', "NaN, not a number"),
+        ('{"paths": {"cut": NaN}}', "NaN, not a number"),
         ('{"seed": 0', "does not hold a TrainConfig"),
         ('{"sead": 0}', "unknown 'sead'"),
         ('{"paths": {"cut": 2}}', "The cut is a share"),
