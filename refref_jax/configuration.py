@@ -101,6 +101,20 @@ def build(content: Any, kind: type[_Config], *, variants: Variants | None = None
     return _build(kind, content, kind.__name__, variants or {})
 
 
+def convert(value: Any, kind: Any, *, name: str) -> Any:
+    """Returns a value as what a field is annotated with; see `read`.
+
+    Args:
+      value: number, text, `None`, or list of these, as JSON has them.
+      kind: annotation of the field.
+      name: name of the value, for errors.
+
+    Raises:
+      ValueError: if it is of another type, or none of the choices.
+    """
+    return _build(kind, value, name, {})
+
+
 def _build(kind: Any, value: Any, where: str, variants: Variants) -> Any:
     """Converts parsed JSON to an annotated type."""
     if dataclasses.is_dataclass(kind):

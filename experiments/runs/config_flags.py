@@ -135,8 +135,7 @@ def parse_index(word: str) -> tuple[str, float]:
 
 def _kind(option: Option) -> Any:
     """Returns the type of an option that is given."""
-    owner = TrainConfig if not option.section else type(getattr(TrainConfig(), option.section))
-    kind = typing.get_type_hints(owner)[option.field.name]
+    kind = training_config.type_of(option)
     if typing.get_origin(kind) in (typing.Union, types.UnionType):
         (kind,) = (each for each in typing.get_args(kind) if each is not type(None))
     return kind

@@ -12,9 +12,12 @@ Importing this module imports neither JAX nor the library's numerics.
 
 import dataclasses
 import math
-from collections.abc import Iterator
+import typing
+from collections.abc import Iterator, Mapping
+from pathlib import PurePath
 from typing import Any, NamedTuple
 
+from refref_jax import configuration
 from refref_jax.choices import (
     DataLoss,
     DistortionOver,
@@ -293,6 +296,7 @@ class TrainConfig:
             raise ValueError(
                 f"There is no option {unknown[0]!r}. Choose from {', '.join(sorted(options))}."
             )
+        given = {name: _converted(options[name], value) for name, value in given.items()}
         before = {name: self.get(name) for name in options}
         changed = {n for n, x in given.items() if before[n] not in (None, "", x)}
         again = {
@@ -321,6 +325,33 @@ class TrainConfig:
         section = getattr(self, option.section)
         section = dataclasses.replace(section, **{option.field.name: value})
         return dataclasses.replace(self, **{option.section: section})
+
+
+def type_of(option: Option) -> Any:
+    """Returns the annotation of an option's field."""
+    owner = type(getattr(TrainConfig(), option.section)) if option.section else TrainConfig
+    return typing.get_type_hints(owner)[option.field.name]
+
+
+def _converted(option: Option, value: Any) -> Any:
+    """Returns a value as its field takes it: lists become tuples, numbers floats.
+
+    Raises:
+      ValueError: if it is of another type, or none of the choices.
+    """
+    default = option.field.default
+    if value is None and default is not None:
+        return default
+    return configuration.convert(_plain(value), type_of(option), name=option.name)
+
+
+def _plain(value: Any) -> Any:
+    """Returns a value as JSON has it."""
+    if isinstance(value, Mapping):
+        return [[name, _plain(each)] for name, each in sorted(value.items())]
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    return str(value) if isinstance(value, PurePath) else value
 
 
 def options_of() -> Iterator[Option]:

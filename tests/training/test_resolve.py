@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -148,8 +149,11 @@ def test_resolve_warns_of_what_is_doubtful():
         (_CLEAR, {"finest": 3}, "finest=3"),
         (_CLEAR, {"radius": -1.0}, "radius is -1"),
         (_CLEAR, {"dilation": -0.5}, "dilation is -0.5"),
+        (_CLEAR, {"paths": "treee"}, "paths is 'treee', not one of"),
+        (_CLEAR, {"steps": "50"}, "steps is '50', not of type int"),
+        (_CLEAR, {"samples": [32, "20"]}, "not of type int"),
         (_CLEAR, {"steps": 0}, "steps is 0"),
-        (_CLEAR, {"learning_rate": float("nan")}, "learning rate peak is nan"),
+        (_CLEAR, {"learning_rate": float("nan")}, "learning_rate is NaN"),
     ],
 )
 def test_resolve_refuses_what_can_not_be(found, given, message):
@@ -165,6 +169,10 @@ def test_override_takes_decisions_again_that_follow_from_a_change():
     shorter = config.override(steps=100).schedule
     assert (shorter.warmup, shorter.anneal, shorter.peak) == (None, None, 1e-2)
     assert config.override(steps=100, warmup=7).schedule.warmup == 7
+    # Lists, mappings and paths are taken as users write them.
+    plain = TrainConfig().override(samples=[8, 4], ior={"glass": 1.52}, scene=Path("a"), cut=0)
+    assert (plain.model.samples, plain.scene.indices) == ((8, 4), (("glass", 1.52),))
+    assert (plain.scene.path, type(plain.paths.cut)) == ("a", float)
     # What was never set is no change.
     assert TrainConfig().override(interior="field", scene="a").model.interior == "field"
 
