@@ -1,7 +1,7 @@
 """Cameras of a browser and cameras of a scene, and how pictures of one shape fill any window.
 
 A browser's camera has a vertical field of view and the aspect of its window, and its axes are x
-right, y down, z forward; ours are those of `data.cameras`. Aspects are width over height.
+right, y down, z forward; ours are those of `geometry.cameras`. Aspects are width over height.
 
 Pictures are of one aspect, 16:9, so that nothing is compiled for a window. The rule: *the picture
 covers the window, and what sticks out is cropped*, alike on both sides. In a window wider than the
@@ -36,7 +36,7 @@ class Viewpoint(NamedTuple):
     """A window's camera.
 
     Attributes:
-      pose: camera to world, in the axes of `data.cameras`.
+      pose: camera to world, in the axes of `geometry.cameras`.
       fov: vertical field of view, radians.
       aspect: of the window.
     """

@@ -13,7 +13,7 @@ Importing this module imports neither JAX nor the library's numerics.
 import dataclasses
 import math
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Set
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
@@ -33,6 +33,15 @@ from refref_jax.choices import (
     Tints,
 )
 from refref_jax.optics.budgets import Reentry
+
+# Options that say which objects there are.
+_OBJECTS = ("scene", "reconstruction")
+
+# Of steps, rays and batches, which are counted in 32 bits.
+_MOST = 2**31 - 1
+
+_FINEST = 2**20
+_SEEDS = 2**32
 
 # Points of the cone patterns, see `sampling.cones`.
 _PATTERNS = (1, 6)
@@ -110,10 +119,10 @@ class PathsConfig:
         the meshes.
     """
 
-    name: Paths | None = _option(name="paths", after=("scene",))
+    name: Paths | None = _option(name="paths", after=_OBJECTS)
     cut: float | None = _option(after=("paths",))
     bends: int | None = _option(after=("paths",))
-    reentry: Reentry | None = _option(after=("scene", "paths", "bends"))
+    reentry: Reentry | None = _option(after=(*_OBJECTS, "rule", "paths", "bends"))
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -151,8 +160,8 @@ class FieldConfig:
 
     preset: PresetName = _option("tiny")
     field: FieldName = _option("zipnerf")
-    interior: Interior | None = _option(after=("scene", "paths", "bends", "tints"))
-    tints: Tints | None = _option(after=("scene", "paths", "bends", "interior"))
+    interior: Interior | None = _option(after=(*_OBJECTS, "paths", "bends", "tints"))
+    tints: Tints | None = _option(after=(*_OBJECTS, "paths", "bends", "interior"))
     footprint: Footprint | None = _option(after=("preset", "field"))
     samples: tuple[int, ...] | None = _option(after=("preset", "field"))
     multisamples: int | None = _option(after=("preset", "field"))
@@ -173,6 +182,8 @@ class FieldConfig:
                 f"There is no pattern of multisamples={self.multisamples} points. Give 1 (on the "
                 "centre line) or 6 (Zip-NeRF's hexagon)."
             )
+        if self.finest is not None and not 1 <= self.finest <= _FINEST:
+            raise ValueError(f"finest is {self.finest}. Give 1 to {_FINEST} cells a side.")
         if self.dilation is not None and not 0.0 <= self.dilation < math.inf:
             raise ValueError(f"dilation is {self.dilation}. Give 0 or a positive number.")
         if self.entries is not None and not 1 <= self.entries <= _MOST_ENTRIES:
@@ -205,6 +216,15 @@ class LossConfig:
     dye_decay: float = _option(1e-3)
     distortion_over: DistortionOver = _option("outside", name="distortion")
 
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        weights = (self.interlevel, self.distortion, self.hash_decay, self.dye_decay)
+        for number in (*weights, *(self.blurs or ())):
+            if number is not None and not 0.0 <= number < math.inf:
+                raise ValueError(
+                    f"A weight or blur of the losses is {number}. Give 0 or a positive number."
+                )
+
 
 @dataclasses.dataclass(frozen=True)
 class ScheduleConfig:
@@ -231,8 +251,9 @@ class ScheduleConfig:
     def __post_init__(self) -> None:
         """Checks the numbers."""
         for name, least in [("steps", 1), ("batch", 1), ("pool", 1), ("warmup", 0), ("anneal", 0)]:
-            if (number := getattr(self, name)) is not None and number < least:
-                raise ValueError(f"{name} is {number}. Give {least} or more.")
+            number = getattr(self, name)
+            if number is not None and not least <= number <= _MOST:
+                raise ValueError(f"{name} is {number}. Give {least} to {_MOST}.")
         for name in ("peak", "end"):
             if (rate := getattr(self, name)) is not None and not 0.0 < rate < math.inf:
                 raise ValueError(f"The learning rate {name} is {rate}. Give a positive number.")
@@ -278,6 +299,11 @@ class TrainConfig:
     schedule: ScheduleConfig = ScheduleConfig()
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        """Checks the seed."""
+        if not 0 <= self.seed < _SEEDS:
+            raise ValueError(f"seed is {self.seed}. Give 0 to {_SEEDS - 1}.")
+
     def override(self, **given: Any) -> "TrainConfig":
         """Returns this configuration with other values, by the names of their options.
 
@@ -299,13 +325,9 @@ class TrainConfig:
         given = {name: _converted(options[name], value) for name, value in given.items()}
         before = {name: self.get(name) for name in options}
         changed = {n for n, x in given.items() if before[n] not in (None, "", x)}
-        again = {
-            name: None
-            for name, option in options.items()
-            if changed & set(option.field.metadata.get("after", ()))
-        }
+        again = _followers(changed, given)
         config = self
-        for name, value in (again | given).items():
+        for name, value in (dict.fromkeys(again) | given).items():
             config = config._with(options[name], value)
         return config
 
@@ -325,6 +347,21 @@ class TrainConfig:
         section = getattr(self, option.section)
         section = dataclasses.replace(section, **{option.field.name: value})
         return dataclasses.replace(self, **{option.section: section})
+
+
+def _followers(changed: Set[str], given: Collection[str]) -> set[str]:
+    """Returns the options whose decisions followed from those that change, directly or not."""
+    found: set[str] = set()
+    while True:
+        more = {
+            option.name
+            for option in options_of()
+            if (changed | found) & set(option.field.metadata.get("after", ()))
+            and option.name not in given
+        }
+        if more <= found:
+            return found
+        found |= more
 
 
 def type_of(option: Option) -> Any:

@@ -93,7 +93,10 @@ def fit(
         run = Path(out)
         resuming = existing == "resume" and run_folder.exists(run)
         if config is None and not resuming:
-            raise ValueError(f"{run} holds no run to resume. Give a configuration.")
+            raise ValueError(
+                f"Without a configuration a run is resumed, but {run} holds none, or existing is "
+                "not 'resume'. Give a configuration, or that."
+            )
         if not resuming:
             run_folder.check_free(run)
         if config is not None:

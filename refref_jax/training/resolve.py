@@ -148,6 +148,7 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
     reasons: dict[str, str] = {}
     grid = grid_of(model)
     tints = "learned" if model.learned_tints else "given"
+    config = config.override(field=model.field.kind)
     return _decide(
         config,
         reasons,
@@ -319,6 +320,12 @@ def _resolve_training(
     usual = presets.loss(model)
     why = f"field={config.model.field}"
     config = _decide(config, reasons, why, blurs=usual.blurs, hash_decay=usual.hash_decay)
+    blurs, rounds = len(config.losses.blurs), len(model.proposals)
+    if blurs != rounds:
+        raise ValueError(
+            f"There are {blurs} blurs for {rounds} proposal rounds. Give one for each, or leave "
+            "them out."
+        )
     preset = presets.PRESETS[config.model.preset]
     schedule = preset.schedule.over(config.schedule.steps or preset.schedule.steps)
     return _decide(

@@ -69,22 +69,9 @@ def read_config(run: Path) -> TrainConfig:
     Raises:
       ValueError: if the file is missing or damaged.
     """
-    return read_config_file(run / CONFIG)
-
-
-def read_config_file(path: Path) -> TrainConfig:
-    """Reads a configuration, complete or partial.
-
-    That of a run of an earlier version lacks what its model.json tells; it is added from there.
-
-    Raises:
-      ValueError: if the file is missing, or is not one.
-    """
-    try:
-        content = configuration.parse_json(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        content = None  # `read` says what is wrong
-    if not (isinstance(content, dict) and set(content) >= _KEYS_BEFORE):
+    path = run / CONFIG
+    content = _of_an_earlier_version(path)
+    if content is None:
         return configuration.read(path, TrainConfig)
     try:
         config = configuration.build(_with_todays_keys(content), TrainConfig)
@@ -92,7 +79,34 @@ def read_config_file(path: Path) -> TrainConfig:
         raise ValueError(
             f"{path} does not hold a TrainConfig of an earlier version ({error}). Restore the file."
         ) from error
-    return resolve.as_trained(config, saved.read_static(path.parent))
+    # What that file lacked, the model beside it tells.
+    return resolve.as_trained(config, saved.read_static(run))
+
+
+def read_config_file(path: Path) -> TrainConfig:
+    """Reads a configuration to begin a run with, complete or partial.
+
+    Raises:
+      ValueError: if the file is missing, or is not one, or is that of an earlier version's run.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path} is not a file. Give a configuration, as a run's {CONFIG}.")
+    if _of_an_earlier_version(path) is not None:
+        raise ValueError(
+            f"{path} is of an earlier version, and does not name the preset. Its run can be "
+            "resumed, evaluated and rendered, but not begun again: give the options themselves."
+        )
+    return configuration.read(path, TrainConfig)
+
+
+def _of_an_earlier_version(path: Path) -> dict[str, Any] | None:
+    """Returns what the configuration of an earlier version says; `None` if it is not one."""
+    try:
+        content = configuration.parse_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None  # `configuration.read` says what is wrong
+    is_earlier = isinstance(content, dict) and set(content) >= _KEYS_BEFORE
+    return content if is_earlier else None
 
 
 def _with_todays_keys(content: dict[str, Any]) -> dict[str, Any]:

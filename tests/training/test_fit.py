@@ -78,7 +78,7 @@ def test_what_is_asked_for_stays_where_the_path_of_the_scene_is_made_absolute(mo
 
 
 def test_fit_refuses_what_names_no_run(tmp_path):
-    with pytest.raises(ValueError, match="holds no run to resume"):
+    with pytest.raises(ValueError, match="holds none, or existing"):
         fit.fit(None, out=tmp_path, existing="resume")
     with pytest.raises(ValueError, match="No scene is given"):
         fit.fit(TrainConfig(), out=tmp_path / "run")

@@ -152,6 +152,11 @@ def test_resolve_warns_of_what_is_doubtful():
         (_CLEAR, {"paths": "treee"}, "paths is 'treee', not one of"),
         (_CLEAR, {"steps": "50"}, "steps is '50', not of type int"),
         (_CLEAR, {"samples": [32, "20"]}, "not of type int"),
+        (_CLEAR, {"steps": 10**30}, "steps is 10"),
+        (_CLEAR, {"seed": -1}, "seed is -1"),
+        (_CLEAR, {"blurs": [0.1, 0.1, 0.1]}, "3 blurs for 1 proposal rounds"),
+        (_CLEAR, {"distortion_weight": -1.0}, "weight or blur"),
+        (_CLEAR, {"finest": 10**30}, "finest is 10"),
         (_CLEAR, {"steps": 0}, "steps is 0"),
         (_CLEAR, {"learning_rate": float("nan")}, "learning_rate is NaN"),
     ],
@@ -173,6 +178,11 @@ def test_override_takes_decisions_again_that_follow_from_a_change():
     plain = TrainConfig().override(samples=[8, 4], ior={"glass": 1.52}, scene=Path("a"), cut=0)
     assert (plain.model.samples, plain.scene.indices) == ((8, 4), (("glass", 1.52),))
     assert (plain.scene.path, type(plain.paths.cut)) == ("a", float)
+    # Also those that followed from what is decided again.
+    straight = _resolve(_EMPTY, scene="a").config.override(scene="b").paths
+    assert (straight.name, straight.cut, straight.bends) == (None, None, None)
+    assert config.override(rule="facing").paths.reentry is None
+    assert config.override(ior=[["glass", 1.4]]).paths.reentry is not None
     # What was never set is no change.
     assert TrainConfig().override(interior="field", scene="a").model.interior == "field"
 
@@ -216,8 +226,8 @@ def test_a_configuration_is_read_as_it_was_written(tmp_path):
         ('{"sead": 0}', "unknown 'sead'"),
         ('{"paths": {"cut": 2}}', "The cut is a share"),
         ("[]", "not an object"),
-        ('{"loss": 1, "batch": 2, "pool": 3}', "of an earlier version"),
-        ('{"loss": {}, "batch": 2, "pool": 3, "paths": []}', "of an earlier version"),
+        ('{"loss": 1, "batch": 2, "pool": 3}', "not begun again"),
+        ('{"seed": -1}', "seed is -1"),
         (b"\xff\xfe\x00", "does not hold a TrainConfig"),
     ],
 )
