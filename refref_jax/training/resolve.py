@@ -146,7 +146,6 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
     """
     model, budget = saved.config, saved.budget
     reasons: dict[str, str] = {}
-    grid = grid_of(model)
     tints = "learned" if model.learned_tints else "given"
     config = config.override(field=model.field.kind)
     return _decide(
@@ -160,13 +159,7 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
         reentry=budget.reentry if budget.bends else None,
         interior=model.interior,
         tints=tints if model.interior == "absorbing" and budget.bends else "none",
-        footprint=model.footprint,
-        samples=samples_of(model),
-        multisamples=model.multisamples,
-        entries=grid and grid.entries.bit_length() - 1,
-        finest=grid and grid.finest,
-        precision=model.field.precision,
-        dilation=model.dilation,
+        **_sampling_of(model),
     )
 
 
@@ -185,6 +178,20 @@ def samples_of(model: ModelConfig) -> tuple[int, ...]:
 def grid_of(model: ModelConfig) -> HashGridConfig | None:
     """Returns the hash grid of a model's radiance field, if fields of its kind have one."""
     return model.field.grid if isinstance(model.field, networks.GridRadianceConfig) else None
+
+
+def _sampling_of(model: ModelConfig) -> dict[str, Any]:
+    """Returns the options that a model was made with, by name: its samples, grid and precision."""
+    grid = grid_of(model)
+    return {
+        "footprint": model.footprint,
+        "samples": samples_of(model),
+        "multisamples": model.multisamples,
+        "entries": grid and grid.entries.bit_length() - 1,
+        "finest": grid and grid.finest,
+        "precision": model.field.precision,
+        "dilation": model.dilation,
+    }
 
 
 def _first_reasons(config: TrainConfig) -> dict[str, str]:
@@ -298,18 +305,11 @@ def _resolve_model(
     model = preset.model(extent, config.model.interior, field=config.model.field)
     learned = found.parts if config.model.tints == "learned" else 0
     model = override_model(dataclasses.replace(model, learned_tints=learned), config.model)
-    grid = grid_of(model)
     config = _decide(
         config,
         reasons,
         f"preset={config.model.preset}",
-        footprint=model.footprint,
-        samples=samples_of(model),
-        multisamples=model.multisamples,
-        entries=grid and grid.entries.bit_length() - 1,
-        finest=grid and grid.finest,
-        precision=model.field.precision,
-        dilation=model.dilation,
+        **_sampling_of(model),
     )
     return model, config
 

@@ -2,7 +2,6 @@
 
 import ast
 import re
-import types
 
 import imageio.v3 as iio
 import jax
@@ -85,29 +84,3 @@ def test_fit_refuses_what_names_no_run(tmp_path):
     with pytest.raises(ValueError, match="was reconstructed"):
         fit.fit(TrainConfig().override(scene="x", reconstruction="y"), out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
-
-
-def test_before_its_first_step_a_training_stops_with_nothing_saved(tmp_path, monkeypatch):
-    known = types.SimpleNamespace(
-        schedule=types.SimpleNamespace(steps=5),
-        scene=types.SimpleNamespace(path="scene"),
-        budget=types.SimpleNamespace(bends=1),
-        config=None,
-        seed=0,
-        hit_fraction=1.0,
-    )
-    for module, name in (
-        (fit.run_folder, "read_config"),
-        (fit.saved, "read_static"),
-        (fit.saved, "load_geometry"),
-        (fit.scene_source, "open_scene"),
-        (fit, "_sampler"),
-        (fit, "init_state"),
-        (fit.devices, "put_everywhere"),
-        (fit.loop, "set_up"),
-    ):
-        monkeypatch.setattr(module, name, lambda *arguments, **options: known)
-    monkeypatch.setattr(fit, "_take_steps", lambda *arguments: pytest.fail("it has begun"))
-    with pytest.raises(KeyboardInterrupt):
-        fit.train(tmp_path, stop=lambda: True)
-    assert not any((tmp_path / "checkpoints").iterdir())
