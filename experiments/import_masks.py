@@ -32,13 +32,13 @@ _OUT = cli_flags.out("The copy to write; must not exist.")
 
 def main() -> None:
     """Writes the copy."""
-    scene, masks, out = Path(_SCENE.value), Path(_MASKS.value), Path(_OUT.value)
+    scene, folder, out = Path(_SCENE.value), Path(_MASKS.value), Path(_OUT.value)
     cli_scenes.check(scene)
-    if not masks.is_dir():
-        raise errors.SceneError(f"{masks} is no folder. Give the folder that holds the masks.")
+    if not folder.is_dir():
+        raise errors.SceneError(f"{folder} is no folder. Give the folder that holds the masks.")
 
     def read(image: Path) -> Bool[np.ndarray, "h w"]:
-        path = masks / image.relative_to(scene)
+        path = folder / image.relative_to(scene)
         if not path.is_file():
             raise errors.SceneError(
                 f"There is no mask of {image}: {path} does not exist. Save it there, or take the "

@@ -23,7 +23,7 @@ class _Walk(NamedTuple):
 
 def trace_ray(
     nodes: Int[Array, "rows 8"],
-    triangles: Float[Array, "slots 12"],
+    packed: Float[Array, "slots 12"],
     origin: Float[Array, "3"],
     direction: Float[Array, "3"],
     limit: Float[Array, ""],
@@ -33,7 +33,7 @@ def trace_ray(
 
     Args:
       nodes: the tables of all octants, one after the other.
-      triangles: facets by slot.
+      packed: precomputed triangles by slot.
       origin: start of the ray.
       direction: unit vector.
       limit: farthest distance of interest, negative for a ray that is not to be traced.
@@ -53,7 +53,7 @@ def trace_ray(
         tested = hit & (node.leaf > 0)
         distance, slot = jax.lax.cond(
             tested,
-            lambda: _test_leaf(triangles, origin, direction, leaving, node.leaf - 1, walk),
+            lambda: _test_leaf(packed, origin, direction, leaving, node.leaf - 1, walk),
             lambda: (walk.distance, walk.slot),
         )
         return _Walk(jnp.where(hit, walk.node + 1, node.skip), distance, slot)
@@ -66,7 +66,7 @@ def trace_ray(
 
 
 def _test_leaf(
-    triangles: Float[Array, "slots 12"],
+    packed: Float[Array, "slots 12"],
     origin: Float[Array, "3"],
     direction: Float[Array, "3"],
     leaving: Int[Array, ""],
@@ -77,7 +77,7 @@ def _test_leaf(
     distance, slot = walk.distance, walk.slot
     for offset in range(node_table.LEAF_SIZE):
         candidate = first + offset
-        facet = node_table.read_row(triangles, candidate)
+        facet = node_table.read_row(packed, candidate)
         found = facets.distance(origin, direction, facet)
         closer = (found < distance) | ((found == distance) & (candidate < slot))
         closer = closer & (candidate != leaving)

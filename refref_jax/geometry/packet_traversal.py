@@ -75,26 +75,26 @@ class _Walk(NamedTuple):
 
 @native_loop
 def trace(
-    nodes: Int[Array, "rows 8"], triangles: Float[Array, "slots 12"], packets: Packet
+    nodes: Int[Array, "rows 8"], packed: Float[Array, "slots 12"], packets: Packet
 ) -> Closest:
     """Traces packet after packet.
 
     Args:
       nodes: the tables of all octants, one after the other.
-      triangles: facets by slot.
+      packed: precomputed triangles by slot.
       packets: any number, along the leading axis.
     """
-    return jax.lax.map(lambda packet: _trace_packet(nodes, triangles, packet), packets)
+    return jax.lax.map(lambda packet: _trace_packet(nodes, packed, packet), packets)
 
 
-def _trace_packet(nodes: Int[Array, "rows 8"], triangles: Array, packet: Packet) -> Closest:
+def _trace_packet(nodes: Int[Array, "rows 8"], packed: Array, packet: Packet) -> Closest:
     """Walks once for each octant that the packet's rays have."""
 
     def walk_octant(rounds: _Rounds) -> _Rounds:
         octant, octants, closest = rounds
         awake = octants == octant
         reach = jnp.where(awake, closest.distances, -1.0)
-        walked = _walk(nodes, triangles, packet, octant, Closest(reach, closest.slots))
+        walked = _walk(nodes, packed, packet, octant, Closest(reach, closest.slots))
         distances = jnp.where(awake, walked.distances, closest.distances)
         left = jnp.where(awake, _DONE, octants)
         return _Rounds(jnp.min(left), left, Closest(distances, walked.slots))
@@ -106,7 +106,7 @@ def _trace_packet(nodes: Int[Array, "rows 8"], triangles: Array, packet: Packet)
 
 def _walk(
     nodes: Int[Array, "rows 8"],
-    triangles: Float[Array, "slots 12"],
+    packed: Float[Array, "slots 12"],
     packet: Packet,
     octant: Int[Array, ""],
     closest: Closest,
@@ -125,7 +125,7 @@ def _walk(
         )
 
     def advance(walk: _Walk) -> _Walk:
-        closest = _test_leaf(triangles, packet, walk.leaf - 1, walk.closest)
+        closest = _test_leaf(packed, packet, walk.leaf - 1, walk.closest)
         return _Walk(*find_leaf(walk.node, closest.distances), closest)
 
     root = octant * (nodes.shape[0] // node_table.OCTANTS)
@@ -172,7 +172,7 @@ def _visit(
 
 
 def _test_leaf(
-    triangles: Float[Array, "slots 12"],
+    packed: Float[Array, "slots 12"],
     packet: Packet,
     first: Int[Array, ""],
     closest: Closest,
@@ -185,7 +185,7 @@ def _test_leaf(
     best = None
     for offset in range(node_table.LEAF_SIZE):
         slot = first + offset
-        facet = node_table.read_row(triangles, slot)
+        facet = node_table.read_row(packed, slot)
         distances = jax.vmap(facets.distance, in_axes=(-1, -1, None))(
             packet.origins, packet.directions, facet
         )

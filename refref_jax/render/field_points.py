@@ -49,8 +49,8 @@ def look_up(
     """
     # A cube's standard deviation along each axis.
     scale = jnp.full((1,), width, point.dtype) / jnp.sqrt(jnp.asarray(12.0, point.dtype))
-    domain = transport.domain(config)
-    held = domains.nearest_within(domain, point)
-    cell = domains.to_unit_cube(domain, Gaussians(held[None], scale))
+    bounds = transport.domain(config)
+    held = domains.nearest_within(bounds, point)
+    cell = domains.to_unit_cube(bounds, Gaussians(held[None], scale))
     seen = registry.radiance(params.field, config.field, cell, direction)
     return FieldPoint(seen.density / config.radius, seen.rgb)

@@ -122,9 +122,9 @@ def path_radiance(
     see = jax.vmap(registry.radiance, in_axes=(None, None, 0, 0))
     seen = see(params.field, config.field, samples.gaussians, points.direction)
     weights = _weigh(config, seen.density, samples.t)
-    composite = compositing.composite(weights, seen.rgb, samples.t)
+    composited = compositing.composite(weights, seen.rgb, samples.t)
     return PathRadiance(
-        composite=_in_arc_length(line, composite),
+        composite=_in_arc_length(line, composited),
         histograms=(*histograms, Histogram(s, weights)),
         outside=points.outside,
     )

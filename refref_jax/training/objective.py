@@ -60,16 +60,16 @@ def total(light: pixels.Light, paths: LightPaths, config: LossConfig) -> Totals:
     """Sums what some paths of a batch are to the loss."""
     *proposals, final = light.paths.histograms
     exists = light_paths.exists(paths)
-    interlevel = jnp.zeros(())
+    missed = jnp.zeros(())
     for proposal, blur in zip(proposals, config.blurs, strict=True):
         per_path = jax.vmap(functools.partial(losses.interlevel, blur=blur))(final, proposal)
-        interlevel += _sum_where(exists, per_path)
+        missed += _sum_where(exists, per_path)
     counted = light.paths.outside
     if config.distortion_over == "everywhere":
         counted = jnp.ones_like(counted)
-    distortion = jax.vmap(losses.distortion)(final, counted)
-    count = jnp.sum(exists, dtype=interlevel.dtype)
-    return Totals(light.linear, interlevel, _sum_where(exists, distortion), count)
+    spread = jax.vmap(losses.distortion)(final, counted)
+    count = jnp.sum(exists, dtype=missed.dtype)
+    return Totals(light.linear, missed, _sum_where(exists, spread), count)
 
 
 def measure(
