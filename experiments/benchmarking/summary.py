@@ -18,9 +18,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.benchmarking import jobs, paper_tables, results, settings, tables
-from experiments.benchmarking.jobs import Skipped
+from experiments.benchmarking import paper_tables, plan, results, settings, tables
 from experiments.benchmarking.methods import METHODS
+from experiments.benchmarking.plan import Skipped
 from experiments.benchmarking.results import Record
 from experiments.benchmarking.settings import Benchmark
 from experiments.benchmarking.tables import Block, Cell, Column, Mark, Row, Table
@@ -160,7 +160,7 @@ def all_tables(found: Sequence[Record]) -> list[Table]:
 
 
 def _has_result(out: Path, name: str) -> bool:
-    return (out / jobs.FOLDER / name / jobs.RESULT).is_file()
+    return (out / plan.FOLDER / name / plan.RESULT).is_file()
 
 
 def _missing(
@@ -218,7 +218,7 @@ def _not_done(
 
 def _indexed(out: Path, record: Record) -> dict[str, Any]:
     """Returns a result with the paths of its pictures from `out`, and its curve of training."""
-    folder = Path(jobs.FOLDER) / record.scene / record.method
+    folder = Path(plan.FOLDER) / record.scene / record.method
     views = [
         view._replace(rgb=str(folder / view.rgb), distance=str(folder / view.distance))
         for view in record.views

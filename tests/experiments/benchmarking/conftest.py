@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.benchmarking import running
+from experiments.benchmarking import worker
 from experiments.cli import subprocesses as child_process
 from tests.experiments.benchmarking.made_scenes import write_scene
 from tests.experiments.benchmarking.serving import Server
@@ -19,7 +19,7 @@ def stand_in_line(name, options):
 def run_with_stand_in(out, job):
     """Does a job with stand-ins for its commands, in whatever process."""
     child_process.command_line = stand_in_line
-    return running.run(out, job)
+    return worker.run_job(out, job)
 
 
 @pytest.fixture

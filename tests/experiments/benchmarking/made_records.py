@@ -1,6 +1,6 @@
 """Results of jobs whose tables can be reckoned by hand."""
 
-from experiments.benchmarking import jobs, results
+from experiments.benchmarking import plan, results
 from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.results import Costs, Image, Record
 from experiments.benchmarking.settings import Settings
@@ -17,7 +17,7 @@ def made_record(scene, method, **metrics):
         background=background,
         method=method,
         fingerprint="",
-        options=jobs.options(method, METHODS[method].train if method in METHODS else (), SETTINGS),
+        options=plan.options(method, METHODS[method].train if method in METHODS else (), SETTINGS),
         settings=SETTINGS,
         metrics=metrics,
         per_image=[Image("r_0", 0.1, None, metrics)],

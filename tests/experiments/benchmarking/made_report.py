@@ -5,9 +5,9 @@ import json
 import imageio.v3 as iio
 import numpy as np
 
-from experiments.benchmarking import jobs, results, settings, summary
-from experiments.benchmarking.jobs import Skipped
+from experiments.benchmarking import plan, results, settings, summary
 from experiments.benchmarking.methods import METHODS
+from experiments.benchmarking.plan import Skipped
 from experiments.benchmarking.results import Costs, Image, Truth, View
 from experiments.benchmarking.settings import Benchmark, Scene
 from refref_jax.data import files
@@ -69,7 +69,7 @@ def _write_scene(folder, images):
 
 
 def _write_job(out, scene, path, method, images):
-    folder = out / jobs.FOLDER / scene / method
+    folder = out / plan.FOLDER / scene / method
     run = folder / "run"
     noise = np.random.default_rng(len(method))
     for kind in ("rgb", "distance"):

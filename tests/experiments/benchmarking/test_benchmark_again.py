@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
-from experiments.benchmarking import jobs, summary
+from experiments.benchmarking import plan, summary
 from refref_jax import atomic_files
 from tests import made_lpips
 from tests.experiments.benchmarking.serving import calls
@@ -58,7 +58,7 @@ def test_results_of_several_versions_are_told(tmp_path, serve, scenes):
     serve(tmp_path, scenes, "--methods=straight")
     summary_ = tmp_path / "out" / summary.FILE
     assert "several versions" not in summary_.read_text()
-    path = tmp_path / "out" / jobs.FOLDER / "cube_smcvx_ball/straight/result.json"
+    path = tmp_path / "out" / plan.FOLDER / "cube_smcvx_ball/straight/result.json"
     content = json.loads(path.read_text())
     content["versions"]["jax"] = "0.0"
     path.write_text(json.dumps(content))

@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from experiments.benchmarking import engines, jobs, summary
+from experiments.benchmarking import plan, summary, worker
 from refref_jax import atomic_files
 from tests.experiments.benchmarking.serving import MODULES, calls, environment
 from tests.experiments.command import ROOT
@@ -149,8 +149,8 @@ def test_results_of_two_machines_are_merged_by_copying(tmp_path, serve, scenes):
     serve(tmp_path, scenes, "--methods=straight,tree")
     serve(here, scenes, "--methods=straight")
     serve(there, scenes, "--methods=tree")
-    for folder in (there / "out" / jobs.FOLDER).glob("*/*"):
-        shutil.copytree(folder, here / "out" / jobs.FOLDER / folder.parent.name / folder.name)
+    for folder in (there / "out" / plan.FOLDER).glob("*/*"):
+        shutil.copytree(folder, here / "out" / plan.FOLDER / folder.parent.name / folder.name)
     result = serve(here, "--tables_only")
     assert "summary.md" in result.stdout
     assert _texts(here / "out") == _texts(tmp_path / "out")
@@ -206,13 +206,13 @@ def test_a_dry_run_lists_and_does_nothing(tmp_path, serve, scenes):
 )
 def test_mistakes_end_before_anything_is_done(tmp_path, serve, options, message):
     assert message in serve(tmp_path, *options, status=2).stderr
-    assert not (tmp_path / "out" / jobs.FOLDER).exists()
+    assert not (tmp_path / "out" / plan.FOLDER).exists()
 
 
 def test_without_ray_its_option_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ValueError, match=r"pip install -e '.\[cluster\]'"):
-        engines.import_ray()
+        worker.import_ray()
 
 
 def test_no_cluster_at_an_address_is_said(tmp_path, serve, scenes):

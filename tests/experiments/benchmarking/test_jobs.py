@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.benchmarking import jobs, methods, results, running, scene_list, settings
+from experiments.benchmarking import methods, plan, results, settings, worker
 from experiments.benchmarking.methods import METHODS, RECONSTRUCTION
 from experiments.cli import scenes as cli_scenes
 from refref_jax import atomic_files
@@ -17,7 +17,7 @@ from tests.experiments.benchmarking.made_scenes import write_scene
 def _scenes(tmp_path, *names, **options):
     for name in names:
         write_scene(tmp_path / "scenes" / name, **options)
-    return scene_list.find([str(tmp_path / "scenes" / "*")])
+    return plan.find_scenes([str(tmp_path / "scenes" / "*")])
 
 
 def _chosen(text):
@@ -49,7 +49,7 @@ def test_methods_are_in_the_order_of_the_table_and_none_hides_a_reconstruction()
 
 def test_there_is_a_job_for_each_scene_and_method_and_one_reconstruction_a_scene(tmp_path):
     scenes = _scenes(tmp_path, "cube_smcvx_ball", "env_smncvx_torus")
-    planned, skipped = jobs.plan(scenes, _chosen("straight,r3f,r3f_tree"), SETTINGS)
+    planned, skipped = plan.plan_jobs(scenes, _chosen("straight,r3f,r3f_tree"), SETTINGS)
     assert skipped == []
     assert [job.name for job in planned[:4]] == [
         f"cube_smcvx_ball/{name}" for name in (RECONSTRUCTION, "straight", "r3f", "r3f_tree")
@@ -71,7 +71,9 @@ def test_what_a_scene_lacks_is_skipped_and_said(tmp_path):
         ({"colours": False}, ["straight", "tree", "r3f"], ["scene.json does not tell"]),
     ]:
         folder = tmp_path / next(iter(lacks))
-        planned, skipped = jobs.plan(_scenes(folder, "cube_smcvx_ball", **lacks), chosen, SETTINGS)
+        planned, skipped = plan.plan_jobs(
+            _scenes(folder, "cube_smcvx_ball", **lacks), chosen, SETTINGS
+        )
         assert sorted(job.method for job in planned if job.method in METHODS) == sorted(left)
         assert len(skipped) == len(reasons)
         for each, reason in zip(skipped, reasons, strict=True):
@@ -92,7 +94,7 @@ def test_an_ablation_that_a_scene_comes_to_anyway_is_left_out(tmp_path):
         if colour is not None:
             content["parts"][0]["colour_per_interface"] = colour
             path.write_text(json.dumps(content))
-        planned, skipped = jobs.plan([scene], chosen, SETTINGS)
+        planned, skipped = plan.plan_jobs([scene], chosen, SETTINGS)
         reasons = {each.method: each.reason for each in skipped}
         assert reasons[same] == f"in this scene it is tree again {told}"
         left = {"tree", "tree_field", *insides} - set(reasons)
@@ -104,7 +106,7 @@ def test_an_ablation_that_a_scene_comes_to_anyway_is_left_out(tmp_path):
 def test_a_broken_scene_is_left_to_its_jobs(tmp_path):
     scenes = _scenes(tmp_path, "cube_smcvx_ball")
     (tmp_path / "scenes" / "cube_smcvx_ball" / "scene.json").write_text("{")
-    planned, skipped = jobs.plan(scenes, _chosen("tree,tree_tints_given"), SETTINGS)
+    planned, skipped = plan.plan_jobs(scenes, _chosen("tree,tree_tints_given"), SETTINGS)
     assert [job.method for job in planned] == ["tree", "tree_tints_given"] and skipped == []
 
 
@@ -113,7 +115,7 @@ def test_scenes_are_found_by_wildcards_and_folders(tmp_path):
     write_scene(tmp_path / "b" / "cube_smcvx_ball")
     write_scene(tmp_path / "a" / "mine")
     (tmp_path / "a" / "preview").mkdir()
-    found = scene_list.find([str(tmp_path / "a" / "*"), str(tmp_path / "a" / "mine")])
+    found = plan.find_scenes([str(tmp_path / "a" / "*"), str(tmp_path / "a" / "mine")])
     assert [scene.name for scene in found] == ["cube_smcvx_ball", "mine"]
     assert results.category_and_background("cube_smcvx_ball") == ("smcvx", "cube")
     assert results.category_and_background("mine") == (results.OTHER, results.OTHER)
@@ -125,16 +127,16 @@ def test_scenes_are_found_by_wildcards_and_folders(tmp_path):
         ([], "names no scene"),
     ]:
         with pytest.raises(ValueError, match=message):
-            scene_list.find(words)
+            plan.find_scenes(words)
 
 
 def test_a_folder_whose_name_looks_like_wildcards_is_taken_as_it_is(tmp_path):
     for name in ("ball[1]", "ball1"):
         write_scene(tmp_path / name)
-    (found,) = scene_list.find([str(tmp_path / "ball[1]")])
+    (found,) = plan.find_scenes([str(tmp_path / "ball[1]")])
     assert found.path == str(tmp_path / "ball[1]")
     (tmp_path / "ball[1]").rename(tmp_path / "other")
-    (found,) = scene_list.find([str(tmp_path / "ball[1]")])  # a wildcard
+    (found,) = plan.find_scenes([str(tmp_path / "ball[1]")])  # a wildcard
     assert found.path == str(tmp_path / "ball1")
     (tmp_path / "no[1]scene").mkdir()
     with pytest.raises(ValueError, match=r"scene/transforms_train\.json does not exist"):
@@ -181,10 +183,10 @@ def test_a_folder_without_a_benchmark_is_named(tmp_path):
 def test_a_job_leaves_a_result_that_says_all_and_is_done_once(tmp_path, stand_in):
     (scene,) = _scenes(tmp_path, "env_smcvx_ball")
     common = dataclasses.replace(SETTINGS, limit=6)
-    (job,), _ = jobs.plan([scene], _chosen("tree_cone"), common)
+    (job,), _ = plan.plan_jobs([scene], _chosen("tree_cone"), common)
     out = tmp_path / "out"
-    assert running.run(out, job) is None and jobs.is_done(out, job)
-    assert running.run(out, job) is None
+    assert worker.run_job(out, job) is None and plan.is_done(out, job)
+    assert worker.run_job(out, job) is None
     assert _calls(stand_in) == [f"train {job.name}", f"evaluate {job.name}"]
     (record,) = results.read_all(out, _benchmark(common))
     assert (record.category, record.background, record.method) == ("smcvx", "env", "tree_cone")
@@ -212,27 +214,27 @@ def test_a_job_leaves_a_result_that_says_all_and_is_done_once(tmp_path, stand_in
 
 def test_results_of_other_settings_or_places_are_refused(tmp_path, stand_in):
     (scene,) = _scenes(tmp_path, "cube_smcvx_ball")
-    (job,), _ = jobs.plan([scene], _chosen("tree"), SETTINGS)
+    (job,), _ = plan.plan_jobs([scene], _chosen("tree"), SETTINGS)
     out = tmp_path / "out"
-    running.run(out, job)
-    path = jobs.folder(out, job) / jobs.RESULT
+    worker.run_job(out, job)
+    path = plan.job_folder(out, job) / plan.RESULT
     with pytest.raises(ValueError, match="made with other settings"):
         results.read_all(out, _benchmark(dataclasses.replace(SETTINGS, seed=1)))
     path.parent.rename(path.parent.with_name("straight"))
     with pytest.raises(ValueError, match="is the result of cube_smcvx_ball/tree"):
         results.read_all(out, _benchmark())
-    (path.parent.with_name("straight") / jobs.RESULT).write_text("{")
+    (path.parent.with_name("straight") / plan.RESULT).write_text("{")
     with pytest.raises(ValueError, match="is not the result of a job"):
         results.read_all(out, _benchmark())
 
 
 def test_a_reconstruction_is_given_to_the_methods_that_wait_for_it(tmp_path, stand_in):
     (scene,) = _scenes(tmp_path, "cube_smcvx_ball", meshes=False)
-    planned, _ = jobs.plan([scene], _chosen("r3f"), SETTINGS)
+    planned, _ = plan.plan_jobs([scene], _chosen("r3f"), SETTINGS)
     out = tmp_path / "out"
-    assert [running.run(out, job) for job in planned] == [None, None]
-    folder = jobs.folder(out, planned[0])
-    words = (jobs.folder(out, planned[1]) / "run" / "trained_with").read_text()
+    assert [worker.run_job(out, job) for job in planned] == [None, None]
+    folder = plan.job_folder(out, planned[0])
+    words = (plan.job_folder(out, planned[1]) / "run" / "trained_with").read_text()
     assert f"reconstruction={folder / 'run'}" in words
     everything = results.read_all(out, _benchmark())
     assert [record.method for record in results.compared(everything)] == ["r3f"]
@@ -244,32 +246,32 @@ def test_a_reconstruction_is_given_to_the_methods_that_wait_for_it(tmp_path, sta
 
 def test_a_failure_is_a_reason_and_its_job_is_tried_again(tmp_path, stand_in, monkeypatch):
     (scene,) = _scenes(tmp_path, "cube_smcvx_ball")
-    (job,), _ = jobs.plan([scene], _chosen("tree"), SETTINGS)
+    (job,), _ = plan.plan_jobs([scene], _chosen("tree"), SETTINGS)
     out = tmp_path / "out"
     monkeypatch.setenv("FAIL", "tree")
-    assert "told to fail" in running.run(out, job) and not jobs.is_done(out, job)
+    assert "told to fail" in worker.run_job(out, job) and not plan.is_done(out, job)
     monkeypatch.setenv("FAIL", "^$")
-    assert running.run(out, job) is None and jobs.is_done(out, job)
+    assert worker.run_job(out, job) is None and plan.is_done(out, job)
 
 
 def test_a_mistake_of_ours_is_a_reason_too(tmp_path, stand_in, monkeypatch):
     (scene,) = _scenes(tmp_path, "cube_smcvx_ball")
-    (job,), _ = jobs.plan([scene], _chosen("tree"), SETTINGS)
+    (job,), _ = plan.plan_jobs([scene], _chosen("tree"), SETTINGS)
 
     def broken(*arguments, **options):
         raise KeyError("psnr")
 
-    monkeypatch.setattr(running.trained_runs, "train", broken)
-    reason = running.run(tmp_path / "out", job)
+    monkeypatch.setattr(worker.measured_runs, "train", broken)
+    reason = worker.run_job(tmp_path / "out", job)
     assert reason.startswith("KeyError: 'psnr'")
-    log = jobs.folder(tmp_path / "out", job) / "error.txt"
+    log = plan.job_folder(tmp_path / "out", job) / "error.txt"
     assert str(log) in reason and "Traceback" in log.read_text()
 
 
 def test_a_job_waits_for_who_still_works_in_its_run(tmp_path, capsys):
-    running.wait_until_free(tmp_path / "nothing")
-    running.wait_until_free(tmp_path)
+    worker.wait_until_free(tmp_path / "nothing")
+    worker.wait_until_free(tmp_path)
     with atomic_files.hold(tmp_path), pytest.raises(ValueError, match="Another process works"):
-        running.wait_until_free(tmp_path, patience=0.3)
+        worker.wait_until_free(tmp_path, patience=0.3)
     line = f"Waiting until the process ends that works in {tmp_path} yet.\n"
     assert capsys.readouterr().out == line

@@ -6,16 +6,7 @@ import shutil
 
 import pytest
 
-from experiments.benchmarking import (
-    fingerprints,
-    jobs,
-    methods,
-    paper_tables,
-    results,
-    running,
-    scene_list,
-    settings,
-)
+from experiments.benchmarking import methods, paper_tables, plan, results, settings, worker
 from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.report import page
 from experiments.benchmarking.report.data import Result, Scene
@@ -60,42 +51,42 @@ def _append(name):
 )
 def test_what_decides_results_changes_the_fingerprint(tmp_path, change):
     scene = write_scene(tmp_path / "ball")
-    before = fingerprints.fingerprint(scene)
+    before = plan.fingerprint(scene)
     change(scene)
-    assert fingerprints.fingerprint(scene) != before
+    assert plan.fingerprint(scene) != before
 
 
 def test_where_a_scene_lies_and_what_else_is_there_does_not(tmp_path):
     scene = write_scene(tmp_path / "ball")
-    before = fingerprints.fingerprint(scene)
+    before = plan.fingerprint(scene)
     shutil.copytree(scene, tmp_path / "elsewhere" / "other")
     (scene / "preview.png").write_bytes(b"0")
-    assert fingerprints.fingerprint(scene) == before
-    assert fingerprints.fingerprint(tmp_path / "elsewhere" / "other") == before
+    assert plan.fingerprint(scene) == before
+    assert plan.fingerprint(tmp_path / "elsewhere" / "other") == before
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"frames": 3}', '{"frames": [3, {"file_path": 1}]}'])
 def test_a_broken_scene_has_a_fingerprint_too(tmp_path, text):
     scene = write_scene(tmp_path / "ball")
     (scene / "transforms_train.json").write_text(text)
-    assert len(fingerprints.fingerprint(scene)) == 16
+    assert len(plan.fingerprint(scene)) == 16
 
 
 def test_a_scene_that_changes_is_refused_by_the_benchmark_and_by_its_jobs(tmp_path, stand_in):
     folder = write_scene(tmp_path / "scenes" / "cube_smcvx_ball")
-    (scene,) = scene_list.find([str(folder)])
+    (scene,) = plan.find_scenes([str(folder)])
     asked = settings.asked(SETTINGS, [scene], methods.parse(["tree"]))
     out = tmp_path / "out"
     settings.write(out, asked)
-    (job,), _ = jobs.plan([scene], methods.parse(["tree"]), SETTINGS)
-    assert running.run(out, job) is None
+    (job,), _ = plan.plan_jobs([scene], methods.parse(["tree"]), SETTINGS)
+    assert worker.run_job(out, job) is None
     _edit("scene.json", "1.5", "1.9")(folder)
-    (changed,) = scene_list.find([str(folder)])
+    (changed,) = plan.find_scenes([str(folder)])
     with pytest.raises(ValueError, match="another scene named cube_smcvx_ball"):
         settings.extended(out, settings.asked(SETTINGS, [changed], methods.parse(["oracle"])))
     late = job._replace(method="straight", train=METHODS["straight"].train)
-    assert "have changed since the benchmark" in running.run(out, late)
-    assert not jobs.is_done(out, late) and len(stand_in.read_text().splitlines()) == 2
+    assert "have changed since the benchmark" in worker.run_job(out, late)
+    assert not plan.is_done(out, late) and len(stand_in.read_text().splitlines()) == 2
 
 
 # --- what is compared when results are read ---
@@ -103,7 +94,7 @@ def test_a_scene_that_changes_is_refused_by_the_benchmark_and_by_its_jobs(tmp_pa
 
 def _written(tmp_path, record):
     out = tmp_path / "out"
-    folder = out / jobs.FOLDER / record.scene / record.method
+    folder = out / plan.FOLDER / record.scene / record.method
     folder.mkdir(parents=True)
     results.write(folder, record)
     return out
@@ -217,7 +208,9 @@ def test_a_scene_without_test_views_is_left_out_and_not_trained(tmp_path, spoil)
         (folder / "transforms_test.json").write_text('{"camera_angle_x": 1.0, "frames": []}')
     else:
         (folder / "test/r_003.png").unlink()
-    planned, skipped = jobs.plan(scene_list.find([str(folder)]), methods.parse(["main"]), SETTINGS)
+    planned, skipped = plan.plan_jobs(
+        plan.find_scenes([str(folder)]), methods.parse(["main"]), SETTINGS
+    )
     assert planned == [] and [each.method for each in skipped] == [
         name for name in METHODS if METHODS[name].group == "main"
     ]
@@ -236,9 +229,9 @@ def test_a_scene_without_test_views_is_left_out_and_not_trained(tmp_path, spoil)
     ],
 )
 def test_an_ablation_that_the_preset_has_already_is_left_out(tmp_path, preset, same):
-    scenes = scene_list.find([str(write_scene(tmp_path / "ball"))])
+    scenes = plan.find_scenes([str(write_scene(tmp_path / "ball"))])
     common = settings.Settings(preset, 6, None, 1, 0, None)
-    planned, skipped = jobs.plan(scenes, methods.parse(["all"]), common)
+    planned, skipped = plan.plan_jobs(scenes, methods.parse(["all"]), common)
     (left,) = [each for each in skipped if "preset" in each.reason]
     assert (left.method, left.reason) == (same, f"in the preset {preset} it is tree again")
     assert len([job for job in planned if job.method in METHODS]) == len(METHODS) - len(skipped)

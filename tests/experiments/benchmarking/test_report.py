@@ -11,7 +11,7 @@ import sys
 import pytest
 from PIL import Image
 
-from experiments.benchmarking import jobs, results, summary
+from experiments.benchmarking import plan, results, summary
 from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.report import data, page
 from experiments.benchmarking.report.data import Result, Scene
@@ -146,7 +146,7 @@ def test_without_pictures_there_is_a_report_still(out, tmp_path):
 
 def test_a_broken_picture_and_one_of_another_size_are_left_out(out, tmp_path):
     shutil.copytree(out, tmp_path / "copy")
-    folders = [tmp_path / "copy" / jobs.FOLDER / name / "tree/run/eval/test" for name in _SCENES]
+    folders = [tmp_path / "copy" / plan.FOLDER / name / "tree/run/eval/test" for name in _SCENES]
     (folders[0] / "rgb/r_0.png").write_bytes(b"no picture")
     Image.new("RGB", (5, 5)).save(folders[1] / "rgb/r_0.png")
     (folders[1] / "distance/r_0.exr").write_bytes(b"")
@@ -248,7 +248,7 @@ def test_what_failed_before_is_known_until_it_is_done(out, tmp_path):
     assert list(failed) == ["cube_smcvx_ball/r3f"] and [e.method for e in skipped] == ["r3f_tree"]
     copy = _copy(out, tmp_path)
     for method in ("r3f", "r3f_tree"):
-        folder = copy / jobs.FOLDER / "cube_smcvx_ball" / method
+        folder = copy / plan.FOLDER / "cube_smcvx_ball" / method
         folder.mkdir()
         results.write(folder, made_record("cube_smcvx_ball", method))
     assert summary.not_done(copy) == ({}, [])

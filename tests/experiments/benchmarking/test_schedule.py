@@ -4,10 +4,10 @@ import threading
 
 import pytest
 
-from experiments.benchmarking import schedule
-from experiments.benchmarking.engines import LocalEngine
-from experiments.benchmarking.jobs import Job
+from experiments.benchmarking import worker
 from experiments.benchmarking.methods import RECONSTRUCTION
+from experiments.benchmarking.plan import Job
+from experiments.benchmarking.worker import LocalEngine
 from experiments.cli import subprocesses as child_process
 from experiments.cli.subprocesses import RunFailedError
 from tests.experiments.benchmarking.made_records import SETTINGS
@@ -28,7 +28,7 @@ _WITH_RECONSTRUCTION = [
 def _work(todo, run, workers=1):
     done = []
     engine = LocalEngine(None, workers, lambda out, job: run(job))
-    schedule.work(todo, engine, lambda job, reason: done.append((job.name, reason)))
+    worker.run_in_order(todo, engine, lambda job, reason: done.append((job.name, reason)))
     return done
 
 
@@ -76,7 +76,7 @@ def test_an_interruption_stops_what_runs_and_begins_nothing_more():
 
     jobs = [made_job(scene, "tree") for scene in "abcdef"]
     with pytest.raises(KeyboardInterrupt):
-        schedule.work(jobs, LocalEngine(None, 1, lambda out, job: run(job)), interrupted)
+        worker.run_in_order(jobs, LocalEngine(None, 1, lambda out, job: run(job)), interrupted)
     assert len(begun) < len(jobs)
 
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from experiments.benchmarking import jobs, results, settings, summary, working
-from experiments.benchmarking.jobs import Job, Skipped
+from experiments.benchmarking import plan, results, settings, summary, worker
 from experiments.benchmarking.methods import METHODS
+from experiments.benchmarking.plan import Job, Skipped
 from experiments.benchmarking.settings import Benchmark, Scene
 from tests.experiments.benchmarking.made_records import SETTINGS, made_record
 
@@ -28,7 +28,7 @@ class _Engine:
         if job.name in self._failing:
             return job, self._failing[job.name]
         record = made_record(job.scene, job.method, psnr=20.0)
-        folder = jobs.folder(self._out, job)
+        folder = plan.job_folder(self._out, job)
         folder.mkdir(parents=True, exist_ok=True)
         results.write(folder, record)
         return job, None
@@ -50,7 +50,7 @@ def work(tmp_path):
         benchmark = Benchmark(SETTINGS, known, {name: METHODS[name].train for name in METHODS})
         settings.write(tmp_path, benchmark)
         engine = _Engine(tmp_path, failing or {}, most)
-        return working.work(tmp_path, benchmark, planned, skipped, engine=lambda: engine)
+        return worker.run_missing(tmp_path, benchmark, planned, skipped, engine=lambda: engine)
 
     return run
 
