@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 with epy.lazy_imports():
     from experiments.benchmarking import plan, settings, summary, worker
-    from experiments.benchmarking.report import page, sheet
+    from experiments.benchmarking.report import images, page
     from experiments.runs import perceptual
     from refref_jax.training import presets
 
@@ -200,7 +200,7 @@ def _finish(out: Path) -> None:
     print(f"Tables:  {out / summary.TABLES}")
     print(f"Results: {out / summary.RESULTS}")
     print(f"Report:  {report} ({report.stat().st_size / 1e6:.1f} MB)")
-    print(f"Picture: {sheet.write(out) or 'none, for the scenes are gone'}")
+    print(f"Picture: {images.write_sheet(out) or 'none, for the scenes are gone'}")
 
 
 def _next(out: Path, done: Sequence[Method]) -> str:

@@ -6,7 +6,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from experiments.benchmarking.report import data, sheet
+from experiments.benchmarking.report import data, images
 from tests.experiments.benchmarking import made_report
 
 _SCENES = ("cube_smcvx_ball", "env_mmncvx_cup")
@@ -32,7 +32,7 @@ def test_the_view_in_the_middle_stands_for_a_scene(out):
 
 
 def test_each_scene_has_a_column_of_its_true_image_and_each_method(out):
-    path = sheet.write(out)
+    path = images.write_sheet(out)
     assert path == out / "pictures.jpg"
     pixels = iio.imread(path).astype(int)
     height, width, _ = pixels.shape
@@ -46,18 +46,18 @@ def test_each_scene_has_a_column_of_its_true_image_and_each_method(out):
 
 
 def test_scenes_that_are_gone_have_no_column_and_no_scene_no_picture(out, tmp_path):
-    both = iio.imread(sheet.write(out)).shape
+    both = iio.imread(images.write_sheet(out)).shape
     copy = tmp_path / "copy"
     shutil.copytree(out.parent, copy)
     for name in ("benchmark.json", "results.json"):
         text = (copy / "out" / name).read_text().replace(str(out.parent), str(copy))
         (copy / "out" / name).write_text(text)
     shutil.rmtree(copy / "scene_1")
-    one = iio.imread(sheet.write(copy / "out")).shape
+    one = iio.imread(images.write_sheet(copy / "out")).shape
     assert one[0] == both[0] and one[1] < 0.6 * both[1]
     shutil.rmtree(copy / "scene_0")
-    assert sheet.write(copy / "out") is None
-    assert not (copy / "out" / sheet.FILE).exists()
+    assert images.write_sheet(copy / "out") is None
+    assert not (copy / "out" / images.SHEET).exists()
 
 
 def test_a_method_without_a_result_leaves_its_place_empty(tmp_path):
@@ -65,7 +65,7 @@ def test_a_method_without_a_result_leaves_its_place_empty(tmp_path):
     shutil.rmtree(tmp_path / "a/out/jobs/cube_smcvx_ball/tree/run/eval", ignore_errors=True)
     for path in (out / "jobs/cube_smcvx_ball/tree").rglob("*.png"):
         path.unlink()
-    pixels = iio.imread(sheet.write(out))
+    pixels = iio.imread(images.write_sheet(out))
     height, width, _ = pixels.shape
     lowest = pixels[3 * height // 4 : -height // 16]
     assert (lowest[:, : width // 2] > 250).mean() > 0.8
