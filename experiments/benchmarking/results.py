@@ -46,7 +46,7 @@ class Image(NamedTuple):
 
 
 class Costs(NamedTuple):
-    """What a job took; `None` where it was not measured. See `trained_runs.Training`.
+    """What a job took; `None` where it was not measured. See `measured_runs.Training`.
 
     Attributes:
       steps: of training.

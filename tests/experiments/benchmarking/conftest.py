@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from experiments.benchmarking import worker
-from experiments.cli import subprocesses as child_process
+from experiments.cli import subprocesses
 from tests.experiments.benchmarking.made_scenes import write_scene
 from tests.experiments.benchmarking.serving import Server
 
@@ -18,7 +18,7 @@ def stand_in_line(name, options):
 
 def run_with_stand_in(out, job):
     """Does a job with stand-ins for its commands, in whatever process."""
-    child_process.command_line = stand_in_line
+    subprocesses.command_line = stand_in_line
     return worker.run_job(out, job)
 
 
@@ -27,7 +27,7 @@ def stand_in(tmp_path, monkeypatch):
     """Stands in for the commands; they write what they are called with into this file."""
     calls = tmp_path / "calls.txt"
     monkeypatch.setenv("CALLS", str(calls))
-    monkeypatch.setattr(child_process, "command_line", stand_in_line)
+    monkeypatch.setattr(subprocesses, "command_line", stand_in_line)
     return calls
 
 

@@ -13,8 +13,7 @@ import sys
 from absl import flags
 
 from experiments import benchmark
-from experiments.cli import app
-from experiments.cli import subprocesses as child_process
+from experiments.cli import app, subprocesses
 from tests.experiments.benchmarking.conftest import stand_in_line
 
 
@@ -36,6 +35,6 @@ def _answer(request):
 
 
 if __name__ == "__main__":
-    child_process.command_line = stand_in_line
+    subprocesses.command_line = stand_in_line
     for line in sys.stdin:
         print(json.dumps(_answer(json.loads(line))), flush=True)

@@ -8,7 +8,7 @@ from experiments.benchmarking import worker
 from experiments.benchmarking.methods import RECONSTRUCTION
 from experiments.benchmarking.plan import Job
 from experiments.benchmarking.worker import LocalEngine
-from experiments.cli import subprocesses as child_process
+from experiments.cli import subprocesses
 from experiments.cli.subprocesses import RunFailedError
 from tests.experiments.benchmarking.made_records import SETTINGS
 
@@ -82,7 +82,7 @@ def test_an_interruption_stops_what_runs_and_begins_nothing_more():
 
 def test_commands_are_stopped_and_none_starts_while_stopping(tmp_path, monkeypatch):
     """A command that sleeps is asked to stop by another thread."""
-    start = child_process.subprocess.Popen
+    start = subprocesses.subprocess.Popen
     started = threading.Event()
 
     def popen(command, **options):
@@ -90,21 +90,21 @@ def test_commands_are_stopped_and_none_starts_while_stopping(tmp_path, monkeypat
         started.set()
         return process
 
-    monkeypatch.setattr(child_process.subprocess, "Popen", popen)
+    monkeypatch.setattr(subprocesses.subprocess, "Popen", popen)
     raised = []
 
     def wait():
         try:
-            child_process.run("train", log=tmp_path / "log")
+            subprocesses.run("train", log=tmp_path / "log")
         except RunFailedError as error:
             raised.append(str(error))
 
     thread = threading.Thread(target=wait)
     thread.start()
     assert started.wait(20.0)
-    with child_process.stopping():
+    with subprocesses.stopping():
         thread.join(20.0)
         assert not thread.is_alive()
         with pytest.raises(RunFailedError, match="stopped before it began"):
-            child_process.run("train", log=tmp_path / "log")
+            subprocesses.run("train", log=tmp_path / "log")
     assert len(raised) == 1 and "killed by SIGTERM" in raised[0]
