@@ -5,7 +5,7 @@ import pytest
 
 from experiments.benchmarking import worker
 from experiments.cli import subprocesses
-from tests.experiments.benchmarking.made_scenes import write_scene
+from tests.experiments.benchmarking.made import write_scene
 from tests.experiments.benchmarking.serving import Server
 
 _STAND_IN = Path(__file__).with_name("stand_in.py")

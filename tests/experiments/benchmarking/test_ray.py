@@ -8,8 +8,7 @@ import pytest
 from experiments.benchmarking import methods, plan, results, settings, worker
 from experiments.benchmarking.worker import LocalEngine, RayEngine
 from tests.experiments.benchmarking.conftest import run_with_stand_in
-from tests.experiments.benchmarking.made_records import SETTINGS
-from tests.experiments.benchmarking.made_scenes import write_scene
+from tests.experiments.benchmarking.made import SETTINGS, write_scene
 
 pytestmark = pytest.mark.slow
 
