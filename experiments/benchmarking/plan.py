@@ -88,7 +88,7 @@ class Skipped(NamedTuple):
         return f"{self.scene}/{self.method}"
 
 
-_LACKING: dict[Need, str] = {
+_WANTING: dict[Need, str] = {
     "meshes": "it has no meshes",
     "masks": "its training images have no masks",
     "colours": "scene.json does not tell the colours of all its parts",
@@ -140,12 +140,15 @@ def options(method: str, train: Sequence[str], settings: Settings) -> dict[str, 
     }
 
 
-def lacking(scene: Path, needs: set[Need]) -> set[Need]:
-    """Returns which of some needs a scene does not meet.
+def _lacking(scene: Path, needs: set[Need]) -> set[Need]:
+    """Returns which of some needs a scene does not meet; none if it is broken."""
+    try:
+        return _unmet(scene, needs)
+    except ValueError:
+        return set()
 
-    Raises:
-      ValueError: if the scene is broken.
-    """
+
+def _unmet(scene: Path, needs: set[Need]) -> set[Need]:
     found: set[Need] = set()
     files = meshes.mesh_files(scene) if needs & {"meshes", "colours"} else []
     if "meshes" in needs and not files:
@@ -176,10 +179,11 @@ def _reasons(scene: Scene, methods: Sequence[Method], preset: str) -> dict[str, 
         local_layout.read_frames(Path(scene.path), SPLIT)
     except ValueError as error:
         return {method.name: f"its {SPLIT} views can not be read: {error}" for method in methods}
-    lacks, inside = _lacking_or_broken(scene, methods), _inside(Path(scene.path))
+    needs = {need for method in methods for need in method.needs}
+    lacks, inside = _lacking(Path(scene.path), needs), _inside(Path(scene.path))
     reasons = {}
     for method in methods:
-        if missing := [_LACKING[need] for need in method.needs if need in lacks]:
+        if missing := [_WANTING[need] for need in method.needs if need in lacks]:
             reasons[method.name] = missing[0]
         elif full := same_as(method, preset):
             reasons[method.name] = f"in the preset {preset} it is {full} again"
@@ -198,13 +202,6 @@ def _inside(scene: Path) -> dict[str, str]:
         return {}
     tints = find_tints(parts)
     return {"interior": "clear"} if tints == "none" else {"interior": "absorbing", "tints": tints}
-
-
-def _lacking_or_broken(scene: Scene, methods: Sequence[Method]) -> set[Need]:
-    try:
-        return lacking(Path(scene.path), {need for method in methods for need in method.needs})
-    except ValueError:
-        return set()
 
 
 def _has_no_masks(scene: Path) -> bool:

@@ -99,7 +99,11 @@ def write(
     """
     everything = results.read_all(out, benchmark)
     found = results.compared(everything)
-    made = all_tables(found)
+    made = [
+        paper_tables.main_table(found),
+        paper_tables.top_views_table(found),
+        paper_tables.ablation_table(found),
+    ]
     missing = _missing(out, benchmark, failed, skipped)
     _write_tables(out / TABLES, made, found)
     lines = [*_heading(benchmark, found), *_not_done(failed, skipped, missing)]
@@ -148,15 +152,6 @@ def not_done(out: Path) -> tuple[dict[str, str], list[Skipped]]:
         {name: reason for name, reason in failed.items() if not _has_result(out, name)},
         [each for each in skipped if not _has_result(out, each.name)],
     )
-
-
-def all_tables(found: Sequence[Record]) -> list[Table]:
-    """Returns all tables of some results."""
-    return [
-        paper_tables.main_table(found),
-        paper_tables.top_views_table(found),
-        paper_tables.ablation_table(found),
-    ]
 
 
 def _has_result(out: Path, name: str) -> bool:

@@ -68,30 +68,6 @@ ERRORS = Scale(0.0, 0.25, "magma")
 """Of errors: the mean over the channels of the absolute difference of sRGB in `[0, 1]`."""
 
 
-class Embedded(NamedTuple):
-    """A picture as a page has it.
-
-    Attributes:
-      uri: the picture itself, as a data URI.
-      width: in pixels.
-      height: in pixels.
-    """
-
-    uri: str
-    width: int
-    height: int
-
-
-def embed(pixels: UInt8[np.ndarray, "h w 3"], edge: int) -> Embedded:
-    """Returns a picture, reduced to a longest edge where it is longer."""
-    image = Image.fromarray(pixels)
-    image = image.resize(_size(image, edge), Image.Resampling.BOX)
-    file = io.BytesIO()
-    image.save(file, "WEBP", quality=_QUALITY)
-    text = base64.b64encode(file.getvalue()).decode("ascii")
-    return Embedded(f"data:image/webp;base64,{text}", *image.size)
-
-
 def error_map(
     rendered: UInt8[np.ndarray, "h w 3"], target: UInt8[np.ndarray, "h w 3"], edge: int
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
@@ -159,8 +135,8 @@ def _size(image: Image.Image, edge: int) -> tuple[int, int]:
     return max(1, round(image.width * share)), max(1, round(image.height * share))
 
 
-class Figures(NamedTuple):
-    """The pictures of a view, as a page has them.
+class Shown(NamedTuple):
+    """A view, or a scene with all of its views, as a page has it.
 
     Attributes:
       html: what is shown.
@@ -171,7 +147,7 @@ class Figures(NamedTuple):
     places: Places
 
 
-def show(view: View, scene: Scene, edge: int, prefix: str) -> Figures:
+def show(view: View, scene: Scene, edge: int, prefix: str) -> Shown:
     """Returns a view: a group of pictures for the truth and for each method.
 
     Args:
@@ -200,7 +176,7 @@ def show(view: View, scene: Scene, edge: int, prefix: str) -> Figures:
         _legends(scale),
         data_view=view.name,
     )
-    return Figures(html, places)
+    return Shown(html, places)
 
 
 def title(method: str) -> str:
@@ -233,13 +209,17 @@ def _picture(
     place: str | None,
     key: tuple[str, str, str],
 ) -> Html:
+    """Returns a picture, reduced to a longest edge where it is longer."""
     view, method, kind = key
     if pixels is None:
         return tag("figure", tag("p", NOT_HERE, class_="absent"), tag("figcaption", kind))
-    picture = embed(pixels, edge)
+    picture = Image.fromarray(pixels)
+    picture = picture.resize(_size(picture, edge), Image.Resampling.BOX)
+    file = io.BytesIO()
+    picture.save(file, "WEBP", quality=_QUALITY)
     image = tag(
         "img",
-        src=picture.uri,
+        src=f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode('ascii')}",
         width=picture.width,
         height=picture.height,
         id=place,
