@@ -4,6 +4,7 @@ Commands are stood in for, and jobs too where only their order matters.
 """
 
 import dataclasses
+import functools
 import json
 import threading
 
@@ -188,41 +189,26 @@ def test_an_interruption_stops_what_runs_and_begins_nothing_more(tmp_path, monke
 _SCENE = "cube_smcvx_ball"
 
 
-class _Engine:
-    """Leaves results of all jobs but those that fail, and is interrupted after so many."""
-
-    def __init__(self, out, failing, most=10):
-        self._out, self._failing, self._left, self._taken = out, failing, most, []
-
-    def submit(self, job):
-        self._taken.append(job)
-
-    def next(self):
-        if self._left == 0:
-            raise KeyboardInterrupt
-        self._left -= 1
-        job = self._taken.pop(0)
-        if job.name not in self._failing:
-            plan.job_folder(self._out, job).mkdir(parents=True, exist_ok=True)
-            record = made_record(job.scene, job.method, psnr=20.0)
-            results.write(plan.job_folder(self._out, job), record)
-        return job, self._failing.get(job.name)
-
-    def stop(self):
-        pass
-
-
 @pytest.fixture
 def work(tmp_path):
-    """Does the jobs of some methods on one scene."""
+    """Does the jobs of some methods on one scene, until one is interrupted."""
 
-    def run(names, failing=None, *, skipped=(), most=10):
+    def run(names, failing=None, *, skipped=(), interrupted=None):
+        def do(out, job):
+            if job.method == interrupted:
+                raise KeyboardInterrupt
+            if job.name not in (failing or {}):
+                plan.job_folder(out, job).mkdir(parents=True)
+                record = made_record(job.scene, job.method, psnr=20.0)
+                results.write(plan.job_folder(out, job), record)
+            return (failing or {}).get(job.name)
+
         planned = [_job(_SCENE, name)._replace(train=METHODS[name].train) for name in names]
         scene = settings.Scene(_SCENE, "/nowhere", "")
         benchmark = settings.asked(SETTINGS, [scene], list(METHODS.values()))
         settings.write(tmp_path, benchmark)
-        engine = _Engine(tmp_path, failing or {}, most)
-        return worker.run_missing(tmp_path, benchmark, planned, skipped, engine=lambda: engine)
+        engine = functools.partial(LocalEngine, tmp_path, 1, do)
+        return worker.run_missing(tmp_path, benchmark, planned, skipped, engine=engine)
 
     return run
 
@@ -232,12 +218,12 @@ def test_a_failure_stays_listed_until_its_job_has_been_done_again(tmp_path, work
     first = {f"{_SCENE}/oracle": "out of memory", f"{_SCENE}/tree": "a broken mesh"}
     assert work(both, first) == first == summary.not_done(tmp_path)[0]
     with pytest.raises(KeyboardInterrupt):
-        work(both, first, most=0)
+        work(both, first, interrupted="oracle")
     assert summary.not_done(tmp_path)[0] == first
     assert "a broken mesh" in (tmp_path / summary.FILE).read_text()
     again = {f"{_SCENE}/oracle": "another reason"}
     with pytest.raises(KeyboardInterrupt):
-        work(both, again, most=1)
+        work(both, again, interrupted="tree")
     assert summary.not_done(tmp_path)[0] == first | again
     assert work(both) == {} == summary.not_done(tmp_path)[0]
     assert "a broken mesh" not in (tmp_path / summary.FILE).read_text()
