@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from absl import app, flags
 
-from experiments.runs import measured_runs as trained_runs
+from experiments.runs import measured_runs
 from refref_jax.data import meshes
 
 _SCENE = flags.DEFINE_string("scene", None, "Folder of a tinted scene.", required=True)
@@ -34,7 +34,7 @@ _TOLERANCE = 0.05
 def main(arguments: list[str]) -> None:
     del arguments
     scene = Path(_SCENE.value)
-    trained_runs.check_masks(scene)
+    measured_runs.check_masks(scene)
     results = {name: _measure(scene, name, options) for name, options in _INTERIORS.items()}
     print("| interior | PSNR | PSNR in mask | ms a step |")
     print("|---|---|---|---|")
@@ -57,9 +57,9 @@ def _measure(scene: Path, name: str, options: list[str]) -> dict[str, float]:
         options.append(f"--steps={_STEPS.value}")
     print(f"{scene.resolve().name}: interior {name} ...", flush=True)
     run = _run(scene, name)
-    cost = trained_runs.train(run, scene=scene, options=options)
+    cost = measured_runs.train(run, scene=scene, options=options)
     looks = [f"--rays_per_pixel={_RAYS_PER_PIXEL.value}"]
-    return vars(cost) | vars(trained_runs.evaluate(run, scene=scene, options=looks))
+    return vars(cost) | vars(measured_runs.evaluate(run, scene=scene, options=looks))
 
 
 def _print_tints(scene: Path, run: Path) -> float:

@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from absl import app, flags, logging
 
-from experiments.runs import measured_runs as trained_runs
+from experiments.runs import measured_runs
 from refref_jax.optics.budgets import BUDGETS
 from refref_jax.render.saved import load_model
 from refref_jax.training import run_folder
@@ -65,7 +65,7 @@ def _train(precision: str, steps: int) -> Path:
     options = [f"--preset={_PRESET.value}", f"--paths={_PATHS.value}"]
     options += [f"--precision={precision}", f"--steps={steps}"]
     print(f"{scene.resolve().name}: {precision}, {steps} steps ...", flush=True)
-    trained_runs.train(run, scene=scene, options=options, log_every=max(1, steps // _LINES))
+    measured_runs.train(run, scene=scene, options=options, log_every=max(1, steps // _LINES))
     return run
 
 

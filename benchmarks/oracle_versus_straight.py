@@ -11,7 +11,7 @@ from pathlib import Path
 
 from absl import app, flags
 
-from experiments.runs import measured_runs as trained_runs
+from experiments.runs import measured_runs
 
 _BUNDLED = "cube_smcvx_ball"
 
@@ -46,8 +46,8 @@ def _measure(scene: Path, name: str, paths: str) -> dict[str, float]:
     if _STEPS.value:
         options.append(f"--steps={_STEPS.value}")
     print(f"{scene.resolve().name}: {name} ...", flush=True)
-    cost = trained_runs.train(run, scene=scene, options=options)
-    return vars(cost) | vars(trained_runs.evaluate(run, scene=scene))
+    cost = measured_runs.train(run, scene=scene, options=options)
+    return vars(cost) | vars(measured_runs.evaluate(run, scene=scene))
 
 
 def _print_table(scene: str, results: dict[str, dict[str, float]]) -> None:

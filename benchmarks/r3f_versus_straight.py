@@ -19,10 +19,10 @@ from typing import NamedTuple
 
 from absl import app, flags
 
-from experiments.cli import subprocesses as child_process
+from experiments.cli import subprocesses
 from experiments.r3f import records
 from experiments.r3f.records import IndexFacts
-from experiments.runs import measured_runs as trained_runs
+from experiments.runs import measured_runs
 from experiments.runs.measured_runs import Evaluation
 from refref_jax.data import meshes, scene_names
 from refref_jax.training.presets import PRESETS
@@ -72,7 +72,7 @@ def main(arguments: list[str]) -> None:
     del arguments
     scenes = [Path(scene) for scene in _SCENES.value]
     for scene in scenes:
-        trained_runs.check_masks(scene)
+        measured_runs.check_masks(scene)
     if not any(_is_convex(scene.resolve().name) for scene in scenes):
         print("No scene is named as one of a convex body (_smcvx_): nothing will be asserted.")
     trials = [measure(scene) for scene in scenes]
@@ -88,7 +88,7 @@ def measure(scene: Path) -> Trial:
     body = folder / "reconstruction"
     print(f"{name}: reconstruct ...", flush=True)
     command = [f"--scene={scene}", f"--out={body}"]
-    child_process.run("reconstruct", *command, log=folder / "reconstruct.log")
+    subprocesses.run("reconstruct", *command, log=folder / "reconstruct.log")
     given = {
         "straight": ["--paths=straight"],
         "r3f": ["--paths=tree", f"--reconstruction={body}"],
@@ -140,11 +140,11 @@ def _train(scene: Path, folder: Path, method: str, options: Sequence[str]) -> Ev
     run = folder / f"{_PRESET.value}_{method}_{steps}"
     print(f"{scene.resolve().name}: {method}, {steps} steps ...", flush=True)
     asked = [f"--preset={_PRESET.value}", f"--steps={steps}", *options]
-    trained_runs.train(run, scene=scene, options=asked)
+    measured_runs.train(run, scene=scene, options=asked)
     looks = [f"--rays_per_pixel={_RAYS_PER_PIXEL.value}"]
     if _LIMIT.value is not None:
         looks.append(f"--limit={_LIMIT.value}")
-    return trained_runs.evaluate(run, scene=scene, options=looks)
+    return measured_runs.evaluate(run, scene=scene, options=looks)
 
 
 def _index(trial: Trial, method: str) -> str:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 from absl import app, flags
 
 from experiments.figures.style import pyplot, style
-from experiments.runs import measured_runs as trained_runs
+from experiments.runs import measured_runs
 from experiments.runs.measured_runs import Evaluation, Training
 from refref_jax.training.presets import PRESETS
 
@@ -64,7 +64,7 @@ def main(arguments: list[str]) -> None:
     scenes = [Path(scene) for scene in _SCENES.value]
     counts = sorted({full, *map(int, _CURVE_STEPS.value)})
     for scene in scenes:
-        trained_runs.check_masks(scene)
+        measured_runs.check_masks(scene)
     duels = [fight(scene, steps) for steps in counts for scene in scenes]
     print(table(duels))
     if len(counts) > 1:
@@ -86,8 +86,8 @@ def fight(scene: Path, steps: int) -> Duel:
         options = [f"--preset={_PRESET.value}", f"--interior={_INTERIOR.value}"]
         options += [f"--paths={paths}", f"--steps={steps}"]
         print(f"{scene.resolve().name}: {paths}, {steps} steps ...", flush=True)
-        costs.append(trained_runs.train(run, scene=scene, options=options))
-        results.append(trained_runs.evaluate(run, scene=scene, options=looks))
+        costs.append(measured_runs.train(run, scene=scene, options=options))
+        results.append(measured_runs.evaluate(run, scene=scene, options=looks))
     return Duel(scene.resolve().name, steps, tuple(costs), tuple(results))
 
 

@@ -33,12 +33,12 @@ from experiments.cli import scenes as cli_scenes
 from refref_jax import atomic_files
 
 if TYPE_CHECKING:
-    from experiments.benchmarking.jobs import Job, Skipped
+    from experiments.benchmarking.plan import Job, Skipped
     from experiments.benchmarking.settings import Settings
 
 with epy.lazy_imports():
-    from experiments.benchmarking import engines, jobs, scene_list, settings, summary, working
-    from experiments.benchmarking.report import page, sheet
+    from experiments.benchmarking import plan, settings, summary, worker
+    from experiments.benchmarking.report import images, page
     from experiments.runs import perceptual
     from refref_jax.training import presets
 
@@ -104,12 +104,12 @@ def main() -> None:
         return
     _check_engine()
     cli_scenes.check_all(_SCENES.value)
-    scenes, chosen = scene_list.find(_SCENES.value), methods.parse(_METHODS.value)
+    scenes, chosen = plan.find_scenes(_SCENES.value), methods.parse(_METHODS.value)
     weights = perceptual.checked(_LPIPS_WEIGHTS.value)
     common = _settings(weights)
     benchmark = settings.extended(out, settings.asked(common, scenes, chosen))
     file = None if weights is None else str(weights.absolute())
-    planned, skipped = jobs.plan(scenes, chosen, common, lpips_weights=file)
+    planned, skipped = plan.plan_jobs(scenes, chosen, common, lpips_weights=file)
     if _DRY_RUN.value:
         _list(out, planned, skipped)
         return
@@ -120,7 +120,7 @@ def main() -> None:
         # Another process may have added to it meanwhile.
         benchmark = settings.extended(out, benchmark)
         settings.write(out, benchmark)
-        failed = working.work(
+        failed = worker.run_missing(
             out, benchmark, planned, skipped, engine=functools.partial(_engine, out)
         )
         _finish(out)
@@ -178,14 +178,14 @@ def _check_engine() -> None:
         )
 
 
-def _engine(out: Path) -> engines.Engine:
+def _engine(out: Path) -> worker.Engine:
     if _RAY.value is None:
-        return engines.LocalEngine(out, _JOBS.value)
-    return engines.RayEngine(out, _RAY.value, cpus=_JOB_CPUS.value, gpus=_JOB_GPUS.value)
+        return worker.LocalEngine(out, _JOBS.value)
+    return worker.RayEngine(out, _RAY.value, cpus=_JOB_CPUS.value, gpus=_JOB_GPUS.value)
 
 
 def _list(out: Path, planned: Sequence[Job], skipped: Sequence[Skipped]) -> None:
-    done = [jobs.is_done(out, job) for job in planned]
+    done = [plan.is_done(out, job) for job in planned]
     for job, is_done in zip(planned, done, strict=True):
         print(f"{'done' if is_done else 'to do':6} {job.name:48} {' '.join(job.train)}".rstrip())
     for each in skipped:
@@ -200,7 +200,7 @@ def _finish(out: Path) -> None:
     print(f"Tables:  {out / summary.TABLES}")
     print(f"Results: {out / summary.RESULTS}")
     print(f"Report:  {report} ({report.stat().st_size / 1e6:.1f} MB)")
-    print(f"Picture: {sheet.write(out) or 'none, for the scenes are gone'}")
+    print(f"Picture: {images.write_sheet(out) or 'none, for the scenes are gone'}")
 
 
 def _next(out: Path, done: Sequence[Method]) -> str:

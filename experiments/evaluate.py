@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from refref_jax.render import Model
 
 with epy.lazy_imports():
-    from experiments.figures import comparison as figures
+    from experiments.figures import comparison
     from experiments.r3f import object_source
     from experiments.runs import evaluation as reporting
-    from experiments.runs import perceptual as perceptual_metrics
+    from experiments.runs import perceptual
     from refref_jax.data import files, scene_names
     from refref_jax.render import saved
     from refref_jax.training import evaluation, run_folder
@@ -57,7 +57,7 @@ def main() -> None:
     outputs.replaceable(out, **place)
     cli_flags.check_run(run)
     cli_scenes.check(_SCENE.value)
-    perceptual = perceptual_metrics.chosen(_LPIPS_WEIGHTS.value)
+    lpips = perceptual.chosen(_LPIPS_WEIGHTS.value)
     config = run_folder.read_config(run)
     # Resolved first, and once: training may be going on.
     step = _STEP.value if _STEP.value is not None else saved.latest_step(run)
@@ -70,11 +70,11 @@ def main() -> None:
         "rays_per_pixel": _RAYS_PER_PIXEL.value,
     }
     with outputs.fresh(out, **place) as draft:
-        found, views = evaluate(model, scene, draft, perceptual)
+        found, views = evaluate(model, scene, draft, lpips)
         summary = told | found._asdict()
         text = json.dumps(configuration.string_safe(summary), indent=2, allow_nan=False)
         (draft / "metrics.json").write_text(text + "\n", encoding="utf-8")
-        figures.write_comparison(draft / "comparison.png", views)
+        comparison.write_comparison(draft / "comparison.png", views)
     for key, value in summary["results"].items():
         print(f"{key:>24}  {'-' if value is None else format(value, '.4f')}")
     reporting.warn_of_lost_light(
@@ -92,12 +92,12 @@ def _method(run: Path, paths: str) -> str:
 
 
 def evaluate(
-    model: Model, scene: Path, out: Path, perceptual: evaluation.Perceptual
-) -> tuple[evaluation.Evaluation, list[figures.Comparison]]:
+    model: Model, scene: Path, out: Path, lpips: evaluation.Perceptual
+) -> tuple[evaluation.Evaluation, list[comparison.Comparison]]:
     """Evaluates a model, and writes each image as soon as it is rendered."""
     for folder in ("rgb", "distance"):
         (out / folder).mkdir()
-    views: list[figures.Comparison] = []
+    views: list[comparison.Comparison] = []
     bars: list[ProgressBar] = []
 
     def write(view: evaluation.EvaluatedView) -> None:
@@ -106,7 +106,7 @@ def evaluate(
         files.write_exr(out / "distance" / f"{view.name}.exr", seen.distance)
         if view.place in reporting.shown_views(view.count):
             target = view.target / 255.0
-            views.append(figures.Comparison(view.name, target, seen.rgb, seen.distance))
+            views.append(comparison.Comparison(view.name, target, seen.rgb, seen.distance))
 
     with contextlib.ExitStack() as stack:
 
@@ -122,7 +122,7 @@ def evaluate(
             rays_per_pixel=_RAYS_PER_PIXEL.value,
             limit=_LIMIT.value,
             chunk=_CHUNK.value,
-            perceptual=perceptual,
+            perceptual=lpips,
             progress=progress,
             on_view=write,
         )

@@ -23,7 +23,7 @@ from experiments.runs import refraction_indices
 
 with epy.lazy_imports():
     from experiments.figures import glass
-    from experiments.runs import known_scene as known_scenes
+    from experiments.runs import known_scene
     from refref_jax.data import background
     from refref_jax.render import backgrounds
 
@@ -73,7 +73,7 @@ def _drawers(folder: Path, indices: dict[str, float]) -> dict[str, Callable[[Pat
             f"The background of {folder} is no cube, whose walls are drawn. Choose a scene in one."
         )
     half = float(walls.half_extent)
-    scene = known_scenes.read_scene(
+    scene = known_scene.read_scene(
         folder,
         split=_SPLIT.value,
         views=str(_VIEW.value),

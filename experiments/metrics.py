@@ -21,8 +21,7 @@ from experiments.cli.progress import ProgressBar
 from refref_jax import configuration
 
 with epy.lazy_imports():
-    from experiments.runs import image_folders as folder_comparison
-    from experiments.runs import perceptual as perceptual_metrics
+    from experiments.runs import image_folders, perceptual
 
 _MASKS = flags.DEFINE_string("masks", None, "Folder of masks, named as the images: 0 is outside.")
 _OUT = flags.DEFINE_string("out", None, "JSON file to write; nothing is written without it.")
@@ -36,14 +35,14 @@ def main(rendered: str, truth: str) -> None:
     if out is not None:
         outputs.check_file(out, overwrite=_OVERWRITE.value)
     masks = None if _MASKS.value is None else Path(_MASKS.value)
-    pairs = folder_comparison.match(Path(rendered), Path(truth), masks)
-    perceptual = perceptual_metrics.chosen(_LPIPS_WEIGHTS.value)
+    pairs = image_folders.match(Path(rendered), Path(truth), masks)
+    lpips = perceptual.chosen(_LPIPS_WEIGHTS.value)
     rows = []
     with ProgressBar("compare", len(pairs)) as bar:
-        for row in folder_comparison.compare(pairs, perceptual):
+        for row in image_folders.compare(pairs, lpips):
             rows.append(row)
-            bar.show(len(rows), row[folder_comparison.NAME])
-    print(folder_comparison.table(rows))
+            bar.show(len(rows), row[image_folders.NAME])
+    print(image_folders.table(rows))
     if out is None:
         print(f"Nothing was written. Next, to keep all digits: {_again(rendered, truth)}")
         return
@@ -59,7 +58,7 @@ def _again(rendered: str, truth: str) -> str:
 
 
 def _write(out: Path, given: dict[str, Any], rows: list[dict[str, Any]]) -> None:
-    summary = given | {"results": folder_comparison.summarise(rows), "per_image": rows}
+    summary = given | {"results": image_folders.summarise(rows), "per_image": rows}
     text = json.dumps(configuration.string_safe(summary), indent=2, allow_nan=False)
     with outputs.fresh_file(out, overwrite=_OVERWRITE.value) as path:
         path.write_text(text + "\n", encoding="utf-8")

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from experiments.sweeps.paths import Setting, Trial
 
 with epy.lazy_imports():
-    from experiments.runs import known_scene as known_scenes
+    from experiments.runs import known_scene
     from experiments.sweeps import paths
 
 _SCENES = flags.DEFINE_list(
@@ -114,7 +114,7 @@ def chosen_budgets() -> list[tuple[str, str, Budget]]:
 
 
 def _read(folder: Path, indices: dict[str, float]) -> KnownScene:
-    scene = known_scenes.read_scene(
+    scene = known_scene.read_scene(
         folder,
         split=_SPLIT.value,
         views=_VIEWS.value,

@@ -19,8 +19,7 @@ from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
 
 with epy.lazy_imports():
-    from experiments.sweeps import recommend
-    from experiments.sweeps import table as trade_table
+    from experiments.sweeps import recommend, table
     from refref_jax.data import local_layout
 
 _BUNDLED = Path(__file__).parent / "data" / "trade_off.csv"
@@ -38,10 +37,10 @@ _TIMED_STEPS = flags.DEFINE_integer(
 def main() -> None:
     """Times this machine and prints the recommendation."""
     cli_scenes.check(_SCENE.value)
-    rows = trade_table.read(Path(_TABLE.value))
+    rows = table.read(Path(_TABLE.value))
     scene = cli_scenes.opened(_SCENE.value)
     images = len(local_layout.read_frames(scene, "test").names)
-    base = trade_table.base_of(rows)
+    base = table.base_of(rows)
     print(f"Timing {_TIMED_STEPS.value} steps of the table's base point ...", flush=True)
     timing = recommend.time_machine(scene, base, _TIMED_STEPS.value)
     machine = recommend.compare(timing, base, images)

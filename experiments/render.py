@@ -1,4 +1,4 @@
-"""Renders the views of a split, or an orbit, as pictures, distance maps and videos.
+"""Renders the views of a split, or an orbit, as pictures, distance maps and video.
 
 python -m experiments.render --run=runs/ball --views=orbit --frames=60
 """
@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from refref_jax.render import Model
 
 with epy.lazy_imports():
-    from experiments.figures import comparison as figures
-    from experiments.figures import video as videos
+    from experiments.figures import comparison, video
     from refref_jax.data import files, local_layout
     from refref_jax.geometry import cameras
     from refref_jax.render import saved, supersampling
@@ -40,7 +39,7 @@ _SIZE = flags.DEFINE_integer("size", 200, "Width and height of an orbit's frames
 _FOV = flags.DEFINE_float("fov", 66.785, "Horizontal field of view of an orbit, degrees.", 1, 179)
 _DISTANCE = flags.DEFINE_float("distance", 4.0, "Distance of an orbit from the origin.", 1e-3)
 _ELEVATION = flags.DEFINE_float("elevation", 20.0, "Elevation of an orbit, degrees.", -89, 89)
-_FPS = flags.DEFINE_float("fps", 15.0, "Frames a second of the videos.", 0.1)
+_FPS = flags.DEFINE_float("fps", 15.0, "Frames a second of the video.", 0.1)
 _RAYS_PER_PIXEL = cli_flags.rays_per_pixel(1)
 _CHUNK = cli_flags.chunk()
 _OVERWRITE = cli_flags.overwrite("earlier pictures of these views")
@@ -62,15 +61,15 @@ def main() -> None:
         written = render(model, seen_by, names, draft)
     for name in written:
         print(f"Video: {out / name}")
-    if not videos.has_ffmpeg():
-        print(f"Videos as mp4 too: {videos.INSTALL}")
+    if not video.has_ffmpeg():
+        print(f"Videos as mp4 too: {video.INSTALL}")
     print(f"Pictures: {out / 'rgb'}")
     print(f"Distance in world units: {out / 'distance'}")
     print(f"Next: {app.shell('view', f'--run={run}')}")
 
 
 def render(model: Model, seen_by: cameras.Cameras, names: tuple[str, ...], out: Path) -> list[str]:
-    """Renders each view, writes pictures and videos, and returns the names of the videos."""
+    """Renders each view, writes pictures and videos, and returns the names of the video."""
     rays_per_pixel, chunk = _RAYS_PER_PIXEL.value, _CHUNK.value
     for folder in ("rgb", "distance"):
         (out / folder).mkdir()
@@ -85,11 +84,11 @@ def render(model: Model, seen_by: cameras.Cameras, names: tuple[str, ...], out: 
             frames.append(files.to_bytes(seen.rgb))
             distances.append(seen.distance)
             bar.show(i + 1, name)
-    coloured = figures.colour_distances(distances)
+    coloured = comparison.colour_distances(distances)
     return [
         path.name
-        for name, video in (("rgb", frames), ("distance", coloured))
-        for path in videos.write(out / name, video, fps=_FPS.value)
+        for name, pictures in (("rgb", frames), ("distance", coloured))
+        for path in video.write(out / name, pictures, fps=_FPS.value)
     ]
 
 

@@ -34,11 +34,11 @@ if TYPE_CHECKING:
 with epy.lazy_imports():
     import numpy as np
 
-    from experiments.figures import comparison as figures
+    from experiments.figures import comparison
     from experiments.runs import evaluation as reporting
-    from experiments.runs import known_scene as known_scenes
+    from experiments.runs import known_scene
     from refref_jax.data import files
-    from refref_jax.training import evaluation as measures
+    from refref_jax.training import evaluation
 
 _SCENE = cli_flags.scene("The scene")
 _OUT = cli_flags.out("Folder to write the pictures to.")
@@ -80,7 +80,7 @@ def main() -> None:
     _check(metrics_file)
     budget = _chosen_budget()
     indices, folder = refraction_indices.parse_named(_IOR.value), cli_scenes.opened(_SCENE.value)
-    scene = known_scenes.read_scene(
+    scene = known_scene.read_scene(
         folder,
         split=_SPLIT.value,
         views=_VIEWS.value,
@@ -108,20 +108,20 @@ def render(scene: KnownScene, budget: Budget, out: Path) -> dict[str, Any]:
     side = cli_flags.side_of(_RAYS_PER_PIXEL.value)
     (out / "rgb").mkdir()
     print(f"Compiling for {scene.name}, {_PATHS.value} ...", flush=True)
-    known_scenes.warm_up(scene, budget)
+    known_scene.warm_up(scene, budget)
     with ProgressBar("render", len(scene.indices)) as bar:
         for i, (index, name) in enumerate(zip(scene.indices, scene.frames.names, strict=True)):
-            view = known_scenes.render_view(scene, i, budget=budget, side=side)
+            view = known_scene.render_view(scene, i, budget=budget, side=side)
             files.write_rgb(out / "rgb" / f"{name}.png", view.rgb)
-            found = known_scenes.measure(scene, i, view.rgb)
+            found = known_scene.measure(scene, i, view.rgb)
             views.append(view)
             measured.append({"index": index, "name": name, **found})
             bar.show(i + 1, f"{name}  PSNR {found['psnr']:.2f}")
     compared = [
-        figures.Comparison(scene.frames.names[i], scene.images[i] / 255.0, views[i].rgb)
+        comparison.Comparison(scene.frames.names[i], scene.images[i] / 255.0, views[i].rgb)
         for i in reporting.shown_views(len(views))
     ]
-    figures.write_comparison(out / "comparison.png", compared)
+    comparison.write_comparison(out / "comparison.png", compared)
     return summarise(scene, budget, views, measured)
 
 
@@ -137,7 +137,7 @@ def summarise(
         "bends": budget.bends,
         "unfinished": budget.unfinished,
         "views": measured,
-        "mean": {key: measures.mean_of(measured, key) for key in keys},
+        "mean": {key: evaluation.mean_of(measured, key) for key in keys},
         "casts_per_pixel": float(np.mean([view.casts for view in views])),
         "paths_per_pixel": float(np.mean([view.paths for view in views])),
         "seconds": sum(view.seconds for view in views),

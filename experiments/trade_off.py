@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from experiments.sweeps.points import Point
 
 with epy.lazy_imports():
-    from experiments.sweeps import points as trade_points
-    from experiments.sweeps import sweep as sweeps
+    from experiments.sweeps import points, sweep
     from refref_jax.data import local_layout
 
 _SCENE = cli_flags.scene("The scene")
@@ -57,9 +56,9 @@ _DRY_RUN = flags.DEFINE_bool("dry_run", False, "List the points, and measure not
 def main() -> None:
     """Measures all points and writes the report."""
     cli_scenes.check(_SCENE.value)
-    points = points_from_flags()
+    chosen = points_from_flags()
     if _DRY_RUN.value:
-        for point in points:
+        for point in chosen:
             print(f"{point.name:24} {' '.join((*point.training, *point.evaluation))}")
         return
     scene, out = cli_scenes.opened(_SCENE.value), Path(_OUT.value)
@@ -68,13 +67,13 @@ def main() -> None:
     limit = () if _LIMIT.value is None else (f"--limit={_LIMIT.value}",)
     images = len(local_layout.read_frames(scene, "test").names)
     images = min(images, _LIMIT.value or images)
-    earlier = sweeps.earlier_rows(out, points[0], scene, images=images)
+    earlier = sweep.earlier_rows(out, chosen[0], scene, images=images)
     out.mkdir(parents=True, exist_ok=True)
     outputs.note(out, __name__)
-    failed = sweeps.sweep(
-        points,
+    failed = sweep.sweep(
+        chosen,
         out,
-        lambda point: sweeps.measure(point, scene, out / "runs", limit),
+        lambda point: sweep.measure(point, scene, out / "runs", limit),
         earlier,
     )
     print(f"Table:  {out / 'trade_off.csv'}")
@@ -90,15 +89,15 @@ def main() -> None:
 
 def points_from_flags() -> list[Point]:
     """Returns the points that the options ask for."""
-    points = trade_points.sweep(
+    found = points.sweep(
         preset=_PRESET.value,
         seed=_SEED.value,
         steps=read_steps(_STEPS.value),
-        base=trade_points.parse_base(_BASE.value),
-        values=trade_points.parse_values(_VALUES.value),
+        base=points.parse_base(_BASE.value),
+        values=points.parse_values(_VALUES.value),
         knobs=_KNOBS.value,
     )
-    return points if _POINTS.value is None else trade_points.choose(points, _POINTS.value)
+    return found if _POINTS.value is None else points.choose(found, _POINTS.value)
 
 
 def read_steps(words: list[str]) -> list[int]:

@@ -19,7 +19,7 @@ from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
 
 with epy.lazy_imports():
-    from experiments.viewer import session as subjects
+    from experiments.viewer import session
     from refref_jax.data import errors
     from refref_jax.render import saved
     from refref_jax.training import run_folder
@@ -48,21 +48,21 @@ def main() -> None:
     cli_flags.check_run(Path(_RUN.value))
     cli_scenes.check(_SCENE.value)
     try:
-        from experiments.viewer import server as serving
+        from experiments.viewer import server
     except ModuleNotFoundError as error:
         if error.name != "viser":
             raise
         raise ValueError("The viewer needs viser. Run pip install -e '.[viewer]'.") from error
     subject = read_subject(heights)
-    server = serving.serve(subject, host=_HOST.value, port=_PORT.value)
-    print(f"Look at http://{_HOST.value}:{server.get_port()}", flush=True)
+    running = server.serve(subject, host=_HOST.value, port=_PORT.value)
+    print(f"Look at http://{_HOST.value}:{running.get_port()}", flush=True)
     if subject.frames is None:
         print("There are no test views, and no errors to show: give the scene as --scene.")
     print("The first picture is compiled first. Ctrl-C ends this.", flush=True)
     try:
         threading.Event().wait()
     finally:
-        server.stop()
+        running.stop()
         given = (f"--run={_RUN.value}", "--what=mesh", f"--out={_RUN.value}.ply")
         print(f"Next: {app.shell('export', *given)}")
 
@@ -88,18 +88,18 @@ def read_heights(words: list[str]) -> tuple[int, ...]:
 app.check(_HEIGHTS, read_heights)
 
 
-def read_subject(heights: tuple[int, ...]) -> subjects.Subject:
+def read_subject(heights: tuple[int, ...]) -> session.Subject:
     """Reads the run, and its scene where there is one."""
     run = Path(_RUN.value)
     config = run_folder.read_config(run)
     scene = _scene(config.scene.path)
     model = saved.load_model(run, step=_STEP.value)
-    return subjects.Subject(
+    return session.Subject(
         name=run.resolve().name,
         model=model,
         rule=config.scene.rule,
-        frames=None if scene is None else subjects.read_test_views(scene),
-        parts=subjects.part_names(scene, len(model.geometry.interfaces.index_inside)),
+        frames=None if scene is None else session.read_test_views(scene),
+        parts=session.part_names(scene, len(model.geometry.interfaces.index_inside)),
         heights=heights,
         chunk=_CHUNK.value,
     )

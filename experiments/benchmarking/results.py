@@ -14,7 +14,7 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.benchmarking import jobs, settings
+from experiments.benchmarking import plan, settings
 from experiments.benchmarking.methods import METHODS, RECONSTRUCTION
 from experiments.benchmarking.settings import Benchmark, Settings
 from refref_jax import configuration
@@ -46,7 +46,7 @@ class Image(NamedTuple):
 
 
 class Costs(NamedTuple):
-    """What a job took; `None` where it was not measured. See `trained_runs.Training`.
+    """What a job took; `None` where it was not measured. See `measured_runs.Training`.
 
     Attributes:
       steps: of training.
@@ -96,7 +96,7 @@ class Record(NamedTuple):
       category: `smcvx`, `smncvx`, `mmncvx`, or `OTHER`.
       background: `cube`, `sphere`, `env`, or `OTHER`.
       method: name, or `RECONSTRUCTION`.
-      fingerprint: of the scene's files, see `fingerprints`.
+      fingerprint: of the scene's files, see `plan.fingerprint`.
       options: of its commands, by command.
       settings: of the benchmark.
       metrics: means over the images.
@@ -264,7 +264,7 @@ def _text_or_none(value: Any, what: str) -> str | None:
 
 def write(folder: Path, record: Record) -> None:
     """Writes the result of a job, all or nothing."""
-    settings.write_json(folder / jobs.RESULT, to_json(record))
+    settings.write_json(folder / plan.RESULT, to_json(record))
 
 
 def read(path: Path) -> Record:
@@ -290,7 +290,7 @@ def read_all(out: Path, benchmark: Benchmark) -> list[Record]:
     """
     found: list[Record] = []
     fingerprints = {name: scene.fingerprint for name, scene in benchmark.scenes.items()}
-    for path in sorted((out / jobs.FOLDER).glob(f"*/*/{jobs.RESULT}")):
+    for path in sorted((out / plan.FOLDER).glob(f"*/*/{plan.RESULT}")):
         record = read(path)
         if (record.scene, record.method) != (path.parts[-3], path.parts[-2]):
             raise ValueError(
@@ -317,7 +317,7 @@ def _check_method(path: Path, record: Record, benchmark: Benchmark) -> None:
     train = benchmark.methods.get(record.method)
     if train is None and record.method in METHODS:
         train = METHODS[record.method].train
-    expected = jobs.options(record.method, train or (), benchmark.settings)
+    expected = plan.options(record.method, train or (), benchmark.settings)
     for command in sorted({*expected, *record.options}):
         made, asked = record.options.get(command, []), expected.get(command, [])
         if made != asked:

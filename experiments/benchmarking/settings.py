@@ -59,7 +59,7 @@ class Scene:
     Attributes:
       name: unique in the benchmark.
       path: absolute path of its folder, where it was last.
-      fingerprint: hash of its files, see `fingerprints`.
+      fingerprint: hash of its files, see `plan.fingerprint`.
     """
 
     name: str

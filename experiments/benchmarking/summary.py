@@ -18,9 +18,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.benchmarking import jobs, paper_tables, results, settings, tables
-from experiments.benchmarking.jobs import Skipped
+from experiments.benchmarking import paper_tables, plan, results, settings, tables
 from experiments.benchmarking.methods import METHODS
+from experiments.benchmarking.plan import Skipped
 from experiments.benchmarking.results import Record
 from experiments.benchmarking.settings import Benchmark
 from experiments.benchmarking.tables import Block, Cell, Column, Mark, Row, Table
@@ -99,7 +99,11 @@ def write(
     """
     everything = results.read_all(out, benchmark)
     found = results.compared(everything)
-    made = all_tables(found)
+    made = [
+        paper_tables.main_table(found),
+        paper_tables.top_views_table(found),
+        paper_tables.ablation_table(found),
+    ]
     missing = _missing(out, benchmark, failed, skipped)
     _write_tables(out / TABLES, made, found)
     lines = [*_heading(benchmark, found), *_not_done(failed, skipped, missing)]
@@ -150,17 +154,8 @@ def not_done(out: Path) -> tuple[dict[str, str], list[Skipped]]:
     )
 
 
-def all_tables(found: Sequence[Record]) -> list[Table]:
-    """Returns all tables of some results."""
-    return [
-        paper_tables.main_table(found),
-        paper_tables.top_views_table(found),
-        paper_tables.ablation_table(found),
-    ]
-
-
 def _has_result(out: Path, name: str) -> bool:
-    return (out / jobs.FOLDER / name / jobs.RESULT).is_file()
+    return (out / plan.FOLDER / name / plan.RESULT).is_file()
 
 
 def _missing(
@@ -218,7 +213,7 @@ def _not_done(
 
 def _indexed(out: Path, record: Record) -> dict[str, Any]:
     """Returns a result with the paths of its pictures from `out`, and its curve of training."""
-    folder = Path(jobs.FOLDER) / record.scene / record.method
+    folder = Path(plan.FOLDER) / record.scene / record.method
     views = [
         view._replace(rgb=str(folder / view.rgb), distance=str(folder / view.distance))
         for view in record.views

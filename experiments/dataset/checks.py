@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from experiments.runs import known_scene as known_scenes
+from experiments.runs import known_scene
 from experiments.runs.known_scene import KnownScene
 from refref_jax.data import containment, files, lint, local_layout, meshes, transforms
 from refref_jax.data.containment import Containment
@@ -118,13 +118,13 @@ def read_views(scene: Path, made_of: Meshes, *, count: int) -> KnownScene:
     chosen = tuple(int(i) for i in np.unique(spread))
     path = scene / "scene.json"
     rule = transforms.read_json(path).get("rule", "nested") if path.is_file() else "nested"
-    return known_scenes.build_scene(scene, *made_of, frames=frames, chosen=chosen, rule=rule)
+    return known_scene.build_scene(scene, *made_of, frames=frames, chosen=chosen, rule=rule)
 
 
 def compare_view(scene: KnownScene, index: int, *, budget: Budget, side: int) -> View:
     """Renders one of a scene's views and compares all that is known of it."""
-    rendered = known_scenes.render_view(scene, index, budget=budget, side=side)
-    measured = known_scenes.measure(scene, index, rendered.rgb)
+    rendered = known_scene.render_view(scene, index, budget=budget, side=side)
+    measured = known_scene.measure(scene, index, rendered.rgb)
     first = find_first_surface(
         scene.geometry.surfaces, cameras.image_rays(scene.frames.cameras, index)
     )

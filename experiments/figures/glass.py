@@ -16,7 +16,7 @@ from experiments.figures import cross_sections
 from experiments.figures.comparison import ERROR_GAIN, amplified_error
 from experiments.figures.cross_sections import Line, Outline, Panel, lines_within
 from experiments.figures.style import pyplot
-from experiments.runs import known_scene as known_scenes
+from experiments.runs import known_scene
 from experiments.runs.known_scene import KnownScene
 from refref_jax.data import meshes
 from refref_jax.geometry import cameras
@@ -80,8 +80,8 @@ def draw_views(scene: KnownScene, path: Path, *, side: int) -> None:
     """
     shown = [_truth(scene)]
     for name, title in _NAMES.items():
-        rgb = known_scenes.render_view(scene, 0, budget=BUDGETS[name], side=side).rgb
-        shown.append(Shown(title, rgb, known_scenes.measure(scene, 0, rgb)["psnr_masked"]))
+        rgb = known_scene.render_view(scene, 0, budget=BUDGETS[name], side=side).rgb
+        shown.append(Shown(title, rgb, known_scene.measure(scene, 0, rgb)["psnr_masked"]))
     write_views(path, shown)
 
 

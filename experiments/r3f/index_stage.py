@@ -18,7 +18,7 @@ from jaxtyping import Int
 
 from experiments.cli import app
 from experiments.cli.progress import ProgressBar
-from experiments.figures import style as plotting
+from experiments.figures import style
 from experiments.figures.style import COLOURS, pyplot
 from refref_jax.choices import Space
 from refref_jax.data import local_layout, mask_margins
@@ -225,6 +225,6 @@ def draw(path: Path, found: IndexEstimate) -> None:
     axis.set_xlabel("index of refraction")
     axis.set_ylabel("mean error, sRGB")
     axis.legend(frameon=False)
-    plotting.style(axis)
+    style.style(axis)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from refref_jax.data import files
 from refref_jax.data.errors import SceneError
-from refref_jax.training import evaluation as measures
+from refref_jax.training import evaluation
 from refref_jax.training.evaluation import Perceptual
 
 NAME = "name"
@@ -77,17 +77,17 @@ def compare(pairs: Sequence[Pair], perceptual: Perceptual) -> Iterator[dict[str,
         row: dict[str, Any] = {NAME: pair.name}
         if pair.images is not None:
             rendered, target = (files.read_rgb(path) / 255.0 for path in pair.images)
-            row |= measures.measure_colours(rendered, target, mask, perceptual)
+            row |= evaluation.measure_colours(rendered, target, mask, perceptual)
         if pair.distances is not None:
             seen, true = (files.read_depth(path) for path in pair.distances)
-            row |= measures.measure_distances("distance", seen, true, mask)
+            row |= evaluation.measure_distances("distance", seen, true, mask)
         yield row
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Returns the means of all measures, over the rows that have them."""
     keys = dict.fromkeys(key for row in rows for key in row if key != NAME)
-    return {key: measures.mean_of([row for row in rows if key in row], key) for key in keys}
+    return {key: evaluation.mean_of([row for row in rows if key in row], key) for key in keys}
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:

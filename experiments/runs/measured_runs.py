@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.cli import subprocesses as child_process
+from experiments.cli import subprocesses
 from refref_jax import atomic_files, configuration
 from refref_jax.data import local_layout, transforms
 from refref_jax.training import run_folder
@@ -114,7 +114,7 @@ def train(
     every = log_every or min(_LOG_EVERY, max(1, (steps or 4 * _LOG_EVERY) // 4))
     command = [f"--scene={scene}", f"--out={run}", "--resume", f"--log_every={every}", *options]
     trained_before = _has_ended(run, steps)
-    wall, peak = child_process.run("train", *command, log=run.with_name(f"{run.name}.log"))
+    wall, peak = subprocesses.run("train", *command, log=run.with_name(f"{run.name}.log"))
     if trained_before:
         wall, peak = 0.0, None
     training = read_training(run, wall=wall, peak_host_mib=peak)
@@ -136,7 +136,7 @@ def evaluate(
     if key not in known.get("evaluations", {}):
         # One with other options may be there.
         command = [f"--run={run}", f"--scene={scene}", *asked, "--overwrite"]
-        child_process.run("evaluate", *command, log=run.with_name(f"{run.name}.log"))
+        subprocesses.run("evaluate", *command, log=run.with_name(f"{run.name}.log"))
         summary = configuration.parse_json(
             (run / "eval" / split / "metrics.json").read_text("utf-8")
         )

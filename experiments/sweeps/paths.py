@@ -10,10 +10,10 @@ from matplotlib import patheffects
 from matplotlib.lines import Line2D
 
 from experiments.figures.style import COLOURS, LABEL_HEIGHT, label_plainly, pyplot, style
-from experiments.runs import known_scene as known_scenes
+from experiments.runs import known_scene
 from experiments.runs.known_scene import KnownScene
 from refref_jax.optics.budgets import Budget
-from refref_jax.training import evaluation as measures
+from refref_jax.training import evaluation
 
 _MARKERS = {"straight": "s", "paper": "D"}
 _GREY = "#777777"
@@ -88,12 +88,12 @@ def measure_all(chosen: list[KnownScene], plan: list[Setting], side: int) -> Ite
 
 def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
     """Renders all views of a scene with one budget."""
-    known_scenes.warm_up(scene, setting.budget)
+    known_scene.warm_up(scene, setting.budget)
     views, measured = [], []
     for i in range(len(scene.indices)):
-        view = known_scenes.render_view(scene, i, budget=setting.budget, side=side)
+        view = known_scene.render_view(scene, i, budget=setting.budget, side=side)
         views.append(view)
-        measured.append(known_scenes.measure(scene, i, view.rgb))
+        measured.append(known_scene.measure(scene, i, view.rgb))
     pixels = scene.frames.cameras.height * scene.frames.cameras.width * side**2
     return Trial(
         scene=scene.name,
@@ -101,9 +101,9 @@ def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
         name=setting.name,
         cut=setting.budget.cut,
         bends=setting.budget.bends,
-        psnr=measures.mean_of(measured, "psnr"),
-        psnr_masked=measures.mean_of(measured, "psnr_masked"),
-        psnr_outside=measures.mean_of(measured, "psnr_outside"),
+        psnr=evaluation.mean_of(measured, "psnr"),
+        psnr_masked=evaluation.mean_of(measured, "psnr_masked"),
+        psnr_outside=evaluation.mean_of(measured, "psnr_outside"),
         casts_per_pixel=float(np.mean([view.casts for view in views])),
         paths_per_pixel=float(np.mean([view.paths for view in views])),
         seconds_per_pixel=sum(view.seconds for view in views) / (pixels * len(views)),

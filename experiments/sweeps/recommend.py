@@ -13,15 +13,15 @@ from pathlib import Path
 
 from experiments.cli import app
 from experiments.cli.subprocesses import RunFailedError
-from experiments.runs import measured_runs as trained_runs
+from experiments.runs import measured_runs
 from experiments.runs.measured_runs import Training
-from experiments.sweeps import table as trade_table
+from experiments.sweeps import table
 from experiments.sweeps.points import BASE, OF_EVALUATION
 from experiments.sweeps.table import NOISE, Row
 from refref_jax.data import scene_names
 
 # Times that differ by no more are the same.
-_SAME_TIME = 1.0 + trade_table.TIME_NOISE / 100.0
+_SAME_TIME = 1.0 + table.TIME_NOISE / 100.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Machine:
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """What to train with. Differences below `trade_table.NOISE` decide nothing.
+    """What to train with. Differences below `table.NOISE` decide nothing.
 
     Attributes:
       best: the cheapest of those that fit and that none beats; the base, if it is as good.
@@ -66,7 +66,7 @@ def time_machine(scene: Path, base: Row, steps: int) -> Training:
     options = [word for word in base.training.split() if not word.startswith("--steps=")]
     with tempfile.TemporaryDirectory() as folder:
         try:
-            return trained_runs.train(
+            return measured_runs.train(
                 Path(folder) / "timing",
                 scene=scene,
                 options=[*options, f"--steps={steps}"],
@@ -109,19 +109,19 @@ def choose(rows: Sequence[Row], machine: Machine, seconds: float) -> Choice:
     def cost(row: Row) -> float:
         return seconds_of(row, machine)
 
-    front = trade_table.pareto(rows, cost)
+    front = table.pareto(rows, cost)
     fitting = [row for row in front if cost(row) <= seconds]
     if not fitting:
         raise ValueError(
             f"No measured point takes less than {cost(front[0]) / 60:.1f} minutes here "
             f"({front[0].name}). Give more time, or a table with smaller points."
         )
-    enough = fitting[-1].quality - trade_table.NOISE
+    enough = fitting[-1].quality - table.NOISE
     best = next(row for row in fitting if row.quality >= enough)
-    base = trade_table.base_of(rows)
+    base = table.base_of(rows)
     if base.quality >= enough and cost(base) <= min(seconds, cost(best) * _SAME_TIME):
         best = base
-    more = best.quality + trade_table.NOISE
+    more = best.quality + table.NOISE
     cheaper = [row for row in front if cost(row) * _SAME_TIME < cost(best)]
     combined = combine(rows, cost, seconds)
     return Choice(
@@ -185,7 +185,7 @@ def combine(rows: Sequence[Row], cost: Callable[[Row], float], most: float) -> R
       A row that was not measured, or the base itself. It may take longer than there is time, if
       the base does.
     """
-    base = trade_table.base_of(rows)
+    base = table.base_of(rows)
     useful = [row for row in rows if row.quality > base.quality + NOISE and row.knob != "paths"]
     chosen: list[Row] = []
     while True:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from experiments.figures.style import COLOURS, LABEL_HEIGHT, label_plainly, pyplot, style
-from experiments.sweeps import table as trade_table
+from experiments.sweeps import table
 from experiments.sweeps.points import OF_EVALUATION
 from experiments.sweeps.table import NOISE, Row, Turn
 
@@ -31,8 +31,8 @@ _LETTER_WIDTH = 6.5
 
 def markdown(rows: Sequence[Row]) -> str:
     """Returns the text of a report on a sweep; its figure is expected beside it."""
-    base = trade_table.base_of(rows)
-    found = trade_table.turns(rows)
+    base = table.base_of(rows)
+    found = table.turns(rows)
     parts = [
         f"# The trade of speed for accuracy on {base.scene}",
         f"Base: `{base.training}`{base.evaluation and f', evaluated with `{base.evaluation}`'}. "
@@ -40,8 +40,8 @@ def markdown(rows: Sequence[Row]) -> str:
         f"means over {base.images} test images. Training is the time of all steps, compiling "
         "excluded; device memory is empty where there is no accelerator.",
         "![PSNR against time](trade_off.png)",
-        f"## What to turn first\n\n{_first_table(trade_table.worth_turning(found))}",
-        f"## What saves time\n\n{_saving_table(trade_table.worth_saving(found))}",
+        f"## What to turn first\n\n{_first_table(table.worth_turning(found))}",
+        f"## What saves time\n\n{_saving_table(table.worth_saving(found))}",
         "## All points\n\nCheapest first; ● marks those that no other point beats in both training "
         f"time and PSNR. Differences below {NOISE:g} dB are noise.\n\n{_all_points(rows)}",
     ]
@@ -49,7 +49,7 @@ def markdown(rows: Sequence[Row]) -> str:
 
 
 def _all_points(rows: Sequence[Row]) -> str:
-    front = {row.name for row in trade_table.pareto(rows, lambda row: row.stepping)}
+    front = {row.name for row in table.pareto(rows, lambda row: row.stepping)}
     lines = [_HEAD, "|---" * 12 + "|"]
     for row in sorted(rows, key=lambda row: (row.stepping, row.name)):
         cells = [
@@ -75,7 +75,7 @@ def _first_table(found: Sequence[Turn]) -> str:
         return f"No option gains more than {NOISE:g} dB."
     lines = ["| option | gain, dB | more time | dB for each percent |", "|---|---|---|---|"]
     for turn in found:
-        rate = "free" if trade_table.is_free(turn) else f"{turn.gain / turn.percent:.3f}"
+        rate = "free" if table.is_free(turn) else f"{turn.gain / turn.percent:.3f}"
         lines.append(f"| `--{_option(turn)}` | {turn.gain:+.2f} | {_time(turn)} | {rate} |")
     return "\n".join(lines)
 
@@ -137,7 +137,7 @@ def _draw(
     styles: dict[str, tuple[str, str]],
     foot: float,
 ) -> None:
-    front = trade_table.pareto(rows, cost)
+    front = table.pareto(rows, cost)
     axis.step(
         [cost(row) for row in front],
         [max(row.quality, foot) for row in front],
@@ -170,9 +170,9 @@ def _label_points(
     foot: float,
 ) -> None:
     """Names the points by their values, those of the front first; none where another name is."""
-    front = trade_table.pareto(rows, cost)
+    front = table.pareto(rows, cost)
     taken: list[tuple[float, float, float]] = []
-    named_first = [trade_table.base_of(rows), *front]
+    named_first = [table.base_of(rows), *front]
     for row in [*named_first, *(row for row in rows if row not in named_first)]:
         name = (row.value or row.name) + f" ({row.quality:.1f} dB)" * (row.quality < foot)
         point = (cost(row), max(row.quality, foot))

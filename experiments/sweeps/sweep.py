@@ -7,11 +7,9 @@ from pathlib import Path
 
 from experiments.cli.progress import ProgressBar
 from experiments.cli.subprocesses import RunFailedError
-from experiments.runs import measured_runs as trained_runs
-from experiments.sweeps import points as trade_points
-from experiments.sweeps import report
-from experiments.sweeps import table as trade_table
-from experiments.sweeps.points import BASE, Point
+from experiments.runs import measured_runs
+from experiments.sweeps import report, table
+from experiments.sweeps.points import BASE, OF_EVALUATION, Point
 from experiments.sweeps.table import Row
 from refref_jax.data import scene_names
 
@@ -72,20 +70,20 @@ def earlier_rows(out: Path, base: Point, scene: Path, *, images: int) -> list[Ro
     Raises:
       ValueError: if they were around another base, of another scene, or on other images.
     """
-    table = out / "trade_off.csv"
-    if not table.exists():
+    path = out / "trade_off.csv"
+    if not path.exists():
         return []
-    rows = trade_table.read(table)
-    found, new = trade_table.base_of(rows), (" ".join(base.training), " ".join(base.evaluation))
+    rows = table.read(path)
+    found, new = table.base_of(rows), (" ".join(base.training), " ".join(base.evaluation))
     if (found.scene, found.training, found.evaluation) != (scene_names.of_folder(scene), *new):
         raise ValueError(
-            f"{table} is of {found.scene}, around {found.training}. Give another --out."
+            f"{path} is of {found.scene}, around {found.training}. Give another --out."
         )
     if not (out / "runs" / run_name(base, scene)).is_dir():
-        raise ValueError(f"{table} is of another folder named {found.scene}. Give another --out.")
+        raise ValueError(f"{path} is of another folder named {found.scene}. Give another --out.")
     if found.images != images:
         raise ValueError(
-            f"{table} was measured on {found.images} images, and this sweep would be on {images}. "
+            f"{path} was measured on {found.images} images, and this sweep would be on {images}. "
             f"Give --limit={found.images}, or another --out."
         )
     return rows
@@ -103,8 +101,8 @@ def measure(point: Point, scene: Path, runs: Path, limit: Sequence[str] = ()) ->
       limit: options that choose the images of the evaluation.
     """
     run = runs / run_name(point, scene)
-    cost = trained_runs.train(run, scene=scene, options=point.training)
-    gain = trained_runs.evaluate(run, scene=scene, options=(*point.evaluation, *limit))
+    cost = measured_runs.train(run, scene=scene, options=point.training)
+    gain = measured_runs.evaluate(run, scene=scene, options=(*point.evaluation, *limit))
     return Row(
         scene=scene_names.of_folder(scene),
         name=point.name,
@@ -121,12 +119,12 @@ def run_name(point: Point, scene: Path) -> str:
     """Returns the name of a training's folder, another for each scene and set of options."""
     text = " ".join((str(scene.resolve()), *point.training))
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
-    shared = not point.knob or point.knob in trade_points.OF_EVALUATION
+    shared = not point.knob or point.knob in OF_EVALUATION
     return f"{BASE if shared else point.name}-{digest}"
 
 
 def _write(out: Path, rows: Sequence[Row]) -> None:
-    trade_table.write(out / "trade_off.csv", rows)
+    table.write(out / "trade_off.csv", rows)
     report.write_figure(out / "trade_off.png", rows)
     text = report.markdown(rows)
     (out / "trade_off.md").write_text(text, encoding="utf-8")

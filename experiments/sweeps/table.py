@@ -19,7 +19,7 @@ TIME_NOISE = 3.0
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """A point that was measured; the fields without a note are those of `trained_runs`.
+    """A point that was measured; the fields without a note are those of `measured_runs`.
 
     Attributes:
       scene: name of its folder.

@@ -11,8 +11,7 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from experiments.viewer import cameras as viewpoints
-from experiments.viewer import session
+from experiments.viewer import cameras, session
 from experiments.viewer.session import Choice, Subject
 from refref_jax.geometry.bvh import LEAF_SIZE
 from refref_jax.geometry.cameras import Cameras
@@ -72,8 +71,8 @@ class Panel:
             control.on_update(lambda _: changed())
         self._bodies = gui.add_checkbox("bodies", False, visible=bool(first.bends))
         self._bodies.on_update(lambda _: show_bodies(self._bodies.value))
-        cameras = gui.add_checkbox("test cameras", False, visible=subject.views is not None)
-        cameras.on_update(lambda _: show_cameras(cameras.value))
+        box = gui.add_checkbox("test cameras", False, visible=subject.views is not None)
+        box.on_update(lambda _: show_cameras(box.value))
         with gui.add_folder("light paths"):
             self._paths = gui.add_markdown(_HINT)
             self._remove = gui.add_button("remove", visible=False)
@@ -201,8 +200,8 @@ class Scenery:
         nodes = []
         aspect = views.width / views.height
         for i, pose in enumerate(views.poses):
-            wxyz, position = viewpoints.to_browser(pose)
-            fov = viewpoints.containing_fov(views, aspect)
+            wxyz, position = cameras.to_browser(pose)
+            fov = cameras.containing_fov(views, aspect)
             options = {"scale": 0.2, "color": (60, 60, 60), "visible": False}
             node = self._scene.add_camera_frustum(
                 f"/cameras/{i}", fov, aspect, wxyz=wxyz, position=position, **options

@@ -12,7 +12,7 @@
   everywhere.
 - `normals`, `mask`: of the first surface of the meshes, with no light. Normals point out of the
   body and are coloured `(n + 1) / 2` by world axes.
-- `error`: of one test view, amplified as in `figures`, at its own pixels.
+- `error`: of one test view, amplified as in `comparison`, at its own pixels.
 
 Everything is drawn in bands of rows, between which a drawing can be called off.
 """
@@ -25,7 +25,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from experiments.figures import comparison as figures
+from experiments.figures import comparison
 from refref_jax.data import files
 from refref_jax.data.local_layout import Frames
 from refref_jax.geometry import cameras
@@ -46,7 +46,7 @@ OF_SURFACES = (NORMALS, MASK)
 
 _NOWHERE = 255
 
-GAIN = figures.ERROR_GAIN
+GAIN = comparison.ERROR_GAIN
 """By how much errors are amplified."""
 
 Cancelled = Callable[[], bool]
@@ -104,7 +104,7 @@ def draw(
     whole = np.concatenate(bands)
     if layer == DISTANCE:
         # From wall to wall: nothing inside a bounded scene is much farther.
-        return figures.colour_distances([whole], farthest=2.0 * model.config.radius)[0]
+        return comparison.colour_distances([whole], farthest=2.0 * model.config.radius)[0]
     return files.to_bytes(whole)
 
 
@@ -124,7 +124,7 @@ def draw_error(
         bands.append(render_image(model, band, chunk=chunk).rgb)
     seen = np.concatenate(bands)
     error = math.sqrt(float(np.mean(np.square(seen - pixels.target, dtype=np.float64))))
-    return files.to_bytes(figures.amplified_error(seen, pixels.target)), error
+    return files.to_bytes(comparison.amplified_error(seen, pixels.target)), error
 
 
 def view_pixels(frames: Frames, i: int, most: int) -> Pixels:

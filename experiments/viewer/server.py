@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from experiments.viewer import cameras as viewpoints
-from experiments.viewer import controls, layers, session
+from experiments.viewer import cameras, controls, layers, session
 from experiments.viewer.cameras import Viewpoint
 from experiments.viewer.controls import Panel
 from experiments.viewer.layers import Picture
@@ -30,7 +29,7 @@ from refref_jax.render import pixel_paths
 _JPEG_QUALITY = 92
 
 # How near to a test view a browser's camera stays where it is.
-_NEAR = 10 * viewpoints.ROUNDING
+_NEAR = 10 * cameras.ROUNDING
 
 
 class Turns:
@@ -109,14 +108,14 @@ class Page:
 
     def _viewpoint(self) -> Viewpoint:
         camera = self._client.camera
-        aspect = camera.image_width / max(camera.image_height, 1) or viewpoints.ASPECT
-        return viewpoints.from_browser(camera.wxyz, camera.position, camera.fov, aspect)
+        aspect = camera.image_width / max(camera.image_height, 1) or cameras.ASPECT
+        return cameras.from_browser(camera.wxyz, camera.position, camera.fov, aspect)
 
     def _look(self) -> None:
         """Notes where the camera is; what a browser says again is no change."""
         view = self._viewpoint()
         with self._event:
-            if viewpoints.is_same(view, self._view):
+            if cameras.is_same(view, self._view):
                 return
             self._view = view
         self._change()
@@ -153,7 +152,7 @@ class Page:
         """Draws a job's picture; `None` if it was called off."""
         model = session.chosen_model(self._subject, choice)
         height, chunk = self._subject.heights[job.stage], self._subject.chunk
-        most = height * viewpoints.width_of(height)
+        most = height * cameras.width_of(height)
         layer, what = choice.layer, ("image", model.budget)
         if layer == layers.ERROR and job.stage > 0:
             return self._draw_error(job, view, model, most)
@@ -161,7 +160,7 @@ class Page:
             layer = layers.RGB
         if layer in layers.OF_SURFACES:
             what = ("surfaces", most)
-        rays = viewpoints.window_rays(view, height)
+        rays = cameras.window_rays(view, height)
         with self._turns.drawing, self._compiling(what):
             picture = layers.draw(
                 model, layer, rays, chunk=chunk, most=most, cancelled=lambda: self._stale(job)
@@ -173,8 +172,8 @@ class Page:
     def _draw_error(self, job: Job, view: Viewpoint, model: Any, most: int) -> Picture | None:
         """Goes to the nearest test view and draws its error, with bars beside it."""
         frames = self._subject.frames
-        i = viewpoints.nearest(view.pose, frames.cameras)
-        fov = viewpoints.containing_fov(frames.cameras, view.aspect)
+        i = cameras.nearest(view.pose, frames.cameras)
+        fov = cameras.containing_fov(frames.cameras, view.aspect)
         self._go_to(Viewpoint(frames.cameras.poses[i], fov, view.aspect))
         pixels = layers.view_pixels(frames, i, most)
         with self._turns.drawing, self._compiling(("image", model.budget)):
@@ -190,7 +189,7 @@ class Page:
             f"test view **{name}**: {decibels:.1f} dB, errors x {layers.GAIN:g}. "
             + _sized(picture, job.stage + 1, len(self._subject.heights))
         )
-        return viewpoints.letterbox(picture, view.aspect)
+        return cameras.letterbox(picture, view.aspect)
 
     def _go_to(self, view: Viewpoint) -> None:
         """Moves the browser's camera, which is no change of what is seen.
@@ -199,10 +198,10 @@ class Page:
         not corrected again, or there would be no end.
         """
         with self._event:
-            if viewpoints.is_same(view, self._view, within=_NEAR):
+            if cameras.is_same(view, self._view, within=_NEAR):
                 return
             self._view = view
-        wxyz, position = viewpoints.to_browser(view.pose)
+        wxyz, position = cameras.to_browser(view.pose)
         with self._client.atomic():
             self._client.camera.position = position
             self._client.camera.wxyz = wxyz

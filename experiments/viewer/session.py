@@ -18,12 +18,10 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from experiments.viewer import cameras as viewpoints
-from experiments.viewer import layers
+from experiments.viewer import cameras, layers
 from refref_jax.data import local_layout, meshes
 from refref_jax.data.local_layout import Frames
-from refref_jax.geometry import cameras
-from refref_jax.geometry.cameras import Cameras
+from refref_jax.geometry.cameras import Cameras, orbit
 from refref_jax.render import Model
 
 CUTS = (0.1, 0.05, 0.02, 0.01, 0.005)
@@ -150,13 +148,13 @@ def read_test_views(scene: Path) -> Frames:
     return local_layout.read_frames(scene, "test")
 
 
-def first_viewpoint(subject: Subject, aspect: float = viewpoints.ASPECT) -> viewpoints.Viewpoint:
+def first_viewpoint(subject: Subject, aspect: float = cameras.ASPECT) -> cameras.Viewpoint:
     """Returns where a new page looks from: the first test view, or somewhere beside the origin."""
     if subject.views is not None:
-        fov = viewpoints.containing_fov(subject.views, aspect)
-        return viewpoints.Viewpoint(subject.views.poses[0], fov, aspect)
-    pose = cameras.orbit(1, distance=_DISTANCE, elevation=_ELEVATION, size=1, angle_x=1.0).poses[0]
-    return viewpoints.Viewpoint(pose, _FOV, aspect)
+        fov = cameras.containing_fov(subject.views, aspect)
+        return cameras.Viewpoint(subject.views.poses[0], fov, aspect)
+    pose = orbit(1, distance=_DISTANCE, elevation=_ELEVATION, size=1, angle_x=1.0).poses[0]
+    return cameras.Viewpoint(pose, _FOV, aspect)
 
 
 def changed(state: State, now: float) -> State:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from experiments.figures import video as videos
+from experiments.figures import video
 from refref_jax.data import files
 from refref_jax.render import load_model
 from tests import code_generator
@@ -169,7 +169,7 @@ def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
     assert files.read_exr(out / "distance" / "r_001.exr").shape == (24, 24)
     assert iio.imread(out / "rgb.gif").shape[:3] == (2, 24, 24)
     assert iio.imread(out / "distance.gif").shape[1:] == (24, 24, 3)
-    if videos.has_ffmpeg():
+    if video.has_ffmpeg():
         assert iio.imread(out / "rgb.mp4", plugin="FFMPEG").shape == (2, 24, 24, 3)
 
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from experiments.runs import image_folders as folder_comparison
+from experiments.runs import image_folders
 from refref_jax.data import files
 from refref_jax.training.evaluation import Perceptual
 from tests import made_lpips
@@ -46,8 +46,8 @@ def masks(tmp_path):
 
 
 def _compared(rendered, target, masks=None):
-    pairs = folder_comparison.match(rendered, target, masks)
-    return list(folder_comparison.compare(pairs, _NOTHING))
+    pairs = image_folders.match(rendered, target, masks)
+    return list(image_folders.compare(pairs, _NOTHING))
 
 
 def test_measures_by_hand(folders, masks):
@@ -57,7 +57,7 @@ def test_measures_by_hand(folders, masks):
     assert first["psnr_masked"] == pytest.approx(-20.0 * np.log10(0.2))
     assert second["psnr"] == np.inf and second["ssim"] == pytest.approx(1.0)
     assert second["psnr_masked"] is None
-    means = folder_comparison.summarise([first, second])
+    means = image_folders.summarise([first, second])
     assert means["psnr"] == np.inf and means["lpips"] is None
     assert means["psnr_masked"] == first["psnr_masked"]
 
@@ -77,7 +77,7 @@ def test_distances_are_compared_if_both_folders_hold_them(folders, masks):
             path.unlink()
     alone = _compared(*folders)
     assert "psnr" not in alone[0] and alone[0]["distance_mae"] == 0.5
-    assert folder_comparison.summarise(alone)["distance_mae"] == 0.5
+    assert image_folders.summarise(alone)["distance_mae"] == 0.5
 
 
 def test_a_table_has_a_line_for_each_image_and_one_for_the_mean(folders):
@@ -86,7 +86,7 @@ def test_a_table_has_a_line_for_each_image_and_one_for_the_mean(folders):
         {"name": "long", "psnr": np.inf, "ssim": 0.5, "distance_mae": None},
         {"name": "d", "psnr": None, "ssim": None, "distance_mae": None},
     ]
-    assert folder_comparison.table(rows).splitlines() == [
+    assert image_folders.table(rows).splitlines() == [
         "name     psnr    ssim",
         "a     20.0000       -",
         "long      inf  0.5000",
@@ -134,16 +134,16 @@ def test_all_sizes_are_looked_at_before_anything_is_compared(folders, masks):
     for folder in folders:
         for name in ("r_000", "r_001"):
             _write_distance(folder, name, 1.0)
-    assert len(folder_comparison.match(*folders, masks)) == 2
+    assert len(image_folders.match(*folders, masks)) == 2
     _write_distance(folders[0], "r_001", 1.0, size=(12, 17))
     with pytest.raises(ValueError, match=r"r_001\.exr is 17 x 13 pixels, but .* is 17 x 12"):
-        folder_comparison.match(*folders, masks)
+        image_folders.match(*folders, masks)
     write_grey(masks / "r_001.png", np.zeros((5, 4)))
     with pytest.raises(ValueError, match=r"masks/r_001\.png is 4 x 5 pixels"):
-        folder_comparison.match(*folders, masks)
+        image_folders.match(*folders, masks)
     (folders[0] / "r_001.exr").write_text("no EXR")
     with pytest.raises(ValueError, match=r"rendered/r_001\.exr can not be read as EXR"):
-        folder_comparison.match(*folders, None)
+        image_folders.match(*folders, None)
 
 
 def test_many_missing_names_are_counted(folders):

@@ -10,7 +10,7 @@ import pytest
 
 from experiments.runs import view_numbers
 from refref_jax.data import files
-from refref_jax.training import evaluation as measures
+from refref_jax.training import evaluation
 from tests.experiments.command import ROOT, run_command
 
 _SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
@@ -200,9 +200,9 @@ def test_views_keep_their_order():
 
 def test_measures_over_no_pixel_are_left_out():
     views = [{"psnr": 30.0, "psnr_masked": None}, {"psnr": 40.0, "psnr_masked": 20.0}]
-    assert measures.mean_of(views, "psnr") == 35.0
-    assert measures.mean_of(views, "psnr_masked") == 20.0
-    assert measures.mean_of(views[:1], "psnr_masked") is None
+    assert evaluation.mean_of(views, "psnr") == 35.0
+    assert evaluation.mean_of(views, "psnr_masked") == 20.0
+    assert evaluation.mean_of(views[:1], "psnr_masked") is None
 
 
 def test_a_scene_without_a_known_background_is_named(tmp_path):

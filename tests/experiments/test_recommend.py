@@ -3,8 +3,7 @@
 import pytest
 
 from experiments.runs.measured_runs import Training
-from experiments.sweeps import recommend
-from experiments.sweeps import table as trade_table
+from experiments.sweeps import recommend, table
 from experiments.sweeps.recommend import Machine
 from tests.experiments.command import ROOT, run_command
 from tests.experiments.made_rows import made_row
@@ -97,7 +96,7 @@ def test_the_machine_is_compared_by_the_base():
 
 
 def test_the_bundled_table_is_a_whole_sweep():
-    rows = trade_table.read(ROOT / "experiments" / "data" / "trade_off.csv")
+    rows = table.read(ROOT / "experiments" / "data" / "trade_off.csv")
     assert {row.scene for row in rows} == {"cube_smcvx_ball"}
     assert {row.knob for row in rows} >= {"", "paths", "cut", "samples", "steps", "rays_per_pixel"}
     choice = recommend.choose(rows, _MACHINE, 600.0)

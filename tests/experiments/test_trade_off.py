@@ -7,13 +7,11 @@ import subprocess
 import imageio.v3 as iio
 import pytest
 
-from experiments.cli import subprocesses as child_process
+from experiments.cli import subprocesses
 from experiments.cli.subprocesses import RunFailedError
-from experiments.runs import measured_runs as trained_runs
+from experiments.runs import measured_runs
 from experiments.sweeps import points as trade_points
-from experiments.sweeps import report
-from experiments.sweeps import sweep as sweeps
-from experiments.sweeps import table as trade_table
+from experiments.sweeps import report, sweep, table
 from experiments.sweeps.points import BASE
 from tests.experiments.command import ROOT, run_command
 from tests.experiments.made_rows import made_row
@@ -73,10 +71,10 @@ def test_rays_per_pixel_are_evaluations_alone():
     points = {point.name: point for point in trade_points.sweep(preset="tiny")}
     nine = points["rays_per_pixel=9"]
     assert nine.training == points[BASE].training and nine.evaluation == ("--rays_per_pixel=9",)
-    names = {name: sweeps.run_name(point, _SCENE) for name, point in points.items()}
+    names = {name: sweep.run_name(point, _SCENE) for name, point in points.items()}
     assert names["rays_per_pixel=9"] == names[BASE]  # trained once
     assert len(set(names.values())) == len(names) - 2
-    assert sweeps.run_name(points[BASE], ROOT) != names[BASE]
+    assert sweep.run_name(points[BASE], ROOT) != names[BASE]
 
 
 def test_the_lists_of_a_knob_can_be_replaced_and_knobs_added():
@@ -132,8 +130,8 @@ def test_mistakes_end_before_anything_is_trained(tmp_path, options, message):
 
 def test_a_table_is_read_as_it_was_written(tmp_path):
     rows = [made_row(), dataclasses.replace(made_row("cut=0.1"), psnr_masked=None)]
-    trade_table.write(tmp_path / "t.csv", rows)
-    assert trade_table.read(tmp_path / "t.csv") == rows
+    table.write(tmp_path / "t.csv", rows)
+    assert table.read(tmp_path / "t.csv") == rows
     assert rows[1].quality == rows[1].psnr == 28.0
 
 
@@ -146,7 +144,7 @@ def test_a_table_that_is_none_is_named(tmp_path, text, message):
     if text is not None:
         path.write_text(text)
     with pytest.raises(ValueError, match=message):
-        trade_table.read(path)
+        table.read(path)
 
 
 def test_the_front_holds_what_nothing_beats():
@@ -157,7 +155,7 @@ def test_the_front_holds_what_nothing_beats():
         made_row("a=4", pace=0.3, quality=25.0),
         made_row("a=5", pace=0.4, quality=26.0),
     ]
-    front = trade_table.pareto(rows, lambda row: row.stepping)
+    front = table.pareto(rows, lambda row: row.stepping)
     assert [row.name for row in front] == ["a=1", "a=2", "a=5"]
 
 
@@ -176,8 +174,8 @@ def _measured():
 
 
 def test_what_to_turn_first_is_what_is_free_then_what_gives_most_for_its_time():
-    found = trade_table.turns(_measured())
-    worth = trade_table.worth_turning(found)
+    found = table.turns(_measured())
+    worth = table.worth_turning(found)
     assert [turn.row.name for turn in worth] == ["free=1", "fair=1", "dear=1", "rays_per_pixel=4"]
     assert worth[1].gain == pytest.approx(1.0) and worth[1].percent == pytest.approx(10.0)
     # Of rendering: training takes as long as the base's.
@@ -185,7 +183,7 @@ def test_what_to_turn_first_is_what_is_free_then_what_gives_most_for_its_time():
 
 
 def test_what_saves_time_is_named_once_a_knob():
-    saving = trade_table.worth_saving(trade_table.turns(_measured()))
+    saving = table.worth_saving(table.turns(_measured()))
     assert [turn.row.name for turn in saving] == ["less=1"]
 
 
@@ -206,9 +204,9 @@ def test_a_sweep_writes_everything_and_outlives_a_point_that_fails(tmp_path):
             raise RunFailedError("out of memory")
         return made_row(point.name, pace=0.1 + 0.01 * len(point.name), quality=20.0)
 
-    failed = sweeps.sweep(points, tmp_path / "out", measure)
+    failed = sweep.sweep(points, tmp_path / "out", measure)
     assert failed == {"cut=0.05": "out of memory"}
-    rows = trade_table.read(tmp_path / "out" / "trade_off.csv")
+    rows = table.read(tmp_path / "out" / "trade_off.csv")
     assert [row.name for row in rows] == [p.name for p in points if p.name != "cut=0.05"]
     assert "paths=straight" in (tmp_path / "out" / "trade_off.md").read_text()
     assert iio.imread(tmp_path / "out" / "trade_off.png").shape[1] > 1000
@@ -216,7 +214,7 @@ def test_a_sweep_writes_everything_and_outlives_a_point_that_fails(tmp_path):
 
 def test_a_sweep_adds_to_the_one_before_it_around_the_same_base(tmp_path):
     def measure(point):
-        (tmp_path / "runs" / sweeps.run_name(point, _SCENE)).mkdir(parents=True, exist_ok=True)
+        (tmp_path / "runs" / sweep.run_name(point, _SCENE)).mkdir(parents=True, exist_ok=True)
         options = " ".join(point.training), " ".join(point.evaluation)
         row = made_row(point.name)
         return dataclasses.replace(
@@ -225,23 +223,23 @@ def test_a_sweep_adds_to_the_one_before_it_around_the_same_base(tmp_path):
 
     for knobs in (["cut"], ["paths"]):
         points = trade_points.sweep(preset="tiny", knobs=knobs)
-        earlier = sweeps.earlier_rows(tmp_path, points[0], _SCENE, images=20)
-        sweeps.sweep(points, tmp_path, measure, earlier)
-    names = [row.name for row in trade_table.read(tmp_path / "trade_off.csv")]
+        earlier = sweep.earlier_rows(tmp_path, points[0], _SCENE, images=20)
+        sweep.sweep(points, tmp_path, measure, earlier)
+    names = [row.name for row in table.read(tmp_path / "trade_off.csv")]
     assert names[0] == BASE and {"cut=0.1", "paths=straight"} < set(names)
     other = trade_points.sweep(preset="tiny", base={"batch": "64"})[0]
     with pytest.raises(ValueError, match="another --out"):
-        sweeps.earlier_rows(tmp_path, other, _SCENE, images=20)
+        sweep.earlier_rows(tmp_path, other, _SCENE, images=20)
     with pytest.raises(ValueError, match="another --out"):
-        sweeps.earlier_rows(tmp_path, points[0], ROOT, images=20)
+        sweep.earlier_rows(tmp_path, points[0], ROOT, images=20)
     # Measured on other images they could not stand in one table.
     with pytest.raises(ValueError, match="on 20 images, and this sweep would be on 5"):
-        sweeps.earlier_rows(tmp_path, points[0], _SCENE, images=5)
+        sweep.earlier_rows(tmp_path, points[0], _SCENE, images=5)
     # A folder of that name, elsewhere, is another scene.
     namesake = tmp_path / _SCENE.name
     namesake.mkdir()
     with pytest.raises(ValueError, match="another folder named"):
-        sweeps.earlier_rows(tmp_path, points[0], namesake, images=20)
+        sweep.earlier_rows(tmp_path, points[0], namesake, images=20)
 
 
 @pytest.mark.parametrize(
@@ -262,14 +260,14 @@ def test_a_sweep_without_its_base_ends(tmp_path):
         raise RunFailedError("unknown flag")
 
     with pytest.raises(ValueError, match="unknown flag"):
-        sweeps.sweep(trade_points.sweep(preset="tiny"), tmp_path, measure)
+        sweep.sweep(trade_points.sweep(preset="tiny"), tmp_path, measure)
 
 
 def test_the_pace_is_the_median_without_the_interval_that_compiles():
     seconds = [30.0, 31.0, 32.0, 50.0, 51.0]
     lines = [{"step": 10 * i, "seconds": s} for i, s in enumerate(seconds, 1)]
-    assert trained_runs.seconds_per_step(lines) == pytest.approx(0.1)
-    assert trained_runs.seconds_per_step(lines[:1]) == pytest.approx(3.0)
+    assert measured_runs.seconds_per_step(lines) == pytest.approx(0.1)
+    assert measured_runs.seconds_per_step(lines[:1]) == pytest.approx(3.0)
 
 
 _STUB = """
@@ -305,21 +303,21 @@ def stub(tmp_path, monkeypatch):
         name = command[2].removeprefix("experiments.")
         return start([command[0], str(tmp_path / "stub.py"), name, *command[3:]], **options)
 
-    monkeypatch.setattr(child_process.subprocess, "Popen", popen)
+    monkeypatch.setattr(subprocesses.subprocess, "Popen", popen)
     return tmp_path / "runs"
 
 
 def test_a_point_is_measured_once(stub):
     points = {p.name: p for p in trade_points.sweep(preset="tiny", steps=[4])}
-    row = sweeps.measure(points[BASE], _SCENE, stub)
+    row = sweep.measure(points[BASE], _SCENE, stub)
     assert (row.steps, row.seconds_per_step, row.rays_per_second) == (4, 0.5, 200.0)
     assert row.train_seconds == 7.0 and row.peak_device_mib == 1024.0
     assert 1.0 < row.peak_host_mib < 10_000.0
     assert (row.psnr, row.psnr_masked, row.images) == (float("inf"), None, 2)
-    assert sweeps.measure(points[BASE], _SCENE, stub) == row
-    sweeps.measure(points["rays_per_pixel=4"], _SCENE, stub)
-    sweeps.measure(points[BASE], _SCENE, stub, ["--limit=1"])
-    sweeps.measure(points["cut=0.1"], _SCENE, stub)
+    assert sweep.measure(points[BASE], _SCENE, stub) == row
+    sweep.measure(points["rays_per_pixel=4"], _SCENE, stub)
+    sweep.measure(points[BASE], _SCENE, stub, ["--limit=1"])
+    sweep.measure(points["cut=0.1"], _SCENE, stub)
     calls = (stub / "calls.txt").read_text().split()
     assert calls == ["train", "evaluate", "evaluate", "evaluate", "train", "evaluate"]
 
@@ -329,47 +327,47 @@ def test_a_failure_tells_its_last_word_and_is_tried_again(stub):
     point = trade_points.sweep(preset="tiny", values=values, knobs=["cut"])[1]
     for _ in range(2):
         with pytest.raises(RunFailedError, match=r"The cut is a share, not 2.*\.log"):
-            sweeps.measure(point, _SCENE, stub)
+            sweep.measure(point, _SCENE, stub)
     assert (stub / "calls.txt").read_text().split() == ["train", "train"]
 
 
 def test_the_complaint_is_that_of_the_last_attempt(tmp_path, stub):
     point = trade_points.sweep(preset="tiny", values={"cut": ("2",)}, knobs=["cut"])[1]
-    log = stub / f"{sweeps.run_name(point, _SCENE)}.log"
+    log = stub / f"{sweep.run_name(point, _SCENE)}.log"
     log.parent.mkdir()
     log.write_text("error: an older one\n")
     with pytest.raises(RunFailedError, match="The cut is a share"):
-        sweeps.measure(point, _SCENE, stub)
+        sweep.measure(point, _SCENE, stub)
     mirror = "$ python -m experiments.train --scene=mirror\nCompiling\n"
-    assert child_process._complaint(mirror, 1) == "Compiling"
-    assert child_process._complaint(mirror, -9) == "killed by SIGKILL"
-    assert child_process._complaint("ValueError: no\nbye\n", 1) == "ValueError: no"
-    assert child_process._complaint("", 3) == "ended with status 3, and printed nothing"
+    assert subprocesses._complaint(mirror, 1) == "Compiling"
+    assert subprocesses._complaint(mirror, -9) == "killed by SIGKILL"
+    assert subprocesses._complaint("ValueError: no\nbye\n", 1) == "ValueError: no"
+    assert subprocesses._complaint("", 3) == "ended with status 3, and printed nothing"
 
 
 def test_who_says_nothing_is_not_told_by_the_command_itself(tmp_path, monkeypatch):
-    monkeypatch.setattr(child_process, "command_line", lambda name, options: ["false"])
+    monkeypatch.setattr(subprocesses, "command_line", lambda name, options: ["false"])
     with pytest.raises(RunFailedError, match=r"train: ended with status 1, and printed nothing"):
-        child_process.run("train", log=tmp_path / "log")
+        subprocesses.run("train", log=tmp_path / "log")
     assert (tmp_path / "log").read_text() == "$ python -m experiments.train\n"
 
 
 def test_an_option_with_a_space_stays_one_and_its_line_can_be_pasted(stub):
     point = trade_points.sweep(preset="tiny", steps=[4])[0]
-    sweeps.measure(point, _SCENE, stub, ["--lpips_weights=a b.npz"])
+    sweep.measure(point, _SCENE, stub, ["--lpips_weights=a b.npz"])
     assert json.loads((stub / "words.json").read_text())[-2:] == [
         "--lpips_weights=a b.npz",
         "--overwrite",
     ]
-    log = (stub / f"{sweeps.run_name(point, _SCENE)}.log").read_text()
+    log = (stub / f"{sweep.run_name(point, _SCENE)}.log").read_text()
     assert " '--lpips_weights=a b.npz' --overwrite" in log
 
 
 def test_a_training_that_ended_unmeasured_has_no_peak(stub):
     point = trade_points.sweep(preset="tiny", steps=[4])[0]
-    first = sweeps.measure(point, _SCENE, stub)
-    (stub / sweeps.run_name(point, _SCENE) / "measured.json").unlink()
-    again = sweeps.measure(point, _SCENE, stub)
+    first = sweep.measure(point, _SCENE, stub)
+    (stub / sweep.run_name(point, _SCENE) / "measured.json").unlink()
+    again = sweep.measure(point, _SCENE, stub)
     assert again.peak_host_mib is None and again.seconds_per_step == first.seconds_per_step
 
 
@@ -379,7 +377,7 @@ def test_a_real_sweep_of_three_steps(tmp_path):
     options += ("--base=interior=field", "--base=batch=64", "--points=paths=straight,paths=paper")
     result = run_command("trade_off", *options)
     assert "experiments.recommend" in result.stdout
-    rows = trade_table.read(tmp_path / "trade_off.csv")
+    rows = table.read(tmp_path / "trade_off.csv")
     assert [row.name for row in rows] == [BASE, "paths=straight", "paths=paper"]
     assert all(row.steps == 3 and row.psnr_masked > 5.0 for row in rows)
     before = (tmp_path / "trade_off.csv").read_text()

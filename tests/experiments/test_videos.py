@@ -4,7 +4,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from experiments.figures import video as videos
+from experiments.figures import video
 
 
 def _frames(height=23, width=25, count=5):
@@ -17,7 +17,7 @@ def _frames(height=23, width=25, count=5):
 
 def test_an_mp4_has_all_frames_and_their_colours(tmp_path):
     pytest.importorskip("imageio_ffmpeg")
-    gif, mp4 = videos.write(tmp_path / "turn.1", _frames(), fps=10.0)
+    gif, mp4 = video.write(tmp_path / "turn.1", _frames(), fps=10.0)
     assert (gif.name, mp4.name) == ("turn.1.gif", "turn.1.mp4")
     read = iio.imread(mp4, plugin="FFMPEG")
     assert read.shape == (5, 24, 26, 3)  # odd sizes are filled up, not resized
@@ -30,7 +30,7 @@ def test_an_mp4_has_all_frames_and_their_colours(tmp_path):
 
 def test_without_ffmpeg_there_is_the_gif(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    assert not videos.has_ffmpeg()
-    assert videos.write(tmp_path / "turn", _frames(), fps=10.0) == (tmp_path / "turn.gif",)
+    assert not video.has_ffmpeg()
+    assert video.write(tmp_path / "turn", _frames(), fps=10.0) == (tmp_path / "turn.gif",)
     assert iio.imread(tmp_path / "turn.gif").shape == (5, 23, 25, 3)
     assert not (tmp_path / "turn.mp4").exists()

@@ -9,8 +9,7 @@ import sys
 import threading
 from pathlib import Path
 
-from experiments.cli import app
-from experiments.cli import subprocesses as child_process
+from experiments.cli import app, subprocesses
 
 
 def _command_line(name, options):
@@ -18,21 +17,21 @@ def _command_line(name, options):
 
 
 def _work(folder):
-    with contextlib.suppress(child_process.RunFailedError):
-        child_process.run("saving", f"--folder={folder}", log=folder / "run.log")
+    with contextlib.suppress(subprocesses.RunFailedError):
+        subprocesses.run("saving", f"--folder={folder}", log=folder / "run.log")
 
 
 if __name__ == "__main__":
     # As at a terminal: who is started in the background, or by nohup, ignores them.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    child_process.command_line = _command_line
+    subprocesses.command_line = _command_line
     app.stop_at_kill()
     worker = threading.Thread(target=_work, args=[Path(sys.argv[1])])
     try:
         worker.start()
         worker.join()
     except KeyboardInterrupt:
-        with child_process.stopping():
+        with subprocesses.stopping():
             worker.join()
         sys.exit(app.INTERRUPTED)

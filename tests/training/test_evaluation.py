@@ -11,7 +11,7 @@ from refref_jax.data import local_layout
 from refref_jax.data.local_layout import Frames
 from refref_jax.optics.budgets import STRAIGHT, TREE
 from refref_jax.render import Model, Rendering, init_params
-from refref_jax.training import evaluation as measures
+from refref_jax.training import evaluation
 from refref_jax.training.evaluation import Perceptual
 from tests import made_lpips, scenes
 from tests.small_model import CAMERAS, MODEL
@@ -29,7 +29,7 @@ def _seen(rgb, distance=1.0, lost=0.0):
 
 def _truth(masks, distances):
     images = np.zeros((1, 16, 16, 3), np.uint8)
-    return measures.Truth(Frames(("a",), (), None, None, CAMERAS), images, masks, distances)
+    return evaluation.Truth(Frames(("a",), (), None, None, CAMERAS), images, masks, distances)
 
 
 def _top_rows():
@@ -43,7 +43,7 @@ def _ones():
 
 
 def _measure(seen, truth, first=None, perceptual=_NOTHING):
-    return measures.measure(seen, truth, 0, first=first, perceptual=perceptual)
+    return evaluation.measure(seen, truth, 0, first=first, perceptual=perceptual)
 
 
 _GREY = np.full((16, 16, 3), np.float32(0.1))
@@ -107,8 +107,8 @@ def test_what_is_over_no_pixel_is_left_out_and_spoils_no_mean():
     found = _measure(_seen(_GREY), _truth(nothing, misses), np.ones((16, 16), np.float32))
     assert found["psnr_masked"] is None
     assert all(found[key] is None for key in found if key.startswith(_KINDS))
-    assert measures.mean_of([found, found | {"psnr_masked": 30.0}], "psnr_masked") == 30.0
-    assert measures.mean_of([found], "psnr_masked") is None
+    assert evaluation.mean_of([found, found | {"psnr_masked": 30.0}], "psnr_masked") == 30.0
+    assert evaluation.mean_of([found], "psnr_masked") is None
 
 
 def test_equal_images_are_infinitely_good():
@@ -117,12 +117,12 @@ def test_equal_images_are_infinitely_good():
     assert found["psnr"] == found["psnr_masked"] == np.inf
     assert found["ssim"] == pytest.approx(1.0, abs=1e-9)
     assert all(found[key] == 0.0 for key in found if key.startswith(_KINDS))
-    assert measures.mean_of([found, found | {"psnr": 30.0}], "psnr") == np.inf
+    assert evaluation.mean_of([found, found | {"psnr": 30.0}], "psnr") == np.inf
 
 
 def test_an_image_too_small_for_a_window_has_no_ssim():
     flat = np.full((10, 30, 3), np.float32(0.5))
-    found = measures.measure_colours(flat, np.zeros_like(flat), None, _NOTHING)
+    found = evaluation.measure_colours(flat, np.zeros_like(flat), None, _NOTHING)
     assert found["ssim"] is None
     assert found["psnr"] == pytest.approx(-20.0 * np.log10(0.5))
 
@@ -132,7 +132,7 @@ def test_psnr_and_ssim_of_photographs_are_those_of_scikit_image(ball_scene):
     first, second = (image / 255.0 for image in local_layout.read_images(frames)[:2])
     noise = np.random.default_rng(0).normal(scale=0.02, size=first.shape)
     for other in (second, np.clip(first + noise, 0.0, 1.0)):
-        found = measures.measure_colours(other.astype(np.float32), first, None, _NOTHING)
+        found = evaluation.measure_colours(other.astype(np.float32), first, None, _NOTHING)
         expected = peak_signal_noise_ratio(first, other, data_range=1.0)
         assert found["psnr"] == pytest.approx(expected, abs=1e-5)
         options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
@@ -155,11 +155,11 @@ def test_eyes_are_asked_where_they_are_at_hand(tmp_path):
 
     rng = np.random.default_rng(0)
     rendered, target = rng.uniform(size=(2, 33, 31, 3)).astype(np.float32)
-    found = measures.measure_colours(rendered, target, None, Perceptual(lpips, flip))
+    found = evaluation.measure_colours(rendered, target, None, Perceptual(lpips, flip))
     expected = jax.jit(metrics.lpips)(lpips, *jax.device_put((rendered, target)))
     assert found["lpips"] == pytest.approx(float(expected), rel=1e-5)
     assert found["flip"] == 0.125 and asked == [((33, 31, 3), target.max())]
-    small = measures.measure_colours(rendered[:30], target[:30], None, Perceptual(lpips, flip))
+    small = evaluation.measure_colours(rendered[:30], target[:30], None, Perceptual(lpips, flip))
     assert small["lpips"] is None and small["flip"] == 0.125
 
 
@@ -170,20 +170,20 @@ def _model(budget):
 
 def test_evaluating_is_rendering_and_measuring_view_by_view(ball_scene):
     views, calls = [], []
-    found = measures.evaluate(
+    found = evaluation.evaluate(
         _model(STRAIGHT),
         str(ball_scene),
         limit=2,
         progress=lambda *call: calls.append(call),
         on_view=views.append,
     )
-    truth = measures.read_truth(ball_scene, "test")
+    truth = evaluation.read_truth(ball_scene, "test")
     names = [truth.frames.names[0], truth.frames.names[-1]]
     assert [view.name for view in views] == [image["name"] for image in found.per_image] == names
     assert [(view.place, view.count) for view in views] == [(0, 2), (1, 2)]
     assert [call[:2] for call in calls] == [(0, 2), (1, 2), (2, 2)]
     assert calls[-1][2] == f"{names[1]}  PSNR {found.per_image[1]['psnr']:.2f}"
-    expected = measures.measure(views[1].rendering, truth, -1, first=None, perceptual=_NOTHING)
+    expected = evaluation.measure(views[1].rendering, truth, -1, first=None, perceptual=_NOTHING)
     assert views[1].measures == expected | {"seconds": found.per_image[1]["seconds"]}
     np.testing.assert_array_equal(views[1].target, truth.images[-1])
     for key, value in found.results.items():
@@ -193,8 +193,8 @@ def test_evaluating_is_rendering_and_measuring_view_by_view(ball_scene):
 
 
 def test_surfaces_are_known_where_light_bends():
-    assert measures.first_distances(_model(STRAIGHT), CAMERAS, 0) is None
-    first = measures.first_distances(_model(TREE), CAMERAS, 0)
+    assert evaluation.first_distances(_model(STRAIGHT), CAMERAS, 0) is None
+    first = evaluation.first_distances(_model(TREE), CAMERAS, 0)
     # A ball of radius 1.3, seen from a distance of 4; its facets lie a little deeper.
     assert np.min(first) == pytest.approx(2.7, abs=0.15) and np.isinf(first[0, 0])
 
@@ -205,7 +205,7 @@ def test_surfaces_are_known_where_light_bends():
 )
 def test_wrong_arguments_are_refused_before_anything_is_read(wrong, says):
     with pytest.raises(ValueError, match=says):
-        measures.evaluate(_model(STRAIGHT), "nowhere", **wrong)
+        evaluation.evaluate(_model(STRAIGHT), "nowhere", **wrong)
 
 
 def test_what_is_not_at_hand_is_warned_of_once(monkeypatch, capsys, tmp_path):

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from experiments.benchmarking import settings, summary
-from experiments.benchmarking.jobs import SPLIT, Skipped
+from experiments.benchmarking.plan import SPLIT, Skipped
 from experiments.benchmarking.results import Metrics, Record, Truth, compared, from_json
 from experiments.benchmarking.settings import Settings
 from experiments.benchmarking.tables import Table

@@ -1,11 +1,13 @@
 """Pictures of a page: reduced, coloured, compressed, and written into it as text.
 
-The figure of a view has the truth and each method side by side: picture, error and distance.
+The figure of a view has the truth and each method side by side: picture, error and distance. The
+sheet is one picture beside the page: a view of each scene as each method sees it.
 """
 
 import base64
 import io
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import matplotlib
@@ -13,9 +15,11 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
-from experiments.benchmarking.report import markup
+from experiments.benchmarking.report import data, markup
 from experiments.benchmarking.report.data import Scene, View
 from experiments.benchmarking.report.markup import Html, join, tag
+from experiments.figures.style import pyplot
+from refref_jax import atomic_files
 
 # Of WebP: beyond it a picture of 100 x 100 grows faster than the eye gains.
 _QUALITY = 82
@@ -25,6 +29,14 @@ _STOPS = 12
 _GREY = 128.0
 
 _DISTANCES = "viridis"
+
+SHEET = "pictures.jpg"
+
+# Beyond, tiles of the sheet are too small to be looked at.
+_MOST_SCENES, _MOST_METHODS = 8, 7
+
+_INCHES = 1.7
+_DOTS = 120
 
 TRUTH = "truth"
 """What the true image is called, beside the names of methods."""
@@ -54,30 +66,6 @@ class Scale(NamedTuple):
 
 ERRORS = Scale(0.0, 0.25, "magma")
 """Of errors: the mean over the channels of the absolute difference of sRGB in `[0, 1]`."""
-
-
-class Embedded(NamedTuple):
-    """A picture as a page has it.
-
-    Attributes:
-      uri: the picture itself, as a data URI.
-      width: in pixels.
-      height: in pixels.
-    """
-
-    uri: str
-    width: int
-    height: int
-
-
-def embed(pixels: UInt8[np.ndarray, "h w 3"], edge: int) -> Embedded:
-    """Returns a picture, reduced to a longest edge where it is longer."""
-    image = Image.fromarray(pixels)
-    image = image.resize(_size(image, edge), Image.Resampling.BOX)
-    file = io.BytesIO()
-    image.save(file, "WEBP", quality=_QUALITY)
-    data = base64.b64encode(file.getvalue()).decode("ascii")
-    return Embedded(f"data:image/webp;base64,{data}", *image.size)
 
 
 def error_map(
@@ -147,8 +135,8 @@ def _size(image: Image.Image, edge: int) -> tuple[int, int]:
     return max(1, round(image.width * share)), max(1, round(image.height * share))
 
 
-class Figures(NamedTuple):
-    """The pictures of a view, as a page has them.
+class Shown(NamedTuple):
+    """A view, or a scene with all of its views, as a page has it.
 
     Attributes:
       html: what is shown.
@@ -159,7 +147,7 @@ class Figures(NamedTuple):
     places: Places
 
 
-def show(view: View, scene: Scene, edge: int, prefix: str) -> Figures:
+def show(view: View, scene: Scene, edge: int, prefix: str) -> Shown:
     """Returns a view: a group of pictures for the truth and for each method.
 
     Args:
@@ -188,7 +176,7 @@ def show(view: View, scene: Scene, edge: int, prefix: str) -> Figures:
         _legends(scale),
         data_view=view.name,
     )
-    return Figures(html, places)
+    return Shown(html, places)
 
 
 def title(method: str) -> str:
@@ -221,13 +209,17 @@ def _picture(
     place: str | None,
     key: tuple[str, str, str],
 ) -> Html:
+    """Returns a picture, reduced to a longest edge where it is longer."""
     view, method, kind = key
     if pixels is None:
         return tag("figure", tag("p", NOT_HERE, class_="absent"), tag("figcaption", kind))
-    picture = embed(pixels, edge)
+    picture = Image.fromarray(pixels)
+    picture = picture.resize(_size(picture, edge), Image.Resampling.BOX)
+    file = io.BytesIO()
+    picture.save(file, "WEBP", quality=_QUALITY)
     image = tag(
         "img",
-        src=picture.uri,
+        src=f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode('ascii')}",
         width=picture.width,
         height=picture.height,
         id=place,
@@ -263,3 +255,72 @@ def _legend(name: str, scale: Scale) -> Html:
     ramp = tag("span", class_="ramp", style=f"background:{gradient(scale)}")
     bounds = tag("span", f"{scale.low:.3g} ", ramp, f" {scale.high:.3g} and more")
     return tag("p", f"{name}: ", bounds)
+
+
+def write_sheet(out: Path) -> Path | None:
+    """Draws a column for each scene: the true image, then each method's with its PSNR in the mask.
+
+    The view is the one in the middle of the scene's views, ordered by how well all methods do on
+    it. Scenes whose images are gone have none; of many scenes some are shown, spread evenly over
+    their names.
+
+    Args:
+      out: folder of the benchmark, with its results.json.
+
+    Returns:
+      The file; `None` if there is nothing to show.
+
+    Raises:
+      ValueError: if there are no results, or they are broken.
+    """
+    everything = data.read(out)
+    methods = list(everything.labels)[:_MOST_METHODS]
+    columns = []
+    for scene in _spread(everything.scenes, _MOST_SCENES):
+        name = data.typical_view(scene)
+        view = None if name is None else data.read_view(out, scene, name)
+        if view is not None and view.truth.rgb is not None:
+            columns.append((scene, view))
+    path = out / SHEET
+    if not columns:
+        path.unlink(missing_ok=True)  # of scenes that are gone
+        return None
+    _draw_sheet(path, columns, {name: everything.labels[name] for name in methods})
+    return path
+
+
+def _spread(scenes: Sequence[Scene], most: int) -> list[Scene]:
+    count = min(len(scenes), most)
+    return [scenes[i * len(scenes) // count] for i in range(count)]
+
+
+def _draw_sheet(path: Path, columns: Sequence[tuple[Scene, View]], labels: dict[str, str]) -> None:
+    figure, axes = pyplot.subplots(
+        len(labels) + 1,
+        len(columns),
+        figsize=(_INCHES * len(columns) + 0.3, 1.1 * _INCHES * (len(labels) + 1) + 0.2),
+        squeeze=False,
+        layout="constrained",
+    )
+    for tiles, (scene, view) in zip(axes.T, columns, strict=True):
+        tiles[0].set_title(scene.name, fontsize=7)
+        images = [view.truth, *(view.rendered.get(name) for name in labels)]
+        below = [view.name, *(_psnr(scene, name, view.name) for name in labels)]
+        for tile, image, text in zip(tiles, images, below, strict=True):
+            tile.set_xticks([])
+            tile.set_yticks([])
+            tile.set_xlabel(text, fontsize=7, labelpad=2)
+            if image is not None and image.rgb is not None:
+                tile.imshow(image.rgb)
+            else:
+                tile.set_frame_on(False)
+    for tile, label in zip(axes[:, 0], ("ground truth", *labels.values()), strict=True):
+        tile.set_ylabel(label, fontsize=8)
+    with atomic_files.written_file(path) as draft:
+        figure.savefig(draft, format="jpeg", dpi=_DOTS, pil_kwargs={"quality": 88})
+    pyplot.close(figure)
+
+
+def _psnr(scene: Scene, method: str, view: str) -> str:
+    value = data.psnr_masked(scene, method, view)
+    return "" if value is None else f"{value:.1f} dB"

@@ -11,13 +11,20 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 from urllib.parse import quote
 
 from experiments.benchmarking import paper_tables
 from experiments.benchmarking.report import charts, data, images, markup
 from experiments.benchmarking.report.data import Case, Contents, Scene
-from experiments.benchmarking.report.images import ERROR, IMAGE, NOT_HERE, TRUTH, Places, title
+from experiments.benchmarking.report.images import (
+    ERROR,
+    IMAGE,
+    NOT_HERE,
+    TRUTH,
+    Places,
+    Shown,
+    title,
+)
 from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.benchmarking.results import Record
 from experiments.benchmarking.tables import MAIN, PSNR, PSNR_MASKED, Quantity, value
@@ -62,25 +69,13 @@ _NOTHING_FROM_OUTSIDE = (
 _ASSETS = Path(__file__).parent
 
 
-class Page(NamedTuple):
-    """The page of a scene.
-
-    Attributes:
-      html: the page.
-      places: identifiers of its pictures.
-    """
-
-    html: Html
-    places: Places
-
-
 def address(scene: str, view: str | None = None) -> str:
     """Returns the link to a scene's page, at a view."""
     words = [scene] if view is None else [scene, view]
     return "#scene/" + "/".join(quote(word, safe="") for word in words)
 
 
-def show_scene(out: Path, scene: Scene, views: Sequence[str], *, edge: int, prefix: str) -> Page:
+def show_scene(out: Path, scene: Scene, views: Sequence[str], *, edge: int, prefix: str) -> Shown:
     """Returns the page of a scene.
 
     Args:
@@ -94,9 +89,9 @@ def show_scene(out: Path, scene: Scene, views: Sequence[str], *, edge: int, pref
     articles = []
     for i, name in enumerate(views):
         view = data.read_view(out, scene, name)
-        figures = images.show(view, scene, edge, f"{prefix}v{i}")
-        articles.append(figures.html)
-        places |= figures.places
+        shown = images.show(view, scene, edge, f"{prefix}v{i}")
+        articles.append(shown.html)
+        places |= shown.places
     methods = [result.record.method for result in scene.results]
     chosen = [
         tag("a", thumbnail(places, name, TRUTH, "image"), name, href=address(scene.name, name))
@@ -118,7 +113,7 @@ def show_scene(out: Path, scene: Scene, views: Sequence[str], *, edge: int, pref
         class_="scene",
         data_scene=scene.name,
     )
-    return Page(page, places)
+    return Shown(page, places)
 
 
 def thumbnail(places: Places, view: str, method: str, kind: str) -> Html | None:
@@ -362,7 +357,7 @@ def write(out: Path, *, views: int, edge: int) -> Path:
     """
     everything = data.read(out)
     count = shown_views(everything.scenes, views)
-    pages: dict[str, Page] = {}
+    pages: dict[str, Shown] = {}
     with ProgressBar("report", len(everything.scenes)) as bar:
         for i, scene in enumerate(everything.scenes):
             chosen = data.choose_views(scene, count)

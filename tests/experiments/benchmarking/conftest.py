@@ -3,9 +3,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments.benchmarking import running
-from experiments.cli import subprocesses as child_process
-from tests.experiments.benchmarking.made_scenes import write_scene
+from experiments.benchmarking import worker
+from experiments.cli import subprocesses
+from tests.experiments.benchmarking.made import write_scene
 from tests.experiments.benchmarking.serving import Server
 
 _STAND_IN = Path(__file__).with_name("stand_in.py")
@@ -18,8 +18,8 @@ def stand_in_line(name, options):
 
 def run_with_stand_in(out, job):
     """Does a job with stand-ins for its commands, in whatever process."""
-    child_process.command_line = stand_in_line
-    return running.run(out, job)
+    subprocesses.command_line = stand_in_line
+    return worker.run_job(out, job)
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def stand_in(tmp_path, monkeypatch):
     """Stands in for the commands; they write what they are called with into this file."""
     calls = tmp_path / "calls.txt"
     monkeypatch.setenv("CALLS", str(calls))
-    monkeypatch.setattr(child_process, "command_line", stand_in_line)
+    monkeypatch.setattr(subprocesses, "command_line", stand_in_line)
     return calls
 
 

@@ -1,14 +1,13 @@
 """The command in a process that is started once, for all tests of a module."""
 
 import json
-import os
 import subprocess
 import sys
 from typing import NamedTuple
 
 from tests.experiments.command import ROOT
 
-MODULES = "tests.experiments.benchmarking"
+COMMAND = [sys.executable, "-m", "tests.experiments.benchmarking.with_stand_in"]
 
 
 class Answer(NamedTuple):
@@ -23,13 +22,8 @@ class Server:
     """Runs `experiments.benchmark` with stand-ins for its commands, as often as it is asked."""
 
     def __init__(self):
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", f"{MODULES}.serve_with_stand_in"],
-            cwd=ROOT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        self._process = subprocess.Popen(COMMAND, cwd=ROOT, text=True, **pipes)
 
     def __call__(self, folder, *options, status=0, fail="^$"):
         """Runs it on `{folder}/out` for five steps a job, and returns its answer."""
@@ -54,8 +48,3 @@ def calls(folder):
     """Returns what commands were begun for, as `[name, job, process]`."""
     path = folder / "calls.txt"
     return [line.split() for line in path.read_text().splitlines()] if path.exists() else []
-
-
-def environment(folder, pace):
-    """Returns what a process of its own needs to run the command with stand-ins."""
-    return os.environ | {"CALLS": str(folder / "calls.txt"), "PACE": str(pace)}

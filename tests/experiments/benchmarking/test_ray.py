@@ -5,11 +5,10 @@ import time
 
 import pytest
 
-from experiments.benchmarking import jobs, methods, results, scene_list, schedule, settings
-from experiments.benchmarking.engines import LocalEngine, RayEngine
+from experiments.benchmarking import methods, plan, results, settings, worker
+from experiments.benchmarking.worker import LocalEngine, RayEngine
 from tests.experiments.benchmarking.conftest import run_with_stand_in
-from tests.experiments.benchmarking.made_records import SETTINGS
-from tests.experiments.benchmarking.made_scenes import write_scene
+from tests.experiments.benchmarking.made import SETTINGS, write_scene
 
 pytestmark = pytest.mark.slow
 
@@ -21,13 +20,13 @@ def planned(tmp_path, stand_in, monkeypatch):
     monkeypatch.setenv("RAY_worker_niceness", "0")
     for name in ("cube_smcvx_ball", "env_mmncvx_cup"):
         write_scene(tmp_path / "scenes" / name)
-    scenes = scene_list.find([str(tmp_path / "scenes" / "*")])
-    return jobs.plan(scenes, methods.parse(["straight", "r3f", "tree"]), SETTINGS)[0]
+    scenes = plan.find_scenes([str(tmp_path / "scenes" / "*")])
+    return plan.plan_jobs(scenes, methods.parse(["straight", "r3f", "tree"]), SETTINGS)[0]
 
 
 def _work(todo, engine):
     done = {}
-    schedule.work(todo, engine, lambda job, reason: done.update({job.name: reason}))
+    worker.run_in_order(todo, engine, lambda job, reason: done.update({job.name: reason}))
     return done
 
 
@@ -46,7 +45,7 @@ def test_a_cluster_comes_to_the_same_results_and_a_failure_is_told(tmp_path, pla
     assert list(failed) == ["env_mmncvx_cup/tree"]
     assert "The stand-in was told to fail" in failed["env_mmncvx_cup/tree"]
     monkeypatch.setenv("FAIL", "^$")
-    missing = [job for job in planned if not jobs.is_done(there, job)]
+    missing = [job for job in planned if not plan.is_done(there, job)]
     assert [job.name for job in missing] == list(failed)
     engine = RayEngine(there, "local", cpus=1.0, gpus=0.0, run=run_with_stand_in)
     assert _work(missing, engine) == {"env_mmncvx_cup/tree": None}
@@ -78,4 +77,4 @@ def test_a_job_that_is_interrupted_stops_its_command(tmp_path, planned, monkeypa
         for _ in range(600):
             os.kill(pid, 0)
             time.sleep(0.1)
-    assert not jobs.is_done(tmp_path / "out", planned[1])
+    assert not plan.is_done(tmp_path / "out", planned[1])

@@ -10,7 +10,7 @@ from html import unescape
 import pytest
 
 from experiments.benchmarking.report import page
-from tests.experiments.benchmarking import made_report
+from tests.experiments.benchmarking.made import write_benchmark
 
 _CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
@@ -114,7 +114,7 @@ def _opened(tmp_path, html):
 
 
 def test_the_slider_moves_and_the_pages_change(tmp_path):
-    out = made_report.write(tmp_path, _SCENES)
+    out = write_benchmark(tmp_path, _SCENES)
     html = page.write(out, views=3, edge=200).read_text("utf-8")
     addresses = {
         "ball": page.address(_SCENES[0]),

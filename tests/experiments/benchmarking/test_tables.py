@@ -1,4 +1,4 @@
-"""Tables, by hand: means, errors, marks, differences, and how they are written."""
+"""Tables by hand: the paper's numbers, means, errors, marks, differences, how they are written."""
 
 import csv
 import io
@@ -8,20 +8,77 @@ import math
 import numpy as np
 import pytest
 
-from experiments.benchmarking import paper_tables, pose_space, summary, tables
+from experiments.benchmarking import paper_tables, pose_space, published, summary, tables
 from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.results import Image
 from experiments.benchmarking.tables import NOTHING, Cell, Column, mean_over
-from tests.experiments.benchmarking.made_records import made_record
+from refref_jax.data import scene_names
+from tests.experiments.benchmarking.made import made_record
+
+_PSNR = Column("PSNR", "PSNR", "higher", 2)
+
+_THEIRS = [
+    *("NeuS", "Splatfacto", "Zip-NeRF", "TNSR", "MS-NeRF", "RayDef"),
+    *("RoseNeRF", "R3F", "Oracle"),
+]
 
 
-def _block(table, title):
-    (found,) = [block for block in table.blocks if block.title == title]
-    return {(row.label, row.origin): row for row in found.rows}
+def _rows(block, origin="ours"):
+    return {row.label: row for row in block.rows if row.origin == origin}
 
 
 def _place(table, label):
     return [column.label for column in table.columns].index(label)
+
+
+# --- the paper's numbers ---
+
+
+def test_the_papers_tables_are_whole():
+    for category in (*scene_names.CATEGORIES, published.ALL):
+        for background in (*scene_names.BACKGROUNDS, published.ALL):
+            rows = published.rows(published.MAIN, category, background)
+            assert [row.method for row in rows] == _THEIRS
+            for row in rows:
+                missing = {name for name, number in row.numbers.items() if number is None}
+                expected = {"drmse"} | ({"dmae"} if row.method == "RoseNeRF" else set())
+                if row.method in ("NeuS", "TNSR") and background == "env":
+                    expected = set(published.NUMBERS)
+                assert missing == expected, row
+    lines = [row.line for row in published.read()]
+    assert lines == sorted(lines) and len(published.read()) == 16 * 9 + 5 + 5
+    ablated = published.rows(published.ABLATION, "smcvx", "cube")
+    named = {m.published for m in METHODS.values() if m.group == "ablation of the oracle"}
+    assert {row.method for row in ablated} == (named - {None}) | {"Oracle"}
+    top = published.rows(published.TOP_VIEWS, published.ALL, published.ALL)
+    distances = {row.method: float(row.numbers["drmse"]) for row in top}
+    assert list(distances) == ["Zip-NeRF", "MS-NeRF", "RayDef", "R3F", "Oracle"]
+    assert list(distances.values()) == [1.21, 0.94, 1.98, 0.88, 0.0]
+    for row in (*ablated, *top):
+        assert None not in [row.numbers[name] for name in ("psnr", "psnr_masked", "ssim", "lpips")]
+    assert {m.published for m in METHODS.values() if m.group == "main"} - {None} <= set(_THEIRS)
+
+
+@pytest.mark.parametrize(
+    ("table", "category", "background", "method", "numbers"),
+    [
+        ("result_quantitative", "smcvx", "cube", "Oracle", (31.64, 25.37, 0.96, 0.03, 0.04)),
+        ("result_quantitative", "smncvx", "sphere", "R3F", (23.27, 15.03, 0.88, 0.11, 0.25)),
+        ("result_quantitative", "mmncvx", "all", "RoseNeRF", (22.78, 18.27, 0.75, 0.30, None)),
+        ("result_quantitative", "mmncvx", "cube", "Splatfacto", (24.70, 17.72, 0.86, 0.10, 11.03)),
+        ("result_quantitative", "all", "sphere", "TNSR", (18.51, 11.28, 0.82, 0.18, 1.87)),
+        ("ablation", "smcvx", "cube", "w/o Zip-NeRF", (24.68, 21.45, 0.8779, 0.1163, 0.2742)),
+        ("top5", "all", "all", "RayDef", (19.99, 16.28, 0.72, 0.38, None)),
+    ],
+)
+def test_numbers_of_the_paper(table, category, background, method, numbers):
+    (row,) = [row for row in published.rows(table, category, background) if row.method == method]
+    names = ("psnr", "psnr_masked", "ssim", "lpips", "dmae")
+    found = tuple(row.numbers[name] for name in names)
+    assert tuple(None if text is None else float(text) for text in found) == numbers
+
+
+# --- means, distances of poses, marks ---
 
 
 def test_a_mean_has_an_error_over_scenes_and_passes_over_what_is_not_known():
@@ -31,6 +88,8 @@ def test_a_mean_has_an_error_over_scenes_and_passes_over_what_is_not_known():
     mean, error, count, _ = mean_over([1.0, 2.0, 6.0, None])
     assert (mean, count) == (3.0, 3) and error == pytest.approx(math.sqrt(7.0 / 3.0))
     assert mean_over([math.inf, 1.0]) == Cell(math.inf, None, 2)
+    assert mean_over([math.inf, 1.0, -math.inf]) == NOTHING
+    assert math.isnan(mean_over([math.nan, 1.0]).mean)
 
 
 def test_the_farthest_views_are_those_of_the_largest_distance():
@@ -42,21 +101,46 @@ def test_the_farthest_views_are_those_of_the_largest_distance():
     trainings = np.stack([pose(0.0), pose(2.0)])
     tests = np.stack([pose(0.3), pose(1.0), pose(1.8), pose(0.0), pose(0.0, 8.0)])
     found = pose_space.distances(tests, trainings)
-    # By an angle a on a circle: the chord 2 sin(a / 2), and a.
+    # By an angle a on a circle: the chord 2 sin(a / 2), and a; a radius away, and not turned.
     expected = [math.hypot(2.0 * math.sin(a / 2.0), a) for a in (0.3, 1.0, 0.2, 0.0)]
-    np.testing.assert_allclose(found[:4], expected, atol=1e-6)
-    np.testing.assert_allclose(found[4], 1.0, atol=1e-6)  # a radius away, not turned
+    np.testing.assert_allclose(found, [*expected, 1.0], atol=1e-6)
     assert pose_space.farthest(found, 3) == [1, 4, 0]
     assert pose_space.farthest(found, 99) == [1, 4, 0, 2, 3]
     assert pose_space.farthest(np.zeros(3), 2) == [0, 1]
+    # A turn about the optical axis counts.
+    rolled = pose(0.0) @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    found = pose_space.distances(rolled[None], trainings[:1])
+    np.testing.assert_allclose(found, [math.pi], atol=1e-6)
 
 
-def test_a_turn_about_the_optical_axis_counts_and_half_a_turn_is_pi():
-    still = np.column_stack([np.eye(3), [0.0, 0.0, 4.0]])
-    rolled = np.column_stack([np.diag([-1.0, -1.0, 1.0]), [0.0, 0.0, 4.0]])
-    found = pose_space.distances(np.stack([still, rolled]), still[None])
-    np.testing.assert_allclose(found, [0.0, math.pi], atol=1e-6)
+def test_equal_numbers_share_a_mark_and_lower_may_be_better():
+    columns = [Column("", "", "higher", 1), Column("", "", "lower", 1), Column("", "", None, 1)]
+    cells = [(1.04, 2.0, 1.0), (1.01, 1.0, 2.0), (0.9, 3.0, 3.0), (0.8, 3.0, 4.0)]
+    rows = [tables.row("", "ours", 1, [Cell(x, None, 1) for x in each]) for each in cells]
+    marked = tables.mark(rows, columns, 1)
+    assert [row.marks for row in marked] == [
+        ("best", "second", ""),
+        ("best", "best", ""),
+        ("second", "", ""),
+        ("", "", ""),
+    ]
+    assert tables.mark(rows[:1], columns, 1)[0].marks == ("", "", "")
 
+
+def test_what_is_no_number_is_not_ranked():
+    rows = [tables.row("", "ours", 1, [Cell(each, None, 1)]) for each in (math.nan, 1.0, 2.0)]
+    assert [row.marks for row in tables.mark(rows, [_PSNR], 1)] == [("",), ("",), ("best",)]
+    assert [row.marks for row in tables.mark(rows[:2], [_PSNR], 1)] == [("",), ("",)]
+
+
+def test_distances_before_natural_backgrounds_are_those_in_the_mask():
+    metrics = {"distance_mae": 500.0, "distance_mae_masked": 0.25}
+    assert tables.value(tables.DMAE_MEDIAN, metrics, "env") == 0.25
+    assert tables.value(tables.DMAE_MEDIAN, metrics, "cube") == 500.0
+    assert tables.value(tables.DMAE, metrics, "cube") is None
+
+
+# --- tables of results ---
 
 _RESULTS = [
     made_record("cube_smcvx_ball", "oracle", psnr=30.0, psnr_masked=24.0, lpips=None),
@@ -68,6 +152,7 @@ _RESULTS = [
     made_record("cube_smcvx_ball", "r3f", psnr=99.0, psnr_masked=20.0, lpips=None),
     made_record("env_smncvx_torus", "tree", psnr=25.0, psnr_masked=20.0, lpips=None),
 ]
+_TREE, _ORACLE = METHODS["tree"].label, METHODS["oracle"].label
 
 
 def test_the_main_table_by_hand():
@@ -81,31 +166,23 @@ def test_the_main_table_by_hand():
         "all categories; natural background",
         "all categories; all backgrounds",
     ]
-    rows = _block(table, "convex, single material; cube background")
+    rows = _rows(table.blocks[0])
     psnr, masked = _place(table, "PSNR"), _place(table, "masked PSNR")
-    tree = rows[METHODS["tree"].label, "ours"]
-    oracle = rows[METHODS["oracle"].label, "ours"]
-    straight = rows[METHODS["straight"].label, "ours"]
-    r3f = rows[METHODS["r3f"].label, "ours"]
+    tree, oracle, straight = rows[_TREE], rows[_ORACLE], rows[METHODS["straight"].label]
     assert tree.cells[psnr] == Cell(33.5, 2.5, 2) and tree.cells[masked] == Cell(30.0, 0.0, 2)
     assert oracle.cells[psnr] == Cell(32.0, 2.0, 2) and oracle.cells[masked].mean == 26.0
     assert straight.cells[masked] == Cell(16.0, None, 1) and straight.scenes == 2
     # R3F has one scene, which by chance is the best: it does not compare.
     assert (tree.marks[psnr], oracle.marks[psnr]) == ("best", "second")
-    assert straight.marks[psnr] == "" and r3f.marks[psnr] == ""
+    assert straight.marks[psnr] == rows[METHODS["r3f"].label].marks[psnr] == ""
     # Two that have all scenes: there is a best, but no second best worth the name.
     assert (tree.marks[masked], oracle.marks[masked]) == ("best", "")
-    every = _block(table, "all categories; all backgrounds")
-    assert every[METHODS["tree"].label, "ours"].cells[psnr].mean == pytest.approx(92.0 / 3.0)
-    assert every[METHODS["tree"].label, "ours"].scenes == 3
-
-
-def test_the_papers_rows_are_beside_ours_and_never_marked():
-    table = paper_tables.main_table(_RESULTS)
-    rows = _block(table, "convex, single material; cube background")
-    theirs = {label: row for (label, origin), row in rows.items() if origin == "published"}
-    assert len(theirs) == 9 and all(row.scenes is None for row in theirs.values())
-    assert theirs["Oracle"].cells[_place(table, "PSNR")] == Cell(31.64, digits=2)
+    every = _rows(table.blocks[-1])[_TREE]
+    assert every.cells[psnr].mean == pytest.approx(92.0 / 3.0) and every.scenes == 3
+    # The paper's rows are beside ours and never marked.
+    theirs = _rows(table.blocks[0], "published")
+    assert list(theirs) == _THEIRS and all(row.scenes is None for row in theirs.values())
+    assert theirs["Oracle"].cells[psnr] == Cell(31.64, digits=2)
     assert theirs["RoseNeRF"].cells[_place(table, "DMAE, substituted")] == NOTHING
     assert all(set(row.marks) == {""} for row in theirs.values())
     # The paper's columns stay, though we know no LPIPS; FLIP, which nobody has, does not.
@@ -113,32 +190,21 @@ def test_the_papers_rows_are_beside_ours_and_never_marked():
     assert "LPIPS" in labels and "FLIP" not in labels and "DMAE, median" not in labels
 
 
-def test_distances_before_natural_backgrounds_are_those_in_the_mask():
-    metrics = {"distance_mae": 500.0, "distance_mae_masked": 0.25}
-    assert tables.value(tables.DMAE_MEDIAN, metrics, "env") == 0.25
-    assert tables.value(tables.DMAE_MEDIAN, metrics, "cube") == 500.0
-    assert tables.value(tables.DMAE, metrics, "cube") is None
-
-
-def test_equal_numbers_share_a_mark_and_lower_may_be_better():
-    columns = [
-        Column("a", "a", "higher", 1),
-        Column("b", "b", "lower", 1),
-        Column("c", "c", None, 1),
+def test_methods_that_lack_different_scenes_are_not_compared():
+    found = [
+        made_record("cube_smcvx_ball", "oracle", psnr=20.0),
+        made_record("cube_smcvx_cube", "oracle", psnr=20.0),
+        made_record("cube_smcvx_cube", "tree", psnr=30.0),
+        made_record("cube_smcvx_cone", "tree", psnr=30.0),
     ]
-    cells = [(1.04, 2.0, 1.0), (1.01, 1.0, 2.0), (0.9, 3.0, 3.0), (0.8, 3.0, 4.0)]
-    rows = [
-        tables.row(str(i), "ours", 1, [Cell(x, None, 1) for x in c]) for i, c in enumerate(cells)
+    both = [
+        made_record("cube_smcvx_cone", "oracle", psnr=20.0),
+        made_record("cube_smcvx_ball", "tree", psnr=30.0),
     ]
-    marked = tables.mark(rows, columns, 1)
-    assert [row.marks for row in marked] == [
-        ("best", "second", ""),
-        ("best", "best", ""),
-        ("second", "", ""),
-        ("", "", ""),
-    ]
-    alone = tables.mark(rows[:1], columns, 1)
-    assert alone[0].marks == ("", "", "")
+    for make in (paper_tables.main_table, paper_tables.top_views_table):
+        for records, mark in ((found, ""), (found + both, "best")):
+            rows = _rows(make(records).blocks[0])
+            assert (rows[_TREE].marks[0], rows[_ORACLE].marks[0]) == (mark, "")
 
 
 def test_top_views_are_means_over_the_five_farthest():
@@ -151,52 +217,49 @@ def test_top_views_are_means_over_the_five_farthest():
     found = paper_tables.top_metrics(record)
     assert found["psnr"] == pytest.approx((6.0 + 5.0 + 4.0 + 3.0 + 2.0) / 5.0)
     assert found["psnr_masked"] is None  # the only view that has one is near
-    table = paper_tables.top_views_table([record])
-    (block,) = table.blocks
-    rows = {(row.label, row.origin): row for row in block.rows}
-    assert rows[METHODS["tree"].label, "ours"].cells[0].mean == pytest.approx(4.0)
-    assert (
-        rows["R3F", "published"].cells[_place(table, "DRMSE, substituted, in the mask")].mean
-        == 0.88
-    )
+    (block,) = paper_tables.top_views_table([record]).blocks
+    assert _rows(block)[_TREE].cells[0].mean == pytest.approx(4.0)
+    few = made_record("cube_smcvx_cube", "tree", psnr=1.0)._replace(per_image=views[:2])
+    for records, told in (([record], "5"), ([few], "2"), ([few, record], "2 to 5")):
+        notes = paper_tables.top_views_table(records).notes
+        assert f"the {told} rendered test views" in notes[0]
+    assert paper_tables.top_views_table([]).blocks == ()
 
 
-@pytest.mark.parametrize(
-    ("views", "told"), [([7], "the 5 rendered"), ([3], "the 3 rendered"), ([2, 9], "the 2 to 5 ")]
-)
-def test_the_farthest_views_are_as_many_as_there_were(views, told):
-    found = [
-        made_record(scene, "tree", psnr=1.0)._replace(
-            per_image=[Image(str(i), 0.1 * i, None, {"psnr": 1.0}) for i in range(count)]
-        )
-        for scene, count in zip(("cube_smcvx_ball", "cube_smcvx_cube"), views, strict=False)
-    ]
-    assert told in paper_tables.top_views_table(found).notes[0]
+def test_the_drmse_beside_the_papers_is_that_in_the_mask():
+    metrics = {"substituted_rmse": 0.75, "substituted_rmse_masked": 0.0}
+    table = paper_tables.top_views_table([made_record("cube_smcvx_ball", "tree", **metrics)])
+    masked = _place(table, "DRMSE, substituted, in the mask")
+    image = _place(table, "DRMSE, substituted, of the image")
+    ours = _rows(table.blocks[0])[_TREE].cells
+    theirs = _rows(table.blocks[0], "published")["R3F"].cells
+    assert (ours[masked].mean, ours[image].mean) == (0.0, 0.75)
+    assert (theirs[masked].mean, theirs[image]) == (0.88, NOTHING)
+    assert "does not say over which pixels" in " ".join(table.notes)
 
 
 def test_ablations_are_differences_over_common_scenes_beside_the_papers():
-    results = [
+    found = [
         *_RESULTS,
         made_record("cube_smcvx_ball", "oracle_no_tir", psnr=25.0, psnr_masked=20.0),
         made_record("cube_smcvx_cube", "oracle_no_tir", psnr=33.0, psnr_masked=None),
         made_record("env_smncvx_torus", "oracle_no_tir", psnr=10.0, psnr_masked=10.0),
         made_record("cube_smcvx_ball", "tree_cone", psnr=30.5, psnr_masked=29.0),
     ]
-    table = paper_tables.ablation_table(results)
+    table = paper_tables.ablation_table(found)
     assert [block.title for block in table.blocks] == [
         "ablation of the oracle; convex, single material; cube background",
         "ablation of the oracle; all categories; all backgrounds",
         "ablation of the tree; convex, single material; cube background",
         "ablation of the tree; all categories; all backgrounds",
     ]
-    rows = {row.label: row for row in table.blocks[0].rows}
+    rows = _rows(table.blocks[0])
     difference, published_one = _place(table, "Δ PSNR"), _place(table, "Δ PSNR, published")
-    tir = rows["w/o TIR"]
+    tir, full = rows["w/o TIR"], rows[_ORACLE]
     assert tir.cells[difference] == Cell(-3.0, 2.0, 2)  # -5 and -1
     assert tir.cells[_place(table, "Δ masked PSNR")] == Cell(-4.0, None, 1)
     assert tir.cells[published_one].mean == -5.79
     assert tir.cells[_place(table, "SSIM, published")].mean == 0.9084
-    full = rows[METHODS["oracle"].label]
     assert full.cells[difference] == NOTHING and full.cells[0].mean == 32.0
     assert full.cells[_place(table, "PSNR, published")].mean == 31.64
     # Ours is substituted; which kind the paper's is, is not known.
@@ -208,25 +271,36 @@ def test_ablations_are_differences_over_common_scenes_beside_the_papers():
     assert rows["w/o first reflection"].cells[published_one].mean == -1.99
     assert "no refraction past 2 bends" not in rows
     # Over all scenes the oracle lacks the torus, which then does not count in the difference.
-    every = {row.label: row for row in table.blocks[1].rows}["w/o TIR"]
+    every = _rows(table.blocks[1])["w/o TIR"]
     assert every.cells[difference] == Cell(-3.0, 2.0, 2) and every.scenes == 3
     assert every.cells[published_one] == NOTHING
-    cone = {row.label: row for row in table.blocks[2].rows}["footprint: cone"]
-    assert cone.cells[difference].mean == -0.5
+    assert _rows(table.blocks[2])["footprint: cone"].cells[difference].mean == -0.5
+    # They are in their own table alone.
+    for other in (paper_tables.main_table(found), paper_tables.top_views_table(found)):
+        labels = {row.label for block in other.blocks for row in block.rows}
+        assert _ORACLE in labels and "w/o TIR" not in labels
+    nothing = paper_tables.ablation_table(_RESULTS)
+    assert nothing.blocks == () and "Nothing is measured yet" in summary.markdown(nothing)
 
 
-def test_ablations_are_in_their_own_table_alone():
-    results = [*_RESULTS, made_record("cube_smcvx_ball", "oracle_no_tir", psnr=25.0)]
-    for table in (paper_tables.main_table(results), paper_tables.top_views_table(results)):
-        labels = {row.label for block in table.blocks for row in block.rows}
-        assert METHODS["oracle"].label in labels and "w/o TIR" not in labels
-    assert paper_tables.main_table(results[-1:]).blocks == ()
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_differences_of_what_is_infinite_are_not_known(sign):
+    inf = sign * math.inf
+    for pairs, expected in [
+        ([(inf, inf)], NOTHING),
+        ([(inf, inf), (3.0, 1.0)], Cell(2.0, None, 1)),
+        ([(inf, 1.0)], Cell(inf, None, 1)),
+        ([(inf, 1.0), (1.0, inf)], NOTHING),
+    ]:
+        found = [
+            made_record(f"cube_smcvx_{i}", name, psnr=psnr)
+            for i, pair in enumerate(pairs)
+            for name, psnr in zip(("oracle_no_tir", "oracle"), pair, strict=True)
+        ]
+        assert paper_tables.difference(found, "oracle_no_tir", "oracle", tables.PSNR) == expected
 
 
-def test_without_ablations_their_table_says_that_nothing_is_measured():
-    table = paper_tables.ablation_table(_RESULTS)
-    assert table.blocks == () and "Nothing is measured yet" in summary.markdown(table)
-    assert paper_tables.top_views_table([]).blocks == ()
+# --- how they are written ---
 
 
 def test_markdown_and_latex_mark_and_label():
@@ -236,39 +310,43 @@ def test_markdown_and_latex_mark_and_label():
     assert "| 2 | **33.50** ± 2.50 | **30.00** ± 0.00 | - | - | - |" in line
     assert "| Oracle (paper's paths) | 2 | <u>32.00</u> ± 2.00 | 26.00 ± 2.00 |" in text
     assert "| Oracle, *published* | - | 31.64 | 25.37 | 0.96 |" in text
-    assert "| method | scenes | PSNR ↑ | masked PSNR ↑ | SSIM ↑ | LPIPS ↓ |" in text
+    assert "| method | scenes | PSNR ↑ | masked PSNR ↑ | SSIM ↑ | LPIPS ↓ | DMAE, sub" in text
     assert "measured on its data, which is not ours" in " ".join(text.split())
     tex = summary.latex(table)
     assert r"\textbf{33.50} {\tiny$\pm$2.50}" in tex and r"\underline{32.00}" in tex
-    assert r"Oracle \emph{(published)} & -- & 31.64" in tex
+    assert r"Oracle \emph{(published)} & -- & 31.64" in tex and "& DMAE, substituted" in tex
     assert tex.count(r"\begin{tabular}") == tex.count(r"\end{tabular}") == 1
-    width = len(table.columns) + 2
-    assert all(
-        line.count("&") == width - 1 for line in tex.splitlines() if line.startswith("Oracle (path")
-    )
-    assert summary._escaped("a_b & 5%") == r"a\_b \& 5\%"
+    body = [line for line in tex.splitlines() if line.startswith("Oracle (path")]
+    assert body and {line.count("&") for line in body} == {len(table.columns) + 1}
+    comments = [line for line in tex.splitlines() if line[:1] == "%"]
+    assert len(comments) == 1 + len(table.notes)
+    assert not any("**" in line or "<u>" in line or "`" in line for line in comments)
+    assert any("Substituted distances have the true ones" in line for line in comments)
+
+
+def test_odd_names_break_no_row():
+    shown = summary.in_markdown("a_b|<x> *c*\n_d_ `e`")
+    assert shown == r"a_b\|\<x\> \*c\* \_d\_ \`e\`"
+    assert summary.in_markdown("cube_smcvx_ball/tree: --a_b") == "cube_smcvx_ball/tree: --a_b"
+    row = tables.row("a|b & 5%", "ours", 1, [Cell(1.5, 0.25, 2)])
+    column = Column("Δ", "Δ", None, 2, True)
+    table = tables.Table("t", "T", (), (column,), (tables.Block("b", (row,)),))
+    assert r"| a\|b \& 5% | 1 | +1.50 ± 0.25 |" in summary.markdown(table)
+    assert r"a|b \& 5\% & 1 & +1.50" in summary.latex(table)
 
 
 def test_csv_and_json_have_every_number():
     table = paper_tables.main_table(_RESULTS)
     lines = list(csv.DictReader(io.StringIO(summary.table_as_csv(table))))
     assert len(lines) == sum(len(block.rows) for block in table.blocks) * len(table.columns)
-    (line,) = [
-        line
-        for line in lines
-        if (line["block"], line["method"], line["quantity"])
-        == ("convex, single material; cube background", METHODS["tree"].label, "PSNR")
-    ]
+    wanted = (table.blocks[0].title, _TREE, "PSNR")
+    (line,) = [e for e in lines if (e["block"], e["method"], e["quantity"]) == wanted]
     assert (line["mean"], line["standard_error"]) == ("33.5", "2.5")
     assert (line["scenes"], line["mark"], line["origin"]) == ("2", "best", "ours")
     assert {line["mean"] for line in lines if line["quantity"] == "LPIPS"} >= {"", "0.11"}
-    record = json.loads(json.dumps(summary.table_as_json(table), allow_nan=False))
-    assert record["blocks"][0]["rows"][0]["cells"][0]["mean"] == 21.0
     scenes = list(csv.DictReader(io.StringIO(summary.scenes_csv(_RESULTS))))
     assert len(scenes) == len(_RESULTS) and scenes[4]["psnr_masked"] == ""
-
-
-def test_signed_columns_show_their_sign():
-    column = Column("Δ", "Δ", None, 2, True)
-    assert tables.number(Cell(1.5), column) == "+1.50" and tables.number(NOTHING, column) == "-"
-    assert tables.error(Cell(1.5, 0.25, 2), column) == "0.25"
+    odd = [made_record("cube_smcvx_ball", "oracle", psnr=30.0, psnr_masked=math.inf)]
+    for each in (table, paper_tables.main_table(odd), paper_tables.main_table([])):
+        content = json.loads(json.dumps(summary.table_as_json(each), allow_nan=False))
+        assert summary.table_from_json(content) == each

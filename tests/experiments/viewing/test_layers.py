@@ -8,7 +8,7 @@ import jaxtyping
 import numpy as np
 import pytest
 
-from experiments.figures import comparison as figures
+from experiments.figures import comparison
 from experiments.viewer import layers, session
 from experiments.viewer.session import Subject
 from refref_jax.data import files
@@ -116,7 +116,7 @@ def test_cropped_windows_share_the_program_of_surfaces(model):
 def test_distances_have_one_scale_from_everywhere(model):
     drawn = layers.draw(model, layers.DISTANCE, _RAYS, **_OPTIONS)
     seen = render_image(model, _RAYS).distance
-    expected = figures.colour_distances([seen], farthest=2.0 * MODEL.radius)[0]
+    expected = comparison.colour_distances([seen], farthest=2.0 * MODEL.radius)[0]
     np.testing.assert_array_equal(drawn, expected)
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from experiments.viewer import cameras as viewpoints
+from experiments.viewer import cameras
 from experiments.viewer.cameras import Viewpoint
 from refref_jax.geometry.cameras import image_rays, orbit
 
@@ -17,17 +17,17 @@ def _view(aspect, fov=0.8):
 
 
 def test_a_browser_that_looks_along_z_sees_our_camera_turned_around():
-    view = viewpoints.from_browser(np.array([1.0, 0, 0, 0]), np.array([1.0, 2, 3]), 0.8, 1.5)
+    view = cameras.from_browser(np.array([1.0, 0, 0, 0]), np.array([1.0, 2, 3]), 0.8, 1.5)
     np.testing.assert_allclose(view.pose[:, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-12)
     np.testing.assert_array_equal(view.pose[:, 3], [1.0, 2.0, 3.0])
-    middle = viewpoints.window_rays(view, 36).directions.reshape(-1, 3).mean(axis=0)
+    middle = cameras.window_rays(view, 36).directions.reshape(-1, 3).mean(axis=0)
     assert middle[2] > 0.9 and np.all(np.abs(middle[:2]) < 1e-6)
 
 
 @pytest.mark.parametrize("i", range(8))
 def test_a_pose_survives_the_browser(i):
-    wxyz, position = viewpoints.to_browser(_ORBIT.poses[i])
-    again = viewpoints.from_browser(wxyz, position, 0.8, 1.0)
+    wxyz, position = cameras.to_browser(_ORBIT.poses[i])
+    again = cameras.from_browser(wxyz, position, 0.8, 1.0)
     np.testing.assert_allclose(again.pose, _ORBIT.poses[i], atol=1e-12)
 
 
@@ -35,9 +35,9 @@ def test_a_pose_survives_the_browser(i):
 @pytest.mark.parametrize("height", [36, 90, 181])
 def test_the_picture_covers_the_window_and_what_sticks_out_is_cropped(aspect, height):
     view = _view(aspect)
-    rays = viewpoints.window_rays(view, height)
+    rays = cameras.window_rays(view, height)
     rows, columns = rays.radii.shape
-    width = viewpoints.width_of(height)
+    width = cameras.width_of(height)
     assert (rows == height) if aspect <= width / height else (columns == width)
     assert (
         rows <= height
@@ -57,41 +57,41 @@ def test_the_picture_covers_the_window_and_what_sticks_out_is_cropped(aspect, he
 
 
 def test_a_square_window_on_a_square_view_has_the_view_s_own_rays():
-    fov = viewpoints.containing_fov(_ORBIT, 1.0)
+    fov = cameras.containing_fov(_ORBIT, 1.0)
     view = Viewpoint(_ORBIT.poses[2], fov, 1.0)
-    ours, theirs = viewpoints.window_rays(view, 64), image_rays(_ORBIT, 2)
+    ours, theirs = cameras.window_rays(view, 64), image_rays(_ORBIT, 2)
     np.testing.assert_allclose(ours.directions, theirs.directions, atol=1e-6)
     np.testing.assert_allclose(ours.radii, theirs.radii, rtol=1e-5)
 
 
 def test_the_nearest_view_of_a_view_is_itself_and_a_small_step_does_not_matter():
     for i, pose in enumerate(_ORBIT.poses):
-        assert viewpoints.nearest(pose, _ORBIT) == i
+        assert cameras.nearest(pose, _ORBIT) == i
         moved = pose.copy()
         moved[:, 3] += [0.1, -0.1, 0.2]
-        assert viewpoints.nearest(moved, _ORBIT) == i
+        assert cameras.nearest(moved, _ORBIT) == i
     # Looking elsewhere counts: between two places, the one that looks the same way is taken.
     between = _ORBIT.poses[0].copy()
     between[:, 3] = 0.5 * (_ORBIT.poses[0] + _ORBIT.poses[1])[:, 3]
-    assert viewpoints.nearest(between, _ORBIT) == 0
+    assert cameras.nearest(between, _ORBIT) == 0
 
 
 def test_only_what_a_hand_moves_is_a_change():
     view = _view(1.5)
-    assert viewpoints.is_same(view, view._replace(pose=view.pose + 1e-5))
-    assert not viewpoints.is_same(view, view._replace(pose=view.pose + 0.01))
-    assert not viewpoints.is_same(view, view._replace(fov=0.9))
-    assert not viewpoints.is_same(view, view._replace(aspect=1.6))
+    assert cameras.is_same(view, view._replace(pose=view.pose + 1e-5))
+    assert not cameras.is_same(view, view._replace(pose=view.pose + 0.01))
+    assert not cameras.is_same(view, view._replace(fov=0.9))
+    assert not cameras.is_same(view, view._replace(aspect=1.6))
 
 
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 2.0])
 def test_bars_complete_a_picture_to_a_window_and_the_view_fits_into_it(aspect):
     picture = np.full((40, 40, 3), 200, np.uint8)
-    boxed = viewpoints.letterbox(picture, aspect)
+    boxed = cameras.letterbox(picture, aspect)
     height, width, _ = boxed.shape
     assert width / height == aspect and (boxed == 200).all(-1).sum() == 40 * 40
     middle = boxed[height // 2 - 20 : height // 2 + 20, width // 2 - 20 : width // 2 + 20]
     np.testing.assert_array_equal(middle, picture)
-    half = math.tan(0.5 * viewpoints.containing_fov(_ORBIT, aspect))
+    half = math.tan(0.5 * cameras.containing_fov(_ORBIT, aspect))
     own = 0.5 * 64 / _ORBIT.focal
     assert min(half, half * aspect) == pytest.approx(own)

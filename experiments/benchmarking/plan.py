@@ -1,18 +1,30 @@
-"""What a benchmark has to do: one job for each scene and method, and what each waits for.
+"""What a benchmark has to do: which scenes, which jobs, and what decides the result of each.
 
-{out}/jobs/{scene}/{method}/result.json    there when the job is done, see `records`
+One job for each scene and method, and what each waits for:
+
+{out}/jobs/{scene}/{method}/result.json    there when the job is done, see `results`
                            /run/           the trained run, with its evaluation
                            /run.log        all that its commands printed
 {out}/jobs/{scene}/reconstruction/         what the R3F methods of a scene share
+
+A scene's fingerprint is a hash of what decides results on it, so that results of another scene of
+that name are not mixed in. It covers the transforms files, scene.json and the meshes by their
+content, and all images that the transforms files name (colours, masks, depth maps) by their names
+and sizes in bytes: to read a data set's images whole whenever a benchmark begins would take
+minutes. Where the folder lies does not matter, nor does what else is in it.
 """
 
-from collections.abc import Sequence
+import glob
+import hashlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from experiments.benchmarking.methods import RECONSTRUCTION, Method, Need, same_as, same_inside
 from experiments.benchmarking.settings import Scene, Settings
-from refref_jax.data import local_layout, meshes, transforms
+from experiments.cli import scenes as cli_scenes
+from refref_jax import configuration
+from refref_jax.data import local_layout, meshes, scene_names, transforms
 from refref_jax.data.needs import find_tints
 from refref_jax.data.part_descriptions import PartDescription, read_part_descriptions
 
@@ -21,6 +33,12 @@ RESULT = "result.json"
 
 SPLIT = "test"
 """The views that are evaluated."""
+
+# Of a fingerprint.
+_LETTERS = 16
+
+# Endings of what a key of a frame names: a float depth map may lie beside an 8-bit one.
+_ENDINGS = {"file_path": (".png",), "mask_file_path": ("",), "depth_file_path": ("", ".exr")}
 
 
 class Job(NamedTuple):
@@ -70,14 +88,14 @@ class Skipped(NamedTuple):
         return f"{self.scene}/{self.method}"
 
 
-_LACKING: dict[Need, str] = {
+_WANTING: dict[Need, str] = {
     "meshes": "it has no meshes",
     "masks": "its training images have no masks",
     "colours": "scene.json does not tell the colours of all its parts",
 }
 
 
-def plan(
+def plan_jobs(
     scenes: Sequence[Scene],
     methods: Sequence[Method],
     settings: Settings,
@@ -122,12 +140,15 @@ def options(method: str, train: Sequence[str], settings: Settings) -> dict[str, 
     }
 
 
-def lacking(scene: Path, needs: set[Need]) -> set[Need]:
-    """Returns which of some needs a scene does not meet.
+def _lacking(scene: Path, needs: set[Need]) -> set[Need]:
+    """Returns which of some needs a scene does not meet; none if it is broken."""
+    try:
+        return _unmet(scene, needs)
+    except ValueError:
+        return set()
 
-    Raises:
-      ValueError: if the scene is broken.
-    """
+
+def _unmet(scene: Path, needs: set[Need]) -> set[Need]:
     found: set[Need] = set()
     files = meshes.mesh_files(scene) if needs & {"meshes", "colours"} else []
     if "meshes" in needs and not files:
@@ -142,14 +163,14 @@ def lacking(scene: Path, needs: set[Need]) -> set[Need]:
     return found
 
 
-def folder(out: Path, job: Job) -> Path:
+def job_folder(out: Path, job: Job) -> Path:
     """Returns the folder of a job."""
     return out / FOLDER / job.scene / job.method
 
 
 def is_done(out: Path, job: Job) -> bool:
     """Returns whether a job has left its result."""
-    return (folder(out, job) / RESULT).is_file()
+    return (job_folder(out, job) / RESULT).is_file()
 
 
 def _reasons(scene: Scene, methods: Sequence[Method], preset: str) -> dict[str, str]:
@@ -158,10 +179,11 @@ def _reasons(scene: Scene, methods: Sequence[Method], preset: str) -> dict[str, 
         local_layout.read_frames(Path(scene.path), SPLIT)
     except ValueError as error:
         return {method.name: f"its {SPLIT} views can not be read: {error}" for method in methods}
-    lacks, inside = _lacking_or_broken(scene, methods), _inside(Path(scene.path))
+    needs = {need for method in methods for need in method.needs}
+    lacks, inside = _lacking(Path(scene.path), needs), _inside(Path(scene.path))
     reasons = {}
     for method in methods:
-        if missing := [_LACKING[need] for need in method.needs if need in lacks]:
+        if missing := [_WANTING[need] for need in method.needs if need in lacks]:
             reasons[method.name] = missing[0]
         elif full := same_as(method, preset):
             reasons[method.name] = f"in the preset {preset} it is {full} again"
@@ -182,13 +204,91 @@ def _inside(scene: Path) -> dict[str, str]:
     return {"interior": "clear"} if tints == "none" else {"interior": "absorbing", "tints": tints}
 
 
-def _lacking_or_broken(scene: Scene, methods: Sequence[Method]) -> set[Need]:
-    try:
-        return lacking(Path(scene.path), {need for method in methods for need in method.needs})
-    except ValueError:
-        return set()
-
-
 def _has_no_masks(scene: Path) -> bool:
     frames = transforms.get(transforms.read_json(scene / "transforms_train.json"), "frames", scene)
     return not any(isinstance(frame, dict) and "mask_file_path" in frame for frame in frames)
+
+
+def find_scenes(words: Sequence[str]) -> list[Scene]:
+    """Returns scenes in the order of their names.
+
+    Args:
+      words: folders, with wildcards or without, or `hf:CONFIG/SCENE`. What a wildcard matches and
+        is no scene is passed over.
+
+    Raises:
+      ValueError: if there is none, if a folder holds none, or two have one name.
+    """
+    folders = [folder for word in words if word for folder in _folders(word.strip())]
+    if not folders:
+        raise ValueError(
+            f"--scenes={','.join(words)} names no scene. Give folders that hold "
+            "transforms_train.json, as in --scenes='scenes/*'."
+        )
+    found: dict[str, Scene] = {}
+    for folder in dict.fromkeys(folder.resolve() for folder in folders):
+        name = scene_names.of_folder(folder)
+        if name in found:
+            raise ValueError(
+                f"Both {found[name].path} and {folder} are named {name}. Rename one of them."
+            )
+        found[name] = Scene(name, str(folder), fingerprint(folder))
+    return [found[name] for name in sorted(found)]
+
+
+def _folders(word: str) -> list[Path]:
+    if cli_scenes.has_wildcards(word):
+        return [Path(path) for path in sorted(glob.glob(word)) if _is_scene(Path(path))]
+    folder = cli_scenes.opened(word)
+    if not _is_scene(folder):
+        raise ValueError(
+            f"{folder} is no scene: it holds no transforms_train.json. Give the folder of one."
+        )
+    return [folder]
+
+
+def _is_scene(folder: Path) -> bool:
+    return (folder / "transforms_train.json").is_file()
+
+
+def fingerprint(scene: Path) -> str:
+    """Returns the hash of a scene, which may be broken or lack files."""
+    found = hashlib.sha256()
+    described = scene / "scene.json"
+    transforms = sorted(scene.glob("transforms_*.json"))
+    for path in (*transforms, *([described] if described.is_file() else [])):
+        _add(found, path.name, path.read_bytes())
+    for path in meshes.mesh_files(scene):
+        _add(found, f"meshes/{path.name}", path.read_bytes())
+    for name in sorted({name for path in transforms for name in _images(path)}):
+        path = scene / name
+        size = path.stat().st_size if path.is_file() else "missing"
+        _add(found, Path(name).as_posix(), str(size).encode())
+    return found.hexdigest()[:_LETTERS]
+
+
+def _add(found: Any, name: str, content: bytes) -> None:
+    """Adds to a hash what a name stands for; no two lists of such come to the same bytes."""
+    for part in (name.encode(), content):
+        found.update(len(part).to_bytes(8, "big"))
+        found.update(part)
+
+
+def _images(transforms: Path) -> Iterator[str]:
+    """Yields the files that a transforms file names, as far as it is one."""
+    try:
+        frames = configuration.parse_json(transforms.read_text(encoding="utf-8"))["frames"]
+    except (ValueError, KeyError, TypeError):
+        return
+    for frame in frames if isinstance(frames, list) else ():
+        for key, endings in _ENDINGS.items():
+            name = frame.get(key) if isinstance(frame, dict) else None
+            if isinstance(name, str):
+                yield from (_ending(name, ending) for ending in endings)
+
+
+def _ending(name: str, ending: str) -> str:
+    """Returns the file of a name: image names lack their ending, depth maps may have another."""
+    if ending == ".exr":
+        return str(Path(name).with_suffix(ending)) if Path(name).name else name
+    return f"{name}{ending}"

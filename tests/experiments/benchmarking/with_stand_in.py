@@ -1,7 +1,8 @@
-"""Runs `experiments.benchmark` again and again in one process, with stand-ins for its commands.
+"""Runs `experiments.benchmark` with stand-ins for its commands: once, with the options given.
 
-Reads lines of JSON, `{"words": [...], "environment": {...}}`; answers each with one line,
-`{"status": 0, "stdout": "...", "stderr": "..."}`. Starting takes seconds, which are spent once so.
+With none it runs again and again, as starting takes seconds. It reads lines of JSON,
+`{"words": [...], "environment": {...}}`, and answers each with one line,
+`{"status": 0, "stdout": "...", "stderr": "..."}`.
 """
 
 import contextlib
@@ -13,8 +14,7 @@ import sys
 from absl import flags
 
 from experiments import benchmark
-from experiments.cli import app
-from experiments.cli import subprocesses as child_process
+from experiments.cli import app, subprocesses
 from tests.experiments.benchmarking.conftest import stand_in_line
 
 
@@ -36,6 +36,9 @@ def _answer(request):
 
 
 if __name__ == "__main__":
-    child_process.command_line = stand_in_line
-    for line in sys.stdin:
-        print(json.dumps(_answer(json.loads(line))), flush=True)
+    subprocesses.command_line = stand_in_line
+    if sys.argv[1:]:
+        app.run(benchmark.main)
+    else:
+        for line in sys.stdin:
+            print(json.dumps(_answer(json.loads(line))), flush=True)

@@ -1,0 +1,433 @@
+"""Does the jobs of a benchmark: one here, in another process or on another machine, or all missing.
+
+A job is a chain of commands, each in a process of its own: `reconstruct`, or `train` and
+`evaluate`. Killed at any time, it goes on where it was when it is done again, and one that has left
+its result is not done again (`run_job`).
+
+An engine takes jobs, and gives each back when it is done, with the reason if it failed: threads
+here that wait for commands, or a Ray cluster. None knows of what a job waits for: `run_in_order`
+does. `run_missing` also writes the summary after each job.
+"""
+
+import dataclasses
+import socket
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from concurrent import futures
+from pathlib import Path
+from typing import Any, Protocol
+
+import jax
+import numpy as np
+
+import refref_jax
+from experiments.benchmarking import plan, pose_space, results, summary
+from experiments.benchmarking.methods import RECONSTRUCTION
+from experiments.benchmarking.plan import SPLIT, Job, Skipped
+from experiments.benchmarking.results import Costs, Image, Record, Truth, View, number
+from experiments.benchmarking.settings import Benchmark
+from experiments.cli import subprocesses
+from experiments.cli.progress import ProgressBar
+from experiments.cli.subprocesses import RunFailedError
+from experiments.r3f import records
+from experiments.runs import measured_runs
+from refref_jax import atomic_files, configuration
+from refref_jax.data import local_layout
+
+# Seconds that a command which outlived its benchmark may take to save and end: where others work
+# too, compiling alone takes minutes, and what compiles does not look up.
+_PATIENCE = 600.0
+
+# Ray itself tries for many minutes, while nobody is told.
+_SECONDS_TO_ANSWER = 10.0
+
+Run = Callable[[Path, Job], str | None]
+"""Does a job of the benchmark in a folder; returns why it failed, or `None`."""
+
+Done = Callable[[Job, str | None], None]
+"""Is told of a job that is done, and why it failed, if it did."""
+
+
+def run_job(out: Path, job: Job) -> str | None:
+    """Does a job, unless it is done.
+
+    Args:
+      out: folder of the benchmark.
+      job: what to do.
+
+    Returns:
+      Why it failed, or `None` if it is done.
+    """
+    if plan.is_done(out, job):
+        return None
+    folder = plan.job_folder(out, job)
+    try:
+        _check_scene(job)
+        folder.mkdir(parents=True, exist_ok=True)
+        record = _reconstruct(job, folder) if job.method == RECONSTRUCTION else _learn(job, folder)
+        _check_scene(job)
+        results.write(folder, record)
+    except (RunFailedError, ValueError, OSError) as error:
+        return str(error)
+    except Exception as error:  # The others go on, whatever this is.
+        log = folder / "error.txt"
+        log.write_text(traceback.format_exc(), encoding="utf-8")
+        return f"{type(error).__name__}: {error} (all of it: {log})"
+    return None
+
+
+def wait_until_free(folder: Path, patience: float = _PATIENCE) -> None:
+    """Waits while a process that an earlier benchmark left behind works in a folder, and says so.
+
+    Raises:
+      ValueError: if it still does after so many seconds.
+    """
+    end, said = time.monotonic() + patience, False
+    while folder.is_dir():
+        try:
+            with atomic_files.hold(folder):
+                return
+        except ValueError:
+            if time.monotonic() > end:
+                raise
+            if not said:
+                print(f"Waiting until the process ends that works in {folder} yet.", flush=True)
+                said = True
+            time.sleep(0.2)
+
+
+def _check_scene(job: Job) -> None:
+    """Refuses to measure a scene whose files are no longer those that the job was planned for."""
+    if plan.fingerprint(Path(job.path)) != job.fingerprint:
+        raise ValueError(
+            f"Cameras, meshes, images or scene.json of {job.path} have changed since the benchmark "
+            "was begun. Restore them, or begin another benchmark."
+        )
+
+
+def _reconstruct(job: Job, folder: Path) -> Record:
+    out = folder / "run"
+    wait_until_free(out)
+    options = plan.options(job.method, job.train, job.settings)
+    command = [f"--scene={job.path}", f"--out={out}", *options["reconstruct"]]
+    seconds, peak = subprocesses.run("reconstruct", *command, log=folder / "run.log")
+    found = records.read(out)
+    return _record(job)._replace(
+        options=options,
+        costs=Costs(seconds=seconds, peak_host_mib=peak),
+        facts={"index": dataclasses.asdict(found.index)},
+    )
+
+
+def _learn(job: Job, folder: Path) -> Record:
+    run_, scene = folder / "run", Path(job.path)
+    options = plan.options(job.method, job.train, job.settings)
+    objects = []
+    if job.reconstructed:
+        objects = [f"--reconstruction={folder.parent / RECONSTRUCTION / 'run'}"]
+    weights = [] if job.lpips_weights is None else [f"--lpips_weights={job.lpips_weights}"]
+    wait_until_free(run_)
+    cost = measured_runs.train(run_, scene=scene, options=[*options["train"], *objects])
+    measured_runs.evaluate(run_, scene=scene, options=[*options["evaluate"], *weights], split=SPLIT)
+    summary = configuration.parse_json((run_ / "eval" / SPLIT / "metrics.json").read_text("utf-8"))
+    metrics = {key: number(value, key) for key, value in summary["results"].items()}
+    # Tables are of what does not change from one time to the next.
+    seconds = metrics.pop("seconds_per_image")
+    frames, apart = _frames(scene)
+    per_image = [_image(image, apart) for image in summary["per_image"]]
+    return _record(job)._replace(
+        options=options,
+        metrics=metrics,
+        per_image=per_image,
+        costs=Costs(**dataclasses.asdict(cost), seconds_per_image=seconds),
+        views=[_view(image.name, frames, scene) for image in per_image],
+        facts={key: summary[key] for key in ("learned",) if summary.get(key) is not None},
+    )
+
+
+def _image(told: dict[str, Any], apart: Mapping[str, float]) -> Image:
+    """Returns what an evaluation says of an image, and how far it is from the training views."""
+    metrics = {key: number(value, key) for key, value in told.items() if key != "name"}
+    name, seconds = told["name"], metrics.pop("seconds", None)
+    return Image(name, apart[name], seconds, metrics)
+
+
+def _record(job: Job) -> Record:
+    """Returns what any result of a job has."""
+    category, background = results.category_and_background(job.scene)
+    return Record(
+        scene=job.scene,
+        category=category,
+        background=background,
+        method=job.method,
+        fingerprint=job.fingerprint,
+        options={},
+        settings=job.settings,
+        metrics={},
+        per_image=[],
+        costs=Costs(),
+        versions={"jax": jax.__version__, "refref_jax": refref_jax.__version__},
+        views=[],
+        scene_path=job.path,
+        facts={},
+    )
+
+
+def _frames(scene: Path) -> tuple[local_layout.Frames, dict[str, float]]:
+    """Returns the test views, and how far each is from the training views, by name."""
+    frames = local_layout.read_frames(scene, SPLIT)
+    training = local_layout.read_frames(scene, "train").cameras.poses
+    apart = pose_space.distances(np.asarray(frames.cameras.poses), np.asarray(training))
+    return frames, {
+        name: float(distance) for name, distance in zip(frames.names, apart, strict=True)
+    }
+
+
+def _view(name: str, frames: local_layout.Frames, scene: Path) -> View:
+    """Returns where the files of a view are; see docs/benchmark.md."""
+    i = frames.names.index(name)
+
+    def of_scene(paths: tuple[Path, ...] | None) -> str | None:
+        return None if paths is None else str(paths[i].relative_to(scene))
+
+    return View(
+        name,
+        Truth(
+            rgb=str(frames.images[i].relative_to(scene)),
+            mask=of_scene(frames.masks),
+            distance=of_scene(frames.depths),
+        ),
+        rgb=f"run/eval/{SPLIT}/rgb/{name}.png",
+        distance=f"run/eval/{SPLIT}/distance/{name}.exr",
+    )
+
+
+class Engine(Protocol):
+    """What does jobs."""
+
+    def submit(self, job: Job) -> None:
+        """Takes a job."""
+
+    def next(self) -> tuple[Job, str | None]:
+        """Waits for a job that was taken, and returns it and why it failed, if it did."""
+
+    def stop(self) -> None:
+        """Gives up all jobs that are not done; those that have begun may save first."""
+
+
+class LocalEngine:
+    """Some jobs at once on this machine."""
+
+    def __init__(self, out: Path, workers: int, run: Run = run_job) -> None:
+        """Starts threads, each of which does one job at a time.
+
+        Args:
+          out: folder of the benchmark.
+          workers: how many.
+          run: what they do.
+        """
+        self._out, self._run = out, run
+        self._pool = futures.ThreadPoolExecutor(workers)
+        self._taken: dict[futures.Future[str | None], Job] = {}
+
+    def submit(self, job: Job) -> None:
+        """Takes a job."""
+        self._taken[self._pool.submit(self._run, self._out, job)] = job
+
+    def next(self) -> tuple[Job, str | None]:
+        """Waits for a job."""
+        done, _ = futures.wait(self._taken, return_when=futures.FIRST_COMPLETED)
+        future = next(future for future in self._taken if future in done)
+        return self._taken.pop(future), future.result()
+
+    def stop(self) -> None:
+        """Asks all commands to stop, and waits until they have."""
+        with subprocesses.stopping():
+            self._pool.shutdown(cancel_futures=True)
+
+
+class RayEngine:
+    """Jobs on a Ray cluster, whose machines see this folder and these modules by the same paths."""
+
+    def __init__(
+        self, out: Path, address: str, *, cpus: float, gpus: float, run: Run = run_job
+    ) -> None:
+        """Connects to a cluster.
+
+        Args:
+          out: folder of the benchmark, on a file system that all machines share.
+          address: of the cluster; `local` starts one on this machine.
+          cpus: that a job takes of a machine's.
+          gpus: the same of accelerators.
+          run: what is done.
+
+        Raises:
+          ValueError: if Ray is not installed, or there is no such cluster.
+        """
+        self._ray = import_ray()
+        connect(self._ray, address)
+        self._out = out
+        self._work = self._ray.remote(num_cpus=cpus, num_gpus=gpus)(run)
+        self._taken: dict[Any, Job] = {}
+        resources = self._ray.cluster_resources()
+        counts = [resources.get("CPU", 0.0) / cpus] if cpus else []
+        counts += [resources.get("GPU", 0.0) / gpus] if gpus else []
+        if any(count < 1.0 for count in counts):
+            self._ray.shutdown()
+            raise ValueError(
+                f"No job will ever start: one takes {cpus:g} CPUs and {gpus:g} GPUs, and the "
+                f"cluster has {resources.get('CPU', 0.0):g} and {resources.get('GPU', 0.0):g} in "
+                "all. Lower --job_cpus or --job_gpus."
+            )
+
+    def submit(self, job: Job) -> None:
+        """Takes a job."""
+        self._taken[self._work.remote(self._out, job)] = job
+
+    def next(self) -> tuple[Job, str | None]:
+        """Waits for a job; one whose machine was lost has failed."""
+        (done,), _ = self._ray.wait(list(self._taken), num_returns=1)
+        job = self._taken.pop(done)
+        try:
+            return job, self._ray.get(done)
+        except self._ray.exceptions.RayError as error:
+            return job, f"Ray: {' '.join(str(error).split())}"
+
+    def stop(self) -> None:
+        """Interrupts all jobs, whose commands may save, and leaves the cluster."""
+        for task in self._taken:
+            self._ray.cancel(task, force=False)
+        if self._taken:
+            self._ray.wait(list(self._taken), num_returns=len(self._taken), timeout=60.0)
+        self._ray.shutdown()
+
+
+def import_ray() -> Any:
+    """Returns Ray.
+
+    Raises:
+      ValueError: if it is not installed.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise ValueError(
+            "Ray is not installed. Run pip install -e '.[cluster]', or leave out --ray to do "
+            "the jobs on this machine."
+        ) from error
+    return ray
+
+
+def connect(ray: Any, address: str) -> None:
+    """Connects to a cluster, whose processes find these modules.
+
+    Raises:
+      ValueError: if there is none at that address.
+    """
+    root = str(Path(__file__).resolve().parents[2])
+    try:
+        _await_answer(address)
+        ray.init(
+            address=address,
+            runtime_env={"env_vars": {"PYTHONPATH": root}},
+            include_dashboard=False if address == "local" else None,
+            logging_level="error",
+            log_to_driver=False,
+        )
+    except (OSError, RuntimeError, ValueError) as error:
+        raise ValueError(
+            f"There is no Ray cluster at {address} ({error}). Start one with ray start --head, and "
+            "give what it prints, or --ray=local."
+        ) from error
+
+
+def _await_answer(address: str) -> None:
+    """Raises an `OSError` if nothing listens at `host:port` or `ray://host:port`."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdigit():
+        socket.create_connection((host.strip("[]"), int(port)), _SECONDS_TO_ANSWER).close()
+
+
+def run_in_order(todo: Sequence[Job], engine: Engine, done: Done) -> None:
+    """Does jobs, as many at once as the engine does.
+
+    A job that waits for another of these begins when that is done, and fails if that fails. The
+    engine is stopped in the end, and at an interruption.
+    """
+    awaited = {job.name for job in todo}
+    waiting = [job for job in todo if job.awaited in awaited]
+    begun = 0
+    try:
+        for job in todo:
+            if job.awaited not in awaited:
+                engine.submit(job)
+                begun += 1
+        while begun:
+            job, reason = engine.next()
+            begun -= 1
+            done(job, reason)
+            for next_ in [each for each in waiting if each.awaited == job.name]:
+                waiting.remove(next_)
+                if reason is None:
+                    engine.submit(next_)
+                    begun += 1
+                else:
+                    done(next_, f"{job.method} failed: {reason}")
+    finally:
+        engine.stop()
+
+
+def run_missing(
+    out: Path,
+    benchmark: Benchmark,
+    planned: Sequence[Job],
+    skipped: Sequence[Skipped],
+    *,
+    engine: Callable[[], Engine],
+) -> dict[str, str]:
+    """Does the jobs that are missing, and returns why some of them failed, by name.
+
+    What failed or was left out before stays in the summary until that is otherwise: a job that
+    failed, until it has been done again.
+
+    Args:
+      out: folder of the benchmark.
+      benchmark: what it was begun with.
+      planned: what it is to do now.
+      skipped: what is left out now.
+      engine: makes what does the jobs; it is not asked if there are none.
+    """
+    failed_before, skipped_before = summary.not_done(out)
+    now = {each.name for each in (*planned, *skipped)}
+    left_out = [*(each for each in skipped_before if each.name not in now), *skipped]
+    names = {each.name for each in skipped}
+    told = {name: reason for name, reason in failed_before.items() if name not in names}
+    summary.write(out, benchmark, failed=told, skipped=left_out)
+    missing = [job for job in planned if not plan.is_done(out, job)]
+    if not missing:
+        print("All jobs are done already." if planned else "All jobs are left out.")
+        return {}
+    failed: dict[str, str] = {}
+    start, count = time.monotonic(), 0
+    doing = engine()
+    with ProgressBar("benchmark", len(missing)) as bar:
+
+        def done(job: Job, reason: str | None) -> None:
+            nonlocal count
+            count += 1
+            told.pop(job.name, None)
+            if reason is not None:
+                failed[job.name] = told[job.name] = reason
+            summary.write(out, benchmark, failed=told, skipped=left_out)
+            left = (time.monotonic() - start) / count * (len(missing) - count)
+            end = "failed" if reason is not None else "done"
+            bar.show(count, f"{job.name} {end}, about {_duration(left)} left")
+
+        run_in_order(missing, doing, done)
+    return failed
+
+
+def _duration(seconds: float) -> str:
+    minutes = round(seconds / 60.0)
+    return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{minutes} min"
