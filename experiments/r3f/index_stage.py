@@ -25,6 +25,7 @@ from refref_jax.data import local_layout, mask_margins
 from refref_jax.data.geometry import build_geometry
 from refref_jax.geometry.cameras import pixel_rays
 from refref_jax.geometry.surface_build import build_surfaces
+from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.optics.budgets import STRAIGHT
 from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.optics.scene import Scene
@@ -35,7 +36,6 @@ from refref_jax.reconstruct.index_search import (
     most_looks,
 )
 from refref_jax.reconstruct.photometry import Evidence
-from refref_jax.reconstruct.triangles import Mesh
 from refref_jax.render import saved
 from refref_jax.render.model import Model
 from refref_jax.render.saved import SavedModel

@@ -14,7 +14,7 @@ from refref_jax import configuration
 from refref_jax.data import meshes
 from refref_jax.data.geometry import shading_normals
 from refref_jax.data.meshes import MeshPart
-from refref_jax.reconstruct.triangles import Mesh
+from refref_jax.geometry.triangle_meshes import Mesh
 
 _FILE = "body.json"
 

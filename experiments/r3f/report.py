@@ -23,11 +23,11 @@ from refref_jax.geometry.cameras import Cameras, image_rays
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surface_build import build_surfaces
 from refref_jax.geometry.surfaces import Surfaces
+from refref_jax.geometry.triangle_meshes import Mesh, diameter, join
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.reconstruct.closest import signed_distance
 from refref_jax.reconstruct.comparison import compare_meshes, silhouettes
 from refref_jax.reconstruct.silhouettes import overlaps
-from refref_jax.reconstruct.triangles import Mesh, diameter, join
 from refref_jax.render.first_surface import FirstSurface, find_first_surface
 
 FOLDER = "pictures"

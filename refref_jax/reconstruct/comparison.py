@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float
 from refref_jax.geometry.cameras import Cameras, image_rays
 from refref_jax.geometry.corner_normals import unit_vectors
 from refref_jax.geometry.surface_build import build_surfaces
+from refref_jax.geometry.triangle_meshes import Mesh, diameter
 from refref_jax.reconstruct.closest import ClosestSearch
 from refref_jax.reconstruct.silhouettes import overlaps
-from refref_jax.reconstruct.triangles import Mesh, diameter
 from refref_jax.render.first_surface import find_first_surface
 
 SAMPLES = 20_000

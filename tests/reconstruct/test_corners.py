@@ -9,6 +9,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from refref_jax.geometry.cameras import project
 from refref_jax.geometry.corner_normals import face_normals
+from refref_jax.geometry.triangle_meshes import is_closed, volume
 from refref_jax.reconstruct import convex, outlines
 from refref_jax.reconstruct.comparison import silhouette_overlap
 from refref_jax.reconstruct.corners import fit_corners
@@ -16,7 +17,6 @@ from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.isosurface import find_isosurface
 from refref_jax.reconstruct.refinement import Refinement, refine
 from refref_jax.reconstruct.silhouettes import Views
-from refref_jax.reconstruct.triangles import is_closed, volume
 from refref_jax.reconstruct.visual_hull import carve
 from tests.reconstruct import bodies
 

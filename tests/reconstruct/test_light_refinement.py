@@ -6,11 +6,11 @@ import pytest
 from refref_jax.data.geometry import build_geometry
 from refref_jax.data.meshes import MeshPart
 from refref_jax.geometry.surface_build import build_surfaces
+from refref_jax.geometry.triangle_meshes import make_mesh
 from refref_jax.optics.scene import Scene
 from refref_jax.reconstruct import photometry
 from refref_jax.reconstruct.comparison import compare_meshes
 from refref_jax.reconstruct.light_refinement import LightRefinement, refine_by_light
-from refref_jax.reconstruct.triangles import make_mesh
 from tests import scenes
 from tests.reconstruct import bodies, lit_scenes
 

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from refref_jax.geometry.corner_normals import face_normals
+from refref_jax.geometry.triangle_meshes import Mesh, is_closed, make_mesh, pieces, volume
 from refref_jax.reconstruct import convex, refinement, smoothing
 from refref_jax.reconstruct.comparison import compare_meshes, silhouette_overlap
 from refref_jax.reconstruct.denoising import denoise_within
@@ -13,7 +14,6 @@ from refref_jax.reconstruct.grids import Box, sample
 from refref_jax.reconstruct.isosurface import find_isosurface
 from refref_jax.reconstruct.refinement import Refinement, keep_pieces, refine
 from refref_jax.reconstruct.silhouettes import Views, some_of
-from refref_jax.reconstruct.triangles import Mesh, is_closed, make_mesh, pieces, volume
 from tests.reconstruct import bodies
 
 _BOX = Box(np.full(3, -1.6), np.full(3, 1.6))
