@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from experiments.dataset.cameras import CAMERA_RADIUS
-from experiments.dataset.parts import Part
+from experiments.dataset.parts import ObjectPart
 from experiments.dataset.render_settings import RenderSettings
 from refref_jax.choices import NO_ABSORPTION, TwoSidedRule
 from refref_jax.data.containment import find_containment
@@ -22,7 +22,10 @@ _AIR = "air"
 
 
 def describe(
-    scene: SceneName, parts: Sequence[Part], background: dict[str, Any], settings: RenderSettings
+    scene: SceneName,
+    parts: Sequence[ObjectPart],
+    background: dict[str, Any],
+    settings: RenderSettings,
 ) -> dict[str, Any]:
     """Returns the content of `scene.json`.
 
@@ -52,12 +55,12 @@ def identify(scene: SceneName, settings: RenderSettings) -> dict[str, Any]:
     return {"scene": str(scene), "category": scene.category, **settings.record()}
 
 
-def mesh_name(scene: SceneName, part: Part) -> str:
+def mesh_name(scene: SceneName, part: ObjectPart) -> str:
     """Returns the file name of a part's mesh."""
     return f"{scene.object}_{part.name}_{part.material}.ply"
 
 
-def _describe_part(scene: SceneName, part: Part, outside: str) -> dict[str, Any]:
+def _describe_part(scene: SceneName, part: ObjectPart, outside: str) -> dict[str, Any]:
     description = {
         "mesh": f"meshes/{mesh_name(scene, part)}",
         "inside": part.material,
@@ -74,7 +77,9 @@ def _describe_part(scene: SceneName, part: Part, outside: str) -> dict[str, Any]
     return description
 
 
-def _materials_outside(scene: SceneName, parts: Sequence[Part], rule: TwoSidedRule) -> list[str]:
+def _materials_outside(
+    scene: SceneName, parts: Sequence[ObjectPart], rule: TwoSidedRule
+) -> list[str]:
     tree = find_containment([_mesh_part(part) for part in parts])
     if tree.overlaps:
         first, second = (parts[number].name for number in tree.overlaps[0])
@@ -92,14 +97,14 @@ def _materials_outside(scene: SceneName, parts: Sequence[Part], rule: TwoSidedRu
     return [_AIR if parent == NO_PARENT else parts[parent].material for parent in tree.parents]
 
 
-def _mesh_part(part: Part) -> MeshPart:
+def _mesh_part(part: ObjectPart) -> MeshPart:
     index = INDEX_OF_REFRACTION[part.material]
     return MeshPart(
         part.name, part.vertices, part.faces, index, "smooth" if part.smooth else "flat"
     )
 
 
-def _is_closed(part: Part) -> bool:
+def _is_closed(part: ObjectPart) -> bool:
     """Returns whether every edge belongs to two faces, once in each direction."""
     start, end = part.faces.ravel(), np.roll(part.faces, -1, axis=1).ravel()
     edges = start.astype(np.int64) * len(part.vertices) + end
