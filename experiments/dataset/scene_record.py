@@ -16,6 +16,7 @@ from refref_jax.choices import NO_ABSORPTION, TwoSidedRule
 from refref_jax.data.containment import find_containment
 from refref_jax.data.meshes import INDEX_OF_REFRACTION, MeshPart
 from refref_jax.data.scene_names import SceneName
+from refref_jax.geometry.triangle_meshes import is_closed
 from refref_jax.optics.interface_rules import NO_PARENT
 
 _AIR = "air"
@@ -69,7 +70,7 @@ def _describe_part(scene: SceneName, part: ObjectPart, outside: str) -> dict[str
         "ior_outside": INDEX_OF_REFRACTION[outside],
         "smooth_normals": part.smooth,
         "colour_per_interface": list(part.tint),
-        "watertight": _is_closed(part),
+        "watertight": is_closed(part.faces.astype(np.int64), once=True),
         "faces": len(part.faces),
     }
     if part.absorption != NO_ABSORPTION:
@@ -80,7 +81,7 @@ def _describe_part(scene: SceneName, part: ObjectPart, outside: str) -> dict[str
 def _materials_outside(
     scene: SceneName, parts: Sequence[ObjectPart], rule: TwoSidedRule
 ) -> list[str]:
-    tree = find_containment([_mesh_part(part) for part in parts])
+    tree = find_containment([mesh_part(part) for part in parts])
     if tree.overlaps:
         first, second = (parts[number].name for number in tree.overlaps[0])
         raise ValueError(
@@ -97,16 +98,9 @@ def _materials_outside(
     return [_AIR if parent == NO_PARENT else parts[parent].material for parent in tree.parents]
 
 
-def _mesh_part(part: ObjectPart) -> MeshPart:
+def mesh_part(part: ObjectPart) -> MeshPart:
+    """Returns a part as the library reads it again, without its colour."""
     index = INDEX_OF_REFRACTION[part.material]
     return MeshPart(
         part.name, part.vertices, part.faces, index, "smooth" if part.smooth else "flat"
     )
-
-
-def _is_closed(part: ObjectPart) -> bool:
-    """Returns whether every edge belongs to two faces, once in each direction."""
-    start, end = part.faces.ravel(), np.roll(part.faces, -1, axis=1).ravel()
-    edges = start.astype(np.int64) * len(part.vertices) + end
-    mirrored = end.astype(np.int64) * len(part.vertices) + start
-    return bool(len(np.unique(edges)) == len(edges) and set(edges) == set(mirrored))

@@ -74,12 +74,18 @@ def neighbours(
     return owner[same], owner[same + 1], edges[same]
 
 
-def is_closed(faces: Faces) -> bool:
-    """Returns whether every edge is used as often in one direction as in the other."""
+def is_closed(faces: Faces, *, once: bool = False) -> bool:
+    """Returns whether every edge is used as often in one direction as in the other.
+
+    Args:
+      faces: of the mesh.
+      once: whether it has to be used once in each, by two faces.
+    """
     start, end = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
     size = int(faces.max(initial=0)) + 1
     forward, backward = np.sort(start * size + end), np.sort(end * size + start)
-    return np.array_equal(forward, backward)
+    closed = np.array_equal(forward, backward)
+    return bool(closed and not (once and np.any(np.diff(forward) == 0)))
 
 
 def diameter(vertices: Vertices) -> float:

@@ -5,10 +5,9 @@ import collections
 import numpy as np
 import pytest
 
-from experiments.dataset import catalogue
+from experiments.dataset import catalogue, scene_record
 from experiments.dataset.parts import RADIUS
 from refref_jax.data import containment, lint
-from refref_jax.data.meshes import INDEX_OF_REFRACTION, MeshPart
 
 
 def test_there_are_as_many_of_each_category_as_in_the_paper():
@@ -21,16 +20,7 @@ def test_there_are_as_many_of_each_category_as_in_the_paper():
 def test_the_lint_finds_nothing(name):
     if name == "monkey" and not catalogue.SUZANNE.is_file():
         pytest.skip("the monkey is exported by the first dataset.make that renders it")
-    parts = [
-        MeshPart(
-            part.name,
-            part.vertices,
-            part.faces,
-            INDEX_OF_REFRACTION[part.material],
-            "smooth" if part.smooth else "flat",
-        )
-        for part in catalogue.OBJECTS[name].make(1.0)
-    ]
+    parts = [scene_record.mesh_part(part) for part in catalogue.OBJECTS[name].make(1.0)]
     tree = containment.find_containment(parts)
     assert [str(each) for each in lint.lint(parts, tree) if each.severity != "note"] == []
     assert max(np.linalg.norm(part.vertices, axis=1).max() for part in parts) <= RADIUS
