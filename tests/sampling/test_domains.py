@@ -16,11 +16,10 @@ _ROUNDING = 1e-6
 _MAGNITUDES = 10.0 ** np.arange(-6, 7)
 
 _contract = jax.jit(domains.contract)
-_uncontract = jax.jit(domains.uncontract)
 _shrinkage = jax.jit(domains.shrinkage)
 _to_unit_cube = jax.jit(domains.to_unit_cube, static_argnums=0)
 
-_FUNCTIONS = (domains.contract, domains.uncontract, domains.shrinkage)
+_FUNCTIONS = (domains.contract, domains.shrinkage)
 _JACOBIANS = {function: jax.jit(jax.vmap(jax.jacrev(function))) for function in _FUNCTIONS}
 
 
@@ -164,27 +163,10 @@ def test_contract_against_its_definition(magnitude):
     np.testing.assert_allclose(_contract(points), expected, rtol=_ROUNDING, atol=_ROUNDING)
 
 
-@pytest.mark.parametrize("magnitude", _MAGNITUDES)
-def test_uncontract_inverts_contract(magnitude):
-    # Near the sphere of radius 2 a rounding is a share `|x|` of the whole distance.
-    points = _points(magnitude)
-    tolerance = _ROUNDING * max(magnitude, 1.0)
-    back = np.asarray(_uncontract(_contract(points)), np.float64)
-    error = (back - np.asarray(points, np.float64)) / magnitude
-    assert np.linalg.norm(error, axis=-1).max() <= tolerance
-
-
-@pytest.mark.parametrize("radius", [1e-6, 0.5, 1.0, 1.5, 1.99])
-def test_contract_inverts_uncontract(radius):
-    points = _points(radius)
-    np.testing.assert_allclose(_contract(_uncontract(points)), points, atol=_ROUNDING)
-
-
 @pytest.mark.parametrize("magnitude", [0.0, 1e-30, 1e-6, 0.3, 0.999])
 def test_the_unit_ball_stays_as_it_is(magnitude):
     points = _points(magnitude)
     np.testing.assert_array_equal(_contract(points), points)
-    np.testing.assert_array_equal(_uncontract(points), points)
     np.testing.assert_array_equal(_shrinkage(points), np.ones(20))
 
 
@@ -306,11 +288,6 @@ def test_gradients_are_finite_at_any_distance(function, magnitude):
     assert gradients.all_finite(_JACOBIANS[function](_points(magnitude)))
 
 
-@pytest.mark.parametrize("radius", [0.0, 1e-30, 0.5, 1.0, 1.999])
-def test_gradients_of_uncontract_are_finite(radius):
-    assert gradients.all_finite(_JACOBIANS[domains.uncontract](_points(radius)))
-
-
 @pytest.mark.parametrize("magnitude", [3.0, 1e3, 1e6])
 def test_contract_has_the_right_gradient_far_away(magnitude):
     points = _points(magnitude)
@@ -345,7 +322,6 @@ _SOME = (jnp.stack([_points(x) for x in (0.5, 1.0, 20.0)]), jnp.ones((3, 20)))
 
 _CASES = {
     "contract": lambda x, scales: domains.contract(x),
-    "uncontract": lambda x, scales: domains.uncontract(0.05 * x),
     "shrinkage": lambda x, scales: domains.shrinkage(x),
     "bounded": lambda x, scales: _box(x, scales, domain=_BOUNDED),
     "unbounded": lambda x, scales: _box(x, scales, domain=_UNBOUNDED),
