@@ -132,6 +132,10 @@ def test_masks_mean_what_they_are_said_to(folder, tmp_path):
     assert np.argwhere(local_layout.read_masks(frames)[0]).tolist() == [[2, 3]]
     assert _convert(folder, tmp_path / "none", "none").masked is None
     assert local_layout.read_frames(tmp_path / "none", "train").masks is None
+    shutil.rmtree(folder / "masks")
+    edit(folder, lambda content: [record.pop("mask_path") for record in content["frames"]])
+    assert _convert(folder, tmp_path / "scene").masked is None
+    assert local_layout.read_frames(tmp_path / "scene", "train").masks is None
 
 
 def test_what_masks_are_written_for_nerfstudio(tmp_path):
@@ -178,12 +182,8 @@ def _tall(folder):
     edit(folder, change)
 
 
-def _small_mask(folder):
-    files.write_mask(folder / "masks" / "frame_00003.png", np.ones((5, 6), bool))
-
-
-def _empty_mask(folder):
-    files.write_mask(folder / "masks" / "frame_00003.png", np.zeros((HEIGHT, WIDTH), bool))
+def _mask(folder, marked):
+    files.write_mask(folder / "masks" / "frame_00003.png", marked.astype(bool))
 
 
 def _focals(values):
@@ -202,8 +202,14 @@ def _focals(values):
         (lambda folder: edit(folder, lambda c: c.update(fl_y=12.0)), "are not square: fl_x is 9"),
         (_focals([9.0] * 8 + [12.0]), r"frame_00008\.png is 12 pixels, but the mean is 9\.33"),
         (lambda folder: edit(folder, lambda c: c.update(cx=1.0)), r"point of .* is \(1, 5\), far"),
-        (_small_mask, r"frame_00003\.png is 6 x 5 pixels, but its image 12 x 10"),
-        (_empty_mask, r"frame_00003\.png marks no object, taking object for white"),
+        (
+            lambda f: _mask(f, np.ones((5, 6))),
+            r"frame_00003\.png is 6 x 5 pixels, but its",
+        ),
+        (
+            lambda f: _mask(f, np.zeros((HEIGHT, WIDTH))),
+            r"frame_00003\.png marks no object",
+        ),
     ],
 )
 def test_what_a_scene_can_not_hold_is_refused(folder, tmp_path, spoil, message):
@@ -218,10 +224,3 @@ def test_focal_lengths_that_differ_by_less_than_shows_share_their_mean(folder, t
     done = _convert(folder, tmp_path / "scene")
     assert done.lens.focal == pytest.approx(9.01)
     assert done.lens.stretch == pytest.approx(0.08 / 9.01 * 6.0)  # at the image's border
-
-
-def test_a_capture_without_masks(folder, tmp_path):
-    shutil.rmtree(folder / "masks")
-    edit(folder, lambda content: [record.pop("mask_path") for record in content["frames"]])
-    assert _convert(folder, tmp_path / "scene").masked is None
-    assert local_layout.read_frames(tmp_path / "scene", "train").masks is None
