@@ -11,11 +11,11 @@ from refref_jax.data.containment import (
     winding_number,
 )
 from refref_jax.data.meshes import read_meshes
-from refref_jax.geometry.triangle_meshes import volume
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import EMPTY_SLOT, SLOTS
 from tests.data.expectations import scene_error
 from tests.data.solids import as_part, ball, box, inverted, joined, shell
+from tests.scenes import volume_of
 
 # Sums of solid angles in double precision.
 _EXACT = 1e-9
@@ -114,24 +114,20 @@ def test_winding_number_beyond_the_bounding_box_is_exactly_zero():
 # Volumes.
 
 
-def _volume(part):
-    return volume(part.vertices, part.faces)
-
-
 def test_volume_of_a_box_by_hand():
     part = box(size=(1.0, 2.0, 3.0))
-    assert _volume(part) == pytest.approx(6.0)
-    assert _volume(inverted(part)) == pytest.approx(-6.0)
+    assert volume_of(part) == pytest.approx(6.0)
+    assert volume_of(inverted(part)) == pytest.approx(-6.0)
 
 
 def test_volume_does_not_change_far_from_the_origin():
     moved = ball(centre=(1.1e6, -1.3e6, 1.7e6))
-    assert _volume(moved) == pytest.approx(_volume(ball()), rel=1e-7)
+    assert volume_of(moved) == pytest.approx(volume_of(ball()), rel=1e-7)
 
 
 def test_volume_of_a_hollow_ball_is_the_difference():
-    solid, cavity = _volume(ball(radius=2.0)), _volume(ball(radius=1.5))
-    assert _volume(shell()) == pytest.approx(solid - cavity)
+    solid, cavity = volume_of(ball(radius=2.0)), volume_of(ball(radius=1.5))
+    assert volume_of(shell()) == pytest.approx(solid - cavity)
     # An inscribed polyhedron of 320 faces has 96 % of the ball's volume.
     assert 0.95 < solid / (4.0 / 3.0 * np.pi * 8.0) < 1.0
 

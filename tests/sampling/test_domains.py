@@ -8,7 +8,7 @@ import pytest
 from refref_jax.sampling import domains
 from refref_jax.sampling.cones import Gaussians
 from refref_jax.sampling.domains import Domain
-from tests import gradients, reference_sampling, transformations
+from tests import arrays, gradients, reference_sampling, transformations
 
 # A few float32 roundings.
 _ROUNDING = 1e-6
@@ -45,13 +45,8 @@ _SPHERICAL = Domain(radius=2.0, space="spherical")
 _exit_distance = jax.jit(domains.exit_distance, static_argnums=0)
 
 
-def _unit(vector):
-    vector = np.asarray(vector, np.float64)
-    return vector / np.linalg.norm(vector)
-
-
 def _assert_exit(domain, origin, direction, expected):
-    ray = (jnp.asarray(x, jnp.float32) for x in (origin, _unit(direction)))
+    ray = (jnp.asarray(x, jnp.float32) for x in (origin, arrays.unit(direction)))
     np.testing.assert_allclose(_exit_distance(domain, *ray), expected, rtol=_ROUNDING)
 
 
@@ -79,7 +74,7 @@ def test_exit_lies_on_a_face_and_nothing_beyond_it_inside(radius):
     rng = np.random.default_rng(3)
     domain = Domain(radius=radius, space="bounded")
     for _ in range(20):
-        origin, direction = rng.uniform(-radius, radius, size=3), _unit(rng.normal(size=3))
+        origin, direction = rng.uniform(-radius, radius, size=3), arrays.unit(rng.normal(size=3))
         t = _exit_distance(domain, *(jnp.asarray(x, jnp.float32) for x in (origin, direction)))
         end = origin + float(t) * direction
         np.testing.assert_allclose(np.max(abs(end)), radius, rtol=1e-5)
@@ -108,8 +103,8 @@ def test_exit_lies_on_the_sphere(radius):
     rng = np.random.default_rng(3)
     domain = Domain(radius=radius, space="spherical")
     for _ in range(20):
-        origin = rng.uniform(0.0, radius) * _unit(rng.normal(size=3))
-        direction = _unit(rng.normal(size=3))
+        origin = rng.uniform(0.0, radius) * arrays.unit(rng.normal(size=3))
+        direction = arrays.unit(rng.normal(size=3))
         given = (jnp.asarray(x, jnp.float32) for x in (origin, direction))
         end = origin + float(_exit_distance(domain, *given)) * direction
         np.testing.assert_allclose(np.linalg.norm(end), radius, rtol=1e-6)
