@@ -1,8 +1,5 @@
 """The figures of docs/glass.md: what is drawn of bodies and paths, and the command once."""
 
-import subprocess
-import sys
-
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -112,34 +109,6 @@ def test_every_drawing_is_a_picture_with_something_in_it(tmp_path):
         picture = iio.imread(path)
         assert picture.shape[0] > 300 and picture.shape[1] > 600
         assert picture.min() < 64 and picture.max() > 240 and picture.std() > 5.0
-
-
-_STAND_IN = """
-import sys
-from pathlib import Path
-from absl import flags
-from experiments import glass_figures
-draw = {name: lambda path: path.write_text("drawn") for name in glass_figures.FIGURES}
-glass_figures._drawers = lambda folder, indices: draw
-glass_figures.cli_scenes.opened = Path  # so that JAX is not imported
-flags.FLAGS(["glass_figures", *sys.argv[1:]])
-glass_figures.main()
-"""
-
-
-def test_one_figure_is_drawn_anew_and_the_others_stay(tmp_path):
-    def draw(*options):
-        words = [sys.executable, "-c", _STAND_IN, f"--scene={_SCENE}", f"--out={tmp_path}"]
-        subprocess.run([*words, *options], check=True, cwd=ROOT, capture_output=True)
-        return {path.name: path.read_text() for path in tmp_path.glob("*.jpg")}
-
-    names = {f"glass_{name}.jpg" for name in ("views", "fan", "tree", "distances")}
-    assert draw("--figure=fan") == {"glass_fan.jpg": "drawn"}
-    assert set(draw("--figure=views", "--figure=tree", "--figure=distances")) == names
-    for name in names:
-        (tmp_path / name).write_text("old")
-    changed = draw("--figure=tree", "--overwrite")
-    assert changed == dict.fromkeys(names, "old") | {"glass_tree.jpg": "drawn"}
 
 
 @pytest.mark.slow

@@ -10,9 +10,8 @@ from experiments.dataset.check_page import SceneReport, write_page
 from refref_jax.data.findings import Finding
 from refref_jax.optics import budgets
 from tests.data.small_scenes import truncate
-from tests.experiments.command import ROOT, run_command
-
-_SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
+from tests.experiments.command import run_command
+from tests.experiments.dataset.cut_ball import cut_ball
 
 
 def _view(**changes):
@@ -31,14 +30,7 @@ def _view(**changes):
 
 @pytest.fixture
 def copy(tmp_path):
-    """The bundled scene with two frames a split."""
-    scene = tmp_path / "scenes" / "cube_smcvx_ball"
-    shutil.copytree(_SCENE, scene)
-    for path in scene.glob("transforms_*.json"):
-        content = json.loads(path.read_text())
-        content["frames"] = content["frames"][:2]
-        path.write_text(json.dumps(content))
-    return scene
+    return cut_ball(tmp_path / "scenes" / "cube_smcvx_ball")
 
 
 def test_pixels_near_a_silhouette_are_left_out_by_hand():
@@ -112,7 +104,7 @@ def test_a_mesh_that_is_not_where_it_was_rendered_is_found(copy):
 def test_a_broken_scene_is_reported_and_the_others_go_on(copy):
     other = copy.parent / "cube_smcvx_other"
     shutil.copytree(copy, other)
-    picture = other / "mask" / "val" / "r_001.png"
+    picture = other / "mask" / "val" / "r_000.png"
     truncate(picture)
     out = copy.parents[1] / "report"
     result = run_command("dataset.check", copy.parent, "--views=0", f"--out={out}", fails=True)

@@ -21,7 +21,7 @@ from experiments.dataset.objects import (
     perfumes,
     quadrics,
 )
-from experiments.dataset.objects.formed import centred, spacing
+from experiments.dataset.objects.formed import spacing
 from experiments.dataset.objects.isosurface import Surface
 from experiments.dataset.parts import RADIUS
 from refref_jax.choices import CLEAR, NO_ABSORPTION
@@ -246,13 +246,6 @@ def test_the_brilliant_has_the_facets_of_its_cut():
 def test_detail_makes_finer_triangles_but_walls_set_the_coarsest():
     assert spacing(1.0, thinnest=1.0) == pytest.approx(0.5 * spacing(0.5, thinnest=1.0))
     assert spacing(0.1, thinnest=0.1) < 0.12
-
-
-def test_centring():
-    part = _only("cube")
-    moved = part._replace(vertices=0.3 * part.vertices + [1.0, 2.0, 3.0])
-    [back] = centred([moved], 1.5)
-    np.testing.assert_allclose(back.vertices, part.vertices * 1.5 / np.sqrt(3 * 0.95**2))
 
 
 # The monkey.

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from experiments.dataset.objects.profiles import (
-    arc,
     filleted,
     joined,
     resampled,
@@ -20,14 +19,7 @@ from experiments.dataset.objects.regions import (
     rounded,
     top,
 )
-
-
-def _distances(points, curve):
-    """Distance of points from a polyline, edge by edge."""
-    start, way = curve[:-1], np.diff(curve, axis=0)
-    off = points[:, None] - start
-    along = np.clip(np.sum(off * way, -1) / np.sum(way**2, -1), 0.0, 1.0)
-    return np.linalg.norm(off - along[..., None] * way, axis=-1).min(axis=1)
+from tests.experiments.dataset.polylines import distances
 
 
 def _turns(curve):
@@ -69,7 +61,7 @@ def test_fillets_that_have_no_room_are_refused():
 def test_a_smooth_curve_passes_its_points_and_ends_as_it_is_told():
     knots = [(0.0, 0.0), (0.8, 0.6), (0.5, 1.2), (0.0, 1.5)]
     curve = smooth(knots)
-    assert _distances(np.array(knots), curve).max() < 1e-5
+    assert distances(np.array(knots), curve).max() < 1e-5
     sides = np.diff(curve, axis=0)[[0, -1]]
     ways = sides / np.linalg.norm(sides, axis=1, keepdims=True)
     np.testing.assert_allclose(ways[:, 0], [1.0, -1.0], atol=1e-3)  # perpendicular to the axis
@@ -90,7 +82,7 @@ def test_edges_keep_to_the_sampling_and_to_the_curve(detail):
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     assert lengths.max() <= cut.edge * (1.0 + 1e-9)
     assert np.max(np.abs(_turns(points))) <= 1.2 * cut.turn
-    assert _distances(points, curve).max() < 1e-9
+    assert distances(points, curve).max() < 1e-9
     assert np.max(np.maximum(lengths[1:] / lengths[:-1], lengths[:-1] / lengths[1:])) < 1.7
     np.testing.assert_array_equal(points[[0, -1]], curve[[0, -1]])
 
@@ -103,22 +95,15 @@ def test_an_offset_lies_at_its_distance_everywhere(distance):
     curve = _bottle()
     [found] = profiles(offset(region(curve), distance))
     whole = joined(curve, (curve * [-1.0, 1.0])[::-1])
-    np.testing.assert_allclose(_distances(found, whole), abs(distance), atol=2e-4)
+    np.testing.assert_allclose(distances(found, whole), abs(distance), atol=2e-4)
     assert found[0, 0] == 0.0 == found[-1, 0]
+    assert offset(region(curve), -1.1).is_empty()
 
 
 def test_an_offset_does_not_cross_itself_where_a_neck_closes():
     [found] = profiles(offset(region(_bottle()), -0.45))  # wider than the neck's 0.4
     assert found[:, 1].max() < 1.9
     assert np.all(np.diff(np.unwrap(np.arctan2(found[:, 1] - 0.9, found[:, 0]))) > 0.0)
-
-
-def test_shrinking_and_growing_a_ball():
-    ball = region(arc((0.0, 0.0), 1.0, -90.0, 90.0))
-    [found] = profiles(offset(ball, -0.3))
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 0.7, atol=1e-4)
-    assert offset(ball, -1.1).is_empty()
-    assert offset(ball, 0.0) is ball
 
 
 # Regions.

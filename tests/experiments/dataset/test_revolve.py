@@ -8,12 +8,10 @@ from experiments.dataset.objects.revolve import (
     Turned,
     faded,
     polygon,
-    ramp,
     revolve,
     round_about,
     section_angles,
     waves,
-    within,
 )
 
 _FINE = Sampling(edge=0.02, turn=0.03, segments=360)
@@ -107,15 +105,6 @@ def test_angles_crowd_at_corners_and_go_around_once():
     assert np.all(steps > 0.0) and angles[0] >= 0.0 and angles[-1] < 2.0 * np.pi
     corner = np.abs(angles[:-1] % (0.5 * np.pi) - 0.25 * np.pi) < 0.05
     assert steps[corner].mean() < 0.5 * steps[~corner].mean()
-
-
-def test_ramps_are_smooth_and_monotone():
-    values = np.linspace(-1.0, 2.0, 301)
-    steps = ramp(values, 0.0, 1.0)
-    assert steps[0] == 0.0 and steps[-1] == 1.0 and np.all(np.diff(steps) >= 0.0)
-    assert ramp(np.array(0.5), 0.0, 1.0) == pytest.approx(0.5)
-    inside = within(np.array([0.0, 0.1, 0.5, 0.9, 1.0]), 0.0, 1.0, soft=0.1)
-    np.testing.assert_allclose(inside, [0.0, 1.0, 1.0, 1.0, 0.0], atol=1e-12)
 
 
 # Meshes.

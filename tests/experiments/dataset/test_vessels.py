@@ -5,23 +5,21 @@ import trimesh
 from experiments.dataset.objects.placing import centred, enlarged, moved, tilted, united
 from experiments.dataset.objects.profiles import Sampling, arc, filleted
 from experiments.dataset.objects.regions import box, profiles, region
-from experiments.dataset.objects.sticks import Stick, bundle, piece
+from experiments.dataset.objects.sticks import Stick, piece
 from experiments.dataset.objects.vessels import (
     FILM,
     GLASS,
     Look,
     body,
-    cap,
     filled,
     hollow,
     open_mouth,
     resized,
-    rod,
     sealed,
     space_in,
-    stopper,
     vessel,
 )
+from tests.experiments.dataset.polylines import distances
 
 _FINE = Sampling(edge=0.04, turn=0.1, segments=180)
 _WATER = Look("water", tint=(0.5, 0.8, 0.9))
@@ -77,7 +75,7 @@ def test_a_liquid_fills_the_space_up_to_the_film_and_stays_apart():
     assert liquid[-1] == pytest.approx([0.0, 1.2 - FILM], abs=1e-4)
     assert 1.2 - FILM < shapes.liquid.bounds()[3] < 1.2 + 0.06
     assert glass[-1] == pytest.approx([0.0, 1.2], abs=1e-4) and glass[:, 1].max() <= 2.0
-    assert _gap(liquid, glass) == pytest.approx(FILM, abs=2e-4)
+    assert distances(liquid, glass).min() == pytest.approx(FILM, abs=2e-4)
     assert _volume(shapes.liquid) == pytest.approx(np.pi * 0.81 * (1.1 - FILM), rel=0.02)
     small = resized(shapes, 0.5)
     assert small.glass.bounds() == pytest.approx((-0.5, 0.0, 0.5, 1.0), abs=1e-3)
@@ -95,7 +93,7 @@ def test_a_sealed_vessel_holds_liquid_and_air_with_a_film_between():
     liquid, air = profiles(shapes.liquid)[0], profiles(shapes.air)[0]
     assert liquid[-1] == pytest.approx([0.0, 1.19], abs=1e-4)
     assert air[0] == pytest.approx([0.0, 1.21], abs=1e-4)
-    assert _gap(liquid, air) == pytest.approx(0.02, abs=2e-4)
+    assert distances(liquid, air).min() == pytest.approx(0.02, abs=2e-4)
     assert (shapes.liquid ^ shapes.air).is_empty()
 
 
@@ -123,15 +121,6 @@ def test_a_body_with_a_cavity_is_one_part():
     assert mesh.volume == pytest.approx(expected, rel=5e-3)
 
 
-def test_stoppers_caps_and_rods():
-    plug = stopper(0.2, low=0.0, high=0.8, head=0.4, rim=0.5)
-    assert _radius_at(plug, 0.3) == pytest.approx(0.2, abs=1e-4)
-    assert _radius_at(plug, 0.7) == pytest.approx(0.4, abs=1e-4)
-    lid = cap(0.5, low=0.0, high=0.8, bore=0.4, ceiling=0.6)
-    assert lid.area() == pytest.approx(2.0 * (0.1 * 0.6 + 0.5 * 0.2), rel=0.02)
-    assert _volume(rod(0.1, 0.0, 1.0)) == pytest.approx(np.pi * 0.01, rel=0.05)
-
-
 # Sticks, and placing.
 
 
@@ -146,28 +135,13 @@ def test_a_piece_lies_on_its_stick_between_its_heights():
     assert (heights.min(), heights.max()) == pytest.approx((0.8, 2.0), abs=1e-6)
 
 
-def test_sticks_of_a_bundle_never_meet():
-    radius, height = 0.03, np.linspace(-1.0, 2.0, 200)[:, None]
-    sticks = bundle(6, waist=0.12, height=0.5, slope=0.24, radius=radius)
-    lines = [np.array(s.origin) + (height - s.origin[2]) * np.array(s.way) for s in sticks]
-    apart = [
-        np.linalg.norm(one[:, None] - other[None], axis=-1).min()
-        for i, one in enumerate(lines)
-        for other in lines[:i]
-    ]
-    assert min(apart) > 2.0 * radius + 0.008
-
-
 def test_placing_keeps_shapes():
     part = body("x", GLASS, box(0.5, 0.0, 1.0), _FINE)
     [there] = moved([part], (1.0, 2.0, 3.0))
-    np.testing.assert_allclose(
-        there.vertices - part.vertices, np.tile([1, 2, 3], (len(part.vertices), 1))
-    )
+    np.testing.assert_allclose(there.vertices, np.add(part.vertices, (1.0, 2.0, 3.0)))
     [middle] = centred([there])
-    np.testing.assert_allclose(
-        middle.vertices.max(axis=0) + middle.vertices.min(axis=0), 0, atol=1e-12
-    )
+    ends = middle.vertices.max(axis=0) + middle.vertices.min(axis=0)
+    np.testing.assert_allclose(ends, 0.0, atol=1e-12)
     [larger] = enlarged([middle], 2.0)
     assert np.ptp(larger.vertices[:, 2]) == pytest.approx(2.0)
     [lying] = tilted([middle], axis="y", degrees=90.0)
@@ -175,11 +149,3 @@ def test_placing_keeps_shapes():
     both = united([part, there])
     assert both.name == "x" and len(both.faces) == 2 * len(part.faces)
     assert both.faces.max() == len(both.vertices) - 1
-
-
-def _gap(one, other):
-    """Shortest distance of points of one curve from the edges of another."""
-    start, way = other[:-1], np.diff(other, axis=0)
-    off = one[:, None] - start
-    along = np.clip(np.sum(off * way, -1) / np.sum(way**2, -1), 0.0, 1.0)
-    return np.linalg.norm(off - along[..., None] * way, axis=-1).min()
