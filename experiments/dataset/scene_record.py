@@ -16,7 +16,7 @@ from refref_jax.choices import NO_ABSORPTION, TwoSidedRule
 from refref_jax.data.containment import find_containment
 from refref_jax.data.meshes import INDEX_OF_REFRACTION, MeshPart
 from refref_jax.data.scene_names import SceneName
-from refref_jax.geometry.triangle_meshes import is_closed
+from refref_jax.geometry.triangle_meshes import is_watertight
 from refref_jax.optics.interface_rules import NO_PARENT
 
 _AIR = "air"
@@ -70,7 +70,7 @@ def _describe_part(scene: SceneName, part: ObjectPart, outside: str) -> dict[str
         "ior_outside": INDEX_OF_REFRACTION[outside],
         "smooth_normals": part.smooth,
         "colour_per_interface": list(part.tint),
-        "watertight": is_closed(part.faces.astype(np.int64), once=True),
+        "watertight": is_watertight(part.faces.astype(np.int64)),
         "faces": len(part.faces),
     }
     if part.absorption != NO_ABSORPTION:

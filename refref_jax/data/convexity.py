@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from refref_jax.data.meshes import MeshPart
 from refref_jax.geometry.corner_normals import is_degenerate
-from refref_jax.geometry.triangle_meshes import is_closed, volume
+from refref_jax.geometry.triangle_meshes import is_watertight, volume
 
 TOLERANCE = 1e-5
 """How deep below its convex hull a surface may lie, as a share of its diagonal.
@@ -33,7 +33,7 @@ def is_convex(part: MeshPart) -> bool:
     there is no reflex edge.
     """
     faces = part.faces[~is_degenerate(part.vertices[part.faces])]
-    if len(faces) == 0 or not is_closed(faces, once=True):
+    if len(faces) == 0 or not is_watertight(faces):
         return False
     try:
         hull = ConvexHull(part.vertices)
