@@ -21,6 +21,7 @@ import trimesh
 from absl import app, flags
 
 from refref_jax.geometry.cameras import Cameras, focal_length
+from refref_jax.geometry.triangle_meshes import Mesh, make_mesh, volume
 from refref_jax.reconstruct.comparison import (
     Distance,
     compare_meshes,
@@ -31,7 +32,6 @@ from refref_jax.reconstruct.convex import depth_below_hull, hull
 from refref_jax.reconstruct.isosurface import find_isosurface
 from refref_jax.reconstruct.refinement import PAPER, Refinement, Stage, refine, remesh
 from refref_jax.reconstruct.silhouettes import Views
-from refref_jax.reconstruct.triangles import Mesh, make_mesh, volume
 from refref_jax.reconstruct.visual_hull import carve
 
 _VIEWS = flags.DEFINE_integer("views", 60, "Views to carve with.")

@@ -16,7 +16,8 @@ from absl import app, flags
 from experiments.r3f import chain, index_stage, object_source
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import meshes
-from refref_jax.reconstruct.triangles import Mesh
+from refref_jax.data.geometry import shaded_mesh
+from refref_jax.geometry.triangle_meshes import Mesh
 
 _BODIES = {"true": 0.005, "masks": 0.02}
 
@@ -36,7 +37,7 @@ def main(arguments: list[str]) -> None:
         name, out = scene.resolve().name, Path(_OUT.value) / scene.resolve().name
         (part,) = meshes.read_meshes(scene)
         for kind in _BODY.value:
-            mesh = object_source.mesh_of(part) if kind == "true" else _mesh_of_masks(scene, out)
+            mesh = shaded_mesh(part) if kind == "true" else _mesh_of_masks(scene, out)
             for start in starts:
                 begun = time.monotonic()
                 found = index_stage.run(scene, mesh, out, seed=0, start=start)

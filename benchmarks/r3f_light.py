@@ -17,6 +17,7 @@ from absl import app, flags
 from experiments.r3f import chain, index_stage, light_stage, object_source
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import meshes
+from refref_jax.data.geometry import shaded_mesh
 from refref_jax.reconstruct.comparison import Distance, compare_meshes
 
 _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folder of a scene.")
@@ -31,7 +32,7 @@ def main(arguments: list[str]) -> None:
     del arguments
     scene, out = Path(_SCENE.value), Path(_OUT.value)
     (part,) = meshes.read_meshes(scene)
-    truth = object_source.mesh_of(part)
+    truth = shaded_mesh(part)
     found = chain.reconstruct(scene, out, _config(), compare=False)
     masked = dataclasses.replace(found, light=None)
     model = index_stage.learn_background(scene, out / "index", seed=_SEED)

@@ -24,6 +24,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from refref_jax.data import local_layout
 from refref_jax.geometry.cameras import Cameras
+from refref_jax.geometry.triangle_meshes import Mesh, make_mesh, volume
 from refref_jax.reconstruct import occupancy
 from refref_jax.reconstruct.agreement import without_outliers
 from refref_jax.reconstruct.comparison import Distance, compare_meshes, silhouette_overlap
@@ -32,7 +33,6 @@ from refref_jax.reconstruct.isosurface import find_isosurface
 from refref_jax.reconstruct.occupancy_config import OccupancyTrainingConfig
 from refref_jax.reconstruct.refinement import Refinement, refine
 from refref_jax.reconstruct.silhouettes import Views
-from refref_jax.reconstruct.triangles import Mesh, make_mesh, volume
 from refref_jax.reconstruct.visual_hull import carve
 
 Masks = Bool[np.ndarray, "views h w"]

@@ -1,14 +1,19 @@
 """Small scenes with known answers, and rays to send into them."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
 
+from refref_jax.data import meshes
 from refref_jax.data.containment import find_containment
 from refref_jax.data.geometry import build_geometry
 from refref_jax.data.meshes import MeshPart
 from refref_jax.geometry.rays import Rays
+from refref_jax.geometry.triangle_meshes import volume
+from refref_jax.optics import path_tracing
 
 
 def ball(radius=1.0, *, index=1.5, subdivisions=4, centre=(0.0, 0.0, 0.0), name="ball_glass"):
@@ -43,3 +48,20 @@ def rays(origins, directions):
         jnp.asarray(unit, jnp.float32),
         jnp.full(len(origins), 1e-3, jnp.float32),
     )
+
+
+@functools.cache
+def read_geometry(scene):
+    """Returns what the meshes of a scene's folder make, under the rule `nested`."""
+    return geometry(*meshes.read_meshes(scene))
+
+
+@functools.partial(jax.jit, static_argnames="budget")
+def trace_ends(geometry, rays, *, budget):
+    """Traces a batch of rays in one program."""
+    return path_tracing.trace_ends(geometry, rays, budget=budget)
+
+
+def volume_of(mesh):
+    """Returns the volume inside a mesh or a part, negative if its faces point inwards."""
+    return volume(mesh.vertices, mesh.faces)

@@ -4,7 +4,6 @@ Every trace runs under JAX's check for NaN. The reference (`reference_tree`) get
 corners, after they were rounded to single precision.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -14,7 +13,6 @@ import trimesh
 
 from refref_jax.data.geometry import build_geometry
 from refref_jax.data.meshes import MeshPart
-from refref_jax.optics import path_tracing
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.interface_rules import NO_PARENT
 from tests import reference_surfaces, reference_tree, scenes
@@ -80,15 +78,10 @@ def build(*parts):
     return jax.tree.map(jnp.asarray, built)
 
 
-@functools.partial(jax.jit, static_argnames="budget")
-def _trace(geometry, rays, *, budget):
-    return path_tracing.trace_ends(geometry, rays, budget=budget)
-
-
 def trace(geometry, rays, *, budget):
     """Traces, and refuses any NaN on the way."""
     with jax.debug_nans(True):
-        return jax.tree.map(np.asarray, _trace(geometry, rays, budget=budget))
+        return jax.tree.map(np.asarray, scenes.trace_ends(geometry, rays, budget=budget))
 
 
 def trace_in_double(geometry, rays, *, budget):

@@ -4,31 +4,22 @@ import functools
 
 import imageio.v3 as iio
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
-from refref_jax.data import background, containment, local_layout, meshes
-from refref_jax.data.geometry import build_geometry
+from refref_jax.data import background, local_layout
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
 from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE, Budget
 from refref_jax.render import radiance_of, render_known
-from tests import reference
+from tests import reference, scenes
 from tests.backgrounds import CubeBackground
 
 # Rays a pixel along each axis: Cycles' pixels are box-filtered. What the paper's paths lack is more
 # than what fewer rays alias.
 _FINE, _COARSE = 6, 3
-
-
-@functools.cache
-def _geometry(scene):
-    parts = meshes.read_meshes(scene)
-    parents = containment.find_containment(parts).parents
-    return jax.tree.map(jnp.asarray, build_geometry(parts, parents, rule="nested"))
 
 
 @functools.partial(jax.jit, static_argnames="budget")
@@ -42,7 +33,7 @@ def _render(scene, view, budget, *, oversampling=_FINE):
     frames = local_layout.read_frames(scene, "test")
     rays = cameras.image_rays(cameras.supersample(frames.cameras, oversampling), view)
     radiance = radiance_of(background.read_background(scene))
-    seen = render_known(_geometry(scene), radiance, rays, budget=budget)
+    seen = render_known(scenes.read_geometry(scene), radiance, rays, budget=budget)
     linear = cameras.box_filter(seen.linear, oversampling)
     return (
         np.clip(reference.linear_to_srgb(linear), 0.0, 1.0),
@@ -103,7 +94,7 @@ def test_the_first_surface_is_where_cycles_sees_it(ball_scene):
     distances = local_layout.read_distances(frames)[0]
     rays = cameras.image_rays(frames.cameras, 0)
     flat = Rays(*(x.reshape(-1, *x.shape[2:]) for x in rays))
-    paths = jax.tree.map(np.asarray, _trace(_geometry(ball_scene), flat, budget=PAPER))
+    paths = jax.tree.map(np.asarray, _trace(scenes.read_geometry(ball_scene), flat, budget=PAPER))
     ours = paths.tau[: distances.size, 1].reshape(distances.shape)
     mask = local_layout.read_masks(frames)[0]
     both = np.isfinite(ours) & mask

@@ -125,6 +125,7 @@ def test_data_is_numpy_only(path):
         "geometry.rays",
         "geometry.surface_build",
         "geometry.corner_normals",
+        "geometry.triangle_meshes",
     }
     for name in _imports(path):
         assert name.split(".")[0] not in ("jax", "flax", "optax"), name

@@ -4,7 +4,6 @@ The bundled scene is always there. The folders of other scenes can be named in t
 variable `REFREF_SCENES`, separated like the entries of `PATH`.
 """
 
-import functools
 import os
 from pathlib import Path
 
@@ -13,12 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.data import containment, meshes
-from refref_jax.data.geometry import build_geometry
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import budgets, path_tracing
+from refref_jax.optics import budgets
 from refref_jax.optics.light_paths import PathStatus
-from tests import reference_images, reference_surfaces, reference_tree
+from tests import reference_images, reference_surfaces, reference_tree, scenes
 
 _BUNDLED = Path(__file__).parents[1] / "experiments" / "data" / "cube_smcvx_ball"
 _SCENES = [_BUNDLED, *map(Path, filter(None, os.environ.get("REFREF_SCENES", "").split(":")))]
@@ -38,18 +35,6 @@ _RULES = [
     pytest.param(budgets.PAPER, reference_tree.PAPER, marks=pytest.mark.slow),
     (budgets.TREE, reference_tree.TREE),
 ]
-
-
-@functools.cache
-def _geometry(scene):
-    parts = meshes.read_meshes(scene)
-    parents = containment.find_containment(parts).parents
-    return jax.tree.map(jnp.asarray, build_geometry(parts, parents, rule="nested"))
-
-
-@functools.partial(jax.jit, static_argnames="budget")
-def _trace(geometry, rays, *, budget):
-    return path_tracing.trace_ends(geometry, rays, budget=budget)
 
 
 def _rays(origins, directions):
@@ -77,7 +62,10 @@ def test_images_are_those_of_the_slow_tree(scene, budget, rule):
         origins, directions = (x.reshape(-1, 3) for x in shaped)
         slow = reference_tree.trace(surfaces, cast, origins, directions, rule)
         traced = jax.tree.map(
-            np.asarray, _trace(_geometry(scene), _rays(origins, directions), budget=budget)
+            np.asarray,
+            scenes.trace_ends(
+                scenes.read_geometry(scene), _rays(origins, directions), budget=budget
+            ),
         )
         assert not traced.lost.any()
         quality, images = [], []

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from experiments.dataset import objects
 from experiments.dataset.objects import monkey
-from experiments.dataset.parts import Object, Part
+from experiments.dataset.parts import Object, ObjectPart
 
 SUZANNE = Path(__file__).parents[2] / "build" / "suzanne.npz"
 """Where the monkey's mesh is, when `blender_meshes` has made it."""
@@ -34,7 +34,7 @@ def gather() -> dict[str, Object]:
     return dict(sorted(found.items(), key=lambda pair: (_ORDER[pair[1].category], pair[0])))
 
 
-def _make_monkey(detail: float) -> list[Part]:
+def _make_monkey(detail: float) -> list[ObjectPart]:
     return monkey.monkey(monkey.load_suzanne(SUZANNE)).make(detail)
 
 

@@ -15,7 +15,7 @@ RADIUS = 2.0
 """No vertex of any object is farther from the origin, world units."""
 
 
-class Part(NamedTuple):
+class ObjectPart(NamedTuple):
     """One closed surface, and the medium inside.
 
     A part that lies in another is separated from it by a gap all around, so that which medium is
@@ -55,4 +55,4 @@ class Object(NamedTuple):
 
     name: str
     category: Category
-    make: Callable[[float], list[Part]]
+    make: Callable[[float], list[ObjectPart]]

@@ -10,19 +10,23 @@ from typing import Any
 import numpy as np
 
 from experiments.dataset.cameras import CAMERA_RADIUS
-from experiments.dataset.parts import Part
+from experiments.dataset.parts import ObjectPart
 from experiments.dataset.render_settings import RenderSettings
 from refref_jax.choices import NO_ABSORPTION, TwoSidedRule
 from refref_jax.data.containment import find_containment
 from refref_jax.data.meshes import INDEX_OF_REFRACTION, MeshPart
 from refref_jax.data.scene_names import SceneName
+from refref_jax.geometry.triangle_meshes import is_watertight
 from refref_jax.optics.interface_rules import NO_PARENT
 
 _AIR = "air"
 
 
 def describe(
-    scene: SceneName, parts: Sequence[Part], background: dict[str, Any], settings: RenderSettings
+    scene: SceneName,
+    parts: Sequence[ObjectPart],
+    background: dict[str, Any],
+    settings: RenderSettings,
 ) -> dict[str, Any]:
     """Returns the content of `scene.json`.
 
@@ -52,12 +56,12 @@ def identify(scene: SceneName, settings: RenderSettings) -> dict[str, Any]:
     return {"scene": str(scene), "category": scene.category, **settings.record()}
 
 
-def mesh_name(scene: SceneName, part: Part) -> str:
+def mesh_name(scene: SceneName, part: ObjectPart) -> str:
     """Returns the file name of a part's mesh."""
     return f"{scene.object}_{part.name}_{part.material}.ply"
 
 
-def _describe_part(scene: SceneName, part: Part, outside: str) -> dict[str, Any]:
+def _describe_part(scene: SceneName, part: ObjectPart, outside: str) -> dict[str, Any]:
     description = {
         "mesh": f"meshes/{mesh_name(scene, part)}",
         "inside": part.material,
@@ -66,7 +70,7 @@ def _describe_part(scene: SceneName, part: Part, outside: str) -> dict[str, Any]
         "ior_outside": INDEX_OF_REFRACTION[outside],
         "smooth_normals": part.smooth,
         "colour_per_interface": list(part.tint),
-        "watertight": _is_closed(part),
+        "watertight": is_watertight(part.faces.astype(np.int64)),
         "faces": len(part.faces),
     }
     if part.absorption != NO_ABSORPTION:
@@ -74,8 +78,10 @@ def _describe_part(scene: SceneName, part: Part, outside: str) -> dict[str, Any]
     return description
 
 
-def _materials_outside(scene: SceneName, parts: Sequence[Part], rule: TwoSidedRule) -> list[str]:
-    tree = find_containment([_mesh_part(part) for part in parts])
+def _materials_outside(
+    scene: SceneName, parts: Sequence[ObjectPart], rule: TwoSidedRule
+) -> list[str]:
+    tree = find_containment([mesh_part(part) for part in parts])
     if tree.overlaps:
         first, second = (parts[number].name for number in tree.overlaps[0])
         raise ValueError(
@@ -92,16 +98,9 @@ def _materials_outside(scene: SceneName, parts: Sequence[Part], rule: TwoSidedRu
     return [_AIR if parent == NO_PARENT else parts[parent].material for parent in tree.parents]
 
 
-def _mesh_part(part: Part) -> MeshPart:
+def mesh_part(part: ObjectPart) -> MeshPart:
+    """Returns a part as the library reads it again, without its colour."""
     index = INDEX_OF_REFRACTION[part.material]
     return MeshPart(
         part.name, part.vertices, part.faces, index, "smooth" if part.smooth else "flat"
     )
-
-
-def _is_closed(part: Part) -> bool:
-    """Returns whether every edge belongs to two faces, once in each direction."""
-    start, end = part.faces.ravel(), np.roll(part.faces, -1, axis=1).ravel()
-    edges = start.astype(np.int64) * len(part.vertices) + end
-    mirrored = end.astype(np.int64) * len(part.vertices) + start
-    return bool(len(np.unique(edges)) == len(edges) and set(edges) == set(mirrored))

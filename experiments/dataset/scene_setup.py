@@ -16,7 +16,7 @@ from typing import Any
 import trimesh
 
 from experiments.dataset import backgrounds, cameras, frame_files, scene_record
-from experiments.dataset.parts import Part
+from experiments.dataset.parts import ObjectPart
 from experiments.dataset.render_settings import RenderSettings
 from experiments.dataset.seeds import seed_of
 from refref_jax import atomic_files, configuration
@@ -30,7 +30,7 @@ def make(
     scene: SceneName,
     settings: RenderSettings,
     *,
-    parts: Callable[[], Sequence[Part]],
+    parts: Callable[[], Sequence[ObjectPart]],
     scratch: Path,
 ) -> None:
     """Makes the folder of a scene if it is not there.
@@ -60,7 +60,7 @@ def make(
     atomic_files.move(draft, folder)
 
 
-def write_meshes(folder: Path, scene: SceneName, parts: Sequence[Part]) -> None:
+def write_meshes(folder: Path, scene: SceneName, parts: Sequence[ObjectPart]) -> None:
     """Writes the parts of a scene into its folder, which has one for meshes."""
     for part in parts:
         mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)

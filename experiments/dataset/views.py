@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from experiments.dataset import cameras, frame_files, scene_setup
 from experiments.dataset.cameras import Split
-from experiments.dataset.parts import Object, Part
+from experiments.dataset.parts import Object, ObjectPart
 from experiments.dataset.render_settings import RenderSettings
 from experiments.dataset.seeds import seed_of
 from experiments.dataset.workers import Job, Task
@@ -79,7 +79,7 @@ def tasks(
 
     # Scenes that follow each other share their object.
     @lru_cache(maxsize=1)
-    def make(name: str) -> Sequence[Part]:
+    def make(name: str) -> Sequence[ObjectPart]:
         return objects[name].make(_DETAIL)
 
     for view in views:

@@ -21,10 +21,10 @@ from refref_jax.geometry.corner_normals import unit_vectors
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surface_build import build_surfaces
 from refref_jax.geometry.surfaces import Surfaces
+from refref_jax.geometry.triangle_meshes import vertex_vectors
 from refref_jax.optics.scene import Scene
 from refref_jax.reconstruct import isosurface
 from refref_jax.reconstruct.grids import Grid
-from refref_jax.reconstruct.triangles import vertex_vectors
 from refref_jax.render import Model, colour
 from refref_jax.render.field_points import look_up
 from refref_jax.render.first_surface import find_first_surface

@@ -11,8 +11,8 @@ from experiments.cli import outputs
 from experiments.exporting.field_mesh import split_parts
 from experiments.r3f import object_source, records
 from refref_jax.data import stored_normals
+from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.optics.scene import Scene
-from refref_jax.reconstruct.triangles import Mesh
 from refref_jax.render.saved import load_geometry
 
 

@@ -12,6 +12,7 @@ from experiments.cli.progress import ProgressBar
 from experiments.r3f.records import GeometryFacts, ReconstructionConfig
 from refref_jax import atomic_files
 from refref_jax.data import local_layout, scene_names, stored_normals
+from refref_jax.geometry.triangle_meshes import Mesh, diameter, volume
 from refref_jax.reconstruct import occupancy, visual_hull
 from refref_jax.reconstruct.agreement import carved_alone, without_outliers
 from refref_jax.reconstruct.comparison import silhouette_overlap
@@ -20,7 +21,6 @@ from refref_jax.reconstruct.isosurface import find_isosurface
 from refref_jax.reconstruct.occupancy_config import OccupancyTrainingConfig
 from refref_jax.reconstruct.refinement import Refinement, refine
 from refref_jax.reconstruct.silhouettes import Views
-from refref_jax.reconstruct.triangles import Mesh, diameter, volume
 
 FOLDER = "geometry"
 

@@ -24,7 +24,8 @@ from refref_jax.choices import Space
 from refref_jax.data import local_layout, mask_margins
 from refref_jax.data.geometry import build_geometry
 from refref_jax.geometry.cameras import pixel_rays
-from refref_jax.geometry.surface_build import build_surfaces
+from refref_jax.geometry.surface_build import pack_meshes
+from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.optics.budgets import STRAIGHT
 from refref_jax.optics.interface_rules import NO_PARENT, nested
 from refref_jax.optics.scene import Scene
@@ -35,7 +36,6 @@ from refref_jax.reconstruct.index_search import (
     most_looks,
 )
 from refref_jax.reconstruct.photometry import Evidence
-from refref_jax.reconstruct.triangles import Mesh
 from refref_jax.render import saved
 from refref_jax.render.model import Model
 from refref_jax.render.saved import SavedModel
@@ -103,9 +103,7 @@ def look(scene: Path, split: str, model: Model, *, seed: int, rays: int) -> Body
 
 def body_geometry(mesh: Mesh, index: float) -> Scene:
     """Returns one clear body in air, on the device."""
-    owners = np.zeros(len(mesh.faces), np.int64)
-    surfaces = build_surfaces(mesh.vertices[mesh.faces], mesh.normals, owners)
-    return jax.device_put(Scene(surfaces, nested([index], [NO_PARENT])))
+    return jax.device_put(Scene(pack_meshes([mesh]), nested([index], [NO_PARENT])))
 
 
 def run(

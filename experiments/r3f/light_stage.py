@@ -17,10 +17,10 @@ from experiments.r3f.index_stage import BodyPixels
 from experiments.r3f.records import IndexFacts, LightFacts
 from refref_jax import atomic_files
 from refref_jax.data import stored_normals
+from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.reconstruct import photometry
 from refref_jax.reconstruct.light_refinement import LightRefinement, refine_by_light
 from refref_jax.reconstruct.soundness import objection
-from refref_jax.reconstruct.triangles import Mesh
 from refref_jax.render.model import Model
 
 FOLDER = "light"

@@ -12,9 +12,9 @@ from experiments.r3f import geometry_stage, light_stage
 from experiments.r3f.records import IndexFacts, Reconstruction
 from refref_jax import configuration
 from refref_jax.data import meshes
-from refref_jax.data.geometry import shading_normals
+from refref_jax.data.geometry import shaded_mesh
 from refref_jax.data.meshes import MeshPart
-from refref_jax.reconstruct.triangles import Mesh
+from refref_jax.geometry.triangle_meshes import Mesh
 
 _FILE = "body.json"
 
@@ -66,9 +66,4 @@ def read_part(out: Path, found: Reconstruction) -> MeshPart:
 
 def read_mesh(out: Path, found: Reconstruction) -> Mesh:
     """Reads the surface; its vertices are in the order of the file's reader."""
-    return mesh_of(meshes.read_part(surface_file(out, found), index=1.0))
-
-
-def mesh_of(part: MeshPart) -> Mesh:
-    """Returns the surface of a part, with the normals that bend light."""
-    return Mesh(part.vertices, part.faces, shading_normals(part))
+    return shaded_mesh(meshes.read_part(surface_file(out, found), index=1.0))

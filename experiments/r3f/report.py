@@ -18,16 +18,16 @@ from experiments.r3f.report_figures import Outline, SurfaceView, Window
 from refref_jax import atomic_files
 from refref_jax.data import containment, local_layout, meshes
 from refref_jax.data.errors import SceneError
+from refref_jax.data.geometry import shaded_mesh
 from refref_jax.data.local_layout import Frames
 from refref_jax.geometry.cameras import Cameras, image_rays
 from refref_jax.geometry.rays import Rays
-from refref_jax.geometry.surface_build import build_surfaces
-from refref_jax.geometry.surfaces import Surfaces
+from refref_jax.geometry.surface_build import pack_meshes
+from refref_jax.geometry.triangle_meshes import Mesh, diameter, join
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.reconstruct.closest import signed_distance
 from refref_jax.reconstruct.comparison import compare_meshes, silhouettes
 from refref_jax.reconstruct.silhouettes import overlaps
-from refref_jax.reconstruct.triangles import Mesh, diameter, join
 from refref_jax.render.first_surface import FirstSurface, find_first_surface
 
 FOLDER = "pictures"
@@ -124,7 +124,7 @@ def _read_truth(scene: Path) -> _Truth:
         return _Truth(None, "The scene has no meshes to compare with.")
     parents = containment.find_containment(parts).parents
     outer = [part for part, parent in zip(parts, parents, strict=True) if parent == NO_PARENT]
-    joined = join([object_source.mesh_of(part) for part in outer])
+    joined = join([shaded_mesh(part) for part in outer])
     names = ", ".join(f"{part.name}.ply" for part in outer)
     inner = len(parts) - len(outer)
     within = f"; {inner} more within {'it' if len(outer) == 1 else 'them'}" if inner else ""
@@ -138,8 +138,8 @@ def _surface_views(mesh: Mesh, truth: Mesh | None, frames: Frames) -> list[Surfa
         frames._replace(images=tuple(frames.images[i] for i in chosen))
     )
     cameras = _resized(frames.cameras, _HEIGHT)
-    ours = _surfaces(mesh)
-    theirs = None if truth is None else _surfaces(truth)
+    ours = pack_meshes([mesh])
+    theirs = None if truth is None else pack_meshes([truth])
     views = []
     for i, image in zip(chosen, images, strict=True):
         rays = image_rays(cameras, i)
@@ -174,11 +174,6 @@ def _within(view: SurfaceView, window: Window) -> SurfaceView:
         for picture in pictures_of_view.values()
     )
     return SurfaceView(name, *parts)
-
-
-def _surfaces(mesh: Mesh) -> Surfaces:
-    owners = np.zeros(len(mesh.faces), np.int64)
-    return build_surfaces(mesh.vertices[mesh.faces], mesh.normals, owners)
 
 
 def _in_camera(

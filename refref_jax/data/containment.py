@@ -15,6 +15,7 @@ from refref_jax.data.errors import SceneError
 from refref_jax.data.facing_walls import spread_points
 from refref_jax.data.meshes import MeshPart
 from refref_jax.geometry.corner_normals import face_normals, is_degenerate
+from refref_jax.geometry.triangle_meshes import volume
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import EMPTY_SLOT, SLOTS
 
@@ -46,7 +47,7 @@ class Containment(NamedTuple):
 def find_containment(parts: Sequence[MeshPart]) -> Containment:
     """Finds the tree of containment."""
     count = len(parts)
-    volumes = [abs(signed_volume(part)) for part in parts]
+    volumes = [abs(volume(part.vertices, part.faces)) for part in parts]
     contains = np.zeros((count, count), bool)
     overlaps = set()
     for inner, outer in itertools.permutations(range(count), 2):
@@ -114,12 +115,6 @@ def beside_faces(
     corners = part.vertices[part.faces[faces]]
     step = side * _GAP * np.max(np.ptp(part.vertices, axis=0))
     return corners.mean(axis=1) + step * face_normals(corners)
-
-
-def signed_volume(part: MeshPart) -> float:
-    """Returns the volume inside a closed surface, negative if its faces point inwards."""
-    a, b, c = np.moveaxis(part.vertices[part.faces] - part.vertices.mean(axis=0), 1, 0)
-    return float(np.sum(a * np.cross(b, c)) / 6.0)
 
 
 def _probes(part: MeshPart, other: MeshPart) -> Float[np.ndarray, "probes 3"]:

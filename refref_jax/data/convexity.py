@@ -4,12 +4,12 @@ A ray that has left a convex body never meets it again, which spares casting it.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
-from refref_jax.data.containment import signed_volume
 from refref_jax.data.meshes import MeshPart
 from refref_jax.geometry.corner_normals import is_degenerate
+from refref_jax.geometry.triangle_meshes import is_watertight, volume
 
 TOLERANCE = 1e-5
 """How deep below its convex hull a surface may lie, as a share of its diagonal.
@@ -33,13 +33,13 @@ def is_convex(part: MeshPart) -> bool:
     there is no reflex edge.
     """
     faces = part.faces[~is_degenerate(part.vertices[part.faces])]
-    if len(faces) == 0 or not _is_closed(faces):
+    if len(faces) == 0 or not is_watertight(faces):
         return False
     try:
         hull = ConvexHull(part.vertices)
     except QhullError:  # a flat part, or fewer than four points
         return False
-    if not np.isclose(signed_volume(part), hull.volume, rtol=_VOLUME_TOLERANCE):
+    if not np.isclose(volume(part.vertices, part.faces), hull.volume, rtol=_VOLUME_TOLERANCE):
         return False
     corners = part.vertices[faces]
     points = np.concatenate([corners.reshape(-1, 3), corners.mean(axis=1)])
@@ -51,14 +51,6 @@ def encloses(outer: MeshPart, inner: MeshPart) -> bool:
     """Returns whether no vertex of a part lies outside of another one's convex hull."""
     hull = ConvexHull(np.concatenate([outer.vertices, inner.vertices]))
     return bool(np.all(hull.vertices < len(outer.vertices)))
-
-
-def _is_closed(faces: Int[np.ndarray, "faces 3"]) -> bool:
-    """Returns whether every edge is used by two faces, once in each direction."""
-    start, end = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
-    size = faces.max() + 1
-    forward, backward = np.sort(start * size + end), np.sort(end * size + start)
-    return bool(np.array_equal(forward, backward) and np.all(np.diff(forward) > 0))
 
 
 def _lie_on(hull: ConvexHull, points: Float[np.ndarray, "points 3"], tolerance: float) -> bool:

@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour, RuleName
 from refref_jax.data import lint, rule_advice
@@ -12,9 +11,10 @@ from refref_jax.data.containment import find_containment
 from refref_jax.data.findings import refuse_errors
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.part_descriptions import Shading
-from refref_jax.data.parts import Mesh, make_part
-from refref_jax.geometry.corner_normals import CREASE_ANGLE, corner_normals
-from refref_jax.geometry.surface_build import build_surfaces
+from refref_jax.data.parts import MeshSource, make_part
+from refref_jax.geometry.corner_normals import CREASE_ANGLE
+from refref_jax.geometry.surface_build import pack_meshes
+from refref_jax.geometry.triangle_meshes import Mesh, make_mesh
 from refref_jax.optics.interface_rules import RULES
 from refref_jax.optics.scene import Scene
 
@@ -22,7 +22,7 @@ _CREASE_ANGLES: dict[Shading, float] = {"auto": CREASE_ANGLE, "smooth": np.pi, "
 
 
 def single_body(
-    mesh: Mesh,
+    mesh: MeshSource,
     *,
     index: float,
     shading: Shading = "auto",
@@ -98,14 +98,7 @@ def build_geometry(
       parents: the innermost part around each part, from `containment.find_containment`.
       rule: what lies outside a part, see `optics.interface_rules`.
     """
-    triangles = [part.vertices[part.faces] for part in parts]
-    normals = [shading_normals(part) for part in parts]
-    owners = [np.full(len(part.faces), i) for i, part in enumerate(parts)]
-    surfaces = build_surfaces(
-        np.concatenate([np.zeros((0, 3, 3)), *triangles]),
-        np.concatenate([np.zeros((0, 3, 3)), *normals]),
-        np.concatenate([np.zeros(0, np.int64), *owners]),
-    )
+    surfaces = pack_meshes([shaded_mesh(part) for part in parts])
     interfaces = RULES[rule](
         [part.index for part in parts],
         parents,
@@ -116,8 +109,8 @@ def build_geometry(
     return Scene(surfaces, interfaces)
 
 
-def shading_normals(part: MeshPart) -> Float[np.ndarray, "faces 3 3"]:
-    """Returns the outward unit normals at the corners of a part's faces that bend light."""
+def shaded_mesh(part: MeshPart) -> Mesh:
+    """Returns the surface of a part, with the normals that bend light."""
     if part.normals is not None:
-        return part.normals
-    return corner_normals(part.vertices, part.faces, crease_angle=_CREASE_ANGLES[part.shading])
+        return Mesh(part.vertices, part.faces, part.normals)
+    return make_mesh(part.vertices, part.faces, crease_angle=_CREASE_ANGLES[part.shading])

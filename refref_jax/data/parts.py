@@ -15,12 +15,12 @@ from refref_jax.data.part_descriptions import Shading
 Arrays = tuple[np.ndarray, np.ndarray]
 """Vertices `[vertices, 3]` in world units; faces `[faces, 3]`, counter-clockwise from outside."""
 
-Mesh = str | os.PathLike[str] | trimesh.Trimesh | Arrays
+MeshSource = str | os.PathLike[str] | trimesh.Trimesh | Arrays
 """What a part can be made of."""
 
 
 def make_part(
-    mesh: Mesh,
+    mesh: MeshSource,
     *,
     index: float,
     name: str | None = None,

@@ -3,9 +3,6 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-SPHERICAL_HARMONICS = 16
-"""Number of values that `spherical_harmonics` returns: all of degree 0 to 3."""
-
 
 def spherical_harmonics(direction: Float[Array, "3"]) -> Float[Array, "16"]:
     """Returns the real spherical harmonics of degree 0 to 3 at a unit direction.

@@ -19,15 +19,6 @@ _PRIMES = (1, 2654435761, 805459861)
 _CORNERS = tuple(itertools.product((0, 1), repeat=3))
 
 
-def vertex_index(vertex: UInt32[Array, "3"], resolution: int, entries: int) -> UInt32[Array, ""]:
-    """Returns the table entry of a grid vertex, `0 .. resolution` along each axis.
-
-    Dense where every vertex has an entry of its own, hashed where not.
-    """
-    strides = _strides(resolution, entries)
-    return _entry([vertex[axis] * jnp.uint32(strides[axis]) for axis in range(3)], strides, entries)
-
-
 def corners(
     position: Sequence[Float[Array, "*batch"]], resolution: int, entries: int
 ) -> list[tuple[UInt32[Array, "*batch"], Float[Array, "*batch"]]]:

@@ -1,10 +1,22 @@
 """Packs meshes into `Surfaces` on the host (NumPy only)."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float, Int
 
 from refref_jax.geometry import bvh_build
 from refref_jax.geometry.surfaces import Surfaces
+from refref_jax.geometry.triangle_meshes import Mesh
+
+
+def pack_meshes(meshes: Sequence[Mesh]) -> Surfaces:
+    """Builds the device record of meshes; parts have the numbers of their places, none is empty."""
+    return build_surfaces(
+        np.concatenate([np.zeros((0, 3, 3)), *(mesh.vertices[mesh.faces] for mesh in meshes)]),
+        np.concatenate([np.zeros((0, 3, 3)), *(mesh.normals for mesh in meshes)]),
+        np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes]),
+    )
 
 
 def build_surfaces(

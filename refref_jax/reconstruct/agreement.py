@@ -7,11 +7,11 @@ agrees, and all others disagree. What a mask alone carves away tells it from the
 
 import numpy as np
 
+from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.reconstruct.comparison import silhouette_overlap
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.grids import Box, Values, lattice
 from refref_jax.reconstruct.silhouettes import Views, check_masks, views_at
-from refref_jax.reconstruct.triangles import Mesh
 from refref_jax.reconstruct.visual_hull import REACH, values_by_view
 
 # Points along each edge of the cube in which a body is looked for.

@@ -17,9 +17,9 @@ from scipy.spatial import KDTree
 from trimesh.triangles import closest_point, points_to_barycentric
 
 from refref_jax.geometry.corner_normals import corner_normals, face_normals, is_degenerate
+from refref_jax.geometry.triangle_meshes import Faces, Mesh, Vertices, diameter
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.grids import Field, Points, Values
-from refref_jax.reconstruct.triangles import Faces, Mesh, Vertices, diameter
 
 # Triangles that are looked at first, and how many times more in each further round.
 _FIRST = 8

@@ -8,10 +8,10 @@ from jaxtyping import Bool, Float
 
 from refref_jax.geometry.cameras import Cameras, image_rays
 from refref_jax.geometry.corner_normals import unit_vectors
-from refref_jax.geometry.surface_build import build_surfaces
+from refref_jax.geometry.surface_build import pack_meshes
+from refref_jax.geometry.triangle_meshes import Mesh, diameter
 from refref_jax.reconstruct.closest import ClosestSearch
 from refref_jax.reconstruct.silhouettes import overlaps
-from refref_jax.reconstruct.triangles import Mesh, diameter
 from refref_jax.render.first_surface import find_first_surface
 
 SAMPLES = 20_000
@@ -75,8 +75,7 @@ def silhouette_overlap(
 
 def silhouettes(mesh: Mesh, cameras: Cameras) -> Bool[np.ndarray, "views h w"]:
     """Returns which pixels see a mesh."""
-    owners = np.zeros(len(mesh.faces), np.int64)
-    surfaces = build_surfaces(mesh.vertices[mesh.faces], mesh.normals, owners)
+    surfaces = pack_meshes([mesh])
     views: Sequence[int] = range(len(cameras.poses))
     return np.stack(
         [np.isfinite(find_first_surface(surfaces, image_rays(cameras, i)).distances) for i in views]

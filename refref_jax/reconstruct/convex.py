@@ -13,9 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from refref_jax.geometry.corner_normals import CREASE_ANGLE, face_normals
-from refref_jax.reconstruct.closest import ClosestSearch
-from refref_jax.reconstruct.smoothing import CREASE
-from refref_jax.reconstruct.triangles import (
+from refref_jax.geometry.triangle_meshes import (
     Mesh,
     diameter,
     face_vectors,
@@ -23,6 +21,8 @@ from refref_jax.reconstruct.triangles import (
     neighbours,
     volume,
 )
+from refref_jax.reconstruct.closest import ClosestSearch
+from refref_jax.reconstruct.smoothing import CREASE
 
 FaceIndex = Int[np.ndarray, " pairs"]
 

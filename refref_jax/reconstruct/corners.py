@@ -23,6 +23,7 @@ from scipy.sparse import coo_array, csr_array, vstack
 from scipy.spatial import KDTree, QhullError
 
 from refref_jax.geometry.cameras import project
+from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.reconstruct.convex import hull, of_points, weigh_facets
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.grids import Points, Values
@@ -40,7 +41,6 @@ from refref_jax.reconstruct.outlines import (
     projection_slopes,
 )
 from refref_jax.reconstruct.silhouettes import BLUR, Views, signed_distances, views_at
-from refref_jax.reconstruct.triangles import Mesh
 
 MOST = 128
 """Corners of the body that is looked for."""

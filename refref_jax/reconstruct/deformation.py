@@ -23,8 +23,8 @@ from refref_jax import numerics
 from refref_jax.geometry import bvh_build
 from refref_jax.geometry.corner_normals import smooth_groups
 from refref_jax.geometry.surfaces import Surfaces
+from refref_jax.geometry.triangle_meshes import Mesh, Vertices
 from refref_jax.reconstruct.errors import ReconstructionError
-from refref_jax.reconstruct.triangles import Mesh, Vertices
 
 HANDLES = 256
 """Enough for errors of a twentieth of a body's size; what is finer is noise of the masks."""

@@ -6,11 +6,11 @@ cut off by it, which no noise excuses and masks show.
 
 import numpy as np
 
+from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.reconstruct.comparison import silhouette_overlap
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.silhouettes import Views, some_of
 from refref_jax.reconstruct.smoothing import denoise
-from refref_jax.reconstruct.triangles import Mesh
 
 # Shares of the length that are tried, and the overlap with masks that it may cost: smooth bodies
 # lose a tenth of that, those with fillets twice as much.

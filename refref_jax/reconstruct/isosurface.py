@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 
 from refref_jax.geometry.corner_normals import CREASE_ANGLE, corner_normals
+from refref_jax.geometry.triangle_meshes import Faces, Mesh, Vertices
 from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.grids import Grid, Points, gradient, interpolate
-from refref_jax.reconstruct.triangles import Faces, Mesh, Vertices
 
 # Values this close to zero, in cells, are pushed away from it, so that no two vertices of marching
 # cubes meet in a corner of the grid and no face is degenerate.

@@ -21,12 +21,12 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
+from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.optics.media import Interfaces
 from refref_jax.optics.scene import Scene, with_index
 from refref_jax.reconstruct import deformation, photometry
 from refref_jax.reconstruct.deformation import Rig
 from refref_jax.reconstruct.photometry import Evidence
-from refref_jax.reconstruct.triangles import Mesh
 from refref_jax.render.config import ModelConfig
 
 

@@ -19,6 +19,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from refref_jax.geometry.triangle_meshes import (
+    Mesh,
+    diameter,
+    face_vectors,
+    keep_faces,
+    pieces,
+)
 from refref_jax.reconstruct.closest import signed_distance
 from refref_jax.reconstruct.convex import depth_below_hull, from_tangents, is_convex
 from refref_jax.reconstruct.corners import MOST, fit_corners
@@ -29,13 +36,6 @@ from refref_jax.reconstruct.isosurface import find_isosurface, import_skimage
 from refref_jax.reconstruct.silhouettes import Views, check_masks
 from refref_jax.reconstruct.smoothing import CREASE, diffuse
 from refref_jax.reconstruct.soundness import check_body, objection
-from refref_jax.reconstruct.triangles import (
-    Mesh,
-    diameter,
-    face_vectors,
-    keep_faces,
-    pieces,
-)
 
 # Spacings around a mesh that is sampled.
 _RIM = 3

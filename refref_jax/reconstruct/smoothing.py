@@ -21,7 +21,7 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.linalg import cg
 
 from refref_jax.geometry.corner_normals import face_normals, unit_vectors
-from refref_jax.reconstruct.triangles import (
+from refref_jax.geometry.triangle_meshes import (
     Faces,
     Mesh,
     Vertices,

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
+from refref_jax.geometry.triangle_meshes import Mesh, is_closed, pieces, volume
 from refref_jax.reconstruct.errors import ReconstructionError
-from refref_jax.reconstruct.triangles import Mesh, is_closed, pieces, volume
 
 
 def check_body(mesh: Mesh) -> None:

@@ -102,14 +102,6 @@ def contract(x: Float[Array, "*shape 3"]) -> Float[Array, "*shape 3"]:
     return jnp.where(outside, (2.0 - inverse) * inverse * x, x)
 
 
-def uncontract(z: Float[Array, "*shape 3"]) -> Float[Array, "*shape 3"]:
-    """Inverts `contract` for points with `|z| < 2`."""
-    norm = numerics.length(z)[..., None]
-    outside = norm > 1.0
-    held = jnp.where(outside, norm, 1.0)
-    return jnp.where(outside, z / (held * (2.0 - held)), z)
-
-
 def shrinkage(x: Float[Array, "*shape 3"]) -> Float[Array, "*shape"]:
     """Returns by how much `contract` scales a small Gaussian at `x`: `|det J|^(1/3)`.
 

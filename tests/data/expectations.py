@@ -17,3 +17,9 @@ def scene_error(*words: str) -> Iterator[None]:
     assert message.endswith(".")
     for word in words:
         assert word in message
+
+
+def only(findings):
+    """Returns the one finding that there is."""
+    [finding] = findings
+    return finding

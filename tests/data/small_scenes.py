@@ -30,6 +30,12 @@ def edit_transforms(scene: Path, edit: Edit) -> None:
     _transforms(scene).write_text(json.dumps(transforms), encoding="utf-8")
 
 
+def without_masks(transforms: dict[str, Any]) -> None:
+    """An edit: takes the masks out of a transforms file."""
+    for record in transforms["frames"]:
+        del record["mask_file_path"]
+
+
 def truncate(path: Path, share: float = 0.5) -> None:
     """Cuts a file off, as an interrupted copy does."""
     content = path.read_bytes()

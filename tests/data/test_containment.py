@@ -8,7 +8,6 @@ from refref_jax.data import containment
 from refref_jax.data.containment import (
     find_containment,
     parts_around,
-    signed_volume,
     winding_number,
 )
 from refref_jax.data.meshes import read_meshes
@@ -16,6 +15,7 @@ from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import EMPTY_SLOT, SLOTS
 from tests.data.expectations import scene_error
 from tests.data.solids import as_part, ball, box, inverted, joined, shell
+from tests.scenes import volume_of
 
 # Sums of solid angles in double precision.
 _EXACT = 1e-9
@@ -116,18 +116,18 @@ def test_winding_number_beyond_the_bounding_box_is_exactly_zero():
 
 def test_volume_of_a_box_by_hand():
     part = box(size=(1.0, 2.0, 3.0))
-    assert signed_volume(part) == pytest.approx(6.0)
-    assert signed_volume(inverted(part)) == pytest.approx(-6.0)
+    assert volume_of(part) == pytest.approx(6.0)
+    assert volume_of(inverted(part)) == pytest.approx(-6.0)
 
 
 def test_volume_does_not_change_far_from_the_origin():
     moved = ball(centre=(1.1e6, -1.3e6, 1.7e6))
-    assert signed_volume(moved) == pytest.approx(signed_volume(ball()), rel=1e-7)
+    assert volume_of(moved) == pytest.approx(volume_of(ball()), rel=1e-7)
 
 
 def test_volume_of_a_hollow_ball_is_the_difference():
-    solid, cavity = signed_volume(ball(radius=2.0)), signed_volume(ball(radius=1.5))
-    assert signed_volume(shell()) == pytest.approx(solid - cavity)
+    solid, cavity = volume_of(ball(radius=2.0)), volume_of(ball(radius=1.5))
+    assert volume_of(shell()) == pytest.approx(solid - cavity)
     # An inscribed polyhedron of 320 faces has 96 % of the ball's volume.
     assert 0.95 < solid / (4.0 / 3.0 * np.pi * 8.0) < 1.0
 

@@ -6,16 +6,12 @@ from refref_jax.data.containment import find_containment
 from refref_jax.data.findings import Finding
 from refref_jax.data.lint import lint
 from refref_jax.data.meshes import read_meshes
+from tests.data.expectations import only
 from tests.data.solids import as_part, ball, box, inverted, joined, shell
 
 
 def _findings(*parts):
     return lint(parts, find_containment(parts))
-
-
-def _only(findings):
-    [finding] = findings
-    return finding
 
 
 def _with_faces(part, *faces):
@@ -72,7 +68,7 @@ def test_the_bundled_ball_is_clean(ball_scene):
 
 def test_an_open_mesh():
     part = ball()._replace(faces=ball().faces[1:])
-    finding = _only(_findings(part))
+    finding = only(_findings(part))
     assert finding.severity == "warning"
     assert "not watertight: 3 edges" in finding.message
     assert "close the holes" in finding.message
@@ -81,7 +77,7 @@ def test_an_open_mesh():
 def test_a_soup_of_triangles_is_open_everywhere():
     corners = box().vertices[box().faces].reshape(-1, 3)
     part = box()._replace(vertices=corners, faces=np.arange(36).reshape(12, 3))
-    assert "36 edges" in _only(_findings(part)).message
+    assert "36 edges" in only(_findings(part)).message
 
 
 def test_a_fin_on_a_closed_mesh():
@@ -89,12 +85,12 @@ def test_a_fin_on_a_closed_mesh():
     tip = len(ball().vertices)
     part = _with_faces(ball(), (*ball().faces[0, :2], tip))
     part = part._replace(vertices=np.vstack([part.vertices, [0.0, 0.0, 3.0]]))
-    assert "3 edges" in _only(_findings(part)).message
+    assert "3 edges" in only(_findings(part)).message
 
 
 @pytest.mark.parametrize("part", [ball(), box(centre=(1e4, 1e4, 1e4)), shell()])
 def test_an_inverted_mesh(part):
-    finding = _only(_findings(inverted(part)))
+    finding = only(_findings(inverted(part)))
     assert finding.severity == "error"
     assert "point inwards" in finding.message
     assert "Flip those faces" in finding.message
@@ -102,7 +98,7 @@ def test_an_inverted_mesh(part):
 
 def test_one_inverted_piece_among_others():
     pieces = [ball(), inverted(ball(centre=(5.0, 0.0, 0.0))), box(centre=(0.0, 5.0, 0.0))]
-    finding = _only(_findings(joined("three_glass", *pieces)))
+    finding = only(_findings(joined("three_glass", *pieces)))
     assert finding.severity == "error"
     assert "1 of its 3 pieces" in finding.message
 
@@ -110,7 +106,7 @@ def test_one_inverted_piece_among_others():
 def test_one_flipped_face():
     faces = ball().faces.copy()
     faces[7] = faces[7, ::-1]
-    finding = _only(_findings(ball()._replace(faces=faces)))
+    finding = only(_findings(ball()._replace(faces=faces)))
     assert finding.severity == "error"
     assert "disagree across 3 edges" in finding.message
     assert "Recalculate its normals" in finding.message
@@ -127,7 +123,7 @@ def test_a_collinear_face_is_noted(share):
         vertices=np.vstack([part.vertices, position]),
         faces=np.concatenate([part.faces[1:], split]),
     )
-    finding = _only(_findings(part))
+    finding = only(_findings(part))
     assert finding.severity == "note"
     assert "1 degenerate faces" in finding.message
 
@@ -137,14 +133,14 @@ def test_a_face_with_a_repeated_corner_is_noted_and_opens_nothing(count):
     corner = ball().faces[0, 0]
     others = ball().faces[:count, 1]
     part = _with_faces(ball(), *[(corner, corner, other) for other in others])
-    finding = _only(_findings(part))
+    finding = only(_findings(part))
     assert finding.severity == "note"
     assert f"{count} degenerate faces" in finding.message
 
 
 @pytest.mark.parametrize("sections", [8, 9])
 def test_a_globe_of_quadrangles_is_closed(sections):
-    finding = _only(_findings(_globe(sections)))
+    finding = only(_findings(_globe(sections)))
     assert finding.severity == "note"
     assert f"{2 * sections} degenerate faces" in finding.message
 
@@ -153,7 +149,7 @@ def test_a_globe_of_quadrangles_is_closed(sections):
 def test_a_duplicate_face(order):
     findings = _findings(_with_faces(ball(), ball().faces[5][list(order)]))
     duplicates = [finding for finding in findings if "duplicate" in finding.message]
-    assert _only(duplicates).severity == "error"
+    assert only(duplicates).severity == "error"
     assert "1 duplicate faces" in duplicates[0].message
     assert "Remove them" in duplicates[0].message
 

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.data.containment import find_containment, signed_volume
+from refref_jax.data.containment import find_containment
 from refref_jax.data.lint_pairs import lint_pairs
+from tests.data.expectations import only
 from tests.data.solids import as_part, ball, box, shell
+from tests.scenes import volume_of
 
 
 def _findings(*parts):
@@ -15,11 +17,6 @@ def _findings(*parts):
 
 def _warnings(*parts):
     return [finding for finding in _findings(*parts) if finding.severity != "note"]
-
-
-def _only(findings):
-    [finding] = findings
-    return finding
 
 
 def _cylinder(name, radius, height, *, index, bottom=0.0):
@@ -49,7 +46,7 @@ def _share(message):
 def test_the_cup_is_a_body():
     # The cylinder of 48 sides has 0.997 of the area of the circle.
     expected = 0.997 * np.pi * (1.1**2 * 2.1 - 1.0**2 * 2.0)
-    assert signed_volume(_cup()) == pytest.approx(expected, rel=1e-2)
+    assert volume_of(_cup()) == pytest.approx(expected, rel=1e-2)
 
 
 @pytest.mark.parametrize(
@@ -69,7 +66,7 @@ def test_parts_that_are_apart_have_no_findings(parts):
 
 
 def test_a_part_inside_another_is_noted():
-    finding = _only(_findings(ball("drink_water", radius=0.5), ball("cup_glass")))
+    finding = only(_findings(ball("drink_water", radius=0.5), ball("cup_glass")))
     assert (finding.severity, finding.part) == ("note", "drink_water")
     assert finding.message == "lies inside cup_glass."
 
@@ -92,14 +89,14 @@ def test_a_pane_between_two_liquids_is_no_gap():
 @pytest.mark.parametrize("shift", [0.3, 1.0])
 def test_parts_that_cut_each_other_are_warned_about(shift):
     parts = (ball("a_glass"), ball("b_water", centre=(shift, 0.0, 0.0)))
-    finding = _only(_findings(*parts))
+    finding = only(_findings(*parts))
     assert (finding.severity, finding.part) == ("warning", "a_glass")
     assert "cuts or touches b_water" in finding.message
     assert "use the rule 'priority'" in finding.message
 
 
 def test_a_drink_that_overlaps_its_cup_cuts_it():
-    finding = _only(_warnings(_cup(), _drink(1.05, -0.05)))
+    finding = only(_warnings(_cup(), _drink(1.05, -0.05)))
     assert "cuts or touches" in finding.message
 
 
@@ -108,7 +105,7 @@ def test_a_drink_that_overlaps_its_cup_cuts_it():
 
 @pytest.mark.parametrize("part", [ball("b_water"), box("b_water")])
 def test_coincident_parts_are_warned_about(part):
-    finding = _only(_findings(part._replace(name="a_glass"), part))
+    finding = only(_findings(part._replace(name="a_glass"), part))
     assert finding.severity == "warning"
     assert "coincides with" in finding.message
     assert "a_glass" in str(finding) and "b_water" in str(finding)
@@ -117,14 +114,14 @@ def test_coincident_parts_are_warned_about(part):
 
 
 def test_boxes_that_share_one_side():
-    finding = _only(_findings(box("a_glass"), box("b_glass", centre=(1.0, 0.0, 0.0))))
+    finding = only(_findings(box("a_glass"), box("b_glass", centre=(1.0, 0.0, 0.0))))
     assert "coincides" in finding.message
     assert _share(finding.message) == pytest.approx(1 / 6, abs=0.02)
 
 
 def test_a_drink_that_fills_its_cup():
     """Its side and its bottom coincide with the cup, its top is free."""
-    finding = _only(_warnings(_cup(), _drink(1.0, 0.0)))
+    finding = only(_warnings(_cup(), _drink(1.0, 0.0)))
     assert (finding.severity, finding.part) == ("warning", "drink_water")
     assert "coincides with cup_glass" in finding.message
     side, end = 2 * np.pi * 1.5, np.pi
@@ -134,14 +131,14 @@ def test_a_drink_that_fills_its_cup():
 @pytest.mark.parametrize("closer", [1e-6, 3e-5])
 def test_walls_too_close_to_be_told_apart_coincide(closer):
     parts = [ball("a_glass"), ball("b_water", radius=1.0 - closer, index=1.333)]
-    assert "coincides" in _only(_warnings(*parts)).message
+    assert "coincides" in only(_warnings(*parts)).message
 
 
 # Gaps.
 
 
 def test_a_drink_that_is_shrunk_in_its_cup():
-    finding = _only(_warnings(_cup(), _drink(0.99, 0.01)))
+    finding = only(_warnings(_cup(), _drink(0.99, 0.01)))
     assert (finding.severity, finding.part) == ("warning", "drink_water")
     assert "separated from cup_glass by a gap of 0.01 " in finding.message
     assert _share(finding.message) > 0.7
@@ -150,7 +147,7 @@ def test_a_drink_that_is_shrunk_in_its_cup():
 
 def test_a_drink_that_is_shrunk_in_a_hollow_ball():
     drink = ball("drink_water", radius=1.48, index=1.333)
-    finding = _only(_warnings(shell("jar_glass"), drink))
+    finding = only(_warnings(shell("jar_glass"), drink))
     assert finding.part == "drink_water"
     assert "gap of 0.02 " in finding.message
     assert _share(finding.message) == 1.0
@@ -163,7 +160,7 @@ def test_a_drink_that_is_shrunk_in_the_air_of_a_cavity():
         ball("cavity_air", radius=1.5, index=1.0),
         ball("drink_water", radius=1.48, index=1.333),
     ]
-    finding = _only(_warnings(*parts))
+    finding = only(_warnings(*parts))
     assert (finding.part, _share(finding.message)) == ("drink_water", 1.0)
     assert "separated from cavity_air by a gap of 0.02 " in finding.message
 
@@ -181,7 +178,7 @@ def test_findings_know_no_size(scale, shift):
 
     cup, *drinks = map(placed, [_cup(), _drink(1.0, 0.0), _drink(0.99, 0.01), _drink(1.05, -0.05)])
     for drink, words in zip(drinks, ("coincides", "gap", "cuts"), strict=True):
-        assert words in _only(_warnings(cup, drink)).message
+        assert words in only(_warnings(cup, drink)).message
 
 
 def test_the_order_of_parts_does_not_matter():

@@ -6,18 +6,13 @@ import pytest
 from refref_jax.data import files, local_layout
 from refref_jax.data.errors import SceneError
 from refref_jax.data.mask_import import add_masks
-from tests.data.small_scenes import HEIGHT, WIDTH, edit_transforms, write_scene
-
-
-def _without_masks(transforms):
-    for record in transforms["frames"]:
-        del record["mask_file_path"]
+from tests.data.small_scenes import HEIGHT, WIDTH, edit_transforms, without_masks, write_scene
 
 
 @pytest.fixture
 def scene(tmp_path):
     scene = write_scene(tmp_path / "own")
-    edit_transforms(scene, _without_masks)
+    edit_transforms(scene, without_masks)
     return scene
 
 

@@ -2,6 +2,7 @@ import pytest
 
 from refref_jax.data.containment import find_containment
 from refref_jax.data.rule_advice import Advice, advise, examine_priorities
+from tests.data.expectations import only
 from tests.data.solids import ball, box
 
 
@@ -15,11 +16,6 @@ def _priorities(*parts):
 
 def _ranked(priority, name, **shape):
     return ball(name, **shape)._replace(priority=priority)
-
-
-def _only(findings):
-    [finding] = findings
-    return finding
 
 
 @pytest.mark.parametrize(
@@ -75,7 +71,7 @@ def test_good_priorities_have_no_findings():
 @pytest.mark.parametrize("priority", [1, 0, -1])
 def test_a_part_that_would_vanish(priority):
     drink = _ranked(priority, "drink_water", radius=0.5)
-    finding = _only(_priorities(_ranked(1, "cup_glass"), drink))
+    finding = only(_priorities(_ranked(1, "cup_glass"), drink))
     assert (finding.severity, finding.part) == ("warning", "drink_water")
     assert "lies inside cup_glass without a higher priority" in finding.message
     assert "Give it the higher number" in finding.message
@@ -88,7 +84,7 @@ def test_a_part_may_vanish_in_one_that_is_not_its_parent():
 
 
 def test_an_overlap_that_is_left_to_chance():
-    finding = _only(_priorities(ball("a_glass"), ball("b_water", centre=(1.0, 0.0, 0.0))))
+    finding = only(_priorities(ball("a_glass"), ball("b_water", centre=(1.0, 0.0, 0.0))))
     assert (finding.severity, finding.part) == ("warning", "a_glass")
     assert "same priority as b_water (0)" in finding.message
     assert "different numbers" in finding.message

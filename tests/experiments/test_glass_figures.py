@@ -1,8 +1,5 @@
 """The figures of docs/glass.md: what is drawn of bodies and paths, and the command once."""
 
-import subprocess
-import sys
-
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -34,27 +31,21 @@ def _paths(*polylines, shares):
     )
 
 
-def test_a_box_is_cut_into_a_square():
+def test_bodies_are_cut_into_outlines_that_go_round_in_order():
     (outline,) = cross_sections.outlines_of([_part(trimesh.creation.box([2.0, 3.0, 4.0]))])
     assert np.abs(outline).max(axis=0) == pytest.approx([1.0, 1.5])
     on_border = np.isclose(np.abs(outline), [1.0, 1.5]).any(axis=-1)
     assert on_border.all()
     assert cross_sections.width_of([outline]) == pytest.approx(1.5)
-
-
-def test_an_outline_goes_round_in_order():
-    (outline,) = cross_sections.outlines_of([_part(trimesh.creation.icosphere(radius=1.4))])
-    # The area of its polygon is that of the disc, but for the facets; of points in any other
-    # order it would be far smaller.
-    x, y = outline.T
-    area = 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
-    assert area == pytest.approx(np.pi * 1.4**2, rel=0.02)
-
-
-def test_a_torus_has_two_outlines():
     outlines = cross_sections.outlines_of([_part(trimesh.creation.torus(1.0, 0.3))])
-    reach = sorted(np.linalg.norm(outline, axis=-1).max() for outline in outlines)
-    assert reach == pytest.approx([0.7, 1.3], abs=0.02)
+    # The area of a polygon is that of the disc, but for the facets; of points in any other order
+    # it would be far smaller.
+    rings = [(xy.T, np.roll(xy, -1, axis=0).T) for xy in outlines]
+    areas = [abs(np.sum(x * next_y - y * next_x)) / 2.0 for (x, y), (next_x, next_y) in rings]
+    assert sorted(areas) == pytest.approx([np.pi * 0.7**2, np.pi * 1.3**2], rel=0.02)
+    above = trimesh.creation.box().apply_translation([0.0, 0.0, 2.0])
+    with pytest.raises(SceneError, match="around the origin"):
+        cross_sections.outlines_of([_part(above)])
 
 
 def test_an_open_mesh_has_one_outline_from_end_to_end():
@@ -69,12 +60,6 @@ def test_an_open_mesh_has_one_outline_from_end_to_end():
     found = np.unwrap(np.arctan2(-outline[:, 1], -outline[:, 0]))
     assert np.all(np.diff(found) > 0.0) or np.all(np.diff(found) < 0.0)
     assert sorted(found[[0, -1]]) == pytest.approx([-0.75 * np.pi, 0.75 * np.pi], abs=1e-4)
-
-
-def test_what_the_plane_misses_is_refused():
-    above = trimesh.creation.box().apply_translation([0.0, 0.0, 2.0])
-    with pytest.raises(SceneError, match="around the origin"):
-        cross_sections.outlines_of([_part(above)])
 
 
 def test_rays_start_in_one_point_and_cross_where_they_are_told():
@@ -124,34 +109,6 @@ def test_every_drawing_is_a_picture_with_something_in_it(tmp_path):
         picture = iio.imread(path)
         assert picture.shape[0] > 300 and picture.shape[1] > 600
         assert picture.min() < 64 and picture.max() > 240 and picture.std() > 5.0
-
-
-_STAND_IN = """
-import sys
-from pathlib import Path
-from absl import flags
-from experiments import glass_figures
-draw = {name: lambda path: path.write_text("drawn") for name in glass_figures.FIGURES}
-glass_figures._drawers = lambda folder, indices: draw
-glass_figures.cli_scenes.opened = Path  # so that JAX is not imported
-flags.FLAGS(["glass_figures", *sys.argv[1:]])
-glass_figures.main()
-"""
-
-
-def test_one_figure_is_drawn_anew_and_the_others_stay(tmp_path):
-    def draw(*options):
-        words = [sys.executable, "-c", _STAND_IN, f"--scene={_SCENE}", f"--out={tmp_path}"]
-        subprocess.run([*words, *options], check=True, cwd=ROOT, capture_output=True)
-        return {path.name: path.read_text() for path in tmp_path.glob("*.jpg")}
-
-    names = {f"glass_{name}.jpg" for name in ("views", "fan", "tree", "distances")}
-    assert draw("--figure=fan") == {"glass_fan.jpg": "drawn"}
-    assert set(draw("--figure=views", "--figure=tree", "--figure=distances")) == names
-    for name in names:
-        (tmp_path / name).write_text("old")
-    changed = draw("--figure=tree", "--overwrite")
-    assert changed == dict.fromkeys(names, "old") | {"glass_tree.jpg": "drawn"}
 
 
 @pytest.mark.slow

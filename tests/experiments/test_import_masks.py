@@ -1,20 +1,15 @@
 """The command that takes over masks, as a user calls it."""
 
 from refref_jax.data import local_layout
-from tests.data.small_scenes import edit_transforms, write_scene
+from tests.data.small_scenes import edit_transforms, without_masks, write_scene
 from tests.experiments.command import run_command
-
-
-def _without_masks(transforms):
-    for record in transforms["frames"]:
-        del record["mask_file_path"]
 
 
 def test_masks_from_a_folder(tmp_path):
     scene, masks = write_scene(tmp_path / "own"), tmp_path / "masks"
     expected = local_layout.read_masks(local_layout.read_frames(scene, "train"))
     (scene / "mask").rename(masks)
-    edit_transforms(scene, _without_masks)
+    edit_transforms(scene, without_masks)
     options = (f"--scene={scene}", f"--masks={masks}", f"--out={tmp_path / 'copy'}")
     result = run_command("import_masks", *options)
     assert "Masks: 2" in result.stdout

@@ -8,7 +8,6 @@ import nbformat
 import pytest
 
 from experiments import notebooks
-from tests.experiments.command import run_command
 
 _NAMES = ("index_of_refraction", "light_paths", "quickstart", "your_scene")
 
@@ -33,10 +32,6 @@ def _texts(cell):
         for kind, value in output.get("data", {}).items():
             if not kind.startswith("image/"):
                 yield "".join(value)
-
-
-def test_there_are_four():
-    assert tuple(path.stem for path in notebooks.find([])) == _NAMES
 
 
 @pytest.mark.parametrize("path", _STORED)
@@ -77,6 +72,9 @@ def test_the_check_for_folders_of_a_machine_finds_them():
 def test_all_notebooks_begin_with_the_same_cell():
     first = {"".join(_code(param.values[0])[0]["source"]) for param in _STORED}
     assert len(first) == 1
+    assert tuple(path.stem for path in notebooks.find([])) == _NAMES
+    with pytest.raises(ValueError, match=r"'quickstrat'.* quickstart"):
+        notebooks.find(["quickstrat"])
 
 
 @pytest.mark.parametrize("path", _STORED)
@@ -89,11 +87,6 @@ def test_files_that_a_notebook_names_are_there(path):
         assert there.exists(), name
     for command in re.findall(r"-m experiments\.(\w+)", text):
         assert (notebooks.ROOT / "experiments" / f"{command}.py").exists(), command
-
-
-def test_an_unknown_notebook_is_named_beside_those_that_exist():
-    result = run_command("notebooks", "--only=quickstrat", fails=True)
-    assert "'quickstrat'" in result.stderr and "quickstart" in result.stderr
 
 
 def _write_notebook(path, *sources):

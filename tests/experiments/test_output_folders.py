@@ -51,6 +51,16 @@ def test_only_what_was_noted_is_replaced(tmp_path):
     _write(out, ["rgb/0.png"], overwrite=True)
     assert _files(out) == {"rgb/0.png", "rgb/mine.txt", "command.json"}
     assert (out / "notes").is_dir()
+    (out / "metrics.json").write_text("mine")  # is told before the work
+    with pytest.raises(ValueError, match=r"out/metrics.json is not of this command"):
+        outputs.replaceable(out, module=__name__, writes=_WRITES, overwrite=True)
+    # A note of files that are gone is no obstacle.
+    (out / "rgb" / "0.png").unlink()
+    (out / "rgb" / "mine.txt").unlink()
+    (out / "rgb").rmdir()
+    (out / "metrics.json").unlink()
+    _write(out, ["metrics.json"], overwrite=False)
+    assert _noted(out) == ["metrics.json"]
 
 
 def test_nothing_of_others_is_replaced_even_if_asked(tmp_path):
@@ -100,15 +110,12 @@ def test_an_interruption_leaves_what_was_there(tmp_path, error):
         path.write_text("half")
         raise error
     assert not (out / "x").exists() and _files(out) == {"metrics.json", "command.json"}
-
-
-def test_an_interruption_leaves_no_empty_folder_but_one_that_was_there(tmp_path):
     (tmp_path / "there").mkdir()
     for name in ("made", "there"):
-        with pytest.raises(KeyboardInterrupt), _fresh(tmp_path / name) as draft:
+        with pytest.raises(error), _fresh(tmp_path / name) as draft:
             (draft / "metrics.json").write_text("half")
-            raise KeyboardInterrupt
-    assert [path.name for path in tmp_path.iterdir()] == ["there"]
+            raise error
+    assert {path.name for path in tmp_path.iterdir()} == {"out", "there"}  # no empty folder
 
 
 def test_two_calls_at_once_do_not_share_a_folder(tmp_path):
@@ -146,23 +153,6 @@ def test_a_product_of_its_own_is_added_or_replaced_alone(tmp_path):
     _write(out, ["tree.jpg"], writes=["tree.jpg"], overwrite=True)
     assert (out / "fan.jpg").read_text() == "old" and (out / "tree.jpg").read_text() == "new"
     assert _noted(out) == ["fan.jpg", "tree.jpg"]
-
-
-def test_a_foreign_file_beside_an_own_note_is_told_before_the_work(tmp_path):
-    out = tmp_path / "out"
-    _write(out, ["metrics.json"], overwrite=False)
-    (out / "rgb").mkdir()
-    with pytest.raises(ValueError, match=r"out/rgb is not of this command"):
-        outputs.replaceable(out, module=__name__, writes=_WRITES, overwrite=True)
-
-
-def test_an_own_note_of_files_that_are_gone_is_no_obstacle(tmp_path):
-    out = tmp_path / "out"
-    _write(out, ["rgb/0.png", "metrics.json"], overwrite=False)
-    (out / "rgb" / "0.png").unlink()
-    (out / "metrics.json").unlink()
-    _write(out, ["metrics.json"], overwrite=False)
-    assert _noted(out) == ["metrics.json"]
 
 
 def test_who_is_stopped_while_files_are_moved_owns_all_of_them(tmp_path, monkeypatch):

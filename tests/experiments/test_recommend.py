@@ -20,10 +20,6 @@ _ROWS = [
 ]
 
 
-def test_the_time_is_that_of_steps_and_images_on_this_machine():
-    assert recommend.seconds_of(_ROWS[1], _MACHINE) == pytest.approx(80.0)
-
-
 @pytest.mark.parametrize(
     ("seconds", "cheaper", "best", "dearer"),
     [
@@ -37,6 +33,10 @@ def test_the_best_that_fits_is_chosen(seconds, cheaper, best, dearer):
     choice = recommend.choose(_ROWS, _MACHINE, seconds)
     names = [row and row.name for row in (choice.cheaper, choice.best, choice.dearer)]
     assert names == [cheaper, best, dearer]
+    assert recommend.seconds_of(_ROWS[1], _MACHINE) == pytest.approx(80.0)
+    # 0.5 * (25 + 20) + 20 = 42.5 s.
+    with pytest.raises(ValueError, match=r"less than 0\.7 minutes here \(steps=250\)"):
+        recommend.choose(_ROWS, _MACHINE, 42.0)
 
 
 def test_noise_decides_nothing():
@@ -76,18 +76,6 @@ def test_turns_are_combined_when_there_is_time_and_that_is_said(tmp_path):
     assert recommend.choose(rows, _MACHINE, tight + 0.1).combined is None
 
 
-def test_folders_with_blanks_can_be_pasted(tmp_path):
-    choice = recommend.choose(_ROWS, _MACHINE, 1e6)
-    text = "\n".join(recommend.told(choice, _MACHINE, tmp_path / "my ball"))
-    assert f"'--scene={tmp_path / 'my ball'}' '--out=runs/my ball'" in text
-
-
-def test_too_little_time_is_refused_with_what_is_needed():
-    # 0.5 * (25 + 20) + 20 = 42.5 s.
-    with pytest.raises(ValueError, match=r"less than 0\.7 minutes here \(steps=250\)"):
-        recommend.choose(_ROWS, _MACHINE, 42.0)
-
-
 def test_the_machine_is_compared_by_the_base():
     timing = Training(96, 0.3, 3413.0, 60.0, 31.0, 900.0, None)
     machine = recommend.compare(timing, made_row(pace=0.1), 40)
@@ -106,6 +94,8 @@ def test_the_bundled_table_is_a_whole_sweep():
 def test_what_is_told_can_be_pasted(tmp_path):
     rows = [made_row("base", evaluation="--rays_per_pixel=4")]
     choice = recommend.choose(rows, _MACHINE, 1e6)
+    blank = "\n".join(recommend.told(choice, _MACHINE, tmp_path / "my ball"))
+    assert f"'--scene={tmp_path / 'my ball'}' '--out=runs/my ball'" in blank
     text = "\n".join(recommend.told(choice, _MACHINE, tmp_path / "ball"))
     train = f"python -m experiments.train --scene={tmp_path / 'ball'} --out=runs/ball"
     assert f"{train} --preset=tiny --steps=1000" in text

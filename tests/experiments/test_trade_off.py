@@ -44,22 +44,14 @@ def test_no_point_is_the_base_and_none_comes_twice():
     assert [point.name for point in points] == [BASE, "cut=0.1"]
 
 
-def test_a_sweep_may_be_around_another_kind_of_field():
+def test_a_sweep_may_be_around_another_base():
     points = trade_points.sweep(
         preset="tiny", base={"field": "nerfacto"}, knobs=["samples", "entries", "footprint"]
     )
     names = {point.name for point in points}
     assert {"samples=24+12+8", "entries=18", "footprint=differential"} <= names
     assert not names & {"samples=48+24+16", "entries=17", "footprint=cone"}
-    kinds = trade_points.sweep(
-        preset="tiny", values={"field": ("zipnerf", "nerfacto")}, knobs=["field"]
-    )
-    assert [point.name for point in kinds] == [BASE, "field=nerfacto"]
-    with pytest.raises(ValueError, match=r"no --base=field=voxels\. Choose from zipnerf, nerfacto"):
-        trade_points.sweep(preset="tiny", base={"field": "voxels"})
-
-
-def test_straight_light_has_neither_cut_nor_bends():
+    # Straight light has neither a cut nor bends.
     points = trade_points.sweep(preset="tiny", base={"cut": "0.05"}, knobs=["paths", "bends"])
     straight = next(point for point in points if point.name == "paths=straight")
     assert not [word for word in straight.training if "cut" in word or "bends" in word]
@@ -85,17 +77,11 @@ def test_the_lists_of_a_knob_can_be_replaced_and_knobs_added():
         "samples=16+10",
         "samples=8+4",
         "batch=256",
-        "steps=625",
-        "steps=1250",
-        "steps=5000",
+        *("steps=625", "steps=1250", "steps=5000"),
     }
-
-
-def test_steps_are_the_bases_and_those_of_more_trainings():
     points = trade_points.sweep(preset="tiny", steps=[300, 100], knobs=["steps"])
     assert [point.name for point in points] == [BASE, "steps=100"]
     assert "--steps=300" in points[0].training
-    assert len(trade_points.sweep(preset="tiny", steps=[300], knobs=["steps"])) == 1
 
 
 @pytest.mark.parametrize(
@@ -104,6 +90,13 @@ def test_steps_are_the_bases_and_those_of_more_trainings():
         (lambda: trade_points.sweep(preset="huge"), "Choose from tiny, small, paper, best"),
         (lambda: trade_points.sweep(preset="tiny", knobs=["colour"]), "--values=colour=A/B"),
         (lambda: trade_points.sweep(preset="tiny", base={"steps": "9"}), "Use --steps"),
+        (lambda: trade_points.sweep(preset="tiny", base={"paths": "foo"}), "no --base=paths=foo"),
+        (lambda: trade_points.sweep(preset="tiny", base={"out": "x"}), "--out"),
+        (lambda: trade_points.sweep(preset="tiny", base={"scene": "x"}), "--scene"),
+        (
+            lambda: trade_points.sweep(preset="tiny", base={"field": "a"}),
+            "Choose from zipnerf",
+        ),
         (lambda: trade_points.parse_base(["cut"]), "NAME=VALUE"),
         (lambda: trade_points.parse_values(["cut="]), "NAME=A/B"),
         (lambda: trade_points.choose(trade_points.sweep(preset="tiny"), ["cut=1"]), "cut=1"),
@@ -180,11 +173,7 @@ def test_what_to_turn_first_is_what_is_free_then_what_gives_most_for_its_time():
     assert worth[1].gain == pytest.approx(1.0) and worth[1].percent == pytest.approx(10.0)
     # Of rendering: training takes as long as the base's.
     assert worth[3].percent == pytest.approx(300.0)
-
-
-def test_what_saves_time_is_named_once_a_knob():
-    saving = table.worth_saving(table.turns(_measured()))
-    assert [turn.row.name for turn in saving] == ["less=1"]
+    assert [turn.row.name for turn in table.worth_saving(found)] == ["less=1"]
 
 
 def test_the_report_marks_the_front_and_sorts_by_time():
@@ -235,32 +224,16 @@ def test_a_sweep_adds_to_the_one_before_it_around_the_same_base(tmp_path):
     # Measured on other images they could not stand in one table.
     with pytest.raises(ValueError, match="on 20 images, and this sweep would be on 5"):
         sweep.earlier_rows(tmp_path, points[0], _SCENE, images=5)
-    # A folder of that name, elsewhere, is another scene.
-    namesake = tmp_path / _SCENE.name
+    namesake = tmp_path / _SCENE.name  # elsewhere it is another scene
     namesake.mkdir()
     with pytest.raises(ValueError, match="another folder named"):
         sweep.earlier_rows(tmp_path, points[0], namesake, images=20)
 
-
-@pytest.mark.parametrize(
-    ("base", "message"),
-    [
-        ({"paths": "foo"}, "no --base=paths=foo"),
-        ({"out": "x"}, "--out"),
-        ({"scene": "x"}, "--scene"),
-    ],
-)
-def test_a_base_that_points_can_not_have_is_refused(base, message):
-    with pytest.raises(ValueError, match=message):
-        trade_points.sweep(preset="tiny", base=base)
-
-
-def test_a_sweep_without_its_base_ends(tmp_path):
-    def measure(point):
+    def fail(point):
         raise RunFailedError("unknown flag")
 
-    with pytest.raises(ValueError, match="unknown flag"):
-        sweep.sweep(trade_points.sweep(preset="tiny"), tmp_path, measure)
+    with pytest.raises(ValueError, match="unknown flag"):  # without its base
+        sweep.sweep(points, tmp_path / "failed", fail)
 
 
 def test_the_pace_is_the_median_without_the_interval_that_compiles():
@@ -293,6 +266,19 @@ else:
 """
 
 
+@pytest.mark.parametrize(
+    ("text", "status", "told"),
+    [
+        ("$ python -m experiments.train --scene=mirror\nCompiling\n", 1, "Compiling"),
+        ("$ python -m experiments.train --scene=mirror\n", -9, "killed by SIGKILL"),
+        ("ValueError: no\nbye\n", 1, "ValueError: no"),
+        ("", 3, "ended with status 3, and printed nothing"),
+    ],
+)
+def test_the_complaint_is_what_was_said_last(text, status, told):
+    assert subprocesses._complaint(text, status) == told
+
+
 @pytest.fixture
 def stub(tmp_path, monkeypatch):
     """Stands in for the commands; writes their names into `calls.txt`."""
@@ -320,36 +306,21 @@ def test_a_point_is_measured_once(stub):
     sweep.measure(points["cut=0.1"], _SCENE, stub)
     calls = (stub / "calls.txt").read_text().split()
     assert calls == ["train", "evaluate", "evaluate", "evaluate", "train", "evaluate"]
+    (stub / sweep.run_name(points[BASE], _SCENE) / "measured.json").unlink()
+    again = sweep.measure(points[BASE], _SCENE, stub)  # it ended unmeasured
+    assert again.peak_host_mib is None and again.seconds_per_step == row.seconds_per_step
 
 
 def test_a_failure_tells_its_last_word_and_is_tried_again(stub):
     values = {"cut": ("2",)}
     point = trade_points.sweep(preset="tiny", values=values, knobs=["cut"])[1]
+    log = stub / f"{sweep.run_name(point, _SCENE)}.log"
+    log.parent.mkdir()
+    log.write_text("error: an older one\n")
     for _ in range(2):
         with pytest.raises(RunFailedError, match=r"The cut is a share, not 2.*\.log"):
             sweep.measure(point, _SCENE, stub)
     assert (stub / "calls.txt").read_text().split() == ["train", "train"]
-
-
-def test_the_complaint_is_that_of_the_last_attempt(tmp_path, stub):
-    point = trade_points.sweep(preset="tiny", values={"cut": ("2",)}, knobs=["cut"])[1]
-    log = stub / f"{sweep.run_name(point, _SCENE)}.log"
-    log.parent.mkdir()
-    log.write_text("error: an older one\n")
-    with pytest.raises(RunFailedError, match="The cut is a share"):
-        sweep.measure(point, _SCENE, stub)
-    mirror = "$ python -m experiments.train --scene=mirror\nCompiling\n"
-    assert subprocesses._complaint(mirror, 1) == "Compiling"
-    assert subprocesses._complaint(mirror, -9) == "killed by SIGKILL"
-    assert subprocesses._complaint("ValueError: no\nbye\n", 1) == "ValueError: no"
-    assert subprocesses._complaint("", 3) == "ended with status 3, and printed nothing"
-
-
-def test_who_says_nothing_is_not_told_by_the_command_itself(tmp_path, monkeypatch):
-    monkeypatch.setattr(subprocesses, "command_line", lambda name, options: ["false"])
-    with pytest.raises(RunFailedError, match=r"train: ended with status 1, and printed nothing"):
-        subprocesses.run("train", log=tmp_path / "log")
-    assert (tmp_path / "log").read_text() == "$ python -m experiments.train\n"
 
 
 def test_an_option_with_a_space_stays_one_and_its_line_can_be_pasted(stub):
@@ -361,14 +332,6 @@ def test_an_option_with_a_space_stays_one_and_its_line_can_be_pasted(stub):
     ]
     log = (stub / f"{sweep.run_name(point, _SCENE)}.log").read_text()
     assert " '--lpips_weights=a b.npz' --overwrite" in log
-
-
-def test_a_training_that_ended_unmeasured_has_no_peak(stub):
-    point = trade_points.sweep(preset="tiny", steps=[4])[0]
-    first = sweep.measure(point, _SCENE, stub)
-    (stub / sweep.run_name(point, _SCENE) / "measured.json").unlink()
-    again = sweep.measure(point, _SCENE, stub)
-    assert again.peak_host_mib is None and again.seconds_per_step == first.seconds_per_step
 
 
 @pytest.mark.slow

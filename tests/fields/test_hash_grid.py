@@ -111,37 +111,36 @@ def test_tables_must_have_a_power_of_two_entries(entries, hint):
 # --- vertices ---
 
 
-def _vertex(*coordinates):
-    return jnp.array(coordinates, jnp.uint32)
+def _entries(points, resolution, entries):
+    """The table entries of grid vertices, as a cell has them in whose corner they lie."""
+    position = [*jnp.asarray(np.asarray(points) / resolution, jnp.float32).T]
+    rows, weights = (
+        np.array(x) for x in zip(*vertices.corners(position, resolution, entries), strict=True)
+    )
+    assert weights.max(axis=0).min() > 0.99
+    return np.take_along_axis(rows, weights.argmax(axis=0)[None], axis=0)[0]
 
 
-def test_vertex_index_of_a_dense_level_by_hand():
-    assert vertices.vertex_index(_vertex(1, 2, 3), 4, 128) == 1 + 2 * 5 + 3 * 25
-
-
-def test_vertex_index_of_a_hashed_level_by_hand():
+def test_entries_by_hand():
+    assert _entries([[1, 2, 3]], 4, 128) == 1 + 2 * 5 + 3 * 25  # dense
     # 1 xor 2654435761 * 2 xor 805459861 * 3, each modulo 2^32; then the last eight bits.
-    expected = (1 ^ (2654435761 * 2 % 2**32) ^ (805459861 * 3 % 2**32)) % 256
-    assert vertices.vertex_index(_vertex(1, 2, 3), 16, 256) == expected
+    hashed = (1 ^ (2654435761 * 2 % 2**32) ^ (805459861 * 3 % 2**32)) % 256
+    assert _entries([[1, 2, 3]], 16, 256) == hashed
 
 
 @pytest.mark.parametrize(
     ("resolution", "entries"), [(5, 256), (18, 256), (18, 8192), (8192, 2**16)]
 )
-def test_vertex_index_against_python_integers(resolution, entries):
+def test_entries_against_python_integers(resolution, entries):
     drawn = np.random.default_rng(0).integers(0, resolution + 1, size=(40, 3))
     drawn[:2] = [[0, 0, 0], [resolution] * 3]
     expected = [reference_sampling.vertex_entry(v, resolution, entries) for v in drawn]
-    index = jax.vmap(lambda v: vertices.vertex_index(v, resolution, entries))
-    got = index(jnp.asarray(drawn, jnp.uint32))
-    np.testing.assert_array_equal(got, expected)
-    assert max(expected) < entries
+    np.testing.assert_array_equal(_entries(drawn, resolution, entries), expected)
 
 
 def test_vertices_of_a_dense_level_have_entries_of_their_own():
-    every = np.array(list(itertools.product(range(6), repeat=3)), np.uint32)
-    got = jax.vmap(lambda v: vertices.vertex_index(v, 5, 256))(jnp.asarray(every))
-    np.testing.assert_array_equal(np.sort(got), np.arange(216))
+    every = list(itertools.product(range(6), repeat=3))
+    np.testing.assert_array_equal(np.sort(_entries(every, 5, 256)), np.arange(216))
 
 
 # --- interpolation ---

@@ -7,6 +7,7 @@ import pytest
 
 from refref_jax.fields import interpolation, vertex_loops
 from tests import gradients, reference_sampling
+from tests.arrays import single
 
 # Sums of products of float32 numbers of about 1, eight a point.
 _BLENDING = 2e-5
@@ -35,10 +36,6 @@ def _points(kind, count=12):
 
 
 _POINTS = pytest.mark.parametrize("kind", ["anywhere", "faces", "one cell"])
-
-
-def _single(values):
-    return jnp.asarray(values, jnp.float32)
 
 
 def _matrix(level, points):
@@ -73,10 +70,10 @@ def _pull(table, points, slopes, *, level, precision="float32"):
 def test_values_and_gradients_against_a_matrix(level, kind):
     points, table = _points(kind), _table(level)
     matrix = _matrix(level, points)
-    got = _blend(_single(table), _single(points), level=level)
+    got = _blend(single(table), single(points), level=level)
     np.testing.assert_allclose(got, matrix @ table, atol=_BLENDING)
     slopes = np.random.default_rng(2).normal(size=(len(points), _FEATURES))
-    got = _pull(_single(table), _single(points), _single(slopes), level=level)
+    got = _pull(single(table), single(points), single(slopes), level=level)
     np.testing.assert_allclose(got, matrix.T @ slopes, atol=_BLENDING)
 
 
@@ -84,16 +81,16 @@ def test_values_and_gradients_against_a_matrix(level, kind):
 def test_points_in_one_place_add_up(level):
     points = np.repeat(_points("anywhere", 1), 50, axis=0)
     ones = np.ones((50, _FEATURES))
-    got = _pull(_single(_table(level)), _single(points), _single(ones), level=level)
+    got = _pull(single(_table(level)), single(points), single(ones), level=level)
     np.testing.assert_allclose(got, _matrix(level, points).T @ ones, rtol=1e-5, atol=_BLENDING)
     np.testing.assert_allclose(np.sum(got), 50 * _FEATURES, rtol=1e-5)
 
 
 @_LEVEL
 def test_a_gradient_does_not_depend_on_the_table(level):
-    points, slopes = _single(_points("anywhere")), jnp.ones((12, _FEATURES))
-    first = _pull(_single(_table(level)), points, slopes, level=level)
-    huge = _pull(_single(1e30 * _table(level, 5)), points, slopes, level=level)
+    points, slopes = single(_points("anywhere")), jnp.ones((12, _FEATURES))
+    first = _pull(single(_table(level)), points, slopes, level=level)
+    huge = _pull(single(1e30 * _table(level, 5)), points, slopes, level=level)
     np.testing.assert_array_equal(first, huge)
 
 
@@ -117,7 +114,7 @@ def test_derivatives_by_table_and_position(level, order):
 
 @_LEVEL
 def test_values_do_not_depend_on_batching(level):
-    table, points = _single(_table(level)), _single(_points("anywhere"))
+    table, points = single(_table(level)), single(_points("anywhere"))
     flat = _blend(table, points, level=level)
     one = functools.partial(_blend, table, level=level)
     np.testing.assert_allclose(jax.vmap(one)(points), flat, atol=_BLENDING)
@@ -128,8 +125,8 @@ def test_values_do_not_depend_on_batching(level):
 
 @_LEVEL
 def test_gradients_do_not_depend_on_batching(level):
-    table, points = _single(_table(level)), _single(_points("anywhere"))
-    slopes = _single(np.random.default_rng(2).normal(size=(12, _FEATURES)))
+    table, points = single(_table(level)), single(_points("anywhere"))
+    slopes = single(np.random.default_rng(2).normal(size=(12, _FEATURES)))
     flat = _pull(table, points, slopes, level=level)
     nested, by_place = points.reshape(3, 4, 3), slopes.reshape(3, 4, _FEATURES)
 
@@ -144,7 +141,7 @@ def test_gradients_do_not_depend_on_batching(level):
 
 @_LEVEL
 def test_many_tables_at_once(level):
-    tables, points = _single([_table(level, 0), _table(level, 1)]), _single(_points("anywhere"))
+    tables, points = single([_table(level, 0), _table(level, 1)]), single(_points("anywhere"))
     got = jax.vmap(functools.partial(_blend, level=level), in_axes=(0, None))(tables, points)
     expected = [_matrix(level, _points("anywhere")) @ _table(level, seed) for seed in (0, 1)]
     np.testing.assert_allclose(got, expected, atol=_BLENDING)
@@ -152,13 +149,13 @@ def test_many_tables_at_once(level):
 
 @_LEVEL
 def test_steps_in_a_scan(level):
-    points = _single(_points("anywhere"))
+    points = single(_points("anywhere"))
 
     def step(table, _):
         blend = lambda x: jnp.sum(_blend(x, points, level=level))
         return table - 0.1 * jax.grad(blend)(table), None
 
-    got, _ = jax.jit(lambda x: jax.lax.scan(step, x, length=3))(_single(_table(level)))
+    got, _ = jax.jit(lambda x: jax.lax.scan(step, x, length=3))(single(_table(level)))
     slope = _matrix(level, _points("anywhere")).sum(axis=0)[:, None]
     np.testing.assert_allclose(got, _table(level) - 0.3 * slope, atol=_BLENDING)
 
@@ -167,7 +164,7 @@ def test_steps_in_a_scan(level):
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 def test_loops_mean_what_the_formulas_do(level, precision):
     resolution, entries = _LEVELS[level]
-    table, points = _single(_table(level)), _single(_points("anywhere"))
+    table, points = single(_table(level)), single(_points("anywhere"))
     options = {"resolution": resolution, "precision": precision}
     np.testing.assert_allclose(
         vertex_loops.gather(table, points, **options),
@@ -195,7 +192,7 @@ def test_other_devices_get_plain_operations(platform):
 
 @_LEVEL
 def test_rows_are_read_as_bfloat16_and_gradients_are_exact(level):
-    table, points = _single(_table(level)), _single(_points("anywhere"))
+    table, points = single(_table(level)), single(_points("anywhere"))
     got = _blend(table, points, level=level, precision="bfloat16")
     rounded = np.asarray(table.astype(jnp.bfloat16).astype(jnp.float32), np.float64)
     expected = _matrix(level, _points("anywhere")) @ rounded

@@ -8,7 +8,7 @@ import trimesh
 
 from refref_jax.geometry import bvh, bvh_build, lockstep_traversal
 from refref_jax.geometry.rays import Rays
-from tests import reference
+from tests import arrays, reference
 
 # Distances are float32 sums of terms near 10.
 _DISTANCE_TOLERANCE = 2e-5
@@ -44,10 +44,6 @@ def _closest(triangles, origins, directions, *, limits=None, leaving=None, locks
     return np.asarray(hits.distances), faces, np.asarray(hits.barycentrics)
 
 
-def _unit(vectors):
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-
-
 def _soup(count, seed=0):
     generator = np.random.default_rng(seed)
     centres = generator.uniform(-1, 1, (count, 1, 3))
@@ -56,8 +52,8 @@ def _soup(count, seed=0):
 
 def _random_rays(count, seed=1, reach=3.0):
     generator = np.random.default_rng(seed)
-    origins = reach * _unit(generator.normal(size=(count, 3)))
-    return origins, _unit(generator.uniform(-1, 1, (count, 3)) - origins)
+    origins = reach * arrays.unit(generator.normal(size=(count, 3)))
+    return origins, arrays.unit(generator.uniform(-1, 1, (count, 3)) - origins)
 
 
 @pytest.mark.parametrize("faces", [1, 2, 5, 40, 400])
@@ -104,7 +100,7 @@ def test_no_ray_slips_through_a_closed_surface(target, subdivisions):
     }[target]
     generator = np.random.default_rng(0)
     origins = generator.uniform(-0.2, 0.2, points.shape)
-    directions = _unit(points - origins)
+    directions = arrays.unit(points - origins)
     distances, _, _ = _closest(mesh.triangles, origins, directions)
     expected = np.linalg.norm(points - origins, axis=-1)
     np.testing.assert_allclose(distances, expected, atol=_DISTANCE_TOLERANCE)
@@ -118,9 +114,9 @@ def test_hits_agree_with_embree(aim):
     mesh = trimesh.creation.icosphere(subdivisions=4)
     origins, directions = _random_rays(len(mesh.vertices))
     if aim == "vertices":
-        directions = _unit(mesh.vertices - origins)
+        directions = arrays.unit(mesh.vertices - origins)
     elif aim == "edges":
-        directions = _unit(mesh.vertices[mesh.edges_unique[: len(origins)]].mean(1) - origins)
+        directions = arrays.unit(mesh.vertices[mesh.edges_unique[: len(origins)]].mean(1) - origins)
     elif aim == "axes":
         axes = np.repeat(np.concatenate([np.eye(3), -np.eye(3)]), 400, axis=0)
         offsets = np.random.default_rng(0).uniform(-0.9, 0.9, axes.shape)

@@ -9,7 +9,7 @@ import trimesh
 from benchmarks import ray_sorting
 from refref_jax.geometry import bvh, bvh_build
 from refref_jax.geometry.rays import Rays
-from tests import reference
+from tests import arrays, reference
 
 _trace = jax.jit(bvh.closest_hits)
 
@@ -18,10 +18,6 @@ _trace = jax.jit(bvh.closest_hits)
 def _debug_nans():
     with jax.debug_nans(True):
         yield
-
-
-def _unit(vectors):
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def _hits(triangles, origins, directions):
@@ -89,7 +85,7 @@ def test_rays_at_vertices_and_edges_do_not_leak(target):
     generator = np.random.default_rng(0)
     reach = 0.9 if target == "inner vertices" else 0.2
     origins = generator.uniform(-reach, reach, points.shape) / np.sqrt(3.0)
-    directions = _unit(points - origins)
+    directions = arrays.unit(points - origins)
     distances, _ = _hits(mesh.triangles, origins, directions)
     expected = np.linalg.norm(points - origins, axis=-1)
     assert np.mean(np.abs(distances - expected) > 1e-4) <= 1e-4
@@ -101,8 +97,8 @@ def test_hits_equal_brute_force_at_any_size_and_place(size, offset):
     generator = np.random.default_rng(1)
     shift = np.array([offset, -0.5 * offset, 0.0]) * size
     soup = generator.uniform(-1, 1, (60, 1, 3)) + generator.normal(size=(60, 3, 3)) * 0.4
-    origins = 3.0 * _unit(generator.normal(size=(300, 3)))
-    directions = _unit(generator.uniform(-0.5, 0.5, (300, 3)) - origins)
+    origins = 3.0 * arrays.unit(generator.normal(size=(300, 3)))
+    directions = arrays.unit(generator.uniform(-0.5, 0.5, (300, 3)) - origins)
     triangles, origins = soup * size + shift, origins * size + shift
     distances, faces = _hits(triangles, origins, directions)
     expected, expected_faces = _expected(triangles, origins, directions)
@@ -121,14 +117,14 @@ def test_hits_equal_brute_force_at_any_size_and_place(size, offset):
 def test_needles_are_hit_where_they_are():
     """Triangles of aspect 1e6: a ray at their middle meets them, one beside them does not."""
     generator = np.random.default_rng(2)
-    along = _unit(generator.normal(size=(40, 3)))
-    across = _unit(np.cross(along, generator.normal(size=(40, 3))))
+    along = arrays.unit(generator.normal(size=(40, 3)))
+    across = arrays.unit(np.cross(along, generator.normal(size=(40, 3))))
     centres = generator.uniform(-1, 1, (40, 3))
     needles = np.stack(
         [centres - along, centres + along - 1e-6 * across, centres + along + 1e-6 * across], axis=1
     )
     needles = needles.astype(np.float32).astype(float)
-    normals = _unit(np.cross(needles[:, 1] - needles[:, 0], needles[:, 2] - needles[:, 0]))
+    normals = arrays.unit(np.cross(needles[:, 1] - needles[:, 0], needles[:, 2] - needles[:, 0]))
     middles = needles.mean(axis=1)
     for needle, middle, normal, sideways in zip(needles, middles, normals, across, strict=True):
         origins = np.stack([middle + normal, middle + normal + 0.01 * sideways])
@@ -140,8 +136,8 @@ def test_needles_are_hit_where_they_are():
 def test_degenerate_triangles_are_never_hit():
     generator = np.random.default_rng(3)
     points = np.repeat(generator.uniform(-1, 1, (20, 1, 3)), 3, axis=1)
-    origins = 3.0 * _unit(generator.normal(size=(20, 3)))
-    distances, faces = _hits(points, origins, _unit(points[:, 0] - origins))
+    origins = 3.0 * arrays.unit(generator.normal(size=(20, 3)))
+    distances, faces = _hits(points, origins, arrays.unit(points[:, 0] - origins))
     assert np.all(distances == np.inf)
     assert np.all(faces == -1)
 
@@ -152,7 +148,7 @@ def test_duplicates_give_one_hit_whatever_their_order_and_the_company():
     tree = jax.tree.map(jnp.asarray, tree)
     generator = np.random.default_rng(4)
     origins = jnp.asarray(generator.uniform(-0.3, 0.3, (200, 3)), jnp.float32)
-    directions = jnp.asarray(_unit(generator.normal(size=(200, 3))), jnp.float32)
+    directions = jnp.asarray(arrays.unit(generator.normal(size=(200, 3))), jnp.float32)
     rays = Rays(origins, directions, jnp.zeros(200))
     extra = {"limits": jnp.full(200, jnp.inf), "leaving": jnp.full(200, -1, jnp.int32)}
     hits = _trace(tree, rays, **extra)
@@ -165,7 +161,7 @@ def test_duplicates_give_one_hit_whatever_their_order_and_the_company():
 @pytest.mark.parametrize("broken", [np.nan, np.inf])
 def test_a_ray_that_is_not_finite_hits_nothing_and_harms_no_other(broken):
     mesh = trimesh.creation.icosphere(subdivisions=1)
-    directions = _unit(np.random.default_rng(5).normal(size=(32, 3)))
+    directions = arrays.unit(np.random.default_rng(5).normal(size=(32, 3)))
     origins = np.zeros((32, 3))
     origins[3, 1], directions[5, 0] = broken, broken
     with jax.debug_nans(False):

@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from refref_jax.geometry.cameras import Cameras, focal_length
-from refref_jax.reconstruct.triangles import make_mesh
+from refref_jax.geometry.triangle_meshes import make_mesh
 
 ANGLE = 1.1656107902526855
 

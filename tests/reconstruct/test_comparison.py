@@ -3,10 +3,10 @@ import pytest
 import trimesh
 
 from refref_jax.data import local_layout, meshes
+from refref_jax.geometry.triangle_meshes import make_mesh
 from refref_jax.reconstruct.comparison import compare_meshes, silhouette_overlap, silhouettes
 from refref_jax.reconstruct.isosurface import find_isosurface
 from refref_jax.reconstruct.refinement import Refinement, refine
-from refref_jax.reconstruct.triangles import make_mesh
 from refref_jax.reconstruct.visual_hull import carve
 from tests.reconstruct import bodies
 

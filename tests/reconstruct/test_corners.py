@@ -9,6 +9,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from refref_jax.geometry.cameras import project
 from refref_jax.geometry.corner_normals import face_normals
+from refref_jax.geometry.triangle_meshes import is_closed
 from refref_jax.reconstruct import convex, outlines
 from refref_jax.reconstruct.comparison import silhouette_overlap
 from refref_jax.reconstruct.corners import fit_corners
@@ -16,9 +17,9 @@ from refref_jax.reconstruct.errors import ReconstructionError
 from refref_jax.reconstruct.isosurface import find_isosurface
 from refref_jax.reconstruct.refinement import Refinement, refine
 from refref_jax.reconstruct.silhouettes import Views
-from refref_jax.reconstruct.triangles import is_closed, volume
 from refref_jax.reconstruct.visual_hull import carve
 from tests.reconstruct import bodies
+from tests.scenes import volume_of
 
 _TURN = trimesh.transformations.euler_matrix(0.3, 0.2, 0.1)[:3, :3]
 _PLATE = (0.8, 0.8, 0.12)
@@ -50,10 +51,6 @@ def _carved(views, **options):
 @functools.cache
 def _box_hull():
     return _carved(_views(_turned_box))
-
-
-def _volume(mesh):
-    return volume(mesh.vertices, mesh.faces)
 
 
 def _refined(mesh, views, settings=_LITTLE):
@@ -119,7 +116,9 @@ def test_a_box_gets_its_corners_and_overlaps_with_views_it_was_not_made_from():
     stage = _refined(hull, _views(_turned_box))
     assert not stage.refused
     _assert_is_box(stage.mesh)
-    assert _volume(stage.mesh) == pytest.approx(1.6**3, rel=0.01) and _volume(hull) > 1.03 * 1.6**3
+    assert (
+        volume_of(stage.mesh) == pytest.approx(1.6**3, rel=0.01) and volume_of(hull) > 1.03 * 1.6**3
+    )
     others = _views(_turned_box, views=7)
     assert silhouette_overlap(stage.mesh, *others).mean() > 0.985
 
@@ -158,7 +157,7 @@ def test_one_bad_mask_moves_no_corner_far(bad):
     truth = 0.8 * np.array(list(itertools.product((-1.0, 1.0), repeat=3))) @ _TURN.T
     away = np.linalg.norm(stage.mesh.vertices[:, None] - truth, axis=-1).min(axis=0)
     assert away.max() < 4.0 / cameras.focal
-    assert _volume(stage.mesh) == pytest.approx(1.6**3, rel=0.03)
+    assert volume_of(stage.mesh) == pytest.approx(1.6**3, rel=0.03)
     assert (
         outlines.outline_overlaps(stage.mesh.vertices, _views(_turned_box, views=7)).mean() > 0.98
     )
@@ -170,7 +169,7 @@ def test_masks_eroded_by_a_pixel_shrink_the_box_by_a_pixel():
     found = _refined(_carved(views), views).mesh
     pixel = 4.0 / cameras.focal
     assert len(found.vertices) == 8
-    assert 0.8 - 1.5 * pixel < np.cbrt(_volume(found)) / 2.0 < 0.8 - 0.5 * pixel
+    assert 0.8 - 1.5 * pixel < np.cbrt(volume_of(found)) / 2.0 < 0.8 - 0.5 * pixel
 
 
 def test_a_thin_wall_stays_one():
@@ -179,7 +178,7 @@ def test_a_thin_wall_stays_one():
     meshes = [stage.mesh for stage in refine(carved, _LITTLE, views=_views(_plate))]
     for mesh in (*meshes, body):
         assert is_closed(mesh.faces) and np.all(np.isfinite(mesh.vertices))
-        assert 0.8 < _volume(mesh) / (8.0 * np.prod(_PLATE)) < 1.35
+        assert 0.8 < volume_of(mesh) / (8.0 * np.prod(_PLATE)) < 1.35
     assert len(body.vertices) < 20
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from refref_jax.geometry.corner_normals import corner_normals
+from refref_jax.geometry.triangle_meshes import is_closed, volume
 from refref_jax.reconstruct import deformation
 from refref_jax.reconstruct.errors import ReconstructionError
-from refref_jax.reconstruct.triangles import is_closed, volume
 from tests.reconstruct import bodies
 
 

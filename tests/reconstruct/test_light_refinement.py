@@ -5,12 +5,12 @@ import pytest
 
 from refref_jax.data.geometry import build_geometry
 from refref_jax.data.meshes import MeshPart
-from refref_jax.geometry.surface_build import build_surfaces
+from refref_jax.geometry.surface_build import pack_meshes
+from refref_jax.geometry.triangle_meshes import make_mesh
 from refref_jax.optics.scene import Scene
 from refref_jax.reconstruct import photometry
 from refref_jax.reconstruct.comparison import compare_meshes
 from refref_jax.reconstruct.light_refinement import LightRefinement, refine_by_light
-from refref_jax.reconstruct.triangles import make_mesh
 from tests import scenes
 from tests.reconstruct import bodies, lit_scenes
 
@@ -37,8 +37,7 @@ def _dented(mesh):
 def _error(mesh, index, evidence):
     part = MeshPart("ball_glass", mesh.vertices, mesh.faces, index, "auto")
     interfaces = build_geometry([part], [-1], rule="nested").interfaces
-    owners = np.zeros(len(mesh.faces), np.int64)
-    surfaces = build_surfaces(mesh.vertices[mesh.faces], mesh.normals, owners)
+    surfaces = pack_meshes([mesh])
     found = photometry.errors_at_index(
         np.float32(index),
         evidence,

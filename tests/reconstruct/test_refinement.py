@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from refref_jax.geometry.corner_normals import face_normals
+from refref_jax.geometry.triangle_meshes import Mesh, is_closed, make_mesh, pieces
 from refref_jax.reconstruct import convex, refinement, smoothing
 from refref_jax.reconstruct.comparison import compare_meshes, silhouette_overlap
 from refref_jax.reconstruct.denoising import denoise_within
@@ -13,16 +14,12 @@ from refref_jax.reconstruct.grids import Box, sample
 from refref_jax.reconstruct.isosurface import find_isosurface
 from refref_jax.reconstruct.refinement import Refinement, keep_pieces, refine
 from refref_jax.reconstruct.silhouettes import Views, some_of
-from refref_jax.reconstruct.triangles import Mesh, is_closed, make_mesh, pieces, volume
 from tests.reconstruct import bodies
+from tests.scenes import volume_of
 
 _BOX = Box(np.full(3, -1.6), np.full(3, 1.6))
 
 _NOTHING = Refinement(denoising=0.0, convex_depth=0.0)
-
-
-def _volume(mesh):
-    return volume(mesh.vertices, mesh.faces)
 
 
 def _surface(body, spacing=0.07):
@@ -66,14 +63,14 @@ def test_diffusion_damps_a_ripple_as_the_heat_kernel_does_at_any_edge_length():
 @pytest.mark.parametrize("smooth", [smoothing.diffuse, smoothing.denoise])
 def test_smoothing_keeps_the_volume_and_does_nothing_over_no_length(smooth):
     mesh = _shaken(bodies.icosphere(4), 0.01)
-    assert _volume(smooth(mesh, 0.2)) == pytest.approx(_volume(mesh), rel=1e-4)
+    assert volume_of(smooth(mesh, 0.2)) == pytest.approx(volume_of(mesh), rel=1e-4)
     assert smooth(mesh, 0.0) is mesh
 
 
 def test_diffusion_does_not_shrink_a_thin_ring():
     mesh = _surface(bodies.torus)
     after = smoothing.diffuse(mesh, 0.15)
-    assert _volume(after) == pytest.approx(_volume(mesh), rel=1e-3)
+    assert volume_of(after) == pytest.approx(volume_of(mesh), rel=1e-3)
     assert np.ptp(after.vertices[:, 0]) == pytest.approx(3.0, abs=0.06)
 
 
@@ -106,14 +103,14 @@ def test_a_noisy_cube_without_its_edges_becomes_the_cube():
     assert len(body.vertices) == 8
     expected = 0.8 * np.sign(body.vertices)
     assert np.allclose(body.vertices, expected, atol=0.01)
-    assert is_closed(body.faces) and _volume(body) > 0.0
+    assert is_closed(body.faces) and volume_of(body) > 0.0
 
 
 def test_a_smooth_body_becomes_its_hull():
     mesh = bodies.icosphere(3)
     found = convex.from_tangents(mesh)
     assert len(found.vertices) == len(mesh.vertices)
-    assert _volume(found) == pytest.approx(_volume(mesh))
+    assert volume_of(found) == pytest.approx(volume_of(mesh))
     assert np.all(np.sum(face_normals(found.vertices[found.faces]) * found.normals[:, 0], -1) > 0.9)
 
 
@@ -129,13 +126,13 @@ def test_floaters_go_and_the_largest_piece_stays_whatever_the_share():
     assert len(keep_pieces(both, smallest=0.01).faces) == len(body.faces)
     assert len(keep_pieces(both, smallest=0.0).faces) == len(both.faces)
     assert len(keep_pieces(both, smallest=1.1).faces) == len(body.faces)
-    assert _volume(keep_pieces(both, smallest=0.9)) == pytest.approx(_volume(body))
+    assert volume_of(keep_pieces(both, smallest=0.9)) == pytest.approx(volume_of(body))
 
 
 def test_a_cavity_is_no_floater():
     shell = bodies.joined(bodies.icosphere(3), bodies.inverted(bodies.icosphere(3, radius=0.7)))
     kept = keep_pieces(shell, smallest=0.05)
-    assert _volume(kept) == pytest.approx(_volume(shell))
+    assert volume_of(kept) == pytest.approx(volume_of(shell))
 
 
 def test_rounding_a_cube_leaves_the_volume_of_a_rounded_cube():
@@ -144,7 +141,7 @@ def test_rounding_a_cube_leaves_the_volume_of_a_rounded_cube():
     expected = inner**3 + 6 * inner**2 * radius + 3 * np.pi * inner * radius**2
     expected += 4.0 / 3.0 * np.pi * radius**3
     found = refinement.round_edges(mesh, radius, spacing=0.08)
-    assert expected * 0.95 < _volume(found) < expected * 1.005
+    assert expected * 0.95 < volume_of(found) < expected * 1.005
     assert np.ptp(found.vertices, axis=0) == pytest.approx(1.6, abs=0.01)
 
 
@@ -183,7 +180,9 @@ def test_no_stage_empties_flips_tears_or_inflates(mesh):
     ]
     for stage in stages:
         assert is_closed(stage.mesh.faces) and np.all(np.isfinite(stage.mesh.vertices))
-        assert _volume(stage.mesh) == pytest.approx(_volume(stages[0].mesh), rel=0.08), stage.name
+        assert volume_of(stage.mesh) == pytest.approx(volume_of(stages[0].mesh), rel=0.08), (
+            stage.name
+        )
     holes = [trimesh.Trimesh(*stage.mesh[:2], process=False).euler_number for stage in stages]
     assert len(set(holes)) == 1
 
@@ -198,8 +197,8 @@ def test_what_would_vanish_is_refused_with_the_reason():
         bodies.icosphere(3, radius=0.5), bodies.icosphere(3, radius=0.5, centre=(1.5, 0, 0))
     )
     assert len(np.unique(pieces(dumbbell.faces, len(dumbbell.vertices)))) == 2
-    assert _volume(refine(dumbbell, Refinement())[-1].mesh) == pytest.approx(
-        _volume(dumbbell), 0.02
+    assert volume_of(refine(dumbbell, Refinement())[-1].mesh) == pytest.approx(
+        volume_of(dumbbell), 0.02
     )
 
 

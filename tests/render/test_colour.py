@@ -1,10 +1,10 @@
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from refref_jax.render import colour
 from tests import gradients, reference_sampling, transformations
+from tests.arrays import single
 
 # A power in float32.
 _POWER = 1e-6
@@ -19,21 +19,17 @@ _LINEAR = np.concatenate(
 )
 
 
-def _f32(values):
-    return jnp.asarray(values, jnp.float32)
-
-
 @pytest.mark.parametrize(
     ("linear", "srgb"),
     [(0.0, 0.0), (1.0, 1.0), (0.0025, 0.0323), (0.5, 0.7353569), (0.214041, 0.5), (-0.5, -6.46)],
 )
 def test_linear_to_srgb_by_hand(linear, srgb):
-    np.testing.assert_allclose(_encode(_f32(linear)), srgb, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(_encode(single(linear)), srgb, rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.parametrize("function", [_encode, _decode])
 def test_black_and_white_stay(function):
-    black, white = function(_f32([0.0, 1.0]))
+    black, white = function(single([0.0, 1.0]))
     assert black == 0.0
     np.testing.assert_allclose(white, 1.0, rtol=2e-7)
 
@@ -41,24 +37,24 @@ def test_black_and_white_stay(function):
 def test_linear_to_srgb_against_float64():
     linear = np.float32(_LINEAR)
     expected = [reference_sampling.linear_to_srgb(x) for x in linear]
-    np.testing.assert_allclose(_encode(_f32(linear)), expected, rtol=_POWER)
+    np.testing.assert_allclose(_encode(single(linear)), expected, rtol=_POWER)
 
 
 def test_srgb_to_linear_inverts():
-    np.testing.assert_allclose(_decode(_encode(_f32(_LINEAR))), _f32(_LINEAR), rtol=4e-6)
+    np.testing.assert_allclose(_decode(_encode(single(_LINEAR))), single(_LINEAR), rtol=4e-6)
     srgb = np.linspace(-0.5, 1.5, 201)
-    np.testing.assert_allclose(_encode(_decode(_f32(srgb))), srgb, rtol=4e-6, atol=1e-6)
+    np.testing.assert_allclose(_encode(_decode(single(srgb))), srgb, rtol=4e-6, atol=1e-6)
 
 
 def test_eight_bit_colours_survive():
     srgb = np.arange(256) / 255.0
-    back = np.asarray(_encode(_decode(_f32(srgb)))) * 255.0
+    back = np.asarray(_encode(_decode(single(srgb)))) * 255.0
     np.testing.assert_array_equal(np.round(back), np.arange(256))
 
 
 @pytest.mark.parametrize(("function", "knee"), [(_encode, 0.0031308), (_decode, 0.04045)])
 def test_the_two_parts_meet_at_the_knee(function, knee):
-    below, at, above = function(_f32(knee * np.array([1.0 - 1e-5, 1.0, 1.0 + 1e-5])))
+    below, at, above = function(single(knee * np.array([1.0 - 1e-5, 1.0, 1.0 + 1e-5])))
     # The standard's constants leave a step of less than 1e-7.
     np.testing.assert_allclose([below, above], at, rtol=3e-5)
     assert below <= at <= above
@@ -66,14 +62,14 @@ def test_the_two_parts_meet_at_the_knee(function, knee):
 
 @pytest.mark.parametrize("function", [_encode, _decode])
 def test_brighter_stays_brighter(function):
-    values = np.asarray(function(_f32(np.linspace(-1.0, 4.0, 2001))))
+    values = np.asarray(function(single(np.linspace(-1.0, 4.0, 2001))))
     assert (np.diff(values) > 0.0).all()
 
 
 def test_gradient_is_finite_everywhere_and_not_cut_off():
     magnitudes = 10.0 ** np.arange(-30.0, 31.0)
     linear = np.concatenate([-magnitudes, [-0.0, 0.0, 0.0031308], magnitudes])
-    slope = np.asarray(_encode_slope(_f32(linear)), np.float64)
+    slope = np.asarray(_encode_slope(single(linear)), np.float64)
     assert np.isfinite(slope).all() and (slope > 0.0).all()
     np.testing.assert_allclose(slope[linear <= 0.0031308], 12.92, rtol=_POWER)
     above = np.float32(linear[linear > 0.0031308]).astype(np.float64)
@@ -82,12 +78,12 @@ def test_gradient_is_finite_everywhere_and_not_cut_off():
 
 
 def test_gradient_at_zero_is_that_of_the_straight_part():
-    np.testing.assert_allclose(_encode_slope(_f32([0.0]))[0], 12.92, rtol=_POWER)
-    np.testing.assert_allclose(_decode_slope(_f32([0.0]))[0], 1.0 / 12.92, rtol=_POWER)
+    np.testing.assert_allclose(_encode_slope(single([0.0]))[0], 12.92, rtol=_POWER)
+    np.testing.assert_allclose(_decode_slope(single([0.0]))[0], 1.0 / 12.92, rtol=_POWER)
 
 
 def test_gradient_of_the_inverse_is_finite():
-    slope = np.asarray(_decode_slope(_f32([-1e30, -1.0, 0.0, 0.04045, 1.0, 10.0, 1e10])))
+    slope = np.asarray(_decode_slope(single([-1e30, -1.0, 0.0, 0.04045, 1.0, 10.0, 1e10])))
     assert np.isfinite(slope).all() and (slope > 0.0).all()
 
 
@@ -99,4 +95,4 @@ def test_check_grads(function):
 @pytest.mark.parametrize("transformation", transformations.ALL)
 @pytest.mark.parametrize("function", [colour.linear_to_srgb, colour.srgb_to_linear])
 def test_transformations_change_nothing(function, transformation):
-    transformation(function, (_f32([-0.5, 0.0, 0.001, 0.2, 1.5]),))
+    transformation(function, (single([-0.5, 0.0, 0.001, 0.2, 1.5]),))

@@ -5,6 +5,7 @@ import pytest
 
 from refref_jax.render import compositing
 from tests import gradients, reference_sampling, transformations
+from tests.arrays import singles
 
 # A dozen float32 products and sums.
 _SUMMATION = 2e-6
@@ -19,21 +20,17 @@ _composite = jax.jit(compositing.composite)
 _MULTIPLIERS = [0.0, 1e-10, 1.0, 1e10, 1e30]
 
 
-def _f32(*arrays):
-    return tuple(jnp.asarray(array, jnp.float32) for array in arrays)
-
-
 def _medium(seed=0):
     """Returns densities and lengths whose products are of about 0.3."""
     rng = np.random.default_rng(seed)
-    return _f32(rng.uniform(0.1, 3.0, size=_SAMPLES), rng.uniform(0.1, 0.3, size=_SAMPLES))
+    return singles(rng.uniform(0.1, 3.0, size=_SAMPLES), rng.uniform(0.1, 0.3, size=_SAMPLES))
 
 
 def _see(weights, *, edges=None, rgb=None):
     count = len(weights)
     edges = np.linspace(0.0, count, count + 1) if edges is None else edges
     rgb = np.ones((count, 3)) if rgb is None else rgb
-    return _composite(*_f32(weights, rgb, edges))
+    return _composite(*singles(weights, rgb, edges))
 
 
 # --- weights ---
@@ -42,7 +39,7 @@ def _see(weights, *, edges=None, rgb=None):
 def test_alpha_weights_by_hand():
     # Each sample takes half of what reaches it, and the last one everything.
     half = np.log(2.0)
-    got = _weigh(*_f32([half, 2.0 * half, 1e10], [1.0, 0.5, 1.0]))
+    got = _weigh(*singles([half, 2.0 * half, 1e10], [1.0, 0.5, 1.0]))
     np.testing.assert_allclose(got, [0.5, 0.25, 0.25], rtol=_SUMMATION)
 
 
@@ -59,7 +56,7 @@ def test_alpha_weights_over_magnitudes(density_scale, length_scale):
     density, lengths = _medium()
     density, lengths = np.float32(density_scale) * density, np.float32(length_scale) * lengths
     expected = reference_sampling.alpha_weights(density, lengths)
-    got = _weigh(*_f32(density, lengths))
+    got = _weigh(*singles(density, lengths))
     # Light that many samples have dimmed keeps the error of the exponent: up to 1e-6 times 100.
     np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-37)
 
@@ -69,7 +66,7 @@ def test_alpha_weights_can_be_built_backwards():
     lengths = np.array([0.1, 0.2, 0.1, 1.0, 0.5, 2.0, 0.3])
     reaching = 1.0 - np.concatenate([[0.0], np.cumsum(weights)[:-1]])
     density = -np.log1p(-weights / reaching) / lengths
-    np.testing.assert_allclose(_weigh(*_f32(density, lengths)), weights, atol=_SUMMATION)
+    np.testing.assert_allclose(_weigh(*singles(density, lengths)), weights, atol=_SUMMATION)
 
 
 def test_alpha_weights_leave_what_passes_through():
@@ -81,7 +78,7 @@ def test_alpha_weights_leave_what_passes_through():
 def test_splitting_a_sample_changes_nothing():
     density, lengths = _medium()
     halves = np.repeat(density, 2), np.repeat(lengths, 2) / 2.0
-    pairs = np.asarray(_weigh(*_f32(*halves))).reshape(-1, 2)
+    pairs = np.asarray(_weigh(*singles(*halves))).reshape(-1, 2)
     np.testing.assert_allclose(pairs.sum(axis=-1), _weigh(density, lengths), rtol=5e-6)
 
 
@@ -101,7 +98,7 @@ def test_alpha_weights_are_finite_with_their_gradients(density_scale, length_sca
         np.float32(scale) * np.asarray(x)
         for x, scale in zip(_medium(), (density_scale, length_scale), strict=True)
     )
-    weights, gradient = _weights_and_gradients(*_f32(density, lengths))
+    weights, gradient = _weights_and_gradients(*singles(density, lengths))
     assert gradients.all_finite((weights, gradient))
     assert (np.asarray(weights) >= 0.0).all() and np.sum(weights) <= 1.0 + _SUMMATION
 
@@ -120,7 +117,7 @@ def test_a_length_that_rounding_made_negative_holds_nothing(density_scale):
 def test_one_opaque_sample_takes_all_the_light_that_reaches_it(place, size):
     density, lengths = np.zeros(_SAMPLES), np.ones(_SAMPLES)
     density[place] = size
-    weights, gradient = _weights_and_gradients(*_f32(density, lengths))
+    weights, gradient = _weights_and_gradients(*singles(density, lengths))
     np.testing.assert_array_equal(weights, np.eye(_SAMPLES)[place])
     assert gradients.all_finite(gradient)
 
@@ -135,7 +132,7 @@ def test_alpha_weights_check_grads():
 @pytest.mark.parametrize("scale", [0.0, 1e-10, 0.1, 1.0, 1e10])
 def test_an_opaque_end_makes_the_weights_sum_to_one(scale):
     density, lengths = _medium()
-    weights = _close(_weigh(*_f32(scale * np.asarray(density), lengths)))
+    weights = _close(_weigh(*singles(scale * np.asarray(density), lengths)))
     np.testing.assert_allclose(np.sum(weights), 1.0, rtol=_SUMMATION)
     assert (np.asarray(weights) >= 0.0).all()
 
@@ -146,15 +143,15 @@ def test_an_opaque_end_changes_the_last_sample_only():
 
 
 def test_an_opaque_end_by_hand():
-    np.testing.assert_allclose(_close(*_f32([0.25, 0.5, 0.0])), [0.25, 0.5, 0.25])
-    np.testing.assert_allclose(_close(*_f32([0.75, 0.5, 0.1])), [0.75, 0.5, 0.0])
+    np.testing.assert_allclose(_close(*singles([0.25, 0.5, 0.0])), [0.25, 0.5, 0.25])
+    np.testing.assert_allclose(_close(*singles([0.75, 0.5, 0.1])), [0.75, 0.5, 0.0])
 
 
 def test_an_opaque_end_is_an_infinitely_dense_last_sample():
     density, lengths = _medium()
     dense = np.concatenate([density[:-1], [1e30]])
     np.testing.assert_allclose(
-        _close(_weigh(density, lengths)), _weigh(*_f32(dense, lengths)), atol=_SUMMATION
+        _close(_weigh(density, lengths)), _weigh(*singles(dense, lengths)), atol=_SUMMATION
     )
 
 
@@ -217,7 +214,7 @@ def test_distances_against_a_loop(seed):
 def test_a_single_surface_is_found_in_its_interval(place):
     edges = np.cumsum(np.geomspace(0.1, 3.0, _SAMPLES + 1))
     density = np.where(np.arange(_SAMPLES) == place, 1e5, 0.0)
-    weights = _weigh(*_f32(density, np.diff(edges)))
+    weights = _weigh(*singles(density, np.diff(edges)))
     seen = _see(weights, edges=edges)
     middle = 0.5 * (edges[place] + edges[place + 1])
     np.testing.assert_allclose(seen.median, middle, rtol=_SUMMATION)
@@ -272,7 +269,7 @@ def _composite_gradients(density, lengths, rgb):
 def test_gradients_of_colour_and_distances_are_finite(density_scale, length_scale):
     density, lengths = (np.asarray(x) for x in _medium())
     scaled = np.float32(density_scale) * density, np.float32(length_scale) * lengths
-    assert gradients.all_finite(_composite_gradients(*_f32(*scaled, np.ones((_SAMPLES, 3)))))
+    assert gradients.all_finite(_composite_gradients(*singles(*scaled, np.ones((_SAMPLES, 3)))))
 
 
 def test_composite_check_grads():

@@ -30,11 +30,6 @@ def model():
 
 
 @pytest.fixture(scope="module")
-def rays():
-    return image_rays(CAMERAS, 0)
-
-
-@pytest.fixture(scope="module")
 def whole(model, rays):
     return render_image(model, rays)
 

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from refref_jax.data.containment import parts_around
-from refref_jax.geometry.cameras import image_rays
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE
 from refref_jax.render import known, radiance_of, render_known
 from refref_jax.render.backgrounds import Environment, LinearTexture
 from tests import reference, scenes
-from tests.small_model import CAMERAS
 
 _BALL = scenes.ball(1.3, subdivisions=2)
 
@@ -32,11 +30,6 @@ _WHITE = _environment_of(np.ones((8, 16, 3)))
 @pytest.fixture(scope="module")
 def geometry():
     return scenes.geometry(_BALL)
-
-
-@pytest.fixture(scope="module")
-def rays():
-    return image_rays(CAMERAS, 0)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 from refref_jax.sampling import domains
 from refref_jax.sampling.cones import Gaussians
 from refref_jax.sampling.domains import Domain
-from tests import gradients, reference_sampling, transformations
+from tests import arrays, gradients, reference_sampling, transformations
 
 # A few float32 roundings.
 _ROUNDING = 1e-6
@@ -16,11 +16,10 @@ _ROUNDING = 1e-6
 _MAGNITUDES = 10.0 ** np.arange(-6, 7)
 
 _contract = jax.jit(domains.contract)
-_uncontract = jax.jit(domains.uncontract)
 _shrinkage = jax.jit(domains.shrinkage)
 _to_unit_cube = jax.jit(domains.to_unit_cube, static_argnums=0)
 
-_FUNCTIONS = (domains.contract, domains.uncontract, domains.shrinkage)
+_FUNCTIONS = (domains.contract, domains.shrinkage)
 _JACOBIANS = {function: jax.jit(jax.vmap(jax.jacrev(function))) for function in _FUNCTIONS}
 
 
@@ -46,13 +45,8 @@ _SPHERICAL = Domain(radius=2.0, space="spherical")
 _exit_distance = jax.jit(domains.exit_distance, static_argnums=0)
 
 
-def _unit(vector):
-    vector = np.asarray(vector, np.float64)
-    return vector / np.linalg.norm(vector)
-
-
 def _assert_exit(domain, origin, direction, expected):
-    ray = (jnp.asarray(x, jnp.float32) for x in (origin, _unit(direction)))
+    ray = (jnp.asarray(x, jnp.float32) for x in (origin, arrays.unit(direction)))
     np.testing.assert_allclose(_exit_distance(domain, *ray), expected, rtol=_ROUNDING)
 
 
@@ -80,7 +74,7 @@ def test_exit_lies_on_a_face_and_nothing_beyond_it_inside(radius):
     rng = np.random.default_rng(3)
     domain = Domain(radius=radius, space="bounded")
     for _ in range(20):
-        origin, direction = rng.uniform(-radius, radius, size=3), _unit(rng.normal(size=3))
+        origin, direction = rng.uniform(-radius, radius, size=3), arrays.unit(rng.normal(size=3))
         t = _exit_distance(domain, *(jnp.asarray(x, jnp.float32) for x in (origin, direction)))
         end = origin + float(t) * direction
         np.testing.assert_allclose(np.max(abs(end)), radius, rtol=1e-5)
@@ -109,8 +103,8 @@ def test_exit_lies_on_the_sphere(radius):
     rng = np.random.default_rng(3)
     domain = Domain(radius=radius, space="spherical")
     for _ in range(20):
-        origin = rng.uniform(0.0, radius) * _unit(rng.normal(size=3))
-        direction = _unit(rng.normal(size=3))
+        origin = rng.uniform(0.0, radius) * arrays.unit(rng.normal(size=3))
+        direction = arrays.unit(rng.normal(size=3))
         given = (jnp.asarray(x, jnp.float32) for x in (origin, direction))
         end = origin + float(_exit_distance(domain, *given)) * direction
         np.testing.assert_allclose(np.linalg.norm(end), radius, rtol=1e-6)
@@ -164,27 +158,10 @@ def test_contract_against_its_definition(magnitude):
     np.testing.assert_allclose(_contract(points), expected, rtol=_ROUNDING, atol=_ROUNDING)
 
 
-@pytest.mark.parametrize("magnitude", _MAGNITUDES)
-def test_uncontract_inverts_contract(magnitude):
-    # Near the sphere of radius 2 a rounding is a share `|x|` of the whole distance.
-    points = _points(magnitude)
-    tolerance = _ROUNDING * max(magnitude, 1.0)
-    back = np.asarray(_uncontract(_contract(points)), np.float64)
-    error = (back - np.asarray(points, np.float64)) / magnitude
-    assert np.linalg.norm(error, axis=-1).max() <= tolerance
-
-
-@pytest.mark.parametrize("radius", [1e-6, 0.5, 1.0, 1.5, 1.99])
-def test_contract_inverts_uncontract(radius):
-    points = _points(radius)
-    np.testing.assert_allclose(_contract(_uncontract(points)), points, atol=_ROUNDING)
-
-
 @pytest.mark.parametrize("magnitude", [0.0, 1e-30, 1e-6, 0.3, 0.999])
 def test_the_unit_ball_stays_as_it_is(magnitude):
     points = _points(magnitude)
     np.testing.assert_array_equal(_contract(points), points)
-    np.testing.assert_array_equal(_uncontract(points), points)
     np.testing.assert_array_equal(_shrinkage(points), np.ones(20))
 
 
@@ -306,11 +283,6 @@ def test_gradients_are_finite_at_any_distance(function, magnitude):
     assert gradients.all_finite(_JACOBIANS[function](_points(magnitude)))
 
 
-@pytest.mark.parametrize("radius", [0.0, 1e-30, 0.5, 1.0, 1.999])
-def test_gradients_of_uncontract_are_finite(radius):
-    assert gradients.all_finite(_JACOBIANS[domains.uncontract](_points(radius)))
-
-
 @pytest.mark.parametrize("magnitude", [3.0, 1e3, 1e6])
 def test_contract_has_the_right_gradient_far_away(magnitude):
     points = _points(magnitude)
@@ -345,7 +317,6 @@ _SOME = (jnp.stack([_points(x) for x in (0.5, 1.0, 20.0)]), jnp.ones((3, 20)))
 
 _CASES = {
     "contract": lambda x, scales: domains.contract(x),
-    "uncontract": lambda x, scales: domains.uncontract(0.05 * x),
     "shrinkage": lambda x, scales: domains.shrinkage(x),
     "bounded": lambda x, scales: _box(x, scales, domain=_BOUNDED),
     "unbounded": lambda x, scales: _box(x, scales, domain=_UNBOUNDED),

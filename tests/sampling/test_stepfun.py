@@ -7,6 +7,7 @@ import pytest
 
 from refref_jax.sampling import stepfun
 from tests import gradients, reference_sampling, transformations
+from tests.arrays import singles
 
 # Cumulative sums of a dozen float32 numbers of about 1.
 _SUMMATION = 2e-6
@@ -25,17 +26,13 @@ _dilate = jax.jit(stepfun.dilate, static_argnums=2)
 _blurred_mass = jax.jit(stepfun.blurred_mass_below, static_argnums=3)
 
 
-def _f32(*arrays):
-    return tuple(jnp.asarray(array, jnp.float32) for array in arrays)
-
-
 def _step_function(seed, *, empty=0):
     """Returns edges in `[0, 1]` and weights that sum to 1, some of them 0, as float32."""
     rng = np.random.default_rng(seed)
     edges = np.concatenate([[0.0], np.sort(rng.uniform(size=_BINS - 1)), [1.0]])
     weights = rng.uniform(0.05, 1.0, size=_BINS)
     weights[rng.permutation(_BINS)[:empty]] = 0.0
-    return _f32(edges, weights / weights.sum())
+    return singles(edges, weights / weights.sum())
 
 
 def _middles(count):
@@ -56,7 +53,7 @@ _NARROW = jnp.array([0.0, 0.2, 0.2, 0.2, 0.5, 0.5 + 1e-6, 0.8, 1.0, 1.0])
 
 
 def test_heights_by_hand():
-    got = _heights(*_f32([0.0, 0.5, 0.5, 2.5], [0.25, 0.5, 1.0]))
+    got = _heights(*singles([0.0, 0.5, 0.5, 2.5], [0.25, 0.5, 1.0]))
     np.testing.assert_allclose(got, [0.5, 0.0, 0.5])
 
 
@@ -101,7 +98,7 @@ def test_cumulative_ignores_the_scale_of_the_weights(scale):
 def test_cumulative_runs_from_exactly_zero_to_exactly_one_and_never_decreases(bins):
     rng = np.random.default_rng(bins)
     weights = rng.uniform(size=(300, bins)) ** 4 * (rng.uniform(size=(300, bins)) > 0.5)
-    cdf = np.asarray(_cumulative(*_f32(weights)))
+    cdf = np.asarray(_cumulative(*singles(weights)))
     assert (cdf[:, 0] == 0.0).all() and (cdf[:, -1] == 1.0).all()
     assert (np.diff(cdf, axis=-1) >= 0.0).all()
 
@@ -109,14 +106,14 @@ def test_cumulative_runs_from_exactly_zero_to_exactly_one_and_never_decreases(bi
 @pytest.mark.parametrize("weights", [np.zeros(_BINS), np.eye(_BINS)[3], np.full(_BINS, 1e-30)])
 def test_cumulative_has_finite_gradients(weights):
     total = lambda w: jnp.sum(jnp.square(stepfun.cumulative(w)))
-    assert gradients.all_finite(jax.jit(jax.grad(total))(*_f32(weights)))
+    assert gradients.all_finite(jax.jit(jax.grad(total))(*singles(weights)))
 
 
 # --- its inverse ---
 
 
 def test_invert_cumulative_by_hand():
-    arguments = _f32([0.0, 0.25, 0.5, 0.75, 1.0], [0.0, 1.0, 4.0, 6.0], [0.0, 0.5, 0.5, 1.0])
+    arguments = singles([0.0, 0.25, 0.5, 0.75, 1.0], [0.0, 1.0, 4.0, 6.0], [0.0, 0.5, 0.5, 1.0])
     np.testing.assert_allclose(_invert(*arguments), [0.0, 0.5, 4.0, 5.0, 6.0])
 
 
@@ -145,7 +142,7 @@ def test_invert_cumulative_meets_the_edges():
 
 
 def test_invert_cumulative_skips_what_is_empty():
-    edges, cdf = _f32([0.0, 1.0, 2.0, 3.0, 4.0], [0.0, 0.0, 1.0, 1.0, 1.0])
+    edges, cdf = singles([0.0, 1.0, 2.0, 3.0, 4.0], [0.0, 0.0, 1.0, 1.0, 1.0])
     got = _invert(jnp.array([0.0, 1e-6, 0.5, 1.0 - 1e-6]), edges, cdf)
     np.testing.assert_allclose(got, [1.0, 1.0, 1.5, 2.0], atol=1e-5)
 
@@ -155,7 +152,7 @@ def test_invert_cumulative_skips_what_is_empty():
 
 def test_sample_edges_by_hand():
     # Samples at 1/4 and 3/4 of the mass: at 1 and 2.5, with 1.75 between.
-    got = _sample(*_f32([0.25, 0.75], [0.0, 2.0, 3.0], [0.5, 0.5]))
+    got = _sample(*singles([0.25, 0.75], [0.0, 2.0, 3.0], [0.5, 0.5]))
     np.testing.assert_allclose(got, [0.25, 1.75, 3.0])
 
 
@@ -171,7 +168,7 @@ def test_sample_edges_against_a_loop(empty, count):
 
 
 def test_sampling_evenly_from_an_even_function_gives_even_intervals():
-    got = _sample(_middles(8), *_f32([0.0, 1.0], [0.3]))
+    got = _sample(_middles(8), *singles([0.0, 1.0], [0.3]))
     np.testing.assert_allclose(got, np.linspace(0.0, 1.0, 9), atol=_SUMMATION)
 
 
@@ -197,7 +194,7 @@ _HARD_WEIGHTS = [np.zeros(8), *np.eye(8), np.full(8, 1e-30), np.array([1.0, 0, 0
 @pytest.mark.parametrize("offset", [-0.5, 0.0, 0.499999])
 def test_samples_are_sorted_and_stay_within_the_domain(weights, offset):
     u = (jnp.arange(16, dtype=jnp.float32) + 0.5 + offset) / 16.0
-    drawn = np.asarray(_sample(u, _NARROW, *_f32(weights)))
+    drawn = np.asarray(_sample(u, _NARROW, *singles(weights)))
     assert np.isfinite(drawn).all() and (np.diff(drawn) >= 0.0).all()
     assert drawn[0] >= 0.0 and drawn[-1] <= 1.0
 
@@ -208,7 +205,7 @@ def test_samples_of_random_functions_are_sorted_and_stay_within_the_domain(seed)
     edges = np.sort(rng.uniform(size=(200, 65)) ** rng.choice([1, 8], size=(200, 1)), axis=-1)
     weights = rng.uniform(size=(200, 64)) ** 8 * (rng.uniform(size=(200, 64)) > 0.7)
     u = np.sort(rng.uniform(size=(200, 32)), axis=-1)
-    drawn = np.asarray(_sample(*_f32(u, edges, weights)))
+    drawn = np.asarray(_sample(*singles(u, edges, weights)))
     first, last = np.float32(edges[:, :1]), np.float32(edges[:, -1:])
     assert ((drawn >= first) & (drawn <= last)).all()
     # Where a bin is left and the next one starts, rounding may swap two samples by this much.
@@ -216,13 +213,13 @@ def test_samples_of_random_functions_are_sorted_and_stay_within_the_domain(seed)
 
 
 def test_all_weight_in_one_bin_draws_from_that_bin_only():
-    edges, weights = _f32([0.0, 0.3, 0.4, 1.0], [0.0, 7.0, 0.0])
+    edges, weights = singles([0.0, 0.3, 0.4, 1.0], [0.0, 7.0, 0.0])
     drawn = _sample(_middles(8), edges, weights)
     np.testing.assert_allclose(drawn, np.linspace(0.3, 0.4, 9), atol=_SUMMATION)
 
 
 def test_all_weight_in_a_bin_of_no_width_draws_one_point():
-    edges, weights = _f32([0.0, 0.3, 0.3, 1.0], [0.0, 7.0, 0.0])
+    edges, weights = singles([0.0, 0.3, 0.3, 1.0], [0.0, 7.0, 0.0])
     np.testing.assert_allclose(_sample(_middles(8), edges, weights), np.full(9, 0.3), rtol=1e-6)
 
 
@@ -238,7 +235,7 @@ def test_sampling_moves_and_scales_with_the_edges(scale, shift):
 
 
 def test_dilate_by_hand():
-    edges, weights = _dilate(*_f32([0.0, 0.4, 0.6, 1.0], [0.0, 1.0, 0.0]), 0.1)
+    edges, weights = _dilate(*singles([0.0, 0.4, 0.6, 1.0], [0.0, 1.0, 0.0]), 0.1)
     # The bins' ends, and where they were moved to: -0.1, 0.3, 0.5 and 0.5, 0.7, 1.1.
     np.testing.assert_allclose(edges, [0, 0, 0.3, 0.4, 0.5, 0.5, 0.6, 0.7, 1, 1], atol=1e-6)
     inside = (edges[:-1] >= 0.2999) & (edges[1:] <= 0.7001)
@@ -294,7 +291,7 @@ def test_dilation_by_nothing_changes_nothing():
 
 @pytest.mark.parametrize("weights", _HARD_WEIGHTS)
 def test_dilate_is_finite_with_bins_of_no_width(weights):
-    grid, dilated = _dilate(_NARROW, *_f32(weights), _AMOUNT)
+    grid, dilated = _dilate(_NARROW, *singles(weights), _AMOUNT)
     assert np.isfinite(grid).all() and np.isfinite(dilated).all()
     visible = (np.asarray(weights) * np.diff(_NARROW)).sum() > 0.0
     np.testing.assert_allclose(np.sum(dilated), float(visible), rtol=_SUMMATION)
@@ -307,7 +304,7 @@ def test_blurred_mass_by_hand():
     # One bin with mass 2, spread over [-0.25, 1.25]; ramps of width 0.5 at both ends.
     at = [-9.0, -0.25, 0.0, 0.25, 0.5, 0.75, 1.25, 9.0]
     expected = [0.0, 0.0, 0.125, 0.5, 1.0, 1.5, 2.0, 2.0]
-    got = _blurred_mass(*_f32(at, [0.0, 1.0], [2.0]), 0.25)
+    got = _blurred_mass(*singles(at, [0.0, 1.0], [2.0]), 0.25)
     np.testing.assert_allclose(got, expected, atol=_SUMMATION)
 
 
@@ -330,7 +327,7 @@ def test_blurred_mass_is_conserved_and_never_decreases(radius):
 
 
 def test_blurred_mass_of_a_bin_without_width_is_that_of_a_point():
-    edges, weights = _f32([0.0, 0.5, 0.5, 1.0], [0.0, 1.0, 0.0])
+    edges, weights = singles([0.0, 0.5, 0.5, 1.0], [0.0, 1.0, 0.0])
     got = _blurred_mass(jnp.array([0.3, 0.45, 0.5, 0.55, 0.7]), edges, weights, 0.1)
     np.testing.assert_allclose(got, [0.0, 0.25, 0.5, 0.75, 1.0], atol=_SUMMATION)
 
@@ -338,7 +335,7 @@ def test_blurred_mass_of_a_bin_without_width_is_that_of_a_point():
 @pytest.mark.parametrize("width", [1e-3, 1e-5, 1e-7])
 def test_blurred_mass_of_thin_bins_is_no_more_than_they_hold(width):
     edges = np.float32(0.6) + np.float32(width) * np.linspace(0.0, 1.0, 9)
-    edges, weights = _f32([0.0, *edges, 1.0], [0.0, *np.full(8, 0.125), 0.0])
+    edges, weights = singles([0.0, *edges, 1.0], [0.0, *np.full(8, 0.125), 0.0])
     below = np.asarray(_blurred_mass(jnp.linspace(0.0, 1.0, 201), edges, weights, 0.01))
     assert (np.diff(below) >= -_SUMMATION).all()
     assert below.max() <= 1.0 + _SUMMATION
@@ -351,7 +348,7 @@ def test_blurred_mass_of_thin_bins_is_no_more_than_they_hold(width):
 
 
 def test_count_below_is_a_right_sided_search():
-    values, queries = _f32([0.0, 1.0, 1.0, 3.0], [-1.0, 0.0, 0.5, 1.0, 3.0, 4.0])
+    values, queries = singles([0.0, 1.0, 1.0, 3.0], [-1.0, 0.0, 0.5, 1.0, 3.0, 4.0])
     expected = np.searchsorted(values, queries, side="right")
     np.testing.assert_array_equal(stepfun.count_below(values, queries), expected)
     assert stepfun.count_below(values, queries).dtype == jnp.int32

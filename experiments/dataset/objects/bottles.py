@@ -16,7 +16,7 @@ from experiments.dataset.objects.revolve import (
     within,
 )
 from experiments.dataset.objects.vessels import Look, body, cap, hollow, space_in
-from experiments.dataset.parts import Object, Part
+from experiments.dataset.parts import Object, ObjectPart
 
 _COLA_GREEN = Look(tint=(0.9, 0.97, 0.92))
 _DEMIJOHN_GREEN = Look(tint=(0.84, 0.95, 0.88))
@@ -24,7 +24,7 @@ _STAR_BLUE = Look(tint=(0.84, 0.92, 0.98))
 _PLASTIC = Look("plastic", tint=(0.93, 0.97, 0.99))
 
 
-def _make_cola_bottle(detail: float) -> list[Part]:
+def _make_cola_bottle(detail: float) -> list[ObjectPart]:
     """The contour bottle of 195 mm by 60 mm: waisted, with flutes above and below its belt."""
     cut = sampling(detail)
     side = smooth(
@@ -57,7 +57,7 @@ def _fluted(r: Values, z: Values) -> Values:
     return within(z, 0.15, 1.62, soft=0.35) + within(z, 2.12, 3.1, soft=0.35)
 
 
-def _make_plastic_bottle(detail: float) -> list[Part]:
+def _make_plastic_bottle(detail: float) -> list[ObjectPart]:
     """Ribbed, with a foot of five lobes, and a screw cap that lies around its neck."""
     cut = sampling(0.75 * detail, segments=112)
     outline = region(
@@ -93,7 +93,7 @@ def _side_of_cap(r: Values, z: Values) -> Values:
     return ramp(r, 0.255, 0.305) * within(z, 3.13, 3.6, soft=0.08)
 
 
-def _make_star_shaped_bottle(detail: float) -> list[Part]:
+def _make_star_shaped_bottle(detail: float) -> list[ObjectPart]:
     """Five ridges that run together into a round neck."""
     cut = sampling(0.75 * detail, segments=112)
     outline = region(
@@ -114,7 +114,7 @@ def _make_star_shaped_bottle(detail: float) -> list[Part]:
     return centred([body("body", _STAR_BLUE, shape, cut, turned=turned)])
 
 
-def _make_demijohn_vase(detail: float) -> list[Part]:
+def _make_demijohn_vase(detail: float) -> list[ObjectPart]:
     """A big round jug with a short neck, as wine is fermented in."""
     globe = smooth(
         [(0.85, 0.06), (1.22, 0.45), (1.4, 1.15), (1.22, 1.85), (0.75, 2.3), (0.36, 2.6)]

@@ -15,13 +15,13 @@ from experiments.dataset.objects.revolve import (
     within,
 )
 from experiments.dataset.objects.vessels import GLASS, Look, body, hollow, open_mouth, space_in
-from experiments.dataset.parts import Object, Part
+from experiments.dataset.parts import Object, ObjectPart
 
 _PALE_GREEN = Look(tint=(0.95, 0.985, 0.96))
 _ROSE = Look(tint=(0.98, 0.93, 0.95))
 
 
-def _make_korken_jar(detail: float) -> list[Part]:
+def _make_korken_jar(detail: float) -> list[ObjectPart]:
     """A preserving jar of 115 mm by 175 mm, its lid resting a rubber ring's height above."""
     cut = sampling(detail)
     outline = region(
@@ -47,7 +47,7 @@ def _make_korken_jar(detail: float) -> list[Part]:
     return centred([united(parts)])
 
 
-def _make_vardagen_jar(detail: float) -> list[Part]:
+def _make_vardagen_jar(detail: float) -> list[ObjectPart]:
     """A storage jar with a heavy bottom, and a lid with a knob that hangs into its mouth."""
     cut = sampling(detail)
     outline = region(
@@ -73,7 +73,7 @@ def _make_vardagen_jar(detail: float) -> list[Part]:
     return centred([united(parts)])
 
 
-def _make_light_bulb(detail: float) -> list[Part]:
+def _make_light_bulb(detail: float) -> list[ObjectPart]:
     """A bulb of 60 mm by 110 mm, all of it glass: a shell with a cavity, into which a mount rises.
 
     It is closed, for a real one is: outer surface and cavity are one part, the latter with faces
@@ -105,7 +105,7 @@ def _make_light_bulb(detail: float) -> list[Part]:
     return centred([body("body", GLASS, shape, sampling(detail))])
 
 
-def _make_candle_holder(detail: float) -> list[Part]:
+def _make_candle_holder(detail: float) -> list[ObjectPart]:
     """A turned candlestick of solid glass, with a socket for a taper."""
     outline = region(
         filleted(
@@ -139,7 +139,7 @@ def _make_candle_holder(detail: float) -> list[Part]:
     return centred([body("body", _ROSE, shape, cut)])
 
 
-def _make_crystal_vase(detail: float) -> list[Part]:
+def _make_crystal_vase(detail: float) -> list[ObjectPart]:
     """Thick, with cuts that wind around it; round within, at its foot and at its rim."""
     cut = sampling(detail)
     side = smooth([(0.66, 0.12), (0.6, 0.5), (0.66, 1.3), (0.82, 2.2), (1.0, 3.1)])

@@ -100,15 +100,6 @@ def ellipsoid(centre: Vector, radii: Vector) -> Field:
     return Field(distance, _triple(middle), float(axes.max()))
 
 
-def round_cone(start: Vector, end: Vector, start_radius: float, end_radius: float) -> Field:
-    """The hull of two balls; a capsule if they are equal.
-
-    Raises:
-      ValueError: if one ball lies in the other.
-    """
-    return tube(np.array([start, end], float), np.array([start_radius, end_radius], float))
-
-
 def tube(
     curve: Float[np.ndarray, "joints 3"], radii: Float[np.ndarray, " joints"] | float
 ) -> Field:

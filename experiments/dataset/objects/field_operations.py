@@ -79,11 +79,6 @@ def offset(field: Field, distance: float) -> Field:
     return Field(lambda p: field(p) - distance, field.centre, field.radius + max(distance, 0.0))
 
 
-def onion(field: Field, thickness: float) -> Field:
-    """Returns the wall of a thickness inside the surface of a solid: all that is not deeper."""
-    return field._replace(distance=lambda p: np.maximum(field(p), -thickness - field(p)))
-
-
 def moved(field: Field, shift: Vector) -> Field:
     """Returns a solid elsewhere."""
     step = np.asarray(shift, float)

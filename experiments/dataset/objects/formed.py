@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from experiments.dataset.objects.distance_fields import Field
 from experiments.dataset.objects.field_operations import gridded, intersection, offset
 from experiments.dataset.objects.isosurface import isosurface, largest_piece, sample
-from experiments.dataset.parts import RADIUS, Category, Object, Part
+from experiments.dataset.parts import RADIUS, Category, Object, ObjectPart
 from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
 
 WALL = 0.09
@@ -63,13 +63,13 @@ def single_glass(
       radius: to the farthest point, once the object is centred.
       thinnest: see `spacing`.
       fineness: a factor of the detail, for shapes with small features.
-      tint: see `Part`.
+      tint: see `ObjectPart`.
     """
 
-    def make(detail: float) -> list[Part]:
+    def make(detail: float) -> list[ObjectPart]:
         step = spacing(fineness * detail, thinnest=thinnest)
         surface = isosurface(softened(field()), spacing=step)
-        return centred([Part("body", "glass", *surface, tint=tint)], radius)
+        return centred([ObjectPart("body", "glass", *surface, tint=tint)], radius)
 
     return Object(name, "smncvx", make)
 
@@ -101,13 +101,13 @@ def filled_glass(
     """
     category: Category = "mmncvx"
 
-    def make(detail: float) -> list[Part]:
+    def make(detail: float) -> list[ObjectPart]:
         step = spacing(fineness * detail, thinnest=thinnest)
         body = softened(field())
         outer = isosurface(body, spacing=step)
         inner = largest_piece(isosurface(core(body, wall), spacing=step))
-        shell = Part("body", "glass", *outer)
-        filling = Part("core", medium, *inner, tint=tint, absorption=absorption)
+        shell = ObjectPart("body", "glass", *outer)
+        filling = ObjectPart("core", medium, *inner, tint=tint, absorption=absorption)
         return centred([shell, filling], radius)
 
     return Object(name, category, make)
@@ -132,7 +132,7 @@ def _blurred(solid: Field, *, width: float, grid: float) -> Field:
     return field._replace(centre=solid.centre, radius=solid.radius)
 
 
-def centred(parts: Sequence[Part], radius: float) -> list[Part]:
+def centred(parts: Sequence[ObjectPart], radius: float) -> list[ObjectPart]:
     """Returns parts moved and scaled: in the middle of their box, and as far as a radius.
 
     Args:

@@ -20,7 +20,7 @@ from experiments.dataset.objects.vessels import (
     space_in,
     vessel,
 )
-from experiments.dataset.parts import Object, Part
+from experiments.dataset.parts import Object, ObjectPart
 
 _WINE = Look("alcohol", absorption=(0.35, 2.6, 2.2))
 _SCENT = Look("perfume", tint=(0.95, 0.86, 0.62))
@@ -30,7 +30,7 @@ _STEM = Look("plastic", tint=(0.5, 0.82, 0.45))
 _PETALS = Look("plastic", tint=(0.97, 0.62, 0.68))
 
 
-def _make_wine_glass(detail: float) -> list[Part]:
+def _make_wine_glass(detail: float) -> list[ObjectPart]:
     """A red wine in a stemmed glass with a wide bowl."""
     bowl = smooth(
         [
@@ -62,7 +62,7 @@ def _make_wine_glass(detail: float) -> list[Part]:
     return centred(vessel(shapes, sampling(detail), liquid=_WINE))
 
 
-def _make_reed_diffuser(detail: float) -> list[Part]:
+def _make_reed_diffuser(detail: float) -> list[ObjectPart]:
     """Six reeds in a square bottle."""
     outline = region(
         filleted(
@@ -93,7 +93,7 @@ def _make_reed_diffuser(detail: float) -> list[Part]:
     return centred([*parts, united(upper), united(lower)])
 
 
-def _make_flower_vase(detail: float) -> list[Part]:
+def _make_flower_vase(detail: float) -> list[ObjectPart]:
     """Three tulips in water."""
     side = smooth([(0.55, 0.1), (0.68, 0.5), (0.6, 1.05), (0.34, 1.5), (0.42, 1.95)])
     foot = filleted((0, 0), (0.5, 0, 0.06), (0.55, 0.1))

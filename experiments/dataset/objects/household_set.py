@@ -17,7 +17,7 @@ from experiments.dataset.objects.vessels import (
     stopper,
     vessel,
 )
-from experiments.dataset.parts import Object, Part
+from experiments.dataset.parts import Object, ObjectPart
 
 _DRINK = Look("water", tint=(0.98, 0.86, 0.72))
 _SOAP = Look("water", absorption=(1.5, 0.35, 0.2))
@@ -30,7 +30,7 @@ _LID = Look("plastic", tint=(0.92, 0.75, 0.4))
 _STOPPER = Look("glass", tint=(0.9, 0.84, 0.97))
 
 
-def _tumbler(cut: Sampling, detail: float) -> list[Part]:
+def _tumbler(cut: Sampling, detail: float) -> list[ObjectPart]:
     """A drink with a straw, which leans on nothing: it stays clear of the glass."""
     outline = region(filleted((0, 0), (0.46, 0, 0.08), (0.58, 1.5), (0, 1.5)))
     mouth = open_mouth(outline, wall=0.05)
@@ -44,7 +44,7 @@ def _tumbler(cut: Sampling, detail: float) -> list[Part]:
     ]
 
 
-def _dispenser(cut: Sampling) -> list[Part]:
+def _dispenser(cut: Sampling) -> list[ObjectPart]:
     """Liquid soap in a bottle of clear plastic under a pump."""
     outline = region(
         filleted(
@@ -63,7 +63,7 @@ def _dispenser(cut: Sampling) -> list[Part]:
     return [*parts, body("pump", _WHITE, rounded(pump, concave=0.05), cut)]
 
 
-def _jar(cut: Sampling) -> list[Part]:
+def _jar(cut: Sampling) -> list[ObjectPart]:
     """Honey in a hexagonal jar with a lid."""
     outline = region(
         filleted(
@@ -81,7 +81,7 @@ def _jar(cut: Sampling) -> list[Part]:
     return [*parts, body("lid", _LID, lid, cut)]
 
 
-def _flacon(cut: Sampling) -> list[Part]:
+def _flacon(cut: Sampling) -> list[ObjectPart]:
     """Scent in a globe with a stopper of glass."""
     globe = region(arc((0.0, 0.42), 0.46, -90.0, 90.0))
     outline = rounded(globe - box(1.0, -1.0, 0.0), convex=0.06) + box(0.17, 0.5, 1.08)
@@ -95,7 +95,7 @@ def _flacon(cut: Sampling) -> list[Part]:
     return [*parts, body("stopper", _STOPPER, plug, cut)]
 
 
-def _make_household_item_set(detail: float) -> list[Part]:
+def _make_household_item_set(detail: float) -> list[ObjectPart]:
     cut = sampling(detail, segments=64)
     placed = [
         (_tumbler(cut, detail), (0.4, 0.66)),

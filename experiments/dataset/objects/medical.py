@@ -25,7 +25,7 @@ from experiments.dataset.objects.vessels import (
     space_in,
     vessel,
 )
-from experiments.dataset.parts import Object, Part
+from experiments.dataset.parts import Object, ObjectPart
 
 _AMBER = Look("water", tint=(0.97, 0.82, 0.5))
 _CLEAR_BLUE = Look("water", tint=(0.78, 0.9, 0.99))
@@ -35,7 +35,7 @@ _CAP = Look("plastic", tint=(0.6, 0.68, 0.9))
 _PLUNGER = Look("plastic", tint=(0.72, 0.86, 0.95))
 
 
-def _make_ampoule(detail: float) -> list[Part]:
+def _make_ampoule(detail: float) -> list[ObjectPart]:
     """Drawn shut above its bulb, over a narrow neck where it is broken off."""
     outline = region(
         filleted(
@@ -54,7 +54,7 @@ def _make_ampoule(detail: float) -> list[Part]:
     return centred(vessel(shapes, sampling(detail, segments=72), liquid=_AMBER))
 
 
-def _make_vial(detail: float) -> list[Part]:
+def _make_vial(detail: float) -> list[ObjectPart]:
     """A scintillation vial of 20 ml with a knurled screw cap."""
     outline = region(
         filleted(
@@ -85,7 +85,7 @@ def _side_of_cap(r: Values, z: Values) -> Values:
     return ramp(r, 0.6, 0.69) * within(z, 2.68, 3.24, soft=0.1)
 
 
-def _make_syringe(detail: float) -> list[Part]:
+def _make_syringe(detail: float) -> list[ObjectPart]:
     """Half full, needle down, tilted."""
     cut = sampling(detail, segments=80)
     barrel, space = _barrel()

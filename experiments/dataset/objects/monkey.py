@@ -20,7 +20,7 @@ from experiments.dataset.objects.distance_fields import Distances, Field, Points
 from experiments.dataset.objects.field_operations import gridded, union
 from experiments.dataset.objects.formed import centred, spacing
 from experiments.dataset.objects.isosurface import Surface, isosurface, sample
-from experiments.dataset.parts import Object, Part
+from experiments.dataset.parts import Object, ObjectPart
 
 _RADIUS = 1.7
 
@@ -57,14 +57,14 @@ def monkey(mesh: Surface) -> Object:
       mesh: from `load_suzanne`; within 1.6 of the origin along each axis.
     """
 
-    def make(detail: float) -> list[Part]:
+    def make(detail: float) -> list[ObjectPart]:
         pieces = [_solid(closed(piece)) for piece in pieces_of(mesh)]
         values, low = sample(union(*pieces, blend=_SEAM), spacing=_GRID, half_extent=_HALF_EXTENT)
         field = gridded(gaussian_filter(values, _SMOOTHING / _GRID), low, _GRID)
         surface = isosurface(
             field, spacing=0.75 * spacing(detail, thinnest=0.1), half_extent=_HALF_EXTENT
         )
-        return centred([Part("body", "glass", *surface)], _RADIUS)
+        return centred([ObjectPart("body", "glass", *surface)], _RADIUS)
 
     return Object("monkey", "smncvx", make)
 

@@ -13,7 +13,7 @@ from experiments.dataset.objects.revolve import (
     stretched,
 )
 from experiments.dataset.objects.vessels import Look, body, cap, sealed, space_in, vessel
-from experiments.dataset.parts import Object, Part
+from experiments.dataset.parts import Object, ObjectPart
 
 _RED = Look("perfume", absorption=(0.12, 1.9, 1.5))
 _YELLOW = Look("perfume", absorption=(0.04, 0.28, 1.7))
@@ -21,7 +21,7 @@ _BLACK = Look("plastic", tint=(0.35, 0.35, 0.38))
 _GOLD = Look("plastic", tint=(0.93, 0.8, 0.5))
 
 
-def _make_perfume_red(detail: float) -> list[Part]:
+def _make_perfume_red(detail: float) -> list[ObjectPart]:
     """A cube with a black square cap."""
     outline = region(
         filleted(
@@ -42,7 +42,7 @@ def _make_perfume_red(detail: float) -> list[Part]:
     return centred([*parts, _cap(lid, _BLACK, polygon(4, 0.2), cut)])
 
 
-def _make_perfume_yellow(detail: float) -> list[Part]:
+def _make_perfume_yellow(detail: float) -> list[ObjectPart]:
     """A flat, tall block with sloping shoulders and a golden cap of twelve sides."""
     outline = region(
         filleted(
@@ -71,7 +71,7 @@ def _thick(outline: Region, shoulder: float, wall: float, floor: float) -> Regio
     return space_in(outline - box(1.0, shoulder, 9.0), wall=wall, floor=floor, corner=0.1)
 
 
-def _cap(shape: Region, look: Look, section: Section, cut: Sampling) -> Part:
+def _cap(shape: Region, look: Look, section: Section, cut: Sampling) -> ObjectPart:
     """Returns a cap with an outer section of its own, and a round bore."""
     fitted = faded(section, lambda r, z: ramp(r, 0.42, 0.5))
     return body("cap", look, shape, cut, turned=Turned(section_angles(section, cut), fitted))

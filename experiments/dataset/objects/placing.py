@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from experiments.dataset.parts import Part
+from experiments.dataset.parts import ObjectPart
 
 Mesh = tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]
 
@@ -20,29 +20,29 @@ def merged(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
-def united(parts: Sequence[Part]) -> Part:
+def united(parts: Sequence[ObjectPart]) -> ObjectPart:
     """Returns parts of one look, which are apart, as one part with the name of the first."""
     vertices, faces = merged([(part.vertices, part.faces) for part in parts])
     return parts[0]._replace(vertices=vertices, faces=faces)
 
 
-def moved(parts: Sequence[Part], by: tuple[float, float, float]) -> list[Part]:
+def moved(parts: Sequence[ObjectPart], by: tuple[float, float, float]) -> list[ObjectPart]:
     """Returns parts moved by a vector, in world units."""
     return [part._replace(vertices=part.vertices + np.asarray(by)) for part in parts]
 
 
-def tilted(parts: Sequence[Part], *, axis: str, degrees: float) -> list[Part]:
+def tilted(parts: Sequence[ObjectPart], *, axis: str, degrees: float) -> list[ObjectPart]:
     """Returns parts turned around an axis of the world, `x`, `y` or `z`, through the origin."""
     matrix = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
     return [part._replace(vertices=part.vertices @ matrix.T) for part in parts]
 
 
-def enlarged(parts: Sequence[Part], factor: float) -> list[Part]:
+def enlarged(parts: Sequence[ObjectPart], factor: float) -> list[ObjectPart]:
     """Returns parts scaled about the origin, and the gaps between them with them."""
     return [part._replace(vertices=part.vertices * factor) for part in parts]
 
 
-def centred(parts: Sequence[Part]) -> list[Part]:
+def centred(parts: Sequence[ObjectPart]) -> list[ObjectPart]:
     """Returns parts moved so that the box around all of them has its middle at the origin."""
     vertices = np.concatenate([part.vertices for part in parts])
     middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))

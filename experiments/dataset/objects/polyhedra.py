@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
-from experiments.dataset.parts import Object, Part
+from experiments.dataset.parts import Object, ObjectPart
 from refref_jax.choices import CLEAR, Colour
 
 GREEN: Colour = (0.72, 0.95, 0.80)
@@ -32,7 +32,7 @@ _BASE, _HEIGHT = 1.15, 1.75
 _GIRDLE_RADIUS = 1.7
 
 
-def cube(detail: float, *, tint: Colour = CLEAR) -> list[Part]:
+def cube(detail: float, *, tint: Colour = CLEAR) -> list[ObjectPart]:
     """A cube along the axes; it has no more detail to show."""
     del detail
     corners = _HALF_EDGE * np.array(
@@ -42,7 +42,7 @@ def cube(detail: float, *, tint: Colour = CLEAR) -> list[Part]:
     return [_flat("body", "glass", corners, [[3, 2, 1, 0], [4, 5, 6, 7], *sides], tint)]
 
 
-def pyramid(detail: float, *, tint: Colour = CLEAR) -> list[Part]:
+def pyramid(detail: float, *, tint: Colour = CLEAR) -> list[ObjectPart]:
     """A pyramid on a square; it has no more detail to show."""
     del detail
     low = -0.5 * _HEIGHT
@@ -52,7 +52,7 @@ def pyramid(detail: float, *, tint: Colour = CLEAR) -> list[Part]:
     return [_flat("body", "glass", corners, [[3, 2, 1, 0], *sides], tint)]
 
 
-def diamond(detail: float) -> list[Part]:
+def diamond(detail: float) -> list[ObjectPart]:
     """A round brilliant of 57 facets and 16 more on its girdle; it has no more detail to show."""
     del detail
     top, bottom = GIRDLE, -GIRDLE  # the girdle's diameter is 2, here
@@ -106,14 +106,14 @@ def _flat(
     corners: Float[np.ndarray, "corners 3"],
     polygons: Sequence[Sequence[int]],
     tint: Colour,
-) -> Part:
+) -> ObjectPart:
     """Makes a part of convex polygons, each a fan of triangles."""
     faces = [
         [polygon[0], polygon[i], polygon[i + 1]]
         for polygon in polygons
         for i in range(1, len(polygon) - 1)
     ]
-    return Part(name, material, corners, np.array(faces, np.int64), smooth=False, tint=tint)
+    return ObjectPart(name, material, corners, np.array(faces, np.int64), smooth=False, tint=tint)
 
 
 OBJECTS = (

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from experiments.dataset.objects.isosurface import Surface
-from experiments.dataset.parts import Object, Part
+from experiments.dataset.parts import Object, ObjectPart
 from refref_jax.choices import CLEAR, Colour
 
 BLUE: Colour = (0.72, 0.86, 1.0)
@@ -32,7 +32,7 @@ _BALL_PIECES, _SECTIONS, _FILLET_SEGMENTS = 48, 192, 12
 _SUPPORT = 0.01
 
 
-def ball(detail: float, *, tint: Colour = CLEAR) -> list[Part]:
+def ball(detail: float, *, tint: Colour = CLEAR) -> list[ObjectPart]:
     """A ball of 20 n^2 triangles, none much larger than another."""
     pieces = max(2, round(_BALL_PIECES * detail))
     rough = trimesh.creation.icosahedron()
@@ -47,7 +47,7 @@ def ball(detail: float, *, tint: Colour = CLEAR) -> list[Part]:
     return [_smooth(_outward_hull(vertices), tint)]
 
 
-def cylinder(detail: float, *, tint: Colour = CLEAR) -> list[Part]:
+def cylinder(detail: float, *, tint: Colour = CLEAR) -> list[ObjectPart]:
     """An upright cylinder whose edges are rounded."""
     half, inner = CYLINDER_HALF_HEIGHT, CYLINDER_RADIUS - CYLINDER_FILLET
     segments = max(3, round(_FILLET_SEGMENTS * detail))
@@ -65,7 +65,7 @@ def cylinder(detail: float, *, tint: Colour = CLEAR) -> list[Part]:
     return [_smooth(_turned(profile, sections, (-half, half)), tint)]
 
 
-def torus(detail: float, *, tint: Colour = CLEAR) -> list[Part]:
+def torus(detail: float, *, tint: Colour = CLEAR) -> list[ObjectPart]:
     """A ring that lies flat."""
     sections = max(12, round(_SECTIONS * detail))
     around = max(8, round(_SECTIONS * detail * TORUS_THICKNESS / TORUS_RADIUS))
@@ -78,8 +78,8 @@ def torus(detail: float, *, tint: Colour = CLEAR) -> list[Part]:
     return [_smooth(Surface(_points(profile, sections), faces), tint)]
 
 
-def _smooth(surface: Surface, tint: Colour) -> Part:
-    return Part("body", "glass", surface.vertices, surface.faces, tint=tint)
+def _smooth(surface: Surface, tint: Colour) -> ObjectPart:
+    return ObjectPart("body", "glass", surface.vertices, surface.faces, tint=tint)
 
 
 def _supported(half: float) -> Float[np.ndarray, " heights"]:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from experiments.dataset.objects.profiles import sampling
 from experiments.dataset.objects.regions import Region
 from experiments.dataset.objects.vessels import Look, body, rod
-from experiments.dataset.parts import Part
+from experiments.dataset.parts import ObjectPart
 
 
 class Stick(NamedTuple):
@@ -48,7 +48,9 @@ def bundle(count: int, *, waist: float, height: float, slope: float, radius: flo
     return sticks
 
 
-def piece(name: str, look: Look, stick: Stick, low: float, high: float, detail: float) -> Part:
+def piece(
+    name: str, look: Look, stick: Stick, low: float, high: float, detail: float
+) -> ObjectPart:
     """Returns the piece of a stick between two heights, measured along its middle."""
     way = np.asarray(stick.way)
     stretch = float(np.linalg.norm(way) / way[2])
@@ -58,7 +60,7 @@ def piece(name: str, look: Look, stick: Stick, low: float, high: float, detail: 
 
 def along(
     name: str, look: Look, shape: Region, stick: Stick, low: float, detail: float, **turned
-) -> Part:
+) -> ObjectPart:
     """Returns a body whose axis, from height 0 on, lies on a stick from a height on."""
     part = body(name, look, shape, sampling(detail, segments=32), **turned)
     start = np.asarray(stick.origin) + (low - stick.origin[2]) / stick.way[2] * np.asarray(

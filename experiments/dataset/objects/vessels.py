@@ -23,7 +23,7 @@ from experiments.dataset.objects.regions import (
     top,
 )
 from experiments.dataset.objects.revolve import Turned, revolve, round_about
-from experiments.dataset.parts import Part
+from experiments.dataset.parts import ObjectPart
 from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
 
 FILM = 0.016
@@ -41,8 +41,8 @@ class Look(NamedTuple):
 
     Attributes:
       material: inside.
-      tint: see `Part`.
-      absorption: see `Part`.
+      tint: see `ObjectPart`.
+      absorption: see `ObjectPart`.
     """
 
     material: str = "glass"
@@ -171,7 +171,7 @@ def body(
     cut: Sampling,
     *,
     turned: Turned | None = None,
-) -> Part:
+) -> ObjectPart:
     """Returns the part that a region becomes when it is turned around the axis."""
     turned = round_about(cut) if turned is None else turned
     pieces = [
@@ -180,7 +180,9 @@ def body(
         if np.max(np.ptp(profile, axis=0)) > _SLIVER
     ]
     vertices, faces = merged(pieces)
-    return Part(name, look.material, vertices, faces, tint=look.tint, absorption=look.absorption)
+    return ObjectPart(
+        name, look.material, vertices, faces, tint=look.tint, absorption=look.absorption
+    )
 
 
 def vessel(
@@ -191,7 +193,7 @@ def vessel(
     glass: Look = GLASS,
     turned: Turned | None = None,
     name: str = "",
-) -> list[Part]:
+) -> list[ObjectPart]:
     """Returns the parts of a vessel with a liquid: `shell`, `liquid`, and `air` if it is sealed.
 
     Args:

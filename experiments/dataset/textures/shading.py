@@ -7,7 +7,7 @@ import numpy as np
 import scipy.ndimage
 from jaxtyping import Float
 
-from experiments.dataset.textures.fields import Field, Picture, smooth
+from experiments.dataset.textures.fields import Field, Picture
 
 _LIGHT = (-0.45, -0.55, 0.7)
 _AMBIENT = 0.3
@@ -65,11 +65,6 @@ def hollows(height: Field, radius: float, *, strength: float) -> Field:
     """Returns a factor below 1 where a relief lies lower than around it, within `radius`."""
     around = scipy.ndimage.gaussian_filter(height, radius * height.shape[0], truncate=2.5)
     return np.exp(-strength * np.maximum(around - height, 0.0) / radius)
-
-
-def vignette(x: Field, y: Field, *, strength: float) -> Field:
-    """Returns a factor that falls towards the corners by `strength`."""
-    return 1.0 - strength * smooth(0.3, 0.75, np.hypot(x - 0.5, y - 0.5))
 
 
 def linear(picture: np.ndarray) -> np.ndarray:

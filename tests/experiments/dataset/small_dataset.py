@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 
 from experiments.dataset import backgrounds, frame_files, production, scene_record, scenes
-from experiments.dataset.parts import Object, Part
+from experiments.dataset.parts import Object, ObjectPart
 from experiments.dataset.render_settings import PerSplit, RenderSettings
 from refref_jax import atomic_files
 
@@ -21,7 +21,9 @@ SETTINGS = RenderSettings(size=6, spp=PerSplit(2, 2, 4), views=PerSplit(3, 1, 2)
 
 def box(edge, name="body", material="glass", **options):
     mesh = trimesh.creation.box(3 * [edge])
-    return Part(name, material, np.array(mesh.vertices), np.array(mesh.faces), False, **options)
+    return ObjectPart(
+        name, material, np.array(mesh.vertices), np.array(mesh.faces), False, **options
+    )
 
 
 SMALL_OBJECTS = {

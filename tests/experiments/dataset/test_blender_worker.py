@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from experiments.dataset import cameras, frame_files, workers
-from experiments.dataset.parts import Part
+from experiments.dataset.parts import ObjectPart
 from refref_jax.data.background import read_background
 from refref_jax.geometry.cameras import box_filter, image_rays, supersample
 from refref_jax.render.backgrounds import radiance_of
@@ -37,7 +37,7 @@ def blender(tmp_path_factory):
 
 def _ball(radius, name="body", material="glass", **options):
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
-    return Part(name, material, np.array(mesh.vertices), np.array(mesh.faces), **options)
+    return ObjectPart(name, material, np.array(mesh.vertices), np.array(mesh.faces), **options)
 
 
 def _psnr(a, b):

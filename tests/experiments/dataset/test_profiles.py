@@ -2,8 +2,6 @@ import numpy as np
 import pytest
 
 from experiments.dataset.objects.profiles import (
-    Sampling,
-    arc,
     filleted,
     joined,
     resampled,
@@ -21,14 +19,7 @@ from experiments.dataset.objects.regions import (
     rounded,
     top,
 )
-
-
-def _distances(points, curve):
-    """Distance of points from a polyline, edge by edge."""
-    start, way = curve[:-1], np.diff(curve, axis=0)
-    off = points[:, None] - start
-    along = np.clip(np.sum(off * way, -1) / np.sum(way**2, -1), 0.0, 1.0)
-    return np.linalg.norm(off - along[..., None] * way, axis=-1).min(axis=1)
+from tests.experiments.dataset.polylines import distances
 
 
 def _turns(curve):
@@ -58,10 +49,6 @@ def test_a_fillet_is_an_arc_tangent_to_both_sides(corner):
     assert np.max(np.abs(_turns(curve))) <= np.radians(2.0) + 1e-9
 
 
-def test_a_corner_without_a_fillet_stays():
-    np.testing.assert_array_equal(filleted((0, 0), (1, 0), (1, 2)), [[0, 0], [1, 0], [1, 2]])
-
-
 def test_fillets_that_have_no_room_are_refused():
     with pytest.raises(ValueError, match=r"fillets at \(1, 0, 0.3\) and \(1, 0.5, 0.3\) overlap"):
         filleted((0, 0), (1, 0, 0.3), (1, 0.5, 0.3), (0, 0.5))
@@ -71,32 +58,17 @@ def test_fillets_that_have_no_room_are_refused():
 # Splines and arcs.
 
 
-def test_a_smooth_curve_passes_its_points_and_meets_the_axis_perpendicularly():
+def test_a_smooth_curve_passes_its_points_and_ends_as_it_is_told():
     knots = [(0.0, 0.0), (0.8, 0.6), (0.5, 1.2), (0.0, 1.5)]
     curve = smooth(knots)
-    assert _distances(np.array(knots), curve).max() < 1e-5
-    sides = np.diff(curve, axis=0)
-    for side, sign in ((sides[0], 1.0), (sides[-1], -1.0)):
-        way = side / np.linalg.norm(side)
-        assert way[0] == pytest.approx(sign, abs=1e-3)
+    assert distances(np.array(knots), curve).max() < 1e-5
+    sides = np.diff(curve, axis=0)[[0, -1]]
+    ways = sides / np.linalg.norm(sides, axis=1, keepdims=True)
+    np.testing.assert_allclose(ways[:, 0], [1.0, -1.0], atol=1e-3)  # perpendicular to the axis
     assert np.max(np.abs(_turns(curve))) < 0.05
-
-
-def test_a_curve_can_end_upright():
-    curve = smooth([(0.5, 0.0), (0.9, 1.0), (0.4, 2.0)], ends="upright")
-    for side in np.diff(curve, axis=0)[[0, -1]]:
-        assert abs(side[0]) < 0.02 * side[1]
-
-
-def test_an_arc_lies_on_its_circle():
-    curve = arc((0.0, 0.4), 1.5, -90.0, 90.0)
-    np.testing.assert_allclose(np.hypot(curve[:, 0], curve[:, 1] - 0.4), 1.5, rtol=1e-12)
-    assert curve[0, 0] == 0.0 == curve[-1, 0]
-
-
-def test_joined_curves_share_their_ends():
-    one, two = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[1.0, 0.0], [1.0, 1.0]])
-    np.testing.assert_array_equal(joined(one, two), [[0, 0], [1, 0], [1, 1]])
+    upright = smooth([(0.5, 0.0), (0.9, 1.0), (0.4, 2.0)], ends="upright")
+    sides = np.diff(upright, axis=0)[[0, -1]]
+    assert np.all(np.abs(sides[:, 0]) < 0.02 * sides[:, 1])
 
 
 # Sampling.
@@ -110,20 +82,9 @@ def test_edges_keep_to_the_sampling_and_to_the_curve(detail):
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     assert lengths.max() <= cut.edge * (1.0 + 1e-9)
     assert np.max(np.abs(_turns(points))) <= 1.2 * cut.turn
-    assert _distances(points, curve).max() < 1e-9
+    assert distances(points, curve).max() < 1e-9
     assert np.max(np.maximum(lengths[1:] / lengths[:-1], lengths[:-1] / lengths[1:])) < 1.7
     np.testing.assert_array_equal(points[[0, -1]], curve[[0, -1]])
-
-
-def test_twice_the_detail_halves_the_edges():
-    coarse, fine = (len(resampled(_bottle(), sampling(detail))) for detail in (0.5, 1.0))
-    assert 1.5 < fine / coarse < 2.5
-
-
-def test_a_straight_line_is_cut_evenly():
-    cut = Sampling(edge=0.25, turn=0.1, segments=16)
-    points = resampled(np.array([[0.0, 1.0], [2.0, 1.0]]), cut)
-    np.testing.assert_allclose(points[:, 0], np.linspace(0.0, 2.0, 9), atol=1e-12)
 
 
 # Offsets.
@@ -134,22 +95,15 @@ def test_an_offset_lies_at_its_distance_everywhere(distance):
     curve = _bottle()
     [found] = profiles(offset(region(curve), distance))
     whole = joined(curve, (curve * [-1.0, 1.0])[::-1])
-    np.testing.assert_allclose(_distances(found, whole), abs(distance), atol=2e-4)
+    np.testing.assert_allclose(distances(found, whole), abs(distance), atol=2e-4)
     assert found[0, 0] == 0.0 == found[-1, 0]
+    assert offset(region(curve), -1.1).is_empty()
 
 
 def test_an_offset_does_not_cross_itself_where_a_neck_closes():
     [found] = profiles(offset(region(_bottle()), -0.45))  # wider than the neck's 0.4
     assert found[:, 1].max() < 1.9
     assert np.all(np.diff(np.unwrap(np.arctan2(found[:, 1] - 0.9, found[:, 0]))) > 0.0)
-
-
-def test_shrinking_and_growing_a_ball():
-    ball = region(arc((0.0, 0.0), 1.0, -90.0, 90.0))
-    [found] = profiles(offset(ball, -0.3))
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 0.7, atol=1e-4)
-    assert offset(ball, -1.1).is_empty()
-    assert offset(ball, 0.0) is ball
 
 
 # Regions.
@@ -167,12 +121,6 @@ def test_halves_of_a_region_make_up_the_whole():
     parts = below(shape, 1.1).area() + above(shape, 1.1).area()
     assert parts == pytest.approx(shape.area(), rel=1e-6)
     assert top(shape) == pytest.approx((0.4, 2.5))
-
-
-def test_a_region_gives_back_its_profile():
-    [found] = profiles(region(_bottle()))
-    assert _distances(found, _bottle()).max() < 1e-6
-    assert tuple(found[0]) == (0.0, 0.0) and tuple(found[-1]) == (0.0, 2.5)
 
 
 def test_a_cavity_is_traversed_downwards_and_a_ring_ends_where_it_began():

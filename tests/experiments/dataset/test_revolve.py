@@ -6,16 +6,12 @@ from experiments.dataset.objects.profiles import Sampling, arc, resampled, sampl
 from experiments.dataset.objects.regions import profiles, ring
 from experiments.dataset.objects.revolve import (
     Turned,
-    even_angles,
     faded,
     polygon,
-    ramp,
     revolve,
     round_about,
     section_angles,
-    stretched,
     waves,
-    within,
 )
 
 _FINE = Sampling(edge=0.02, turn=0.03, segments=360)
@@ -35,36 +31,26 @@ def _closed_and_outward(mesh):
 # Closed forms.
 
 
-def test_a_sphere():
-    mesh = _mesh(arc((0.0, 0.0), 1.5, -90.0, 90.0))
-    assert _closed_and_outward(mesh)
-    assert mesh.volume == pytest.approx(4.0 / 3.0 * np.pi * 1.5**3, rel=1e-3)
-    assert mesh.area == pytest.approx(4.0 * np.pi * 1.5**2, rel=1e-3)
+_BALL = arc((0.0, 0.0), 1.5, -90.0, 90.0)
+_SMOOTH = smooth([(0.0, 0.0), (0.8, 0.5), (0.4, 1.3), (0.6, 1.8), (0.0, 2.2)])
 
 
-def test_a_cone():
-    mesh = _mesh([(0.0, 0.0), (1.2, 0.0), (0.0, 0.9)])
-    assert _closed_and_outward(mesh)
-    assert mesh.volume == pytest.approx(np.pi * 1.2**2 * 0.9 / 3.0, rel=1e-3)
-
-
-def test_a_torus_by_pappus():
-    [loop] = profiles(ring(1.1, 0.3, 0.5))
-    mesh = _mesh(loop)
-    assert _closed_and_outward(mesh) and mesh.euler_number == 0
-    assert mesh.volume == pytest.approx(2.0 * np.pi * 1.1 * np.pi * 0.25**2, rel=1e-3)
-    assert mesh.area == pytest.approx(2.0 * np.pi * 1.1 * 2.0 * np.pi * 0.25, rel=1e-3)
-
-
-def test_a_smooth_body_by_pappus():
-    curve = smooth([(0.0, 0.0), (0.8, 0.5), (0.4, 1.3), (0.6, 1.8), (0.0, 2.2)])
-    r, z = curve.T
-    expected = np.pi * np.sum(0.5 * (r[1:] ** 2 + r[:-1] ** 2) * np.diff(z))
-    assert _mesh(curve).volume == pytest.approx(expected, rel=1e-3)
-
-
-def test_a_profile_that_goes_down_encloses_a_cavity():
-    assert _mesh(arc((0.0, 0.0), 1.0, 90.0, -90.0)).volume < 0.0
+@pytest.mark.parametrize(
+    ("profile", "volume", "holes"),
+    [
+        (_BALL, 4.0 / 3.0 * np.pi * 1.5**3, 0),
+        ([(0.0, 0.0), (1.2, 0.0), (0.0, 0.9)], np.pi * 1.2**2 * 0.9 / 3.0, 0),
+        (profiles(ring(1.1, 0.3, 0.5))[0], 2.0 * np.pi * 1.1 * np.pi * 0.25**2, 1),
+        (_SMOOTH, np.pi * np.trapezoid(_SMOOTH[:, 0] ** 2, _SMOOTH[:, 1]), 0),
+    ],
+    ids=["ball", "cone", "torus", "smooth"],
+)
+def test_volumes_by_hand_and_by_pappus(profile, volume, holes):
+    mesh = _mesh(profile)
+    assert _closed_and_outward(mesh) and mesh.euler_number == 2 - 2 * holes
+    assert mesh.volume == pytest.approx(volume, rel=1e-3)
+    down = _mesh(np.asarray(profile)[::-1])  # encloses a cavity
+    assert down.volume == pytest.approx(-volume, rel=1e-3)
 
 
 def test_a_square_section_is_a_box_with_rounded_edges():
@@ -113,35 +99,12 @@ def test_waves_lie_between_ridge_and_valley():
     assert narrow < 0.85 < wide
 
 
-def test_stretching_makes_an_ellipse_of_a_circle():
-    factor = stretched(np.ones_like, 0.5)(_ANGLES)
-    x, y = factor * np.cos(_ANGLES), factor * np.sin(_ANGLES)
-    np.testing.assert_allclose(x**2 + (y / 0.5) ** 2, 1.0, rtol=1e-12)
-
-
 def test_angles_crowd_at_corners_and_go_around_once():
     angles = section_angles(polygon(4, 0.1), sampling(1.0))
     steps = np.diff(angles)
     assert np.all(steps > 0.0) and angles[0] >= 0.0 and angles[-1] < 2.0 * np.pi
     corner = np.abs(angles[:-1] % (0.5 * np.pi) - 0.25 * np.pi) < 0.05
     assert steps[corner].mean() < 0.5 * steps[~corner].mean()
-
-
-def test_even_angles_divide_among_lobes():
-    cut = sampling(1.0)
-    assert len(even_angles(cut)) == cut.segments == 96
-    assert len(even_angles(cut, lobes=7)) % 7 == 0
-    assert len(even_angles(cut, lobes=20, each=12)) == 240
-    assert len(even_angles(sampling(0.3), lobes=20, each=12)) == 120
-
-
-def test_ramps_are_smooth_and_monotone():
-    values = np.linspace(-1.0, 2.0, 301)
-    steps = ramp(values, 0.0, 1.0)
-    assert steps[0] == 0.0 and steps[-1] == 1.0 and np.all(np.diff(steps) >= 0.0)
-    assert ramp(np.array(0.5), 0.0, 1.0) == pytest.approx(0.5)
-    inside = within(np.array([0.0, 0.1, 0.5, 0.9, 1.0]), 0.0, 1.0, soft=0.1)
-    np.testing.assert_allclose(inside, [0.0, 1.0, 1.0, 1.0, 0.0], atol=1e-12)
 
 
 # Meshes.

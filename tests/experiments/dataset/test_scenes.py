@@ -4,16 +4,9 @@ from experiments.dataset import catalogue, objects, scenes
 from experiments.dataset.parts import Object
 from experiments.dataset.render_settings import PerSplit, RenderSettings
 
-_OBJECTS = {
-    name: Object(name, category, lambda detail: [])
-    for name, category in [
-        ("ball", "smcvx"),
-        ("ball_coloured", "smcvx"),
-        ("torus", "smncvx"),
-        ("vial", "mmncvx"),
-        ("cube_coloured", "smcvx"),
-    ]
-}
+_CATEGORIES = {"ball": "smcvx", "ball_coloured": "smcvx", "torus": "smncvx", "vial": "mmncvx"}
+_CATEGORIES |= {"cube_coloured": "smcvx"}
+_OBJECTS = {name: Object(name, kind, lambda detail: []) for name, kind in _CATEGORIES.items()}
 
 
 def _names(text):
@@ -74,12 +67,11 @@ def _settings(**changes):
 
 
 def test_views_are_numbered_from_zero():
-    settings = _settings()
-    numbers = [settings.numbers(split) for split in ("train", "val", "test")]
-    assert numbers == [(0, 1), (), (0, 1, 2, 3, 4, 5)]
-    settings = _settings(preview=True)
-    numbers = [settings.numbers(split) for split in ("train", "val", "test")]
-    assert numbers == [(), (), (3,)]
+    for settings, numbers in (
+        (_settings(), [(0, 1), (), (0, 1, 2, 3, 4, 5)]),
+        (_settings(preview=True), [(), (), (3,)]),
+    ):
+        assert [settings.numbers(split) for split in ("train", "val", "test")] == numbers
 
 
 @pytest.mark.parametrize(

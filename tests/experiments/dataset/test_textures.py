@@ -32,39 +32,24 @@ def _blocks(grey, side):
     return grey[: rows * side, : columns * side].reshape(rows, side, columns, side).swapaxes(1, 2)
 
 
-def test_the_pool_has_24_faces_and_13_spheres():
+def test_pictures_are_srgb_in_range_and_coloured(faces, spheres):
     assert len(FACES) == 24 and len(SPHERES) == 13
-
-
-def test_pictures_are_srgb_in_range(faces, spheres):
-    for name, picture in faces.items():
-        assert picture.shape == (_FACE, _FACE, 3) and picture.dtype == np.float32, name
-    for name, picture in spheres.items():
-        assert picture.shape == (_SPHERE, 2 * _SPHERE, 3) and picture.dtype == np.float32, name
     for name, picture in (faces | spheres).items():
+        wanted = (_FACE, _FACE, 3) if name in faces else (_SPHERE, 2 * _SPHERE, 3)
+        assert picture.shape == wanted and picture.dtype == np.float32, name
         assert np.all(picture >= 0.0) and np.all(picture <= 1.0), name
         assert 0.15 < picture.mean() < 0.75, name
+        assert (picture.max(-1) - picture.min(-1)).mean() > 0.05, name
 
 
 def test_no_picture_is_flat_at_any_scale(faces, spheres):
     for name, picture in (faces | spheres).items():
         grey = _luminance(picture)
         fine = grey - scipy.ndimage.gaussian_filter(grey, 1.5)
-        assert grey.std() > 0.12, name
-        assert fine.std() > 0.04, name
+        assert grey.std() > 0.12 and fine.std() > 0.04, name
         assert _blocks(grey, 8).mean((2, 3)).std() > 0.025, name
-
-
-def test_faces_have_detail_nearly_everywhere(faces):
-    for name, picture in faces.items():
-        local = _blocks(_luminance(picture), 12).std((2, 3))
-        assert np.quantile(local, 0.1) > 0.03, name
-
-
-def test_pictures_have_colours(faces, spheres):
-    for name, picture in (faces | spheres).items():
-        chroma = picture.max(-1) - picture.min(-1)
-        assert chroma.mean() > 0.05, name
+        if name in faces:
+            assert np.quantile(_blocks(grey, 12).std((2, 3)), 0.1) > 0.03, name
 
 
 def test_pictures_differ_from_each_other(faces, spheres):
@@ -73,14 +58,10 @@ def test_pictures_differ_from_each_other(faces, spheres):
             assert np.abs(first - second).mean() > 0.1, (one, other)
 
 
-@pytest.mark.parametrize("name", ["brick", "leaves", "circuit", "posters", "penrose"])
-def test_a_face_is_always_the_same(faces, name):
-    np.testing.assert_array_equal(make_face(name, _FACE), faces[name])
-
-
-@pytest.mark.parametrize("name", ["nebula", "lantern", "skyline"])
-def test_a_sphere_is_always_the_same(spheres, name):
-    np.testing.assert_array_equal(make_sphere(name, _SPHERE), spheres[name])
+@pytest.mark.parametrize("name", ["brick", "leaves", "circuit", "penrose", "nebula", "lantern"])
+def test_a_picture_is_always_the_same(faces, spheres, name):
+    again = make_face(name, _FACE) if name in faces else make_sphere(name, _SPHERE)
+    np.testing.assert_array_equal(again, (faces | spheres)[name])
 
 
 @pytest.mark.parametrize("name", ["carpet", "cobbles", "planks", "rust"])
@@ -90,17 +71,13 @@ def test_more_samples_show_the_same(faces, name):
     assert np.corrcoef(*(each.ravel() for each in broad))[0, 1] > 0.97
 
 
-def test_spheres_have_no_seam(spheres):
+def test_spheres_have_no_seam_and_smooth_poles(spheres):
     for name, picture in spheres.items():
-        steps = np.abs(np.roll(picture, -1, axis=1) - picture).mean((0, 2))
-        assert steps[-1] < 1.5 * np.quantile(steps[:-1], 0.9), name
-
-
-def test_spheres_are_smooth_around_their_poles(spheres):
-    for name, picture in spheres.items():
-        steps = np.abs(np.roll(picture, -1, axis=1) - picture).mean((1, 2))
+        steps = np.abs(np.roll(picture, -1, axis=1) - picture).mean(2)
+        columns, rows = steps.mean(0), steps.mean(1)
+        assert columns[-1] < 1.5 * np.quantile(columns[:-1], 0.9), name
         # A row at a pole is as long as a few samples of the equator.
-        assert max(steps[0], steps[-1]) < 0.75 * steps[_SPHERE // 4 : -_SPHERE // 4].max(), name
+        assert max(rows[0], rows[-1]) < 0.75 * rows[_SPHERE // 4 : -_SPHERE // 4].max(), name
 
 
 def test_noise_is_normal_and_periodic():
@@ -112,13 +89,6 @@ def test_noise_is_normal_and_periodic():
     points = sphere_fields.directions(128)
     assert sphere_fields.noise3(points, 12.0, 5).std() == pytest.approx(1.0, abs=0.15)
     assert sphere_fields.waves3(points, 40.0, 5).std() == pytest.approx(1.0, abs=0.15)
-
-
-def test_octaves_that_the_samples_can_not_show_are_left_out():
-    assert not np.any(fields.fbm(16, 64, 3))
-    # Only the first can be shown; it is the weaker the more there would be.
-    one, three = (fields.fbm(16, 8, 3, octaves=octaves) for octaves in (1, 3))
-    np.testing.assert_allclose(three, one / np.sqrt(1 + 0.25 + 0.0625), rtol=1e-4)
 
 
 def test_cells_are_those_of_the_nearest_seed():
@@ -147,15 +117,6 @@ def test_the_middle_column_looks_along_x_and_the_top_row_up():
     np.testing.assert_allclose(points[32, 31:33].mean(0), [0.0, 1.0, 0.0], atol=0.03)
     np.testing.assert_allclose(points[0].mean(0), [0.0, 0.0, 1.0], atol=0.03)
     np.testing.assert_allclose(np.linalg.norm(points, axis=-1), 1.0, atol=1e-6)
-
-
-def test_a_flat_relief_is_as_it_was_and_slopes_are_lit_from_the_upper_left():
-    grey = np.full((32, 32, 3), 0.5, np.float32)
-    flat = np.zeros((32, 32), np.float32)
-    np.testing.assert_allclose(shading.lit(grey, flat), grey, atol=1e-6)
-    x, _ = fields.coordinates(32)
-    assert np.all(shading.lit(grey, 0.5 * x) > 0.55)
-    assert np.all(shading.lit(grey, -0.5 * x) < 0.45)
 
 
 def test_linear_colours_are_those_of_the_standard():

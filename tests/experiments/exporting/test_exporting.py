@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -82,24 +81,29 @@ def test_a_planted_ball_is_found_with_radius_volume_and_colours(model, tmp_path)
     assert (read.visual.vertex_colors[right, :3] == [255, 0, 0]).all()
     assert (read.visual.vertex_colors[left, :3] == [0, 0, 255]).all()
     np.testing.assert_allclose(read.vertex_normals, found.normals, atol=1e-5)
-
-
-def test_points_are_the_shell_of_the_ball(model, tmp_path):
-    grid = _sampled(model)
-    found = field_mesh.find_points(grid, level=_LEVEL)
-    distances = np.linalg.norm(found.points - [0.2, 0.0, 0.0], axis=-1)
+    # Points are the shell of the ball.
+    shell = field_mesh.find_points(grid, level=_LEVEL)
+    distances = np.linalg.norm(shell.points - [0.2, 0.0, 0.0], axis=-1)
     assert distances.max() <= 1.0 + 1e-6 and distances.min() > 1.0 - np.sqrt(3.0) * grid.spacing
-    outwards = (found.points - [0.2, 0.0, 0.0]) / distances[:, None]
-    assert np.sum(found.normals * outwards, axis=-1).min() > 0.9
-    _, colours = field_mesh.look_up_points(model, found.points, -found.normals, width=0.08)
-    eight = np.rint(255 * colours).astype(np.uint8)
-    field_mesh.write_points(tmp_path / "ball.ply", found, eight)
-    read = trimesh.load(tmp_path / "ball.ply")
+    outwards = (shell.points - [0.2, 0.0, 0.0]) / distances[:, None]
+    assert np.sum(shell.normals * outwards, axis=-1).min() > 0.9
+    eight = np.full(shell.points.shape, (255, 0, 128), np.uint8)
+    field_mesh.write_points(tmp_path / "points.ply", shell, eight)
+    read = trimesh.load(tmp_path / "points.ply")
     assert isinstance(read, trimesh.PointCloud)
-    np.testing.assert_allclose(read.vertices, found.points, atol=1e-6)
+    np.testing.assert_allclose(read.vertices, shell.points, atol=1e-6)
     np.testing.assert_array_equal(read.colors[:, :3], eight)
-    right = found.points[:, 0] > 0.25
-    assert (eight[right] == [255, 0, 0]).all() and right.sum() > 100
+
+
+def test_density_is_per_world_unit_and_colours_go_by_the_side_that_is_looked_at(model):
+    point, along = np.array([[1.2, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0]])
+    density, front = field_mesh.look_up_points(model, point, -along, width=0.1)
+    _, back = field_mesh.look_up_points(model, point, along, width=0.1)
+    assert density[0] == pytest.approx(_LEVEL, rel=1e-4)
+    np.testing.assert_allclose(front, [[1.0, 0.0, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(back, [[1.055 * 0.2 ** (1 / 2.4) - 0.055, 0, 0]], atol=1e-5)
+    none, rgb = field_mesh.look_up_points(model, np.zeros((0, 3)), None, width=0.1)
+    assert none.shape == (0,) and rgb.shape == (0, 3)
 
 
 def test_where_no_samples_are_taken_there_is_no_density(model):
@@ -125,13 +129,6 @@ def test_a_cavity_is_inside_and_what_is_between_bodies_is_not():
     axes = [np.array([-1.2, -0.75, 0.0, 0.75, 1.75, 3.0, 3.9]), np.zeros(1), np.zeros(1)]
     inside = field_mesh.inside_bodies(geometry, axes)[:, 0, 0]
     assert inside.tolist() == [False, True, True, True, False, True, False]
-
-
-def test_density_is_per_world_unit(model):
-    density, _ = field_mesh.look_up_points(model, np.array([[1.2, 0.0, 0.0]]), None, width=0.1)
-    assert density[0] == pytest.approx(_LEVEL, rel=1e-4)
-    none, rgb = field_mesh.look_up_points(model, np.zeros((0, 3)), None, width=0.1)
-    assert none.shape == (0,) and rgb.shape == (0, 3)
 
 
 def test_walls_are_where_a_bounded_model_ends():
@@ -196,15 +193,6 @@ def test_a_run_s_bodies_are_files_that_are_read_again(tmp_path, monkeypatch):
     monkeypatch.setattr(object_meshes, "load_geometry", lambda run: scenes.geometry())
     with pytest.raises(ValueError, match="has no body"):
         object_meshes.write(tmp_path, tmp_path / "none.ply", overwrite=False)
-
-
-def test_colours_go_by_the_side_that_is_looked_at(model):
-    point = np.array([[1.2, 0.0, 0.0]])
-    _, front = field_mesh.look_up_points(model, point, np.array([[-1.0, 0.0, 0.0]]), width=0.1)
-    _, back = field_mesh.look_up_points(model, point, np.array([[1.0, 0.0, 0.0]]), width=0.1)
-    np.testing.assert_allclose(front, [[1.0, 0.0, 0.0]], atol=1e-6)
-    np.testing.assert_allclose(back, [[1.055 * 0.2 ** (1 / 2.4) - 0.055, 0, 0]], atol=1e-5)
-    assert jax.tree.leaves(model.params) == []
 
 
 def test_the_command_writes_the_bodies_of_a_run(trained, tmp_path):

@@ -5,8 +5,9 @@ import functools
 import numpy as np
 import pytest
 
-from experiments.r3f import index_stage, object_source
+from experiments.r3f import index_stage
 from refref_jax.data import meshes
+from refref_jax.data.geometry import shaded_mesh
 from refref_jax.reconstruct.index_search import IndexSearch
 from refref_jax.training import fit, run_folder
 
@@ -14,7 +15,7 @@ from refref_jax.training import fit, run_folder
 @pytest.mark.slow
 def test_a_background_is_learned_beside_the_body_and_once(ball_scene, tmp_path, monkeypatch):
     (part,) = meshes.read_meshes(ball_scene)
-    mesh = object_source.mesh_of(part)
+    mesh = shaded_mesh(part)
     search = functools.partial(IndexSearch, 1.47, 1.53, spacing=0.03, descents=1, most=4)
     monkeypatch.setattr(index_stage, "IndexSearch", search)
     kept = []

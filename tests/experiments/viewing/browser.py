@@ -49,6 +49,10 @@ class Page:
         """Returns what the page says."""
         return self.evaluate("document.body?.innerText") or ""
 
+    def wait_for(self, words, *, patience=600.0):
+        """Waits until the page says something; programs are compiled on the way."""
+        until(lambda: words in self.text(), words, patience=patience)
+
     def screenshot(self):
         """Returns what the page looks like, `[h, w, 3]` of 8 bits."""
         data = self.send("Page.captureScreenshot", format="png")["data"]

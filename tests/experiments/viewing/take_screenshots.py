@@ -17,7 +17,6 @@ import imageio.v3 as iio
 from tests.experiments.viewing import browser
 
 _SIZE = (1280, 720)
-_PATIENCE = 600.0
 
 # On the bundled ball, left of its middle; and a turn, begun beside it.
 _CLICK = (540, 300)
@@ -33,20 +32,16 @@ def main(address: str, out: str) -> None:
         tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
         browser.opened(address, Path(profile), size=_SIZE) as page,
     ):
-        _wait_for(page, "size 3 of 3")
+        page.wait_for("size 3 of 3")
         page.evaluate(_CLOSE_NOTICE)
         time.sleep(1.0)  # it fades
         _keep(page, Path(out) / "viewer_rgb.jpg")
         page.click(*_CLICK)
-        _wait_for(page, "left the objects")
+        page.wait_for("left the objects")
         page.drag(*_TURN)
         browser.until(lambda: "size 3 of 3" not in page.text(), "a new picture is begun")
-        _wait_for(page, "size 3 of 3")
+        page.wait_for("size 3 of 3")
         _keep(page, Path(out) / "viewer_paths.jpg")
-
-
-def _wait_for(page: browser.Page, words: str) -> None:
-    browser.until(lambda: words in page.text(), words, patience=_PATIENCE)
 
 
 def _keep(page: browser.Page, path: Path) -> None:

@@ -4,7 +4,6 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import pytest
 
@@ -79,19 +78,20 @@ def test_another_index_is_another_picture_of_the_same_programs(model):
     assert thin < 0.5 * thick and np.any(files.to_bytes(after.rgb) != before)
 
 
-def test_a_branch_that_is_none_is_refused(model):
-    # The check of types, which runs in tests alone, is quicker to refuse it.
-    with pytest.raises((ValueError, jaxtyping.TypeCheckError), match="refracted"):
-        render_image(model, _RAYS, branch="refracted")
-
-
-def test_the_mask_is_the_disc_of_the_ball(model):
+def test_the_mask_is_the_disc_of_the_ball_and_distances_have_one_scale(model):
     mask = layers.draw(model, layers.MASK, _RAYS, **_OPTIONS)
     assert mask.dtype == np.uint8 and set(np.unique(mask)) == {0, 255}
     # A ray meets a ball of 1.3 around the origin if it passes nearer than that.
     nearest = np.linalg.norm(np.cross(_RAYS.origins, _RAYS.directions), axis=-1)
     np.testing.assert_array_equal(mask[nearest < 1.26], 255)
     np.testing.assert_array_equal(mask[nearest > 1.3], 0)
+    cropped = type(_RAYS)(*(x[4:11] for x in _RAYS))
+    drawn = layers.draw(model, layers.MASK, cropped, **_OPTIONS)
+    np.testing.assert_array_equal(drawn, mask[4:11])
+    # Distances have one scale from everywhere.
+    seen = render_image(model, _RAYS).distance
+    expected = comparison.colour_distances([seen], farthest=2.0 * MODEL.radius)[0]
+    np.testing.assert_array_equal(layers.draw(model, layers.DISTANCE, _RAYS, **_OPTIONS), expected)
 
 
 def test_normals_are_those_of_the_ball_in_colour(model):
@@ -105,19 +105,6 @@ def test_normals_are_those_of_the_ball_in_colour(model):
     expected = 127.5 * (points[inner] / 1.3 + 1.0)
     assert np.abs(drawn[inner] - expected).max() < 4.0  # of a ball of triangles
     assert (drawn[across > 1.69] == 255).all()
-
-
-def test_cropped_windows_share_the_program_of_surfaces(model):
-    whole = layers.draw(model, layers.MASK, _RAYS, **_OPTIONS)
-    part = type(_RAYS)(*(x[4:11] for x in _RAYS))
-    np.testing.assert_array_equal(layers.draw(model, layers.MASK, part, **_OPTIONS), whole[4:11])
-
-
-def test_distances_have_one_scale_from_everywhere(model):
-    drawn = layers.draw(model, layers.DISTANCE, _RAYS, **_OPTIONS)
-    seen = render_image(model, _RAYS).distance
-    expected = comparison.colour_distances([seen], farthest=2.0 * MODEL.radius)[0]
-    np.testing.assert_array_equal(drawn, expected)
 
 
 def test_a_drawing_that_is_called_off_ends_at_the_next_band(model, monkeypatch):

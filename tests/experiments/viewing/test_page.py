@@ -27,9 +27,6 @@ _SIZE = (1000, 640)
 # A pixel of the ball beside its middle, where light bends; one beside the ball.
 _OF_THE_BALL, _BESIDE = (440, 290), (60, 600)
 
-# Programs are compiled on the way.
-_PATIENCE = 600.0
-
 
 @pytest.fixture
 def subject(ball_scene, monkeypatch):
@@ -50,10 +47,6 @@ def server(subject):
     server = serving.serve(subject, host="127.0.0.1", port=port)
     yield server
     server.stop()
-
-
-def _wait_for(page, words):
-    browser.until(lambda: words in page.text(), words, patience=_PATIENCE)
 
 
 def _choose(page, old, new):
@@ -80,11 +73,11 @@ def _canvas(page):
 def test_it_opens_and_draws_and_a_click_draws_light_paths(subject, server, tmp_path):
     address = f"http://127.0.0.1:{server.get_port()}"
     with browser.opened(address, tmp_path / "profile", size=_SIZE) as page:
-        _wait_for(page, "size 2 of 2")
+        page.wait_for("size 2 of 2")
         (client,) = server.get_clients().values()
 
         _choose(page, "rgb", "normals")
-        _wait_for(page, "56 x 36 pixels, size 2 of 2")
+        page.wait_for("56 x 36 pixels, size 2 of 2")
         x, y = _BESIDE
         browser.until(lambda: (_canvas(page)[y, x] > 245).all(), "white where no surface is")
         drawn = _canvas(page)
@@ -93,7 +86,7 @@ def test_it_opens_and_draws_and_a_click_draws_light_paths(subject, server, tmp_p
         assert _drawn_light(drawn, _canvas(page)) == 0
 
         page.click(*_OF_THE_BALL)
-        _wait_for(page, "left the objects")
+        page.wait_for("left the objects")
         lines = [client.scene.get_handle_by_name(f"/paths/{i}") for i in range(4)]
         segments = np.concatenate([line.points for line in lines if line is not None])
         assert len(segments) >= 4  # in, through, out, and mirrored
@@ -103,12 +96,12 @@ def test_it_opens_and_draws_and_a_click_draws_light_paths(subject, server, tmp_p
         browser.until(lambda: _drawn_light(drawn, _canvas(page)) > 50, "lines of strong light")
 
         page.drag((300, 500), (420, 460))
-        _wait_for(page, "size 2 of 2")
+        page.wait_for("size 2 of 2")
         moved = np.asarray(client.camera.position)
         assert np.linalg.norm(moved - eye) > 0.3
 
         _choose(page, "normals", "error")
-        _wait_for(page, "test view")
+        page.wait_for("test view")
         views = subject.frames.cameras.poses[:, :, 3]
         gaps = np.linalg.norm(views - client.camera.position, axis=-1)
         assert gaps.min() < 0.01

@@ -6,13 +6,10 @@ from experiments.viewer import session
 from experiments.viewer.session import STILL, Job, State
 
 
-def test_nothing_is_drawn_before_a_change():
+def test_a_camera_that_rests_is_refined_and_then_left_alone():
     state = State(stages=3)
     assert session.next_job(state, 5.0) is None and session.wait(state, 5.0) is None
-
-
-def test_a_camera_that_rests_is_refined_and_then_left_alone():
-    state = session.changed(State(stages=3), 10.0)
+    state = session.changed(state, 10.0)
     now, drawn = 10.0, []
     while (pause := session.wait(state, now)) is not None:
         now += pause
@@ -47,12 +44,6 @@ def test_a_newer_camera_cancels_the_refinement_of_an_older_one():
     assert session.is_stale(state, job)
     assert session.finished(state, job) == state
     assert session.next_job(state, STILL + 0.01) == Job(2, 0)
-
-
-def test_a_picture_waits_until_the_camera_is_still():
-    state = session.finished(session.changed(State(stages=2), 1.0), Job(1, 0))
-    assert session.next_job(state, 1.0 + 0.5 * STILL) is None
-    assert abs(session.wait(state, 1.0 + 0.5 * STILL) - 0.5 * STILL) < 1e-9
 
 
 def test_any_order_of_events_ends_with_all_stages_of_the_last_change():

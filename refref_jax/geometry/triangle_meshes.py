@@ -76,10 +76,13 @@ def neighbours(
 
 def is_closed(faces: Faces) -> bool:
     """Returns whether every edge is used as often in one direction as in the other."""
-    start, end = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
-    size = int(faces.max(initial=0)) + 1
-    forward, backward = np.sort(start * size + end), np.sort(end * size + start)
-    return np.array_equal(forward, backward)
+    return np.array_equal(*_directed_edges(faces))
+
+
+def is_watertight(faces: Faces) -> bool:
+    """Returns whether every edge is used by two faces, once in each direction."""
+    forward, backward = _directed_edges(faces)
+    return np.array_equal(forward, backward) and bool(np.all(np.diff(forward) > 0))
 
 
 def diameter(vertices: Vertices) -> float:
@@ -108,3 +111,10 @@ def keep_faces(mesh: Mesh, kept: np.ndarray) -> Mesh:
     """Returns some of the faces, without the vertices that no longer belong to any."""
     used, numbers = np.unique(mesh.faces[kept], return_inverse=True)
     return Mesh(mesh.vertices[used], numbers.reshape(-1, 3), mesh.normals[kept])
+
+
+def _directed_edges(faces: Faces) -> tuple[Int[np.ndarray, " edges"], Int[np.ndarray, " edges"]]:
+    """Numbers the edges as faces go along them, and against it; both are sorted."""
+    start, end = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
+    size = int(faces.max(initial=0)) + 1
+    return np.sort(start * size + end), np.sort(end * size + start)
