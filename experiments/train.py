@@ -58,16 +58,16 @@ def check_flags() -> TrainConfig:
     """
     say = (lambda line: None) if _DEVICES.process.value else print
     scene, config = _CONFIG["scene"].value, training_body.asked(_CONFIG, say=say)
-    cli_scenes.check(config.scene.path or None if scene is None else scene)
-    if scene is None and flags.FLAGS["config"].value is None and not _RESUME.value:
-        raise ValueError(
-            "No scene is given. Add --scene=FOLDER, or --resume to continue a run, or "
-            "--config=FILE."
-        )
     if processes.together(_DEVICES) and training_body.reconstructs(config):
         raise ValueError(
             "Several processes do not reconstruct together. Run experiments.reconstruct on one "
             "machine first, and give its folder as --reconstruction."
+        )
+    cli_scenes.check((config.scene.path or None) if scene is None else scene)
+    if scene is None and flags.FLAGS["config"].value is None and not _RESUME.value:
+        raise ValueError(
+            "No scene is given. Add --scene=FOLDER, or --resume to continue a run, or "
+            "--config=FILE."
         )
     training_body.check_flags(config, _CONFIG)
     if config.paths.name is not None:

@@ -161,8 +161,12 @@ def find(run: Path, config: TrainConfig, *, ior: Sequence[str], resume: bool) ->
         raise ValueError(
             f"{out} holds a reconstruction already. Continue with --resume, or give another --out."
         )
+    wishes = config.wishes()  # what training has decided, a reconstruction does for itself
     asked = _RECONSTRUCTED.chosen(
-        index=index, seed=config.seed, space=config.scene.space, radius=config.scene.radius
+        index=index,
+        seed=config.seed,
+        space=config.scene.space if "background" in wishes else None,
+        radius=config.scene.radius if "radius" in wishes else None,
     )
     try:
         chain.reconstruct(scene, out, asked, compare=False)

@@ -57,6 +57,13 @@ def _on_top(runs, moved, scene, r3f):
     run = f"--out={moved / 'run'}"
     gone = f"--config={moved / 'gone' / 'run' / 'config.json'}"
     return sent | {
+        "file anew, resumed": (
+            f"--out={runs / 'file anew'}",
+            file,
+            f"--scene={scene}",
+            *r3f,
+            "--resume",
+        ),
         "run moves": ("copy", str(runs / "r3f"), str(moved / "run")),
         "scene moves": ("copy", str(scene), str(there)),
         "moved, resumed": (run, f"--scene={there}", *r3f, "--resume"),
@@ -150,6 +157,7 @@ def test_the_broken_mesh_stops_the_oracle_alone(found):
         ("file", 1.5),
         ("file with index", 1.7),
         ("file anew", 1.5),
+        ("file anew, resumed", 1.5),
         ("moved, resumed", 1.5),
         ("moved without it, told", 1.5),
     ],
