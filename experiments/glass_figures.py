@@ -20,6 +20,7 @@ from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
 from experiments.cli.progress import ProgressBar
 from experiments.runs import refraction_indices
+from refref_jax import choices
 
 with epy.lazy_imports():
     from experiments.figures import glass
@@ -80,7 +81,7 @@ def _drawers(folder: Path, indices: dict[str, float]) -> dict[str, Callable[[Pat
         rule=_RULE.value,
         indices=indices,
     )
-    side = cli_flags.side_of(_RAYS_PER_PIXEL.value)
+    side = choices.side_of(_RAYS_PER_PIXEL.value)
     return {
         "views": functools.partial(glass.draw_views, scene, side=side),
         "fan": functools.partial(glass.draw_fan, scene, folder, half),

@@ -21,6 +21,7 @@ from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
 from experiments.cli.progress import ProgressBar
 from experiments.runs import refraction_indices
+from refref_jax import choices
 from refref_jax.data import scene_names
 from refref_jax.optics import budgets
 from refref_jax.optics.budgets import BUDGETS, Budget
@@ -76,7 +77,7 @@ def main() -> None:
 def _measure(chosen: list[KnownScene], plan: list[Setting]) -> list[Trial]:
     """Measures all there is to, with a bar of progress."""
     trials: list[Trial] = []
-    side = cli_flags.side_of(_RAYS_PER_PIXEL.value)
+    side = choices.side_of(_RAYS_PER_PIXEL.value)
     with ProgressBar("trade-off", len(chosen) * len(plan)) as bar:
         for trial in paths.measure_all(chosen, plan, side):
             trials.append(trial)

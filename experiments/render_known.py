@@ -25,7 +25,7 @@ from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
 from experiments.cli.progress import ProgressBar
 from experiments.runs import refraction_indices
-from refref_jax import configuration
+from refref_jax import choices, configuration
 from refref_jax.optics.budgets import BUDGETS, Budget
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def main() -> None:
 def render(scene: KnownScene, budget: Budget, out: Path) -> dict[str, Any]:
     """Renders and measures all views, writes the pictures, and returns what the JSON holds."""
     views, measured = [], []
-    side = cli_flags.side_of(_RAYS_PER_PIXEL.value)
+    side = choices.side_of(_RAYS_PER_PIXEL.value)
     (out / "rgb").mkdir()
     print(f"Compiling for {scene.name}, {_PATHS.value} ...", flush=True)
     known_scene.warm_up(scene, budget)

@@ -37,44 +37,45 @@ _KEEP = flags.DEFINE_integer("keep", 2, "Newest checkpoints to keep.", 1)
 def main() -> None:
     """Resolves a run, or finds the one to resume, and trains it."""
     run = Path(_OUT.value)
-    check_flags()
+    asked = check_flags()
     processes.connect(_DEVICES)
     with processes.first_speaks():
-        if not _train(run):
+        if not _train(run, asked):
             print(f"Continue with {app.shell('train', f'--out={run}', '--resume')}")
             sys.exit(app.INTERRUPTED)
         print(f"Run: {run}  (config.json, metrics.jsonl, checkpoints/)")
         print(f"Next: {app.shell('evaluate', f'--run={run}', '--split=test')}")
 
 
-def check_flags() -> None:
-    """Refuses what can be told of the flags alone, before anything is imported.
+def check_flags() -> TrainConfig:
+    """Refuses what can be told without the scene, before anything is imported.
+
+    Returns:
+      The configuration that is asked for: the file of --config, with the flags on top.
 
     Raises:
       ValueError: if one makes no sense, or there is no scene.
     """
-    given = _CONFIG["reconstruction"].value
-    if processes.together(_DEVICES) and training_body.reconstructs(given):
+    say = (lambda line: None) if _DEVICES.process.value else print
+    scene, config = _CONFIG["scene"].value, training_body.asked(_CONFIG, say=say)
+    if processes.together(_DEVICES) and training_body.reconstructs(config):
         raise ValueError(
             "Several processes do not reconstruct together. Run experiments.reconstruct on one "
             "machine first, and give its folder as --reconstruction."
         )
-    scene, config = _CONFIG["scene"].value, flags.FLAGS["config"].value
-    cli_scenes.check(scene)
-    if scene is None and config is None and not _RESUME.value:
+    cli_scenes.check((config.scene.path or None) if scene is None else scene)
+    if scene is None and flags.FLAGS["config"].value is None and not _RESUME.value:
         raise ValueError(
             "No scene is given. Add --scene=FOLDER, or --resume to continue a run, or "
             "--config=FILE."
         )
-    ior = _CONFIG["ior"].value or ()
-    training_body.check_flags(given, paths=_CONFIG["paths"].value, ior=ior)
-    if not training_body.is_reconstructed(given) and config is None:
-        asked = config_flags.chosen(_CONFIG).paths
-        if asked.name is not None:
-            budget_of(asked.name, cut=asked.cut, bends=asked.bends)
+    training_body.check_flags(config, _CONFIG)
+    if config.paths.name is not None:
+        budget_of(config.paths.name, cut=config.paths.cut, bends=config.paths.bends)
+    return config
 
 
-def _train(run: Path) -> bool:
+def _train(run: Path, asked: TrainConfig) -> bool:
     """Begins a run, or goes on with it; returns whether it has reached its last step."""
     from refref_jax.training import fit, run_folder
 
@@ -87,7 +88,7 @@ def _train(run: Path) -> bool:
     if not resuming:
         run_folder.check_free(run)
     if not resuming or _CONFIG["scene"].value is not None:
-        _open(run, resuming=resuming)
+        _open(run, asked, resuming=resuming)
     else:
         _refuse_flags(run)
     moved = _CONFIG["scene"].value
@@ -103,16 +104,19 @@ def _train(run: Path) -> bool:
         )
 
 
-def _open(run: Path, *, resuming: bool) -> None:
+def _open(run: Path, asked: TrainConfig, *, resuming: bool) -> None:
     """Resolves a run and opens its folder, or compares it with the one that is resumed."""
     from refref_jax.training import devices, fit, run_folder
 
-    config = _asked_config()
-    part = training_body.find(run, config, ior=_CONFIG["ior"].value or (), resume=_RESUME.value)
+    if not asked.scene.path:
+        raise ValueError("The configuration names no scene. Add --scene=FOLDER.")
+    config = asked.at(str(cli_scenes.opened(asked.scene.path).resolve()))
+    ior = _CONFIG["ior"].value or ()
+    part = training_body.find(run, config, ior=ior, resume=_RESUME.value)
     given = config.scene.reconstruction
     if part is not None:
-        made = str(training_body.folder(run, given).resolve())
-        config = config.override(ior=((part.name, part.index),), reconstruction=made)
+        made = training_body.folder(run, given)
+        config = training_body.with_part(config, part, made, ior=ior, say=print)
     resolved, scene = fit.prepare(config, parts=None if part is None else [part])
     print(resolved.describe())
     begun = resolved.config, resolved.model, scene
@@ -123,16 +127,6 @@ def _open(run: Path, *, resuming: bool) -> None:
     if devices.is_first():
         training_body.note(run, part, given)
     fit.begin(run, *begun)
-
-
-def _asked_config() -> TrainConfig:
-    """Returns what the flags ask for, with the folder of the scene."""
-    named = not training_body.is_reconstructed(_CONFIG["reconstruction"].value)
-    instead = {} if named or _CONFIG["ior"].value is None else {"ior": ()}
-    config = config_flags.chosen(_CONFIG, **instead)
-    if not config.scene.path:
-        raise ValueError("The configuration names no scene. Add --scene=FOLDER.")
-    return config.at(str(cli_scenes.opened(config.scene.path).resolve()))
 
 
 def _refuse_flags(run: Path) -> None:

@@ -1,5 +1,6 @@
 """The choices of scenes and configurations, each defined once (standard library only)."""
 
+import math
 from typing import Literal
 
 Colour = tuple[float, float, float]
@@ -55,3 +56,19 @@ DataLoss = Literal["mse", "charbonnier"]
 
 DistortionOver = Literal["outside", "everywhere"]
 """Samples that the distortion loss counts: those outside the objects, or all."""
+
+
+def side_of(rays_per_pixel: int) -> int:
+    """Returns the number of rays along each edge of a pixel.
+
+    Args:
+      rays_per_pixel: number of rays in the pixel.
+
+    Raises:
+      ValueError: if they do not make a square grid.
+    """
+    side = math.isqrt(max(rays_per_pixel, 0))
+    if side >= 1 and side**2 == rays_per_pixel:
+        return side
+    nearest = " or ".join(str(s**2) for s in (side, side + 1) if s)
+    raise ValueError(f"{rays_per_pixel} rays a pixel do not make a square grid. Give {nearest}.")

@@ -112,17 +112,8 @@ def rays_per_pixel(default: int) -> flags.FlagHolder[int]:
     """Defines `--rays_per_pixel`."""
     what = "Rays in each pixel, a square: 1, 4, 9, 16. They are averaged."
     holder = flags.DEFINE_integer("rays_per_pixel", default, what)
-    app.check(holder, side_of)
+    app.check(holder, choices.side_of)
     return holder
-
-
-def side_of(rays: int) -> int:
-    """Returns the rays along each edge of a pixel; a `ValueError` if they make no square grid."""
-    side = math.isqrt(max(rays, 0))
-    if side >= 1 and side**2 == rays:
-        return side
-    nearest = " or ".join(str(s**2) for s in (side, side + 1) if s)
-    raise ValueError(f"{rays} rays a pixel do not make a square grid. Give {nearest}.")
 
 
 def chunk() -> flags.FlagHolder[int]:

@@ -26,6 +26,8 @@ def check(source: str | Path | None) -> None:
     """
     if source is None:
         return
+    if not str(source):
+        raise SceneError(f"--scene is empty. Give {SCENE_FORMS}.")
     if str(source).startswith("hf:"):
         scene_names.parse_source(str(source))
         return

@@ -26,7 +26,7 @@ from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
 from experiments.cli.progress import ProgressBar
 from experiments.dataset import render_settings
-from refref_jax import configuration
+from refref_jax import choices, configuration
 
 if TYPE_CHECKING:
     from experiments.dataset.check_page import SceneReport
@@ -52,7 +52,7 @@ _SHOWN_COMPLAINTS = 3
 def main(folder: str) -> None:
     """Checks every scene of a folder, and writes the report."""
     budget = dataclasses.replace(_BUDGET.chosen("tree"), unfinished="dark")
-    checked, side = Path(folder), cli_flags.side_of(_RAYS_PER_PIXEL.value)
+    checked, side = Path(folder), choices.side_of(_RAYS_PER_PIXEL.value)
     out = Path(_OUT.value) if _OUT.value else checked
     page, figures = out / "check.html", out / "check.json"
     for path in (page, figures):

@@ -8,18 +8,47 @@ import inspect
 import re
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 from absl import flags
 
 from experiments.cli import app
+from experiments.runs import refraction_indices
 from refref_jax.training import config as training_config
+from refref_jax.training import config_files
 from refref_jax.training.config import Option, TrainConfig
 
 AUTO = "auto"
-"""Value of a choice that leaves it to the scene or the preset."""
+"""Value of an option that leaves it to the scene or the preset, also on top of a file."""
+
+Say = Callable[[str], None]
+
+# Of lists, for what is said of wrong ones.
+_EXAMPLES = {int: "32,20", float: "0.03,0.003"}
+
+
+class _Words(list):
+    """A list of words that is printed as it is given."""
+
+    def __str__(self) -> str:
+        return ",".join(self)
+
+
+class _ListParser(flags.ListParser):
+    def parse(self, argument: Any) -> _Words:
+        return _Words(super().parse(argument))
+
+
+class _IntegerParser(flags.IntegerParser):
+    def parse(self, argument: Any) -> Any:
+        return argument if argument == AUTO else super().parse(argument)
+
+
+class _FloatParser(flags.FloatParser):
+    def parse(self, argument: Any) -> Any:
+        return argument if argument == AUTO else super().parse(argument)
 
 
 def define_flags() -> dict[str, flags.FlagHolder]:
@@ -31,7 +60,8 @@ def define_flags() -> dict[str, flags.FlagHolder]:
     flags.DEFINE_string(
         "config",
         None,
-        "File of a configuration, as a run's config.json; the other flags override it.",
+        "File of a configuration, as a run's config.json; the other flags override it, and "
+        "--NAME=auto takes back what it asks for.",
     )
     return {option.name: _define(option) for option in training_config.options_of()}
 
@@ -46,26 +76,54 @@ def given(holders: Mapping[str, flags.FlagHolder]) -> dict[str, Any]:
     }
 
 
-def chosen(holders: Mapping[str, flags.FlagHolder], **instead: Any) -> TrainConfig:
+def base() -> TrainConfig:
+    """Returns the configuration of `--config`, without the flags on top.
+
+    Raises:
+      ValueError: if the file is not a configuration.
+    """
+    path = flags.FLAGS["config"].value
+    return TrainConfig() if path is None else config_files.read_to_begin(Path(path))
+
+
+def chosen(holders: Mapping[str, flags.FlagHolder], *, say: Say, **instead: Any) -> TrainConfig:
     """Returns the configuration of the command line: that of `--config`, with the flags on top.
 
     Args:
       holders: what `define_flags` returned.
+      say: is told which decisions of the file are taken again.
       **instead: values in place of those of flags.
 
     Raises:
       ValueError: if the file is not a configuration, or a value makes no sense.
     """
-    base, path = TrainConfig(), flags.FLAGS["config"].value
-    if path is not None:
-        from refref_jax.training import run_folder
-
-        base = run_folder.read_config_file(Path(path))
+    below = base()
     values = given({name: each for name, each in holders.items() if name not in instead})
-    scene = values.get("scene", "")
-    if base.scene.path and scene and Path(scene).resolve() == Path(base.scene.path).resolve():
-        del values["scene"]  # the same, by another path
-    return base.override(**values, **instead)
+    for name in ("scene", "reconstruction"):
+        before, now = below.get(name), values.get(name)
+        if before and now and Path(now).resolve() == Path(before).resolve():
+            del values[name]  # the same, by another path
+    return on_top(below, values | instead, say=say)
+
+
+def on_top(below: TrainConfig, values: Mapping[str, Any], *, say: Say) -> TrainConfig:
+    """Returns a configuration with values on top, and says what is decided again because of them.
+
+    Args:
+      below: the configuration, of `--config` if that is given.
+      values: the new values, by the names of the options.
+      say: is told.
+    """
+    config, (decided, kept) = below.override(**values), below.followers(**values)
+    options = [option.name for option in training_config.options_of()]
+    again = [name for name in options if name in decided and below.get(name) != config.get(name)]
+    stays = [name for name in options if name in kept]
+    file = flags.FLAGS["config"].value
+    if file is not None and again:
+        say(f"decided again, because of what is on top of {file}: {', '.join(again)}")
+    if file is not None and stays:
+        say(f"asked for in {file}, and kept: {', '.join(stays)} (--{stays[0]}=auto has it decided)")
+    return config
 
 
 def _define(option: Option) -> flags.FlagHolder:
@@ -81,12 +139,12 @@ def _define(option: Option) -> flags.FlagHolder:
         text += " As glass=1.52; may be repeated."
         holder = flags.DEFINE_multi_string(name, None, text)
     elif typing.get_origin(kind) is tuple:
-        holder = flags.DEFINE_list(name, None, text)
+        holder = flags.DEFINE(_ListParser(), name, None, text, serializer=flags.ListSerializer(","))
     elif kind is int and name == "seed":
         return flags.DEFINE_integer(name, None, text, 0, 2**32 - 1)
     else:
-        define = {int: flags.DEFINE_integer, float: flags.DEFINE_float, str: flags.DEFINE_string}
-        holder = define[kind](name, None, text)
+        parser = {int: _IntegerParser, float: _FloatParser, str: flags.ArgumentParser}[kind]()
+        holder = flags.DEFINE(parser, name, None, text, serializer=flags.ArgumentSerializer())
     if name != "ior":  # which is written otherwise for a reconstructed object
         app.check(holder, lambda value: _check(option, value))
     return holder
@@ -99,38 +157,22 @@ def _check(option: Option, value: Any) -> None:
 
 def _parse(option: Option, value: Any) -> Any:
     """Returns the value of an option, of that of its flag."""
-    if value == AUTO:
+    if value == AUTO and _kind(option) is not str:
         return None
     if option.name == "ior":
-        return tuple(sorted(dict(map(parse_index, value)).items()))
+        return refraction_indices.parse_named(value)
     if isinstance(value, list):
+        if value == [AUTO]:
+            return None
         number = typing.get_args(_kind(option))[0]
         try:
             return tuple(map(number, value))
         except ValueError:
             raise ValueError(
                 f"--{option.name}={','.join(value)} is not a list of numbers. Write as in "
-                f"--{option.name}=32,20."
+                f"--{option.name}={_EXAMPLES[number]}."
             ) from None
     return value
-
-
-def parse_index(word: str) -> tuple[str, float]:
-    """Returns what `--ior=NAME=NUMBER` gives.
-
-    Raises:
-      ValueError: if it is not of that form, or not an index of refraction.
-    """
-    name, _, number = word.partition("=")
-    try:
-        index = float(number)
-    except ValueError:
-        index = 0.0
-    if not name or not 0.0 < index < float("inf"):
-        raise ValueError(
-            f"--ior={word} is not NAME=NUMBER with a positive number. Write as in --ior=glass=1.52."
-        )
-    return name, index
 
 
 def _kind(option: Option) -> Any:

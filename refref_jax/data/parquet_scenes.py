@@ -7,8 +7,8 @@ One row is one frame. Its columns:
     transform_matrix      4 x 4, camera to world
 
 The first third of the rows is `train`, the second `val`, the last `test`, and the field of view is
-that of the data set. Files that `experiments.dataset.convert` wrote say more in their schema's
-metadata, under `METADATA_KEY`; then that holds.
+that of the data set. A file may say more in its schema's metadata, under `METADATA_KEY`; then that
+holds.
 """
 
 import json
@@ -69,8 +69,8 @@ def read_contents(shards: Sequence[Path]) -> Contents:
             if missing := {"image", POSE_COLUMN} - names:
                 raise SceneError(
                     f"{shard} lacks the column {', '.join(sorted(missing))}; it has "
-                    f"{', '.join(sorted(names)) or 'none'}. Give a file of the data set, or write "
-                    "it with experiments.dataset.convert."
+                    f"{', '.join(sorted(names)) or 'none'}. Give a file of the data set, or one "
+                    "with the columns image and transform_matrix."
                 )
             rows += file.metadata.num_rows
             told = told or (file.schema_arrow.metadata or {}).get(METADATA_KEY)
@@ -204,8 +204,8 @@ def _decoded(told: bytes, rows: int, shard: Path) -> Contents:
         valid = False
     if not valid:
         raise SceneError(
-            f"The metadata of {shard} can not be understood. Write the file again with this "
-            "version of experiments.dataset.convert."
+            f"The metadata of {shard} can not be understood. Convert the scene again with "
+            "this version."
         )
     if sum(frames.values()) != rows:
         counts = ", ".join(f"{count} {split}" for split, count in frames.items())

@@ -5,7 +5,7 @@
     scene_files/{scene}/...                   scene.json, meshes/, textures: all else of its folder
 
 The first are of the repository `yinyue27/RefRef`, the second of `yinyue27/RefRef_additional`; the
-last are written by `experiments.dataset.convert` alone, and go before the second.
+last are of our own conversions alone, and go before the second.
 A name here is a path below such a repository, with slashes.
 """
 

@@ -78,8 +78,8 @@ def read_lpips(path: Path) -> dict[str, np.ndarray]:
             arrays = {name: file[name] for name in file.files}
     except Exception as error:  # NumPy raises what zipfile, zlib and Python's tokenizer do
         raise ValueError(
-            f"{path} can not be read as the weights of LPIPS ({error}). Make it with python -m "
-            "experiments.convert_lpips, see docs/metrics.md."
+            f"{path} can not be read as the weights of LPIPS ({error}). Give a .npz file of "
+            "them; docs/metrics.md says how to make it."
         ) from error
     return choose(arrays, ALEXNET_SHAPES | LINEAR_SHAPES, source=str(path))
 

@@ -111,9 +111,9 @@ def open_checkpoints(run: Path, *, keep: int | None = None) -> ocp.CheckpointMan
       run: the run folder.
       keep: how many of the newest to keep; `None` to read only.
     """
-    # What Orbax comes to by itself where it only reads, and warns of.
-    reading = {"read_only": True, "create": False, "save_interval_steps": 0}
-    chosen = reading if keep is None else {"max_to_keep": keep}
+    # Not Orbax's `read_only`, of which it warns each time: a manager that is asked for nothing but
+    # to restore writes nothing either.
+    chosen = {"create": False} if keep is None else {"max_to_keep": keep}
     return ocp.CheckpointManager(
         (run / CHECKPOINTS).absolute(),
         item_names=(PARAMS_ITEM, TRAINING_ITEM),

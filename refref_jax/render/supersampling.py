@@ -5,13 +5,13 @@ much smaller, so the fields are queried for finer detail too. Colours are averag
 and encoded afterwards: what a camera does, and what the true images were made with.
 """
 
-import math
 from collections.abc import Iterator
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
+from refref_jax.choices import side_of
 from refref_jax.geometry.cameras import Cameras, box_filter, pixel_rays, supersample
 from refref_jax.geometry.rays import Rays
 from refref_jax.render import colour, tiles
@@ -57,22 +57,6 @@ def render_camera(
         for rays in _bands(fine, view, rows=side * max(1, band // (side * fine.width)))
     ]
     return tiles.join(bands)
-
-
-def side_of(rays_per_pixel: int) -> int:
-    """Returns the number of rays along each edge of a pixel.
-
-    Args:
-      rays_per_pixel: number of rays in the pixel.
-
-    Raises:
-      ValueError: if they do not make a square grid.
-    """
-    side = math.isqrt(max(rays_per_pixel, 0))
-    if side >= 1 and side**2 == rays_per_pixel:
-        return side
-    nearest = " or ".join(str(s**2) for s in (side, side + 1) if s)
-    raise ValueError(f"{rays_per_pixel} rays a pixel do not make a square grid. Give {nearest}.")
 
 
 def warm_up(model: Model, cameras: Cameras, *, chunk: int) -> None:

@@ -5,7 +5,8 @@
 Every value is reached by the name of its option, which is also the name of its command-line flag.
 `None` leaves a decision to the scene or the preset: `training.resolve` takes it, with a reason, and
 returns the same tree without `None`. That is what a run writes as `config.json`; a file in this
-form, complete or partial, begins a run again.
+form, complete or partial, begins a run again. What was asked for is told from what was decided by
+`TrainConfig.chosen`: with another scene, say, decisions are taken again, and wishes stay.
 
 Importing this module imports neither JAX nor the library's numerics.
 """
@@ -13,7 +14,7 @@ Importing this module imports neither JAX nor the library's numerics.
 import dataclasses
 import math
 import typing
-from collections.abc import Collection, Iterator, Mapping, Set
+from collections.abc import Iterator, Mapping
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
@@ -56,7 +57,8 @@ def _option(default: Any = None, *, name: str = "", after: tuple[str, ...] = ())
     Args:
       default: value if none is given; `None` for a decision of the scene or the preset.
       name: name of the option where it is not that of the field.
-      after: options on which the decision depends. Overriding one of them takes it again.
+      after: options on which the decision depends. Overriding one of them takes it again, unless
+        the option was asked for.
     """
     return dataclasses.field(default=default, metadata={"name": name, "after": after})
 
@@ -83,7 +85,7 @@ class SceneConfig:
 
     path: str = _option("", name="scene")
     rule: RuleName = _option("nested")
-    indices: tuple[tuple[str, float], ...] = _option((), name="ior")
+    indices: tuple[tuple[str, float], ...] = _option((), name="ior", after=("reconstruction",))
     space: Space | None = _option(name="background", after=("scene",))
     radius: float | None = _option(after=("scene", "background"))
     reconstruction: str = _option("")
@@ -174,8 +176,8 @@ class FieldConfig:
         """Checks the numbers."""
         if self.samples is not None and not (self.samples and min(self.samples) > 0):
             raise ValueError(
-                f"samples is {self.samples}, not a list of positive numbers. Write as in "
-                "samples=32,20."
+                f"samples is {','.join(map(str, self.samples))}, not a list of positive numbers. "
+                "Write as in samples=32,20."
             )
         if self.multisamples not in (None, *_PATTERNS):
             raise ValueError(
@@ -265,6 +267,18 @@ class ScheduleConfig:
         return dataclasses.replace(self, steps=steps, warmup=warmup, anneal=anneal)
 
 
+class Followers(NamedTuple):
+    """Options that depend on others which change, by name.
+
+    Attributes:
+      decided: those that were decided, which is done again.
+      kept: those that were asked for, and stay.
+    """
+
+    decided: frozenset[str]
+    kept: frozenset[str]
+
+
 class Option(NamedTuple):
     """One value of the configuration.
 
@@ -290,6 +304,8 @@ class TrainConfig:
       losses: The training loss.
       schedule: How the parameters move, and on how many rays.
       seed: Seed of the initial parameters, the order of pixels and the sampling.
+      chosen: Names of the options that were asked for, no option itself; see `wishes` for `None`.
+        Configurations that differ in nothing else are equal.
     """
 
     scene: SceneConfig = SceneConfig()
@@ -298,6 +314,7 @@ class TrainConfig:
     losses: LossConfig = LossConfig()
     schedule: ScheduleConfig = ScheduleConfig()
     seed: int = 0
+    chosen: tuple[str, ...] | None = dataclasses.field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         """Checks the seed."""
@@ -307,9 +324,9 @@ class TrainConfig:
     def override(self, **given: Any) -> "TrainConfig":
         """Returns this configuration with other values, by the names of their options.
 
-        Decisions that depended on a value that changes are taken again, unless they are given too:
-        with another `paths` the cut is that of those paths, with other `steps` the warm-up is
-        stretched. What was never set does not count as a change.
+        Decisions that depended on a value that changes are taken again: with another `paths` the
+        cut is that of those paths, with other `steps` the warm-up is stretched. What was asked for
+        stays, until it is given as `None`.
 
         Args:
           **given: new values.
@@ -317,19 +334,50 @@ class TrainConfig:
         Raises:
           ValueError: if there is no such option, or a value is out of range.
         """
-        options = {option.name: option for option in options_of()}
-        if unknown := sorted(set(given) - set(options)):
-            raise ValueError(
-                f"There is no option {unknown[0]!r}. Choose from {', '.join(sorted(options))}."
-            )
-        given = {name: _converted(options[name], value) for name, value in given.items()}
-        before = {name: self.get(name) for name in options}
-        changed = {n for n, x in given.items() if before[n] not in (None, "", x)}
-        again = _followers(changed, given)
-        config = self
-        for name, value in (dict.fromkeys(again) | given).items():
+        given, options = _converted(given), _by_name()
+        usual = {name: options[name].field.default for name in self.followers(**given).decided}
+        asked = {name for name, value in given.items() if value not in (None, "", ())}
+        wishes = (self.wishes() - set(given)) | asked
+        chosen = tuple(name for name in options if name in wishes)
+        return dataclasses.replace(self.decided(**usual, **given), chosen=chosen)
+
+    def decided(self, **values: Any) -> "TrainConfig":
+        """Returns this configuration with values that were decided, not asked for.
+
+        Nothing else changes. The arguments and errors are those of `override`.
+        """
+        options, wishes = _by_name(), self.wishes()
+        chosen = tuple(name for name in options if name in wishes)
+        config = dataclasses.replace(self, chosen=chosen)
+        for name, value in _converted(values).items():
             config = config._with(options[name], value)
         return config
+
+    def wishes(self) -> frozenset[str]:
+        """Returns the names of the options that were asked for.
+
+        Where `chosen` does not tell, they are all that are not as usual; but none if the schedule
+        is complete, as in the file of an earlier version's run, where decisions look the same.
+        """
+        if self.chosen is not None:
+            return frozenset(self.chosen)
+        if None not in vars(self.schedule).values():
+            return frozenset()
+        usual = TrainConfig()
+        return frozenset(name for name in _by_name() if self.get(name) != usual.get(name))
+
+    def followers(self, **given: Any) -> Followers:
+        """Returns what depends on values that would change; see `override`."""
+        changed = {name for name, value in _converted(given).items() if self.get(name) != value}
+        wishes = self.wishes()
+        after = {o.name: set(o.field.metadata.get("after", ())) - {o.name} for o in options_of()}
+        decided: set[str] = set()
+        while True:
+            reached = {n for n, causes in after.items() if causes & (changed | decided)}
+            reached -= set(given)
+            if reached - wishes <= decided:
+                return Followers(frozenset(decided), frozenset(reached & wishes))
+            decided |= reached - wishes
 
     def at(self, scene: str) -> "TrainConfig":
         """Returns this configuration for the same scene by another path; all decisions stay."""
@@ -349,37 +397,30 @@ class TrainConfig:
         return dataclasses.replace(self, **{option.section: section})
 
 
-def _followers(changed: Set[str], given: Collection[str]) -> set[str]:
-    """Returns the options whose decisions followed from those that change, directly or not."""
-    found: set[str] = set()
-    while True:
-        more = {
-            option.name
-            for option in options_of()
-            if (changed | found) & set(option.field.metadata.get("after", ()))
-            and option.name not in given
-        }
-        if more <= found:
-            return found
-        found |= more
-
-
 def type_of(option: Option) -> Any:
     """Returns the annotation of an option's field."""
     owner = type(getattr(TrainConfig(), option.section)) if option.section else TrainConfig
     return typing.get_type_hints(owner)[option.field.name]
 
 
-def _converted(option: Option, value: Any) -> Any:
-    """Returns a value as its field takes it: lists become tuples, numbers floats.
+def _converted(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns values as their fields take them: lists become tuples, numbers floats.
 
     Raises:
-      ValueError: if it is of another type, or none of the choices.
+      ValueError: if one is of another type, or none of the choices, or there is no such option.
     """
-    default = option.field.default
-    if value is None and default is not None:
-        return default
-    return configuration.convert(_plain(value), type_of(option), name=option.name)
+    options = _by_name()
+    if unknown := sorted(set(given) - set(options)):
+        raise ValueError(
+            f"There is no option {unknown[0]!r}. Choose from {', '.join(sorted(options))}."
+        )
+    usual = {name: options[name].field.default for name in given}
+    return {
+        name: usual[name]
+        if value is None
+        else configuration.convert(_plain(value), type_of(options[name]), name=name)
+        for name, value in given.items()
+    }
 
 
 def _plain(value: Any) -> Any:
@@ -391,11 +432,15 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, PurePath) else value
 
 
+def _by_name() -> dict[str, Option]:
+    return {option.name: option for option in options_of()}
+
+
 def options_of() -> Iterator[Option]:
     """Yields all options of a training, in the order of the configuration."""
     for field in dataclasses.fields(TrainConfig):
         if dataclasses.is_dataclass(field.default):
             for leaf in dataclasses.fields(field.default):
                 yield Option(leaf.metadata["name"] or leaf.name, field.name, leaf)
-        else:
+        elif field.compare:
             yield Option(field.name, "", field)

@@ -25,7 +25,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from refref_jax import metrics
+from refref_jax import choices, metrics
 from refref_jax.data import local_layout
 from refref_jax.geometry import cameras
 from refref_jax.geometry.cameras import Cameras
@@ -132,7 +132,7 @@ def evaluate(
     """
     if limit is not None and limit < 1:
         raise ValueError(f"limit={limit} leaves no image to evaluate. Give 1 or more.")
-    supersampling.side_of(rays_per_pixel)
+    choices.side_of(rays_per_pixel)
     truth = read_truth(Path(scene), split)
     chosen = _spread(len(truth.images), limit)
     views = truth.frames.cameras

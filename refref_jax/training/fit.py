@@ -129,7 +129,7 @@ def prepare(
     if config.scene.reconstruction and parts is None:
         raise ValueError(
             f"The object of this configuration was reconstructed ({config.scene.reconstruction}), "
-            "and is not read here. Give its mesh as parts, or use experiments.train."
+            "and is not read here. Call prepare with its mesh as parts, then begin and train."
         )
     config = config.at(str(scene_source.open_scene(config.scene.path).resolve()))
     facts = read_facts(config.scene, parts=parts)

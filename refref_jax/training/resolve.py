@@ -41,6 +41,7 @@ _COLUMNS = 100
 # Why options have their values.
 _GIVEN = "given"
 _USUAL = "by default"
+_KEPT = "as the configuration has it"
 
 
 class SceneFacts(NamedTuple):
@@ -147,7 +148,7 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
     model, budget = saved.config, saved.budget
     reasons: dict[str, str] = {}
     tints = "learned" if model.learned_tints else "given"
-    config = config.override(field=model.field.kind)
+    config = config.decided(field=model.field.kind)
     return _decide(
         config,
         reasons,
@@ -195,11 +196,14 @@ def _sampling_of(model: ModelConfig) -> dict[str, Any]:
 
 
 def _first_reasons(config: TrainConfig) -> dict[str, str]:
-    usual = TrainConfig()
-    return {
-        option.name: _USUAL if config.get(option.name) == usual.get(option.name) else _GIVEN
-        for option in options_of()
-    }
+    usual, wishes = TrainConfig(), config.wishes()
+    reasons = {}
+    for option in options_of():
+        is_decision = option.field.default is None and option.name not in wishes
+        set_ = _KEPT if is_decision else _GIVEN
+        same = config.get(option.name) == usual.get(option.name)
+        reasons[option.name] = _USUAL if same else set_
+    return reasons
 
 
 def _decide(
@@ -208,7 +212,7 @@ def _decide(
     """Fills in options that are open, and notes why."""
     for name, value in values.items():
         if config.get(name) is None and value is not None:
-            config = config.override(**{name: value})
+            config = config.decided(**{name: value})
             reasons[name] = why
     return config
 

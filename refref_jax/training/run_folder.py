@@ -16,14 +16,9 @@ from refref_jax import atomic_files, configuration
 from refref_jax.optics.scene import Scene
 from refref_jax.render import saved
 from refref_jax.render.saved import SavedModel
-from refref_jax.training import resolve
+from refref_jax.training import config_files, resolve
 from refref_jax.training.config import TrainConfig, options_of
-
-CONFIG = "config.json"
-"""What makes a folder that of a run."""
-
-# Of configurations that earlier versions wrote, beside those that are still there.
-_KEYS_BEFORE = {"loss", "batch", "pool"}
+from refref_jax.training.config_files import CONFIG
 
 _METRICS = "metrics.jsonl"
 _LEFT_BEHIND = (_METRICS, saved.CHECKPOINTS)
@@ -43,7 +38,7 @@ def create(run: Path, config: TrainConfig, model: SavedModel, geometry: Scene) -
     check_free(run)
     run.mkdir(parents=True, exist_ok=True)
     saved.save_scene(run, model, geometry)
-    configuration.write(run / CONFIG, config)
+    config_files.write(run / CONFIG, config)
 
 
 def check_free(run: Path) -> None:
@@ -70,9 +65,9 @@ def read_config(run: Path) -> TrainConfig:
       ValueError: if the file is missing or damaged.
     """
     path = run / CONFIG
-    content = _of_an_earlier_version(path)
+    content = config_files.of_an_earlier_version(path)
     if content is None:
-        return configuration.read(path, TrainConfig)
+        return config_files.read(path)
     try:
         config = configuration.build(_with_todays_keys(content), TrainConfig)
     except (ValueError, TypeError, KeyError) as error:
@@ -81,32 +76,6 @@ def read_config(run: Path) -> TrainConfig:
         ) from error
     # What that file lacked, the model beside it tells.
     return resolve.as_trained(config, saved.read_static(run))
-
-
-def read_config_file(path: Path) -> TrainConfig:
-    """Reads a configuration to begin a run with, complete or partial.
-
-    Raises:
-      ValueError: if the file is missing, or is not one, or is that of an earlier version's run.
-    """
-    if not path.is_file():
-        raise ValueError(f"{path} is not a file. Give a configuration, as a run's {CONFIG}.")
-    if _of_an_earlier_version(path) is not None:
-        raise ValueError(
-            f"{path} is of an earlier version, and does not name the preset. Its run can be "
-            "resumed, evaluated and rendered, but not begun again: give the options themselves."
-        )
-    return configuration.read(path, TrainConfig)
-
-
-def _of_an_earlier_version(path: Path) -> dict[str, Any] | None:
-    """Returns what the configuration of an earlier version says; `None` if it is not one."""
-    try:
-        content = configuration.parse_json(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None  # `configuration.read` says what is wrong
-    is_earlier = isinstance(content, dict) and set(content) >= _KEYS_BEFORE
-    return content if is_earlier else None
 
 
 def _with_todays_keys(content: dict[str, Any]) -> dict[str, Any]:
@@ -122,12 +91,16 @@ def _with_todays_keys(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, geometry: Scene) -> None:
-    """Checks that a run was made with this very configuration; only its scene may have moved.
+    """Checks that a run was made with this very configuration.
+
+    Its scene and its reconstruction may have moved: that the meshes are the same is checked too.
 
     Raises:
       ValueError: if not.
     """
     moved = read_config(run).at(config.scene.path)
+    if moved.scene.reconstruction and config.scene.reconstruction:
+        moved = moved.decided(reconstruction=config.scene.reconstruction)
     if moved != config or saved.read_static(run) != model:
         differing = [
             option.name
@@ -142,8 +115,9 @@ def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, geometry:
     pairs = zip(jax.tree.leaves(saved.load_geometry(run)), jax.tree.leaves(geometry), strict=True)
     if not all(np.array_equal(theirs, ours) for theirs, ours in pairs):
         raise ValueError(
-            f"{run} was begun with other meshes than those of {config.scene.path}. Give the scene "
-            "that it was begun with, or choose another folder."
+            f"{run} was begun with other meshes than those of "
+            f"{config.scene.reconstruction or config.scene.path}. Give the one that it was begun "
+            "with, or choose another folder."
         )
 
 

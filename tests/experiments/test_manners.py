@@ -44,7 +44,9 @@ _IN_THE_WAY = {
 _OF_THE_SCENE = {
     "--cut=1": "--cut=1.0: The cut is a share of a pixel's light",
     "--bends=-1": "can not have -1 bends. Give 0 or more.",
-    "--samples=4,0": "Write as in samples=32,20.",
+    "--samples=4,0": "--samples=4,0: samples is 4,0, not a list of positive numbers. Write as in",
+    "--samples=a": "is not a list of numbers. Write as in --samples=32,20.",
+    "--blurs=x": "--blurs=x is not a list of numbers. Write as in --blurs=0.03,0.003.",
     "--multisamples=3": "Give 1 (on the centre line) or 6",
     "--entries=40": "Give 1 to 31",
     "--paths=straight --cut=0.1": "Leave them out, or use paths=tree.",
@@ -54,7 +56,22 @@ _OF_THE_SCENE = {
     "--resolution=32": "or add --method=r3f.",
     "--resume=maybe": "Non-boolean argument",
     "--steps": "Missing value for flag --steps",
+    "--steps=many": "flag --steps=many",
+    "--cut=auto --paths=straight --bends=3": "use paths=tree",
     "--devices=two": "Give a number, or all.",
+}
+
+# On top of a file that names a reconstruction, and asks for cut=0.01.
+_ON_TOP_OF_R3F = {
+    "--ior=glass=1.5": "--ior=glass=1.5, but there is one reconstructed object",
+    "--resolution=32": "r3f is reconstructed already. Leave it out, or add --method=r3f.",
+    "--reconstruction=x --method=oracle": "Leave out either --method or --reconstruction.",
+    "--paths=straight": "config.json names the reconstruction",
+    "--paths=straight --method=oracle": "Leave them out, or use paths=tree.",
+    "--method=oracle --ior=1.5": "Write as in --ior=glass=1.52.",
+    "--method=oracle --resolution=32": "nothing is reconstructed. Leave it out",
+    "--scene=": "--scene is empty. Give a folder, or hf:CONFIG/SCENE",
+    "--scene=nowhere": "nowhere/transforms_train.json does not exist",
 }
 
 # What absl does not know the values of, and what is not there; of each command, with its refusal.
@@ -63,6 +80,10 @@ _MISTAKES = {
         "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
         "--out=OUT --scene=hf:cubebg/cube_smcvx_ball": "no configuration of the data set",
         "--out=OUT": "Add --scene=FOLDER, or --resume",
+        "--out=OUT --scene=": "--scene is empty. Give a folder, or hf:CONFIG/SCENE",
+        "--out=OUT --config=nowhere.json": "nowhere.json is not a file.",
+        "--out=OUT --config=BARE": "which is not there. Give where it is now as --reconstruction",
+        **{f"--out=OUT --config=CONFIG {x}": told for x, told in _ON_TOP_OF_R3F.items()},
         **{f"--out=OUT --scene=SCENE {words}": told for words, told in _OF_THE_SCENE.items()},
     },
     "evaluate": {
@@ -72,6 +93,7 @@ _MISTAKES = {
     "render": {"--run=nowhere": "nowhere/config.json does not exist"},
     "render_known": {
         "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
+        "--out=OUT --scene=": "--scene is empty. Give a folder",
         "--out=OUT --scene=SCENE --cut=-0.5": "Give 0.02 for 2 %.",
         "--out=OUT --scene=SCENE --ior=glass": "Write as in --ior=glass=1.52.",
         "--out=OUT --scene=SCENE --paths=straight --unfinished=dark": "none is unfinished",
@@ -126,9 +148,15 @@ _MISTAKES = {
 def tried(tmp_path_factory):
     """What each command answered, and the folder that held what was in its way."""
     cases, folders = {}, {}
+    given = tmp_path_factory.mktemp("given")
+    content = {"scene": {"path": str(_SCENE), "reconstruction": "r3f"}, "paths": {"cut": 0.01}}
+    (given / "r3f").mkdir()
+    (given / "r3f" / cli_flags.RECONSTRUCTION).write_text("{}")
+    for folder in (given, given / "r3f"):
+        (folder / "config.json").write_text(json.dumps(content))
     out = tmp_path_factory.mktemp("mistakes") / "out"
     for command in _COMMANDS:
-        cases[command] = [_words(line, out) for line in _MISTAKES.get(command, ())]
+        cases[command] = [_words(line, out, given) for line in _MISTAKES.get(command, ())]
         if command in _IN_THE_WAY:
             words, name = _IN_THE_WAY[command]
             folder = folders[command] = tmp_path_factory.mktemp(command)
@@ -148,8 +176,10 @@ def tried(tmp_path_factory):
     return json.loads(done.stdout), folders
 
 
-def _words(line, out):
-    return line.replace("OUT", str(out)).replace("SCENE", str(_SCENE)).split()
+def _words(line, out, given):
+    config, bare = given / "config.json", given / "r3f" / "config.json"
+    line = line.replace("OUT", str(out)).replace("SCENE", str(_SCENE))
+    return line.replace("CONFIG", str(config)).replace("BARE", str(bare)).split()
 
 
 def _refusal(answer):

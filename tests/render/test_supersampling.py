@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+from refref_jax import choices
 from refref_jax.geometry import cameras
 from refref_jax.optics.budgets import STRAIGHT
 from refref_jax.render import (
@@ -28,7 +29,7 @@ def model():
 
 @pytest.mark.parametrize(("rays", "side"), [(1, 1), (4, 2), (9, 3), (16, 4), (49, 7)])
 def test_rays_make_a_square_grid(rays, side):
-    assert supersampling.side_of(rays) == side
+    assert choices.side_of(rays) == side
 
 
 @pytest.mark.parametrize(
@@ -36,7 +37,7 @@ def test_rays_make_a_square_grid(rays, side):
 )
 def test_rays_that_do_not_are_told_the_nearest_squares(rays, nearest):
     with pytest.raises(ValueError, match=nearest):
-        supersampling.side_of(rays)
+        choices.side_of(rays)
 
 
 def _fine(linear, distance):

@@ -67,6 +67,14 @@ def test_the_configuration_of_a_run_repeats_it_bit_for_bit(fifty, tmp_path):
         fit.fit(config, out=tmp_path / "again")
 
 
+def test_a_model_is_loaded_without_a_word_and_nothing_is_written(fifty, caplog, capfd):
+    before = {path: path.stat().st_mtime_ns for path in fifty.rglob("*")}
+    saved.load_model(fifty)
+    assert saved.latest_step(fifty) == 50
+    assert not caplog.records and capfd.readouterr() == ("", "")
+    assert before == {path: path.stat().st_mtime_ns for path in fifty.rglob("*")}
+
+
 def test_what_is_asked_for_stays_where_the_path_of_the_scene_is_made_absolute(monkeypatch):
     monkeypatch.chdir(ROOT / "experiments" / "data")
     asked = {"paths": "straight", "background": "spherical", "radius": 9.0}

@@ -11,8 +11,14 @@ from refref_jax import configuration
 from refref_jax.data.needs import Needs
 from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE, budget_of, capacity_factors
 from refref_jax.render import saved
-from refref_jax.training import run_folder
-from refref_jax.training.config import FieldConfig, TrainConfig, options_of
+from refref_jax.training import config_files, run_folder
+from refref_jax.training.config import (
+    FieldConfig,
+    PathsConfig,
+    SceneConfig,
+    TrainConfig,
+    options_of,
+)
 from refref_jax.training.fit import prepare
 from refref_jax.training.resolve import SceneFacts, override_model, resolve, samples_of
 from tests.experiments.command import ROOT
@@ -167,7 +173,7 @@ def test_resolve_refuses_what_can_not_be(found, given, message):
 
 
 def test_override_takes_decisions_again_that_follow_from_a_change():
-    config = _resolve(_TINTED, scene="a", cut=0.01).config
+    config = _resolve(_TINTED, scene="a").config
     paper = config.override(paths="paper")
     assert (paper.paths.cut, paper.model.interior, paper.model.samples) == (None, None, (32, 20))
     assert config.override(paths="tree", steps=2500) == config
@@ -185,6 +191,45 @@ def test_override_takes_decisions_again_that_follow_from_a_change():
     assert config.override(ior=[["glass", 1.4]]).paths.reentry is not None
     # What was never set is no change.
     assert TrainConfig().override(interior="field", scene="a").model.interior == "field"
+
+
+def test_what_was_asked_for_stays_and_what_was_decided_is_decided_again():
+    wishes = {"paths": "straight", "radius": 9.0, "steps": 100}
+    made = _resolve(_TINTED, scene="a", **wishes)
+    config = made.config
+    assert set(config.chosen) == {"scene", "paths", "radius", "steps", "batch"}
+    other = config.override(scene="b", preset="small")
+    assert {name: other.get(name) for name in wishes} == wishes
+    open_ = ("interior", "tints", "background", "samples", "warmup")
+    assert {other.get(name) for name in open_} == {None}
+    decided, kept = config.followers(scene="b")
+    assert {"paths", "radius"} <= kept and {"interior", "background"} <= decided
+    assert not decided & config.wishes()
+    # Until it is taken back, or something else is asked for.
+    assert config.override(paths=None).paths.name is None
+    assert "paths" not in config.override(paths=None).chosen
+    assert config.override(paths="tree").override(scene="b").paths.name == "tree"
+    # Resolving neither adds a wish nor drops one, and the reasons tell both apart.
+    again = _resolve_again(config)
+    assert again.config.chosen == config.chosen and again.config == config
+    assert (again.reasons["paths"], made.reasons["cut"]) == ("given", "paths=straight")
+    assert again.reasons["cut"] == "as the configuration has it"
+    # Another object is no wish, and has another index of refraction.
+    part = config.decided(reconstruction="r3f", ior={"ball": 1.5})
+    assert part.chosen == config.chosen and part.override(reconstruction="x").scene.indices == ()
+
+
+def test_wishes_of_a_file_that_does_not_tell_them():
+    partial = TrainConfig(scene=SceneConfig(path="a"), paths=PathsConfig(name="straight"))
+    assert partial.wishes() == {"scene", "paths"}
+    assert partial.override(scene="b").paths.name == "straight"
+    # A run of an earlier version: decisions look as wishes do, and are taken again.
+    before = dataclasses.replace(_resolve(_TINTED, scene="a", paths="paper").config, chosen=None)
+    assert before.wishes() == set() and before.override(scene="b").paths.name is None
+
+
+def _resolve_again(config):
+    return resolve(config, SceneFacts(_TINTED, CAMERAS, (), None, None, ()))
 
 
 def test_override_model_replaces_one_thing_an_option():
@@ -210,10 +255,35 @@ def test_override_model_replaces_one_thing_an_option():
 def test_a_configuration_is_read_as_it_was_written(tmp_path):
     config = _resolve(_TINTED, ior=(("glass", 1.52),), scene="a").config
     configuration.write(tmp_path / "config.json", config)
-    assert run_folder.read_config_file(tmp_path / "config.json") == config
+    read = config_files.read_to_begin(tmp_path / "config.json")
+    assert read == config and read.chosen == config.chosen == ("scene", "ior", "batch")
     (tmp_path / "partial.json").write_text('{"paths": {"cut": 0.01}, "seed": 3}')
-    partial = run_folder.read_config_file(tmp_path / "partial.json")
+    partial = config_files.read_to_begin(tmp_path / "partial.json")
     assert partial == TrainConfig().override(cut=0.01, seed=3)
+
+
+def test_a_reconstruction_is_named_as_seen_from_its_run(tmp_path, monkeypatch):
+    near, far = tmp_path / "runs" / "a" / "r3f", tmp_path / "r3f"
+    near.mkdir(parents=True)
+    (tmp_path / "runs" / "b").mkdir()
+    config = TrainConfig().override(scene="a", steps=3)
+    for name, folder, written in [
+        ("a", near, "r3f"),
+        ("b", near, "../a/r3f"),
+        ("a", far, str(far)),
+        ("a", "", ""),
+    ]:
+        file = tmp_path / "runs" / name / "config.json"
+        config_files.write(file, config.decided(reconstruction=folder))
+        assert json.loads(file.read_text())["scene"]["reconstruction"] == written
+        read = config_files.read(file)
+        assert read.scene.reconstruction == str(folder) and read.chosen == ("scene", "steps")
+    # A path that was written by hand may be as seen from the working directory.
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.json").write_text('{"scene": {"reconstruction": "runs/a/r3f"}}')
+    (near / "mine.json").write_text('{"scene": {"reconstruction": "runs/a/r3f"}}')
+    assert config_files.read(tmp_path / "mine.json").scene.reconstruction == str(near)
+    assert config_files.read(near / "mine.json").scene.reconstruction == "runs/a/r3f"
 
 
 @pytest.mark.parametrize(
@@ -235,7 +305,7 @@ def test_a_file_that_is_no_configuration_is_refused_in_one_line(tmp_path, text, 
     path = tmp_path / "config.json"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ValueError, match=message) as caught:
-        run_folder.read_config_file(path)
+        config_files.read_to_begin(path)
     assert "\n" not in str(caught.value)
 
 

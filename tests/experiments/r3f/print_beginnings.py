@@ -1,11 +1,12 @@
 """Begins many trainings in one process, without a step, and prints what each came to.
 
-Reads a JSON list of lists of options; prints a JSON list of records.
+Reads a JSON list of lists of options, or of "copy" and two folders; prints a JSON list of records.
 """
 
 import contextlib
 import io
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -19,6 +20,9 @@ from refref_jax.training import fit, run_folder
 
 
 def _begin(options):
+    if options[0] == "copy":
+        shutil.copytree(*options[1:])
+        return None
     for name in flags.FLAGS:
         flags.FLAGS[name].unparse()
     printed = io.StringIO()
@@ -26,8 +30,7 @@ def _begin(options):
         flags.FLAGS(["train", *options])
         run = Path(flags.FLAGS.out)
         with contextlib.redirect_stdout(printed):
-            train.check_flags()
-            train._train(run)
+            train._train(run, train.check_flags())
     except (ValueError, flags.Error) as error:
         return {"error": str(error)}
     geometry = saved.load_geometry(run)
@@ -37,6 +40,7 @@ def _begin(options):
         "printed": printed.getvalue(),
         "body": body and vars(body),
         "indices": run_folder.read_config(run).scene.indices,
+        "reconstruction": run_folder.read_config(run).scene.reconstruction,
         "faces": len(np.unique(geometry.surfaces.bvh.triangles.reshape(-1, 9), axis=0)),
         "inside": geometry.interfaces.index_inside.tolist(),
     }

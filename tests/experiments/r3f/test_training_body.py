@@ -40,8 +40,58 @@ def runs(tmp_path_factory):
     return runs
 
 
+def _on_top(runs, moved, scene, r3f):
+    """Returns words on top of the file of the run `r3f`, by name, and of it when it has moved."""
+    file, there = f"--config={runs / 'r3f' / 'config.json'}", moved / "scenes" / scene.name
+    on_top = {
+        "file": (),
+        "file with index": ("--ior=1.7",),
+        "file with named index": ("--ior=glass=1.7",),
+        "file with oracle": ("--method=oracle",),
+        "file with a grid": (_GRID,),
+        "file anew": r3f,
+        "file with straight": ("--paths=straight",),
+        "file with straight oracle": ("--paths=straight", "--method=oracle"),
+    }
+    sent = {name: (f"--out={runs / name}", file, *words) for name, words in on_top.items()}
+    run = f"--out={moved / 'run'}"
+    gone = f"--config={moved / 'gone' / 'run' / 'config.json'}"
+    return sent | {
+        "file anew, resumed": (
+            f"--out={runs / 'file anew'}",
+            file,
+            f"--scene={scene}",
+            *r3f,
+            "--resume",
+        ),
+        "run moves": ("copy", str(runs / "r3f"), str(moved / "run")),
+        "scene moves": ("copy", str(scene), str(there)),
+        "moved, resumed": (run, f"--scene={there}", *r3f, "--resume"),
+        "moved, resumed by its file": (
+            run,
+            f"--config={moved / 'run' / 'config.json'}",
+            f"--scene={there}",
+            "--resume",
+        ),
+        "moved without it": (f"--out={runs / 'gone'}", gone),
+        "moved without it, told": (
+            f"--out={runs / 'told'}",
+            gone,
+            f"--reconstruction={moved / 'run' / 'r3f'}",
+        ),
+    }
+
+
 @pytest.fixture(scope="module")
-def found(scene, made, runs):
+def moved(tmp_path_factory):
+    """A place that runs move to, with the file of one that has left its reconstruction behind."""
+    moved = tmp_path_factory.mktemp("moved")
+    (moved / "gone" / "run").mkdir(parents=True)
+    return moved
+
+
+@pytest.fixture(scope="module")
+def found(scene, made, runs, moved):
     """What beginning each training came to, by name; all in one process, in this order."""
     r3f, given = ("--method=r3f", _GRID, "--ior=1.5"), f"--reconstruction={made}"
     cases = {
@@ -74,7 +124,11 @@ def found(scene, made, runs):
         "r3f with a given one": ("r3f", f"--scene={scene}", given, "--resume"),
     }
     sent += [[f"--out={runs / run}", *options] for run, *options in again.values()]
+    on_top = _on_top(runs, moved, scene, r3f)
+    sent += on_top.values()
     sent.append([f"--out={made}", f"--scene={scene}", given])
+    left = {"scene": {"path": str(scene), "reconstruction": "r3f"}}
+    (moved / "gone" / "run" / "config.json").write_text(json.dumps(left))
     result = subprocess.run(
         [sys.executable, "-m", "tests.experiments.r3f.print_beginnings"],
         cwd=ROOT,
@@ -84,7 +138,8 @@ def found(scene, made, runs):
         check=False,
     )
     assert result.returncode == 0, result.stderr
-    return dict(zip([*cases, *again, "run in its body"], json.loads(result.stdout), strict=True))
+    names = [*cases, *again, *on_top, "run in its body"]
+    return dict(zip(names, json.loads(result.stdout), strict=True))
 
 
 def test_the_broken_mesh_stops_the_oracle_alone(found):
@@ -93,7 +148,20 @@ def test_the_broken_mesh_stops_the_oracle_alone(found):
         assert found[name]["error"] is None, name
 
 
-@pytest.mark.parametrize(("name", "index"), [("r3f", 1.5), ("given", 1.45), ("other index", 1.7)])
+@pytest.mark.parametrize(
+    ("name", "index"),
+    [
+        ("r3f", 1.5),
+        ("given", 1.45),
+        ("other index", 1.7),
+        ("file", 1.5),
+        ("file with index", 1.7),
+        ("file anew", 1.5),
+        ("file anew, resumed", 1.5),
+        ("moved, resumed", 1.5),
+        ("moved without it, told", 1.5),
+    ],
+)
 def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
     assert found[name]["body"]["index"] == index
     assert found[name]["indices"] == [["ball_glass", index]]
@@ -121,6 +189,12 @@ def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
         ("r3f with another grid", "ior 1.5, not 1.6"),
         ("r3f by name alone", "--method would have no effect"),
         ("r3f with a given one", "begun with other options"),
+        ("file with named index", "Give its index alone, once"),
+        ("file with oracle", "ball_glass.ply can not be read"),
+        ("file with a grid", "is reconstructed already. Leave it out, or add --method=r3f."),
+        ("file with straight", "Add --method=oracle, since"),
+        ("file with straight oracle", "ball_glass.ply can not be read"),
+        ("moved without it", "which is not there. Give where it is now as --reconstruction"),
     ],
 )
 def test_mistakes_are_told(found, name, message):
@@ -137,6 +211,21 @@ def test_what_is_reconstructed_for_a_run_is_kept_and_not_made_again(found, runs,
     assert found["given"]["body"]["reconstruction"] == str(made)
     for name in ("straight", "no index", "nothing there", "oracle"):
         assert not (runs / name).exists(), name
+
+
+def test_a_run_and_what_was_reconstructed_for_it_move_together(found, runs, moved, made):
+    written = json.loads((runs / "r3f" / "config.json").read_text())["scene"]["reconstruction"]
+    beside = json.loads((runs / "file" / "config.json").read_text())["scene"]["reconstruction"]
+    absolute = json.loads((runs / "given" / "config.json").read_text())["scene"]["reconstruction"]
+    assert (written, beside, absolute) == ("r3f", "../r3f/r3f", str(made))
+    assert found["file"]["reconstruction"] == str(runs / "r3f" / "r3f")
+    for name in ("moved, resumed", "moved, resumed by its file"):
+        assert found[name]["error"] is None
+        assert found[name]["reconstruction"] == str(moved / "run" / "r3f")
+    assert "hull of the training masks" not in found["moved, resumed by its file"]["printed"]
+    told = found["file anew"]
+    assert told["reconstruction"] == str(runs / "file anew" / "r3f")
+    assert "decided again, because of what is on top of" in told["printed"]
 
 
 @pytest.mark.slow
