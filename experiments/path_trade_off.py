@@ -62,11 +62,11 @@ def main() -> None:
     out = Path(_OUT.value)
     place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
     outputs.replaceable(out, **place)
-    budgets, indices = chosen_budgets(), refraction_indices.parse_named(_IOR.value)
+    settings, indices = chosen_budgets(), refraction_indices.parse_named(_IOR.value)
     # All scenes first: a broken one is named before anything is rendered.
     chosen = [_read(folder, indices) for folder in _open_scenes()]
     with outputs.fresh(out, **place) as draft:
-        trials = _measure(chosen, [paths.Setting(*each) for each in budgets])
+        trials = _measure(chosen, [paths.Setting(*each) for each in settings])
         paths.write_table(draft / _TABLE, trials)
         pictures = [out / path.name for path in paths.write_figures(draft, trials)]
     print(f"Figures:  {', '.join(map(str, pictures))}")

@@ -255,12 +255,12 @@ def fingerprint(scene: Path) -> str:
     """Returns the hash of a scene, which may be broken or lack files."""
     found = hashlib.sha256()
     described = scene / "scene.json"
-    transforms = sorted(scene.glob("transforms_*.json"))
-    for path in (*transforms, *([described] if described.is_file() else [])):
+    files = sorted(scene.glob("transforms_*.json"))
+    for path in (*files, *([described] if described.is_file() else [])):
         _add(found, path.name, path.read_bytes())
     for path in meshes.mesh_files(scene):
         _add(found, f"meshes/{path.name}", path.read_bytes())
-    for name in sorted({name for path in transforms for name in _images(path)}):
+    for name in sorted({name for path in files for name in _images(path)}):
         path = scene / name
         size = path.stat().st_size if path.is_file() else "missing"
         _add(found, Path(name).as_posix(), str(size).encode())
@@ -274,10 +274,10 @@ def _add(found: Any, name: str, content: bytes) -> None:
         found.update(part)
 
 
-def _images(transforms: Path) -> Iterator[str]:
+def _images(path: Path) -> Iterator[str]:
     """Yields the files that a transforms file names, as far as it is one."""
     try:
-        frames = configuration.parse_json(transforms.read_text(encoding="utf-8"))["frames"]
+        frames = configuration.parse_json(path.read_text(encoding="utf-8"))["frames"]
     except (ValueError, KeyError, TypeError):
         return
     for frame in frames if isinstance(frames, list) else ():

@@ -32,20 +32,20 @@ def write(run: Path, out: Path, *, overwrite: bool) -> list[Path]:
         replaced.
     """
     if records.exists(run):
-        meshes = [object_source.read_mesh(run, _finished(run))]
+        found = [object_source.read_mesh(run, _finished(run))]
     else:
-        meshes = read_meshes(load_geometry(run))
-    if not meshes:
+        found = read_meshes(load_geometry(run))
+    if not found:
         raise ValueError(
             f"{run} has no body: it was trained along straight paths, or without meshes. Export "
             "--what=mesh, or another run."
         )
     paths = [out]
-    if len(meshes) > 1:
-        paths = [out.with_stem(f"{out.stem}_{number}") for number in range(len(meshes))]
+    if len(found) > 1:
+        paths = [out.with_stem(f"{out.stem}_{number}") for number in range(len(found))]
     for path in paths:
         outputs.check_file(path, overwrite=overwrite)
-    for path, mesh in zip(paths, meshes, strict=True):
+    for path, mesh in zip(paths, found, strict=True):
         with outputs.fresh_file(path, overwrite=overwrite) as draft:
             stored_normals.write_mesh(draft, *mesh)
     return paths

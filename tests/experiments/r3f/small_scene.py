@@ -4,7 +4,8 @@ import json
 
 import numpy as np
 
-from refref_jax.data import file_names, files, stored_normals
+from refref_jax.data import file_names, files
+from refref_jax.data.stored_normals import write_mesh
 from tests.data.small_scenes import write_grey
 from tests.reconstruct import bodies
 
@@ -31,9 +32,7 @@ def write_scene(scene, *, views=24, size=40, meshes=True):
         file_names.write_transforms(scene, split, content)
     if meshes:
         (scene / "meshes").mkdir()
-        stored_normals.write_mesh(
-            scene / "meshes" / "ball_glass.ply", *bodies.icosphere(3, radius=RADIUS)
-        )
+        write_mesh(scene / "meshes" / "ball_glass.ply", *bodies.icosphere(3, radius=RADIUS))
     return scene
 
 
