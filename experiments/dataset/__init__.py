@@ -1,4 +1,4 @@
-"""The generator of the data set: objects, backgrounds, cameras, and how Blender renders them.
+"""The generator of the data set: objects, backgrounds, cameras, and their rendering in Blender.
 
 Nothing here is imported by `refref_jax`. Blender lives in an environment of its own
 (`make dataset-env`): only `blender_worker`, its two neighbours and `export_monkey` import it. They

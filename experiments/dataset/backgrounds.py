@@ -60,9 +60,9 @@ def write_background(scene: Path, kind: Kind, *, seed: int, size: int) -> dict[s
     are made once in a process.
 
     Args:
-      scene: its folder; is made if need be.
-      kind: of background.
-      seed: decides which pictures; any integer that is not negative.
+      scene: folder of the scene; created if needed.
+      kind: kind of background.
+      seed: non-negative integer that selects the images.
       size: rows of each image, 16 or more.
 
     Returns:

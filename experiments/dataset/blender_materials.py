@@ -1,4 +1,4 @@
-"""What surfaces look like in Blender: glass, glowing walls, the world (bpy only)."""
+"""Blender materials: glass, emissive backgrounds, the world (bpy only)."""
 
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ def glass(part: dict[str, Any]) -> Any:
     here, at a back face it multiplies. So the index has to be the inside's over the outside's.
 
     Args:
-      part: its description in `scene.json`.
+      part: record of the part in `scene.json`.
     """
     material, nodes, links = _new_material(part["mesh"])
     bsdf = nodes.new("ShaderNodeBsdfGlass")

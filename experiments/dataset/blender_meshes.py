@@ -1,4 +1,4 @@
-"""Gets from Blender the one mesh that is its own: the monkey's."""
+"""Exports Blender's built-in mesh of the monkey."""
 
 import subprocess
 from pathlib import Path
@@ -12,7 +12,7 @@ def export_monkey(path: Path, *, blender: Path) -> None:
     """Writes the monkey's mesh, if it is not there.
 
     Args:
-      path: of the file, as `catalogue.SUZANNE`.
+      path: output file, usually `catalogue.SUZANNE`.
       blender: Python that has bpy.
 
     Raises:

@@ -30,7 +30,7 @@ def build(folder: Path, record: dict[str, Any]) -> None:
     """Replaces whatever Blender holds by a scene, without a camera's pose.
 
     Args:
-      folder: of the scene, which file names count from.
+      folder: folder of the scene; file names are relative to it.
       record: the content of its `scene.json`.
     """
     bpy.ops.wm.read_factory_settings(use_empty=True)

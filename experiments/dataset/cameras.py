@@ -1,4 +1,4 @@
-"""Where the data set's cameras stand (NumPy only).
+"""Camera poses of the data set (NumPy only).
 
 A pose is a 4x4 camera-to-world matrix of OpenGL's axes: x right, y up, looks along -z. All look
 from the sphere of radius 4 at the origin, with z up. Azimuth is counted from +x towards +y,

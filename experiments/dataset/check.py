@@ -1,4 +1,4 @@
-"""Checks scenes that were made: files, meshes, and pictures against our own light paths.
+"""Checks generated scenes: files, meshes, and images against our own renderer.
 
 python -m experiments.dataset.check runs/dataset --limit=3
 

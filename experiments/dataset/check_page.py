@@ -1,4 +1,4 @@
-"""The report of a check as one web page: no server, no network, pictures inside."""
+"""Writes the report of a check as one self-contained web page."""
 
 import base64
 import html
@@ -33,13 +33,13 @@ tr.bad td { color: #b3261e; }
 
 
 class SceneReport(NamedTuple):
-    """What was found of one scene.
+    """Results of checking one scene.
 
     Attributes:
-      name: of its folder.
-      complaints: what does not hold; nothing if it may be used.
-      notes: what is worth knowing beside.
-      views: those that were compared.
+      name: name of the scene's folder.
+      complaints: failed checks; empty if the scene may be used.
+      notes: further remarks.
+      views: compared views.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What must hold of a scene that was rendered: files, meshes, and pictures against our own tracer.
+"""Checks of a rendered scene: files, meshes, and images against our own tracer.
 
 Two renderers that share nothing but the scene's files agree, or one of them is wrong. Colours are
 compared inside the mask, where light went through the object. Depths are compared away from
@@ -54,15 +54,15 @@ class Meshes(NamedTuple):
 
 
 class View(NamedTuple):
-    """One view, rendered by both.
+    """One test view, rendered by Blender and by our tracer.
 
     Attributes:
-      name: of the frame.
+      name: name of the frame.
       target: the image, sRGB in `[0, 1]`.
       rgb: our rendering.
-      psnr: over the whole image, dB.
-      psnr_masked: inside the mask.
-      lost: share of light that found no room.
+      psnr: PSNR over the whole image, dB.
+      psnr_masked: masked PSNR, dB.
+      lost: share of the throughput that was dropped because the path buffer was full.
       mask_share: share of pixels where mask and traced silhouette differ.
       depth_share: share of pixels away from silhouettes whose depths agree; NaN without a map.
       depth_error: the 99.9th percentile of the depths' difference there, world units.
@@ -153,7 +153,7 @@ def away_from_silhouettes(
     """Returns the pixels of an object that no silhouette is near.
 
     Args:
-      mask: of the object.
+      mask: mask of the object.
       depth: traced planar depth of the first surface; `inf` where there is none.
     """
     finite = np.isfinite(depth)
@@ -164,12 +164,12 @@ def away_from_silhouettes(
 
 
 def complaints(convex: bool, findings: Sequence[Finding], views: Sequence[View]) -> list[str]:
-    """Returns what does not hold of a scene, in words; nothing if it may be used.
+    """Returns the failed checks of a scene, in words; empty if the scene may be used.
 
     Args:
-      convex: whether its object is convex, so that more is asked.
-      findings: about its files and meshes; notes are no complaint.
-      views: those that were compared.
+      convex: whether the object is convex; more checks apply then.
+      findings: results for its files and meshes; notes do not count as failures.
+      views: compared views.
     """
     least = PSNR_CONVEX if convex else PSNR
     found = [f"{each.part}: {each.message}" for each in findings if each.severity != "note"]

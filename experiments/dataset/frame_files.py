@@ -47,7 +47,7 @@ class FrameFiles(NamedTuple):
 
 
 class Rendering(NamedTuple):
-    """What Blender renders of a view. All but the colours belong to the middle of each pixel.
+    """One view as rendered by Blender. All arrays but the colours are sampled at pixel centres.
 
     Attributes:
       linear: linear RGB, the mean over each pixel's square.
@@ -55,7 +55,7 @@ class Rendering(NamedTuple):
         nothing is met.
       normal: shading normal in world space where the object is met first, towards the camera's
         side; else 0.
-      mask: whether the object is met first.
+      mask: whether the object is the first surface.
     """
 
     linear: Float[np.ndarray, "h w 3"]
@@ -81,10 +81,10 @@ def is_done(scene: Path, split: Split, number: int, *, linear: bool) -> bool:
     """Returns whether a view is rendered.
 
     Args:
-      scene: its folder.
-      split: of the view.
-      number: of the view.
-      linear: whether the linear image belongs to it.
+      scene: folder of the scene.
+      split: split of the view.
+      number: number of the view in its split.
+      linear: whether the linear image is required, too.
     """
     wanted = relative(split, number) if linear else relative(split, number)[:-1]
     return all((scene / path).is_file() for path in wanted)

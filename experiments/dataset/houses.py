@@ -1,4 +1,4 @@
-"""A ring of gabled houses around a square, as the eye in its middle sees them."""
+"""A ring of gabled houses around a square, seen from its middle."""
 
 import math
 
@@ -60,10 +60,10 @@ def _openings(
 
     Args:
       front: plaster.
-      index: of the house.
+      index: index of the house.
       u: metres to the right of its middle.
       up: metres above the ground.
-      extent: how wide it is, and how high are its eaves.
+      extent: width of the house and height of its eaves, in metres.
     """
     wide, eaves = extent
     pitch, floor = wide / 3.0, 1.45

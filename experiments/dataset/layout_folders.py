@@ -19,10 +19,10 @@ def write(
     All extras are kept in their places; an EXR beside an image or a depth map goes along with it.
 
     Args:
-      contents: of the scene.
-      target: the folder, which must not exist.
-      naming: of the frames' files.
-      step: is called for every image.
+      contents: contents of the scene.
+      target: output folder, which must not exist.
+      naming: naming of the frames' files.
+      step: called after every image.
     """
     with atomic_files.new_folder(target) as scene:
         for split, (frames, header) in contents.splits.items():

@@ -41,10 +41,10 @@ def write(
     """Writes the files of a scene, which appear when they are whole.
 
     Args:
-      contents: of the scene.
-      name: its name.
-      out: folder of the whole layout.
-      step: is called for every image.
+      contents: contents of the scene.
+      name: name of the scene.
+      out: folder of the complete layout.
+      step: called after every image.
 
     Returns:
       What was left out, extras by their places, EXRs of frames by kind and split.

@@ -1,4 +1,4 @@
-"""Makes what is missing of scenes, alone in their folder (NumPy only)."""
+"""Makes the missing files of scenes, one process per folder (NumPy only)."""
 
 import contextlib
 import os
@@ -29,16 +29,16 @@ def produce(
     workers: int | None,
     stopped: Callable[[], bool],
 ) -> bool:
-    """Makes folders and views that are not there, and returns whether none is left.
+    """Makes missing folders and views, and returns whether all of them exist.
 
     Args:
-      out: folder of the scenes; made if it is not there.
+      out: folder of the scenes; created if missing.
       chosen: scenes to make; those of one object follow each other.
-      settings: of the rendering.
-      objects: by name.
+      settings: settings of the rendering.
+      objects: objects by name.
       blender: Python that has bpy.
-      workers: number of processes of Blender, or one for each core.
-      stopped: whether the user wants to end; it is asked after every view.
+      workers: number of Blender processes, or one for each core.
+      stopped: callback that returns whether the user wants to end; queried after every view.
 
     Raises:
       ValueError: if there is something else in a scene's place, if another command works in the

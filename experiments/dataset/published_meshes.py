@@ -1,4 +1,4 @@
-"""Writes an object's meshes under their published names, one file a material, for other readers.
+"""Writes an object's meshes under their published names, one file per material.
 
     mesh_files/{category}/{object}_{material}.ply
 
@@ -20,9 +20,9 @@ def write(parts: Sequence[Path], name: SceneName, out: Path) -> None:
     """Writes the meshes of a scene's object; those of another background's scene are the same.
 
     Args:
-      parts: the scene's mesh files; those of unknown material are left out.
-      name: of the scene.
-      out: folder of the whole layout.
+      parts: mesh files of the scene; those of unknown material are omitted.
+      name: name of the scene.
+      out: folder of the complete layout.
 
     Raises:
       SceneError: if a mesh is there already, and is another.

@@ -1,4 +1,4 @@
-"""With what settings scenes are rendered (NumPy only)."""
+"""Settings of the rendering (NumPy only)."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -45,16 +45,16 @@ class PerSplit(NamedTuple):
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """What decides a scene's files, besides its name.
+    """Settings that decide a scene's files, in addition to its name.
 
     Attributes:
       size: width and height of images in pixels.
-      spp: samples a pixel.
-      views: poses of each split.
-      rule: what lies outside a part.
+      spp: samples per pixel.
+      views: number of poses of each split.
+      rule: outside medium of each part.
       texture_size: rows of each image of the background.
-      linear: which splits keep linear EXRs.
-      preview: whether of all views only `preview_view` is rendered.
+      linear: splits that keep linear EXRs.
+      preview: whether only `preview_view` is rendered.
     """
 
     size: int

@@ -1,4 +1,4 @@
-"""Checks one scene of the data set, and finds those of a folder; see `check`."""
+"""Finds the scenes of a folder and checks one scene of the data set; see `check`."""
 
 from pathlib import Path
 
@@ -40,9 +40,9 @@ def check_scene(scene: Path, budget: Budget, *, views: int, side: int) -> SceneR
     """Checks one scene.
 
     Args:
-      scene: its folder.
-      budget: which light to follow.
-      views: test views to compare, evenly spread.
+      scene: folder of the scene.
+      budget: path settings.
+      views: number of test views to compare, evenly spaced.
       side: rays along each edge of a pixel.
     """
     name = scene.resolve().name

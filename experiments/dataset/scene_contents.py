@@ -1,4 +1,4 @@
-"""All that a scene's folder holds, by what it is: the first half of every conversion (NumPy only).
+"""Lists the files of a scene's folder by type: the first half of every conversion (NumPy only).
 
 A frame is its image, mask and depth map; all other files are *extras*, by their places below the
 folder: `scene.json`, meshes, textures, maps of floats.
@@ -17,11 +17,11 @@ class Frame(NamedTuple):
 
     Attributes:
       image: 8-bit image.
-      mask: of the object, if there is one.
-      depth: the depth map that the transforms file names, if it does.
-      linear: the EXR beside the image, if there is one.
-      float_depth: the EXR beside the depth map, if there is one.
-      record: of the frame in the transforms file.
+      mask: mask of the object, if it exists.
+      depth: depth map, if the transforms file names one.
+      linear: EXR next to the image, if it exists.
+      float_depth: EXR next to the depth map, if it exists.
+      record: record of the frame in the transforms file.
     """
 
     image: Path
@@ -40,12 +40,12 @@ class Split(NamedTuple):
 
 
 class SceneContents(NamedTuple):
-    """What a scene's folder holds.
+    """Contents of a scene's folder.
 
     Attributes:
-      splits: by name; only those that there are.
-      extras: all other files, by their places below the folder; meshes of the raw release are in
-        `meshes/`.
+      splits: frames by the name of the split; only existing splits.
+      extras: all other files, by their path relative to the folder; meshes of the raw release are
+        in `meshes/`.
     """
 
     splits: dict[str, Split]

@@ -1,4 +1,4 @@
-"""Finds the scenes that a place holds, in any layout, and opens them one by one."""
+"""Finds the scenes of a folder or repository, in any layout, and opens them one by one."""
 
 import contextlib
 import tempfile
@@ -19,10 +19,10 @@ class FoundScene(NamedTuple):
     """A scene to read.
 
     Attributes:
-      name: of the scene, or of its folder.
-      images: how many it has.
-      folder: its folder; `None` if it is in parquet files.
-      copy: what holds the parquet files; `None` if it is a folder.
+      name: name of the scene, or of its folder.
+      images: number of images.
+      folder: folder of the scene; `None` if it is in parquet files.
+      copy: copy that holds the parquet files; `None` if the scene is a folder.
     """
 
     name: str
@@ -37,7 +37,7 @@ def find(place: str, chosen: Sequence[str] | None = None) -> list[FoundScene]:
     Args:
       place: `hf:CONFIG/SCENE`, a scene's folder, a folder of such folders, one in the raw release's
         layout, or one of parquet files.
-      chosen: names of the scenes that are wanted; all if `None`.
+      chosen: names of the requested scenes; all if `None`.
 
     Raises:
       SceneError: if there are none, or not those that are wanted, or one is broken.

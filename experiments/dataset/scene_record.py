@@ -1,4 +1,4 @@
-"""What `scene.json` says of a scene (NumPy only).
+"""The record of a scene in `scene.json` (NumPy only).
 
 Of each part it says what is inside and outside of its surface, as Blender gets it: under the rule
 `nested` outside is the innermost part around it, else air; under `facing` it is always air.
@@ -27,10 +27,10 @@ def describe(
     """Returns the content of `scene.json`.
 
     Args:
-      scene: which.
-      parts: of its object.
-      background: its record, as `refref_jax.data.background` reads it.
-      settings: of the rendering.
+      scene: scene to describe.
+      parts: parts of its object.
+      background: record of its background, as `refref_jax.data.background` reads it.
+      settings: settings of the rendering.
 
     Raises:
       ValueError: if parts cut each other, or one that absorbs has another inside.

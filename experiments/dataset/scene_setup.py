@@ -1,4 +1,4 @@
-"""Makes the folder of a scene, ready to be rendered, and recognises one (NumPy only).
+"""Creates the folder of a scene, ready to be rendered, and recognises one (NumPy only).
 
     {scene}/meshes/{object}_{part}_{material}.ply    binary, single precision
     {scene}/background/                              what the record names
@@ -36,11 +36,11 @@ def make(
     """Makes the folder of a scene if it is not there.
 
     Args:
-      folder: to make.
-      scene: which.
-      settings: of the rendering.
-      parts: makes those of the object.
-      scratch: an existing folder in the same file system, where it is put together.
+      folder: folder to create.
+      scene: scene to make.
+      settings: settings of the rendering.
+      parts: function that makes the parts of the object.
+      scratch: existing folder on the same file system, for temporary files.
     """
     if folder.exists():
         return

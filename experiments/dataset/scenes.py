@@ -23,7 +23,7 @@ def choose(text: str, objects: Mapping[str, Object]) -> list[SceneName]:
     Args:
       text: `all`, or names parted by commas: of scenes, else of objects for all their scenes. Both
         may have wildcards, as `cube_*` and `ball*`.
-      objects: by name.
+      objects: objects by name.
 
     Raises:
       ValueError: if a name fits nothing.

@@ -70,14 +70,14 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
 class Weather(NamedTuple):
-    """What makes a sky.
+    """Parameters of a sky.
 
     Attributes:
-      azimuth: of the sun, from +x towards +y, radians.
-      elevation: of the sun, radians, above 0.
-      turbidity: of the air, 2 to 6.
-      clouds: how much of the sky they cover, about 0 to 1.
-      seed: of the clouds.
+      azimuth: azimuth of the sun, from +x towards +y, radians.
+      elevation: elevation of the sun, radians, above 0.
+      turbidity: turbidity of the air, 2 to 6.
+      clouds: share of the sky covered by clouds, about 0 to 1.
+      seed: seed of the clouds.
     """
 
     azimuth: float

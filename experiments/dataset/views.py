@@ -1,4 +1,4 @@
-"""The views of scenes: which are missing, and what is to be rendered for each (NumPy only)."""
+"""Lists the missing views of scenes and their render jobs (NumPy only)."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache, partial
@@ -20,12 +20,12 @@ _DETAIL = 1.0
 
 
 class View(NamedTuple):
-    """One image.
+    """One view to render.
 
     Attributes:
-      scene: that it is of.
-      split: that it belongs to.
-      number: in the split.
+      scene: scene of the view.
+      split: split of the view.
+      number: number of the view in its split.
     """
 
     scene: SceneName
@@ -71,10 +71,10 @@ def tasks(
 
     Args:
       out: folder of the scenes.
-      views: to render; those of one scene follow each other.
-      settings: of the rendering.
-      objects: by name.
-      scratch: existing folder for what is half made.
+      views: views to render; those of one scene follow each other.
+      settings: settings of the rendering.
+      objects: objects by name.
+      scratch: existing folder for temporary files.
     """
 
     # Scenes that follow each other share their object.

@@ -1,4 +1,4 @@
-"""Several processes of Blender that share the views between them.
+"""Distributes views over several Blender processes.
 
 Which process renders a view, and when, does not show in it.
 """
@@ -25,7 +25,7 @@ class Pool:
           blender: Python that has bpy.
           scratch: existing folder for files that come and go.
           workers: number of processes.
-          threads: of each.
+          threads: number of threads of each process.
         """
         self._tasks, self._taking = iter(tasks), threading.Lock()
         self._command = [str(blender), str(SCRIPT)]

@@ -1,4 +1,4 @@
-"""Blender in a process of its own, which renders one view after the other.
+"""Runs Blender in a separate process that renders one view after the other.
 
 What is spoken with it is told in `blender_worker`.
 """
@@ -38,9 +38,10 @@ class Task(NamedTuple):
     """A job, and what is to be done with its result.
 
     Attributes:
-      name: what the view is called, for people.
-      job: the view.
-      finish: takes the multi-layer EXRs of colour and of geometry, which go away afterwards.
+      name: name of the view in messages.
+      job: description of the view.
+      finish: function that takes the multi-layer EXRs of colour and of geometry, which are deleted
+        afterwards.
     """
 
     name: str
@@ -67,10 +68,10 @@ class Worker:
         """Starts the process.
 
         Args:
-          command: that starts it.
+          command: command that starts the process.
           scratch: existing folder for its files.
-          name: of the process, unique in the folder.
-          threads: that it renders with.
+          name: name of the process, unique in the folder.
+          threads: number of render threads.
         """
         self.log = scratch / f"{name}.log"
         self._files = tuple(scratch / f"{name}_{kind}.exr" for kind in ("colour", "geometry"))

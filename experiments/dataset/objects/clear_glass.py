@@ -1,4 +1,4 @@
-"""Things of clear glass alone: jars with glass lids, a light bulb, a candlestick, a cut vase."""
+"""Objects of clear glass only: jars with glass lids, a light bulb, a candlestick, a cut vase."""
 
 import numpy as np
 

@@ -37,9 +37,9 @@ class Field(NamedTuple):
     """A signed distance, and a ball that holds the solid.
 
     Attributes:
-      distance: from points to signed distances.
-      centre: of the ball.
-      radius: of the ball; outside of it, distances are at least those to the ball. May be `inf`.
+      distance: function from points to signed distances.
+      centre: centre of the ball.
+      radius: radius of the ball, may be `inf`; outside, distances are at least those to the ball.
     """
 
     distance: Callable[[Points], Distances]

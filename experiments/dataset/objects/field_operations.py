@@ -115,8 +115,8 @@ def warped(field: Field, warp: Callable[[Points], Points], reach: float) -> Fiel
 
     Args:
       field: the solid.
-      warp: from points to those where the solid is asked for instead.
-      reach: how far the warp moves the surface at most.
+      warp: function from points to the points where the solid is evaluated instead.
+      reach: largest distance by which the warp moves the surface.
     """
     return Field(lambda p: field(warp(p)), field.centre, field.radius + reach)
 
@@ -129,7 +129,7 @@ def gridded(
     Args:
       values: signed distances.
       low: position of the first one.
-      spacing: between them, along all axes.
+      spacing: distance between samples, along all axes.
     """
     coefficients = spline_filter(values, order=3)
 

@@ -58,12 +58,12 @@ def single_glass(
     """Returns an object that is one piece of glass.
 
     Args:
-      name: of the object.
-      field: makes its solid.
-      radius: to the farthest point, once the object is centred.
-      thinnest: see `spacing`.
-      fineness: a factor of the detail, for shapes with small features.
-      tint: see `Part`.
+      name: name of the object.
+      field: function that makes its solid.
+      radius: distance of the farthest point after centring.
+      thinnest: least thickness of any wall; see `spacing`.
+      fineness: factor of the detail, for shapes with small features.
+      tint: tint of the surface; see `Part`.
     """
 
     def make(detail: float) -> list[Part]:
@@ -89,15 +89,15 @@ def filled_glass(
     """Returns an object of clear glass around a core.
 
     Args:
-      name: of the object.
-      field: makes its solid.
-      radius: to the farthest point, once the object is centred.
-      thinnest: see `spacing`.
-      medium: a material, of the core.
-      tint: of the core's surface.
-      absorption: in the core.
-      wall: least thickness of the glass around it.
-      fineness: a factor of the detail.
+      name: name of the object.
+      field: function that makes its solid.
+      radius: distance of the farthest point after centring.
+      thinnest: least thickness of any wall; see `spacing`.
+      medium: material of the core.
+      tint: tint of the core's surface.
+      absorption: absorption in the core.
+      wall: least thickness of the glass around the core.
+      fineness: factor of the detail.
     """
     category: Category = "mmncvx"
 
@@ -136,8 +136,8 @@ def centred(parts: Sequence[Part], radius: float) -> list[Part]:
     """Returns parts moved and scaled: in the middle of their box, and as far as a radius.
 
     Args:
-      parts: of one object.
-      radius: to the farthest vertex.
+      parts: parts of one object.
+      radius: distance of the farthest vertex afterwards.
     """
     points = np.concatenate([part.vertices for part in parts])
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))

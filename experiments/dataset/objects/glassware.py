@@ -75,10 +75,10 @@ def spout(low: float, high: float, *, reach: float, width: float) -> Warp:
     """Returns the warp that draws a lip out to a spout at angle 0.
 
     Args:
-      low: height where it begins.
-      high: of the lip.
-      reach: by how much of the radius the lip is drawn out.
-      width: of the spout, in radians; beside it the lip is drawn in a little.
+      low: height where the spout begins.
+      high: height of the lip.
+      reach: distance by which the lip is drawn out, as a share of the radius.
+      width: width of the spout, in radians; next to it the lip is drawn in a little.
     """
 
     def warp(angle: Values, r: Values, z: Values) -> Values:

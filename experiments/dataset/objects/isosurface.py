@@ -1,4 +1,4 @@
-"""The surface of a field (see `distance_fields`) as triangles (NumPy only).
+"""Extracts the surface of a field (see `distance_fields`) as triangles (NumPy only).
 
 Marching cubes gives the right topology, but slivers. So its vertices are spread evenly along the
 surface, and put on the zero set by Newton steps along the gradient.
@@ -50,9 +50,9 @@ def isosurface(field: Field, *, spacing: float, half_extent: float = RADIUS + 0.
     """Returns the zero set of a field: closed, outward, evenly triangulated.
 
     Args:
-      field: negative inside.
-      spacing: of the grid, and about the length of an edge. The thinnest wall should be thicker.
-      half_extent: of the cube around the origin that is looked at.
+      field: signed distance, negative inside.
+      spacing: spacing of the grid, and about the length of an edge; less than the thinnest wall.
+      half_extent: half the edge of the searched cube around the origin.
 
     Raises:
       ValueError: if there is no surface in the cube, or it leaves the cube.

@@ -1,4 +1,4 @@
-"""Blender's monkey, Suzanne, as one closed body (NumPy only).
+"""Blender's monkey, Suzanne, as one closed mesh (NumPy only).
 
 Blender makes the mesh (`export_monkey`), and `monkey(load_suzanne(path))` the object of it.
 Its head has open eye sockets, in which eyes sit that are open at the back: each of the three is
@@ -54,7 +54,7 @@ def monkey(mesh: Surface) -> Object:
     """Returns the monkey made of a mesh of open pieces.
 
     Args:
-      mesh: from `load_suzanne`; within 1.6 of the origin along each axis.
+      mesh: mesh from `load_suzanne`; within 1.6 of the origin along each axis.
     """
 
     def make(detail: float) -> list[Part]:

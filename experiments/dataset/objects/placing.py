@@ -1,4 +1,4 @@
-"""Moves bodies and puts them side by side (NumPy only)."""
+"""Moves meshes and arranges them side by side (NumPy only)."""
 
 from collections.abc import Sequence
 

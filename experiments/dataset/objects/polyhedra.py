@@ -1,4 +1,4 @@
-"""Bodies with flat faces: cube, pyramid, and a diamond of brilliant cut (NumPy only).
+"""Objects with flat faces: cube, pyramid, and a diamond of brilliant cut (NumPy only).
 
 Vocabulary of a cut stone: the *table* is its flat top, the *crown* what lies above the *girdle*,
 its widest part, and the *pavilion* what lies below, down to the *culet*. Angles are those of the

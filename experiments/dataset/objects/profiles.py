@@ -1,4 +1,4 @@
-"""Curves in the half plane of a turned body (NumPy and SciPy only).
+"""Profile curves in the half plane of a turned object (NumPy and SciPy only).
 
 A point is (r, z): its distance from the axis, and its height. A *curve* is a dense polyline. A
 *profile* is a curve from the axis to the axis with the body on its left, so that an outer one goes
@@ -52,8 +52,8 @@ def sampling(detail: float, *, segments: int = 96) -> Sampling:
     """Returns the sampling of a detail; the number of triangles grows with its square.
 
     Args:
-      detail: 1 is what is rendered.
-      segments: around the axis at detail 1; at least 16 are left of them.
+      detail: level of detail; 1 is the one that is rendered.
+      segments: number of segments around the axis at detail 1; never reduced below 16.
     """
     return Sampling(
         edge=0.08 / detail,
@@ -66,7 +66,7 @@ def filleted(*corners: Corner) -> Curve:
     """Returns a polyline with rounded corners.
 
     Args:
-      corners: (r, z), or (r, z, radius of the fillet), in world units.
+      corners: tuples (r, z) or (r, z, radius of the fillet), in world units.
 
     Raises:
       ValueError: if a fillet is longer than the sides have room for.

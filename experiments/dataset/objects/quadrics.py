@@ -1,4 +1,4 @@
-"""Round bodies that a formula gives: ball, cylinder, torus (NumPy only).
+"""Round objects in closed form: ball, cylinder, torus (NumPy only).
 
 Where a curved surface goes over in a flat one, a narrow ring of the flat one follows, so that
 vertex normals, which are means over a vertex's faces, lean over nowhere else.

@@ -1,4 +1,4 @@
-"""Cross-sections of turned bodies, combined as sets of points (Clipper2, through manifold3d).
+"""Boolean operations on cross-sections of turned objects (Clipper2, through manifold3d).
 
 A *region* is the section of a body through its axis, both halves of it. Walls are regions shrunk by
 their thickness, cavities are subtracted, and edges are rounded by rolling a disc along them: all of

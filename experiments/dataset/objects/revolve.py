@@ -1,4 +1,4 @@
-"""Surfaces of revolution, and what becomes of them if the radius depends on the angle (NumPy only).
+"""Surfaces of revolution, also with a radius that depends on the angle (NumPy only).
 
 A *section* tells the shape across the axis: a factor of the radius at each angle. A *warp* is the
 radius that a point (r, z) of the profile gets at an angle; it leaves the axis where it is, and
@@ -24,12 +24,12 @@ _SHORTER = 1.0 - 1e-6
 
 
 class Turned(NamedTuple):
-    """How a profile becomes a surface.
+    """Parameters that turn a profile into a surface.
 
     Attributes:
-      angles: of its meridians, ascending, in radians over less than a full turn.
-      warp: radius at an angle of each point of the profile.
-      twist: by which the surface turns around its axis, radians per world unit of height.
+      angles: angles of the meridians, ascending, in radians over less than a full turn.
+      warp: radius of each point of the profile at an angle.
+      twist: rotation of the surface around its axis, radians per world unit of height.
     """
 
     angles: Float[np.ndarray, " segments"]
@@ -46,9 +46,9 @@ def even_angles(cut: Sampling, *, lobes: int = 1, each: int = 8) -> Float[np.nda
     """Returns evenly spaced angles.
 
     Args:
-      cut: how finely; a round body has that many.
-      lobes: of the section, each of which gets as many.
-      each: edges of a lobe where a round body has 96 in all; at least 6 are left of them.
+      cut: sampling of the surface; a round body has its number of segments as angles.
+      lobes: number of lobes of the section, each with as many angles.
+      each: edges of a lobe where a round body has 96 in all; never reduced below 6.
     """
     share = max(cut.segments / lobes, each * cut.segments / 96.0, 6.0)
     count = lobes * int(np.ceil(share))
@@ -98,9 +98,9 @@ def waves(count: int, depth: float, *, sharpness: float = 0.0) -> Section:
 
     Args:
       count: number of lobes.
-      depth: of the valleys, as a share of the radius.
-      sharpness: 0 for a cosine; towards 1 the ridges become narrow and the valleys wide, towards -1
-        the other way round.
+      depth: depth of the valleys, as a share of the radius.
+      sharpness: shape of the ridges: 0 is a cosine; towards 1 they become narrow and the valleys
+        wide, towards -1 the other way round.
     """
 
     def factor(angle: Values) -> Values:

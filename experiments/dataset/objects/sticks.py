@@ -20,8 +20,8 @@ class Stick(NamedTuple):
 
     Attributes:
       origin: a point of it, in world units.
-      way: where it goes; its upward component is positive.
-      radius: of the stick.
+      way: direction; its upward component is positive.
+      radius: radius of the stick.
     """
 
     origin: tuple[float, float, float]
@@ -34,10 +34,10 @@ def bundle(count: int, *, waist: float, height: float, slope: float, radius: flo
 
     Args:
       count: number of sticks.
-      waist: distance of each from the axis where they are closest.
-      height: of the waist.
-      slope: sideways per upwards; sticks slightly differ, as ones that were put there by hand.
-      radius: of each.
+      waist: distance of each stick from the axis where they are closest.
+      height: height of the waist.
+      slope: sideways per upwards; it varies slightly between sticks, as if placed by hand.
+      radius: radius of each stick.
     """
     sticks = []
     for number in range(count):

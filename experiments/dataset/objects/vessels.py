@@ -1,4 +1,4 @@
-"""Vessels and what is in them, as regions in the half plane, and the parts they become.
+"""Vessels and their contents, as regions in the half plane, and the resulting parts.
 
 An *outline* is a vessel's outer shape as if it were solid, the *space* what it can hold. An open
 vessel is one body of glass that covers its liquid by a thin *film*, below which the liquid fills
@@ -79,12 +79,11 @@ def space_in(
     """Returns the space in a vessel.
 
     Args:
-      outline: of the vessel.
-      wall: its least thickness.
+      outline: outline of the vessel.
+      wall: least thickness of the wall.
       floor: height of the space's bottom; by default it follows the outline.
       corner: radius to which the space's edges are rounded.
-      mouth: inner radius of the opening at the top, beyond which the space goes on; closed if not
-        given.
+      mouth: inner radius of the opening at the top, where the space continues; closed if not given.
     """
     if mouth is not None:
         height = top(outline)[1]
@@ -102,8 +101,8 @@ def hollow(outline: Region, space: Region, *, rim: float, inner: float = 0.05) -
     """Returns an empty vessel.
 
     Args:
-      outline: of the vessel.
-      space: in it; open if it goes on beyond the outline.
+      outline: outline of the vessel.
+      space: space inside; open if it extends beyond the outline.
       rim: radius to which the edges are rounded; less than half of the thinnest wall.
       inner: radius to which the corners are filled.
     """
@@ -122,8 +121,8 @@ def filled(
     """Returns an open vessel with a liquid up to a height, drawn up at the wall.
 
     Args:
-      outline: of the vessel.
-      space: in it.
+      outline: outline of the vessel.
+      space: space inside.
       level: height of the liquid's visible surface.
       rim: radius to which the glass's edges are rounded; less than half of the thinnest wall.
       film: thickness of the glass over the liquid.
@@ -195,12 +194,12 @@ def vessel(
     """Returns the parts of a vessel with a liquid: `shell`, `liquid`, and `air` if it is sealed.
 
     Args:
-      shapes: of glass, liquid and air.
-      cut: how finely.
-      liquid: what it is.
-      glass: of what the vessel is.
-      turned: how it is turned around its axis; round by default.
-      name: of the vessel, if the object has several; the parts' names begin with it.
+      shapes: regions of glass, liquid and air.
+      cut: sampling of the curves.
+      liquid: material of the liquid.
+      glass: material of the vessel.
+      turned: rotation around the vessel's axis; round by default.
+      name: name of the vessel if the object has several; prefix of the parts' names.
     """
     prefix = f"{name}_" if name else ""
     parts = [

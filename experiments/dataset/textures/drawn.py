@@ -1,4 +1,4 @@
-"""A map, a circuit board and an oil painting: pictures made of many lines."""
+"""A map, a circuit board and an oil painting: images made of many lines."""
 
 import math
 

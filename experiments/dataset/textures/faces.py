@@ -1,4 +1,4 @@
-"""The pool of square pictures for the walls of cubes."""
+"""The set of square images for background cubes."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -26,11 +26,11 @@ SIZE = 1024
 
 
 class Face(NamedTuple):
-    """How a picture is made.
+    """Recipe of an image.
 
     Attributes:
-      paint: from samples a side to sRGB values, which may lie a little outside 0 to 1.
-      samples: per pixel a side. Pictures made of stamps have soft outlines anyway.
+      paint: function from samples a side to sRGB values, which may lie a little outside 0 to 1.
+      samples: samples per pixel a side. Images made of stamps have soft outlines anyway.
     """
 
     paint: Callable[[int], Picture]
@@ -69,7 +69,7 @@ def make_face(name: str, size: int = SIZE) -> Float[np.ndarray, "size size 3"]:
     """Returns a picture, sRGB from 0 to 1 in float32, row 0 at the top.
 
     Args:
-      name: one of `FACES`.
+      name: name of an image in `FACES`.
       size: samples a side, 16 or more.
 
     Raises:

@@ -32,7 +32,7 @@ def noise(n: int, frequency: int | tuple[int, int], seed: int) -> Field:
     Args:
       n: samples a side.
       frequency: nodes of the lattice a side, or along x and along y.
-      seed: of the nodes.
+      seed: seed of the nodes.
     """
     along_x, along_y = (frequency, frequency) if isinstance(frequency, int) else frequency
     nodes = np.random.default_rng(seed).standard_normal((along_y, along_x), np.float32)

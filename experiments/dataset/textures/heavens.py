@@ -1,4 +1,4 @@
-"""Spheres of space: a nebula among stars, and the clouds of a giant planet."""
+"""Background spheres of space: a nebula among stars, and the clouds of a giant planet."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What weather and pressure paint: marble, rust, and the patterns of reaction and diffusion."""
+"""Marble, rust, and the patterns of reaction and diffusion."""
 
 import functools
 

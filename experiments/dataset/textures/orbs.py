@@ -1,4 +1,4 @@
-"""Spheres of matter: agate, leaded glass, coral, sandstone."""
+"""Background spheres of materials: agate, leaded glass, coral, sandstone."""
 
 import numpy as np
 

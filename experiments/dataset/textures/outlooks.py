@@ -1,4 +1,4 @@
-"""Panoramas of the open: a city by the water at night, and a wood in autumn."""
+"""Outdoor panoramas: a city by the water at night, and a wood in autumn."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Autumn leaves on the ground of a wood, and a meadow in flower."""
+"""Autumn leaves on a forest floor, and a meadow in flower."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Square rooms seen from their middle, papered with pictures of `faces`."""
+"""Square rooms seen from their middle, papered with images of `faces`."""
 
 from typing import NamedTuple
 
@@ -33,11 +33,12 @@ from experiments.dataset.textures.sphere_fields import directions, fbm3
 
 
 class Seen(NamedTuple):
-    """What a box room's samples see.
+    """Visible point of a box room for every sample.
 
     Attributes:
       wall: 0 to 3 for walls (+x, +y, -x, -y), 4 for the floor and 5 for the ceiling.
-      across: along a wall to the right, from its middle; x on floor and ceiling. World units.
+      across: position along a wall to the right, from its middle; x on floor and ceiling. World
+        units.
       up: height over the eye; y on floor and ceiling.
       half: half the wall's width.
       nearest: distance to the nearest edge of the room.
@@ -53,13 +54,13 @@ class Seen(NamedTuple):
 
 
 def box_room(height: int, half: tuple[float, float], floor: float, ceiling: float) -> Seen:
-    """Returns what an eye sees in a box.
+    """Returns the visible points of a box.
 
     Args:
-      height: rows of the picture.
+      height: rows of the image.
       half: half the room's length along x and along y.
-      floor: how far below the eye it is.
-      ceiling: how far above.
+      floor: distance of the floor below the eye.
+      ceiling: distance of the ceiling above the eye.
     """
     points = directions(height)
     x, y, z = points[..., 0], points[..., 1], points[..., 2]

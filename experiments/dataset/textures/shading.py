@@ -38,11 +38,11 @@ def chosen(share: np.ndarray, *codes: str) -> np.ndarray:
 
 
 def lit(picture: Picture, height: Field, *, gloss: float = 0.0, shininess: float = 30.0) -> Picture:
-    """Returns a picture as a relief in light from the upper left; what is flat is unchanged.
+    """Returns an image as a relief lit from the upper left; flat areas are unchanged.
 
     Args:
       picture: colours without light.
-      height: of the relief.
+      height: height of the relief.
       gloss: strength of highlights.
       shininess: exponent of highlights (Blinn and Phong).
     """

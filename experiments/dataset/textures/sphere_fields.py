@@ -80,7 +80,7 @@ def waves3(points: Directions, number: float, seed: int) -> Field:
     Args:
       points: positions.
       number: radians per unit of length.
-      seed: of directions and phases.
+      seed: seed of directions and phases.
     """
     rng = np.random.default_rng(seed)
     towards = rng.standard_normal((28, 3))
@@ -104,10 +104,10 @@ def averaged(paint: Callable[[int], Picture], height: int) -> Float[np.ndarray, 
 
 
 class SphereCells(NamedTuple):
-    """What every sample knows of its cell.
+    """Cell of every sample.
 
     Attributes:
-      index: of the cell.
+      index: index of the cell.
       border: distance to the nearest border, on the unit sphere.
       away: distance to the cell's seed.
     """
@@ -143,9 +143,9 @@ def lit_sphere(picture: Picture, height: Field, *, strength: float = 1.0) -> Pic
     """Returns a picture as a relief in light from one direction of space.
 
     Args:
-      picture: without light.
-      height: of the relief, in radii.
-      strength: of light and shade.
+      picture: colours without light.
+      height: height of the relief, in radii.
+      strength: strength of light and shade.
     """
     rows = height.shape[0]
     azimuth, elevation = angles(rows)

@@ -1,4 +1,4 @@
-"""The pool of pictures that are laid around a sphere."""
+"""The set of images for background spheres."""
 
 from collections.abc import Callable
 
@@ -34,7 +34,7 @@ def make_sphere(name: str, height: int = HEIGHT) -> Float[np.ndarray, "height wi
     """Returns a picture of `[height, 2 height]` samples, sRGB from 0 to 1 in float32.
 
     Args:
-      name: one of `SPHERES`.
+      name: name of an image in `SPHERES`.
       height: rows, 16 or more.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Things laid on a picture one over the other, each with its shadow.
+"""Lays stamps on an image one over the other, each with its shadow.
 
 In a stamp's own frame `u` and `v` go from about -1 to 1, `u` along it and `v` across.
 """
@@ -22,12 +22,12 @@ Paint = Callable[[Samples, Samples, Samples], Float[np.ndarray, "samples 3"]]
 
 
 class Place(NamedTuple):
-    """Where a stamp lies.
+    """Pose of a stamp.
 
     Attributes:
-      x, y: of its middle, on the unit square.
+      x, y: position of its middle, on the unit square.
       size: half its length.
-      angle: of `u` from x towards y, radians.
+      angle: angle of `u` from x towards y, radians.
     """
 
     x: float
@@ -48,14 +48,14 @@ def stamp(
     *,
     shadow: float = 0.55,
 ) -> None:
-    """Lays a stamp on a picture, in place; beyond a border it goes on at the opposite one.
+    """Lays a stamp on an image, in place; beyond a border it continues at the opposite one.
 
     Args:
-      picture: to lay on.
-      place: of the stamp.
-      distance: its outline.
-      paint: its colours.
-      shadow: how much darker it gets beneath, 0 to 1.
+      picture: image to lay the stamp on.
+      place: pose of the stamp.
+      distance: outline of the stamp.
+      paint: colours of the stamp.
+      shadow: darkening of the image beneath, 0 to 1.
     """
     reach = _MARGIN * place.size
     for right in (-1.0, 0.0, 1.0):

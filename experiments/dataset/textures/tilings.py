@@ -1,4 +1,4 @@
-"""Surfaces put together of pieces: leaded glass, mosaic, Truchet tiles, Penrose's rhombs."""
+"""Surfaces made of pieces: leaded glass, mosaic, Truchet tiles, Penrose's rhombs."""
 
 import numpy as np
 from jaxtyping import Int

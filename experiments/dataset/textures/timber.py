@@ -1,4 +1,4 @@
-"""Things of wood: parquet, painted planks, and what every board shares, its grain."""
+"""Wood: parquet, painted planks, and the grain of every board."""
 
 import numpy as np
 from jaxtyping import Int

@@ -1,4 +1,4 @@
-"""Writing that says nothing: glyphs of a few strokes each."""
+"""Illegible writing: glyphs of a few strokes each."""
 
 import numpy as np
 from jaxtyping import Float
@@ -35,10 +35,10 @@ def write(
     """Fills a box with one line of glyphs, as high as the box.
 
     Args:
-      draw: of the image.
-      box: of the line.
-      rng: decides which glyphs.
-      ink: their colour.
+      draw: drawing context of the image.
+      box: bounding box of the line.
+      rng: random generator that selects the glyphs.
+      ink: colour of the glyphs.
       weight: thickness of strokes, in heights of the line.
     """
     left, top, right, bottom = box
