@@ -1,4 +1,4 @@
-"""Cameras of a browser and cameras of a scene, and how pictures of one shape fill any window.
+"""Conversion between browser and scene cameras, and cropping of images to any window.
 
 A browser's camera has a vertical field of view and the aspect of its window, and its axes are x
 right, y down, z forward; ours are those of `geometry.cameras`. Aspects are width over height.
@@ -38,7 +38,7 @@ class Viewpoint(NamedTuple):
     Attributes:
       pose: camera to world, in the axes of `geometry.cameras`.
       fov: vertical field of view, radians.
-      aspect: of the window.
+      aspect: width of the window over its height.
     """
 
     pose: Float[np.ndarray, "3 4"]
@@ -70,7 +70,7 @@ def window_rays(view: Viewpoint, height: int) -> Rays:
 
     Args:
       view: the window's camera.
-      height: of the whole picture, pixels.
+      height: rows of the uncropped image.
 
     Returns:
       Rays `[rows, columns]`: `height` rows, or `width_of(height)` columns, and what is left of the
@@ -107,7 +107,7 @@ def containing_fov(views: Cameras, aspect: float) -> float:
 
     Args:
       views: cameras, of which only the intrinsics count.
-      aspect: of the window.
+      aspect: width of the window over its height.
     """
     tallest = max(float(views.height), views.width / aspect)
     return 2.0 * math.atan(0.5 * tallest / views.focal)

@@ -1,4 +1,4 @@
-"""What a page shows besides the picture: its panel of controls, and its 3D scene.
+"""The page around the image: its panel of controls and its 3D scene.
 
 The scene holds the objects, the test cameras and the light paths of a pixel. Functions take a
 `viser` page's `gui` or `scene` and never import that package.
@@ -53,8 +53,8 @@ class Panel:
         """Adds the controls.
 
         Args:
-          gui: of the page.
-          subject: what is looked at.
+          gui: GUI of the page.
+          subject: displayed run.
           changed: called after every choice that changes the picture.
           show_bodies: shows or hides the bodies.
           show_cameras: shows or hides the test cameras.
@@ -140,7 +140,7 @@ class Scenery:
         """Adds bodies and cameras, hidden.
 
         Args:
-          scene: of the page.
+          scene: 3D scene of the page.
           surfaces: the bodies; they may have no triangle.
           views: the test cameras.
         """

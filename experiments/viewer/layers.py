@@ -1,4 +1,4 @@
-"""What the viewer can show of a model, and how it is coloured.
+"""Layers that the viewer can display, and their colouring.
 
 - `rgb`: the picture.
 - `refraction only`, `reflection only`: two pictures whose linear colours sum to it. A light path
@@ -57,8 +57,8 @@ class Pixels(NamedTuple):
     """Some pixels of a test view, evenly spaced.
 
     Attributes:
-      rays: through their centres, `[h, w]`.
-      target: their true sRGB in `[0, 1]`.
+      rays: rays through the pixel centres, `[h, w]`.
+      target: true sRGB of the pixels, in `[0, 1]`.
     """
 
     rays: Rays
@@ -83,12 +83,12 @@ def draw(
 
     Args:
       model: the scene.
-      layer: one of those of the module.
-      rays: `[h, w]`.
-      chunk: paths rendered at once.
-      most: pixels of the largest picture of this size: what is cropped of it is filled up, so
-        that windows of all shapes share one program.
-      cancelled: asked before every band.
+      layer: name of a layer of this module.
+      rays: rays, `[h, w]`.
+      chunk: number of paths rendered at once.
+      most: pixels of the largest image of this size; smaller crops are padded to it, so that
+        windows of all shapes share one compiled program.
+      cancelled: callback that returns whether to stop; queried before every band.
 
     Returns:
       The picture, or `None` if it was called off.
@@ -133,9 +133,9 @@ def view_pixels(frames: Frames, i: int, most: int) -> Pixels:
     So no true colour is averaged, and a small picture's error is that of its pixels.
 
     Args:
-      frames: of the split.
-      i: which view.
-      most: pixels that are wanted at most.
+      frames: frames of the split.
+      i: index of the view.
+      most: largest number of pixels.
     """
     height, width = frames.cameras.height, frames.cameras.width
     stride = max(1, math.ceil(math.sqrt(height * width / most)))
@@ -151,9 +151,9 @@ def with_indices(interfaces: Interfaces, indices: Sequence[float], rule: str) ->
     """Returns interfaces with other indices of refraction, one a part, and all else as it was.
 
     Args:
-      interfaces: of the scene.
-      indices: of the inside of each part; what follows for the outsides is the rule's to say.
-      rule: the scene's, a name in `interface_rules.RULES`.
+      interfaces: interfaces of the scene.
+      indices: index of refraction inside each part; the rule decides those outside.
+      rule: rule of the scene, a name in `interface_rules.RULES`.
     """
     parents = [int(medium) - 1 for medium in interfaces.medium_outside]
     made = RULES[rule](indices, parents)

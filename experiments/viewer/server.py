@@ -1,4 +1,4 @@
-"""The server of the viewer, and what it does for each page that is open.
+"""The viewer's server, and the worker of each open page.
 
 Every page has a camera, a panel and a scene of its own, and one thread that draws for it what
 `session` schedules. Pages take turns: one picture is drawn at a time.
@@ -47,9 +47,9 @@ def serve(subject: Subject, *, host: str, port: int) -> viser.ViserServer:
     """Starts a server, which runs in threads of its own until it is stopped.
 
     Args:
-      subject: what is looked at.
-      host: address that it listens on.
-      port: the first port to try; its own method `get_port` tells which it is.
+      subject: run to display.
+      host: address to listen on.
+      port: first port to try; the server's method `get_port` returns the actual one.
     """
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints a box
         server = viser.ViserServer(host=host, port=port, label=subject.name, verbose=False)

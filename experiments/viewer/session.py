@@ -1,4 +1,4 @@
-"""The state of a page: what is looked at, what was chosen, and which picture to draw next.
+"""The state of a page: the displayed run, its settings, and the next image to draw.
 
 The second part is a state machine without clock, threads or pictures. Everything that changes what
 is to be seen, a moving camera or a slider, is a *change*. Pictures are drawn in *stages*, small to
@@ -41,16 +41,16 @@ STILL = 0.25
 
 @dataclasses.dataclass(frozen=True)
 class Subject:
-    """What is looked at.
+    """Displayed run.
 
     Attributes:
-      name: of the run.
+      name: name of the run.
       model: the scene.
-      rule: what lies outside each part, a name in `interface_rules.RULES`.
-      frames: the scene's test views, if it is there.
+      rule: outside medium of each part, a name in `interface_rules.RULES`.
+      frames: test views of the scene, if it exists.
       parts: name of each part.
-      heights: of the pictures before they are cropped, pixels, from small to large.
-      chunk: paths rendered at once.
+      heights: heights of the images before cropping, pixels, ascending.
+      chunk: number of paths rendered at once.
     """
 
     name: str
@@ -74,13 +74,13 @@ class Subject:
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """What a user has chosen on the panel.
+    """Settings that a user has chosen on the panel.
 
     Attributes:
-      layer: what is shown.
-      indices: of refraction, of each part.
-      cut: smallest throughput that is followed.
-      bends: most bends of a path.
+      layer: displayed layer.
+      indices: index of refraction of each part.
+      cut: throughput threshold.
+      bends: largest number of bends of a path.
     """
 
     layer: str
@@ -106,11 +106,11 @@ class State(NamedTuple):
 
 
 class Job(NamedTuple):
-    """A picture to draw.
+    """An image to draw.
 
     Attributes:
-      change: what it shows is as it was after this change, or later.
-      stage: its size.
+      change: number of a change; the image shows the state after it, or after a later one.
+      stage: size of the image.
     """
 
     change: int
