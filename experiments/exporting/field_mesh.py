@@ -1,4 +1,4 @@
-"""Density and colours of a trained run: sampled on a grid, as a surface or points, written as PLY.
+"""Exports density and colours of a trained run: sampled on a grid, as a surface or points, as PLY.
 
 A surface of the density is where it crosses a level. It is looked for in the logarithm, since
 densities grow by factors, and stays open at the borders of the grid. Inside the objects there is no
@@ -49,7 +49,7 @@ class DensitySurface(NamedTuple):
     Attributes:
       vertices: world units.
       faces: counter-clockwise seen from where the density is lower.
-      normals: of the vertices, unit, towards lower density.
+      normals: unit normals of the vertices, towards lower density.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
@@ -117,8 +117,8 @@ def look_up_points(
     Args:
       model: the trained model.
       points: world units.
-      directions: of view; `None` where colours do not matter.
-      width: edge of the cell that a point stands for, world units.
+      directions: unit view directions; `None` if colours are not needed.
+      width: edge of the cell around each point, world units.
     """
     if directions is None:
         directions = np.tile(_ASKEW, (len(points), 1))
@@ -209,9 +209,9 @@ def with_sphere(density: Grid, *, level: float, radius: float) -> Grid:
     """Returns the density with a surface on a sphere around the origin, as `with_walls` has it.
 
     Args:
-      density: per world unit.
-      level: of the surface.
-      radius: of the sphere, on which a spherical model ends, world units.
+      density: density per world unit.
+      level: level of the surface.
+      radius: radius of the sphere that bounds a spherical model, world units.
     """
     axes = [
         low + density.spacing * np.arange(count)

@@ -1,4 +1,4 @@
-"""Writes the bodies that bend light as PLY, with the normals that bend it.
+"""Writes the refractive objects as PLY, with their shading normals.
 
 A run keeps them itself, in single precision; a reconstruction keeps its surface as a file.
 """
@@ -20,9 +20,9 @@ def write(run: Path, out: Path, *, overwrite: bool) -> list[Path]:
     """Writes all bodies of a run, or of a reconstruction; each has a file of its own.
 
     Args:
-      run: the folder.
-      out: of one body, its file; of several, their names are numbered: `out_0.ply`, `out_1.ply`.
-      overwrite: whether files may be replaced.
+      run: folder of the run or reconstruction.
+      out: file of the mesh; several meshes are numbered: `out_0.ply`, `out_1.ply`.
+      overwrite: whether existing files may be replaced.
 
     Returns:
       The files.
