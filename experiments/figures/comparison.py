@@ -1,4 +1,4 @@
-"""Pictures for people, drawn with matplotlib."""
+"""Comparison figures, drawn with matplotlib."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +24,7 @@ class Comparison(NamedTuple):
     """One view, true and rendered.
 
     Attributes:
-      name: of the view.
+      name: name of the view.
       target: true sRGB in `[0, 1]`.
       rgb: rendered sRGB in `[0, 1]`.
       distance: rendered distance, world units; `None` for all views, or for none.

@@ -1,4 +1,4 @@
-"""Bodies and light in a horizontal plane through the origin, to be drawn from above.
+"""Cross-sections of objects and light paths in a horizontal plane through the origin.
 
 A ray in the plane z = 0 stays there around a body that the plane cuts in half, as a ball, so a
 drawing of it is no projection. Around others a drawing shows the paths from above.
@@ -29,8 +29,8 @@ class Line(NamedTuple):
     """One light path from above.
 
     Attributes:
-      points: its polyline, the last of them at the edge of the picture.
-      share: of the pixel's light, mean over RGB.
+      points: vertices of the polyline; the last one is at the edge of the figure.
+      share: share of the pixel's light, mean over RGB.
     """
 
     points: Float[np.ndarray, "points 2"]
@@ -38,11 +38,11 @@ class Line(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """One picture of light paths.
+    """One figure of light paths.
 
     Attributes:
-      title: above it.
-      paths: of each ray.
+      title: title above the figure.
+      paths: paths of each ray.
     """
 
     title: str
@@ -76,8 +76,8 @@ def rays_towards(distance: float, heights: Sequence[float]) -> list[Rays]:
     """Returns rays in the plane, from a camera on the negative x axis.
 
     Args:
-      distance: of the camera from the origin, world units.
-      heights: where each ray crosses the y axis, or would without objects.
+      distance: distance of the camera from the origin, world units.
+      heights: height at which each ray crosses the y axis, or would without objects.
     """
     origin = np.array([-distance, 0.0, 0.0], np.float32)
     targets = np.array([[0.0, height, 0.0] for height in heights], np.float32)

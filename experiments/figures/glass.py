@@ -1,4 +1,4 @@
-"""The figures of docs/glass.md, of scenes with known walls: what they show, and how it is drawn."""
+"""Draws the figures of docs/glass.md, of scenes with a known background."""
 
 import dataclasses
 import functools
@@ -71,11 +71,11 @@ class Shown(NamedTuple):
 
 
 def draw_views(scene: KnownScene, path: Path, *, side: int) -> None:
-    """Draws the true image, and what three kinds of light paths make of it.
+    """Draws the true image, and renderings with three kinds of light paths.
 
     Args:
-      scene: with one view.
-      path: of the picture.
+      scene: scene with one view.
+      path: output file.
       side: camera rays along each edge of a pixel.
     """
     shown = [_truth(scene)]
@@ -89,10 +89,10 @@ def draw_fan(scene: KnownScene, folder: Path, half: float, path: Path) -> None:
     """Draws a fan of camera rays, straight and bent.
 
     Args:
-      scene: what bends them.
-      folder: of the scene, whose meshes are cut.
-      half: half the edge of the walls' cube, world units.
-      path: of the picture.
+      scene: refractive scene.
+      folder: folder of the scene; its meshes are cut.
+      half: half the edge of the background cube, world units.
+      path: output file.
     """
     outlines = cross_sections.outlines_of(meshes.read_meshes(folder))
     reach = 1.2 * cross_sections.width_of(outlines)
@@ -106,12 +106,12 @@ def draw_fan(scene: KnownScene, folder: Path, half: float, path: Path) -> None:
 
 
 def draw_tree(scene: KnownScene, folder: Path, path: Path) -> None:
-    """Draws the light paths of one ray under three budgets, and under a finer one.
+    """Draws the light paths of one ray under three presets, and under a finer one.
 
     Args:
-      scene: what bends it.
-      folder: of the scene, whose meshes are cut.
-      path: of the picture.
+      scene: refractive scene.
+      folder: folder of the scene; its meshes are cut.
+      path: output file.
     """
     outlines = cross_sections.outlines_of(meshes.read_meshes(folder))
     rays = cross_sections.rays_towards(_CAMERA, [_AIM * cross_sections.width_of(outlines)])
@@ -131,9 +131,9 @@ def draw_distances(scene: KnownScene, half: float, path: Path) -> None:
     """Draws three distances of a pixel: to the glass, the wall behind, and the wall it shows.
 
     Args:
-      scene: with one view.
-      half: half the edge of the walls' cube, world units.
-      path: of the picture.
+      scene: scene with one view.
+      half: half the edge of the background cube, world units.
+      path: output file.
     """
     rays = cameras.image_rays(scene.frames.cameras, 0)
     first = find_first_surface(scene.geometry.surfaces, rays).distances

@@ -1,4 +1,4 @@
-"""What all figures share: matplotlib without a screen, colours, and plain axes."""
+"""Shared style of all figures: matplotlib without a screen, colours, and plain axes."""
 
 import matplotlib
 

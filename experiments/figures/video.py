@@ -1,4 +1,4 @@
-"""Writes pictures as a video: always as GIF, and as mp4 where there is an FFmpeg to do it."""
+"""Writes images as a video: always as GIF, and as mp4 if FFmpeg is installed."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,9 +32,9 @@ def write(
     """Writes a video, replacing those of before.
 
     Args:
-      stem: of the files' names; the endings are added.
-      frames: sRGB, all of one size.
-      fps: frames a second.
+      stem: stem of the file names; the suffixes are appended.
+      frames: sRGB frames, all of one size.
+      fps: frames per second.
 
     Returns:
       The files: the GIF, and the mp4 if there is an FFmpeg.
