@@ -31,12 +31,12 @@ _COSTS = {
 
 
 class Setting(NamedTuple):
-    """One light budget of a sweep.
+    """One setting of a sweep over path settings.
 
     Attributes:
-      sweep: what it varies, `cut` or `bends`; `budget` for a point alone.
-      name: how figures call it.
-      budget: which light is followed.
+      sweep: varied option, `cut` or `bends`; `budget` for a single preset.
+      name: label in figures.
+      budget: path settings.
     """
 
     sweep: str
@@ -45,21 +45,21 @@ class Setting(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """What one budget cost and gave on one scene: means over its views, one ray a pixel.
+    """Cost and quality of one setting on one scene: means over its views, one ray per pixel.
 
     Attributes:
-      scene: its name.
-      sweep: which option is varied: `cut`, `bends`, or `budget` for a point alone.
-      name: value of that option, or name of the budget.
-      cut: smallest throughput followed.
-      bends: most bends.
-      psnr: over the image, dB.
-      psnr_masked: inside the mask.
-      psnr_outside: outside the mask.
-      casts_per_pixel: closest-hit queries.
-      paths_per_pixel: light paths.
-      seconds_per_pixel: of rendering.
-      lost_energy: share of light that found no room.
+      scene: name of the scene.
+      sweep: varied option: `cut`, `bends`, or `budget` for a single preset.
+      name: value of that option, or name of the preset.
+      cut: throughput threshold.
+      bends: max bends.
+      psnr: PSNR over the image, dB.
+      psnr_masked: masked PSNR, dB.
+      psnr_outside: PSNR outside the mask, dB.
+      casts_per_pixel: closest-hit queries per pixel.
+      paths_per_pixel: light paths per pixel.
+      seconds_per_pixel: rendering time per pixel, seconds.
+      lost_energy: share of the throughput that was dropped because the path buffer was full.
     """
 
     scene: str
@@ -123,11 +123,11 @@ def write_figures(folder: Path, trials: Sequence[Trial]) -> list[Path]:
     """Draws each sweep against casts and against time, one line a scene.
 
     Args:
-      folder: where to write.
-      trials: of all scenes.
+      folder: output folder.
+      trials: trials of all scenes.
 
     Returns:
-      The files, none of a sweep that was not made.
+      The files; none for a sweep without trials.
     """
     made = {trial.sweep for trial in trials}
     return [_write_sweep(folder, trials, sweep) for sweep in _SWEEPS if sweep in made]

@@ -1,4 +1,4 @@
-"""The points of a sweep, as data: a base, and around it one option changed at a time.
+"""The points of a sweep: a base, and variants with one changed option each.
 
 A *knob* is an option of `experiments.train`, or `rays_per_pixel`, one of `experiments.evaluate`. A
 point is named after the knob and its value, as `cut=0.01`; commas become `+`, so that points can be
@@ -32,11 +32,11 @@ class Point(NamedTuple):
     """One training and one evaluation.
 
     Attributes:
-      name: `base`, or knob and value.
-      knob: the option that is changed; empty for the base.
-      value: of the knob; empty for the base.
+      name: `base`, or option and value.
+      knob: changed option; empty for the base.
+      value: value of that option; empty for the base.
       training: options of `experiments.train`, as `--name=value`, without scene and folder.
-      evaluation: options of `experiments.evaluate`.
+      evaluation: options of `experiments.evaluate`, likewise.
     """
 
     name: str
@@ -57,16 +57,17 @@ def sweep(
 ) -> list[Point]:
     """Returns the base and all points around it; a point that equals the base is left out.
 
-    Straight light has no cut, no bends and no inside, so that none of them is given beside it.
+    Straight rays have no throughput threshold, bends or interior, so these options are not combined
+    with them.
 
     Args:
-      preset: of the base.
-      seed: of all trainings.
-      steps: the base's first, then those of further trainings; by default the preset's own, and a
-        quarter, half and twice of them. One number alone leaves the steps as they are.
-      base: options of the base, over the preset's.
-      values: of a knob, in place of those of `default_values`; new knobs are added.
-      knobs: only these; all if `None`.
+      preset: preset of the base.
+      seed: seed of all trainings.
+      steps: number of steps of the base, then those of further trainings; by default the preset's
+        own, and a quarter, half and twice of them. A single number keeps the steps constant.
+      base: options of the base that override the preset.
+      values: values of an option, in place of those of `default_values`; new options are added.
+      knobs: names of the options to vary; all if `None`.
 
     Raises:
       ValueError: if a preset or knob does not exist, or the base has options of its own.

@@ -1,4 +1,4 @@
-"""Chooses what to train with in the time that there is, from a measured table; see `recommend`.
+"""Recommends training options for a time limit from a measured table; see `recommend`.
 
 `combine` guesses what several turns give together, by what each gave alone: gains in dB are added,
 and times of a step and of an image multiplied. Options are taken for independent, which they are
@@ -26,12 +26,12 @@ _SAME_TIME = 1.0 + trade_table.TIME_NOISE / 100.0
 
 @dataclasses.dataclass(frozen=True)
 class Machine:
-    """How this machine compares with that of a table.
+    """Speed of this machine relative to that of a table.
 
     Attributes:
       ratio: time of a step here over that in the table.
-      startup: seconds that a command takes beside its steps: starting, compiling, saving.
-      images: that an evaluation renders.
+      startup: seconds that a command takes in addition to its steps: starting, compiling, saving.
+      images: number of images that an evaluation renders.
     """
 
     ratio: float
@@ -47,8 +47,8 @@ class Choice:
       best: the cheapest of those that fit and that none beats; the base, if it is as good.
       cheaper: the best that takes less time; `None` if there is none.
       dearer: the cheapest that gives more, which does not fit; `None` if none was measured.
-      combined: what single turns are expected to give together, if that is more than the best;
-        it was not measured.
+      combined: expected joint gain of the single changes, if it exceeds that of the best; it was
+        not measured.
     """
 
     best: Row

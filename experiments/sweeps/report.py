@@ -105,8 +105,8 @@ def write_figure(path: Path, rows: Sequence[Row]) -> None:
     """Draws the points of a sweep against both costs.
 
     Args:
-      path: of the picture.
-      rows: of one scene, with the base.
+      path: output file.
+      rows: rows of one scene, with the base.
     """
     knobs = list(dict.fromkeys(row.knob for row in rows))
     styles = {

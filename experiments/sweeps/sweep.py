@@ -1,4 +1,4 @@
-"""Sweeps: points are measured one by one, and written as a table, a figure and a report."""
+"""Runs sweeps: measures points one by one, and writes a table, a figure and a report."""
 
 import dataclasses
 import hashlib
@@ -67,7 +67,7 @@ def earlier_rows(out: Path, base: Point, scene: Path, *, images: int) -> list[Ro
       out: folder of the sweeps.
       base: the base point.
       scene: folder of the scene.
-      images: that an evaluation renders.
+      images: number of images that an evaluation renders.
 
     Raises:
       ValueError: if they were around another base, of another scene, or on other images.

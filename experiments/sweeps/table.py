@@ -1,4 +1,4 @@
-"""The measured trade of speed for accuracy: a table, what of it is worth having, and in words."""
+"""The measured trade-off between speed and accuracy: its table, Pareto front and summary."""
 
 import csv
 import dataclasses
@@ -19,15 +19,15 @@ TIME_NOISE = 3.0
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """A point that was measured; the fields without a note are those of `trained_runs`.
+    """A measured point; undocumented fields are those of `trained_runs`.
 
     Attributes:
-      scene: name of its folder.
-      name: of the point.
-      knob: the option that differs from the base; empty for the base.
-      value: of the knob.
-      training: options of `experiments.train`, with blanks between.
-      evaluation: options of `experiments.evaluate`.
+      scene: name of the scene's folder.
+      name: name of the point.
+      knob: option that differs from the base; empty for the base.
+      value: value of that option.
+      training: options of `experiments.train`, separated by blanks.
+      evaluation: options of `experiments.evaluate`, likewise.
     """
 
     scene: str
@@ -63,13 +63,13 @@ class Row:
 
 
 class Turn(NamedTuple):
-    """What changing one knob brings.
+    """Effect of changing one option.
 
     Attributes:
       row: the changed point.
       gain: dB over the base.
-      percent: of time that it takes more than the base: of training, or, if the knob is one of
-        evaluation, of rendering.
+      percent: additional time relative to the base: training time or, for an option of evaluation,
+        rendering time.
     """
 
     row: Row
