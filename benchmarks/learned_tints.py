@@ -1,4 +1,4 @@
-"""Claim: a few learned colours beat a learned volume inside coloured glass, and are the true ones.
+"""Claim: learned tints beat a learned volume inside coloured glass, and match the true colours.
 
     python -m benchmarks.learned_tints --scene=FOLDER [--steps=N] [--rays_per_pixel=N]
 

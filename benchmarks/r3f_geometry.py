@@ -1,4 +1,4 @@
-"""Claim: masks alone give convex bodies silhouettes that overlap by 0.985, and a ball its normals.
+"""Claim: masks alone give convex objects silhouettes with an IoU of 0.985, and a ball its normals.
 
     python -m benchmarks.r3f_geometry [--views=N] [--size=PIXELS] [--resolution=N]
 

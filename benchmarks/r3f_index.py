@@ -1,4 +1,4 @@
-"""Claim: the index of refraction is found within 0.005 with the true mesh, within 0.02 without.
+"""Claim: the estimated index of refraction is within 0.005 with the true mesh, 0.02 without.
 
     python -m benchmarks.r3f_index [--scenes=FOLDER,FOLDER] [--starts=1.2,2.0] [--bodies=true,masks]
 

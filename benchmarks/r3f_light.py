@@ -1,4 +1,4 @@
-"""Claim: refinement by light explains pixels better that it was not fitted to.
+"""Claim: refinement by light improves pixels that it was not fitted to.
 
     python -m benchmarks.r3f_light [--scene=FOLDER] [--steps=N]
 

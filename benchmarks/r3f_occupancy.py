@@ -1,4 +1,4 @@
-"""Claim: a field trained on masks is about as near a scene's body as their hull is.
+"""Claim: an occupancy field trained on masks is about as accurate as their visual hull.
 
     python -m benchmarks.r3f_occupancy [--scene=FOLDER] [--masks=given,uneven,shifted]
 

@@ -1,4 +1,4 @@
-"""Claim: masks of a rendered scene give silhouettes that overlap by 0.985, and a ball its normals.
+"""Claim: masks of a rendered scene give silhouettes with an IoU of 0.985, and a ball its normals.
 
     python -m benchmarks.r3f_scenes [--scenes=FOLDER,FOLDER] [--resolution=N]
 

@@ -1,4 +1,4 @@
-"""Claim: a body reconstructed from masks and images beats straight light inside it by 3 dB.
+"""Claim: an object reconstructed from masks and images beats straight rays by 3 dB masked PSNR.
 
     python -m benchmarks.r3f_versus_straight [--scenes=FOLDER,FOLDER] [--steps=N] [--limit=N]
 
@@ -39,15 +39,15 @@ _INDEX_ERROR = 0.02
 
 
 class Trial(NamedTuple):
-    """What a scene's trainings gave.
+    """Results of a scene's trainings.
 
     Attributes:
       scene: name of its folder.
-      index: what R3F took for the body's.
-      true_index: of its mesh; `None` if there are several.
-      straight: without the objects.
-      r3f: with the reconstructed body.
-      oracle: with the scene's meshes.
+      index: index of refraction that R3F estimated.
+      true_index: index of the mesh; `None` if there are several.
+      straight: result without the objects.
+      r3f: result with the reconstructed object.
+      oracle: result with the scene's meshes.
     """
 
     scene: str

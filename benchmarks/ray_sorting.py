@@ -1,4 +1,4 @@
-"""Puts rays in an order in which neighbours share their way through the tree.
+"""Sorts rays so that neighbours share their traversal of the tree.
 
 Two rays need the same nodes where they run in one octant of directions, start in one region and
 leave in one region. So a ray's key is its octant, then the cell of its origin in the scene's box
@@ -50,8 +50,8 @@ def closest_hits_sorted(
     Args:
       bvh: the scene.
       rays: any number of rays.
-      limits: as for `bvh.closest_hits`.
-      leaving: as for `bvh.closest_hits`.
+      limits: see `bvh.closest_hits`.
+      leaving: see `bvh.closest_hits`.
 
     Returns:
       The hits, in the order of the rays as they were given.

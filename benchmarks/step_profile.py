@@ -1,4 +1,4 @@
-"""Claim: tracing paths anew takes at most a quarter of a training step along the path tree.
+"""Claim: tracing paths takes at most a quarter of a training step along the path tree.
 
     python -m benchmarks.step_profile [--scene=FOLDER] [--preset=tiny] [--paths=tree] [--rounds=N]
 
@@ -45,11 +45,12 @@ _COPIED = 1 << 26
 
 
 class _Points(NamedTuple):
-    """What the fields are asked in one step.
+    """Field queries of one step.
 
     Attributes:
-      rounds: Gaussians `[paths, samples, multisamples]` of each proposal and of the final round.
-      directions: of the final round.
+      rounds: Gaussians `[paths, samples, multisamples]` of each proposal level and of the final
+        level.
+      directions: view directions of the final level.
     """
 
     rounds: list[Gaussians]

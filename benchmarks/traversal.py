@@ -1,4 +1,4 @@
-"""Claim: on one core rays are traced at Embree's speed, and half of it if they come shuffled.
+"""Claim: on one core, rays are traced at Embree's speed, or half of it if they are shuffled.
 
     taskset -c 0 python -m benchmarks.traversal [--rounds=N] [--meshes=NAME,...] [--any_speed]
 

@@ -1,4 +1,4 @@
-"""Claim: with the same training, following the tree beats the paper's paths inside the object.
+"""Claim: with the same training, the path tree beats the paper's paths in masked PSNR.
 
     python -m benchmarks.tree_versus_paper [--scenes=FOLDER,FOLDER] [--curve_steps=500,1000,2500]
 
@@ -38,13 +38,13 @@ _MEAN_GAIN = 2.5
 
 
 class Duel(NamedTuple):
-    """Both trainings of a scene, and what they gave.
+    """Both trainings of a scene, and their results.
 
     Attributes:
       scene: name of its folder.
-      steps: of both.
-      cost: of the paper's training and the tree's.
-      result: of the paper's and the tree's evaluation.
+      steps: number of steps of both.
+      cost: cost of the paper's training and of the tree's.
+      result: result of the paper's and of the tree's evaluation.
     """
 
     scene: str
