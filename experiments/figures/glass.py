@@ -32,18 +32,18 @@ from refref_jax.sampling.domains import Domain
 _NAMES = {"straight": "straight light", "paper": "the paper's paths", "tree": "the path tree"}
 
 _CAMERA = 4.0
-"""Distance of the camera that is drawn from the origin, as in the data set; world units."""
+"""Distance of the drawn camera from the origin, as in the data set; world units."""
 
 _RAYS_OF_A_FAN = 15
 
-# Where the one ray of a tree is aimed, as a share of the body's width: near the rim, where
+# Target of the single ray of a tree, as a share of the object's width: near the rim, where
 # reflections carry some of the light.
 _AIM = 0.9
 
-# Share of the light below which a branch of the finer tree is not followed: the scale's end.
+# Throughput threshold of the finer tree: the end of the colour scale.
 _FINER = 1e-3
 
-# Beyond any wall: last segments are cut where the picture ends.
+# Beyond the background: last segments are cut at the edge of the figure.
 _FAR = 100.0
 
 _DPI = 150
@@ -57,12 +57,12 @@ _DISTANCES = "viridis"
 
 
 class Shown(NamedTuple):
-    """One picture of a row.
+    """One image of a row.
 
     Attributes:
-      title: above it.
+      title: title above the image.
       rgb: sRGB in `[0, 1]`.
-      psnr: inside the mask against the first picture of the row, dB; `None` for that one.
+      psnr: masked PSNR relative to the first image of the row, dB; `None` for that one.
     """
 
     title: str
@@ -128,7 +128,7 @@ def _follow(scene: KnownScene, rays: list[Rays], budget: Budget) -> list[PixelPa
 
 
 def draw_distances(scene: KnownScene, half: float, path: Path) -> None:
-    """Draws three distances of a pixel: to the glass, the wall behind, and the wall it shows.
+    """Draws three distances of a pixel: glass, background behind it, and visible background.
 
     Args:
       scene: scene with one view.
@@ -156,7 +156,7 @@ def draw_distances(scene: KnownScene, half: float, path: Path) -> None:
 def _walls(
     geometry: Scene, rays: Rays, half: float
 ) -> tuple[Float[Array, " rays"], Float[Array, " rays"]]:
-    """Returns how far light goes to the walls, straight on and refracted; arc length."""
+    """Returns the arc length of light to the background, straight and refracted."""
     leave = jax.vmap(functools.partial(domains.exit_distance, Domain(half, "bounded")))
     # Without reflections every ray has one path.
     ends = path_tracing.trace_ends(geometry, rays, budget=BUDGETS["paper_no_reflection"]).ends
@@ -203,7 +203,7 @@ def write_views(path: Path, views: Sequence[Shown]) -> None:
 def write_fan(
     path: Path, panels: Sequence[Panel], outlines: Sequence[Outline], half: float
 ) -> None:
-    """Draws many rays of a camera, each in a colour of its own, up to the walls of a room."""
+    """Draws many rays of a camera, each in its own colour, up to the background cube."""
     figure, axes = pyplot.subplots(
         1, len(panels), figsize=(4.6 * len(panels), 4.9), layout="constrained", squeeze=False
     )
@@ -220,7 +220,7 @@ def write_fan(
 
 
 def write_tree(path: Path, panels: Sequence[Panel], outlines: Sequence[Outline]) -> None:
-    """Draws the light paths of one ray, coloured and labelled by the light that they carry."""
+    """Draws the light paths of one ray, coloured and labelled by their share of the light."""
     half = 3.0 * max(float(np.max(np.abs(outline))) for outline in outlines)
     figure, axes = pyplot.subplots(
         1, len(panels), figsize=(3.3 * len(panels) + 0.8, 3.7), layout="constrained", squeeze=False
@@ -247,7 +247,7 @@ def write_tree(path: Path, panels: Sequence[Panel], outlines: Sequence[Outline])
 def write_distances(
     path: Path, truth: Shown, maps: Sequence[tuple[str, Float[np.ndarray, "h w"]]]
 ) -> None:
-    """Draws a picture beside maps of distances on one scale; what has none is white."""
+    """Draws an image next to distance maps on one scale; missing distances are white."""
     count = 1 + len(maps)
     figure, axes = pyplot.subplots(
         1, count, figsize=(2.75 * count + 0.6, 3.2), layout="constrained", squeeze=False
@@ -282,7 +282,7 @@ def _draw_body(axis: pyplot.Axes, outlines: Sequence[Outline], half: float) -> N
 
 
 def _label_shares(axis: pyplot.Axes, lines: Sequence[Line], half: float) -> None:
-    """Writes each path's share beside its end, a little inside of the frame."""
+    """Writes each path's share next to its end, slightly inside the frame."""
     for line in lines:
         end, before = line.points[-1], line.points[-2]
         back = (before - end) / np.linalg.norm(before - end)
