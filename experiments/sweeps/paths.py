@@ -77,7 +77,7 @@ class Trial(NamedTuple):
 
 
 def measure_all(chosen: list[KnownScene], plan: list[Setting], side: int) -> Iterator[Trial]:
-    """Renders every scene with every budget; equal budgets are rendered once."""
+    """Renders every scene with every setting; equal path settings are rendered once."""
     for scene in chosen:
         known: dict[Budget, Trial] = {}
         for setting in plan:
@@ -87,7 +87,7 @@ def measure_all(chosen: list[KnownScene], plan: list[Setting], side: int) -> Ite
 
 
 def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
-    """Renders all views of a scene with one budget."""
+    """Renders all views of a scene with one setting."""
     known_scenes.warm_up(scene, setting.budget)
     views, measured = [], []
     for i in range(len(scene.indices)):
@@ -112,7 +112,7 @@ def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
 
 
 def write_table(path: Path, trials: Sequence[Trial]) -> None:
-    """Writes a CSV, one row a trial."""
+    """Writes a CSV, one row per trial."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(Trial._fields)
@@ -120,7 +120,7 @@ def write_table(path: Path, trials: Sequence[Trial]) -> None:
 
 
 def write_figures(folder: Path, trials: Sequence[Trial]) -> list[Path]:
-    """Draws each sweep against casts and against time, one line a scene.
+    """Draws each sweep against casts and against time, one line per scene.
 
     Args:
       folder: output folder.
@@ -186,9 +186,9 @@ def _draw_scene(
 def _label_points(
     axis: pyplot.Axes, trials: Sequence[Trial], cost: str, scale: float, colours: dict[str, str]
 ) -> None:
-    """Labels points with the option's value, but none where another label is."""
+    """Labels points with the option's value, except where labels would overlap."""
     taken: list[tuple[float, float]] = []
-    # The ends of the lines first: what lies between them can be guessed.
+    # Ends of lines come first: intermediate values can be guessed.
     lines = [[trial for trial in trials if trial.scene == scene] for scene in colours]
     ends = [trial for line in lines for trial in (line[0], line[-1])]
     for trial in ends + [trial for line in lines for trial in line[1:-1]]:
@@ -210,7 +210,7 @@ def _label_points(
 
 
 def _fixed(trials: Sequence[Trial], sweep: str) -> str:
-    """Returns what all trials of a sweep have in common."""
+    """Returns the value that is constant over all trials of a sweep, as text."""
     other = "bends" if sweep == "cut" else "cut"
     values = {getattr(trial, other) for trial in trials if trial.sweep == sweep}
     return f"; {other} {values.pop():g}" if len(values) == 1 else ""

@@ -21,27 +21,27 @@ _COSTS: dict[str, Callable[[Row], float]] = {
 _FRONT = "#999999"
 _MARKERS = "osD^vP"
 
-# Decibels below the best beyond which a point stands at the figure's foot, with its number: it
-# would press all others together.
+# Points this many decibels below the best are drawn at the bottom, labelled with their PSNR: they
+# would compress the scale of all others.
 _DEPTH = 10.0
 
-# Of a letter of a label, in pixels of the figure.
+# Width of a letter of a label, in pixels of the figure.
 _LETTER_WIDTH = 6.5
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """Returns the text of a report on a sweep; its figure is expected beside it."""
+    """Returns the text of a report on a sweep; its figure must be in the same folder."""
     base = trade_table.base_of(rows)
     found = trade_table.turns(rows)
     parts = [
-        f"# The trade of speed for accuracy on {base.scene}",
+        f"# Trade-off between speed and accuracy on {base.scene}",
         f"Base: `{base.training}`{base.evaluation and f', evaluated with `{base.evaluation}`'}. "
         "Every other point changes one option of it, and is trained from the same seed. Errors are "
         f"means over {base.images} test images. Training is the time of all steps, compiling "
         "excluded; device memory is empty where there is no accelerator.",
         "![PSNR against time](trade_off.png)",
-        f"## What to turn first\n\n{_first_table(trade_table.worth_turning(found))}",
-        f"## What saves time\n\n{_saving_table(trade_table.worth_saving(found))}",
+        f"## Options to change first\n\n{_first_table(trade_table.worth_turning(found))}",
+        f"## Options that save time\n\n{_saving_table(trade_table.worth_saving(found))}",
         "## All points\n\nCheapest first; ● marks those that no other point beats in both training "
         f"time and PSNR. Differences below {NOISE:g} dB are noise.\n\n{_all_points(rows)}",
     ]
@@ -169,7 +169,7 @@ def _label_points(
     styles: dict[str, tuple[str, str]],
     foot: float,
 ) -> None:
-    """Names the points by their values, those of the front first; none where another name is."""
+    """Labels the points with their values, the Pareto front first; omits overlapping labels."""
     front = trade_table.pareto(rows, cost)
     taken: list[tuple[float, float, float]] = []
     named_first = [trade_table.base_of(rows), *front]
