@@ -49,7 +49,7 @@ class SceneReport(NamedTuple):
 
 
 def write_page(reports: Sequence[SceneReport], *, title: str) -> str:
-    """Returns the page: a table of all scenes, then each with its views, failures first."""
+    """Returns the page: a table of all scenes, then each scene with its views, failures first."""
     ordered = sorted(reports, key=lambda report: not report.complaints)
     failed = sum(bool(report.complaints) for report in reports)
     told = "all hold" if not failed else f"{failed} do not hold"
@@ -63,7 +63,7 @@ def write_page(reports: Sequence[SceneReport], *, title: str) -> str:
 
 
 def mean(values: Sequence[float]) -> float:
-    """Returns the mean of the values that are known, or NaN."""
+    """Returns the mean of all values but NaN, or NaN."""
     known = [value for value in values if not np.isnan(value)]
     return float(np.mean(known)) if known else np.nan
 

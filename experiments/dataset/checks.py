@@ -1,9 +1,9 @@
 """Checks of a rendered scene: files, meshes, and images against our own tracer.
 
-Two renderers that share nothing but the scene's files agree, or one of them is wrong. Colours are
-compared inside the mask, where light went through the object. Depths are compared away from
-*silhouettes*: pixels whose centre is within a pixel or two of an edge of the object, or of one part
-before another, see one or the other by rounding.
+Two renderers share only the scene's files, so a disagreement means that one of them is wrong.
+Colours are compared inside the mask, where light passed through the object. Depths are compared
+away from *silhouettes*: pixels whose centre is within a pixel or two of an edge of the object, or
+of one part in front of another, hit one or the other by rounding.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ from refref_jax.optics.budgets import Budget
 from refref_jax.render.first_surface import FirstSurface, find_first_surface
 
 PSNR = 33.0
-"""Least PSNR inside the mask, dB, of the rendering against the image."""
+"""Least masked PSNR, dB, of the rendering relative to the image."""
 
 PSNR_CONVEX = 40.0
 """The same for convex objects, whose light paths are short."""
@@ -34,20 +34,20 @@ DEPTH = 1e-3
 """Largest difference of planar depth, world units, away from silhouettes."""
 
 DEPTH_SHARE = 0.999
-"""Least share of pixels within it."""
+"""Least share of pixels within that difference."""
 
 MASK_SHARE = 0.002
 """Largest share of an image's pixels where mask and traced silhouette differ."""
 
-# Pixels around a silhouette that are left out of depths and normals.
+# Pixels around a silhouette that are excluded from depths and normals.
 _MARGIN = 2
 
-# Planar depths of neighbours that differ by more lie on either side of an inner silhouette.
+# Neighbours whose planar depths differ by more lie on either side of an inner silhouette.
 _STEP = 0.2
 
 
 class Meshes(NamedTuple):
-    """The meshes of a scene, and how they lie in one another."""
+    """The meshes of a scene, and their nesting."""
 
     parts: list[MeshPart]
     tree: Containment
@@ -82,9 +82,9 @@ class View(NamedTuple):
 
 
 def check_files(scene: Path) -> list[Finding]:
-    """Reads every file that the transforms name, and every EXR beside them.
+    """Reads every file named in the transforms, and every EXR next to them.
 
-    A scene that was made with `--preview` has one split only.
+    A scene made with `--preview` has one split only.
     """
     try:
         local_layout.check_scene(scene, needed=())
@@ -96,7 +96,7 @@ def check_files(scene: Path) -> list[Finding]:
 
 
 def check_meshes(scene: Path) -> tuple[Meshes | None, list[Finding]]:
-    """Reads and lints the meshes of a scene; there are none to use if they can not be read."""
+    """Reads and lints the meshes of a scene; returns `None` for unreadable meshes."""
     try:
         parts = meshes.read_meshes(scene)
     except ValueError as error:
@@ -108,9 +108,9 @@ def check_meshes(scene: Path) -> tuple[Meshes | None, list[Finding]]:
 
 
 def read_views(scene: Path, made_of: Meshes, *, count: int) -> KnownScene:
-    """Reads some test views of a scene, evenly spread, and all that rendering them takes.
+    """Reads some evenly spaced test views of a scene, and everything required to render them.
 
-    By the rule that `scene.json` names, or `nested`.
+    The rule is that of `scene.json`, or `nested`.
     """
     frames = local_layout.read_frames(scene, "test")
     last = len(frames.names) - 1
@@ -122,7 +122,7 @@ def read_views(scene: Path, made_of: Meshes, *, count: int) -> KnownScene:
 
 
 def compare_view(scene: KnownScene, index: int, *, budget: Budget, side: int) -> View:
-    """Renders one of a scene's views and compares all that is known of it."""
+    """Renders one of a scene's views and compares all available maps."""
     rendered = known_scenes.render_view(scene, index, budget=budget, side=side)
     measured = known_scenes.measure(scene, index, rendered.rgb)
     first = find_first_surface(
@@ -150,7 +150,7 @@ def compare_view(scene: KnownScene, index: int, *, budget: Budget, side: int) ->
 def away_from_silhouettes(
     mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Returns the pixels of an object that no silhouette is near.
+    """Returns the pixels of an object that are not close to a silhouette.
 
     Args:
       mask: mask of the object.
@@ -196,7 +196,7 @@ def _depth_errors(
     traced: Float[np.ndarray, "h w"],
     inner: Bool[np.ndarray, "h w"],
 ) -> Float[np.ndarray, " pixels"]:
-    """Returns the differences from the float map; none if there is no such map."""
+    """Returns the differences from the float map; none if the map does not exist."""
     depths = scene.frames.depths
     if depths is None or depths[index].suffix != ".exr":
         return np.zeros(0)

@@ -1,4 +1,4 @@
-"""Writes a scene as a folder, with plain names or those of the raw release; files byte for byte."""
+"""Writes a scene as a folder, with plain names or those of the raw release."""
 
 import shutil
 from collections.abc import Callable
@@ -14,9 +14,9 @@ from refref_jax.data.file_names import FrameFiles, Naming
 def write(
     contents: SceneContents, target: Path, *, naming: Naming, step: Callable[[], None]
 ) -> None:
-    """Writes a scene's folder, which appears when it is whole.
+    """Writes a scene's folder atomically.
 
-    All extras are kept in their places; an EXR beside an image or a depth map goes along with it.
+    All extras keep their paths; an EXR next to an image or a depth map is copied with it.
 
     Args:
       contents: contents of the scene.

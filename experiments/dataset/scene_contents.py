@@ -1,7 +1,7 @@
 """Lists the files of a scene's folder by type: the first half of every conversion (NumPy only).
 
-A frame is its image, mask and depth map; all other files are *extras*, by their places below the
-folder: `scene.json`, meshes, textures, maps of floats.
+A frame is its image, mask and depth map; all other files are *extras*, by their path relative to
+the folder: `scene.json`, meshes, textures, float maps.
 """
 
 from pathlib import Path
@@ -33,7 +33,7 @@ class Frame(NamedTuple):
 
 
 class Split(NamedTuple):
-    """One split: its frames, and all else that its transforms file says."""
+    """One split: its frames, and the other contents of its transforms file."""
 
     frames: tuple[Frame, ...]
     header: dict[str, Any]
@@ -53,7 +53,7 @@ class SceneContents(NamedTuple):
 
 
 def read(scene: Path) -> SceneContents:
-    """Lists what a scene holds, and checks its cameras and that all files exist.
+    """Lists the files of a scene, and checks its cameras and that all files exist.
 
     Raises:
       SceneError: if a file is missing or broken.
@@ -83,9 +83,9 @@ def read(scene: Path) -> SceneContents:
 
 
 def named_extras(contents: SceneContents) -> dict[str, Path]:
-    """Returns the extras that a reader of the scene can use: those that `scene.json` names.
+    """Returns the extras that are named in `scene.json`.
 
-    They are `scene.json` itself, all meshes, and files such as textures.
+    These are `scene.json` itself, all meshes, and files such as textures.
     """
     words = _texts(_scene_json(contents))
     return {
@@ -133,7 +133,7 @@ def _scene_json(contents: SceneContents) -> Any:
 
 
 def _texts(value: Any) -> set[str]:
-    """Returns all texts in parsed JSON, written as places are."""
+    """Returns all strings in parsed JSON, normalized as paths."""
     if isinstance(value, dict):
         value = list(value.values())
     if isinstance(value, list):

@@ -5,7 +5,7 @@
     {scene}/transforms_{train,val,test}.json         poses and file names, of splits with views
     {scene}/scene.json                               see `scene_record`
 
-A folder appears under its name when all of that is in it, so one that is there is whole.
+A folder is created atomically, so an existing one is complete.
 """
 
 import json
@@ -33,7 +33,7 @@ def make(
     parts: Callable[[], Sequence[Part]],
     scratch: Path,
 ) -> None:
-    """Makes the folder of a scene if it is not there.
+    """Creates the folder of a scene, unless it exists.
 
     Args:
       folder: folder to create.
@@ -61,7 +61,7 @@ def make(
 
 
 def write_meshes(folder: Path, scene: SceneName, parts: Sequence[Part]) -> None:
-    """Writes the parts of a scene into its folder, which has one for meshes."""
+    """Writes the parts of a scene into its folder, which must have a subfolder for meshes."""
     for part in parts:
         mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
         content = trimesh.exchange.ply.export_ply(mesh, vertex_normal=False)
@@ -69,10 +69,10 @@ def write_meshes(folder: Path, scene: SceneName, parts: Sequence[Part]) -> None:
 
 
 def check(folder: Path, scene: SceneName, settings: RenderSettings) -> None:
-    """Checks that a folder, if it is there, is that of a scene with these settings.
+    """Checks that an existing folder belongs to a scene with these settings.
 
     Raises:
-      ValueError: if it is not.
+      ValueError: if it does not.
     """
     if not folder.exists():
         return
@@ -82,18 +82,18 @@ def check(folder: Path, scene: SceneName, settings: RenderSettings) -> None:
         different = _difference(found, scene_record.identify(scene, settings), "")
     except (OSError, ValueError, AttributeError) as error:
         raise ValueError(
-            f"{folder} exists, but is no scene of this command ({error}). Give another --out, or "
-            "remove it."
+            f"{folder} exists, but is not a scene of this command ({error}). Give another --out, "
+            "or remove it."
         ) from error
     if different:
         raise ValueError(
-            f"{path} has other settings: {different}. Give the same ones to go on, or another "
+            f"{path} has other settings: {different}. Give the same ones to resume, or another "
             "--out."
         )
 
 
 def _difference(found: Any, wanted: Any, name: str) -> str:
-    """Returns the first value that differs, in words, or nothing."""
+    """Returns the first difference, in words, or an empty string."""
     if isinstance(wanted, dict):
         for key, value in wanted.items():
             if different := _difference(found.get(key), value, f"{name} {key}"):

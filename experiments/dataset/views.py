@@ -13,7 +13,7 @@ from experiments.dataset.seeds import seed_of
 from experiments.dataset.workers import Job, Task
 from refref_jax.data.scene_names import SceneName
 
-# What Blender takes.
+# Number of seeds that Blender accepts.
 _SEEDS = 1 << 31
 
 _DETAIL = 1.0
@@ -34,7 +34,7 @@ class View(NamedTuple):
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name of the view in messages."""
         return f"{self.scene} {self.split} {self.number}"
 
 
@@ -55,7 +55,7 @@ def is_done(out: Path, view: View, settings: RenderSettings) -> bool:
 
 
 def seed(view: View) -> int:
-    """Returns the seed that Blender renders a view with."""
+    """Returns Blender's seed for a view."""
     return seed_of(str(view.scene), view.split, f"r_{view.number:03d}") % _SEEDS
 
 
@@ -67,7 +67,7 @@ def tasks(
     objects: Mapping[str, Object],
     scratch: Path,
 ) -> Iterator[Task]:
-    """Yields what is to be rendered; the folder of a scene is made when its first view comes.
+    """Yields render jobs; the folder of a scene is created with its first view.
 
     Args:
       out: folder of the scenes.
@@ -77,7 +77,7 @@ def tasks(
       scratch: existing folder for temporary files.
     """
 
-    # Scenes that follow each other share their object.
+    # Consecutive scenes share their object.
     @lru_cache(maxsize=1)
     def make(name: str) -> Sequence[Part]:
         return objects[name].make(_DETAIL)

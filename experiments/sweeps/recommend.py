@@ -139,7 +139,7 @@ def told(choice: Choice, machine: Machine, scene: Path) -> list[str]:
     lines += [*_commands(choice.best, scene), ""]
     if choice.combined is not None:
         lines += [
-            f"Predicted from single changes, not measured: "
+            f"Predicted from single changes, not measured together: "
             f"{choice.combined.name}: {_expected(choice.combined, machine)}.",
             *_commands(choice.combined, scene),
             "",
