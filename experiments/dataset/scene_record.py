@@ -86,7 +86,7 @@ def _materials_outside(scene: SceneName, parts: Sequence[Part], rule: TwoSidedRu
         if parent != NO_PARENT and parts[parent].absorption != NO_ABSORPTION:
             raise ValueError(
                 f"The part {parts[parent].name} of {scene.object} absorbs light, but contains "
-                "another part, where Blender would continue to absorb. Give its surface a tint instead."
+                "another part, in which Blender keeps absorbing. Give its surface a tint instead."
             )
     if rule == "facing":
         return [_AIR] * len(parts)

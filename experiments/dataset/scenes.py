@@ -39,7 +39,7 @@ def choose(text: str, objects: Mapping[str, Object]) -> list[SceneName]:
             names = [*map(str, scenes), *objects]
             near = app.did_you_mean(pattern, names, most=3)
             raise ValueError(
-                f"No scene or object is named {pattern!r}.{near or f' A valid name is {names[0]}.'} "
+                f"No scene or object is named {pattern!r}.{near or f' One name is {names[0]}.'} "
                 "Use 'all' for all of them."
             )
         chosen.update(fitting)

@@ -22,7 +22,7 @@ from experiments.dataset.textures import (
 from experiments.dataset.textures.fields import Picture
 
 SIZE = 1024
-"""Usual samples a side."""
+"""Default number of samples a side."""
 
 
 class Face(NamedTuple):
@@ -66,14 +66,14 @@ FACES: dict[str, Face] = {
 
 
 def make_face(name: str, size: int = SIZE) -> Float[np.ndarray, "size size 3"]:
-    """Returns a picture, sRGB from 0 to 1 in float32, row 0 at the top.
+    """Returns an image, sRGB from 0 to 1 in float32, row 0 at the top.
 
     Args:
       name: name of an image in `FACES`.
       size: samples a side, 16 or more.
 
     Raises:
-      ValueError: if there is no such picture, or the size is too small.
+      ValueError: if the image does not exist, or the size is too small.
     """
     if name not in FACES:
         raise ValueError(f"There is no face {name!r}. Choose from {', '.join(FACES)}.")
@@ -84,6 +84,6 @@ def make_face(name: str, size: int = SIZE) -> Float[np.ndarray, "size size 3"]:
 
 
 def require_size(size: int) -> None:
-    """Raises ValueError if a picture of so few samples would show nothing."""
+    """Raises ValueError if the size of an image is too small to be useful."""
     if size < 16:
-        raise ValueError(f"A picture of {size} samples shows nothing. Ask for 16 or more.")
+        raise ValueError(f"An image of {size} samples is too small. Request 16 or more.")

@@ -85,7 +85,7 @@ def box_room(height: int, half: tuple[float, float], floor: float, ceiling: floa
 
 
 def _shaded(picture: Picture, seen: Seen, *, lamp: float, corners: float) -> Picture:
-    """Returns a room that a lamp lights from the eye's place, darker in its corners."""
+    """Returns a room lit by a lamp at the eye, darker in its corners."""
     falloff = 1.0 / (1.0 + (seen.far / lamp) ** 2)
     shade = 1.0 - 0.5 * np.exp(-seen.nearest / corners)
     return picture * (1.75 * falloff * shade)[..., None]
@@ -197,7 +197,7 @@ def gallery(height: int) -> Picture:
 
 
 def _skylight(picture: Picture, seen: Seen) -> Picture:
-    """Returns a room with a glazed ceiling, clouds beyond it, in a stuccoed border."""
+    """Returns a room with a glazed ceiling in a stuccoed border, and clouds behind it."""
     clouds = fbm(512, 4, 9, octaves=7, gain=0.6)
     sky = graded(
         lookup(clouds, seen.across / 7.0, seen.up / 7.0),

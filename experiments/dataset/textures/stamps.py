@@ -1,6 +1,6 @@
 """Lays stamps on an image one over the other, each with its shadow.
 
-In a stamp's own frame `u` and `v` go from about -1 to 1, `u` along it and `v` across.
+In a stamp's local frame `u` and `v` range from about -1 to 1, `u` along it and `v` across.
 """
 
 import math
@@ -13,12 +13,12 @@ from jaxtyping import Float
 from experiments.dataset.textures.fields import Field, smooth
 
 Distance = Callable[[Field, Field], Field]
-"""From `u` and `v` to the distance outside of the outline, negative within, in the stamp's unit."""
+"""Function from `u` and `v` to the signed distance from the outline, in the stamp's unit."""
 
 Samples = Float[np.ndarray, " samples"]
 
 Paint = Callable[[Samples, Samples, Samples], Float[np.ndarray, "samples 3"]]
-"""From `u`, `v` and the distance of samples within to colours."""
+"""Function from `u`, `v` and the distance of inner samples to colours."""
 
 
 class Place(NamedTuple):
@@ -72,7 +72,7 @@ def _lay(
     paint: Paint,
     shadow: float,
 ) -> None:
-    """Lays a stamp, in place; what lies beyond the border is cut off."""
+    """Lays a stamp, in place, cropped at the border."""
     n = picture.shape[0]
     reach = _MARGIN * place.size
     left, right = _range(place.x - reach, place.x + reach, n)
@@ -86,7 +86,7 @@ def _lay(
     outside = distance(u, v)
     target = picture[top:bottom, left:right]
     if shadow:
-        # The shadow is the outline moved by whole samples.
+        # The shadow is the outline shifted by an integer number of samples.
         right_by, down_by = (round(each * place.size * n) for each in _SHADOW)
         beneath = outside[: -down_by or None, : -right_by or None]
         target[down_by:, right_by:] *= (1.0 - shadow * smooth(0.12, -0.06, beneath))[..., None]

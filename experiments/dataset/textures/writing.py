@@ -5,9 +5,9 @@ from jaxtyping import Float
 from PIL import ImageDraw
 
 Box = tuple[float, float, float, float]
-"""Left, top, right, bottom, in samples."""
+"""Bounding box: left, top, right, bottom, in samples."""
 
-# The ends of a glyph's strokes, on a grid of 3 x 5 nodes.
+# Endpoints of a glyph's strokes, on a grid of 3 x 5 nodes.
 _STROKES = (
     ((0, 0), (2, 0)),
     ((0, 2), (2, 2)),
@@ -56,5 +56,5 @@ def write(
 
 
 def ink(tone: Float[np.ndarray, "3"]) -> tuple[int, int, int]:
-    """Returns a colour as Pillow takes it."""
+    """Returns a colour in Pillow's format."""
     return tuple(round(255 * min(max(float(each), 0.0), 1.0)) for each in tone)
