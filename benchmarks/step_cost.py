@@ -70,7 +70,7 @@ def main(arguments: list[str]) -> None:
     for method in methods.values():
         method.cost()  # compiles
     rounds = [{name: each.cost() for name, each in methods.items()} for _ in range(_ROUNDS.value)]
-    print("| paths | room a ray | ms a step | of them tracing | to straight (least, most) |")
+    print("| paths | capacity per ray | ms per step | tracing, ms | to straight (least, most) |")
     print("|---|---|---|---|---|")
     medians = {}
     for name, method in methods.items():

@@ -58,7 +58,7 @@ class _Case(NamedTuple):
 
 
 def _jar() -> np.ndarray:
-    """Returns a thick-walled body of revolution with 103k triangles."""
+    """Returns a thick-walled surface of revolution with 103k triangles."""
     height = np.linspace(0.0, 1.0, 201)
     radius = 0.7 + 0.15 * np.sin(3.0 * height)
     outer = np.stack([radius, 2.0 * height - 1.0], axis=1)
@@ -183,7 +183,7 @@ def main(arguments: list[str]) -> None:
     if importlib.util.find_spec("mitsuba") is None:
         print("Mitsuba is not installed and is omitted. `pip install mitsuba` adds it.")
     plain, sorted_first = jax.jit(bvh.closest_hits), jax.jit(ray_sorting.closest_hits_sorted)
-    print("mesh        build s  rays      Mrays/s  Embree  ratio  asked")
+    print("mesh        build s  rays      Mrays/s  Embree  ratio  bound")
     missed = []
     for name in _MESHES.value or _ALL:
         triangles = _ALL[name]().astype(np.float32)
@@ -203,7 +203,7 @@ def main(arguments: list[str]) -> None:
             rates = f"{_COUNT / mine / 1e6:7.2f} {_COUNT / embree / 1e6:7.2f}"
             print(f"{name:11s} {build:7.2f}  {case.name:8s} {rates} {ratio:6.2f} {case.limit:6.2f}")
             if ratio < case.limit:
-                missed.append(f"{name}, {case.name}: {ratio:.2f} of Embree, asked {case.limit}")
+                missed.append(f"{name}, {case.name}: {ratio:.2f} of Embree, below {case.limit}")
         if importlib.util.find_spec("mitsuba") is not None:
             print(f"{name:11s}          camera   {_mitsuba_rate(triangles) / 1e6:7.2f}  (Mitsuba)")
     assert _ANY_SPEED.value or not missed, "; ".join(missed)

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 with epy.lazy_imports():
     from experiments.dataset import check_page, scene_check
 
-_SCENES = flags.DEFINE_list("scenes", None, "Only these scenes of the folder, by name.")
-_LIMIT = flags.DEFINE_integer("limit", 3, "Only this many test images, evenly spread; 0: none.", 0)
+_SCENES = flags.DEFINE_list("scenes", None, "Names of the scenes to check; all if not given.")
+_LIMIT = flags.DEFINE_integer("limit", 3, "Number of test images, evenly spaced; 0: none.", 0)
 flags.DEFINE_alias("views", "limit")
 _OUT = flags.DEFINE_string("out", None, "Folder of the report; FOLDER if not given.")
 _OVERWRITE = cli_flags.overwrite("the report of an earlier check")
@@ -75,24 +75,24 @@ def main(folder: str) -> None:
     for report in bad:
         for complaint in report.complaints[:_SHOWN_COMPLAINTS]:
             print(f"{report.name}: {complaint}")
-    print(f"{len(reports) - len(bad)} of {len(reports)} scenes hold.")
+    print(f"{len(reports) - len(bad)} of {len(reports)} scenes passed.")
     print(f"Report:  {page}")
     print(f"Figures: {figures}")
     if (scenes[0] / "transforms_train.json").is_file():
         given = (f"--scene={scenes[0]}", f"--out=runs/{scenes[0].resolve().name}")
         print(f"Next: {app.shell('train', *given)}")
     else:
-        print("Next: python -m experiments.dataset.make without --preview, for scenes to train on")
+        print("Next: python -m experiments.dataset.make without --preview, for training scenes")
     if bad:
         sys.exit(1)
 
 
 def _summary(report: SceneReport) -> str:
     if report.complaints:
-        return f"{report.name}  does not hold"
+        return f"{report.name}  failed"
     if not report.views:
-        return f"{report.name}  holds"
-    return f"{report.name}  {min(view.psnr_masked for view in report.views):.1f} dB in the mask"
+        return f"{report.name}  passed"
+    return f"{report.name}  {min(view.psnr_masked for view in report.views):.1f} dB masked PSNR"
 
 
 def _record(report: SceneReport) -> dict[str, Any]:
@@ -108,5 +108,5 @@ if __name__ == "__main__":
     app.run(
         main,
         arguments=("FOLDER",),
-        again="it checks anew; --overwrite replaces the report.",
+        again="it repeats the check; --overwrite replaces the report.",
     )

@@ -102,7 +102,7 @@ def check_meshes(scene: Path) -> tuple[Meshes | None, list[Finding]]:
     except ValueError as error:
         return None, [Finding("error", scene.name, str(error))]
     if not parts:
-        return None, [Finding("error", scene.name, "there are no meshes. Make the scene again.")]
+        return None, [Finding("error", scene.name, "the scene has no meshes. Make it again.")]
     tree = containment.find_containment(parts)
     return Meshes(parts, tree), lint.lint(parts, tree)
 
@@ -175,12 +175,12 @@ def complaints(convex: bool, findings: Sequence[Finding], views: Sequence[View])
     found = [f"{each.part}: {each.message}" for each in findings if each.severity != "note"]
     for view in views:
         if not view.psnr_masked >= least:
-            found.append(f"{view.name}: {view.psnr_masked:.1f} dB in the mask, not {least:g}")
+            found.append(f"{view.name}: {view.psnr_masked:.1f} dB masked PSNR, below {least:g}")
         if not view.mask_share <= MASK_SHARE:
             found.append(f"{view.name}: the mask differs in {view.mask_share:.2%} of pixels")
         if view.depth_share < DEPTH_SHARE:
             found.append(
-                f"{view.name}: depths agree to {DEPTH:g} in {view.depth_share:.2%} of pixels only"
+                f"{view.name}: depths agree to {DEPTH:g} in only {view.depth_share:.2%} of pixels"
             )
     return found
 

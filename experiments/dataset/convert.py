@@ -31,7 +31,7 @@ with epy.lazy_imports():
 _SCENE = cli_flags.scene("Scene to convert, or a folder of scenes")
 _TO = flags.DEFINE_enum("to", None, ["local", "raw", "parquet"], "Layout to write.", required=True)
 _OUT = cli_flags.out("Output folder.")
-_SCENES = flags.DEFINE_list("scenes", None, "Only these scenes of a folder; all if not given.")
+_SCENES = flags.DEFINE_list("scenes", None, "Names of the scenes to convert; all if not given.")
 
 
 def main() -> None:

@@ -26,7 +26,7 @@ from experiments.dataset.textures.fields import (
 from experiments.dataset.textures.shading import colour, graded, linear
 from experiments.dataset.textures.sphere_fields import angles, averaged, directions, fbm3
 
-_SOFT = 256  # rows from which pictures of the ground are as fine as they get
+_SOFT = 256  # rows above which images of the ground gain no detail
 
 
 def meadow(height: int) -> Picture:

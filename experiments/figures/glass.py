@@ -29,7 +29,7 @@ from refref_jax.render.pixel_paths import PixelPaths, trace_pixel
 from refref_jax.sampling import domains
 from refref_jax.sampling.domains import Domain
 
-_NAMES = {"straight": "straight light", "paper": "the paper's paths", "tree": "the path tree"}
+_NAMES = {"straight": "straight rays", "paper": "the paper's paths", "tree": "the path tree"}
 
 _CAMERA = 4.0
 """Distance of the drawn camera from the origin, as in the data set; world units."""
@@ -98,8 +98,8 @@ def draw_fan(scene: KnownScene, folder: Path, half: float, path: Path) -> None:
     reach = 1.2 * cross_sections.width_of(outlines)
     rays = cross_sections.rays_towards(_CAMERA, list(np.linspace(-reach, reach, _RAYS_OF_A_FAN)))
     titles = {
-        "straight": "what a NeRF assumes: light goes straight",
-        "paper_no_reflection": "what light does: neighbours part, left and right swap",
+        "straight": "the model of NeRF: straight rays",
+        "paper_no_reflection": "actual light: neighbours separate, left and right swap",
     }
     panels = [Panel(title, _follow(scene, rays, BUDGETS[name])) for name, title in titles.items()]
     write_fan(path, panels, outlines, half)
@@ -117,7 +117,7 @@ def draw_tree(scene: KnownScene, folder: Path, path: Path) -> None:
     rays = cross_sections.rays_towards(_CAMERA, [_AIM * cross_sections.width_of(outlines)])
     budgets = {title: BUDGETS[name] for name, title in _NAMES.items()}
     finer = dataclasses.replace(BUDGETS["tree"], cut=_FINER)
-    budgets[f"the tree, cut at {100.0 * _FINER:g} %"] = finer
+    budgets[f"the tree, threshold {100.0 * _FINER:g} %"] = finer
     panels = [Panel(title, _follow(scene, rays, budget)) for title, budget in budgets.items()]
     write_tree(path, panels, outlines)
 
@@ -186,8 +186,7 @@ def write_views(path: Path, views: Sequence[Shown]) -> None:
             below.text(
                 0.5,
                 0.5,
-                f"below each picture:\nwhat is wrong with it,\n{ERROR_GAIN:g} times as bright,\n"
-                "and PSNR on the glass",
+                f"below each image:\nits error,\namplified {ERROR_GAIN:g} times,\nand masked PSNR",
                 ha="center",
                 va="center",
                 fontsize=11,

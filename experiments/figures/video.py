@@ -22,7 +22,7 @@ def has_ffmpeg() -> bool:
         return False
     try:
         return bool(imageio_ffmpeg.get_ffmpeg_exe())
-    except RuntimeError:  # the package has no program for this machine, and there is none beside
+    except RuntimeError:  # neither the package nor the machine has an FFmpeg
         return False
 
 
@@ -50,7 +50,7 @@ def write(
         extension=".mp4",
         fps=fps,
         codec="libx264",
-        macro_block_size=1,  # else pictures are resized to multiples of 16
+        macro_block_size=1,  # otherwise frames are resized to multiples of 16
         output_params=["-crf", _QUALITY],
     )
     return gif, mp4

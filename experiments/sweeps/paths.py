@@ -21,8 +21,8 @@ _GREY = "#777777"
 _LABEL_WIDTH = 34.0
 
 _SWEEPS = {
-    "cut": "cut: smallest throughput followed",
-    "bends": "bends: most of a path",
+    "cut": "cut: throughput threshold",
+    "bends": "bends: max bends of a path",
 }
 _COSTS = {
     "casts_per_pixel": ("ray casts per pixel", 1.0),
@@ -146,7 +146,7 @@ def _write_sweep(folder: Path, trials: Sequence[Trial], sweep: str) -> Path:
         if cost == "seconds_per_pixel":
             label_plainly(axis.xaxis)
         style(axis)
-    axes[0].set_ylabel("PSNR inside the mask, dB")
+    axes[0].set_ylabel("masked PSNR, dB")
     fixed = _fixed(trials, sweep)
     figure.suptitle(f"{_SWEEPS[sweep]}, as labelled{fixed}", fontsize=12)
     figure.legend(

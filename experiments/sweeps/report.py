@@ -118,7 +118,7 @@ def write_figure(path: Path, rows: Sequence[Row]) -> None:
     for axis, (label, cost) in zip(axes, _COSTS.items(), strict=True):
         _draw(axis, rows, label, cost, styles, foot)
     masked = all(row.psnr_masked is not None for row in rows)
-    axes[0].set_ylabel("PSNR inside the mask, dB" if masked else "PSNR, dB")
+    axes[0].set_ylabel("masked PSNR, dB" if masked else "PSNR, dB")
     figure.suptitle(f"{rows[0].scene}: one option changed at a time")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=7, frameon=False)

@@ -138,7 +138,7 @@ class Page:
                     continue
             try:
                 picture = self._draw(job, view, self._panel.choice())
-            except Exception as error:  # the page stays open, and says why it shows nothing
+            except Exception as error:  # the page stays open and shows the error
                 traceback.print_exc()
                 self._say(f"**{type(error).__name__}**: {error}")
                 picture = np.zeros((2, 2, 3), np.uint8)
@@ -157,7 +157,7 @@ class Page:
         layer, what = choice.layer, ("image", model.budget)
         if layer == layers.ERROR and job.stage > 0:
             return self._draw_error(job, view, model, most)
-        if layer == layers.ERROR:  # on the way to a view there is no error to show
+        if layer == layers.ERROR:  # no error is available while moving to a view
             layer = layers.RGB
         if layer in layers.OF_SURFACES:
             what = ("surfaces", most)

@@ -57,7 +57,7 @@ def test_a_sweep_may_be_around_another_kind_of_field():
         preset="tiny", values={"field": ("zipnerf", "nerfacto")}, knobs=["field"]
     )
     assert [point.name for point in kinds] == [BASE, "field=nerfacto"]
-    with pytest.raises(ValueError, match=r"no --base=field=voxels\. Choose from zipnerf, nerfacto"):
+    with pytest.raises(ValueError, match=r"--base=field=voxels does not exist\. Choose from zipnerf, nerfacto"):
         trade_points.sweep(preset="tiny", base={"field": "voxels"})
 
 
@@ -247,7 +247,7 @@ def test_a_sweep_adds_to_the_one_before_it_around_the_same_base(tmp_path):
 @pytest.mark.parametrize(
     ("base", "message"),
     [
-        ({"paths": "foo"}, "no --base=paths=foo"),
+        ({"paths": "foo"}, "--base=paths=foo does not exist"),
         ({"out": "x"}, "--out"),
         ({"scene": "x"}, "--scene"),
     ],

@@ -46,9 +46,9 @@ def even_angles(cut: Sampling, *, lobes: int = 1, each: int = 8) -> Float[np.nda
     """Returns evenly spaced angles.
 
     Args:
-      cut: sampling of the surface; a round body has its number of segments as angles.
+      cut: sampling of the surface; a round object has one angle per segment.
       lobes: number of lobes of the section, each with as many angles.
-      each: edges of a lobe where a round body has 96 in all; never reduced below 6.
+      each: edges of a lobe where a round object has 96 in all; never reduced below 6.
     """
     share = max(cut.segments / lobes, each * cut.segments / 96.0, 6.0)
     count = lobes * int(np.ceil(share))

@@ -13,7 +13,7 @@ from experiments.dataset.objects.field_operations import moved, subtraction, tur
 from experiments.dataset.objects.formed import filled_glass
 from experiments.dataset.objects.space_curves import limb, through
 
-# Along the spine: angle (degrees), distance from the axis, height, and radius of the body.
+# Along the spine: angle (degrees), distance from the axis, height, and radius of the trunk.
 _SPINE = np.array(
     [
         (-84.0, 1.18, -0.06, 0.2),
