@@ -175,7 +175,9 @@ def complaints(convex: bool, findings: Sequence[Finding], views: Sequence[View])
     found = [f"{each.part}: {each.message}" for each in findings if each.severity != "note"]
     for view in views:
         if not view.psnr_masked >= least:
-            found.append(f"{view.name}: {view.psnr_masked:.1f} dB masked PSNR, below {least:g}")
+            found.append(
+                f"{view.name}: {view.psnr_masked:.1f} dB masked PSNR, not at least {least:g}"
+            )
         if not view.mask_share <= MASK_SHARE:
             found.append(f"{view.name}: the mask differs in {view.mask_share:.2%} of pixels")
         if view.depth_share < DEPTH_SHARE:

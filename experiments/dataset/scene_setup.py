@@ -1,7 +1,7 @@
 """Creates the folder of a scene, ready to be rendered, and recognises one (NumPy only).
 
     {scene}/meshes/{object}_{part}_{material}.ply    binary, single precision
-    {scene}/background/                              what the record names
+    {scene}/background/                              files of the record
     {scene}/transforms_{train,val,test}.json         poses and file names, of splits with views
     {scene}/scene.json                               see `scene_record`
 

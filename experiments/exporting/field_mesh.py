@@ -147,7 +147,7 @@ def _chunk(params, points, directions, config, width):
 def inside_bodies(
     geometry: Scene, axes: Sequence[Float[np.ndarray, " ticks"]]
 ) -> Bool[np.ndarray, "nx ny nz"]:
-    """Returns which points of a grid lie inside any part of the geometry.
+    """Returns the mask of grid points inside any part of the scene.
 
     From inside a closed surface every ray first hits its back side. Three rays are cast for each
     point of a part's box, and the majority counts: at a grazing hit a shading normal may mislead.

@@ -62,12 +62,12 @@ def test_a_slope_is_no_silhouette_and_a_mask_that_lacks_pixels_counts():
     ("changes", "convex", "message"),
     [
         ({}, True, None),
-        ({"psnr_masked": 39.0}, True, "39.0 dB in the mask, not 40"),
+        ({"psnr_masked": 39.0}, True, "39.0 dB masked PSNR, not at least 40"),
         ({"psnr_masked": 39.0}, False, None),
-        ({"psnr_masked": 32.9}, False, "not 33"),
+        ({"psnr_masked": 32.9}, False, "not at least 33"),
         ({"psnr_masked": np.nan}, False, "nan dB"),
         ({"mask_share": 0.003}, False, "0.30% of pixels"),
-        ({"depth_share": 0.99}, False, "99.00% of pixels only"),
+        ({"depth_share": 0.99}, False, "only 99.00% of pixels"),
         ({"depth_share": np.nan}, False, None),
     ],
 )
@@ -144,7 +144,7 @@ def test_the_page_stands_alone_and_shows_failures_first():
     page = write_page([good, bad], title="Scenes")
     assert page.count("<section") == 2 and page.count("data:image/png;base64,") == 6
     assert page.index("<h2>bad &amp; broken") < page.index("<h2>good")
-    assert "a &lt; b" in page and "a &lt;note&gt;" in page and "1 do not hold" in page
+    assert "a &lt; b" in page and "a &lt;note&gt;" in page and "1 failed" in page
     assert "http" not in page and 'src="/' not in page
 
 
