@@ -49,8 +49,8 @@ def closest_hits_sorted(
     Args:
       bvh: tree of the scene.
       rays: any number of rays.
-      limits: see `bvh.closest_hits`.
-      leaving: see `bvh.closest_hits`.
+      limits: limits of the hit distances, as in `bvh.closest_hits`.
+      leaving: excluded primitives, as in `bvh.closest_hits`.
 
     Returns:
       The hits, in the original order of the rays.

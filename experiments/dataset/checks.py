@@ -58,7 +58,7 @@ class View(NamedTuple):
 
     Attributes:
       name: name of the frame.
-      target: the image, sRGB in `[0, 1]`.
+      target: image rendered by Blender, sRGB in `[0, 1]`.
       rgb: our rendering.
       psnr: PSNR over the whole image, dB.
       psnr_masked: masked PSNR, dB.

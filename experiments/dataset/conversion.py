@@ -54,7 +54,7 @@ def convert(
       scene: scene to convert.
       layout: name of the layout: `local`, `raw` or `parquet`.
       out: existing folder of the complete layout.
-      step: called for every unpacked and for every written image.
+      step: callback for every unpacked and for every written image.
 
     Returns:
       Number of omitted files, by folder and suffix.

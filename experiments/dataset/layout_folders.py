@@ -22,7 +22,7 @@ def write(
       contents: contents of the scene.
       target: output folder, which must not exist.
       naming: naming of the frames' files.
-      step: called after every image.
+      step: callback after every image.
     """
     with atomic_files.new_folder(target) as scene:
         for split, (frames, header) in contents.splits.items():

@@ -44,7 +44,7 @@ def write(
       contents: contents of the scene.
       name: name of the scene.
       out: folder of the complete layout.
-      step: called after every image.
+      step: callback after every image.
 
     Returns:
       Omitted files: extras by their paths, EXRs of frames by kind and split.

@@ -70,7 +70,7 @@ def opened(scene: FoundScene, out: Path, step: Callable[[], None]) -> Iterator[P
     Args:
       scene: scene to open.
       out: existing folder for the temporary one.
-      step: called for every unpacked image.
+      step: callback for every unpacked image.
     """
     if scene.folder is not None:
         yield scene.folder

@@ -55,7 +55,7 @@ class Panel:
         Args:
           gui: GUI of the page.
           subject: displayed run.
-          changed: called after every choice that changes the image.
+          changed: callback after every choice that changes the image.
           show_bodies: function that shows or hides the objects.
           show_cameras: function that shows or hides the test cameras.
           remove_paths: function that removes the light paths.

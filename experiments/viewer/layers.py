@@ -67,7 +67,7 @@ def offered(model: Model, *, truth: bool) -> tuple[str, ...]:
     """Returns the available layers of a model.
 
     Args:
-      model: the scene.
+      model: trained model of the scene.
       truth: whether there are test views.
     """
     bent = (REFRACTION, REFLECTION, DISTANCE, NORMALS, MASK)
@@ -80,7 +80,7 @@ def draw(
     """Draws a layer other than `error`.
 
     Args:
-      model: the scene.
+      model: trained model of the scene.
       layer: name of a layer of this module.
       rays: rays, `[h, w]`.
       chunk: number of paths rendered at once.

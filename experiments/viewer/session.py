@@ -45,7 +45,7 @@ class Subject:
 
     Attributes:
       name: name of the run.
-      model: the scene.
+      model: trained model of the scene.
       rule: outside medium of each part, a name in `interface_rules.RULES`.
       frames: test views of the scene, if it exists.
       parts: name of each part.
