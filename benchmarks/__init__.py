@@ -1,1 +1,1 @@
-"""One script per claim. Each measures it as a ratio or a margin, and asserts it."""
+"""One script per claim. Each measures a ratio or a margin, and asserts it."""

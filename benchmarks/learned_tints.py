@@ -1,11 +1,11 @@
-"""Claim: a few learned colours beat a learned volume inside coloured glass, and are the true ones.
+"""Claim: learned tints beat a learned volume inside coloured glass, and match the true colours.
 
     python -m benchmarks.learned_tints --scene=FOLDER [--steps=N] [--rays_per_pixel=N]
 
 Trains a tinted scene along the path tree twice, with the same pixels and steps: once with the
-paper's field inside the objects, once with tints and absorption to be learned, of which nothing is
-told. Asserts that the learned colours give the higher PSNR inside the mask, and that every tint is
-within 0.05 of the one in `scene.json`.
+paper's field inside the objects, once with learned tints and absorption, without known values.
+Asserts that the learned colours give the higher masked PSNR, and that every tint is within 0.05 of
+the one in `scene.json`.
 """
 
 import json
@@ -20,8 +20,8 @@ from refref_jax.data import meshes
 _SCENE = flags.DEFINE_string("scene", None, "Folder of a tinted scene.", required=True)
 _PRESET = flags.DEFINE_string("preset", "tiny", "Preset of both trainings.")
 _STEPS = flags.DEFINE_integer("steps", None, "Training steps; the preset's if not given.")
-_RAYS_PER_PIXEL = flags.DEFINE_integer("rays_per_pixel", 4, "Rays a pixel in evaluation.")
-_OUT = flags.DEFINE_string("out", "runs/learned_tints", "Where to write the runs.")
+_RAYS_PER_PIXEL = flags.DEFINE_integer("rays_per_pixel", 4, "Rays per pixel in evaluation.")
+_OUT = flags.DEFINE_string("out", "runs/learned_tints", "Output folder of the runs.")
 
 _INTERIORS = {
     "field": ["--interior=field"],
@@ -51,7 +51,7 @@ def _run(scene: Path, name: str) -> Path:
 
 
 def _measure(scene: Path, name: str, options: list[str]) -> dict[str, float]:
-    """Trains and evaluates one interior; a finished run is used again."""
+    """Trains and evaluates one interior; a finished run is reused."""
     options = [f"--preset={_PRESET.value}", "--paths=tree", *options]
     if _STEPS.value:
         options.append(f"--steps={_STEPS.value}")

@@ -5,10 +5,10 @@
 Trains --steps steps of the preset and asserts that no line of metrics and no parameter of the last
 checkpoint has a NaN or an infinity. Then trains --curve_steps steps with the fields in float32 and
 again in bfloat16, from the same seed on the same pixels, prints the PSNR of both side by side, and
-asserts that they end less than 0.5 dB apart. That PSNR is the mean over the batches logged in each
-interval: one batch of a thousand pixels says too little.
+asserts that they end less than 0.5 dB apart. Each PSNR is the mean over the batches logged in an
+interval, since a single batch of a thousand pixels is too noisy.
 
-Started again, it goes on where it was interrupted.
+An interrupted benchmark resumes where it stopped.
 """
 
 import math
@@ -29,26 +29,26 @@ from refref_jax.training.presets import PRESETS
 
 _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folder of the scene.")
 _PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Preset of all trainings.")
-_PATHS = flags.DEFINE_enum("paths", "tree", list(BUDGETS), "Budget of all trainings.")
+_PATHS = flags.DEFINE_enum("paths", "tree", list(BUDGETS), "Path settings of all trainings.")
 _STEPS = flags.DEFINE_integer("steps", 20_000, "Steps of the long training; 0 for none.", 0)
 _CURVE_STEPS = flags.DEFINE_integer("curve_steps", 2500, "Steps in each precision; 0 for none.", 0)
-_OUT = flags.DEFINE_string("out", "runs/long_run", "Where to write the runs.")
+_OUT = flags.DEFINE_string("out", "runs/long_run", "Output folder of the runs.")
 
 _PRECISIONS = ("float32", "bfloat16")
 
-# Decibels by which the two may differ in the end.
+# Largest difference of the final PSNR, in decibels.
 _APART = 0.5
 
-# Lines of a printed curve.
+# Number of lines of a printed curve.
 _INTERVALS = 10
 
-# Of one curve; what the noise of single batches averages out over.
+# Number of logged lines per curve, enough to average out the noise of single batches.
 _LINES = 20 * _INTERVALS
 
 
 def main(arguments: list[str]) -> None:
     del arguments
-    # Reading a checkpoint is not worth thirty lines.
+    # Suppresses thirty lines of logs on reading a checkpoint.
     logging.set_verbosity(logging.ERROR)
     if _STEPS.value:
         check_finite(_train("float32", _STEPS.value))
@@ -58,7 +58,7 @@ def main(arguments: list[str]) -> None:
 
 
 def _train(precision: str, steps: int) -> Path:
-    """Trains a run, or goes on with it; a finished one is used again."""
+    """Trains a run, or resumes it; a finished one is reused."""
     scene = Path(_SCENE.value)
     name = f"{_PRESET.value}_{_PATHS.value}_{precision}_{steps}"
     run = Path(_OUT.value) / scene.resolve().name / name
@@ -82,7 +82,7 @@ def check_finite(run: Path) -> None:
     largest = max(float(np.abs(leaf).max()) for _, leaf in leaves)
     print(
         f"{lines[-1]['step']} steps: {len(lines)} lines of metrics and {numbers} parameters are "
-        f"finite, the largest {largest:.3g}. Light that found no room: at most "
+        f"finite, the largest {largest:.3g}. Dropped throughput: at most "
         f"{max(line['lost'] for line in lines):.2g}."
     )
 
@@ -100,7 +100,7 @@ def curve(lines: Sequence[dict[str, Any]], steps: int) -> list[tuple[int, float]
 
 
 def compare(wide: Sequence[tuple[int, float]], narrow: Sequence[tuple[int, float]]) -> None:
-    """Prints two curves side by side, and asserts that they end together."""
+    """Prints two curves side by side, and asserts that their ends agree."""
     print("\n| step | float32: PSNR | bfloat16: PSNR | difference |")
     print("|---|---|---|---|")
     for (step, first), (_, second) in zip(wide, narrow, strict=True):

@@ -2,17 +2,17 @@
 
     python -m benchmarks.paths [--scene=FOLDER] [--view=N] [--fine=N] [--repeats=N]
 
-All camera rays of one test view are followed under the budget `tree`. In NumPy a round casts all
-live rays with Embree (single precision, `rtcIntersect1`) and shades them as arrays in single
-precision; the table also shows how much of that time is Embree's own. Compiling is not timed.
+All camera rays of one test view are traced with the path settings `tree`. In NumPy a round casts
+all live rays with Embree (single precision, `rtcIntersect1`) and shades them as arrays in single
+precision; the table also shows Embree's own share of that time. Compiling is not timed.
 
-Where Mitsuba is installed, its `path` integrator (variant `scalar_rgb`) renders the same view. It
-samples one branch at an interface where the tree follows both, so that only casts a second can be
-compared: its samples times the mean number of casts of a random path, from the tree's weights.
-Its time includes the film and its random numbers; the others' includes the list of paths.
+If Mitsuba is installed, its `path` integrator (variant `scalar_rgb`) renders the same view. It
+samples one branch at an interface where the tree follows both, so only casts per second can be
+compared: its samples times the mean number of casts of a random path, from the tree's weights. Its
+time includes the film and random numbers; the others' includes the list of paths.
 
-The process is kept on one core and the ways take turns, so that ratios hold when the machine's
-speed drifts.
+The process is pinned to one core and the methods are timed in turn, so that ratios hold when the
+machine's speed drifts.
 """
 
 import os
@@ -44,24 +44,24 @@ from tests.reference_surfaces import Embree, Hits, Surfaces
 
 _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folder of the scene.")
 _VIEW = flags.DEFINE_integer("view", 0, "Test view.")
-_FINE = flags.DEFINE_integer("fine", 2, "Rays a pixel along each axis.")
-_REPEATS = flags.DEFINE_integer("repeats", 7, "Times that each way takes its turn.")
+_FINE = flags.DEFINE_integer("fine", 2, "Rays per pixel along each axis.")
+_REPEATS = flags.DEFINE_integer("repeats", 7, "Number of timings of each method.")
 
 _LIMIT = 3.0
 
-# Mitsuba's paths are ended by length only, as long ones carry next to nothing.
+# Only the length limit ends Mitsuba's paths; long ones carry almost no light.
 _MITSUBA_DEPTH = 64
 
 
 class Outcome(NamedTuple):
-    """What one way of tracing a view did."""
+    """Result of tracing a view with one method."""
 
     casts: float
     paths: int
 
 
 class SinglePrecisionEmbree(Embree):
-    """Takes Embree's hits as they are, and counts the seconds that it needs."""
+    """Uses Embree's hits without refinement, and measures its time."""
 
     def __init__(self, surfaces: Surfaces):
         """Builds Embree's tree."""
@@ -69,7 +69,7 @@ class SinglePrecisionEmbree(Embree):
         self.seconds = 0.0
 
     def __call__(self, origins: np.ndarray, directions: np.ndarray, leaving: np.ndarray) -> Hits:
-        """Returns the closest hits of rays that leave some triangles (-1: none)."""
+        """Returns the closest hits of rays that start on the given triangles (-1: none)."""
         starts = self.off_surface(origins, directions, leaving)
         begin = time.perf_counter()
         found = self.scene.run(starts, directions, output=1)
@@ -78,7 +78,7 @@ class SinglePrecisionEmbree(Embree):
 
 
 class _Library:
-    """The library's tree; the first turn compiles."""
+    """The library's tree; the first call compiles."""
 
     def __init__(self, scene: Path, origins: np.ndarray, directions: np.ndarray):
         parts = meshes.read_meshes(scene)
@@ -164,7 +164,7 @@ def main(arguments: list[str]) -> None:
         casts = _casts_of_random_paths(surfaces, origins, directions)
         ways["Mitsuba"] = _Mitsuba(scene, view, casts)
     else:
-        print("Mitsuba is not installed and left out: pip install mitsuba")
+        print("Mitsuba is not installed and is omitted. `pip install mitsuba` adds it.")
     seconds, outcomes, embree = _take_turns(ways, numpy)
     _print_table(f"{scene.name}, view {_VIEW.value}", len(origins), seconds, outcomes, embree)
     ratio = np.median(seconds["refref_jax"]) / np.median(seconds["Embree in NumPy"])
@@ -176,7 +176,7 @@ def main(arguments: list[str]) -> None:
 def _casts_of_random_paths(
     surfaces: Surfaces, origins: np.ndarray, directions: np.ndarray
 ) -> float:
-    """Returns how often a path is cast on average that takes either branch by its share."""
+    """Returns the mean casts of a path that takes each branch with its share as probability."""
     clear = surfaces._replace(tints=np.ones_like(surfaces.tints))
     rule = reference_tree.Rule(_MITSUBA_DEPTH, "all", cut=0.002)
     some = np.arange(0, len(origins), 4)
@@ -188,7 +188,7 @@ def _casts_of_random_paths(
 def _take_turns(
     ways: dict[str, Callable[[], Outcome]], numpy: _NumPy
 ) -> tuple[dict[str, list[float]], dict[str, Outcome], float]:
-    """Returns the seconds of every turn, what was done, and Embree's own share of the time."""
+    """Returns the seconds of every turn, the outcomes, and Embree's own share of the time."""
     outcomes = {name: way() for name, way in ways.items()}
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     numpy.embree.seconds = 0.0
@@ -221,7 +221,7 @@ def _print_table(
 
 
 def _check_same_tree(ours: Outcome, theirs: Outcome) -> None:
-    """Checks that both followed the same light, but for rounding where it is trapped long."""
+    """Checks that both trees agree, up to rounding of long trapped paths."""
     assert abs(ours.casts / theirs.casts - 1.0) < 0.01
     assert abs(ours.paths / theirs.paths - 1.0) < 0.01
 

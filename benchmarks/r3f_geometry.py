@@ -1,17 +1,17 @@
-"""Claim: masks alone give convex bodies silhouettes that overlap by 0.985, and a ball its normals.
+"""Claim: masks alone give convex objects silhouettes with an IoU of 0.985, and a ball its normals.
 
     python -m benchmarks.r3f_geometry [--views=N] [--size=PIXELS] [--resolution=N]
 
-Five bodies with known normals are seen by cameras like the data set's; their masks are made by the
-library's own tracer, the body is carved from them, and refined. Normals of the ball are within 2
-degrees, and refining betters those of every body. A table shows after every stage the
-mean distance between the surfaces (share of the diameter), the mean angle between the normals, the
-overlap of silhouettes in views that were not carved with, and the volume.
+Masks of five objects with known normals, seen by cameras like the data set's, are rendered by the
+library's own tracer; each object is carved from them, and refined. Normals of the ball are within 2
+degrees, and refining improves those of every object. After every stage a table shows the mean
+distance between the surfaces (share of the diameter), the mean angle between the normals, the IoU
+of silhouettes in held-out views, and the volume.
 
-`paper` is the paper's recipe as it is done by hand: convex hull if no vertex is 0.02 deep below it,
-and a hundred moves of every vertex to the mean of its neighbours. Its bevel does nothing to a mesh
-without edges above its limit of 30 degrees; its remesh follows the smoothed surface. Both are left
-out. `diffused` is the same with the smoothing as a length of 0.3 and the volume kept.
+`paper` is the paper's manual recipe: the convex hull if no vertex is 0.02 deep below it, and a
+hundred moves of every vertex to the mean of its neighbours. The recipe's bevel has no effect on a
+mesh without edges above its limit of 30 degrees, and its remesh follows the smoothed surface; both
+are omitted. `diffused` is the same with a smoothing length of 0.3 and the volume preserved.
 """
 
 from dataclasses import replace
@@ -55,9 +55,11 @@ def main(arguments: list[str]) -> None:
     for name, truth in _bodies().items():
         raw, last, overlap = _measure(name, truth)
         assert last.chamfer <= 0.005, f"the {name} is further than 0.5 % of its diameter off"
-        assert last.normal_error < raw.normal_error, f"refining spoils the normals of the {name}"
+        assert last.normal_error < raw.normal_error, (
+            f"refinement degrades the normals of the {name}"
+        )
         if name != "torus":
-            assert overlap >= 0.985, f"silhouettes of the {name} overlap by less than 0.985"
+            assert overlap >= 0.985, f"the silhouettes of the {name} have an IoU below 0.985"
         if name == "ball":
             assert last.normal_error <= 2.0, "the ball's normals are off by more than 2 degrees"
 
@@ -79,7 +81,7 @@ def _bodies() -> dict[str, Mesh]:
 
 
 def _measure(name: str, truth: Mesh) -> tuple[Distance, Distance, float]:
-    """Prints the rows of a body; returns its distances, raw and refined, and the overlap then."""
+    """Prints the rows of an object; returns its distances, raw and refined, and the refined IoU."""
     generator = np.random.default_rng(0)
     cameras = _cameras(_VIEWS.value, generator)
     others = _cameras(_TEST_VIEWS, generator)
@@ -111,7 +113,7 @@ def _measure(name: str, truth: Mesh) -> tuple[Distance, Distance, float]:
 
 
 def _cameras(count: int, generator: np.random.Generator) -> Cameras:
-    """Returns cameras at random places on a sphere that look at its middle."""
+    """Returns cameras at random positions on a sphere that look at its centre."""
     back = generator.normal(size=(count, 3))
     back /= np.linalg.norm(back, axis=1, keepdims=True)
     right = np.cross([0.0, 0.0, 1.0], back)
@@ -121,7 +123,7 @@ def _cameras(count: int, generator: np.random.Generator) -> Cameras:
 
 
 def _paper(mesh: Mesh) -> Mesh:
-    """Returns what the paper does by hand, counted in steps instead of lengths."""
+    """Returns the paper's manual recipe, counted in steps instead of lengths."""
     if depth_below_hull(mesh) < _DEPTH:
         mesh = hull(mesh)
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)

@@ -1,11 +1,11 @@
-"""Claim: the index of refraction is found within 0.005 with the true mesh, within 0.02 without.
+"""Claim: the estimated index of refraction is within 0.005 with the true mesh, 0.02 without.
 
     python -m benchmarks.r3f_index [--scenes=FOLDER,FOLDER] [--starts=1.2,2.0] [--bodies=true,masks]
 
-For each scene of one body a background is learned beside it, and the index is looked for with the
-scene's own mesh and with the one that masks give, from every start. A table shows what was found,
-one standard deviation, and the truth, which is what the scene says of its mesh. What is learned or
-reconstructed is used again.
+For each scene with a single mesh a background is trained, and the index is estimated with the
+scene's own mesh and with the one from masks, from every start. A table shows the estimate, one
+standard deviation, and the true index in the scene's record. Finished trainings and reconstructions
+are reused.
 """
 
 import time
@@ -22,9 +22,9 @@ from refref_jax.geometry.triangle_meshes import Mesh
 _BODIES = {"true": 0.005, "masks": 0.02}
 
 _SCENES = flags.DEFINE_list("scenes", ["experiments/data/cube_smcvx_ball"], "Folders of scenes.")
-_STARTS = flags.DEFINE_list("starts", ["1.2", "2.0"], "Indices to descend from, besides others.")
-_BODY = flags.DEFINE_list("bodies", list(_BODIES), "Meshes to look with: 'true', 'masks'.")
-_OUT = flags.DEFINE_string("out", "runs/r3f_index", "Where to write.")
+_STARTS = flags.DEFINE_list("starts", ["1.2", "2.0"], "Initial indices, in addition to others.")
+_BODY = flags.DEFINE_list("bodies", list(_BODIES), "Meshes to estimate with: 'true', 'masks'.")
+_OUT = flags.DEFINE_string("out", "runs/r3f_index", "Output folder.")
 
 _CELLS = 128
 
@@ -55,7 +55,7 @@ def main(arguments: list[str]) -> None:
 
 
 def _mesh_of_masks(scene: Path, out: Path) -> Mesh:
-    """Reconstructs a body as the command does, with an index that nobody looks at."""
+    """Reconstructs an object as the command does, with an index that is never used."""
     folder = out / "reconstruction"
     config = ReconstructionConfig("hull", _CELLS, 0, 1.5, None, None, 0, 0)
     found = chain.reconstruct(scene, folder, config, compare=True)

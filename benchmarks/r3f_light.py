@@ -1,12 +1,12 @@
-"""Claim: refinement by light explains pixels better that it was not fitted to.
+"""Claim: refinement by light improves pixels that it was not fitted to.
 
     python -m benchmarks.r3f_light [--scene=FOLDER] [--steps=N]
 
-A scene's object is reconstructed as `experiments.reconstruct --light_steps=N` does. A table shows
-the body that masks gave, the one that light made of it, and the scene's own: the mean error of the
+A scene's object is reconstructed as `experiments.reconstruct --light_steps=N` does. A table
+compares the mesh from masks, the mesh refined by light, and the scene's own: the mean error of the
 validation views' pixels, the index of refraction, the distance to the scene's own mesh (share of
-the diameter) and the angle between the normals, which gets no worse. What is reconstructed is used
-again.
+the diameter) and the angle between the normals, which must not increase. Finished reconstructions
+are reused.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ from refref_jax.reconstruct.comparison import Distance, compare_meshes
 _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folder of a scene.")
 _STEPS = flags.DEFINE_integer("steps", 60, "Steps of the descent.")
 _RESOLUTION = flags.DEFINE_integer("resolution", 128, "Cells along the longest edge of the grid.")
-_OUT = flags.DEFINE_string("out", "runs/r3f_light", "Where to write.")
+_OUT = flags.DEFINE_string("out", "runs/r3f_light", "Output folder.")
 
 _SEED = 0
 
@@ -50,8 +50,10 @@ def main(arguments: list[str]) -> None:
         measured[name] = error, compare_meshes(mesh, truth)
         print(_row(name, error, index, measured[name][1]), flush=True)
     (before, normals_before), (after, normals_after), _ = measured.values()
-    assert after < before, "light explains pixels no better that it was not fitted to"
-    assert normals_after.normal_error <= normals_before.normal_error, "light spoils the normals"
+    assert after < before, "refinement by light does not improve held-out pixels"
+    assert normals_after.normal_error <= normals_before.normal_error, (
+        "refinement by light degrades the normals"
+    )
 
 
 def _config() -> ReconstructionConfig:

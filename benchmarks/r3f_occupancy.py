@@ -1,4 +1,4 @@
-"""Claim: a field trained on masks is about as near a scene's body as their hull is.
+"""Claim: an occupancy field trained on masks is about as accurate as their visual hull.
 
     python -m benchmarks.r3f_occupancy [--scene=FOLDER] [--masks=given,uneven,shifted]
 
@@ -7,10 +7,10 @@ The training masks of a scene are carved (`visual_hull`), and an occupancy field
 (share of the diameter), the mean angle between the normals, the overlap of silhouettes in test
 views, and the volume.
 
-The claim is of the masks as given. What becomes of it where masks err is shown, and nothing is
-claimed: `uneven`, where every second one is eroded and the others dilated by a pixel; `shifted`,
-where one is moved by a tenth of its width. Of hulls there are two in the last case: `hull`, and
-`hull, 1 out` that passes over one view at every point.
+The claim is about correct masks (`given`). Results with wrong masks are shown, without a claim:
+`uneven`, where every second one is eroded and the others dilated by a pixel; `shifted`, where one
+is moved by a tenth of its width. The last case has two hulls: `hull`, and `hull, 1 out`, which
+ignores one view at every point.
 """
 
 from collections.abc import Callable
@@ -49,7 +49,7 @@ _TEST_VIEWS = 10
 _ONE_OUT = "hull, 1 out"
 _OUTLIERS = {_ONE_OUT: 1}
 
-# The field's distance over the hull's that still counts as near.
+# Largest ratio of the field's distance to the hull's.
 _AS_NEAR = 1.25
 
 
@@ -88,7 +88,7 @@ def _bodies(kind: str) -> dict[str, Callable[[Masks, Cameras], Grid]]:
 
 
 def _altered(kind: str, masks: Masks) -> Masks:
-    """Returns masks that err as their kind says."""
+    """Returns masks with the errors of a kind."""
     if kind == "uneven":
         changes = (binary_erosion, binary_dilation)
         return np.stack([changes[i % 2](mask) for i, mask in enumerate(masks)])
@@ -102,7 +102,7 @@ def _altered(kind: str, masks: Masks) -> Masks:
 def _row(
     names: tuple[str, ...], mesh: Mesh, truth: Mesh, others: local_layout.Frames
 ) -> tuple[Distance, float]:
-    """Prints a row, and returns the distance and the overlap in it."""
+    """Prints a row, and returns its distance and IoU."""
     cameras = others.cameras._replace(poses=others.cameras.poses[:_TEST_VIEWS])
     expected = local_layout.read_masks(others)[:_TEST_VIEWS]
     found = compare_meshes(mesh, truth)

@@ -1,11 +1,11 @@
-"""Claim: masks of a rendered scene give silhouettes that overlap by 0.985, and a ball its normals.
+"""Claim: masks of a rendered scene give silhouettes with an IoU of 0.985, and a ball its normals.
 
     python -m benchmarks.r3f_scenes [--scenes=FOLDER,FOLDER] [--resolution=N]
 
-Each scene is reconstructed from its training images and masks as `experiments.reconstruct` does.
-A table shows what its report measured: the overlap with the masks of views that it was not made
-from, and the distance to the scene's own outermost mesh as a share of its diameter. The distance
-is at most 0.5 %, and a ball's normals are within 2 degrees. What is reconstructed is used again.
+Each scene is reconstructed from its training images and masks as `experiments.reconstruct` does. A
+table shows the numbers of its report: the IoU with the masks of held-out views, and the distance to
+the scene's own outermost mesh as a share of its diameter. The distance is at most 0.5 %, and a
+ball's normals are within 2 degrees. Finished reconstructions are reused.
 """
 
 from pathlib import Path
@@ -17,13 +17,13 @@ from experiments.r3f.records import ReconstructionConfig, ReportFacts
 
 _SCENES = flags.DEFINE_list("scenes", ["experiments/data/cube_smcvx_ball"], "Folders of scenes.")
 _RESOLUTION = flags.DEFINE_integer("resolution", 128, "Cells along the longest edge of the grid.")
-_OUT = flags.DEFINE_string("out", "runs/r3f_scenes", "Where to write.")
+_OUT = flags.DEFINE_string("out", "runs/r3f_scenes", "Output folder.")
 
 _OVERLAP = 0.985
 _CHAMFER = 0.005
 _BALL_NORMALS = 2.0
 
-# Nobody looks at it, and so it is not searched for.
+# Fixed, since it is not used: this skips the search.
 _INDEX = 1.5
 
 
@@ -66,9 +66,9 @@ def _nothing(text: str) -> None:
 
 
 def _failures(name: str, found: ReportFacts) -> list[str]:
-    """Returns what does not hold of a scene."""
+    """Returns the failed checks of a scene."""
     claims = {
-        f"silhouettes of {name} overlap by less than {_OVERLAP}": found.mean_overlap >= _OVERLAP,
+        f"the silhouettes of {name} have an IoU below {_OVERLAP}": found.mean_overlap >= _OVERLAP,
         f"{name} is further than 0.5 % of its diameter off": found.truth.chamfer <= _CHAMFER,
         f"the normals of {name} are off by more than 2 degrees": (
             not name.endswith("ball") or found.truth.normal_error <= _BALL_NORMALS

@@ -1,16 +1,17 @@
-"""Claim: a body reconstructed from masks and images beats straight light inside it by 3 dB.
+"""Claim: an object reconstructed from masks and images beats straight rays by 3 dB masked PSNR.
 
     python -m benchmarks.r3f_versus_straight [--scenes=FOLDER,FOLDER] [--steps=N] [--limit=N]
 
-On each scene the same preset is trained three times on the same pixels: with straight light, with
-the body that R3F makes of images and masks alone, and with the scene's own meshes (the oracle). The
-table shows what each gave on the test split, and how far R3F is from the oracle. The distance of a
-pixel is that of the first surface where a body is met, else the median of the field's weights.
+On each scene the same preset is trained three times on the same pixels: with straight rays, with
+the object that R3F reconstructs from images and masks alone, and with the scene's own meshes (the
+oracle). The table shows the results on the test split, and the distance of R3F from the oracle. The
+depth of a pixel is that of the first surface if an object is hit, else the median of the field's
+weights.
 
-Asserted is the gain of R3F over straight light inside the mask, on scenes of one convex body by
-their names (`_smcvx_`), and that an estimated index of a body in the table of materials is within
-0.02 of it there. Other bodies are reported: the hull sees into no cavity. What is finished is not
-done again.
+Asserted are the gain of R3F over straight rays in masked PSNR, on scenes of one convex object
+according to their names (`_smcvx_`), and that an estimated index of an object in the table of
+materials is within 0.02 of it there. Other objects are reported only: a visual hull cannot
+represent cavities. Finished trainings are reused.
 """
 
 from collections.abc import Sequence
@@ -30,24 +31,26 @@ from refref_jax.training.presets import PRESETS
 _SCENES = flags.DEFINE_list("scenes", ["experiments/data/cube_smcvx_ball"], "Folders of scenes.")
 _PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Preset of all trainings.")
 _STEPS = flags.DEFINE_integer("steps", None, "Training steps; the preset's if not given.", 1)
-_RAYS_PER_PIXEL = flags.DEFINE_integer("rays_per_pixel", 4, "Rays a pixel in evaluation.", 1)
-_LIMIT = flags.DEFINE_integer("limit", None, "Only this many test images, evenly spread.", 1)
-_OUT = flags.DEFINE_string("out", "runs/r3f_versus_straight", "Where to write the runs.")
+_RAYS_PER_PIXEL = flags.DEFINE_integer("rays_per_pixel", 4, "Rays per pixel in evaluation.", 1)
+_LIMIT = flags.DEFINE_integer(
+    "limit", None, "Number of test images, evenly spaced; all if not given.", 1
+)
+_OUT = flags.DEFINE_string("out", "runs/r3f_versus_straight", "Output folder of the runs.")
 
 _GAIN = 3.0
 _INDEX_ERROR = 0.02
 
 
 class Trial(NamedTuple):
-    """What a scene's trainings gave.
+    """Results of a scene's trainings.
 
     Attributes:
       scene: name of its folder.
-      index: what R3F took for the body's.
-      true_index: of its mesh; `None` if there are several.
-      straight: without the objects.
-      r3f: with the reconstructed body.
-      oracle: with the scene's meshes.
+      index: index of refraction that R3F estimated.
+      true_index: index of the mesh; `None` if there are several.
+      straight: result without the objects.
+      r3f: result with the reconstructed object.
+      oracle: result with the scene's meshes.
     """
 
     scene: str
@@ -59,12 +62,12 @@ class Trial(NamedTuple):
 
     @property
     def gain(self) -> float:
-        """Decibels of R3F over straight light inside the mask."""
+        """Gain of R3F over straight rays in masked PSNR, dB."""
         return self.r3f.psnr_masked - self.straight.psnr_masked
 
     @property
     def shortfall(self) -> float:
-        """Decibels of R3F below the oracle there."""
+        """Masked PSNR of R3F below the oracle's, dB."""
         return self.oracle.psnr_masked - self.r3f.psnr_masked
 
 
@@ -74,14 +77,14 @@ def main(arguments: list[str]) -> None:
     for scene in scenes:
         measured_runs.check_masks(scene)
     if not any(_is_convex(scene.resolve().name) for scene in scenes):
-        print("No scene is named as one of a convex body (_smcvx_): nothing will be asserted.")
+        print("No scene name contains _smcvx_ (convex objects): nothing will be asserted.")
     trials = [measure(scene) for scene in scenes]
     print(table(trials))
     check(trials)
 
 
 def measure(scene: Path) -> Trial:
-    """Reconstructs a scene's body, trains all three, and evaluates them."""
+    """Reconstructs a scene's object, trains all three, and evaluates them."""
     name = scene.resolve().name
     folder = Path(_OUT.value) / name
     folder.mkdir(parents=True, exist_ok=True)
@@ -122,7 +125,7 @@ def table(trials: Sequence[Trial]) -> str:
 
 
 def check(trials: Sequence[Trial]) -> None:
-    """Asserts the claim on convex bodies."""
+    """Asserts the claim on convex objects."""
     for trial in trials:
         if _is_convex(trial.scene):
             assert trial.gain >= _GAIN, f"R3F gains only {trial.gain:.2f} dB on {trial.scene}"

@@ -1,14 +1,13 @@
-"""Puts rays in an order in which neighbours share their way through the tree.
+"""Sorts rays so that neighbours share their traversal of the tree.
 
-Two rays need the same nodes where they run in one octant of directions, start in one region and
-leave in one region. So a ray's key is its octant, then the cell of its origin in the scene's box
-(4 x 4 x 4), then the cell of the point where it leaves that box (16 x 16 x 16), both as Morton
-codes.
+Two rays visit the same nodes if they share an octant of directions, the region where they start and
+the region where they leave. So a ray's key is its octant, then the cell of its origin in the
+scene's box (4 x 4 x 4), then the cell of the point where it leaves that box (16 x 16 x 16), both as
+Morton codes.
 
-The keys are put in order by counting on a CPU, where it is four times faster than a sort. Each pass
-puts them in order of one digit and keeps the order of those that share it, from the lowest digit
-up. A pass takes two loops over the keys, one that counts each digit and one that puts every key in
-its place.
+On a CPU the keys are sorted by counting (radix sort), four times faster than a comparison sort.
+Each pass sorts them stably by one digit, from the lowest digit up. A pass has two loops over the
+keys: one counts each digit, the other moves every key to its position.
 
 Source: Seward, Information Sorting in the Application of Electronic Digital Computers (1954).
 """
@@ -30,7 +29,7 @@ _EXIT_BITS = 4
 _KEY_BITS = 3 + 3 * _ORIGIN_BITS + 3 * _EXIT_BITS
 
 _DIGIT_BITS = 11
-"""Most bits of a digit: the counters of one pass are 8 KiB, and two passes serve 22 bits."""
+"""Most bits of a digit: the counters of one pass are 8 KiB, and two passes suffice for 22 bits."""
 
 
 def closest_hits_sorted(
@@ -42,19 +41,19 @@ def closest_hits_sorted(
 ) -> Hits:
     """Finds the same hits as `bvh.closest_hits`, tracing the rays in a coherent order.
 
-    It pays on a CPU for rays that come in no order, from some thousands on: rays inside a body
-    that are shuffled are then traced more than twice as fast, the sort included. The more rays are
-    sorted at once, the more alike are neighbours: 262,144 are a tenth to a fifth faster than
-    65,536. Camera rays in tiles, and what a smooth body makes of them, are slower for it.
+    This pays on a CPU for incoherent rays, from some thousands on: shuffled rays inside an object
+    are traced more than twice as fast, including the sort. Larger batches have more similar
+    neighbours: 262,144 rays are a tenth to a fifth faster than 65,536. Camera rays in tiles, and
+    their refractions by a smooth object, become slower.
 
     Args:
-      bvh: the scene.
+      bvh: tree of the scene.
       rays: any number of rays.
-      limits: as for `bvh.closest_hits`.
-      leaving: as for `bvh.closest_hits`.
+      limits: limits of the hit distances, as in `bvh.closest_hits`.
+      leaving: excluded primitives, as in `bvh.closest_hits`.
 
     Returns:
-      The hits, in the order of the rays as they were given.
+      The hits, in the original order of the rays.
     """
     order = coherent_order(bvh, rays)
 
@@ -73,10 +72,10 @@ def closest_hits_sorted(
 
 
 def coherent_order(bvh: BVH, rays: Rays) -> Int[Array, " rays"]:
-    """Returns the numbers of the rays in an order in which neighbours are alike.
+    """Returns a permutation of the rays that makes neighbours similar.
 
     Args:
-      bvh: the scene, for its box.
+      bvh: tree of the scene, for its box.
       rays: any number of rays.
     """
     corners = jax.lax.bitcast_convert_type(bvh.nodes[0, 0, :6], jnp.float32)
@@ -104,9 +103,9 @@ def _key(
 def _morton(
     point: Float[Array, "3"], lower: Float[Array, "3"], upper: Float[Array, "3"], bits: int
 ) -> UInt32[Array, ""]:
-    """Returns the number of the point's cell, with the bits of its three coordinates interleaved.
+    """Returns the Morton code of the point's cell: the interleaved bits of its three coordinates.
 
-    A point outside the box counts as on its nearest face.
+    A point outside the box is moved to its nearest face.
     """
     scaled = (point - lower) * numerics.safe_divide(jnp.ones_like(lower), upper - lower)
     cell = jnp.clip(scaled * 2**bits, 0, 2**bits - 1).astype(jnp.int32).astype(jnp.uint32)
@@ -118,11 +117,11 @@ def _morton(
 
 
 def stable_order(keys: UInt32[Array, " numbers"], *, bits: int) -> Int[Array, " numbers"]:
-    """Returns the places of the keys from the lowest to the highest; equal keys keep their order.
+    """Returns the permutation that sorts the keys in ascending order; equal keys keep their order.
 
     Args:
-      keys: below `2**bits`.
-      bits: fixed when compiled.
+      keys: keys below `2**bits`.
+      bits: number of bits, a constant at compile time.
     """
     if keys.shape[0] == 0:
         return jnp.zeros(0, jnp.int32)
@@ -148,7 +147,7 @@ def _order_by_digits(keys: UInt32[Array, " numbers"], bits: int) -> Int[Array, "
 def _count(
     keys: UInt32[Array, " numbers"], shift: UInt32[Array, ""], zeros: Int[Array, " digits"]
 ) -> Int[Array, " digits"]:
-    """Returns how often each digit occurs."""
+    """Returns the count of each digit."""
 
     def count(index: Array, totals: Array) -> Array:
         return _increase(totals, _digit(_read(keys, index), shift, totals))
@@ -163,13 +162,13 @@ def _place(
     order: Int[Array, " numbers"],
     starts: Int[Array, " digits"],
 ) -> Int[Array, " numbers"]:
-    """Returns the numbers of the keys by digit; those of one digit go from its start on."""
+    """Returns the indices of the keys sorted by digit; those of one digit start at its offset."""
 
     def place(index: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         ends, placed = state
         number = _read(order, index)
         digit = _digit(_read(keys, number), shift, ends)
-        # The place is read from the counters after their update: if the old ones were still in
+        # The position is read from the counters after their update: if the old ones were still in
         # use, XLA would copy all of them for every number.
         ends = _increase(ends, digit)
         return ends, _write(placed, _read(ends, digit) - 1, number)
@@ -181,8 +180,8 @@ def _place(
 def _digit(
     key: UInt32[Array, ""], shift: UInt32[Array, ""], counters: Int[Array, " digits"]
 ) -> Int[Array, ""]:
-    """Returns the digit of a key that begins at the bit `shift`."""
-    # Cut out before the loops, XLA would compute the keys anew for every pass.
+    """Returns the digit of a key that starts at the bit `shift`."""
+    # If this were done before the loops, XLA would recompute the keys for every pass.
     return ((key >> shift) & (counters.shape[0] - 1)).astype(jnp.int32)
 
 

@@ -2,10 +2,10 @@
 
     python -m benchmarks.step_cost [--scene=FOLDER] [--rounds=N]
 
-All models have the same samples a path, and model of the scene what it needs. They are stepped in
+All models have the same samples per path, and the scene analysis of training. They are stepped in
 turn in one process, so that ratios hold when the machine's speed drifts. A step includes its share
-of drawing and tracing; where paths are kept, that of tracing all of them once, spread over the
-steps of the preset. Tracing is to take at most a tenth of a step.
+of drawing and tracing; if paths are cached, that is the cost of tracing all of them once, spread
+over the steps of the preset. Tracing must take at most a tenth of a step.
 """
 
 import time
@@ -21,32 +21,32 @@ from refref_jax.training import loop
 
 _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folder of the scene.")
 _PRESET = flags.DEFINE_string("preset", "tiny", "Preset of all models.")
-_ROUNDS = flags.DEFINE_integer("rounds", 8, "Times that each model takes two pools of steps.")
+_ROUNDS = flags.DEFINE_integer("rounds", 8, "Number of times that each model steps two pools.")
 
 _STRAIGHT = "straight"
 _LIMITS = {_STRAIGHT: 1.0, "paper": 1.25, "tree": 1.5}
 _MOST_TRACING = 0.1
 
-# As `experiments.train` has it by default.
+# The default of `experiments.train`.
 _STRIDE = 10
 
 
 class _Cost(NamedTuple):
-    """Seconds a step, and those of them that are tracing."""
+    """Seconds per step, and the part spent on tracing."""
 
     step: float
     tracing: float
 
 
 class _Method:
-    """One model in training, stepped two pools at a time."""
+    """One model in training, stepped two pools of batches at a time."""
 
     def __init__(self, scene: Path, paths: str) -> None:
         self._setup, self._state = set_up_training(scene, preset=_PRESET.value, paths=paths)
         self.paths_per_ray = self._setup.capacity / self._setup.config.schedule.batch
 
     def cost(self) -> _Cost:
-        """Traces a pool and takes the steps of two."""
+        """Traces a pool of batches and takes the steps of two."""
         pool, batches = self._setup.config.schedule.pool, self._setup.sampler.batches
         begin = time.perf_counter()
         jax.block_until_ready(loop.trace_batches(self._setup, range(pool)))
@@ -70,7 +70,7 @@ def main(arguments: list[str]) -> None:
     for method in methods.values():
         method.cost()  # compiles
     rounds = [{name: each.cost() for name, each in methods.items()} for _ in range(_ROUNDS.value)]
-    print("| paths | room a ray | ms a step | of them tracing | to straight (least, most) |")
+    print("| paths | capacity per ray | ms per step | tracing, ms | to straight (least, most) |")
     print("|---|---|---|---|---|")
     medians = {}
     for name, method in methods.items():

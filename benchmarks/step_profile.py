@@ -1,11 +1,11 @@
-"""Claim: tracing paths anew takes at most a quarter of a training step along the path tree.
+"""Claim: tracing paths takes at most a quarter of a training step along the path tree.
 
     python -m benchmarks.step_profile [--scene=FOLDER] [--preset=tiny] [--paths=tree] [--rounds=N]
 
 Times a step and its parts in turn, in one process: shares hold when the machine's speed drifts.
-Parts are compiled on their own, so they need not add up to the step. Tracing is that of a pool that
-is traced anew; `step_cost` has the share where paths are kept, and claims it. Reading and adding to
-the tables of hash grids is bound by memory: it is compared with the device's speed of copying.
+Parts are compiled separately, so they need not add up to the step. Tracing is that of a newly
+traced pool of batches; `step_cost` claims the share if paths are cached. Reading from and adding to
+the tables of hash grids is bound by memory: it is compared with the device's copy speed.
 """
 
 import functools
@@ -41,15 +41,16 @@ _ROUNDS = flags.DEFINE_integer("rounds", 8, "How often everything is timed.")
 _LIMIT = 0.25
 
 _COPIED = 1 << 26
-"""Floats of the copy by which memory is measured: more than any cache holds."""
+"""Number of floats in the copy that measures memory speed: larger than any cache."""
 
 
 class _Points(NamedTuple):
-    """What the fields are asked in one step.
+    """Field queries of one step.
 
     Attributes:
-      rounds: Gaussians `[paths, samples, multisamples]` of each proposal and of the final round.
-      directions: of the final round.
+      rounds: Gaussians `[paths, samples, multisamples]` of each proposal level and of the final
+        level.
+      directions: view directions of the final level.
     """
 
     rounds: list[Gaussians]
@@ -57,7 +58,7 @@ class _Points(NamedTuple):
 
 
 def _chords(config: ModelConfig, paths: int) -> _Points:
-    """Returns points along random chords of the unit cube, as sparse in memory as a step's."""
+    """Returns points along random chords of the unit cube, as scattered in memory as a step's."""
     rng = np.random.default_rng(0)
     first, last = rng.uniform(size=(2, paths, 1, 3))
     counts = [*(proposal.samples for proposal in config.proposals), config.samples]
@@ -75,7 +76,7 @@ def _grids(config: ModelConfig) -> list[HashGridConfig]:
 
 
 def _features(params: list, config: ModelConfig, points: _Points) -> list[jax.Array]:
-    """Returns the features of all rounds; `params` are those of the grids alone."""
+    """Returns the features of all levels; `params` are those of the grids alone."""
 
     def one_round(params: dict, grid: HashGridConfig, gaussians: Gaussians) -> jax.Array:
         features = functools.partial(MultisampledGrid(grid).apply, {"params": params})
@@ -85,7 +86,7 @@ def _features(params: list, config: ModelConfig, points: _Points) -> list[jax.Ar
 
 
 def _seen(params: tuple, config: ModelConfig, points: _Points) -> list[jax.Array]:
-    """Returns what the fields of all rounds answer."""
+    """Returns the outputs of the fields of all levels."""
     found = []
     for field, proposal, gaussians in zip(
         params.proposals, config.proposals, points.rounds[:-1], strict=True
@@ -119,7 +120,7 @@ def _interlevel(final: Histogram, proposal: Histogram, blur: float) -> jax.Array
 
 
 def _sampling(weights: list[jax.Array], blurs: tuple[float, ...]) -> jax.Array:
-    """Draws each round from the one before it, and compares all with the last."""
+    """Draws each level from the previous one, and compares all with the last."""
     paths, count = weights[0].shape
     edges = [jnp.broadcast_to(jnp.linspace(0.0, 1.0, count + 1), (paths, count + 1))]
     for before, after in itertools.pairwise(weights):
@@ -130,7 +131,7 @@ def _sampling(weights: list[jax.Array], blurs: tuple[float, ...]) -> jax.Array:
 
 
 class _Profile:
-    """A step and its parts, each a function without arguments that returns when it is done."""
+    """A step and its parts, each a function without arguments that blocks until it is done."""
 
     def __init__(self, scene: Path, *, preset: str, paths: str) -> None:
         self.setup, self._state = set_up_training(scene, preset=preset, paths=paths)
@@ -235,7 +236,7 @@ def _compiled(function: Callable, *arguments: object) -> Callable[[], None]:
 
 
 def _copy_speed() -> float:
-    """Returns the bytes a second that a copy reads and writes."""
+    """Returns the bytes per second that a copy reads and writes."""
     values = jnp.ones(_COPIED)
     copy = _compiled(lambda x: x + 1.0, values)
     taken = []

@@ -12,12 +12,12 @@ from refref_jax.training.steps import Pool
 
 
 def set_up_training(scene: Path, *, preset: str, paths: str) -> tuple[loop.Setup, TrainState]:
-    """Returns a run that has not begun, and models of the scene what it needs.
+    """Returns a run before its first step, with the scene analysis of training.
 
     Args:
       scene: folder of the scene.
       preset: name of a preset.
-      paths: name of a budget.
+      paths: name of path settings.
     """
     asked = TrainConfig().override(scene=str(scene), preset=preset, paths=paths)
     (config, model, *_), geometry = prepare(asked)
@@ -29,5 +29,5 @@ def set_up_training(scene: Path, *, preset: str, paths: str) -> tuple[loop.Setup
 
 
 def trace_pool(setup: loop.Setup) -> Pool:
-    """Draws and traces the first pool of a run, as its loop does."""
+    """Draws and traces the first pool of batches of a run, as its loop does."""
     return loop.trace_batches(setup, setup.sampler.numbers(0, setup.config.schedule.pool).tolist())

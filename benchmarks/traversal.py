@@ -1,15 +1,15 @@
-"""Claim: on one core rays are traced at Embree's speed, and half of it if they come shuffled.
+"""Claim: on one core, rays are traced at Embree's speed, or half of it if they are shuffled.
 
     taskset -c 0 python -m benchmarks.traversal [--rounds=N] [--meshes=NAME,...] [--any_speed]
 
-Single rays of Embree (`rtcIntersect1`, through embreex) against packets in XLA, in turn and in
-one process, each timed by the median of its rounds, 262,144 rays at once: with fewer, shuffled
-rays have less alike neighbours and are slower. Camera rays come in tiles of 4 x 4 pixels and must
-reach 0.9 of Embree's rate up to 100k triangles and 0.65 above. Rays that start anywhere
-inside the body, in any direction and shuffled, must reach 0.55, with the time of sorting them
-included. The hits are compared as well. Mitsuba's image of distances (`scalar_rgb`) is shown
-beside them where it is installed. All must run on one core, which is the caller's to see to; a
-core that others share slows wide arithmetic more than it slows Embree.
+Single rays of Embree (`rtcIntersect1`, through embreex) are compared with packets in XLA, in turn
+and in one process, each timed by the median of its rounds, 262,144 rays at once: with fewer,
+shuffled rays have less similar neighbours and are slower. Camera rays come in tiles of 4 x 4 pixels
+and must reach 0.9 of Embree's rate up to 100k triangles and 0.65 above. Shuffled rays that start
+anywhere inside the object, in any direction, must reach 0.55, including the time to sort them. The
+hits are compared as well. Mitsuba's distance render (`scalar_rgb`) is shown next to them if it is
+installed. All must run on one core, which the caller has to ensure; a core shared with other
+processes slows wide arithmetic more than it slows Embree.
 
 With `--any_speed` the table is printed and only the hits are asserted.
 """
@@ -38,7 +38,7 @@ _ANY_SPEED = flags.DEFINE_bool("any_speed", False, "Assert nothing about the spe
 _SIDE = 512
 _COUNT = _SIDE * _SIDE
 
-# The camera: where it stands, and half the width of its image at unit distance.
+# The camera: its position, and half the width of its image at unit distance.
 _EYE = np.array([2.2, 1.6, 2.0])
 _HALF_WIDTH = 0.42
 
@@ -49,7 +49,7 @@ _SHUFFLED_LIMIT = 0.55
 
 
 class _Case(NamedTuple):
-    """Rays with the function that is to trace them, and the least ratio to Embree's rate."""
+    """Rays, the function that traces them, and the least ratio to Embree's rate."""
 
     name: str
     rays: Rays
@@ -58,7 +58,7 @@ class _Case(NamedTuple):
 
 
 def _jar() -> np.ndarray:
-    """Returns a thick-walled body of revolution with 103k triangles."""
+    """Returns a thick-walled surface of revolution with 103k triangles."""
     height = np.linspace(0.0, 1.0, 201)
     radius = 0.7 + 0.15 * np.sin(3.0 * height)
     outer = np.stack([radius, 2.0 * height - 1.0], axis=1)
@@ -90,7 +90,7 @@ def _rays(origins: np.ndarray, directions: np.ndarray) -> Rays:
 
 
 def _camera_rays() -> Rays:
-    """Returns the rays of an image, tile by tile of 4 x 4 pixels."""
+    """Returns the rays of an image, in tiles of 4 x 4 pixels."""
     tiles = np.arange(_COUNT).reshape(_SIDE // 4, 4, _SIDE // 4, 4).swapaxes(1, 2).ravel()
     y, x = np.divmod(tiles, _SIDE)
     ahead = -_EYE / np.linalg.norm(_EYE)
@@ -102,7 +102,7 @@ def _camera_rays() -> Rays:
 
 
 def _inner_rays(triangles: np.ndarray, scene: EmbreeScene) -> Rays:
-    """Returns rays from random points inside the body in random directions."""
+    """Returns rays from random points inside the object in random directions."""
     generator = np.random.default_rng(0)
     lower, upper = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -117,7 +117,7 @@ def _inner_rays(triangles: np.ndarray, scene: EmbreeScene) -> Rays:
 
 
 def _mitsuba_rate(triangles: np.ndarray) -> float:
-    """Returns the rate at which Mitsuba makes an image of distances, one ray a pixel."""
+    """Returns the rate at which Mitsuba renders distances, one ray per pixel."""
     import mitsuba
 
     mitsuba.set_variant("scalar_rgb")
@@ -153,7 +153,7 @@ def _seconds(function: Callable, *arguments: object) -> float:
 
 
 def _compare(hits: bvh.Hits, theirs: dict) -> None:
-    """Asserts that the hits are Embree's, but for rays that graze an edge."""
+    """Asserts that the hits equal Embree's, except for rays that graze an edge."""
     expected = np.where(theirs["primID"] >= 0, theirs["tfar"], np.inf)
     distances = np.asarray(hits.distances)
     met = np.isfinite(distances) & np.isfinite(expected)
@@ -181,9 +181,9 @@ def _measure(case: _Case, tree: bvh.BVH, scene: EmbreeScene) -> tuple[float, flo
 def main(arguments: list[str]) -> None:
     del arguments
     if importlib.util.find_spec("mitsuba") is None:
-        print("Mitsuba is not installed and is left out. `pip install mitsuba` adds it.")
+        print("Mitsuba is not installed and is omitted. `pip install mitsuba` adds it.")
     plain, sorted_first = jax.jit(bvh.closest_hits), jax.jit(ray_sorting.closest_hits_sorted)
-    print("mesh        build s  rays      Mrays/s  Embree  ratio  asked")
+    print("mesh        build s  rays      Mrays/s  Embree  ratio  bound")
     missed = []
     for name in _MESHES.value or _ALL:
         triangles = _ALL[name]().astype(np.float32)
@@ -203,7 +203,7 @@ def main(arguments: list[str]) -> None:
             rates = f"{_COUNT / mine / 1e6:7.2f} {_COUNT / embree / 1e6:7.2f}"
             print(f"{name:11s} {build:7.2f}  {case.name:8s} {rates} {ratio:6.2f} {case.limit:6.2f}")
             if ratio < case.limit:
-                missed.append(f"{name}, {case.name}: {ratio:.2f} of Embree, asked {case.limit}")
+                missed.append(f"{name}, {case.name}: {ratio:.2f} of Embree, below {case.limit}")
         if importlib.util.find_spec("mitsuba") is not None:
             print(f"{name:11s}          camera   {_mitsuba_rate(triangles) / 1e6:7.2f}  (Mitsuba)")
     assert _ANY_SPEED.value or not missed, "; ".join(missed)

@@ -25,11 +25,11 @@ Kind = Literal["cube", "sphere", "env"]
 KINDS: tuple[Kind, ...] = ("cube", "sphere", "env")
 
 HALF_EXTENT = 7.3
-"""Of the cube, and radius of the sphere, world units."""
+"""Half the edge of the cube, and radius of the sphere, world units."""
 
 FOLDER = "background"
 
-# Names of walls, with normal, u axis and v axis.
+# Names of the cube's faces, with normal, u axis and v axis.
 _WALLS: dict[str, tuple[tuple[float, ...], ...]] = {
     "+x": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     "-x": ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
@@ -56,20 +56,20 @@ _ENVIRONMENT_MAPPING = _AROUND.format(where="", texels="linear RGB, infinitely d
 def write_background(scene: Path, kind: Kind, *, seed: int, size: int) -> dict[str, Any]:
     """Writes the images of a background into `scene/background/`.
 
-    Each file appears whole or not at all. The images of a name and size are always the same, and
-    are made once in a process.
+    Files are written atomically. The images of a name and size are deterministic, and are computed
+    once per process.
 
     Args:
-      scene: its folder; is made if need be.
-      kind: of background.
-      seed: decides which pictures; any integer that is not negative.
+      scene: folder of the scene; created if needed.
+      kind: kind of background.
+      seed: non-negative integer that selects the images.
       size: rows of each image, 16 or more.
 
     Returns:
-      The record `background` of `scene.json`; `texture` in it names the picture.
+      The record `background` of `scene.json`; its `texture` is the name of the image.
 
     Raises:
-      ValueError: if there is no such kind, or the size is below 16.
+      ValueError: if the kind does not exist, or the size is below 16.
     """
     if kind not in KINDS:
         raise ValueError(f"There is no background {kind!r}. Choose from {', '.join(KINDS)}.")
@@ -112,12 +112,12 @@ def _write_environment(scene: Path, rng: np.random.Generator, size: int) -> dict
 def _replace(
     path: Path, write: Callable[[Path, np.ndarray], None], pixels: Float[np.ndarray, "h w 3"]
 ) -> None:
-    """Writes a file beside its place, and moves it there when it is whole."""
+    """Writes a file under a temporary name, and renames it when it is complete."""
     with atomic_files.written_file(path) as draft:
         write(draft, pixels)
 
 
-# Bytes, since a worker keeps the pictures of all its scenes.
+# 8-bit images, since a worker keeps those of all its scenes.
 @functools.cache
 def _face(name: str, size: int) -> UInt8[np.ndarray, "size size 3"]:
     return files.to_bytes(make_face(name, size))

@@ -1,4 +1,4 @@
-"""What surfaces look like in Blender: glass, glowing walls, the world (bpy only)."""
+"""Blender materials: glass, emissive backgrounds, the world (bpy only)."""
 
 from pathlib import Path
 from typing import Any
@@ -11,11 +11,11 @@ _LINEAR, _SRGB = "Linear Rec.709", "sRGB"
 def glass(part: dict[str, Any]) -> Any:
     """Returns a clear, polished interface.
 
-    Cycles keeps no list of the bodies around a ray: at a front face it divides by the index given
-    here, at a back face it multiplies. So the index has to be the inside's over the outside's.
+    Cycles keeps no interior list for a ray: at a front face it divides by the index given here, at
+    a back face it multiplies. So the index must be the ratio of the inside's to the outside's.
 
     Args:
-      part: its description in `scene.json`.
+      part: record of the part in `scene.json`.
     """
     material, nodes, links = _new_material(part["mesh"])
     bsdf = nodes.new("ShaderNodeBsdfGlass")
@@ -38,7 +38,7 @@ def glass(part: dict[str, Any]) -> Any:
 
 
 def wall(image: Path) -> Any:
-    """Returns a glowing wall with an image that lies by the mesh's UVs."""
+    """Returns an emissive wall with an image mapped by the mesh's UVs."""
     material, nodes, _ = _new_material(image.name)
     texture = nodes.new("ShaderNodeTexImage")
     texture.image = _load(image)
@@ -49,7 +49,7 @@ def wall(image: Path) -> Any:
 
 
 def sphere(image: Path) -> Any:
-    """Returns a glowing sphere around the origin, whose image lies by the direction from there."""
+    """Returns an emissive sphere around the origin, with an image mapped by direction."""
     material, nodes, links = _new_material(image.name)
     geometry = nodes.new("ShaderNodeNewGeometry")
     normalise = nodes.new("ShaderNodeVectorMath")
@@ -62,7 +62,7 @@ def sphere(image: Path) -> Any:
 
 
 def world(image: Path | None) -> Any:
-    """Returns an environment, or darkness."""
+    """Returns an environment map, or a black world."""
     made = bpy.data.worlds.new("world")
     made.use_nodes = True
     made.cycles.sampling_method = "NONE"
@@ -88,7 +88,7 @@ def _new_material(name: str) -> tuple[Any, Any, Any]:
 
 
 def _glow(material: Any, texture: Any) -> None:
-    """Makes a surface send out a texture's colour, to be met by rays, not to be aimed at."""
+    """Makes a surface emit a texture's colour, without light sampling."""
     nodes, links = material.node_tree.nodes, material.node_tree.links
     emission = nodes.new("ShaderNodeEmission")
     emission.inputs["Strength"].default_value = 1.0

@@ -1,4 +1,4 @@
-"""Gets from Blender the one mesh that is its own: the monkey's."""
+"""Exports Blender's built-in mesh of the monkey."""
 
 import subprocess
 from pathlib import Path
@@ -9,10 +9,10 @@ _SCRIPT = Path(__file__).with_name("export_monkey.py")
 
 
 def export_monkey(path: Path, *, blender: Path) -> None:
-    """Writes the monkey's mesh, if it is not there.
+    """Writes the monkey's mesh, unless it exists.
 
     Args:
-      path: of the file, as `catalogue.SUZANNE`.
+      path: output file, usually `catalogue.SUZANNE`.
       blender: Python that has bpy.
 
     Raises:
@@ -27,6 +27,6 @@ def export_monkey(path: Path, *, blender: Path) -> None:
         if result.returncode != 0:
             said = (result.stderr.strip().splitlines() or ["nothing"])[-1]
             raise ValueError(
-                f"Blender can not write its monkey's mesh to {path} ({said}). Run make "
+                f"Blender cannot write its monkey's mesh to {path} ({said}). Run make "
                 "dataset-env, or leave the monkey out."
             )

@@ -1,9 +1,9 @@
 """Builds a scene folder in Blender and sets Cycles up (bpy, NumPy and the standard library only).
 
-`scene.json` tells all: parts, indices of refraction, background, bounces. Positions are world
-units, z up; images lie on walls as `refref_jax.render.backgrounds` has it.
+`scene.json` describes the scene: parts, indices of refraction, background, bounces. Positions are
+world units, z up; images are mapped as in `refref_jax.render.backgrounds`.
 
-Blender runs this file by its path, in an environment of its own, so it imports nothing of the
+Blender runs this file by its path, in a separate environment, so it imports nothing from the
 package.
 """
 
@@ -17,21 +17,21 @@ import mathutils
 import numpy as np
 
 WHOLE_PIXEL, MIDDLE = "BOX", "GAUSSIAN"
-"""Filters: the mean over a pixel's square, and 1 % of its width around its middle."""
+"""Filters: the mean over a pixel's square, and 1 % of its width around its centre."""
 
-# Within this distance of the camera nothing is seen, nor beyond that one, world units.
+# Near and far clipping distance of the camera, world units.
 _NEAR, _FAR = 1e-3, 1e6
 
-# A sphere of 327,680 triangles, which follows the round one within 5e-5 world units.
+# A sphere of 327,680 triangles, which deviates from the exact one by at most 5e-5 world units.
 _SUBDIVISIONS = 8
 
 
 def build(folder: Path, record: dict[str, Any]) -> None:
-    """Replaces whatever Blender holds by a scene, without a camera's pose.
+    """Replaces the current Blender scene, without a camera pose.
 
     Args:
-      folder: of the scene, which file names count from.
-      record: the content of its `scene.json`.
+      folder: folder of the scene; file names are relative to it.
+      record: content of its `scene.json`.
     """
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
@@ -51,7 +51,7 @@ def build(folder: Path, record: dict[str, Any]) -> None:
 
 
 def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Reads a mesh as `meshes_written` writes it: floats `[v, 3]` and corners `[f, 3]`."""
+    """Reads a mesh written by `meshes_written`: floats `[v, 3]` and corners `[f, 3]`."""
     header, body = path.read_bytes().split(b"end_header\n", 1)
     counts = {}
     for line in header.decode("ascii").splitlines():
@@ -65,18 +65,18 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _set_up_cycles(scene: Any, bounces: int) -> None:
-    """Leaves nothing of what makes pictures nicer and wrong, see the comments of each."""
+    """Disables all settings that trade correctness for noise or speed; see the comments."""
     scene.render.engine = "CYCLES"
     scene.render.use_persistent_data = True
     cycles = scene.cycles
     cycles.device = "CPU"
     cycles.use_auto_tile = False
-    # The same number of samples everywhere, and no guess of what more of them would show.
+    # A constant number of samples, and no denoising.
     cycles.use_adaptive_sampling = False
     cycles.use_denoising = False
     cycles.sampling_pattern = "TABULATED_SOBOL"
     cycles.use_light_tree = False
-    # Energy is kept: nothing is clamped or blurred, and no chain of reflections goes black early.
+    # Energy is preserved: no clamping, no filtering of glossy paths, no early end of reflections.
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0.0
     cycles.blur_glossy = 0.0
     cycles.caustics_reflective = cycles.caustics_refractive = True
@@ -85,7 +85,7 @@ def _set_up_cycles(scene: Any, bounces: int) -> None:
 
 
 def _set_up_output(scene: Any, size: int) -> None:
-    """Writes square float EXRs that hold linear light, planar depth, normal and object index."""
+    """Writes square float EXRs with linear light, planar depth, normal and object index."""
     render = scene.render
     render.resolution_x = render.resolution_y = size
     render.resolution_percentage = 100
@@ -104,7 +104,7 @@ def _set_up_output(scene: Any, size: int) -> None:
 def _add_mesh(
     name: str, vertices: np.ndarray, faces: np.ndarray, material: Any, *, smooth: bool
 ) -> Any:
-    """Adds polygons, all with the same number of corners, as an object of one material."""
+    """Adds polygons, all with the same number of corners, as an object with one material."""
     mesh = bpy.data.meshes.new(name)
     corners = faces.shape[1]
     mesh.vertices.add(len(vertices))
@@ -118,7 +118,7 @@ def _add_mesh(
     mesh.materials.append(material)
     mesh.update(calc_edges=True)
     if mesh.validate():
-        raise ValueError(f"{name} has faces that Blender does not accept. Make the mesh again.")
+        raise ValueError(f"{name} has faces that Blender rejects. Generate the mesh again.")
     added = bpy.data.objects.new(name, mesh)
     bpy.context.scene.collection.objects.link(added)
     return added
@@ -146,7 +146,7 @@ def _add_sphere(folder: Path, record: dict[str, Any]) -> None:
     sphere.data.vertices.foreach_get("co", directions)
     directions = directions.reshape(-1, 3)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    # Corners lie as much beyond the round sphere as the middles of the largest triangle within.
+    # Vertices lie as far outside the exact sphere as the centres of the largest triangle inside.
     corners = np.empty(3 * len(sphere.data.polygons), np.int32)
     sphere.data.loops.foreach_get("vertex_index", corners)
     middles = directions[corners.reshape(-1, 3)].mean(axis=1)
@@ -171,7 +171,7 @@ def place_camera(pose: list[list[float]], angle_x: float) -> None:
     """Moves the camera.
 
     Args:
-      pose: camera-to-world, 4 x 4; the camera looks along -z, y up.
+      pose: camera-to-world matrix, 4 x 4; the camera looks along -z, y up.
       angle_x: horizontal field of view in radians.
     """
     camera = bpy.context.scene.camera
@@ -180,10 +180,10 @@ def place_camera(pose: list[list[float]], angle_x: float) -> None:
 
 
 def filter_over(pixel_filter: str) -> None:
-    """Chooses what a pixel is, `WHOLE_PIXEL` or `MIDDLE`.
+    """Sets the pixel filter to `WHOLE_PIXEL` or `MIDDLE`.
 
-    Cycles sends the first sample through the middle of any filter, but looks its place up in a
-    table, which is coarse: 0.001 of the width off.
+    Cycles sends the first sample through the centre of any filter, but looks up its position in a
+    coarse table, with errors of 0.001 of the width.
     """
     cycles = bpy.context.scene.cycles
     cycles.pixel_filter_type = pixel_filter

@@ -2,13 +2,13 @@
 
 PYTHON_OF_BLENDER experiments/dataset/blender_worker.py --threads=2
 
-Jobs come as lines of JSON on standard input, one answer a job goes to standard output. First of all
-it says `{"blender": VERSION}`. A job is a `workers.Job`; its answer `{}` once its files are
-whole, or `{"error": TEXT}`. Two multi-layer EXRs are written: `colour`, of all samples, and
-`geometry`, whose single sample goes through the middles of pixels, so that depth, normal and object
-index belong to one ray and are not mixed.
+Jobs are lines of JSON on standard input; each is answered by one line on standard output. The first
+line of output is `{"blender": VERSION}`. A job is a `workers.Job`; its answer is `{}` once its
+files are complete, or `{"error": TEXT}`. Two multi-layer EXRs are written: `colour`, with all
+samples, and `geometry`, whose single sample goes through the pixel centres, so that depth, normal
+and object index belong to one ray and are not averaged.
 
-The worker ends when its input does, in the middle of a rendering too: whoever asked is gone.
+The worker exits at the end of its input, also during a rendering: its parent process has ended.
 """
 
 import argparse
@@ -29,7 +29,7 @@ def main() -> None:
     answers = _take_over_output()
     jobs: queue.SimpleQueue[str] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(jobs,), daemon=True).start()
-    # Late, since Blender may print already.
+    # Late, since Blender may print before this.
     import blender_scene
     import bpy
 
@@ -69,7 +69,7 @@ def _render(bpy: Any, path: str, samples: int, seed: int) -> None:
 
 
 def _take_over_output() -> TextIO:
-    """Returns what standard output was, and sends all that Blender prints to standard error."""
+    """Returns the original standard output, and redirects Blender's output to standard error."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     return answers

@@ -1,8 +1,8 @@
-"""Where the data set's cameras stand (NumPy only).
+"""Camera poses of the data set (NumPy only).
 
-A pose is a 4x4 camera-to-world matrix of OpenGL's axes: x right, y up, looks along -z. All look
-from the sphere of radius 4 at the origin, with z up. Azimuth is counted from +x towards +y,
-elevation from the horizon upwards.
+A pose is a 4x4 camera-to-world matrix with OpenGL's axes: x right, y up, looking along -z. All
+cameras look at the origin from a sphere of radius 4, with z up. Azimuth is counted from +x towards
++y, elevation from the horizon upwards.
 """
 
 import math
@@ -24,13 +24,13 @@ _LOWEST, _HIGHEST = -10.0, 65.0  # degrees
 
 
 def split_poses(scene: str, split: Split, count: int) -> Float[np.ndarray, "count 4 4"]:
-    """Returns the poses of a split by the published data set's law.
+    """Returns the poses of a split with the published data set's distribution.
 
-    Training and validation are at random, each with its own seed from the names of scene and split
-    (`seeds.seed_of`); testing is on the helix, the same for all scenes.
+    Training and validation poses are random, each split with its own seed from the names of scene
+    and split (`seeds.seed_of`); test poses lie on the helix, the same for all scenes.
 
     Raises:
-      ValueError: if there is no such split, or the count is not positive.
+      ValueError: if the split does not exist, or the count is not positive.
     """
     if split not in SPLITS:
         raise ValueError(f"There is no split {split!r}. Choose from {', '.join(SPLITS)}.")
@@ -40,7 +40,7 @@ def split_poses(scene: str, split: Split, count: int) -> Float[np.ndarray, "coun
 
 
 def random_poses(count: int, *, seed: int) -> Float[np.ndarray, "count 4 4"]:
-    """Returns poses uniform on the sphere; the first of many are those of fewer.
+    """Returns poses uniform on the sphere; smaller counts give prefixes of larger ones.
 
     Raises:
       ValueError: if the count is not positive.
@@ -66,11 +66,11 @@ def helix_poses(count: int) -> Float[np.ndarray, "count 4 4"]:
 def look_at_origin(
     azimuth: Float[np.ndarray, " count"], elevation: Float[np.ndarray, " count"]
 ) -> Float[np.ndarray, "count 4 4"]:
-    """Returns the poses that look from the sphere at the origin, z up.
+    """Returns poses on the sphere that look at the origin, z up.
 
     Args:
-      azimuth: radians. At a pole it alone decides what is right.
-      elevation: radians.
+      azimuth: azimuths in radians; at a pole they alone decide the right axis.
+      elevation: elevations in radians.
     """
     cos_a, sin_a, zero = np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)
     cos_e, sin_e = np.cos(elevation), np.sin(elevation)
@@ -84,4 +84,4 @@ def look_at_origin(
 
 def _require_positive(count: int) -> None:
     if count < 1:
-        raise ValueError(f"{count} poses were asked for. Ask for one or more.")
+        raise ValueError(f"{count} poses were requested. Request one or more.")

@@ -9,7 +9,7 @@ from experiments.dataset.objects import monkey
 from experiments.dataset.parts import Object, ObjectPart
 
 SUZANNE = Path(__file__).parents[2] / "build" / "suzanne.npz"
-"""Where the monkey's mesh is, when `blender_meshes` has made it."""
+"""Path of the monkey's mesh, written by `blender_meshes`."""
 
 _ORDER = {"smcvx": 0, "smncvx": 1, "mmncvx": 2}
 
@@ -17,18 +17,18 @@ _ORDER = {"smcvx": 0, "smncvx": 1, "mmncvx": 2}
 def gather() -> dict[str, Object]:
     """Returns the objects by name, ordered by category and name.
 
-    They are the tuples `OBJECTS` of the modules, and the monkey, which can only be made when its
-    mesh is there. A module without such a tuple lends to others.
+    They are the tuples `OBJECTS` of the modules, and the monkey, which requires its mesh file.
+    Modules without such a tuple are helpers.
 
     Raises:
-      ValueError: if two objects have one name.
+      ValueError: if two objects have the same name.
     """
     found = {"monkey": Object("monkey", "smncvx", _make_monkey)}
     for module in pkgutil.iter_modules(objects.__path__, f"{objects.__name__}."):
         for item in getattr(importlib.import_module(module.name), "OBJECTS", ()):
             if item.name in found:
                 raise ValueError(
-                    f"Two objects are called {item.name}, one of them in {module.name}. Rename it."
+                    f"Two objects are named {item.name}, one of them in {module.name}. Rename it."
                 )
             found[item.name] = item
     return dict(sorted(found.items(), key=lambda pair: (_ORDER[pair[1].category], pair[0])))
@@ -39,4 +39,4 @@ def _make_monkey(detail: float) -> list[ObjectPart]:
 
 
 OBJECTS: dict[str, Object] = gather()
-"""Every object by its name."""
+"""Every object by name."""

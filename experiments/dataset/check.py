@@ -1,13 +1,13 @@
-"""Checks scenes that were made: files, meshes, and pictures against our own light paths.
+"""Checks generated scenes: files, meshes, and images against our own renderer.
 
 python -m experiments.dataset.check runs/dataset --limit=3
 
 Each scene's meshes are linted and all of its images opened. Some of its test views are rendered
-again along the path tree, with a finer cut and more bends than `render_known --paths=tree` has by
-default, and without light of more bends than Cycles follows, and compared with the image; depth
-map, mask and normals are compared with the first surface that rays meet. {out}/check.html shows
-it all, {out}/check.json has the figures; {out} is the folder itself by default. A scene that does
-not hold makes the command end with status 1.
+again along the path tree, with a lower throughput threshold and more bends than the defaults of
+`render_known --paths=tree`, without light of more bends than Cycles traces, and compared with the
+image; depth map, mask and normals are compared with the first surface of our rays. {out}/check.html
+shows all results, {out}/check.json has the numbers; {out} is the folder itself by default. If a
+scene fails, the command ends with status 1.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ if TYPE_CHECKING:
 with epy.lazy_imports():
     from experiments.dataset import check_page, scene_check
 
-_SCENES = flags.DEFINE_list("scenes", None, "Only these scenes of the folder, by name.")
-_LIMIT = flags.DEFINE_integer("limit", 3, "Only this many test images, evenly spread; 0: none.", 0)
+_SCENES = flags.DEFINE_list("scenes", None, "Names of the scenes to check; all if not given.")
+_LIMIT = flags.DEFINE_integer("limit", 3, "Number of test images, evenly spaced; 0: none.", 0)
 flags.DEFINE_alias("views", "limit")
 _OUT = flags.DEFINE_string("out", None, "Folder of the report; FOLDER if not given.")
 _OVERWRITE = cli_flags.overwrite("the report of an earlier check")
-# Diamond keeps light for so long that the tree's own cut loses 5 dB of 39, and what Cycles drops
-# after its 64 bounces another 6. Paths are to be judged here, not where they stop.
+# The diamond traps light for so long that the tree's own threshold costs 5 dB of 39, and Cycles'
+# limit of 64 bounces another 6. Paths are checked here, not their truncation.
 _BUDGET = cli_flags.budget(cut=0.004, bends=render_settings.BOUNCES)
-# What Cycles averages over hundreds of rays aliases with few: a wall of the generator is 41 dB off
-# with 25 rays a pixel of 200 x 200, and 48 with 100.
+# Few rays per pixel alias where Cycles averages over hundreds: a face of the cube is 41 dB off with
+# 25 rays per pixel of 200 x 200, and 48 with 100.
 _RAYS_PER_PIXEL = cli_flags.rays_per_pixel(100)
 
 _SHOWN_COMPLAINTS = 3
@@ -75,24 +75,24 @@ def main(folder: str) -> None:
     for report in bad:
         for complaint in report.complaints[:_SHOWN_COMPLAINTS]:
             print(f"{report.name}: {complaint}")
-    print(f"{len(reports) - len(bad)} of {len(reports)} scenes hold.")
+    print(f"{len(reports) - len(bad)} of {len(reports)} scenes passed.")
     print(f"Report:  {page}")
     print(f"Figures: {figures}")
     if (scenes[0] / "transforms_train.json").is_file():
         given = (f"--scene={scenes[0]}", f"--out=runs/{scenes[0].resolve().name}")
         print(f"Next: {app.shell('train', *given)}")
     else:
-        print("Next: python -m experiments.dataset.make without --preview, for scenes to train on")
+        print("Next: python -m experiments.dataset.make without --preview, for training scenes")
     if bad:
         sys.exit(1)
 
 
 def _summary(report: SceneReport) -> str:
     if report.complaints:
-        return f"{report.name}  does not hold"
+        return f"{report.name}  failed"
     if not report.views:
-        return f"{report.name}  holds"
-    return f"{report.name}  {min(view.psnr_masked for view in report.views):.1f} dB in the mask"
+        return f"{report.name}  passed"
+    return f"{report.name}  {min(view.psnr_masked for view in report.views):.1f} dB masked PSNR"
 
 
 def _record(report: SceneReport) -> dict[str, Any]:
@@ -108,5 +108,5 @@ if __name__ == "__main__":
     app.run(
         main,
         arguments=("FOLDER",),
-        again="it checks anew; --overwrite replaces the report.",
+        again="it repeats the check; --overwrite replaces the report.",
     )

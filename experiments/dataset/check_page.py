@@ -1,4 +1,4 @@
-"""The report of a check as one web page: no server, no network, pictures inside."""
+"""Writes the report of a check as one self-contained web page."""
 
 import base64
 import html
@@ -21,7 +21,7 @@ body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 76rem
   padding: 0 1rem; }
 h1 { font-weight: 600; } h2 { margin: 0; font-size: 1.05rem; }
 section { border-top: 1px solid #ddd; padding: 1rem 0; }
-.bad h2::after { content: " does not hold"; color: #b3261e; font-weight: 400; }
+.bad h2::after { content: " failed"; color: #b3261e; font-weight: 400; }
 .views { display: flex; flex-wrap: wrap; gap: 1rem; margin-top: .6rem; }
 figure { margin: 0; } figcaption { font-size: .85rem; color: #555; }
 img { width: 150px; image-rendering: auto; border-radius: 3px; }
@@ -33,13 +33,13 @@ tr.bad td { color: #b3261e; }
 
 
 class SceneReport(NamedTuple):
-    """What was found of one scene.
+    """Results of checking one scene.
 
     Attributes:
-      name: of its folder.
-      complaints: what does not hold; nothing if it may be used.
-      notes: what is worth knowing beside.
-      views: those that were compared.
+      name: name of the scene's folder.
+      complaints: failed checks; empty if the scene may be used.
+      notes: further remarks.
+      views: compared views.
     """
 
     name: str
@@ -49,10 +49,10 @@ class SceneReport(NamedTuple):
 
 
 def write_page(reports: Sequence[SceneReport], *, title: str) -> str:
-    """Returns the page: a table of all scenes, then each with its views, failures first."""
+    """Returns the page: a table of all scenes, then each scene with its views, failures first."""
     ordered = sorted(reports, key=lambda report: not report.complaints)
     failed = sum(bool(report.complaints) for report in reports)
-    told = "all hold" if not failed else f"{failed} do not hold"
+    told = "all passed" if not failed else f"{failed} failed"
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
         f"<style>{_STYLE}</style><h1>{html.escape(title)}</h1>"
@@ -63,13 +63,13 @@ def write_page(reports: Sequence[SceneReport], *, title: str) -> str:
 
 
 def mean(values: Sequence[float]) -> float:
-    """Returns the mean of the values that are known, or NaN."""
+    """Returns the mean of all values but NaN, or NaN."""
     known = [value for value in values if not np.isnan(value)]
     return float(np.mean(known)) if known else np.nan
 
 
 def _table(reports: Sequence[SceneReport]) -> str:
-    titles = ("scene", "PSNR in mask", "PSNR", "masks differ", "depths agree", "normals")
+    titles = ("scene", "masked PSNR", "PSNR", "masks differ", "depths agree", "normals")
     head = "".join(f"<th>{title}</th>" for title in titles)
     return f"<table><tr>{head}</tr>{''.join(map(_row, reports))}</table>"
 
@@ -103,7 +103,7 @@ def _section(report: SceneReport) -> str:
 def _figure(view: View) -> str:
     error = np.clip(np.abs(view.rgb - view.target) * _ERROR_GAIN, 0.0, 1.0)
     pictures = (_picture(each) for each in (view.target, view.rgb, error))
-    caption = f"{html.escape(view.name)}: {view.psnr_masked:.1f} dB in the mask"
+    caption = f"{html.escape(view.name)}: {view.psnr_masked:.1f} dB masked PSNR"
     return f"<figure>{''.join(pictures)}<figcaption>{caption}</figcaption></figure>"
 
 

@@ -1,9 +1,9 @@
-"""What must hold of a scene that was rendered: files, meshes, and pictures against our own tracer.
+"""Checks of a rendered scene: files, meshes, and images against our own tracer.
 
-Two renderers that share nothing but the scene's files agree, or one of them is wrong. Colours are
-compared inside the mask, where light went through the object. Depths are compared away from
-*silhouettes*: pixels whose centre is within a pixel or two of an edge of the object, or of one part
-before another, see one or the other by rounding.
+Two renderers share only the scene's files, so a disagreement means that one of them is wrong.
+Colours are compared inside the mask, where light passed through the object. Depths are compared
+away from *silhouettes*: pixels whose centre is within a pixel or two of an edge of the object, or
+of one part in front of another, hit one or the other by rounding.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ from refref_jax.optics.budgets import Budget
 from refref_jax.render.first_surface import FirstSurface, find_first_surface
 
 PSNR = 33.0
-"""Least PSNR inside the mask, dB, of the rendering against the image."""
+"""Least masked PSNR, dB, of the rendering relative to the image."""
 
 PSNR_CONVEX = 40.0
 """The same for convex objects, whose light paths are short."""
@@ -34,35 +34,35 @@ DEPTH = 1e-3
 """Largest difference of planar depth, world units, away from silhouettes."""
 
 DEPTH_SHARE = 0.999
-"""Least share of pixels within it."""
+"""Least share of pixels within that difference."""
 
 MASK_SHARE = 0.002
 """Largest share of an image's pixels where mask and traced silhouette differ."""
 
-# Pixels around a silhouette that are left out of depths and normals.
+# Pixels around a silhouette that are excluded from depths and normals.
 _MARGIN = 2
 
-# Planar depths of neighbours that differ by more lie on either side of an inner silhouette.
+# Neighbours whose planar depths differ by more lie on either side of an inner silhouette.
 _STEP = 0.2
 
 
 class Meshes(NamedTuple):
-    """The meshes of a scene, and how they lie in one another."""
+    """The meshes of a scene, and their nesting."""
 
     parts: list[MeshPart]
     tree: Containment
 
 
 class View(NamedTuple):
-    """One view, rendered by both.
+    """One test view, rendered by Blender and by our tracer.
 
     Attributes:
-      name: of the frame.
-      target: the image, sRGB in `[0, 1]`.
+      name: name of the frame.
+      target: image rendered by Blender, sRGB in `[0, 1]`.
       rgb: our rendering.
-      psnr: over the whole image, dB.
-      psnr_masked: inside the mask.
-      lost: share of light that found no room.
+      psnr: PSNR over the whole image, dB.
+      psnr_masked: masked PSNR, dB.
+      lost: share of the throughput that was dropped because the path buffer was full.
       mask_share: share of pixels where mask and traced silhouette differ.
       depth_share: share of pixels away from silhouettes whose depths agree; NaN without a map.
       depth_error: the 99.9th percentile of the depths' difference there, world units.
@@ -82,9 +82,9 @@ class View(NamedTuple):
 
 
 def check_files(scene: Path) -> list[Finding]:
-    """Reads every file that the transforms name, and every EXR beside them.
+    """Reads every file named in the transforms, and every EXR next to them.
 
-    A scene that was made with `--preview` has one split only.
+    A scene made with `--preview` has one split only.
     """
     try:
         local_layout.check_scene(scene, needed=())
@@ -96,21 +96,21 @@ def check_files(scene: Path) -> list[Finding]:
 
 
 def check_meshes(scene: Path) -> tuple[Meshes | None, list[Finding]]:
-    """Reads and lints the meshes of a scene; there are none to use if they can not be read."""
+    """Reads and lints the meshes of a scene; returns `None` for unreadable meshes."""
     try:
         parts = meshes.read_meshes(scene)
     except ValueError as error:
         return None, [Finding("error", scene.name, str(error))]
     if not parts:
-        return None, [Finding("error", scene.name, "there are no meshes. Make the scene again.")]
+        return None, [Finding("error", scene.name, "the scene has no meshes. Make it again.")]
     tree = containment.find_containment(parts)
     return Meshes(parts, tree), lint.lint(parts, tree)
 
 
 def read_views(scene: Path, made_of: Meshes, *, count: int) -> KnownScene:
-    """Reads some test views of a scene, evenly spread, and all that rendering them takes.
+    """Reads some evenly spaced test views of a scene, and everything required to render them.
 
-    By the rule that `scene.json` names, or `nested`.
+    The rule is that of `scene.json`, or `nested`.
     """
     frames = local_layout.read_frames(scene, "test")
     last = len(frames.names) - 1
@@ -122,7 +122,7 @@ def read_views(scene: Path, made_of: Meshes, *, count: int) -> KnownScene:
 
 
 def compare_view(scene: KnownScene, index: int, *, budget: Budget, side: int) -> View:
-    """Renders one of a scene's views and compares all that is known of it."""
+    """Renders one of a scene's views and compares all available maps."""
     rendered = known_scene.render_view(scene, index, budget=budget, side=side)
     measured = known_scene.measure(scene, index, rendered.rgb)
     first = find_first_surface(
@@ -150,10 +150,10 @@ def compare_view(scene: KnownScene, index: int, *, budget: Budget, side: int) ->
 def away_from_silhouettes(
     mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Returns the pixels of an object that no silhouette is near.
+    """Returns the pixels of an object that are not close to a silhouette.
 
     Args:
-      mask: of the object.
+      mask: mask of the object.
       depth: traced planar depth of the first surface; `inf` where there is none.
     """
     finite = np.isfinite(depth)
@@ -164,23 +164,25 @@ def away_from_silhouettes(
 
 
 def complaints(convex: bool, findings: Sequence[Finding], views: Sequence[View]) -> list[str]:
-    """Returns what does not hold of a scene, in words; nothing if it may be used.
+    """Returns the failed checks of a scene, in words; empty if the scene may be used.
 
     Args:
-      convex: whether its object is convex, so that more is asked.
-      findings: about its files and meshes; notes are no complaint.
-      views: those that were compared.
+      convex: whether the object is convex; more checks apply then.
+      findings: results for its files and meshes; notes do not count as failures.
+      views: compared views.
     """
     least = PSNR_CONVEX if convex else PSNR
     found = [f"{each.part}: {each.message}" for each in findings if each.severity != "note"]
     for view in views:
         if not view.psnr_masked >= least:
-            found.append(f"{view.name}: {view.psnr_masked:.1f} dB in the mask, not {least:g}")
+            found.append(
+                f"{view.name}: {view.psnr_masked:.1f} dB masked PSNR, not at least {least:g}"
+            )
         if not view.mask_share <= MASK_SHARE:
             found.append(f"{view.name}: the mask differs in {view.mask_share:.2%} of pixels")
         if view.depth_share < DEPTH_SHARE:
             found.append(
-                f"{view.name}: depths agree to {DEPTH:g} in {view.depth_share:.2%} of pixels only"
+                f"{view.name}: depths agree to {DEPTH:g} in only {view.depth_share:.2%} of pixels"
             )
     return found
 
@@ -196,7 +198,7 @@ def _depth_errors(
     traced: Float[np.ndarray, "h w"],
     inner: Bool[np.ndarray, "h w"],
 ) -> Float[np.ndarray, " pixels"]:
-    """Returns the differences from the float map; none if there is no such map."""
+    """Returns the differences from the float map; none if the map does not exist."""
     depths = scene.frames.depths
     if depths is None or depths[index].suffix != ".exr":
         return np.zeros(0)

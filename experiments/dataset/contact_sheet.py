@@ -1,4 +1,4 @@
-"""One picture of many small ones, each with its name below."""
+"""A contact sheet: many small images in one, each with its name below."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,9 +15,9 @@ def write(path: Path, pictures: Sequence[tuple[str, Path]], *, tile: int = 200) 
     """Writes a contact sheet.
 
     Args:
-      path: to write, a PNG.
-      pictures: name and image file of each, row by row.
-      tile: width and height of each picture on the sheet, in pixels.
+      path: output file, a PNG.
+      pictures: name and file of each image, row by row.
+      tile: width and height of each image on the sheet, in pixels.
     """
     columns = min(_COLUMNS, len(pictures))
     rows = -(-len(pictures) // columns)

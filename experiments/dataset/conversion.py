@@ -16,17 +16,17 @@ from refref_jax.data import file_names, scene_names
 
 
 def check_room(scenes: Sequence[FoundScene], layout: str, out: Path) -> None:
-    """Refuses scenes that are there already, or whose names the layout does not know.
+    """Rejects scenes that exist already, or whose names do not fit the layout.
 
     Raises:
-      ValueError: naming them.
+      ValueError: if there are such scenes; the message names them.
     """
     there = [scene.name for scene in scenes if is_there(scene.name, layout, out)]
     if there:
         others = [scene.name for scene in scenes if scene.name not in there]
         advice = f", or convert the others with --scenes={','.join(others)}" if others else ""
         raise ValueError(
-            f"{out} holds {len(there)} of the {len(scenes)} scenes already, as {there[0]}. Give "
+            f"{out} holds {len(there)} of the {len(scenes)} scenes already, e.g. {there[0]}. Give "
             f"another --out{advice}."
         )
 
@@ -51,13 +51,13 @@ def convert(
     """Converts a scene.
 
     Args:
-      scene: the scene.
-      layout: `local`, `raw` or `parquet`.
-      out: existing folder of the whole layout.
-      step: is called for every image that is unpacked, and for every one that is written.
+      scene: scene to convert.
+      layout: name of the layout: `local`, `raw` or `parquet`.
+      out: existing folder of the complete layout.
+      step: callback for every unpacked and for every written image.
 
     Returns:
-      How many files were left out, by folder and ending.
+      Number of omitted files, by folder and suffix.
     """
     left: dict[str, Path] = {}
     with scene_folders.opened(scene, out, step) as folder:

@@ -8,8 +8,8 @@ python -m experiments.dataset.convert --scene=experiments/data/cube_smcvx_ball -
     parquet    data/{scene}-*.parquet, as on Hugging Face, scene_files/ and mesh_files/
 
 --scene takes one scene, or a folder of scenes in any of these layouts. A scene appears in --out
-when it is whole, and none is overwritten. Parquet files have no place for maps of floats: these are
-left out, and it is said. What `scene.json` names is kept beside them.
+when it is complete, and existing ones are never overwritten. Parquet files cannot hold float maps:
+these are omitted, with a message. Files named in `scene.json` are kept next to them.
 """
 
 import collections
@@ -28,14 +28,14 @@ with epy.lazy_imports():
     from experiments.dataset import conversion, dataset_card, scene_folders
     from refref_jax.data import parquet_scenes
 
-_SCENE = cli_flags.scene("What to convert, one scene or a folder of them")
+_SCENE = cli_flags.scene("Scene to convert, or a folder of scenes")
 _TO = flags.DEFINE_enum("to", None, ["local", "raw", "parquet"], "Layout to write.", required=True)
-_OUT = cli_flags.out("Folder to write to.")
-_SCENES = flags.DEFINE_list("scenes", None, "Only these scenes of a folder; all if not given.")
+_OUT = cli_flags.out("Output folder.")
+_SCENES = flags.DEFINE_list("scenes", None, "Names of the scenes to convert; all if not given.")
 
 
 def main() -> None:
-    """Converts all scenes that the options name."""
+    """Converts all selected scenes."""
     cli_scenes.check_place(_SCENE.value)
     layout, out = _TO.value, Path(_OUT.value)
     if layout == "parquet":
@@ -45,7 +45,7 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     left: collections.Counter[str] = collections.Counter()
     done = 0
-    # What is in parquet files is unpacked first.
+    # Scenes in parquet files are unpacked first.
     images = sum(scene.images * (1 if scene.copy is None else 2) for scene in scenes)
     with ProgressBar("convert", images) as bar:
         for scene in scenes:
@@ -58,13 +58,13 @@ def main() -> None:
             left.update(conversion.convert(scene, layout, out, step=step))
             dataset_card.add_to_list(out, [scene.name])
     for kind, count in sorted(left.items()):
-        print(f"left out: {count} files {kind}, which have no place in this layout")
+        print(f"left out: {count} files {kind}, which this layout cannot hold")
     print(f"Scenes: {len(scenes)} in {out}")
     print(f"List:   {out / dataset_card.LIST}")
     name = scenes[0].name
     if layout == "parquet":
         card = dataset_card.write(out, dataset_card.names_in(out))
-        print(f"Card:   {card or f'{out / dataset_card.CARD} is yours, and was left as it is'}")
+        print(f"Card:   {card or f'{out / dataset_card.CARD} was edited, and is kept'}")
         source, before = scene_names.parse(name).source, f"REFREF_HF={out} "
     else:
         source, before = str(conversion.folder_of(name, layout, out)), ""
@@ -72,4 +72,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    app.run(main, again="scenes that are there are refused, and never replaced.")
+    app.run(main, again="existing scenes are refused, and never replaced.")

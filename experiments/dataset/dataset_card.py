@@ -1,4 +1,4 @@
-"""The list of all scenes of a folder, and the card that Hugging Face shows of parquet files."""
+"""The list of all scenes of a folder, and the Hugging Face card of parquet files."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ from refref_jax.data.scene_names import CONFIGS, SceneName
 LIST = "scene_list.txt"
 CARD = "README.md"
 
-# By what a card of ours is known, and may be replaced.
+# Cards with this line are ours, and may be replaced.
 _MARK = "<!-- Written by experiments.dataset.convert; remove this line to keep your changes. -->"
 
 _TEXT = """
@@ -31,7 +31,7 @@ Say here who made the images, how, and under which licence they are.
 
 
 def add_to_list(out: Path, names: Iterable[str]) -> Path:
-    """Adds scenes to the list of a folder, one name a line, and returns its place."""
+    """Adds scenes to the list of a folder, one name per line, and returns its path."""
     path = out / LIST
     known = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
     _write(path, "".join(f"{name}\n" for name in sorted({*filter(None, known), *names})))
@@ -42,7 +42,7 @@ def write(out: Path, scenes: Sequence[SceneName]) -> Path | None:
     """Writes the card of a folder of parquet files, with its configurations.
 
     Returns:
-      Its place, or `None` if there is one that was not written here, or was changed.
+      Path of the card, or `None` if a card exists that was not written here, or was edited.
     """
     path = out / CARD
     if path.is_file() and _MARK not in path.read_text(encoding="utf-8"):
@@ -61,7 +61,7 @@ def write(out: Path, scenes: Sequence[SceneName]) -> Path | None:
 
 
 def names_in(out: Path) -> list[SceneName]:
-    """Returns the scenes that the list of a folder names."""
+    """Returns the scenes in the list of a folder."""
     lines = (out / LIST).read_text(encoding="utf-8").splitlines()
     return [scene_names.parse(line) for line in lines if scene_names.is_name(line)]
 

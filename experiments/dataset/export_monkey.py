@@ -2,10 +2,10 @@
 
   PYTHON_OF_BLENDER experiments/dataset/export_monkey.py OUT.npz
 
-The monkey, Suzanne, comes with Blender and is licensed as Blender is, so it is made on the user's
-machine and not kept here. The file has `vertices` and `faces` (triangles, counter-clockwise seen
-from outside) after two Catmull-Clark subdivisions: a head with open eye sockets, and two eyes that
-are open at their backs. `objects.monkey` makes one closed body of them.
+The monkey, Suzanne, is part of Blender and under Blender's licence, so it is exported on the user's
+machine and not distributed here. The file has `vertices` and `faces` (triangles, counter-clockwise
+seen from outside) after two Catmull-Clark subdivisions: a head with open eye sockets, and two eyes
+that are open at their backs. `objects.monkey` turns them into one closed mesh.
 """
 
 import sys
@@ -18,9 +18,9 @@ _SUBDIVISIONS = 2
 
 
 def main() -> None:
-    """Writes the file that the command names."""
+    """Writes the output file."""
     if len(sys.argv) != 2:
-        raise SystemExit("There is not one file to write. Give its name: export_monkey.py OUT.npz")
+        raise SystemExit("The output file is missing. Give one name: export_monkey.py OUT.npz")
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.mesh.primitive_monkey_add()
     monkey = bpy.context.object
@@ -32,7 +32,7 @@ def main() -> None:
     shape.vertices.foreach_get("co", vertices)
     faces = np.empty(3 * len(shape.loop_triangles), np.int32)
     shape.loop_triangles.foreach_get("vertices", faces)
-    # A file that is open keeps its name, whatever that ends with.
+    # NumPy appends a suffix to names, but not to open files.
     with Path(sys.argv[1]).open("wb") as file:
         np.savez(file, vertices=vertices.reshape(-1, 3), faces=faces.reshape(-1, 3))
 

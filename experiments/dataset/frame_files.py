@@ -1,7 +1,7 @@
 """The files of one rendered view (NumPy only).
 
-A file is written under another name, in the same folder, and gets its own when it is whole. So a
-view is done when all of its files are there.
+Files are written under a temporary name in the same folder, and renamed when complete. So a view is
+done when all of its files exist.
 """
 
 from collections.abc import Callable
@@ -20,22 +20,22 @@ from refref_jax.data import files
 # The published depth maps: white is 1 world unit, black 11.5 or more.
 _NEAREST_DEPTH, _DEPTH_RANGE = 1.0, 10.5
 
-# Where the straight and the curved part of sRGB's transfer function meet, linear.
+# Boundary of the linear and the curved part of sRGB's transfer function, linear value.
 _KNEE = 0.0031308
 
 _LAYER = "ViewLayer."
 
 
 class FrameFiles(NamedTuple):
-    """Where the files of a view are.
+    """Paths of a view's files.
 
     Attributes:
-      image: 8-bit sRGB.
-      mask: 255 where the object is.
+      image: 8-bit sRGB image.
+      mask: mask, 255 inside the object.
       depth_8_bit: inverted planar depth, see `to_published_depth`.
       depth: float planar depth.
       normal: float normals in world space.
-      linear: linear RGB in half precision, of some splits.
+      linear: linear RGB in half precision, for some splits.
     """
 
     image: Path
@@ -47,15 +47,15 @@ class FrameFiles(NamedTuple):
 
 
 class Rendering(NamedTuple):
-    """What Blender renders of a view. All but the colours belong to the middle of each pixel.
+    """One view as rendered by Blender. All arrays but the colours are sampled at pixel centres.
 
     Attributes:
       linear: linear RGB, the mean over each pixel's square.
-      depth: planar, world units, of the first surface, be it the object or a wall; 1e10 where
-        nothing is met.
-      normal: shading normal in world space where the object is met first, towards the camera's
-        side; else 0.
-      mask: whether the object is met first.
+      depth: planar depth of the first surface, object or background, world units; 1e10 without a
+        hit.
+      normal: shading normal in world space where the object is the first surface, towards the
+        camera; else 0.
+      mask: whether the object is the first surface.
     """
 
     linear: Float[np.ndarray, "h w 3"]
@@ -65,7 +65,7 @@ class Rendering(NamedTuple):
 
 
 def relative(split: Split, number: int) -> FrameFiles:
-    """Returns the files of a view, as they count from the scene's folder."""
+    """Returns the files of a view, relative to the scene's folder."""
     place = Path(split) / f"r_{number:03d}.png"
     return FrameFiles(
         image=place,
@@ -81,17 +81,17 @@ def is_done(scene: Path, split: Split, number: int, *, linear: bool) -> bool:
     """Returns whether a view is rendered.
 
     Args:
-      scene: its folder.
-      split: of the view.
-      number: of the view.
-      linear: whether the linear image belongs to it.
+      scene: folder of the scene.
+      split: split of the view.
+      number: number of the view in its split.
+      linear: whether the linear image is required, too.
     """
     wanted = relative(split, number) if linear else relative(split, number)[:-1]
     return all((scene / path).is_file() for path in wanted)
 
 
 def write(scene: Path, split: Split, number: int, rendering: Rendering, *, linear: bool) -> None:
-    """Writes the files of a view; arguments as of `is_done`."""
+    """Writes the files of a view; for the arguments see `is_done`."""
     named = relative(split, number)
     _write(scene / named.image, _png(to_srgb(rendering.linear)))
     _write(scene / named.mask, _png(np.where(rendering.mask, 255, 0).astype(np.uint8)))
@@ -105,20 +105,20 @@ def write(scene: Path, split: Split, number: int, rendering: Rendering, *, linea
 
 
 def remove_unfinished(scene: Path) -> None:
-    """Removes files that an interrupted command left half-written."""
+    """Removes incomplete files of an interrupted command."""
     for path in scene.rglob(f"*{atomic_files.UNFINISHED}"):
         path.unlink()
 
 
 def read_rendering(colour: Path, geometry: Path) -> Rendering:
-    """Reads the two files that `blender_worker` writes of a view.
+    """Reads the two files of a view written by `blender_worker`.
 
     Raises:
       ValueError: if a file is missing or broken, or a colour is not finite.
     """
     linear = _read_layers(colour)["Combined"][..., :3]
     if not np.all(np.isfinite(linear)):
-        raise ValueError(f"{colour} has colours that are not finite. Look at the scene in Blender.")
+        raise ValueError(f"{colour} has colours that are not finite. Check the scene in Blender.")
     layers = _read_layers(geometry)
     mask = layers["Object Index.X"] > 0.0
     normal = np.stack([layers[f"Normal.{axis}"] for axis in "XYZ"], axis=-1)
@@ -128,7 +128,7 @@ def read_rendering(colour: Path, geometry: Path) -> Rendering:
 def to_srgb(linear: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
     """Encodes linear light by the sRGB transfer function, clipped, as 8 bits.
 
-    Blender's view transform Standard gives the same numbers, but for a rounding.
+    Blender's view transform Standard gives the same values, up to rounding.
 
     Source: IEC 61966-2-1.
     """
@@ -153,8 +153,8 @@ def _read_layers(path: Path) -> dict[str, np.ndarray]:
             }
     except Exception as error:  # OpenEXR raises what its C++ core does
         raise ValueError(
-            f"{path} can not be read ({error}). Look whether the disk is full; the same command "
-            "goes on where this one stopped."
+            f"{path} cannot be read ({error}). Check that the disk is not full; the same command "
+            "resumes where this one stopped."
         ) from error
 
 
@@ -173,7 +173,7 @@ def _exr(name: str, pixels: np.ndarray) -> Callable[[Path], None]:
 
 
 def _write(path: Path, write_to: Callable[[Path], None]) -> None:
-    """Writes a file that is never seen half-written, even if the machine stops."""
+    """Writes a file atomically, also on a power failure."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_files.written_file(path, survives="machine") as draft:
         write_to(draft)

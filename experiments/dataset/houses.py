@@ -1,4 +1,4 @@
-"""A ring of gabled houses around a square, as the eye in its middle sees them."""
+"""A ring of gabled houses around a square, seen from its middle."""
 
 import math
 
@@ -14,7 +14,7 @@ from experiments.dataset.textures.sphere_fields import fbm3
 def row_of_houses(
     azimuth: Field, elevation: Field, points: np.ndarray, weather: Weather
 ) -> tuple[Picture, np.ndarray]:
-    """Returns a ring of fronts with windows, doors and gables, and where it stands."""
+    """Returns a ring of fronts with windows, doors and gables, and the mask of its samples."""
     count, away = 26, 11.0
     turn = (azimuth / (2.0 * math.pi) + 0.5) * count
     index = np.floor(turn).astype(np.int32) % count
@@ -59,11 +59,11 @@ def _openings(
     """Returns fronts with three windows on each floor, shuttered, and a door below.
 
     Args:
-      front: plaster.
-      index: of the house.
-      u: metres to the right of its middle.
-      up: metres above the ground.
-      extent: how wide it is, and how high are its eaves.
+      front: colours of the plaster.
+      index: index of the house.
+      u: position to the right of the house's middle, in metres.
+      up: height above the ground, in metres.
+      extent: width of the house and height of its eaves, in metres.
     """
     wide, eaves = extent
     pitch, floor = wide / 3.0, 1.45

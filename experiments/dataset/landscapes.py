@@ -1,7 +1,7 @@
 """Outdoor environments: daylight over a meadow, a town square, a lake and dunes.
 
-A picture has `[h, 2h]` samples of linear RGB, laid out as in `textures.sphere_fields`; it is
-finite, not negative, and at most `sky.SUN_RADIANCE`.
+An image has `[h, 2h]` samples of linear RGB, laid out as in `textures.sphere_fields`; it is finite,
+not negative, and at most `sky.SUN_RADIANCE`.
 """
 
 import math
@@ -26,7 +26,7 @@ from experiments.dataset.textures.fields import (
 from experiments.dataset.textures.shading import colour, graded, linear
 from experiments.dataset.textures.sphere_fields import angles, averaged, directions, fbm3
 
-_SOFT = 256  # rows from which pictures of the ground are as fine as they get
+_SOFT = 256  # rows above which images of the ground gain no detail
 
 
 def meadow(height: int) -> Picture:
@@ -87,7 +87,7 @@ def square(height: int) -> Picture:
 
 
 def lake(height: int) -> Picture:
-    """Mountains with snow around a lake that mirrors them, early, over a shore of pebbles."""
+    """Mountains with snow reflected in a lake, in the early morning, over a shore of pebbles."""
     points = directions(height)
     azimuth, elevation = angles(height)
     weather = Weather(math.radians(80.0), math.radians(31.0), 3.0, 0.5, 91)
@@ -154,7 +154,7 @@ def dunes(height: int) -> Picture:
     for row, (tall, rough) in enumerate(((0.05, 2.5), (-0.03, 1.6), (-0.16, 1.2), (-0.38, 1.0))):
         crest = tall + 0.05 * (row + 1) * _around(azimuth, rough, 61 + 10 * row)
         deep = np.maximum(crest - elevation, 0.0)
-        # Each slope is a plane of its own, that begins at its crest.
+        # Each slope is a separate plane that starts at its crest.
         x, y, reach = _ground(azimuth, -(deep + 0.06), 1.2)
         bend = lookup(bends, x / 9.0, y / 9.0)
         wind = np.sin(9.0 * (x + 0.45 * y) + 5.0 * bend + row) * smooth(14.0, 5.0, reach)
@@ -179,7 +179,7 @@ def make_environment(name: str, height: int) -> Float[np.ndarray, "h w 3"]:
     """Returns an environment of `[height, 2 height]` samples, linear RGB in float32.
 
     Raises:
-      ValueError: if there is none of this name, or the height is too small.
+      ValueError: if the name does not exist, or the height is too small.
     """
     if name not in ENVIRONMENTS:
         raise ValueError(
@@ -194,13 +194,13 @@ def _finished(picture: Picture) -> Float[np.ndarray, "h w 3"]:
 
 
 def _ground(azimuth: Field, elevation: Field, eye: float) -> tuple[Field, Field, Field]:
-    """Returns the point of flat ground that is seen, and how far it is."""
+    """Returns the visible point of flat ground, and its distance."""
     reach = eye / np.tan(np.clip(-elevation, 0.004, 0.5 * math.pi))
     return reach * np.cos(azimuth), reach * np.sin(azimuth), reach
 
 
 def _around(azimuth: Field, frequency: float, seed: int) -> Field:
-    """Returns noise along the horizon, without a seam."""
+    """Returns noise along the horizon, periodic in azimuth."""
     rows = azimuth.shape[0]
     turn = np.linspace(-math.pi, math.pi, 4 * rows, endpoint=False)[None]
     ring = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], -1).astype(np.float32)

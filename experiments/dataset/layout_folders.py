@@ -1,4 +1,4 @@
-"""Writes a scene as a folder, with plain names or those of the raw release; files byte for byte."""
+"""Writes a scene as a folder, with plain names or those of the raw release."""
 
 import shutil
 from collections.abc import Callable
@@ -14,15 +14,15 @@ from refref_jax.data.file_names import FrameFiles, Naming
 def write(
     contents: SceneContents, target: Path, *, naming: Naming, step: Callable[[], None]
 ) -> None:
-    """Writes a scene's folder, which appears when it is whole.
+    """Writes a scene's folder atomically.
 
-    All extras are kept in their places; an EXR beside an image or a depth map goes along with it.
+    All extras keep their paths; an EXR next to an image or a depth map is copied with it.
 
     Args:
-      contents: of the scene.
-      target: the folder, which must not exist.
-      naming: of the frames' files.
-      step: is called for every image.
+      contents: contents of the scene.
+      target: output folder, which must not exist.
+      naming: naming of the frames' files.
+      step: callback after every image.
     """
     with atomic_files.new_folder(target) as scene:
         for split, (frames, header) in contents.splits.items():

@@ -1,8 +1,8 @@
 """Writes a scene as parquet files, as the data set is published on Hugging Face.
 
-One row is one frame, the splits one after the other. The schema's metadata holds what `datasets`
-wants, so that it shows the columns as images, and how many frames each split has. All else that a
-reader of ours can use is put beside, see `refref_jax.data.published_files`.
+One row is one frame, the splits one after the other. The schema's metadata holds the features of
+`datasets`, so that it shows the columns as images, and the number of frames of each split. All
+other files that our readers can use are stored next to it, see `refref_jax.data.published_files`.
 """
 
 import json
@@ -21,10 +21,10 @@ from refref_jax.data.errors import SceneError
 from refref_jax.data.parquet_scenes import IMAGE_COLUMNS, POSE_COLUMN
 from refref_jax.data.scene_names import SceneName
 
-# As large as files of Hugging Face's own converter.
+# The file size of Hugging Face's own converter.
 _BYTES_OF_A_SHARD = 500_000_000
 
-# Few enough to show single images without reading the file, and to hold in memory.
+# Small enough to show single images without reading the complete file, and to fit in memory.
 _ROWS_OF_A_GROUP = 25
 
 _FEATURES = {column: {"_type": "Image"} for column in IMAGE_COLUMNS} | {
@@ -38,19 +38,19 @@ _FEATURES = {column: {"_type": "Image"} for column in IMAGE_COLUMNS} | {
 def write(
     contents: SceneContents, name: SceneName, out: Path, *, step: Callable[[], None]
 ) -> dict[str, Path]:
-    """Writes the files of a scene, which appear when they are whole.
+    """Writes the files of a scene atomically.
 
     Args:
-      contents: of the scene.
-      name: its name.
-      out: folder of the whole layout.
-      step: is called for every image.
+      contents: contents of the scene.
+      name: name of the scene.
+      out: folder of the complete layout.
+      step: callback after every image.
 
     Returns:
-      What was left out, extras by their places, EXRs of frames by kind and split.
+      Omitted files: extras by their paths, EXRs of frames by kind and split.
 
     Raises:
-      SceneError: if pyarrow is missing, or the scene has no place in the layout.
+      SceneError: if pyarrow is missing, or the layout cannot hold the scene.
     """
     rows = [(split, frame) for split, found in contents.splits.items() for frame in found.frames]
     metadata = _metadata(contents, name)
@@ -75,7 +75,7 @@ def write(
 
 
 def files_of(name: SceneName, out: Path) -> list[Path]:
-    """Returns the parquet files of a scene that a folder holds."""
+    """Returns the parquet files of a scene in a folder."""
     return sorted((out / "data").glob(f"{name}-[0-9]*-of-[0-9]*.parquet"))
 
 
@@ -84,7 +84,7 @@ def _metadata(contents: SceneContents, name: SceneName) -> dict[bytes, bytes]:
     if len(angles) > 1:
         raise SceneError(
             f"The splits of {name} have different fields of view, {sorted(angles)}, but parquet "
-            "files have one. Leave the scene as a folder."
+            "files have only one. Leave the scene as a folder."
         )
     frames = {split: len(found.frames) for split, found in contents.splits.items()}
     told = parquet_scenes.Contents(frames, float(angles.pop()))
@@ -107,7 +107,7 @@ def _write_shard(
     pose = pyarrow.list_(pyarrow.list_(pyarrow.float64()))
     types = dict.fromkeys(IMAGE_COLUMNS, image) | {POSE_COLUMN: pose}
     schema = pyarrow.schema(types, metadata=metadata)
-    # No two images are equal: there is nothing to look up.
+    # All images differ: a dictionary would not help.
     with parquet.ParquetWriter(path, schema, use_dictionary=False) as file:
         for start in range(0, len(rows), _ROWS_OF_A_GROUP):
             group = []
@@ -120,8 +120,8 @@ def _write_shard(
 def _row(split: str, frame: Frame) -> dict[str, Any]:
     if frame.depth is not None and frame.depth.suffix == ".exr":
         raise SceneError(
-            f"{frame.depth} is a map of floats, but parquet files hold 8-bit depth. Write such a "
-            "PNG beside it, and name that in the transforms file."
+            f"{frame.depth} is a float map, but parquet files hold 8-bit depth. Write such a "
+            "PNG next to it, and name it in the transforms file."
         )
     files = {"image": frame.image, "depth": frame.depth, "mask": frame.mask}
     row: dict[str, Any] = {
@@ -132,7 +132,7 @@ def _row(split: str, frame: Frame) -> dict[str, Any]:
 
 
 def _write_extras(extras: dict[str, Path], folder: Path) -> None:
-    # What is there without parquet files is of a conversion that was interrupted.
+    # Without parquet files, the folder is left over from an interrupted conversion.
     shutil.rmtree(folder, ignore_errors=True)
     if not extras:
         return

@@ -2,9 +2,9 @@
 
 python -m experiments.dataset.make --out=runs/dataset --scenes=all --workers=4
 
-Each scene gets a folder in --out. Blender needs an environment of its own, which
-`make dataset-env` makes. A command that was stopped, in whatever way, is given again and goes on
-where it stopped: the result is the same, to the bit. What is there already is never replaced.
+Each scene gets a folder in --out. Blender requires a separate environment, created by `make
+dataset-env`. An interrupted command resumes when it is given again: the result is the same, to the
+bit. Existing files are never replaced.
 
 `--preview` renders one test view of each scene instead, into {out}/preview, and contact sheets.
 """
@@ -33,18 +33,18 @@ with epy.lazy_imports():
         scenes,
     )
 
-_OUT = cli_flags.out("Folder that gets a folder for each scene.")
+_OUT = cli_flags.out("Output folder, with a folder for each scene.")
 _SCENES = flags.DEFINE_string(
     "scenes",
     "all",
-    "all, or names parted by commas: scenes as cube_smcvx_ball, objects as ball for all their "
-    "backgrounds, or either with wildcards as 'sphere_*'.",
+    "all, or names separated by commas: scenes such as cube_smcvx_ball, objects such as ball for "
+    "all their backgrounds, or either with wildcards such as 'sphere_*'.",
 )
 app.check(_SCENES, lambda words: scenes.choose(words, catalogue.OBJECTS))
 _SIZE = flags.DEFINE_integer("size", 800, "Width and height of images in pixels.", lower_bound=1)
-_SPP = flags.DEFINE_integer("spp", 512, "Samples a pixel of train and val.", lower_bound=1)
+_SPP = flags.DEFINE_integer("spp", 512, "Samples per pixel of train and val.", lower_bound=1)
 _TEST_SPP = flags.DEFINE_integer(
-    "test_spp", None, "Samples a pixel of test; those of --spp if not given.", lower_bound=1
+    "test_spp", None, "Samples per pixel of test; those of --spp if not given.", lower_bound=1
 )
 _VIEWS = flags.DEFINE_integer("views", 100, "Views of each split.", lower_bound=0)
 _SPLIT_VIEWS = {
@@ -54,38 +54,38 @@ _SPLIT_VIEWS = {
     for split in cli_flags.SPLITS
 }
 _WORKERS = flags.DEFINE_integer(
-    "workers", None, "Processes of Blender; one for each core if not given.", lower_bound=1
+    "workers", None, "Number of Blender processes; one for each core if not given.", lower_bound=1
 )
 _RULE = flags.DEFINE_enum(
     "rule",
     "nested",
     get_args(TwoSidedRule),
-    "What lies outside a part: the part around it, or always air, as in Blender without care.",
+    "Medium outside a part: the part around it, or always air, the default in Blender.",
 )
 _TEXTURE_SIZE = flags.DEFINE_integer(
     "texture_size", 1024, "Rows of each image of the background.", lower_bound=LEAST_TEXTURE
 )
 _EXR = flags.DEFINE_enum(
-    "exr", "test", ["all", "test", "none"], "Splits whose images are kept as linear EXRs too."
+    "exr", "test", ["all", "test", "none"], "Splits that also keep their images as linear EXRs."
 )
 _PREVIEW = flags.DEFINE_bool("preview", False, "One test view of each scene, and contact sheets.")
 _BLENDER = flags.DEFINE_string(
     "blender", ".venv-dataset/bin/python", "Python of the environment that has Blender."
 )
 
-# Pixels of a picture on a contact sheet.
+# Width and height of an image on a contact sheet, pixels.
 _TILE = 200
 
 
 def main() -> None:
-    """Makes what is missing of the chosen scenes."""
+    """Makes the missing files of the chosen scenes."""
     chosen = scenes.choose(_SCENES.value, catalogue.OBJECTS)
     settings = _settings()
     blender = Path(_BLENDER.value).absolute()
     if not blender.is_file():
         raise ValueError(
-            f"There is no Blender: {_BLENDER.value} does not exist. Run make dataset-env, or give "
-            "the Python of an environment that has bpy 5.0.1 as --blender."
+            f"--blender={_BLENDER.value} does not exist. Run make dataset-env, or give "
+            "the Python of an environment with bpy 5.0.1 as --blender."
         )
     out = Path(_OUT.value) / "preview" if _PREVIEW.value else Path(_OUT.value)
     if any(scene.object == "monkey" for scene in chosen):
@@ -102,7 +102,7 @@ def main() -> None:
         )
     outputs.note(out, __name__)
     if not whole:
-        print("Stopped. The same command goes on from here.")
+        print("Stopped. The same command resumes from here.")
         sys.exit(app.INTERRUPTED)
     if _PREVIEW.value:
         _write_contact_sheets(out, chosen, settings)
@@ -128,7 +128,7 @@ def _settings() -> RenderSettings:
 
 
 def _write_contact_sheets(out: Path, chosen: Sequence[SceneName], settings: RenderSettings) -> None:
-    """Writes a sheet for each kind of background."""
+    """Writes a contact sheet for each kind of background."""
     (number,) = settings.numbers("test")
     image = frame_files.relative("test", number).image
     for kind in BACKGROUNDS:
@@ -142,5 +142,5 @@ def _write_contact_sheets(out: Path, chosen: Sequence[SceneName], settings: Rend
 if __name__ == "__main__":
     app.run(
         main,
-        again="it goes on; views that are there are not rendered again.",
+        again="it resumes; existing views are not rendered again.",
     )

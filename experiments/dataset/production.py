@@ -1,4 +1,4 @@
-"""Makes what is missing of scenes, alone in their folder (NumPy only)."""
+"""Makes the missing files of scenes, one process per folder (NumPy only)."""
 
 import contextlib
 import os
@@ -29,20 +29,20 @@ def produce(
     workers: int | None,
     stopped: Callable[[], bool],
 ) -> bool:
-    """Makes folders and views that are not there, and returns whether none is left.
+    """Makes missing folders and views, and returns whether all of them exist.
 
     Args:
-      out: folder of the scenes; made if it is not there.
+      out: folder of the scenes; created if missing.
       chosen: scenes to make; those of one object follow each other.
-      settings: of the rendering.
-      objects: by name.
+      settings: settings of the rendering.
+      objects: objects by name.
       blender: Python that has bpy.
-      workers: number of processes of Blender, or one for each core.
-      stopped: whether the user wants to end; it is asked after every view.
+      workers: number of Blender processes, or one for each core.
+      stopped: callback that returns whether the user wants to end; queried after every view.
 
     Raises:
-      ValueError: if there is something else in a scene's place, if another command works in the
-        folder, or if Blender fails.
+      ValueError: if a scene's folder has other contents, if another command works in the folder, or
+      if Blender fails.
     """
     for scene in chosen:
         scene_setup.check(out / str(scene), scene, settings)
@@ -53,7 +53,7 @@ def produce(
         wanted = views.all_views(chosen, settings)
         missing = [view for view in wanted if not views.is_done(out, view, settings)]
         if not missing:
-            print(f"Nothing to do: all {len(wanted)} views are there.")
+            print(f"Nothing to do: all {len(wanted)} views exist.")
             return True
         cores = _cores()
         count = min(workers or cores, len(missing))
@@ -69,12 +69,12 @@ def produce(
 
 
 def _render(pool: Pool, there: int, total: int, stopped: Callable[[], bool]) -> int:
-    """Renders, and returns how many views were."""
+    """Renders views, and returns their number."""
     started, done = time.monotonic(), 0
     with ProgressBar("render", total, there) as bar, pool:
         for done, task in enumerate(pool.run(), start=1):
             pace = (time.monotonic() - started) / done
-            bar.show(there + done, f"{task.name}  {pace:.1f} s a view")
+            bar.show(there + done, f"{task.name}  {pace:.1f} s per view")
             if stopped():
                 pool.stop()
     return done
@@ -82,21 +82,21 @@ def _render(pool: Pool, there: int, total: int, stopped: Callable[[], bool]) -> 
 
 @contextlib.contextmanager
 def _alone_in(out: Path) -> Iterator[Path]:
-    """Gives an empty folder for files that come and go to the only command that works in `out`.
+    """Locks `out` for this command, and yields an empty folder for temporary files.
 
-    It stays behind where an error ends the command, for the logs in it.
+    After an error the folder remains, for the logs in it.
     """
     with atomic_files.hold(out):
         scratch = out / _SCRATCH
         shutil.rmtree(scratch, ignore_errors=True)
         scratch.mkdir(exist_ok=True)
-        # A process of a killed command may still be about to write: the name is new every time.
+        # A process of a killed command may still write later: the name is always new.
         yield Path(tempfile.mkdtemp(dir=scratch)).absolute()
         shutil.rmtree(scratch, ignore_errors=True)
 
 
 def _cores() -> int:
-    """Returns how many cores this process may use."""
+    """Returns the number of cores available to this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

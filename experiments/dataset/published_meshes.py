@@ -1,8 +1,9 @@
-"""Writes an object's meshes under their published names, one file a material, for other readers.
+"""Writes an object's meshes under their published names, one file per material.
 
     mesh_files/{category}/{object}_{material}.ply
 
-All parts of a material are in one file. Ours reads the parts themselves, which a scene keeps.
+All parts with the same material are in one file. Our reader uses the separate parts, which the
+scene keeps.
 """
 
 from collections.abc import Sequence
@@ -17,15 +18,15 @@ from refref_jax.data.scene_names import CATEGORIES, SceneName
 
 
 def write(parts: Sequence[Path], name: SceneName, out: Path) -> None:
-    """Writes the meshes of a scene's object; those of another background's scene are the same.
+    """Writes the meshes of a scene's object; they are the same for all backgrounds.
 
     Args:
-      parts: the scene's mesh files; those of unknown material are left out.
-      name: of the scene.
-      out: folder of the whole layout.
+      parts: mesh files of the scene; those of unknown material are omitted.
+      name: name of the scene.
+      out: folder of the complete layout.
 
     Raises:
-      SceneError: if a mesh is there already, and is another.
+      SceneError: if a different mesh of that name exists already.
     """
     by_material: dict[str, list[Path]] = {}
     for part in sorted(parts):
@@ -40,13 +41,13 @@ def write(parts: Sequence[Path], name: SceneName, out: Path) -> None:
                 draft.write_bytes(content)
         elif target.read_bytes() != content:
             raise SceneError(
-                f"{target} is there already, but {name} has another mesh. Give another --out, or "
-                "the same mesh to all scenes of an object."
+                f"{target} exists, but {name} has another mesh. Give another --out, or use "
+                "the same mesh in all scenes of an object."
             )
 
 
 def _merged(files: Sequence[Path]) -> bytes:
-    """Returns one PLY file of all the files' triangles; of one file, itself."""
+    """Returns one PLY file with the triangles of all files; a single file is returned verbatim."""
     if len(files) == 1:
         return files[0].read_bytes()
     surfaces = [trimesh.Trimesh(*meshes.read_mesh(path), process=False) for path in files]

@@ -1,4 +1,4 @@
-"""With what settings scenes are rendered (NumPy only)."""
+"""Settings of the rendering (NumPy only)."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -7,19 +7,19 @@ from experiments.dataset.cameras import SPLITS, Split
 from refref_jax.choices import TwoSidedRule
 
 LinearImages = Literal["all", "test", "none"]
-"""Which splits keep their images as linear EXRs too."""
+"""Splits that also keep their images as linear EXRs."""
 
 GENERATOR = 1
-"""Version of the generator. It grows when a scene of the same settings would look different."""
+"""Version of the generator, incremented when scenes with the same settings would change."""
 
 LEAST_TEXTURE = 16
-"""Rows below which a texture shows nothing."""
+"""Smallest useful number of rows of a texture."""
 
 BLENDER = "5.0.1"
-"""Version of Blender; another one's pixels may differ."""
+"""Required version of Blender; pixels may differ between versions."""
 
 BOUNCES = 64
-"""Of every kind, after which Cycles gives up a path."""
+"""Limit of bounces of every kind in Cycles."""
 
 _RENDER: dict[str, Any] = {
     "bounces": BOUNCES,
@@ -45,16 +45,16 @@ class PerSplit(NamedTuple):
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """What decides a scene's files, besides its name.
+    """Settings that decide a scene's files, in addition to its name.
 
     Attributes:
       size: width and height of images in pixels.
-      spp: samples a pixel.
-      views: poses of each split.
-      rule: what lies outside a part.
+      spp: samples per pixel.
+      views: number of poses of each split.
+      rule: outside medium of each part.
       texture_size: rows of each image of the background.
-      linear: which splits keep linear EXRs.
-      preview: whether of all views only `preview_view` is rendered.
+      linear: splits that keep linear EXRs.
+      preview: whether only `preview_view` is rendered.
     """
 
     size: int
@@ -66,10 +66,10 @@ class RenderSettings:
     preview: bool = False
 
     def __post_init__(self) -> None:
-        """Refuses what has no meaning.
+        """Rejects invalid settings.
 
         Raises:
-          ValueError: if a number is too small, or there is no view at all.
+          ValueError: if a number is too small, or all splits are empty.
         """
         for name, number in [("size", self.size), *zip(_SPP, self.spp, strict=True)]:
             if number < 1:
@@ -81,23 +81,23 @@ class RenderSettings:
         if min(self.views) < 0 or not any(self.views):
             raise ValueError(
                 f"The views of train, val and test are {', '.join(map(str, self.views))}. Give "
-                "numbers that are not negative, and at least one view."
+                "non-negative numbers, and at least one view."
             )
         if self.preview and not self.views.test:
             raise ValueError("A preview shows a test view, but there is none. Give --test_views.")
 
     def numbers(self, split: Split) -> tuple[int, ...]:
-        """Returns the numbers of the views of a split that are rendered."""
+        """Returns the numbers of the rendered views of a split."""
         if self.preview:
             return (preview_view(self.views.test),) if split == "test" else ()
         return tuple(range(getattr(self.views, split)))
 
     def keeps_linear(self, split: Split) -> bool:
-        """Returns whether the images of a split are kept as linear EXRs."""
+        """Returns whether a split keeps its images as linear EXRs."""
         return self.linear in ("all", split)
 
     def record(self) -> dict[str, Any]:
-        """Returns what `scene.json` says of the settings."""
+        """Returns the record of the settings for `scene.json`."""
         return {
             "renderer": f"Blender Cycles {BLENDER}",
             "size": self.size,
@@ -115,5 +115,5 @@ _SPP = ("spp of train", "spp of val", "spp of test")
 
 
 def preview_view(count: int) -> int:
-    """Returns the number of the test view that a preview shows: seen from somewhat above."""
+    """Returns the number of the preview's test view, which looks down slightly."""
     return (count - 1) * 6 // 10

@@ -1,4 +1,4 @@
-"""Checks one scene of the data set, and finds those of a folder; see `check`."""
+"""Finds the scenes of a folder and checks one scene of the data set; see `check`."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ def find_scenes(folder: Path, names: list[str] | None) -> list[Path]:
     """Returns the scenes of a folder, or the folder itself if it is one.
 
     Raises:
-      ValueError: if there is none, or not that of a name.
+      ValueError: if the folder has no scene, or not one with a given name.
     """
     if any(folder.glob(_TRANSFORMS)):
         found = [folder]
@@ -31,7 +31,7 @@ def find_scenes(folder: Path, names: list[str] | None) -> list[Path]:
     if missing := sorted(set(names or ()) - there):
         near = app.did_you_mean(missing[0], sorted(there))
         raise ValueError(
-            f"{folder} holds no scene {missing[0]}.{near or ' See the names of its folders.'}"
+            f"{folder} holds no scene {missing[0]}.{near or ' Give one of its folders.'}"
         )
     return [path for path in found if names is None or path.resolve().name in names]
 
@@ -40,9 +40,9 @@ def check_scene(scene: Path, budget: Budget, *, views: int, side: int) -> SceneR
     """Checks one scene.
 
     Args:
-      scene: its folder.
-      budget: which light to follow.
-      views: test views to compare, evenly spread.
+      scene: folder of the scene.
+      budget: path settings.
+      views: number of test views to compare, evenly spaced.
       side: rays along each edge of a pixel.
     """
     name = scene.resolve().name
@@ -59,7 +59,7 @@ def check_scene(scene: Path, budget: Budget, *, views: int, side: int) -> SceneR
     convex = "smcvx" in name.split("_")
     notes = [str(each) for each in findings if each.severity == "note"]
     notes += [
-        f"{view.name}: no depth was compared, for want of a float map or of pixels away from edges"
+        f"{view.name}: no depth was compared: no float map, or no pixels away from edges"
         for view in compared
         if np.isnan(view.depth_share)
     ]

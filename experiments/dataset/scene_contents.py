@@ -1,7 +1,7 @@
-"""All that a scene's folder holds, by what it is: the first half of every conversion (NumPy only).
+"""Lists the files of a scene's folder by type: the first half of every conversion (NumPy only).
 
-A frame is its image, mask and depth map; all other files are *extras*, by their places below the
-folder: `scene.json`, meshes, textures, maps of floats.
+A frame is its image, mask and depth map; all other files are *extras*, by their path relative to
+the folder: `scene.json`, meshes, textures, float maps.
 """
 
 from pathlib import Path
@@ -17,11 +17,11 @@ class Frame(NamedTuple):
 
     Attributes:
       image: 8-bit image.
-      mask: of the object, if there is one.
-      depth: the depth map that the transforms file names, if it does.
-      linear: the EXR beside the image, if there is one.
-      float_depth: the EXR beside the depth map, if there is one.
-      record: of the frame in the transforms file.
+      mask: mask of the object, if it exists.
+      depth: depth map, if the transforms file names one.
+      linear: EXR next to the image, if it exists.
+      float_depth: EXR next to the depth map, if it exists.
+      record: record of the frame in the transforms file.
     """
 
     image: Path
@@ -33,19 +33,19 @@ class Frame(NamedTuple):
 
 
 class Split(NamedTuple):
-    """One split: its frames, and all else that its transforms file says."""
+    """One split: its frames, and the other contents of its transforms file."""
 
     frames: tuple[Frame, ...]
     header: dict[str, Any]
 
 
 class SceneContents(NamedTuple):
-    """What a scene's folder holds.
+    """Contents of a scene's folder.
 
     Attributes:
-      splits: by name; only those that there are.
-      extras: all other files, by their places below the folder; meshes of the raw release are in
-        `meshes/`.
+      splits: frames by the name of the split; only existing splits.
+      extras: all other files, by their path relative to the folder; meshes of the raw release are
+        in `meshes/`.
     """
 
     splits: dict[str, Split]
@@ -53,7 +53,7 @@ class SceneContents(NamedTuple):
 
 
 def read(scene: Path) -> SceneContents:
-    """Lists what a scene holds, and checks its cameras and that all files exist.
+    """Lists the files of a scene, and checks its cameras and that all files exist.
 
     Raises:
       SceneError: if a file is missing or broken.
@@ -83,9 +83,9 @@ def read(scene: Path) -> SceneContents:
 
 
 def named_extras(contents: SceneContents) -> dict[str, Path]:
-    """Returns the extras that a reader of the scene can use: those that `scene.json` names.
+    """Returns the extras that are named in `scene.json`.
 
-    They are `scene.json` itself, all meshes, and files such as textures.
+    These are `scene.json` itself, all meshes, and files such as textures.
     """
     words = _texts(_scene_json(contents))
     return {
@@ -133,7 +133,7 @@ def _scene_json(contents: SceneContents) -> Any:
 
 
 def _texts(value: Any) -> set[str]:
-    """Returns all texts in parsed JSON, written as places are."""
+    """Returns all strings in parsed JSON, normalized as paths."""
     if isinstance(value, dict):
         value = list(value.values())
     if isinstance(value, list):

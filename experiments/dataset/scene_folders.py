@@ -1,4 +1,4 @@
-"""Finds the scenes that a place holds, in any layout, and opens them one by one."""
+"""Finds the scenes of a folder or repository, in any layout, and opens them one by one."""
 
 import contextlib
 import tempfile
@@ -19,10 +19,10 @@ class FoundScene(NamedTuple):
     """A scene to read.
 
     Attributes:
-      name: of the scene, or of its folder.
-      images: how many it has.
-      folder: its folder; `None` if it is in parquet files.
-      copy: what holds the parquet files; `None` if it is a folder.
+      name: name of the scene, or of its folder.
+      images: number of images.
+      folder: folder of the scene; `None` if it is in parquet files.
+      copy: copy that holds the parquet files; `None` if the scene is a folder.
     """
 
     name: str
@@ -32,15 +32,15 @@ class FoundScene(NamedTuple):
 
 
 def find(place: str, chosen: Sequence[str] | None = None) -> list[FoundScene]:
-    """Finds the scenes of a place, and checks that their files exist.
+    """Finds the scenes of a folder or repository, and checks that their files exist.
 
     Args:
       place: `hf:CONFIG/SCENE`, a scene's folder, a folder of such folders, one in the raw release's
-        layout, or one of parquet files.
-      chosen: names of the scenes that are wanted; all if `None`.
+        layout, or a folder of parquet files.
+      chosen: names of the requested scenes; all if `None`.
 
     Raises:
-      SceneError: if there are none, or not those that are wanted, or one is broken.
+      SceneError: if there are no scenes, if a requested one is missing, or if one is broken.
     """
     if place.startswith("hf:"):
         return _chosen([_in_folder(cli_scenes.opened(place))], chosen, place)
@@ -65,12 +65,12 @@ def find(place: str, chosen: Sequence[str] | None = None) -> list[FoundScene]:
 
 @contextlib.contextmanager
 def opened(scene: FoundScene, out: Path, step: Callable[[], None]) -> Iterator[Path]:
-    """Yields the scene's folder; one in parquet files is unpacked, and removed at the end.
+    """Yields the scene's folder; parquet files are unpacked into a temporary one.
 
     Args:
-      scene: the scene.
-      out: existing folder, below which it is unpacked.
-      step: is called for every image that is unpacked.
+      scene: scene to open.
+      out: existing folder for the temporary one.
+      step: callback for every unpacked image.
     """
     if scene.folder is not None:
         yield scene.folder
@@ -94,7 +94,7 @@ def _images(copy: LocalCopy, name: scene_names.SceneName) -> int:
 
 
 def _folders(top: Path) -> list[Path]:
-    """Returns the folders of scenes below a folder; those half-written have names with dots."""
+    """Returns the folders of scenes below a folder, without incomplete ones (leading dot)."""
     for pattern in ("*", "image_data/*/*/*", "*/*/*"):
         found = {path.parent for path in top.glob(f"{pattern}/transforms_*.json")}
         found = {path for path in found if not path.name.startswith(".")}
@@ -108,7 +108,7 @@ def _chosen(found: list[FoundScene], chosen: Sequence[str] | None, place: str) -
 
 
 def _wanted(found: dict[str, _T], chosen: Sequence[str] | None, place: str) -> list[_T]:
-    """Returns what is found of what is chosen."""
+    """Returns the requested scenes."""
     for name in chosen or ():
         if name not in found:
             near = scene_names.nearest(name, found)

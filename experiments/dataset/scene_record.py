@@ -1,7 +1,8 @@
-"""What `scene.json` says of a scene (NumPy only).
+"""The record of a scene in `scene.json` (NumPy only).
 
-Of each part it says what is inside and outside of its surface, as Blender gets it: under the rule
-`nested` outside is the innermost part around it, else air; under `facing` it is always air.
+For each part it has the media inside and outside of its surface, as passed to Blender: under the
+rule `nested` the outside is the innermost part around it, else air; under `facing` it is always
+air.
 """
 
 from collections.abc import Sequence
@@ -31,13 +32,13 @@ def describe(
     """Returns the content of `scene.json`.
 
     Args:
-      scene: which.
-      parts: of its object.
-      background: its record, as `refref_jax.data.background` reads it.
-      settings: of the rendering.
+      scene: scene to describe.
+      parts: parts of its object.
+      background: record of its background, as `refref_jax.data.background` reads it.
+      settings: settings of the rendering.
 
     Raises:
-      ValueError: if parts cut each other, or one that absorbs has another inside.
+      ValueError: if parts intersect, or an absorbing one contains another.
     """
     outside = _materials_outside(scene, parts, settings.rule)
     return {
@@ -52,7 +53,7 @@ def describe(
 
 
 def identify(scene: SceneName, settings: RenderSettings) -> dict[str, Any]:
-    """Returns what of `scene.json` is known before anything is made."""
+    """Returns the part of `scene.json` that is known in advance."""
     return {"scene": str(scene), "category": scene.category, **settings.record()}
 
 
@@ -85,13 +86,13 @@ def _materials_outside(
     if tree.overlaps:
         first, second = (parts[number].name for number in tree.overlaps[0])
         raise ValueError(
-            f"The parts {first} and {second} of {scene.object} cut each other. Part them by a gap."
+            f"The parts {first} and {second} of {scene.object} intersect. Separate them by a gap."
         )
     for parent in tree.parents:
         if parent != NO_PARENT and parts[parent].absorption != NO_ABSORPTION:
             raise ValueError(
-                f"The part {parts[parent].name} of {scene.object} absorbs light, and has another "
-                "part inside, where Blender would go on absorbing. Give its surface a tint instead."
+                f"The part {parts[parent].name} of {scene.object} absorbs light, but contains "
+                "another part, in which Blender keeps absorbing. Give its surface a tint instead."
             )
     if rule == "facing":
         return [_AIR] * len(parts)

@@ -1,11 +1,11 @@
-"""Makes the folder of a scene, ready to be rendered, and recognises one (NumPy only).
+"""Creates the folder of a scene, ready to be rendered, and recognises one (NumPy only).
 
     {scene}/meshes/{object}_{part}_{material}.ply    binary, single precision
-    {scene}/background/                              what the record names
+    {scene}/background/                              files of the record
     {scene}/transforms_{train,val,test}.json         poses and file names, of splits with views
     {scene}/scene.json                               see `scene_record`
 
-A folder appears under its name when all of that is in it, so one that is there is whole.
+A folder is created atomically, so an existing one is complete.
 """
 
 import json
@@ -33,14 +33,14 @@ def make(
     parts: Callable[[], Sequence[ObjectPart]],
     scratch: Path,
 ) -> None:
-    """Makes the folder of a scene if it is not there.
+    """Creates the folder of a scene, unless it exists.
 
     Args:
-      folder: to make.
-      scene: which.
-      settings: of the rendering.
-      parts: makes those of the object.
-      scratch: an existing folder in the same file system, where it is put together.
+      folder: folder to create.
+      scene: scene to make.
+      settings: settings of the rendering.
+      parts: function that makes the parts of the object.
+      scratch: existing folder on the same file system, for temporary files.
     """
     if folder.exists():
         return
@@ -61,7 +61,7 @@ def make(
 
 
 def write_meshes(folder: Path, scene: SceneName, parts: Sequence[ObjectPart]) -> None:
-    """Writes the parts of a scene into its folder, which has one for meshes."""
+    """Writes the parts of a scene into its folder, which must have a subfolder for meshes."""
     for part in parts:
         mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
         content = trimesh.exchange.ply.export_ply(mesh, vertex_normal=False)
@@ -69,10 +69,10 @@ def write_meshes(folder: Path, scene: SceneName, parts: Sequence[ObjectPart]) ->
 
 
 def check(folder: Path, scene: SceneName, settings: RenderSettings) -> None:
-    """Checks that a folder, if it is there, is that of a scene with these settings.
+    """Checks that an existing folder belongs to a scene with these settings.
 
     Raises:
-      ValueError: if it is not.
+      ValueError: if it does not.
     """
     if not folder.exists():
         return
@@ -82,18 +82,18 @@ def check(folder: Path, scene: SceneName, settings: RenderSettings) -> None:
         different = _difference(found, scene_record.identify(scene, settings), "")
     except (OSError, ValueError, AttributeError) as error:
         raise ValueError(
-            f"{folder} exists, but is no scene of this command ({error}). Give another --out, or "
-            "remove it."
+            f"{folder} exists, but is not a scene of this command ({error}). Give another --out, "
+            "or remove it."
         ) from error
     if different:
         raise ValueError(
-            f"{path} has other settings: {different}. Give the same ones to go on, or another "
+            f"{path} has other settings: {different}. Give the same ones to resume, or another "
             "--out."
         )
 
 
 def _difference(found: Any, wanted: Any, name: str) -> str:
-    """Returns the first value that differs, in words, or nothing."""
+    """Returns the first difference, in words, or an empty string."""
     if isinstance(wanted, dict):
         for key, value in wanted.items():
             if different := _difference(found.get(key), value, f"{name} {key}"):

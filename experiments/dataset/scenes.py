@@ -1,4 +1,4 @@
-"""The scenes of the data set: every object before every kind of background."""
+"""The scenes of the data set: every object with every kind of background."""
 
 import fnmatch
 from collections.abc import Mapping
@@ -18,29 +18,29 @@ def all_scenes(objects: Mapping[str, Object]) -> list[SceneName]:
 
 
 def choose(text: str, objects: Mapping[str, Object]) -> list[SceneName]:
-    """Returns the scenes that an option names, in the order of `all_scenes`.
+    """Returns the scenes selected by an option, in the order of `all_scenes`.
 
     Args:
-      text: `all`, or names parted by commas: of scenes, else of objects for all their scenes. Both
-        may have wildcards, as `cube_*` and `ball*`.
-      objects: by name.
+      text: `all`, or names separated by commas: of scenes, or of objects for all their scenes. Both
+        may have wildcards, such as `cube_*` and `ball*`.
+      objects: objects by name.
 
     Raises:
-      ValueError: if a name fits nothing.
+      ValueError: if nothing matches a name.
     """
     scenes = all_scenes(objects)
     chosen: set[SceneName] = set()
     for word in text.split(","):
         pattern = "*" if word.strip() == "all" else word.strip()
-        # `cube_*` is every scene between walls, not every scene of a coloured cube.
+        # `cube_*` matches scenes with a background cube, not those of a coloured cube.
         fitting = [scene for scene in scenes if fnmatch.fnmatchcase(str(scene), pattern)]
         fitting = fitting or [s for s in scenes if fnmatch.fnmatchcase(s.object, pattern)]
         if not fitting:
             names = [*map(str, scenes), *objects]
             near = app.did_you_mean(pattern, names, most=3)
             raise ValueError(
-                f"No scene or object is called {pattern!r}.{near or f' Names are as {names[0]}.'} "
-                "All of them: all."
+                f"No scene or object is named {pattern!r}.{near or f' One name is {names[0]}.'} "
+                "Use 'all' for all of them."
             )
         chosen.update(fitting)
     return [scene for scene in scenes if scene in chosen]

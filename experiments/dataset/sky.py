@@ -1,9 +1,9 @@
 """Daylight: a clear sky, its sun, and clouds (NumPy only).
 
 Source: Preetham, Shirley and Smits, A practical analytic model for daylight (SIGGRAPH 1999),
-appendix A.2: Perez's distribution of luminance Y and chromaticity x, y over the dome, from the
-sun's place and the turbidity `T` of the air (2 clear, 6 hazy). `theta` is the angle from the
-zenith, `gamma` from the sun. Colours are linear RGB with the primaries of sRGB.
+appendix A.2: Perez's distribution of luminance Y and chromaticity x, y over the dome, as a function
+of the sun's position and the turbidity `T` of the air (2 clear, 6 hazy). `theta` is the angle from
+the zenith, `gamma` the angle from the sun. Colours are linear RGB with the primaries of sRGB.
 """
 
 import math
@@ -16,10 +16,9 @@ from experiments.dataset.textures.fields import Field, Picture, blend, smooth
 from experiments.dataset.textures.sphere_fields import Directions, directions, fbm3
 
 SUN_RADIANCE = 12.0
-"""The largest radiance of any environment: the sun's middle.
+"""The largest radiance of any environment: the sun's centre.
 
-The real sun is 1e5 times as bright as the sky; that would make each pixel of a glass body one of
-noise.
+The real sun is 1e5 times as bright as the sky, which would make the pixels of a glass object noisy.
 """
 
 _SUN_WIDTH = math.radians(1.6)
@@ -66,18 +65,18 @@ _ZENITH_Y = (
 # IEC 61966-2-1.
 _RGB_OF_XYZ = ((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557, -0.2040, 1.0570))
 LUMINANCE = (0.2126, 0.7152, 0.0722)
-"""Of linear R, G and B."""
+"""Luminance of linear R, G and B."""
 
 
 class Weather(NamedTuple):
-    """What makes a sky.
+    """Parameters of a sky.
 
     Attributes:
-      azimuth: of the sun, from +x towards +y, radians.
-      elevation: of the sun, radians, above 0.
-      turbidity: of the air, 2 to 6.
-      clouds: how much of the sky they cover, about 0 to 1.
-      seed: of the clouds.
+      azimuth: azimuth of the sun, from +x towards +y, radians.
+      elevation: elevation of the sun, radians, above 0.
+      turbidity: turbidity of the air, 2 to 6.
+      clouds: share of the sky covered by clouds, about 0 to 1.
+      seed: seed of the clouds.
     """
 
     azimuth: float
@@ -101,18 +100,18 @@ def sun_direction(weather: Weather) -> Float[np.ndarray, "3"]:
 def clear_sky(points: Directions, weather: Weather) -> Picture:
     """Returns the sky without sun and clouds, exposed so that its median luminance is 0.33.
 
-    Below the horizon it goes on as at the horizon.
+    Below the horizon it continues with the colours at the horizon.
 
     Raises:
-      ValueError: if the sun is not up, or the turbidity is not 2 to 10.
+      ValueError: if the sun is not above the horizon, or the turbidity is not 2 to 10.
     """
     if not 0.0 < weather.elevation <= 0.5 * math.pi or not 2.0 <= weather.turbidity <= 10.0:
         raise ValueError(
             f"The model has no sky for a sun at {weather.elevation} rad and a turbidity of "
-            f"{weather.turbidity}. Put the sun above the horizon, and the turbidity at 2 to 10."
+            f"{weather.turbidity}. Give an elevation above 0 and a turbidity of 2 to 10."
         )
     few = directions(_ROWS_OF_EXPOSURE)[: _ROWS_OF_EXPOSURE // 2]
-    # Rows are as many at the zenith as lower down, where they are more of the sky.
+    # Rows near the zenith have as many samples but cover less of the sky: weights are areas.
     weight = np.sqrt(1.0 - few[:, 0, 2] ** 2)
     bright = _preetham(few, weather) @ np.array(LUMINANCE, np.float32)
     median = _weighted_median(bright, np.broadcast_to(weight[:, None], bright.shape))
@@ -123,7 +122,7 @@ def sky_of(points: Directions, weather: Weather) -> Picture:
     """Returns the sky with clouds and sun, at most `SUN_RADIANCE`."""
     sky = clear_sky(points, weather)
     density = _clouds(points, weather)
-    # Seen towards the sun, clouds are thicker where they are darker.
+    # Clouds are darker where they are thicker towards the sun.
     to_sun = _clouds(points + 0.06 * sun_direction(weather), weather)
     cos_gamma = np.clip(points @ sun_direction(weather), -1.0, 1.0)
     silver = 0.9 + 0.9 * smooth(0.75, 1.0, cos_gamma)
@@ -138,7 +137,7 @@ def sky_of(points: Directions, weather: Weather) -> Picture:
 
 
 def _sun(cos_gamma: Field, weather: Weather, cover: Field) -> Picture:
-    """Returns the softened disc, and the glow around it that clouds dim."""
+    """Returns the softened disc of the sun and its glow, dimmed by clouds."""
     gamma = np.arccos(cos_gamma)
     low = math.exp(-5.0 * weather.elevation)
     tone = np.array([1.0, 0.95 - 0.35 * low, 0.88 - 0.65 * low], np.float32)
@@ -148,7 +147,7 @@ def _sun(cos_gamma: Field, weather: Weather, cover: Field) -> Picture:
 
 
 def _clouds(points: Directions, weather: Weather) -> Field:
-    """Returns how dense clouds are: heaps on a layer that the eye looks up to."""
+    """Returns the density of clouds: cumulus on a layer seen from below."""
     up = np.maximum(points[..., 2:], 0.0) + np.float32(0.22)
     layer = np.concatenate([points[..., :2] / up, 0.15 / up], -1)
     heaps = fbm3(layer, 1.1, weather.seed, octaves=7, gain=0.56)
@@ -156,7 +155,7 @@ def _clouds(points: Directions, weather: Weather) -> Field:
 
 
 def _preetham(points: Directions, weather: Weather) -> Picture:
-    """Returns the model's linear RGB; luminance in kcd/m2."""
+    """Returns linear RGB of the model; luminance in kcd/m2."""
     turbidity, theta_sun = weather.turbidity, 0.5 * math.pi - weather.elevation
     cos_theta = np.maximum(points[..., 2], np.float32(0.02))
     cos_gamma = np.clip(points @ sun_direction(weather), -1.0, 1.0)
@@ -175,7 +174,7 @@ def _preetham(points: Directions, weather: Weather) -> Picture:
         for value, rows in zip(zeniths, (_OF_LUMINANCE, _OF_X, _OF_Y), strict=True)
     )
     xyz = np.stack([x * luminance / y, luminance, (1.0 - x - y) * luminance / y], -1)
-    # Colours beyond the primaries of sRGB are cut.
+    # Colours outside the gamut of sRGB are clipped.
     return np.maximum(xyz @ np.array(_RGB_OF_XYZ, np.float32).T, 0.0).astype(np.float32)
 
 

@@ -1,4 +1,4 @@
-"""The views of scenes: which are missing, and what is to be rendered for each (NumPy only)."""
+"""Lists the missing views of scenes and their render jobs (NumPy only)."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache, partial
@@ -13,19 +13,19 @@ from experiments.dataset.seeds import seed_of
 from experiments.dataset.workers import Job, Task
 from refref_jax.data.scene_names import SceneName
 
-# What Blender takes.
+# Number of seeds that Blender accepts.
 _SEEDS = 1 << 31
 
 _DETAIL = 1.0
 
 
 class View(NamedTuple):
-    """One image.
+    """One view to render.
 
     Attributes:
-      scene: that it is of.
-      split: that it belongs to.
-      number: in the split.
+      scene: scene of the view.
+      split: split of the view.
+      number: number of the view in its split.
     """
 
     scene: SceneName
@@ -34,7 +34,7 @@ class View(NamedTuple):
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name of the view in messages."""
         return f"{self.scene} {self.split} {self.number}"
 
 
@@ -55,7 +55,7 @@ def is_done(out: Path, view: View, settings: RenderSettings) -> bool:
 
 
 def seed(view: View) -> int:
-    """Returns the seed that Blender renders a view with."""
+    """Returns Blender's seed for a view."""
     return seed_of(str(view.scene), view.split, f"r_{view.number:03d}") % _SEEDS
 
 
@@ -67,17 +67,17 @@ def tasks(
     objects: Mapping[str, Object],
     scratch: Path,
 ) -> Iterator[Task]:
-    """Yields what is to be rendered; the folder of a scene is made when its first view comes.
+    """Yields render jobs; the folder of a scene is created with its first view.
 
     Args:
       out: folder of the scenes.
-      views: to render; those of one scene follow each other.
-      settings: of the rendering.
-      objects: by name.
-      scratch: existing folder for what is half made.
+      views: views to render; those of one scene follow each other.
+      settings: settings of the rendering.
+      objects: objects by name.
+      scratch: existing folder for temporary files.
     """
 
-    # Scenes that follow each other share their object.
+    # Consecutive scenes share their object.
     @lru_cache(maxsize=1)
     def make(name: str) -> Sequence[ObjectPart]:
         return objects[name].make(_DETAIL)

@@ -1,6 +1,6 @@
-"""Several processes of Blender that share the views between them.
+"""Distributes views over several Blender processes.
 
-Which process renders a view, and when, does not show in it.
+Images do not depend on the process that renders a view, nor on the time.
 """
 
 import queue
@@ -13,7 +13,7 @@ from experiments.dataset.workers import SCRIPT, BlenderError, Task, Worker, Work
 
 
 class Pool:
-    """The processes. Used as a context, it leaves none behind."""
+    """The processes. The context manager ends all of them."""
 
     def __init__(
         self, tasks: Iterable[Task], *, blender: Path, scratch: Path, workers: int, threads: int
@@ -21,11 +21,11 @@ class Pool:
         """Describes a pool; `run` starts it.
 
         Args:
-          tasks: views, taken one by one as processes get free, from several threads in turn.
+          tasks: views, taken one by one by idle processes, from several threads in turn.
           blender: Python that has bpy.
-          scratch: existing folder for files that come and go.
+          scratch: existing folder for temporary files.
           workers: number of processes.
-          threads: of each.
+          threads: number of threads of each process.
         """
         self._tasks, self._taking = iter(tasks), threading.Lock()
         self._command = [str(blender), str(SCRIPT)]
@@ -39,8 +39,8 @@ class Pool:
         """Renders all views, and yields each when it is finished.
 
         Raises:
-          BlenderError: if a view can not be rendered; a process that dies is replaced once.
-          ValueError: whatever taking a task raises.
+          BlenderError: if a view cannot be rendered; a process that dies is replaced once.
+          ValueError: if taking a task raises it.
         """
         for number in range(self._workers):
             threading.Thread(target=self._work, args=(f"worker_{number}",), daemon=True).start()
@@ -55,7 +55,7 @@ class Pool:
                 yield done
 
     def stop(self) -> None:
-        """Lets `run` end after the views that are being rendered."""
+        """Ends `run` after the current views."""
         self._stopping.set()
 
     def __enter__(self) -> "Pool":
@@ -69,7 +69,7 @@ class Pool:
             self._alive.clear()
 
     def _work(self, name: str) -> None:
-        """Renders views one after the other, until there are no more."""
+        """Renders views one after the other, until none is left."""
         try:
             worker = self._start(name)
             while (task := self._take()) is not None:
@@ -78,12 +78,12 @@ class Pool:
                 except WorkerDiedError as error:
                     if self._stopping.is_set():
                         break
-                    print(f"{task.name}: Blender ended, {error}. Once more.", file=sys.stderr)
+                    print(f"{task.name}: Blender ended, {error}. Retrying.", file=sys.stderr)
                     worker = self._start(name)
                     self._render_again(worker, task)
                 self._done.put(task)
         except Exception as error:  # is raised where the results are awaited
-            # After `stop` it may be no more than a process that was not to start.
+            # After `stop` this may only be a process that was not started.
             if not self._stopping.is_set():
                 self._done.put(error)
         self._done.put(None)
@@ -94,13 +94,13 @@ class Pool:
         except WorkerDiedError as error:
             raise BlenderError(
                 f"Blender ended twice while it rendered {task.name}: {error}. See {worker.log}; "
-                "the same command goes on where this one stopped."
+                "the same command resumes where this one stopped."
             ) from error
 
     def _start(self, name: str) -> Worker:
         with self._changing:
             if self._stopping.is_set():
-                raise BlenderError("No process is started any more. Start the command again.")
+                raise BlenderError("The command is stopping. Start it again.")
             worker = Worker(self._command, scratch=self._scratch, name=name, threads=self._threads)
             self._alive[name] = worker
         worker.check_version()

@@ -1,6 +1,6 @@
-"""Blender in a process of its own, which renders one view after the other.
+"""Runs Blender in a separate process that renders one view after the other.
 
-What is spoken with it is told in `blender_worker`.
+See `blender_worker` for the protocol.
 """
 
 import json
@@ -13,18 +13,18 @@ from typing import NamedTuple
 from experiments.dataset.render_settings import BLENDER
 
 SCRIPT = Path(__file__).with_name("blender_worker.py")
-"""What a process of Blender runs."""
+"""Script that a Blender process runs."""
 
 
 class Job(NamedTuple):
     """A view to render.
 
     Attributes:
-      scene: folder of the scene, absolute.
-      pose: camera-to-world, 4 x 4.
+      scene: absolute path of the scene's folder.
+      pose: camera-to-world matrix, 4 x 4.
       angle_x: horizontal field of view in radians.
-      samples: a pixel.
-      seed: below 2^31.
+      samples: samples per pixel.
+      seed: seed, below 2^31.
     """
 
     scene: str
@@ -35,12 +35,13 @@ class Job(NamedTuple):
 
 
 class Task(NamedTuple):
-    """A job, and what is to be done with its result.
+    """A job, and the processing of its result.
 
     Attributes:
-      name: what the view is called, for people.
-      job: the view.
-      finish: takes the multi-layer EXRs of colour and of geometry, which go away afterwards.
+      name: name of the view in messages.
+      job: description of the view.
+      finish: function that takes the multi-layer EXRs of colour and of geometry, which are deleted
+        afterwards.
     """
 
     name: str
@@ -49,33 +50,33 @@ class Task(NamedTuple):
 
 
 class BlenderError(ValueError):
-    """Blender does not start, or does not render a view."""
+    """Blender does not start, or cannot render a view."""
 
 
 class WorkerDiedError(BlenderError):
-    """A process ended by itself, or was killed."""
+    """A process exited, or was killed."""
 
 
 class Worker:
     """One process of Blender.
 
     Attributes:
-      log: file that it prints to.
+      log: path of its log file.
     """
 
     def __init__(self, command: list[str], *, scratch: Path, name: str, threads: int) -> None:
         """Starts the process.
 
         Args:
-          command: that starts it.
+          command: command that starts the process.
           scratch: existing folder for its files.
-          name: of the process, unique in the folder.
-          threads: that it renders with.
+          name: name of the process, unique in the folder.
+          threads: number of render threads.
         """
         self.log = scratch / f"{name}.log"
         self._files = tuple(scratch / f"{name}_{kind}.exr" for kind in ("colour", "geometry"))
         with self.log.open("a", encoding="utf-8") as log:
-            # Ctrl-C goes to a whole session: there, only this process is to decide what it means.
+            # Ctrl-C reaches all processes of a session: only this one decides how to react.
             self._process = subprocess.Popen(
                 [*command, f"--threads={threads}"],
                 stdin=subprocess.PIPE,
@@ -89,7 +90,7 @@ class Worker:
         """Waits until the process is ready.
 
         Raises:
-          BlenderError: if it does not start, or is another version.
+          BlenderError: if it does not start, or has another version.
         """
         try:
             version = self._receive()["blender"]
@@ -121,26 +122,26 @@ class Worker:
         answer = self._receive()
         if "error" in answer:
             raise BlenderError(
-                f"Blender can not render {task.name} ({answer['error']}). See {self.log}."
+                f"Blender cannot render {task.name} ({answer['error']}). See {self.log}."
             )
         task.finish(colour, geometry)
         for path in self._files:
             path.unlink()
 
     def kill(self) -> None:
-        """Ends the process at once."""
+        """Kills the process."""
         self._process.kill()
         self._process.wait()
 
     def _receive(self) -> dict[str, str]:
         line = self._process.stdout.readline()
-        # What is cut off was said by a process that was killed meanwhile.
+        # An incomplete line is from a process that was killed meanwhile.
         if not line.endswith("\n"):
             raise WorkerDiedError(self._end())
         return json.loads(line)
 
     def _end(self) -> str:
-        """Returns how the process ended, in words."""
+        """Returns the cause of the process's end, in words."""
         status = self._process.wait()
         how = f"killed by {signal.Signals(-status).name}" if status < 0 else f"status {status}"
         lines = self.log.read_text(encoding="utf-8", errors="replace").split("\n")

@@ -1,8 +1,8 @@
-"""Density and colours of a trained run: sampled on a grid, as a surface or points, written as PLY.
+"""Exports density and colours of a trained run: sampled on a grid, as a surface or points, as PLY.
 
-A surface of the density is where it crosses a level. It is looked for in the logarithm, since
-densities grow by factors, and stays open at the borders of the grid. Inside the objects there is no
-density where the model samples nothing there: what the field holds there was never learned.
+A surface is the level set of the density. It is computed on the logarithm, since densities grow by
+factors, and stays open at the borders of the grid. Inside objects that the model does not sample
+the density is 0: the field was never trained there.
 """
 
 import functools
@@ -30,26 +30,26 @@ from refref_jax.render.field_points import look_up
 from refref_jax.render.first_surface import find_first_surface
 
 CHUNK = 1 << 15
-"""Points looked up at once."""
+"""Number of points per query."""
 
-# A direction that lies in no face or edge of a made body.
+# A direction that lies in no face or edge of a synthetic object.
 _ASKEW = np.array([0.48, 0.6, 0.64], np.float32)
 
-# A density this many factors of e from the level is as good as none, or as opaque as any.
+# Densities this many factors of e below or above the level are clamped.
 _RANGE = 3.0
 
 # Marching cubes keeps values a tenth of a cell off zero, as if they were distances. A density falls
-# by a factor of e in several cells: made steeper, its surface is moved less by that.
+# by a factor of e over several cells: steeper values reduce the displacement of its surface.
 _STEEPNESS = 4.0
 
 
 class DensitySurface(NamedTuple):
-    """Where the density crosses a level.
+    """Level set of the density.
 
     Attributes:
-      vertices: world units.
-      faces: counter-clockwise seen from where the density is lower.
-      normals: of the vertices, unit, towards lower density.
+      vertices: positions, world units.
+      faces: vertex indices, counter-clockwise seen from the side of lower density.
+      normals: unit normals of the vertices, towards lower density.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
@@ -58,11 +58,11 @@ class DensitySurface(NamedTuple):
 
 
 class SurfacePoints(NamedTuple):
-    """Points of a grid on the near side of what is dense.
+    """Grid points on the outside of dense regions.
 
     Attributes:
-      points: world units.
-      normals: unit, towards lower density.
+      points: positions, world units.
+      normals: unit normals, towards lower density.
     """
 
     points: Float[np.ndarray, "points 3"]
@@ -81,13 +81,13 @@ def sample_density(
 
     Args:
       model: the trained model.
-      low: the box's least corner, world units.
-      high: its greatest corner.
-      resolution: cells along its longest edge.
-      step: is called after each slice, with the number of those done and of all.
+      low: least corner of the box, world units.
+      high: greatest corner of the box.
+      resolution: number of cells along its longest edge.
+      step: callback after each slice, with the number of completed slices and of all.
 
     Returns:
-      Density per world unit at the grid's points, 0 inside bodies that are not sampled.
+      Density per world unit at the grid's points, 0 inside objects that are not sampled.
     """
     spacing = float((high - low).max()) / resolution
     counts = np.maximum(np.rint((high - low) / spacing), 1).astype(np.int64) + 1
@@ -112,13 +112,13 @@ def look_up_points(
     *,
     width: float,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Returns density per world unit, and sRGB colour as it is seen along unit directions.
+    """Returns density per world unit, and sRGB colour along unit view directions.
 
     Args:
       model: the trained model.
-      points: world units.
-      directions: of view; `None` where colours do not matter.
-      width: edge of the cell that a point stands for, world units.
+      points: positions, world units.
+      directions: unit view directions; `None` if colours are not needed.
+      width: edge of the cell around each point, world units.
     """
     if directions is None:
         directions = np.tile(_ASKEW, (len(points), 1))
@@ -126,7 +126,7 @@ def look_up_points(
     for start in range(0, len(points), CHUNK):
         part = slice(start, start + CHUNK)
         count = len(points[part])
-        # Filled up, so that nothing is compiled twice.
+        # Padded, to avoid a second compilation.
         filled = [
             np.pad(each[part].astype(np.float32), ((0, CHUNK - count), (0, 0)), mode="edge")
             for each in (points, directions)
@@ -147,13 +147,13 @@ def _chunk(params, points, directions, config, width):
 def inside_bodies(
     geometry: Scene, axes: Sequence[Float[np.ndarray, " ticks"]]
 ) -> Bool[np.ndarray, "nx ny nz"]:
-    """Returns which points of a grid lie inside any part of the geometry.
+    """Returns the mask of grid points inside any part of the scene.
 
-    From within a closed surface every ray first meets its inner side. Three rays are cast for each
+    From inside a closed surface every ray first hits its back side. Three rays are cast for each
     point of a part's box, and the majority counts: at a grazing hit a shading normal may mislead.
 
     Args:
-      geometry: the bodies.
+      geometry: scene with the objects.
       axes: coordinates of the grid along x, y and z, ascending.
     """
     inside = np.zeros([len(axis) for axis in axes], bool)
@@ -194,10 +194,10 @@ def _meets_inner_side(
 
 
 def with_walls(density: Grid, *, level: float) -> Grid:
-    """Returns the density with a surface in the border of the grid.
+    """Returns the density with a surface at the border of the grid.
 
-    For the cube of a bounded model: whatever light reaches its faces is seen there, as if they were
-    opaque, and a field that knows walls on them has no need of a density.
+    This is the background cube of a bounded model: light that reaches its faces ends there, as if
+    they were opaque, and a field with colours on the cube needs no density there.
     """
     values = np.full_like(density.values, level)
     within = (slice(1, -1),) * 3
@@ -209,9 +209,9 @@ def with_sphere(density: Grid, *, level: float, radius: float) -> Grid:
     """Returns the density with a surface on a sphere around the origin, as `with_walls` has it.
 
     Args:
-      density: per world unit.
-      level: of the surface.
-      radius: of the sphere, on which a spherical model ends, world units.
+      density: density per world unit.
+      level: level of the surface.
+      radius: radius of the sphere that bounds a spherical model, world units.
     """
     axes = [
         low + density.spacing * np.arange(count)
@@ -219,16 +219,16 @@ def with_sphere(density: Grid, *, level: float, radius: float) -> Grid:
     ]
     squares = [np.square(axis) for axis in np.meshgrid(*axes, indexing="ij", sparse=True)]
     beyond = (np.sqrt(sum(squares)) - radius) / density.spacing
-    # In the logarithm, in which surfaces are looked for, the distance to the sphere.
+    # The distance to the sphere, in the units of the logarithm.
     walls = level * np.exp(np.clip(beyond, -2.0 * _RANGE, 2.0 * _RANGE))
     return density._replace(values=np.maximum(walls, density.values).astype(density.values.dtype))
 
 
 def find_surface(density: Grid, *, level: float) -> DensitySurface:
-    """Returns the surface on which the density has a level, both per world unit.
+    """Returns the level set of the density; density and level are per world unit.
 
     Raises:
-      ValueError: if it has that level nowhere, or scikit-image is not installed.
+      ValueError: if the density never has that level, or scikit-image is not installed.
     """
     thinness = _thinness(density, level)
     vertices, faces = isosurface.march(thinness, density.spacing)
@@ -237,7 +237,7 @@ def find_surface(density: Grid, *, level: float) -> DensitySurface:
 
 
 def find_points(density: Grid, *, level: float) -> SurfacePoints:
-    """Returns the grid's points that have at least a level, and a neighbour with less.
+    """Returns the grid points at or above a level that have a neighbour below it.
 
     Raises:
       ValueError: if there is none.
@@ -256,7 +256,7 @@ def find_points(density: Grid, *, level: float) -> SurfacePoints:
 
 
 def write_surface(path: Path, surface: DensitySurface, colours: UInt8[np.ndarray, "n 3"]) -> None:
-    """Writes a surface as PLY, with a normal and an sRGB colour a vertex."""
+    """Writes a surface as PLY, with a normal and an sRGB colour per vertex."""
     mesh = trimesh.Trimesh(
         surface.vertices,
         surface.faces,
@@ -287,14 +287,14 @@ def write_points(path: Path, points: SurfacePoints, colours: UInt8[np.ndarray, "
 
 
 def _thinness(density: Grid, level: float) -> np.ndarray:
-    """Returns how far the density is below a level, as a steep kind of distance."""
+    """Returns the signed distance of the density below a level, on the steepened logarithm."""
     ratio = np.maximum(density.values.astype(np.float64), np.exp(-_RANGE) * level) / level
     found = -np.minimum(np.log(ratio), _RANGE) * _STEEPNESS * density.spacing
     if not (found.min() <= 0.0 < found.max()):
         raise ValueError(
             f"The density is {'at least' if found.max() <= 0.0 else 'below'} {level:g} per world "
             f"unit in the whole box (least {density.values.min():.3g}, most "
-            f"{density.values.max():.3g}). Give a --level in between, or another --box: what is "
-            "far in an unbounded scene lies beyond it."
+            f"{density.values.max():.3g}). Give a --level in between, or a larger --box for "
+            "distant parts of an unbounded scene."
         )
     return found

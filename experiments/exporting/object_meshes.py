@@ -1,6 +1,6 @@
-"""Writes the bodies that bend light as PLY, with the normals that bend it.
+"""Writes the refractive objects as PLY, with their shading normals.
 
-A run keeps them itself, in single precision; a reconstruction keeps its surface as a file.
+A run stores its meshes in single precision; a reconstruction stores its surface as a file.
 """
 
 from pathlib import Path
@@ -17,19 +17,19 @@ from refref_jax.render.saved import load_geometry
 
 
 def write(run: Path, out: Path, *, overwrite: bool) -> list[Path]:
-    """Writes all bodies of a run, or of a reconstruction; each has a file of its own.
+    """Writes all objects of a run or a reconstruction, one file each.
 
     Args:
-      run: the folder.
-      out: of one body, its file; of several, their names are numbered: `out_0.ply`, `out_1.ply`.
-      overwrite: whether files may be replaced.
+      run: folder of the run or reconstruction.
+      out: file of the mesh; several meshes are numbered: `out_0.ply`, `out_1.ply`.
+      overwrite: whether existing files may be replaced.
 
     Returns:
       The files.
 
     Raises:
-      ValueError: if it is no folder of a run, if there is no body, or a file may not be
-        replaced.
+      ValueError: if it is not the folder of a run, if there is no object, or if a file may not be
+      replaced.
     """
     if records.exists(run):
         found = [object_source.read_mesh(run, _finished(run))]
@@ -37,7 +37,7 @@ def write(run: Path, out: Path, *, overwrite: bool) -> list[Path]:
         found = read_meshes(load_geometry(run))
     if not found:
         raise ValueError(
-            f"{run} has no body: it was trained along straight paths, or without meshes. Export "
+            f"{run} has no object: it was trained along straight rays, or without meshes. Export "
             "--what=mesh, or another run."
         )
     paths = [out]
@@ -52,7 +52,7 @@ def write(run: Path, out: Path, *, overwrite: bool) -> list[Path]:
 
 
 def read_meshes(geometry: Scene) -> list[Mesh]:
-    """Returns the parts of a run's geometry in their order; vertices at one place are one."""
+    """Returns the parts of a run's scene in their order; coincident vertices are merged."""
     found = []
     for surfaces, triangles in split_parts(geometry):
         normals = surfaces.normals[: len(triangles)].astype(np.float64)
@@ -67,6 +67,6 @@ def _finished(run: Path) -> records.Reconstruction:
     if found.geometry is None or found.index is None:
         raise ValueError(
             f"The reconstruction in {run} is not finished. Run `python -m experiments.reconstruct` "
-            "with the same options again: it goes on where it was stopped."
+            "with the same options again: it resumes where it was stopped."
         )
     return found

@@ -1,4 +1,4 @@
-"""Pictures for people, drawn with matplotlib."""
+"""Comparison figures, drawn with matplotlib."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from matplotlib import pyplot
 _COLOUR_MAP = "turbo"
 
 ERROR_GAIN = 4.0
-"""By how much errors of colours are amplified to be seen."""
+"""Amplification of colour errors."""
 
 _INCHES = 2.4
 _INCHES_OF_THE_SCALE = 1.1
@@ -24,7 +24,7 @@ class Comparison(NamedTuple):
     """One view, true and rendered.
 
     Attributes:
-      name: of the view.
+      name: name of the view.
       target: true sRGB in `[0, 1]`.
       rgb: rendered sRGB in `[0, 1]`.
       distance: rendered distance, world units; `None` for all views, or for none.
@@ -37,7 +37,7 @@ class Comparison(NamedTuple):
 
 
 def write_comparison(path: Path, views: Sequence[Comparison]) -> None:
-    """Draws views as rows: ground truth, render, error, and distance if there is one.
+    """Draws views as rows: ground truth, render, error, and distance if available.
 
     Distances share one scale, from 0 to the largest finite one.
     """
@@ -86,8 +86,8 @@ def colour_distances(
     """Colours distance maps on one scale from 0; misses are white.
 
     Args:
-      distances: the maps, world units.
-      farthest: end of the scale, beyond which its last colour stays; the largest finite distance
+      distances: distance maps, world units.
+      farthest: end of the scale, beyond which its last colour is used; the largest finite distance
         if not given.
     """
     if farthest is None:

@@ -1,7 +1,7 @@
-"""Bodies and light in a horizontal plane through the origin, to be drawn from above.
+"""Cross-sections of objects and light paths in a horizontal plane through the origin.
 
-A ray in the plane z = 0 stays there around a body that the plane cuts in half, as a ball, so a
-drawing of it is no projection. Around others a drawing shows the paths from above.
+A ray in the plane z = 0 stays there around an object that is symmetric about the plane, such as a
+ball, so its drawing is exact. For other objects a drawing is a projection of the paths from above.
 """
 
 from collections.abc import Sequence
@@ -18,10 +18,10 @@ from refref_jax.render.pixel_paths import PixelPaths
 
 Outline = Float[np.ndarray, "points 2"]
 
-# A little beside z = 0, where meshes like to have their vertices.
+# Slightly off z = 0, where meshes often have vertices.
 _HEIGHT = 1e-3
 
-# Decimals of a coordinate by which ends of segments are told to be the same.
+# Decimals to which the coordinates of segments' ends are compared.
 _DECIMALS = 6
 
 
@@ -29,8 +29,8 @@ class Line(NamedTuple):
     """One light path from above.
 
     Attributes:
-      points: its polyline, the last of them at the edge of the picture.
-      share: of the pixel's light, mean over RGB.
+      points: vertices of the polyline; the last one is at the edge of the figure.
+      share: share of the pixel's light, mean over RGB.
     """
 
     points: Float[np.ndarray, "points 2"]
@@ -38,11 +38,11 @@ class Line(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """One picture of light paths.
+    """One figure of light paths.
 
     Attributes:
-      title: above it.
-      paths: of each ray.
+      title: title above the figure.
+      paths: paths of each ray.
     """
 
     title: str
@@ -52,11 +52,11 @@ class Panel(NamedTuple):
 def outlines_of(parts: Sequence[MeshPart]) -> list[Outline]:
     """Returns the outlines of all parts in the plane, world units.
 
-    Those of a closed mesh go round, their last point beside the first; that of an open one goes
-    from one end to the other.
+    The outline of a closed mesh is closed, its last point next to the first; that of an open one
+    goes from one end to the other.
 
     Raises:
-      SceneError: if the plane meets none of them.
+      SceneError: if the plane intersects no part.
     """
     found = [outline for part in parts for outline in _outlines(part.vertices, part.faces)]
     if not found:
@@ -68,7 +68,7 @@ def outlines_of(parts: Sequence[MeshPart]) -> list[Outline]:
 
 
 def width_of(outlines: Sequence[Outline]) -> float:
-    """Returns how far outlines reach to the sides of the x axis, world units."""
+    """Returns the largest distance of outlines from the x axis, world units."""
     return max(float(np.max(np.abs(outline[:, 1]))) for outline in outlines)
 
 
@@ -76,8 +76,8 @@ def rays_towards(distance: float, heights: Sequence[float]) -> list[Rays]:
     """Returns rays in the plane, from a camera on the negative x axis.
 
     Args:
-      distance: of the camera from the origin, world units.
-      heights: where each ray crosses the y axis, or would without objects.
+      distance: distance of the camera from the origin, world units.
+      heights: height at which each ray crosses the y axis, or would without objects.
     """
     origin = np.array([-distance, 0.0, 0.0], np.float32)
     targets = np.array([[0.0, height, 0.0] for height in heights], np.float32)
@@ -87,7 +87,7 @@ def rays_towards(distance: float, heights: Sequence[float]) -> list[Rays]:
 
 
 def lines_within(paths: PixelPaths, half: float) -> list[Line]:
-    """Returns paths from above, cut where they last leave the square of half edge `half`."""
+    """Returns paths from above, cut at their last exit from the square of half edge `half`."""
     shares = paths.weights.mean(axis=-1)
     return [
         Line(_cut(line[:, :2].astype(float), half), float(share))

@@ -1,4 +1,4 @@
-"""The figures of docs/glass.md, of scenes with known walls: what they show, and how it is drawn."""
+"""Draws the figures of docs/glass.md, of scenes with a known background."""
 
 import dataclasses
 import functools
@@ -29,21 +29,21 @@ from refref_jax.render.pixel_paths import PixelPaths, trace_pixel
 from refref_jax.sampling import domains
 from refref_jax.sampling.domains import Domain
 
-_NAMES = {"straight": "straight light", "paper": "the paper's paths", "tree": "the path tree"}
+_NAMES = {"straight": "straight rays", "paper": "the paper's paths", "tree": "the path tree"}
 
 _CAMERA = 4.0
-"""Distance of the camera that is drawn from the origin, as in the data set; world units."""
+"""Distance of the drawn camera from the origin, as in the data set; world units."""
 
 _RAYS_OF_A_FAN = 15
 
-# Where the one ray of a tree is aimed, as a share of the body's width: near the rim, where
+# Target of the single ray of a tree, as a share of the object's width: near the rim, where
 # reflections carry some of the light.
 _AIM = 0.9
 
-# Share of the light below which a branch of the finer tree is not followed: the scale's end.
+# Throughput threshold of the finer tree: the end of the colour scale.
 _FINER = 1e-3
 
-# Beyond any wall: last segments are cut where the picture ends.
+# Beyond the background: last segments are cut at the edge of the figure.
 _FAR = 100.0
 
 _DPI = 150
@@ -57,12 +57,12 @@ _DISTANCES = "viridis"
 
 
 class Shown(NamedTuple):
-    """One picture of a row.
+    """One image of a row.
 
     Attributes:
-      title: above it.
+      title: title above the image.
       rgb: sRGB in `[0, 1]`.
-      psnr: inside the mask against the first picture of the row, dB; `None` for that one.
+      psnr: masked PSNR relative to the first image of the row, dB; `None` for that one.
     """
 
     title: str
@@ -71,11 +71,11 @@ class Shown(NamedTuple):
 
 
 def draw_views(scene: KnownScene, path: Path, *, side: int) -> None:
-    """Draws the true image, and what three kinds of light paths make of it.
+    """Draws the true image, and renderings with three kinds of light paths.
 
     Args:
-      scene: with one view.
-      path: of the picture.
+      scene: scene with one view.
+      path: output file.
       side: camera rays along each edge of a pixel.
     """
     shown = [_truth(scene)]
@@ -89,35 +89,35 @@ def draw_fan(scene: KnownScene, folder: Path, half: float, path: Path) -> None:
     """Draws a fan of camera rays, straight and bent.
 
     Args:
-      scene: what bends them.
-      folder: of the scene, whose meshes are cut.
-      half: half the edge of the walls' cube, world units.
-      path: of the picture.
+      scene: refractive scene.
+      folder: folder of the scene; its meshes are cut.
+      half: half the edge of the background cube, world units.
+      path: output file.
     """
     outlines = cross_sections.outlines_of(meshes.read_meshes(folder))
     reach = 1.2 * cross_sections.width_of(outlines)
     rays = cross_sections.rays_towards(_CAMERA, list(np.linspace(-reach, reach, _RAYS_OF_A_FAN)))
     titles = {
-        "straight": "what a NeRF assumes: light goes straight",
-        "paper_no_reflection": "what light does: neighbours part, left and right swap",
+        "straight": "the model of NeRF: straight rays",
+        "paper_no_reflection": "actual light: neighbours separate, left and right swap",
     }
     panels = [Panel(title, _follow(scene, rays, BUDGETS[name])) for name, title in titles.items()]
     write_fan(path, panels, outlines, half)
 
 
 def draw_tree(scene: KnownScene, folder: Path, path: Path) -> None:
-    """Draws the light paths of one ray under three budgets, and under a finer one.
+    """Draws the light paths of one ray under three presets, and under a finer one.
 
     Args:
-      scene: what bends it.
-      folder: of the scene, whose meshes are cut.
-      path: of the picture.
+      scene: refractive scene.
+      folder: folder of the scene; its meshes are cut.
+      path: output file.
     """
     outlines = cross_sections.outlines_of(meshes.read_meshes(folder))
     rays = cross_sections.rays_towards(_CAMERA, [_AIM * cross_sections.width_of(outlines)])
     budgets = {title: BUDGETS[name] for name, title in _NAMES.items()}
     finer = dataclasses.replace(BUDGETS["tree"], cut=_FINER)
-    budgets[f"the tree, cut at {100.0 * _FINER:g} %"] = finer
+    budgets[f"the tree, threshold {100.0 * _FINER:g} %"] = finer
     panels = [Panel(title, _follow(scene, rays, budget)) for title, budget in budgets.items()]
     write_tree(path, panels, outlines)
 
@@ -128,12 +128,12 @@ def _follow(scene: KnownScene, rays: list[Rays], budget: Budget) -> list[PixelPa
 
 
 def draw_distances(scene: KnownScene, half: float, path: Path) -> None:
-    """Draws three distances of a pixel: to the glass, the wall behind, and the wall it shows.
+    """Draws three distances of a pixel: glass, background behind it, and visible background.
 
     Args:
-      scene: with one view.
-      half: half the edge of the walls' cube, world units.
-      path: of the picture.
+      scene: scene with one view.
+      half: half the edge of the background cube, world units.
+      path: output file.
     """
     rays = cameras.image_rays(scene.frames.cameras, 0)
     first = find_first_surface(scene.geometry.surfaces, rays).distances
@@ -156,7 +156,7 @@ def draw_distances(scene: KnownScene, half: float, path: Path) -> None:
 def _walls(
     geometry: Scene, rays: Rays, half: float
 ) -> tuple[Float[Array, " rays"], Float[Array, " rays"]]:
-    """Returns how far light goes to the walls, straight on and refracted; arc length."""
+    """Returns the arc length of light to the background, straight and refracted."""
     leave = jax.vmap(functools.partial(domains.exit_distance, Domain(half, "bounded")))
     # Without reflections every ray has one path.
     ends = path_tracing.trace_ends(geometry, rays, budget=BUDGETS["paper_no_reflection"]).ends
@@ -186,8 +186,7 @@ def write_views(path: Path, views: Sequence[Shown]) -> None:
             below.text(
                 0.5,
                 0.5,
-                f"below each picture:\nwhat is wrong with it,\n{ERROR_GAIN:g} times as bright,\n"
-                "and PSNR on the glass",
+                f"below each image:\nits error,\namplified {ERROR_GAIN:g} times,\nand masked PSNR",
                 ha="center",
                 va="center",
                 fontsize=11,
@@ -203,7 +202,7 @@ def write_views(path: Path, views: Sequence[Shown]) -> None:
 def write_fan(
     path: Path, panels: Sequence[Panel], outlines: Sequence[Outline], half: float
 ) -> None:
-    """Draws many rays of a camera, each in a colour of its own, up to the walls of a room."""
+    """Draws many rays of a camera, each in its own colour, up to the background cube."""
     figure, axes = pyplot.subplots(
         1, len(panels), figsize=(4.6 * len(panels), 4.9), layout="constrained", squeeze=False
     )
@@ -220,7 +219,7 @@ def write_fan(
 
 
 def write_tree(path: Path, panels: Sequence[Panel], outlines: Sequence[Outline]) -> None:
-    """Draws the light paths of one ray, coloured and labelled by the light that they carry."""
+    """Draws the light paths of one ray, coloured and labelled by their share of the light."""
     half = 3.0 * max(float(np.max(np.abs(outline))) for outline in outlines)
     figure, axes = pyplot.subplots(
         1, len(panels), figsize=(3.3 * len(panels) + 0.8, 3.7), layout="constrained", squeeze=False
@@ -247,7 +246,7 @@ def write_tree(path: Path, panels: Sequence[Panel], outlines: Sequence[Outline])
 def write_distances(
     path: Path, truth: Shown, maps: Sequence[tuple[str, Float[np.ndarray, "h w"]]]
 ) -> None:
-    """Draws a picture beside maps of distances on one scale; what has none is white."""
+    """Draws an image next to distance maps on one scale; missing distances are white."""
     count = 1 + len(maps)
     figure, axes = pyplot.subplots(
         1, count, figsize=(2.75 * count + 0.6, 3.2), layout="constrained", squeeze=False
@@ -282,7 +281,7 @@ def _draw_body(axis: pyplot.Axes, outlines: Sequence[Outline], half: float) -> N
 
 
 def _label_shares(axis: pyplot.Axes, lines: Sequence[Line], half: float) -> None:
-    """Writes each path's share beside its end, a little inside of the frame."""
+    """Writes each path's share next to its end, slightly inside the frame."""
     for line in lines:
         end, before = line.points[-1], line.points[-2]
         back = (before - end) / np.linalg.norm(before - end)

@@ -1,4 +1,4 @@
-"""What all figures share: matplotlib without a screen, colours, and plain axes."""
+"""Shared style of all figures: matplotlib without a screen, colours, and plain axes."""
 
 import matplotlib
 
@@ -6,10 +6,10 @@ matplotlib.use("Agg")
 from matplotlib import pyplot, ticker
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe and Ito's colours, which all eyes tell apart."""
+"""Okabe and Ito's colours, distinguishable with colour vision deficiencies."""
 
 LABEL_HEIGHT = 13.0
-"""Of a label, in pixels of the screen."""
+"""Size of a label, in pixels of the screen."""
 
 
 def style(axis: pyplot.Axes) -> None:

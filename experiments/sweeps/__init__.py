@@ -1,1 +1,1 @@
-"""The trade of speed for accuracy: points of a sweep, their table, figures and advice."""
+"""The trade-off between speed and accuracy: sweeps, their tables, figures and recommendations."""

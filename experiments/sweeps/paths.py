@@ -21,8 +21,8 @@ _GREY = "#777777"
 _LABEL_WIDTH = 34.0
 
 _SWEEPS = {
-    "cut": "cut: smallest throughput followed",
-    "bends": "bends: most of a path",
+    "cut": "cut: throughput threshold",
+    "bends": "bends: max bends of a path",
 }
 _COSTS = {
     "casts_per_pixel": ("ray casts per pixel", 1.0),
@@ -31,12 +31,12 @@ _COSTS = {
 
 
 class Setting(NamedTuple):
-    """One light budget of a sweep.
+    """One setting of a sweep over path settings.
 
     Attributes:
-      sweep: what it varies, `cut` or `bends`; `budget` for a point alone.
-      name: how figures call it.
-      budget: which light is followed.
+      sweep: varied option, `cut` or `bends`; `budget` for a single preset.
+      name: label in figures.
+      budget: path settings.
     """
 
     sweep: str
@@ -45,21 +45,21 @@ class Setting(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """What one budget cost and gave on one scene: means over its views, one ray a pixel.
+    """Cost and quality of one setting on one scene: means over its views, one ray per pixel.
 
     Attributes:
-      scene: its name.
-      sweep: which option is varied: `cut`, `bends`, or `budget` for a point alone.
-      name: value of that option, or name of the budget.
-      cut: smallest throughput followed.
-      bends: most bends.
-      psnr: over the image, dB.
-      psnr_masked: inside the mask.
-      psnr_outside: outside the mask.
-      casts_per_pixel: closest-hit queries.
-      paths_per_pixel: light paths.
-      seconds_per_pixel: of rendering.
-      lost_energy: share of light that found no room.
+      scene: name of the scene.
+      sweep: varied option: `cut`, `bends`, or `budget` for a single preset.
+      name: value of that option, or name of the preset.
+      cut: throughput threshold.
+      bends: max bends.
+      psnr: PSNR over the image, dB.
+      psnr_masked: masked PSNR, dB.
+      psnr_outside: PSNR outside the mask, dB.
+      casts_per_pixel: closest-hit queries per pixel.
+      paths_per_pixel: light paths per pixel.
+      seconds_per_pixel: rendering time per pixel, seconds.
+      lost_energy: share of the throughput that was dropped because the path buffer was full.
     """
 
     scene: str
@@ -77,7 +77,7 @@ class Trial(NamedTuple):
 
 
 def measure_all(chosen: list[KnownScene], plan: list[Setting], side: int) -> Iterator[Trial]:
-    """Renders every scene with every budget; equal budgets are rendered once."""
+    """Renders every scene with every setting; equal path settings are rendered once."""
     for scene in chosen:
         known: dict[Budget, Trial] = {}
         for setting in plan:
@@ -87,7 +87,7 @@ def measure_all(chosen: list[KnownScene], plan: list[Setting], side: int) -> Ite
 
 
 def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
-    """Renders all views of a scene with one budget."""
+    """Renders all views of a scene with one setting."""
     known_scene.warm_up(scene, setting.budget)
     views, measured = [], []
     for i in range(len(scene.indices)):
@@ -112,7 +112,7 @@ def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
 
 
 def write_table(path: Path, trials: Sequence[Trial]) -> None:
-    """Writes a CSV, one row a trial."""
+    """Writes a CSV, one row per trial."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(Trial._fields)
@@ -120,14 +120,14 @@ def write_table(path: Path, trials: Sequence[Trial]) -> None:
 
 
 def write_figures(folder: Path, trials: Sequence[Trial]) -> list[Path]:
-    """Draws each sweep against casts and against time, one line a scene.
+    """Draws each sweep against casts and against time, one line per scene.
 
     Args:
-      folder: where to write.
-      trials: of all scenes.
+      folder: output folder.
+      trials: trials of all scenes.
 
     Returns:
-      The files, none of a sweep that was not made.
+      The files; none for a sweep without trials.
     """
     made = {trial.sweep for trial in trials}
     return [_write_sweep(folder, trials, sweep) for sweep in _SWEEPS if sweep in made]
@@ -146,7 +146,7 @@ def _write_sweep(folder: Path, trials: Sequence[Trial], sweep: str) -> Path:
         if cost == "seconds_per_pixel":
             label_plainly(axis.xaxis)
         style(axis)
-    axes[0].set_ylabel("PSNR inside the mask, dB")
+    axes[0].set_ylabel("masked PSNR, dB")
     fixed = _fixed(trials, sweep)
     figure.suptitle(f"{_SWEEPS[sweep]}, as labelled{fixed}", fontsize=12)
     figure.legend(
@@ -186,9 +186,9 @@ def _draw_scene(
 def _label_points(
     axis: pyplot.Axes, trials: Sequence[Trial], cost: str, scale: float, colours: dict[str, str]
 ) -> None:
-    """Labels points with the option's value, but none where another label is."""
+    """Labels points with the option's value, except where labels would overlap."""
     taken: list[tuple[float, float]] = []
-    # The ends of the lines first: what lies between them can be guessed.
+    # Ends of lines come first: intermediate values can be guessed.
     lines = [[trial for trial in trials if trial.scene == scene] for scene in colours]
     ends = [trial for line in lines for trial in (line[0], line[-1])]
     for trial in ends + [trial for line in lines for trial in line[1:-1]]:
@@ -210,7 +210,7 @@ def _label_points(
 
 
 def _fixed(trials: Sequence[Trial], sweep: str) -> str:
-    """Returns what all trials of a sweep have in common."""
+    """Returns the value that is constant over all trials of a sweep, as text."""
     other = "bends" if sweep == "cut" else "cut"
     values = {getattr(trial, other) for trial in trials if trial.sweep == sweep}
     return f"; {other} {values.pop():g}" if len(values) == 1 else ""

@@ -1,8 +1,8 @@
-"""The points of a sweep, as data: a base, and around it one option changed at a time.
+"""The points of a sweep: a base, and variants with one changed option each.
 
-A *knob* is an option of `experiments.train`, or `rays_per_pixel`, one of `experiments.evaluate`. A
-point is named after the knob and its value, as `cut=0.01`; commas become `+`, so that points can be
-listed.
+A *knob* is an option of `experiments.train`, or `rays_per_pixel`, an option of
+`experiments.evaluate`. A point is named after the option and its value, as in `cut=0.01`; commas
+become `+`, so that points can be listed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ from refref_jax.training.presets import PRESETS, Bounds
 BASE = "base"
 
 OF_EVALUATION = ("rays_per_pixel",)
-"""Knobs that training knows nothing of."""
+"""Options of the evaluation only."""
 
 _BASE_OPTIONS = {"paths": "tree"}
 
@@ -32,11 +32,11 @@ class Point(NamedTuple):
     """One training and one evaluation.
 
     Attributes:
-      name: `base`, or knob and value.
-      knob: the option that is changed; empty for the base.
-      value: of the knob; empty for the base.
+      name: `base`, or option and value.
+      knob: changed option; empty for the base.
+      value: value of that option; empty for the base.
       training: options of `experiments.train`, as `--name=value`, without scene and folder.
-      evaluation: options of `experiments.evaluate`.
+      evaluation: options of `experiments.evaluate`, likewise.
     """
 
     name: str
@@ -57,28 +57,30 @@ def sweep(
 ) -> list[Point]:
     """Returns the base and all points around it; a point that equals the base is left out.
 
-    Straight light has no cut, no bends and no inside, so that none of them is given beside it.
+    Straight rays have no throughput threshold, bends or interior, so these options are not combined
+    with them.
 
     Args:
-      preset: of the base.
-      seed: of all trainings.
-      steps: the base's first, then those of further trainings; by default the preset's own, and a
-        quarter, half and twice of them. One number alone leaves the steps as they are.
-      base: options of the base, over the preset's.
-      values: of a knob, in place of those of `default_values`; new knobs are added.
-      knobs: only these; all if `None`.
+      preset: preset of the base.
+      seed: seed of all trainings.
+      steps: number of steps of the base, then those of further trainings; by default the preset's
+        own, and a quarter, half and twice of them. A single number keeps the steps constant.
+      base: options of the base that override the preset.
+      values: values of an option, in place of those of `default_values`; new options are added.
+      knobs: names of the options to vary; all if `None`.
 
     Raises:
-      ValueError: if a preset or knob does not exist, or the base has options of its own.
+      ValueError: if a preset or option does not exist, or the base sets an option of the sweep
+      itself.
     """
     if preset not in PRESETS:
         raise ValueError(f"There is no preset {preset}. Choose from {', '.join(PRESETS)}.")
     if misplaced := [name for name in _NOT_OF_BASE if name in (base or {})]:
         raise ValueError(
-            f"--base={misplaced[0]}=... would be at odds with the points. Use --{misplaced[0]}."
+            f"--base={misplaced[0]}=... conflicts with the points. Use --{misplaced[0]}."
         )
     if (paths := (base or {}).get("paths", "tree")) not in BUDGETS:
-        raise ValueError(f"There are no --base=paths={paths}. Choose from {', '.join(BUDGETS)}.")
+        raise ValueError(f"--base=paths={paths} does not exist. Choose from {', '.join(BUDGETS)}.")
     usual = PRESETS[preset].schedule.steps
     first, *others = steps or (usual, usual // 4, usual // 2, 2 * usual)
     base = _BASE_OPTIONS | dict(base or {})
@@ -86,7 +88,7 @@ def sweep(
     field = base.get("field", registry.USUAL)
     if field not in registry.KINDS:
         raise ValueError(
-            f"There is no --base=field={field}. Choose from {', '.join(registry.KINDS)}."
+            f"--base=field={field} does not exist. Choose from {', '.join(registry.KINDS)}."
         )
     swept = (
         default_values(preset, field=field)
@@ -96,7 +98,7 @@ def sweep(
     if knobs is not None:
         if unknown := [knob for knob in knobs if knob not in swept]:
             raise ValueError(
-                f"There is no knob {unknown[0]}.{app.did_you_mean(unknown[0], swept)} "
+                f"There is no option {unknown[0]}.{app.did_you_mean(unknown[0], swept)} "
                 f"Choose from {', '.join(swept)}, or give its "
                 f"values with --values={unknown[0]}=A/B."
             )
@@ -114,11 +116,11 @@ def sweep(
 
 
 def own_values(preset: str, paths: str = "tree", *, field: str = registry.USUAL) -> dict[str, str]:
-    """Returns what the knobs are if no option changes them.
+    """Returns the options' values that apply by default.
 
     Args:
-      preset: a preset.
-      paths: name of a budget of paths.
+      preset: name of a preset.
+      paths: name of path settings.
       field: kind of the fields.
     """
     model = PRESETS[preset].model(_ANY_BOUNDS, "field", field=field)
@@ -141,9 +143,9 @@ def own_values(preset: str, paths: str = "tree", *, field: str = registry.USUAL)
 
 
 def default_values(preset: str, *, field: str = registry.USUAL) -> dict[str, tuple[str, ...]]:
-    """Returns what is tried of each knob, around a preset: a little less, and more.
+    """Returns the values of each option that a sweep tries: some below and some above the preset's.
 
-    Of interiors it is the paper's field; the base has what the scene needs.
+    For interiors this is the paper's field; the base has the interior that the scene requires.
     """
     own = own_values(preset, field=field)
     rounds = [int(count) for count in own["samples"].split(",")]
@@ -171,10 +173,10 @@ def default_values(preset: str, *, field: str = registry.USUAL) -> dict[str, tup
 
 
 def choose(points: Sequence[Point], names: Sequence[str]) -> list[Point]:
-    """Returns the points of these names, and the base, with which they are compared.
+    """Returns the points with these names, and the base, for comparison.
 
     Raises:
-      ValueError: if there is no such point.
+      ValueError: if a point does not exist.
     """
     known = [point.name for point in points]
     if unknown := [name for name in names if name not in known]:
@@ -184,32 +186,34 @@ def choose(points: Sequence[Point], names: Sequence[str]) -> list[Point]:
 
 
 def parse_base(words: Sequence[str]) -> dict[str, str]:
-    """Returns the options that words as `cut=0.05` or `samples=48,32` give.
+    """Returns the options given by words such as `cut=0.05` or `samples=48,32`.
 
     Raises:
-      ValueError: if one is not of that form.
+      ValueError: if a word does not have that form.
     """
     options = {}
     for word in words:
         name, equals, value = word.partition("=")
         if not (name and equals and value):
-            raise ValueError(f"--base={word} is not NAME=VALUE. Write as in --base=cut=0.05.")
+            raise ValueError(f"--base={word} is not NAME=VALUE. Write for example --base=cut=0.05.")
         options[name] = value
     return options
 
 
 def parse_values(words: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Returns the values of knobs that words as `cut=0.1/0.05` or `samples=16,10/48,32` give.
+    """Returns the values of options from words such as `cut=0.1/0.05` or `samples=16,10/48,32`.
 
     Raises:
-      ValueError: if one is not of that form.
+      ValueError: if a word does not have that form.
     """
     values = {}
     for word in words:
         name, equals, given = word.partition("=")
         values[name] = tuple(value for value in given.split("/") if value)
         if not (name and equals and values[name]):
-            raise ValueError(f"--values={word} is not NAME=A/B. Write as in --values=cut=0.1/0.05.")
+            raise ValueError(
+                f"--values={word} is not NAME=A/B. Write for example --values=cut=0.1/0.05."
+            )
     return values
 
 
@@ -228,7 +232,7 @@ def _point(base: Mapping[str, str], knob: str, value: str) -> Point:
 
 
 def _same(value: str, other: str | None) -> bool:
-    """Returns whether two values are the same words, or the same numbers."""
+    """Returns whether two values are equal as text or as numbers."""
     try:
         return other is not None and [*map(float, value.split(","))] == [
             *map(float, other.split(","))

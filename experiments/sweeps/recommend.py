@@ -1,8 +1,8 @@
-"""Chooses what to train with in the time that there is, from a measured table; see `recommend`.
+"""Recommends training options for a time limit from a measured table; see `recommend`.
 
-`combine` guesses what several turns give together, by what each gave alone: gains in dB are added,
-and times of a step and of an image multiplied. Options are taken for independent, which they are
-only roughly: two that mend the same error share its gain.
+`combine` predicts the effect of several changes from their single effects: gains in dB are added,
+and times per step and per image are multiplied. This treats options as independent, which is only
+roughly true: two changes that fix the same error share its gain.
 """
 
 import dataclasses
@@ -20,18 +20,18 @@ from experiments.sweeps.points import BASE, OF_EVALUATION
 from experiments.sweeps.table import NOISE, Row
 from refref_jax.data import scene_names
 
-# Times that differ by no more are the same.
+# Times within this ratio count as equal.
 _SAME_TIME = 1.0 + table.TIME_NOISE / 100.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Machine:
-    """How this machine compares with that of a table.
+    """Speed of this machine relative to that of a table.
 
     Attributes:
       ratio: time of a step here over that in the table.
-      startup: seconds that a command takes beside its steps: starting, compiling, saving.
-      images: that an evaluation renders.
+      startup: seconds that a command takes in addition to its steps: starting, compiling, saving.
+      images: number of images that an evaluation renders.
     """
 
     ratio: float
@@ -41,14 +41,15 @@ class Machine:
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """What to train with. Differences below `table.NOISE` decide nothing.
+    """Recommended points. Differences below `table.NOISE` are ignored.
 
     Attributes:
-      best: the cheapest of those that fit and that none beats; the base, if it is as good.
-      cheaper: the best that takes less time; `None` if there is none.
-      dearer: the cheapest that gives more, which does not fit; `None` if none was measured.
-      combined: what single turns are expected to give together, if that is more than the best;
-        it was not measured.
+      best: the cheapest point in the time limit with the highest PSNR, up to noise; the base, if it
+        is as good.
+      cheaper: the best point that takes less time; `None` if there is none.
+      dearer: the cheapest better point, over the time limit; `None` if none was measured.
+      combined: expected joint gain of the single changes, if it exceeds that of the best; it was
+        not measured.
     """
 
     best: Row
@@ -58,10 +59,10 @@ class Choice:
 
 
 def time_machine(scene: Path, base: Row, steps: int) -> Training:
-    """Trains the table's base point for a few steps, in a folder that is deleted again.
+    """Trains the table's base point for a few steps, in a temporary folder.
 
-    So few steps see no pixel twice, and keep no light paths: where the table's base does, a step is
-    taken to be up to a tenth slower here than it will be.
+    So few steps never repeat a pixel, and do not cache light paths: if the table's base does, the
+    time per step is overestimated by up to a tenth.
     """
     options = [word for word in base.training.split() if not word.startswith("--steps=")]
     with tempfile.TemporaryDirectory() as folder:
@@ -73,15 +74,15 @@ def time_machine(scene: Path, base: Row, steps: int) -> Training:
                 log_every=steps // 3,
             )
         except RunFailedError as error:
-            # The log goes with the folder.
+            # The log is deleted with the folder.
             raise ValueError(
                 f"Timing the table's base point ({' '.join(options)}) failed: {error}. Give a "
-                "table whose base this scene can be trained with."
+                "table with a base that can be trained on this scene."
             ) from error
 
 
 def compare(timing: Training, base: Row, images: int) -> Machine:
-    """Returns how this machine compares with the table's, by the same training on both."""
+    """Returns the speed of this machine relative to the table's, from the same training on both."""
     return Machine(
         ratio=timing.seconds_per_step / base.seconds_per_step,
         startup=timing.startup_seconds,
@@ -90,20 +91,20 @@ def compare(timing: Training, base: Row, images: int) -> Machine:
 
 
 def seconds_of(row: Row, machine: Machine) -> float:
-    """Returns the seconds that training and evaluating a point are expected to take here.
+    """Returns the expected seconds to train and evaluate a point on this machine.
 
-    Training and evaluation both start and compile, for as long as it took in the timing. Images
-    are taken to be of the size of the table's.
+    Training and evaluation each start and compile once, for as long as in the timing. Images are
+    assumed to have the size of the table's.
     """
     working = row.stepping + machine.images * row.seconds_per_image
     return machine.ratio * working + 2.0 * machine.startup
 
 
 def choose(rows: Sequence[Row], machine: Machine, seconds: float) -> Choice:
-    """Returns the point with the highest PSNR that fits, and its neighbours.
+    """Returns the point with the highest PSNR in the time limit, and its neighbours.
 
     Raises:
-      ValueError: if none fits.
+      ValueError: if no point fits the limit.
     """
 
     def cost(row: Row) -> float:
@@ -138,7 +139,7 @@ def told(choice: Choice, machine: Machine, scene: Path) -> list[str]:
     lines += [*_commands(choice.best, scene), ""]
     if choice.combined is not None:
         lines += [
-            f"Worth trying, by adding up single turns, not measured together: "
+            f"Predicted from single changes, not measured together: "
             f"{choice.combined.name}: {_expected(choice.combined, machine)}.",
             *_commands(choice.combined, scene),
             "",
@@ -151,7 +152,7 @@ def told(choice: Choice, machine: Machine, scene: Path) -> list[str]:
         lines.append("Cheaper: nothing was measured that takes less time.")
     if choice.dearer is None:
         lines.append(
-            "Dearer: the table has no single point that gives more. Longer trainings and larger "
+            "Dearer: the table has no better single point. Longer trainings and larger "
             "models were not measured: python -m experiments.trade_off can."
         )
     return lines
@@ -171,19 +172,18 @@ def _expected(row: Row, machine: Machine) -> str:
 
 
 def combine(rows: Sequence[Row], cost: Callable[[Row], float], most: float) -> Row:
-    """Returns the base with the turns that promise most in the time there is.
+    """Returns the base with the best predicted combination of changes within a time limit.
 
-    Turn after turn is added, always the one that gives most decibels for its time, at most one of
-    each knob; one that gives no more than noise is none.
+    Changes are added greedily by decibels per second, at most one of each option; those that gain
+    no more than noise are ignored.
 
     Args:
-      rows: a table, with the base.
-      cost: seconds that a row takes.
-      most: seconds that there are.
+      rows: rows of a table, with the base.
+      cost: function that returns the seconds that a row takes.
+      most: time limit, seconds.
 
     Returns:
-      A row that was not measured, or the base itself. It may take longer than there is time, if
-      the base does.
+      A predicted row, or the base itself. It may exceed the time limit if the base does.
     """
     base = table.base_of(rows)
     useful = [row for row in rows if row.quality > base.quality + NOISE and row.knob != "paths"]
@@ -202,7 +202,7 @@ def combine(rows: Sequence[Row], cost: Callable[[Row], float], most: float) -> R
 
 
 def _worth(together: Row, now: Row, cost: Callable[[Row], float]) -> float:
-    """Returns the decibels that a turn gives for a second."""
+    """Returns the decibels per second of a change."""
     gain, price = together.quality - now.quality, cost(together) - cost(now)
     return gain / price if price > 0.0 else math.inf
 

@@ -21,27 +21,27 @@ _COSTS: dict[str, Callable[[Row], float]] = {
 _FRONT = "#999999"
 _MARKERS = "osD^vP"
 
-# Decibels below the best beyond which a point stands at the figure's foot, with its number: it
-# would press all others together.
+# Points this many decibels below the best are drawn at the bottom, labelled with their PSNR: they
+# would compress the scale of all others.
 _DEPTH = 10.0
 
-# Of a letter of a label, in pixels of the figure.
+# Width of a letter of a label, in pixels of the figure.
 _LETTER_WIDTH = 6.5
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """Returns the text of a report on a sweep; its figure is expected beside it."""
+    """Returns the text of a report on a sweep; its figure must be in the same folder."""
     base = table.base_of(rows)
     found = table.turns(rows)
     parts = [
-        f"# The trade of speed for accuracy on {base.scene}",
+        f"# Trade-off between speed and accuracy on {base.scene}",
         f"Base: `{base.training}`{base.evaluation and f', evaluated with `{base.evaluation}`'}. "
         "Every other point changes one option of it, and is trained from the same seed. Errors are "
         f"means over {base.images} test images. Training is the time of all steps, compiling "
         "excluded; device memory is empty where there is no accelerator.",
         "![PSNR against time](trade_off.png)",
-        f"## What to turn first\n\n{_first_table(table.worth_turning(found))}",
-        f"## What saves time\n\n{_saving_table(table.worth_saving(found))}",
+        f"## Options to change first\n\n{_first_table(table.worth_turning(found))}",
+        f"## Options that save time\n\n{_saving_table(table.worth_saving(found))}",
         "## All points\n\nCheapest first; ● marks those that no other point beats in both training "
         f"time and PSNR. Differences below {NOISE:g} dB are noise.\n\n{_all_points(rows)}",
     ]
@@ -105,8 +105,8 @@ def write_figure(path: Path, rows: Sequence[Row]) -> None:
     """Draws the points of a sweep against both costs.
 
     Args:
-      path: of the picture.
-      rows: of one scene, with the base.
+      path: output file.
+      rows: rows of one scene, with the base.
     """
     knobs = list(dict.fromkeys(row.knob for row in rows))
     styles = {
@@ -118,7 +118,7 @@ def write_figure(path: Path, rows: Sequence[Row]) -> None:
     for axis, (label, cost) in zip(axes, _COSTS.items(), strict=True):
         _draw(axis, rows, label, cost, styles, foot)
     masked = all(row.psnr_masked is not None for row in rows)
-    axes[0].set_ylabel("PSNR inside the mask, dB" if masked else "PSNR, dB")
+    axes[0].set_ylabel("masked PSNR, dB" if masked else "PSNR, dB")
     figure.suptitle(f"{rows[0].scene}: one option changed at a time")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=7, frameon=False)
@@ -169,7 +169,7 @@ def _label_points(
     styles: dict[str, tuple[str, str]],
     foot: float,
 ) -> None:
-    """Names the points by their values, those of the front first; none where another name is."""
+    """Labels the points with their values, the Pareto front first; omits overlapping labels."""
     front = table.pareto(rows, cost)
     taken: list[tuple[float, float, float]] = []
     named_first = [table.base_of(rows), *front]

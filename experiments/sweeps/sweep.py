@@ -1,4 +1,4 @@
-"""Sweeps: points are measured one by one, and written as a table, a figure and a report."""
+"""Runs sweeps: measures points one by one, and writes a table, a figure and a report."""
 
 import dataclasses
 import hashlib
@@ -16,7 +16,7 @@ from refref_jax.data import scene_names
 Measure = Callable[[Point], Row]
 """Trains and evaluates a point, or raises `RunFailedError`."""
 
-# An evaluation measures more than the table shows.
+# An evaluation has more columns than the table.
 _COLUMNS = {field.name for field in dataclasses.fields(Row)}
 
 
@@ -26,16 +26,16 @@ def sweep(
     """Measures points, and writes table, figure and report after each.
 
     Args:
-      points: the base first.
-      out: folder to write to.
-      measure_: measures one point.
-      earlier: rows that stay in the table; see `earlier_rows`.
+      points: points to measure, the base first.
+      out: output folder.
+      measure_: function that measures one point.
+      earlier: existing rows of the table; see `earlier_rows`.
 
     Returns:
-      Why points failed, by name: they are left out, and the others go on.
+      Error messages of failed points, by name; the sweep continues without them.
 
     Raises:
-      ValueError: if the base point failed, with which all are compared.
+      ValueError: if the base point failed: all others are compared with it.
     """
     out.mkdir(parents=True, exist_ok=True)
     rows = {row.name: row for row in earlier}
@@ -47,7 +47,7 @@ def sweep(
             except RunFailedError as error:
                 if point.name == BASE:
                     raise ValueError(
-                        f"The base point failed: {error}. Mend that, or give another --base."
+                        f"The base point failed: {error}. Fix this error, or give another --base."
                     ) from error
                 failed[point.name] = str(error)
                 bar.show(done, f"{point.name} failed")
@@ -59,16 +59,16 @@ def sweep(
 
 
 def earlier_rows(out: Path, base: Point, scene: Path, *, images: int) -> list[Row]:
-    """Returns what sweeps around the same base have measured into a folder.
+    """Returns the rows that earlier sweeps around the same base have written to a folder.
 
     Args:
       out: folder of the sweeps.
       base: the base point.
       scene: folder of the scene.
-      images: that an evaluation renders.
+      images: number of images that an evaluation renders.
 
     Raises:
-      ValueError: if they were around another base, of another scene, or on other images.
+      ValueError: if they had another base, scene or number of images.
     """
     path = out / "trade_off.csv"
     if not path.exists():
@@ -77,7 +77,7 @@ def earlier_rows(out: Path, base: Point, scene: Path, *, images: int) -> list[Ro
     found, new = table.base_of(rows), (" ".join(base.training), " ".join(base.evaluation))
     if (found.scene, found.training, found.evaluation) != (scene_names.of_folder(scene), *new):
         raise ValueError(
-            f"{path} is of {found.scene}, around {found.training}. Give another --out."
+            f"{path} has another base: {found.scene}, {found.training}. Give another --out."
         )
     if not (out / "runs" / run_name(base, scene)).is_dir():
         raise ValueError(f"{path} is of another folder named {found.scene}. Give another --out.")
@@ -90,15 +90,15 @@ def earlier_rows(out: Path, base: Point, scene: Path, *, images: int) -> list[Ro
 
 
 def measure(point: Point, scene: Path, runs: Path, limit: Sequence[str] = ()) -> Row:
-    """Trains and evaluates a point, or reads what was measured before.
+    """Trains and evaluates a point, or reads its earlier measurement.
 
-    Points that differ in evaluation alone share a training.
+    Points that differ only in evaluation share a training.
 
     Args:
-      point: the point.
+      point: point to measure.
       scene: folder of the scene.
       runs: folder of the trainings.
-      limit: options that choose the images of the evaluation.
+      limit: options that select the images of the evaluation.
     """
     run = runs / run_name(point, scene)
     cost = measured_runs.train(run, scene=scene, options=point.training)
@@ -116,7 +116,7 @@ def measure(point: Point, scene: Path, runs: Path, limit: Sequence[str] = ()) ->
 
 
 def run_name(point: Point, scene: Path) -> str:
-    """Returns the name of a training's folder, another for each scene and set of options."""
+    """Returns the name of a training's folder, unique for each scene and set of options."""
     text = " ".join((str(scene.resolve()), *point.training))
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     shared = not point.knob or point.knob in OF_EVALUATION

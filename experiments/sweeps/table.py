@@ -1,4 +1,4 @@
-"""The measured trade of speed for accuracy: a table, what of it is worth having, and in words."""
+"""The measured trade-off between speed and accuracy: its table, Pareto front and summary."""
 
 import csv
 import dataclasses
@@ -11,23 +11,23 @@ from experiments.sweeps.points import BASE, OF_EVALUATION
 from refref_jax import atomic_files
 
 NOISE = 0.3
-"""Decibels by which trainings differ that differ in nothing that matters; see `BUILD_NOTES.md`."""
+"""Typical difference in decibels between equivalent trainings; see `BUILD_NOTES.md`."""
 
 TIME_NOISE = 3.0
-"""Percent of time that say nothing, on a machine that was left alone."""
+"""Differences of times below this percentage are noise, on an otherwise idle machine."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """A point that was measured; the fields without a note are those of `measured_runs`.
+    """A measured point; undocumented fields are those of `measured_runs`.
 
     Attributes:
-      scene: name of its folder.
-      name: of the point.
-      knob: the option that differs from the base; empty for the base.
-      value: of the knob.
-      training: options of `experiments.train`, with blanks between.
-      evaluation: options of `experiments.evaluate`.
+      scene: name of the scene's folder.
+      name: name of the point.
+      knob: option that differs from the base; empty for the base.
+      value: value of that option.
+      training: options of `experiments.train`, separated by blanks.
+      evaluation: options of `experiments.evaluate`, likewise.
     """
 
     scene: str
@@ -53,7 +53,7 @@ class Row:
 
     @property
     def quality(self) -> float:
-        """PSNR inside the mask in dB, or over the image where there are no masks."""
+        """Masked PSNR in dB, or PSNR of the image if there are no masks."""
         return self.psnr if self.psnr_masked is None else self.psnr_masked
 
     @property
@@ -63,13 +63,13 @@ class Row:
 
 
 class Turn(NamedTuple):
-    """What changing one knob brings.
+    """Effect of changing one option.
 
     Attributes:
       row: the changed point.
       gain: dB over the base.
-      percent: of time that it takes more than the base: of training, or, if the knob is one of
-        evaluation, of rendering.
+      percent: additional time relative to the base: training time or, for an option of evaluation,
+        rendering time.
     """
 
     row: Row
@@ -78,7 +78,7 @@ class Turn(NamedTuple):
 
 
 def write(path: Path, rows: Sequence[Row]) -> None:
-    """Writes a table as CSV, all or nothing; what is not known stays empty."""
+    """Writes a table as CSV, atomically; unknown values stay empty."""
     with (
         atomic_files.written_file(path) as draft,
         draft.open("w", newline="", encoding="utf-8") as file,
@@ -89,10 +89,10 @@ def write(path: Path, rows: Sequence[Row]) -> None:
 
 
 def read(path: Path) -> list[Row]:
-    """Reads a table that `write` wrote.
+    """Reads a table written by `write`.
 
     Raises:
-      ValueError: if there is none, or it is another.
+      ValueError: if the file does not exist, or is not such a table.
     """
     if not path.is_file():
         raise ValueError(
@@ -109,15 +109,17 @@ def read(path: Path) -> list[Row]:
         ]
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(
-            f"{path} is not a table of experiments.trade_off ({error!r}). Give one that is."
+            f"{path} is not a table of experiments.trade_off ({error!r}). Give another file."
         ) from error
     if not any(row.name == BASE for row in rows):
-        raise ValueError(f"{path} has no row of the base point. Let the sweep measure it.")
+        raise ValueError(
+            f"{path} has no row of the base point. Measure it with experiments.trade_off."
+        )
     return rows
 
 
 def pareto(rows: Sequence[Row], cost: Callable[[Row], float]) -> list[Row]:
-    """Returns the rows that no other row beats in cost and quality, cheapest first."""
+    """Returns the Pareto front of cost and quality, cheapest first."""
     front: list[Row] = []
     for row in sorted(rows, key=lambda row: (cost(row), -row.quality)):
         if not front or row.quality > front[-1].quality:
@@ -131,7 +133,7 @@ def base_of(rows: Sequence[Row]) -> Row:
 
 
 def turns(rows: Sequence[Row]) -> list[Turn]:
-    """Returns what each knob brings, measured against the base."""
+    """Returns the effect of each change, relative to the base."""
     base = base_of(rows)
     found = []
     for row in rows:
@@ -143,9 +145,9 @@ def turns(rows: Sequence[Row]) -> list[Turn]:
 
 
 def worth_turning(found: Sequence[Turn]) -> list[Turn]:
-    """Returns the best turn of each knob that gains more than noise, what to turn first leading.
+    """Returns the best change of each option that gains more than noise, most worthwhile first.
 
-    Those that take no more time come first, by gain; then by decibels for a percent of time.
+    Changes without additional time come first, by gain; then by decibels per percent of time.
     """
     gaining = [turn for turn in found if turn.gain > NOISE]
     return _best_of_each(
@@ -154,14 +156,14 @@ def worth_turning(found: Sequence[Turn]) -> list[Turn]:
 
 
 def is_free(turn: Turn) -> bool:
-    """Returns whether a turn takes no more time than two measurements of the same differ by."""
+    """Returns whether a change takes no additional time, to within the noise of timings."""
     return turn.percent <= TIME_NOISE
 
 
 def worth_saving(found: Sequence[Turn]) -> list[Turn]:
-    """Returns the best turn of each knob that saves time and gains nothing, cheapest leading.
+    """Returns the best change of each option that saves time and gains nothing, cheapest first.
 
-    Those that lose no more than noise come first, by time saved; then by percent for a decibel.
+    Changes that lose no more than noise come first, by time saved; then by percent per decibel.
     """
     saving = [turn for turn in found if turn.percent < -TIME_NOISE and turn.gain <= NOISE]
 
@@ -172,7 +174,7 @@ def worth_saving(found: Sequence[Turn]) -> list[Turn]:
 
 
 def _rate(gain: float, price: float) -> tuple[bool, float]:
-    """Returns what orders things by gain for a price; those that are free stand above all."""
+    """Returns a sort key by gain per price; free changes rank above all."""
     return (True, gain) if price <= 0.0 else (False, gain / price)
 
 

@@ -1,12 +1,12 @@
-"""Cameras of a browser and cameras of a scene, and how pictures of one shape fill any window.
+"""Conversion between browser and scene cameras, and cropping of images to any window.
 
-A browser's camera has a vertical field of view and the aspect of its window, and its axes are x
-right, y down, z forward; ours are those of `geometry.cameras`. Aspects are width over height.
+A browser's camera has a vertical field of view and the aspect of its window; its axes are x right,
+y down, z forward. Ours are those of `geometry.cameras`. Aspects are width over height.
 
-Pictures are of one aspect, 16:9, so that nothing is compiled for a window. The rule: *the picture
-covers the window, and what sticks out is cropped*, alike on both sides. In a window wider than the
-picture rows are left out at top and bottom, in a narrower one columns at left and right. A view of
-the scene's own is shown whole instead, with grey bars beside it.
+Images always have the aspect 16:9, so that nothing is compiled for a window. The rule: *the image
+covers the window, and the overhang is cropped*, equally on both sides. A wider window crops rows at
+top and bottom, a narrower one columns at left and right. Test views are instead shown in full, with
+grey bars at the sides.
 """
 
 import math
@@ -21,14 +21,14 @@ from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
 
 ASPECT = 16 / 9
-"""Aspect of all pictures before they are cropped."""
+"""Aspect of all images before cropping."""
 
 _GREY = 96
 
 ROUNDING = 1e-3
-"""What a browser may round a camera by, and less than any hand moves it by."""
+"""Tolerance for the rounding of cameras by browsers; smaller than any manual movement."""
 
-# Our axes are the browser's with y and z turned around.
+# Our axes are the browser's with y and z negated.
 _TURN = np.diag([1.0, -1.0, -1.0])
 
 
@@ -38,7 +38,7 @@ class Viewpoint(NamedTuple):
     Attributes:
       pose: camera to world, in the axes of `geometry.cameras`.
       fov: vertical field of view, radians.
-      aspect: of the window.
+      aspect: width of the window over its height.
     """
 
     pose: Float[np.ndarray, "3 4"]
@@ -49,32 +49,32 @@ class Viewpoint(NamedTuple):
 def from_browser(
     wxyz: Float[np.ndarray, "4"], position: Float[np.ndarray, "3"], fov: float, aspect: float
 ) -> Viewpoint:
-    """Returns the camera that a browser tells by a unit quaternion, scalar first."""
+    """Returns the camera of a browser from its unit quaternion, scalar first."""
     rotation = Rotation.from_quat(wxyz, scalar_first=True).as_matrix() @ _TURN
     return Viewpoint(np.concatenate([rotation, position[:, None]], axis=1), fov, aspect)
 
 
 def to_browser(pose: Float[np.ndarray, "3 4"]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a pose as the browser has it: unit quaternion, scalar first, and position."""
+    """Returns a pose in the browser's form: unit quaternion, scalar first, and position."""
     rotation = Rotation.from_matrix(pose[:, :3] @ _TURN)
     return rotation.as_quat(scalar_first=True), pose[:, 3]
 
 
 def width_of(height: int) -> int:
-    """Returns the width of a picture of that height, before it is cropped."""
+    """Returns the width of an uncropped image of that height."""
     return max(1, round(height * ASPECT))
 
 
 def window_rays(view: Viewpoint, height: int) -> Rays:
-    """Returns the rays of a picture as it is cropped to its window: the module has the rule.
+    """Returns the rays of an image after cropping to its window; see the rule of the module.
 
     Args:
       view: the window's camera.
-      height: of the whole picture, pixels.
+      height: rows of the uncropped image.
 
     Returns:
-      Rays `[rows, columns]`: `height` rows, or `width_of(height)` columns, and what is left of the
-      other. The shape's aspect is the window's but for two pixels.
+      Rays `[rows, columns]`: `height` rows or `width_of(height)` columns, and the cropped number of
+      the other. The aspect equals the window's to within two pixels.
     """
     width, half = width_of(height), math.tan(0.5 * view.fov)
     focal = min(0.5 * height / half, 0.5 * width / (view.aspect * half))
@@ -86,10 +86,10 @@ def window_rays(view: Viewpoint, height: int) -> Rays:
 
 
 def nearest(pose: Float[np.ndarray, "3 4"], views: Cameras) -> int:
-    """Returns which camera is most like a pose.
+    """Returns the index of the camera that is closest to a pose.
 
-    The difference is that of the positions, plus that of the directions they look in times the
-    distance of the candidate from the origin: what either moves an object there by.
+    The difference is that of the positions, plus that of the viewing directions times the distance
+    of the candidate from the origin: the displacement of an object there.
     """
     apart = np.linalg.norm(views.poses[:, :, 3] - pose[:, 3], axis=-1)
     turned = np.linalg.norm(views.poses[:, :, 2] - pose[:, 2], axis=-1)
@@ -97,17 +97,17 @@ def nearest(pose: Float[np.ndarray, "3 4"], views: Cameras) -> int:
 
 
 def is_same(a: Viewpoint, b: Viewpoint, *, within: float = ROUNDING) -> bool:
-    """Returns whether two cameras are one, but for so much in every number."""
+    """Returns whether two cameras agree to within a tolerance in every number."""
     numbers = [np.append(view.pose, [view.fov, view.aspect]) for view in (a, b)]
     return bool(np.allclose(*numbers, rtol=0.0, atol=within))
 
 
 def containing_fov(views: Cameras, aspect: float) -> float:
-    """Returns the vertical field of view with which a window shows all of a scene's view, radians.
+    """Returns the vertical field of view for a window to show a complete view of a scene, radians.
 
     Args:
-      views: cameras, of which only the intrinsics count.
-      aspect: of the window.
+      views: cameras; only their intrinsics are used.
+      aspect: width of the window over its height.
     """
     tallest = max(float(views.height), views.width / aspect)
     return 2.0 * math.atan(0.5 * tallest / views.focal)
@@ -116,7 +116,7 @@ def containing_fov(views: Cameras, aspect: float) -> float:
 def letterbox(
     picture: UInt8[np.ndarray, "h w 3"], aspect: float
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Returns a picture with grey bars, alike on both sides, that give it an aspect."""
+    """Returns an image with equal grey bars on both sides that give it an aspect."""
     height, width, _ = picture.shape
     across = max(0, round(0.5 * (height * aspect - width)))
     along = max(0, round(0.5 * (width / aspect - height)))
@@ -124,6 +124,6 @@ def letterbox(
 
 
 def _middle(whole: int, wanted: float) -> np.ndarray:
-    """Returns the numbers of the pixels in the middle of a row, about as many as are wanted."""
+    """Returns the indices of about as many pixels as requested, in the middle of a row."""
     margin = min(max(0, round(0.5 * (whole - wanted))), (whole - 1) // 2)
     return np.arange(margin, whole - margin)

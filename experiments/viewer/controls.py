@@ -1,4 +1,4 @@
-"""What a page shows besides the picture: its panel of controls, and its 3D scene.
+"""The page around the image: its panel of controls and its 3D scene.
 
 The scene holds the objects, the test cameras and the light paths of a pixel. Functions take a
 `viser` page's `gui` or `scene` and never import that package.
@@ -30,14 +30,14 @@ _COLOURS = matplotlib.colormaps["plasma"]
 _WEAKEST, _STRONGEST = 1e-3, 1.0
 
 THICKNESSES = (1.0, 2.0, 3.5, 5.5)
-"""Of lines, pixels, from weak to strong light: each stands for one share of the scale."""
+"""Line widths, pixels, from weak to strong light; each stands for one part of the scale."""
 
 _BODY_COLOURS = ((110, 190, 235), (240, 170, 90), (140, 210, 130), (220, 130, 190))
 _OPACITY = 0.15
 
 
 class Panel:
-    """The controls of one page, and what is chosen on them."""
+    """The controls of one page, and their values."""
 
     def __init__(
         self,
@@ -52,12 +52,12 @@ class Panel:
         """Adds the controls.
 
         Args:
-          gui: of the page.
-          subject: what is looked at.
-          changed: called after every choice that changes the picture.
-          show_bodies: shows or hides the bodies.
-          show_cameras: shows or hides the test cameras.
-          remove_paths: removes the light paths.
+          gui: GUI of the page.
+          subject: displayed run.
+          changed: callback after every choice that changes the image.
+          show_bodies: function that shows or hides the objects.
+          show_cameras: function that shows or hides the test cameras.
+          remove_paths: function that removes the light paths.
         """
         first = session.first_choice(subject)
         self._own = first.indices
@@ -84,8 +84,8 @@ class Panel:
             self._remove.visible = False
 
     def choice(self) -> Choice:
-        """Returns what is chosen."""
-        # A slider rounds to its step: what was not moved stays as it was trained.
+        """Returns the chosen settings."""
+        # A slider rounds to its step: unmoved ones keep the trained value.
         moved = [slider.value for slider in self._sliders]
         indices = [
             own if abs(own - new) <= _STEP else new
@@ -103,7 +103,7 @@ class Panel:
         self._status.content = text
 
     def show_table(self, table: str) -> None:
-        """Shows a table of light paths, and the bodies that they go through."""
+        """Shows a table of light paths, and the objects that they pass through."""
         self._paths.content = f"{table}\n\n{_HINT}"
         self._remove.visible = True
         self._bodies.value = True
@@ -136,11 +136,11 @@ class Scenery:
     """The nodes of one page's scene."""
 
     def __init__(self, scene: Any, surfaces: Surfaces, views: Cameras | None) -> None:
-        """Adds bodies and cameras, hidden.
+        """Adds objects and cameras, hidden.
 
         Args:
-          scene: of the page.
-          surfaces: the bodies; they may have no triangle.
+          scene: 3D scene of the page.
+          surfaces: the objects' surfaces; they may have no triangle.
           views: the test cameras.
         """
         self._scene = scene
@@ -162,7 +162,7 @@ class Scenery:
         self._paths: list[Any] = []
 
     def show_bodies(self, shown: bool) -> None:
-        """Shows or hides the bodies."""
+        """Shows or hides the objects."""
         for node in self._bodies:
             node.visible = shown
 
@@ -172,7 +172,7 @@ class Scenery:
             node.visible = shown
 
     def show_paths(self, pieces: Pieces) -> None:
-        """Draws a pixel's light paths in place of the last ones; strong light is thick."""
+        """Draws a pixel's light paths in place of the previous ones; strong light is thick."""
         self.remove_paths()
         strengths = np.minimum(
             (strength(pieces.shares) * len(THICKNESSES)).astype(int), len(THICKNESSES) - 1
@@ -211,18 +211,18 @@ class Scenery:
 
 
 def triangles_by_part(surfaces: Surfaces) -> dict[int, Float[np.ndarray, "faces 3 3"]]:
-    """Returns the triangles of each part that has any, without the slots that pad their tree."""
+    """Returns the triangles of each part that has any, without the padding of their tree."""
     corners = np.asarray(surfaces.bvh.triangles)[:-LEAF_SIZE]
     parts = np.asarray(surfaces.parts)[:-LEAF_SIZE]
     return {int(part): corners[parts == part] for part in np.unique(parts)}
 
 
 def strength(shares: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Returns where on the logarithmic scale from 0.1 % to 100 % shares of light lie, in [0, 1]."""
+    """Returns the positions of shares of light on the log scale from 0.1 % to 100 %, in [0, 1]."""
     held = np.clip(shares, _WEAKEST, _STRONGEST)
     return np.log(held / _WEAKEST) / np.log(_STRONGEST / _WEAKEST)
 
 
 def colour(shares: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
-    """Returns the colours of lines: dark blue for 0.1 % of a pixel's light, yellow for all."""
+    """Returns the colours of lines: dark blue for 0.1 % of a pixel's light, yellow for 100 %."""
     return np.round(255.0 * _COLOURS(strength(shares))[:, :3]).astype(np.uint8)

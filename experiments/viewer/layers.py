@@ -1,20 +1,18 @@
-"""What the viewer can show of a model, and how it is coloured.
+"""Layers that the viewer can display, and their colouring.
 
-- `rgb`: the picture.
-- `refraction only`, `reflection only`: two pictures whose linear colours sum to it. A light path
-  belongs to `reflection only` if it was mirrored at the *first* surface it met, and else, if it
-  went through that surface or met none, to `refraction only`; what became of it later does not
-  count.
-  So neither is what a budget with fewer reflections would show, which gives the share of what it
-  leaves out to what it keeps.
+- `rgb`: the image.
+- `refraction only`, `reflection only`: two images whose linear colours sum to it. A light path
+  belongs to `reflection only` if it was reflected at the *first* surface it hit; all others belong
+  to `refraction only`, whatever happens to them later.
+  Neither equals a rendering with fewer reflections, which redistributes the share of omitted paths
+  to the remaining ones.
 - `distance`: the median of the field's weights along a pixel's heaviest path (see
-  `render.images.Rendering`), from 0 to a length that is fixed, so that colours mean the same from
-  everywhere.
-- `normals`, `mask`: of the first surface of the meshes, with no light. Normals point out of the
-  body and are coloured `(n + 1) / 2` by world axes.
+  `render.images.Rendering`), from 0 to a fixed length, so that colours mean the same in all views.
+- `normals`, `mask`: of the first surface of the meshes, without light. Normals point outwards and
+  are coloured `(n + 1) / 2` by world axes.
 - `error`: of one test view, amplified as in `comparison`, at its own pixels.
 
-Everything is drawn in bands of rows, between which a drawing can be called off.
+Everything is drawn in bands of rows; drawing can be cancelled between two bands.
 """
 
 import math
@@ -41,13 +39,13 @@ DISTANCE, NORMALS, MASK, ERROR = "distance", "normals", "mask", "error"
 
 _BRANCHES: dict[str, Branch] = {RGB: "both", REFRACTION: "transmitted", REFLECTION: "reflected"}
 
-# Needs no light paths, only the meshes.
+# Layers that need only the meshes, no light paths.
 OF_SURFACES = (NORMALS, MASK)
 
 _NOWHERE = 255
 
 GAIN = comparison.ERROR_GAIN
-"""By how much errors are amplified."""
+"""Amplification of errors."""
 
 Cancelled = Callable[[], bool]
 Picture = UInt8[np.ndarray, "h w 3"]
@@ -57,8 +55,8 @@ class Pixels(NamedTuple):
     """Some pixels of a test view, evenly spaced.
 
     Attributes:
-      rays: through their centres, `[h, w]`.
-      target: their true sRGB in `[0, 1]`.
+      rays: rays through the pixel centres, `[h, w]`.
+      target: true sRGB of the pixels, in `[0, 1]`.
     """
 
     rays: Rays
@@ -66,10 +64,10 @@ class Pixels(NamedTuple):
 
 
 def offered(model: Model, *, truth: bool) -> tuple[str, ...]:
-    """Returns the layers that a model has.
+    """Returns the available layers of a model.
 
     Args:
-      model: the scene.
+      model: trained model of the scene.
       truth: whether there are test views.
     """
     bent = (REFRACTION, REFLECTION, DISTANCE, NORMALS, MASK)
@@ -79,19 +77,19 @@ def offered(model: Model, *, truth: bool) -> tuple[str, ...]:
 def draw(
     model: Model, layer: str, rays: Rays, *, chunk: int, most: int, cancelled: Cancelled
 ) -> Picture | None:
-    """Draws a layer, all but `error`.
+    """Draws a layer other than `error`.
 
     Args:
-      model: the scene.
-      layer: one of those of the module.
-      rays: `[h, w]`.
-      chunk: paths rendered at once.
-      most: pixels of the largest picture of this size: what is cropped of it is filled up, so
-        that windows of all shapes share one program.
-      cancelled: asked before every band.
+      model: trained model of the scene.
+      layer: name of a layer of this module.
+      rays: rays, `[h, w]`.
+      chunk: number of paths rendered at once.
+      most: pixels of the largest image of this size; smaller crops are padded to it, so that
+        windows of all shapes share one compiled program.
+      cancelled: callback that returns whether to stop; queried before every band.
 
     Returns:
-      The picture, or `None` if it was called off.
+      The image, or `None` if it was cancelled.
     """
     if layer in OF_SURFACES:
         return None if cancelled() else _draw_surface(model, layer, rays, most)
@@ -103,7 +101,7 @@ def draw(
         bands.append(seen.distance if layer == DISTANCE else seen.rgb)
     whole = np.concatenate(bands)
     if layer == DISTANCE:
-        # From wall to wall: nothing inside a bounded scene is much farther.
+        # From wall to wall: hardly anything inside a bounded scene is farther.
         return comparison.colour_distances([whole], farthest=2.0 * model.config.radius)[0]
     return files.to_bytes(whole)
 
@@ -114,8 +112,8 @@ def draw_error(
     """Draws the amplified error of a test view.
 
     Returns:
-      The picture and the root mean square of the error itself, of sRGB in `[0, 1]`; `None` if it
-      was called off.
+      The image and the root mean square of the unamplified error, of sRGB in `[0, 1]`; `None` if it
+      was cancelled.
     """
     bands = []
     for band in _bands(pixels.rays):
@@ -130,12 +128,12 @@ def draw_error(
 def view_pixels(frames: Frames, i: int, most: int) -> Pixels:
     """Returns every pixel of a test view, or every second, third, ... in each direction.
 
-    So no true colour is averaged, and a small picture's error is that of its pixels.
+    Nothing is averaged: a small image's error is that of its own pixels.
 
     Args:
-      frames: of the split.
-      i: which view.
-      most: pixels that are wanted at most.
+      frames: frames of the split.
+      i: index of the view.
+      most: largest number of pixels.
     """
     height, width = frames.cameras.height, frames.cameras.width
     stride = max(1, math.ceil(math.sqrt(height * width / most)))
@@ -148,12 +146,12 @@ def view_pixels(frames: Frames, i: int, most: int) -> Pixels:
 
 
 def with_indices(interfaces: Interfaces, indices: Sequence[float], rule: str) -> Interfaces:
-    """Returns interfaces with other indices of refraction, one a part, and all else as it was.
+    """Returns interfaces with new indices of refraction, one per part, and all else unchanged.
 
     Args:
-      interfaces: of the scene.
-      indices: of the inside of each part; what follows for the outsides is the rule's to say.
-      rule: the scene's, a name in `interface_rules.RULES`.
+      interfaces: interfaces of the scene.
+      indices: index of refraction inside each part; the rule decides those outside.
+      rule: rule of the scene, a name in `interface_rules.RULES`.
     """
     parents = [int(medium) - 1 for medium in interfaces.medium_outside]
     made = RULES[rule](indices, parents)
@@ -174,7 +172,7 @@ def _draw_surface(model: Model, layer: str, rays: Rays, most: int) -> Picture:
 
 
 def _bands(rays: Rays) -> Iterator[Rays]:
-    """Yields some rows at a time, no more rays than are traced at once if a row has no more."""
+    """Yields bands of rows, as many as are traced at once, but at least one row each."""
     height, width = rays.radii.shape
     rows = max(1, images.TILE // width)
     for start in range(0, height, rows):

@@ -1,7 +1,7 @@
-"""The server of the viewer, and what it does for each page that is open.
+"""The viewer's server, and the worker of each open page.
 
-Every page has a camera, a panel and a scene of its own, and one thread that draws for it what
-`session` schedules. Pages take turns: one picture is drawn at a time.
+Every page has its own camera, panel and scene, and a thread that draws the images scheduled by
+`session`. Pages take turns: one image is drawn at a time.
 
 This is the only module that imports viser.
 """
@@ -28,31 +28,31 @@ from refref_jax.render import pixel_paths
 
 _JPEG_QUALITY = 92
 
-# How near to a test view a browser's camera stays where it is.
+# Closer to a test view than this, a browser's camera is not moved.
 _NEAR = 10 * cameras.ROUNDING
 
 
 class Turns:
-    """What pages share: whose turn it is to draw, and what is compiled."""
+    """State shared by pages: the lock for drawing, and the compiled settings."""
 
     def __init__(self) -> None:
-        """Begins with nothing compiled."""
+        """Starts with nothing compiled."""
         self.drawing = threading.Lock()
         self.tracing = threading.Lock()
         self.compiled: set[Any] = set()
 
 
 def serve(subject: Subject, *, host: str, port: int) -> viser.ViserServer:
-    """Starts a server, which runs in threads of its own until it is stopped.
+    """Starts a server, which runs in its own threads until it is stopped.
 
     Args:
-      subject: what is looked at.
-      host: address that it listens on.
-      port: the first port to try; its own method `get_port` tells which it is.
+      subject: run to display.
+      host: address to listen on.
+      port: first port to try; the server's method `get_port` returns the actual one.
     """
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints a box
         server = viser.ViserServer(host=host, port=port, label=subject.name, verbose=False)
-    # Sharing would open the page to the internet, through a machine of viser's authors.
+    # Sharing would expose the page to the internet, through a server of viser's authors.
     server.gui.configure_theme(show_share_button=False, show_logo=False)
     view = session.first_viewpoint(subject)
     position, back = view.pose[:, 3], view.pose[:, 2]
@@ -79,7 +79,7 @@ class Page:
     """One open page."""
 
     def __init__(self, client: viser.ClientHandle, subject: Subject, turns: Turns) -> None:
-        """Builds panel and scene, and begins to draw."""
+        """Builds panel and scene, and starts to draw."""
         self._client, self._subject, self._turns = client, subject, turns
         self._event = threading.Condition()
         self._closed = False
@@ -101,7 +101,7 @@ class Page:
         self._change()
 
     def close(self) -> None:
-        """Ends the page's thread."""
+        """Stops the page's thread."""
         with self._event:
             self._closed = True
             self._event.notify()
@@ -112,7 +112,7 @@ class Page:
         return cameras.from_browser(camera.wxyz, camera.position, camera.fov, aspect)
 
     def _look(self) -> None:
-        """Notes where the camera is; what a browser says again is no change."""
+        """Records the camera; repeated reports of the same camera are not a change."""
         view = self._viewpoint()
         with self._event:
             if cameras.is_same(view, self._view):
@@ -137,7 +137,7 @@ class Page:
                     continue
             try:
                 picture = self._draw(job, view, self._panel.choice())
-            except Exception as error:  # the page stays open, and says why it shows nothing
+            except Exception as error:  # the page stays open and shows the error
                 traceback.print_exc()
                 self._say(f"**{type(error).__name__}**: {error}")
                 picture = np.zeros((2, 2, 3), np.uint8)
@@ -149,14 +149,14 @@ class Page:
                     self._state = session.finished(self._state, job)
 
     def _draw(self, job: Job, view: Viewpoint, choice: Choice) -> Picture | None:
-        """Draws a job's picture; `None` if it was called off."""
+        """Draws a job's image; `None` if it was cancelled."""
         model = session.chosen_model(self._subject, choice)
         height, chunk = self._subject.heights[job.stage], self._subject.chunk
         most = height * cameras.width_of(height)
         layer, what = choice.layer, ("image", model.budget)
         if layer == layers.ERROR and job.stage > 0:
             return self._draw_error(job, view, model, most)
-        if layer == layers.ERROR:  # on the way to a view there is no error to show
+        if layer == layers.ERROR:  # no error is available while moving to a view
             layer = layers.RGB
         if layer in layers.OF_SURFACES:
             what = ("surfaces", most)
@@ -170,7 +170,7 @@ class Page:
         return picture
 
     def _draw_error(self, job: Job, view: Viewpoint, model: Any, most: int) -> Picture | None:
-        """Goes to the nearest test view and draws its error, with bars beside it."""
+        """Moves to the nearest test view and draws its error, with bars at the sides."""
         frames = self._subject.frames
         i = cameras.nearest(view.pose, frames.cameras)
         fov = cameras.containing_fov(frames.cameras, view.aspect)
@@ -192,10 +192,10 @@ class Page:
         return cameras.letterbox(picture, view.aspect)
 
     def _go_to(self, view: Viewpoint) -> None:
-        """Moves the browser's camera, which is no change of what is seen.
+        """Moves the browser's camera, which does not count as a change.
 
-        Browsers keep the horizon level, and answer with another pose if the view's is not: that is
-        not corrected again, or there would be no end.
+        Browsers keep the horizon level, and report another pose if the view's is tilted. That pose
+        is not corrected again, to avoid an endless loop.
         """
         with self._event:
             if cameras.is_same(view, self._view, within=_NEAR):
@@ -208,7 +208,7 @@ class Page:
             self._client.camera.fov = view.fov
 
     def _click(self, event: viser.SceneClickEvent) -> None:
-        """Draws the light paths of the pixel that was clicked."""
+        """Draws the light paths of the clicked pixel."""
         model = session.chosen_model(self._subject, self._panel.choice())
         direction = np.asarray(event.ray_direction)
         ray = Rays(np.asarray(event.ray_origin), direction / np.linalg.norm(direction), 1e-3)
@@ -227,7 +227,7 @@ class Page:
 
     @contextlib.contextmanager
     def _compiling(self, what: Any) -> Iterator[None]:
-        """Tells the user while something is done for the first time, which takes a while."""
+        """Notifies the user while something is compiled for the first time."""
         if what in self._turns.compiled:
             yield
             return

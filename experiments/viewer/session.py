@@ -1,12 +1,12 @@
-"""The state of a page: what is looked at, what was chosen, and which picture to draw next.
+"""The state of a page: the displayed run, its settings, and the next image to draw.
 
-The second part is a state machine without clock, threads or pictures. Everything that changes what
-is to be seen, a moving camera or a slider, is a *change*. Pictures are drawn in *stages*, small to
-large. While changes come, the first stage alone is drawn, again and again; `STILL` seconds after
-the last one the larger stages follow, one after the other.
+The second part is a state machine without clock, threads or images. Everything that alters the
+view, a moving camera or a slider, is a *change*. Images are drawn in *stages*, small to large.
+During changes, only the first stage is drawn, repeatedly; `STILL` seconds after the last one the
+larger stages follow, one after the other.
 
 A change makes larger stages stale, and their drawing should stop. The first stage is never stale:
-it is drawn to its end and shown, or a camera that never rests would show nothing.
+it is always completed and shown, since a camera in constant motion would otherwise show nothing.
 """
 
 import dataclasses
@@ -25,30 +25,30 @@ from refref_jax.geometry.cameras import Cameras, orbit
 from refref_jax.render import Model
 
 CUTS = (0.1, 0.05, 0.02, 0.01, 0.005)
-"""Cuts that are offered beside a model's own."""
+"""Throughput thresholds offered in addition to a model's own."""
 
 BENDS = (2, 4, 6, 10, 24, 32)
-"""Bends that are offered beside a model's own."""
+"""Max bends offered in addition to a model's own."""
 
-# Where there are no test views: as the data set's cameras stand.
+# Without test views: a pose like those of the data set's cameras.
 _DISTANCE, _ELEVATION, _FOV = 4.0, math.radians(20.0), math.radians(50.0)
 
 STILL = 0.25
-"""Seconds without a change after which a picture is refined."""
+"""Seconds without a change after which an image is refined."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Subject:
-    """What is looked at.
+    """Displayed run.
 
     Attributes:
-      name: of the run.
-      model: the scene.
-      rule: what lies outside each part, a name in `interface_rules.RULES`.
-      frames: the scene's test views, if it is there.
+      name: name of the run.
+      model: trained model of the scene.
+      rule: outside medium of each part, a name in `interface_rules.RULES`.
+      frames: test views of the scene, if it exists.
       parts: name of each part.
-      heights: of the pictures before they are cropped, pixels, from small to large.
-      chunk: paths rendered at once.
+      heights: heights of the images before cropping, pixels, ascending.
+      chunk: number of paths rendered at once.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Subject:
 
     @functools.cached_property
     def layers(self) -> tuple[str, ...]:
-        """What can be shown."""
+        """The available layers."""
         return layers.offered(self.model, truth=self.frames is not None)
 
     @property
@@ -72,13 +72,13 @@ class Subject:
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """What a user has chosen on the panel.
+    """Settings that a user has chosen on the panel.
 
     Attributes:
-      layer: what is shown.
-      indices: of refraction, of each part.
-      cut: smallest throughput that is followed.
-      bends: most bends of a path.
+      layer: displayed layer.
+      indices: index of refraction of each part.
+      cut: throughput threshold.
+      bends: largest number of bends of a path.
     """
 
     layer: str
@@ -88,13 +88,13 @@ class Choice:
 
 
 class State(NamedTuple):
-    """What is known between two events.
+    """State between two events.
 
     Attributes:
       stages: number of sizes.
       change: number of the last change, counted from 1; 0 before any.
-      changed_at: time of the last change, seconds of any clock that runs evenly.
-      drawn: stages that are drawn of the last change.
+      changed_at: time of the last change, seconds of a steady clock.
+      drawn: number of drawn stages of the last change.
     """
 
     stages: int
@@ -104,11 +104,11 @@ class State(NamedTuple):
 
 
 class Job(NamedTuple):
-    """A picture to draw.
+    """An image to draw.
 
     Attributes:
-      change: what it shows is as it was after this change, or later.
-      stage: its size.
+      change: number of a change; the image shows the state after it, or after a later one.
+      stage: size of the image.
     """
 
     change: int
@@ -116,20 +116,20 @@ class Job(NamedTuple):
 
 
 def first_choice(subject: Subject) -> Choice:
-    """Returns what is shown before anything is chosen: the model as it was trained."""
+    """Returns the initial settings: those of the trained model."""
     indices = tuple(float(x) for x in np.asarray(subject.model.geometry.interfaces.index_inside))
     budget = subject.model.budget
     return Choice(layers.RGB, indices, budget.cut, budget.bends)
 
 
 def chosen_model(subject: Subject, choice: Choice) -> Model:
-    """Returns the model with what was chosen; with the first choice, as it was trained."""
+    """Returns the model with the chosen settings; the initial ones leave it as it was trained."""
     model = subject.model
     if model.budget.bends == 0:
         return model
     interfaces = model.geometry.interfaces
     if choice.indices != first_choice(subject).indices:
-        # On the device, as those of the model are: what is compiled serves both.
+        # On the device, as those of the model are, so that both share one compiled program.
         interfaces = jax.device_put(layers.with_indices(interfaces, choice.indices, subject.rule))
     budget = model.budget
     if (choice.cut, choice.bends) != (budget.cut, budget.bends):
@@ -138,7 +138,7 @@ def chosen_model(subject: Subject, choice: Choice) -> Model:
 
 
 def part_names(scene: Path | None, count: int) -> tuple[str, ...]:
-    """Returns the names of a model's parts: those of the scene's meshes, if there are as many."""
+    """Returns the names of a model's parts: those of the scene's meshes, if the counts match."""
     stems = tuple(path.stem for path in meshes.mesh_files(scene)) if scene else ()
     return stems if len(stems) == count else tuple(f"part {i + 1}" for i in range(count))
 
@@ -149,7 +149,7 @@ def read_test_views(scene: Path) -> Frames:
 
 
 def first_viewpoint(subject: Subject, aspect: float = cameras.ASPECT) -> cameras.Viewpoint:
-    """Returns where a new page looks from: the first test view, or somewhere beside the origin."""
+    """Returns a new page's camera: the first test view, or a fixed one outside the origin."""
     if subject.views is not None:
         fov = cameras.containing_fov(subject.views, aspect)
         return cameras.Viewpoint(subject.views.poses[0], fov, aspect)
@@ -158,18 +158,18 @@ def first_viewpoint(subject: Subject, aspect: float = cameras.ASPECT) -> cameras
 
 
 def changed(state: State, now: float) -> State:
-    """Returns the state after a change at a time."""
+    """Returns the state after a change at the given time."""
     return state._replace(change=state.change + 1, changed_at=now, drawn=0)
 
 
 def next_job(state: State, now: float) -> Job | None:
-    """Returns what to draw at a time, or `None` if there is nothing to draw yet."""
+    """Returns the job to draw at the given time, or `None` if there is nothing to draw yet."""
     pause = wait(state, now)
     return Job(state.change, state.drawn) if pause == 0.0 else None
 
 
 def wait(state: State, now: float) -> float | None:
-    """Returns in how many seconds there is something to draw; `None`: not before a change."""
+    """Returns the seconds until there is something to draw; `None`: not before a change."""
     if state.change == 0 or state.drawn >= state.stages:
         return None
     if state.drawn == 0:
@@ -178,12 +178,12 @@ def wait(state: State, now: float) -> float | None:
 
 
 def is_stale(state: State, job: Job) -> bool:
-    """Returns whether a job is not worth going on with."""
+    """Returns whether a job should be cancelled."""
     return job.stage > 0 and job.change != state.change
 
 
 def finished(state: State, job: Job) -> State:
-    """Returns the state after a job; one that a change has overtaken leaves the state as it is."""
+    """Returns the state after a job; outdated jobs leave the state unchanged."""
     if job.change != state.change:
         return state
     return state._replace(drawn=job.stage + 1)

@@ -1,1 +1,1 @@
-"""The fifty objects, as closed surfaces that are made, not downloaded (NumPy only)."""
+"""The fifty objects, as procedural closed surfaces (NumPy only)."""

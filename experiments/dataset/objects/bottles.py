@@ -53,12 +53,12 @@ def _make_cola_bottle(detail: float) -> list[ObjectPart]:
 
 
 def _fluted(r: Values, z: Values) -> Values:
-    """Returns how deep the flutes of a contour bottle are: none at its foot, belt and neck."""
+    """Returns the depth of a contour bottle's flutes: 0 at its foot, belt and neck."""
     return within(z, 0.15, 1.62, soft=0.35) + within(z, 2.12, 3.1, soft=0.35)
 
 
 def _make_plastic_bottle(detail: float) -> list[ObjectPart]:
-    """Ribbed, with a foot of five lobes, and a screw cap that lies around its neck."""
+    """A ribbed bottle with a foot of five lobes, and a screw cap around its neck."""
     cut = sampling(0.75 * detail, segments=112)
     outline = region(
         filleted(
@@ -94,7 +94,7 @@ def _side_of_cap(r: Values, z: Values) -> Values:
 
 
 def _make_star_shaped_bottle(detail: float) -> list[ObjectPart]:
-    """Five ridges that run together into a round neck."""
+    """A bottle with five ridges that merge into a round neck."""
     cut = sampling(0.75 * detail, segments=112)
     outline = region(
         filleted(
@@ -115,7 +115,7 @@ def _make_star_shaped_bottle(detail: float) -> list[ObjectPart]:
 
 
 def _make_demijohn_vase(detail: float) -> list[ObjectPart]:
-    """A big round jug with a short neck, as wine is fermented in."""
+    """A big round jug with a short neck, used for fermenting wine."""
     globe = smooth(
         [(0.85, 0.06), (1.22, 0.45), (1.4, 1.15), (1.22, 1.85), (0.75, 2.3), (0.36, 2.6)]
     )

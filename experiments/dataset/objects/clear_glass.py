@@ -1,4 +1,4 @@
-"""Things of clear glass alone: jars with glass lids, a light bulb, a candlestick, a cut vase."""
+"""Objects of clear glass only: jars with glass lids, a light bulb, a candlestick, a cut vase."""
 
 import numpy as np
 
@@ -22,7 +22,7 @@ _ROSE = Look(tint=(0.98, 0.93, 0.95))
 
 
 def _make_korken_jar(detail: float) -> list[ObjectPart]:
-    """A preserving jar of 115 mm by 175 mm, its lid resting a rubber ring's height above."""
+    """A preserving jar of 115 mm by 175 mm; its lid is raised by the height of a rubber ring."""
     cut = sampling(detail)
     outline = region(
         filleted(
@@ -48,7 +48,7 @@ def _make_korken_jar(detail: float) -> list[ObjectPart]:
 
 
 def _make_vardagen_jar(detail: float) -> list[ObjectPart]:
-    """A storage jar with a heavy bottom, and a lid with a knob that hangs into its mouth."""
+    """A storage jar with a thick bottom, and a lid with a knob that extends into its mouth."""
     cut = sampling(detail)
     outline = region(
         filleted(
@@ -74,10 +74,10 @@ def _make_vardagen_jar(detail: float) -> list[ObjectPart]:
 
 
 def _make_light_bulb(detail: float) -> list[ObjectPart]:
-    """A bulb of 60 mm by 110 mm, all of it glass: a shell with a cavity, into which a mount rises.
+    """A bulb of 60 mm by 110 mm, all of it glass: a shell with a cavity and a mount inside.
 
-    It is closed, for a real one is: outer surface and cavity are one part, the latter with faces
-    that look into it, which is outwards from the glass.
+    Like a real one it is closed: outer surface and cavity are one part; the cavity's faces point
+    into it, which is outwards from the glass.
     """
     globe = region(arc((0.0, 2.5), 1.05, -90.0, 90.0))
     neck = filleted(
@@ -140,7 +140,7 @@ def _make_candle_holder(detail: float) -> list[ObjectPart]:
 
 
 def _make_crystal_vase(detail: float) -> list[ObjectPart]:
-    """Thick, with cuts that wind around it; round within, at its foot and at its rim."""
+    """A thick vase with cuts that wind around it; round inside, at its foot and at its rim."""
     cut = sampling(detail)
     side = smooth([(0.66, 0.12), (0.6, 0.5), (0.66, 1.3), (0.82, 2.2), (1.0, 3.1)])
     foot = filleted((0, 0.04), (0.5, 0.04, 0.1), (0.56, 0.0, 0.03), (0.68, 0.0, 0.06), (0.66, 0.12))

@@ -1,6 +1,6 @@
 """A standing cow: clear glass around a white core (NumPy only).
 
-Fields are those of `distance_fields`; z is up, and it looks to -y.
+Fields are those of `distance_fields`; z is up, and the cow faces -y.
 """
 
 from experiments.dataset.objects.distance_fields import Field, ellipsoid
@@ -19,7 +19,7 @@ def _body() -> Field:
         ellipsoid((0.0, -0.62, 0.16), (0.44, 0.48, 0.54)),
         ellipsoid((0.0, 0.8, 0.22), (0.46, 0.46, 0.48)),
         limb((0.0, -0.75, 0.3, 0.4), (0.0, -1.1, 0.52, 0.3), (0.0, -1.35, 0.68, 0.26)),
-        # The hips stand out, and the dewlap hangs.
+        # The hips protrude, and the dewlap hangs.
         *both_sides(ellipsoid((0.3, 0.85, 0.5), (0.16, 0.2, 0.16))),
         ellipsoid((0.0, -1.02, 0.1), (0.12, 0.3, 0.32)),
         blend=0.2,

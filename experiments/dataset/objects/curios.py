@@ -1,6 +1,6 @@
 """Magnifier, skull-shaped bottle, and an abstract sculpture: one piece of glass each (NumPy only).
 
-Fields are those of `distance_fields`; z is up, faces look to -y.
+Fields are those of `distance_fields`; z is up, faces point to -y.
 """
 
 import numpy as np
@@ -26,19 +26,19 @@ from experiments.dataset.objects.field_operations import (
 from experiments.dataset.objects.formed import single_glass
 from experiments.dataset.objects.space_curves import limb
 
-# The lens: its radius, and its thickness in the middle.
+# The lens: its radius, and its thickness at the centre.
 _LENS_RADIUS, _LENS_THICKNESS = 0.98, 0.42
 
 _SKULL_WALL = 0.13
 
-# The knot: radius of the ring that it winds around, how far from it, and the tube's radius, which
-# swells three times on its way.
+# The knot: radius of the ring that it winds around, distance from that ring, and the tube's radius,
+# which increases three times along the knot.
 _KNOT_RING, _KNOT_AWAY, _KNOT_TUBE, _KNOT_SWELL = 1.15, 0.5, 0.27, 0.06
 _KNOT_POINTS = 360
 
 
 def _magnifier() -> Field:
-    # Two caps of a sphere, each as high as half of the lens.
+    # Two caps of a sphere, each with half the height of the lens.
     half = 0.5 * _LENS_THICKNESS
     curvature = (_LENS_RADIUS**2 + half**2) / (2.0 * half)
     caps = [sphere((0.0, side * (curvature - half), 0.0), curvature) for side in (-1.0, 1.0)]
@@ -98,7 +98,7 @@ def _skull_bottle() -> Field:
 
 
 def _between_teeth() -> Field:
-    """Returns grooves: between the rows of teeth, and between the teeth of both."""
+    """Returns the grooves between the rows of teeth, and between the teeth of both rows."""
     row = limb((-0.36, -0.76, -0.76, 0.05), (0.0, -1.0, -0.78, 0.05), (0.36, -0.76, -0.76, 0.05))
     gaps = []
     for x in np.linspace(-0.27, 0.27, 6).tolist():
@@ -110,7 +110,7 @@ def _between_teeth() -> Field:
 
 
 def _generic_sculpture() -> Field:
-    # A few points come twice, so that there are neighbours on both sides of the seam.
+    # A few points are repeated, so that there are neighbours on both sides of the seam.
     turn = 2.0 * np.pi * np.arange(-4, _KNOT_POINTS + 5) / _KNOT_POINTS
     away = _KNOT_RING + _KNOT_AWAY * np.cos(3.0 * turn)
     curve = np.stack(

@@ -1,8 +1,8 @@
 """Signed distances to solids: negative inside, zero on the surface, in world units (NumPy only).
 
 A *field* is a function from points to signed distances. Those of this module are exact, so their
-gradient has norm 1 wherever there is one nearest point, and none of them changes faster than 1 per
-unit (it is 1-Lipschitz). `field_operations` combines them, and keeps the latter.
+gradient has norm 1 wherever the nearest point is unique, and all of them are 1-Lipschitz (change by
+at most 1 per unit). `field_operations` combines them, and preserves the Lipschitz bound.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,30 +16,31 @@ Points = Float[np.ndarray, "points 3"]
 Distances = Float[np.ndarray, " points"]
 Vector = Sequence[float]
 
-# Points of one block: few enough that a block's intermediate arrays stay in a core's cache.
+# Number of points per block: a block's intermediate arrays fit in a core's cache.
 _BLOCK = 1 << 14
 
-# Newton's steps to the nearest point of an ellipsoid, the last of which may be so small (squared
-# world units); and the least share of its radii that
-# coordinates are taken for: at the centre of symmetry there are several nearest points.
+# Newton's method for the nearest point of an ellipsoid: number of steps, tolerance of the last one
+# (squared world units), and least coordinates as a share of the radii: at the centre of symmetry
+# the nearest point is not unique.
 _ELLIPSOID_STEPS = 12
 _ELLIPSOID_TOLERANCE = 1e-13
 _NEAR_CENTRE = 1e-4
 
-# Segments of a tube around the one of the nearest joint that are looked at.
+# Number of segments of a tube that are evaluated around the nearest joint.
 _AROUND_JOINT = (-2, -1, 0, 1)
 
-# Larger shares of a segment for the change of radius: one end would nearly swallow the other.
+# Largest change of radius as a share of a segment: beyond it one end would almost contain the
+# other.
 _STEEPEST = 0.999
 
 
 class Field(NamedTuple):
-    """A signed distance, and a ball that holds the solid.
+    """A signed distance, and a bounding ball of the solid.
 
     Attributes:
-      distance: from points to signed distances.
-      centre: of the ball.
-      radius: of the ball; outside of it, distances are at least those to the ball. May be `inf`.
+      distance: function from points to signed distances.
+      centre: centre of the ball.
+      radius: radius of the ball, may be `inf`; outside, distances are at least those to the ball.
     """
 
     distance: Callable[[Points], Distances]
@@ -83,7 +84,7 @@ def ellipsoid(centre: Vector, radii: Vector) -> Field:
     column = axes[:, None]
 
     def distance(points: Points) -> Distances:
-        # Coordinates come first, so that sums run over whole arrays.
+        # Coordinates are the first axis, so that sums run over complete arrays.
         y = np.maximum(np.abs((points - middle).T), _NEAR_CENTRE * column)
         t = np.max(column * y - column**2, axis=0, initial=-np.inf)
         for _ in range(_ELLIPSOID_STEPS):
@@ -103,20 +104,20 @@ def ellipsoid(centre: Vector, radii: Vector) -> Field:
 def tube(
     curve: Float[np.ndarray, "joints 3"], radii: Float[np.ndarray, " joints"] | float
 ) -> Field:
-    """All balls that roll along a polyline while their radius changes from joint to joint.
+    """The union of all balls along a polyline whose radius changes from joint to joint.
 
-    Exact for a tube that does not bend within a few of its segments by more than its radius
-    allows; see `space_curves` for smooth polylines.
+    The distance is exact for a tube that does not bend within a few of its segments by more than
+    its radius allows; see `space_curves` for smooth polylines.
 
     Raises:
-      ValueError: if the radius changes faster than the curve goes on.
+      ValueError: if the radius changes faster than the arc length.
     """
     radius = np.broadcast_to(np.asarray(radii, float), len(curve))
     along = np.diff(curve, axis=0)
     length = np.linalg.norm(along, axis=-1)
     slope = -np.diff(radius) / length
     gentle = bool(np.all(np.abs(slope) < _STEEPEST))
-    _require(gentle, "The radius of a tube changes faster than its curve goes on.")
+    _require(gentle, "The radius of a tube changes faster than its arc length.")
     axes, skew = along / length[:, None], slope / np.sqrt(1.0 - slope**2)
     tree = KDTree(curve)
 
@@ -124,7 +125,7 @@ def tube(
         offset = points - curve[i]
         height = np.einsum("pc,pc->p", offset, axes[i])
         wide = np.sqrt(np.maximum(np.einsum("pc,pc->p", offset, offset) - height**2, 0.0))
-        # Where the rolling ball comes nearest.
+        # The nearest position of the rolling ball.
         at = np.clip(height - wide * skew[i], 0.0, length[i])
         return np.hypot(height - at, wide) - radius[i] + slope[i] * at
 
@@ -141,9 +142,9 @@ def tube(
 
 
 def box(half_extents: Vector, rounding: float = 0.0) -> Field:
-    """A box around the origin, along the axes, whose edges are rounded within it."""
+    """A box around the origin, along the axes, with edges rounded inwards."""
     core = np.asarray(half_extents, float) - rounding
-    _require(bool(np.all(core >= 0.0)), f"A box of {half_extents} has no room for its rounding.")
+    _require(bool(np.all(core >= 0.0)), f"A box of {half_extents} is too small for its rounding.")
 
     def distance(points: Points) -> Distances:
         beyond = np.abs(points) - core
@@ -154,7 +155,7 @@ def box(half_extents: Vector, rounding: float = 0.0) -> Field:
 
 
 def torus(radius: float, thickness: float) -> Field:
-    """A ring around the z axis: a circle of radius `thickness`, led around one of `radius`."""
+    """A torus around the z axis: major radius `radius`, minor radius `thickness`."""
 
     def distance(points: Points) -> Distances:
         away = np.hypot(points[:, 0], points[:, 1]) - radius
@@ -164,16 +165,16 @@ def torus(radius: float, thickness: float) -> Field:
 
 
 def revolution(profile: Float[np.ndarray, "corners 2"]) -> Field:
-    """A polygon of (distance from the z axis, z), turned around that axis.
+    """A polygon of (distance from the z axis, z), revolved around that axis.
 
-    Its edges may lie on the axis; none of its corners may lie beyond. Either sense of rotation.
+    Its edges may lie on the axis, but no corner may lie beyond it. Both orientations are allowed.
 
     Raises:
       ValueError: if a corner lies beyond the axis.
     """
-    _require(bool(np.all(profile[:, 0] >= 0.0)), "A profile crosses the axis it is turned around.")
+    _require(bool(np.all(profile[:, 0] >= 0.0)), "A profile crosses its axis of revolution.")
     ends = np.roll(profile, -1, axis=0)
-    # What lies on the axis is no surface.
+    # Edges on the axis are not part of the surface.
     real = (profile[:, 0] > 0.0) | (ends[:, 0] > 0.0)
 
     def distance(points: Points) -> Distances:
@@ -188,9 +189,10 @@ def revolution(profile: Float[np.ndarray, "corners 2"]) -> Field:
 
 
 def revolution_wall(curve: Float[np.ndarray, "points 2"], thickness: float) -> Field:
-    """A wall along an open curve of (distance from the z axis, z), turned around that axis.
+    """A wall along an open curve of (distance from the z axis, z), revolved around that axis.
 
-    Its edge is a half circle: the wall is all that is within half a thickness of the curve.
+    The wall is the set of points within half a thickness of the curve, so its edge is a half
+    circle.
     """
 
     def distance(points: Points) -> Distances:
@@ -221,7 +223,7 @@ def _in_polygon(
     starts: Float[np.ndarray, "segments 2"],
     ends: Float[np.ndarray, "segments 2"],
 ) -> np.ndarray:
-    """Returns which points a polygon surrounds: rays outwards cross it an odd number of times."""
+    """Returns the points inside a polygon: rays outwards cross it an odd number of times."""
     inside = np.zeros(len(points), bool)
     x, y = points.T
     for (ax, ay), (bx, by) in zip(starts, ends, strict=True):
@@ -233,7 +235,7 @@ def _in_polygon(
 
 def _require(holds: bool, problem: str) -> None:
     if not holds:
-        raise ValueError(f"{problem} Give other measures.")
+        raise ValueError(f"{problem} Give other dimensions.")
 
 
 def _triple(vector: Float[np.ndarray, "3"]) -> tuple[float, float, float]:

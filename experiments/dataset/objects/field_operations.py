@@ -1,9 +1,9 @@
 """Combines fields (see `distance_fields`): union, subtraction, walls, and motions (NumPy only).
 
-*Blending length*: where two distances differ by less, their union (or intersection) is rounded;
-at equal distances, by a sixth of it. Elsewhere it is the sharp one. A blended field is 1-Lipschitz
-if its operands are, for its gradient is a mean of theirs: an offset inwards by a wall leaves at
-least that wall.
+*Blending length*: the union (or intersection) is rounded where two distances differ by less than
+this, by a sixth of it at equal distances. Elsewhere it is sharp. A blended field is 1-Lipschitz if
+its operands are, since its gradient is a mean of theirs: an inward offset by a wall leaves at least
+that wall.
 """
 
 from collections.abc import Callable
@@ -22,31 +22,31 @@ from experiments.dataset.objects.distance_fields import (
 
 
 def union(*fields: Field, blend: float = 0.0) -> Field:
-    """Returns what lies in any of some solids, rounded where they meet.
+    """Returns the union of solids, rounded where they meet.
 
     Args:
-      *fields: one by one, each to the union of those before it.
-      blend: the blending length, 0 or more.
+      *fields: operands, combined one by one with the union of the previous ones.
+      blend: blending length, 0 or more.
     """
     balls = [(np.asarray(field.centre), field.radius) for field in fields]
 
     def distance(points: Points) -> Distances:
         nearest = fields[0](points)
         for field, (centre, radius) in zip(fields[1:], balls[1:], strict=True):
-            # Only where the solid may come near enough to matter, which spares most of them.
+            # Evaluated only where the solid is close enough to matter, which skips most points.
             near = np.linalg.norm(points - centre, axis=-1) - radius < nearest + blend
             nearest[near] = smooth_minimum(nearest[near], field(points[near]), blend)
         return nearest
 
     middle = np.mean([centre for centre, _ in balls], axis=0)
     reach = max(float(np.linalg.norm(centre - middle)) + radius for centre, radius in balls)
-    # A union may be outside of its operands by a sixth of the blend at each blending.
+    # A union may exceed its operands by a sixth of the blend at each blending.
     grown = reach + blend / 6.0 * (len(fields) - 1)
     return Field(distance, (float(middle[0]), float(middle[1]), float(middle[2])), grown)
 
 
 def subtraction(solid: Field, tool: Field, *, blend: float = 0.0) -> Field:
-    """Returns a solid without what lies in another, rounded at the new edge."""
+    """Returns the difference of two solids, rounded at the new edge."""
     centre = np.asarray(tool.centre)
 
     def distance(points: Points) -> Distances:
@@ -59,12 +59,12 @@ def subtraction(solid: Field, tool: Field, *, blend: float = 0.0) -> Field:
 
 
 def intersection(solid: Field, other: Field, *, blend: float = 0.0) -> Field:
-    """Returns what lies in both of two solids, rounded at the edge between them."""
+    """Returns the intersection of two solids, rounded at the edge between them."""
     return solid._replace(distance=lambda p: -smooth_minimum(-solid(p), -other(p), blend))
 
 
 def smooth_minimum(a: Distances, b: Distances, blend: float) -> Distances:
-    """Returns the smaller one, less up to a sixth of the blending length where they are close.
+    """Returns the smaller distance, less up to a sixth of the blending length where they are close.
 
     Twice differentiable. Source: Quilez, Smooth minimum (2013), the cubic one.
     """
@@ -75,26 +75,26 @@ def smooth_minimum(a: Distances, b: Distances, blend: float) -> Distances:
 
 
 def offset(field: Field, distance: float) -> Field:
-    """Returns a solid that has grown by a distance on all sides; shrunk, if it is negative."""
+    """Returns a solid grown by a distance on all sides; shrunk, if it is negative."""
     return Field(lambda p: field(p) - distance, field.centre, field.radius + max(distance, 0.0))
 
 
 def moved(field: Field, shift: Vector) -> Field:
-    """Returns a solid elsewhere."""
+    """Returns a translated solid."""
     step = np.asarray(shift, float)
     x, y, z = (np.asarray(field.centre) + step).tolist()
     return Field(lambda p: field(p - step), (x, y, z), field.radius)
 
 
 def turned(field: Field, rotation: Rotation) -> Field:
-    """Returns a solid turned around the origin."""
+    """Returns a solid rotated around the origin."""
     back = rotation.as_matrix()
     x, y, z = rotation.apply(np.asarray(field.centre)).tolist()
     return Field(lambda p: field(p @ back), (x, y, z), field.radius)
 
 
 def mirrored(field: Field) -> Field:
-    """Returns a solid on the other side of the plane x = 0."""
+    """Returns a solid reflected in the plane x = 0."""
     flip = np.array([-1.0, 1.0, 1.0])
     x, y, z = field.centre
     return Field(lambda p: field(p * flip), (-x, y, z), field.radius)
@@ -106,12 +106,12 @@ def both_sides(*fields: Field) -> list[Field]:
 
 
 def warped(field: Field, warp: Callable[[Points], Points], reach: float) -> Field:
-    """Returns a solid seen through a change of coordinates: no longer an exact distance.
+    """Returns a solid under a change of coordinates; the distance is then not exact.
 
     Args:
-      field: the solid.
-      warp: from points to those where the solid is asked for instead.
-      reach: how far the warp moves the surface at most.
+      field: solid to warp.
+      warp: function from points to the points where the solid is evaluated instead.
+      reach: largest distance by which the warp moves the surface.
     """
     return Field(lambda p: field(warp(p)), field.centre, field.radius + reach)
 
@@ -119,12 +119,12 @@ def warped(field: Field, warp: Callable[[Points], Points], reach: float) -> Fiel
 def gridded(
     values: Float[np.ndarray, "nx ny nz"], low: Float[np.ndarray, "3"], spacing: float
 ) -> Field:
-    """Returns the cubic spline through samples on a grid, with the nearest ones' values beyond.
+    """Returns the cubic spline through samples on a grid, extended by the nearest values.
 
     Args:
       values: signed distances.
-      low: position of the first one.
-      spacing: between them, along all axes.
+      low: position of the first sample.
+      spacing: distance between samples, along all axes.
     """
     coefficients = spline_filter(values, order=3)
 

@@ -1,7 +1,7 @@
 """A man and a woman as classical statues on a base (NumPy only).
 
-Both rest on one leg, so that hips and shoulders tilt against each other. Fields are those of
-`distance_fields`; z is up, they look to -y, and their left is +x.
+Both rest on one leg, so that hips and shoulders tilt in opposite directions. Fields are those of
+`distance_fields`; z is up, they face -y, and their left is +x.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ from experiments.dataset.objects.field_operations import (
 from experiments.dataset.objects.formed import filled_glass, single_glass
 from experiments.dataset.objects.space_curves import limb
 
-# Folds of the woman's dress: their number around it, and how deep they are at its hem.
+# Folds of the woman's dress: their number around it, and their depth at the hem.
 _FOLDS, _FOLD_DEPTH = 14, 0.045
 _WAIST, _HEM = 0.25, -1.6
 
@@ -66,7 +66,7 @@ def _woman() -> Field:
     skirt = union(
         ellipsoid((0.0, 0.04, 0.0), (0.36, 0.29, 0.3)),
         limb((-0.06, 0.04, -0.1, 0.33), (-0.06, 0.03, -0.8, 0.34), (-0.04, 0.03, -1.3, 0.42)),
-        # The bent leg shows under the cloth.
+        # The bent leg is visible under the cloth.
         limb((0.14, -0.04, -0.1, 0.26), (0.24, -0.26, -0.68, 0.2), (0.22, -0.1, -1.35, 0.3)),
         blend=0.18,
     )
@@ -112,13 +112,13 @@ def _base(radius: float) -> Field:
 
 
 def _into_folds(points: Points) -> Points:
-    """Widens and narrows what is below the waist, in folds that deepen towards the hem."""
+    """Scales the part below the waist periodically, in folds that deepen towards the hem."""
     share = np.clip((_WAIST - points[:, 2]) / (_WAIST - _HEM), 0.0, 1.0)
     angle = np.arctan2(points[:, 1], points[:, 0])
     away = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
     # Less near the axis, where all angles meet.
     depth = _FOLD_DEPTH * share * np.minimum(1.0, (away / 0.2) ** 2)
-    # At most as deep as `_FOLD_DEPTH`, so that a distance is hardly more than before.
+    # At most `_FOLD_DEPTH`, so that distances hardly increase.
     wider = np.maximum(away - depth * np.sin(_FOLDS * angle), 0.0) / away
     return points * np.stack([wider, wider, np.ones_like(wider)], axis=-1)
 

@@ -1,7 +1,7 @@
-"""Makes parts of fields (see `distance_fields`), and sets objects in the middle (NumPy only).
+"""Makes parts from fields (see `distance_fields`), and centres objects (NumPy only).
 
-*Core*: in a figure of clear glass, a smaller one of another medium, as of a bottle in the shape of
-an animal that is filled with tinted spirit.
+*Core*: a smaller solid of another medium inside a figure of clear glass, like the tinted spirit in
+a bottle in the shape of an animal.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,21 +18,21 @@ from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
 WALL = 0.09
 """Least thickness of the glass around a core."""
 
-# Of the cube that is looked at, beyond the largest radius: solids are scaled only afterwards.
+# Margin of the searched cube beyond the largest radius: solids are scaled only afterwards.
 _MARGIN = 0.4
 
-# At detail 1.
+# Spacing at detail 1.
 _SPACING = 0.036
 
-# A wall is sure to be found where the grid has a point in it.
+# Largest spacing as a share of the thinnest wall: walls are found if they contain a grid point.
 _OF_THINNEST = 0.75
 
-# Widths of the Gaussians that round all of a solid, and a core; and of the grids for that.
+# Widths of the Gaussians that smooth a complete solid, and a core; and spacings of their grids.
 _SOFTNESS, _SOFT_SPACING = 0.032, 0.04
 _CORE_SOFTNESS, _CORE_SPACING = 0.09, 0.07
 
-# A core is made this much smaller at first, since smoothing fills folds, and is cut back to the
-# least wall where it does more so, with this blending length.
+# Initial extra margin of a core, since smoothing fills folds; where it exceeds the margin, the core
+# is intersected with the least wall, with this blending length.
 _CORE_RESERVE, _CORE_BLEND = 0.025, 0.06
 
 
@@ -40,7 +40,7 @@ def spacing(detail: float, *, thinnest: float) -> float:
     """Returns the spacing of the grid for a detail, world units.
 
     Args:
-      detail: 1 for rendering.
+      detail: level of detail; 1 for rendering.
       thinnest: thickness of the thinnest wall, neck or gap.
     """
     return min(_SPACING / detail, _OF_THINNEST * thinnest)
@@ -58,12 +58,12 @@ def single_glass(
     """Returns an object that is one piece of glass.
 
     Args:
-      name: of the object.
-      field: makes its solid.
-      radius: to the farthest point, once the object is centred.
-      thinnest: see `spacing`.
-      fineness: a factor of the detail, for shapes with small features.
-      tint: see `ObjectPart`.
+      name: name of the object.
+      field: function that makes its solid.
+      radius: distance of the farthest point after centring.
+      thinnest: least thickness of any wall; see `spacing`.
+      fineness: factor of the detail, for shapes with small features.
+      tint: tint of the surface; see `ObjectPart`.
     """
 
     def make(detail: float) -> list[ObjectPart]:
@@ -89,15 +89,15 @@ def filled_glass(
     """Returns an object of clear glass around a core.
 
     Args:
-      name: of the object.
-      field: makes its solid.
-      radius: to the farthest point, once the object is centred.
-      thinnest: see `spacing`.
-      medium: a material, of the core.
-      tint: of the core's surface.
-      absorption: in the core.
-      wall: least thickness of the glass around it.
-      fineness: a factor of the detail.
+      name: name of the object.
+      field: function that makes its solid.
+      radius: distance of the farthest point after centring.
+      thinnest: least thickness of any wall; see `spacing`.
+      medium: material of the core.
+      tint: tint of the core's surface.
+      absorption: absorption in the core.
+      wall: least thickness of the glass around the core.
+      fineness: factor of the detail.
     """
     category: Category = "mmncvx"
 
@@ -114,12 +114,12 @@ def filled_glass(
 
 
 def softened(solid: Field) -> Field:
-    """Returns a solid without creases and fissures, which a mesh could not follow."""
+    """Returns a solid without creases and fissures, which a mesh could not represent."""
     return _blurred(solid, width=_SOFTNESS, grid=_SOFT_SPACING)
 
 
 def core(body: Field, wall: float) -> Field:
-    """Returns what lies deeper in a 1-Lipschitz field than a wall, without its details."""
+    """Returns the interior of a 1-Lipschitz field below a wall, without its details."""
     reserved = offset(body, -wall - _CORE_RESERVE)
     rounded = _blurred(reserved, width=_CORE_SOFTNESS, grid=_CORE_SPACING)
     return intersection(rounded, offset(body, -wall), blend=_CORE_BLEND)
@@ -127,17 +127,17 @@ def core(body: Field, wall: float) -> Field:
 
 def _blurred(solid: Field, *, width: float, grid: float) -> Field:
     values, low = sample(solid, spacing=grid, half_extent=RADIUS + _MARGIN)
-    # Where samples stop to be exact is many widths from the surface.
+    # Samples are exact up to many widths from the surface.
     field = gridded(gaussian_filter(values, width / grid), low, grid)
     return field._replace(centre=solid.centre, radius=solid.radius)
 
 
 def centred(parts: Sequence[ObjectPart], radius: float) -> list[ObjectPart]:
-    """Returns parts moved and scaled: in the middle of their box, and as far as a radius.
+    """Returns parts translated to the middle of their bounding box and scaled to a radius.
 
     Args:
-      parts: of one object.
-      radius: to the farthest vertex.
+      parts: parts of one object.
+      radius: distance of the farthest vertex afterwards.
     """
     points = np.concatenate([part.vertices for part in parts])
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))

@@ -1,7 +1,7 @@
 """Shapes of laboratory glass, as regions, from the bottom at height 0 upwards (NumPy only).
 
 Proportions are those of borosilicate glass in catalogues; the walls of small vessels are thicker
-than real ones, for an edge has to be rounded visibly.
+than real ones, since edges must be visibly rounded.
 """
 
 import numpy as np
@@ -12,31 +12,31 @@ from experiments.dataset.objects.revolve import Values, Warp, polygon, ramp
 from experiments.dataset.objects.vessels import FILM, Filled, filled, open_mouth, space_in
 
 MARK_SPACING = 0.3
-"""Between the rings on a graduated cylinder, world units."""
+"""Distance between the rings on a graduated cylinder, world units."""
 
 
 def beaker(*, level: float, wall: float = 0.052, film: float = FILM) -> Filled:
-    """Returns a low beaker, 2.72 high, as the Griffin beakers of 250 ml: 70 mm wide, 95 mm high."""
+    """Returns a low beaker, 2.72 high, like the 250 ml Griffin beaker: 70 mm wide, 95 mm high."""
     outline = region(filleted((0, 0), (1.0, 0, 0.16), (1.0, 2.5, 0.3), (1.09, 2.72), (0, 2.72)))
     space = space_in(outline, wall=wall, corner=0.12, mouth=open_mouth(outline, wall=wall))
     return filled(outline, space, level=level, rim=0.45 * wall, film=film)
 
 
 def conical_flask(*, level: float, wall: float = 0.052, film: float = FILM) -> Filled:
-    """Returns an Erlenmeyer flask, 3.2 high, as those of 250 ml: 85 mm wide, 145 mm high."""
+    """Returns an Erlenmeyer flask, 3.2 high, like that of 250 ml: 85 mm wide, 145 mm high."""
     outline = region(filleted((0, 0), (1.02, 0, 0.14), (0.35, 2.3, 0.4), (0.35, 3.2), (0, 3.2)))
     return _beaded(outline, 0.4, level, wall, film)
 
 
 def round_bottom_flask(*, level: float, wall: float = 0.052, film: float = FILM) -> Filled:
-    """Returns a round-bottom flask, 3.4 high, as those of 250 ml: 85 mm wide, 140 mm high."""
+    """Returns a round-bottom flask, 3.4 high, like that of 250 ml: 85 mm wide, 140 mm high."""
     globe = region(arc((0.0, 1.08), 1.08, -90.0, 90.0))
     outline = rounded(globe + box(0.34, 1.5, 3.4), concave=0.22)
     return _beaded(outline, 0.39, level, wall, film)
 
 
 def test_tube(*, level: float, wall: float = 0.05, film: float = FILM) -> Filled:
-    """Returns a test tube, 3.6 high, as those of 30 mm by 150 mm."""
+    """Returns a test tube, 3.6 high, like that of 30 mm by 150 mm."""
     outline = region(
         joined(arc((0.0, 0.36), 0.36, -90.0, 0.0), filleted((0.36, 0.36), (0.36, 3.6), (0, 3.6)))
     )
@@ -75,10 +75,10 @@ def spout(low: float, high: float, *, reach: float, width: float) -> Warp:
     """Returns the warp that draws a lip out to a spout at angle 0.
 
     Args:
-      low: height where it begins.
-      high: of the lip.
-      reach: by how much of the radius the lip is drawn out.
-      width: of the spout, in radians; beside it the lip is drawn in a little.
+      low: height where the spout begins.
+      high: height of the lip.
+      reach: distance by which the lip is drawn out, as a share of the radius.
+      width: width of the spout, in radians; next to it the lip is drawn in a little.
     """
 
     def warp(angle: Values, r: Values, z: Values) -> Values:

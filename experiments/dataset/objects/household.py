@@ -31,7 +31,7 @@ _PETALS = Look("plastic", tint=(0.97, 0.62, 0.68))
 
 
 def _make_wine_glass(detail: float) -> list[ObjectPart]:
-    """A red wine in a stemmed glass with a wide bowl."""
+    """Red wine in a stemmed glass with a wide bowl."""
     bowl = smooth(
         [
             (0.085, 1.35),

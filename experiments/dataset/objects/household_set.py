@@ -31,7 +31,7 @@ _STOPPER = Look("glass", tint=(0.9, 0.84, 0.97))
 
 
 def _tumbler(cut: Sampling, detail: float) -> list[ObjectPart]:
-    """A drink with a straw, which leans on nothing: it stays clear of the glass."""
+    """A drink with a straw that does not touch the glass."""
     outline = region(filleted((0, 0), (0.46, 0, 0.08), (0.58, 1.5), (0, 1.5)))
     mouth = open_mouth(outline, wall=0.05)
     space = space_in(outline, wall=0.05, floor=0.14, corner=0.08, mouth=mouth)
@@ -82,7 +82,7 @@ def _jar(cut: Sampling) -> list[ObjectPart]:
 
 
 def _flacon(cut: Sampling) -> list[ObjectPart]:
-    """Scent in a globe with a stopper of glass."""
+    """Scent in a globe with a glass stopper."""
     globe = region(arc((0.0, 0.42), 0.46, -90.0, 90.0))
     outline = rounded(globe - box(1.0, -1.0, 0.0), convex=0.06) + box(0.17, 0.5, 1.08)
     outline = rounded(outline, concave=0.1)

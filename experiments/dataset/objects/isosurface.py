@@ -1,7 +1,7 @@
-"""The surface of a field (see `distance_fields`) as triangles (NumPy only).
+"""Extracts the surface of a field (see `distance_fields`) as triangles (NumPy only).
 
-Marching cubes gives the right topology, but slivers. So its vertices are spread evenly along the
-surface, and put on the zero set by Newton steps along the gradient.
+Marching cubes gives the right topology, but slivers. So its vertices are distributed evenly along
+the surface, and projected to the zero set by Newton steps along the gradient.
 """
 
 from typing import NamedTuple
@@ -16,30 +16,29 @@ from experiments.dataset.objects.distance_fields import Distances, Field, Points
 from experiments.dataset.parts import RADIUS
 from refref_jax.reconstruct.isosurface import march
 
-# Fine cells along the edge of a coarse one; and how many of its edges from the surface a coarse
-# corner is looked around: sqrt(3) / 2 for a 1-Lipschitz field, and more for one that is nearly so.
+# Number of fine cells along the edge of a coarse one; and largest distance of coarse corners to the
+# surface, in coarse edges: sqrt(3) / 2 for a 1-Lipschitz field, and more for an approximate one.
 _COARSE = 4
 _NEAR = 1.5
 
-# Steps towards the mean of the neighbours, the share of the way that each goes, the longest one in
-# cells, and how much more a neighbour weighs for an angle between the normals, per radian; and
-# Newton steps after the last.
+# Number of smoothing steps, relaxation factor, largest step in cells, additional weight of a
+# neighbour per radian between the normals; and number of final Newton steps.
 _RELAXATIONS = 8
 _SHARE = 0.5
 _LONGEST = 0.3
 _STIFFENING = 6.0
 _NEWTON_STEPS = 2
 
-# Of the differences that the gradient is made of, in cells.
+# Step of the finite differences for gradients, in cells.
 _DIFFERENCE = 1e-3
 
 
 class Surface(NamedTuple):
-    """Triangles.
+    """A closed triangle mesh.
 
     Attributes:
-      vertices: world units.
-      faces: counter-clockwise seen from outside, closed.
+      vertices: positions, world units.
+      faces: vertex indices, counter-clockwise seen from outside, closed.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
@@ -50,20 +49,20 @@ def isosurface(field: Field, *, spacing: float, half_extent: float = RADIUS + 0.
     """Returns the zero set of a field: closed, outward, evenly triangulated.
 
     Args:
-      field: negative inside.
-      spacing: of the grid, and about the length of an edge. The thinnest wall should be thicker.
-      half_extent: of the cube around the origin that is looked at.
+      field: signed distance, negative inside.
+      spacing: spacing of the grid, and about the length of an edge; less than the thinnest wall.
+      half_extent: half the edge of the searched cube around the origin.
 
     Raises:
-      ValueError: if there is no surface in the cube, or it leaves the cube.
+      ValueError: if the cube contains no surface, or the surface leaves the cube.
     """
     values, low = sample(field, spacing=spacing, half_extent=half_extent)
     shell = np.ones(values.shape, bool)
     shell[1:-1, 1:-1, 1:-1] = False
     if not np.any(values < 0.0) or np.any(values[shell] < 0.0):
         raise ValueError(
-            f"No closed surface lies within {half_extent} of the origin. Check the measures of "
-            "the solid."
+            f"No closed surface lies within {half_extent} of the origin. Check the dimensions "
+            "of the solid."
         )
     vertices, faces = march(values, spacing)
     return Surface(settle(field, low + vertices, faces, spacing=spacing), faces)
@@ -74,8 +73,8 @@ def sample(
 ) -> tuple[Float[np.ndarray, "n n n"], Float[np.ndarray, "3"]]:
     """Returns a field's values on a grid, exact near the surface, and the grid's first point.
 
-    Elsewhere they are those of a coarser grid, of the right sign. The field must not change much
-    faster than 1 per unit.
+    Elsewhere values come from a coarser grid and have the right sign. The field must not change
+    much faster than 1 per unit.
     """
     cells = int(np.ceil(2.0 * half_extent / (_COARSE * spacing)))
     low = np.full(3, -0.5 * cells * _COARSE * spacing)
@@ -96,13 +95,13 @@ def sample(
 def settle(
     field: Field, vertices: Points, faces: Int[np.ndarray, "faces 3"], *, spacing: float
 ) -> Points:
-    """Returns vertices near a zero set, spread evenly and put on it."""
+    """Returns vertices near a zero set, distributed evenly and projected to it."""
     start, end = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
     for _ in range(_RELAXATIONS):
         vertices, normals = _towards_zero(field, vertices, spacing)
-        # Stiffer where the surface bends, so that edges are shorter there.
+        # Stiffer where the curvature is high, so that edges are shorter there.
         stiffness = 1.0 + _STIFFENING * np.linalg.norm(normals[start] - normals[end], axis=-1)
-        # Of a closed surface, every edge comes once in each direction.
+        # In a closed surface, every edge occurs once in each direction.
         pull = csr_array((stiffness, (start, end)), shape=(len(vertices),) * 2)
         mean = (pull @ vertices) / pull.sum(axis=1)[:, None]
         step = _SHARE * (mean - vertices)
@@ -114,13 +113,13 @@ def settle(
 
 
 def largest_piece(surface: Surface) -> Surface:
-    """Returns the connected piece with most vertices."""
+    """Returns the connected component with the most vertices."""
     labels = _pieces(surface)
     return without(surface, labels != np.argmax(np.bincount(labels)))
 
 
 def without(surface: Surface, dropped: Bool[np.ndarray, " vertices"]) -> Surface:
-    """Returns a surface less all faces that have a dropped vertex."""
+    """Returns a surface without all faces that have a dropped vertex."""
     faces = surface.faces[~np.any(dropped[surface.faces], axis=1)]
     used, numbers = np.unique(faces, return_inverse=True)
     return Surface(surface.vertices[used], numbers.reshape(-1, 3))
@@ -145,12 +144,12 @@ def _spread(cells: Bool[np.ndarray, "n n n"], times: int) -> Bool[np.ndarray, "m
 
 
 def _towards_zero(field: Field, vertices: Points, spacing: float) -> tuple[Points, Points]:
-    """Makes a Newton step along the gradient; returns the vertices, and its direction."""
+    """Makes a Newton step along the gradient; returns the vertices and the gradient's direction."""
     value, step = evaluate(field, vertices), _DIFFERENCE * spacing
     slope = np.stack([evaluate(field, vertices + step * e) - value for e in np.eye(3)], axis=-1)
     slope /= step
     squared = np.sum(slope**2, axis=-1, keepdims=True)
-    # At a kink of the field the differences may cancel; such a vertex waits for its neighbours.
+    # At a kink of the field the differences may cancel; such vertices do not move.
     squared = np.where(squared > 0.01, squared, np.inf)
     move = _shortened(-value[:, None] * slope / squared, _LONGEST * spacing)
     return vertices + move, slope / np.sqrt(squared)

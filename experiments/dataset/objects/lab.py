@@ -48,7 +48,7 @@ def _make_test_tube(detail: float) -> list[ObjectPart]:
 
 
 def _make_lab_equipment_set(detail: float) -> list[ObjectPart]:
-    """A flask, a tube and a beaker; walls and films are as thick as those of single ones."""
+    """A flask, a tube and a beaker; walls and films are as thick as those of the single vessels."""
     cut = sampling(detail, segments=72)
     flask = resized(conical_flask(level=1.3, wall=0.08, film=0.026), 0.66)
     tube = resized(test_tube(level=1.9, wall=0.075, film=0.024), 0.74)

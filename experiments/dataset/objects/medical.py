@@ -36,7 +36,7 @@ _PLUNGER = Look("plastic", tint=(0.72, 0.86, 0.95))
 
 
 def _make_ampoule(detail: float) -> list[ObjectPart]:
-    """Drawn shut above its bulb, over a narrow neck where it is broken off."""
+    """A sealed ampoule above a bulb and a narrow neck, where it is broken off."""
     outline = region(
         filleted(
             (0, 0),
@@ -86,7 +86,7 @@ def _side_of_cap(r: Values, z: Values) -> Values:
 
 
 def _make_syringe(detail: float) -> list[ObjectPart]:
-    """Half full, needle down, tilted."""
+    """A half full syringe, needle down, tilted."""
     cut = sampling(detail, segments=80)
     barrel, space = _barrel()
     shapes = filled(barrel, space, level=0.98, rim=0.024, meniscus=0.03)
@@ -101,7 +101,7 @@ def _make_syringe(detail: float) -> list[ObjectPart]:
 
 
 def _barrel() -> tuple[Region, Region]:
-    """Returns the outline of a barrel with a solid needle, and the space in it."""
+    """Returns the outline of a barrel with a solid needle, and the space inside."""
     outline = region(
         filleted(
             (0, -1.0),
@@ -120,7 +120,7 @@ def _barrel() -> tuple[Region, Region]:
 
 
 def _plunger() -> Region:
-    """Returns a piston with two sealing rings, a rod, and a rest for the thumb."""
+    """Returns a piston with two sealing rings, a rod, and a thumb rest."""
     piston = box(0.2, 1.03, 1.3) + ring(0.19, 1.09, 0.08) + ring(0.19, 1.24, 0.08)
     rest = box(0.36, 2.72, 2.83)
     return rounded(piston + box(0.16, 1.1, 2.8) + rest, convex=0.035, concave=0.04)

@@ -1,8 +1,8 @@
-"""Blender's monkey, Suzanne, as one closed body (NumPy only).
+"""Blender's monkey, Suzanne, as one closed mesh (NumPy only).
 
-Blender makes the mesh (`export_monkey`), and `monkey(load_suzanne(path))` the object of it.
-Its head has open eye sockets, in which eyes sit that are open at the back: each of the three is
-closed where it is open, and they are united with rounded seams.
+Blender writes the mesh (`export_monkey`), and `monkey(load_suzanne(path))` makes the object. Its
+head has open eye sockets with eyes that are open at the back: holes in each of the three pieces are
+closed, and the pieces are united with rounded seams.
 """
 
 import zipfile
@@ -24,21 +24,21 @@ from experiments.dataset.parts import Object, ObjectPart
 
 _RADIUS = 1.7
 
-# Suzanne is 2.7 wide as she comes, and looks to -y.
+# Suzanne is 2.7 wide in Blender, and faces -y.
 _HALF_EXTENT = 1.6
 
-# Of the grid that holds the distances: its spacing, the Gaussian's width, and the seams' blending.
+# The grid of distances: its spacing, the Gaussian's width, and the seams' blending length.
 _GRID, _SMOOTHING, _SEAM = 0.035, 0.03, 0.06
 
-# Triangles around a point, of nearest centres, that are looked at.
+# Number of candidate triangles per point: those with the nearest centres.
 _CANDIDATES = 10
 
 
 def load_suzanne(path: Path) -> Surface:
-    """Reads the file that `export_monkey` wrote.
+    """Reads the file written by `export_monkey`.
 
     Raises:
-      ValueError: if it is missing or is no such file.
+      ValueError: if it is missing or is another file.
     """
     try:
         with np.load(path, allow_pickle=False) as arrays:
@@ -54,7 +54,7 @@ def monkey(mesh: Surface) -> Object:
     """Returns the monkey made of a mesh of open pieces.
 
     Args:
-      mesh: from `load_suzanne`; within 1.6 of the origin along each axis.
+      mesh: mesh from `load_suzanne`; within 1.6 of the origin along each axis.
     """
 
     def make(detail: float) -> list[ObjectPart]:
@@ -104,7 +104,7 @@ def closed(piece: Surface) -> Surface:
 
 
 def _solid(surface: Surface) -> Field:
-    """Returns the distance to a closed surface of triangles that are small for its curvature."""
+    """Returns the distance to a closed surface with triangles that are small for its curvature."""
     mesh = trimesh.Trimesh(*surface, process=False)
     corners = surface.vertices[surface.faces]
     normals = np.asarray(mesh.vertex_normals)[surface.faces]
@@ -131,7 +131,7 @@ def _nearest(
     corners: Float[np.ndarray, "faces 3 3"],
     candidates: Int[np.ndarray, "points candidates"],
 ) -> tuple[Points, Int[np.ndarray, " points"]]:
-    """Returns the nearest point on some candidates for each point, and whose it is."""
+    """Returns the nearest point on the candidates for each point, and its candidate's index."""
     best, found, face = np.full(len(points), np.inf), np.zeros_like(points), candidates[:, 0].copy()
     for candidate in candidates.T:
         on = trimesh.triangles.closest_point(corners[candidate], points)

@@ -56,7 +56,7 @@ def _make_perfume_yellow(detail: float) -> list[ObjectPart]:
     )
     cut = sampling(detail)
     block = stretched(polygon(4, 0.2), 0.62)
-    # It narrows the bottle, so that a fade along the radius would fold the bottom.
+    # It narrows the bottle, so that a blend along the radius would fold the bottom.
     turned = Turned(
         section_angles(block, cut), faded(block, lambda r, z: 1.0 - ramp(z, 1.45, 2.25))
     )
@@ -67,12 +67,12 @@ def _make_perfume_yellow(detail: float) -> list[ObjectPart]:
 
 
 def _thick(outline: Region, shoulder: float, wall: float, floor: float) -> Region:
-    """Returns the space in a bottle whose neck is solid."""
+    """Returns the space in a bottle with a solid neck."""
     return space_in(outline - box(1.0, shoulder, 9.0), wall=wall, floor=floor, corner=0.1)
 
 
 def _cap(shape: Region, look: Look, section: Section, cut: Sampling) -> ObjectPart:
-    """Returns a cap with an outer section of its own, and a round bore."""
+    """Returns a cap with its own outer section, and a round bore."""
     fitted = faded(section, lambda r, z: ramp(r, 0.42, 0.5))
     return body("cap", look, shape, cut, turned=Turned(section_angles(section, cut), fitted))
 

@@ -1,6 +1,6 @@
 """Cat, fox and dog: figures of clear glass around a tinted core (NumPy only).
 
-Fields are those of `distance_fields`; z is up, and they look to -y.
+Fields are those of `distance_fields`; z is up, and they face -y.
 """
 
 from experiments.dataset.objects.distance_fields import Field, ellipsoid

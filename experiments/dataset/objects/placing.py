@@ -1,4 +1,4 @@
-"""Moves bodies and puts them side by side (NumPy only)."""
+"""Moves meshes and arranges them side by side (NumPy only)."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ Mesh = tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]
 
 
 def merged(meshes: Sequence[Mesh]) -> Mesh:
-    """Returns meshes as one of several pieces."""
+    """Returns one mesh with the pieces of several."""
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes[:-1])])
     return (
         np.concatenate([vertices for vertices, _ in meshes]),
@@ -21,7 +21,7 @@ def merged(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def united(parts: Sequence[ObjectPart]) -> ObjectPart:
-    """Returns parts of one look, which are apart, as one part with the name of the first."""
+    """Returns separate parts with the same look as one part with the name of the first."""
     vertices, faces = merged([(part.vertices, part.faces) for part in parts])
     return parts[0]._replace(vertices=vertices, faces=faces)
 
@@ -32,18 +32,18 @@ def moved(parts: Sequence[ObjectPart], by: tuple[float, float, float]) -> list[O
 
 
 def tilted(parts: Sequence[ObjectPart], *, axis: str, degrees: float) -> list[ObjectPart]:
-    """Returns parts turned around an axis of the world, `x`, `y` or `z`, through the origin."""
+    """Returns parts rotated around an axis of the world, `x`, `y` or `z`, through the origin."""
     matrix = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
     return [part._replace(vertices=part.vertices @ matrix.T) for part in parts]
 
 
 def enlarged(parts: Sequence[ObjectPart], factor: float) -> list[ObjectPart]:
-    """Returns parts scaled about the origin, and the gaps between them with them."""
+    """Returns parts scaled about the origin, including the gaps between them."""
     return [part._replace(vertices=part.vertices * factor) for part in parts]
 
 
 def centred(parts: Sequence[ObjectPart]) -> list[ObjectPart]:
-    """Returns parts moved so that the box around all of them has its middle at the origin."""
+    """Returns parts moved so that their common bounding box is centred at the origin."""
     vertices = np.concatenate([part.vertices for part in parts])
     middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     return [part._replace(vertices=part.vertices - middle) for part in parts]

@@ -1,8 +1,8 @@
-"""Bodies with flat faces: cube, pyramid, and a diamond of brilliant cut (NumPy only).
+"""Objects with flat faces: cube, pyramid, and a diamond of brilliant cut (NumPy only).
 
-Vocabulary of a cut stone: the *table* is its flat top, the *crown* what lies above the *girdle*,
-its widest part, and the *pavilion* what lies below, down to the *culet*. Angles are those of the
-main facets to the girdle's plane; shares are those of the girdle's diameter.
+Vocabulary of a cut stone: the *table* is its flat top, the *crown* the part above the *girdle*, its
+widest part, and the *pavilion* the part below, down to the *culet*. Angles are between the main
+facets and the girdle's plane; shares are of the girdle's diameter.
 """
 
 from collections.abc import Sequence
@@ -18,13 +18,13 @@ GREEN: Colour = (0.72, 0.95, 0.80)
 ROSE: Colour = (1.0, 0.74, 0.80)
 
 CROWN_ANGLE, PAVILION_ANGLE = np.radians(34.5), np.radians(40.75)
-"""As Tolkowsky has them for the brightest stone."""
+"""Tolkowsky's angles for the brightest stone."""
 
 TABLE, GIRDLE = 0.57, 0.03
 """Width of the table, and height of the girdle."""
 
-# Of the way from the table's edge to the girdle, how far the stars reach; of the way from the
-# girdle to the culet, how far the lower halves do.
+# Reach of the stars, as a share of the way from the table's edge to the girdle; reach of the lower
+# halves, as a share of the way from the girdle to the culet.
 _STAR, _LOWER_HALF = 0.5, 0.77
 
 _HALF_EDGE = 0.95
@@ -33,7 +33,7 @@ _GIRDLE_RADIUS = 1.7
 
 
 def cube(detail: float, *, tint: Colour = CLEAR) -> list[ObjectPart]:
-    """A cube along the axes; it has no more detail to show."""
+    """A cube along the axes; the same for all levels of detail."""
     del detail
     corners = _HALF_EDGE * np.array(
         [[x, y, z] for z in (-1.0, 1.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
@@ -43,7 +43,7 @@ def cube(detail: float, *, tint: Colour = CLEAR) -> list[ObjectPart]:
 
 
 def pyramid(detail: float, *, tint: Colour = CLEAR) -> list[ObjectPart]:
-    """A pyramid on a square; it has no more detail to show."""
+    """A pyramid on a square; the same for all levels of detail."""
     del detail
     low = -0.5 * _HEIGHT
     base = [[x * _BASE, y * _BASE, low] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
@@ -53,7 +53,7 @@ def pyramid(detail: float, *, tint: Colour = CLEAR) -> list[ObjectPart]:
 
 
 def diamond(detail: float) -> list[ObjectPart]:
-    """A round brilliant of 57 facets and 16 more on its girdle; it has no more detail to show."""
+    """A round brilliant of 57 facets and 16 more on its girdle, at all levels of detail."""
     del detail
     top, bottom = GIRDLE, -GIRDLE  # the girdle's diameter is 2, here
     star = np.cos(np.pi / 8.0) * TABLE
@@ -93,7 +93,7 @@ def diamond(detail: float) -> list[ObjectPart]:
 
 
 def _ring(count: int, shift: int, radius: float, height: float) -> Float[np.ndarray, "count 3"]:
-    """Returns points of a circle, shifted by sixteenths of it."""
+    """Returns points on a circle, shifted by sixteenths of it."""
     angle = 2.0 * np.pi * (np.arange(count) / count + shift / 16.0)
     return np.stack(
         [radius * np.cos(angle), radius * np.sin(angle), np.full(count, height)], axis=-1
@@ -107,7 +107,7 @@ def _flat(
     polygons: Sequence[Sequence[int]],
     tint: Colour,
 ) -> ObjectPart:
-    """Makes a part of convex polygons, each a fan of triangles."""
+    """Makes a part from convex polygons, each a fan of triangles."""
     faces = [
         [polygon[0], polygon[i], polygon[i + 1]]
         for polygon in polygons

@@ -1,9 +1,9 @@
-"""Curves in the half plane of a turned body (NumPy and SciPy only).
+"""Profile curves in the half plane of a turned object (NumPy and SciPy only).
 
 A point is (r, z): its distance from the axis, and its height. A *curve* is a dense polyline. A
-*profile* is a curve from the axis to the axis with the body on its left, so that an outer one goes
-from the bottom outwards and up; one that ends where it begins is a ring around the axis instead. A
-*fillet* is an arc in place of a corner, tangent to both of its sides.
+*profile* is a curve from the axis to the axis with the object on its left, so that an outer one
+goes from the bottom outwards and up; one that ends where it begins is a ring around the axis
+instead. A *fillet* is an arc that replaces a corner, tangent to both of its sides.
 """
 
 from collections.abc import Sequence
@@ -18,28 +18,28 @@ from scipy.ndimage import uniform_filter1d
 Curve = Float[np.ndarray, "points 2"]
 Corner = tuple[float, float] | tuple[float, float, float]
 
-# How finely curves are drawn before they are sampled: arcs, and splines in world units.
+# Resolution of curves before they are resampled: arcs, and splines in world units.
 _ARC_STEP = np.radians(2.0)
 _SPLINE_STEP = 0.004
 
-# Where a curve's bending is looked at, and over what length it is averaged, in world units.
+# Step at which a curve's curvature is evaluated, and window of its average, in steps.
 _LOOK_STEP = 0.001
 _LOOK_WINDOW = 9
 
-# A spacing grows by this much per unit of length at most, so that neighbours are alike: a long edge
-# beside a fillet would carry the fillet's normals far into a flat.
+# Largest growth of the spacing per unit of length, so that neighbours are similar: a long edge next
+# to a fillet would carry the fillet's normals far into a flat.
 _GROWTH = 0.4
 
-# A sharp turn left in a curve is spread over the window; no spacing is finer than this.
+# Least spacing: a sharp left turn in a curve is spread over the window.
 _FINEST = 0.002
 
 
 class Sampling(NamedTuple):
-    """How finely a turned body is cut up.
+    """Resolution of a turned object.
 
     Attributes:
       edge: longest edge along a profile, in world units.
-      turn: most that a profile turns in one edge, in radians.
+      turn: largest turn of a profile in one edge, in radians.
       segments: number of edges around the axis.
     """
 
@@ -52,8 +52,8 @@ def sampling(detail: float, *, segments: int = 96) -> Sampling:
     """Returns the sampling of a detail; the number of triangles grows with its square.
 
     Args:
-      detail: 1 is what is rendered.
-      segments: around the axis at detail 1; at least 16 are left of them.
+      detail: level of detail; 1 is the one that is rendered.
+      segments: number of segments around the axis at detail 1; never reduced below 16.
     """
     return Sampling(
         edge=0.08 / detail,
@@ -66,10 +66,10 @@ def filleted(*corners: Corner) -> Curve:
     """Returns a polyline with rounded corners.
 
     Args:
-      corners: (r, z), or (r, z, radius of the fillet), in world units.
+      corners: tuples (r, z) or (r, z, radius of the fillet), in world units.
 
     Raises:
-      ValueError: if a fillet is longer than the sides have room for.
+      ValueError: if a fillet is too long for the adjacent sides.
     """
     points = np.array([corner[:2] for corner in corners], np.float64)
     radii = np.array([corner[2] if len(corner) == 3 else 0.0 for corner in corners])
@@ -98,9 +98,9 @@ def smooth(points: Sequence[tuple[float, float]] | Curve, *, ends: str = "axis")
     """Returns a smooth curve through points: a cubic spline over their chord length.
 
     Args:
-      points: (r, z), in world units.
-      ends: `axis` if it shall meet the axis perpendicularly where it ends there, `upright` if it
-        shall, at ends off the axis, run parallel to it as well.
+      points: points (r, z), in world units.
+      ends: boundary condition: `axis` to meet the axis perpendicularly at ends on it, `upright` to
+        be parallel to the axis at ends off it as well.
     """
     knots = np.asarray(points, np.float64)
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
@@ -128,10 +128,10 @@ def joined(*curves: Curve) -> Curve:
 
 
 def resampled(curve: Curve, cut: Sampling) -> Curve:
-    """Returns a curve with edges as long as its bending allows; both ends stay.
+    """Returns a curve with edge lengths adapted to its curvature; both ends are kept.
 
-    An edge turns by no more than `cut.turn`, is no longer than `cut.edge`, and not much longer than
-    the one before.
+    An edge turns by at most `cut.turn`, is at most `cut.edge` long, and not much longer than the
+    previous one.
     """
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
     looks = np.linspace(0.0, along[-1], max(8, int(np.ceil(along[-1] / _LOOK_STEP))) + 1)
@@ -170,7 +170,7 @@ def _at(
 def _fillet(
     corner: Float[np.ndarray, "2"], way: Float[np.ndarray, "2"], turn: float, radius: float
 ) -> Curve:
-    """Returns the arc in place of a corner that is reached along a way; the corner without one."""
+    """Returns the arc that replaces a corner; without a fillet, the corner itself."""
     if radius == 0.0 or turn == 0.0:
         return corner[None]
     start = corner - radius * abs(np.tan(turn / 2.0)) * way
@@ -181,7 +181,7 @@ def _fillet(
 
 
 def _end(point: Float[np.ndarray, "2"], sign: float, ends: str) -> tuple[int, tuple[float, float]]:
-    """Returns the boundary condition of a spline: its derivative's order, and the derivative."""
+    """Returns the boundary condition of a spline: its derivative's order and value."""
     if point[0] == 0.0:
         return 1, (sign, 0.0)
     return (1, (0.0, 1.0)) if ends == "upright" else (2, (0.0, 0.0))

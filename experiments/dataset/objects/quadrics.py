@@ -1,7 +1,7 @@
-"""Round bodies that a formula gives: ball, cylinder, torus (NumPy only).
+"""Round objects in closed form: ball, cylinder, torus (NumPy only).
 
-Where a curved surface goes over in a flat one, a narrow ring of the flat one follows, so that
-vertex normals, which are means over a vertex's faces, lean over nowhere else.
+Between a curved and a flat surface, a narrow ring of the flat one is inserted, so that vertex
+normals, which are means over a vertex's faces, deviate from the exact ones only there.
 """
 
 from functools import partial
@@ -25,25 +25,25 @@ CYLINDER_RADIUS, CYLINDER_HALF_HEIGHT, CYLINDER_FILLET = 0.95, 1.2, 0.08
 
 TORUS_RADIUS, TORUS_THICKNESS = 1.25, 0.5
 
-# At detail 1: pieces of an icosahedron's edge, sections of a turn, and segments of a fillet.
+# At detail 1: subdivisions of an icosahedron's edge, segments per turn, and segments of a fillet.
 _BALL_PIECES, _SECTIONS, _FILLET_SEGMENTS = 48, 192, 12
 
-# Width of a ring of support, and its share of the distance to the next one.
+# Width of a support ring, and its share of the distance to the next one.
 _SUPPORT = 0.01
 
 
 def ball(detail: float, *, tint: Colour = CLEAR) -> list[ObjectPart]:
-    """A ball of 20 n^2 triangles, none much larger than another."""
+    """A ball of 20 n^2 triangles of similar size."""
     pieces = max(2, round(_BALL_PIECES * detail))
     rough = trimesh.creation.icosahedron()
     corners = np.asarray(rough.vertices)[rough.faces]
     shares = [(i, j, pieces - i - j) for i in range(pieces + 1) for j in range(pieces + 1 - i)]
     points = np.einsum("sc,fcx->fsx", np.array(shares) / pieces, corners).reshape(-1, 3)
     points /= np.linalg.norm(points, axis=-1, keepdims=True)
-    # Points of an edge come once from either side.
+    # Points of an edge occur once from either side.
     _, first = np.unique(np.round(points, 9) + 0.0, axis=0, return_index=True)
     vertices = BALL_RADIUS * points[np.sort(first)]
-    # Of points on a sphere, the hull is the best triangulation.
+    # For points on a sphere, the convex hull is the best triangulation.
     return [_smooth(_outward_hull(vertices), tint)]
 
 
@@ -66,7 +66,7 @@ def cylinder(detail: float, *, tint: Colour = CLEAR) -> list[ObjectPart]:
 
 
 def torus(detail: float, *, tint: Colour = CLEAR) -> list[ObjectPart]:
-    """A ring that lies flat."""
+    """A horizontal ring."""
     sections = max(12, round(_SECTIONS * detail))
     around = max(8, round(_SECTIONS * detail * TORUS_THICKNESS / TORUS_RADIUS))
     angle = 2.0 * np.pi * np.arange(around) / around
@@ -83,7 +83,7 @@ def _smooth(surface: Surface, tint: Colour) -> ObjectPart:
 
 
 def _supported(half: float) -> Float[np.ndarray, " heights"]:
-    """Returns heights between two ends, which are not among them, close to these and wide apart."""
+    """Returns heights between two ends (excluded), dense near the ends and sparse between them."""
     inner = half - _SUPPORT
     return np.concatenate([[-inner], np.linspace(-inner, inner, 6)[1:-1], [inner]])
 
@@ -99,7 +99,7 @@ def _outward_hull(vertices: Float[np.ndarray, "vertices 3"]) -> Surface:
 def _turned(
     profile: Float[np.ndarray, "rings 2"], sections: int, ends: tuple[float, float]
 ) -> Surface:
-    """Turns a profile around the z axis, from bottom to top, and closes it there at two heights."""
+    """Revolves a profile around the z axis, from bottom to top, and closes it at both ends."""
     grid = np.arange(len(profile) * sections).reshape(len(profile), sections)
     low, high = grid.size, grid.size + 1
     after = np.roll(np.arange(sections), -1)
@@ -121,7 +121,7 @@ def _points(profile: Float[np.ndarray, "rings 2"], sections: int) -> Float[np.nd
 
 
 def _quads(grid: np.ndarray) -> np.ndarray:
-    """Returns two triangles for every cell of rings of vertices."""
+    """Returns two triangles for every cell between rings of vertices."""
     below, above = grid[:-1], grid[1:]
     right_below, right_above = np.roll(below, -1, axis=1), np.roll(above, -1, axis=1)
     first = np.stack([below, right_below, right_above], axis=-1)

@@ -1,8 +1,8 @@
-"""Cross-sections of turned bodies, combined as sets of points (Clipper2, through manifold3d).
+"""Boolean operations on cross-sections of turned objects (Clipper2, through manifold3d).
 
-A *region* is the section of a body through its axis, both halves of it. Walls are regions shrunk by
-their thickness, cavities are subtracted, and edges are rounded by rolling a disc along them: all of
-it exact but for arcs that are drawn with corners, and never crossing itself.
+A *region* is the section of an object through its axis, both halves of it. Walls are regions shrunk
+by their thickness, cavities are subtracted, and edges are rounded by rolling a disc along them: all
+operations are exact up to the polygons of arcs, and free of self-intersections.
 """
 
 from typing import TypeAlias
@@ -17,22 +17,22 @@ Region: TypeAlias = CrossSection
 # Wider and higher than any object.
 _FAR = 10.0
 
-# Corners of a full circle that replace a corner of a region. Even, so that both halves are alike.
+# Number of corners of a full circle that rounds a corner of a region. Even, for symmetric halves.
 _CIRCLE = 240
 
-# Points that Clipper leaves closer than this to the line through their neighbours are noise, and so
-# is a distance from the axis below it. World units.
+# Tolerance of Clipper, world units: points closer than this to the line through their neighbours
+# are noise, and so are smaller distances from the axis.
 _NOISE = 1e-6
 
 
 def region(profile: Curve) -> Region:
-    """Returns the section of the body in a profile, from the axis to the axis."""
+    """Returns the section of the object bounded by a profile, from the axis to the axis."""
     ring = np.concatenate([profile, (profile * [-1.0, 1.0])[::-1]])
     return CrossSection([ring], FillRule.NonZero)
 
 
 def ring(radius: float, height: float, thickness: float) -> Region:
-    """Returns the section of a round ring: its middle's distance from the axis, and height."""
+    """Returns the section of a round ring, given its distance from the axis and height."""
     disc = CrossSection.circle(0.5 * thickness, _CIRCLE)
     return disc.translate((radius, height)) + disc.translate((-radius, height))
 
@@ -44,19 +44,19 @@ def box(radius: float, low: float, high: float) -> Region:
 
 
 def below(shape: Region, height: float) -> Region:
-    """Returns what of a region lies below a height."""
+    """Returns the part of a region below a height."""
     return shape ^ box(_FAR, -_FAR, height)
 
 
 def above(shape: Region, height: float) -> Region:
-    """Returns what of a region lies above a height."""
+    """Returns the part of a region above a height."""
     return shape ^ box(_FAR, height, _FAR)
 
 
 def offset(shape: Region, distance: float) -> Region:
-    """Returns the points no farther from a region than a distance, rounded at convex corners.
+    """Returns the points within a distance of a region, rounded at convex corners.
 
-    With a negative distance, those of the region that are at least as far from its boundary.
+    With a negative distance, the points of the region at least that far from its boundary.
     """
     if distance == 0.0:
         return shape
@@ -67,7 +67,7 @@ def offset(shape: Region, distance: float) -> Region:
 def rounded(shape: Region, *, convex: float = 0.0, concave: float = 0.0) -> Region:
     """Returns a region whose edges have at least these radii.
 
-    What is thinner than twice the convex radius disappears, and gaps thinner than twice the concave
+    Parts thinner than twice the convex radius disappear, and gaps thinner than twice the concave
     one are filled.
     """
     opened = offset(offset(shape, -convex), convex) if convex else shape
@@ -81,17 +81,17 @@ def top(shape: Region) -> tuple[float, float]:
 
 
 def profiles(shape: Region) -> list[Curve]:
-    """Returns the profiles of a region's boundary, outer ones and those of cavities."""
+    """Returns the profiles of a region's boundary: outer ones and those of cavities."""
     half = shape ^ CrossSection.square((_FAR, 2.0 * _FAR)).translate((0.0, -_FAR))
     found = []
     for polygon in half.to_polygons():
         found += _chains(np.asarray(polygon, np.float64))
-    # Clipper's order of polygons is not part of its promises.
+    # Clipper does not guarantee an order of polygons.
     return sorted(found, key=lambda curve: (-float(np.max(curve[:, 0])), tuple(curve[0])))
 
 
 def _chains(polygon: Curve) -> list[Curve]:
-    """Returns the pieces of a polygon between its edges along the axis, or the closed polygon."""
+    """Returns the pieces of a polygon between its edges on the axis, or the closed polygon."""
     on_axis = np.abs(polygon[:, 0]) < _NOISE
     polygon = np.where(on_axis[:, None], polygon * [0.0, 1.0], polygon)
     axial = on_axis & np.roll(on_axis, -1)

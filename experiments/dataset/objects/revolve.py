@@ -1,8 +1,8 @@
-"""Surfaces of revolution, and what becomes of them if the radius depends on the angle (NumPy only).
+"""Surfaces of revolution, also with a radius that depends on the angle (NumPy only).
 
-A *section* tells the shape across the axis: a factor of the radius at each angle. A *warp* is the
-radius that a point (r, z) of the profile gets at an angle; it leaves the axis where it is, and
-grows with r, so that what lies inside something still does afterwards.
+A *section* is the shape perpendicular to the axis: a factor of the radius at each angle. A *warp*
+maps a point (r, z) of the profile and an angle to a radius; it keeps the axis, and increases with
+r, so that nested shapes remain nested.
 """
 
 from collections.abc import Callable
@@ -24,12 +24,12 @@ _SHORTER = 1.0 - 1e-6
 
 
 class Turned(NamedTuple):
-    """How a profile becomes a surface.
+    """Parameters that turn a profile into a surface.
 
     Attributes:
-      angles: of its meridians, ascending, in radians over less than a full turn.
-      warp: radius at an angle of each point of the profile.
-      twist: by which the surface turns around its axis, radians per world unit of height.
+      angles: angles of the meridians, ascending, in radians over less than a full turn.
+      warp: radius of each point of the profile at an angle.
+      twist: rotation of the surface around its axis, radians per world unit of height.
     """
 
     angles: Float[np.ndarray, " segments"]
@@ -38,7 +38,7 @@ class Turned(NamedTuple):
 
 
 def round_about(cut: Sampling) -> Turned:
-    """Returns what turns a profile into a surface of revolution."""
+    """Returns the parameters of a plain surface of revolution."""
     return Turned(even_angles(cut))
 
 
@@ -46,9 +46,9 @@ def even_angles(cut: Sampling, *, lobes: int = 1, each: int = 8) -> Float[np.nda
     """Returns evenly spaced angles.
 
     Args:
-      cut: how finely; a round body has that many.
-      lobes: of the section, each of which gets as many.
-      each: edges of a lobe where a round body has 96 in all; at least 6 are left of them.
+      cut: sampling of the surface; a round object has one angle per segment.
+      lobes: number of lobes of the section, each with as many angles.
+      each: edges of a lobe where a round object has 96 in all; never reduced below 6.
     """
     share = max(cut.segments / lobes, each * cut.segments / 96.0, 6.0)
     count = lobes * int(np.ceil(share))
@@ -56,7 +56,7 @@ def even_angles(cut: Sampling, *, lobes: int = 1, each: int = 8) -> Float[np.nda
 
 
 def faded(section: Section, share: Callable[[Values, Values], Values]) -> Warp:
-    """Returns the warp that has a share of a section, 0 to 1, at each (r, z)."""
+    """Returns the warp that applies a share of a section, 0 to 1, at each (r, z)."""
     return lambda angle, r, z: r * (1.0 + share(r, z) * (section(angle) - 1.0))
 
 
@@ -67,7 +67,7 @@ def ramp(value: Values, low: float, high: float) -> Values:
 
 
 def within(value: Values, low: float, high: float, *, soft: float) -> Values:
-    """Returns 1 in a range, 0 outside of it, and a smooth step over a length inside its ends."""
+    """Returns 1 in a range, 0 outside, and smooth steps of a given length inside its ends."""
     return ramp(value, low, low + soft) * (1.0 - ramp(value, high - soft, high))
 
 
@@ -75,11 +75,11 @@ def polygon(sides: int, corner: float) -> Section:
     """Returns a regular polygon with rounded corners; 1 in the middle of each flat side.
 
     Args:
-      sides: number of them; the first looks along angle 0.
+      sides: number of sides; the normal of the first has angle 0.
       corner: radius of the corners, where the sides' distance from the axis is 1.
     """
     half = np.pi / sides
-    # Of the corner's arc, seen from the axis: where it is, and where it begins.
+    # The corner's arc, seen from the axis: its middle angle, and the angle where it begins.
     centre = (1.0 - corner) / np.cos(half)
     begin = np.arctan2((1.0 - corner) * np.tan(half), 1.0)
 
@@ -94,13 +94,13 @@ def polygon(sides: int, corner: float) -> Section:
 
 
 def waves(count: int, depth: float, *, sharpness: float = 0.0) -> Section:
-    """Returns a section with lobes: from 1 at the ridges, of which one is at angle 0.
+    """Returns a section with lobes: 1 at the ridges, one of which is at angle 0.
 
     Args:
       count: number of lobes.
-      depth: of the valleys, as a share of the radius.
-      sharpness: 0 for a cosine; towards 1 the ridges become narrow and the valleys wide, towards -1
-        the other way round.
+      depth: depth of the valleys, as a share of the radius.
+      sharpness: shape of the ridges: 0 is a cosine; towards 1 they become narrow and the valleys
+        wide, towards -1 the other way round.
     """
 
     def factor(angle: Values) -> Values:
@@ -112,7 +112,7 @@ def waves(count: int, depth: float, *, sharpness: float = 0.0) -> Section:
 
 
 def stretched(section: Section, ratio: float) -> Section:
-    """Returns a section that is made wider across angle 0 by a ratio, or narrower below 1."""
+    """Returns a section widened across angle 0 by a ratio, or narrowed by a ratio below 1."""
 
     def factor(angle: Values) -> Values:
         along, across = np.cos(angle), np.sin(angle) / ratio
@@ -122,11 +122,11 @@ def stretched(section: Section, ratio: float) -> Section:
 
 
 def section_angles(section: Section, cut: Sampling) -> Float[np.ndarray, " segments"]:
-    """Returns angles that follow a section: close together where it bends."""
+    """Returns angles adapted to a section: dense where its curvature is high."""
     angles = np.linspace(0.0, _TAU, 4097)
     curve = section(angles)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     curve[-1] = curve[0]
-    # A round section gets as many meridians as one of revolution.
+    # A round section gets as many meridians as a surface of revolution.
     spaced = cut._replace(edge=_TAU / cut.segments, turn=min(1.5 * _TAU / cut.segments, 0.5))
     points = resampled(curve, spaced)[:-1]
     return np.unwrap(np.arctan2(points[:, 1], points[:, 0]))
@@ -135,20 +135,20 @@ def section_angles(section: Section, cut: Sampling) -> Float[np.ndarray, " segme
 def revolve(
     profile: Curve, turned: Turned
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
-    """Returns a closed surface around the body on the left of a profile.
+    """Returns a closed surface around the object on the left of a profile.
 
     Ends on the axis become poles with a fan of triangles; a profile that ends where it begins gives
     a ring.
 
     Raises:
-      ValueError: if the profile touches the axis between its ends, or ends off it.
+      ValueError: if the profile touches the axis between its ends, or ends off the axis.
     """
     loop = bool(np.all(profile[0] == profile[-1]))
     middle = profile[:-1] if loop else profile[1:-1]
     if np.any(middle[:, 0] <= 0.0) or not (loop or np.all(profile[[0, -1], 0] == 0.0)):
         raise ValueError(
-            "A profile touches the axis between its ends, or ends beside it. Let it begin and end "
-            "at r = 0, or where it began, and nowhere else."
+            "A profile touches the axis between its ends, or ends off the axis. Let both ends be "
+            "at r = 0, or at the same point, and no other point at r = 0."
         )
     count = len(turned.angles)
     vertices = _rings(middle, turned).reshape(-1, 3)
@@ -176,7 +176,7 @@ def _rings(middle: Curve, turned: Turned) -> Float[np.ndarray, "rings segments 3
 def _quads(
     vertices: Float[np.ndarray, "vertices 3"], lattice: Int[np.ndarray, "rings segments"]
 ) -> Int[np.ndarray, "faces 3"]:
-    """Returns the quadrilaterals between rings, each cut along its shorter diagonal."""
+    """Returns the triangles between rings: quadrilaterals, each cut along its shorter diagonal."""
     a, d = lattice[:-1], lattice[1:]
     b, c = np.roll(a, -1, axis=1), np.roll(d, -1, axis=1)
     ac = np.linalg.norm(vertices[a] - vertices[c], axis=-1)

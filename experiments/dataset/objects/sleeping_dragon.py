@@ -1,7 +1,7 @@
 """A dragon asleep, curled up with its head on its tail: glass around a tinted core (NumPy only).
 
-Fields are those of `distance_fields`; z is up. The spine goes around the z axis: an angle of 0 is
-where x points, and the head lies towards -y.
+Fields are those of `distance_fields`; z is up. The spine goes around the z axis: angle 0 is +x, and
+the head lies towards -y.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from experiments.dataset.objects.field_operations import moved, subtraction, tur
 from experiments.dataset.objects.formed import filled_glass
 from experiments.dataset.objects.space_curves import limb, through
 
-# Along the spine: angle (degrees), distance from the axis, height, and radius of the body.
+# Along the spine: angle (degrees), distance from the axis, height, and radius of the trunk.
 _SPINE = np.array(
     [
         (-84.0, 1.18, -0.06, 0.2),
@@ -33,7 +33,7 @@ _SPINE = np.array(
     ]
 )
 
-# Spikes stand between these angles, every so many degrees, and lean outwards.
+# Spikes are placed between these angles, at this step in degrees, and lean outwards.
 _FIRST_SPIKE, _LAST_SPIKE, _SPIKE_STEP = -52.0, 250.0, 16.0
 _SPIKE_LENGTH = 0.26
 
@@ -77,7 +77,7 @@ def _limbs() -> list[Field]:
 
 
 def _head() -> Field:
-    """Returns the head, on its way back around the ring, on top of the tail."""
+    """Returns the head, at the end of the ring, on top of the tail."""
     skull = union(
         ellipsoid((0.0, 0.0, 0.06), (0.27, 0.32, 0.24)),
         limb((0.0, -0.1, 0.02, 0.23), (0.0, -0.42, -0.03, 0.17), (0.0, -0.66, -0.05, 0.14)),
@@ -102,7 +102,7 @@ def _head() -> Field:
         for side in (-1.0, 1.0)
     ]
     head = union(skull, *horns, blend=0.06)
-    # Its muzzle, at -y, comes to point along the ring, over the tail.
+    # Its muzzle, at -y, is turned to point along the ring, over the tail.
     head = turned(head, Rotation.from_euler("z", -80.0, degrees=True))
     return moved(head, (0.02, -1.22, -0.03))
 
@@ -116,7 +116,7 @@ def _arrow() -> Field:
 
 
 def _at(degrees: float, away: float, solid: Field) -> Field:
-    """Returns a solid that is turned to look along the ring, somewhere on it."""
+    """Returns a solid moved to the ring and rotated along it."""
     return moved(
         turned(solid, Rotation.from_euler("z", degrees, degrees=True)),
         _ring_point(degrees, away, 0.0),

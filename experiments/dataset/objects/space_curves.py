@@ -6,18 +6,18 @@ from scipy.interpolate import PchipInterpolator, make_interp_spline
 
 from experiments.dataset.objects.distance_fields import Field, tube
 
-# Points of a curve between two of its joints.
+# Number of points of a curve between two of its joints.
 _BETWEEN = 8
 
 
 def through(
     joints: Float[np.ndarray, "joints dimensions"], *, between: int = _BETWEEN
 ) -> Float[np.ndarray, "points dimensions"]:
-    """Returns points of the smooth curve through some joints, which are among them.
+    """Returns points of the smooth curve through some joints, including these.
 
     Args:
-      joints: two or more; with two, the curve is straight.
-      between: pieces of the curve from each joint to the next.
+      joints: two or more points; with two, the curve is straight.
+      between: number of segments between consecutive joints.
     """
     at = _parameters(joints)
     spline = make_interp_spline(at, joints, k=min(3, len(joints) - 1))
@@ -28,8 +28,8 @@ def limb(*joints: tuple[float, float, float, float]) -> Field:
     """Returns a tube along the smooth curve through joints.
 
     Args:
-      *joints: positions and radii, as (x, y, z, radius). Between them, no radius is larger or
-        smaller than at both of its neighbours.
+      *joints: positions and radii, as (x, y, z, radius). Radii between them are within the range of
+        the two neighbours.
     """
     table = np.asarray(joints, float)
     at = _parameters(table[:, :3])
@@ -38,7 +38,7 @@ def limb(*joints: tuple[float, float, float, float]) -> Field:
 
 
 def _parameters(joints: Float[np.ndarray, "joints dimensions"]) -> Float[np.ndarray, " joints"]:
-    """Returns the centripetal parameters of joints, which keep a spline from making loops."""
+    """Returns the centripetal parameters of joints, which prevent loops of the spline."""
     steps = np.sqrt(np.linalg.norm(np.diff(joints, axis=0), axis=-1))
     return np.concatenate([[0.0], np.cumsum(steps)])
 

@@ -1,7 +1,7 @@
-"""Straight rods that stand in a liquid: one piece in it, and one above.
+"""Straight rods in a liquid: one piece in it, and one above.
 
-A rod does not pierce the surface of a liquid, for then a surface would lie half in one medium and
-half in another; its lower piece ends below the surface, its upper piece goes on in the same line.
+A rod must not intersect the surface of a liquid, since its own surface would then lie in two media;
+its lower piece ends below the surface, and its upper piece continues along the same line.
 """
 
 from typing import NamedTuple
@@ -19,9 +19,9 @@ class Stick(NamedTuple):
     """A straight line with a thickness.
 
     Attributes:
-      origin: a point of it, in world units.
-      way: where it goes; its upward component is positive.
-      radius: of the stick.
+      origin: point on the line, in world units.
+      way: direction; its upward component is positive.
+      radius: radius of the stick.
     """
 
     origin: tuple[float, float, float]
@@ -30,14 +30,14 @@ class Stick(NamedTuple):
 
 
 def bundle(count: int, *, waist: float, height: float, slope: float, radius: float) -> list[Stick]:
-    """Returns sticks that lean all around, closest to each other at a height.
+    """Returns sticks that lean in all directions, closest to each other at a height.
 
     Args:
       count: number of sticks.
-      waist: distance of each from the axis where they are closest.
-      height: of the waist.
-      slope: sideways per upwards; sticks slightly differ, as ones that were put there by hand.
-      radius: of each.
+      waist: distance of each stick from the axis where they are closest.
+      height: height of the waist.
+      slope: sideways per upwards; it varies slightly between sticks, as if placed by hand.
+      radius: radius of each stick.
     """
     sticks = []
     for number in range(count):
@@ -51,7 +51,7 @@ def bundle(count: int, *, waist: float, height: float, slope: float, radius: flo
 def piece(
     name: str, look: Look, stick: Stick, low: float, high: float, detail: float
 ) -> ObjectPart:
-    """Returns the piece of a stick between two heights, measured along its middle."""
+    """Returns the piece of a stick between two heights, measured along its axis."""
     way = np.asarray(stick.way)
     stretch = float(np.linalg.norm(way) / way[2])
     shape = rod(stick.radius, 0.0, (high - low) * stretch)
@@ -61,7 +61,7 @@ def piece(
 def along(
     name: str, look: Look, shape: Region, stick: Stick, low: float, detail: float, **turned
 ) -> ObjectPart:
-    """Returns a body whose axis, from height 0 on, lies on a stick from a height on."""
+    """Returns a part whose axis, from height 0, is moved to a stick from a given height."""
     part = body(name, look, shape, sampling(detail, segments=32), **turned)
     start = np.asarray(stick.origin) + (low - stick.origin[2]) / stick.way[2] * np.asarray(
         stick.way
@@ -70,7 +70,7 @@ def along(
 
 
 def _frame(way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Returns the rotation that takes the axis z along a way, without turning around it."""
+    """Returns the rotation that takes the z axis to a direction, without a twist around it."""
     z = way / np.linalg.norm(way)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)

@@ -1,7 +1,7 @@
 """Teapot, teacup, water pitcher and kettle: hollow, with handles and spouts (NumPy only).
 
-Each is one piece of glass, open where one pours. Fields are those of `distance_fields`; the spout
-points to x, z is up.
+Each is one piece of glass, open at mouth and spout. Fields are those of `distance_fields`; the
+spout points to x, z is up.
 """
 
 import numpy as np
@@ -26,14 +26,14 @@ from experiments.dataset.objects.field_operations import (
 from experiments.dataset.objects.formed import single_glass
 from experiments.dataset.objects.space_curves import limb, through
 
-# Walls of vessels, and the roundness of their edges (as a blending length).
+# Thickness of vessels' walls, and blending length of their edges.
 _WALL = 0.1
 _EDGE = 0.06
 
-# How far the cup is lifted off its saucer: softening would join what is closer.
+# Gap between cup and saucer: smoothing would merge closer surfaces.
 _LIFT = 0.04
 
-# The pitcher's lip: how far it juts out, how wide it is (radians), and over which heights it grows.
+# The pitcher's lip: its reach, its width (radians), and the range of heights over which it grows.
 _LIP, _LIP_WIDTH, _LIP_FROM, _LIP_TO = 0.34, 0.5, 0.55, 1.3
 
 
@@ -89,7 +89,7 @@ def _teacup() -> Field:
     )
     ring = revolution_wall(np.array([(0.68, -0.64), (0.69, -0.74)]), 0.09)
     saucer = union(revolution_wall(dish, 0.08), ring, blend=0.06)
-    # Under the cup's foot, whose end is at -0.55, the dish is at -0.58.
+    # Under the cup's foot, which ends at -0.55, the dish is at -0.58.
     return union(moved(cup, (0.0, 0.0, _LIFT)), saucer)
 
 
@@ -151,18 +151,18 @@ def _kettle() -> Field:
 
 
 def _outside_of(solid: Field, curve: Float[np.ndarray, "points 2"]) -> Field:
-    """Returns what of a solid does not reach through a vessel's wall into the vessel."""
+    """Returns the part of a solid that does not reach through a vessel's wall into the vessel."""
     top = np.array([[curve[-1, 0], 2.0], [0.0, 2.0]])
     return subtraction(solid, revolution(np.concatenate([curve, top])))
 
 
 def _above(height: float) -> Field:
-    """Returns all that is above a plane."""
+    """Returns the half space above a plane."""
     return Field(lambda p: height - p[:, 2], (0.0, 0.0, 0.0), np.inf)
 
 
 def _to_a_lip(points: Points) -> Points:
-    """Draws points near the rim towards the axis, so that what is found there juts out."""
+    """Moves points near the rim towards the axis, so that the rim juts out."""
     share = np.clip((points[:, 2] - _LIP_FROM) / (_LIP_TO - _LIP_FROM), 0.0, None)
     angle = np.arctan2(points[:, 1], points[:, 0])
     out = _LIP * np.minimum(share, 1.2) ** 2 * np.exp(-((angle / _LIP_WIDTH) ** 2))

@@ -1,9 +1,10 @@
-"""Vessels and what is in them, as regions in the half plane, and the parts they become.
+"""Vessels and their contents, as regions in the half plane, and the resulting parts.
 
-An *outline* is a vessel's outer shape as if it were solid, the *space* what it can hold. An open
-vessel is one body of glass that covers its liquid by a thin *film*, below which the liquid fills
-the space; a sealed one is solid but for the liquid and the air in it, with a film between them. So
-every surface lies strictly inside another or apart from it, and light is bent as in the real thing.
+An *outline* is a vessel's outer shape as if it were solid, the *space* its capacity. An open vessel
+is one piece of glass that covers its liquid by a thin *film*, below which the liquid fills the
+space; a sealed one is solid except for the liquid and the air in it, with a film between them. So
+every surface lies strictly inside another or apart from it, and refraction is as in the real
+object.
 """
 
 from typing import NamedTuple
@@ -29,20 +30,20 @@ from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
 FILM = 0.016
 """Thickness of the glass between a liquid and the air over it, world units."""
 
-# How far a space goes on beyond the mouth.
+# Length by which a space extends beyond the mouth.
 _BEYOND = 1.0
 
-# Pieces narrower than this are left over where regions are cut, and are not meant.
+# Narrower pieces are artefacts of cutting regions.
 _SLIVER = 0.005
 
 
 class Look(NamedTuple):
-    """Of what a body is, and its colour.
+    """Material of a part, and its colour.
 
     Attributes:
-      material: inside.
-      tint: see `ObjectPart`.
-      absorption: see `ObjectPart`.
+      material: material inside the surface.
+      tint: tint of the surface; see `ObjectPart`.
+      absorption: absorption of the medium; see `ObjectPart`.
     """
 
     material: str = "glass"
@@ -55,12 +56,12 @@ AIR = Look("air")
 
 
 class Filled(NamedTuple):
-    """A vessel with a liquid.
+    """Regions of a vessel with a liquid.
 
     Attributes:
-      glass: the vessel.
-      liquid: strictly inside the glass.
-      air: the cavity over it; only a sealed vessel has one.
+      glass: region of the vessel.
+      liquid: region of the liquid, strictly inside the glass.
+      air: cavity over the liquid; only in a sealed vessel.
     """
 
     glass: Region
@@ -79,12 +80,11 @@ def space_in(
     """Returns the space in a vessel.
 
     Args:
-      outline: of the vessel.
-      wall: its least thickness.
+      outline: outline of the vessel.
+      wall: least thickness of the wall.
       floor: height of the space's bottom; by default it follows the outline.
       corner: radius to which the space's edges are rounded.
-      mouth: inner radius of the opening at the top, beyond which the space goes on; closed if not
-        given.
+      mouth: inner radius of the opening at the top, where the space continues; closed if not given.
     """
     if mouth is not None:
         height = top(outline)[1]
@@ -102,8 +102,8 @@ def hollow(outline: Region, space: Region, *, rim: float, inner: float = 0.05) -
     """Returns an empty vessel.
 
     Args:
-      outline: of the vessel.
-      space: in it; open if it goes on beyond the outline.
+      outline: outline of the vessel.
+      space: space inside; open if it extends beyond the outline.
       rim: radius to which the edges are rounded; less than half of the thinnest wall.
       inner: radius to which the corners are filled.
     """
@@ -119,11 +119,11 @@ def filled(
     film: float = FILM,
     meniscus: float = 0.06,
 ) -> Filled:
-    """Returns an open vessel with a liquid up to a height, drawn up at the wall.
+    """Returns an open vessel with a liquid up to a height, with a meniscus at the wall.
 
     Args:
-      outline: of the vessel.
-      space: in it.
+      outline: outline of the vessel.
+      space: space inside.
       level: height of the liquid's visible surface.
       rim: radius to which the glass's edges are rounded; less than half of the thinnest wall.
       film: thickness of the glass over the liquid.
@@ -158,7 +158,7 @@ def stopper(
 def cap(
     radius: float, *, low: float, high: float, bore: float, ceiling: float, edge: float = 0.03
 ) -> Region:
-    """Returns a cap over a neck: a cylinder, hollow from below to a ceiling, of an inner radius."""
+    """Returns a cap over a neck: a cylinder with a bore from below up to a ceiling."""
     return rounded(
         box(radius, low, high) - box(bore, low - 1.0, ceiling), convex=edge, concave=edge
     )
@@ -172,7 +172,7 @@ def body(
     *,
     turned: Turned | None = None,
 ) -> ObjectPart:
-    """Returns the part that a region becomes when it is turned around the axis."""
+    """Returns the part that results from revolving a region around the axis."""
     turned = round_about(cut) if turned is None else turned
     pieces = [
         revolve(resampled(profile, cut), turned)
@@ -197,12 +197,12 @@ def vessel(
     """Returns the parts of a vessel with a liquid: `shell`, `liquid`, and `air` if it is sealed.
 
     Args:
-      shapes: of glass, liquid and air.
-      cut: how finely.
-      liquid: what it is.
-      glass: of what the vessel is.
-      turned: how it is turned around its axis; round by default.
-      name: of the vessel, if the object has several; the parts' names begin with it.
+      shapes: regions of glass, liquid and air.
+      cut: sampling of the curves.
+      liquid: material of the liquid.
+      glass: material of the vessel.
+      turned: rotation around the vessel's axis; round by default.
+      name: name of the vessel if the object has several; prefix of the parts' names.
     """
     prefix = f"{name}_" if name else ""
     parts = [
@@ -215,6 +215,6 @@ def vessel(
 
 
 def resized(shapes: Filled, factor: float) -> Filled:
-    """Returns a vessel of another size, with its walls and films."""
+    """Returns a scaled vessel, including its walls and films."""
     glass, liquid, air = (None if each is None else each.scale((factor, factor)) for each in shapes)
     return Filled(glass, liquid, air)

@@ -1,6 +1,6 @@
-"""What walls are papered with: procedural pictures, the same on every machine.
+"""Procedural images for backgrounds, the same on every machine.
 
-`faces` lists the pictures of cube walls and `spheres` those around a sphere. They are made of
-random fields (`fields`, `sphere_fields`), cells (`cells`), stamps (`stamps`) and polygons (Pillow),
-and lit as reliefs (`shading`).
+`faces` lists the images of background cubes and `spheres` those of background spheres. They are
+made of random fields (`fields`, `sphere_fields`), cells (`cells`), stamps (`stamps`) and polygons
+(Pillow), and lit as reliefs (`shading`).
 """

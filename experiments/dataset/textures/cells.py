@@ -11,12 +11,12 @@ _ROWS = 64  # at a time: what is in work stays in the cache
 
 
 class Cells(NamedTuple):
-    """What every sample knows of its cell.
+    """Cell of every sample.
 
     Attributes:
-      index: of the cell.
+      index: index of the cell.
       border: distance to the nearest border.
-      dx, dy: from the cell's seed to the sample.
+      dx, dy: offset from the cell's seed to the sample.
     """
 
     index: Int[np.ndarray, "h w"]
@@ -29,10 +29,10 @@ def voronoi(x: Field, y: Field, shape: tuple[int, int], seed: int, *, jitter: fl
     """Returns the cells of one seed in each node of a lattice.
 
     Args:
-      x: positions, of any value: the cells repeat with period 1.
-      y: as `x`.
-      shape: nodes along x and along y.
-      seed: of the jitter.
+      x: x coordinates of any value: the cells repeat with period 1.
+      y: y coordinates, likewise.
+      shape: number of nodes along x and along y.
+      seed: seed of the jitter.
       jitter: side of the square in its node in which a seed lies; at 0 the cells are squares.
     """
     offsets = np.random.default_rng(seed).random((shape[1], shape[0], 2), np.float32)

@@ -17,7 +17,7 @@ from experiments.dataset.textures.shading import chosen, colour, colours, lit
 
 
 def jacquard(n: int) -> Picture:
-    """A heavy weave of warp and weft in many yarns, with a pattern of diamonds and waves."""
+    """A heavy weave of warp and weft in many yarns, patterned with diamonds and waves."""
     x, y = coordinates(n)
     x, y = x + 0.0012 * noise(n, 14, 1), y + 0.0012 * noise(n, 14, 2)
     threads = 84
@@ -29,7 +29,7 @@ def jacquard(n: int) -> Picture:
     band = (j // 28) % 2 == 0
     lifted = np.where(band, diamond, wave)
     plain = (i + j) % 2 == 0
-    # Where the pattern lifts the warp it floats over three of four wefts.
+    # Where the pattern lifts the warp, it floats over three of four wefts.
     over = np.where(lifted, (i + 2 * j) % 4 != 0, (i + 2 * j) % 4 == 0) ^ (plain & ((a + b) == 14))
     warp = chosen(random_of(i // 7, 11), "#f1e3c6", "#e9c46a", "#f4a261", "#f7ead2", "#dfa08a")
     weft = chosen(
@@ -61,7 +61,7 @@ _SETTS = (
 
 
 def tartan(n: int) -> Picture:
-    """A quilt of tartans in twill, each patch of another clan, with stitched seams."""
+    """A quilt of twill tartans, each patch from another clan, with stitched seams."""
     x, y = coordinates(n)
     patches = 4
     column, row = np.floor(x * patches).astype(np.int32), np.floor(y * patches).astype(np.int32)
@@ -91,7 +91,7 @@ def tartan(n: int) -> Picture:
 
 
 def _stripes(thread: Int[np.ndarray, "h w"], kind: Int[np.ndarray, "h w"]) -> np.ndarray:
-    """Returns the yarn of each thread: a sett of 60, mirrored, other widths for other clans."""
+    """Returns the yarn of each thread: a mirrored sett of 60, with other widths for other clans."""
     widths = np.random.default_rng(3).integers(3, 14, (len(_SETTS), 9))
     order = np.array([0, 2, 1, 3, 1, 2, 0, 4, 0])
     setts = np.stack(
@@ -127,7 +127,7 @@ def carpet(n: int) -> Picture:
         "#5a7fa0",
     )[dye]
     knot = j * _KNOTS + i
-    abrash = noise(n, (2, 26), 7)  # the bands of one vat of dye and the next
+    abrash = noise(n, (2, 26), 7)  # bands between batches of dye
     fuzz = fbm(n, 130, 5, octaves=3, gain=0.9)
     wool = wool * (0.87 + 0.26 * random_of(knot, 4) + 0.06 * abrash + 0.10 * fuzz)[..., None]
     u, v = (x + wave) * _KNOTS % 1.0 - 0.5, (y - wave) * _KNOTS % 1.0 - 0.5
@@ -137,7 +137,7 @@ def carpet(n: int) -> Picture:
 
 
 def _woven() -> Int[np.ndarray, "knots knots"]:
-    """Returns the dye of each knot, alike in all four quarters."""
+    """Returns the dye of each knot, symmetric in all four quarters."""
     ticks = (np.arange(_KNOTS) + 0.5) / _KNOTS * 2.0 - 1.0
     a, b = (np.abs(each) for each in np.meshgrid(ticks, ticks))
     out = np.maximum(a, b)
@@ -202,7 +202,7 @@ def _borders(
 
 
 def _flower(a: Field, b: Field, count: float, petals: int) -> Int[np.ndarray, "k k"]:
-    """Returns 0 beside flowers on a staggered lattice, and within them which ring it is."""
+    """Returns the ring index inside flowers on a staggered lattice, and 0 elsewhere."""
     row = np.floor(b * count)
     u, v = (a * count + 0.5 * (row % 2)) % 1.0 - 0.5, b * count - row - 0.5
     radius = np.hypot(u, v) * (1.0 + 0.22 * np.cos(petals * np.arctan2(v, u)))

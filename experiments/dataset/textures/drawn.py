@@ -1,4 +1,4 @@
-"""A map, a circuit board and an oil painting: pictures made of many lines."""
+"""A map, a circuit board and an oil painting: images made of many lines."""
 
 import math
 
@@ -64,7 +64,7 @@ def contours(n: int) -> Picture:
 
 
 def _roads(sheet: Picture, ground: Field, land: Bool[np.ndarray, "n n"]) -> Picture:
-    """Returns a map with three kinds of roads, which go about mountains."""
+    """Returns a map with three kinds of roads, which avoid mountains."""
     n = ground.shape[0]
     for seed, width, tone in (
         (61, 0.0030, "#b3261e"),
@@ -81,7 +81,7 @@ def _roads(sheet: Picture, ground: Field, land: Bool[np.ndarray, "n n"]) -> Pict
 
 
 def _names(n: int) -> Field:
-    """Returns how much ink names and symbols leave on the map."""
+    """Returns the amount of ink of names and symbols on the map."""
     rng = np.random.default_rng(7)
     image = Image.new("L", (n, n), 0)
     draw = ImageDraw.Draw(image)
@@ -196,7 +196,7 @@ def _chip(
     pitch: float,
     taken: list[Box],
 ) -> None:
-    """Draws a chip with legs, a dot and three lines of lettering, if its place is not taken."""
+    """Draws a chip with legs, a dot and three lines of lettering, unless its place is occupied."""
     x, y = (np.round(rng.random(2) * 128) * pitch).tolist()
     wide, high = (rng.integers(5, 17, 2) * pitch).tolist()
     room = 2.5 * pitch

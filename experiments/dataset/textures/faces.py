@@ -1,4 +1,4 @@
-"""The pool of square pictures for the walls of cubes."""
+"""The set of square images for background cubes."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -22,15 +22,15 @@ from experiments.dataset.textures import (
 from experiments.dataset.textures.fields import Picture
 
 SIZE = 1024
-"""Usual samples a side."""
+"""Default number of samples a side."""
 
 
 class Face(NamedTuple):
-    """How a picture is made.
+    """Recipe of an image.
 
     Attributes:
-      paint: from samples a side to sRGB values, which may lie a little outside 0 to 1.
-      samples: per pixel a side. Pictures made of stamps have soft outlines anyway.
+      paint: function from samples a side to sRGB values, which may lie a little outside 0 to 1.
+      samples: samples per pixel a side. Images made of stamps have soft outlines anyway.
     """
 
     paint: Callable[[int], Picture]
@@ -66,14 +66,14 @@ FACES: dict[str, Face] = {
 
 
 def make_face(name: str, size: int = SIZE) -> Float[np.ndarray, "size size 3"]:
-    """Returns a picture, sRGB from 0 to 1 in float32, row 0 at the top.
+    """Returns an image, sRGB from 0 to 1 in float32, row 0 at the top.
 
     Args:
-      name: one of `FACES`.
+      name: name of an image in `FACES`.
       size: samples a side, 16 or more.
 
     Raises:
-      ValueError: if there is no such picture, or the size is too small.
+      ValueError: if the image does not exist, or the size is too small.
     """
     if name not in FACES:
         raise ValueError(f"There is no face {name!r}. Choose from {', '.join(FACES)}.")
@@ -84,6 +84,6 @@ def make_face(name: str, size: int = SIZE) -> Float[np.ndarray, "size size 3"]:
 
 
 def require_size(size: int) -> None:
-    """Raises ValueError if a picture of so few samples would show nothing."""
+    """Raises ValueError if the size of an image is too small to be useful."""
     if size < 16:
-        raise ValueError(f"A picture of {size} samples shows nothing. Ask for 16 or more.")
+        raise ValueError(f"An image of {size} samples is too small. Request 16 or more.")

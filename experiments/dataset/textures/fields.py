@@ -3,7 +3,7 @@
 A field has `[n, n]` samples of the unit square: row 0 at the top, `x` to the right and `y` down,
 both from 0 to 1, sample `i` at `(i + 0.5) / n`. Noise is periodic: cubic B-splines through normal
 random numbers on a lattice of `frequency` nodes a side, with mean 0 and variance 1. A field depends
-on its seed and not on `n`: more samples show the same with more detail.
+on its seed and not on `n`: more samples only add detail.
 """
 
 import math
@@ -30,9 +30,9 @@ def noise(n: int, frequency: int | tuple[int, int], seed: int) -> Field:
     """Returns one octave of noise.
 
     Args:
-      n: samples a side.
+      n: number of samples a side.
       frequency: nodes of the lattice a side, or along x and along y.
-      seed: of the nodes.
+      seed: seed of the nodes.
     """
     along_x, along_y = (frequency, frequency) if isinstance(frequency, int) else frequency
     nodes = np.random.default_rng(seed).standard_normal((along_y, along_x), np.float32)
@@ -50,7 +50,7 @@ def fbm(
 ) -> Field:
     """Returns octaves of noise, each of twice the frequency and `gain` times as strong.
 
-    Octaves that the samples can not show are left out. The variance is 1 of all octaves together.
+    Octaves above the sampling limit are omitted. All octaves together have variance 1.
     """
     total = np.zeros((n, n), np.float32)
     for octave, lattice, weight in _octaves(n, frequency, octaves, gain):
@@ -59,7 +59,7 @@ def fbm(
 
 
 def lookup(field: Float[np.ndarray, "h w *channels"], u: Field, v: Field) -> np.ndarray:
-    """Returns a periodic field at `x = u`, `y = v`, bilinear; of any shape."""
+    """Returns a periodic field at `x = u`, `y = v`, bilinearly interpolated; `u` has any shape."""
     height, width = field.shape[:2]
     at = np.stack([v * height - 0.5, u * width - 0.5])
     options = {"order": 1, "mode": "grid-wrap", "prefilter": False}
@@ -73,23 +73,23 @@ def lookup(field: Float[np.ndarray, "h w *channels"], u: Field, v: Field) -> np.
 
 
 def reflected(position: np.ndarray) -> np.ndarray:
-    """Returns positions from 0 to 1, folded at both ends: for pictures that do not repeat."""
+    """Returns positions from 0 to 1, reflected at both ends: for images that do not repeat."""
     return 1.0 - np.abs(position % 2.0 - 1.0)
 
 
 def smooth(low: float, high: float, values: np.ndarray) -> np.ndarray:
-    """Returns the step from 0 at `low` to 1 at `high` without kinks; `low` may be the larger."""
+    """Returns a smooth step from 0 at `low` to 1 at `high`; `low` may be the larger."""
     t = np.clip((values - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 def blend(low: np.ndarray, high: np.ndarray, share: np.ndarray | float) -> np.ndarray:
-    """Returns the colours `low` where the share is 0, and `high` where it is 1."""
+    """Returns colours blended from `low` at share 0 to `high` at share 1."""
     return low + np.asarray(share, np.float32)[..., None] * (high - low)
 
 
 def random_of(index: Int[np.ndarray, "*shape"], seed: int) -> Float[np.ndarray, "*shape"]:
-    """Returns a number from 0 to 1 for each index of things, the same for the same index."""
+    """Returns a random number from 0 to 1 for each index; equal indices give equal numbers."""
     table = np.random.default_rng(seed).random(4093, np.float32)
     return table[index % table.size]
 
@@ -97,7 +97,7 @@ def random_of(index: Int[np.ndarray, "*shape"], seed: int) -> Float[np.ndarray, 
 def _octaves(
     n: int, frequency: int | tuple[int, int], octaves: int, gain: float
 ) -> list[tuple[int, tuple[int, int], float]]:
-    """Returns number, lattice and weight of the octaves of which `n` samples show anything."""
+    """Returns number, lattice and weight of the octaves below the sampling limit of `n` samples."""
     along_x, along_y = (frequency, frequency) if isinstance(frequency, int) else frequency
     return [
         (octave, (along_x << octave, along_y << octave), gain**octave / _norm(octaves, gain))

@@ -69,7 +69,7 @@ def rotunda(height: int) -> Picture:
 
 
 def _dome(azimuth: Float[np.ndarray, "h w"], elevation: Float[np.ndarray, "h w"]) -> Picture:
-    """Returns a dome of coffers in rings, each with a star, around an opening to the sky."""
+    """Returns a coffered dome, with a star in each coffer, around an opening to the sky."""
     low = math.atan(1.45 / 3.0)
     share = (elevation - low) / (0.5 * math.pi - low)
     # Rings get lower towards the top as the coffers get narrower.
@@ -156,7 +156,7 @@ def _canvas(
             canvas, colour("#2b1a12"), smooth(0.006, 0.003, np.abs(elevation - height_of))
         )
         canvas = canvas + colour("#ffcf70") * (0.9 * np.exp(-lamp / 0.012))[..., None]
-    # Where stripes would get finer than samples a ring holds the cloth.
+    # Where stripes would be narrower than samples, the cloth is gathered by a ring.
     crown = graded(np.cos(70.0 * elevation), (-1.0, "#5a1420"), (0.0, "#c99a3a"), (0.7, "#fff0c0"))
     return blend(canvas, crown, smooth(1.30, 1.32, elevation))
 

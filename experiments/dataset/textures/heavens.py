@@ -1,4 +1,4 @@
-"""Spheres of space: a nebula among stars, and the clouds of a giant planet."""
+"""Background spheres of space: a nebula among stars, and the clouds of a giant planet."""
 
 import numpy as np
 
@@ -37,7 +37,7 @@ def nebula(height: int) -> Picture:
     sky = sky * (1.0 - 0.8 * lanes)[..., None]
     for count, seed, size in ((9000, 5, 0.0016), (1600, 6, 0.0026), (160, 7, 0.0052)):
         stars = cells3(points, count, seed)
-        # What is smaller than a sample is as much dimmer.
+        # Stars smaller than a sample are dimmed by their area.
         shown = max(size, 1.1 * np.pi / height)
         dimmed, size = (size / shown) ** 2, shown
         bright = random_of(stars.index, seed) ** 2.0

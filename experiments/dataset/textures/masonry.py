@@ -77,7 +77,7 @@ def cobbles(n: int) -> Picture:
 
 
 def pebbles(n: int) -> Picture:
-    """A shore of pebbles of all sizes, striped and speckled, the small ones below."""
+    """A shore of pebbles of all sizes, striped and speckled, the small ones at the bottom."""
     rng = np.random.default_rng(77)
     grain, bands = fbm(n, 128, 1, octaves=3, gain=0.8), fbm(n, 16, 9, octaves=5)
     sand = graded(grain + bands, (-2.5, "#3c3027"), (0.0, "#8f7a5f"), (2.5, "#d9c8a4"))
@@ -118,7 +118,7 @@ def _pebble(
     base: np.ndarray,
     fields: tuple[Field, Field],
 ) -> None:
-    """Lays one pebble with stripes, speckles or neither; the light comes as in `shading.lit`."""
+    """Lays one pebble with stripes, speckles or neither; the light is that of `shading.lit`."""
     grain, bands = fields
     squash, power = rng.uniform(0.55, 0.85), rng.uniform(2.0, 2.7)
     stripes, speckles = rng.random() < 0.4, rng.random() < 0.5
@@ -153,7 +153,7 @@ def _pebble(
 
 
 def shingles(n: int) -> Picture:
-    """Glazed roof tiles like the scales of a fish, in rows, each with its own glaze."""
+    """Glazed roof tiles like fish scales, in rows, each with its own glaze."""
     x, y = coordinates(n)
     across, rows = 14, 20
     picture = np.zeros((n, n, 3), np.float32)
@@ -161,7 +161,7 @@ def shingles(n: int) -> Picture:
     grain, run = fbm(n, 64, 5, octaves=4, gain=0.7), fbm(n, (40, 8), 15, octaves=4)
     kinds = ("#0f5e5c", "#1c8a7d", "#c9a227", "#16405b", "#2f6e3b", "#7b2d26", "#d9c27a", "#0c3340")
     base = np.floor(y * rows).astype(np.int32)
-    # A tile hangs over the two rows below its own, so that upper rows are laid last.
+    # A tile covers parts of the two rows below, so upper rows are laid last.
     for above in (0, 1, 2):
         row = base - above
         along = x * across + 0.5 * (row % 2)
@@ -215,7 +215,7 @@ def terrazzo(n: int) -> Picture:
         radii = size * rng.uniform(0.65, 1.1, corners)
         middle = rng.random(2)
         points = middle + np.stack([np.cos(turns), 0.8 * np.sin(turns)], -1) * radii[:, None]
-        # A rim of cement keeps chips apart.
+        # A rim of cement separates chips.
         rim = middle + (points - middle) * (1.0 + 0.0028 / size)
         draw.polygon([tuple(point) for point in rim * n], fill=0)
         draw.polygon([tuple(point) for point in points * n], fill=int(index))

@@ -1,4 +1,4 @@
-"""What weather and pressure paint: marble, rust, and the patterns of reaction and diffusion."""
+"""Marble, rust, and the patterns of reaction and diffusion."""
 
 import functools
 
@@ -102,7 +102,7 @@ def rust(n: int) -> Picture:
 
 
 def turing(n: int) -> Picture:
-    """Corals: patterns of many scales that grow out of each other, as reaction and diffusion do.
+    """Coral-like reaction-diffusion patterns of many scales.
 
     Source: McCabe, Cyclic symmetric multi-scale Turing patterns (Bridges 2010): each point follows
     the scale at which activator and inhibitor differ least.
@@ -136,7 +136,7 @@ def turing(n: int) -> Picture:
 
 @functools.cache
 def _grow(side: int, steps: int) -> tuple[Field, Field]:
-    """Returns the pattern, -1 to 1, and which of the scales each point followed last."""
+    """Returns the pattern, -1 to 1, and the last scale of each point."""
     state = np.random.default_rng(12).uniform(-1.0, 1.0, (side, side)).astype(np.float32)
     radii, amounts = (2, 4, 8, 17, 34), (0.020, 0.026, 0.034, 0.042, 0.05)
     chosen_scale = np.zeros_like(state)
@@ -145,7 +145,7 @@ def _grow(side: int, steps: int) -> tuple[Field, Field]:
         least = np.full_like(state, np.inf)
         change = np.zeros_like(state)
         for scale, (radius, amount) in enumerate(zip(radii, amounts, strict=True)):
-            # A box twice is nearly a Gaussian, and takes the same time for every radius.
+            # Two box filters approximate a Gaussian, at the same cost for every radius.
             active = scipy.ndimage.uniform_filter(blurred, 2 * radius + 1, mode="wrap")
             held = scipy.ndimage.uniform_filter(active, 4 * radius + 1, mode="wrap")
             differ = np.abs(active - held)

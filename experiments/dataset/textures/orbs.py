@@ -1,4 +1,4 @@
-"""Spheres of matter: agate, leaded glass, coral, sandstone."""
+"""Background spheres of materials: agate, leaded glass, coral, sandstone."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from experiments.dataset.textures.sphere_fields import (
 
 
 def agate(height: int) -> Picture:
-    """Agates and malachite: many nests of thin bands, with quartz where they meet."""
+    """Agates and malachite: nests of thin bands, with quartz between them."""
     points = directions(height)
     bent = points + 0.10 * np.stack(
         [fbm3(points, 2.5, each, octaves=3) for each in (1, 11, 21)], -1
@@ -49,7 +49,7 @@ def agate(height: int) -> Picture:
 
 
 def lantern(height: int) -> Picture:
-    """A globe of leaded glass: large panes of colour, small ones between, jewels at the joints."""
+    """A globe of leaded glass: large coloured panes, small ones between, jewels at the joints."""
     points = directions(height)
     bent = points + 0.02 * np.stack(
         [fbm3(points, 5.0, each, octaves=2) for each in (1, 11, 21)], -1
@@ -153,7 +153,7 @@ _SANDSTONE = (
 
 
 def canyon(height: int) -> Picture:
-    """A slot canyon: strata of sandstone that light falls into from above, sand on its floor."""
+    """A slot canyon: strata of sandstone lit from above, sand on its floor."""
     points = directions(height)
     _, elevation = angles(height)
     fold = fbm3(points, 1.3, 1, octaves=4, gain=0.4)

@@ -1,4 +1,4 @@
-"""Panoramas of the open: a city by the water at night, and a wood in autumn."""
+"""Outdoor panoramas: a city by the water at night, and a wood in autumn."""
 
 import math
 
@@ -23,7 +23,7 @@ Samples = Float[np.ndarray, " samples"]
 
 
 def skyline(height: int) -> Picture:
-    """A city by the water at night: towers with lit windows, neon, the moon, and all mirrored."""
+    """A city by the water at night: lit towers, neon, the moon, and their reflections."""
     azimuth, elevation = angles(height)
     points = directions(height)
     ripple = fbm3(points * np.array([1.0, 1.0, 9.0], np.float32), 5.0, 3, octaves=6, gain=0.65)
@@ -54,7 +54,7 @@ def skyline(height: int) -> Picture:
     lit = graded(glow, (0.0, "#ffd9a0"), (0.3, "#f58fa8"), (0.8, "#6f6fc0"), (1.5, "#39437f"))
     sky = blend(sky, lit, smooth(0.1, 1.6, clouds))
     stars = cells3(points, 5200, 5)
-    # What is smaller than a sample is as much dimmer.
+    # Lights smaller than a sample are dimmed by their area.
     size = max(0.0028, 1.2 * math.pi / height)
     shine = (
         (0.0028 / size) ** 2
@@ -87,7 +87,7 @@ def _fireworks(sky: Picture, azimuth: Angle, elevation: Angle) -> Picture:
     for burst in range(22):
         at, up = rng.uniform(-2.7, 2.7), rng.uniform(0.55, 1.2)
         size, rays = rng.uniform(0.10, 0.24), int(rng.integers(9, 18))
-        # What is far from the burst is left alone.
+        # Samples far from the burst are skipped.
         near = (np.abs(azimuth - at) * math.cos(up + 0.3) < size) & (np.abs(elevation - up) < size)
         row, column = np.nonzero(near)
         a = (azimuth[row, column] - at) * np.cos(elevation[row, column]) / size
@@ -103,7 +103,7 @@ def _fireworks(sky: Picture, azimuth: Angle, elevation: Angle) -> Picture:
 
 
 def _towers(azimuth: Angle, elevation: Angle) -> tuple[Picture, Float[np.ndarray, "h w"]]:
-    """Returns four rows of buildings, the near ones last, and where any stands."""
+    """Returns four rows of buildings, the near ones last, and their mask."""
     city = np.zeros((*azimuth.shape, 3), np.float32)
     built = np.zeros(azimuth.shape, bool)
     turn = azimuth / (2.0 * math.pi) + 0.5
@@ -147,7 +147,7 @@ def _towers(azimuth: Angle, elevation: Angle) -> tuple[Picture, Float[np.ndarray
 
 
 def wood(height: int) -> Picture:
-    """A wood in autumn: trunks of birch and beech into the mist, leaves above and on the ground."""
+    """A forest in autumn: trunks of birch and beech in mist, leaves above and on the ground."""
     azimuth, elevation = angles(height)
     points = directions(height)
     size = height // 2
@@ -195,7 +195,7 @@ def _trunks(
     bark: Field,
     row: tuple[int, float, float, int],
 ) -> Picture:
-    """Draws a row of trunks, in place: how many, how far, how much mist, and which row it is."""
+    """Draws a row of trunks, in place, from its count, distance, mist and index."""
     count, distance, haze, number = row
     up = distance * np.tan(np.clip(elevation, -1.5, 1.5))
     at = (azimuth / (2.0 * math.pi) + 0.5) * count

@@ -15,7 +15,7 @@ from experiments.dataset.textures.shading import colour, colours, graded, lit
 
 
 def painting(n: int) -> Picture:
-    """A starry night over hills in oil: the strokes follow the whirls of the sky."""
+    """A starry night over hills in oil: the strokes follow the swirls of the sky."""
     rng = np.random.default_rng(17)
     image = Image.new("RGB", (n, n), (18, 26, 60))
     draw = ImageDraw.Draw(image)
@@ -43,7 +43,7 @@ def painting(n: int) -> Picture:
 
 
 def _night(grid: int) -> tuple[Picture, Float[np.ndarray, "grid grid 2"]]:
-    """Returns what is painted, and the unit direction of strokes."""
+    """Returns the colours of the painting, and the unit direction of strokes."""
     x, y = coordinates(grid)
     potential = 0.05 * fbm(grid, 3, 2, octaves=3)
     glow = np.zeros_like(x)
@@ -88,7 +88,7 @@ def _night(grid: int) -> tuple[Picture, Float[np.ndarray, "grid grid 2"]]:
 def _follow(
     flow: Float[np.ndarray, "grid grid 2"], starts: Float[np.ndarray, "strokes 2"], length: float
 ) -> Float[np.ndarray, "strokes 5 2"]:
-    """Returns where strokes go: four steps along the flow from each start."""
+    """Returns the strokes' points: four steps along the flow from each start."""
     grid = flow.shape[0]
     path = [starts]
     for _ in range(4):

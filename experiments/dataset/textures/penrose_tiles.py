@@ -72,10 +72,10 @@ def _inlaid(n: int, stone: Picture, piece: np.ndarray, lines: np.ndarray) -> Pic
 
 
 def _rhombs(times: int) -> list[tuple[bool, Complex[np.ndarray, "4"]]]:
-    """Returns thick and thin rhombs within the unit square's reach.
+    """Returns thick and thin rhombs around the unit square.
 
-    Robinson's triangles (de Bruijn 1981), halved `times` times by the golden ratio: each triangle
-    is half a rhomb, which is completed by mirroring it at its base.
+    Robinson's triangles (de Bruijn 1981), subdivided `times` times by the golden ratio: each
+    triangle is half a rhomb, which is completed by a reflection in its base.
     """
     golden = (1.0 + math.sqrt(5.0)) / 2.0
     turn = math.pi / 10.0

@@ -1,4 +1,4 @@
-"""Autumn leaves on the ground of a wood, and a meadow in flower."""
+"""Autumn leaves on a forest floor, and a meadow in flower."""
 
 import math
 
@@ -35,12 +35,12 @@ _PETALS = (
     "#ffe8d6",
 )
 
-# Of half a leaf of maple: angle and length of its lobes.
+# Half a maple leaf: angle and length of its lobes.
 _LOBES = ((0.0, 1.22), (0.8, 1.05), (1.72, 0.72))
 
 
 def leaves(n: int) -> Picture:
-    """Leaves of maple, beech and birch, the upper ones larger, on dark soil."""
+    """Leaves of maple, beech and birch on dark soil, the upper ones larger."""
     rng = np.random.default_rng(31)
     cloud = fbm(n, 8, 4, octaves=7, gain=0.7)
     wood = np.ascontiguousarray(
@@ -57,7 +57,7 @@ def leaves(n: int) -> Picture:
 def _leaf(
     wood: Picture, place: Place, tone: np.ndarray, rng: np.random.Generator, cloud: Field
 ) -> None:
-    """Lays a leaf: its stalk at `u = -1`; lobed as of a maple, or an oval."""
+    """Lays a leaf with its stalk at `u = -1`: a lobed maple leaf, or an oval one."""
     maple, wide = rng.random() < 0.5, rng.uniform(0.42, 0.62)
     teeth, curl = rng.uniform(14.0, 26.0), rng.uniform(-0.25, 0.25)
     at, veins = rng.random(2).tolist(), int(rng.integers(6, 9))

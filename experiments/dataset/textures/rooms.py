@@ -1,4 +1,4 @@
-"""Square rooms seen from their middle, papered with pictures of `faces`."""
+"""Square rooms seen from their middle, papered with images of `faces`."""
 
 from typing import NamedTuple
 
@@ -33,11 +33,12 @@ from experiments.dataset.textures.sphere_fields import directions, fbm3
 
 
 class Seen(NamedTuple):
-    """What a box room's samples see.
+    """Visible point of a box room for every sample.
 
     Attributes:
       wall: 0 to 3 for walls (+x, +y, -x, -y), 4 for the floor and 5 for the ceiling.
-      across: along a wall to the right, from its middle; x on floor and ceiling. World units.
+      across: position along a wall to the right, from its middle; x on floor and ceiling. World
+        units.
       up: height over the eye; y on floor and ceiling.
       half: half the wall's width.
       nearest: distance to the nearest edge of the room.
@@ -53,13 +54,13 @@ class Seen(NamedTuple):
 
 
 def box_room(height: int, half: tuple[float, float], floor: float, ceiling: float) -> Seen:
-    """Returns what an eye sees in a box.
+    """Returns the visible points of a box.
 
     Args:
-      height: rows of the picture.
+      height: rows of the image.
       half: half the room's length along x and along y.
-      floor: how far below the eye it is.
-      ceiling: how far above.
+      floor: distance of the floor below the eye.
+      ceiling: distance of the ceiling above the eye.
     """
     points = directions(height)
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
@@ -84,7 +85,7 @@ def box_room(height: int, half: tuple[float, float], floor: float, ceiling: floa
 
 
 def _shaded(picture: Picture, seen: Seen, *, lamp: float, corners: float) -> Picture:
-    """Returns a room that a lamp lights from the eye's place, darker in its corners."""
+    """Returns a room lit by a lamp at the eye, darker in its corners."""
     falloff = 1.0 / (1.0 + (seen.far / lamp) ** 2)
     shade = 1.0 - 0.5 * np.exp(-seen.nearest / corners)
     return picture * (1.75 * falloff * shade)[..., None]
@@ -196,7 +197,7 @@ def gallery(height: int) -> Picture:
 
 
 def _skylight(picture: Picture, seen: Seen) -> Picture:
-    """Returns a room with a glazed ceiling, clouds beyond it, in a stuccoed border."""
+    """Returns a room with a glazed ceiling in a stuccoed border, and clouds behind it."""
     clouds = fbm(512, 4, 9, octaves=7, gain=0.6)
     sky = graded(
         lookup(clouds, seen.across / 7.0, seen.up / 7.0),

@@ -1,6 +1,7 @@
 """Colours, and light on reliefs.
 
-Colours are sRGB values from 0 to 1, as they are stored. Heights count in edges of the picture.
+Colours are sRGB values from 0 to 1, as stored in files. The unit of heights is the edge of the
+image.
 """
 
 import numpy as np
@@ -14,7 +15,7 @@ _AMBIENT = 0.3
 
 
 def colour(code: str) -> Float[np.ndarray, "3"]:
-    """Returns the colour of a code as `#c04020`."""
+    """Returns the colour of a code such as `#c04020`."""
     return np.array([int(code[at : at + 2], 16) for at in (1, 3, 5)], np.float32) / 255.0
 
 
@@ -24,7 +25,7 @@ def colours(*codes: str) -> Float[np.ndarray, "colours 3"]:
 
 
 def graded(values: np.ndarray, *stops: tuple[float, str]) -> np.ndarray:
-    """Returns colours for values: linear between stops, of rising position."""
+    """Returns colours for values: linear between stops in ascending order."""
     positions = [position for position, _ in stops]
     table = colours(*(code for _, code in stops))
     channels = [np.interp(values, positions, table[:, each]) for each in range(3)]
@@ -32,17 +33,17 @@ def graded(values: np.ndarray, *stops: tuple[float, str]) -> np.ndarray:
 
 
 def chosen(share: np.ndarray, *codes: str) -> np.ndarray:
-    """Returns one of the colours for each share from 0 to 1: equal parts of the range."""
+    """Returns one of the colours for each share from 0 to 1, split into equal intervals."""
     index = np.minimum((share * len(codes)).astype(np.int32), len(codes) - 1)
     return colours(*codes)[index]
 
 
 def lit(picture: Picture, height: Field, *, gloss: float = 0.0, shininess: float = 30.0) -> Picture:
-    """Returns a picture as a relief in light from the upper left; what is flat is unchanged.
+    """Returns an image as a relief lit from the upper left; flat areas are unchanged.
 
     Args:
       picture: colours without light.
-      height: of the relief.
+      height: height of the relief.
       gloss: strength of highlights.
       shininess: exponent of highlights (Blinn and Phong).
     """
@@ -62,7 +63,7 @@ def lit(picture: Picture, height: Field, *, gloss: float = 0.0, shininess: float
 
 
 def hollows(height: Field, radius: float, *, strength: float) -> Field:
-    """Returns a factor below 1 where a relief lies lower than around it, within `radius`."""
+    """Returns a factor below 1 where a relief is lower than its surroundings within `radius`."""
     around = scipy.ndimage.gaussian_filter(height, radius * height.shape[0], truncate=2.5)
     return np.exp(-strength * np.maximum(around - height, 0.0) / radius)
 

@@ -1,9 +1,9 @@
 """Random fields on the unit sphere, and light on its reliefs.
 
-A picture of a sphere has `[h, 2h]` samples: the middle column looks along +x, the seam along -x,
-row 0 at the zenith (+z). Fields are evaluated at the samples' directions in space, so that neither
-the seam nor the poles show. Noise has about mean 0 and variance 1; `frequency` counts nodes per
-unit of length.
+An image of a sphere has `[h, 2h]` samples: the middle column looks along +x, the seam along -x, row
+0 at the zenith (+z). Fields are evaluated at the samples' directions in space, so that neither the
+seam nor the poles are visible. Noise has about mean 0 and variance 1; `frequency` is the number of
+nodes per unit of length.
 """
 
 import math
@@ -22,7 +22,7 @@ Directions = Float[np.ndarray, "h w 3"]
 
 _NODES = 48  # a side of the lattice, which repeats
 
-# Of trilinear interpolation with a smooth step, the mean square of a weight in one dimension.
+# Mean square of a weight in one dimension, for trilinear interpolation with a smooth step.
 _VARIANCE = 0.74285
 
 
@@ -43,7 +43,7 @@ def angles(height: int) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h 
 
 
 def noise3(points: Directions, frequency: float, seed: int) -> Field:
-    """Returns one octave of noise in space, on a lattice that is turned at random."""
+    """Returns one octave of noise in space, on a randomly rotated lattice."""
     rng = np.random.default_rng(seed)
     nodes = rng.standard_normal((_NODES, _NODES, _NODES), np.float32)
     turn = np.linalg.qr(rng.standard_normal((3, 3)))[0].astype(np.float32)
@@ -65,7 +65,7 @@ def fbm3(
     gain: float = 0.5,
     rows: int | None = None,
 ) -> Field:
-    """Returns octaves of noise, as far as a picture of so many rows (those of `points`) shows."""
+    """Returns octaves of noise up to the sampling limit of an image with the rows of `points`."""
     finest = (rows or points.shape[0]) / math.pi / 2.0
     total = np.zeros(points.shape[:2], np.float32)
     for octave in range(octaves):
@@ -75,12 +75,12 @@ def fbm3(
 
 
 def waves3(points: Directions, number: float, seed: int) -> Field:
-    """Returns plane waves of one wave number in all directions: where it is 0 lines wind about.
+    """Returns plane waves of one wave number in all directions; the zeros form winding lines.
 
     Args:
-      points: positions.
-      number: radians per unit of length.
-      seed: of directions and phases.
+      points: positions on the sphere.
+      number: wave number, radians per unit of length.
+      seed: seed of directions and phases.
     """
     rng = np.random.default_rng(seed)
     towards = rng.standard_normal((28, 3))
@@ -92,7 +92,7 @@ def waves3(points: Directions, number: float, seed: int) -> Field:
 
 
 def averaged(paint: Callable[[int], Picture], height: int) -> Float[np.ndarray, "height width 3"]:
-    """Returns a picture that is painted with half as many rows and columns again, and averaged."""
+    """Returns an image painted with 1.5 times as many rows and columns, and averaged."""
     fine = paint((3 * height + 1) // 2).astype(np.float32)
     channels = [
         Image.fromarray(np.ascontiguousarray(fine[..., each])).resize(
@@ -104,10 +104,10 @@ def averaged(paint: Callable[[int], Picture], height: int) -> Float[np.ndarray, 
 
 
 class SphereCells(NamedTuple):
-    """What every sample knows of its cell.
+    """Cell of every sample.
 
     Attributes:
-      index: of the cell.
+      index: index of the cell.
       border: distance to the nearest border, on the unit sphere.
       away: distance to the cell's seed.
     """
@@ -118,7 +118,7 @@ class SphereCells(NamedTuple):
 
 
 def cells3(points: Directions, count: int, seed: int) -> SphereCells:
-    """Returns the Voronoi cells of seeds that lie at random, and nowhere too dense."""
+    """Returns the Voronoi cells of random seeds with limited density."""
     rng = np.random.default_rng(seed)
     height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
     turn = np.arange(count) * math.pi * (3.0 - math.sqrt(5.0))
@@ -140,12 +140,12 @@ _SUN = (0.45, 0.35, 0.82)
 
 
 def lit_sphere(picture: Picture, height: Field, *, strength: float = 1.0) -> Picture:
-    """Returns a picture as a relief in light from one direction of space.
+    """Returns an image as a relief lit from one direction of space.
 
     Args:
-      picture: without light.
-      height: of the relief, in radii.
-      strength: of light and shade.
+      picture: colours without light.
+      height: height of the relief, in radii.
+      strength: strength of light and shade.
     """
     rows = height.shape[0]
     azimuth, elevation = angles(rows)

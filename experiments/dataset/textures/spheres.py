@@ -1,4 +1,4 @@
-"""The pool of pictures that are laid around a sphere."""
+"""The set of images for background spheres."""
 
 from collections.abc import Callable
 
@@ -11,7 +11,7 @@ from experiments.dataset.textures.fields import Picture
 from experiments.dataset.textures.sphere_fields import averaged
 
 HEIGHT = 1024
-"""Usual rows; there are twice as many columns."""
+"""Default number of rows; there are twice as many columns."""
 
 SPHERES: dict[str, Callable[[int], Picture]] = {
     "nebula": heavens.nebula,
@@ -31,14 +31,14 @@ SPHERES: dict[str, Callable[[int], Picture]] = {
 
 
 def make_sphere(name: str, height: int = HEIGHT) -> Float[np.ndarray, "height width 3"]:
-    """Returns a picture of `[height, 2 height]` samples, sRGB from 0 to 1 in float32.
+    """Returns an image of `[height, 2 height]` samples, sRGB from 0 to 1 in float32.
 
     Args:
-      name: one of `SPHERES`.
-      height: rows, 16 or more.
+      name: name of an image in `SPHERES`.
+      height: number of rows, 16 or more.
 
     Raises:
-      ValueError: if there is no such picture, or the height is too small.
+      ValueError: if the image does not exist, or the height is too small.
     """
     if name not in SPHERES:
         raise ValueError(f"There is no sphere {name!r}. Choose from {', '.join(SPHERES)}.")

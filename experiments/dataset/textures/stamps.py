@@ -1,6 +1,6 @@
-"""Things laid on a picture one over the other, each with its shadow.
+"""Lays stamps on an image one over the other, each with its shadow.
 
-In a stamp's own frame `u` and `v` go from about -1 to 1, `u` along it and `v` across.
+In a stamp's local frame `u` and `v` range from about -1 to 1, `u` along it and `v` across.
 """
 
 import math
@@ -13,21 +13,21 @@ from jaxtyping import Float
 from experiments.dataset.textures.fields import Field, smooth
 
 Distance = Callable[[Field, Field], Field]
-"""From `u` and `v` to the distance outside of the outline, negative within, in the stamp's unit."""
+"""Function from `u` and `v` to the signed distance from the outline, in the stamp's unit."""
 
 Samples = Float[np.ndarray, " samples"]
 
 Paint = Callable[[Samples, Samples, Samples], Float[np.ndarray, "samples 3"]]
-"""From `u`, `v` and the distance of samples within to colours."""
+"""Function from `u`, `v` and the distance of inner samples to colours."""
 
 
 class Place(NamedTuple):
-    """Where a stamp lies.
+    """Pose of a stamp.
 
     Attributes:
-      x, y: of its middle, on the unit square.
+      x, y: position of its middle, on the unit square.
       size: half its length.
-      angle: of `u` from x towards y, radians.
+      angle: angle of `u` from x towards y, radians.
     """
 
     x: float
@@ -48,14 +48,14 @@ def stamp(
     *,
     shadow: float = 0.55,
 ) -> None:
-    """Lays a stamp on a picture, in place; beyond a border it goes on at the opposite one.
+    """Lays a stamp on an image, in place; beyond a border it continues at the opposite one.
 
     Args:
-      picture: to lay on.
-      place: of the stamp.
-      distance: its outline.
-      paint: its colours.
-      shadow: how much darker it gets beneath, 0 to 1.
+      picture: image to lay the stamp on.
+      place: pose of the stamp.
+      distance: outline of the stamp.
+      paint: colours of the stamp.
+      shadow: darkening of the image beneath, 0 to 1.
     """
     reach = _MARGIN * place.size
     for right in (-1.0, 0.0, 1.0):
@@ -72,7 +72,7 @@ def _lay(
     paint: Paint,
     shadow: float,
 ) -> None:
-    """Lays a stamp, in place; what lies beyond the border is cut off."""
+    """Lays a stamp, in place, cropped at the border."""
     n = picture.shape[0]
     reach = _MARGIN * place.size
     left, right = _range(place.x - reach, place.x + reach, n)
@@ -86,7 +86,7 @@ def _lay(
     outside = distance(u, v)
     target = picture[top:bottom, left:right]
     if shadow:
-        # The shadow is the outline moved by whole samples.
+        # The shadow is the outline shifted by an integer number of samples.
         right_by, down_by = (round(each * place.size * n) for each in _SHADOW)
         beneath = outside[: -down_by or None, : -right_by or None]
         target[down_by:, right_by:] *= (1.0 - shadow * smooth(0.12, -0.06, beneath))[..., None]

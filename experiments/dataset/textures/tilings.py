@@ -1,4 +1,4 @@
-"""Surfaces put together of pieces: leaded glass, mosaic, Truchet tiles, Penrose's rhombs."""
+"""Surfaces made of pieces: leaded glass, mosaic, Truchet tiles, Penrose's rhombs."""
 
 import numpy as np
 from jaxtyping import Int
@@ -19,7 +19,7 @@ from experiments.dataset.textures.shading import chosen, colour, graded, hollows
 
 
 def stained_glass(n: int) -> Picture:
-    """A rose window: rings of petals, and beyond them shards, of streaky glass in lead."""
+    """A rose window: rings of petals, surrounded by shards, of streaky glass in lead."""
     x, y = coordinates(n)
     a, b = x - 0.5, y - 0.5
     border, piece = _rose(x, y)
@@ -54,7 +54,7 @@ def stained_glass(n: int) -> Picture:
 
 
 def _rose(x: Field, y: Field) -> tuple[Field, Int[np.ndarray, "h w"]]:
-    """Returns the distance to the nearest lead, and which kind of piece each sample lies in."""
+    """Returns the distance to the nearest lead, and the kind of piece of each sample."""
     a, b = x - 0.5, y - 0.5
     radius, turn = np.hypot(a, b), np.arctan2(b, a) / (2.0 * np.pi)
     border, piece = np.full(x.shape, np.inf, np.float32), np.zeros(x.shape, np.int32)
@@ -71,7 +71,7 @@ def _rose(x: Field, y: Field) -> tuple[Field, Int[np.ndarray, "h w"]]:
         arch = np.abs(radius - (low + 0.68 * (high - low)) - bow) if ring > 1 else rim
         here = np.minimum(np.minimum(side, rim), arch)
         index = ring * 400 + np.floor(sector).astype(np.int32) % count * 4
-        # Every other petal has the same glass, and the arch another.
+        # Every other petal has the same glass; the arch has a different one.
         index = (
             ring * 40
             + (index // 4 % 2) * 8
@@ -110,7 +110,7 @@ def mosaic(n: int) -> Picture:
 
 
 def _cartoon(x: Field, y: Field) -> Picture:
-    """Returns the picture that the stones of the mosaic show."""
+    """Returns the colours of the mosaic before it is split into stones."""
     a, b = x - 0.5, y - 0.5
     radius, turn = np.hypot(a, b), np.arctan2(b, a)
     sea = np.sin(2.0 * np.pi * (9.0 * y + 0.55 * np.sin(2.0 * np.pi * 4.0 * x + 5.0 * y)))
@@ -132,7 +132,7 @@ def _cartoon(x: Field, y: Field) -> Picture:
     frame = out > 0.385
     for low, code in ((0.385, "#2b1d16"), (0.397, "#f3e5c0"), (0.488, "#2b1d16")):
         picture = np.where((out > low)[..., None], colour(code), picture)
-    # Three strands, each a third of a turn behind the other.
+    # Three strands, each a third of a turn apart.
     for strand, code in enumerate(("#b23a2e", "#2a6f6b", "#d9a441")):
         middle = 0.441 + 0.026 * np.sin(2.0 * np.pi * (along * 7.0 + strand / 3.0))
         away = np.abs(out - middle)
@@ -142,7 +142,7 @@ def _cartoon(x: Field, y: Field) -> Picture:
 
 
 def truchet(n: int) -> Picture:
-    """Majolica of Truchet tiles of two sizes: bands that wander, with blossoms between them."""
+    """Majolica of Truchet tiles of two sizes: winding bands, with blossoms between them."""
     x, y = coordinates(n)
     coarse = 9
     i, j = np.floor(x * coarse).astype(np.int32), np.floor(y * coarse).astype(np.int32)

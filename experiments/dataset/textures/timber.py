@@ -1,4 +1,4 @@
-"""Things of wood: parquet, painted planks, and what every board shares, its grain."""
+"""Wood: parquet, painted planks, and the grain of every board."""
 
 import numpy as np
 from jaxtyping import Int
@@ -18,13 +18,13 @@ from experiments.dataset.textures.shading import chosen, colour, graded, hollows
 
 
 def grain_of(n: int, along: Field, across: Field, board: Int[np.ndarray, "h w"]) -> Field:
-    """Returns how dark wood is: 0 to 1, year rings and pores, along `along`.
+    """Returns the darkness of wood: 0 to 1, year rings and pores, along `along`.
 
     Args:
-      n: samples a side.
-      along: position in the direction of the fibres, in edges of the picture.
-      across: position across them.
-      board: each has a piece of wood of its own.
+      n: number of samples a side.
+      along: position in the direction of the fibres, in edges of the image.
+      across: position perpendicular to the fibres, likewise.
+      board: index of the board; each has its own grain.
     """
     fibres = fbm(n, (3, 48), 301, octaves=5, gain=0.75)
     bends = fbm(n, (2, 5), 311, octaves=3)
@@ -82,7 +82,7 @@ def parquet(n: int) -> Picture:
 
 
 def planks(n: int) -> Picture:
-    """Boards of a fisherman's hut: bright paint that peels from grey wood, with knots and nails."""
+    """Boards of a fisherman's hut: bright peeling paint on grey wood, with knots and nails."""
     x, y = coordinates(n)
     count = 13
     board = np.floor(x * count).astype(np.int32)
@@ -125,7 +125,7 @@ def planks(n: int) -> Picture:
 
 
 def _knots(board: Int[np.ndarray, "h w"], u: Field, y: Field) -> tuple[Field, Field]:
-    """Returns how far right the nearest of three knots a board is, and how far: 1 is 0.4 widths."""
+    """Returns offset and distance to the nearest of three knots a board; unit: 0.4 widths."""
     nearest = np.full(u.shape, np.inf, np.float32)
     nearest_x = np.zeros_like(nearest)
     for each in range(3):

@@ -1,13 +1,13 @@
-"""Writing that says nothing: glyphs of a few strokes each."""
+"""Illegible writing: glyphs of a few strokes each."""
 
 import numpy as np
 from jaxtyping import Float
 from PIL import ImageDraw
 
 Box = tuple[float, float, float, float]
-"""Left, top, right, bottom, in samples."""
+"""Bounding box: left, top, right, bottom, in samples."""
 
-# The ends of a glyph's strokes, on a grid of 3 x 5 nodes.
+# Endpoints of a glyph's strokes, on a grid of 3 x 5 nodes.
 _STROKES = (
     ((0, 0), (2, 0)),
     ((0, 2), (2, 2)),
@@ -35,10 +35,10 @@ def write(
     """Fills a box with one line of glyphs, as high as the box.
 
     Args:
-      draw: of the image.
-      box: of the line.
-      rng: decides which glyphs.
-      ink: their colour.
+      draw: drawing context of the image.
+      box: bounding box of the line.
+      rng: random generator that selects the glyphs.
+      ink: colour of the glyphs.
       weight: thickness of strokes, in heights of the line.
     """
     left, top, right, bottom = box
@@ -56,5 +56,5 @@ def write(
 
 
 def ink(tone: Float[np.ndarray, "3"]) -> tuple[int, int, int]:
-    """Returns a colour as Pillow takes it."""
+    """Returns a colour in Pillow's format."""
     return tuple(round(255 * min(max(float(each), 0.0), 1.0)) for each in tone)

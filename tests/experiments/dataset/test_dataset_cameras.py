@@ -96,6 +96,6 @@ def test_wrong_input_is_told():
     with pytest.raises(ValueError, match=r"no split 'eval'\. Choose from train, val, test"):
         cameras.split_poses("cube_smcvx_ball", "eval", 3)
     for make in (cameras.helix_poses, lambda count: cameras.random_poses(count, seed=0)):
-        with pytest.raises(ValueError, match=r"0 poses were asked for\. Ask for one or more"):
+        with pytest.raises(ValueError, match=r"0 poses were requested\. Request one or more"):
             make(0)
     assert cameras.helix_poses(1).shape == (1, 4, 4)

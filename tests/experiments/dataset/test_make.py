@@ -115,7 +115,7 @@ def test_what_blender_complains_of_is_told(tmp_path, blender, monkeypatch):
     with pytest.raises(BlenderError, match="does not start: status 1"):
         make(tmp_path, "/bin/false")
     monkeypatch.setenv("FAKE_ERROR", "1")
-    with pytest.raises(BlenderError, match=r"can not render cube_smcvx_box .*no light"):
+    with pytest.raises(BlenderError, match=r"cannot render cube_smcvx_box .*no light"):
         make(tmp_path, blender)
     monkeypatch.setenv("FAKE_VERSION", "4.2.0")
     with pytest.raises(BlenderError, match=r"Blender 4\.2\.0.*make dataset-env"):
@@ -140,7 +140,7 @@ def test_other_settings_are_refused(made, blender, changes, said):
 
 def test_a_strange_folder_is_left_alone(tmp_path, blender):
     (tmp_path / "env_smcvx_box").mkdir()
-    with pytest.raises(ValueError, match="no scene of this command"):
+    with pytest.raises(ValueError, match="not a scene of this command"):
         make(tmp_path, blender)
     assert os.listdir(tmp_path) == ["env_smcvx_box"]
     assert not os.listdir(tmp_path / "env_smcvx_box")

@@ -129,5 +129,5 @@ def test_poles_are_fans_and_no_vertex_comes_twice():
     ids=["touches-the-axis", "ends-off-it", "begins-off-it"],
 )
 def test_profiles_that_bound_no_body_are_refused(profile):
-    with pytest.raises(ValueError, match="touches the axis between its ends, or ends beside it"):
+    with pytest.raises(ValueError, match="touches the axis between its ends, or ends off the axis"):
         revolve(np.array(profile), round_about(_FINE))

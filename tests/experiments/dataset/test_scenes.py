@@ -37,7 +37,7 @@ def test_names_objects_and_wildcards_choose_in_one_order(text, names):
 
 @pytest.mark.parametrize("text", ["cube_smcvx_torus", "", "ball,,torus", "Ball"])
 def test_a_name_that_fits_nothing_is_told(text):
-    with pytest.raises(ValueError, match="All of them: all"):
+    with pytest.raises(ValueError, match="'all' for all of them"):
         scenes.choose(text, _OBJECTS)
     with pytest.raises(ValueError, match="cube_smncvx_torus"):
         scenes.choose("cube_smcvx_torus", _OBJECTS)
@@ -56,7 +56,7 @@ def test_two_objects_of_one_name_are_refused(tmp_path, monkeypatch):
         text += "OBJECTS = (Object('same', 'smcvx', lambda detail: []),)\n"
         (tmp_path / f"{name}_made_for_a_test.py").write_text(text)
     monkeypatch.setattr(objects, "__path__", [str(tmp_path)])
-    with pytest.raises(ValueError, match="called same"):
+    with pytest.raises(ValueError, match="named same"):
         catalogue.gather()
 
 
@@ -89,7 +89,7 @@ def test_linear_images_are_kept_of_the_chosen_splits(linear, kept):
         ({"spp": PerSplit(1, 1, 0)}, "The spp of test is 0"),
         ({"texture_size": 15}, "The texture_size is 15"),
         ({"views": PerSplit(0, 0, 0)}, "at least one view"),
-        ({"views": PerSplit(1, -1, 0)}, "not negative"),
+        ({"views": PerSplit(1, -1, 0)}, "non-negative"),
         ({"views": PerSplit(1, 1, 0), "preview": True}, "--test_views"),
     ],
 )

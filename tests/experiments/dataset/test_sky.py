@@ -127,7 +127,7 @@ def test_environments_differ_and_each_is_always_the_same(environments):
 def test_wrong_input_is_told():
     with pytest.raises(ValueError, match=r"no environment 'moon'\. Choose from meadow"):
         make_environment("moon", 64)
-    with pytest.raises(ValueError, match=r"shows nothing\. Ask for 16"):
+    with pytest.raises(ValueError, match=r"is too small\. Request 16"):
         make_environment("lake", 8)
     for changes in ({"elevation": -0.1}, {"turbidity": 1.0}):
         with pytest.raises(ValueError, match="no sky for a sun at"):

@@ -130,5 +130,5 @@ def test_wrong_names_and_sizes_are_told():
     with pytest.raises(ValueError, match=r"no sphere 'moon'\. Choose from nebula"):
         make_sphere("moon")
     for make, name in ((make_face, "brick"), (make_sphere, "nebula")):
-        with pytest.raises(ValueError, match=r"8 samples shows nothing\. Ask for 16"):
+        with pytest.raises(ValueError, match=r"8 samples is too small\. Request 16"):
             make(name, 8)

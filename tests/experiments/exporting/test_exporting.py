@@ -191,7 +191,7 @@ def test_a_run_s_bodies_are_files_that_are_read_again(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"body_0\.ply exists.* --overwrite"):
         object_meshes.write(tmp_path, tmp_path / "new" / "body.ply", overwrite=False)
     monkeypatch.setattr(object_meshes, "load_geometry", lambda run: scenes.geometry())
-    with pytest.raises(ValueError, match="has no body"):
+    with pytest.raises(ValueError, match="has no object"):
         object_meshes.write(tmp_path, tmp_path / "none.ply", overwrite=False)
 
 
