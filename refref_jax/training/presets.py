@@ -23,7 +23,7 @@ interior `field` to have the published set-up in full, and leave both out for th
 
 On the bundled ball 1250 steps of 1024 rays give `tiny` 36.6 dB in the mask and `small` 37.9, at 3.1
 times the time of a step. `paper` and `best` take a GPU: a CPU's core needs 0.8 s for 256 of their
-rays, 10 times as long as `tiny` (`BUILD_NOTES.md` has their first steps).
+rays, 10 times as long as `tiny` (`benchmarks/results/presets_few_rays.csv`).
 
 `small` lies between its neighbours in every number. `best` samples as the paper does and differs in
 what a pixel sees and how often: footprints follow the bends, and a step has four times the rays, at

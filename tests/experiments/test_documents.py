@@ -9,6 +9,13 @@ import pytest
 from tests.experiments.command import ROOT
 
 _PAGES = ["README.md", *sorted(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md"))]
+_DECISIONS = sorted(page.name for page in (ROOT / "docs/decisions").glob("[0-9]*.md"))
+_LINKING = [
+    *_PAGES,
+    *(f"docs/decisions/{name}" for name in ["README.md", *_DECISIONS]),
+    "BUILD_NOTES.md",
+    "benchmarks/results/README.md",
+]
 
 # A link, or a picture: its text, the file if it is another one, and the heading if one is named.
 _LINK = re.compile(r"\[(?P<text>[^\]]*)\]\((?P<file>[^)#:\s]*)(?:#(?P<heading>[^)\s]*))?\)")
@@ -33,16 +40,21 @@ def test_the_snippets_of_a_page_run(page, printed, trained, tmp_path, monkeypatc
     assert printed in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("page", _PAGES)
+@pytest.mark.parametrize("page", _LINKING)
 def test_every_local_link_leads_somewhere(page):
     assert [link.group() for link in _links(page) if not _leads_somewhere(page, link)] == []
 
 
 def test_the_index_and_the_readme_lead_to_every_page():
     pages = {page.removeprefix("docs/") for page in _PAGES} - {"README.md"}
-    assert {link["file"] for link in _links("docs/README.md")} == pages
+    assert {link["file"] for link in _links("docs/README.md")} == {*pages, "decisions/README.md"}
     linked = {link["file"].removeprefix("docs/") for link in _links("README.md")}
     assert linked >= pages
+
+
+def test_the_index_of_decisions_leads_to_every_one_in_their_order():
+    linked = [link["file"] for link in _links("docs/decisions/README.md")]
+    assert [file for file in linked if file[0].isdigit()] == _DECISIONS
 
 
 @pytest.mark.parametrize("page", _PAGES)
@@ -76,7 +88,7 @@ def test_formulas_are_such_that_github_draws_them(page):
             assert not re.search(wrong, formula.strip(), re.MULTILINE), formula
 
 
-@pytest.mark.parametrize("page", _PAGES)
+@pytest.mark.parametrize("page", _LINKING)
 def test_every_command_on_a_page_exists(page):
     text = (ROOT / page).read_text()
     modules = set(re.findall(r"python -m ((?:experiments|benchmarks)\.[a-z0-9_.]*[a-z0-9])", text))
