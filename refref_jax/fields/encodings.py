@@ -1,10 +1,10 @@
-"""Encodings of directions."""
+"""Direction encodings of fields."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 SPHERICAL_HARMONICS = 16
-"""Number of values that `spherical_harmonics` returns: all of degree 0 to 3."""
+"""Number of values of `spherical_harmonics`, of degree 0 to 3."""
 
 
 def spherical_harmonics(direction: Float[Array, "3"]) -> Float[Array, "16"]:
