@@ -1,8 +1,8 @@
 """Radiance fields of scenes with glass and liquids, along the true, bent paths of light.
 
-The public names are those of this module, for bodies, rays and the paths of light, and those of
-`refref_jax.render`, for colours. `docs/library.md` lists all of them. They are imported when they
-are first used, so that importing the package costs nothing, and touches no device.
+The public API consists of this module, for objects, rays and light paths, and of
+`refref_jax.render`, for colours. `docs/library.md` lists all names. They are imported on first use,
+so that importing the package is fast and does not initialise a device.
 
 >>> import trimesh
 >>> import refref_jax
@@ -15,7 +15,7 @@ are first used, so that importing the package costs nothing, and touches no devi
 import importlib
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # the same names for those who read types; a test compares the two lists
+if TYPE_CHECKING:  # the same names for static type checkers; a test compares both lists
     from refref_jax.data.errors import SceneError as SceneError
     from refref_jax.data.geometry import assemble as assemble
     from refref_jax.data.geometry import single_body as single_body
@@ -65,11 +65,11 @@ _HOMES = {
     "trace": "optics.path_tracing",
     "with_index": "optics.scene",
 }
-"""The module that defines each public name."""
+"""Module that defines each public name."""
 
 
 def __getattr__(name: str) -> Any:
-    """Imports a public name when it is first asked for."""
+    """Imports a public name on first access."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
@@ -78,5 +78,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Lists what the module holds, and what it would import."""
+    """Lists the names of the module, including those that are not imported yet."""
     return sorted({*globals(), *_HOMES})

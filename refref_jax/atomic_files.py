@@ -1,11 +1,10 @@
-"""Files and folders that appear whole, and the lock of a folder.
+"""Atomic writing of files and folders, and locks on folders.
 
-What is written gets another name first, and its own by a rename, in this module alone. An error, or
-Ctrl-C, leaves nothing of it. Whoever is killed in between leaves what the next attempt removes.
+Files and folders are written under a temporary name and then renamed. On an error or Ctrl-C, the
+temporary file is removed. If the process is killed, it remains and is removed by the next attempt.
 
-The lock is the operating system's, on the folder itself: it leaves no file behind, and ends with
-the process that holds it, however that ends. Where there is none of the kind (Windows), nothing is
-locked.
+Locks are held by the operating system on the folder itself: they leave no file behind, and end with
+the process that holds them. On systems without such locks (Windows), folders are not locked.
 """
 
 import contextlib
@@ -22,20 +21,20 @@ except ImportError:  # pragma: no cover
     fcntl = None
 
 Stop = Literal["process", "machine"]
-"""What may end while a file is written."""
+"""Failure that a write survives: termination of the process, or a crash of the machine."""
 
 UNFINISHED = ".unfinished"
-"""How names end of what is not whole yet."""
+"""Suffix of temporary files and folders."""
 
 
 @contextlib.contextmanager
 def written_file(target: Path, *, survives: Stop = "process") -> Iterator[Path]:
-    """Yields the path of a file that takes the place of the target when the context ends well.
+    """Yields the path of a temporary file that replaces the target if the context succeeds.
 
     Args:
       target: path of the file, in an existing folder.
-      survives: whose sudden end the file is whole after. For that of the machine, the content is
-        synced to the disk before the file gets its name.
+      survives: failure after which the file is still complete. For `machine`, the content is synced
+        to disk before the file is renamed.
     """
     draft = beside(target)
     try:
@@ -50,7 +49,7 @@ def written_file(target: Path, *, survives: Stop = "process") -> Iterator[Path]:
 
 @contextlib.contextmanager
 def written_folder(target: Path) -> Iterator[Path]:
-    """Yields an empty folder that takes the place of the target when the context ends well."""
+    """Yields an empty temporary folder that replaces the target if the context succeeds."""
     draft = beside(target)
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir()
@@ -65,10 +64,10 @@ def written_folder(target: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def new_folder(target: Path) -> Iterator[Path]:
-    """Yields an empty folder that becomes the target when the context ends well.
+    """Yields an empty temporary folder that becomes the target if the context succeeds.
 
-    Its name is new every time, so that two processes do not meet in it. A target that holds
-    anything already is an error.
+    Its name is unique, so that two processes never share it. A target that is not empty is an
+    error.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{target.name}-", dir=target.parent) as place:
@@ -79,27 +78,27 @@ def new_folder(target: Path) -> Iterator[Path]:
 
 
 def move(finished: Path, target: Path) -> None:
-    """Moves a file or a folder that is whole to its place in the same file system.
+    """Moves a complete file or folder to its target in the same file system.
 
-    A file or an empty folder in that place is replaced.
+    A file or an empty folder at the target is replaced.
     """
     os.replace(finished, target)
 
 
 def beside(target: Path) -> Path:
-    """Returns the name of a target as long as it is not whole."""
+    """Returns the temporary path of a target."""
     return target.with_name(f".{target.name}{UNFINISHED}")
 
 
 @contextlib.contextmanager
 def hold(folder: Path) -> Iterator[None]:
-    """Keeps other processes out of a folder, for as long as the context lasts.
+    """Locks a folder against other processes for the duration of the context.
 
     Args:
-      folder: that of a run, or of anything else in which one process works at a time.
+      folder: folder in which only one process works at a time, such as that of a run.
 
     Raises:
-      ValueError: if another process holds it.
+      ValueError: if another process holds the lock.
     """
     if fcntl is None:
         yield

@@ -1,4 +1,4 @@
-"""The choices of scenes and configurations, each defined once (standard library only)."""
+"""Values of the options of scenes and configurations (standard library only)."""
 
 import math
 from typing import Literal
@@ -7,55 +7,55 @@ Colour = tuple[float, float, float]
 """Linear RGB."""
 
 CLEAR: Colour = (1.0, 1.0, 1.0)
-"""The tint of an interface that takes no light."""
+"""Tint of an interface without loss."""
 
 NO_ABSORPTION: Colour = (0.0, 0.0, 0.0)
-"""The absorption of a medium that takes no light."""
+"""Absorption of a clear medium."""
 
 TwoSidedRule = Literal["nested", "facing"]
-"""Rules under which a part knows the media on both of its sides."""
+"""Rules under which the media on both sides of a part are known in advance."""
 
 RuleName = Literal[TwoSidedRule, "priority"]
-"""All rules for what lies outside a part; `optics.interface_rules` says what they mean."""
+"""Rules for the medium outside a part; see `optics.interface_rules`."""
 
 KnownTints = Literal["given", "learned"]
-"""Where colours come from, of parts that have some."""
+"""Source of tints and absorption in scenes with coloured parts."""
 
 Tints = Literal["none", KnownTints]
-"""Where colours come from; `none` if no part has any."""
+"""Source of tints and absorption; `none` if no part is coloured."""
 
 Space = Literal["bounded", "spherical", "unbounded"]
-"""Where the background stands: on a cube, on a sphere, or infinitely far away."""
+"""Scene bounds: a background cube, a background sphere, or none."""
 
 Split = Literal["train", "val", "test"]
-"""Views of a scene."""
+"""Splits of a scene's views."""
 
 Pixels = Literal["all", "background"]
-"""Pixels that are learned from."""
+"""Pixels that are used for training."""
 
 Paths = Literal["straight", "paper", "tree", "paper_no_reflection", "paper_no_tir"]
-"""Names of budgets of light paths; see `optics.budgets.BUDGETS`."""
+"""Names of preset path settings; see `optics.budgets.BUDGETS`."""
 
 PresetName = Literal["tiny", "small", "paper", "best"]
 """Sizes of a model and its training; see `training.presets`."""
 
 FieldName = Literal["zipnerf", "nerfacto"]
-"""Kinds of field, the usual one first; see `fields.registry`."""
+"""Field types, the default first; see `fields.registry`."""
 
 Interior = Literal["field", "clear", "absorbing"]
-"""What is modelled inside the objects; see `render.config.ModelConfig`."""
+"""Model of the inside of the objects; see `render.config.ModelConfig`."""
 
 Footprint = Literal["cone", "differential"]
-"""How wide a pixel is along its path; see `render.config.ModelConfig`."""
+"""Model of the pixel footprint along a path; see `render.config.ModelConfig`."""
 
 Precision = Literal["float32", "bfloat16"]
-"""Arithmetic of the fields."""
+"""Arithmetic precision of the fields."""
 
 DataLoss = Literal["mse", "charbonnier"]
 """Loss on sRGB colours."""
 
 DistortionOver = Literal["outside", "everywhere"]
-"""Samples that the distortion loss counts: those outside the objects, or all."""
+"""Samples that the distortion loss includes: those outside the objects, or all."""
 
 
 def side_of(rays_per_pixel: int) -> int:

@@ -1,9 +1,9 @@
-"""Writes nested frozen dataclasses as JSON text, and reads them back exactly.
+"""Writes nested frozen dataclasses as JSON, and reads them back exactly.
 
-A field with a default may be missing, as it is in files of versions that did not know it.
+Fields with a default may be missing, as in files of older versions.
 
-Fields may be numbers, strings, booleans, `None`, other dataclasses, and tuples of these. Where a
-field is annotated with a base class, its own key `kind` says which of that class's variants it is.
+Fields may be numbers, strings, booleans, `None`, other dataclasses, and tuples of these. If a field
+is annotated with a base class, the key `kind` of its value selects the variant of that class.
 """
 
 import dataclasses
@@ -20,27 +20,27 @@ from refref_jax import atomic_files
 _Config = TypeVar("_Config")
 
 Variants = Mapping[type, Mapping[str, type]]
-"""The classes that may stand for a base class, by their key `kind`; the first is the default."""
+"""Variants of each base class, by their key `kind`; the first is the default."""
 
 _KIND = "kind"
 
 
 NOT_FINITE = ("inf", "-inf", "nan")
-"""Names of the numbers that JSON does not know."""
+"""Names of the numbers that JSON does not support."""
 
 
 def write(path: Path, config: Any) -> None:
-    """Writes a configuration as readable text, all or nothing."""
+    """Writes a configuration as indented JSON, atomically."""
     text = json.dumps(dataclasses.asdict(config), indent=2) + "\n"
     with atomic_files.written_file(path) as draft:
         draft.write_text(text, encoding="utf-8")
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Returns what a JSON text says, for files that may be anybody's.
+    """Parses JSON text from untrusted files.
 
     Raises:
-      ValueError: if it is not JSON, or is nested too deeply to be read.
+      ValueError: if the text is not JSON, or is nested too deeply.
     """
     try:
         return json.loads(text)
@@ -49,14 +49,14 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def string_safe(value: Any) -> Any:
-    """Replaces numbers that JSON does not know by their names."""
+    """Replaces numbers that JSON does not support by their names."""
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return _each(value, string_safe)
 
 
 def from_string_safe(value: Any) -> Any:
-    """Undoes `string_safe`."""
+    """Inverts `string_safe`."""
     if isinstance(value, str) and value in NOT_FINITE:
         return float(value)
     return _each(value, from_string_safe)
@@ -69,12 +69,12 @@ def _each(value: Any, change: Callable[[Any], Any]) -> Any:
 
 
 def read(path: Path, kind: type[_Config], *, variants: Variants | None = None) -> _Config:
-    """Reads a configuration of a known kind.
+    """Reads a configuration of a given class.
 
     Args:
-      path: the file.
+      path: path of the file.
       kind: class of the configuration.
-      variants: of the base classes within it.
+      variants: variants of the base classes in the configuration.
 
     Raises:
       ValueError: if the file is missing or not JSON, or a key is missing, unknown or of the
@@ -93,24 +93,24 @@ def read(path: Path, kind: type[_Config], *, variants: Variants | None = None) -
 
 
 def build(content: Any, kind: type[_Config], *, variants: Variants | None = None) -> _Config:
-    """Makes a configuration of what `parse_json` returns; see `read`.
+    """Builds a configuration from the result of `parse_json`; see `read`.
 
     Raises:
-      ValueError: naming the key.
+      ValueError: if a key is missing, unknown or of the wrong type; the message names the key.
     """
     return _build(kind, content, kind.__name__, variants or {})
 
 
 def convert(value: Any, kind: Any, *, name: str) -> Any:
-    """Returns a value as what a field is annotated with; see `read`.
+    """Converts a JSON value to the annotated type of a field; see `read`.
 
     Args:
-      value: number, text, `None`, or list of these, as JSON has them.
+      value: number, string, `None`, or list of these, as parsed from JSON.
       kind: annotation of the field.
-      name: name of the value, for errors.
+      name: name of the value, for error messages.
 
     Raises:
-      ValueError: if it is of another type, or none of the choices.
+      ValueError: if the value has another type, or is not one of the allowed values.
     """
     return _build(kind, value, name, {})
 
@@ -157,7 +157,7 @@ def _build_dataclass(kind: Any, value: Any, where: str, variants: Variants) -> A
 
 
 def _variant(known: Mapping[str, type], value: dict[str, Any], where: str) -> type:
-    """Returns the class that a value's own key names, or the first."""
+    """Returns the class named by the key `kind` of a value, or the first."""
     name = value.get(_KIND, next(iter(known)))
     if not isinstance(name, str) or name not in known:
         raise ValueError(f"{where}.{_KIND} is {name!r}, not one of {', '.join(known)}")

@@ -1,9 +1,9 @@
 """Training losses. Each takes one path or one batch of colours and returns a scalar.
 
-Colours are compared as they are rendered, without clipping: one below black or above white has the
-gradient that draws it back, and a black pixel has the slope 12.92 of the transfer function (see
-`render.colour`). Fields give colours in `[-0.001, 1.001]`, so that black and white lie where their
-sigmoid still has a slope.
+Rendered colours are compared without clipping: colours below black or above white have gradients
+that move them back, and black pixels have the slope 12.92 of the transfer function (see
+`render.colour`). Fields return colours in `[-0.001, 1.001]`, so that their sigmoid has a non-zero
+slope at black and white.
 
 Letters: `s` is the normalised distance along a path, `w` its weights (see `sampling.stepfun`).
 """
@@ -19,7 +19,7 @@ from refref_jax.sampling import stepfun
 
 _CHARBONNIER_PADDING = 0.001
 
-# Keeps a proposal that is empty where light was found from an infinite loss (Zip-NeRF).
+# Keeps the loss finite if a proposal is empty where the final histogram is not (Zip-NeRF).
 _INTERLEVEL_PADDING = 1e-5
 
 
@@ -33,16 +33,16 @@ def mean_squared_error(
 def charbonnier(
     rendered: Float[Array, "rays 3"], target: Float[Array, "rays 3"]
 ) -> Float[Array, ""]:
-    """Returns the mean of `sqrt(e^2 + 0.001^2)`, which forgives outliers (Zip-NeRF)."""
+    """Returns the mean of `sqrt(e^2 + 0.001^2)`, which is robust to outliers (Zip-NeRF)."""
     return jnp.mean(jnp.sqrt(jnp.square(rendered - target) + _CHARBONNIER_PADDING**2))
 
 
 def interlevel(final: Histogram, proposal: Histogram, *, blur: float) -> Float[Array, ""]:
-    """Penalises a proposal that misses light which the final round found on a path.
+    """Penalises a proposal that is lower than the final histogram of a path.
 
-    The final histogram is blurred by a box of half-width `blur` before it is compared, so that
-    the loss stays smooth when a surface moves past the proposal's edges. Gradients reach the
-    proposal only.
+    The final histogram is blurred by a box of half-width `blur` before the comparison, so that the
+    loss is smooth when a surface moves past the proposal's edges. Only the proposal receives
+    gradients.
 
     Source: Barron et al., Zip-NeRF (2023), section 3 (anti-aliased interlevel loss).
     """
@@ -54,11 +54,11 @@ def interlevel(final: Histogram, proposal: Histogram, *, blur: float) -> Float[A
 
 
 def distortion(final: Histogram, outside: Bool[Array, " samples"]) -> Float[Array, ""]:
-    """Pulls the light of a path together, over the samples outside the objects only.
+    """Concentrates the weights of a path, over the samples outside the objects only.
 
-    `sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 delta_i` over intervals with middle `m` and
-    width `delta` for which `outside` holds. Inside a translucent object light may come from
-    everywhere, and the original loss would empty it.
+    The loss is `sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 delta_i`, over intervals with middle
+    `m` and width `delta` for which `outside` holds. Inside a translucent object, light may come
+    from everywhere, and the original loss would empty it.
 
     Source: paper (arXiv 2505.05848), corrected distortion loss; Mip-NeRF 360 (2022), Eq 15.
     """
@@ -73,7 +73,7 @@ def distortion(final: Histogram, outside: Bool[Array, " samples"]) -> Float[Arra
 def hash_decay(tables: Sequence[Float[Array, "_ _"]]) -> Float[Array, ""]:
     """Returns the sum over levels of the mean squared entry.
 
-    Taking the mean per level weighs coarse levels, with few entries, more than their share.
+    The mean per level gives more weight to the entries of coarse levels, which have few.
 
     Source: Barron et al., Zip-NeRF (2023), section 2 (normalised weight decay).
     """

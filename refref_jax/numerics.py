@@ -1,11 +1,11 @@
-"""Every numerical guard of the library, in one place.
+"""Numerical guards of the library.
 
-A guard keeps a value or a gradient finite where the plain formula would not. Each says what it
-returns at its edge, what its gradient is there, and why that is the useful choice. Elsewhere a
-value is clipped only where its meaning has a range, and nothing hides a NaN.
+A guard keeps a value or gradient finite where the plain formula would not. Each docstring states
+the value and gradient at the singularity, and the reason for them. Elsewhere in the library, values
+are clipped only to the range of their definition, and NaNs are never hidden.
 
-The pattern is the double `where`: JAX evaluates both branches of a `where` when it
-differentiates, so the *argument* of the dangerous function is replaced as well as its result.
+The pattern is the double `where`: JAX evaluates both branches of a `where` when it differentiates,
+so the *argument* of the singular function is replaced as well as its result.
 """
 
 import functools
@@ -15,24 +15,24 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-# Directions closer to an axis than this are treated as parallel to the other two; a ray would
-# have to travel 1e12 units before the difference shows.
+# Smaller direction components count as zero: a ray would have to travel 1e12 units before the
+# difference matters.
 _SMALLEST_COMPONENT = 1e-12
 
-# Where `truncated_exponential` holds its value, and on either side its slope.
+# Exponents at which `truncated_exponential` clamps its value, and, on both sides, its slope.
 _LARGEST_EXPONENT = 40.0
 _STEEPEST_EXPONENT = 15.0
 
-# Rounding in the barycentric evaluation of a hit is a few units in the last place of the
-# largest coordinate involved; eight of them clear it with room to spare.
+# The rounding error of a hit point from barycentrics is a few units in the last place of the
+# largest coordinate involved; eight units exceed it by a safe margin.
 _OFFSET_IN_ULPS = 8.0
 
 
 def safe_sqrt(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Returns `sqrt(x)` where `x > 0`, else 0.
 
-    At and below zero the gradient is 0 (the plain formula has infinity at 0 and NaN below).
-    Just above zero it is the true `1 / (2 sqrt(x))`, which is unbounded.
+    At and below zero the gradient is 0 (the plain formula gives infinity at 0 and NaN below).
+    Above zero it is the true `1 / (2 sqrt(x))`, which is unbounded near 0.
     """
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
@@ -44,8 +44,8 @@ def safe_divide(
 ) -> Float[Array, "*shape"]:
     """Returns `numerator / denominator`, and 0 with zero gradients where the denominator is 0.
 
-    The gradient is formed from the quotient, never from the squared denominator, so it stays
-    finite down to denominators whose square is below the smallest number.
+    The gradient is computed from the quotient instead of the squared denominator, so it is finite
+    even for denominators whose square underflows.
     """
     nonzero = denominator != 0
     return jnp.where(nonzero, numerator / jnp.where(nonzero, denominator, 1.0), 0.0)
@@ -62,10 +62,10 @@ def _safe_divide_jvp(
 
 
 def safe_reciprocal(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Returns `1 / x`, with `|x|` held at 1e-12 or above and the sign of zero kept.
+    """Returns `1 / x`, with `|x|` clamped to at least 1e-12, respecting the sign of zero.
 
-    For the slab test of rays parallel to a box face: the result is huge but finite, so that a
-    product with zero stays zero and no NaN can arise. Not meant to be differentiated.
+    This is for the slab test of rays parallel to a box face: the result is huge but finite, so that
+    its product with zero is zero instead of NaN. Do not differentiate it.
     """
     held = jnp.where(jnp.abs(x) < _SMALLEST_COMPONENT, jnp.copysign(_SMALLEST_COMPONENT, x), x)
     return 1.0 / held
@@ -74,10 +74,10 @@ def safe_reciprocal(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 def time_to_close(
     gap: Float[Array, "*shape"], speed: Float[Array, "*shape"]
 ) -> Float[Array, "*shape"]:
-    """Returns `gap / speed`: when a gap closes that shrinks at a speed.
+    """Returns `gap / speed`, the time until a gap that shrinks at a speed is closed.
 
-    `inf` with gradient 0 where the speed is not above 1e-12, and 0 with gradient 0 where the gap
-    is closed already. Elsewhere the gradient is at most 1e12 times the quotient's own size.
+    The result is `inf` with gradient 0 if the speed is at most 1e-12, and 0 with gradient 0 if the
+    gap is already closed. Elsewhere the gradient is at most 1e12 times the quotient.
     """
     closing = speed > _SMALLEST_COMPONENT
     left = jnp.where(gap > 0, gap, 0.0)
@@ -88,8 +88,8 @@ def time_to_close(
 def safe_atan2(y: Float[Array, "*shape"], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Returns `atan2(y, x)`, and 0 with gradient 0 where the point is within 1e-12 of the origin.
 
-    The gradient is formed from the unit vector, never from squares that vanish, and is at most
-    1e12: it is unbounded, like `1 / sqrt(x^2 + y^2)`, as the origin is approached.
+    The gradient is computed from the unit vector instead of squares that underflow. It grows as
+    `1 / sqrt(x^2 + y^2)` towards the origin, and is at most 1e12.
     """
     near = length(jnp.stack([x, y], axis=-1)) < _SMALLEST_COMPONENT
     return jnp.where(near, 0.0, jnp.arctan2(y, jnp.where(near, 1.0, x)))
@@ -108,10 +108,10 @@ def _safe_atan2_jvp(
 
 
 def dot(a: Float[Array, "*shape n"], b: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
-    """Returns the scalar product over the last axis, for vectors of few components.
+    """Returns the dot product over the last axis, for vectors of few components.
 
-    Component by component: XLA compiles a reduction over an axis of three into a loop of its own,
-    which is three times slower and keeps its neighbours from being fused.
+    It is computed component by component: XLA compiles a reduction over an axis of size 3 to a
+    separate loop, which is three times slower and prevents fusion with neighbouring operations.
     """
     return _sum_components(a * b)
 
@@ -119,8 +119,8 @@ def dot(a: Float[Array, "*shape n"], b: Float[Array, "*shape n"]) -> Float[Array
 def length(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
     """Returns the Euclidean norm over the last axis.
 
-    Components are scaled by the largest first, so that neither 1e30 overflows nor 1e-30
-    vanishes. The zero vector has length 0 and gradient 0.
+    Components are first scaled by the largest, so that 1e30 does not overflow and 1e-30 does not
+    underflow. The zero vector has length 0 and gradient 0.
     """
     scale = _scale(vector)
     return scale * safe_sqrt(_sum_components(jnp.square(vector / scale[..., None])))
@@ -129,7 +129,8 @@ def length(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
 def normalize(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape n"]:
     """Returns the unit vector along the last axis; the zero vector stays zero, with gradient 0.
 
-    Scaled like `length`, so any representable magnitude is normalised to rounding error.
+    Components are scaled as in `length`, so vectors of any magnitude are normalised to rounding
+    error.
     """
     scaled = vector / _scale(vector)[..., None]
     norm = length(scaled)[..., None]
@@ -137,11 +138,11 @@ def normalize(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape n"]:
 
 
 def renormalize(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape n"]:
-    """Returns a vector that is a unit vector but for rounding, with its length mended.
+    """Normalises a vector that is a unit vector up to rounding.
 
-    One step of Newton's method, without a division: an error `e` of the length leaves `1.5 e^2`.
-    Other vectors stay finite, but not unit. The gradient is that of the formula: of `normalize`,
-    but for `e`.
+    This is one step of Newton's method, without a division: it reduces an error `e` of the length
+    to `1.5 e^2`. Other vectors stay finite, but are not normalised. The gradient is that of the
+    formula, which equals that of `normalize` up to `e`.
     """
     return vector * (1.5 - 0.5 * dot(vector, vector)[..., None])
 
@@ -151,7 +152,7 @@ def _sum_components(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
 
 
 def largest_component(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
-    """Returns the largest absolute component over the last axis, as a constant without gradient."""
+    """Returns the largest absolute component over the last axis, without gradient."""
     size = jax.lax.stop_gradient(jnp.abs(vector))
     return functools.reduce(jnp.maximum, (size[..., i] for i in range(size.shape[-1])))
 
@@ -159,8 +160,8 @@ def largest_component(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape"
 def _scale(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
     """Returns the largest absolute component, and 1 for the zero vector.
 
-    Held at 8.5e37 in float32: compilers divide by a scale by multiplying with its reciprocal, which
-    must stay a normal number.
+    The scale is clamped to 8.5e37 in float32: compilers replace the division by a multiplication
+    with the reciprocal, which must be a normal number.
     """
     largest = largest_component(vector)
     held = jnp.minimum(largest, 1.0 / jnp.finfo(vector.dtype).tiny)
@@ -170,11 +171,11 @@ def _scale(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
 def exponential_decay(
     rate: Float[Array, "*rates"], length: Float[Array, ""]
 ) -> Float[Array, "*rates"]:
-    """Returns `exp(-rate * length)`, also over an infinite length.
+    """Returns `exp(-rate * length)`, including for infinite length.
 
-    There a rate of 0 leaves everything and any other leaves nothing, both with gradient 0; the
-    plain formula has NaN in the value of the first and in the gradient of the second. Over a
-    finite length the gradients are the true ones, also at rate 0.
+    For infinite length the result is 1 if the rate is 0, and 0 for other rates, both with gradient
+    0; the plain formula gives NaN in the value of the former and the gradient of the latter. For
+    finite length the gradients are exact, including at rate 0.
     """
     endless = jnp.isinf(length)
     decay = jnp.exp(-rate * jnp.where(endless, 0.0, length))
@@ -183,13 +184,13 @@ def exponential_decay(
 
 @jax.custom_jvp
 def truncated_exponential(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Returns `exp(x)`, held at `exp(40)`, with the slope held between `exp(-15)` and `exp(15)`.
+    """Returns `exp(x)`, clamped to `exp(40)`, with slope clamped to `[exp(-15), exp(15)]`.
 
-    As a density 2e17 is opaque over every length that a float tells from 0, and its product with
-    any length of a scene is a number. The slope is the true one for `|x| <= 15`; below, it never
-    vanishes, so that a field which has become empty can come back.
+    A density of 2e17 is opaque over every length that a float can distinguish from 0, and its
+    product with any length in a scene is finite. The slope is exact for `|x| <= 15`; below, it does
+    not vanish, so that an empty field can recover.
 
-    Source: the density of Nerfacto (`trunc_exp`, from torch-ngp), whose value is not held.
+    Source: the density of Nerfacto (`trunc_exp`, from torch-ngp), which does not clamp the value.
     """
     return jnp.exp(jnp.minimum(x, _LARGEST_EXPONENT))
 
@@ -206,15 +207,15 @@ def _truncated_exponential_jvp(
 def offset_origin(
     point: Float[Array, "3"], towards: Float[Array, "3"], scale: Float[Array, ""]
 ) -> Float[Array, "3"]:
-    """Returns where to restart a ray that leaves a surface, just off it.
+    """Returns the origin of a ray that leaves a surface, offset from the surface.
 
-    The step is proportional to `scale`, the largest coordinate that took part in computing
-    `point`, because that sets the rounding error. At coordinates near 2 it is 2e-6 in float32: it
-    clears the surface, and no wall worth modelling is that thin.
+    The offset is proportional to `scale`, the largest coordinate used to compute `point`, which
+    determines the rounding error. At coordinates near 2 the offset is 2e-6 in float32, which clears
+    the surface and is much thinner than any modelled wall.
 
     Args:
-      point: on the surface.
-      towards: unit geometric normal on the side that the ray leaves to.
+      point: point on the surface.
+      towards: unit geometric normal on the side of the new ray.
       scale: largest absolute coordinate involved, at least 0.
 
     Source: after Waechter and Binder, A Fast and Robust Method for Avoiding

@@ -1,1 +1,1 @@
-"""Fields of density and colour. They know positions and directions, never rays."""
+"""Fields of density and colour, as functions of position and direction."""

@@ -1,6 +1,6 @@
-"""The proposal field of Zip-NeRF: density alone, cheap enough to be asked many times along a path.
+"""Zip-NeRF's proposal field: density only, cheap to query many times along a path.
 
-Plain functions over Gaussians in the unit cube; the linen module stays inside.
+Its interface is pure functions over Gaussians in the unit cube; the linen module is private.
 
 Source: Barron et al., Mip-NeRF 360 (2022), section 3; Zip-NeRF (2023) for the hash grid.
 """
@@ -16,7 +16,7 @@ from refref_jax.fields.kinds import Params
 from refref_jax.fields.networks import GridDensityConfig, grid_network, nowhere
 from refref_jax.sampling.cones import Gaussians
 
-# Where softplus starts to rise: an untrained field is thin, but not empty.
+# Shift of the softplus: the density of an untrained field is low, but not zero.
 _DENSITY_SHIFT = -1.0
 
 
@@ -28,23 +28,23 @@ class DensityFieldConfig(GridDensityConfig):
 
 
 def init(key: Array, config: DensityFieldConfig) -> Params:
-    """Returns new parameters."""
+    """Returns initial parameters."""
     return _DensityField(config).init(key, nowhere())
 
 
 def density(params: Params, config: DensityFieldConfig, gaussians: Gaussians) -> Float[Array, ""]:
-    """Returns the density that the multisamples of one interval see, per scene radius.
+    """Returns the density of one interval, averaged over its multisamples, per scene radius.
 
     Args:
-      params: from `init`.
-      config: the same as there.
+      params: parameters, from `init`.
+      config: shape of the field, as in `init`.
       gaussians: multisamples in the unit cube, as fractions of its edge.
     """
     return _DensityField(config).apply(params, gaussians)
 
 
 def activate_density(raw: Float[Array, ""]) -> Float[Array, ""]:
-    """Returns the density of a network's output: a shifted softplus, linear for large input."""
+    """Returns the density for a network output: a shifted softplus, linear for large inputs."""
     return jax.nn.softplus(raw + _DENSITY_SHIFT)
 
 

@@ -1,4 +1,4 @@
-"""Encodings of directions."""
+"""Direction encodings of fields."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float

@@ -1,8 +1,8 @@
-"""A multiresolution hash grid: features of a point, interpolated from tables at many scales.
+"""Multiresolution hash grid: features interpolated from tables at many scales.
 
-Each level covers the unit cube with `n` cells a side. A coarse level stores every grid vertex; a
-fine one hashes its vertices into a table of fixed size. A level whose cells are finer than the
-Gaussian being queried is faded out, which anti-aliases the field.
+Each level covers the unit cube with `n` cells per side. A coarse level stores every grid vertex; a
+fine level hashes its vertices into a table of fixed size. Levels whose cells are finer than the
+queried Gaussian are down-weighted, which anti-aliases the field.
 
 Source: Mueller et al., Instant NGP (2022), section 3; Barron et al., Zip-NeRF (2023), section 2,
 for the down-weighting.
@@ -32,11 +32,11 @@ class HashGridConfig:
     """Shape of a hash grid.
 
     Attributes:
-      levels: number of resolutions.
-      coarsest: cells a side of the first level.
-      finest: cells a side of the last; those between grow geometrically.
-      entries: most entries of a level's table, a power of two.
-      features: values an entry.
+      levels: number of levels.
+      coarsest: base resolution, cells per side of the first level.
+      finest: finest resolution, cells per side of the last level; resolutions grow geometrically.
+      entries: hash map size, the maximum number of entries per level, a power of two.
+      features: number of features per entry.
     """
 
     levels: int
@@ -46,21 +46,21 @@ class HashGridConfig:
     features: int
 
     def __post_init__(self) -> None:
-        """Checks what the shapes below rely on."""
+        """Validates the shape."""
         if self.levels < 1 or self.features < 1 or not 1 <= self.coarsest <= self.finest:
             raise ValueError(
-                f"A hash grid needs at least one level and feature, and 1 <= coarsest <= finest; "
-                f"got {self}. Correct the field's configuration."
+                f"The hash grid {self} is invalid. Give at least one level and one feature, and "
+                f"1 <= coarsest <= finest."
             )
         if self.entries < 2 or self.entries & (self.entries - 1):
             raise ValueError(
-                f"A hash table has a power of two entries, not {self.entries}. Use for example "
+                f"entries must be a power of two, not {self.entries}. Use for example "
                 f"{2 ** max(1, self.entries.bit_length())}."
             )
 
 
 def resolutions(config: HashGridConfig) -> list[int]:
-    """Returns the cells a side of each level."""
+    """Returns the number of cells per side of each level."""
     if config.levels == 1:
         return [config.coarsest]
     growth = (config.finest / config.coarsest) ** (1.0 / (config.levels - 1))
@@ -68,7 +68,7 @@ def resolutions(config: HashGridConfig) -> list[int]:
 
 
 def tables(params: Any) -> list[Float[Array, "_ _"]]:
-    """Returns the tables of all hash grids in a tree of parameters."""
+    """Returns the tables of all hash grids in a pytree of parameters."""
     leaves = jax.tree_util.tree_leaves_with_path(params)
     return [leaf for path, leaf in leaves if _TABLE in jax.tree_util.keystr(path)]
 
@@ -77,8 +77,8 @@ class HashGrid(nn.Module):
     """The tables, as a linen module over one Gaussian.
 
     Attributes:
-      config: the grid's shape.
-      precision: in which entries are read.
+      config: shape of the grid.
+      precision: precision in which entries are read.
     """
 
     config: HashGridConfig
@@ -91,7 +91,7 @@ class HashGrid(nn.Module):
         """Returns the features of a Gaussian in the unit cube.
 
         Args:
-          position: mean, in `[0, 1]^3`.
+          position: mean of the Gaussian, in `[0, 1]^3`.
           scale: standard deviation, as a fraction of the cube's edge.
         """
         levels = []
@@ -107,8 +107,8 @@ class MultisampledGrid(nn.Module):
     """A hash grid over the multisamples of one interval: the mean of their features.
 
     Attributes:
-      config: the grid's shape.
-      precision: as for `HashGrid`.
+      config: shape of the grid.
+      precision: precision in which entries are read.
     """
 
     config: HashGridConfig
@@ -125,15 +125,15 @@ class MultisampledGrid(nn.Module):
 
 
 def fading(scale: Float[Array, ""], resolution: int) -> Float[Array, ""]:
-    """Returns how much of a level a Gaussian still sees: `erf(1 / sqrt(8 scale^2 n^2))`.
+    """Returns the weight of a level's features for a Gaussian: `erf(1 / sqrt(8 scale^2 n^2))`.
 
-    1 for a point (`scale = 0`), falling to 0 as it outgrows the cells.
+    The weight is 1 for a point (`scale = 0`) and tends to 0 for Gaussians larger than the cells.
     """
     return jax.lax.erf(numerics.safe_reciprocal(math.sqrt(8.0) * resolution * scale))
 
 
 def _initialise(key: Array, shape: tuple[int, int]) -> Float[Array, "entries features"]:
-    # Fields are in single precision, also where JAX has doubles.
+    # Fields are in single precision, even if double precision is enabled in JAX.
     return jax.random.uniform(
         key, shape, jnp.float32, minval=-_INITIAL_RANGE, maxval=_INITIAL_RANGE
     )

@@ -1,12 +1,13 @@
-"""Trilinear interpolation of a table over the vertices of a grid, and its transpose.
+"""Trilinear interpolation of a table at the vertices of a grid, and its transpose.
 
-The part of a field whose cost is memory: every point reads eight rows that lie anywhere, and in
-the backward pass adds to eight. Both are primitives of their own, since XLA's loops for them on a
-CPU take about twice as long as one over points that finds its rows once. A CPU runs
-`vertex_loops`; other devices take the formulas `_gathered` and `_scattered`, and so does what is
-seldom asked for (derivatives by the position, many tables at once).
+This part of a field is memory-bound: every point reads eight rows at random addresses, and adds to
+eight rows in the backward pass. Both operations are custom primitives, because XLA's loops for them
+on a CPU take about twice as long as one loop over points that computes the rows once. CPUs run
+`vertex_loops`; other devices use the formulas `_gathered` and `_scattered`, as do rare operations
+(derivatives with respect to the position, several tables at once).
 
-Both take leading axes, which `vmap` adds: all points of a batch are one loop, or one gather.
+Both primitives take leading axes, which `vmap` adds: all points of a batch are one loop, or one
+gather.
 
 Source: Mueller et al., Instant NGP (2022), section 3.
 """
@@ -37,11 +38,11 @@ def interpolate(
     """Blends the table's rows at the eight corners of each point's cell.
 
     Args:
-      table: a row for each vertex, or for all that share a hash; see `vertices`.
-      positions: in `[0, 1]^3`.
-      resolution: cells a side.
-      precision: rows are read as `bfloat16`, or as they are. The sums, and the gradient by the
-        table, are in the table's own type.
+      table: one row per vertex, or per hash value; see `vertices`.
+      positions: points in `[0, 1]^3`.
+      resolution: number of cells per side.
+      precision: precision in which rows are read. Sums, and the gradient with respect to the table,
+        have the type of the table.
     """
     return _gather.bind(table, positions, resolution=resolution, precision=precision)
 
@@ -69,7 +70,7 @@ def _scattered(
     resolution: int,
     entries: int,
 ) -> Float[Array, "entries features"]:
-    """Adds each point's slopes to the rows that it reads, by their weights."""
+    """Adds each point's gradient to the rows that it reads, multiplied by their weights."""
     rows, weights = _stacked_corners(positions, resolution, entries)
     shares = weights[..., None] * slopes[..., None, :]
     zeros = jnp.zeros((entries, slopes.shape[-1]), slopes.dtype)
@@ -84,11 +85,11 @@ def _stacked_corners(
     return jnp.stack(rows, axis=-1), jnp.stack(weights, axis=-1)
 
 
-# --- as primitives, each linear in its first argument and the transpose of the other ---
+# --- as primitives: both are linear in their first argument, and each is the other's transpose ---
 
 
 def _primitive(name: str, formula: Callable[..., Array], loop: Callable[..., Array]) -> Primitive:
-    """Returns a primitive over `(values, positions)` that is neither mapped nor derived yet."""
+    """Returns a primitive over `(values, positions)`, without batching or derivative rules."""
     primitive = Primitive(name)
 
     def abstract(*arguments: Any, **options: Any) -> jax.core.ShapedArray:
@@ -103,7 +104,7 @@ def _primitive(name: str, formula: Callable[..., Array], loop: Callable[..., Arr
 
 
 def _evaluate(formula: Callable[..., Array], *arguments: ArrayLike, **options: Any) -> Array:
-    """Returns the formula's value; JAX hands constants to a primitive as NumPy arrays."""
+    """Returns the value of the formula; JAX passes constants to primitives as NumPy arrays."""
     return formula(*map(jnp.asarray, arguments), **options)
 
 
@@ -130,7 +131,7 @@ def _map(
 def _map_gather(
     arguments: Sequence[ArrayLike], axes: Sequence[Any], **options: Any
 ) -> tuple[Array, int]:
-    """Makes a mapped axis of points one more of their leading axes."""
+    """Converts a mapped axis of points to a leading axis."""
     table, positions = arguments
     if axes[0] is None:
         return _gather.bind(table, jnp.moveaxis(positions, axes[1], 0), **options), 0
@@ -145,7 +146,7 @@ def _derive_gather(
     resolution: int,
     precision: Precision,
 ) -> Array:
-    del precision  # rounding is not linear, and its derivative is taken to be 1
+    del precision  # rounding is not linear; its derivative is defined as 1
     return _gather.bind(tangent, positions, resolution=resolution, precision="float32")
 
 

@@ -1,8 +1,8 @@
-"""What makes a kind of field: configurations, and functions that take them.
+"""Interface of field types: configurations, and functions of these.
 
-A field is two functions, `init` and `radiance`; a proposal's are `init` and `density`. All of them
-are plain functions over Gaussians in the unit cube. A kind is one module with a `FieldKind`, and
-one line in `registry`; all else asks the registry.
+A radiance field has two functions, `init` and `radiance`; a proposal field has `init` and
+`density`. All are pure functions over Gaussians in the unit cube. A field type is one module with a
+`FieldKind`, and one line in `registry`, through which all other modules query fields.
 """
 
 import dataclasses
@@ -16,44 +16,44 @@ from refref_jax.fields.precision import check_precision
 from refref_jax.sampling.cones import Gaussians
 
 Params = Any
-"""A pytree of arrays, as `init` makes it."""
+"""Pytree of arrays, from `init`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FieldConfig:
-    """Shape of a field of any kind.
+    """Shape of a field of any type.
 
-    Each kind derives from the two classes below, and gives `kind` its name as the default and the
-    only choice: by that name the registry, and the files of a run, know what a shape is of.
+    Field types derive from `RadianceConfig` and `DensityConfig`, with their name as the default and
+    only value of `kind`. The registry and the files of a run identify the type by this name.
 
     Attributes:
-      precision: of tables and matrix products.
-      kind: name of the kind.
+      precision: precision of tables and matrix products.
+      kind: name of the field type.
     """
 
     precision: Precision = dataclasses.field(default="float32", kw_only=True)
     kind: str = dataclasses.field(default="", kw_only=True)
 
     def __post_init__(self) -> None:
-        """Checks the choice."""
+        """Validates the precision."""
         check_precision(self.precision)
 
 
 @dataclasses.dataclass(frozen=True)
 class RadianceConfig(FieldConfig):
-    """Shape of a radiance field of any kind."""
+    """Shape of a radiance field of any type."""
 
 
 @dataclasses.dataclass(frozen=True)
 class DensityConfig(FieldConfig):
-    """Shape of a density field, of a proposal, of any kind."""
+    """Shape of a proposal's density field of any type."""
 
 
 class Radiance(NamedTuple):
-    """The field at a point.
+    """Output of a radiance field.
 
     Attributes:
-      density: per scene radius, not negative.
+      density: density per scene radius, non-negative.
       rgb: linear radiance towards the camera, in `[-0.001, 1.001]`.
     """
 
@@ -62,14 +62,14 @@ class Radiance(NamedTuple):
 
 
 class FieldSize(NamedTuple):
-    """Fields of one size, and how often a path asks them.
+    """Fields of one size, and the numbers of samples along a path.
 
     Attributes:
-      field: the radiance field.
-      proposals: the density field of each round of proposals, coarse to fine.
-      samples: intervals of each of these rounds, then of the final one.
-      multisamples: points that stand for an interval's cone.
-      footprint: how wide a pixel is along its path.
+      field: shape of the radiance field.
+      proposals: shape of each proposal level's density field, coarse to fine.
+      samples: number of intervals of each proposal level, then of the radiance field.
+      multisamples: number of multisamples per interval.
+      footprint: pixel footprint along a path, see `ModelConfig`.
       dilation: widening of a proposal before it is sampled, see `ModelConfig`.
     """
 
@@ -82,18 +82,18 @@ class FieldSize(NamedTuple):
 
 
 class FieldKind(NamedTuple):
-    """A kind of field.
+    """A field type.
 
     Attributes:
-      radiance_config: class of the radiance field's shape.
-      init_radiance: makes its parameters, of a key and a shape.
-      radiance: density and colour of one interval of a path, of parameters, shape, Gaussians in
-        the unit cube (fractions of its edge), and the unit direction of travel, world frame.
-      density_config: class of a proposal's shape.
-      init_density: makes its parameters.
-      density: density of one interval, of parameters, shape and Gaussians.
-      sizes: by the names of presets.
-      hash_decay: weight of the decay of hash grids in its loss.
+      radiance_config: configuration class of the radiance field.
+      init_radiance: function of key and shape that returns initial radiance field parameters.
+      radiance: function of parameters, shape, Gaussians in the unit cube (fractions of its edge)
+        and unit direction of travel (world frame) that returns density and colour of one interval.
+      density_config: configuration class of the proposal fields.
+      init_density: function of key and shape that returns initial proposal field parameters.
+      density: function of parameters, shape and Gaussians that returns the density of one interval.
+      sizes: field sizes by preset name.
+      hash_decay: weight of the hash decay loss.
     """
 
     radiance_config: type[RadianceConfig]
@@ -107,7 +107,7 @@ class FieldKind(NamedTuple):
 
 
 def in_half_precision(size: FieldSize) -> FieldSize:
-    """Returns the same fields with their arithmetic in bfloat16."""
+    """Returns the same fields with bfloat16 arithmetic."""
     field, *proposals = (
         dataclasses.replace(each, precision="bfloat16") for each in (size.field, *size.proposals)
     )

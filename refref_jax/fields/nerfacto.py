@@ -1,18 +1,18 @@
-"""Fields in the style of Nerfacto, for the paper's ablation "without Zip-NeRF".
+"""Nerfacto fields, for the paper's ablation "without Zip-NeRF".
 
-The same hash grids as Zip-NeRF's, read at points: no level fades where a pixel is wider than its
-cells, so nothing is anti-aliased, and an interval is one point on its path. Densities are
-exponentials of what the networks say, and colours a sigmoid of it.
+The hash grids are those of the Zip-NeRF fields, but queried at points: levels are not down-weighted
+for wide pixels, so there is no anti-aliasing, and an interval has one sample on its path. Density
+is an exponential of the network output, and colour a sigmoid.
 
-Nerfacto as published learns more, which belongs to photographs and not to the field: a code for
-each image, corrections of the cameras. These are left out. Its sampling, that is its first round
-evenly in a warped distance, and its loss on proposals are those of this library for every kind.
-Networks have biases, as in its PyTorch version.
+Published Nerfacto also learns appearance embeddings and camera corrections, which concern
+photographs rather than the field; both are omitted. Sampling (with the first proposal level uniform
+in warped distance) and the proposal loss are those that this library uses for all field types.
+Networks have biases, as in the PyTorch version.
 
 Source: Tancik et al., Nerfstudio (2023), section 4, and its code, `nerfstudio/models/nerfacto.py`,
 `fields/nerfacto_field.py` and `fields/density_fields.py` at commit 50e0e3c, for the size `paper`;
-the paper's own version of it (`YueYin27/nerfstudio_for_engn8501`) has the same numbers. There the
-untrained density is near 1, as it is here; later versions of Nerfacto begin at 0.01.
+the paper's own version of it (`YueYin27/nerfstudio_for_engn8501`) has the same numbers. The
+untrained density is near 1 there and here; later versions of Nerfacto start at 0.01.
 """
 
 import dataclasses
@@ -50,7 +50,7 @@ class NerfactoProposalConfig(GridDensityConfig):
 
 
 def init_radiance(key: Array, config: NerfactoConfig) -> Params:
-    """Returns new parameters of a radiance field."""
+    """Returns initial parameters of a radiance field."""
     return _RadianceField(config).init(key, nowhere(), jnp.zeros(3, jnp.float32))
 
 
@@ -60,16 +60,16 @@ def radiance(
     """Returns density and colour of one interval of a path.
 
     Args:
-      params: from `init_radiance`.
-      config: the same as there.
-      gaussians: points in the unit cube; how wide they are is not heeded.
+      params: parameters, from `init_radiance`.
+      config: shape of the field, as in `init_radiance`.
+      gaussians: points in the unit cube; their scales are ignored.
       direction: unit direction of travel at the interval, world frame.
     """
     return _RadianceField(config).apply(params, gaussians, direction)
 
 
 def init_density(key: Array, config: NerfactoProposalConfig) -> Params:
-    """Returns new parameters of a density field."""
+    """Returns initial parameters of a density field."""
     return _DensityField(config).init(key, nowhere())
 
 
@@ -79,15 +79,15 @@ def density(
     """Returns the density of one interval of a path, per scene radius.
 
     Args:
-      params: from `init_density`.
-      config: the same as there.
-      gaussians: points in the unit cube; how wide they are is not heeded.
+      params: parameters, from `init_density`.
+      config: shape of the field, as in `init_density`.
+      gaussians: points in the unit cube; their scales are ignored.
     """
     return _DensityField(config).apply(params, gaussians)
 
 
 def _points(gaussians: Gaussians) -> Gaussians:
-    """Returns Gaussians without width, for which no level fades."""
+    """Returns Gaussians of scale 0, for which no level is down-weighted."""
     return gaussians._replace(scales=jnp.zeros_like(gaussians.scales))
 
 

@@ -1,6 +1,6 @@
-"""The small networks behind a hash grid, which several kinds of field share.
+"""MLPs on hash grid features, shared by several field types.
 
-Functions for the body of a compact linen module: their layers are that module's.
+The functions are called in a compact linen module, to which their layers belong.
 """
 
 import dataclasses
@@ -23,11 +23,11 @@ class GridRadianceConfig(RadianceConfig):
     """Shape of a radiance field on a hash grid.
 
     Attributes:
-      grid: the hash grid.
-      density_width: units of the density network's hidden layer.
-      bottleneck: features that the density network hands to the colour network.
-      colour_width: units of the colour network's hidden layers.
-      colour_depth: number of those layers.
+      grid: shape of the hash grid.
+      density_width: width of the density network's hidden layer.
+      bottleneck: number of features passed from the density network to the colour network.
+      colour_width: width of the colour network's hidden layers.
+      colour_depth: number of hidden layers of the colour network.
     """
 
     grid: HashGridConfig
@@ -42,8 +42,8 @@ class GridDensityConfig(DensityConfig):
     """Shape of a density field on a hash grid.
 
     Attributes:
-      grid: the hash grid.
-      width: units of the hidden layer.
+      grid: shape of the hash grid.
+      width: width of the hidden layer.
     """
 
     grid: HashGridConfig
@@ -51,7 +51,7 @@ class GridDensityConfig(DensityConfig):
 
 
 def nowhere() -> Gaussians:
-    """Returns one point, with which a module's parameters are made."""
+    """Returns one point, as an example input for initialising a module."""
     return Gaussians(jnp.zeros((1, 3), jnp.float32), jnp.zeros(1, jnp.float32))
 
 
@@ -63,18 +63,18 @@ def grid_network(
     outputs: int,
     precision: Precision,
 ) -> Float[Array, " outputs"]:
-    """Returns what a network with one hidden layer says of the grid's mean features.
+    """Returns the output of an MLP with one hidden layer on the grid's mean features.
 
     Args:
-      gaussians: in the unit cube.
-      grid: the hash grid.
-      width: units of the hidden layer.
-      outputs: number of outputs, which no activation follows.
-      precision: of tables and matrix products.
+      gaussians: multisamples in the unit cube.
+      grid: shape of the hash grid.
+      width: width of the hidden layer.
+      outputs: number of outputs, without activation.
+      precision: precision of tables and matrix products.
     """
     layer = dense(precision)
     features = MultisampledGrid(grid, precision)(gaussians)
-    # Flax numbers layers as they are made, and checkpoints have their names.
+    # Flax numbers layers in order of creation, and checkpoints contain these names.
     hidden = nn.relu(layer(width)(features))
     return layer(outputs)(hidden)
 
@@ -84,7 +84,7 @@ def colour(
     direction: Float[Array, "3"],
     config: GridRadianceConfig,
 ) -> Float[Array, "3"]:
-    """Returns a colour in `[0, 1]`, of the density network's features and a unit direction."""
+    """Returns a colour in `[0, 1]` from the bottleneck features and a unit direction."""
     layer = dense(config.precision)
     hidden = jnp.concatenate([bottleneck, spherical_harmonics(direction)])
     for _ in range(config.colour_depth):

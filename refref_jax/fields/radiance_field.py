@@ -1,6 +1,6 @@
-"""The radiance field of Zip-NeRF: density, and colour by direction.
+"""Zip-NeRF's radiance field: density and view-dependent colour.
 
-Plain functions over Gaussians in the unit cube; the linen module stays inside.
+Its interface is pure functions over Gaussians in the unit cube; the linen module is private.
 
 Source: paper (arXiv 2505.05848), supplement (f for density, g for colour, spherical harmonics of
 the local direction); Zip-NeRF (2023) for the hash grid and the bottleneck.
@@ -18,7 +18,7 @@ from refref_jax.fields.kinds import Params, Radiance
 from refref_jax.fields.networks import GridRadianceConfig, colour, grid_network, nowhere
 from refref_jax.sampling.cones import Gaussians
 
-# Colours may leave [0, 1] by this much, so that black and white lie at finite network outputs.
+# Colours may exceed [0, 1] by this much, so that black and white have finite network outputs.
 _COLOUR_PADDING = 0.001
 
 
@@ -30,7 +30,7 @@ class RadianceFieldConfig(GridRadianceConfig):
 
 
 def init(key: Array, config: RadianceFieldConfig) -> Params:
-    """Returns new parameters."""
+    """Returns initial parameters."""
     return _RadianceField(config).init(key, nowhere(), jnp.zeros(3, jnp.float32))
 
 
@@ -43,8 +43,8 @@ def radiance(
     """Returns density and colour of one interval of a path.
 
     Args:
-      params: from `init`.
-      config: the same as there.
+      params: parameters, from `init`.
+      config: shape of the field, as in `init`.
       gaussians: multisamples in the unit cube, as fractions of its edge.
       direction: unit direction of travel at the interval, world frame.
     """

@@ -1,6 +1,7 @@
-"""All kinds of field. Whoever asks a field asks here; the kind is told by the configuration.
+"""Registry of field types.
 
-A new kind is a module with a `FieldKind`, and a line of `KINDS`.
+Callers query fields through these functions, which dispatch on `config.kind`. To add a field type,
+write a module with a `FieldKind` and add it to `KINDS`.
 """
 
 from collections.abc import Mapping
@@ -24,11 +25,11 @@ KINDS: dict[str, FieldKind] = {
 }
 
 USUAL = "zipnerf"
-"""The kind that is taken where none is named, as in the files of older runs."""
+"""Field type if none is named, as in the files of older runs."""
 
 
 def init_radiance(key: Array, config: RadianceConfig) -> Params:
-    """Returns new parameters of a radiance field."""
+    """Returns initial parameters of a radiance field."""
     return KINDS[config.kind].init_radiance(key, config)
 
 
@@ -40,7 +41,7 @@ def radiance(
 
 
 def init_density(key: Array, config: DensityConfig) -> Params:
-    """Returns new parameters of a density field."""
+    """Returns initial parameters of a density field."""
     return KINDS[config.kind].init_density(key, config)
 
 
@@ -50,7 +51,7 @@ def density(params: Params, config: DensityConfig, gaussians: Gaussians) -> Floa
 
 
 def variants() -> Mapping[type[FieldConfig], Mapping[str, type[FieldConfig]]]:
-    """Returns which classes stand for the shapes of fields, by kind, the usual one first."""
+    """Returns the configuration classes of fields by base class and kind, the default first."""
     order = [USUAL, *(name for name in KINDS if name != USUAL)]
     return {
         RadianceConfig: {name: KINDS[name].radiance_config for name in order},

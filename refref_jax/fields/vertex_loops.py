@@ -1,7 +1,7 @@
-"""Interpolation of a table, and its transpose, as native loops of a CPU over points.
+"""Interpolation of a table, and its transpose, as native CPU loops over points.
 
-The meaning is that of the formulas in `interpolation`. A point's rows are found once and stay in
-registers for all of its features.
+The results are those of the formulas in `interpolation`. The rows of a point are computed once and
+stay in registers for all of its features.
 """
 
 import jax
@@ -12,7 +12,7 @@ from refref_jax.choices import Precision
 from refref_jax.fields.vertices import corners
 from refref_jax.geometry.native_loop import native_loop
 
-# Bits of bfloat16's exponent and mantissa.
+# Numbers of exponent and mantissa bits of bfloat16.
 _BFLOAT16 = (8, 7)
 
 
@@ -48,7 +48,7 @@ def scatter(
     resolution: int,
     entries: int,
 ) -> Float[Array, "entries features"]:
-    """Adds each point's slopes to the rows that it reads, by their weights."""
+    """Adds each point's gradient to the rows that it reads, multiplied by their weights."""
     features = slopes.shape[-1]
 
     @native_loop
@@ -67,8 +67,8 @@ def scatter(
 
 
 def _rounded(row: Array, precision: Precision) -> Array:
-    """Returns a row as if it had been stored in a precision."""
-    # There and back by conversions would be left out by XLA.
+    """Returns a row rounded to a precision."""
+    # XLA would remove a conversion to the precision and back.
     return jax.lax.reduce_precision(row, *_BFLOAT16) if precision == "bfloat16" else row
 
 

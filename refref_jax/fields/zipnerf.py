@@ -1,7 +1,7 @@
-"""Zip-NeRF's fields as a kind, in all sizes.
+"""Zip-NeRF field type, with its preset sizes.
 
 Source: paper (arXiv 2505.05848), supplement (implementation details), and Zip-NeRF (2023) for the
-size `paper`; the others are ours.
+size `paper`; the other sizes are ours.
 """
 
 from refref_jax.fields import density_field, radiance_field

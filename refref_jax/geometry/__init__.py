@@ -1,1 +1,1 @@
-"""Rays, triangles and the tree that finds where they meet. It knows nothing of light."""
+"""Cameras, rays, triangles and the BVH that intersects them. Independent of optics."""

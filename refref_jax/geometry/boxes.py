@@ -1,9 +1,9 @@
-"""One ray against one axis-aligned box.
+"""Intersection test of one ray with one axis-aligned box.
 
-A ray's *octant* is the set of axes along which it runs backwards, as a number of three bits (x is
-the lowest). Within one octant it is known by which faces a ray enters and leaves any box, so the
-slab test needs no sorting: the *entry corner* is where the three entered faces meet, the *exit
-corner* where the three left ones do.
+A ray's *octant* is the set of axes along which its direction is negative, as a 3-bit number (x is
+the lowest bit). All rays of an octant enter and leave a box through the same faces, so the slab
+test needs no sorting: the *entry corner* is where the three entered faces meet, the *exit corner*
+where the three exited faces meet.
 
 Source: the slab method, Kay and Kajiya (1986).
 """
@@ -15,24 +15,24 @@ from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
 
-# The product of a plane with the reciprocal and the product of the origin with it are rounded
-# once each, by half a unit in the last place of the second. Two units cover both.
+# The products of plane and origin with the reciprocal are each rounded once, by half a unit in the
+# last place of the second. Two units cover both.
 _SLACK = 2.4e-7
 
-# Two roundings up on the far side, so that a triangle lying in a box face is never culled.
+# Two roundings up on the far side, so that a triangle that lies in a box face is never culled.
 _FAR_PADDING = 1.0000004
 
 
 class Slabs(NamedTuple):
-    """What the test needs of a ray, computed once for all boxes.
+    """A ray prepared for box tests, computed once for all boxes.
 
     The distance to a plane is one fused multiply-add, `plane * reciprocal - offset`. The offset
-    is rounded so that a box is met early and left late.
+    is rounded so that boxes are entered early and left late.
 
     Attributes:
-      reciprocals: of the direction, finite in every component.
-      entries: offsets for the planes by which a box is entered.
-      exits: offsets for those by which it is left.
+      reciprocals: reciprocals of the direction's components, all finite.
+      entries: offsets for the planes through which a box is entered.
+      exits: offsets for the planes through which a box is left.
     """
 
     reciprocals: Float[Array, "3"]
@@ -41,7 +41,7 @@ class Slabs(NamedTuple):
 
 
 def octant(direction: Float[Array, "3"]) -> Int[Array, ""]:
-    """Returns the octant of a direction, 0 to 7; a zero counts by its sign, as in `slabs`."""
+    """Returns the octant of a direction, 0 to 7; zeros count by their sign bit, as in `slabs`."""
     x, y, z = jnp.signbit(direction).astype(jnp.int32)
     return x + 2 * y + 4 * z
 
@@ -63,14 +63,14 @@ def overlaps(
     """Returns whether the ray passes through the box at a distance in `[0, limit]`.
 
     Args:
-      ray: from `slabs`.
-      entry: the box's entry corner in the octant of the ray.
-      exit: its exit corner.
-      limit: farthest distance of interest; anything negative overlaps no box.
+      ray: the ray, from `slabs`.
+      entry: entry corner of the box in the octant of the ray.
+      exit: exit corner of the box.
+      limit: farthest distance of interest; a negative limit overlaps no box.
     """
     # Written out by components and with `where` instead of `minimum`, which would propagate NaN:
     # in a packet each line is then one instruction for eight rays.
-    kind = ray.reciprocals.dtype  # boxes are in single precision, whatever the rays are
+    kind = ray.reciprocals.dtype  # boxes are in single precision, rays in any
     enter_x, enter_y, enter_z = entry.astype(kind) * ray.reciprocals - ray.entries
     leave_x, leave_y, leave_z = exit.astype(kind) * ray.reciprocals - ray.exits
     near = _larger(_larger(enter_x, enter_y), _larger(enter_z, jnp.zeros_like(enter_z)))

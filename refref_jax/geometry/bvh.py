@@ -1,10 +1,10 @@
-"""Closest hits of rays with a packed tree of triangles (a bounding volume hierarchy).
+"""Closest hits of rays with a packed bounding volume hierarchy (BVH).
 
-On a CPU packets of rays walk the tree together (`packet_traversal`); on an accelerator every ray
-walks alone, all in lock-step (`lockstep_traversal`). How the tree lies in memory is told in
-`node_table`, how it is built in `bvh_build`.
+On a CPU, packets of rays traverse the tree together (`packet_traversal`); on an accelerator, every
+ray traverses it alone and all rays run in lock-step (`lockstep_traversal`). `node_table` describes
+the memory layout of the tree, `bvh_build` its construction.
 
-This module works on whole batches of rays (one leading axis).
+Rays are passed as batches with one leading axis.
 """
 
 from typing import NamedTuple
@@ -19,19 +19,19 @@ from refref_jax.geometry.packet_traversal import PACKET, Packet
 from refref_jax.geometry.rays import Rays
 
 LEAF_SIZE = node_table.LEAF_SIZE
-"""Most triangles a leaf may hold."""
+"""Maximum number of triangles in a leaf."""
 
 NO_SLOT = -1
-"""The slot of a ray that hit nothing, or that leaves no triangle."""
+"""Triangle slot of a ray that hit nothing, or that does not start on a triangle."""
 
 
 class BVH(NamedTuple):
     """A packed tree, built on the host by `bvh_build`.
 
     Attributes:
-      nodes: one table of nodes for each octant of directions, as `node_table` describes.
-      triangles: corners by slot, in leaf order, padded by `LEAF_SIZE` slots that nothing hits.
-      facets: the same triangles prepared for the test, as `facets` describes.
+      nodes: one node table for each octant of directions (see `node_table`).
+      triangles: corners by slot, in leaf order, padded by `LEAF_SIZE` slots that are never hit.
+      facets: the same triangles, precomputed for the intersection test (see `facets`).
     """
 
     nodes: Int[Array, "8 nodes 8"]
@@ -44,7 +44,7 @@ class Hits(NamedTuple):
 
     Attributes:
       distances: arc length, `inf` for a miss.
-      slots: the triangle that was hit, `NO_SLOT` for a miss.
+      slots: slot of the triangle that was hit, `NO_SLOT` for a miss.
       barycentrics: weights of the triangle's second and third corner, 0 for a miss.
     """
 
@@ -60,22 +60,22 @@ def closest_hits(
     limits: Float[Array, " rays"],
     leaving: Int[Array, " rays"],
 ) -> Hits:
-    """Finds where each ray first meets a triangle, from either side.
+    """Finds the first triangle that each ray hits, from either side.
 
-    Of triangles met at one and the same distance the lowest slot is returned. Gradients do not
-    flow: recompute the point from the slot and the barycentrics.
+    Among triangles at the same distance the lowest slot is returned. Gradients do not flow through
+    the search: recompute the point from the slot and the barycentrics.
 
-    Neighbours in the batch should be neighbours in space: on a CPU 16 of them share their way
-    through the tree. Pixels in tiles of 4 x 4 are so by nature; for rays in no order
+    Neighbours in the batch should be neighbours in space, because on a CPU 16 of them traverse the
+    tree together. Pixels in tiles of 4 x 4 are coherent already; for incoherent rays,
     `benchmarks/ray_sorting.py` has a sort.
 
     Args:
-      bvh: the scene.
-      rays: any number of rays; one that is not finite hits nothing.
-      limits: farthest distance of interest; `inf` for all, negative for a ray that is not to
-        be traced (it costs next to nothing).
-      leaving: the slot of the triangle that a ray starts on, which it can not hit again, or
-        `NO_SLOT`.
+      bvh: the tree of the scene.
+      rays: any number of rays; rays that are not finite hit nothing.
+      limits: farthest distance of interest; `inf` for no limit, negative for a ray that is not to
+        be traced (its cost is negligible).
+      leaving: excluded primitive, the slot of the triangle that a ray starts on, which it cannot
+        hit again, or `NO_SLOT`.
 
     Returns:
       The hits, in the order of the rays.
@@ -110,8 +110,8 @@ def _finish(
     distances: Float[Array, " rays"],
     slots: Int[Array, " rays"],
 ) -> Hits:
-    """Turns what a traversal found into hits."""
-    # Two infinite distances tie, so a missed triangle may have left its slot.
+    """Converts the result of a traversal to hits."""
+    # Infinite distances tie, so a missed triangle may have been recorded as the slot.
     hit = jnp.isfinite(distances) & (slots != node_table.NONE)
     found = jnp.where(hit, slots, 0)
     met = bvh.facets.at[found].get(mode="promise_in_bounds")

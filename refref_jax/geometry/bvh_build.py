@@ -1,8 +1,8 @@
-"""Builds the packed tree on the host (NumPy only), level by level.
+"""Builds the packed BVH on the host (NumPy only), level by level.
 
-Each level splits all of its large nodes at once, where the surface area heuristic is cheapest over
-every place between two centroids along each of the three axes. The centroids are sorted once; every
-split keeps the three orders.
+Each level splits all of its large nodes at once, at the minimum of the surface area heuristic over
+all positions between two centroids along each of the three axes. The centroids are sorted once;
+every split preserves the three orders.
 
 Source: Wald, On fast Construction of SAH-based Bounding Volume Hierarchies (2007), without bins.
 """
@@ -25,8 +25,8 @@ def build(
       triangles: corners, world units, finite. May be empty, degenerate or duplicate.
 
     Returns:
-      The tree, with triangles in leaf order, and for each slot the face it came from (padding
-      slots repeat the last face; nothing hits them).
+      The tree, with triangles in leaf order, and the face of each slot (padding slots repeat the
+      last face and are never hit).
 
     Raises:
       ValueError: if a coordinate is not finite.
@@ -48,7 +48,7 @@ def build(
 
 
 def _empty(dtype: np.dtype) -> BVH:
-    """Returns a tree of one leaf that holds nothing."""
+    """Returns a tree of one empty leaf."""
     point = np.zeros((1, 3), dtype)
     level = Level(np.array([0]), np.array([1]), np.array([-1]))
     nodes = node_build.pack_nodes([level], point, point)
@@ -62,7 +62,7 @@ def _empty(dtype: np.dtype) -> BVH:
 def _split_all(
     lower: Float[np.ndarray, "faces 3"], upper: Float[np.ndarray, "faces 3"]
 ) -> tuple[list[Level], Int[np.ndarray, " faces"]]:
-    """Splits until every node fits a leaf; returns the levels and the faces in leaf order."""
+    """Splits until every node fits in a leaf; returns the levels and the faces in leaf order."""
     centroids = 0.5 * lower + 0.5 * upper
     scene = lower.min(axis=0).astype(np.float64), upper.max(axis=0).astype(np.float64)
     orders = [np.argsort(centroids[:, axis], kind="stable") for axis in range(3)]
@@ -94,13 +94,13 @@ def _partition(
     left: Int[np.ndarray, " nodes"],
     axis: Int[np.ndarray, " nodes"],
 ) -> list[Int[np.ndarray, " faces"]]:
-    """Moves the faces of each node's left child before those of its right one, in every order.
+    """Moves the faces of each left child before those of its right sibling, in all three orders.
 
     Args:
-      orders: faces by centroid along each axis, node after node.
-      counts: faces of each node.
-      left: how many of them go left.
-      axis: the order whose first `left` faces do.
+      orders: faces sorted by centroid along each axis, node after node.
+      counts: number of faces of each node.
+      left: number of faces that go left.
+      axis: split axis of each node; the first `left` faces in its order go left.
     """
     first = np.cumsum(counts) - counts
     owner = np.repeat(np.arange(counts.size), counts)

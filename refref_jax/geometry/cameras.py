@@ -1,6 +1,6 @@
 """Pinhole cameras and their rays (NumPy only).
 
-Camera frame: x right, y up, looking along -z (OpenGL, Blender). World frame: the data set's own.
+Camera frame: x right, y up, looking along -z (OpenGL, Blender). World frame: that of the data set.
 Pixel `(row, column)` has its centre at `(column + 0.5, row + 0.5)`, rows counted from the top.
 """
 
@@ -31,7 +31,7 @@ class Cameras(NamedTuple):
 
 
 def focal_length(width: int, angle_x: float) -> float:
-    """Returns the focal length in pixels of a horizontal field of view in radians."""
+    """Returns the focal length in pixels for a horizontal field of view in radians."""
     return 0.5 * width / math.tan(0.5 * angle_x)
 
 
@@ -43,8 +43,8 @@ def pixel_rays(
 ) -> Rays:
     """Returns the rays through pixel centres, in single precision.
 
-    A ray's radius is that of the cone with the pixel's solid angle, scaled so that a disc of
-    that radius has the variance of the pixel (mip-NeRF: `2 / sqrt(12)` of its width).
+    The radius of a ray is that of a cone with the solid angle of the pixel, scaled so that a disc
+    of this radius has the variance of the pixel (mip-NeRF: `2 / sqrt(12)` of its width).
 
     Args:
       cameras: the cameras.
@@ -55,12 +55,12 @@ def pixel_rays(
     towards, cosine = _unit_directions(cameras, row, column)
     pose = cameras.poses[camera]
     directions = np.einsum("...ij,...j->...i", pose[..., :3], towards)
-    # A pixel's solid angle is the cube of its cosine over the squared focal length.
+    # The solid angle of a pixel is the cube of its cosine over the squared focal length.
     width = cosine**1.5 / cameras.focal
     return Rays(
         np.ascontiguousarray(pose[..., 3], np.float32),
         directions.astype(np.float32),
-        np.asarray(width * 2.0 / math.sqrt(12.0), np.float32),  # also that of a single ray
+        np.asarray(width * 2.0 / math.sqrt(12.0), np.float32),  # an array for a single ray too
     )
 
 
@@ -78,11 +78,11 @@ def image_rays(cameras: Cameras, camera: int) -> Rays:
 
 
 class Projection(NamedTuple):
-    """Points as a camera sees them.
+    """Points projected into the image of a camera.
 
     Attributes:
-      pixels: column and row; the image's centre where nothing is in front of the camera.
-      depths: along the camera's axis, world units, positive in front of it.
+      pixels: column and row; the image centre for points behind the camera.
+      depths: depth along the camera axis, world units, positive in front of the camera.
     """
 
     pixels: Float[np.ndarray, "points 2"]
@@ -92,7 +92,7 @@ class Projection(NamedTuple):
 def project(
     points: Float[np.ndarray, "points 3"], pose: Float[np.ndarray, "3 4"], cameras: Cameras
 ) -> Projection:
-    """Returns where the camera of a pose sees points, world units."""
+    """Projects points, in world units, into the camera of one pose."""
     x, y, z = pose[:, :3].T @ (points.T - pose[:, 3:])
     scale = np.divide(-cameras.focal, z, out=np.zeros_like(z), where=z < 0.0)
     middle = 0.5 * np.array([cameras.width, cameras.height])
@@ -100,11 +100,11 @@ def project(
 
 
 def supersample(cameras: Cameras, side: int) -> Cameras:
-    """Returns the same cameras with every pixel cut into `side x side` smaller ones.
+    """Returns the same cameras with every pixel split into `side x side` subpixels.
 
     Args:
       cameras: the cameras.
-      side: small pixels along each edge of a pixel, at least 1.
+      side: number of subpixels along each edge of a pixel, at least 1.
     """
     return cameras._replace(
         width=side * cameras.width, height=side * cameras.height, focal=side * cameras.focal
@@ -114,11 +114,11 @@ def supersample(cameras: Cameras, side: int) -> Cameras:
 def box_filter(
     pixels: Float[np.ndarray, "height width *channels"], side: int
 ) -> Float[np.ndarray, "h w *channels"]:
-    """Averages the small pixels of `supersample` into pixels; colours must be linear.
+    """Averages the subpixels of `supersample` into pixels; colours must be linear.
 
     Args:
-      pixels: of a supersampled camera.
-      side: as given to `supersample`.
+      pixels: image of a supersampled camera.
+      side: subpixels along each edge of a pixel, as in `supersample`.
     """
     height, width, *channels = pixels.shape
     blocks = pixels.reshape(height // side, side, width // side, side, *channels)
@@ -126,11 +126,11 @@ def box_filter(
 
 
 def orbit(frames: int, *, distance: float, elevation: float, size: int, angle_x: float) -> Cameras:
-    """Returns cameras on a circle around the origin that look at it, with z up.
+    """Returns cameras on a circle around the origin, all looking at it, with z up.
 
     Args:
-      frames: number of cameras, spread evenly.
-      distance: from the origin, world units.
+      frames: number of cameras, evenly spaced.
+      distance: distance to the origin, world units.
       elevation: angle above the horizontal plane in radians, strictly between -pi/2 and pi/2.
       size: width and height in pixels.
       angle_x: horizontal field of view in radians.

@@ -1,8 +1,7 @@
-"""The closest hit of one ray, to be mapped and differentiated at will.
+"""Closest hit of one ray, for use under `vmap` and differentiation.
 
-Under `vmap`, any number of times, all rays are cast together (see `bvh`). To differentiation the
-triangle that is found is a constant, and so is every number about the hit: recompute the point from
-the triangle.
+Under any nesting of `vmap`, all rays are cast as one batch (see `bvh`). The triangle that is hit is
+a constant for differentiation: recompute the hit point from the triangle to obtain gradients.
 """
 
 from typing import NamedTuple
@@ -32,14 +31,14 @@ def closest_slot(
     limit: Float[Array, ""],
     leaving: Int[Array, ""],
 ) -> Int[Array, ""]:
-    """Returns the slot of the triangle that a ray meets first, `NO_SLOT` if none.
+    """Returns the slot of the first triangle that a ray hits, `NO_SLOT` if there is none.
 
     Args:
-      bvh: the scene; it can not be mapped over.
+      bvh: the tree of the scene; it cannot be mapped over.
       origin: start of the ray.
-      direction: unit.
+      direction: unit vector.
       limit: farthest distance of interest; negative for a ray that is not to be cast.
-      leaving: the slot that the ray starts on, or `NO_SLOT`.
+      leaving: excluded primitive, the slot that the ray starts on, or `NO_SLOT`.
     """
     query = _Query(origin[None], direction[None], limit[None], leaving[None])
     return _find(*jax.lax.stop_gradient((bvh, query)))[0]
@@ -59,8 +58,8 @@ def _find_mapped(
     bvh_batched, query_batched = in_batched
     if any(jax.tree.leaves(bvh_batched)):
         raise TypeError(
-            "Rays can not be cast into many scenes by one vmap: the tree is an argument that must "
-            "not be mapped over. Use jax.lax.map over scenes."
+            "vmap over the argument bvh is not supported: one vmap cannot cast rays into several "
+            "scenes. Use jax.lax.map over scenes."
         )
     every = jax.tree.map(
         lambda x, batched: x if batched else jnp.broadcast_to(x, (axis_size, *x.shape)),

@@ -1,11 +1,11 @@
 """Shading normals at the corners of triangles, on the host (NumPy only).
 
-Faces that meet at less than the crease angle belong to one smooth patch; at a corner, the
-normals of the patch's faces are averaged by the angle that each has there. Across a crease
-nothing is averaged, so a cube stays flat and a cylinder keeps its rim.
+Neighbouring faces whose normals differ by less than the crease angle belong to one smooth patch.
+At a corner, the face normals of a patch are averaged, weighted by the angle of each face there.
+Normals are not averaged across a crease, so a cube stays flat and a cylinder keeps its rim.
 
 Source: Thuermer and Wuethrich, Computing Vertex Normals from Polygonal Facets (1998), for the
-weight by angle.
+weighting by angle.
 """
 
 import numpy as np
@@ -14,10 +14,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 CREASE_ANGLE = np.radians(30.0)
-"""The angle between face normals, in radians, from which an edge counts as sharp."""
+"""Smallest angle between face normals, in radians, at which an edge counts as sharp."""
 
-# A face is degenerate when its area is below this share of its longest edge squared: where
-# single-precision files put three corners on one line.
+# A face is degenerate if its area is below this fraction of its longest edge squared, as happens
+# when single-precision files put three corners on one line.
 _DEGENERATE = 1e-6
 
 
@@ -31,11 +31,11 @@ def corner_normals(
 
     Args:
       vertices: positions, shared between faces where the surface is connected.
-      faces: corners, counter-clockwise seen from outside.
-      crease_angle: radians; 0 gives face normals, pi smooths everything.
+      faces: corner indices, counter-clockwise seen from outside.
+      crease_angle: angle in radians; 0 gives face normals, pi smooths everything.
 
     Returns:
-      Unit normals. Degenerate faces have zero ones, and do not count in any average.
+      Unit normals. Degenerate faces have zero normals and are left out of the averages.
     """
     corners = vertices[faces]
     flat = face_normals(corners)
@@ -45,7 +45,7 @@ def corner_normals(
     weighted = (_corner_angles(corners)[..., None] * flat[:, None]).reshape(-1, 3)
     sums = np.stack([np.bincount(group, weighted[:, axis]) for axis in range(3)], axis=-1)
     averaged = unit_vectors(sums)[group].reshape(-1, 3, 3)
-    # Opposite faces may cancel at a corner: fall back to the face's own normal there.
+    # Opposite faces may cancel at a corner: fall back to the face normal there.
     cancelled = np.all(averaged == 0.0, axis=-1, keepdims=True)
     return np.where(cancelled, flat[:, None], averaged)
 
@@ -56,7 +56,7 @@ def smooth_groups(
     *,
     crease_angle: float = CREASE_ANGLE,
 ) -> Int[np.ndarray, "faces 3"]:
-    """Numbers the corners that share a normal: those at one vertex, of faces of one patch."""
+    """Numbers groups of corners that share a normal: same vertex, faces of the same patch."""
     patch = _smooth_patches(faces, face_normals(vertices[faces]), crease_angle)
     key = patch[:, None].astype(np.int64) * len(vertices) + faces
     return np.unique(key, return_inverse=True)[1].reshape(-1, 3)
@@ -69,7 +69,7 @@ def face_normals(corners: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "
 
 
 def is_degenerate(corners: Float[np.ndarray, "faces 3 3"]) -> Bool[np.ndarray, " faces"]:
-    """Returns which faces have no area to speak of: their normals would be rounding errors."""
+    """Returns which faces have negligible area, so that their normals would be rounding errors."""
     edges = np.roll(corners, -1, axis=1) - corners
     longest = np.max(np.sum(edges**2, axis=-1), axis=1)
     area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1)
@@ -77,7 +77,7 @@ def is_degenerate(corners: Float[np.ndarray, "faces 3 3"]) -> Bool[np.ndarray, "
 
 
 def unit_vectors(vectors: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 3"]:
-    """Returns vectors of length one; zero stays zero."""
+    """Returns vectors scaled to length 1; zero vectors stay zero."""
     norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.divide(vectors, norm, out=np.zeros_like(vectors), where=norm > 0.0)
 

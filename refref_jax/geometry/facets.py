@@ -1,9 +1,9 @@
-"""One ray against one triangle that is prepared for it: the inner loop of the traversal.
+"""Intersection of one ray with one precomputed triangle: the inner loop of the traversal.
 
-Letters as in `triangles`: corners `a, b, c`; `(u, v)` weighs `b` and `c`. A *facet* is a row of
-twelve numbers, `a`, `b - a`, `a - c` and `(b - a) x (c - a)`: all that the test needs, in the
-order in which it is read. Nothing in it moves with the origin of the world except `a`, so it is
-as exact far from the origin as the corners themselves.
+Letters as in `triangles`: corners `a, b, c`; `(u, v)` are the weights of `b` and `c`. A *facet* is
+a precomputed triangle, a row of twelve numbers in the order in which they are read: `a`, `b - a`,
+`a - c` and `(b - a) x (c - a)`. Only `a` depends on the origin of the world, so a facet is as
+exact far from the origin as the corners themselves.
 
 Source: Moeller and Trumbore, Fast, Minimum Storage Ray-Triangle Intersection (1997), with the
 normal precomputed and the division last, as in Embree.
@@ -18,11 +18,11 @@ from refref_jax import numerics
 from refref_jax.geometry.triangles import EDGE_TOLERANCE
 
 WORDS = 12
-"""Numbers in a facet."""
+"""Number of values in a facet."""
 
 
 class _Scaled(NamedTuple):
-    """Barycentrics and distance, all times the area that the ray sees (twice, and >= 0)."""
+    """Barycentrics and distance, all multiplied by twice the projected area, which is >= 0."""
 
     u: Float[Array, ""]
     v: Float[Array, ""]
@@ -43,8 +43,8 @@ def distance(
     outside = jnp.where(u_or_v < rest, u_or_v, rest)
     ahead = jnp.where(reach < area, reach, area) > 0.0
     hit = ahead & (outside >= -EDGE_TOLERANCE * area)
-    # XLA computes a division once and keeps it, where it would do all of the above once more for
-    # every use of another result.
+    # XLA computes a division once and keeps it; for any other result it would repeat all of the
+    # above at every use.
     return jnp.where(hit, reach, jnp.inf) / area
 
 
@@ -64,7 +64,7 @@ def _solve(
     to_corner = corner - origin
     moment = _cross(direction, to_corner)
     determinant = _dot(direction, normal)
-    # The signs of all four turn with the side from which the triangle is seen.
+    # All four signs flip with the side from which the triangle is seen.
     side = jnp.where(determinant < 0.0, -1.0, 1.0).astype(determinant.dtype)
     return _Scaled(
         _dot(moment, edge_c) * side,
@@ -83,5 +83,5 @@ def _cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> tuple[Array, Array, Ar
 
 
 def _dot(a: Float[Array, "3"] | tuple[Array, Array, Array], b: Float[Array, "3"]) -> Array:
-    """Written out: `jnp.dot` would become a call instead of three multiply-adds."""
+    """Returns the dot product, written out: `jnp.dot` would be a call, not three multiply-adds."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -1,7 +1,7 @@
-"""Closest hits with every ray walking alone and all in lock-step, for an accelerator.
+"""Single-ray BVH traversal for accelerators, run in lock-step under `vmap`.
 
-One loop, whose state is a row of the node table and the hit so far: under `vmap` it becomes one
-loop over all rays, which ends with the slowest of them.
+The state of the loop is a row of the node table and the closest hit so far. Under `vmap` it becomes
+one loop over all rays, which ends with the slowest ray.
 """
 
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from refref_jax.geometry import boxes, facets, node_table
 
 
 class _Walk(NamedTuple):
-    """State of a ray's walk: the next node, and the closest hit so far."""
+    """State of a ray's traversal: the next node, and the closest hit so far."""
 
     node: Int[Array, ""]
     distance: Float[Array, ""]
@@ -32,15 +32,15 @@ def trace_ray(
     """Traces one ray.
 
     Args:
-      nodes: the tables of all octants, one after the other.
+      nodes: node tables of all octants, concatenated.
       packed: precomputed triangles by slot.
       origin: start of the ray.
       direction: unit vector.
       limit: farthest distance of interest, negative for a ray that is not to be traced.
-      leaving: slot that the ray can not hit.
+      leaving: excluded primitive, a slot that the ray cannot hit.
 
     Returns:
-      The distance of the closest hit, else the limit, and its slot, else `NONE`.
+      The distance and slot of the closest hit; the limit and `NONE` for a miss.
     """
     slabs = boxes.slabs(origin, direction)
     rows = nodes.shape[0] // node_table.OCTANTS
@@ -73,7 +73,7 @@ def _test_leaf(
     first: Int[Array, ""],
     walk: _Walk,
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    """Keeps the closer of the hit so far and those of one leaf; ties go to the lower slot."""
+    """Returns the closest of the hit so far and the hits in one leaf; the lower slot wins ties."""
     distance, slot = walk.distance, walk.slot
     for offset in range(node_table.LEAF_SIZE):
         candidate = first + offset

@@ -1,9 +1,9 @@
-"""Lets XLA compile a loop nest for the CPU as one native function.
+"""Makes XLA compile a loop nest for the CPU as one native function.
 
-XLA:CPU runs a `while_loop` as many small kernels, dispatched one by one. A call that carries the
-attribute below is instead emitted as one function with real control flow, which makes the
-traversal of a tree about five times faster. The attribute is internal to XLA: where it is not
-known it is ignored, and only the speed changes.
+XLA:CPU runs a `while_loop` as many small kernels, dispatched one by one. A call with the attribute
+set by `native_loop` is instead emitted as one function with real control flow, which makes BVH
+traversal about five times faster. The attribute is internal to XLA: versions that do not know it
+ignore it, and only the speed changes.
 """
 
 from collections.abc import Callable
@@ -17,15 +17,15 @@ _Result = TypeVar("_Result")
 
 
 def native_loop(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Marks a function of arrays for one native kernel.
+    """Marks a function of arrays for compilation as one native kernel.
 
-    The function must use every argument and hold no sort, scatter or callback. The mark sits on
-    the call of a nested `jit`. Inside, it is taken back, or every small jitted function of
-    `jax.numpy` would inherit it and become a real call of its own.
+    The function must use every argument and must not contain a sort, scatter or callback. The
+    attribute is set on the call of a nested `jit`. Inside, it is reset; otherwise every small
+    jitted function of `jax.numpy` would inherit it and become a real call.
 
-    XLA aborts (JAX 0.10.2) when an argument of a marked call is a constant, as geometry is that a
-    user's function closes over. So every argument first passes a barrier, behind which XLA does not
-    see what it is. The barrier copies nothing.
+    XLA aborts (JAX 0.10.2) if an argument of a marked call is a constant, such as a scene that a
+    user's function closes over. Every argument therefore passes an optimization barrier first,
+    which hides constants from XLA. The barrier does not copy.
     """
 
     def unmarked(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:

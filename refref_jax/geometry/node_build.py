@@ -1,4 +1,4 @@
-"""Packs the nodes of a tree into the tables of `node_table` on the host (NumPy only)."""
+"""Packs the nodes of a BVH into the tables of `node_table`, on the host (NumPy only)."""
 
 from typing import NamedTuple
 
@@ -12,8 +12,8 @@ class Level(NamedTuple):
     """Nodes of one depth. Each covers the faces `start:end` in leaf order.
 
     Attributes:
-      start, end: the run of faces.
-      child: index of the left child in the next level (the right one follows), -1 at leaves.
+      start, end: range of faces.
+      child: index of the left child in the next level (the right child follows), -1 for leaves.
     """
 
     start: Int[np.ndarray, " nodes"]
@@ -28,7 +28,7 @@ class _Boxes(NamedTuple):
     upper: Float[np.ndarray, "nodes 3"]
 
 
-# Bit of an axis in the number of an octant, as in `boxes.octant`.
+# Sign bit of each axis in the number of an octant, as in `boxes.octant`.
 _BACKWARDS = ((np.arange(node_table.OCTANTS)[:, None] >> np.arange(3)) & 1).astype(bool)
 
 
@@ -40,12 +40,12 @@ def pack_nodes(
     """Numbers the nodes depth first, once for each octant, and packs them.
 
     Boxes are widened by one unit in the last place of the scene's largest coordinate, so that a
-    ray lying in a face of one is not lost.
+    ray that lies in the face of a box does not miss it.
 
     Args:
-      levels: from the root down.
+      levels: levels of the tree, from the root down.
       lower: lower corners of the faces' boxes, in leaf order.
-      upper: upper corners.
+      upper: upper corners of the faces' boxes.
     """
     sizes, bounds = _subtree_sizes(levels), _bounds(levels, lower, upper)
     margin = np.spacing(np.float32(max(np.abs(lower).max(), np.abs(upper).max())))
@@ -72,7 +72,7 @@ def pack_nodes(
 
 
 def prepare_facets(triangles: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "faces 12"]:
-    """Returns what `facets.distance` needs of each triangle, in the triangles' own precision."""
+    """Precomputes triangles for `facets.distance`, in the precision of the input."""
     a, b, c = np.moveaxis(triangles.astype(np.float64), 1, 0)
     normal = np.cross(b - a, c - a)
     return np.concatenate([a, b - a, a - c, normal], axis=-1).astype(triangles.dtype)
@@ -81,7 +81,7 @@ def prepare_facets(triangles: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarra
 def runs(
     start: Int[np.ndarray, " nodes"], counts: Int[np.ndarray, " nodes"]
 ) -> Int[np.ndarray, " faces"]:
-    """Returns `start, start + 1, ...` for `counts` numbers, node after node."""
+    """Returns the concatenated ranges `start, start + 1, ...` of `counts` numbers per node."""
     first = np.cumsum(counts) - counts
     return np.arange(counts.sum()) + np.repeat(start - first, counts)
 
@@ -102,14 +102,14 @@ def _write_boxes(
 def _right_is_nearer(
     below: _Boxes, left: Int[np.ndarray, " nodes"], backwards: Bool[np.ndarray, "3"]
 ) -> Bool[np.ndarray, " nodes"]:
-    """Returns which nodes' right child lies before the left one, along the octant's diagonal."""
+    """Returns the nodes whose right child comes before the left along the octant's diagonal."""
     diagonal = np.where(backwards, -1.0, 1.0)
     middle = (below.lower + below.upper) @ diagonal
     return middle[left + 1] < middle[left]
 
 
 def _subtree_sizes(levels: list[Level]) -> list[Int[np.ndarray, " nodes"]]:
-    """Returns the number of nodes in each node's subtree, itself included."""
+    """Returns the number of nodes in each node's subtree, including the node."""
     sizes = [np.ones(levels[-1].start.size, np.int64)]
     for level in reversed(levels[:-1]):
         size = np.ones(level.start.size, np.int64)
@@ -123,7 +123,7 @@ def _bounds(
     levels: list[Level], lower: Float[np.ndarray, "faces 3"], upper: Float[np.ndarray, "faces 3"]
 ) -> list[_Boxes]:
     """Returns the boxes of each level's nodes, from the leaves up."""
-    # reduceat takes pairs (start, end); a sentinel row keeps the last end in range.
+    # reduceat takes (start, end) pairs; a sentinel row keeps the last end in range.
     lower, upper = np.concatenate([lower, lower[-1:]]), np.concatenate([upper, upper[-1:]])
     found: list[_Boxes] = []
     for level in reversed(levels):

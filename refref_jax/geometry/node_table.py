@@ -1,14 +1,14 @@
-"""How the nodes of a tree lie in memory, and how they are read on the device.
+"""Memory layout of BVH nodes, and their access on the device.
 
 A node is one row of eight 32-bit words, so that one visit is one contiguous load: the entry corner
-of its box (three floats, by their bits), the exit corner, the *skip pointer* and the leaf.
+of its box (three floats, bit-cast), the exit corner, the *skip pointer* and the leaf.
 
-There are eight tables, one an octant of directions, each depth first with the nearer child of
-every node before the farther. The skip pointer is the row to visit next when the box is missed;
-when it is hit, the next row is simply the following one. So a walk needs no stack: its whole state
-is one row. All tables share the triangles.
+There are eight tables, one per octant of directions, each in depth-first order with the nearer
+child of every node first. If a box is missed, the traversal continues at the row of the skip
+pointer; if it is hit, at the following row. A traversal therefore needs no stack: its state is one
+row. All tables share the triangles.
 
-The last row of a table is its end, which has no box and a leaf below zero.
+The last row of a table marks its end; it has no box and a negative leaf.
 """
 
 from typing import NamedTuple
@@ -20,21 +20,21 @@ from jaxtyping import Array, Float, Int
 OCTANTS = 8
 
 WORDS = 8
-"""Words of a node."""
+"""Number of words in a node."""
 
 LEAF_SIZE = 4
-"""Most triangles a leaf may hold: the number tested at each leaf visit."""
+"""Maximum number of triangles in a leaf, and the number tested at each leaf visit."""
 
 NONE = 2**31 - 1
-"""The slot of no triangle, above all others."""
+"""Slot for "no triangle", above all others."""
 
 
 class Node(NamedTuple):
-    """A node as it is read.
+    """A decoded node.
 
     Attributes:
       entry, exit: corners of the box.
-      skip: the row to visit after the node's whole subtree.
+      skip: row to visit after the node's subtree.
       leaf: first triangle slot + 1 of a leaf, 0 for an inner node, -1 for the end of the table.
     """
 
@@ -52,7 +52,7 @@ def read_node(nodes: Int[Array, "rows 8"], index: Int[Array, ""]) -> Node:
 
 
 def read_row(table: Array, index: Int[Array, ""]) -> Array:
-    """Returns a row without a check for a negative index, which would cost half a box test."""
+    """Returns a row without the check for negative indices, which would cost half a box test."""
     index = index.astype(jnp.uint32)
     start = (index, jnp.zeros_like(index))
     row = jax.lax.dynamic_slice(table, start, (1, table.shape[1]), allow_negative_indices=False)

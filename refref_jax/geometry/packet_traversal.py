@@ -1,12 +1,12 @@
-"""Closest hits by packets of rays that walk the tree together, for a CPU.
+"""Packet traversal of the BVH, for CPUs.
 
-A packet shares one node index and descends where any of its rays hits. Its rays are arranged
-component by component, so that XLA turns each operation of the one-ray functions in `boxes` and
-`facets` into one vector instruction. Packets run one after the other; one without a live ray
-costs next to nothing.
+The rays of a packet share one node index, and the packet descends where any of its rays hits. Rays
+are stored component by component, so that XLA turns each operation of the single-ray functions in
+`boxes` and `facets` into one vector instruction. Packets run one after the other; the cost of a
+packet without active rays is negligible.
 
-A packet takes the node table of its rays' octant. Where its rays are of several octants it walks
-once for each, with the others asleep.
+A packet uses the node table of its rays' octant. If its rays have several octants, it traverses
+the tree once for each, with the other rays masked.
 
 Source: Wald et al., Interactive Rendering with Coherent Ray Tracing (2001), for packets; Smits,
 Efficiency Issues for Ray Tracing (1998), for skip pointers.
@@ -22,24 +22,24 @@ from refref_jax.geometry import boxes, facets, node_table
 from refref_jax.geometry.native_loop import native_loop
 
 PACKET = 16
-"""Rays in a packet: two vectors of eight, which hide each other's latency."""
+"""Number of rays in a packet: two vectors of eight, which hide each other's latency."""
 
 _VISITS = 2
-"""Nodes visited in one pass of the loop."""
+"""Number of nodes visited in one iteration of the loop."""
 
 _DONE = node_table.OCTANTS
-"""In place of the octant of a ray that needs no walk any more."""
+"""Octant of a ray whose traversal is complete."""
 
 
 class Packet(NamedTuple):
-    """Rays that walk together, or many packets of them along a leading axis.
+    """Rays that traverse the tree together, or many packets of them along a leading axis.
 
     Attributes:
-      origins, directions: of the rays.
-      slabs: the rays prepared for boxes.
-      octants: of the directions, `_DONE` for a ray that is not to be traced.
+      origins, directions: origins and unit directions of the rays.
+      slabs: rays prepared for box tests.
+      octants: octants of the directions, `_DONE` for a ray that is not to be traced.
       limits: farthest distance of interest.
-      leaving: slot that a ray can not hit.
+      leaving: excluded primitive, a slot that a ray cannot hit.
     """
 
     origins: Float[Array, "*packets 3 rays"]
@@ -51,14 +51,14 @@ class Packet(NamedTuple):
 
 
 class Closest(NamedTuple):
-    """The closest hit so far: its distance, at first the limit, and its slot, at first `NONE`."""
+    """The closest hit so far: distance (initially the limit) and slot (initially `NONE`)."""
 
     distances: Float[Array, "*packets rays"]
     slots: Int[Array, "*packets rays"]
 
 
 class _Rounds(NamedTuple):
-    """State of a packet's walks: the next octant, the octants left to do, the hits so far."""
+    """State of a packet's traversals: next octant, remaining octants of the rays, hits so far."""
 
     octant: Int[Array, ""]
     octants: Int[Array, " rays"]
@@ -66,7 +66,7 @@ class _Rounds(NamedTuple):
 
 
 class _Walk(NamedTuple):
-    """State of one walk: the next node, the leaf at hand (0 for none), the hits so far."""
+    """State of one traversal: the next node, the current leaf (0 for none), the hits so far."""
 
     node: Int[Array, ""]
     leaf: Int[Array, ""]
@@ -77,18 +77,18 @@ class _Walk(NamedTuple):
 def trace(
     nodes: Int[Array, "rows 8"], packed: Float[Array, "slots 12"], packets: Packet
 ) -> Closest:
-    """Traces packet after packet.
+    """Traces packets one after the other.
 
     Args:
-      nodes: the tables of all octants, one after the other.
+      nodes: node tables of all octants, concatenated.
       packed: precomputed triangles by slot.
-      packets: any number, along the leading axis.
+      packets: any number of packets, along the leading axis.
     """
     return jax.lax.map(lambda packet: _trace_packet(nodes, packed, packet), packets)
 
 
 def _trace_packet(nodes: Int[Array, "rows 8"], packed: Array, packet: Packet) -> Closest:
-    """Walks once for each octant that the packet's rays have."""
+    """Traverses the tree once for each octant among the packet's rays."""
 
     def walk_octant(rounds: _Rounds) -> _Rounds:
         octant, octants, closest = rounds
@@ -111,10 +111,9 @@ def _walk(
     octant: Int[Array, ""],
     closest: Closest,
 ) -> Closest:
-    """Walks the table of one octant, at most one visit a node, and tests the leaves it meets.
+    """Traverses the table of one octant, visiting each node at most once, and tests its leaves.
 
-    The loop over nodes between two leaves changes nothing but two numbers; the hits stay where
-    they are.
+    The inner loop over nodes between two leaves carries only two numbers, not the hits.
     """
 
     def find_leaf(node: Array, reach: Array) -> tuple[Array, Array]:
@@ -139,10 +138,10 @@ def _visit_some(
     reach: Float[Array, " rays"],
     index: Int[Array, ""],
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """Visits a node and those after it; what comes after a leaf does not count.
+    """Visits `_VISITS` nodes in sequence; visits after a leaf are discarded.
 
-    A visit waits for the one before it, not for the processor's units, so some in one pass of the
-    loop are up to a tenth faster than a pass for each.
+    Visits are bound by latency, not by throughput, so several visits per iteration are up to 10 %
+    faster than one.
     """
     index, leaf = _visit(nodes, slabs, reach, index)
     for _ in range(_VISITS - 1):
@@ -158,9 +157,9 @@ def _visit(
     reach: Float[Array, " rays"],
     index: Int[Array, ""],
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """Returns the node to visit after this one, and the leaf that this one is if it was hit.
+    """Returns the node to visit next, and the leaf of this node if it is one and was hit.
 
-    The end of the table is always returned, so that a walk ends whatever the rays are.
+    The end of the table is always returned, so that every traversal terminates.
     """
     node = node_table.read_node(nodes, index)
     overlap = jax.vmap(boxes.overlaps, in_axes=(-1, None, None, 0))(
@@ -177,10 +176,10 @@ def _test_leaf(
     first: Int[Array, ""],
     closest: Closest,
 ) -> Closest:
-    """Keeps the closer of the hits so far and those of one leaf's triangles.
+    """Returns the closest of the hits so far and the hits in one leaf.
 
-    The triangles are tested independently of each other and compared afterwards. Of two at one
-    distance the lower slot wins, whatever the order of the walk.
+    Triangles are tested independently and compared afterwards. At equal distance the lower slot
+    wins, regardless of the order of traversal.
     """
     best = None
     for offset in range(node_table.LEAF_SIZE):

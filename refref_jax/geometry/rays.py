@@ -1,7 +1,7 @@
-"""Rays: where light is followed from.
+"""Rays with the footprints of their pixels, in the world frame and world units.
 
-World frame and world units throughout. Directions are unit vectors, so a distance along a ray
-is arc length, never depth along an optical axis.
+Directions are unit vectors, so a distance along a ray is arc length, never depth along an optical
+axis.
 """
 
 from typing import NamedTuple
@@ -16,8 +16,8 @@ class Rays(NamedTuple):
     Attributes:
       origins: start points, world units.
       directions: unit vectors.
-      radii: footprint of a pixel as the radius of its cone at unit distance (world units per
-        world unit).
+      radii: footprint of the pixel, as the cone radius at unit distance (world units per world
+        unit).
     """
 
     origins: Float[Array, "*rays 3"]

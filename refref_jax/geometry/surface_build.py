@@ -1,4 +1,4 @@
-"""Packs meshes into `Surfaces` on the host (NumPy only)."""
+"""Packs meshes into `Surfaces`, on the host (NumPy only)."""
 
 from collections.abc import Sequence
 
@@ -24,15 +24,15 @@ def build_surfaces(
     normals: Float[np.ndarray, "faces 3 3"],
     parts: Int[np.ndarray, " faces"],
 ) -> Surfaces:
-    """Builds the device record of a triangle soup, in single precision.
+    """Builds the `Surfaces` of a triangle soup, in single precision.
 
     Args:
       triangles: corners, counter-clockwise seen from outside, world units. May be empty.
       normals: outward unit shading normals at the corners.
-      parts: index of each triangle's part.
+      parts: part index of each triangle.
 
     Returns:
-      The surfaces, sorted into the leaves of their tree.
+      The surfaces, in the leaf order of their tree.
     """
     bvh, slots = bvh_build.build(triangles.astype(np.float32))
     if len(triangles) == 0:

@@ -1,8 +1,8 @@
-"""What a ray finds at a hit: the point, the two normals and the part of the scene.
+"""Surface points at ray hits: position, normals and part of the scene.
 
-The *geometric* normal is the triangle's own and decides on which side a ray is. The *shading*
-normal is interpolated between the corners and bends the ray; on a flat part the two agree.
-Both point out of the body.
+The *geometric* normal is that of the triangle and determines the side that a ray is on. The
+*shading* normal is interpolated between the corners and determines the directions of the reflected
+and refracted rays; on a flat part both normals agree. Both point out of the object.
 """
 
 from typing import NamedTuple
@@ -16,12 +16,12 @@ from refref_jax.geometry.bvh import BVH
 
 
 class Surfaces(NamedTuple):
-    """All surfaces of a scene, indexed by the triangle slots of their tree.
+    """All surfaces of a scene, indexed by the triangle slots of their BVH.
 
     Attributes:
-      bvh: the tree, which also holds the corners.
+      bvh: the BVH, which also holds the corners.
       normals: outward unit shading normals at the three corners.
-      parts: index of the mesh part that a triangle belongs to.
+      parts: index of each triangle's mesh part.
     """
 
     bvh: BVH
@@ -33,9 +33,9 @@ class SurfacePoint(NamedTuple):
     """A point on a surface.
 
     Attributes:
-      position: on the triangle's plane, world units.
-      geometric_normal: outward, unit.
-      shading_normal: outward, unit.
+      position: point on the triangle's plane, world units.
+      geometric_normal: outward unit normal of the triangle.
+      shading_normal: outward unit normal, interpolated between the corners.
       part: index of the mesh part.
       scale: largest absolute coordinate of the triangle, which sets the rounding error of
         `position`.
@@ -53,12 +53,12 @@ def surface_point(
 ) -> SurfacePoint:
     """Returns the point of one triangle at barycentric coordinates.
 
-    The position comes from the corners, not from a distance along a ray, so its error does not
-    grow with the length of the ray.
+    The position is computed from the corners, not from a distance along a ray, so its error does
+    not grow with the length of the ray.
 
     Args:
-      surfaces: the scene.
-      slot: a triangle; for `NO_SLOT` the result is some finite point without meaning.
+      surfaces: surfaces of the scene.
+      slot: slot of a triangle; for `NO_SLOT` the result is finite but meaningless.
       barycentric: weights of the second and third corner.
     """
     corners = surfaces.bvh.triangles[slot]

@@ -1,8 +1,8 @@
-"""The surface area heuristic over every split of every node of a level (NumPy only).
+"""Surface area heuristic for all splits of all nodes of a level (NumPy only).
 
-A split sends the first `n` of a node's faces, in the order of their centroids along an axis, to
-the left. Its cost is `area(left) leaves(left) + area(right) leaves(right)`, with the number of full
-leaves that a side needs in place of its faces, since a leaf is tested as a whole.
+A split sends the first `n` faces of a node, in the order of their centroids along an axis, to the
+left. Its cost is `area(left) leaves(left) + area(right) leaves(right)`. It counts the leaves that a
+side fills instead of its faces, because all slots of a leaf are tested.
 """
 
 import numpy as np
@@ -21,15 +21,15 @@ def best_splits(
     """Finds the cheapest split of each node.
 
     Args:
-      orders: faces by centroid along each axis, node after node.
-      counts: faces of each node, at least two.
+      orders: faces sorted by centroid along each axis, node after node.
+      counts: number of faces of each node, at least two.
       lower: lower corner of every face's box.
-      upper: upper corner.
+      upper: upper corner of every face's box.
       scene: lower and upper corner of the box around all faces, in double precision.
 
     Returns:
-      How many faces go left, and along which axis. Of equally cheap splits along an axis the one
-      nearest to the middle is taken.
+      The number of faces that go left, and the split axis. Of equally cheap splits along an axis,
+      the one nearest to the middle is taken.
     """
     first = np.cumsum(counts) - counts
     owner = np.repeat(np.arange(counts.size), counts)
@@ -61,7 +61,7 @@ def _areas(
     owner: Int[np.ndarray, " faces"],
     scene: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
 ) -> tuple[Float[np.ndarray, " faces"], Float[np.ndarray, " faces"]]:
-    """Returns half the area of the box around each node's faces up to, and from, every face."""
+    """Returns half the areas of the boxes around each node's faces up to, and from, every face."""
     before, after = [], []
     for axis in range(3):
         base, top = scene[0][axis], scene[1][axis]
@@ -77,10 +77,11 @@ def _areas(
 def _running(
     values: Float[np.ndarray, " faces"], owner: Int[np.ndarray, " faces"], span: float
 ) -> Float[np.ndarray, " faces"]:
-    """Returns the largest value so far within each owner's run; values are in `[0, span]`.
+    """Returns the running maximum within each owner's range; values are in `[0, span]`.
 
-    Every owner gets a storey of its own, above those before it, so that one accumulation serves
-    all. In double precision this costs `owners * span` units in the last place: nothing.
+    Each owner's values are offset above those of the previous owner, so that one accumulation
+    serves all. In double precision this costs `owners * span` units in the last place, which is
+    negligible.
     """
     storey = owner * (2.0 * span)
     return np.maximum.accumulate(values + storey) - storey

@@ -1,7 +1,7 @@
-"""One ray against one triangle.
+"""Intersection of one ray with one triangle.
 
-Letters: a triangle has corners `a, b, c` in counter-clockwise order seen from outside; the
-barycentric pair `(u, v)` weighs `b` and `c`, so a point is `(1 - u - v) a + u b + v c`.
+Letters: a triangle has corners `a, b, c`, counter-clockwise seen from outside; the barycentrics
+`(u, v)` are the weights of `b` and `c`, so a point is `(1 - u - v) a + u b + v c`.
 """
 
 from typing import NamedTuple
@@ -11,20 +11,20 @@ from jaxtyping import Array, Float
 
 from refref_jax import numerics
 
-# How far outside its edges a triangle still counts as hit, in barycentric units. Two
-# neighbours see a shared edge with different rounding; without the tolerance rays aimed at
-# vertices slip between them (of rays aimed at the vertices of a sphere of 20,480 faces, 0.1 % do
-# at 1e-6 and none at 1e-5). Wider is wrong too: a ray that passes outside a body's edge would
-# enter it through one face and enter it once more through the next.
+# Tolerance outside the edges within which a triangle is still hit, in barycentric units. Two
+# neighbours round a shared edge differently; without the tolerance, rays aimed at vertices slip
+# between them (of rays aimed at the vertices of a sphere of 20,480 faces, 0.1 % do at 1e-6 and none
+# at 1e-5). A larger tolerance is wrong too: a ray that passes outside an object's edge would enter
+# it through one face and enter it again through the next.
 EDGE_TOLERANCE = 1e-5
 
 
 class Intersection(NamedTuple):
-    """Where a ray meets a triangle.
+    """Intersection of a ray with a triangle.
 
     Attributes:
       distance: arc length from the origin, `inf` for a miss.
-      barycentric: `(u, v)`; meaningless for a miss.
+      barycentric: weights `(u, v)`; meaningless for a miss.
     """
 
     distance: Float[Array, ""]
@@ -58,7 +58,7 @@ def intersect(
 def interpolate(corners: Float[Array, "3 n"], barycentric: Float[Array, "2"]) -> Float[Array, " n"]:
     """Returns the value at `(u, v)` of a quantity given at the three corners.
 
-    Outside the triangle (a hit within the edge tolerance) the pair is used as it is.
+    Barycentrics outside the triangle (hits within the edge tolerance) are not clamped.
     """
     u, v = barycentric
     return (1.0 - u - v) * corners[0] + u * corners[1] + v * corners[2]

@@ -1,7 +1,7 @@
-"""Measures of rendered images and distances against the true ones.
+"""Metrics of rendered images and distances against ground truth.
 
-All are of one image; a table has their means over images. `docs/metrics.md` lists them with what
-they are where they have no value.
+All metrics are computed per image; tables contain their means over images. `docs/metrics.md` lists
+the metrics and their undefined values.
 """
 
 from refref_jax.metrics.colours import SMALLEST_FOR_SSIM as SMALLEST_FOR_SSIM

@@ -1,8 +1,8 @@
-"""How near the colours of an image are to the true ones, pixel by pixel and window by window.
+"""Colour metrics: PSNR, masked PSNR and SSIM.
 
-Images are sRGB in `[0, 1]`, as they are shown. In float32, means of a bright and nearly flat image
-have no digits left for its variance (an SSIM of two flat images was 1e-4 off), so whoever reports
-these numbers calls them in double precision.
+Images are sRGB in `[0, 1]`. In float32, the variance of a bright and nearly constant image is lost
+to rounding (the SSIM of two constant images had an error of 1e-4), so use double precision for
+reported numbers.
 """
 
 import dm_pix
@@ -10,14 +10,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 SMALLEST_FOR_SSIM = 11
-"""Edge of SSIM's window: an image that it does not fit into has no SSIM."""
+"""Edge of SSIM's window in pixels; SSIM is undefined for smaller images."""
 
 
 def psnr(rendered: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Float[Array, ""]:
     """Returns the peak signal-to-noise ratio in dB, `-10 log10(mean((rendered - target)^2))`.
 
-    The mean is over pixels and channels, the peak is 1. From 0 for images in `[0, 1]` to `inf` for
-    equal ones; more is better.
+    The mean is over pixels and channels, the peak is 1. At least 0 for images in `[0, 1]`, and
+    `inf` for equal images; higher is better.
     """
     return dm_pix.psnr(rendered, target)
 
@@ -29,8 +29,8 @@ def psnr_masked(
 ) -> Float[Array, ""]:
     """Returns the PSNR over the pixels of a mask in dB.
 
-    As `psnr`, with the mean over the mask's pixels and their channels alone: `inf` where they are
-    equal, NaN for an empty mask. Over images, the paper's PSNR_M is the mean of these.
+    As `psnr`, with the mean over the channels of the mask's pixels only: `inf` if they are equal,
+    NaN for an empty mask. The paper's PSNR_M is the mean of this metric over images.
 
     Source: paper (arXiv 2505.05848), section 5 (PSNR_M).
     """
@@ -40,7 +40,7 @@ def psnr_masked(
 
 
 def ssim(rendered: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Float[Array, ""]:
-    """Returns the structural similarity, in `[-1, 1]`: 1 for equal images, more is better.
+    """Returns the structural similarity, in `[-1, 1]`: 1 for equal images, higher is better.
 
     With means `m`, variances `v` and the covariance `c` of both images under a window,
 
@@ -57,7 +57,7 @@ def ssim(rendered: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Floa
     height, width, _ = rendered.shape
     if min(height, width) < SMALLEST_FOR_SSIM:
         raise ValueError(
-            f"An image of {width} x {height} pixels has no SSIM: its window is "
+            f"SSIM is undefined for an image of {width} x {height} pixels: its window is "
             f"{SMALLEST_FOR_SSIM} x {SMALLEST_FOR_SSIM}. Give larger images."
         )
     return dm_pix.ssim(rendered, target)

@@ -1,7 +1,7 @@
-"""How near distances are to the true ones, over the pixels of a mask.
+"""Distance metrics over the pixels of a mask: DMAE and DRMSE.
 
-Distances are arc lengths along each pixel's ray, in world units. What is outside of the mask may be
-infinite or no number at all. Over images, DMAE and DRMSE are means of each image's value.
+Distances are arc lengths along each pixel's ray, in world units. Values outside the mask may be
+infinite or NaN. For several images, DMAE and DRMSE are means of the values per image.
 """
 
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ def mean_absolute_error(
 ) -> Float[Array, ""]:
     """Returns the mean of `|rendered - target|` over a mask, in world units.
 
-    At least 0, less is better; NaN for an empty mask.
+    At least 0, lower is better; NaN for an empty mask.
 
     Source: paper (arXiv 2505.05848), section 5 (DMAE).
     """
@@ -27,8 +27,8 @@ def root_mean_square_error(
 ) -> Float[Array, ""]:
     """Returns `sqrt(mean((rendered - target)^2))` over a mask, in world units.
 
-    At least 0 and at least the mean absolute error, less is better; NaN for an empty mask. Where
-    all distances are equal the gradient is 0, not the plain formula's NaN.
+    At least 0 and at least the mean absolute error, lower is better; NaN for an empty mask. If all
+    distances are equal, the gradient is 0, where the plain formula gives NaN.
 
     Source: paper (arXiv 2505.05848), supplement, table of the farthest views (DRMSE).
     """
@@ -39,7 +39,7 @@ def root_mean_square_error(
 def _errors(
     rendered: Float[Array, "h w"], target: Float[Array, "h w"], mask: Bool[Array, "h w"]
 ) -> Float[Array, "h w"]:
-    """Returns differences in the mask, and 0 elsewhere, whatever stands there."""
+    """Returns differences inside the mask, and 0 elsewhere."""
     return jnp.where(mask, rendered, 0.0) - jnp.where(mask, target, 0.0)
 
 

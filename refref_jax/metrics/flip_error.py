@@ -1,6 +1,6 @@
-"""FLIP: how much two images differ to an eye that flips between them (NumPy only).
+"""FLIP: the perceived difference of two images when flipping between them (NumPy only).
 
-Measured by the authors' own program, which is an extra: `pip install -e '.[flip]'`.
+It is computed by the authors' program, an optional dependency: `pip install -e '.[flip]'`.
 
 Source: Andersson, Nilsson, Akenine-Möller, Oskarsson, Åström, Fairchild, FLIP: A Difference
 Evaluator for Alternating Images, Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020.
@@ -13,14 +13,14 @@ from jaxtyping import Float
 
 
 def flip(rendered: Float[np.ndarray, "h w 3"], target: Float[np.ndarray, "h w 3"]) -> float:
-    """Returns the mean of LDR-FLIP's error map, in `[0, 1]`: 0 for equal images, less is better.
+    """Returns the mean of LDR-FLIP's error map, in `[0, 1]`: 0 for equal images, lower is better.
 
-    It depends on how large a pixel is to the eye. As the program has it by default: 67 pixels a
-    degree, a display of 3840 pixels over 0.7 m, seen from 0.7 m.
+    FLIP depends on the visual angle of a pixel. The program's default is used: 67 pixels per
+    degree, for a display of 3840 pixels over 0.7 m, seen from 0.7 m.
 
     Args:
-      rendered: sRGB in `[0, 1]`.
-      target: likewise; of the same size, and of any.
+      rendered: sRGB image in `[0, 1]`, of any size.
+      target: sRGB image in `[0, 1]`, of the same size.
 
     Raises:
       ValueError: if flip-evaluator is not installed.
@@ -32,16 +32,16 @@ def flip(rendered: Float[np.ndarray, "h w 3"], target: Float[np.ndarray, "h w 3"
 
 
 def import_flip() -> Any:
-    """Returns the module `flip_evaluator`, so that its lack can be told before it is needed.
+    """Returns the module `flip_evaluator`. Call this early to report that it is missing.
 
     Raises:
-      ValueError: if it is not installed.
+      ValueError: if the module is not installed.
     """
     try:
         import flip_evaluator
     except ImportError as error:
         raise ValueError(
-            "FLIP is measured by flip-evaluator, which is not installed. Install it: "
+            "FLIP requires the package flip-evaluator, which is not installed. Install it with "
             "pip install -e '.[flip]'."
         ) from error
     return flip_evaluator

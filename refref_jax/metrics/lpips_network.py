@@ -1,7 +1,7 @@
-"""LPIPS: how alike two images are to a network that was taught by people's judgements.
+"""LPIPS: perceptual distance of two images by a network trained on human similarity ratings.
 
-The network is AlexNet's five convolutions, as torchvision has them, and the weights of the channels
-are those of `lin` version 0.1. Weights are the user's: see `lpips_weights`.
+The network consists of the five convolutions of torchvision's AlexNet; the channel weights are
+those of `lin` version 0.1. The user provides the weights: see `lpips_weights`.
 
 Source: Zhang, Isola, Efros, Shechtman, Wang, The Unreasonable Effectiveness of Deep Features as a
 Perceptual Metric (CVPR 2018), equation 1, and the constants of its code, version 0.1.
@@ -16,13 +16,13 @@ from jaxtyping import Array, Float
 from refref_jax.numerics import safe_sqrt
 
 SMALLEST_FOR_LPIPS = 31
-"""Least edge of an image in pixels: below, the second pooling has nothing left to pool."""
+"""Smallest edge of an image in pixels; for smaller images the second pooling has no output."""
 
-# Of the images of which AlexNet was taught, in the range [-1, 1].
+# Mean and deviation of AlexNet's training images, in the range [-1, 1].
 _MEAN = (-0.030, -0.088, -0.188)
 _DEVIATION = (0.458, 0.448, 0.450)
 
-# Beside the length of a pixel's features, as the published numbers have it.
+# Added to the norm of a pixel's features, as in the published implementation.
 _LENGTH_PADDING = 1e-10
 
 _POOL = 3
@@ -30,15 +30,15 @@ _POOL_STRIDE = 2
 
 
 class Layer(NamedTuple):
-    """One convolution of AlexNet; what it gives is rectified, and compared.
+    """One convolution of AlexNet; its rectified output is compared.
 
     Attributes:
-      inputs: channels that it reads.
-      outputs: channels that it gives.
-      side: edge of its kernel, pixels.
-      stride: pixels between two places of it.
-      padding: pixels of zero around its input.
-      pools: whether its input is pooled first, 3 x 3 at every second pixel.
+      inputs: number of input channels.
+      outputs: number of output channels.
+      side: edge of the kernel, pixels.
+      stride: stride, pixels.
+      padding: zero padding of the input, pixels.
+      pools: whether the input is max-pooled first, 3 x 3 with stride 2.
     """
 
     inputs: int
@@ -59,12 +59,12 @@ LAYERS = (
 
 
 class LpipsParams(NamedTuple):
-    """Weights of LPIPS, one of each for every entry of `LAYERS`.
+    """Weights of LPIPS, with one array per entry of `LAYERS`.
 
     Attributes:
-      kernels: of the convolutions.
-      biases: of the convolutions.
-      channels: what a difference in each channel counts; not negative.
+      kernels: kernels of the convolutions.
+      biases: biases of the convolutions.
+      channels: weight of each channel's difference; non-negative.
     """
 
     kernels: tuple[Float[Array, "outputs inputs side side"], ...]
@@ -77,15 +77,15 @@ def lpips(
 ) -> Float[Array, ""]:
     """Returns the LPIPS distance of two images.
 
-    The features of both after each of the five layers are made unit vectors, pixel by pixel; their
-    squared differences are summed over channels with the weights of `params.channels`, averaged
-    over pixels, and added up over layers. 0 for equal images (compiled, 1e-14 or less), symmetric,
-    never negative; less is better, and 1 is rarely reached.
+    The features of both images after each of the five layers are normalised per pixel; their
+    squared differences are summed over channels with the weights `params.channels`, averaged over
+    pixels, and summed over layers. 0 for equal images (at most 1e-14 when compiled), symmetric,
+    non-negative; lower is better, and values rarely reach 1.
 
     Args:
-      params: the weights.
-      rendered: sRGB in `[0, 1]`; it is brought to `[-1, 1]`, which the network wants.
-      target: likewise.
+      params: weights of LPIPS.
+      rendered: sRGB image in `[0, 1]`; it is scaled to `[-1, 1]`, the range of the network.
+      target: sRGB image in `[0, 1]`, of the same size.
 
     Raises:
       ValueError: if the images are too small for the network.
@@ -93,8 +93,8 @@ def lpips(
     height, width, _ = rendered.shape
     if min(height, width) < SMALLEST_FOR_LPIPS:
         raise ValueError(
-            f"An image of {width} x {height} pixels has no LPIPS: its network needs "
-            f"{SMALLEST_FOR_LPIPS} x {SMALLEST_FOR_LPIPS} or more. Give larger images."
+            f"LPIPS is undefined for an image of {width} x {height} pixels: its network needs at "
+            f"least {SMALLEST_FOR_LPIPS} x {SMALLEST_FOR_LPIPS}. Give larger images."
         )
     images = 2.0 * jnp.stack([rendered, target]) - 1.0
     mean, deviation = (jnp.asarray(x, images.dtype)[None, None, None] for x in (_MEAN, _DEVIATION))
@@ -135,6 +135,6 @@ def _convolve(
 
 
 def _unit(features: Float[Array, "images h w channels"]) -> Float[Array, "images h w channels"]:
-    """Returns unit vectors over channels; where all are 0 they stay so."""
+    """Returns features normalised over channels; zero vectors stay zero."""
     length = safe_sqrt(jnp.sum(jnp.square(features), axis=-1, keepdims=True))
     return features / (length + _LENGTH_PADDING)

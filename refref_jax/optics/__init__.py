@@ -1,1 +1,1 @@
-"""What light does at surfaces, and the paths that it takes."""
+"""Reflection, refraction and absorption of light at and between surfaces, and path tracing."""

@@ -1,4 +1,6 @@
-"""One ray arrives at a surface and leaves it as two. Both tracers are made of these steps.
+"""Splits one ray at a surface into a reflected and a transmitted ray.
+
+Both tracers, `wavefront` and `single_path`, are built from these steps.
 
 Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
 """
@@ -21,18 +23,18 @@ from refref_jax.optics.scene import Scene
 
 
 class RayState(NamedTuple):
-    """A ray on its way.
+    """State of a ray along its path.
 
     Attributes:
-      origin: where to cast from, just off the surface, world units.
+      origin: origin of the next cast, just off the surface, world units.
       point: start of the current segment, on the surface.
-      direction: unit.
+      direction: unit vector.
       tau: arc length from the camera to `point`.
-      weight: share of the camera ray's linear RGB.
+      weight: throughput, the share of the camera ray's linear RGB.
       bends: number of bends so far.
-      leaving: triangle slot that the segment starts on.
-      inside: the parts that the ray is in (see `media`).
-      spread: of the current segment (see `footprints`).
+      leaving: excluded primitive, the triangle slot that the segment starts on.
+      inside: interior list, the parts that the ray is in (see `media`).
+      spread: ray differential of the current segment (see `footprints`).
     """
 
     origin: Float[Array, "*rays 3"]
@@ -47,14 +49,14 @@ class RayState(NamedTuple):
 
 
 class Arrival(NamedTuple):
-    """What a ray meets.
+    """A ray's hit of a surface.
 
     Attributes:
-      interaction: what the surface does to it.
-      length: of the segment that ends there.
-      weight: the ray's light after the medium on the way, and the surface's tint.
-      reflected: spread of the reflected ray.
-      transmitted: spread of the transmitted ray.
+      interaction: interaction of the ray with the interface.
+      length: length of the segment that ends at the hit.
+      weight: throughput after absorption along the segment and the surface's tint.
+      reflected: ray differential of the reflected ray.
+      transmitted: ray differential of the transmitted ray.
     """
 
     interaction: interaction.Interaction
@@ -65,14 +67,14 @@ class Arrival(NamedTuple):
 
 
 class Branches(NamedTuple):
-    """The two rays that leave a surface; a branch of no weight is not followed."""
+    """The two rays that leave a surface; branches of weight 0 are not followed."""
 
     reflected: RayState
     transmitted: RayState
 
 
 def begin(ray: Rays, inside: Int[Array, " slots"], spread: Spread) -> RayState:
-    """Returns a camera ray before its first surface."""
+    """Returns the state of a camera ray before its first surface."""
     return RayState(
         origin=ray.origins,
         point=ray.origins,
@@ -87,10 +89,10 @@ def begin(ray: Rays, inside: Int[Array, " slots"], spread: Spread) -> RayState:
 
 
 def arrive(geometry: Scene, state: RayState, slot: Int[Array, ""]) -> Arrival:
-    """Follows a ray to the triangle that it meets; without meaning for `NO_SLOT`, but finite.
+    """Advances a ray to the triangle that it hits; finite but meaningless for `NO_SLOT`.
 
-    Where it meets the triangle is computed anew, from the corners as they are: so it has gradients,
-    and the precision of the corners rather than that of the search.
+    The hit point is recomputed from the corners of the triangle, so it has gradients and the
+    precision of the corners rather than that of the BVH traversal.
     """
 
     def surface(
@@ -98,10 +100,10 @@ def arrive(geometry: Scene, state: RayState, slot: Int[Array, ""]) -> Arrival:
     ) -> tuple[Bend, interaction.Interaction]:
         corners = geometry.surfaces.bvh.triangles[slot]
         found = triangles.intersect(origin, direction, corners).barycentric
-        # A ray that meets nothing looks at some triangle: no value nor gradient may come of it.
+        # A ray without a hit reads an arbitrary triangle: keep it out of values and gradients.
         barycentric = jnp.where(slot == NO_SLOT, 1.0 / 3.0, found)
         point = surfaces.surface_point(geometry.surfaces, slot, barycentric)
-        # Or XLA would gather the triangle anew for every result that depends on it.
+        # Otherwise XLA would gather the triangle again for every result that depends on it.
         point = jax.lax.optimization_barrier(point)
         met = interaction.meet(point, geometry.interfaces, state.inside, direction)
         return Bend(met.position, met.reflected, met.transmitted), met
@@ -118,13 +120,13 @@ def arrive(geometry: Scene, state: RayState, slot: Int[Array, ""]) -> Arrival:
 def ending(
     budget: Budget, state: RayState, arrival: Arrival, hit: Bool[Array, ""]
 ) -> Int[Array, ""]:
-    """Returns the status of a path that ends here; `EMPTY` if it bends and goes on.
+    """Returns the status of a path that ends here; `EMPTY` if it bends and continues.
 
     Args:
-      budget: which light to follow.
-      state: the ray.
-      arrival: what it meets.
-      hit: whether it meets anything.
+      budget: path settings.
+      state: state of the ray.
+      arrival: the ray's hit.
+      hit: whether the ray hits anything.
     """
     missed = jnp.where(state.bends > 0, PathStatus.ESCAPED, PathStatus.MISSED)
     met = jnp.where(state.bends < budget.bends, PathStatus.EMPTY, PathStatus.OUT_OF_BENDS)
@@ -134,14 +136,14 @@ def ending(
 
 
 def shown(budget: Budget, weight: Float[Array, "3"], status: Int[Array, ""]) -> Float[Array, "3"]:
-    """Returns what of a path's light is shown when it ends with a status."""
+    """Returns the weight that a path contributes when it ends with a status."""
     if budget.unfinished == "kept":
         return weight
     return jnp.where(status == PathStatus.OUT_OF_BENDS, 0.0, weight)
 
 
 def branch(budget: Budget, state: RayState, arrival: Arrival, slot: Int[Array, ""]) -> Branches:
-    """Returns both rays that leave the surface, with their shares of the light."""
+    """Returns both rays that leave the surface, with their shares of the throughput."""
     met = arrival.interaction
     share = splitting.shares(
         budget,

@@ -1,15 +1,15 @@
-"""How much of the light is followed, and how much room it gets.
+"""Path settings: the branches of light that are traced, and the capacity for them.
 
-At every interface light splits into a reflected and a transmitted part, so a camera ray grows a
-tree of paths. A budget says which branches are followed:
+At every interface light splits into a reflected and a transmitted ray, so a camera ray has a tree
+of paths. Path settings select the branches to follow. The presets are:
 
 - `STRAIGHT`: none; light ignores the objects, as in a plain NeRF.
 - `PAPER`: the paper's oracle. One path of at most 10 bends, refracted wherever it can be and
   totally reflected elsewhere, without loss, and one reflection at the first surface, which is not
   traced any further.
-- `TREE`: every branch that carries at least 2 % of its pixel's light.
+- `TREE`: every branch with a throughput of at least 2 %.
 - `PAPER_NO_REFLECTION`, `PAPER_NO_TIR`: the paper's ablations: `PAPER` without the reflection at
-  the first surface, and with paths that go straight on where they would be reflected totally.
+  the first surface, and with paths that continue straight at total internal reflections.
 
 Source: paper (arXiv 2505.05848), sections 4 and 5 (ablation study), for all but the tree.
 """
@@ -23,40 +23,41 @@ TotalReflection = Literal["followed", "ended"]
 Reentry = Literal["possible", "impossible"]
 Unfinished = Literal["kept", "dark"]
 
-# Bends and cut for which the capacity factors below were measured.
+# Max bends and throughput threshold for which the capacity factors below were measured.
 _PAPER_BENDS = 10
 _TREE_BENDS = 24
 _TREE_CUT = 0.02
 
-# Capacities do not grow for smaller cuts, which would take any amount of memory.
+# Capacities do not grow for thresholds below this one, so that memory is bounded.
 _SMALLEST_CUT_WITH_ROOM = 5e-4
 
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """Which light to follow.
+    """Path settings: the branches to follow, and the capacity for them.
 
-    The capacity factors bound memory, per camera ray of a pool. What does not fit is the least
-    light there is, and it is returned as lost; see `wavefront`. A factor of `None` follows from the
-    cut and the bends (`capacity_factors`), so `dataclasses.replace(TREE, cut=0.002)` also has room
-    for the paths that the finer cut adds. A pool of few rays that all meet much glass may need
-    more than that.
+    The capacity factors bound memory, per camera ray traced together. If a buffer is full, the
+    paths of least throughput are dropped, and the dropped throughput is returned; see `wavefront`.
+    A factor of `None` is derived from the throughput threshold and the max bends
+    (`capacity_factors`), so `dataclasses.replace(TREE, cut=0.002)` also has capacity for the
+    additional paths. A batch of few rays that all hit much glass may need larger factors.
 
     Attributes:
-      bends: most refractions and reflections of a path.
-      reflections: `none` follows total reflections only; `first` adds the reflection at the first
-        surface, untraced; `all` follows every reflection.
-      total_reflection: `followed`, or `ended`: a path that meets one then goes on along its last
-        direction, as in the paper's ablation.
-      cut: smallest throughput worth following, by the largest of its RGB. A weaker branch leaves
-        its share to its sibling, so no energy is lost.
-      reentry: `impossible` promises that a ray which has left the objects meets none again, as
-        around one convex body: it is not cast again.
-      unfinished: light of paths that run out of bends. `kept` goes on along its last direction,
-        as in the paper; `dark` is lost, as in renderers that stop after a number of bounces.
-      live_per_ray: capacity for rays that are still to be cast, per camera ray; at least 1.
-      segments_per_ray: capacity for segments of paths, beyond the camera rays themselves.
-      paths_per_ray: capacity for finished paths.
+      bends: max bends, the largest number of refractions and reflections of a path.
+      reflections: reflections to follow. `none` follows only total internal reflections; `first`
+        adds the reflection at the first surface, untraced; `all` follows every reflection.
+      total_reflection: `followed`, or `ended`: paths continue straight at a total internal
+        reflection, as in the paper's ablation.
+      cut: throughput threshold for following a branch, compared to the largest RGB component. A
+        weaker branch leaves its share to its sibling, so that energy is conserved.
+      reentry: `impossible` states that a ray that has left the objects never hits one again, as
+        with one convex object; such rays are not cast again.
+      unfinished: treatment of truncated paths, which reach the max bends. `kept` ends them on the
+        background along their last direction, as in the paper; `dark` makes them black, as in
+        renderers with a max depth.
+      live_per_ray: capacity for rays still to be cast, per camera ray; at least 1.
+      segments_per_ray: capacity for path segments per camera ray, in addition to the camera rays.
+      paths_per_ray: capacity for finished paths, per camera ray.
     """
 
     bends: int
@@ -70,40 +71,40 @@ class Budget:
     paths_per_ray: float | None = None
 
     def __post_init__(self) -> None:
-        """Checks what tracing relies on."""
+        """Validates the values."""
         if self.bends < 0:
-            raise ValueError(f"A path can not have {self.bends} bends. Give 0 or more.")
+            raise ValueError(f"bends is {self.bends}, which is negative. Give 0 or more.")
         if not 0.0 <= self.cut < 1.0:
             raise ValueError(
-                f"The cut is a share of a pixel's light, in [0, 1), not {self.cut}. Give 0.02 for "
-                "2 %."
+                f"The throughput threshold cut is {self.cut}, outside [0, 1). Give 0.02 for 2 % of "
+                "a pixel's light."
             )
         if self.reflections not in get_args(Reflections):
             raise ValueError(
-                f"The reflections are 'none', 'first' or 'all', not {self.reflections!r}. Choose "
-                "one."
+                f"reflections is {self.reflections!r}, which is unknown. Use 'none', 'first' or "
+                "'all'."
             )
         if self.total_reflection not in get_args(TotalReflection):
             raise ValueError(
-                "Total reflection is 'followed' or 'ended', not "
-                f"{self.total_reflection!r}. Choose one."
+                f"total_reflection is {self.total_reflection!r}, which is unknown. Use 'followed' "
+                "or 'ended'."
             )
         if self.reentry not in get_args(Reentry):
             raise ValueError(
-                f"Re-entry is 'possible' or 'impossible', not {self.reentry!r}. Choose one."
+                f"reentry is {self.reentry!r}, which is unknown. Use 'possible' or 'impossible'."
             )
         if self.unfinished not in get_args(Unfinished):
             raise ValueError(
-                f"Unfinished light is 'kept' or 'dark', not {self.unfinished!r}. Choose one."
+                f"unfinished is {self.unfinished!r}, which is unknown. Use 'kept' or 'dark'."
             )
         for name, usual in _usual_factors(self)._asdict().items():
             factor = getattr(self, name)
             if factor is not None and not 1.0 <= factor < math.inf:
                 raise ValueError(
-                    f"{name} is {factor}, but every ray needs room for itself. Give a number of at "
-                    "least 1, or None."
+                    f"{name} is {factor}, but every ray needs a capacity of at least 1. Give a "
+                    "number of at least 1, or None."
                 )
-            # The usual factor, written out (as in files of older runs), goes on following the cut.
+            # A default factor that is written out (as in files of older runs) still follows cut.
             if factor == usual:
                 object.__setattr__(self, name, None)
 
@@ -117,11 +118,12 @@ class CapacityFactors(NamedTuple):
 
 
 def capacity_factors(budget: Budget) -> CapacityFactors:
-    """Returns the capacity factors of a budget, those it does not set by its cut and bends.
+    """Returns the capacity factors of path settings; `None` is derived from `cut` and `bends`.
 
-    Generous for images of which glass fills a part. Where all reflections are followed, room grows
-    as the inverse square root of a cut below 0.02; that of segments also grows with the bends.
-    Measured: at a cut of 0.002 a flask of three media loses 0.27 % of its light without either.
+    The defaults are generous for images that are partly filled by glass. If all reflections are
+    followed, capacities grow with the inverse square root of a threshold below 0.02; the capacity
+    for segments also grows with the max bends. Measured: without this growth, a flask of three
+    media drops 0.27 % of its light at a threshold of 0.002.
     """
     set_here = (budget.live_per_ray, budget.segments_per_ray, budget.paths_per_ray)
     pairs = zip(set_here, _usual_factors(budget), strict=True)
@@ -139,12 +141,12 @@ def _usual_factors(budget: Budget) -> CapacityFactors:
 
 
 class Room(NamedTuple):
-    """Most records that the lists of a pool keep, by the capacity factors of its budget.
+    """Capacities of the buffers of a batch of rays, from the capacity factors.
 
     Attributes:
-      live: rays that are still to be cast.
-      segments: of paths, camera rays included.
-      paths: finished ones.
+      live: capacity for rays still to be cast.
+      segments: capacity for path segments, including the camera rays.
+      paths: capacity for finished paths.
     """
 
     live: int
@@ -169,10 +171,10 @@ BUDGETS = {
 
 
 def budget_of(paths: str, *, cut: float | None = None, bends: int | None = None) -> Budget:
-    """Returns a budget by name, with another cut or number of bends.
+    """Returns preset path settings by name, with another throughput threshold or max bends.
 
     Raises:
-      ValueError: if light is straight and has a cut or bends nevertheless.
+      ValueError: if rays are straight, but `cut` or `bends` is given.
     """
     budget = BUDGETS[paths]
     given = {"cut": cut, "bends": bends}
@@ -185,7 +187,7 @@ def budget_of(paths: str, *, cut: float | None = None, bends: int | None = None)
 
 
 def room(budget: Budget, rays: int) -> Room:
-    """Returns the room that a budget gives a pool of rays."""
+    """Returns the capacities for a number of camera rays."""
     factors = capacity_factors(budget)
     return Room(
         live=math.ceil(rays * factors.live_per_ray),
@@ -195,17 +197,17 @@ def room(budget: Budget, rays: int) -> Room:
 
 
 def capacity_for(budget: Budget, rays: int, *, mean: float, deviation: float) -> int:
-    """Returns the room for the paths of a batch of a scene.
+    """Returns the capacity for the paths of a batch of a scene.
 
-    One standard deviation above the mean number of paths of a random batch, rounded up to 8. A
-    batch in six loses its weakest paths, and training logs their light. A step costs as much as its
-    room, so that room for all of them would cost 6 % of it.
+    This is one standard deviation above the mean number of paths of a random batch, rounded up to a
+    multiple of 8. One batch in six drops its weakest paths, and training logs their throughput. The
+    cost of a step is proportional to this capacity; a capacity for all paths would cost 6 % more.
 
     Args:
-      budget: which light to follow.
-      rays: rays in a batch.
-      mean: mean number of paths of the scene's camera rays.
-      deviation: its standard deviation over rays.
+      budget: path settings.
+      rays: number of rays in a batch.
+      mean: mean number of paths per camera ray of the scene.
+      deviation: standard deviation of the number of paths over rays.
     """
     most = room(budget, rays).paths
     needed = rays * mean + math.sqrt(rays) * deviation

@@ -1,4 +1,4 @@
-"""How much is kept of the light paths that are traced: what nobody asks for is not stored."""
+"""Selects which segments of traced paths are stored, to save memory."""
 
 import dataclasses
 from typing import Literal
@@ -8,14 +8,14 @@ from refref_jax.choices import Footprint
 
 @dataclasses.dataclass(frozen=True)
 class Detail:
-    """What a record of light paths holds.
+    """Contents of stored light paths.
 
     Attributes:
-      segments: `all`, or those `outside` the objects and the last one.
-      most: most segments of a path; `all` needs one more than there are bends. Of a path that has
-        more the first is kept, and the last ones.
-      footprint: whether derivatives across the pixel are carried (see `footprints`).
-      tally: `parts` counts how often a path met each part and how far it went in it.
+      segments: `all` segments, or only those `outside` the objects and the last one.
+      most: maximum number of segments per path; `all` needs max bends + 1. Of a longer path, the
+        first segment and the last ones are kept.
+      footprint: `differential` carries derivatives across the pixel (see `footprints`).
+      tally: `parts` stores each path's hit counts and path lengths per part.
     """
 
     segments: Literal["all", "outside"]
@@ -24,11 +24,11 @@ class Detail:
     tally: Literal["none", "parts"] = "none"
 
     def __post_init__(self) -> None:
-        """Checks the room for segments."""
+        """Validates the number of segments."""
         if self.most < 1:
-            raise ValueError(f"A path has at least one segment, not {self.most}. Give 1 or more.")
+            raise ValueError(f"most is {self.most}; a path has at least one segment. Give >= 1.")
 
 
 def everything(bends: int) -> Detail:
-    """Returns the detail of a path that is kept in full."""
+    """Returns the settings that store complete paths."""
     return Detail("all", bends + 1)

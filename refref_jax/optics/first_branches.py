@@ -1,7 +1,7 @@
-"""Which of its two branches a light path took at the first surface that it met.
+"""Separates light paths by the branch that they take at their first surface.
 
-There light divides for the first time, and so the light of a pixel into two images: what was
-mirrored by the objects' outside, and all the rest, which went through them or beside them.
+The first surface divides the light of a pixel into two images: light reflected by the outside of
+the objects, and the rest, which passes through the objects or misses them.
 """
 
 from typing import Literal
@@ -12,16 +12,16 @@ from jaxtyping import Array, Bool
 from refref_jax.optics.light_paths import LightPaths
 
 Branch = Literal["both", "transmitted", "reflected"]
-"""Paths of either branch, or of one: `transmitted` has all that are not `reflected`."""
+"""Paths to select: both branches, `reflected` ones, or `transmitted` ones (all others)."""
 
 
 def reflected_first(paths: LightPaths) -> Bool[Array, " paths"]:
-    """Returns which paths were reflected at the first surface they met.
+    """Returns which paths were reflected at the first surface they hit.
 
-    These stay in their medium: the second segment begins where the first one ends. Of a path with
-    more segments outside the objects than its record keeps (see `details`) the second one is not
-    known, and it counts as transmitted; around one convex body there is none such. The camera is
-    taken to be outside of all objects.
+    These stay in their medium: their second segment starts at the end of the first. If a path has
+    more segments outside the objects than are stored (see `details`), its second segment is unknown
+    and it counts as transmitted; with one convex object this never happens. The camera is assumed
+    to be outside all objects.
     """
     if paths.tau.shape[-1] < 2:
         return jnp.zeros_like(paths.bends, bool)

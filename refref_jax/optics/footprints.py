@@ -1,13 +1,14 @@
-"""How the rays of one pixel spread around the one that is traced: ray differentials.
+"""Ray differentials: the footprint of a pixel along its traced ray.
 
-A pixel is seen along a bundle of rays. To first order the bundle is known by how its middle ray
-moves with two coordinates across the pixel: the derivatives of point and direction, carried through
-every bend by forward-mode differentiation of the very steps that bend the ray. Behind a ball of
-glass a pixel is several times wider than behind as much air, and a flat ellipse rather than a disc.
+To first order, the bundle of rays of a pixel is described by the derivatives of the central ray's
+point and direction with respect to two coordinates across the pixel. They are propagated through
+every bend by forward-mode differentiation of the steps that bend the ray. Behind a glass ball, the
+footprint is several times wider than after the same distance in air, and a flat ellipse rather than
+a disc.
 
-Coordinates are such that a ray which never bends has, at distance `t`, two derivatives at right
-angles of length `radius * t`: the cone of `Rays.radii`. Which way they point is arbitrary, since a
-square pixel has the same second moments in all directions.
+The coordinates are scaled so that, at distance `t`, a straight ray has two orthogonal derivatives
+of length `radius * t`: the cone of `Rays.radii`. Their orientation is arbitrary, since a square
+pixel has the same second moments in all directions.
 
 Source: Igehy, Tracing Ray Differentials (1999).
 """
@@ -23,17 +24,17 @@ from refref_jax import numerics
 from refref_jax.choices import Footprint
 from refref_jax.geometry.rays import Rays, orthonormal_basis
 
-# Where a bundle is focused on the critical angle its derivatives have no bound. A footprint as
-# wide as this blurs all there is, and its square is still a number.
+# Near the critical angle the derivatives are unbounded. A footprint of this width covers the
+# scene, and its square is still finite.
 _WIDEST = 1e6
 
 
 class Spread(NamedTuple):
-    """The derivatives of a ray across its pixel; no axis at all where none are carried.
+    """Ray differential: derivatives of a ray across its pixel; zero axes if they are not carried.
 
     Attributes:
-      points: of the start of the segment, world units.
-      directions: of its unit direction.
+      points: derivatives of the segment's start, world units.
+      directions: derivatives of the segment's unit direction.
     """
 
     points: Float[Array, "*rays axes 3"]
@@ -41,10 +42,10 @@ class Spread(NamedTuple):
 
 
 class Bend(NamedTuple):
-    """What a surface makes of a ray, as far as it is differentiated.
+    """Differentiated results of a ray's interaction with a surface.
 
     Attributes:
-      point: on the surface, world units.
+      point: hit point on the surface, world units.
       reflected: mirrored unit direction.
       transmitted: refracted unit direction.
     """
@@ -55,7 +56,7 @@ class Bend(NamedTuple):
 
 
 def begin(ray: Rays, footprint: Footprint) -> Spread:
-    """Returns the spread of a camera ray: all rays of a pixel start in one point."""
+    """Returns the ray differential of a camera ray: all rays of a pixel start at one point."""
     if footprint == "cone":
         return nothing(ray.origins)
     sides = ray.radii * jnp.stack(orthonormal_basis(ray.directions))
@@ -63,7 +64,7 @@ def begin(ray: Rays, footprint: Footprint) -> Spread:
 
 
 def nothing(like: Float[Array, "3"]) -> Spread:
-    """Returns the spread of a ray whose derivatives are not carried."""
+    """Returns the empty ray differential of a ray whose derivatives are not carried."""
     none = jnp.zeros((0, 3), like.dtype)
     return Spread(none, none)
 
@@ -74,16 +75,16 @@ def bend(
     direction: Float[Array, "3"],
     spread: Spread,
 ) -> tuple[object, Spread, Spread]:
-    """Bends a ray and what is carried with it.
+    """Bends a ray and its differential.
 
     Args:
-      surface: takes origin and direction of a ray; returns where it bends it to, and anything.
-      origin: of the ray.
-      direction: of the ray.
-      spread: of the ray.
+      surface: function of origin and direction that returns a `Bend` and an auxiliary output.
+      origin: origin of the ray.
+      direction: unit direction of the ray.
+      spread: differential of the ray.
 
     Returns:
-      What `surface` returned besides, and the spreads of the reflected and the transmitted ray.
+      The auxiliary output, and the differentials of the reflected and the transmitted ray.
     """
     if spread.points.shape[0] == 0:
         return surface(origin, direction)[1], spread, spread
@@ -96,12 +97,12 @@ def bend(
 def across(
     spread: Spread, along: Float[Array, ""], direction: Float[Array, "3"]
 ) -> Float[Array, "axes 3"]:
-    """Returns the half axes of a footprint that is cut across its ray.
+    """Returns the half axes of a footprint in the plane perpendicular to its ray.
 
     Args:
-      spread: of the segment.
+      spread: ray differential of the segment.
       along: distance from the segment's start, world units.
-      direction: of the segment.
+      direction: unit direction of the segment.
     """
     moved = spread.points + along * spread.directions
     rows = jnp.broadcast_to(direction, moved.shape)

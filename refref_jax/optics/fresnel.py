@@ -1,4 +1,4 @@
-"""The Fresnel equations for unpolarised light. Letters as in `snell`."""
+"""Fresnel equations for unpolarised light. Letters as in `snell`."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -14,9 +14,9 @@ def reflectance(
 
     `R = (R_p + R_s) / 2` with `R_p = ((nu_1 beta - nu_0 gamma) / (nu_1 beta + nu_0 gamma))^2`
     and `R_s = ((nu_0 beta - nu_1 gamma) / (nu_0 beta + nu_1 gamma))^2`; 1 in total internal
-    reflection. Equal indices give 0 at every angle, grazing included, where the plain formula
-    is 0/0; the gradient there is 0. Just below the critical angle the gradient is unbounded,
-    like `snell.transmission`'s; beyond it is 0.
+    reflection. Equal indices give 0 at every angle, including grazing incidence, where the plain
+    formula is 0/0; the gradient there is 0. Just below the critical angle the gradient is
+    unbounded, like that of `snell.transmission`; beyond it, it is 0.
 
     Args:
       beta: cosine of incidence, in `[0, 1]`.

@@ -1,7 +1,7 @@
-"""One ray meets one interface: where the light goes on.
+"""Interaction of one ray with one interface: the reflected and the refracted ray.
 
-Letters as in `snell`. The geometric normal decides from which side the ray comes and where it
-starts again; the shading normal bends it.
+Letters as in `snell`. The geometric normal determines the side that the ray comes from and the
+origins of the new rays; the shading normal determines their directions.
 """
 
 from typing import NamedTuple
@@ -15,17 +15,17 @@ from refref_jax.optics import fresnel, media, snell
 
 
 class Interaction(NamedTuple):
-    """What an interface does to a ray.
+    """Reflection and refraction of a ray at an interface.
 
     Attributes:
-      position: the point on the interface.
+      position: hit point on the interface.
       reflectance: Fresnel's `R`, 1 in total internal reflection.
       total: whether reflection is total.
       reflected: mirrored unit direction.
-      transmitted: refracted unit direction; finite, without meaning, if reflection is total.
+      transmitted: refracted unit direction; finite but meaningless if reflection is total.
       restart_reflected: origin of the mirrored ray, just off the surface.
       restart_transmitted: origin of the refracted ray, just off the surface on its other side.
-      sides: the media on both sides.
+      sides: media on both sides.
     """
 
     position: Float[Array, "3"]
@@ -44,15 +44,15 @@ def meet(
     inside: Int[Array, " slots"],
     direction: Float[Array, "3"],
 ) -> Interaction:
-    """Follows a ray to an interface and beyond it.
+    """Reflects and refracts a ray at an interface.
 
-    Where the shading normal would send either ray to the wrong side of the triangle, both
-    follow the geometric normal instead.
+    If the shading normal would send either ray to the wrong side of the triangle, the geometric
+    normal is used for both.
 
     Args:
-      point: where the ray meets the surface.
-      interfaces: the scene's interfaces.
-      inside: the parts that the ray is in (see `media`).
+      point: hit point of the ray.
+      interfaces: interfaces of the scene.
+      inside: interior list of the ray (see `media`).
       direction: unit direction of the incident ray.
     """
     entering = numerics.dot(direction, point.geometric_normal) < 0.0
@@ -63,7 +63,7 @@ def meet(
     normal = jnp.where(_keeps_sides(direction, shading, geometric, sides), shading, geometric)
     near, far = sides.index_near, sides.index_far
     beta = -numerics.dot(direction, normal)
-    # Lengths are renormalised, or rounding would add up over bends.
+    # Directions are renormalised, or rounding errors would accumulate over bends.
     return Interaction(
         position=point.position,
         reflectance=fresnel.reflectance(beta, near, far),
@@ -82,7 +82,7 @@ def _keeps_sides(
     geometric: Float[Array, "3"],
     sides: media.Crossing,
 ) -> Bool[Array, ""]:
-    """Returns whether the shading normal sends both rays to their own side of the triangle."""
+    """Returns whether the shading normal sends both rays to the correct side of the triangle."""
     near, far = sides.index_near, sides.index_far
     beta = -numerics.dot(direction, shading)
     total = snell.transmission(beta, near, far).total

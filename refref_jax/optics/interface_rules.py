@@ -1,17 +1,18 @@
-"""Decides on the host what lies outside each part (NumPy only).
+"""Determines the medium outside each part, on the host (NumPy only).
 
-A part knows its own medium. What is on the other side of its surface follows from a rule:
+A part defines the medium inside it. The medium on the other side of its surface follows from a
+rule:
 
-- `nested`: bodies lie strictly inside one another, so it is the material of the innermost part
-  that contains this one, and air for the outermost. Physical.
-- `facing`: always air. Blender Cycles does this when every material has its index relative to
-  air: it takes the index on a front face and its inverse on a back face, and keeps no record of
-  the media a ray is in.
-- `priority`: bodies may overlap, and where they do THE HIGHEST PRIORITY WINS. Physical; it is how
-  a liquid is modelled that fills its glass without a gap: overlapping the wall a little, with the
-  glass above it (glass 3, ice 2, liquid 1). A body *inside* another needs the higher one of the
-  two (bubble 2, glass 1), which is why no rule can tell the priorities from the materials. Of
-  equal priorities the part that is listed first wins: the media are then defined, but by chance.
+- `nested`: objects lie strictly inside one another, so it is the medium of the innermost part that
+  contains this one, or air. Physical.
+- `facing`: always air. This is the behaviour of Blender Cycles with indices relative to air: it
+  uses the index on a front face and its inverse on a back face, and does not track the media that
+  a ray is in.
+- `priority`: objects may overlap, and THE HIGHEST PRIORITY WINS in the overlap. Physical. It models
+  a liquid that fills a glass without a gap: the liquid overlaps the wall a little, and the glass
+  has the higher priority (glass 3, ice 2, liquid 1). Of two objects *inside* each other, the inner
+  one needs the higher priority (bubble 2, glass 1), so priorities cannot be derived from materials.
+  Among equal priorities the part listed first wins: the media are defined, but arbitrary.
 """
 
 from collections.abc import Sequence
@@ -24,10 +25,10 @@ from refref_jax.choices import CLEAR, NO_ABSORPTION, RuleName
 from refref_jax.optics.media import AMBIENT, INDEX_OF_AIR, Interfaces
 
 NO_PARENT = -1
-"""The parent of a part that no other part contains."""
+"""Parent of a part that is not inside another part."""
 
 Colours = Sequence[Sequence[float]]
-"""Linear RGB, one a part."""
+"""Linear RGB values, one per part."""
 
 
 class Rule(Protocol):
@@ -42,14 +43,14 @@ class Rule(Protocol):
         absorptions: Colours | None = None,
         priorities: Sequence[int] | None = None,
     ) -> Interfaces:
-        """Makes the interfaces of a scene.
+        """Builds the interfaces of a scene.
 
         Args:
           indices: index of refraction of each part's material, relative to air.
-          parents: the innermost part that contains each part, or `NO_PARENT`.
-          tints: factor of light at each part's surface, `CLEAR` if not given.
-          absorptions: of each part's medium, per world unit, `NO_ABSORPTION` if not given.
-          priorities: of each part, 0 if not given; the highest wins.
+          parents: innermost part that contains each part, or `NO_PARENT`.
+          tints: factor on light at each part's surface, `CLEAR` by default.
+          absorptions: absorption of each part's medium, per world unit, `NO_ABSORPTION` by default.
+          priorities: priority of each part, 0 by default; the highest wins.
         """
 
 
@@ -61,7 +62,7 @@ def nested(
     absorptions: Colours | None = None,
     priorities: Sequence[int] | None = None,
 ) -> Interfaces:
-    """Applies the `nested` rule; arguments of `Rule`. It takes no notice of priorities."""
+    """Applies the `nested` rule; arguments as in `Rule`. Priorities are ignored."""
     del priorities
     outside = [INDEX_OF_AIR if parent == NO_PARENT else indices[parent] for parent in parents]
     return _interfaces(indices, outside, parents, tints, absorptions)
@@ -75,9 +76,9 @@ def facing(
     absorptions: Colours | None = None,
     priorities: Sequence[int] | None = None,
 ) -> Interfaces:
-    """Applies the `facing` rule; arguments of `Rule`. It takes no notice of priorities.
+    """Applies the `facing` rule; arguments as in `Rule`. Priorities are ignored.
 
-    The parents name the media, and so what absorbs, but not the indices.
+    Parents determine the media, and therefore absorption, but not the indices.
     """
     del priorities
     return _interfaces(indices, [INDEX_OF_AIR] * len(indices), parents, tints, absorptions)
@@ -91,7 +92,7 @@ def priority(
     absorptions: Colours | None = None,
     priorities: Sequence[int] | None = None,
 ) -> Interfaces:
-    """Applies the `priority` rule; arguments of `Rule`. It takes no notice of parents.
+    """Applies the `priority` rule; arguments as in `Rule`. Parents are ignored.
 
     Source: Schmidt and Budge, Simple Nested Dielectrics in Ray Traced Images (2002).
     """
@@ -104,7 +105,7 @@ RULES: dict[RuleName, Rule] = {"nested": nested, "facing": facing, "priority": p
 
 
 def _order(priorities: Sequence[int]) -> Int[np.ndarray, " parts"]:
-    """Returns the place of each part in the order of priority; of equals the first is higher."""
+    """Returns the rank of each part by priority; among equals, the first part ranks highest."""
     ascending = sorted(range(len(priorities)), key=lambda part: (priorities[part], -part))
     return np.argsort(ascending).astype(np.int32)
 
@@ -118,7 +119,7 @@ def _interfaces(
 ) -> Interfaces:
     media = [AMBIENT if parent == NO_PARENT else parent + 1 for parent in parents]
     if not media:
-        # A scene without parts: one interface that no triangle refers to can be indexed.
+        # A scene without parts gets one unused interface, so that arrays can be indexed.
         inside, outside, media, tints, absorptions = (
             [INDEX_OF_AIR],
             [INDEX_OF_AIR],

@@ -1,4 +1,4 @@
-"""Light paths: the polylines that light takes from a pixel into the scene.
+"""Light paths: polylines of light from a pixel into the scene.
 
 Letters, as in the paper (section 4.2): a path has points `p_0 .. p_K`, unit directions
 `d_0 .. d_K` and cumulative distances `tau_0 = 0 .. tau_K`; segment `i` is
@@ -20,45 +20,44 @@ from refref_jax.optics.media import AMBIENT
 
 
 class PathStatus(enum.IntEnum):
-    """How a path ended."""
+    """Reason for the end of a path."""
 
     EMPTY = 0
-    """The slot holds no path; its weight is 0."""
+    """The slot is empty; its weight is 0."""
     MISSED = 1
-    """The ray met no interface; the path is straight."""
+    """The ray hit no interface; the path is straight."""
     ESCAPED = 2
-    """The path bent, left the objects and goes on for ever along its last direction."""
+    """The path bent, left the objects and continues to infinity along its last direction."""
     OUT_OF_BENDS = 3
-    """The path would meet another interface, but its budget of bends is spent."""
+    """The path was truncated: it would hit another interface after the max bends."""
     NOT_TRACED = 4
-    """The last direction was not traced against the objects: the paper's reflected ray, and every
-    ray of a budget without bends."""
+    """The last direction was not traced against the objects: the paper's reflected ray, and all
+    rays if max bends is 0."""
     TOTALLY_REFLECTED = 5
-    """The path met a total reflection, which its budget does not follow."""
+    """The path hit a total internal reflection, which its settings do not follow."""
 
 
 class LightPaths(NamedTuple):
     """The light paths of a batch of rays, padded to the same number of segments.
 
-    A ray may have any number of paths, in any order. Its colour is the sum of its paths'
-    colours times their weights. Segments inside the objects may be left out (see `details`): then
-    the next one starts later than the one before it ends.
+    A ray may have any number of paths, in any order. Its colour is the sum of the colours of its
+    paths, multiplied by their weights. Segments inside the objects may be omitted (see `details`);
+    then there is a gap in arc length before the next segment.
 
     Attributes:
       points: start of each segment, world units; finite but meaningless where unused.
-      directions: unit direction of each segment; likewise.
+      directions: unit direction of each segment; finite but meaningless where unused.
       tau: arc length at the start of each segment, increasing from 0; `inf` where unused.
       ends: arc length at the end of each segment; `inf` for the last, and where unused.
       media: medium of each segment (see `media`).
-      spreads: derivatives of each segment across the pixel, if they are carried (see
-        `footprints`).
-      rays: index of the ray that a path belongs to.
+      spreads: ray differential of each segment, if carried (see `footprints`).
+      rays: index of each path's ray.
       weights: share of the path in its ray's linear RGB.
       radii: footprint of the ray's pixel as a cone radius at unit distance.
       bends: number of refractions and reflections.
-      statuses: a `PathStatus`.
-      meetings: how often the path met each part, if that is tallied (see `details`).
-      passages: how far it went through each part's medium, world units; likewise.
+      statuses: `PathStatus` of each path.
+      meetings: hit count per part, if tallied (see `details`).
+      passages: path length in each part's medium, world units, if tallied.
     """
 
     points: Float[Array, "paths segments 3"]
@@ -77,17 +76,17 @@ class LightPaths(NamedTuple):
 
 
 class PathEnds(NamedTuple):
-    """The last segments of light paths: all that a known background needs.
+    """Last segments of light paths; sufficient for a known background.
 
     Attributes:
       origins: start of the last segment, world units; finite but meaningless in empty slots.
-      directions: its unit direction; likewise.
-      tau: arc length from the camera to its start.
-      media: its medium (see `media`).
-      rays: index of the ray that a path belongs to.
+      directions: unit direction of the last segment; finite but meaningless in empty slots.
+      tau: arc length from the camera to the start of the last segment.
+      media: medium of the last segment (see `media`).
+      rays: index of each path's ray.
       weights: share of the path in its ray's linear RGB; 0 in empty slots.
       bends: number of refractions and reflections.
-      statuses: a `PathStatus`.
+      statuses: `PathStatus` of each path.
     """
 
     origins: Float[Array, "paths 3"]
@@ -101,7 +100,7 @@ class PathEnds(NamedTuple):
 
 
 def straight(rays: Rays) -> LightPaths:
-    """Returns one straight path a ray, with full weight: the light paths of a plain NeRF."""
+    """Returns one straight path per ray, with full weight: the light paths of a plain NeRF."""
     count = rays.radii.shape[0]
     integers = jnp.arange(count, dtype=jnp.int32)
     return LightPaths(
@@ -122,12 +121,12 @@ def straight(rays: Rays) -> LightPaths:
 
 
 def straight_ends(rays: Rays) -> PathEnds:
-    """Returns the only segments of `straight`'s paths."""
+    """Returns the last segments of the paths of `straight`."""
     return ends_of(straight(rays))
 
 
 def ends_of(paths: LightPaths) -> PathEnds:
-    """Returns the last segment of each path; of one that does not exist, some segment."""
+    """Returns the last segment of each path; an arbitrary segment for empty slots."""
     used = jnp.sum(jnp.isfinite(paths.tau), axis=1, dtype=jnp.int32)
     path, last = jnp.arange(used.shape[0], dtype=jnp.int32), jnp.maximum(used - 1, 0)
     return PathEnds(
@@ -143,10 +142,10 @@ def ends_of(paths: LightPaths) -> PathEnds:
 
 
 def filled_up(paths: LightPaths, *, multiple: int) -> LightPaths:
-    """Returns the paths with empty slots after them, so that their number is a multiple."""
+    """Returns the paths, padded with empty slots to a multiple of a number."""
     count = paths.radii.shape[0]
     room = -(-count // multiple) * multiple
-    # What is in an empty slot is finite: the last path again, which carries no light.
+    # Empty slots repeat the last path with weight 0, so that their values are finite.
     paths = jax.tree.map(lambda x: x[jnp.minimum(jnp.arange(room), count - 1)], paths)
     real = jnp.arange(room) < count
     return paths._replace(

@@ -1,11 +1,12 @@
-"""The few branches that carry most of a ray's light, with gradients.
+"""Traces the main branches of a ray, which carry most of its light, with gradients.
 
 They are the main path, which is refracted wherever it can be, and the paths that are reflected
-once, at one of the first surfaces, and go on as the main path does. In clear glass all others
-together carry a hundredth of the light. What a budget's cut gives to siblings stays with these.
+once, at one of the first surfaces, and then refracted like the main path. In clear glass, all other
+paths together carry 1 % of the light. Throughput that the threshold moves to siblings stays on
+these branches.
 
-A reflection that does not take place, because the path has left before, or because it is total and
-so the main path's own, is no path.
+A reflection that does not occur is an empty path: the path has already left the objects, or the
+reflection is total and therefore part of the main path.
 
 Source: paper (arXiv 2505.05848), section 4.2; its two paths are the first two of these.
 """
@@ -23,17 +24,17 @@ from refref_jax.optics.single_path import follow_branch
 def follow_main_branches(
     geometry: Scene, ray: Rays, *, budget: Budget, reflections: int
 ) -> LightPaths:
-    """Follows one ray along its main path, and along those that are reflected once.
+    """Traces one ray along its main path, and along the paths that are reflected once.
 
     Args:
       geometry: the scene.
       ray: one camera ray.
-      budget: which light to follow.
-      reflections: at how many of the first surfaces a reflection is followed.
+      budget: path settings.
+      reflections: number of first surfaces at which a reflection is followed.
 
     Returns:
-      `1 + reflections` paths, the main one first; those that do not exist are `EMPTY`. All name
-      ray 0.
+      `1 + reflections` paths, the main path first; paths that do not exist are `EMPTY`. Their ray
+      index is 0.
 
     Raises:
       ValueError: if there are more reflections than bends.
@@ -63,14 +64,14 @@ def follow_main_branches(
     """
     if not 0 <= reflections <= budget.bends:
         raise ValueError(
-            f"{reflections} reflections do not fit into {budget.bends} bends. Ask for that many at "
-            "most, 0 or more."
+            f"reflections is {reflections}, outside 0 to {budget.bends}, the max bends. Choose a "
+            "number in that range."
         )
     first = jnp.arange(reflections, dtype=jnp.int32)
     once = first[:, None] == jnp.arange(budget.bends, dtype=jnp.int32)[None]
     choices = jnp.concatenate([jnp.zeros_like(once, shape=(1, budget.bends)), once])
     paths = jax.vmap(lambda choice: follow_branch(geometry, ray, choice, budget=budget))(choices)
-    # A main path that stays in its medium at a bend is reflected totally there.
+    # If the main path stays in its medium at a bend, reflection is total there.
     total = paths.media[0, 1:] == paths.media[0, :-1]
     real = jnp.append(True, (paths.bends[1:] > first) & ~total[:reflections])
     return paths._replace(

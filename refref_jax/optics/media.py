@@ -1,19 +1,19 @@
-"""Interfaces between media: what a ray crosses when it meets a mesh part.
+"""Media on both sides of the interfaces that a ray crosses.
 
-Every part is the boundary of a body. A *medium* is named by an integer: 0 is the surrounding air
-(`AMBIENT`), `1 + k` is the inside of part `k`.
+Every part is the boundary of an object. A *medium* is identified by an integer: 0 is the
+surrounding air (`AMBIENT`), `1 + k` is the inside of part `k`.
 
-Under the rules `nested` and `facing` a part knows both of its sides. Under `priority` bodies may
-overlap, and of all the bodies around a point THE HIGHEST PRIORITY WINS (as in Arnold and in the
-paper below; Maxwell counts the other way): the point is filled with that body's medium alone. A
-ray then carries its *interior list*, the numbers of the parts that it is inside of, and meets
-surfaces that part nothing: those of outranked bodies.
+Under the rules `nested` and `facing`, both sides of a part are known in advance. Under `priority`,
+objects may overlap, and THE HIGHEST PRIORITY WINS (as in Arnold and in the paper cited below;
+Maxwell counts the other way): a point in several objects is filled with the medium of the
+highest-ranked one only. A ray then carries its *interior list*, the indices of the parts that
+contain it. Surfaces of outranked objects do not separate media and leave the ray unchanged.
 
-The list is an unordered array of `SLOTS` part numbers, `EMPTY_SLOT` where free, and needs no
-branches. The side of a surface that a ray comes from decides whether it is inside that part, be
-the part on the list or not. A part that is entered while the list is full takes the place of the
-entry of lowest priority, or is left out if it is itself the lowest: of more than `SLOTS` bodies
-around a point the ray knows the highest, and takes a forgotten one to have been left.
+The list is an unordered array of `SLOTS` part indices, `EMPTY_SLOT` where free, and its updates are
+branch-free. The side of a surface that a ray comes from determines whether the ray is inside that
+part, regardless of the list. A part entered while the list is full replaces the entry of lowest
+priority, or is omitted if its own priority is the lowest: with more than `SLOTS` objects around a
+point, the ray tracks those of highest priority and treats the others as left.
 
 Source: Schmidt and Budge, Simple Nested Dielectrics in Ray Traced Images, Journal of Graphics
 Tools 7 (2002).
@@ -27,30 +27,30 @@ from jaxtyping import Array, Bool, Float, Int
 from refref_jax import numerics
 
 AMBIENT = 0
-"""The medium outside every body."""
+"""Medium outside all objects."""
 
 INDEX_OF_AIR = 1.0
-"""The index of refraction of the ambient medium."""
+"""Index of refraction of the ambient medium."""
 
 SLOTS = 4
-"""Most parts that a ray of the rule `priority` knows itself to be inside of."""
+"""Length of the interior list under the rule `priority`."""
 
 EMPTY_SLOT = -1
-"""A free place in the interior list."""
+"""Free slot in the interior list."""
 
 
 class Interfaces(NamedTuple):
-    """The interfaces of a scene, one a part; made by `interface_rules`.
+    """The interfaces of a scene, one per part; built by `interface_rules`.
 
     Attributes:
       index_inside: index of refraction inside the part.
-      index_outside: index on the other side of its surface, without meaning under `priority`.
-      medium_outside: the medium on the other side, without meaning under `priority`.
-      tint: factor of linear RGB light at every reflection and every crossing (the colour of
-        Cycles' glass).
-      absorption: of the medium inside the part, linear RGB, per world unit.
-      priority: the part's place in the order of priority, the highest wins and no two are equal;
-        no element at all under `nested` and `facing`, where no ray carries an interior list.
+      index_outside: index of refraction outside the part, meaningless under `priority`.
+      medium_outside: medium outside the part, meaningless under `priority`.
+      tint: factor on linear RGB at every reflection and refraction (the colour of the glass BSDF
+        in Cycles).
+      absorption: absorption of the medium inside the part, linear RGB, per world unit.
+      priority: rank of the part by priority, unique, the highest wins; an empty array under
+        `nested` and `facing`, where rays carry no interior list.
     """
 
     index_inside: Float[Array, " parts"]
@@ -62,18 +62,18 @@ class Interfaces(NamedTuple):
 
 
 class Crossing(NamedTuple):
-    """The two sides of an interface as a ray meets them.
+    """The two sides of an interface, as seen by a ray.
 
-    At the surface of an outranked body both sides are one medium and the tint is 1, so that
-    Snell's and Fresnel's laws leave the ray alone.
+    At the surface of an outranked object, both sides have the same medium and the tint is 1, so
+    that Snell's and Fresnel's laws leave the ray unchanged.
 
     Attributes:
       index_near: index of refraction on the incident side.
       index_far: index on the other side.
       medium_near: medium on the incident side.
       medium_far: medium on the other side.
-      tint: factor of linear RGB light, reflected or transmitted.
-      part: the part whose surface it is, or `EMPTY_SLOT` if it is outranked.
+      tint: factor on linear RGB, reflected or transmitted.
+      part: part whose surface is hit, or `EMPTY_SLOT` if it is outranked.
       inside_after: interior list on the other side; a reflected ray keeps its own.
     """
 
@@ -92,7 +92,7 @@ def interior_slots(interfaces: Interfaces) -> int:
 
 
 def nowhere(interfaces: Interfaces) -> Int[Array, " slots"]:
-    """Returns the interior list of a ray that is outside of every part."""
+    """Returns the interior list of a ray outside all parts."""
     return jnp.full(interior_slots(interfaces), EMPTY_SLOT, jnp.int32)
 
 
@@ -102,13 +102,13 @@ def crossing(
     part: Int[Array, ""],
     entering: Bool[Array, ""],
 ) -> Crossing:
-    """Returns the media on both sides of the surface that a ray meets.
+    """Returns the media on both sides of the surface that a ray hits.
 
     Args:
-      interfaces: the scene's interfaces.
-      inside: the ray's interior list before it; of no length under `nested` and `facing`.
-      part: the part that is met.
-      entering: whether the ray comes from the outside of that part.
+      interfaces: interfaces of the scene.
+      inside: interior list of the ray before the surface; empty under `nested` and `facing`.
+      part: part that is hit.
+      entering: whether the ray comes from outside that part.
     """
     if interior_slots(interfaces) == 0:
         return _declared_crossing(interfaces, inside, part, entering)
@@ -132,14 +132,14 @@ def crossing(
 def transmittance(
     interfaces: Interfaces, medium: Int[Array, ""], length: Float[Array, ""]
 ) -> Float[Array, "3"]:
-    """Returns the share of linear RGB light that is left after a way through a medium.
+    """Returns the transmittance of linear RGB light along a segment in a medium.
 
     Args:
-      interfaces: the scene's interfaces.
-      medium: where the way lies; `AMBIENT` absorbs nothing.
-      length: in world units; may be infinite.
+      interfaces: interfaces of the scene.
+      medium: medium of the segment; `AMBIENT` does not absorb.
+      length: length of the segment, world units; may be infinite.
 
-    Source: the law of Beer and Lambert.
+    Source: the Beer-Lambert law.
     """
     part = jnp.maximum(medium - 1, 0)
     absorption = jnp.where(medium == AMBIENT, 0.0, interfaces.absorption[part])
@@ -152,7 +152,7 @@ def _declared_crossing(
     part: Int[Array, ""],
     entering: Bool[Array, ""],
 ) -> Crossing:
-    """Returns the crossing of a part that knows both of its sides."""
+    """Returns the crossing of a part whose two sides are known in advance."""
     index_inside = interfaces.index_inside[part]
     index_outside = interfaces.index_outside[part]
     within = part + 1
@@ -169,14 +169,14 @@ def _declared_crossing(
 
 
 def _ranks(interfaces: Interfaces, inside: Int[Array, " slots"]) -> Int[Array, " slots"]:
-    """Returns the priority of every entry of a list; free slots rank lowest."""
+    """Returns the rank of every entry of an interior list; free slots rank lowest."""
     return jnp.where(inside == EMPTY_SLOT, EMPTY_SLOT, interfaces.priority[jnp.maximum(inside, 0)])
 
 
 def _add(
     interfaces: Interfaces, inside: Int[Array, " slots"], part: Int[Array, ""]
 ) -> Int[Array, " slots"]:
-    """Writes a part into a free slot, or over the lowest entry if the part outranks it."""
+    """Adds a part to a free slot, or replaces the lowest entry if the part outranks it."""
     ranks = _ranks(interfaces, inside)
     lowest = jnp.argmin(ranks)
     here = (jnp.arange(SLOTS) == lowest) & (interfaces.priority[part] > ranks[lowest])
@@ -184,7 +184,7 @@ def _add(
 
 
 def _medium(interfaces: Interfaces, inside: Int[Array, " slots"]) -> Int[Array, ""]:
-    """Returns the medium of the highest entry; `1 + EMPTY_SLOT` is the ambient one."""
+    """Returns the medium of the highest entry; `1 + EMPTY_SLOT` is the ambient medium."""
     return 1 + inside[jnp.argmax(_ranks(interfaces, inside))]
 
 

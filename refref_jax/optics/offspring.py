@@ -1,4 +1,4 @@
-"""The branches of a block of rays: which there are, their segments, and where they go next.
+"""Child rays of a block of rays: stores their segments and queues or ends them.
 
 Letters as in `light_paths`.
 """
@@ -19,12 +19,12 @@ from refref_jax.optics.pools import Pool
 
 
 class Live(NamedTuple):
-    """Rays that are to be cast.
+    """Active rays, which are still to be cast.
 
     Attributes:
-      state: the rays on their way.
+      state: states of the rays.
       rays: index of each one's camera ray.
-      segments: index of its current segment.
+      segments: index of each one's current segment.
     """
 
     state: RayState
@@ -33,19 +33,19 @@ class Live(NamedTuple):
 
     @property
     def weights(self) -> Float[Array, "live 3"]:
-        """The light that they carry."""
+        """Throughputs of the rays."""
         return self.state.weight
 
 
 class Children(NamedTuple):
-    """The branches of a block, reflected ones first.
+    """The child rays of a block, reflected ones first.
 
     Attributes:
-      live: the branches; the index of their segment is their parent's until it is logged.
-      media: medium of each one's segment.
-      parts: part that each one leaves.
-      exists: which there are.
-      traced: which are followed further.
+      live: child rays; they have the segment index of their parent until their own is stored.
+      media: medium of each child's segment.
+      parts: part that each child's segment starts on.
+      exists: mask of children with positive weight.
+      traced: mask of children that are traced further.
     """
 
     live: Live
@@ -62,7 +62,7 @@ def children_of(
     bending: Bool[Array, " block"],
     budget: Budget,
 ) -> Children:
-    """Lists the branches of the rays that bend."""
+    """Returns the child rays of the rays that bend."""
     sides = arrival.interaction.sides
     states = pools.join(branches.reflected, branches.transmitted)
     mediums = pools.join(sides.medium_near, sides.medium_far)
@@ -82,7 +82,7 @@ def children_of(
 
 
 def log(tree: PathTree, children: Children, room: Room) -> tuple[PathTree, Children]:
-    """Logs the segments of children; drops the weakest of them if the log is full."""
+    """Stores the segments of children; drops the weakest children if the buffer is full."""
     live = children.live
     left = room.segments - tree.segments.count
     kept = pools.strongest(children.exists, jnp.max(live.weights, axis=-1), left)
@@ -104,9 +104,9 @@ def log(tree: PathTree, children: Children, room: Room) -> tuple[PathTree, Child
 
 
 def push(tree: PathTree, stack: Pool, children: Children, budget: Budget) -> tuple[PathTree, Pool]:
-    """Puts children on the stack, and ends those that are not traced.
+    """Pushes children on the stack, and ends those that are not traced further.
 
-    They are the paper's first reflections, and rays that leave the objects for good.
+    The latter are the paper's first reflections, and rays that cannot hit an object again.
     """
     live = children.live
     if budget.reflections == "first" or budget.reentry == "impossible":
@@ -123,7 +123,7 @@ def end_by(
     status: Int[Array, " n"],
     ending: Bool[Array, " n"],
 ) -> PathTree:
-    """Ends some rays as paths; what the budget leaves dark of their light is lost."""
+    """Ends some rays as paths; the weight of paths that the settings make black is dropped."""
     weights = jax.vmap(functools.partial(branching.shown, budget))(live.weights, status)
     lost = pools.lose(tree.lost, live.rays, live.weights - weights, ending)
     live = live._replace(state=live.state._replace(weight=weights))

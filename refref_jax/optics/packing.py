@@ -1,8 +1,8 @@
 """Packs the paths of many batches into lists of equal length.
 
-A batch keeps its strongest paths, in the order of its rays, each ray's heaviest first. Where all
-batches together have more paths than there is room for, the weakest of all go before that, since
-every slot takes part in the sorting.
+A batch keeps its strongest paths, in the order of its rays, the heaviest path of each ray first. If
+the batches together exceed the total capacity, the weakest paths of all batches are dropped first,
+because the cost of sorting depends on the number of slots.
 """
 
 import jax
@@ -12,23 +12,23 @@ from jaxtyping import Array, Bool, Float, Int
 from refref_jax.optics import path_tree, pools
 from refref_jax.optics.path_tree import Ends, PathTree
 
-# An index past any list: writing there is dropped.
+# Index past the end of any list: writes to it are dropped.
 _NOWHERE = 2**31 - 1
 
 
 def pack(
     tree: PathTree, batches: int, rays: int, capacity: int
 ) -> tuple[Ends, Float[Array, "all_rays 3"]]:
-    """Sorts paths into one list a batch.
+    """Sorts paths into one list per batch.
 
     Args:
-      tree: the paths of all batches.
-      batches: how many there are.
-      rays: in each.
-      capacity: room for the paths of each.
+      tree: paths of all batches.
+      batches: number of batches.
+      rays: number of rays in each batch.
+      capacity: capacity for the paths of each batch.
 
     Returns:
-      The lists, joined end to end, and the light that each ray has lost by now.
+      The concatenated lists, and the throughput dropped so far for each ray.
     """
     room = min(batches * capacity, tree.ends.items.rays.shape[0])
     pool, lost = pools.shed(tree.ends, tree.lost, room)
@@ -51,7 +51,7 @@ def pack(
 def _strongest_of_each(
     batch: Int[Array, " paths"], weight: Float[Array, " paths"], batches: int, capacity: int
 ) -> Bool[Array, " paths"]:
-    """Returns which paths are among the strongest of their batch; sorts only if there is a need."""
+    """Returns which paths are among the strongest of their batch; sorts only if necessary."""
 
     def choose(batch: Int[Array, " paths"]) -> Bool[Array, " paths"]:
         order = jnp.lexsort((-weight, batch))
@@ -65,6 +65,6 @@ def _strongest_of_each(
 
 
 def _rank_in_group(group: Int[Array, " n"], groups: int) -> Int[Array, " n"]:
-    """Returns the place of each record among its group's, for records sorted by group."""
+    """Returns the position of each record within its group, for records sorted by group."""
     begin = jnp.searchsorted(group, jnp.arange(groups + 1, dtype=jnp.int32)).astype(jnp.int32)
     return jnp.arange(group.shape[0], dtype=jnp.int32) - begin[group]

@@ -1,10 +1,10 @@
-"""The light paths of batches of rays under a budget.
+"""Traces the light paths of batches of rays.
 
-Rays are followed in one large pool (see `wavefront`); then each batch packs its paths into a list
-of fixed capacity, in the order of its rays, each ray's heaviest path first.
+All rays are traced in one wavefront (see `wavefront`); then the paths of each batch are packed into
+a list of fixed capacity, in the order of its rays, the heaviest path of each ray first.
 
-To differentiation, light paths are constants: parameters of fields have gradients along them, but
-rays and geometry have none, and asking for one is an error (see `single_path` for these).
+Light paths are constants for differentiation: field parameters have gradients along them, but rays
+and the scene do not, and differentiating with respect to these is an error (use `single_path`).
 
 Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
 """
@@ -35,9 +35,10 @@ class Traced(NamedTuple):
     """The light paths of one batch of rays.
 
     Attributes:
-      paths: the paths, in the order of their rays, each ray's heaviest first; empty slots last.
-      lost: the share of each ray's linear RGB that found no room, or is dark. Weights and losses
-        of a ray sum to 1, less what tints and absorption took.
+      paths: paths in the order of their rays, the heaviest of each ray first; empty slots last.
+      lost: dropped throughput of each ray, linear RGB, because a buffer was full or truncated
+        paths are black. The weights and dropped throughput of a ray sum to 1, minus absorption by
+        tints and media.
     """
 
     paths: LightPaths
@@ -48,8 +49,8 @@ class TracedEnds(NamedTuple):
     """The last segments of the light paths of some rays.
 
     Attributes:
-      ends: one record a path.
-      lost: as in `Traced`.
+      ends: last segment of each path.
+      lost: dropped throughput of each ray, as in `Traced`.
       casts: number of rays that were cast.
     """
 
@@ -59,12 +60,12 @@ class TracedEnds(NamedTuple):
 
 
 class Survey(NamedTuple):
-    """How many paths the rays of a scene have.
+    """Path statistics of a scene.
 
     Attributes:
-      mean: mean number of paths of a ray.
-      deviation: its standard deviation over rays.
-      hit_fraction: share of rays that meet a surface.
+      mean: mean number of paths per ray.
+      deviation: standard deviation of the number of paths over rays.
+      hit_fraction: fraction of rays that hit a surface.
     """
 
     mean: Float[Array, ""]
@@ -80,15 +81,15 @@ def trace_ends(
     inside: Int[Array, "rays slots"] | None = None,
     block: int = BLOCK,
 ) -> TracedEnds:
-    """Traces rays, and keeps only where their paths end.
+    """Traces rays, and returns only the last segments of their paths.
 
     Args:
       geometry: the scene.
       rays: camera rays.
-      budget: which light to follow.
-      inside: the parts that each camera is in, for the rule `priority` (see
-        `data.containment`); by default none. The other rules find out by themselves.
-      block: rays cast at once, see `wavefront`.
+      budget: path settings.
+      inside: interior list of each camera, for the rule `priority` (see `data.containment`); none
+        by default. The other rules do not use it.
+      block: number of rays cast at once, see `wavefront`.
     """
     geometry, rays = scene.in_one_precision(geometry, rays)
     if _needs_no_tracing(rays, budget):
@@ -114,15 +115,15 @@ def trace(
     Args:
       geometry: the scene.
       rays: camera rays.
-      budget: which light to follow.
-      capacity: room for paths; by default all that the budget gives so many rays, which is more
-        than most scenes fill, see `budgets.capacity_for`. Not used if there are no bends to follow,
-        or no rays.
-      detail: what to keep of the paths; by default every segment, and nothing besides.
-      inside: as for `trace_ends`.
+      budget: path settings.
+      capacity: capacity for paths; by default that of the path settings for this number of rays,
+        which is more than most scenes need, see `budgets.capacity_for`. Unused if max bends is 0 or
+        there are no rays.
+      detail: parts of the paths to store; by default every segment, and nothing else.
+      inside: interior list of each camera, as in `trace_ends`.
 
     Example:
-      Light that meets a plane of glass head-on: 4 % are reflected, the rest goes on.
+      Light that hits a glass surface head-on: 4 % is reflected, the rest is transmitted.
 
       >>> import functools
       >>> import jax, numpy as np, trimesh
@@ -154,18 +155,18 @@ def trace_batches(
     detail: Detail | None = None,
     inside: Int[Array, "batches rays slots"] | None = None,
 ) -> Traced:
-    """Traces many batches in one pool, which amortises the latency of the traversal's loop.
+    """Traces many batches in one wavefront, which amortises the latency of the traversal loop.
 
     Args:
       geometry: the scene.
       rays: camera rays `[batches, rays]`.
-      budget: which light to follow.
-      capacity: room for the paths of each batch; as for `trace`.
-      detail: as for `trace`.
-      inside: as for `trace_ends`.
+      budget: path settings.
+      capacity: capacity for the paths of each batch, as in `trace`.
+      detail: parts of the paths to store, as in `trace`.
+      inside: interior list of each camera, as in `trace_ends`.
 
     Returns:
-      The paths of each batch, stacked; `rays` counts within a batch.
+      The paths of each batch, stacked; ray indices count within a batch.
     """
     geometry, rays = scene.in_one_precision(geometry, rays)
     if _needs_no_tracing(rays, budget):
@@ -191,7 +192,7 @@ def trace_batches(
 
 
 def survey(geometry: Scene, rays: Rays, *, budget: Budget) -> Survey:
-    """Measures what batches of a scene's rays need room for."""
+    """Measures the path statistics that determine the capacity for batches of rays."""
     count = rays.radii.shape[0]
     ends = trace_ends(geometry, rays, budget=budget).ends
     one = exists(ends).astype(jnp.float32)

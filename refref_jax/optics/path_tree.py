@@ -1,7 +1,7 @@
-"""The tree of light paths that a pool of rays grows, and how paths are read from it.
+"""Tree of the light paths of many rays, and conversion of the tree to paths.
 
-A segment is stored once, however many paths share it, with a pointer to the one before it; a path
-is known by its last segment. Letters as in `light_paths`.
+A segment that several paths share is stored once, with a pointer to its parent segment; a path is
+identified by its last segment. Letters as in `light_paths`.
 """
 
 from typing import NamedTuple
@@ -17,20 +17,20 @@ from refref_jax.optics.media import AMBIENT
 from refref_jax.optics.pools import Pool
 
 NO_SEGMENT = -1
-"""The segment before a camera ray."""
+"""Parent of a camera ray's first segment."""
 
 
 class Segments(NamedTuple):
-    """A log of path segments; the first ones are the camera rays.
+    """A list of path segments; the first ones are the camera rays.
 
     Attributes:
-      parents: index of the segment before, `NO_SEGMENT` for a camera ray.
-      points: start, world units.
+      parents: index of the parent segment, `NO_SEGMENT` for a camera ray.
+      points: start of the segment, world units.
       directions: unit direction.
       tau: arc length from the camera to the start.
-      media: medium (see `media`).
-      parts: the part whose surface it leaves, or `media.EMPTY_SLOT`.
-      spreads: its derivatives across the pixel (see `footprints`).
+      media: medium of the segment (see `media`).
+      parts: part on whose surface the segment starts, or `media.EMPTY_SLOT`.
+      spreads: ray differential of the segment (see `footprints`).
     """
 
     parents: Int[Array, " segments"]
@@ -43,14 +43,14 @@ class Segments(NamedTuple):
 
 
 class Ends(NamedTuple):
-    """Where paths end.
+    """The ends of paths.
 
     Attributes:
       segments: index of the last segment.
       rays: index of the camera ray.
-      weights: share in its linear RGB.
+      weights: share of the path in its ray's linear RGB.
       bends: number of bends.
-      statuses: a `PathStatus`.
+      statuses: `PathStatus` of each path.
     """
 
     segments: Int[Array, " paths"]
@@ -61,12 +61,12 @@ class Ends(NamedTuple):
 
 
 class PathTree(NamedTuple):
-    """All paths of a pool of rays.
+    """All paths of the rays that are traced together.
 
     Attributes:
-      segments: the log.
-      ends: one record a path.
-      lost: share of each ray's linear RGB that found no room.
+      segments: list of `Segments`.
+      ends: list of `Ends`, one per path.
+      lost: dropped throughput of each ray, linear RGB.
       casts: number of rays that were cast.
     """
 
@@ -82,7 +82,7 @@ def name_media(
     media: Int[Array, " n"],
     which: Bool[Array, " n"],
 ) -> PathTree:
-    """Notes the media that some segments run through."""
+    """Sets the media of some segments."""
     log = tree.segments.items
     target = jnp.where(which, segments, log.media.shape[0])
     log = log._replace(media=log.media.at[target].set(media, mode="drop"))
@@ -90,14 +90,14 @@ def name_media(
 
 
 def listed(tree: PathTree, capacity: int) -> Ends:
-    """Returns the ends of a tree in a list of that capacity; slots past the last are empty."""
+    """Returns the ends of a tree in a list of a given capacity; slots past the last are empty."""
     ends = jax.tree.map(lambda x: x[:capacity], tree.ends.items)
     lanes = jnp.arange(capacity, dtype=jnp.int32)
     return emptied(ends, lanes >= tree.ends.count, jnp.zeros_like(lanes))
 
 
 def emptied(ends: Ends, empty: Bool[Array, " paths"], home: Int[Array, " paths"]) -> Ends:
-    """Takes the paths out of some slots; these then look along the camera ray `home`."""
+    """Clears the marked slots, which then refer to the camera ray `home`."""
     return Ends(
         segments=jnp.where(empty, home, ends.segments),
         rays=jnp.where(empty, home, ends.rays),
@@ -108,7 +108,7 @@ def emptied(ends: Ends, empty: Bool[Array, " paths"], home: Int[Array, " paths"]
 
 
 def last_segments(segments: Segments, ends: Ends) -> PathEnds:
-    """Returns only the last segment of each path."""
+    """Returns the last segment of each path."""
     last = jax.tree.map(lambda x: x[ends.segments], segments)
     return PathEnds(
         origins=last.points,
@@ -125,17 +125,17 @@ def last_segments(segments: Segments, ends: Ends) -> PathEnds:
 def polylines(
     segments: Segments, ends: Ends, radii: Float[Array, " paths"], *, detail: Detail, parts: int
 ) -> LightPaths:
-    """Returns paths with the segments that are wanted of them.
+    """Returns paths with the selected segments.
 
     Args:
-      segments: the log.
-      ends: of the wanted paths.
+      segments: all segments.
+      ends: ends of the paths.
       radii: footprint of each path's pixel.
-      detail: which segments, and whether parts are tallied.
-      parts: number of parts that can be met.
+      detail: selection of segments, and whether hits are tallied per part.
+      parts: number of parts in the scene.
     """
     walk = _walk_back(segments, ends, detail, parts if detail.tally == "parts" else 0)
-    # Picked from the last to the first, at the right of their row.
+    # Segments were selected from last to first and are right-aligned in their row.
     count = jnp.minimum(walk.found, detail.most)
     lanes = jnp.arange(detail.most, dtype=jnp.int32)[None]
     used = lanes < count[:, None]
@@ -161,16 +161,16 @@ def polylines(
 
 
 class _Walk(NamedTuple):
-    """State of the walk from the last segment of each path to its first.
+    """State of the loop from the last segment of each path back to its first.
 
     Attributes:
-      segment: where each path is, `NO_SEGMENT` if it is done.
-      stop: arc length at which that segment ends.
-      found: number of wanted segments by now.
-      picked: the wanted segments, from the right; the first of a path takes the leftmost place.
-      stops: where they end.
-      meetings: tallied by now.
-      passages: tallied by now.
+      segment: current segment of each path, `NO_SEGMENT` if it is done.
+      stop: arc length at the end of the current segment.
+      found: number of selected segments so far.
+      picked: selected segments, right-aligned; the first segment of a path goes leftmost.
+      stops: arc lengths at the ends of the selected segments.
+      meetings: hit counts so far.
+      passages: path lengths so far.
     """
 
     segment: Int[Array, " paths"]
@@ -194,7 +194,7 @@ def _walk_back(segments: Segments, ends: Ends, detail: Detail, tallied: int) -> 
         tau, medium = segments.tau[at], segments.media[at]
         wanted = going & ((detail.segments == "all") | (medium == AMBIENT) | jnp.isinf(walk.stop))
         here = wanted[:, None] & (lanes == jnp.maximum(detail.most - 1 - walk.found, 0)[:, None])
-        # The last segment never ends, and is not a passage.
+        # The last segment is infinite and is not added to the path lengths.
         length = jnp.where(going & jnp.isfinite(walk.stop), walk.stop - tau, 0.0)
         met = (going & (segments.parts[at] >= 0))[:, None] & (names == segments.parts[at][:, None])
         through = names + 1 == medium[:, None]
@@ -217,5 +217,5 @@ def _walk_back(segments: Segments, ends: Ends, detail: Detail, tallied: int) -> 
         meetings=none,
         passages=none,
     )
-    # Every segment has one bend more than its parent, so this ends.
+    # Every segment has one bend more than its parent, so the loop terminates.
     return jax.lax.while_loop(lambda walk: jnp.any(walk.segment != NO_SEGMENT), step, start)

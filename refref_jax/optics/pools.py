@@ -1,8 +1,8 @@
-"""Lists of rays and paths of static capacity, for many of them at once.
+"""Work queues of rays and paths with static capacity.
 
-A pool is an array of records with a count; records past the count have no meaning. Appending
-writes one block, so a pool holds as many slots beyond its capacity as a block is long. Whoever
-appends then sheds what is too much: the least light.
+A pool is an array of records with a count; records past the count are meaningless. Appending writes
+a full block, so a pool has one block of slots beyond its capacity. After appending, callers reduce
+the pool to its capacity with `shed`, which drops the records of least throughput.
 """
 
 from typing import Any, NamedTuple
@@ -12,15 +12,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 Records = Any
-"""A NamedTuple of arrays with one leading axis; of light, with `weights` and `rays`."""
+"""NamedTuple of arrays with one leading axis; `shed` requires the fields `weights` and `rays`."""
 
 
 class Pool(NamedTuple):
-    """Records in a row.
+    """A list of records.
 
     Attributes:
       items: records, along the leading axis of each field.
-      count: how many of them are there.
+      count: number of valid records.
     """
 
     items: Records
@@ -28,7 +28,7 @@ class Pool(NamedTuple):
 
 
 def fill(items: Records, count: int, slots: int) -> Pool:
-    """Returns a pool with some slots, whose first `count` hold the records given."""
+    """Returns a pool of `slots` slots, whose first `count` hold the given records."""
 
     def pad(x: Array) -> Array:
         return jnp.concatenate([x, jnp.zeros((slots - x.shape[0], *x.shape[1:]), x.dtype)])
@@ -37,17 +37,17 @@ def fill(items: Records, count: int, slots: int) -> Pool:
 
 
 def join(first: Records, second: Records) -> Records:
-    """Returns two blocks of records as one."""
+    """Concatenates two blocks of records."""
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
 
 
 def append(pool: Pool, block: Records, keep: Bool[Array, " block"]) -> Pool:
-    """Appends those records of a block that are to be kept, in their order.
+    """Appends the selected records of a block, in order.
 
     Args:
-      pool: has room for a whole block beyond its count.
-      block: records of the same kind.
-      keep: which to append.
+      pool: pool with at least one block of slots beyond its count.
+      block: records of the same type.
+      keep: mask of the records to append.
     """
     order = front_first(keep)
     items = jax.tree.map(
@@ -59,7 +59,7 @@ def append(pool: Pool, block: Records, keep: Bool[Array, " block"]) -> Pool:
 
 
 def pop(pool: Pool, size: int) -> tuple[Pool, Pool]:
-    """Takes up to `size` of the last records off a pool; returns the rest, and what was taken."""
+    """Removes up to `size` records from the end; returns the remaining and the removed records."""
     start = jnp.maximum(pool.count - size, 0)
     taken = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, size, 0), pool.items)
     return Pool(pool.items, start), Pool(taken, pool.count - start)
@@ -68,15 +68,15 @@ def pop(pool: Pool, size: int) -> tuple[Pool, Pool]:
 def shed(
     pool: Pool, lost: Float[Array, "rays 3"], capacity: int
 ) -> tuple[Pool, Float[Array, "rays 3"]]:
-    """Drops the weakest records until a capacity is kept. Costs next to nothing if it is.
+    """Drops the weakest records beyond a capacity. Its cost is negligible if there are none.
 
     Args:
       pool: records with fields `weights` (linear RGB) and `rays` (index of the camera ray).
-      lost: light that each ray has lost so far.
-      capacity: most records to keep.
+      lost: throughput dropped so far for each ray.
+      capacity: maximum number of records to keep.
 
     Returns:
-      The pool, in its order, and what the rays have lost by now.
+      The pool, in its order, and the updated dropped throughput.
     """
 
     def drop(pool: Pool, lost: Float[Array, "rays 3"]) -> tuple[Pool, Float[Array, "rays 3"]]:
@@ -97,16 +97,16 @@ def lose(
     weights: Float[Array, "n 3"],
     dropped: Bool[Array, " n"],
 ) -> Float[Array, "rays 3"]:
-    """Adds the light of dropped records to their rays' losses."""
+    """Adds the weights of dropped records to the dropped throughput of their rays."""
     return lost.at[rays].add(jnp.where(dropped[:, None], weights, 0.0))
 
 
 def strongest(
     mask: Bool[Array, " n"], strength: Float[Array, " n"], room: Int[Array, ""]
 ) -> Bool[Array, " n"]:
-    """Returns the strongest `room` of the marked records; all of them if there are fewer.
+    """Returns the `room` strongest of the marked records; all of them if there are fewer.
 
-    Of equally strong ones the first stay. Sorts only if there is too little room.
+    Among equally strong records, the first are kept. Sorts only if there are more than `room`.
     """
 
     def choose(mask: Bool[Array, " n"]) -> Bool[Array, " n"]:
@@ -120,9 +120,9 @@ def strongest(
 
 
 def front_first(keep: Bool[Array, " n"]) -> Int[Array, " n"]:
-    """Returns the order that brings the marked records to the front, in their order.
+    """Returns indices that move the marked records to the front, in order.
 
-    What follows them is arbitrary: a valid index, without meaning.
+    The remaining indices are valid but arbitrary.
     """
     count = keep.shape[0]
     target = jnp.where(keep, jnp.cumsum(keep, dtype=jnp.int32) - 1, count)

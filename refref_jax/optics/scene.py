@@ -1,4 +1,4 @@
-"""What light meets, and what may be changed of it without building it anew."""
+"""Scenes for path tracing, and changes to a scene that do not require a rebuild."""
 
 from typing import NamedTuple, TypeVar
 
@@ -15,7 +15,7 @@ _Tree = TypeVar("_Tree")
 
 
 class Scene(NamedTuple):
-    """All that light meets: surfaces, and the interfaces that they stand for."""
+    """A scene: surfaces, and the interfaces between media at these surfaces."""
 
     surfaces: surfaces.Surfaces
     interfaces: media.Interfaces
@@ -24,18 +24,18 @@ class Scene(NamedTuple):
 def with_index(geometry: Scene, index: Float[ArrayLike, ""], *, part: int = 0) -> Scene:
     """Returns a scene in which one part has another index of refraction.
 
-    So it has wherever it lies around another part, if that part had its index outside before: not
-    under the rule `facing`, where air is outside of every part. Differentiable; no shape changes,
-    so that what is compiled for one index serves all.
+    The outer index of parts directly inside this part changes too, except under the rule `facing`,
+    where air is outside every part. Differentiable; no array shape changes, so that functions
+    compiled for one index work for all.
 
     Args:
       geometry: the scene.
-      index: of refraction, relative to air.
-      part: number of the part, in the order in which the parts were given; those of a scene folder
-        are ordered by name.
+      index: index of refraction, relative to air.
+      part: index of the part, in the order in which the parts were given; the parts of a scene
+        folder are ordered by name.
 
     Raises:
-      ValueError: if there is no such part.
+      ValueError: if the part does not exist.
 
     Example:
       >>> import trimesh
@@ -46,13 +46,13 @@ def with_index(geometry: Scene, index: Float[ArrayLike, ""], *, part: int = 0) -
     """
     new = jnp.asarray(index)
     interfaces = jax.tree.map(jnp.asarray, geometry.interfaces)
-    # A number of Python's has no precision of its own.
+    # A Python number has no precision of its own.
     decisive = interfaces if new.weak_type else (interfaces, new)
     interfaces = _in_precision(_highest(decisive), interfaces)
     parts = interfaces.index_inside.shape[0]
     if not 0 <= part < parts:
         raise ValueError(
-            f"There is no part {part}: the scene has {parts}. Give a number from 0 to {parts - 1}."
+            f"part is {part}, but the scene has {parts} parts. Give a number from 0 to {parts - 1}."
         )
     new = new.astype(interfaces.index_inside.dtype)
     had = interfaces.index_outside == interfaces.index_inside[part]
@@ -65,17 +65,17 @@ def with_index(geometry: Scene, index: Float[ArrayLike, ""], *, part: int = 0) -
 
 
 def in_one_precision(geometry: Scene, rays: Rays) -> tuple[Scene, Rays]:
-    """Returns a scene and rays as JAX arrays of one precision, the highest of their numbers'.
+    """Returns a scene and rays as JAX arrays of the highest precision among their arrays.
 
     Scenes are built in single precision, so rays in double precision are traced in double
-    precision through the corners as they were rounded.
+    precision through corners that were rounded to single precision.
     """
     both = jax.tree.map(jnp.asarray, (geometry, rays))
     return _in_precision(_highest(both), both)
 
 
 def _highest(tree: _Tree) -> DTypeLike:
-    """Returns the widest type of the real numbers in a tree of arrays."""
+    """Returns the widest real data type in a pytree of arrays."""
     kinds = {x.dtype for x in jax.tree.leaves(tree) if _is_real(x)}
     return max(kinds, key=lambda each: each.itemsize)
 

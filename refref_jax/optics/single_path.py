@@ -1,15 +1,15 @@
-"""One light path, differentiable: the scan.
+"""Differentiable tracing of one light path, as a scan.
 
-The same steps as the wavefront's, for one ray along one branch of its tree. Which triangles are met
-is found without gradients; where each is met is computed anew from its corners. So positions,
-directions, arc lengths and weights of a path have gradients with respect to indices of refraction,
-tints, absorption, corners, normals and the ray.
+The steps are those of `wavefront`, for one ray along one branch of its tree. The search for the
+triangles that are hit has no gradients, but each hit point is recomputed from the corners of its
+triangle. Positions, directions, arc lengths and weights of a path therefore have gradients with
+respect to indices of refraction, tints, absorption, corners, normals and the ray.
 
-The gradient is that of this path as it is: the same triangles in the same order, and the same
-branches. It does not see that light moves to another triangle or falls below the cut. At the
-critical angle refraction and reflectance have a gradient that grows without bound; at it and
-beyond it the derivatives of the refracted ray are 0 (see `snell.transmission`), and those of the
-totally reflected ray are its own.
+Gradients are those of a fixed path: the same triangles in the same order, and the same branches.
+They do not account for paths that move to another triangle or fall below the throughput threshold.
+Towards the critical angle, the gradients of refraction and reflectance are unbounded; at it and
+beyond, the derivatives of the refracted ray are 0 (see `snell.transmission`), while those of the
+totally reflected ray are exact.
 
 Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
 """
@@ -37,9 +37,9 @@ class _Segment(NamedTuple):
     """One segment of the path.
 
     Attributes:
-      state: the ray on it.
-      medium: it runs through; known from the surface at its end, or else from the one before.
-      used: whether the path comes so far.
+      state: state of the ray on the segment.
+      medium: medium of the segment, known from the surface at its end, or else at its start.
+      used: whether the path has this segment.
     """
 
     state: RayState
@@ -51,10 +51,11 @@ class _Walk(NamedTuple):
     """State of the scan.
 
     Attributes:
-      state: the ray.
-      medium: that it is in, as far as its last surface tells.
-      traced: whether it is to be cast; not the paper's first reflection, nor without any bends.
-      status: `EMPTY` as long as the path goes on.
+      state: state of the ray.
+      medium: medium of the ray after its last surface.
+      traced: whether the ray is to be cast; false for the paper's first reflection, and if max
+        bends is 0.
+      status: `EMPTY` while the path continues.
     """
 
     state: RayState
@@ -71,26 +72,26 @@ def follow_branch(
     budget: Budget,
     inside: Int[Array, " slots"] | None = None,
 ) -> LightPaths:
-    """Follows one ray along one branch.
+    """Traces one ray along one branch.
 
     Args:
       geometry: the scene.
       ray: one camera ray.
-      reflects: for each bend whether to take the reflected branch; where reflection is total it is
-        taken in any case. All false is the main path.
-      budget: which light to follow; its `bends` must be the number of `reflects`.
-      inside: the parts that the camera is in, for the rule `priority` (see `media`).
+      reflects: choice of the reflected branch at each bend; a total internal reflection is always
+        followed. All false is the main path.
+      budget: path settings; `budget.bends` must be the length of `reflects`.
+      inside: interior list of the camera, for the rule `priority` (see `media`).
 
     Returns:
-      One path. Its weight is 0 where the budget does not follow the branch: where its light went
-      to the sibling.
+      One path. Its weight is 0 if the path settings do not follow the branch, because its
+      throughput moves to the sibling.
 
     Raises:
-      ValueError: if `reflects` has not one entry a bend.
+      ValueError: if the length of `reflects` is not the max bends.
 
     Example:
-      What a plane of glass lets through, and how that changes with the index `n`: the share is
-      `4 n / (n + 1)^2`, its derivative `4 (1 - n) / (n + 1)^3`.
+      The transmittance of a glass surface, and its derivative with respect to the index `n`:
+      `4 n / (n + 1)^2` and `4 (1 - n) / (n + 1)^3`.
 
       >>> import jax, numpy as np, trimesh
       >>> import refref_jax
@@ -106,8 +107,8 @@ def follow_branch(
     """
     if reflects.shape[0] != budget.bends:
         raise ValueError(
-            f"There are {reflects.shape[0]} choices for {budget.bends} bends. Give one choice for "
-            "each bend of the budget."
+            f"reflects has {reflects.shape[0]} choices for {budget.bends} bends. Give one choice "
+            "for each of the max bends."
         )
     reflects = jnp.asarray(reflects)
     geometry, ray = scene.in_one_precision(geometry, ray)
@@ -119,7 +120,7 @@ def follow_branch(
         jnp.asarray(budget.bends > 0),
         jnp.int32(PathStatus.EMPTY),
     )
-    # One step more than bends: the last one only sees whether the path escapes.
+    # One step more than max bends: the last one only checks whether the path escapes.
     choices = jnp.append(reflects, False)
     advance = functools.partial(_advance, geometry, budget)
     end, segments = jax.lax.scan(advance, start, choices)
@@ -129,7 +130,7 @@ def follow_branch(
 def _advance(
     geometry: Scene, budget: Budget, walk: _Walk, reflect: Bool[Array, ""]
 ) -> tuple[_Walk, _Segment]:
-    """Casts the ray; ends the path, or takes one of the two branches."""
+    """Casts the ray, then ends the path or follows one of the two branches."""
     state, alive = walk.state, walk.status == PathStatus.EMPTY
     limit = jnp.where(alive & walk.traced, jnp.inf, -1.0).astype(state.tau.dtype)
     slot = closest_slot(geometry.surfaces.bvh, state.origin, state.direction, limit, state.leaving)

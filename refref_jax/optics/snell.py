@@ -16,7 +16,7 @@ from refref_jax import numerics
 
 
 class Transmission(NamedTuple):
-    """The far side of an interface.
+    """Transmission through an interface.
 
     Attributes:
       cosine: `gamma`, 0 in total internal reflection.
@@ -32,12 +32,12 @@ def transmission(
 ) -> Transmission:
     """Returns the cosine of the transmitted ray (the paper's `gamma`).
 
-    It is computed as `gamma^2 = ((nu_1 - nu_0)(nu_1 + nu_0) + (nu_0 beta)^2) / nu_1^2`, equal
-    to the paper's form but exact where that one cancels: with equal indices `gamma = beta`
-    down to the smallest `beta`.
+    It is computed as `gamma^2 = ((nu_1 - nu_0)(nu_1 + nu_0) + (nu_0 beta)^2) / nu_1^2`, which
+    equals the paper's form but avoids its cancellation: with equal indices `gamma = beta` down to
+    the smallest `beta`.
 
-    At the critical angle the gradient grows without bound like `1 / gamma`; at it and beyond
-    it is 0.
+    Towards the critical angle, the gradient is unbounded, as `1 / gamma`; at it and beyond, it is
+    0.
     """
     contrast = (index_far - index_near) * (index_far + index_near)
     squared = (contrast + jnp.square(index_near * beta)) / jnp.square(index_far)
@@ -60,8 +60,8 @@ def refract(
 ) -> Float[Array, "3"]:
     """Returns the refracted unit direction, `alpha d + (alpha beta - gamma) n`.
 
-    In total internal reflection there is none; the result is then the tangent that `gamma = 0`
-    gives, finite, and longer than 1.
+    In total internal reflection there is no refracted ray; the result is then the tangent for
+    `gamma = 0`, which is finite and longer than 1.
 
     Args:
       direction: incident unit direction.

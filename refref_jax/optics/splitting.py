@@ -1,6 +1,7 @@
-"""How light divides at an interface, under a budget. One ray.
+"""Divides the throughput of one ray between reflection and transmission at an interface.
 
-Source: paper (arXiv 2505.05848), section 4.2, Fresnel blend; the conserving cut is ours.
+Source: paper (arXiv 2505.05848), section 4.2, Fresnel blend; the energy-conserving throughput
+threshold is ours.
 """
 
 from typing import NamedTuple
@@ -12,7 +13,7 @@ from refref_jax.optics.budgets import Budget
 
 
 class Shares(NamedTuple):
-    """Shares of the light that arrives, which sum to 1. A share of 0 is a branch not followed."""
+    """Shares of the incident throughput, which sum to 1. Branches of share 0 are not followed."""
 
     reflected: Float[Array, ""]
     transmitted: Float[Array, ""]
@@ -26,19 +27,19 @@ def shares(
     first: Bool[Array, ""],
     strength: Float[Array, ""],
 ) -> Shares:
-    """Divides light between its two branches.
+    """Divides throughput between the two branches.
 
-    Where a reflection is not followed, transmitted light takes all of it. Where the weaker branch
-    falls below the cut, the stronger one takes all: the cut blurs nothing and darkens nothing, it
-    only moves a little light. Shares are constant where a branch is cut and follow `reflectance`
-    elsewhere, so their gradient is Fresnel's or 0.
+    If a reflection is not followed, the transmitted branch takes its share. If the weaker branch
+    falls below the throughput threshold, the stronger one takes all, so the threshold neither
+    darkens the image nor adds noise. Shares are constant if a branch is below the threshold and
+    follow `reflectance` elsewhere, so their gradient is that of Fresnel's equations or 0.
 
     Args:
-      budget: which light to follow.
+      budget: path settings.
       reflectance: Fresnel's `R`.
       total: whether reflection is total.
       first: whether this is the first surface of a path.
-      strength: throughput that arrives, times the interface's tint; the largest of its RGB.
+      strength: incident throughput times the interface's tint, the largest of its RGB.
     """
     if budget.reflections == "all":
         partial = reflectance

@@ -1,19 +1,20 @@
-"""Follows rays through the objects along all branches of their paths: the wavefront.
+"""Wavefront path tracing of rays along all branches of their paths.
 
-Rays that are still to be cast lie on a stack. Every round takes a block off its top and casts it:
-a ray that meets nothing ends as a path; one that meets a surface leaves its reflected and its
-transmitted child on the stack, as the budget has it. So a block is full until the very end,
-however few rays go deep, and children are followed before their elders: the stack stays low.
+Rays still to be cast are on a stack. Every iteration pops a block of rays and casts it: a ray that
+hits nothing ends as a path; for a ray that hits a surface, the reflected and transmitted children
+that the path settings follow are pushed on the stack. Blocks are therefore full until near the end,
+even if few paths are deep. Children are traced before their parents' siblings (depth first), which
+keeps the stack small.
 
-Every segment of a path is logged once, with a pointer to the segment before it; a path is known by
-its last one.
+Every segment of a path is stored once, with a pointer to its parent segment; a path is identified
+by its last segment.
 
-Where any list outgrows its capacity, the least throughput is dropped, and each ray's loss is
-returned: the weights of a ray's paths and its loss sum to the light that went in, less what tints
-and absorption took.
+If a buffer exceeds its capacity, its records of least throughput are dropped, and the dropped
+throughput of each ray is returned: the weights of a ray's paths and its dropped throughput sum to
+1, minus absorption by tints and media.
 
-Letters as in `light_paths`. Source: paper (arXiv 2505.05848), section 4.2, for what happens at a
-surface.
+Letters as in `light_paths`. Source: paper (arXiv 2505.05848), section 4.2, for the interaction
+with surfaces.
 """
 
 import functools
@@ -36,12 +37,12 @@ from refref_jax.optics.pools import Pool
 from refref_jax.optics.scene import Scene
 
 BLOCK = 4096
-"""Rays cast in a round. A larger one serves an accelerator, at the price of memory."""
+"""Number of rays cast per iteration. Accelerators benefit from more, at the cost of memory."""
 
-# From so many blocks of rays on the last ones are cast in smaller blocks: a second loop to compile.
+# From this number of blocks, the last rays are cast in smaller blocks, by a second compiled loop.
 _MANY_BLOCKS = 6
 
-# How many times smaller; blocks of fewer rays have no such part.
+# Ratio of the two block sizes; blocks of fewer rays than this have no second loop.
 _SMALLER = 16
 
 
@@ -49,9 +50,9 @@ class _Walk(NamedTuple):
     """State of the loop.
 
     Attributes:
-      stack: rays that are to be cast later.
-      next: the block that is cast next.
-      tree: what is known by now.
+      stack: rays to be cast later.
+      next: block of rays to be cast next.
+      tree: path tree so far.
     """
 
     stack: Pool
@@ -68,15 +69,15 @@ def follow(
     footprint: Footprint = "cone",
     block: int = BLOCK,
 ) -> PathTree:
-    """Follows each ray along all branches; every child has one bend more than its parent.
+    """Traces each ray along all branches; every child has one bend more than its parent.
 
     Args:
       geometry: the scene.
       rays: any number of camera rays.
-      inside: the parts that each camera is in (see `media.nowhere`).
-      budget: which light to follow, with at least one bend.
-      footprint: whether to carry derivatives across the pixel.
-      block: rays cast in a round.
+      inside: interior list of each camera (see `media.nowhere`).
+      budget: path settings, with at least one bend.
+      footprint: `differential` carries derivatives across the pixel.
+      block: number of rays cast per iteration.
     """
     return _follow(budget, footprint, block, geometry, rays, inside)
 
@@ -96,7 +97,7 @@ def _follow(
     walk = _begin(rays, inside, footprint, block, room)
     if count < _MANY_BLOCKS * block or block < _SMALLER:
         return _work_off(geometry, walk, budget, block, room, least=1).tree
-    # The few rays that go deepest would cast a whole block each round.
+    # Otherwise the few deepest rays would cast a full block in each iteration.
     walk = _work_off(geometry, walk, budget, block, room, least=block // 4)
     stack = pools.append(
         walk.stack, walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
@@ -136,16 +137,16 @@ def _refuse_gradients(
 ) -> None:
     del budget, footprint, block, primals, tangents
     raise TypeError(
-        "Light paths of the wavefront have no derivatives with respect to rays or geometry: they "
-        "would be silently wrong. Use follow_branch or follow_main_branches for these, or hold "
-        "rays and geometry constant with jax.lax.stop_gradient."
+        "Light paths of trace have no derivatives with respect to rays or geometry. Use "
+        "follow_branch or follow_main_branches, or hold rays and geometry constant with "
+        "jax.lax.stop_gradient."
     )
 
 
 def _begin(
     rays: Rays, inside: Int[Array, "rays slots"], footprint: Footprint, block: int, room: Room
 ) -> _Walk:
-    """Puts the camera rays on the stack and their segments into the log."""
+    """Pushes the camera rays on the stack and stores their segments."""
     count = rays.radii.shape[0]
     order = jnp.arange(count, dtype=jnp.int32)
     spread = jax.vmap(lambda ray: footprints.begin(ray, footprint))(rays)
@@ -157,7 +158,7 @@ def _begin(
         first, state.point, state.direction, state.tau, ambient, nowhere, state.spread
     )
     ends = Ends(order, order, state.weight, order, order)
-    # Beyond its capacity each list has room for what one round may append.
+    # Each buffer has slots beyond its capacity for the records that one iteration may append.
     tree = PathTree(
         segments=pools.fill(segments, count, room.segments + 2 * block),
         ends=pools.fill(ends, 0, room.paths + 3 * block),
@@ -169,7 +170,7 @@ def _begin(
 
 
 def _round(geometry: Scene, walk: _Walk, budget: Budget, block: int, room: Room) -> _Walk:
-    """Casts one block, ends paths, and puts the children on the stack."""
+    """Casts one block, ends paths, and pushes the children on the stack."""
     live, alive = walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
     hits = _cast(geometry, live.state, alive)
     arrive = jax.vmap(branching.arrive, in_axes=(None, 0, 0))
@@ -179,7 +180,7 @@ def _round(geometry: Scene, walk: _Walk, budget: Budget, block: int, room: Room)
     bending = hit & (status == PathStatus.EMPTY)
     tree = walk.tree._replace(casts=walk.tree.casts + jnp.sum(alive, dtype=jnp.int32))
     medium = arrival.interaction.sides.medium_near
-    # Only its first surface tells what a camera is in.
+    # The medium of a camera is known only from the first surface it sees.
     tree = path_tree.name_media(tree, live.segments, medium, hit & (live.state.bends == 0))
     tree = offspring.end_by(budget, tree, live, status, alive & ~bending)
     branches = jax.vmap(functools.partial(branching.branch, budget))(

@@ -1,1 +1,1 @@
-"""Where along a path a field is asked."""
+"""Sampling of fields along light paths."""

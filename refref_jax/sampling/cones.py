@@ -1,9 +1,9 @@
-"""Multisamples of a pixel's cone, placed around the bent centre line of a light path.
+"""Multisamples of a pixel's cone around the bent centre line of a light path.
 
-An interval of a path is a conical frustum. It is sampled at a few points, each an isotropic
-Gaussian, so that a field can blur what is finer than the pixel's footprint. Without derivatives of
-the path, the cone grows with arc length as if it were straight, and its pattern is carried along
-the bends; with them (`optics.footprints`) it is as wide as they say.
+An interval of a path is a conical frustum, represented by a few multisamples, each an isotropic
+Gaussian, so that a field can blur detail that is finer than the pixel's footprint. Without ray
+differentials, the cone grows with arc length as along a straight ray, and the pattern follows the
+bends; with ray differentials (`optics.footprints`), they determine its width.
 
 Source: Barron et al., Zip-NeRF (2023), section 2; paper (arXiv 2505.05848), supplement, for the
 bent centre line.
@@ -19,18 +19,18 @@ from jaxtyping import Array, Float
 from refref_jax import numerics
 from refref_jax.sampling.polylines import Polyline, point_at
 
-# Zip-NeRF's hexagon: each triangle of points turns once, the second one shifted by half a turn.
+# Angles of Zip-NeRF's hexagon: two triangles of points, the second rotated by half a turn.
 _HEXAGON = tuple(math.pi * turn for turn in (0.0, 2.0 / 3.0, 4.0 / 3.0, 1.0, 5.0 / 3.0, 1.0 / 3.0))
 
-# Their distances, in the formula below.
+# Offsets of the six points along the ray, for the formula in `_hexagon_distances`.
 _HEXAGON_STEPS = tuple(3.0 / math.sqrt(7.0) * (2.0 * j / 5.0 - 1.0) for j in range(6))
 
-# Width of a multisample's Gaussian in units of its distance from the centre line.
+# Standard deviation of a multisample in units of its distance from the centre line.
 _HEXAGON_SCALE = 0.5
 
 
 class Gaussians(NamedTuple):
-    """Isotropic Gaussians that together stand for one interval of a path.
+    """Isotropic Gaussians, the multisamples of one interval of a path.
 
     Attributes:
       positions: means.
@@ -51,19 +51,19 @@ def multisamples(
 ) -> Gaussians:
     """Samples the frustum of one interval.
 
-    Six points reproduce the frustum's mean and its covariance across the ray; one point sits on
-    the centre line and takes that covariance as its own. A point belongs to the segment that
-    its own coordinate falls on, also when the interval straddles an interface.
+    Six multisamples match the mean of the frustum and its covariance across the ray; a single one
+    lies on the centre line and has this covariance. A multisample belongs to the segment at its own
+    coordinate, even if the interval straddles an interface.
 
     Args:
       line: the path.
       start: coordinate of the interval's start.
-      end: coordinate of its end, not below `start`.
-      rotation: turns the pattern about the centre line, radians.
-      count: 1 or 6.
+      end: coordinate of the interval's end, at least `start`.
+      rotation: rotation of the pattern about the centre line, radians.
+      count: number of multisamples, 1 or 6.
 
     Raises:
-      ValueError: if there is no pattern of that many points.
+      ValueError: if `count` is neither 1 nor 6.
     """
     if count == 1:
         t = _frustum_mean(start, end)
@@ -71,7 +71,7 @@ def multisamples(
         return Gaussians(point.position[None], (0.5 * _mean_radius(point.footprint))[None])
     if count != len(_HEXAGON):
         raise ValueError(
-            f"There is no cone pattern of {count} points. Use 1 (on the centre line) or 6 "
+            f"count is {count}, but cone patterns have 1 or 6 points. Use 1 (centre line) or 6 "
             "(Zip-NeRF's hexagon)."
         )
     angles = jnp.asarray(_HEXAGON, start.dtype) + rotation
@@ -87,12 +87,12 @@ def multisamples(
 
 
 def _mean_radius(footprint: Float[Array, "2 3"]) -> Float[Array, ""]:
-    """Returns the radius of the disc that has an ellipse's second moments on average."""
+    """Returns the radius of a disc with the mean second moment of an ellipse."""
     return numerics.length(footprint.reshape(6)) / math.sqrt(2.0)
 
 
 def _frustum_mean(start: Float[Array, ""], end: Float[Array, ""]) -> Float[Array, ""]:
-    """Returns the mean distance of a conical frustum (mip-NeRF, Eq 7), free of overflow."""
+    """Returns the mean distance of a conical frustum (mip-NeRF, Eq 7), without overflow."""
     mean, ratio = _middle_and_ratio(start, end)
     return mean * (1.0 + 2.0 * ratio**2 / (3.0 + ratio**2))
 
@@ -109,6 +109,6 @@ def _hexagon_distances(start: Float[Array, ""], end: Float[Array, ""]) -> Float[
 def _middle_and_ratio(
     start: Float[Array, ""], end: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Returns the middle of an interval and its half-width as a share of it, 0 at the apex."""
+    """Returns the middle of an interval, and the ratio of half-width to middle, 0 at the apex."""
     mean = 0.5 * (start + end)
     return mean, numerics.safe_divide(0.5 * (end - start), mean)

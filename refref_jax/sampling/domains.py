@@ -1,8 +1,8 @@
-"""From world space to the unit cube that a field is stored in.
+"""Maps world space to the unit cube in which a field is stored.
 
-A bounded scene is a cube, scaled, and a spherical one the ball in it. An unbounded one is
-contracted: a ball around the origin stays as it is and all of the space beyond it is squeezed into
-a shell of the same thickness.
+A bounded scene is a scaled cube, and a spherical scene is the ball in this cube. An unbounded scene
+is contracted: a ball around the origin is unchanged, and the space beyond it is contracted to a
+shell of the same thickness.
 
 Source: Barron et al., Mip-NeRF 360 (2022), Eq 10; Zip-NeRF (2023), section 2, for the scale of a
 contracted Gaussian.
@@ -19,13 +19,13 @@ from refref_jax.sampling.cones import Gaussians
 
 
 class Domain(NamedTuple):
-    """The part of space that a field stores.
+    """Scene bounds: the part of space that a field stores.
 
     Attributes:
       radius: half edge of a bounded scene's cube, or radius of a spherical scene or of an
         unbounded scene's uncontracted ball; world units.
-      space: whether all there is lies in the cube, or in the ball, or space beyond the ball is
-        contracted.
+      space: `bounded` by the cube, `spherical` (bounded by the ball), or `unbounded` (contracted
+        beyond the ball).
     """
 
     radius: float
@@ -35,7 +35,7 @@ class Domain(NamedTuple):
 def to_unit_cube(domain: Domain, gaussian: Gaussians) -> Gaussians:
     """Maps world-space Gaussians to `[0, 1]^3`; scales become fractions of the cube's edge.
 
-    Points outside the cube of a scene that is not unbounded are moved to its nearest face.
+    In bounded and spherical scenes, points outside the cube are moved to its nearest face.
     """
     positions = gaussian.positions / domain.radius
     scales = gaussian.scales / domain.radius
@@ -45,7 +45,7 @@ def to_unit_cube(domain: Domain, gaussian: Gaussians) -> Gaussians:
 
 
 def nearest_within(domain: Domain, point: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Returns the point of the domain that is nearest to a point: that itself, if it is within."""
+    """Returns the nearest point in the domain; points inside it are unchanged."""
     if domain.space == "unbounded":
         return point
     if domain.space == "spherical":
@@ -56,12 +56,12 @@ def nearest_within(domain: Domain, point: Float[Array, "3"]) -> Float[Array, "3"
 def exit_distance(
     domain: Domain, origin: Float[Array, "3"], direction: Float[Array, "3"]
 ) -> Float[Array, ""]:
-    """Returns how far a ray goes before it leaves a bounded scene's cube, or the ball, for good.
+    """Returns the distance at which a ray leaves the cube or ball of the scene bounds.
 
-    `inf` for a ray that never meets it and in an unbounded scene. The gradient is not meant to be
-    used: which face is left changes abruptly.
+    The result is `inf` in an unbounded scene and for rays that miss the bounds. Do not use its
+    gradient: the face through which a ray leaves changes abruptly.
 
-    Source: for the cube the slab method, Kay and Kajiya (1986).
+    Source: the slab method for the cube, Kay and Kajiya (1986).
     """
     if domain.space == "unbounded":
         return jnp.full_like(origin[0], jnp.inf)
@@ -78,16 +78,17 @@ def exit_distance(
 def chord(
     radius: float | Float[Array, ""], origin: Float[Array, "3"], direction: Float[Array, "3"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Returns which part of a line lies in a sphere around the origin.
+    """Returns the chord of a line in a sphere around the origin.
 
     Args:
-      radius: of the sphere, world units.
+      radius: radius of the sphere, world units.
       origin: a point of the line.
-      direction: of the line, unit.
+      direction: unit direction of the line.
 
     Returns:
-      From the point to the chord's middle, and half the chord: 0 of a line that misses the sphere,
-      whose middle is its point nearest to the origin.
+      The distance from `origin` to the middle of the chord, and half the length of the chord. If
+      the line misses the sphere, half the length is 0 and the middle is the line's nearest point to
+      the centre.
     """
     along = numerics.dot(origin, direction)
     beyond = numerics.dot(origin, origin) - jnp.square(radius)
@@ -103,9 +104,9 @@ def contract(x: Float[Array, "*shape 3"]) -> Float[Array, "*shape 3"]:
 
 
 def shrinkage(x: Float[Array, "*shape 3"]) -> Float[Array, "*shape"]:
-    """Returns by how much `contract` scales a small Gaussian at `x`: `|det J|^(1/3)`.
+    """Returns the factor by which `contract` scales a small Gaussian at `x`: `|det J|^(1/3)`.
 
-    Where `|x| > 1` that is `(2 - 1 / |x|)^(2/3) |x|^(-4/3)`.
+    It is `(2 - 1 / |x|)^(2/3) |x|^(-4/3)` for `|x| > 1`, else 1.
     """
     norm = numerics.length(x)
     inverse = 1.0 / jnp.where(norm > 1.0, norm, 1.0)

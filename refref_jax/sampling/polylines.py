@@ -1,8 +1,8 @@
-"""Points on a light path, found exactly by its cumulative distances.
+"""Points on a light path at given coordinates, computed from its cumulative distances.
 
-A sampler works on one coordinate `t` along a path. Usually `t` is arc length. Where the inside
-of the objects is known to be clear, `t` may count only the way outside them: the same polyline
-with its inner segments shrunk to length zero, so that no sample can fall inside.
+A sampler works on one coordinate `t` along a path. Usually `t` is arc length. If the inside of the
+objects is known to be clear, `t` can be the arc length outside them only: the same polyline with
+its inner segments shrunk to length zero, so that no sample falls inside.
 """
 
 from typing import NamedTuple
@@ -19,18 +19,17 @@ from refref_jax.optics.media import AMBIENT
 
 
 class Polyline(NamedTuple):
-    """One light path, ready to be sampled.
+    """One light path, ready for sampling.
 
     Attributes:
       points: start of each segment, world units.
       directions: unit direction of each segment.
-      knots: the coordinate `t` at which each segment starts, not decreasing from 0; `inf` where
-        unused.
+      knots: coordinate `t` at the start of each segment, non-decreasing from 0; `inf` where unused.
       arcs: arc length from the camera to the start of each segment.
-      outside: whether the segment runs outside the objects. The last segment always counts as
-        outside: a path that ran out of bends ends on the background like any other.
-      spreads: derivatives of each segment across the pixel, if they are carried.
-      radius: of the pixel's cone at unit distance.
+      outside: whether the segment is outside the objects. The last segment always counts as
+        outside: truncated paths end on the background too.
+      spreads: ray differential of each segment, if carried.
+      radius: radius of the pixel's cone at unit distance.
     """
 
     points: Float[Array, "segments 3"]
@@ -46,11 +45,11 @@ class PolylinePoint(NamedTuple):
     """A point of a polyline.
 
     Attributes:
-      position: world units.
-      direction: unit direction of travel there.
+      position: position in world units.
+      direction: unit direction of travel at the point.
       arc: arc length from the camera.
-      outside: whether it lies outside the objects.
-      footprint: half axes of the pixel's footprint, across the direction, world units.
+      outside: whether the point is outside the objects.
+      footprint: half axes of the pixel's footprint, perpendicular to `direction`, world units.
     """
 
     position: Float[Array, "3"]
@@ -75,11 +74,12 @@ def whole_path(path: LightPaths) -> Polyline:
 
 
 def outside_path(path: LightPaths) -> Polyline:
-    """Returns one light path whose coordinate stands still inside the objects."""
+    """Returns one light path whose coordinate does not advance inside the objects."""
     line = whole_path(path)
     lengths = jnp.where(jnp.isfinite(path.ends) & line.outside, path.ends - line.arcs, 0.0)
-    # Summed anew for each segment, in one order: a segment without length then starts exactly
-    # where the next one does. A running sum rounds them apart, and a sample falls between.
+    # Summed separately for each segment, in the same order, so that a segment of length 0 starts
+    # exactly where the next one does. A running sum would round them apart, and a sample could fall
+    # between.
     earlier = jnp.tril(jnp.ones((lengths.size, lengths.size), bool), k=-1)
     starts = jnp.sum(jnp.where(earlier, lengths[None, :], 0.0), axis=-1)
     return line._replace(knots=jnp.where(jnp.isfinite(path.tau), starts, jnp.inf))
@@ -88,7 +88,7 @@ def outside_path(path: LightPaths) -> Polyline:
 def point_at(line: Polyline, t: Float[Array, ""]) -> PolylinePoint:
     """Returns the point at coordinate `t >= 0`.
 
-    At a knot the later segment is taken, as in the paper's half-open intervals
+    At a knot, the later segment is used, as in the paper's half-open intervals
     `[tau_i, tau_{i+1})` (arXiv 2505.05848, section 4.2).
     """
     segment = segment_at(line, t)
@@ -105,14 +105,14 @@ def point_at(line: Polyline, t: Float[Array, ""]) -> PolylinePoint:
 
 
 def segment_at(line: Polyline, t: Float[Array, ""]) -> Int[Array, ""]:
-    """Returns the index of the segment that holds coordinate `t`."""
+    """Returns the index of the segment that contains coordinate `t`."""
     return jnp.sum(line.knots[1:] <= t, dtype=jnp.int32)
 
 
 def _footprint(
     line: Polyline, segment: Int[Array, ""], along: Float[Array, ""], arc: Float[Array, ""]
 ) -> Float[Array, "2 3"]:
-    """Returns the half axes of a footprint; those of the unbent cone if no spread is carried."""
+    """Returns the half axes of a footprint; those of a straight cone without differentials."""
     direction = line.directions[segment]
     if line.spreads.points.shape[-2] == 0:
         return line.radius * arc * jnp.stack(orthonormal_basis(direction))

@@ -1,8 +1,8 @@
-"""The algebra of step functions on an interval.
+"""Operations on step functions over an interval.
 
-Vocabulary: `edges` are `n + 1` increasing endpoints; `weights` are `n` bin masses, not negative,
-that sum to at most 1; `heights` are bin values, a density when `heights * widths` are masses;
-`cdf` is a cumulative function at the edges, from 0 to 1. All functions take leading batch axes.
+Notation: `edges` are `n + 1` increasing endpoints; `weights` are `n` non-negative bin masses that
+sum to at most 1; `heights` are bin values, a density if `heights * widths` are masses; `cdf` is a
+cumulative function at the edges, from 0 to 1. All functions take leading batch axes.
 
 Source: Barron et al., Mip-NeRF 360 (2022), section 3 and Zip-NeRF (2023), section 3.
 """
@@ -16,14 +16,14 @@ from refref_jax import numerics
 def heights(
     edges: Float[Array, "*batch edges"], weights: Float[Array, "*batch edges-1"]
 ) -> Float[Array, "*batch edges-1"]:
-    """Returns `weights / widths`, 0 in bins of no width."""
+    """Returns `weights / widths`, 0 in bins of width 0."""
     return numerics.safe_divide(weights, jnp.diff(edges))
 
 
 def cumulative(weights: Float[Array, "*batch n"]) -> Float[Array, "*batch n+1"]:
-    """Returns the normalised cumulative sum: exactly 0 first, exactly 1 last, not decreasing.
+    """Returns the normalised cumulative sum, non-decreasing from exactly 0 to exactly 1.
 
-    Weights that are all zero give the uniform distribution.
+    If all weights are zero, the distribution is uniform.
     """
     total = jnp.broadcast_to(jnp.sum(weights, axis=-1, keepdims=True), weights.shape)
     share = jnp.where(total > 0, numerics.safe_divide(weights, total), 1.0 / weights.shape[-1])
@@ -37,7 +37,7 @@ def invert_cumulative(
     edges: Float[Array, "*batch edges"],
     cdf: Float[Array, "*batch edges"],
 ) -> Float[Array, "*batch m"]:
-    """Returns where a piecewise linear cumulative function takes the values `u` in `[0, 1]`."""
+    """Inverts a piecewise linear cumulative function at values `u` in `[0, 1]`."""
     bin_ = count_below(cdf[..., 1:-1], u)
     low, high = take(cdf, bin_), take(cdf, bin_ + 1)
     left, right = take(edges, bin_), take(edges, bin_ + 1)
@@ -51,13 +51,13 @@ def sample_edges(
 ) -> Float[Array, "*batch m+1"]:
     """Draws `m` intervals whose density follows a step function.
 
-    The samples at `u` become the middles of the new intervals: an edge lies half-way between
-    two samples, and the outermost two mirror theirs, within the old interval.
+    The samples at `u` become the middles of the new intervals: an edge lies half-way between two
+    samples; the outermost two edges are reflected at their samples, within the old domain.
 
     Args:
       u: increasing quantiles in `[0, 1]`.
-      edges: of the step function.
-      weights: of the step function, in any scale.
+      edges: edges of the step function.
+      weights: weights of the step function, in any scale.
     """
     samples = invert_cumulative(u, edges, cumulative(weights))
     middles = 0.5 * (samples[..., 1:] + samples[..., :-1])
@@ -69,20 +69,20 @@ def sample_edges(
 def snap(
     edges: Float[Array, "*batch edges"], knots: Float[Array, "*batch knots"]
 ) -> Float[Array, "*batch edges"]:
-    """Moves edges onto knots, so that no interval has a knot inside.
+    """Moves edges onto knots, so that no interval contains a knot.
 
-    Every knot draws its nearest inner edge; of two knots that draw the same one the first has it.
-    Edges stay in order, and the outermost two stay where they are. Knots at them or beyond have no
+    Every knot attracts its nearest inner edge; if two knots attract the same edge, it moves to the
+    first. Edges stay in order, and the outermost two do not move. Knots at or beyond these have no
     effect.
 
     Args:
-      edges: in order.
-      knots: in any order, finite.
+      edges: edges in order.
+      knots: knots in any order, finite.
     """
     inner = edges.shape[-1] - 2
     if inner < 1 or knots.shape[-1] == 0:
         return edges
-    # Of equal edges a knot draws the one on its own side, so that they stay in order.
+    # Among equal edges, a knot attracts the one on its own side, so that they stay in order.
     right = count_below(edges[..., 1:-1], knots)
     nearer = knots - take(edges, right) < take(edges, right + 1) - knots
     drawn = jnp.where((right == inner) | (nearer & (right > 0)), right - 1, right)
@@ -99,8 +99,8 @@ def dilate(
 ) -> tuple[Float[Array, "*batch k"], Float[Array, "*batch k-1"]]:
     """Widens every bin by `amount` on both sides and keeps the maximum height.
 
-    Guards a proposal against aliasing: what it found may lie a little to the side. The domain
-    stays the same, and the result has `3 n + 1` edges.
+    This protects proposals from aliasing, because content may lie slightly beside the bins that
+    found it. The domain is unchanged, and the result has `3 n + 1` edges.
 
     Returns:
       The new edges and weights, which sum to 1.
@@ -124,11 +124,11 @@ def blurred_mass_below(
 ) -> Float[Array, "*batch m"]:
     """Returns the mass below each of `at` after blurring by a box of half-width `radius`.
 
-    A point spread by the box lies below `x` with probability `clip(x', 0, 1)` for
-    `x' = (x - point + radius) / (2 radius)`: a bin's share is the mean of that over the bin.
-    Each share is in `[0, 1]` however thin its bin; the usual way, to integrate the blurred step
-    function by cumulative sums, multiplies rounding by the heights of thin bins and finds light
-    where there is none.
+    A point blurred by the box lies below `x` with probability `clip(x', 0, 1)` for
+    `x' = (x - point + radius) / (2 radius)`; the contribution of a bin is the mean of this
+    probability over the bin. It is in `[0, 1]` for bins of any width. The usual implementation,
+    which integrates the blurred step function by cumulative sums, multiplies rounding errors by the
+    heights of thin bins and produces mass in empty regions.
 
     Source: Zip-NeRF, section 3 (anti-aliased interlevel loss), in closed form.
     """
@@ -144,14 +144,14 @@ def blurred_mass_below(
 def count_below(
     sorted_values: Float[Array, "*batch n"], queries: Float[Array, "*batch m"]
 ) -> Int[Array, "*batch m"]:
-    """Returns how many values are at most each query: a right-sided search, by comparing all.
+    """Returns the number of values <= each query: a right-sided search by brute force.
 
-    For the few dozen bins of a path this beats a binary search, whose steps depend on each
-    other.
+    For the few dozen bins of a path this is faster than a binary search, whose steps are
+    sequential.
     """
     return jnp.sum(sorted_values[..., None, :] <= queries[..., :, None], axis=-1, dtype=jnp.int32)
 
 
 def take(values: Array, index: Int[Array, "*batch m"]) -> Array:
-    """Returns `values[..., index]`, batch by batch."""
+    """Returns `values[..., index]`, separately for each batch element."""
     return jnp.take_along_axis(values, index, axis=-1)

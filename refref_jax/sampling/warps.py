@@ -1,7 +1,7 @@
-"""Between distance along a path and the unit interval that a sampler works on.
+"""Maps distance along a path to the unit interval in which samplers work, and back.
 
-Letters: `t` is distance in world units, `s` the normalised coordinate in `[0, 1]`. Equal steps
-in `s` are fine near the camera and grow with distance, so that one interval can hold both.
+Letters: `t` is distance in world units, `s` the normalised coordinate in `[0, 1]`. Equal steps in
+`s` are short near the camera and grow with distance, so that one interval covers near and far.
 
 Source: Barron et al., Zip-NeRF (2023), section 4: the power transformation with
 `lambda = -1.5`, applied to twice the distance.
@@ -16,12 +16,12 @@ _LAMBDA = -1.5
 
 
 class DistanceWarp(NamedTuple):
-    """The interval of distances that is sampled, and the length that sets its scale.
+    """The sampled interval of distances, and its length scale.
 
     Attributes:
       near: distance at `s = 0`, world units, at least 0.
-      far: distance at `s = 1`, world units, > near; may differ from path to path.
-      unit: the scene's size, world units; steps start to grow at about this distance.
+      far: distance at `s = 1`, world units, > `near`; may differ between paths.
+      unit: size of the scene, world units; steps start to grow at about this distance.
     """
 
     near: float
@@ -30,10 +30,10 @@ class DistanceWarp(NamedTuple):
 
 
 def to_distance(warp: DistanceWarp, s: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Maps `s` in `[0, 1]` to a distance in `[near, far]`, increasing but for rounding error.
+    """Maps `s` in `[0, 1]` to a distance in `[near, far]`, increasing up to rounding error.
 
-    The transformed distance is interpolated from both of its ends, so that `s = 1` gives `far`
-    to rounding error although the transform flattens out there.
+    The transformed distance is interpolated from both ends, so that `s = 1` gives `far` up to
+    rounding error, although the transform is flat there.
     """
     start, end = _ladder(warp, warp.near), _ladder(warp, warp.far)
     power = (1.0 - s) * start + s * end
@@ -47,7 +47,7 @@ def to_unit(warp: DistanceWarp, t: Float[Array, "*shape"]) -> Float[Array, "*sha
 
 
 def _scale(warp: DistanceWarp) -> float:
-    """Returns the distance that the power transformation measures in: `|lambda - 1| / 2` units."""
+    """Returns the length unit of the power transformation: `|lambda - 1| / 2` times `unit`."""
     return abs(_LAMBDA - 1.0) / 2.0 * warp.unit
 
 

@@ -270,5 +270,5 @@ def test_scenes_can_not_be_mapped_over():
     twice = jax.tree.map(lambda x: jnp.stack([x, x]), geometry)
     ray = _ray([-4.0, 0.0, 0.0], [1.0, 0.0, 0.0])
     follow = lambda scene: follow_branch(scene, ray, jnp.zeros(24, bool), budget=TREE)
-    with pytest.raises(TypeError, match="can not be cast into many scenes"):
+    with pytest.raises(TypeError, match="one vmap cannot cast rays into several scenes"):
         jax.vmap(follow)(twice)

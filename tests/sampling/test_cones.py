@@ -158,7 +158,7 @@ def test_a_ray_without_width_has_points_without_width():
 
 @pytest.mark.parametrize("count", [0, 2, 5, 7])
 def test_other_numbers_of_points_are_refused(count):
-    with pytest.raises(ValueError, match=f"no cone pattern of {count} points"):
+    with pytest.raises(ValueError, match=f"count is {count}, but cone patterns"):
         _sample(_straight(), 1.0, 2.0, count=count)
 
 
