@@ -406,7 +406,7 @@ def _():
 
 
 def _table():
-    text = _PAGE.read_text().partition("## What works under which transformation")[2]
+    text = _PAGE.read_text().partition("## Supported transformations")[2]
     rows = [line.strip("|").split(" | ") for line in text.splitlines() if line.startswith("|")]
     head, _, *rows = [[cell.strip(" `|") for cell in row] for row in rows]
     return {(row[0], column): cell for row in rows for column, cell in zip(head, row, strict=True)}

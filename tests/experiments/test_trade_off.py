@@ -90,7 +90,10 @@ def test_the_lists_of_a_knob_can_be_replaced_and_knobs_added():
         (lambda: trade_points.sweep(preset="huge"), "Choose from tiny, small, paper, best"),
         (lambda: trade_points.sweep(preset="tiny", knobs=["colour"]), "--values=colour=A/B"),
         (lambda: trade_points.sweep(preset="tiny", base={"steps": "9"}), "Use --steps"),
-        (lambda: trade_points.sweep(preset="tiny", base={"paths": "foo"}), "--base=paths=foo does not exist"),
+        (
+            lambda: trade_points.sweep(preset="tiny", base={"paths": "foo"}),
+            "--base=paths=foo does not exist",
+        ),
         (lambda: trade_points.sweep(preset="tiny", base={"out": "x"}), "--out"),
         (lambda: trade_points.sweep(preset="tiny", base={"scene": "x"}), "--scene"),
         (
