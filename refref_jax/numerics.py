@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-# Smaller direction components count as zero: a ray would have to travel 1e12 units before the
-# difference matters.
+# Direction components are clamped to at least this: a ray would have to travel 1e12 units before
+# the difference matters.
 _SMALLEST_COMPONENT = 1e-12
 
 # Exponents at which `truncated_exponential` clamps its value, and, on both sides, its slope.
@@ -160,8 +160,8 @@ def largest_component(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape"
 def _scale(vector: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
     """Returns the largest absolute component, and 1 for the zero vector.
 
-    The scale is clamped to 8.5e37 in float32: compilers replace the division by a multiplication
-    with the reciprocal, which must be a normal number.
+    The scale is clamped to at most 8.5e37 in float32: compilers replace the division by a
+    multiplication with the reciprocal, which must be a normal number.
     """
     largest = largest_component(vector)
     held = jnp.minimum(largest, 1.0 / jnp.finfo(vector.dtype).tiny)

@@ -1,8 +1,8 @@
 """Arithmetic precision of fields: float32, or mixed precision with bfloat16.
 
 With `bfloat16`, tables are read and matrices multiplied in bfloat16. Parameters, sums, gradients
-and outputs stay in float32: bfloat16 has 8 significant bits, in which a sum of many small gradients
-would lose them.
+and outputs stay in float32: bfloat16 has only 8 significant bits, so small gradients would be lost
+in a sum of many.
 
 Source: Micikevicius et al., Mixed Precision Training (2018), for the float32 master weights.
 """

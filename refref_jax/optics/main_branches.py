@@ -40,8 +40,8 @@ def follow_main_branches(
       ValueError: if there are more reflections than bends.
 
     Example:
-      A glass cube before a red wall, and how its colour changes with the index: more and more of
-      the black behind the camera is mirrored.
+      A glass cube in front of a red wall, and the derivative of its colour with respect to the
+      index: with a higher index, more of the black behind the camera is reflected.
 
       >>> import jax, numpy as np, trimesh
       >>> import refref_jax

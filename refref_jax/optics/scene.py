@@ -52,7 +52,7 @@ def with_index(geometry: Scene, index: Float[ArrayLike, ""], *, part: int = 0) -
     parts = interfaces.index_inside.shape[0]
     if not 0 <= part < parts:
         raise ValueError(
-            f"part is {part}, but the scene has {parts} parts. Give a number from 0 to {parts - 1}."
+            f"part is {part}, but the number of parts is {parts}. Give 0 to {parts - 1}."
         )
     new = new.astype(interfaces.index_inside.dtype)
     had = interfaces.index_outside == interfaces.index_inside[part]

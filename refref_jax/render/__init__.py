@@ -1,10 +1,10 @@
-"""Rendering: from light paths to colours. Bodies, rays and paths are names of `refref_jax`.
+"""Rendering of light paths to colours. Objects, rays and paths are in `refref_jax`.
 
-A trained run is read by `load_model`; `render_camera` renders it from a camera and `render_image`
-along any rays, both in pieces on the host, and `render_rays` as one pure function. Any function of
-one ray may stand in for the fields, `radiance(origin, direction)` to linear RGB, such as a
-background (`radiance_of`): `render_known` renders that in pieces, and `shade` is the pure function.
-`docs/library.md` shows all of them.
+`load_model` reads a trained run; `render_camera` renders it from a camera and `render_image` along
+any rays, both in tiles on the host; `render_rays` is one pure function. Instead of fields, any
+function of one ray can be rendered, `radiance(origin, direction)` to linear RGB, such as a
+background (`radiance_of`): `render_known` renders it in tiles, and `shade` is the pure function.
+`docs/library.md` shows examples of all of them.
 """
 
 from refref_jax.geometry.rays import Rays as Rays

@@ -1,13 +1,13 @@
-"""What light sees where it comes from, when that is known: textured walls and environments.
+"""Known backgrounds: textured cubes, textured spheres and environment maps.
 
-A background is a record of arrays; `*_radiance` is what one ray sees of it, in linear RGB. `u` goes
-from 0 at an image's left edge to 1 at its right, `v` from 0 at its *bottom* to 1 at its top, and
-pixel `(row, column)` of `[h, w]` has its centre at `u = (column + 0.5) / w`,
-`v = 1 - (row + 0.5) / h`. Between centres colours are bilinear. The world is that of the rays, with
-z up.
+A background is a record of arrays; the `*_radiance` functions return its linear RGB radiance along
+one ray. `u` is 0 at the left edge of an image and 1 at the right, `v` is 0 at its *bottom* edge and
+1 at the top, and pixel `(row, column)` of `[h, w]` has its centre at `u = (column + 0.5) / w`,
+`v = 1 - (row + 0.5) / h`. Colours are interpolated bilinearly between centres. The world frame is
+that of the rays, with z up.
 
-Everything is differentiable with respect to ray and texels; a texel's border and a cube's edge are
-kinks. `radiance_of` makes a background what `render_known` takes.
+All functions are differentiable with respect to ray and texels, with kinks at texel centres and at
+the edges of a cube. `radiance_of` converts a background to a function for `render_known`.
 """
 
 from collections.abc import Callable
@@ -22,17 +22,17 @@ from refref_jax.render import colour
 from refref_jax.sampling import domains
 
 Radiance = Callable[[Float[Array, "3"], Float[Array, "3"]], Float[Array, "3"]]
-"""What one ray sees: from origin and unit direction, world units, to linear RGB."""
+"""Radiance along one ray: function of origin and unit direction, world units, to linear RGB."""
 
 
 class SrgbTexture(NamedTuple):
     """Images that are stored as sRGB.
 
-    They are interpolated as they are stored and decoded afterwards, as Blender Cycles does with
-    8-bit images; the other order is off by up to 0.1 between texels.
+    They are interpolated as sRGB and decoded afterwards, as Blender Cycles does with 8-bit images;
+    the other order differs by up to 0.1 between texels.
 
     Attributes:
-      texels: sRGB, row 0 at the top.
+      texels: sRGB values, row 0 at the top.
     """
 
     texels: Float[Array, "*images h w 3"]
@@ -42,7 +42,7 @@ class LinearTexture(NamedTuple):
     """Images that are stored as linear RGB.
 
     Attributes:
-      texels: linear RGB, row 0 at the top.
+      texels: linear RGB values, row 0 at the top.
     """
 
     texels: Float[Array, "*images h w 3"]
@@ -52,16 +52,16 @@ Texture = SrgbTexture | LinearTexture
 
 
 class CubeBackground(NamedTuple):
-    """Six square walls around the origin, each with an image.
+    """Background cube: six square walls around the origin, each with an image.
 
-    A wall's point is `half_extent (normal + (2u - 1) u_axis + (2v - 1) v_axis)`.
+    The point `(u, v)` of a wall is `half_extent (normal + (2u - 1) u_axis + (2v - 1) v_axis)`.
 
     Attributes:
-      texture: one image a wall, all of one size.
-      normals: of the walls, outward, unit.
-      u_axes: direction of growing `u` on each wall, unit.
-      v_axes: direction of growing `v`.
-      half_extent: half the cube's edge, world units.
+      texture: one image per wall, all of the same size.
+      normals: outward unit normals of the walls.
+      u_axes: unit direction of increasing `u` on each wall.
+      v_axes: unit direction of increasing `v` on each wall.
+      half_extent: half the edge of the cube, world units.
     """
 
     texture: Texture
@@ -72,13 +72,13 @@ class CubeBackground(NamedTuple):
 
 
 class SphereBackground(NamedTuple):
-    """A sphere around the origin with an equirectangular image.
+    """Background sphere: a sphere around the origin with an equirectangular image.
 
-    The image is laid out by the direction from the origin to the wall, as an `Environment`'s.
+    The image is indexed by the direction from the origin to the sphere, as in `Environment`.
 
     Attributes:
       texture: one image.
-      radius: of the sphere, world units.
+      radius: radius of the sphere, world units.
     """
 
     texture: Texture
@@ -86,10 +86,10 @@ class SphereBackground(NamedTuple):
 
 
 class Environment(NamedTuple):
-    """An equirectangular image, infinitely far away.
+    """Environment map: an equirectangular image at infinity.
 
-    A unit direction sees `u = 0.5 - atan2(y, x) / (2 pi)`, `v = 0.5 + asin(z) / pi`: the middle
-    column is `+x`, and `-x` the seam.
+    A unit direction maps to `u = 0.5 - atan2(y, x) / (2 pi)`, `v = 0.5 + asin(z) / pi`: the middle
+    column is `+x`, and the seam is `-x`.
 
     Attributes:
       texture: one image.
@@ -102,11 +102,11 @@ Background = CubeBackground | SphereBackground | Environment
 
 
 class _Neighbours(NamedTuple):
-    """The two rows, or columns, that a position lies between.
+    """The two rows, or columns, on both sides of a position.
 
     Attributes:
-      low, high: their indices.
-      fraction: how far from `low` to `high`.
+      low, high: indices of the rows or columns.
+      fraction: position between `low` (0) and `high` (1).
     """
 
     low: Int[Array, ""]
@@ -117,7 +117,7 @@ class _Neighbours(NamedTuple):
 def radiance_of(background: Background) -> Radiance:
     """Returns a background as a function of one ray, for `render_known`.
 
-    The function is a pytree whose arrays are the background's, so that compiled programs take them
+    The function is a pytree with the arrays of the background, so that compiled programs take them
     as arguments.
 
     Example:
@@ -138,12 +138,12 @@ def radiance_of(background: Background) -> Radiance:
 def cube_radiance(
     background: CubeBackground, origin: Float[Array, "3"], direction: Float[Array, "3"]
 ) -> Float[Array, "3"]:
-    """Returns what a ray inside the cube sees: the wall through which it leaves.
+    """Returns the radiance along a ray inside the cube, at the wall through which it leaves.
 
-    A ray that starts on a wall or beyond it and goes away from the cube sees that wall where it
-    stands; one that starts beyond and looks back sees the far wall through the near one, and a
-    wall's border where it misses the cube. The image repeats over a wall's border for the last half
-    of a texel, as Cycles has it. A zero direction sees the first wall where it stands.
+    A ray that starts on or beyond a wall and points away from the cube sees that wall at its
+    origin; a ray that starts outside and points to the cube sees the far wall through the near one,
+    or the border of a wall if it misses the cube. Images repeat beyond the border of a wall for the
+    last half texel, as in Cycles. A zero direction sees the first wall at the origin of the ray.
     """
     dot_all = jax.vmap(numerics.dot, in_axes=(0, None))
     gaps = background.half_extent - dot_all(background.normals, origin)
@@ -162,11 +162,12 @@ def cube_radiance(
 def sphere_radiance(
     background: SphereBackground, origin: Float[Array, "3"], direction: Float[Array, "3"]
 ) -> Float[Array, "3"]:
-    """Returns what a ray inside the sphere sees: the point where it leaves.
+    """Returns the radiance along a ray inside the sphere, at the point where it leaves.
 
-    A ray that starts outside and misses the sphere, or has it behind, sees the point of its line
-    that is nearest to the origin, or where its line left. Gradients are finite everywhere; where
-    the line only touches the sphere the distance to it has gradient 0 (`numerics.safe_sqrt`).
+    A ray that starts outside and misses the sphere sees the nearest point of its line to the
+    origin; a ray with the sphere behind it sees the point where its line leaves the sphere.
+    Gradients are finite everywhere; if the line is tangent to the sphere, the gradient of the
+    distance is 0 (`numerics.safe_sqrt`).
     """
     middle, half = domains.chord(background.radius, origin, direction)
     return _look(background.texture, origin + (middle + half) * direction)
@@ -175,7 +176,7 @@ def sphere_radiance(
 def environment_radiance(
     background: Environment, origin: Float[Array, "3"], direction: Float[Array, "3"]
 ) -> Float[Array, "3"]:
-    """Returns what a ray sees of an environment, wherever it starts."""
+    """Returns the radiance of an environment along a ray; its origin has no effect."""
     del origin
     return _look(background.texture, direction)
 
@@ -183,9 +184,9 @@ def environment_radiance(
 def _look(texture: Texture, towards: Float[Array, "3"]) -> Float[Array, "3"]:
     """Looks up an equirectangular image in a direction of any length.
 
-    The elevation is formed from both legs, `atan2(z, sqrt(x^2 + y^2))`, which is as precise at the
-    poles as elsewhere, where `asin(z)` is not. Exactly at a pole `u` is 0.5, with gradient 0.
-    Columns wrap around; beyond the middle of the first and the last row the image is constant.
+    The elevation is computed as `atan2(z, sqrt(x^2 + y^2))`, which is as precise at the poles as
+    elsewhere, unlike `asin(z)`. Exactly at a pole, `u` is 0.5, with gradient 0. Columns wrap
+    around; beyond the centres of the first and the last row the image is constant.
     """
     azimuth = numerics.safe_atan2(towards[1], towards[0])
     elevation = numerics.safe_atan2(towards[2], numerics.length(towards[:2]))
@@ -196,14 +197,14 @@ def _look(texture: Texture, towards: Float[Array, "3"]) -> Float[Array, "3"]:
 
 
 def _repeated(position: Float[Array, ""], size: int) -> _Neighbours:
-    """Returns the neighbours on a ring."""
+    """Returns the neighbours of a position, with wrap-around."""
     low = jnp.floor(position)
     index = low.astype(jnp.int32)
     return _Neighbours(index % size, (index + 1) % size, position - low)
 
 
 def _held(position: Float[Array, ""], size: int) -> _Neighbours:
-    """Returns the neighbours on a line, whose ends go on for ever."""
+    """Returns the neighbours of a position, clamped to the ends."""
     held = jnp.clip(position, 0.0, size - 1.0)
     low = jnp.floor(held)
     index = low.astype(jnp.int32)
@@ -213,9 +214,9 @@ def _held(position: Float[Array, ""], size: int) -> _Neighbours:
 def _interpolate(
     texture: Texture, image: tuple[Int[Array, ""], ...], rows: _Neighbours, columns: _Neighbours
 ) -> Float[Array, "3"]:
-    """Returns the bilinear colour between four texels of one of the images, as linear RGB."""
+    """Returns the bilinear interpolation of four texels of one of the images, as linear RGB."""
     texels = texture.texels
-    # One gather with the full index: an image is never copied for a ray.
+    # One gather with the full index, so that images are not copied for each ray.
     upper, lower = (
         _mix(texels[(*image, row, columns.low)], texels[(*image, row, columns.high)], columns)
         for row in (rows.low, rows.high)

@@ -1,9 +1,9 @@
-"""Between linear radiance, in which light adds up, and sRGB, in which images are stored."""
+"""Conversion between linear RGB, in which light is summed, and sRGB, in which images are stored."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-# Where the straight and the curved part of the transfer function meet.
+# Thresholds between the linear and the power segment of the transfer function.
 _LINEAR_KNEE = 0.0031308
 _SRGB_KNEE = 0.04045
 
@@ -11,8 +11,8 @@ _SRGB_KNEE = 0.04045
 def linear_to_srgb(linear: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Applies the sRGB opto-electronic transfer function; 0 maps to 0 and 1 to 1.
 
-    Negative values follow the straight part and values above 1 the curve, so that neither value
-    nor gradient is cut off. The gradient is finite everywhere: 12.92 at and below 0.
+    Negative values use the linear segment and values above 1 the power segment, so that neither
+    value nor gradient is clipped. The gradient is finite everywhere: 12.92 at and below 0.
 
     Source: IEC 61966-2-1.
     """

@@ -2,7 +2,7 @@
 
 Letters, as in the paper (arXiv 2505.05848, section 4.1): interval `i` has density `sigma_i` and
 length `delta_i`; `T_i = exp(-sum_{j<i} sigma_j delta_j)` is the light that reaches it and
-`w_i = T_i (1 - exp(-sigma_i delta_i))` its share in the colour.
+`w_i = T_i (1 - exp(-sigma_i delta_i))` its weight in the colour.
 """
 
 from typing import NamedTuple
@@ -15,15 +15,14 @@ from refref_jax.sampling import stepfun
 
 
 class Composite(NamedTuple):
-    """What a path sees.
+    """Colour and distance of a path.
 
     Attributes:
       rgb: linear colour.
-      accumulation: share of light that the samples account for, in `[0, 1]`.
-      median: distance that half of the light has come from; `inf` when less than half is
-        accounted for. The paper's distance: it finds the nearest surface that matters, be it
-        translucent.
-      mean: mean distance of the light that is accounted for; `inf` when there is none.
+      accumulation: sum of the weights, in `[0, 1]`.
+      median: distance at which the cumulative weight is 0.5; `inf` if the accumulation is lower.
+        This is the paper's distance: the nearest relevant surface, even if it is translucent.
+      mean: weighted mean distance; `inf` if the accumulation is 0.
     """
 
     rgb: Float[Array, "3"]
@@ -37,10 +36,10 @@ def alpha_weights(
 ) -> Float[Array, " samples"]:
     """Returns the weights `w_i`, which sum to at most 1.
 
-    Finite in value and gradient for any density and length in `[0, inf)` whose product does
-    not overflow; the product may be infinite as long as it is not `0 * inf`. Edges that are a
-    rounding error apart may come out of order: a length below 0 counts as 0, since a solid would
-    make a weight of minus infinity of it.
+    Value and gradient are finite for any density and length in `[0, inf)` whose product does not
+    overflow; the product may be infinite if it is not `0 * inf`. Edges that differ by a rounding
+    error may be out of order: lengths below 0 count as 0, because an opaque sample would otherwise
+    have a weight of minus infinity.
 
     Source: paper, volume rendering equation.
     """
@@ -50,9 +49,9 @@ def alpha_weights(
 
 
 def opaque_end(weights: Float[Array, " samples"]) -> Float[Array, " samples"]:
-    """Gives the light that is left over to the last sample, as if it were opaque.
+    """Adds the remaining transmittance to the last sample, as if it were opaque.
 
-    The weights then sum to 1, however thin the field.
+    The weights then sum to 1 for any density.
     """
     return weights.at[-1].set(jnp.maximum(1.0 - jnp.sum(weights[:-1]), 0.0))
 
@@ -65,9 +64,9 @@ def composite(
     """Sums the samples of a path.
 
     Args:
-      weights: `w_i`.
+      weights: weights `w_i`.
       rgb: linear colours.
-      edges: distances at which the intervals begin and end.
+      edges: distances of the edges of the intervals.
     """
     accumulation = jnp.sum(weights)
     middles = 0.5 * (edges[1:] + edges[:-1])

@@ -1,4 +1,4 @@
-"""Static description of a model: what is sampled, how often, and by which fields."""
+"""Static configuration of a model: its fields, its sampling, and the scene bounds."""
 
 import dataclasses
 import math
@@ -9,21 +9,21 @@ from refref_jax.fields.kinds import DensityConfig, RadianceConfig
 from refref_jax.optics.budgets import Budget
 from refref_jax.optics.details import Detail
 
-# Before a convex body, and after it.
+# Segments before and after a convex object.
 _CONVEX_LEGS = 2
 
-# Between bodies that light leaves and enters again there are more, but few: with four places,
-# 0.04 % of the light of a torus has one left out, which is then taken to be empty.
+# Light that leaves and re-enters objects has more outer segments, but few: with four, 0.04 % of the
+# light of a torus has an omitted segment, which is then treated as empty.
 _MOST_LEGS = 4
 
 
 @dataclasses.dataclass(frozen=True)
 class ProposalConfig:
-    """One round of proposal sampling.
+    """One proposal level.
 
     Attributes:
-      field: its density field, of any kind.
-      samples: intervals along a path.
+      field: shape of its density field, of any type.
+      samples: number of intervals along a path.
     """
 
     field: DensityConfig
@@ -32,29 +32,29 @@ class ProposalConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """A model of a scene.
+    """Configuration of a model of a scene.
 
     Attributes:
-      proposals: rounds of proposal sampling, coarse to fine; at least one.
-      field: the radiance field, of any kind.
-      samples: intervals of the final round.
-      multisamples: points that stand for an interval's cone, 1 or 6.
-      interior: `field` also samples inside the objects (the paper); `clear` takes nothing to be
-        there, which holds for clear glass and costs no samples; `absorbing` too takes no samples
-        there, but light is dimmed on its way by the colours of media and interfaces.
-      footprint: `cone` widens a pixel's footprint with arc length as if the path were straight
-        (the paper); `differential` follows it through every bend by its derivatives.
-      learned_tints: number of parts whose tint and absorption are learned, all of them or 0.
-      near: distance of the first sample from the camera, world units; 0 begins at the camera.
-      far: distance of the last from the last bend, or from the camera on a straight path; the
-        background is opaque there. In a bounded or spherical scene a path ends already where it
-        leaves that, and `far` only serves paths that do not meet it.
+      proposals: proposal levels, coarse to fine; at least one.
+      field: shape of the radiance field, of any type.
+      samples: number of intervals of the radiance field.
+      multisamples: number of multisamples per interval, 1 or 6.
+      interior: `field` also samples inside the objects (the paper); `clear` assumes empty objects,
+        which holds for clear glass and costs no samples; `absorbing` does not sample inside the
+        objects either, but attenuates light by the tints and absorption of interfaces and media.
+      footprint: `cone` widens the pixel footprint with arc length, as along a straight ray (the
+        paper); `differential` propagates it through every bend by ray differentials.
+      learned_tints: number of parts whose tint and absorption are learned, all parts or 0.
+      near: distance of the first sample from the camera, world units; 0 starts at the camera.
+      far: distance of the last sample from the last bend, or from the camera on a straight path;
+        the background is opaque there. In bounded and spherical scenes, paths end at the scene
+        bounds, and `far` is only used for paths that miss them.
       radius: half edge of a bounded scene's cube, or radius of a spherical scene or of an
-        unbounded scene's uncontracted ball, world units, around the origin. Walls should stand on
-        the faces of the cube: between walls and faces the field has to guess.
-      space: `bounded` by the cube, `spherical`: by the ball, or `unbounded`: beyond the ball it
-        is contracted.
-      dilation: widening of a proposal before it is sampled, as a share of its mean bin width; 0
+        unbounded scene's uncontracted ball, world units, around the origin. A background cube
+        should coincide with the scene bounds: the field is unconstrained between the two.
+      space: `bounded` by the cube, `spherical` (bounded by the ball), or `unbounded` (contracted
+        beyond the ball).
+      dilation: widening of a proposal before it is sampled, as a fraction of its mean bin width; 0
         for none.
     """
 
@@ -72,21 +72,19 @@ class ModelConfig:
     dilation: float
 
     def __post_init__(self) -> None:
-        """Checks what sampling relies on."""
+        """Validates the values."""
         if not self.proposals:
-            raise ValueError("A model needs at least one proposal round. Add one.")
+            raise ValueError("proposals is empty. Give at least one proposal level.")
         if not 0.0 <= self.near < self.far:
             raise ValueError(
-                f"The distances must satisfy 0 <= near < far; got near = {self.near} and far = "
-                f"{self.far}. Correct them."
+                f"The distances near = {self.near} and far = {self.far} are invalid. Choose them "
+                f"such that 0 <= near < far."
             )
         if not 0.0 < self.radius < math.inf:
-            raise ValueError(
-                f"The radius must be positive and finite, not {self.radius}. Correct it."
-            )
+            raise ValueError(f"radius is {self.radius}. Give a positive, finite radius.")
         if self.learned_tints < 0:
             raise ValueError(
-                f"{self.learned_tints} parts can not have learned tints. Give their number, or 0."
+                f"learned_tints is {self.learned_tints}. Give the number of parts, or 0."
             )
         _check_choice("space", self.space, get_args(Space))
         _check_choice("interior", self.interior, get_args(Interior))
@@ -94,7 +92,7 @@ class ModelConfig:
 
 
 def path_detail(config: ModelConfig, budget: Budget) -> Detail:
-    """Returns what a model needs to know of its light paths."""
+    """Returns the parts of light paths that a model needs."""
     tally = "parts" if config.learned_tints else "none"
     most = budget.bends + 1
     if config.interior == "field":
@@ -105,4 +103,4 @@ def path_detail(config: ModelConfig, budget: Budget) -> Detail:
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
-        raise ValueError(f"The {name} is one of {', '.join(choices)}, not {value!r}. Choose one.")
+        raise ValueError(f"{name} is {value!r}, which is unknown. Use one of {', '.join(choices)}.")

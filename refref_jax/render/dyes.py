@@ -1,11 +1,11 @@
-"""Colours of media and interfaces that are learned: a few numbers a part.
+"""Learned tints of interfaces and learned absorption of media.
 
-Light of a path is dimmed at every meeting with a part's surface, reflected or not, and on its way
-through the part's medium: `exp(-sum_p (n_p density_p + length_p absorption_p))`. The tint of a
-surface is `exp(-density)`. Both are kept from making light by a softplus, which has a gradient
-everywhere.
+The throughput of a path is attenuated at every hit of a part's surface, reflected or refracted, and
+along its length in the part's medium: `exp(-sum_p (n_p density_p + length_p absorption_p))`. The
+tint of a surface is `exp(-density)`. A softplus, which has a gradient everywhere, keeps densities
+and absorptions positive.
 
-Source: the law of Beer and Lambert; the tint is the colour of Blender Cycles' glass.
+Source: the Beer-Lambert law; the tint is the colour of Blender Cycles' glass BSDF.
 """
 
 from typing import NamedTuple
@@ -16,16 +16,16 @@ from jaxtyping import Array, Float
 
 from refref_jax.optics.light_paths import LightPaths
 
-# Almost white, but where the softplus still has a slope.
+# Almost white, with a useful slope of the softplus.
 _INITIAL = -3.0
 
 
 class Dyes(NamedTuple):
-    """Learned colours, before the softplus, linear RGB.
+    """Learned tints and absorption, before the softplus, linear RGB.
 
     Attributes:
-      density: optical density of a part's surface, per meeting.
-      absorption: of its medium, per scene radius.
+      density: optical density of each part's surface, per hit.
+      absorption: absorption of each part's medium, per scene radius.
     """
 
     density: Float[Array, "parts 3"]
@@ -33,14 +33,14 @@ class Dyes(NamedTuple):
 
 
 def init(parts: int) -> Dyes:
-    """Returns the colours of parts that are nearly clear."""
-    # Two arrays, since training gives the buffers of both away.
+    """Returns initial values, for nearly clear parts."""
+    # Two separate arrays, since training donates both buffers.
     initial = (jnp.full((parts, 3), _INITIAL, jnp.float32) for _ in Dyes._fields)
     return Dyes(*initial)
 
 
 def tints(dyes: Dyes) -> Float[Array, "parts 3"]:
-    """Returns the factor of linear RGB light at every meeting with a part's surface."""
+    """Returns the factor on linear RGB at every hit of each part's surface."""
     return jnp.exp(-jax.nn.softplus(dyes.density))
 
 
@@ -48,8 +48,8 @@ def absorptions(dyes: Dyes, radius: float) -> Float[Array, "parts 3"]:
     """Returns the absorption of every part's medium, linear RGB, per world unit.
 
     Args:
-      dyes: the colours.
-      radius: of the scene, world units.
+      dyes: learned tints and absorption.
+      radius: radius of the scene, world units.
     """
     return jax.nn.softplus(dyes.absorption) / radius
 
@@ -57,8 +57,8 @@ def absorptions(dyes: Dyes, radius: float) -> Float[Array, "parts 3"]:
 def optical_density(dyes: Dyes | None) -> Float[Array, ""]:
     """Returns the mean density of all surfaces and of all media over a scene radius; 0 for none.
 
-    A little of it in a loss settles what images leave open: a tint at both ends of a passage looks
-    much like absorption between them, and takes far less density.
+    With a small weight in the loss, it resolves an ambiguity of the images: a tint at both ends of
+    a segment looks similar to absorption along it, and needs far less density.
     """
     if dyes is None:
         return jnp.zeros(())
@@ -66,12 +66,12 @@ def optical_density(dyes: Dyes | None) -> Float[Array, ""]:
 
 
 def dye(dyes: Dyes | None, paths: LightPaths, *, radius: float) -> LightPaths:
-    """Dims the light of paths by the colours of what they passed.
+    """Attenuates the weights of paths by the tints and absorption along them.
 
     Args:
-      dyes: the colours; none leave the paths as they are.
-      paths: any number, with their parts tallied.
-      radius: of the scene, world units.
+      dyes: learned tints and absorption; `None` leaves the paths unchanged.
+      paths: any number of paths, with hit counts and path lengths per part.
+      radius: radius of the scene, world units.
     """
     if dyes is None:
         return paths

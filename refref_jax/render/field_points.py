@@ -1,7 +1,7 @@
-"""A model's radiance field at points of the world, without any path of light.
+"""Queries of a model's radiance field at world points, without light paths.
 
-For surfaces and point clouds. What is inside a body where no samples are taken was never learned,
-and means nothing.
+They are used to export surfaces and point clouds. The field inside objects is meaningless if the
+model takes no samples there.
 """
 
 from typing import NamedTuple
@@ -18,12 +18,12 @@ from refref_jax.sampling.cones import Gaussians
 
 
 class FieldPoint(NamedTuple):
-    """The field at a point.
+    """Values of the field at a point.
 
     Attributes:
-      density: per world unit, not negative: light that goes a short way `dt` is dimmed by
+      density: density per world unit, non-negative: the transmittance of a short distance `dt` is
         `exp(-density dt)`.
-      linear: linear RGB that leaves towards where the direction comes from.
+      linear: linear RGB radiance, opposite to the direction of travel.
     """
 
     density: Float[Array, ""]
@@ -41,13 +41,13 @@ def look_up(
     """Returns density and colour at one point; map it over many.
 
     Args:
-      params: the model's parameters.
-      config: the model.
-      point: world units; behind a scene's walls the nearest point of them is looked at.
-      direction: of travel of the light path that looks, unit.
-      width: edge of the cell that the point stands for, world units: finer detail is blurred.
+      params: parameters of the model.
+      config: configuration of the model.
+      point: position in world units; beyond the scene bounds, their nearest point is used.
+      direction: unit direction of travel of the viewing path.
+      width: edge of the cell around the point, world units: finer detail is blurred.
     """
-    # A cube's standard deviation along each axis.
+    # Standard deviation of a cube along each axis.
     scale = jnp.full((1,), width, point.dtype) / jnp.sqrt(jnp.asarray(12.0, point.dtype))
     bounds = transport.domain(config)
     held = domains.nearest_within(bounds, point)

@@ -1,7 +1,7 @@
-"""Where camera rays first meet an object: the geometry of an image, with no light in it.
+"""First surface hit by each camera ray: distances, normals and parts, without light.
 
-Rays go in tiles of fixed size, so that memory is bounded and nothing is compiled twice: this is one
-of the modules that call `jax.jit`.
+Rays are cast in tiles of fixed size, so that memory is bounded and programs compile once: this is
+one of the modules that call `jax.jit`.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from refref_jax.geometry.surfaces import Surfaces, surface_point
 from refref_jax.render import tiles
 
 TILE = 65536
-"""Rays cast at once."""
+"""Number of rays cast at once."""
 
 NO_PART = -1
 
@@ -25,11 +25,11 @@ _INSTEAD = "Call it outside, or cast single rays with bvh.closest_hits."
 
 
 class FirstSurface(NamedTuple):
-    """What rays meet first. The leading axes are those of the rays.
+    """First surface hit by each ray. The leading axes are those of the rays.
 
     Attributes:
-      distances: arc length from the ray's origin, world units; `inf` where it meets nothing.
-      normals: unit shading normal, out of the body; zero where the ray meets nothing.
+      distances: arc length from the ray's origin, world units; `inf` for a miss.
+      normals: unit shading normal, out of the object; zero for a miss.
       parts: index of the mesh part, or `NO_PART`.
     """
 
@@ -42,15 +42,15 @@ def find_first_surface(surfaces: Surfaces, rays: Rays, *, tile: int = TILE) -> F
     """Casts rays and returns the first surface of each.
 
     Args:
-      surfaces: the scene.
-      rays: any leading axes, usually `[height, width]`; unit directions.
-      tile: rays cast at once.
+      surfaces: surfaces of the scene.
+      rays: rays with any leading axes, usually `[height, width]`, and unit directions.
+      tile: number of rays cast at once.
 
     Raises:
-      ValueError: if a tile holds no ray.
+      ValueError: if `tile` is less than 1.
     """
     if tile < 1:
-        raise ValueError(f"A tile of {tile} rays casts nothing. Give 1 or more.")
+        raise ValueError(f"tile is {tile}, but a tile needs rays. Give 1 or more.")
     surfaces = jax.device_put(surfaces)
     empty = np.zeros((0, 3), jax.dtypes.canonicalize_dtype(rays.radii.dtype))
     return tiles.in_tiles(

@@ -1,8 +1,8 @@
-"""Renders images in pieces of fixed size, so that nothing is compiled twice.
+"""Renders images in tiles and chunks of fixed size, so that programs compile once.
 
-An image is traced in tiles. The paths of a tile are sorted so that the slots without a path come
-last, and are then rendered chunk by chunk: a pixel that misses the objects costs one path, not
-two. This is one of the modules that call `jax.jit`.
+Rays are traced in tiles. The paths of a tile are sorted so that empty slots come last, and are then
+rendered in chunks: a pixel that misses the objects costs one path, not two. This is one of the
+modules that call `jax.jit`.
 """
 
 import functools
@@ -26,10 +26,10 @@ from refref_jax.render.config import ModelConfig, path_detail
 from refref_jax.render.model import Model, Params
 
 TILE = 16384
-"""Rays traced at once."""
+"""Number of rays traced at once."""
 
 CHUNK = 4096
-"""Paths rendered at once: the option to lower when memory runs out."""
+"""Number of paths rendered at once. Lower it if memory runs out."""
 
 _INSTEAD = "Call it outside, or use render_rays, which is a pure function."
 _BRANCHES: tuple[Branch, ...] = get_args(Branch)
@@ -37,17 +37,16 @@ _ALL, _PASSED, _MIRRORED = range(len(_BRANCHES))
 
 
 class Rendering(NamedTuple):
-    """What rays see. The leading axes are those of the rays.
+    """Rendered rays. The leading axes are those of the rays.
 
     Attributes:
-      rgb: sRGB in `[0, 1]`.
-      distance: median distance of the light of the ray's heaviest path, as arc length from the
-        camera in world units.
-      mean_distance: its mean distance.
-      accumulation: share of light accounted for, 1 with an opaque background.
-      linear: the colours as linear RGB, not clipped: what is averaged where several rays share a
-        pixel.
-      lost: share of a ray's light that no path carries, for want of room.
+      rgb: sRGB colours in `[0, 1]`.
+      distance: median distance along the ray's heaviest path, as arc length from the camera in
+        world units.
+      mean_distance: mean distance along the ray's heaviest path.
+      accumulation: sum of the weights, 1 with an opaque background.
+      linear: linear RGB colours, not clipped, for averaging the rays of a pixel.
+      lost: dropped throughput of each ray, because a path buffer was full.
     """
 
     rgb: Float[Array, "*rays 3"]
@@ -59,13 +58,13 @@ class Rendering(NamedTuple):
 
 
 class _Tile(NamedTuple):
-    """The paths of a tile, those that are wanted first.
+    """The paths of a tile, with the selected paths first.
 
     Attributes:
-      paths: the light paths.
-      heaviest: whether a path carries most of its ray's light.
-      count: number of paths that are wanted.
-      lost: see `Rendering`.
+      paths: light paths.
+      heaviest: whether a path is the heaviest of its ray.
+      count: number of selected paths.
+      lost: dropped throughput of each ray.
     """
 
     paths: LightPaths
@@ -77,12 +76,12 @@ class _Tile(NamedTuple):
 def render_rays(model: Model, rays: Rays) -> Rendering:
     """Renders rays in one piece: a pure function, to be jitted or differentiated by the caller.
 
-    A trained model is in single precision, and so is what it renders.
+    A trained model is in single precision, and so are its renderings.
 
     Args:
-      model: the scene.
-      rays: `[n]` camera rays. They share the room of the budget: the fewer they are, the sooner
-        light is lost.
+      model: trained model.
+      rays: camera rays `[n]`. They share the path buffers, so with few rays, throughput is dropped
+        sooner.
     """
     rays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), rays)
     detail = path_detail(model.config, model.budget)
@@ -95,26 +94,26 @@ def render_rays(model: Model, rays: Rays) -> Rendering:
 def render_image(
     model: Model, rays: Rays, *, chunk: int = CHUNK, branch: Branch = "both"
 ) -> Rendering:
-    """Renders any number of rays in pieces of fixed size; 0 rays give an empty rendering.
+    """Renders any number of rays in chunks of fixed size; 0 rays give an empty rendering.
 
     Args:
-      model: the scene.
+      model: trained model.
       rays: camera rays with any leading axes, usually `[height, width]`.
-      chunk: paths rendered at once.
-      branch: the light of which paths, by what happened to them at the first surface: the linear
-        colours of `transmitted` and `reflected` sum to those of `both`. All three are one program.
+      chunk: number of paths rendered at once.
+      branch: selection of paths by their branch at the first surface. The linear colours of
+        `transmitted` and `reflected` sum to those of `both`. All three use one compiled program.
 
     Returns:
       NumPy arrays, with the leading axes of the rays.
 
     Raises:
-      ValueError: if a chunk holds no path, or there is no such branch.
+      ValueError: if `chunk` is less than 1, or `branch` is unknown.
       TypeError: if it is called in a function that JAX transforms.
     """
     if branch not in _BRANCHES:
-        raise ValueError(f"There is no branch {branch!r}. Choose one of {', '.join(_BRANCHES)}.")
+        raise ValueError(f"branch is {branch!r}, unknown. Use one of {', '.join(_BRANCHES)}.")
     if chunk < 1:
-        raise ValueError(f"A chunk of {chunk} paths renders nothing. Give 1 or more.")
+        raise ValueError(f"chunk is {chunk}, but a chunk needs paths. Give 1 or more.")
     rays = jax.tree.map(np.float32, tiles.fetch(rays, instead=_INSTEAD))
     nothing = jax.device_get(_blank(jax.device_put(np.zeros((0, 3), np.float32))))
     return tiles.in_tiles(
@@ -138,7 +137,7 @@ def _render_tile(model: Model, rays: Rays, real: int, chunk: int, branch: Branch
 
 
 def _blank(lost: Float[Array, "rays 3"]) -> Rendering:
-    """Returns what rays see before any path is rendered."""
+    """Returns the initial rendering, before any path is added."""
     black = jnp.zeros_like(lost)
     zeros = black[:, 0]
     return Rendering(black, zeros, zeros, zeros, linear=black, lost=lost)
@@ -168,7 +167,7 @@ def _render_chunk(
     config: ModelConfig,
     chunk: int,
 ) -> Rendering:
-    # Slots past the end repeat the last path with no weight.
+    # Slots past the end repeat the last path with weight 0.
     index = start + jnp.arange(chunk)
     held = jnp.minimum(index, tile.count - 1)
     paths = jax.tree.map(lambda x: x[held], tile.paths)
@@ -183,12 +182,12 @@ def _finish_tile(sums: Rendering) -> Rendering:
 
 
 def _sort(traced: Traced, real: int | Int[Array, ""], which: int | Int[Array, ""] = _ALL) -> _Tile:
-    """Moves the paths that are wanted to the front and marks the heaviest of each ray.
+    """Moves the selected paths to the front and marks the heaviest path of each ray.
 
     Args:
-      traced: the light of a tile.
-      real: how many of its rays are not there to fill it up.
-      which: place in `_BRANCHES` of those that are wanted.
+      traced: traced paths of a tile.
+      real: number of rays in the tile that are not padding.
+      which: index of the selected branch in `_BRANCHES`.
     """
     paths, rays = traced.paths, traced.lost.shape[0]
     mirrored = jnp.where(reflected_first(paths), _MIRRORED, _PASSED)
@@ -217,7 +216,7 @@ def _add(
     paths = dyes.dye(params.dyes, paths, radius=config.radius)
     share = jnp.mean(paths.weights, axis=-1)
     rays = sums.distance.shape[0]
-    # An index past the end drops the write.
+    # Writes to an index past the end are dropped.
     target = jnp.where(heaviest, paths.rays, rays)
     return sums._replace(
         linear=sums.linear.at[paths.rays].add(paths.weights * seen.rgb),

@@ -1,13 +1,14 @@
-"""Renders scenes whose background is known: nothing is learned, only light paths count.
+"""Renders scenes with a known background, without learned fields.
 
-Every path's last segment is looked up in a radiance function, and a ray's colour is the weighted
-sum over its paths. Any function of one ray that JAX can trace serves, `radiance(origin, direction)`
-to linear RGB: a background (`backgrounds.radiance_of`), or one of the user's own. As a pytree, such
-as `jax.tree_util.Partial(function, arrays)`, its arrays are arguments of the compiled program; what
-a plain function closes over are constants of it, and each new function compiles anew.
+The radiance function is evaluated at the last segment of every path, and the colour of a ray is the
+weighted sum over its paths. The function can be any JAX function of one ray, `radiance(origin,
+direction)` to linear RGB: a background (`backgrounds.radiance_of`) or a custom function. If it is a
+pytree, such as `jax.tree_util.Partial(function, arrays)`, its arrays are arguments of the compiled
+program; values that a plain function closes over are constants, and every new function triggers a
+compilation.
 
-Rays go in tiles of fixed size, so that memory is bounded and nothing is compiled twice: this is one
-of the modules that call `jax.jit`.
+Rays are rendered in tiles of fixed size, so that memory is bounded and programs compile once: this
+is one of the modules that call `jax.jit`.
 """
 
 import functools
@@ -27,25 +28,26 @@ from refref_jax.render import colour, tiles
 from refref_jax.render.backgrounds import Radiance
 
 TILE = 65536
-"""Rays traced at once."""
+"""Number of rays traced at once."""
 
 _INSTEAD = (
     "Call it outside, or use trace or follow_main_branches and shade, which are pure functions."
 )
 
-# Paths that are looked up at once.
+# Number of paths whose radiance is evaluated at once.
 _CHUNK = 4096
 
 
 class KnownRendering(NamedTuple):
-    """What rays see. The leading axes are those of the rays.
+    """Rendered rays. The leading axes are those of the rays.
 
     Attributes:
-      rgb: sRGB in `[0, 1]`.
-      linear: the same light as linear RGB, not clipped.
-      paths: number of light paths that carry a ray's colour.
-      lost: share of a ray's light that no path carries, for want of room or left dark.
-      casts: closest-hit queries, all rays together.
+      rgb: sRGB colours in `[0, 1]`.
+      linear: linear RGB colours, not clipped.
+      paths: number of light paths of each ray.
+      lost: dropped throughput of each ray, because a path buffer was full or truncated paths are
+        black.
+      casts: total number of closest-hit queries.
     """
 
     rgb: Float[np.ndarray, "*rays 3"]
@@ -56,7 +58,7 @@ class KnownRendering(NamedTuple):
 
 
 class _Tile(NamedTuple):
-    """What the rays of a tile see; fields as in `KnownRendering`."""
+    """Rendered rays of a tile; fields as in `KnownRendering`."""
 
     rgb: Float[Array, "rays 3"]
     linear: Float[Array, "rays 3"]
@@ -78,17 +80,16 @@ def render_known(
 
     Args:
       geometry: the scene.
-      radiance: what one ray sees of the background, see the module.
+      radiance: function of origin and direction that returns the background's linear RGB.
       rays: camera rays with any leading axes, usually `[height, width]`.
-      budget: which light to follow.
-      inside: the parts that each ray starts in, for the rule `priority` (see
-        `data.containment.parts_around`); by default none.
-      tile: rays traced at once: the option to lower when memory runs out. A budget's room is that
-        of its tile: the fewer rays share it, the sooner light is lost.
+      budget: path settings.
+      inside: interior list of each ray's origin, for the rule `priority` (see
+        `data.containment.parts_around`); none by default.
+      tile: number of rays traced at once. Lower it if memory runs out. The rays of a tile share the
+        path buffers, so with few rays, throughput is dropped sooner.
 
     Raises:
-      ValueError: if a tile holds no ray, or the radiance function returns something else than
-        three numbers.
+      ValueError: if `tile` is less than 1, or the radiance function does not return three numbers.
       TypeError: if it is called in a function that JAX transforms; see `shade`.
 
     Example:
@@ -104,19 +105,19 @@ def render_known(
       ((4, 4, 3), 0)
     """
     if tile < 1:
-        raise ValueError(f"A tile of {tile} rays renders nothing. Give 1 or more.")
+        raise ValueError(f"tile is {tile}, but a tile needs rays. Give 1 or more.")
     if jax.tree.structure(radiance) == jax.tree.structure(0):
-        radiance = jax.tree_util.Partial(radiance)  # a leaf is no argument of a compiled function
+        radiance = jax.tree_util.Partial(radiance)  # a plain function cannot be an argument of jit
     count = rays.radii.size
     tile = tiles.size_for(count, most=tile)
-    # On the device once, not once a tile.
+    # Transferred to the device once, not once per tile.
     geometry, radiance = jax.device_put((geometry, radiance))
     casts = []
 
     def see(
         rays: Rays, inside: Int[np.ndarray, "rays slots"] | None, real: int
     ) -> tuple[Array | np.ndarray, ...]:
-        # Each ray that fills up a tile misses, which takes one cast if any are made.
+        # Each padding ray misses, which counts as one cast if rays are cast at all.
         seen = tiles.fetch(
             _render_tile(geometry, radiance, rays, inside, budget=budget), instead=_INSTEAD
         )
@@ -130,22 +131,22 @@ def render_known(
 
 
 def shade(paths: LightPaths | PathEnds, radiance: Radiance, *, rays: int) -> Float[Array, "rays 3"]:
-    """Returns the linear RGB of rays: the sum over their paths of weight times what is seen.
+    """Returns the linear RGB of rays: the sum over their paths of weight times radiance.
 
-    A pure function, to be jitted, mapped and differentiated by the caller: with respect to what the
-    radiance function is made of, and to the paths, where these have gradients themselves
-    (`follow_branch`, `follow_main_branches`).
+    This is a pure function, for use under jit, vmap and differentiation: with respect to the
+    radiance function's parameters, and to paths that have gradients (`follow_branch`,
+    `follow_main_branches`).
 
     Args:
-      paths: of these rays, along one axis, or one path alone. Where `trace` or `follow_branch` was
-        mapped over, map this as well.
-      radiance: what a ray sees, `radiance(origin, direction)` to linear RGB; it is asked for the
+      paths: paths of these rays, along one axis, or a single path. If `trace` or `follow_branch`
+        was mapped, map this function too.
+      radiance: function of origin and direction that returns linear RGB; it is evaluated at the
         last segment of every path.
       rays: number of rays that the paths belong to.
 
     Raises:
-      ValueError: if the paths have more than one axis, or the radiance function returns something
-        else than three numbers.
+      ValueError: if the paths have more than one axis, or the radiance function does not return
+        three numbers.
 
     Example:
       >>> import numpy as np
@@ -159,14 +160,14 @@ def shade(paths: LightPaths | PathEnds, radiance: Radiance, *, rays: int) -> Flo
     """
     if paths.statuses.ndim > 1:
         raise ValueError(
-            f"The paths have the axes {paths.statuses.shape}, where one is expected. Apply "
-            "jax.vmap to shade as well as to what has made them."
+            f"The paths have the axes {paths.statuses.shape}, but one axis is expected. Apply "
+            "jax.vmap to shade as well as to the function that traced the paths."
         )
     if paths.statuses.ndim == 0:
         paths = jax.tree.map(lambda x: x[None], paths)
     ends = light_paths.ends_of(paths) if isinstance(paths, LightPaths) else paths
     exists = light_paths.exists(ends)
-    # An empty slot looks where the first path does, lest the radiance function see nonsense.
+    # Empty slots use the segment of the first path, so that the input of radiance is valid.
     held = jnp.where(exists, jnp.arange(exists.shape[0], dtype=jnp.int32), 0)
     ends = jax.tree.map(lambda x: x[held], ends)
     return jax.ops.segment_sum(_light(radiance, ends, exists), ends.rays, num_segments=rays)
@@ -201,10 +202,10 @@ def _render_tile(
 
 
 def _sum_light(radiance: Radiance, ends: PathEnds, rays: int) -> Float[Array, "rays 3"]:
-    """Returns the light of each ray, looked up in chunks that end where the paths do.
+    """Returns the linear RGB of each ray, evaluated in chunks up to the last path.
 
-    The list has room for more paths than there are, and looking up a texture costs about as much as
-    casting a ray.
+    The list usually has many empty slots, and a texture lookup costs about as much as casting a
+    ray.
     """
     slots = ends.rays.shape[0]
     chunk = min(_CHUNK, slots)
@@ -224,7 +225,7 @@ def _sum_light(radiance: Radiance, ends: PathEnds, rays: int) -> Float[Array, "r
 def _light(
     radiance: Radiance, ends: PathEnds, real: Bool[Array, " paths"]
 ) -> Float[Array, "paths 3"]:
-    """Returns what each path brings to its ray; those that are not real bring nothing."""
+    """Returns the contribution of each path to its ray; 0 for paths that are not `real`."""
     seen = jax.vmap(radiance)(ends.origins, ends.directions)
     if seen.shape != ends.directions.shape:
         raise ValueError(

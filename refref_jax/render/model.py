@@ -1,4 +1,4 @@
-"""A model of a scene: fields, and the geometry that bends the light between them."""
+"""A model of a scene: learned fields, and the scene that bends light paths."""
 
 from typing import NamedTuple
 
@@ -17,9 +17,9 @@ class Params(NamedTuple):
     """The learned part of a model.
 
     Attributes:
-      proposals: parameters of each proposal round's density field.
+      proposals: parameters of each proposal level's density field.
       field: parameters of the radiance field.
-      dyes: colours of the parts, if they are learned.
+      dyes: learned tints and absorption of the parts, if any.
     """
 
     proposals: tuple[kinds.Params, ...]
@@ -28,13 +28,13 @@ class Params(NamedTuple):
 
 
 class Model(NamedTuple):
-    """Everything that rendering needs.
+    """A complete model, ready to be rendered.
 
     Attributes:
-      config: static description of the fields and of the sampling.
-      budget: which light is followed.
-      geometry: what bends it.
-      params: the fields' parameters.
+      config: static configuration of fields and sampling.
+      budget: path settings.
+      geometry: the scene.
+      params: learned parameters.
     """
 
     config: ModelConfig
@@ -44,7 +44,7 @@ class Model(NamedTuple):
 
 
 def init_params(key: Array, config: ModelConfig) -> Params:
-    """Returns new parameters for all fields of a model."""
+    """Returns initial parameters of all fields of a model."""
     field_key, *keys = jax.random.split(key, 1 + len(config.proposals))
     proposals = tuple(
         registry.init_density(proposal_key, proposal.field)

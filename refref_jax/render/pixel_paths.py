@@ -1,4 +1,4 @@
-"""The light paths of one pixel, as polylines to draw.
+"""Light paths of one pixel, as polylines for plots.
 
     model = render.load_model("runs/ball")
     ray = jax.tree.map(lambda x: x[64, 64], image_rays(cameras, 0))
@@ -7,9 +7,9 @@
     for line, weight in zip(paths.polylines, paths.weights):
         axes.plot(*line.T, linewidth=5.0 * weight.mean() ** 0.5)
 
-It is the tracer that renders images, under the same budget. Paths share their beginnings, and a
-piece that several have in common carries what they carry together: `pieces` gives the tree as line
-segments, each once.
+The paths come from the tracer that renders images, with the same path settings. Paths share their
+first segments: `pieces` returns each line segment of the tree once, with the combined throughput of
+its paths.
 """
 
 import dataclasses
@@ -33,7 +33,8 @@ from refref_jax.render.dyes import Dyes
 from refref_jax.sampling import domains
 from refref_jax.sampling.domains import Domain
 
-# Room for one pixel's paths: with the cut of 0.005 a flask of three media has about 40.
+# Capacity for one pixel's paths: at a throughput threshold of 0.005, a flask of three media has
+# about 40.
 _MOST_PATHS = 512
 _MOST_SEGMENTS = 8192
 
@@ -44,19 +45,19 @@ ENDINGS = {
     PathStatus.NOT_TRACED: "is not followed further",
     PathStatus.TOTALLY_REFLECTED: "met a total reflection",
 }
-"""What each status of a path means, in words that follow it."""
+"""Description of each path status, as a predicate of "the path"."""
 
 
 class PixelPaths(NamedTuple):
     """The light paths of one ray, the heaviest first.
 
     Attributes:
-      polylines: one a path, `[points, 3]`, world units: the camera, every bend, and where the last
-        segment is drawn to.
+      polylines: one polyline `[points, 3]` per path, world units: the camera, every bend, and the
+        end of the last segment as drawn.
       weights: share of each path in the ray's linear RGB.
-      statuses: how each ended.
-      bends: refractions and reflections of each.
-      lost: share of the ray's linear RGB that found no room.
+      statuses: status of each path.
+      bends: number of refractions and reflections of each path.
+      lost: dropped throughput of the ray, linear RGB.
     """
 
     polylines: tuple[Float[np.ndarray, "_ 3"], ...]
@@ -70,8 +71,9 @@ class Pieces(NamedTuple):
     """The tree of a pixel's light paths as line segments, each once.
 
     Attributes:
-      ends: start and end of each, world units.
-      shares: of the pixel's light that it carries, mean over RGB, as it arrives at the paths' ends.
+      ends: start and end of each segment, world units.
+      shares: share of the pixel's light on each segment, mean over RGB, by the weights of its
+        paths.
     """
 
     ends: Float[np.ndarray, "pieces 2 3"]
@@ -79,7 +81,7 @@ class Pieces(NamedTuple):
 
 
 class _Traced(NamedTuple):
-    """Paths, what was lost, and how far each last segment goes before it leaves the domain."""
+    """Paths, dropped throughput, and the distance at which each last segment leaves the bounds."""
 
     paths: LightPaths
     lost: Float[Array, "1 3"]
@@ -89,20 +91,20 @@ class _Traced(NamedTuple):
 def trace_pixel(
     scene: Model | Scene, ray: Rays, *, budget: Budget | None = None, reach: float = 4.0
 ) -> PixelPaths:
-    """Follows one ray along all branches that a budget follows.
+    """Traces one ray along all branches that the path settings follow.
 
     Args:
-      scene: a model, or geometry alone. A model's learned colours dim its paths, and where
-        there are walls last segments are drawn to them.
+      scene: a model, or only its scene. The learned tints and absorption of a model attenuate the
+        paths, and last segments are drawn up to its scene bounds.
       ray: one camera ray, with a unit direction.
-      budget: which light to follow; that of the model if not given.
-      reach: length of the last segment where no walls end it, world units.
+      budget: path settings; those of the model by default.
+      reach: length of last segments that have no scene bounds, world units.
 
     Returns:
       NumPy arrays.
 
     Raises:
-      ValueError: if there is geometry alone and no budget.
+      ValueError: if `scene` is not a model and `budget` is not given.
     """
     if isinstance(scene, Model):
         geometry, colours, domain = (
@@ -114,7 +116,7 @@ def trace_pixel(
     else:
         geometry, colours, domain = scene, None, None
     if budget is None:
-        raise ValueError("Geometry alone does not say which light to follow. Give a budget.")
+        raise ValueError("budget is None, but scene is not a model. Give a budget.")
     roomy = dataclasses.replace(
         budget,
         live_per_ray=float(_MOST_PATHS),
@@ -127,7 +129,7 @@ def trace_pixel(
 
 
 def pieces(paths: PixelPaths) -> Pieces:
-    """Returns each segment of the paths once, with the light of all paths that run along it."""
+    """Returns each segment of the paths once, with the combined share of its paths."""
     shares: dict[bytes, float] = {}
     for line, weight in zip(paths.polylines, paths.weights, strict=True):
         for ends in np.stack([line[:-1], line[1:]], axis=1):
@@ -138,11 +140,11 @@ def pieces(paths: PixelPaths) -> Pieces:
 
 
 def describe(paths: PixelPaths, *, most: int = 12) -> str:
-    """Returns a table of paths in Markdown, and what it leaves out.
+    """Returns a Markdown table of paths, with a summary of the paths that it omits.
 
     Args:
-      paths: of one pixel.
-      most: rows of the table.
+      paths: light paths of one pixel.
+      most: maximum number of rows of the table.
     """
     count = len(paths.polylines)
     lines = [

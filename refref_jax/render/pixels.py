@@ -1,7 +1,7 @@
 """Colours of pixels from the light paths of a batch.
 
-Paths are rendered side by side; a pixel's colour is the weighted sum over its paths, in linear
-space (paper, arXiv 2505.05848, Fresnel blend), and is encoded as sRGB at the very end.
+Paths are rendered in parallel; the colour of a pixel is the weighted sum over its paths in linear
+RGB (paper, arXiv 2505.05848, Fresnel blend), and is converted to sRGB at the end.
 """
 
 from typing import NamedTuple
@@ -18,11 +18,11 @@ from refref_jax.render.transport import Jitter, PathRadiance
 
 
 class Light(NamedTuple):
-    """The light of a batch of rays, or what some of its paths add to it.
+    """The linear colours of a batch of rays, or the contribution of some of its paths.
 
     Attributes:
-      linear: linear RGB.
-      paths: what each path sees, for the losses.
+      linear: linear RGB colours.
+      paths: radiance of each path, for the losses.
     """
 
     linear: Float[Array, "rays 3"]
@@ -34,7 +34,7 @@ class Pixels(NamedTuple):
 
     Attributes:
       rgb: sRGB colours, not clipped.
-      paths: what each path sees, for the losses.
+      paths: radiance of each path, for the losses.
     """
 
     rgb: Float[Array, "rays 3"]
@@ -53,12 +53,12 @@ def render_pixels(
     """Renders a batch of rays from all of their paths.
 
     Args:
-      params: the model's parameters.
-      config: the model.
-      paths: the light paths, in any order.
-      jitter: of each path.
+      params: parameters of the model.
+      config: configuration of the model.
+      paths: light paths, in any order.
+      jitter: jitter of each path.
       rays: number of rays in the batch.
-      anneal: see `transport.path_radiance`.
+      anneal: exponent on the proposals' weights, see `transport.path_radiance`.
     """
     light = gather_light(params, config, paths, jitter, rays=rays, anneal=anneal)
     return Pixels(colour.linear_to_srgb(light.linear), light.paths)
@@ -73,7 +73,7 @@ def gather_light(
     rays: int,
     anneal: Float[Array, ""],
 ) -> Light:
-    """Sums the light of paths over the rays that they belong to; arguments as `render_pixels`."""
+    """Sums the contributions of paths to their rays; arguments as in `render_pixels`."""
     seen = render_paths(params, config, paths, jitter, anneal=anneal)
     paths = dyes.dye(params.dyes, paths, radius=config.radius)
     linear = jax.ops.segment_sum(paths.weights * seen.composite.rgb, paths.rays, num_segments=rays)
@@ -88,21 +88,21 @@ def render_paths(
     *,
     anneal: Float[Array, ""],
 ) -> PathRadiance:
-    """Renders each path of a batch on its own."""
+    """Renders each path of a batch independently."""
     render = jax.vmap(transport.path_radiance, in_axes=(None, None, 0, 0, None))
     return render(params, config, paths, jitter, anneal)
 
 
 def random_jitter(key: Array, config: ModelConfig, slots: Int[Array, " paths"]) -> Jitter:
-    """Draws one offset and one rotation for every round of every path.
+    """Draws one offset and one rotation for every sampling level of every path.
 
-    Each slot of a batch's list has noise of its own, which knows nothing of the others: the list
-    can be shared out among devices, or be longer, and the noise stays the same.
+    The noise of each slot depends only on the key and its index, so it is the same if the list is
+    longer or is split among devices.
 
     Args:
-      key: of the batch.
-      config: the model.
-      slots: place of each path in the batch's list.
+      key: random key of the batch.
+      config: configuration of the model.
+      slots: index of each path in the batch's list.
     """
     shape = (2, transport.rounds(config))
     draw = jax.vmap(lambda slot: jax.random.uniform(jax.random.fold_in(key, slot), shape))
@@ -111,6 +111,6 @@ def random_jitter(key: Array, config: ModelConfig, slots: Int[Array, " paths"]) 
 
 
 def no_jitter(config: ModelConfig, paths: int) -> Jitter:
-    """Returns the jitter of a rendering without noise, in single precision as the fields are."""
+    """Returns zero jitter, for rendering without noise, in single precision like the fields."""
     zeros = jnp.zeros((paths, transport.rounds(config)), jnp.float32)
     return Jitter(zeros, zeros)

@@ -1,6 +1,6 @@
-"""Cuts rays into tiles of one size, so that what renders a tile is compiled once.
+"""Splits rays into tiles of one size, so that the function that renders a tile compiles once.
 
-What goes tile by tile runs on the host, and compiles on its own.
+The loop over tiles runs on the host, so it cannot be part of a transformed function.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,11 +13,11 @@ from jaxtyping import Int
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.media import EMPTY_SLOT
 
-# A ray that fills up a tile starts this far out and goes away: it meets nothing, and leaves the
-# room of the tile's budget to the others.
+# Padding rays of a tile start at this distance and point away from the scene: they hit nothing and
+# leave the capacity of the path buffers to the other rays.
 _OUT_OF_REACH = 1e9
 
-# A budget's room must not be that of a ray or two.
+# Smaller tiles would have too little capacity for the paths of a ray.
 _SMALLEST_TILE = 1024
 
 _Tree = TypeVar("_Tree")
@@ -32,19 +32,19 @@ def in_tiles(
     instead: str,
     inside: Int[np.ndarray, "*rays slots"] | None = None,
 ) -> _Tree:
-    """Returns what rays see, tile by tile, as NumPy arrays with the leading axes of the rays.
+    """Renders rays tile by tile, to NumPy arrays with the leading axes of the rays.
 
     Args:
-      see: what the rays of a tile see, from them, the parts that they start in, and how many of
-        them are real: the others fill it up.
+      see: function that renders a tile, given its rays, their interior lists, and the number of
+        rays that are not padding.
       rays: camera rays with any leading axes.
-      tile: rays in a tile.
-      nothing: what no rays see.
-      instead: what the error tells to do.
-      inside: the parts that each ray starts in, if that is known.
+      tile: number of rays per tile.
+      nothing: result for 0 rays.
+      instead: advice at the end of the error message.
+      inside: interior list of each ray's origin, if known.
 
     Raises:
-      TypeError: if an array has no value yet, see `fetch`.
+      TypeError: if an array is a tracer, see `fetch`.
     """
     rays, inside = fetch((rays, inside), instead=instead)
     shape, count = rays.radii.shape, rays.radii.size
@@ -58,28 +58,28 @@ def in_tiles(
 
 
 def size_for(rays: int, *, most: int) -> int:
-    """Returns the size of the tiles of some rays: few need no large one."""
+    """Returns the tile size for a number of rays: smaller tiles for few rays."""
     return min(most, max(_SMALLEST_TILE, 1 << max(rays - 1, 0).bit_length()))
 
 
 def join(parts: Sequence[_Tree]) -> _Tree:
-    """Returns one tree of NumPy arrays, which are those of the parts behind each other."""
+    """Concatenates the arrays of several pytrees, as NumPy arrays."""
     return jax.tree.map(lambda *each: np.concatenate(each), *parts)
 
 
 def fetch(tree: _Tree, *, instead: str) -> _Tree:
-    """Returns NumPy arrays in place of all arrays.
+    """Converts all arrays of a pytree to NumPy arrays.
 
     Args:
-      tree: numbers and arrays.
-      instead: what the error tells to do.
+      tree: pytree of numbers and arrays.
+      instead: advice at the end of the error message.
 
     Raises:
-      TypeError: if one of them has no value yet, because JAX transforms the calling function.
+      TypeError: if an array is a tracer, because JAX transforms the calling function.
     """
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree)):
         raise TypeError(
-            "Pictures are rendered tile by tile on the host, which can not be part of a function "
+            "This function works tile by tile on the host and cannot be part of a function "
             f"that jit, vmap or grad transforms. {instead}"
         )
     return jax.tree.map(np.asarray, jax.device_get(tree))
@@ -88,13 +88,13 @@ def fetch(tree: _Tree, *, instead: str) -> _Tree:
 def cut_out(
     rays: Rays, inside: Int[np.ndarray, "rays slots"] | None, start: int, tile: int
 ) -> tuple[Rays, Int[np.ndarray, "tile slots"] | None]:
-    """Returns one tile of rays, the last one filled up with rays that meet nothing.
+    """Returns one tile of rays; the last tile is padded with rays that hit nothing.
 
     Args:
-      rays: all of them, NumPy arrays.
-      inside: the parts that each starts in, if that is known.
-      start: the first ray of the tile.
-      tile: rays in it.
+      rays: all rays, as NumPy arrays.
+      inside: interior list of each ray's origin, if known.
+      start: index of the first ray of the tile.
+      tile: number of rays per tile.
     """
     part, within = jax.tree.map(lambda x: x[start : start + tile], (rays, inside))
     missing = tile - part.radii.shape[0]

@@ -1,6 +1,6 @@
-"""Radiance along one light path: proposal rounds, then the radiance field.
+"""Radiance of one light path: proposal levels, then the radiance field.
 
-One path per function; `pixels` maps them over a batch.
+All functions take one path; `pixels` maps them over a batch.
 
 Source: Barron et al., Mip-NeRF 360 (2022), section 3, and Zip-NeRF (2023); paper (arXiv
 2505.05848), section 4.2, for samples and directions on the bent path.
@@ -23,22 +23,22 @@ from refref_jax.sampling import cones, domains, polylines, stepfun, warps
 from refref_jax.sampling.cones import Gaussians
 from refref_jax.sampling.polylines import Polyline
 
-# Least widening of a proposal, in units of the whole path (Mip-NeRF 360, supplement).
+# Minimum dilation of a proposal, in units of the full path (Mip-NeRF 360, supplement).
 _DILATION_BIAS = 0.0025
 
-# Least length of a path, in units of the scene's radius: four digits of `s` remain in float32.
+# Minimum length of a path, in units of the scene radius: `s` keeps four digits in float32.
 _SHORTEST = 1e-3
 
-# Adjacent cone patterns are turned against each other by this angle (Zip-NeRF, supplement).
+# Rotation between adjacent cone patterns (Zip-NeRF, supplement).
 _PATTERN_TURN = jnp.pi / 6.0
 
 
 class Jitter(NamedTuple):
-    """Where in its stratum a path is sampled; all zero for rendering without noise.
+    """Random offsets for stratified sampling of a path; all zero for rendering without noise.
 
     Attributes:
-      offsets: shift of every sample of a round, in `[-0.5, 0.5)` strata.
-      rotations: turn of a round's cone patterns, radians.
+      offsets: offset of all samples of each sampling level, in `[-0.5, 0.5)` strata.
+      rotations: rotation of each sampling level's cone patterns, radians.
     """
 
     offsets: Float[Array, "*paths rounds"]
@@ -46,11 +46,11 @@ class Jitter(NamedTuple):
 
 
 class Histogram(NamedTuple):
-    """How a round of sampling saw a path.
+    """Weights of one sampling level along a path.
 
     Attributes:
-      edges: of the intervals, in the normalised coordinate `s` in `[0, 1]`.
-      weights: share of the path's light in each.
+      edges: edges of the intervals, in the normalised coordinate `s` in `[0, 1]`.
+      weights: weight of each interval in the colour of the path.
     """
 
     edges: Float[Array, "*paths edges"]
@@ -58,12 +58,12 @@ class Histogram(NamedTuple):
 
 
 class PathRadiance(NamedTuple):
-    """What one path sees.
+    """Radiance of one path.
 
     Attributes:
       composite: colour and distances; distances are arc length from the camera.
-      histograms: of each proposal round, then of the final one.
-      outside: which of the final intervals lie outside the objects (by their middle).
+      histograms: histogram of each proposal level, then of the radiance field.
+      outside: whether each of the final intervals is outside the objects (by its middle).
     """
 
     composite: compositing.Composite
@@ -72,11 +72,11 @@ class PathRadiance(NamedTuple):
 
 
 class _Round(NamedTuple):
-    """The intervals of one round, in every coordinate they are needed in.
+    """The intervals of one sampling level, in all coordinates.
 
     Attributes:
       s: edges in the normalised coordinate.
-      t: edges in the path's own coordinate, world units.
+      t: edges in the coordinate of the polyline, world units.
       gaussians: multisamples of each interval, in the unit cube.
     """
 
@@ -95,15 +95,16 @@ def path_radiance(
     """Renders one light path.
 
     Args:
-      params: the model's parameters.
-      config: the model.
-      path: one path of the record.
-      jitter: of this path.
-      anneal: exponent on the proposals' weights, 0 for uniform sampling to 1 for full trust.
+      params: parameters of the model.
+      config: configuration of the model.
+      path: one light path.
+      jitter: jitter of the path.
+      anneal: exponent on the proposals' weights, from 0 for uniform sampling to 1 for the
+        proposals' distribution.
     """
     line = _polyline(config, path)
     warp = distance_warp(config, line)
-    # No interval straddles an interface, as far as there are edges enough.
+    # No interval straddles an interface, if there are enough edges.
     bends = warps.to_unit(warp, line.knots[1:])
     histograms = []
     for level, proposal in enumerate(config.proposals):
@@ -131,26 +132,26 @@ def path_radiance(
 
 
 def rounds(config: ModelConfig) -> int:
-    """Returns how many rounds of sampling a path takes, the final one included."""
+    """Returns the number of sampling levels, including the final one."""
     return len(config.proposals) + 1
 
 
 def distance_warp(config: ModelConfig, line: Polyline) -> warps.DistanceWarp:
-    """Returns the distance warp of a path: it ends where a scene that is not unbounded does.
+    """Returns the distance warp of a path, which ends at the scene bounds, if any.
 
-    The farthest distance counts from the last bend, so that a path that was turned around many
-    times still reaches the background.
+    The far distance is measured from the last bend, so that paths with many bends still reach the
+    background.
     """
     last = jnp.sum(jnp.isfinite(line.knots)) - 1
     leave = domains.exit_distance(domain(config), line.points[last], line.directions[last])
     far = line.knots[last] + jnp.where(jnp.isfinite(leave), leave, config.far)
-    # A camera on the very wall still leaves room for samples.
+    # Keep a minimum length for samples even if the camera is on the scene bounds.
     far = jnp.maximum(far, config.near + _SHORTEST * config.radius)
     return warps.DistanceWarp(config.near, far, config.radius)
 
 
 def domain(config: ModelConfig) -> domains.Domain:
-    """Returns the part of space that a model's fields store."""
+    """Returns the scene bounds of a model."""
     return domains.Domain(config.radius, config.space)
 
 
@@ -167,18 +168,18 @@ def _resample(
     anneal: Float[Array, ""],
     samples: int,
 ) -> Float[Array, " edges"]:
-    """Draws the next round's intervals where the last round saw light; evenly at first."""
+    """Samples the next level's intervals from the last histogram; uniformly at first."""
     strata = (jnp.arange(samples, dtype=offset.dtype) + 0.5 + offset) / samples
     if not histograms:
         ends = jnp.array([0.0, 1.0], offset.dtype)
         even = stepfun.sample_edges(strata, ends, jnp.ones_like(ends[:1]))
-        # Jitter must not cut the path short: its end is opaque, and would move with the noise.
+        # Jitter must not shorten the path: its end is opaque and would move with the noise.
         return even.at[jnp.array([0, -1])].set(ends)
     edges, weights = jax.lax.stop_gradient(histograms[-1])
     if config.dilation > 0.0:
         drawn = math.prod(histogram.weights.shape[-1] for histogram in histograms)
         edges, weights = stepfun.dilate(edges, weights, config.dilation / drawn + _DILATION_BIAS)
-    # Bins of no width stay empty; the others tend to equal weight as the exponent tends to 0.
+    # Bins of width 0 stay empty; the others tend to equal weight as the exponent tends to 0.
     trusted = jnp.where(jnp.diff(edges) > 0.0, weights**anneal, 0.0)
     return stepfun.sample_edges(strata, edges, trusted)
 
@@ -190,7 +191,7 @@ def _place(
     s: Float[Array, " edges"],
     rotation: Float[Array, ""],
 ) -> _Round:
-    """Puts intervals on the path and their cones into the field's unit cube."""
+    """Maps intervals to the path, and their multisamples to the field's unit cube."""
     t = warps.to_distance(warp, s)
     turns = rotation + _PATTERN_TURN * (jnp.arange(t.shape[0] - 1, dtype=t.dtype) % 2)
 
@@ -204,13 +205,13 @@ def _place(
 def _weigh(
     config: ModelConfig, density: Float[Array, " samples"], edges: Float[Array, " edges"]
 ) -> Float[Array, " samples"]:
-    """Turns densities into weights; the last interval is opaque, as the background is."""
+    """Converts densities to weights; the last interval is opaque, like the background."""
     lengths = jnp.diff(edges) / config.radius
     return compositing.opaque_end(compositing.alpha_weights(density, lengths))
 
 
 def _in_arc_length(line: Polyline, composite: compositing.Composite) -> compositing.Composite:
-    """Converts distances from the path's own coordinate to arc length."""
+    """Converts distances from the coordinate of the polyline to arc length."""
     arc = jax.vmap(lambda t: polylines.point_at(line, t).arc)
     median, mean = arc(jnp.stack([composite.median, composite.mean]))
     return composite._replace(median=median, mean=mean)

@@ -35,7 +35,7 @@ def test_other_rules_keep_what_is_outside(rule):
 
 @pytest.mark.parametrize("part", [-1, 2])
 def test_a_part_that_is_not_there_is_refused(part):
-    with pytest.raises(ValueError, match=f"part is {part}, but the scene has 2 .* 0 to 1"):
+    with pytest.raises(ValueError, match=f"part is {part}, but .* parts is 2. Give 0 to 1"):
         with_index(_glass_with_a_bubble(), 1.5, part=part)
 
 

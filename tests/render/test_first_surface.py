@@ -60,5 +60,5 @@ def test_an_empty_scene_and_no_rays_and_no_tile():
     surfaces = scenes.geometry(scenes.ball()).surfaces
     nothing = Rays(*(np.zeros((0, *shape), np.float32) for shape in ((3,), (3,), ())))
     assert find_first_surface(surfaces, nothing).distances.shape == (0,)
-    with pytest.raises(ValueError, match="casts nothing"):
+    with pytest.raises(ValueError, match="tile is"):
         find_first_surface(surfaces, nothing, tile=0)

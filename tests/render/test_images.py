@@ -106,7 +106,7 @@ def test_rays_may_have_any_leading_axes(model, rays, whole, shape):
 
 
 def test_a_chunk_of_nothing_is_refused(model, rays):
-    with pytest.raises(ValueError, match="chunk of 0"):
+    with pytest.raises(ValueError, match="chunk is 0"):
         render_image(model, rays, chunk=0)
 
 
