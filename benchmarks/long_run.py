@@ -22,8 +22,8 @@ import numpy as np
 from absl import app, flags, logging
 
 from experiments.runs import measured_runs
-from refref_jax.optics.budgets import BUDGETS
-from refref_jax.render.saved import load_model
+from refref_jax.optics.path_settings import BUDGETS
+from refref_jax.render.checkpoint_io import load_model
 from refref_jax.training import run_folder
 from refref_jax.training.presets import PRESETS
 

@@ -33,12 +33,12 @@ import jax.numpy as jnp
 import numpy as np
 from absl import app, flags
 
-from refref_jax.data import containment, meshes
-from refref_jax.data.geometry import build_geometry
+from refref_jax.data import mesh_queries, meshes
+from refref_jax.data.scene_assembly import build_geometry
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
-from refref_jax.optics.budgets import TREE
 from refref_jax.optics.light_paths import exists
+from refref_jax.optics.path_settings import TREE
 from tests import reference_images, reference_surfaces, reference_tree
 from tests.reference_surfaces import Embree, Hits, Surfaces
 
@@ -82,7 +82,7 @@ class _Library:
 
     def __init__(self, scene: Path, origins: np.ndarray, directions: np.ndarray):
         parts = meshes.read_meshes(scene)
-        parents = containment.find_containment(parts).parents
+        parents = mesh_queries.find_containment(parts).parents
         geometry = jax.tree.map(jnp.asarray, build_geometry(parts, parents, rule="nested"))
         radii = jnp.full(len(origins), 1e-3, jnp.float32)
         rays = Rays(jnp.asarray(origins), jnp.asarray(directions), radii)

@@ -22,16 +22,16 @@ from absl import app, flags
 
 from refref_jax.geometry.cameras import Cameras, focal_length
 from refref_jax.geometry.triangle_meshes import Mesh, make_mesh, volume
-from refref_jax.reconstruct.comparison import (
+from refref_jax.reconstruct.convex import depth_below_hull, hull
+from refref_jax.reconstruct.grids import find_isosurface
+from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.mesh_distance import (
     Distance,
     compare_meshes,
     silhouette_overlap,
     silhouettes,
 )
-from refref_jax.reconstruct.convex import depth_below_hull, hull
-from refref_jax.reconstruct.isosurface import find_isosurface
 from refref_jax.reconstruct.refinement import PAPER, Refinement, Stage, refine, remesh
-from refref_jax.reconstruct.silhouettes import Views
 from refref_jax.reconstruct.visual_hull import carve
 
 _VIEWS = flags.DEFINE_integer("views", 60, "Views to carve with.")

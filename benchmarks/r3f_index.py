@@ -16,7 +16,7 @@ from absl import app, flags
 from experiments.r3f import chain, index_stage, object_source
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import meshes
-from refref_jax.data.geometry import shaded_mesh
+from refref_jax.data.scene_assembly import shaded_mesh
 from refref_jax.geometry.triangle_meshes import Mesh
 
 _BODIES = {"true": 0.005, "masks": 0.02}

@@ -17,8 +17,8 @@ from absl import app, flags
 from experiments.r3f import chain, index_stage, light_stage, object_source
 from experiments.r3f.records import ReconstructionConfig
 from refref_jax.data import meshes
-from refref_jax.data.geometry import shaded_mesh
-from refref_jax.reconstruct.comparison import Distance, compare_meshes
+from refref_jax.data.scene_assembly import shaded_mesh
+from refref_jax.reconstruct.mesh_distance import Distance, compare_meshes
 
 _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folder of a scene.")
 _STEPS = flags.DEFINE_integer("steps", 60, "Steps of the descent.")

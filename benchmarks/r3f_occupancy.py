@@ -22,17 +22,20 @@ from absl import app, flags
 from jaxtyping import Bool
 from scipy.ndimage import binary_dilation, binary_erosion
 
-from refref_jax.data import local_layout
+from refref_jax.data import scene_folder
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.triangle_meshes import Mesh, make_mesh, volume
 from refref_jax.reconstruct import occupancy
-from refref_jax.reconstruct.agreement import without_outliers
-from refref_jax.reconstruct.comparison import Distance, compare_meshes, silhouette_overlap
-from refref_jax.reconstruct.grids import Grid
-from refref_jax.reconstruct.isosurface import find_isosurface
-from refref_jax.reconstruct.occupancy_config import OccupancyTrainingConfig
+from refref_jax.reconstruct.grids import Grid, find_isosurface
+from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.mesh_distance import (
+    Distance,
+    compare_meshes,
+    silhouette_overlap,
+    without_outliers,
+)
+from refref_jax.reconstruct.occupancy import OccupancyTrainingConfig
 from refref_jax.reconstruct.refinement import Refinement, refine
-from refref_jax.reconstruct.silhouettes import Views
 from refref_jax.reconstruct.visual_hull import carve
 
 Masks = Bool[np.ndarray, "views h w"]
@@ -57,8 +60,8 @@ def main(arguments: list[str]) -> None:
     del arguments
     scene = Path(_SCENE.value)
     truth = _true_mesh(scene)
-    frames, others = (local_layout.read_frames(scene, split) for split in ("train", "test"))
-    masks = local_layout.read_masks(frames)
+    frames, others = (scene_folder.read_frames(scene, split) for split in ("train", "test"))
+    masks = scene_folder.read_masks(frames)
     print("| masks | body | stage | Chamfer, % | normals, degrees: mean, 99 % | IoU | volume |")
     print("|---|---|---|---|---|---|---|")
     for kind in _MASKS.value:
@@ -100,11 +103,11 @@ def _altered(kind: str, masks: Masks) -> Masks:
 
 
 def _row(
-    names: tuple[str, ...], mesh: Mesh, truth: Mesh, others: local_layout.Frames
+    names: tuple[str, ...], mesh: Mesh, truth: Mesh, others: scene_folder.Frames
 ) -> tuple[Distance, float]:
     """Prints a row, and returns its distance and IoU."""
     cameras = others.cameras._replace(poses=others.cameras.poses[:_TEST_VIEWS])
-    expected = local_layout.read_masks(others)[:_TEST_VIEWS]
+    expected = scene_folder.read_masks(others)[:_TEST_VIEWS]
     found = compare_meshes(mesh, truth)
     overlap = float(silhouette_overlap(mesh, expected, cameras).mean())
     share = volume(*mesh[:2]) / volume(*truth[:2])

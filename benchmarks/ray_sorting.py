@@ -19,10 +19,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
 from refref_jax import numerics
-from refref_jax.geometry import boxes
+from refref_jax.geometry import bvh_nodes
 from refref_jax.geometry.bvh import BVH, Hits, closest_hits
-from refref_jax.geometry.native_loop import native_loop
 from refref_jax.geometry.rays import Rays
+from refref_jax.native_loop import native_loop
 
 _ORIGIN_BITS = 2
 _EXIT_BITS = 4
@@ -94,7 +94,7 @@ def _key(
     reciprocal = numerics.safe_reciprocal(direction)
     x, y, z = (jnp.where(direction < 0.0, lower, upper) - origin) * reciprocal
     leaving = origin + jnp.minimum(jnp.minimum(x, y), z) * direction
-    octant = boxes.octant(direction).astype(jnp.uint32)
+    octant = bvh_nodes.octant(direction).astype(jnp.uint32)
     start = _morton(origin, lower, upper, _ORIGIN_BITS)
     end = _morton(leaving, lower, upper, _EXIT_BITS)
     return (((octant << 3 * _ORIGIN_BITS) | start) << 3 * _EXIT_BITS) | end

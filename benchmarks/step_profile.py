@@ -22,16 +22,15 @@ import optax
 from absl import app, flags
 
 from benchmarks.training_setup import set_up_training, trace_pool
-from refref_jax import losses
 from refref_jax.fields import hash_grid, registry
 from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid
 from refref_jax.render import pixels
-from refref_jax.render.config import ModelConfig
-from refref_jax.render.transport import Histogram
+from refref_jax.render.model import ModelConfig
+from refref_jax.render.volume_rendering import Histogram
 from refref_jax.sampling import stepfun
 from refref_jax.sampling.cones import Gaussians
-from refref_jax.training import loop
-from refref_jax.training.state import optimizer
+from refref_jax.training import loop, objective
+from refref_jax.training.loop import optimizer
 
 _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folder of the scene.")
 _PRESET = flags.DEFINE_string("preset", "tiny", "Preset of the model.")
@@ -106,17 +105,17 @@ def _loss(params: tuple, setup: loop.Setup, pool: tuple) -> jax.Array:
     seen = pixels.render_pixels(
         params, model, traced.paths, jitter, rays=rgb.shape[0], anneal=jnp.ones(())
     )
-    total = losses.mean_squared_error(seen.rgb, rgb.astype(jnp.float32) / 255.0)
-    total += losses.hash_decay(hash_grid.tables(params))
+    total = objective.mean_squared_error(seen.rgb, rgb.astype(jnp.float32) / 255.0)
+    total += objective.hash_decay(hash_grid.tables(params))
     *proposals, final = seen.paths.histograms
-    total += jnp.mean(jax.vmap(losses.distortion)(final, seen.paths.outside))
+    total += jnp.mean(jax.vmap(objective.distortion)(final, seen.paths.outside))
     for proposal, blur in zip(proposals, config.losses.blurs, strict=True):
         total += _interlevel(final, proposal, blur)
     return total
 
 
 def _interlevel(final: Histogram, proposal: Histogram, blur: float) -> jax.Array:
-    return jnp.mean(jax.vmap(lambda a, b: losses.interlevel(a, b, blur=blur))(final, proposal))
+    return jnp.mean(jax.vmap(lambda a, b: objective.interlevel(a, b, blur=blur))(final, proposal))
 
 
 def _sampling(weights: list[jax.Array], blurs: tuple[float, ...]) -> jax.Array:

@@ -2,13 +2,12 @@
 
 from pathlib import Path
 
-from refref_jax.data import local_layout
+from refref_jax.data import scene_folder
 from refref_jax.data.batches import PixelSampler
 from refref_jax.training import loop
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.fit import prepare
-from refref_jax.training.state import TrainState, init_state
-from refref_jax.training.steps import Pool
+from refref_jax.training.loop import Pool, TrainState, init_state
 
 
 def set_up_training(scene: Path, *, preset: str, paths: str) -> tuple[loop.Setup, TrainState]:
@@ -21,8 +20,8 @@ def set_up_training(scene: Path, *, preset: str, paths: str) -> tuple[loop.Setup
     """
     asked = TrainConfig().override(scene=str(scene), preset=preset, paths=paths)
     (config, model, *_), geometry = prepare(asked)
-    frames = local_layout.read_frames(scene, "train")
-    images = local_layout.read_images(frames)
+    frames = scene_folder.read_frames(scene, "train")
+    images = scene_folder.read_images(frames)
     sampler = PixelSampler(images, frames.cameras, seed=config.seed, batch=config.schedule.batch)
     setup = loop.set_up(config, model.config, model.budget, geometry, sampler)
     return setup, init_state(config.seed, model.config, config.schedule)

@@ -24,9 +24,9 @@ with epy.lazy_imports():
     import numpy as np
 
     from refref_jax.data.nerfstudio import capture as nerfstudio
-    from refref_jax.data.nerfstudio import exporting as to_nerfstudio
-    from refref_jax.data.nerfstudio import importing as from_nerfstudio
-    from refref_jax.data.nerfstudio import placement
+    from refref_jax.data.nerfstudio import conversion
+    from refref_jax.data.nerfstudio import conversion as from_nerfstudio
+    from refref_jax.data.nerfstudio import conversion as to_nerfstudio
     from refref_jax.reconstruct import visual_hull
 
 _SOURCE = flags.DEFINE_string("source", None, "What to convert: a folder.", required=True)
@@ -69,7 +69,7 @@ def _make_scene(source: Path, out: Path) -> None:
     capture = nerfstudio.read_capture(source)
     poses = from_nerfstudio.positions(capture, original=_WORLD.value == "original")
     where = _chosen_placement(poses)
-    poses = placement.place(poses, where)
+    poses = conversion.place(poses, where)
     splits = capture.splits or nerfstudio.every_nth(len(capture.frames), every=_TEST_EVERY.value)
     views = {
         split: [from_nerfstudio.View(capture.frames[number], poses[number]) for number in numbers]
@@ -109,16 +109,16 @@ def _make_capture(source: Path, out: Path) -> None:
     print(f"Next: ns-train nerfacto --data {out}")
 
 
-def _chosen_placement(poses: np.ndarray) -> placement.Placement:
+def _chosen_placement(poses: np.ndarray) -> conversion.Placement:
     given = read_centre(_CENTRE.value)
-    centre = placement.meeting_point(poses) if given is None else np.array(given)
+    centre = conversion.meeting_point(poses) if given is None else np.array(given)
     scale = read_scale(_SCALE.value)
     if scale is None:
         distance = np.linalg.norm(poses[:, :, 3] - centre, axis=-1).mean()
         if distance == 0.0:
             raise ValueError("All cameras stand in the centre. Give --scale a number.")
-        return placement.Placement(centre, placement.USUAL_DISTANCE / distance)
-    return placement.Placement(centre, scale)
+        return conversion.Placement(centre, conversion.USUAL_DISTANCE / distance)
+    return conversion.Placement(centre, scale)
 
 
 def read_centre(word: str) -> list[float] | None:
@@ -180,7 +180,7 @@ def _tell_left_out(capture: nerfstudio.Capture, unlisted: int) -> None:
         print("warning: there are no test images, so nothing can be evaluated on them.")
 
 
-def _tell_placement(poses: np.ndarray, where: placement.Placement) -> None:
+def _tell_placement(poses: np.ndarray, where: conversion.Placement) -> None:
     centre = ",".join(f"{value:.6g}" for value in where.centre)
     print(f"World: x -> {where.scale:.6g} (x - ({centre})), which meshes have to go through too")
     distances = np.linalg.norm(poses[:, :, 3], axis=-1)

@@ -3,7 +3,7 @@
 python -m experiments.evaluate --run=runs/ball --split=test --rays_per_pixel=4
 
 With several rays a pixel colours are averaged as linear light, and a pixel's distance is the median
-of its rays'; see `refref_jax.render.supersampling`. `docs/metrics.md` explains each metric.
+of its rays'; see `refref_jax.render.images`. `docs/metrics.md` explains each metric.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ with epy.lazy_imports():
     from experiments.r3f import object_source
     from experiments.runs import evaluation as reporting
     from experiments.runs import perceptual
-    from refref_jax.data import files, scene_names
-    from refref_jax.render import saved
+    from refref_jax.data import image_files, scene_names
+    from refref_jax.render import checkpoint_io
     from refref_jax.training import evaluation, run_folder
 
 _RUN = cli_flags.run()
@@ -60,8 +60,8 @@ def main() -> None:
     lpips = perceptual.chosen(_LPIPS_WEIGHTS.value)
     config = run_folder.read_config(run)
     # Resolved first, and once: training may be going on.
-    step = _STEP.value if _STEP.value is not None else saved.latest_step(run)
-    model = saved.load_model(run, step=step)
+    step = _STEP.value if _STEP.value is not None else checkpoint_io.latest_step(run)
+    model = checkpoint_io.load_model(run, step=step)
     scene = cli_scenes.opened(_SCENE.value or config.scene.path)
     told = {
         "scene": scene_names.of_folder(scene),
@@ -102,8 +102,8 @@ def evaluate(
 
     def write(view: evaluation.EvaluatedView) -> None:
         seen = view.rendering
-        files.write_rgb(out / "rgb" / f"{view.name}.png", seen.rgb)
-        files.write_exr(out / "distance" / f"{view.name}.exr", seen.distance)
+        image_files.write_rgb(out / "rgb" / f"{view.name}.png", seen.rgb)
+        image_files.write_exr(out / "distance" / f"{view.name}.exr", seen.distance)
         if view.place in reporting.shown_views(view.count):
             target = view.target / 255.0
             views.append(comparison.Comparison(view.name, target, seen.rgb, seen.distance))

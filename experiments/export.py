@@ -31,9 +31,9 @@ with epy.lazy_imports():
     import numpy as np
 
     from experiments.exporting import field_mesh, object_meshes
-    from refref_jax.data import files
-    from refref_jax.reconstruct import isosurface
-    from refref_jax.render import saved
+    from refref_jax.data import image_files
+    from refref_jax.reconstruct import grids
+    from refref_jax.render import checkpoint_io
 
 _RUN = cli_flags.run()
 _WHAT = flags.DEFINE_enum("what", None, ["mesh", "points", "body"], "What to write.", required=True)
@@ -61,7 +61,7 @@ def main() -> None:
     if _WHAT.value == "body":
         written = object_meshes.write(run, out, overwrite=_OVERWRITE.value)
     else:
-        written = _write_field(saved.load_model(run, step=_STEP.value), out)
+        written = _write_field(checkpoint_io.load_model(run, step=_STEP.value), out)
     for path in written:
         print(f"Wrote:  {path}")
     print("Next: open it with Blender, MeshLab or CloudCompare: z is up.")
@@ -76,7 +76,7 @@ app.check(_OUT, _refuse_other_files)
 
 
 def _write_field(model: Model, out: Path) -> list[Path]:
-    isosurface.import_skimage()  # so that its lack is told before the work
+    grids.import_skimage()  # so that its lack is told before the work
     space, radius = model.config.space, model.config.radius
     half = _BOX.value or radius
     if space != "unbounded":
@@ -115,7 +115,7 @@ def _write_field(model: Model, out: Path) -> list[Path]:
 def _colours(model: Model, points: np.ndarray, normals: np.ndarray, spacing: float) -> np.ndarray:
     """Returns what is seen just below the surface by who looks straight at it, 8-bit sRGB."""
     below = points - 0.5 * spacing * normals
-    return files.to_bytes(field_mesh.look_up_points(model, below, -normals, width=spacing)[1])
+    return image_files.to_bytes(field_mesh.look_up_points(model, below, -normals, width=spacing)[1])
 
 
 if __name__ == "__main__":

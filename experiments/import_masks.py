@@ -17,13 +17,14 @@ from etils import epy
 from experiments.cli import app
 from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
+from refref_jax.data import SceneError
 
 if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Bool
 
 with epy.lazy_imports():
-    from refref_jax.data import errors, files, mask_import
+    from refref_jax.data import image_files, masks
 
 _SCENE = flags.DEFINE_string("scene", None, "The scene, in the local layout.", required=True)
 _MASKS = flags.DEFINE_string("masks", None, "Folder of the masks.", required=True)
@@ -35,18 +36,18 @@ def main() -> None:
     scene, folder, out = Path(_SCENE.value), Path(_MASKS.value), Path(_OUT.value)
     cli_scenes.check(scene)
     if not folder.is_dir():
-        raise errors.SceneError(f"{folder} is no folder. Give the folder that holds the masks.")
+        raise SceneError(f"{folder} is no folder. Give the folder that holds the masks.")
 
     def read(image: Path) -> Bool[np.ndarray, "h w"]:
         path = folder / image.relative_to(scene)
         if not path.is_file():
-            raise errors.SceneError(
+            raise SceneError(
                 f"There is no mask of {image}: {path} does not exist. Save it there, or take the "
                 "frame out of the transforms file."
             )
-        return files.read_mask(path)
+        return image_files.read_mask(path)
 
-    count = mask_import.add_masks(scene, out, read)
+    count = masks.add_masks(scene, out, read)
     print(f"Masks: {count}")
     print(f"Scene: {out}")
     print(f"Next: {app.shell('reconstruct', f'--scene={out}', f'--out={out}_r3f')}")

@@ -23,8 +23,8 @@ from experiments.cli.progress import ProgressBar
 from experiments.runs import refraction_indices
 from refref_jax import choices
 from refref_jax.data import scene_names
-from refref_jax.optics import budgets
-from refref_jax.optics.budgets import BUDGETS, Budget
+from refref_jax.optics import path_settings
+from refref_jax.optics.path_settings import BUDGETS, Budget
 
 if TYPE_CHECKING:
     from experiments.runs.known_scene import KnownScene
@@ -108,8 +108,8 @@ def chosen_budgets() -> list[tuple[str, str, Budget]]:
     """Returns sweep, name and budget of all settings to try; equal ones are in both sweeps."""
     cuts = sorted(_numbers("cuts", _CUTS.value, float), reverse=True)
     bends = sorted(_numbers("bends", _BENDS.value, int))
-    swept = [("cut", f"{cut:g}", budgets.budget_of("tree", cut=cut)) for cut in cuts]
-    swept += [("bends", str(n), budgets.budget_of("tree", bends=n)) for n in bends]
+    swept = [("cut", f"{cut:g}", path_settings.budget_of("tree", cut=cut)) for cut in cuts]
+    swept += [("bends", str(n), path_settings.budget_of("tree", bends=n)) for n in bends]
     points = [("budget", name, BUDGETS[name]) for name in ("straight", "paper")]
     return points + swept
 

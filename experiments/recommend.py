@@ -20,7 +20,7 @@ from experiments.cli import scenes as cli_scenes
 
 with epy.lazy_imports():
     from experiments.sweeps import recommend, table
-    from refref_jax.data import local_layout
+    from refref_jax.data import scene_folder
 
 _BUNDLED = Path(__file__).parent / "data" / "trade_off.csv"
 
@@ -39,7 +39,7 @@ def main() -> None:
     cli_scenes.check(_SCENE.value)
     rows = table.read(Path(_TABLE.value))
     scene = cli_scenes.opened(_SCENE.value)
-    images = len(local_layout.read_frames(scene, "test").names)
+    images = len(scene_folder.read_frames(scene, "test").names)
     base = table.base_of(rows)
     print(f"Timing {_TIMED_STEPS.value} steps of the table's base point ...", flush=True)
     timing = recommend.time_machine(scene, base, _TIMED_STEPS.value)

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 with epy.lazy_imports():
     from experiments.figures import comparison, video
-    from refref_jax.data import files, local_layout
+    from refref_jax.data import image_files, scene_folder
     from refref_jax.geometry import cameras
-    from refref_jax.render import saved, supersampling
+    from refref_jax.render import checkpoint_io, images
     from refref_jax.training import run_folder
 
 _RUN = cli_flags.run()
@@ -55,7 +55,7 @@ def main() -> None:
     outputs.replaceable(out, **place)
     cli_flags.check_run(run)
     cli_scenes.check(_SCENE.value)
-    model = saved.load_model(run, step=_STEP.value)
+    model = checkpoint_io.load_model(run, step=_STEP.value)
     seen_by, names = _cameras(run)
     with outputs.fresh(out, **place) as draft:
         written = render(model, seen_by, names, draft)
@@ -76,12 +76,12 @@ def render(model: Model, seen_by: cameras.Cameras, names: tuple[str, ...], out: 
     frames, distances = [], []
     with ProgressBar("render", len(names)) as bar:
         for i, name in enumerate(names):
-            seen = supersampling.render_camera(
+            seen = images.render_camera(
                 model, seen_by, i, rays_per_pixel=rays_per_pixel, chunk=chunk
             )
-            files.write_rgb(out / "rgb" / f"{name}.png", seen.rgb)
-            files.write_exr(out / "distance" / f"{name}.exr", seen.distance)
-            frames.append(files.to_bytes(seen.rgb))
+            image_files.write_rgb(out / "rgb" / f"{name}.png", seen.rgb)
+            image_files.write_exr(out / "distance" / f"{name}.exr", seen.distance)
+            frames.append(image_files.to_bytes(seen.rgb))
             distances.append(seen.distance)
             bar.show(i + 1, name)
     coloured = comparison.colour_distances(distances)
@@ -103,7 +103,7 @@ def _cameras(run: Path) -> tuple[cameras.Cameras, tuple[str, ...]]:
         )
         return around, tuple(f"r_{i:03d}" for i in range(_FRAMES.value))
     scene = cli_scenes.opened(_SCENE.value or run_folder.read_config(run).scene.path)
-    frames = local_layout.read_frames(scene, _VIEWS.value)
+    frames = scene_folder.read_frames(scene, _VIEWS.value)
     return frames.cameras, frames.names
 
 

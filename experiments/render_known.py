@@ -26,7 +26,7 @@ from experiments.cli import scenes as cli_scenes
 from experiments.cli.progress import ProgressBar
 from experiments.runs import refraction_indices
 from refref_jax import choices, configuration
-from refref_jax.optics.budgets import BUDGETS, Budget
+from refref_jax.optics.path_settings import BUDGETS, Budget
 
 if TYPE_CHECKING:
     from experiments.runs.known_scene import KnownScene, View
@@ -37,7 +37,7 @@ with epy.lazy_imports():
     from experiments.figures import comparison
     from experiments.runs import evaluation as reporting
     from experiments.runs import known_scene
-    from refref_jax.data import files
+    from refref_jax.data import image_files
     from refref_jax.training import evaluation
 
 _SCENE = cli_flags.scene("The scene")
@@ -112,7 +112,7 @@ def render(scene: KnownScene, budget: Budget, out: Path) -> dict[str, Any]:
     with ProgressBar("render", len(scene.indices)) as bar:
         for i, (index, name) in enumerate(zip(scene.indices, scene.frames.names, strict=True)):
             view = known_scene.render_view(scene, i, budget=budget, side=side)
-            files.write_rgb(out / "rgb" / f"{name}.png", view.rgb)
+            image_files.write_rgb(out / "rgb" / f"{name}.png", view.rgb)
             found = known_scene.measure(scene, i, view.rgb)
             views.append(view)
             measured.append({"index": index, "name": name, **found})

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 with epy.lazy_imports():
     from experiments.sweeps import points, sweep
-    from refref_jax.data import local_layout
+    from refref_jax.data import scene_folder
 
 _SCENE = cli_flags.scene("The scene")
 _OUT = cli_flags.out("Folder of the sweep.")
@@ -65,7 +65,7 @@ def main() -> None:
     # A sweep that is killed takes the training that it waits for with it.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     limit = () if _LIMIT.value is None else (f"--limit={_LIMIT.value}",)
-    images = len(local_layout.read_frames(scene, "test").names)
+    images = len(scene_folder.read_frames(scene, "test").names)
     images = min(images, _LIMIT.value or images)
     earlier = sweep.earlier_rows(out, chosen[0], scene, images=images)
     out.mkdir(parents=True, exist_ok=True)

@@ -20,7 +20,7 @@ from experiments.cli import scenes as cli_scenes
 from experiments.cli.progress import ProgressBar
 from experiments.r3f import training_body
 from experiments.runs import config_flags, processes
-from refref_jax.optics.budgets import budget_of
+from refref_jax.optics.path_settings import budget_of
 from refref_jax.training.config import TrainConfig
 
 _OUT = cli_flags.out("Folder to write the run to.")

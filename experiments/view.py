@@ -17,11 +17,11 @@ from etils import epy
 from experiments.cli import app
 from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
+from refref_jax.data import SceneError
 
 with epy.lazy_imports():
     from experiments.viewer import session
-    from refref_jax.data import errors
-    from refref_jax.render import saved
+    from refref_jax.render import checkpoint_io
     from refref_jax.training import run_folder
 
 _RUN = cli_flags.run()
@@ -93,7 +93,7 @@ def read_subject(heights: tuple[int, ...]) -> session.Subject:
     run = Path(_RUN.value)
     config = run_folder.read_config(run)
     scene = _scene(config.scene.path)
-    model = saved.load_model(run, step=_STEP.value)
+    model = checkpoint_io.load_model(run, step=_STEP.value)
     return session.Subject(
         name=run.resolve().name,
         model=model,
@@ -110,7 +110,7 @@ def _scene(trained_on: str) -> Path | None:
         return cli_scenes.opened(_SCENE.value)
     try:
         return cli_scenes.opened(trained_on)
-    except (errors.SceneError, OSError) as error:
+    except (SceneError, OSError) as error:
         print(f"warning: the scene of the run can not be read: {error}")
         return None
 

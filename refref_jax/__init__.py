@@ -16,25 +16,25 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # the same names for static type checkers; a test compares both lists
-    from refref_jax.data.errors import SceneError as SceneError
-    from refref_jax.data.geometry import assemble as assemble
-    from refref_jax.data.geometry import single_body as single_body
+    from refref_jax.data import SceneError as SceneError
     from refref_jax.data.meshes import MeshPart as MeshPart
     from refref_jax.data.meshes import read_meshes as read_meshes
-    from refref_jax.data.parts import make_part as make_part
+    from refref_jax.data.scene_assembly import assemble as assemble
+    from refref_jax.data.scene_assembly import make_part as make_part
+    from refref_jax.data.scene_assembly import single_body as single_body
     from refref_jax.geometry.cameras import Cameras as Cameras
     from refref_jax.geometry.cameras import image_rays as image_rays
     from refref_jax.geometry.cameras import orbit as orbit
     from refref_jax.geometry.rays import Rays as Rays
-    from refref_jax.optics.budgets import BUDGETS as BUDGETS
-    from refref_jax.optics.budgets import Budget as Budget
+    from refref_jax.optics.differentiable_paths import follow_branch as follow_branch
+    from refref_jax.optics.differentiable_paths import follow_main_branches as follow_main_branches
     from refref_jax.optics.light_paths import LightPaths as LightPaths
     from refref_jax.optics.light_paths import PathStatus as PathStatus
-    from refref_jax.optics.main_branches import follow_main_branches as follow_main_branches
+    from refref_jax.optics.path_settings import BUDGETS as BUDGETS
+    from refref_jax.optics.path_settings import Budget as Budget
     from refref_jax.optics.path_tracing import trace as trace
     from refref_jax.optics.scene import Scene as Scene
     from refref_jax.optics.scene import with_index as with_index
-    from refref_jax.optics.single_path import follow_branch as follow_branch
     from refref_jax.training.config import TrainConfig as TrainConfig
     from refref_jax.training.evaluation import evaluate as evaluate
     from refref_jax.training.fit import fit as fit
@@ -42,26 +42,26 @@ if TYPE_CHECKING:  # the same names for static type checkers; a test compares bo
 __version__ = "0.1.0"
 
 _HOMES = {
-    "BUDGETS": "optics.budgets",
-    "Budget": "optics.budgets",
+    "BUDGETS": "optics.path_settings",
+    "Budget": "optics.path_settings",
     "Cameras": "geometry.cameras",
     "LightPaths": "optics.light_paths",
     "MeshPart": "data.meshes",
     "PathStatus": "optics.light_paths",
     "Rays": "geometry.rays",
     "Scene": "optics.scene",
-    "SceneError": "data.errors",
+    "SceneError": "data",
     "TrainConfig": "training.config",
-    "assemble": "data.geometry",
+    "assemble": "data.scene_assembly",
     "evaluate": "training.evaluation",
     "fit": "training.fit",
-    "follow_branch": "optics.single_path",
-    "follow_main_branches": "optics.main_branches",
+    "follow_branch": "optics.differentiable_paths",
+    "follow_main_branches": "optics.differentiable_paths",
     "image_rays": "geometry.cameras",
-    "make_part": "data.parts",
+    "make_part": "data.scene_assembly",
     "orbit": "geometry.cameras",
     "read_meshes": "data.meshes",
-    "single_body": "data.geometry",
+    "single_body": "data.scene_assembly",
     "trace": "optics.path_tracing",
     "with_index": "optics.scene",
 }

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from refref_jax.optics.footprints import Spread
 from refref_jax.optics.light_paths import LightPaths, PathStatus
+from refref_jax.optics.ray_differentials import Spread
 
 
 def path(

@@ -8,9 +8,9 @@ import numpy as np
 import trimesh
 
 from refref_jax.data import meshes
-from refref_jax.data.containment import find_containment
-from refref_jax.data.geometry import build_geometry
+from refref_jax.data.mesh_queries import find_containment
 from refref_jax.data.meshes import MeshPart
+from refref_jax.data.scene_assembly import build_geometry
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.triangle_meshes import volume
 from refref_jax.optics import path_tracing

@@ -3,13 +3,12 @@
 import numpy as np
 
 from refref_jax.data.batches import PixelSampler
-from refref_jax.fields.density_field import DensityFieldConfig
 from refref_jax.fields.hash_grid import HashGridConfig
-from refref_jax.fields.radiance_field import RadianceFieldConfig
+from refref_jax.fields.zipnerf import DensityFieldConfig, RadianceFieldConfig
 from refref_jax.geometry.cameras import orbit
-from refref_jax.optics.budgets import PAPER
-from refref_jax.render.config import ModelConfig, ProposalConfig
-from refref_jax.render.saved import SavedModel
+from refref_jax.optics.path_settings import PAPER
+from refref_jax.render.checkpoint_io import SavedModel
+from refref_jax.render.model import ModelConfig, ProposalConfig
 from refref_jax.training.config import (
     LossConfig,
     PathsConfig,

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from refref_jax.data.geometry import build_geometry
-from refref_jax.optics.budgets import PAPER, TREE, Budget
+from refref_jax.data.scene_assembly import build_geometry
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics.path_settings import PAPER, TREE, Budget
 from tests import scenes
 from tests import stability_paths as paths
 from tests.reference_surfaces import unit

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
-from refref_jax.data.geometry import build_geometry
 from refref_jax.data.meshes import MeshPart
-from refref_jax.optics.budgets import Budget
+from refref_jax.data.scene_assembly import build_geometry
 from refref_jax.optics.interface_rules import NO_PARENT
+from refref_jax.optics.path_settings import Budget
 from tests import reference_surfaces, reference_tree, scenes
 
 MAIN = Budget(10, "none", live_per_ray=1.0, segments_per_ray=10.0, paths_per_ray=1.0)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
-from refref_jax.data import background, local_layout
+from refref_jax.data import background, scene_folder
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
-from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE, Budget
+from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, Budget
 from refref_jax.render import radiance_of, render_known
 from tests import reference, scenes
 from tests.backgrounds import CubeBackground
@@ -30,7 +30,7 @@ def _trace(geometry, rays, *, budget):
 @functools.cache
 def _render(scene, view, budget, *, oversampling=_FINE):
     """Renders a view of the test split; returns sRGB, and casts and paths a camera ray."""
-    frames = local_layout.read_frames(scene, "test")
+    frames = scene_folder.read_frames(scene, "test")
     rays = cameras.image_rays(cameras.supersample(frames.cameras, oversampling), view)
     radiance = radiance_of(background.read_background(scene))
     seen = render_known(scenes.read_geometry(scene), radiance, rays, budget=budget)
@@ -57,8 +57,8 @@ def _psnr(image, target, mask):
     ids=["straight", "refraction", "paper", "tree"],
 )
 def test_the_glass_ball_is_as_good_as_its_path_model(ball_scene, budget, at_least, at_most):
-    frames = local_layout.read_frames(ball_scene, "test")
-    masks = local_layout.read_masks(frames)
+    frames = scene_folder.read_frames(ball_scene, "test")
+    masks = scene_folder.read_masks(frames)
     values = []
     for view in (0, 10):
         target = iio.imread(frames.images[view])[..., :3] / 255.0
@@ -82,21 +82,21 @@ def test_the_walls_are_exact_to_8_bits(ball_scene, view, at_least):
 
     Decoding texels before interpolating them would give 33.4 and 36.9 dB.
     """
-    frames = local_layout.read_frames(ball_scene, "test")
+    frames = scene_folder.read_frames(ball_scene, "test")
     target = iio.imread(frames.images[view])[..., :3] / 255.0
     image, *_ = _render(ball_scene, view, STRAIGHT, oversampling=8)
-    away = ~binary_dilation(local_layout.read_masks(frames)[view], iterations=2)
+    away = ~binary_dilation(scene_folder.read_masks(frames)[view], iterations=2)
     assert _psnr(image, target, away) > at_least
 
 
 def test_the_first_surface_is_where_cycles_sees_it(ball_scene):
-    frames = local_layout.read_frames(ball_scene, "test")
-    distances = local_layout.read_distances(frames)[0]
+    frames = scene_folder.read_frames(ball_scene, "test")
+    distances = scene_folder.read_distances(frames)[0]
     rays = cameras.image_rays(frames.cameras, 0)
     flat = Rays(*(x.reshape(-1, *x.shape[2:]) for x in rays))
     paths = jax.tree.map(np.asarray, _trace(scenes.read_geometry(ball_scene), flat, budget=PAPER))
     ours = paths.tau[: distances.size, 1].reshape(distances.shape)
-    mask = local_layout.read_masks(frames)[0]
+    mask = scene_folder.read_masks(frames)[0]
     both = np.isfinite(ours) & mask
     # Both are of rays through the middles of pixels.
     assert np.sum(np.isfinite(ours) != mask) <= 1
@@ -104,10 +104,10 @@ def test_the_first_surface_is_where_cycles_sees_it(ball_scene):
 
 
 def test_the_walls_are_where_cycles_sees_them(ball_scene):
-    frames = local_layout.read_frames(ball_scene, "test")
-    distances = local_layout.read_distances(frames)[3].ravel()
+    frames = scene_folder.read_frames(ball_scene, "test")
+    distances = scene_folder.read_distances(frames)[3].ravel()
     rays = cameras.image_rays(frames.cameras, 3)
     origins, directions = (np.asarray(x, float).reshape(-1, 3) for x in rays[:2])
     _, ours = CubeBackground(ball_scene).look(origins, directions)
-    outside = ~local_layout.read_masks(frames)[3].ravel()
+    outside = ~scene_folder.read_masks(frames)[3].ravel()
     assert np.quantile(np.abs(ours - distances)[outside], 0.999) < 1e-4

@@ -35,15 +35,15 @@ _LONGEST_FUNCTION = 45
 
 _MAY_JIT = {
     "render/images.py",
-    "render/known.py",
+    "render/background_rendering.py",
     "render/first_surface.py",
     "render/pixel_paths.py",
-    "training/steps.py",
+    "training/loop.py",
     "training/evaluation.py",
-    "reconstruct/occupancy_training.py",
-    "geometry/native_loop.py",
+    "reconstruct/occupancy.py",
+    "native_loop.py",
     "reconstruct/light_refinement.py",
-    "reconstruct/photometry.py",
+    "reconstruct/refractive_index.py",
 }
 
 _VAGUE_NAMES = {"utils", "util", "misc", "helpers", "common", "math"}
@@ -123,8 +123,7 @@ def test_data_is_numpy_only(path):
     allowed = {
         "geometry.cameras",
         "geometry.rays",
-        "geometry.surface_build",
-        "geometry.corner_normals",
+        "geometry.surfaces",
         "geometry.triangle_meshes",
     }
     for name in _imports(path):

@@ -6,8 +6,8 @@ import pytest
 
 from experiments.benchmarking import settings
 from experiments.r3f import object_source, records
-from refref_jax.data import background, local_layout, meshes
-from refref_jax.render import saved
+from refref_jax.data import background, meshes, scene_folder
+from refref_jax.render import checkpoint_io
 from refref_jax.training import run_folder
 
 _TEXTS = {
@@ -24,9 +24,9 @@ _TEXTS = {
 }
 
 _READERS = {
-    "transforms_train.json": local_layout.check_scene,
+    "transforms_train.json": scene_folder.check_scene,
     "config.json": run_folder.read_config,
-    "model.json": saved.read_static,
+    "model.json": checkpoint_io.read_static,
     "body.json": object_source.read,
     "reconstruction.json": records.read,
     "benchmark.json": settings.read,

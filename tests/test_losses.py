@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax import losses
-from refref_jax.render.transport import Histogram
+from refref_jax.render.volume_rendering import Histogram
+from refref_jax.training import objective
 from tests import gradients, reference_sampling, transformations
 
 # A few float32 roundings.
@@ -34,16 +34,18 @@ def _even_histogram(weights):
 
 @functools.cache
 def _interlevel_blurred(blur):
-    return jax.jit(functools.partial(losses.interlevel, blur=blur))
+    return jax.jit(functools.partial(objective.interlevel, blur=blur))
 
 
 _interlevel = _interlevel_blurred(_BLUR)
 _interlevel_gradients = jax.jit(jax.grad(_interlevel, argnums=(0, 1)))
-_distortion = jax.jit(losses.distortion)
-_PHOTOMETRIC = {loss: jax.jit(loss) for loss in (losses.mean_squared_error, losses.charbonnier)}
+_distortion = jax.jit(objective.distortion)
+_PHOTOMETRIC = {
+    loss: jax.jit(loss) for loss in (objective.mean_squared_error, objective.charbonnier)
+}
 _PHOTOMETRIC_SLOPES = {loss: jax.jit(jax.value_and_grad(loss)) for loss in _PHOTOMETRIC}
-_hash_decay = jax.jit(losses.hash_decay)
-_distortion_gradient = jax.jit(jax.grad(losses.distortion))
+_hash_decay = jax.jit(objective.hash_decay)
+_distortion_gradient = jax.jit(jax.grad(objective.distortion))
 
 # --- photometric losses ---
 
@@ -53,7 +55,7 @@ def test_mean_squared_error_by_hand():
     target = jnp.array([[0.0, 0.0, 0.0], [0.2, 0.2, 0.5]])
     expected = (0.25 + 1.0 + 0.09) / 6.0
     np.testing.assert_allclose(
-        _PHOTOMETRIC[losses.mean_squared_error](rendered, target), expected, rtol=_ROUNDING
+        _PHOTOMETRIC[objective.mean_squared_error](rendered, target), expected, rtol=_ROUNDING
     )
 
 
@@ -61,7 +63,7 @@ def test_charbonnier_by_hand():
     rendered, target = jnp.array([[0.0, 0.003, 1.0]]), jnp.array([[0.0, 0.0, 0.0]])
     expected = (0.001 + np.sqrt(1e-5) + np.sqrt(1.0 + 1e-6)) / 3.0
     np.testing.assert_allclose(
-        _PHOTOMETRIC[losses.charbonnier](rendered, target), expected, rtol=_ROUNDING
+        _PHOTOMETRIC[objective.charbonnier](rendered, target), expected, rtol=_ROUNDING
     )
 
 
@@ -149,7 +151,7 @@ def test_interlevel_check_grads():
 
     def loss(weights):
         wide = [jnp.asarray(x, jnp.float64) for x in (*final, proposal.edges)]
-        return losses.interlevel(Histogram(*wide[:2]), Histogram(wide[2], weights), blur=_BLUR)
+        return objective.interlevel(Histogram(*wide[:2]), Histogram(wide[2], weights), blur=_BLUR)
 
     gradients.assert_numerical(loss, proposal.weights)
 
@@ -276,7 +278,7 @@ def test_distortion_is_finite_with_bins_of_no_width(weights):
 def test_distortion_check_grads():
     final, outside = _path_through_an_object()
     mask = jnp.asarray(outside, bool)
-    loss = lambda edges, weights: losses.distortion(Histogram(edges, weights), mask)
+    loss = lambda edges, weights: objective.distortion(Histogram(edges, weights), mask)
     gradients.assert_numerical(loss, *final)
 
 
@@ -285,20 +287,20 @@ def test_distortion_check_grads():
 
 def test_hash_decay_by_hand():
     tables = [jnp.array([[1.0, 2.0], [3.0, 4.0]]), jnp.array([[2.0, 0.0]])]
-    np.testing.assert_allclose(losses.hash_decay(tables), 7.5 + 2.0, rtol=_ROUNDING)
+    np.testing.assert_allclose(objective.hash_decay(tables), 7.5 + 2.0, rtol=_ROUNDING)
 
 
 def test_hash_decay_weighs_levels_alike_whatever_their_size():
     table = jnp.array([[1.0, -2.0], [0.5, 3.0]])
     repeated = jnp.concatenate([table] * 4)
     np.testing.assert_allclose(
-        losses.hash_decay([table]), losses.hash_decay([repeated]), rtol=_ROUNDING
+        objective.hash_decay([table]), objective.hash_decay([repeated]), rtol=_ROUNDING
     )
 
 
 def test_hash_decay_gradient_is_per_level():
     tables = [jnp.array([[1.0, 2.0], [3.0, 4.0]]), jnp.array([[2.0, 0.0]])]
-    first, second = jax.grad(losses.hash_decay)(tables)
+    first, second = jax.grad(objective.hash_decay)(tables)
     np.testing.assert_allclose(first, 2.0 * tables[0] / 4.0, rtol=_ROUNDING)
     np.testing.assert_allclose(second, [[2.0, 0.0]], rtol=_ROUNDING)
 
@@ -307,11 +309,11 @@ def test_hash_decay_takes_tables_of_any_sizes():
     # The shape checks look at one table of a list at random: ask them often.
     tables = [jnp.ones((2 + level, 1 + level % 2)) for level in range(8)]
     for _ in range(5):
-        assert losses.hash_decay(tables) == 8.0
+        assert objective.hash_decay(tables) == 8.0
 
 
 def test_hash_decay_without_tables_is_zero():
-    assert losses.hash_decay([]) == 0.0
+    assert objective.hash_decay([]) == 0.0
 
 
 # --- transformations ---
@@ -325,23 +327,23 @@ def _batch(make):
 _COLOURS = tuple(np.random.default_rng(0).uniform(size=(2, 3, 5, 3)).astype(np.float32))
 
 _CASES = {
-    "mean_squared_error": (losses.mean_squared_error, lambda: _COLOURS),
-    "charbonnier": (losses.charbonnier, lambda: _COLOURS),
+    "mean_squared_error": (objective.mean_squared_error, lambda: _COLOURS),
+    "charbonnier": (objective.charbonnier, lambda: _COLOURS),
     "interlevel": (
-        lambda final, proposal: losses.interlevel(final, proposal, blur=_BLUR),
+        lambda final, proposal: objective.interlevel(final, proposal, blur=_BLUR),
         lambda: (
             _batch(lambda rng: _random_histogram(rng, 12)),
             _batch(lambda rng: _random_histogram(rng, 9)),
         ),
     ),
     "distortion": (
-        losses.distortion,
+        objective.distortion,
         lambda: (
             _batch(lambda rng: _random_histogram(rng, 12)),
             _batch(lambda rng: rng.uniform(size=12) > 0.5),
         ),
     ),
-    "hash_decay": (lambda *tables: losses.hash_decay(list(tables)), lambda: _COLOURS),
+    "hash_decay": (lambda *tables: objective.hash_decay(list(tables)), lambda: _COLOURS),
 }
 
 

@@ -11,18 +11,17 @@ import numpy as np
 import pytest
 from jax import extend
 
-from refref_jax.data import containment, local_layout, meshes
-from refref_jax.data.geometry import build_geometry
-from refref_jax.data.needs import find_needs
+from refref_jax.data import mesh_queries, meshes, scene_folder
+from refref_jax.data.scene_analysis import find_needs
+from refref_jax.data.scene_assembly import build_geometry
 from refref_jax.geometry.cameras import image_rays
 from refref_jax.optics import path_tracing
-from refref_jax.optics.budgets import TREE
 from refref_jax.optics.media import SLOTS
-from refref_jax.render import pixels, transport
-from refref_jax.render.config import path_detail
-from refref_jax.render.model import init_params
-from refref_jax.sampling import domains
-from refref_jax.training import steps
+from refref_jax.optics.path_settings import TREE
+from refref_jax.render import pixels, volume_rendering
+from refref_jax.render.model import init_params, path_detail
+from refref_jax.sampling import scene_bounds
+from refref_jax.training import loop
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.resolve import SceneFacts, resolve
 from tests import made_paths, scenes
@@ -33,7 +32,7 @@ _BALL = scenes.ball(1.3, subdivisions=2)
 
 
 def _needs(*parts, rule="nested"):
-    tree = containment.find_containment(parts)
+    tree = mesh_queries.find_containment(parts)
     return find_needs(parts, tree, CAMERAS, rule=rule, space="bounded")
 
 
@@ -51,8 +50,8 @@ def _training_programs(geometry, budget):
     """Returns the operations of all programs of a run that know of the meshes."""
     batches = jax.tree.map(lambda x: x[None], _RAYS)
     detail = path_detail(dataclasses.replace(MODEL, interior="clear"), budget)
-    trace = steps.trace_pool.lower(geometry, batches, budget=budget, capacity=2048, detail=detail)
-    survey = steps.survey_paths.lower(geometry, _RAYS, budget=budget)
+    trace = loop.trace_pool.lower(geometry, batches, budget=budget, capacity=2048, detail=detail)
+    survey = loop.survey_paths.lower(geometry, _RAYS, budget=budget)
     return _operations(trace.as_text()) + _operations(survey.as_text())
 
 
@@ -86,8 +85,8 @@ def test_bounded_space_is_not_contracted(monkeypatch):
     def refuse(x):
         raise AssertionError(f"{x} is contracted")
 
-    monkeypatch.setattr(domains, "contract", refuse)
-    monkeypatch.setattr(domains, "shrinkage", refuse)
+    monkeypatch.setattr(scene_bounds, "contract", refuse)
+    monkeypatch.setattr(scene_bounds, "shrinkage", refuse)
     bounded = _render_operations(MODEL)
     rounds = len(MODEL.proposals) + 1
     # Each round contracts positions, and shrinks the Gaussians by powers of their distance.
@@ -125,13 +124,13 @@ def _samples_inside(model):
     """Counts the final samples that a path takes inside an object, on half of its way."""
     path = made_paths.path((2.0, 3.0), [(0.0, 0.0, -1.0)] * 3, (0, 1, 0), origin=(0.0, 0.0, 3.0))
     params = init_params(jax.random.key(0), model)
-    jitter = transport.Jitter(
-        jnp.zeros(transport.rounds(model)), jnp.zeros(transport.rounds(model))
+    jitter = volume_rendering.Jitter(
+        jnp.zeros(volume_rendering.rounds(model)), jnp.zeros(volume_rendering.rounds(model))
     )
 
     @jax.jit
     def outside(params, path):
-        return transport.path_radiance(params, model, path, jitter, jnp.zeros(())).outside
+        return volume_rendering.path_radiance(params, model, path, jitter, jnp.zeros(())).outside
 
     return int(np.sum(~np.asarray(outside(params, path))))
 
@@ -148,8 +147,8 @@ def test_only_a_field_inside_takes_samples_there():
 @pytest.mark.slow
 def test_light_that_leaves_the_bundled_ball_for_good_is_cast_less_often(ball_scene):
     parts = meshes.read_meshes(ball_scene)
-    tree = containment.find_containment(parts)
-    cameras = local_layout.read_frames(ball_scene, "train").cameras
+    tree = mesh_queries.find_containment(parts)
+    cameras = scene_folder.read_frames(ball_scene, "train").cameras
     found = find_needs(parts, tree, cameras, rule="nested", space="bounded")
     geometry = jax.tree.map(jnp.asarray, build_geometry(parts, tree.parents, rule="nested"))
     rays = jax.tree.map(

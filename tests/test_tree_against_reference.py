@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import budgets
+from refref_jax.optics import path_settings
 from refref_jax.optics.light_paths import PathStatus
 from tests import reference_images, reference_surfaces, reference_tree, scenes
 
@@ -31,9 +31,9 @@ _ROWS = 8
 _VIEWS = (0, 10)
 
 _RULES = [
-    (budgets.STRAIGHT, reference_tree.STRAIGHT),
-    pytest.param(budgets.PAPER, reference_tree.PAPER, marks=pytest.mark.slow),
-    (budgets.TREE, reference_tree.TREE),
+    (path_settings.STRAIGHT, reference_tree.STRAIGHT),
+    pytest.param(path_settings.PAPER, reference_tree.PAPER, marks=pytest.mark.slow),
+    (path_settings.TREE, reference_tree.TREE),
 ]
 
 

@@ -24,9 +24,9 @@ from experiments.benchmarking.methods import RECONSTRUCTION, Method, Need, same_
 from experiments.benchmarking.settings import Scene, Settings
 from experiments.cli import scenes as cli_scenes
 from refref_jax import configuration
-from refref_jax.data import local_layout, meshes, scene_names, transforms
-from refref_jax.data.needs import find_tints
-from refref_jax.data.part_descriptions import PartDescription, read_part_descriptions
+from refref_jax.data import meshes, scene_folder, scene_names
+from refref_jax.data.meshes import PartDescription, read_part_descriptions
+from refref_jax.data.scene_analysis import find_tints
 
 FOLDER = "jobs"
 RESULT = "result.json"
@@ -176,7 +176,7 @@ def is_done(out: Path, job: Job) -> bool:
 def _reasons(scene: Scene, methods: Sequence[Method], preset: str) -> dict[str, str]:
     """Returns why methods are left out, by name."""
     try:
-        local_layout.read_frames(Path(scene.path), SPLIT)
+        scene_folder.read_frames(Path(scene.path), SPLIT)
     except ValueError as error:
         return {method.name: f"its {SPLIT} views can not be read: {error}" for method in methods}
     needs = {need for method in methods for need in method.needs}
@@ -205,7 +205,9 @@ def _inside(scene: Path) -> dict[str, str]:
 
 
 def _has_no_masks(scene: Path) -> bool:
-    frames = transforms.get(transforms.read_json(scene / "transforms_train.json"), "frames", scene)
+    frames = scene_folder.get(
+        scene_folder.read_json(scene / "transforms_train.json"), "frames", scene
+    )
     return not any(isinstance(frame, dict) and "mask_file_path" in frame for frame in frames)
 
 

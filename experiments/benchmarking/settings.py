@@ -14,7 +14,7 @@ from typing import Any
 
 from experiments.benchmarking.methods import Method
 from refref_jax import atomic_files
-from refref_jax.data import transforms
+from refref_jax.data import scene_folder
 
 FILE = "benchmark.json"
 
@@ -100,7 +100,7 @@ def read(out: Path) -> Benchmark:
     path = out / FILE
     if not path.is_file():
         raise ValueError(f"{out} holds no benchmark. Give --scenes and --methods to begin one.")
-    record = transforms.read_json(path)
+    record = scene_folder.read_json(path)
     try:
         return Benchmark(
             Settings(**record["settings"]),

@@ -33,7 +33,7 @@ from experiments.cli.subprocesses import RunFailedError
 from experiments.r3f import records
 from experiments.runs import measured_runs
 from refref_jax import atomic_files, configuration
-from refref_jax.data import local_layout
+from refref_jax.data import scene_folder
 
 # Seconds that a command which outlived its benchmark may take to save and end: where others work
 # too, compiling alone takes minutes, and what compiles does not look up.
@@ -174,17 +174,17 @@ def _record(job: Job) -> Record:
     )
 
 
-def _frames(scene: Path) -> tuple[local_layout.Frames, dict[str, float]]:
+def _frames(scene: Path) -> tuple[scene_folder.Frames, dict[str, float]]:
     """Returns the test views, and how far each is from the training views, by name."""
-    frames = local_layout.read_frames(scene, SPLIT)
-    training = local_layout.read_frames(scene, "train").cameras.poses
+    frames = scene_folder.read_frames(scene, SPLIT)
+    training = scene_folder.read_frames(scene, "train").cameras.poses
     apart = pose_space.distances(np.asarray(frames.cameras.poses), np.asarray(training))
     return frames, {
         name: float(distance) for name, distance in zip(frames.names, apart, strict=True)
     }
 
 
-def _view(name: str, frames: local_layout.Frames, scene: Path) -> View:
+def _view(name: str, frames: scene_folder.Frames, scene: Path) -> View:
     """Returns where the files of a view are; see docs/benchmark.md."""
     i = frames.names.index(name)
 

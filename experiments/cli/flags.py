@@ -19,7 +19,7 @@ from etils import epy
 from experiments.cli import app
 from experiments.runs import processes, view_numbers
 from refref_jax import choices
-from refref_jax.optics.budgets import Budget, budget_of
+from refref_jax.optics.path_settings import Budget, budget_of
 
 with epy.lazy_imports():
     from experiments.r3f import records

@@ -10,8 +10,7 @@ from etils import epy
 
 from experiments.cli.flags import SCENE_FORMS
 from experiments.cli.progress import ProgressBar
-from refref_jax.data import scene_names
-from refref_jax.data.errors import SceneError
+from refref_jax.data import SceneError, scene_names
 
 with epy.lazy_imports():
     from refref_jax.data import scene_source

@@ -18,7 +18,7 @@ from experiments.dataset.landscapes import ENVIRONMENTS, make_environment
 from experiments.dataset.textures.faces import FACES, make_face
 from experiments.dataset.textures.spheres import SPHERES, make_sphere
 from refref_jax import atomic_files
-from refref_jax.data import files
+from refref_jax.data import image_files
 
 Kind = Literal["cube", "sphere", "env"]
 
@@ -85,7 +85,7 @@ def _write_cube(scene: Path, rng: np.random.Generator, size: int) -> dict[str, A
     faces = {}
     for (wall, (normal, u_axis, v_axis)), name in zip(_WALLS.items(), names, strict=True):
         image = f"{FOLDER}/face_{wall}.png"
-        _replace(scene / image, files.write_rgb, _face(name, size) / 255.0)
+        _replace(scene / image, image_files.write_rgb, _face(name, size) / 255.0)
         faces[wall] = {
             "image": image,
             "normal": list(normal),
@@ -98,14 +98,14 @@ def _write_cube(scene: Path, rng: np.random.Generator, size: int) -> dict[str, A
 
 def _write_sphere(scene: Path, rng: np.random.Generator, size: int) -> dict[str, Any]:
     name, image = str(rng.choice(list(SPHERES))), f"{FOLDER}/sphere.png"
-    _replace(scene / image, files.write_rgb, _sphere(name, size) / 255.0)
+    _replace(scene / image, image_files.write_rgb, _sphere(name, size) / 255.0)
     record = {"type": "sphere", "radius": HALF_EXTENT, "image": image, "texture": name}
     return record | {"mapping": _SPHERE_MAPPING}
 
 
 def _write_environment(scene: Path, rng: np.random.Generator, size: int) -> dict[str, Any]:
     name, image = str(rng.choice(list(ENVIRONMENTS))), f"{FOLDER}/env.exr"
-    _replace(scene / image, files.write_exr, _environment(name, size))
+    _replace(scene / image, image_files.write_exr, _environment(name, size))
     return {"type": "env", "image": image, "texture": name, "mapping": _ENVIRONMENT_MAPPING}
 
 
@@ -120,12 +120,12 @@ def _replace(
 # 8-bit images, since a worker keeps those of all its scenes.
 @functools.cache
 def _face(name: str, size: int) -> UInt8[np.ndarray, "size size 3"]:
-    return files.to_bytes(make_face(name, size))
+    return image_files.to_bytes(make_face(name, size))
 
 
 @functools.cache
 def _sphere(name: str, height: int) -> UInt8[np.ndarray, "height width 3"]:
-    return files.to_bytes(make_sphere(name, height))
+    return image_files.to_bytes(make_sphere(name, height))
 
 
 @functools.cache

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.dataset.checks import View
-from refref_jax.data import files
+from refref_jax.data import image_files
 
 _ERROR_GAIN = 4.0
 
@@ -109,6 +109,6 @@ def _figure(view: View) -> str:
 
 def _picture(rgb: Float[np.ndarray, "h w 3"]) -> str:
     stride = -(-max(rgb.shape[:2]) // _LARGEST_THUMBNAIL)
-    pixels = files.to_bytes(rgb[::stride, ::stride])
+    pixels = image_files.to_bytes(rgb[::stride, ::stride])
     data = base64.b64encode(iio.imwrite("<bytes>", pixels, plugin="pillow", extension=".png"))
     return f'<img alt="" src="data:image/png;base64,{data.decode()}">'

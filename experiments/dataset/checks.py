@@ -16,12 +16,12 @@ from scipy import ndimage
 
 from experiments.runs import known_scene
 from experiments.runs.known_scene import KnownScene
-from refref_jax.data import containment, files, lint, local_layout, meshes, transforms
-from refref_jax.data.containment import Containment
-from refref_jax.data.findings import Finding
+from refref_jax.data import image_files, mesh_checks, mesh_queries, meshes, scene_folder
+from refref_jax.data.mesh_checks import Finding
+from refref_jax.data.mesh_queries import Containment
 from refref_jax.data.meshes import MeshPart
 from refref_jax.geometry import cameras
-from refref_jax.optics.budgets import Budget
+from refref_jax.optics.path_settings import Budget
 from refref_jax.render.first_surface import FirstSurface, find_first_surface
 
 PSNR = 33.0
@@ -87,9 +87,9 @@ def check_files(scene: Path) -> list[Finding]:
     A scene made with `--preview` has one split only.
     """
     try:
-        local_layout.check_scene(scene, needed=())
+        scene_folder.check_scene(scene, needed=())
         for path in sorted(scene.glob("**/*.exr")):
-            files.read_exr(path)
+            image_files.read_exr(path)
     except ValueError as error:
         return [Finding("error", scene.name, str(error))]
     return []
@@ -103,8 +103,8 @@ def check_meshes(scene: Path) -> tuple[Meshes | None, list[Finding]]:
         return None, [Finding("error", scene.name, str(error))]
     if not parts:
         return None, [Finding("error", scene.name, "the scene has no meshes. Make it again.")]
-    tree = containment.find_containment(parts)
-    return Meshes(parts, tree), lint.lint(parts, tree)
+    tree = mesh_queries.find_containment(parts)
+    return Meshes(parts, tree), mesh_checks.lint(parts, tree)
 
 
 def read_views(scene: Path, made_of: Meshes, *, count: int) -> KnownScene:
@@ -112,12 +112,12 @@ def read_views(scene: Path, made_of: Meshes, *, count: int) -> KnownScene:
 
     The rule is that of `scene.json`, or `nested`.
     """
-    frames = local_layout.read_frames(scene, "test")
+    frames = scene_folder.read_frames(scene, "test")
     last = len(frames.names) - 1
     spread = np.linspace(0, last, min(count, last + 1)).round().astype(int)
     chosen = tuple(int(i) for i in np.unique(spread))
     path = scene / "scene.json"
-    rule = transforms.read_json(path).get("rule", "nested") if path.is_file() else "nested"
+    rule = scene_folder.read_json(path).get("rule", "nested") if path.is_file() else "nested"
     return known_scene.build_scene(scene, *made_of, frames=frames, chosen=chosen, rule=rule)
 
 
@@ -202,7 +202,7 @@ def _depth_errors(
     depths = scene.frames.depths
     if depths is None or depths[index].suffix != ".exr":
         return np.zeros(0)
-    return np.abs(traced[inner] - files.read_depth(depths[index])[inner])
+    return np.abs(traced[inner] - image_files.read_depth(depths[index])[inner])
 
 
 def _normal_degrees(
@@ -212,5 +212,5 @@ def _normal_degrees(
     path = image.parents[1] / "normal" / image.parent.name / f"{image.stem}.exr"
     if not path.is_file() or not inner.any():
         return np.nan
-    cosine = np.sum(files.read_exr(path) * first.normals, axis=-1)[inner]
+    cosine = np.sum(image_files.read_exr(path) * first.normals, axis=-1)[inner]
     return float(np.degrees(np.mean(np.arccos(np.clip(cosine, -1.0, 1.0)))))

@@ -12,7 +12,7 @@ from experiments.dataset import (
     scene_folders,
 )
 from experiments.dataset.scene_folders import FoundScene
-from refref_jax.data import file_names, scene_names
+from refref_jax.data import scene_folder, scene_names
 
 
 def check_room(scenes: Sequence[FoundScene], layout: str, out: Path) -> None:
@@ -68,7 +68,7 @@ def convert(
         if layout == "parquet":
             left = layout_parquet.write(contents, scene_names.parse(scene.name), out, step=step)
         else:
-            naming = file_names.plain if layout == "local" else file_names.raw
+            naming = scene_folder.plain if layout == "local" else scene_folder.raw
             layout_folders.write(
                 contents, folder_of(scene.name, layout, out), naming=naming, step=step
             )

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from experiments.dataset.cameras import Split
 from refref_jax import atomic_files
-from refref_jax.data import files
+from refref_jax.data import image_files
 
 # The published depth maps: white is 1 world unit, black 11.5 or more.
 _NEAREST_DEPTH, _DEPTH_RANGE = 1.0, 10.5
@@ -134,12 +134,12 @@ def to_srgb(linear: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
     """
     light = np.clip(linear, 0.0, 1.0).astype(np.float64)
     curved = 1.055 * np.maximum(light, _KNEE) ** (1.0 / 2.4) - 0.055
-    return files.to_bytes(np.where(light > _KNEE, curved, 12.92 * light))
+    return image_files.to_bytes(np.where(light > _KNEE, curved, 12.92 * light))
 
 
 def to_published_depth(depth: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
     """Encodes planar depth, world units, in 8 bits: 255 at 1, 0 at 11.5 and beyond."""
-    return files.to_bytes(1.0 - (depth.astype(np.float64) - _NEAREST_DEPTH) / _DEPTH_RANGE)
+    return image_files.to_bytes(1.0 - (depth.astype(np.float64) - _NEAREST_DEPTH) / _DEPTH_RANGE)
 
 
 def _read_layers(path: Path) -> dict[str, np.ndarray]:

@@ -7,8 +7,8 @@ from typing import Any
 
 from experiments.dataset.scene_contents import Frame, SceneContents
 from refref_jax import atomic_files
-from refref_jax.data import file_names
-from refref_jax.data.file_names import FrameFiles, Naming
+from refref_jax.data import scene_folder
+from refref_jax.data.scene_folder import FrameFiles, Naming
 
 
 def write(
@@ -30,7 +30,7 @@ def write(
             for number, frame in enumerate(frames):
                 records.append(_write_frame(frame, scene, naming(split, number)))
                 step()
-            file_names.write_transforms(scene, split, header | {"frames": records})
+            scene_folder.write_transforms(scene, split, header | {"frames": records})
         for place, path in contents.extras.items():
             _copy(path, scene / place)
 

@@ -2,7 +2,7 @@
 
 One row is one frame, the splits one after the other. The schema's metadata holds the features of
 `datasets`, so that it shows the columns as images, and the number of frames of each split. All
-other files that our readers can use are stored next to it, see `refref_jax.data.published_files`.
+other files that our readers can use are stored next to it, see `refref_jax.data.scene_source`.
 """
 
 import json
@@ -16,8 +16,7 @@ from typing import Any
 from experiments.dataset import scene_contents
 from experiments.dataset.scene_contents import Frame, SceneContents
 from refref_jax import atomic_files
-from refref_jax.data import parquet_scenes
-from refref_jax.data.errors import SceneError
+from refref_jax.data import SceneError, parquet_scenes
 from refref_jax.data.parquet_scenes import IMAGE_COLUMNS, POSE_COLUMN
 from refref_jax.data.scene_names import SceneName
 

@@ -12,8 +12,7 @@ from pathlib import Path
 import trimesh
 
 from refref_jax import atomic_files
-from refref_jax.data import meshes
-from refref_jax.data.errors import SceneError
+from refref_jax.data import SceneError, meshes
 from refref_jax.data.scene_names import CATEGORIES, SceneName
 
 

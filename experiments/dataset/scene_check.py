@@ -7,7 +7,7 @@ import numpy as np
 from experiments.cli import app
 from experiments.dataset import checks
 from experiments.dataset.check_page import SceneReport
-from refref_jax.optics.budgets import Budget
+from refref_jax.optics.path_settings import Budget
 
 _TRANSFORMS = "transforms_*.json"
 

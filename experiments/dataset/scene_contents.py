@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from refref_jax import configuration
-from refref_jax.data import file_names, local_layout, meshes, transforms
-from refref_jax.data.errors import SceneError
+from refref_jax.data import SceneError, meshes, scene_folder
 
 
 class Frame(NamedTuple):
@@ -60,8 +59,8 @@ def read(scene: Path) -> SceneContents:
     """
     present = [
         split
-        for split in local_layout.SPLITS
-        if split == "train" or (scene / file_names.TRANSFORMS.format(split)).is_file()
+        for split in scene_folder.SPLITS
+        if split == "train" or (scene / scene_folder.TRANSFORMS.format(split)).is_file()
     ]
     splits = {split: _read_split(scene, split) for split in present}
     known = {
@@ -71,7 +70,7 @@ def read(scene: Path) -> SceneContents:
         for path in frame[:-1]
         if path is not None
     }
-    known |= {(scene / file_names.TRANSFORMS.format(split)).resolve() for split in present}
+    known |= {(scene / scene_folder.TRANSFORMS.format(split)).resolve() for split in present}
     places = {path.relative_to(scene): path for path in sorted(scene.rglob("*")) if path.is_file()}
     extras = {
         place.as_posix(): path
@@ -96,8 +95,8 @@ def named_extras(contents: SceneContents) -> dict[str, Path]:
 
 
 def _read_split(scene: Path, split: str) -> Split:
-    local_layout.read_frames(scene, split)  # raises if a file is missing, or a pose is wrong
-    content = transforms.read_json(scene / file_names.TRANSFORMS.format(split))
+    scene_folder.read_frames(scene, split)  # raises if a file is missing, or a pose is wrong
+    content = scene_folder.read_json(scene / scene_folder.TRANSFORMS.format(split))
     records = content.pop("frames")
     return Split(tuple(_frame(scene, record) for record in records), content)
 

@@ -8,9 +8,8 @@ from typing import NamedTuple, TypeVar
 
 from experiments.cli import scenes as cli_scenes
 from experiments.dataset import scene_contents
-from refref_jax.data import parquet_scenes, published_files, scene_names, scene_source
-from refref_jax.data.errors import SceneError
-from refref_jax.data.published_files import LocalCopy
+from refref_jax.data import SceneError, parquet_scenes, scene_names, scene_source
+from refref_jax.data.scene_source import LocalCopy
 
 _T = TypeVar("_T")
 
@@ -48,7 +47,7 @@ def find(place: str, chosen: Sequence[str] | None = None) -> list[FoundScene]:
     if any(top.glob("transforms_*.json")):
         return _chosen([_in_folder(top)], chosen, place)
     copy = LocalCopy([top])
-    if names := published_files.scenes_in(copy):
+    if names := scene_source.scenes_in(copy):
         return [
             FoundScene(str(name), _images(copy, name), None, copy)
             for name in _wanted({str(name): name for name in names}, chosen, place)
@@ -89,7 +88,7 @@ def _in_folder(folder: Path) -> FoundScene:
 
 
 def _images(copy: LocalCopy, name: scene_names.SceneName) -> int:
-    shards = [copy.fetch(shard) for shard in published_files.find_shards(copy, name)]
+    shards = [copy.fetch(shard) for shard in scene_source.find_shards(copy, name)]
     return sum(parquet_scenes.read_contents(shards).frames.values())
 
 

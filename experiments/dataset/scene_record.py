@@ -14,7 +14,7 @@ from experiments.dataset.cameras import CAMERA_RADIUS
 from experiments.dataset.parts import ObjectPart
 from experiments.dataset.render_settings import RenderSettings
 from refref_jax.choices import NO_ABSORPTION, TwoSidedRule
-from refref_jax.data.containment import find_containment
+from refref_jax.data.mesh_queries import find_containment
 from refref_jax.data.meshes import INDEX_OF_REFRACTION, MeshPart
 from refref_jax.data.scene_names import SceneName
 from refref_jax.geometry.triangle_meshes import is_watertight

@@ -17,17 +17,15 @@ import trimesh
 from jaxtyping import Bool, Float, Int, UInt8
 
 from refref_jax.geometry.bvh import LEAF_SIZE
-from refref_jax.geometry.corner_normals import unit_vectors
 from refref_jax.geometry.rays import Rays
-from refref_jax.geometry.surface_build import build_surfaces
-from refref_jax.geometry.surfaces import Surfaces
-from refref_jax.geometry.triangle_meshes import vertex_vectors
+from refref_jax.geometry.surfaces import Surfaces, build_surfaces
+from refref_jax.geometry.triangle_meshes import unit_vectors, vertex_vectors
 from refref_jax.optics.scene import Scene
-from refref_jax.reconstruct import isosurface
+from refref_jax.reconstruct import grids
 from refref_jax.reconstruct.grids import Grid
 from refref_jax.render import Model, colour
-from refref_jax.render.field_points import look_up
 from refref_jax.render.first_surface import find_first_surface
+from refref_jax.render.volume_rendering import look_up
 
 CHUNK = 1 << 15
 """Number of points per query."""
@@ -231,7 +229,7 @@ def find_surface(density: Grid, *, level: float) -> DensitySurface:
       ValueError: if the density never has that level, or scikit-image is not installed.
     """
     thinness = _thinness(density, level)
-    vertices, faces = isosurface.march(thinness, density.spacing)
+    vertices, faces = grids.march(thinness, density.spacing)
     vertices = density.low + vertices
     return DensitySurface(vertices, faces, unit_vectors(vertex_vectors(vertices, faces)))
 

@@ -10,10 +10,10 @@ import numpy as np
 from experiments.cli import outputs
 from experiments.exporting.field_mesh import split_parts
 from experiments.r3f import object_source, records
-from refref_jax.data import stored_normals
+from refref_jax.data import meshes
 from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.optics.scene import Scene
-from refref_jax.render.saved import load_geometry
+from refref_jax.render.checkpoint_io import load_geometry
 
 
 def write(run: Path, out: Path, *, overwrite: bool) -> list[Path]:
@@ -47,7 +47,7 @@ def write(run: Path, out: Path, *, overwrite: bool) -> list[Path]:
         outputs.check_file(path, overwrite=overwrite)
     for path, mesh in zip(paths, found, strict=True):
         with outputs.fresh_file(path, overwrite=overwrite) as draft:
-            stored_normals.write_mesh(draft, *mesh)
+            meshes.write_mesh(draft, *mesh)
     return paths
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
-from refref_jax.data.errors import SceneError
+from refref_jax.data import SceneError
 from refref_jax.data.meshes import MeshPart
 from refref_jax.geometry.rays import Rays
 from refref_jax.render.pixel_paths import PixelPaths

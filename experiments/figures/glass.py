@@ -22,12 +22,12 @@ from refref_jax.data import meshes
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.budgets import BUDGETS, Budget
+from refref_jax.optics.path_settings import BUDGETS, Budget
 from refref_jax.optics.scene import Scene
 from refref_jax.render.first_surface import find_first_surface
 from refref_jax.render.pixel_paths import PixelPaths, trace_pixel
-from refref_jax.sampling import domains
-from refref_jax.sampling.domains import Domain
+from refref_jax.sampling import scene_bounds
+from refref_jax.sampling.scene_bounds import Domain
 
 _NAMES = {"straight": "straight rays", "paper": "the paper's paths", "tree": "the path tree"}
 
@@ -157,7 +157,7 @@ def _walls(
     geometry: Scene, rays: Rays, half: float
 ) -> tuple[Float[Array, " rays"], Float[Array, " rays"]]:
     """Returns the arc length of light to the background, straight and refracted."""
-    leave = jax.vmap(functools.partial(domains.exit_distance, Domain(half, "bounded")))
+    leave = jax.vmap(functools.partial(scene_bounds.exit_distance, Domain(half, "bounded")))
     # Without reflections every ray has one path.
     ends = path_tracing.trace_ends(geometry, rays, budget=BUDGETS["paper_no_reflection"]).ends
     reached = jax.numpy.where(

@@ -9,9 +9,9 @@ from pathlib import Path
 from experiments.r3f import geometry_stage, index_stage, light_stage, object_source, records, report
 from experiments.r3f.records import IndexFacts, LightFacts, Reconstruction, ReconstructionConfig
 from refref_jax import atomic_files, configuration
-from refref_jax.data import local_layout, scene_names
+from refref_jax.data import scene_folder, scene_names
 from refref_jax.data.meshes import MeshPart
-from refref_jax.reconstruct.isosurface import import_skimage
+from refref_jax.reconstruct.grids import import_skimage
 
 INDEX_FILE = "index.json"
 _INDEX_FOLDER = "index"
@@ -42,14 +42,14 @@ def reconstruct(
     """
     import_skimage()
     for split in _splits(config):
-        masks = local_layout.read_masks(local_layout.read_frames(scene, split))
+        masks = scene_folder.read_masks(scene_folder.read_frames(scene, split))
         if config.outliers >= len(masks):
             raise ValueError(
                 f"--outliers={config.outliers}, but there are {len(masks)} {split} masks. Give "
                 "fewer."
             )
     # So that a broken one is told now, and not at the end.
-    local_layout.read_masks(report.judging_frames(scene)[1])
+    scene_folder.read_masks(report.judging_frames(scene)[1])
     asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene), config)
     found = records.begin(out, asked)
     with atomic_files.hold(out):
@@ -100,7 +100,7 @@ def fingerprint(scene: Path) -> str:
       ValueError: if a file is missing, or the transforms file is broken.
     """
     found = hashlib.sha256()
-    frames = local_layout.read_frames(scene, "train")
+    frames = scene_folder.read_frames(scene, "train")
     found.update(frames.cameras.poses.tobytes())
     found.update(repr(frames.cameras.focal).encode())
     for path in (*frames.images, *(frames.masks or ())):

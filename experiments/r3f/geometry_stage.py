@@ -11,16 +11,14 @@ import numpy as np
 from experiments.cli.progress import ProgressBar
 from experiments.r3f.records import GeometryFacts, ReconstructionConfig
 from refref_jax import atomic_files
-from refref_jax.data import local_layout, scene_names, stored_normals
+from refref_jax.data import meshes, scene_folder, scene_names
 from refref_jax.geometry.triangle_meshes import Mesh, diameter, volume
 from refref_jax.reconstruct import occupancy, visual_hull
-from refref_jax.reconstruct.agreement import carved_alone, without_outliers
-from refref_jax.reconstruct.comparison import silhouette_overlap
-from refref_jax.reconstruct.grids import Grid
-from refref_jax.reconstruct.isosurface import find_isosurface
-from refref_jax.reconstruct.occupancy_config import OccupancyTrainingConfig
+from refref_jax.reconstruct.grids import Grid, find_isosurface
+from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.mesh_distance import carved_alone, silhouette_overlap, without_outliers
+from refref_jax.reconstruct.occupancy import OccupancyTrainingConfig
 from refref_jax.reconstruct.refinement import Refinement, refine
-from refref_jax.reconstruct.silhouettes import Views
 
 FOLDER = "geometry"
 
@@ -70,8 +68,8 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
     Raises:
       ValueError: if there are no masks, or no body fits them.
     """
-    frames = local_layout.read_frames(scene, "train")
-    views = Views(local_layout.read_masks(frames), frames.cameras)
+    frames = scene_folder.read_frames(scene, "train")
+    views = Views(scene_folder.read_masks(frames), frames.cameras)
     names = [_within(path, scene).as_posix() for path in frames.masks]
     cut = find_isosurface(GEOMETRIES[config.geometry](views, names, config))
     trusted = without_outliers(cut, views, config.outliers)
@@ -80,7 +78,7 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
     befores = [cut, *(stage.mesh for stage in refined)]
     name = f"{_object(scene)}_{MATERIAL}.ply"
     with atomic_files.written_folder(out / FOLDER) as folder:
-        stored_normals.write_mesh(folder / name, *mesh)
+        meshes.write_mesh(folder / name, *mesh)
     return GeometryFacts(
         mesh=name,
         masks=len(views.masks),

@@ -21,24 +21,24 @@ from experiments.cli.progress import ProgressBar
 from experiments.figures import style
 from experiments.figures.style import COLOURS, pyplot
 from refref_jax.choices import Space
-from refref_jax.data import local_layout, mask_margins
-from refref_jax.data.geometry import build_geometry
+from refref_jax.data import masks, scene_folder
+from refref_jax.data.scene_assembly import build_geometry
 from refref_jax.geometry.cameras import pixel_rays
-from refref_jax.geometry.surface_build import pack_meshes
+from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import Mesh
-from refref_jax.optics.budgets import STRAIGHT
 from refref_jax.optics.interface_rules import NO_PARENT, nested
+from refref_jax.optics.path_settings import STRAIGHT
 from refref_jax.optics.scene import Scene
-from refref_jax.reconstruct.index_search import (
+from refref_jax.reconstruct.refractive_index import (
+    Evidence,
     IndexEstimate,
     IndexSearch,
     estimate_index,
     most_looks,
 )
-from refref_jax.reconstruct.photometry import Evidence
-from refref_jax.render import saved
+from refref_jax.render import checkpoint_io
+from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Model
-from refref_jax.render.saved import SavedModel
 from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.resolve import read_facts, resolve
@@ -81,8 +81,8 @@ def look(scene: Path, split: str, model: Model, *, seed: int, rays: int) -> Body
     Raises:
       ValueError: if there are no masks, or they are too thin to have an inside.
     """
-    frames = local_layout.read_frames(scene, split)
-    inside = mask_margins.well_inside(local_layout.read_masks(frames))
+    frames = scene_folder.read_frames(scene, split)
+    inside = masks.well_inside(scene_folder.read_masks(frames))
     if not inside.any():
         raise ValueError(
             f"No pixel of the {split} views of {scene} lies inside of a mask and off its outline. "
@@ -96,7 +96,7 @@ def look(scene: Path, split: str, model: Model, *, seed: int, rays: int) -> Body
         picked = generator.choice(places, min(each, len(places)), replace=False)
         chosen.append(picked + view * mask.size)
     view, row, column = np.unravel_index(np.concatenate(chosen), inside.shape)
-    rgb = local_layout.read_images(frames)[view, row, column].astype(np.float32) / 255.0
+    rgb = scene_folder.read_images(frames)[view, row, column].astype(np.float32) / 255.0
     seen = pixel_rays(frames.cameras, view, row, column)
     return BodyPixels(Evidence(model.params, *jax.device_put((seen, rgb))), view)
 
@@ -195,7 +195,7 @@ def learn_background(
     if not run_folder.exists(run):
         empty = build_geometry([], [], rule="nested")
         run_folder.create(run, resolved.config, wanted, empty)
-    elif saved.read_static(run) != wanted:
+    elif checkpoint_io.read_static(run) != wanted:
         raise ValueError(
             f"{run} was begun with another --background or --radius than are given now. Give those "
             "again, or remove that folder to have the background learned anew."
@@ -209,7 +209,7 @@ def learn_background(
         )
     if not ended:
         raise KeyboardInterrupt
-    return saved.load_model(run)
+    return checkpoint_io.load_model(run)
 
 
 def draw(path: Path, found: IndexEstimate) -> None:

@@ -16,11 +16,11 @@ from experiments.r3f import index_stage
 from experiments.r3f.index_stage import BodyPixels
 from experiments.r3f.records import IndexFacts, LightFacts
 from refref_jax import atomic_files
-from refref_jax.data import stored_normals
+from refref_jax.data import meshes
 from refref_jax.geometry.triangle_meshes import Mesh
-from refref_jax.reconstruct import photometry
+from refref_jax.reconstruct import refractive_index
 from refref_jax.reconstruct.light_refinement import LightRefinement, refine_by_light
-from refref_jax.reconstruct.soundness import objection
+from refref_jax.reconstruct.refinement import objection
 from refref_jax.render.model import Model
 
 FOLDER = "light"
@@ -70,7 +70,7 @@ def run(
     kept = after < before and not objection(mesh, found.mesh, _VOLUME_CHANGE)
     if kept:
         with atomic_files.written_folder(target.parent) as folder:
-            stored_normals.write_mesh(folder / target.name, *found.mesh)
+            meshes.write_mesh(folder / target.name, *found.mesh)
     return LightFacts(steps, kept, before, after, found.index, found.furthest)
 
 
@@ -85,7 +85,7 @@ def find_judges(scene: Path, model: Model, *, seed: int) -> BodyPixels:
 
 def judge(mesh: Mesh, index: float, judges: BodyPixels, model: Model) -> float:
     """Returns the mean error of the judging pixels in sRGB, with the body's own tree."""
-    errors = photometry.errors_at_index(
+    errors = refractive_index.errors_at_index(
         np.float32(index),
         judges.evidence,
         index_stage.body_geometry(mesh, index),

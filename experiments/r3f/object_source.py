@@ -12,8 +12,8 @@ from experiments.r3f import geometry_stage, light_stage
 from experiments.r3f.records import IndexFacts, Reconstruction
 from refref_jax import configuration
 from refref_jax.data import meshes
-from refref_jax.data.geometry import shaded_mesh
 from refref_jax.data.meshes import MeshPart
+from refref_jax.data.scene_assembly import shaded_mesh
 from refref_jax.geometry.triangle_meshes import Mesh
 
 _FILE = "body.json"

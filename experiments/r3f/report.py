@@ -16,18 +16,16 @@ from experiments.r3f import object_source, report_figures
 from experiments.r3f.records import DistanceFacts, IndexFacts, Reconstruction, ReportFacts
 from experiments.r3f.report_figures import Outline, SurfaceView, Window
 from refref_jax import atomic_files
-from refref_jax.data import containment, local_layout, meshes
-from refref_jax.data.errors import SceneError
-from refref_jax.data.geometry import shaded_mesh
-from refref_jax.data.local_layout import Frames
+from refref_jax.data import SceneError, mesh_queries, meshes, scene_folder
+from refref_jax.data.scene_assembly import shaded_mesh
+from refref_jax.data.scene_folder import Frames
 from refref_jax.geometry.cameras import Cameras, image_rays
 from refref_jax.geometry.rays import Rays
-from refref_jax.geometry.surface_build import pack_meshes
+from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import Mesh, diameter, join
 from refref_jax.optics.interface_rules import NO_PARENT
-from refref_jax.reconstruct.closest import signed_distance
-from refref_jax.reconstruct.comparison import compare_meshes, silhouettes
-from refref_jax.reconstruct.silhouettes import overlaps
+from refref_jax.reconstruct.masks import overlaps
+from refref_jax.reconstruct.mesh_distance import compare_meshes, signed_distance, silhouettes
 from refref_jax.render.first_surface import FirstSurface, find_first_surface
 
 FOLDER = "pictures"
@@ -98,14 +96,14 @@ def judging_frames(scene: Path) -> tuple[str, Frames]:
     """
     for split in _SPLITS[:-1]:
         if (scene / f"transforms_{split}.json").is_file():
-            frames = local_layout.read_frames(scene, split)
+            frames = scene_folder.read_frames(scene, split)
             if frames.masks is not None:
                 return split, frames
-    return _SPLITS[-1], local_layout.read_frames(scene, _SPLITS[-1])
+    return _SPLITS[-1], scene_folder.read_frames(scene, _SPLITS[-1])
 
 
 def _outlines(mesh: Mesh, frames: Frames) -> list[Outline]:
-    masks, images = local_layout.read_masks(frames), local_layout.read_images(frames)
+    masks, images = scene_folder.read_masks(frames), scene_folder.read_images(frames)
     seen = silhouettes(mesh, frames.cameras)
     shares = overlaps(seen, masks)
     return [
@@ -122,7 +120,7 @@ def _read_truth(scene: Path) -> _Truth:
         return _Truth(None, f"The scene's meshes could not be read: {error}")
     if not parts:
         return _Truth(None, "The scene has no meshes to compare with.")
-    parents = containment.find_containment(parts).parents
+    parents = mesh_queries.find_containment(parts).parents
     outer = [part for part, parent in zip(parts, parents, strict=True) if parent == NO_PARENT]
     joined = join([shaded_mesh(part) for part in outer])
     names = ", ".join(f"{part.name}.ply" for part in outer)
@@ -134,7 +132,7 @@ def _read_truth(scene: Path) -> _Truth:
 def _surface_views(mesh: Mesh, truth: Mesh | None, frames: Frames) -> list[SurfaceView]:
     """Returns what a few cameras see, in windows around the object."""
     chosen = np.unique(np.linspace(0, len(frames.names) - 1, _ROWS).astype(int)).tolist()
-    images = local_layout.read_images(
+    images = scene_folder.read_images(
         frames._replace(images=tuple(frames.images[i] for i in chosen))
     )
     cameras = _resized(frames.cameras, _HEIGHT)

@@ -4,8 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from refref_jax.data import files
-from refref_jax.data.errors import SceneError
+from refref_jax.data import SceneError, image_files
 from refref_jax.training import evaluation
 from refref_jax.training.evaluation import Perceptual
 
@@ -73,13 +72,13 @@ def compare(pairs: Sequence[Pair], perceptual: Perceptual) -> Iterator[dict[str,
       SceneError: if a file is broken.
     """
     for pair in pairs:
-        mask = None if pair.mask is None else files.read_mask(pair.mask)
+        mask = None if pair.mask is None else image_files.read_mask(pair.mask)
         row: dict[str, Any] = {NAME: pair.name}
         if pair.images is not None:
-            rendered, target = (files.read_rgb(path) / 255.0 for path in pair.images)
+            rendered, target = (image_files.read_rgb(path) / 255.0 for path in pair.images)
             row |= evaluation.measure_colours(rendered, target, mask, perceptual)
         if pair.distances is not None:
-            seen, true = (files.read_depth(path) for path in pair.distances)
+            seen, true = (image_files.read_depth(path) for path in pair.distances)
             row |= evaluation.measure_distances("distance", seen, true, mask)
         yield row
 
@@ -132,7 +131,7 @@ def _check_sizes(pair: Pair) -> None:
     for kind in (pair.images, pair.distances):
         if kind is None:
             continue
-        sizes = {path: files.read_size(path) for path in (*kind, *masks)}
+        sizes = {path: image_files.read_size(path) for path in (*kind, *masks)}
         first, (height, width) = next(iter(sizes.items()))
         for path, (other_height, other_width) in sizes.items():
             if (other_height, other_width) != (height, width):

@@ -11,18 +11,18 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from experiments.runs import view_numbers
 from refref_jax import metrics
-from refref_jax.data import background, containment, local_layout, meshes, rule_advice, scene_names
-from refref_jax.data.containment import Containment
-from refref_jax.data.geometry import build_geometry
+from refref_jax.data import background, mesh_checks, mesh_queries, meshes, scene_folder, scene_names
+from refref_jax.data.mesh_queries import Containment
 from refref_jax.data.meshes import MeshPart
+from refref_jax.data.scene_assembly import build_geometry
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics.budgets import Budget
 from refref_jax.optics.media import interior_slots
+from refref_jax.optics.path_settings import Budget
 from refref_jax.optics.scene import Scene
 from refref_jax.render import colour
+from refref_jax.render.background_rendering import TILE, KnownRendering, render_known
 from refref_jax.render.backgrounds import Radiance, radiance_of
-from refref_jax.render.known import TILE, KnownRendering, render_known
 
 
 class KnownScene(NamedTuple):
@@ -42,7 +42,7 @@ class KnownScene(NamedTuple):
     name: str
     geometry: Scene
     radiance: Radiance
-    frames: local_layout.Frames
+    frames: scene_folder.Frames
     indices: tuple[int, ...]
     images: UInt8[np.ndarray, "views h w 3"]
     masks: Bool[np.ndarray, "views h w"] | None
@@ -82,11 +82,11 @@ def read_scene(
     Raises:
       ValueError: if anything is missing or broken, or there is no such view.
     """
-    frames = local_layout.read_frames(scene, split)
+    frames = scene_folder.read_frames(scene, split)
     chosen = view_numbers.choose(views, len(frames.names))
     parts = meshes.read_meshes(scene, indices=indices)
-    tree = containment.find_containment(parts)
-    print("\n".join(rule_advice.check_meshes(parts, tree, rule=rule)))
+    tree = mesh_queries.find_containment(parts)
+    print("\n".join(mesh_checks.check_meshes(parts, tree, rule=rule)))
     return build_scene(scene, parts, tree, frames=frames, chosen=chosen, rule=rule)
 
 
@@ -95,7 +95,7 @@ def build_scene(
     parts: Sequence[MeshPart],
     tree: Containment,
     *,
-    frames: local_layout.Frames,
+    frames: scene_folder.Frames,
     chosen: Sequence[int],
     rule: str,
 ) -> KnownScene:
@@ -120,10 +120,10 @@ def build_scene(
         radiance=jax.device_put(radiance_of(background.read_background(scene))),
         frames=frames,
         indices=tuple(chosen),
-        images=local_layout.read_images(frames),
-        masks=local_layout.read_masks(frames) if frames.masks else None,
+        images=scene_folder.read_images(frames),
+        masks=scene_folder.read_masks(frames) if frames.masks else None,
         inside=(
-            containment.parts_around(parts, frames.cameras.poses[:, :, 3])
+            mesh_queries.parts_around(parts, frames.cameras.poses[:, :, 3])
             if interior_slots(geometry.interfaces)
             else None
         ),
@@ -185,11 +185,11 @@ def _render(scene: KnownScene, view: int, rays: Rays, budget: Budget) -> KnownRe
     return render_known(scene.geometry, scene.radiance, rays, budget=budget, inside=inside)
 
 
-def _choose(frames: local_layout.Frames, chosen: Sequence[int]) -> local_layout.Frames:
+def _choose(frames: scene_folder.Frames, chosen: Sequence[int]) -> scene_folder.Frames:
     def choose(items: tuple[Path, ...]) -> tuple[Path, ...]:
         return tuple(items[i] for i in chosen)
 
-    return local_layout.Frames(
+    return scene_folder.Frames(
         names=tuple(frames.names[i] for i in chosen),
         images=choose(frames.images),
         masks=frames.masks and choose(frames.masks),

@@ -15,7 +15,7 @@ from typing import Any
 
 from experiments.cli import subprocesses
 from refref_jax import atomic_files, configuration
-from refref_jax.data import local_layout, transforms
+from refref_jax.data import scene_folder
 from refref_jax.training import run_folder
 
 _MEASURED = "measured.json"
@@ -154,7 +154,7 @@ def check_masks(scene: Path, split: str = "test") -> None:
     Raises:
       ValueError: naming the scene.
     """
-    if local_layout.read_frames(scene, split).masks is None:
+    if scene_folder.read_frames(scene, split).masks is None:
         raise ValueError(
             f"The {split} images of {scene} have no masks. Add mask_file_path to their frames: "
             "what is compared is inside them."
@@ -208,7 +208,7 @@ def _steps_in(options: Sequence[str]) -> int | None:
 
 def _read(run: Path) -> dict[str, Any]:
     path = run / _MEASURED
-    return transforms.read_json(path) if path.is_file() else {}
+    return scene_folder.read_json(path) if path.is_file() else {}
 
 
 def _write(run: Path, record: dict[str, Any]) -> None:

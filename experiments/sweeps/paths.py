@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from experiments.figures.style import COLOURS, LABEL_HEIGHT, label_plainly, pyplot, style
 from experiments.runs import known_scene
 from experiments.runs.known_scene import KnownScene
-from refref_jax.optics.budgets import Budget
+from refref_jax.optics.path_settings import Budget
 from refref_jax.training import evaluation
 
 _MARKERS = {"straight": "s", "paper": "D"}

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from experiments.cli import app
 from refref_jax.fields import registry
-from refref_jax.optics.budgets import BUDGETS
+from refref_jax.optics.path_settings import BUDGETS
 from refref_jax.training import resolve
 from refref_jax.training.presets import PRESETS, Bounds
 

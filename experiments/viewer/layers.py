@@ -24,14 +24,14 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from experiments.figures import comparison
-from refref_jax.data import files
-from refref_jax.data.local_layout import Frames
+from refref_jax.data import image_files
+from refref_jax.data.scene_folder import Frames
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics.first_branches import Branch
 from refref_jax.optics.interface_rules import RULES
+from refref_jax.optics.light_paths import Branch
 from refref_jax.optics.media import Interfaces
-from refref_jax.render import Model, images, render_image, tiles
+from refref_jax.render import Model, images, render_image
 from refref_jax.render.first_surface import NO_PART, find_first_surface
 
 RGB, REFRACTION, REFLECTION = "rgb", "refraction only", "reflection only"
@@ -103,7 +103,7 @@ def draw(
     if layer == DISTANCE:
         # From wall to wall: hardly anything inside a bounded scene is farther.
         return comparison.colour_distances([whole], farthest=2.0 * model.config.radius)[0]
-    return files.to_bytes(whole)
+    return image_files.to_bytes(whole)
 
 
 def draw_error(
@@ -122,7 +122,7 @@ def draw_error(
         bands.append(render_image(model, band, chunk=chunk).rgb)
     seen = np.concatenate(bands)
     error = math.sqrt(float(np.mean(np.square(seen - pixels.target, dtype=np.float64))))
-    return files.to_bytes(comparison.amplified_error(seen, pixels.target)), error
+    return image_files.to_bytes(comparison.amplified_error(seen, pixels.target)), error
 
 
 def view_pixels(frames: Frames, i: int, most: int) -> Pixels:
@@ -141,7 +141,7 @@ def view_pixels(frames: Frames, i: int, most: int) -> Pixels:
         np.arange(stride // 2, height, stride), np.arange(stride // 2, width, stride), indexing="ij"
     )
     rays = cameras.pixel_rays(frames.cameras, np.full(row.shape, i), row, column)
-    target = files.read_rgb(frames.images[i])[row, column] / np.float32(255.0)
+    target = image_files.read_rgb(frames.images[i])[row, column] / np.float32(255.0)
     return Pixels(rays, target)
 
 
@@ -161,13 +161,13 @@ def with_indices(interfaces: Interfaces, indices: Sequence[float], rule: str) ->
 def _draw_surface(model: Model, layer: str, rays: Rays, most: int) -> Picture:
     shape = rays.radii.shape
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
-    filled, _ = tiles.cut_out(flat, None, 0, max(most, flat.radii.size))
+    filled, _ = images.cut_out(flat, None, 0, max(most, flat.radii.size))
     met = find_first_surface(model.geometry.surfaces, filled)
     count = flat.radii.size
     found = (met.parts[:count] != NO_PART).reshape(*shape, 1)
     if layer == MASK:
         return np.broadcast_to(np.where(found, 255, 0), (*shape, 3)).astype(np.uint8)
-    normals = files.to_bytes(0.5 * (met.normals[:count].reshape(*shape, 3) + 1.0))
+    normals = image_files.to_bytes(0.5 * (met.normals[:count].reshape(*shape, 3) + 1.0))
     return np.where(found, normals, np.uint8(_NOWHERE))
 
 

@@ -19,8 +19,8 @@ import jax
 import numpy as np
 
 from experiments.viewer import cameras, layers
-from refref_jax.data import local_layout, meshes
-from refref_jax.data.local_layout import Frames
+from refref_jax.data import meshes, scene_folder
+from refref_jax.data.scene_folder import Frames
 from refref_jax.geometry.cameras import Cameras, orbit
 from refref_jax.render import Model
 
@@ -145,7 +145,7 @@ def part_names(scene: Path | None, count: int) -> tuple[str, ...]:
 
 def read_test_views(scene: Path) -> Frames:
     """Reads the test views of a scene."""
-    return local_layout.read_frames(scene, "test")
+    return scene_folder.read_frames(scene, "test")
 
 
 def first_viewpoint(subject: Subject, aspect: float = cameras.ASPECT) -> cameras.Viewpoint:

@@ -20,8 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from refref_jax.choices import Space
-from refref_jax.data import files, scene_names, transforms
-from refref_jax.data.errors import SceneError
+from refref_jax.data import SceneError, image_files, scene_folder, scene_names
 from refref_jax.render.backgrounds import (
     Background,
     CubeBackground,
@@ -89,8 +88,8 @@ def read_background(scene: Path) -> Background:
 
 def _read_cube(record: dict[str, Any], scene: Path) -> CubeBackground:
     path = scene / _FILE
-    half = _positive(transforms.get(record, "half_extent", path), "half_extent", scene)
-    faces = transforms.get(record, "faces", path)
+    half = _positive(scene_folder.get(record, "half_extent", path), "half_extent", scene)
+    faces = scene_folder.get(record, "faces", path)
     if not isinstance(faces, dict) or len(faces) != _WALLS:
         raise SceneError(f"The faces of the background are not six in {path}. Describe each wall.")
     walls = list(faces.values())
@@ -107,7 +106,7 @@ def _read_cube(record: dict[str, Any], scene: Path) -> CubeBackground:
 
 
 def _read_sphere(record: dict[str, Any], scene: Path) -> SphereBackground:
-    radius = _positive(transforms.get(record, "radius", scene / _FILE), "radius", scene)
+    radius = _positive(scene_folder.get(record, "radius", scene / _FILE), "radius", scene)
     return SphereBackground(_read_texture(record, scene), np.float32(radius))
 
 
@@ -124,10 +123,10 @@ _READERS: dict[str, Callable[[dict[str, Any], Path], Background]] = {
 
 def _read_texture(record: Any, scene: Path) -> Texture:
     """Reads the image that a record names: EXR as linear, all else as 8-bit sRGB."""
-    path = scene / transforms.get_text(record, "image", scene / _FILE)
+    path = scene / scene_folder.get_text(record, "image", scene / _FILE)
     if path.suffix.lower() != ".exr":
-        return SrgbTexture((files.read_rgb(path) / 255.0).astype(np.float32))
-    texels = files.read_exr(path)
+        return SrgbTexture((image_files.read_rgb(path) / 255.0).astype(np.float32))
+    texels = image_files.read_exr(path)
     if texels.ndim != 3:
         raise SceneError(f"{path} has one channel, but a background has three. Export R, G and B.")
     if not np.all(np.isfinite(texels)):
@@ -147,7 +146,7 @@ def _stack(textures: list[Texture], path: Path) -> Texture:
 
 def _axes(wall: Any, name: str, path: Path) -> Float[np.ndarray, "3 3"]:
     """Returns the normal, u axis and v axis of a wall as rows: unit and perpendicular."""
-    values = [transforms.get(wall, key, path) for key in ("normal", "u_axis", "v_axis")]
+    values = [scene_folder.get(wall, key, path) for key in ("normal", "u_axis", "v_axis")]
     try:
         axes = np.asarray(values, np.float64)
     except (TypeError, ValueError):
@@ -170,7 +169,7 @@ def _positive(value: Any, name: str, scene: Path) -> float:
 
 def _background(scene: Path) -> dict[str, Any]:
     path = scene / _FILE
-    background = transforms.read_json(path).get("background", {}) if path.is_file() else {}
+    background = scene_folder.read_json(path).get("background", {}) if path.is_file() else {}
     if not isinstance(background, dict):
         raise SceneError(
             f"The background is {background!r} in {path}, not an object. Correct it, or remove the "

@@ -1,4 +1,25 @@
-"""Reads the meshes of a scene and decides what they are made of (NumPy only).
+"""Mesh files that keep the shading normals they were written with (NumPy only).
+
+A reconstructed surface knows its normals better than its triangles do: from the gradient of a
+field, or averaged within patches of its own. PLY keeps one normal a vertex, so a vertex is written
+once for each normal that faces have there; the reader of meshes merges equal positions again.
+Numbers are in double precision, and come back as they were.
+
+Only a file with the very header that is written here is trusted: normals of other programs may be
+anything, and what such a program writes again has another header.
+
+What the optional `scene.json` of a scene says about its meshes (NumPy only).
+
+    {"parts": [{"mesh": "meshes/cup_glass.ply",
+                "ior_inside": 1.5,                        index of refraction
+                "smooth_normals": true,                   how it was shaded
+                "colour_per_interface": [0.9, 1.0, 0.9],  linear RGB factor at its surface
+                "absorption": [0.1, 0.0, 0.1],            linear RGB, per world unit inside
+                "priority": 3}]}                          where bodies overlap the highest wins
+
+Only `mesh` is needed.
+
+Reads the meshes of a scene and decides what they are made of (NumPy only).
 
 One PLY file is one part. Its material is the last word of the file's own name that the table of
 indices knows: `perfume_red_glass.ply` is glass. An optional `scene.json` may say more of each mesh
@@ -10,23 +31,172 @@ A reconstructed mesh brings its shading normals (see `stored_normals`); of any o
 from its faces.
 """
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
+from refref_jax import configuration
 from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
-from refref_jax.data import scene_names, stored_normals
-from refref_jax.data.errors import SceneError
-from refref_jax.data.part_descriptions import (
-    PartDescription,
-    Shading,
-    read_part_descriptions,
-)
+from refref_jax.data import SceneError, scene_names
+
+_HEADER = """ply
+format binary_little_endian 1.0
+comment shading normals of refref_jax
+element vertex {}
+property double x
+property double y
+property double z
+property double nx
+property double ny
+property double nz
+element face {}
+property list uchar int vertex_indices
+end_header
+"""
+
+_VERTEX = np.dtype([("position", "<f8", 3), ("normal", "<f8", 3)])
+_FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
+
+_LONGEST_NORMALS_HEADER = len(_HEADER) + 40
+
+
+def write_mesh(
+    path: Path,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    normals: Float[np.ndarray, "faces 3 3"],
+) -> None:
+    """Writes a mesh as PLY.
+
+    Args:
+      path: of the file.
+      vertices: world units.
+      faces: counter-clockwise seen from outside.
+      normals: outward unit shading normals at the corners of the faces.
+    """
+    corners = np.concatenate([vertices[faces], normals], axis=-1).reshape(-1, 6)
+    split, index = np.unique(corners, axis=0, return_inverse=True)
+    points = np.zeros(len(split), _VERTEX)
+    points["position"], points["normal"] = split[:, :3], split[:, 3:]
+    triangles = np.zeros(len(faces), _FACE)
+    triangles["corners"], triangles["vertices"] = 3, index.reshape(-1, 3)
+    header = _HEADER.format(len(points), len(triangles)).encode()
+    path.write_bytes(header + points.tobytes() + triangles.tobytes())
+
+
+def read_normals(path: Path) -> Float[np.ndarray, "faces 3 3"] | None:
+    """Returns the normals at the corners of a file's faces, or `None` if it keeps none of ours."""
+    content = path.read_bytes()
+    end = content.find(b"end_header\n", 0, _LONGEST_NORMALS_HEADER) + len(b"end_header\n")
+    words = content[:end].decode("ascii", "replace").split()
+    counts = [int(word) for word in words if word.isdecimal()]
+    if len(counts) != 2 or content[:end] != _HEADER.format(*counts).encode():
+        return None
+    middle = end + counts[0] * _VERTEX.itemsize
+    if len(content) != middle + counts[1] * _FACE.itemsize:
+        return None
+    points = np.frombuffer(content[end:middle], _VERTEX)
+    triangles = np.frombuffer(content[middle:], _FACE)
+    return points["normal"][triangles["vertices"]]
+
+
+Shading = Literal["auto", "smooth", "flat"]
+
+
+class PartDescription(NamedTuple):
+    """What is known of one mesh, or the default where nothing is.
+
+    Attributes:
+      index: index of refraction inside, relative to air; `None` leaves it to the file's name.
+      shading: `smooth`, `flat`, or `auto` for smooth up to the crease angle.
+      tint: factor of linear RGB light at every reflection and every crossing, 0 to 1.
+      absorption: of the medium inside, linear RGB, per world unit.
+      priority: of overlapping bodies the highest wins.
+      colour_known: whether tint or absorption were told; then what is not told of the two takes no
+        light.
+    """
+
+    index: float | None = None
+    shading: Shading = "auto"
+    tint: Colour = CLEAR
+    absorption: Colour = NO_ABSORPTION
+    priority: int = 0
+    colour_known: bool = False
+
+
+def read_part_descriptions(path: Path) -> dict[str, PartDescription]:
+    """Returns the description of each mesh file that `scene.json` names, by file name.
+
+    Raises:
+      SceneError: if the file can not be understood, or a value has no physical meaning.
+    """
+    if not path.is_file():
+        return {}
+    try:
+        parts = configuration.parse_json(path.read_text(encoding="utf-8")).get("parts", [])
+        named = {Path(part["mesh"]).name: dict(part) for part in parts}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise SceneError(
+            f"{path} can not be understood ({error}). Correct it, or remove it: it is optional."
+        ) from error
+    return {name: _describe(f"{path}: {name}", part) for name, part in named.items()}
+
+
+def _describe(where: str, part: dict[str, Any]) -> PartDescription:
+    found: dict[str, Any] = {}
+    if "ior_inside" in part:
+        found["index"] = index = _number(part["ior_inside"])
+        if not 0.0 < index < math.inf:
+            raise _refusal(where, part, "ior_inside", "a positive number, such as 1.5 for glass")
+    if "smooth_normals" in part:
+        if not isinstance(part["smooth_normals"], bool):
+            raise _refusal(where, part, "smooth_normals", "true or false")
+        found["shading"] = "smooth" if part["smooth_normals"] else "flat"
+    if "colour_per_interface" in part:
+        found["tint"] = tint = _colour(part["colour_per_interface"])
+        if not all(0.0 <= channel <= 1.0 for channel in tint):
+            wanted = "three numbers from 0 to 1, since no surface adds light"
+            raise _refusal(where, part, "colour_per_interface", wanted)
+    if "absorption" in part:
+        found["absorption"] = absorption = _colour(part["absorption"])
+        if not all(0.0 <= channel < math.inf for channel in absorption):
+            wanted = "three numbers that are 0 or positive, per world unit"
+            raise _refusal(where, part, "absorption", wanted)
+    if "priority" in part:
+        found["priority"] = part["priority"]
+        if not isinstance(part["priority"], int) or isinstance(part["priority"], bool):
+            raise _refusal(where, part, "priority", "a whole number; the highest wins")
+    found["colour_known"] = "tint" in found or "absorption" in found
+    return PartDescription(**found)
+
+
+def _number(value: Any) -> float:
+    """Returns a number, or NaN for what is none."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
+def _colour(value: Any) -> Colour:
+    """Returns three numbers, or three times NaN for what is none."""
+    if not isinstance(value, list) or len(value) != 3:
+        return math.nan, math.nan, math.nan
+    red, green, blue = map(_number, value)
+    return red, green, blue
+
+
+def _refusal(where: str, part: dict[str, Any], key: str, wanted: str) -> SceneError:
+    return SceneError(f"{where} has the {key} {part[key]!r}. Give {wanted}.")
+
 
 INDEX_OF_REFRACTION: dict[str, float] = {
     "glass": 1.5,
@@ -206,7 +376,7 @@ def _declared_faces(path: Path) -> int:
 def _read_part(path: Path, overrides: Mapping[str, float], described: PartDescription) -> MeshPart:
     index = _index(path, overrides, described)
     vertices, faces = read_mesh(path)
-    normals = stored_normals.read_normals(path) if described.shading == "auto" else None
+    normals = read_normals(path) if described.shading == "auto" else None
     return MeshPart(path.stem, vertices, faces, index, *described[1:], normals)
 
 

@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from refref_jax import configuration
-from refref_jax.data import file_names, transforms
-from refref_jax.data.errors import SceneError
-from refref_jax.data.local_layout import SPLITS
+from refref_jax.data import SceneError, scene_folder
+from refref_jax.data.scene_folder import SPLITS
 
 CAMERA_ANGLE_X = 1.1656107902526855
 """Horizontal field of view of all published images, radians."""
@@ -105,7 +104,7 @@ def unpack(shards: Sequence[Path], scene: Path, *, progress: Progress) -> None:
             progress(done, total)
         if count:
             content = {"camera_angle_x": contents.camera_angle_x, "frames": records}
-            file_names.write_transforms(scene, split, content)
+            scene_folder.write_transforms(scene, split, content)
 
 
 def import_parquet() -> Any:
@@ -156,9 +155,9 @@ def _write_frame(
     scene: Path, split: str, number: int, row: dict[str, Any], name: str, shard: Path
 ) -> dict[str, Any]:
     """Writes the images of a row, and returns its record in the transforms file."""
-    files = file_names.plain(split, number)
+    files = scene_folder.plain(split, number)
     pose = row[POSE_COLUMN]
-    transforms.rigid_motion(pose, name, shard)
+    scene_folder.rigid_motion(pose, name, shard)
     paths = {"image": f"{files.image}.png", "mask": files.mask, "depth": files.depth}
     found = {column: _bytes(row.get(column), column, name, shard) for column in paths}
     if found["image"] is None:
@@ -169,7 +168,7 @@ def _write_frame(
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content)
     masked, deep = found["mask"] is not None, found["depth"] is not None
-    return file_names.frame_record(files, pose, masked=masked, deep=deep)
+    return scene_folder.frame_record(files, pose, masked=masked, deep=deep)
 
 
 def _bytes(value: Any, column: str, name: str, shard: Path) -> bytes | None:

@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from refref_jax.data.errors import SceneError
+from refref_jax.data import SceneError
 
 
 class _Background(NamedTuple):

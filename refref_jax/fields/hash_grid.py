@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from refref_jax import numerics
 from refref_jax.choices import Precision
-from refref_jax.fields.interpolation import interpolate
+from refref_jax.fields.hash_grid_kernels import interpolate
 from refref_jax.sampling.cones import Gaussians
 
 _INITIAL_RANGE = 1e-4

@@ -23,9 +23,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from refref_jax import numerics
+from refref_jax.fields.base import FieldKind, FieldSize, Params, Radiance, in_half_precision
 from refref_jax.fields.hash_grid import HashGridConfig
-from refref_jax.fields.kinds import FieldKind, FieldSize, Params, Radiance, in_half_precision
-from refref_jax.fields.networks import (
+from refref_jax.fields.mlps import (
     GridDensityConfig,
     GridRadianceConfig,
     colour,

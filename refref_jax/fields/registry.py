@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from jaxtyping import Array, Float
 
 from refref_jax.fields import nerfacto, zipnerf
-from refref_jax.fields.kinds import (
+from refref_jax.fields.base import (
     DensityConfig,
     FieldConfig,
     FieldKind,

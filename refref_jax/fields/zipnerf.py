@@ -1,14 +1,136 @@
-"""Zip-NeRF field type, with its preset sizes.
+"""Zip-NeRF's density and radiance fields.
+
+Zip-NeRF's proposal field: density only, cheap to query many times along a path.
+
+Its interface is pure functions over Gaussians in the unit cube; the linen module is private.
+
+Source: Barron et al., Mip-NeRF 360 (2022), section 3; Zip-NeRF (2023) for the hash grid.
+
+Zip-NeRF's radiance field: density and view-dependent colour.
+
+Its interface is pure functions over Gaussians in the unit cube; the linen module is private.
+
+Source: paper (arXiv 2505.05848), supplement (f for density, g for colour, spherical harmonics of
+the local direction); Zip-NeRF (2023) for the hash grid and the bottleneck.
+
+Zip-NeRF field type, with its preset sizes.
 
 Source: paper (arXiv 2505.05848), supplement (implementation details), and Zip-NeRF (2023) for the
 size `paper`; the other sizes are ours.
 """
 
-from refref_jax.fields import density_field, radiance_field
-from refref_jax.fields.density_field import DensityFieldConfig
+import dataclasses
+from typing import Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from refref_jax.fields.base import FieldKind, FieldSize, Params, Radiance, in_half_precision
 from refref_jax.fields.hash_grid import HashGridConfig
-from refref_jax.fields.kinds import FieldKind, FieldSize, in_half_precision
-from refref_jax.fields.radiance_field import RadianceFieldConfig
+from refref_jax.fields.mlps import (
+    GridDensityConfig,
+    GridRadianceConfig,
+    colour,
+    grid_network,
+    nowhere,
+)
+from refref_jax.sampling.cones import Gaussians
+
+# Shift of the softplus: the density of an untrained field is low, but not zero.
+_DENSITY_SHIFT = -1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class DensityFieldConfig(GridDensityConfig):
+    """Shape of a density field; see `GridDensityConfig`."""
+
+    kind: Literal["zipnerf"] = dataclasses.field(default="zipnerf", kw_only=True)
+
+
+def init_density(key: Array, config: DensityFieldConfig) -> Params:
+    """Returns initial parameters."""
+    return _DensityField(config).init(key, nowhere())
+
+
+def density(params: Params, config: DensityFieldConfig, gaussians: Gaussians) -> Float[Array, ""]:
+    """Returns the density of one interval, averaged over its multisamples, per scene radius.
+
+    Args:
+      params: parameters, from `init`.
+      config: shape of the field, as in `init`.
+      gaussians: multisamples in the unit cube, as fractions of its edge.
+    """
+    return _DensityField(config).apply(params, gaussians)
+
+
+def activate_density(raw: Float[Array, ""]) -> Float[Array, ""]:
+    """Returns the density for a network output: a shifted softplus, linear for large inputs."""
+    return jax.nn.softplus(raw + _DENSITY_SHIFT)
+
+
+class _DensityField(nn.Module):
+    config: DensityFieldConfig
+
+    @nn.compact
+    def __call__(self, gaussians: Gaussians) -> Float[Array, ""]:
+        config = self.config
+        raw = grid_network(
+            gaussians, config.grid, width=config.width, outputs=1, precision=config.precision
+        )
+        return activate_density(raw[0])
+
+
+# Colours may exceed [0, 1] by this much, so that black and white have finite network outputs.
+_COLOUR_PADDING = 0.001
+
+
+@dataclasses.dataclass(frozen=True)
+class RadianceFieldConfig(GridRadianceConfig):
+    """Shape of a radiance field; see `GridRadianceConfig`."""
+
+    kind: Literal["zipnerf"] = dataclasses.field(default="zipnerf", kw_only=True)
+
+
+def init_radiance(key: Array, config: RadianceFieldConfig) -> Params:
+    """Returns initial parameters."""
+    return _RadianceField(config).init(key, nowhere(), jnp.zeros(3, jnp.float32))
+
+
+def radiance(
+    params: Params,
+    config: RadianceFieldConfig,
+    gaussians: Gaussians,
+    direction: Float[Array, "3"],
+) -> Radiance:
+    """Returns density and colour of one interval of a path.
+
+    Args:
+      params: parameters, from `init`.
+      config: shape of the field, as in `init`.
+      gaussians: multisamples in the unit cube, as fractions of its edge.
+      direction: unit direction of travel at the interval, world frame.
+    """
+    return _RadianceField(config).apply(params, gaussians, direction)
+
+
+class _RadianceField(nn.Module):
+    config: RadianceFieldConfig
+
+    @nn.compact
+    def __call__(self, gaussians: Gaussians, direction: Float[Array, "3"]) -> Radiance:
+        config = self.config
+        raw = grid_network(
+            gaussians,
+            config.grid,
+            width=config.density_width,
+            outputs=1 + config.bottleneck,
+            precision=config.precision,
+        )
+        rgb = colour(raw[1:], direction, config)
+        padded = rgb * (1.0 + 2.0 * _COLOUR_PADDING) - _COLOUR_PADDING
+        return Radiance(activate_density(raw[0]), padded)
 
 
 def _proposal(
@@ -70,11 +192,11 @@ _BEST = in_half_precision(_PAPER)._replace(footprint="differential")
 
 KIND = FieldKind(
     radiance_config=RadianceFieldConfig,
-    init_radiance=radiance_field.init,
-    radiance=radiance_field.radiance,
+    init_radiance=init_radiance,
+    radiance=radiance,
     density_config=DensityFieldConfig,
-    init_density=density_field.init,
-    density=density_field.density,
+    init_density=init_density,
+    density=density,
     sizes={"tiny": _TINY, "small": _SMALL, "paper": _PAPER, "best": _BEST},
     hash_decay=0.1,
 )

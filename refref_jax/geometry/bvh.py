@@ -1,24 +1,32 @@
-"""Closest hits of rays with a packed bounding volume hierarchy (BVH).
+"""Closest hits of rays with a packed BVH of triangles.
+
+Closest hits of rays with a packed bounding volume hierarchy (BVH).
 
 On a CPU, packets of rays traverse the tree together (`packet_traversal`); on an accelerator, every
 ray traverses it alone and all rays run in lock-step (`lockstep_traversal`). `node_table` describes
 the memory layout of the tree, `bvh_build` its construction.
 
 Rays are passed as batches with one leading axis.
+
+Closest hit of one ray, for use under `vmap` and differentiation.
+
+Under any nesting of `vmap`, all rays are cast as one batch (see `bvh`). The triangle that is hit is
+a constant for differentiation: recompute the hit point from the triangle to obtain gradients.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
-from refref_jax.geometry import boxes, lockstep_traversal, node_table, packet_traversal
-from refref_jax.geometry import facets as prepared
-from refref_jax.geometry.packet_traversal import PACKET, Packet
+from refref_jax.geometry import bvh_nodes, traversal_accelerator, traversal_cpu
+from refref_jax.geometry import triangles as prepared
 from refref_jax.geometry.rays import Rays
+from refref_jax.geometry.traversal_cpu import PACKET, Packet
 
-LEAF_SIZE = node_table.LEAF_SIZE
+LEAF_SIZE = bvh_nodes.LEAF_SIZE
 """Maximum number of triangles in a leaf."""
 
 NO_SLOT = -1
@@ -83,7 +91,7 @@ def closest_hits(
     bvh, origins, directions, limits = jax.lax.stop_gradient(
         (bvh, rays.origins, rays.directions, limits)
     )
-    nodes = bvh.nodes.reshape(-1, node_table.WORDS)
+    nodes = bvh.nodes.reshape(-1, bvh_nodes.WORDS)
     limits = jnp.where(_finite(origins) & _finite(directions), limits, -1.0)
     distances, slots = jax.lax.platform_dependent(
         nodes,
@@ -93,7 +101,7 @@ def closest_hits(
         limits,
         leaving,
         cpu=_closest_in_packets,
-        default=jax.vmap(lockstep_traversal.trace_ray, in_axes=(None, None, 0, 0, 0, 0)),
+        default=jax.vmap(traversal_accelerator.trace_ray, in_axes=(None, None, 0, 0, 0, 0)),
     )
     return _finish(bvh, origins, directions, distances, slots)
 
@@ -112,7 +120,7 @@ def _finish(
 ) -> Hits:
     """Converts the result of a traversal to hits."""
     # Infinite distances tie, so a missed triangle may have been recorded as the slot.
-    hit = jnp.isfinite(distances) & (slots != node_table.NONE)
+    hit = jnp.isfinite(distances) & (slots != bvh_nodes.NONE)
     found = jnp.where(hit, slots, 0)
     met = bvh.facets.at[found].get(mode="promise_in_bounds")
     barycentrics = jax.vmap(prepared.barycentric)(origins, directions, met)
@@ -142,18 +150,73 @@ def _closest_in_packets(
     def by_ray(values: Array, fill: float | int) -> Array:
         return jnp.pad(values, (0, padding), constant_values=fill).reshape(-1, PACKET)
 
-    slabs = jax.vmap(boxes.slabs)(origins, directions)
-    octants = jnp.where(limits >= 0.0, jax.vmap(boxes.octant)(directions), node_table.OCTANTS)
-    closest = packet_traversal.trace(
+    slabs = jax.vmap(bvh_nodes.slabs)(origins, directions)
+    octants = jnp.where(limits >= 0.0, jax.vmap(bvh_nodes.octant)(directions), bvh_nodes.OCTANTS)
+    closest = traversal_cpu.trace(
         nodes,
         facets,
         Packet(
             by_component(origins),
             by_component(directions),
             jax.tree.map(by_component, slabs),
-            by_ray(octants, node_table.OCTANTS),
+            by_ray(octants, bvh_nodes.OCTANTS),
             by_ray(limits, -1.0),
             by_ray(leaving, NO_SLOT),
         ),
     )
     return jax.tree.map(lambda x: x.reshape(-1)[:count], tuple(closest))
+
+
+class _Query(NamedTuple):
+    """Rays to cast; arguments of `bvh.closest_hits`."""
+
+    origins: Float[Array, " *rays 3"]
+    directions: Float[Array, "*rays 3"]
+    limits: Float[Array, "*rays"]
+    leaving: Int[Array, "*rays"]
+
+
+def closest_slot(
+    bvh: BVH,
+    origin: Float[Array, "3"],
+    direction: Float[Array, "3"],
+    limit: Float[Array, ""],
+    leaving: Int[Array, ""],
+) -> Int[Array, ""]:
+    """Returns the slot of the first triangle that a ray hits, `NO_SLOT` if there is none.
+
+    Args:
+      bvh: the tree of the scene; it cannot be mapped over.
+      origin: start of the ray.
+      direction: unit vector.
+      limit: farthest distance of interest; negative for a ray that is not to be cast.
+      leaving: excluded primitive, the slot that the ray starts on, or `NO_SLOT`.
+    """
+    query = _Query(origin[None], direction[None], limit[None], leaving[None])
+    return _find(*jax.lax.stop_gradient((bvh, query)))[0]
+
+
+@custom_vmap
+def _find(bvh: BVH, query: _Query) -> Int[Array, " rays"]:
+    rays = Rays(query.origins, query.directions, jnp.zeros_like(query.limits))
+    hits: Hits = closest_hits(bvh, rays, limits=query.limits, leaving=query.leaving)
+    return hits.slots
+
+
+@_find.def_vmap
+def _find_mapped(
+    axis_size: int, in_batched: list, bvh: BVH, query: _Query
+) -> tuple[Int[Array, "axis rays"], bool]:
+    bvh_batched, query_batched = in_batched
+    if any(jax.tree.leaves(bvh_batched)):
+        raise TypeError(
+            "vmap over the argument bvh is not supported: one vmap cannot cast rays into several "
+            "scenes. Use jax.lax.map over scenes."
+        )
+    every = jax.tree.map(
+        lambda x, batched: x if batched else jnp.broadcast_to(x, (axis_size, *x.shape)),
+        query,
+        query_batched,
+    )
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), every)
+    return _find(bvh, flat).reshape(axis_size, -1), True

@@ -1,18 +1,25 @@
-"""Surface points at ray hits: position, normals and part of the scene.
+"""Surfaces of a scene: packed on the host, evaluated at a hit on the device.
+
+Surface points at ray hits: position, normals and part of the scene.
 
 The *geometric* normal is that of the triangle and determines the side that a ray is on. The
 *shading* normal is interpolated between the corners and determines the directions of the reflected
 and refracted rays; on a flat part both normals agree. Both point out of the object.
+
+Packs meshes into `Surfaces`, on the host (NumPy only).
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from refref_jax import numerics
-from refref_jax.geometry import triangles
+from refref_jax.geometry import bvh_build, triangles
 from refref_jax.geometry.bvh import BVH
+from refref_jax.geometry.triangle_meshes import Mesh
 
 
 class Surfaces(NamedTuple):
@@ -73,3 +80,33 @@ def surface_point(
         part=surfaces.parts[slot],
         scale=numerics.largest_component(corners.reshape(9)),
     )
+
+
+def pack_meshes(meshes: Sequence[Mesh]) -> Surfaces:
+    """Builds the device record of meshes; parts have the numbers of their places, none is empty."""
+    return build_surfaces(
+        np.concatenate([np.zeros((0, 3, 3)), *(mesh.vertices[mesh.faces] for mesh in meshes)]),
+        np.concatenate([np.zeros((0, 3, 3)), *(mesh.normals for mesh in meshes)]),
+        np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes]),
+    )
+
+
+def build_surfaces(
+    triangles: Float[np.ndarray, "faces 3 3"],
+    normals: Float[np.ndarray, "faces 3 3"],
+    parts: Int[np.ndarray, " faces"],
+) -> Surfaces:
+    """Builds the `Surfaces` of a triangle soup, in single precision.
+
+    Args:
+      triangles: corners, counter-clockwise seen from outside, world units. May be empty.
+      normals: outward unit shading normals at the corners.
+      parts: part index of each triangle.
+
+    Returns:
+      The surfaces, in the leaf order of their tree.
+    """
+    bvh, slots = bvh_build.build(triangles.astype(np.float32))
+    if len(triangles) == 0:
+        return Surfaces(bvh, np.zeros_like(bvh.triangles), slots)
+    return Surfaces(bvh, normals[slots].astype(np.float32), parts[slots].astype(np.int32))

@@ -1,14 +1,122 @@
-"""Closed triangle meshes: what is measured on them, and their pieces (NumPy only)."""
+"""Triangle meshes and their vertex normals (NumPy only).
+
+Shading normals at the corners of triangles, on the host (NumPy only).
+
+Neighbouring faces whose normals differ by less than the crease angle belong to one smooth patch.
+At a corner, the face normals of a patch are averaged, weighted by the angle of each face there.
+Normals are not averaged across a crease, so a cube stays flat and a cylinder keeps its rim.
+
+Source: Thuermer and Wuethrich, Computing Vertex Normals from Polygonal Facets (1998), for the
+weighting by angle.
+
+Closed triangle meshes: what is measured on them, and their pieces (NumPy only).
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from refref_jax.geometry.corner_normals import CREASE_ANGLE, corner_normals
+CREASE_ANGLE = np.radians(30.0)
+"""Smallest angle between face normals, in radians, at which an edge counts as sharp."""
+
+# A face is degenerate if its area is below this fraction of its longest edge squared, as happens
+# when single-precision files put three corners on one line.
+_DEGENERATE = 1e-6
+
+
+def corner_normals(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    *,
+    crease_angle: float = CREASE_ANGLE,
+) -> Float[np.ndarray, "faces 3 3"]:
+    """Returns an outward unit normal for every corner of every face.
+
+    Args:
+      vertices: positions, shared between faces where the surface is connected.
+      faces: corner indices, counter-clockwise seen from outside.
+      crease_angle: angle in radians; 0 gives face normals, pi smooths everything.
+
+    Returns:
+      Unit normals. Degenerate faces have zero normals and are left out of the averages.
+    """
+    corners = vertices[faces]
+    flat = face_normals(corners)
+    if crease_angle <= 0.0:
+        return np.repeat(flat[:, None], 3, axis=1)
+    group = smooth_groups(vertices, faces, crease_angle=crease_angle).reshape(-1)
+    weighted = (_corner_angles(corners)[..., None] * flat[:, None]).reshape(-1, 3)
+    sums = np.stack([np.bincount(group, weighted[:, axis]) for axis in range(3)], axis=-1)
+    averaged = unit_vectors(sums)[group].reshape(-1, 3, 3)
+    # Opposite faces may cancel at a corner: fall back to the face normal there.
+    cancelled = np.all(averaged == 0.0, axis=-1, keepdims=True)
+    return np.where(cancelled, flat[:, None], averaged)
+
+
+def smooth_groups(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    *,
+    crease_angle: float = CREASE_ANGLE,
+) -> Int[np.ndarray, "faces 3"]:
+    """Numbers groups of corners that share a normal: same vertex, faces of the same patch."""
+    patch = _smooth_patches(faces, face_normals(vertices[faces]), crease_angle)
+    key = patch[:, None].astype(np.int64) * len(vertices) + faces
+    return np.unique(key, return_inverse=True)[1].reshape(-1, 3)
+
+
+def face_normals(corners: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "faces 3"]:
+    """Returns outward unit normals; zero for degenerate faces."""
+    normals = unit_vectors(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    return np.where(is_degenerate(corners)[:, None], 0.0, normals)
+
+
+def is_degenerate(corners: Float[np.ndarray, "faces 3 3"]) -> Bool[np.ndarray, " faces"]:
+    """Returns which faces have negligible area, so that their normals would be rounding errors."""
+    edges = np.roll(corners, -1, axis=1) - corners
+    longest = np.max(np.sum(edges**2, axis=-1), axis=1)
+    area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1)
+    return area <= _DEGENERATE * longest
+
+
+def unit_vectors(vectors: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 3"]:
+    """Returns vectors scaled to length 1; zero vectors stay zero."""
+    norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.divide(vectors, norm, out=np.zeros_like(vectors), where=norm > 0.0)
+
+
+def _smooth_patches(
+    faces: Int[np.ndarray, "faces 3"],
+    normals: Float[np.ndarray, "faces 3"],
+    crease_angle: float,
+) -> Int[np.ndarray, " faces"]:
+    """Numbers the patches of faces that are connected across smooth edges."""
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    owner = np.repeat(np.arange(len(faces)), 3)
+    order = np.lexsort((edges[:, 1], edges[:, 0]))
+    edges, owner = edges[order], owner[order]
+    shared = np.all(edges[1:] == edges[:-1], axis=1)
+    first, second = owner[:-1][shared], owner[1:][shared]
+    cosine = np.sum(normals[first] * normals[second], axis=1)
+    solid = np.any(normals != 0.0, axis=1)
+    smooth = (cosine > np.cos(crease_angle)) & solid[first] & solid[second]
+    graph = coo_array(
+        (np.ones(smooth.sum(), bool), (first[smooth], second[smooth])),
+        shape=(len(faces), len(faces)),
+    )
+    return connected_components(graph, directed=False)[1]
+
+
+def _corner_angles(corners: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "faces 3"]:
+    """Returns the angle of each face at each of its corners, in radians."""
+    forward = unit_vectors(np.roll(corners, -1, axis=1) - corners)
+    backward = unit_vectors(np.roll(corners, 1, axis=1) - corners)
+    return np.arccos(np.clip(np.sum(forward * backward, axis=-1), -1.0, 1.0))
+
 
 Vertices = Float[np.ndarray, "vertices 3"]
 Faces = Int[np.ndarray, "faces 3"]

@@ -4,19 +4,24 @@ Letters, as in the paper (section 4.2): a path has points `p_0 .. p_K`, unit dir
 `d_0 .. d_K` and cumulative distances `tau_0 = 0 .. tau_K`; segment `i` is
 `r(t) = p_i + (t - tau_i) d_i` for `t` in `[tau_i, tau_{i+1})`, and the last one never ends.
 `t` is arc length in world units.
+
+Separates light paths by the branch that they take at their first surface.
+
+The first surface divides the light of a pixel into two images: light reflected by the outside of
+the objects, and the rest, which passes through the objects or misses them.
 """
 
 import enum
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import footprints
-from refref_jax.optics.footprints import Spread
+from refref_jax.optics import ray_differentials
 from refref_jax.optics.media import AMBIENT
+from refref_jax.optics.ray_differentials import Spread
 
 
 class PathStatus(enum.IntEnum):
@@ -109,7 +114,7 @@ def straight(rays: Rays) -> LightPaths:
         tau=jnp.zeros_like(rays.radii)[:, None],
         ends=jnp.full_like(rays.radii, jnp.inf)[:, None],
         media=jnp.full((count, 1), AMBIENT, jnp.int32),
-        spreads=jax.vmap(jax.vmap(footprints.nothing))(rays.origins[:, None]),
+        spreads=jax.vmap(jax.vmap(ray_differentials.nothing))(rays.origins[:, None]),
         rays=integers,
         weights=jnp.ones_like(rays.directions),
         radii=rays.radii,
@@ -157,3 +162,21 @@ def filled_up(paths: LightPaths, *, multiple: int) -> LightPaths:
 def exists(paths: LightPaths | PathEnds) -> Bool[Array, " paths"]:
     """Returns which slots hold a path."""
     return paths.statuses != PathStatus.EMPTY
+
+
+Branch = Literal["both", "transmitted", "reflected"]
+"""Paths to select: both branches, `reflected` ones, or `transmitted` ones (all others)."""
+
+
+def reflected_first(paths: LightPaths) -> Bool[Array, " paths"]:
+    """Returns which paths were reflected at the first surface they hit.
+
+    These stay in their medium: their second segment starts at the end of the first. If a path has
+    more segments outside the objects than are stored (see `details`), its second segment is unknown
+    and it counts as transmitted; with one convex object this never happens. The camera is assumed
+    to be outside all objects.
+    """
+    if paths.tau.shape[-1] < 2:
+        return jnp.zeros_like(paths.bends, bool)
+    at_once = paths.tau[:, 1] == paths.ends[:, 0]
+    return (paths.bends > 0) & at_once & (paths.media[:, 1] == paths.media[:, 0])

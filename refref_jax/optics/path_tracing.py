@@ -16,9 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import details, media, packing, path_tree, scene
-from refref_jax.optics.budgets import Budget, room
-from refref_jax.optics.details import Detail
+from refref_jax.optics import media, path_settings, path_tree, scene
 from refref_jax.optics.light_paths import (
     LightPaths,
     PathEnds,
@@ -27,6 +25,7 @@ from refref_jax.optics.light_paths import (
     straight,
     straight_ends,
 )
+from refref_jax.optics.path_settings import Budget, Detail, room
 from refref_jax.optics.scene import Scene
 from refref_jax.optics.wavefront import BLOCK, follow
 
@@ -117,7 +116,7 @@ def trace(
       rays: camera rays.
       budget: path settings.
       capacity: capacity for paths; by default that of the path settings for this number of rays,
-        which is more than most scenes need, see `budgets.capacity_for`. Unused if max bends is 0 or
+        which is more than most scenes need, see `path_settings.capacity_for`. Unused if max bends is 0 or
         there are no rays.
       detail: parts of the paths to store; by default every segment, and nothing else.
       inside: interior list of each camera, as in `trace_ends`.
@@ -176,10 +175,10 @@ def trace_batches(
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
     if inside is not None:
         inside = inside.reshape(batches * count, inside.shape[-1])
-    detail = detail or details.everything(budget.bends)
+    detail = detail or path_settings.everything(budget.bends)
     inside = _inside(geometry, flat, inside)
     tree = follow(geometry, flat, inside, budget=budget, footprint=detail.footprint)
-    ends, lost = packing.pack(tree, batches, count, capacity)
+    ends, lost = path_tree.pack(tree, batches, count, capacity)
     paths = path_tree.polylines(
         tree.segments.items,
         ends,

@@ -1,4 +1,8 @@
-"""Wavefront path tracing of rays along all branches of their paths.
+"""Child rays of a block of rays: stores their segments and queues or ends them.
+
+Letters as in `light_paths`.
+
+Wavefront path tracing of rays along all branches of their paths.
 
 Rays still to be cast are on a stack. Every iteration pops a block of rays and casts it: a ray that
 hits nothing ends as a path; for a ray that hits a surface, the reflected and transmitted children
@@ -22,19 +26,139 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.choices import Footprint
 from refref_jax.geometry import bvh
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import branching, budgets, footprints, media, offspring, path_tree, pools
-from refref_jax.optics.branching import RayState
-from refref_jax.optics.budgets import Budget, Room
+from refref_jax.optics import media, path_settings, path_step, path_tree, queues, ray_differentials
 from refref_jax.optics.light_paths import PathStatus
-from refref_jax.optics.offspring import Live
+from refref_jax.optics.path_settings import Budget, Room
+from refref_jax.optics.path_step import Arrival, Branches, RayState
 from refref_jax.optics.path_tree import NO_SEGMENT, Ends, PathTree, Segments
-from refref_jax.optics.pools import Pool
+from refref_jax.optics.queues import Pool
 from refref_jax.optics.scene import Scene
+
+
+class Live(NamedTuple):
+    """Active rays, which are still to be cast.
+
+    Attributes:
+      state: states of the rays.
+      rays: index of each one's camera ray.
+      segments: index of each one's current segment.
+    """
+
+    state: RayState
+    rays: Int[Array, " live"]
+    segments: Int[Array, " live"]
+
+    @property
+    def weights(self) -> Float[Array, "live 3"]:
+        """Throughputs of the rays."""
+        return self.state.weight
+
+
+class Children(NamedTuple):
+    """The child rays of a block, reflected ones first.
+
+    Attributes:
+      live: child rays; they have the segment index of their parent until their own is stored.
+      media: medium of each child's segment.
+      parts: part that each child's segment starts on.
+      exists: mask of children with positive weight.
+      traced: mask of children that are traced further.
+    """
+
+    live: Live
+    media: Int[Array, " branches"]
+    parts: Int[Array, " branches"]
+    exists: Bool[Array, " branches"]
+    traced: Bool[Array, " branches"]
+
+
+def children_of(
+    live: Live,
+    branches: Branches,
+    arrival: Arrival,
+    bending: Bool[Array, " block"],
+    budget: Budget,
+) -> Children:
+    """Returns the child rays of the rays that bend."""
+    sides = arrival.interaction.sides
+    states = queues.join(branches.reflected, branches.transmitted)
+    mediums = queues.join(sides.medium_near, sides.medium_far)
+    untraced = ~arrival.interaction.total & (budget.reflections == "first")
+    traced = queues.join(~untraced, jnp.ones_like(bending))
+    if budget.reentry == "impossible":
+        traced &= mediums != media.AMBIENT
+    return Children(
+        live=Live(
+            states, queues.join(live.rays, live.rays), queues.join(live.segments, live.segments)
+        ),
+        media=mediums,
+        parts=queues.join(sides.part, sides.part),
+        exists=queues.join(bending, bending) & (jnp.max(states.weight, axis=-1) > 0.0),
+        traced=traced,
+    )
+
+
+def log(tree: PathTree, children: Children, room: Room) -> tuple[PathTree, Children]:
+    """Stores the segments of children; drops the weakest children if the buffer is full."""
+    live = children.live
+    left = room.segments - tree.segments.count
+    kept = queues.strongest(children.exists, jnp.max(live.weights, axis=-1), left)
+    index = tree.segments.count + jnp.cumsum(kept, dtype=jnp.int32) - 1
+    state = live.state
+    logged = Segments(
+        live.segments,
+        state.point,
+        state.direction,
+        state.tau,
+        children.media,
+        children.parts,
+        state.spread,
+    )
+    log = queues.append(tree.segments, logged, kept)
+    lost = queues.lose(tree.lost, live.rays, live.weights, children.exists & ~kept)
+    children = children._replace(live=live._replace(segments=index), exists=kept)
+    return tree._replace(segments=log, lost=lost), children
+
+
+def push(tree: PathTree, stack: Pool, children: Children, budget: Budget) -> tuple[PathTree, Pool]:
+    """Pushes children on the stack, and ends those that are not traced further.
+
+    The latter are the paper's first reflections, and rays that cannot hit an object again.
+    """
+    live = children.live
+    if budget.reflections == "first" or budget.reentry == "impossible":
+        escapes = (budget.reentry == "impossible") & (children.media == media.AMBIENT)
+        status = jnp.where(escapes, PathStatus.ESCAPED, PathStatus.NOT_TRACED).astype(jnp.int32)
+        tree = end(tree, live, status, children.exists & ~children.traced)
+    return tree, queues.append(stack, live, children.exists & children.traced)
+
+
+def end_by(
+    budget: Budget,
+    tree: PathTree,
+    live: Live,
+    status: Int[Array, " n"],
+    ending: Bool[Array, " n"],
+) -> PathTree:
+    """Ends some rays as paths; the weight of paths that the settings make black is dropped."""
+    weights = jax.vmap(functools.partial(path_step.shown, budget))(live.weights, status)
+    lost = queues.lose(tree.lost, live.rays, live.weights - weights, ending)
+    live = live._replace(state=live.state._replace(weight=weights))
+    return end(tree._replace(lost=lost), live, status, ending)
+
+
+def end(
+    tree: PathTree, live: Live, status: Int[Array, " n"], ending: Bool[Array, " n"]
+) -> PathTree:
+    """Ends some rays as paths."""
+    block = Ends(live.segments, live.rays, live.weights, live.state.bends, status)
+    return tree._replace(ends=queues.append(tree.ends, block, ending))
+
 
 BLOCK = 4096
 """Number of rays cast per iteration. Accelerators benefit from more, at the cost of memory."""
@@ -93,17 +217,17 @@ def _follow(
 ) -> PathTree:
     count = rays.radii.shape[0]
     block = max(1, min(block, count))
-    room = budgets.room(budget, count)
+    room = path_settings.room(budget, count)
     walk = _begin(rays, inside, footprint, block, room)
     if count < _MANY_BLOCKS * block or block < _SMALLER:
         return _work_off(geometry, walk, budget, block, room, least=1).tree
     # Otherwise the few deepest rays would cast a full block in each iteration.
     walk = _work_off(geometry, walk, budget, block, room, least=block // 4)
-    stack = pools.append(
+    stack = queues.append(
         walk.stack, walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
     )
     small = block // _SMALLER
-    walk = _Walk(*pools.pop(stack, small), walk.tree)
+    walk = _Walk(*queues.pop(stack, small), walk.tree)
     return _work_off(geometry, walk, budget, small, room, least=1).tree
 
 
@@ -124,8 +248,8 @@ def _work_off(
             lambda walk: _round(geometry, walk, budget, block, room),
             walk,
         )
-        stack, lost = pools.shed(walk.stack, walk.tree.lost, room.live)
-        ends, lost = pools.shed(walk.tree.ends, lost, room.paths)
+        stack, lost = queues.shed(walk.stack, walk.tree.lost, room.live)
+        ends, lost = queues.shed(walk.tree.ends, lost, room.paths)
         return _Walk(stack, walk.next, walk.tree._replace(ends=ends, lost=lost))
 
     return jax.lax.while_loop(unfinished, advance, walk)
@@ -149,8 +273,8 @@ def _begin(
     """Pushes the camera rays on the stack and stores their segments."""
     count = rays.radii.shape[0]
     order = jnp.arange(count, dtype=jnp.int32)
-    spread = jax.vmap(lambda ray: footprints.begin(ray, footprint))(rays)
-    state = jax.vmap(branching.begin)(rays, inside, spread)
+    spread = jax.vmap(lambda ray: ray_differentials.begin(ray, footprint))(rays)
+    state = jax.vmap(path_step.begin)(rays, inside, spread)
     ambient = jnp.full_like(order, media.AMBIENT)
     first = jnp.full_like(order, NO_SEGMENT)
     nowhere = jnp.full_like(order, media.EMPTY_SLOT)
@@ -160,36 +284,36 @@ def _begin(
     ends = Ends(order, order, state.weight, order, order)
     # Each buffer has slots beyond its capacity for the records that one iteration may append.
     tree = PathTree(
-        segments=pools.fill(segments, count, room.segments + 2 * block),
-        ends=pools.fill(ends, 0, room.paths + 3 * block),
+        segments=queues.fill(segments, count, room.segments + 2 * block),
+        ends=queues.fill(ends, 0, room.paths + 3 * block),
         lost=jnp.zeros_like(rays.origins),
         casts=jnp.zeros((), jnp.int32),
     )
-    stack = pools.fill(Live(state, order, order), count, room.live + 2 * block)
-    return _Walk(*pools.pop(stack, block), tree)
+    stack = queues.fill(Live(state, order, order), count, room.live + 2 * block)
+    return _Walk(*queues.pop(stack, block), tree)
 
 
 def _round(geometry: Scene, walk: _Walk, budget: Budget, block: int, room: Room) -> _Walk:
     """Casts one block, ends paths, and pushes the children on the stack."""
     live, alive = walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
     hits = _cast(geometry, live.state, alive)
-    arrive = jax.vmap(branching.arrive, in_axes=(None, 0, 0))
+    arrive = jax.vmap(path_step.arrive, in_axes=(None, 0, 0))
     arrival = arrive(geometry, live.state, hits.slots)
     hit = alive & jnp.isfinite(hits.distances)
-    status = jax.vmap(functools.partial(branching.ending, budget))(live.state, arrival, hit)
+    status = jax.vmap(functools.partial(path_step.ending, budget))(live.state, arrival, hit)
     bending = hit & (status == PathStatus.EMPTY)
     tree = walk.tree._replace(casts=walk.tree.casts + jnp.sum(alive, dtype=jnp.int32))
     medium = arrival.interaction.sides.medium_near
     # The medium of a camera is known only from the first surface it sees.
     tree = path_tree.name_media(tree, live.segments, medium, hit & (live.state.bends == 0))
-    tree = offspring.end_by(budget, tree, live, status, alive & ~bending)
-    branches = jax.vmap(functools.partial(branching.branch, budget))(
+    tree = end_by(budget, tree, live, status, alive & ~bending)
+    branches = jax.vmap(functools.partial(path_step.branch, budget))(
         live.state, arrival, hits.slots
     )
-    children = offspring.children_of(live, branches, arrival, bending, budget)
-    tree, children = offspring.log(tree, children, room)
-    tree, stack = offspring.push(tree, walk.stack, children, budget)
-    return _Walk(*pools.pop(stack, block), tree)
+    children = children_of(live, branches, arrival, bending, budget)
+    tree, children = log(tree, children, room)
+    tree, stack = push(tree, walk.stack, children, budget)
+    return _Walk(*queues.pop(stack, block), tree)
 
 
 def _cast(geometry: Scene, state: RayState, alive: Bool[Array, " block"]) -> bvh.Hits:

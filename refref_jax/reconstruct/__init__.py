@@ -1,7 +1,14 @@
-"""R3F: from posed masks to geometry, with no step by hand.
+"""R3F: geometry and refractive index from posed images and masks, without manual steps.
 
-The hull of the masks is a scalar grid (`visual_hull`), its zero set a mesh (`isosurface`), which is
-cleaned, smoothed and meshed anew (`refinement`); `comparison` says how far it is from a true mesh,
-and from masks. A field that is trained on the masks (`occupancy`, the paper's way) gives such a
-grid too; one from elsewhere enters at `isosurface`.
+The visual hull of the masks is a scalar field on a grid (`visual_hull`), its zero set a mesh
+(`grids`), which is cleaned, smoothed and remeshed (`refinement`). An occupancy field trained on the
+masks (`occupancy`, as in the paper) gives such a grid, too. `mesh_distance` compares the mesh with
+a true one and with the masks; `refractive_index` estimates the index from images.
 """
+
+
+class ReconstructionError(ValueError):
+    """Masks, a grid or a mesh contain no object, or a required package is not installed.
+
+    The message says what is wrong and what to do.
+    """

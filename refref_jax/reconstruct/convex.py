@@ -12,16 +12,17 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
-from refref_jax.geometry.corner_normals import CREASE_ANGLE, face_normals
 from refref_jax.geometry.triangle_meshes import (
+    CREASE_ANGLE,
     Mesh,
     diameter,
+    face_normals,
     face_vectors,
     make_mesh,
     neighbours,
     volume,
 )
-from refref_jax.reconstruct.closest import ClosestSearch
+from refref_jax.reconstruct.mesh_distance import ClosestSearch
 from refref_jax.reconstruct.smoothing import CREASE
 
 FaceIndex = Int[np.ndarray, " pairs"]

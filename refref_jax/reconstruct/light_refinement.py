@@ -1,4 +1,18 @@
-"""A body made better by the light that went through it.
+"""Refines a mesh by the light refracted through it.
+
+A mesh that moves with a few handles, differentiably.
+
+Handles are vertices spread evenly over the surface. A vertex moves by the mean shift of the handles
+next to it, the nearer the more; where there are no more vertices than handles,
+each is its own. Shading normals turn as those of the faces around do, so that without a shift they
+are what they were, however these were made.
+
+Hosts build (`build`), devices move (`move`).
+
+The tree of the surfaces stays that of the mesh at rest: which triangle a ray meets is found there,
+and where it meets it on the moved one. That holds for shifts well below an edge's length.
+
+A body made better by the light that went through it.
 
 Masks know where a body's outlines are; what is seen through it knows its normals, which bend light
 by as much as they turn. So, with the field of the background held fixed, the handles of the surface
@@ -20,14 +34,145 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
+from scipy.spatial import KDTree
 
-from refref_jax.geometry.triangle_meshes import Mesh
+from refref_jax import numerics
+from refref_jax.geometry import bvh_build
+from refref_jax.geometry.surfaces import Surfaces
+from refref_jax.geometry.triangle_meshes import Mesh, Vertices, smooth_groups
 from refref_jax.optics.media import Interfaces
 from refref_jax.optics.scene import Scene, with_index
-from refref_jax.reconstruct import deformation, photometry
-from refref_jax.reconstruct.deformation import Rig
-from refref_jax.reconstruct.photometry import Evidence
-from refref_jax.render.config import ModelConfig
+from refref_jax.reconstruct import ReconstructionError, refractive_index
+from refref_jax.reconstruct.refractive_index import Evidence
+from refref_jax.render.model import ModelConfig
+
+HANDLES = 256
+"""Enough for errors of a twentieth of a body's size; what is finer is noise of the masks."""
+
+# Handles that a vertex hangs on.
+_NEAREST = 6
+
+
+class Rig(NamedTuple):
+    """What moves a mesh.
+
+    Attributes:
+      surfaces: at rest.
+      vertices: at rest, world units.
+      faces: of the mesh.
+      groups: number of the smooth group that each corner of a face belongs to.
+      slots: the face of each slot of the surfaces.
+      handles: those that a vertex hangs on.
+      shares: their weights, which sum to 1.
+      neighbours: handles next to each handle.
+    """
+
+    surfaces: Surfaces
+    vertices: Float[Array, "vertices 3"]
+    faces: Int[Array, "faces 3"]
+    groups: Int[Array, "faces 3"]
+    slots: Int[Array, " slots"]
+    handles: Int[Array, "vertices nearest"]
+    shares: Float[Array, "vertices nearest"]
+    neighbours: Int[Array, "handles around"]
+
+
+def build(mesh: Mesh, *, handles: int = HANDLES) -> Rig:
+    """Puts handles on a mesh; the arrays are the host's.
+
+    Args:
+      mesh: at rest.
+      handles: how many at most; 4 or more.
+
+    Raises:
+      ReconstructionError: if there are fewer.
+    """
+    if handles < 4:
+        raise ReconstructionError(f"{handles} handles hold no body. Give 4 or more.")
+    bvh, slots = bvh_build.build(mesh.vertices[mesh.faces].astype(np.float32))
+    surfaces = Surfaces(bvh, mesh.normals[slots].astype(np.float32), np.zeros(len(slots), np.int32))
+    chosen = _spread(mesh.vertices, handles)
+    hung, shares = _hang(mesh.vertices, mesh.vertices[chosen])
+    around = KDTree(mesh.vertices[chosen]).query(
+        mesh.vertices[chosen], k=[*range(2, 2 + min(_NEAREST, len(chosen) - 1))]
+    )[1]
+    return Rig(
+        surfaces,
+        mesh.vertices.astype(np.float32),
+        mesh.faces.astype(np.int32),
+        smooth_groups(mesh.vertices, mesh.faces).astype(np.int32),
+        slots,
+        hung.astype(np.int32),
+        shares.astype(np.float32),
+        around.astype(np.int32),
+    )
+
+
+def move(rig: Rig, shifts: Float[Array, "handles 3"]) -> Surfaces:
+    """Returns the surfaces with their handles shifted, in world units."""
+    corners = _moved(rig, shifts)[rig.faces]
+    still = rig.vertices[rig.faces]
+    turned = _group_normals(rig, corners) - _group_normals(rig, still)
+    normals = jax.vmap(jax.vmap(numerics.normalize))(rig.surfaces.normals + turned[rig.slots])
+    bvh = rig.surfaces.bvh._replace(triangles=corners[rig.slots])
+    return rig.surfaces._replace(bvh=bvh, normals=normals)
+
+
+def moved_mesh(mesh: Mesh, rig: Rig, shifts: Float[np.ndarray, "handles 3"]) -> Mesh:
+    """Returns a mesh with its handles shifted, for good: its surfaces can be built anew."""
+    moved = np.einsum("vn,vnk->vk", rig.shares, shifts[rig.handles])
+    device = jax.device_put((rig, shifts.astype(np.float32)))
+    normals = np.zeros(mesh.normals.shape)
+    # Slots at the end are padding, which repeats a face.
+    normals[rig.slots] = np.asarray(move(*device).normals, np.float64)
+    return Mesh(mesh.vertices + moved, mesh.faces, normals)
+
+
+def unevenness(rig: Rig, shifts: Float[Array, "handles 3"]) -> Float[Array, ""]:
+    """Returns the mean squared difference of a handle's shift to the mean of those around it."""
+    if rig.neighbours.shape[1] == 0:
+        return jnp.zeros((), shifts.dtype)
+    around = jnp.mean(shifts[rig.neighbours], axis=1)
+    return jnp.mean(jnp.sum(jnp.square(shifts - around), axis=-1))
+
+
+def _moved(rig: Rig, shifts: Float[Array, "handles 3"]) -> Float[Array, "vertices 3"]:
+    return rig.vertices + jnp.einsum("vn,vnk->vk", rig.shares, shifts[rig.handles])
+
+
+def _group_normals(rig: Rig, corners: Float[Array, "faces 3 3"]) -> Float[Array, "faces 3 3"]:
+    """Returns unit normals at corners: of the smooth group there, weighted by area."""
+    a, b, c = jnp.moveaxis(corners, 1, 0)
+    area = jnp.cross(b - a, c - a)
+    flat = rig.groups.reshape(-1)
+    sums = jax.ops.segment_sum(jnp.repeat(area, 3, axis=0), flat, num_segments=flat.shape[0])
+    return jax.vmap(numerics.normalize)(sums)[rig.groups]
+
+
+def _spread(vertices: Vertices, count: int) -> Int[np.ndarray, " handles"]:
+    """Returns vertices far from one another, each the furthest from those before it."""
+    if len(vertices) <= count:
+        return np.arange(len(vertices))
+    chosen = [int(np.argmax(np.linalg.norm(vertices - vertices.mean(axis=0), axis=-1)))]
+    away = np.full(len(vertices), np.inf)
+    while len(chosen) < count:
+        away = np.minimum(away, np.linalg.norm(vertices - vertices[chosen[-1]], axis=-1))
+        chosen.append(int(np.argmax(away)))
+    return np.asarray(chosen)
+
+
+def _hang(
+    vertices: Vertices, handles: Float[np.ndarray, "handles 3"]
+) -> tuple[Int[np.ndarray, "vertices nearest"], Float[np.ndarray, "vertices nearest"]]:
+    """Returns the handles of each vertex, and their shares."""
+    if len(handles) == len(vertices):
+        return np.arange(len(vertices))[:, None], np.ones((len(vertices), 1))
+    count = min(_NEAREST, len(handles))
+    away, nearest = KDTree(handles).query(vertices, k=[*range(1, count + 1)])
+    # The width is that of the furthest: a handle loses a vertex smoothly to another one.
+    reach = away[:, -1:]
+    shares = np.maximum(1.0 - (away / reach) ** 2, 0.0) ** 2
+    return nearest, shares / shares.sum(axis=1, keepdims=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +192,7 @@ class LightRefinement:
 
     steps: int = 100
     rays: int = 3072
-    handles: int = deformation.HANDLES
+    handles: int = HANDLES
     stride: float = 5e-5
     index_stride: float = 2e-4
     evenness: float = 30.0
@@ -107,7 +252,7 @@ def refine_by_light(
       settings: how.
       progress: told the steps done and the error of the last one.
     """
-    rig = deformation.build(mesh, handles=settings.handles)
+    rig = build(mesh, handles=settings.handles)
     device = jax.device_put((rig, interfaces))
     state = _start(rig.neighbours.shape[0], settings)
     generator = np.random.default_rng(settings.seed)
@@ -123,7 +268,7 @@ def refine_by_light(
             progress(step + 1, found[-1])
     shifts = settings.stride * np.asarray(state.unknowns.shifts, np.float64)
     furthest = float(np.linalg.norm(shifts, axis=-1).max())
-    moved = deformation.moved_mesh(mesh, rig, shifts)
+    moved = moved_mesh(mesh, rig, shifts)
     better = index + settings.index_stride * float(state.unknowns.index)
     return Refined(moved, better, tuple(found), furthest)
 
@@ -158,10 +303,10 @@ def _step(
 
     def objective(unknowns: _Unknowns) -> tuple[Float[Array, ""], Float[Array, ""]]:
         shifts = settings.stride * unknowns.shifts
-        moved = Scene(deformation.move(rig, shifts), interfaces)
+        moved = Scene(move(rig, shifts), interfaces)
         geometry = with_index(moved, index + settings.index_stride * unknowns.index)
-        error = jnp.mean(photometry.errors(some, geometry, config=config))
-        prior = settings.evenness * deformation.unevenness(rig, shifts)
+        error = jnp.mean(refractive_index.errors(some, geometry, config=config))
+        prior = settings.evenness * unevenness(rig, shifts)
         return error + prior, error
 
     gradient, error = jax.grad(objective, has_aux=True)(state.unknowns)

@@ -1,4 +1,6 @@
-"""From a mesh cut out of a grid to one that light can be traced through (host).
+"""Whether a mesh bounds a body, and whether that is still the same one (NumPy only).
+
+From a mesh cut out of a grid to one that light can be traced through (host).
 
 The stages, none of which needs a hand: all pieces but the largest go, unless they are large;
 ripples are smoothed; a body that is convex but for noise becomes so; a convex body that few corners
@@ -13,6 +15,7 @@ which can remove the body; in Blender a bevel of 0.015, 100 smoothings of factor
 the body by a length that depends on its edges, and a remesh at octree depth 8.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -23,19 +26,61 @@ from refref_jax.geometry.triangle_meshes import (
     Mesh,
     diameter,
     face_vectors,
+    is_closed,
     keep_faces,
     pieces,
+    volume,
 )
-from refref_jax.reconstruct.closest import signed_distance
+from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.convex import depth_below_hull, from_tangents, is_convex
-from refref_jax.reconstruct.corners import MOST, fit_corners
-from refref_jax.reconstruct.denoising import denoise_within
-from refref_jax.reconstruct.errors import ReconstructionError
-from refref_jax.reconstruct.grids import Box, sample
-from refref_jax.reconstruct.isosurface import find_isosurface, import_skimage
-from refref_jax.reconstruct.silhouettes import Views, check_masks
-from refref_jax.reconstruct.smoothing import CREASE, diffuse
-from refref_jax.reconstruct.soundness import check_body, objection
+from refref_jax.reconstruct.grids import Box, find_isosurface, import_skimage, sample
+from refref_jax.reconstruct.masks import Views, check_masks
+from refref_jax.reconstruct.mesh_distance import signed_distance
+from refref_jax.reconstruct.polytope_fit import MOST, fit_corners
+from refref_jax.reconstruct.smoothing import CREASE, denoise_within, diffuse
+
+
+def check_body(mesh: Mesh) -> None:
+    """Checks that a mesh bounds a body.
+
+    Raises:
+      ReconstructionError: if it is empty, open or turned inwards.
+    """
+    if len(mesh.faces) == 0:
+        raise ReconstructionError("The mesh is empty. Check the masks and the level of the grid.")
+    if not is_closed(mesh.faces):
+        raise ReconstructionError(
+            "The mesh is not closed. Cut it from a grid whose border is outside the body."
+        )
+    if volume(mesh.vertices, mesh.faces) <= 0.0:
+        raise ReconstructionError(
+            "The mesh is turned inwards. Exchange two corners of every face, or negate the grid."
+        )
+
+
+def objection(before: Mesh, after: Mesh, most: float) -> str:
+    """Returns why what was made of a body is no body, or another one; or nothing.
+
+    Args:
+      before: a body.
+      after: what was made of it.
+      most: share of the volume by which the two may differ.
+    """
+    if len(after.faces) == 0:
+        return "nothing would be left"
+    if not is_closed(after.faces) or not np.all(np.isfinite(after.vertices)):
+        return "the surface would be torn"
+    old, new = (volume(mesh.vertices, mesh.faces) for mesh in (before, after))
+    if not math.isclose(new, old, rel_tol=most):
+        return f"the volume would go from {old:.4g} to {new:.4g}"
+    if _count_pieces(after) > _count_pieces(before):
+        return "the body would fall apart"
+    return ""
+
+
+def _count_pieces(mesh: Mesh) -> int:
+    return len(np.unique(pieces(mesh.faces, len(mesh.vertices))[mesh.faces[:, 0]]))
+
 
 # Spacings around a mesh that is sampled.
 _RIM = 3
@@ -109,7 +154,7 @@ def refine(mesh: Mesh, settings: Refinement, *, views: Views | None = None) -> t
     """Returns the mesh after each stage that the settings ask for; the last one is the result.
 
     Args:
-      mesh: closed and outward, such as `isosurface.find_isosurface` returns.
+      mesh: closed and outward, such as `grids.find_isosurface` returns.
       settings: see `Refinement`.
       views: masks from which the mesh was made; without them no corners are fitted, and nothing
         holds denoising back.

@@ -22,9 +22,9 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import map_coordinates
 
 from refref_jax.geometry.cameras import Cameras, project
-from refref_jax.reconstruct.errors import ReconstructionError
+from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.grids import Box, Field, Grid, Points, Values, lattice, sample
-from refref_jax.reconstruct.silhouettes import BLUR, check_masks, signed_distances
+from refref_jax.reconstruct.masks import BLUR, check_masks, signed_distances
 
 REACH = 2.1
 """Half the edge of the cube around the origin in which a body is looked for, world units."""

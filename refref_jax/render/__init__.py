@@ -8,23 +8,23 @@ background (`radiance_of`): `render_known` renders it in tiles, and `shade` is t
 """
 
 from refref_jax.geometry.rays import Rays as Rays
-from refref_jax.optics.budgets import BUDGETS as BUDGETS
-from refref_jax.optics.budgets import Budget as Budget
+from refref_jax.optics.path_settings import BUDGETS as BUDGETS
+from refref_jax.optics.path_settings import Budget as Budget
+from refref_jax.render.background_rendering import KnownRendering as KnownRendering
+from refref_jax.render.background_rendering import render_known as render_known
+from refref_jax.render.background_rendering import shade as shade
 from refref_jax.render.backgrounds import CubeBackground as CubeBackground
 from refref_jax.render.backgrounds import Environment as Environment
 from refref_jax.render.backgrounds import LinearTexture as LinearTexture
 from refref_jax.render.backgrounds import SphereBackground as SphereBackground
 from refref_jax.render.backgrounds import SrgbTexture as SrgbTexture
 from refref_jax.render.backgrounds import radiance_of as radiance_of
-from refref_jax.render.config import ModelConfig as ModelConfig
+from refref_jax.render.checkpoint_io import load_model as load_model
 from refref_jax.render.images import Rendering as Rendering
+from refref_jax.render.images import render_camera as render_camera
 from refref_jax.render.images import render_image as render_image
 from refref_jax.render.images import render_rays as render_rays
-from refref_jax.render.known import KnownRendering as KnownRendering
-from refref_jax.render.known import render_known as render_known
-from refref_jax.render.known import shade as shade
 from refref_jax.render.model import Model as Model
+from refref_jax.render.model import ModelConfig as ModelConfig
 from refref_jax.render.model import Params as Params
 from refref_jax.render.model import init_params as init_params
-from refref_jax.render.saved import load_model as load_model
-from refref_jax.render.supersampling import render_camera as render_camera

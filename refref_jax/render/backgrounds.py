@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from refref_jax import numerics
 from refref_jax.render import colour
-from refref_jax.sampling import domains
+from refref_jax.sampling import scene_bounds
 
 Radiance = Callable[[Float[Array, "3"], Float[Array, "3"]], Float[Array, "3"]]
 """Radiance along one ray: function of origin and unit direction, world units, to linear RGB."""
@@ -169,7 +169,7 @@ def sphere_radiance(
     Gradients are finite everywhere; if the line is tangent to the sphere, the gradient of the
     distance is 0 (`numerics.safe_sqrt`).
     """
-    middle, half = domains.chord(background.radius, origin, direction)
+    middle, half = scene_bounds.chord(background.radius, origin, direction)
     return _look(background.texture, origin + (middle + half) * direction)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from refref_jax.geometry import bvh
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import Surfaces, surface_point
-from refref_jax.render import tiles
+from refref_jax.render import images
 
 TILE = 65536
 """Number of rays cast at once."""
@@ -53,10 +53,10 @@ def find_first_surface(surfaces: Surfaces, rays: Rays, *, tile: int = TILE) -> F
         raise ValueError(f"tile is {tile}, but a tile needs rays. Give 1 or more.")
     surfaces = jax.device_put(surfaces)
     empty = np.zeros((0, 3), jax.dtypes.canonicalize_dtype(rays.radii.dtype))
-    return tiles.in_tiles(
+    return images.in_tiles(
         lambda part, *_: FirstSurface(*_cast(surfaces, part)),
         rays,
-        tile=tiles.size_for(rays.radii.size, most=tile),
+        tile=images.size_for(rays.radii.size, most=tile),
         nothing=FirstSurface(empty[:, 0], empty, np.zeros(0, np.int32)),
         instead=_INSTEAD,
     )

@@ -1,29 +1,133 @@
-"""Renders images in tiles and chunks of fixed size, so that programs compile once.
+"""Renders images in tiles of fixed size.
+
+Splits rays into tiles of one size, so that the function that renders a tile compiles once.
+
+The loop over tiles runs on the host, so it cannot be part of a transformed function.
+
+Renders images in tiles and chunks of fixed size, so that programs compile once.
 
 Rays are traced in tiles. The paths of a tile are sorted so that empty slots come last, and are then
 rendered in chunks: a pixel that misses the objects costs one path, not two. This is one of the
 modules that call `jax.jit`.
+
+Images of a trained model with several rays in every pixel.
+
+A pixel is divided into `side x side` smaller ones. Each has a ray of its own with a footprint as
+much smaller, so the fields are queried for finer detail too. Colours are averaged as linear light
+and encoded afterwards: what a camera does, and what the true images were made with.
 """
 
 import functools
-from typing import NamedTuple, get_args
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple, TypeVar, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from refref_jax.choices import side_of
+from refref_jax.geometry.cameras import Cameras, box_filter, pixel_rays, supersample
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.budgets import Budget
-from refref_jax.optics.details import Detail
-from refref_jax.optics.first_branches import Branch, reflected_first
-from refref_jax.optics.light_paths import LightPaths
+from refref_jax.optics.light_paths import Branch, LightPaths, reflected_first
+from refref_jax.optics.media import EMPTY_SLOT
+from refref_jax.optics.path_settings import Budget, Detail
 from refref_jax.optics.path_tracing import Traced
 from refref_jax.optics.scene import Scene
-from refref_jax.render import colour, dyes, pixels, tiles
-from refref_jax.render.config import ModelConfig, path_detail
-from refref_jax.render.model import Model, Params
+from refref_jax.render import colour, learned_media, pixels
+from refref_jax.render.model import Model, ModelConfig, Params, path_detail
+
+# Padding rays of a tile start at this distance and point away from the scene: they hit nothing and
+# leave the capacity of the path buffers to the other rays.
+_OUT_OF_REACH = 1e9
+
+# Smaller tiles would have too little capacity for the paths of a ray.
+_SMALLEST_TILE = 1024
+
+_Tree = TypeVar("_Tree")
+
+
+def in_tiles(
+    see: Callable[[Rays, Int[np.ndarray, "tile slots"] | None, int], _Tree],
+    rays: Rays,
+    *,
+    tile: int,
+    nothing: _Tree,
+    instead: str,
+    inside: Int[np.ndarray, "*rays slots"] | None = None,
+) -> _Tree:
+    """Renders rays tile by tile, to NumPy arrays with the leading axes of the rays.
+
+    Args:
+      see: function that renders a tile, given its rays, their interior lists, and the number of
+        rays that are not padding.
+      rays: camera rays with any leading axes.
+      tile: number of rays per tile.
+      nothing: result for 0 rays.
+      instead: advice at the end of the error message.
+      inside: interior list of each ray's origin, if known.
+
+    Raises:
+      TypeError: if an array is a tracer, see `fetch`.
+    """
+    rays, inside = fetch((rays, inside), instead=instead)
+    shape, count = rays.radii.shape, rays.radii.size
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), (rays, inside))
+    parts = []
+    for start in range(0, count, tile):
+        seen = see(*cut_out(*flat, start, tile), min(tile, count - start))
+        parts.append(fetch(seen, instead=instead))
+    joined = join(parts or [nothing])
+    return jax.tree.map(lambda x: x[:count].reshape((*shape, *x.shape[1:])), joined)
+
+
+def size_for(rays: int, *, most: int) -> int:
+    """Returns the tile size for a number of rays: smaller tiles for few rays."""
+    return min(most, max(_SMALLEST_TILE, 1 << max(rays - 1, 0).bit_length()))
+
+
+def join(parts: Sequence[_Tree]) -> _Tree:
+    """Concatenates the arrays of several pytrees, as NumPy arrays."""
+    return jax.tree.map(lambda *each: np.concatenate(each), *parts)
+
+
+def fetch(tree: _Tree, *, instead: str) -> _Tree:
+    """Converts all arrays of a pytree to NumPy arrays.
+
+    Args:
+      tree: pytree of numbers and arrays.
+      instead: advice at the end of the error message.
+
+    Raises:
+      TypeError: if an array is a tracer, because JAX transforms the calling function.
+    """
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree)):
+        raise TypeError(
+            "This function works tile by tile on the host and cannot be part of a function "
+            f"that jit, vmap or grad transforms. {instead}"
+        )
+    return jax.tree.map(np.asarray, jax.device_get(tree))
+
+
+def cut_out(
+    rays: Rays, inside: Int[np.ndarray, "rays slots"] | None, start: int, tile: int
+) -> tuple[Rays, Int[np.ndarray, "tile slots"] | None]:
+    """Returns one tile of rays; the last tile is padded with rays that hit nothing.
+
+    Args:
+      rays: all rays, as NumPy arrays.
+      inside: interior list of each ray's origin, if known.
+      start: index of the first ray of the tile.
+      tile: number of rays per tile.
+    """
+    part, within = jax.tree.map(lambda x: x[start : start + tile], (rays, inside))
+    missing = tile - part.radii.shape[0]
+    away = np.tile(np.eye(3, dtype=part.directions.dtype)[:1], (missing, 1))
+    filling = Rays(_OUT_OF_REACH * away, away, np.ones(missing, part.radii.dtype))
+    nowhere = jax.tree.map(lambda x: np.full((missing, x.shape[1]), EMPTY_SLOT, x.dtype), within)
+    return jax.tree.map(lambda a, b: np.concatenate([a, b]), (part, within), (filling, nowhere))
+
 
 TILE = 16384
 """Number of rays traced at once."""
@@ -114,9 +218,9 @@ def render_image(
         raise ValueError(f"branch is {branch!r}, unknown. Use one of {', '.join(_BRANCHES)}.")
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but a chunk needs paths. Give 1 or more.")
-    rays = jax.tree.map(np.float32, tiles.fetch(rays, instead=_INSTEAD))
+    rays = jax.tree.map(np.float32, fetch(rays, instead=_INSTEAD))
     nothing = jax.device_get(_blank(jax.device_put(np.zeros((0, 3), np.float32))))
-    return tiles.in_tiles(
+    return in_tiles(
         lambda tile, _, real: _render_tile(model, tile, real, chunk, branch),
         rays,
         tile=TILE,
@@ -130,7 +234,7 @@ def _render_tile(model: Model, rays: Rays, real: int, chunk: int, branch: Branch
     which = _BRANCHES.index(branch)
     tile = _trace_tile(model.geometry, rays, real, which, budget=model.budget, detail=detail)
     sums = _blank(tile.lost)
-    count = int(tiles.fetch(tile.count, instead=_INSTEAD))
+    count = int(fetch(tile.count, instead=_INSTEAD))
     for start in range(0, count, chunk):
         sums = _render_chunk(model.params, tile, sums, start, config=model.config, chunk=chunk)
     return _finish_tile(sums)
@@ -213,7 +317,7 @@ def _add(
     jitter = pixels.no_jitter(config, paths.radii.shape[0])
     one = jnp.ones((), paths.radii.dtype)
     seen = pixels.render_paths(params, config, paths, jitter, anneal=one).composite
-    paths = dyes.dye(params.dyes, paths, radius=config.radius)
+    paths = learned_media.dye(params.dyes, paths, radius=config.radius)
     share = jnp.mean(paths.weights, axis=-1)
     rays = sums.distance.shape[0]
     # Writes to an index past the end are dropped.
@@ -228,3 +332,83 @@ def _add(
 
 def _finish(sums: Rendering) -> Rendering:
     return sums._replace(rgb=jnp.clip(colour.linear_to_srgb(sums.linear), 0.0, 1.0))
+
+
+RAYS_OF_A_BAND = 1 << 18
+"""Most rays that are held at once, where a row of pixels has no more."""
+
+
+def render_camera(
+    model: Model,
+    cameras: Cameras,
+    view: int,
+    *,
+    rays_per_pixel: int = 1,
+    chunk: int = CHUNK,
+    band: int = RAYS_OF_A_BAND,
+) -> Rendering:
+    """Renders one camera's image, with one or several rays in every pixel.
+
+    Rows of pixels are rendered band by band, so that memory does not grow with the image.
+
+    Args:
+      model: the scene.
+      cameras: cameras with the resolution of the image.
+      view: index of the camera.
+      rays_per_pixel: number of rays in each pixel, a square: 1, 4, 9, 16.
+      chunk: number of paths rendered at once.
+      band: number of rays held at once; at least one row of pixels is.
+
+    Returns:
+      NumPy arrays as `[height, width]`, see `average`.
+
+    Raises:
+      ValueError: if the rays of a pixel do not make a square grid.
+      TypeError: if it is called in a function that JAX transforms.
+    """
+    side = side_of(rays_per_pixel)
+    fine = supersample(cameras, side)
+    bands = [
+        average(render_image(model, rays, chunk=chunk), side)
+        for rays in _bands(fine, view, rows=side * max(1, band // (side * fine.width)))
+    ]
+    return join(bands)
+
+
+def warm_up(model: Model, cameras: Cameras, *, chunk: int) -> None:
+    """Compiles all programs of rendering, so that later timings are of rendering alone."""
+    zero = np.zeros(1, np.int64)
+    render_image(model, pixel_rays(cameras, zero, zero, zero), chunk=chunk)
+
+
+def average(fine: Rendering, side: int) -> Rendering:
+    """Averages the small pixels of a supersampled camera.
+
+    Colours are averaged as linear light, without clipping, and then encoded and clipped; mean
+    distances and accumulations are averaged as they are. The distance is the median of the small
+    pixels', the lower of the two middle ones if their number is even: at an edge it is that of one
+    of the two surfaces, never a place between them where nothing is.
+    """
+    linear = box_filter(fine.linear, side)
+    return Rendering(
+        rgb=np.clip(jax.device_get(colour.linear_to_srgb(jax.device_put(linear))), 0.0, 1.0),
+        distance=_lower_median(fine.distance, side),
+        mean_distance=box_filter(fine.mean_distance, side),
+        accumulation=box_filter(fine.accumulation, side),
+        linear=linear,
+        lost=box_filter(fine.lost, side),
+    )
+
+
+def _lower_median(fine: Float[np.ndarray, "height width"], side: int) -> Float[np.ndarray, "h w"]:
+    height, width = fine.shape
+    blocks = fine.reshape(height // side, side, width // side, side).swapaxes(1, 2)
+    ordered = np.sort(blocks.reshape(*blocks.shape[:2], side**2), axis=-1)
+    return ordered[..., (side**2 - 1) // 2]
+
+
+def _bands(cameras: Cameras, view: int, *, rows: int) -> Iterator[Rays]:
+    """Yields the rays of an image, some rows at a time."""
+    for start in range(0, cameras.height, rows):
+        row, column = np.indices((min(rows, cameras.height - start), cameras.width))
+        yield pixel_rays(cameras, np.full(row.shape, view), start + row, column)

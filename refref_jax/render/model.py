@@ -1,16 +1,120 @@
-"""A model of a scene: learned fields, and the scene that bends light paths."""
+"""Model of a scene: static configuration, parameters, scene and path settings.
 
-from typing import NamedTuple
+Static configuration of a model: its fields, its sampling, and the scene bounds.
+
+A model of a scene: learned fields, and the scene that bends light paths.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple, get_args
 
 import jax
 from jaxtyping import Array
 
-from refref_jax.fields import kinds, registry
-from refref_jax.optics.budgets import Budget
+from refref_jax.choices import Footprint, Interior, Space
+from refref_jax.fields import base, registry
+from refref_jax.fields.base import DensityConfig, RadianceConfig
+from refref_jax.optics.path_settings import Budget, Detail
 from refref_jax.optics.scene import Scene
-from refref_jax.render import dyes
-from refref_jax.render.config import ModelConfig
-from refref_jax.render.dyes import Dyes
+from refref_jax.render import learned_media
+from refref_jax.render.learned_media import Dyes
+
+# Segments before and after a convex object.
+_CONVEX_LEGS = 2
+
+# Light that leaves and re-enters objects has more outer segments, but few: with four, 0.04 % of the
+# light of a torus has an omitted segment, which is then treated as empty.
+_MOST_LEGS = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class ProposalConfig:
+    """One proposal level.
+
+    Attributes:
+      field: shape of its density field, of any type.
+      samples: number of intervals along a path.
+    """
+
+    field: DensityConfig
+    samples: int
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelConfig:
+    """Configuration of a model of a scene.
+
+    Attributes:
+      proposals: proposal levels, coarse to fine; at least one.
+      field: shape of the radiance field, of any type.
+      samples: number of intervals of the radiance field.
+      multisamples: number of multisamples per interval, 1 or 6.
+      interior: `field` also samples inside the objects (the paper); `clear` assumes empty objects,
+        which holds for clear glass and costs no samples; `absorbing` does not sample inside the
+        objects either, but attenuates light by the tints and absorption of interfaces and media.
+      footprint: `cone` widens the pixel footprint with arc length, as along a straight ray (the
+        paper); `differential` propagates it through every bend by ray differentials.
+      learned_tints: number of parts whose tint and absorption are learned, all parts or 0.
+      near: distance of the first sample from the camera, world units; 0 starts at the camera.
+      far: distance of the last sample from the last bend, or from the camera on a straight path;
+        the background is opaque there. In bounded and spherical scenes, paths end at the scene
+        bounds, and `far` is only used for paths that miss them.
+      radius: half edge of a bounded scene's cube, or radius of a spherical scene or of an
+        unbounded scene's uncontracted ball, world units, around the origin. A background cube
+        should coincide with the scene bounds: the field is unconstrained between the two.
+      space: `bounded` by the cube, `spherical` (bounded by the ball), or `unbounded` (contracted
+        beyond the ball).
+      dilation: widening of a proposal before it is sampled, as a fraction of its mean bin width; 0
+        for none.
+    """
+
+    proposals: tuple[ProposalConfig, ...]
+    field: RadianceConfig
+    samples: int
+    multisamples: int
+    interior: Interior
+    footprint: Footprint
+    learned_tints: int
+    near: float
+    far: float
+    radius: float
+    space: Space
+    dilation: float
+
+    def __post_init__(self) -> None:
+        """Validates the values."""
+        if not self.proposals:
+            raise ValueError("proposals is empty. Give at least one proposal level.")
+        if not 0.0 <= self.near < self.far:
+            raise ValueError(
+                f"The distances near = {self.near} and far = {self.far} are invalid. Choose them "
+                f"such that 0 <= near < far."
+            )
+        if not 0.0 < self.radius < math.inf:
+            raise ValueError(f"radius is {self.radius}. Give a positive, finite radius.")
+        if self.learned_tints < 0:
+            raise ValueError(
+                f"learned_tints is {self.learned_tints}. Give the number of parts, or 0."
+            )
+        _check_choice("space", self.space, get_args(Space))
+        _check_choice("interior", self.interior, get_args(Interior))
+        _check_choice("footprint", self.footprint, get_args(Footprint))
+
+
+def path_detail(config: ModelConfig, budget: Budget) -> Detail:
+    """Returns the parts of light paths that a model needs."""
+    tally = "parts" if config.learned_tints else "none"
+    most = budget.bends + 1
+    if config.interior == "field":
+        return Detail("all", most, config.footprint, tally)
+    legs = _CONVEX_LEGS if budget.reentry == "impossible" else _MOST_LEGS
+    return Detail("outside", min(legs, most), config.footprint, tally)
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name} is {value!r}, which is unknown. Use one of {', '.join(choices)}.")
 
 
 class Params(NamedTuple):
@@ -22,8 +126,8 @@ class Params(NamedTuple):
       dyes: learned tints and absorption of the parts, if any.
     """
 
-    proposals: tuple[kinds.Params, ...]
-    field: kinds.Params
+    proposals: tuple[base.Params, ...]
+    field: base.Params
     dyes: Dyes | None = None
 
 
@@ -50,5 +154,5 @@ def init_params(key: Array, config: ModelConfig) -> Params:
         registry.init_density(proposal_key, proposal.field)
         for proposal_key, proposal in zip(keys, config.proposals, strict=True)
     )
-    colours = dyes.init(config.learned_tints) if config.learned_tints else None
+    colours = learned_media.init(config.learned_tints) if config.learned_tints else None
     return Params(proposals, registry.init_radiance(field_key, config.field), colours)

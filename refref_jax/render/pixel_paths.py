@@ -24,14 +24,13 @@ from jaxtyping import Array, Float, Int
 
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
-from refref_jax.optics.budgets import Budget
-from refref_jax.optics.details import Detail
 from refref_jax.optics.light_paths import LightPaths, PathStatus
+from refref_jax.optics.path_settings import Budget, Detail
 from refref_jax.optics.scene import Scene
-from refref_jax.render import Model, dyes, transport
-from refref_jax.render.dyes import Dyes
-from refref_jax.sampling import domains
-from refref_jax.sampling.domains import Domain
+from refref_jax.render import Model, learned_media, volume_rendering
+from refref_jax.render.learned_media import Dyes
+from refref_jax.sampling import scene_bounds
+from refref_jax.sampling.scene_bounds import Domain
 
 # Capacity for one pixel's paths: at a throughput threshold of 0.005, a flask of three media has
 # about 40.
@@ -110,7 +109,7 @@ def trace_pixel(
         geometry, colours, domain = (
             scene.geometry,
             scene.params.dyes,
-            transport.domain(scene.config),
+            volume_rendering.domain(scene.config),
         )
         budget = budget or scene.budget
     else:
@@ -208,7 +207,7 @@ def _trace(
     last = jnp.sum(jnp.isfinite(paths.tau), axis=-1, dtype=jnp.int32) - 1
 
     def leave(points: Array, directions: Array, i: Array) -> Array:
-        return domains.exit_distance(domain, points[i], directions[i])
+        return scene_bounds.exit_distance(domain, points[i], directions[i])
 
     ends = jax.vmap(leave)(paths.points, paths.directions, jnp.maximum(last, 0))
-    return _Traced(dyes.dye(colours, paths, radius=domain.radius), traced.lost, ends)
+    return _Traced(learned_media.dye(colours, paths, radius=domain.radius), traced.lost, ends)

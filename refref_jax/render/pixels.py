@@ -11,10 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from refref_jax.optics.light_paths import LightPaths
-from refref_jax.render import colour, dyes, transport
-from refref_jax.render.config import ModelConfig
-from refref_jax.render.model import Params
-from refref_jax.render.transport import Jitter, PathRadiance
+from refref_jax.render import colour, learned_media, volume_rendering
+from refref_jax.render.model import ModelConfig, Params
+from refref_jax.render.volume_rendering import Jitter, PathRadiance
 
 
 class Light(NamedTuple):
@@ -58,7 +57,7 @@ def render_pixels(
       paths: light paths, in any order.
       jitter: jitter of each path.
       rays: number of rays in the batch.
-      anneal: exponent on the proposals' weights, see `transport.path_radiance`.
+      anneal: exponent on the proposals' weights, see `volume_rendering.path_radiance`.
     """
     light = gather_light(params, config, paths, jitter, rays=rays, anneal=anneal)
     return Pixels(colour.linear_to_srgb(light.linear), light.paths)
@@ -75,7 +74,7 @@ def gather_light(
 ) -> Light:
     """Sums the contributions of paths to their rays; arguments as in `render_pixels`."""
     seen = render_paths(params, config, paths, jitter, anneal=anneal)
-    paths = dyes.dye(params.dyes, paths, radius=config.radius)
+    paths = learned_media.dye(params.dyes, paths, radius=config.radius)
     linear = jax.ops.segment_sum(paths.weights * seen.composite.rgb, paths.rays, num_segments=rays)
     return Light(linear, seen)
 
@@ -89,7 +88,7 @@ def render_paths(
     anneal: Float[Array, ""],
 ) -> PathRadiance:
     """Renders each path of a batch independently."""
-    render = jax.vmap(transport.path_radiance, in_axes=(None, None, 0, 0, None))
+    render = jax.vmap(volume_rendering.path_radiance, in_axes=(None, None, 0, 0, None))
     return render(params, config, paths, jitter, anneal)
 
 
@@ -104,7 +103,7 @@ def random_jitter(key: Array, config: ModelConfig, slots: Int[Array, " paths"]) 
       config: configuration of the model.
       slots: index of each path in the batch's list.
     """
-    shape = (2, transport.rounds(config))
+    shape = (2, volume_rendering.rounds(config))
     draw = jax.vmap(lambda slot: jax.random.uniform(jax.random.fold_in(key, slot), shape))
     drawn = draw(slots)
     return Jitter(drawn[:, 0] - 0.5, 2.0 * jnp.pi * drawn[:, 1])
@@ -112,5 +111,5 @@ def random_jitter(key: Array, config: ModelConfig, slots: Int[Array, " paths"]) 
 
 def no_jitter(config: ModelConfig, paths: int) -> Jitter:
     """Returns zero jitter, for rendering without noise, in single precision like the fields."""
-    zeros = jnp.zeros((paths, transport.rounds(config)), jnp.float32)
+    zeros = jnp.zeros((paths, volume_rendering.rounds(config)), jnp.float32)
     return Jitter(zeros, zeros)

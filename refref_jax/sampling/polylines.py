@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.geometry.rays import orthonormal_basis
-from refref_jax.optics import footprints
-from refref_jax.optics.footprints import Spread
+from refref_jax.optics import ray_differentials
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.optics.media import AMBIENT
+from refref_jax.optics.ray_differentials import Spread
 
 
 class Polyline(NamedTuple):
@@ -117,7 +117,7 @@ def _footprint(
     if line.spreads.points.shape[-2] == 0:
         return line.radius * arc * jnp.stack(orthonormal_basis(direction))
     spread = jax.tree.map(lambda x: x[segment], line.spreads)
-    return footprints.across(spread, along, direction)
+    return ray_differentials.across(spread, along, direction)
 
 
 def _outside(path: LightPaths) -> Bool[Array, " segments"]:

@@ -33,7 +33,7 @@ from refref_jax.choices import (
     Space,
     Tints,
 )
-from refref_jax.optics.budgets import Reentry
+from refref_jax.optics.path_settings import Reentry
 
 # Options that say which objects there are.
 _OBJECTS = ("scene", "reconstruction")

@@ -26,10 +26,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from refref_jax import choices, metrics
-from refref_jax.data import local_layout
+from refref_jax.data import scene_folder
 from refref_jax.geometry import cameras
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.render import dyes, first_surface, supersampling
+from refref_jax.render import first_surface, images, learned_media
 from refref_jax.render.images import CHUNK, Rendering
 from refref_jax.render.model import Model
 
@@ -43,7 +43,7 @@ _lpips = jax.jit(metrics.lpips)
 class Truth(NamedTuple):
     """What a split says of its images; masks and distances may be missing."""
 
-    frames: local_layout.Frames
+    frames: scene_folder.Frames
     images: UInt8[np.ndarray, "frames h w 3"]
     masks: Bool[np.ndarray, "frames h w"] | None
     distances: Float[np.ndarray, "frames h w"] | None
@@ -136,15 +136,13 @@ def evaluate(
     truth = read_truth(Path(scene), split)
     chosen = _spread(len(truth.images), limit)
     views = truth.frames.cameras
-    supersampling.warm_up(model, views, chunk=chunk)
+    images.warm_up(model, views, chunk=chunk)
     if progress is not None:
         progress(0, len(chosen), "")
     per_image: list[dict[str, Any]] = []
     for place, i in enumerate(chosen):
         name, start = truth.frames.names[i], time.monotonic()
-        seen = supersampling.render_camera(
-            model, views, i, rays_per_pixel=rays_per_pixel, chunk=chunk
-        )
+        seen = images.render_camera(model, views, i, rays_per_pixel=rays_per_pixel, chunk=chunk)
         seconds = time.monotonic() - start
         first = first_distances(model, views, i)
         measured = measure(seen, truth, i, first=first, perceptual=perceptual)
@@ -165,9 +163,9 @@ def learned_colours(model: Model) -> dict[str, Any] | None:
     colours = model.params.dyes
     if colours is None:
         return None
-    absorptions = dyes.absorptions(colours, model.config.radius)
+    absorptions = learned_media.absorptions(colours, model.config.radius)
     return {
-        "tints": np.asarray(dyes.tints(colours), float).round(4).tolist(),
+        "tints": np.asarray(learned_media.tints(colours), float).round(4).tolist(),
         "absorptions": np.asarray(absorptions, float).round(4).tolist(),
     }
 
@@ -191,12 +189,12 @@ def first_distances(model: Model, views: Cameras, i: int) -> Float[np.ndarray, "
 
 def read_truth(scene: Path, split: str) -> Truth:
     """Reads all that a split has."""
-    frames = local_layout.read_frames(scene, split)
+    frames = scene_folder.read_frames(scene, split)
     return Truth(
         frames,
-        local_layout.read_images(frames),
-        local_layout.read_masks(frames) if frames.masks else None,
-        local_layout.read_distances(frames) if frames.depths else None,
+        scene_folder.read_images(frames),
+        scene_folder.read_masks(frames) if frames.masks else None,
+        scene_folder.read_distances(frames) if frames.depths else None,
     )
 
 

@@ -19,19 +19,19 @@ import jax
 from jax.sharding import Mesh
 
 from refref_jax import atomic_files, configuration
-from refref_jax.data import local_layout, mask_margins, scene_source
+from refref_jax.data import masks, scene_folder, scene_source
 from refref_jax.data.batches import PixelSampler
 from refref_jax.data.meshes import MeshPart
 from refref_jax.optics.scene import Scene
-from refref_jax.render import saved
+from refref_jax.render import checkpoint_io
+from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Model
-from refref_jax.render.saved import SavedModel
 from refref_jax.training import devices, loop, run_folder
-from refref_jax.training.checkpoints import Checkpoints
 from refref_jax.training.config import TrainConfig
+from refref_jax.training.loop import TrainState, init_state
 from refref_jax.training.objective import StepReport
 from refref_jax.training.resolve import Resolved, build_scene, read_facts, resolve
-from refref_jax.training.state import TrainState, init_state
+from refref_jax.training.run_folder import Checkpoints
 
 # Steps that the device takes without the host, which sees an interrupt only between them.
 _MOST_STEPS = 10
@@ -105,7 +105,7 @@ def fit(
             open_ = run_folder.check_unchanged if resuming else begin
             open_(run, resolved.config, resolved.model, scene)
         train(run, progress=progress, report=report, periods=periods, mesh=mesh)
-        return saved.load_model(run)
+        return checkpoint_io.load_model(run)
 
 
 def prepare(
@@ -187,14 +187,14 @@ def train(
     Raises:
       KeyboardInterrupt: if it was to stop before it took a step.
     """
-    config, model = run_folder.read_config(run), saved.read_static(run)
+    config, model = run_folder.read_config(run), checkpoint_io.read_static(run)
     lock = atomic_files.hold(run) if devices.is_first() else contextlib.nullcontext()
     with lock, Checkpoints(run, keep=periods.keep) as checkpoints:
         if checkpoints.newest() == config.schedule.steps:
             report(f"{run} is trained already: {config.schedule.steps} steps.")
             return True
         sampler = _sampler(config, scene_source.open_scene(scene or config.scene.path))
-        geometry = saved.load_geometry(run)
+        geometry = checkpoint_io.load_geometry(run)
         setup = loop.set_up(config, model.config, model.budget, geometry, sampler, mesh=mesh)
         if setup.hit_fraction == 0.0 and model.budget.bends > 0:
             report(
@@ -215,11 +215,11 @@ def train(
 
 def _sampler(config: TrainConfig, scene: Path) -> PixelSampler:
     """Reads the pixels that a run learns from."""
-    frames = local_layout.read_frames(scene, "train")
+    frames = scene_folder.read_frames(scene, "train")
     kept = None
     if config.scene.pixels == "background":
-        kept = mask_margins.well_outside(local_layout.read_masks(frames))
-    images, batch = local_layout.read_images(frames), config.schedule.batch
+        kept = masks.well_outside(scene_folder.read_masks(frames))
+    images, batch = scene_folder.read_images(frames), config.schedule.batch
     return PixelSampler(images, frames.cameras, seed=config.seed, batch=batch, kept=kept)
 
 

@@ -1,20 +1,258 @@
-"""The loop over training steps: draws pixels, traces them in pools, and steps."""
+"""The training loop: state, compiled steps, and pre-traced batches.
 
+What changes while a model is trained.
+
+One training step, and the tracing of the light paths that many steps use.
+
+This is one of the modules that call `jax.jit`.
+
+The loop over training steps: draws pixels, traces them in pools, and steps.
+"""
+
+import functools
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
+import optax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float, Int, UInt8
 
 from refref_jax.data.batches import PixelSampler
-from refref_jax.optics.budgets import Budget, capacity_for
+from refref_jax.geometry.rays import Rays
+from refref_jax.optics import light_paths, path_tracing
+from refref_jax.optics.path_settings import Budget, Detail, capacity_for
+from refref_jax.optics.path_tracing import Survey, Traced
 from refref_jax.optics.scene import Scene
-from refref_jax.render.config import ModelConfig, path_detail
-from refref_jax.training import devices, steps
-from refref_jax.training.config import TrainConfig
-from refref_jax.training.state import TrainState
+from refref_jax.render import pixels
+from refref_jax.render.model import ModelConfig, Params, init_params, path_detail
+from refref_jax.training import devices, objective
+from refref_jax.training.config import ScheduleConfig, TrainConfig
+from refref_jax.training.devices import AXIS
+from refref_jax.training.objective import StepReport, Totals
+
+# Zip-NeRF's decay of the second moment; hash entries are touched too rarely for 0.999.
+_SECOND_MOMENT_DECAY = 0.99
+
+_EPSILON = 1e-15
+
+
+class TrainState(NamedTuple):
+    """State of a run.
+
+    Attributes:
+      step: steps taken. With the seed it fixes which pixels and which noise come next, so it is
+        also the position in the data.
+      params: the model's parameters.
+      optimizer: optax's state.
+    """
+
+    step: Int[Array, ""]
+    params: Params
+    optimizer: optax.OptState
+
+
+def init_state(seed: int, model: ModelConfig, schedule: ScheduleConfig) -> TrainState:
+    """Returns the state of a run that has not begun."""
+    params = init_params(jax.random.key(seed), model)
+    return TrainState(jnp.zeros((), jnp.int32), params, optimizer(schedule).init(params))
+
+
+def optimizer(schedule: ScheduleConfig) -> optax.GradientTransformation:
+    """Returns Adam under the schedule's learning rate."""
+    return optax.adam(learning_rate(schedule), b2=_SECOND_MOMENT_DECAY, eps=_EPSILON)
+
+
+def learning_rate(schedule: ScheduleConfig) -> optax.Schedule:
+    """Returns the learning rate by step: a linear warm-up, then an exponential decay.
+
+    Source: paper (arXiv 2505.05848), supplement (implementation details).
+    """
+    return optax.warmup_exponential_decay_schedule(
+        init_value=0.0,
+        peak_value=schedule.peak,
+        warmup_steps=schedule.warmup,
+        transition_steps=max(1, schedule.steps - schedule.warmup),
+        decay_rate=schedule.end / schedule.peak,
+        end_value=schedule.end,
+    )
+
+
+# Slope of Schlick's bias function, by which trust in the proposals grows (Mip-NeRF 360).
+_ANNEAL_SLOPE = 10.0
+
+
+class Pool(NamedTuple):
+    """The light paths and true colours of many batches, and of some steps which they see.
+
+    Attributes:
+      traced: paths, stacked by batch.
+      rgb: 8-bit sRGB.
+      order: the batch of each step.
+    """
+
+    traced: Traced
+    rgb: UInt8[Array, "batches rays 3"]
+    order: Int[Array, " steps"]
+
+
+# How a pool lies on a mesh: of every batch each device has a share of the paths, and all colours.
+_SHARED = Pool(
+    traced=Traced(paths=PartitionSpec(None, AXIS), lost=PartitionSpec()),
+    rgb=PartitionSpec(),
+    order=PartitionSpec(),
+)
+
+
+@functools.partial(jax.jit, static_argnames=("budget", "capacity", "detail", "mesh"))
+def trace_pool(
+    geometry: Scene,
+    rays: Rays,
+    *,
+    budget: Budget,
+    capacity: int,
+    detail: Detail,
+    mesh: Mesh | None = None,
+) -> Traced:
+    """Traces the rays `[batches, rays]` of many batches; see `path_tracing.trace_batches`.
+
+    The devices of a mesh trace whole batches each, and are left with a share of every batch's
+    paths; a list is filled up with empty slots where it can not be shared evenly.
+    """
+    trace = functools.partial(
+        path_tracing.trace_batches, budget=budget, capacity=capacity, detail=detail
+    )
+    if mesh is None:
+        return trace(geometry, rays)
+    batches = rays.radii.shape[0]
+    again = jnp.arange(-(-batches // mesh.size) * mesh.size) % batches
+    specs = PartitionSpec(), PartitionSpec(AXIS)
+    trace = jax.shard_map(trace, mesh=mesh, in_specs=specs, out_specs=specs[1], check_vma=False)
+    traced = trace(geometry, jax.tree.map(lambda x: x[again], rays))
+    paths, lost = jax.tree.map(lambda x: x[:batches], traced)
+    paths = jax.vmap(functools.partial(light_paths.filled_up, multiple=mesh.size))(paths)
+    shared = jax.tree.map(lambda spec: NamedSharding(mesh, spec), _SHARED.traced)
+    return jax.lax.with_sharding_constraint(Traced(paths, lost), shared)
+
+
+@functools.partial(jax.jit, static_argnames="budget")
+def survey_paths(geometry: Scene, rays: Rays, *, budget: Budget) -> Survey:
+    """Measures how many paths the rays `[rays]` of a scene have; see `path_tracing.survey`."""
+    return path_tracing.survey(geometry, rays, budget=budget)
+
+
+@functools.partial(jax.jit, static_argnames=("config", "model", "mesh"), donate_argnames="state")
+def train_steps(
+    state: TrainState,
+    pool: Pool,
+    first: Int[Array, ""],
+    last: Int[Array, ""],
+    *,
+    config: TrainConfig,
+    model: ModelConfig,
+    mesh: Mesh | None = None,
+) -> tuple[TrainState, StepReport]:
+    """Takes consecutive steps of a pool, without a word to the host in between.
+
+    Args:
+      state: consumed: its buffers are reused for the result.
+      pool: light paths and colours.
+      first: place of the first step in the pool's order.
+      last: place after that of the last step; any number of steps is one compiled program.
+      config: the run.
+      model: the model.
+      mesh: the devices among which the pool's paths are shared out, by `trace_pool`. Results
+        depend on them by rounding alone.
+
+    Returns:
+      The state after the last step, and what that step measured.
+    """
+    take = functools.partial(_take_steps, config=config, model=model)
+    if mesh is not None:
+        whole = PartitionSpec()
+        take = jax.shard_map(
+            functools.partial(take, axis=AXIS),
+            mesh=mesh,
+            in_specs=(whole, _SHARED, whole, whole),
+            out_specs=whole,
+            check_vma=False,
+        )
+    return take(state, pool, first, last)
+
+
+def _take_steps(
+    state: TrainState,
+    pool: Pool,
+    first: Int[Array, ""],
+    last: Int[Array, ""],
+    *,
+    config: TrainConfig,
+    model: ModelConfig,
+    axis: str | None = None,
+) -> tuple[TrainState, StepReport]:
+    step = functools.partial(_step, pool=pool, config=config, model=model, axis=axis)
+    shapes = jax.eval_shape(step, state, first)[1]
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return jax.lax.fori_loop(
+        first, last, lambda place, carry: step(carry[0], place), (state, blank)
+    )
+
+
+def _step(
+    state: TrainState,
+    place: Int[Array, ""],
+    *,
+    pool: Pool,
+    config: TrainConfig,
+    model: ModelConfig,
+    axis: str | None,
+) -> tuple[TrainState, StepReport]:
+    """Takes one step, with the paths that this device has of the batch."""
+    batch = pool.order[place]
+    traced, rgb = jax.tree.map(lambda x: x[batch], (pool.traced, pool.rgb))
+    key = jax.random.fold_in(jax.random.key(config.seed), state.step)
+    jitter = pixels.random_jitter(key, model, _slots(traced.paths.radii.shape[0], axis))
+    anneal = _anneal(state.step, config.schedule.anneal)
+
+    def look(params: Params) -> Totals:
+        light = pixels.gather_light(
+            params, model, traced.paths, jitter, rays=rgb.shape[0], anneal=anneal
+        )
+        return objective.total(light, traced.paths, config.losses)
+
+    def judge(params: Params, totals: Totals) -> tuple[Float[Array, ""], StepReport]:
+        target = rgb.astype(jnp.float32) / 255.0
+        report = objective.measure(params, totals, target, traced.lost, config.losses)
+        return report.loss, report
+
+    # In two halves, between which devices tell each other what their paths sum to.
+    totals, pull_back = jax.vjp(look, state.params)
+    slopes = jax.grad(judge, argnums=(0, 1), has_aux=True)
+    (by_params, by_totals), report = slopes(state.params, _sum_devices(totals, axis))
+    (through_paths,) = pull_back(by_totals)
+    gradient = jax.tree.map(jnp.add, by_params, _sum_devices(through_paths, axis))
+    updates, moments = optimizer(config.schedule).update(gradient, state.optimizer, state.params)
+    params = optax.apply_updates(state.params, updates)
+    return TrainState(state.step + 1, params, moments), report
+
+
+def _slots(paths: int, axis: str | None) -> Int[Array, " paths"]:
+    """Returns the places that this device's paths have in the batch's list."""
+    slots = jnp.arange(paths, dtype=jnp.int32)
+    return slots if axis is None else slots + paths * jax.lax.axis_index(axis)
+
+
+def _sum_devices(tree: Any, axis: str | None) -> Any:
+    return tree if axis is None else jax.lax.psum(tree, axis)
+
+
+def _anneal(step: Int[Array, ""], steps: int) -> Float[Array, ""]:
+    """Returns the exponent on the proposals' weights (Mip-NeRF 360, Eq 18)."""
+    progress = jnp.minimum(step.astype(jnp.float32) / max(1, steps), 1.0)
+    return _ANNEAL_SLOPE * progress / ((_ANNEAL_SLOPE - 1.0) * progress + 1.0)
+
 
 # Pixels by which the room for a batch's paths is measured.
 _SURVEY = 1 << 14
@@ -45,7 +283,7 @@ class Setup(NamedTuple):
     sampler: PixelSampler
     capacity: int
     hit_fraction: float
-    epoch: steps.Pool | None = None
+    epoch: Pool | None = None
     mesh: Mesh | None = None
 
 
@@ -64,7 +302,7 @@ def set_up(
     half a gibibyte; while they are joined, three times that is in use.
     """
     geometry = jax.tree.map(jnp.asarray, geometry)
-    found = steps.survey_paths(geometry, sampler.survey(_SURVEY).rays, budget=budget)
+    found = survey_paths(geometry, sampler.survey(_SURVEY).rays, budget=budget)
     found = devices.as_in_the_first(jax.device_get(found))
     capacity = capacity_for(
         budget, config.schedule.batch, mean=float(found.mean), deviation=float(found.deviation)
@@ -77,7 +315,7 @@ def set_up(
 
 def run_steps(
     setup: Setup, state: TrainState, until: int, *, every: Sequence[int] = (1,)
-) -> Iterator[tuple[TrainState, steps.StepReport]]:
+) -> Iterator[tuple[TrainState, StepReport]]:
     """Takes all steps up to `until`; yields the state and the report every so many of them.
 
     A state is consumed by the steps that follow it: copy what is to be kept. Starting from a
@@ -100,14 +338,14 @@ def run_steps(
         while step < end:
             last = min(end, *(step + period - step % period for period in every))
             batches = np.int32(step - first), np.int32(last - first)
-            state, report = steps.train_steps(
+            state, report = train_steps(
                 state, pool, *batches, config=config, model=setup.model, mesh=setup.mesh
             )
             step = last
             yield state, report
 
 
-def _pools(setup: Setup, step: int, until: int) -> Iterator[tuple[int, steps.Pool]]:
+def _pools(setup: Setup, step: int, until: int) -> Iterator[tuple[int, Pool]]:
     """Yields the pools of some steps with the number of steps before each, one traced ahead."""
     size = setup.config.schedule.pool
     firsts = range(step - step % size, until, size)
@@ -119,7 +357,7 @@ def _pools(setup: Setup, step: int, until: int) -> Iterator[tuple[int, steps.Poo
         pool = following
 
 
-def _pool(setup: Setup, first: int) -> steps.Pool:
+def _pool(setup: Setup, first: int) -> Pool:
     """Returns the pool of the steps that follow the first so many."""
     numbers = setup.sampler.numbers(first, setup.config.schedule.pool)
     if setup.epoch is not None:
@@ -127,10 +365,10 @@ def _pool(setup: Setup, first: int) -> steps.Pool:
     return trace_batches(setup, numbers.tolist())
 
 
-def trace_batches(setup: Setup, numbers: Sequence[int]) -> steps.Pool:
+def trace_batches(setup: Setup, numbers: Sequence[int]) -> Pool:
     """Traces some batches of a run, to be seen in their order."""
     drawn = setup.sampler.draw(np.asarray(numbers))
-    traced = steps.trace_pool(
+    traced = trace_pool(
         setup.geometry,
         drawn.rays,
         budget=setup.budget,
@@ -139,10 +377,10 @@ def trace_batches(setup: Setup, numbers: Sequence[int]) -> steps.Pool:
         mesh=setup.mesh,
     )
     order = np.arange(len(numbers), dtype=np.int32)
-    return steps.Pool(traced, *devices.put_everywhere((drawn.rgb, order), mesh=setup.mesh))
+    return Pool(traced, *devices.put_everywhere((drawn.rgb, order), mesh=setup.mesh))
 
 
-def _trace_epoch(setup: Setup) -> steps.Pool | None:
+def _trace_epoch(setup: Setup) -> Pool | None:
     """Traces all batches once and for all, if their paths are worth keeping and fit in memory.
 
     They are traced pool by pool, with a pool's room for paths. Training is the same whether they

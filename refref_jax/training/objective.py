@@ -1,23 +1,99 @@
-"""What training minimises: the losses of a batch, from what its light paths sum to.
+"""Losses, and the training objective that sums them.
+
+Training losses. Each takes one path or one batch of colours and returns a scalar.
+
+Rendered colours are compared without clipping: colours below black or above white have gradients
+that move them back, and black pixels have the slope 12.92 of the transfer function (see
+`render.colour`). Fields return colours in `[-0.001, 1.001]`, so that their sigmoid has a non-zero
+slope at black and white.
+
+Letters: `s` is the normalised distance along a path, `w` its weights (see `sampling.stepfun`).
+
+What training minimises: the losses of a batch, from what its light paths sum to.
 
 In two halves: `total` sums over paths, of which a device may have a part, and `measure` takes the
 sums over all of them.
 """
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from refref_jax import losses, numerics
+from refref_jax import numerics
 from refref_jax.fields import hash_grid
 from refref_jax.optics import light_paths
 from refref_jax.optics.light_paths import LightPaths
-from refref_jax.render import colour, dyes, pixels
+from refref_jax.render import colour, learned_media, pixels
 from refref_jax.render.model import Params
+from refref_jax.render.volume_rendering import Histogram
+from refref_jax.sampling import stepfun
 from refref_jax.training.config import LossConfig
+
+_CHARBONNIER_PADDING = 0.001
+
+# Keeps the loss finite if a proposal is empty where the final histogram is not (Zip-NeRF).
+_INTERLEVEL_PADDING = 1e-5
+
+
+def mean_squared_error(
+    rendered: Float[Array, "rays 3"], target: Float[Array, "rays 3"]
+) -> Float[Array, ""]:
+    """Returns the mean squared error over pixels and channels (paper, photometric loss)."""
+    return jnp.mean(jnp.square(rendered - target))
+
+
+def charbonnier(
+    rendered: Float[Array, "rays 3"], target: Float[Array, "rays 3"]
+) -> Float[Array, ""]:
+    """Returns the mean of `sqrt(e^2 + 0.001^2)`, which is robust to outliers (Zip-NeRF)."""
+    return jnp.mean(jnp.sqrt(jnp.square(rendered - target) + _CHARBONNIER_PADDING**2))
+
+
+def interlevel(final: Histogram, proposal: Histogram, *, blur: float) -> Float[Array, ""]:
+    """Penalises a proposal that is lower than the final histogram of a path.
+
+    The final histogram is blurred by a box of half-width `blur` before the comparison, so that the
+    loss is smooth when a surface moves past the proposal's edges. Only the proposal receives
+    gradients.
+
+    Source: Barron et al., Zip-NeRF (2023), section 3 (anti-aliased interlevel loss).
+    """
+    edges, weights = jax.lax.stop_gradient(final)
+    below = stepfun.blurred_mass_below(proposal.edges, edges, weights, blur)
+    target = jax.lax.stop_gradient(jnp.diff(below))
+    shortfall = jnp.maximum(target - proposal.weights, 0.0)
+    return jnp.sum(jnp.square(shortfall) / (proposal.weights + _INTERLEVEL_PADDING))
+
+
+def distortion(final: Histogram, outside: Bool[Array, " samples"]) -> Float[Array, ""]:
+    """Concentrates the weights of a path, over the samples outside the objects only.
+
+    The loss is `sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 delta_i`, over intervals with middle
+    `m` and width `delta` for which `outside` holds. Inside a translucent object, light may come
+    from everywhere, and the original loss would empty it.
+
+    Source: paper (arXiv 2505.05848), corrected distortion loss; Mip-NeRF 360 (2022), Eq 15.
+    """
+    weights = jnp.where(outside, final.weights, 0.0)
+    middles = 0.5 * (final.edges[1:] + final.edges[:-1])
+    apart = jnp.abs(middles[:, None] - middles[None, :])
+    between = jnp.sum(weights * jnp.sum(weights[None, :] * apart, axis=-1))
+    within = jnp.sum(jnp.square(weights) * jnp.diff(final.edges)) / 3.0
+    return between + within
+
+
+def hash_decay(tables: Sequence[Float[Array, "_ _"]]) -> Float[Array, ""]:
+    """Returns the sum over levels of the mean squared entry.
+
+    The mean per level gives more weight to the entries of coarse levels, which have few.
+
+    Source: Barron et al., Zip-NeRF (2023), section 2 (normalised weight decay).
+    """
+    return sum((jnp.mean(jnp.square(table)) for table in tables), jnp.zeros(()))
 
 
 class StepReport(NamedTuple):
@@ -62,12 +138,12 @@ def total(light: pixels.Light, paths: LightPaths, config: LossConfig) -> Totals:
     exists = light_paths.exists(paths)
     missed = jnp.zeros(())
     for proposal, blur in zip(proposals, config.blurs, strict=True):
-        per_path = jax.vmap(functools.partial(losses.interlevel, blur=blur))(final, proposal)
+        per_path = jax.vmap(functools.partial(interlevel, blur=blur))(final, proposal)
         missed += _sum_where(exists, per_path)
     counted = light.paths.outside
     if config.distortion_over == "everywhere":
         counted = jnp.ones_like(counted)
-    spread = jax.vmap(losses.distortion)(final, counted)
+    spread = jax.vmap(distortion)(final, counted)
     count = jnp.sum(exists, dtype=missed.dtype)
     return Totals(light.linear, missed, _sum_where(exists, spread), count)
 
@@ -81,18 +157,18 @@ def measure(
 ) -> StepReport:
     """Returns the losses of a batch; those of paths are means over the paths that exist."""
     rgb = colour.linear_to_srgb(totals.linear)
-    mse = losses.mean_squared_error(rgb, target)
-    data = mse if config.data == "mse" else losses.charbonnier(rgb, target)
+    mse = mean_squared_error(rgb, target)
+    data = mse if config.data == "mse" else charbonnier(rgb, target)
     # Without any path both are 0, with gradient 0.
     interlevel = numerics.safe_divide(totals.interlevel, totals.paths)
     distortion = numerics.safe_divide(totals.distortion, totals.paths)
-    decay = losses.hash_decay(hash_grid.tables(params))
+    decay = hash_decay(hash_grid.tables(params))
     loss = (
         data
         + config.interlevel * interlevel
         + config.distortion * distortion
         + config.hash_decay * decay
-        + config.dye_decay * dyes.optical_density(params.dyes)
+        + config.dye_decay * learned_media.optical_density(params.dyes)
     )
     psnr = -10.0 * jnp.log10(mse)
     return StepReport(loss, psnr, interlevel, distortion, decay, jnp.mean(lost))

@@ -39,7 +39,7 @@ import numpy as np
 from refref_jax.choices import Interior, Space
 from refref_jax.fields import registry
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.render.config import ModelConfig, ProposalConfig
+from refref_jax.render.model import ModelConfig, ProposalConfig
 from refref_jax.training.config import LossConfig, ScheduleConfig
 
 _WALLS = 7.3

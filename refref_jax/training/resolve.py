@@ -17,21 +17,28 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from refref_jax.data import background, containment, local_layout, meshes, needs, rule_advice
+from refref_jax.data import (
+    background,
+    mesh_checks,
+    mesh_queries,
+    meshes,
+    scene_analysis,
+    scene_folder,
+)
 from refref_jax.data.batches import check_batch
-from refref_jax.data.containment import Containment
-from refref_jax.data.geometry import build_geometry
+from refref_jax.data.mesh_queries import Containment
 from refref_jax.data.meshes import MeshPart
-from refref_jax.data.needs import Needs
-from refref_jax.fields import networks
+from refref_jax.data.scene_analysis import Needs
+from refref_jax.data.scene_assembly import build_geometry
+from refref_jax.fields import mlps
+from refref_jax.fields.base import RadianceConfig
 from refref_jax.fields.hash_grid import HashGridConfig
-from refref_jax.fields.kinds import RadianceConfig
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.optics.budgets import Budget, budget_of
 from refref_jax.optics.media import EMPTY_SLOT
+from refref_jax.optics.path_settings import Budget, budget_of
 from refref_jax.optics.scene import Scene
-from refref_jax.render.config import ModelConfig
-from refref_jax.render.saved import SavedModel
+from refref_jax.render.checkpoint_io import SavedModel
+from refref_jax.render.model import ModelConfig
 from refref_jax.training import presets
 from refref_jax.training.config import FieldConfig, SceneConfig, TrainConfig, options_of
 
@@ -65,7 +72,7 @@ class SceneFacts(NamedTuple):
 
     def describe(self) -> str:
         """Returns what the scene requires, in one line."""
-        return needs.describe(self.needs)
+        return scene_analysis.describe(self.needs)
 
 
 class Resolved(NamedTuple):
@@ -107,16 +114,16 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
       ValueError: if the scene is broken, or a camera stands where it can not be followed.
     """
     folder = Path(scene.path)
-    local_layout.check_scene(folder)
-    cameras = local_layout.read_frames(folder, "train").cameras
+    scene_folder.check_scene(folder)
+    cameras = scene_folder.read_frames(folder, "train").cameras
     if parts is None:
         parts = meshes.read_meshes(folder, indices=dict(scene.indices))
-    tree = containment.find_containment(parts)
-    notes = rule_advice.check_meshes(parts, tree, rule=scene.rule)
+    tree = mesh_queries.find_containment(parts)
+    notes = mesh_checks.check_meshes(parts, tree, rule=scene.rule)
     if scene.rule == "priority":
         _refuse_cameras_inside(parts, cameras)
     space = scene.space or background.space(folder)
-    found = needs.find_needs(parts, tree, cameras, rule=scene.rule, space=space)
+    found = scene_analysis.find_needs(parts, tree, cameras, rule=scene.rule, space=space)
     extent = background.half_extent(folder) if space != "unbounded" else None
     return SceneFacts(found, cameras, parts, tree, extent, notes)
 
@@ -178,7 +185,7 @@ def samples_of(model: ModelConfig) -> tuple[int, ...]:
 
 def grid_of(model: ModelConfig) -> HashGridConfig | None:
     """Returns the hash grid of a model's radiance field, if fields of its kind have one."""
-    return model.field.grid if isinstance(model.field, networks.GridRadianceConfig) else None
+    return model.field.grid if isinstance(model.field, mlps.GridRadianceConfig) else None
 
 
 def _sampling_of(model: ModelConfig) -> dict[str, Any]:
@@ -387,7 +394,7 @@ def _with_samples(model: ModelConfig, samples: tuple[int, ...], preset: str) -> 
 def _with_grid(field: RadianceConfig, asked: FieldConfig) -> RadianceConfig:
     if asked.entries is None and asked.finest is None:
         return field
-    if not isinstance(field, networks.GridRadianceConfig):
+    if not isinstance(field, mlps.GridRadianceConfig):
         raise ValueError(
             f"entries and finest are of a hash grid, which fields of kind {field.kind} do not have."
             " Leave them out."
@@ -422,7 +429,7 @@ def _doubts(asked: TrainConfig, found: Needs) -> list[str]:
 
 def _refuse_cameras_inside(parts: Sequence[MeshPart], cameras: Cameras) -> None:
     """Refuses cameras whose rays would have to know at once what they are in."""
-    if np.any(containment.parts_around(parts, cameras.poses[:, :, 3]) != EMPTY_SLOT):
+    if np.any(mesh_queries.parts_around(parts, cameras.poses[:, :, 3]) != EMPTY_SLOT):
         raise ValueError(
             "A camera stands inside a mesh, which training can not follow under rule=priority. Use "
             "rule=nested, or move the camera."

@@ -1,4 +1,8 @@
-"""What a run writes: configuration, model and metrics, all readable text.
+"""Files of a run: configuration, model, metrics and checkpoints.
+
+Saves and restores the state of a run with Orbax: atomic, the newest few kept.
+
+What a run writes: configuration, model and metrics, all readable text.
 
 {run}/config.json      the resolved `TrainConfig`
 {run}/model.json       see `render.saved`
@@ -10,18 +14,97 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as ocp
 
 from refref_jax import atomic_files, configuration
 from refref_jax.optics.scene import Scene
-from refref_jax.render import saved
-from refref_jax.render.saved import SavedModel
+from refref_jax.render import checkpoint_io
+from refref_jax.render.checkpoint_io import (
+    PARAMS_ITEM,
+    TRAINING_ITEM,
+    SavedModel,
+    find_step,
+    open_checkpoints,
+    restore,
+)
 from refref_jax.training import config_files, resolve
 from refref_jax.training.config import TrainConfig, options_of
 from refref_jax.training.config_files import CONFIG
+from refref_jax.training.loop import TrainState
+
+
+class Checkpoints:
+    """The checkpoints of one run, open for writing. Use it in a `with` statement."""
+
+    def __init__(self, run: Path, *, keep: int) -> None:
+        """Opens or creates the checkpoints of a run folder, keeping the newest `keep`."""
+        self._run = run
+        self._manager = open_checkpoints(run, keep=keep)
+
+    def __enter__(self) -> "Checkpoints":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._manager.close()
+
+    def newest(self) -> int | None:
+        """Returns the step of the newest checkpoint, if there is one."""
+        return self._manager.latest_step()
+
+    def save(self, state: TrainState) -> None:
+        """Writes a state, and waits: its buffers belong to the next step.
+
+        Raises:
+          ValueError: if a parameter is not finite. The checkpoints there are stay.
+        """
+        step = int(state.step)
+        if step == self.newest():
+            return
+        if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(state.params)):
+            raise ValueError(
+                f"Parameters are not finite at step {step}, so no checkpoint is written. Evaluate "
+                "an earlier one, or train again with another seed, in another folder."
+            )
+        items = {
+            PARAMS_ITEM: ocp.args.StandardSave(state.params),
+            TRAINING_ITEM: ocp.args.StandardSave(_training_item(state)),
+        }
+        self._manager.save(step, args=ocp.args.Composite(**items), force=True)
+        self._manager.wait_until_finished()
+
+    def restore(self, like: TrainState) -> TrainState:
+        """Reads the newest state.
+
+        Args:
+          like: a state of the same run, or its shapes. What is read lies on the same devices, or
+            on the first one if `like` lies on none; which devices it was written from is no matter.
+
+        Raises:
+          ValueError: if there is no checkpoint.
+        """
+        shapes = jax.tree.map(_abstract, like)
+        step = find_step(self._manager, self._run, None)
+        items = restore(
+            self._manager,
+            step,
+            {PARAMS_ITEM: shapes.params, TRAINING_ITEM: _training_item(shapes)},
+        )
+        training = items[TRAINING_ITEM]
+        return TrainState(training["step"], items[PARAMS_ITEM], training["optimizer"])
+
+
+def _abstract(leaf: jax.Array | jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding)
+
+
+def _training_item(state: TrainState) -> dict[str, Any]:
+    return {"step": state.step, "optimizer": state.optimizer}
+
 
 _METRICS = "metrics.jsonl"
-_LEFT_BEHIND = (_METRICS, saved.CHECKPOINTS)
+_LEFT_BEHIND = (_METRICS, checkpoint_io.CHECKPOINTS)
 
 
 def exists(run: Path) -> bool:
@@ -37,7 +120,7 @@ def create(run: Path, config: TrainConfig, model: SavedModel, geometry: Scene) -
     """
     check_free(run)
     run.mkdir(parents=True, exist_ok=True)
-    saved.save_scene(run, model, geometry)
+    checkpoint_io.save_scene(run, model, geometry)
     config_files.write(run / CONFIG, config)
 
 
@@ -75,7 +158,7 @@ def read_config(run: Path) -> TrainConfig:
             f"{path} does not hold a TrainConfig of an earlier version ({error}). Restore the file."
         ) from error
     # What that file lacked, the model beside it tells.
-    return resolve.as_trained(config, saved.read_static(run))
+    return resolve.as_trained(config, checkpoint_io.read_static(run))
 
 
 def _with_todays_keys(content: dict[str, Any]) -> dict[str, Any]:
@@ -101,7 +184,7 @@ def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, geometry:
     moved = read_config(run).at(config.scene.path)
     if moved.scene.reconstruction and config.scene.reconstruction:
         moved = moved.decided(reconstruction=config.scene.reconstruction)
-    if moved != config or saved.read_static(run) != model:
+    if moved != config or checkpoint_io.read_static(run) != model:
         differing = [
             option.name
             for option in options_of()
@@ -112,7 +195,9 @@ def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, geometry:
             f"({', '.join(differing) or 'in the model'}). Resume it without options to continue it "
             "as it was, or choose another folder."
         )
-    pairs = zip(jax.tree.leaves(saved.load_geometry(run)), jax.tree.leaves(geometry), strict=True)
+    pairs = zip(
+        jax.tree.leaves(checkpoint_io.load_geometry(run)), jax.tree.leaves(geometry), strict=True
+    )
     if not all(np.array_equal(theirs, ours) for theirs, ours in pairs):
         raise ValueError(
             f"{run} was begun with other meshes than those of "

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from refref_jax.data.errors import SceneError
+from refref_jax.data import SceneError
 
 
 @contextmanager

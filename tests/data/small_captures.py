@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from refref_jax.data import files
+from refref_jax.data import image_files
 
 WIDTH, HEIGHT = 12, 10
 FOCAL = 9.0
@@ -55,10 +55,10 @@ def _save(folder: Path, content: dict[str, Any]) -> None:
 
 def _write_frame(folder: Path, frame: int) -> dict[str, Any]:
     name = f"frame_{frame:05d}.png"
-    files.write_png(folder / "images" / name, pixels_of(frame))
+    image_files.write_png(folder / "images" / name, pixels_of(frame))
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[4, 5] = True
-    files.write_mask(folder / "masks" / name, mask)
+    image_files.write_mask(folder / "masks" / name, mask)
     return {
         "file_path": f"images/{name}",
         "mask_path": f"./masks/{name}",

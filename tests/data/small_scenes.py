@@ -8,7 +8,7 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 
-from refref_jax.data import files
+from refref_jax.data import image_files
 
 WIDTH, HEIGHT = 8, 6
 """Not square, so that rows and columns can not be exchanged."""
@@ -55,7 +55,7 @@ def _transforms(scene: Path) -> Path:
 def _write_frame(scene: Path, frame: int) -> dict[str, Any]:
     name = f"train/r_{frame:03d}"
     (scene / "train").mkdir(parents=True, exist_ok=True)
-    files.write_rgb(scene / f"{name}.png", np.full((HEIGHT, WIDTH, 3), (frame + 1) / 255.0))
+    image_files.write_rgb(scene / f"{name}.png", np.full((HEIGHT, WIDTH, 3), (frame + 1) / 255.0))
     mask = np.zeros((HEIGHT, WIDTH))
     mask[1, 2 + frame] = 255
     write_grey(scene / "mask" / f"{name}.png", mask)

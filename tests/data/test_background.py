@@ -4,7 +4,7 @@ import shutil
 import numpy as np
 import pytest
 
-from refref_jax.data import files
+from refref_jax.data import image_files
 from refref_jax.data.background import half_extent, read_background, space
 from refref_jax.render.backgrounds import (
     CubeBackground,
@@ -117,7 +117,9 @@ def _ball_with(tmp_path, ball_scene, change):
 
 def _image(scene, name, value=0.25):
     pixels = np.full((4, 8, 3), value, np.float32)
-    (files.write_exr if name.endswith(".exr") else files.write_rgb)(scene / name, pixels)
+    (image_files.write_exr if name.endswith(".exr") else image_files.write_rgb)(
+        scene / name, pixels
+    )
 
 
 def test_the_walls_of_the_bundled_scene(ball_scene):
@@ -128,7 +130,7 @@ def test_the_walls_of_the_bundled_scene(ball_scene):
     np.testing.assert_array_equal(walls.normals[:2], [[1, 0, 0], [-1, 0, 0]])
     np.testing.assert_array_equal(walls.u_axes[:2], [[0, 1, 0], [0, -1, 0]])
     np.testing.assert_array_equal(walls.v_axes[:2], [[0, 0, 1], [0, 0, 1]])
-    expected = files.read_rgb(ball_scene / "background" / "face_-x.png") / 255.0
+    expected = image_files.read_rgb(ball_scene / "background" / "face_-x.png") / 255.0
     np.testing.assert_allclose(walls.texture.texels[1], expected, rtol=1e-6)
     assert {leaf.dtype for leaf in (walls.texture.texels, *walls[1:])} == {np.dtype(np.float32)}
 
@@ -190,7 +192,7 @@ def test_an_environment_that_is_not_finite(tmp_path):
 
 def test_an_environment_of_one_channel(tmp_path):
     scene = _scene(tmp_path / "a", {"background": {"type": "env", "image": "sky.exr"}})
-    files.write_exr(scene / "sky.exr", np.ones((4, 8), np.float32))
+    image_files.write_exr(scene / "sky.exr", np.ones((4, 8), np.float32))
     with scene_error("sky.exr", "R, G and B"):
         read_background(scene)
 

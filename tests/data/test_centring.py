@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from refref_jax.data.nerfstudio.centring import centred_windows
+from refref_jax.data.nerfstudio.conversion import centred_windows
 
 
 @pytest.mark.parametrize(

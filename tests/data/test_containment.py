@@ -4,12 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.data import containment
-from refref_jax.data.containment import (
-    find_containment,
-    parts_around,
-    winding_number,
-)
+from refref_jax.data import mesh_queries
+from refref_jax.data.mesh_queries import find_containment, parts_around, winding_number
 from refref_jax.data.meshes import read_meshes
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import EMPTY_SLOT, SLOTS
@@ -98,7 +94,7 @@ def test_winding_number_is_the_same_in_several_sweeps(monkeypatch):
     part = _open_box(2)
     points = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
     whole = winding_number(part, points)
-    monkeypatch.setattr(containment, "_SWEEP", 64)
+    monkeypatch.setattr(mesh_queries, "_SWEEP", 64)
     np.testing.assert_allclose(winding_number(part, points), whole, atol=_EXACT)
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.data.facing_walls import diagonal, sample_surface, walls_between
+from refref_jax.data.mesh_queries import diagonal, sample_surface, walls_between
 from tests.data.solids import as_part, ball, box, inverted, joined
 
 _EXACT = 1e-12

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from refref_jax.data.containment import find_containment
-from refref_jax.data.geometry import build_geometry
-from refref_jax.geometry.corner_normals import corner_normals, face_normals
+from refref_jax.data.mesh_queries import find_containment
+from refref_jax.data.scene_assembly import build_geometry
+from refref_jax.geometry.triangle_meshes import corner_normals, face_normals
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import AMBIENT
 from tests.data.solids import ball, box

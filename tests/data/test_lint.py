@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.data.containment import find_containment
-from refref_jax.data.findings import Finding
-from refref_jax.data.lint import lint
+from refref_jax.data.mesh_checks import Finding, lint
+from refref_jax.data.mesh_queries import find_containment
 from refref_jax.data.meshes import read_meshes
 from tests.data.expectations import only
 from tests.data.solids import as_part, ball, box, inverted, joined, shell

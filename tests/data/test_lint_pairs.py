@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.data.containment import find_containment
-from refref_jax.data.lint_pairs import lint_pairs
+from refref_jax.data.mesh_checks import lint_pairs
+from refref_jax.data.mesh_queries import find_containment
 from tests.data.expectations import only
 from tests.data.solids import as_part, ball, box, shell
 from tests.scenes import volume_of

@@ -3,7 +3,7 @@ import shutil
 import numpy as np
 import pytest
 
-from refref_jax.data import files, local_layout
+from refref_jax.data import image_files, scene_folder
 from refref_jax.geometry.cameras import image_rays, planar_depth_to_distance
 from tests.data.expectations import scene_error
 from tests.data.small_scenes import (
@@ -64,12 +64,12 @@ def scene(tmp_path):
 
 @pytest.fixture
 def rendered(ball_scene):
-    return local_layout.read_frames(ball_scene, "test")
+    return scene_folder.read_frames(ball_scene, "test")
 
 
 @pytest.mark.parametrize(("split", "count"), [("train", 60), ("val", 10), ("test", 20)])
 def test_bundled_splits(ball_scene, split, count):
-    frames = local_layout.read_frames(ball_scene, split)
+    frames = scene_folder.read_frames(ball_scene, split)
     cameras = frames.cameras
     assert len(frames.names) == len(set(frames.names)) == len(cameras.poses) == count
     assert len(frames.images) == len(frames.masks) == len(frames.depths) == count
@@ -80,7 +80,7 @@ def test_bundled_splits(ball_scene, split, count):
 
 
 def test_bundled_images_and_masks(rendered):
-    images, masks = local_layout.read_images(rendered), local_layout.read_masks(rendered)
+    images, masks = scene_folder.read_images(rendered), scene_folder.read_masks(rendered)
     assert images.shape == (20, 128, 128, 3)
     assert masks.shape == (20, 128, 128)
     sine = _BALL_RADIUS / _CAMERA_DISTANCE
@@ -102,15 +102,15 @@ def test_float_depth_is_preferred(rendered):
 def test_float_distances_agree_with_the_eight_bit_ones(rendered):
     coarse = rendered._replace(depths=tuple(p.with_suffix(".png") for p in rendered.depths))
     secant = planar_depth_to_distance(rendered.cameras, np.ones((128, 128)))
-    exact = local_layout.read_distances(rendered) / secant
-    rounded = local_layout.read_distances(coarse) / secant
+    exact = scene_folder.read_distances(rendered) / secant
+    rounded = scene_folder.read_distances(coarse) / secant
     assert np.max(exact) > 11.5 > np.min(exact) > 1.0
     np.testing.assert_allclose(np.minimum(exact, 11.5), rounded, rtol=0.0, atol=_HALF_LEVEL)
 
 
 def test_distances_of_the_ball_are_those_of_a_sphere(rendered):
-    masks = local_layout.read_masks(rendered)
-    distances = local_layout.read_distances(rendered)
+    masks = scene_folder.read_masks(rendered)
+    distances = scene_folder.read_distances(rendered)
     assert np.min(distances[masks]) >= _CAMERA_DISTANCE - _BALL_RADIUS - 1e-3
     assert np.max(distances[masks]) <= _CAMERA_DISTANCE
     for camera in range(20):
@@ -130,20 +130,20 @@ def test_distances_of_the_ball_are_those_of_a_sphere(rendered):
 
 
 def test_small_scene_is_read_as_written(scene):
-    frames = local_layout.read_frames(scene, "train")
+    frames = scene_folder.read_frames(scene, "train")
     assert frames.names == ("r_000", "r_001")
     assert (frames.cameras.width, frames.cameras.height) == (WIDTH, HEIGHT)
     assert frames.cameras.focal == pytest.approx(4.0 / np.tan(0.5))
     assert frames.cameras.poses.shape == (2, 3, 4)
     np.testing.assert_array_equal(frames.cameras.poses[1, :, 3], [1.0, 10.0, 20.0])
-    images, masks = local_layout.read_images(frames), local_layout.read_masks(frames)
+    images, masks = scene_folder.read_images(frames), scene_folder.read_masks(frames)
     np.testing.assert_array_equal(images[:, 0, 0], [[1] * 3, [2] * 3])
     np.testing.assert_array_equal(np.argwhere(masks), [[0, 1, 2], [1, 1, 3]])
 
 
 def test_eight_bit_depth_becomes_distance(scene):
-    frames = local_layout.read_frames(scene, "train")
-    distances = local_layout.read_distances(frames)
+    frames = scene_folder.read_frames(scene, "train")
+    distances = scene_folder.read_distances(frames)
     x, y = 3.5 / frames.cameras.focal, 2.5 / frames.cameras.focal
     corner = np.sqrt(1.0 + x * x + y * y)
     np.testing.assert_allclose(distances[:, 0, 0], [11.5 * corner, 9.4 * corner], rtol=1e-6)
@@ -152,10 +152,10 @@ def test_eight_bit_depth_becomes_distance(scene):
 def test_a_float_depth_beside_the_named_one_is_read(scene):
     depth = np.full((HEIGHT, WIDTH), 3.0)
     depth[0, 0] = 1e10
-    files.write_exr(scene / "depth" / "train" / "r_001.exr", depth)
-    frames = local_layout.read_frames(scene, "train")
+    image_files.write_exr(scene / "depth" / "train" / "r_001.exr", depth)
+    frames = scene_folder.read_frames(scene, "train")
     assert [path.suffix for path in frames.depths] == [".png", ".exr"]
-    distances = local_layout.read_distances(frames)
+    distances = scene_folder.read_distances(frames)
     assert distances[1, 0, 0] == np.inf
     assert np.all(np.isfinite(distances[0]))
 
@@ -166,20 +166,20 @@ def test_masks_and_depths_are_optional(scene):
             del record["mask_file_path"], record["depth_file_path"]
 
     edit_transforms(scene, strip)
-    frames = local_layout.read_frames(scene, "train")
+    frames = scene_folder.read_frames(scene, "train")
     assert frames.masks is None
     assert frames.depths is None
-    assert len(local_layout.read_images(frames)) == 2
+    assert len(scene_folder.read_images(frames)) == 2
     with scene_error("train", "no masks", "Add mask_file_path"):
-        local_layout.read_masks(frames)
+        scene_folder.read_masks(frames)
     with scene_error("train", "no depth maps", "Add depth_file_path"):
-        local_layout.read_distances(frames)
+        scene_folder.read_distances(frames)
 
 
 @pytest.mark.parametrize("angle", [1, 0.01, 3.14])
 def test_field_of_view_may_be_any_number_below_pi(scene, angle):
     edit_transforms(scene, lambda transforms: transforms.update(camera_angle_x=angle))
-    focal = local_layout.read_frames(scene, "train").cameras.focal
+    focal = scene_folder.read_frames(scene, "train").cameras.focal
     assert focal == pytest.approx(4.0 / np.tan(0.5 * angle))
 
 
@@ -189,7 +189,7 @@ def test_a_pose_may_be_rounded_to_six_digits(scene):
     pose[:2, :2] = [[cosine, -sine], [sine, cosine]]
     edit_transforms(scene, _pose(pose))
     np.testing.assert_array_equal(
-        local_layout.read_frames(scene, "train").cameras.poses[0], pose[:3]
+        scene_folder.read_frames(scene, "train").cameras.poses[0], pose[:3]
     )
 
 
@@ -198,12 +198,12 @@ def test_a_pose_may_be_rounded_to_six_digits(scene):
 
 def test_missing_transforms_file(scene):
     with scene_error("transforms_val.json", "does not exist", "Give the folder of a scene"):
-        local_layout.read_frames(scene, "val")
+        scene_folder.read_frames(scene, "val")
 
 
 def test_missing_scene_folder(tmp_path):
     with scene_error(_JSON, "does not exist", "Give the folder of a scene"):
-        local_layout.read_frames(tmp_path / "absent", "train")
+        scene_folder.read_frames(tmp_path / "absent", "train")
 
 
 @pytest.mark.parametrize(
@@ -218,21 +218,21 @@ def test_missing_scene_folder(tmp_path):
 def test_transforms_file_that_is_no_json_object(scene, content, problem):
     (scene / _JSON).write_bytes(content)
     with scene_error(_JSON, problem, "Copy it again"):
-        local_layout.read_frames(scene, "train")
+        scene_folder.read_frames(scene, "train")
 
 
 @pytest.mark.parametrize("frames", [[], {}, 7, None])
 def test_no_frames(scene, frames):
     edit_transforms(scene, lambda transforms: transforms.update(frames=frames))
     with scene_error(_JSON, "lists no frames", "Add frames"):
-        local_layout.read_frames(scene, "train")
+        scene_folder.read_frames(scene, "train")
 
 
 @pytest.mark.parametrize("key", ["frames", "camera_angle_x"])
 def test_missing_key(scene, key):
     edit_transforms(scene, lambda transforms: transforms.pop(key))
     with scene_error(_JSON, repr(key), "Add it"):
-        local_layout.read_frames(scene, "train")
+        scene_folder.read_frames(scene, "train")
 
 
 @pytest.mark.parametrize(
@@ -241,21 +241,21 @@ def test_missing_key(scene, key):
 def test_a_frame_that_lacks_what_others_have(scene, key):
     edit_transforms(scene, _first_frame(**{key: None}))
     with scene_error(_JSON, repr(key), "Add it"):
-        local_layout.read_frames(scene, "train")
+        scene_folder.read_frames(scene, "train")
 
 
 @pytest.mark.parametrize("key", ["mask_file_path", "depth_file_path"])
 def test_the_frame_that_lacks_a_file_is_named(scene, key):
     edit_transforms(scene, _first_frame(**{key: None}))
     with scene_error("The frame ./train/r_000 of", "1 of 2 frames"):
-        local_layout.read_frames(scene, "train")
+        scene_folder.read_frames(scene, "train")
 
 
 @pytest.mark.parametrize("record", ["./train/r_000", None, []])
 def test_a_frame_that_is_no_object(scene, record):
     edit_transforms(scene, lambda transforms: transforms["frames"].append(record))
     with scene_error(_JSON):
-        local_layout.read_frames(scene, "train")
+        scene_folder.read_frames(scene, "train")
 
 
 @pytest.mark.parametrize("key", ["file_path", "mask_file_path", "depth_file_path"])
@@ -263,14 +263,14 @@ def test_a_frame_that_is_no_object(scene, record):
 def test_a_file_name_that_is_no_text(scene, key, value):
     edit_transforms(scene, lambda transforms: transforms["frames"][0].update({key: value}))
     with scene_error(str(scene)):
-        local_layout.read_frames(scene, "train")
+        scene_folder.read_frames(scene, "train")
 
 
 @pytest.mark.parametrize("angle", [0.0, -1.0, np.pi, 40.0, np.nan, np.inf, "1.0", None, [1.0]])
 def test_bad_field_of_view(scene, angle):
     edit_transforms(scene, lambda transforms: transforms.update(camera_angle_x=angle))
     with scene_error(_JSON, "camera_angle_x", "radians"):
-        local_layout.read_frames(scene, "train")
+        scene_folder.read_frames(scene, "train")
 
 
 @pytest.mark.parametrize(
@@ -280,30 +280,30 @@ def test_bad_field_of_view(scene, angle):
 def test_missing_file(scene, name):
     (scene / name).unlink()
     with scene_error(name, "does not exist", "opy"):
-        local_layout.read_frames(scene, "train")
+        scene_folder.read_frames(scene, "train")
 
 
 @pytest.mark.parametrize("shape", [(WIDTH, HEIGHT), (1, WIDTH), (HEIGHT, 1), (12, 16)])
 @pytest.mark.parametrize(
     ("folder", "read"),
     [
-        ("train", local_layout.read_images),
-        ("mask/train", local_layout.read_masks),
-        ("depth/train", local_layout.read_distances),
+        ("train", scene_folder.read_images),
+        ("mask/train", scene_folder.read_masks),
+        ("depth/train", scene_folder.read_distances),
     ],
 )
 def test_wrong_size(scene, shape, folder, read):
     write_grey(scene / folder / "r_001.png", np.ones(shape))
-    frames = local_layout.read_frames(scene, "train")
+    frames = scene_folder.read_frames(scene, "train")
     height, width = shape
     with scene_error(f"{folder}/r_001.png", f"{width} x {height}", "8 x 6", "Render it again"):
         read(frames)
 
 
 def test_wrong_size_of_float_depth(scene):
-    files.write_exr(scene / "depth/train/r_001.exr", np.ones((WIDTH, HEIGHT)))
+    image_files.write_exr(scene / "depth/train/r_001.exr", np.ones((WIDTH, HEIGHT)))
     with scene_error("r_001.exr", "6 x 8", "8 x 6"):
-        local_layout.read_distances(local_layout.read_frames(scene, "train"))
+        scene_folder.read_distances(scene_folder.read_frames(scene, "train"))
 
 
 @pytest.mark.parametrize(
@@ -320,7 +320,7 @@ def test_wrong_size_of_float_depth(scene):
 def test_a_pose_that_is_no_rotation(scene, edit):
     edit_transforms(scene, edit)
     with scene_error(_JSON, "transform_matrix", "Export the poses"):
-        local_layout.read_frames(scene, "train")
+        scene_folder.read_frames(scene, "train")
 
 
 @pytest.mark.parametrize(
@@ -340,7 +340,7 @@ def test_a_pose_that_is_no_rotation(scene, edit):
 def test_a_pose_that_is_no_finite_matrix(scene, edit):
     edit_transforms(scene, edit)
     with scene_error(_JSON, "4 x 4", "Export the poses again"):
-        local_layout.read_frames(scene, "train")
+        scene_folder.read_frames(scene, "train")
 
 
 def test_a_transposed_pose_is_no_rigid_motion(scene):
@@ -348,33 +348,33 @@ def test_a_transposed_pose_is_no_rigid_motion(scene):
     pose[3, :3] = [1.0, 2.0, 3.0]
     edit_transforms(scene, _pose(pose))
     with scene_error(_JSON, "transform_matrix"):
-        local_layout.read_frames(scene, "train")
+        scene_folder.read_frames(scene, "train")
 
 
 def test_a_mask_without_object(scene):
     write_grey(scene / "mask/train/r_001.png", np.zeros((HEIGHT, WIDTH)))
     with scene_error("mask/train/r_001.png", "marks no object", "Render the mask again"):
-        local_layout.read_masks(local_layout.read_frames(scene, "train"))
+        scene_folder.read_masks(scene_folder.read_frames(scene, "train"))
 
 
 @pytest.mark.parametrize(
     ("name", "read"),
     [
-        ("train/r_001.png", local_layout.read_images),
-        ("mask/train/r_000.png", local_layout.read_masks),
-        ("depth/train/r_001.png", local_layout.read_distances),
+        ("train/r_001.png", scene_folder.read_images),
+        ("mask/train/r_000.png", scene_folder.read_masks),
+        ("depth/train/r_001.png", scene_folder.read_distances),
     ],
 )
 def test_truncated_image(scene, name, read):
     truncate(scene / name)
     with scene_error(name, "truncated"):
-        read(local_layout.read_frames(scene, "train"))
+        read(scene_folder.read_frames(scene, "train"))
 
 
 def test_truncated_first_image(scene):
     truncate(scene / "train/r_000.png")
     with scene_error("train/r_000.png", "truncated"):
-        local_layout.read_frames(scene, "train")
+        scene_folder.read_frames(scene, "train")
 
 
 @pytest.mark.parametrize("other", ["train", "more"])
@@ -387,20 +387,20 @@ def test_two_frames_of_one_name(scene, other):
 
     edit_transforms(scene, repeat)
     with scene_error("r_000", "Give every frame a name of its own"):
-        local_layout.read_frames(scene, "train")
+        scene_folder.read_frames(scene, "train")
 
 
-@pytest.mark.parametrize("split", local_layout.SPLITS)
+@pytest.mark.parametrize("split", scene_folder.SPLITS)
 @pytest.mark.parametrize("kind", ["", "mask", "depth"])
 def test_checking_a_scene_finds_a_broken_file_in_any_split(tmp_path, ball_scene, split, kind):
     scene = tmp_path / "scene"
     shutil.copytree(ball_scene, scene)
-    local_layout.check_scene(scene)
+    scene_folder.check_scene(scene)
     broken = sorted((scene / kind / split).glob("*.png"))[-1]
     broken.write_bytes(broken.read_bytes()[:-30])
     broken.with_suffix(".exr").unlink(missing_ok=True)
     with scene_error(broken.name, "again"):
-        local_layout.check_scene(scene)
+        scene_folder.check_scene(scene)
 
 
 def test_checking_a_scene_does_without_val_and_test(tmp_path, ball_scene):
@@ -408,6 +408,6 @@ def test_checking_a_scene_does_without_val_and_test(tmp_path, ball_scene):
     shutil.copytree(ball_scene, scene)
     for split in ("val", "test"):
         (scene / f"transforms_{split}.json").unlink()
-    local_layout.check_scene(scene)
+    scene_folder.check_scene(scene)
     with scene_error("transforms_test.json"):
-        local_layout.check_scene(scene, needed=("test",))
+        scene_folder.check_scene(scene, needed=("test",))

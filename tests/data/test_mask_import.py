@@ -3,9 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from refref_jax.data import files, local_layout
-from refref_jax.data.errors import SceneError
-from refref_jax.data.mask_import import add_masks
+from refref_jax.data import SceneError, image_files, scene_folder
+from refref_jax.data.masks import add_masks
 from tests.data.small_scenes import HEIGHT, WIDTH, edit_transforms, without_masks, write_scene
 
 
@@ -29,14 +28,14 @@ def _contents(folder):
 def test_the_copy_has_the_masks_and_all_else(scene, tmp_path):
     before = _contents(scene)
     assert add_masks(scene, tmp_path / "new" / "copy", _one_pixel) == 2
-    frames = local_layout.read_frames(tmp_path / "new" / "copy", "train")
+    frames = scene_folder.read_frames(tmp_path / "new" / "copy", "train")
     expected = [_one_pixel(image) for image in frames.images]
-    np.testing.assert_array_equal(local_layout.read_masks(frames), expected)
+    np.testing.assert_array_equal(scene_folder.read_masks(frames), expected)
     assert _contents(scene) == before
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["copy"]
     np.testing.assert_array_equal(
-        local_layout.read_images(frames),
-        local_layout.read_images(local_layout.read_frames(scene, "train")),
+        scene_folder.read_images(frames),
+        scene_folder.read_images(scene_folder.read_frames(scene, "train")),
     )
 
 
@@ -48,10 +47,10 @@ def test_the_model_sees_each_image_once(scene, tmp_path):
 
 def test_masks_of_before_are_replaced_in_the_copy_alone(tmp_path):
     scene = write_scene(tmp_path / "own")
-    old = local_layout.read_masks(local_layout.read_frames(scene, "train"))
+    old = scene_folder.read_masks(scene_folder.read_frames(scene, "train"))
     add_masks(scene, tmp_path / "copy", _one_pixel)
-    copied = local_layout.read_masks(local_layout.read_frames(tmp_path / "copy", "train"))
-    kept = local_layout.read_masks(local_layout.read_frames(scene, "train"))
+    copied = scene_folder.read_masks(scene_folder.read_frames(tmp_path / "copy", "train"))
+    kept = scene_folder.read_masks(scene_folder.read_frames(scene, "train"))
     np.testing.assert_array_equal(kept, old)
     assert copied[0, 3, 0] and not copied[0, 1, 2]
 
@@ -89,7 +88,7 @@ def test_images_outside_of_the_scene_are_refused(scene, tmp_path, name):
 
 def test_a_scene_without_masks_says_where_to_get_them(scene):
     with pytest.raises(SceneError, match=r"docs/masks\.md"):
-        local_layout.read_masks(local_layout.read_frames(scene, "train"))
+        scene_folder.read_masks(scene_folder.read_frames(scene, "train"))
 
 
 def test_the_example_of_the_document_names_files_as_they_are_read(scene, tmp_path):
@@ -99,4 +98,4 @@ def test_the_example_of_the_document_names_files_as_they_are_read(scene, tmp_pat
         "./train/r_000",
         "./mask/train/r_000.png",
     )
-    assert files.read_mask(tmp_path / "copy" / record["mask_file_path"]).sum() == 1
+    assert image_files.read_mask(tmp_path / "copy" / record["mask_file_path"]).sum() == 1

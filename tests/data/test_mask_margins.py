@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from refref_jax.data.mask_margins import well_inside, well_outside
+from refref_jax.data.masks import well_inside, well_outside
 
 
 def _masks():

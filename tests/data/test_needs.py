@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.data import containment, meshes
-from refref_jax.data.convexity import is_convex
-from refref_jax.data.needs import describe, find_needs
+from refref_jax.data import mesh_queries, meshes
+from refref_jax.data.mesh_queries import is_convex
+from refref_jax.data.scene_analysis import describe, find_needs
 from refref_jax.geometry.cameras import orbit
 from tests.data import solids
 
@@ -12,7 +12,7 @@ _CAMERAS = orbit(4, distance=4.0, elevation=0.3, size=8, angle_x=1.0)
 
 
 def _needs(*parts, rule="nested", space="bounded", cameras=_CAMERAS):
-    tree = containment.find_containment(parts)
+    tree = mesh_queries.find_containment(parts)
     return find_needs(parts, tree, cameras, rule=rule, space=space)
 
 

@@ -5,7 +5,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from refref_jax.data.errors import SceneError
+from refref_jax.data import SceneError
 from refref_jax.data.nerfstudio import capture as nerfstudio
 from refref_jax.geometry.cameras import Cameras, image_rays
 from tests.data.small_captures import FOCAL, HEIGHT, LENS, WIDTH, edit, pose_of, write_capture

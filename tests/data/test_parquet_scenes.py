@@ -3,7 +3,7 @@ import sys
 import numpy as np
 import pytest
 
-from refref_jax.data import local_layout, parquet_scenes
+from refref_jax.data import parquet_scenes, scene_folder
 from refref_jax.data.parquet_scenes import METADATA_KEY, Contents
 from refref_jax.geometry.cameras import focal_length, planar_depth_to_distance
 from tests.data.expectations import scene_error
@@ -27,23 +27,23 @@ def test_three_hundred_rows_are_three_splits(tmp_path):
     shards = write_copy(tmp_path, shards=2)
     scene = _unpack(shards, tmp_path, lambda done, total: steps.append((done, total)))
     assert steps == [(i + 1, 300) for i in range(300)]
-    local_layout.check_scene(scene)
+    scene_folder.check_scene(scene)
     for first, split in ((0, "train"), (100, "val"), (200, "test")):
-        frames = local_layout.read_frames(scene, split)
+        frames = scene_folder.read_frames(scene, split)
         cameras = frames.cameras
         assert cameras.focal == pytest.approx(focal_length(WIDTH, 1.1656107902526855), rel=1e-12)
         assert frames.names[0] == "r_000" and frames.names[-1] == "r_099"
         rows = np.arange(first, first + 100)
         np.testing.assert_array_equal(cameras.poses[:, 0, 3], rows)
         assert np.all(cameras.poses[:, 1, 3] == 1.0 / 3.0)  # not rounded on the way
-        images = local_layout.read_images(frames)
+        images = scene_folder.read_images(frames)
         np.testing.assert_array_equal(images[:, 0, 0, :2], np.stack([rows % 256, rows // 256], 1))
-        masks = local_layout.read_masks(frames)
+        masks = scene_folder.read_masks(frames)
         np.testing.assert_array_equal(masks.sum((1, 2)), 1)
         assert np.all(masks[np.arange(100), rows % masks.shape[1], rows % masks.shape[2]])
         depth = 1.0 + 10.5 * (1.0 - rows % 256 / 255.0)
         secant = planar_depth_to_distance(cameras, np.ones((1, HEIGHT, WIDTH)))[0, 2, 3]
-        distances = local_layout.read_distances(frames)[:, 2, 3]
+        distances = scene_folder.read_distances(frames)[:, 2, 3]
         np.testing.assert_allclose(distances, depth * secant, rtol=1e-6)
 
 
@@ -59,8 +59,8 @@ def test_metadata_tells_splits_and_field_of_view(tmp_path):
     shards = write_copy(tmp_path, rows=7, metadata=_told({"train": 5, "val": 0, "test": 2}))
     scene = _unpack(shards, tmp_path)
     assert not (scene / "transforms_val.json").exists()
-    test = local_layout.read_frames(scene, "test")
-    assert len(local_layout.read_frames(scene, "train").names) == 5
+    test = scene_folder.read_frames(scene, "test")
+    assert len(scene_folder.read_frames(scene, "train").names) == 5
     np.testing.assert_array_equal(test.cameras.poses[:, 0, 3], [5, 6])
     assert test.cameras.focal == pytest.approx(focal_length(WIDTH, 1.0))
 
@@ -101,9 +101,9 @@ def test_masks_and_depth_maps_are_optional(tmp_path):
             each["mask"] = None
 
     shards = write_copy(tmp_path, rows=3, edit=strip, drop=("depth",))
-    frames = local_layout.read_frames(_unpack(shards, tmp_path), "val")
+    frames = scene_folder.read_frames(_unpack(shards, tmp_path), "val")
     assert frames.masks is None and frames.depths is None
-    assert len(local_layout.read_images(frames)) == 1
+    assert len(scene_folder.read_images(frames)) == 1
 
 
 @pytest.mark.parametrize(

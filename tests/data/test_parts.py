@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.data.errors import SceneError
-from refref_jax.data.geometry import assemble, build_geometry, single_body
-from refref_jax.data.parts import make_part
+from refref_jax.data import SceneError
+from refref_jax.data.scene_assembly import assemble, build_geometry, make_part, single_body
 from refref_jax.optics.interface_rules import NO_PARENT
 from tests.data.solids import ball, box, inverted
 

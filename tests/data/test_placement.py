@@ -1,13 +1,8 @@
 import numpy as np
 import pytest
 
-from refref_jax.data.errors import SceneError
-from refref_jax.data.nerfstudio.placement import (
-    Placement,
-    meeting_point,
-    place,
-    undo_motion,
-)
+from refref_jax.data import SceneError
+from refref_jax.data.nerfstudio.conversion import Placement, meeting_point, place, undo_motion
 from refref_jax.geometry.cameras import orbit
 from tests.data.small_captures import pose_of
 

@@ -1,7 +1,7 @@
 import pytest
 
-from refref_jax.data.containment import find_containment
-from refref_jax.data.rule_advice import Advice, advise, examine_priorities
+from refref_jax.data.mesh_checks import Advice, advise, examine_priorities
+from refref_jax.data.mesh_queries import find_containment
 from tests.data.expectations import only
 from tests.data.solids import ball, box
 

@@ -8,7 +8,7 @@ import warnings
 import pytest
 import trimesh
 
-from refref_jax.data import background, local_layout, meshes, parquet_scenes
+from refref_jax.data import background, meshes, parquet_scenes, scene_folder
 from refref_jax.data.scene_source import SceneWarning, open_scene
 from tests.data.abandoned_folder import AbandonedFolder
 from tests.data.expectations import scene_error
@@ -50,7 +50,7 @@ def test_a_scene_is_unpacked_with_its_meshes(copy, tmp_path):
         scene = open_scene(_SOURCE, progress=lambda done, total: steps.append((done, total)))
     assert scene.name == NAME and scene.is_relative_to(tmp_path / "cache")
     assert steps[-1] == (6, 6)
-    local_layout.check_scene(scene)
+    scene_folder.check_scene(scene)
     (part,) = meshes.read_meshes(scene)
     assert part.name == "ball_glass" and part.index == 1.5
     assert (scene / "meshes/ball_glass.ply").read_bytes() == (
@@ -70,8 +70,8 @@ def test_what_changes_in_the_copy_is_unpacked_anew(copy):
     write_copy(copy, rows=9)
     longer = open_scene(_SOURCE)
     assert longer != scene
-    assert len(local_layout.read_frames(longer, "val").names) == 3
-    assert len(local_layout.read_frames(scene, "val").names) == 2  # whoever reads it goes on
+    assert len(scene_folder.read_frames(longer, "val").names) == 3
+    assert len(scene_folder.read_frames(scene, "val").names) == 2  # whoever reads it goes on
 
 
 def test_files_may_be_in_the_folder_of_the_configuration(tmp_path):
@@ -79,7 +79,7 @@ def test_files_may_be_in_the_folder_of_the_configuration(tmp_path):
     write_copy(elsewhere, rows=9, folder=CONFIG)
     _write_mesh(elsewhere / _MESHES / "ball_glass.ply")
     scene = open_scene(_SOURCE, copies=[elsewhere], cache=tmp_path / "cache")
-    assert len(local_layout.read_frames(scene, "train").names) == 3
+    assert len(scene_folder.read_frames(scene, "train").names) == 3
 
 
 def test_several_folders_may_be_given(tmp_path, monkeypatch):
@@ -109,7 +109,7 @@ def test_without_meshes_a_scene_is_read_with_a_warning(copy):
         scene = open_scene(_SOURCE)
     assert str(scene / "meshes") in str(caught[0].message)
     assert meshes.read_meshes(scene) == []
-    local_layout.check_scene(scene)
+    scene_folder.check_scene(scene)
 
 
 def test_a_scene_that_was_unpacked_in_part_is_never_used(copy, tmp_path, monkeypatch):
@@ -128,8 +128,8 @@ def test_a_scene_that_was_unpacked_in_part_is_never_used(copy, tmp_path, monkeyp
     (abandoned,) = (tmp_path / "cache").glob("*/.unpacking-*")
     assert list(abandoned.rglob("*.png"))
     scene = open_scene(_SOURCE)
-    local_layout.check_scene(scene)
-    assert len(local_layout.read_frames(scene, "test").names) == 2
+    scene_folder.check_scene(scene)
+    assert len(scene_folder.read_frames(scene, "test").names) == 2
     assert abandoned.is_dir()  # another process may be at it
     long_ago = time.time() - 100_000
     os.utime(abandoned, (long_ago, long_ago))
@@ -147,7 +147,7 @@ def test_a_scene_that_another_process_has_unpacked_meanwhile_is_used(copy):
             scenes[0] = open_scene(_SOURCE)
 
     assert open_scene(_SOURCE, progress=meanwhile) == scenes[0]
-    local_layout.check_scene(scenes[0])
+    scene_folder.check_scene(scenes[0])
 
 
 def test_a_broken_file_leaves_nothing_behind(copy, tmp_path):
@@ -232,7 +232,7 @@ def test_without_a_copy_files_are_downloaded_once(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "huggingface_hub", client)
     monkeypatch.delenv("REFREF_HF", raising=False)
     scene = open_scene(_SOURCE, cache=tmp_path / "cache")
-    local_layout.check_scene(scene)
+    scene_folder.check_scene(scene)
     assert [part.name for part in meshes.read_meshes(scene)] == ["ball_glass"]
     assert client.asked[2:] == [f"data/{NAME}-00000-of-00001.parquet", f"{_MESHES}/ball_glass.ply"]
     monkeypatch.setitem(sys.modules, "huggingface_hub", _Client({}))

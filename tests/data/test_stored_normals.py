@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.data import meshes, stored_normals
-from refref_jax.data.geometry import build_geometry, shaded_mesh
-from refref_jax.data.part_descriptions import PartDescription
-from refref_jax.geometry.corner_normals import corner_normals
+from refref_jax.data import meshes
+from refref_jax.data.meshes import PartDescription
+from refref_jax.data.scene_assembly import build_geometry, shaded_mesh
+from refref_jax.geometry.triangle_meshes import corner_normals
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def mesh():
 def test_a_mesh_comes_back_to_the_bit(tmp_path, mesh):
     vertices, faces, normals = mesh
     path = tmp_path / "box_glass.ply"
-    stored_normals.write_mesh(path, *mesh)
+    meshes.write_mesh(path, *mesh)
     part = meshes.read_part(path, index=1.37)
     assert part.name == "box_glass" and part.index == 1.37
     np.testing.assert_array_equal(part.vertices[part.faces], vertices[faces])
@@ -36,7 +36,7 @@ def test_a_mesh_comes_back_to_the_bit(tmp_path, mesh):
 
 
 def test_light_is_bent_by_the_stored_normals(tmp_path, mesh):
-    stored_normals.write_mesh(tmp_path / "box_glass.ply", *mesh)
+    meshes.write_mesh(tmp_path / "box_glass.ply", *mesh)
     part = meshes.read_part(tmp_path / "box_glass.ply", index=1.5)
     surfaces = build_geometry([part], [-1], rule="nested").surfaces
     ours = np.concatenate([surfaces.bvh.triangles, surfaces.normals], axis=-1).reshape(-1, 18)
@@ -48,7 +48,7 @@ def test_light_is_bent_by_the_stored_normals(tmp_path, mesh):
 
 def test_a_scene_reads_them_unless_it_says_how_it_is_shaded(tmp_path, mesh):
     (tmp_path / "meshes").mkdir()
-    stored_normals.write_mesh(tmp_path / "meshes" / "box_glass.ply", *mesh)
+    meshes.write_mesh(tmp_path / "meshes" / "box_glass.ply", *mesh)
     (part,) = meshes.read_meshes(tmp_path)
     np.testing.assert_array_equal(part.normals, mesh[2])
     description = '{"parts": [{"mesh": "box_glass.ply", "smooth_normals": false}]}'
@@ -60,7 +60,7 @@ def test_a_scene_reads_them_unless_it_says_how_it_is_shaded(tmp_path, mesh):
 
 def test_other_programs_read_the_file(tmp_path, mesh):
     path = tmp_path / "box_glass.ply"
-    stored_normals.write_mesh(path, *mesh)
+    meshes.write_mesh(path, *mesh)
     seen = trimesh.load_mesh(path, process=False)
     np.testing.assert_array_equal(seen.vertices[seen.faces], mesh[0][mesh[1]])
     assert len(seen.vertices) > len(mesh[0])  # one for each normal
@@ -68,19 +68,19 @@ def test_other_programs_read_the_file(tmp_path, mesh):
 
 def test_normals_of_other_files_are_not_trusted(tmp_path, mesh):
     path = tmp_path / "box_glass.ply"
-    stored_normals.write_mesh(path, *mesh)
+    meshes.write_mesh(path, *mesh)
     trimesh.load_mesh(path, process=False).export(path, vertex_normal=True)
     assert b"property float nx" in path.read_bytes()[:400]
-    assert stored_normals.read_normals(path) is None
+    assert meshes.read_normals(path) is None
     assert meshes.read_part(path, index=1.5).normals is None
 
 
 @pytest.mark.parametrize("kept", [0.1, 0.5, 0.99])
 def test_a_truncated_file_is_refused(tmp_path, mesh, kept):
     path = tmp_path / "box_glass.ply"
-    stored_normals.write_mesh(path, *mesh)
+    meshes.write_mesh(path, *mesh)
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content))])
-    assert stored_normals.read_normals(path) is None
+    assert meshes.read_normals(path) is None
     with pytest.raises(ValueError, match="export it again"):
         meshes.read_part(path, index=1.5)

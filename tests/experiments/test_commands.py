@@ -16,7 +16,7 @@ import pytest
 import trimesh
 
 from experiments.figures import video
-from refref_jax.data import files
+from refref_jax.data import image_files
 from refref_jax.render import load_model
 from tests import code_generator
 from tests.experiments.command import ROOT, TINY, run_command
@@ -138,12 +138,12 @@ def test_evaluation_writes_images_metrics_and_a_comparison(trained):
     mean = np.mean([image["psnr"] for image in summary["per_image"]])
     np.testing.assert_allclose(summary["results"]["psnr"], mean)
     for image in summary["per_image"]:
-        rgb = files.read_rgb(out / "rgb" / f"{image['name']}.png")
-        distance = files.read_exr(out / "distance" / f"{image['name']}.exr")
+        rgb = image_files.read_rgb(out / "rgb" / f"{image['name']}.png")
+        distance = image_files.read_exr(out / "distance" / f"{image['name']}.exr")
         assert rgb.shape == (128, 128, 3) and distance.shape == (128, 128)
         # The picture on disk is the one that was measured.
         scene = Path(json.loads((trained / "config.json").read_text())["scene"]["path"])
-        target = files.read_rgb(scene / "val" / f"{image['name']}.png") / 255.0
+        target = image_files.read_rgb(scene / "val" / f"{image['name']}.png") / 255.0
         psnr = -10 * np.log10(np.mean((rgb / 255.0 - target) ** 2))
         assert psnr == pytest.approx(image["psnr"], abs=0.05)
     assert iio.imread(out / "comparison.png").ndim == 3
@@ -166,7 +166,7 @@ def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
     )
     out = trained / "render" / "orbit"
     assert {path.name for path in (out / "rgb").iterdir()} == {"r_000.png", "r_001.png"}
-    assert files.read_exr(out / "distance" / "r_001.exr").shape == (24, 24)
+    assert image_files.read_exr(out / "distance" / "r_001.exr").shape == (24, 24)
     assert iio.imread(out / "rgb.gif").shape[:3] == (2, 24, 24)
     assert iio.imread(out / "distance.gif").shape[1:] == (24, 24, 3)
     if video.has_ffmpeg():

@@ -6,12 +6,11 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from refref_jax.data import files, local_layout
-from refref_jax.data.errors import SceneError
+from refref_jax.data import SceneError, image_files, scene_folder
 from refref_jax.data.nerfstudio import capture as nerfstudio
-from refref_jax.data.nerfstudio import exporting as to_nerfstudio
-from refref_jax.data.nerfstudio import importing as from_nerfstudio
-from refref_jax.data.nerfstudio.importing import View
+from refref_jax.data.nerfstudio import conversion as from_nerfstudio
+from refref_jax.data.nerfstudio import conversion as to_nerfstudio
+from refref_jax.data.nerfstudio.conversion import View
 from tests.data.small_captures import FOCAL, HEIGHT, WIDTH, edit, pixels_of, pose_of, write_capture
 from tests.data.small_scenes import write_scene
 from tests.experiments.command import run_command
@@ -37,15 +36,15 @@ def test_the_command_both_ways(folder, tmp_path):
     assert "World: x -> 0.8 (x - (" in result.stdout  # from 5 units to the data set's 4
     assert "Cameras: 4 to 4 from the origin" in result.stdout
     assert "experiments.reconstruct" in result.stdout
-    local_layout.check_scene(tmp_path / "scene", needed=("train", "test"))
-    train = local_layout.read_frames(tmp_path / "scene", "train")
+    scene_folder.check_scene(tmp_path / "scene", needed=("train", "test"))
+    train = scene_folder.read_frames(tmp_path / "scene", "train")
     numbers = [1, 2, 3, 5, 6, 7]
     expected = np.stack([pose_of(number)[:3] for number in numbers])
     expected[..., 3] *= 0.8
     np.testing.assert_allclose(train.cameras.poses, expected, atol=1e-9)
     assert train.cameras.focal == pytest.approx(FOCAL)
     np.testing.assert_array_equal(
-        local_layout.read_images(train), [pixels_of(number) for number in numbers]
+        scene_folder.read_images(train), [pixels_of(number) for number in numbers]
     )
     again = run_command("convert_nerfstudio", *to_scene, fails=True)
     assert "nothing is overwritten" in again.stderr and "Traceback" not in again.stderr
@@ -61,10 +60,10 @@ def test_the_command_both_ways(folder, tmp_path):
     assert {split: len(each) for split, each in views.items()} == {"train": 6, "test": 3}
     from_nerfstudio.write_scene(views, tmp_path / "again", "object", step=lambda: None)
     for split in views:
-        before, after = (local_layout.read_frames(tmp_path / x, split) for x in ("scene", "again"))
+        before, after = (scene_folder.read_frames(tmp_path / x, split) for x in ("scene", "again"))
         np.testing.assert_allclose(after.cameras.poses, before.cameras.poses, atol=1e-6)
         assert after.cameras.focal == pytest.approx(before.cameras.focal, rel=1e-12)
-        for read in (local_layout.read_images, local_layout.read_masks):
+        for read in (scene_folder.read_images, scene_folder.read_masks):
             np.testing.assert_array_equal(read(after), read(before))
 
 
@@ -100,23 +99,23 @@ def _white_but_for(capture, *pixel):
     for path in (capture / "masks").iterdir():
         mask = np.ones((HEIGHT, WIDTH), bool)
         mask[pixel] = False
-        files.write_mask(path, mask)
+        image_files.write_mask(path, mask)
 
 
 def test_masks_mean_what_they_are_said_to(folder, tmp_path):
     assert _convert(folder, tmp_path / "white").masked == pytest.approx(1.0 / 120.0)
-    frames = local_layout.read_frames(tmp_path / "white", "train")
-    assert np.argwhere(local_layout.read_masks(frames)[0]).tolist() == [[4, 5]]
+    frames = scene_folder.read_frames(tmp_path / "white", "train")
+    assert np.argwhere(scene_folder.read_masks(frames)[0]).tolist() == [[4, 5]]
     _white_but_for(folder, 2, 3)
     _convert(folder, tmp_path / "black", "background")
-    frames = local_layout.read_frames(tmp_path / "black", "train")
-    assert np.argwhere(local_layout.read_masks(frames)[0]).tolist() == [[2, 3]]
+    frames = scene_folder.read_frames(tmp_path / "black", "train")
+    assert np.argwhere(scene_folder.read_masks(frames)[0]).tolist() == [[2, 3]]
     assert _convert(folder, tmp_path / "none", "none").masked is None
-    assert local_layout.read_frames(tmp_path / "none", "train").masks is None
+    assert scene_folder.read_frames(tmp_path / "none", "train").masks is None
     shutil.rmtree(folder / "masks")
     edit(folder, lambda content: [record.pop("mask_path") for record in content["frames"]])
     assert _convert(folder, tmp_path / "scene").masked is None
-    assert local_layout.read_frames(tmp_path / "scene", "train").masks is None
+    assert scene_folder.read_frames(tmp_path / "scene", "train").masks is None
 
 
 def test_what_masks_are_written_for_nerfstudio(tmp_path):
@@ -138,9 +137,9 @@ def test_images_are_cut_around_the_principal_point(folder, tmp_path):
     done = _convert(folder, tmp_path / "scene")
     assert (done.lens.columns.size, done.lens.rows.size) == (10, 8)
     assert done.lens.columns.shift == pytest.approx(0.1) and done.lens.rows.shift == 0.0
-    frames = local_layout.read_frames(tmp_path / "scene", "train")
-    np.testing.assert_array_equal(local_layout.read_images(frames)[2], pixels_of(2)[2:, :10])
-    assert np.argwhere(local_layout.read_masks(frames)[0]).tolist() == [[2, 5]]
+    frames = scene_folder.read_frames(tmp_path / "scene", "train")
+    np.testing.assert_array_equal(scene_folder.read_images(frames)[2], pixels_of(2)[2:, :10])
+    assert np.argwhere(scene_folder.read_masks(frames)[0]).tolist() == [[2, 5]]
     assert frames.cameras.focal == pytest.approx(FOCAL)  # of pixels, whatever is cut away
 
 
@@ -149,13 +148,13 @@ def test_photographs_become_png(folder, tmp_path):
     iio.imwrite(folder / "images" / "photo.jpg", smooth, plugin="pillow", quality=95)
     edit(folder, lambda content: content["frames"][0].update(file_path="images/photo.jpg"))
     _convert(folder, tmp_path / "scene")
-    read = local_layout.read_images(local_layout.read_frames(tmp_path / "scene", "train"))
+    read = scene_folder.read_images(scene_folder.read_frames(tmp_path / "scene", "train"))
     photo = iio.imread(folder / "images" / "photo.jpg", plugin="pillow")
     assert any(np.array_equal(photo, each) for each in read)
 
 
 def _tall(folder):
-    files.write_png(folder / "images" / "frame_00003.png", np.zeros((14, WIDTH, 3), np.uint8))
+    image_files.write_png(folder / "images" / "frame_00003.png", np.zeros((14, WIDTH, 3), np.uint8))
 
     def change(content):
         del content["w"], content["h"], content["cx"], content["cy"]
@@ -164,7 +163,7 @@ def _tall(folder):
 
 
 def _mask(folder, marked):
-    files.write_mask(folder / "masks" / "frame_00003.png", marked.astype(bool))
+    image_files.write_mask(folder / "masks" / "frame_00003.png", marked.astype(bool))
 
 
 def _focals(values):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.runs import image_folders
-from refref_jax.data import files
+from refref_jax.data import image_files
 from refref_jax.training.evaluation import Perceptual
 from tests import made_lpips
 from tests.data.small_scenes import truncate, write_grey
@@ -17,12 +17,12 @@ _NOTHING = Perceptual()
 
 def _write(folder, name, level, *, size=(13, 17)):
     folder.mkdir(exist_ok=True)
-    files.write_rgb(folder / f"{name}.png", np.full((*size, 3), level))
+    image_files.write_rgb(folder / f"{name}.png", np.full((*size, 3), level))
 
 
 def _write_distance(folder, name, distance, *, size=(13, 17)):
     folder.mkdir(exist_ok=True)
-    files.write_exr(folder / f"{name}.exr", np.full(size, np.float32(distance)))
+    image_files.write_exr(folder / f"{name}.exr", np.full(size, np.float32(distance)))
 
 
 @pytest.fixture

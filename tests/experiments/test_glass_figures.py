@@ -8,7 +8,7 @@ import trimesh
 from experiments.figures import cross_sections, glass
 from experiments.figures.cross_sections import Panel
 from experiments.figures.glass import Shown
-from refref_jax.data.errors import SceneError
+from refref_jax.data import SceneError
 from refref_jax.data.meshes import MeshPart
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.render.pixel_paths import PixelPaths

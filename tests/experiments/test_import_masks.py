@@ -1,19 +1,19 @@
 """The command that takes over masks, as a user calls it."""
 
-from refref_jax.data import local_layout
+from refref_jax.data import scene_folder
 from tests.data.small_scenes import edit_transforms, without_masks, write_scene
 from tests.experiments.command import run_command
 
 
 def test_masks_from_a_folder(tmp_path):
     scene, masks = write_scene(tmp_path / "own"), tmp_path / "masks"
-    expected = local_layout.read_masks(local_layout.read_frames(scene, "train"))
+    expected = scene_folder.read_masks(scene_folder.read_frames(scene, "train"))
     (scene / "mask").rename(masks)
     edit_transforms(scene, without_masks)
     options = (f"--scene={scene}", f"--masks={masks}", f"--out={tmp_path / 'copy'}")
     result = run_command("import_masks", *options)
     assert "Masks: 2" in result.stdout
-    copied = local_layout.read_masks(local_layout.read_frames(tmp_path / "copy", "train"))
+    copied = scene_folder.read_masks(scene_folder.read_frames(tmp_path / "copy", "train"))
     assert (copied == expected).all()
     again = run_command("import_masks", *options, fails=True)
     assert "nothing is overwritten" in again.stderr and "Traceback" not in again.stderr

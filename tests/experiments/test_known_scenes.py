@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments.runs import view_numbers
-from refref_jax.data import files
+from refref_jax.data import image_files
 from tests.experiments.command import ROOT, run_command
 
 _SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
@@ -37,9 +37,9 @@ def test_a_rendering_is_measured_and_pictured(rendered):
     assert summary["paths_per_pixel"] == pytest.approx(1.56, rel=0.02)
     assert summary["seconds"] > 0.0 and 0.0 <= summary["lost_energy"] < 1e-3
     for view in summary["views"]:
-        picture = files.read_rgb(out / "rgb" / f"{view['name']}.png") / 255.0
-        target = files.read_rgb(_SCENE / "test" / f"{view['name']}.png") / 255.0
-        mask = files.read_mask(_SCENE / "mask" / "test" / f"{view['name']}.png")
+        picture = image_files.read_rgb(out / "rgb" / f"{view['name']}.png") / 255.0
+        target = image_files.read_rgb(_SCENE / "test" / f"{view['name']}.png") / 255.0
+        mask = image_files.read_mask(_SCENE / "mask" / "test" / f"{view['name']}.png")
         # The picture on disk is the one that was measured.
         for key, where in (("psnr", mask | True), ("psnr_masked", mask), ("psnr_outside", ~mask)):
             found = -10.0 * np.log10(np.mean((picture - target)[where] ** 2))
@@ -86,9 +86,9 @@ def test_light_that_has_no_bend_left_may_be_dark(rendered, tmp_path):
     assert "light that has no bend left" in told and "found no room, and" not in told
     summary = json.loads((out / "metrics.json").read_text())
     assert (summary["bends"], summary["unfinished"]) == (1, "dark")
-    mask = files.read_mask(_SCENE / "mask" / "test" / "r_010.png")
+    mask = image_files.read_mask(_SCENE / "mask" / "test" / "r_010.png")
     dark, kept = (
-        files.read_rgb(folder / "rgb" / "r_010.png") / 255.0 for folder in (out, rendered[0])
+        image_files.read_rgb(folder / "rgb" / "r_010.png") / 255.0 for folder in (out, rendered[0])
     )
     # What entered the ball ends inside: a few per cent of light, the first reflection, are seen.
     assert np.median(dark[mask]) < 0.5 * np.median(kept[mask])

@@ -13,10 +13,10 @@ from experiments.cli import flags as cli_flags
 from experiments.r3f import records
 from experiments.r3f.geometry_stage import GEOMETRIES
 from refref_jax import choices
-from refref_jax.data import local_layout
+from refref_jax.data import scene_folder
 from refref_jax.fields import registry
-from refref_jax.optics.budgets import BUDGETS
 from refref_jax.optics.interface_rules import RULES
+from refref_jax.optics.path_settings import BUDGETS
 from refref_jax.training import presets, run_folder
 from tests.experiments.command import ROOT
 
@@ -263,7 +263,7 @@ def test_what_is_there_is_refused_before_anything_is_done(tried, command):
 def test_names_of_what_can_be_chosen_are_those_that_exist():
     assert (cli_flags.RUN, cli_flags.RECONSTRUCTION) == (run_folder.CONFIG, records.FILE)
     assert tuple(presets.PRESETS) == get_args(choices.PresetName)
-    assert get_args(choices.Split) == local_layout.SPLITS
+    assert get_args(choices.Split) == scene_folder.SPLITS
     names = (registry.USUAL, *(x for x in registry.KINDS if x != registry.USUAL))
     assert names == get_args(choices.FieldName)
     assert tuple(RULES) == get_args(choices.RuleName)

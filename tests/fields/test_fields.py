@@ -7,13 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.fields import density_field, radiance_field, registry
-from refref_jax.fields.density_field import DensityFieldConfig
+from refref_jax.fields import registry, zipnerf
+from refref_jax.fields.base import DensityConfig, check_precision
 from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid, tables
-from refref_jax.fields.kinds import DensityConfig
 from refref_jax.fields.nerfacto import NerfactoConfig, NerfactoProposalConfig
-from refref_jax.fields.precision import check_precision
-from refref_jax.fields.radiance_field import RadianceFieldConfig
+from refref_jax.fields.zipnerf import DensityFieldConfig, RadianceFieldConfig
 from refref_jax.sampling.cones import Gaussians
 from tests import gradients, reference_sampling, transformations
 
@@ -43,7 +41,7 @@ _RADIANCES = ("radiance", "nerfacto radiance")
 
 @jax.jit
 def _untrained(seed):
-    return radiance_field.init(jax.random.key(seed), _RADIANCE)
+    return zipnerf.init_radiance(jax.random.key(seed), _RADIANCE)
 
 
 @functools.cache
@@ -96,19 +94,19 @@ def _see(name, gaussians, direction=None, params=None):
     ("raw", "expected"), [(1.0, np.log(2.0)), (101.0, 100.0), (-99.0, 0.0), (0.0, 0.3132617)]
 )
 def test_activate_density_by_hand(raw, expected):
-    got = density_field.activate_density(jnp.float32(raw))
+    got = zipnerf.activate_density(jnp.float32(raw))
     np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-30)
 
 
 @pytest.mark.parametrize("raw", [-1e30, -1e3, 0.0, 1e3, 1e30])
 def test_activate_density_is_finite_and_not_negative(raw):
-    value, slope = jax.value_and_grad(density_field.activate_density)(jnp.float32(raw))
+    value, slope = jax.value_and_grad(zipnerf.activate_density)(jnp.float32(raw))
     assert value >= 0.0 and np.isfinite(value)
     assert 0.0 <= slope <= 1.0
 
 
 def test_activate_density_check_grads():
-    gradients.assert_numerical(density_field.activate_density, 0.7)
+    gradients.assert_numerical(zipnerf.activate_density, 0.7)
 
 
 @pytest.mark.parametrize("name", _CONFIGS)

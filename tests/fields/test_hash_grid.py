@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.special
 
-from refref_jax.fields import hash_grid, vertices
+from refref_jax.fields import hash_grid, hash_grid_kernels
 from refref_jax.fields.hash_grid import HashGrid, HashGridConfig, MultisampledGrid
 from refref_jax.sampling.cones import Gaussians
 from tests import gradients, reference_sampling, transformations
@@ -115,7 +115,8 @@ def _entries(points, resolution, entries):
     """The table entries of grid vertices, as a cell has them in whose corner they lie."""
     position = [*jnp.asarray(np.asarray(points) / resolution, jnp.float32).T]
     rows, weights = (
-        np.array(x) for x in zip(*vertices.corners(position, resolution, entries), strict=True)
+        np.array(x)
+        for x in zip(*hash_grid_kernels.corners(position, resolution, entries), strict=True)
     )
     assert weights.max(axis=0).min() > 0.99
     return np.take_along_axis(rows, weights.argmax(axis=0)[None], axis=0)[0]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.fields import interpolation, vertex_loops
+from refref_jax.fields import hash_grid_kernels
 from tests import gradients, reference_sampling
 from tests.arrays import single
 
@@ -50,7 +50,7 @@ def _matrix(level, points):
 
 @functools.partial(jax.jit, static_argnames=("level", "precision"))
 def _blend(table, points, *, level, precision="float32"):
-    return interpolation.interpolate(
+    return hash_grid_kernels.interpolate(
         table, points, resolution=_LEVELS[level][0], precision=precision
     )
 
@@ -100,7 +100,7 @@ def test_a_gradient_does_not_depend_on_the_table(level):
 )
 def test_derivatives_by_table_and_position(level, order):
     def blend(table, points):
-        return interpolation.interpolate(
+        return hash_grid_kernels.interpolate(
             table, points, resolution=_LEVELS[level][0], precision="float32"
         )
 
@@ -167,14 +167,14 @@ def test_loops_mean_what_the_formulas_do(level, precision):
     table, points = single(_table(level)), single(_points("anywhere"))
     options = {"resolution": resolution, "precision": precision}
     np.testing.assert_allclose(
-        vertex_loops.gather(table, points, **options),
-        interpolation._gathered(table, points, **options),
+        hash_grid_kernels.gather(table, points, **options),
+        hash_grid_kernels._gathered(table, points, **options),
         atol=_BLENDING,
     )
     slopes, options = table[:12], {"resolution": resolution, "entries": entries}
     np.testing.assert_allclose(
-        vertex_loops.scatter(slopes, points, **options),
-        interpolation._scattered(slopes, points, **options),
+        hash_grid_kernels.scatter(slopes, points, **options),
+        hash_grid_kernels._scattered(slopes, points, **options),
         atol=_BLENDING,
     )
 

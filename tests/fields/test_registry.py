@@ -12,12 +12,12 @@ import pytest
 
 from refref_jax import configuration
 from refref_jax.fields import hash_grid, nerfacto, registry
-from refref_jax.fields.kinds import DensityConfig, FieldKind, FieldSize, Radiance, RadianceConfig
-from refref_jax.optics.budgets import STRAIGHT
-from refref_jax.render import saved
+from refref_jax.fields.base import DensityConfig, FieldKind, FieldSize, Radiance, RadianceConfig
+from refref_jax.optics.path_settings import STRAIGHT
+from refref_jax.render import checkpoint_io
+from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.images import render_rays
 from refref_jax.render.model import Model, init_params
-from refref_jax.render.saved import SavedModel
 from refref_jax.training.config import FieldConfig
 from refref_jax.training.presets import PRESETS, Bounds, loss
 from refref_jax.training.resolve import override_model, samples_of
@@ -72,8 +72,8 @@ def test_a_third_kind_is_rendered_saved_and_sized(fog, tmp_path):
     assert loss(model).blurs == (0.03, 0.003, 0.003) and loss(model).hash_decay == 0.0
     static = SavedModel(model, STRAIGHT)
     geometry = scenes.geometry(scenes.ball(1.3, subdivisions=1))
-    saved.save_scene(tmp_path, static, geometry)
-    assert saved.read_static(tmp_path) == static
+    checkpoint_io.save_scene(tmp_path, static, geometry)
+    assert checkpoint_io.read_static(tmp_path) == static
     params = jax.jit(lambda: init_params(jax.random.key(0), model))()
     assert hash_grid.tables(params) == []
     rays = jax.tree.map(jnp.asarray, small_model.sampler().survey(4).rays)
@@ -109,7 +109,7 @@ def test_configurations_know_their_kind(name):
 def test_models_of_every_kind_and_size_survive_a_file(name, preset, tmp_path):
     static = SavedModel(PRESETS[preset].model(_BOUNDS, "clear", field=name), STRAIGHT)
     configuration.write(tmp_path / "model.json", static)
-    assert saved.read_static(tmp_path) == static
+    assert checkpoint_io.read_static(tmp_path) == static
 
 
 def _without_kind(value):
@@ -125,7 +125,7 @@ def test_files_of_older_runs_mean_zipnerf(tmp_path):
     content = json.loads(path.read_text())
     path.write_text(json.dumps(_without_kind(content)))
     assert json.loads(path.read_text()) != content
-    assert saved.read_static(tmp_path) == static
+    assert checkpoint_io.read_static(tmp_path) == static
 
 
 def test_a_kind_that_is_not_known_is_named(tmp_path):
@@ -134,7 +134,7 @@ def test_a_kind_that_is_not_known_is_named(tmp_path):
     configuration.write(path, static)
     path.write_text(path.read_text().replace('"zipnerf"', '"plenoxels"'))
     with pytest.raises(ValueError, match=r"kind is 'plenoxels', not one of zipnerf, nerfacto"):
-        saved.read_static(tmp_path)
+        checkpoint_io.read_static(tmp_path)
 
 
 def test_nerfacto_has_its_published_size():

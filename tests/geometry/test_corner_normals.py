@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.geometry.corner_normals import CREASE_ANGLE, corner_normals, face_normals
+from refref_jax.geometry.triangle_meshes import CREASE_ANGLE, corner_normals, face_normals
 
 # Double precision, after a few sums.
 _EXACT = 1e-12

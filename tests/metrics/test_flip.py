@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from refref_jax import metrics
-from refref_jax.data import files
+from refref_jax.data import image_files
 
 flip_evaluator = pytest.importorskip("flip_evaluator")
 
@@ -19,8 +19,8 @@ def _images(shape=(24, 31, 3)):
 
 def test_it_is_what_the_program_says_of_the_same_files(tmp_path):
     rendered, target = _images()
-    files.write_rgb(tmp_path / "rendered.png", rendered)
-    files.write_rgb(tmp_path / "target.png", target)
+    image_files.write_rgb(tmp_path / "rendered.png", rendered)
+    image_files.write_rgb(tmp_path / "target.png", target)
     names = (str(tmp_path / "target.png"), str(tmp_path / "rendered.png"))
     _, expected, settings = flip_evaluator.evaluate(*names, "LDR")
     assert settings["ppd"] == pytest.approx(0.7 * 3840 / 0.7 * np.pi / 180, rel=1e-5)

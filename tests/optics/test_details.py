@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from refref_jax.optics import path_tracing
-from refref_jax.optics.budgets import PAPER, TREE, Budget
-from refref_jax.optics.details import Detail, everything
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.media import AMBIENT
+from refref_jax.optics.path_settings import PAPER, TREE, Budget, Detail, everything
 from tests import scenes
 
 _CAPACITY = 256

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from refref_jax.optics import path_tracing
-from refref_jax.optics.budgets import TREE
-from refref_jax.optics.first_branches import reflected_first
-from refref_jax.optics.light_paths import PathStatus, exists, straight
-from refref_jax.optics.single_path import follow_branch
+from refref_jax.optics.differentiable_paths import follow_branch
+from refref_jax.optics.light_paths import PathStatus, exists, reflected_first, straight
+from refref_jax.optics.path_settings import TREE
 from tests import made_paths, scenes
 
 _TURN = [(0.0, 0.0, -1.0), (0.0, 0.1, 1.0), (0.0, 1.0, 0.0)]

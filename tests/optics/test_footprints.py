@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from refref_jax.geometry.rays import orthonormal_basis
-from refref_jax.optics import footprints, path_tracing
-from refref_jax.optics.budgets import TREE, Budget
-from refref_jax.optics.details import Detail
+from refref_jax.optics import path_tracing, ray_differentials
+from refref_jax.optics.differentiable_paths import follow_branch
 from refref_jax.optics.light_paths import exists, straight
-from refref_jax.optics.single_path import follow_branch
+from refref_jax.optics.path_settings import TREE, Budget, Detail
 from refref_jax.sampling import polylines
 from tests import scenes
 
@@ -125,7 +124,7 @@ def test_spreads_are_finite_at_grazing_and_critical_angles(index):
 
 
 def test_nothing_is_carried_for_a_cone():
-    spread = footprints.begin(
+    spread = ray_differentials.begin(
         jax.tree.map(lambda x: x[0], scenes.rays([0, 0, 0], [0, 0, 1])), "cone"
     )
     assert spread.points.size == 0 and spread.directions.size == 0

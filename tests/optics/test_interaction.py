@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from refref_jax.geometry.surfaces import SurfacePoint
-from refref_jax.optics import interaction, interface_rules, media
+from refref_jax.optics import interface_rules, media, path_step
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import AMBIENT
 
@@ -23,7 +23,7 @@ def _meet(direction, shading=(0.0, 0.0, 1.0)):
     )
     unit = np.asarray(direction) / np.linalg.norm(direction)
     nowhere = media.nowhere(_GLASS)
-    return interaction.meet(point, _GLASS, nowhere, jnp.asarray(unit, jnp.float32))
+    return path_step.meet(point, _GLASS, nowhere, jnp.asarray(unit, jnp.float32))
 
 
 def test_entering_glass():

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from refref_jax.optics import path_tracing
-from refref_jax.optics.budgets import Budget
+from refref_jax.optics.differentiable_paths import follow_main_branches
 from refref_jax.optics.light_paths import PathStatus
-from refref_jax.optics.main_branches import follow_main_branches
+from refref_jax.optics.path_settings import Budget
 from tests import scenes
 
 _BUDGET = Budget(bends=6, reflections="all", cut=0.02)

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.data.containment import parts_around
+from refref_jax.data.mesh_queries import parts_around
 from refref_jax.optics import media, path_tracing
-from refref_jax.optics.budgets import TREE, Budget
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.media import AMBIENT, EMPTY_SLOT
+from refref_jax.optics.path_settings import TREE, Budget
 from tests import reference, scenes
 from tests.reference import Sphere
 

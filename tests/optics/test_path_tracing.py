@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from refref_jax.optics import path_tracing
-from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE, Budget, capacity_for, room
 from refref_jax.optics.light_paths import PathStatus, straight
 from refref_jax.optics.media import AMBIENT
+from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, Budget, capacity_for, room
 from tests import reference, scenes
 from tests.reference import Sphere
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from refref_jax.optics import path_tracing
-from refref_jax.optics.budgets import BUDGETS, PAPER, TREE, Budget, room
 from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics.path_settings import BUDGETS, PAPER, TREE, Budget, room
 from tests import scenes
 
 _GLASS = 0.04

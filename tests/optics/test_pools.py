@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.optics import pools
+from refref_jax.optics import queues
 
 
 class _Light(NamedTuple):
@@ -24,19 +24,19 @@ def _values(pool):
 
 
 def test_appending_keeps_the_order_of_what_is_kept():
-    pool = pools.fill(_light([1.0, 2.0]), 2, 8)
-    pool = pools.append(pool, _light([3.0, 4.0, 5.0]), jnp.array([True, False, True]))
+    pool = queues.fill(_light([1.0, 2.0]), 2, 8)
+    pool = queues.append(pool, _light([3.0, 4.0, 5.0]), jnp.array([True, False, True]))
     assert _values(pool) == [1.0, 2.0, 3.0, 5.0]
-    pool = pools.append(pool, _light([6.0, 7.0]), jnp.array([False, False]))
+    pool = queues.append(pool, _light([6.0, 7.0]), jnp.array([False, False]))
     assert _values(pool) == [1.0, 2.0, 3.0, 5.0]
 
 
 def test_appending_equals_a_list():
     generator = np.random.default_rng(0)
-    pool, expected = pools.fill(_light([]), 0, 100), []
+    pool, expected = queues.fill(_light([]), 0, 100), []
     for _ in range(10):
         block, keep = generator.random(7).astype(np.float32), generator.random(7) < 0.5
-        pool = pools.append(pool, _light(block), jnp.asarray(keep))
+        pool = queues.append(pool, _light(block), jnp.asarray(keep))
         expected += block[keep].tolist()
     assert _values(pool) == expected
 
@@ -44,8 +44,8 @@ def test_appending_equals_a_list():
 @pytest.mark.parametrize("capacity", [0, 1, 3, 4, 9])
 def test_shedding_drops_the_weakest_and_says_whose(capacity):
     values, rays = [0.5, 0.1, 0.4, 0.2], [0, 1, 1, 2]
-    pool = pools.fill(_light(values, rays), 4, 6)
-    kept, lost = pools.shed(pool, jnp.zeros((3, 3)), capacity)
+    pool = queues.fill(_light(values, rays), 4, 6)
+    kept, lost = queues.shed(pool, jnp.zeros((3, 3)), capacity)
     strongest = sorted(values, reverse=True)[:capacity]
     assert _values(kept) == pytest.approx([v for v in values if v in strongest])
     expected = np.zeros(3)
@@ -56,19 +56,19 @@ def test_shedding_drops_the_weakest_and_says_whose(capacity):
 
 def test_of_equally_strong_records_the_first_stay():
     mask = jnp.array([True, False, True, True, True])
-    kept = pools.strongest(mask, jnp.ones(5), jnp.int32(2))
+    kept = queues.strongest(mask, jnp.ones(5), jnp.int32(2))
     assert kept.tolist() == [True, False, True, False, False]
 
 
 def test_unmarked_records_never_count():
     mask = jnp.array([False, True, True])
-    kept = pools.strongest(mask, jnp.array([9.0, 0.0, -1.0]), jnp.int32(1))
+    kept = queues.strongest(mask, jnp.array([9.0, 0.0, -1.0]), jnp.int32(1))
     assert kept.tolist() == [False, True, False]
-    assert not pools.strongest(mask, jnp.ones(3), jnp.int32(-2)).any()
+    assert not queues.strongest(mask, jnp.ones(3), jnp.int32(-2)).any()
 
 
 def test_the_marked_come_first():
     keep = np.random.default_rng(1).random(50) < 0.3
-    order = np.asarray(pools.front_first(jnp.asarray(keep)))
+    order = np.asarray(queues.front_first(jnp.asarray(keep)))
     np.testing.assert_array_equal(order[: keep.sum()], np.flatnonzero(keep))
     assert order.min() >= 0 and order.max() < 50

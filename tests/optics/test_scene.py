@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.data.geometry import assemble
+from refref_jax.data.scene_assembly import assemble
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.scene import in_one_precision, with_index
 from tests import scenes

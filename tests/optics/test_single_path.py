@@ -12,10 +12,10 @@ import pytest
 from jax.test_util import check_grads
 
 from refref_jax.optics import path_tracing
-from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE, Budget
+from refref_jax.optics.differentiable_paths import follow_branch
 from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, Budget
 from refref_jax.optics.scene import Scene
-from refref_jax.optics.single_path import follow_branch
 from tests import scenes
 
 _DEPTH = 4

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics.budgets import TREE
-from refref_jax.reconstruct.photometry import Evidence
+from refref_jax.optics.path_settings import TREE
+from refref_jax.reconstruct.refractive_index import Evidence
 from refref_jax.render import Model, init_params, render_rays
 from tests import scenes
 from tests.small_model import MODEL

@@ -5,9 +5,9 @@ import functools
 import numpy as np
 import pytest
 
-from refref_jax.reconstruct.agreement import carved_alone, without_outliers
-from refref_jax.reconstruct.errors import ReconstructionError
-from refref_jax.reconstruct.silhouettes import Views
+from refref_jax.reconstruct import ReconstructionError
+from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.mesh_distance import carved_alone, without_outliers
 from tests.reconstruct import bodies
 
 _SPOILT = 7

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.data import local_layout, meshes
+from refref_jax.data import meshes, scene_folder
 from refref_jax.geometry.triangle_meshes import make_mesh
-from refref_jax.reconstruct.comparison import compare_meshes, silhouette_overlap, silhouettes
-from refref_jax.reconstruct.isosurface import find_isosurface
+from refref_jax.reconstruct.grids import find_isosurface
+from refref_jax.reconstruct.mesh_distance import compare_meshes, silhouette_overlap, silhouettes
 from refref_jax.reconstruct.refinement import Refinement, refine
 from refref_jax.reconstruct.visual_hull import carve
 from tests.reconstruct import bodies
@@ -48,8 +48,8 @@ def test_silhouettes_are_those_of_marched_rays():
 
 @pytest.mark.slow
 def test_the_bundled_ball_is_found_from_its_masks(ball_scene):
-    train, test = (local_layout.read_frames(ball_scene, split) for split in ("train", "test"))
-    grid = carve(local_layout.read_masks(train), train.cameras, resolution=64)
+    train, test = (scene_folder.read_frames(ball_scene, split) for split in ("train", "test"))
+    grid = carve(scene_folder.read_masks(train), train.cameras, resolution=64)
     stages = refine(find_isosurface(grid), Refinement())
     assert not any(stage.refused for stage in stages)
     part = meshes.read_meshes(ball_scene)[0]
@@ -59,7 +59,7 @@ def test_the_bundled_ball_is_found_from_its_masks(ball_scene):
     assert found.normal_error < 0.5 * compare_meshes(stages[0].mesh, truth).normal_error
     overlap = silhouette_overlap(
         stages[-1].mesh,
-        local_layout.read_masks(test)[:6],
+        scene_folder.read_masks(test)[:6],
         test.cameras._replace(poses=test.cameras.poses[:6]),
     )
     assert overlap.mean() > 0.99

@@ -8,15 +8,13 @@ import trimesh
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from refref_jax.geometry.cameras import project
-from refref_jax.geometry.corner_normals import face_normals
-from refref_jax.geometry.triangle_meshes import is_closed
-from refref_jax.reconstruct import convex, outlines
-from refref_jax.reconstruct.comparison import silhouette_overlap
-from refref_jax.reconstruct.corners import fit_corners
-from refref_jax.reconstruct.errors import ReconstructionError
-from refref_jax.reconstruct.isosurface import find_isosurface
+from refref_jax.geometry.triangle_meshes import face_normals, is_closed
+from refref_jax.reconstruct import ReconstructionError, convex, polytope_fit
+from refref_jax.reconstruct.grids import find_isosurface
+from refref_jax.reconstruct.masks import Views
+from refref_jax.reconstruct.mesh_distance import silhouette_overlap
+from refref_jax.reconstruct.polytope_fit import fit_corners
 from refref_jax.reconstruct.refinement import Refinement, refine
-from refref_jax.reconstruct.silhouettes import Views
 from refref_jax.reconstruct.visual_hull import carve
 from tests.reconstruct import bodies
 from tests.scenes import volume_of
@@ -69,7 +67,7 @@ def test_a_point_is_seen_where_its_ray_passes_and_slopes_are_differences():
     point = np.array([[0.3, -0.2, 0.5]])
     pose = cameras.poses[1]
     seen = project(point, pose, cameras)
-    slopes = outlines.projection_slopes(seen, pose, cameras)
+    slopes = polytope_fit.projection_slopes(seen, pose, cameras)
     column, row = seen.pixels[0]
     x, y = (column - 32.0) / cameras.focal, (32.0 - row) / cameras.focal
     on_ray = pose[:, 3] + seen.depths[0] * pose[:, :3] @ [x, y, -1.0]
@@ -82,23 +80,23 @@ def test_a_point_is_seen_where_its_ray_passes_and_slopes_are_differences():
 
 
 def test_a_square_is_known_by_hand():
-    order = outlines.polygon(np.concatenate([_SQUARE, [[10.0, 12.0]]]))
+    order = polytope_fit.polygon(np.concatenate([_SQUARE, [[10.0, 12.0]]]))
     assert sorted(order) == [0, 1, 2, 3]
     square = _SQUARE[order]
     points = np.array([[15.0, 15.0], [15.0, 35.0], [-3.0, 4.0]])
-    assert np.allclose(outlines.excess(square, points), [-15.0, 5.0, 3.0])
-    assert np.allclose(outlines.heights(square), 15.0 * np.sqrt(2.0))
+    assert np.allclose(polytope_fit.excess(square, points), [-15.0, 5.0, 3.0])
+    assert np.allclose(polytope_fit.heights(square), 15.0 * np.sqrt(2.0))
 
 
 def test_points_lie_on_edges_a_pixel_apart_and_away_from_corners():
-    samples = outlines.along_edges(_SQUARE, margin=3.0)
+    samples = polytope_fit.along_edges(_SQUARE, margin=3.0)
     assert len(samples.pixels) == 4 * 24
     ends = np.stack([1.0 - samples.shares, samples.shares], axis=-1)
     corners = _SQUARE[np.stack([samples.first, samples.second], axis=-1)]
     assert np.allclose(np.einsum("ne,nec->nc", ends, corners), samples.pixels)
     away = np.linalg.norm(samples.pixels[:, None] - _SQUARE, axis=-1)
     assert away.min() == pytest.approx(3.5)
-    assert np.allclose(outlines.excess(_SQUARE, samples.pixels), 0.0)
+    assert np.allclose(polytope_fit.excess(_SQUARE, samples.pixels), 0.0)
 
 
 def test_overlap_of_corners_is_what_the_tracer_finds():
@@ -106,7 +104,7 @@ def test_overlap_of_corners_is_what_the_tracer_finds():
     mesh = bodies.as_mesh(trimesh.creation.box((1.4, 1.7, 1.6)))
     expected = silhouette_overlap(mesh, *views).mean()
     assert 0.7 < expected < 0.95
-    assert outlines.outline_overlaps(mesh.vertices, views).mean() == pytest.approx(
+    assert polytope_fit.outline_overlaps(mesh.vertices, views).mean() == pytest.approx(
         expected, abs=1e-3
     )
 
@@ -159,7 +157,8 @@ def test_one_bad_mask_moves_no_corner_far(bad):
     assert away.max() < 4.0 / cameras.focal
     assert volume_of(stage.mesh) == pytest.approx(1.6**3, rel=0.03)
     assert (
-        outlines.outline_overlaps(stage.mesh.vertices, _views(_turned_box, views=7)).mean() > 0.98
+        polytope_fit.outline_overlaps(stage.mesh.vertices, _views(_turned_box, views=7)).mean()
+        > 0.98
     )
 
 

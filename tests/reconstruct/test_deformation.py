@@ -5,10 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.geometry.corner_normals import corner_normals
-from refref_jax.geometry.triangle_meshes import is_closed, volume
-from refref_jax.reconstruct import deformation
-from refref_jax.reconstruct.errors import ReconstructionError
+from refref_jax.geometry.triangle_meshes import corner_normals, is_closed, volume
+from refref_jax.reconstruct import ReconstructionError, light_refinement
 from tests.reconstruct import bodies
 
 
@@ -22,9 +20,9 @@ def _cube():
 
 @pytest.mark.parametrize("mesh", [_ball(), _cube()], ids=["ball", "cube"])
 def test_no_shift_changes_nothing(mesh):
-    rig = deformation.build(mesh, handles=32)
+    rig = light_refinement.build(mesh, handles=32)
     still = np.zeros((rig.neighbours.shape[0], 3))
-    moved = deformation.moved_mesh(mesh, rig, still)
+    moved = light_refinement.moved_mesh(mesh, rig, still)
     np.testing.assert_allclose(moved.vertices, mesh.vertices, atol=1e-12)
     np.testing.assert_allclose(moved.normals, mesh.normals, atol=1e-6)
     np.testing.assert_array_equal(moved.faces, mesh.faces)
@@ -32,18 +30,18 @@ def test_no_shift_changes_nothing(mesh):
 
 def test_one_shift_of_all_handles_moves_the_whole_body():
     mesh = _ball()
-    rig = deformation.build(mesh, handles=32)
+    rig = light_refinement.build(mesh, handles=32)
     shift = np.array([0.1, -0.2, 0.3])
-    moved = deformation.moved_mesh(mesh, rig, np.tile(shift, (32, 1)))
+    moved = light_refinement.moved_mesh(mesh, rig, np.tile(shift, (32, 1)))
     np.testing.assert_allclose(moved.vertices, mesh.vertices + shift, atol=1e-7)
     np.testing.assert_allclose(moved.normals, mesh.normals, atol=1e-6)
 
 
 def test_normals_turn_as_those_of_the_moved_mesh():
     mesh = _ball(4)
-    rig = deformation.build(mesh, handles=64)
+    rig = light_refinement.build(mesh, handles=64)
     shifts = np.random.default_rng(0).normal(size=(64, 3)) * 0.01
-    moved = deformation.moved_mesh(mesh, rig, shifts)
+    moved = light_refinement.moved_mesh(mesh, rig, shifts)
     expected = corner_normals(moved.vertices, moved.faces)
     cosine = np.sum(moved.normals * expected, axis=-1)
     turned = np.degrees(np.arccos(np.clip(np.sum(moved.normals * mesh.normals, axis=-1), -1, 1)))
@@ -55,22 +53,22 @@ def test_normals_turn_as_those_of_the_moved_mesh():
 
 def test_the_corners_of_a_cube_are_its_handles_and_its_faces_stay_flat():
     mesh = _cube()
-    rig = deformation.build(mesh)
+    rig = light_refinement.build(mesh)
     assert len(mesh.vertices) == 8 and rig.handles.shape == (8, 1)
     # The face at x = 0.8 is moved along x.
     shifts = np.where(mesh.vertices[:, :1] > 0.0, [[0.05, 0.0, 0.0]], 0.0)
-    moved = deformation.moved_mesh(mesh, rig, shifts)
+    moved = light_refinement.moved_mesh(mesh, rig, shifts)
     np.testing.assert_allclose(np.ptp(moved.vertices, axis=0), [1.65, 1.6, 1.6])
     np.testing.assert_allclose(np.abs(moved.normals).max(axis=-1), 1.0, atol=1e-6)
 
 
 def test_corners_have_the_gradient_of_their_shares():
     mesh = _ball(2)
-    rig = deformation.build(mesh, handles=16)
+    rig = light_refinement.build(mesh, handles=16)
     device = jax.device_put(rig)
 
     def total(shifts):
-        corners = deformation.move(device, shifts).bvh.triangles
+        corners = light_refinement.move(device, shifts).bvh.triangles
         return jnp.sum(corners[..., 0])
 
     slope = jax.grad(total)(jnp.zeros((16, 3)))
@@ -86,23 +84,23 @@ def test_normals_have_finite_gradients_at_degenerate_triangles():
     mesh = _ball(2)
     vertices = mesh.vertices.copy()
     vertices[mesh.faces[0, 1]] = vertices[mesh.faces[0, 0]]
-    device = jax.device_put(deformation.build(mesh._replace(vertices=vertices), handles=16))
+    device = jax.device_put(light_refinement.build(mesh._replace(vertices=vertices), handles=16))
 
     def total(shifts):
-        return jnp.sum(jnp.square(deformation.move(device, shifts).normals[..., 0]))
+        return jnp.sum(jnp.square(light_refinement.move(device, shifts).normals[..., 0]))
 
     value, slope = jax.value_and_grad(total)(jnp.zeros((16, 3)))
     assert np.isfinite(value) and np.all(np.isfinite(slope))
 
 
 def test_unevenness_is_that_of_single_handles_alone():
-    rig = jax.device_put(deformation.build(_ball(), handles=32))
-    assert float(deformation.unevenness(rig, jnp.ones((32, 3)))) == 0.0
+    rig = jax.device_put(light_refinement.build(_ball(), handles=32))
+    assert float(light_refinement.unevenness(rig, jnp.ones((32, 3)))) == 0.0
     one = jnp.zeros((32, 3)).at[4, 0].set(1.0)
-    assert float(deformation.unevenness(rig, one)) > 1.0 / 32.0
+    assert float(light_refinement.unevenness(rig, one)) > 1.0 / 32.0
 
 
 @pytest.mark.parametrize("handles", [0, 3])
 def test_too_few_handles_are_refused(handles):
     with pytest.raises(ReconstructionError, match="Give 4 or more"):
-        deformation.build(_ball(1), handles=handles)
+        light_refinement.build(_ball(1), handles=handles)

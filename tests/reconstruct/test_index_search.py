@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.reconstruct import photometry
-from refref_jax.reconstruct.errors import ReconstructionError
-from refref_jax.reconstruct.index_search import (
+from refref_jax.reconstruct import ReconstructionError, refractive_index
+from refref_jax.reconstruct.refractive_index import (
     IndexSearch,
     descend,
     estimate_index,
@@ -39,7 +38,7 @@ def test_errors_vanish_at_the_truth_alone(ball, seen):
     evidence, _ = seen
 
     def mean(index):
-        found = photometry.errors_at_index(
+        found = refractive_index.errors_at_index(
             np.float32(index), evidence, ball, part=0, config=lit_scenes.CONFIG
         )
         assert np.all(np.isfinite(found)) and np.all(np.asarray(found) >= 0.0)
@@ -54,10 +53,10 @@ def test_errors_vanish_at_the_truth_alone(ball, seen):
 def test_the_slope_is_that_of_the_errors(ball, seen, index):
     evidence, _ = seen
     given = {"part": 0, "config": lit_scenes.CONFIG}
-    found = photometry.slope_at_index(np.float32(index), evidence, ball, **given)
+    found = refractive_index.slope_at_index(np.float32(index), evidence, ball, **given)
     assert np.isfinite(found.slope)
     one, other = (
-        float(jnp.mean(photometry.errors_at_index(np.float32(at), evidence, ball, **given)))
+        float(jnp.mean(refractive_index.errors_at_index(np.float32(at), evidence, ball, **given)))
         for at in (index - 2e-3, index + 2e-3)
     )
     # The field's own kinks, and rays that change triangle, make differences coarse.

@@ -5,10 +5,9 @@ import pytest
 import trimesh
 
 from refref_jax.geometry.triangle_meshes import is_closed, volume
-from refref_jax.reconstruct.closest import ClosestSearch, signed_distance
-from refref_jax.reconstruct.errors import ReconstructionError
-from refref_jax.reconstruct.grids import Box, Grid, sample
-from refref_jax.reconstruct.isosurface import find_isosurface
+from refref_jax.reconstruct import ReconstructionError
+from refref_jax.reconstruct.grids import Box, Grid, find_isosurface, sample
+from refref_jax.reconstruct.mesh_distance import ClosestSearch, signed_distance
 from tests.reconstruct import bodies
 
 _BOX = Box(np.full(3, -1.6), np.full(3, 1.6))

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from refref_jax.data.geometry import build_geometry
 from refref_jax.data.meshes import MeshPart
-from refref_jax.geometry.surface_build import pack_meshes
+from refref_jax.data.scene_assembly import build_geometry
+from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import make_mesh
 from refref_jax.optics.scene import Scene
-from refref_jax.reconstruct import photometry
-from refref_jax.reconstruct.comparison import compare_meshes
+from refref_jax.reconstruct import refractive_index
 from refref_jax.reconstruct.light_refinement import LightRefinement, refine_by_light
+from refref_jax.reconstruct.mesh_distance import compare_meshes
 from tests import scenes
 from tests.reconstruct import bodies, lit_scenes
 
@@ -38,7 +38,7 @@ def _error(mesh, index, evidence):
     part = MeshPart("ball_glass", mesh.vertices, mesh.faces, index, "auto")
     interfaces = build_geometry([part], [-1], rule="nested").interfaces
     surfaces = pack_meshes([mesh])
-    found = photometry.errors_at_index(
+    found = refractive_index.errors_at_index(
         np.float32(index),
         evidence,
         Scene(surfaces, interfaces),

@@ -7,12 +7,10 @@ import pytest
 
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.geometry.triangle_meshes import volume
-from refref_jax.reconstruct import occupancy, occupancy_field
-from refref_jax.reconstruct.comparison import compare_meshes
-from refref_jax.reconstruct.errors import ReconstructionError
-from refref_jax.reconstruct.grids import Box
-from refref_jax.reconstruct.isosurface import find_isosurface
-from refref_jax.reconstruct.occupancy_config import OccupancyTrainingConfig
+from refref_jax.reconstruct import ReconstructionError, occupancy, occupancy_field
+from refref_jax.reconstruct.grids import Box, find_isosurface
+from refref_jax.reconstruct.mesh_distance import compare_meshes
+from refref_jax.reconstruct.occupancy import OccupancyTrainingConfig
 from refref_jax.reconstruct.occupancy_field import OccupancyFieldConfig
 from tests import gradients
 from tests.reconstruct import bodies

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.reconstruct.occupancy_rendering import (
+from refref_jax.reconstruct.occupancy_field import (
     Chord,
     Scan,
     at,

@@ -4,16 +4,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.geometry.corner_normals import face_normals
-from refref_jax.geometry.triangle_meshes import Mesh, is_closed, make_mesh, pieces
-from refref_jax.reconstruct import convex, refinement, smoothing
-from refref_jax.reconstruct.comparison import compare_meshes, silhouette_overlap
-from refref_jax.reconstruct.denoising import denoise_within
-from refref_jax.reconstruct.errors import ReconstructionError
-from refref_jax.reconstruct.grids import Box, sample
-from refref_jax.reconstruct.isosurface import find_isosurface
+from refref_jax.geometry.triangle_meshes import Mesh, face_normals, is_closed, make_mesh, pieces
+from refref_jax.reconstruct import ReconstructionError, convex, refinement, smoothing
+from refref_jax.reconstruct.grids import Box, find_isosurface, sample
+from refref_jax.reconstruct.masks import Views, some_of
+from refref_jax.reconstruct.mesh_distance import compare_meshes, silhouette_overlap
 from refref_jax.reconstruct.refinement import Refinement, keep_pieces, refine
-from refref_jax.reconstruct.silhouettes import Views, some_of
+from refref_jax.reconstruct.smoothing import denoise_within
 from tests.reconstruct import bodies
 from tests.scenes import volume_of
 

@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 
 from refref_jax.geometry.triangle_meshes import volume
-from refref_jax.reconstruct.errors import ReconstructionError
-from refref_jax.reconstruct.grids import Box, Grid, gradient, interpolate, sample
-from refref_jax.reconstruct.isosurface import find_isosurface
-from refref_jax.reconstruct.silhouettes import check_masks, signed_distances
+from refref_jax.reconstruct import ReconstructionError
+from refref_jax.reconstruct.grids import Box, Grid, find_isosurface, gradient, interpolate, sample
+from refref_jax.reconstruct.masks import check_masks, signed_distances
 from refref_jax.reconstruct.visual_hull import LEAST_RESOLUTION, carve, hull_field
 from tests.reconstruct import bodies
 

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.render import compositing
+from refref_jax.render import volume_rendering
 from tests import gradients, reference_sampling, transformations
 from tests.arrays import singles
 
@@ -12,9 +12,9 @@ _SUMMATION = 2e-6
 
 _SAMPLES = 8
 
-_weigh = jax.jit(compositing.alpha_weights)
-_close = jax.jit(compositing.opaque_end)
-_composite = jax.jit(compositing.composite)
+_weigh = jax.jit(volume_rendering.alpha_weights)
+_close = jax.jit(volume_rendering.opaque_end)
+_composite = jax.jit(volume_rendering.composite)
 
 # What the factors of a medium's depth may be multiplied by, as in the tests of Zip-NeRF.
 _MULTIPLIERS = [0.0, 1e-10, 1.0, 1e10, 1e30]
@@ -86,9 +86,9 @@ def test_splitting_a_sample_changes_nothing():
 def _weights_and_gradients(density, lengths):
     # A sum over unequal factors, so that no gradient cancels.
     factors = jnp.arange(1.0, _SAMPLES + 1.0)
-    total = lambda *x: jnp.sum(factors * compositing.alpha_weights(*x))
+    total = lambda *x: jnp.sum(factors * volume_rendering.alpha_weights(*x))
     gradient = jax.grad(total, argnums=(0, 1))(density, lengths)
-    return compositing.alpha_weights(density, lengths), gradient
+    return volume_rendering.alpha_weights(density, lengths), gradient
 
 
 @pytest.mark.parametrize("density_scale", _MULTIPLIERS)
@@ -123,7 +123,7 @@ def test_one_opaque_sample_takes_all_the_light_that_reaches_it(place, size):
 
 
 def test_alpha_weights_check_grads():
-    gradients.assert_numerical(compositing.alpha_weights, *_medium())
+    gradients.assert_numerical(volume_rendering.alpha_weights, *_medium())
 
 
 # --- the opaque end ---
@@ -156,7 +156,7 @@ def test_an_opaque_end_is_an_infinitely_dense_last_sample():
 
 
 def test_an_opaque_end_check_grads():
-    gradients.assert_numerical(compositing.opaque_end, _weigh(*_medium()))
+    gradients.assert_numerical(volume_rendering.opaque_end, _weigh(*_medium()))
 
 
 # --- colour ---
@@ -253,9 +253,9 @@ def test_distances_scale_with_the_path():
 @jax.jit
 def _composite_gradients(density, lengths, rgb):
     def total(density, lengths, rgb):
-        weights = compositing.alpha_weights(density, lengths)
+        weights = volume_rendering.alpha_weights(density, lengths)
         edges = jnp.concatenate([jnp.zeros(1), jnp.cumsum(lengths)])
-        seen = compositing.composite(weights, rgb, edges)
+        seen = volume_rendering.composite(weights, rgb, edges)
         finite = jnp.where(jnp.isfinite(seen.median), seen.median, 0.0)
         finite += jnp.where(jnp.isfinite(seen.mean), seen.mean, 0.0)
         return jnp.sum(seen.rgb) + seen.accumulation + finite
@@ -276,16 +276,16 @@ def test_composite_check_grads():
     weights, rgb = np.asarray(_weigh(*_medium())), np.random.default_rng(0).uniform(size=(8, 3))
     edges = np.linspace(1.0, 3.0, _SAMPLES + 1)
     gradients.assert_numerical(
-        lambda *x: tuple(compositing.composite(*x)), weights, rgb, edges, rtol=1e-4
+        lambda *x: tuple(volume_rendering.composite(*x)), weights, rgb, edges, rtol=1e-4
     )
 
 
 # --- transformations ---
 
 _CASES = {
-    "alpha_weights": lambda density, lengths: compositing.alpha_weights(density, lengths),
-    "opaque_end": lambda density, lengths: compositing.opaque_end(0.1 * density),
-    "composite": lambda density, lengths: compositing.composite(
+    "alpha_weights": lambda density, lengths: volume_rendering.alpha_weights(density, lengths),
+    "opaque_end": lambda density, lengths: volume_rendering.opaque_end(0.1 * density),
+    "composite": lambda density, lengths: volume_rendering.composite(
         0.05 * density, jnp.stack([density, lengths, density], axis=-1), jnp.append(lengths, 9.0)
     ),
 }

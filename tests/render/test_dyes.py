@@ -3,8 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.render import dyes
-from refref_jax.render.dyes import Dyes
+from refref_jax.render import learned_media
+from refref_jax.render.learned_media import Dyes
 from tests import gradients, made_paths
 
 _RADIUS = 7.3
@@ -18,16 +18,19 @@ def _paths(meetings, passages):
 
 
 def test_parts_begin_nearly_clear():
-    begun = dyes.init(3)
-    assert np.all(np.asarray(dyes.tints(begun)) > 0.95)
-    assert np.all(np.asarray(dyes.absorptions(begun, _RADIUS)) < 0.01)
+    begun = learned_media.init(3)
+    assert np.all(np.asarray(learned_media.tints(begun)) > 0.95)
+    assert np.all(np.asarray(learned_media.absorptions(begun, _RADIUS)) < 0.01)
 
 
 def test_light_is_dimmed_at_every_meeting_and_along_every_passage():
     made = Dyes(jnp.array([[0.3, -1.0, 2.0], [0.0, 1.0, -4.0]]), jnp.array([[1.0, 0, 2]] * 2))
     meetings, passages = [[0, 0], [2, 0], [1, 3]], [[0, 0], [0.5, 0], [1.5, 2.0]]
-    dimmed = dyes.dye(made, _paths(meetings, passages), radius=_RADIUS).weights
-    tint, absorption = np.asarray(dyes.tints(made)), np.asarray(dyes.absorptions(made, _RADIUS))
+    dimmed = learned_media.dye(made, _paths(meetings, passages), radius=_RADIUS).weights
+    tint, absorption = (
+        np.asarray(learned_media.tints(made)),
+        np.asarray(learned_media.absorptions(made, _RADIUS)),
+    )
     for n, lengths, got in zip(meetings, passages, dimmed, strict=True):
         expected = np.prod(tint ** np.array(n)[:, None], axis=0)
         expected *= np.exp(-np.array(lengths) @ absorption)
@@ -36,23 +39,23 @@ def test_light_is_dimmed_at_every_meeting_and_along_every_passage():
 
 def test_optical_density_by_hand():
     made = Dyes(jnp.log(jnp.expm1(jnp.array([[0.5, 1.0, 1.5]]))), jnp.full((1, 3), -200.0))
-    np.testing.assert_allclose(dyes.optical_density(made), 1.0, rtol=1e-6)
-    assert dyes.optical_density(None) == 0.0
+    np.testing.assert_allclose(learned_media.optical_density(made), 1.0, rtol=1e-6)
+    assert learned_media.optical_density(None) == 0.0
 
 
 def test_without_dyes_paths_stay_as_they_are():
     paths = _paths([[1.0]], [[2.0]])
-    assert dyes.dye(None, paths, radius=_RADIUS) is paths
+    assert learned_media.dye(None, paths, radius=_RADIUS) is paths
 
 
 @pytest.mark.parametrize("raw", [-200.0, -30.0, -3.0, 0.0, 5.0, 200.0])
 def test_tints_are_factors_with_finite_gradients(raw):
     made = Dyes(*[jnp.full((1, 3), raw)] * 2)
-    tint = np.asarray(dyes.tints(made))
+    tint = np.asarray(learned_media.tints(made))
     assert np.all((tint >= 0.0) & (tint <= 1.0))
 
     def light(made):
-        return jnp.sum(dyes.dye(made, _paths([[24.0]], [[1e3]]), radius=_RADIUS).weights)
+        return jnp.sum(learned_media.dye(made, _paths([[24.0]], [[1e3]]), radius=_RADIUS).weights)
 
     assert gradients.all_finite(jax.grad(light)(made))
 
@@ -66,7 +69,7 @@ def test_dye_check_grads():
             meetings=paths.meetings.astype(density.dtype),
             passages=paths.passages.astype(density.dtype),
         )
-        return dyes.dye(Dyes(density, absorption), wide, radius=_RADIUS).weights
+        return learned_media.dye(Dyes(density, absorption), wide, radius=_RADIUS).weights
 
     rng = np.random.default_rng(0)
     gradients.assert_numerical(light, *rng.normal(size=(2, 2, 3)))

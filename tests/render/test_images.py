@@ -7,10 +7,9 @@ import pytest
 
 from refref_jax.geometry.cameras import image_rays
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE
-from refref_jax.optics.details import everything
 from refref_jax.optics.light_paths import PathStatus
-from refref_jax.render import Model, images, init_params, render_image, render_rays, tiles
+from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, everything
+from refref_jax.render import Model, images, init_params, render_image, render_rays
 from tests import scenes
 from tests.small_model import CAMERAS, MODEL
 
@@ -112,7 +111,7 @@ def test_a_chunk_of_nothing_is_refused(model, rays):
 
 def test_rays_that_only_fill_up_a_tile_are_not_rendered(model, rays):
     flat = Rays(*(x.reshape(256, *x.shape[2:])[:200] for x in rays))
-    full, _ = tiles.cut_out(flat, None, 0, 256)
+    full, _ = images.cut_out(flat, None, 0, 256)
     assert full.radii.shape == (256,)
     tile = images._trace_tile(model.geometry, full, 200, budget=STRAIGHT, detail=everything(0))
     assert int(tile.count) == 200

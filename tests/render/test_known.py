@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.data.containment import parts_around
+from refref_jax.data.mesh_queries import parts_around
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE
-from refref_jax.render import known, radiance_of, render_known
+from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE
+from refref_jax.render import background_rendering, radiance_of, render_known
 from refref_jax.render.backgrounds import Environment, LinearTexture
 from tests import reference, scenes
 
@@ -91,9 +91,9 @@ def test_a_function_of_the_user_s_sees_origins_and_directions(geometry, rays):
 
 def test_backgrounds_are_arguments_of_one_program(geometry, rays):
     first = render_known(geometry, _environment(1), rays, budget=TREE, tile=256)
-    compiled = known._render_tile._cache_size()
+    compiled = background_rendering._render_tile._cache_size()
     second = render_known(geometry, _environment(2), rays, budget=TREE, tile=256)
-    assert known._render_tile._cache_size() == compiled
+    assert background_rendering._render_tile._cache_size() == compiled
     assert np.max(np.abs(first.linear - second.linear)) > 0.1
 
 

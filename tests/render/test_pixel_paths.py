@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics.budgets import STRAIGHT, TREE
 from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics.path_settings import STRAIGHT, TREE
 from refref_jax.render import Model, init_params, pixel_paths
 from refref_jax.render.pixel_paths import PixelPaths
 from tests import scenes

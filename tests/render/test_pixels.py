@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax import losses
 from refref_jax.fields import hash_grid
 from refref_jax.optics.light_paths import PathStatus
-from refref_jax.render import pixels, transport
+from refref_jax.render import pixels, volume_rendering
 from refref_jax.render.model import init_params
-from refref_jax.render.transport import Jitter
+from refref_jax.render.volume_rendering import Jitter
+from refref_jax.training import objective
 from tests import gradients, made_paths, reference_sampling
 from tests.small_model import MODEL
 
@@ -141,12 +141,12 @@ def test_rendering_without_jitter_is_deterministic():
 def test_no_jitter_is_zero():
     jitter = pixels.no_jitter(MODEL, 5)
     for part in jitter:
-        np.testing.assert_array_equal(part, np.zeros((5, transport.rounds(MODEL))))
+        np.testing.assert_array_equal(part, np.zeros((5, volume_rendering.rounds(MODEL))))
 
 
 def test_random_jitter_fills_its_ranges():
     offsets, rotations = (np.asarray(x) for x in _draw(0, 2000))
-    assert offsets.shape == rotations.shape == (2000, transport.rounds(MODEL))
+    assert offsets.shape == rotations.shape == (2000, volume_rendering.rounds(MODEL))
     assert (offsets >= -0.5).all() and (offsets < 0.5).all()
     assert (rotations >= 0.0).all() and (rotations <= 2.0 * np.pi).all()
     # Mean and deviation of a uniform distribution, five standard errors wide.
@@ -197,13 +197,13 @@ def _loss_gradients(params, paths, jitter):
         )
         *proposals, final = seen.paths.histograms
         target = jnp.full_like(seen.rgb, 0.3)
-        interlevel = jax.vmap(lambda a, b: losses.interlevel(a, b, blur=0.01))
+        interlevel = jax.vmap(lambda a, b: objective.interlevel(a, b, blur=0.01))
         return jnp.stack(
             [
-                losses.mean_squared_error(seen.rgb, target),
+                objective.mean_squared_error(seen.rgb, target),
                 sum(jnp.mean(interlevel(final, proposal)) for proposal in proposals),
-                jnp.mean(jax.vmap(losses.distortion)(final, seen.paths.outside)),
-                losses.hash_decay(hash_grid.tables(params)),
+                jnp.mean(jax.vmap(objective.distortion)(final, seen.paths.outside)),
+                objective.hash_decay(hash_grid.tables(params)),
             ]
         )
 

@@ -9,8 +9,8 @@ import pytest
 
 from refref_jax.geometry.cameras import image_rays, orbit
 from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.budgets import TREE
 from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics.path_settings import TREE
 from refref_jax.render import render_known, shade
 from tests import gradients, scenes
 

@@ -6,15 +6,8 @@ import pytest
 
 from refref_jax import choices
 from refref_jax.geometry import cameras
-from refref_jax.optics.budgets import STRAIGHT
-from refref_jax.render import (
-    Model,
-    Rendering,
-    init_params,
-    render_camera,
-    render_image,
-    supersampling,
-)
+from refref_jax.optics.path_settings import STRAIGHT
+from refref_jax.render import Model, Rendering, images, init_params, render_camera, render_image
 from tests import scenes
 from tests.small_model import CAMERAS, MODEL
 
@@ -48,14 +41,14 @@ def _fine(linear, distance):
 
 
 def test_half_a_pixel_of_white_is_more_than_half_of_its_code():
-    seen = supersampling.average(_fine([[1.0, 0.0], [1.0, 0.0]], np.ones((2, 2))), 2)
+    seen = images.average(_fine([[1.0, 0.0], [1.0, 0.0]], np.ones((2, 2))), 2)
     # Half of the light is 0.735 in sRGB; the mean of the codes would be 0.5.
     np.testing.assert_allclose(seen.rgb, np.full((1, 1, 3), 0.7354), atol=1e-4)
     np.testing.assert_allclose(seen.linear, np.full((1, 1, 3), 0.5), atol=1e-4)
 
 
 def test_light_is_clipped_after_it_is_averaged():
-    seen = supersampling.average(_fine([[3.0, 0.0], [0.0, 0.0]], np.ones((2, 2))), 2)
+    seen = images.average(_fine([[3.0, 0.0], [0.0, 0.0]], np.ones((2, 2))), 2)
     np.testing.assert_allclose(seen.rgb, np.full((1, 1, 3), 0.8808), atol=1e-4)
 
 
@@ -68,13 +61,13 @@ def test_light_is_clipped_after_it_is_averaged():
     ],
 )
 def test_a_distance_is_one_that_a_ray_saw(distance, expected):
-    seen = supersampling.average(_fine(np.ones_like(distance), distance), len(distance))
+    seen = images.average(_fine(np.ones_like(distance), distance), len(distance))
     np.testing.assert_array_equal(seen.distance, [[expected]])
 
 
 def test_each_block_of_small_pixels_makes_its_own_pixel():
     fine = np.arange(24.0).reshape(4, 6)
-    seen = supersampling.average(_fine(fine / 24.0, fine), 2)
+    seen = images.average(_fine(fine / 24.0, fine), 2)
     np.testing.assert_array_equal(seen.distance, [[1.0, 3.0, 5.0], [13.0, 15.0, 17.0]])
     np.testing.assert_allclose(seen.mean_distance, [[3.5, 5.5, 7.5], [15.5, 17.5, 19.5]])
 
@@ -92,7 +85,7 @@ def test_bands_of_rows_make_the_same_picture(model):
     banded = render_camera(model, CAMERAS, 0, rays_per_pixel=4, chunk=_CHUNK, band=200)
     fine = render_image(model, cameras.image_rays(cameras.supersample(CAMERAS, 2), 0))
     assert banded.rgb.shape == (16, 16, 3) and banded.distance.shape == (16, 16)
-    for ours, expected in zip(banded, supersampling.average(fine, 2), strict=True):
+    for ours, expected in zip(banded, images.average(fine, 2), strict=True):
         np.testing.assert_allclose(ours, expected, atol=2e-5)
 
 

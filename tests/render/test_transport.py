@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from refref_jax.fields import registry
-from refref_jax.fields.kinds import Radiance
-from refref_jax.render import pixels, transport
+from refref_jax.fields.base import Radiance
+from refref_jax.render import pixels, volume_rendering
 from refref_jax.render.model import Params, init_params
-from refref_jax.render.transport import Jitter
-from refref_jax.sampling import polylines, warps
+from refref_jax.render.volume_rendering import Jitter
+from refref_jax.sampling import polylines, scene_bounds
 from tests import made_paths, reference_sampling
 from tests.small_model import MODEL
 
@@ -86,13 +86,13 @@ def _tree_item(tree, index):
 
 
 def test_rounds_counts_the_final_one():
-    assert transport.rounds(MODEL) == 2
-    assert transport.rounds(dataclasses.replace(MODEL, proposals=MODEL.proposals * 3)) == 4
+    assert volume_rendering.rounds(MODEL) == 2
+    assert volume_rendering.rounds(dataclasses.replace(MODEL, proposals=MODEL.proposals * 3)) == 4
 
 
 def _warp(config, path):
     shape = polylines.outside_path if config.interior == "clear" else polylines.whole_path
-    return transport.distance_warp(config, shape(jax.tree.map(jnp.asarray, path)))
+    return volume_rendering.distance_warp(config, shape(jax.tree.map(jnp.asarray, path)))
 
 
 @pytest.mark.parametrize("interior", _MODELS)
@@ -152,7 +152,7 @@ def test_a_path_always_has_room_for_samples(origin, direction, far):
 def test_histograms_are_sorted_and_hold_all_light(interior):
     config = _MODELS[interior]
     seen = _render(config, _some_paths())
-    assert len(seen.histograms) == transport.rounds(config)
+    assert len(seen.histograms) == volume_rendering.rounds(config)
     samples = [*(proposal.samples for proposal in config.proposals), config.samples]
     for histogram, count in zip(seen.histograms, samples, strict=True):
         edges, weights = (np.asarray(x) for x in histogram)
@@ -201,8 +201,8 @@ def test_rendering_many_paths_is_a_loop():
 
 
 def _one(config, path):
-    jitter = Jitter(*(jnp.zeros(transport.rounds(config)) for _ in range(2)))
-    return transport.path_radiance(_params(config), config, path, jitter, jnp.float32(1.0))
+    jitter = Jitter(*(jnp.zeros(volume_rendering.rounds(config)) for _ in range(2)))
+    return volume_rendering.path_radiance(_params(config), config, path, jitter, jnp.float32(1.0))
 
 
 # --- the inside of objects ---
@@ -210,7 +210,7 @@ def _one(config, path):
 
 def _coordinates(config, path, edges):
     """Returns the distances at which the intervals of a path have their edges."""
-    return np.asarray(warps.to_distance(_warp(config, path), jnp.asarray(edges)), np.float64)
+    return np.asarray(scene_bounds.to_distance(_warp(config, path), jnp.asarray(edges)), np.float64)
 
 
 def _walk(path, t, *, interior):

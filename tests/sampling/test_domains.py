@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.sampling import domains
+from refref_jax.sampling import scene_bounds
 from refref_jax.sampling.cones import Gaussians
-from refref_jax.sampling.domains import Domain
+from refref_jax.sampling.scene_bounds import Domain
 from tests import arrays, gradients, reference_sampling, transformations
 
 # A few float32 roundings.
@@ -15,11 +15,11 @@ _ROUNDING = 1e-6
 
 _MAGNITUDES = 10.0 ** np.arange(-6, 7)
 
-_contract = jax.jit(domains.contract)
-_shrinkage = jax.jit(domains.shrinkage)
-_to_unit_cube = jax.jit(domains.to_unit_cube, static_argnums=0)
+_contract = jax.jit(scene_bounds.contract)
+_shrinkage = jax.jit(scene_bounds.shrinkage)
+_to_unit_cube = jax.jit(scene_bounds.to_unit_cube, static_argnums=0)
 
-_FUNCTIONS = (domains.contract, domains.shrinkage)
+_FUNCTIONS = (scene_bounds.contract, scene_bounds.shrinkage)
 _JACOBIANS = {function: jax.jit(jax.vmap(jax.jacrev(function))) for function in _FUNCTIONS}
 
 
@@ -42,7 +42,7 @@ def _cube(domain, positions, scales=None):
 _BOUNDED = Domain(radius=2.0, space="bounded")
 _SPHERICAL = Domain(radius=2.0, space="spherical")
 
-_exit_distance = jax.jit(domains.exit_distance, static_argnums=0)
+_exit_distance = jax.jit(scene_bounds.exit_distance, static_argnums=0)
 
 
 def _assert_exit(domain, origin, direction, expected):
@@ -114,7 +114,7 @@ def test_gradients_of_an_exit_are_finite_everywhere():
     for origin in ([0.0, 0.0, 0.0], [0.0, 0.0, 2.0], [0.0, 0.0, 3.0], [0.0, 1.9999999, 0.0]):
         for space in ("bounded", "spherical"):
             domain = Domain(radius=2.0, space=space)
-            gradient = jax.grad(lambda x, d=domain: domains.exit_distance(d, x, jnp.eye(3)[0]))
+            gradient = jax.grad(lambda x, d=domain: scene_bounds.exit_distance(d, x, jnp.eye(3)[0]))
             assert np.isfinite(gradient(jnp.array(origin))).all()
 
 
@@ -130,9 +130,9 @@ def test_gradients_of_an_exit_are_finite_everywhere():
 )
 def test_the_nearest_point_within_by_hand(space, point, expected):
     domain = Domain(radius=2.0, space=space)
-    got = domains.nearest_within(domain, jnp.array(point))
+    got = scene_bounds.nearest_within(domain, jnp.array(point))
     np.testing.assert_allclose(got, expected, rtol=_ROUNDING)
-    jacobian = jax.jacrev(lambda x: domains.nearest_within(domain, x))(jnp.array(point))
+    jacobian = jax.jacrev(lambda x: scene_bounds.nearest_within(domain, x))(jnp.array(point))
     assert np.isfinite(jacobian).all()
 
 
@@ -169,7 +169,7 @@ def test_contraction_is_smooth_where_it_starts():
     inner, outer = _points(1.0 - 1e-6), _points(1.0 + 1e-6)
     np.testing.assert_allclose(_contract(outer), _contract(inner), atol=4e-6)
     np.testing.assert_allclose(_shrinkage(outer), _shrinkage(inner), atol=4e-6)
-    jacobian = _JACOBIANS[domains.contract]
+    jacobian = _JACOBIANS[scene_bounds.contract]
     # Across the sphere the slope starts to fall like `1 / |x|^2`.
     np.testing.assert_allclose(jacobian(outer), jacobian(inner), atol=1e-5)
 
@@ -197,7 +197,7 @@ def test_contraction_keeps_the_order_of_distances():
 def test_shrinkage_is_the_cube_root_of_the_jacobians_determinant(magnitude):
     points = np.asarray(_points(magnitude), np.float64)
     with jax.enable_x64(True):
-        jacobians = np.asarray(_JACOBIANS[domains.contract](jnp.asarray(points)))
+        jacobians = np.asarray(_JACOBIANS[scene_bounds.contract](jnp.asarray(points)))
     expected = abs(np.linalg.det(jacobians)) ** (1.0 / 3.0)
     np.testing.assert_allclose(_shrinkage(_points(magnitude)), expected, rtol=1e-5)
 
@@ -277,7 +277,7 @@ def test_a_small_ball_keeps_its_volume_in_the_scale(magnitude):
 # --- gradients and transformations ---
 
 
-@pytest.mark.parametrize("function", [domains.contract, domains.shrinkage])
+@pytest.mark.parametrize("function", [scene_bounds.contract, scene_bounds.shrinkage])
 @pytest.mark.parametrize("magnitude", [0.0, 1e-30, 1e-6, 1.0, 1e6, 1e30])
 def test_gradients_are_finite_at_any_distance(function, magnitude):
     assert gradients.all_finite(_JACOBIANS[function](_points(magnitude)))
@@ -286,7 +286,7 @@ def test_gradients_are_finite_at_any_distance(function, magnitude):
 @pytest.mark.parametrize("magnitude", [3.0, 1e3, 1e6])
 def test_contract_has_the_right_gradient_far_away(magnitude):
     points = _points(magnitude)
-    got = np.asarray(_JACOBIANS[domains.contract](points), np.float64)
+    got = np.asarray(_JACOBIANS[scene_bounds.contract](points), np.float64)
     for jacobian, point in zip(got, np.asarray(points, np.float64), strict=True):
         unit = point / np.linalg.norm(point)
         across = (2.0 - 1.0 / magnitude) / magnitude * (np.eye(3) - np.outer(unit, unit))
@@ -297,7 +297,9 @@ def test_contract_has_the_right_gradient_far_away(magnitude):
 @pytest.mark.parametrize("domain", [_BOUNDED, _UNBOUNDED])
 def test_gradients_of_the_unit_cube_are_finite(domain):
     def total(positions, scales):
-        return sum(jnp.sum(x) for x in domains.to_unit_cube(domain, Gaussians(positions, scales)))
+        return sum(
+            jnp.sum(x) for x in scene_bounds.to_unit_cube(domain, Gaussians(positions, scales))
+        )
 
     gradient = jax.jit(jax.grad(total, argnums=(0, 1)))
     for magnitude in (0.0, 1.0, 1e30):
@@ -310,14 +312,14 @@ def test_check_grads(function):
 
 
 def _box(positions, scales, *, domain):
-    return tuple(domains.to_unit_cube(domain, Gaussians(positions, scales)))
+    return tuple(scene_bounds.to_unit_cube(domain, Gaussians(positions, scales)))
 
 
 _SOME = (jnp.stack([_points(x) for x in (0.5, 1.0, 20.0)]), jnp.ones((3, 20)))
 
 _CASES = {
-    "contract": lambda x, scales: domains.contract(x),
-    "shrinkage": lambda x, scales: domains.shrinkage(x),
+    "contract": lambda x, scales: scene_bounds.contract(x),
+    "shrinkage": lambda x, scales: scene_bounds.shrinkage(x),
     "bounded": lambda x, scales: _box(x, scales, domain=_BOUNDED),
     "unbounded": lambda x, scales: _box(x, scales, domain=_UNBOUNDED),
 }

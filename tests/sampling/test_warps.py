@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.sampling import warps
-from refref_jax.sampling.warps import DistanceWarp
+from refref_jax.sampling import scene_bounds
+from refref_jax.sampling.scene_bounds import DistanceWarp
 from tests import gradients, reference_sampling, transformations
 
 _EPSILON = float(np.finfo(np.float32).eps)
@@ -23,8 +23,8 @@ _WARPS = [
 _OPERATIONS = 4.0
 
 
-_to_distance = jax.jit(warps.to_distance, static_argnums=0)
-_to_unit = jax.jit(warps.to_unit, static_argnums=0)
+_to_distance = jax.jit(scene_bounds.to_distance, static_argnums=0)
+_to_unit = jax.jit(scene_bounds.to_unit, static_argnums=0)
 
 
 def _slope(warp, t):
@@ -127,20 +127,20 @@ def test_to_unit_holds_distances_outside_the_interval(warp):
 @pytest.mark.parametrize("warp", _WARPS)
 def test_gradients_are_finite_and_positive(warp):
     s = jnp.linspace(0.0, 1.0, 101)
-    slope = jax.jit(jax.vmap(jax.grad(functools.partial(warps.to_distance, warp))))(s)
+    slope = jax.jit(jax.vmap(jax.grad(functools.partial(scene_bounds.to_distance, warp))))(s)
     assert np.isfinite(slope).all() and (slope > 0.0).all()
     t = jnp.asarray(_distances(warp), jnp.float32)
-    slope = jax.jit(jax.vmap(jax.grad(functools.partial(warps.to_unit, warp))))(t)
+    slope = jax.jit(jax.vmap(jax.grad(functools.partial(scene_bounds.to_unit, warp))))(t)
     assert np.isfinite(slope).all() and (slope[1:-1] > 0.0).all()
 
 
 def test_check_grads():
     warp = _WARPS[0]
-    gradients.assert_numerical(functools.partial(warps.to_distance, warp), [0.1, 0.5, 0.9])
-    gradients.assert_numerical(functools.partial(warps.to_unit, warp), [0.1, 1.0, 10.0])
+    gradients.assert_numerical(functools.partial(scene_bounds.to_distance, warp), [0.1, 0.5, 0.9])
+    gradients.assert_numerical(functools.partial(scene_bounds.to_unit, warp), [0.1, 1.0, 10.0])
 
 
 @pytest.mark.parametrize("transformation", transformations.ALL)
-@pytest.mark.parametrize("function", [warps.to_distance, warps.to_unit])
+@pytest.mark.parametrize("function", [scene_bounds.to_distance, scene_bounds.to_unit])
 def test_transformations_change_nothing(function, transformation):
     transformation(functools.partial(function, _WARPS[0]), (jnp.array([0.1, 0.5, 0.9]),))

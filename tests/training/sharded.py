@@ -16,10 +16,10 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from refref_jax.optics.budgets import BUDGETS
+from refref_jax.optics.path_settings import BUDGETS
 from refref_jax.training import devices, loop
-from refref_jax.training.checkpoints import Checkpoints
-from refref_jax.training.state import init_state
+from refref_jax.training.loop import init_state
+from refref_jax.training.run_folder import Checkpoints
 from tests import scenes, small_model
 from tests.small_model import CONFIG, MODEL
 

@@ -13,10 +13,10 @@ import pytest
 from jax.sharding import Mesh
 
 from refref_jax.optics import light_paths
-from refref_jax.optics.budgets import STRAIGHT
 from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics.path_settings import STRAIGHT
 from refref_jax.training import devices, loop
-from refref_jax.training.state import init_state
+from refref_jax.training.loop import init_state
 from tests import made_paths, scenes, small_model
 from tests.experiments.command import ROOT
 from tests.small_model import CONFIG, MODEL

@@ -7,9 +7,9 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from experiments.runs import perceptual
 from refref_jax import metrics
-from refref_jax.data import local_layout
-from refref_jax.data.local_layout import Frames
-from refref_jax.optics.budgets import STRAIGHT, TREE
+from refref_jax.data import scene_folder
+from refref_jax.data.scene_folder import Frames
+from refref_jax.optics.path_settings import STRAIGHT, TREE
 from refref_jax.render import Model, Rendering, init_params
 from refref_jax.training import evaluation
 from refref_jax.training.evaluation import Perceptual
@@ -128,8 +128,8 @@ def test_an_image_too_small_for_a_window_has_no_ssim():
 
 
 def test_psnr_and_ssim_of_photographs_are_those_of_scikit_image(ball_scene):
-    frames = local_layout.read_frames(ball_scene, "test")
-    first, second = (image / 255.0 for image in local_layout.read_images(frames)[:2])
+    frames = scene_folder.read_frames(ball_scene, "test")
+    first, second = (image / 255.0 for image in scene_folder.read_images(frames)[:2])
     noise = np.random.default_rng(0).normal(scale=0.02, size=first.shape)
     for other in (second, np.clip(first + noise, 0.0, 1.0)):
         found = evaluation.measure_colours(other.astype(np.float32), first, None, _NOTHING)

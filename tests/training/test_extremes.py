@@ -1,6 +1,6 @@
 """A training step at the edges of what can happen in it: values and gradients stay finite.
 
-The step is `steps.train_steps` itself. Its gradient is read from the optimizer, which has seen no
+The step is `loop.train_steps` itself. Its gradient is read from the optimizer, which has seen no
 other: the first moment of Adam is then a tenth of it.
 """
 
@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from refref_jax.fields import hash_grid
-from refref_jax.render import dyes
-from refref_jax.training import steps
-from refref_jax.training.state import TrainState, optimizer
+from refref_jax.render import learned_media
+from refref_jax.training import loop
+from refref_jax.training.loop import TrainState, optimizer
 from tests import gradients, small_model
 from tests.training import extremes
 
@@ -88,9 +88,9 @@ def _step(case, batch, params, target, *, step=2):
     state = TrainState(jnp.int32(step), params, _begin(params))
     first = np.int32(names.index(batch))
     order = jnp.arange(len(names), dtype=jnp.int32)
-    state, report = steps.train_steps(
+    state, report = loop.train_steps(
         state,
-        steps.Pool(traced, jnp.asarray(rgb), order),
+        loop.Pool(traced, jnp.asarray(rgb), order),
         first,
         first + 1,
         config=config,
@@ -134,7 +134,7 @@ def test_without_light_only_what_does_not_need_it_is_learned(batch):
     assert np.all(gradient.dyes.density > 0.0) and np.all(gradient.dyes.absorption > 0.0)
     assert not np.any(extremes.colour_bias(gradient))
     assert all(np.any(table) for table in hash_grid.tables(gradient))
-    fading = dyes.optical_density(extremes.parameters(case[1])["trained"].dyes)
+    fading = learned_media.optical_density(extremes.parameters(case[1])["trained"].dyes)
     expected = (200 / 255.0) ** 2 + _CONFIG.losses.hash_decay * report.hash_decay
     expected += _CONFIG.losses.dye_decay * fading
     if batch == "all empty":

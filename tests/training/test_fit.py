@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from refref_jax.render import saved
+from refref_jax.render import checkpoint_io
 from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig
 from tests.experiments.command import ROOT
@@ -53,7 +53,7 @@ def test_the_configuration_of_a_run_repeats_it_bit_for_bit(fifty, tmp_path):
     messages = []
     model = fit.fit(config, out=tmp_path / "again", report=messages.append)
     assert run_folder.read_config(tmp_path / "again") == config
-    first = saved.load_model(fifty)
+    first = checkpoint_io.load_model(fifty)
     assert (first.config, first.budget) == (model.config, model.budget)
     pairs = zip(jax.tree.leaves(first.params), jax.tree.leaves(model.params), strict=True)
     assert all(np.array_equal(ours, again) for ours, again in pairs)
@@ -69,8 +69,8 @@ def test_the_configuration_of_a_run_repeats_it_bit_for_bit(fifty, tmp_path):
 
 def test_a_model_is_loaded_without_a_word_and_nothing_is_written(fifty, caplog, capfd):
     before = {path: path.stat().st_mtime_ns for path in fifty.rglob("*")}
-    saved.load_model(fifty)
-    assert saved.latest_step(fifty) == 50
+    checkpoint_io.load_model(fifty)
+    assert checkpoint_io.latest_step(fifty) == 50
     assert not caplog.records and capfd.readouterr() == ("", "")
     assert before == {path: path.stat().st_mtime_ns for path in fifty.rglob("*")}
 

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE, room
-from refref_jax.render import saved
-from refref_jax.render.config import path_detail
-from refref_jax.render.saved import load_model
-from refref_jax.training import loop, run_folder, steps
-from refref_jax.training.checkpoints import Checkpoints
-from refref_jax.training.state import init_state
+from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, room
+from refref_jax.render import checkpoint_io
+from refref_jax.render.checkpoint_io import load_model
+from refref_jax.render.model import path_detail
+from refref_jax.training import loop, run_folder
+from refref_jax.training.loop import init_state
+from refref_jax.training.run_folder import Checkpoints
 from tests import scenes, small_model
 from tests.small_model import CONFIG, MODEL, SAVED
 
@@ -93,11 +93,11 @@ def test_a_run_resumed_within_a_pool_may_take_other_strides(tmp_path):
 
 def test_one_pool_is_traced_ahead_and_no_more(monkeypatch):
     traced = []
-    trace_pool = steps.trace_pool
+    trace_pool = loop.trace_pool
     noted = lambda *arguments, **options: (
         traced.append(len(traced)) or trace_pool(*arguments, **options)
     )
-    monkeypatch.setattr(steps, "trace_pool", noted)
+    monkeypatch.setattr(loop, "trace_pool", noted)
     setup = _setup()._replace(epoch=None)
     traced.clear()
     counts = [len(traced) for _ in loop.run_steps(setup, _start(), 12)]
@@ -205,7 +205,7 @@ def test_light_is_lost_only_where_paths_have_too_little_room():
     )
     room = {"roomy": setup.capacity, "tight": CONFIG.schedule.batch}
     lost = {
-        name: steps.trace_pool(
+        name: loop.trace_pool(
             setup.geometry, rays, budget=PAPER, capacity=capacity, detail=detail
         ).lost
         for name, capacity in room.items()
@@ -296,7 +296,7 @@ def test_a_damaged_geometry_is_named(tmp_path, damage):
     if damage == "truncated":
         path.write_bytes(content[: len(content) // 2])
     with pytest.raises(ValueError, match=r"geometry\.npz can not be read"):
-        saved.load_geometry(tmp_path)
+        checkpoint_io.load_geometry(tmp_path)
 
 
 def test_a_damaged_checkpoint_is_named(tmp_path):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from refref_jax import configuration
-from refref_jax.data.needs import Needs
-from refref_jax.optics.budgets import PAPER, STRAIGHT, TREE, budget_of, capacity_factors
-from refref_jax.render import saved
+from refref_jax.data.scene_analysis import Needs
+from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, budget_of, capacity_factors
+from refref_jax.render import checkpoint_io
 from refref_jax.training import config_files, run_folder
 from refref_jax.training.config import (
     FieldConfig,
@@ -312,7 +312,7 @@ def test_a_file_that_is_no_configuration_is_refused_in_one_line(tmp_path, text, 
 def test_the_configuration_of_an_earlier_version_is_read(tmp_path):
     resolved = _resolve(_TINTED, scene="a", paths="paper", steps=100, seed=3)
     config, model = resolved.config, resolved.model
-    saved.write_static(tmp_path, model)
+    checkpoint_io.write_static(tmp_path, model)
     schedule, losses = vars(config.schedule), vars(config.losses)
     before = {
         "scene": {"path": "a", "rule": "nested", "indices": []},

@@ -18,8 +18,7 @@ from experiments.benchmarking.results import Metrics, Record, Truth, compared, f
 from experiments.benchmarking.settings import Settings
 from experiments.benchmarking.tables import Table
 from refref_jax import configuration
-from refref_jax.data import files, transforms
-from refref_jax.data.errors import SceneError
+from refref_jax.data import SceneError, image_files, scene_folder
 from refref_jax.geometry import cameras
 from refref_jax.geometry.cameras import Cameras
 
@@ -102,7 +101,7 @@ def read(out: Path) -> Contents:
     path = out / summary.RESULTS
     if not path.is_file():
         raise ValueError(f"{out} has no {path.name}. Make it with --tables_only.")
-    content = transforms.read_json(path)
+    content = scene_folder.read_json(path)
     moved = {name: Path(scene.path) for name, scene in settings.read(out).scenes.items()}
     try:
         results = [_result(job, moved) for job in content["jobs"]]
@@ -202,8 +201,8 @@ def read_view(out: Path, scene: Scene, name: str) -> View:
     truth, mask = _truth(list(roots), told)
     rendered = {
         method: Image(
-            _or_unknown(files.read_rgb, out / view.rgb),
-            _or_unknown(files.read_exr, out / view.distance),
+            _or_unknown(image_files.read_rgb, out / view.rgb),
+            _or_unknown(image_files.read_exr, out / view.distance),
         )
         for method, view in files_of.items()
     }
@@ -223,9 +222,9 @@ def _truth(roots: Sequence[Path], told: Truth) -> tuple[Image, Bool[np.ndarray, 
     root = next((root for root in roots if (root / told.rgb).is_file()), None)
     if root is None:
         return Image(None, None), None
-    rgb = _or_unknown(files.read_rgb, root / told.rgb)
-    mask = told.mask and _or_unknown(files.read_mask, root / told.mask)
-    depth = told.distance and _or_unknown(files.read_depth, root / told.distance)
+    rgb = _or_unknown(image_files.read_rgb, root / told.rgb)
+    mask = told.mask and _or_unknown(image_files.read_mask, root / told.mask)
+    depth = told.distance and _or_unknown(image_files.read_depth, root / told.distance)
     return Image(rgb, None if depth is None else _distance(root, depth)), mask
 
 
@@ -233,7 +232,7 @@ def _distance(root: Path, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, 
     """Returns planar depth as distance; `None` if the scene does not tell its field of view."""
     path = root / f"transforms_{SPLIT}.json"
     try:
-        angle = transforms.get(transforms.read_json(path), "camera_angle_x", path)
+        angle = scene_folder.get(scene_folder.read_json(path), "camera_angle_x", path)
         height, width = depth.shape
         pose = np.eye(4)[None, :3]
         seen = Cameras(pose, width, height, cameras.focal_length(width, float(angle)))

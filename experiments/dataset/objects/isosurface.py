@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from experiments.dataset.objects.distance_fields import Distances, Field, Points, evaluate
 from experiments.dataset.parts import RADIUS
-from refref_jax.reconstruct.isosurface import march
+from refref_jax.reconstruct.grids import march
 
 # Number of fine cells along the edge of a coarse one; and largest distance of coarse corners to the
 # surface, in coarse edges: sqrt(3) / 2 for a 1-Lipschitz field, and more for an approximate one.

@@ -10,7 +10,7 @@ from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.plan import Skipped
 from experiments.benchmarking.results import Costs, Image, Record, Truth, View
 from experiments.benchmarking.settings import Benchmark, Scene, Settings
-from refref_jax.data import files
+from refref_jax.data import image_files
 from tests.data import small_scenes
 
 SETTINGS = Settings(preset="tiny", steps=6, limit=None, rays_per_pixel=1, seed=0, lpips=None)
@@ -91,11 +91,13 @@ def _write_scene(folder, images):
     for kind in ("test", "mask", "depth"):
         (folder / kind).mkdir(parents=True)
     for i, rgb in enumerate(images):
-        files.write_rgb(folder / f"test/r_{i}.png", rgb)
+        image_files.write_rgb(folder / f"test/r_{i}.png", rgb)
         mask = np.zeros(rgb.shape[:2], np.uint8)
         mask[4:8, 4:8] = 255
         iio.imwrite(folder / f"mask/r_{i}.png", mask, plugin="pillow", extension=".png")
-        files.write_exr(folder / f"depth/r_{i}.exr", np.where(mask > 0, 3.0, 5.0).astype("f4"))
+        image_files.write_exr(
+            folder / f"depth/r_{i}.exr", np.where(mask > 0, 3.0, 5.0).astype("f4")
+        )
     frames = [{"file_path": f"./test/r_{i}"} for i in range(len(images))]
     content = {"camera_angle_x": 1.0, "frames": frames}
     (folder / "transforms_test.json").write_text(json.dumps(content))
@@ -107,9 +109,9 @@ def _write_job(out, scene, path, method, images):
     for kind in ("rgb", "distance"):
         (run / "eval/test" / kind).mkdir(parents=True)
     for i, rgb in enumerate(images):
-        files.write_rgb(run / f"eval/test/rgb/r_{i}.png", rgb * quality / 30.0)
+        image_files.write_rgb(run / f"eval/test/rgb/r_{i}.png", rgb * quality / 30.0)
         distance = np.full(rgb.shape[:2], 4.0, np.float32)
-        files.write_exr(run / f"eval/test/distance/r_{i}.exr", distance)
+        image_files.write_exr(run / f"eval/test/distance/r_{i}.exr", distance)
     curve = [{"step": n, "seconds": 0.1 * n, "loss": 1.0, "psnr": quality} for n in (1, 50, 100)]
     (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in curve))
     per_image = [

@@ -7,7 +7,7 @@ import numpy as np
 from experiments.dataset import cameras, frame_files, scene_record, scene_setup, workers
 from experiments.dataset.frame_files import Rendering
 from experiments.dataset.render_settings import PerSplit, RenderSettings
-from refref_jax.data import files
+from refref_jax.data import image_files
 from refref_jax.data.scene_names import SceneName
 from refref_jax.geometry.cameras import Cameras, focal_length
 from tests.experiments.dataset import small_dataset
@@ -29,15 +29,15 @@ def write_room(folder, kind, parts=(), *, white=False, rule="nested"):
     background = small_dataset.write_background(folder, kind, seed=0, size=None)
     if kind == "env":
         background["image"] = "background/env.exr"
-        files.write_exr(folder / background["image"], np.ones_like(image) if white else image)
+        image_files.write_exr(folder / background["image"], np.ones_like(image) if white else image)
     for number, wall in enumerate(background.get("faces", {}).values()):
         wall["image"] = f"background/wall_{number}.png"
         pixels = (
             np.ones_like(image) if white else np.roll(image[:, :96], number, -1) ** (1 + number)
         )
-        files.write_rgb(folder / wall["image"], pixels)
+        image_files.write_rgb(folder / wall["image"], pixels)
     if kind == "sphere":
-        files.write_rgb(folder / background["image"], np.ones_like(image) if white else image)
+        image_files.write_rgb(folder / background["image"], np.ones_like(image) if white else image)
     settings = RenderSettings(SIZE, PerSplit(1, 1, 1), PerSplit(1, 1, 1), rule=rule)
     scene = SceneName(kind, "smcvx", "known")
     scene_setup.write_meshes(folder, scene, parts)

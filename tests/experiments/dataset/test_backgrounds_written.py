@@ -9,7 +9,7 @@ from experiments.dataset import backgrounds
 from experiments.dataset.landscapes import ENVIRONMENTS, make_environment
 from experiments.dataset.textures.faces import FACES, make_face
 from experiments.dataset.textures.spheres import SPHERES
-from refref_jax.data import background, files
+from refref_jax.data import background, image_files
 from refref_jax.render.backgrounds import CubeBackground, Environment, SphereBackground
 from tests.experiments.command import ROOT
 
@@ -63,7 +63,7 @@ def test_the_same_seed_writes_the_same_bytes(tmp_path, kind):
         if path.suffix == ".png":
             assert path.read_bytes() == again.read_bytes()
         else:
-            np.testing.assert_array_equal(files.read_exr(path), files.read_exr(again))
+            np.testing.assert_array_equal(image_files.read_exr(path), image_files.read_exr(again))
 
 
 def test_other_seeds_draw_others_and_all_are_drawn(monkeypatch, tmp_path):
@@ -89,7 +89,7 @@ def test_a_file_that_is_cut_off_leaves_the_old_one(monkeypatch, tmp_path):
         path.write_bytes(b"half")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(files, "write_exr", cut_off)
+    monkeypatch.setattr(image_files, "write_exr", cut_off)
     with pytest.raises(KeyboardInterrupt):
         _write(tmp_path, "env", seed=1)
     assert path.read_bytes() == whole

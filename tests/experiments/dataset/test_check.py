@@ -7,8 +7,8 @@ import trimesh
 
 from experiments.dataset import checks, scene_check
 from experiments.dataset.check_page import SceneReport, write_page
-from refref_jax.data.findings import Finding
-from refref_jax.optics import budgets
+from refref_jax.data.mesh_checks import Finding
+from refref_jax.optics import path_settings
 from tests.data.small_scenes import truncate
 from tests.experiments.command import run_command
 from tests.experiments.dataset.cut_ball import cut_ball
@@ -73,7 +73,7 @@ def test_findings_are_complaints_unless_they_are_notes():
 
 @pytest.mark.slow
 def test_the_bundled_scene_agrees_with_cycles(copy):
-    report = scene_check.check_scene(copy, budgets.TREE, views=1, side=6)
+    report = scene_check.check_scene(copy, path_settings.TREE, views=1, side=6)
     assert report.complaints == [] and report.notes == [] and len(report.views) == 1
     assert report.views[0].psnr_masked > checks.PSNR_CONVEX
     assert report.views[0].depth_error < 2e-4
@@ -83,21 +83,23 @@ def test_a_preview_has_test_views_only(copy):
     for split in ("train", "val"):
         (copy / f"transforms_{split}.json").unlink()
     assert scene_check.find_scenes(copy.parent, None) == [copy]
-    report = scene_check.check_scene(copy, budgets.TREE, views=0, side=1)
+    report = scene_check.check_scene(copy, path_settings.TREE, views=0, side=1)
     assert report.complaints == [] and report.views == []
     shutil.rmtree(copy / "mask")
-    assert "mask" in scene_check.check_scene(copy, budgets.TREE, views=0, side=1).complaints[0]
+    assert (
+        "mask" in scene_check.check_scene(copy, path_settings.TREE, views=0, side=1).complaints[0]
+    )
 
 
 @pytest.mark.slow
 def test_a_mesh_that_is_not_where_it_was_rendered_is_found(copy):
     path = next((copy / "meshes").iterdir())
     trimesh.load(path).apply_translation([0.0, 0.0, 0.04]).export(path)
-    told = " ".join(scene_check.check_scene(copy, budgets.TREE, views=1, side=3).complaints)
+    told = " ".join(scene_check.check_scene(copy, path_settings.TREE, views=1, side=3).complaints)
     assert "dB masked PSNR" in told and "the mask differs" in told and "depths agree" in told
     for path in (copy / "depth" / "test").glob("*.exr"):
         path.unlink()
-    report = scene_check.check_scene(copy, budgets.PAPER, views=1, side=1)
+    report = scene_check.check_scene(copy, path_settings.PAPER, views=1, side=1)
     assert any("no depth was compared" in note for note in report.notes)
 
 

@@ -16,8 +16,8 @@ from experiments.dataset import (
     scene_contents,
     scene_folders,
 )
-from refref_jax.data import background, local_layout, meshes, scene_source
-from refref_jax.data.local_layout import SPLITS
+from refref_jax.data import background, meshes, scene_folder, scene_source
+from refref_jax.data.scene_folder import SPLITS
 from refref_jax.data.scene_names import parse
 from tests.data.abandoned_folder import AbandonedFolder
 from tests.data.expectations import scene_error
@@ -62,11 +62,11 @@ def _files(folder):
 
 def _assert_same_frames(scene, other, *, float_depth=True):
     for split in SPLITS:
-        ours, theirs = (local_layout.read_frames(each, split) for each in (scene, other))
+        ours, theirs = (scene_folder.read_frames(each, split) for each in (scene, other))
         assert len(ours.names) == COUNTS[split]
         np.testing.assert_array_equal(ours.cameras.poses, theirs.cameras.poses)
         assert ours.cameras[1:] == theirs.cameras[1:]
-        for read in (local_layout.read_images, local_layout.read_masks):
+        for read in (scene_folder.read_images, scene_folder.read_masks):
             np.testing.assert_array_equal(read(ours), read(theirs))
         if not float_depth:
             ours, theirs = (
@@ -74,7 +74,7 @@ def _assert_same_frames(scene, other, *, float_depth=True):
                 for each in (ours, theirs)
             )
         np.testing.assert_array_equal(
-            local_layout.read_distances(ours), local_layout.read_distances(theirs)
+            scene_folder.read_distances(ours), scene_folder.read_distances(theirs)
         )
 
 

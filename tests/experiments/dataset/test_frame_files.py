@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from experiments.dataset import frame_files
-from refref_jax.data import files
+from refref_jax.data import image_files
 from refref_jax.render import colour
 
 
@@ -32,7 +32,7 @@ def test_half_precision_does_not_overflow(tmp_path):
     frame_files.write(tmp_path, "test", 7, rendering, linear=True)
     assert frame_files.is_done(tmp_path, "test", 7, linear=True)
     assert not frame_files.is_done(tmp_path, "test", 8, linear=False)
-    written = files.read_exr(tmp_path / "test" / "r_007.exr")
+    written = image_files.read_exr(tmp_path / "test" / "r_007.exr")
     assert np.all(written == 65504.0)
 
 

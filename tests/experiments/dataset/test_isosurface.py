@@ -5,7 +5,7 @@ import trimesh
 from experiments.dataset.objects import distance_fields as fields
 from experiments.dataset.objects import formed, isosurface
 from experiments.dataset.objects.field_operations import offset, subtraction, union
-from refref_jax.geometry.corner_normals import corner_normals, is_degenerate
+from refref_jax.geometry.triangle_meshes import corner_normals, is_degenerate
 
 _BLEND = union(
     fields.sphere((0, 0, 0), 1.0),

@@ -15,7 +15,7 @@ import pytest
 from experiments.dataset import render_settings
 from experiments.dataset.render_settings import PerSplit
 from experiments.dataset.workers import BlenderError
-from refref_jax.data import background, containment, files, local_layout, meshes
+from refref_jax.data import background, image_files, mesh_queries, meshes, scene_folder
 from tests import code_generator
 from tests.experiments.command import ROOT
 from tests.experiments.dataset import fake_blender, small_dataset
@@ -159,17 +159,17 @@ def test_two_commands_never_work_in_one_folder(tmp_path, blender, monkeypatch):
 
 def test_the_library_reads_what_was_made_and_blender_is_given(made):
     for name in _SCENES:
-        local_layout.check_scene(made / name)
+        scene_folder.check_scene(made / name)
         background.read_background(made / name)
     parts = meshes.read_meshes(made / "env_mmncvx_box_full")
     liquid, shell = parts
     assert (shell.index, liquid.index) == (1.5, 1.333)
     assert liquid.absorption == (0.1, 0.0, 0.2) and shell.shading == "flat"
-    assert containment.find_containment(parts).parents == (1, -1)
+    assert mesh_queries.find_containment(parts).parents == (1, -1)
     assert meshes.read_meshes(made / "cube_smcvx_box")[0].tint == (0.5, 1.0, 0.25)
-    frames = local_layout.read_frames(made / "cube_smcvx_box", "test")
+    frames = scene_folder.read_frames(made / "cube_smcvx_box", "test")
     assert frames.depths[0].suffix == ".exr"
-    assert np.isinf(local_layout.read_distances(frames)[:, 0]).all()
+    assert np.isinf(scene_folder.read_distances(frames)[:, 0]).all()
     record = json.loads((made / "env_mmncvx_box_full" / "scene.json").read_text())
     shell, liquid = record["parts"]
     assert (shell["outside"], liquid["outside"]) == ("air", "glass")
@@ -183,14 +183,14 @@ def test_the_library_reads_what_was_made_and_blender_is_given(made):
 def test_files_hold_the_same_view(made):
     scene = made / "cube_smcvx_box"
     image = iio.imread(scene / "test" / "r_001.png").astype(float) / 255.0
-    linear = files.read_exr(scene / "test" / "r_001.exr")
+    linear = image_files.read_exr(scene / "test" / "r_001.exr")
     decoded = np.where(image > 0.04045, ((image + 0.055) / 1.055) ** 2.4, image / 12.92)
     np.testing.assert_allclose(decoded, linear, atol=0.005)
-    depth = files.read_depth(scene / "depth" / "test" / "r_001.exr")
-    published = files.read_depth(scene / "depth" / "test" / "r_001.png")
+    depth = image_files.read_depth(scene / "depth" / "test" / "r_001.exr")
+    published = image_files.read_depth(scene / "depth" / "test" / "r_001.png")
     np.testing.assert_allclose(published, np.minimum(depth, 11.5), atol=0.0206)
-    mask = files.read_mask(scene / "mask" / "test" / "r_001.png")
-    normal = files.read_exr(scene / "normal" / "test" / "r_001.exr")
+    mask = image_files.read_mask(scene / "mask" / "test" / "r_001.png")
+    normal = image_files.read_exr(scene / "normal" / "test" / "r_001.exr")
     assert np.array_equal(normal.any(axis=-1), mask) and 0 < mask.sum() < mask.size
     assert not (scene / "train" / "r_000.exr").exists()
 
@@ -199,9 +199,9 @@ def test_views_differ_in_pose_and_noise(made):
     poses, images = [], []
     for name in _SCENES:
         for split in ("train", "val"):
-            frames = local_layout.read_frames(made / name, split)
+            frames = scene_folder.read_frames(made / name, split)
             poses.extend(pose.tobytes() for pose in frames.cameras.poses)
-            images.extend(image.tobytes() for image in local_layout.read_images(frames))
+            images.extend(image.tobytes() for image in scene_folder.read_images(frames))
     assert len(set(poses)) == len(set(images)) == len(_SCENES) * 4
 
 
@@ -216,7 +216,7 @@ def test_the_rule_facing_gives_every_part_air_outside(tmp_path, blender):
 def test_a_preview_is_a_test_view_as_it_is_in_the_whole(tmp_path, blender, made):
     assert render_settings.preview_view(small_dataset.SETTINGS.views.test) == 0
     make(tmp_path, blender, preview=True)
-    assert local_layout.read_frames(tmp_path / "env_smcvx_box", "test").names == ("r_000",)
+    assert scene_folder.read_frames(tmp_path / "env_smcvx_box", "test").names == ("r_000",)
     assert not (tmp_path / "env_smcvx_box" / "transforms_train.json").exists()
     image = "env_smcvx_box/test/r_000.png"
     assert _contents(tmp_path)[image] == _contents(made)[image]

@@ -25,15 +25,15 @@ from experiments.dataset.objects.formed import spacing
 from experiments.dataset.objects.isosurface import Surface
 from experiments.dataset.parts import RADIUS
 from refref_jax.choices import CLEAR, NO_ABSORPTION
-from refref_jax.data.containment import (
+from refref_jax.data.mesh_checks import lint
+from refref_jax.data.mesh_queries import (
     Containment,
     beside_faces,
     find_containment,
+    is_convex,
     winding_number,
 )
-from refref_jax.data.convexity import is_convex
-from refref_jax.data.lint import lint
-from refref_jax.geometry.corner_normals import face_normals
+from refref_jax.geometry.triangle_meshes import face_normals
 from refref_jax.optics.interface_rules import NO_PARENT
 
 _OBJECTS = catalogue.OBJECTS

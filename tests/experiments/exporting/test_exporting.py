@@ -9,10 +9,10 @@ import pytest
 import trimesh
 
 from experiments.exporting import field_mesh, object_meshes
-from refref_jax.data import meshes, stored_normals
+from refref_jax.data import meshes
 from refref_jax.fields import registry
-from refref_jax.fields.kinds import Radiance, RadianceConfig
-from refref_jax.optics.budgets import PAPER
+from refref_jax.fields.base import Radiance, RadianceConfig
+from refref_jax.optics.path_settings import PAPER
 from refref_jax.reconstruct.grids import Grid
 from refref_jax.render.model import Model, Params
 from tests import scenes, small_model
@@ -186,7 +186,7 @@ def test_a_run_s_bodies_are_files_that_are_read_again(tmp_path, monkeypatch):
     written = object_meshes.write(tmp_path, tmp_path / "new" / "body.ply", overwrite=False)
     assert [path.name for path in written] == ["body_0.ply", "body_1.ply"]
     part = meshes.read_part(written[1], index=1.5)
-    np.testing.assert_array_equal(part.normals, stored_normals.read_normals(written[1]))
+    np.testing.assert_array_equal(part.normals, meshes.read_normals(written[1]))
     assert len(part.faces) == 320
     with pytest.raises(ValueError, match=r"body_0\.ply exists.* --overwrite"):
         object_meshes.write(tmp_path, tmp_path / "new" / "body.ply", overwrite=False)

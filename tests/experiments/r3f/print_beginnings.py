@@ -15,7 +15,7 @@ from absl import flags
 
 from experiments import train
 from experiments.r3f import object_source
-from refref_jax.render import saved
+from refref_jax.render import checkpoint_io
 from refref_jax.training import fit, run_folder
 
 
@@ -33,7 +33,7 @@ def _begin(options):
             train._train(run, train.check_flags())
     except (ValueError, flags.Error) as error:
         return {"error": str(error)}
-    geometry = saved.load_geometry(run)
+    geometry = checkpoint_io.load_geometry(run)
     body = object_source.read(run)
     return {
         "error": None,

@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 
-from refref_jax.data import file_names, files
-from refref_jax.data.stored_normals import write_mesh
+from refref_jax.data import image_files, scene_folder
+from refref_jax.data.meshes import write_mesh
 from tests.data.small_scenes import write_grey
 from tests.reconstruct import bodies
 
@@ -19,17 +19,17 @@ def write_scene(scene, *, views=24, size=40, meshes=True):
         masks = bodies.masks_of(lambda points: bodies.ball(points, radius=RADIUS), cameras)
         frames = []
         for i, (mask, pose) in enumerate(zip(masks, cameras.poses, strict=True)):
-            names = file_names.plain(split, i)
+            names = scene_folder.plain(split, i)
             (scene / names.image).parent.mkdir(parents=True, exist_ok=True)
             shade = np.linspace(0.2, 0.9, size)[:, None, None] * [1.0, 0.5 + 0.01 * i, 0.7]
-            files.write_rgb(
+            image_files.write_rgb(
                 scene / f"{names.image}.png", np.where(mask[..., None], 0.5 * shade, shade)
             )
             write_grey(scene / names.mask, 255 * mask)
             whole = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]]).tolist()
-            frames.append(file_names.frame_record(names, whole, masked=True, deep=False))
+            frames.append(scene_folder.frame_record(names, whole, masked=True, deep=False))
         content = {"camera_angle_x": bodies.ANGLE, "frames": frames}
-        file_names.write_transforms(scene, split, content)
+        scene_folder.write_transforms(scene, split, content)
     if meshes:
         (scene / "meshes").mkdir()
         write_mesh(scene / "meshes" / "ball_glass.ply", *bodies.icosphere(3, radius=RADIUS))

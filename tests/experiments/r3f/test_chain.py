@@ -21,11 +21,11 @@ from experiments.r3f import (
     report,
 )
 from experiments.r3f.records import ReconstructionConfig
-from refref_jax.data import local_layout, stored_normals
-from refref_jax.geometry.corner_normals import corner_normals
-from refref_jax.reconstruct.comparison import compare_meshes
-from refref_jax.reconstruct.index_search import Descent, IndexEstimate
+from refref_jax.data import meshes, scene_folder
+from refref_jax.geometry.triangle_meshes import corner_normals
 from refref_jax.reconstruct.light_refinement import Refined
+from refref_jax.reconstruct.mesh_distance import compare_meshes
+from refref_jax.reconstruct.refractive_index import Descent, IndexEstimate
 from tests.experiments.r3f.small_scene import RADIUS, without_masks, write_scene
 from tests.reconstruct import bodies
 
@@ -83,13 +83,13 @@ def test_the_surface_in_the_file_is_what_light_is_traced_through(
     whole, monkeypatch, scene, tmp_path
 ):
     written = []
-    write = stored_normals.write_mesh
+    write = meshes.write_mesh
 
     def keep(path, *mesh):
         written.append(mesh)
         write(path, *mesh)
 
-    monkeypatch.setattr(stored_normals, "write_mesh", keep)
+    monkeypatch.setattr(meshes, "write_mesh", keep)
     geometry_stage.run(scene, tmp_path, _CONFIG)
     (vertices, faces, normals), body = written[0], chain.read_part(whole)
     np.testing.assert_array_equal(body.vertices[body.faces], vertices[faces])
@@ -155,7 +155,7 @@ def _killing(function, *, after=False, calls=1):
     ("target", "options"),
     [
         ("experiments.r3f.geometry_stage.refine", {}),
-        ("refref_jax.data.stored_normals.write_mesh", {"after": True}),  # before the renaming
+        ("refref_jax.data.meshes.write_mesh", {"after": True}),  # before the renaming
         ("experiments.r3f.geometry_stage.run", {"after": True}),  # renamed, not recorded
         ("experiments.r3f.records.write", {"calls": 2, "after": True}),  # between two stages
         ("experiments.r3f.report_figures.draw_surface", {"after": True}),
@@ -361,7 +361,7 @@ def test_a_folder_that_was_killed_while_it_was_opened_is_taken(scene, tmp_path):
 @pytest.mark.parametrize("outliers", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_wrong_mask_is_named_unless_one_may_be_wrong(scene, tmp_path, outliers):
     spoilt = shutil.copytree(scene, tmp_path / scene.name)
-    wrong = local_layout.read_frames(spoilt, "train").masks[5]
+    wrong = scene_folder.read_frames(spoilt, "train").masks[5]
     half = iio.imread(wrong)
     half[:, :20] = 0
     iio.imwrite(wrong, half)
@@ -379,7 +379,7 @@ def test_a_wrong_mask_is_named_unless_one_may_be_wrong(scene, tmp_path, outliers
 
 def test_where_a_mask_removes_the_body_its_file_is_named(scene, tmp_path):
     spoilt = shutil.copytree(scene, tmp_path / scene.name)
-    wrong = local_layout.read_frames(spoilt, "train").masks[5]
+    wrong = scene_folder.read_frames(spoilt, "train").masks[5]
     corner = np.zeros((40, 40), np.uint8)
     corner[:3, :3] = 255
     iio.imwrite(wrong, corner)
@@ -389,7 +389,7 @@ def test_where_a_mask_removes_the_body_its_file_is_named(scene, tmp_path):
 
 def test_masks_without_an_inside_are_refused(scene, tmp_path):
     thin = shutil.copytree(scene, tmp_path / scene.name)
-    for path in local_layout.read_frames(thin, "train").masks:
+    for path in scene_folder.read_frames(thin, "train").masks:
         lone = np.zeros((40, 40), np.uint8)
         lone[20, 20] = 255
         iio.imwrite(path, lone)

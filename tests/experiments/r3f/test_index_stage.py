@@ -7,8 +7,8 @@ import pytest
 
 from experiments.r3f import index_stage
 from refref_jax.data import meshes
-from refref_jax.data.geometry import shaded_mesh
-from refref_jax.reconstruct.index_search import IndexSearch
+from refref_jax.data.scene_assembly import shaded_mesh
+from refref_jax.reconstruct.refractive_index import IndexSearch
 from refref_jax.training import fit, run_folder
 
 

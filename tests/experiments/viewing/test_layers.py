@@ -10,11 +10,11 @@ import pytest
 from experiments.figures import comparison
 from experiments.viewer import layers, session
 from experiments.viewer.session import Subject
-from refref_jax.data import files
-from refref_jax.data.local_layout import read_frames
+from refref_jax.data import image_files
+from refref_jax.data.scene_folder import read_frames
 from refref_jax.geometry.cameras import image_rays
-from refref_jax.optics.budgets import PAPER, STRAIGHT
 from refref_jax.optics.interface_rules import RULES
+from refref_jax.optics.path_settings import PAPER, STRAIGHT
 from refref_jax.render import Model, images, init_params, render_image
 from tests import scenes
 from tests.small_model import CAMERAS, MODEL
@@ -75,7 +75,7 @@ def test_another_index_is_another_picture_of_the_same_programs(model):
     assert [program._cache_size() for program in programs] == compiled
     thin = render_image(other, _RAYS, branch="reflected").linear.mean()
     thick = render_image(model, _RAYS, branch="reflected").linear.mean()
-    assert thin < 0.5 * thick and np.any(files.to_bytes(after.rgb) != before)
+    assert thin < 0.5 * thick and np.any(image_files.to_bytes(after.rgb) != before)
 
 
 def test_the_mask_is_the_disc_of_the_ball_and_distances_have_one_scale(model):
@@ -131,14 +131,14 @@ def test_bands_are_joined_in_order(model, monkeypatch):
         lambda model, rays, **_: _blank()._replace(rgb=0.5 + 0.5 * rays.directions),
     )
     drawn = layers.draw(model, layers.RGB, _RAYS, **_OPTIONS)
-    np.testing.assert_array_equal(drawn, files.to_bytes(0.5 + 0.5 * _RAYS.directions))
+    np.testing.assert_array_equal(drawn, image_files.to_bytes(0.5 + 0.5 * _RAYS.directions))
 
 
 def test_an_error_is_that_of_the_pixels_that_are_drawn(model, ball_scene, monkeypatch):
     frames = read_frames(ball_scene, "test")
     pixels = layers.view_pixels(frames, 2, 128 * 128 // 4)
     assert pixels.target.shape == (64, 64, 3)
-    true = files.read_rgb(frames.images[2]) / 255.0
+    true = image_files.read_rgb(frames.images[2]) / 255.0
     np.testing.assert_allclose(pixels.target, true[1::2, 1::2], atol=1e-6)
     every = layers.view_pixels(frames, 2, 10**6)
     np.testing.assert_array_equal(every.rays.directions, image_rays(frames.cameras, 2).directions)

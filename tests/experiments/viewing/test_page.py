@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from experiments.viewer import session
-from refref_jax.data import local_layout
-from refref_jax.optics.budgets import TREE
+from refref_jax.data import scene_folder
+from refref_jax.optics.path_settings import TREE
 from refref_jax.render import Model, images, init_params
 from tests import scenes
 from tests.small_model import MODEL
@@ -35,7 +35,7 @@ def subject(ball_scene, monkeypatch):
     budget = dataclasses.replace(TREE, bends=4, reentry="impossible")
     config = dataclasses.replace(MODEL, interior="clear")
     model = Model(config, budget, scenes.geometry(scenes.ball(1.4, subdivisions=3)), params)
-    frames = local_layout.read_frames(ball_scene, "test")
+    frames = scene_folder.read_frames(ball_scene, "test")
     return session.Subject("made", model, "nested", frames, ("ball_glass",), (18, 36), 1024)
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from experiments.viewer import layers, session
 from experiments.viewer.session import Subject
-from refref_jax.data import local_layout
-from refref_jax.optics.budgets import STRAIGHT, TREE, capacity_factors
+from refref_jax.data import scene_folder
+from refref_jax.optics.path_settings import STRAIGHT, TREE, capacity_factors
 from refref_jax.render import Model, init_params
 from tests import scenes
 from tests.experiments.command import ROOT, run_command
@@ -99,7 +99,7 @@ def test_parts_have_the_names_of_their_meshes_where_these_are_known(ball_scene):
 
 
 def test_a_page_begins_at_the_first_test_view_or_beside_the_origin(ball_scene):
-    frames = local_layout.read_frames(ball_scene, "test")
+    frames = scene_folder.read_frames(ball_scene, "test")
     view = session.first_viewpoint(_subject(frames=frames))
     np.testing.assert_array_equal(view.pose, frames.cameras.poses[0])
     alone = session.first_viewpoint(_subject()).pose

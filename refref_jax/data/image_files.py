@@ -1,0 +1,165 @@
+"""Reads and writes images, masks and depth maps (NumPy only).
+
+Every reader raises a `SceneError` that names the file and says what to do.
+"""
+
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import OpenEXR
+from jaxtyping import Bool, Float, UInt8
+
+from refref_jax.data import SceneError
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+# The 8-bit depth maps of the data set: white is 1 world unit, black 11.5 or more.
+_NEAREST_DEPTH = 1.0
+_DEPTH_RANGE = 10.5
+
+# Renderers write 1e4 or more where a ray meets nothing.
+_DEPTH_OF_A_MISS = 1e4
+
+
+def read_rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+    """Reads an 8-bit image as sRGB; transparency goes over white, grey becomes colour."""
+    pixels = _read_png(path)
+    if pixels.ndim == 2:
+        return np.repeat(pixels[..., None], 3, axis=-1)
+    if pixels.shape[-1] == 3:
+        return pixels
+    if pixels.shape[-1] == 2:
+        pixels = np.concatenate([np.repeat(pixels[..., :1], 3, axis=-1), pixels[..., 1:]], -1)
+    alpha = pixels[..., 3:] / 255.0
+    return np.round(pixels[..., :3] * alpha + 255.0 * (1.0 - alpha)).astype(np.uint8)
+
+
+def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
+    """Reads a mask: any nonzero value is object."""
+    pixels = _read_png(path)
+    if pixels.ndim == 3 and pixels.shape[-1] in (2, 4):
+        pixels = pixels[..., :-1]
+    return pixels != 0 if pixels.ndim == 2 else np.any(pixels != 0, axis=-1)
+
+
+def read_depth(path: Path) -> Float[np.ndarray, "h w"]:
+    """Reads a map of planar depth in world units, `inf` where a float map has a miss.
+
+    Two formats: a float EXR with one channel, and an 8-bit image of inverted depth,
+    `z = 1 + 10.5 (1 - v / 255)`, which saturates at 11.5.
+    """
+    if path.suffix == ".exr":
+        depth = read_exr(path)
+        if depth.ndim != 2:
+            raise SceneError(
+                f"{path} has {depth.shape[-1]} channels, but a depth map has one. Export the Z "
+                "pass alone."
+            )
+        if np.any(np.isnan(depth)):
+            raise SceneError(f"{path} has a depth that is not a number. Export it again.")
+        return np.where(depth >= _DEPTH_OF_A_MISS, np.inf, depth).astype(np.float32)
+    pixels = _read_png(path)
+    grey = pixels if pixels.ndim == 2 else pixels[..., 0]
+    return (_NEAREST_DEPTH + _DEPTH_RANGE * (1.0 - grey / 255.0)).astype(np.float32)
+
+
+def read_size(path: Path) -> tuple[int, int]:
+    """Returns height and width of an image or EXR in pixels, without reading its pixels."""
+    _require(path)
+    if path.suffix != ".exr":
+        try:
+            return iio.improps(path, plugin="pillow").shape[:2]
+        except Exception as error:  # as in `_read_png`
+            raise _unreadable_image(path, error) from error
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            low, high = file.header()["dataWindow"]
+    except Exception as error:  # as in `read_exr`
+        raise _unreadable_exr(path, error) from error
+    width, height = high - low + 1
+    return int(height), int(width)
+
+
+def read_exr(path: Path) -> Float[np.ndarray, "h w *channels"]:
+    """Reads the first part of an EXR: `[h, w]` for one channel, `[h, w, 3]` for RGB."""
+    _require(path)
+    try:
+        with OpenEXR.File(str(path)) as file:
+            channels = {name: channel.pixels for name, channel in file.channels().items()}
+    except Exception as error:  # OpenEXR raises what its C++ core does
+        raise _unreadable_exr(path, error) from error
+    if set(channels) == {"RGB"}:
+        return channels["RGB"].astype(np.float32)
+    if len(channels) == 1 and next(iter(channels.values())).ndim == 2:
+        return next(iter(channels.values())).astype(np.float32)
+    raise SceneError(
+        f"{path} has the channels {sorted(channels)}. Export one channel, or R, G and B."
+    )
+
+
+def write_exr(path: Path, pixels: Float[np.ndarray, "h w *channels"]) -> None:
+    """Writes a float EXR: one channel `Z` for `[h, w]`, `RGB` for `[h, w, 3]`."""
+    name = "Z" if pixels.ndim == 2 else "RGB"
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {name: np.ascontiguousarray(pixels, np.float32)}) as file:
+        file.write(str(path))
+
+
+def write_rgb(path: str | Path, pixels: Float[np.ndarray, "h w 3"]) -> None:
+    """Writes an sRGB image in `[0, 1]` as 8-bit PNG; values outside are clipped."""
+    write_png(path, to_bytes(pixels))
+
+
+def write_mask(path: Path, mask: Bool[np.ndarray, "h w"]) -> None:
+    """Writes a mask as 8-bit PNG: white where it is true, black elsewhere."""
+    write_png(path, np.where(mask, 255, 0).astype(np.uint8))
+
+
+def write_png(path: str | Path, pixels: UInt8[np.ndarray, "h w *channels"]) -> None:
+    """Writes an 8-bit image as it is."""
+    iio.imwrite(path, pixels, plugin="pillow", extension=".png")
+
+
+def to_bytes(pixels: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """Quantises `[0, 1]` to 8 bits, rounding to the nearest."""
+    return np.round(np.clip(pixels, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def _read_png(path: Path) -> UInt8[np.ndarray, "h w *channels"]:
+    _require(path)
+    try:
+        pixels = iio.imread(path, plugin="pillow")
+    except Exception as error:  # Pillow raises OSError, SyntaxError and its own
+        raise _unreadable_image(path, error) from error
+    if pixels.dtype == bool:
+        pixels = pixels.astype(np.uint8) * 255
+    if pixels.dtype != np.uint8 or _has_sixteen_bits(path):
+        raise SceneError(
+            f"{path} has more than 8 bits a channel. Convert it to an 8-bit PNG: no more would be "
+            "used."
+        )
+    return pixels
+
+
+def _unreadable_image(path: Path, error: Exception) -> SceneError:
+    return SceneError(
+        f"{path} can not be read as an image ({error}). It may be truncated: copy or render it "
+        "again."
+    )
+
+
+def _unreadable_exr(path: Path, error: Exception) -> SceneError:
+    return SceneError(f"{path} can not be read as EXR ({error}). Export it again.")
+
+
+def _has_sixteen_bits(path: Path) -> bool:
+    """Returns whether a PNG's header says so; Pillow halves colours without a word."""
+    with path.open("rb") as file:
+        header = file.read(25)
+    return header.startswith(_PNG_SIGNATURE) and header[24] == 16
+
+
+def _require(path: Path) -> None:
+    if not path.is_file():
+        raise SceneError(f"{path} does not exist. Check the scene folder, or copy it again.")

@@ -1,0 +1,438 @@
+"""Checks the meshes of a scene and advises an interface rule (NumPy only).
+
+What an examination of a scene's meshes has found.
+
+Examines how the parts of a scene lie to each other (NumPy only).
+
+A liquid in its glass has one surface in common with it. Modelled as two surfaces, they coincide
+(light meets them in either order), leave a gap (light is reflected totally at a layer of air that
+is not there) or overlap (right under the rule `priority` alone).
+
+Examines the meshes of a scene before anything is traced (NumPy only).
+
+Each part by itself; `lint_pairs` looks at how parts lie to each other, and `rule_advice` says
+which interface rule that asks for.
+
+Says which interface rule the parts of a scene ask for (NumPy only).
+
+The rules are those of `optics.interface_rules`.
+"""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from refref_jax.choices import RuleName
+from refref_jax.data import SceneError
+from refref_jax.data.mesh_queries import (
+    Containment,
+    SampledSurface,
+    Walls,
+    beside_faces,
+    diagonal,
+    sample_surface,
+    walls_between,
+    winding_number,
+)
+from refref_jax.data.meshes import MeshPart
+from refref_jax.geometry.triangle_meshes import is_degenerate
+from refref_jax.optics.interface_rules import NO_PARENT
+from refref_jax.optics.media import INDEX_OF_AIR
+
+
+class Finding(NamedTuple):
+    """Something about a mesh that a user should know.
+
+    Attributes:
+      severity: an `error` makes light paths wrong; a `warning` may; a `note` does not.
+      part: name of the part.
+      message: what it is, and what to do.
+    """
+
+    severity: Literal["error", "warning", "note"]
+    part: str
+    message: str
+
+    def __str__(self) -> str:
+        return f"{self.severity}: {self.part}: {self.message}"
+
+
+def refuse_errors(findings: Sequence[Finding]) -> None:
+    """Stops at meshes whose light paths would be wrong.
+
+    Raises:
+      SceneError: if there is an error among the findings; it tells all of them.
+    """
+    errors = [finding for finding in findings if finding.severity == "error"]
+    if errors:
+        told = "\n".join(f"  {finding.part}: {finding.message}" for finding in errors)
+        raise SceneError(f"the meshes must be mended first.\n{told}")
+
+
+# As shares of the smaller part's diagonal: walls closer than the first coincide, for the tracer may
+# not tell them apart; walls farther apart than the second are meant to be.
+_COINCIDENT = 1e-4
+_THIN = 0.02
+
+# Smallest shares of a surface that are told. Two round bodies come close at a point, too.
+_COINCIDENT_SHARE = 0.01
+_THIN_SHARE = 0.1
+
+# Least cosine between walls, and between a wall and the way to the next, that run side by side.
+_PARALLEL = 0.7
+
+_REMEDY = (
+    "let them overlap a little and use the rule 'priority', or model the wall between them as one "
+    "interface."
+)
+
+
+class _Patch(NamedTuple):
+    """Where two surfaces run side by side.
+
+    Attributes:
+      part: the part that has more of its area there.
+      share: how much of its area.
+      distance: median distance of the surfaces, in world units.
+    """
+
+    part: int
+    share: float
+    distance: float
+
+
+def lint_pairs(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
+    """Reports parts that lie inside, cut, coincide with or nearly touch others."""
+    findings = [
+        Finding("note", parts[inner].name, f"lies inside {parts[outer].name}.")
+        for inner, outer in enumerate(containment.parents)
+        if outer != NO_PARENT
+    ]
+    surfaces = [sample_surface(part) for part in parts]
+    for one, other in itertools.combinations(range(len(parts)), 2):
+        findings += _lint_pair(parts, containment, surfaces, (one, other))
+    return findings
+
+
+def _lint_pair(
+    parts: Sequence[MeshPart],
+    containment: Containment,
+    surfaces: Sequence[SampledSurface],
+    pair: tuple[int, int],
+) -> list[Finding]:
+    size = diagonal([parts[part] for part in pair])
+    sides = []
+    if _box_distance(parts, pair) <= _THIN * size:
+        sides = [
+            (a, b, walls_between(surfaces[a], surfaces[b]))
+            for a, b in (pair, pair[::-1])
+            if len(surfaces[a].points) and len(surfaces[b].points)
+        ]
+    coincident = [_patch(a, walls, _coincide(walls, size)) for a, b, walls in sides]
+    layers = [
+        _patch(a, walls, _thin_layer(parts, containment.parents, (a, b), walls, size))
+        for a, b, walls in sides
+    ]
+    findings = []
+    if found := _largest(coincident, _COINCIDENT_SHARE):
+        findings.append(_coincidence(parts, pair, found, size))
+    elif pair in containment.overlaps:
+        findings.append(_cut(parts, pair))
+    if found := _largest(layers, _THIN_SHARE):
+        findings.append(_gap(parts, pair, found))
+    return findings
+
+
+def _coincide(walls: Walls, size: float) -> Bool[np.ndarray, " samples"]:
+    return (walls.distances <= _COINCIDENT * size) & (np.abs(walls.alignment) > _PARALLEL)
+
+
+def _thin_layer(
+    parts: Sequence[MeshPart],
+    parents: Sequence[int],
+    pair: tuple[int, int],
+    walls: Walls,
+    size: float,
+) -> Bool[np.ndarray, " samples"]:
+    """Returns where a thin layer of lower index than both of its sides lies before a part.
+
+    Light that would go on if the sides touched is reflected totally there. A layer of higher
+    index is a wall, as of glass around a liquid, and bends light as it should.
+    """
+    part, other = pair
+    thin = (walls.distances > _COINCIDENT * size) & (walls.distances <= _THIN * size)
+    ahead = thin & (walls.ahead > _PARALLEL)
+    near = parts[part].index
+    # Between two bodies that face each other is what surrounds both; between a body and the one
+    # around it is the latter's medium, with what surrounds that on the other side.
+    apart = np.zeros_like(ahead)
+    if parents[part] == parents[other] and _index(parts, parents[part]) < min(
+        near, parts[other].index
+    ):
+        apart = ahead & (walls.alignment < -_PARALLEL)
+    beyond = _index(parts, parents[other])
+    if parents[part] == other and parts[other].index < min(near, beyond):
+        return apart | (ahead & (walls.alignment > _PARALLEL))
+    return apart
+
+
+def _index(parts: Sequence[MeshPart], part: int) -> float:
+    return INDEX_OF_AIR if part == NO_PARENT else parts[part].index
+
+
+def _box_distance(parts: Sequence[MeshPart], pair: tuple[int, int]) -> float:
+    """Returns how far the bounding boxes of two parts are from each other."""
+    lows = [parts[part].vertices.min(axis=0) for part in pair]
+    highs = [parts[part].vertices.max(axis=0) for part in pair]
+    return float(np.linalg.norm(np.maximum(np.max(lows, axis=0) - np.min(highs, axis=0), 0.0)))
+
+
+def _patch(part: int, walls: Walls, there: Bool[np.ndarray, " samples"]) -> _Patch:
+    # Samples stand for equal areas.
+    distance = float(np.median(walls.distances[there])) if there.any() else 0.0
+    return _Patch(part, float(np.mean(there)), distance)
+
+
+def _largest(patches: Sequence[_Patch], share: float) -> _Patch | None:
+    """Returns the patch of the largest share, if it reaches the given one."""
+    found = max(patches, key=lambda patch: patch.share, default=None)
+    return found if found is not None and found.share >= share else None
+
+
+def _coincidence(
+    parts: Sequence[MeshPart], pair: tuple[int, int], patch: _Patch, size: float
+) -> Finding:
+    [other] = set(pair) - {patch.part}
+    return Finding(
+        "warning",
+        parts[patch.part].name,
+        f"coincides with {parts[other].name} over {patch.share:.0%} of its surface, to within "
+        f"{_COINCIDENT * size:.1g}: light would meet the two walls in either order. If they "
+        f"belong together, {_REMEDY}",
+    )
+
+
+def _cut(parts: Sequence[MeshPart], pair: tuple[int, int]) -> Finding:
+    return Finding(
+        "warning",
+        parts[pair[0]].name,
+        f"cuts or touches {parts[pair[1]].name}. The rules 'nested' and 'facing' ask for bodies "
+        "that are apart or strictly inside one another: use the rule 'priority', or model the "
+        "surface between them as one interface.",
+    )
+
+
+def _gap(parts: Sequence[MeshPart], pair: tuple[int, int], patch: _Patch) -> Finding:
+    [other] = set(pair) - {patch.part}
+    return Finding(
+        "warning",
+        parts[patch.part].name,
+        f"is separated from {parts[other].name} by a gap of {patch.distance:.2g} over "
+        f"{patch.share:.0%} of its surface, where light is reflected totally. If they should "
+        f"touch, {_REMEDY}",
+    )
+
+
+# -1 in front of an inverted closed piece; a lone open sheet gives -1/2.
+_WOUND_BACKWARDS = -0.75
+
+
+def lint(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
+    """Reports on every part (closed, outward, without waste), and on how they lie to each other."""
+    findings = []
+    for part in parts:
+        findings += _edges(part)
+        findings += _faces(part)
+        findings += _bodies(part)
+    return findings + lint_pairs(parts, containment)
+
+
+def _bodies(part: MeshPart) -> list[Finding]:
+    """Reports pieces whose faces point inwards; those of a cavity do so rightly."""
+    faces = _largest_faces(part)
+    # In front of an inverted piece the surface winds around the other way; in a cavity not at all.
+    winding = winding_number(part, beside_faces(part, faces, 1.0))
+    inverted = int(np.sum(winding < _WOUND_BACKWARDS))
+    if not inverted:
+        return []
+    return [
+        Finding(
+            "error",
+            part.name,
+            f"the faces of {inverted} of its {len(faces)} pieces point inwards, so inside and "
+            "outside are exchanged. Flip those faces and export it again.",
+        )
+    ]
+
+
+def _largest_faces(part: MeshPart) -> Int[np.ndarray, " pieces"]:
+    """Returns the largest face of each connected piece."""
+    first, second = part.faces[:, [0, 1, 0]].ravel(), part.faces[:, [1, 2, 2]].ravel()
+    count = len(part.vertices)
+    graph = coo_array((np.ones(first.size, bool), (first, second)), shape=(count, count))
+    pieces = connected_components(graph, directed=False)[1][part.faces[:, 0]]
+    a, b, c = np.moveaxis(part.vertices[part.faces], 1, 0)
+    by_area = np.argsort(np.linalg.norm(np.cross(b - a, c - a), axis=-1), kind="stable")
+    return np.array(list(dict(zip(pieces[by_area], by_area, strict=True)).values()), np.int64)
+
+
+def _edges(part: MeshPart) -> list[Finding]:
+    """Reports edges that a closed, consistently oriented surface does not have."""
+    directed = part.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    directed = directed[directed[:, 0] != directed[:, 1]]
+    _, inverse, uses = np.unique(
+        np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    findings = []
+    if open_edges := int(np.sum(uses % 2)):
+        findings.append(
+            Finding(
+                "warning",
+                part.name,
+                f"is not watertight: {open_edges} edges are open. Light that slips through loses "
+                "track of its medium; close the holes.",
+            )
+        )
+    forward = np.where(directed[:, 0] < directed[:, 1], 1, -1)
+    balance = np.bincount(inverse.reshape(-1), forward)
+    if unbalanced := int(np.sum((balance != 0) & (uses % 2 == 0))):
+        findings.append(
+            Finding(
+                "error",
+                part.name,
+                f"is not oriented consistently: faces disagree across {unbalanced} edges. "
+                "Recalculate its normals to the outside.",
+            )
+        )
+    return findings
+
+
+def _faces(part: MeshPart) -> list[Finding]:
+    """Reports faces that carry no surface, or carry it twice."""
+    findings = []
+    if degenerate := int(np.sum(is_degenerate(part.vertices[part.faces]))):
+        findings.append(
+            Finding("note", part.name, f"has {degenerate} degenerate faces, which are ignored.")
+        )
+    duplicates = len(part.faces) - len(np.unique(np.sort(part.faces, axis=1), axis=0))
+    if duplicates:
+        findings.append(
+            Finding(
+                "error",
+                part.name,
+                f"has {duplicates} duplicate faces: light would cross the surface twice at one "
+                "point. Remove them.",
+            )
+        )
+    return findings
+
+
+# Parts that an explanation names before it only counts.
+_NAMED = 3
+
+
+class Advice(NamedTuple):
+    """Which rule is right for a scene.
+
+    Attributes:
+      rule: the interface rule.
+      reason: why, and what to heed.
+    """
+
+    rule: RuleName
+    reason: str
+
+    def __str__(self) -> str:
+        return f"advice: rule {self.rule}: {self.reason}"
+
+
+def advise(parts: Sequence[MeshPart], containment: Containment) -> Advice:
+    """Returns the rule that is physical for parts that lie as they do."""
+    nested = [
+        f"{parts[inner].name} in {parts[outer].name}"
+        for inner, outer in enumerate(containment.parents)
+        if outer != NO_PARENT
+    ]
+    overlaps = [f"{parts[a].name} and {parts[b].name}" for a, b in containment.overlaps]
+    if overlaps:
+        return Advice(
+            "priority",
+            f"{_listed(overlaps)} overlap or touch. Give the parts a 'priority' in scene.json: the "
+            "highest wins, so a container is above the liquid that overlaps its wall, and a body "
+            "above the one that it is inside of.",
+        )
+    if nested:
+        return Advice(
+            "nested",
+            f"parts lie strictly inside one another ({_listed(nested)}). Use 'facing' for images "
+            "of a renderer that takes every index relative to air alone.",
+        )
+    lone = "there is one part" if len(parts) == 1 else f"all {len(parts)} parts lie apart"
+    return Advice("nested", f"{lone}, so 'nested', 'facing' and 'priority' are the same.")
+
+
+def check_meshes(parts: Sequence[MeshPart], tree: Containment, *, rule: str) -> tuple[str, ...]:
+    """Returns which rule the meshes need, and what a lint finds in them.
+
+    Raises:
+      SceneError: if some of it must be mended first.
+    """
+    findings = lint(parts, tree)
+    if rule == "priority":
+        findings += examine_priorities(parts, tree)
+    advice = "note: there are no meshes, so all light goes straight."
+    if parts:
+        advice = advise(parts, tree)
+    refuse_errors(findings)
+    return str(advice), *map(str, findings)
+
+
+def examine_priorities(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
+    """Reports priorities that make a part vanish, or leave an overlap to chance.
+
+    For scenes that are to be traced under the rule `priority`.
+    """
+    findings = []
+    for inner in range(len(parts)):
+        for outer in _around(containment.parents, inner):
+            if parts[inner].priority <= parts[outer].priority:
+                findings.append(_hidden(parts[inner], parts[outer]))
+    for one, other in containment.overlaps:
+        if parts[one].priority == parts[other].priority:
+            findings.append(_tie(parts[one], parts[other]))
+    return findings
+
+
+def _around(parents: Sequence[int], part: int) -> Iterator[int]:
+    """Yields all parts that contain one, from the inside outwards."""
+    while (part := parents[part]) != NO_PARENT:
+        yield part
+
+
+def _hidden(inner: MeshPart, outer: MeshPart) -> Finding:
+    return Finding(
+        "warning",
+        inner.name,
+        f"lies inside {outer.name} without a higher priority ({inner.priority} and "
+        f"{outer.priority}), so under the rule 'priority' it may not be seen. Give it the higher "
+        "number, or use the rule 'nested'.",
+    )
+
+
+def _tie(first: MeshPart, second: MeshPart) -> Finding:
+    return Finding(
+        "warning",
+        first.name,
+        f"has the same priority as {second.name} ({first.priority}), which it overlaps: it wins "
+        "because its name comes first. Give the two different numbers in scene.json.",
+    )
+
+
+def _listed(things: Sequence[str]) -> str:
+    more = len(things) - _NAMED
+    return "; ".join(things[:_NAMED]) + (f"; and {more} more" if more > 0 else "")

@@ -1,0 +1,388 @@
+"""Converts between nerfstudio captures and scene folders (NumPy only).
+
+Cuts images so that the principal point of all is their middle (NumPy only).
+
+Cameras of a scene share a focal length and a centred principal point. An image whose principal
+point lies elsewhere is cut along its borders; what is left of the shift is below half a pixel, and
+nothing is interpolated.
+
+Moves and scales the world that cameras stand in (NumPy only).
+
+Makes a scene in our layout of a capture in nerfstudio's (NumPy only).
+
+What our cameras can not be is refused, or brought about without interpolation: images are cut so
+that the principal point is their middle, and cameras whose focal lengths differ by less than shows
+in the pictures share their mean.
+
+Writes a scene of ours for nerfstudio (NumPy only).
+"""
+
+import math
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from refref_jax import atomic_files
+from refref_jax.data import SceneError, image_files, scene_folder
+from refref_jax.data.nerfstudio import capture as nerfstudio
+from refref_jax.data.nerfstudio.capture import CaptureFrame
+from refref_jax.data.scene_folder import Frames
+
+
+class Windows(NamedTuple):
+    """What is kept of each image of a split, along one axis.
+
+    Attributes:
+      starts: first pixel of each image's window.
+      size: of all windows, pixels.
+      shift: how far the principal point may be from the windows' middle, pixels.
+    """
+
+    starts: Int[np.ndarray, " images"]
+    size: int
+    shift: float
+
+
+def centred_windows(centres: Float[np.ndarray, " images"], size: int) -> Windows:
+    """Returns the largest windows of one size that have the principal points in their middle.
+
+    Of the largest even and the largest odd size the one with the smaller shift is taken, and the
+    larger one if they are equal.
+
+    Args:
+      centres: principal points along the axis, pixels from the border, within the images.
+      size: of the images, pixels.
+    """
+    found: list[Windows] = []
+    for kept in range(size, 0, -1):
+        starts = np.rint(centres - 0.5 * kept).astype(np.int64)
+        if np.all((starts >= 0) & (starts + kept <= size)):
+            found.append(Windows(starts, kept, float(np.abs(starts + 0.5 * kept - centres).max())))
+        if len(found) == 2:
+            break
+    return min(found, key=lambda windows: windows.shift)
+
+
+USUAL_DISTANCE = 4.0
+"""Distance of the data set's cameras from the origin, world units, for captures without a scale."""
+
+# Axes are taken for parallel if the meeting point moves more than this per unit of their shift.
+_WORST_CONDITION = 1e4
+
+
+class Placement(NamedTuple):
+    """A change of the world frame: `x -> scale (x - centre)`.
+
+    Attributes:
+      centre: what becomes the origin, in the units of before.
+      scale: units of after per unit of before.
+    """
+
+    centre: Float[np.ndarray, "3"]
+    scale: float
+
+
+def place(
+    poses: Float[np.ndarray, "cameras 3 4"], placement: Placement
+) -> Float[np.ndarray, "cameras 3 4"]:
+    """Returns camera-to-world matrices in the changed frame; rotations stay as they are."""
+    positions = placement.scale * (poses[..., 3] - placement.centre)
+    return np.concatenate([poses[..., :3], positions[..., None]], axis=-1)
+
+
+def undo_motion(
+    poses: Float[np.ndarray, "cameras 3 4"], motion: Float[np.ndarray, "3 4"], scale: float
+) -> Float[np.ndarray, "cameras 3 4"]:
+    """Returns poses as they were before `p -> scale motion(p)`.
+
+    Args:
+      poses: camera to world.
+      motion: rotation and translation, that were applied first.
+      scale: of positions, that was applied then.
+    """
+    back = motion[:, :3].T
+    positions = (poses[..., 3] / scale - motion[:, 3]) @ back.T
+    return np.concatenate([back @ poses[..., :3], positions[..., None]], axis=-1)
+
+
+def meeting_point(poses: Float[np.ndarray, "cameras 3 4"]) -> Float[np.ndarray, "3"]:
+    """Returns the point that is nearest to all optical axes, by least squares.
+
+    Raises:
+      SceneError: if the axes are all but parallel, so that they meet nowhere.
+    """
+    axes = poses[..., 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    total = across.sum(axis=0)
+    if np.linalg.cond(total) > _WORST_CONDITION:
+        raise SceneError(
+            "All cameras look the same way, so nothing says where the middle of the scene is. Give "
+            "it as the centre, such as (0.5, 0, 1.2)."
+        )
+    return np.linalg.solve(total, np.einsum("nij,nj->i", across, poses[..., 3]))
+
+
+Sense = Literal["object", "background", "none"]
+"""What is white in nerfstudio's masks: the object, or all else; or there are to be none."""
+
+# By how much a pixel may be displaced at the image's border, pixels.
+_TOLERANCE = 0.5
+
+# Less of an image than this is not kept: its principal point is another image's.
+_LEAST_KEPT = 0.5
+
+
+class View(NamedTuple):
+    """A frame on its way.
+
+    Attributes:
+      frame: of the capture.
+      pose: camera to world, of the scene.
+    """
+
+    frame: CaptureFrame
+    pose: Float[np.ndarray, "3 4"]
+
+
+class Lens(NamedTuple):
+    """The camera that all frames of a split share.
+
+    Attributes:
+      columns, rows: what is kept of each image.
+      focal: focal length, pixels.
+      stretch: by how much pixels at the border are displaced by the one focal length, pixels.
+    """
+
+    columns: Windows
+    rows: Windows
+    focal: float
+    stretch: float
+
+
+class Converted(NamedTuple):
+    """What was written of a split.
+
+    Attributes:
+      frames: their number.
+      before: width and height of the capture's images.
+      lens: what they were seen through.
+      masked: share of the pixels that the masks mark, or `None` without masks.
+    """
+
+    frames: int
+    before: tuple[int, int]
+    lens: Lens
+    masked: float | None
+
+
+def positions(capture: nerfstudio.Capture, *, original: bool) -> Float[np.ndarray, "frames 3 4"]:
+    """Returns the poses of all frames.
+
+    Args:
+      capture: the capture.
+      original: as they were found, before `applied_transform` and `applied_scale`.
+    """
+    poses = np.stack([frame.pose for frame in capture.frames])
+    if original:
+        return undo_motion(poses, capture.applied, capture.applied_scale)
+    return poses
+
+
+def write_scene(
+    views: dict[str, Sequence[View]], out: Path, sense: Sense, *, step: Callable[[], None]
+) -> dict[str, Converted]:
+    """Writes the scene, which appears when it is whole.
+
+    Args:
+      views: of each split.
+      out: its folder; must not exist.
+      sense: of the masks.
+      step: is called after every image.
+
+    Raises:
+      SceneError: if the folder exists, if a split's cameras can not be one, or an image or mask is
+        broken, of another size, or marks nothing.
+    """
+    if out.exists():
+        raise SceneError(f"{out} exists, and nothing is overwritten. Give a new folder.")
+    lenses = {split: _common_lens([view.frame for view in each]) for split, each in views.items()}
+    with atomic_files.new_folder(out) as scene:
+        return {
+            split: _write_split(each, split, scene, lenses[split], sense, step)
+            for split, each in views.items()
+        }
+
+
+def _common_lens(frames: Sequence[CaptureFrame]) -> Lens:
+    first = frames[0].intrinsics
+    for frame in frames:
+        lens = frame.intrinsics
+        if (lens.width, lens.height) != (first.width, first.height):
+            raise SceneError(
+                f"{frame.name} is {lens.width} x {lens.height} pixels, but {frames[0].name} is "
+                f"{first.width} x {first.height}. Images of a split must be of one size: leave "
+                "out one kind, or put them into different lists (train_filenames, ...)."
+            )
+    half = 0.5 * max(first.width, first.height)
+    focals = np.array([(frame.intrinsics.focal_x, frame.intrinsics.focal_y) for frame in frames])
+    focal = float(focals.mean())
+    for frame, (along, across) in zip(frames, focals, strict=True):
+        if half * abs(along - across) / (along + across) > _TOLERANCE:
+            raise SceneError(
+                f"The pixels of {frame.name} are not square: fl_x is {along:g}, and fl_y "
+                f"{across:g}. Let one focal length be found (COLMAP's SIMPLE_RADIAL, then "
+                "image_undistorter), or resize the images to square pixels."
+            )
+    stretches = half * np.abs(focals - focal).max(axis=-1) / focal
+    if stretches.max() > _TOLERANCE:
+        frame = frames[int(np.argmax(stretches))]
+        raise SceneError(
+            f"The focal length of {frame.name} is {frame.intrinsics.focal_x:g} pixels, but the "
+            f"mean is {focal:g}. All frames of a split share one: find the cameras as one camera "
+            "(COLMAP's single_camera), or put them into different lists (train_filenames, ...)."
+        )
+    columns = _windows(frames, [frame.intrinsics.centre_x for frame in frames], first.width)
+    rows = _windows(frames, [frame.intrinsics.centre_y for frame in frames], first.height)
+    return Lens(columns, rows, focal, float(stretches.max()))
+
+
+def _windows(frames: Sequence[CaptureFrame], centres: Sequence[float], size: int) -> Windows:
+    off = np.abs(np.array(centres) - 0.5 * size)
+    if off.max() > 0.5 * (1.0 - _LEAST_KEPT) * size:
+        frame = frames[int(np.argmax(off))]
+        raise SceneError(
+            f"The principal point of {frame.name} is ({frame.intrinsics.centre_x:g}, "
+            f"{frame.intrinsics.centre_y:g}), far from the middle of its {frame.intrinsics.width} "
+            f"x {frame.intrinsics.height} pixels. Check that cx and cy belong to these images."
+        )
+    return centred_windows(np.array(centres), size)
+
+
+def _write_split(
+    views: Sequence[View],
+    split: str,
+    scene: Path,
+    lens: Lens,
+    sense: Sense,
+    step: Callable[[], None],
+) -> Converted:
+    is_masked = sense != "none" and views[0].frame.mask is not None
+    records, shares = [], []
+    for number, view in enumerate(views):
+        names = scene_folder.plain(split, number)
+        cut = _cut(lens, number)
+        _write_image(view.frame, cut, scene / f"{names.image}.png")
+        if is_masked:
+            mask = _read_mask(view.frame, sense)[cut]
+            if not mask.any():
+                raise SceneError(
+                    f"The mask {view.frame.mask} marks no object, taking {sense} for white. Give "
+                    "another sense of masks, or leave the frame out."
+                )
+            (scene / names.mask).parent.mkdir(parents=True, exist_ok=True)
+            image_files.write_mask(scene / names.mask, mask)
+            shares.append(mask.mean())
+        pose = [*view.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
+        record = scene_folder.frame_record(names, pose, masked=is_masked, deep=False)
+        records.append(record | {"source": view.frame.name})
+        step()
+    angle = 2.0 * math.atan(0.5 * lens.columns.size / lens.focal)
+    scene_folder.write_transforms(scene, split, {"camera_angle_x": angle, "frames": records})
+    first = views[0].frame.intrinsics
+    share = float(np.mean(shares)) if shares else None
+    return Converted(len(views), (first.width, first.height), lens, share)
+
+
+def _cut(lens: Lens, number: int) -> tuple[slice, slice]:
+    top, left = lens.rows.starts[number], lens.columns.starts[number]
+    return slice(top, top + lens.rows.size), slice(left, left + lens.columns.size)
+
+
+def _write_image(frame: CaptureFrame, cut: tuple[slice, slice], path: Path) -> None:
+    """Writes what is kept of an image; a PNG that is kept whole is copied byte for byte."""
+    pixels = image_files.read_rgb(frame.image)
+    kept = pixels[cut]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if kept.shape == pixels.shape and frame.image.suffix.lower() == ".png":
+        shutil.copyfile(frame.image, path)
+    else:
+        image_files.write_png(path, kept)
+
+
+def _read_mask(frame: CaptureFrame, sense: Sense) -> Bool[np.ndarray, "h w"]:
+    white = nerfstudio.read_capture_mask(frame.mask)
+    expected = (frame.intrinsics.height, frame.intrinsics.width)
+    if white.shape != expected:
+        raise SceneError(
+            f"The mask {frame.mask} is {white.shape[1]} x {white.shape[0]} pixels, but its image "
+            f"{expected[1]} x {expected[0]}. Resize it without blending."
+        )
+    return white if sense == "object" else ~white
+
+
+def read_splits(scene: Path) -> dict[str, Frames]:
+    """Returns the splits that a scene has."""
+    names = [
+        split
+        for split in scene_folder.SPLITS
+        if split == "train" or (scene / f"transforms_{split}.json").is_file()
+    ]
+    return {split: scene_folder.read_frames(scene, split) for split in names}
+
+
+def write_capture(
+    splits: dict[str, Frames], out: Path, sense: Sense, *, step: Callable[[], None]
+) -> None:
+    """Writes a capture, which appears when it is whole. Images are copied byte for byte.
+
+    Args:
+      splits: of the scene.
+      out: its folder; must not exist.
+      sense: what is to be white in the masks.
+      step: is called after every image.
+
+    Raises:
+      SceneError: if the folder exists, or a mask is broken.
+    """
+    if out.exists():
+        raise SceneError(f"{out} exists, and nothing is overwritten. Give a new folder.")
+    digits = len(str(max(len(frames.names) for frames in splits.values())))
+    images: dict[str, list[str]] = {}
+    masks: dict[str, list[str]] = {}
+    with atomic_files.new_folder(out) as folder:
+        for name in ("images", "masks"):
+            (folder / name).mkdir()
+        for split, frames in splits.items():
+            # Every name is its own, whatever its folder: nerfstudio looks for smaller copies so.
+            files_of = [f"{split}_{i:0{digits}d}.png" for i in range(len(frames.names))]
+            images[split] = [f"images/{name}" for name in files_of]
+            if frames.masks is not None and sense != "none":
+                masks[split] = [f"masks/{name}" for name in files_of]
+            for number, name in enumerate(images[split]):
+                shutil.copyfile(frames.images[number], folder / name)
+                if split in masks:
+                    _write_mask(frames.masks[number], folder / masks[split][number], sense)
+                step()
+        if not masks:
+            (folder / "masks").rmdir()
+        cameras = {split: frames.cameras for split, frames in splits.items()}
+        _check_masks(images, masks)
+        nerfstudio.write_capture(folder, cameras, images, masks)
+
+
+def _write_mask(source: Path, target: Path, sense: Sense) -> None:
+    seen = image_files.read_mask(source)
+    image_files.write_mask(target, seen if sense == "object" else ~seen)
+
+
+def _check_masks(images: dict[str, list[str]], masks: dict[str, list[str]]) -> None:
+    if masks and set(masks) != set(images):
+        lacking = next(split for split in images if split not in masks)
+        raise SceneError(
+            f"The {lacking} split has no masks, but another has, and nerfstudio wants all or none. "
+            "Give the sense none to leave them all out, or add them."
+        )

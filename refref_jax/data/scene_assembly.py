@@ -1,0 +1,194 @@
+"""Assembles meshes into the scene that light paths are traced through (NumPy only).
+
+Makes parts of meshes that belong to no scene folder: files, trimeshes, arrays (NumPy only).
+
+Assembles the meshes of a scene into what light paths are traced through (NumPy only).
+"""
+
+import os
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour, RuleName
+from refref_jax.data import SceneError, mesh_checks, meshes
+from refref_jax.data.mesh_checks import refuse_errors
+from refref_jax.data.mesh_queries import find_containment
+from refref_jax.data.meshes import MeshPart, Shading
+from refref_jax.geometry.surfaces import pack_meshes
+from refref_jax.geometry.triangle_meshes import CREASE_ANGLE, Mesh, make_mesh
+from refref_jax.optics.interface_rules import RULES
+from refref_jax.optics.scene import Scene
+
+Arrays = tuple[np.ndarray, np.ndarray]
+"""Vertices `[vertices, 3]` in world units; faces `[faces, 3]`, counter-clockwise from outside."""
+
+MeshSource = str | os.PathLike[str] | trimesh.Trimesh | Arrays
+"""What a part can be made of."""
+
+
+def make_part(
+    mesh: MeshSource,
+    *,
+    index: float,
+    name: str | None = None,
+    shading: Shading = "auto",
+    tint: Colour = CLEAR,
+    absorption: Colour = NO_ABSORPTION,
+    priority: int = 0,
+) -> MeshPart:
+    """Makes one body of a mesh; `assemble` puts bodies together.
+
+    Args:
+      mesh: a file that trimesh reads (of a PLY file stored normals are taken), a `trimesh.Trimesh`,
+        or vertices and faces.
+      index: index of refraction inside.
+      name: for messages; by default the file's stem, or `body`.
+      shading: `smooth`, `flat`, or `auto` for smooth up to the crease angle.
+      tint: factor of linear RGB light at every reflection and every crossing, 0 to 1.
+      absorption: of the medium inside, linear RGB, per world unit.
+      priority: where bodies overlap under the rule `priority`, the highest wins.
+
+    Raises:
+      SceneError: if the mesh is broken or empty, or a number has no physical meaning.
+
+    Example:
+      >>> import trimesh
+      >>> import refref_jax
+      >>> ball = refref_jax.make_part(trimesh.creation.icosphere(), index=1.5, name="ball")
+      >>> ball.name, ball.faces.shape
+      ('ball', (1280, 3))
+    """
+    if isinstance(mesh, str | os.PathLike):
+        part = meshes.read_part(Path(mesh), index=index, shading=shading)
+        part = part._replace(name=name or part.name)
+    else:
+        part = _of_arrays(mesh, index, name or "body", shading)
+    meshes.check_index(part.name, index)
+    if not all(0.0 <= channel <= 1.0 for channel in tint):
+        raise SceneError(
+            f"The tint of {part.name!r} is {tint}. Give three numbers from 0 to 1, since no "
+            "surface adds light."
+        )
+    if not all(0.0 <= channel < np.inf for channel in absorption):
+        raise SceneError(
+            f"The absorption of {part.name!r} is {absorption}. Give three numbers that are 0 or "
+            "positive, per world unit."
+        )
+    coloured = tuple(tint) != CLEAR or tuple(absorption) != NO_ABSORPTION
+    return part._replace(tint=tint, absorption=absorption, priority=priority, colour_known=coloured)
+
+
+def _of_arrays(
+    mesh: trimesh.Trimesh | Arrays, index: float, name: str, shading: Shading
+) -> MeshPart:
+    vertices, faces = (mesh.vertices, mesh.faces) if isinstance(mesh, trimesh.Trimesh) else mesh
+    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.dtype.kind not in "iu":
+        raise SceneError(
+            f"{name} has vertices of shape {vertices.shape} and faces of shape {faces.shape} and "
+            f"type {faces.dtype}. Give positions [vertices, 3] and whole numbers [faces, 3]."
+        )
+    vertices, faces = meshes.merge_corners(name, vertices, faces.astype(np.int64))
+    return MeshPart(name, vertices, faces, index, shading)
+
+
+_CREASE_ANGLES: dict[Shading, float] = {"auto": CREASE_ANGLE, "smooth": np.pi, "flat": 0.0}
+
+
+def single_body(
+    mesh: MeshSource,
+    *,
+    index: float,
+    shading: Shading = "auto",
+    tint: Colour = CLEAR,
+    absorption: Colour = NO_ABSORPTION,
+) -> Scene:
+    """Returns a scene of one body in air; arguments as of `scene_assembly.make_part`.
+
+    Its arrays are NumPy's, which every function of light takes; `jax.device_put` moves them to an
+    accelerator once and for all.
+
+    Raises:
+      SceneError: as `make_part` and `assemble`.
+
+    Example:
+      >>> import trimesh
+      >>> import refref_jax
+      >>> glass = refref_jax.single_body(trimesh.creation.box(), index=1.5)
+      >>> glass.interfaces.index_inside.tolist()
+      [1.5]
+    """
+    part = make_part(mesh, index=index, shading=shading, tint=tint, absorption=absorption)
+    return assemble([part])
+
+
+def assemble(parts: Sequence[MeshPart], *, rule: RuleName = "nested") -> Scene:
+    """Examines parts and builds the scene that they make; no part is an empty scene.
+
+    Args:
+      parts: of `make_part` or `meshes.read_meshes`.
+      rule: what lies outside a part: what it lies in (`nested`), always air (`facing`), or, where
+        parts overlap, the one of the highest priority (`priority`); see `optics.interface_rules`.
+
+    Returns:
+      NumPy arrays, as of `single_body`. Parts have the numbers of their places in `parts`.
+
+    Raises:
+      SceneError: if light paths would be wrong, as where faces point inwards. What may make them
+        wrong, such as a hole, is a Python warning.
+
+    Example:
+      >>> import trimesh
+      >>> import refref_jax
+      >>> cup = refref_jax.make_part(trimesh.creation.box([2.0, 2.0, 2.0]), index=1.5)
+      >>> water = refref_jax.make_part(trimesh.creation.icosphere(radius=0.5), index=1.333)
+      >>> refref_jax.assemble([cup, water]).interfaces.index_outside.tolist()  # air, and the cup
+      [1.0, 1.5]
+    """
+    tree = find_containment(parts)
+    if rule == "priority":
+        # Bodies that overlap are what this rule is for.
+        findings = mesh_checks.lint(parts, tree._replace(overlaps=()))
+        findings += mesh_checks.examine_priorities(parts, tree)
+    else:
+        findings = mesh_checks.lint(parts, tree)
+    refuse_errors(findings)
+    for finding in findings:
+        if finding.severity == "warning":
+            warnings.warn(f"{finding.part} {finding.message}", stacklevel=2)
+    return build_geometry(parts, tree.parents, rule=rule)
+
+
+def build_geometry(
+    parts: Sequence[MeshPart],
+    parents: Sequence[int],
+    *,
+    rule: RuleName,
+) -> Scene:
+    """Builds surfaces and interfaces of all parts.
+
+    Args:
+      parts: the meshes; none is an empty scene.
+      parents: the innermost part around each part, from `mesh_queries.find_containment`.
+      rule: what lies outside a part, see `optics.interface_rules`.
+    """
+    surfaces = pack_meshes([shaded_mesh(part) for part in parts])
+    interfaces = RULES[rule](
+        [part.index for part in parts],
+        parents,
+        tints=[part.tint for part in parts],
+        absorptions=[part.absorption for part in parts],
+        priorities=[part.priority for part in parts],
+    )
+    return Scene(surfaces, interfaces)
+
+
+def shaded_mesh(part: MeshPart) -> Mesh:
+    """Returns the surface of a part, with the normals that bend light."""
+    if part.normals is not None:
+        return Mesh(part.vertices, part.faces, part.normals)
+    return make_mesh(part.vertices, part.faces, crease_angle=_CREASE_ANGLES[part.shading])

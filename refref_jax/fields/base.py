@@ -1,0 +1,154 @@
+"""Interface of radiance fields: configurations, functions, and precision.
+
+Arithmetic precision of fields: float32, or mixed precision with bfloat16.
+
+With `bfloat16`, tables are read and matrices multiplied in bfloat16. Parameters, sums, gradients
+and outputs stay in float32: bfloat16 has only 8 significant bits, so small gradients would be lost
+in a sum of many.
+
+Source: Micikevicius et al., Mixed Precision Training (2018), for the float32 master weights.
+
+Interface of field types: configurations, and functions of these.
+
+A radiance field has two functions, `init` and `radiance`; a proposal field has `init` and
+`density`. All are pure functions over Gaussians in the unit cube. A field type is one module with a
+`FieldKind`, and one line in `registry`, through which all other modules query fields.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, get_args
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from refref_jax.choices import Footprint, Precision
+from refref_jax.sampling.cones import Gaussians
+
+
+def check_precision(precision: str) -> None:
+    """Checks the name of a precision.
+
+    Raises:
+      ValueError: if the name is not one of `Precision`.
+    """
+    choices = get_args(Precision)
+    if precision not in choices:
+        raise ValueError(
+            f"The precision must be one of {', '.join(choices)}, not {precision!r}. Choose one."
+        )
+
+
+def dense(precision: Precision) -> Callable[..., nn.Dense]:
+    """Returns flax's dense layer, `x @ kernel + bias`, with factors in a given precision."""
+    return nn.Dense if precision == "float32" else functools.partial(nn.Dense, dot_general=_product)
+
+
+def _product(left: Array, right: Array, axes: Any, precision: None = None) -> Array:
+    """Returns the matrix product of factors rounded to bfloat16, summed in their original type."""
+    factors = left.astype(jnp.bfloat16), right.astype(jnp.bfloat16)
+    return jax.lax.dot_general(
+        *factors, axes, precision=precision, preferred_element_type=left.dtype
+    )
+
+
+Params = Any
+"""Pytree of arrays, from `init`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FieldConfig:
+    """Shape of a field of any type.
+
+    Field types derive from `RadianceConfig` and `DensityConfig`, with their name as the default and
+    only value of `kind`. The registry and the files of a run identify the type by this name.
+
+    Attributes:
+      precision: precision of tables and matrix products.
+      kind: name of the field type.
+    """
+
+    precision: Precision = dataclasses.field(default="float32", kw_only=True)
+    kind: str = dataclasses.field(default="", kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Validates the precision."""
+        check_precision(self.precision)
+
+
+@dataclasses.dataclass(frozen=True)
+class RadianceConfig(FieldConfig):
+    """Shape of a radiance field of any type."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DensityConfig(FieldConfig):
+    """Shape of a proposal's density field of any type."""
+
+
+class Radiance(NamedTuple):
+    """Output of a radiance field.
+
+    Attributes:
+      density: density per scene radius, non-negative.
+      rgb: linear radiance towards the camera, in `[-0.001, 1.001]`.
+    """
+
+    density: Float[Array, ""]
+    rgb: Float[Array, "3"]
+
+
+class FieldSize(NamedTuple):
+    """Fields of one size, and the numbers of samples along a path.
+
+    Attributes:
+      field: shape of the radiance field.
+      proposals: shape of each proposal level's density field, coarse to fine.
+      samples: number of intervals of each proposal level, then of the radiance field.
+      multisamples: number of multisamples per interval.
+      footprint: pixel footprint along a path, see `ModelConfig`.
+      dilation: widening of a proposal before it is sampled, see `ModelConfig`.
+    """
+
+    field: RadianceConfig
+    proposals: tuple[DensityConfig, ...]
+    samples: tuple[int, ...]
+    multisamples: int
+    footprint: Footprint
+    dilation: float
+
+
+class FieldKind(NamedTuple):
+    """A field type.
+
+    Attributes:
+      radiance_config: configuration class of the radiance field.
+      init_radiance: function of key and shape that returns initial radiance field parameters.
+      radiance: function of parameters, shape, Gaussians in the unit cube (fractions of its edge)
+        and unit direction of travel (world frame) that returns density and colour of one interval.
+      density_config: configuration class of the proposal fields.
+      init_density: function of key and shape that returns initial proposal field parameters.
+      density: function of parameters, shape and Gaussians that returns the density of one interval.
+      sizes: field sizes by preset name.
+      hash_decay: weight of the hash decay loss.
+    """
+
+    radiance_config: type[RadianceConfig]
+    init_radiance: Callable[[Array, Any], Params]
+    radiance: Callable[[Params, Any, Gaussians, Float[Array, "3"]], Radiance]
+    density_config: type[DensityConfig]
+    init_density: Callable[[Array, Any], Params]
+    density: Callable[[Params, Any, Gaussians], Float[Array, ""]]
+    sizes: Mapping[str, FieldSize]
+    hash_decay: float
+
+
+def in_half_precision(size: FieldSize) -> FieldSize:
+    """Returns the same fields with bfloat16 arithmetic."""
+    field, *proposals = (
+        dataclasses.replace(each, precision="bfloat16") for each in (size.field, *size.proposals)
+    )
+    return size._replace(field=field, proposals=tuple(proposals))

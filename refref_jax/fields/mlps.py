@@ -1,0 +1,127 @@
+"""Small networks behind a hash grid, and encodings of directions.
+
+Direction encodings of fields.
+
+MLPs on hash grid features, shared by several field types.
+
+The functions are called in a compact linen module, to which their layers belong.
+"""
+
+import dataclasses
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from refref_jax.choices import Precision
+from refref_jax.fields.base import DensityConfig, RadianceConfig, dense
+from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid
+from refref_jax.sampling.cones import Gaussians
+
+
+def spherical_harmonics(direction: Float[Array, "3"]) -> Float[Array, "16"]:
+    """Returns the real spherical harmonics of degree 0 to 3 at a unit direction.
+
+    Ordered by degree `l`, then by order `m = -l .. l`; orthonormal over the sphere; without the
+    Condon-Shortley phase.
+
+    Source: paper (arXiv 2505.05848), supplement (direction encoding); Sloan, Stupid Spherical
+    Harmonics Tricks (2008), appendix A2.
+    """
+    x, y, z = direction
+    xx, yy, zz = x * x, y * y, z * z
+    return jnp.stack(
+        [
+            0.28209479177387814 * jnp.ones_like(x),
+            0.4886025119029199 * y,
+            0.4886025119029199 * z,
+            0.4886025119029199 * x,
+            1.0925484305920792 * x * y,
+            1.0925484305920792 * y * z,
+            0.31539156525252005 * (3.0 * zz - 1.0),
+            1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+            0.5900435899266435 * y * (3.0 * xx - yy),
+            2.890611442640554 * x * y * z,
+            0.4570457994644658 * y * (5.0 * zz - 1.0),
+            0.3731763325901154 * z * (5.0 * zz - 3.0),
+            0.4570457994644658 * x * (5.0 * zz - 1.0),
+            1.445305721320277 * z * (xx - yy),
+            0.5900435899266435 * x * (xx - 3.0 * yy),
+        ]
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class GridRadianceConfig(RadianceConfig):
+    """Shape of a radiance field on a hash grid.
+
+    Attributes:
+      grid: shape of the hash grid.
+      density_width: width of the density network's hidden layer.
+      bottleneck: number of features passed from the density network to the colour network.
+      colour_width: width of the colour network's hidden layers.
+      colour_depth: number of hidden layers of the colour network.
+    """
+
+    grid: HashGridConfig
+    density_width: int
+    bottleneck: int
+    colour_width: int
+    colour_depth: int
+
+
+@dataclasses.dataclass(frozen=True)
+class GridDensityConfig(DensityConfig):
+    """Shape of a density field on a hash grid.
+
+    Attributes:
+      grid: shape of the hash grid.
+      width: width of the hidden layer.
+    """
+
+    grid: HashGridConfig
+    width: int
+
+
+def nowhere() -> Gaussians:
+    """Returns one point, as an example input for initialising a module."""
+    return Gaussians(jnp.zeros((1, 3), jnp.float32), jnp.zeros(1, jnp.float32))
+
+
+def grid_network(
+    gaussians: Gaussians,
+    grid: HashGridConfig,
+    *,
+    width: int,
+    outputs: int,
+    precision: Precision,
+) -> Float[Array, " outputs"]:
+    """Returns the output of an MLP with one hidden layer on the grid's mean features.
+
+    Args:
+      gaussians: multisamples in the unit cube.
+      grid: shape of the hash grid.
+      width: width of the hidden layer.
+      outputs: number of outputs, without activation.
+      precision: precision of tables and matrix products.
+    """
+    layer = dense(precision)
+    features = MultisampledGrid(grid, precision)(gaussians)
+    # Flax numbers layers in order of creation, and checkpoints contain these names.
+    hidden = nn.relu(layer(width)(features))
+    return layer(outputs)(hidden)
+
+
+def colour(
+    bottleneck: Float[Array, " bottleneck"],
+    direction: Float[Array, "3"],
+    config: GridRadianceConfig,
+) -> Float[Array, "3"]:
+    """Returns a colour in `[0, 1]` from the bottleneck features and a unit direction."""
+    layer = dense(config.precision)
+    hidden = jnp.concatenate([bottleneck, spherical_harmonics(direction)])
+    for _ in range(config.colour_depth):
+        hidden = nn.relu(layer(config.colour_width)(hidden))
+    return jax.nn.sigmoid(layer(3)(hidden))

@@ -1,0 +1,251 @@
+"""Differentiable tracing of single light paths.
+
+Differentiable tracing of one light path, as a scan.
+
+The steps are those of `wavefront`, for one ray along one branch of its tree. The search for the
+triangles that are hit has no gradients, but each hit point is recomputed from the corners of its
+triangle. Positions, directions, arc lengths and weights of a path therefore have gradients with
+respect to indices of refraction, tints, absorption, corners, normals and the ray.
+
+Gradients are those of a fixed path: the same triangles in the same order, and the same branches.
+They do not account for paths that move to another triangle or fall below the throughput threshold.
+Towards the critical angle, the gradients of refraction and reflectance are unbounded; at it and
+beyond, the derivatives of the refracted ray are 0 (see `snell.transmission`), while those of the
+totally reflected ray are exact.
+
+Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
+
+Traces the main branches of a ray, which carry most of its light, with gradients.
+
+They are the main path, which is refracted wherever it can be, and the paths that are reflected
+once, at one of the first surfaces, and then refracted like the main path. In clear glass, all other
+paths together carry 1 % of the light. Throughput that the threshold moves to siblings stays on
+these branches.
+
+A reflection that does not occur is an empty path: the path has already left the objects, or the
+reflection is total and therefore part of the main path.
+
+Source: paper (arXiv 2505.05848), section 4.2; its two paths are the first two of these.
+"""
+
+import functools
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from refref_jax.geometry.bvh import NO_SLOT, closest_slot
+from refref_jax.geometry.rays import Rays
+from refref_jax.optics import media, path_step, ray_differentials, scene
+from refref_jax.optics.light_paths import LightPaths, PathStatus
+from refref_jax.optics.path_settings import Budget
+from refref_jax.optics.path_step import RayState
+from refref_jax.optics.scene import Scene
+
+_Record = TypeVar("_Record")
+
+
+class _Segment(NamedTuple):
+    """One segment of the path.
+
+    Attributes:
+      state: state of the ray on the segment.
+      medium: medium of the segment, known from the surface at its end, or else at its start.
+      used: whether the path has this segment.
+    """
+
+    state: RayState
+    medium: Int[Array, ""]
+    used: Bool[Array, ""]
+
+
+class _Walk(NamedTuple):
+    """State of the scan.
+
+    Attributes:
+      state: state of the ray.
+      medium: medium of the ray after its last surface.
+      traced: whether the ray is to be cast; false for the paper's first reflection, and if max
+        bends is 0.
+      status: `EMPTY` while the path continues.
+    """
+
+    state: RayState
+    medium: Int[Array, ""]
+    traced: Bool[Array, ""]
+    status: Int[Array, ""]
+
+
+def follow_branch(
+    geometry: Scene,
+    ray: Rays,
+    reflects: Bool[Array, " bends"],
+    *,
+    budget: Budget,
+    inside: Int[Array, " slots"] | None = None,
+) -> LightPaths:
+    """Traces one ray along one branch.
+
+    Args:
+      geometry: the scene.
+      ray: one camera ray.
+      reflects: choice of the reflected branch at each bend; a total internal reflection is always
+        followed. All false is the main path.
+      budget: path settings; `budget.bends` must be the length of `reflects`.
+      inside: interior list of the camera, for the rule `priority` (see `media`).
+
+    Returns:
+      One path. Its weight is 0 if the path settings do not follow the branch, because its
+      throughput moves to the sibling.
+
+    Raises:
+      ValueError: if the length of `reflects` is not the max bends.
+
+    Example:
+      The transmittance of a glass surface, and its derivative with respect to the index `n`:
+      `4 n / (n + 1)^2` and `4 (1 - n) / (n + 1)^3`.
+
+      >>> import jax, numpy as np, trimesh
+      >>> import refref_jax
+      >>> glass = refref_jax.single_body(trimesh.creation.box(), index=1.5)
+      >>> ray = refref_jax.Rays(np.array([-2.0, 0.1, 0.2]), np.array([1.0, 0.0, 0.0]), 1e-3)
+      >>> budget = refref_jax.Budget(bends=1, reflections="all")
+      >>> def transmitted(index):
+      ...     scene, straight_on = refref_jax.with_index(glass, index), jax.numpy.zeros(1, bool)
+      ...     return refref_jax.follow_branch(scene, ray, straight_on, budget=budget).weights[0]
+      >>> share, slope = jax.jit(jax.value_and_grad(transmitted))(1.5)
+      >>> print(f"{share:.4f} {slope:.4f}")
+      0.9600 -0.1280
+    """
+    if reflects.shape[0] != budget.bends:
+        raise ValueError(
+            f"reflects has {reflects.shape[0]} choices for {budget.bends} bends. Give one choice "
+            "for each of the max bends."
+        )
+    reflects = jnp.asarray(reflects)
+    geometry, ray = scene.in_one_precision(geometry, ray)
+    if inside is None:
+        inside = media.nowhere(geometry.interfaces)
+    start = _Walk(
+        path_step.begin(ray, inside, ray_differentials.nothing(ray.origins)),
+        jnp.int32(media.AMBIENT),
+        jnp.asarray(budget.bends > 0),
+        jnp.int32(PathStatus.EMPTY),
+    )
+    # One step more than max bends: the last one only checks whether the path escapes.
+    choices = jnp.append(reflects, False)
+    advance = functools.partial(_advance, geometry, budget)
+    end, segments = jax.lax.scan(advance, start, choices)
+    return _record(budget, ray, end, segments)
+
+
+def _advance(
+    geometry: Scene, budget: Budget, walk: _Walk, reflect: Bool[Array, ""]
+) -> tuple[_Walk, _Segment]:
+    """Casts the ray, then ends the path or follows one of the two branches."""
+    state, alive = walk.state, walk.status == PathStatus.EMPTY
+    limit = jnp.where(alive & walk.traced, jnp.inf, -1.0).astype(state.tau.dtype)
+    slot = closest_slot(geometry.surfaces.bvh, state.origin, state.direction, limit, state.leaving)
+    hit = slot != NO_SLOT
+    arrival = path_step.arrive(geometry, state, slot)
+    ended = jnp.where(
+        walk.traced, path_step.ending(budget, state, arrival, hit), PathStatus.NOT_TRACED
+    )
+    status = jnp.where(alive, ended, walk.status).astype(jnp.int32)
+    met, sides = arrival.interaction, arrival.interaction.sides
+    mirrored = reflect | met.total
+    branches = path_step.branch(budget, state, arrival, slot)
+    bent = _Walk(
+        state=_either(mirrored, branches.reflected, branches.transmitted),
+        medium=jnp.where(mirrored, sides.medium_near, sides.medium_far),
+        traced=~(reflect & ~met.total & (budget.reflections == "first")),
+        status=status,
+    )
+    segment = _Segment(state, jnp.where(hit, sides.medium_near, walk.medium), alive)
+    going_on = status == PathStatus.EMPTY
+    return _either(going_on, bent, walk._replace(status=status)), segment
+
+
+def _either(which: Bool[Array, ""], first: _Record, second: _Record) -> _Record:
+    return jax.tree.map(lambda a, b: jnp.where(which, a, b), first, second)
+
+
+def _record(budget: Budget, ray: Rays, end: _Walk, segments: _Segment) -> LightPaths:
+    used = segments.used
+    tau = jnp.where(used, segments.state.tau, jnp.inf)
+    none = jnp.zeros_like(tau, shape=(0,))
+    return LightPaths(
+        points=segments.state.point,
+        directions=segments.state.direction,
+        tau=tau,
+        ends=jnp.append(tau[1:], jnp.inf),
+        spreads=segments.state.spread,
+        media=jnp.where(used, segments.medium, media.AMBIENT),
+        rays=jnp.zeros_like(end.status),
+        weights=path_step.shown(budget, end.state.weight, end.status),
+        radii=ray.radii,
+        bends=end.state.bends,
+        statuses=end.status,
+        meetings=none,
+        passages=none,
+    )
+
+
+def follow_main_branches(
+    geometry: Scene, ray: Rays, *, budget: Budget, reflections: int
+) -> LightPaths:
+    """Traces one ray along its main path, and along the paths that are reflected once.
+
+    Args:
+      geometry: the scene.
+      ray: one camera ray.
+      budget: path settings.
+      reflections: number of first surfaces at which a reflection is followed.
+
+    Returns:
+      `1 + reflections` paths, the main path first; paths that do not exist are `EMPTY`. Their ray
+      index is 0.
+
+    Raises:
+      ValueError: if there are more reflections than bends.
+
+    Example:
+      A glass cube in front of a red wall, and the derivative of its colour with respect to the
+      index: with a higher index, more of the black behind the camera is reflected.
+
+      >>> import jax, numpy as np, trimesh
+      >>> import refref_jax
+      >>> from refref_jax.render import shade
+      >>> glass = refref_jax.single_body(trimesh.creation.box(), index=1.5)
+      >>> ray = refref_jax.Rays(np.array([-2.0, 0.1, 0.2]), np.array([1.0, 0.0, 0.0]), 1e-3)
+      >>> red = jax.numpy.array([1.0, 0.0, 0.0])
+      >>> wall = lambda origin, direction: jax.numpy.where(direction[0] > 0.0, red, 0.0)
+      >>> def colour(index):
+      ...     paths = refref_jax.follow_main_branches(
+      ...         refref_jax.with_index(glass, index),
+      ...         ray,
+      ...         budget=refref_jax.Budget(bends=2, reflections="all"),
+      ...         reflections=1,
+      ...     )
+      ...     return shade(paths, wall, rays=1)[0]
+      >>> value, slope = jax.jit(lambda n: jax.jvp(colour, (n,), (1.0,)))(1.5)
+      >>> print(f"{value[0]:.4f} {slope[0]:.4f}")  # (4 n / (n + 1)^2)^2, and its derivative
+      0.9216 -0.2458
+    """
+    if not 0 <= reflections <= budget.bends:
+        raise ValueError(
+            f"reflections is {reflections}, outside 0 to {budget.bends}, the max bends. Choose a "
+            "number in that range."
+        )
+    first = jnp.arange(reflections, dtype=jnp.int32)
+    once = first[:, None] == jnp.arange(budget.bends, dtype=jnp.int32)[None]
+    choices = jnp.concatenate([jnp.zeros_like(once, shape=(1, budget.bends)), once])
+    paths = jax.vmap(lambda choice: follow_branch(geometry, ray, choice, budget=budget))(choices)
+    # If the main path stays in its medium at a bend, reflection is total there.
+    total = paths.media[0, 1:] == paths.media[0, :-1]
+    real = jnp.append(True, (paths.bends[1:] > first) & ~total[:reflections])
+    return paths._replace(
+        statuses=jnp.where(real, paths.statuses, PathStatus.EMPTY),
+        weights=jnp.where(real[:, None], paths.weights, 0.0),
+    )

@@ -1,0 +1,311 @@
+"""One bounce of one ray: refraction, reflection and the split of throughput.
+
+Interaction of one ray with one interface: the reflected and the refracted ray.
+
+Letters as in `snell`. The geometric normal determines the side that the ray comes from and the
+origins of the new rays; the shading normal determines their directions.
+
+Divides the throughput of one ray between reflection and transmission at an interface.
+
+Source: paper (arXiv 2505.05848), section 4.2, Fresnel blend; the energy-conserving throughput
+threshold is ours.
+
+Splits one ray at a surface into a reflected and a transmitted ray.
+
+Both tracers, `wavefront` and `single_path`, are built from these steps.
+
+Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from refref_jax import numerics
+from refref_jax.geometry import surfaces, triangles
+from refref_jax.geometry.bvh import NO_SLOT
+from refref_jax.geometry.rays import Rays
+from refref_jax.geometry.surfaces import SurfacePoint
+from refref_jax.optics import fresnel, media, ray_differentials, snell
+from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics.path_settings import Budget
+from refref_jax.optics.ray_differentials import Bend, Spread
+from refref_jax.optics.scene import Scene
+
+
+class Interaction(NamedTuple):
+    """Reflection and refraction of a ray at an interface.
+
+    Attributes:
+      position: hit point on the interface.
+      reflectance: Fresnel's `R`, 1 in total internal reflection.
+      total: whether reflection is total.
+      reflected: mirrored unit direction.
+      transmitted: refracted unit direction; finite but meaningless if reflection is total.
+      restart_reflected: origin of the mirrored ray, just off the surface.
+      restart_transmitted: origin of the refracted ray, just off the surface on its other side.
+      sides: media on both sides.
+    """
+
+    position: Float[Array, "3"]
+    reflectance: Float[Array, ""]
+    total: Bool[Array, ""]
+    reflected: Float[Array, "3"]
+    transmitted: Float[Array, "3"]
+    restart_reflected: Float[Array, "3"]
+    restart_transmitted: Float[Array, "3"]
+    sides: media.Crossing
+
+
+def meet(
+    point: SurfacePoint,
+    interfaces: media.Interfaces,
+    inside: Int[Array, " slots"],
+    direction: Float[Array, "3"],
+) -> Interaction:
+    """Reflects and refracts a ray at an interface.
+
+    If the shading normal would send either ray to the wrong side of the triangle, the geometric
+    normal is used for both.
+
+    Args:
+      point: hit point of the ray.
+      interfaces: interfaces of the scene.
+      inside: interior list of the ray (see `media`).
+      direction: unit direction of the incident ray.
+    """
+    entering = numerics.dot(direction, point.geometric_normal) < 0.0
+    sides = media.crossing(interfaces, inside, point.part, entering)
+    outward = jnp.where(entering, 1.0, -1.0).astype(direction.dtype)
+    geometric, shading = outward * point.geometric_normal, outward * point.shading_normal
+
+    normal = jnp.where(_keeps_sides(direction, shading, geometric, sides), shading, geometric)
+    near, far = sides.index_near, sides.index_far
+    beta = -numerics.dot(direction, normal)
+    # Directions are renormalised, or rounding errors would accumulate over bends.
+    return Interaction(
+        position=point.position,
+        reflectance=fresnel.reflectance(beta, near, far),
+        total=snell.transmission(beta, near, far).total,
+        reflected=numerics.renormalize(snell.reflect(direction, normal)),
+        transmitted=numerics.renormalize(snell.refract(direction, normal, near, far)),
+        restart_reflected=numerics.offset_origin(point.position, geometric, point.scale),
+        restart_transmitted=numerics.offset_origin(point.position, -geometric, point.scale),
+        sides=sides,
+    )
+
+
+def _keeps_sides(
+    direction: Float[Array, "3"],
+    shading: Float[Array, "3"],
+    geometric: Float[Array, "3"],
+    sides: media.Crossing,
+) -> Bool[Array, ""]:
+    """Returns whether the shading normal sends both rays to the correct side of the triangle."""
+    near, far = sides.index_near, sides.index_far
+    beta = -numerics.dot(direction, shading)
+    total = snell.transmission(beta, near, far).total
+    reflected = snell.reflect(direction, shading)
+    refracted = snell.refract(direction, shading, near, far)
+    return (
+        (beta > 0.0)
+        & (numerics.dot(reflected, geometric) > 0.0)
+        & (total | (numerics.dot(refracted, geometric) < 0.0))
+    )
+
+
+class Shares(NamedTuple):
+    """Shares of the incident throughput, which sum to 1. Branches of share 0 are not followed."""
+
+    reflected: Float[Array, ""]
+    transmitted: Float[Array, ""]
+
+
+def shares(
+    budget: Budget,
+    *,
+    reflectance: Float[Array, ""],
+    total: Bool[Array, ""],
+    first: Bool[Array, ""],
+    strength: Float[Array, ""],
+) -> Shares:
+    """Divides throughput between the two branches.
+
+    If a reflection is not followed, the transmitted branch takes its share. If the weaker branch
+    falls below the throughput threshold, the stronger one takes all, so the threshold neither
+    darkens the image nor adds noise. Shares are constant if a branch is below the threshold and
+    follow `reflectance` elsewhere, so their gradient is that of Fresnel's equations or 0.
+
+    Args:
+      budget: path settings.
+      reflectance: Fresnel's `R`.
+      total: whether reflection is total.
+      first: whether this is the first surface of a path.
+      strength: incident throughput times the interface's tint, the largest of its RGB.
+    """
+    if budget.reflections == "all":
+        partial = reflectance
+    elif budget.reflections == "first":
+        partial = jnp.where(first, reflectance, 0.0)
+    else:
+        partial = jnp.zeros_like(reflectance)
+    reflected = jnp.where(total, jnp.ones_like(partial), partial)
+    weaker = jnp.minimum(reflected, 1.0 - reflected)
+    winner = jnp.where(reflected > 0.5, jnp.ones_like(reflected), jnp.zeros_like(reflected))
+    reflected = jnp.where(weaker * strength < budget.cut, winner, reflected)
+    return Shares(reflected, 1.0 - reflected)
+
+
+class RayState(NamedTuple):
+    """State of a ray along its path.
+
+    Attributes:
+      origin: origin of the next cast, just off the surface, world units.
+      point: start of the current segment, on the surface.
+      direction: unit vector.
+      tau: arc length from the camera to `point`.
+      weight: throughput, the share of the camera ray's linear RGB.
+      bends: number of bends so far.
+      leaving: excluded primitive, the triangle slot that the segment starts on.
+      inside: interior list, the parts that the ray is in (see `media`).
+      spread: ray differential of the current segment (see `footprints`).
+    """
+
+    origin: Float[Array, "*rays 3"]
+    point: Float[Array, "*rays 3"]
+    direction: Float[Array, "*rays 3"]
+    tau: Float[Array, "*rays"]
+    weight: Float[Array, "*rays 3"]
+    bends: Int[Array, "*rays"]
+    leaving: Int[Array, "*rays"]
+    inside: Int[Array, "*rays slots"]
+    spread: Spread
+
+
+class Arrival(NamedTuple):
+    """A ray's hit of a surface.
+
+    Attributes:
+      interaction: interaction of the ray with the interface.
+      length: length of the segment that ends at the hit.
+      weight: throughput after absorption along the segment and the surface's tint.
+      reflected: ray differential of the reflected ray.
+      transmitted: ray differential of the transmitted ray.
+    """
+
+    interaction: Interaction
+    length: Float[Array, "*rays"]
+    weight: Float[Array, "*rays 3"]
+    reflected: Spread
+    transmitted: Spread
+
+
+class Branches(NamedTuple):
+    """The two rays that leave a surface; branches of weight 0 are not followed."""
+
+    reflected: RayState
+    transmitted: RayState
+
+
+def begin(ray: Rays, inside: Int[Array, " slots"], spread: Spread) -> RayState:
+    """Returns the state of a camera ray before its first surface."""
+    return RayState(
+        origin=ray.origins,
+        point=ray.origins,
+        direction=ray.directions,
+        tau=jnp.zeros_like(ray.radii),
+        weight=jnp.ones_like(ray.origins),
+        bends=jnp.zeros((), jnp.int32),
+        leaving=jnp.full((), NO_SLOT, jnp.int32),
+        inside=inside,
+        spread=spread,
+    )
+
+
+def arrive(geometry: Scene, state: RayState, slot: Int[Array, ""]) -> Arrival:
+    """Advances a ray to the triangle that it hits; finite but meaningless for `NO_SLOT`.
+
+    The hit point is recomputed from the corners of the triangle, so it has gradients and the
+    precision of the corners rather than that of the BVH traversal.
+    """
+
+    def surface(
+        origin: Float[Array, "3"], direction: Float[Array, "3"]
+    ) -> tuple[Bend, Interaction]:
+        corners = geometry.surfaces.bvh.triangles[slot]
+        found = triangles.intersect(origin, direction, corners).barycentric
+        # A ray without a hit reads an arbitrary triangle: keep it out of values and gradients.
+        barycentric = jnp.where(slot == NO_SLOT, 1.0 / 3.0, found)
+        point = surfaces.surface_point(geometry.surfaces, slot, barycentric)
+        # Otherwise XLA would gather the triangle again for every result that depends on it.
+        point = jax.lax.optimization_barrier(point)
+        met = meet(point, geometry.interfaces, state.inside, direction)
+        return Bend(met.position, met.reflected, met.transmitted), met
+
+    met, reflected, transmitted = ray_differentials.bend(
+        surface, state.origin, state.direction, state.spread
+    )
+    length = numerics.length(met.position - state.point)
+    passed = media.transmittance(geometry.interfaces, met.sides.medium_near, length)
+    weight = state.weight * passed * met.sides.tint
+    return Arrival(met, length, weight, reflected, transmitted)
+
+
+def ending(
+    budget: Budget, state: RayState, arrival: Arrival, hit: Bool[Array, ""]
+) -> Int[Array, ""]:
+    """Returns the status of a path that ends here; `EMPTY` if it bends and continues.
+
+    Args:
+      budget: path settings.
+      state: state of the ray.
+      arrival: the ray's hit.
+      hit: whether the ray hits anything.
+    """
+    missed = jnp.where(state.bends > 0, PathStatus.ESCAPED, PathStatus.MISSED)
+    met = jnp.where(state.bends < budget.bends, PathStatus.EMPTY, PathStatus.OUT_OF_BENDS)
+    if budget.total_reflection == "ended":
+        met = jnp.where(arrival.interaction.total, PathStatus.TOTALLY_REFLECTED, met)
+    return jnp.where(hit, met, missed).astype(jnp.int32)
+
+
+def shown(budget: Budget, weight: Float[Array, "3"], status: Int[Array, ""]) -> Float[Array, "3"]:
+    """Returns the weight that a path contributes when it ends with a status."""
+    if budget.unfinished == "kept":
+        return weight
+    return jnp.where(status == PathStatus.OUT_OF_BENDS, 0.0, weight)
+
+
+def branch(budget: Budget, state: RayState, arrival: Arrival, slot: Int[Array, ""]) -> Branches:
+    """Returns both rays that leave the surface, with their shares of the throughput."""
+    met = arrival.interaction
+    share = shares(
+        budget,
+        reflectance=met.reflectance,
+        total=met.total,
+        first=state.bends == 0,
+        strength=jnp.max(arrival.weight),
+    )
+    after = state._replace(
+        point=met.position,
+        tau=state.tau + arrival.length,
+        bends=state.bends + 1,
+        leaving=slot,
+    )
+    return Branches(
+        reflected=after._replace(
+            origin=met.restart_reflected,
+            direction=met.reflected,
+            weight=arrival.weight * share.reflected,
+            spread=arrival.reflected,
+        ),
+        transmitted=after._replace(
+            origin=met.restart_transmitted,
+            direction=met.transmitted,
+            weight=arrival.weight * share.transmitted,
+            inside=met.sides.inside_after,
+            spread=arrival.transmitted,
+        ),
+    )

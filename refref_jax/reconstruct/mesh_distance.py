@@ -1,0 +1,313 @@
+"""Distances between meshes, and agreement of a mesh with masks.
+
+The closest points of a mesh and signed distances to it, exact but far inside (NumPy only).
+
+Triangles are cut until all are small, which changes no surface, so that a tree of their middles
+finds the few that can hold the closest point: the distance to the nearest middle bounds it from
+above, and a triangle further than that bound and its own radius can not hold it.
+
+Inside is told by the angle-weighted normal of the feature (face, edge or vertex) where the closest
+point lies, which is exact on closed surfaces. Source: Baerentzen and Aanaes, Signed Distance
+Computation Using the Angle Weighted Pseudonormal (2005).
+
+How far a mesh is from another one, and from masks.
+
+Which masks a body does not agree with, and which of them spoils it (host).
+
+Masks that are right agree with the silhouettes of their hull. One that marks too much is overruled
+by the others, and alone disagrees. One that marks too little takes its part of the body away: it
+agrees, and all others disagree. What a mask alone carves away tells it from them.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+from trimesh.triangles import closest_point, points_to_barycentric
+
+from refref_jax.geometry.cameras import Cameras, image_rays
+from refref_jax.geometry.surfaces import pack_meshes
+from refref_jax.geometry.triangle_meshes import (
+    Faces,
+    Mesh,
+    Vertices,
+    corner_normals,
+    diameter,
+    face_normals,
+    is_degenerate,
+    unit_vectors,
+)
+from refref_jax.reconstruct import ReconstructionError
+from refref_jax.reconstruct.grids import Box, Field, Points, Values, lattice
+from refref_jax.reconstruct.masks import Views, check_masks, overlaps, views_at
+from refref_jax.reconstruct.visual_hull import REACH, values_by_view
+from refref_jax.render.first_surface import find_first_surface
+
+# Triangles that are looked at first, and how many times more in each further round.
+_FIRST = 8
+_GROWTH = 4
+
+# And at most. Where more could hold the closest point, which is about a medial axis, all are about
+# as near as the nearest middles, and those are believed.
+_MOST = 128
+
+# Points times triangles of one sweep.
+_SWEEP = 1 << 20
+
+# A triangle is cut if an edge is longer than this share of the diameter.
+_LONGEST_EDGE = 0.04
+
+# A barycentric coordinate below this lies on the edge.
+_ON_EDGE = 1e-6
+
+
+class ClosestPoints(NamedTuple):
+    """What lies closest to some points.
+
+    Attributes:
+      points: on the surface.
+      distances: to them, world units, at least 0.
+      faces: that hold them.
+      weights: their barycentric coordinates there.
+    """
+
+    points: Float[np.ndarray, "points 3"]
+    distances: Float[np.ndarray, " points"]
+    faces: Int[np.ndarray, " points"]
+    weights: Float[np.ndarray, "points 3"]
+
+
+class ClosestSearch:
+    """Finds closest points of one mesh; holds its tree."""
+
+    def __init__(self, vertices: Vertices, faces: Faces):
+        """Builds the tree.
+
+        Raises:
+          ReconstructionError: if no triangle has an area.
+        """
+        kept = np.flatnonzero(~is_degenerate(vertices[faces]))
+        if len(kept) == 0:
+            raise ReconstructionError("The mesh has no triangle with an area. Make it again.")
+        self._corners = vertices[faces]
+        self._pieces, owner = _cut(vertices[faces[kept]], _LONGEST_EDGE * diameter(vertices))
+        self._owner = kept[owner]
+        middles = self._pieces.mean(axis=1)
+        self._radius = float(np.linalg.norm(self._pieces - middles[:, None], axis=-1).max())
+        self._tree = KDTree(middles)
+
+    def __call__(self, points: Points) -> ClosestPoints:
+        """Returns the closest point of the surface to each point."""
+        found, distance = np.zeros(points.shape), np.full(len(points), np.inf)
+        piece = np.zeros(len(points), np.int64)
+        left, count = np.arange(len(points)), min(_FIRST, len(self._pieces))
+        most = min(_MOST, len(self._pieces))
+        while len(left):
+            done = []
+            step = max(1, _SWEEP // count)
+            for some in (left[i : i + step] for i in range(0, len(left), step)):
+                found[some], distance[some], piece[some], reach = self._nearest(points[some], count)
+                beyond = distance[some] + self._radius <= reach
+                done.append(beyond | (count == most))
+            left = left[~np.concatenate(done)]
+            count = min(_GROWTH * count, most)
+        face = self._owner[piece]
+        weights = points_to_barycentric(self._corners[face], found)
+        return ClosestPoints(found, distance, face, weights)
+
+    def _nearest(
+        self, points: Points, count: int
+    ) -> tuple[Points, Values, Int[np.ndarray, " points"], Values]:
+        """Returns the closest among so many pieces, and how far their middles reach."""
+        away, near = self._tree.query(points, k=[*range(1, count + 1)])
+        corners = self._pieces[near].reshape(-1, 3, 3)
+        on = closest_point(corners, np.repeat(points, count, axis=0)).reshape(-1, count, 3)
+        distance = np.linalg.norm(on - points[:, None], axis=-1)
+        best = np.argmin(distance, axis=1)
+        row = np.arange(len(points))
+        return on[row, best], distance[row, best], near[row, best], away[:, -1]
+
+
+def signed_distance(mesh: Mesh) -> Field:
+    """Returns the exact distance to a closed mesh as a field, negative inside."""
+    search = ClosestSearch(mesh.vertices, mesh.faces)
+    of_faces = face_normals(mesh.vertices[mesh.faces])
+    of_edges = _edge_normals(mesh.faces, of_faces)
+    of_corners = corner_normals(mesh.vertices, mesh.faces, crease_angle=np.pi)
+
+    def field(points: Points) -> Values:
+        found = search(points)
+        small = found.weights < _ON_EDGE
+        row = found.faces
+        # The edge opposite a corner holds the points whose weight is small there.
+        normal = np.where(
+            small.any(axis=1)[:, None],
+            of_edges[row, np.argmin(found.weights, axis=1)],
+            of_faces[row],
+        )
+        at_corner = small.sum(axis=1) >= 2
+        corner = of_corners[row, np.argmax(found.weights, axis=1)]
+        normal = np.where(at_corner[:, None], corner, normal)
+        side = np.sum((points - found.points) * normal, axis=-1)
+        return np.where(side < 0.0, -found.distances, found.distances)
+
+    return field
+
+
+def _edge_normals(
+    faces: Faces, normals: Float[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "faces 3 3"]:
+    """Returns for every edge, by the opposite corner, the sum of the normals of its faces."""
+    edges = np.sort(faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
+    _, edge = np.unique(edges, axis=0, return_inverse=True)
+    edge = edge.reshape(-1)
+    owner = np.repeat(np.arange(len(faces)), 3)
+    sums = np.stack([np.bincount(edge, normals[owner, i]) for i in range(3)], axis=-1)
+    return sums[edge].reshape(-1, 3, 3)
+
+
+def _cut(
+    corners: Float[np.ndarray, "faces 3 3"], longest: float
+) -> tuple[Float[np.ndarray, "pieces 3 3"], Int[np.ndarray, " pieces"]]:
+    """Halves the longest edges of triangles until none is longer; and tells whose each piece is."""
+    owner, done, owners = np.arange(len(corners)), [], []
+    while len(corners):
+        edges = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
+        long = edges.max(axis=1) > longest
+        done.append(corners[~long])
+        owners.append(owner[~long])
+        corners, owner, edge = corners[long], owner[long], edges[long].argmax(axis=1)
+        row = np.arange(len(corners))
+        a, b, c = (corners[row, (edge + i) % 3] for i in range(3))
+        middle = 0.5 * (a + b)
+        halves = [np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)]
+        corners, owner = np.concatenate(halves), np.concatenate([owner, owner])
+    return np.concatenate(done), np.concatenate(owners)
+
+
+SAMPLES = 20_000
+"""Points on each surface."""
+
+
+class Distance(NamedTuple):
+    """How far two surfaces are from each other.
+
+    Attributes:
+      chamfer: mean distance from one surface to the other, mean of both ways, as a share of the
+        true mesh's diameter (the diagonal of its box).
+      furthest: largest distance of either way, as a share of the diameter.
+      normal_error: mean angle in degrees between the shading normals at points of the mesh and at
+        the closest points of the true one.
+      normal_error_99: the angle that 99 of 100 points stay below.
+    """
+
+    chamfer: float
+    furthest: float
+    normal_error: float
+    normal_error_99: float
+
+
+def compare_meshes(mesh: Mesh, truth: Mesh, *, samples: int = SAMPLES, seed: int = 0) -> Distance:
+    """Compares a mesh with the true one, at points spread evenly by area over each.
+
+    Args:
+      mesh: any.
+      truth: what it should be; its size is the unit.
+      samples: points on each surface. Distances to the other are exact.
+      seed: of the points.
+    """
+    generator = np.random.default_rng(seed)
+    points, normals = _spread(mesh, samples, generator)
+    there, _ = _spread(truth, samples, generator)
+    forth = ClosestSearch(truth.vertices, truth.faces)(points)
+    back = ClosestSearch(mesh.vertices, mesh.faces)(there)
+    expected = unit_vectors(np.einsum("nk,nkc->nc", forth.weights, truth.normals[forth.faces]))
+    cosine = np.clip(np.sum(normals * expected, axis=-1), -1.0, 1.0)
+    angles = np.degrees(np.arccos(cosine))
+    size = diameter(truth.vertices)
+    return Distance(
+        0.5 * float(forth.distances.mean() + back.distances.mean()) / size,
+        float(max(forth.distances.max(), back.distances.max())) / size,
+        float(angles.mean()),
+        float(np.percentile(angles, 99.0)),
+    )
+
+
+def silhouette_overlap(
+    mesh: Mesh, masks: Bool[np.ndarray, "views h w"], cameras: Cameras
+) -> Float[np.ndarray, " views"]:
+    """Returns for each view the pixels in both mask and silhouette over those in either (IoU).
+
+    A pixel is in the silhouette if the ray through its centre meets the mesh, as the data set's
+    masks are made. A view in which both are empty counts 1.
+    """
+    return overlaps(silhouettes(mesh, cameras), masks)
+
+
+def silhouettes(mesh: Mesh, cameras: Cameras) -> Bool[np.ndarray, "views h w"]:
+    """Returns which pixels see a mesh."""
+    surfaces = pack_meshes([mesh])
+    views: Sequence[int] = range(len(cameras.poses))
+    return np.stack(
+        [np.isfinite(find_first_surface(surfaces, image_rays(cameras, i)).distances) for i in views]
+    )
+
+
+def _spread(
+    mesh: Mesh, count: int, generator: np.random.Generator
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Returns points spread over a mesh, and their interpolated unit normals."""
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
+    )
+    # One point in each of equal shares of the area.
+    total = np.cumsum(area)
+    at = (np.arange(count) + generator.uniform(size=count)) / count * total[-1]
+    face = np.minimum(np.searchsorted(total, at), len(area) - 1)
+    u, v = generator.uniform(size=(2, count))
+    root = np.sqrt(u)
+    weights = np.stack([1.0 - root, root * (1.0 - v), root * v], axis=-1)
+    points = np.einsum("nk,nkc->nc", weights, corners[face])
+    return points, unit_vectors(np.einsum("nk,nkc->nc", weights, mesh.normals[face]))
+
+
+# Points along each edge of the cube in which a body is looked for.
+_POINTS = 64
+
+
+def without_outliers(mesh: Mesh, views: Views, count: int) -> Views:
+    """Returns views without so many whose masks overlap least with the silhouettes of a mesh.
+
+    Raises:
+      ReconstructionError: if no view would be left, or masks and cameras do not fit each other.
+    """
+    check_masks(*views)
+    if not 0 <= count < len(views.masks):
+        raise ReconstructionError(
+            f"{count} of {len(views.masks)} views can not be left out. Give fewer, 0 or more."
+        )
+    if count == 0:
+        return views
+    overlaps = silhouette_overlap(mesh, *views)
+    return views_at(views, np.sort(np.argsort(overlaps, kind="stable")[count:]))
+
+
+def carved_alone(views: Views) -> Values:
+    """Returns for each view the share of what all others leave that it carves away.
+
+    Measured on a lattice of 64 points along each edge of the cube in which a body is looked for,
+    see `visual_hull.REACH`; 0 where the others leave none of them.
+
+    Raises:
+      ReconstructionError: if masks and cameras do not fit each other.
+    """
+    check_masks(*views)
+    ends = np.full(3, REACH)
+    values = values_by_view(*views, lattice(Box(-ends, ends), _POINTS))
+    carved, seen = values > 0.0, np.any(values > -np.inf, axis=0)
+    times = carved.sum(axis=0)
+    alone = np.sum(carved & (times == 1), axis=1)
+    return alone / np.maximum(alone + np.sum(seen & (times == 0)), 1)

@@ -1,0 +1,235 @@
+"""Renders scenes with a known background, without learned fields.
+
+The radiance function is evaluated at the last segment of every path, and the colour of a ray is the
+weighted sum over its paths. The function can be any JAX function of one ray, `radiance(origin,
+direction)` to linear RGB: a background (`backgrounds.radiance_of`) or a custom function. If it is a
+pytree, such as `jax.tree_util.Partial(function, arrays)`, its arrays are arguments of the compiled
+program; values that a plain function closes over are constants, and every new function triggers a
+compilation.
+
+Rays are rendered in tiles of fixed size, so that memory is bounded and programs compile once: this
+is one of the modules that call `jax.jit`.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from refref_jax.geometry.rays import Rays
+from refref_jax.optics import light_paths, path_tracing
+from refref_jax.optics.light_paths import LightPaths, PathEnds
+from refref_jax.optics.path_settings import Budget
+from refref_jax.optics.scene import Scene
+from refref_jax.render import colour, images
+from refref_jax.render.backgrounds import Radiance
+
+TILE = 65536
+"""Number of rays traced at once."""
+
+_INSTEAD = (
+    "Call it outside, or use trace or follow_main_branches and shade, which are pure functions."
+)
+
+# Number of paths whose radiance is evaluated at once.
+_CHUNK = 4096
+
+
+class KnownRendering(NamedTuple):
+    """Rendered rays. The leading axes are those of the rays.
+
+    Attributes:
+      rgb: sRGB colours in `[0, 1]`.
+      linear: linear RGB colours, not clipped.
+      paths: number of light paths of each ray.
+      lost: dropped throughput of each ray, because a path buffer was full or truncated paths are
+        black.
+      casts: total number of closest-hit queries.
+    """
+
+    rgb: Float[np.ndarray, "*rays 3"]
+    linear: Float[np.ndarray, "*rays 3"]
+    paths: Int[np.ndarray, "*rays"]
+    lost: Float[np.ndarray, "*rays 3"]
+    casts: int
+
+
+class _Tile(NamedTuple):
+    """Rendered rays of a tile; fields as in `KnownRendering`."""
+
+    rgb: Float[Array, "rays 3"]
+    linear: Float[Array, "rays 3"]
+    paths: Int[Array, " rays"]
+    lost: Float[Array, "rays 3"]
+    casts: Int[Array, ""]
+
+
+def render_known(
+    geometry: Scene,
+    radiance: Radiance,
+    rays: Rays,
+    *,
+    budget: Budget,
+    inside: Int[np.ndarray, "*rays slots"] | None = None,
+    tile: int = TILE,
+) -> KnownRendering:
+    """Renders any number of rays in front of a known background; 0 rays give an empty rendering.
+
+    Args:
+      geometry: the scene.
+      radiance: function of origin and direction that returns the background's linear RGB.
+      rays: camera rays with any leading axes, usually `[height, width]`.
+      budget: path settings.
+      inside: interior list of each ray's origin, for the rule `priority` (see
+        `data.containment.parts_around`); none by default.
+      tile: number of rays traced at once. Lower it if memory runs out. The rays of a tile share the
+        path buffers, so with few rays, throughput is dropped sooner.
+
+    Raises:
+      ValueError: if `tile` is less than 1, or the radiance function does not return three numbers.
+      TypeError: if it is called in a function that JAX transforms; see `shade`.
+
+    Example:
+      >>> import trimesh
+      >>> import refref_jax
+      >>> from refref_jax.render import render_known
+      >>> glass = refref_jax.single_body(trimesh.creation.box(), index=1.5)
+      >>> camera = refref_jax.orbit(1, distance=4.0, elevation=0.3, size=4, angle_x=0.5)
+      >>> rays = refref_jax.image_rays(camera, 0)
+      >>> sky = lambda origin, direction: 0.5 + 0.5 * direction
+      >>> picture = render_known(glass, sky, rays, budget=refref_jax.BUDGETS["straight"])
+      >>> picture.rgb.shape, picture.casts
+      ((4, 4, 3), 0)
+    """
+    if tile < 1:
+        raise ValueError(f"tile is {tile}, but a tile needs rays. Give 1 or more.")
+    if jax.tree.structure(radiance) == jax.tree.structure(0):
+        radiance = jax.tree_util.Partial(radiance)  # a plain function cannot be an argument of jit
+    count = rays.radii.size
+    tile = images.size_for(count, most=tile)
+    # Transferred to the device once, not once per tile.
+    geometry, radiance = jax.device_put((geometry, radiance))
+    casts = []
+
+    def see(
+        rays: Rays, inside: Int[np.ndarray, "rays slots"] | None, real: int
+    ) -> tuple[Array | np.ndarray, ...]:
+        # Each padding ray misses, which counts as one cast if rays are cast at all.
+        seen = images.fetch(
+            _render_tile(geometry, radiance, rays, inside, budget=budget), instead=_INSTEAD
+        )
+        casts.append(int(seen.casts) - (tile - real) * (budget.bends > 0))
+        return seen[:-1]
+
+    fields = images.in_tiles(
+        see, rays, tile=tile, nothing=_blank()[:-1], instead=_INSTEAD, inside=inside
+    )
+    return KnownRendering(*fields, sum(casts))
+
+
+def shade(paths: LightPaths | PathEnds, radiance: Radiance, *, rays: int) -> Float[Array, "rays 3"]:
+    """Returns the linear RGB of rays: the sum over their paths of weight times radiance.
+
+    This is a pure function, for use under jit, vmap and differentiation: with respect to the
+    radiance function's parameters, and to paths that have gradients (`follow_branch`,
+    `follow_main_branches`).
+
+    Args:
+      paths: paths of these rays, along one axis, or a single path. If `trace` or `follow_branch`
+        was mapped, map this function too.
+      radiance: function of origin and direction that returns linear RGB; it is evaluated at the
+        last segment of every path.
+      rays: number of rays that the paths belong to.
+
+    Raises:
+      ValueError: if the paths have more than one axis, or the radiance function does not return
+        three numbers.
+
+    Example:
+      >>> import numpy as np
+      >>> import refref_jax
+      >>> from refref_jax.render import shade
+      >>> ray = refref_jax.Rays(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.full(1, 1e-3))
+      >>> empty = refref_jax.assemble([])
+      >>> paths = refref_jax.trace(empty, ray, budget=refref_jax.BUDGETS["straight"]).paths
+      >>> shade(paths, lambda origin, direction: 0.5 + 0.5 * direction, rays=1).tolist()
+      [[0.5, 0.5, 1.0]]
+    """
+    if paths.statuses.ndim > 1:
+        raise ValueError(
+            f"The paths have the axes {paths.statuses.shape}, but one axis is expected. Apply "
+            "jax.vmap to shade as well as to the function that traced the paths."
+        )
+    if paths.statuses.ndim == 0:
+        paths = jax.tree.map(lambda x: x[None], paths)
+    ends = light_paths.ends_of(paths) if isinstance(paths, LightPaths) else paths
+    exists = light_paths.exists(ends)
+    # Empty slots use the segment of the first path, so that the input of radiance is valid.
+    held = jnp.where(exists, jnp.arange(exists.shape[0], dtype=jnp.int32), 0)
+    ends = jax.tree.map(lambda x: x[held], ends)
+    return jax.ops.segment_sum(_light(radiance, ends, exists), ends.rays, num_segments=rays)
+
+
+def _blank() -> KnownRendering:
+    nothing = np.zeros((0, 3), np.float32)
+    return KnownRendering(nothing, nothing, np.zeros(0, np.int32), nothing, casts=0)
+
+
+@functools.partial(jax.jit, static_argnames="budget")
+def _render_tile(
+    geometry: Scene,
+    radiance: Radiance,
+    rays: Rays,
+    inside: Int[Array, "rays slots"] | None,
+    *,
+    budget: Budget,
+) -> _Tile:
+    count = rays.radii.shape[0]
+    traced = path_tracing.trace_ends(geometry, rays, budget=budget, inside=inside)
+    ends = traced.ends
+    linear = _sum_light(radiance, ends, count)
+    exists = light_paths.exists(ends).astype(jnp.int32)
+    return _Tile(
+        rgb=jnp.clip(colour.linear_to_srgb(linear), 0.0, 1.0),
+        linear=linear,
+        paths=jax.ops.segment_sum(exists, ends.rays, num_segments=count),
+        lost=traced.lost,
+        casts=traced.casts,
+    )
+
+
+def _sum_light(radiance: Radiance, ends: PathEnds, rays: int) -> Float[Array, "rays 3"]:
+    """Returns the linear RGB of each ray, evaluated in chunks up to the last path.
+
+    The list usually has many empty slots, and a texture lookup costs about as much as casting a
+    ray.
+    """
+    slots = ends.rays.shape[0]
+    chunk = min(_CHUNK, slots)
+    count = jnp.sum(light_paths.exists(ends), dtype=jnp.int32)
+
+    def add(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        start, linear = state
+        index = start + jnp.arange(chunk, dtype=jnp.int32)
+        part = jax.tree.map(lambda x: x[jnp.minimum(index, slots - 1)], ends)
+        light = _light(radiance, part, index < count)
+        return start + chunk, linear.at[part.rays].add(light)
+
+    begin = jnp.zeros((), jnp.int32), jnp.zeros((rays, 3), ends.weights.dtype)
+    return jax.lax.while_loop(lambda state: state[0] < count, add, begin)[1]
+
+
+def _light(
+    radiance: Radiance, ends: PathEnds, real: Bool[Array, " paths"]
+) -> Float[Array, "paths 3"]:
+    """Returns the contribution of each path to its ray; 0 for paths that are not `real`."""
+    seen = jax.vmap(radiance)(ends.origins, ends.directions)
+    if seen.shape != ends.directions.shape:
+        raise ValueError(
+            f"The radiance function returned an array of shape {seen.shape[1:]} for one ray. "
+            "Return linear RGB, of shape (3,)."
+        )
+    return jnp.where(real[:, None], ends.weights * seen.astype(ends.weights.dtype), 0.0)

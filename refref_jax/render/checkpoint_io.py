@@ -1,0 +1,187 @@
+"""A model on disk: what a run folder holds for rendering.
+
+    {run}/model.json            static description (`SavedModel`)
+    {run}/geometry.npz          surfaces and interfaces
+    {run}/checkpoints/{step}/   parameters, and the training state beside them
+
+A model can be rendered from these alone, without the scene that it was trained on.
+"""
+
+import dataclasses
+import os
+import zipfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+
+from refref_jax import configuration
+from refref_jax.fields import registry
+from refref_jax.geometry.bvh import BVH
+from refref_jax.geometry.surfaces import Surfaces
+from refref_jax.optics.media import Interfaces
+from refref_jax.optics.path_settings import Budget
+from refref_jax.optics.scene import Scene
+from refref_jax.render.model import Model, ModelConfig, Params, init_params
+
+_MODEL = "model.json"
+_GEOMETRY = "geometry.npz"
+
+CHECKPOINTS = "checkpoints"
+
+PARAMS_ITEM = "params"
+TRAINING_ITEM = "training"
+
+
+@dataclasses.dataclass(frozen=True)
+class SavedModel:
+    """The static half of a model.
+
+    Attributes:
+      config: fields and sampling.
+      budget: which light is followed.
+    """
+
+    config: ModelConfig
+    budget: Budget
+
+
+def save_scene(run: Path, saved: SavedModel, geometry: Scene) -> None:
+    """Writes everything but the parameters into an existing folder."""
+    write_static(run, saved)
+    surfaces, interfaces = geometry
+    np.savez_compressed(
+        run / _GEOMETRY,
+        **surfaces.bvh._asdict(),
+        normals=surfaces.normals,
+        parts=surfaces.parts,
+        **interfaces._asdict(),
+    )
+
+
+def write_static(run: Path, saved: SavedModel) -> None:
+    """Writes the static half of a model into an existing folder."""
+    configuration.write(run / _MODEL, saved)
+
+
+def read_static(run: Path) -> SavedModel:
+    """Reads the static half of a model."""
+    return configuration.read(run / _MODEL, SavedModel, variants=registry.variants())
+
+
+def load_model(run: str | os.PathLike[str], *, step: int | None = None) -> Model:
+    """Loads a trained model.
+
+    Args:
+      run: the folder that training wrote.
+      step: which checkpoint; the newest by default.
+
+    Raises:
+      ValueError: if the folder is not a run, or has no such checkpoint.
+    """
+    run = Path(run)
+    saved = read_static(run)
+    shapes = jax.eval_shape(lambda: init_params(jax.random.key(0), saved.config))
+    with open_checkpoints(run) as manager:
+        step = find_step(manager, run, step)
+        params = restore(manager, step, {PARAMS_ITEM: shapes})[PARAMS_ITEM]
+    # What is restored is bound to a device, and so is all that is made of it. The sums with which
+    # an image begins are not, and the chunk that they go to would be compiled for itself.
+    unbound = jax.tree.map(jnp.asarray, jax.device_get(params))
+    return Model(saved.config, saved.budget, load_geometry(run), Params(*unbound))
+
+
+def latest_step(run: Path) -> int:
+    """Returns the step of a run's newest checkpoint.
+
+    Raises:
+      ValueError: if there is none.
+    """
+    with open_checkpoints(run) as manager:
+        return find_step(manager, run, None)
+
+
+def open_checkpoints(run: Path, *, keep: int | None = None) -> ocp.CheckpointManager:
+    """Opens the checkpoints of a run.
+
+    Args:
+      run: the run folder.
+      keep: how many of the newest to keep; `None` to read only.
+    """
+    # Not Orbax's `read_only`, of which it warns each time: a manager that is asked for nothing but
+    # to restore writes nothing either.
+    chosen = {"create": False} if keep is None else {"max_to_keep": keep}
+    return ocp.CheckpointManager(
+        (run / CHECKPOINTS).absolute(),
+        item_names=(PARAMS_ITEM, TRAINING_ITEM),
+        options=ocp.CheckpointManagerOptions(**chosen),
+    )
+
+
+def find_step(manager: ocp.CheckpointManager, run: Path, step: int | None) -> int:
+    """Returns the wanted checkpoint, or the newest.
+
+    Raises:
+      ValueError: if it does not exist.
+    """
+    steps = sorted(manager.all_steps())
+    if not steps:
+        raise ValueError(
+            f"{run} holds no checkpoint. Train it first, or give the folder of a finished run."
+        )
+    if step is not None and step not in steps:
+        raise ValueError(f"{run} has no checkpoint of step {step}. It has {steps}: choose one.")
+    return steps[-1] if step is None else step
+
+
+def restore(manager: ocp.CheckpointManager, step: int, items: dict) -> ocp.args.Composite:
+    """Reads some items of a checkpoint into the shapes and types that are given.
+
+    Args:
+      manager: of the checkpoints.
+      step: of the checkpoint.
+      items: shapes by the name of the item. Those without a sharding are read onto one device, from
+        however many they were written.
+
+    Raises:
+      ValueError: if it is damaged.
+    """
+    here = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    items = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding or here), items
+    )
+    arguments = {name: ocp.args.StandardRestore(shapes) for name, shapes in items.items()}
+    try:
+        return manager.restore(step, args=ocp.args.Composite(**arguments))
+    except Exception as error:  # Orbax raises what its storage does
+        raise ValueError(
+            f"The checkpoint {manager.directory / str(step)} can not be read ({_brief(error)}). "
+            "Remove it to use an older one, or train again."
+        ) from error
+
+
+def load_geometry(run: Path) -> Scene:
+    """Reads the geometry that a run was made with.
+
+    Raises:
+      ValueError: if the file is missing or damaged.
+    """
+    path = run / _GEOMETRY
+    try:
+        with np.load(path) as arrays:
+            bvh = BVH(*(arrays[name] for name in BVH._fields))
+            surfaces = Surfaces(bvh, arrays["normals"], arrays["parts"])
+            interfaces = Interfaces(*(arrays[name] for name in Interfaces._fields))
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(
+            f"{path} can not be read ({_brief(error)}). Restore it, or train again into another "
+            "folder."
+        ) from error
+    return jax.tree.map(jax.numpy.asarray, Scene(surfaces, interfaces))
+
+
+def _brief(error: Exception) -> str:
+    """Returns the kind of an error and the first line of what it says."""
+    return f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"

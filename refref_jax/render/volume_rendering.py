@@ -1,0 +1,337 @@
+"""Samples one light path and integrates radiance along it.
+
+Volume rendering of one path from its samples.
+
+Letters, as in the paper (arXiv 2505.05848, section 4.1): interval `i` has density `sigma_i` and
+length `delta_i`; `T_i = exp(-sum_{j<i} sigma_j delta_j)` is the light that reaches it and
+`w_i = T_i (1 - exp(-sigma_i delta_i))` its weight in the colour.
+
+Radiance of one light path: proposal levels, then the radiance field.
+
+All functions take one path; `pixels` maps them over a batch.
+
+Source: Barron et al., Mip-NeRF 360 (2022), section 3, and Zip-NeRF (2023); paper (arXiv
+2505.05848), section 4.2, for samples and directions on the bent path.
+
+Queries of a model's radiance field at world points, without light paths.
+
+They are used to export surfaces and point clouds. The field inside objects is meaningless if the
+model takes no samples there.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from refref_jax import numerics
+from refref_jax.fields import registry
+from refref_jax.optics.light_paths import LightPaths
+from refref_jax.render.model import ModelConfig, Params
+from refref_jax.sampling import cones, polylines, scene_bounds, stepfun
+from refref_jax.sampling.cones import Gaussians
+from refref_jax.sampling.polylines import Polyline
+
+
+class Composite(NamedTuple):
+    """Colour and distance of a path.
+
+    Attributes:
+      rgb: linear colour.
+      accumulation: sum of the weights, in `[0, 1]`.
+      median: distance at which the cumulative weight is 0.5; `inf` if the accumulation is lower.
+        This is the paper's distance: the nearest relevant surface, even if it is translucent.
+      mean: weighted mean distance; `inf` if the accumulation is 0.
+    """
+
+    rgb: Float[Array, "3"]
+    accumulation: Float[Array, ""]
+    median: Float[Array, ""]
+    mean: Float[Array, ""]
+
+
+def alpha_weights(
+    density: Float[Array, " samples"], lengths: Float[Array, " samples"]
+) -> Float[Array, " samples"]:
+    """Returns the weights `w_i`, which sum to at most 1.
+
+    Value and gradient are finite for any density and length in `[0, inf)` whose product does not
+    overflow; the product may be infinite if it is not `0 * inf`. Edges that differ by a rounding
+    error may be out of order: lengths below 0 count as 0, because an opaque sample would otherwise
+    have a weight of minus infinity.
+
+    Source: paper, volume rendering equation.
+    """
+    depth = density * jnp.where(lengths < 0.0, 0.0, lengths)
+    before = jnp.concatenate([jnp.zeros_like(depth[:1]), jnp.cumsum(depth[:-1])])
+    return jnp.exp(-before) * -jnp.expm1(-depth)
+
+
+def opaque_end(weights: Float[Array, " samples"]) -> Float[Array, " samples"]:
+    """Adds the remaining transmittance to the last sample, as if it were opaque.
+
+    The weights then sum to 1 for any density.
+    """
+    return weights.at[-1].set(jnp.maximum(1.0 - jnp.sum(weights[:-1]), 0.0))
+
+
+def composite(
+    weights: Float[Array, " samples"],
+    rgb: Float[Array, "samples 3"],
+    edges: Float[Array, " samples+1"],
+) -> Composite:
+    """Sums the samples of a path.
+
+    Args:
+      weights: weights `w_i`.
+      rgb: linear colours.
+      edges: distances of the edges of the intervals.
+    """
+    accumulation = jnp.sum(weights)
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    mean = numerics.safe_divide(jnp.sum(weights * middles), accumulation)
+    half = jnp.full((1,), 0.5, weights.dtype)
+    level = numerics.safe_divide(half, accumulation[None])
+    median = stepfun.invert_cumulative(level, edges, stepfun.cumulative(weights))[0]
+    return Composite(
+        rgb=jnp.sum(weights[:, None] * rgb, axis=0),
+        accumulation=accumulation,
+        median=jnp.where(accumulation >= 0.5, median, jnp.inf),
+        mean=jnp.where(accumulation > 0.0, mean, jnp.inf),
+    )
+
+
+# Minimum dilation of a proposal, in units of the full path (Mip-NeRF 360, supplement).
+_DILATION_BIAS = 0.0025
+
+# Minimum length of a path, in units of the scene radius: `s` keeps four digits in float32.
+_SHORTEST = 1e-3
+
+# Rotation between adjacent cone patterns (Zip-NeRF, supplement).
+_PATTERN_TURN = jnp.pi / 6.0
+
+
+class Jitter(NamedTuple):
+    """Random offsets for stratified sampling of a path; all zero for rendering without noise.
+
+    Attributes:
+      offsets: offset of all samples of each sampling level, in `[-0.5, 0.5)` strata.
+      rotations: rotation of each sampling level's cone patterns, radians.
+    """
+
+    offsets: Float[Array, "*paths rounds"]
+    rotations: Float[Array, "*paths rounds"]
+
+
+class Histogram(NamedTuple):
+    """Weights of one sampling level along a path.
+
+    Attributes:
+      edges: edges of the intervals, in the normalised coordinate `s` in `[0, 1]`.
+      weights: weight of each interval in the colour of the path.
+    """
+
+    edges: Float[Array, "*paths edges"]
+    weights: Float[Array, "*paths samples"]
+
+
+class PathRadiance(NamedTuple):
+    """Radiance of one path.
+
+    Attributes:
+      composite: colour and distances; distances are arc length from the camera.
+      histograms: histogram of each proposal level, then of the radiance field.
+      outside: whether each of the final intervals is outside the objects (by its middle).
+    """
+
+    composite: Composite
+    histograms: tuple[Histogram, ...]
+    outside: Bool[Array, " samples"]
+
+
+class _Round(NamedTuple):
+    """The intervals of one sampling level, in all coordinates.
+
+    Attributes:
+      s: edges in the normalised coordinate.
+      t: edges in the coordinate of the polyline, world units.
+      gaussians: multisamples of each interval, in the unit cube.
+    """
+
+    s: Float[Array, " edges"]
+    t: Float[Array, " edges"]
+    gaussians: Gaussians
+
+
+def path_radiance(
+    params: Params,
+    config: ModelConfig,
+    path: LightPaths,
+    jitter: Jitter,
+    anneal: Float[Array, ""],
+) -> PathRadiance:
+    """Renders one light path.
+
+    Args:
+      params: parameters of the model.
+      config: configuration of the model.
+      path: one light path.
+      jitter: jitter of the path.
+      anneal: exponent on the proposals' weights, from 0 for uniform sampling to 1 for the
+        proposals' distribution.
+    """
+    line = _polyline(config, path)
+    warp = distance_warp(config, line)
+    # No interval straddles an interface, if there are enough edges.
+    bends = scene_bounds.to_unit(warp, line.knots[1:])
+    histograms = []
+    for level, proposal in enumerate(config.proposals):
+        s = _resample(config, histograms, jitter.offsets[level], anneal, proposal.samples)
+        s = stepfun.snap(s, bends)
+        samples = _place(config, line, warp, s, jitter.rotations[level])
+        see = jax.vmap(registry.density, in_axes=(None, None, 0))
+        density = see(params.proposals[level], proposal.field, samples.gaussians)
+        histograms.append(Histogram(s, _weigh(config, density, samples.t)))
+
+    s = _resample(config, histograms, jitter.offsets[-1], anneal, config.samples)
+    s = stepfun.snap(s, bends)
+    samples = _place(config, line, warp, s, jitter.rotations[-1])
+    middles = 0.5 * (samples.t[1:] + samples.t[:-1])
+    points = jax.vmap(polylines.point_at, in_axes=(None, 0))(line, middles)
+    see = jax.vmap(registry.radiance, in_axes=(None, None, 0, 0))
+    seen = see(params.field, config.field, samples.gaussians, points.direction)
+    weights = _weigh(config, seen.density, samples.t)
+    composited = composite(weights, seen.rgb, samples.t)
+    return PathRadiance(
+        composite=_in_arc_length(line, composited),
+        histograms=(*histograms, Histogram(s, weights)),
+        outside=points.outside,
+    )
+
+
+def rounds(config: ModelConfig) -> int:
+    """Returns the number of sampling levels, including the final one."""
+    return len(config.proposals) + 1
+
+
+def distance_warp(config: ModelConfig, line: Polyline) -> scene_bounds.DistanceWarp:
+    """Returns the distance warp of a path, which ends at the scene bounds, if any.
+
+    The far distance is measured from the last bend, so that paths with many bends still reach the
+    background.
+    """
+    last = jnp.sum(jnp.isfinite(line.knots)) - 1
+    leave = scene_bounds.exit_distance(domain(config), line.points[last], line.directions[last])
+    far = line.knots[last] + jnp.where(jnp.isfinite(leave), leave, config.far)
+    # Keep a minimum length for samples even if the camera is on the scene bounds.
+    far = jnp.maximum(far, config.near + _SHORTEST * config.radius)
+    return scene_bounds.DistanceWarp(config.near, far, config.radius)
+
+
+def domain(config: ModelConfig) -> scene_bounds.Domain:
+    """Returns the scene bounds of a model."""
+    return scene_bounds.Domain(config.radius, config.space)
+
+
+def _polyline(config: ModelConfig, path: LightPaths) -> Polyline:
+    if config.interior == "field":
+        return polylines.whole_path(path)
+    return polylines.outside_path(path)
+
+
+def _resample(
+    config: ModelConfig,
+    histograms: Sequence[Histogram],
+    offset: Float[Array, ""],
+    anneal: Float[Array, ""],
+    samples: int,
+) -> Float[Array, " edges"]:
+    """Samples the next level's intervals from the last histogram; uniformly at first."""
+    strata = (jnp.arange(samples, dtype=offset.dtype) + 0.5 + offset) / samples
+    if not histograms:
+        ends = jnp.array([0.0, 1.0], offset.dtype)
+        even = stepfun.sample_edges(strata, ends, jnp.ones_like(ends[:1]))
+        # Jitter must not shorten the path: its end is opaque and would move with the noise.
+        return even.at[jnp.array([0, -1])].set(ends)
+    edges, weights = jax.lax.stop_gradient(histograms[-1])
+    if config.dilation > 0.0:
+        drawn = math.prod(histogram.weights.shape[-1] for histogram in histograms)
+        edges, weights = stepfun.dilate(edges, weights, config.dilation / drawn + _DILATION_BIAS)
+    # Bins of width 0 stay empty; the others tend to equal weight as the exponent tends to 0.
+    trusted = jnp.where(jnp.diff(edges) > 0.0, weights**anneal, 0.0)
+    return stepfun.sample_edges(strata, edges, trusted)
+
+
+def _place(
+    config: ModelConfig,
+    line: Polyline,
+    warp: scene_bounds.DistanceWarp,
+    s: Float[Array, " edges"],
+    rotation: Float[Array, ""],
+) -> _Round:
+    """Maps intervals to the path, and their multisamples to the field's unit cube."""
+    t = scene_bounds.to_distance(warp, s)
+    turns = rotation + _PATTERN_TURN * (jnp.arange(t.shape[0] - 1, dtype=t.dtype) % 2)
+
+    def cone(start: Array, end: Array, turn: Array) -> Gaussians:
+        world = cones.multisamples(line, start, end, turn, count=config.multisamples)
+        return scene_bounds.to_unit_cube(domain(config), world)
+
+    return _Round(s, t, jax.vmap(cone)(t[:-1], t[1:], turns))
+
+
+def _weigh(
+    config: ModelConfig, density: Float[Array, " samples"], edges: Float[Array, " edges"]
+) -> Float[Array, " samples"]:
+    """Converts densities to weights; the last interval is opaque, like the background."""
+    lengths = jnp.diff(edges) / config.radius
+    return opaque_end(alpha_weights(density, lengths))
+
+
+def _in_arc_length(line: Polyline, composite: Composite) -> Composite:
+    """Converts distances from the coordinate of the polyline to arc length."""
+    arc = jax.vmap(lambda t: polylines.point_at(line, t).arc)
+    median, mean = arc(jnp.stack([composite.median, composite.mean]))
+    return composite._replace(median=median, mean=mean)
+
+
+class FieldPoint(NamedTuple):
+    """Values of the field at a point.
+
+    Attributes:
+      density: density per world unit, non-negative: the transmittance of a short distance `dt` is
+        `exp(-density dt)`.
+      linear: linear RGB radiance, opposite to the direction of travel.
+    """
+
+    density: Float[Array, ""]
+    linear: Float[Array, "3"]
+
+
+def look_up(
+    params: Params,
+    config: ModelConfig,
+    point: Float[Array, "3"],
+    direction: Float[Array, "3"],
+    *,
+    width: float,
+) -> FieldPoint:
+    """Returns density and colour at one point; map it over many.
+
+    Args:
+      params: parameters of the model.
+      config: configuration of the model.
+      point: position in world units; beyond the scene bounds, their nearest point is used.
+      direction: unit direction of travel of the viewing path.
+      width: edge of the cell around the point, world units: finer detail is blurred.
+    """
+    # Standard deviation of a cube along each axis.
+    scale = jnp.full((1,), width, point.dtype) / jnp.sqrt(jnp.asarray(12.0, point.dtype))
+    bounds = domain(config)
+    held = scene_bounds.nearest_within(bounds, point)
+    cell = scene_bounds.to_unit_cube(bounds, Gaussians(held[None], scale))
+    seen = registry.radiance(params.field, config.field, cell, direction)
+    return FieldPoint(seen.density / config.radius, seen.rgb)

@@ -1,0 +1,168 @@
+"""Scene bounds, contraction, and the distance warp along a ray.
+
+Maps world space to the unit cube in which a field is stored.
+
+A bounded scene is a scaled cube, and a spherical scene is the ball in this cube. An unbounded scene
+is contracted: a ball around the origin is unchanged, and the space beyond it is contracted to a
+shell of the same thickness.
+
+Source: Barron et al., Mip-NeRF 360 (2022), Eq 10; Zip-NeRF (2023), section 2, for the scale of a
+contracted Gaussian.
+
+Maps distance along a path to the unit interval in which samplers work, and back.
+
+Letters: `t` is distance in world units, `s` the normalised coordinate in `[0, 1]`. Equal steps in
+`s` are short near the camera and grow with distance, so that one interval covers near and far.
+
+Source: Barron et al., Zip-NeRF (2023), section 4: the power transformation with
+`lambda = -1.5`, applied to twice the distance.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from refref_jax import numerics
+from refref_jax.choices import Space
+from refref_jax.sampling.cones import Gaussians
+
+
+class Domain(NamedTuple):
+    """Scene bounds: the part of space that a field stores.
+
+    Attributes:
+      radius: half edge of a bounded scene's cube, or radius of a spherical scene or of an
+        unbounded scene's uncontracted ball; world units.
+      space: `bounded` by the cube, `spherical` (bounded by the ball), or `unbounded` (contracted
+        beyond the ball).
+    """
+
+    radius: float
+    space: Space
+
+
+def to_unit_cube(domain: Domain, gaussian: Gaussians) -> Gaussians:
+    """Maps world-space Gaussians to `[0, 1]^3`; scales become fractions of the cube's edge.
+
+    In bounded and spherical scenes, points outside the cube are moved to its nearest face.
+    """
+    positions = gaussian.positions / domain.radius
+    scales = gaussian.scales / domain.radius
+    if domain.space == "unbounded":
+        return Gaussians(0.25 * contract(positions) + 0.5, 0.25 * scales * shrinkage(positions))
+    return Gaussians(jnp.clip(0.5 * positions + 0.5, 0.0, 1.0), 0.5 * scales)
+
+
+def nearest_within(domain: Domain, point: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Returns the nearest point in the domain; points inside it are unchanged."""
+    if domain.space == "unbounded":
+        return point
+    if domain.space == "spherical":
+        return point * (domain.radius / jnp.maximum(numerics.length(point), domain.radius))
+    return jnp.clip(point, -domain.radius, domain.radius)
+
+
+def exit_distance(
+    domain: Domain, origin: Float[Array, "3"], direction: Float[Array, "3"]
+) -> Float[Array, ""]:
+    """Returns the distance at which a ray leaves the cube or ball of the scene bounds.
+
+    The result is `inf` in an unbounded scene and for rays that miss the bounds. Do not use its
+    gradient: the face through which a ray leaves changes abruptly.
+
+    Source: the slab method for the cube, Kay and Kajiya (1986).
+    """
+    if domain.space == "unbounded":
+        return jnp.full_like(origin[0], jnp.inf)
+    if domain.space == "spherical":
+        middle, half = chord(domain.radius, origin, direction)
+        return jnp.where((half > 0.0) & (middle + half >= 0.0), middle + half, jnp.inf)
+    inverse = numerics.safe_reciprocal(direction)
+    first = (-domain.radius - origin) * inverse
+    second = (domain.radius - origin) * inverse
+    enter, leave = jnp.max(jnp.minimum(first, second)), jnp.min(jnp.maximum(first, second))
+    return jnp.where((enter <= leave) & (leave >= 0.0), leave, jnp.inf)
+
+
+def chord(
+    radius: float | Float[Array, ""], origin: Float[Array, "3"], direction: Float[Array, "3"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Returns the chord of a line in a sphere around the origin.
+
+    Args:
+      radius: radius of the sphere, world units.
+      origin: a point of the line.
+      direction: unit direction of the line.
+
+    Returns:
+      The distance from `origin` to the middle of the chord, and half the length of the chord. If
+      the line misses the sphere, half the length is 0 and the middle is the line's nearest point to
+      the centre.
+    """
+    along = numerics.dot(origin, direction)
+    beyond = numerics.dot(origin, origin) - jnp.square(radius)
+    return -along, numerics.safe_sqrt(jnp.square(along) - beyond)
+
+
+def contract(x: Float[Array, "*shape 3"]) -> Float[Array, "*shape 3"]:
+    """Contracts points to the ball of radius 2: `(2 - 1 / |x|) x / |x|` where `|x| > 1`."""
+    norm = numerics.length(x)[..., None]
+    outside = norm > 1.0
+    inverse = 1.0 / jnp.where(outside, norm, 1.0)
+    return jnp.where(outside, (2.0 - inverse) * inverse * x, x)
+
+
+def shrinkage(x: Float[Array, "*shape 3"]) -> Float[Array, "*shape"]:
+    """Returns the factor by which `contract` scales a small Gaussian at `x`: `|det J|^(1/3)`.
+
+    It is `(2 - 1 / |x|)^(2/3) |x|^(-4/3)` for `|x| > 1`, else 1.
+    """
+    norm = numerics.length(x)
+    inverse = 1.0 / jnp.where(norm > 1.0, norm, 1.0)
+    return (2.0 - inverse) ** (2.0 / 3.0) * inverse ** (4.0 / 3.0)
+
+
+_LAMBDA = -1.5
+
+
+class DistanceWarp(NamedTuple):
+    """The sampled interval of distances, and its length scale.
+
+    Attributes:
+      near: distance at `s = 0`, world units, at least 0.
+      far: distance at `s = 1`, world units, > `near`; may differ between paths.
+      unit: size of the scene, world units; steps start to grow at about this distance.
+    """
+
+    near: float
+    far: float | Float[Array, ""]
+    unit: float
+
+
+def to_distance(warp: DistanceWarp, s: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Maps `s` in `[0, 1]` to a distance in `[near, far]`, increasing up to rounding error.
+
+    The transformed distance is interpolated from both ends, so that `s = 1` gives `far` up to
+    rounding error, although the transform is flat there.
+    """
+    start, end = _ladder(warp, warp.near), _ladder(warp, warp.far)
+    power = (1.0 - s) * start + s * end
+    return _scale(warp) * (power ** (1.0 / _LAMBDA) - 1.0)
+
+
+def to_unit(warp: DistanceWarp, t: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Maps a distance in `[near, far]` to `s` in `[0, 1]`; the inverse of `to_distance`."""
+    start, end = _ladder(warp, warp.near), _ladder(warp, warp.far)
+    return jnp.clip((start - _ladder(warp, t)) / (start - end), 0.0, 1.0)
+
+
+def _scale(warp: DistanceWarp) -> float:
+    """Returns the length unit of the power transformation: `|lambda - 1| / 2` times `unit`."""
+    return abs(_LAMBDA - 1.0) / 2.0 * warp.unit
+
+
+def _ladder(
+    warp: DistanceWarp, t: float | Float[Array, "*shape"]
+) -> float | Float[Array, "*shape"]:
+    return (1.0 + t / _scale(warp)) ** _LAMBDA
