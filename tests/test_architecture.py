@@ -13,13 +13,13 @@ _FLOORS = {
     "choices": 0,
     "numerics": 0,
     "atomic_files": 0,
+    "native_loop": 0,
     "configuration": 1,
     "geometry": 1,
     "optics": 2,
     "sampling": 3,
     "fields": 4,
     "render": 5,
-    "losses": 6,
     "metrics": 6,
     "data": 7,
     "training": 8,
@@ -32,6 +32,11 @@ _BENCHMARKS = sorted((_ROOT / "benchmarks").rglob("*.py"))
 
 _LONGEST_MODULE = 500
 _LONGEST_FUNCTION = 45
+
+# Deep modules: few, long enough to hold a topic, and seldom made for a single importer.
+_MOST_MODULES = 90
+_LEAST_MEAN_LENGTH = 180
+_MOST_WITH_ONE_IMPORTER = 15
 
 _MAY_JIT = {
     "render/images.py",
@@ -152,6 +157,26 @@ def test_guards_live_in_numerics(path):
     assert "nan_to_num" not in text
     if path.name != "numerics.py":
         assert "finfo" not in text
+
+
+def test_modules_are_deep():
+    modules = [path for path in _MODULES if path.name != "__init__.py"]
+    lengths = [len(path.read_text().splitlines()) for path in modules]
+    assert len(modules) <= _MOST_MODULES
+    assert sum(lengths) >= _LEAST_MEAN_LENGTH * len(modules)
+    importers = [path for path in modules + _SCRIPTS if path.name != "__init__.py"]
+    imported = {path: set(_imports(path)) for path in importers}
+    lonely = [path for path in modules if _count_importers(path, imported) == 1]
+    assert len(lonely) <= _MOST_WITH_ONE_IMPORTER, [_name(path) for path in lonely]
+
+
+def _count_importers(path, imported):
+    name = ".".join(path.relative_to(_ROOT).with_suffix("").parts)
+    return sum(
+        any(f"{other}.".startswith(f"{name}.") for other in names)
+        for importer, names in imported.items()
+        if importer != path
+    )
 
 
 @pytest.mark.parametrize("path", _MODULES + _SCRIPTS, ids=lambda p: p.name)

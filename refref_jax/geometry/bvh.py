@@ -2,8 +2,8 @@
 
 Closest hits of rays with a packed bounding volume hierarchy (BVH).
 
-On a CPU, packets of rays traverse the tree together (`packet_traversal`); on an accelerator, every
-ray traverses it alone and all rays run in lock-step (`lockstep_traversal`). `node_table` describes
+On a CPU, packets of rays traverse the tree together (`traversal_cpu`); on an accelerator, every ray
+traverses it alone and all rays run in lock-step (`traversal_accelerator`). `bvh_nodes` describes
 the memory layout of the tree, `bvh_build` its construction.
 
 Rays are passed as batches with one leading axis.
@@ -37,9 +37,9 @@ class BVH(NamedTuple):
     """A packed tree, built on the host by `bvh_build`.
 
     Attributes:
-      nodes: one node table for each octant of directions (see `node_table`).
+      nodes: one node table for each octant of directions (see `bvh_nodes`).
       triangles: corners by slot, in leaf order, padded by `LEAF_SIZE` slots that are never hit.
-      facets: the same triangles, precomputed for the intersection test (see `facets`).
+      facets: the same triangles, precomputed for the intersection test (see `triangles`).
     """
 
     nodes: Int[Array, "8 nodes 8"]

@@ -6,7 +6,7 @@ A split sends the first `n` faces of a node, in the order of their centroids alo
 left. Its cost is `area(left) leaves(left) + area(right) leaves(right)`. It counts the leaves that a
 side fills instead of its faces, because all slots of a leaf are tested.
 
-Packs the nodes of a BVH into the tables of `node_table`, on the host (NumPy only).
+Packs the nodes of a BVH into the tables of `bvh_nodes`, on the host (NumPy only).
 
 Builds the packed BVH on the host (NumPy only), level by level.
 

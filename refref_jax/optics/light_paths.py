@@ -46,8 +46,8 @@ class LightPaths(NamedTuple):
     """The light paths of a batch of rays, padded to the same number of segments.
 
     A ray may have any number of paths, in any order. Its colour is the sum of the colours of its
-    paths, multiplied by their weights. Segments inside the objects may be omitted (see `details`);
-    then there is a gap in arc length before the next segment.
+    paths, multiplied by their weights. Segments inside the objects may be omitted (see
+    `path_settings`); then there is a gap in arc length before the next segment.
 
     Attributes:
       points: start of each segment, world units; finite but meaningless where unused.
@@ -55,13 +55,13 @@ class LightPaths(NamedTuple):
       tau: arc length at the start of each segment, increasing from 0; `inf` where unused.
       ends: arc length at the end of each segment; `inf` for the last, and where unused.
       media: medium of each segment (see `media`).
-      spreads: ray differential of each segment, if carried (see `footprints`).
+      spreads: ray differential of each segment, if carried (see `ray_differentials`).
       rays: index of each path's ray.
       weights: share of the path in its ray's linear RGB.
       radii: footprint of the ray's pixel as a cone radius at unit distance.
       bends: number of refractions and reflections.
       statuses: `PathStatus` of each path.
-      meetings: hit count per part, if tallied (see `details`).
+      meetings: hit count per part, if tallied (see `path_settings`).
       passages: path length in each part's medium, world units, if tallied.
     """
 
@@ -172,9 +172,9 @@ def reflected_first(paths: LightPaths) -> Bool[Array, " paths"]:
     """Returns which paths were reflected at the first surface they hit.
 
     These stay in their medium: their second segment starts at the end of the first. If a path has
-    more segments outside the objects than are stored (see `details`), its second segment is unknown
-    and it counts as transmitted; with one convex object this never happens. The camera is assumed
-    to be outside all objects.
+    more segments outside the objects than are stored (see `path_settings`), its second segment is
+    unknown and it counts as transmitted; with one convex object this never happens. The camera is
+    assumed to be outside all objects.
     """
     if paths.tau.shape[-1] < 2:
         return jnp.zeros_like(paths.bends, bool)

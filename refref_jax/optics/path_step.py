@@ -12,7 +12,7 @@ threshold is ours.
 
 Splits one ray at a surface into a reflected and a transmitted ray.
 
-Both tracers, `wavefront` and `single_path`, are built from these steps.
+Both tracers, `wavefront` and `differentiable_paths`, are built from these steps.
 
 Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
 """
@@ -170,7 +170,7 @@ class RayState(NamedTuple):
       bends: number of bends so far.
       leaving: excluded primitive, the triangle slot that the segment starts on.
       inside: interior list, the parts that the ray is in (see `media`).
-      spread: ray differential of the current segment (see `footprints`).
+      spread: ray differential of the current segment (see `ray_differentials`).
     """
 
     origin: Float[Array, "*rays 3"]

@@ -4,7 +4,8 @@ All rays are traced in one wavefront (see `wavefront`); then the paths of each b
 a list of fixed capacity, in the order of its rays, the heaviest path of each ray first.
 
 Light paths are constants for differentiation: field parameters have gradients along them, but rays
-and the scene do not, and differentiating with respect to these is an error (use `single_path`).
+and the scene do not, and differentiating with respect to these is an error (use
+`differentiable_paths`).
 
 Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
 """
@@ -86,7 +87,7 @@ def trace_ends(
       geometry: the scene.
       rays: camera rays.
       budget: path settings.
-      inside: interior list of each camera, for the rule `priority` (see `data.containment`); none
+      inside: interior list of each camera, for the rule `priority` (see `data.mesh_queries`); none
         by default. The other rules do not use it.
       block: number of rays cast at once, see `wavefront`.
     """
@@ -116,8 +117,8 @@ def trace(
       rays: camera rays.
       budget: path settings.
       capacity: capacity for paths; by default that of the path settings for this number of rays,
-        which is more than most scenes need, see `path_settings.capacity_for`. Unused if max bends is 0 or
-        there are no rays.
+        which is more than most scenes need, see `path_settings.capacity_for`. Unused if max bends
+        is 0 or there are no rays.
       detail: parts of the paths to store; by default every segment, and nothing else.
       inside: interior list of each camera, as in `trace_ends`.
 

@@ -37,7 +37,7 @@ class Segments(NamedTuple):
       tau: arc length from the camera to the start.
       media: medium of the segment (see `media`).
       parts: part on whose surface the segment starts, or `media.EMPTY_SLOT`.
-      spreads: ray differential of the segment (see `footprints`).
+      spreads: ray differential of the segment (see `ray_differentials`).
     """
 
     parents: Int[Array, " segments"]

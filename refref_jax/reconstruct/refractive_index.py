@@ -87,7 +87,7 @@ def errors(
       evidence: the pixels.
       geometry: what bends their light.
       config: of the field's model; its footprint must be `cone`.
-      budget: which light is followed, see `main_branches`.
+      budget: which light is followed, see `differentiable_paths`.
 
     Raises:
       ValueError: if the model's footprint is another.

@@ -80,7 +80,7 @@ def carve(
       box: where the body lies; found from the masks within `REACH` of the origin if not given.
       outliers: values passed over at each point.
       tolerance: pixels outside of an outline up to which nothing is carved, see the module.
-      blur: of the outlines in pixels, see `silhouettes`.
+      blur: of the outlines in pixels, see `masks`.
       names: what the masks are called in errors; their numbers if not given.
 
     Raises:

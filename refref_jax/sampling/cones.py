@@ -3,7 +3,7 @@
 An interval of a path is a conical frustum, represented by a few multisamples, each an isotropic
 Gaussian, so that a field can blur detail that is finer than the pixel's footprint. Without ray
 differentials, the cone grows with arc length as along a straight ray, and the pattern follows the
-bends; with ray differentials (`optics.footprints`), they determine its width.
+bends; with ray differentials (`optics.ray_differentials`), they determine its width.
 
 Source: Barron et al., Zip-NeRF (2023), section 2; paper (arXiv 2505.05848), supplement, for the
 bent centre line.

@@ -5,7 +5,7 @@ Saves and restores the state of a run with Orbax: atomic, the newest few kept.
 What a run writes: configuration, model and metrics, all readable text.
 
 {run}/config.json      the resolved `TrainConfig`
-{run}/model.json       see `render.saved`
+{run}/model.json       see `render.checkpoint_io`
 {run}/metrics.jsonl    one line for every logged step
 """
 
