@@ -26,6 +26,7 @@ _SHOWN_ELSEWHERE = {
     "refref_jax.render.load_model",
     "refref_jax.render.render_camera",
     "refref_jax.render.render_image",
+    "refref_jax.render.render_ray",
     "refref_jax.render.render_rays",
 }
 

@@ -125,7 +125,7 @@ def _samples_inside(model):
     path = made_paths.path((2.0, 3.0), [(0.0, 0.0, -1.0)] * 3, (0, 1, 0), origin=(0.0, 0.0, 3.0))
     params = init_params(jax.random.key(0), model)
     jitter = volume_rendering.Jitter(
-        jnp.zeros(volume_rendering.rounds(model)), jnp.zeros(volume_rendering.rounds(model))
+        jnp.zeros(volume_rendering.levels(model)), jnp.zeros(volume_rendering.levels(model))
     )
 
     @jax.jit

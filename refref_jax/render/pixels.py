@@ -103,7 +103,7 @@ def random_jitter(key: Array, config: ModelConfig, slots: Int[Array, " paths"]) 
       config: configuration of the model.
       slots: index of each path in the batch's list.
     """
-    shape = (2, volume_rendering.rounds(config))
+    shape = (2, volume_rendering.levels(config))
     draw = jax.vmap(lambda slot: jax.random.uniform(jax.random.fold_in(key, slot), shape))
     drawn = draw(slots)
     return Jitter(drawn[:, 0] - 0.5, 2.0 * jnp.pi * drawn[:, 1])
@@ -111,5 +111,5 @@ def random_jitter(key: Array, config: ModelConfig, slots: Int[Array, " paths"]) 
 
 def no_jitter(config: ModelConfig, paths: int) -> Jitter:
     """Returns zero jitter, for rendering without noise, in single precision like the fields."""
-    zeros = jnp.zeros((paths, volume_rendering.rounds(config)), jnp.float32)
+    zeros = jnp.zeros((paths, volume_rendering.levels(config)), jnp.float32)
     return Jitter(zeros, zeros)

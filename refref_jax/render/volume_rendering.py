@@ -122,8 +122,8 @@ class Jitter(NamedTuple):
       rotations: rotation of each sampling level's cone patterns, radians.
     """
 
-    offsets: Float[Array, "*paths rounds"]
-    rotations: Float[Array, "*paths rounds"]
+    offsets: Float[Array, "*paths levels"]
+    rotations: Float[Array, "*paths levels"]
 
 
 class Histogram(NamedTuple):
@@ -152,7 +152,7 @@ class PathRadiance(NamedTuple):
     outside: Bool[Array, " samples"]
 
 
-class _Round(NamedTuple):
+class Samples(NamedTuple):
     """The intervals of one sampling level, in all coordinates.
 
     Attributes:
@@ -183,36 +183,37 @@ def path_radiance(
       anneal: exponent on the proposals' weights, from 0 for uniform sampling to 1 for the
         proposals' distribution.
     """
-    line = _polyline(config, path)
+    line = polyline(config, path)
     warp = distance_warp(config, line)
-    # No interval straddles an interface, if there are enough edges.
-    bends = scene_bounds.to_unit(warp, line.knots[1:])
-    histograms = []
-    for level, proposal in enumerate(config.proposals):
-        s = _resample(config, histograms, jitter.offsets[level], anneal, proposal.samples)
-        s = stepfun.snap(s, bends)
-        samples = _place(config, line, warp, s, jitter.rotations[level])
-        see = jax.vmap(registry.density, in_axes=(None, None, 0))
-        density = see(params.proposals[level], proposal.field, samples.gaussians)
-        histograms.append(Histogram(s, _weigh(config, density, samples.t)))
 
-    s = _resample(config, histograms, jitter.offsets[-1], anneal, config.samples)
-    s = stepfun.snap(s, bends)
-    samples = _place(config, line, warp, s, jitter.rotations[-1])
+    def drawn(level: int, count: int) -> Samples:
+        noise = jax.tree.map(lambda x: x[level], jitter)
+        return sample(config, line, warp, histograms, count, jitter=noise, anneal=anneal)
+
+    histograms: list[Histogram] = []
+    for level, proposal in enumerate(config.proposals):
+        samples = drawn(level, proposal.samples)
+        density = jax.vmap(registry.density, in_axes=(None, None, 0))(
+            params.proposals[level], proposal.field, samples.gaussians
+        )
+        histograms.append(Histogram(samples.s, _weigh(config, density, samples.t)))
+
+    samples = drawn(-1, config.samples)
     middles = 0.5 * (samples.t[1:] + samples.t[:-1])
     points = jax.vmap(polylines.point_at, in_axes=(None, 0))(line, middles)
-    see = jax.vmap(registry.radiance, in_axes=(None, None, 0, 0))
-    seen = see(params.field, config.field, samples.gaussians, points.direction)
+    seen = jax.vmap(registry.radiance, in_axes=(None, None, 0, 0))(
+        params.field, config.field, samples.gaussians, points.direction
+    )
     weights = _weigh(config, seen.density, samples.t)
     composited = composite(weights, seen.rgb, samples.t)
     return PathRadiance(
         composite=_in_arc_length(line, composited),
-        histograms=(*histograms, Histogram(s, weights)),
+        histograms=(*histograms, Histogram(samples.s, weights)),
         outside=points.outside,
     )
 
 
-def rounds(config: ModelConfig) -> int:
+def levels(config: ModelConfig) -> int:
     """Returns the number of sampling levels, including the final one."""
     return len(config.proposals) + 1
 
@@ -236,23 +237,57 @@ def domain(config: ModelConfig) -> scene_bounds.Domain:
     return scene_bounds.Domain(config.radius, config.space)
 
 
-def _polyline(config: ModelConfig, path: LightPaths) -> Polyline:
+def polyline(config: ModelConfig, path: LightPaths) -> Polyline:
+    """Returns the polyline that a model samples: without the segments inside clear objects."""
     if config.interior == "field":
         return polylines.whole_path(path)
     return polylines.outside_path(path)
 
 
-def _resample(
+def sample(
+    config: ModelConfig,
+    line: Polyline,
+    warp: scene_bounds.DistanceWarp,
+    histograms: Sequence[Histogram],
+    count: int,
+    *,
+    jitter: Jitter,
+    anneal: Float[Array, ""],
+) -> Samples:
+    """Samples one level's intervals from the histogram of the level before; uniformly at first.
+
+    Args:
+      config: configuration of the model.
+      line: polyline of the path.
+      warp: distance warp of the path.
+      histograms: histograms of the levels before this one, coarse to fine.
+      count: number of intervals.
+      jitter: jitter of this level.
+      anneal: exponent on the weights of the last histogram.
+    """
+    strata = (jnp.arange(count, dtype=jitter.offsets.dtype) + 0.5 + jitter.offsets) / count
+    # No interval straddles an interface, if there are enough edges.
+    bends = scene_bounds.to_unit(warp, line.knots[1:])
+    s = stepfun.snap(_draw(config, histograms, strata, anneal), bends)
+    t = scene_bounds.to_distance(warp, s)
+    turns = jitter.rotations + _PATTERN_TURN * (jnp.arange(count, dtype=t.dtype) % 2)
+
+    def cone(start: Array, end: Array, turn: Array) -> Gaussians:
+        world = cones.multisamples(line, start, end, turn, count=config.multisamples)
+        return scene_bounds.to_unit_cube(domain(config), world)
+
+    return Samples(s, t, jax.vmap(cone)(t[:-1], t[1:], turns))
+
+
+def _draw(
     config: ModelConfig,
     histograms: Sequence[Histogram],
-    offset: Float[Array, ""],
+    strata: Float[Array, " samples"],
     anneal: Float[Array, ""],
-    samples: int,
 ) -> Float[Array, " edges"]:
-    """Samples the next level's intervals from the last histogram; uniformly at first."""
-    strata = (jnp.arange(samples, dtype=offset.dtype) + 0.5 + offset) / samples
+    """Draws intervals in proportion to the weights of the last histogram, if there is one."""
     if not histograms:
-        ends = jnp.array([0.0, 1.0], offset.dtype)
+        ends = jnp.array([0.0, 1.0], strata.dtype)
         even = stepfun.sample_edges(strata, ends, jnp.ones_like(ends[:1]))
         # Jitter must not shorten the path: its end is opaque and would move with the noise.
         return even.at[jnp.array([0, -1])].set(ends)
@@ -263,24 +298,6 @@ def _resample(
     # Bins of width 0 stay empty; the others tend to equal weight as the exponent tends to 0.
     trusted = jnp.where(jnp.diff(edges) > 0.0, weights**anneal, 0.0)
     return stepfun.sample_edges(strata, edges, trusted)
-
-
-def _place(
-    config: ModelConfig,
-    line: Polyline,
-    warp: scene_bounds.DistanceWarp,
-    s: Float[Array, " edges"],
-    rotation: Float[Array, ""],
-) -> _Round:
-    """Maps intervals to the path, and their multisamples to the field's unit cube."""
-    t = scene_bounds.to_distance(warp, s)
-    turns = rotation + _PATTERN_TURN * (jnp.arange(t.shape[0] - 1, dtype=t.dtype) % 2)
-
-    def cone(start: Array, end: Array, turn: Array) -> Gaussians:
-        world = cones.multisamples(line, start, end, turn, count=config.multisamples)
-        return scene_bounds.to_unit_cube(domain(config), world)
-
-    return _Round(s, t, jax.vmap(cone)(t[:-1], t[1:], turns))
 
 
 def _weigh(

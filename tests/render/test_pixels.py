@@ -141,12 +141,12 @@ def test_rendering_without_jitter_is_deterministic():
 def test_no_jitter_is_zero():
     jitter = pixels.no_jitter(MODEL, 5)
     for part in jitter:
-        np.testing.assert_array_equal(part, np.zeros((5, volume_rendering.rounds(MODEL))))
+        np.testing.assert_array_equal(part, np.zeros((5, volume_rendering.levels(MODEL))))
 
 
 def test_random_jitter_fills_its_ranges():
     offsets, rotations = (np.asarray(x) for x in _draw(0, 2000))
-    assert offsets.shape == rotations.shape == (2000, volume_rendering.rounds(MODEL))
+    assert offsets.shape == rotations.shape == (2000, volume_rendering.levels(MODEL))
     assert (offsets >= -0.5).all() and (offsets < 0.5).all()
     assert (rotations >= 0.0).all() and (rotations <= 2.0 * np.pi).all()
     # Mean and deviation of a uniform distribution, five standard errors wide.

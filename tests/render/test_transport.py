@@ -86,8 +86,8 @@ def _tree_item(tree, index):
 
 
 def test_rounds_counts_the_final_one():
-    assert volume_rendering.rounds(MODEL) == 2
-    assert volume_rendering.rounds(dataclasses.replace(MODEL, proposals=MODEL.proposals * 3)) == 4
+    assert volume_rendering.levels(MODEL) == 2
+    assert volume_rendering.levels(dataclasses.replace(MODEL, proposals=MODEL.proposals * 3)) == 4
 
 
 def _warp(config, path):
@@ -152,7 +152,7 @@ def test_a_path_always_has_room_for_samples(origin, direction, far):
 def test_histograms_are_sorted_and_hold_all_light(interior):
     config = _MODELS[interior]
     seen = _render(config, _some_paths())
-    assert len(seen.histograms) == volume_rendering.rounds(config)
+    assert len(seen.histograms) == volume_rendering.levels(config)
     samples = [*(proposal.samples for proposal in config.proposals), config.samples]
     for histogram, count in zip(seen.histograms, samples, strict=True):
         edges, weights = (np.asarray(x) for x in histogram)
@@ -201,7 +201,7 @@ def test_rendering_many_paths_is_a_loop():
 
 
 def _one(config, path):
-    jitter = Jitter(*(jnp.zeros(volume_rendering.rounds(config)) for _ in range(2)))
+    jitter = Jitter(*(jnp.zeros(volume_rendering.levels(config)) for _ in range(2)))
     return volume_rendering.path_radiance(_params(config), config, path, jitter, jnp.float32(1.0))
 
 

@@ -1,0 +1,59 @@
+"""The readable rendering of one ray equals the compiled one, on rays of three scenes."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE
+from refref_jax.render import Model, init_params, render_ray, render_rays
+from tests import scenes
+from tests.small_model import MODEL
+
+_CLEAR = dataclasses.replace(MODEL, interior="clear", footprint="differential", multisamples=6)
+_TINTED = dataclasses.replace(MODEL, interior="absorbing", learned_tints=2)
+
+_SCENES = {
+    "glass ball, path tree": (_CLEAR, TREE, [scenes.ball(subdivisions=3)]),
+    "water in glass, learned tints": (
+        _TINTED,
+        PAPER,
+        [scenes.ball(), scenes.ball(0.7, index=1.333, name="drink_water")],
+    ),
+    "box, the paper's paths, field inside": (MODEL, PAPER, [scenes.box()]),
+}
+
+
+@pytest.mark.parametrize("name", _SCENES)
+def test_render_ray_equals_render_rays(name):
+    config, settings, parts = _SCENES[name]
+    model = Model(config, settings, scenes.geometry(*parts), _params(config))
+    rays = scenes.rays([[-4.0, 0.21, 0.33]], [1.0, 0.02, 0.01])
+    expected = _compiled(model, rays)
+    assert expected.distance[0] > 0.0
+    got = render_ray(model, jax.tree.map(lambda x: x[0], rays))
+    np.testing.assert_allclose(got, expected.rgb[0], atol=2e-6)
+    # The object bends the ray: along a straight one the colour is another.
+    straight = model._replace(
+        config=dataclasses.replace(config, learned_tints=0),
+        budget=STRAIGHT,
+        params=model.params._replace(dyes=None),
+    )
+    assert np.max(np.abs(_compiled(straight, rays).rgb[0] - got)) > 1e-4
+
+
+def _compiled(model, rays):
+    def render(params, geometry):
+        return render_rays(model._replace(params=params, geometry=geometry), rays)
+
+    return jax.jit(render)(model.params, model.geometry)
+
+
+def _params(config):
+    """Random parameters whose densities and colours vary strongly in space."""
+    params = init_params(jax.random.PRNGKey(3), config)
+    leaves, tree = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.PRNGKey(4), len(leaves))
+    noisy = [x + 0.5 * jax.random.normal(key, x.shape) for x, key in zip(leaves, keys, strict=True)]
+    return jax.tree.unflatten(tree, noisy)
