@@ -1,6 +1,7 @@
 """Writes nested frozen dataclasses as JSON, and reads them back exactly.
 
-Fields with a default may be missing, as in files of older versions.
+Fields with a default may be missing, as in files of older versions, and a field may be stored under
+the name that its metadata give as `formerly`.
 
 Fields may be numbers, strings, booleans, `None`, other dataclasses, and tuples of these. If a field
 is annotated with a base class, the key `kind` of its value selects the variant of that class.
@@ -11,7 +12,7 @@ import json
 import math
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,6 +25,8 @@ Variants = Mapping[type, Mapping[str, type]]
 
 _KIND = "kind"
 
+FORMERLY = "formerly"
+"""Key of a field's metadata: the name of the field in files of earlier versions."""
 
 NOT_FINITE = ("inf", "-inf", "nan")
 """Names of the numbers that JSON does not support."""
@@ -146,6 +149,7 @@ def _build_dataclass(kind: Any, value: Any, where: str, variants: Variants) -> A
     kind = _variant(variants[kind], value, where) if kind in variants else kind
     hints = typing.get_type_hints(kind)
     fields = dataclasses.fields(kind)
+    value = _with_present_names(fields, value)
     names = [field.name for field in fields if field.name in value]
     needed = {field.name for field in fields if field.default is dataclasses.MISSING}
     if missing := needed - set(value):
@@ -154,6 +158,15 @@ def _build_dataclass(kind: Any, value: Any, where: str, variants: Variants) -> A
         raise ValueError(f"{where} has the unknown {', '.join(map(repr, sorted(unknown)))}")
     built = {n: _build(hints[n], value[n], f"{where}.{n}", variants) for n in names}
     return kind(**built)
+
+
+def _with_present_names(
+    fields: Sequence[dataclasses.Field[Any]], value: dict[str, Any]
+) -> dict[str, Any]:
+    """Renames keys that earlier versions wrote; a key stays if the present one is there, too."""
+    names = {field.metadata.get(FORMERLY): field.name for field in fields}
+    present = {old: new for old, new in names.items() if new not in value}
+    return {present.get(key, key): item for key, item in value.items()}
 
 
 def _variant(known: Mapping[str, type], value: dict[str, Any], where: str) -> type:
