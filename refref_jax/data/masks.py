@@ -25,6 +25,9 @@ Masks = Bool[np.ndarray, "frames h w"]
 # Neighbours within an image, corners included, and none in another one.
 _AROUND = np.ones((1, 3, 3), bool)
 
+Segment = Callable[[Path], Bool[np.ndarray, "h w"]]
+"""Takes the path of an image; returns which of its pixels show the object."""
+
 
 def well_inside(masks: Masks, *, margin: int = 1) -> Masks:
     """Returns the pixels that are so many pixels inside of a mask, and of the image."""
@@ -34,10 +37,6 @@ def well_inside(masks: Masks, *, margin: int = 1) -> Masks:
 def well_outside(masks: Masks, *, margin: int = 2) -> Masks:
     """Returns the pixels that are so many pixels away from a mask."""
     return ~(binary_dilation(masks, _AROUND, iterations=margin) if margin else masks)
-
-
-Segment = Callable[[Path], Bool[np.ndarray, "h w"]]
-"""Takes the path of an image; returns which of its pixels show the object."""
 
 
 def add_masks(scene: Path, out: Path, segment: Segment) -> int:

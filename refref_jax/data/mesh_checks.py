@@ -44,6 +44,29 @@ from refref_jax.geometry.triangle_meshes import is_degenerate
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import INDEX_OF_AIR
 
+# As shares of the smaller part's diagonal: walls closer than the first coincide, for the tracer may
+# not tell them apart; walls farther apart than the second are meant to be.
+_COINCIDENT = 1e-4
+_THIN = 0.02
+
+# Smallest shares of a surface that are told. Two round bodies come close at a point, too.
+_COINCIDENT_SHARE = 0.01
+_THIN_SHARE = 0.1
+
+# Least cosine between walls, and between a wall and the way to the next, that run side by side.
+_PARALLEL = 0.7
+
+_REMEDY = (
+    "let them overlap a little and use the rule 'priority', or model the wall between them as one "
+    "interface."
+)
+
+# -1 in front of an inverted closed piece; a lone open sheet gives -1/2.
+_WOUND_BACKWARDS = -0.75
+
+# Parts that an explanation names before it only counts.
+_NAMED = 3
+
 
 class Finding(NamedTuple):
     """Something about a mesh that a user should know.
@@ -72,24 +95,6 @@ def refuse_errors(findings: Sequence[Finding]) -> None:
     if errors:
         told = "\n".join(f"  {finding.part}: {finding.message}" for finding in errors)
         raise SceneError(f"the meshes must be mended first.\n{told}")
-
-
-# As shares of the smaller part's diagonal: walls closer than the first coincide, for the tracer may
-# not tell them apart; walls farther apart than the second are meant to be.
-_COINCIDENT = 1e-4
-_THIN = 0.02
-
-# Smallest shares of a surface that are told. Two round bodies come close at a point, too.
-_COINCIDENT_SHARE = 0.01
-_THIN_SHARE = 0.1
-
-# Least cosine between walls, and between a wall and the way to the next, that run side by side.
-_PARALLEL = 0.7
-
-_REMEDY = (
-    "let them overlap a little and use the rule 'priority', or model the wall between them as one "
-    "interface."
-)
 
 
 class _Patch(NamedTuple):
@@ -238,10 +243,6 @@ def _gap(parts: Sequence[MeshPart], pair: tuple[int, int], patch: _Patch) -> Fin
     )
 
 
-# -1 in front of an inverted closed piece; a lone open sheet gives -1/2.
-_WOUND_BACKWARDS = -0.75
-
-
 def lint(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
     """Reports on every part (closed, outward, without waste), and on how they lie to each other."""
     findings = []
@@ -330,10 +331,6 @@ def _faces(part: MeshPart) -> list[Finding]:
             )
         )
     return findings
-
-
-# Parts that an explanation names before it only counts.
-_NAMED = 3
 
 
 class Advice(NamedTuple):

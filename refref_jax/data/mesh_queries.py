@@ -41,6 +41,31 @@ _CANDIDATES = 8
 # x^3 = x + 1 (Roberts, The Unreasonable Effectiveness of Quasirandom Sequences, 2018).
 _STEPS = 1.324717957244746 ** -np.array([1.0, 2.0])
 
+# Points of a part that are tested against each other part: more against a coarse one, where they
+# cost little, and where a few of its faces may be cut without their middles being inside.
+_FEWEST_PROBES, _MOST_PROBES = 64, 2048
+_PROBED_PAIRS = 1 << 21
+
+# How far off a face its probes lie, on both sides, as a share of the part's size. Bodies that are
+# closer than that touch.
+_GAP = 1e-5
+
+# Triangles times points of one sweep, to bound its memory.
+_SWEEP = 1 << 20
+
+TOLERANCE = 1e-5
+"""How deep below its convex hull a surface may lie, as a share of its diagonal.
+
+Far above the rounding of single precision, and far below a dent that anyone would model.
+"""
+
+# A surface that lies on its hull and covers it once encloses the same volume.
+_VOLUME_TOLERANCE = 1e-3
+
+# Facets of the hull that are looked at first, nearest ones, and points times facets of one sweep.
+_NEAREST = 8
+_PLANE_SWEEP = 1 << 21
+
 
 class SampledSurface(NamedTuple):
     """A surface and points spread evenly over its area.
@@ -144,19 +169,6 @@ def _closest(corners: Float[np.ndarray, "*shape 3 3"]) -> Float[np.ndarray, "*sh
     within = np.all(np.sum(np.cross(corners, following) * normal[..., None, :], axis=-1) >= 0.0, -1)
     height = np.sum(corners[..., 0, :] * normal, axis=-1) / np.sum(normal**2, axis=-1)
     return np.where(within[..., None], height[..., None] * normal, on_edge)
-
-
-# Points of a part that are tested against each other part: more against a coarse one, where they
-# cost little, and where a few of its faces may be cut without their middles being inside.
-_FEWEST_PROBES, _MOST_PROBES = 64, 2048
-_PROBED_PAIRS = 1 << 21
-
-# How far off a face its probes lie, on both sides, as a share of the part's size. Bodies that are
-# closer than that touch.
-_GAP = 1e-5
-
-# Triangles times points of one sweep, to bound its memory.
-_SWEEP = 1 << 20
 
 
 class Containment(NamedTuple):
@@ -276,20 +288,6 @@ def _minor(
     a: Float[np.ndarray, "3 points faces"], b: Float[np.ndarray, "3 points faces"], i: int, j: int
 ) -> Float[np.ndarray, "points faces"]:
     return a[i] * b[j] - a[j] * b[i]
-
-
-TOLERANCE = 1e-5
-"""How deep below its convex hull a surface may lie, as a share of its diagonal.
-
-Far above the rounding of single precision, and far below a dent that anyone would model.
-"""
-
-# A surface that lies on its hull and covers it once encloses the same volume.
-_VOLUME_TOLERANCE = 1e-3
-
-# Facets of the hull that are looked at first, nearest ones, and points times facets of one sweep.
-_NEAREST = 8
-_PLANE_SWEEP = 1 << 21
 
 
 def is_convex(part: MeshPart) -> bool:

@@ -65,6 +65,21 @@ _FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
 
 _LONGEST_NORMALS_HEADER = len(_HEADER) + 40
 
+Shading = Literal["auto", "smooth", "flat"]
+
+INDEX_OF_REFRACTION: dict[str, float] = {
+    "glass": 1.5,
+    "water": 1.333,
+    "diamond": 2.418,
+    "air": 1.0,
+    "alcohol": 1.36,
+    "plastic": 1.45,
+    "perfume": 1.46,
+}
+"""Indices of the data set's materials."""
+
+_LONGEST_HEADER = 1 << 16
+
 
 def write_mesh(
     path: Path,
@@ -104,9 +119,6 @@ def read_normals(path: Path) -> Float[np.ndarray, "faces 3 3"] | None:
     points = np.frombuffer(content[end:middle], _VERTEX)
     triangles = np.frombuffer(content[middle:], _FACE)
     return points["normal"][triangles["vertices"]]
-
-
-Shading = Literal["auto", "smooth", "flat"]
 
 
 class PartDescription(NamedTuple):
@@ -196,20 +208,6 @@ def _colour(value: Any) -> Colour:
 
 def _refusal(where: str, part: dict[str, Any], key: str, wanted: str) -> SceneError:
     return SceneError(f"{where} has the {key} {part[key]!r}. Give {wanted}.")
-
-
-INDEX_OF_REFRACTION: dict[str, float] = {
-    "glass": 1.5,
-    "water": 1.333,
-    "diamond": 2.418,
-    "air": 1.0,
-    "alcohol": 1.36,
-    "plastic": 1.45,
-    "perfume": 1.46,
-}
-"""Indices of the data set's materials."""
-
-_LONGEST_HEADER = 1 << 16
 
 
 class MeshPart(NamedTuple):

@@ -29,6 +29,8 @@ Arrays = tuple[np.ndarray, np.ndarray]
 MeshSource = str | os.PathLike[str] | trimesh.Trimesh | Arrays
 """What a part can be made of."""
 
+_CREASE_ANGLES: dict[Shading, float] = {"auto": CREASE_ANGLE, "smooth": np.pi, "flat": 0.0}
+
 
 def make_part(
     mesh: MeshSource,
@@ -94,9 +96,6 @@ def _of_arrays(
         )
     vertices, faces = meshes.merge_corners(name, vertices, faces.astype(np.int64))
     return MeshPart(name, vertices, faces, index, shading)
-
-
-_CREASE_ANGLES: dict[Shading, float] = {"auto": CREASE_ANGLE, "smooth": np.pi, "flat": 0.0}
 
 
 def single_body(

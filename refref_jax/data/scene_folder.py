@@ -39,6 +39,11 @@ from refref_jax.geometry.cameras import Cameras, focal_length, planar_depth_to_d
 # Poses are written with six digits or more; a larger deviation is a scale or a shear.
 _ROTATION_TOLERANCE = 1e-3
 
+SPLITS: tuple[Split, ...] = get_args(Split)
+
+TRANSFORMS = "transforms_{}.json"
+"""Name of a split's transforms file."""
+
 
 def read_json(path: Path) -> dict[str, Any]:
     """Reads a JSON object."""
@@ -95,12 +100,6 @@ def rigid_motion(matrix: Any, name: str, path: Path) -> Float[np.ndarray, "3 4"]
             f"sheared or mirrored (deviation {residual:.2g}). Export the poses without scale."
         )
     return pose[:3]
-
-
-SPLITS: tuple[Split, ...] = get_args(Split)
-
-TRANSFORMS = "transforms_{}.json"
-"""Name of a split's transforms file."""
 
 
 class FrameFiles(NamedTuple):

@@ -42,6 +42,11 @@ _FOLDERS = ("data", *CONFIGS, "mesh_files", "scene_files")
 
 _SHARD = re.compile(rf"({'|'.join(_FOLDERS[:-2])})/(.+)-(\d+)-of-(\d+)\.parquet")
 
+_UNPACKING = ".unpacking-"
+
+# Seconds after which a folder that is being unpacked must have been abandoned.
+_ABANDONED = 24 * 3600
+
 
 class LocalCopy:
     """Folders that together hold what the published repositories do, or a part of it.
@@ -203,12 +208,6 @@ def find_others(repository: Repository, scene: SceneName) -> dict[str, str]:
             if name.removeprefix(folder) in meshes
         }
     return found
-
-
-_UNPACKING = ".unpacking-"
-
-# Seconds after which a folder that is being unpacked must have been abandoned.
-_ABANDONED = 24 * 3600
 
 
 class SceneWarning(UserWarning):

@@ -28,6 +28,9 @@ from jaxtyping import Array, Float
 from refref_jax.choices import Footprint, Precision
 from refref_jax.sampling.cones import Gaussians
 
+Params = Any
+"""Pytree of arrays, from `init`."""
+
 
 def check_precision(precision: str) -> None:
     """Checks the name of a precision.
@@ -53,10 +56,6 @@ def _product(left: Array, right: Array, axes: Any, precision: None = None) -> Ar
     return jax.lax.dot_general(
         *factors, axes, precision=precision, preferred_element_type=left.dtype
     )
-
-
-Params = Any
-"""Pytree of arrays, from `init`."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -47,6 +47,9 @@ _PRIMES = (1, 2654435761, 805459861)
 
 _CORNERS = tuple(itertools.product((0, 1), repeat=3))
 
+# Numbers of exponent and mantissa bits of bfloat16.
+_BFLOAT16 = (8, 7)
+
 
 def corners(
     position: Sequence[Float[Array, "*batch"]], resolution: int, entries: int
@@ -90,10 +93,6 @@ def _entry(
     x, y, z = terms
     # Parenthesised so that the term of two axes is computed once for two corners.
     return (x ^ (y ^ z)) & jnp.uint32(entries - 1) if strides is _PRIMES else x + (y + z)
-
-
-# Numbers of exponent and mantissa bits of bfloat16.
-_BFLOAT16 = (8, 7)
 
 
 def gather(

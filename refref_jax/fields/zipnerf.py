@@ -41,6 +41,9 @@ from refref_jax.sampling.cones import Gaussians
 # Shift of the softplus: the density of an untrained field is low, but not zero.
 _DENSITY_SHIFT = -1.0
 
+# Colours may exceed [0, 1] by this much, so that black and white have finite network outputs.
+_COLOUR_PADDING = 0.001
+
 
 @dataclasses.dataclass(frozen=True)
 class DensityFieldConfig(GridDensityConfig):
@@ -80,10 +83,6 @@ class _DensityField(nn.Module):
             gaussians, config.grid, width=config.width, outputs=1, precision=config.precision
         )
         return activate_density(raw[0])
-
-
-# Colours may exceed [0, 1] by this much, so that black and white have finite network outputs.
-_COLOUR_PADDING = 0.001
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,6 +25,9 @@ from jaxtyping import Bool, Float, Int
 from refref_jax.geometry import bvh_nodes
 from refref_jax.geometry.bvh import BVH, LEAF_SIZE
 
+# Sign bit of each axis in the number of an octant, as in `bvh_nodes.octant`.
+_BACKWARDS = ((np.arange(bvh_nodes.OCTANTS)[:, None] >> np.arange(3)) & 1).astype(bool)
+
 
 def best_splits(
     orders: list[Int[np.ndarray, " faces"]],
@@ -124,10 +127,6 @@ class _Boxes(NamedTuple):
 
     lower: Float[np.ndarray, "nodes 3"]
     upper: Float[np.ndarray, "nodes 3"]
-
-
-# Sign bit of each axis in the number of an octant, as in `bvh_nodes.octant`.
-_BACKWARDS = ((np.arange(bvh_nodes.OCTANTS)[:, None] >> np.arange(3)) & 1).astype(bool)
 
 
 def pack_nodes(

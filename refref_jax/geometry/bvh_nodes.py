@@ -37,6 +37,17 @@ _SLACK = 2.4e-7
 # Two roundings up on the far side, so that a triangle that lies in a box face is never culled.
 _FAR_PADDING = 1.0000004
 
+OCTANTS = 8
+
+WORDS = 8
+"""Number of words in a node."""
+
+LEAF_SIZE = 4
+"""Maximum number of triangles in a leaf, and the number tested at each leaf visit."""
+
+NONE = 2**31 - 1
+"""Slot for "no triangle", above all others."""
+
 
 class Slabs(NamedTuple):
     """A ray prepared for box tests, computed once for all boxes.
@@ -99,18 +110,6 @@ def _larger(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
 
 def _smaller(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.where(a < b, a, b)
-
-
-OCTANTS = 8
-
-WORDS = 8
-"""Number of words in a node."""
-
-LEAF_SIZE = 4
-"""Maximum number of triangles in a leaf, and the number tested at each leaf visit."""
-
-NONE = 2**31 - 1
-"""Slot for "no triangle", above all others."""
 
 
 class Node(NamedTuple):

@@ -27,6 +27,9 @@ CREASE_ANGLE = np.radians(30.0)
 # when single-precision files put three corners on one line.
 _DEGENERATE = 1e-6
 
+Vertices = Float[np.ndarray, "vertices 3"]
+Faces = Int[np.ndarray, "faces 3"]
+
 
 def corner_normals(
     vertices: Float[np.ndarray, "vertices 3"],
@@ -116,10 +119,6 @@ def _corner_angles(corners: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray,
     forward = unit_vectors(np.roll(corners, -1, axis=1) - corners)
     backward = unit_vectors(np.roll(corners, 1, axis=1) - corners)
     return np.arccos(np.clip(np.sum(forward * backward, axis=-1), -1.0, 1.0))
-
-
-Vertices = Float[np.ndarray, "vertices 3"]
-Faces = Int[np.ndarray, "faces 3"]
 
 
 class Mesh(NamedTuple):

@@ -30,6 +30,9 @@ from refref_jax import numerics
 # it through one face and enter it again through the next.
 EDGE_TOLERANCE = 1e-5
 
+WORDS = 12
+"""Number of values in a facet."""
+
 
 class Intersection(NamedTuple):
     """Intersection of a ray with a triangle.
@@ -79,10 +82,6 @@ def interpolate(corners: Float[Array, "3 n"], barycentric: Float[Array, "2"]) ->
 def geometric_normal(triangle: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """Returns the outward unit normal; zero for a degenerate triangle."""
     return numerics.normalize(jnp.cross(triangle[1] - triangle[0], triangle[2] - triangle[0]))
-
-
-WORDS = 12
-"""Number of values in a facet."""
 
 
 class _Scaled(NamedTuple):

@@ -51,6 +51,19 @@ from refref_jax.numerics import safe_divide, safe_sqrt
 SMALLEST_FOR_SSIM = 11
 """Edge of SSIM's window in pixels; SSIM is undefined for smaller images."""
 
+SMALLEST_FOR_LPIPS = 31
+"""Smallest edge of an image in pixels; for smaller images the second pooling has no output."""
+
+# Mean and deviation of AlexNet's training images, in the range [-1, 1].
+_MEAN = (-0.030, -0.088, -0.188)
+_DEVIATION = (0.458, 0.448, 0.450)
+
+# Added to the norm of a pixel's features, as in the published implementation.
+_LENGTH_PADDING = 1e-10
+
+_POOL = 3
+_POOL_STRIDE = 2
+
 
 def psnr(rendered: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Float[Array, ""]:
     """Returns the peak signal-to-noise ratio in dB, `-10 log10(mean((rendered - target)^2))`.
@@ -173,20 +186,6 @@ def import_flip() -> Any:
             "pip install -e '.[flip]'."
         ) from error
     return flip_evaluator
-
-
-SMALLEST_FOR_LPIPS = 31
-"""Smallest edge of an image in pixels; for smaller images the second pooling has no output."""
-
-# Mean and deviation of AlexNet's training images, in the range [-1, 1].
-_MEAN = (-0.030, -0.088, -0.188)
-_DEVIATION = (0.458, 0.448, 0.450)
-
-# Added to the norm of a pixel's features, as in the published implementation.
-_LENGTH_PADDING = 1e-10
-
-_POOL = 3
-_POOL_STRIDE = 2
 
 
 class Layer(NamedTuple):

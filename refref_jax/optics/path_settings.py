@@ -24,6 +24,19 @@ from typing import Literal, NamedTuple, get_args
 
 from refref_jax.choices import Footprint
 
+Reflections = Literal["none", "first", "all"]
+TotalReflection = Literal["followed", "ended"]
+Reentry = Literal["possible", "impossible"]
+Unfinished = Literal["kept", "dark"]
+
+# Max bends and throughput threshold for which the capacity factors below were measured.
+_PAPER_BENDS = 10
+_TREE_BENDS = 24
+_TREE_CUT = 0.02
+
+# Capacities do not grow for thresholds below this one, so that memory is bounded.
+_SMALLEST_CUT_WITH_ROOM = 5e-4
+
 
 @dataclasses.dataclass(frozen=True)
 class Detail:
@@ -51,20 +64,6 @@ class Detail:
 def everything(bends: int) -> Detail:
     """Returns the settings that store complete paths."""
     return Detail("all", bends + 1)
-
-
-Reflections = Literal["none", "first", "all"]
-TotalReflection = Literal["followed", "ended"]
-Reentry = Literal["possible", "impossible"]
-Unfinished = Literal["kept", "dark"]
-
-# Max bends and throughput threshold for which the capacity factors below were measured.
-_PAPER_BENDS = 10
-_TREE_BENDS = 24
-_TREE_CUT = 0.02
-
-# Capacities do not grow for thresholds below this one, so that memory is bounded.
-_SMALLEST_CUT_WITH_ROOM = 5e-4
 
 
 @dataclasses.dataclass(frozen=True)

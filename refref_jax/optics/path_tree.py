@@ -26,6 +26,9 @@ from refref_jax.optics.ray_differentials import Spread
 NO_SEGMENT = -1
 """Parent of a camera ray's first segment."""
 
+# Index past the end of any list: writes to it are dropped.
+_NOWHERE = 2**31 - 1
+
 
 class Segments(NamedTuple):
     """A list of path segments; the first ones are the camera rays.
@@ -226,10 +229,6 @@ def _walk_back(segments: Segments, ends: Ends, detail: Detail, tallied: int) -> 
     )
     # Every segment has one bend more than its parent, so the loop terminates.
     return jax.lax.while_loop(lambda walk: jnp.any(walk.segment != NO_SEGMENT), step, start)
-
-
-# Index past the end of any list: writes to it are dropped.
-_NOWHERE = 2**31 - 1
 
 
 def pack(

@@ -39,6 +39,15 @@ from refref_jax.optics.path_tree import NO_SEGMENT, Ends, PathTree, Segments
 from refref_jax.optics.queues import Pool
 from refref_jax.optics.scene import Scene
 
+BLOCK = 4096
+"""Number of rays cast per iteration. Accelerators benefit from more, at the cost of memory."""
+
+# From this number of blocks, the last rays are cast in smaller blocks, by a second compiled loop.
+_MANY_BLOCKS = 6
+
+# Ratio of the two block sizes; blocks of fewer rays than this have no second loop.
+_SMALLER = 16
+
 
 class Live(NamedTuple):
     """Active rays, which are still to be cast.
@@ -158,16 +167,6 @@ def end(
     """Ends some rays as paths."""
     block = Ends(live.segments, live.rays, live.weights, live.state.bends, status)
     return tree._replace(ends=queues.append(tree.ends, block, ending))
-
-
-BLOCK = 4096
-"""Number of rays cast per iteration. Accelerators benefit from more, at the cost of memory."""
-
-# From this number of blocks, the last rays are cast in smaller blocks, by a second compiled loop.
-_MANY_BLOCKS = 6
-
-# Ratio of the two block sizes; blocks of fewer rays than this have no second loop.
-_SMALLER = 16
 
 
 class _Walk(NamedTuple):

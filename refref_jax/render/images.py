@@ -47,6 +47,19 @@ _SMALLEST_TILE = 1024
 
 _Tree = TypeVar("_Tree")
 
+TILE = 16384
+"""Number of rays traced at once."""
+
+CHUNK = 4096
+"""Number of paths rendered at once. Lower it if memory runs out."""
+
+_INSTEAD = "Call it outside, or use render_rays, which is a pure function."
+_BRANCHES: tuple[Branch, ...] = get_args(Branch)
+_ALL, _PASSED, _MIRRORED = range(len(_BRANCHES))
+
+RAYS_OF_A_BAND = 1 << 18
+"""Most rays that are held at once, where a row of pixels has no more."""
+
 
 def in_tiles(
     see: Callable[[Rays, Int[np.ndarray, "tile slots"] | None, int], _Tree],
@@ -127,17 +140,6 @@ def cut_out(
     filling = Rays(_OUT_OF_REACH * away, away, np.ones(missing, part.radii.dtype))
     nowhere = jax.tree.map(lambda x: np.full((missing, x.shape[1]), EMPTY_SLOT, x.dtype), within)
     return jax.tree.map(lambda a, b: np.concatenate([a, b]), (part, within), (filling, nowhere))
-
-
-TILE = 16384
-"""Number of rays traced at once."""
-
-CHUNK = 4096
-"""Number of paths rendered at once. Lower it if memory runs out."""
-
-_INSTEAD = "Call it outside, or use render_rays, which is a pure function."
-_BRANCHES: tuple[Branch, ...] = get_args(Branch)
-_ALL, _PASSED, _MIRRORED = range(len(_BRANCHES))
 
 
 class Rendering(NamedTuple):
@@ -332,10 +334,6 @@ def _add(
 
 def _finish(sums: Rendering) -> Rendering:
     return sums._replace(rgb=jnp.clip(colour.linear_to_srgb(sums.linear), 0.0, 1.0))
-
-
-RAYS_OF_A_BAND = 1 << 18
-"""Most rays that are held at once, where a row of pixels has no more."""
 
 
 def render_camera(

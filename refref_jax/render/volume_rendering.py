@@ -35,6 +35,15 @@ from refref_jax.sampling import cones, polylines, scene_bounds, stepfun
 from refref_jax.sampling.cones import Gaussians
 from refref_jax.sampling.polylines import Polyline
 
+# Minimum dilation of a proposal, in units of the full path (Mip-NeRF 360, supplement).
+_DILATION_BIAS = 0.0025
+
+# Minimum length of a path, in units of the scene radius: `s` keeps four digits in float32.
+_SHORTEST = 1e-3
+
+# Rotation between adjacent cone patterns (Zip-NeRF, supplement).
+_PATTERN_TURN = jnp.pi / 6.0
+
 
 class Composite(NamedTuple):
     """Colour and distance of a path.
@@ -102,16 +111,6 @@ def composite(
         median=jnp.where(accumulation >= 0.5, median, jnp.inf),
         mean=jnp.where(accumulation > 0.0, mean, jnp.inf),
     )
-
-
-# Minimum dilation of a proposal, in units of the full path (Mip-NeRF 360, supplement).
-_DILATION_BIAS = 0.0025
-
-# Minimum length of a path, in units of the scene radius: `s` keeps four digits in float32.
-_SHORTEST = 1e-3
-
-# Rotation between adjacent cone patterns (Zip-NeRF, supplement).
-_PATTERN_TURN = jnp.pi / 6.0
 
 
 class Jitter(NamedTuple):

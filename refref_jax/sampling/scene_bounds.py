@@ -27,6 +27,8 @@ from refref_jax import numerics
 from refref_jax.choices import Space
 from refref_jax.sampling.cones import Gaussians
 
+_LAMBDA = -1.5
+
 
 class Domain(NamedTuple):
     """Scene bounds: the part of space that a field stores.
@@ -121,9 +123,6 @@ def shrinkage(x: Float[Array, "*shape 3"]) -> Float[Array, "*shape"]:
     norm = numerics.length(x)
     inverse = 1.0 / jnp.where(norm > 1.0, norm, 1.0)
     return (2.0 - inverse) ** (2.0 / 3.0) * inverse ** (4.0 / 3.0)
-
-
-_LAMBDA = -1.5
 
 
 class DistanceWarp(NamedTuple):

@@ -38,6 +38,15 @@ _SECOND_MOMENT_DECAY = 0.99
 
 _EPSILON = 1e-15
 
+# Slope of Schlick's bias function, by which trust in the proposals grows (Mip-NeRF 360).
+_ANNEAL_SLOPE = 10.0
+
+# Pixels by which the room for a batch's paths is measured.
+_SURVEY = 1 << 14
+
+# Memory for the light paths of all pixels.
+_MOST_BYTES = 1 << 29
+
 
 class TrainState(NamedTuple):
     """State of a run.
@@ -78,10 +87,6 @@ def learning_rate(schedule: ScheduleConfig) -> optax.Schedule:
         decay_rate=schedule.end / schedule.peak,
         end_value=schedule.end,
     )
-
-
-# Slope of Schlick's bias function, by which trust in the proposals grows (Mip-NeRF 360).
-_ANNEAL_SLOPE = 10.0
 
 
 class Pool(NamedTuple):
@@ -252,13 +257,6 @@ def _anneal(step: Int[Array, ""], steps: int) -> Float[Array, ""]:
     """Returns the exponent on the proposals' weights (Mip-NeRF 360, Eq 18)."""
     progress = jnp.minimum(step.astype(jnp.float32) / max(1, steps), 1.0)
     return _ANNEAL_SLOPE * progress / ((_ANNEAL_SLOPE - 1.0) * progress + 1.0)
-
-
-# Pixels by which the room for a batch's paths is measured.
-_SURVEY = 1 << 14
-
-# Memory for the light paths of all pixels.
-_MOST_BYTES = 1 << 29
 
 
 class Setup(NamedTuple):

@@ -34,6 +34,9 @@ from refref_jax.training.config import TrainConfig, options_of
 from refref_jax.training.config_files import CONFIG
 from refref_jax.training.loop import TrainState
 
+_METRICS = "metrics.jsonl"
+_LEFT_BEHIND = (_METRICS, checkpoint_io.CHECKPOINTS)
+
 
 class Checkpoints:
     """The checkpoints of one run, open for writing. Use it in a `with` statement."""
@@ -101,10 +104,6 @@ def _abstract(leaf: jax.Array | jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
 
 def _training_item(state: TrainState) -> dict[str, Any]:
     return {"step": state.step, "optimizer": state.optimizer}
-
-
-_METRICS = "metrics.jsonl"
-_LEFT_BEHIND = (_METRICS, checkpoint_io.CHECKPOINTS)
 
 
 def exists(run: Path) -> bool:

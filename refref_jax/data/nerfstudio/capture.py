@@ -47,6 +47,11 @@ _UNDISTORT = (
     "image_undistorter` does, and convert what it writes (see docs/data_formats.md)."
 )
 
+FILE = "transforms.json"
+
+# Grey levels from here on are white: JPEG leaves some beside every edge.
+_WHITE = 128
+
 
 class Intrinsics(NamedTuple):
     """What a pinhole camera makes of the scene, in pixels.
@@ -202,12 +207,6 @@ def _image_size(path: Path) -> tuple[int, int]:
             f"{path} can not be read as an image ({error}). Copy or convert it again."
         ) from error
     return width, height
-
-
-FILE = "transforms.json"
-
-# Grey levels from here on are white: JPEG leaves some beside every edge.
-_WHITE = 128
 
 
 class Capture(NamedTuple):

@@ -32,6 +32,21 @@ from refref_jax.data.nerfstudio import capture as nerfstudio
 from refref_jax.data.nerfstudio.capture import CaptureFrame
 from refref_jax.data.scene_folder import Frames
 
+USUAL_DISTANCE = 4.0
+"""Distance of the data set's cameras from the origin, world units, for captures without a scale."""
+
+# Axes are taken for parallel if the meeting point moves more than this per unit of their shift.
+_WORST_CONDITION = 1e4
+
+Sense = Literal["object", "background", "none"]
+"""What is white in nerfstudio's masks: the object, or all else; or there are to be none."""
+
+# By how much a pixel may be displaced at the image's border, pixels.
+_TOLERANCE = 0.5
+
+# Less of an image than this is not kept: its principal point is another image's.
+_LEAST_KEPT = 0.5
+
 
 class Windows(NamedTuple):
     """What is kept of each image of a split, along one axis.
@@ -65,13 +80,6 @@ def centred_windows(centres: Float[np.ndarray, " images"], size: int) -> Windows
         if len(found) == 2:
             break
     return min(found, key=lambda windows: windows.shift)
-
-
-USUAL_DISTANCE = 4.0
-"""Distance of the data set's cameras from the origin, world units, for captures without a scale."""
-
-# Axes are taken for parallel if the meeting point moves more than this per unit of their shift.
-_WORST_CONDITION = 1e4
 
 
 class Placement(NamedTuple):
@@ -124,16 +132,6 @@ def meeting_point(poses: Float[np.ndarray, "cameras 3 4"]) -> Float[np.ndarray, 
             "it as the centre, such as (0.5, 0, 1.2)."
         )
     return np.linalg.solve(total, np.einsum("nij,nj->i", across, poses[..., 3]))
-
-
-Sense = Literal["object", "background", "none"]
-"""What is white in nerfstudio's masks: the object, or all else; or there are to be none."""
-
-# By how much a pixel may be displaced at the image's border, pixels.
-_TOLERANCE = 0.5
-
-# Less of an image than this is not kept: its principal point is another image's.
-_LEAST_KEPT = 0.5
 
 
 class View(NamedTuple):
