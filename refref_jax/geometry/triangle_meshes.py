@@ -1,6 +1,4 @@
-"""Triangle meshes and their vertex normals (NumPy only).
-
-Shading normals at the corners of triangles, on the host (NumPy only).
+"""Closed triangle meshes: their shading normals, measures and connected pieces (NumPy only).
 
 Neighbouring faces whose normals differ by less than the crease angle belong to one smooth patch.
 At a corner, the face normals of a patch are averaged, weighted by the angle of each face there.
@@ -8,8 +6,6 @@ Normals are not averaged across a crease, so a cube stays flat and a cylinder ke
 
 Source: Thuermer and Wuethrich, Computing Vertex Normals from Polygonal Facets (1998), for the
 weighting by angle.
-
-Closed triangle meshes: what is measured on them, and their pieces (NumPy only).
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,4 @@
-"""Path settings: which light is followed, and the capacities of its buffers.
-
-Selects which segments of traced paths are stored, to save memory.
-
-Path settings: the branches of light that are traced, and the capacity for them.
+"""Path settings: the branches of light that are traced, and the capacities of the buffers for them.
 
 At every interface light splits into a reflected and a transmitted ray, so a camera ray has a tree
 of paths. Path settings select the branches to follow. The presets are:
@@ -14,6 +10,8 @@ of paths. Path settings select the branches to follow. The presets are:
 - `TREE`: every branch with a throughput of at least 2 %.
 - `PAPER_NO_REFLECTION`, `PAPER_NO_TIR`: the paper's ablations: `PAPER` without the reflection at
   the first surface, and with paths that continue straight at total internal reflections.
+
+`Detail` selects which segments of traced paths are stored, to save memory.
 
 Source: paper (arXiv 2505.05848), sections 4 and 5 (ablation study), for all but the tree.
 """

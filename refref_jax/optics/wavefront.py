@@ -1,8 +1,4 @@
-"""Child rays of a block of rays: stores their segments and queues or ends them.
-
-Letters as in `light_paths`.
-
-Wavefront path tracing of rays along all branches of their paths.
+"""Wavefront path tracing of rays along all branches of their paths.
 
 Rays still to be cast are on a stack. Every iteration pops a block of rays and casts it: a ray that
 hits nothing ends as a path; for a ray that hits a surface, the reflected and transmitted children

@@ -1,10 +1,10 @@
-"""A model on disk: what a run folder holds for rendering.
+"""Saves and loads a model: the files of a run folder that rendering needs.
 
     {run}/model.json            static description (`SavedModel`)
     {run}/geometry.npz          surfaces and interfaces
-    {run}/checkpoints/{step}/   parameters, and the training state beside them
+    {run}/checkpoints/{step}/   parameters, and next to them the training state
 
-A model can be rendered from these alone, without the scene that it was trained on.
+These files alone suffice to render a model, without the scene that it was trained on.
 """
 
 import dataclasses

@@ -1,20 +1,13 @@
-"""Renders images in tiles of fixed size.
+"""Renders images in tiles and chunks of fixed size, so that programs compile once.
 
-Splits rays into tiles of one size, so that the function that renders a tile compiles once.
+Rays are traced in *tiles*. The paths of a tile are sorted so that empty slots come last, and are
+then rendered in *chunks*: a pixel that misses the objects costs one path, not two. The loops over
+tiles and chunks run on the host, so they cannot be part of a transformed function. This is one of
+the modules that call `jax.jit`.
 
-The loop over tiles runs on the host, so it cannot be part of a transformed function.
-
-Renders images in tiles and chunks of fixed size, so that programs compile once.
-
-Rays are traced in tiles. The paths of a tile are sorted so that empty slots come last, and are then
-rendered in chunks: a pixel that misses the objects costs one path, not two. This is one of the
-modules that call `jax.jit`.
-
-Images of a trained model with several rays in every pixel.
-
-A pixel is divided into `side x side` smaller ones. Each has a ray of its own with a footprint as
-much smaller, so the fields are queried for finer detail too. Colours are averaged as linear light
-and encoded afterwards: what a camera does, and what the true images were made with.
+With several rays in every pixel, a pixel is divided into `side x side` smaller ones. Each has a ray
+of its own with a footprint as much smaller, so the fields are queried for finer detail too. Colours
+are averaged as linear light and encoded afterwards, as a camera does.
 """
 
 import functools
