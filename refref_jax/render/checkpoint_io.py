@@ -157,7 +157,7 @@ def restore(manager: ocp.CheckpointManager, step: int, items: dict) -> ocp.args.
         return manager.restore(step, args=ocp.args.Composite(**arguments))
     except Exception as error:  # Orbax raises what its storage does
         raise ValueError(
-            f"The checkpoint {manager.directory / str(step)} can not be read ({_brief(error)}). "
+            f"The checkpoint {manager.directory / str(step)} cannot be read ({_brief(error)}). "
             "Remove it to use an older one, or train again."
         ) from error
 
@@ -176,7 +176,7 @@ def load_geometry(run: Path) -> Scene:
             interfaces = Interfaces(*(arrays[name] for name in Interfaces._fields))
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(
-            f"{path} can not be read ({_brief(error)}). Restore it, or train again into another "
+            f"{path} cannot be read ({_brief(error)}). Restore it, or train again into another "
             "folder."
         ) from error
     return jax.tree.map(jax.numpy.asarray, Scene(surfaces, interfaces))

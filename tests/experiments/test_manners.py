@@ -43,7 +43,7 @@ _IN_THE_WAY = {
 
 _OF_THE_SCENE = {
     "--cut=1": "--cut=1.0: The cut is a share of a pixel's light",
-    "--bends=-1": "can not have -1 bends. Give 0 or more.",
+    "--bends=-1": "cannot have -1 bends. Give 0 or more.",
     "--samples=4,0": "--samples=4,0: samples is 4,0, not a list of positive numbers. Write as in",
     "--samples=a": "is not a list of numbers. Write as in --samples=32,20.",
     "--blurs=x": "--blurs=x is not a list of numbers. Write as in --blurs=0.03,0.003.",
@@ -78,7 +78,7 @@ _ON_TOP_OF_R3F = {
 _MISTAKES = {
     "train": {
         "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
-        "--out=OUT --scene=hf:cubebg/cube_smcvx_ball": "no configuration of the data set",
+        "--out=OUT --scene=hf:cubebg/cube_smcvx_ball": "not a configuration of the data set",
         "--out=OUT": "Add --scene=FOLDER, or --resume",
         "--out=OUT --scene=": "--scene is empty. Give a folder, or hf:CONFIG/SCENE",
         "--out=OUT --config=nowhere.json": "nowhere.json is not a file.",

@@ -295,7 +295,7 @@ def test_a_damaged_geometry_is_named(tmp_path, damage):
     path.unlink()
     if damage == "truncated":
         path.write_bytes(content[: len(content) // 2])
-    with pytest.raises(ValueError, match=r"geometry\.npz can not be read"):
+    with pytest.raises(ValueError, match=r"geometry\.npz cannot be read"):
         checkpoint_io.load_geometry(tmp_path)
 
 
@@ -305,7 +305,7 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
     with Checkpoints(tmp_path, keep=1) as checkpoints:
         checkpoints.save(state)
     shutil.rmtree(tmp_path / "checkpoints" / "1" / "params")
-    with pytest.raises(ValueError, match=r"checkpoints/1 can not be read"):
+    with pytest.raises(ValueError, match=r"checkpoints/1 cannot be read"):
         load_model(tmp_path)
 
 
