@@ -232,14 +232,14 @@ def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> l
     """Reads all parts of a scene, ordered by name.
 
     Args:
-      scene: the scene folder, see `mesh_files`. No file is no part.
+      scene: the scene folder, see `mesh_files`; without mesh files, there are no parts.
       indices: indices of refraction that replace or extend the table and `scene.json`, by
         material or, for one part alone, by file stem.
 
     Raises:
       SceneError: if a mesh is broken or empty, if its material is unknown, if an index is not
-        positive or names nothing, or if `scene.json` is wrong or describes a mesh that is missing
-        among others.
+        positive or does not fit any mesh, or if `scene.json` is invalid or describes a missing
+        mesh.
     """
     overrides = dict(indices or {})
     for name, index in overrides.items():

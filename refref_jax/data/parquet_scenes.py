@@ -84,7 +84,7 @@ def unpack(shards: Sequence[Path], scene: Path, *, progress: Progress) -> None:
       progress: function called after every frame.
 
     Raises:
-      SceneError: as `read_contents`, or if a row is broken.
+      SceneError: under the conditions of `read_contents`, or if a row is broken.
     """
     contents = read_contents(shards)
     total, done = sum(contents.frames.values()), 0

@@ -101,7 +101,7 @@ def _bodies(needs: Needs) -> str:
     before = ["clear"] if needs.interior == "clear" else []
     if needs.convex:
         before.append("convex")
-    noun = "body" if needs.bodies == 1 else "bodies"
+    noun = "object" if needs.bodies == 1 else "objects"
     text = " ".join([str(needs.bodies), *before, noun])
     if needs.parts > needs.bodies:
         text = f"{needs.parts} parts in {text}"
