@@ -170,7 +170,7 @@ def interpolate(
     return _gather.bind(table, positions, resolution=resolution, precision=precision)
 
 
-# --- as formulas ---
+# Formulas, for all devices.
 
 
 def _gathered(
@@ -208,7 +208,7 @@ def _stacked_corners(
     return jnp.stack(rows, axis=-1), jnp.stack(weights, axis=-1)
 
 
-# --- as primitives: both are linear in their first argument, and each is the other's transpose ---
+# Primitives: both are linear in their first argument, and each is the other's transpose.
 
 
 def _primitive(name: str, formula: Callable[..., Array], loop: Callable[..., Array]) -> Primitive:
