@@ -87,7 +87,7 @@ def test_a_mesh_that_no_camera_sees_is_warned_about(tmp_path):
     path = next((scene / "meshes").iterdir())
     trimesh.load(path).apply_translation([500.0, 0.0, 0.0]).export(path)
     result = run_command("train", f"--scene={scene}", f"--out={tmp_path / 'run'}", *TINY)
-    assert "no pixel sees the meshes" in result.stdout
+    assert "no camera ray hits the meshes" in result.stdout
     assert "advice: rule nested: there is one part" in result.stdout
 
 

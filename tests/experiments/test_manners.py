@@ -42,9 +42,9 @@ _IN_THE_WAY = {
 }
 
 _OF_THE_SCENE = {
-    "--cut=1": "--cut=1.0: The cut is a share of a pixel's light",
+    "--cut=1": "--cut=1.0: cut is 1.0, but it is a share of a pixel's light",
     "--bends=-1": "cannot have -1 bends. Give 0 or more.",
-    "--samples=4,0": "--samples=4,0: samples is 4,0, not a list of positive numbers. Write as in",
+    "--samples=4,0": "--samples=4,0: samples is 4,0, not a list of positive numbers. Use a list",
     "--samples=a": "is not a list of numbers. Write as in --samples=32,20.",
     "--blurs=x": "--blurs=x is not a list of numbers. Write as in --blurs=0.03,0.003.",
     "--multisamples=3": "Give 1 (on the centre line) or 6",

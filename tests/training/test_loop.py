@@ -282,7 +282,7 @@ def test_a_scene_may_move_but_not_change(tmp_path):
 @pytest.mark.parametrize("left", ["checkpoints", "metrics.jsonl"])
 def test_what_is_left_of_a_run_is_not_taken_over(tmp_path, left):
     (tmp_path / left).mkdir()
-    with pytest.raises(ValueError, match=rf"can not be continued.* Remove \S+/{left}, ") as refused:
+    with pytest.raises(ValueError, match=rf"cannot be continued.* Remove \S+/{left}, ") as refused:
         run_folder.create(tmp_path, CONFIG, SAVED, _GEOMETRY)
     assert "--resume" not in str(refused.value)
 
