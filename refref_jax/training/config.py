@@ -131,8 +131,8 @@ class PathsConfig:
         """Checks the numbers."""
         if self.cut is not None and not 0.0 <= self.cut < 1.0:
             raise ValueError(
-                f"cut is {self.cut}, but it is a share of a pixel's light in [0, 1). Give 0.02 for "
-                "2 %."
+                f"The throughput threshold cut is {self.cut}, outside [0, 1). Give 0.02 for 2 % of "
+                "a pixel's light."
             )
         if self.bends is not None and self.bends < 0:
             raise ValueError(f"A path cannot have {self.bends} bends. Give 0 or more.")

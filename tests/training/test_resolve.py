@@ -294,7 +294,7 @@ def test_a_reconstruction_is_named_as_seen_from_its_run(tmp_path, monkeypatch):
         ('{"paths": {"cut": NaN}}', "NaN, not a number"),
         ('{"seed": 0', "does not hold a TrainConfig"),
         ('{"sead": 0}', "unknown 'sead'"),
-        ('{"paths": {"cut": 2}}', "cut is 2.0, but it is a share"),
+        ('{"paths": {"cut": 2}}', "cut is 2.0, outside"),
         ("[]", "not an object"),
         ('{"loss": 1, "batch": 2, "pool": 3}', "not started again"),
         ('{"seed": -1}', "seed is -1"),
