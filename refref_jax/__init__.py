@@ -1,4 +1,4 @@
-"""Radiance fields of scenes with glass and liquids, along the true, bent paths of light.
+"""Radiance fields of scenes with glass and liquids, sampled along refracted light paths.
 
 The public API consists of this module, for objects, rays and light paths, and of
 `refref_jax.render`, for colours. `docs/library.md` lists all names. They are imported on first use,

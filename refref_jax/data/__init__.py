@@ -1,8 +1,8 @@
-"""Scenes on disk: images, cameras, meshes. NumPy only; nothing here touches a device."""
+"""Scenes on disk: images, cameras, meshes. NumPy only, without a device."""
 
 
 class SceneError(ValueError):
     """A file of a scene is missing, broken or contradicts another.
 
-    The message names the file and says what to do.
+    The message names the file and the remedy.
     """

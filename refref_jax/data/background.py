@@ -1,14 +1,14 @@
-"""What is behind the objects of a scene: near or infinitely far, and how it looks (NumPy only).
+"""Reads the background of a scene: its geometry and its images (NumPy only).
 
-`scene.json` may tell; the data set's own scenes have none.
+`scene.json` may describe it; the data set's own scenes have none.
 
     "background": {"type": "cube", "half_extent": 7.3, "faces": {NAME: {"image": FILE,
                    "normal": [x, y, z], "u_axis": [x, y, z], "v_axis": [x, y, z]}, ...}}
     "background": {"type": "sphere", "radius": 7.3, "image": FILE}
     "background": {"type": "env", "image": FILE}
 
-An image is a PNG of 8-bit sRGB, or an EXR of linear RGB; its name counts from the scene's folder.
-How it lies on its wall is told in `render.backgrounds`.
+An image is a PNG of 8-bit sRGB, or an EXR of linear RGB; its name is relative to the scene folder.
+`render.backgrounds` defines how it is mapped onto the background.
 """
 
 import math
@@ -34,7 +34,7 @@ from refref_jax.render.backgrounds import (
 _FILE = "scene.json"
 _WALLS = 6
 
-# Axes are written with six digits or more.
+# Axes are stored with at least six digits.
 _AXES_TOLERANCE = 1e-3
 
 _SPACES: dict[str, Space] = {"cube": "bounded", "sphere": "spherical", "env": "unbounded"}
@@ -43,9 +43,9 @@ _SPACES: dict[str, Space] = {"cube": "bounded", "sphere": "spherical", "env": "u
 def space(scene: Path) -> Space:
     """Returns `unbounded` if the background is an environment map, `spherical` if it is a sphere.
 
-    `scene.json` decides if it names the background; otherwise the scene's name does, which begins
-    with `env` in the data set, and with `cube` or `sphere` where there are walls. That is not
-    enough to know of a sphere where it stands, and a cube around it is taken.
+    `scene.json` decides if it describes the background. Otherwise the scene's name does: in the
+    data set it starts with `env`, or with `cube` or `sphere` for a bounded background. The name
+    does not contain the radius of a sphere, so a cube around it is used (`bounded`).
     """
     kind = _background(scene).get("type")
     if kind is None:
@@ -60,7 +60,7 @@ def space(scene: Path) -> Space:
 
 
 def half_extent(scene: Path) -> float | None:
-    """Returns half the edge of the cube that the walls form, or their sphere's radius, if told."""
+    """Returns half the edge of the background cube, or the radius of the sphere, if known."""
     record = _background(scene)
     key = "radius" if record.get("type") == "sphere" else "half_extent"
     extent = record.get(key)
@@ -71,17 +71,17 @@ def read_background(scene: Path) -> Background:
     """Reads the background that `scene.json` describes, with its images.
 
     Returns:
-      A record of NumPy arrays.
+      The background, as NumPy arrays.
 
     Raises:
-      SceneError: if the file does not tell the background, or an image is missing or broken.
+      SceneError: if the file does not describe the background, or an image is missing or broken.
     """
     record = _background(scene)
     kind = record.get("type")
     if not isinstance(kind, str) or kind not in _READERS:
         raise SceneError(
-            f"The background is not known: {scene / _FILE} gives it no type of "
-            f"{', '.join(_READERS)}. Describe it there, or use a scene that does."
+            f"The background is unknown: its type in {scene / _FILE} is not one of "
+            f"{', '.join(_READERS)}. Describe it there, or use a scene with a background."
         )
     return _READERS[kind](record, scene)
 
@@ -91,13 +91,13 @@ def _read_cube(record: dict[str, Any], scene: Path) -> CubeBackground:
     half = _positive(scene_folder.get(record, "half_extent", path), "half_extent", scene)
     faces = scene_folder.get(record, "faces", path)
     if not isinstance(faces, dict) or len(faces) != _WALLS:
-        raise SceneError(f"The faces of the background are not six in {path}. Describe each wall.")
+        raise SceneError(f"The background in {path} does not have six faces. Describe all six.")
     walls = list(faces.values())
     axes = np.stack([_axes(wall, name, path) for name, wall in faces.items()])
     towards = axes[:, 0] @ axes[:, 0].T
     if np.max(np.abs(np.sort(towards, axis=1) - [-1.0, 0.0, 0.0, 0.0, 0.0, 1.0])) > _AXES_TOLERANCE:
         raise SceneError(
-            f"The normals of the faces do not make a cube in {path}. Give six, two along each of "
+            f"The normals of the faces in {path} do not form a cube. Give six, two along each of "
             "three perpendicular axes."
         )
     axes = axes.astype(np.float32)
@@ -122,7 +122,7 @@ _READERS: dict[str, Callable[[dict[str, Any], Path], Background]] = {
 
 
 def _read_texture(record: Any, scene: Path) -> Texture:
-    """Reads the image that a record names: EXR as linear, all else as 8-bit sRGB."""
+    """Reads the image of a record: EXR as linear RGB, other formats as 8-bit sRGB."""
     path = scene / scene_folder.get_text(record, "image", scene / _FILE)
     if path.suffix.lower() != ".exr":
         return SrgbTexture((image_files.read_rgb(path) / 255.0).astype(np.float32))
@@ -138,14 +138,14 @@ def _stack(textures: list[Texture], path: Path) -> Texture:
     kinds = {type(texture) for texture in textures}
     if len(kinds) > 1 or len({texture.texels.shape for texture in textures}) > 1:
         raise SceneError(
-            f"The images of the faces in {path} differ in size or format. Give all walls images of "
-            "one size, all PNG or all EXR."
+            f"The images of the faces in {path} differ in size or format. Use images "
+            "of one size, all PNG or all EXR."
         )
     return kinds.pop()(np.stack([texture.texels for texture in textures]))
 
 
 def _axes(wall: Any, name: str, path: Path) -> Float[np.ndarray, "3 3"]:
-    """Returns the normal, u axis and v axis of a wall as rows: unit and perpendicular."""
+    """Returns the normal, u axis and v axis of a face as rows: unit vectors, perpendicular."""
     values = [scene_folder.get(wall, key, path) for key in ("normal", "u_axis", "v_axis")]
     try:
         axes = np.asarray(values, np.float64)

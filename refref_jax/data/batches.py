@@ -1,9 +1,10 @@
-"""Which pixels a training step sees (NumPy only).
+"""Draws the pixels of each training step (NumPy only).
 
-Pixels are dealt to batches once, at random; every epoch sees all batches, in an order of its own.
-So what is made of a batch, its light paths, serves for every epoch. Which batch a step sees depends
-on the seed and on the step alone, so a run that is resumed sees the very pixels that it would have
-seen. Within an epoch no pixel comes twice, but for those that fill up the last batch.
+Pixels are assigned to batches once, at random; every epoch has all batches, in an order of its own.
+Results computed for a batch, such as its light paths, are therefore valid in every epoch. The batch
+of a step depends on the seed and the step alone, so a resumed run has the same pixels as an
+uninterrupted one. Within an epoch no pixel is repeated, except for those that fill up the last
+batch.
 """
 
 from typing import NamedTuple
@@ -16,11 +17,11 @@ from refref_jax.geometry.rays import Rays
 
 
 class PixelBatch(NamedTuple):
-    """Rays and true colours of some pixels.
+    """Rays and true colours of pixels.
 
     Attributes:
       rays: camera rays.
-      rgb: 8-bit sRGB.
+      rgb: colours, 8-bit sRGB.
     """
 
     rays: Rays
@@ -28,15 +29,15 @@ class PixelBatch(NamedTuple):
 
 
 def check_batch(cameras: Cameras, batch: int) -> None:
-    """Checks that the images of some cameras hold a batch.
+    """Checks that the images of cameras have enough pixels for a batch.
 
     Raises:
-      ValueError: if not.
+      ValueError: if they have fewer.
     """
     pixels = len(cameras.poses) * cameras.height * cameras.width
     if batch > pixels:
         raise ValueError(
-            f"A batch of {batch} pixels is larger than all images together, which have {pixels}. "
+            f"A batch of {batch} pixels is larger than all images together, with {pixels}. "
             "Use a smaller batch."
         )
 
@@ -45,7 +46,7 @@ class PixelSampler:
     """Draws batches of pixels from a set of images.
 
     Attributes:
-      batches: number of batches of an epoch.
+      batches: number of batches per epoch.
     """
 
     def __init__(
@@ -57,14 +58,14 @@ class PixelSampler:
         batch: int,
         kept: Bool[np.ndarray, "frames h w"] | None = None,
     ) -> None:
-        """Prepares to draw.
+        """Assigns pixels to batches.
 
         Args:
-          images: 8-bit sRGB.
-          cameras: one an image.
-          seed: of the order of pixels.
-          batch: pixels a step.
-          kept: the pixels to draw from; all of them if not given.
+          images: images in 8-bit sRGB.
+          cameras: cameras of the images.
+          seed: seed of the order of pixels.
+          batch: number of pixels per step.
+          kept: mask of the pixels to draw from; all pixels if `None`.
 
         Raises:
           ValueError: if the images do not fit the cameras, or have fewer pixels than a batch.
@@ -72,7 +73,7 @@ class PixelSampler:
         expected = (len(cameras.poses), cameras.height, cameras.width, 3)
         if images.shape != expected:
             raise ValueError(
-                f"The images are {images.shape}, but the cameras ask for {expected}. Give one "
+                f"The images are {images.shape}, but the cameras require {expected}. Give one "
                 "image a camera, in its size."
             )
         check_batch(cameras, batch)
@@ -90,17 +91,17 @@ class PixelSampler:
         self._order = self._generator(0).permutation(places).astype(np.uint32)
 
     def numbers(self, first: int, steps: int) -> Int[np.ndarray, " steps"]:
-        """Returns the batches that steps `first .. first + steps - 1` see."""
+        """Returns the batch numbers of steps `first .. first + steps - 1`."""
         epoch, place = np.divmod(np.arange(first, first + steps), self.batches)
         found = np.empty(steps, np.int32)
         for each in np.unique(epoch):
-            # The number 0 is that of the deal.
+            # Number 0 is used to assign pixels to batches.
             order = self._generator(int(each) + 1).permutation(self.batches)
             found[epoch == each] = order[place[epoch == each]]
         return found
 
     def draw(self, numbers: Int[np.ndarray, " n"]) -> PixelBatch:
-        """Returns some batches, as `[n, batch]`."""
+        """Returns batches by their numbers, as `[n, batch]`."""
         place = np.int64(self._batch) * numbers[:, None] + np.arange(self._batch)
         return self.look_up(self._order[place % len(self._order)].astype(np.int64))
 

@@ -1,6 +1,6 @@
 """Reads and writes images, masks and depth maps (NumPy only).
 
-Every reader raises a `SceneError` that names the file and says what to do.
+Every reader raises a `SceneError` that names the file and the remedy.
 """
 
 from pathlib import Path
@@ -18,12 +18,12 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _NEAREST_DEPTH = 1.0
 _DEPTH_RANGE = 10.5
 
-# Renderers write 1e4 or more where a ray meets nothing.
+# Renderers write 1e4 or more for rays that hit nothing.
 _DEPTH_OF_A_MISS = 1e4
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """Reads an 8-bit image as sRGB; transparency goes over white, grey becomes colour."""
+    """Reads an 8-bit image as sRGB, composited over white; grey is repeated in three channels."""
     pixels = _read_png(path)
     if pixels.ndim == 2:
         return np.repeat(pixels[..., None], 3, axis=-1)
@@ -36,7 +36,7 @@ def read_rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
-    """Reads a mask: any nonzero value is object."""
+    """Reads a mask: all nonzero values are the object."""
     pixels = _read_png(path)
     if pixels.ndim == 3 and pixels.shape[-1] in (2, 4):
         pixels = pixels[..., :-1]
@@ -44,7 +44,7 @@ def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
 
 
 def read_depth(path: Path) -> Float[np.ndarray, "h w"]:
-    """Reads a map of planar depth in world units, `inf` where a float map has a miss.
+    """Reads a map of planar depth in world units; misses of a float map are `inf`.
 
     Two formats: a float EXR with one channel, and an 8-bit image of inverted depth,
     `z = 1 + 10.5 (1 - v / 255)`, which saturates at 11.5.
@@ -87,7 +87,7 @@ def read_exr(path: Path) -> Float[np.ndarray, "h w *channels"]:
     try:
         with OpenEXR.File(str(path)) as file:
             channels = {name: channel.pixels for name, channel in file.channels().items()}
-    except Exception as error:  # OpenEXR raises what its C++ core does
+    except Exception as error:  # OpenEXR raises the errors of its C++ core
         raise _unreadable_exr(path, error) from error
     if set(channels) == {"RGB"}:
         return channels["RGB"].astype(np.float32)
@@ -112,12 +112,12 @@ def write_rgb(path: str | Path, pixels: Float[np.ndarray, "h w 3"]) -> None:
 
 
 def write_mask(path: Path, mask: Bool[np.ndarray, "h w"]) -> None:
-    """Writes a mask as 8-bit PNG: white where it is true, black elsewhere."""
+    """Writes a mask as 8-bit PNG: white for true, black for false."""
     write_png(path, np.where(mask, 255, 0).astype(np.uint8))
 
 
 def write_png(path: str | Path, pixels: UInt8[np.ndarray, "h w *channels"]) -> None:
-    """Writes an 8-bit image as it is."""
+    """Writes an 8-bit image as PNG."""
     iio.imwrite(path, pixels, plugin="pillow", extension=".png")
 
 
@@ -136,7 +136,7 @@ def _read_png(path: Path) -> UInt8[np.ndarray, "h w *channels"]:
         pixels = pixels.astype(np.uint8) * 255
     if pixels.dtype != np.uint8 or _has_sixteen_bits(path):
         raise SceneError(
-            f"{path} has more than 8 bits a channel. Convert it to an 8-bit PNG: no more would be "
+            f"{path} has more than 8 bits per channel. Convert it to an 8-bit PNG: only 8 bits are "
             "used."
         )
     return pixels
@@ -144,17 +144,17 @@ def _read_png(path: Path) -> UInt8[np.ndarray, "h w *channels"]:
 
 def _unreadable_image(path: Path, error: Exception) -> SceneError:
     return SceneError(
-        f"{path} can not be read as an image ({error}). It may be truncated: copy or render it "
+        f"{path} cannot be read as an image ({error}). It may be truncated: copy or render it "
         "again."
     )
 
 
 def _unreadable_exr(path: Path, error: Exception) -> SceneError:
-    return SceneError(f"{path} can not be read as EXR ({error}). Export it again.")
+    return SceneError(f"{path} cannot be read as EXR ({error}). Export it again.")
 
 
 def _has_sixteen_bits(path: Path) -> bool:
-    """Returns whether a PNG's header says so; Pillow halves colours without a word."""
+    """Returns whether a PNG has 16 bits per channel, which Pillow silently reduces to 8."""
     with path.open("rb") as file:
         header = file.read(25)
     return header.startswith(_PNG_SIGNATURE) and header[24] == 16

@@ -1,21 +1,12 @@
-"""Checks the meshes of a scene and advises an interface rule (NumPy only).
+"""Checks the meshes of a scene, and advises an interface rule for them (NumPy only).
 
-What an examination of a scene's meshes has found.
+Each part is checked by itself: it should be closed and oriented outwards, without degenerate or
+duplicate faces. Pairs of parts are checked for their position relative to each other. A liquid in
+its glass has one surface in common with it. Modelled as two surfaces, they coincide (light meets
+them in either order), leave a gap (light is totally reflected at a layer of air that does not
+exist) or overlap (correct under the rule `priority` alone).
 
-Examines how the parts of a scene lie to each other (NumPy only).
-
-A liquid in its glass has one surface in common with it. Modelled as two surfaces, they coincide
-(light meets them in either order), leave a gap (light is reflected totally at a layer of air that
-is not there) or overlap (right under the rule `priority` alone).
-
-Examines the meshes of a scene before anything is traced (NumPy only).
-
-Each part by itself; `lint_pairs` looks at how parts lie to each other, and `rule_advice` says
-which interface rule that asks for.
-
-Says which interface rule the parts of a scene ask for (NumPy only).
-
-The rules are those of `optics.interface_rules`.
+The advised rule is one of `optics.interface_rules`.
 """
 
 import itertools
@@ -44,14 +35,38 @@ from refref_jax.geometry.triangle_meshes import is_degenerate
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import INDEX_OF_AIR
 
+# As shares of the smaller part's diagonal: surfaces closer than the first coincide, because the
+# tracer may not distinguish them; surfaces farther apart than the second are separate on purpose.
+_COINCIDENT = 1e-4
+_THIN = 0.02
+
+# Smallest shares of a surface that are reported. Two round objects are also close at a point.
+_COINCIDENT_SHARE = 0.01
+_THIN_SHARE = 0.1
+
+# Minimum cosine between the normals of parallel surfaces, and between a normal and the direction
+# to the other surface.
+_PARALLEL = 0.7
+
+_REMEDY = (
+    "let them overlap a little and use the rule 'priority', or model the surface between them as "
+    "one interface."
+)
+
+# Winding number: -1 in front of an inverted closed piece, -1/2 in front of a single open sheet.
+_WOUND_BACKWARDS = -0.75
+
+# Number of parts that a message names; it counts the others.
+_NAMED = 3
+
 
 class Finding(NamedTuple):
-    """Something about a mesh that a user should know.
+    """Result of a check of a mesh, for the user.
 
     Attributes:
       severity: an `error` makes light paths wrong; a `warning` may; a `note` does not.
       part: name of the part.
-      message: what it is, and what to do.
+      message: description and remedy.
     """
 
     severity: Literal["error", "warning", "note"]
@@ -63,41 +78,23 @@ class Finding(NamedTuple):
 
 
 def refuse_errors(findings: Sequence[Finding]) -> None:
-    """Stops at meshes whose light paths would be wrong.
+    """Refuses meshes whose light paths would be wrong.
 
     Raises:
-      SceneError: if there is an error among the findings; it tells all of them.
+      SceneError: if there is an error among the findings; the message lists all errors.
     """
     errors = [finding for finding in findings if finding.severity == "error"]
     if errors:
         told = "\n".join(f"  {finding.part}: {finding.message}" for finding in errors)
-        raise SceneError(f"the meshes must be mended first.\n{told}")
-
-
-# As shares of the smaller part's diagonal: walls closer than the first coincide, for the tracer may
-# not tell them apart; walls farther apart than the second are meant to be.
-_COINCIDENT = 1e-4
-_THIN = 0.02
-
-# Smallest shares of a surface that are told. Two round bodies come close at a point, too.
-_COINCIDENT_SHARE = 0.01
-_THIN_SHARE = 0.1
-
-# Least cosine between walls, and between a wall and the way to the next, that run side by side.
-_PARALLEL = 0.7
-
-_REMEDY = (
-    "let them overlap a little and use the rule 'priority', or model the wall between them as one "
-    "interface."
-)
+        raise SceneError(f"The meshes have errors. Fix them first:\n{told}")
 
 
 class _Patch(NamedTuple):
-    """Where two surfaces run side by side.
+    """Area over which two surfaces are parallel and close.
 
     Attributes:
-      part: the part that has more of its area there.
-      share: how much of its area.
+      part: number of the part that has the larger share of its area there.
+      share: share of its area.
       distance: median distance of the surfaces, in world units.
     """
 
@@ -107,7 +104,7 @@ class _Patch(NamedTuple):
 
 
 def lint_pairs(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
-    """Reports parts that lie inside, cut, coincide with or nearly touch others."""
+    """Reports parts that lie inside, intersect, coincide with or nearly touch others."""
     findings = [
         Finding("note", parts[inner].name, f"lies inside {parts[outer].name}.")
         for inner, outer in enumerate(containment.parents)
@@ -159,17 +156,17 @@ def _thin_layer(
     walls: Walls,
     size: float,
 ) -> Bool[np.ndarray, " samples"]:
-    """Returns where a thin layer of lower index than both of its sides lies before a part.
+    """Returns where a thin layer of lower index than both of its sides lies in front of a part.
 
-    Light that would go on if the sides touched is reflected totally there. A layer of higher
-    index is a wall, as of glass around a liquid, and bends light as it should.
+    Light that would continue if the sides touched is totally reflected there. A layer of higher
+    index is a real wall, as of glass around a liquid, and refracts light correctly.
     """
     part, other = pair
     thin = (walls.distances > _COINCIDENT * size) & (walls.distances <= _THIN * size)
     ahead = thin & (walls.ahead > _PARALLEL)
     near = parts[part].index
-    # Between two bodies that face each other is what surrounds both; between a body and the one
-    # around it is the latter's medium, with what surrounds that on the other side.
+    # Between two objects that face each other is the medium around both; between an object and its
+    # container is the medium of the container, whose surroundings are on the other side.
     apart = np.zeros_like(ahead)
     if parents[part] == parents[other] and _index(parts, parents[part]) < min(
         near, parts[other].index
@@ -186,20 +183,20 @@ def _index(parts: Sequence[MeshPart], part: int) -> float:
 
 
 def _box_distance(parts: Sequence[MeshPart], pair: tuple[int, int]) -> float:
-    """Returns how far the bounding boxes of two parts are from each other."""
+    """Returns the distance of the bounding boxes of two parts."""
     lows = [parts[part].vertices.min(axis=0) for part in pair]
     highs = [parts[part].vertices.max(axis=0) for part in pair]
     return float(np.linalg.norm(np.maximum(np.max(lows, axis=0) - np.min(highs, axis=0), 0.0)))
 
 
 def _patch(part: int, walls: Walls, there: Bool[np.ndarray, " samples"]) -> _Patch:
-    # Samples stand for equal areas.
+    # Samples represent equal areas.
     distance = float(np.median(walls.distances[there])) if there.any() else 0.0
     return _Patch(part, float(np.mean(there)), distance)
 
 
 def _largest(patches: Sequence[_Patch], share: float) -> _Patch | None:
-    """Returns the patch of the largest share, if it reaches the given one."""
+    """Returns the patch of the largest share, or `None` if it is below `share`."""
     found = max(patches, key=lambda patch: patch.share, default=None)
     return found if found is not None and found.share >= share else None
 
@@ -212,7 +209,7 @@ def _coincidence(
         "warning",
         parts[patch.part].name,
         f"coincides with {parts[other].name} over {patch.share:.0%} of its surface, to within "
-        f"{_COINCIDENT * size:.1g}: light would meet the two walls in either order. If they "
+        f"{_COINCIDENT * size:.1g}: light would meet the two surfaces in either order. If they "
         f"belong together, {_REMEDY}",
     )
 
@@ -221,9 +218,9 @@ def _cut(parts: Sequence[MeshPart], pair: tuple[int, int]) -> Finding:
     return Finding(
         "warning",
         parts[pair[0]].name,
-        f"cuts or touches {parts[pair[1]].name}. The rules 'nested' and 'facing' ask for bodies "
-        "that are apart or strictly inside one another: use the rule 'priority', or model the "
-        "surface between them as one interface.",
+        f"intersects or touches {parts[pair[1]].name}. The rules 'nested' and 'facing' require "
+        "objects that are apart or strictly inside one another: use the rule 'priority', or model "
+        "the surface between them as one interface.",
     )
 
 
@@ -233,17 +230,13 @@ def _gap(parts: Sequence[MeshPart], pair: tuple[int, int], patch: _Patch) -> Fin
         "warning",
         parts[patch.part].name,
         f"is separated from {parts[other].name} by a gap of {patch.distance:.2g} over "
-        f"{patch.share:.0%} of its surface, where light is reflected totally. If they should "
+        f"{patch.share:.0%} of its surface, where light is totally reflected. If they should "
         f"touch, {_REMEDY}",
     )
 
 
-# -1 in front of an inverted closed piece; a lone open sheet gives -1/2.
-_WOUND_BACKWARDS = -0.75
-
-
 def lint(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
-    """Reports on every part (closed, outward, without waste), and on how they lie to each other."""
+    """Checks every part (closed, oriented outwards, no needless faces), and all pairs of parts."""
     findings = []
     for part in parts:
         findings += _edges(part)
@@ -253,9 +246,9 @@ def lint(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
 
 
 def _bodies(part: MeshPart) -> list[Finding]:
-    """Reports pieces whose faces point inwards; those of a cavity do so rightly."""
+    """Reports pieces whose faces point inwards; those of a cavity correctly do."""
     faces = _largest_faces(part)
-    # In front of an inverted piece the surface winds around the other way; in a cavity not at all.
+    # The winding number is negative in front of an inverted piece, and 0 in a cavity.
     winding = winding_number(part, beside_faces(part, faces, 1.0))
     inverted = int(np.sum(winding < _WOUND_BACKWARDS))
     if not inverted:
@@ -265,7 +258,7 @@ def _bodies(part: MeshPart) -> list[Finding]:
             "error",
             part.name,
             f"the faces of {inverted} of its {len(faces)} pieces point inwards, so inside and "
-            "outside are exchanged. Flip those faces and export it again.",
+            "outside are swapped. Flip those faces and export it again.",
         )
     ]
 
@@ -294,8 +287,8 @@ def _edges(part: MeshPart) -> list[Finding]:
             Finding(
                 "warning",
                 part.name,
-                f"is not watertight: {open_edges} edges are open. Light that slips through loses "
-                "track of its medium; close the holes.",
+                f"is not watertight: {open_edges} edges are open. Light that passes through them "
+                "has the wrong medium; close the holes.",
             )
         )
     forward = np.where(directed[:, 0] < directed[:, 1], 1, -1)
@@ -313,7 +306,7 @@ def _edges(part: MeshPart) -> list[Finding]:
 
 
 def _faces(part: MeshPart) -> list[Finding]:
-    """Reports faces that carry no surface, or carry it twice."""
+    """Reports degenerate and duplicate faces."""
     findings = []
     if degenerate := int(np.sum(is_degenerate(part.vertices[part.faces]))):
         findings.append(
@@ -332,16 +325,12 @@ def _faces(part: MeshPart) -> list[Finding]:
     return findings
 
 
-# Parts that an explanation names before it only counts.
-_NAMED = 3
-
-
 class Advice(NamedTuple):
-    """Which rule is right for a scene.
+    """The interface rule that is correct for a scene.
 
     Attributes:
-      rule: the interface rule.
-      reason: why, and what to heed.
+      rule: name of the interface rule.
+      reason: reason for it, and restrictions.
     """
 
     rule: RuleName
@@ -352,7 +341,7 @@ class Advice(NamedTuple):
 
 
 def advise(parts: Sequence[MeshPart], containment: Containment) -> Advice:
-    """Returns the rule that is physical for parts that lie as they do."""
+    """Returns the rule that is physically correct for parts in their positions."""
     nested = [
         f"{parts[inner].name} in {parts[outer].name}"
         for inner, outer in enumerate(containment.parents)
@@ -363,29 +352,29 @@ def advise(parts: Sequence[MeshPart], containment: Containment) -> Advice:
         return Advice(
             "priority",
             f"{_listed(overlaps)} overlap or touch. Give the parts a 'priority' in scene.json: the "
-            "highest wins, so a container is above the liquid that overlaps its wall, and a body "
-            "above the one that it is inside of.",
+            "highest wins, so a container is above the liquid that overlaps its wall, and an inner "
+            "object above an outer one.",
         )
     if nested:
         return Advice(
             "nested",
             f"parts lie strictly inside one another ({_listed(nested)}). Use 'facing' for images "
-            "of a renderer that takes every index relative to air alone.",
+            "of a renderer that takes every index relative to air.",
         )
-    lone = "there is one part" if len(parts) == 1 else f"all {len(parts)} parts lie apart"
-    return Advice("nested", f"{lone}, so 'nested', 'facing' and 'priority' are the same.")
+    lone = "there is one part" if len(parts) == 1 else f"all {len(parts)} parts are apart"
+    return Advice("nested", f"{lone}, so 'nested', 'facing' and 'priority' are equivalent.")
 
 
 def check_meshes(parts: Sequence[MeshPart], tree: Containment, *, rule: str) -> tuple[str, ...]:
-    """Returns which rule the meshes need, and what a lint finds in them.
+    """Returns the advised rule for the meshes, and the findings of all checks, as text.
 
     Raises:
-      SceneError: if some of it must be mended first.
+      SceneError: if there is an error among the findings.
     """
     findings = lint(parts, tree)
     if rule == "priority":
         findings += examine_priorities(parts, tree)
-    advice = "note: there are no meshes, so all light goes straight."
+    advice = "note: there are no meshes, so all rays are straight."
     if parts:
         advice = advise(parts, tree)
     refuse_errors(findings)
@@ -393,9 +382,9 @@ def check_meshes(parts: Sequence[MeshPart], tree: Containment, *, rule: str) -> 
 
 
 def examine_priorities(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
-    """Reports priorities that make a part vanish, or leave an overlap to chance.
+    """Reports priorities that hide a part, or leave an overlap undecided.
 
-    For scenes that are to be traced under the rule `priority`.
+    Only for scenes that are traced under the rule `priority`.
     """
     findings = []
     for inner in range(len(parts)):
@@ -409,7 +398,7 @@ def examine_priorities(parts: Sequence[MeshPart], containment: Containment) -> l
 
 
 def _around(parents: Sequence[int], part: int) -> Iterator[int]:
-    """Yields all parts that contain one, from the inside outwards."""
+    """Yields all parts that contain a part, from the inside outwards."""
     while (part := parents[part]) != NO_PARENT:
         yield part
 
@@ -419,7 +408,7 @@ def _hidden(inner: MeshPart, outer: MeshPart) -> Finding:
         "warning",
         inner.name,
         f"lies inside {outer.name} without a higher priority ({inner.priority} and "
-        f"{outer.priority}), so under the rule 'priority' it may not be seen. Give it the higher "
+        f"{outer.priority}), so it may be invisible under the rule 'priority'. Give it the higher "
         "number, or use the rule 'nested'.",
     )
 
@@ -429,7 +418,7 @@ def _tie(first: MeshPart, second: MeshPart) -> Finding:
         "warning",
         first.name,
         f"has the same priority as {second.name} ({first.priority}), which it overlaps: it wins "
-        "because its name comes first. Give the two different numbers in scene.json.",
+        "because its name comes first. Give them different priorities in scene.json.",
     )
 
 

@@ -1,17 +1,12 @@
-"""Containment, convexity and distances of meshes (NumPy only).
+"""Queries of meshes: distances of surfaces, containment of parts, convexity (NumPy only).
 
-How far the surface of one part is from another's (NumPy only).
+Distances: both surfaces are sampled, so small patches may be missed; distances are never
+underestimated.
 
-Both surfaces are sampled, so small patches may be missed; a distance is never found too short.
+Containment: a point is inside a closed surface where the surface winds around it once. The winding
+number is a sum over triangles, so it needs no rays and tolerates small defects of a mesh.
 
-Which part of a scene lies inside which (NumPy only).
-
-A point is inside a closed surface where the surface winds around it once. The winding number is
-a sum over triangles, so it needs no rays and bears small defects of a mesh.
-
-Whether a surface bounds a convex body (NumPy only).
-
-A ray that has left a convex body never meets it again, which spares casting it.
+Convexity: a ray that has left a convex object never meets it again, and need not be cast again.
 """
 
 import itertools
@@ -28,29 +23,55 @@ from refref_jax.geometry.triangle_meshes import face_normals, is_degenerate, is_
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import EMPTY_SLOT, SLOTS
 
-# Samples of a part that look for the other: enough to see a patch of a few per mille of its area.
+# Query samples of a surface: enough to detect a patch of a few per mille of its area.
 _SAMPLES = 2000
 
-# Samples that can be found: closer together, so that one lies on every triangle of some width.
+# Target samples of a surface: denser, so that every triangle of some width has one.
 _TARGETS = 20_000
 
-# Triangles that are tried for the point nearest to a sample.
+# Number of triangles that are tested for the point nearest to a sample.
 _CANDIDATES = 8
 
-# Steps of a sequence that fills a square evenly: powers of the plastic number, the root of
+# Steps of a low-discrepancy sequence in the square: powers of the plastic number, the root of
 # x^3 = x + 1 (Roberts, The Unreasonable Effectiveness of Quasirandom Sequences, 2018).
 _STEPS = 1.324717957244746 ** -np.array([1.0, 2.0])
 
+# Number of points of a part that are tested against another part: more for a coarse mesh, where
+# they cost little, and where faces may intersect without their centres being inside.
+_FEWEST_PROBES, _MOST_PROBES = 64, 2048
+_PROBED_PAIRS = 1 << 21
+
+# Distance of probes from their face, on both sides, as a share of the part's size. Parts that are
+# closer than that touch.
+_GAP = 1e-5
+
+# Number of triangles times points of one sum of solid angles, to bound its memory.
+_SWEEP = 1 << 20
+
+TOLERANCE = 1e-5
+"""Maximum depth of a convex surface below its convex hull, as a share of its diagonal.
+
+This is far above rounding in single precision, and far below any modelled dent.
+"""
+
+# A surface that lies on its hull and covers it once encloses the same volume.
+_VOLUME_TOLERANCE = 1e-3
+
+# Number of nearest facets of the hull that are tested first, and of points times facets of one test
+# against all of them.
+_NEAREST = 8
+_PLANE_SWEEP = 1 << 21
+
 
 class SampledSurface(NamedTuple):
-    """A surface and points spread evenly over its area.
+    """A surface with samples that are evenly distributed over its area.
 
     Attributes:
-      corners: its triangles, without those that have no area.
+      corners: corners of its non-degenerate triangles.
       normals: unit normals of the triangles.
       faces: triangle of each sample.
-      points: the samples.
-      tree: over more such points, and the middle of every triangle.
+      points: positions of the samples.
+      tree: search tree of more such points, and the centroids of all triangles.
       owners: triangle of each point of the tree.
     """
 
@@ -63,13 +84,14 @@ class SampledSurface(NamedTuple):
 
 
 class Walls(NamedTuple):
-    """What lies next to each sample of a surface on another one.
+    """The nearest point of another surface to each sample of a surface.
 
     Attributes:
-      distances: to the nearest point there, in world units.
-      ahead: cosine between the sample's normal and the way there; 0 where the two coincide.
-      alignment: cosine between both normals: 1 if the surfaces look the same way, -1 if they
-        look at or away from each other.
+      distances: distance to the nearest point, in world units.
+      ahead: cosine between the sample's normal and the direction to the nearest point; 0 if the two
+        coincide.
+      alignment: cosine between both normals: 1 if the surfaces face the same way, -1 if they face
+        towards or away from each other.
     """
 
     distances: Float[np.ndarray, " samples"]
@@ -78,7 +100,7 @@ class Walls(NamedTuple):
 
 
 def sample_surface(part: MeshPart) -> SampledSurface:
-    """Samples a part, the same way every time."""
+    """Samples the surface of a part, deterministically."""
     corners = part.vertices[part.faces]
     corners = corners[~is_degenerate(corners)]
     faces, points = spread_points(corners, _SAMPLES)
@@ -94,7 +116,7 @@ def sample_surface(part: MeshPart) -> SampledSurface:
 
 
 def walls_between(surface: SampledSurface, other: SampledSurface) -> Walls:
-    """Returns what lies next to each sample of a surface on another one; both have area."""
+    """Returns the nearest point of another surface to each sample; both surfaces have area."""
     _, near = other.tree.query(surface.points, k=_CANDIDATES)
     faces = other.owners[near]
     ways = _closest(other.corners[faces] - surface.points[:, None, None])
@@ -120,7 +142,7 @@ def diagonal(parts: Sequence[MeshPart]) -> float:
 def spread_points(
     corners: Float[np.ndarray, "faces 3 3"], count: int
 ) -> tuple[Int[np.ndarray, " samples"], Float[np.ndarray, "samples 3"]]:
-    """Spreads points evenly over an area; none if there are no triangles."""
+    """Distributes points evenly over the area of triangles; without triangles there are none."""
     a, b, c = np.moveaxis(corners, 1, 0)
     areas = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=-1))
     number = np.arange(count if len(corners) else 0)
@@ -146,25 +168,12 @@ def _closest(corners: Float[np.ndarray, "*shape 3 3"]) -> Float[np.ndarray, "*sh
     return np.where(within[..., None], height[..., None] * normal, on_edge)
 
 
-# Points of a part that are tested against each other part: more against a coarse one, where they
-# cost little, and where a few of its faces may be cut without their middles being inside.
-_FEWEST_PROBES, _MOST_PROBES = 64, 2048
-_PROBED_PAIRS = 1 << 21
-
-# How far off a face its probes lie, on both sides, as a share of the part's size. Bodies that are
-# closer than that touch.
-_GAP = 1e-5
-
-# Triangles times points of one sweep, to bound its memory.
-_SWEEP = 1 << 20
-
-
 class Containment(NamedTuple):
-    """How the parts of a scene lie in one another.
+    """Containment of the parts of a scene in one another.
 
     Attributes:
       parents: index of the innermost part around each part, or `NO_PARENT`.
-      overlaps: pairs of parts whose surfaces cut each other or coincide.
+      overlaps: pairs of parts whose surfaces intersect or coincide.
     """
 
     parents: tuple[int, ...]
@@ -172,7 +181,7 @@ class Containment(NamedTuple):
 
 
 def find_containment(parts: Sequence[MeshPart]) -> Containment:
-    """Finds the tree of containment."""
+    """Determines which parts contain which, and which overlap."""
     count = len(parts)
     volumes = [abs(volume(part.vertices, part.faces)) for part in parts]
     contains = np.zeros((count, count), bool)
@@ -192,9 +201,9 @@ def find_containment(parts: Sequence[MeshPart]) -> Containment:
 def parts_around(
     parts: Sequence[MeshPart], points: Float[np.ndarray, "points 3"]
 ) -> Int[np.ndarray, "points slots"]:
-    """Returns the interior list of rays that start at points: the parts that contain each.
+    """Returns the interior lists of rays that start at points: the parts that contain each point.
 
-    For the rule `priority`, see `optics.media`; the other rules need none.
+    Only the rule `priority` needs them, see `optics.media`.
 
     Raises:
       SceneError: if a list is too short for the parts around a point.
@@ -207,7 +216,7 @@ def parts_around(
         names = ", ".join(parts[number].name for number in np.flatnonzero(inside[point]))
         raise SceneError(
             f"More than {SLOTS} parts contain the point {points[point].tolist()}: {names}. Move "
-            "the camera, or join parts that are of one material."
+            "the camera, or merge parts of one material."
         )
     order = np.argsort(~inside, axis=1, kind="stable")[:, :SLOTS]
     listed = np.take_along_axis(inside, order, axis=1)
@@ -217,10 +226,10 @@ def parts_around(
 def winding_number(
     part: MeshPart, points: Float[np.ndarray, "points 3"]
 ) -> Float[np.ndarray, " points"]:
-    """Returns how often a surface winds around points: 1 inside, 0 outside a closed one.
+    """Returns the winding number of a surface around points: 1 inside, 0 outside a closed surface.
 
-    0 without a look at the triangles for points outside the surface's bounding box. Negative
-    where the faces point inwards.
+    Points outside the bounding box of the surface have 0, without a sum over triangles. Where faces
+    point inwards, the number is negative.
 
     Source: Jacobson et al., Robust Inside-Outside Segmentation using Generalized Winding
     Numbers (2013); van Oosterom and Strackee (1983) for the solid angle.
@@ -238,14 +247,14 @@ def winding_number(
 def beside_faces(
     part: MeshPart, faces: Int[np.ndarray, " faces"], side: float
 ) -> Float[np.ndarray, "faces 3"]:
-    """Returns points just off the middle of some faces: in front for side 1, behind for -1."""
+    """Returns points next to the centroids of faces: in front for side 1, behind for side -1."""
     corners = part.vertices[part.faces[faces]]
     step = side * _GAP * np.max(np.ptp(part.vertices, axis=0))
     return corners.mean(axis=1) + step * face_normals(corners)
 
 
 def _probes(part: MeshPart, other: MeshPart) -> Float[np.ndarray, "probes 3"]:
-    """Returns points just inside and outside of a surface, spread evenly over it."""
+    """Returns points just inside and outside a surface, evenly distributed over it."""
     count = int(np.clip(_PROBED_PAIRS // len(other.faces), _FEWEST_PROBES, _MOST_PROBES))
     corners = part.vertices[part.faces]
     faces, points = spread_points(corners[~is_degenerate(corners)], count)
@@ -258,7 +267,7 @@ def _solid_angles(
     corners: Float[np.ndarray, "faces 3 3"], points: Float[np.ndarray, "points 3"]
 ) -> Float[np.ndarray, "points faces"]:
     """Returns the signed solid angle of every triangle seen from every point."""
-    # Coordinates come first, so that every product below runs over whole arrays.
+    # Coordinates are the leading axis, so that every product below is over whole arrays.
     a, b, c = (corners[:, i].T[:, None] - points.T[:, :, None] for i in range(3))
     la, lb, lc = (np.sqrt(_dot(edge, edge)) for edge in (a, b, c))
     triple = _dot(a, np.stack([_minor(b, c, 1, 2), _minor(b, c, 2, 0), _minor(b, c, 0, 1)]))
@@ -278,25 +287,11 @@ def _minor(
     return a[i] * b[j] - a[j] * b[i]
 
 
-TOLERANCE = 1e-5
-"""How deep below its convex hull a surface may lie, as a share of its diagonal.
-
-Far above the rounding of single precision, and far below a dent that anyone would model.
-"""
-
-# A surface that lies on its hull and covers it once encloses the same volume.
-_VOLUME_TOLERANCE = 1e-3
-
-# Facets of the hull that are looked at first, nearest ones, and points times facets of one sweep.
-_NEAREST = 8
-_PLANE_SWEEP = 1 << 21
-
-
 def is_convex(part: MeshPart) -> bool:
-    """Returns whether a part is one closed convex body with outward faces.
+    """Returns whether a part is one closed convex object with outward faces.
 
-    All vertices and the middles of all faces must lie on the convex hull within `TOLERANCE`. Depth
-    below a hull is a concave function, so between them a face lies at most three times as deep:
+    All vertices and centroids of faces must lie on the convex hull within `TOLERANCE`. Depth below
+    a hull is a concave function, so between these points a face is at most three times as deep:
     there is no reflex edge.
     """
     faces = part.faces[~is_degenerate(part.vertices[part.faces])]
@@ -315,13 +310,13 @@ def is_convex(part: MeshPart) -> bool:
 
 
 def encloses(outer: MeshPart, inner: MeshPart) -> bool:
-    """Returns whether no vertex of a part lies outside of another one's convex hull."""
+    """Returns whether all vertices of a part lie in the convex hull of another part."""
     hull = ConvexHull(np.concatenate([outer.vertices, inner.vertices]))
     return bool(np.all(hull.vertices < len(outer.vertices)))
 
 
 def _lie_on(hull: ConvexHull, points: Float[np.ndarray, "points 3"], tolerance: float) -> bool:
-    """Returns whether all points of a body lie on its hull: near the plane of one of its facets."""
+    """Returns whether all points lie on the hull of their object: near the plane of some facet."""
     planes = np.asarray(hull.equations)
     middles = hull.points[hull.simplices].mean(axis=1)
     nearest = KDTree(middles).query(points, k=[*range(1, min(_NEAREST, len(planes)) + 1)])[1]

@@ -1,34 +1,24 @@
-"""Mesh files that keep the shading normals they were written with (NumPy only).
+"""Reads the meshes of a scene and resolves their materials (NumPy only).
 
-A reconstructed surface knows its normals better than its triangles do: from the gradient of a
-field, or averaged within patches of its own. PLY keeps one normal a vertex, so a vertex is written
-once for each normal that faces have there; the reader of meshes merges equal positions again.
-Numbers are in double precision, and come back as they were.
-
-Only a file with the very header that is written here is trusted: normals of other programs may be
-anything, and what such a program writes again has another header.
-
-What the optional `scene.json` of a scene says about its meshes (NumPy only).
+One PLY file is one part. Its material is the last word of the file name that the table of indices
+contains: `perfume_red_glass.ply` is glass. An optional `scene.json` may describe each mesh:
 
     {"parts": [{"mesh": "meshes/cup_glass.ply",
                 "ior_inside": 1.5,                        index of refraction
                 "smooth_normals": true,                   how it was shaded
                 "colour_per_interface": [0.9, 1.0, 0.9],  linear RGB factor at its surface
                 "absorption": [0.1, 0.0, 0.1],            linear RGB, per world unit inside
-                "priority": 3}]}                          where bodies overlap the highest wins
+                "priority": 3}]}                          where parts overlap, the highest wins
 
-Only `mesh` is needed.
+Only `mesh` is required. The index of refraction is, in this order, that of the caller's `indices`,
+that of `scene.json`, and that of the table.
 
-Reads the meshes of a scene and decides what they are made of (NumPy only).
-
-One PLY file is one part. Its material is the last word of the file's own name that the table of
-indices knows: `perfume_red_glass.ply` is glass. An optional `scene.json` may say more of each mesh
-(see `part_descriptions`). The index of refraction is, in this order, the one that the user gives,
-that of `scene.json`, and that of the table: what was rendered beats what a name suggests, and
-what is asked for by hand beats both.
-
-A reconstructed mesh brings its shading normals (see `stored_normals`); of any other they follow
-from its faces.
+A reconstructed mesh has its own shading normals, from the gradient of a field or averaged within
+patches; those of any other mesh follow from its faces. `write_mesh` stores them: PLY has one normal
+per vertex, so a vertex is written once for each normal that its faces have there, and the reader
+merges equal positions again. Numbers are in double precision, and are read back exactly. Normals
+are only read from files with exactly the header that `write_mesh` writes, because other programs
+may store any normals.
 """
 
 import math
@@ -65,6 +55,21 @@ _FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
 
 _LONGEST_NORMALS_HEADER = len(_HEADER) + 40
 
+Shading = Literal["auto", "smooth", "flat"]
+
+INDEX_OF_REFRACTION: dict[str, float] = {
+    "glass": 1.5,
+    "water": 1.333,
+    "diamond": 2.418,
+    "air": 1.0,
+    "alcohol": 1.36,
+    "plastic": 1.45,
+    "perfume": 1.46,
+}
+"""Indices of refraction of the data set's materials."""
+
+_LONGEST_HEADER = 1 << 16
+
 
 def write_mesh(
     path: Path,
@@ -75,9 +80,9 @@ def write_mesh(
     """Writes a mesh as PLY.
 
     Args:
-      path: of the file.
-      vertices: world units.
-      faces: counter-clockwise seen from outside.
+      path: path of the file.
+      vertices: positions in world units.
+      faces: vertex indices, counter-clockwise seen from outside.
       normals: outward unit shading normals at the corners of the faces.
     """
     corners = np.concatenate([vertices[faces], normals], axis=-1).reshape(-1, 6)
@@ -91,7 +96,7 @@ def write_mesh(
 
 
 def read_normals(path: Path) -> Float[np.ndarray, "faces 3 3"] | None:
-    """Returns the normals at the corners of a file's faces, or `None` if it keeps none of ours."""
+    """Returns the corner normals of a file of `write_mesh`, or `None` for any other file."""
     content = path.read_bytes()
     end = content.find(b"end_header\n", 0, _LONGEST_NORMALS_HEADER) + len(b"end_header\n")
     words = content[:end].decode("ascii", "replace").split()
@@ -106,20 +111,16 @@ def read_normals(path: Path) -> Float[np.ndarray, "faces 3 3"] | None:
     return points["normal"][triangles["vertices"]]
 
 
-Shading = Literal["auto", "smooth", "flat"]
-
-
 class PartDescription(NamedTuple):
-    """What is known of one mesh, or the default where nothing is.
+    """Description of one mesh in `scene.json`, with defaults.
 
     Attributes:
-      index: index of refraction inside, relative to air; `None` leaves it to the file's name.
+      index: index of refraction inside, relative to air; `None` if the file name decides.
       shading: `smooth`, `flat`, or `auto` for smooth up to the crease angle.
       tint: factor of linear RGB light at every reflection and every crossing, 0 to 1.
-      absorption: of the medium inside, linear RGB, per world unit.
-      priority: of overlapping bodies the highest wins.
-      colour_known: whether tint or absorption were told; then what is not told of the two takes no
-        light.
+      absorption: absorption of the medium inside, linear RGB, per world unit.
+      priority: priority under the rule `priority`; the highest wins where parts overlap.
+      colour_known: whether tint or absorption is given; if only one is, the other is clear.
     """
 
     index: float | None = None
@@ -134,7 +135,7 @@ def read_part_descriptions(path: Path) -> dict[str, PartDescription]:
     """Returns the description of each mesh file that `scene.json` names, by file name.
 
     Raises:
-      SceneError: if the file can not be understood, or a value has no physical meaning.
+      SceneError: if the file is invalid, or a value has no physical meaning.
     """
     if not path.is_file():
         return {}
@@ -143,7 +144,7 @@ def read_part_descriptions(path: Path) -> dict[str, PartDescription]:
         named = {Path(part["mesh"]).name: dict(part) for part in parts}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise SceneError(
-            f"{path} can not be understood ({error}). Correct it, or remove it: it is optional."
+            f"{path} is not valid ({error}). Correct it, or remove it: it is optional."
         ) from error
     return {name: _describe(f"{path}: {name}", part) for name, part in named.items()}
 
@@ -177,7 +178,7 @@ def _describe(where: str, part: dict[str, Any]) -> PartDescription:
 
 
 def _number(value: Any) -> float:
-    """Returns a number, or NaN for what is none."""
+    """Returns a number, or NaN for any other value."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return math.nan
     try:
@@ -187,7 +188,7 @@ def _number(value: Any) -> float:
 
 
 def _colour(value: Any) -> Colour:
-    """Returns three numbers, or three times NaN for what is none."""
+    """Returns three numbers, or NaN three times for any other value."""
     if not isinstance(value, list) or len(value) != 3:
         return math.nan, math.nan, math.nan
     red, green, blue = map(_number, value)
@@ -198,33 +199,19 @@ def _refusal(where: str, part: dict[str, Any], key: str, wanted: str) -> SceneEr
     return SceneError(f"{where} has the {key} {part[key]!r}. Give {wanted}.")
 
 
-INDEX_OF_REFRACTION: dict[str, float] = {
-    "glass": 1.5,
-    "water": 1.333,
-    "diamond": 2.418,
-    "air": 1.0,
-    "alcohol": 1.36,
-    "plastic": 1.45,
-    "perfume": 1.46,
-}
-"""Indices of the data set's materials."""
-
-_LONGEST_HEADER = 1 << 16
-
-
 class MeshPart(NamedTuple):
     """One closed surface and its material.
 
     Attributes:
       name: the file's stem.
-      vertices: world units; equal positions are merged.
-      faces: counter-clockwise seen from outside.
+      vertices: positions in world units; equal positions are merged.
+      faces: vertex indices, counter-clockwise seen from outside.
       index: index of refraction inside.
       shading: `smooth`, `flat`, or `auto` for smooth up to the crease angle.
       tint: factor of linear RGB light at every reflection and every crossing of the surface.
-      absorption: of the medium inside, linear RGB, per world unit.
-      priority: where bodies overlap under the rule `priority`, the highest wins.
-      colour_known: whether `scene.json` tells tint or absorption; else they are a mere default.
+      absorption: absorption of the medium inside, linear RGB, per world unit.
+      priority: priority under the rule `priority`; the highest wins where parts overlap.
+      colour_known: whether tint or absorption is given, not just the default.
       normals: outward unit shading normals at the corners of the faces, or `None` if `shading`
         decides them.
     """
@@ -245,14 +232,14 @@ def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> l
     """Reads all parts of a scene, ordered by name.
 
     Args:
-      scene: the scene folder, see `mesh_files`. No file is no part.
+      scene: the scene folder, see `mesh_files`; without mesh files, there are no parts.
       indices: indices of refraction that replace or extend the table and `scene.json`, by
         material or, for one part alone, by file stem.
 
     Raises:
       SceneError: if a mesh is broken or empty, if its material is unknown, if an index is not
-        positive or names nothing, or if `scene.json` is wrong or describes a mesh that is missing
-        among others.
+        positive or does not fit any mesh, or if `scene.json` is invalid or describes a missing
+        mesh.
     """
     overrides = dict(indices or {})
     for name, index in overrides.items():
@@ -271,7 +258,7 @@ def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> l
 
 
 def check_index(name: str, index: float) -> None:
-    """Refuses what is no index of refraction.
+    """Refuses an invalid index of refraction.
 
     Raises:
       SceneError: if the index is not a positive number.
@@ -284,7 +271,7 @@ def check_index(name: str, index: float) -> None:
 
 
 def read_part(path: Path, *, index: float, shading: Shading = "auto") -> MeshPart:
-    """Reads one mesh that belongs to no scene, of a known index of refraction.
+    """Reads one mesh outside a scene folder, with a given index of refraction.
 
     Raises:
       SceneError: if the file is broken, or has no triangle.
@@ -296,7 +283,7 @@ def mesh_files(scene: Path) -> list[Path]:
     """Returns the mesh files of a scene, ordered by name.
 
     They are `meshes/*.ply` in its folder. If a folder of the raw release has none, they are
-    `mesh_files/{category}/{object}_{material}.ply` beside `image_data`.
+    `mesh_files/{category}/{object}_{material}.ply` next to `image_data`.
     """
     folder, stems = scene / "meshes", None
     if not folder.is_dir() and (name := scene_names.of_raw_folder(scene)) is not None:
@@ -310,9 +297,9 @@ def mesh_files(scene: Path) -> list[Path]:
 
 
 def published_stems(thing: str) -> set[str]:
-    """Returns the published names of an object's meshes, without their ending: one a material.
+    """Returns the published names of an object's meshes, without extension: one per material.
 
-    The whole name counts: ball_coloured_glass.ply is not of the object ball.
+    Names are matched completely: ball_coloured_glass.ply is not a mesh of the object ball.
     """
     return {f"{thing}_{material}" for material in INDEX_OF_REFRACTION}
 
@@ -320,8 +307,8 @@ def published_stems(thing: str) -> set[str]:
 def without_colour(parts: Sequence[MeshPart]) -> list[MeshPart]:
     """Returns the parts with clear surfaces and media.
 
-    For fields that learn the colour of glass from images, as the paper's oracle does: a tint that
-    is already on the light paths would be counted twice.
+    This is for fields that learn the colour of glass from images, as the paper's oracle does: a
+    tint that is already applied to the light paths would count twice.
     """
     return [part._replace(tint=CLEAR, absorption=NO_ABSORPTION) for part in parts]
 
@@ -336,9 +323,9 @@ def read_mesh(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 
         mesh = trimesh.load_mesh(path, process=False)
         vertices = np.asarray(mesh.vertices, np.float64)
         faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
-    except Exception as error:  # trimesh raises whatever a broken file runs into
+    except Exception as error:  # trimesh raises errors of many types for broken files
         raise SceneError(
-            f"{path} can not be read as a mesh ({error}). It may be truncated: export it again."
+            f"{path} cannot be read as a mesh ({error}). It may be truncated: export it again."
         ) from error
     if len(faces) < _declared_faces(path) and len(faces):
         raise SceneError(
@@ -350,10 +337,10 @@ def read_mesh(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 
 def merge_corners(
     name: str, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "f 3"]]:
-    """Checks the numbers of a mesh, and merges equal positions.
+    """Validates the arrays of a mesh, and merges equal positions.
 
     Raises:
-      SceneError: if there is no triangle, or one that has no vertices.
+      SceneError: if there is no triangle, a missing vertex, or a position that is not finite.
     """
     if len(faces) == 0:
         raise SceneError(f"{name} has no triangles. Export the mesh again, or leave it out.")
@@ -368,7 +355,7 @@ def merge_corners(
 
 
 def _declared_faces(path: Path) -> int:
-    """Returns how many faces a PLY header promises: no fewer triangles should be found."""
+    """Returns the number of faces that a PLY header declares: there should be as many triangles."""
     found = re.search(rb"element face (\d+)", path.read_bytes()[:_LONGEST_HEADER])
     return int(found.group(1)) if found else 0
 
@@ -381,7 +368,7 @@ def _read_part(path: Path, overrides: Mapping[str, float], described: PartDescri
 
 
 def _index(path: Path, overrides: Mapping[str, float], described: PartDescription) -> float:
-    """Returns the index of the part's own override, or of its material, see the module."""
+    """Returns the index of refraction of a mesh file, by the order in the module docstring."""
     if path.stem in overrides:
         return overrides[path.stem]
     table = INDEX_OF_REFRACTION | dict(overrides)
@@ -398,7 +385,7 @@ def _index(path: Path, overrides: Mapping[str, float], described: PartDescriptio
 
 
 def material_of(path: Path, *, table: Mapping[str, float] = INDEX_OF_REFRACTION) -> str | None:
-    """Returns the material of a mesh file: the last word of its name that the table knows."""
+    """Returns the material of a mesh file: the last word of its name that is in the table."""
     known = [word for word in path.stem.split("_") if word in table]
     return known[-1] if known else None
 

@@ -7,8 +7,7 @@ One row is one frame. Its columns:
     transform_matrix      4 x 4, camera to world
 
 The first third of the rows is `train`, the second `val`, the last `test`, and the field of view is
-that of the data set. A file may say more in its schema's metadata, under `METADATA_KEY`; then that
-holds.
+that of the data set. Metadata in the schema of a file, under `METADATA_KEY`, override both.
 """
 
 import json
@@ -31,11 +30,11 @@ POSE_COLUMN = "transform_matrix"
 _ROWS_AT_ONCE = 16
 
 Progress = Callable[[int, int], None]
-"""Is told how many of how many frames are done."""
+"""Function of the number of frames done and their total."""
 
 
 class Contents(NamedTuple):
-    """What the rows of a scene's parquet files are.
+    """Contents of a scene's parquet files.
 
     Attributes:
       frames: number of frames of each split, in the order of the rows.
@@ -52,14 +51,14 @@ def encode(contents: Contents) -> bytes:
 
 
 def read_contents(shards: Sequence[Path]) -> Contents:
-    """Reads what the rows of a scene's parquet files are, and no image.
+    """Reads the contents of a scene's parquet files, but no images.
 
     Args:
       shards: all files of one scene, in order.
 
     Raises:
-      SceneError: if pyarrow is missing, if a file is broken or lacks a column, or if the rows are
-        not as many as they should be.
+      SceneError: if pyarrow is missing, if a file is broken or lacks a column, or if the number
+        of rows is wrong.
     """
     rows, told = 0, None
     for shard in shards:
@@ -68,7 +67,7 @@ def read_contents(shards: Sequence[Path]) -> Contents:
             if missing := {"image", POSE_COLUMN} - names:
                 raise SceneError(
                     f"{shard} lacks the column {', '.join(sorted(missing))}; it has "
-                    f"{', '.join(sorted(names)) or 'none'}. Give a file of the data set, or one "
+                    f"{', '.join(sorted(names)) or 'none'}. Use a file of the data set, or one "
                     "with the columns image and transform_matrix."
                 )
             rows += file.metadata.num_rows
@@ -77,15 +76,15 @@ def read_contents(shards: Sequence[Path]) -> Contents:
 
 
 def unpack(shards: Sequence[Path], scene: Path, *, progress: Progress) -> None:
-    """Writes the frames of a scene into a folder in the local layout; images byte for byte.
+    """Writes the frames of a scene to a folder in the local layout, with images byte for byte.
 
     Args:
       shards: all files of the scene, in order.
       scene: the folder, which must exist.
-      progress: is told of every frame.
+      progress: function called after every frame.
 
     Raises:
-      SceneError: as `read_contents`, or if a row is broken.
+      SceneError: under the conditions of `read_contents`, or if a row is broken.
     """
     contents = read_contents(shards)
     total, done = sum(contents.frames.values()), 0
@@ -97,7 +96,7 @@ def unpack(shards: Sequence[Path], scene: Path, *, progress: Progress) -> None:
             if records and set(record) != set(records[0]):
                 raise SceneError(
                     f"A row of {split} in {shards[0]} has no mask or depth map, but others have. "
-                    "Copy the file again, or fill all rows of the split."
+                    "Copy the file again, or add it to all rows of the split."
                 )
             records.append(record)
             done += 1
@@ -132,7 +131,7 @@ def _opened(shard: Path) -> Any:
 
 
 def _rows(shards: Sequence[Path]) -> Iterator[tuple[dict[str, Any], str, Path]]:
-    """Yields each row, how to call it, and its file."""
+    """Yields each row, its name for messages, and its file."""
     for shard in shards:
         with _opened(shard) as file:
             present = set(file.schema_arrow.names)
@@ -161,7 +160,7 @@ def _write_frame(
     paths = {"image": f"{files.image}.png", "mask": files.mask, "depth": files.depth}
     found = {column: _bytes(row.get(column), column, name, shard) for column in paths}
     if found["image"] is None:
-        raise SceneError(f"{name} of {shard} holds no image. Copy the file again.")
+        raise SceneError(f"{name} of {shard} has no image. Copy the file again.")
     for column, content in found.items():
         if content is not None:
             path = scene / paths[column]
@@ -177,23 +176,23 @@ def _bytes(value: Any, column: str, name: str, shard: Path) -> bytes | None:
     if value is None or isinstance(value, bytes):
         return value or None
     raise SceneError(
-        f"The {column} of {name} in {shard} is not the bytes of an image file. Write the images "
-        "themselves, not their places or pixels."
+        f"The {column} of {name} in {shard} is not the bytes of an image file. Store the "
+        "encoded images, not paths or pixels."
     )
 
 
 def _thirds(rows: int, shard: Path) -> Contents:
-    """Returns the published meaning of so many rows."""
+    """Returns the published splits for a number of rows: three equal ones."""
     if rows == 0 or rows % len(SPLITS):
         raise SceneError(
-            f"{shard} and its like hold {rows} rows, which are no three equal splits. The data "
-            "set has 300 a scene: copy the files again."
+            f"{shard} and the other files of its scene hold {rows} rows, not three equal splits. "
+            "The data set has 300 rows per scene: copy the files again."
         )
     return Contents(dict.fromkeys(SPLITS, rows // len(SPLITS)))
 
 
 def _decoded(told: bytes, rows: int, shard: Path) -> Contents:
-    """Returns what the metadata tells."""
+    """Returns the contents that the metadata describe."""
     try:
         record = configuration.parse_json(told)
         frames = {split: int(record["frames"].get(split, 0)) for split in SPLITS}
@@ -203,18 +202,18 @@ def _decoded(told: bytes, rows: int, shard: Path) -> Contents:
         valid = False
     if not valid:
         raise SceneError(
-            f"The metadata of {shard} can not be understood. Convert the scene again with "
-            "this version."
+            f"The metadata of {shard} are not valid. Convert the scene again with this version."
         )
     if sum(frames.values()) != rows:
         counts = ", ".join(f"{count} {split}" for split, count in frames.items())
         raise SceneError(
-            f"{shard} and its like hold {rows} rows, but should hold {counts}. Copy them again."
+            f"{shard} and the other files of its scene hold {rows} rows, but should hold {counts}. "
+            "Copy them again."
         )
     return Contents(frames, angle)
 
 
 def _unreadable(shard: Path, error: Exception) -> SceneError:
     return SceneError(
-        f"{shard} can not be read as parquet ({error}). It may be truncated: copy it again."
+        f"{shard} cannot be read as parquet ({error}). It may be truncated: copy it again."
     )

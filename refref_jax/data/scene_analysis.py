@@ -1,7 +1,8 @@
-"""What a scene requires of a model, so that it pays for nothing else (NumPy only).
+"""Analyses a scene: the features that a model of it requires (NumPy only).
 
-Found on the host, from the meshes, what `scene.json` says of them, and the cameras. Choices that
-are compiled follow from it. The background is opaque in every scene, so it is not listed.
+A model only includes what its scene requires, so that no computation is spent on the rest. The
+analysis runs on the host, from the meshes, their description in `scene.json`, and the cameras; it
+determines which code is compiled. The background is opaque in every scene, so it is not listed.
 """
 
 from collections.abc import Sequence
@@ -17,21 +18,21 @@ from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.path_settings import Reentry
 
 NeededInterior = Literal["none", "clear", "absorbing"]
-"""What is in the objects; `none` where there are none."""
+"""Interior of the objects; `none` without objects."""
 
 
 class Needs(NamedTuple):
-    """What a scene requires.
+    """Features that a scene requires of a model.
 
     Attributes:
-      parts: number of meshes; without any, light goes straight.
-      bodies: number of outermost parts, which no other part contains.
-      convex: whether there is one body, it is convex and all other parts lie in it.
-      reentry: `impossible` if a ray that has left the objects can not meet any again.
-      interior: what takes light inside the objects: `none` if there are none, `clear` if their
-        colours are known and take no light, else `absorbing`.
-      tints: colours of interfaces and media: `none` to heed, `given` by `scene.json` for every
-        part, or to be `learned` since it does not tell them.
+      parts: number of meshes; without any, rays are straight.
+      bodies: number of objects: outermost parts, which no other part contains.
+      convex: whether there is one object, it is convex and contains all other parts.
+      reentry: `impossible` if a ray that has left the objects cannot meet any again.
+      interior: interior of the objects: `none` without objects, `clear` if their colours are known
+        and absorb no light, otherwise `absorbing`.
+      tints: colours of interfaces and media: `none` if they are clear, `given` if `scene.json` has
+        them for every part, otherwise to be `learned`.
       space: `unbounded` if the background is infinitely far away, `spherical` if it is a sphere.
     """
 
@@ -52,22 +53,23 @@ def find_needs(
     rule: RuleName,
     space: Space,
 ) -> Needs:
-    """Finds what a scene requires.
+    """Analyses a scene.
 
-    What nested parts do to light inside one convex body does not matter to `reentry`: once out, a
-    ray meets nothing. Where bodies may overlap (`priority`) nothing is promised of several parts,
-    nor where a camera stands inside.
+    Parts nested inside one convex object do not affect `reentry`: a ray that has left the object
+    meets nothing again. Re-entry is assumed possible for several parts that may overlap (rule
+    `priority`), and for a camera inside the object.
 
     Args:
-      parts: the meshes.
-      tree: how they lie in one another, from `mesh_queries.find_containment`.
-      cameras: from which rays start.
-      rule: what lies outside a part, see `optics.interface_rules`.
-      space: of the background.
+      parts: meshes of the scene.
+      tree: containment of the meshes, from `mesh_queries.find_containment`.
+      cameras: cameras at which rays start.
+      rule: interface rule, which determines the medium outside a part; see
+        `optics.interface_rules`.
+      space: geometry of the background.
     """
     outermost = [parts[i] for i, parent in enumerate(tree.parents) if parent == NO_PARENT]
     convex = len(outermost) == 1 and _is_one_convex_body(outermost[0], parts)
-    # Other rules may say of a ray between two parts that it is outside of all.
+    # Under other rules, a ray between two parts may count as outside of all parts.
     told_apart = rule == "nested" or len(parts) == 1
     leaves_for_good = convex and told_apart and not _any_inside(cameras, outermost[0])
     return Needs(
@@ -82,7 +84,7 @@ def find_needs(
 
 
 def describe(needs: Needs) -> str:
-    """Says in one line what a scene requires."""
+    """Returns the required features in one line of text."""
     background = f"{needs.space} background"
     if needs.parts == 0:
         return f"this scene has no meshes: no tracer, {background}"
@@ -99,7 +101,7 @@ def _bodies(needs: Needs) -> str:
     before = ["clear"] if needs.interior == "clear" else []
     if needs.convex:
         before.append("convex")
-    noun = "body" if needs.bodies == 1 else "bodies"
+    noun = "object" if needs.bodies == 1 else "objects"
     text = " ".join([str(needs.bodies), *before, noun])
     if needs.parts > needs.bodies:
         text = f"{needs.parts} parts in {text}"
@@ -107,7 +109,7 @@ def _bodies(needs: Needs) -> str:
 
 
 def _is_one_convex_body(body: MeshPart, parts: Sequence[MeshPart]) -> bool:
-    """Returns whether a part is convex and all others lie in it, to the last vertex."""
+    """Returns whether a part is convex and contains all vertices of all other parts."""
     return is_convex(body) and all(encloses(body, part) for part in parts if part is not body)
 
 
@@ -129,7 +131,7 @@ def _interior(parts: Sequence[MeshPart]) -> NeededInterior:
 def find_tints(
     parts: Sequence[MeshPart | PartDescription],
 ) -> Tints:
-    """Returns where the colours of parts, or of what is known of them, come from; see `Needs`."""
+    """Returns the source of the colours of parts or their descriptions; see `Needs`."""
     if not all(part.colour_known for part in parts):
         return "learned"
     return "given" if any(map(_takes_light, parts)) else "none"

@@ -1,8 +1,7 @@
-"""Assembles meshes into the scene that light paths are traced through (NumPy only).
+"""Assembles meshes into the scene through which light paths are traced (NumPy only).
 
-Makes parts of meshes that belong to no scene folder: files, trimeshes, arrays (NumPy only).
-
-Assembles the meshes of a scene into what light paths are traced through (NumPy only).
+Parts are read from a scene folder (`meshes`), or made from mesh files, trimeshes or arrays by
+`make_part`.
 """
 
 import os
@@ -27,7 +26,9 @@ Arrays = tuple[np.ndarray, np.ndarray]
 """Vertices `[vertices, 3]` in world units; faces `[faces, 3]`, counter-clockwise from outside."""
 
 MeshSource = str | os.PathLike[str] | trimesh.Trimesh | Arrays
-"""What a part can be made of."""
+"""Mesh of a part: a path, a trimesh, or arrays."""
+
+_CREASE_ANGLES: dict[Shading, float] = {"auto": CREASE_ANGLE, "smooth": np.pi, "flat": 0.0}
 
 
 def make_part(
@@ -40,17 +41,17 @@ def make_part(
     absorption: Colour = NO_ABSORPTION,
     priority: int = 0,
 ) -> MeshPart:
-    """Makes one body of a mesh; `assemble` puts bodies together.
+    """Makes one part of a scene from a mesh; `assemble` combines parts.
 
     Args:
-      mesh: a file that trimesh reads (of a PLY file stored normals are taken), a `trimesh.Trimesh`,
-        or vertices and faces.
+      mesh: a file that trimesh reads (normals in a PLY file of `meshes.write_mesh` are used), a
+        `trimesh.Trimesh`, or vertices and faces.
       index: index of refraction inside.
-      name: for messages; by default the file's stem, or `body`.
+      name: name in messages; by default the file's stem, or `body`.
       shading: `smooth`, `flat`, or `auto` for smooth up to the crease angle.
       tint: factor of linear RGB light at every reflection and every crossing, 0 to 1.
-      absorption: of the medium inside, linear RGB, per world unit.
-      priority: where bodies overlap under the rule `priority`, the highest wins.
+      absorption: absorption of the medium inside, linear RGB, per world unit.
+      priority: priority under the rule `priority`; the highest wins where parts overlap.
 
     Raises:
       SceneError: if the mesh is broken or empty, or a number has no physical meaning.
@@ -96,9 +97,6 @@ def _of_arrays(
     return MeshPart(name, vertices, faces, index, shading)
 
 
-_CREASE_ANGLES: dict[Shading, float] = {"auto": CREASE_ANGLE, "smooth": np.pi, "flat": 0.0}
-
-
 def single_body(
     mesh: MeshSource,
     *,
@@ -107,13 +105,13 @@ def single_body(
     tint: Colour = CLEAR,
     absorption: Colour = NO_ABSORPTION,
 ) -> Scene:
-    """Returns a scene of one body in air; arguments as of `scene_assembly.make_part`.
+    """Returns a scene of one object in air; the arguments are those of `make_part`.
 
-    Its arrays are NumPy's, which every function of light takes; `jax.device_put` moves them to an
-    accelerator once and for all.
+    Its arrays are NumPy arrays, which all functions that trace light accept; `jax.device_put` moves
+    them to an accelerator.
 
     Raises:
-      SceneError: as `make_part` and `assemble`.
+      SceneError: under the conditions of `make_part` and `assemble`.
 
     Example:
       >>> import trimesh
@@ -127,19 +125,20 @@ def single_body(
 
 
 def assemble(parts: Sequence[MeshPart], *, rule: RuleName = "nested") -> Scene:
-    """Examines parts and builds the scene that they make; no part is an empty scene.
+    """Checks parts and builds a scene from them; without parts it is empty.
 
     Args:
-      parts: of `make_part` or `meshes.read_meshes`.
-      rule: what lies outside a part: what it lies in (`nested`), always air (`facing`), or, where
-        parts overlap, the one of the highest priority (`priority`); see `optics.interface_rules`.
+      parts: parts from `make_part` or `meshes.read_meshes`.
+      rule: medium outside a part: that of the part around it (`nested`), always air (`facing`), or
+        that of the overlapping part with the highest priority (`priority`); see
+        `optics.interface_rules`.
 
     Returns:
-      NumPy arrays, as of `single_body`. Parts have the numbers of their places in `parts`.
+      The scene, as NumPy arrays. Parts are numbered by their indices in `parts`.
 
     Raises:
-      SceneError: if light paths would be wrong, as where faces point inwards. What may make them
-        wrong, such as a hole, is a Python warning.
+      SceneError: if light paths would be wrong, for example where faces point inwards. Defects that
+        may make them wrong, such as a hole, are Python warnings.
 
     Example:
       >>> import trimesh
@@ -151,7 +150,7 @@ def assemble(parts: Sequence[MeshPart], *, rule: RuleName = "nested") -> Scene:
     """
     tree = find_containment(parts)
     if rule == "priority":
-        # Bodies that overlap are what this rule is for.
+        # This rule allows overlapping parts.
         findings = mesh_checks.lint(parts, tree._replace(overlaps=()))
         findings += mesh_checks.examine_priorities(parts, tree)
     else:
@@ -172,9 +171,9 @@ def build_geometry(
     """Builds surfaces and interfaces of all parts.
 
     Args:
-      parts: the meshes; none is an empty scene.
-      parents: the innermost part around each part, from `mesh_queries.find_containment`.
-      rule: what lies outside a part, see `optics.interface_rules`.
+      parts: meshes of the scene, possibly none.
+      parents: innermost part around each part, from `mesh_queries.find_containment`.
+      rule: interface rule, see `optics.interface_rules`.
     """
     surfaces = pack_meshes([shaded_mesh(part) for part in parts])
     interfaces = RULES[rule](
@@ -188,7 +187,7 @@ def build_geometry(
 
 
 def shaded_mesh(part: MeshPart) -> Mesh:
-    """Returns the surface of a part, with the normals that bend light."""
+    """Returns the surface of a part, with its shading normals."""
     if part.normals is not None:
         return Mesh(part.vertices, part.faces, part.normals)
     return make_mesh(part.vertices, part.faces, crease_angle=_CREASE_ANGLES[part.shading])

@@ -1,24 +1,19 @@
-"""Reads scene folders: transforms, file names, images, masks and depth (NumPy only).
+"""Reads and writes scene folders in the local layout of the data set (NumPy only).
 
-The JSON that places a scene's cameras: what it must hold (NumPy only).
+    {scene}/transforms_{train,val,test}.json    poses and file names
+    {scene}/{split}/*.png  mask/  depth/        named in the JSON
+    {scene}/meshes/*.ply                        see `meshes`
+    {scene}/scene.json                          optional, see `meshes` and `background`
 
-Every function raises a `SceneError` that names the file and says what to do.
-
-How a scene's files are called in the layouts of folders (NumPy only).
+Files are named in one of two ways; `raw` is that of the data set's raw release:
 
     plain    {split}/r_000.png    mask/{split}/r_000.png         depth/{split}/r_000.png
     raw      {split}/r_0.png      {split}/r_0_mask_0000.png      {split}/r_0_depth_0000.png
 
-`raw` is that of the data set's raw release. Readers go by the transforms file, never by these.
+Readers use the names in the transforms file, never these patterns. A depth map that is named as PNG
+is read from the float EXR of the same name if there is one.
 
-Reads a scene folder in the local layout of the data set (NumPy only).
-
-    {scene}/transforms_{train,val,test}.json    poses and file names
-    {scene}/{split}/*.png  mask/  depth/        as the JSON names them
-    {scene}/meshes/*.ply                        see `meshes`
-    {scene}/scene.json                          optional, see `meshes`
-
-A depth map named as PNG is read from the float EXR beside it when there is one.
+Every function raises a `SceneError` that names the file and the remedy.
 """
 
 import collections
@@ -36,15 +31,20 @@ from refref_jax.choices import Split
 from refref_jax.data import SceneError, image_files
 from refref_jax.geometry.cameras import Cameras, focal_length, planar_depth_to_distance
 
-# Poses are written with six digits or more; a larger deviation is a scale or a shear.
+# Poses are stored with at least six digits; a larger deviation is a scale or a shear.
 _ROTATION_TOLERANCE = 1e-3
+
+SPLITS: tuple[Split, ...] = get_args(Split)
+
+TRANSFORMS = "transforms_{}.json"
+"""Pattern of the name of a split's transforms file."""
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """Reads a JSON object."""
     if not path.is_file():
         raise SceneError(
-            f"{path} does not exist. Give the folder of a scene, which holds "
+            f"{path} does not exist. Give the folder of a scene, with "
             "transforms_train.json, transforms_val.json and transforms_test.json."
         )
     try:
@@ -57,22 +57,22 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def get(record: Any, name: str, path: Path) -> Any:
-    """Returns a value that a record of a file must have."""
+    """Returns a required value of a record of a file."""
     if not isinstance(record, dict) or name not in record:
-        raise SceneError(f"{path} lacks the key {name!r}. Add it, as the data format asks.")
+        raise SceneError(f"{path} lacks the key {name!r}. Add it, as the data format requires.")
     return record[name]
 
 
 def get_text(record: Any, name: str, path: Path) -> str:
-    """Returns a text that a record of a file must have."""
+    """Returns a required string of a record of a file."""
     text = get(record, name, path)
     if not isinstance(text, str):
-        raise SceneError(f"{name} is {text!r} in {path}. Give the name of a file.")
+        raise SceneError(f"{name} is {text!r} in {path}. Use the name of a file.")
     return text
 
 
 def rigid_motion(matrix: Any, name: str, path: Path) -> Float[np.ndarray, "3 4"]:
-    """Returns the upper three rows of a 4 x 4 matrix that rotates and moves, nothing else."""
+    """Returns the upper three rows of a 4 x 4 rotation and translation."""
     try:
         pose = np.asarray(matrix, np.float64)
     except (TypeError, ValueError):
@@ -91,25 +91,19 @@ def rigid_motion(matrix: Any, name: str, path: Path) -> Float[np.ndarray, "3 4"]
         )
     if residual > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0.0:
         raise SceneError(
-            f"The transform_matrix of {name} in {path} does not rotate: its axes are scaled, "
+            f"The transform_matrix of {name} in {path} is not rigid: its axes are scaled, "
             f"sheared or mirrored (deviation {residual:.2g}). Export the poses without scale."
         )
     return pose[:3]
 
 
-SPLITS: tuple[Split, ...] = get_args(Split)
-
-TRANSFORMS = "transforms_{}.json"
-"""Name of a split's transforms file."""
-
-
 class FrameFiles(NamedTuple):
-    """Files of one frame, below the scene's folder.
+    """Files of one frame, relative to the scene folder.
 
     Attributes:
-      image: without its ending, which is `.png`.
-      mask: with it.
-      depth: with it.
+      image: path of the image, without its extension `.png`.
+      mask: path of the mask, with extension.
+      depth: path of the depth map, with extension.
     """
 
     image: str
@@ -118,7 +112,7 @@ class FrameFiles(NamedTuple):
 
 
 Naming = Callable[[str, int], FrameFiles]
-"""From a split and the number of a frame to its files."""
+"""Function from a split and the number of a frame to its files."""
 
 
 def plain(split: str, number: int) -> FrameFiles:
@@ -145,8 +139,8 @@ def frame_record(
     """Returns a frame of a transforms file.
 
     Args:
-      files: the frame's.
-      pose: 4 x 4, camera to world.
+      files: files of the frame.
+      pose: camera-to-world matrix, 4 x 4.
       masked: whether it has a mask.
       deep: whether it has a depth map.
     """
@@ -159,14 +153,14 @@ def frame_record(
 
 
 class Frames(NamedTuple):
-    """One split of a scene: where its files are, and its cameras.
+    """One split of a scene: paths of its files, and its cameras.
 
     Attributes:
       names: stem of each image, unique in the split.
-      images: 8-bit images.
-      masks: object masks, or `None` where the split has none.
-      depths: planar depth maps, or `None` where the split has none.
-      cameras: one a frame.
+      images: paths of the 8-bit images.
+      masks: paths of the object masks, or `None` if the split has none.
+      depths: paths of the planar depth maps, or `None` if the split has none.
+      cameras: cameras of the frames.
     """
 
     names: tuple[str, ...]
@@ -220,11 +214,11 @@ def read_frames(scene: Path, split: str) -> Frames:
 
 
 def check_scene(scene: Path, *, needed: Sequence[str] = ("train",)) -> None:
-    """Reads every file of every split once, so that a broken one is found before it is needed.
+    """Reads every file of every split once, so that broken files are reported early.
 
     Args:
-      scene: its folder.
-      needed: splits that may not be missing.
+      scene: the scene folder.
+      needed: splits that must exist.
 
     Raises:
       SceneError: at the first file that is broken or missing.
@@ -237,7 +231,7 @@ def check_scene(scene: Path, *, needed: Sequence[str] = ("train",)) -> None:
 
 
 def read_images(frames: Frames) -> UInt8[np.ndarray, "frames h w 3"]:
-    """Reads the images of a split as 8-bit sRGB, over white where they are transparent."""
+    """Reads the images of a split as 8-bit sRGB, composited over white."""
     return np.stack(list(_images(frames)))
 
 
@@ -250,7 +244,7 @@ def read_masks(frames: Frames) -> Bool[np.ndarray, "frames h w"]:
     if frames.masks is None:
         raise SceneError(
             f"The frames of {frames.images[0].parent} have no masks. Add mask_file_path to each "
-            "frame of the transforms file; docs/masks.md tells how to take over the masks of a "
+            "frame of the transforms file; docs/masks.md explains how to import the masks of a "
             "segmentation model."
         )
     return np.stack(list(_masks(frames)))
@@ -259,8 +253,7 @@ def read_masks(frames: Frames) -> Bool[np.ndarray, "frames h w"]:
 def read_distances(frames: Frames) -> Float[np.ndarray, "frames h w"]:
     """Reads the depth maps of a split as distance along each pixel's unit ray, world units.
 
-    `inf` where a float map says that the ray meets nothing. 8-bit maps saturate at a planar
-    depth of 11.5.
+    Rays that hit nothing have `inf` in a float map. 8-bit maps saturate at a planar depth of 11.5.
     """
     if frames.depths is None:
         raise SceneError(
@@ -304,8 +297,8 @@ def _optional_files(
         return None
     if lacking:
         raise SceneError(
-            f"The frame {lacking[0]} of {path} lacks {key!r}, as {len(lacking)} of {len(frames)} "
-            "frames do. Add it to these, or remove it from all."
+            f"The frame {lacking[0]} of {path} lacks {key!r}, like {len(lacking)} of {len(frames)} "
+            "frames. Add it to these, or remove it from all."
         )
     return tuple(scene / get_text(frame, key, path) for frame in frames)
 
@@ -332,17 +325,17 @@ def _check_files(frames: Frames) -> None:
     if count > 1:
         raise SceneError(
             f"{count} frames of {frames.images[0].parent} have the same file name, {name}. Give "
-            "every frame a name of its own."
+            "every frame a unique name."
         )
 
 
 def _checked(pixels: np.ndarray, path: Path, frames: Frames) -> np.ndarray:
-    """Checks an image's size against the split's."""
+    """Checks that an image has the size of its split."""
     expected = (frames.cameras.height, frames.cameras.width)
     if pixels.shape[:2] != expected:
         height, width = pixels.shape[:2]
         raise SceneError(
             f"{path} is {width} x {height} pixels, but the split's images are {expected[1]} x "
-            f"{expected[0]}. Render it again in that size."
+            f"{expected[0]}. Render it again at that size."
         )
     return pixels

@@ -2,10 +2,10 @@
 
     cube_smcvx_ball              a scene: background, category, object
     cubebg_single-convex         its configuration on Hugging Face: background, category
-    textured_cube_scene/single-convex/ball          its folder in the raw release; an object's
-                                 folder ends with _sphere or _hdr before these backgrounds
+    textured_cube_scene/single-convex/ball          its folder in the raw release; the folder of an
+                                 object ends with _sphere or _hdr before these backgrounds
 
-The parser's errors suggest the nearest names.
+Errors of the parser suggest the nearest names.
 """
 
 import difflib
@@ -17,7 +17,7 @@ from refref_jax.data import SceneError
 
 
 class _Background(NamedTuple):
-    """What a kind of background is called: in configurations, and in the raw release."""
+    """Names of a type of background: in configurations, and in the raw release."""
 
     config: str
     raw_folders: tuple[str, ...]
@@ -33,14 +33,14 @@ _BACKGROUNDS: dict[str, _Background] = {
 }
 
 BACKGROUNDS = tuple(_BACKGROUNDS)
-"""Kinds of background, as scenes' names begin."""
+"""Types of background, which start the names of scenes."""
 
 CATEGORIES: dict[str, str] = {
     "smcvx": "single-convex",
     "smncvx": "single-non-convex",
     "mmncvx": "multiple-non-convex",
 }
-"""Categories of objects: as in scenes' names, and as in configurations and folders."""
+"""Categories of objects: in the names of scenes, and in configurations and folders."""
 
 CONFIGS = tuple(
     f"{background.config}_{category}"
@@ -56,7 +56,7 @@ class SceneName(NamedTuple):
     Attributes:
       background: `cube`, `sphere` or `env`.
       category: `smcvx`, `smncvx` or `mmncvx`.
-      object: as in the data set, with underscores.
+      object: name of the object in the data set, with underscores.
     """
 
     background: str
@@ -68,12 +68,12 @@ class SceneName(NamedTuple):
 
     @property
     def config(self) -> str:
-        """The configuration on Hugging Face that the scene is of."""
+        """The scene's configuration on Hugging Face."""
         return f"{_BACKGROUNDS[self.background].config}_{CATEGORIES[self.category]}"
 
     @property
     def source(self) -> str:
-        """The scene as commands take it."""
+        """The scene as `hf:CONFIG/SCENE`."""
         return f"hf:{self.config}/{self}"
 
     @property
@@ -85,7 +85,7 @@ class SceneName(NamedTuple):
 
 
 def is_name(name: str) -> bool:
-    """Returns whether a scene may be called so."""
+    """Returns whether a name is a valid name of a scene."""
     background, _, rest = name.partition("_")
     category, _, thing = rest.partition("_")
     known = background in _BACKGROUNDS and category in CATEGORIES
@@ -96,7 +96,7 @@ def parse(name: str) -> SceneName:
     """Returns the parts of a scene's name.
 
     Raises:
-      SceneError: if it is none.
+      SceneError: if it is not a valid name.
     """
     if is_name(name):
         return SceneName(*name.split("_", 2))
@@ -108,8 +108,8 @@ def parse(name: str) -> SceneName:
         words = words[category is not None :]
     wanted = SceneName(background or "cube", category or "smcvx", "_".join(words) or "ball")
     raise SceneError(
-        f"{name!r} is no name of a scene, which is {{{','.join(BACKGROUNDS)}}}_"
-        f"{{{','.join(CATEGORIES)}}}_{{object}}. Name it as in {wanted}."
+        f"{name!r} is not the name of a scene: names are {{{','.join(BACKGROUNDS)}}}_"
+        f"{{{','.join(CATEGORIES)}}}_{{object}}. Use a name such as {wanted}."
     )
 
 
@@ -117,8 +117,8 @@ def parse_source(source: str) -> SceneName:
     """Returns the scene of `hf:CONFIG/SCENE`.
 
     Raises:
-      SceneError: if it is not of that form, if there is no such configuration, or if the scene is
-        of another.
+      SceneError: if it is not of that form, if there is no such configuration, or if the scene
+        belongs to another one.
     """
     config, separator, text = source.removeprefix("hf:").partition("/")
     if not separator:
@@ -126,7 +126,7 @@ def parse_source(source: str) -> SceneName:
         raise SceneError(f"{source} is not hf:CONFIG/SCENE. Write it as in {example.source}.")
     if config not in CONFIGS:
         raise SceneError(
-            f"{config!r} is no configuration of the data set. Write "
+            f"{config!r} is not a configuration of the data set. Write "
             f"{nearest(config, CONFIGS) or 'one of ' + ', '.join(CONFIGS)}."
         )
     name = parse(text)
@@ -147,7 +147,7 @@ def of_raw_folder(scene: Path) -> SceneName | None:
 
 
 def of_folder(scene: Path) -> str:
-    """Returns how a scene's folder is called: its name, or in the raw release the published one."""
+    """Returns the name of a scene's folder, or the published name in the raw release."""
     return str(of_raw_folder(scene) or scene.resolve().name)
 
 

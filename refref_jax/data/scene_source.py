@@ -1,21 +1,19 @@
 """Opens a scene from a folder or from `hf:CONFIG/SCENE` (NumPy only).
 
-Where the files of the published data set are: in local copies, or on Hugging Face (NumPy only).
+The latter is a scene of the published data set in parquet files, in a local copy of its
+repositories or on Hugging Face:
 
     data/{scene}-00000-of-00002.parquet       or {config}/ instead of data/
     mesh_files/{category}/{object}_{material}.ply
     scene_files/{scene}/...                   scene.json, meshes/, textures: all else of its folder
 
-The first are of the repository `yinyue27/RefRef`, the second of `yinyue27/RefRef_additional`; the
-last are of our own conversions alone, and go before the second.
-A name here is a path below such a repository, with slashes.
+The parquet files are in the repository `yinyue27/RefRef`, the meshes in
+`yinyue27/RefRef_additional`; scene files only exist in conversions by this library, and take
+precedence over the meshes. The name of a file is its path in the repository, with slashes.
 
-Opens a scene wherever it is: a folder, or `hf:CONFIG/SCENE` (NumPy only).
-
-The latter is a scene in parquet files, in a local copy of the data set or on Hugging Face, see
-`published_files`. It is unpacked once, into a folder in the local layout below REFREF_CACHE, which
-appears when it is whole. REFREF_HF names the folder of the local copy, or several, separated like
-the entries of PATH. What is in the cache may be removed at any time.
+A scene is unpacked once, into a folder in the local layout below REFREF_CACHE, which appears when
+it is complete. REFREF_HF is the folder of the local copy, or several, separated like the entries of
+PATH. The cache may be removed at any time.
 """
 
 import hashlib
@@ -42,12 +40,17 @@ _FOLDERS = ("data", *CONFIGS, "mesh_files", "scene_files")
 
 _SHARD = re.compile(rf"({'|'.join(_FOLDERS[:-2])})/(.+)-(\d+)-of-(\d+)\.parquet")
 
+_UNPACKING = ".unpacking-"
+
+# Age in seconds at which a folder of an unfinished unpacking is considered abandoned.
+_ABANDONED = 24 * 3600
+
 
 class LocalCopy:
-    """Folders that together hold what the published repositories do, or a part of it.
+    """Local folders that together hold the files of the published repositories, or some of them.
 
     Attributes:
-      where: how messages call it.
+      where: name in messages.
     """
 
     def __init__(self, folders: Sequence[Path]) -> None:
@@ -61,8 +64,8 @@ class LocalCopy:
         for folder in folders:
             if not folder.is_dir():
                 raise SceneError(
-                    f"{folder} is no folder, but should hold a scene or a copy of the data set. "
-                    "Correct what named it: the scene, or REFREF_HF."
+                    f"{folder} is not a folder, but should hold a scene or a copy of the data set. "
+                    "Correct the path of the scene, or REFREF_HF."
                 )
             for path in (path for place in _FOLDERS for path in (folder / place).rglob("*")):
                 if path.is_file():
@@ -73,11 +76,11 @@ class LocalCopy:
         return sorted(self._paths)
 
     def fetch(self, name: str) -> Path:
-        """Returns where a file is."""
+        """Returns the path of a file."""
         return self._paths[name]
 
     def key(self, scene: SceneName) -> str:
-        """Returns a name of a folder, another one where the scene's files are others."""
+        """Returns a folder name for the scene, which changes with its files."""
         names = [*find_shards(self, scene), *find_others(self, scene).values()]
         stats = [(self._paths[name].resolve(), self._paths[name].stat()) for name in names]
         text = "\n".join(f"{path} {stat.st_size} {stat.st_mtime_ns}" for path, stat in stats)
@@ -88,13 +91,13 @@ class Hub:
     """The published repositories, downloaded file by file.
 
     Attributes:
-      where: how messages call it.
+      where: name in messages.
     """
 
     where = "huggingface.co"
 
     def __init__(self) -> None:
-        """Finds the user's `huggingface_hub`.
+        """Imports `huggingface_hub`, an optional dependency.
 
         Raises:
           SceneError: if it is not installed.
@@ -118,22 +121,22 @@ class Hub:
         return sorted(self._owners)
 
     def fetch(self, name: str) -> Path:
-        """Returns where a file is on this machine, and downloads it if need be."""
+        """Returns the local path of a file, and downloads it if necessary."""
         self.names()
         download = self._hub.hf_hub_download
         return Path(self._try(download, self._owners[name], name, repo_type="dataset"))
 
     def key(self, scene: SceneName) -> str:
-        """Returns a name of a folder: always one, so that it can be found without a network."""
+        """Returns a constant folder name, so that the scene can be opened offline."""
         del scene
         return "huggingface"
 
     def _try(self, call: Any, repository: str, *arguments: str, **options: str) -> Any:
         try:
             return call(repository, *arguments, **options)
-        except Exception as error:  # whatever the network, the service and its client raise
+        except Exception as error:  # the network, the service and its client raise many types
             raise SceneError(
-                f"{' '.join((repository, *arguments))} can not be had from {self.where} "
+                f"{' '.join((repository, *arguments))} cannot be downloaded from {self.where} "
                 f"({type(error).__name__}: {error}). Check the connection, or set REFREF_HF to the "
                 "folder of a local copy."
             ) from error
@@ -143,7 +146,7 @@ Repository = LocalCopy | Hub
 
 
 def scenes_in(repository: Repository) -> list[SceneName]:
-    """Returns all scenes that a repository holds parquet files of."""
+    """Returns all scenes with parquet files in a repository."""
     matches = [_SHARD.fullmatch(name) for name in repository.names()]
     names = sorted({match[2] for match in matches if match})
     return [scene_names.parse(name) for name in names if scene_names.is_name(name)]
@@ -153,7 +156,7 @@ def find_shards(repository: Repository, scene: SceneName) -> list[str]:
     """Returns the names of all parquet files of a scene, in order.
 
     Raises:
-      SceneError: if there are none, or not all of them, or two sets.
+      SceneError: if there are none, if some are missing, or if there are two sets.
     """
     sets: dict[tuple[str, int], dict[int, str]] = {}
     for name in repository.names():
@@ -162,34 +165,34 @@ def find_shards(repository: Repository, scene: SceneName) -> list[str]:
             sets.setdefault((match[1], int(match[4])), {})[int(match[3])] = name
     if not sets:
         near = _nearest(scene, scenes_in(repository))
-        advice = f"The nearest there is {near.source}." if near else "Copy it there."
+        advice = f"The nearest there is {near.source}." if near else "Copy its files there."
         raise SceneError(f"There is no scene {scene} in {repository.where}. {advice}")
     (_, count), shards = next(iter(sets.items()))
     if len(sets) > 1:
         raise SceneError(
             f"{repository.where} holds the scene {scene} more than once, as {shards[min(shards)]} "
-            "and others. Remove all but one set of files."
+            "and others. Keep only one set of files."
         )
     if missing := sorted(set(range(count)) - set(shards)):
         raise SceneError(
-            f"Of {count} parquet files of {scene} in {repository.where} number {missing[0]} is "
+            f"File {missing[0]} of the {count} parquet files of {scene} in {repository.where} is "
             "missing. Copy it again."
         )
     return [shards[i] for i in range(count)]
 
 
 def _nearest(scene: SceneName, scenes: Sequence[SceneName]) -> SceneName | None:
-    """Returns a scene with an object of that or a similar name, before that background if any."""
+    """Returns a scene with the same or a similar object, preferably with the same background."""
     thing = scene_names.nearest(scene.object, {each.object for each in scenes})
     found = [each for each in scenes if each.object == thing]
     return max(found, key=lambda each: each.background == scene.background, default=None)
 
 
 def find_others(repository: Repository, scene: SceneName) -> dict[str, str]:
-    """Finds what belongs to a scene beside its parquet files.
+    """Finds the files of a scene other than parquet files.
 
     Returns:
-      Names of files, by their places below the scene's folder.
+      Names of files, by their paths relative to the scene folder.
     """
     names = repository.names()
     own = f"scene_files/{scene}/"
@@ -205,14 +208,8 @@ def find_others(repository: Repository, scene: SceneName) -> dict[str, str]:
     return found
 
 
-_UNPACKING = ".unpacking-"
-
-# Seconds after which a folder that is being unpacked must have been abandoned.
-_ABANDONED = 24 * 3600
-
-
 class SceneWarning(UserWarning):
-    """Something that a scene lacks, without which it can be read."""
+    """An optional part of a scene is missing."""
 
 
 def open_scene(
@@ -224,18 +221,18 @@ def open_scene(
 ) -> Path:
     """Returns the folder of a scene in the local layout, plain or with the raw release's names.
 
-    A folder is returned as it is; its readers check it.
+    The path of a folder is returned unchanged; its readers check it.
 
     Args:
-      source: a folder, or `hf:CONFIG/SCENE`.
-      copies: folders of local copies of the published repositories; those of REFREF_HF if `None`,
-        and if there are none, Hugging Face itself.
-      cache: where to unpack; REFREF_CACHE if `None`, else `~/.cache/refref_jax`.
-      progress: is told of every frame that is unpacked.
+      source: path of a folder, or `hf:CONFIG/SCENE`.
+      copies: folders of local copies of the published repositories; those of REFREF_HF if `None`.
+        Without any, files are downloaded from Hugging Face.
+      cache: folder for unpacked scenes; if `None`, REFREF_CACHE or else `~/.cache/refref_jax`.
+      progress: function called after every frame that is unpacked.
 
     Raises:
-      SceneError: if there is no such scene, if a file of it is missing or broken, or if what reads
-        it is not installed.
+      SceneError: if there is no such scene, if one of its files is missing or broken, or if a
+        required package is not installed.
     """
     if not str(source).startswith("hf:"):
         folder = Path(source)
@@ -249,7 +246,7 @@ def open_scene(
         _unpack_whole(repository, name, scene, progress)
     if not (scene / "meshes").is_dir():
         warnings.warn(
-            f"{name} has no meshes, so that light goes straight through it. Put them into "
+            f"{name} has no meshes, so rays through it are straight. Put them into "
             f"mesh_files/{CATEGORIES[name.category]} of a folder in REFREF_HF, as "
             f"{name.object}_glass.ply, or into {scene / 'meshes'}.",
             SceneWarning,
@@ -259,7 +256,7 @@ def open_scene(
 
 
 def copies_from_environment() -> list[Path]:
-    """Returns the folders that REFREF_HF names."""
+    """Returns the folders in REFREF_HF."""
     return [Path(word) for word in os.environ.get("REFREF_HF", "").split(os.pathsep) if word]
 
 
@@ -269,13 +266,13 @@ def unpack_scene(
     """Writes a scene of a repository into a new folder in the local layout.
 
     Args:
-      repository: where it is.
-      name: of the scene.
+      repository: repository of the scene.
+      name: name of the scene.
       scene: the folder, which must not exist.
-      progress: is told of every frame.
+      progress: function called after every frame.
 
     Raises:
-      SceneError: as `open_scene`.
+      SceneError: under the conditions of `open_scene`.
     """
     parquet_scenes.import_parquet()  # before anything is downloaded
     shards = [repository.fetch(shard) for shard in find_shards(repository, name)]
@@ -288,7 +285,7 @@ def unpack_scene(
 
 
 def _unpack_whole(repository: Repository, name: SceneName, scene: Path, progress: Progress) -> None:
-    """Unpacks a scene beside its place, and moves it there when it is whole."""
+    """Unpacks a scene to a temporary folder next to its path, and moves it when complete."""
     scene.parent.mkdir(parents=True, exist_ok=True)
     _remove_abandoned(scene.parent)
     with tempfile.TemporaryDirectory(prefix=_UNPACKING, dir=scene.parent) as beside:
@@ -307,14 +304,14 @@ def _remove_abandoned(folder: Path) -> None:
 
 
 def _refuse_parquet(folder: Path) -> None:
-    """Says how a copy of the parquet files is read, where its folder is given as a scene's."""
+    """Refuses a folder of parquet files, with an explanation of how to open one of its scenes."""
     if any(folder.glob("transforms_*.json")) or not folder.is_dir():
         return
     copy = LocalCopy([folder])
     if scenes := scenes_in(copy):
         raise SceneError(
             f"{folder} holds parquet files of {len(scenes)} scenes, not a scene. Set "
-            f"REFREF_HF={folder}, and give the scene as in {scenes[0].source}."
+            f"REFREF_HF={folder}, and open a scene as {scenes[0].source}."
         )
 
 

@@ -1,18 +1,14 @@
-"""Interface of radiance fields: configurations, functions, and precision.
-
-Arithmetic precision of fields: float32, or mixed precision with bfloat16.
-
-With `bfloat16`, tables are read and matrices multiplied in bfloat16. Parameters, sums, gradients
-and outputs stay in float32: bfloat16 has only 8 significant bits, so small gradients would be lost
-in a sum of many.
-
-Source: Micikevicius et al., Mixed Precision Training (2018), for the float32 master weights.
-
-Interface of field types: configurations, and functions of these.
+"""Interface of field types: their configurations, functions and arithmetic precision.
 
 A radiance field has two functions, `init` and `radiance`; a proposal field has `init` and
 `density`. All are pure functions over Gaussians in the unit cube. A field type is one module with a
 `FieldKind`, and one line in `registry`, through which all other modules query fields.
+
+The precision is float32, or mixed with bfloat16: tables are then read and matrices multiplied in
+bfloat16, while parameters, sums, gradients and outputs stay in float32. bfloat16 has only 8
+significant bits, so small gradients would be lost in a sum of many.
+
+Source: Micikevicius et al., Mixed Precision Training (2018), for the float32 master weights.
 """
 
 import dataclasses
@@ -27,6 +23,9 @@ from jaxtyping import Array, Float
 
 from refref_jax.choices import Footprint, Precision
 from refref_jax.sampling.cones import Gaussians
+
+Params = Any
+"""Pytree of arrays, from `init`."""
 
 
 def check_precision(precision: str) -> None:
@@ -53,10 +52,6 @@ def _product(left: Array, right: Array, axes: Any, precision: None = None) -> Ar
     return jax.lax.dot_general(
         *factors, axes, precision=precision, preferred_element_type=left.dtype
     )
-
-
-Params = Any
-"""Pytree of arrays, from `init`."""
 
 
 @dataclasses.dataclass(frozen=True)

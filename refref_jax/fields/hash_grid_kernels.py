@@ -1,24 +1,14 @@
-"""Trilinear interpolation of hash tables, and its transpose.
-
-Table rows and weights of the grid vertices around a point.
+"""Trilinear interpolation of a hash table at the vertices of a grid, and its transpose.
 
 A grid of `n` cells per side covers the unit cube. If its `(n + 1)^3` vertices fit into the table,
 each vertex has its own row, with x varying fastest; otherwise, vertices are hashed to rows.
 
-Source: Mueller et al., Instant NGP (2022), section 3.
-
-Interpolation of a table, and its transpose, as native CPU loops over points.
-
-The results are those of the formulas in `interpolation`. The rows of a point are computed once and
-stay in registers for all of its features.
-
-Trilinear interpolation of a table at the vertices of a grid, and its transpose.
-
 This part of a field is memory-bound: every point reads eight rows at random addresses, and adds to
 eight rows in the backward pass. Both operations are custom primitives, because XLA's loops for them
-on a CPU take about twice as long as one loop over points that computes the rows once. CPUs run
-`vertex_loops`; other devices use the formulas `_gathered` and `_scattered`, as do rare operations
-(derivatives with respect to the position, several tables at once).
+on a CPU take about twice as long as one loop over points that computes the rows once and keeps them
+in registers for all features of a point. CPUs run these native loops, `gather` and `scatter`; other
+devices use the formulas `_gathered` and `_scattered`, as do rare operations (derivatives with
+respect to the position, several tables at once). The results are the same.
 
 Both primitives take leading axes, which `vmap` adds: all points of a batch are one loop, or one
 gather.
@@ -46,6 +36,9 @@ from refref_jax.native_loop import native_loop
 _PRIMES = (1, 2654435761, 805459861)
 
 _CORNERS = tuple(itertools.product((0, 1), repeat=3))
+
+# Numbers of exponent and mantissa bits of bfloat16.
+_BFLOAT16 = (8, 7)
 
 
 def corners(
@@ -90,10 +83,6 @@ def _entry(
     x, y, z = terms
     # Parenthesised so that the term of two axes is computed once for two corners.
     return (x ^ (y ^ z)) & jnp.uint32(entries - 1) if strides is _PRIMES else x + (y + z)
-
-
-# Numbers of exponent and mantissa bits of bfloat16.
-_BFLOAT16 = (8, 7)
 
 
 def gather(
@@ -172,7 +161,7 @@ def interpolate(
     """Blends the table's rows at the eight corners of each point's cell.
 
     Args:
-      table: one row per vertex, or per hash value; see `vertices`.
+      table: one row per vertex, or per hash value; see `corners`.
       positions: points in `[0, 1]^3`.
       resolution: number of cells per side.
       precision: precision in which rows are read. Sums, and the gradient with respect to the table,
@@ -181,7 +170,7 @@ def interpolate(
     return _gather.bind(table, positions, resolution=resolution, precision=precision)
 
 
-# --- as formulas ---
+# Formulas, for all devices.
 
 
 def _gathered(
@@ -219,7 +208,7 @@ def _stacked_corners(
     return jnp.stack(rows, axis=-1), jnp.stack(weights, axis=-1)
 
 
-# --- as primitives: both are linear in their first argument, and each is the other's transpose ---
+# Primitives: both are linear in their first argument, and each is the other's transpose.
 
 
 def _primitive(name: str, formula: Callable[..., Array], loop: Callable[..., Array]) -> Primitive:

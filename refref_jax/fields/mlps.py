@@ -1,10 +1,6 @@
-"""Small networks behind a hash grid, and encodings of directions.
+"""MLPs on hash grid features, and encodings of directions, shared by several field types.
 
-Direction encodings of fields.
-
-MLPs on hash grid features, shared by several field types.
-
-The functions are called in a compact linen module, to which their layers belong.
+The functions of networks are called in a compact linen module, to which their layers belong.
 """
 
 import dataclasses

@@ -1,22 +1,13 @@
-"""Zip-NeRF's density and radiance fields.
+"""Zip-NeRF field type: proposal field, radiance field and preset sizes.
 
-Zip-NeRF's proposal field: density only, cheap to query many times along a path.
+The proposal field has density only, and is cheap to query many times along a path. The radiance
+field has density and view-dependent colour. The interface of both is pure functions over Gaussians
+in the unit cube; the linen modules are private.
 
-Its interface is pure functions over Gaussians in the unit cube; the linen module is private.
-
-Source: Barron et al., Mip-NeRF 360 (2022), section 3; Zip-NeRF (2023) for the hash grid.
-
-Zip-NeRF's radiance field: density and view-dependent colour.
-
-Its interface is pure functions over Gaussians in the unit cube; the linen module is private.
-
-Source: paper (arXiv 2505.05848), supplement (f for density, g for colour, spherical harmonics of
-the local direction); Zip-NeRF (2023) for the hash grid and the bottleneck.
-
-Zip-NeRF field type, with its preset sizes.
-
-Source: paper (arXiv 2505.05848), supplement (implementation details), and Zip-NeRF (2023) for the
-size `paper`; the other sizes are ours.
+Source: Barron et al., Mip-NeRF 360 (2022), section 3, for proposals; Zip-NeRF (2023) for the hash
+grid and the bottleneck; paper (arXiv 2505.05848), supplement (implementation details), for the
+networks (f for density, g for colour, spherical harmonics of the local direction) and, with
+Zip-NeRF, the size `paper`. The other sizes are ours.
 """
 
 import dataclasses
@@ -40,6 +31,9 @@ from refref_jax.sampling.cones import Gaussians
 
 # Shift of the softplus: the density of an untrained field is low, but not zero.
 _DENSITY_SHIFT = -1.0
+
+# Colours may exceed [0, 1] by this much, so that black and white have finite network outputs.
+_COLOUR_PADDING = 0.001
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,10 +74,6 @@ class _DensityField(nn.Module):
             gaussians, config.grid, width=config.width, outputs=1, precision=config.precision
         )
         return activate_density(raw[0])
-
-
-# Colours may exceed [0, 1] by this much, so that black and white have finite network outputs.
-_COLOUR_PADDING = 0.001
 
 
 @dataclasses.dataclass(frozen=True)

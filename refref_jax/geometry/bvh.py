@@ -1,17 +1,13 @@
-"""Closest hits of rays with a packed BVH of triangles.
-
-Closest hits of rays with a packed bounding volume hierarchy (BVH).
+"""Closest hits of rays with a packed bounding volume hierarchy (BVH) of triangles.
 
 On a CPU, packets of rays traverse the tree together (`traversal_cpu`); on an accelerator, every ray
 traverses it alone and all rays run in lock-step (`traversal_accelerator`). `bvh_nodes` describes
 the memory layout of the tree, `bvh_build` its construction.
 
-Rays are passed as batches with one leading axis.
-
-Closest hit of one ray, for use under `vmap` and differentiation.
-
-Under any nesting of `vmap`, all rays are cast as one batch (see `bvh`). The triangle that is hit is
-a constant for differentiation: recompute the hit point from the triangle to obtain gradients.
+`closest_hits` takes a batch of rays with one leading axis. `closest_slot` takes one ray, for use
+under `vmap` and differentiation: under any nesting of `vmap`, all rays are cast as one batch. The
+triangle that is hit is a constant for differentiation: recompute the hit point from the triangle to
+obtain gradients.
 """
 
 from typing import NamedTuple

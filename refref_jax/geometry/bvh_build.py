@@ -1,18 +1,12 @@
-"""Builds the packed BVH on the host by the surface area heuristic (NumPy only).
+"""Builds the packed BVH on the host (NumPy only), level by level.
 
-Surface area heuristic for all splits of all nodes of a level (NumPy only).
+Each level splits all of its large nodes at once, at the minimum of the surface area heuristic over
+all positions between two centroids along each of the three axes. The centroids are sorted once;
+every split preserves the three orders. The nodes are then packed into the tables of `bvh_nodes`.
 
 A split sends the first `n` faces of a node, in the order of their centroids along an axis, to the
 left. Its cost is `area(left) leaves(left) + area(right) leaves(right)`. It counts the leaves that a
 side fills instead of its faces, because all slots of a leaf are tested.
-
-Packs the nodes of a BVH into the tables of `bvh_nodes`, on the host (NumPy only).
-
-Builds the packed BVH on the host (NumPy only), level by level.
-
-Each level splits all of its large nodes at once, at the minimum of the surface area heuristic over
-all positions between two centroids along each of the three axes. The centroids are sorted once;
-every split preserves the three orders.
 
 Source: Wald, On fast Construction of SAH-based Bounding Volume Hierarchies (2007), without bins.
 """
@@ -24,6 +18,9 @@ from jaxtyping import Bool, Float, Int
 
 from refref_jax.geometry import bvh_nodes
 from refref_jax.geometry.bvh import BVH, LEAF_SIZE
+
+# Sign bit of each axis in the number of an octant, as in `bvh_nodes.octant`.
+_BACKWARDS = ((np.arange(bvh_nodes.OCTANTS)[:, None] >> np.arange(3)) & 1).astype(bool)
 
 
 def best_splits(
@@ -124,10 +121,6 @@ class _Boxes(NamedTuple):
 
     lower: Float[np.ndarray, "nodes 3"]
     upper: Float[np.ndarray, "nodes 3"]
-
-
-# Sign bit of each axis in the number of an octant, as in `bvh_nodes.octant`.
-_BACKWARDS = ((np.arange(bvh_nodes.OCTANTS)[:, None] >> np.arange(3)) & 1).astype(bool)
 
 
 def pack_nodes(

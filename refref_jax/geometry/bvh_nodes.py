@@ -1,15 +1,9 @@
-"""Layout of BVH nodes in memory, and the test of one ray against one box.
-
-Intersection test of one ray with one axis-aligned box.
+"""BVH nodes: their layout in memory, and the intersection of one ray with the box of a node.
 
 A ray's *octant* is the set of axes along which its direction is negative, as a 3-bit number (x is
 the lowest bit). All rays of an octant enter and leave a box through the same faces, so the slab
 test needs no sorting: the *entry corner* is where the three entered faces meet, the *exit corner*
 where the three exited faces meet.
-
-Source: the slab method, Kay and Kajiya (1986).
-
-Memory layout of BVH nodes, and their access on the device.
 
 A node is one row of eight 32-bit words, so that one visit is one contiguous load: the entry corner
 of its box (three floats, bit-cast), the exit corner, the *skip pointer* and the leaf.
@@ -17,9 +11,10 @@ of its box (three floats, bit-cast), the exit corner, the *skip pointer* and the
 There are eight tables, one per octant of directions, each in depth-first order with the nearer
 child of every node first. If a box is missed, the traversal continues at the row of the skip
 pointer; if it is hit, at the following row. A traversal therefore needs no stack: its state is one
-row. All tables share the triangles.
+row. All tables share the triangles. The last row of a table marks its end; it has no box and a
+negative leaf.
 
-The last row of a table marks its end; it has no box and a negative leaf.
+Source: the slab method, Kay and Kajiya (1986).
 """
 
 from typing import NamedTuple
@@ -36,6 +31,17 @@ _SLACK = 2.4e-7
 
 # Two roundings up on the far side, so that a triangle that lies in a box face is never culled.
 _FAR_PADDING = 1.0000004
+
+OCTANTS = 8
+
+WORDS = 8
+"""Number of words in a node."""
+
+LEAF_SIZE = 4
+"""Maximum number of triangles in a leaf, and the number tested at each leaf visit."""
+
+NONE = 2**31 - 1
+"""Slot for "no triangle", above all others."""
 
 
 class Slabs(NamedTuple):
@@ -99,18 +105,6 @@ def _larger(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
 
 def _smaller(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.where(a < b, a, b)
-
-
-OCTANTS = 8
-
-WORDS = 8
-"""Number of words in a node."""
-
-LEAF_SIZE = 4
-"""Maximum number of triangles in a leaf, and the number tested at each leaf visit."""
-
-NONE = 2**31 - 1
-"""Slot for "no triangle", above all others."""
 
 
 class Node(NamedTuple):

@@ -1,12 +1,9 @@
-"""Surfaces of a scene: packed on the host, evaluated at a hit on the device.
+"""Surfaces of a scene: packed on the host (NumPy), evaluated at ray hits on the device.
 
-Surface points at ray hits: position, normals and part of the scene.
-
-The *geometric* normal is that of the triangle and determines the side that a ray is on. The
-*shading* normal is interpolated between the corners and determines the directions of the reflected
-and refracted rays; on a flat part both normals agree. Both point out of the object.
-
-Packs meshes into `Surfaces`, on the host (NumPy only).
+A surface point has a position, two normals and the part of the scene that it belongs to. The
+*geometric* normal is that of the triangle and determines the side that a ray is on. The *shading*
+normal is interpolated between the corners and determines the directions of the reflected and
+refracted rays; on a flat part both normals agree. Both point out of the object.
 """
 
 from collections.abc import Sequence

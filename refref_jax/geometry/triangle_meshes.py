@@ -1,6 +1,4 @@
-"""Triangle meshes and their vertex normals (NumPy only).
-
-Shading normals at the corners of triangles, on the host (NumPy only).
+"""Closed triangle meshes: their shading normals, measures and connected pieces (NumPy only).
 
 Neighbouring faces whose normals differ by less than the crease angle belong to one smooth patch.
 At a corner, the face normals of a patch are averaged, weighted by the angle of each face there.
@@ -8,8 +6,6 @@ Normals are not averaged across a crease, so a cube stays flat and a cylinder ke
 
 Source: Thuermer and Wuethrich, Computing Vertex Normals from Polygonal Facets (1998), for the
 weighting by angle.
-
-Closed triangle meshes: what is measured on them, and their pieces (NumPy only).
 """
 
 from collections.abc import Sequence
@@ -26,6 +22,9 @@ CREASE_ANGLE = np.radians(30.0)
 # A face is degenerate if its area is below this fraction of its longest edge squared, as happens
 # when single-precision files put three corners on one line.
 _DEGENERATE = 1e-6
+
+Vertices = Float[np.ndarray, "vertices 3"]
+Faces = Int[np.ndarray, "faces 3"]
 
 
 def corner_normals(
@@ -116,10 +115,6 @@ def _corner_angles(corners: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray,
     forward = unit_vectors(np.roll(corners, -1, axis=1) - corners)
     backward = unit_vectors(np.roll(corners, 1, axis=1) - corners)
     return np.arccos(np.clip(np.sum(forward * backward, axis=-1), -1.0, 1.0))
-
-
-Vertices = Float[np.ndarray, "vertices 3"]
-Faces = Int[np.ndarray, "faces 3"]
 
 
 class Mesh(NamedTuple):

@@ -1,19 +1,14 @@
-"""Intersects one ray with one triangle, as stored and precomputed for traversal.
-
-Intersection of one ray with one triangle.
+"""Intersects one ray with one triangle, given by its corners or precomputed for the traversal.
 
 Letters: a triangle has corners `a, b, c`, counter-clockwise seen from outside; the barycentrics
 `(u, v)` are the weights of `b` and `c`, so a point is `(1 - u - v) a + u b + v c`.
 
-Intersection of one ray with one precomputed triangle: the inner loop of the traversal.
+A *facet* is a precomputed triangle, for the inner loop of the traversal: a row of twelve numbers in
+the order in which they are read, `a`, `b - a`, `a - c` and `(b - a) x (c - a)`. Only `a` depends on
+the origin of the world, so a facet is as exact far from the origin as the corners themselves.
 
-Letters as in `triangles`: corners `a, b, c`; `(u, v)` are the weights of `b` and `c`. A *facet* is
-a precomputed triangle, a row of twelve numbers in the order in which they are read: `a`, `b - a`,
-`a - c` and `(b - a) x (c - a)`. Only `a` depends on the origin of the world, so a facet is as
-exact far from the origin as the corners themselves.
-
-Source: Moeller and Trumbore, Fast, Minimum Storage Ray-Triangle Intersection (1997), with the
-normal precomputed and the division last, as in Embree.
+Source: Moeller and Trumbore, Fast, Minimum Storage Ray-Triangle Intersection (1997); for facets
+with the normal precomputed and the division last, as in Embree.
 """
 
 from typing import NamedTuple
@@ -29,6 +24,9 @@ from refref_jax import numerics
 # at 1e-5). A larger tolerance is wrong too: a ray that passes outside an object's edge would enter
 # it through one face and enter it again through the next.
 EDGE_TOLERANCE = 1e-5
+
+WORDS = 12
+"""Number of values in a facet."""
 
 
 class Intersection(NamedTuple):
@@ -79,10 +77,6 @@ def interpolate(corners: Float[Array, "3 n"], barycentric: Float[Array, "2"]) ->
 def geometric_normal(triangle: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """Returns the outward unit normal; zero for a degenerate triangle."""
     return numerics.normalize(jnp.cross(triangle[1] - triangle[0], triangle[2] - triangle[0]))
-
-
-WORDS = 12
-"""Number of values in a facet."""
 
 
 class _Scaled(NamedTuple):

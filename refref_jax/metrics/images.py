@@ -1,39 +1,31 @@
-"""Image metrics: PSNR, SSIM, LPIPS, FLIP, and errors of distance maps.
+"""Image metrics: PSNR, masked PSNR, SSIM, LPIPS, FLIP, and errors of distance maps.
 
-Colour metrics: PSNR, masked PSNR and SSIM.
-
-Images are sRGB in `[0, 1]`. In float32, the variance of a bright and nearly constant image is lost
+Colours are sRGB in `[0, 1]`. In float32, the variance of a bright and nearly constant image is lost
 to rounding (the SSIM of two constant images had an error of 1e-4), so use double precision for
 reported numbers.
 
-Distance metrics over the pixels of a mask: DMAE and DRMSE.
+Distances are arc lengths along each pixel's ray, in world units; DMAE and DRMSE are over the pixels
+of a mask. Values outside the mask may be infinite or NaN. For several images, DMAE and DRMSE are
+means of the values per image.
 
-Distances are arc lengths along each pixel's ray, in world units. Values outside the mask may be
-infinite or NaN. For several images, DMAE and DRMSE are means of the values per image.
+FLIP is the perceived difference of two images when flipping between them. It is computed by the
+authors' program (NumPy only), an optional dependency: `pip install -e '.[flip]'`.
 
-FLIP: the perceived difference of two images when flipping between them (NumPy only).
-
-It is computed by the authors' program, an optional dependency: `pip install -e '.[flip]'`.
-
-Source: Andersson, Nilsson, Akenine-Möller, Oskarsson, Åström, Fairchild, FLIP: A Difference
-Evaluator for Alternating Images, Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020.
-
-LPIPS: perceptual distance of two images by a network trained on human similarity ratings.
-
-The network consists of the five convolutions of torchvision's AlexNet; the channel weights are
-those of `lin` version 0.1. The user provides the weights: see `lpips_weights`.
-
-Source: Zhang, Isola, Efros, Shechtman, Wang, The Unreasonable Effectiveness of Deep Features as a
-Perceptual Metric (CVPR 2018), equation 1, and the constants of its code, version 0.1.
-
-Reads the weights of LPIPS from a file that the user provides (NumPy only).
-
-The file is a `.npz` with arrays of two published state dicts, under their original names:
+LPIPS is the perceptual distance of two images by a network trained on human similarity ratings: the
+five convolutions of torchvision's AlexNet, and the channel weights of `lin` version 0.1. The user
+provides the weights as a `.npz` file with arrays of two published state dicts, under their original
+names, so that arrays can be compared with their source:
 
     features.{0,3,6,8,10}.{weight,bias}    torchvision's AlexNet
     lin{0,1,2,3,4}.model.1.weight          LPIPS, version 0.1
 
-so that arrays can be compared with their source. `docs/metrics.md` explains how to create it.
+`docs/metrics.md` explains how to create this file.
+
+Sources:
+  FLIP: Andersson, Nilsson, Akenine-Möller, Oskarsson, Åström, Fairchild, FLIP: A Difference
+    Evaluator for Alternating Images, Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020.
+  LPIPS: Zhang, Isola, Efros, Shechtman, Wang, The Unreasonable Effectiveness of Deep Features as a
+    Perceptual Metric (CVPR 2018), equation 1, and the constants of its code, version 0.1.
 """
 
 from collections.abc import Mapping
@@ -50,6 +42,19 @@ from refref_jax.numerics import safe_divide, safe_sqrt
 
 SMALLEST_FOR_SSIM = 11
 """Edge of SSIM's window in pixels; SSIM is undefined for smaller images."""
+
+SMALLEST_FOR_LPIPS = 31
+"""Smallest edge of an image in pixels; for smaller images the second pooling has no output."""
+
+# Mean and deviation of AlexNet's training images, in the range [-1, 1].
+_MEAN = (-0.030, -0.088, -0.188)
+_DEVIATION = (0.458, 0.448, 0.450)
+
+# Added to the norm of a pixel's features, as in the published implementation.
+_LENGTH_PADDING = 1e-10
+
+_POOL = 3
+_POOL_STRIDE = 2
 
 
 def psnr(rendered: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Float[Array, ""]:
@@ -173,20 +178,6 @@ def import_flip() -> Any:
             "pip install -e '.[flip]'."
         ) from error
     return flip_evaluator
-
-
-SMALLEST_FOR_LPIPS = 31
-"""Smallest edge of an image in pixels; for smaller images the second pooling has no output."""
-
-# Mean and deviation of AlexNet's training images, in the range [-1, 1].
-_MEAN = (-0.030, -0.088, -0.188)
-_DEVIATION = (0.458, 0.448, 0.450)
-
-# Added to the norm of a pixel's features, as in the published implementation.
-_LENGTH_PADDING = 1e-10
-
-_POOL = 3
-_POOL_STRIDE = 2
 
 
 class Layer(NamedTuple):

@@ -1,11 +1,9 @@
-"""Differentiable tracing of single light paths.
+"""Traces single light paths, and the main branches of a ray, with gradients.
 
-Differentiable tracing of one light path, as a scan.
-
-The steps are those of `wavefront`, for one ray along one branch of its tree. The search for the
-triangles that are hit has no gradients, but each hit point is recomputed from the corners of its
-triangle. Positions, directions, arc lengths and weights of a path therefore have gradients with
-respect to indices of refraction, tints, absorption, corners, normals and the ray.
+A path is a scan over the steps of `path_step`, for one ray along one branch of its tree. The search
+for the triangles that are hit has no gradients, but each hit point is recomputed from the corners
+of its triangle. Positions, directions, arc lengths and weights of a path therefore have gradients
+with respect to indices of refraction, tints, absorption, corners, normals and the ray.
 
 Gradients are those of a fixed path: the same triangles in the same order, and the same branches.
 They do not account for paths that move to another triangle or fall below the throughput threshold.
@@ -13,19 +11,15 @@ Towards the critical angle, the gradients of refraction and reflectance are unbo
 beyond, the derivatives of the refracted ray are 0 (see `snell.transmission`), while those of the
 totally reflected ray are exact.
 
-Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
+The *main branches* carry most of the light of a ray: the main path, which is refracted wherever it
+can be, and the paths that are reflected once, at one of the first surfaces, and then refracted like
+the main path. In clear glass, all other paths together carry 1 % of the light. Throughput that the
+threshold moves to siblings stays on these branches. A reflection that does not occur is an empty
+path: the path has already left the objects, or the reflection is total and therefore part of the
+main path.
 
-Traces the main branches of a ray, which carry most of its light, with gradients.
-
-They are the main path, which is refracted wherever it can be, and the paths that are reflected
-once, at one of the first surfaces, and then refracted like the main path. In clear glass, all other
-paths together carry 1 % of the light. Throughput that the threshold moves to siblings stays on
-these branches.
-
-A reflection that does not occur is an empty path: the path has already left the objects, or the
-reflection is total and therefore part of the main path.
-
-Source: paper (arXiv 2505.05848), section 4.2; its two paths are the first two of these.
+Source: paper (arXiv 2505.05848), section 4.2; its two paths are the first two main branches.
+Letters as in `light_paths`.
 """
 
 import functools

@@ -1,8 +1,4 @@
-"""Path settings: which light is followed, and the capacities of its buffers.
-
-Selects which segments of traced paths are stored, to save memory.
-
-Path settings: the branches of light that are traced, and the capacity for them.
+"""Path settings: the branches of light that are traced, and the capacities of the buffers for them.
 
 At every interface light splits into a reflected and a transmitted ray, so a camera ray has a tree
 of paths. Path settings select the branches to follow. The presets are:
@@ -15,6 +11,8 @@ of paths. Path settings select the branches to follow. The presets are:
 - `PAPER_NO_REFLECTION`, `PAPER_NO_TIR`: the paper's ablations: `PAPER` without the reflection at
   the first surface, and with paths that continue straight at total internal reflections.
 
+`Detail` selects which segments of traced paths are stored, to save memory.
+
 Source: paper (arXiv 2505.05848), sections 4 and 5 (ablation study), for all but the tree.
 """
 
@@ -23,6 +21,19 @@ import math
 from typing import Literal, NamedTuple, get_args
 
 from refref_jax.choices import Footprint
+
+Reflections = Literal["none", "first", "all"]
+TotalReflection = Literal["followed", "ended"]
+Reentry = Literal["possible", "impossible"]
+Unfinished = Literal["kept", "dark"]
+
+# Max bends and throughput threshold for which the capacity factors below were measured.
+_PAPER_BENDS = 10
+_TREE_BENDS = 24
+_TREE_CUT = 0.02
+
+# Capacities do not grow for thresholds below this one, so that memory is bounded.
+_SMALLEST_CUT_WITH_ROOM = 5e-4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,20 +62,6 @@ class Detail:
 def everything(bends: int) -> Detail:
     """Returns the settings that store complete paths."""
     return Detail("all", bends + 1)
-
-
-Reflections = Literal["none", "first", "all"]
-TotalReflection = Literal["followed", "ended"]
-Reentry = Literal["possible", "impossible"]
-Unfinished = Literal["kept", "dark"]
-
-# Max bends and throughput threshold for which the capacity factors below were measured.
-_PAPER_BENDS = 10
-_TREE_BENDS = 24
-_TREE_CUT = 0.02
-
-# Capacities do not grow for thresholds below this one, so that memory is bounded.
-_SMALLEST_CUT_WITH_ROOM = 5e-4
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,20 +1,12 @@
-"""One bounce of one ray: refraction, reflection and the split of throughput.
-
-Interaction of one ray with one interface: the reflected and the refracted ray.
-
-Letters as in `snell`. The geometric normal determines the side that the ray comes from and the
-origins of the new rays; the shading normal determines their directions.
-
-Divides the throughput of one ray between reflection and transmission at an interface.
-
-Source: paper (arXiv 2505.05848), section 4.2, Fresnel blend; the energy-conserving throughput
-threshold is ours.
-
-Splits one ray at a surface into a reflected and a transmitted ray.
+"""One bounce of one ray: intersection, refraction, reflection and the split of its throughput.
 
 Both tracers, `wavefront` and `differentiable_paths`, are built from these steps.
 
-Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
+Letters as in `snell` and `light_paths`. The geometric normal determines the side that a ray comes
+from and the origins of the new rays; the shading normal determines their directions.
+
+Source: paper (arXiv 2505.05848), section 4.2, with its Fresnel blend; the energy-conserving
+throughput threshold is ours.
 """
 
 from typing import NamedTuple

@@ -1,13 +1,14 @@
-"""Tree of the light paths of many rays, and conversion of the tree to paths.
+"""Tree of the light paths of many rays, and its conversion to lists of paths.
 
 A segment that several paths share is stored once, with a pointer to its parent segment; a path is
-identified by its last segment. Letters as in `light_paths`.
+identified by its last segment.
 
-Packs the paths of many batches into lists of equal length.
+`pack` converts the tree of many batches to lists of equal length. A batch keeps its strongest
+paths, in the order of its rays, the heaviest path of each ray first. If the batches together exceed
+the total capacity, the weakest paths of all batches are dropped first, because the cost of sorting
+depends on the number of slots.
 
-A batch keeps its strongest paths, in the order of its rays, the heaviest path of each ray first. If
-the batches together exceed the total capacity, the weakest paths of all batches are dropped first,
-because the cost of sorting depends on the number of slots.
+Letters as in `light_paths`.
 """
 
 from typing import NamedTuple
@@ -25,6 +26,9 @@ from refref_jax.optics.ray_differentials import Spread
 
 NO_SEGMENT = -1
 """Parent of a camera ray's first segment."""
+
+# Index past the end of any list: writes to it are dropped.
+_NOWHERE = 2**31 - 1
 
 
 class Segments(NamedTuple):
@@ -226,10 +230,6 @@ def _walk_back(segments: Segments, ends: Ends, detail: Detail, tallied: int) -> 
     )
     # Every segment has one bend more than its parent, so the loop terminates.
     return jax.lax.while_loop(lambda walk: jnp.any(walk.segment != NO_SEGMENT), step, start)
-
-
-# Index past the end of any list: writes to it are dropped.
-_NOWHERE = 2**31 - 1
 
 
 def pack(

@@ -1,8 +1,4 @@
-"""Child rays of a block of rays: stores their segments and queues or ends them.
-
-Letters as in `light_paths`.
-
-Wavefront path tracing of rays along all branches of their paths.
+"""Wavefront path tracing of rays along all branches of their paths.
 
 Rays still to be cast are on a stack. Every iteration pops a block of rays and casts it: a ray that
 hits nothing ends as a path; for a ray that hits a surface, the reflected and transmitted children
@@ -38,6 +34,15 @@ from refref_jax.optics.path_step import Arrival, Branches, RayState
 from refref_jax.optics.path_tree import NO_SEGMENT, Ends, PathTree, Segments
 from refref_jax.optics.queues import Pool
 from refref_jax.optics.scene import Scene
+
+BLOCK = 4096
+"""Number of rays cast per iteration. Accelerators benefit from more, at the cost of memory."""
+
+# From this number of blocks, the last rays are cast in smaller blocks, by a second compiled loop.
+_MANY_BLOCKS = 6
+
+# Ratio of the two block sizes; blocks of fewer rays than this have no second loop.
+_SMALLER = 16
 
 
 class Live(NamedTuple):
@@ -158,16 +163,6 @@ def end(
     """Ends some rays as paths."""
     block = Ends(live.segments, live.rays, live.weights, live.state.bends, status)
     return tree._replace(ends=queues.append(tree.ends, block, ending))
-
-
-BLOCK = 4096
-"""Number of rays cast per iteration. Accelerators benefit from more, at the cost of memory."""
-
-# From this number of blocks, the last rays are cast in smaller blocks, by a second compiled loop.
-_MANY_BLOCKS = 6
-
-# Ratio of the two block sizes; blocks of fewer rays than this have no second loop.
-_SMALLER = 16
 
 
 class _Walk(NamedTuple):

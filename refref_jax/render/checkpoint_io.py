@@ -1,10 +1,10 @@
-"""A model on disk: what a run folder holds for rendering.
+"""Saves and loads a model: the files of a run folder that rendering needs.
 
     {run}/model.json            static description (`SavedModel`)
     {run}/geometry.npz          surfaces and interfaces
-    {run}/checkpoints/{step}/   parameters, and the training state beside them
+    {run}/checkpoints/{step}/   parameters, and next to them the training state
 
-A model can be rendered from these alone, without the scene that it was trained on.
+These files alone suffice to render a model, without the scene that it was trained on.
 """
 
 import dataclasses
@@ -37,11 +37,11 @@ TRAINING_ITEM = "training"
 
 @dataclasses.dataclass(frozen=True)
 class SavedModel:
-    """The static half of a model.
+    """The static part of a model.
 
     Attributes:
-      config: fields and sampling.
-      budget: which light is followed.
+      config: configuration of the fields and the sampling.
+      budget: path settings.
     """
 
     config: ModelConfig
@@ -49,7 +49,7 @@ class SavedModel:
 
 
 def save_scene(run: Path, saved: SavedModel, geometry: Scene) -> None:
-    """Writes everything but the parameters into an existing folder."""
+    """Writes a model without its parameters to an existing folder."""
     write_static(run, saved)
     surfaces, interfaces = geometry
     np.savez_compressed(
@@ -62,12 +62,12 @@ def save_scene(run: Path, saved: SavedModel, geometry: Scene) -> None:
 
 
 def write_static(run: Path, saved: SavedModel) -> None:
-    """Writes the static half of a model into an existing folder."""
+    """Writes the static part of a model to an existing folder."""
     configuration.write(run / _MODEL, saved)
 
 
 def read_static(run: Path) -> SavedModel:
-    """Reads the static half of a model."""
+    """Reads the static part of a model."""
     return configuration.read(run / _MODEL, SavedModel, variants=registry.variants())
 
 
@@ -75,8 +75,8 @@ def load_model(run: str | os.PathLike[str], *, step: int | None = None) -> Model
     """Loads a trained model.
 
     Args:
-      run: the folder that training wrote.
-      step: which checkpoint; the newest by default.
+      run: folder of a training run.
+      step: step of the checkpoint; the newest by default.
 
     Raises:
       ValueError: if the folder is not a run, or has no such checkpoint.
@@ -87,8 +87,8 @@ def load_model(run: str | os.PathLike[str], *, step: int | None = None) -> Model
     with open_checkpoints(run) as manager:
         step = find_step(manager, run, step)
         params = restore(manager, step, {PARAMS_ITEM: shapes})[PARAMS_ITEM]
-    # What is restored is bound to a device, and so is all that is made of it. The sums with which
-    # an image begins are not, and the chunk that they go to would be compiled for itself.
+    # Restored arrays are committed to a device, and so are all results computed from them. The
+    # initial sums of an image are not, so their chunk would be compiled separately.
     unbound = jax.tree.map(jnp.asarray, jax.device_get(params))
     return Model(saved.config, saved.budget, load_geometry(run), Params(*unbound))
 
@@ -108,10 +108,10 @@ def open_checkpoints(run: Path, *, keep: int | None = None) -> ocp.CheckpointMan
 
     Args:
       run: the run folder.
-      keep: how many of the newest to keep; `None` to read only.
+      keep: number of the newest checkpoints to keep; `None` to only read.
     """
-    # Not Orbax's `read_only`, of which it warns each time: a manager that is asked for nothing but
-    # to restore writes nothing either.
+    # Orbax warns about its option `read_only` each time; a manager that only restores does not
+    # write either.
     chosen = {"create": False} if keep is None else {"max_to_keep": keep}
     return ocp.CheckpointManager(
         (run / CHECKPOINTS).absolute(),
@@ -121,7 +121,7 @@ def open_checkpoints(run: Path, *, keep: int | None = None) -> ocp.CheckpointMan
 
 
 def find_step(manager: ocp.CheckpointManager, run: Path, step: int | None) -> int:
-    """Returns the wanted checkpoint, or the newest.
+    """Returns the step of a checkpoint, the newest by default.
 
     Raises:
       ValueError: if it does not exist.
@@ -129,7 +129,7 @@ def find_step(manager: ocp.CheckpointManager, run: Path, step: int | None) -> in
     steps = sorted(manager.all_steps())
     if not steps:
         raise ValueError(
-            f"{run} holds no checkpoint. Train it first, or give the folder of a finished run."
+            f"{run} has no checkpoint. Train it first, or give the folder of a finished run."
         )
     if step is not None and step not in steps:
         raise ValueError(f"{run} has no checkpoint of step {step}. It has {steps}: choose one.")
@@ -137,16 +137,16 @@ def find_step(manager: ocp.CheckpointManager, run: Path, step: int | None) -> in
 
 
 def restore(manager: ocp.CheckpointManager, step: int, items: dict) -> ocp.args.Composite:
-    """Reads some items of a checkpoint into the shapes and types that are given.
+    """Reads items of a checkpoint with the given shapes and types.
 
     Args:
-      manager: of the checkpoints.
-      step: of the checkpoint.
-      items: shapes by the name of the item. Those without a sharding are read onto one device, from
-        however many they were written.
+      manager: manager of the checkpoints.
+      step: step of the checkpoint.
+      items: shapes by the name of the item. Those without a sharding are placed on one device,
+        whatever devices they were written from.
 
     Raises:
-      ValueError: if it is damaged.
+      ValueError: if the checkpoint is damaged.
     """
     here = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     items = jax.tree.map(
@@ -155,9 +155,9 @@ def restore(manager: ocp.CheckpointManager, step: int, items: dict) -> ocp.args.
     arguments = {name: ocp.args.StandardRestore(shapes) for name, shapes in items.items()}
     try:
         return manager.restore(step, args=ocp.args.Composite(**arguments))
-    except Exception as error:  # Orbax raises what its storage does
+    except Exception as error:  # Orbax raises the errors of its storage
         raise ValueError(
-            f"The checkpoint {manager.directory / str(step)} can not be read ({_brief(error)}). "
+            f"The checkpoint {manager.directory / str(step)} cannot be read ({_brief(error)}). "
             "Remove it to use an older one, or train again."
         ) from error
 
@@ -176,7 +176,7 @@ def load_geometry(run: Path) -> Scene:
             interfaces = Interfaces(*(arrays[name] for name in Interfaces._fields))
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(
-            f"{path} can not be read ({_brief(error)}). Restore it, or train again into another "
+            f"{path} cannot be read ({_brief(error)}). Restore it, or train again into another "
             "folder."
         ) from error
     return jax.tree.map(jax.numpy.asarray, Scene(surfaces, interfaces))

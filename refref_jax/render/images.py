@@ -1,20 +1,13 @@
-"""Renders images in tiles of fixed size.
+"""Renders images in tiles and chunks of fixed size, so that programs compile once.
 
-Splits rays into tiles of one size, so that the function that renders a tile compiles once.
+Rays are traced in *tiles*. The paths of a tile are sorted so that empty slots come last, and are
+then rendered in *chunks*: a pixel that misses the objects costs one path, not two. The loops over
+tiles and chunks run on the host, so they cannot be part of a transformed function. This is one of
+the modules that call `jax.jit`.
 
-The loop over tiles runs on the host, so it cannot be part of a transformed function.
-
-Renders images in tiles and chunks of fixed size, so that programs compile once.
-
-Rays are traced in tiles. The paths of a tile are sorted so that empty slots come last, and are then
-rendered in chunks: a pixel that misses the objects costs one path, not two. This is one of the
-modules that call `jax.jit`.
-
-Images of a trained model with several rays in every pixel.
-
-A pixel is divided into `side x side` smaller ones. Each has a ray of its own with a footprint as
-much smaller, so the fields are queried for finer detail too. Colours are averaged as linear light
-and encoded afterwards: what a camera does, and what the true images were made with.
+With several rays in every pixel, a pixel is divided into `side x side` smaller ones. Each has a ray
+of its own with a footprint as much smaller, so the fields are queried for finer detail too. Colours
+are averaged as linear light and encoded afterwards, as a camera does.
 """
 
 import functools
@@ -46,6 +39,19 @@ _OUT_OF_REACH = 1e9
 _SMALLEST_TILE = 1024
 
 _Tree = TypeVar("_Tree")
+
+TILE = 16384
+"""Number of rays traced at once."""
+
+CHUNK = 4096
+"""Number of paths rendered at once. Lower it if memory runs out."""
+
+_INSTEAD = "Call it outside, or use render_rays, which is a pure function."
+_BRANCHES: tuple[Branch, ...] = get_args(Branch)
+_ALL, _PASSED, _MIRRORED = range(len(_BRANCHES))
+
+RAYS_OF_A_BAND = 1 << 18
+"""Most rays that are held at once, where a row of pixels has no more."""
 
 
 def in_tiles(
@@ -127,17 +133,6 @@ def cut_out(
     filling = Rays(_OUT_OF_REACH * away, away, np.ones(missing, part.radii.dtype))
     nowhere = jax.tree.map(lambda x: np.full((missing, x.shape[1]), EMPTY_SLOT, x.dtype), within)
     return jax.tree.map(lambda a, b: np.concatenate([a, b]), (part, within), (filling, nowhere))
-
-
-TILE = 16384
-"""Number of rays traced at once."""
-
-CHUNK = 4096
-"""Number of paths rendered at once. Lower it if memory runs out."""
-
-_INSTEAD = "Call it outside, or use render_rays, which is a pure function."
-_BRANCHES: tuple[Branch, ...] = get_args(Branch)
-_ALL, _PASSED, _MIRRORED = range(len(_BRANCHES))
 
 
 class Rendering(NamedTuple):
@@ -332,10 +327,6 @@ def _add(
 
 def _finish(sums: Rendering) -> Rendering:
     return sums._replace(rgb=jnp.clip(colour.linear_to_srgb(sums.linear), 0.0, 1.0))
-
-
-RAYS_OF_A_BAND = 1 << 18
-"""Most rays that are held at once, where a row of pixels has no more."""
 
 
 def render_camera(

@@ -1,8 +1,7 @@
-"""Model of a scene: static configuration, parameters, scene and path settings.
+"""Model of a scene: static configuration, learned parameters, scene and path settings.
 
-Static configuration of a model: its fields, its sampling, and the scene bounds.
-
-A model of a scene: learned fields, and the scene that bends light paths.
+The static configuration holds the fields, their sampling, and the scene bounds. It is hashable, so
+compiled functions take it as a static argument.
 """
 
 import dataclasses

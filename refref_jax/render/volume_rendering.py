@@ -1,22 +1,15 @@
-"""Samples one light path and integrates radiance along it.
-
-Volume rendering of one path from its samples.
+"""Integrates radiance along one light path: proposal levels, the radiance field, compositing.
 
 Letters, as in the paper (arXiv 2505.05848, section 4.1): interval `i` has density `sigma_i` and
 length `delta_i`; `T_i = exp(-sum_{j<i} sigma_j delta_j)` is the light that reaches it and
 `w_i = T_i (1 - exp(-sigma_i delta_i))` its weight in the colour.
 
-Radiance of one light path: proposal levels, then the radiance field.
-
-All functions take one path; `pixels` maps them over a batch.
+All functions of paths take one path; `pixels` maps them over a batch. `look_up` queries the fields
+of a model at world points, without light paths, to export surfaces and point clouds; the field
+inside objects is meaningless if the model takes no samples there.
 
 Source: Barron et al., Mip-NeRF 360 (2022), section 3, and Zip-NeRF (2023); paper (arXiv
 2505.05848), section 4.2, for samples and directions on the bent path.
-
-Queries of a model's radiance field at world points, without light paths.
-
-They are used to export surfaces and point clouds. The field inside objects is meaningless if the
-model takes no samples there.
 """
 
 import math
@@ -34,6 +27,15 @@ from refref_jax.render.model import ModelConfig, Params
 from refref_jax.sampling import cones, polylines, scene_bounds, stepfun
 from refref_jax.sampling.cones import Gaussians
 from refref_jax.sampling.polylines import Polyline
+
+# Minimum dilation of a proposal, in units of the full path (Mip-NeRF 360, supplement).
+_DILATION_BIAS = 0.0025
+
+# Minimum length of a path, in units of the scene radius: `s` keeps four digits in float32.
+_SHORTEST = 1e-3
+
+# Rotation between adjacent cone patterns (Zip-NeRF, supplement).
+_PATTERN_TURN = jnp.pi / 6.0
 
 
 class Composite(NamedTuple):
@@ -102,16 +104,6 @@ def composite(
         median=jnp.where(accumulation >= 0.5, median, jnp.inf),
         mean=jnp.where(accumulation > 0.0, mean, jnp.inf),
     )
-
-
-# Minimum dilation of a proposal, in units of the full path (Mip-NeRF 360, supplement).
-_DILATION_BIAS = 0.0025
-
-# Minimum length of a path, in units of the scene radius: `s` keeps four digits in float32.
-_SHORTEST = 1e-3
-
-# Rotation between adjacent cone patterns (Zip-NeRF, supplement).
-_PATTERN_TURN = jnp.pi / 6.0
 
 
 class Jitter(NamedTuple):

@@ -1,21 +1,16 @@
-"""Scene bounds, contraction, and the distance warp along a ray.
-
-Maps world space to the unit cube in which a field is stored.
+"""Maps world space to the unit cube of the fields, and distance along a path to `[0, 1]`.
 
 A bounded scene is a scaled cube, and a spherical scene is the ball in this cube. An unbounded scene
 is contracted: a ball around the origin is unchanged, and the space beyond it is contracted to a
 shell of the same thickness.
 
-Source: Barron et al., Mip-NeRF 360 (2022), Eq 10; Zip-NeRF (2023), section 2, for the scale of a
-contracted Gaussian.
+Letters: `t` is distance in world units, `s` the normalised coordinate in `[0, 1]` in which samplers
+work. Equal steps in `s` are short near the camera and grow with distance, so that one interval
+covers near and far.
 
-Maps distance along a path to the unit interval in which samplers work, and back.
-
-Letters: `t` is distance in world units, `s` the normalised coordinate in `[0, 1]`. Equal steps in
-`s` are short near the camera and grow with distance, so that one interval covers near and far.
-
-Source: Barron et al., Zip-NeRF (2023), section 4: the power transformation with
-`lambda = -1.5`, applied to twice the distance.
+Source: Barron et al., Mip-NeRF 360 (2022), Eq 10, for the contraction; Zip-NeRF (2023), section 2,
+for the scale of a contracted Gaussian, and section 4 for the warp of distance, the power
+transformation with `lambda = -1.5`, applied to twice the distance.
 """
 
 from typing import NamedTuple
@@ -26,6 +21,8 @@ from jaxtyping import Array, Float
 from refref_jax import numerics
 from refref_jax.choices import Space
 from refref_jax.sampling.cones import Gaussians
+
+_LAMBDA = -1.5
 
 
 class Domain(NamedTuple):
@@ -121,9 +118,6 @@ def shrinkage(x: Float[Array, "*shape 3"]) -> Float[Array, "*shape"]:
     norm = numerics.length(x)
     inverse = 1.0 / jnp.where(norm > 1.0, norm, 1.0)
     return (2.0 - inverse) ** (2.0 / 3.0) * inverse ** (4.0 / 3.0)
-
-
-_LAMBDA = -1.5
 
 
 class DistanceWarp(NamedTuple):

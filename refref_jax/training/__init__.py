@@ -1,1 +1,1 @@
-"""Training: one optax step, its loop, and what a run writes."""
+"""Training: configurations, their resolution, the training loop, run folders and evaluation."""

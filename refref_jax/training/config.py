@@ -1,14 +1,14 @@
-"""The configuration of a training run: one small tree of frozen dataclasses.
+"""Configuration of a training run: a small tree of frozen dataclasses.
 
     config = TrainConfig().override(scene="scenes/ball", preset="small", steps=4000)
 
-Every value is reached by the name of its option, which is also the name of its command-line flag.
-`None` leaves a decision to the scene or the preset: `training.resolve` takes it, with a reason, and
-returns the same tree without `None`. That is what a run writes as `config.json`; a file in this
-form, complete or partial, begins a run again. What was asked for is told from what was decided by
-`TrainConfig.chosen`: with another scene, say, decisions are taken again, and wishes stay.
+Every value is accessed by the name of its option. `None` leaves a decision to the scene or the
+preset: `training.resolve` takes it, with a reason, and returns the same tree without `None`. A run
+stores this resolved tree as `config.json`; a file in this form, complete or partial, can start
+another run. `TrainConfig.chosen` distinguishes overrides, which the user set, from decisions: with
+another scene, for example, decisions are taken again, and overrides are kept.
 
-Importing this module imports neither JAX nor the library's numerics.
+This module imports neither JAX nor the library's numerics.
 """
 
 import dataclasses
@@ -35,19 +35,19 @@ from refref_jax.choices import (
 )
 from refref_jax.optics.path_settings import Reentry
 
-# Options that say which objects there are.
+# Options that determine the objects.
 _OBJECTS = ("scene", "reconstruction")
 
-# Of steps, rays and batches, which are counted in 32 bits.
+# Maximum number of steps, rays and batches, which are 32-bit integers.
 _MOST = 2**31 - 1
 
 _FINEST = 2**20
 _SEEDS = 2**32
 
-# Points of the cone patterns, see `sampling.cones`.
+# Numbers of multisamples of the patterns in `sampling.cones`.
 _PATTERNS = (1, 6)
 
-# More entries than a 32-bit hash tells apart serve nothing.
+# A 32-bit hash cannot address more entries.
 _MOST_ENTRIES = 31
 
 
@@ -56,31 +56,31 @@ def _option(default: Any = None, *, name: str = "", after: tuple[str, ...] = ())
 
     Args:
       default: value if none is given; `None` for a decision of the scene or the preset.
-      name: name of the option where it is not that of the field.
+      name: name of the option if it differs from that of the field.
       after: options on which the decision depends. Overriding one of them takes it again, unless
-        the option was asked for.
+        the option itself is an override.
     """
     return dataclasses.field(default=default, metadata={"name": name, "after": after})
 
 
 @dataclasses.dataclass(frozen=True)
 class SceneConfig:
-    """The scene that is trained on.
+    """The training scene.
 
     Attributes:
       path: Scene to train on: a folder, or hf:CONFIG/SCENE of the published data set.
-      rule: What lies outside each mesh: the part around it (nested), always air as in Cycles
-        (facing), or, of meshes that overlap, the one with the highest priority in scene.json.
-      indices: Index of refraction of a material or a mesh, over those of the table and of
-        scene.json.
-      space: Where the background stands: on a cube (bounded), on a sphere (spherical), or
-        infinitely far away (unbounded). By default as scene.json or the scene's name says.
-      radius: Half edge of the background's cube, or radius of its sphere (by default that of
-        scene.json, else 7.3), or radius of an unbounded scene's uncontracted ball, world units.
-      reconstruction: Folder that experiments.reconstruct wrote, whose object takes the place of the
-        scene's meshes.
-      pixels: Pixels that are learned from: all, or only those of the background, at least a margin
-        away from the masks.
+      rule: Medium outside each mesh: that of the part around it (nested), always air as in Cycles
+        (facing), or that of the overlapping mesh with the highest priority in scene.json
+        (priority).
+      indices: Index of refraction of a material or a mesh, instead of that in scene.json or in the
+        table of materials.
+      space: Geometry of the background: a cube (bounded), a sphere (spherical), or infinitely far
+        away (unbounded). By default that of scene.json or the scene's name.
+      radius: Half edge of the background cube, or radius of the background sphere (by default that
+        of scene.json, else 7.3), or radius of an unbounded scene's uncontracted ball, world units.
+      reconstruction: Output folder of experiments.reconstruct, whose object replaces the scene's
+        meshes.
+      pixels: Training pixels: all, or only those of the background, at a margin from the masks.
     """
 
     path: str = _option("", name="scene")
@@ -101,24 +101,25 @@ class SceneConfig:
         for name, index in self.indices:
             if not name or not 0.0 < index < math.inf:
                 raise ValueError(
-                    f"The index of refraction of {name!r} is {index}. Give a name, and a positive "
+                    f"The index of refraction of {name!r} is {index}. Give a name and a positive "
                     "number."
                 )
 
 
 @dataclasses.dataclass(frozen=True)
 class PathsConfig:
-    """The light paths that are followed.
+    """The light paths that are traced.
 
     Attributes:
-      name: Light paths: straight ignores the objects; paper bends up to 10 times and reflects at
-        the first surface, with its ablations without that and without total internal reflection;
-        tree follows every branch that carries light. By default tree if there are meshes, else
-        straight.
-      cut: Smallest throughput worth following, in [0, 1); by default that of the paths.
-      bends: Most refractions and reflections of a path; by default that of the paths.
-      reentry: Whether light that has left the objects may meet them again; by default found from
-        the meshes.
+      name: Light paths: straight ignores the objects; paper has at most 10 bends and a reflection
+        at the first surface; paper_no_reflection and paper_no_tir are its ablations without this
+        reflection and without total internal reflections; tree follows every branch that carries
+        light. By default tree if there are meshes, else straight.
+      cut: Throughput threshold, below which paths are not followed, in [0, 1); by default that of
+        the paths.
+      bends: Maximum number of refractions and reflections of a path; by default that of the paths.
+      reentry: Whether light that has left the objects may meet them again; by default determined
+        from the meshes.
     """
 
     name: Paths | None = _option(name="paths", after=_OBJECTS)
@@ -130,33 +131,34 @@ class PathsConfig:
         """Checks the numbers."""
         if self.cut is not None and not 0.0 <= self.cut < 1.0:
             raise ValueError(
-                f"The cut is a share of a pixel's light, in [0, 1), not {self.cut}. Give 0.02 for "
-                "2 %."
+                f"The throughput threshold cut is {self.cut}, outside [0, 1). Give 0.02 for 2 % of "
+                "a pixel's light."
             )
         if self.bends is not None and self.bends < 0:
-            raise ValueError(f"A path can not have {self.bends} bends. Give 0 or more.")
+            raise ValueError(f"A path cannot have {self.bends} bends. Give 0 or more.")
 
 
 @dataclasses.dataclass(frozen=True)
 class FieldConfig:
-    """The fields, and how they are sampled; what is not given is the preset's.
+    """The fields and their sampling; values that are not given are those of the preset.
 
     Attributes:
-      preset: Size of the model and its training.
-      field: Kind of field: Zip-NeRF's, or without its anti-aliasing Nerfacto's.
-      interior: What is modelled inside the objects: a learned field (the paper), nothing (clear),
-        or interfaces and media that take light (absorbing). By default clear if scene.json says
-        that all is, else absorbing.
+      preset: Size of the model and length of its training.
+      field: Field type: zipnerf, or nerfacto, which has no anti-aliasing.
+      interior: Model of the inside of the objects: a learned field (the paper), empty (clear), or
+        interfaces and media that absorb light (absorbing). By default clear if all objects are
+        clear in scene.json, else absorbing.
       tints: Colours of interfaces and media of an absorbing interior: those of scene.json, or
         learned; by default given if scene.json describes every part.
-      footprint: Footprint of a pixel: widened by arc length (cone), or followed through the bends
-        (differential).
-      samples: Samples along a path in each proposal round, then in the final one, as 32,20.
-      multisamples: Points that stand for a sample's cone, 1 or 6.
-      entries: Most entries of a level of the radiance field's hash grid, as base-2 logarithm.
-      finest: Cells a side of that grid's finest level.
-      precision: Arithmetic of the fields.
-      dilation: Widening of a proposal before it is sampled, as a share of its mean bin width; 0 for
+      footprint: Footprint of a pixel: widened by arc length (cone), or propagated through the bends
+        by ray differentials (differential).
+      samples: Numbers of samples per path of each proposal level, then of the radiance field, such
+        as 32,20.
+      multisamples: Number of multisamples per interval, 1 or 6.
+      entries: Hash map size of the radiance field, base-2 logarithm of the entries of a level.
+      finest: Finest resolution of the radiance field's hash grid, cells per side.
+      precision: Arithmetic precision of the fields.
+      dilation: Dilation of a proposal before it is sampled, as a share of its mean bin width; 0 for
         none.
     """
 
@@ -177,15 +179,15 @@ class FieldConfig:
         if self.samples is not None and not (self.samples and min(self.samples) > 0):
             raise ValueError(
                 f"samples is {','.join(map(str, self.samples))}, not a list of positive numbers. "
-                "Write as in samples=32,20."
+                "Use a list such as samples=32,20."
             )
         if self.multisamples not in (None, *_PATTERNS):
             raise ValueError(
-                f"There is no pattern of multisamples={self.multisamples} points. Give 1 (on the "
-                "centre line) or 6 (Zip-NeRF's hexagon)."
+                f"There is no pattern with multisamples={self.multisamples}. Give 1 (on the centre "
+                "line) or 6 (Zip-NeRF's hexagon)."
             )
         if self.finest is not None and not 1 <= self.finest <= _FINEST:
-            raise ValueError(f"finest is {self.finest}. Give 1 to {_FINEST} cells a side.")
+            raise ValueError(f"finest is {self.finest}. Give 1 to {_FINEST} cells per side.")
         if self.dilation is not None and not 0.0 <= self.dilation < math.inf:
             raise ValueError(f"dilation is {self.dilation}. Give 0 or a positive number.")
         if self.entries is not None and not 1 <= self.entries <= _MOST_ENTRIES:
@@ -202,12 +204,12 @@ class LossConfig:
     Attributes:
       data: Loss on sRGB colours.
       interlevel: Weight of the anti-aliased interlevel loss.
-      blurs: Half-width of its blur for each proposal round, in normalised distance.
+      blurs: Half-width of its blur for each proposal level, in normalised distance.
       distortion: Weight of the distortion loss.
-      hash_decay: Weight of the decay of the hash grids; by default that of the kind of field.
-      dye_decay: Weight of the optical density of learned colours.
-      distortion_over: Samples that the distortion loss draws together: those outside the objects
-        (the paper's correction), or everywhere (Mip-NeRF 360, the paper's ablation).
+      hash_decay: Weight of the decay of the hash grids; by default that of the field type.
+      dye_decay: Weight of the optical density of learned tints and absorption.
+      distortion_over: Samples in the distortion loss: those outside the objects (the paper's
+        correction), or all (everywhere; Mip-NeRF 360, the paper's ablation).
     """
 
     data: DataLoss = _option("mse", name="data_loss")
@@ -230,16 +232,17 @@ class LossConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ScheduleConfig:
-    """How the parameters move, and on how many rays; what is not given is the preset's.
+    """Optimisation schedule; values that are not given are those of the preset.
 
     Attributes:
-      steps: Training steps, after which the learning rate has reached its end.
-      warmup: Steps of linear warm-up; by default the preset's share of the steps.
+      steps: Number of training steps, over which the learning rate decays.
+      warmup: Number of steps of linear warm-up; by default the preset's share of the steps.
       peak: Learning rate after the warm-up.
-      end: Learning rate at the end; the decay between is exponential.
-      anneal: Steps until the proposals are fully trusted; by default the preset's share.
-      batch: Rays a step.
-      pool: Batches whose light paths are traced at once.
+      end: Learning rate at the end, after an exponential decay.
+      anneal: Number of steps over which proposal weights are annealed; by default the preset's
+        share of the steps.
+      batch: Number of rays per step.
+      pool: Number of batches whose light paths are traced at once.
     """
 
     steps: int | None = _option(after=("preset",))
@@ -268,11 +271,11 @@ class ScheduleConfig:
 
 
 class Followers(NamedTuple):
-    """Options that depend on others which change, by name.
+    """Names of options that depend on options that change.
 
     Attributes:
-      decided: those that were decided, which is done again.
-      kept: those that were asked for, and stay.
+      decided: options that were decided, and will be decided again.
+      kept: options that are overrides, and keep their values.
     """
 
     decided: frozenset[str]
@@ -283,9 +286,9 @@ class Option(NamedTuple):
     """One value of the configuration.
 
     Attributes:
-      name: name of the option, and of its flag.
-      section: field of `TrainConfig` that holds it; empty for the seed.
-      field: its field there.
+      name: name of the option.
+      section: field of `TrainConfig` that contains the option; empty for the seed.
+      field: dataclass field of the option in its section.
     """
 
     name: str
@@ -298,14 +301,14 @@ class TrainConfig:
     """A training run.
 
     Attributes:
-      scene: The scene that is trained on.
-      paths: The light paths that are followed.
-      model: The fields, and how they are sampled.
+      scene: The training scene.
+      paths: The light paths that are traced.
+      model: The fields and their sampling.
       losses: The training loss.
-      schedule: How the parameters move, and on how many rays.
+      schedule: Optimisation schedule.
       seed: Seed of the initial parameters, the order of pixels and the sampling.
-      chosen: Names of the options that were asked for, no option itself; see `wishes` for `None`.
-        Configurations that differ in nothing else are equal.
+      chosen: Names of the options that are overrides, not an option itself; see `wishes` for
+        `None`. Configurations that only differ in it are equal.
     """
 
     scene: SceneConfig = SceneConfig()
@@ -322,11 +325,11 @@ class TrainConfig:
             raise ValueError(f"seed is {self.seed}. Give 0 to {_SEEDS - 1}.")
 
     def override(self, **given: Any) -> "TrainConfig":
-        """Returns this configuration with other values, by the names of their options.
+        """Returns this configuration with overrides, by the names of their options.
 
-        Decisions that depended on a value that changes are taken again: with another `paths` the
-        cut is that of those paths, with other `steps` the warm-up is stretched. What was asked for
-        stays, until it is given as `None`.
+        Decisions that depend on a changed value are taken again: another value of `paths` brings
+        its own throughput threshold, another number of `steps` scales the warm-up. Overrides are
+        kept until they are set to `None`.
 
         Args:
           **given: new values.
@@ -342,7 +345,7 @@ class TrainConfig:
         return dataclasses.replace(self.decided(**usual, **given), chosen=chosen)
 
     def decided(self, **values: Any) -> "TrainConfig":
-        """Returns this configuration with values that were decided, not asked for.
+        """Returns this configuration with values that are decisions, not overrides.
 
         Nothing else changes. The arguments and errors are those of `override`.
         """
@@ -354,10 +357,11 @@ class TrainConfig:
         return config
 
     def wishes(self) -> frozenset[str]:
-        """Returns the names of the options that were asked for.
+        """Returns the names of the options that are overrides.
 
-        Where `chosen` does not tell, they are all that are not as usual; but none if the schedule
-        is complete, as in the file of an earlier version's run, where decisions look the same.
+        If `chosen` is `None`, these are all options with values other than the default; but none
+        if the schedule is complete, as in a configuration of an earlier version, which does not
+        distinguish overrides from decisions.
         """
         if self.chosen is not None:
             return frozenset(self.chosen)
@@ -367,7 +371,7 @@ class TrainConfig:
         return frozenset(name for name in _by_name() if self.get(name) != usual.get(name))
 
     def followers(self, **given: Any) -> Followers:
-        """Returns what depends on values that would change; see `override`."""
+        """Returns the options that depend on values that would change; see `override`."""
         changed = {name for name, value in _converted(given).items() if self.get(name) != value}
         wishes = self.wishes()
         after = {o.name: set(o.field.metadata.get("after", ())) - {o.name} for o in options_of()}
@@ -380,7 +384,7 @@ class TrainConfig:
             decided |= reached - wishes
 
     def at(self, scene: str) -> "TrainConfig":
-        """Returns this configuration for the same scene by another path; all decisions stay."""
+        """Returns this configuration with another path of the same scene; decisions are kept."""
         return dataclasses.replace(self, scene=dataclasses.replace(self.scene, path=scene))
 
     def get(self, name: str) -> Any:
@@ -404,10 +408,10 @@ def type_of(option: Option) -> Any:
 
 
 def _converted(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns values as their fields take them: lists become tuples, numbers floats.
+    """Returns values converted to the types of their fields.
 
     Raises:
-      ValueError: if one is of another type, or none of the choices, or there is no such option.
+      ValueError: if a value has another type, is not one of the choices, or has no option.
     """
     options = _by_name()
     if unknown := sorted(set(given) - set(options)):
@@ -424,7 +428,7 @@ def _converted(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Returns a value as JSON has it."""
+    """Returns a value as JSON represents it."""
     if isinstance(value, Mapping):
         return [[name, _plain(each)] for name, each in sorted(value.items())]
     if isinstance(value, list | tuple):
@@ -437,7 +441,7 @@ def _by_name() -> dict[str, Option]:
 
 
 def options_of() -> Iterator[Option]:
-    """Yields all options of a training, in the order of the configuration."""
+    """Yields all options of a training run, in the order of the configuration."""
     for field in dataclasses.fields(TrainConfig):
         if dataclasses.is_dataclass(field.default):
             for leaf in dataclasses.fields(field.default):

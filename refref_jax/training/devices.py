@@ -1,8 +1,8 @@
-"""The devices that train one scene together.
+"""Distributes the training of one scene over several devices and processes.
 
 A *mesh* is a row of devices, of one process or of several. Every device holds all parameters, and
-an equal share of the light paths of every batch; what the paths sum to, and their gradients, are
-summed over the devices. Without a mesh there is one device, and no sum.
+an equal share of the light paths of every batch; the sums over paths, and their gradients, are
+summed over the devices. Without a mesh there is one device, and no such sum.
 """
 
 from typing import Any
@@ -15,20 +15,20 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 AXIS = "devices"
 """Name of the mesh's only axis."""
 
-# Seconds after which a process that does not answer is given up.
+# Timeout for a process that does not answer, seconds.
 _PATIENCE = 100
 
 
 def connect(*, coordinator: str, processes: int, process: int) -> None:
-    """Makes this process one of several that train together; before anything touches a device.
+    """Connects this process to others that train together; must be called before devices are used.
 
     Args:
-      coordinator: where the first process listens, as `host:port`.
-      processes: how many there are.
-      process: number of this one, from 0.
+      coordinator: address at which the first process listens, as `host:port`.
+      processes: number of processes.
+      process: number of this process, from 0.
 
     Raises:
-      ValueError: if they do not find each other.
+      ValueError: if the processes cannot connect.
     """
     try:
         jax.distributed.initialize(
@@ -48,42 +48,42 @@ def connect(*, coordinator: str, processes: int, process: int) -> None:
 
 
 def is_first() -> bool:
-    """Returns whether this is the first process, which alone writes and speaks."""
+    """Returns whether this is the first process, which does all I/O."""
     return jax.process_index() == 0
 
 
 def wait_for_all(what: str) -> None:
-    """Waits until every process has come to this place.
+    """Waits until every process has reached this call.
 
     Args:
-      what: a name for the place.
+      what: name of the barrier.
     """
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices(what)
 
 
 def any_process(flag: bool) -> bool:
-    """Returns whether a flag is set in any process; all of them must ask."""
+    """Returns whether a flag is set in any process; all of them must call this."""
     if jax.process_count() == 1:
         return flag
     return bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))
 
 
 def as_in_the_first(tree: Any) -> Any:
-    """Returns the numbers that the first process has: rounding may differ between machines."""
+    """Returns the values of the first process, because rounding may differ between machines."""
     if jax.process_count() == 1:
         return tree
     return multihost_utils.broadcast_one_to_all(tree)
 
 
 def row(count: int | None) -> Mesh | None:
-    """Returns a mesh of so many devices of every process; `None` for one device altogether.
+    """Returns a mesh of `count` devices of every process; `None` for a single device in total.
 
     Args:
-      count: of each process; all of them if `None`.
+      count: number of devices of each process; all if `None`.
 
     Raises:
-      ValueError: if a process has fewer, or processes have different numbers.
+      ValueError: if a process has fewer, or, without a count, if processes have different numbers.
     """
     by_process = [
         [device for device in jax.devices() if device.process_index == process]
@@ -92,14 +92,14 @@ def row(count: int | None) -> Mesh | None:
     fewest, most = min(map(len, by_process)), max(map(len, by_process))
     if count is None and fewest < most:
         raise ValueError(
-            f"Processes have {fewest} to {most} devices, but share paths evenly. Give a count of "
-            f"devices up to {fewest}."
+            f"Processes have {fewest} to {most} devices, but paths are shared evenly. Give a count "
+            f"up to {fewest}."
         )
     count = most if count is None else count
     if not 1 <= count <= fewest:
         raise ValueError(
             f"There {'is 1 device' if fewest == 1 else f'are {fewest} devices'} of kind "
-            f"{jax.devices()[0].platform}, not {count}. Give 1 to {fewest}, or all."
+            f"{jax.devices()[0].platform}, not {count}. Give 1 to {fewest}, or None for all."
         )
     chosen = [device for each in by_process for device in each[:count]]
     return None if len(chosen) == 1 else Mesh(chosen, (AXIS,))
@@ -110,7 +110,7 @@ def put_everywhere(tree: Any, *, mesh: Mesh | None) -> Any:
 
     Args:
       tree: arrays of the host or of a device; the same in every process.
-      mesh: the devices; if `None`, the arrays are on the usual one.
+      mesh: devices of the mesh; if `None`, the arrays are placed on the default device.
     """
     if mesh is None:
         return jax.device_put(tree)

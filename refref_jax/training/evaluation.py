@@ -1,19 +1,19 @@
-"""Evaluates a model: renders the images of a split, and measures them against the scene's own.
+"""Evaluates a model: renders the images of a split, and compares them with the true images.
 
-`evaluate` does both; `measure` compares one image that was rendered already.
+`evaluate` does both; `measure` compares one image that has been rendered already.
 
-Distances are of three kinds, told apart by name:
+Distances are of three kinds, distinguished by name:
 
 - `distance_*`: the median of the weights of the field, as the paper defines it (section 5).
-- `surface_*`: of the first surface of the meshes that bend light, where the ray through the pixel's
-  centre meets one; elsewhere the median. Clear glass has hardly any density, so the median passes
-  through it, to the wall; a method that is given, or finds, the glass knows better.
-- `substituted_*`: inside the object's mask the true distance itself, elsewhere the median: an error
-  of 0 in the mask, by definition. The first release of the paper's code did so for its two methods
+- `surface_*`: the first surface of the meshes that the ray through the pixel's centre meets, and
+  the median elsewhere. Clear glass has hardly any density, so the median passes through it to the
+  background; a method that knows or reconstructs the glass has a better distance.
+- `substituted_*`: the true distance inside the object's mask, and the median elsewhere; its error
+  in the mask is 0 by definition. The first release of the paper's code did this for its two methods
   that know objects, which explains the oracle's masked DMAE of 0.00 in the paper's table 2, though
-  not R3F's 0.01 to 0.05. Only for comparison with that table.
+  not R3F's 0.01 to 0.05. Only use it for comparison with that table.
 
-Straight light knows of no object: there, all three are the median, as for the paper's baselines.
+For straight rays, which ignore objects, all three are the median, as for the paper's baselines.
 """
 
 import time
@@ -34,14 +34,14 @@ from refref_jax.render.images import CHUNK, Rendering
 from refref_jax.render.model import Model
 
 Measured = dict[str, float | None]
-"""Values by name; `None` where there is nothing to measure, or nothing to measure it with."""
+"""Metrics by name; `None` if a metric is undefined or not available."""
 
-# Sooner compiled as a whole than op by op.
+# Compiled as a whole, which is faster than op by op.
 _lpips = jax.jit(metrics.lpips)
 
 
 class Truth(NamedTuple):
-    """What a split says of its images; masks and distances may be missing."""
+    """True images of a split; masks and distances may be missing."""
 
     frames: scene_folder.Frames
     images: UInt8[np.ndarray, "frames h w 3"]
@@ -50,11 +50,11 @@ class Truth(NamedTuple):
 
 
 class Perceptual(NamedTuple):
-    """What measures as eyes do: not all is always at hand.
+    """Perceptual metrics, which have optional dependencies.
 
     Attributes:
       lpips: weights of `metrics.lpips`, or `None`.
-      flip: `metrics.flip`, or `None` where it is not installed.
+      flip: the function `metrics.flip`, or `None` if it is not installed.
     """
 
     lpips: metrics.LpipsParams | None = None
@@ -65,7 +65,7 @@ _WITHOUT_EYES = Perceptual()
 
 
 class EvaluatedView(NamedTuple):
-    """An image that was rendered and measured, for a caller who wants to save it.
+    """An image that has been rendered and measured, for callers that save it.
 
     Attributes:
       name: stem of the true image's file.
@@ -112,7 +112,7 @@ def evaluate(
 ) -> Evaluation:
     """Renders and measures the images of a split.
 
-    Compiling is not part of the seconds that are measured.
+    The measured seconds do not include compilation.
 
     Args:
       model: trained model, see `refref_jax.render.load_model`.
@@ -171,15 +171,16 @@ def learned_colours(model: Model) -> dict[str, Any] | None:
 
 
 def first_distances(model: Model, views: Cameras, i: int) -> Float[np.ndarray, "h w"] | None:
-    """Returns the distance of the first surface that bends light along the rays of pixel centres.
+    """Returns the distance of the first surface along the rays of pixel centres.
 
     Args:
-      model: the scene.
+      model: model of the scene.
       views: cameras.
       i: index of the camera.
 
     Returns:
-      Distances in world units, `inf` where there is no surface; `None` if light goes straight.
+      Distances in world units, `inf` where there is no surface; `None` for straight
+      rays.
     """
     if model.budget.bends == 0:
         return None
@@ -188,7 +189,7 @@ def first_distances(model: Model, views: Cameras, i: int) -> Float[np.ndarray, "
 
 
 def read_truth(scene: Path, split: str) -> Truth:
-    """Reads all that a split has."""
+    """Reads all images of a split."""
     frames = scene_folder.read_frames(scene, split)
     return Truth(
         frames,
@@ -206,17 +207,17 @@ def measure(
     first: Float[np.ndarray, "h w"] | None,
     perceptual: Perceptual,
 ) -> Measured:
-    """Returns all metrics of one image; `None` for what the scene does not tell.
+    """Returns all metrics of one image; `None` where the scene lacks the true values.
 
-    `lost` is the share of light that found no room.
+    `lost` is the dropped throughput.
 
     Args:
-      seen: the image, as it was rendered.
-      truth: of its split.
-      i: which image of the split.
-      first: distance of the first surface of the meshes that bent the light, `inf` where there is
-        none; `None` if light went straight.
-      perceptual: what is at hand to measure as eyes do.
+      seen: rendered image.
+      truth: true images of the split.
+      i: index of the image in the split.
+      first: distance of the first surface of the meshes, `inf` where there is none; `None` for
+        straight rays.
+      perceptual: perceptual metrics to compute in addition.
     """
     mask = None if truth.masks is None else truth.masks[i]
     target = (truth.images[i] / 255.0).astype(np.float32)
@@ -233,10 +234,10 @@ def measure_colours(
     mask: Bool[np.ndarray, "h w"] | None,
     perceptual: Perceptual,
 ) -> Measured:
-    """Returns what is measured of an image's colours, which are sRGB in `[0, 1]`.
+    """Returns the colour metrics of an image in sRGB, `[0, 1]`.
 
-    PSNR and SSIM in double precision. An empty mask has no masked PSNR, and an image that is too
-    small for a window or a network has no SSIM or LPIPS.
+    PSNR and SSIM are computed in double precision. With an empty mask there is no masked PSNR, and
+    for an image that is smaller than a window or the network, no SSIM or LPIPS.
     """
     shortest = min(target.shape[:2])
     result: Measured = dict.fromkeys(("psnr", "psnr_masked", "ssim", "lpips", "flip"))
@@ -261,13 +262,13 @@ def measure_distances(
     true: Float[np.ndarray, "h w"] | None,
     mask: Bool[np.ndarray, "h w"] | None,
 ) -> Measured:
-    """Returns errors of distances, over all pixels whose distance is known, and in the mask.
+    """Returns errors of distances, over all pixels with a known distance, and over the mask.
 
     Args:
-      name: of their kind, with which all keys begin.
-      seen: the distances; `None` has no error.
-      true: the true ones, `inf` where there is none; `None` if nothing is known.
-      mask: the object's; without one, or over an empty one, nothing is in it.
+      name: kind of distance, the prefix of all keys.
+      seen: rendered distances; `None` if there are none.
+      true: true distances, `inf` where there is none; `None` if unknown.
+      mask: mask of the object; masked errors are `None` without one, or if it is empty.
     """
     keys = {"mae": metrics.mean_absolute_error, "rmse": metrics.root_mean_square_error}
     result: Measured = {f"{name}_{key}{area}": None for key in keys for area in ("", "_masked")}
@@ -286,13 +287,13 @@ def measure_distances(
 
 
 def mean_of(per_image: Sequence[Mapping[str, Any]], measure: str) -> float | None:
-    """Returns the mean of a measure over the images that have it."""
+    """Returns the mean of a metric over the images that have it."""
     values = [image[measure] for image in per_image if image[measure] is not None]
     return float(np.mean(values)) if values else None
 
 
 def _spread(count: int, limit: int | None) -> list[int]:
-    """Returns indices of all images, or of so many of them, evenly spread."""
+    """Returns indices of all images, or of `limit` evenly spaced ones."""
     chosen = np.linspace(0, count - 1, min(limit or count, count)).astype(int)
     return np.unique(chosen).tolist()
 
@@ -303,7 +304,7 @@ def _distances(
     true: Float[np.ndarray, "h w"] | None,
     mask: Bool[np.ndarray, "h w"] | None,
 ) -> dict[str, Float[np.ndarray, "h w"] | None]:
-    """Returns an image's distances of all three kinds; `None` where one can not be known."""
+    """Returns an image's distances of all three kinds; `None` if one is unknown."""
     if first is None:
         return dict.fromkeys(("distance", "surface", "substituted"), median)
     unknown = true is None or mask is None
@@ -315,5 +316,5 @@ def _distances(
 
 
 def _device_of_doubles() -> jax.Device:
-    """Returns the device to measure on; of a TPU, which has no double precision, the CPU."""
+    """Returns the device for metrics: the CPU if the default is a TPU, which has no doubles."""
     return jax.devices("cpu")[0] if jax.default_backend() == "tpu" else jax.devices()[0]

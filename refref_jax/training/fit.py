@@ -1,10 +1,10 @@
-"""Trains a model of a scene, into a folder that can be resumed, evaluated and rendered.
+"""Trains a model of a scene, in a folder from which it can be resumed, evaluated and rendered.
 
     config = TrainConfig().override(scene="experiments/data/cube_smcvx_ball", steps=50)
     model = fit(config, out="runs/fifty")
 
-`fit` is made of three calls for those who need what lies between them: `prepare` resolves a
-configuration, `begin` opens the run's folder, and `train` takes the steps that are missing.
+`fit` consists of three functions that can also be called separately: `prepare` resolves a
+configuration, `begin` creates the run folder, and `train` takes the remaining steps.
 """
 
 import contextlib
@@ -33,22 +33,22 @@ from refref_jax.training.objective import StepReport
 from refref_jax.training.resolve import Resolved, build_scene, read_facts, resolve
 from refref_jax.training.run_folder import Checkpoints
 
-# Steps that the device takes without the host, which sees an interrupt only between them.
+# Number of steps between returns to the host, which only then handles interrupts.
 _MOST_STEPS = 10
 
 Existing = Literal["refuse", "resume"]
 
 Progress = Callable[[int, int, str], None]
-"""Is called with the steps taken, those of the whole run, and a line on the last one."""
+"""Function of the number of steps taken, their total, and a line of text on the last step."""
 
 
 class Periods(NamedTuple):
-    """How often things are done.
+    """Periods of logging and checkpoints.
 
     Attributes:
-      log: steps between two lines of metrics.
-      checkpoint: steps between checkpoints.
-      keep: newest checkpoints to keep.
+      log: number of steps between two lines of metrics.
+      checkpoint: number of steps between checkpoints.
+      keep: number of the newest checkpoints to keep.
     """
 
     log: int = 50
@@ -69,23 +69,23 @@ def fit(
     periods: Periods = USUAL,
     mesh: Mesh | None = None,
 ) -> Model:
-    """Trains a model of a scene, or goes on with a run, and returns it.
+    """Trains a model of a scene, or resumes a run, and returns the model.
 
-    The folder holds the complete configuration (`config.json`), which repeats the run: on a CPU bit
-    for bit.
+    The folder holds the complete configuration (`config.json`), which reproduces the run: on a CPU
+    bit for bit.
 
     Args:
-      config: configuration of the run, with which a resumed run is compared; `None` to resume
-        it as it is.
-      out: folder of the run, which must not hold one yet; a temporary one if `None`.
-      existing: whether a run that is in `out` already is refused, or resumed.
-      progress: is called every `periods.log` steps.
-      report: is given what was decided, and warnings, as lines of text.
-      periods: how often metrics and checkpoints are written.
-      mesh: devices that train together; `None` for one alone.
+      config: configuration of the run, which must agree with that of a resumed run; `None` to
+        resume a run with its own configuration.
+      out: folder of the run, which must not contain a run yet; a temporary one if `None`.
+      existing: `refuse` or `resume` a run that is in `out` already.
+      progress: function called every `periods.log` steps.
+      report: function that receives decisions and warnings, as lines of text.
+      periods: periods of metrics and checkpoints.
+      mesh: devices that train together; `None` for a single device.
 
     Raises:
-      ValueError: if the configuration, the scene or the folder is not what training needs.
+      ValueError: if the configuration, the scene or the folder is not suitable for training.
     """
     with contextlib.ExitStack() as stack:
         if out is None:
@@ -95,7 +95,7 @@ def fit(
         if config is None and not resuming:
             raise ValueError(
                 f"Without a configuration a run is resumed, but {run} holds none, or existing is "
-                "not 'resume'. Give a configuration, or that."
+                "not 'resume'. Give a configuration, or existing='resume' and the folder of a run."
             )
         if not resuming:
             run_folder.check_free(run)
@@ -114,22 +114,22 @@ def prepare(
     parts: Sequence[MeshPart] | None = None,
     report: Callable[[str], None] = print,
 ) -> tuple[Resolved, Scene]:
-    """Reads the scene of a configuration and takes the decisions that are open.
+    """Reads the scene of a configuration and takes all open decisions.
 
     Args:
-      config: the run.
-      parts: objects that take the place of the scene's own meshes.
-      report: is given what the checks of the scene found, as lines of text.
+      config: configuration of the run.
+      parts: objects that replace the scene's own meshes.
+      report: function that receives the results of the checks of the scene, as lines of text.
 
     Raises:
-      ValueError: if there is no such scene, it is broken, or what is asked for can not be had.
+      ValueError: if the scene is missing or broken, or the configuration contradicts it.
     """
     if not config.scene.path:
         raise ValueError("No scene is given. Set scene to a folder, or to hf:CONFIG/SCENE.")
     if config.scene.reconstruction and parts is None:
         raise ValueError(
             f"The object of this configuration was reconstructed ({config.scene.reconstruction}), "
-            "and is not read here. Call prepare with its mesh as parts, then begin and train."
+            "which fit does not read. Call prepare with its mesh as parts, then begin and train."
         )
     config = config.at(str(scene_source.open_scene(config.scene.path).resolve()))
     facts = read_facts(config.scene, parts=parts)
@@ -141,16 +141,16 @@ def prepare(
 
 
 def begin(run: Path, config: TrainConfig, model: SavedModel, scene: Scene) -> None:
-    """Opens a run's folder; of several processes the first does, when all are ready.
+    """Creates a run folder; with several processes, the first one does when all are ready.
 
     Args:
-      run: the folder.
+      run: folder of the run.
       config: complete configuration.
-      model: static half of the model.
-      scene: surfaces and interfaces that bend light.
+      model: static part of the model.
+      scene: surfaces and interfaces of the objects.
 
     Raises:
-      ValueError: if the folder holds a run already.
+      ValueError: if the folder contains a run already.
     """
     devices.wait_for_all("all have planned, and nothing is written yet")
     if devices.is_first():
@@ -170,22 +170,23 @@ def train(
 ) -> bool:
     """Trains the run of a folder from its newest checkpoint, or from the start.
 
-    Of several processes all take the same steps and end together, and the first alone writes.
+    Several processes take the same steps and end together; only the first one writes files.
 
     Args:
-      run: the folder.
-      scene: where its scene is now, if it has moved.
-      progress: is called every `periods.log` steps.
-      report: is given warnings, and how it ended, as lines of text.
-      stop: is asked between steps whether to save a checkpoint and end.
-      periods: how often metrics and checkpoints are written.
-      mesh: the devices that train together; `None` for one alone.
+      run: folder of the run.
+      scene: new path of its scene, if the scene has moved.
+      progress: function called every `periods.log` steps.
+      report: function that receives warnings and the final status, as lines of text.
+      stop: function called between steps; if it returns `True`, a checkpoint is saved and training
+        ends.
+      periods: periods of metrics and checkpoints.
+      mesh: devices that train together; `None` for a single device.
 
     Returns:
-      Whether it has reached its last step.
+      Whether the run has reached its last step.
 
     Raises:
-      KeyboardInterrupt: if it was to stop before it took a step.
+      KeyboardInterrupt: if `stop` returned `True` before the first step.
     """
     config, model = run_folder.read_config(run), checkpoint_io.read_static(run)
     lock = atomic_files.hold(run) if devices.is_first() else contextlib.nullcontext()
@@ -198,15 +199,15 @@ def train(
         setup = loop.set_up(config, model.config, model.budget, geometry, sampler, mesh=mesh)
         if setup.hit_fraction == 0.0 and model.budget.bends > 0:
             report(
-                "warning: no pixel sees the meshes, so no light is bent. Check that their units, "
-                "axes and position are those of the cameras."
+                "warning: no camera ray hits the meshes, so no light is bent. Check that their "
+                "units, axes and position are those of the cameras."
             )
         state = init_state(config.seed, model.config, config.schedule)
         state = devices.put_everywhere(state, mesh=mesh)
         if checkpoints.newest() is not None:
             state = checkpoints.restore(state)
         if devices.any_process(stop()):
-            raise KeyboardInterrupt  # there is nothing to save yet
+            raise KeyboardInterrupt  # there is no new state to save
         step = _take_steps(run, setup, state, checkpoints, periods, progress, stop)
     if step < config.schedule.steps:
         report(f"Stopped at step {step}.")
@@ -214,7 +215,7 @@ def train(
 
 
 def _sampler(config: TrainConfig, scene: Path) -> PixelSampler:
-    """Reads the pixels that a run learns from."""
+    """Reads the training pixels of a run."""
     frames = scene_folder.read_frames(scene, "train")
     kept = None
     if config.scene.pixels == "background":
@@ -232,7 +233,7 @@ def _take_steps(
     progress: Progress,
     stop: Callable[[], bool],
 ) -> int:
-    """Takes the steps that are missing, and returns the number of the last."""
+    """Takes the remaining steps, and returns the number of the last."""
     total, step = setup.config.schedule.steps, int(state.step)
     writes = devices.is_first()
     earlier = run_folder.rewind_metrics(run, step) if writes else 0.0
@@ -269,13 +270,13 @@ def _line(step: int, measured: StepReport, rate: float, seconds: float) -> dict[
     if not math.isfinite(measured.loss):
         raise ValueError(
             f"The loss is {measured.loss} at step {step}. Evaluate the last checkpoint, which is "
-            "finite, or train again with another seed into another folder; and please report the "
+            "finite, or train again with another seed in another folder; and please report the "
             "scene."
         )
     values = {name: float(value) for name, value in measured._asdict().items()}
     line = {"step": step, **values, "rays_per_second": rate, "seconds": seconds}
-    # A CPU keeps no such record.
+    # CPUs do not report memory.
     if (memory := jax.local_devices()[0].memory_stats()) is not None:
         line["peak_device_bytes"] = memory["peak_bytes_in_use"]
-    # The PSNR of a batch that is met exactly is infinite.
+    # The PSNR of a batch without error is infinite.
     return configuration.string_safe(line)

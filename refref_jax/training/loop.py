@@ -1,12 +1,8 @@
-"""The training loop: state, compiled steps, and pre-traced batches.
+"""Training loop: the state of a run, pre-traced batches of light paths, and compiled steps.
 
-What changes while a model is trained.
-
-One training step, and the tracing of the light paths that many steps use.
-
-This is one of the modules that call `jax.jit`.
-
-The loop over training steps: draws pixels, traces them in pools, and steps.
+The light paths of many batches are traced at once, as a *pool*, and then used by consecutive steps.
+If all batches of an epoch fit in memory, they are only traced once. This is one of the modules that
+call `jax.jit`.
 """
 
 import functools
@@ -38,15 +34,24 @@ _SECOND_MOMENT_DECAY = 0.99
 
 _EPSILON = 1e-15
 
+# Slope of Schlick's bias function for the annealing of proposal weights (Mip-NeRF 360).
+_ANNEAL_SLOPE = 10.0
+
+# Number of pixels from which the capacity for the paths of a batch is estimated.
+_SURVEY = 1 << 14
+
+# Maximum memory for the light paths of all pixels.
+_MOST_BYTES = 1 << 29
+
 
 class TrainState(NamedTuple):
     """State of a run.
 
     Attributes:
-      step: steps taken. With the seed it fixes which pixels and which noise come next, so it is
-        also the position in the data.
-      params: the model's parameters.
-      optimizer: optax's state.
+      step: number of steps taken. With the seed, it determines the pixels and the noise of the
+        next step, so it is also the position in the data.
+      params: parameters of the model.
+      optimizer: state of optax.
     """
 
     step: Int[Array, ""]
@@ -55,13 +60,13 @@ class TrainState(NamedTuple):
 
 
 def init_state(seed: int, model: ModelConfig, schedule: ScheduleConfig) -> TrainState:
-    """Returns the state of a run that has not begun."""
+    """Returns the initial state of a run."""
     params = init_params(jax.random.key(seed), model)
     return TrainState(jnp.zeros((), jnp.int32), params, optimizer(schedule).init(params))
 
 
 def optimizer(schedule: ScheduleConfig) -> optax.GradientTransformation:
-    """Returns Adam under the schedule's learning rate."""
+    """Returns Adam with the schedule's learning rate."""
     return optax.adam(learning_rate(schedule), b2=_SECOND_MOMENT_DECAY, eps=_EPSILON)
 
 
@@ -80,17 +85,13 @@ def learning_rate(schedule: ScheduleConfig) -> optax.Schedule:
     )
 
 
-# Slope of Schlick's bias function, by which trust in the proposals grows (Mip-NeRF 360).
-_ANNEAL_SLOPE = 10.0
-
-
 class Pool(NamedTuple):
-    """The light paths and true colours of many batches, and of some steps which they see.
+    """Pre-traced light paths and true colours of many batches, and the batch of each step.
 
     Attributes:
-      traced: paths, stacked by batch.
-      rgb: 8-bit sRGB.
-      order: the batch of each step.
+      traced: light paths, stacked by batch.
+      rgb: true colours, 8-bit sRGB.
+      order: index of the batch of each step.
     """
 
     traced: Traced
@@ -98,7 +99,7 @@ class Pool(NamedTuple):
     order: Int[Array, " steps"]
 
 
-# How a pool lies on a mesh: of every batch each device has a share of the paths, and all colours.
+# Sharding of a pool: every device has a share of the paths of every batch, and all colours.
 _SHARED = Pool(
     traced=Traced(paths=PartitionSpec(None, AXIS), lost=PartitionSpec()),
     rgb=PartitionSpec(),
@@ -118,8 +119,8 @@ def trace_pool(
 ) -> Traced:
     """Traces the rays `[batches, rays]` of many batches; see `path_tracing.trace_batches`.
 
-    The devices of a mesh trace whole batches each, and are left with a share of every batch's
-    paths; a list is filled up with empty slots where it can not be shared evenly.
+    Each device of a mesh traces whole batches; afterwards it holds a share of the paths of every
+    batch. Lists that cannot be shared evenly are padded with empty slots.
     """
     trace = functools.partial(
         path_tracing.trace_batches, budget=budget, capacity=capacity, detail=detail
@@ -139,7 +140,7 @@ def trace_pool(
 
 @functools.partial(jax.jit, static_argnames="budget")
 def survey_paths(geometry: Scene, rays: Rays, *, budget: Budget) -> Survey:
-    """Measures how many paths the rays `[rays]` of a scene have; see `path_tracing.survey`."""
+    """Returns statistics of the paths of the rays `[rays]`; see `path_tracing.survey`."""
     return path_tracing.survey(geometry, rays, budget=budget)
 
 
@@ -154,20 +155,20 @@ def train_steps(
     model: ModelConfig,
     mesh: Mesh | None = None,
 ) -> tuple[TrainState, StepReport]:
-    """Takes consecutive steps of a pool, without a word to the host in between.
+    """Takes consecutive steps of a pool, without returning to the host in between.
 
     Args:
-      state: consumed: its buffers are reused for the result.
+      state: state before the first step, which is donated: its buffers are reused.
       pool: light paths and colours.
-      first: place of the first step in the pool's order.
-      last: place after that of the last step; any number of steps is one compiled program.
-      config: the run.
-      model: the model.
-      mesh: the devices among which the pool's paths are shared out, by `trace_pool`. Results
-        depend on them by rounding alone.
+      first: index of the first step in the pool's order.
+      last: index after the last step; all numbers of steps share one compiled program.
+      config: configuration of the run.
+      model: configuration of the model.
+      mesh: devices that share the pool's paths, as in `trace_pool`. Results only depend on them by
+        rounding.
 
     Returns:
-      The state after the last step, and what that step measured.
+      The state after the last step, and the report of that step.
     """
     take = functools.partial(_take_steps, config=config, model=model)
     if mesh is not None:
@@ -209,7 +210,7 @@ def _step(
     model: ModelConfig,
     axis: str | None,
 ) -> tuple[TrainState, StepReport]:
-    """Takes one step, with the paths that this device has of the batch."""
+    """Takes one step, with this device's paths of the batch."""
     batch = pool.order[place]
     traced, rgb = jax.tree.map(lambda x: x[batch], (pool.traced, pool.rgb))
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
@@ -227,7 +228,7 @@ def _step(
         report = objective.measure(params, totals, target, traced.lost, config.losses)
         return report.loss, report
 
-    # In two halves, between which devices tell each other what their paths sum to.
+    # In two halves, between which the sums over paths are summed over devices.
     totals, pull_back = jax.vjp(look, state.params)
     slopes = jax.grad(judge, argnums=(0, 1), has_aux=True)
     (by_params, by_totals), report = slopes(state.params, _sum_devices(totals, axis))
@@ -239,7 +240,7 @@ def _step(
 
 
 def _slots(paths: int, axis: str | None) -> Int[Array, " paths"]:
-    """Returns the places that this device's paths have in the batch's list."""
+    """Returns the indices of this device's paths in the list of the batch."""
     slots = jnp.arange(paths, dtype=jnp.int32)
     return slots if axis is None else slots + paths * jax.lax.axis_index(axis)
 
@@ -254,26 +255,19 @@ def _anneal(step: Int[Array, ""], steps: int) -> Float[Array, ""]:
     return _ANNEAL_SLOPE * progress / ((_ANNEAL_SLOPE - 1.0) * progress + 1.0)
 
 
-# Pixels by which the room for a batch's paths is measured.
-_SURVEY = 1 << 14
-
-# Memory for the light paths of all pixels.
-_MOST_BYTES = 1 << 29
-
-
 class Setup(NamedTuple):
-    """Everything about a run that does not change.
+    """The constant part of a run.
 
     Attributes:
-      config: the run.
-      model: the model.
-      budget: which light is followed.
-      geometry: what bends it.
-      sampler: where the pixels come from.
-      capacity: room for the paths of a batch.
-      hit_fraction: share of the pixels that see an object, 0 if no light is bent.
-      epoch: all batches, traced once and for all; `None` if they are traced as they come.
-      mesh: the devices that train together; `None` for one alone.
+      config: configuration of the run.
+      model: configuration of the model.
+      budget: path settings.
+      geometry: scene through which paths are traced.
+      sampler: sampler of the training pixels.
+      capacity: capacity for the paths of a batch.
+      hit_fraction: share of the pixels whose rays hit an object, 0 if no light is bent.
+      epoch: all batches, if they are only traced once; `None` if they are traced pool by pool.
+      mesh: devices that train together; `None` for a single device.
     """
 
     config: TrainConfig
@@ -296,10 +290,10 @@ def set_up(
     *,
     mesh: Mesh | None = None,
 ) -> Setup:
-    """Moves the geometry to the devices, and measures how many paths it makes of a ray.
+    """Moves the scene to the devices, and estimates the number of paths per ray.
 
-    Light paths of all pixels are kept if the run sees them more than once and they take at most
-    half a gibibyte; while they are joined, three times that is in use.
+    The light paths of all pixels are kept if the run uses them more than once and they take at most
+    half a gibibyte; while they are concatenated, three times that is in use.
     """
     geometry = jax.tree.map(jnp.asarray, geometry)
     found = survey_paths(geometry, sampler.survey(_SURVEY).rays, budget=budget)
@@ -316,20 +310,20 @@ def set_up(
 def run_steps(
     setup: Setup, state: TrainState, until: int, *, every: Sequence[int] = (1,)
 ) -> Iterator[tuple[TrainState, StepReport]]:
-    """Takes all steps up to `until`; yields the state and the report every so many of them.
+    """Takes all steps up to `until`, and yields the state and the report at regular steps.
 
-    A state is consumed by the steps that follow it: copy what is to be kept. Starting from a
-    restored state continues exactly where its run would have gone on.
+    A yielded state is donated to the following steps: copy it to keep it. A run that starts from a
+    restored state continues exactly like the uninterrupted run.
 
-    The light paths of the next pool are asked for before the steps of this one are, so that they
-    can be traced meanwhile; there are never more than two pools.
+    The light paths of the next pool are dispatched before the steps of the current pool, so that
+    they can be traced at the same time; there are at most two pools.
 
     Args:
-      setup: the run.
-      state: where to begin; on all of the run's devices, if there are several.
+      setup: constant part of the run.
+      state: initial state, on all devices of the run if there are several.
       until: number of the last step.
-      every: the state is seen at the multiples of each of these numbers, at the end of every pool,
-        and at the end; in between the device takes steps without a word to the host.
+      every: periods; the state is yielded at the multiples of each of these numbers, at the end of
+        every pool, and at the end. In between, the device takes steps without the host.
     """
     config = setup.config
     step = int(state.step)
@@ -346,7 +340,7 @@ def run_steps(
 
 
 def _pools(setup: Setup, step: int, until: int) -> Iterator[tuple[int, Pool]]:
-    """Yields the pools of some steps with the number of steps before each, one traced ahead."""
+    """Yields the pools of steps, with the number of steps before each; one is traced ahead."""
     size = setup.config.schedule.pool
     firsts = range(step - step % size, until, size)
     ahead = (_pool(setup, first) for first in firsts)
@@ -358,7 +352,7 @@ def _pools(setup: Setup, step: int, until: int) -> Iterator[tuple[int, Pool]]:
 
 
 def _pool(setup: Setup, first: int) -> Pool:
-    """Returns the pool of the steps that follow the first so many."""
+    """Returns the pool of the steps after the first `first` ones."""
     numbers = setup.sampler.numbers(first, setup.config.schedule.pool)
     if setup.epoch is not None:
         return setup.epoch._replace(order=devices.put_everywhere(numbers, mesh=setup.mesh))
@@ -366,7 +360,7 @@ def _pool(setup: Setup, first: int) -> Pool:
 
 
 def trace_batches(setup: Setup, numbers: Sequence[int]) -> Pool:
-    """Traces some batches of a run, to be seen in their order."""
+    """Traces batches of a run, for steps in the order of `numbers`."""
     drawn = setup.sampler.draw(np.asarray(numbers))
     traced = trace_pool(
         setup.geometry,
@@ -381,10 +375,10 @@ def trace_batches(setup: Setup, numbers: Sequence[int]) -> Pool:
 
 
 def _trace_epoch(setup: Setup) -> Pool | None:
-    """Traces all batches once and for all, if their paths are worth keeping and fit in memory.
+    """Traces all batches in advance, if the run uses them more than once and they fit in memory.
 
-    They are traced pool by pool, with a pool's room for paths. Training is the same whether they
-    are kept or not as long as a pool has that room: when not kept, its batches are others.
+    They are traced pool by pool, with the capacity of a pool. Training is the same with and without
+    them, unless paths are dropped because a pool is full: otherwise its batches are different ones.
     """
     config, batches = setup.config, setup.sampler.batches
     pools = range(0, batches, config.schedule.pool)

@@ -1,6 +1,8 @@
 """Losses, and the training objective that sums them.
 
-Training losses. Each takes one path or one batch of colours and returns a scalar.
+Each loss takes one path or one batch of colours and returns a scalar. The objective is computed in
+two halves: `total` sums over paths, of which a device may hold a part, and `measure` combines the
+sums over all of them.
 
 Rendered colours are compared without clipping: colours below black or above white have gradients
 that move them back, and black pixels have the slope 12.92 of the transfer function (see
@@ -8,11 +10,6 @@ that move them back, and black pixels have the slope 12.92 of the transfer funct
 slope at black and white.
 
 Letters: `s` is the normalised distance along a path, `w` its weights (see `sampling.stepfun`).
-
-What training minimises: the losses of a batch, from what its light paths sum to.
-
-In two halves: `total` sums over paths, of which a device may have a part, and `measure` takes the
-sums over all of them.
 """
 
 import functools
@@ -97,15 +94,15 @@ def hash_decay(tables: Sequence[Float[Array, "_ _"]]) -> Float[Array, ""]:
 
 
 class StepReport(NamedTuple):
-    """What a step measured before it moved the parameters.
+    """Losses and metrics of a step, before its update of the parameters.
 
     Attributes:
-      loss: what is minimised.
-      psnr: of the batch's sRGB colours, in dB.
+      loss: training objective.
+      psnr: PSNR of the batch's sRGB colours, in dB.
       interlevel: unweighted interlevel loss.
       distortion: unweighted distortion loss.
       hash_decay: unweighted hash decay.
-      lost: mean share of a ray's light that found no room among the batch's paths.
+      lost: mean dropped throughput of the batch's rays.
     """
 
     loss: Float[Array, ""]
@@ -117,12 +114,12 @@ class StepReport(NamedTuple):
 
 
 class Totals(NamedTuple):
-    """What light paths sum to: the sums of parts of a batch's paths add up to the batch's.
+    """Sums over light paths; those of disjoint parts of a batch add up to those of the batch.
 
     Attributes:
-      linear: the rays' linear RGB.
-      interlevel: interlevel losses.
-      distortion: distortion losses.
+      linear: linear RGB of the rays.
+      interlevel: sum of interlevel losses.
+      distortion: sum of distortion losses.
       paths: number of paths that exist.
     """
 
@@ -133,7 +130,7 @@ class Totals(NamedTuple):
 
 
 def total(light: pixels.Light, paths: LightPaths, config: LossConfig) -> Totals:
-    """Sums what some paths of a batch are to the loss."""
+    """Sums the contributions of paths of a batch to the losses."""
     *proposals, final = light.paths.histograms
     exists = light_paths.exists(paths)
     missed = jnp.zeros(())
@@ -155,11 +152,11 @@ def measure(
     lost: Float[Array, "rays 3"],
     config: LossConfig,
 ) -> StepReport:
-    """Returns the losses of a batch; those of paths are means over the paths that exist."""
+    """Returns the losses of a batch; losses of paths are averaged over the paths that exist."""
     rgb = colour.linear_to_srgb(totals.linear)
     mse = mean_squared_error(rgb, target)
     data = mse if config.data == "mse" else charbonnier(rgb, target)
-    # Without any path both are 0, with gradient 0.
+    # Without paths, both are 0 with gradient 0.
     interlevel = numerics.safe_divide(totals.interlevel, totals.paths)
     distortion = numerics.safe_divide(totals.distortion, totals.paths)
     decay = hash_decay(hash_grid.tables(params))
@@ -175,5 +172,5 @@ def measure(
 
 
 def _sum_where(mask: Bool[Array, " n"], values: Float[Array, " n"]) -> Float[Array, ""]:
-    """Returns the sum of the values that count."""
+    """Returns the sum of the values where the mask is true."""
     return jnp.sum(jnp.where(mask, values, 0.0))

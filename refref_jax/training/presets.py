@@ -1,34 +1,36 @@
-"""Presets: how large a model is and how long it is trained.
+"""Presets: the size of a model and the length of its training.
 
-| preset  | for                    | samples      | points | hash levels x features, finest, size |
-|---------|------------------------|--------------|--------|--------------------------------------|
-| `tiny`  | two CPU cores, minutes | 32 + 20      | 1      | 6 x 4, 512, 2^17                     |
-| `small` | a laptop, a small GPU  | 48 + 32      | 1      | 8 x 4, 2048, 2^19                    |
-| `paper` | a GPU, as published    | 64 + 64 + 32 | 6      | 10 x 4, 8192, 2^21                   |
-| `best`  | a large GPU            | 64 + 64 + 32 | 6      | 10 x 4, 8192, 2^21                   |
+| preset  | for                    | samples      | multi | hash levels x features, max res, size |
+|---------|------------------------|--------------|-------|---------------------------------------|
+| `tiny`  | two CPU cores, minutes | 32 + 20      | 1     | 6 x 4, 512, 2^17                      |
+| `small` | a laptop, a small GPU  | 48 + 32      | 1     | 8 x 4, 2048, 2^19                     |
+| `paper` | a GPU, as published    | 64 + 64 + 32 | 6     | 10 x 4, 8192, 2^21                    |
+| `best`  | a large GPU            | 64 + 64 + 32 | 6     | 10 x 4, 8192, 2^21                    |
 
-| preset  | network of colour | rays a step | steps  | footprint    |
-|---------|-------------------|-------------|--------|--------------|
-| `tiny`  | 1 x 32            | 1,024       | 2,500  | differential |
-| `small` | 1 x 64            | 2,048       | 8,000  | differential |
-| `paper` | 2 x 256           | 4,096       | 25,000 | cone         |
-| `best`  | 2 x 256           | 16,384      | 25,000 | differential |
+| preset  | colour network | rays per step | steps  | footprint    |
+|---------|----------------|---------------|--------|--------------|
+| `tiny`  | 1 x 32         | 1,024         | 2,500  | differential |
+| `small` | 1 x 64         | 2,048         | 8,000  | differential |
+| `paper` | 2 x 256        | 4,096         | 25,000 | cone         |
+| `best`  | 2 x 256        | 16,384        | 25,000 | differential |
 
-These are sizes of Zip-NeRF's fields (`fields/zipnerf.py`). Those of another kind, by `field`, are
-in its own module; `paper` are the published ones.
+These are the sizes of Zip-NeRF's fields (`fields/zipnerf.py`). The sizes of another field type are
+in its own module; those of `paper` are the published ones.
 
-Points are those that stand for an interval's cone, `multisamples`; the size is the entries of a
-level. What depends on the scene is no preset's: give `paper` the budget `paper` and the
-interior `field` to have the published set-up in full, and leave both out for the others.
+Samples are per path, for each proposal level and the radiance field; `multi` is the number of
+multisamples per interval; the hash map size is the number of entries of a level. Values that depend
+on the scene are not part of a preset: for the complete published set-up, use `paper` with the path
+settings `paper` and the interior `field`; leave both out for the other presets.
 
-On the bundled ball 1250 steps of 1024 rays give `tiny` 36.6 dB in the mask and `small` 37.9, at 3.1
-times the time of a step. `paper` and `best` take a GPU: a CPU's core needs 0.8 s for 256 of their
-rays, 10 times as long as `tiny` (`benchmarks/results/presets_few_rays.csv`).
+On the bundled ball, 1250 steps of 1024 rays reach a masked PSNR of 36.6 dB with `tiny` and 37.9 dB
+with `small`, whose steps take 3.1 times as long. `paper` and `best` require a GPU: a CPU core needs
+0.8 s for 256 of their rays, 10 times as long as `tiny`
+(`benchmarks/results/presets_few_rays.csv`).
 
-`small` lies between its neighbours in every number. `best` samples as the paper does and differs in
-what a pixel sees and how often: footprints follow the bends, and a step has four times the rays, at
-the learning rate at which Zip-NeRF takes 65,536. It traces fewer batches at once, so that a pool is
-of as many rays, and takes as much memory, as one of `paper`.
+`small` is between its neighbours in every number. `best` has the samples of the paper, but ray
+differentials, so that footprints follow the bends, and four times as many rays per step, at the
+learning rate that Zip-NeRF uses for 65,536. It traces fewer batches at once, so that pre-traced
+batches have as many rays, and take as much memory, as those of `paper`.
 """
 
 import dataclasses
@@ -43,22 +45,22 @@ from refref_jax.render.model import ModelConfig, ProposalConfig
 from refref_jax.training.config import LossConfig, ScheduleConfig
 
 _WALLS = 7.3
-"""Half edge of a bounded scene's cube, or radius of a sphere, if nothing tells: the data set's.
+"""Default half edge of the background cube, or radius of the background sphere: the data set's.
 
-Paths end there, on an opaque background. Of all the ways to choose an end this one alone knows
-where the background is: a cube 3 % too large costs 2.7 dB, since its faces are taken for walls.
+Paths end there, on an opaque background, so the value must be exact: a cube that is 3 % too large
+costs 2.7 dB.
 """
 
 _NEAR = 0.05
 _FAR_UNBOUNDED = 1000.0
 
-# Blur of the interlevel loss in each proposal round (Zip-NeRF, supplement).
+# Blur of the interlevel loss for each proposal level (Zip-NeRF, supplement).
 _BLURS = (0.03, 0.003)
 
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """The space that a scene takes up; see `ModelConfig`."""
+    """Bounds of a scene; see `ModelConfig`."""
 
     near: float
     far: float
@@ -68,11 +70,11 @@ class Bounds:
 
 @dataclasses.dataclass(frozen=True)
 class Preset:
-    """One point of the trade between speed and accuracy.
+    """One trade-off between speed and accuracy.
 
     Attributes:
-      size: of the fields, by its name in `fields.registry`.
-      schedule: how parameters move, and on how many rays.
+      size: size of the fields, by its name in `fields.registry`.
+      schedule: optimisation schedule.
     """
 
     size: str
@@ -81,15 +83,15 @@ class Preset:
     def model(
         self, bounds_: Bounds, interior: Interior, *, field: str = registry.USUAL
     ) -> ModelConfig:
-        """Returns a model of a scene, with fields of some kind.
+        """Returns the configuration of a model of a scene, with fields of a given type.
 
         Raises:
-          ValueError: if that kind has no such size.
+          ValueError: if that field type does not have this size.
         """
         sizes = registry.KINDS[field].sizes
         if self.size not in sizes:
             raise ValueError(
-                f"Fields of kind {field} have no size {self.size}. Use a preset of "
+                f"Field type {field} has no size {self.size}. Use one of the presets "
                 f"{', '.join(sizes)}."
             )
         size = sizes[self.size]
@@ -110,14 +112,14 @@ class Preset:
 def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
     """Returns the bounds of a scene.
 
-    A bounded scene reaches from any camera to the farthest corner of its cube, a spherical one to
-    the far side of its sphere. An unbounded one keeps the cameras, and all between them,
-    uncontracted.
+    A bounded scene extends from any camera to the farthest corner of its cube, a spherical scene to
+    the far side of its sphere. In an unbounded scene, the cameras and the space between them are
+    not contracted.
 
     Args:
-      cameras: of the training images.
-      space: `unbounded` if the background is infinitely far, `spherical` if it is a sphere.
-      radius: overrides the default of `ModelConfig.radius`.
+      cameras: cameras of the training images.
+      space: geometry of the background: `bounded`, `spherical` or `unbounded`.
+      radius: radius instead of the default of `ModelConfig.radius`.
 
     Raises:
       ValueError: if the radius is not positive and finite.
@@ -135,9 +137,9 @@ def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
 
 
 def loss(model: ModelConfig) -> LossConfig:
-    """Returns what is minimised when a model is trained, the same for all presets.
+    """Returns the training loss of a model, which is the same for all presets.
 
-    The interlevel loss and its blurs are Zip-NeRF's for every kind of field.
+    The interlevel loss and its blurs are those of Zip-NeRF for every field type.
     """
     finest = len(_BLURS) - 1
     return LossConfig(

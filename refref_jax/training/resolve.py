@@ -1,11 +1,15 @@
-"""Decides what a training models of its scene: only what the scene requires, unless told otherwise.
+"""Resolves a configuration: takes all open decisions of a training run.
 
     facts = read_facts(config.scene)      # reads and checks the scene (NumPy)
     resolved = resolve(config, facts)     # takes every open decision, with a reason for each
     print(resolved.describe())
 
-This is the one place where decisions are taken. The resolved configuration is complete, and
-resolving it again gives the same.
+A run models only the features that its scene requires, unless the user overrides a decision:
+objects that are known to be clear need no absorption, a single convex object needs no re-entry, and
+a scene without meshes needs no tracer. This saves computation.
+
+All decisions are taken in this module. The resolved configuration is complete, and resolving it
+again changes nothing.
 """
 
 import dataclasses
@@ -42,25 +46,26 @@ from refref_jax.render.model import ModelConfig
 from refref_jax.training import presets
 from refref_jax.training.config import FieldConfig, SceneConfig, TrainConfig, options_of
 
-# Of what is printed.
+# Width of printed lines.
 _COLUMNS = 100
 
-# Why options have their values.
+# Reasons for the values of options.
 _GIVEN = "given"
 _USUAL = "by default"
 _KEPT = "as the configuration has it"
 
 
 class SceneFacts(NamedTuple):
-    """What a scene says of itself.
+    """Properties of a scene that decisions depend on.
 
     Attributes:
-      needs: what it requires, with the space of `SceneConfig` if that is given.
-      cameras: of the training images.
-      parts: the meshes.
-      tree: how they lie in one another.
-      half_extent: of the background's cube, or radius of its sphere, if scene.json tells it.
-      notes: what the checks of the meshes found.
+      needs: required features, with the space of `SceneConfig` if that is given.
+      cameras: cameras of the training images.
+      parts: meshes of the scene.
+      tree: containment of the meshes.
+      half_extent: half edge of the background cube, or radius of the background sphere, if it is in
+        scene.json.
+      notes: results of the checks of the meshes.
     """
 
     needs: Needs
@@ -71,7 +76,7 @@ class SceneFacts(NamedTuple):
     notes: tuple[str, ...]
 
     def describe(self) -> str:
-        """Returns what the scene requires, in one line."""
+        """Returns the required features in one line of text."""
         return scene_analysis.describe(self.needs)
 
 
@@ -79,10 +84,10 @@ class Resolved(NamedTuple):
     """A training run with every decision taken.
 
     Attributes:
-      config: the configuration, complete.
-      model: what is compiled of it: fields, sampling, and which light is followed.
-      reasons: why each option has its value, by its name.
-      warnings: what is doubtful about what was asked for.
+      config: complete configuration.
+      model: static part of the model: fields, sampling and path settings.
+      reasons: reason for the value of each option, by its name.
+      warnings: warnings about doubtful overrides.
     """
 
     config: TrainConfig
@@ -91,7 +96,7 @@ class Resolved(NamedTuple):
     warnings: tuple[str, ...]
 
     def describe(self) -> str:
-        """Returns the options by the reason for their values, a line for each reason."""
+        """Returns the options as text, grouped by the reason for their values."""
         by_reason: dict[str, list[str]] = {}
         for option in options_of():
             value = self.config.get(option.name)
@@ -107,11 +112,11 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
     """Reads and checks a scene (a folder).
 
     Args:
-      scene: the scene; its path is that of a folder.
-      parts: objects that take the place of the scene's own meshes.
+      scene: configuration of the scene, with the path of a folder.
+      parts: objects that replace the scene's own meshes.
 
     Raises:
-      ValueError: if the scene is broken, or a camera stands where it can not be followed.
+      ValueError: if the scene is broken, or a camera is inside a mesh under the rule `priority`.
     """
     folder = Path(scene.path)
     scene_folder.check_scene(folder)
@@ -132,7 +137,7 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
     """Takes every decision that a configuration leaves open.
 
     Raises:
-      ValueError: if what is asked for contradicts itself, or is not known of the scene.
+      ValueError: if overrides contradict each other or the scene.
     """
     asked, found = config, facts.needs
     reasons = _first_reasons(config)
@@ -147,10 +152,10 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
 
 
 def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
-    """Returns a configuration with what a saved model tells of its decisions.
+    """Returns a configuration with the decisions that follow from a saved model.
 
-    For runs of earlier versions, whose configuration did not hold them. Which preset they began
-    with is not known, and all that follows from it is told by the model.
+    This is for runs of earlier versions, whose configurations lack these decisions. The preset of
+    such a run is unknown, but the model determines all values that follow from it.
     """
     model, budget = saved.config, saved.budget
     reasons: dict[str, str] = {}
@@ -172,24 +177,24 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
 
 
 def build_scene(resolved: Resolved, facts: SceneFacts) -> Scene:
-    """Returns what bends light; its parts have colours only where these are given."""
+    """Builds the scene for tracing; its parts only have colours if `tints` is `given`."""
     given = resolved.config.model.tints == "given"
     parts = facts.parts if given else meshes.without_colour(facts.parts)
     return build_geometry(parts, facts.tree.parents, rule=resolved.config.scene.rule)
 
 
 def samples_of(model: ModelConfig) -> tuple[int, ...]:
-    """Returns the samples of every proposal round, the final round's last."""
+    """Returns the number of samples of each proposal level, then of the radiance field."""
     return (*(proposal.samples for proposal in model.proposals), model.samples)
 
 
 def grid_of(model: ModelConfig) -> HashGridConfig | None:
-    """Returns the hash grid of a model's radiance field, if fields of its kind have one."""
+    """Returns the hash grid of a model's radiance field, if its field type has one."""
     return model.field.grid if isinstance(model.field, mlps.GridRadianceConfig) else None
 
 
 def _sampling_of(model: ModelConfig) -> dict[str, Any]:
-    """Returns the options that a model was made with, by name: its samples, grid and precision."""
+    """Returns the options of a model's samples, grid and precision, by name."""
     grid = grid_of(model)
     return {
         "footprint": model.footprint,
@@ -216,7 +221,7 @@ def _first_reasons(config: TrainConfig) -> dict[str, str]:
 def _decide(
     config: TrainConfig, reasons: dict[str, str], why: str, /, **values: Any
 ) -> TrainConfig:
-    """Fills in options that are open, and notes why."""
+    """Sets options that are open, and records the reason."""
     for name, value in values.items():
         if config.get(name) is None and value is not None:
             config = config.decided(**{name: value})
@@ -229,7 +234,7 @@ def _resolve_paths(
 ) -> tuple[Budget, TrainConfig]:
     if found.parts == 0 and config.paths.name not in (None, "straight"):
         raise ValueError(
-            f"There are no meshes, so there is nothing to bend light for paths={config.paths.name}."
+            f"There are no meshes that could bend light for paths={config.paths.name}."
             " Add .ply files of the objects to the scene's folder meshes, or use paths=straight."
         )
     name, why = ("tree", "there are meshes") if found.parts else ("straight", "there are no meshes")
@@ -248,31 +253,30 @@ def _resolve_paths(
 
 
 def _check_straight(config: TrainConfig) -> None:
-    """Refuses a wish about the inside of objects where light goes straight through them.
+    """Refuses overrides about objects for straight rays, which ignore objects.
 
     Raises:
-      ValueError: unless it asks for what there is anyway: a field everywhere.
+      ValueError: if one is neither open nor equivalent to a field everywhere.
     """
     asked = {"interior": config.model.interior, "reentry": config.paths.reentry}
     for name, value in asked.items():
         if value not in (None, "field", "possible"):
             raise ValueError(
-                f"{name}={value} has no effect: light that goes straight "
-                f"(paths={config.paths.name}) knows of no objects. Leave it out, or use paths=tree "
-                "with meshes."
+                f"{name}={value} has no effect: straight rays (paths={config.paths.name}) ignore "
+                "objects. Leave it out, or use paths=tree with meshes."
             )
 
 
 def _resolve_inside(
     config: TrainConfig, found: Needs, budget: Budget, reasons: dict[str, str]
 ) -> TrainConfig:
-    """Decides what is modelled inside the objects, and where their colours come from."""
+    """Decides the model of the inside of the objects, and the source of their colours."""
     if budget.bends == 0:
-        interior, why = "field", "straight light ignores the objects"
+        interior, why = "field", "straight rays ignore the objects"
     elif found.interior == "clear" and config.model.tints != "learned":
-        interior, why = "clear", "scene.json says that the objects are clear"
+        interior, why = "clear", "the objects are clear in scene.json"
     else:
-        interior, why = "absorbing", "objects may take light"
+        interior, why = "absorbing", "objects may absorb light"
     config = _decide(config, reasons, why, interior=interior)
     interior, tints = config.model.interior, config.model.tints
     if interior != "absorbing" or budget.bends == 0:
@@ -292,13 +296,13 @@ def _resolve_inside(
         )
     if tints == "given" and found.tints == "learned":
         raise ValueError(
-            "tints=given, but scene.json does not tell colour_per_interface or absorption of every "
-            "part. Describe all of them there, or use tints=learned."
+            "tints=given, but scene.json lacks colour_per_interface or absorption of a part. "
+            "Describe all parts there, or use tints=learned."
         )
     if found.tints == "learned":
         why = "scene.json does not describe the colours of every part"
         return _decide(config, reasons, why, tints="learned")
-    return _decide(config, reasons, "scene.json tells the colours", tints="given")
+    return _decide(config, reasons, "scene.json describes the colours", tints="given")
 
 
 def _resolve_model(
@@ -309,7 +313,7 @@ def _resolve_model(
     extent = presets.bounds(
         facts.cameras, space=found.space, radius=scene.radius or facts.half_extent
     )
-    why = "scene.json" if facts.half_extent else "the data set's usual walls"
+    why = "scene.json" if facts.half_extent else "the data set's usual background"
     why = "the cameras" if found.space == "unbounded" else why
     config = _decide(config, reasons, why, radius=extent.radius)
     preset = presets.PRESETS[config.model.preset]
@@ -334,7 +338,7 @@ def _resolve_training(
     blurs, rounds = len(config.losses.blurs), len(model.proposals)
     if blurs != rounds:
         raise ValueError(
-            f"There are {blurs} blurs for {rounds} proposal rounds. Give one for each, or leave "
+            f"There are {blurs} blurs for {rounds} proposal levels. Give one for each, or leave "
             "them out."
         )
     preset = presets.PRESETS[config.model.preset]
@@ -354,10 +358,10 @@ def _resolve_training(
 
 
 def override_model(model: ModelConfig, asked: FieldConfig) -> ModelConfig:
-    """Returns a preset's model with what is asked of it; `None` leaves the preset's value.
+    """Returns a preset's model with overrides; `None` keeps the value of the preset.
 
     Raises:
-      ValueError: if the model can not have that.
+      ValueError: if the model does not support an override.
     """
     if asked.samples is not None:
         model = _with_samples(model, asked.samples, asked.preset)
@@ -380,9 +384,9 @@ def _with_samples(model: ModelConfig, samples: tuple[int, ...], preset: str) -> 
     rounds = len(model.proposals)
     if len(samples) != rounds + 1:
         raise ValueError(
-            f"samples={','.join(map(str, samples))} is for {len(samples) - 1} proposal rounds, but "
+            f"samples={','.join(map(str, samples))} is for {len(samples) - 1} proposal levels, but "
             f"preset {preset} has {rounds}. Give {rounds + 1} numbers: one for each proposal "
-            "round, then the final round's."
+            "level, then one for the radiance field."
         )
     proposals = tuple(
         dataclasses.replace(proposal, samples=count)
@@ -396,8 +400,8 @@ def _with_grid(field: RadianceConfig, asked: FieldConfig) -> RadianceConfig:
         return field
     if not isinstance(field, mlps.GridRadianceConfig):
         raise ValueError(
-            f"entries and finest are of a hash grid, which fields of kind {field.kind} do not have."
-            " Leave them out."
+            f"entries and finest are options of a hash grid, which field type {field.kind} does "
+            "not have. Leave them out."
         )
     grid = field.grid
     if asked.entries is not None:
@@ -406,7 +410,7 @@ def _with_grid(field: RadianceConfig, asked: FieldConfig) -> RadianceConfig:
         if asked.finest < grid.coarsest:
             raise ValueError(
                 f"finest={asked.finest} is coarser than the grid's first level of {grid.coarsest} "
-                "cells a side. Give at least that."
+                "cells per side. Give at least that."
             )
         grid = dataclasses.replace(grid, finest=asked.finest)
     return dataclasses.replace(field, grid=grid)
@@ -416,22 +420,22 @@ def _doubts(asked: TrainConfig, found: Needs) -> list[str]:
     doubts = []
     if asked.model.interior == "clear" and found.tints == "given":
         doubts.append(
-            "interior=clear, but scene.json gives the objects colours, which will be missing. Use "
-            "interior=absorbing."
+            "interior=clear, but the objects have colours in scene.json, which will be missing. "
+            "Use interior=absorbing."
         )
     if asked.paths.reentry == "impossible" and found.reentry == "possible":
         doubts.append(
-            "reentry=impossible, but light that has left these objects may meet them again: it "
-            "will be followed no further. Leave it out."
+            "reentry=impossible, but light that has left these objects may meet them again; "
+            "such light will not be traced any further. Leave it out."
         )
     return doubts
 
 
 def _refuse_cameras_inside(parts: Sequence[MeshPart], cameras: Cameras) -> None:
-    """Refuses cameras whose rays would have to know at once what they are in."""
+    """Refuses cameras inside a mesh, whose rays would start with an interior list."""
     if np.any(mesh_queries.parts_around(parts, cameras.poses[:, :, 3]) != EMPTY_SLOT):
         raise ValueError(
-            "A camera stands inside a mesh, which training can not follow under rule=priority. Use "
+            "A camera is inside a mesh, which training does not support under rule=priority. Use "
             "rule=nested, or move the camera."
         )
 
@@ -448,7 +452,7 @@ def _wrapped(text: str) -> list[str]:
 
 
 def _shown(value: Any) -> str:
-    """Returns a value as its flag takes it."""
+    """Returns a value as text."""
     if isinstance(value, tuple):
         return ",".join(f"{x[0]}={x[1]:g}" if isinstance(x, tuple) else str(x) for x in value)
     return f"{value:g}" if isinstance(value, float) and math.isfinite(value) else str(value)

@@ -1,12 +1,11 @@
-"""Files of a run: configuration, model, metrics and checkpoints.
+"""Reads and writes the files of a run: configuration, model, metrics and checkpoints.
 
-Saves and restores the state of a run with Orbax: atomic, the newest few kept.
+    {run}/config.json      the resolved `TrainConfig`
+    {run}/model.json       the model, see `render.checkpoint_io`
+    {run}/metrics.jsonl    one line for every logged step
+    {run}/checkpoints/     the newest few states, saved atomically by Orbax
 
-What a run writes: configuration, model and metrics, all readable text.
-
-{run}/config.json      the resolved `TrainConfig`
-{run}/model.json       see `render.checkpoint_io`
-{run}/metrics.jsonl    one line for every logged step
+All but the checkpoints are readable text.
 """
 
 import json
@@ -34,9 +33,12 @@ from refref_jax.training.config import TrainConfig, options_of
 from refref_jax.training.config_files import CONFIG
 from refref_jax.training.loop import TrainState
 
+_METRICS = "metrics.jsonl"
+_LEFT_BEHIND = (_METRICS, checkpoint_io.CHECKPOINTS)
+
 
 class Checkpoints:
-    """The checkpoints of one run, open for writing. Use it in a `with` statement."""
+    """Checkpoints of one run, open for writing. Use it in a `with` statement."""
 
     def __init__(self, run: Path, *, keep: int) -> None:
         """Opens or creates the checkpoints of a run folder, keeping the newest `keep`."""
@@ -54,10 +56,10 @@ class Checkpoints:
         return self._manager.latest_step()
 
     def save(self, state: TrainState) -> None:
-        """Writes a state, and waits: its buffers belong to the next step.
+        """Writes a state, and waits, because the next step reuses its buffers.
 
         Raises:
-          ValueError: if a parameter is not finite. The checkpoints there are stay.
+          ValueError: if a parameter is not finite. Existing checkpoints are kept.
         """
         step = int(state.step)
         if step == self.newest():
@@ -78,8 +80,8 @@ class Checkpoints:
         """Reads the newest state.
 
         Args:
-          like: a state of the same run, or its shapes. What is read lies on the same devices, or
-            on the first one if `like` lies on none; which devices it was written from is no matter.
+          like: a state of the same run, or its shapes. The result is placed on the same devices,
+            or on the first one if `like` has none; it may have been written from other devices.
 
         Raises:
           ValueError: if there is no checkpoint.
@@ -103,20 +105,16 @@ def _training_item(state: TrainState) -> dict[str, Any]:
     return {"step": state.step, "optimizer": state.optimizer}
 
 
-_METRICS = "metrics.jsonl"
-_LEFT_BEHIND = (_METRICS, checkpoint_io.CHECKPOINTS)
-
-
 def exists(run: Path) -> bool:
-    """Returns whether a folder holds a run."""
+    """Returns whether a folder contains a run."""
     return (run / CONFIG).is_file()
 
 
 def create(run: Path, config: TrainConfig, model: SavedModel, geometry: Scene) -> None:
-    """Opens a new run; the configuration comes last, so that a half-made folder is no run.
+    """Creates a run; its configuration is written last, so that an incomplete folder is not a run.
 
     Raises:
-      ValueError: if the folder holds a run already, or is a file.
+      ValueError: if the folder contains a run already, or is a file.
     """
     check_free(run)
     run.mkdir(parents=True, exist_ok=True)
@@ -125,16 +123,16 @@ def create(run: Path, config: TrainConfig, model: SavedModel, geometry: Scene) -
 
 
 def check_free(run: Path) -> None:
-    """Checks that a run may be begun in a folder, which need not exist.
+    """Checks that a run can be created in a folder, which need not exist.
 
     Raises:
-      ValueError: if the folder holds a run already, or is a file.
+      ValueError: if the folder contains a run already, or is a file.
     """
     if exists(run):
-        raise ValueError(f"{run} holds a run already. Resume it, or give another folder.")
+        raise ValueError(f"{run} contains a run already. Resume it, or give another folder.")
     if found := [str(run / name) for name in _LEFT_BEHIND if (run / name).exists()]:
         raise ValueError(
-            f"{run} holds what is left of a run that can not be continued, for its {CONFIG} is "
+            f"{run} contains the rest of a run that cannot be continued, because its {CONFIG} is "
             f"missing. Remove {' and '.join(found)}, or give another folder."
         )
     if run.exists() and not run.is_dir():
@@ -142,7 +140,7 @@ def check_free(run: Path) -> None:
 
 
 def read_config(run: Path) -> TrainConfig:
-    """Reads the configuration of a run, also of one that an earlier version wrote.
+    """Reads the configuration of a run, including runs of earlier versions.
 
     Raises:
       ValueError: if the file is missing or damaged.
@@ -157,12 +155,12 @@ def read_config(run: Path) -> TrainConfig:
         raise ValueError(
             f"{path} does not hold a TrainConfig of an earlier version ({error}). Restore the file."
         ) from error
-    # What that file lacked, the model beside it tells.
+    # Values that this file lacks follow from the model next to it.
     return resolve.as_trained(config, checkpoint_io.read_static(run))
 
 
 def _with_todays_keys(content: dict[str, Any]) -> dict[str, Any]:
-    """Returns what a configuration of an earlier version says, by the keys of this one."""
+    """Converts a configuration of an earlier version to the keys of this one."""
     sizes = {name: content[name] for name in ("batch", "pool")}
     return {
         "scene": content["scene"] | {"pixels": content.get("pixels", "all")},
@@ -174,12 +172,12 @@ def _with_todays_keys(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, geometry: Scene) -> None:
-    """Checks that a run was made with this very configuration.
+    """Checks that a run has exactly this configuration and these meshes.
 
-    Its scene and its reconstruction may have moved: that the meshes are the same is checked too.
+    Its scene and its reconstruction may have moved to other folders.
 
     Raises:
-      ValueError: if not.
+      ValueError: if it differs.
     """
     moved = read_config(run).at(config.scene.path)
     if moved.scene.reconstruction and config.scene.reconstruction:
@@ -191,32 +189,32 @@ def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, geometry:
             if moved.get(option.name) != config.get(option.name)
         ]
         raise ValueError(
-            f"{run} was begun with other options than the ones given now "
-            f"({', '.join(differing) or 'in the model'}). Resume it without options to continue it "
-            "as it was, or choose another folder."
+            f"{run} was created with other options "
+            f"({', '.join(differing) or 'in the model'}). Resume it without a configuration to "
+            "continue it unchanged, or choose another folder."
         )
     pairs = zip(
         jax.tree.leaves(checkpoint_io.load_geometry(run)), jax.tree.leaves(geometry), strict=True
     )
     if not all(np.array_equal(theirs, ours) for theirs, ours in pairs):
         raise ValueError(
-            f"{run} was begun with other meshes than those of "
-            f"{config.scene.reconstruction or config.scene.path}. Give the one that it was begun "
-            "with, or choose another folder."
+            f"{run} was created with other meshes than those of "
+            f"{config.scene.reconstruction or config.scene.path}. Use the original meshes, or "
+            "choose another folder."
         )
 
 
 def append_metrics(run: Path, line: dict[str, Any]) -> None:
-    """Adds one line to the metrics."""
+    """Appends one line to the metrics."""
     with (run / _METRICS).open("a", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")
 
 
 def rewind_metrics(run: Path, step: int) -> float:
-    """Drops the lines after a step, which a resumed run will write again.
+    """Removes the lines after a step, which a resumed run will write again.
 
     Returns:
-      The seconds of training that the kept lines account for.
+      The training time up to the last remaining line, seconds.
     """
     path = run / _METRICS
     if not path.is_file():
@@ -228,7 +226,7 @@ def rewind_metrics(run: Path, step: int) -> float:
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """Reads all lines; the last one may be half written, where a run was killed: it is left out.
+    """Reads all lines, except for an incomplete last line of a run that was killed.
 
     Raises:
       ValueError: if another line is broken.

@@ -150,7 +150,7 @@ def test_spheres_and_environments(tmp_path, image, kind):
 
 @pytest.mark.parametrize("content", [None, {}, {"background": {"type": "fog"}}])
 def test_a_background_that_is_not_told(tmp_path, content):
-    with scene_error("scene.json", "not known", "cube, sphere, env"):
+    with scene_error("scene.json", "unknown", "cube, sphere, env"):
         read_background(_scene(tmp_path / "a", content))
 
 
@@ -166,7 +166,7 @@ def test_a_background_that_is_not_told(tmp_path, content):
         (lambda r: r["faces"]["+x"].pop("u_axis"), ("u_axis",)),
         (lambda r: r["faces"]["+x"].update(u_axis=[0, 2, 0]), ("'+x'", "perpendicular unit")),
         (lambda r: r["faces"]["+x"].update(u_axis="y"), ("'+x'", "perpendicular unit")),
-        (lambda r: r["faces"].update({"+x": r["faces"]["-x"]}), ("do not make a cube",)),
+        (lambda r: r["faces"].update({"+x": r["faces"]["-x"]}), ("do not form a cube",)),
     ],
 )
 def test_walls_that_are_not_a_cube(tmp_path, ball_scene, change, words):

@@ -171,7 +171,7 @@ def test_pairs_of_parts_are_examined_too():
     holed = ball("b_water", centre=(1.0, 0.0, 0.0))
     findings = _findings(ball("a_glass"), holed._replace(faces=holed.faces[1:]))
     assert [finding.part for finding in findings] == ["b_water", "a_glass"]
-    assert "cuts or touches b_water" in findings[1].message
+    assert "intersects or touches b_water" in findings[1].message
 
 
 def test_a_finding_reads_as_one_line():

@@ -91,13 +91,13 @@ def test_parts_that_cut_each_other_are_warned_about(shift):
     parts = (ball("a_glass"), ball("b_water", centre=(shift, 0.0, 0.0)))
     finding = only(_findings(*parts))
     assert (finding.severity, finding.part) == ("warning", "a_glass")
-    assert "cuts or touches b_water" in finding.message
+    assert "intersects or touches b_water" in finding.message
     assert "use the rule 'priority'" in finding.message
 
 
 def test_a_drink_that_overlaps_its_cup_cuts_it():
     finding = only(_warnings(_cup(), _drink(1.05, -0.05)))
-    assert "cuts or touches" in finding.message
+    assert "intersects or touches" in finding.message
 
 
 # Coincident walls.
@@ -177,7 +177,7 @@ def test_findings_know_no_size(scale, shift):
         return part._replace(vertices=scale * (part.vertices + shift))
 
     cup, *drinks = map(placed, [_cup(), _drink(1.0, 0.0), _drink(0.99, 0.01), _drink(1.05, -0.05)])
-    for drink, words in zip(drinks, ("coincides", "gap", "cuts"), strict=True):
+    for drink, words in zip(drinks, ("coincides", "gap", "intersects"), strict=True):
         assert words in only(_warnings(cup, drink)).message
 
 

@@ -386,7 +386,7 @@ def test_two_frames_of_one_name(scene, other):
         transforms["frames"][1]["file_path"] = f"./{other}/r_000"
 
     edit_transforms(scene, repeat)
-    with scene_error("r_000", "Give every frame a name of its own"):
+    with scene_error("r_000", "Give every frame a unique name"):
         scene_folder.read_frames(scene, "train")
 
 

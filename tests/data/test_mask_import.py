@@ -58,7 +58,7 @@ def test_masks_of_before_are_replaced_in_the_copy_alone(tmp_path):
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
-        (np.zeros((HEIGHT, WIDTH), bool), "marks nothing"),
+        (np.zeros((HEIGHT, WIDTH), bool), "marks no object"),
         (np.ones((HEIGHT, WIDTH)), "Compare the model's output with a threshold"),
         (np.ones((WIDTH, HEIGHT), bool), "resize it to the image"),
     ],
@@ -73,7 +73,7 @@ def test_nothing_is_overwritten(scene, tmp_path):
     (tmp_path / "copy").mkdir()
     with pytest.raises(SceneError, match=r"nothing is overwritten\. Give a new folder"):
         add_masks(scene, tmp_path / "copy", _one_pixel)
-    with pytest.raises(SceneError, match="lies within the scene"):
+    with pytest.raises(SceneError, match="is inside the scene"):
         add_masks(scene, scene / "copy", _one_pixel)
     with pytest.raises(SceneError, match=r"transforms_train\.json does not exist"):
         add_masks(tmp_path / "copy", tmp_path / "other", _one_pixel)

@@ -136,7 +136,7 @@ def test_light_leaves_one_convex_body_for_good():
     assert (needs.parts, needs.bodies, needs.convex) == (1, 1, True)
     assert needs.reentry == "impossible"
     assert describe(needs) == (
-        "this scene needs: 1 clear convex body, no re-entry, bounded background, no tint"
+        "this scene needs: 1 clear convex object, no re-entry, bounded background, no tint"
     )
 
 
@@ -182,16 +182,16 @@ def test_a_scene_is_described_in_one_line():
     wine = solids.ball("wine_water", radius=1.7)._replace(tint=(0.5, 1.0, 1.0))
     tinted = describe(_needs(_clear(solids.shell()), _clear(wine), space="unbounded"))
     assert tinted == (
-        "this scene needs: 2 parts in 1 body that is not convex, re-entry, unbounded background, "
+        "this scene needs: 2 parts in 1 object that is not convex, re-entry, unbounded background, "
         "tints and absorption (given)"
     )
     apart = [solids.box(), solids.box("other_glass", centre=(3.0, 0.0, 0.0))]
-    assert "2 bodies, re-entry" in describe(_needs(*apart))
-    assert "2 clear bodies" in describe(_needs(*map(_clear, apart)))
+    assert "2 objects, re-entry" in describe(_needs(*apart))
+    assert "2 clear objects" in describe(_needs(*map(_clear, apart)))
     nested = describe(_needs(solids.ball(), solids.ball("inner_water", radius=0.5)))
-    assert "2 parts in 1 convex body, no re-entry" in nested and "(to be learned)" in nested
+    assert "2 parts in 1 convex object, no re-entry" in nested and "(to be learned)" in nested
     torus = _made(trimesh.creation.torus(1.0, 0.3))
-    assert "1 body that is not convex, re-entry" in describe(_needs(torus))
+    assert "1 object that is not convex, re-entry" in describe(_needs(torus))
 
 
 def test_a_spherical_background_is_told():
@@ -208,5 +208,5 @@ def test_a_scene_tells_whether_its_colours_are_known(ball_scene):
     (part,) = meshes.read_meshes(ball_scene)
     assert part.colour_known
     assert describe(_needs(part)) == (
-        "this scene needs: 1 clear convex body, no re-entry, bounded background, no tint"
+        "this scene needs: 1 clear convex object, no re-entry, bounded background, no tint"
     )

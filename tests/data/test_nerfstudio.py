@@ -92,7 +92,7 @@ def _distorted(key, value, frame=None):
         (_distorted("val_filenames", ["images/frame_00001.png"]), "lists no train_filenames"),
         (_distorted("applied_transform", [[2, 0, 0, 0]]), "applied_transform .* 4 x 4 matrix"),
         (_distorted("applied_scale", -1.0), "applied_scale is -1"),
-        (lambda content: content["frames"][2].pop("mask_path"), "frame_00002.* no mask_path, as 1"),
+        (lambda content: content["frames"][2].pop("mask_path"), "frame_00002.* no mask_path, like"),
         (lambda content: content.pop("fl_x") + content.pop("fl_y"), "lacks the focal length"),
     ],
 )
@@ -112,7 +112,7 @@ def test_a_missing_file_and_a_scene_of_ours(tmp_path):
 
 def test_a_broken_image_is_named(capture):
     (capture / "images" / "frame_00002.png").write_bytes(b"no image")
-    with pytest.raises(SceneError, match=r"frame_00002\.png can not be read as an image"):
+    with pytest.raises(SceneError, match=r"frame_00002\.png cannot be read as an image"):
         nerfstudio.read_capture(capture)
 
 
@@ -139,7 +139,7 @@ def test_without_lists_each_eighth_is_for_testing():
     splits = nerfstudio.every_nth(17, every=8)
     assert splits["test"] == (0, 8, 16)
     assert splits["train"] == tuple(i for i in range(17) if i not in (0, 8, 16))
-    with pytest.raises(SceneError, match="none is left to train on"):
+    with pytest.raises(SceneError, match="none is left for training"):
         nerfstudio.every_nth(1, every=8)
 
 

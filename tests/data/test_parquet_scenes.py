@@ -85,13 +85,13 @@ def test_rows_that_are_not_those_of_the_metadata(tmp_path):
 @pytest.mark.parametrize("text", [b"", b"[]", b'{"frames": 3}', b'{"frames": {"train": -1}}'])
 def test_metadata_that_is_broken(tmp_path, text):
     shards = write_copy(tmp_path, rows=6, metadata={METADATA_KEY: text})
-    with scene_error("metadata", "Write the file again"):
+    with scene_error("metadata", "Convert the scene again"):
         parquet_scenes.read_contents(shards)
 
 
 @pytest.mark.parametrize("column", ["image", "transform_matrix"])
 def test_a_missing_column(tmp_path, column):
-    with scene_error(f"lacks the column {column}", "depth", "Give a file of the data set"):
+    with scene_error(f"lacks the column {column}", "depth", "Use a file of the data set"):
         parquet_scenes.read_contents(write_copy(tmp_path, rows=3, drop=(column,)))
 
 

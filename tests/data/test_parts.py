@@ -90,7 +90,7 @@ def test_broken_arrays_are_refused(vertices, faces, message):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(SceneError, match=r"ball\.ply can not be read"):
+    with pytest.raises(SceneError, match=r"ball\.ply cannot be read"):
         single_body(tmp_path / "ball.ply", index=1.5)
 
 
@@ -109,7 +109,7 @@ def test_no_part_is_an_empty_scene():
 
 
 def test_faces_that_point_inwards_are_refused():
-    with pytest.raises(SceneError, match=r"mended first.\n  ball_glass: .*point inwards"):
+    with pytest.raises(SceneError, match=r"Fix them first:\n  ball_glass: .*point inwards"):
         assemble([inverted(ball())])
 
 
@@ -130,5 +130,5 @@ def test_overlaps_that_the_rule_is_for_are_not_warned_of():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assemble(parts, rule="priority")
-    with pytest.warns(UserWarning, match="ice cuts or touches drink"):
+    with pytest.warns(UserWarning, match="ice intersects or touches drink"):
         assemble(parts)

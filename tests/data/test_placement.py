@@ -46,7 +46,7 @@ def test_the_meeting_point_is_the_nearest_to_all_axes():
 def test_parallel_axes_meet_nowhere():
     poses = np.stack([pose_of(0)[:3]] * 3)
     poses[1, 2, 3] += 1.0
-    with pytest.raises(SceneError, match=r"look the same way.*centre, such as"):
+    with pytest.raises(SceneError, match=r"look in the same direction.*centre, such as"):
         meeting_point(poses)
 
 

@@ -19,12 +19,12 @@ def _ranked(priority, name, **shape):
 
 
 @pytest.mark.parametrize(
-    ("count", "words"), [(1, "there is one part"), (3, "all 3 parts lie apart")]
+    ("count", "words"), [(1, "there is one part"), (3, "all 3 parts are apart")]
 )
 def test_rules_are_the_same_for_parts_that_are_apart(count, words):
     advice = _advice(*[ball(centre=(5.0 * i, 0.0, 0.0)) for i in range(count)])
     assert advice.rule == "nested"
-    assert words in advice.reason and "are the same" in advice.reason
+    assert words in advice.reason and "are equivalent" in advice.reason
 
 
 def test_strictly_nested_parts_need_nested():
@@ -87,4 +87,4 @@ def test_an_overlap_that_is_left_to_chance():
     finding = only(_priorities(ball("a_glass"), ball("b_water", centre=(1.0, 0.0, 0.0))))
     assert (finding.severity, finding.part) == ("warning", "a_glass")
     assert "same priority as b_water (0)" in finding.message
-    assert "different numbers" in finding.message
+    assert "different priorities" in finding.message

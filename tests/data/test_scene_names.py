@@ -55,7 +55,7 @@ def test_nine_configurations_of_every_background_and_category():
 )
 def test_other_names_are_refused_with_a_suggestion(text, suggestion):
     assert not scene_names.is_name(text)
-    with scene_error(repr(text), f"Name it as in {suggestion}."):
+    with scene_error(repr(text), f"Use a name such as {suggestion}."):
         scene_names.parse(text)
 
 

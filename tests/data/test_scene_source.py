@@ -161,7 +161,7 @@ def test_a_broken_file_leaves_nothing_behind(copy, tmp_path):
     ("source", "words"),
     [
         ("hf:cubebg_single-convex/cube_smcvx_bal", (f"The nearest there is {_SOURCE}.",)),
-        ("hf:cubebg_single-convex/cube_smcvx_xylophone", ("no scene", "Copy it there")),
+        ("hf:cubebg_single-convex/cube_smcvx_xylophone", ("no scene", "Copy its files there")),
         ("hf:cubebg_single-convx/cube_smcvx_ball", ("Write cubebg_single-convex",)),
         ("hf:spherebg_single-convex/cube_smcvx_ball", (_SOURCE,)),
     ],
@@ -181,19 +181,19 @@ def test_an_object_of_another_category_is_suggested(copy):
 
 def test_a_missing_shard(copy):
     write_copy(copy, name="cube_smcvx_cube", rows=9, shards=3)[1].unlink()
-    with scene_error("Of 3 parquet files of cube_smcvx_cube", "number 1 is missing"):
+    with scene_error("File 1 of the 3 parquet files of cube_smcvx_cube", "is missing"):
         open_scene("hf:cubebg_single-convex/cube_smcvx_cube")
 
 
 def test_a_scene_that_is_there_twice(copy):
     write_copy(copy, rows=9, shards=3)
-    with scene_error("more than once", "Remove all but one"):
+    with scene_error("more than once", "Keep only one set"):
         open_scene(_SOURCE)
 
 
 def test_a_copy_that_is_no_folder(copy, monkeypatch):
     monkeypatch.setenv("REFREF_HF", "nowhere")
-    with scene_error("nowhere is no folder", "or REFREF_HF"):
+    with scene_error("nowhere is not a folder", "or REFREF_HF"):
         open_scene(_SOURCE)
 
 

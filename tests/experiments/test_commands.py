@@ -87,7 +87,7 @@ def test_a_mesh_that_no_camera_sees_is_warned_about(tmp_path):
     path = next((scene / "meshes").iterdir())
     trimesh.load(path).apply_translation([500.0, 0.0, 0.0]).export(path)
     result = run_command("train", f"--scene={scene}", f"--out={tmp_path / 'run'}", *TINY)
-    assert "no pixel sees the meshes" in result.stdout
+    assert "no camera ray hits the meshes" in result.stdout
     assert "advice: rule nested: there is one part" in result.stdout
 
 
@@ -184,11 +184,11 @@ def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
         ("train", ("--scene=experiments/data/cube_smcvx_ball", "--out=README.md/x"), "README.md"),
         ("evaluate", ("--run=nowhere",), "nowhere/config.json does not exist"),
         ("evaluate", ("--run=nowhere", "--rays_per_pixel=8"), "Give 4 or 9"),
-        ("evaluate", ("--run=RUN", "--lpips_weights=none.npz"), "none.npz can not be read"),
+        ("evaluate", ("--run=RUN", "--lpips_weights=none.npz"), "none.npz cannot be read"),
         ("render", ("--run=RUN",), "run/model.json does not exist"),
         ("render", ("--run=nowhere", "--rays_per_pixel=0"), "Give 1."),
         ("export", ("--run=RUN", "--what=mesh", "--out=x.ply"), "run/model.json does not"),
-        ("export", ("--run=RUN", "--what=body", "--out=x.ply"), "run/geometry.npz can not"),
+        ("export", ("--run=RUN", "--what=body", "--out=x.ply"), "run/geometry.npz cannot"),
         ("export", ("--run=nowhere", "--what=body", "--out=x.obj"), "ends with .ply"),
     ],
 )

@@ -122,7 +122,7 @@ def _with_more(rendered, target):
             lambda _, theirs: _write(theirs, "r_001", 0.4, size=(13, 16)),
             "truth/r_001.png is 16 x 13 pixels, but .*r_001.png is 17 x 13",
         ),
-        (lambda ours, _: truncate(ours / "r_000.png"), "r_000.png can not be read"),
+        (lambda ours, _: truncate(ours / "r_000.png"), "r_000.png cannot be read"),
     ],
 )
 def test_folders_that_do_not_fit_are_named(folders, spoil, message):
@@ -148,7 +148,7 @@ def test_all_sizes_are_looked_at_before_anything_is_compared(folders, masks):
     with pytest.raises(ValueError, match="nowhere is no folder"):
         image_folders.match(folders[0], masks / "nowhere", None)
     (folders[0] / "r_001.exr").write_text("no EXR")
-    with pytest.raises(ValueError, match=r"rendered/r_001\.exr can not be read as EXR"):
+    with pytest.raises(ValueError, match=r"rendered/r_001\.exr cannot be read as EXR"):
         image_folders.match(*folders, None)
 
 

@@ -168,4 +168,4 @@ def test_a_scene_without_a_known_background_is_named(tmp_path):
     (scene / "scene.json").unlink()
     out = tmp_path / "out"
     refused = run_command("render_known", f"--scene={scene}", f"--out={out}", fails=True)
-    assert "The background is not known" in refused.stderr and not out.exists()
+    assert "The background is unknown" in refused.stderr and not out.exists()

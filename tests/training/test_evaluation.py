@@ -214,7 +214,7 @@ def test_what_is_not_at_hand_is_warned_of_once(monkeypatch, capsys, tmp_path):
     first, second = capsys.readouterr().out.splitlines()
     assert first.startswith("warning: LPIPS") and "docs/metrics.md" in first
     assert second.startswith("warning: FLIP") and "pip install -e '.[flip]'" in second
-    with pytest.raises(ValueError, match=r"none\.npz can not be read"):
+    with pytest.raises(ValueError, match=r"none\.npz cannot be read"):
         perceptual.chosen(str(tmp_path / "none.npz"))
     weights = made_lpips.write(tmp_path / "weights.npz")
     assert perceptual.chosen(str(weights)).lpips is not None

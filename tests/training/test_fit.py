@@ -61,9 +61,9 @@ def test_the_configuration_of_a_run_repeats_it_bit_for_bit(fifty, tmp_path):
     # Resumed, it is done; with another option it is refused.
     done = fit.fit(config, out=tmp_path / "again", existing="resume", report=messages.append)
     assert "trained already" in messages[-1] and done.budget == model.budget
-    with pytest.raises(ValueError, match=r"other options than .* \(cut\)"):
+    with pytest.raises(ValueError, match=r"other options \(cut\)"):
         fit.fit(config.override(cut=0.05), out=tmp_path / "again", existing="resume")
-    with pytest.raises(ValueError, match="holds a run already"):
+    with pytest.raises(ValueError, match="contains a run already"):
         fit.fit(config, out=tmp_path / "again")
 
 

@@ -282,7 +282,7 @@ def test_a_scene_may_move_but_not_change(tmp_path):
 @pytest.mark.parametrize("left", ["checkpoints", "metrics.jsonl"])
 def test_what_is_left_of_a_run_is_not_taken_over(tmp_path, left):
     (tmp_path / left).mkdir()
-    with pytest.raises(ValueError, match=rf"can not be continued.* Remove \S+/{left}, ") as refused:
+    with pytest.raises(ValueError, match=rf"cannot be continued.* Remove \S+/{left}, ") as refused:
         run_folder.create(tmp_path, CONFIG, SAVED, _GEOMETRY)
     assert "--resume" not in str(refused.value)
 
@@ -295,7 +295,7 @@ def test_a_damaged_geometry_is_named(tmp_path, damage):
     path.unlink()
     if damage == "truncated":
         path.write_bytes(content[: len(content) // 2])
-    with pytest.raises(ValueError, match=r"geometry\.npz can not be read"):
+    with pytest.raises(ValueError, match=r"geometry\.npz cannot be read"):
         checkpoint_io.load_geometry(tmp_path)
 
 
@@ -305,7 +305,7 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
     with Checkpoints(tmp_path, keep=1) as checkpoints:
         checkpoints.save(state)
     shutil.rmtree(tmp_path / "checkpoints" / "1" / "params")
-    with pytest.raises(ValueError, match=r"checkpoints/1 can not be read"):
+    with pytest.raises(ValueError, match=r"checkpoints/1 cannot be read"):
         load_model(tmp_path)
 
 

@@ -136,19 +136,19 @@ def test_resolve_warns_of_what_is_doubtful():
 @pytest.mark.parametrize(
     ("found", "given", "message"),
     [
-        (_UNTOLD, {"tints": "given"}, "scene.json does not tell"),
+        (_UNTOLD, {"tints": "given"}, "scene.json lacks"),
         (_TINTED, {"tints": "learned", "interior": "clear"}, "no effect with interior clear"),
         (_TINTED, {"tints": "given", "interior": "field"}, "no effect with interior field"),
         (_TINTED, {"tints": "given", "paths": "straight"}, "at most 0 bends"),
         (_TINTED, {"tints": "none"}, "an absorbing interior has colours"),
         (_EMPTY, {"tints": "learned"}, "no effect"),
         (_EMPTY, {"paths": "tree"}, "no meshes"),
-        (_CLEAR, {"cut": 2.0}, "The cut"),
+        (_CLEAR, {"cut": 2.0}, "cut is 2.0"),
         (_CLEAR, {"bends": -1}, "bends"),
         (_CLEAR, {"paths": "straight", "bends": 10}, "no cut and no bends"),
         (_CLEAR, {"paths": "straight", "cut": 0.02}, "no cut and no bends"),
         (_CLEAR, {"dilatation": 0.5}, "There is no option 'dilatation'"),
-        (_CLEAR, {"samples": (32,)}, "is for 0 proposal rounds, but preset tiny has 1"),
+        (_CLEAR, {"samples": (32,)}, "is for 0 proposal levels, but preset tiny has 1"),
         (_CLEAR, {"samples": (32, 0)}, "not a list of positive numbers"),
         (_CLEAR, {"multisamples": 3}, "multisamples=3"),
         (_CLEAR, {"entries": 40}, "entries is 40"),
@@ -160,7 +160,7 @@ def test_resolve_warns_of_what_is_doubtful():
         (_CLEAR, {"samples": [32, "20"]}, "not of type int"),
         (_CLEAR, {"steps": 10**30}, "steps is 10"),
         (_CLEAR, {"seed": -1}, "seed is -1"),
-        (_CLEAR, {"blurs": [0.1, 0.1, 0.1]}, "3 blurs for 1 proposal rounds"),
+        (_CLEAR, {"blurs": [0.1, 0.1, 0.1]}, "3 blurs for 1 proposal levels"),
         (_CLEAR, {"distortion_weight": -1.0}, "weight or blur"),
         (_CLEAR, {"finest": 10**30}, "finest is 10"),
         (_CLEAR, {"steps": 0}, "steps is 0"),
@@ -294,9 +294,9 @@ def test_a_reconstruction_is_named_as_seen_from_its_run(tmp_path, monkeypatch):
         ('{"paths": {"cut": NaN}}', "NaN, not a number"),
         ('{"seed": 0', "does not hold a TrainConfig"),
         ('{"sead": 0}', "unknown 'sead'"),
-        ('{"paths": {"cut": 2}}', "The cut is a share"),
+        ('{"paths": {"cut": 2}}', "cut is 2.0, outside"),
         ("[]", "not an object"),
-        ('{"loss": 1, "batch": 2, "pool": 3}', "not begun again"),
+        ('{"loss": 1, "batch": 2, "pool": 3}', "not started again"),
         ('{"seed": -1}', "seed is -1"),
         (b"\xff\xfe\x00", "does not hold a TrainConfig"),
     ],
@@ -380,7 +380,7 @@ def test_prepare_resolves_scenes(scene):
             expected = (tint, absorption) if on_paths else ([1.0] * 3, [0.0] * 3)
             np.testing.assert_array_equal(found, expected)
         assert any("this scene" in line for line in lines)
-    with pytest.raises(ValueError, match="does not tell colour_per"):
+    with pytest.raises(ValueError, match="lacks colour_per"):
         prepare(TrainConfig().override(scene=untold, tints="given"))
     with pytest.raises(ValueError, match="no meshes"):
         prepare(TrainConfig().override(scene=empty, paths="tree"))

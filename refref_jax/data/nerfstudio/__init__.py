@@ -1,1 +1,1 @@
-"""Captures in nerfstudio's layout: read, turned into scenes, and written."""
+"""Captures in nerfstudio's format: reading, conversion to scene folders, and writing."""

@@ -1,23 +1,19 @@
 """Reads and writes captures in nerfstudio's `transforms.json` format (NumPy only).
 
-One frame of nerfstudio's `transforms.json`: its files, its pose, and its camera (NumPy only).
-
-Cameras must be pinholes without distortion. What all frames share stands at the top of the file;
-else each frame has its own.
-
-Reads and writes captures in nerfstudio's dialect of `transforms.json` (NumPy only).
-
     {source}/transforms.json    cameras, shared or in each frame; poses; names of files
     {source}/images/...         PNG or JPEG
-    {source}/masks/...          one an image, or none at all; black is what training ignores
+    {source}/masks/...          one per image, or none at all; training ignores black pixels
 
-Its camera frame is ours (x right, y up, looking along -z), and so is its pixel frame: a principal
-point of half the width and half the height is the image's centre. `applied_transform` and
-`applied_scale` say what the poses *have been* moved by, `p -> applied_scale applied_transform(p)`:
-they are not to be applied once more.
+Cameras must be pinholes without distortion. Values that all frames share are at the top of the
+file; otherwise each frame has its own.
+
+The camera frame is that of this library (x right, y up, looking along -z), and so is the pixel
+frame: a principal point of half the width and half the height is the image's centre.
+`applied_transform` and `applied_scale` state how the poses *were* transformed,
+`p -> applied_scale applied_transform(p)`: they must not be applied again.
 
 Source: https://docs.nerf.studio/quickstart/data_conventions.html. `camera_angle_x` and file names
-without an ending are Instant NGP's, whose files are alike.
+without an extension are Instant NGP's, whose files have the same form.
 """
 
 import json
@@ -35,26 +31,31 @@ from refref_jax.data.scene_folder import SPLITS
 from refref_jax.geometry.cameras import Cameras, focal_length
 
 MODEL = "OPENCV"
-"""The camera model that is written, with no distortion."""
+"""Camera model of captures that are written, without distortion."""
 
 _PINHOLES = (MODEL, "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-"""Coefficients of the models that nerfstudio knows; all must be 0."""
+"""Distortion coefficients of nerfstudio's models; all must be 0."""
 
 _UNDISTORT = (
-    "Only pinholes without distortion can be used: undistort the images first, as `colmap "
-    "image_undistorter` does, and convert what it writes (see docs/data_formats.md)."
+    "Only pinholes without distortion can be used: undistort the images first, with `colmap "
+    "image_undistorter`, and convert its output (see docs/data_formats.md)."
 )
+
+FILE = "transforms.json"
+
+# Minimum grey level of white: JPEG adds grey pixels at every edge.
+_WHITE = 128
 
 
 class Intrinsics(NamedTuple):
-    """What a pinhole camera makes of the scene, in pixels.
+    """Intrinsics of a pinhole camera, in pixels.
 
     Attributes:
       focal_x, focal_y: focal lengths along rows and along columns.
-      centre_x, centre_y: the principal point, from the image's upper left corner.
-      width, height: of the image.
+      centre_x, centre_y: principal point, from the upper left corner of the image.
+      width, height: size of the image.
     """
 
     focal_x: float
@@ -69,11 +70,11 @@ class CaptureFrame(NamedTuple):
     """One image of a capture.
 
     Attributes:
-      name: of the image, as the file has it.
-      image: PNG or JPEG.
-      mask: of the same size, or `None` where the frame has none.
-      pose: camera to world, as the file has it.
-      intrinsics: of its camera.
+      name: name of the image in the file.
+      image: path of a PNG or JPEG.
+      mask: path of a mask of the same size, or `None` if the frame has none.
+      pose: camera-to-world matrix in the file.
+      intrinsics: intrinsics of the camera.
     """
 
     name: str
@@ -87,16 +88,16 @@ def read_frame(content: dict[str, Any], record: Any, path: Path) -> CaptureFrame
     """Reads a frame, and the size of its image, but no pixels.
 
     Args:
-      content: of the whole file.
-      record: of the frame.
-      path: of the file.
+      content: content of the whole file.
+      record: record of the frame.
+      path: path of the file.
 
     Raises:
       SceneError: if a file is missing, the pose is not a rigid motion, or the camera is not a
         pinhole without distortion.
     """
     name = scene_folder.get_text(record, "file_path", path)
-    # Instant NGP leaves the ending out.
+    # Instant NGP omits the extension.
     image = path.parent / (name if Path(name).suffix else f"{name}.png")
     matrix = scene_folder.get(record, "transform_matrix", path)
     mask = None
@@ -118,10 +119,10 @@ def read_frame(content: dict[str, Any], record: Any, path: Path) -> CaptureFrame
 
 
 def read_number(records: Sequence[dict[str, Any]], name: str, path: Path) -> float | None:
-    """Returns a finite number that one of some records has, or `None`.
+    """Returns a number by its key in one of several records, or `None`.
 
     Raises:
-      SceneError: if it is none, or if two records contradict each other.
+      SceneError: if a value is not a finite number, or two records contradict each other.
     """
     values = [record[name] for record in records if name in record]
     for value in values:
@@ -163,7 +164,7 @@ def _intrinsics(
     if declared != (width, height):
         raise SceneError(
             f"{image} is {width} x {height} pixels, but {path} says {declared[0]:g} x "
-            f"{declared[1]:g}. Use the images that the file was made for, or make it again."
+            f"{declared[1]:g}. Use the images that belong to the file, or create it again."
         )
     along = _focal(given["fl_x"], given["camera_angle_x"], width, image, path)
     across = _focal(given["fl_y"], given["camera_angle_y"], height, image, path) or along
@@ -199,25 +200,19 @@ def _image_size(path: Path) -> tuple[int, int]:
         height, width = iio.improps(path, plugin="pillow").shape[:2]
     except Exception as error:  # Pillow raises OSError, SyntaxError and its own
         raise SceneError(
-            f"{path} can not be read as an image ({error}). Copy or convert it again."
+            f"{path} cannot be read as an image ({error}). Copy or convert it again."
         ) from error
     return width, height
 
 
-FILE = "transforms.json"
-
-# Grey levels from here on are white: JPEG leaves some beside every edge.
-_WHITE = 128
-
-
 class Capture(NamedTuple):
-    """What a `transforms.json` says that we can use.
+    """Content of a `transforms.json`, as far as it is used here.
 
     Attributes:
-      frames: ordered by name.
+      frames: frames, ordered by name.
       splits: numbers of the frames of `train`, `val` and `test`, or `None` if the file lists none.
-      applied: what the poses were turned and moved by, from the world in which they were found.
-      applied_scale: what they were scaled by after that.
+      applied: rotation and translation that were applied to the original poses.
+      applied_scale: scale that was applied after that.
       has_depth: whether frames name depth maps, which are not read.
     """
 
@@ -232,17 +227,17 @@ def read_capture(source: Path) -> Capture:
     """Reads a capture, and the size of each of its images, but no pixels.
 
     Args:
-      source: the folder of a `transforms.json`, or such a file of any name.
+      source: folder of a `transforms.json`, or path of such a file with any name.
 
     Raises:
       SceneError: if a file is missing or broken, if a pose is not a rigid motion, if a camera is
-        not a pinhole without distortion, or if some frames have a mask and others none.
+        not a pinhole without distortion, or if some frames have a mask and others have none.
     """
     path = source if source.suffix == ".json" else source / FILE
     if not path.is_file():
         is_ours = (path.parent / "transforms_train.json").is_file()
         advice = (
-            "The folder is a scene in our own layout: no conversion is needed."
+            "The folder already is a scene folder: no conversion is needed."
             if is_ours
             else f"Give the folder that holds {FILE}."
         )
@@ -268,13 +263,13 @@ def read_capture(source: Path) -> Capture:
 
 
 def every_nth(frames: int, *, every: int) -> dict[str, tuple[int, ...]]:
-    """Returns splits of a capture that lists none: each n-th frame is test, the first included.
+    """Returns splits for a capture that lists none: every n-th frame, from the first, is test.
 
-    So does nerfstudio in its evaluation mode `interval`.
+    nerfstudio's evaluation mode `interval` does the same.
 
     Args:
-      frames: their number.
-      every: n, at least 2.
+      frames: number of frames.
+      every: value of n, at least 2.
 
     Raises:
       SceneError: if no frame is left to train on.
@@ -283,13 +278,13 @@ def every_nth(frames: int, *, every: int) -> dict[str, tuple[int, ...]]:
     if not train:
         raise SceneError(
             f"There is {frames} frame, and the first of every {every} is for testing, so none is "
-            "left to train on. Capture more."
+            "left for training. Capture more images."
         )
     return {"train": train, "test": tuple(range(0, frames, every))}
 
 
 def read_capture_mask(path: Path) -> Bool[np.ndarray, "h w"]:
-    """Returns where a mask is not black; the grey that JPEG adds around edges counts half-way."""
+    """Returns the pixels of a mask that are not black; JPEG masks are thresholded at mid-grey."""
     if path.suffix.lower() in (".jpg", ".jpeg"):
         return image_files.read_rgb(path).max(axis=-1) >= _WHITE
     return image_files.read_mask(path)
@@ -301,16 +296,16 @@ def write_capture(
     images: Mapping[str, Sequence[str]],
     masks: Mapping[str, Sequence[str]],
 ) -> None:
-    """Writes the `transforms.json` of images that are there.
+    """Writes the `transforms.json` for images that already exist.
 
-    nerfstudio asks for all three lists of files if there is one: what is missing is the test split,
-    or what stands for it, once more.
+    nerfstudio requires all three lists of files if there is one: a missing list repeats the test
+    split or, without one, `val` or `train`.
 
     Args:
       out: the folder.
-      cameras: of each split.
-      images: names of each split's images, below the folder.
-      masks: likewise; of no split if there are none.
+      cameras: cameras of each split.
+      images: names of each split's images, relative to the folder.
+      masks: names of each split's masks; empty if there are none.
     """
     lenses = {split: _describe_lens(each) for split, each in cameras.items()}
     first = next(iter(lenses.values()))
@@ -349,8 +344,8 @@ def _check_masks(frames: Sequence[CaptureFrame], path: Path) -> None:
     lacking = [frame.name for frame in frames if frame.mask is None]
     if 0 < len(lacking) < len(frames):
         raise SceneError(
-            f"{lacking[0]} in {path} has no mask_path, as {len(lacking)} of {len(frames)} frames "
-            "have none. Add it to these, or remove it from all."
+            f"{lacking[0]} in {path} has no mask_path, like {len(lacking)} of {len(frames)} "
+            "frames. Add it to these, or remove it from all."
         )
 
 
@@ -364,7 +359,7 @@ def _applied_transform(content: dict[str, Any], path: Path) -> Float[np.ndarray,
 def _splits(
     content: dict[str, Any], names: Sequence[str], path: Path
 ) -> dict[str, tuple[int, ...]] | None:
-    """Returns the splits that a file lists; one that repeats another is left out."""
+    """Returns the splits that a file lists, without repetitions of another split."""
     numbers = {Path(name): number for number, name in enumerate(names)}
     found: dict[str, tuple[int, ...]] = {}
     for split in ("train", "test", "val"):
@@ -372,8 +367,8 @@ def _splits(
         for name in listed:
             if not isinstance(name, str) or Path(name) not in numbers:
                 raise SceneError(
-                    f"{split}_filenames of {path} lists {name!r}, which is no frame's file_path. "
-                    "Add the frame, or remove the name."
+                    f"{split}_filenames of {path} lists {name!r}, which is not the file_path of a "
+                    "frame. Add the frame, or remove the name."
                 )
         frames = tuple(sorted(numbers[Path(name)] for name in listed))
         if frames and frames not in found.values():

@@ -1,20 +1,9 @@
 """Converts between nerfstudio captures and scene folders (NumPy only).
 
-Cuts images so that the principal point of all is their middle (NumPy only).
-
-Cameras of a scene share a focal length and a centred principal point. An image whose principal
-point lies elsewhere is cut along its borders; what is left of the shift is below half a pixel, and
-nothing is interpolated.
-
-Moves and scales the world that cameras stand in (NumPy only).
-
-Makes a scene in our layout of a capture in nerfstudio's (NumPy only).
-
-What our cameras can not be is refused, or brought about without interpolation: images are cut so
-that the principal point is their middle, and cameras whose focal lengths differ by less than shows
-in the pictures share their mean.
-
-Writes a scene of ours for nerfstudio (NumPy only).
+All cameras of a split share one focal length and a centred principal point. A capture is brought
+into this form without interpolation, or refused: images are cropped so that the principal point is
+their centre, to within half a pixel, and cameras whose focal lengths differ by less than half a
+pixel at the image border share their mean. `Placement` moves and scales the world of the cameras.
 """
 
 import math
@@ -32,14 +21,29 @@ from refref_jax.data.nerfstudio import capture as nerfstudio
 from refref_jax.data.nerfstudio.capture import CaptureFrame
 from refref_jax.data.scene_folder import Frames
 
+USUAL_DISTANCE = 4.0
+"""Distance of the data set's cameras from the origin, world units, for captures without a scale."""
+
+# Axes count as parallel if their intersection moves more than this per unit of their shift.
+_WORST_CONDITION = 1e4
+
+Sense = Literal["object", "background", "none"]
+"""White area of nerfstudio's masks: the object or the background; `none` for no masks."""
+
+# Maximum displacement of a pixel at the border of an image, pixels.
+_TOLERANCE = 0.5
+
+# Minimum share of an image that is kept; for less, the principal point must be wrong.
+_LEAST_KEPT = 0.5
+
 
 class Windows(NamedTuple):
-    """What is kept of each image of a split, along one axis.
+    """Crop windows of the images of a split, along one axis.
 
     Attributes:
       starts: first pixel of each image's window.
-      size: of all windows, pixels.
-      shift: how far the principal point may be from the windows' middle, pixels.
+      size: size of all windows, pixels.
+      shift: maximum distance of a principal point from the centre of its window, pixels.
     """
 
     starts: Int[np.ndarray, " images"]
@@ -48,14 +52,14 @@ class Windows(NamedTuple):
 
 
 def centred_windows(centres: Float[np.ndarray, " images"], size: int) -> Windows:
-    """Returns the largest windows of one size that have the principal points in their middle.
+    """Returns the largest windows of one size that are centred on the principal points.
 
-    Of the largest even and the largest odd size the one with the smaller shift is taken, and the
-    larger one if they are equal.
+    Of the largest even and the largest odd size, the one with the smaller shift is used, and the
+    larger one if the shifts are equal.
 
     Args:
       centres: principal points along the axis, pixels from the border, within the images.
-      size: of the images, pixels.
+      size: size of the images, pixels.
     """
     found: list[Windows] = []
     for kept in range(size, 0, -1):
@@ -67,19 +71,12 @@ def centred_windows(centres: Float[np.ndarray, " images"], size: int) -> Windows
     return min(found, key=lambda windows: windows.shift)
 
 
-USUAL_DISTANCE = 4.0
-"""Distance of the data set's cameras from the origin, world units, for captures without a scale."""
-
-# Axes are taken for parallel if the meeting point moves more than this per unit of their shift.
-_WORST_CONDITION = 1e4
-
-
 class Placement(NamedTuple):
     """A change of the world frame: `x -> scale (x - centre)`.
 
     Attributes:
-      centre: what becomes the origin, in the units of before.
-      scale: units of after per unit of before.
+      centre: position of the new origin, in old units.
+      scale: new units per old unit.
     """
 
     centre: Float[np.ndarray, "3"]
@@ -89,7 +86,7 @@ class Placement(NamedTuple):
 def place(
     poses: Float[np.ndarray, "cameras 3 4"], placement: Placement
 ) -> Float[np.ndarray, "cameras 3 4"]:
-    """Returns camera-to-world matrices in the changed frame; rotations stay as they are."""
+    """Returns camera-to-world matrices in the changed frame; rotations do not change."""
     positions = placement.scale * (poses[..., 3] - placement.centre)
     return np.concatenate([poses[..., :3], positions[..., None]], axis=-1)
 
@@ -100,9 +97,9 @@ def undo_motion(
     """Returns poses as they were before `p -> scale motion(p)`.
 
     Args:
-      poses: camera to world.
-      motion: rotation and translation, that were applied first.
-      scale: of positions, that was applied then.
+      poses: camera-to-world matrices.
+      motion: rotation and translation, which were applied first.
+      scale: scale of positions, which was applied second.
     """
     back = motion[:, :3].T
     positions = (poses[..., 3] / scale - motion[:, 3]) @ back.T
@@ -113,35 +110,25 @@ def meeting_point(poses: Float[np.ndarray, "cameras 3 4"]) -> Float[np.ndarray, 
     """Returns the point that is nearest to all optical axes, by least squares.
 
     Raises:
-      SceneError: if the axes are all but parallel, so that they meet nowhere.
+      SceneError: if the axes are nearly parallel, so that they have no such point.
     """
     axes = poses[..., 2]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     total = across.sum(axis=0)
     if np.linalg.cond(total) > _WORST_CONDITION:
         raise SceneError(
-            "All cameras look the same way, so nothing says where the middle of the scene is. Give "
-            "it as the centre, such as (0.5, 0, 1.2)."
+            "All cameras look in the same direction, so the centre of the scene is unknown. Give "
+            "centre, such as (0.5, 0, 1.2)."
         )
     return np.linalg.solve(total, np.einsum("nij,nj->i", across, poses[..., 3]))
 
 
-Sense = Literal["object", "background", "none"]
-"""What is white in nerfstudio's masks: the object, or all else; or there are to be none."""
-
-# By how much a pixel may be displaced at the image's border, pixels.
-_TOLERANCE = 0.5
-
-# Less of an image than this is not kept: its principal point is another image's.
-_LEAST_KEPT = 0.5
-
-
 class View(NamedTuple):
-    """A frame on its way.
+    """A frame that is converted.
 
     Attributes:
-      frame: of the capture.
-      pose: camera to world, of the scene.
+      frame: frame of the capture.
+      pose: camera-to-world matrix in the scene.
     """
 
     frame: CaptureFrame
@@ -152,9 +139,9 @@ class Lens(NamedTuple):
     """The camera that all frames of a split share.
 
     Attributes:
-      columns, rows: what is kept of each image.
+      columns, rows: crop windows of the images.
       focal: focal length, pixels.
-      stretch: by how much pixels at the border are displaced by the one focal length, pixels.
+      stretch: maximum displacement of border pixels by the shared focal length, pixels.
     """
 
     columns: Windows
@@ -164,12 +151,12 @@ class Lens(NamedTuple):
 
 
 class Converted(NamedTuple):
-    """What was written of a split.
+    """Summary of a split that was written.
 
     Attributes:
-      frames: their number.
+      frames: number of frames.
       before: width and height of the capture's images.
-      lens: what they were seen through.
+      lens: shared camera of the frames.
       masked: share of the pixels that the masks mark, or `None` without masks.
     """
 
@@ -184,7 +171,7 @@ def positions(capture: nerfstudio.Capture, *, original: bool) -> Float[np.ndarra
 
     Args:
       capture: the capture.
-      original: as they were found, before `applied_transform` and `applied_scale`.
+      original: whether to undo `applied_transform` and `applied_scale`.
     """
     poses = np.stack([frame.pose for frame in capture.frames])
     if original:
@@ -195,17 +182,17 @@ def positions(capture: nerfstudio.Capture, *, original: bool) -> Float[np.ndarra
 def write_scene(
     views: dict[str, Sequence[View]], out: Path, sense: Sense, *, step: Callable[[], None]
 ) -> dict[str, Converted]:
-    """Writes the scene, which appears when it is whole.
+    """Writes the scene, which appears when it is complete.
 
     Args:
-      views: of each split.
-      out: its folder; must not exist.
-      sense: of the masks.
-      step: is called after every image.
+      views: frames and poses of each split.
+      out: folder of the scene; must not exist.
+      sense: white area of the masks.
+      step: function called after every image.
 
     Raises:
-      SceneError: if the folder exists, if a split's cameras can not be one, or an image or mask is
-        broken, of another size, or marks nothing.
+      SceneError: if the folder exists, if the cameras of a split differ too much to share a lens,
+        if an image or mask is broken or of another size, or if a mask is empty.
     """
     if out.exists():
         raise SceneError(f"{out} exists, and nothing is overwritten. Give a new folder.")
@@ -224,8 +211,8 @@ def _common_lens(frames: Sequence[CaptureFrame]) -> Lens:
         if (lens.width, lens.height) != (first.width, first.height):
             raise SceneError(
                 f"{frame.name} is {lens.width} x {lens.height} pixels, but {frames[0].name} is "
-                f"{first.width} x {first.height}. Images of a split must be of one size: leave "
-                "out one kind, or put them into different lists (train_filenames, ...)."
+                f"{first.width} x {first.height}. Images of a split must have one size: leave "
+                "out one size, or list them in different splits (train_filenames, ...)."
             )
     half = 0.5 * max(first.width, first.height)
     focals = np.array([(frame.intrinsics.focal_x, frame.intrinsics.focal_y) for frame in frames])
@@ -234,7 +221,7 @@ def _common_lens(frames: Sequence[CaptureFrame]) -> Lens:
         if half * abs(along - across) / (along + across) > _TOLERANCE:
             raise SceneError(
                 f"The pixels of {frame.name} are not square: fl_x is {along:g}, and fl_y "
-                f"{across:g}. Let one focal length be found (COLMAP's SIMPLE_RADIAL, then "
+                f"{across:g}. Estimate a single focal length (COLMAP's SIMPLE_RADIAL, then "
                 "image_undistorter), or resize the images to square pixels."
             )
     stretches = half * np.abs(focals - focal).max(axis=-1) / focal
@@ -242,8 +229,8 @@ def _common_lens(frames: Sequence[CaptureFrame]) -> Lens:
         frame = frames[int(np.argmax(stretches))]
         raise SceneError(
             f"The focal length of {frame.name} is {frame.intrinsics.focal_x:g} pixels, but the "
-            f"mean is {focal:g}. All frames of a split share one: find the cameras as one camera "
-            "(COLMAP's single_camera), or put them into different lists (train_filenames, ...)."
+            f"mean is {focal:g}. All frames of a split share one: calibrate them as one camera "
+            "(COLMAP's single_camera), or list them in different splits (train_filenames, ...)."
         )
     columns = _windows(frames, [frame.intrinsics.centre_x for frame in frames], first.width)
     rows = _windows(frames, [frame.intrinsics.centre_y for frame in frames], first.height)
@@ -256,7 +243,7 @@ def _windows(frames: Sequence[CaptureFrame], centres: Sequence[float], size: int
         frame = frames[int(np.argmax(off))]
         raise SceneError(
             f"The principal point of {frame.name} is ({frame.intrinsics.centre_x:g}, "
-            f"{frame.intrinsics.centre_y:g}), far from the middle of its {frame.intrinsics.width} "
+            f"{frame.intrinsics.centre_y:g}), far from the centre of its {frame.intrinsics.width} "
             f"x {frame.intrinsics.height} pixels. Check that cx and cy belong to these images."
         )
     return centred_windows(np.array(centres), size)
@@ -280,8 +267,8 @@ def _write_split(
             mask = _read_mask(view.frame, sense)[cut]
             if not mask.any():
                 raise SceneError(
-                    f"The mask {view.frame.mask} marks no object, taking {sense} for white. Give "
-                    "another sense of masks, or leave the frame out."
+                    f"The mask {view.frame.mask} marks no object if {sense} is white. Give another "
+                    "sense, or leave the frame out."
                 )
             (scene / names.mask).parent.mkdir(parents=True, exist_ok=True)
             image_files.write_mask(scene / names.mask, mask)
@@ -303,7 +290,7 @@ def _cut(lens: Lens, number: int) -> tuple[slice, slice]:
 
 
 def _write_image(frame: CaptureFrame, cut: tuple[slice, slice], path: Path) -> None:
-    """Writes what is kept of an image; a PNG that is kept whole is copied byte for byte."""
+    """Writes the cropped image; a PNG that is not cropped is copied byte for byte."""
     pixels = image_files.read_rgb(frame.image)
     kept = pixels[cut]
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -319,13 +306,13 @@ def _read_mask(frame: CaptureFrame, sense: Sense) -> Bool[np.ndarray, "h w"]:
     if white.shape != expected:
         raise SceneError(
             f"The mask {frame.mask} is {white.shape[1]} x {white.shape[0]} pixels, but its image "
-            f"{expected[1]} x {expected[0]}. Resize it without blending."
+            f"{expected[1]} x {expected[0]}. Resize it without interpolation."
         )
     return white if sense == "object" else ~white
 
 
 def read_splits(scene: Path) -> dict[str, Frames]:
-    """Returns the splits that a scene has."""
+    """Reads all splits of a scene."""
     names = [
         split
         for split in scene_folder.SPLITS
@@ -337,13 +324,13 @@ def read_splits(scene: Path) -> dict[str, Frames]:
 def write_capture(
     splits: dict[str, Frames], out: Path, sense: Sense, *, step: Callable[[], None]
 ) -> None:
-    """Writes a capture, which appears when it is whole. Images are copied byte for byte.
+    """Writes a capture, which appears when it is complete. Images are copied byte for byte.
 
     Args:
-      splits: of the scene.
-      out: its folder; must not exist.
-      sense: what is to be white in the masks.
-      step: is called after every image.
+      splits: splits of the scene.
+      out: folder of the capture; must not exist.
+      sense: white area of the masks.
+      step: function called after every image.
 
     Raises:
       SceneError: if the folder exists, or a mask is broken.
@@ -357,7 +344,7 @@ def write_capture(
         for name in ("images", "masks"):
             (folder / name).mkdir()
         for split, frames in splits.items():
-            # Every name is its own, whatever its folder: nerfstudio looks for smaller copies so.
+            # Names are unique across folders, as nerfstudio's search for downscaled copies needs.
             files_of = [f"{split}_{i:0{digits}d}.png" for i in range(len(frames.names))]
             images[split] = [f"images/{name}" for name in files_of]
             if frames.masks is not None and sense != "none":
@@ -383,6 +370,6 @@ def _check_masks(images: dict[str, list[str]], masks: dict[str, list[str]]) -> N
     if masks and set(masks) != set(images):
         lacking = next(split for split in images if split not in masks)
         raise SceneError(
-            f"The {lacking} split has no masks, but another has, and nerfstudio wants all or none. "
-            "Give the sense none to leave them all out, or add them."
+            f"The {lacking} split has no masks, but another has, and nerfstudio requires all or "
+            "none. Use sense='none' to leave all masks out, or add the missing ones."
         )

@@ -295,7 +295,7 @@ def test_scenes_are_chosen_by_name_and_looked_at_before_anything_is_written(ball
 @pytest.mark.parametrize("layout", ["raw", "parquet"])
 def test_a_name_that_the_published_layouts_do_not_know(ball, tmp_path, layout):
     toy = ball.rename(ball.with_name("toy"))
-    with scene_error("'toy' is no name", "cube_smcvx_toy"):
+    with scene_error("'toy' is not the name of a scene", "cube_smcvx_toy"):
         conversion.check_room(scene_folders.find(str(toy)), layout, tmp_path)
     _convert(toy, "local", tmp_path / "out")
     assert _files(tmp_path / "out" / "toy") == _files(toy)

@@ -16,7 +16,7 @@ _GRID = "--resolution=20"
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """A scene whose mesh can not be read."""
+    """A scene whose mesh cannot be read."""
     scene = write_scene(tmp_path_factory.mktemp("scenes") / "cube_smcvx_ball")
     (scene / "meshes" / "ball_glass.ply").write_bytes(b"broken")
     return scene
@@ -143,7 +143,7 @@ def found(scene, made, runs, moved):
 
 
 def test_the_broken_mesh_stops_the_oracle_alone(found):
-    assert "ball_glass.ply can not be read" in found["oracle"]["error"]
+    assert "ball_glass.ply cannot be read" in found["oracle"]["error"]
     for name in ("r3f", "killed", "given", "other index", "r3f resumed", "r3f resumed alone"):
         assert found[name]["error"] is None, name
 
@@ -190,10 +190,10 @@ def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
         ("r3f by name alone", "--method would have no effect"),
         ("r3f with a given one", "begun with other options"),
         ("file with named index", "Give its index alone, once"),
-        ("file with oracle", "ball_glass.ply can not be read"),
+        ("file with oracle", "ball_glass.ply cannot be read"),
         ("file with a grid", "is reconstructed already. Leave it out, or add --method=r3f."),
         ("file with straight", "Add --method=oracle, since"),
-        ("file with straight oracle", "ball_glass.ply can not be read"),
+        ("file with straight oracle", "ball_glass.ply cannot be read"),
         ("moved without it", "which is not there. Give where it is now as --reconstruction"),
     ],
 )
