@@ -1,7 +1,7 @@
 """Values of the options of scenes and configurations (standard library only)."""
 
 import math
-from typing import Literal
+from typing import Literal, get_args
 
 Colour = tuple[float, float, float]
 """Linear RGB."""
@@ -29,6 +29,9 @@ Space = Literal["bounded", "spherical", "unbounded"]
 
 Split = Literal["train", "val", "test"]
 """Splits of a scene's views."""
+
+SPLITS: tuple[Split, ...] = get_args(Split)
+"""All splits, in the order of the published data set."""
 
 Pixels = Literal["all", "background"]
 """Pixels that are used for training."""

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.dataset.seeds import seed_of
-from refref_jax.data.scene_folder import SPLITS, Split
+from refref_jax.choices import SPLITS, Split
 
 ANGLE_X = 1.1656107902526855
 """Horizontal field of view of all cameras, radians: `camera_angle_x`."""

@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from experiments.dataset.cameras import SPLITS, Split
-from refref_jax.choices import TwoSidedRule
+from refref_jax.choices import SPLITS, Split, TwoSidedRule
 
 LinearImages = Literal["all", "test", "none"]
 """Splits that also keep their images as linear EXRs."""

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from refref_jax import configuration
+from refref_jax.choices import SPLITS
 from refref_jax.data import SceneError, scene_folder
-from refref_jax.data.scene_folder import SPLITS
 
 CAMERA_ANGLE_X = 1.1656107902526855
 """Horizontal field of view of all published images, radians."""

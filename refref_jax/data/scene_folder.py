@@ -21,20 +21,18 @@ import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from refref_jax import configuration
-from refref_jax.choices import Split
+from refref_jax.choices import SPLITS
 from refref_jax.data import SceneError, image_files
 from refref_jax.geometry.cameras import Cameras, focal_length, planar_depth_to_distance
 
 # Poses are stored with at least six digits; a larger deviation is a scale or a shear.
 _ROTATION_TOLERANCE = 1e-3
-
-SPLITS: tuple[Split, ...] = get_args(Split)
 
 TRANSFORMS = "transforms_{}.json"
 """Pattern of the name of a split's transforms file."""

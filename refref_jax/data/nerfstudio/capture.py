@@ -26,8 +26,8 @@ import imageio.v3 as iio
 import numpy as np
 from jaxtyping import Bool, Float
 
+from refref_jax.choices import SPLITS
 from refref_jax.data import SceneError, image_files, scene_folder
-from refref_jax.data.scene_folder import SPLITS
 from refref_jax.geometry.cameras import Cameras, focal_length
 
 MODEL = "OPENCV"

@@ -16,8 +16,8 @@ from experiments.dataset import (
     scene_contents,
     scene_folders,
 )
+from refref_jax.choices import SPLITS
 from refref_jax.data import background, meshes, scene_folder, scene_source
-from refref_jax.data.scene_folder import SPLITS
 from refref_jax.data.scene_names import parse
 from tests.data.abandoned_folder import AbandonedFolder
 from tests.data.expectations import scene_error
