@@ -213,7 +213,7 @@ def test_another_scene_is_refused_and_a_moved_one_is_not(scene, whole, tmp_path)
 
 def test_folders_of_other_things_are_left_alone(scene, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match="something else than a reconstruction"):
+    with pytest.raises(ValueError, match="files, but no reconstruction"):
         _run(scene, tmp_path)
     with pytest.raises(ValueError, match="is a file"):
         _run(scene, tmp_path / "notes.txt")
@@ -371,7 +371,7 @@ def test_a_wrong_mask_is_named_unless_one_may_be_wrong(scene, tmp_path, outliers
         assert facts.doubts == () and facts.volume == pytest.approx(true, rel=0.1)
     else:
         seen, taken = facts.doubts
-        assert "of 24 training masks overlap with the body by less than 0.9" in seen
+        assert "of 24 training masks overlap with the object by less than 0.9" in seen
         name = wrong.relative_to(spoilt).as_posix()
         assert taken.startswith(f"{name} alone carves away") and "--outliers=1" in taken
         assert facts.volume < 0.7 * true
