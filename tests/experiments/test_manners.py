@@ -119,7 +119,7 @@ _MISTAKES = {
         "--run=nowhere --what=body --out=OUT.ply": "nowhere/config.json does not exist",
     },
     "reconstruct": {
-        "--out=OUT --scene=x --ior=0.5": "--ior=0.5 is no index",
+        "--out=OUT --scene=x --ior=0.5": "--ior=0.5 is not an index",
         "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
     },
     "trade_off": {

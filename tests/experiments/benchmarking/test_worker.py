@@ -178,9 +178,9 @@ def test_an_interruption_stops_what_runs_and_begins_nothing_more(tmp_path, monke
     jobs = [_job(scene, "tree") for scene in "abcdef"]
     with pytest.raises(KeyboardInterrupt):
         worker.run_in_order(jobs, Interrupted(None, 1, lambda out, job: run(job)), None)
-    assert "killed by SIGTERM" in ends[0] or "stopped before it began" in ends[0]
+    assert "killed by SIGTERM" in ends[0] or "stopped before it started" in ends[0]
     assert len(ends) < len(jobs)
-    with subprocesses.stopping(), pytest.raises(RunFailedError, match="stopped before it began"):
+    with subprocesses.stopping(), pytest.raises(RunFailedError, match="stopped before it started"):
         subprocesses.run("train", log=tmp_path / "log")
 
 

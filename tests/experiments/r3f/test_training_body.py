@@ -103,7 +103,7 @@ def found(scene, made, runs, moved):
         "killed": (*r3f, "--resume"),
         "named index": ("--method=r3f", "--ior=glass=1.5"),
         "two indices": (given, "--ior=1.5", "--ior=1.6"),
-        "no index": ("--method=r3f", "--ior=15"),
+        "not an index": ("--method=r3f", "--ior=15"),
         "no number": ("--method=r3f", "--ior=glass"),
         "oracle too": (given, "--method=oracle"),
         "no effect": (given, _GRID),
@@ -176,7 +176,7 @@ def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
         ("half", "Continue with --resume"),
         ("named index", "--ior=glass=1.5, but there is one reconstructed object"),
         ("two indices", "Pass its index once"),
-        ("no index", "--ior=15 is no index of refraction"),
+        ("not an index", "--ior=15 is no index of refraction"),
         ("no number", "--ior=glass is no index of refraction"),
         ("oracle too", "--method=oracle uses the scene's own meshes"),
         ("no effect", "--resolution would have no effect"),
@@ -209,7 +209,7 @@ def test_what_is_reconstructed_for_a_run_is_kept_and_not_made_again(found, runs,
         assert "hull of the training masks" in found[name]["printed"]
     assert "hull of the training masks" not in found["r3f resumed"]["printed"]
     assert found["given"]["body"]["reconstruction"] == str(made)
-    for name in ("straight", "no index", "nothing there", "oracle"):
+    for name in ("straight", "not an index", "nothing there", "oracle"):
         assert not (runs / name).exists(), name
 
 
@@ -225,7 +225,7 @@ def test_a_run_and_what_was_reconstructed_for_it_move_together(found, runs, move
     assert "hull of the training masks" not in found["moved, resumed by its file"]["printed"]
     told = found["file anew"]
     assert told["reconstruction"] == str(runs / "file anew" / "r3f")
-    assert "decided again, because of what is on top of" in told["printed"]
+    assert "decided again, because of flags that override" in told["printed"]
 
 
 @pytest.mark.slow
