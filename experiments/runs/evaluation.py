@@ -27,6 +27,6 @@ def warn_of_lost_light(lost: float, *, advice: str) -> None:
     """
     if lost > _WORTH_A_WARNING:
         print(
-            f"warning: path buffer overflow: {100 * lost:.1f} % of the throughput was dropped, images "
-            f"are too dark. {advice}"
+            f"warning: path buffer overflow: {100 * lost:.1f} % of the throughput was dropped, "
+            f"images are too dark. {advice}"
         )

@@ -63,7 +63,7 @@ def test_one_process_connects_to_nobody_and_speaks(capsys):
 def test_several_processes_do_not_reconstruct(tmp_path):
     options = ["--method=r3f", "--processes=2", "--coordinator=localhost:1", "--process=0"]
     result = run_command("train", f"--out={tmp_path / 'run'}", *options, fails=True)
-    assert "Several processes do not reconstruct together" in result.stderr
+    assert "Several processes cannot reconstruct together" in result.stderr
     assert "Traceback" not in result.stderr and not (tmp_path / "run").exists()
 
 

@@ -96,7 +96,7 @@ _MISTAKES = {
         "--out=OUT --scene=": "--scene is empty. Give a folder",
         "--out=OUT --scene=SCENE --cut=-0.5": "Give 0.02 for 2 %.",
         "--out=OUT --scene=SCENE --ior=glass": "Write as in --ior=glass=1.52.",
-        "--out=OUT --scene=SCENE --paths=straight --unfinished=dark": "none is unfinished",
+        "--out=OUT --scene=SCENE --paths=straight --unfinished=dark": "no path is truncated",
         "--out=OUT --scene=SCENE --views=1,1": "names a view twice",
     },
     "path_trade_off": {
@@ -110,11 +110,11 @@ _MISTAKES = {
         "--out=OUT --scene=SCENE --ior==1.5": "Write as in --ior=glass=1.52.",
     },
     "view": {
-        "--run=x --heights=2,1": "whole numbers that grow",
+        "--run=x --heights=2,1": "increasing integers",
         "--run=nowhere": "nowhere/config.json does not exist",
     },
     "export": {
-        "--run=x --what=body --out=a.obj": "ends with .ply",
+        "--run=x --what=body --out=a.obj": "ends in .ply",
         "--run=nowhere --what=mesh --out=OUT.ply": "nowhere/config.json does not exist",
         "--run=nowhere --what=body --out=OUT.ply": "nowhere/config.json does not exist",
     },

@@ -187,7 +187,7 @@ def test_results_of_two_machines_are_merged_by_copying(tmp_path, serve, scenes):
     shutil.copytree(there / "out" / plan.FOLDER, here / "out" / plan.FOLDER, dirs_exist_ok=True)
     told = serve(here, "--tables_only", "--report_views=1", "--report_edge=16").stdout
     assert f"Report:  {here / 'out/report.html'} (" in told
-    assert f"Picture: {here / 'out/pictures.jpg'}" in told
+    assert f"Images:  {here / 'out/pictures.jpg'}" in told
     assert _text(here, "report.html").count("<article") == 2
     assert _all_but_costs(here) == _all_but_costs(tmp_path)
     assert "several versions" not in _text(here)

@@ -103,7 +103,7 @@ def found(scene, made, runs, moved):
         "killed": (*r3f, "--resume"),
         "named index": ("--method=r3f", "--ior=glass=1.5"),
         "two indices": (given, "--ior=1.5", "--ior=1.6"),
-        "not an index": ("--method=r3f", "--ior=15"),
+        "no index": ("--method=r3f", "--ior=15"),
         "no number": ("--method=r3f", "--ior=glass"),
         "oracle too": (given, "--method=oracle"),
         "no effect": (given, _GRID),
@@ -176,8 +176,8 @@ def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
         ("half", "Continue with --resume"),
         ("named index", "--ior=glass=1.5, but there is one reconstructed object"),
         ("two indices", "Pass its index once"),
-        ("not an index", "--ior=15 is no index of refraction"),
-        ("no number", "--ior=glass is no index of refraction"),
+        ("no index", "--ior=15 is not an index of refraction"),
+        ("no number", "--ior=glass is not an index of refraction"),
         ("oracle too", "--method=oracle uses the scene's own meshes"),
         ("no effect", "--resolution would have no effect"),
         ("no effect of oracle", "add --method=r3f"),
@@ -185,7 +185,7 @@ def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
         ("nothing there", "nowhere holds no reconstruction"),
         ("outliers of no hull", "geometry=occupancy, outliers=1: --outliers has no effect"),
         ("run in its body", "is the reconstruction itself"),
-        ("r3f begun anew", "holds a run already"),
+        ("r3f begun anew", "already contains a run"),
         ("r3f with another grid", "ior 1.5, not 1.6"),
         ("r3f by name alone", "--method would have no effect"),
         ("r3f with a given one", "started with other options"),
@@ -209,7 +209,7 @@ def test_what_is_reconstructed_for_a_run_is_kept_and_not_made_again(found, runs,
         assert "hull of the training masks" in found[name]["printed"]
     assert "hull of the training masks" not in found["r3f resumed"]["printed"]
     assert found["given"]["body"]["reconstruction"] == str(made)
-    for name in ("straight", "not an index", "nothing there", "oracle"):
+    for name in ("straight", "no index", "nothing there", "oracle"):
         assert not (runs / name).exists(), name
 
 
