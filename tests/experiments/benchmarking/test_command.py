@@ -108,7 +108,7 @@ def test_killed_at_any_time_it_comes_to_the_same_tables(tmp_path, serve, scenes)
     serve(cut, scenes, "--methods=straight,tree")
     assert _all_but_costs(cut) == _all_but_costs(whole)
     count = len(calls(cut))
-    assert "All jobs are done already" in serve(cut, scenes, "--methods=straight,tree").stdout
+    assert "All jobs are already finished" in serve(cut, scenes, "--methods=straight,tree").stdout
     assert len(calls(cut)) == count
 
 
@@ -148,7 +148,7 @@ def test_what_was_left_out_stays_listed_and_what_has_no_result_is_listed(tmp_pat
     ball = scenes.replace("*", "cube_smcvx_ball")
     (tmp_path / "scenes/cube_smcvx_ball/meshes/ball_glass.ply").unlink()
     serve(tmp_path, ball, "--methods=tree")
-    assert "All jobs are left out" in serve(tmp_path, ball, "--methods=oracle").stdout
+    assert "All jobs are skipped" in serve(tmp_path, ball, "--methods=oracle").stdout
     serve(tmp_path, scenes, "--methods=straight")
     text = _text(tmp_path)
     assert "- cube_smcvx_ball/tree: it has no meshes" in text
@@ -225,14 +225,14 @@ def test_a_dry_run_lists_and_does_nothing(tmp_path, serve, scenes):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--scenes=nowhere/*",), "names no scene"),
+        (("--scenes=nowhere/*",), "matches no scene"),
         (("--scenes=nowhere",), "nowhere/transforms_train.json does not exist"),
         (("--jobs=2", "--ray=local", _BUNDLED), "--jobs would have no effect on a Ray cluster"),
         (("--job_cpus=1", "--job_gpus=1", _BUNDLED), "--job_cpus, --job_gpus would have no"),
         (("--methods=magic", _BUNDLED), "There is no method 'magic'"),
         (("--rays_per_pixel=3", _BUNDLED), "3 rays a pixel do not make a square"),
         (("--lpips_weights=none.npz", _BUNDLED), "none.npz can not be read as the weights"),
-        (("--tables_only",), "holds no benchmark"),
+        (("--tables_only",), "has no benchmark"),
         (("--tables_only", "--methods=tree"), "--tables_only does not use --methods:"),
         (("--tables_only", "--scenes=/nope"), "--tables_only does not use --scenes:"),
         (("--tables_only", "--dry_run"), "--tables_only does not use --dry_run:"),

@@ -144,8 +144,8 @@ def test_scenes_are_found_by_wildcards_and_folders(tmp_path):
     for words, message in [
         ([str(tmp_path / "*" / "cube_*")], "are named cube_smcvx_ball"),
         ([str(tmp_path / "a" / "preview")], r"preview/transforms_train\.json does not exist"),
-        ([str(tmp_path / "c*")], "names no scene"),
-        ([], "names no scene"),
+        ([str(tmp_path / "c*")], "matches no scene"),
+        ([], "matches no scene"),
     ]:
         with pytest.raises(ValueError, match=message):
             plan.find_scenes(words)
@@ -184,7 +184,7 @@ def test_a_benchmark_grows_but_does_not_change(tmp_path):
         with pytest.raises(ValueError, match=message):
             settings.extended(out, asked)
     (out / settings.FILE).write_text('{"settings": {}}')
-    for folder, message in [(out, "is not that of a benchmark"), (tmp_path, "holds no benchmark")]:
+    for folder, message in [(out, "is not a valid benchmark"), (tmp_path, "has no benchmark")]:
         with pytest.raises(ValueError, match=message):
             settings.read(folder)
 

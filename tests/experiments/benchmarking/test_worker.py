@@ -103,7 +103,7 @@ def test_a_job_waits_for_who_still_works_in_its_run(tmp_path, capsys):
     worker.wait_until_free(tmp_path)
     with atomic_files.hold(tmp_path), pytest.raises(ValueError, match="Another process works"):
         worker.wait_until_free(tmp_path, patience=0.3)
-    line = f"Waiting until the process ends that works in {tmp_path} yet.\n"
+    line = f"Waiting for the process that still works in {tmp_path}.\n"
     assert capsys.readouterr().out == line
 
 
