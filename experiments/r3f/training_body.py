@@ -117,8 +117,8 @@ def given_index(ior: Sequence[str]) -> float | None:
         return None
     if len(ior) > 1 or "=" in ior[0]:
         raise ValueError(
-            f"--ior={ior[-1]} names an object or is one of several, but there is one reconstructed "
-            "object. Pass its index once, as in --ior=1.5."
+            f"--ior={ior[-1]} is invalid for the single reconstructed object. Pass its index once, "
+            "without a name, as in --ior=1.5."
         )
     return refraction_indices.parse(ior[0])
 

@@ -63,8 +63,8 @@ _OF_THE_SCENE = {
 
 # On top of a file that names a reconstruction, and asks for cut=0.01.
 _ON_TOP_OF_R3F = {
-    "--ior=glass=1.5": "--ior=glass=1.5, but there is one reconstructed object",
-    "--resolution=32": "r3f is reconstructed already. Leave it out, or add --method=r3f.",
+    "--ior=glass=1.5": "--ior=glass=1.5 is invalid for the single reconstructed object",
+    "--resolution=32": "r3f is already reconstructed. Remove it, or add --method=r3f.",
     "--reconstruction=x --method=oracle": "Remove either --method or --reconstruction.",
     "--paths=straight": "config.json names the reconstruction",
     "--paths=straight --method=oracle": "Leave them out, or use paths=tree.",
@@ -94,14 +94,14 @@ _MISTAKES = {
     "render_known": {
         "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
         "--out=OUT --scene=": "--scene is empty. Give a folder",
-        "--out=OUT --scene=SCENE --cut=-0.5": "Give 0.02 for 2 %.",
+        "--out=OUT --scene=SCENE --cut=-0.5": "Give 0.02 for 2 %",
         "--out=OUT --scene=SCENE --ior=glass": "Write as in --ior=glass=1.52.",
         "--out=OUT --scene=SCENE --paths=straight --unfinished=dark": "no path is truncated",
         "--out=OUT --scene=SCENE --views=1,1": "names a view twice",
     },
     "path_trade_off": {
         "--out=OUT --scenes=SCENE,nowhere": "nowhere/transforms_train.json does not exist",
-        "--out=OUT --scenes=SCENE --cuts=2": "Give 0.02 for 2 %.",
+        "--out=OUT --scenes=SCENE --cuts=2": "Give 0.02 for 2 %",
         "--out=OUT --scenes=SCENE --ior=glass=x": "Write as in --ior=glass=1.52.",
         "--out=OUT --scenes=SCENE --views=a": "as in --views=0,10,20",
     },
@@ -134,12 +134,12 @@ _MISTAKES = {
         "--out=OUT --methods=tree,strait": "Did you mean straight?",
         "--out=OUT --scenes=SCENE,nowhere": "nowhere/transforms_train.json does not exist",
     },
-    "dataset.convert": {"--scene=nowhere --to=raw --out=OUT": "nowhere is no folder."},
+    "dataset.convert": {"--scene=nowhere --to=raw --out=OUT": "nowhere is not a folder."},
     "dataset.make": {"--out=OUT --scenes=cube_smcvx_bal": "Did you mean cube_smcvx_ball"},
-    "dataset.check": {"x --cut=2": "Give 0.02 for 2 %.", "nowhere": "nowhere is no folder."},
+    "dataset.check": {"x --cut=2": "Give 0.02 for 2 %", "nowhere": "nowhere is not a folder."},
     "convert_nerfstudio": {
         "--source=x --out=OUT --scale=-1": "Give a positive number",
-        "--source=nowhere --out=OUT": "nowhere is no folder.",
+        "--source=nowhere --out=OUT": "nowhere is not a folder.",
     },
 }
 

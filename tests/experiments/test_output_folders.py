@@ -52,7 +52,7 @@ def test_only_what_was_noted_is_replaced(tmp_path):
     assert _files(out) == {"rgb/0.png", "rgb/mine.txt", "command.json"}
     assert (out / "notes").is_dir()
     (out / "metrics.json").write_text("mine")  # is told before the work
-    with pytest.raises(ValueError, match=r"out/metrics.json is not written by this command"):
+    with pytest.raises(ValueError, match=r"out/metrics.json was not written by this command"):
         outputs.replaceable(out, module=__name__, writes=_WRITES, overwrite=True)
     # A note of files that are gone is no obstacle.
     (out / "rgb" / "0.png").unlink()

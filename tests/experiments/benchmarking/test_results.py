@@ -30,13 +30,13 @@ def _read(out, scenes=()):
     [
         (
             _TREE._replace(options=_TREE.options | {"train": ["--preset=tiny"]}),
-            "made by train --preset=tiny, and here tree is train --preset=tiny --steps=6",
+            "made by train --preset=tiny, but here tree is train --preset=tiny --steps=6",
         ),
         (_TREE._replace(options={**_TREE.options, "evaluate": []}), "made by evaluate"),
         (_TREE._replace(settings=dataclasses.replace(SETTINGS, seed=1)), "with other settings"),
-        (_TREE._replace(category="smncvx"), "its name says smcvx before cube"),
-        (_TREE._replace(background="env"), "its name says smcvx before cube"),
-        (_TREE._replace(method="magic"), "method magic, which this version does not know"),
+        (_TREE._replace(category="smncvx"), "its name has smcvx and cube"),
+        (_TREE._replace(background="env"), "its name has smcvx and cube"),
+        (_TREE._replace(method="magic"), "method magic, which is unknown in this version"),
         (_TREE._replace(fingerprint="other"), "another scene named cube_smcvx_ball"),
     ],
 )

@@ -222,7 +222,7 @@ def test_top_views_are_means_over_the_five_farthest():
     few = made_record("cube_smcvx_cube", "tree", psnr=1.0)._replace(per_image=views[:2])
     for records, told in (([record], "5"), ([few], "2"), ([few, record], "2 to 5")):
         notes = paper_tables.top_views_table(records).notes
-        assert f"the {told} rendered test views" in notes[0]
+        assert f"The {told} rendered test views" in notes[0]
     assert paper_tables.top_views_table([]).blocks == ()
 
 

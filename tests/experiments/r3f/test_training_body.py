@@ -174,7 +174,7 @@ def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
     ("name", "message"),
     [
         ("half", "Continue with --resume"),
-        ("named index", "--ior=glass=1.5, but there is one reconstructed object"),
+        ("named index", "--ior=glass=1.5 is invalid for the single reconstructed object"),
         ("two indices", "Pass its index once"),
         ("no index", "--ior=15 is not an index of refraction"),
         ("no number", "--ior=glass is not an index of refraction"),
