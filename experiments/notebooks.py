@@ -190,7 +190,7 @@ def _run_cells(notebook: nbformat.NotebookNode, name: str, copy: Path, cell_seco
 
 
 def _follow(client: nbclient.NotebookClient, show: Callable[[int, str], None]) -> list[int]:
-    """Reports each finished cell with its duration; returns the start times as a list."""
+    """Reports each finished cell with its duration; returns the growing list of started cells."""
     begun: list[int] = []
     starts: list[float] = []
 

@@ -171,7 +171,7 @@ def _describe_light(facts: LightFacts) -> str:
         f"refinement by light: error of the validation views {facts.before:.4f} before, "
         f"{facts.after:.4f} after {facts.steps} steps"
     )
-    return f"{told}; kept" if facts.kept else f"{told}; left out"
+    return f"{told}; kept" if facts.kept else f"{told}; discarded"
 
 
 def _describe_geometry(found: Reconstruction) -> str:
@@ -180,7 +180,7 @@ def _describe_geometry(found: Reconstruction) -> str:
         f"geometry: {facts.faces} faces from {facts.masks} masks of {facts.width} x "
         f"{facts.height}; {', '.join(facts.stages) or 'not refined'}"
     ]
-    told += [f"  left out {refused}" for refused in facts.refused]
+    told += [f"  skipped {refused}" for refused in facts.refused]
     told += [f"warning: {doubt}" for doubt in facts.doubts]
     return "\n".join(told)
 

@@ -105,7 +105,7 @@ def is_there(out: Path, facts: GeometryFacts) -> bool:
 
 
 def _within(path: Path, scene: Path) -> Path:
-    """Returns the path of a file relative to the parent of its scene, which may be moved."""
+    """Returns the path of a file relative to its scene, whose folder may be moved."""
     return path.relative_to(scene) if path.is_relative_to(scene) else path
 
 

@@ -45,7 +45,7 @@ from refref_jax.training.config import TrainConfig
 from refref_jax.training.resolve import read_facts, resolve
 
 PRESET = "tiny"
-"""Footprint of the background's model, whose field is only queried."""
+"""Preset of the background's model, whose field is only queried."""
 
 STEPS = 1000
 """Training steps of the background; more change the index by less than a thousandth."""

@@ -239,7 +239,7 @@ def _table(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
     ]
     if found.light is not None:
         light = found.light
-        kept = f"kept, with index {light.index:.4f}" if light.kept else "left out"
+        kept = f"kept, with index {light.index:.4f}" if light.kept else "discarded"
         rows.append(
             (
                 "error of validation views, by light",
@@ -291,6 +291,6 @@ def _making(found: Reconstruction) -> str:
         + (f" `--background={config.space}`" if config.space is not None else "")
         + (f" `--radius={config.radius:g}`" if config.radius is not None else ""),
         f"- refined: {', '.join(geometry.stages) or 'nothing to do'}",
-        *(f"- left out {refused}" for refused in geometry.refused),
+        *(f"- skipped {refused}" for refused in geometry.refused),
     ]
     return "\n".join(told)

@@ -34,7 +34,7 @@ FOLDER = "r3f"
 
 
 def asked(options: Options, *, say: config_flags.Say) -> TrainConfig:
-    """Returns the configuration of the command line; `--ior` is ignored for reconstructions.
+    """Returns the command line's configuration, without `--ior` if the object is reconstructed.
 
     Args:
       options: flags of the configuration, by name.

@@ -42,7 +42,7 @@ from refref_jax.reconstruct.refractive_index import Evidence
 from refref_jax.render.model import ModelConfig
 
 HANDLES = 256
-"""Enough for errors of a twentieth of the object's size; finer detail is noise of the masks."""
+"""Sufficient for errors of a twentieth of the object's size; finer detail is noise of masks."""
 
 # Handles per vertex.
 _NEAREST = 6

@@ -124,7 +124,7 @@ class _OccupancyField(nn.Module):
 Signed = Callable[[Float[Array, "3"]], Float[Array, ""]]
 """A field as a function of position only, see the module."""
 
-# Half-width of the second scan around the deepest sample, in spacings; its refinement; its repeats.
+# Samples around the deepest one, in spacings; factor by which they refine it; number of repeats.
 _NEARBY = (-1.0, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0)
 _FINER = 4.0
 _ROUNDS = 2

@@ -85,7 +85,7 @@ def distance_map(
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
     """Colours distances at the size of the page.
 
-    Downsampling takes the nearest distance: the mean of two would not be on any surface.
+    Downsampling takes nearest neighbours: the mean of two distances may be on no surface.
     """
     image = Image.fromarray(distances.astype(np.float32))
     return colour(np.asarray(image.resize(_size(image, edge), Image.Resampling.NEAREST)), scale)

@@ -311,7 +311,7 @@ def test_light_is_kept_only_where_validation_views_say_so(
     grown = np.ptp(part.vertices) / np.ptp(old.vertices)
     assert grown == pytest.approx(1.001 if kept else 1.0)
     told = (out / "report.md").read_text()
-    assert ("(light/ball_glass.ply)" in told) == kept and ("; left out" in told) != kept
+    assert ("(light/ball_glass.ply)" in told) == kept and ("; discarded" in told) != kept
     # The index was given, so that light leaves it alone.
     assert json.loads((out / "index.json").read_text())["index"] == part.index == 1.5
     if kept:
