@@ -189,7 +189,7 @@ def _list(out: Path, planned: Sequence[Job], skipped: Sequence[Skipped]) -> None
     for job, is_done in zip(planned, done, strict=True):
         print(f"{'done' if is_done else 'to do':6} {job.name:48} {' '.join(job.train)}".rstrip())
     for each in skipped:
-        print(f"{'skipped':6} {each.name}: {each.reason}")
+        print(f"{'skip':6} {each.name}: {each.reason}")
     print(f"{len(planned)} jobs, {done.count(False)} to do.")
 
 
