@@ -173,7 +173,7 @@ def test_errors_say_what_to_do():
         carve(masks, cameras, outliers=30)
     with pytest.raises(ReconstructionError, match="resolution=9 is too coarse"):
         carve(masks, cameras, resolution=9)
-    with pytest.raises(ReconstructionError, match="masks are uint8"):
+    with pytest.raises(ReconstructionError, match="masks have the type uint8"):
         check_masks(masks.astype(np.uint8), cameras)
     broken = cameras.poses.copy()
     broken[3, 0, 3] = np.nan
