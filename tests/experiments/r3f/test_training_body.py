@@ -182,7 +182,7 @@ def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
         ("no effect", "--resolution would have no effect"),
         ("no effect of oracle", "add --method=r3f"),
         ("straight", "--paths=straight ignores objects"),
-        ("nothing there", "nowhere holds no reconstruction"),
+        ("nothing there", "nowhere has no reconstruction"),
         ("outliers of no hull", "geometry=occupancy, outliers=1: --outliers has no effect"),
         ("run in its body", "is the reconstruction itself"),
         ("r3f begun anew", "already contains a run"),
