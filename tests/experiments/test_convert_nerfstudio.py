@@ -50,7 +50,7 @@ def test_the_command_both_ways(folder, tmp_path):
     assert "nothing is overwritten" in again.stderr and "Traceback" not in again.stderr
     back = (f"--source={tmp_path / 'scene'}", f"--out={tmp_path / 'back'}", "--to=nerfstudio")
     result = run_command("convert_nerfstudio", *back)
-    assert "train on the object alone" in result.stdout
+    assert "train on the object only" in result.stdout
     assert "ns-train nerfacto --data" in result.stdout
     capture = nerfstudio.read_capture(tmp_path / "back")
     views = {

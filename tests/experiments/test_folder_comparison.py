@@ -145,7 +145,7 @@ def test_all_sizes_are_looked_at_before_anything_is_compared(folders, masks):
     (masks / "r_001.png").unlink()
     with pytest.raises(ValueError, match="There is no mask of r_001"):
         image_folders.match(*folders, masks)
-    with pytest.raises(ValueError, match="nowhere is no folder"):
+    with pytest.raises(ValueError, match="nowhere is not a folder"):
         image_folders.match(folders[0], masks / "nowhere", None)
     (folders[0] / "r_001.exr").write_text("no EXR")
     with pytest.raises(ValueError, match=r"rendered/r_001\.exr can not be read as EXR"):

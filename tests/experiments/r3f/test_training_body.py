@@ -188,7 +188,7 @@ def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
         ("r3f begun anew", "already contains a run"),
         ("r3f with another grid", "ior 1.5, not 1.6"),
         ("r3f by name alone", "--method would have no effect"),
-        ("r3f with a given one", "started with other options"),
+        ("r3f with a given one", "begun with other options"),
         ("file with named index", "Pass its index once"),
         ("file with oracle", "ball_glass.ply can not be read"),
         ("file with a grid", "is already reconstructed. Remove it, or add --method=r3f."),
