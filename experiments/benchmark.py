@@ -1,17 +1,17 @@
-"""Compares methods over scenes: trains and evaluates each with each, and tables what comes of it.
+"""Compares methods over scenes: trains and evaluates each pair, and tabulates the results.
 
 python -m experiments.benchmark --scenes='scenes/*' --methods=straight,oracle,tree --out=runs/all
 
-One job for each scene and method, each command in a process of its own. Killed at any time, in
-whatever way, the same command goes on where it was, and does only what is missing; scenes and
-methods can be added later. What fails is listed, and the rest goes on. After every job
-{out}/summary.md is written anew: methods by category and background beside the paper's numbers, the
-test views farthest from the training views, and ablations; as Markdown, CSV, JSON and LaTeX in
-{out}/tables. At the end {out}/report.html shows all of it, with pictures, in one page that needs no
-network, and {out}/pictures.jpg a typical view of each scene. --tables_only makes these again.
+There is one job for each scene and method, whose commands run in separate processes. An interrupted
+benchmark resumes where it stopped if the same command is repeated; scenes and methods can be added
+later. Failed jobs are listed, and the others continue. After every job {out}/summary.md is updated:
+methods by category and background next to the paper's numbers, the test views farthest from the
+training views, and ablations. {out}/tables has the same as Markdown, CSV, JSON and LaTeX. At the
+end {out}/report.html shows all results with images in one self-contained page, and
+{out}/pictures.jpg a typical view of each scene. --tables_only writes these files again.
 
-Jobs are done on this machine, --jobs at once, or on a Ray cluster with --ray=ADDRESS, whose
-machines see --out, --scenes and these modules by the same paths. docs/benchmark.md says all.
+Jobs run on this machine, --jobs at a time, or on a Ray cluster with --ray=ADDRESS, whose machines
+must see --out, --scenes and these modules under the same paths. See docs/benchmark.md.
 """
 
 from __future__ import annotations
@@ -45,49 +45,49 @@ with epy.lazy_imports():
 _SCENES = flags.DEFINE_list(
     "scenes",
     [],
-    "Scenes, parted by commas: folders, with wildcards or without, or hf:CONFIG/SCENE of the "
+    "Scenes, separated by commas: folders, with or without wildcards, or hf:CONFIG/SCENE of the "
     "published data set.",
 )
 _METHODS = flags.DEFINE_list(
     "methods",
     ["straight", "oracle", "tree"],
-    f"Methods: {', '.join(methods.METHODS)}; main, ablations and all stand for many.",
+    f"Methods: {', '.join(methods.METHODS)}; main, ablations and all are groups of them.",
 )
 app.check(_METHODS, methods.parse)
 _OUT = cli_flags.out("Folder of the benchmark.")
 _PRESET = cli_flags.preset("Preset of all trainings.")
 _STEPS = flags.DEFINE_integer(
-    "steps", None, "Steps of each training; the preset's if not given.", 1
+    "steps", None, "Steps of each training; those of the preset by default.", 1
 )
 _LIMIT = cli_flags.limit()
 _RAYS_PER_PIXEL = cli_flags.rays_per_pixel(4)
 _SEED = cli_flags.seed()
-_JOBS = flags.DEFINE_integer("jobs", 1, "Jobs at once on this machine.", 1)
+_JOBS = flags.DEFINE_integer("jobs", 1, "Number of concurrent jobs on this machine.", 1)
 _RAY = flags.DEFINE_string(
-    "ray", None, "Address of a Ray cluster that does the jobs, or 'local' to start one here."
+    "ray", None, "Address of a Ray cluster that runs the jobs, or 'local' to start one here."
 )
-_JOB_CPUS = flags.DEFINE_float("job_cpus", 1.0, "CPUs that a job takes of a cluster.", 0.0)
-_JOB_GPUS = flags.DEFINE_float("job_gpus", 0.0, "Accelerators that it takes.", 0.0)
-_DRY_RUN = flags.DEFINE_bool("dry_run", False, "List the jobs, and do nothing.")
+_JOB_CPUS = flags.DEFINE_float("job_cpus", 1.0, "CPUs of the cluster per job.", 0.0)
+_JOB_GPUS = flags.DEFINE_float("job_gpus", 0.0, "Accelerators per job.", 0.0)
+_DRY_RUN = flags.DEFINE_bool("dry_run", False, "List the jobs without running them.")
 _TABLES_ONLY = flags.DEFINE_bool(
-    "tables_only", False, "Make the tables and the report again, and do no job."
+    "tables_only", False, "Write the tables and the report again without running jobs."
 )
 _REPORT_VIEWS = flags.DEFINE_integer(
     "report_views",
     5,
-    "Test views of a scene in the report: three in five where methods fail most, the others spread "
+    "Test views per scene in the report: three in five where methods fail most, the others spread "
     "evenly.",
     1,
 )
 _REPORT_EDGE = flags.DEFINE_integer(
     "report_edge",
     200,
-    "Longest edge of the report's pictures in pixels; larger ones are reduced.",
+    "Longest edge of the report's images in pixels; larger ones are downsampled.",
     16,
 )
 _LPIPS_WEIGHTS = cli_flags.lpips_weights()
 
-# What decides results, and who does the jobs.
+# Flags that affect results, and flags that select the engine.
 _OF_JOBS = (
     *(_PRESET, _STEPS, _LIMIT, _RAYS_PER_PIXEL, _SEED, _LPIPS_WEIGHTS),
     *(_JOBS, _RAY, _JOB_CPUS, _JOB_GPUS),
@@ -95,10 +95,10 @@ _OF_JOBS = (
 
 
 def main() -> None:
-    """Does all jobs that are missing, and writes the tables and the report."""
+    """Runs all missing jobs, and writes the tables and the report."""
     out = Path(_OUT.value).absolute()
     if out.exists() and not out.is_dir():
-        raise ValueError(f"{out} is a file, but a folder is needed. Give another --out.")
+        raise ValueError(f"{out} is a file, not a folder. Give another --out.")
     if _TABLES_ONLY.value:
         _make_tables(out)
         return
@@ -113,11 +113,11 @@ def main() -> None:
     if _DRY_RUN.value:
         _list(out, planned, skipped)
         return
-    # A benchmark that is killed takes the commands that it waits for with it.
+    # If the benchmark is killed, its child processes are stopped too.
     app.stop_at_kill()
     out.mkdir(parents=True, exist_ok=True)
     with atomic_files.hold(out):
-        # Another process may have added to it meanwhile.
+        # Another process may have added to the plan meanwhile.
         benchmark = settings.extended(out, benchmark)
         settings.write(out, benchmark)
         failed = worker.run_missing(
@@ -126,26 +126,26 @@ def main() -> None:
         _finish(out)
     print(f"Next: {_next(out, chosen)}")
     for each in skipped:
-        print(f"left out: {each.name}: {each.reason}")
+        print(f"skipped: {each.name}: {each.reason}")
     for name, reason in failed.items():
         print(f"failed: {name}: {reason}", file=sys.stderr)
     if failed:
-        print("The same command tries them again.", file=sys.stderr)
+        print("Repeat the command to retry them.", file=sys.stderr)
         sys.exit(1)
 
 
 def _make_tables(out: Path) -> None:
-    """Writes tables and report of the results that are there.
+    """Writes tables and report of the existing results.
 
     Raises:
-      ValueError: if an option is given that this does not use, there is no benchmark, or another
-        process works in it.
+      ValueError: if unused flags are set, if there is no benchmark, or if another process works in
+        it.
     """
     unused = [f"--{each.name}" for each in (_SCENES, _METHODS, *_OF_JOBS, _DRY_RUN) if each.present]
     if unused:
         raise ValueError(
-            f"--tables_only does not use {', '.join(unused)}: tables are of the results that are "
-            "there. Leave out the one or the other."
+            f"--tables_only does not use {', '.join(unused)}, because it only reads existing "
+            "results. Remove one or the other."
         )
     benchmark = settings.read(out)
     with atomic_files.hold(out):
@@ -156,7 +156,7 @@ def _make_tables(out: Path) -> None:
 
 
 def _settings(weights: Path | None) -> Settings:
-    """Returns what the options fix for all results, measured with these weights of LPIPS."""
+    """Returns the settings that all results share, from the flags and the weights of LPIPS."""
     return settings.Settings(
         preset=_PRESET.value,
         steps=_STEPS.value or presets.PRESETS[_PRESET.value].schedule.steps,
@@ -168,13 +168,13 @@ def _settings(weights: Path | None) -> Settings:
 
 
 def _check_engine() -> None:
-    """Refuses options that who does the jobs would not heed."""
+    """Rejects flags that the selected engine ignores."""
     unheeded = (_JOB_CPUS, _JOB_GPUS) if _RAY.value is None else (_JOBS,)
     if given := [f"--{each.name}" for each in unheeded if each.present]:
         who = "without --ray" if _RAY.value is None else "on a Ray cluster"
         raise ValueError(
-            f"{', '.join(given)} would have no effect {who}. Leave it out, or "
-            + ("add --ray=ADDRESS." if _RAY.value is None else "leave out --ray.")
+            f"{', '.join(given)} would have no effect {who}. Remove it, or "
+            + ("add --ray=ADDRESS." if _RAY.value is None else "remove --ray.")
         )
 
 
@@ -189,22 +189,22 @@ def _list(out: Path, planned: Sequence[Job], skipped: Sequence[Skipped]) -> None
     for job, is_done in zip(planned, done, strict=True):
         print(f"{'done' if is_done else 'to do':6} {job.name:48} {' '.join(job.train)}".rstrip())
     for each in skipped:
-        print(f"{'out':6} {each.name}: {each.reason}")
+        print(f"{'skip':6} {each.name}: {each.reason}")
     print(f"{len(planned)} jobs, {done.count(False)} to do.")
 
 
 def _finish(out: Path) -> None:
-    """Writes report and picture, and says where everything is."""
+    """Writes report and contact sheet, and prints the paths of all results."""
     report = page.write(out, views=_REPORT_VIEWS.value, edge=_REPORT_EDGE.value)
     print(f"Summary: {out / summary.FILE}")
     print(f"Tables:  {out / summary.TABLES}")
     print(f"Results: {out / summary.RESULTS}")
     print(f"Report:  {report} ({report.stat().st_size / 1e6:.1f} MB)")
-    print(f"Picture: {images.write_sheet(out) or 'none, for the scenes are gone'}")
+    print(f"Images:  {images.write_sheet(out) or 'none, because the scenes are missing'}")
 
 
 def _next(out: Path, done: Sequence[Method]) -> str:
-    """Returns the command that adds the ablations to a benchmark, or another if they are done."""
+    """Returns the command that adds the ablations, or another suggestion if they are finished."""
     if {each.name for each in methods.parse(["ablations"])} <= {each.name for each in done}:
         return f"open {out / page.FILE} in a browser, or add scenes or methods"
     deciding = (*_OF_JOBS, _REPORT_VIEWS, _REPORT_EDGE)
@@ -214,4 +214,4 @@ def _next(out: Path, done: Sequence[Method]) -> str:
 
 
 if __name__ == "__main__":
-    app.run(main, again="it goes on; jobs that are done are not done again.")
+    app.run(main, again="repeat the command to resume; finished jobs are skipped.")

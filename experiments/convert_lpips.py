@@ -1,10 +1,10 @@
-"""Puts the published weights of LPIPS into one file that this package reads.
+"""Converts the published weights of LPIPS into one file that this package reads.
 
 python -m experiments.convert_lpips --alexnet=FILE.pth --lpips=FILE.pth --out=lpips.npz
 
-The weights are of others, and are not distributed here; `docs/metrics.md` tells where they are
-published. `.pth` files are read by PyTorch, which this package does not need otherwise; `.npz`
-files with the same names are read without it.
+The weights are third-party work and are not distributed here; `docs/metrics.md` lists their
+sources. `.pth` files require PyTorch, which this package does not need otherwise; `.npz` files with
+the same names do not.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _ALEXNET = flags.DEFINE_string(
 _LPIPS = flags.DEFINE_string(
     "lpips", None, "State dict of LPIPS with AlexNet, version 0.1, .pth or .npz.", required=True
 )
-_OUT = cli_flags.out("The .npz to write.")
+_OUT = cli_flags.out("The .npz file to write.")
 _OVERWRITE = cli_flags.overwrite("the file if it exists")
 
 
@@ -51,24 +51,24 @@ def main() -> None:
 
 
 def read_state_dict(path: Path) -> dict[str, np.ndarray]:
-    """Reads named arrays, from PyTorch's format or NumPy's.
+    """Reads named arrays from PyTorch's or NumPy's format.
 
     Raises:
-      ValueError: if the file can not be read, or PyTorch is needed and not installed.
+      ValueError: if the file cannot be read, or PyTorch is required but not installed.
     """
     if not path.is_file():
-        raise ValueError(f"{path} does not exist. docs/metrics.md tells where to get it.")
+        raise ValueError(f"{path} does not exist. See docs/metrics.md for its source.")
     reader = _read_npz if path.suffix == ".npz" else _reader_of_torch(path)
     try:
         return reader(path)
     except pickle.UnpicklingError as error:
         raise ValueError(
-            f"{path} holds more than tensors, or is no such file. Give a state dict as it is "
-            "published, not a whole model."
+            f"{path} contains more than tensors, or is not a PyTorch file. Give the published "
+            "state dict, not a pickled model."
         ) from error
-    except Exception as error:  # PyTorch raises what its unpickler does
+    except Exception as error:  # PyTorch raises the errors of its unpickler
         raise ValueError(
-            f"{path} can not be read as a state dict ({error}). Copy it again."
+            f"{path} cannot be read as a state dict ({error}). Copy it again."
         ) from error
 
 
@@ -82,14 +82,14 @@ def _reader_of_torch(path: Path) -> Callable[[Path], dict[str, np.ndarray]]:
         import torch
     except ImportError as error:
         raise ValueError(
-            f"{path} is read by PyTorch, which is not installed. Run this once where it is (pip "
+            f"{path} requires PyTorch, which is not installed. Run this command where it is (pip "
             "install torch), or give the same arrays as .npz."
         ) from error
 
     def read_torch(path: Path) -> dict[str, np.ndarray]:
         state = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(state, dict):
-            raise TypeError("it holds no dict")
+            raise TypeError("it is not a dict")
         tensors = {name: x for name, x in state.items() if isinstance(x, torch.Tensor)}
         return {name: x.detach().numpy() for name, x in tensors.items()}
 
@@ -97,18 +97,18 @@ def _reader_of_torch(path: Path) -> Callable[[Path], dict[str, np.ndarray]]:
 
 
 def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    # NumPy appends .npz to names, but not to files.
+    # NumPy appends .npz to paths, but not to open files.
     with path.open("wb") as file:
         np.savez(file, **arrays)
 
 
 def _refuse_other_files(out: str | None) -> None:
     if out is not None and not out.endswith(".npz"):
-        raise ValueError(f"--out={out} does not end in .npz. Give a name that does.")
+        raise ValueError(f"--out={out} does not end in .npz. Give a name with this ending.")
 
 
 app.check(_OUT, _refuse_other_files)
 
 
 if __name__ == "__main__":
-    app.run(main, again="it converts anew; --overwrite replaces the file.")
+    app.run(main, again="repeat the command to convert again; --overwrite replaces the file.")

@@ -3,8 +3,9 @@
 python -m experiments.convert_nerfstudio --source=CAPTURE --out=SCENE --centre=auto --scale=auto
 python -m experiments.convert_nerfstudio --source=SCENE --out=CAPTURE --to=nerfstudio
 
-Captures of COLMAP come this way too, through nerfstudio's ns-process-data. `docs/data_formats.md`
-tells how, and what of a capture a scene can hold. Nothing is overwritten.
+COLMAP captures are converted in the same way after nerfstudio's ns-process-data.
+`docs/data_formats.md` describes the steps, and which parts of a capture a scene supports. Nothing
+is overwritten.
 """
 
 from __future__ import annotations
@@ -29,30 +30,30 @@ with epy.lazy_imports():
     from refref_jax.data.nerfstudio import conversion as to_nerfstudio
     from refref_jax.reconstruct import visual_hull
 
-_SOURCE = flags.DEFINE_string("source", None, "What to convert: a folder.", required=True)
-_OUT = cli_flags.out("Folder to write; must not exist.")
-_TO = flags.DEFINE_enum("to", "scene", ["scene", "nerfstudio"], "What to write.")
+_SOURCE = flags.DEFINE_string("source", None, "Folder to convert.", required=True)
+_OUT = cli_flags.out("Folder to write, which must not exist.")
+_TO = flags.DEFINE_enum("to", "scene", ["scene", "nerfstudio"], "Format to write.")
 _MASKS = flags.DEFINE_enum(
     "masks",
     "object",
     ["object", "background", "none"],
-    "What is white in nerfstudio's masks: the object, or all but the object; none leaves them out. "
-    "nerfstudio ignores what is black.",
+    "Meaning of white in nerfstudio's masks: the object, or all but the object; none drops them. "
+    "nerfstudio ignores black pixels.",
 )
 _TEST_EVERY = flags.DEFINE_integer(
-    "test_every", 8, "Each n-th image is for testing, if the capture has no lists.", 2
+    "test_every", 8, "Every n-th image is a test image, if the capture has no lists.", 2
 )
 _WORLD = flags.DEFINE_enum(
     "world",
     "file",
     ["file", "original"],
-    "Frame of the poses: the file's, or that of before its applied_transform (as COLMAP's).",
+    "Frame of the poses: that of the file, or that before its applied_transform (as in COLMAP).",
 )
 _CENTRE = flags.DEFINE_string(
-    "centre", "0,0,0", "What becomes the origin: x,y,z, or auto for where the optical axes meet."
+    "centre", "0,0,0", "New origin: x,y,z, or auto for the point where the optical axes meet."
 )
 _SCALE = flags.DEFINE_string(
-    "scale", "1", "Factor of all lengths, or auto: cameras are 4 from the origin on average."
+    "scale", "1", "Factor of all lengths, or auto: mean distance of the cameras to the origin is 4."
 )
 
 
@@ -102,9 +103,9 @@ def _make_capture(source: Path, out: Path) -> None:
     for split, frames in splits.items():
         print(f"{split}: {len(frames.names)} images")
     if _MASKS.value != "none" and splits["train"].masks is not None:
-        kept = "the object alone" if _MASKS.value == "object" else "all but the object"
+        kept = "the object only" if _MASKS.value == "object" else "all but the object"
         print(f"Masks: nerfstudio will train on {kept}; --masks=none for whole images.")
-    print("Left out: depth, meshes and scene.json, if there are any: the layout has no place.")
+    print("Skipped: depth, meshes and scene.json, which the format does not support.")
     print(f"Capture: {out}")
     print(f"Next: ns-train nerfacto --data {out}")
 
@@ -116,27 +117,27 @@ def _chosen_placement(poses: np.ndarray) -> conversion.Placement:
     if scale is None:
         distance = np.linalg.norm(poses[:, :, 3] - centre, axis=-1).mean()
         if distance == 0.0:
-            raise ValueError("All cameras stand in the centre. Give --scale a number.")
+            raise ValueError("All cameras are in the centre. Give --scale a number.")
         return conversion.Placement(centre, conversion.USUAL_DISTANCE / distance)
     return conversion.Placement(centre, scale)
 
 
 def read_centre(word: str) -> list[float] | None:
-    """Returns the point that an option means; `None` for auto.
+    """Parses the value of --centre; `None` for auto.
 
     Raises:
-      ValueError: if it is no point.
+      ValueError: if it is not a point.
     """
     if word == "auto":
         return None
     centre = [_number("centre", each) for each in word.split(",")]
     if len(centre) != 3:
-        raise ValueError(f"--centre is {word}. Give x,y,z, as 0,0.5,1, or auto.")
+        raise ValueError(f"--centre is {word}. Give x,y,z, as in 0,0.5,1, or auto.")
     return centre
 
 
 def read_scale(word: str) -> float | None:
-    """Returns the factor that an option means; `None` for auto.
+    """Parses the value of --scale; `None` for auto.
 
     Raises:
       ValueError: if it is not positive.
@@ -155,7 +156,7 @@ def _number(flag: str, word: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise ValueError(f"--{flag} has {word!r}, which is no finite number. Give one, or auto.")
+        raise ValueError(f"--{flag} has {word!r}, which is not a finite number. Give one, or auto.")
     return value
 
 
@@ -163,32 +164,32 @@ def _tell_splits(written: dict[str, from_nerfstudio.Converted]) -> None:
     for split, done in written.items():
         columns, rows, _, stretch = done.lens
         size, before = f"{columns.size} x {rows.size}", f"{done.before[0]} x {done.before[1]}"
-        cut = "" if size == before else f", cut from {before} around the principal point"
+        cut = "" if size == before else f", cropped from {before} around the principal point"
         print(f"{split}: {done.frames} images of {size}{cut}")
         if off := max(columns.shift, rows.shift) + stretch:
-            print(f"{split}: pixels are off by up to {off:.2f}, see docs/data_formats.md")
+            print(f"{split}: pixels are displaced by up to {off:.2f}, see docs/data_formats.md")
         if done.masked is not None:
             print(f"{split}: masks mark {100 * done.masked:.1f} % of the pixels as object")
 
 
 def _tell_left_out(capture: nerfstudio.Capture, unlisted: int) -> None:
     if unlisted:
-        print(f"Left out: {unlisted} frames that are in no list of the capture.")
+        print(f"Skipped: {unlisted} frames that are not in the capture's lists.")
     if capture.has_depth:
-        print("Left out: depth maps; they would serve evaluation alone.")
+        print("Skipped: depth maps, which are only useful for evaluation.")
     if "test" not in (capture.splits or {"test": ()}):
-        print("warning: there are no test images, so nothing can be evaluated on them.")
+        print("warning: there are no test images, so the test split cannot be evaluated.")
 
 
 def _tell_placement(poses: np.ndarray, where: conversion.Placement) -> None:
     centre = ",".join(f"{value:.6g}" for value in where.centre)
-    print(f"World: x -> {where.scale:.6g} (x - ({centre})), which meshes have to go through too")
+    print(f"World: x -> {where.scale:.6g} (x - ({centre})), which applies to meshes too")
     distances = np.linalg.norm(poses[:, :, 3], axis=-1)
     print(f"Cameras: {distances.min():.3g} to {distances.max():.3g} from the origin")
     if where.scale == 1.0 and not where.centre.any():
         print(
-            f"R3F looks for the body within {visual_hull.REACH} units of the origin along each "
-            "axis: --centre and --scale move it there."
+            f"R3F searches for the object within {visual_hull.REACH} units of the origin along "
+            "each axis: use --centre and --scale to move it there."
         )
 
 
@@ -197,4 +198,4 @@ app.check(_SCALE, read_scale)
 
 
 if __name__ == "__main__":
-    app.run(main, again="it is refused, for a converted folder is never replaced.")
+    app.run(main, again="a converted folder is never replaced.")

@@ -1,9 +1,9 @@
-"""Renders a split of a scene with a trained model, and measures it.
+"""Renders a split of a scene with a trained model, and computes metrics.
 
 python -m experiments.evaluate --run=runs/ball --split=test --rays_per_pixel=4
 
-With several rays a pixel colours are averaged as linear light, and a pixel's distance is the median
-of its rays'; see `refref_jax.render.images`. `docs/metrics.md` explains each metric.
+With several rays per pixel, colours are averaged in linear radiance, and the distance of a pixel is
+the median of its rays; see `refref_jax.render.images`. `docs/metrics.md` explains each metric.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _SPLIT = cli_flags.split("Images to render.")
 _RAYS_PER_PIXEL = cli_flags.rays_per_pixel(1)
 _LIMIT = cli_flags.limit()
 _STEP = cli_flags.step()
-_SCENE = cli_flags.scene("The scene, if it has moved", required=False)
+_SCENE = cli_flags.scene("The scene, if it has been moved", required=False)
 _CHUNK = cli_flags.chunk()
 _OVERWRITE = cli_flags.overwrite("an earlier evaluation of that split")
 _LPIPS_WEIGHTS = cli_flags.lpips_weights()
@@ -59,7 +59,7 @@ def main() -> None:
     cli_scenes.check(_SCENE.value)
     lpips = perceptual.chosen(_LPIPS_WEIGHTS.value)
     config = run_folder.read_config(run)
-    # Resolved first, and once: training may be going on.
+    # Resolved once, at the start: the training may still be running.
     step = _STEP.value if _STEP.value is not None else checkpoint_io.latest_step(run)
     model = checkpoint_io.load_model(run, step=step)
     scene = cli_scenes.opened(_SCENE.value or config.scene.path)
@@ -80,13 +80,13 @@ def main() -> None:
     reporting.warn_of_lost_light(
         summary["results"]["lost"], advice="Train with a larger --cut or fewer --bends."
     )
-    print(f"Pictures: {out / 'comparison.png'}, {out / 'rgb'}, {out / 'distance'}")
+    print(f"Images:   {out / 'comparison.png'}, {out / 'rgb'}, {out / 'distance'}")
     print(f"Metrics:  {out / 'metrics.json'}")
     print(f"Next: {app.shell('render', f'--run={run}', '--views=orbit')}")
 
 
 def _method(run: Path, paths: str) -> str:
-    """Returns what a run's geometry and light paths are called together."""
+    """Returns the name of a run's combination of geometry and light paths."""
     names = _METHODS if object_source.read(run) is None else _RECONSTRUCTED
     return names.get(paths, paths)
 
@@ -130,4 +130,4 @@ def evaluate(
 
 
 if __name__ == "__main__":
-    app.run(main, again="it evaluates anew; --overwrite replaces the results.")
+    app.run(main, again="repeat the command to evaluate again; --overwrite replaces the results.")

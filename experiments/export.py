@@ -1,14 +1,14 @@
-"""Writes a run's surfaces as PLY for other programs: the field's, or the bodies that bend light.
+"""Exports a run's surfaces as PLY: those of the field, or the objects that refract light.
 
 python -m experiments.export --run=runs/ball --what=mesh --out=ball.ply
 
-    mesh      where the field's density crosses --level, and walls where the scene has some, with
+    mesh      level set of the field's density at --level, and the background if it has walls, with
               normals and colours
     points    the same surfaces as points of a grid
-    body      the bodies: those of R3F, or the scene's meshes; with the normals that bend light
+    body      the objects: those of R3F, or the scene's meshes; with their shading normals
 
-Of body, --run may be a reconstruction's folder as well. In clear glass a field learns nothing, so
-mesh and points show what is around the bodies.
+For body, --run may also be the folder of a reconstruction. A field learns nothing inside clear
+glass, so mesh and points show the surroundings of the objects.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ with epy.lazy_imports():
     from refref_jax.render import checkpoint_io
 
 _RUN = cli_flags.run()
-_WHAT = flags.DEFINE_enum("what", None, ["mesh", "points", "body"], "What to write.", required=True)
-_OUT = cli_flags.out("The PLY file.")
-_OVERWRITE = cli_flags.overwrite("the file, or those of several bodies")
+_WHAT = flags.DEFINE_enum("what", None, ["mesh", "points", "body"], "Output type.", required=True)
+_OUT = cli_flags.out("PLY file to write.")
+_OVERWRITE = cli_flags.overwrite("the file, or those of several objects")
 _STEP = cli_flags.step()
 _LEVEL = flags.DEFINE_float(
-    "level", 10.0, "Density of the surface per world unit; 10 halves light in 0.07 units.", 1e-6
+    "level", 10.0, "Density of the surface per world unit; 10 halves light over 0.07 units.", 1e-6
 )
 _RESOLUTION = flags.DEFINE_integer("resolution", 128, "Cells along each edge of the box.", 4)
 _BOX = flags.DEFINE_float(
     "box",
     None,
-    "Half edge of the box around the origin, world units; the model's if not given.",
+    "Half-extent of the box around the origin, world units; that of the model by default.",
     1e-6,
 )
 
 
 def main() -> None:
-    """Writes one file, or one for each body."""
+    """Writes one file, or one per object."""
     run, out = Path(_RUN.value), Path(_OUT.value)
     outputs.check_file(out, overwrite=_OVERWRITE.value)
     others = (cli_flags.RECONSTRUCTION,) if _WHAT.value == "body" else ()
@@ -69,21 +69,21 @@ def main() -> None:
 
 def _refuse_other_files(out: str | None) -> None:
     if out is not None and not out.lower().endswith(".ply"):
-        raise ValueError(f"--out is {out}, which is no PLY file. Give a name that ends with .ply.")
+        raise ValueError(f"--out is {out}, which is not a PLY file. Give a name that ends in .ply.")
 
 
 app.check(_OUT, _refuse_other_files)
 
 
 def _write_field(model: Model, out: Path) -> list[Path]:
-    grids.import_skimage()  # so that its lack is told before the work
+    grids.import_skimage()  # reports a missing package early
     space, radius = model.config.space, model.config.radius
     half = _BOX.value or radius
     if space != "unbounded":
-        half = min(half, radius)  # there is nothing beyond
+        half = min(half, radius)  # there is nothing outside
     print(f"Box:    from {-half:g} to {half:g} along each axis, {_RESOLUTION.value} cells")
     if space == "unbounded":
-        print("        The scene goes on beyond it: a larger --box shows more of it.")
+        print("        The scene extends beyond it: a larger --box shows more of it.")
     with ProgressBar("density", _RESOLUTION.value + 1) as bar:
         density = field_mesh.sample_density(
             model,
@@ -94,7 +94,7 @@ def _write_field(model: Model, out: Path) -> list[Path]:
         )
     if space == "bounded" and half == radius:
         density = field_mesh.with_walls(density, level=_LEVEL.value)
-        print("Walls:  the box's faces, on which the model is opaque")
+        print("Walls:  the faces of the box, on which the model is opaque")
     if space == "spherical" and math.sqrt(3.0) * half > radius:
         density = field_mesh.with_sphere(density, level=_LEVEL.value, radius=radius)
         print(f"Walls:  the sphere of radius {radius:g}, on which the model is opaque")
@@ -113,10 +113,10 @@ def _write_field(model: Model, out: Path) -> list[Path]:
 
 
 def _colours(model: Model, points: np.ndarray, normals: np.ndarray, spacing: float) -> np.ndarray:
-    """Returns what is seen just below the surface by who looks straight at it, 8-bit sRGB."""
+    """Returns the 8-bit sRGB just below the surface, viewed along the normals."""
     below = points - 0.5 * spacing * normals
     return image_files.to_bytes(field_mesh.look_up_points(model, below, -normals, width=spacing)[1])
 
 
 if __name__ == "__main__":
-    app.run(main, again="it exports anew; --overwrite replaces the files.")
+    app.run(main, again="repeat the command to export again; --overwrite replaces the files.")

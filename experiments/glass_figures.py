@@ -1,8 +1,8 @@
-"""Draws the figures of docs/glass.md: why glass is hard, and what following its light is worth.
+"""Draws the figures of docs/glass.md: the difficulty of glass, and the benefit of ray tracing it.
 
 python -m experiments.glass_figures --scene=experiments/data/cube_smcvx_ball --out=runs/glass
 
-`scene.json` must tell the walls of a cube. Nothing is learned. Each figure is a JPEG,
+`scene.json` must define a background cube. Nothing is trained. Each figure is a JPEG,
 `{out}/glass_{figure}.jpg`.
 """
 
@@ -31,9 +31,9 @@ with epy.lazy_imports():
 FIGURES = ("views", "fan", "tree", "distances")
 
 _SCENE = cli_flags.scene("The scene")
-_OUT = cli_flags.out("Folder to write the figures to.")
+_OUT = cli_flags.out("Folder for the figures.")
 _FIGURES = flags.DEFINE_multi_enum(
-    "figure", list(FIGURES), list(FIGURES), "What to draw, all by default; may be repeated."
+    "figure", list(FIGURES), list(FIGURES), "Figure to draw, all by default; may be repeated."
 )
 _VIEW = flags.DEFINE_integer("view", 0, "Number of the view of the split.", 0)
 _RULE = cli_flags.rule()
@@ -44,7 +44,7 @@ _OVERWRITE = cli_flags.overwrite("the figures of an earlier call")
 
 
 def main() -> None:
-    """Draws the figures that are asked for."""
+    """Draws the selected figures."""
     out = Path(_OUT.value)
     wanted = {name: f"glass_{name}.jpg" for name in dict.fromkeys(_FIGURES.value)}
     place = {
@@ -67,11 +67,11 @@ def main() -> None:
 
 
 def _drawers(folder: Path, indices: dict[str, float]) -> dict[str, Callable[[Path], None]]:
-    """Reads a scene, and returns what draws each figure into a file."""
+    """Reads a scene, and returns functions that draw each figure into a file."""
     walls = background.read_background(folder)
     if not isinstance(walls, backgrounds.CubeBackground):
         raise ValueError(
-            f"The background of {folder} is no cube, whose walls are drawn. Choose a scene in one."
+            f"The background of {folder} is not a cube. Choose a scene with a background cube."
         )
     half = float(walls.half_extent)
     scene = known_scene.read_scene(
@@ -91,4 +91,4 @@ def _drawers(folder: Path, indices: dict[str, float]) -> dict[str, Callable[[Pat
 
 
 if __name__ == "__main__":
-    app.run(main, again="a figure is replaced only with --overwrite, and the others stay.")
+    app.run(main, again="existing figures are only replaced with --overwrite.")

@@ -1,9 +1,10 @@
-"""Gives a scene without masks those of a segmentation model, in a copy of the scene.
+"""Copies a scene without masks and adds those of a segmentation model.
 
 python -m experiments.import_masks --scene=FOLDER --masks=FOLDER --out=FOLDER
 
-The masks are named as the images: that of {scene}/train/r_000.png is {masks}/train/r_000.png, of
-the same size; what is not black shows the object. `docs/masks.md` tells how models make them.
+Masks are named like the images: the mask of {scene}/train/r_000.png is {masks}/train/r_000.png, of
+the same size; all pixels that are not black show the object. `docs/masks.md` describes segmentation
+models.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ with epy.lazy_imports():
 
 _SCENE = flags.DEFINE_string("scene", None, "The scene, in the local layout.", required=True)
 _MASKS = flags.DEFINE_string("masks", None, "Folder of the masks.", required=True)
-_OUT = cli_flags.out("The copy to write; must not exist.")
+_OUT = cli_flags.out("Copy to write, which must not exist.")
 
 
 def main() -> None:
@@ -36,14 +37,14 @@ def main() -> None:
     scene, folder, out = Path(_SCENE.value), Path(_MASKS.value), Path(_OUT.value)
     cli_scenes.check(scene)
     if not folder.is_dir():
-        raise SceneError(f"{folder} is no folder. Give the folder that holds the masks.")
+        raise SceneError(f"{folder} is not a folder. Give the folder that contains the masks.")
 
     def read(image: Path) -> Bool[np.ndarray, "h w"]:
         path = folder / image.relative_to(scene)
         if not path.is_file():
             raise SceneError(
-                f"There is no mask of {image}: {path} does not exist. Save it there, or take the "
-                "frame out of the transforms file."
+                f"There is no mask of {image}: {path} does not exist. Save it there, or remove the "
+                "frame from the transforms file."
             )
         return image_files.read_mask(path)
 
@@ -54,4 +55,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    app.run(main, again="it is refused, for a copy is never replaced.")
+    app.run(main, again="an existing copy is never replaced.")

@@ -1,11 +1,11 @@
-"""Compares two folders of images, without any model: a table of all metrics, image by image.
+"""Compares two folders of images, without any model: a table of all metrics for each image.
 
 python -m experiments.metrics RENDERED TRUTH --masks=MASKS --out=metrics.json
 
-Files are paired by name. Images are 8-bit .png; where both folders hold .exr too, or only these,
-they are compared as distances along the ray: both in world units, as `evaluate` writes them. (A
-scene's own depth maps are planar, and not to be compared with those.) What each metric is tells
-`docs/metrics.md`.
+Files are paired by name. Images are 8-bit .png files. If both folders also or only contain .exr
+files, these are compared as distances along the ray: both in world units, as written by `evaluate`.
+(A scene's own depth maps are planar and cannot be compared with them.) `docs/metrics.md` explains
+each metric.
 """
 
 import json
@@ -23,8 +23,8 @@ from refref_jax import configuration
 with epy.lazy_imports():
     from experiments.runs import image_folders, perceptual
 
-_MASKS = flags.DEFINE_string("masks", None, "Folder of masks, named as the images: 0 is outside.")
-_OUT = flags.DEFINE_string("out", None, "JSON file to write; nothing is written without it.")
+_MASKS = flags.DEFINE_string("masks", None, "Folder of masks, named like the images: 0 is outside.")
+_OUT = flags.DEFINE_string("out", None, "JSON file to write; nothing is written by default.")
 _OVERWRITE = cli_flags.overwrite("the file of --out if it exists")
 _LPIPS_WEIGHTS = cli_flags.lpips_weights()
 
@@ -44,15 +44,15 @@ def main(rendered: str, truth: str) -> None:
             bar.show(len(rows), row[image_folders.NAME])
     print(image_folders.table(rows))
     if out is None:
-        print(f"Nothing was written. Next, to keep all digits: {_again(rendered, truth)}")
+        print(f"Nothing was written. Next, to store all digits: {_again(rendered, truth)}")
         return
     _write(out, {"rendered": rendered, "truth": truth, "masks": _MASKS.value}, rows)
     print(f"Metrics: {out}")
-    print("Next: the same for other renderings with another --out, and compare the two.")
+    print("Next: repeat this for other renderings with another --out, and compare the two.")
 
 
 def _again(rendered: str, truth: str) -> str:
-    """Returns the same command, with a file to write."""
+    """Returns the same command with an output file."""
     given = [each.serialize() for each in (_MASKS, _LPIPS_WEIGHTS) if each.value is not None]
     return app.shell("metrics", rendered, truth, *given, "--out=metrics.json")
 
@@ -68,5 +68,5 @@ if __name__ == "__main__":
     app.run(
         main,
         arguments=("RENDERED", "TRUTH"),
-        again="it compares anew; --overwrite replaces the file of --out.",
+        again="repeat the command to compare again; --overwrite replaces the file of --out.",
     )

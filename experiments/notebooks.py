@@ -1,12 +1,12 @@
 """Executes the notebooks of `experiments/colab`, each from top to bottom in a kernel of its own.
 
-python -m experiments.notebooks             # executes them, and reports
-python -m experiments.notebooks --write     # and writes them back with what they print and draw
+python -m experiments.notebooks             # executes them and reports
+python -m experiments.notebooks --write     # also stores them with their outputs
 
-They run in a temporary copy of the package and the experiments, so that nothing they train stays
-behind and no earlier run helps them. The first error ends it, with the cell and its message; the
-notebooks before it are written by then. The extra `notebooks` has what this needs, and the extras
-`experiments` and `r3f` what the notebooks need.
+They run in a temporary copy of the package and the experiments, so that no results remain and no
+earlier run is used. The first error ends the command, with the cell and its message; the notebooks
+before it are already written. The command needs the extra `notebooks`, and the notebooks need the
+extras `experiments` and `r3f`.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ with epy.lazy_imports():
     import nbformat
     from nbclient import exceptions
 
-_WRITE = flags.DEFINE_bool("write", False, "Write the notebooks back, with their outputs.")
-_ONLY = flags.DEFINE_list("only", [], "Names of the notebooks to execute; all if not given.")
-_CELL_SECONDS = flags.DEFINE_integer("cell_seconds", 1200, "Most seconds that a cell may take.", 1)
+_WRITE = flags.DEFINE_bool("write", False, "Store the notebooks with their outputs.")
+_ONLY = flags.DEFINE_list("only", [], "Names of the notebooks to execute; all by default.")
+_CELL_SECONDS = flags.DEFINE_integer("cell_seconds", 1200, "Time limit of a cell, seconds.", 1)
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "experiments" / "colab"
@@ -45,10 +45,10 @@ METADATA = {
     "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
     "language_info": {"name": "python"},
 }
-"""Of every notebook; more would change with each machine that executes them."""
+"""Metadata of every notebook; more would differ between machines."""
 
 LARGEST = 1_500_000
-"""Most bytes of a notebook: what hosts of code still show as a page."""
+"""Largest size of a notebook in bytes, above which code hosting sites do not display it."""
 
 _COPIED = ("refref_jax", "experiments")
 
@@ -56,7 +56,7 @@ _LINES_OF_AN_ERROR = 15
 
 
 def main() -> None:
-    """Executes the chosen notebooks."""
+    """Executes the selected notebooks."""
     for name in ("nbclient", "nbformat", "ipykernel"):
         if importlib.util.find_spec(name) is None:
             raise ValueError(f"{name} is missing. Run pip install -e '.[notebooks]'.")
@@ -71,14 +71,14 @@ def main() -> None:
         print(f"{path.stem}: {seconds:.0f} s, {size / 1e6:.2f} MB", flush=True)
     if _WRITE.value:
         print(f"Notebooks: {FOLDER}")
-        print("Next: look at the pictures, and then git diff --stat")
+        print("Next: check the images, then run git diff --stat")
     else:
-        print("All ran; nothing was written.")
+        print("All notebooks ran; nothing was written.")
         print(f"Next: {app.shell('notebooks', '--write')}")
 
 
 def find(names: Sequence[str], *, folder: Path = FOLDER) -> list[Path]:
-    """Returns the files of notebooks, all if none is named.
+    """Returns the files of notebooks, all if no name is given.
 
     Raises:
       ValueError: if there is no such notebook.
@@ -86,7 +86,7 @@ def find(names: Sequence[str], *, folder: Path = FOLDER) -> list[Path]:
     there = {path.stem: path for path in sorted(folder.glob("*.ipynb"))}
     for name in names:
         if name not in there:
-            raise ValueError(f"There is no notebook {name!r}. Give some of {', '.join(there)}.")
+            raise ValueError(f"There is no notebook {name!r}. Choose from {', '.join(there)}.")
     return [there[name] for name in names or there]
 
 
@@ -94,8 +94,8 @@ def execute(path: Path, *, cell_seconds: int) -> nbformat.NotebookNode:
     """Executes a notebook in a copy of this checkout, and returns it with its outputs.
 
     Args:
-      path: of the notebook.
-      cell_seconds: most that a cell may take.
+      path: path of the notebook.
+      cell_seconds: time limit of a cell, seconds.
 
     Raises:
       ValueError: at the first cell that fails, takes too long, or ends the kernel.
@@ -113,7 +113,7 @@ def execute(path: Path, *, cell_seconds: int) -> nbformat.NotebookNode:
 
 
 def write(path: Path, notebook: nbformat.NotebookNode) -> None:
-    """Writes a notebook, whole or not at all.
+    """Writes a notebook atomically.
 
     Raises:
       ValueError: if it is larger than `LARGEST`.
@@ -122,23 +122,23 @@ def write(path: Path, notebook: nbformat.NotebookNode) -> None:
     if len(text.encode()) > LARGEST:
         raise ValueError(
             f"{path.name} would have {len(text.encode()) / 1e6:.1f} MB, more than "
-            f"{LARGEST / 1e6:.1f}. Draw its pictures smaller, or as JPEG."
+            f"{LARGEST / 1e6:.1f}. Draw its images smaller, or as JPEG."
         )
     with atomic_files.written_file(path) as draft:
         draft.write_text(text, encoding="utf-8")
 
 
 def as_text(notebook: nbformat.NotebookNode) -> str:
-    """Returns what a notebook's file holds."""
+    """Returns the text of a notebook's file."""
     return nbformat.writes(notebook) + "\n"
 
 
 def tidy(notebook: nbformat.NotebookNode, names: dict[str, str]) -> None:
-    """Removes from an executed notebook what differs from machine to machine.
+    """Removes machine-dependent data from an executed notebook.
 
     Args:
-      notebook: is changed.
-      names: what to replace in texts, such as folders of this machine, in this order.
+      notebook: notebook to change in place.
+      names: replacements in texts, such as folders of this machine, applied in this order.
     """
     notebook.metadata = nbformat.from_dict(METADATA)
     for cell in notebook.cells:
@@ -172,25 +172,25 @@ def _run_cells(notebook: nbformat.NotebookNode, name: str, copy: Path, cell_seco
     with ProgressBar(name, len(number)) as bar:
         current = _follow(client, lambda i, text: bar.show(number[i], text))
         try:
-            # The reader's own settings of IPython have no say.
+            # The user's own IPython settings are ignored.
             client.execute(env={**os.environ, "IPYTHONDIR": str(copy / "ipython")})
         except (
             exceptions.CellExecutionError,
             exceptions.CellTimeoutError,
-            RuntimeError,  # of a kernel that is dead, before the first cell or later
+            RuntimeError,  # if the kernel is dead, before the first cell or later
         ) as error:
             if not current:
-                atexit.unregister(client._cleanup_kernel)  # which fails where none has started
+                atexit.unregister(client._cleanup_kernel)  # it fails if no kernel has started
                 raise ValueError(
-                    f"{name}: the kernel ended before the first cell ({error}). Try python -m "
-                    "ipykernel_launcher, which says why."
+                    f"{name}: the kernel ended before the first cell ({error}). Run python -m "
+                    "ipykernel_launcher to see the reason."
                 ) from error
             cell = notebook.cells[current[-1]]
             raise ValueError(_explain(name, number[current[-1]], cell, error)) from error
 
 
 def _follow(client: nbclient.NotebookClient, show: Callable[[int, str], None]) -> list[int]:
-    """Has each finished cell shown with its seconds; returns a list of those that were begun."""
+    """Reports each finished cell with its duration; returns the growing list of started cells."""
     begun: list[int] = []
     starts: list[float] = []
 
@@ -212,17 +212,17 @@ def _code_cells(notebook: nbformat.NotebookNode) -> list[int]:
 
 
 def _explain(name: str, number: int, cell: nbformat.NotebookNode, error: Exception) -> str:
-    """Says which cell failed, how, and what it had printed last."""
+    """Returns the number of the failed cell, its error and its last output."""
     if isinstance(error, exceptions.CellExecutionError):
         what = f"{error.ename}: {error.evalue}"
     elif isinstance(error, exceptions.CellTimeoutError):
-        what = "it took too long; --cell_seconds gives it more"
+        what = "it exceeded the time limit; increase --cell_seconds"
     else:
-        what = "the kernel died, perhaps for want of memory"
+        what = "the kernel died, perhaps because memory ran out"
     printed = [out.text for out in cell.outputs if out.output_type == "stream"]
     last = "".join(printed).splitlines()[-_LINES_OF_AN_ERROR:]
     return "\n  ".join([f"{name}, code cell {number} ({cell.id}): {what}", *last])
 
 
 if __name__ == "__main__":
-    app.run(main, again="it executes them anew; only --write replaces what is stored.")
+    app.run(main, again="repeat the command to execute them again; --write stores the outputs.")

@@ -1,11 +1,12 @@
-"""Measures what light paths cost and what they give: the speed-accuracy curve.
+"""Measures the cost and the accuracy of light paths: the speed-accuracy curve.
 
 python -m experiments.path_trade_off --scenes=experiments/data/cube_smcvx_ball --out=runs/paths
 
-Renders views of scenes with a known background, as `experiments.render_known` does, once for every
-value of --cuts at the tree's bends, once for every value of --bends at its cut, and with the
-straight and the paper's paths. Writes a CSV, one row a rendering, and two figures: decibels inside
-the mask against ray casts and against time. Casts, paths and seconds are of one camera ray a pixel.
+Renders views of scenes with a known background, like `experiments.render_known`: once for every
+value of --cuts at the tree's maximum of bends, once for every value of --bends at its threshold,
+and with the straight and the paper's paths. Writes a CSV with one row per rendering, and two
+figures: masked PSNR over ray casts and over time. Casts, paths and seconds are those of one camera
+ray per pixel.
 """
 
 from __future__ import annotations
@@ -35,15 +36,15 @@ with epy.lazy_imports():
     from experiments.sweeps import paths
 
 _SCENES = flags.DEFINE_list(
-    "scenes", None, f"Scenes, with commas: each {cli_flags.SCENE_FORMS}.", required=True
+    "scenes", None, f"Scenes, separated by commas: each {cli_flags.SCENE_FORMS}.", required=True
 )
 _CUTS = flags.DEFINE_list(
     "cuts",
     ["0.2", "0.1", "0.05", "0.04", "0.03", "0.02", "0.01", "0.005", "0.002"],
-    "Smallest throughputs worth following.",
+    "Throughput thresholds.",
 )
 _BENDS = flags.DEFINE_list(
-    "bends", ["1", "2", "4", "6", "10", "16", "24", "32"], "Most bends of a path."
+    "bends", ["1", "2", "4", "6", "10", "16", "24", "32"], "Maximum numbers of bends."
 )
 _VIEWS = cli_flags.views("0,10")
 _RULE = cli_flags.rule()
@@ -58,12 +59,12 @@ _WRITES = (_TABLE, *(f"path_trade_off_{sweep}.png" for sweep in ("cut", "bends")
 
 
 def main() -> None:
-    """Renders all scenes with all budgets."""
+    """Renders all scenes with all path settings."""
     out = Path(_OUT.value)
     place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
     outputs.replaceable(out, **place)
     settings, indices = chosen_budgets(), refraction_indices.parse_named(_IOR.value)
-    # All scenes first: a broken one is named before anything is rendered.
+    # All scenes are opened first, so that a broken one is reported before anything is rendered.
     chosen = [_read(folder, indices) for folder in _open_scenes()]
     with outputs.fresh(out, **place) as draft:
         trials = _measure(chosen, [paths.Setting(*each) for each in settings])
@@ -71,11 +72,11 @@ def main() -> None:
         pictures = [out / path.name for path in paths.write_figures(draft, trials)]
     print(f"Figures:  {', '.join(map(str, pictures))}")
     print(f"Measures: {out / _TABLE}")
-    print("Next: choose a cut, and render with python -m experiments.render_known --cut=...")
+    print("Next: choose a threshold, and use python -m experiments.render_known --cut=...")
 
 
 def _measure(chosen: list[KnownScene], plan: list[Setting]) -> list[Trial]:
-    """Measures all there is to, with a bar of progress."""
+    """Measures all combinations, with a progress bar."""
     trials: list[Trial] = []
     side = choices.side_of(_RAYS_PER_PIXEL.value)
     with ProgressBar("trade-off", len(chosen) * len(plan)) as bar:
@@ -90,7 +91,7 @@ def _measure(chosen: list[KnownScene], plan: list[Setting]) -> list[Trial]:
 
 
 def _open_scenes() -> list[Path]:
-    """Refuses no scene at all, and names that plot and table could not tell apart."""
+    """Rejects an empty list of scenes, and scenes of the same name."""
     cli_scenes.check_all(_SCENES.value)
     folders = [cli_scenes.opened(scene) for scene in _SCENES.value]
     names = [scene_names.of_folder(folder) for folder in folders]
@@ -98,14 +99,14 @@ def _open_scenes() -> list[Path]:
         raise ValueError("No scene is given. Add --scenes=FOLDER,FOLDER.")
     if len(set(names)) < len(names):
         raise ValueError(
-            f"Two of the scenes have the same name: {', '.join(names)}. Rename a folder, or leave "
-            "one out."
+            f"Two of the scenes have the same name: {', '.join(names)}. Rename a folder, or remove "
+            "one."
         )
     return folders
 
 
 def chosen_budgets() -> list[tuple[str, str, Budget]]:
-    """Returns sweep, name and budget of all settings to try; equal ones are in both sweeps."""
+    """Returns sweep, name and path settings of all trials; equal ones are in both sweeps."""
     cuts = sorted(_numbers("cuts", _CUTS.value, float), reverse=True)
     bends = sorted(_numbers("bends", _BENDS.value, int))
     swept = [("cut", f"{cut:g}", path_settings.budget_of("tree", cut=cut)) for cut in cuts]
@@ -124,8 +125,8 @@ def _read(folder: Path, indices: dict[str, float]) -> KnownScene:
     )
     if scene.masks is None:
         raise ValueError(
-            f"The views of {folder} have no masks, inside which the error is measured. Add "
-            "mask_file_path to each frame of its transforms file."
+            f"The views of {folder} have no masks, which the error requires. Add mask_file_path to "
+            "each frame of its transforms file."
         )
     return scene
 
@@ -135,7 +136,7 @@ def _numbers(option: str, words: list[str], kind: type) -> list:
         return [kind(word) for word in words]
     except ValueError as error:
         raise ValueError(
-            f"--{option}={','.join(words)} is not a list of numbers. Write them with commas."
+            f"--{option}={','.join(words)} is not a list of numbers. Separate them by commas."
         ) from error
 
 
@@ -144,4 +145,4 @@ app.check(_BENDS, lambda words: _numbers("bends", words, int))
 
 
 if __name__ == "__main__":
-    app.run(main, again="it measures anew; --overwrite replaces the curves.")
+    app.run(main, again="repeat the command to measure again; --overwrite replaces the curves.")

@@ -1,12 +1,11 @@
-"""Recommends options of training for the time that there is.
+"""Recommends training options for a given time.
 
 python -m experiments.recommend --scene=experiments/data/cube_smcvx_ball --minutes=5
 
-Reads the table that `experiments.trade_off` measured, times a short training of its base point on
-this machine, and scales the table's times by the ratio. Printed are the options that gave the
-highest PSNR inside the mask of those that fit, and the next cheaper and dearer ones. Only what was
-measured is recommended: PSNR is that of the table's scene, and nothing between or beyond its points
-is guessed.
+Reads the table measured by `experiments.trade_off`, times a short training of its base point on
+this machine, and scales the table's times by the ratio. It prints the options with the highest
+masked PSNR that fit into the time, and the next cheaper and more expensive ones. Only measured
+points are recommended, without interpolation; their PSNR is that of the table's scene.
 """
 
 from pathlib import Path
@@ -26,11 +25,11 @@ _BUNDLED = Path(__file__).parent / "data" / "trade_off.csv"
 
 _SCENE = cli_flags.scene("The scene to train on")
 _MINUTES = flags.DEFINE_float(
-    "minutes", None, "Time for training and evaluation.", 0.0, required=True
+    "minutes", None, "Time for training and evaluation, minutes.", 0.0, required=True
 )
 _TABLE = flags.DEFINE_string("table", str(_BUNDLED), "Table of a sweep, trade_off.csv.")
 _TIMED_STEPS = flags.DEFINE_integer(
-    "timed_steps", 96, "Steps of the timing; the first third, which compiles, is left out.", 6
+    "timed_steps", 96, "Steps to time; the first third, which includes compilation, is dropped.", 6
 )
 
 
@@ -47,11 +46,11 @@ def main() -> None:
     print(
         f"A step takes {1e3 * timing.seconds_per_step:.1f} ms here and "
         f"{1e3 * base.seconds_per_step:.1f} ms in the table: times are scaled by "
-        f"{machine.ratio:.2f}. Starting and compiling takes {machine.startup:.0f} s."
+        f"{machine.ratio:.2f}. Startup and compilation take {machine.startup:.0f} s."
     )
     choice = recommend.choose(rows, machine, 60.0 * _MINUTES.value)
     print("\n".join(recommend.told(choice, machine, scene)))
 
 
 if __name__ == "__main__":
-    app.run(main, again="it times this machine anew; nothing is written.")
+    app.run(main, again="repeat the command to time this machine again; nothing is written.")

@@ -1,11 +1,11 @@
-"""Reconstructs the object of a scene from images and masks: its surface, and its index (R3F).
+"""Reconstructs the object of a scene from images and masks: its surface and its index (R3F).
 
 python -m experiments.reconstruct --scene=experiments/data/cube_smcvx_ball --out=runs/ball_r3f
 
-{out}/report.md shows what it came to; {out}/geometry/*.ply is the surface, {out}/index.json the
-index of refraction, {out}/reconstruction.json has all figures. The scene's own meshes are looked at
-by the report alone, which compares. Stages that are finished are not done again: the same command
-goes on where it was stopped.
+{out}/report.md shows the results; {out}/geometry/*.ply is the surface, {out}/index.json the index
+of refraction, and {out}/reconstruction.json has all numbers. Only the report reads the scene's own
+meshes, for comparison. Finished stages are skipped: repeat the command to resume an interrupted
+reconstruction.
 """
 
 from pathlib import Path
@@ -24,7 +24,7 @@ with epy.lazy_imports():
 _SCENE = cli_flags.scene("The scene to reconstruct")
 _OUT = cli_flags.out("Folder to write to.")
 _IOR = flags.DEFINE_string(
-    "ior", None, "Index of refraction of the body, as 1.5; estimated if not given."
+    "ior", None, "Index of refraction of the object, as in 1.5; estimated by default."
 )
 _RECONSTRUCTION = cli_flags.reconstruction()
 _SPACE = cli_flags.space()
@@ -39,7 +39,7 @@ app.check(_IOR, _parse)
 
 
 def main() -> None:
-    """Reconstructs a scene, or goes on with it."""
+    """Reconstructs a scene, or resumes its reconstruction."""
     cli_scenes.check(_SCENE.value)
     index = _parse(_IOR.value)
     config = _RECONSTRUCTION.chosen(
@@ -56,4 +56,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    app.run(main, again="it goes on where it was stopped; what is finished stays.")
+    app.run(main, again="repeat the command to resume; finished stages are kept.")

@@ -1,4 +1,4 @@
-"""Renders the views of a split, or an orbit, as pictures, distance maps and video.
+"""Renders the views of a split, or an orbit, as images, distance maps and video.
 
 python -m experiments.render --run=runs/ball --views=orbit --frames=60
 """
@@ -32,23 +32,23 @@ _VIEWS = flags.DEFINE_enum(
     "views", "orbit", ["orbit", *cli_flags.SPLITS], "Cameras: an orbit, or those of a split."
 )
 _STEP = cli_flags.step()
-_SCENE = cli_flags.scene("The scene, if it has moved", required=False)
-_OUT = flags.DEFINE_string("out", None, "Where to write; {run}/render/{views} if not given.")
-_FRAMES = flags.DEFINE_integer("frames", 60, "Frames of an orbit.", 1)
+_SCENE = cli_flags.scene("The scene, if it has been moved", required=False)
+_OUT = flags.DEFINE_string("out", None, "Folder to write; {run}/render/{views} by default.")
+_FRAMES = flags.DEFINE_integer("frames", 60, "Number of frames of an orbit.", 1)
 _SIZE = flags.DEFINE_integer("size", 200, "Width and height of an orbit's frames, pixels.", 1)
 _FOV = flags.DEFINE_float("fov", 66.785, "Horizontal field of view of an orbit, degrees.", 1, 179)
 _DISTANCE = flags.DEFINE_float("distance", 4.0, "Distance of an orbit from the origin.", 1e-3)
 _ELEVATION = flags.DEFINE_float("elevation", 20.0, "Elevation of an orbit, degrees.", -89, 89)
-_FPS = flags.DEFINE_float("fps", 15.0, "Frames a second of the video.", 0.1)
+_FPS = flags.DEFINE_float("fps", 15.0, "Frames per second of the video.", 0.1)
 _RAYS_PER_PIXEL = cli_flags.rays_per_pixel(1)
 _CHUNK = cli_flags.chunk()
-_OVERWRITE = cli_flags.overwrite("earlier pictures of these views")
+_OVERWRITE = cli_flags.overwrite("earlier images of these views")
 
 _WRITES = ("rgb", "distance", "rgb.gif", "rgb.mp4", "distance.gif", "distance.mp4")
 
 
 def main() -> None:
-    """Renders the chosen cameras."""
+    """Renders the selected cameras."""
     run = Path(_RUN.value)
     out = Path(_OUT.value) if _OUT.value else run / "render" / _VIEWS.value
     place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
@@ -62,14 +62,14 @@ def main() -> None:
     for name in written:
         print(f"Video: {out / name}")
     if not video.has_ffmpeg():
-        print(f"Videos as mp4 too: {video.INSTALL}")
-    print(f"Pictures: {out / 'rgb'}")
+        print(f"For videos as mp4: {video.INSTALL}")
+    print(f"Images: {out / 'rgb'}")
     print(f"Distance in world units: {out / 'distance'}")
     print(f"Next: {app.shell('view', f'--run={run}')}")
 
 
 def render(model: Model, seen_by: cameras.Cameras, names: tuple[str, ...], out: Path) -> list[str]:
-    """Renders each view, writes pictures and videos, and returns the names of the video."""
+    """Renders each view, writes images and videos, and returns the names of the videos."""
     rays_per_pixel, chunk = _RAYS_PER_PIXEL.value, _CHUNK.value
     for folder in ("rgb", "distance"):
         (out / folder).mkdir()
@@ -110,5 +110,5 @@ def _cameras(run: Path) -> tuple[cameras.Cameras, tuple[str, ...]]:
 if __name__ == "__main__":
     app.run(
         main,
-        again="it renders anew; --overwrite replaces the pictures.",
+        again="repeat the command to render again; --overwrite replaces the images.",
     )

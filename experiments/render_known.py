@@ -1,13 +1,13 @@
-"""Renders a scene whose background is known, with no learning, and measures it.
+"""Renders a scene with a known background, without any training, and computes metrics.
 
 python -m experiments.render_known --scene=experiments/data/cube_smcvx_ball --out=runs/known
 
-`scene.json` must tell the background. What is left of the error is that of the light paths. The
-JSON holds, for each view and as the mean over views, the PSNR in dB over the image, inside the
-mask and outside; `casts_per_pixel` and `paths_per_pixel`, which count ray casts and light paths of
-one camera ray, so that they do not depend on --rays_per_pixel; `seconds`, that rendering all views
-took, without compiling, reading and writing; and `lost_energy`, the share of light that found no
-room, or has no bend left and is `dark`.
+`scene.json` must define the background. The remaining error is that of the light paths. For each
+view and as the mean over views, the JSON file contains: the PSNR in dB over the image, inside the
+mask and outside; `casts_per_pixel` and `paths_per_pixel`, the number of ray casts and light paths
+per camera ray, which does not depend on --rays_per_pixel; `seconds`, the time to render all views
+without compiling, reading and writing; and `lost_energy`, the share of the throughput that was
+dropped because buffers were full, or that exceeds --bends and is `dark`.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ with epy.lazy_imports():
     from refref_jax.training import evaluation
 
 _SCENE = cli_flags.scene("The scene")
-_OUT = cli_flags.out("Folder to write the pictures to.")
+_OUT = cli_flags.out("Folder for the images.")
 _PATHS = flags.DEFINE_enum(
     "paths",
     "tree",
     list(BUDGETS),
     "Light paths: 'straight' ignores the objects; 'paper' bends up to 10 times and reflects at the "
-    "first surface; 'tree' follows every branch that carries light.",
+    "first surface; 'tree' follows every branch above the throughput threshold.",
 )
 _UNFINISHED = flags.DEFINE_enum(
     "unfinished",
     "kept",
     ["kept", "dark"],
-    "Light that has no bend left: 'kept' goes on along its last direction; 'dark' is not shown, as "
-    "in renderers that stop after so many bounces.",
+    "Truncated paths, which have reached the maximum of bends: 'kept' lets them end on the "
+    "background along their last direction; 'dark' makes them black, as in path tracers.",
 )
 _VIEWS = cli_flags.views("all")
 _BUDGET = cli_flags.budget()
@@ -62,17 +62,17 @@ _RULE = cli_flags.rule()
 _IOR = cli_flags.ior()
 _RAYS_PER_PIXEL = cli_flags.rays_per_pixel(9)
 _SPLIT = cli_flags.split("Views to render.")
-_JSON = flags.DEFINE_string("json", None, "File for the measures; {out}/metrics.json by default.")
+_JSON = flags.DEFINE_string("json", None, "File for the metrics; {out}/metrics.json by default.")
 _OVERWRITE = cli_flags.overwrite("an earlier rendering in that folder")
 
 _WRITES = ("rgb", "comparison.png", "metrics.json")
 
-# By what a file of ours is known.
+# Keys that identify a file of this command.
 _KEYS = {"scene", "paths", "views", "casts_per_pixel"}
 
 
 def main() -> None:
-    """Renders and measures the chosen views."""
+    """Renders and measures the selected views."""
     out = Path(_OUT.value)
     place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
     outputs.replaceable(out, **place)
@@ -96,14 +96,14 @@ def main() -> None:
         with outputs.fresh_file(metrics_file, overwrite=_OVERWRITE.value) as path:
             path.write_text(text, encoding="utf-8")
     _report(summary)
-    print(f"Pictures: {out / 'comparison.png'}, {out / 'rgb'}")
+    print(f"Images:   {out / 'comparison.png'}, {out / 'rgb'}")
     print(f"Metrics:  {metrics_file or out / 'metrics.json'}")
     given = (f"--scenes={_SCENE.value}", f"--out={out}_trade_off")
     print(f"Next: {app.shell('path_trade_off', *given)}")
 
 
 def render(scene: KnownScene, budget: Budget, out: Path) -> dict[str, Any]:
-    """Renders and measures all views, writes the pictures, and returns what the JSON holds."""
+    """Renders and measures all views, writes the images, and returns the JSON content."""
     views, measured = [], []
     side = choices.side_of(_RAYS_PER_PIXEL.value)
     (out / "rgb").mkdir()
@@ -128,7 +128,7 @@ def render(scene: KnownScene, budget: Budget, out: Path) -> dict[str, Any]:
 def summarise(
     scene: KnownScene, budget: Budget, views: list[View], measured: list[dict[str, Any]]
 ) -> dict[str, Any]:
-    """Returns what the JSON holds."""
+    """Returns the JSON content."""
     keys = ("psnr", "psnr_masked", "psnr_outside")
     return {
         "scene": scene.name,
@@ -148,19 +148,19 @@ def summarise(
 def _chosen_budget() -> Budget:
     if _PATHS.value == "straight" and _UNFINISHED.value == "dark":
         raise ValueError(
-            "--paths=straight bends no light, so none is unfinished. Leave --unfinished out, or "
-            "use --paths=tree."
+            "--paths=straight has no bends, so no path is truncated. Remove --unfinished, or use "
+            "--paths=tree."
         )
     return dataclasses.replace(_BUDGET.chosen(_PATHS.value), unfinished=_UNFINISHED.value)
 
 
 def _check(metrics_file: Path | None) -> None:
-    """Refuses a file for the measures that holds anything else."""
+    """Rejects a metrics file that was written by another program."""
     if metrics_file is None:
         return
     if metrics_file.is_file() and not _is_ours(metrics_file):
         raise ValueError(
-            f"{metrics_file} exists and is not of this command. Remove it, or give another --json."
+            f"{metrics_file} is not from this command. Remove it, or give another --json."
         )
     outputs.check_file(metrics_file, overwrite=_OVERWRITE.value)
 
@@ -182,11 +182,11 @@ def _report(summary: dict[str, Any]) -> None:
     print(f"{'seconds':>16}  {summary['seconds']:.2f}")
     print(f"{'lost_energy':>16}  {summary['lost_energy']:.2g}")
     if summary["unfinished"] == "dark":
-        print("lost_energy is that of light that has no bend left, and what found no room if any.")
+        print("lost_energy: truncated paths, and paths dropped because buffers were full, if any.")
     else:
         reporting.warn_of_lost_light(
             summary["lost_energy"],
-            advice="Give a larger --cut or fewer --bends, or, as a library, a Budget with larger "
+            advice="Use a larger --cut or fewer --bends, or, as a library, a Budget with larger "
             "capacity factors.",
         )
 
@@ -194,5 +194,5 @@ def _report(summary: dict[str, Any]) -> None:
 if __name__ == "__main__":
     app.run(
         main,
-        again="it renders anew; --overwrite replaces the results.",
+        again="repeat the command to render again; --overwrite replaces the results.",
     )

@@ -1,15 +1,15 @@
-"""Measures the trade of speed for accuracy: trains around a base point, one option at a time.
+"""Measures speed against accuracy: trains around a base point, changing one option at a time.
 
 python -m experiments.trade_off --scene=experiments/data/cube_smcvx_ball --out=runs/trade_off
 
 Every point is trained from the same seed by `experiments.train` and measured by
-`experiments.evaluate`, each in a process of its own. Written are trade_off.csv, one row a point;
-trade_off.png, PSNR inside the mask against time; and trade_off.md, tables of what to turn first.
-Points that are finished are not measured again, and one that was interrupted goes on: repeat the
-command. Times are of this machine: leave it alone meanwhile.
+`experiments.evaluate`, each in a separate process. The outputs are trade_off.csv, one row per
+point; trade_off.png, masked PSNR over time; and trade_off.md, tables of the most effective options.
+Repeat the command to resume: finished points are skipped, and an interrupted one continues. Times
+are those of this machine, which should be idle otherwise.
 
---base=NAME=VALUE changes the base, --values=NAME=A/B what is tried of an option. Both may be
-repeated, and take any option of `experiments.train`, and rays_per_pixel.
+--base=NAME=VALUE changes the base, --values=NAME=A/B the values to try for an option. Both may be
+repeated, and accept any option of `experiments.train`, and rays_per_pixel.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ _SEED = cli_flags.seed("Seed of all trainings.")
 _STEPS = flags.DEFINE_list(
     "steps",
     [],
-    "Steps of the base point, then those of further trainings of it; by default the preset's, and "
-    "a quarter, half and twice of them.",
+    "Steps of the base point, then those of further trainings of it; by default those of the "
+    "preset, and a quarter, half and twice as many.",
 )
-_BASE = flags.DEFINE_multi_string("base", [], "Option of the base, as cut=0.05. May be repeated.")
+_BASE = flags.DEFINE_multi_string("base", [], "Base option, as in cut=0.05. May be repeated.")
 _VALUES = flags.DEFINE_multi_string(
-    "values", [], "Values to try of an option, as cut=0.1/0.05. May be repeated."
+    "values", [], "Values to try for an option, as in cut=0.1/0.05. May be repeated."
 )
-_KNOBS = flags.DEFINE_list("knobs", None, "Only these options are tried; all if not given.")
-_POINTS = flags.DEFINE_list("points", None, "Only these points, and the base, as cut=0.1.")
+_KNOBS = flags.DEFINE_list("knobs", None, "Options to try; all by default.")
+_POINTS = flags.DEFINE_list("points", None, "Points to measure with the base, as in cut=0.1.")
 _LIMIT = cli_flags.limit()
-_DRY_RUN = flags.DEFINE_bool("dry_run", False, "List the points, and measure nothing.")
+_DRY_RUN = flags.DEFINE_bool("dry_run", False, "List the points without measuring them.")
 
 
 def main() -> None:
@@ -62,7 +62,7 @@ def main() -> None:
             print(f"{point.name:24} {' '.join((*point.training, *point.evaluation))}")
         return
     scene, out = cli_scenes.opened(_SCENE.value), Path(_OUT.value)
-    # A sweep that is killed takes the training that it waits for with it.
+    # If the sweep is killed, its training is stopped too.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     limit = () if _LIMIT.value is None else (f"--limit={_LIMIT.value}",)
     images = len(scene_folder.read_frames(scene, "test").names)
@@ -88,7 +88,7 @@ def main() -> None:
 
 
 def points_from_flags() -> list[Point]:
-    """Returns the points that the options ask for."""
+    """Returns the points that the flags select."""
     found = points.sweep(
         preset=_PRESET.value,
         seed=_SEED.value,
@@ -101,10 +101,10 @@ def points_from_flags() -> list[Point]:
 
 
 def read_steps(words: list[str]) -> list[int]:
-    """Returns the numbers of steps that an option lists.
+    """Parses a list of numbers of steps.
 
     Raises:
-      ValueError: if one is no positive whole number.
+      ValueError: if one is not a positive integer.
     """
     try:
         steps = [int(word) for word in words]
@@ -121,4 +121,4 @@ app.check(_STEPS, read_steps)
 
 
 if __name__ == "__main__":
-    app.run(main, again="it goes on; points that are finished are not measured again.")
+    app.run(main, again="repeat the command to resume; finished points are skipped.")

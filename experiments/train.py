@@ -3,7 +3,7 @@
 python -m experiments.train --scene=experiments/data/cube_smcvx_ball --out=runs/ball
 python -m experiments.train --config=runs/ball/config.json --out=runs/again
 
-With --method=r3f the object is reconstructed from images and masks first, into {out}/r3f, and the
+With --method=r3f the object is first reconstructed from images and masks, into {out}/r3f, and the
 scene's own meshes are never read.
 """
 
@@ -23,7 +23,7 @@ from experiments.runs import config_flags, processes
 from refref_jax.optics.path_settings import budget_of
 from refref_jax.training.config import TrainConfig
 
-_OUT = cli_flags.out("Folder to write the run to.")
+_OUT = cli_flags.out("Folder of the run.")
 _CONFIG = config_flags.define_flags()
 flags.adopt_module_key_flags(config_flags)
 flags.adopt_module_key_flags(training_body)
@@ -31,11 +31,11 @@ _DEVICES = cli_flags.devices()
 _RESUME = flags.DEFINE_bool("resume", False, "Continue the run in --out, if there is one.")
 _LOG_EVERY = flags.DEFINE_integer("log_every", 50, "Steps between two lines of metrics.", 1)
 _CHECKPOINT_EVERY = flags.DEFINE_integer("checkpoint_every", 500, "Steps between checkpoints.", 1)
-_KEEP = flags.DEFINE_integer("keep", 2, "Newest checkpoints to keep.", 1)
+_KEEP = flags.DEFINE_integer("keep", 2, "Number of newest checkpoints to keep.", 1)
 
 
 def main() -> None:
-    """Resolves a run, or finds the one to resume, and trains it."""
+    """Resolves a new run, or the one to resume, and trains it."""
     run = Path(_OUT.value)
     asked = check_flags()
     processes.connect(_DEVICES)
@@ -48,20 +48,20 @@ def main() -> None:
 
 
 def check_flags() -> TrainConfig:
-    """Refuses what can be told without the scene, before anything is imported.
+    """Rejects flags that are invalid for any scene, before JAX is imported.
 
     Returns:
-      The configuration that is asked for: the file of --config, with the flags on top.
+      The configuration: the file of --config, overridden by flags.
 
     Raises:
-      ValueError: if one makes no sense, or there is no scene.
+      ValueError: if a flag is invalid, or no scene is set.
     """
     say = (lambda line: None) if _DEVICES.process.value else print
     scene, config = _CONFIG["scene"].value, training_body.asked(_CONFIG, say=say)
     if processes.together(_DEVICES) and training_body.reconstructs(config):
         raise ValueError(
-            "Several processes do not reconstruct together. Run experiments.reconstruct on one "
-            "machine first, and give its folder as --reconstruction."
+            "Several processes cannot reconstruct together. Run experiments.reconstruct on one "
+            "machine first, and pass its folder as --reconstruction."
         )
     cli_scenes.check((config.scene.path or None) if scene is None else scene)
     if scene is None and flags.FLAGS["config"].value is None and not _RESUME.value:
@@ -76,14 +76,14 @@ def check_flags() -> TrainConfig:
 
 
 def _train(run: Path, asked: TrainConfig) -> bool:
-    """Begins a run, or goes on with it; returns whether it has reached its last step."""
+    """Starts or resumes a run; returns whether it has reached its last step."""
     from refref_jax.training import fit, run_folder
 
     mesh = processes.mesh(_DEVICES)
     resuming = _RESUME.value and run_folder.exists(run)
     if run_folder.exists(run) and not resuming:
         raise ValueError(
-            f"{run} holds a run already. Continue it with --resume, or give another --out."
+            f"{run} already contains a run. Continue it with --resume, or give another --out."
         )
     if not resuming:
         run_folder.check_free(run)
@@ -105,11 +105,11 @@ def _train(run: Path, asked: TrainConfig) -> bool:
 
 
 def _open(run: Path, asked: TrainConfig, *, resuming: bool) -> None:
-    """Resolves a run and opens its folder, or compares it with the one that is resumed."""
+    """Resolves a run and creates its folder, or compares it with the one that is resumed."""
     from refref_jax.training import devices, fit, run_folder
 
     if not asked.scene.path:
-        raise ValueError("The configuration names no scene. Add --scene=FOLDER.")
+        raise ValueError("The configuration has no scene. Add --scene=FOLDER.")
     config = asked.at(str(cli_scenes.opened(asked.scene.path).resolve()))
     ior = _CONFIG["ior"].value or ()
     part = training_body.find(run, config, ior=ior, resume=_RESUME.value)
@@ -130,17 +130,17 @@ def _open(run: Path, asked: TrainConfig, *, resuming: bool) -> None:
 
 
 def _refuse_flags(run: Path) -> None:
-    """Refuses flags that a resumed run would not heed."""
+    """Rejects flags that a resumed run would ignore."""
     settled = [*_CONFIG, "config", *(holder.name for holder in training_body.FLAGS)]
     if given := [f"--{name}" for name in settled if flags.FLAGS[name].present]:
         raise ValueError(
-            f"{run} goes on with the options that it was begun with: {', '.join(given)} would have "
-            "no effect. Leave it out, or add --scene to have all options compared."
+            f"{run} resumes with its original options: {', '.join(given)} would have no effect. "
+            "Remove it, or add --scene to compare all options."
         )
 
 
 if __name__ == "__main__":
     app.run(
         main,
-        again="a run is never replaced; the same command with --resume goes on with it.",
+        again="repeat the command with --resume to continue; a run is never replaced.",
     )

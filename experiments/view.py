@@ -1,9 +1,9 @@
-"""Looks at a trained run in a browser: orbit, layers, and the light paths of any pixel.
+"""Shows a trained run in a browser: orbit, layers, and the light paths of any pixel.
 
 python -m experiments.view --run=runs/ball
 
-Bodies may be given other indices of refraction, and light another cut or more bends; the fields
-stay as they were trained. `docs/viewer.md` tells what is shown.
+The objects' indices of refraction, the throughput threshold and the maximum of bends can be
+changed; the fields stay as trained. See `docs/viewer.md`.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ with epy.lazy_imports():
 
 _RUN = cli_flags.run()
 _STEP = cli_flags.step()
-_SCENE = cli_flags.scene("The scene of the test views, if it has moved", required=False)
+_SCENE = cli_flags.scene("The scene of the test views, if it has been moved", required=False)
 _HOST = flags.DEFINE_string(
-    "host", "127.0.0.1", "Address to listen on; 0.0.0.0 lets in everyone who reaches this machine."
+    "host", "127.0.0.1", "Address to listen on; 0.0.0.0 admits everyone who can reach this machine."
 )
 _PORT = flags.DEFINE_integer(
-    "port", 8080, "Port; if it is taken, the next one that is free.", 1, 65535
+    "port", 8080, "Port; the next free one is used if it is taken.", 1, 65535
 )
 _HEIGHTS = flags.DEFINE_list(
     "heights",
     ["36", "90", "180"],
-    "Heights of the pictures in pixels: while the camera moves, and then one after the other. "
+    "Heights of the images in pixels: while the camera moves, and of the successive refinements. "
     "Widths are 16/9 of them.",
 )
 _CHUNK = cli_flags.chunk()
@@ -55,10 +55,10 @@ def main() -> None:
         raise ValueError("The viewer needs viser. Run pip install -e '.[viewer]'.") from error
     subject = read_subject(heights)
     running = server.serve(subject, host=_HOST.value, port=_PORT.value)
-    print(f"Look at http://{_HOST.value}:{running.get_port()}", flush=True)
+    print(f"Viewer: http://{_HOST.value}:{running.get_port()}", flush=True)
     if subject.frames is None:
-        print("There are no test views, and no errors to show: give the scene as --scene.")
-    print("The first picture is compiled first. Ctrl-C ends this.", flush=True)
+        print("There are no test views, so no errors can be shown. Set the scene with --scene.")
+    print("The first image takes longer, because it is compiled. Stop with Ctrl-C.", flush=True)
     try:
         threading.Event().wait()
     finally:
@@ -68,10 +68,10 @@ def main() -> None:
 
 
 def read_heights(words: list[str]) -> tuple[int, ...]:
-    """Returns the heights of pictures.
+    """Parses the heights of images.
 
     Raises:
-      ValueError: if they are not two numbers or more that grow.
+      ValueError: if they are not two or more increasing numbers.
     """
     try:
         heights = tuple(int(word) for word in words)
@@ -79,8 +79,8 @@ def read_heights(words: list[str]) -> tuple[int, ...]:
         heights = ()
     if len(heights) < 2 or heights[0] < 1 or list(heights) != sorted(set(heights)):
         raise ValueError(
-            f"--heights={','.join(words)} are not two or more whole numbers that grow. Write "
-            "as in --heights=36,90,180."
+            f"--heights={','.join(words)} are not two or more increasing integers. Write as in "
+            "--heights=36,90,180."
         )
     return heights
 
@@ -89,7 +89,7 @@ app.check(_HEIGHTS, read_heights)
 
 
 def read_subject(heights: tuple[int, ...]) -> session.Subject:
-    """Reads the run, and its scene where there is one."""
+    """Reads the run, and its scene if it exists."""
     run = Path(_RUN.value)
     config = run_folder.read_config(run)
     scene = _scene(config.scene.path)
@@ -111,9 +111,9 @@ def _scene(trained_on: str) -> Path | None:
     try:
         return cli_scenes.opened(trained_on)
     except (SceneError, OSError) as error:
-        print(f"warning: the scene of the run can not be read: {error}")
+        print(f"warning: the scene of the run cannot be read: {error}")
         return None
 
 
 if __name__ == "__main__":
-    app.run(main, again="it shows the run again; nothing is written.")
+    app.run(main, again="repeat the command to show the run again; nothing is written.")

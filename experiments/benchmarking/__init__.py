@@ -1,1 +1,1 @@
-"""The benchmark: scenes by methods, trained, evaluated and tabled; see docs/benchmark.md."""
+"""The benchmark: methods by scenes, trained, evaluated and tabulated; see docs/benchmark.md."""

@@ -1,13 +1,13 @@
-"""The methods that a benchmark compares: what each is called, and the options that make it.
+"""Defines the methods that a benchmark compares: their names, labels and training options.
 
-A method is options of `experiments.train`, no more: adding one is adding a line here. Everything
-else is the preset's, for all methods alike: sizes, schedule, and the footprint too. So `oracle`,
-`--paths=paper --interior=field`, has the published light paths and field, and is the published
-method in full in the preset `paper` alone: the others are smaller, or have differential footprints
-where the paper's are cones. Ablations of `oracle` take one thing from it; those of `tree`, which is
-ours, change one thing of that, and one that the preset has already is left out (`same_as`), as is
-one that a scene comes to anyway (`same_inside`). Nerfacto's fields (`oracle_nerfacto`) bring their
-own sizes, samples and footprint, a cone.
+A method is a set of options of `experiments.train`, so adding one means adding a line here.
+Everything else is that of the preset for all methods: sizes, schedule and footprint. `oracle`,
+`--paths=paper --interior=field`, therefore has the published light paths and field, and is the
+complete published method only in the preset `paper`: the other presets are smaller, or have
+differential footprints where the paper uses cones. Ablations of `oracle` remove one component;
+those of `tree`, our method, change one. An ablation that equals the preset is skipped (`same_as`),
+as is one that equals the scene's own choice (`same_inside`). Nerfacto's fields (`oracle_nerfacto`)
+define their own sizes, samples and footprint, a cone.
 """
 
 import dataclasses
@@ -26,22 +26,22 @@ Need = Literal["meshes", "masks", "colours"]
 Group = Literal["main", "ablation of the oracle", "ablation of the tree"]
 
 RECONSTRUCTION = "reconstruction"
-"""What the methods that know no meshes share, a scene: no method may be called so."""
+"""Folder for the reconstruction that R3F methods share; no method may have this name."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """One way to learn a scene.
+    """A method to train scenes with.
 
     Attributes:
-      name: as commands take it, and as its folders are called.
-      label: as tables have it.
-      group: which comparison it belongs to.
+      name: name in commands and folders.
+      label: label in tables.
+      group: comparison to which it belongs.
       train: options of `experiments.train`.
-      needs: what a scene must have: `meshes` of its objects, `masks` of its training images,
+      needs: requirements on a scene: `meshes` of its objects, `masks` of its training images,
         `colours` of all its parts in scene.json.
-      reconstructed: whether objects are those that R3F finds, in place of the scene's meshes.
-      published: the row of the paper's tables that is the same method, if there is one.
+      reconstructed: whether the objects come from R3F instead of the scene's meshes.
+      published: row of the paper's tables with the same method, if there is one.
     """
 
     name: str
@@ -58,18 +58,18 @@ _TREE = ("--paths=tree",)
 
 
 def _over(options: Sequence[str], others: Sequence[str]) -> tuple[str, ...]:
-    """Returns options, of which others replace those of their name."""
+    """Overrides options by others of the same name."""
     return tuple({word.partition("=")[0]: word for word in (*options, *others)}.values())
 
 
 def _ablated(name: str, label: str, *options: str, published: str | None = None) -> Method:
-    """Returns the oracle with other options."""
+    """Returns the oracle with changed options."""
     train = _over(_ORACLE, options)
     return Method(name, label, "ablation of the oracle", train, published=published)
 
 
 def _varied(name: str, label: str, *options: str, colours: tuple[Need, ...] = ()) -> Method:
-    """Returns the tree with other options."""
+    """Returns the tree with changed options."""
     train = _over(_TREE, options)
     return Method(name, label, "ablation of the tree", train, needs=("meshes", *colours))
 
@@ -117,27 +117,27 @@ _ALL = (
 )
 
 METHODS: dict[str, Method] = {method.name: method for method in _ALL}
-"""Every method by its name, in the order of tables."""
+"""All methods by name, in the order of tables."""
 
 _OF_INSIDE = ("interior", "tints")
 
 FULL: dict[Group, str] = {"ablation of the oracle": "oracle", "ablation of the tree": "tree"}
-"""The method that each group of ablations is compared with."""
+"""Reference method of each group of ablations."""
 
 
 def same_as(method: Method, preset: str) -> str | None:
-    """Returns which method an ablation is again, where its footprint is the preset's already."""
+    """Returns the method that an ablation equals because its footprint is the preset's."""
     chosen = _options_of(method).get("footprint")
     size = registry.KINDS[registry.USUAL].sizes[presets.PRESETS[preset].size]
     return FULL[method.group] if chosen == size.footprint else None
 
 
 def same_inside(method: Method, inside: Mapping[str, str]) -> str | None:
-    """Returns which method an ablation is again in a scene that needs this inside anyway.
+    """Returns the method that an ablation equals because the scene has this interior anyway.
 
     Args:
-      method: the ablation.
-      inside: options of training that the scene's objects come to, of those in `_OF_INSIDE`.
+      method: ablation.
+      inside: training options that the scene's objects lead to, of those in `_OF_INSIDE`.
     """
     given = _options_of(method)
     chosen = {name: given[name] for name in _OF_INSIDE if name in given}
@@ -149,17 +149,17 @@ def _options_of(method: Method) -> dict[str, str]:
 
 
 def parse(names: Sequence[str]) -> list[Method]:
-    """Returns methods by name, in the order of the table.
+    """Returns methods by name, in the order of tables.
 
     Args:
-      names: of methods; `main`, `ablations` or `all` stand for many.
+      names: names of methods; `main`, `ablations` and `all` are groups of them.
 
     Raises:
-      ValueError: if there is none, or no such one.
+      ValueError: if the list is empty, or a name is unknown.
     """
     wanted = {name for word in names if word for name in _meaning(word.strip())}
     if not wanted:
-        raise ValueError("--methods is empty. Name methods, as --methods=straight,oracle,tree.")
+        raise ValueError("--methods is empty. Set it, as in --methods=straight,oracle,tree.")
     return [method for method in _ALL if method.name in wanted]
 
 

@@ -1,13 +1,13 @@
-"""The tables that compare methods with each other and with the paper's rows.
+"""Builds the tables that compare methods with each other and with the paper's rows.
 
-- `main_table`: by category and background, as the paper's table 2.
-- `top_views_table`: the same means over the test views farthest from all training views (its table
-  of the supplement).
-- `ablation_table`: what taking or changing one thing does to the oracle and to the tree.
+- `main_table`: by category and background, like the paper's table 2.
+- `top_views_table`: the same means over the test views farthest from all training views (the
+corresponding table of the supplement).
+- `ablation_table`: the effect of single changes to the oracle and to the tree.
 
 A number is the mean over a scene's images, then over scenes; its error is over scenes. Differences
-are those of each scene, from the method that nothing is taken from, averaged over the scenes that
-both have; the paper's stand beside them.
+are computed per scene, relative to the reference method, and averaged over the scenes that both
+methods have; those of the paper are next to them.
 """
 
 import math
@@ -30,7 +30,7 @@ from experiments.benchmarking.tables import (
 )
 
 TOP = 5
-"""Test views of a scene that are farthest from its training views, as in the paper."""
+"""Number of test views of a scene, the farthest from its training views, as in the paper."""
 
 CATEGORIES = {
     "smcvx": "convex, single material",
@@ -47,30 +47,30 @@ BACKGROUNDS = {
 
 _THEIRS = (
     "Rows marked *published* are the paper's own (arXiv 2505.05848), measured on its data, which "
-    "is not ours: they are beside ours for orientation and take no part in best and second best."
+    "differs from ours: they are shown for orientation and excluded from best and second best."
 )
 _MEANS = (
-    "Mean over the images of a scene, then over scenes; ± is the standard error over scenes. What "
-    "is not known is - and is not counted. Best **bold**, and of three or more second best "
-    "<u>underlined</u>, among our methods that have all scenes of a block."
+    "Mean over the images of a scene, then over scenes; ± is the standard error over scenes. "
+    "Unknown values are shown as - and not counted. Best **bold**, and of three or more second "
+    "best <u>underlined</u>, among our methods that have all scenes of a block."
 )
 _SUBSTITUTED = (
-    "Substituted distances have the true ones inside the mask, as the first release of the paper's "
-    "code had: they are 0 there by definition for methods that know objects, and do not rank. The "
-    "paper's stand in their column, for they come nearest; which kind they are is not known. "
-    "Before natural backgrounds all distances are those inside the mask."
+    "Substituted distances equal the true ones inside the mask, as in the first release of the "
+    "paper's code: their error is 0 there by definition for methods that know the objects, so they "
+    "are not ranked. The paper's are in their column as the most similar; their definition is not "
+    "known. With natural backgrounds all distances are those inside the mask."
 )
 _FARTHEST = (
-    "Of each scene the {views} rendered test views that are farthest from any training view. The "
-    "paper defines no distance of poses; here it is sqrt(|c - c'|²/s² + a²) of positions c, the "
-    "angle a between the cameras' axes, and the mean distance s of the training cameras from the "
-    "origin."
+    "The {views} rendered test views of each scene that are farthest from any training view. The "
+    "paper does not define a distance of poses; here it is sqrt(|c - c'|²/s² + a²) of positions c, "
+    "the angle a between the cameras' axes, and the mean distance s of the training cameras from "
+    "the origin."
 )
 _DRMSE = (
-    "The paper does not say over which pixels its DRMSE is. It is beside ours *in the mask*, for "
-    "it is hardly over the image: its Oracle has 0.00 here, its DMAE over the image is 0.04 before "
-    "cubes and 0.15 in spheres, and no root mean square is below the mean of the same pixels. That "
-    "*of the image* is ours alone."
+    "The paper does not state the pixels of its DRMSE. It is next to ours *in the mask*, because "
+    "it is unlikely to be over the image: its Oracle has 0.00 here, but a DMAE over the image of "
+    "0.04 with cubes and 0.15 with spheres, and a root mean square is never below the mean of the "
+    "same pixels. Our DRMSE *of the image* has no counterpart."
 )
 
 _PAPERS_SCENES = ("smcvx", "cube")
@@ -79,19 +79,19 @@ _DIFFERENCES = (tables.PSNR, tables.PSNR_MASKED)
 
 _NOTES = (
     "Ablations change one thing of the method in the first row of their block. Means over images, "
-    "then over scenes, ± the standard error over scenes; Δ is the mean over the scenes that both "
-    "have of the difference to the first row, in dB. What is not known is -. All else, the "
-    "footprint included, is the preset's for every row; Nerfacto's fields bring their own sizes, "
-    "samples and footprint (a cone).",
+    "then over scenes, ± the standard error over scenes; Δ is the mean difference to the first row "
+    "over the scenes that both have, in dB. Unknown values are shown as -. All other options, "
+    "including the footprint, are the preset's for every row; Nerfacto's fields define their own "
+    "sizes, samples and footprint (a cone).",
     "*Published* columns are the paper's own (arXiv 2505.05848, ablation study: convex objects of "
-    "a single material, cube backgrounds), measured on its data, which is not ours.",
-    "Our DMAE is the substituted one, see the table of methods; which one the paper's is we do not "
+    "a single material, cube backgrounds), measured on its data, which differs from ours.",
+    "Our DMAE is the substituted one, see the table of methods; the paper's definition is not "
     "know.",
 )
 
 
 def main_table(found: Sequence[Record]) -> Table:
-    """Returns the means of all methods that are no ablations, by category and background."""
+    """Returns the means of all methods except ablations, by category and background."""
     found, blocks = _without_ablations(found), []
     for category in (*CATEGORIES, published.ALL):
         for background in (*BACKGROUNDS, published.ALL):
@@ -115,14 +115,14 @@ def top_views_table(found: Sequence[Record]) -> Table:
 
 
 def _views(found: Sequence[Record]) -> str:
-    """Returns how many of the farthest views there were, up to `TOP` of each scene."""
+    """Returns the number of farthest views per scene, up to `TOP`, as text."""
     counts = {min(TOP, len(record.per_image)) for record in found} or {TOP}
     least, most = min(counts), max(counts)
     return str(most) if least == most else f"{least} to {most}"
 
 
 def top_metrics(record: Record) -> Metrics:
-    """Returns the means over the views of a result that are farthest from any training view."""
+    """Returns the means over those views of a result that are farthest from any training view."""
     apart = np.array([image.pose_distance for image in record.per_image])
     views = [record.per_image[i].metrics for i in pose_space.farthest(apart, TOP)]
     keys = [key for key in record.metrics if all(key in view for view in views)]
@@ -130,7 +130,7 @@ def top_metrics(record: Record) -> Metrics:
 
 
 def select(found: Sequence[Record], category: str, background: str) -> list[Record]:
-    """Returns the results of a category and background; `published.ALL` is any."""
+    """Returns the results of a category and background; `published.ALL` matches all."""
     return [
         record
         for record in found
@@ -140,7 +140,7 @@ def select(found: Sequence[Record], category: str, background: str) -> list[Reco
 
 
 def describe(category: str, background: str) -> str:
-    """Returns what a block of rows is of."""
+    """Returns the title of a block of rows."""
     kind = CATEGORIES.get(category, "all categories")
     return f"{kind}; {BACKGROUNDS.get(background, 'all backgrounds')}"
 
@@ -153,7 +153,7 @@ def columns(wanted: Sequence[Quantity]) -> tuple[Column, ...]:
 def _marked(
     title: str, rows: Sequence[Row], wanted: Sequence[Quantity], found: Sequence[Record]
 ) -> Block:
-    """Returns a block of rows whose best are marked, among those that have all of its scenes."""
+    """Returns a block of rows; the best among those that have all of its scenes are marked."""
     scenes = len({record.scene for record in found})
     return Block(title, tables.mark(rows, columns(wanted), scenes))
 
@@ -198,7 +198,7 @@ def _table(
 
 
 def ablation_table(found: Sequence[Record]) -> Table:
-    """Returns the ablations, over the paper's kind of scenes and over all."""
+    """Returns the ablations, over the scenes of the paper's ablations and over all scenes."""
     blocks = []
     for group in FULL:
         for scenes in (_PAPERS_SCENES, (published.ALL, published.ALL)):
@@ -210,7 +210,7 @@ def ablation_table(found: Sequence[Record]) -> Table:
 
 
 def difference(found: Sequence[Record], method: str, full: str, quantity: Quantity) -> Cell:
-    """Returns the mean difference of a quantity to that of a full method, over common scenes."""
+    """Returns the mean difference of a quantity to that of the reference, over common scenes."""
     known = {
         (record.scene, record.method): tables.value(quantity, record.metrics, record.background)
         for record in found
@@ -221,14 +221,14 @@ def difference(found: Sequence[Record], method: str, full: str, quantity: Quanti
 
 
 def _apart(ours: float | None, theirs: float | None) -> float | None:
-    """Returns a difference; of what is infinite in both nothing is known."""
+    """Returns a difference, or `None` if both values are infinite."""
     if ours is None or theirs is None or (math.isinf(ours) and ours == theirs):
         return None
     return ours - theirs
 
 
 def _rows(found: Sequence[Record], group: Group, *, with_published: bool) -> tuple[Row, ...]:
-    """Returns a row for each method of a group that was measured, the full one first."""
+    """Returns a row for each measured method of a group, the reference first."""
     present = {record.method for record in found}
     members = [method for method in METHODS.values() if method.group == group]
     if not present & {method.name for method in members}:
@@ -265,7 +265,7 @@ def _columns() -> tuple[Column, ...]:
     columns = []
     for each in tables.ABLATIONS:
         plain = Column(each.label, each.latex, each.better, each.digits)
-        # Not our kind of it: which kind of distance the paper's is, is not known.
+        # Not ranked with ours, because the paper's kind of distance is not known.
         name, latex = (text.partition(",")[0] for text in (each.label, each.latex))
         theirs = plain._replace(
             label=f"{name}, published", latex=f"{latex}, published", better=None

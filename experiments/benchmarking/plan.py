@@ -1,17 +1,17 @@
-"""What a benchmark has to do: which scenes, which jobs, and what decides the result of each.
+"""Plans a benchmark: its scenes, its jobs, and the inputs that determine each result.
 
-One job for each scene and method, and what each waits for:
+There is one job for each scene and method, and one for the reconstruction that some wait for:
 
-{out}/jobs/{scene}/{method}/result.json    there when the job is done, see `results`
+{out}/jobs/{scene}/{method}/result.json    exists when the job is finished, see `results`
                            /run/           the trained run, with its evaluation
-                           /run.log        all that its commands printed
-{out}/jobs/{scene}/reconstruction/         what the R3F methods of a scene share
+                           /run.log        the output of its commands
+{out}/jobs/{scene}/reconstruction/         the reconstruction shared by the scene's R3F methods
 
-A scene's fingerprint is a hash of what decides results on it, so that results of another scene of
-that name are not mixed in. It covers the transforms files, scene.json and the meshes by their
-content, and all images that the transforms files name (colours, masks, depth maps) by their names
-and sizes in bytes: to read a data set's images whole whenever a benchmark begins would take
-minutes. Where the folder lies does not matter, nor does what else is in it.
+A scene's fingerprint is a hash of the data that determines its results, so that results of another
+scene of the same name are not mixed in. It covers the contents of the transforms files, scene.json
+and the meshes, and the names and sizes of all images in the transforms files (colours, masks, depth
+maps); reading all images of a data set at every start would take minutes. It does not depend on the
+location of the folder or on other files in it.
 """
 
 import glob
@@ -32,27 +32,27 @@ FOLDER = "jobs"
 RESULT = "result.json"
 
 SPLIT = "test"
-"""The views that are evaluated."""
+"""Split whose views are evaluated."""
 
-# Of a fingerprint.
+# Length of a fingerprint.
 _LETTERS = 16
 
-# Endings of what a key of a frame names: a float depth map may lie beside an 8-bit one.
+# Possible extensions of the files in a frame: a float depth map may be next to an 8-bit one.
 _ENDINGS = {"file_path": (".png",), "mask_file_path": ("",), "depth_file_path": ("", ".exr")}
 
 
 class Job(NamedTuple):
-    """One thing to do, which a process on any machine that sees the folders can.
+    """A unit of work for any process on any machine that can access the folders.
 
     Attributes:
       scene: name of the scene.
-      path: its folder.
-      fingerprint: of its files when this was planned.
+      path: folder of the scene.
+      fingerprint: hash of the scene's files at planning time.
       method: name of the method, or `RECONSTRUCTION`.
-      train: options of training; none of a reconstruction.
-      reconstructed: whether it takes the objects that the scene's reconstruction found.
-      settings: of the benchmark.
-      lpips_weights: file of them.
+      train: training options; empty for a reconstruction.
+      reconstructed: whether it uses the objects of the scene's reconstruction.
+      settings: settings of the benchmark.
+      lpips_weights: file of LPIPS's weights.
     """
 
     scene: str
@@ -66,17 +66,17 @@ class Job(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Name of the job."""
         return f"{self.scene}/{self.method}"
 
     @property
     def awaited(self) -> str | None:
-        """The name of the job that must be done before, if there is one."""
+        """Name of the job that must be finished before this one, if any."""
         return f"{self.scene}/{RECONSTRUCTION}" if self.reconstructed else None
 
 
 class Skipped(NamedTuple):
-    """A method that is left out on a scene, and why."""
+    """A method that is skipped on a scene, and the reason."""
 
     scene: str
     method: str
@@ -84,14 +84,14 @@ class Skipped(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What its job would be called."""
+        """Name that the job would have."""
         return f"{self.scene}/{self.method}"
 
 
 _WANTING: dict[Need, str] = {
     "meshes": "it has no meshes",
     "masks": "its training images have no masks",
-    "colours": "scene.json does not tell the colours of all its parts",
+    "colours": "scene.json does not define the colours of all its parts",
 }
 
 
@@ -102,11 +102,11 @@ def plan_jobs(
     *,
     lpips_weights: str | None = None,
 ) -> tuple[list[Job], list[Skipped]]:
-    """Returns all jobs, scene by scene, and what is left out for want of something.
+    """Returns all jobs, scene by scene, and the skipped ones.
 
-    A reconstruction comes before the jobs that wait for it. A scene whose test views can not be
-    read is left out, for it could be trained on and not be evaluated. One that is broken otherwise
-    is left to its jobs: each will fail, and say why.
+    A reconstruction precedes the jobs that depend on it. A scene whose test views cannot be read is
+    skipped, because it could be trained but not evaluated. A scene that is broken in another way is
+    kept: each of its jobs fails with an error message.
     """
     jobs: list[Job] = []
     skipped: list[Skipped] = []
@@ -125,12 +125,12 @@ def plan_jobs(
 
 
 def options(method: str, train: Sequence[str], settings: Settings) -> dict[str, list[str]]:
-    """Returns what decides a job's result: the options of its commands, by command.
+    """Returns the options of a job's commands, by command; they determine its result.
 
     Args:
-      method: name, or `RECONSTRUCTION`.
-      train: options of the method.
-      settings: of the benchmark.
+      method: name of the method, or `RECONSTRUCTION`.
+      train: training options of the method.
+      settings: settings of the benchmark.
     """
     if method == RECONSTRUCTION:
         return {"reconstruct": [f"--seed={settings.seed}"]}
@@ -141,7 +141,7 @@ def options(method: str, train: Sequence[str], settings: Settings) -> dict[str, 
 
 
 def _lacking(scene: Path, needs: set[Need]) -> set[Need]:
-    """Returns which of some needs a scene does not meet; none if it is broken."""
+    """Returns the requirements that a scene does not meet; none if it is broken."""
     try:
         return _unmet(scene, needs)
     except ValueError:
@@ -169,16 +169,16 @@ def job_folder(out: Path, job: Job) -> Path:
 
 
 def is_done(out: Path, job: Job) -> bool:
-    """Returns whether a job has left its result."""
+    """Returns whether the result of a job exists."""
     return (job_folder(out, job) / RESULT).is_file()
 
 
 def _reasons(scene: Scene, methods: Sequence[Method], preset: str) -> dict[str, str]:
-    """Returns why methods are left out, by name."""
+    """Returns the reasons for skipping methods, by name."""
     try:
         scene_folder.read_frames(Path(scene.path), SPLIT)
     except ValueError as error:
-        return {method.name: f"its {SPLIT} views can not be read: {error}" for method in methods}
+        return {method.name: f"its {SPLIT} views cannot be read: {error}" for method in methods}
     needs = {need for method in methods for need in method.needs}
     lacks, inside = _lacking(Path(scene.path), needs), _inside(Path(scene.path))
     reasons = {}
@@ -186,15 +186,15 @@ def _reasons(scene: Scene, methods: Sequence[Method], preset: str) -> dict[str, 
         if missing := [_WANTING[need] for need in method.needs if need in lacks]:
             reasons[method.name] = missing[0]
         elif full := same_as(method, preset):
-            reasons[method.name] = f"in the preset {preset} it is {full} again"
+            reasons[method.name] = f"in the preset {preset} it equals {full}"
         elif full := same_inside(method, inside):
             told = ", ".join(f"{name} {value}" for name, value in inside.items())
-            reasons[method.name] = f"in this scene it is {full} again ({told})"
+            reasons[method.name] = f"in this scene it equals {full} ({told})"
     return reasons
 
 
 def _inside(scene: Path) -> dict[str, str]:
-    """Returns what a scene needs inside its objects, as options; nothing if it is broken."""
+    """Returns the interior options that a scene leads to; none if it is broken."""
     try:
         described = read_part_descriptions(scene / "scene.json")
         parts = [described.get(p.name, PartDescription()) for p in meshes.mesh_files(scene)]
@@ -215,16 +215,16 @@ def find_scenes(words: Sequence[str]) -> list[Scene]:
     """Returns scenes in the order of their names.
 
     Args:
-      words: folders, with wildcards or without, or `hf:CONFIG/SCENE`. What a wildcard matches and
-        is no scene is passed over.
+      words: folders, with or without wildcards, or `hf:CONFIG/SCENE`. Matches of a wildcard that
+        are not scenes are ignored.
 
     Raises:
-      ValueError: if there is none, if a folder holds none, or two have one name.
+      ValueError: if there are no scenes, if a folder is not a scene, or if two have the same name.
     """
     folders = [folder for word in words if word for folder in _folders(word.strip())]
     if not folders:
         raise ValueError(
-            f"--scenes={','.join(words)} names no scene. Give folders that hold "
+            f"--scenes={','.join(words)} matches no scene. Give folders that contain "
             "transforms_train.json, as in --scenes='scenes/*'."
         )
     found: dict[str, Scene] = {}
@@ -244,7 +244,7 @@ def _folders(word: str) -> list[Path]:
     folder = cli_scenes.opened(word)
     if not _is_scene(folder):
         raise ValueError(
-            f"{folder} is no scene: it holds no transforms_train.json. Give the folder of one."
+            f"{folder} is not a scene: it has no transforms_train.json. Give the folder of a scene."
         )
     return [folder]
 
@@ -254,7 +254,7 @@ def _is_scene(folder: Path) -> bool:
 
 
 def fingerprint(scene: Path) -> str:
-    """Returns the hash of a scene, which may be broken or lack files."""
+    """Returns the hash of a scene, which may be broken or incomplete."""
     found = hashlib.sha256()
     described = scene / "scene.json"
     files = sorted(scene.glob("transforms_*.json"))
@@ -270,14 +270,14 @@ def fingerprint(scene: Path) -> str:
 
 
 def _add(found: Any, name: str, content: bytes) -> None:
-    """Adds to a hash what a name stands for; no two lists of such come to the same bytes."""
+    """Adds a name and its content to a hash, unambiguously."""
     for part in (name.encode(), content):
         found.update(len(part).to_bytes(8, "big"))
         found.update(part)
 
 
 def _images(path: Path) -> Iterator[str]:
-    """Yields the files that a transforms file names, as far as it is one."""
+    """Yields the files in a transforms file, as far as it is valid."""
     try:
         frames = configuration.parse_json(path.read_text(encoding="utf-8"))["frames"]
     except (ValueError, KeyError, TypeError):
@@ -290,7 +290,7 @@ def _images(path: Path) -> Iterator[str]:
 
 
 def _ending(name: str, ending: str) -> str:
-    """Returns the file of a name: image names lack their ending, depth maps may have another."""
+    """Returns the file of an image name, which lacks its extension; depth maps may have another."""
     if ending == ".exr":
         return str(Path(name).with_suffix(ending)) if Path(name).name else name
     return f"{name}{ending}"

@@ -1,14 +1,14 @@
-"""How far test views are from all training views, in the space of camera poses (NumPy only).
+"""Distances between camera poses, to find the test views farthest from the training (NumPy only).
 
-The paper speaks of test views "farthest from any training view in camera pose space" and does not
-define a distance. Here that of two poses is
+The paper uses test views "farthest from any training view in camera pose space" without defining a
+distance. Here the distance of two poses is
 
     sqrt(|c - c'|^2 / s^2 + a^2)
 
-of camera positions `c`, the angle `a` in radians of the rotation that takes one camera's axes to
-the other's, and the scale `s`, the mean distance of the training cameras from the world's origin,
-about which the objects of the data set stand. A camera that moves round the origin by an angle
-moves by as much in both terms. A test view's own distance is that to the nearest training view.
+with the camera positions `c`, the angle `a` in radians of the rotation between the cameras' axes,
+and the scale `s`, the mean distance of the training cameras from the world's origin, around which
+the objects of the data set are placed. A camera that rotates around the origin by an angle changes
+both terms by the same amount. The distance of a test view is that to the nearest training view.
 """
 
 import numpy as np
@@ -21,8 +21,8 @@ def distances(
     """Returns the distance of each test pose from the nearest training pose.
 
     Args:
-      tests: camera-to-world matrices.
-      trainings: the same, of the training views.
+      tests: camera-to-world matrices of the test views.
+      trainings: camera-to-world matrices of the training views.
     """
     scale = np.mean(np.linalg.norm(trainings[:, :, 3], axis=-1))
     apart = np.linalg.norm(tests[:, None, :, 3] - trainings[None, :, :, 3], axis=-1)
@@ -33,5 +33,5 @@ def distances(
 
 
 def farthest(found: Float[np.ndarray, " tests"], count: int) -> list[int]:
-    """Returns the places of the largest distances, the farthest first; ties in their order."""
+    """Returns the indices of the largest distances, the farthest first; ties keep their order."""
     return [int(i) for i in np.argsort(-found, kind="stable")[:count]]

@@ -1,8 +1,9 @@
-"""The numbers that the paper prints, as `published.csv` has them: theirs, on their data.
+"""Reads the numbers printed in the paper, measured on its own data, from `published.csv`.
 
-Transcribed from the LaTeX source of arXiv 2505.05848; `line` is the line there. `--` is missing,
-as in the paper. In the ablation table SSIM, LPIPS and DMAE are divided by 100, which the paper
-multiplies them with. DMAE is taken inside the mask before natural backgrounds (`env`).
+They are transcribed from the LaTeX source of arXiv 2505.05848; `line` is the line there. `--` marks
+a missing value, as in the paper. In the ablation table SSIM, LPIPS and DMAE are divided by 100,
+because the paper multiplies them by 100. DMAE is taken inside the mask with natural backgrounds
+(`env`).
 """
 
 import csv
@@ -19,19 +20,19 @@ MAIN, ABLATION, TOP_VIEWS = "result_quantitative", "ablation", "top5"
 """Labels of the paper's tables."""
 
 ALL = "all"
-"""Category or background of a row over all of them."""
+"""Category or background of a row that covers all of them."""
 
 
 class Published(NamedTuple):
-    """A row.
+    """A row of a table of the paper.
 
     Attributes:
       table: label of the paper's table.
-      category: as in `scene_names.CATEGORIES`, or `ALL`.
-      background: as in `scene_names.BACKGROUNDS`, or `ALL`.
-      method: its name there.
-      numbers: as printed, by name, see `NUMBERS`; `None` where the paper has none.
-      line: of the source.
+      category: category as in `scene_names.CATEGORIES`, or `ALL`.
+      background: background as in `scene_names.BACKGROUNDS`, or `ALL`.
+      method: name of the method in the paper.
+      numbers: printed numbers by name, see `NUMBERS`; `None` if missing.
+      line: line of the LaTeX source.
     """
 
     table: str
@@ -42,7 +43,7 @@ class Published(NamedTuple):
     line: int
 
     def cell(self, quantity: Quantity) -> Cell:
-        """Returns a number of the row as tables have it."""
+        """Returns a number of the row as a cell of a table."""
         text = None if quantity.published is None else self.numbers[quantity.published]
         return NOTHING if text is None else Cell(float(text), digits=len(text.partition(".")[2]))
 
@@ -65,6 +66,6 @@ def read() -> tuple[Published, ...]:
 
 
 def rows(table: str, category: str, background: str) -> list[Published]:
-    """Returns the rows of one part of one table."""
+    """Returns the rows of a table for a category and background."""
     wanted = (table, category, background)
     return [each for each in read() if (each.table, each.category, each.background) == wanted]

@@ -1,12 +1,13 @@
-"""The results of a benchmark's jobs: records, their JSON, and the files that hold it.
+"""Stores the results of a benchmark's jobs: records, their JSON, and its files.
 
-A record says all there is to say of a job. Its JSON is checked when it is read: docs/benchmark.md
-has the schema. Numbers that JSON does not know are written by name, "inf", "-inf" and "nan"; these
-are read as numbers where a number belongs, and nowhere else: a scene may be called nan.
+A record contains everything that is known of a job. Its JSON is validated when it is read;
+docs/benchmark.md has the schema. Numbers that JSON does not support are written as strings, "inf",
+"-inf" and "nan"; these are read as numbers only where a number is expected: a scene may be called
+nan.
 
-Tables are made of these files alone. A job's folder can be copied to another machine's benchmark
-of the same settings, to merge what both have measured: so each is compared with what the benchmark
-asks for when it is read.
+Tables are built from these files only. To merge the results of several machines, the folder of a
+job can be copied into another benchmark with the same settings. Each record is therefore compared
+with the benchmark when it is read.
 """
 
 import dataclasses
@@ -21,22 +22,22 @@ from refref_jax import configuration
 from refref_jax.data import scene_names
 
 OTHER = "other"
-"""Category or background of a scene that has no name of the data set's form."""
+"""Category or background of a scene whose name does not follow the data set's pattern."""
 
 Metrics = dict[str, float | None]
-"""Measured numbers, by the names of docs/metrics.md; `None` for what is not known."""
+"""Measured numbers, by the names of docs/metrics.md; `None` for unknown values."""
 
-_TAKE_OUT = "Take its folder out, and repeat the command."
+_TAKE_OUT = "Remove its folder, and repeat the command."
 
 
 class Image(NamedTuple):
-    """What was measured of a test view.
+    """Metrics of a test view.
 
     Attributes:
-      name: of the view.
-      pose_distance: from the nearest training view, see `pose_space`.
-      seconds: that it was rendered in, if that was measured.
-      metrics: of it.
+      name: name of the view.
+      pose_distance: distance from the nearest training view, see `pose_space`.
+      seconds: rendering time, if measured.
+      metrics: metrics of the image.
     """
 
     name: str
@@ -46,18 +47,18 @@ class Image(NamedTuple):
 
 
 class Costs(NamedTuple):
-    """What a job took; `None` where it was not measured. See `measured_runs.Training`.
+    """Cost of a job; `None` if not measured. See `measured_runs.Training`.
 
     Attributes:
-      steps: of training.
-      seconds_per_step: median.
-      rays_per_second: of training.
-      train_seconds: of all steps.
-      startup_seconds: of training's process besides.
-      peak_host_mib: most memory of training's process, or of a reconstruction's.
-      peak_device_mib: most memory of its accelerator.
-      seconds_per_image: of rendering.
-      seconds: of a reconstruction's last process.
+      steps: number of training steps.
+      seconds_per_step: median duration of a training step.
+      rays_per_second: throughput of training.
+      train_seconds: duration of all training steps.
+      startup_seconds: remaining duration of the training's process.
+      peak_host_mib: peak memory of the process of the training or reconstruction.
+      peak_device_mib: peak memory of its accelerator.
+      seconds_per_image: rendering time per image.
+      seconds: duration of a reconstruction's last process.
     """
 
     steps: float | None = None
@@ -72,7 +73,7 @@ class Costs(NamedTuple):
 
 
 class Truth(NamedTuple):
-    """True files of a view, from `scene_path`; `None` for what the scene lacks."""
+    """Reference files of a view, relative to `scene_path`; `None` if the scene lacks them."""
 
     rgb: str
     mask: str | None
@@ -80,7 +81,7 @@ class Truth(NamedTuple):
 
 
 class View(NamedTuple):
-    """Files of a view: the true ones, and what was rendered, from the job's folder."""
+    """Files of a view: the references, and the renders relative to the job's folder."""
 
     name: str
     truth: Truth
@@ -89,23 +90,23 @@ class View(NamedTuple):
 
 
 class Record(NamedTuple):
-    """What a job left, see docs/benchmark.md.
+    """Result of a job, see docs/benchmark.md.
 
     Attributes:
-      scene: name.
+      scene: name of the scene.
       category: `smcvx`, `smncvx`, `mmncvx`, or `OTHER`.
       background: `cube`, `sphere`, `env`, or `OTHER`.
-      method: name, or `RECONSTRUCTION`.
-      fingerprint: of the scene's files, see `plan.fingerprint`.
-      options: of its commands, by command.
-      settings: of the benchmark.
+      method: name of the method, or `RECONSTRUCTION`.
+      fingerprint: hash of the scene's files, see `plan.fingerprint`.
+      options: options of its commands, by command.
+      settings: settings of the benchmark.
       metrics: means over the images.
-      per_image: of each image.
-      costs: what it took.
-      versions: of what it ran with.
+      per_image: metrics of each image.
+      costs: cost of the job.
+      versions: versions of the software.
       views: files of each image.
-      scene_path: where the scene was.
-      facts: what was found besides: learned colours, index of refraction.
+      scene_path: folder of the scene at that time.
+      facts: other results, such as learned colours and the index of refraction.
     """
 
     scene: str
@@ -130,7 +131,7 @@ def compared(found: list[Record]) -> list[Record]:
 
 
 def category_and_background(scene: str) -> tuple[str, str]:
-    """Returns what a scene's name says it is."""
+    """Returns the category and the background in a scene's name."""
     if not scene_names.is_name(scene):
         return OTHER, OTHER
     name = scene_names.parse(scene)
@@ -138,7 +139,7 @@ def category_and_background(scene: str) -> tuple[str, str]:
 
 
 def to_json(record: Record) -> dict[str, Any]:
-    """Returns a result as JSON has it."""
+    """Returns a record as a JSON object."""
     return configuration.string_safe(
         record._asdict()
         | {
@@ -158,10 +159,10 @@ def to_json(record: Record) -> dict[str, Any]:
 
 
 def from_json(content: Any) -> Record:
-    """Undoes `to_json`. What else an object holds is passed over.
+    """Inverts `to_json`; unknown keys of objects are ignored.
 
     Raises:
-      ValueError: if something is missing or of another kind.
+      ValueError: if something is missing or has the wrong type.
     """
     told = _object(content, "the file")
     known = {key: _get(told, key, "the file") for key in Record._fields}
@@ -170,7 +171,7 @@ def from_json(content: Any) -> Record:
     try:
         common = Settings(**given)
     except TypeError as error:
-        raise ValueError(f"its settings are others: {error}") from error
+        raise ValueError(f"its settings differ: {error}") from error
     return Record(
         **{key: _text(known[key], key) for key in texts},
         options={
@@ -191,7 +192,7 @@ def from_json(content: Any) -> Record:
 
 
 def number(value: Any, what: str) -> float | None:
-    """Returns a number that JSON holds; what is not known is `None`.
+    """Returns a number from JSON; `None` if it is unknown.
 
     Raises:
       ValueError: if it is anything else.
@@ -200,7 +201,7 @@ def number(value: Any, what: str) -> float | None:
         return float(value)
     if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
         return value
-    raise ValueError(f"{what} is {value!r}, which is no number")
+    raise ValueError(f"{what} is {value!r}, which is not a number")
 
 
 def _image(content: Any) -> Image:
@@ -208,7 +209,7 @@ def _image(content: Any) -> Image:
     name = _text(told.pop("name", None), "the name of an image")
     apart = number(told.pop("pose_distance", None), f"pose_distance of {name}")
     if apart is None or not math.isfinite(apart):
-        raise ValueError(f"pose_distance of {name} is {apart}, which is no distance")
+        raise ValueError(f"pose_distance of {name} is {apart}, which is not a distance")
     seconds = number(told.pop("seconds", None), f"seconds of {name}")
     return Image(name, apart, seconds, _numbers(told, name))
 
@@ -216,7 +217,7 @@ def _image(content: Any) -> Image:
 def _costs(content: Any) -> Costs:
     known = _numbers(content, "costs")
     if unknown := set(known) - set(Costs._fields):
-        raise ValueError(f"costs has {sorted(unknown)[0]}, which is no cost")
+        raise ValueError(f"costs has {sorted(unknown)[0]}, which is not a cost")
     return Costs(**known)
 
 
@@ -242,19 +243,19 @@ def _get(told: dict[str, Any], key: str, what: str) -> Any:
 
 def _object(value: Any, what: str) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise ValueError(f"{what} is {value!r}, which is no object")
+        raise ValueError(f"{what} is {value!r}, which is not an object")
     return value
 
 
 def _list(value: Any, what: str) -> list[Any]:
     if not isinstance(value, list):
-        raise ValueError(f"{what} is {value!r}, which is no list")
+        raise ValueError(f"{what} is {value!r}, which is not a list")
     return value
 
 
 def _text(value: Any, what: str) -> str:
     if not isinstance(value, str):
-        raise ValueError(f"{what} is {value!r}, which is no text")
+        raise ValueError(f"{what} is {value!r}, which is not text")
     return value
 
 
@@ -263,7 +264,7 @@ def _text_or_none(value: Any, what: str) -> str | None:
 
 
 def write(folder: Path, record: Record) -> None:
-    """Writes the result of a job, all or nothing."""
+    """Writes the result of a job atomically."""
     settings.write_json(folder / plan.RESULT, to_json(record))
 
 
@@ -271,7 +272,7 @@ def read(path: Path) -> Record:
     """Reads the result of a job.
 
     Raises:
-      ValueError: if it is none.
+      ValueError: if the file is not a result.
     """
     try:
         return from_json(configuration.parse_json(path.read_text("utf-8")))
@@ -285,8 +286,8 @@ def read_all(out: Path, benchmark: Benchmark) -> list[Record]:
     """Reads all results of a benchmark, ordered by scene and method.
 
     Raises:
-      ValueError: if one is broken, lies in another's folder, or was made with other settings, with
-        a method that is another or not known, or of another scene of that name.
+      ValueError: if a result is broken, is in the wrong folder, or was made with other settings,
+        with another or unknown method, or of another scene of that name.
     """
     found: list[Record] = []
     fingerprints = {name: scene.fingerprint for name, scene in benchmark.scenes.items()}
@@ -303,16 +304,16 @@ def read_all(out: Path, benchmark: Benchmark) -> list[Record]:
 
 
 def _check_method(path: Path, record: Record, benchmark: Benchmark) -> None:
-    """Refuses a result that was not made as the benchmark has it."""
+    """Rejects a result whose settings or options differ from those of the benchmark."""
     if record.settings != benchmark.settings:
         raise ValueError(
             f"{path} was made with other settings than those of {path.parents[3] / settings.FILE}, "
-            f"so that it does not compare. {_TAKE_OUT}"
+            f"so it is not comparable. {_TAKE_OUT}"
         )
     if record.method not in (*METHODS, RECONSTRUCTION):
         raise ValueError(
-            f"{path} is of the method {record.method}, which this version does not know. Use the "
-            "version that made it, or take its folder out."
+            f"{path} has the method {record.method}, which is unknown in this version. Use the "
+            "version that made it, or remove its folder."
         )
     train = benchmark.methods.get(record.method)
     if train is None and record.method in METHODS:
@@ -322,13 +323,13 @@ def _check_method(path: Path, record: Record, benchmark: Benchmark) -> None:
         made, asked = record.options.get(command, []), expected.get(command, [])
         if made != asked:
             raise ValueError(
-                f"{path} was made by {command} {' '.join(made)}, and here {record.method} is "
+                f"{path} was made by {command} {' '.join(made)}, but here {record.method} is "
                 f"{command} {' '.join(asked)}. {_TAKE_OUT}"
             )
 
 
 def _check_scene(path: Path, record: Record, fingerprint: str) -> None:
-    """Refuses a result of another scene than that of its name."""
+    """Rejects a result of another scene of the same name."""
     if record.fingerprint != fingerprint:
         raise ValueError(
             f"{path} is of another scene named {record.scene} (fingerprint {record.fingerprint}) "
@@ -338,6 +339,6 @@ def _check_scene(path: Path, record: Record, fingerprint: str) -> None:
     kind = category_and_background(record.scene)
     if (record.category, record.background) != kind:
         raise ValueError(
-            f"{path} says that {record.scene} is {record.category} before {record.background}, its "
-            f"name says {' before '.join(kind)}. {_TAKE_OUT}"
+            f"{path} has the category {record.category} and the background {record.background} for "
+            f"{record.scene}, but its name has {' and '.join(kind)}. {_TAKE_OUT}"
         )

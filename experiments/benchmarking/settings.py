@@ -1,8 +1,8 @@
-"""What decides the results of a benchmark, fixed in its folder when it begins.
+"""Stores the settings of a benchmark, which are fixed in its folder when it starts.
 
-{out}/benchmark.json    a `Benchmark`: its settings, and all scenes and methods asked for so far
+{out}/benchmark.json    a `Benchmark`: its settings, and all scenes and methods requested so far
 
-Scenes and methods may be added later; what they are may not change.
+Scenes and methods may be added later, but not changed.
 """
 
 import dataclasses
@@ -18,21 +18,21 @@ from refref_jax.data import scene_folder
 
 FILE = "benchmark.json"
 
-# Settings that no training depends on.
+# Settings that do not affect any training.
 _OF_EVALUATION = ("limit", "rays_per_pixel", "lpips")
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What all results of a benchmark have in common.
+    """Settings that all results of a benchmark share.
 
     Attributes:
-      preset: of the trainings.
-      steps: of each.
-      limit: test images of an evaluation, evenly spread; `None` for all.
-      rays_per_pixel: of an evaluation.
-      seed: of everything random.
-      lpips: SHA-256 of the weights that LPIPS is measured with; `None` if it is not.
+      preset: preset of the trainings.
+      steps: number of steps of each training.
+      limit: number of test images per evaluation, evenly spread; `None` for all.
+      rays_per_pixel: number of rays per pixel in an evaluation.
+      seed: random seed.
+      lpips: SHA-256 of LPIPS's weights; `None` if LPIPS is not measured.
     """
 
     preset: str
@@ -43,11 +43,11 @@ class Settings:
     lpips: str | None
 
     def training(self) -> tuple[str, ...]:
-        """Returns what all trainings are told."""
+        """Returns the flags that all trainings share."""
         return (f"--preset={self.preset}", f"--steps={self.steps}", f"--seed={self.seed}")
 
     def evaluation(self) -> tuple[str, ...]:
-        """Returns what all evaluations are told, but for where the weights of LPIPS are."""
+        """Returns the flags that all evaluations share, except for the file of LPIPS's weights."""
         limit = () if self.limit is None else (f"--limit={self.limit}",)
         return (f"--rays_per_pixel={self.rays_per_pixel}", *limit)
 
@@ -57,8 +57,8 @@ class Scene:
     """A scene of a benchmark.
 
     Attributes:
-      name: unique in the benchmark.
-      path: absolute path of its folder, where it was last.
+      name: name, unique in the benchmark.
+      path: latest absolute path of its folder.
       fingerprint: hash of its files, see `plan.fingerprint`.
     """
 
@@ -69,12 +69,12 @@ class Scene:
 
 @dataclasses.dataclass(frozen=True)
 class Benchmark:
-    """What a benchmark was begun with, and what was added.
+    """Settings, scenes and methods of a benchmark.
 
     Attributes:
-      settings: common to all results.
-      scenes: by name.
-      methods: options of training of each, by its name.
+      settings: settings of all results.
+      scenes: scenes by name.
+      methods: training options of each method, by its name.
     """
 
     settings: Settings
@@ -83,7 +83,7 @@ class Benchmark:
 
 
 def asked(settings: Settings, scenes: Sequence[Scene], methods: Sequence[Method]) -> Benchmark:
-    """Returns the benchmark that a command asks for."""
+    """Returns the benchmark that a command requests."""
     return Benchmark(
         settings,
         {scene.name: scene for scene in scenes},
@@ -92,14 +92,14 @@ def asked(settings: Settings, scenes: Sequence[Scene], methods: Sequence[Method]
 
 
 def read(out: Path) -> Benchmark:
-    """Reads what a benchmark was begun with.
+    """Reads the benchmark of a folder.
 
     Raises:
-      ValueError: if the folder holds none, or a broken one.
+      ValueError: if the folder contains no benchmark, or a broken one.
     """
     path = out / FILE
     if not path.is_file():
-        raise ValueError(f"{out} holds no benchmark. Give --scenes and --methods to begin one.")
+        raise ValueError(f"{out} has no benchmark. Use --scenes and --methods to start one.")
     record = scene_folder.read_json(path)
     try:
         return Benchmark(
@@ -109,16 +109,16 @@ def read(out: Path) -> Benchmark:
         )
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(
-            f"{path} is not that of a benchmark ({error!r}). Restore it, or give another --out."
+            f"{path} is not a valid benchmark ({error!r}). Restore it, or give another --out."
         ) from error
 
 
 def extended(out: Path, more: Benchmark) -> Benchmark:
-    """Returns the benchmark of a folder, if it holds one, with scenes and methods added.
+    """Adds scenes and methods to the benchmark of a folder, if it exists.
 
     Raises:
-      ValueError: if it was begun with other settings, or knows a scene or method of that name that
-        is not the same.
+      ValueError: if it was started with other settings, or contains another scene or method of the
+        same name.
     """
     if not (out / FILE).exists():
         return more
@@ -128,22 +128,22 @@ def extended(out: Path, more: Benchmark) -> Benchmark:
         known = begun.scenes.get(name, scene)
         if known.fingerprint != scene.fingerprint:
             raise ValueError(
-                f"{out} was begun with another scene named {name}: that of {known.path} had other "
-                f"cameras, meshes, images or scene.json than {scene.path} has now. Restore or "
-                "rename the folder, or give another --out."
+                f"{out} was started with another scene named {name}: that of {known.path} had "
+                f"other cameras, meshes, images or scene.json than {scene.path} has now. Restore "
+                "or rename the folder, or give another --out."
             )
     for name, options in more.methods.items():
         known = begun.methods.get(name, options)
         if known != options:
             raise ValueError(
-                f"In {out} the method {name} is {' '.join(known)}, in this version it is "
-                f"{' '.join(options)}. Use the version that it was begun with, or another --out."
+                f"In {out} the method {name} is {' '.join(known)}, but in this version it is "
+                f"{' '.join(options)}. Use the version that started it, or another --out."
             )
     return Benchmark(begun.settings, begun.scenes | more.scenes, dict(begun.methods) | more.methods)
 
 
 def write(out: Path, benchmark: Benchmark) -> None:
-    """Writes what a benchmark is begun with; its folder is made."""
+    """Writes the settings of a benchmark; its folder is created."""
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / FILE, dataclasses.asdict(benchmark))
 
@@ -155,7 +155,7 @@ def digest(path: Path) -> str:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Writes a JSON file, all or nothing."""
+    """Writes a JSON file atomically."""
     with atomic_files.written_file(path) as draft:
         draft.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
@@ -168,13 +168,13 @@ def _check_settings(out: Path, begun: Settings, now: Settings) -> None:
             again = ""
             if field.name in _OF_EVALUATION:
                 again = (
-                    " To evaluate what is trained once more, without training it again, see "
+                    " To evaluate existing trainings again without repeating them, see "
                     "'Evaluating again' in docs/benchmark.md."
                 )
             raise ValueError(
-                f"{out} was begun {_told(field.name, before)}, and is now asked for "
-                f"{_told(field.name, after)}: results would not compare. Leave --{option} as it "
-                f"was, or give another --out.{again}"
+                f"{out} was started {_told(field.name, before)}, but is now requested "
+                f"{_told(field.name, after)}: results would not be comparable. Keep --{option} "
+                f"unchanged, or give another --out.{again}"
             )
 
 
@@ -182,5 +182,5 @@ def _told(name: str, value: int | str | None) -> str:
     if value is None:
         return "without LPIPS" if name == "lpips" else f"without --{name}"
     if name == "lpips":
-        return f"with the weights of LPIPS whose SHA-256 begins with {str(value)[:8]}"
+        return f"with the weights of LPIPS whose SHA-256 starts with {str(value)[:8]}"
     return f"with {name} {value}"

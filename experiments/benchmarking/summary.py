@@ -1,13 +1,12 @@
-"""Writes what a benchmark has come to so far, from its results alone; each file all or nothing.
+"""Writes the tables and the index of a benchmark from its results; each file atomically.
 
-{out}/summary.md                         all tables, what failed, what was left out, what has no
-                                         result yet
+{out}/summary.md                         all tables, and the failed, skipped and missing results
 {out}/tables/{table}.{md,csv,json,tex}   each table
 {out}/tables/scenes.csv                  all metrics of each scene and method
-{out}/results.json                       what a report needs, see docs/benchmark.md
+{out}/results.json                       input of the report, see docs/benchmark.md
 
-Tables are written for programs, as CSV with a line for each number and as JSON, and for people, as
-Markdown and as LaTeX for a paper (with booktabs).
+Tables are written as CSV with a line for each number and as JSON, for programs, and as Markdown and
+LaTeX (with booktabs), for people.
 """
 
 import csv
@@ -29,10 +28,10 @@ from refref_jax.training import run_folder
 
 FILE, RESULTS, TABLES = "summary.md", "results.json", "tables"
 
-# Points of a curve of training: as many as a figure shows.
+# Largest number of points of a training curve in a figure.
 _MOST_POINTS = 200
 
-# Scenes without a result that summary.md names for each method; results.json has all.
+# Largest number of missing scenes in summary.md for each method; results.json lists all.
 _MOST_NAMES = 10
 
 _HEAD = (
@@ -72,10 +71,10 @@ _LATEX_SPECIAL = {
     "^": r"\textasciicircum{}",
 }
 
-# Underscores between letters and digits are letters; elsewhere they may begin emphasis.
+# Underscores between letters and digits are literal; elsewhere they may start emphasis.
 _MARKDOWN_SPECIAL = re.compile(r"[\\|<>*`\[\]&]|(?<![^\W_])_|_(?![^\W_])")
 
-# What the notes of tables are written with.
+# Markup in the notes of tables.
 _MARKS = re.compile(r"\*+|</?u>|`")
 
 
@@ -90,12 +89,12 @@ def write(
 
     Args:
       out: folder of the benchmark.
-      benchmark: what it was begun with.
-      failed: why jobs failed, by name, as `scene/method`.
-      skipped: what was left out.
+      benchmark: its settings, scenes and methods.
+      failed: reasons of failed jobs, by name, as in `scene/method`.
+      skipped: skipped methods.
 
     Raises:
-      ValueError: if a result is broken, or does not compare with the others.
+      ValueError: if a result is broken, or not comparable with the others.
     """
     everything = results.read_all(out, benchmark)
     found = results.compared(everything)
@@ -136,10 +135,10 @@ def _write_tables(folder: Path, made: Sequence[Table], found: Sequence[Record]) 
 
 
 def not_done(out: Path) -> tuple[dict[str, str], list[Skipped]]:
-    """Returns what failed and what was left out when the results were last written.
+    """Returns the failed and skipped jobs when the results were last written.
 
-    What has a result since is in neither. Nothing is told where no results were written, or where
-    they can not be read.
+    Jobs that have a result since are not included. Both are empty if no results were written, or if
+    they cannot be read.
     """
     try:
         index = configuration.parse_json((out / RESULTS).read_text("utf-8"))
@@ -161,7 +160,7 @@ def _has_result(out: Path, name: str) -> bool:
 def _missing(
     out: Path, benchmark: Benchmark, failed: Mapping[str, str], skipped: Sequence[Skipped]
 ) -> list[tuple[str, str]]:
-    """Returns the scenes and methods of a benchmark that have no result, for no reason known."""
+    """Returns the scenes and methods of a benchmark that lack a result for no known reason."""
     told = {*failed, *(each.name for each in skipped)}
     return [
         (scene, method)
@@ -182,8 +181,8 @@ def _heading(benchmark: Benchmark, found: Sequence[Record]) -> list[str]:
         "# Benchmark",
         "",
         f"Results: {len(found)}, scenes: {len({record.scene for record in found})}. Preset "
-        f"`{common.preset}`, steps: {common.steps}, seed: {common.seed}; {images} a scene, rays in "
-        f"a pixel: {common.rays_per_pixel}.",
+        f"`{common.preset}`, steps: {common.steps}, seed: {common.seed}; {images} per scene, rays "
+        f"per pixel: {common.rays_per_pixel}.",
         "",
         *(several if len(versions) > 1 else ()),
     ]
@@ -197,8 +196,8 @@ def _not_done(
         without.setdefault(method, []).append(scene)
     parts = {
         "Failed:": [f"{name}: {reason}" for name, reason in failed.items()],
-        "Left out:": [f"{each.name}: {each.reason}" for each in skipped],
-        "No result yet, of the scenes and methods asked for:": [
+        "Skipped:": [f"{each.name}: {each.reason}" for each in skipped],
+        "Without result:": [
             f"{method}, scenes: {len(scenes)}: {', '.join(scenes[:_MOST_NAMES])}"
             + (", ..." if len(scenes) > _MOST_NAMES else "")
             for method, scenes in without.items()
@@ -212,7 +211,7 @@ def _not_done(
 
 
 def _indexed(out: Path, record: Record) -> dict[str, Any]:
-    """Returns a result with the paths of its pictures from `out`, and its curve of training."""
+    """Returns a result with paths of its images relative to `out`, and its training curve."""
     folder = Path(plan.FOLDER) / record.scene / record.method
     views = [
         view._replace(rgb=str(folder / view.rgb), distance=str(folder / view.distance))
@@ -226,7 +225,7 @@ def _indexed(out: Path, record: Record) -> dict[str, Any]:
 
 
 def _curve(run: Path) -> list[dict[str, Any]]:
-    """Returns the metrics of a training, thinned to what a figure shows; the last stays."""
+    """Returns the metrics of a training, subsampled for a figure; the last line is kept."""
     lines = configuration.from_string_safe(run_folder.read_metrics(run))
     stride = max(1, -(-len(lines) // _MOST_POINTS))
     thinned = lines[::-1][::stride][::-1]
@@ -240,7 +239,7 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def table_as_csv(table: Table) -> str:
-    """Returns a line for each number of a table; what is not known is empty."""
+    """Returns a CSV line for each number of a table; unknown values are empty."""
     rows = [
         (
             table.name,
@@ -261,7 +260,7 @@ def table_as_csv(table: Table) -> str:
 
 
 def table_as_json(table: Table) -> dict[str, Any]:
-    """Returns a table as JSON has it."""
+    """Returns a table as a JSON object."""
     return configuration.string_safe(
         {
             "name": table.name,
@@ -291,10 +290,10 @@ def table_as_json(table: Table) -> dict[str, Any]:
 
 
 def table_from_json(record: dict[str, Any]) -> Table:
-    """Undoes `table_as_json`.
+    """Inverts `table_as_json`.
 
     Raises:
-      KeyError, TypeError: if it is no table.
+      KeyError, TypeError: if the object is not a table.
     """
     return Table(
         name=record["name"],
@@ -308,7 +307,7 @@ def table_from_json(record: dict[str, Any]) -> Table:
 
 
 def scenes_csv(found: Sequence[Record]) -> str:
-    """Returns a line for each result, with all of its metrics."""
+    """Returns a CSV line for each result, with all of its metrics."""
     keys = sorted({key for record in found for key in record.metrics})
     head = ("scene", "category", "background", "method", *keys)
     rows = [
@@ -344,7 +343,7 @@ def _text(value: float | None) -> str:
 
 
 def markdown(table: Table) -> str:
-    """Returns a section: title, a table for each block, and notes."""
+    """Returns a Markdown section: title, a table for each block, and notes."""
     lines = [f"## {table.title}", ""]
     for block in table.blocks:
         heads = [heading(column) for column in table.columns]
@@ -357,22 +356,22 @@ def markdown(table: Table) -> str:
             "",
         ]
     if not table.blocks:
-        lines += ["Nothing is measured yet.", ""]
+        lines += ["No results yet.", ""]
     return "\n".join([*lines, *(f"{note}\n" for note in table.notes)])
 
 
 def in_markdown(text: str) -> str:
-    """Returns text of one line that Markdown shows as it is, in a table's cell too."""
+    """Escapes a line of text for Markdown, including cells of tables."""
     return _MARKDOWN_SPECIAL.sub(lambda found: f"\\{found[0]}", " ".join(text.split()))
 
 
 def heading(column: Column) -> str:
-    """Returns what stands above a column: its label, and an arrow to what is better."""
+    """Returns the heading of a column: its label, and an arrow towards better values."""
     return f"{column.label}{_ARROWS[column.better]}"
 
 
 def latex(table: Table) -> str:
-    """Returns a tabular, with the blocks below one another, and the notes in comments."""
+    """Returns a LaTeX tabular with all blocks, and the notes as comments."""
     count = len(table.columns) + 2
     heads = [f"{column.latex}{_LATEX_ARROWS[column.better]}" for column in table.columns]
     lines = [

@@ -1,18 +1,19 @@
-"""Tables before they are written: blocks of rows, ours and the paper's, in columns.
+"""Builds tables before they are formatted: blocks of rows, ours and the paper's, in columns.
 
-`mean_over` makes a cell: a mean over scenes or views with its standard error; what is not known is
-never counted. `mark` finds the best and the second best of a block's own rows. Rows that lack a
-scene of the block are left out of that, and so are the paper's, which are of other data.
+`mean_over` makes a cell: a mean over scenes or views with its standard error; unknown values are
+not counted. `mark` finds the best and the second best of our rows of a block. Rows that lack a
+scene of the block are excluded, and so are the paper's, which use other data.
 
-A `Quantity` is what a column shows of a result, and in which way it is better. Distances are of
-three kinds, see docs/metrics.md. Those that are substituted, as the first release of the paper's
-code had them, are exact inside the mask, by definition, for methods that know objects: they do not
-rank. A distance's error is taken inside the mask before a natural background, which is infinitely
-far, and over the image elsewhere, as the paper's DMAE is.
+A `Quantity` defines a column: a value of a result, and whether higher or lower is better. There are
+three kinds of distances, see docs/metrics.md. Substituted distances, as in the first release of the
+paper's code, are exact inside the mask, by definition, for methods that know the objects: they are
+not ranked. The error of a distance is taken inside the mask with a natural background, which is at
+infinity, and over the image otherwise, like the paper's DMAE.
 
-The paper does not say over which pixels its DRMSE is. Hardly over the image: the Oracle's is 0.00,
-its DMAE there is 0.04 (cubes) and 0.15 (spheres), and no RMSE is below the MAE of the same pixels.
-So the one over the mask is beside the paper's, and the one over the image is ours alone.
+The paper does not state the pixels of its DRMSE. It is unlikely to be over the image: the Oracle's
+is 0.00, but its DMAE there is 0.04 (cubes) and 0.15 (spheres), and an RMSE is never below the MAE
+of the same pixels. Our DRMSE in the mask is therefore next to the paper's, and that over the image
+has no counterpart.
 """
 
 import math
@@ -29,10 +30,10 @@ class Cell(NamedTuple):
     """A number of a table.
 
     Attributes:
-      mean: over scenes; `None` if no scene has the value.
+      mean: mean over scenes; `None` if no scene has the value.
       error: standard error of the mean over scenes; `None` for fewer than two.
-      count: scenes that have the value.
-      digits: after the point, where they are not its column's: those that the paper prints.
+      count: number of scenes that have the value.
+      digits: decimal places, if they differ from those of the column, as for the paper's numbers.
     """
 
     mean: float | None = None
@@ -42,15 +43,15 @@ class Cell(NamedTuple):
 
 
 NOTHING = Cell()
-"""What is not known."""
+"""Cell of an unknown value."""
 
 
 def mean_over(values: Iterable[float | None]) -> Cell:
-    """Returns the mean of one value a scene, or a view.
+    """Returns the mean of one value per scene or view.
 
-    The standard error is the standard deviation (with n - 1) over the square root of n. A mean that
-    is infinite, as the PSNR of equal images is, has none. Of `inf` and `-inf` together no mean is
-    known; one `nan` makes a mean `nan`.
+    The standard error is the standard deviation (with n - 1) over the square root of n. An infinite
+    mean, such as the PSNR of equal images, has no error. The mean of `inf` and `-inf` is unknown;
+    one `nan` makes the mean `nan`.
     """
     known = [value for value in values if value is not None]
     if not known or {math.inf, -math.inf} <= set(known):
@@ -62,16 +63,16 @@ def mean_over(values: Iterable[float | None]) -> Cell:
 
 
 class Quantity(NamedTuple):
-    """A column.
+    """A value of a result that is shown in a column.
 
     Attributes:
-      label: of tables.
-      latex: the same in LaTeX.
-      key: of the metrics, and of the published rows.
-      better: `higher` or `lower`; `None` if it says nothing of how good a method is.
-      digits: after the point.
-      by_mask: whether it is taken inside the mask before a natural background.
-      published: its name in published.csv, if the paper has it.
+      label: label in tables.
+      latex: label in LaTeX.
+      key: key in the metrics, and in the published rows.
+      better: `higher` or `lower`; `None` if it does not measure the quality of a method.
+      digits: number of decimal places.
+      by_mask: whether it is taken inside the mask with a natural background.
+      published: name in published.csv, if the paper has it.
     """
 
     label: str
@@ -124,7 +125,7 @@ ABLATIONS = (PSNR, PSNR_MASKED, SSIM, LPIPS, DMAE)
 
 
 def value(quantity: Quantity, metrics: Mapping[str, float | None], background: str) -> float | None:
-    """Returns a quantity of a result's metrics; `None` if it is not known."""
+    """Returns a quantity of a result's metrics; `None` if it is unknown."""
     masked = quantity.by_mask and background == "env"
     return metrics.get(f"{quantity.key}_masked" if masked else quantity.key)
 
@@ -133,11 +134,11 @@ class Column(NamedTuple):
     """A column of numbers.
 
     Attributes:
-      label: of it.
-      latex: the same in LaTeX.
-      better: `higher` or `lower`; `None` if its numbers are not to be ranked.
-      digits: after the point.
-      signed: whether positive numbers have their sign.
+      label: label of the column.
+      latex: label in LaTeX.
+      better: `higher` or `lower`; `None` if its numbers are not ranked.
+      digits: number of decimal places.
+      signed: whether positive numbers are written with their sign.
     """
 
     label: str
@@ -148,14 +149,14 @@ class Column(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A row: a method.
+    """A row of a table: the numbers of a method.
 
     Attributes:
-      label: of the method.
-      origin: whose numbers they are.
-      scenes: that it was measured on; `None` of published rows.
-      cells: a number for each column.
-      marks: of each.
+      label: label of the method.
+      origin: origin of the numbers, ours or published.
+      scenes: number of scenes of the method; `None` for published rows.
+      cells: number for each column.
+      marks: mark for each cell.
     """
 
     label: str
@@ -166,21 +167,21 @@ class Row(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Rows that compare."""
+    """Comparable rows."""
 
     title: str
     rows: tuple[Row, ...]
 
 
 class Table(NamedTuple):
-    """A table.
+    """A table with all of its blocks.
 
     Attributes:
-      name: of its files.
-      title: what it shows.
-      notes: what one must know to read it.
-      columns: of all blocks.
-      blocks: in order; one without rows is left out.
+      name: name of its files.
+      title: title of the table.
+      notes: notes that explain it.
+      columns: columns of all blocks.
+      blocks: blocks in order; empty ones are omitted.
     """
 
     name: str
@@ -191,19 +192,19 @@ class Table(NamedTuple):
 
 
 def row(label: str, origin: Origin, scenes: int | None, cells: Sequence[Cell]) -> Row:
-    """Returns a row that is not marked."""
+    """Returns a row without marks."""
     return Row(label, origin, scenes, tuple(cells), ("",) * len(cells))
 
 
 def mark(rows: Sequence[Row], columns: Sequence[Column], scenes: int) -> tuple[Row, ...]:
     """Marks the best of our rows, and the second best of three or more, by the digits shown.
 
-    Equal numbers share a mark. Numbers that lack a scene, and `nan`, are not compared.
+    Equal numbers share a mark. Rows that lack a scene, and `nan`, are not compared.
 
     Args:
-      rows: of one block.
-      columns: of the table.
-      scenes: of the block, whichever rows have them.
+      rows: rows of a block.
+      columns: columns of the table.
+      scenes: number of scenes of the block, over all rows.
     """
     marks = [list(row.marks) for row in rows]
     for j, column in enumerate(columns):
@@ -224,11 +225,11 @@ def mark(rows: Sequence[Row], columns: Sequence[Column], scenes: int) -> tuple[R
 
 
 def without_empty_columns(table: Table, kept: Sequence[str]) -> Table:
-    """Returns a table without columns that no row of ours or the paper's fills.
+    """Removes the columns that neither our rows nor the paper's fill.
 
     Args:
-      table: the table.
-      kept: labels of columns that stay nevertheless.
+      table: table to reduce.
+      kept: labels of columns to keep even if empty.
     """
     rows = [row for block in table.blocks for row in block.rows]
     places = [
@@ -254,7 +255,7 @@ def without_empty_columns(table: Table, kept: Sequence[str]) -> Table:
 
 
 def number(cell: Cell, column: Column) -> str:
-    """Returns a mean as it is shown, without its error; `-` if it is not known."""
+    """Returns a formatted mean without its error; `-` if it is unknown."""
     if cell.mean is None:
         return "-"
     digits = column.digits if cell.digits is None else cell.digits
@@ -262,7 +263,7 @@ def number(cell: Cell, column: Column) -> str:
 
 
 def error(cell: Cell, column: Column) -> str:
-    """Returns a standard error as it is shown; `-` if there is none."""
+    """Returns a formatted standard error; `-` if there is none."""
     return "-" if cell.error is None else format(cell.error, f".{column.digits}f")
 
 

@@ -1,12 +1,11 @@
-"""Does the jobs of a benchmark: one here, in another process or on another machine, or all missing.
+"""Runs the jobs of a benchmark: a single one, or all missing ones on an engine.
 
-A job is a chain of commands, each in a process of its own: `reconstruct`, or `train` and
-`evaluate`. Killed at any time, it goes on where it was when it is done again, and one that has left
-its result is not done again (`run_job`).
+A job is a sequence of commands in separate processes: `reconstruct`, or `train` and `evaluate`. An
+interrupted job resumes where it stopped, and a finished one is not repeated (`run_job`).
 
-An engine takes jobs, and gives each back when it is done, with the reason if it failed: threads
-here that wait for commands, or a Ray cluster. None knows of what a job waits for: `run_in_order`
-does. `run_missing` also writes the summary after each job.
+An engine accepts jobs and returns each when it is finished, with a reason if it failed: local
+threads that wait for commands, or a Ray cluster. Engines ignore dependencies, which `run_in_order`
+handles. `run_missing` also updates the summary after each job.
 """
 
 import dataclasses
@@ -35,29 +34,29 @@ from experiments.runs import measured_runs
 from refref_jax import atomic_files, configuration
 from refref_jax.data import scene_folder
 
-# Seconds that a command which outlived its benchmark may take to save and end: where others work
-# too, compiling alone takes minutes, and what compiles does not look up.
+# Seconds that a command which outlived its benchmark may take to save and end: on a busy machine
+# compilation alone takes minutes, and cannot be interrupted.
 _PATIENCE = 600.0
 
-# Ray itself tries for many minutes, while nobody is told.
+# Ray itself tries for many minutes, without any output.
 _SECONDS_TO_ANSWER = 10.0
 
 Run = Callable[[Path, Job], str | None]
-"""Does a job of the benchmark in a folder; returns why it failed, or `None`."""
+"""Runs a job of the benchmark in a folder; returns the reason if it failed, or `None`."""
 
 Done = Callable[[Job, str | None], None]
-"""Is told of a job that is done, and why it failed, if it did."""
+"""Called with a finished job, and the reason if it failed."""
 
 
 def run_job(out: Path, job: Job) -> str | None:
-    """Does a job, unless it is done.
+    """Runs a job, unless it is finished.
 
     Args:
       out: folder of the benchmark.
-      job: what to do.
+      job: job to run.
 
     Returns:
-      Why it failed, or `None` if it is done.
+      The reason if it failed, otherwise `None`.
     """
     if plan.is_done(out, job):
         return None
@@ -70,7 +69,7 @@ def run_job(out: Path, job: Job) -> str | None:
         results.write(folder, record)
     except (RunFailedError, ValueError, OSError) as error:
         return str(error)
-    except Exception as error:  # The others go on, whatever this is.
+    except Exception as error:  # The other jobs continue, whatever the error is.
         log = folder / "error.txt"
         log.write_text(traceback.format_exc(), encoding="utf-8")
         return f"{type(error).__name__}: {error} (all of it: {log})"
@@ -78,10 +77,10 @@ def run_job(out: Path, job: Job) -> str | None:
 
 
 def wait_until_free(folder: Path, patience: float = _PATIENCE) -> None:
-    """Waits while a process that an earlier benchmark left behind works in a folder, and says so.
+    """Waits while a process of an earlier benchmark works in a folder, and prints a message.
 
     Raises:
-      ValueError: if it still does after so many seconds.
+      ValueError: if it still does after `patience` seconds.
     """
     end, said = time.monotonic() + patience, False
     while folder.is_dir():
@@ -92,17 +91,17 @@ def wait_until_free(folder: Path, patience: float = _PATIENCE) -> None:
             if time.monotonic() > end:
                 raise
             if not said:
-                print(f"Waiting until the process ends that works in {folder} yet.", flush=True)
+                print(f"Waiting for the process that still works in {folder}.", flush=True)
                 said = True
             time.sleep(0.2)
 
 
 def _check_scene(job: Job) -> None:
-    """Refuses to measure a scene whose files are no longer those that the job was planned for."""
+    """Rejects a scene whose files have changed since the job was planned."""
     if plan.fingerprint(Path(job.path)) != job.fingerprint:
         raise ValueError(
             f"Cameras, meshes, images or scene.json of {job.path} have changed since the benchmark "
-            "was begun. Restore them, or begin another benchmark."
+            "was started. Restore them, or start another benchmark."
         )
 
 
@@ -132,7 +131,7 @@ def _learn(job: Job, folder: Path) -> Record:
     measured_runs.evaluate(run_, scene=scene, options=[*options["evaluate"], *weights], split=SPLIT)
     summary = configuration.parse_json((run_ / "eval" / SPLIT / "metrics.json").read_text("utf-8"))
     metrics = {key: number(value, key) for key, value in summary["results"].items()}
-    # Tables are of what does not change from one time to the next.
+    # Tables only contain reproducible numbers.
     seconds = metrics.pop("seconds_per_image")
     frames, apart = _frames(scene)
     per_image = [_image(image, apart) for image in summary["per_image"]]
@@ -147,14 +146,14 @@ def _learn(job: Job, folder: Path) -> Record:
 
 
 def _image(told: dict[str, Any], apart: Mapping[str, float]) -> Image:
-    """Returns what an evaluation says of an image, and how far it is from the training views."""
+    """Returns an image's entry of an evaluation, with its distance from the training views."""
     metrics = {key: number(value, key) for key, value in told.items() if key != "name"}
     name, seconds = told["name"], metrics.pop("seconds", None)
     return Image(name, apart[name], seconds, metrics)
 
 
 def _record(job: Job) -> Record:
-    """Returns what any result of a job has."""
+    """Returns a record with the fields that all jobs share."""
     category, background = results.category_and_background(job.scene)
     return Record(
         scene=job.scene,
@@ -175,7 +174,7 @@ def _record(job: Job) -> Record:
 
 
 def _frames(scene: Path) -> tuple[scene_folder.Frames, dict[str, float]]:
-    """Returns the test views, and how far each is from the training views, by name."""
+    """Returns the test views, and the distance of each from the training views, by name."""
     frames = scene_folder.read_frames(scene, SPLIT)
     training = scene_folder.read_frames(scene, "train").cameras.poses
     apart = pose_space.distances(np.asarray(frames.cameras.poses), np.asarray(training))
@@ -185,7 +184,7 @@ def _frames(scene: Path) -> tuple[scene_folder.Frames, dict[str, float]]:
 
 
 def _view(name: str, frames: scene_folder.Frames, scene: Path) -> View:
-    """Returns where the files of a view are; see docs/benchmark.md."""
+    """Returns the paths of a view's files; see docs/benchmark.md."""
     i = frames.names.index(name)
 
     def of_scene(paths: tuple[Path, ...] | None) -> str | None:
@@ -204,35 +203,35 @@ def _view(name: str, frames: scene_folder.Frames, scene: Path) -> View:
 
 
 class Engine(Protocol):
-    """What does jobs."""
+    """Interface of engines that run jobs."""
 
     def submit(self, job: Job) -> None:
-        """Takes a job."""
+        """Accepts a job."""
 
     def next(self) -> tuple[Job, str | None]:
-        """Waits for a job that was taken, and returns it and why it failed, if it did."""
+        """Waits for an accepted job; returns it, and the reason if it failed."""
 
     def stop(self) -> None:
-        """Gives up all jobs that are not done; those that have begun may save first."""
+        """Stops all unfinished jobs; those that run may save their state first."""
 
 
 class LocalEngine:
-    """Some jobs at once on this machine."""
+    """Runs several jobs at a time on this machine."""
 
     def __init__(self, out: Path, workers: int, run: Run = run_job) -> None:
-        """Starts threads, each of which does one job at a time.
+        """Starts threads, each of which runs one job at a time.
 
         Args:
           out: folder of the benchmark.
-          workers: how many.
-          run: what they do.
+          workers: number of threads.
+          run: function that runs a job.
         """
         self._out, self._run = out, run
         self._pool = futures.ThreadPoolExecutor(workers)
         self._taken: dict[futures.Future[str | None], Job] = {}
 
     def submit(self, job: Job) -> None:
-        """Takes a job."""
+        """Accepts a job."""
         self._taken[self._pool.submit(self._run, self._out, job)] = job
 
     def next(self) -> tuple[Job, str | None]:
@@ -242,13 +241,13 @@ class LocalEngine:
         return self._taken.pop(future), future.result()
 
     def stop(self) -> None:
-        """Asks all commands to stop, and waits until they have."""
+        """Stops all commands gracefully, and waits for them."""
         with subprocesses.stopping():
             self._pool.shutdown(cancel_futures=True)
 
 
 class RayEngine:
-    """Jobs on a Ray cluster, whose machines see this folder and these modules by the same paths."""
+    """Runs jobs on a Ray cluster, whose machines need the same paths of folder and modules."""
 
     def __init__(
         self, out: Path, address: str, *, cpus: float, gpus: float, run: Run = run_job
@@ -257,10 +256,10 @@ class RayEngine:
 
         Args:
           out: folder of the benchmark, on a file system that all machines share.
-          address: of the cluster; `local` starts one on this machine.
-          cpus: that a job takes of a machine's.
-          gpus: the same of accelerators.
-          run: what is done.
+          address: address of the cluster; `local` starts one on this machine.
+          cpus: number of CPUs per job.
+          gpus: number of accelerators per job.
+          run: function that runs a job.
 
         Raises:
           ValueError: if Ray is not installed, or there is no such cluster.
@@ -276,17 +275,17 @@ class RayEngine:
         if any(count < 1.0 for count in counts):
             self._ray.shutdown()
             raise ValueError(
-                f"No job will ever start: one takes {cpus:g} CPUs and {gpus:g} GPUs, and the "
-                f"cluster has {resources.get('CPU', 0.0):g} and {resources.get('GPU', 0.0):g} in "
-                "all. Lower --job_cpus or --job_gpus."
+                f"No job can start: one needs {cpus:g} CPUs and {gpus:g} GPUs, but the "
+                f"cluster has {resources.get('CPU', 0.0):g} and {resources.get('GPU', 0.0):g}. "
+                "Reduce --job_cpus or --job_gpus."
             )
 
     def submit(self, job: Job) -> None:
-        """Takes a job."""
+        """Accepts a job."""
         self._taken[self._work.remote(self._out, job)] = job
 
     def next(self) -> tuple[Job, str | None]:
-        """Waits for a job; one whose machine was lost has failed."""
+        """Waits for a job; it has failed if its machine was lost."""
         (done,), _ = self._ray.wait(list(self._taken), num_returns=1)
         job = self._taken.pop(done)
         try:
@@ -295,7 +294,7 @@ class RayEngine:
             return job, f"Ray: {' '.join(str(error).split())}"
 
     def stop(self) -> None:
-        """Interrupts all jobs, whose commands may save, and leaves the cluster."""
+        """Interrupts all jobs, whose commands may save, and disconnects from the cluster."""
         for task in self._taken:
             self._ray.cancel(task, force=False)
         if self._taken:
@@ -304,7 +303,7 @@ class RayEngine:
 
 
 def import_ray() -> Any:
-    """Returns Ray.
+    """Imports Ray.
 
     Raises:
       ValueError: if it is not installed.
@@ -313,17 +312,17 @@ def import_ray() -> Any:
         import ray
     except ImportError as error:
         raise ValueError(
-            "Ray is not installed. Run pip install -e '.[cluster]', or leave out --ray to do "
+            "Ray is not installed. Run pip install -e '.[cluster]', or remove --ray to run "
             "the jobs on this machine."
         ) from error
     return ray
 
 
 def connect(ray: Any, address: str) -> None:
-    """Connects to a cluster, whose processes find these modules.
+    """Connects to a cluster, and makes these modules importable in its processes.
 
     Raises:
-      ValueError: if there is none at that address.
+      ValueError: if there is no cluster at that address.
     """
     root = str(Path(__file__).resolve().parents[2])
     try:
@@ -337,8 +336,8 @@ def connect(ray: Any, address: str) -> None:
         )
     except (OSError, RuntimeError, ValueError) as error:
         raise ValueError(
-            f"There is no Ray cluster at {address} ({error}). Start one with ray start --head, and "
-            "give what it prints, or --ray=local."
+            f"There is no Ray cluster at {address} ({error}). Start one with ray start --head and "
+            "pass the address that it prints, or use --ray=local."
         ) from error
 
 
@@ -350,10 +349,10 @@ def _await_answer(address: str) -> None:
 
 
 def run_in_order(todo: Sequence[Job], engine: Engine, done: Done) -> None:
-    """Does jobs, as many at once as the engine does.
+    """Runs jobs on an engine in the order of their dependencies.
 
-    A job that waits for another of these begins when that is done, and fails if that fails. The
-    engine is stopped in the end, and at an interruption.
+    A job that depends on another one starts when that is finished, and fails if that fails. The
+    engine is stopped at the end, and at an interruption.
     """
     awaited = {job.name for job in todo}
     waiting = [job for job in todo if job.awaited in awaited]
@@ -386,17 +385,17 @@ def run_missing(
     *,
     engine: Callable[[], Engine],
 ) -> dict[str, str]:
-    """Does the jobs that are missing, and returns why some of them failed, by name.
+    """Runs the missing jobs, and returns the reasons of failures, by name.
 
-    What failed or was left out before stays in the summary until that is otherwise: a job that
-    failed, until it has been done again.
+    Earlier failed and skipped jobs remain in the summary until they have run again or are planned
+    differently.
 
     Args:
       out: folder of the benchmark.
-      benchmark: what it was begun with.
-      planned: what it is to do now.
-      skipped: what is left out now.
-      engine: makes what does the jobs; it is not asked if there are none.
+      benchmark: its settings, scenes and methods.
+      planned: jobs to run now.
+      skipped: methods skipped now.
+      engine: function that creates the engine; not called if no jobs are missing.
     """
     failed_before, skipped_before = summary.not_done(out)
     now = {each.name for each in (*planned, *skipped)}
@@ -406,7 +405,7 @@ def run_missing(
     summary.write(out, benchmark, failed=told, skipped=left_out)
     missing = [job for job in planned if not plan.is_done(out, job)]
     if not missing:
-        print("All jobs are done already." if planned else "All jobs are left out.")
+        print("All jobs are already finished." if planned else "All jobs are skipped.")
         return {}
     failed: dict[str, str] = {}
     start, count = time.monotonic(), 0

@@ -1,8 +1,8 @@
-"""How commands start, stop, and report what is wrong.
+"""Starts and stops commands, and reports errors.
 
-Flags are absl's, and so are help, flag files and what is said of a wrong flag. Here an error of any
-kind becomes one line and status 2. Nothing here imports JAX: commands import what does lazily, so
-that a wrong flag is refused at once.
+Flags, help, flag files and messages about invalid flags are absl's. Errors of any kind become one
+line with exit status 2. This module does not import JAX; commands import it lazily, so that invalid
+flags are reported immediately.
 """
 
 import difflib
@@ -18,22 +18,22 @@ from typing import Any, NoReturn, Self
 from absl import app, flags, logging
 
 INTERRUPTED = 130
-"""Status of a command that was stopped by Ctrl-C, as shells have it."""
+"""Exit status of a command that was stopped by Ctrl-C, as in shells."""
 
 
 STOP_WITH_INPUT = "REFREF_STOP_WITH_INPUT"
-"""Variable of the environment: if it is set, a command stops when its standard input ends."""
+"""Environment variable: if it is set, a command stops when its standard input ends."""
 
 
 def run(main: Callable[..., None], *, arguments: Sequence[str] = (), again: str = "") -> None:
-    """Runs a command; wrong input, or a file that can not be read, ends it with one line.
+    """Runs a command; invalid input and unreadable files end it with one line.
 
-    Its status is 2 then, and 130 after Ctrl-C.
+    The exit status is 2 in that case, and 130 after Ctrl-C.
 
     Args:
-      main: function of the command; its parameters are the command's arguments, as text.
-      arguments: names of the arguments, as `FOLDER`; all must be given.
-      again: sentence on what the same command does when it is given again, told on Ctrl-C.
+      main: function of the command; it receives the command's arguments as text.
+      arguments: names of the arguments, such as `FOLDER`; all are required.
+      again: sentence printed on Ctrl-C that explains the effect of repeating the command.
     """
     module = sys.modules[main.__module__]
 
@@ -53,28 +53,28 @@ def run(main: Callable[..., None], *, arguments: Sequence[str] = (), again: str 
         print(f"Interrupted. {again[:1].upper()}{again[1:]}".rstrip(), file=sys.stderr)
         sys.stdout.flush()
         sys.stderr.flush()
-        # Not `sys.exit`: XLA may be compiling on other threads, and crashes when Python goes.
+        # Not `sys.exit`: XLA may be compiling on other threads, and crashes at interpreter exit.
         os._exit(INTERRUPTED)
 
 
 def parse(words: Sequence[str]) -> list[str]:
-    """Reads the flags of a command line and returns the other words; what is wrong ends it."""
+    """Parses the flags of a command line and returns the other words; errors end the command."""
     try:
         return flags.FLAGS(words)
     except flags.Error as error:
         fail(str(error))
-    except SystemExit:  # absl has printed help, and calls that status 1
+    except SystemExit:  # absl has printed help, and uses status 1 for it
         sys.exit(0)
 
 
 def fail(message: str) -> NoReturn:
-    """Ends the command because of what the user gave, with one line."""
+    """Ends the command with a one-line message about invalid input."""
     print(f"error: {' '.join(message.splitlines())}", file=sys.stderr)
     sys.exit(2)
 
 
 def check(holder: flags.FlagHolder, refuse: Callable[[Any], Any]) -> None:
-    """Has absl check a flag; `refuse` raises a `ValueError` that says what is wrong."""
+    """Registers a validator of a flag; `refuse` raises a `ValueError` with the reason."""
 
     def hold(value: Any) -> bool:
         try:
@@ -87,7 +87,7 @@ def check(holder: flags.FlagHolder, refuse: Callable[[Any], Any]) -> None:
 
 
 def refuse_words(module: ModuleType, given: Sequence[str], arguments: Sequence[str]) -> None:
-    """Ends the command if there are more or fewer arguments than it takes."""
+    """Ends the command if it has too many or too few arguments."""
     if len(given) == len(arguments):
         return
     for word in given:
@@ -99,7 +99,7 @@ def refuse_words(module: ModuleType, given: Sequence[str], arguments: Sequence[s
 
 
 def did_you_mean(word: str, names: Iterable[str], *, most: int = 1) -> str:
-    """Returns ` Did you mean NAME?`, of the likest names, or nothing if none is like the word."""
+    """Returns ` Did you mean NAME?` with the closest names, or nothing if none is similar."""
     near = difflib.get_close_matches(word, list(names), n=most)
     return f" Did you mean {' or '.join(near)}?" if near else ""
 
@@ -110,28 +110,28 @@ def flags_of(module: ModuleType) -> dict[str, flags.Flag]:
 
 
 def name_of(module: ModuleType) -> str:
-    """Returns the name of a command, as `experiments.train`, however it was started."""
+    """Returns the name of a command, such as `experiments.train`, however it was started."""
     spec = module.__spec__
     return module.__name__ if spec is None else spec.name.removesuffix(".__main__")
 
 
 def shell(name: str, *options: str) -> str:
-    """Returns the line that runs a command of `experiments`, quoted so that it can be pasted."""
+    """Returns the shell command line of a command of `experiments`, quoted."""
     return shlex.join(["python", "-m", f"experiments.{name}", *options])
 
 
 def _stop_with_input() -> None:
-    """Asks this process to stop, as `kill` would, when its standard input ends."""
+    """Stops this process, as by `kill`, when its standard input ends."""
     while os.read(sys.stdin.fileno(), 1):
         pass
     os.kill(os.getpid(), signal.SIGTERM)
 
 
 def stop_at_kill() -> None:
-    """Has `kill` raise `KeyboardInterrupt` as Ctrl-C does, once: groups are often told twice."""
+    """Makes `kill` raise `KeyboardInterrupt` like Ctrl-C, once: groups often receive it twice."""
 
     def stop(number: int, frame: object) -> None:
-        # Not SIG_IGN, which a process that is started now would have too.
+        # Not SIG_IGN, which child processes would inherit.
         signal.signal(number, lambda *_: None)
         raise KeyboardInterrupt
 
@@ -139,14 +139,14 @@ def stop_at_kill() -> None:
 
 
 class Interrupt:
-    """Notes Ctrl-C and `kill` while its context lasts, so that a step can be finished and saved.
+    """Records Ctrl-C and `kill` inside the context, so that a step can be finished and saved.
 
-    A second Ctrl-C ends the process at once. A second `kill` is the same wish as the first, for it
-    may come from somebody else: `timeout` sends two, to its command and to its group.
+    A second Ctrl-C ends the process at once. Repeated `kill`s are treated as one, because they may
+    have one origin: `timeout` sends one to its command and one to its process group.
     """
 
     def __init__(self) -> None:
-        """Nothing is requested yet."""
+        """Starts without a request."""
         self.requested = False
         self._before: dict[int, Any] = {}
 
@@ -165,6 +165,6 @@ class Interrupt:
             signal.signal(number, signal.SIG_DFL)
             more = b"; once more to stop at once."
         if number == signal.SIGINT or not self.requested:
-            # Not `print`: the signal may have come while something was being printed.
+            # Not `print`: the signal may have arrived during a print.
             os.write(1, b"Stopping after this step" + more + b"\n")
         self.requested = True

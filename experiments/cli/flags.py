@@ -1,8 +1,8 @@
-"""Flags that several commands have: one name, one meaning, one definition, by topic.
+"""Defines the flags that several commands share, grouped by topic.
 
-Each function defines its flags for the module that calls it; nothing is defined by importing this
-module, so that no command takes a flag that it does not heed. Values are checked as they are read,
-before JAX is imported.
+Each function defines its flags for the calling module; importing this module defines nothing, so
+that no command accepts a flag that it ignores. Values are validated during parsing, before JAX is
+imported.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ with epy.lazy_imports():
 
 flags.disclaim_key_flags()
 
-# Choices of the library; that of ways to a geometry is held equal to its definition by a test.
+# Choices of the library; a test keeps those of the geometry equal to their definition.
 SPLITS = get_args(choices.Split)
 PRESETS = get_args(choices.PresetName)
 RULES = get_args(choices.RuleName)
@@ -34,24 +34,24 @@ GEOMETRIES = ("hull", "occupancy")
 
 SCENE_FORMS = "a folder, or hf:CONFIG/SCENE of the published data set"
 
-# Files by which the folders of a run and of a reconstruction are known.
+# Files that identify the folders of a run and of a reconstruction.
 RUN = "config.json"
 RECONSTRUCTION = "reconstruction.json"
 
 
 # ---- Runs ----
 def run(what: str = "Folder of a trained run.") -> flags.FlagHolder[str]:
-    """Defines `--run`, which must be given."""
+    """Defines `--run`, which is required."""
     return flags.DEFINE_string("run", None, what, required=True)
 
 
 def step() -> flags.FlagHolder[int | None]:
-    """Defines `--step`, of a run."""
-    return flags.DEFINE_integer("step", None, "Checkpoint to use; the newest if not given.", 0)
+    """Defines `--step`, the checkpoint of a run."""
+    return flags.DEFINE_integer("step", None, "Checkpoint to use; the newest by default.", 0)
 
 
 def check_run(folder: Path, *, holds: Sequence[str] = (RUN,)) -> None:
-    """Refuses a folder that has none of some files, before anything that reads it is imported."""
+    """Rejects a folder that lacks any of some files, before its readers are imported."""
     if not any((folder / name).is_file() for name in holds):
         raise ValueError(
             f"{folder / holds[0]} does not exist. Give the folder that a training wrote, as in "
@@ -61,19 +61,19 @@ def check_run(folder: Path, *, holds: Sequence[str] = (RUN,)) -> None:
 
 # ---- Input and output ----
 def scene(what: str, *, required: bool = True) -> flags.FlagHolder[str]:
-    """Defines `--scene`; `what` is done with it."""
+    """Defines `--scene`; `what` describes its use."""
     return flags.DEFINE_string("scene", None, f"{what}: {SCENE_FORMS}.", required=required)
 
 
 def out(what: str) -> flags.FlagHolder[str]:
-    """Defines `--out`, which must be given."""
+    """Defines `--out`, which is required."""
     holder = flags.DEFINE_string("out", None, what, required=True)
-    flags.register_validator("out", lambda value: value != "", "Give the place to write to.")
+    flags.register_validator("out", lambda value: value != "", "Give a path to write to.")
     return holder
 
 
 def overwrite(what: str) -> flags.FlagHolder[bool]:
-    """Defines `--overwrite`, which replaces `what`."""
+    """Defines `--overwrite`, which allows to replace `what`."""
     return flags.DEFINE_bool("overwrite", False, f"Replace {what}.")
 
 
@@ -83,7 +83,7 @@ def preset(what: str) -> flags.FlagHolder[str]:
     return flags.DEFINE_enum("preset", "tiny", PRESETS, what)
 
 
-def seed(what: str = "Seed of everything random.") -> flags.FlagHolder[int]:
+def seed(what: str = "Random seed.") -> flags.FlagHolder[int]:
     """Defines `--seed`."""
     return flags.DEFINE_integer("seed", 0, what, 0, 2**32 - 1)
 
@@ -96,12 +96,12 @@ def split(what: str) -> flags.FlagHolder[str]:
 
 def limit() -> flags.FlagHolder[int | None]:
     """Defines `--limit`."""
-    return flags.DEFINE_integer("limit", None, "Only this many test images, evenly spread.", 1)
+    return flags.DEFINE_integer("limit", None, "Use only this many test images, evenly spread.", 1)
 
 
 def views(default: str) -> flags.FlagHolder[str]:
-    """Defines `--views`, which `view_numbers` reads."""
-    what = "Numbers of views of the split, as 0,10,20, or all."
+    """Defines `--views`, which `view_numbers` parses."""
+    what = "Numbers of views of the split, as in 0,10,20, or all."
     holder = flags.DEFINE_string("views", default, what)
     app.check(holder, lambda text: view_numbers.choose(text, sys.maxsize))
     return holder
@@ -110,7 +110,7 @@ def views(default: str) -> flags.FlagHolder[str]:
 # ---- Rendering and measuring ----
 def rays_per_pixel(default: int) -> flags.FlagHolder[int]:
     """Defines `--rays_per_pixel`."""
-    what = "Rays in each pixel, a square: 1, 4, 9, 16. They are averaged."
+    what = "Rays per pixel, a square number: 1, 4, 9, 16. Their radiance is averaged."
     holder = flags.DEFINE_integer("rays_per_pixel", default, what)
     app.check(holder, choices.side_of)
     return holder
@@ -118,35 +118,35 @@ def rays_per_pixel(default: int) -> flags.FlagHolder[int]:
 
 def chunk() -> flags.FlagHolder[int]:
     """Defines `--chunk`."""
-    what = "Paths at once: lower it if memory runs out."
+    what = "Paths traced at once. Reduce it if memory runs out."
     return flags.DEFINE_integer("chunk", 4096, what, 1)
 
 
 def lpips_weights() -> flags.FlagHolder[str | None]:
     """Defines `--lpips_weights`; `runs.perceptual` reads the file."""
-    what = "File of the weights of LPIPS, made by experiments.convert_lpips, see docs/metrics.md. "
-    what += "LPIPS is not measured without it."
+    what = "File of LPIPS weights, made by experiments.convert_lpips, see docs/metrics.md. "
+    what += "LPIPS is skipped without it."
     return flags.DEFINE_string("lpips_weights", None, what)
 
 
 # ---- Light paths ----
 class BudgetFlags(NamedTuple):
-    """Flags of commands that follow light with a budget of the user's choice."""
+    """Flags of commands that trace light paths with the user's path settings."""
 
     cut: flags.FlagHolder[float | None]
     bends: flags.FlagHolder[int | None]
 
     def chosen(self, paths: str) -> Budget:
-        """Returns the budget of a name, with the cut and the bends that were asked for."""
+        """Returns the path settings of a preset, with the user's threshold and maximum of bends."""
         return budget_of(paths, cut=self.cut.value, bends=self.bends.value)
 
 
 def budget(*, cut: float | None = None, bends: int | None = None) -> BudgetFlags:
-    """Defines `--cut` and `--bends`; without a default they are those of the light paths."""
-    what = ("Smallest throughput worth following, in [0, 1)", "Most refractions and reflections")
+    """Defines `--cut` and `--bends`; the defaults are those of the path preset."""
+    what = ("Throughput threshold of paths, in [0, 1)", "Maximum number of bends of a path")
     found = BudgetFlags(
-        flags.DEFINE_float("cut", cut, f"{what[0]}; that of the paths if not given."),
-        flags.DEFINE_integer("bends", bends, f"{what[1]}; those of the paths if not given."),
+        flags.DEFINE_float("cut", cut, f"{what[0]}; that of the path preset by default."),
+        flags.DEFINE_integer("bends", bends, f"{what[1]}; that of the path preset by default."),
     )
     app.check(found.cut, lambda cut: budget_of("tree", cut=cut))
     app.check(found.bends, lambda bends: budget_of("tree", bends=bends))
@@ -160,26 +160,26 @@ def rule() -> flags.FlagHolder[str]:
         "rule",
         "nested",
         RULES,
-        "What lies outside each mesh: the part around it, always air (as Cycles does it), or, of "
-        "meshes that overlap, the one with the highest 'priority' in scene.json.",
+        "Medium outside each mesh: that of the enclosing mesh, always air (as in Cycles), or, for "
+        "overlapping meshes, that with the highest 'priority' in scene.json.",
     )
 
 
 def ior() -> flags.FlagHolder[list[str]]:
-    """Defines `--ior` of meshes, which `runs.refraction_indices` reads."""
-    what = "Index of refraction of a material or a mesh, as glass=1.52. May be repeated."
+    """Defines `--ior` of meshes, which `runs.refraction_indices` parses."""
+    what = "Index of refraction of a material or a mesh, as in glass=1.52. May be repeated."
     return flags.DEFINE_multi_string("ior", [], what)
 
 
 # ---- Background ----
 class SpaceFlags(NamedTuple):
-    """Flags that say where a scene's background stands, for scenes that do not."""
+    """Flags for the type and size of a background, for scenes that do not define them."""
 
     background: flags.FlagHolder[str]
     radius: flags.FlagHolder[float | None]
 
     def chosen(self) -> str | None:
-        """Returns the space that `--background` names, or `None` for that of the scene."""
+        """Returns the space that `--background` selects, or `None` for the scene's own."""
         return None if self.background.value == "auto" else self.background.value
 
 
@@ -189,24 +189,24 @@ def space() -> SpaceFlags:
         "background",
         "auto",
         ["auto", *get_args(choices.Space)],
-        "Walls, a cube of them or a sphere, or an environment infinitely far away.",
+        "Type of the background: walls (a cube or a sphere), or an environment at infinity.",
     )
     radius = flags.DEFINE_float(
         "radius",
         None,
-        "Half edge of the cube, or radius of the sphere, on which the background stands (by "
-        "default that of scene.json, else 7.3), or radius of an unbounded scene's uncontracted "
-        "ball, in world units.",
+        "Half-extent of the background cube, or radius of the background sphere (by default from "
+        "scene.json, otherwise 7.3), or radius of the uncontracted ball of an unbounded scene, in "
+        "world units.",
         lower_bound=1e-6,
     )
-    finite = "It is a finite number of world units."
+    finite = "It must be a finite number of world units."
     flags.register_validator("radius", lambda x: x is None or math.isfinite(x), finite)
     return SpaceFlags(background, radius)
 
 
 # ---- Reconstruction ----
 class ReconstructionFlags(NamedTuple):
-    """Flags that all commands which reconstruct a body share."""
+    """Flags of all commands that reconstruct an object."""
 
     geometry: flags.FlagHolder[str]
     resolution: flags.FlagHolder[int]
@@ -216,7 +216,7 @@ class ReconstructionFlags(NamedTuple):
     def chosen(
         self, *, index: float | None, seed: int, space: str | None, radius: float | None
     ) -> records.ReconstructionConfig:
-        """Returns the reconstruction asked for; an index of `None` is estimated."""
+        """Returns the options of the reconstruction; an index of `None` is estimated."""
         geometry, resolution, outliers, light_steps = (each.value for each in self)
         return records.ReconstructionConfig(
             geometry, resolution, outliers, index, space, radius, light_steps, seed
@@ -225,12 +225,12 @@ class ReconstructionFlags(NamedTuple):
 
 def reconstruction() -> ReconstructionFlags:
     """Defines the flags of a reconstruction."""
-    how = "How a body is found from masks: as their exact visual hull, or by an occupancy field "
-    how += "that is trained on them."
-    cells = "Cells along the longest edge of the grid that holds the body."
-    wrong = "Views whose masks may be wrong, at the cost of a hull's accuracy everywhere."
-    steps = "Steps by which the surface is refined by the light that went through it; 0 leaves it "
-    steps += "out. The result is kept only if validation images are explained better."
+    how = "Method that turns masks into an object: their exact visual hull, or an occupancy field "
+    how += "trained on them."
+    cells = "Cells along the longest edge of the grid around the object."
+    wrong = "Number of masks that may be wrong, which reduces the accuracy of a hull everywhere."
+    steps = "Steps of the refinement of the surface with refracted light; 0 skips it. "
+    steps += "The result is kept only if it explains validation images better."
     found = ReconstructionFlags(
         flags.DEFINE_enum("geometry", "hull", GEOMETRIES, how),
         flags.DEFINE_integer("resolution", 128, cells, 16, 1024),
@@ -240,14 +240,14 @@ def reconstruction() -> ReconstructionFlags:
     flags.register_multi_flags_validator(
         ["geometry", "outliers"],
         lambda given: given["geometry"] == "hull" or not given["outliers"],
-        "--outliers has no effect on an occupancy field, which weighs all masks. Leave out either.",
+        "--outliers has no effect on an occupancy field, which weighs all masks. Remove either.",
     )
     return found
 
 
 # ---- Devices and processes ----
 class DeviceFlags(NamedTuple):
-    """Flags that say which devices, and which processes, train together; see `runs.processes`."""
+    """Flags for the devices and processes that train together; see `runs.processes`."""
 
     devices: flags.FlagHolder[str]
     coordinator: flags.FlagHolder[str | None]
@@ -257,12 +257,12 @@ class DeviceFlags(NamedTuple):
 
 def devices() -> DeviceFlags:
     """Defines `--devices`, `--coordinator`, `--processes` and `--process`."""
-    what = "Devices that share the light paths of a batch: a number, or all; of each process."
-    where = "Where the first of several processes listens, as HOST:PORT."
+    what = "Devices per process that share the light paths of a batch: a number, or all."
+    where = "Address of process 0 if there are several, as HOST:PORT."
     found = DeviceFlags(
         flags.DEFINE_string("devices", "1", what),
         flags.DEFINE_string("coordinator", None, where),
-        flags.DEFINE_integer("processes", 1, "Processes that train together.", 1),
+        flags.DEFINE_integer("processes", 1, "Number of processes that train together.", 1),
         flags.DEFINE_integer("process", None, "Number of this process, from 0.", 0),
     )
     flags.register_validator(

@@ -1,10 +1,9 @@
-"""Where commands write: whole or not at all, and never over what is not their own.
+"""Writes the output folders of commands, atomically and without overwriting foreign files.
 
-A command writes its files into a draft inside its folder, which no other process may write to
-meanwhile, and moves them to their places when it has ended well. With them goes `command.json`: the
-command, all flags of its last call, and the files that are its own. Only with --overwrite are files
-replaced, of those that are listed there and that the call itself writes. Whatever else lies in the
-folder stays.
+A command writes its files into a temporary folder inside its output folder, which is locked, and
+moves them to their places when it succeeds. It also writes `command.json`: the command, all flags
+of its last call, and the list of its files. With --overwrite only files on that list that the call
+itself writes are replaced. All other files in the folder are left alone.
 """
 
 import contextlib
@@ -19,22 +18,22 @@ from refref_jax import atomic_files, configuration
 
 NOTE = "command.json"
 
-# Inside the folder, which may be a mount: files are moved within one file system.
+# Inside the output folder, which may be a mount point: files are moved within one file system.
 _DRAFT = ".unfinished"
 
 
 @contextlib.contextmanager
 def fresh(out: Path, *, module: str, writes: Sequence[str], overwrite: bool) -> Iterator[Path]:
-    """Yields an empty folder, whose files come to `out` when the context ends well.
+    """Yields an empty folder, whose files are moved to `out` if the context succeeds.
 
     Args:
-      out: folder of the command, which may hold other things too.
-      module: `__name__` of the command, whose flags are noted.
-      writes: names in the folder that this call of the command writes.
+      out: output folder of the command, which may contain other files.
+      module: `__name__` of the command, whose flags are recorded.
+      writes: names in the folder that this call writes.
       overwrite: whether results of an earlier call may be replaced.
 
     Raises:
-      ValueError: if anything there may not be replaced, or another process writes there.
+      ValueError: if existing files may not be replaced, or another process writes there.
     """
     place = {"module": module, "writes": writes, "overwrite": overwrite}
     replaceable(out, **place)
@@ -42,7 +41,7 @@ def fresh(out: Path, *, module: str, writes: Sequence[str], overwrite: bool) -> 
     out.mkdir(parents=True, exist_ok=True)
     with atomic_files.hold(out):
         try:
-            # Looked at again: another process may have written meanwhile.
+            # Checked again, as another process may have written meanwhile.
             earlier = replaceable(out, **place)
             shutil.rmtree(draft, ignore_errors=True)
             draft.mkdir()
@@ -56,7 +55,7 @@ def fresh(out: Path, *, module: str, writes: Sequence[str], overwrite: bool) -> 
 
 @contextlib.contextmanager
 def fresh_file(path: Path, *, overwrite: bool) -> Iterator[Path]:
-    """Yields the path of a file that takes the place of `path`, if that may be, at a good end."""
+    """Yields the path of a temporary file that replaces `path` if the context succeeds."""
     check_file(path, overwrite=overwrite)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_files.written_file(path) as draft:
@@ -64,15 +63,15 @@ def fresh_file(path: Path, *, overwrite: bool) -> Iterator[Path]:
 
 
 def check_file(path: Path, *, overwrite: bool) -> None:
-    """Refuses, by a `ValueError`, to replace a file without being asked to, and a folder at all."""
+    """Raises `ValueError` if a file exists and may not be replaced, or if it is a folder."""
     if path.is_dir():
-        raise ValueError(f"{path} is a folder, and a file is to be written. Give another name.")
+        raise ValueError(f"{path} is a folder, not a file. Give another name.")
     if path.exists() and not overwrite:
-        raise ValueError(f"{path} exists. Give another --out, or --overwrite to replace it.")
+        raise ValueError(f"{path} exists. Give another --out, or use --overwrite to replace it.")
 
 
 def note(out: Path, module: str, files: Iterable[Path] = ()) -> None:
-    """Notes a command, its options, and the files that it has written, in its folder."""
+    """Records a command, its flags and the files that it has written in its folder."""
     command = sys.modules[module]
     content = {
         "command": app.name_of(command),
@@ -84,13 +83,13 @@ def note(out: Path, module: str, files: Iterable[Path] = ()) -> None:
 
 
 def replaceable(out: Path, *, module: str, writes: Sequence[str], overwrite: bool) -> set[Path]:
-    """Returns the files of earlier calls that may be replaced, by their places in it; see `fresh`.
+    """Returns the files of earlier calls that may be replaced, relative to `out`; see `fresh`.
 
-    Commands ask it before they do anything else, so that none works in vain. A `ValueError` tells
-    what is in the place and may not be replaced.
+    Commands call this first, so that no work is wasted. It raises `ValueError` if there are files
+    that may not be replaced.
     """
     if out.exists() and not out.is_dir():
-        raise ValueError(f"{out} is a file, and a folder is needed. Give another --out.")
+        raise ValueError(f"{out} is a file, not a folder. Give another --out.")
     noted = _noted(out, module)
     own = set() if noted is None else {NOTE, *(path.parts[0] for path in noted)}
     _refuse_strangers(out, [name for name in (*writes, NOTE) if name not in own])
@@ -98,16 +97,16 @@ def replaceable(out: Path, *, module: str, writes: Sequence[str], overwrite: boo
     if there and not overwrite:
         shown = ", ".join(path.as_posix() for path in sorted(there)[:2])
         raise ValueError(
-            f"{out} holds the results of an earlier call ({shown}, ...). Give --overwrite to "
+            f"{out} contains the results of an earlier call ({shown}, ...). Use --overwrite to "
             "replace them, or another --out."
         )
     return there
 
 
 def _take_place(draft: Path, out: Path, module: str, earlier: set[Path]) -> None:
-    """Moves new files to their places, and removes those of `earlier` that are none of them.
+    """Moves new files to their places, and removes other files of `earlier`.
 
-    Whenever it is killed, the note names all files that are the command's.
+    If the process is killed at any time, the record lists all files of the command.
     """
     new = {path.relative_to(draft) for path in draft.rglob("*") if path.is_file()}
     _refuse_strangers(out, sorted(new - earlier))
@@ -123,17 +122,17 @@ def _take_place(draft: Path, out: Path, module: str, earlier: set[Path]) -> None
 def _refuse_strangers(out: Path, names: Iterable[Path | str]) -> None:
     if strangers := [out / name for name in names if (out / name).exists()]:
         raise ValueError(
-            f"{strangers[0]} is not of this command, as far as {NOTE} beside it tells. Remove it, "
-            "or give another --out: --overwrite replaces nothing of others."
+            f"{strangers[0]} was not written by this command, according to {NOTE} next to it. "
+            "Remove it, or give another --out: --overwrite keeps foreign files."
         )
 
 
 def _remove(out: Path, files: set[Path]) -> None:
-    """Removes files, and the folders that are empty then."""
+    """Removes files, and folders that become empty."""
     for path in files:
         (out / path).unlink(missing_ok=True)
     folders = {parent for path in files for parent in path.parents} - {Path()}
-    for folder in sorted(folders, reverse=True):  # those inside others first
+    for folder in sorted(folders, reverse=True):  # nested folders first
         _remove_empty(out / folder)
 
 
@@ -143,7 +142,7 @@ def _remove_empty(folder: Path) -> None:
 
 
 def _noted(out: Path, module: str) -> set[Path] | None:
-    """Returns the files that a command's note lists; `None` if there is no note of it."""
+    """Returns the files recorded by a command; `None` if there is no record."""
     try:
         content = configuration.parse_json((out / NOTE).read_text(encoding="utf-8"))
         command, files = content["command"], {Path(name) for name in content["files"]}

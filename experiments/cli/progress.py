@@ -1,4 +1,4 @@
-"""The progress bar of commands."""
+"""A progress bar for commands."""
 
 import sys
 from typing import Self
@@ -15,7 +15,7 @@ class ProgressBar:
     _PLAIN_LINES = 20
 
     def __init__(self, label: str, total: int, done: int = 0) -> None:
-        """Starts a bar for `total` steps, of which some may be done already."""
+        """Starts a bar for `total` steps, of which `done` are finished already."""
         self._bar = progress.Progress(
             progress.TextColumn("{task.description}"),
             progress.BarColumn(),
@@ -37,14 +37,14 @@ class ProgressBar:
         self._bar.stop()
 
     def move(self, done: int, total: int, text: str) -> None:
-        """Moves the bar of work whose length was not known when it was started."""
+        """Updates a bar whose total was unknown when it was started."""
         if total != self._total:
             self._total, self._printed = total, done
             self._bar.update(self._task, total=total)
         self.show(done, text)
 
     def show(self, done: int, text: str) -> None:
-        """Moves the bar; on a plain output a line is printed every twentieth of the way."""
+        """Updates the bar; if the output is not a terminal a line is printed every twentieth."""
         self._bar.update(self._task, completed=done, text=text)
         due = done - self._printed >= self._total / self._PLAIN_LINES or done == self._total
         if self._bar.disable and due:

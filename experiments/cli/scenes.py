@@ -1,4 +1,4 @@
-"""How commands open the scene that an option names: a folder, or `hf:CONFIG/SCENE`."""
+"""Opens the scene that a flag names: a folder, or `hf:CONFIG/SCENE`."""
 
 import contextlib
 import glob
@@ -17,11 +17,11 @@ with epy.lazy_imports():
 
 
 def check(source: str | Path | None) -> None:
-    """Refuses what is no scene at first sight, before anything that reads one is imported.
+    """Rejects sources that are obviously not scenes, before their readers are imported.
 
     Raises:
-      SceneError: if there is no such folder, or neither views nor parquet files are in it, or
-        `hf:...` is no name of the data set.
+      SceneError: if the folder does not exist, if it contains neither views nor parquet files, or
+        if `hf:...` is not a name of the data set.
     """
     if source is None:
         return
@@ -38,28 +38,28 @@ def check(source: str | Path | None) -> None:
 
 
 def check_all(sources: Sequence[str]) -> None:
-    """Refuses as `check` does, and passes over what is empty or has wildcards."""
+    """Calls `check` for each source, except empty ones and those with wildcards."""
     for source in sources:
         if source and not has_wildcards(source):
             check(source)
 
 
 def has_wildcards(source: str) -> bool:
-    """Returns whether a name stands for many; one that exists as it is, is itself."""
+    """Returns whether a name is a pattern; an existing path is taken literally."""
     return not source.startswith("hf:") and glob.has_magic(source) and not Path(source).exists()
 
 
 def check_place(place: str) -> None:
-    """Refuses a place of one scene or of many that is neither a folder nor `hf:...`."""
+    """Rejects a source of one or many scenes that is neither a folder nor `hf:...`."""
     if not place.startswith("hf:") and not Path(place).is_dir():
-        raise SceneError(f"{place} is no folder. Give one that exists.")
+        raise SceneError(f"{place} is not a folder. Give one that exists.")
 
 
 def opened(source: str | Path) -> Path:
-    """Returns the folder of a scene; one in parquet files is unpacked, with a bar of progress.
+    """Returns the folder of a scene; a scene in parquet files is unpacked, with a progress bar.
 
     Raises:
-      SceneError: if there is none, or it is broken, see `scene_source.open_scene`.
+      SceneError: if the scene is missing or broken, see `scene_source.open_scene`.
     """
     check(source)
     bar: ProgressBar | None = None

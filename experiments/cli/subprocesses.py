@@ -1,9 +1,9 @@
-"""Runs a command of `experiments` in a process of its own.
+"""Runs a command of `experiments` in a separate process.
 
-The command stops, and saves what it has, when this process ends, however that ends: its standard
-input is a pipe from here, which closes then; see `app.run`. It is in a session of its own, so
-that Ctrl-C, a terminal that is closed, and what is sent to the group of this process reach it
-through this process alone.
+The command stops and saves its state when this process ends, for whatever reason: its standard
+input is a pipe from this process, which is closed then; see `app.run`. It runs in its own session,
+so that Ctrl-C, the closing of a terminal, and signals to the process group reach it only through
+this process.
 """
 
 import contextlib
@@ -24,33 +24,33 @@ from experiments.cli import app
 _RSS_UNIT = 1.0 if sys.platform == "darwin" else 1024.0
 _MIB = 2.0**20
 
-# Seconds between two looks at a command.
+# Seconds between two polls of a command.
 _POLL = 0.05
 
 _ROOT = Path(__file__).resolve().parents[2]
 
-# Of all threads: the commands that they wait for.
+# Running commands of all threads.
 _running: set[subprocess.Popen[bytes]] = set()
 _lock = threading.Lock()
 _stopping = threading.Event()
 
 
 class RunFailedError(Exception):
-    """A training or evaluation ended with an error; the text is its last line and where to read."""
+    """A training or evaluation failed; the text is its last line and the path of its log."""
 
 
 def run(name: str, *options: str, log: Path) -> tuple[float, float]:
-    """Runs a command and returns its seconds and the peak of its memory in MiB.
+    """Runs a command and returns its duration in seconds and its peak memory in MiB.
 
-    If this process is interrupted, the command is asked to stop, and may save before it does.
+    If this process is interrupted, the command is stopped gracefully and may save its state.
 
     Args:
-      name: of the command in `experiments`.
-      options: of it.
-      log: file that what it prints is added to.
+      name: name of the command in `experiments`.
+      options: flags of the command.
+      log: file to which the output is appended.
 
     Raises:
-      RunFailedError: if it ends with an error, or is killed.
+      RunFailedError: if the command fails or is killed.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     start = time.monotonic()
@@ -83,21 +83,21 @@ def run(name: str, *options: str, log: Path) -> tuple[float, float]:
 
 
 def command_line(name: str, options: Sequence[str]) -> list[str]:
-    """Returns what runs a command of `experiments`."""
+    """Returns the command line that runs a command of `experiments`."""
     return [sys.executable, "-m", f"experiments.{name}", *options]
 
 
 @contextlib.contextmanager
 def stopping() -> Iterator[None]:
-    """Asks all commands that threads of this process wait for to stop; in the context none starts.
+    """Stops all commands that threads of this process wait for; inside the context none starts.
 
-    Each may save before it ends, and its thread is told that it failed.
+    Each may save its state, and its thread receives an error.
     """
     with _lock:
         _stopping.set()
         for process in _running:
             with contextlib.suppress(ProcessLookupError):
-                # Not by `process`, which might take the status that its thread waits for.
+                # Not by `process`, whose thread may need the exit status.
                 os.kill(process.pid, signal.SIGTERM)
     try:
         yield
@@ -108,16 +108,17 @@ def stopping() -> Iterator[None]:
 def _start(words: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
     with _lock:
         if _stopping.is_set():
-            raise RunFailedError("stopped before it began")
+            raise RunFailedError("stopped before it started")
         process = subprocess.Popen(words, **options)
         _running.add(process)
     return process
 
 
 def _wait(process: subprocess.Popen[bytes]) -> tuple[int, Any]:
-    """Returns how a process ended, and what it used.
+    """Returns the exit status of a process and its resource usage.
 
-    A wait that blocks would not notice the interruption of a task of Ray, which is no signal.
+    It polls, because a blocking wait would ignore the cancellation of a Ray task, which is not a
+    signal.
     """
     while True:
         pid, status, usage = os.wait4(process.pid, os.WNOHANG)
@@ -127,13 +128,13 @@ def _wait(process: subprocess.Popen[bytes]) -> tuple[int, Any]:
 
 
 def _environment() -> dict[str, str]:
-    """Returns the environment of a command, which finds these modules wherever it is started."""
+    """Returns an environment in which a command can import these modules from any folder."""
     paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     return os.environ | {app.STOP_WITH_INPUT: "1", "PYTHONPATH": os.pathsep.join(paths)}
 
 
 def _complaint(printed: str, code: int) -> str:
-    """Returns the last line that tells an error, or what else a command ended with."""
+    """Returns the last line with an error, or a description of the exit status."""
     lines = [line.strip() for line in printed.splitlines() if line.strip()]
     told = [line for line in lines if re.search(r"(^e|E)rror: ", line)]
     if told:

@@ -1,4 +1,4 @@
-"""What an object of the data set consists of (NumPy only)."""
+"""Describes the parts of an object of the data set (NumPy only)."""
 
 from collections.abc import Callable
 from typing import Literal, NamedTuple
@@ -9,29 +9,29 @@ from jaxtyping import Float, Int
 from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
 
 Category = Literal["smcvx", "smncvx", "mmncvx"]
-"""Single material and convex, single and not convex, multiple materials and not convex."""
+"""Convex with one material, not convex with one material, not convex with several materials."""
 
 RADIUS = 2.0
-"""No vertex of any object is farther from the origin, world units."""
+"""Largest distance of a vertex of any object from the origin, world units."""
 
 
 class ObjectPart(NamedTuple):
-    """One closed surface, and the medium inside.
+    """A closed surface and the medium inside.
 
-    A part that lies in another is separated from it by a gap all around, so that which medium is
-    on either side of a surface never depends on rounding.
+    A part inside another is separated from it by a gap, so that the media on both sides of a
+    surface never depend on rounding.
 
     Attributes:
-      name: `body`, `shell`, `liquid`; unique in the object.
-      material: inside; a name of `refref_jax.data.meshes.INDEX_OF_REFRACTION`.
-      vertices: world units, z up, within `RADIUS` of the origin.
-      faces: counter-clockwise seen from outside the surface, closed, without degenerate ones.
-      smooth: whether all of it is shaded with vertex normals; else with face normals. A sharp edge
-        of a smooth part has to be rounded in its geometry.
-      tint: factor of linear RGB light at every reflection and every crossing of the surface, 0 to
-        1.
-      absorption: of the medium inside, linear RGB, per world unit. Only of a part that no other
-        part lies in: Blender goes on absorbing there.
+      name: name of the part, such as `body`, `shell` or `liquid`; unique in the object.
+      material: medium inside; a name of `refref_jax.data.meshes.INDEX_OF_REFRACTION`.
+      vertices: positions, world units, z up, within `RADIUS` of the origin.
+      faces: vertex indices, counter-clockwise seen from outside; closed, without degenerate faces.
+      smooth: whether the part is shaded with vertex normals; with face normals otherwise. A sharp
+        edge of a smooth part has to be rounded in its geometry.
+      tint: factor of linear RGB radiance at every reflection and every crossing of the surface, 0
+        to 1.
+      absorption: absorption coefficient of the medium inside, linear RGB, per world unit. Only for
+        parts that contain no other part, because Blender continues to absorb there.
     """
 
     name: str
@@ -44,13 +44,13 @@ class ObjectPart(NamedTuple):
 
 
 class Object(NamedTuple):
-    """One of the fifty.
+    """One of the fifty objects of the data set.
 
     Attributes:
-      name: as in the published data set, in lower case with underscores.
-      category: of geometry and materials.
-      make: from a detail to the parts. 1 is what is rendered; the number of triangles grows with
-        its square, and 0.3 is enough to test the shape. Always the same parts for the same detail.
+      name: name in the published data set, in lower case with underscores.
+      category: category of geometry and materials.
+      make: function from a level of detail to the parts. The renders use 1; the number of triangles
+        grows with its square, and 0.3 suffices to test the shape. It is deterministic.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The stages of R3F: masks to geometry, its index of refraction, and a report on both.
+"""The R3F pipeline: geometry from masks, its index of refraction, and a report on both.
 
-`chain` goes through them, `records` is what they leave to be read by people and by one another.
+`chain` runs the stages; `records` stores the result of each stage for users and for later stages.
 """

@@ -1,4 +1,4 @@
-"""Goes through the stages of R3F; what is finished is not done again."""
+"""Runs the stages of R3F, skipping those that are finished."""
 
 import dataclasses
 import hashlib
@@ -27,28 +27,28 @@ def reconstruct(
     compare: bool,
     say: Say = print,
 ) -> Reconstruction:
-    """Reconstructs a scene's object from images and masks, or goes on with it.
+    """Reconstructs a scene's object from images and masks, or resumes a reconstruction.
 
     Args:
-      scene: its folder.
-      out: where to, see `records`.
-      config: what is asked for.
-      compare: whether the report may look at the scene's own meshes.
-      say: is told of every stage.
+      scene: folder of the scene.
+      out: folder of the reconstruction, see `records`.
+      config: options of the reconstruction.
+      compare: whether the report may read the scene's own meshes.
+      say: called with a line of text for every stage.
 
     Raises:
-      ValueError: if the scene lacks what is needed, if what makes a surface is not installed, if no
-        body fits the masks, or if the folder holds anything else.
+      ValueError: if the scene lacks required files, if the packages for extracting surfaces are not
+        installed, if no object fits the masks, or if the folder contains anything else.
     """
     import_skimage()
     for split in _splits(config):
         masks = scene_folder.read_masks(scene_folder.read_frames(scene, split))
         if config.outliers >= len(masks):
             raise ValueError(
-                f"--outliers={config.outliers}, but there are {len(masks)} {split} masks. Give "
+                f"--outliers={config.outliers}, but there are {len(masks)} {split} masks. Use "
                 "fewer."
             )
-    # So that a broken one is told now, and not at the end.
+    # Broken files are reported now, not after hours.
     scene_folder.read_masks(report.judging_frames(scene)[1])
     asked = Reconstruction(scene_names.of_folder(scene), fingerprint(scene), config)
     found = records.begin(out, asked)
@@ -74,10 +74,10 @@ def reconstruct(
 
 
 def read_part(out: Path) -> MeshPart:
-    """Reads the body of a finished reconstruction, with its index of refraction.
+    """Reads the object of a finished reconstruction, with its index of refraction.
 
     Raises:
-      ValueError: if the folder holds none, or one that is not finished.
+      ValueError: if the folder contains no reconstruction, or an unfinished one.
     """
     found = records.read(out)
     waits_for_light = found.config.light_steps > 0 and found.light is None
@@ -88,13 +88,13 @@ def read_part(out: Path) -> MeshPart:
         or not object_source.surface_file(out, found).is_file()
     ):
         raise ValueError(
-            f"The reconstruction in {out} is not finished. Repeat the command that began it."
+            f"The reconstruction in {out} is not finished. Repeat the command that started it."
         )
     return object_source.read_part(out, found)
 
 
 def fingerprint(scene: Path) -> str:
-    """Returns a hash of what a reconstruction is made from: the training images, masks and poses.
+    """Returns a hash of the inputs of a reconstruction: the training images, masks and poses.
 
     Raises:
       ValueError: if a file is missing, or the transforms file is broken.
@@ -109,7 +109,7 @@ def fingerprint(scene: Path) -> str:
 
 
 def describe_index(index: IndexFacts) -> str:
-    """Says in one line what the index is."""
+    """Returns a one-line description of the index."""
     if index.error is None:
         return f"index of refraction: {index.index:g} ({index.source})"
     return f"index of refraction: {index.index:.4f} +- {index.error:.4f} ({index.source})"
@@ -127,19 +127,19 @@ def _index(scene: Path, out: Path, found: Reconstruction) -> IndexFacts:
     )
     if not math.isfinite(estimate.deviation):
         raise ValueError(
-            f"The index of refraction was estimated as {estimate.index:.3f}, but no other would be "
-            f"worse (see {folder}). Give it, as in --ior=1.5."
+            f"The index of refraction was estimated as {estimate.index:.3f}, but the error does "
+            f"not depend on it (see {folder}). Set it explicitly, as in --ior=1.5."
         )
     return IndexFacts("estimated", estimate.index, estimate.deviation, estimate.error)
 
 
 def _splits(config: ReconstructionConfig) -> tuple[str, ...]:
-    """Returns the splits that a reconstruction looks at, but for its report."""
+    """Returns the splits that a reconstruction reads, apart from its report."""
     return ("train", "val") if config.light_steps > 0 else ("train",)
 
 
 def _refined(scene: Path, out: Path, found: Reconstruction, say: Say) -> Reconstruction:
-    """Refines by light, if that is asked for and not done."""
+    """Refines the object by light, if requested and not done yet."""
     there = found.light is not None and object_source.surface_file(out, found).is_file()
     if found.config.light_steps > 0 and not there:
         bare = dataclasses.replace(found, light=None, report=None)
@@ -171,7 +171,7 @@ def _describe_light(facts: LightFacts) -> str:
         f"refinement by light: error of the validation views {facts.before:.4f} before, "
         f"{facts.after:.4f} after {facts.steps} steps"
     )
-    return f"{told}; kept" if facts.kept else f"{told}; left out"
+    return f"{told}; kept" if facts.kept else f"{told}; discarded"
 
 
 def _describe_geometry(found: Reconstruction) -> str:
@@ -180,7 +180,7 @@ def _describe_geometry(found: Reconstruction) -> str:
         f"geometry: {facts.faces} faces from {facts.masks} masks of {facts.width} x "
         f"{facts.height}; {', '.join(facts.stages) or 'not refined'}"
     ]
-    told += [f"  left out {refused}" for refused in facts.refused]
+    told += [f"  skipped {refused}" for refused in facts.refused]
     told += [f"warning: {doubt}" for doubt in facts.doubts]
     return "\n".join(told)
 

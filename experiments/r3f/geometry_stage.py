@@ -1,6 +1,6 @@
-"""The first stage of R3F: from the masks of the training views to a surface.
+"""Reconstructs the surface from the masks of the training views, the first stage of R3F.
 
-`about_masks` names the masks that the surface does not agree with.
+`about_masks` names the masks with which the surface disagrees.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,16 +23,17 @@ from refref_jax.reconstruct.refinement import Refinement, refine
 FOLDER = "geometry"
 
 MATERIAL = "glass"
-"""Ends the name of the mesh, which stands for nothing: what it is made of is its index."""
+"""Suffix of the mesh's name. It selects no material, because the index determines it."""
 
-# The overlap of a mask and the body's silhouette below which they do not agree: of right masks of
-# bodies some tens of pixels wide it is above 0.97.
+# Overlap of mask and silhouette below which they disagree; it is above 0.97 for correct masks of
+# objects some tens of pixels wide.
 _AGREES = 0.9
 
-# Masks that are named.
+# Largest number of masks that are named.
 _NAMED = 5
 
-# The share of a body that no mask carves away alone, when it is right and there are many others.
+# Share of an object that a single mask may carve away alone; it is smaller if all of many masks are
+# correct.
 _MUCH = 0.05
 
 
@@ -59,14 +60,14 @@ GEOMETRIES: dict[str, Callable[[Views, Sequence[str], ReconstructionConfig], Gri
     "hull": _hull,
     "occupancy": _occupancy,
 }
-"""Ways from masks, and what they are called, to a grid that is negative inside the body."""
+"""Methods by name, which turn masks into a grid that is negative inside the object."""
 
 
 def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
-    """Reconstructs the surface, and writes it to `{out}/geometry`.
+    """Reconstructs the surface and writes it to `{out}/geometry`.
 
     Raises:
-      ValueError: if there are no masks, or no body fits them.
+      ValueError: if there are no masks, or no object fits them.
     """
     frames = scene_folder.read_frames(scene, "train")
     views = Views(scene_folder.read_masks(frames), frames.cameras)
@@ -99,17 +100,17 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
 
 
 def is_there(out: Path, facts: GeometryFacts) -> bool:
-    """Returns whether the surface is where it was written."""
+    """Returns whether the file of the surface exists."""
     return (out / FOLDER / facts.mesh).is_file()
 
 
 def _within(path: Path, scene: Path) -> Path:
-    """Returns the path of a file from its scene on, which may lie elsewhere tomorrow."""
+    """Returns the path of a file relative to its scene, whose folder may be moved."""
     return path.relative_to(scene) if path.is_relative_to(scene) else path
 
 
 def _object(scene: Path) -> str:
-    """Returns what the object of a scene is called: the published name's, else the folder's."""
+    """Returns the name of a scene's object: from the published name, else from the folder."""
     name = scene_names.of_folder(scene)
     return scene_names.parse(name).object if scene_names.is_name(name) else name
 
@@ -117,13 +118,13 @@ def _object(scene: Path) -> str:
 def about_masks(
     mesh: Mesh, views: Views, names: Sequence[str], *, outliers: int
 ) -> tuple[str, ...]:
-    """Says which masks the body does not agree with, and which of them may have spoilt it.
+    """Returns warnings about masks that disagree with the object or may have corrupted it.
 
     Args:
-      mesh: the body.
-      views: all masks that it was made from.
-      names: what they are called.
-      outliers: as many as may disagree without a word.
+      mesh: mesh of the object.
+      views: all masks from which it was made.
+      names: names of the views.
+      outliers: number of masks that may disagree without a warning.
     """
     overlaps = silhouette_overlap(mesh, *views)
     doubtful = np.flatnonzero(overlaps < _AGREES)
@@ -132,7 +133,7 @@ def about_masks(
     worst = doubtful[np.argsort(overlaps[doubtful])][:_NAMED]
     named = ", ".join(f"{names[view]} ({overlaps[view]:.2f})" for view in worst)
     told = (
-        f"{len(doubtful)} of {len(overlaps)} training masks overlap with the body by less than "
+        f"{len(doubtful)} of {len(overlaps)} training masks overlap with the object by less than "
         f"{_AGREES}, least {named}. Check the masks and the poses."
     )
     shares = carved_alone(views)
@@ -141,6 +142,6 @@ def about_masks(
         return (told,)
     return (
         told,
-        f"{names[taker]} alone carves away {shares[taker]:.0%} of what all others leave. If it is "
-        f"wrong, mend it or leave its frame out, or let --outliers={outliers + 1} masks be wrong.",
+        f"{names[taker]} alone carves away {shares[taker]:.0%} of the other masks' hull. If this "
+        f"mask is wrong, fix it, remove its frame, or use --outliers={outliers + 1}.",
     )

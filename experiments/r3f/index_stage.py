@@ -1,11 +1,12 @@
-"""The stage of R3F that finds the index of refraction: a background, then a search.
+"""Estimates the index of refraction: trains a background, then searches for the index.
 
-    {folder}/background/    a run: the field of what is behind the body, from pixels beside it
-    {folder}/index.png      the error over the index
+    {folder}/background/    a run: the field of the background, from pixels outside the masks
+    {folder}/index.png      the error as a function of the index
 
-The background is learned along straight light from pixels that do not see the body, so that no
-wrong index can have spoilt it. Where the body fills all images there is none: give the index then.
-`look` draws pixels that see the body, for this stage and for that of light.
+The background is trained with straight rays on pixels that do not see the object, so that no wrong
+index can corrupt it. If the object fills all images there are no such pixels, and the index must be
+set by the user. `look` draws pixels that see the object, for this stage and for the refinement by
+light.
 """
 
 import dataclasses
@@ -44,24 +45,24 @@ from refref_jax.training.config import TrainConfig
 from refref_jax.training.resolve import read_facts, resolve
 
 PRESET = "tiny"
-"""Of the background: its field is only looked at."""
+"""Preset of the background's model, whose field is only queried."""
 
 STEPS = 1000
-"""Of the background's training; the index no longer moves by a thousandth."""
+"""Training steps of the background; more change the index by less than a thousandth."""
 
 RAYS = 4096
-"""Pixels that the index is fitted to."""
+"""Number of pixels that the index is fitted to."""
 
-# What the body is told to be before its index is known.
+# Placeholder for the index before it is known.
 _BEFORE = 1.5
 
 
 class BodyPixels(NamedTuple):
-    """Some pixels of a split.
+    """Pixels of a split that see the object.
 
     Attributes:
-      evidence: rays, colours and the field.
-      views: the image of each.
+      evidence: rays, colours and the field of the background.
+      views: image number of each pixel.
     """
 
     evidence: Evidence
@@ -69,23 +70,23 @@ class BodyPixels(NamedTuple):
 
 
 def look(scene: Path, split: str, model: Model, *, seed: int, rays: int) -> BodyPixels:
-    """Draws pixels well inside of a split's masks, spread evenly over its views.
+    """Draws pixels well inside the masks of a split, evenly over its views.
 
     Args:
-      scene: its folder.
-      split: of which images and masks are read.
-      model: of the background.
-      seed: of the choice.
-      rays: how many, about; fewer where masks have no more.
+      scene: folder of the scene.
+      split: split whose images and masks are read.
+      model: model of the background.
+      seed: seed of the draw.
+      rays: approximate number of pixels; fewer if the masks contain fewer.
 
     Raises:
-      ValueError: if there are no masks, or they are too thin to have an inside.
+      ValueError: if there are no masks, or if they have no interior.
     """
     frames = scene_folder.read_frames(scene, split)
     inside = masks.well_inside(scene_folder.read_masks(frames))
     if not inside.any():
         raise ValueError(
-            f"No pixel of the {split} views of {scene} lies inside of a mask and off its outline. "
+            f"No pixel of the {split} views of {scene} lies inside a mask and off its outline. "
             "Use larger images, or check the masks."
         )
     generator = np.random.default_rng(seed)
@@ -102,7 +103,7 @@ def look(scene: Path, split: str, model: Model, *, seed: int, rays: int) -> Body
 
 
 def body_geometry(mesh: Mesh, index: float) -> Scene:
-    """Returns one clear body in air, on the device."""
+    """Returns a scene with one clear object in air, on the device."""
     return jax.device_put(Scene(pack_meshes([mesh]), nested([index], [NO_PARENT])))
 
 
@@ -118,21 +119,22 @@ def run(
     steps: int = STEPS,
     rays: int = RAYS,
 ) -> IndexEstimate:
-    """Finds the index of refraction of a body; what is there of an earlier call is used.
+    """Estimates the index of refraction of an object; reuses the results of an earlier call.
 
     Args:
       scene: folder of the scene; its training images and masks are read.
-      mesh: the body.
-      folder: for the background's run and the figure.
-      seed: of everything random.
-      space: whether there are walls; what the scene says if not given.
-      radius: of the walls' cube or sphere or the uncontracted ball, world units; likewise.
-      start: an index to descend from besides those of the search.
-      steps: of the background's training.
-      rays: pixels to fit.
+      mesh: mesh of the object.
+      folder: folder for the background's run and the figure.
+      seed: random seed.
+      space: type of the background; the scene's own if `None`.
+      radius: half-extent of the background cube, or radius of the sphere or of the uncontracted
+        ball, world units; the scene's own if `None`.
+      start: index from which to descend in addition to those of the search.
+      steps: training steps of the background.
+      rays: number of pixels to fit.
 
     Raises:
-      ValueError: if the scene has no masks, or no pixel beside them.
+      ValueError: if the scene has no masks, or no pixel outside of them.
       KeyboardInterrupt: if the background's training was stopped; it has been saved.
     """
     model = learn_background(scene, folder, seed=seed, space=space, radius=radius, steps=steps)
@@ -147,7 +149,7 @@ def run(
             config=model.config,
             search=search,
             start=start,
-            progress=lambda done, _: bar.show(done, "looks at the pixels, at most"),
+            progress=lambda done, _: bar.show(done, "evaluations, at most"),
         )
     draw(folder / "index.png", found)
     return found
@@ -162,19 +164,19 @@ def learn_background(
     radius: float | None = None,
     steps: int = STEPS,
 ) -> Model:
-    """Returns the field of what is behind the body; trains it first, or goes on with that.
+    """Returns the field of the background, which is trained first or resumed if necessary.
 
     Args:
       scene: folder of the scene.
-      folder: of the stage.
-      seed: of everything random.
-      space: see `run`.
-      radius: likewise.
-      steps: of its training.
+      folder: folder of the stage.
+      seed: random seed.
+      space: type of the background, see `run`.
+      radius: size of the background, see `run`.
+      steps: number of training steps.
 
     Raises:
-      ValueError: if the scene has no masks, or no pixel beside them, or if a background was begun
-        with other walls.
+      ValueError: if the scene has no masks, or no pixel outside of them, or if the training was
+        started with another background.
       KeyboardInterrupt: if its training was stopped; it has been saved.
     """
     run = folder / "background"
@@ -189,7 +191,7 @@ def learn_background(
         seed=seed,
     )
     resolved = resolve(config, read_facts(config.scene, parts=()))
-    # Nothing is inside an object that is not there; straight rays are sampled all along either way.
+    # There is no object in this scene; straight rays are sampled over their full length anyway.
     model = dataclasses.replace(resolved.model.config, interior="clear")
     wanted = SavedModel(model, STRAIGHT)
     if not run_folder.exists(run):
@@ -197,8 +199,8 @@ def learn_background(
         run_folder.create(run, resolved.config, wanted, empty)
     elif checkpoint_io.read_static(run) != wanted:
         raise ValueError(
-            f"{run} was begun with another --background or --radius than are given now. Give those "
-            "again, or remove that folder to have the background learned anew."
+            f"{run} was started with another --background or --radius. Repeat these flags, or "
+            "remove that folder to train the background again."
         )
     with app.Interrupt() as interrupt, ProgressBar("train", steps) as bar:
         ended = fit.train(
@@ -213,9 +215,9 @@ def learn_background(
 
 
 def draw(path: Path, found: IndexEstimate) -> None:
-    """Draws the error over the index: the ladder, the ways down, and where they end."""
+    """Plots the error over the index: the ladder, the descents, and their minima."""
     figure, axis = pyplot.subplots(figsize=(6.4, 3.6), layout="constrained")
-    axis.plot(*found.ladder, "o-", color=COLOURS[5], markersize=4, label="looked at")
+    axis.plot(*found.ladder, "o-", color=COLOURS[5], markersize=4, label="ladder")
     for way, label in zip(found.descents[::-1], ["descents"] + [None] * 9, strict=False):
         axis.plot(*way, ".-", color=COLOURS[1], linewidth=0.8, label=label)
     axis.axvline(found.index, color=COLOURS[0], linewidth=1.0)

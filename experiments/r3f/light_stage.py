@@ -1,9 +1,10 @@
-"""The stage of R3F that refines the body by the light that went through it, if that is asked for.
+"""Refines the object with the light refracted through it, an optional stage of R3F.
 
     {out}/light/{object}_{material}.ply    the refined surface
 
-It is kept only if it explains pixels better that it was not fitted to: those of the validation
-views, and only if it is still the same body. Scenes without such views are refused.
+The result is kept only if it explains the pixels of the validation views better, which it was not
+fitted to, and if the shape has not changed fundamentally. Scenes without validation masks are
+rejected.
 """
 
 import dataclasses
@@ -25,27 +26,27 @@ from refref_jax.render.model import Model
 
 FOLDER = "light"
 
-# Pixels that are descended on, and those that judge.
+# Number of pixels used in the descent, and of pixels for validation.
 _SEEN = 60_000
 _JUDGES = 8192
 
-# Share of the volume that light may change: it mends normals, not outlines.
+# Share of the volume that the refinement may change: it corrects normals, not outlines.
 _VOLUME_CHANGE = 0.02
 
 
 def run(
     scene: Path, mesh: Mesh, known: IndexFacts, model: Model, target: Path, *, steps: int, seed: int
 ) -> LightFacts:
-    """Refines a body, and writes it if it is better.
+    """Refines an object, and writes it if it is better.
 
     Args:
-      scene: its folder; training and validation images and masks are read.
-      mesh: the body.
-      known: its index of refraction, which stays as it is if it was given.
-      model: of the background.
-      target: the file, in a folder of its own.
-      steps: of the descent.
-      seed: of everything random.
+      scene: folder of the scene; training and validation images and masks are read.
+      mesh: mesh of the object.
+      known: index of refraction, which is fixed if the user set it.
+      model: model of the background.
+      target: path of the mesh to write, in a folder of its own.
+      steps: number of steps of the descent.
+      seed: random seed.
 
     Raises:
       ValueError: if there is no validation split with masks.
@@ -75,7 +76,7 @@ def run(
 
 
 def find_judges(scene: Path, model: Model, *, seed: int) -> BodyPixels:
-    """Returns the pixels of the validation views that a refinement is judged by.
+    """Returns the pixels of the validation views by which a refinement is judged.
 
     Raises:
       ValueError: if there is no validation split with masks.
@@ -84,7 +85,7 @@ def find_judges(scene: Path, model: Model, *, seed: int) -> BodyPixels:
 
 
 def judge(mesh: Mesh, index: float, judges: BodyPixels, model: Model) -> float:
-    """Returns the mean error of the judging pixels in sRGB, with the body's own tree."""
+    """Returns the mean error of the validation pixels in sRGB, with the mesh's own BVH."""
     errors = refractive_index.errors_at_index(
         np.float32(index),
         judges.evidence,

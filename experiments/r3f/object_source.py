@@ -1,8 +1,7 @@
-"""Where the object of a run comes from: a reconstruction, as far as it has got.
+"""Reads the object of a run from a reconstruction, and records where it came from.
 
-A run that was trained with a reconstructed object says so in `{run}/body.json`, which `write` and
-`read` are for. The other functions read the newest surface of a reconstruction, and its index of
-refraction.
+A run that was trained with a reconstructed object records it in `{run}/body.json`, with `write` and
+`read`. The other functions read the newest surface of a reconstruction and its index of refraction.
 """
 
 import dataclasses
@@ -21,11 +20,11 @@ _FILE = "body.json"
 
 @dataclasses.dataclass(frozen=True)
 class Provenance:
-    """Of a body.
+    """Origin of an object.
 
     Attributes:
-      reconstruction: the folder that it was reconstructed into.
-      index: its index of refraction, as it was trained with.
+      reconstruction: folder of the reconstruction.
+      index: index of refraction used in training.
     """
 
     reconstruction: str
@@ -33,7 +32,7 @@ class Provenance:
 
 
 def write(run: Path, provenance: Provenance | None) -> None:
-    """Notes it in a run's folder, which is made; or that the body is the scene's own."""
+    """Writes the origin into a run's folder, which is created; `None` removes it."""
     if provenance is None:
         (run / _FILE).unlink(missing_ok=True)
         return
@@ -42,25 +41,25 @@ def write(run: Path, provenance: Provenance | None) -> None:
 
 
 def read(run: Path) -> Provenance | None:
-    """Returns it, or `None` where the scene's own meshes bend light."""
+    """Returns the origin, or `None` if the run uses the scene's own meshes."""
     return configuration.read(run / _FILE, Provenance) if (run / _FILE).is_file() else None
 
 
 def surface_file(out: Path, found: Reconstruction) -> Path:
-    """Returns where the surface is: refined by light, if that bettered it."""
+    """Returns the path of the surface: the refined one if the refinement was kept."""
     refined = found.light is not None and found.light.kept
     folder = light_stage.FOLDER if refined else geometry_stage.FOLDER
     return out / folder / found.geometry.mesh
 
 
 def index_facts(found: Reconstruction) -> IndexFacts:
-    """Returns the index of refraction that goes with the surface."""
+    """Returns the index of refraction that belongs to the surface."""
     moved = found.light is not None and found.light.kept and found.index.source == "estimated"
     return IndexFacts("refined", found.light.index, None, None) if moved else found.index
 
 
 def read_part(out: Path, found: Reconstruction) -> MeshPart:
-    """Reads the body as what light is traced through."""
+    """Reads the object as a mesh part with an index of refraction."""
     return meshes.read_part(surface_file(out, found), index=index_facts(found).index)
 
 

@@ -1,14 +1,14 @@
-"""What a reconstruction is asked for, and what each of its stages found: `reconstruction.json`.
+"""Stores the options of a reconstruction and the result of each stage: `reconstruction.json`.
 
-    {out}/reconstruction.json        all of it, readable; written anew after every stage
+    {out}/reconstruction.json        all records, readable; rewritten after every stage
     {out}/geometry/*.ply             the surface, with its shading normals
-    {out}/index/                     what the estimation of the index keeps
-    {out}/light/*.ply                the surface refined by light, if that bettered it
-    {out}/index.json                 the index of refraction that goes with the surface
+    {out}/index/                     files of the estimation of the index
+    {out}/light/*.ply                the surface refined by light, if it was kept
+    {out}/index.json                 the index of refraction that belongs to the surface
     {out}/pictures/*.png, report.md  the report
 
-A stage that is `None` is not finished. What is written holds no times, so that a reconstruction
-that was interrupted comes to the same files.
+A stage that is `None` is not finished. The records contain no times, so that an interrupted and
+resumed reconstruction yields the same files.
 """
 
 import dataclasses
@@ -23,17 +23,18 @@ FILE = "reconstruction.json"
 
 @dataclasses.dataclass(frozen=True)
 class ReconstructionConfig:
-    """What is asked for.
+    """Options of a reconstruction.
 
     Attributes:
-      geometry: name of the way from masks to a grid, see `geometry_stage.GEOMETRIES`.
-      resolution: cells along the longest edge of the grid.
-      outliers: views that may be wrong.
-      index: the index of refraction, or `None` to estimate it.
-      space: whether there are walls, or `None` for what the scene says.
-      radius: of the walls' cube or sphere or the uncontracted ball, world units; `None` likewise.
-      light_steps: of the refinement by light; 0 leaves it out.
-      seed: of everything random.
+      geometry: name of the method from masks to a grid, see `geometry_stage.GEOMETRIES`.
+      resolution: number of cells along the longest edge of the grid.
+      outliers: number of views that may be wrong.
+      index: index of refraction, or `None` to estimate it.
+      space: type of the background, or `None` for the scene's own.
+      radius: half-extent of the background cube, or radius of the sphere or of the uncontracted
+        ball, world units; `None` for the scene's own.
+      light_steps: number of steps of the refinement by light; 0 skips it.
+      seed: random seed.
     """
 
     geometry: str
@@ -48,20 +49,20 @@ class ReconstructionConfig:
 
 @dataclasses.dataclass(frozen=True)
 class GeometryFacts:
-    """What came of the geometry.
+    """Results of the geometry stage.
 
     Attributes:
-      mesh: the file in the folder `geometry`.
-      masks: how many there were.
-      width: of the masks, pixels.
-      height: of the masks, pixels.
-      vertices: of the mesh.
-      faces: of the mesh.
-      volume: inside of it, cubed world units.
-      diameter: diagonal of its box, world units.
-      stages: of the refinement that changed something.
-      refused: those that were left out, and why.
-      doubts: what is wrong with masks, if anything seems so.
+      mesh: name of the file in the folder `geometry`.
+      masks: number of masks.
+      width: width of the masks, pixels.
+      height: height of the masks, pixels.
+      vertices: number of vertices of the mesh.
+      faces: number of faces of the mesh.
+      volume: enclosed volume, cubed world units.
+      diameter: diagonal of the bounding box, world units.
+      stages: names of the refinement stages that changed the mesh.
+      refused: skipped stages, and the reasons.
+      doubts: warnings about masks.
     """
 
     mesh: str
@@ -79,12 +80,12 @@ class GeometryFacts:
 
 @dataclasses.dataclass(frozen=True)
 class IndexFacts:
-    """The index of refraction.
+    """The index of refraction and its origin.
 
     Attributes:
-      source: whether it was given or estimated, or found together with the surface by light.
-      index: relative to air.
-      error: one standard deviation, of an estimate.
+      source: origin of the index: given, estimated, or refined by light with the surface.
+      index: index relative to air.
+      error: standard deviation of an estimate.
       loss: photometric loss of an estimate.
     """
 
@@ -96,15 +97,15 @@ class IndexFacts:
 
 @dataclasses.dataclass(frozen=True)
 class LightFacts:
-    """What came of the refinement by light.
+    """Results of the refinement by light.
 
     Attributes:
-      steps: of the descent.
+      steps: number of steps of the descent.
       kept: whether the validation views are explained better.
       before: mean error of their pixels before, sRGB.
-      after: and after.
-      index: of refraction, after.
-      furthest: that a part of the surface moved, world units.
+      after: mean error of their pixels after, sRGB.
+      index: index of refraction after the refinement.
+      furthest: largest displacement of the surface, world units.
     """
 
     steps: int
@@ -117,7 +118,7 @@ class LightFacts:
 
 @dataclasses.dataclass(frozen=True)
 class DistanceFacts:
-    """How far the surface is from the true one, see `reconstruct.comparison.Distance`."""
+    """Distances between the surface and the true one, see `mesh_distance.Distance`."""
 
     chamfer: float
     furthest: float
@@ -127,14 +128,14 @@ class DistanceFacts:
 
 @dataclasses.dataclass(frozen=True)
 class ReportFacts:
-    """What the report measured.
+    """Measurements of the report.
 
     Attributes:
-      split: of the views that it looked at.
-      names: of the views.
-      overlaps: of mask and silhouette in each view: intersection over union.
-      truth: the distance to the true meshes, if there are any that may be looked at.
-      remark: why there is no such distance.
+      split: split of the views that were measured.
+      names: names of the views.
+      overlaps: intersection over union of mask and silhouette in each view.
+      truth: distances to the true meshes, if these exist and may be read.
+      remark: reason why the distances are missing.
     """
 
     split: str
@@ -145,22 +146,22 @@ class ReportFacts:
 
     @property
     def mean_overlap(self) -> float:
-        """Of all views."""
+        """Mean overlap of all views."""
         return sum(self.overlaps) / len(self.overlaps)
 
 
 @dataclasses.dataclass(frozen=True)
 class Reconstruction:
-    """A reconstruction as far as it has got.
+    """A reconstruction, finished or not.
 
     Attributes:
-      scene: how the scene is called.
-      inputs: fingerprint of the training images, masks and poses that it is made from.
-      config: what was asked for.
-      geometry: the first stage.
-      index: the second.
-      light: the third, if it is asked for.
-      report: the last.
+      scene: name of the scene.
+      inputs: fingerprint of the training images, masks and poses.
+      config: options of the reconstruction.
+      geometry: results of the first stage.
+      index: results of the second stage.
+      light: results of the third stage, which is optional.
+      report: results of the last stage.
     """
 
     scene: str
@@ -173,40 +174,40 @@ class Reconstruction:
 
 
 def exists(out: Path) -> bool:
-    """Returns whether a folder holds a reconstruction, finished or not."""
+    """Returns whether a folder contains a reconstruction, finished or not."""
     return (out / FILE).is_file()
 
 
 def read(out: Path) -> Reconstruction:
-    """Reads how far a reconstruction has got.
+    """Reads the record of a reconstruction.
 
     Raises:
-      ValueError: if the folder holds none.
+      ValueError: if the folder contains none.
     """
     if not exists(out):
-        raise ValueError(f"{out} holds no reconstruction. Give one of experiments.reconstruct.")
+        raise ValueError(f"{out} has no reconstruction. Use an --out of experiments.reconstruct.")
     return configuration.read(out / FILE, Reconstruction)
 
 
 def write(out: Path, reconstruction: Reconstruction) -> None:
-    """Writes how far it has got, at once."""
+    """Writes the record atomically."""
     configuration.write(out / FILE, reconstruction)
 
 
 def begin(out: Path, asked: Reconstruction) -> Reconstruction:
-    """Opens a folder for a reconstruction, or finds how far it has got there.
+    """Creates the folder of a reconstruction, or reads the record that is there.
 
     Raises:
-      ValueError: if the folder holds anything else, or a reconstruction from other images or with
-        other options.
+      ValueError: if the folder contains anything else, or a reconstruction from other images or
+        with other options.
     """
     if not exists(out):
         if out.exists() and not out.is_dir():
-            raise ValueError(f"{out} is a file, but a folder is needed. Give another --out.")
+            raise ValueError(f"{out} is a file, not a folder. Use another --out.")
         draft = atomic_files.beside(out / FILE)
         if out.is_dir() and any(each != draft for each in out.iterdir()):
             raise ValueError(
-                f"{out} holds something else than a reconstruction. Give a new folder as --out."
+                f"{out} contains files, but no reconstruction. Use a new folder as --out."
             )
         out.mkdir(parents=True, exist_ok=True)
         write(out, asked)
@@ -214,13 +215,13 @@ def begin(out: Path, asked: Reconstruction) -> Reconstruction:
     begun = read(out)
     if begun.inputs != asked.inputs:
         raise ValueError(
-            f"{out} was made from other images, masks or poses, of {begun.scene}. Give the scene "
-            "that it was begun with, or another --out."
+            f"{out} was made from other images, masks or poses, of {begun.scene}. Use the scene "
+            "that it was started with, or another --out."
         )
     if changed := _changed(begun, asked.config):
         raise ValueError(
-            f"{out} was begun with other options: {', '.join(changed)}. Give those again, or "
-            "another --out."
+            f"{out} was started with other options: {', '.join(changed)}. Repeat those options, "
+            "or use another --out."
         )
     if begun.config != asked.config:
         begun = dataclasses.replace(begun, config=asked.config)
@@ -229,7 +230,7 @@ def begin(out: Path, asked: Reconstruction) -> Reconstruction:
 
 
 def _changed(begun: Reconstruction, asked: ReconstructionConfig) -> list[str]:
-    """Says which options of finished stages differ, as they were."""
+    """Returns descriptions of the changed options that affect finished stages."""
     before, now = dataclasses.asdict(begun.config), dataclasses.asdict(asked)
     return [
         f"{_OPTIONS.get(name, name)} {_told(name, value)}, not {_told(name, now[name])}"
@@ -239,10 +240,10 @@ def _changed(begun: Reconstruction, asked: ReconstructionConfig) -> list[str]:
 
 
 def _told(name: str, value: object) -> object:
-    """Says what an option is, or what stands for it where it is left out."""
+    """Returns the value of an option, or a description of its default."""
     return ("estimated" if name == "index" else "as the scene says") if value is None else value
 
 
 _OPTIONS = {"index": "ior", "space": "background"}
-# The first stage that an option matters to, where that is not the geometry.
+# First stage that an option affects, if it is not the geometry.
 _STAGES = {"index": "index", "space": "index", "radius": "index", "light_steps": "light"}

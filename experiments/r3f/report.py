@@ -1,8 +1,8 @@
-"""The last stage of R3F: a report in words and pictures, measured on views that it has not seen.
+"""Writes a report with figures, measured on held-out views: the last stage of R3F.
 
-Views of the test split are looked at, else of the validation split, else those that it was made
-from. Where the scene has meshes of its own, and they may be looked at, the surface is compared with
-the outermost of them.
+The views are those of the test split, otherwise of the validation split, otherwise the training
+views. If the scene has its own meshes and they may be read, the surface is compared with the
+outermost of them.
 """
 
 from pathlib import Path
@@ -33,34 +33,34 @@ FILE = "report.md"
 
 _ROWS = 3
 
-# Rows of pixels of a whole view of the surface, and what is shown around it, as a share of it.
+# Rows of pixels of an image of the surface, and the margin around the object as a share of it.
 _HEIGHT = 300
 _MARGIN = 0.2
 
 _SPLITS = ("test", "val", "train")
 
 _SEEN_ON = {
-    "test": "test views, from which nothing was made",
-    "val": "validation views, from which nothing was made",
-    "train": "training views, the very ones that it was made from",
+    "test": "test views, which were not used in the reconstruction",
+    "val": "validation views, which were not used in the reconstruction",
+    "train": "training views, which were used in the reconstruction",
 }
 
 
 class _Truth(NamedTuple):
-    """The scene's own outermost surface, or why it is not looked at."""
+    """The scene's own outermost surface, or the reason why it is missing."""
 
     mesh: Mesh | None
     remark: str
 
 
 def run(scene: Path, out: Path, found: Reconstruction, compare: bool) -> ReportFacts:
-    """Measures a reconstruction, and writes `pictures` and `report.md`.
+    """Measures a reconstruction and writes `pictures` and `report.md`.
 
     Args:
-      scene: its folder.
-      out: where it is.
-      found: what it came to.
-      compare: whether the scene's own meshes may be looked at.
+      scene: folder of the scene.
+      out: folder of the reconstruction.
+      found: results of the reconstruction.
+      compare: whether the scene's own meshes may be read.
     """
     mesh = object_source.read_mesh(out, found)
     split, frames = judging_frames(scene)
@@ -85,14 +85,14 @@ def run(scene: Path, out: Path, found: Reconstruction, compare: bool) -> ReportF
 
 
 def is_there(out: Path) -> bool:
-    """Returns whether the report is where it was written."""
+    """Returns whether the files of the report exist."""
     return (out / FOLDER).is_dir() and (out / FILE).is_file()
 
 
 def judging_frames(scene: Path) -> tuple[str, Frames]:
-    """Returns the views that a report looks at, and their split.
+    """Returns the views that a report measures, and their split.
 
-    They are of the first split that has masks, those that nothing was made from first.
+    Held-out splits come first; the first split with masks is used.
     """
     for split in _SPLITS[:-1]:
         if (scene / f"transforms_{split}.json").is_file():
@@ -113,7 +113,7 @@ def _outlines(mesh: Mesh, frames: Frames) -> list[Outline]:
 
 
 def _read_truth(scene: Path) -> _Truth:
-    """Returns the outermost of the scene's meshes as one."""
+    """Returns the outermost of the scene's meshes as one mesh."""
     try:
         parts = meshes.read_meshes(scene)
     except SceneError as error:
@@ -130,7 +130,7 @@ def _read_truth(scene: Path) -> _Truth:
 
 
 def _surface_views(mesh: Mesh, truth: Mesh | None, frames: Frames) -> list[SurfaceView]:
-    """Returns what a few cameras see, in windows around the object."""
+    """Renders the surface from a few cameras, in windows around the object."""
     chosen = np.unique(np.linspace(0, len(frames.names) - 1, _ROWS).astype(int)).tolist()
     images = scene_folder.read_images(
         frames._replace(images=tuple(frames.images[i] for i in chosen))
@@ -155,7 +155,7 @@ def _surface_views(mesh: Mesh, truth: Mesh | None, frames: Frames) -> list[Surfa
 
 
 def _distances(first: FirstSurface, rays: Rays, truth: Mesh) -> Float[np.ndarray, "h w"]:
-    """Returns how far from the truth what rays meet is, in percent of its diameter."""
+    """Returns the distance of ray hits from the true surface, in percent of its diameter."""
     seen = np.isfinite(first.distances)
     reach = np.where(seen, first.distances, 0.0)[..., None]
     points = (rays.origins + reach * rays.directions).astype(np.float64)
@@ -181,7 +181,7 @@ def _in_camera(
 
 
 def _resized(cameras: Cameras, height: int) -> Cameras:
-    """Returns cameras of the same views with as many rows of pixels."""
+    """Returns cameras with the same poses and another image height."""
     scale = height / cameras.height
     return cameras._replace(
         width=round(scale * cameras.width), height=height, focal=scale * cameras.focal
@@ -192,28 +192,28 @@ def markdown(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
     """Returns the text of a report.
 
     Args:
-      out: folder of the reconstruction; its pictures are expected in `pictures`.
-      found: geometry and index.
-      facts: what was measured of them.
+      out: folder of the reconstruction; its figures are expected in `pictures`.
+      found: results of the geometry and the index.
+      facts: measurements of the report.
     """
     geometry = found.geometry
     parts = [
         f"# The object of {found.scene}, reconstructed",
         f"From {geometry.masks} masks of {geometry.width} x {geometry.height} pixels and their "
         f"poses; {_of_index(found.index)}.",
-        *(f"**Doubtful:** {doubt}" for doubt in geometry.doubts),
+        *(f"**Warning:** {doubt}" for doubt in geometry.doubts),
         _table(out, found, facts),
         f"## Silhouettes\n\nMeasured on {len(facts.overlaps)} {_SEEN_ON[facts.split]}. IoU is the "
-        "pixels in both mask and silhouette over those in either.",
+        "number of pixels in both mask and silhouette over the number in either.",
         "![Masks and silhouettes](pictures/overlap.png)",
         "![Errors of the silhouettes](pictures/iou.png)",
         f"## Surface\n\n{_of_truth(facts)}",
         "![Normals, and the distance to the true surface](pictures/surface.png)",
         *_pictures_of_index(out),
-        "## How it was made\n\n" + _making(found),
-        "## Go on\n\n```bash\n"
+        "## Options\n\n" + _making(found),
+        "## Next steps\n\n```bash\n"
         + app.shell("train", "--scene=SCENE", "--reconstruction=OUT", "--out=RUN")
-        + "\n```\n\nwith SCENE the scene's folder and OUT this one.",
+        + "\n```\n\nwhere SCENE is the scene's folder and OUT is this folder.",
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -239,7 +239,7 @@ def _table(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
     ]
     if found.light is not None:
         light = found.light
-        kept = f"kept, with index {light.index:.4f}" if light.kept else "left out"
+        kept = f"kept, with index {light.index:.4f}" if light.kept else "discarded"
         rows.append(
             (
                 "error of validation views, by light",
@@ -263,15 +263,15 @@ def _table(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
 
 def _of_truth(facts: ReportFacts) -> str:
     shown = (
-        "No mask shows a cavity, a dent that no line of sight grazes, or what lies within glass: "
-        "the body is filled, with one index. Normals are those of the camera's frame: right is "
-        "red, up green, towards it blue."
+        "Masks do not show cavities, dents that no line of sight grazes, or the inside of glass: "
+        "the object is filled, with one index. Normals are in the camera's frame: right is red, up "
+        "is green, towards the camera is blue."
     )
     if facts.truth is None:
         return f"{facts.remark} {shown}"
     return (
-        f"{facts.remark} {shown} Distances are those of the surface that is seen to the closest "
-        "point of the true one."
+        f"{facts.remark} {shown} Distances are those of the visible surface to the closest point "
+        "of the true one."
     )
 
 
@@ -291,6 +291,6 @@ def _making(found: Reconstruction) -> str:
         + (f" `--background={config.space}`" if config.space is not None else "")
         + (f" `--radius={config.radius:g}`" if config.radius is not None else ""),
         f"- refined: {', '.join(geometry.stages) or 'nothing to do'}",
-        *(f"- left out {refused}" for refused in geometry.refused),
+        *(f"- skipped {refused}" for refused in geometry.refused),
     ]
     return "\n".join(told)

@@ -1,7 +1,7 @@
-"""The figures of the report on a reconstruction, drawn with matplotlib.
+"""Draws the figures of the report on a reconstruction with matplotlib.
 
-Masks and silhouettes, and the surface with its distance to the true one. Each shows square windows
-around what is to be seen.
+One shows masks and silhouettes, another the surface with its distance to the true one. Each shows
+square windows around the object.
 """
 
 import math
@@ -19,41 +19,42 @@ from matplotlib.patches import Patch
 from experiments.figures.style import COLOURS, pyplot, style
 
 AGREES, MISSING, EXCESS = COLOURS[5], COLOURS[1], COLOURS[3]
-"""Colours of pixels in mask and silhouette, in the mask alone, and in the silhouette alone."""
+"""Colours of pixels in mask and silhouette, in the mask only, and in the silhouette only."""
 
 DPI = 110
 
-# Inches of a thumbnail, and the most pixels along its edge; columns of a contact sheet.
+# Inches of a thumbnail, and the largest number of pixels along its edge; columns of a contact
+# sheet.
 _THUMBNAIL = 1.25
 _PIXELS = 136
 _COLUMNS = 10
 
-# Around the object, as a share of it.
+# Margin around the object, as a share of it.
 _MARGIN = 0.12
 
-# Contrast that is left of a photograph, and how strong the colour of agreement is on it.
+# Remaining contrast of a photograph, and opacity of the colour of agreement on it.
 _CONTRAST = 0.35
 _TINT = 0.55
 
-# Inches of a view, and of the scales beside it.
+# Inches of a view, and of the colour bars next to it.
 _VIEW = 2.4
 _SCALES = 1.5
 
 _DISTANCES, _ANGLES = "RdBu_r", "YlOrRd"
 
-# Scales end at the value that so many percent of the pixels stay below, but at least here.
+# Scales end at this percentile of the pixels, but not below the given minimum.
 _MOST = 99.0
 _LEAST_ANGLE = 1.0
 _LEAST_DISTANCE = 0.05
 
 
 class Window(NamedTuple):
-    """A square of a picture, in shares of its height, so that it serves pictures of any size.
+    """A square of an image, in shares of its height, so that it fits images of any size.
 
     Attributes:
-      top: of its first row.
-      left: of its first column.
-      side: of its edge.
+      top: position of the first row.
+      left: position of the first column.
+      side: length of the edge.
     """
 
     top: float
@@ -62,14 +63,14 @@ class Window(NamedTuple):
 
 
 class Outline(NamedTuple):
-    """One view of mask and silhouette.
+    """Mask and silhouette in one view.
 
     Attributes:
-      name: of the view.
-      image: the photograph, 8-bit sRGB.
-      mask: where the object is seen.
-      silhouette: where the mesh is.
-      overlap: of the two.
+      name: name of the view.
+      image: photograph, 8-bit sRGB.
+      mask: true where the object is visible.
+      silhouette: true where the mesh is visible.
+      overlap: IoU of mask and silhouette.
     """
 
     name: str
@@ -80,15 +81,15 @@ class Outline(NamedTuple):
 
 
 class SurfaceView(NamedTuple):
-    """What one camera sees of the surface, and of the true one.
+    """The surface and the true one, as seen by one camera.
 
     Attributes:
-      name: of the view.
-      image: the photograph, 8-bit sRGB, in any size, but square as all are.
-      normals: in the camera's frame, zero where nothing is seen.
-      true_normals: of the true surface, or `None` if there is none.
-      distance: from the true surface, positive outside, in percent of its diameter; NaN where
-        nothing is seen; or `None`.
+      name: name of the view.
+      image: photograph, 8-bit sRGB, of any size, but square as all are.
+      normals: normals in the camera's frame, zero where nothing is visible.
+      true_normals: normals of the true surface, or `None` if there is none.
+      distance: distance from the true surface, positive outside, in percent of its diameter; NaN
+        where nothing is visible; or `None`.
     """
 
     name: str
@@ -99,11 +100,11 @@ class SurfaceView(NamedTuple):
 
 
 def windows_around(areas: Sequence[Bool[np.ndarray, "h w"]], *, margin: float) -> list[Window]:
-    """Returns for each area a window of one size for all, within the picture.
+    """Returns one window for each area, all of the same size, within the image.
 
     Args:
-      areas: what is to be seen, of one size; an empty one is looked at in its middle.
-      margin: around the largest of them, as a share of it.
+      areas: regions to show, of one size; the centre is used if one is empty.
+      margin: margin around the largest of them, as a share of it.
     """
     height, width = areas[0].shape
     boxes = [_box(area) for area in areas]
@@ -115,7 +116,7 @@ def windows_around(areas: Sequence[Bool[np.ndarray, "h w"]], *, margin: float) -
 
 
 def cut_out(picture: Shaped[np.ndarray, "h w *channels"], window: Window) -> np.ndarray:
-    """Returns the part of a picture in a window, to whole pixels."""
+    """Returns the part of an image in a window, rounded to pixels."""
     height = len(picture)
     top, left = math.floor(window.top * height), math.floor(window.left * height)
     side = max(1, math.ceil(window.side * height))
@@ -123,17 +124,17 @@ def cut_out(picture: Shaped[np.ndarray, "h w *channels"], window: Window) -> np.
 
 
 def shrink_any(area: Bool[np.ndarray, "h w"], stride: int) -> Bool[np.ndarray, "sh sw"]:
-    """Returns an area in pixels larger by a stride; one is in it if any of its small ones is."""
+    """Downsamples an area by a stride; a pixel is set if any of its pixels is."""
     return _blocks(area, stride).any(axis=(1, 3))
 
 
 def shrink(picture: Num[np.ndarray, "h w 3"], stride: int) -> Num[np.ndarray, "sh sw 3"]:
-    """Returns a picture in pixels larger by a stride, as means."""
+    """Downsamples an image by a stride, as means."""
     return _blocks(picture, stride).mean(axis=(1, 3))
 
 
 def _blocks(picture: Shaped[np.ndarray, "h w *channels"], stride: int) -> np.ndarray:
-    """Cuts a picture into squares; what is left over at its ends repeats the last pixel."""
+    """Splits an image into squares; the last pixel is repeated at its ends."""
     short = [-length % stride for length in picture.shape[:2]]
     ends = [(0, short[0]), (0, short[1]), *[(0, 0)] * (picture.ndim - 2)]
     padded = np.pad(picture, ends, mode="edge")
@@ -142,7 +143,7 @@ def _blocks(picture: Shaped[np.ndarray, "h w *channels"], stride: int) -> np.nda
 
 
 def _box(area: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the ends of rows and columns of an area."""
+    """Returns the bounds of rows and columns of an area."""
     if not area.any():
         middle = 0.5 * np.asarray(area.shape)
         return middle, middle
@@ -153,7 +154,7 @@ def _box(area: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
 def draw_overlaps(path: Path, outlines: Sequence[Outline]) -> None:
     """Draws all views as a contact sheet of agreement, missing and excess pixels.
 
-    Where there are more pixels than fit, one that errs is never averaged away.
+    Images too large for a thumbnail are downsampled without averaging wrong pixels away.
     """
     columns = min(_COLUMNS, len(outlines), max(4, math.ceil(math.sqrt(1.6 * len(outlines)))))
     rows = -(-len(outlines) // columns)
@@ -171,7 +172,7 @@ def draw_overlaps(path: Path, outlines: Sequence[Outline]) -> None:
     for axis, outline, window in zip(axes.flat, outlines, around, strict=False):
         axis.imshow(colour_overlap(outline, window), interpolation="nearest")
         axis.set_title(f"{outline.name}  {outline.overlap:.4f}", fontsize=6.5, pad=2.5)
-    named = {"in both": _tinted(), "mask alone": MISSING, "silhouette alone": EXCESS}
+    named = {"in both": _tinted(), "mask only": MISSING, "silhouette only": EXCESS}
     figure.legend(
         handles=[Patch(color=colour, label=name) for name, colour in named.items()],
         loc="outside lower center",
@@ -184,7 +185,7 @@ def draw_overlaps(path: Path, outlines: Sequence[Outline]) -> None:
 
 
 def colour_overlap(outline: Outline, window: Window) -> Float[np.ndarray, "ph pw 3"]:
-    """Returns a window of the photograph in grey, agreement tinted, errors in full colour."""
+    """Returns a grey window of the photograph, agreement tinted, errors in full colour."""
     image, mask, silhouette = (
         cut_out(each, window) for each in (outline.image, outline.mask, outline.silhouette)
     )
@@ -199,15 +200,15 @@ def colour_overlap(outline: Outline, window: Window) -> Float[np.ndarray, "ph pw
 
 
 def draw_errors(path: Path, outlines: Sequence[Outline]) -> None:
-    """Draws a bar for each view: the share of pixels in mask or silhouette that are not in both."""
+    """Draws a bar for each view: the share of pixels of mask or silhouette that are not in both."""
     errors = 100.0 * (1.0 - np.asarray([outline.overlap for outline in outlines]))
     missing = np.asarray(
         [_share(outline.mask & ~outline.silhouette, outline) for outline in outlines]
     )
     figure, axis = pyplot.subplots(figsize=(9.0, 3.2), layout="constrained")
     at = np.arange(len(outlines))
-    axis.bar(at, missing, color=MISSING, label="mask alone")
-    axis.bar(at, errors - missing, bottom=missing, color=EXCESS, label="silhouette alone")
+    axis.bar(at, missing, color=MISSING, label="mask only")
+    axis.bar(at, errors - missing, bottom=missing, color=EXCESS, label="silhouette only")
     axis.axhline(errors.mean(), color="#555555", linewidth=1.0, linestyle="--")
     axis.annotate(
         f"mean {errors.mean():.2f} %",
@@ -235,17 +236,17 @@ def draw_errors(path: Path, outlines: Sequence[Outline]) -> None:
 
 
 def _tinted() -> Float[np.ndarray, "3"]:
-    """Returns the colour of agreement on white."""
+    """Returns the colour of agreement on a white background."""
     return 1.0 - _TINT * (1.0 - np.asarray(to_rgb(AGREES)))
 
 
 def _share(pixels: Bool[np.ndarray, "h w"], outline: Outline) -> float:
-    """Returns what percent of mask or silhouette some of their pixels are."""
+    """Returns the percentage of the pixels of mask or silhouette that a part of them makes up."""
     return 100.0 * float(pixels.sum()) / max(1, int((outline.mask | outline.silhouette).sum()))
 
 
 def draw_surface(path: Path, views: Sequence[SurfaceView]) -> None:
-    """Draws views as rows: photograph and normals, and beside a true surface the errors of both."""
+    """Draws one row per view: photograph, normals, and the errors of both if the truth is known."""
     compared = all(view.true_normals is not None for view in views)
     titles = ["photograph", "normals"]
     titles += ["true normals", "angle between", "distance to the truth"] * compared
@@ -273,13 +274,13 @@ def draw_surface(path: Path, views: Sequence[SurfaceView]) -> None:
 
 
 def colour_normals(normals: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """Returns normals as colours: x is red, y green, towards the viewer blue; none is white."""
+    """Returns normals as colours: x is red, y green, towards the viewer blue; missing is white."""
     seen = np.any(normals != 0.0, axis=-1, keepdims=True)
     return np.where(seen, np.clip(0.5 + 0.5 * normals, 0.0, 1.0), 1.0)
 
 
 def angles_between(view: SurfaceView) -> Float[np.ndarray, "h w"]:
-    """Returns the angle in degrees between both normals, NaN where one is missing."""
+    """Returns the angle in degrees between both normals, NaN where either is missing."""
     both = np.any(view.normals != 0.0, axis=-1) & np.any(view.true_normals != 0.0, axis=-1)
     cosine = np.clip(np.sum(view.normals * view.true_normals, axis=-1), -1.0, 1.0)
     return np.where(both, np.degrees(np.arccos(cosine)), np.nan)
@@ -320,7 +321,7 @@ def _coloured(
 def _shaded(
     rgb: Float[np.ndarray, "h w 3"], normals: Float[np.ndarray, "h w 3"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """Darkens a surface a little where it turns away, so that its shape is seen."""
+    """Shades a surface slightly by its slope, so that its shape is visible."""
     seen = np.any(normals != 0.0, axis=-1, keepdims=True)
     return np.where(seen, rgb * (0.65 + 0.35 * np.clip(normals[..., 2:], 0.0, 1.0)), rgb)
 

@@ -1,4 +1,4 @@
-"""The object of a training: the scene's meshes, or one reconstructed from images and masks."""
+"""Selects the object of a training: the scene's meshes, or a reconstruction from masks."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ METHOD = flags.DEFINE_enum(
     "oracle",
     ["oracle", "r3f"],
     "Where objects come from: the scene's meshes and their indices of refraction, or images and "
-    "masks alone, from which one object and its index are reconstructed into {out}/r3f. Then --ior "
-    "is that object's index, as 1.5; it is estimated if not given.",
+    "masks only, from which one object and its index are reconstructed into {out}/r3f. Then --ior "
+    "is the index of that object, as in 1.5; it is estimated by default.",
 )
 _RECONSTRUCTED = cli_flags.reconstruction()
 FLAGS = (METHOD, *_RECONSTRUCTED)
-"""Flags that a run is begun with, and can not change when it is resumed."""
+"""Flags of a new run, which cannot change when it is resumed."""
 
 Options = Mapping[str, flags.FlagHolder]
 
 FOLDER = "r3f"
-"""Below the run's folder: what is reconstructed for it."""
+"""Folder of the reconstruction, relative to the run's folder."""
 
 
 def asked(options: Options, *, say: config_flags.Say) -> TrainConfig:
-    """Returns the configuration of the command line, of a reconstructed object without `--ior`.
+    """Returns the command line's configuration, without `--ior` if the object is reconstructed.
 
     Args:
       options: flags of the configuration, by name.
-      say: is told which decisions of the file of --config are taken again.
+      say: called with the decisions of --config that are made again.
 
     Raises:
-      ValueError: if it makes no sense.
+      ValueError: if the configuration is invalid.
     """
     instead: dict[str, Any] = {}
     decides = METHOD.present and not options["reconstruction"].value
-    if decides and config_flags.base().scene.reconstruction:  # which goes, and its index with it
+    if decides and config_flags.base().scene.reconstruction:  # dropped together with its index
         instead = {"reconstruction": "", "ior": ()}
     others = {name: holder for name, holder in options.items() if name != "ior"}
     config = config_flags.chosen(others, say=say, **instead)
@@ -55,30 +55,30 @@ def asked(options: Options, *, say: config_flags.Say) -> TrainConfig:
 
 
 def reconstructs(config: TrainConfig) -> bool:
-    """Returns whether an object is reconstructed first."""
+    """Returns whether an object must be reconstructed before training."""
     return METHOD.value == "r3f" and not config.scene.reconstruction
 
 
 def is_reconstructed(config: TrainConfig) -> bool:
-    """Returns whether the object is a reconstructed one."""
+    """Returns whether the object comes from a reconstruction."""
     return METHOD.value == "r3f" or bool(config.scene.reconstruction)
 
 
 def check_flags(config: TrainConfig, options: Options) -> None:
-    """Refuses what contradicts itself, or would have no effect, before any import.
+    """Rejects contradictory or useless flags before JAX is imported.
 
     Args:
-      config: the configuration that was asked for, see `asked`.
+      config: resolved flags, see `asked`.
       options: flags of the configuration, by name.
 
     Raises:
-      ValueError: if there is anything, or an index is not one.
+      ValueError: if there are such flags, or an index is invalid.
     """
     given, made = options["reconstruction"].value, config.scene.reconstruction
     file = flags.FLAGS["config"].value
     if METHOD.value == "oracle" and given and METHOD.present:
         raise ValueError(
-            "--method=oracle takes the scene's own meshes, not a reconstruction. Leave out either "
+            "--method=oracle uses the scene's own meshes, not a reconstruction. Remove either "
             "--method or --reconstruction."
         )
     if is_reconstructed(config):
@@ -87,23 +87,23 @@ def check_flags(config: TrainConfig, options: Options) -> None:
     if idle and not reconstructs(config):
         why, instead = "nothing is reconstructed", "add --method=r3f"
         if made:
-            why = f"the object of {made} is reconstructed already"
-            instead = "add --method=r3f" if not given else "give --method=r3f instead of it"
+            why = f"the object of {made} is already reconstructed"
+            instead = "add --method=r3f" if not given else "use --method=r3f instead of it"
         raise ValueError(
-            f"{', '.join(idle)} would have no effect, since {why}. Leave it out, or {instead}."
+            f"{', '.join(idle)} would have no effect, since {why}. Remove it, or {instead}."
         )
     if is_reconstructed(config) and config.paths.name == "straight":
-        instead = "Leave out --method and --reconstruction"
+        instead = "Remove --method and --reconstruction"
         if made and not given:
             instead = f"Add --method=oracle, since {file} names the reconstruction {made}"
         raise ValueError(
-            "--paths=straight knows of no objects, so that none has to be reconstructed. "
+            "--paths=straight ignores objects, so there is nothing to reconstruct. "
             f"{instead}, or use --paths=tree."
         )
     if made and not given and not (Path(made) / cli_flags.RECONSTRUCTION).is_file():
         raise ValueError(
-            f"{file} names the reconstruction {made}, which is not there. Give where it is now as "
-            "--reconstruction, or add --method=r3f to reconstruct the object of the scene anew."
+            f"{file} uses the reconstruction {made}, which does not exist. Set --reconstruction to "
+            "its new location, or add --method=r3f to reconstruct the object again."
         )
 
 
@@ -117,22 +117,22 @@ def given_index(ior: Sequence[str]) -> float | None:
         return None
     if len(ior) > 1 or "=" in ior[0]:
         raise ValueError(
-            f"--ior={ior[-1]}, but there is one reconstructed object, without a name. Give its "
-            "index alone, once, as in --ior=1.5."
+            f"--ior={ior[-1]} is invalid for the single reconstructed object. Pass its index once, "
+            "without a name, as in --ior=1.5."
         )
     return refraction_indices.parse(ior[0])
 
 
 def find(run: Path, config: TrainConfig, *, ior: Sequence[str], resume: bool) -> MeshPart | None:
-    """Returns the reconstructed object that is asked for, or `None` for the scene's meshes.
+    """Returns the reconstructed object, or `None` if the scene's meshes are used.
 
-    It is reconstructed first, or as much of it as is not done yet.
+    Unfinished stages of the reconstruction are run first.
 
     Args:
-      run: the run's folder.
-      config: the configuration, with the folder of the scene.
-      ior: the values of --ior.
-      resume: whether what is there may be continued.
+      run: folder of the run.
+      config: configuration, with the folder of the scene.
+      ior: values of --ior.
+      resume: whether an existing reconstruction may be continued.
 
     Raises:
       ValueError: if there is no such object.
@@ -146,22 +146,22 @@ def find(run: Path, config: TrainConfig, *, ior: Sequence[str], resume: bool) ->
     if given:
         if out.resolve() == run.resolve():
             raise ValueError(
-                f"--out={run} is the reconstruction itself. Give a folder of its own for the run."
+                f"--out={run} is the reconstruction itself. Use another folder for the run."
             )
         part = chain.read_part(out)
         if chain.fingerprint(scene) != records.read(out).inputs:
             print(
                 f"warning: {out} was reconstructed from other images, masks or poses than those of "
                 f"{scene}. Make sure that it is the same object in the same place, or reconstruct "
-                "that of the scene with --method=r3f and without --reconstruction."
+                "the scene's object with --method=r3f and without --reconstruction."
             )
         index = index or dict(config.scene.indices).get(part.name)
         return part if index is None else part._replace(index=index)
     if out.exists() and not resume:
         raise ValueError(
-            f"{out} holds a reconstruction already. Continue with --resume, or give another --out."
+            f"{out} already contains a reconstruction. Continue with --resume, or change --out."
         )
-    wishes = config.wishes()  # what training has decided, a reconstruction does for itself
+    wishes = config.wishes()  # a reconstruction makes its own decisions
     asked = _RECONSTRUCTED.chosen(
         index=index,
         seed=config.seed,
@@ -179,14 +179,14 @@ def find(run: Path, config: TrainConfig, *, ior: Sequence[str], resume: bool) ->
 def with_part(
     config: TrainConfig, part: MeshPart, made: Path, *, ior: Sequence[str], say: config_flags.Say
 ) -> TrainConfig:
-    """Returns a configuration with its reconstructed object.
+    """Returns a configuration that uses a reconstructed object.
 
     Args:
-      config: the configuration, with the folder of the scene.
-      part: the object.
-      made: folder that it was reconstructed into.
-      ior: the values of --ior.
-      say: is told which decisions are taken again.
+      config: configuration, with the folder of the scene.
+      part: reconstructed object.
+      made: folder of its reconstruction.
+      ior: values of --ior.
+      say: called with the decisions that are made again.
     """
     folder, index = str(made.resolve()), ((part.name, part.index),)
     given = config.scene.reconstruction
@@ -198,7 +198,7 @@ def with_part(
 
 
 def note(run: Path, part: MeshPart | None, given: str) -> None:
-    """Notes in the run's folder where its object comes from."""
+    """Records the origin of the object in the run's folder."""
     from experiments.r3f import object_source
 
     made = None

@@ -1,7 +1,8 @@
-"""The options of a training as flags: one for each value of `TrainConfig`, made from its fields.
+"""Defines the options of a training as flags, one for each field of `TrainConfig`.
 
-A flag has the option's name, the choices or the type of its annotation, and the words of its
-attribute line. A new option of training is a field of the configuration, and its use.
+A flag has the name of the option, the choices or the type of its annotation, and its attribute line
+as help text. A new option of training only needs a field of the configuration and the code that
+uses it.
 """
 
 import inspect
@@ -21,16 +22,16 @@ from refref_jax.training import config_files
 from refref_jax.training.config import Option, TrainConfig
 
 AUTO = "auto"
-"""Value of an option that leaves it to the scene or the preset, also on top of a file."""
+"""Value of an option that is left to the scene or the preset; it overrides a file."""
 
 Say = Callable[[str], None]
 
-# Of lists, for what is said of wrong ones.
+# Examples of lists, for error messages.
 _EXAMPLES = {int: "32,20", float: "0.03,0.003"}
 
 
 class _Words(list):
-    """A list of words that is printed as it is given."""
+    """A list of words that is printed as the user wrote it."""
 
     def __str__(self) -> str:
         return ",".join(self)
@@ -60,14 +61,14 @@ def define_flags() -> dict[str, flags.FlagHolder]:
     flags.DEFINE_string(
         "config",
         None,
-        "File of a configuration, as a run's config.json; the other flags override it, and "
-        "--NAME=auto takes back what it asks for.",
+        "Configuration file, such as a run's config.json; other flags override it, and "
+        "--NAME=auto resets an option.",
     )
     return {option.name: _define(option) for option in training_config.options_of()}
 
 
 def given(holders: Mapping[str, flags.FlagHolder]) -> dict[str, Any]:
-    """Returns the values of the options that the command line gives, by name."""
+    """Returns the values of the options that are on the command line, by name."""
     options = {option.name: option for option in training_config.options_of()}
     return {
         name: _parse(options[name], holder.value)
@@ -77,7 +78,7 @@ def given(holders: Mapping[str, flags.FlagHolder]) -> dict[str, Any]:
 
 
 def base() -> TrainConfig:
-    """Returns the configuration of `--config`, without the flags on top.
+    """Returns the configuration of `--config`, without the other flags.
 
     Raises:
       ValueError: if the file is not a configuration.
@@ -87,32 +88,32 @@ def base() -> TrainConfig:
 
 
 def chosen(holders: Mapping[str, flags.FlagHolder], *, say: Say, **instead: Any) -> TrainConfig:
-    """Returns the configuration of the command line: that of `--config`, with the flags on top.
+    """Returns the configuration of the command line: that of `--config`, overridden by flags.
 
     Args:
-      holders: what `define_flags` returned.
-      say: is told which decisions of the file are taken again.
-      **instead: values in place of those of flags.
+      holders: flags that `define_flags` returned.
+      say: called with the decisions of the file that are made again.
+      **instead: values that replace those of flags.
 
     Raises:
-      ValueError: if the file is not a configuration, or a value makes no sense.
+      ValueError: if the file is not a configuration, or a value is invalid.
     """
     below = base()
     values = given({name: each for name, each in holders.items() if name not in instead})
     for name in ("scene", "reconstruction"):
         before, now = below.get(name), values.get(name)
         if before and now and Path(now).resolve() == Path(before).resolve():
-            del values[name]  # the same, by another path
+            del values[name]  # the same folder, by another path
     return on_top(below, values | instead, say=say)
 
 
 def on_top(below: TrainConfig, values: Mapping[str, Any], *, say: Say) -> TrainConfig:
-    """Returns a configuration with values on top, and says what is decided again because of them.
+    """Overrides a configuration, and reports the decisions that are made again because of it.
 
     Args:
-      below: the configuration, of `--config` if that is given.
-      values: the new values, by the names of the options.
-      say: is told.
+      below: configuration to override, from `--config` if that is set.
+      values: new values, by the names of the options.
+      say: called with lines of text.
     """
     config, (decided, kept) = below.override(**values), below.followers(**values)
     options = [option.name for option in training_config.options_of()]
@@ -120,9 +121,9 @@ def on_top(below: TrainConfig, values: Mapping[str, Any], *, say: Say) -> TrainC
     stays = [name for name in options if name in kept]
     file = flags.FLAGS["config"].value
     if file is not None and again:
-        say(f"decided again, because of what is on top of {file}: {', '.join(again)}")
+        say(f"decided again because of flags that override {file}: {', '.join(again)}")
     if file is not None and stays:
-        say(f"asked for in {file}, and kept: {', '.join(stays)} (--{stays[0]}=auto has it decided)")
+        say(f"kept from {file}: {', '.join(stays)} (reset with --{stays[0]}=auto)")
     return config
 
 
@@ -145,7 +146,7 @@ def _define(option: Option) -> flags.FlagHolder:
     else:
         parser = {int: _IntegerParser, float: _FloatParser, str: flags.ArgumentParser}[kind]()
         holder = flags.DEFINE(parser, name, None, text, serializer=flags.ArgumentSerializer())
-    if name != "ior":  # which is written otherwise for a reconstructed object
+    if name != "ior":  # its syntax differs for a reconstructed object
         app.check(holder, lambda value: _check(option, value))
     return holder
 
@@ -156,7 +157,7 @@ def _check(option: Option, value: Any) -> None:
 
 
 def _parse(option: Option, value: Any) -> Any:
-    """Returns the value of an option, of that of its flag."""
+    """Converts the value of a flag to that of its option."""
     if value == AUTO and _kind(option) is not str:
         return None
     if option.name == "ior":
@@ -176,7 +177,7 @@ def _parse(option: Option, value: Any) -> Any:
 
 
 def _kind(option: Option) -> Any:
-    """Returns the type of an option that is given."""
+    """Returns the type of an option that is not `None`."""
     kind = training_config.type_of(option)
     if typing.get_origin(kind) in (typing.Union, types.UnionType):
         (kind,) = (each for each in typing.get_args(kind) if each is not type(None))

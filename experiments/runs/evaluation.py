@@ -1,29 +1,32 @@
-"""Shared by commands that render and measure views: which are compared, and lost light."""
+"""Selects the views of a comparison and warns of dropped throughput, for several commands."""
 
 import numpy as np
 
-# Views that a comparison shows.
+# Number of views that a comparison shows.
 _SHOWN = 4
 
-# A share of light that 8 bits may show.
+# Dropped share of the throughput that may be visible in 8 bits.
 _WORTH_A_WARNING = 1e-3
 
 
 def shown_views(count: int) -> list[int]:
-    """Returns which of so many views a comparison shows: some, evenly spread.
+    """Returns the numbers of the views that a comparison shows, evenly spread.
 
     Args:
-      count: number of views.
+      count: number of views in the split.
     """
     return np.unique(np.linspace(0, count - 1, _SHOWN).astype(int)).tolist()
 
 
 def warn_of_lost_light(lost: float, *, advice: str) -> None:
-    """Prints a warning if so much light was lost for want of room that it may be seen.
+    """Prints a warning if path buffers overflowed and dropped a visible share of the throughput.
 
     Args:
-      lost: share of the light.
-      advice: sentence that says what to do.
+      lost: dropped share of the throughput.
+      advice: sentence that suggests a fix.
     """
     if lost > _WORTH_A_WARNING:
-        print(f"warning: some light found no room, and is missing from the pictures. {advice}")
+        print(
+            f"warning: path buffer overflow: {100 * lost:.1f} % of the throughput was dropped, "
+            f"images are too dark. {advice}"
+        )

@@ -1,4 +1,4 @@
-"""Compares two folders of images, or of distances, file by file."""
+"""Compares two folders of images or distance maps, file by file."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -9,19 +9,19 @@ from refref_jax.training import evaluation
 from refref_jax.training.evaluation import Perceptual
 
 NAME = "name"
-"""Key of what a row is called."""
+"""Key of the name of a row."""
 
 _MEAN = "mean"
 
 
 class Pair(NamedTuple):
-    """A name that both folders have.
+    """Two files of the same name in both folders.
 
     Attributes:
-      name: of the files, without their endings.
+      name: name of the files, without extension.
       images: rendered and true image, or `None`.
       distances: rendered and true distance map, or `None`.
-      mask: of both, or `None`.
+      mask: mask of both, or `None`.
     """
 
     name: str
@@ -31,25 +31,25 @@ class Pair(NamedTuple):
 
 
 def match(rendered: Path, target: Path, masks: Path | None) -> list[Pair]:
-    """Pairs the files of two folders by name: `.png` are images, `.exr` are distances.
+    """Pairs the files of two folders by name: `.png` are images, `.exr` are distance maps.
 
-    A kind that only one of the folders has is left out.
+    A type of file that only one of the folders contains is ignored.
 
     Args:
-      rendered: the folder that is judged.
-      target: the folder of the truth.
-      masks: a folder of 8-bit masks named as the images, or `None`.
+      rendered: folder to evaluate.
+      target: folder of the reference.
+      masks: folder of 8-bit masks named like the images, or `None`.
 
     Raises:
-      SceneError: if a folder is missing or empty, they do not hold the same names, or the sizes of
-        two that are paired differ.
+      SceneError: if a folder is missing or empty, if the names in both folders differ, or if the
+        sizes of a pair differ.
     """
     images = _paired(rendered, target, ".png")
     distances = _paired(rendered, target, ".exr")
     if not images and not distances:
         raise SceneError(
-            f"{rendered} and {target} have nothing in common: one holds images (.png), the other "
-            "distances (.exr). Give two folders of one kind."
+            f"{rendered} and {target} have nothing in common: one contains images (.png), the "
+            "other distances (.exr). Give two folders of the same type."
         )
     pairs = []
     for name in sorted({*images, *distances}):
@@ -66,7 +66,7 @@ def match(rendered: Path, target: Path, masks: Path | None) -> list[Pair]:
 
 
 def compare(pairs: Sequence[Pair], perceptual: Perceptual) -> Iterator[dict[str, Any]]:
-    """Yields the measures of each pair, `None` where it has none.
+    """Yields the metrics of each pair, `None` where they are undefined.
 
     Raises:
       SceneError: if a file is broken.
@@ -84,13 +84,13 @@ def compare(pairs: Sequence[Pair], perceptual: Perceptual) -> Iterator[dict[str,
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Returns the means of all measures, over the rows that have them."""
+    """Returns the means of all metrics, over the rows that have them."""
     keys = dict.fromkeys(key for row in rows for key in row if key != NAME)
     return {key: evaluation.mean_of([row for row in rows if key in row], key) for key in keys}
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Returns a line for each row and one for their means; what no row has is left out."""
+    """Returns a text table with a line per row and their means, without empty columns."""
     means = {NAME: _MEAN} | summarise(rows)
     keys = [key for key, value in means.items() if key != NAME and value is not None]
     cells = [[NAME, *keys]]
@@ -105,20 +105,20 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _paired(rendered: Path, target: Path, ending: str) -> dict[str, tuple[Path, Path]]:
-    """Returns the files of one kind by name; none if one of the folders has none."""
+    """Returns the files of one type by name, or none if one of the folders has none."""
     found = []
     for folder in (rendered, target):
         if not folder.is_dir():
-            raise SceneError(f"{folder} is no folder. Give one that holds images.")
+            raise SceneError(f"{folder} is not a folder. Give one that contains images.")
         if not any(path.suffix in (".png", ".exr") for path in folder.iterdir()):
-            raise SceneError(f"{folder} holds no .png and no .exr. Give a folder of images.")
+            raise SceneError(f"{folder} contains no .png and no .exr. Give a folder of images.")
         found.append({path.stem: path for path in folder.glob(f"*{ending}")})
     a, b = found
     if not a or not b:
         return {}
     for folder, lacking in ((target, sorted(a.keys() - b)), (rendered, sorted(b.keys() - a))):
         if lacking:
-            more = f" (nor {len(lacking) - 1} more)" if len(lacking) > 1 else ""
+            more = f" (and {len(lacking) - 1} more)" if len(lacking) > 1 else ""
             raise SceneError(
                 f"{folder} has no {lacking[0]}{ending}{more}, which the other folder has. Give "
                 "folders with the same names."

@@ -1,4 +1,4 @@
-"""Scenes with a known background: read, rendered and measured, with nothing learned."""
+"""Reads, renders and measures scenes with a known background, without any training."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -26,17 +26,17 @@ from refref_jax.render.backgrounds import Radiance, radiance_of
 
 
 class KnownScene(NamedTuple):
-    """A scene and some views of it.
+    """A scene and some of its views.
 
     Attributes:
-      name: of its folder.
-      geometry: what bends light.
-      radiance: what is behind.
-      frames: the chosen views.
-      indices: number of each in its split.
+      name: name of the folder.
+      geometry: scene that refracts and reflects the rays.
+      radiance: background radiance.
+      frames: selected views.
+      indices: number of each view in its split.
       images: true images of the views, 8-bit sRGB.
-      masks: object masks, or `None` where the split has none.
-      inside: the parts that each view's camera is in; `None` where the rule keeps no list of them.
+      masks: object masks, or `None` if the split has none.
+      inside: interior list of each view's camera; `None` if the interface rule does not need it.
     """
 
     name: str
@@ -50,14 +50,14 @@ class KnownScene(NamedTuple):
 
 
 class View(NamedTuple):
-    """One rendered view.
+    """A rendered view.
 
     Attributes:
       rgb: sRGB in `[0, 1]`.
-      casts: closest-hit queries a camera ray.
-      paths: light paths a camera ray.
-      lost: share of the light that was lost for want of room, mean over rays and channels.
-      seconds: that rendering took.
+      casts: closest-hit queries per camera ray.
+      paths: light paths per camera ray.
+      lost: share of the throughput dropped because buffers were full, mean over rays and channels.
+      seconds: time to render the view.
     """
 
     rgb: Float[np.ndarray, "h w 3"]
@@ -70,17 +70,17 @@ class View(NamedTuple):
 def read_scene(
     scene: Path, *, split: str, views: str, rule: str, indices: Mapping[str, float]
 ) -> KnownScene:
-    """Reads all that rendering and measuring some views takes.
+    """Reads the data for rendering and measuring some views.
 
     Args:
-      scene: the scene folder.
+      scene: folder of the scene.
       split: `train`, `val` or `test`.
-      views: numbers of views in the split, as `0,10,20`, or `all`.
-      rule: what lies outside each mesh, see `optics.interface_rules`.
-      indices: as for `meshes.read_meshes`.
+      views: numbers of views in the split, as in `0,10,20`, or `all`.
+      rule: rule for the medium outside each mesh, see `optics.interface_rules`.
+      indices: indices of refraction by name, see `meshes.read_meshes`.
 
     Raises:
-      ValueError: if anything is missing or broken, or there is no such view.
+      ValueError: if a file is missing or broken, or a view does not exist.
     """
     frames = scene_folder.read_frames(scene, split)
     chosen = view_numbers.choose(views, len(frames.names))
@@ -99,18 +99,18 @@ def build_scene(
     chosen: Sequence[int],
     rule: str,
 ) -> KnownScene:
-    """Makes a scene of meshes that were examined before.
+    """Returns a scene of meshes that have been checked before.
 
     Args:
-      scene: the scene folder, for its background.
-      parts: its meshes.
-      tree: how they lie in one another.
-      frames: a split of it.
-      chosen: views of the split.
-      rule: what lies outside each mesh.
+      scene: folder of the scene, for its background.
+      parts: meshes of the scene.
+      tree: nesting of the meshes.
+      frames: a split of the scene.
+      chosen: numbers of views in the split.
+      rule: rule for the medium outside each mesh.
 
     Raises:
-      ValueError: if the background is not known, or a picture is missing or broken.
+      ValueError: if the background is unknown, or an image is missing or broken.
     """
     frames = _choose(frames, chosen)
     geometry = build_geometry(parts, tree.parents, rule=rule)
@@ -131,19 +131,19 @@ def build_scene(
 
 
 def warm_up(scene: KnownScene, budget: Budget) -> None:
-    """Renders one tile, so that what is timed afterwards has been compiled."""
+    """Renders one tile, so that later timings exclude compilation."""
     rays = cameras.pixel_rays(scene.frames.cameras, *np.zeros((3, TILE), np.int64))
     _render(scene, 0, rays, budget)
 
 
 def render_view(scene: KnownScene, view: int, *, budget: Budget, side: int) -> View:
-    """Renders a view with `side x side` rays in every pixel, averaged as linear light.
+    """Renders a view with `side x side` rays per pixel, averaged in linear radiance.
 
     Args:
-      scene: the scene.
-      view: which of the chosen views.
-      budget: which light to follow.
-      side: rays along each edge of a pixel.
+      scene: scene to render.
+      view: position in the selected views.
+      budget: path settings.
+      side: number of rays along each edge of a pixel.
     """
     rays = cameras.image_rays(cameras.supersample(scene.frames.cameras, side), view)
     start = time.monotonic()
@@ -162,9 +162,9 @@ def render_view(scene: KnownScene, view: int, *, budget: Budget, side: int) -> V
 def measure(
     scene: KnownScene, view: int, rgb: Float[np.ndarray, "h w 3"]
 ) -> dict[str, float | None]:
-    """Returns the PSNR over the image, inside the mask and outside, in dB.
+    """Returns the PSNR over the image, inside the mask and outside of it, in dB.
 
-    Of sRGB in `[0, 1]`, not rounded, against the 8-bit image; `None` over no pixel.
+    It compares unrounded sRGB in `[0, 1]` with the 8-bit image, and is `None` over zero pixels.
     """
     target = (scene.images[view] / 255.0).astype(np.float32)
     pair = jax.device_put((rgb, target))

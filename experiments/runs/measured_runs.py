@@ -1,8 +1,8 @@
-"""Trains and evaluates runs through the command line, and says what they cost and gave.
+"""Trains and evaluates runs through the command line, and measures their cost and quality.
 
-Each training and each evaluation is a process of its own: as a user has it, with nothing compiled
-before, and with a peak of memory that is its own. What has been measured is kept beside the run, in
-`measured.json`, and is not measured again while its options are the same.
+Each training and each evaluation is a separate process, as for a user: nothing is compiled
+beforehand, and the peak memory is its own. Measurements are stored in the run's folder, in
+`measured.json`, and reused while their options are the same.
 """
 
 import dataclasses
@@ -20,8 +20,8 @@ from refref_jax.training import run_folder
 
 _MEASURED = "measured.json"
 
-# Steps between two lines of metrics: whole pools of 32 batches, so that each interval has its share
-# of the tracing.
+# Steps between two lines of metrics: whole batches of pre-traced paths (32 steps), so that each
+# interval includes its share of the tracing.
 _LOG_EVERY = 64
 
 _MIB = 2.0**20
@@ -29,17 +29,18 @@ _MIB = 2.0**20
 
 @dataclasses.dataclass(frozen=True)
 class Training:
-    """What a training cost.
+    """Cost of a training.
 
     Attributes:
-      steps: of it.
-      seconds_per_step: median over its intervals, without the first, which also compiles.
-      rays_per_second: batch over that.
-      train_seconds: of all its steps, compiling included.
-      startup_seconds: of its process beside the steps at that pace: starting, reading, compiling,
-        saving. Too little if the training was resumed.
-      peak_host_mib: largest resident set of its process; `None` if it had ended before, unmeasured.
-      peak_device_mib: largest memory of its accelerator; `None` where there is none.
+      steps: number of steps.
+      seconds_per_step: median over the logged intervals, without the first, which includes
+        compilation.
+      rays_per_second: batch size divided by `seconds_per_step`.
+      train_seconds: duration of all steps, compilation included.
+      startup_seconds: remaining duration of the process at that pace: startup, reading,
+        compilation, saving. Too small if the training was resumed.
+      peak_host_mib: largest resident set of the process; `None` if it had ended before, unmeasured.
+      peak_device_mib: largest memory of the accelerator; `None` if there is none.
     """
 
     steps: int
@@ -53,22 +54,22 @@ class Training:
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
-    """What an evaluation gave: means over images; `None` for what the scene does not tell.
+    """Quality of a run: means over images; `None` if the scene lacks the reference.
 
-    What has a default was not measured always: it is `None` where an evaluation is older than it.
+    Attributes with a default were added later: they are `None` in older evaluations.
 
     Attributes:
-      psnr: over the image, dB.
-      psnr_masked: inside the mask.
+      psnr: PSNR over the image, dB.
+      psnr_masked: PSNR inside the mask, dB.
       ssim: structural similarity; `None` for images smaller than its window.
-      distance_mae: error of the distance, world units, by the median of the field's weights.
-      distance_mae_masked: inside the mask.
-      seconds_per_image: of rendering, without compiling.
-      images: how many were rendered.
-      lpips: distance of the images to a network; `None` without its weights.
-      flip: difference of the images to an eye that flips between them; `None` if not installed.
-      distance_rmse: root of the mean square of the distance's error, and so on for what follows;
-        `refref_jax.training.evaluation` tells the three kinds of distances apart.
+      distance_mae: mean absolute error of the distance, world units, for the median of the weights.
+      distance_mae_masked: the same inside the mask.
+      seconds_per_image: rendering time, without compilation.
+      images: number of rendered images.
+      lpips: LPIPS of the images; `None` without its weights.
+      flip: FLIP error of the images; `None` if the package is not installed.
+      distance_rmse: root mean square error of the distance; likewise for the following attributes,
+        whose three kinds of distances are explained in `refref_jax.training.evaluation`.
     """
 
     psnr: float
@@ -95,16 +96,16 @@ class Evaluation:
 def train(
     run: Path, *, scene: Path, options: Sequence[str], log_every: int | None = None
 ) -> Training:
-    """Trains a run, or goes on with it, or reads what it cost if it is finished.
+    """Trains a run or resumes it; reads its cost if it is finished.
 
     Args:
-      run: its folder.
-      scene: the scene.
-      options: further ones of `experiments.train`; those that decide the result.
-      log_every: steps of an interval that is timed; about a quarter of a short training if `None`.
+      run: folder of the run.
+      scene: scene to train on.
+      options: further flags of `experiments.train` that affect the result.
+      log_every: steps per timed interval; about a quarter of a short training if `None`.
 
     Raises:
-      RunFailedError: if training ends with an error.
+      RunFailedError: if training fails.
     """
     asked = [f"scene={scene.resolve()}", *options]
     known = _read(run)
@@ -125,16 +126,16 @@ def train(
 def evaluate(
     run: Path, *, scene: Path, options: Sequence[str] = (), split: str = "test"
 ) -> Evaluation:
-    """Evaluates a trained run, or reads what an evaluation with the same options gave.
+    """Evaluates a trained run, or reads the result of an evaluation with the same options.
 
     Raises:
-      RunFailedError: if it ends with an error.
+      RunFailedError: if the evaluation fails.
     """
     known = _read(run)
     asked = [f"--split={split}", *options]
     key = " ".join(asked)
     if key not in known.get("evaluations", {}):
-        # One with other options may be there.
+        # There may be an evaluation with other options.
         command = [f"--run={run}", f"--scene={scene}", *asked, "--overwrite"]
         subprocesses.run("evaluate", *command, log=run.with_name(f"{run.name}.log"))
         summary = configuration.parse_json(
@@ -149,25 +150,25 @@ def evaluate(
 
 
 def check_masks(scene: Path, split: str = "test") -> None:
-    """Refuses a scene whose images have no masks, before anything is trained.
+    """Rejects a scene whose images have no masks, before training starts.
 
     Raises:
-      ValueError: naming the scene.
+      ValueError: if masks are missing.
     """
     if scene_folder.read_frames(scene, split).masks is None:
         raise ValueError(
-            f"The {split} images of {scene} have no masks. Add mask_file_path to their frames: "
-            "what is compared is inside them."
+            f"The {split} images of {scene} have no masks. Add mask_file_path to their frames, as "
+            "metrics are computed inside the masks."
         )
 
 
 def read_training(run: Path, *, wall: float, peak_host_mib: float | None) -> Training:
-    """Reads what a finished training cost from its metrics.
+    """Reads the cost of a finished training from its metrics.
 
     Args:
-      run: its folder.
-      wall: seconds that its process took.
-      peak_host_mib: largest resident set of that process, if that is known.
+      run: folder of the run.
+      wall: duration of its process, seconds.
+      peak_host_mib: largest resident set of that process, or `None` if unknown.
     """
     lines = run_folder.read_metrics(run)
     last = lines[-1]
@@ -186,9 +187,9 @@ def read_training(run: Path, *, wall: float, peak_host_mib: float | None) -> Tra
 
 
 def seconds_per_step(lines: Sequence[dict[str, Any]]) -> float:
-    """Returns the median pace between lines of metrics; the first interval also compiles.
+    """Returns the median pace between lines of metrics, without the first, which compiles.
 
-    A training of one line has no other, and its pace includes compiling.
+    A training with a single line has no other interval, so its pace includes compilation.
     """
     pairs = itertools.pairwise(lines)
     paces = [(b["seconds"] - a["seconds"]) / (b["step"] - a["step"]) for a, b in pairs]
@@ -196,7 +197,7 @@ def seconds_per_step(lines: Sequence[dict[str, Any]]) -> float:
 
 
 def _has_ended(run: Path, steps: int | None) -> bool:
-    """Returns whether a run of so many steps is finished, so that training it takes no time."""
+    """Returns whether a run is finished, so that training it takes no time."""
     lines = run_folder.read_metrics(run)
     return bool(lines) and lines[-1]["step"] == steps
 

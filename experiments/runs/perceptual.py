@@ -1,4 +1,4 @@
-"""Metrics that measure as eyes do: LPIPS, with weights that a flag names, and FLIP."""
+"""Selects the perceptual metrics: LPIPS, whose weights are set by a flag, and FLIP."""
 
 from pathlib import Path
 
@@ -7,13 +7,13 @@ from refref_jax.training import evaluation
 
 
 def chosen(weights: str | None) -> evaluation.Perceptual:
-    """Returns the metrics at hand, and warns of what is not, once.
+    """Returns the available metrics, and warns once of those that are missing.
 
     Args:
       weights: value of `--lpips_weights`.
 
     Raises:
-      ValueError: if the file is not one of weights.
+      ValueError: if the file does not contain the weights.
     """
     path = _named(weights)
     lpips = None if path is None else metrics.load_lpips(path)
@@ -21,15 +21,15 @@ def chosen(weights: str | None) -> evaluation.Perceptual:
 
 
 def checked(weights: str | None) -> Path | None:
-    """Returns the file of LPIPS's weights, if one is given, and warns as `chosen` does.
+    """Checks the file of LPIPS's weights and returns it; warns like `chosen`.
 
-    For a command that leaves measuring to others, and takes no device from them.
+    For commands that leave measuring to other processes and must not occupy a device.
 
     Args:
       weights: value of `--lpips_weights`.
 
     Raises:
-      ValueError: if the file is not one of weights.
+      ValueError: if the file does not contain the weights.
     """
     path = _named(weights)
     if path is not None:
@@ -42,8 +42,8 @@ def _named(weights: str | None) -> Path | None:
     if weights is not None:
         return Path(weights)
     print(
-        "warning: LPIPS is not measured, for it needs weights that are published elsewhere. "
-        "docs/metrics.md tells how to get them, and --lpips_weights takes them."
+        "warning: LPIPS is not measured, because its weights are published separately. See "
+        "docs/metrics.md, and pass them with --lpips_weights."
     )
     return None
 

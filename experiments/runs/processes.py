@@ -1,13 +1,13 @@
-"""Devices and processes that train together.
+"""Connects devices and processes for data-parallel training.
 
-On one machine `--devices=all` takes all of its accelerators. Several machines run the same command,
-each as a process of its own that knows where the first one listens:
+On one machine `--devices=all` uses all accelerators. Several machines run the same command, each in
+its own process, which connects to the first one:
 
     python -m experiments.train ... --coordinator=HOST:PORT --processes=2 --process=0   # on HOST
     python -m experiments.train ... --coordinator=HOST:PORT --processes=2 --process=1
 
-The scene is read by every process, and the run is written by the first: both folders must be in
-the same place on all machines, which a file system that they share sees to.
+Every process reads the scene, and process 0 writes the run. Both folders must have the same path on
+all machines, as on a shared file system.
 """
 
 from __future__ import annotations
@@ -31,39 +31,39 @@ with epy.lazy_imports():
 
 
 def check(given: dict[str, Any]) -> bool:
-    """Refuses flags by which several processes can not find each other.
+    """Rejects flags with which several processes cannot find each other.
 
     Args:
       given: values of `--coordinator`, `--processes` and `--process`.
 
     Raises:
-      flags.ValidationError: if one is missing, wrong, or would have no effect.
+      flags.ValidationError: if a flag is missing, invalid, or would have no effect.
     """
     where, count, number = given["coordinator"], given["processes"], given["process"]
     if count == 1 and (where is not None or number is not None):
         raise flags.ValidationError(
-            "These are of several processes. Say how many with --processes, or leave them out."
+            "These flags require --processes > 1. Set --processes, or remove them."
         )
     if count > 1 and (where is None or not re.fullmatch(r"[^\s]+:\d+", where)):
         raise flags.ValidationError(
-            "The processes have to find each other. Give all of them the same "
-            "--coordinator=HOST:PORT, of the first one's machine."
+            "The processes cannot find each other. Pass the same --coordinator=HOST:PORT to all of "
+            "them, with the host of process 0."
         )
     if count > 1 and (number is None or number >= count):
-        raise flags.ValidationError(f"Give this process --process with 0 to {count - 1}.")
+        raise flags.ValidationError(f"Pass --process between 0 and {count - 1} to this process.")
     return True
 
 
 def together(given: DeviceFlags) -> bool:
-    """Returns whether several processes are to train together."""
+    """Returns whether several processes train together."""
     return given.processes.value > 1
 
 
 def connect(given: DeviceFlags) -> None:
-    """Finds the other processes, if there are any; before anything touches a device.
+    """Connects to the other processes, if any; must precede any use of a device.
 
     Raises:
-      ValueError: if they are not found.
+      ValueError: if the connection fails.
     """
     if together(given):
         devices.connect(
@@ -74,10 +74,10 @@ def connect(given: DeviceFlags) -> None:
 
 
 def mesh(given: DeviceFlags) -> Mesh | None:
-    """Returns the devices that train together; `None` for one alone.
+    """Returns the devices that train together; `None` for a single device.
 
     Raises:
-      ValueError: if there are not as many.
+      ValueError: if there are too few devices.
     """
     word = given.devices.value
     return devices.row(None if word == "all" else int(word))
@@ -85,7 +85,7 @@ def mesh(given: DeviceFlags) -> Mesh | None:
 
 @contextlib.contextmanager
 def first_speaks() -> Iterator[None]:
-    """Leaves what is printed to the first process, for as long as the context lasts."""
+    """Suppresses the output of all processes but the first inside the context."""
     if devices.is_first():
         yield
         return

@@ -1,4 +1,4 @@
-"""Indices of refraction as commands take them."""
+"""Parses indices of refraction from the command line."""
 
 import math
 from collections.abc import Sequence
@@ -7,10 +7,10 @@ _LARGEST = 5.0
 
 
 def parse_named(words: Sequence[str]) -> dict[str, float]:
-    """Returns the indices of materials and meshes that `--ior=NAME=NUMBER` flags give.
+    """Returns the indices of materials and meshes from `--ior=NAME=NUMBER` flags.
 
     Raises:
-      ValueError: if one is not of that form, or its number is not an index.
+      ValueError: if a word does not have that form, or its number is not an index.
     """
     indices = {}
     for word in words:
@@ -25,15 +25,15 @@ def parse_named(words: Sequence[str]) -> dict[str, float]:
 
 
 def parse(word: str) -> float:
-    """Returns the index of one reconstructed body that `--ior=NUMBER` gives.
+    """Returns the index of a single reconstructed object from `--ior=NUMBER`.
 
     Raises:
-      ValueError: if no solid or liquid in air could have it.
+      ValueError: if the index is implausible for a solid or liquid in air.
     """
     if not 1.0 < _number(word) < _LARGEST:
         raise ValueError(
-            f"--ior={word} is no index of refraction of one body in air. Give a number above 1 and "
-            f"below {_LARGEST:g}, as in --ior=1.5, or leave it out to have it estimated."
+            f"--ior={word} is not an index of refraction of one object in air. Give a number above "
+            f"1 and below {_LARGEST:g}, as in --ior=1.5, or remove it to estimate the index."
         )
     return float(word)
 

@@ -1,13 +1,13 @@
-"""The views of a split that a list names, as `0,10,20` or `all`."""
+"""Parses a list of views of a split, such as `0,10,20` or `all`."""
 
 from collections.abc import Sequence
 
 
 def choose(text: str, count: int) -> Sequence[int]:
-    """Returns the numbers of views, of so many, in the order of the list.
+    """Returns the listed numbers of views, out of `count` views, in the order of the list.
 
     Raises:
-      ValueError: if one is not a number, comes twice, or is not there.
+      ValueError: if an entry is not a number, occurs twice, or does not exist.
     """
     if text == "all":
         return range(count)

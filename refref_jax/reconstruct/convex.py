@@ -1,7 +1,8 @@
-"""Bodies that are convex but for noise (NumPy only).
+"""Restores convex meshes, whose edges a grid has cut off (NumPy only).
 
-Of a convex body the masks leave more than of any other, since its surface is where its tangent
-planes are: `from_tangents` intersects them, which restores the edges that a grid cuts off.
+Masks constrain a convex object better than any other, because its surface is the envelope of its
+tangent planes. `from_tangents` intersects these planes, which restores the edges that a grid cuts
+off.
 """
 
 import math
@@ -27,32 +28,33 @@ from refref_jax.reconstruct.smoothing import CREASE
 
 FaceIndex = Int[np.ndarray, " pairs"]
 
-# How much larger the body of tangent planes may be than the hull before it is not believed: the
-# edges that a grid cuts off are less.
+# Largest growth in volume from the hull to the intersection of tangent planes. The edges that a
+# grid cuts off have a smaller volume, so a larger growth is an error.
 _MOST_GROWTH = 0.03
 
-# Rings of faces around an edge that are still turned towards it.
+# Rings of faces around an edge whose normals are still affected by it.
 _RINGS = 3
 
-# Patches with a smaller share of the area are left out; and how far the faces of a flat one may lie
-# from its plane, as a share of the diameter.
+# Smallest share of the area of a patch that is used, and the largest distance of the faces of a
+# flat patch from its plane, as a share of the diameter.
 _SMALLEST_PATCH = 0.002
 _FLAT = 0.003
 
-# Share of a flat patch that lies so near, and how often its plane is fitted to that share.
+# Share of a flat patch that lies within that distance, and the number of fits of its plane to that
+# share.
 _MOSTLY = 0.85
 _FITS = 6
 
-# Planes or corners of a body.
+# Fewest planes or corners that bound a volume.
 _LEAST = 4
 
 # Corners of the intersection closer than this share of the diameter are one.
 _SAME = 1e-6
 
-# Faces that meet at a smaller angle make one facet, radians.
+# Faces that meet at a smaller angle belong to the same facet, radians.
 _COPLANAR = np.radians(3.0)
 
-# Of the volume, by which a convex body may differ from its hull.
+# Share of the volume by which a convex mesh may differ from its hull, because of rounding.
 _ROUNDING = 1e-6
 
 
@@ -65,7 +67,7 @@ def of_points(points: Float[np.ndarray, "n 3"]) -> Mesh:
     """Returns the convex hull of points, closed and outward.
 
     Raises:
-      QhullError: if they lie in a plane.
+      QhullError: if they are coplanar.
     """
     found = ConvexHull(points)
     faces = found.simplices.astype(np.int64)
@@ -80,12 +82,13 @@ def of_points(points: Float[np.ndarray, "n 3"]) -> Mesh:
 def weigh_facets(mesh: Mesh, *, crease_angle: float = CREASE_ANGLE) -> Mesh:
     """Returns a mesh of few corners whose normals are averaged by the areas of flat facets.
 
-    Averages by angle would bend the normals all over a large flat lid if it meets a narrow bevel at
-    less than the crease angle. Weighed by area, the bevel bends from the lid to the side.
+    Averages weighted by angle would tilt the normals all over a large flat lid that meets a narrow
+    bevel at less than the crease angle. Weighted by area, the normals vary across the bevel
+    instead.
 
     Args:
-      mesh: convex.
-      crease_angle: radians, from which nothing is averaged.
+      mesh: convex mesh.
+      crease_angle: smallest angle between facets whose normals are not averaged, radians.
     """
     normals = face_normals(mesh.vertices[mesh.faces])
     first, second, _ = neighbours(mesh.faces)
@@ -105,7 +108,7 @@ def weigh_facets(mesh: Mesh, *, crease_angle: float = CREASE_ANGLE) -> Mesh:
 
 
 def is_convex(mesh: Mesh) -> bool:
-    """Returns whether a mesh is its own convex hull but for rounding."""
+    """Returns whether a mesh is its own convex hull, up to rounding."""
     outer = hull(mesh)
     inside = volume(mesh.vertices, mesh.faces)
     return math.isclose(inside, volume(outer.vertices, outer.faces), rel_tol=_ROUNDING)
@@ -120,14 +123,14 @@ def depth_below_hull(mesh: Mesh) -> float:
 def from_tangents(mesh: Mesh, *, crease_angle: float = CREASE) -> Mesh:
     """Returns the intersection of the half-spaces behind a mesh's faces, but not those at edges.
 
-    A face that meets a neighbour at more than the crease angle belongs to an edge which the grid
-    has cut off: without it the planes beside it meet in the edge. A patch between edges that is
-    flat but for noise is one plane, of least squares. Where that adds more than a few percent to
-    the volume, or planes do not close, the result is the convex hull.
+    A face that meets a neighbour at more than the crease angle belongs to an edge that the grid has
+    cut off. Without this face the adjacent planes meet in the true edge. A patch between edges that
+    is flat up to noise becomes one plane, fitted by least squares. If the result adds more than a
+    few percent to the volume, or if the planes do not close, the convex hull is returned instead.
 
     Args:
-      mesh: nearly convex, and smooth but for its edges: noise would carve it down.
-      crease_angle: radians.
+      mesh: nearly convex mesh, smooth except at its edges; noise would carve it down.
+      crease_angle: angle between faces from which they belong to an edge, radians.
     """
     plain = hull(mesh)
     if not _sharp_pairs(mesh, crease_angle)[0].size:
@@ -144,18 +147,18 @@ def from_tangents(mesh: Mesh, *, crease_angle: float = CREASE) -> Mesh:
 def _intersection(
     planes: Float[np.ndarray, "planes 4"], mesh: Mesh, inside: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Returns the corners of what lies behind planes, of those that a point inside is behind.
+    """Returns the corners of the intersection of half-spaces that contain a given inner point.
 
     Raises:
       QhullError: if the planes do not close.
     """
     planes = planes[planes[:, :3] @ inside + planes[:, 3] < 0.0]
     if len(planes) < _LEAST:
-        raise QhullError(f"{len(planes)} planes close nothing")
+        raise QhullError(f"{len(planes)} planes do not bound a volume")
     points = HalfspaceIntersection(planes, inside).intersections
     points = points[np.all(np.isfinite(points), axis=1)]
     if len(points) < _LEAST:
-        raise QhullError(f"{len(points)} corners are no body")
+        raise QhullError(f"{len(points)} corners do not bound a volume")
     size = _SAME * diameter(mesh.vertices)
     return size * np.unique(np.rint(points / size), axis=0)
 

@@ -1,12 +1,8 @@
-"""Scalar fields on regular grids, and their zero sets as meshes (NumPy only).
+"""Samples scalar fields on regular grids and extracts their level sets as meshes (NumPy only).
 
-Scalar fields on regular grids (NumPy only).
-
-A field is negative inside a body and positive outside, in world units, and changes by about 1 per
-unit near the surface. A grid's axes are x, y, z; point `(i, j, k)` lies at `low + spacing (i, j,
-k)`.
-
-The surface of a grid as triangles (NumPy only), by marching cubes of scikit-image.
+A field is negative inside an object and positive outside, in world units, and changes by about 1
+per unit near the surface. The axes of a grid are x, y, z; point `(i, j, k)` lies at `low + spacing
+(i, j, k)`. Level sets are extracted by marching cubes of scikit-image.
 """
 
 from collections.abc import Callable
@@ -24,24 +20,24 @@ Values = Float[np.ndarray, " points"]
 Field = Callable[[Points], Values]
 
 NEAR = 1.5
-"""Edges of a coarse cell from the surface within which a corner is looked around.
+"""Largest distance from the surface at which a coarse corner is refined, in coarse cell edges.
 
-An exact distance needs sqrt(3) / 2, and a field that is nearly one some more.
+An exact distance needs sqrt(3) / 2; an approximate distance needs a little more.
 """
 
-# Fine cells along the edge of a coarse one.
+# Fine cells along the edge of a coarse cell.
 _COARSE = 4
 
-# Points of one sweep: bounds the memory of a field with many terms.
+# Points evaluated at once, which bounds the memory of a field with many terms.
 _SWEEP = 1 << 18
 
 
 class Box(NamedTuple):
-    """A box along the axes.
+    """An axis-aligned box.
 
     Attributes:
-      low: its least corner, world units.
-      high: its greatest corner.
+      low: corner with the smallest coordinates, world units.
+      high: corner with the largest coordinates, world units.
     """
 
     low: Float[np.ndarray, "3"]
@@ -52,9 +48,10 @@ class Grid(NamedTuple):
     """A sampled field.
 
     Attributes:
-      values: exact within a few cells of the surface; elsewhere of the right sign.
-      low: the first point, world units.
-      spacing: between points, world units.
+      values: field values, exact within a few cells of the surface; elsewhere only the sign is
+        right.
+      low: position of the first point, world units.
+      spacing: distance between points, world units.
     """
 
     values: Float[np.ndarray, "nx ny nz"]
@@ -67,16 +64,16 @@ def sample(
 ) -> Grid:
     """Samples a field, finely only near one of its level sets.
 
-    Far from it the values are those of a coarser grid: a feature thinner than its cells
-    (4 spacings) may be missed if no corner is within 6 spacings of the surface by the field's
-    value.
+    Far from it the values are those of a coarser grid. A feature thinner than the coarse cells (4
+    spacings) may be missed if the field is above 6 spacings at all corners around it.
 
     Args:
-      field: see the module.
-      box: is covered, and exceeded by less than 4 spacings on each side.
-      spacing: of the fine grid.
-      level: the value whose surroundings are sampled.
-      near: edges of a coarse cell within which of the surface a corner is looked around.
+      field: function to sample, see the module.
+      box: region to cover; the grid exceeds it by less than 4 spacings on each side.
+      spacing: distance between points of the fine grid, world units.
+      level: value whose surroundings are sampled finely.
+      near: largest distance from the surface at which a coarse corner is refined, in coarse cell
+        edges.
     """
     cells = np.maximum(np.ceil((box.high - box.low) / (_COARSE * spacing)), 1).astype(np.int64)
     low = 0.5 * (box.low + box.high) - 0.5 * cells * _COARSE * spacing
@@ -85,11 +82,11 @@ def sample(
     corners = coarse.reshape(cells + 1) - level
     close_corners = np.abs(corners) < near * _COARSE * spacing
     close = maximum_filter(close_corners, size=2, origin=-1)
-    # A field with a jump may cross the level with no corner near it.
+    # A discontinuous field may cross the level with no corner near it.
     signs = np.sign(corners)
     close |= maximum_filter(signs, size=2, origin=-1) != minimum_filter(signs, size=2, origin=-1)
     looked_at = np.zeros(shape, bool)
-    # A cell's own points, and those on its far sides.
+    # The points of a cell, and those on its far sides.
     looked_at[:-1, :-1, :-1] = _spread(close[:-1, :-1, :-1])
     looked_at = maximum_filter(looked_at, size=2)
     nearest = [np.rint(np.arange(n) / _COARSE).astype(np.int64) for n in shape]
@@ -99,7 +96,7 @@ def sample(
 
 
 def lattice(box: Box, count: int) -> Points:
-    """Returns the points of a regular lattice over a box, so many along each edge."""
+    """Returns a regular lattice over a box, with `count` points along each edge."""
     ticks = [np.linspace(low, high, count) for low, high in zip(*box, strict=True)]
     return np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
 
@@ -141,11 +138,11 @@ def _spread(cells: Bool[np.ndarray, "n m k"]) -> Bool[np.ndarray, "fn fm fk"]:
     return cells
 
 
-# Values this close to zero, in cells, are pushed away from it, so that no two vertices of marching
-# cubes meet in a corner of the grid and no face is degenerate.
+# Values closer to zero than this, in cells, are pushed away from it, so that no two vertices of
+# marching cubes coincide in a grid corner and no face is degenerate.
 CLEARANCE = 0.1
 
-# Steps back to the zero set, the longest one in cells, and the flattest slope that gives one.
+# Newton steps back to the zero set: their number, the longest one in cells, and the smallest slope.
 _NEWTON_STEPS = 3
 _LONGEST = 0.3
 _FLATTEST = 0.1
@@ -154,13 +151,13 @@ _FLATTEST = 0.1
 def find_isosurface(grid: Grid, *, level: float = 0.0) -> Mesh:
     """Returns the level set of a grid: closed, outward, normals from the grid's gradient.
 
-    The grid ends outside: where the body reaches its border it is closed there. Where the gradient
-    strays from a smooth patch (at an edge, which differences run across) the normals are those of
-    the faces, averaged within the crease angle.
+    The surface is closed where the object reaches the border of the grid. Where the gradient
+    deviates from a smooth patch (at an edge, across which finite differences average), the normals
+    are those of the faces, averaged within the crease angle.
 
     Args:
-      grid: negative inside.
-      level: the value on the surface.
+      grid: sampled field, negative inside.
+      level: value on the surface.
 
     Raises:
       ReconstructionError: if no value is below the level, or scikit-image is not installed.
@@ -168,7 +165,7 @@ def find_isosurface(grid: Grid, *, level: float = 0.0) -> Mesh:
     values = np.pad(grid.values - level, 1, constant_values=grid.spacing)
     if not np.any(values < 0.0):
         raise ReconstructionError(
-            f"No value of the grid is below {level:g}, so it holds no surface. Check that the "
+            f"No value of the grid is below {level:g}, so it contains no surface. Check that the "
             "field is negative inside, or sample it more finely."
         )
     padded = Grid(values, grid.low - grid.spacing, grid.spacing)
@@ -179,13 +176,13 @@ def find_isosurface(grid: Grid, *, level: float = 0.0) -> Mesh:
 
 
 def march(values: np.ndarray, spacing: float) -> tuple[Vertices, Faces]:
-    """Returns the triangles between negative and positive values, without degenerate ones.
+    """Returns the zero level set of values as triangles, without degenerate ones.
 
-    Vertices are as far as `CLEARANCE` of a cell from where the values cross zero.
+    Vertices may lie up to `CLEARANCE` of a cell away from the zero crossing.
 
     Args:
-      values: at grid points, with a positive border.
-      spacing: between them.
+      values: field values at grid points, positive on the border.
+      spacing: distance between grid points.
 
     Raises:
       ReconstructionError: if scikit-image is not installed.
@@ -203,7 +200,7 @@ def _settle(grid: Grid, vertices: Points) -> Points:
     for _ in range(_NEWTON_STEPS):
         value, slope = interpolate(grid, vertices), gradient(grid, vertices)
         squared = np.sum(slope**2, axis=-1)
-        # At a kink the differences may cancel; such a vertex stays.
+        # At a kink the differences may cancel; such a vertex is not moved.
         step = -np.where(squared > _FLATTEST, value, 0.0)[:, None] * slope
         step /= np.maximum(squared, _FLATTEST)[:, None]
         length = np.linalg.norm(step, axis=-1, keepdims=True)
@@ -213,7 +210,7 @@ def _settle(grid: Grid, vertices: Points) -> Points:
 
 
 def _normals(slopes: Points, vertices: Vertices, faces: Faces) -> np.ndarray:
-    """Returns unit gradients at corners, except where they stray from the faces around."""
+    """Returns unit gradients at corners, or face normals where the two deviate."""
     averaged = corner_normals(vertices, faces)
     length = np.linalg.norm(slopes, axis=-1, keepdims=True)
     unit = np.divide(slopes, length, out=np.zeros_like(slopes), where=length > 0.0)[faces]
@@ -222,7 +219,7 @@ def _normals(slopes: Points, vertices: Vertices, faces: Faces) -> np.ndarray:
 
 
 def import_skimage() -> Any:
-    """Returns scikit-image's `measure`, so that its lack can be told before a grid is made.
+    """Returns scikit-image's `measure`, so that a missing package is reported early.
 
     Raises:
       ReconstructionError: if scikit-image is not installed.
@@ -231,7 +228,7 @@ def import_skimage() -> Any:
         import skimage.measure
     except ImportError as error:
         raise ReconstructionError(
-            "Surfaces are found by scikit-image, which is not installed. Install it: "
+            "scikit-image, which extracts surfaces, is not installed. Install it with "
             "pip install -e '.[r3f]'."
         ) from error
     return skimage.measure

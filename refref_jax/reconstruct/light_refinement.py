@@ -1,23 +1,18 @@
-"""Refines a mesh by the light refracted through it.
+"""Refines a mesh and its index of refraction with the light refracted through it.
 
-A mesh that moves with a few handles, differentiably.
+Masks determine the outlines of an object; the background seen through it determines its normals,
+because rays are deflected in proportion to the tilt of the surface. With the field of the
+background held fixed, gradient descent on the pixel errors adjusts the shape and the index of
+refraction together, under a prior that neighbouring handles move alike.
 
-Handles are vertices spread evenly over the surface. A vertex moves by the mean shift of the handles
-next to it, the nearer the more; where there are no more vertices than handles,
-each is its own. Shading normals turn as those of the faces around do, so that without a shift they
-are what they were, however these were made.
+The shape is deformed by a few handles, which are vertices spread evenly over the surface. A vertex
+moves by a weighted mean of the shifts of its nearest handles; with as many handles as vertices each
+vertex has its own. Shading normals rotate with the normals of the surrounding faces, so that zero
+shifts leave the original normals unchanged, however they were made.
 
-Hosts build (`build`), devices move (`move`).
-
-The tree of the surfaces stays that of the mesh at rest: which triangle a ray meets is found there,
-and where it meets it on the moved one. That holds for shifts well below an edge's length.
-
-A body made better by the light that went through it.
-
-Masks know where a body's outlines are; what is seen through it knows its normals, which bend light
-by as much as they turn. So, with the field of the background held fixed, the handles of the surface
-(see `deformation`) and its index of refraction descend together on the error of the pixels, against
-a prior that neighbouring handles move alike.
+The host builds the handles (`build`), the device moves them (`move`). The BVH stays that of the
+undeformed mesh: it selects the triangle that a ray hits, and the hit point is computed on the
+deformed triangle. This is valid for shifts well below the length of an edge.
 
 This is one of the modules that call `jax.jit`.
 
@@ -47,23 +42,23 @@ from refref_jax.reconstruct.refractive_index import Evidence
 from refref_jax.render.model import ModelConfig
 
 HANDLES = 256
-"""Enough for errors of a twentieth of a body's size; what is finer is noise of the masks."""
+"""Sufficient for errors of a twentieth of the object's size; finer detail is noise of masks."""
 
-# Handles that a vertex hangs on.
+# Handles per vertex.
 _NEAREST = 6
 
 
 class Rig(NamedTuple):
-    """What moves a mesh.
+    """A mesh and the handles that deform it.
 
     Attributes:
-      surfaces: at rest.
-      vertices: at rest, world units.
-      faces: of the mesh.
-      groups: number of the smooth group that each corner of a face belongs to.
-      slots: the face of each slot of the surfaces.
-      handles: those that a vertex hangs on.
-      shares: their weights, which sum to 1.
+      surfaces: packed surfaces at rest.
+      vertices: vertices at rest, world units.
+      faces: faces of the mesh.
+      groups: number of the smoothing group that each corner of a face belongs to.
+      slots: face number of each primitive of the surfaces.
+      handles: handles that move each vertex.
+      shares: weights of these handles, which sum to 1.
       neighbours: handles next to each handle.
     """
 
@@ -78,17 +73,17 @@ class Rig(NamedTuple):
 
 
 def build(mesh: Mesh, *, handles: int = HANDLES) -> Rig:
-    """Puts handles on a mesh; the arrays are the host's.
+    """Places handles on a mesh; the arrays are NumPy arrays on the host.
 
     Args:
-      mesh: at rest.
-      handles: how many at most; 4 or more.
+      mesh: mesh at rest.
+      handles: largest number of handles, at least 4.
 
     Raises:
-      ReconstructionError: if there are fewer.
+      ReconstructionError: if `handles` is below 4.
     """
     if handles < 4:
-        raise ReconstructionError(f"{handles} handles hold no body. Give 4 or more.")
+        raise ReconstructionError(f"handles={handles} is too small. Pass 4 or more.")
     bvh, slots = bvh_build.build(mesh.vertices[mesh.faces].astype(np.float32))
     surfaces = Surfaces(bvh, mesh.normals[slots].astype(np.float32), np.zeros(len(slots), np.int32))
     chosen = _spread(mesh.vertices, handles)
@@ -109,7 +104,7 @@ def build(mesh: Mesh, *, handles: int = HANDLES) -> Rig:
 
 
 def move(rig: Rig, shifts: Float[Array, "handles 3"]) -> Surfaces:
-    """Returns the surfaces with their handles shifted, in world units."""
+    """Returns the surfaces after shifting the handles, in world units."""
     corners = _moved(rig, shifts)[rig.faces]
     still = rig.vertices[rig.faces]
     turned = _group_normals(rig, corners) - _group_normals(rig, still)
@@ -119,17 +114,17 @@ def move(rig: Rig, shifts: Float[Array, "handles 3"]) -> Surfaces:
 
 
 def moved_mesh(mesh: Mesh, rig: Rig, shifts: Float[np.ndarray, "handles 3"]) -> Mesh:
-    """Returns a mesh with its handles shifted, for good: its surfaces can be built anew."""
+    """Returns a mesh with its handles shifted permanently, from which a new BVH can be built."""
     moved = np.einsum("vn,vnk->vk", rig.shares, shifts[rig.handles])
     device = jax.device_put((rig, shifts.astype(np.float32)))
     normals = np.zeros(mesh.normals.shape)
-    # Slots at the end are padding, which repeats a face.
+    # Primitives at the end are padding, which repeats a face.
     normals[rig.slots] = np.asarray(move(*device).normals, np.float64)
     return Mesh(mesh.vertices + moved, mesh.faces, normals)
 
 
 def unevenness(rig: Rig, shifts: Float[Array, "handles 3"]) -> Float[Array, ""]:
-    """Returns the mean squared difference of a handle's shift to the mean of those around it."""
+    """Returns the mean squared difference between a handle's shift and its neighbours' mean."""
     if rig.neighbours.shape[1] == 0:
         return jnp.zeros((), shifts.dtype)
     around = jnp.mean(shifts[rig.neighbours], axis=1)
@@ -141,7 +136,7 @@ def _moved(rig: Rig, shifts: Float[Array, "handles 3"]) -> Float[Array, "vertice
 
 
 def _group_normals(rig: Rig, corners: Float[Array, "faces 3 3"]) -> Float[Array, "faces 3 3"]:
-    """Returns unit normals at corners: of the smooth group there, weighted by area."""
+    """Returns unit normals at corners, area-weighted over the smoothing group of the corner."""
     a, b, c = jnp.moveaxis(corners, 1, 0)
     area = jnp.cross(b - a, c - a)
     flat = rig.groups.reshape(-1)
@@ -150,7 +145,7 @@ def _group_normals(rig: Rig, corners: Float[Array, "faces 3 3"]) -> Float[Array,
 
 
 def _spread(vertices: Vertices, count: int) -> Int[np.ndarray, " handles"]:
-    """Returns vertices far from one another, each the furthest from those before it."""
+    """Returns vertices by farthest point sampling."""
     if len(vertices) <= count:
         return np.arange(len(vertices))
     chosen = [int(np.argmax(np.linalg.norm(vertices - vertices.mean(axis=0), axis=-1)))]
@@ -164,12 +159,13 @@ def _spread(vertices: Vertices, count: int) -> Int[np.ndarray, " handles"]:
 def _hang(
     vertices: Vertices, handles: Float[np.ndarray, "handles 3"]
 ) -> tuple[Int[np.ndarray, "vertices nearest"], Float[np.ndarray, "vertices nearest"]]:
-    """Returns the handles of each vertex, and their shares."""
+    """Returns the handles of each vertex, and their weights."""
     if len(handles) == len(vertices):
         return np.arange(len(vertices))[:, None], np.ones((len(vertices), 1))
     count = min(_NEAREST, len(handles))
     away, nearest = KDTree(handles).query(vertices, k=[*range(1, count + 1)])
-    # The width is that of the furthest: a handle loses a vertex smoothly to another one.
+    # The width of the kernel is the distance of the furthest handle, so that handles fade out
+    # smoothly.
     reach = away[:, -1:]
     shares = np.maximum(1.0 - (away / reach) ** 2, 0.0) ** 2
     return nearest, shares / shares.sum(axis=1, keepdims=True)
@@ -177,17 +173,17 @@ def _hang(
 
 @dataclasses.dataclass(frozen=True)
 class LightRefinement:
-    """How a body is refined.
+    """Settings of the refinement.
 
     Attributes:
-      steps: of the descent.
-      rays: pixels of a step.
-      handles: of the surface, at most.
-      stride: the most that a coordinate of a handle moves in a step, world units. What masks leave
-        to find is as small: ten times this stride made the bundled ball worse.
-      index_stride: the most that the index does.
+      steps: number of steps of the descent.
+      rays: number of pixels per step.
+      handles: largest number of handles on the surface.
+      stride: largest move of a coordinate of a handle per step, world units. The errors that masks
+        leave are as small: ten times this stride made the bundled ball worse.
+      index_stride: largest change of the index per step.
       evenness: weight of the prior, per squared world unit.
-      seed: of the pixels of each step.
+      seed: seed of the pixels of each step.
     """
 
     steps: int = 100
@@ -200,13 +196,13 @@ class LightRefinement:
 
 
 class Refined(NamedTuple):
-    """What light says of a body.
+    """Result of the refinement.
 
     Attributes:
-      mesh: moved.
-      index: of refraction.
+      mesh: refined mesh.
+      index: refined index of refraction.
       errors: mean error of the pixels at each step, sRGB.
-      furthest: that a handle was shifted, world units.
+      furthest: largest shift of a handle, world units.
     """
 
     mesh: Mesh
@@ -216,14 +212,14 @@ class Refined(NamedTuple):
 
 
 class _Unknowns(NamedTuple):
-    """What is looked for, in strides."""
+    """Unknowns of the descent, in strides."""
 
     shifts: Float[Array, "handles 3"]
     index: Float[Array, ""]
 
 
 class _State(NamedTuple):
-    """Of the descent."""
+    """State of the descent."""
 
     unknowns: _Unknowns
     moments: optax.OptState
@@ -239,18 +235,18 @@ def refine_by_light(
     settings: LightRefinement,
     progress: Callable[[int, float], None] | None = None,
 ) -> Refined:
-    """Descends on the shape and the index of the only body of a scene.
+    """Refines the shape and the index of the only object of a scene.
 
-    Whether the result is better is for pixels to tell that were not descended on.
+    Pixels that were not used in the descent must decide whether the result is better.
 
     Args:
-      mesh: of the body.
-      index: of refraction, where to begin.
-      interfaces: of the scene, which has one part.
-      evidence: pixels well inside of the masks, and the field of what is behind.
-      config: of the field's model.
-      settings: how.
-      progress: told the steps done and the error of the last one.
+      mesh: mesh of the object.
+      index: initial index of refraction.
+      interfaces: interfaces of the scene, which has one part.
+      evidence: pixels well inside the masks, and the field of the background.
+      config: configuration of the field's model.
+      settings: settings of the refinement.
+      progress: called with the number of steps done and the error of the last one.
     """
     rig = build(mesh, handles=settings.handles)
     device = jax.device_put((rig, interfaces))
@@ -279,7 +275,7 @@ def _start(handles: int, settings: LightRefinement) -> _State:
 
 
 def _optimizer(settings: LightRefinement) -> optax.GradientTransformation:
-    """Returns Adam by strides, which shrink to a tenth over the steps."""
+    """Returns Adam in units of strides, which decay to a tenth over the steps."""
     rate = optax.exponential_decay(1.0, settings.steps, 0.1)
     return optax.adam(rate, b2=0.99)
 
@@ -296,7 +292,7 @@ def _step(
     config: ModelConfig,
     settings: LightRefinement,
 ) -> tuple[_State, Float[Array, ""]]:
-    """Takes one step; returns the mean error before it as well."""
+    """Takes one step; also returns the mean error before it."""
     some = evidence._replace(
         rays=jax.tree.map(lambda x: x[chosen], evidence.rays), rgb=evidence.rgb[chosen]
     )

@@ -1,13 +1,14 @@
-"""Masks as signed distances in the image, to a fraction of a pixel (NumPy only).
+"""Turns masks into signed distances in the image, with subpixel accuracy (NumPy only).
 
-A mask says of each pixel's centre whether the body is seen there, so its outline is known to half a
-pixel, in steps. Signed distances to the steps, averaged over a neighbourhood, are known better:
-along a straight edge the steps cancel. A plain Gaussian average would also pull in an outline that
-bends, by `blur^2 / 2` times its curvature; half of its Laplacian is taken off, which keeps every
-quadratic, so that discs keep their size, and corners are rounded less.
+A mask states for each pixel centre whether the object is visible there, so the outline is known to
+half a pixel, in steps. Averaging the signed distances to these steps over a neighbourhood is more
+accurate: along a straight edge the steps cancel. A plain Gaussian average would also pull in a
+curved outline, by `blur^2 / 2` times its curvature. Half of the Laplacian is therefore subtracted,
+which preserves every quadratic: discs keep their size, and corners are rounded less.
 
-Measured on discs of 34 pixels' radius and squares at all angles, in pixels: steps alone 0.23 RMS
-error; blur 1.5: 0.14, mean below 0.01, corners cut back by 0.5; blur 3: 0.10, 0.01 and 1.0.
+Errors measured on discs with a radius of 34 pixels and on squares at all angles, in pixels: steps
+alone 0.23 RMS; blur 1.5: 0.14 RMS, mean below 0.01, corners cut back by 0.5; blur 3: 0.10, 0.01 and
+1.0.
 """
 
 from typing import NamedTuple
@@ -20,15 +21,15 @@ from refref_jax.geometry.cameras import Cameras
 from refref_jax.reconstruct import ReconstructionError
 
 BLUR = 1.5
-"""Standard deviation in pixels of the average over an outline."""
+"""Standard deviation of the average over an outline, pixels."""
 
 
 class Views(NamedTuple):
-    """What is seen of a body.
+    """Masks of an object and their cameras.
 
     Attributes:
-      masks: one a camera, true where the body is seen.
-      cameras: of the masks, in the same order.
+      masks: one mask per camera, true where the object is visible.
+      cameras: cameras of the masks, in the same order.
     """
 
     masks: Bool[np.ndarray, "views h w"]
@@ -36,7 +37,7 @@ class Views(NamedTuple):
 
 
 def some_of(views: Views, count: int) -> Views:
-    """Returns so many views at most, evenly spread over their order."""
+    """Returns at most `count` views, evenly spread over their order."""
     return views_at(views, np.unique(np.linspace(0, len(views.masks) - 1, count).astype(np.int64)))
 
 
@@ -58,38 +59,38 @@ def overlaps(
 
 
 def check_masks(masks: np.ndarray, cameras: Cameras) -> None:
-    """Checks that there are masks, one a camera, of its size, and that each marks something.
+    """Checks that there is one nonempty mask of the right size for each camera.
 
     Raises:
-      ReconstructionError: otherwise, if masks are no booleans, or if cameras are not finite.
+      ReconstructionError: if not, if masks are not boolean, or if poses are not finite.
     """
     if masks.dtype != np.bool_:
         raise ReconstructionError(
-            f"The masks are {masks.dtype}. Give booleans, as in masks > 127 of 8 bits."
+            f"The masks have the type {masks.dtype}. Pass booleans, such as masks > 127."
         )
     if len(masks) == 0:
-        raise ReconstructionError("There is no mask. Give one for each camera, several in all.")
+        raise ReconstructionError("There are no masks. Pass one mask for each of several cameras.")
     if len(masks) != len(cameras.poses):
         raise ReconstructionError(
-            f"There are {len(masks)} masks and {len(cameras.poses)} cameras. Give one mask for "
+            f"There are {len(masks)} masks and {len(cameras.poses)} cameras. Pass one mask for "
             "each camera."
         )
     broken = np.flatnonzero(~np.all(np.isfinite(cameras.poses), axis=(1, 2)))
     if len(broken) or not 0.0 < cameras.focal < np.inf:
         raise ReconstructionError(
-            f"Poses that are not finite: {len(broken)}, of cameras {broken[:5]}; the focal "
-            f"length is {cameras.focal}. Leave these views out, and give the length in pixels."
+            f"{len(broken)} poses are not finite, of cameras {broken[:5]}; the focal length is "
+            f"{cameras.focal}. Remove these views, and pass a focal length in pixels."
         )
     height, width = masks.shape[1:]
     if (height, width) != (cameras.height, cameras.width):
         raise ReconstructionError(
             f"The masks are {width} x {height} pixels, but the cameras {cameras.width} x "
-            f"{cameras.height}. Resize the masks, or give the cameras their size and focal length."
+            f"{cameras.height}. Resize the masks, or adapt the cameras' size and focal length."
         )
     if len(empty := np.flatnonzero(~masks.any(axis=(1, 2)))):
         raise ReconstructionError(
-            f"{_listed(empty)} of {len(masks)} masks mark nothing, which leaves no body. Leave "
-            "these views out, or mark the object there."
+            f"{_listed(empty)} of {len(masks)} masks are empty. Remove these views, or mark the "
+            "object in their masks."
         )
 
 
@@ -98,11 +99,12 @@ def signed_distances(
 ) -> Float[np.ndarray, "h w"]:
     """Returns distances to a mask's outline at pixel centres, in pixels, negative inside.
 
-    Of an outline the image's border cuts through nothing is known outside; there the distance is
-    that to the outline within the image, and `-inf` everywhere in a mask that marks every pixel.
+    Where the border of the image cuts the object, the outline outside of the image is unknown;
+    there the distance is that to the outline within the image. It is `-inf` everywhere in a mask
+    that marks every pixel.
 
     Args:
-      mask: true where the object is seen.
+      mask: true where the object is visible.
       blur: standard deviation of the average in pixels, see the module; 0 for the steps alone.
     """
     if mask.all():
@@ -110,7 +112,7 @@ def signed_distances(
     if not mask.any():
         return np.full(mask.shape, np.inf)
     inside, outside = distance_transform_edt(mask), distance_transform_edt(~mask)
-    # From a pixel's centre to the middle between it and the next.
+    # From the centre of a pixel to the edge it shares with the next pixel.
     steps = np.where(mask, 0.5 - inside, outside - 0.5)
     if blur == 0.0:
         return steps
@@ -119,6 +121,6 @@ def signed_distances(
 
 
 def _listed(views: Int[np.ndarray, " views"]) -> str:
-    """Names the first few views."""
+    """Returns the numbers of the first few views, as text."""
     names = ", ".join(str(view) for view in views[:5])
     return f"Views {names}{', ...' if len(views) > 5 else ''}: {len(views)}"

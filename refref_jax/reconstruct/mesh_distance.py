@@ -1,22 +1,21 @@
-"""Distances between meshes, and agreement of a mesh with masks.
+"""Measures distances between meshes, and the agreement of a mesh with masks.
 
-The closest points of a mesh and signed distances to it, exact but far inside (NumPy only).
+Closest points and signed distances are exact, except far inside an object. Triangles are subdivided
+until all are small, which does not change the surface. A tree of their centres then finds the few
+triangles that can contain the closest point: the distance to the nearest centre is an upper bound,
+and triangles beyond that bound plus their own radius are excluded. The sign is that of the
+angle-weighted normal of the feature (face, edge or vertex) that contains the closest point, which
+is exact on closed surfaces.
 
-Triangles are cut until all are small, which changes no surface, so that a tree of their middles
-finds the few that can hold the closest point: the distance to the nearest middle bounds it from
-above, and a triangle further than that bound and its own radius can not hold it.
+Correct masks agree with the silhouettes of their visual hull. A mask that marks too much is
+overruled by the others, and only this mask disagrees. A mask that marks too little removes part of
+the object: it agrees, and all others disagree. The volume that only this mask carves away
+identifies it (`carved_alone`).
 
-Inside is told by the angle-weighted normal of the feature (face, edge or vertex) where the closest
-point lies, which is exact on closed surfaces. Source: Baerentzen and Aanaes, Signed Distance
-Computation Using the Angle Weighted Pseudonormal (2005).
+All of this runs on the host; only silhouettes are traced with JAX.
 
-How far a mesh is from another one, and from masks.
-
-Which masks a body does not agree with, and which of them spoils it (host).
-
-Masks that are right agree with the silhouettes of their hull. One that marks too much is overruled
-by the others, and alone disagrees. One that marks too little takes its part of the body away: it
-agrees, and all others disagree. What a mask alone carves away tells it from them.
+Source: Baerentzen and Aanaes, Signed Distance Computation Using the Angle Weighted Pseudonormal
+(2005).
 """
 
 from collections.abc import Sequence
@@ -45,32 +44,32 @@ from refref_jax.reconstruct.masks import Views, check_masks, overlaps, views_at
 from refref_jax.reconstruct.visual_hull import REACH, values_by_view
 from refref_jax.render.first_surface import find_first_surface
 
-# Triangles that are looked at first, and how many times more in each further round.
+# Triangles in the first query, and the factor by which each further query grows.
 _FIRST = 8
 _GROWTH = 4
 
-# And at most. Where more could hold the closest point, which is about a medial axis, all are about
-# as near as the nearest middles, and those are believed.
+# Largest query. Where more triangles could contain the closest point, which happens near the medial
+# axis, all are about as near as the nearest centres, and the best of those is used.
 _MOST = 128
 
-# Points times triangles of one sweep.
+# Largest number of points times triangles processed at once.
 _SWEEP = 1 << 20
 
-# A triangle is cut if an edge is longer than this share of the diameter.
+# A triangle is subdivided if an edge is longer than this share of the diameter.
 _LONGEST_EDGE = 0.04
 
-# A barycentric coordinate below this lies on the edge.
+# A point with a barycentric coordinate below this lies on the edge.
 _ON_EDGE = 1e-6
 
 
 class ClosestPoints(NamedTuple):
-    """What lies closest to some points.
+    """The surface points closest to given points.
 
     Attributes:
-      points: on the surface.
-      distances: to them, world units, at least 0.
-      faces: that hold them.
-      weights: their barycentric coordinates there.
+      points: closest points on the surface.
+      distances: distances to them, world units, at least 0.
+      faces: faces that contain them.
+      weights: barycentric coordinates of the points in these faces.
     """
 
     points: Float[np.ndarray, "points 3"]
@@ -80,7 +79,7 @@ class ClosestPoints(NamedTuple):
 
 
 class ClosestSearch:
-    """Finds closest points of one mesh; holds its tree."""
+    """Finds the closest points on one mesh, with a tree of its triangles."""
 
     def __init__(self, vertices: Vertices, faces: Faces):
         """Builds the tree.
@@ -90,7 +89,7 @@ class ClosestSearch:
         """
         kept = np.flatnonzero(~is_degenerate(vertices[faces]))
         if len(kept) == 0:
-            raise ReconstructionError("The mesh has no triangle with an area. Make it again.")
+            raise ReconstructionError("All triangles of the mesh are degenerate. Rebuild the mesh.")
         self._corners = vertices[faces]
         self._pieces, owner = _cut(vertices[faces[kept]], _LONGEST_EDGE * diameter(vertices))
         self._owner = kept[owner]
@@ -120,7 +119,7 @@ class ClosestSearch:
     def _nearest(
         self, points: Points, count: int
     ) -> tuple[Points, Values, Int[np.ndarray, " points"], Values]:
-        """Returns the closest among so many pieces, and how far their middles reach."""
+        """Returns the closest of `count` pieces, and the distance of the furthest piece centre."""
         away, near = self._tree.query(points, k=[*range(1, count + 1)])
         corners = self._pieces[near].reshape(-1, 3, 3)
         on = closest_point(corners, np.repeat(points, count, axis=0)).reshape(-1, count, 3)
@@ -141,7 +140,7 @@ def signed_distance(mesh: Mesh) -> Field:
         found = search(points)
         small = found.weights < _ON_EDGE
         row = found.faces
-        # The edge opposite a corner holds the points whose weight is small there.
+        # The edge opposite a corner contains the points whose weight is small there.
         normal = np.where(
             small.any(axis=1)[:, None],
             of_edges[row, np.argmin(found.weights, axis=1)],
@@ -159,7 +158,7 @@ def signed_distance(mesh: Mesh) -> Field:
 def _edge_normals(
     faces: Faces, normals: Float[np.ndarray, "faces 3"]
 ) -> Float[np.ndarray, "faces 3 3"]:
-    """Returns for every edge, by the opposite corner, the sum of the normals of its faces."""
+    """Returns for every edge, indexed by the opposite corner, the sum of its faces' normals."""
     edges = np.sort(faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
     _, edge = np.unique(edges, axis=0, return_inverse=True)
     edge = edge.reshape(-1)
@@ -171,7 +170,7 @@ def _edge_normals(
 def _cut(
     corners: Float[np.ndarray, "faces 3 3"], longest: float
 ) -> tuple[Float[np.ndarray, "pieces 3 3"], Int[np.ndarray, " pieces"]]:
-    """Halves the longest edges of triangles until none is longer; and tells whose each piece is."""
+    """Halves the longest edges until none is longer; returns the pieces and their triangles."""
     owner, done, owners = np.arange(len(corners)), [], []
     while len(corners):
         edges = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
@@ -188,19 +187,19 @@ def _cut(
 
 
 SAMPLES = 20_000
-"""Points on each surface."""
+"""Number of points sampled on each surface."""
 
 
 class Distance(NamedTuple):
-    """How far two surfaces are from each other.
+    """Distances between two surfaces.
 
     Attributes:
-      chamfer: mean distance from one surface to the other, mean of both ways, as a share of the
-        true mesh's diameter (the diagonal of its box).
-      furthest: largest distance of either way, as a share of the diameter.
-      normal_error: mean angle in degrees between the shading normals at points of the mesh and at
-        the closest points of the true one.
-      normal_error_99: the angle that 99 of 100 points stay below.
+      chamfer: mean distance from one surface to the other, averaged over both directions, as a
+        share of the true mesh's diameter (the diagonal of its bounding box).
+      furthest: largest distance in either direction, as a share of the diameter.
+      normal_error: mean angle between the shading normals at points of the mesh and at the closest
+        points of the true mesh, degrees.
+      normal_error_99: 99th percentile of that angle, degrees.
     """
 
     chamfer: float
@@ -210,13 +209,13 @@ class Distance(NamedTuple):
 
 
 def compare_meshes(mesh: Mesh, truth: Mesh, *, samples: int = SAMPLES, seed: int = 0) -> Distance:
-    """Compares a mesh with the true one, at points spread evenly by area over each.
+    """Compares a mesh with the true mesh, at points sampled evenly by area on each.
 
     Args:
-      mesh: any.
-      truth: what it should be; its size is the unit.
-      samples: points on each surface. Distances to the other are exact.
-      seed: of the points.
+      mesh: mesh to compare.
+      truth: true mesh; its diameter is the unit.
+      samples: number of points on each surface. Distances to the other surface are exact.
+      seed: seed of the points.
     """
     generator = np.random.default_rng(seed)
     points, normals = _spread(mesh, samples, generator)
@@ -240,14 +239,14 @@ def silhouette_overlap(
 ) -> Float[np.ndarray, " views"]:
     """Returns for each view the pixels in both mask and silhouette over those in either (IoU).
 
-    A pixel is in the silhouette if the ray through its centre meets the mesh, as the data set's
-    masks are made. A view in which both are empty counts 1.
+    A pixel is in the silhouette if the ray through its centre hits the mesh, as in the masks of the
+    data set. A view in which both are empty counts as 1.
     """
     return overlaps(silhouettes(mesh, cameras), masks)
 
 
 def silhouettes(mesh: Mesh, cameras: Cameras) -> Bool[np.ndarray, "views h w"]:
-    """Returns which pixels see a mesh."""
+    """Returns the pixels in which a mesh is visible."""
     surfaces = pack_meshes([mesh])
     views: Sequence[int] = range(len(cameras.poses))
     return np.stack(
@@ -258,12 +257,12 @@ def silhouettes(mesh: Mesh, cameras: Cameras) -> Bool[np.ndarray, "views h w"]:
 def _spread(
     mesh: Mesh, count: int, generator: np.random.Generator
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Returns points spread over a mesh, and their interpolated unit normals."""
+    """Returns points sampled on a mesh, and their interpolated unit normals."""
     corners = mesh.vertices[mesh.faces]
     area = np.linalg.norm(
         np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
     )
-    # One point in each of equal shares of the area.
+    # One point in each of `count` equal shares of the area.
     total = np.cumsum(area)
     at = (np.arange(count) + generator.uniform(size=count)) / count * total[-1]
     face = np.minimum(np.searchsorted(total, at), len(area) - 1)
@@ -274,20 +273,20 @@ def _spread(
     return points, unit_vectors(np.einsum("nk,nkc->nc", weights, mesh.normals[face]))
 
 
-# Points along each edge of the cube in which a body is looked for.
+# Points along each edge of the cube that is searched for the object.
 _POINTS = 64
 
 
 def without_outliers(mesh: Mesh, views: Views, count: int) -> Views:
-    """Returns views without so many whose masks overlap least with the silhouettes of a mesh.
+    """Drops the `count` views whose masks overlap least with the silhouettes of a mesh.
 
     Raises:
-      ReconstructionError: if no view would be left, or masks and cameras do not fit each other.
+      ReconstructionError: if no view would be left, or masks and cameras do not match.
     """
     check_masks(*views)
     if not 0 <= count < len(views.masks):
         raise ReconstructionError(
-            f"{count} of {len(views.masks)} views can not be left out. Give fewer, 0 or more."
+            f"{count} of {len(views.masks)} views cannot be left out. Pass a smaller count."
         )
     if count == 0:
         return views
@@ -296,13 +295,14 @@ def without_outliers(mesh: Mesh, views: Views, count: int) -> Views:
 
 
 def carved_alone(views: Views) -> Values:
-    """Returns for each view the share of what all others leave that it carves away.
+    """Returns for each view the share of the other views' hull that only this view carves away.
 
-    Measured on a lattice of 64 points along each edge of the cube in which a body is looked for,
-    see `visual_hull.REACH`; 0 where the others leave none of them.
+    The share is measured on a lattice of 64 points along each edge of the cube that is searched for
+    the object, see `visual_hull.REACH`. It is 0 if the hull of the other views contains none of
+    them.
 
     Raises:
-      ReconstructionError: if masks and cameras do not fit each other.
+      ReconstructionError: if masks and cameras do not match.
     """
     check_masks(*views)
     ends = np.full(3, REACH)

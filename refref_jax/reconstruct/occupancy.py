@@ -1,33 +1,28 @@
-"""Trains an occupancy field on masks, and extracts its surface.
+"""Trains an occupancy field on masks and extracts its surface.
 
-Static description of an occupancy field's training.
+This is the paper's method (UNISURF on masks); `visual_hull` solves the same problem exactly and
+faster. The two differ between tangent cones: the visual hull bulges there, whereas here the
+smoothness of the normals decides, so that round objects become rounder and flat faces less flat.
+Wrong masks harm both: a ray that a mask marks as empty carves the object along its full length.
 
-Trains an occupancy field on silhouettes alone.
-
-A step draws rays, half of them from pixels near an outline of a mask, and descends on
+Each step draws rays, half of them from pixels near an outline of a mask, and minimises
 
     b C / p  +  lambda_e mean (|grad f| - 1)^2  +  lambda_s mean |n(x) - n(x + e)|^2
              +  lambda_v mean f(x) / p
 
 where `C` is the mean binary cross entropy between rendered silhouettes and masks, `b` the softness
-of the step and `p` a pixel, both in edges of the cube: a ray on the wrong side of an outline then
-costs about the pixels by which it is. The second term, which UNISURF has not, holds `f` to a
-distance, at points of the surface and anywhere; the third is UNISURF's smoothness of the normals
-`n` at points of the surface, with small random steps `e`. The fourth pushes the surface outwards,
-so little that outlines resist: a dent that no outline shows would otherwise stay where the first
-steps happened to leave one. Of all bodies with the same silhouettes it asks for the largest.
+of the step and `p` the size of a pixel, both in edges of the cube. A ray on the wrong side of an
+outline then costs about its distance from it in pixels. The second term, which UNISURF does not
+have, keeps `f` close to a distance, at points of the surface and anywhere. The third is UNISURF's
+smoothness of the normals `n` at points of the surface, with small random steps `e`. The fourth
+pushes the surface outwards, too weakly to move outlines: a dent that no outline shows would
+otherwise remain where the first steps happened to leave it. Among all shapes with the same
+silhouettes it selects the largest.
 
 This is one of the modules that call `jax.jit`.
 
-Source: Oechsle, Peng and Geiger, UNISURF (2021), section 3.3; Gropp et al., Implicit Geometric
+Sources: Oechsle, Peng and Geiger, UNISURF (2021), section 3.3; Gropp et al., Implicit Geometric
 Regularization for Learning Shapes (2020), for the second term.
-
-A body from masks by an occupancy field that is trained on their silhouettes (host).
-
-The paper's way (UNISURF on masks), for which `visual_hull` is the exact and faster one. They differ
-in what lies between tangent cones: there the hull bulges, and here the smoothness of the normals
-decides, so that round bodies come out rounder and flat faces less flat. Masks that err harm both: a
-ray that a mask says is empty empties all of itself in either.
 """
 
 import dataclasses
@@ -60,23 +55,23 @@ from refref_jax.reconstruct.visual_hull import find_box, hull_field
 
 @dataclasses.dataclass(frozen=True)
 class OccupancyTrainingConfig:
-    """An occupancy field and how it is trained.
+    """An occupancy field and its training schedule.
 
     Attributes:
-      field: the field's shape.
-      steps: number of them.
-      batch: rays a step.
-      scan: samples along a ray that find the place which decides, without gradient.
-      samples: samples there, which are rendered.
-      softness: `b` at the first and the last step, in pixels; geometric between.
-      rate: Adam's learning rate at the first and the last step; geometric between.
+      field: shape of the field.
+      steps: number of steps.
+      batch: number of rays per step.
+      scan: number of samples along a ray that locate its deepest point, without gradient.
+      samples: number of rendered samples around that point.
+      softness: `b` at the first and the last step, in pixels; interpolated geometrically.
+      rate: Adam's learning rate at the first and the last step; interpolated geometrically.
       distance: weight `lambda_e` of the field's slope.
       smoothness: weight `lambda_s` of the normals' differences.
-      solidity: weight `lambda_v` of the push outwards; without it flat faces keep dents, and with
-        three times as much outlines give way.
+      solidity: weight `lambda_v` of the push outwards; without it flat faces keep dents, and three
+        times as much distorts outlines.
       reach: standard deviation of the steps between compared normals, in cells of the finest grid.
-      surface: rays of a batch which the terms other than the first look at.
-      band: pixels from an outline up to which a ray counts as near it.
+      surface: number of rays per batch for all terms but the first.
+      band: distance from an outline up to which a ray counts as near it, pixels.
     """
 
     field: OccupancyFieldConfig = dataclasses.field(default_factory=OccupancyFieldConfig)
@@ -94,20 +89,20 @@ class OccupancyTrainingConfig:
     band: float = 3.0
 
     def __post_init__(self) -> None:
-        """Checks what the steps rely on."""
+        """Validates the schedule."""
         if min(self.steps, self.samples) < 1 or self.scan < 2:
             raise ValueError(
-                f"A training takes at least 1 step and 1 sample, and scans with 2; got {self}. "
+                f"steps and samples must be at least 1 and scan at least 2; got {self}. "
                 "Correct the configuration."
             )
         if not 1 <= self.surface <= self.batch or min(*self.softness, *self.rate) <= 0.0:
             raise ValueError(
-                "A training needs softness and rate above 0, and looks at 1 to all rays of its "
-                f"batch for the surface; got {self}. Correct the configuration."
+                "softness and rate must be above 0, and surface must lie between 1 and batch; "
+                f"got {self}. Correct the configuration."
             )
 
 
-# As for the radiance fields: entries of a hash table are touched too rarely for 0.999.
+# As for the radiance fields: entries of a hash table are updated too rarely for 0.999.
 _SECOND_MOMENT_DECAY = 0.99
 
 
@@ -115,11 +110,11 @@ class Silhouettes(NamedTuple):
     """Pixels of masks, and the chords of their rays; those near an outline come first.
 
     Attributes:
-      chords: of all rays that may meet the body, and what fills the arrays up.
+      chords: chords of all rays that may hit the object, followed by padding.
       seen: whether the mask marks the pixel.
-      rays: number of rays; what follows is never drawn.
-      near: number of rays that are near an outline.
-      pixel: a pixel's size where the body is, in edges of the cube.
+      rays: number of rays; the padding after them is never drawn.
+      near: number of rays near an outline.
+      pixel: size of a pixel at the object, in edges of the cube.
     """
 
     chords: Chord
@@ -130,11 +125,11 @@ class Silhouettes(NamedTuple):
 
 
 class OccupancyState(NamedTuple):
-    """What changes while a field is trained.
+    """Parameters and optimizer state during training.
 
     Attributes:
-      step: steps taken.
-      params: of the field.
+      step: number of steps taken.
+      params: parameters of the field.
       optimizer: optax's state.
     """
 
@@ -144,10 +139,10 @@ class OccupancyState(NamedTuple):
 
 
 class OccupancyReport(NamedTuple):
-    """What a step measured before it moved the parameters.
+    """Values of a step before its update.
 
     Attributes:
-      loss: what is minimised.
+      loss: minimised loss.
       wrong: share of the rays whose silhouette is on the other side of 1/2 than the mask.
       slope: unweighted term of the field's slope.
       smoothness: unweighted term of the normals.
@@ -160,7 +155,7 @@ class OccupancyReport(NamedTuple):
 
 
 def init_state(key: Array, config: OccupancyTrainingConfig) -> OccupancyState:
-    """Returns the state of a training that has not begun."""
+    """Returns the initial state of a training."""
     params = occupancy_field.init(key, config.field)
     return OccupancyState(jnp.zeros((), jnp.int32), params, _optimizer(config).init(params))
 
@@ -174,17 +169,18 @@ def train_steps(
     *,
     config: OccupancyTrainingConfig,
 ) -> tuple[OccupancyState, OccupancyReport]:
-    """Takes steps until so many have been taken in all.
+    """Takes steps until the total number of steps is `last`.
 
     Args:
-      key: of the training; with the number of a step it fixes what the step draws.
-      state: consumed.
-      views: what is trained on.
-      last: number of steps after which to stop; any is one compiled program.
-      config: the training.
+      key: random key of the training; together with the step's number it determines the step's
+        draws.
+      state: current state, whose buffers are donated.
+      views: pixels to train on.
+      last: total number of steps after which to stop; any value uses the same compiled program.
+      config: settings of the training.
 
     Returns:
-      The state, and what the last step measured.
+      The new state, and the report of the last step.
     """
     step = functools.partial(_step, key, views=views, config=config)
     zero = jnp.zeros(())
@@ -228,7 +224,7 @@ def _step(
 
 
 def _pick(key: Array, views: Silhouettes, batch: int) -> Int[Array, " batch"]:
-    """Draws rays: half of them near outlines, the others anywhere."""
+    """Draws rays: half of them near outlines, the others from all pixels."""
     one, other = jax.random.split(key)
     near = jax.random.randint(one, (batch - batch // 2,), 0, views.near)
     anywhere = jax.random.randint(other, (batch // 2,), 0, views.rays)
@@ -254,7 +250,7 @@ def _measure(
     seen = views.seen.astype(logits.dtype)
     entropy = jnp.mean(jax.vmap(cross_entropy)(logits, seen))
     wrong = jnp.mean((logits > 0.0) != views.seen, dtype=logits.dtype)
-    # The last rays of a batch are drawn from anywhere, and look at the body from the front too.
+    # The last rays of a batch are drawn from all pixels, so they also see the front of the object.
     some = jax.tree.map(lambda x: x[-config.surface :], (views.chords, looked))
     points = jax.vmap(at)(some[0], some[1].surface)
     slope, smoothness = _shape_terms(keys[2], params, points, some[1].meets, config)
@@ -271,7 +267,7 @@ def _shape_terms(
     meets: Float[Array, " points"],
     config: OccupancyTrainingConfig,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Returns the terms of the field's slope, and of the normals where the surface is met."""
+    """Returns the term of the field's slope, and that of the normals at surface points."""
     cell = 1.0 / config.field.grid.finest
     gradient = jax.vmap(
         functools.partial(occupancy_field.slope, params, config.field, step=0.5 * cell)
@@ -299,18 +295,18 @@ def _optimizer(config: OccupancyTrainingConfig) -> optax.GradientTransformation:
 
 
 Progress = Callable[[int, OccupancyReport], None]
-"""Told the number of steps taken, and what the last one measured."""
+"""Called with the number of steps taken, and the report of the last one."""
 
-# Share of the views that may be wrong without the box around the body becoming too small.
+# Share of the masks that may be wrong without making the box around the object too small.
 _DOUBTED = 0.05
 
-# Cells that are added around the box, so that the surface stays within.
+# Cells added around the box, so that the surface stays inside.
 _RIM = 3
 
-# Rays are filled up to a multiple of this, so that scenes of about one size compile once.
+# Rays are padded to a multiple of this, so that scenes of similar size compile once.
 _ROOM = 1 << 17
 
-# Points whose values are computed at once, and steps between two reports.
+# Points evaluated at once, and steps between two reports.
 _SWEEP = 1 << 17
 _EVERY = 100
 
@@ -325,20 +321,21 @@ def fit(
     box: Box | None = None,
     progress: Progress | None = None,
 ) -> Grid:
-    """Returns the field of the body that masks show, trained on them, on a grid.
+    """Trains the field of an object on its masks and returns it on a grid.
 
     Args:
-      masks: one a view, true where the object is seen.
-      cameras: of the masks, in the same order.
-      config: the field and its training.
-      seed: of the first parameters and of what each step draws; the same one gives the same grid.
+      masks: one mask per view, true where the object is visible.
+      cameras: cameras of the masks, in the same order.
+      config: field and training schedule.
+      seed: seed of the initial parameters and of the draws of each step; equal seeds give equal
+        grids.
       resolution: cells along the longest edge of the box.
-      box: where the body lies; that of `search_box` if not given.
+      box: bounding box of the object; that of `search_box` if `None`.
       progress: called every hundred steps and at the end.
 
     Raises:
       ReconstructionError: if there is no mask, if a mask is empty or of another size, if no ray
-        meets the box, or if the field became empty.
+        hits the box, or if the field became empty.
     """
     check_masks(masks, cameras)
     if box is None:
@@ -356,18 +353,18 @@ def fit(
     if not np.any(values < 0.0):
         raise ReconstructionError(
             f"The field is empty after {config.steps} steps on {len(masks)} masks. Check masks and "
-            "poses with visual_hull.carve, which names the view that removes the most, or take "
-            "more steps at a lower rate."
+            "poses with visual_hull.carve, which names the view that removes the most, or train "
+            "with more steps and a lower rate."
         )
     return Grid(values.reshape(cells + 1), low, spacing)
 
 
 def search_box(masks: Bool[np.ndarray, "views h w"], cameras: Cameras) -> Box:
-    """Returns a box around what masks show, of which a twentieth may be wrong.
+    """Returns a bounding box of the object; one mask in twenty may be wrong.
 
     Args:
-      masks: one a view, true where the object is seen.
-      cameras: of the masks, in the same order.
+      masks: one mask per view, true where the object is visible.
+      cameras: cameras of the masks, in the same order.
 
     Raises:
       ReconstructionError: if nothing is left within `visual_hull.REACH`.
@@ -389,7 +386,7 @@ def _train(
 
 
 def _evaluate(params: Params, positions: Points, config: OccupancyFieldConfig) -> np.ndarray:
-    """Returns the field at points of the cube; the last sweep is filled up, to compile one size."""
+    """Returns the field at points of the cube; the last sweep is padded, to compile one size."""
     sweep = min(_SWEEP, len(positions))
     padded = np.pad(positions, ((0, -len(positions) % sweep), (0, 0))).astype(np.float32)
     parts = [
@@ -407,7 +404,7 @@ def _silhouettes(
     edge: float,
     band: float,
 ) -> Silhouettes:
-    """Returns the pixels whose rays cross a box, in the cube at a corner with an edge."""
+    """Returns the pixels whose rays cross a box, relative to a cube given by corner and edge."""
     parts = []
     for view, mask in enumerate(masks):
         rays = image_rays(cameras, view)
@@ -419,8 +416,8 @@ def _silhouettes(
     *chords, seen, close = (np.concatenate(x) for x in zip(*parts, strict=True))
     if len(seen) == 0:
         raise ReconstructionError(
-            f"No ray of {len(masks)} views meets the box between {np.round(box.low, 2)} and "
-            f"{np.round(box.high, 2)}. Check the poses, or give another box."
+            f"No ray of {len(masks)} views hits the box between {np.round(box.low, 2)} and "
+            f"{np.round(box.high, 2)}. Check the poses, or pass another box."
         )
     order = np.argsort(~close, kind="stable")
     away = np.linalg.norm(cameras.poses[:, :, 3] - 0.5 * (box.low + box.high), axis=-1)
@@ -430,7 +427,7 @@ def _silhouettes(
         Chord(*(np.pad(x, (room, (0, 0))[: x.ndim]) for x in chords)),
         np.pad(seen[order], room),
         np.int32(len(seen)),
-        # Without an outline all rays are as good.
+        # Without an outline all rays count as near.
         np.int32(close.sum() or len(seen)),
         np.float32(np.median(away) / cameras.focal / edge),
     )
@@ -439,10 +436,10 @@ def _silhouettes(
 def _crossing(
     origins: Float[np.ndarray, "h w 3"], directions: Float[np.ndarray, "h w 3"], box: Box
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Returns where rays enter and leave a box; the end is not above the start if they miss it."""
+    """Returns the distances at which rays enter and leave a box; the first is larger on a miss."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = [(side - origins) / directions for side in box]
-    # A ray within the plane of a side gives 0 / 0, and is as good as beside it.
+    # A ray within the plane of a side gives 0 / 0, which is ignored.
     near = np.nanmax(np.minimum(*ends), axis=-1)
     far = np.nanmin(np.maximum(*ends), axis=-1)
     return np.maximum(near, 0.0), far

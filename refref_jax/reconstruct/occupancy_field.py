@@ -1,32 +1,27 @@
-"""Occupancy field, and volume rendering of its silhouettes.
+"""Represents an object as an occupancy field and renders its silhouettes.
 
-An occupancy field: a body as the output of a small network, in the manner of UNISURF.
-
-Letters: positions `x` lie in the unit cube; `f(x)` is the network's output, negative inside the
-body and, held to a slope of 1 while it is trained, about the distance to the surface, in edges of
-the cube. The occupancy is `o(x) = 1 / (1 + exp(f(x) / b))` with the softness `b` of a step of the
-training. UNISURF learns the logit of `o` itself; here it is `-f / b`, so that `o` hardens on a
-schedule, and one field serves all softnesses. The surface is where `o = 1/2`, that is `f = 0`.
-
-Plain functions over positions; the linen module stays inside.
-
-Source: Oechsle, Peng and Geiger, UNISURF: Unifying Neural Implicit Surfaces and Radiance Fields for
-Multi-View Reconstruction (2021), section 3; Mueller et al., Instant NGP (2022), for the grid.
-
-What a ray sees of an occupancy field: the share of it that a body stops.
+Notation: positions `x` lie in the unit cube. `f(x)` is the output of a small network, as in
+UNISURF: negative inside the object and, because training keeps its slope near 1, about the distance
+to the surface, in edges of the cube. The occupancy is `o(x) = 1 / (1 + exp(f(x) / b))` with the
+softness `b` of a training step. UNISURF learns the logit of `o` directly; here it is `-f / b`, so
+that `o` hardens on a schedule and one field serves all softnesses. The surface is where `o = 1/2`,
+that is `f = 0`. All functions are pure functions of parameters and positions.
 
 Along a ray the samples `x_i`, ordered from the camera, have the occupancies `o_i`. The first
-occupied one stops the light, so each has the weight `w_i = o_i prod_{j<i} (1 - o_j)`, and the
-silhouette is the sum `S = sum_i w_i = 1 - prod_i (1 - o_i)`. Where `o = sigmoid(l)` the odds
-`S / (1 - S)` of two samples together are `e^l + e^m + e^(l+m)`, so that the logit of `S` is found
-without leaving logarithms: neither an empty ray nor a full one underflows.
+occupied sample stops the light, so each has the weight `w_i = o_i prod_{j<i} (1 - o_j)`, and the
+silhouette is the sum `S = sum_i w_i = 1 - prod_i (1 - o_i)`. With `o = sigmoid(l)` the odds `S / (1
+- S)` of two samples combine to `e^l + e^m + e^(l+m)`, so the logit of `S` is computed in
+logarithms: neither an empty nor a full ray underflows.
 
-Unlike that of a density, `S` grows with the number of samples near the surface: where a ray passes
-by at the distance `d` it is met by `n` samples of the odds `exp(-d / b)`, so outlines lie up to
-`b log n` outside of `f = 0`. Hence few samples, at the place that decides, and a softness `b` that
-ends far below a pixel. UNISURF likewise narrows its interval around the surface as it trains.
+Unlike the opacity of a density field, `S` grows with the number of samples near the surface: a ray
+that passes at the distance `d` has `n` samples with the odds `exp(-d / b)`, so outlines lie up to
+`b log n` outside of `f = 0`. Training therefore uses few samples, around the deepest point, and a
+softness `b` that ends far below a pixel. UNISURF likewise narrows its interval around the surface
+during training.
 
-Source: Oechsle, Peng and Geiger, UNISURF (2021), Eq 3 to 8.
+Sources: Oechsle, Peng and Geiger, UNISURF: Unifying Neural Implicit Surfaces and Radiance Fields
+for Multi-View Reconstruction (2021), section 3, Eq 3 to 8; Mueller et al., Instant NGP (2022), for
+the grid.
 """
 
 import dataclasses
@@ -43,9 +38,9 @@ from refref_jax import numerics
 from refref_jax.fields.hash_grid import HashGrid, HashGridConfig
 
 Params = Any
-"""A pytree of arrays, as `init` makes it."""
+"""A pytree of arrays, as returned by `init`."""
 
-# Every vertex of the finest level has an entry of its own.
+# The finest level is a dense grid: every vertex has an entry of its own.
 _GRID = HashGridConfig(levels=4, coarsest=8, finest=64, entries=1 << 19, features=2)
 
 # Corners of a regular tetrahedron, whose outer products sum to 4 times the identity.
@@ -57,9 +52,9 @@ class OccupancyFieldConfig:
     """Shape of an occupancy field.
 
     Attributes:
-      grid: the hash grid; its finest cells bound the detail of the surface.
-      width: units of the hidden layer.
-      start: radius of the ball that an untrained field is, in edges of the cube.
+      grid: hash grid; its finest cells limit the detail of the surface.
+      width: number of units of the hidden layer.
+      start: radius of the ball that an untrained field represents, in edges of the cube.
     """
 
     grid: HashGridConfig = _GRID
@@ -67,16 +62,16 @@ class OccupancyFieldConfig:
     start: float = 0.4
 
     def __post_init__(self) -> None:
-        """Checks the ball."""
+        """Validates the radius."""
         if not 0.0 < self.start <= 0.5:
             raise ValueError(
-                f"The field starts as a ball of radius {self.start} in a cube of edge 1. Choose a "
-                "radius above 0, at most 0.5."
+                f"The initial radius is {self.start}, in edges of the cube. Choose a radius above "
+                "0 and at most 0.5."
             )
 
 
 def init(key: Array, config: OccupancyFieldConfig) -> Params:
-    """Returns new parameters: a ball in the middle of the cube, but for noise."""
+    """Returns initial parameters, which represent a ball in the middle of the cube plus noise."""
     return _OccupancyField(config).init(key, jnp.zeros(3))
 
 
@@ -86,9 +81,9 @@ def signed(
     """Returns `f` at a point: negative inside, in edges of the cube.
 
     Args:
-      params: from `init`.
-      config: the same as there.
-      position: in the unit cube; beyond it the grid's outer cells go on as they end.
+      params: parameters of the field, from `init`.
+      config: configuration passed to `init`.
+      position: point of the unit cube; outside of it the outermost cells are extrapolated.
     """
     return _OccupancyField(config).apply(params, position)
 
@@ -96,17 +91,17 @@ def signed(
 def slope(
     params: Params, config: OccupancyFieldConfig, position: Float[Array, "3"], *, step: float
 ) -> Float[Array, "3"]:
-    """Returns the gradient of `f`, outward, by differences between corners of a tetrahedron.
+    """Returns the gradient of `f`, outward, by finite differences on a tetrahedron.
 
-    Differences see past the edges of the grid's cells, where the derivative jumps, and can be
-    derived once more by the parameters at the cost of four values. The error is about the step
-    times the second derivative.
+    Finite differences span the boundaries of the grid's cells, where the derivative jumps, and can
+    be differentiated with respect to the parameters at the cost of four values. The error is about
+    the step times the second derivative.
 
     Args:
-      params: from `init`.
-      config: the same as there.
-      position: in the unit cube.
-      step: of each coordinate, in edges of the cube; about a cell of the finest level.
+      params: parameters of the field, from `init`.
+      config: configuration passed to `init`.
+      position: point of the unit cube.
+      step: offset of each coordinate, in edges of the cube; about a cell of the finest level.
     """
     corners = jnp.asarray(_TETRAHEDRON)
     values = jax.vmap(functools.partial(signed, params, config))(position[None] + step * corners)
@@ -122,27 +117,27 @@ class _OccupancyField(nn.Module):
         ball = numerics.length(position - 0.5) - config.start
         features = HashGrid(config.grid, name="grid")(position, jnp.zeros_like(ball))
         hidden = nn.softplus(nn.Dense(config.width)(jnp.concatenate([features, position - 0.5])))
-        # From zero, so that the ball is all there is at first.
+        # Zero initial weights, so that the field starts as the ball alone.
         return ball + nn.Dense(1, kernel_init=nn.initializers.zeros)(hidden)[0]
 
 
 Signed = Callable[[Float[Array, "3"]], Float[Array, ""]]
-"""A field as a function of the position alone, see `occupancy_field`."""
+"""A field as a function of position only, see the module."""
 
-# Where the deepest place is looked for again, in spacings; how much finer that is; how often.
+# Samples around the deepest one, in spacings; factor by which they refine it; number of repeats.
 _NEARBY = (-1.0, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0)
 _FINER = 4.0
 _ROUNDS = 2
 
 
 class Chord(NamedTuple):
-    """The part of a ray that may meet the body; or many, along a leading axis.
+    """The part of a ray that may hit the object; or many, along a leading axis.
 
     Attributes:
-      origins: of the rays, in edges of the cube, from its corner.
+      origins: origins of the rays, in edges of the cube, relative to its corner.
       directions: unit vectors.
-      starts: where the ray enters the box that holds the body, in edges of the cube.
-      ends: where it leaves it, not before.
+      starts: distances at which the rays enter the bounding box, in edges of the cube.
+      ends: distances at which they leave it, not below the starts.
     """
 
     origins: Float[Array, "*rays 3"]
@@ -152,14 +147,14 @@ class Chord(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """A field along a chord, looked at coarsely.
+    """Result of a coarse scan of a field along a chord.
 
     Attributes:
-      deepest: distance along the ray of the least value.
-      spacing: within which of it the place is known.
-      surface: distance of the first crossing into the body, linear between samples; the deepest
-        place where there is none.
-      meets: 1 where there is such a crossing, else 0.
+      deepest: distance along the ray of the smallest value.
+      spacing: accuracy of that distance.
+      surface: distance of the first crossing into the object, linear between samples; the deepest
+        point if there is none.
+      meets: 1 if there is such a crossing, else 0.
     """
 
     deepest: Float[Array, ""]
@@ -174,14 +169,14 @@ def at(chord: Chord, distance: Float[Array, ""]) -> Float[Array, "3"]:
 
 
 def scan(signed: Signed, chord: Chord, shift: Float[Array, ""], *, samples: int) -> Scan:
-    """Looks at a field along one chord, without gradient: at even steps, then about the deepest.
+    """Samples a field along one chord, without gradient: evenly, then around the deepest sample.
 
-    A ray that cuts off an edge is inside for less than a step, hence the second look.
+    A ray that cuts off an edge is inside for less than a step, hence the second scan.
 
     Args:
-      signed: the field.
-      chord: one.
-      shift: of all samples, in steps, in `[0, 1)`.
+      signed: field to sample.
+      chord: a single chord.
+      shift: offset of all samples, in steps, in `[0, 1)`.
       samples: number of steps.
     """
     spacing = (chord.ends - chord.starts) / samples
@@ -213,8 +208,8 @@ def weights(occupancies: Float[Array, " samples"]) -> Float[Array, " samples"]:
 def silhouette_logit(logits: Float[Array, " samples"]) -> Float[Array, ""]:
     """Returns the logit of the silhouette of samples from the logits of their occupancies.
 
-    `sigmoid` of it is the sum of `weights`; value and gradient are finite for all finite logits
-    whose sum is.
+    Its `sigmoid` is the sum of `weights`; value and gradient are finite for all finite logits with
+    a finite sum.
     """
     return functools.reduce(_either, jnp.unstack(logits))
 
@@ -236,17 +231,17 @@ def logit_along(
     *,
     softness: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """Returns the logit of a chord's silhouette from samples about the field's deepest place.
+    """Returns the logit of a chord's silhouette from samples around the field's deepest point.
 
     Args:
-      signed: the field; gradients flow into it.
-      chord: one.
-      scanned: from `scan`.
-      shifts: of each sample within its share of the interval, in `[0, 1)`.
-      softness: `b`, in edges of the cube.
+      signed: field; gradients propagate into it.
+      chord: a single chord.
+      scanned: result of `scan`.
+      shifts: offset of each sample within its stratum, in `[0, 1)`.
+      softness: softness `b`, in edges of the cube.
     """
     samples = shifts.shape[0]
-    # A step of the scan to either side holds the deepest place itself.
+    # One step of the scan to either side contains the deepest point.
     across = (jnp.arange(samples, dtype=shifts.dtype) + shifts) * (2.0 / samples) - 1.0
     distances = jnp.clip(scanned.deepest + across * scanned.spacing, chord.starts, chord.ends)
     values = _along(signed, chord, distances)

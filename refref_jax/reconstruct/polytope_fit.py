@@ -1,24 +1,21 @@
 """Fits a convex polytope to the outlines of masks (NumPy only).
 
-Outlines of convex bodies in views (NumPy only).
+The outline of a convex object is the convex polygon around the images of its *corners*, the points
+whose hull it is. Image coordinates are in pixels, column to the right and row downwards; the centre
+of a pixel lies half a pixel from its edges. The corners of a polygon are listed in the order in
+which it turns.
 
-The outline of a convex body is the convex polygon around the images of its *corners*, the points
-whose hull it is. In pixels, column to the right and row downwards; the centre of a pixel lies half
-a pixel from its edges. A polygon's corners come in the order in which it turns.
+A visual hull bulges over a flat face, because few views lie in its plane: no mask shows the bulge,
+as the edge of the face lies on the same lines of sight. What the masks do show is the position of
+the corners. The simplest convex polytope with the outlines of the masks is therefore fitted. Among
+the hull's points, the one that sticks out furthest from the current outlines is added as a corner,
+as long as it does so by more than a tolerance. All corners are then moved by least squares until
+the outlines match those of the masks, and corners that do not affect any outline are removed. This
+is repeated with finer tolerances. A corner is visible in many views, so it is located far more
+accurately than an outline: to a hundredth of a pixel where the outlines are off by 0.14.
 
-The few corners whose hull has the outlines of masks (NumPy only).
-
-A visual hull bulges over a flat face, since few views lie in its plane: no mask shows the bulge,
-because the face's edge lies on the same lines of sight. What the masks do show is where the corners
-are. So the simplest convex body with their outlines is looked for: of the hull's points, the one
-that sticks out furthest of the outlines so far is taken as a further corner, as long as one does
-by more than a tolerance; all corners are moved until the outlines lie on those of the masks, by
-least squares; those without which no outline changes are left out. And again with a finer
-tolerance. A corner is seen in many views, so that it is known far better than an outline is: to a
-hundredth of a pixel where the outlines are off by 0.14.
-
-A curved rim becomes a ring of corners a few pixels apart, so that a cylinder can be had; a ball
-can not, of which each corner shows little.
+A curved rim becomes a ring of corners a few pixels apart, so cylinders can be fitted. Balls cannot,
+because each of their corners hardly sticks out.
 
 Related: Prince and Willsky, Reconstructing Convex Sets from Support Line Measurements (1990).
 """
@@ -49,10 +46,10 @@ class Samples(NamedTuple):
     """Points on a polygon's edges.
 
     Attributes:
-      pixels: column and row.
-      first: the corner where the edge begins.
-      second: the corner where it ends.
-      shares: of the second corner in the point.
+      pixels: column and row of each point.
+      first: corner at which the edge begins.
+      second: corner at which it ends.
+      shares: weight of the second corner in the point.
     """
 
     pixels: Float[np.ndarray, "points 2"]
@@ -64,14 +61,14 @@ class Samples(NamedTuple):
 def projection_slopes(
     seen: Projection, pose: Float[np.ndarray, "3 4"], cameras: Cameras
 ) -> Float[np.ndarray, "points 2 3"]:
-    """Returns the derivatives of column and row by points, pixels over world units.
+    """Returns the derivatives of column and row with respect to points, pixels per world unit.
 
-    They are zero where nothing is in front of the camera.
+    They are zero for points behind the camera.
 
     Args:
-      seen: the points as the camera sees them.
-      pose: of the camera.
-      cameras: that it is one of.
+      seen: projections of the points.
+      pose: pose of the camera.
+      cameras: cameras that share its intrinsics.
     """
     middle = 0.5 * np.array([cameras.width, cameras.height])
     x, y = ((seen.pixels - middle) / cameras.focal).T
@@ -85,16 +82,16 @@ def projection_slopes(
 
 
 def polygon(pixels: Pixels) -> Int[np.ndarray, " corners"]:
-    """Returns which points are corners of the convex polygon around all, in order.
+    """Returns the indices of the corners of the convex polygon around all points, in order.
 
     Raises:
-      QhullError: if they lie on a line.
+      QhullError: if the points are collinear.
     """
     return ConvexHull(pixels).vertices.astype(np.int64)
 
 
 def excess(corners: Polygon, pixels: Pixels) -> Values:
-    """Returns how far points lie outside of a convex polygon's nearest side, negative inside."""
+    """Returns the distances of points from a convex polygon's nearest side, negative inside."""
     along = np.roll(corners, -1, axis=0) - corners
     outward = np.stack([along[:, 1], -along[:, 0]], axis=-1)
     outward /= np.linalg.norm(along, axis=-1, keepdims=True)
@@ -102,7 +99,7 @@ def excess(corners: Polygon, pixels: Pixels) -> Values:
 
 
 def heights(corners: Polygon) -> Float[np.ndarray, " corners"]:
-    """Returns how far each corner lies from the line through its two neighbours."""
+    """Returns the distance of each corner from the line through its two neighbours."""
     before = np.roll(corners, 1, axis=0)
     across, side = np.roll(corners, -1, axis=0) - before, corners - before
     area = across[:, 0] * side[:, 1] - across[:, 1] * side[:, 0]
@@ -110,12 +107,12 @@ def heights(corners: Polygon) -> Float[np.ndarray, " corners"]:
 
 
 def along_edges(corners: Polygon, *, margin: float) -> Samples:
-    """Returns points on a polygon's edges, about one a pixel, some way from where it turns.
+    """Returns points on a polygon's edges, about one per pixel, with a margin at the corners.
 
     Args:
-      corners: of the polygon.
-      margin: pixels that are left out on both sides of a right angle; of another, in proportion to
-        one less the cosine by which the polygon turns; but no more than a third of an edge.
+      corners: corners of the polygon, in order.
+      margin: margin on both sides of a right angle, pixels; at other angles it is proportional to
+        one minus the cosine of the turning angle, and at most a third of an edge.
     """
     along = np.roll(corners, -1, axis=0) - corners
     length = np.linalg.norm(along, axis=-1)
@@ -132,7 +129,7 @@ def along_edges(corners: Polygon, *, margin: float) -> Samples:
 
 
 def look_up(image: Image, pixels: Pixels) -> tuple[Values, Pixels]:
-    """Returns an image's values between pixel centres, and their slopes over a pixel."""
+    """Returns an image's values interpolated between pixel centres, and their slopes per pixel."""
     column, row = pixels.T - 0.5
 
     def value(down: float, right: float) -> Values:
@@ -144,7 +141,7 @@ def look_up(image: Image, pixels: Pixels) -> tuple[Values, Pixels]:
 
 
 def outline_overlaps(corners: Corners, views: Views) -> Float[np.ndarray, " views"]:
-    """Returns the overlap of mask and outline in each view (IoU)."""
+    """Returns the overlap (IoU) of mask and projected hull in each view."""
     cameras = views.cameras
     images = (project(corners, pose, cameras).pixels for pose in cameras.poses)
     seen = [_fill(pixels[polygon(pixels)], cameras.height, cameras.width) for pixels in images]
@@ -152,7 +149,7 @@ def outline_overlaps(corners: Corners, views: Views) -> Float[np.ndarray, " view
 
 
 def _fill(corners: Polygon, height: int, width: int) -> Bool[np.ndarray, "h w"]:
-    """Returns which pixels have their centres in a convex polygon."""
+    """Returns the pixels whose centres lie in a convex polygon."""
     (x0, y0), (x1, y1) = corners.T, np.roll(corners, -1, axis=0).T
     row, column = np.arange(height)[:, None] + 0.5, np.arange(width) + 0.5
     crossed = (y0 <= row) != (y1 <= row)
@@ -164,63 +161,63 @@ def _fill(corners: Polygon, height: int, width: int) -> Bool[np.ndarray, "h w"]:
 
 
 MOST = 128
-"""Corners of the body that is looked for."""
+"""Largest number of corners."""
 
-# Pixels by which a point must stick out to become a corner, and a corner to stay one, in one round
-# each.
+# Tolerance of each round, in pixels: a point must stick out by it to become a corner, and a corner
+# to remain one.
 _TOLERANCES = (2.0, 1.0, 0.5, 0.3, 0.15)
 
-# The view that says how far a point sticks out, counted from the one that says most: so many less
-# one may be wrong.
+# Rank of the view that decides how far a point sticks out, counted from the largest value: up to
+# one view less than this may be wrong.
 _RANK = 3
 
-# The least overlap of outline and mask in the view in the middle: below it masks err by so much
-# that corners of a round body would pass for its shape.
+# Least median overlap of outline and mask. Below it the masks are so inaccurate that a round object
+# would be fitted by corners.
 _EXPLAINED = 0.97
 
-# Directions whose furthest points are the first corners.
+# Number of directions whose extreme points are the initial corners.
 _FIRST = 12
 
-# Least squares: steps in each round, the longest one in pixels, that after which it ends, and the
-# share by which every coordinate is held, as if outlines told so much more of where it is.
+# Gauss-Newton: steps per round; longest step in pixels; step in pixels below which a round ends;
+# damping of every coordinate, as a share of its diagonal entry.
 _STEPS = 12
 _LONGEST = 4.0
 _SHORTEST = 0.01
 _HOLD = 1e-3
 
-# Distances above this many pixels count by their size, not by its square (Huber).
+# Distances above this many pixels enter linearly instead of squared (Huber).
 _OUTLYING = 0.5
 
-# Pixels about a right angle that are left out, in blurs: there masks' outlines are cut back.
+# Margin at a right angle, in multiples of the blur: there the masks' outlines are cut back.
 _MARGIN = 2.0
 
 
 def fit_corners(mesh: Mesh, candidates: Mesh, views: Views, *, most: int = MOST) -> Mesh:
-    """Returns the hull of the fewest corners that have the outlines of masks.
+    """Returns the hull of the fewest corners that reproduce the outlines of masks.
 
-    Views with a part of the body behind the camera say nothing. Up to two of those that show a
-    corner may be wrong, in whatever way, without making or losing it, and move it little.
+    Views with a part of the object behind the camera are ignored. Up to two of the views that show
+    a corner may be arbitrarily wrong: they neither add nor remove it, and hardly move it.
 
     Args:
-      mesh: convex; what the corners must overlap with the masks better than.
-      candidates: of whose hull's vertices corners are chosen, such as the masks' visual hull.
+      mesh: convex mesh; the result must overlap better with the masks.
+      candidates: mesh whose hull's vertices are the candidate corners, such as the visual hull.
       views: masks and their cameras.
-      most: corners.
+      most: largest number of corners.
 
     Raises:
-      ReconstructionError: if the masks are too few, or do not gain.
+      ReconstructionError: if there are too few masks, or if the overlap does not improve.
     """
     views = _usable(candidates.vertices, views)
     if len(views.masks) < _RANK:
         raise ReconstructionError(
-            f"{len(views.masks)} views show the whole body from outside. Give {_RANK} or more."
+            f"{len(views.masks)} views show the complete object from outside. Pass {_RANK} or more."
         )
     try:
         corners = _find(hull(candidates).vertices, views, most)
         body = weigh_facets(of_points(corners))
     except QhullError as error:
         raise ReconstructionError(
-            "The corners lie in a plane. Keep the mesh, or check the masks."
+            "The corners are coplanar. Keep the mesh, or check the masks."
         ) from error
     old, new = (outline_overlaps(each.vertices, views) for each in (mesh, body))
     if new.mean() <= old.mean() or np.median(new) < _EXPLAINED:
@@ -232,7 +229,7 @@ def fit_corners(mesh: Mesh, candidates: Mesh, views: Views, *, most: int = MOST)
 
 
 def _find(points: Points, views: Views, most: int) -> Corners:
-    """Returns the corners by the finest tolerance that asks for no more than so many."""
+    """Returns the corners for the finest tolerance that needs at most `most` of them."""
     images = [signed_distances(mask).astype(np.float32) for mask in views.masks]
     points = points[_on_outlines(points, views)]
     directions = np.random.default_rng(0).normal(size=(_FIRST, 3))
@@ -252,7 +249,7 @@ def _find(points: Points, views: Views, most: int) -> Corners:
 
 
 def _usable(points: Points, views: Views) -> Views:
-    """Returns the views in front of which all points lie, and whose masks have an outline."""
+    """Returns the views that have all points in front of the camera and a nonempty outline."""
     cameras = views.cameras
     seen = [np.all(project(points, pose, cameras).depths > 0.0) for pose in cameras.poses]
     kept = np.array(seen) & ~views.masks.all(axis=(1, 2)) & views.masks.any(axis=(1, 2))
@@ -264,20 +261,20 @@ def _pixels(points: Points, views: Views) -> list[Pixels]:
 
 
 def _pixel(points: Points, views: Views) -> float:
-    """Returns the width of a pixel at a body, of the view in the middle, world units."""
+    """Returns the width of a pixel at the object in the median view, world units."""
     away = np.linalg.norm(views.cameras.poses[:, :, 3] - points.mean(axis=0), axis=-1)
     return float(np.median(away)) / views.cameras.focal
 
 
 def _on_outlines(points: Points, views: Views) -> np.ndarray:
-    """Returns which points are on the outline of all in some view."""
+    """Returns the indices of the points that lie on the outline in some view."""
     return np.unique(np.concatenate([polygon(pixels) for pixels in _pixels(points, views)]))
 
 
 def _insert(
     corners: Corners, points: Points, views: Views, tolerance: float, most: int
 ) -> Float[np.ndarray, "more 3"]:
-    """Returns corners and the points that stick out of their hull, but one more than `most`."""
+    """Adds the points that stick out of the corners' hull, until there are more than `most`."""
     images = _pixels(points, views)
     out = np.zeros((len(images), len(points)))
     changed = np.arange(len(images))
@@ -295,9 +292,9 @@ def _insert(
 
 
 def _prune(corners: Corners, views: Views, tolerance: float) -> Float[np.ndarray, "fewer 3"]:
-    """Returns corners without those that stick out by less than a tolerance, one after another.
+    """Removes the corners that stick out by less than a tolerance, one after another.
 
-    Of two that are nearer to each other than the blur the middle is left.
+    Two corners closer to each other than the blur are replaced by their midpoint.
     """
     corners = corners.copy()
     while len(corners) > 4:
@@ -320,7 +317,7 @@ def _prune(corners: Corners, views: Views, tolerance: float) -> Float[np.ndarray
 
 
 def _move(corners: Corners, views: Views, images: Sequence[Image]) -> Corners:
-    """Returns corners moved until their hull's outlines are those of the masks (Gauss-Newton)."""
+    """Moves corners until their hull's outlines match those of the masks (Gauss-Newton)."""
     pixel = _pixel(corners, views)
     longest = _LONGEST * pixel
     for _ in range(_STEPS):
@@ -340,9 +337,9 @@ def _move(corners: Corners, views: Views, images: Sequence[Image]) -> Corners:
 
 
 def _equations(corners: Corners, views: Views, images: Sequence[Image]) -> tuple[Values, csr_array]:
-    """Returns the distances of points on the outlines from the masks' in pixels, and their slopes.
+    """Returns distances of outline points from the masks' outlines in pixels, and their Jacobian.
 
-    The slopes are those by all coordinates of all corners.
+    The Jacobian is with respect to all coordinates of all corners.
     """
     distances, slopes = [], []
     for image, pose in zip(images, views.cameras.poses, strict=True):

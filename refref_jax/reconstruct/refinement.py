@@ -1,18 +1,15 @@
-"""Whether a mesh bounds a body, and whether that is still the same one (NumPy only).
+"""Cleans, smooths and remeshes a reconstructed mesh, so that rays can be traced through it.
 
-From a mesh cut out of a grid to one that light can be traced through (host).
+All stages are automatic. Small pieces are removed; ripples are smoothed; an object that is convex
+up to noise is made convex; a convex object with few corners is fitted to the outlines of the masks;
+edges are rounded; the surface is remeshed from its signed distances. All lengths are in world
+units, so that a finer grid only adds detail. A stage is skipped if it would empty the mesh, turn it
+inside out, tear it or change its volume too much. Runs on the host.
 
-The stages, none of which needs a hand: all pieces but the largest go, unless they are large;
-ripples are smoothed; a body that is convex but for noise becomes so; a convex body that few corners
-describe is fitted to the outlines of the masks; edges are rounded; the surface is meshed anew from
-its signed distances. All lengths are in world units, so that a finer grid changes nothing but
-detail. A stage that would empty the body, turn it inside out, tear it or change its volume much is
-left out.
-
-The paper's recipe, by hand (arXiv 2505.05848, section on R3F): convex hull if no vertex lies
-further from it than an unstated threshold; MeshLab's removal of pieces below 90 % of the diameter,
-which can remove the body; in Blender a bevel of 0.015, 100 smoothings of factor 1.0, which shrink
-the body by a length that depends on its edges, and a remesh at octree depth 8.
+The paper's manual recipe (arXiv 2505.05848, section on R3F): convex hull if no vertex lies further
+from it than an unstated threshold; MeshLab's removal of pieces below 90 % of the diameter, which
+can remove the object; in Blender a bevel of 0.015, 100 smoothings of factor 1.0, which shrink the
+object by a length that depends on its edges, and a remesh at octree depth 8.
 """
 
 import math
@@ -41,30 +38,30 @@ from refref_jax.reconstruct.smoothing import CREASE, denoise_within, diffuse
 
 
 def check_body(mesh: Mesh) -> None:
-    """Checks that a mesh bounds a body.
+    """Checks that a mesh bounds a volume.
 
     Raises:
-      ReconstructionError: if it is empty, open or turned inwards.
+      ReconstructionError: if it is empty, open or inside out.
     """
     if len(mesh.faces) == 0:
         raise ReconstructionError("The mesh is empty. Check the masks and the level of the grid.")
     if not is_closed(mesh.faces):
         raise ReconstructionError(
-            "The mesh is not closed. Cut it from a grid whose border is outside the body."
+            "The mesh is not closed. Extract it from a grid whose border is outside the object."
         )
     if volume(mesh.vertices, mesh.faces) <= 0.0:
         raise ReconstructionError(
-            "The mesh is turned inwards. Exchange two corners of every face, or negate the grid."
+            "The mesh is inside out. Swap two corners of every face, or negate the grid."
         )
 
 
 def objection(before: Mesh, after: Mesh, most: float) -> str:
-    """Returns why what was made of a body is no body, or another one; or nothing.
+    """Returns why a stage's result is unusable, or an empty string.
 
     Args:
-      before: a body.
-      after: what was made of it.
-      most: share of the volume by which the two may differ.
+      before: mesh before the stage.
+      after: mesh after the stage.
+      most: largest relative change of the volume.
     """
     if len(after.faces) == 0:
         return "nothing would be left"
@@ -74,7 +71,7 @@ def objection(before: Mesh, after: Mesh, most: float) -> str:
     if not math.isclose(new, old, rel_tol=most):
         return f"the volume would go from {old:.4g} to {new:.4g}"
     if _count_pieces(after) > _count_pieces(before):
-        return "the body would fall apart"
+        return "the object would fall apart"
     return ""
 
 
@@ -82,35 +79,37 @@ def _count_pieces(mesh: Mesh) -> int:
     return len(np.unique(pieces(mesh.faces, len(mesh.vertices))[mesh.faces[:, 0]]))
 
 
-# Spacings around a mesh that is sampled.
+# Margin around a sampled mesh, in spacings.
 _RIM = 3
 
-# As exact distances ask for, with the neighbours that a gradient looks at.
+# Refined distance from the surface for exact distances, including the neighbours that a gradient
+# needs.
 _NEAR = 1.1
 
-# How many times more the volume may change where outlines are held to the masks: that of a hull of
-# few views is far too large.
+# Factor on the allowed change of volume if corners are fitted to the masks, because the hull of few
+# views is far too large.
 _HELD = 4.0
 
-# A mesh is sampled at most this finely, in spacings along its diameter.
+# Finest sampling of a mesh, as spacings per diameter.
 _FINEST = 400
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """What is done to a mesh. A length of 0 leaves its stage out.
+    """Settings of the refinement. A length of 0 skips its stage.
 
     Attributes:
-      smallest_piece: share of the whole volume from which a piece is kept besides the largest.
-      denoising: diffusion length of the normals, which stops at creases, world units; a half or a
-        quarter of it where masks show that more would move outlines.
-      crease: angle between neighbouring faces at which it stops, radians.
-      smoothing: diffusion length of the vertices, which rounds creases too, world units.
-      convex_depth: a body is made convex if no vertex lies deeper below its hull, world units.
-      corners: as many as a convex body may have to be fitted to masks; 0 leaves the stage out.
+      smallest_piece: share of the total volume above which a piece is kept in addition to the
+        largest.
+      denoising: diffusion length of the normals, which stops at creases, world units; halved or
+        quartered if the masks show that it would move outlines.
+      crease: angle between neighbouring faces at which denoising stops, radians.
+      smoothing: diffusion length of the vertices, which also rounds creases, world units.
+      convex_depth: an object is made convex if no vertex lies deeper below its hull, world units.
+      corners: largest number of corners of a convex object fitted to masks; 0 skips the stage.
       rounding: radius to which convex edges are rounded, world units.
-      spacing: of the grid of signed distances from which the surface is meshed anew, world units.
-      volume_change: share of the volume that any stage may change; four times as much where
+      spacing: spacing of the signed distance grid from which the surface is remeshed, world units.
+      volume_change: largest relative change of the volume per stage; four times as much where
         corners are fitted to masks.
     """
 
@@ -133,16 +132,16 @@ PAPER = Refinement(
     rounding=0.015,
     spacing=2.0 * 2.1 / 2**8,
 )
-"""The paper's recipe in lengths, without its shrinking: 100 steps of edges of 0.03 diffuse 0.3."""
+"""The paper's recipe in lengths, without its shrinking: 100 steps on edges of 0.03 diffuse 0.3."""
 
 
 class Stage(NamedTuple):
-    """A mesh after a stage.
+    """Result of a stage.
 
     Attributes:
-      name: of the stage.
-      mesh: what it made, or what it was given if that would not do.
-      refused: why it was left out, or empty.
+      name: name of the stage.
+      mesh: mesh after the stage; unchanged if the stage was skipped.
+      refused: reason for skipping the stage, or an empty string.
     """
 
     name: str
@@ -151,17 +150,17 @@ class Stage(NamedTuple):
 
 
 def refine(mesh: Mesh, settings: Refinement, *, views: Views | None = None) -> tuple[Stage, ...]:
-    """Returns the mesh after each stage that the settings ask for; the last one is the result.
+    """Returns the mesh after each enabled stage; the last one is the result.
 
     Args:
-      mesh: closed and outward, such as `grids.find_isosurface` returns.
-      settings: see `Refinement`.
-      views: masks from which the mesh was made; without them no corners are fitted, and nothing
-        holds denoising back.
+      mesh: closed mesh with outward faces, such as `grids.find_isosurface` returns.
+      settings: settings of the stages.
+      views: masks from which the mesh was made; without them no corners are fitted, and denoising
+        is not limited.
 
     Raises:
-      ReconstructionError: if the mesh is empty, open or turned inwards; if it is to be meshed anew
-        and scikit-image is not installed; or if masks and cameras do not fit each other.
+      ReconstructionError: if the mesh is empty, open or inside out; if it is to be remeshed and
+        scikit-image is not installed; or if masks and cameras do not match.
     """
     check_body(mesh)
     if max(settings.rounding, settings.spacing) > 0.0:
@@ -175,9 +174,9 @@ def refine(mesh: Mesh, settings: Refinement, *, views: Views | None = None) -> t
 
 
 def keep_pieces(mesh: Mesh, *, smallest: float) -> Mesh:
-    """Returns the largest piece by volume, and those not below a share of the whole volume.
+    """Keeps the largest piece by volume, and those above a share of the total volume.
 
-    Cavities, which are pieces turned inwards, count by what they enclose.
+    Cavities, which are pieces turned inwards, count with the volume that they enclose.
     """
     label = pieces(mesh.faces, len(mesh.vertices))[mesh.faces[:, 0]]
     moments = np.sum(
@@ -190,19 +189,19 @@ def keep_pieces(mesh: Mesh, *, smallest: float) -> Mesh:
 
 
 def round_edges(mesh: Mesh, radius: float, *, spacing: float | None = None) -> Mesh:
-    """Returns a mesh whose convex edges are rounded to a radius: moved inwards by it, and back out.
+    """Rounds convex edges to a radius by moving the surface inwards and back outwards.
 
-    Parts thinner than twice the radius vanish; flat and concave ones stay as they are. The grid
-    cuts edges of the inner body off, so that a little more than the rounding is lost.
+    Parts thinner than twice the radius vanish; flat and concave parts are unchanged. The grid cuts
+    off the edges of the inner surface, so slightly more than the rounding is removed.
 
     Args:
-      mesh: closed.
-      radius: world units.
-      spacing: of the grids of signed distances; half the radius if not given, but no finer than a
-        400th of the diameter.
+      mesh: closed mesh.
+      radius: radius of the rounded edges, world units.
+      spacing: spacing of the signed distance grids; half the radius if `None`, but at least a 400th
+        of the diameter.
 
     Raises:
-      ReconstructionError: if nothing is that thick, or scikit-image is not installed.
+      ReconstructionError: if no part is thick enough, or scikit-image is not installed.
     """
     finest = diameter(mesh.vertices) / _FINEST
     spacing = max(0.5 * radius, finest) if spacing is None else spacing
@@ -210,15 +209,15 @@ def round_edges(mesh: Mesh, radius: float, *, spacing: float | None = None) -> M
 
 
 def remesh(mesh: Mesh, spacing: float, *, level: float = 0.0) -> Mesh:
-    """Returns the surface at a signed distance from a mesh, from a grid; its normals are gradients.
+    """Extracts the surface at a signed distance from a mesh, with the field's gradients as normals.
 
     Args:
-      mesh: closed.
-      spacing: of the grid, and about the length of the new edges, world units.
-      level: the distance, negative inside.
+      mesh: closed mesh.
+      spacing: spacing of the grid, about the length of the new edges, world units.
+      level: signed distance of the surface, negative inside.
 
     Raises:
-      ReconstructionError: if nothing is that deep inside, or scikit-image is not installed.
+      ReconstructionError: if no part is that deep, or scikit-image is not installed.
     """
     field = signed_distance(mesh)
     rim = _RIM * spacing + max(level, 0.0)
@@ -230,7 +229,7 @@ def remesh(mesh: Mesh, spacing: float, *, level: float = 0.0) -> Mesh:
 def _changes(
     settings: Refinement, first: Mesh, views: Views | None
 ) -> dict[str, Callable[[Mesh], Mesh]]:
-    """Returns the stages after the first, whose mesh is given, by name, in their order."""
+    """Returns the stages after the first by name, in order; `first` is the first stage's mesh."""
     changes: dict[str, Callable[[Mesh], Mesh]] = {}
     if settings.denoising > 0.0:
         changes["denoised"] = lambda mesh: denoise_within(
@@ -242,7 +241,7 @@ def _changes(
         changes["convex"] = lambda mesh: _made_convex(mesh, settings)
     if settings.corners > 0 and views is not None:
         check_masks(views.masks, views.cameras)
-        # Smoothing moves outlines, so corners are looked for on what was there before it.
+        # Smoothing moves outlines, so corners are selected on the mesh before smoothing.
         changes["corners"] = lambda mesh: (
             fit_corners(mesh, first, views, most=settings.corners) if is_convex(mesh) else mesh
         )
@@ -256,7 +255,7 @@ def _changes(
 
 
 def _stage(name: str, before: Mesh, change: Callable[[Mesh], Mesh], most: float) -> Stage:
-    """Returns what a change makes of a mesh, or the mesh and why it would not do."""
+    """Returns the changed mesh, or the unchanged mesh and the reason for skipping the stage."""
     try:
         after = change(before)
     except ReconstructionError as error:
@@ -273,7 +272,7 @@ def _made_convex(mesh: Mesh, settings: Refinement) -> Mesh:
 
 
 def _attempt(change: Callable[[], Mesh], mesh: Mesh) -> Mesh:
-    """Returns what a change makes, or nothing at all where it finds no body."""
+    """Returns the changed mesh, or an empty one if the change fails."""
     try:
         return change()
     except ReconstructionError:

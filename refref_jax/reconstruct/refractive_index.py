@@ -1,29 +1,24 @@
-"""Estimates a refractive index from images by gradient descent.
+"""Estimates the refractive index of a part from images by gradient descent.
 
-How well a geometry explains the pixels that see it, with gradients.
+A trained field, usually of the background, is rendered along the main branches of the light paths
+through the scene, and the colours are compared with the images. The error is differentiable with
+respect to the scene's indices of refraction, corners and normals.
 
-A field that is already there, usually of the background, is looked at along the main branches of
-light through the geometry, and what is seen is compared with the images. The comparison has
-gradients with respect to all of the geometry: indices of refraction, corners and normals.
+As a function of the index, the error has one narrow valley, about 0.15 wide for a ball whose
+background is as detailed as its images and much wider for flat faces, with ripples outside of it.
+The error is therefore first evaluated on a ladder of indices. Descents start from its best rungs
+and from the index that the user expects. They use only the sign of the derivative, with steps that
+grow while it stays the same and shrink when it changes (resilient propagation): near the critical
+angle single rays have unbounded derivatives, which must not determine the length of a step.
+
+The standard error is estimated from the curvature of the valley: views are split into groups, a
+parabola is fitted to each group, and the scatter of their minima is measured. It excludes errors
+common to all views, such as an object that is too large.
 
 This is one of the modules that call `jax.jit`.
 
-Source: paper (arXiv 2505.05848), photometric loss; the estimation by it is ours.
-
-The index of refraction of a part, by descent from many starts on what its pixels should show.
-
-The error of the pixels over the index has one narrow valley, about 0.15 wide for a ball whose
-background is as fine as its images, and much wider for flat faces; beside it there are ripples. So
-the error is looked at on a ladder of indices first, and the descent begins at its best rungs, and
-at the index that the user expects. Descents go by the sign of the derivative, with steps that grow
-while it stays and shrink when it turns (resilient propagation): near the critical angle single rays
-have derivatives without bound, and no step may be as long as these say.
-
-The error bar comes from the curvature of the valley: views are put into groups, each group's
-parabola has its own bottom, and the bottoms scatter. What is wrong in the same way for all views,
-such as a body that is too large, is not in it.
-
-Source: Riedmiller and Braun (1993), resilient propagation (RPROP).
+Sources: paper (arXiv 2505.05848), photometric loss; its use for the index is ours. Riedmiller and
+Braun (1993), resilient propagation (RPROP).
 """
 
 import dataclasses
@@ -46,14 +41,13 @@ from refref_jax.render import pixels
 from refref_jax.render.model import ModelConfig, Params
 
 TRACING = Budget(bends=12, reflections="all", cut=0.02)
-"""The tree's cut, and half of its bends: the main branches of few rays are longer."""
+"""Threshold as in the tree, half as many bends: the main branches of few rays are longer."""
 
 REFLECTIONS = 3
-"""At how many of the first surfaces a reflection is followed."""
+"""Number of first surfaces at which a reflection is followed."""
 
-# An error below this, in sRGB, counts by its square, one above it as it is: a hundredth is what a
-# trained field is wrong by anyway. Where geometry is wrong, a few rays see something else
-# altogether.
+# Errors below this, in sRGB, enter squared and larger ones linearly: a trained field is wrong by a
+# hundredth anyway, and where the geometry is wrong a few rays see something else.
 _NOISE = 0.01
 
 
@@ -61,9 +55,9 @@ class Evidence(NamedTuple):
     """Pixels, and the field that should explain them.
 
     Attributes:
-      params: of the field.
-      rays: of the pixels.
-      rgb: their true sRGB, in `[0, 1]`.
+      params: parameters of the field.
+      rays: rays of the pixels.
+      rgb: true sRGB of the pixels, in `[0, 1]`.
     """
 
     params: Params
@@ -72,7 +66,7 @@ class Evidence(NamedTuple):
 
 
 class Slope(NamedTuple):
-    """The mean error at an index, and its derivative."""
+    """Mean error at an index, and its derivative."""
 
     error: Float[Array, ""]
     slope: Float[Array, ""]
@@ -81,21 +75,21 @@ class Slope(NamedTuple):
 def errors(
     evidence: Evidence, geometry: Scene, *, config: ModelConfig, budget: Budget = TRACING
 ) -> Float[Array, " rays"]:
-    """Returns each pixel's error in sRGB: Charbonnier's, of the length of the difference.
+    """Returns the Charbonnier error of each pixel in sRGB, of the length of the difference.
 
     Args:
-      evidence: the pixels.
-      geometry: what bends their light.
-      config: of the field's model; its footprint must be `cone`.
-      budget: which light is followed, see `differentiable_paths`.
+      evidence: pixels and the field to compare with.
+      geometry: scene that refracts their rays.
+      config: configuration of the field's model; its footprint must be `cone`.
+      budget: path settings, see `differentiable_paths`.
 
     Raises:
-      ValueError: if the model's footprint is another.
+      ValueError: if the model's footprint is not `cone`.
     """
     if config.footprint != "cone":
         raise ValueError(
-            f"The model's footprint is {config.footprint!r}, but single paths carry no derivatives "
-            "across the pixel. Train the background with 'cone'."
+            f"The model's footprint is {config.footprint!r}, but single paths have no derivatives "
+            "across the pixel. Train the background with the footprint 'cone'."
         )
     count = evidence.rays.radii.shape[0]
     follow = functools.partial(
@@ -122,7 +116,7 @@ def errors_at_index(
     part: int,
     config: ModelConfig,
 ) -> Float[Array, " rays"]:
-    """Returns `errors` with an index of refraction for one part."""
+    """Returns `errors` for a given index of refraction of one part."""
     return errors(evidence, with_index(geometry, index, part=part), config=config)
 
 
@@ -135,7 +129,7 @@ def slope_at_index(
     part: int,
     config: ModelConfig,
 ) -> Slope:
-    """Returns the mean of `errors_at_index` and its derivative, by one pass forwards."""
+    """Returns the mean of `errors_at_index` and its derivative, in forward mode."""
 
     def mean(at: Float[Array, ""]) -> Float[Array, ""]:
         return jnp.mean(errors_at_index(at, evidence, geometry, part=part, config=config))
@@ -144,12 +138,12 @@ def slope_at_index(
 
 
 LOWEST, HIGHEST = 1.01, 2.8
-"""Indices that are believed: those of transparent bodies in air."""
+"""Range of plausible indices: transparent materials in air."""
 
-# How steps change where the derivative keeps its sign, and where it does not (or the error grows).
+# Factors on the step if the derivative keeps its sign, and if it does not (or the error grows).
 _GROW, _SHRINK = 1.3, 0.4
 
-# Half the width of the parabola that the error bar is taken from, and groups of views.
+# Half-width of the parabola for the standard error, and number of groups of views.
 _APART = 0.01
 _PARABOLA = (-_APART, 0.0, _APART)
 _GROUPS = 10
@@ -157,16 +151,16 @@ _GROUPS = 10
 
 @dataclasses.dataclass(frozen=True)
 class IndexSearch:
-    """How an index is looked for.
+    """Settings of the search for an index.
 
     Attributes:
-      lowest: rung of the ladder.
-      highest: rung of the ladder.
-      spacing: of the rungs; more than half a valley misses it.
-      descents: from how many of the best rungs to descend.
+      lowest: lowest rung of the ladder.
+      highest: highest rung of the ladder.
+      spacing: distance between rungs; more than half the width of a valley may miss it.
+      descents: number of best rungs from which to descend.
       step: length of a descent's first step.
-      tolerance: length of the last one.
-      most: steps of a descent.
+      tolerance: length of a descent's last step.
+      most: largest number of steps of a descent.
     """
 
     lowest: float = 1.2
@@ -178,11 +172,11 @@ class IndexSearch:
     most: int = 25
 
     def __post_init__(self) -> None:
-        """Checks the ladder."""
+        """Validates the ladder."""
         if not LOWEST <= self.lowest < self.highest <= HIGHEST:
             raise ReconstructionError(
-                f"The index is looked for from {self.lowest} to {self.highest}. Look for it within "
-                f"{LOWEST} and {HIGHEST}."
+                f"The range of indices is {self.lowest} to {self.highest}. Choose lowest and "
+                f"highest within {LOWEST} and {HIGHEST}."
             )
         if min(self.spacing, self.step, self.tolerance) <= 0.0 or min(self.descents, self.most) < 1:
             raise ReconstructionError(
@@ -191,11 +185,11 @@ class IndexSearch:
 
 
 class Descent(NamedTuple):
-    """One way down.
+    """Iterates of one descent.
 
     Attributes:
-      indices: where it went, the start first and the lowest place last.
-      errors: mean error there.
+      indices: visited indices, the start first and the best one last.
+      errors: mean errors at these indices.
     """
 
     indices: tuple[float, ...]
@@ -203,14 +197,14 @@ class Descent(NamedTuple):
 
 
 class IndexEstimate(NamedTuple):
-    """An index of refraction.
+    """An estimate of an index of refraction.
 
     Attributes:
-      index: the best.
-      deviation: one standard deviation; `inf` if the error has no valley there.
-      error: mean error of the pixels there, sRGB.
-      ladder: indices and errors that were looked at first.
-      descents: from the best rungs, and from the user's start; the best one first.
+      index: best index.
+      deviation: standard deviation of the index; `inf` if the error has no valley there.
+      error: mean error of the pixels at the index, sRGB.
+      ladder: indices and errors of the ladder.
+      descents: descents from the best rungs, and from the user's start; the best one first.
     """
 
     index: float
@@ -231,23 +225,23 @@ def estimate_index(
     start: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> IndexEstimate:
-    """Finds the index of refraction of one part with which its pixels are explained best.
+    """Estimates the index of refraction of one part that best explains its pixels.
 
     Args:
-      evidence: pixels that see the part, and a field of what is behind it.
-      geometry: of the scene; the part's own index is not used.
-      views: the image of each ray, for the error bar.
+      evidence: pixels that see the part, and a field of the background.
+      geometry: scene; the part's own index is ignored.
+      views: image number of each ray, for the standard error.
       part: number of the part.
-      config: of the field's model.
-      search: how.
-      start: an index that the user expects, from which to descend in any case.
-      progress: told the rungs and steps done, and how many there may be.
+      config: configuration of the field's model.
+      search: settings of the search.
+      start: index that the user expects, from which a descent always starts.
+      progress: called with the number of evaluations done, and their largest number.
 
     Raises:
-      ReconstructionError: if there is no pixel, or no error is finite.
+      ReconstructionError: if there are no pixels, or no error is finite.
     """
     if not len(views):
-        raise ReconstructionError("No pixel sees the body. Check the masks and the cameras.")
+        raise ReconstructionError("No pixel sees the object. Check the masks and the cameras.")
     rungs = _rungs(search)
     show = _counter(progress, most_looks(search, start=start))
 
@@ -277,7 +271,7 @@ def estimate_index(
 
 
 def most_looks(search: IndexSearch, *, start: float | None = None) -> int:
-    """Returns how often the error of the pixels is looked at, at most."""
+    """Returns the largest number of evaluations of the error."""
     descents = search.descents + (start is not None)
     return len(_rungs(search)) + search.most * descents + len(_PARABOLA)
 
@@ -285,12 +279,12 @@ def most_looks(search: IndexSearch, *, start: float | None = None) -> int:
 def descend(
     slope: Callable[[float], tuple[float, float]], start: float, search: IndexSearch
 ) -> Descent:
-    """Goes down from a start by the sign of the derivative.
+    """Descends from a start by the sign of the derivative.
 
     Args:
-      slope: gives error and derivative at an index.
-      start: an index; moved into what is believed.
-      search: lengths of steps, and their number.
+      slope: function that returns error and derivative at an index.
+      start: initial index, clipped to the plausible range.
+      search: settings of the search.
     """
     at = min(max(start, LOWEST), HIGHEST)
     error, derivative = slope(at)
@@ -312,12 +306,12 @@ def descend(
 def scatter_of_bottoms(
     errors: Float[np.ndarray, "3 rays"], views: Int[np.ndarray, " rays"], apart: float
 ) -> float:
-    """Returns the standard deviation of a valley's bottom, from those of groups of views.
+    """Returns the standard deviation of a valley's minimum, from groups of views.
 
     Args:
-      errors: of each ray, `apart` below the bottom, there, and above.
-      views: of each ray; those of a view are of one group.
-      apart: in the index.
+      errors: error of each ray at three indices: `apart` below the minimum, at it, and above.
+      views: view of each ray; all rays of a view are in the same group.
+      apart: distance between the indices.
     """
     names, number = np.unique(views, return_inverse=True)
     groups = min(_GROUPS, len(names))
@@ -326,7 +320,7 @@ def scatter_of_bottoms(
     whole = below.mean() + above.mean() - 2.0 * here.mean()
     if groups < 2 or not whole > 0.0:
         return math.inf
-    # The curvature of all groups together, since that of one may be none.
+    # The curvature of all groups together, since that of a single group may be zero.
     bottoms = -0.5 * apart * (above - below) / whole
     return float(bottoms.std(ddof=1) / math.sqrt(groups))
 
@@ -337,7 +331,7 @@ def _rungs(search: IndexSearch) -> tuple[float, ...]:
 
 
 def _lowest_rungs(heights: Sequence[float], count: int) -> list[int]:
-    """Returns the lowest rungs, of which no two are neighbours: these share their valley."""
+    """Returns the lowest rungs that are not adjacent to each other, as those share a valley."""
     chosen: list[int] = []
     for rung in np.argsort(np.where(np.isfinite(heights), heights, np.inf), kind="stable"):
         if len(chosen) < count and all(abs(int(rung) - other) > 1 for other in chosen):

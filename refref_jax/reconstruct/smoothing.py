@@ -1,25 +1,18 @@
-"""Smooths and denoises closed meshes, keeping their volume.
-
-Smoothing of closed meshes by diffusion over a length, the volume kept (NumPy only).
+"""Smooths and denoises closed meshes over a length, keeping their volume (NumPy only).
 
 Diffusion over a length `l` damps a ripple of wavelength `w` by `exp(-2 (pi l / w)^2)`: `l` is the
 standard deviation of the heat kernel, in world units, after a time `l^2 / 2`. It is discretised by
-finite elements (cotangent weights, areas) and taken in implicit steps, so that the result depends
-on neither the length of the edges nor their number, where counted steps towards the neighbours'
-mean do.
+finite elements (cotangent weights, areas) and integrated in implicit steps. Unlike repeated
+averaging over neighbours, the result depends on neither the length nor the number of the edges.
 
-`diffuse` moves the vertices, and rounds whatever is smaller than the length. `denoise` diffuses the
-normals of faces, less across sharp edges, and then fits the vertices to them: ripples go, edges
-stay.
+`diffuse` moves the vertices, and rounds all detail smaller than the length. `denoise` diffuses the
+normals of faces, less across sharp edges, and then fits the vertices to them: ripples vanish, edges
+remain. It cuts off fillets narrower than the length, so `denoise_within` shortens the length if the
+masks disagree.
 
 Sources: Desbrun et al., Implicit Fairing of Irregular Meshes (1999); Yu et al., Mesh Editing with
 Poisson-Based Gradient Field Manipulation (2004); Perona and Malik (1990) for the weight of an
 angle.
-
-Denoises a body as far as the outlines in its masks allow (host).
-
-Denoising turns normals to those around, over a length. A fillet that is narrower than the length is
-cut off by it, which no noise excuses and masks show.
 """
 
 import numpy as np
@@ -47,38 +40,38 @@ from refref_jax.reconstruct.mesh_distance import silhouette_overlap
 Pairs = Int[np.ndarray, " pairs"]
 
 CREASE = np.radians(15.0)
-"""The angle between neighbouring faces, in radians, over which normals hardly diffuse."""
+"""Angle between neighbouring faces across which normals hardly diffuse, radians."""
 
 # Implicit steps of one diffusion: four come within a few percent of the heat kernel.
 _STEPS = 4
 
-# Slivers have cotangents without bound; these keep the system well conditioned.
+# Slivers have unbounded cotangents; these bounds keep the system well conditioned.
 _SMALLEST, _LARGEST = 0.02, 20.0
 
 _TOLERANCE = 1e-6
 _MOST_ITERATIONS = 500
 
-# Vertices are held to where they were on lengths above this many diffusion lengths.
+# Vertices are held in place on lengths above this many diffusion lengths.
 _HOLD = 4.0
 
-# The shortest distance between middles of faces, as a share of the edge between them.
+# Smallest distance between centres of faces, as a share of the edge between them.
 _NEAREST_MIDDLES = 0.2
 
 _VOLUME_STEPS = 4
 
-# The least area that a face counts for, as a share of the mean: one of none would have no normal.
+# Smallest area of a face, as a share of the mean: a face of zero area would have no normal.
 _LIGHTEST = 1e-6
 
-# Faces whose normal would turn by more, by its cosine, stay: the shortest arc is not known there.
+# Faces whose normal would turn further are unchanged (given as a cosine): the arc is ambiguous.
 _TURNED_OVER = -0.9
 
 
 def diffuse(mesh: Mesh, length: float) -> Mesh:
-    """Returns a mesh whose vertices diffused over a length, moved back along normals to its volume.
+    """Diffuses vertices over a length, then moves them along normals to restore the volume.
 
     Args:
-      mesh: closed.
-      length: world units; 0 returns the mesh. Parts thinner than it may vanish.
+      mesh: closed mesh.
+      length: diffusion length, world units; 0 returns the mesh. Thinner parts may vanish.
     """
     if length <= 0.0:
         return mesh
@@ -89,17 +82,17 @@ def diffuse(mesh: Mesh, length: float) -> Mesh:
 
 
 def denoise(mesh: Mesh, length: float, *, crease_angle: float = CREASE, rounds: int = 2) -> Mesh:
-    """Returns a mesh whose normals diffused over a length but not across creases.
+    """Diffuses normals over a length, but not across creases, and fits the vertices to them.
 
-    An angle `a` between faces weighs `exp(-(a / crease_angle)^2)`, measured anew at each of four
-    steps. Shape on lengths above four diffusion lengths stays as it was, and so does the volume.
+    An angle `a` between faces has the weight `exp(-(a / crease_angle)^2)`, recomputed at each of
+    four steps. Shape on lengths above four diffusion lengths and the volume are preserved.
 
     Args:
-      mesh: closed.
-      length: world units; 0 returns the mesh.
-      crease_angle: radians; above the noise of neighbours' normals, and below the angles by which
-        marching cubes takes an edge in several steps.
-      rounds: times that normals and vertices take turns.
+      mesh: closed mesh.
+      length: diffusion length, world units; 0 returns the mesh.
+      crease_angle: angle at which diffusion stops, radians; above the noise of neighbouring
+        normals, and below the angles by which marching cubes splits an edge into several steps.
+      rounds: number of alternations between normals and vertices.
     """
     if length <= 0.0:
         return mesh
@@ -111,7 +104,7 @@ def denoise(mesh: Mesh, length: float, *, crease_angle: float = CREASE, rounds: 
 
 
 def keep_volume(vertices: Vertices, faces: Faces, reference: Mesh) -> Vertices:
-    """Returns vertices moved evenly along their normals until the volume is that of a reference."""
+    """Moves vertices equally along their normals until the volume is that of a reference."""
     wanted = volume(reference.vertices, reference.faces)
     for _ in range(_VOLUME_STEPS):
         outward = vertex_vectors(vertices, faces)
@@ -122,7 +115,7 @@ def keep_volume(vertices: Vertices, faces: Faces, reference: Mesh) -> Vertices:
 
 
 def cotangent_weights(vertices: Vertices, faces: Faces) -> csr_array:
-    """Returns the stiffness matrix of the surface's Laplacian: positive semi-definite, no units."""
+    """Returns the stiffness matrix of the Laplacian: positive semi-definite, dimensionless."""
     weight = 0.5 * _cotangents(vertices, faces)
     first, second = faces[:, [1, 2, 0]].ravel(), faces[:, [2, 0, 1]].ravel()
     return _stiffness(first, second, weight.ravel(), len(vertices))
@@ -137,9 +130,9 @@ def vertex_areas(vertices: Vertices, faces: Faces) -> Float[np.ndarray, " vertic
 def solve(
     matrix: csr_array, right: Float[np.ndarray, "n c"], start: Float[np.ndarray, "n c"]
 ) -> Float[np.ndarray, "n c"]:
-    """Returns the solution of a positive definite system for several right sides."""
+    """Solves a positive definite system for several right-hand sides."""
     scale = matrix.diagonal()
-    # Isolated vertices have no weight at all.
+    # Isolated vertices have zero weight.
     inverse = diags_array(np.divide(1.0, scale, out=np.ones_like(scale), where=scale > 0.0))
     options = {"rtol": _TOLERANCE, "maxiter": _MOST_ITERATIONS, "M": inverse}
     columns = range(right.shape[1])
@@ -162,7 +155,7 @@ def _implicit(
 
 
 def _cotangents(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "faces 3"]:
-    """Returns the cotangent at each corner, within bounds."""
+    """Returns the cotangent at each corner, clipped."""
     corners = vertices[faces]
     one, other = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
     sine = np.linalg.norm(np.cross(one, other), axis=-1)
@@ -174,7 +167,7 @@ def _cotangents(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "faces 3"
 def _diffused_normals(
     vertices: Vertices, faces: Faces, length: float, crease_angle: float
 ) -> Float[np.ndarray, "faces 3"]:
-    """Returns unit normals of faces after diffusion that creases hold up."""
+    """Returns unit normals of faces after diffusion that stops at creases."""
     normals = face_normals(vertices[faces])
     mass = np.linalg.norm(face_vectors(vertices, faces), axis=-1)
     mass = np.maximum(mass, _LIGHTEST * mass.mean())
@@ -196,7 +189,7 @@ def _closeness(
 
 
 def _bond(vertices: Vertices, faces: Faces) -> tuple[Pairs, Pairs, Float[np.ndarray, " pairs"]]:
-    """Returns the two faces at each edge, and its length over the way between their middles."""
+    """Returns the two faces at each edge, and its length over the distance of their centres."""
     a, b, ends = neighbours(faces)
     edge = vertices[ends]
     middles, ridge = vertices[faces].mean(axis=1), edge.mean(axis=1)
@@ -221,11 +214,12 @@ def _stiffness(
 def _fit_to_normals(
     vertices: Vertices, faces: Faces, normals: Float[np.ndarray, "faces 3"], length: float
 ) -> Vertices:
-    """Returns the vertices whose faces come closest to those turned onto given normals."""
+    """Returns the vertices whose faces best match the faces rotated onto given normals."""
     corners = vertices[faces]
     turned = _turn(corners, face_normals(corners), normals)
     cotangent = 0.5 * _cotangents(vertices, faces)
-    # At corner i the edges to the next and the previous one weigh by the angles opposite to them.
+    # At corner i the edges to the next and the previous corner are weighted by their opposite
+    # angles.
     next_, previous = np.roll(turned, -1, axis=1), np.roll(turned, 1, axis=1)
     force = np.roll(cotangent, 1, axis=1)[..., None] * (turned - next_)
     force += np.roll(cotangent, -1, axis=1)[..., None] * (turned - previous)
@@ -240,11 +234,12 @@ def _turn(
     normals: Float[np.ndarray, "f 3"],
     onto: Float[np.ndarray, "f 3"],
 ) -> Float[np.ndarray, "f 3 3"]:
-    """Turns triangles about their middles by the least rotation between two normals."""
+    """Rotates triangles about their centres by the smallest rotation between two normals."""
     middle = corners.mean(axis=1, keepdims=True)
     axis = np.cross(normals, onto)
     cosine = np.sum(normals * onto, axis=-1)
-    # Rodrigues' formula for the shortest arc; faces turned right over, or without normal, stay.
+    # Rodrigues' formula for the shortest arc; reversed faces and those without normal are
+    # unchanged.
     turns = cosine > _TURNED_OVER
     share = np.divide(1.0, 1.0 + cosine, out=np.zeros_like(cosine), where=turns)
     from_middle = corners - middle
@@ -254,12 +249,12 @@ def _turn(
     return middle + from_middle + across + share[:, None, None] * twice
 
 
-# Shares of the length that are tried, and the overlap with masks that it may cost: smooth bodies
+# Shares of the length that are tried, and the loss of mask overlap that is accepted: smooth objects
 # lose a tenth of that, those with fillets twice as much.
 _SHARES = (1.0, 0.5, 0.25)
 _LOST = 0.01
 
-# Views in which the overlap is looked at.
+# Number of views in which the overlap is measured.
 _LOOKS = 20
 
 
@@ -267,13 +262,13 @@ def denoise_within(mesh: Mesh, length: float, *, crease_angle: float, views: Vie
     """Denoises over the longest of a few lengths that the masks allow.
 
     Args:
-      mesh: closed.
-      length: the longest, world units; a half and a quarter of it are tried too.
-      crease_angle: at which denoising stops, radians.
-      views: masks; without them the longest is taken.
+      mesh: closed mesh.
+      length: longest length, world units; half and a quarter of it are tried too.
+      crease_angle: angle at which denoising stops, radians.
+      views: masks that limit the length; the longest length is used without them.
 
     Raises:
-      ReconstructionError: if they allow none.
+      ReconstructionError: if the masks allow none of the lengths.
     """
     few = None if views is None else some_of(views, _LOOKS)
     least = -np.inf if few is None else silhouette_overlap(mesh, *few).mean() - _LOST

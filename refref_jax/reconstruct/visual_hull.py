@@ -1,16 +1,17 @@
-"""The largest body that fits a set of masks (NumPy only).
+"""Carves the visual hull, the largest object that fits a set of masks (NumPy only).
 
-A view carves away what projects outside of its mask. The hull's field at a point is the largest
-over views of the signed distance to the outline, in pixels, times planar depth over focal length:
-the zero set of that maximum is the exact hull, and near it the field is a distance in world units.
+Each view carves away the points that project outside of its mask. The hull's field at a point is
+the maximum over views of the signed distance to the outline, in pixels, times planar depth over
+focal length: the zero set of that maximum is the exact hull, and near it the field is a distance in
+world units.
 
-The hull of finitely many views encloses the body: a ball becomes tangent cones. No view sees into a
-cavity, or into a dent that no line of sight grazes, and those stay filled.
+The hull of finitely many views encloses the object: a ball becomes tangent cones. Cavities, and
+dents that no line of sight grazes, are invisible in outlines and remain filled.
 
-Outlines are known to a fraction of a pixel, and at every point the view that errs most inwards
-wins. So the hull would lie within the true one: by the error of one outline where a surface is
-smooth, and by twice that at an edge, which many views have on their outlines. A tolerance in pixels
-undoes it.
+Outlines are known to a fraction of a pixel, and at every point the view with the largest inward
+error decides. The hull would therefore lie inside the true one: by the error of one outline where
+the surface is smooth, and by twice that at an edge, which is on the outline of many views. A
+tolerance in pixels compensates for this.
 
 Source: Laurentini, The Visual Hull Concept for Silhouette-Based Image Understanding (1994).
 """
@@ -27,28 +28,28 @@ from refref_jax.reconstruct.grids import Box, Field, Grid, Points, Values, latti
 from refref_jax.reconstruct.masks import BLUR, check_masks, signed_distances
 
 REACH = 2.1
-"""Half the edge of the cube around the origin in which a body is looked for, world units."""
+"""Half the edge of the cube around the origin that is searched for the object, world units."""
 
 TOLERANCE = 0.05
 """Pixels outside of an outline up to which nothing is carved: about half a standard error."""
 
 LEAST_RESOLUTION = 10
-"""Cells of a grid, of which some are its rim."""
+"""Smallest number of cells of a grid, including its rim."""
 
 _LIMITLESS = (
-    "What {count} masks leave reaches out of the cube from -{reach} to {reach} around the origin, "
-    "in which a body is looked for. Give masks from other sides, if few views see it; else scale "
-    "and shift the poses, so that the object lies within."
+    "The hull of {count} masks extends outside the cube from -{reach} to {reach} around the "
+    "origin, which is searched for the object. Add masks from other directions if there are "
+    "few; otherwise scale and shift the poses, so that the object lies inside."
 )
 
-# What stands for a distance where there is no outline, so that a grid can be interpolated.
+# Distance used where there is no outline, so that a grid can be interpolated.
 _FAR = 4.0 * REACH
 
-# Cells along the cube's edge when a box is looked for, and how many of them are added around it.
+# Cells along the cube's edge in the search for a box, and cells added around this box.
 _SEARCH = 48
 _MARGIN = 1.0
 
-# Cells that are added around the box in the end, so that the surface stays within.
+# Cells added around the final box, so that the surface stays inside.
 _RIM = 3
 
 
@@ -65,38 +66,40 @@ def carve(
 ) -> Grid:
     """Returns the field of the masks' hull on a grid.
 
-    A point outside of a view's image or behind its camera is not carved by that view; a point that
-    no more views see than are passed over is empty.
+    A view does not carve points outside of its image or behind its camera. A point that at most
+    `outliers` views see is empty.
 
-    `outliers` views may be wrong: at each point the that many largest values are passed over. A
-    mask that misses part of the body, or is shifted, then does no harm. It costs accuracy
-    everywhere: what only so many views see is no longer carved, so that the body grows between
-    tangent cones. Nor is it a vote among near views: masks that all err alike are believed.
+    Up to `outliers` views may be wrong: at each point the `outliers` largest values are ignored, so
+    that a mask that misses part of the object, or is shifted, does no harm. This costs accuracy
+    everywhere: the surplus that at most so many views would carve remains, so the object grows
+    between tangent cones. It is not a vote among nearby views: equal errors in many masks are not
+    detected.
 
     Args:
-      masks: one a view, true where the object is seen.
-      cameras: of the masks, in the same order.
+      masks: one mask per view, true where the object is visible.
+      cameras: cameras of the masks, in the same order.
       resolution: cells along the longest edge of the box, at least `LEAST_RESOLUTION`.
-      box: where the body lies; found from the masks within `REACH` of the origin if not given.
-      outliers: values passed over at each point.
+      box: bounding box of the object; derived from the masks within `REACH` of the origin if
+        `None`.
+      outliers: number of largest values ignored at each point.
       tolerance: pixels outside of an outline up to which nothing is carved, see the module.
-      blur: of the outlines in pixels, see `masks`.
-      names: what the masks are called in errors; their numbers if not given.
+      blur: blur of the outlines in pixels, see `masks`.
+      names: names of the masks in errors; their numbers if `None`.
 
     Raises:
-      ReconstructionError: if there is no mask, if a mask is empty, of another size or no booleans,
-        if a pose is not finite, if as many views are passed over as there are, if the grid is too
-        coarse, if nothing is left, or if what is left reaches out of the cube of `REACH` (as with
-        one view).
+      ReconstructionError: if there is no mask, if a mask is empty, of another size or not boolean,
+        if a pose is not finite, if there are at least as many outliers as views, if the grid is too
+        coarse, if nothing is left, or if the hull extends outside the cube of `REACH` (as with one
+        view).
     """
     check_masks(masks, cameras)
     if not 0 <= outliers < len(masks):
         raise ReconstructionError(
-            f"outliers={outliers}, but there are {len(masks)} views. Pass over fewer, 0 or more."
+            f"outliers={outliers}, but there are {len(masks)} views. Pass a smaller number."
         )
     if resolution < LEAST_RESOLUTION:
         raise ReconstructionError(
-            f"resolution={resolution} is too coarse. Give {LEAST_RESOLUTION} cells or more."
+            f"resolution={resolution} is too coarse. Pass {LEAST_RESOLUTION} cells or more."
         )
     field = hull_field(masks, cameras, outliers=outliers, tolerance=tolerance, blur=blur)
     if box is None:
@@ -121,7 +124,7 @@ def hull_field(
     images = [signed_distances(mask, blur=blur) - tolerance for mask in masks]
 
     def field(points: Points) -> Values:
-        # The largest so far, in falling order.
+        # The largest values so far, in descending order.
         largest = np.full((outliers + 1, len(points)), -np.inf)
         for image, pose in zip(images, cameras.poses, strict=True):
             value = view_values(image, pose, cameras, points)
@@ -143,20 +146,20 @@ def find_box(
     *,
     names: Sequence[str] | None = None,
 ) -> Box:
-    """Returns a box around the body, which must lie within the cube of `REACH`.
+    """Returns a bounding box of the object, which must lie within the cube of `REACH`.
 
     Args:
-      field: the hull's, from `hull_field`.
-      masks: of which it is the hull.
-      cameras: of the masks.
-      names: what the masks are called in errors; their numbers if not given.
+      field: field of the hull, from `hull_field`.
+      masks: masks of the hull.
+      cameras: cameras of the masks.
+      names: names of the masks in errors; their numbers if `None`.
 
     Raises:
-      ReconstructionError: if nothing is left, or the body reaches out of the cube.
+      ReconstructionError: if nothing is left, or the object extends outside the cube.
     """
     ends = np.full(3, REACH)
     grid = sample(field, Box(-ends, ends), spacing=2.0 * REACH / _SEARCH)
-    # Within half a cell's diagonal of the surface, so that a thin body is not overlooked.
+    # Within half a cell's diagonal of the surface, so that thin objects are not missed.
     inside = np.argwhere(grid.values < 0.87 * grid.spacing)
     if len(inside) == 0:
         raise ReconstructionError(_explanation(masks, cameras, Box(-ends, ends), names))
@@ -173,7 +176,7 @@ def view_values(
     cameras: Cameras,
     points: Points,
 ) -> Values:
-    """Returns one view's signed distances in world units, `-inf` where it sees nothing."""
+    """Returns a view's signed distances in world units, `-inf` outside of its image."""
     (column, row), depth = (part.T for part in project(points, pose, cameras))
     seen = (depth > 0.0) & (column >= 0) & (column <= cameras.width)
     seen &= (row >= 0) & (row <= cameras.height)
@@ -190,7 +193,7 @@ def view_values(
 def values_by_view(
     masks: Bool[np.ndarray, "views h w"], cameras: Cameras, points: Points
 ) -> Float[np.ndarray, "views points"]:
-    """Returns `view_values` of all views, of outlines as coarse as the masks' pixels."""
+    """Returns `view_values` of all views, for outlines without blur."""
     views = zip(masks, cameras.poses, strict=True)
     return np.stack(
         [
@@ -201,7 +204,7 @@ def values_by_view(
 
 
 def _reaches_border(grid: Grid) -> bool:
-    """Returns whether a body goes on where its grid ends."""
+    """Returns whether an object extends to the border of its grid."""
     return any(
         bool(np.any(np.take(grid.values, end, axis=axis) < 0.0))
         for axis in range(3)
@@ -215,7 +218,7 @@ def _explanation(
     box: Box,
     names: Sequence[str] | None,
 ) -> str:
-    """Says which view removed the most of what all others leave."""
+    """Returns an error message that names the view that carves most of the other views' hull."""
     carved = values_by_view(masks, cameras, lattice(box, 24)) > 0.0
     alone = carved & (carved.sum(axis=0) == 1)
     view = int(np.argmax(alone.sum(axis=1) + carved.mean(axis=1)))
@@ -224,5 +227,5 @@ def _explanation(
         f"Nothing is left after carving with {len(masks)} masks between {np.round(box.low, 2)} and "
         f"{np.round(box.high, 2)}. {name} removed the most: {carved[view].mean():.0%} of the box, "
         f"and {int(alone[view].sum())} of {carved.shape[1]} points that no other view did. Check "
-        "its mask and its pose, pass over outliers, or give a finer resolution."
+        "its mask and its pose, pass more outliers, or use a finer resolution."
     )

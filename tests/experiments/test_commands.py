@@ -189,7 +189,7 @@ def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
         ("render", ("--run=nowhere", "--rays_per_pixel=0"), "Give 1."),
         ("export", ("--run=RUN", "--what=mesh", "--out=x.ply"), "run/model.json does not"),
         ("export", ("--run=RUN", "--what=body", "--out=x.ply"), "run/geometry.npz cannot"),
-        ("export", ("--run=nowhere", "--what=body", "--out=x.obj"), "ends with .ply"),
+        ("export", ("--run=nowhere", "--what=body", "--out=x.obj"), "ends in .ply"),
     ],
 )
 def test_mistakes_end_with_one_line_that_says_what_to_do(tmp_path, command, options, message):

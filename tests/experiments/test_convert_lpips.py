@@ -64,7 +64,7 @@ def test_tensors_become_arrays_and_nothing_is_executed(stand_in, path):
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
-        ([1, 2], "it holds no dict"),
+        ([1, 2], "it is not a dict"),
         (pickle.UnpicklingError("Weights only load failed"), "more than tensors"),
         (RuntimeError("broken archive"), "broken archive"),
     ],

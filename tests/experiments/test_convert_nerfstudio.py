@@ -50,7 +50,7 @@ def test_the_command_both_ways(folder, tmp_path):
     assert "nothing is overwritten" in again.stderr and "Traceback" not in again.stderr
     back = (f"--source={tmp_path / 'scene'}", f"--out={tmp_path / 'back'}", "--to=nerfstudio")
     result = run_command("convert_nerfstudio", *back)
-    assert "train on the object alone" in result.stdout
+    assert "train on the object only" in result.stdout
     assert "ns-train nerfacto --data" in result.stdout
     capture = nerfstudio.read_capture(tmp_path / "back")
     views = {
@@ -71,9 +71,9 @@ def test_the_command_both_ways(folder, tmp_path):
     ("option", "message"),
     [
         ("--centre=1,2", "Give x,y,z"),
-        ("--centre=1,2,x", "has 'x', which is no finite number"),
+        ("--centre=1,2,x", "has 'x', which is not a finite number"),
         ("--scale=-1", "Give a positive number, or auto"),
-        ("--source=nowhere", "nowhere is no folder"),
+        ("--source=nowhere", "nowhere is not a folder"),
     ],
 )
 def test_mistakes_end_with_one_line(folder, tmp_path, option, message):

@@ -27,12 +27,12 @@ def _parsed():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"coordinator": "host:1"}, "Say how many with --processes"),
-        ({"process": 0}, "Say how many with --processes"),
-        ({"processes": 2, "process": 0}, "Give all of them the same --coordinator"),
+        ({"coordinator": "host:1"}, "Set --processes, or remove them"),
+        ({"process": 0}, "Set --processes, or remove them"),
+        ({"processes": 2, "process": 0}, "Pass the same --coordinator"),
         ({"processes": 2, "process": 0, "coordinator": "host"}, "the same --coordinator"),
-        ({"processes": 2, "coordinator": "host:1"}, "Give this process --process with 0 to 1"),
-        ({"processes": 2, "process": 2, "coordinator": "host:1"}, "--process with 0 to 1"),
+        ({"processes": 2, "coordinator": "host:1"}, "Pass --process between 0 and 1"),
+        ({"processes": 2, "process": 2, "coordinator": "host:1"}, "--process between 0 and 1"),
         ({"devices": "many"}, "devices=many: Give a number, or all"),
         ({"devices": "-1"}, "devices=-1: Give a number, or all"),
     ],
@@ -63,7 +63,7 @@ def test_one_process_connects_to_nobody_and_speaks(capsys):
 def test_several_processes_do_not_reconstruct(tmp_path):
     options = ["--method=r3f", "--processes=2", "--coordinator=localhost:1", "--process=0"]
     result = run_command("train", f"--out={tmp_path / 'run'}", *options, fails=True)
-    assert "Several processes do not reconstruct together" in result.stderr
+    assert "Several processes cannot reconstruct together" in result.stderr
     assert "Traceback" not in result.stderr and not (tmp_path / "run").exists()
 
 

@@ -17,4 +17,5 @@ def test_only_light_that_may_be_seen_is_warned_of(capsys):
     assert capsys.readouterr().out == ""
     evaluation.warn_of_lost_light(2e-3, advice="Do this.")
     printed = capsys.readouterr().out
-    assert printed.startswith("warning: some light found no room") and "Do this." in printed
+    assert printed.startswith("warning: path buffer overflow: 0.2 % of the throughput was dropped")
+    assert "Do this." in printed

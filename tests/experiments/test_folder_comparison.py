@@ -115,8 +115,8 @@ def _with_more(rendered, target):
     [
         (lambda ours, _: (ours / "r_001.png").unlink(), "rendered has no r_001.png, which the oth"),
         (lambda _, theirs: (theirs / "r_000.png").unlink(), "truth has no r_000.png"),
-        (_with_more, r"no s_0\.png \(nor 2 more\)"),
-        (_emptied, "truth holds no .png and no .exr"),
+        (_with_more, r"no s_0\.png \(and 2 more\)"),
+        (_emptied, "truth contains no .png and no .exr"),
         (_of_another_kind, "nothing in common"),
         (
             lambda _, theirs: _write(theirs, "r_001", 0.4, size=(13, 16)),
@@ -145,7 +145,7 @@ def test_all_sizes_are_looked_at_before_anything_is_compared(folders, masks):
     (masks / "r_001.png").unlink()
     with pytest.raises(ValueError, match="There is no mask of r_001"):
         image_folders.match(*folders, masks)
-    with pytest.raises(ValueError, match="nowhere is no folder"):
+    with pytest.raises(ValueError, match="nowhere is not a folder"):
         image_folders.match(folders[0], masks / "nowhere", None)
     (folders[0] / "r_001.exr").write_text("no EXR")
     with pytest.raises(ValueError, match=r"rendered/r_001\.exr cannot be read as EXR"):

@@ -52,7 +52,7 @@ _OF_THE_SCENE = {
     "--paths=straight --cut=0.1": "Leave them out, or use paths=tree.",
     "--ior=1.5": "Write as in --ior=glass=1.52.",
     "--ior=glass=-1": "with a positive number",
-    "--method=r3f --ior=glass=1.5": "Give its index alone",
+    "--method=r3f --ior=glass=1.5": "Pass its index once",
     "--resolution=32": "or add --method=r3f.",
     "--resume=maybe": "Non-boolean argument",
     "--steps": "Missing value for flag --steps",
@@ -63,13 +63,13 @@ _OF_THE_SCENE = {
 
 # On top of a file that names a reconstruction, and asks for cut=0.01.
 _ON_TOP_OF_R3F = {
-    "--ior=glass=1.5": "--ior=glass=1.5, but there is one reconstructed object",
-    "--resolution=32": "r3f is reconstructed already. Leave it out, or add --method=r3f.",
-    "--reconstruction=x --method=oracle": "Leave out either --method or --reconstruction.",
+    "--ior=glass=1.5": "--ior=glass=1.5 is invalid for the single reconstructed object",
+    "--resolution=32": "r3f is already reconstructed. Remove it, or add --method=r3f.",
+    "--reconstruction=x --method=oracle": "Remove either --method or --reconstruction.",
     "--paths=straight": "config.json names the reconstruction",
     "--paths=straight --method=oracle": "Leave them out, or use paths=tree.",
     "--method=oracle --ior=1.5": "Write as in --ior=glass=1.52.",
-    "--method=oracle --resolution=32": "nothing is reconstructed. Leave it out",
+    "--method=oracle --resolution=32": "nothing is reconstructed. Remove it",
     "--scene=": "--scene is empty. Give a folder, or hf:CONFIG/SCENE",
     "--scene=nowhere": "nowhere/transforms_train.json does not exist",
 }
@@ -82,7 +82,7 @@ _MISTAKES = {
         "--out=OUT": "Add --scene=FOLDER, or --resume",
         "--out=OUT --scene=": "--scene is empty. Give a folder, or hf:CONFIG/SCENE",
         "--out=OUT --config=nowhere.json": "nowhere.json is not a file.",
-        "--out=OUT --config=BARE": "which is not there. Give where it is now as --reconstruction",
+        "--out=OUT --config=BARE": "which does not exist. Set --reconstruction to",
         **{f"--out=OUT --config=CONFIG {x}": told for x, told in _ON_TOP_OF_R3F.items()},
         **{f"--out=OUT --scene=SCENE {words}": told for words, told in _OF_THE_SCENE.items()},
     },
@@ -96,7 +96,7 @@ _MISTAKES = {
         "--out=OUT --scene=": "--scene is empty. Give a folder",
         "--out=OUT --scene=SCENE --cut=-0.5": "Give 0.02 for 2 %",
         "--out=OUT --scene=SCENE --ior=glass": "Write as in --ior=glass=1.52.",
-        "--out=OUT --scene=SCENE --paths=straight --unfinished=dark": "none is unfinished",
+        "--out=OUT --scene=SCENE --paths=straight --unfinished=dark": "no path is truncated",
         "--out=OUT --scene=SCENE --views=1,1": "names a view twice",
     },
     "path_trade_off": {
@@ -110,16 +110,16 @@ _MISTAKES = {
         "--out=OUT --scene=SCENE --ior==1.5": "Write as in --ior=glass=1.52.",
     },
     "view": {
-        "--run=x --heights=2,1": "whole numbers that grow",
+        "--run=x --heights=2,1": "increasing integers",
         "--run=nowhere": "nowhere/config.json does not exist",
     },
     "export": {
-        "--run=x --what=body --out=a.obj": "ends with .ply",
+        "--run=x --what=body --out=a.obj": "ends in .ply",
         "--run=nowhere --what=mesh --out=OUT.ply": "nowhere/config.json does not exist",
         "--run=nowhere --what=body --out=OUT.ply": "nowhere/config.json does not exist",
     },
     "reconstruct": {
-        "--out=OUT --scene=x --ior=0.5": "--ior=0.5 is no index",
+        "--out=OUT --scene=x --ior=0.5": "--ior=0.5 is not an index",
         "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
     },
     "trade_off": {
@@ -134,12 +134,12 @@ _MISTAKES = {
         "--out=OUT --methods=tree,strait": "Did you mean straight?",
         "--out=OUT --scenes=SCENE,nowhere": "nowhere/transforms_train.json does not exist",
     },
-    "dataset.convert": {"--scene=nowhere --to=raw --out=OUT": "nowhere is no folder."},
+    "dataset.convert": {"--scene=nowhere --to=raw --out=OUT": "nowhere is not a folder."},
     "dataset.make": {"--out=OUT --scenes=cube_smcvx_bal": "Did you mean cube_smcvx_ball"},
-    "dataset.check": {"x --cut=2": "Give 0.02 for 2 %", "nowhere": "nowhere is no folder."},
+    "dataset.check": {"x --cut=2": "Give 0.02 for 2 %", "nowhere": "nowhere is not a folder."},
     "convert_nerfstudio": {
         "--source=x --out=OUT --scale=-1": "Give a positive number",
-        "--source=nowhere --out=OUT": "nowhere is no folder.",
+        "--source=nowhere --out=OUT": "nowhere is not a folder.",
     },
 }
 

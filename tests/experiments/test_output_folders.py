@@ -46,13 +46,13 @@ def test_only_what_was_noted_is_replaced(tmp_path):
     _write(out, ["rgb/0.png", "rgb/1.png", "metrics.json"], overwrite=False)
     (out / "rgb" / "mine.txt").write_text("mine")
     (out / "notes").mkdir()
-    with pytest.raises(ValueError, match="Give --overwrite to replace them"):
+    with pytest.raises(ValueError, match="Use --overwrite to replace them"):
         _write(out, ["rgb/0.png"], overwrite=False)
     _write(out, ["rgb/0.png"], overwrite=True)
     assert _files(out) == {"rgb/0.png", "rgb/mine.txt", "command.json"}
     assert (out / "notes").is_dir()
     (out / "metrics.json").write_text("mine")  # is told before the work
-    with pytest.raises(ValueError, match=r"out/metrics.json is not of this command"):
+    with pytest.raises(ValueError, match=r"out/metrics.json was not written by this command"):
         outputs.replaceable(out, module=__name__, writes=_WRITES, overwrite=True)
     # A note of files that are gone is no obstacle.
     (out / "rgb" / "0.png").unlink()
@@ -67,7 +67,7 @@ def test_nothing_of_others_is_replaced_even_if_asked(tmp_path):
     out = tmp_path / "out"
     (out / "rgb").mkdir(parents=True)
     (out / "rgb" / "0.png").write_text("mine")
-    with pytest.raises(ValueError, match="not of this command"):
+    with pytest.raises(ValueError, match="not written by this command"):
         _write(out, ["rgb/0.png"], overwrite=True)
     # A note of another command, or one that points elsewhere, is not ours.
     for note in (
@@ -77,7 +77,7 @@ def test_nothing_of_others_is_replaced_even_if_asked(tmp_path):
         ["no record"],
     ):
         (out / outputs.NOTE).write_text(json.dumps(note))
-        with pytest.raises(ValueError, match="not of this command"):
+        with pytest.raises(ValueError, match="not written by this command"):
             _write(out, ["rgb/0.png"], overwrite=True)
     assert (out / "rgb" / "0.png").read_text() == "mine"
     assert _files(tmp_path) == {"out/rgb/0.png", "out/command.json"}
@@ -86,7 +86,7 @@ def test_nothing_of_others_is_replaced_even_if_asked(tmp_path):
 def test_a_file_that_came_meanwhile_stays(tmp_path):
     out = tmp_path / "out"
     with (
-        pytest.raises(ValueError, match="not of this command"),
+        pytest.raises(ValueError, match="not written by this command"),
         _fresh(out, overwrite=True) as draft,
     ):
         (draft / "metrics.json").write_text("new")
@@ -137,7 +137,7 @@ def test_who_waited_for_another_looks_again(tmp_path, monkeypatch):
         return hold(folder)
 
     monkeypatch.setattr(outputs.atomic_files, "hold", hold_after_another)
-    with pytest.raises(ValueError, match="Give --overwrite"), _fresh(out):
+    with pytest.raises(ValueError, match="Use --overwrite"), _fresh(out):
         raise AssertionError("worked in vain")
     assert _files(out) == {"metrics.json", "command.json"}
 
@@ -148,7 +148,7 @@ def test_a_product_of_its_own_is_added_or_replaced_alone(tmp_path):
     _write(out, ["tree.jpg"], writes=["tree.jpg"], overwrite=False)
     (out / "fan.jpg").write_text("old")
     (out / "tree.jpg").write_text("old")
-    with pytest.raises(ValueError, match=r"\(tree.jpg, \.\.\.\). Give --overwrite"):
+    with pytest.raises(ValueError, match=r"\(tree.jpg, \.\.\.\). Use --overwrite"):
         _write(out, ["tree.jpg"], writes=["tree.jpg"], overwrite=False)
     _write(out, ["tree.jpg"], writes=["tree.jpg"], overwrite=True)
     assert (out / "fan.jpg").read_text() == "old" and (out / "tree.jpg").read_text() == "new"
@@ -217,9 +217,9 @@ def test_the_folder_may_be_a_mount(tmp_path, monkeypatch):
 def test_files_and_folders_are_not_taken_for_each_other(tmp_path):
     (tmp_path / "file").write_text("mine")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(ValueError, match="is a file, and a folder is needed"):
+    with pytest.raises(ValueError, match="is a file, not a folder"):
         _write(tmp_path / "file", [], overwrite=True)
-    with pytest.raises(ValueError, match="is a folder, and a file"):
+    with pytest.raises(ValueError, match="is a folder, not a file"):
         outputs.check_file(tmp_path / "folder", overwrite=True)
     with pytest.raises(ValueError, match="--overwrite to replace it"):
         outputs.check_file(tmp_path / "file", overwrite=False)

@@ -44,13 +44,13 @@ def test_points_that_no_view_sees_count_for_nothing():
 
 @pytest.mark.parametrize("count", [-1, 30])
 def test_no_more_views_can_be_left_out_than_there_are(count):
-    with pytest.raises(ReconstructionError, match="can not be left out"):
+    with pytest.raises(ReconstructionError, match="cannot be left out"):
         without_outliers(bodies.icosphere(1), _views(), count)
 
 
 def test_no_views_carve_nothing():
     cameras = _views().cameras
-    with pytest.raises(ReconstructionError, match="There is no mask"):
+    with pytest.raises(ReconstructionError, match="There are no masks"):
         carved_alone(Views(_views().masks[:0], cameras._replace(poses=cameras.poses[:0])))
 
 

@@ -199,12 +199,12 @@ def test_what_cannot_be_fitted_is_an_error_that_says_why():
     masks, cameras = _views(_turned_box)
     hull = convex.hull(_box_hull())
     two = Views(masks[:2], cameras._replace(poses=cameras.poses[:2]))
-    with pytest.raises(ReconstructionError, match="2 views show the whole body"):
+    with pytest.raises(ReconstructionError, match="2 views show the complete object"):
         fit_corners(hull, hull, two)
     inside = cameras._replace(poses=cameras.poses * [1.0, 1.0, 1.0, 0.1])
-    with pytest.raises(ReconstructionError, match="0 views show the whole body"):
+    with pytest.raises(ReconstructionError, match="0 views show the complete object"):
         fit_corners(hull, hull, Views(masks, inside))
-    with pytest.raises(ReconstructionError, match="Give one mask for each camera"):
+    with pytest.raises(ReconstructionError, match="Pass one mask for each camera"):
         refine(hull, _LITTLE, views=Views(masks[1:], cameras))
 
 

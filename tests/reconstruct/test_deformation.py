@@ -102,5 +102,5 @@ def test_unevenness_is_that_of_single_handles_alone():
 
 @pytest.mark.parametrize("handles", [0, 3])
 def test_too_few_handles_are_refused(handles):
-    with pytest.raises(ReconstructionError, match="Give 4 or more"):
+    with pytest.raises(ReconstructionError, match="Pass 4 or more"):
         light_refinement.build(_ball(1), handles=handles)

@@ -92,7 +92,7 @@ def test_the_index_is_found_from_any_start(ball, seen, start):
 def test_no_pixels_and_no_light_are_refused(ball, seen):
     evidence, views = seen
     nothing = jax.tree.map(lambda x: x[:0], evidence.rays)
-    with pytest.raises(ReconstructionError, match="No pixel sees the body"):
+    with pytest.raises(ReconstructionError, match="No pixel sees the object"):
         estimate_index(
             evidence._replace(rays=nothing, rgb=evidence.rgb[:0]),
             ball,

@@ -53,7 +53,7 @@ def test_a_body_that_reaches_the_border_is_closed_there():
 
 
 def test_a_grid_without_a_body_is_an_error():
-    with pytest.raises(ReconstructionError, match="holds no surface"):
+    with pytest.raises(ReconstructionError, match="contains no surface"):
         find_isosurface(Grid(np.ones((4, 4, 4)), np.zeros(3), 0.5))
 
 
@@ -89,5 +89,5 @@ def test_signed_distances_are_those_of_the_box():
 
 
 def test_a_mesh_without_area_has_no_closest_point():
-    with pytest.raises(ReconstructionError, match="no triangle with an area"):
+    with pytest.raises(ReconstructionError, match="All triangles of the mesh are degenerate"):
         ClosestSearch(np.zeros((3, 3)), np.array([[0, 1, 2]]))

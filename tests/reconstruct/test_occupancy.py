@@ -72,11 +72,11 @@ def test_gradients_of_the_field_are_finite_in_the_middle_and_at_corners(at):
 def test_configurations_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match="Choose a radius"):
         OccupancyFieldConfig(start=0.7)
-    with pytest.raises(ValueError, match="at least 1 step"):
+    with pytest.raises(ValueError, match="must be at least 1"):
         OccupancyTrainingConfig(steps=0)
-    with pytest.raises(ValueError, match="softness and rate above 0"):
+    with pytest.raises(ValueError, match="softness and rate must be above 0"):
         OccupancyTrainingConfig(softness=(1.0, 0.0))
-    with pytest.raises(ValueError, match="1 to all rays"):
+    with pytest.raises(ValueError, match="between 1 and batch"):
         OccupancyTrainingConfig(batch=16, surface=17)
 
 
@@ -151,13 +151,13 @@ def test_a_box_is_found_from_the_masks_though_one_is_wrong():
 
 def test_errors_say_what_to_do():
     masks, cameras = _ball_views()
-    with pytest.raises(ReconstructionError, match="There is no mask"):
+    with pytest.raises(ReconstructionError, match="There are no masks"):
         _fit(masks[:0], cameras._replace(poses=cameras.poses[:0]))
-    with pytest.raises(ReconstructionError, match="mark nothing"):
+    with pytest.raises(ReconstructionError, match="masks are empty"):
         _fit(masks & (np.arange(24) != 1)[:, None, None], cameras)
     alone = cameras._replace(poses=cameras.poses[:1])
     behind = 2.0 * alone.poses[0, :, 3]
-    with pytest.raises(ReconstructionError, match=r"No ray of 1 views meets the box .* Check"):
+    with pytest.raises(ReconstructionError, match=r"No ray of 1 views hits the box .* Check"):
         _fit(masks[:1], alone, box=Box(behind - 0.5, behind + 0.5))
 
 

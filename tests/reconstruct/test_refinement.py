@@ -212,7 +212,7 @@ def test_meshes_that_bound_no_body_are_errors():
         refine(Mesh(mesh.vertices[:0], mesh.faces[:0], mesh.normals[:0]), Refinement())
     with pytest.raises(ReconstructionError, match="is not closed"):
         refine(make_mesh(mesh.vertices, mesh.faces[1:]), Refinement())
-    with pytest.raises(ReconstructionError, match="turned inwards"):
+    with pytest.raises(ReconstructionError, match="inside out"):
         refine(bodies.inverted(mesh), Refinement())
 
 

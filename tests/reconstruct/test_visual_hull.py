@@ -161,23 +161,23 @@ def test_masks_eroded_by_a_pixel_shrink_the_body_by_a_pixel():
 
 def test_errors_say_what_to_do():
     masks, cameras = _ball_views()
-    with pytest.raises(ReconstructionError, match="There is no mask"):
+    with pytest.raises(ReconstructionError, match="There are no masks"):
         carve(masks[:0], cameras._replace(poses=cameras.poses[:0]))
     with pytest.raises(ReconstructionError, match="30 masks and 29 cameras"):
         carve(masks, cameras._replace(poses=cameras.poses[1:]))
     with pytest.raises(ReconstructionError, match="are 32 x 64 pixels"):
         carve(masks[:, :, ::2], cameras)
-    with pytest.raises(ReconstructionError, match="Views 0, 2: 2 of 30 masks mark nothing"):
+    with pytest.raises(ReconstructionError, match="Views 0, 2: 2 of 30 masks are empty"):
         carve(masks & (~np.isin(np.arange(30), (0, 2)))[:, None, None], cameras)
-    with pytest.raises(ReconstructionError, match="Pass over fewer"):
+    with pytest.raises(ReconstructionError, match="Pass a smaller number"):
         carve(masks, cameras, outliers=30)
     with pytest.raises(ReconstructionError, match="resolution=9 is too coarse"):
         carve(masks, cameras, resolution=9)
-    with pytest.raises(ReconstructionError, match="masks are uint8"):
+    with pytest.raises(ReconstructionError, match="masks have the type uint8"):
         check_masks(masks.astype(np.uint8), cameras)
     broken = cameras.poses.copy()
     broken[3, 0, 3] = np.nan
-    with pytest.raises(ReconstructionError, match=r"not finite: 1, of cameras \[3\]"):
+    with pytest.raises(ReconstructionError, match=r"1 poses are not finite, of cameras \[3\]"):
         carve(masks, cameras._replace(poses=broken))
 
 
@@ -189,7 +189,7 @@ def test_the_coarsest_grid_still_makes_a_body():
 def test_a_body_that_too_few_views_bound_is_refused(views):
     masks, cameras = _ball_views()
     few = cameras._replace(poses=cameras.poses[:views])
-    with pytest.raises(ReconstructionError, match="masks from other sides"):
+    with pytest.raises(ReconstructionError, match="masks from other directions"):
         carve(masks[:views], few)
 
 
@@ -197,7 +197,7 @@ def test_a_body_larger_than_where_it_is_looked_for_is_refused_and_not_cut_off():
     masks, cameras = _ball_views()
     poses = cameras.poses.copy()
     poses[:, :, 3] *= 3.0
-    with pytest.raises(ReconstructionError, match=r"reaches out of the cube from -2\.1 to 2\.1"):
+    with pytest.raises(ReconstructionError, match=r"extends outside the cube from -2\.1 to 2\.1"):
         carve(masks, cameras._replace(poses=poses))
 
 

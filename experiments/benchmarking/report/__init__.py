@@ -1,1 +1,1 @@
-"""The report of a benchmark: one HTML page with all tables, curves and pictures in it."""
+"""The report of a benchmark: one HTML page with all tables, curves and images."""

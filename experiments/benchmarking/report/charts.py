@@ -1,6 +1,6 @@
-"""Charts of training as SVG in the page: PSNR over steps, and over seconds.
+"""Draws the training curves as inline SVG: PSNR over steps, and over seconds.
 
-The line of a method looks the same in every chart, whatever else is measured.
+A method has the same line style in every chart, whatever else is measured.
 """
 
 import math
@@ -26,11 +26,11 @@ Points = Sequence[tuple[float, float]]
 
 
 class Line(NamedTuple):
-    """A line's looks.
+    """Style of a line.
 
     Attributes:
       colour: index into `figures.style.COLOURS`.
-      dash: as SVG has it; `None` for an unbroken line.
+      dash: SVG dash pattern; `None` for a solid line.
     """
 
     colour: int
@@ -38,10 +38,10 @@ class Line(NamedTuple):
 
 
 def look(method: str) -> Line:
-    """Returns the looks of a method.
+    """Returns the line style of a method.
 
-    An ablation has none of the colour of the method that it is compared with, and is dashed where
-    the colours of its group are used up. Methods that this version does not know look alike.
+    An ablation never has the colour of its reference method, and is dashed once the colours of its
+    group are used up. Methods that are unknown to this version share one style.
     """
     if method not in METHODS:
         return Line(len(COLOURS) - 1, _DASHES[-1])
@@ -55,10 +55,10 @@ def look(method: str) -> Line:
 
 
 def families(methods: Sequence[str]) -> list[list[str]]:
-    """Returns which methods share a chart: the main ones, and each kind of ablation with its own.
+    """Groups methods by chart: the main ones, and each kind of ablation.
 
     Args:
-      methods: names of all that there are, in their order.
+      methods: names of all methods, in order.
     """
     groups = {name: METHODS[name].group if name in METHODS else "main" for name in methods}
     found = [[name for name in methods if groups[name] == "main"]]
@@ -69,7 +69,7 @@ def families(methods: Sequence[str]) -> list[list[str]]:
 
 
 class Span(NamedTuple):
-    """An axis: its range of values, on a range of the picture, with its ticks."""
+    """An axis: the mapping from a range of values to a range of the image, with its ticks."""
 
     low: float
     high: float
@@ -78,13 +78,13 @@ class Span(NamedTuple):
     ticks: tuple[float, ...]
 
     def place(self, value: float) -> float:
-        """Returns where a value is."""
+        """Returns the position of a value."""
         share = (value - self.low) / (self.high - self.low)
         return round(self.start + share * (self.end - self.start), 1)
 
 
 def training_charts(results: Sequence[Result]) -> Html:
-    """Returns charts of all trainings of a scene, a pair for each family of methods."""
+    """Returns charts of all trainings of a scene, a pair for each group of methods."""
     by_name = {result.record.method: result for result in results}
     pairs = []
     for names in families(list(by_name)):
@@ -92,26 +92,26 @@ def training_charts(results: Sequence[Result]) -> Html:
         if curves:
             steps = {name: [(p.step, p.psnr) for p in curve] for name, curve in curves.items()}
             seconds = {name: [(p.seconds, p.psnr) for p in curve] for name, curve in curves.items()}
-            charts = _chart(steps, "steps"), _chart(seconds, "seconds, compiling included; noisy")
+            charts = _chart(steps, "steps"), _chart(seconds, "seconds, compilation included; noisy")
             pairs.append(tag("div", legend(list(curves)), *charts, class_="charts"))
     if not pairs:
-        return tag("p", "No training has left a curve.", class_="note")
+        return tag("p", "There are no training curves.", class_="note")
     return join(pairs)
 
 
 def legend(methods: Sequence[str]) -> Html:
-    """Returns what lines of what looks are which methods."""
+    """Returns a legend of the line styles of methods."""
     return tag("p", *(tag("span", swatch(name), " ", name) for name in methods), class_="legend")
 
 
 def swatch(method: str) -> Html:
-    """Returns a short piece of a method's line."""
+    """Returns a short sample of a method's line."""
     line = tag("line", x1="0", y1="5", x2="22", y2="5", **_look(method))
     return tag("svg", line, viewBox="0 0 22 10", width="22", height="10", aria_hidden="true")
 
 
 def ticks(low: float, high: float) -> tuple[float, ...]:
-    """Returns about five round numbers that hold a range between the first and the last."""
+    """Returns about five round numbers whose range contains the given one."""
     rough = max(high - low, 1e-6) / _TICKS
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= rough)
@@ -120,7 +120,7 @@ def ticks(low: float, high: float) -> tuple[float, ...]:
 
 
 def _chart(curves: dict[str, Points], unit: str) -> Html:
-    """Returns one chart; what is not finite is left out."""
+    """Returns a chart of the finite values."""
     known = {
         name: [point for point in points if all(map(math.isfinite, point))]
         for name, points in curves.items()
@@ -161,7 +161,7 @@ def _span(values: Sequence[float], start: float, end: float) -> Span:
 
 
 def _grid(across: Span, up: Span) -> Html:
-    """Returns lines at the ticks of both axes, with their numbers."""
+    """Returns grid lines at the ticks of both axes, with their numbers."""
     parts = []
     for value in up.ticks:
         y = up.place(value)
@@ -174,7 +174,7 @@ def _grid(across: Span, up: Span) -> Html:
 
 
 def _labels(ends: dict[str, tuple[float, float]]) -> list[Html]:
-    """Returns the names of lines at their ends, moved apart where they are too near."""
+    """Returns the names of lines at their ends, moved apart where they would overlap."""
     heights, last = {}, -math.inf
     for name, (_, y) in sorted(ends.items(), key=lambda item: item[1][1]):
         heights[name] = last = max(y + 4.0, last + _LINE)

@@ -1,7 +1,7 @@
-"""What a report shows: results, the files of views, and which views are shown.
+"""Reads the data of a report: results, files of views, and the selection of views.
 
-Results are read from a benchmark's results.json and from nothing else, files as far as they are
-there. Views are shown where methods fail most, some spread evenly, and one that is typical.
+Results are only read from a benchmark's results.json, and files as far as they exist. The views are
+those where methods fail most, some that are spread evenly, and a typical one.
 """
 
 import math
@@ -24,17 +24,17 @@ from refref_jax.geometry.cameras import Cameras
 
 T = TypeVar("T")
 
-# Of a scene's views, the share that is chosen because methods fail there.
+# Share of a scene's shown views that are selected because methods fail there.
 _WORST = 0.6
 
 
 class Point(NamedTuple):
-    """A point of a training's curve.
+    """A point of a training curve.
 
     Attributes:
-      step: number of steps done.
-      seconds: that they took.
-      psnr: of the training rays, dB.
+      step: number of finished steps.
+      seconds: duration of these steps.
+      psnr: PSNR of the training rays, dB.
     """
 
     step: float
@@ -43,12 +43,13 @@ class Point(NamedTuple):
 
 
 class Result(NamedTuple):
-    """What a method came to on a scene.
+    """Result of a method on a scene.
 
     Attributes:
-      record: the result; the rendered files of its views are relative to the benchmark's folder.
-      curve: of its training.
-      roots: folders where the scene may be, the likeliest first.
+      record: record of the result; the rendered files of its views are relative to the benchmark's
+        folder.
+      curve: training curve.
+      roots: possible folders of the scene, the most likely first.
     """
 
     record: Record
@@ -66,17 +67,17 @@ class Scene(NamedTuple):
 
 
 class Contents(NamedTuple):
-    """All of a benchmark.
+    """All data of a benchmark.
 
     Attributes:
-      settings: common to all results.
-      labels: of the methods, by name.
-      scenes: in the order of their names.
-      reconstructions: what methods of R3F share, a scene.
-      failed: why jobs failed, by `scene/method`.
-      skipped: what was left out.
-      missing: jobs that were asked for and have no result, for no reason known.
-      tables: all of them.
+      settings: settings of all results.
+      labels: labels of the methods, by name.
+      scenes: scenes in the order of their names.
+      reconstructions: reconstruction that the R3F methods share, for each scene.
+      failed: reasons of failed jobs, by `scene/method`.
+      skipped: skipped methods.
+      missing: requested jobs that have no result for no known reason.
+      tables: all tables.
     """
 
     settings: Settings
@@ -93,14 +94,14 @@ def read(out: Path) -> Contents:
     """Reads the results of a benchmark.
 
     Args:
-      out: its folder.
+      out: folder of the benchmark.
 
     Raises:
-      ValueError: if there are none, or they are broken.
+      ValueError: if there are no results, or they are broken.
     """
     path = out / summary.RESULTS
     if not path.is_file():
-        raise ValueError(f"{out} has no {path.name}. Make it with --tables_only.")
+        raise ValueError(f"{out} has no {path.name}. Create it with --tables_only.")
     content = scene_folder.read_json(path)
     moved = {name: Path(scene.path) for name, scene in settings.read(out).scenes.items()}
     try:
@@ -120,7 +121,7 @@ def read(out: Path) -> Contents:
         )
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(
-            f"{path} is not that of a benchmark ({error!r}). Make it again with --tables_only."
+            f"{path} is not a valid index ({error!r}). Create it again with --tables_only."
         ) from error
 
 
@@ -136,7 +137,7 @@ def _result(job: dict[str, Any], moved: dict[str, Path]) -> Result:
 
 
 def _by_scene(results: Sequence[Result], methods: Sequence[str]) -> tuple[Scene, ...]:
-    """Returns the results of methods by scene; methods that are not known come last."""
+    """Groups the results of methods by scene; unknown methods come last."""
     order = {name: i for i, name in enumerate(methods)}
     own: dict[str, list[Result]] = {}
     for result in results:
@@ -153,11 +154,11 @@ def _by_scene(results: Sequence[Result], methods: Sequence[str]) -> tuple[Scene,
 
 
 class Image(NamedTuple):
-    """A view, true or rendered; what is not there is `None`.
+    """A reference or rendered view; missing parts are `None`.
 
     Attributes:
       rgb: 8-bit sRGB.
-      distance: along each pixel's ray, world units, `inf` where it meets nothing.
+      distance: distance along each pixel's ray, world units, `inf` where it hits nothing.
     """
 
     rgb: UInt8[np.ndarray, "h w 3"] | None
@@ -168,10 +169,10 @@ class View(NamedTuple):
     """A view of a scene.
 
     Attributes:
-      name: of the view.
-      truth: what should be seen.
-      mask: of the object; `None` if it is not there.
-      rendered: what each method sees, by its name.
+      name: name of the view.
+      truth: reference image and distance.
+      mask: mask of the object; `None` if it is missing.
+      rendered: render of each method, by its name.
     """
 
     name: str
@@ -183,12 +184,12 @@ class View(NamedTuple):
 def read_view(out: Path, scene: Scene, name: str) -> View:
     """Reads a view of a scene.
 
-    A file that is missing or broken is `None`, and so is one of another size than the true image.
+    A file that is missing, broken, or of another size than the reference image is `None`.
 
     Args:
       out: folder of the benchmark.
-      scene: with its results.
-      name: of the view.
+      scene: scene with its results.
+      name: name of the view.
     """
     files_of = {
         result.record.method: view
@@ -218,7 +219,7 @@ def read_view(out: Path, scene: Scene, name: str) -> View:
 
 
 def _truth(roots: Sequence[Path], told: Truth) -> tuple[Image, Bool[np.ndarray, "h w"] | None]:
-    """Returns the true image and the mask, from the first folder that has the image."""
+    """Returns the reference image and the mask, from the first folder that contains the image."""
     root = next((root for root in roots if (root / told.rgb).is_file()), None)
     if root is None:
         return Image(None, None), None
@@ -229,7 +230,7 @@ def _truth(roots: Sequence[Path], told: Truth) -> tuple[Image, Bool[np.ndarray, 
 
 
 def _distance(root: Path, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"] | None:
-    """Returns planar depth as distance; `None` if the scene does not tell its field of view."""
+    """Converts planar depth to distance; `None` if the scene does not define its field of view."""
     path = root / f"transforms_{SPLIT}.json"
     try:
         angle = scene_folder.get(scene_folder.read_json(path), "camera_angle_x", path)
@@ -253,14 +254,14 @@ def _of_size(pixels: T | None, size: tuple[int, int]) -> T | None:
 
 
 class Case(NamedTuple):
-    """One view, rendered by one method.
+    """A view rendered by a method.
 
     Attributes:
-      scene: name.
-      method: name.
-      view: name.
-      psnr_masked: PSNR inside the mask, dB; `None` if it is not known.
-      psnr: of the image, dB; `None` if it is not known.
+      scene: name of the scene.
+      method: name of the method.
+      view: name of the view.
+      psnr_masked: PSNR inside the mask, dB; `None` if it is unknown.
+      psnr: PSNR of the image, dB; `None` if it is unknown.
     """
 
     scene: str
@@ -271,13 +272,13 @@ class Case(NamedTuple):
 
 
 def failures(scenes: Sequence[Scene], most: int) -> list[Case]:
-    """Returns each method's worst views over all scenes, the worst of all first.
+    """Returns each method's worst views over all scenes, the worst first.
 
-    Worse is a lower PSNR inside the mask. Views that have none come last, by the PSNR of the image.
+    They are sorted by masked PSNR. Views without one come last, sorted by the PSNR of the image.
 
     Args:
-      scenes: with their results.
-      most: views of a method.
+      scenes: scenes with their results.
+      most: number of views per method.
     """
     cases = sorted(
         (case for scene in scenes for result in scene.results for case in _cases(result.record)),
@@ -293,14 +294,14 @@ def failures(scenes: Sequence[Scene], most: int) -> list[Case]:
 
 
 def choose_views(scene: Scene, count: int) -> list[str]:
-    """Returns the names of a scene's views to show, in their own order.
+    """Selects the views of a scene to show; returns their names in the original order.
 
-    Three in five are where methods fail most: the worst view of each method in turn, the best
-    method first. The others are spread evenly over what is left.
+    Three in five are those where methods fail most: the worst view of each method in turn, the best
+      method first. The others are spread evenly over the rest.
 
     Args:
-      scene: with its results.
-      count: views to choose.
+      scene: scene with its results.
+      count: number of views to select.
     """
     names = view_names(scene)
     ranked = [
@@ -316,10 +317,10 @@ def choose_views(scene: Scene, count: int) -> list[str]:
 
 
 def typical_view(scene: Scene) -> str | None:
-    """Returns the name of the view in the middle, ordered by the mean of all methods.
+    """Returns the name of the median view, ordered by the mean of all methods.
 
-    Views that a method has no PSNR of come last, so that they are in the middle only where most
-    views are such; `None` if there are no views.
+    Views that lack the PSNR of a method come last, so that they are only selected if most views do;
+    `None` if there are no views.
     """
     values: dict[str, list[float | None]] = {name: [] for name in view_names(scene)}
     for result in scene.results:
@@ -330,7 +331,7 @@ def typical_view(scene: Scene) -> str | None:
 
 
 def psnr_masked(scene: Scene, method: str, view: str) -> float | None:
-    """Returns the PSNR inside the mask of a method's view, dB; `None` if it is not known."""
+    """Returns the masked PSNR of a method's view, dB; `None` if it is unknown."""
     known = {
         (case.method, case.view): case.psnr_masked
         for result in scene.results
@@ -340,7 +341,7 @@ def psnr_masked(scene: Scene, method: str, view: str) -> float | None:
 
 
 def view_names(scene: Scene) -> list[str]:
-    """Returns the names of all views of a scene, in their order."""
+    """Returns the names of all views of a scene, in order."""
     return list(
         dict.fromkeys(view.name for result in scene.results for view in result.record.views)
     )
@@ -365,7 +366,7 @@ def _known(metrics: Metrics, key: str) -> float | None:
 
 
 def _badness(case: Case) -> tuple[bool, float, bool, float]:
-    """Sorts the worst first."""
+    """Sort key of views, the worst first."""
     return (
         case.psnr_masked is None,
         case.psnr_masked or 0.0,
@@ -380,6 +381,6 @@ def _mean(values: Sequence[float | None]) -> float:
 
 
 def _mean_badness(record: Record) -> float:
-    """Sorts the best method first."""
+    """Sort key of methods, the best first."""
     value = record.metrics.get("psnr_masked")
     return math.inf if value is None or math.isnan(value) else -value

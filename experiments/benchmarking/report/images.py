@@ -1,7 +1,7 @@
-"""Pictures of a page: reduced, coloured, compressed, and written into it as text.
+"""Downsamples, colours and compresses images, and embeds them in a page as text.
 
-The figure of a view has the truth and each method side by side: picture, error and distance. The
-sheet is one picture beside the page: a view of each scene as each method sees it.
+The figure of a view shows the reference and each method next to each other: image, error and
+distance. The contact sheet is a separate image file: one view of each scene for every method.
 """
 
 import base64
@@ -21,7 +21,7 @@ from experiments.benchmarking.report.markup import Html, join, tag
 from experiments.figures.style import pyplot
 from refref_jax import atomic_files
 
-# Of WebP: beyond it a picture of 100 x 100 grows faster than the eye gains.
+# Quality of WebP: above it the size of a 100 x 100 image grows without a visible gain.
 _QUALITY = 82
 
 _STOPS = 12
@@ -32,30 +32,30 @@ _DISTANCES = "viridis"
 
 SHEET = "pictures.jpg"
 
-# Beyond, tiles of the sheet are too small to be looked at.
+# With more scenes the tiles of the sheet become too small.
 _MOST_SCENES, _MOST_METHODS = 8, 7
 
 _INCHES = 1.7
 _DOTS = 120
 
 TRUTH = "truth"
-"""What the true image is called, beside the names of methods."""
+"""Name of the reference image among those of methods."""
 
-NOT_HERE = "picture not here"
+NOT_HERE = "image not available"
 
 Places = dict[tuple[str, str, str], str]
-"""Identifiers of a page's pictures, by view, method (or `TRUTH`) and kind."""
+"""Identifiers of a page's images, by view, method (or `TRUTH`) and kind."""
 
 IMAGE, ERROR, MASK, DISTANCE = "image", "error", "object's mask", "distance"
-"""Kinds of pictures."""
+"""Kinds of images."""
 
 
 class Scale(NamedTuple):
-    """What colours stand for.
+    """A colour scale.
 
     Attributes:
       low: value of the first colour.
-      high: value of the last; what is beyond has it too.
+      high: value of the last colour, to which larger values are clipped.
       colours: name of matplotlib's colour map.
     """
 
@@ -65,15 +65,15 @@ class Scale(NamedTuple):
 
 
 ERRORS = Scale(0.0, 0.25, "magma")
-"""Of errors: the mean over the channels of the absolute difference of sRGB in `[0, 1]`."""
+"""Scale of errors: the mean over the channels of the absolute difference of sRGB in `[0, 1]`."""
 
 
 def error_map(
     rendered: UInt8[np.ndarray, "h w 3"], target: UInt8[np.ndarray, "h w 3"], edge: int
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Colours the error of a rendering on the scale `ERRORS`, as large as it will be shown.
+    """Colours the error of a rendering on the scale `ERRORS`, at the size of the page.
 
-    Errors are averaged where the picture is reduced, not their colours.
+    Downsampling averages the errors, not their colours.
     """
     error = np.mean(np.abs(rendered.astype(np.float32) - target.astype(np.float32)), axis=-1)
     image = Image.fromarray(error / 255.0)
@@ -83,16 +83,16 @@ def error_map(
 def distance_map(
     distances: Float[np.ndarray, "h w"], scale: Scale, edge: int
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Colours distances, as large as they will be shown.
+    """Colours distances at the size of the page.
 
-    Where the picture is reduced one distance stands for its neighbours: there is none between two.
+    Downsampling takes nearest neighbours: the mean of two distances may be on no surface.
     """
     image = Image.fromarray(distances.astype(np.float32))
     return colour(np.asarray(image.resize(_size(image, edge), Image.Resampling.NEAREST)), scale)
 
 
 def colour(values: Float[np.ndarray, "h w"], scale: Scale) -> UInt8[np.ndarray, "h w 3"]:
-    """Colours values; what is not finite is grey."""
+    """Maps values to colours; values that are not finite are grey."""
     known = np.isfinite(values)
     places = (np.where(known, values, scale.low) - scale.low) / (scale.high - scale.low)
     rgb = matplotlib.colormaps[scale.colours](np.clip(places, 0.0, 1.0))[..., :3] * 255.0
@@ -102,7 +102,7 @@ def colour(values: Float[np.ndarray, "h w"], scale: Scale) -> UInt8[np.ndarray, 
 def dim_outside(
     pixels: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns a picture that is nearly grey outside a mask."""
+    """Returns an image that is nearly grey outside a mask."""
     pale = 0.8 * _GREY + 0.2 * pixels
     return np.round(np.where(mask[..., None], pixels, pale)).astype(np.uint8)
 
@@ -110,9 +110,9 @@ def dim_outside(
 def distance_scale(
     truth: Float[np.ndarray, "h w"] | None, rendered: Sequence[Float[np.ndarray, "h w"]]
 ) -> Scale | None:
-    """Returns a scale for all distances of a view: that of the true ones, if there are any.
+    """Returns a scale for all distances of a view: that of the true ones, if they exist.
 
-    It goes from their first to their 99th percentile. `None` if nothing is at a finite distance.
+    It spans their first to their 99th percentile. `None` if no distance is finite.
     """
     for source in ([] if truth is None else [truth], rendered):
         finite = [values[np.isfinite(values)] for values in source]
@@ -124,7 +124,7 @@ def distance_scale(
 
 
 def gradient(scale: Scale) -> str:
-    """Returns the colours of a scale, from left to right, as CSS has them."""
+    """Returns the colours of a scale, from left to right, as a CSS gradient."""
     steps = np.linspace(scale.low, scale.high, _STOPS)[None]
     stops = ", ".join(f"rgb({r} {g} {b})" for r, g, b in colour(steps, scale)[0].tolist())
     return f"linear-gradient(to right, {stops})"
@@ -136,11 +136,11 @@ def _size(image: Image.Image, edge: int) -> tuple[int, int]:
 
 
 class Shown(NamedTuple):
-    """A view, or a scene with all of its views, as a page has it.
+    """HTML of a view, or of a scene with all of its views.
 
     Attributes:
-      html: what is shown.
-      places: identifiers of the pictures.
+      html: markup.
+      places: identifiers of the images.
     """
 
     html: Html
@@ -148,13 +148,13 @@ class Shown(NamedTuple):
 
 
 def show(view: View, scene: Scene, edge: int, prefix: str) -> Shown:
-    """Returns a view: a group of pictures for the truth and for each method.
+    """Returns a view: a group of images for the reference and for each method.
 
     Args:
-      view: what was read of it.
-      scene: with its results.
-      edge: longest edge of a picture.
-      prefix: of the identifiers of its pictures; no other view of the page may have it.
+      view: data of the view.
+      scene: scene with its results.
+      edge: longest edge of an image, pixels.
+      prefix: prefix of the identifiers of its images, unique in the page.
     """
     rendered = [image.distance for image in view.rendered.values() if image.distance is not None]
     scale = distance_scale(view.truth.distance, rendered)
@@ -180,16 +180,16 @@ def show(view: View, scene: Scene, edge: int, prefix: str) -> Shown:
 
 
 def title(method: str) -> str:
-    """Returns what a method, or the truth, is called."""
+    """Returns the title of a method, or of the reference."""
     return "ground truth" if method == TRUTH else method
 
 
 def _drawn(
     view: View, method: str, scale: Scale | None, edge: int
 ) -> dict[str, UInt8[np.ndarray, "h w 3"] | None]:
-    """Returns the pictures of a method by their kinds, `None` for what is not there.
+    """Returns the images of a method by kind, `None` for missing ones.
 
-    The truth has no error: there its mask is shown.
+    The reference has no error; its mask is shown instead.
     """
     image = view.truth if method == TRUTH else view.rendered[method]
     target, second = view.truth.rgb, None
@@ -209,7 +209,7 @@ def _picture(
     place: str | None,
     key: tuple[str, str, str],
 ) -> Html:
-    """Returns a picture, reduced to a longest edge where it is longer."""
+    """Returns an image, downsampled to a longest edge."""
     view, method, kind = key
     if pixels is None:
         return tag("figure", tag("p", NOT_HERE, class_="absent"), tag("figcaption", kind))
@@ -244,10 +244,10 @@ def _caption(scene: Scene, view: str, method: str) -> Html | None:
 
 
 def _legends(scale: Scale | None) -> Html:
-    """Returns what the colours of errors and distances stand for."""
-    parts = [_legend("error, of sRGB in 0 to 1", ERRORS)]
+    """Returns the legends of errors and distances."""
+    parts = [_legend("error of sRGB in 0 to 1", ERRORS)]
     if scale is not None:
-        parts.append(_legend("distance in world units, of this view", scale))
+        parts.append(_legend("distance in this view, world units", scale))
     return tag("div", *parts, class_="legends")
 
 
@@ -258,17 +258,17 @@ def _legend(name: str, scale: Scale) -> Html:
 
 
 def write_sheet(out: Path) -> Path | None:
-    """Draws a column for each scene: the true image, then each method's with its PSNR in the mask.
+    """Draws a column for each scene: the reference, then each method's image with its masked PSNR.
 
-    The view is the one in the middle of the scene's views, ordered by how well all methods do on
-    it. Scenes whose images are gone have none; of many scenes some are shown, spread evenly over
-    their names.
+    The view is the median one of the scene, ordered by the mean over all methods. Scenes whose
+    images are missing are skipped; if there are many scenes, a subset is shown that is spread
+    evenly over their names.
 
     Args:
       out: folder of the benchmark, with its results.json.
 
     Returns:
-      The file; `None` if there is nothing to show.
+      Path of the file; `None` if there is nothing to show.
 
     Raises:
       ValueError: if there are no results, or they are broken.
@@ -283,7 +283,7 @@ def write_sheet(out: Path) -> Path | None:
             columns.append((scene, view))
     path = out / SHEET
     if not columns:
-        path.unlink(missing_ok=True)  # of scenes that are gone
+        path.unlink(missing_ok=True)  # an older sheet, of scenes that are missing now
         return None
     _draw_sheet(path, columns, {name: everything.labels[name] for name in methods})
     return path

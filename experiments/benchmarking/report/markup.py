@@ -1,6 +1,6 @@
-"""Writes HTML, and the tables of the benchmark in it.
+"""Writes HTML, and the tables of the benchmark as HTML.
 
-What is no markup is escaped where it is put in, so that no name breaks a page.
+Text that is not markup is escaped when it is inserted, so that no name can break a page.
 """
 
 import html
@@ -11,21 +11,22 @@ from html import escape
 from experiments.benchmarking import paper_tables, published, summary, tables
 from experiments.benchmarking.tables import Block, Cell, Column, Mark, Row, Table
 
-# Elements without an end tag.
+# Void elements.
 _ENDLESS = ("img", "input", "meta")
 
 Value = str | int | float | bool | None
 
 _MARKS: dict[Mark, str | None] = {"": None, "best": "strong", "second": "u"}
 
-# Blocks that are open at first: all of a few; of more, each category over all backgrounds.
+# Blocks that are open initially: all if there are few, otherwise each category over all
+# backgrounds.
 _FEW = 4
 _OPEN = {
     paper_tables.describe(category, published.ALL)
     for category in (*paper_tables.CATEGORIES, published.ALL)
 }
 
-# What the notes of tables are written with.
+# Markup in the notes of tables.
 _INLINE = (
     (re.compile(r"\*\*(.+?)\*\*"), r"<strong>\1</strong>"),
     (re.compile(r"\*(.+?)\*"), r"<em>\1</em>"),
@@ -35,7 +36,7 @@ _INLINE = (
 
 
 class Html(str):
-    """Text that is markup already; any other text is escaped where it is put in."""
+    """Text that is markup; any other text is escaped when it is inserted."""
 
     __slots__ = ()
 
@@ -44,10 +45,11 @@ def tag(name: str, /, *children: str | None, **attributes: Value) -> Html:
     """Returns an element.
 
     Args:
-      name: of the element.
-      children: what is in it, one after the other; `None` is nothing.
-      attributes: underscores are written as hyphens, and one at the end is left out, as in
-        `class_`. `None` and `False` leave an attribute out, `True` writes it without a value.
+      name: name of the element.
+      children: content of the element, in order; `None` is skipped.
+      attributes: attributes of the element. Underscores are written as hyphens, and a trailing one
+        is removed, as in `class_`. `None` and `False` omit an attribute, `True` writes it without a
+        value.
     """
     words = "".join(_attribute(key, value) for key, value in attributes.items())
     if name in _ENDLESS:
@@ -56,7 +58,7 @@ def tag(name: str, /, *children: str | None, **attributes: Value) -> Html:
 
 
 def join(parts: Iterable[str | None]) -> Html:
-    """Returns parts one after the other."""
+    """Concatenates parts."""
     return Html("".join(_escaped(part) for part in parts if part is not None))
 
 
@@ -72,17 +74,17 @@ def _attribute(key: str, value: Value) -> str:
 
 
 def show(table: Table) -> Html:
-    """Returns a table of the benchmark: a part that folds for each block, and its notes."""
+    """Returns a table of the benchmark: a collapsible section for each block, and its notes."""
     few = len(table.blocks) <= _FEW
     blocks = [_block(table, block, few or block.title in _OPEN) for block in table.blocks]
     if not blocks:
-        blocks = [tag("p", "Nothing is measured yet.", class_="note")]
+        blocks = [tag("p", "No results yet.", class_="note")]
     notes = [tag("p", inline(note), class_="note") for note in table.notes]
     return tag("section", tag("h3", table.title), *blocks, *notes)
 
 
 def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Html:
-    """Returns a table whose first column names its rows; cells may be markup."""
+    """Returns a table whose first column is its row headings; cells may be markup."""
     body = [
         tag("tr", tag("th", row[0], scope="row"), *(tag("td", cell) for cell in row[1:]))
         for row in rows
@@ -91,12 +93,12 @@ def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Html:
 
 
 def number(value: float | None, digits: int) -> str:
-    """Returns a number as it is shown; `-` if it is not known."""
+    """Returns a formatted number; `-` if it is unknown."""
     return "-" if value is None else format(value, f".{digits}f")
 
 
 def inline(text: str) -> Html:
-    """Returns the text of a note, which has the marks of Markdown."""
+    """Converts the text of a note, with its Markdown, to HTML."""
     found = escape(text)
     for pattern, markup in _INLINE:
         found = pattern.sub(markup, found)
@@ -104,7 +106,7 @@ def inline(text: str) -> Html:
 
 
 def options(given: Mapping[str, Sequence[str]]) -> Html:
-    """Returns the options of commands, a line each."""
+    """Returns the options of commands, one line each."""
     return join(
         tag("div", tag("code", f"{command} {' '.join(words)}".rstrip()))
         for command, words in given.items()

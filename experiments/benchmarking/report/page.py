@@ -1,9 +1,9 @@
-"""Writes the report of a benchmark as one HTML file that needs nothing else.
+"""Writes the report of a benchmark as one self-contained HTML file.
 
-No server, no network: the style, the script and all pictures are in it, and a browser is told to
-load nothing from anywhere. The first page has scenes, tables, failure cases, and how it was
-measured; the page of a scene has its numbers, its curves, and its views with a slider between any
-two. Pages are told apart by the address' end, as #scene/NAME/VIEW.
+It needs neither a server nor a network: the style, the script and all images are embedded, and its
+content security policy forbids loading anything. The first page has scenes, tables, failure cases
+and settings. The page of a scene has its numbers, its curves, and its views with a slider between
+any two. Pages are selected by the fragment of the address, as in #scene/NAME/VIEW.
 """
 
 import dataclasses
@@ -33,33 +33,33 @@ from experiments.figures.style import COLOURS
 from refref_jax import atomic_files
 
 _WHAT = (
-    "Error: mean over the channels of the absolute difference from the ground truth. Distance: of "
-    "the ground truth, to the first surface; of methods, the median of the field's weights along "
-    "the light's path, which clear glass does not stop. Grey: none."
+    "Error: mean over the channels of the absolute difference from the reference. Distance: for "
+    "the reference, to the first surface; for methods, the median of the field's weights along the "
+    "path, which clear glass does not stop. Grey: no distance."
 )
 
-# Failure cases of each method.
+# Number of failure cases per method.
 _MOST_CASES = 10
 
 _COSTS = {
     "steps": ("steps", 0),
-    "seconds_per_step": ("s a step, median", 3),
+    "seconds_per_step": ("s per step, median", 3),
     "train_seconds": ("s of training", 0),
-    "startup_seconds": ("s to start", 0),
-    "seconds_per_image": ("s an image", 2),
-    "peak_host_mib": ("MiB of the host, most", 0),
-    "peak_device_mib": ("MiB of the device, most", 0),
+    "startup_seconds": ("s of startup", 0),
+    "seconds_per_image": ("s per image", 2),
+    "peak_host_mib": ("peak MiB of the host", 0),
+    "peak_device_mib": ("peak MiB of the device", 0),
 }
 
 _NOISY = (
-    "Times are those of the machines that did the jobs, whatever else these were doing: they are "
-    "noisy, and tables leave them out."
+    "Times are those of the machines that ran the jobs, including their other load: they are "
+    "noisy, so tables omit them."
 )
 
 FILE = "report.html"
 
-# Beyond, a report shows fewer views of each scene than it is asked to, though never none: of about
-# 5 KiB each at 200 pixels, so many are 20 MiB.
+# Largest number of images in a report, at least one view per scene: at about 5 KiB each with 200
+# pixels they take 20 MiB.
 _MOST_PICTURES = 3000
 
 _NOTHING_FROM_OUTSIDE = (
@@ -70,7 +70,7 @@ _ASSETS = Path(__file__).parent
 
 
 def address(scene: str, view: str | None = None) -> str:
-    """Returns the link to a scene's page, at a view."""
+    """Returns the link to a scene's page, optionally to a view."""
     words = [scene] if view is None else [scene, view]
     return "#scene/" + "/".join(quote(word, safe="") for word in words)
 
@@ -80,10 +80,10 @@ def show_scene(out: Path, scene: Scene, views: Sequence[str], *, edge: int, pref
 
     Args:
       out: folder of the benchmark.
-      scene: with its results.
-      views: names of those to show.
-      edge: longest edge of a picture.
-      prefix: of the identifiers of its pictures; no other scene may have it.
+      scene: scene with its results.
+      views: names of the views to show.
+      edge: longest edge of an image, pixels.
+      prefix: prefix of the identifiers of its images, unique among the scenes.
     """
     places: Places = {}
     articles = []
@@ -107,7 +107,7 @@ def show_scene(out: Path, scene: Scene, views: Sequence[str], *, edge: int, pref
         tag("nav", *chosen, class_="views", aria_label="Views"),
         tag("div", _slider(methods), *articles, class_="pictures")
         if views
-        else tag("p", "No view was rendered.", class_="note"),
+        else tag("p", "No view has been rendered.", class_="note"),
         tag("h3", "Training"),
         charts.training_charts(scene.results),
         class_="scene",
@@ -117,13 +117,13 @@ def show_scene(out: Path, scene: Scene, views: Sequence[str], *, edge: int, pref
 
 
 def thumbnail(places: Places, view: str, method: str, kind: str) -> Html | None:
-    """Returns a small copy of a picture of the page, which its script fills in."""
+    """Returns a small copy of an image of the page, which the script fills in."""
     place = places.get((view, method, kind))
     return None if place is None else tag("img", data_copy=place, alt="", class_="thumb")
 
 
 def _numbers(scene: Scene) -> Html:
-    """Returns all means of a scene, and what was found besides."""
+    """Returns all means of a scene, and its other results."""
     means = {
         result.record.method: [value(q, result.record.metrics, scene.background) for q in MAIN]
         for result in scene.results
@@ -147,8 +147,8 @@ def _heading(quantity: Quantity) -> str:
 
 
 def _slider(methods: Sequence[str]) -> Html:
-    """Returns the slider between two pictures; the script of the page fills and moves it."""
-    last = charts.families(methods)[0][-1]  # of the main methods, if there are any
+    """Returns the slider between two images, which the script of the page fills and moves."""
+    last = charts.families(methods)[0][-1]  # of the main methods, if any
 
     def choice(side: str, chosen: str) -> Html:
         options = [
@@ -163,7 +163,7 @@ def _slider(methods: Sequence[str]) -> Html:
         min="0",
         max="100",
         value="50",
-        aria_label="Share of the left picture",
+        aria_label="Share of the left image",
     )
     wipe = tag(
         "div",
@@ -181,15 +181,15 @@ def show_overview(contents: Contents, introduction: str, places: Mapping[str, Pl
     """Returns the first page.
 
     Args:
-      contents: the benchmark.
-      introduction: what is said at its top.
-      places: identifiers of the pictures of each scene.
+      contents: data of the benchmark.
+      introduction: text at the top.
+      places: identifiers of the images of each scene.
     """
     parts = {
         "scenes": ("Scenes", _scenes(contents, places)),
         "tables": ("Tables", join(map(markup.show, contents.tables))),
         "failures": ("Failure cases", _failures(contents.scenes, places)),
-        "jobs": ("Jobs not done", _not_done(contents)),
+        "jobs": ("Unfinished jobs", _not_done(contents)),
         "settings": ("Settings and costs", _settings(contents)),
     }
     links = [tag("a", title, href=f"#{name}") for name, (title, _) in parts.items()]
@@ -201,9 +201,9 @@ def show_overview(contents: Contents, introduction: str, places: Mapping[str, Pl
 
 
 def _scenes(contents: Contents, places: Mapping[str, Places]) -> Html:
-    """Returns a table of all scenes, with each method's PSNR in the mask, or of the image."""
+    """Returns a table of all scenes, with each method's masked PSNR, or that of the image."""
     if not contents.scenes:
-        return tag("p", "No job is done yet.", class_="note")
+        return tag("p", "No job is finished yet.", class_="note")
     methods = [name for name in contents.labels if _has_results(contents, name)]
     methods += sorted({r.record.method for s in contents.scenes for r in s.results} - set(methods))
     rows = [
@@ -218,8 +218,8 @@ def _scenes(contents: Contents, places: Mapping[str, Places]) -> Html:
     labels = [contents.labels.get(name, name) for name in methods]
     heads = ["scene", *labels, "category", "background"]
     note = (
-        "PSNR inside the object's mask in dB, mean over a scene's images; of the whole image "
-        "where there are no masks. The best is bold. A scene leads to its views."
+        "PSNR inside the object's mask in dB, mean over a scene's images; of the full image where "
+        "there are no masks. The best is bold. Click a scene to see its views."
     )
     return join([markup.grid(heads, rows), tag("p", note, class_="note")])
 
@@ -246,10 +246,10 @@ def _first_picture(places: Places) -> Html | None:
 
 
 def _failures(scenes: Sequence[Scene], places: Mapping[str, Places]) -> Html:
-    """Returns where each method fails most, with a filter that the page's script serves."""
+    """Returns the worst views of each method, with a filter that the page's script applies."""
     found = data.failures(scenes, _MOST_CASES)
     if not found:
-        return tag("p", "No view was measured.", class_="note")
+        return tag("p", "No view has been measured.", class_="note")
     methods = list(dict.fromkeys(case.method for case in found))
     options = [
         tag("option", "all methods", value=""),
@@ -258,15 +258,15 @@ def _failures(scenes: Sequence[Scene], places: Mapping[str, Places]) -> Html:
     rows = [_case(case, places[case.scene]) for case in found]
     note = (
         f"The {_MOST_CASES} views of each method with the lowest PSNR inside the mask, the worst "
-        "first; views without it come last, by the PSNR of the image. Pictures: ground truth, "
-        "rendered, error."
+        "first; views without it come last, by the PSNR of the image. Images: ground truth, "
+        "render, error."
     )
-    choice = tag("label", "Of ", tag("select", *options, id="failing"), hidden=True)
+    choice = tag("label", "Method: ", tag("select", *options, id="failing"), hidden=True)
     return join([tag("p", note, class_="note"), choice, tag("ol", *rows, class_="cases")])
 
 
 def _case(case: Case, places: Places) -> Html:
-    """Returns a line of the failures, with pictures where the report has the view."""
+    """Returns a line of the failures, with images if the report has the view."""
     is_shown = any(view == case.view for view, _, _ in places)
     link = address(case.scene, case.view if is_shown else None)
     pictures = [
@@ -289,10 +289,10 @@ def _case(case: Case, places: Places) -> Html:
 
 def _not_done(contents: Contents) -> Html:
     failed = [[f"failed: {name}", reason] for name, reason in contents.failed.items()]
-    left_out = [[f"left out: {each.name}", each.reason] for each in contents.skipped]
-    missing = [[f"not done: {name}", "it has no result yet"] for name in contents.missing]
+    left_out = [[f"skipped: {each.name}", each.reason] for each in contents.skipped]
+    missing = [[f"unfinished: {name}", "it has no result yet"] for name in contents.missing]
     if not (found := [*failed, *left_out, *missing]):
-        return tag("p", "All jobs that were asked for are done.", class_="note")
+        return tag("p", "All requested jobs are finished.", class_="note")
     return markup.grid(["job", "reason"], found)
 
 
@@ -342,15 +342,15 @@ def _costs(found: Sequence[Record]) -> Html:
 
 
 def write(out: Path, *, views: int, edge: int) -> Path:
-    """Writes the report of a benchmark, all or nothing.
+    """Writes the report of a benchmark atomically.
 
     Args:
       out: folder of the benchmark, with its results.json.
-      views: of each scene to show.
-      edge: longest edge of a picture in pixels; smaller ones stay as they are.
+      views: number of views per scene to show.
+      edge: longest edge of an image in pixels; smaller ones are unchanged.
 
     Returns:
-      The file.
+      Path of the file.
 
     Raises:
       ValueError: if there are no results, or they are broken.
@@ -379,7 +379,7 @@ def write(out: Path, *, views: int, edge: int) -> Path:
 
 
 def shown_views(scenes: tuple[Scene, ...], asked: int) -> int:
-    """Returns how many views of each scene a report shows, so that it does not grow too large."""
+    """Returns the number of views per scene in a report of limited size."""
     of_one = sum(3 * (len(scene.results) + 1) for scene in scenes)
     return max(1, min(asked, _MOST_PICTURES // max(1, of_one)))
 
@@ -390,9 +390,9 @@ def _introduction(everything: Contents, count: int, edge: int) -> str:
     preset, steps = everything.settings.preset, everything.settings.steps
     return (
         f"Results: {results}, scenes: {len(everything.scenes)}; preset {preset}, {steps} steps. "
-        f"Pictures: {min(count, views)} of at most {views} test views of a scene, three in five "
-        "where methods fail most and the others spread evenly. They are compressed, and reduced "
-        f"where they have more than {edge} pixels an edge; all numbers are of the originals."
+        f"Images: {min(count, views)} of at most {views} test views per scene, three in five where "
+        "methods fail most and the others spread evenly. They are compressed, and downsampled if "
+        f"they have more than {edge} pixels per edge; all numbers are those of the originals."
     )
 
 

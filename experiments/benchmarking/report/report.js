@@ -1,6 +1,6 @@
 "use strict";
-// Tells the pages of a report apart by the address' end, copies pictures that are shown more than
-// once, and moves the slider. Without it the page shows everything, one below the other.
+// Selects the page of a report by the fragment of the address, copies images that are shown more
+// than once, and moves the slider. Without it the page shows everything, one below the other.
 (() => {
   const overview = document.getElementById("overview");
   const scenes = [...document.querySelectorAll("section.scene")];
@@ -27,7 +27,7 @@
     }
   }
 
-  // Shows one view of a scene: the one that is asked for, or its first.
+  // Shows one view of a scene: the requested one, or its first.
   function choose(page, asked) {
     const views = [...page.querySelectorAll("article")];
     const shown = views.find((each) => each.dataset.view === asked) ?? views[0];
@@ -39,7 +39,7 @@
     if (shown) fill(page, shown);
   }
 
-  // Fills the slider with two pictures of a view.
+  // Fills the slider with two images of a view.
   function fill(page, view) {
     const slider = page.querySelector(".slider");
     const pictures = new Map();

@@ -108,7 +108,7 @@ def test_killed_at_any_time_it_comes_to_the_same_tables(tmp_path, serve, scenes)
     serve(cut, scenes, "--methods=straight,tree")
     assert _all_but_costs(cut) == _all_but_costs(whole)
     count = len(calls(cut))
-    assert "All jobs are done already" in serve(cut, scenes, "--methods=straight,tree").stdout
+    assert "All jobs are already finished" in serve(cut, scenes, "--methods=straight,tree").stdout
     assert len(calls(cut)) == count
 
 
@@ -148,7 +148,7 @@ def test_what_was_left_out_stays_listed_and_what_has_no_result_is_listed(tmp_pat
     ball = scenes.replace("*", "cube_smcvx_ball")
     (tmp_path / "scenes/cube_smcvx_ball/meshes/ball_glass.ply").unlink()
     serve(tmp_path, ball, "--methods=tree")
-    assert "All jobs are left out" in serve(tmp_path, ball, "--methods=oracle").stdout
+    assert "All jobs are skipped" in serve(tmp_path, ball, "--methods=oracle").stdout
     serve(tmp_path, scenes, "--methods=straight")
     text = _text(tmp_path)
     assert "- cube_smcvx_ball/tree: it has no meshes" in text
@@ -157,7 +157,7 @@ def test_what_was_left_out_stays_listed_and_what_has_no_result_is_listed(tmp_pat
     index = _index(tmp_path)
     assert [each["method"] for each in index["skipped"]] == ["tree", "oracle"]
     assert index["missing"] == ["env_mmncvx_cup/oracle", "env_mmncvx_cup/tree"]
-    assert "not done: env_mmncvx_cup/tree" in _text(tmp_path, "report.html")
+    assert "unfinished: env_mmncvx_cup/tree" in _text(tmp_path, "report.html")
 
 
 def test_scenes_and_methods_are_added_and_settings_stay(tmp_path, serve, scenes):
@@ -172,7 +172,7 @@ def test_scenes_and_methods_are_added_and_settings_stay(tmp_path, serve, scenes)
     ]
     before = _text(tmp_path, "benchmark.json")
     result = serve(tmp_path, scenes, "--methods=tree", "--seed=1", status=2)
-    assert "was begun with seed 0, and is now asked for with seed 1" in result.stderr
+    assert "was started with seed 0, but is now requested with seed 1" in result.stderr
     assert "Evaluating again" not in result.stderr
     assert _text(tmp_path, "benchmark.json") == before
 
@@ -187,7 +187,7 @@ def test_results_of_two_machines_are_merged_by_copying(tmp_path, serve, scenes):
     shutil.copytree(there / "out" / plan.FOLDER, here / "out" / plan.FOLDER, dirs_exist_ok=True)
     told = serve(here, "--tables_only", "--report_views=1", "--report_edge=16").stdout
     assert f"Report:  {here / 'out/report.html'} (" in told
-    assert f"Picture: {here / 'out/pictures.jpg'}" in told
+    assert f"Images:  {here / 'out/pictures.jpg'}" in told
     assert _text(here, "report.html").count("<article") == 2
     assert _all_but_costs(here) == _all_but_costs(tmp_path)
     assert "several versions" not in _text(here)
@@ -225,17 +225,17 @@ def test_a_dry_run_lists_and_does_nothing(tmp_path, serve, scenes):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--scenes=nowhere/*",), "names no scene"),
+        (("--scenes=nowhere/*",), "matches no scene"),
         (("--scenes=nowhere",), "nowhere/transforms_train.json does not exist"),
         (("--jobs=2", "--ray=local", _BUNDLED), "--jobs would have no effect on a Ray cluster"),
         (("--job_cpus=1", "--job_gpus=1", _BUNDLED), "--job_cpus, --job_gpus would have no"),
         (("--methods=magic", _BUNDLED), "There is no method 'magic'"),
         (("--rays_per_pixel=3", _BUNDLED), "3 rays a pixel do not make a square"),
-        (("--lpips_weights=none.npz", _BUNDLED), "none.npz cannot be read as the weights"),
-        (("--tables_only",), "holds no benchmark"),
-        (("--tables_only", "--methods=tree"), "--tables_only does not use --methods:"),
-        (("--tables_only", "--scenes=/nope"), "--tables_only does not use --scenes:"),
-        (("--tables_only", "--dry_run"), "--tables_only does not use --dry_run:"),
+        (("--lpips_weights=none.npz", _BUNDLED), "none.npz cannot be read as weights"),
+        (("--tables_only",), "has no benchmark"),
+        (("--tables_only", "--methods=tree"), "--tables_only does not use --methods,"),
+        (("--tables_only", "--scenes=/nope"), "--tables_only does not use --scenes,"),
+        (("--tables_only", "--dry_run"), "--tables_only does not use --dry_run,"),
     ],
 )
 def test_mistakes_end_before_anything_is_done(tmp_path, serve, options, message):
@@ -284,7 +284,7 @@ def test_the_next_command_has_all_that_was_asked_for_and_can_be_given(tmp_path, 
     for path in (tmp_path / "scenes").glob("*/transforms_test.json"):
         path.unlink()
     answer = serve(tmp_path, scenes, "--methods=ablations", f"--out={tmp_path / 'other'}")
-    assert "its test views can not be read" in answer.stdout and "Next: open " in answer.stdout
+    assert "its test views cannot be read" in answer.stdout and "Next: open " in answer.stdout
 
 
 def test_what_is_trained_is_evaluated_again_in_a_copy_without_results(tmp_path, serve, scenes):
@@ -293,7 +293,7 @@ def test_what_is_trained_is_evaluated_again_in_a_copy_without_results(tmp_path, 
     weights = made_lpips.write(tmp_path / "weights.npz")
     new = ["--methods=straight,r3f", scenes, f"--lpips_weights={weights}", "--limit=2"]
     refused = serve(tmp_path, *new[:3], status=2).stderr
-    assert "was begun without LPIPS, and is now asked for with the weights of LPIPS" in refused
+    assert "was started without LPIPS, but is now requested with the weights of LPIPS" in refused
     assert "'Evaluating again' in docs/benchmark.md" in refused
     copy = tmp_path / "again"
     shutil.copytree(tmp_path / "out", copy)

@@ -72,7 +72,7 @@ def test_there_is_a_job_for_each_scene_and_method_and_one_reconstruction_a_scene
     [
         ("meshes", ["straight", "r3f"], "no meshes"),
         ("masks", ["straight", "tree", "tree_tints_given"], "no masks"),
-        ("colours", ["straight", "tree", "r3f"], "scene.json does not tell"),
+        ("colours", ["straight", "tree", "r3f"], "scene.json does not define"),
     ],
 )
 def test_what_a_scene_lacks_is_skipped_and_said(tmp_path, lacks, left, reason):
@@ -95,7 +95,7 @@ def test_an_ablation_that_a_scene_comes_to_anyway_is_left_out(tmp_path, colour, 
     if colour is not None:
         _edit("scene.json", "[1.0, 1.0, 1.0]", json.dumps(colour))(Path(scene.path))
     names, reasons = _planned(scene, ",".join(["tree", "tree_field", *_INSIDES]))
-    assert reasons[same] == f"in this scene it is tree again {told}"
+    assert reasons[same] == f"in this scene it equals tree {told}"
     # Given colours that are not told are wanting.
     assert set(reasons) - {same} <= ({"tree_tints_given"} if colour is None else set())
     assert set(names) == {"tree", "tree_field", *_INSIDES} - set(reasons)
@@ -108,7 +108,7 @@ def test_an_ablation_that_the_preset_has_already_is_left_out(tmp_path, preset, s
     common = dataclasses.replace(SETTINGS, preset=preset)
     names, reasons = _planned(_scene(tmp_path), "all", common)
     found = {name: reason for name, reason in reasons.items() if "preset" in reason}
-    assert found == {same: f"in the preset {preset} it is tree again"}
+    assert found == {same: f"in the preset {preset} it equals tree"}
     assert len(names) + len(reasons) == len(METHODS)
 
 
@@ -129,7 +129,7 @@ def test_a_scene_without_test_views_is_left_out_and_one_broken_otherwise_is_not(
     names, reasons = _planned(scene, "main")
     assert names == [] and len(reasons) == 5
     assert all(
-        "its test views can not be read" in each and named in each for each in reasons.values()
+        "its test views cannot be read" in each and named in each for each in reasons.values()
     )
 
 
@@ -144,8 +144,8 @@ def test_scenes_are_found_by_wildcards_and_folders(tmp_path):
     for words, message in [
         ([str(tmp_path / "*" / "cube_*")], "are named cube_smcvx_ball"),
         ([str(tmp_path / "a" / "preview")], r"preview/transforms_train\.json does not exist"),
-        ([str(tmp_path / "c*")], "names no scene"),
-        ([], "names no scene"),
+        ([str(tmp_path / "c*")], "matches no scene"),
+        ([], "matches no scene"),
     ]:
         with pytest.raises(ValueError, match=message):
             plan.find_scenes(words)
@@ -174,8 +174,8 @@ def test_a_benchmark_grows_but_does_not_change(tmp_path):
     another = dataclasses.replace(ball, fingerprint="other")
     changed = dataclasses.replace(METHODS["tree"], train=("--paths=tree", "--cut=0.5"))
     for common, scenes, chosen, message in [
-        ({"steps": 7}, [], [], "begun with steps 6, and is now asked for with steps 7.*--steps"),
-        ({"limit": 3}, [], [], "begun without --limit"),
+        ({"steps": 7}, [], [], "started with steps 6, but is now requested with steps 7.*--steps"),
+        ({"limit": 3}, [], [], "started without --limit"),
         ({"lpips": "abc"}, [], [], "--lpips_weights"),
         ({}, [another], [], "another scene named cube_smcvx_ball"),
         ({}, [], [changed], "the method tree is --paths=tree, in this version"),
@@ -184,7 +184,7 @@ def test_a_benchmark_grows_but_does_not_change(tmp_path):
         with pytest.raises(ValueError, match=message):
             settings.extended(out, asked)
     (out / settings.FILE).write_text('{"settings": {}}')
-    for folder, message in [(out, "is not that of a benchmark"), (tmp_path, "holds no benchmark")]:
+    for folder, message in [(out, "is not a valid benchmark"), (tmp_path, "has no benchmark")]:
         with pytest.raises(ValueError, match=message):
             settings.read(folder)
 

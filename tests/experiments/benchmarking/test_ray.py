@@ -56,7 +56,7 @@ def test_a_cluster_comes_to_the_same_results_and_a_failure_is_told(tmp_path, pla
 
 
 def test_what_no_machine_has_is_refused(tmp_path, planned):
-    with pytest.raises(ValueError, match=r"No job will ever start.*--job_gpus"):
+    with pytest.raises(ValueError, match=r"No job can start.*--job_gpus"):
         RayEngine(tmp_path, "local", cpus=1.0, gpus=99.0, run=run_with_stand_in)
 
 

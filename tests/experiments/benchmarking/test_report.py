@@ -98,7 +98,7 @@ def test_every_scene_method_view_and_metric_is_there(text):
     ((_, tables),) = _elements(text, "section", id="tables")
     for name in ("straight", "tree"):
         assert METHODS[name].label in scenes and METHODS[name].label in tables
-    assert "measured on its data" in tables and "Nothing is measured yet" in tables
+    assert "measured on its data" in tables and "No results yet" in tables
     rows = _elements(text, "tr", class_="published")
     assert rows and all("published" in words and "±" not in words for _, words in rows)
     assert "28.00" in [words for _, words in _elements(text, "strong")]
@@ -133,7 +133,7 @@ def test_nothing_is_loaded_from_anywhere_and_links_lead_somewhere(text):
 def test_without_pictures_there_is_a_report_still(out, tmp_path):
     copy = _copy(out, tmp_path)
     text = page.write(copy, views=2, edge=200).read_text("utf-8")
-    assert _pictures(text) == [] and _absent(text) == ["picture not here"] * 4 * 9
+    assert _pictures(text) == [] and _absent(text) == ["image not available"] * 4 * 9
     assert len(_elements(text, "svg", class_="chart")) == 4  # the curves are in results.json
     (copy / images.SHEET).write_bytes(b"of scenes that were there")
     assert images.write_sheet(copy) is None and not (copy / images.SHEET).exists()
@@ -156,10 +156,10 @@ def test_a_broken_picture_and_one_of_another_size_are_left_out(out, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "has no results.json. Make it with --tables_only."),
+        (None, "has no results.json. Create it with --tables_only."),
         ("{", "is not valid JSON"),
-        ("{}", "is not that of a benchmark (KeyError('jobs')"),
-        ('{"jobs": [{}]}', "is not that of a benchmark (ValueError('the file lacks scene')"),
+        ("{}", "is not a valid index (KeyError('jobs')"),
+        ('{"jobs": [{}]}', "is not a valid index (ValueError('the file lacks scene')"),
     ],
 )
 def test_broken_results_are_named(out, tmp_path, text, message):

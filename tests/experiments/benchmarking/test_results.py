@@ -30,13 +30,13 @@ def _read(out, scenes=()):
     [
         (
             _TREE._replace(options=_TREE.options | {"train": ["--preset=tiny"]}),
-            "made by train --preset=tiny, and here tree is train --preset=tiny --steps=6",
+            "made by train --preset=tiny, but here tree is train --preset=tiny --steps=6",
         ),
         (_TREE._replace(options={**_TREE.options, "evaluate": []}), "made by evaluate"),
         (_TREE._replace(settings=dataclasses.replace(SETTINGS, seed=1)), "with other settings"),
-        (_TREE._replace(category="smncvx"), "its name says smcvx before cube"),
-        (_TREE._replace(background="env"), "its name says smcvx before cube"),
-        (_TREE._replace(method="magic"), "method magic, which this version does not know"),
+        (_TREE._replace(category="smncvx"), "its name has smcvx and cube"),
+        (_TREE._replace(background="env"), "its name has smcvx and cube"),
+        (_TREE._replace(method="magic"), "method magic, which is unknown in this version"),
         (_TREE._replace(fingerprint="other"), "another scene named cube_smcvx_ball"),
     ],
 )
@@ -77,13 +77,13 @@ def test_the_options_of_a_method_are_those_that_the_benchmark_was_begun_with(tmp
         (lambda c: c["per_image"][0].pop("name"), "the name of an image is None"),
         (lambda c: c["per_image"][0].update(psnr="thirty"), "r_0.psnr is 'thirty'"),
         (lambda c: c["metrics"].update(psnr=True), "metrics.psnr is True"),
-        (lambda c: c.update(metrics=None), "metrics is None, which is no object"),
-        (lambda c: c.update(per_image={}), "per_image is {}, which is no list"),
-        (lambda c: c.update(costs={"price": 1.0}), "price, which is no cost"),
+        (lambda c: c.update(metrics=None), "metrics is None, which is not an object"),
+        (lambda c: c.update(per_image={}), "per_image is {}, which is not a list"),
+        (lambda c: c.update(costs={"price": 1.0}), "price, which is not a cost"),
         (lambda c: c.update(views=[{"name": "r_0"}]), "rgb of a view is None"),
-        (lambda c: c.update(scene=3.0), "scene is 3.0, which is no text"),
+        (lambda c: c.update(scene=3.0), "scene is 3.0, which is not text"),
         (lambda c: c.pop("fingerprint"), "lacks fingerprint"),
-        (lambda c: c["settings"].update(luck=1), "its settings are others"),
+        (lambda c: c["settings"].update(luck=1), "its settings differ"),
     ],
 )
 def test_contents_of_another_kind_are_named(tmp_path, spoil, message):

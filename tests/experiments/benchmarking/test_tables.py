@@ -222,7 +222,7 @@ def test_top_views_are_means_over_the_five_farthest():
     few = made_record("cube_smcvx_cube", "tree", psnr=1.0)._replace(per_image=views[:2])
     for records, told in (([record], "5"), ([few], "2"), ([few, record], "2 to 5")):
         notes = paper_tables.top_views_table(records).notes
-        assert f"the {told} rendered test views" in notes[0]
+        assert f"The {told} rendered test views" in notes[0]
     assert paper_tables.top_views_table([]).blocks == ()
 
 
@@ -235,7 +235,7 @@ def test_the_drmse_beside_the_papers_is_that_in_the_mask():
     theirs = _rows(table.blocks[0], "published")["R3F"].cells
     assert (ours[masked].mean, ours[image].mean) == (0.0, 0.75)
     assert (theirs[masked].mean, theirs[image]) == (0.88, NOTHING)
-    assert "does not say over which pixels" in " ".join(table.notes)
+    assert "does not state the pixels" in " ".join(table.notes)
 
 
 def test_ablations_are_differences_over_common_scenes_beside_the_papers():
@@ -280,7 +280,7 @@ def test_ablations_are_differences_over_common_scenes_beside_the_papers():
         labels = {row.label for block in other.blocks for row in block.rows}
         assert _ORACLE in labels and "w/o TIR" not in labels
     nothing = paper_tables.ablation_table(_RESULTS)
-    assert nothing.blocks == () and "Nothing is measured yet" in summary.markdown(nothing)
+    assert nothing.blocks == () and "No results yet" in summary.markdown(nothing)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -311,7 +311,7 @@ def test_markdown_and_latex_mark_and_label():
     assert "| Oracle (paper's paths) | 2 | <u>32.00</u> ± 2.00 | 26.00 ± 2.00 |" in text
     assert "| Oracle, *published* | - | 31.64 | 25.37 | 0.96 |" in text
     assert "| method | scenes | PSNR ↑ | masked PSNR ↑ | SSIM ↑ | LPIPS ↓ | DMAE, sub" in text
-    assert "measured on its data, which is not ours" in " ".join(text.split())
+    assert "measured on its data, which differs from ours" in " ".join(text.split())
     tex = summary.latex(table)
     assert r"\textbf{33.50} {\tiny$\pm$2.50}" in tex and r"\underline{32.00}" in tex
     assert r"Oracle \emph{(published)} & -- & 31.64" in tex and "& DMAE, substituted" in tex
@@ -321,7 +321,7 @@ def test_markdown_and_latex_mark_and_label():
     comments = [line for line in tex.splitlines() if line[:1] == "%"]
     assert len(comments) == 1 + len(table.notes)
     assert not any("**" in line or "<u>" in line or "`" in line for line in comments)
-    assert any("Substituted distances have the true ones" in line for line in comments)
+    assert any("Substituted distances equal the true ones" in line for line in comments)
 
 
 def test_odd_names_break_no_row():

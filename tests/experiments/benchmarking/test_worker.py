@@ -103,7 +103,7 @@ def test_a_job_waits_for_who_still_works_in_its_run(tmp_path, capsys):
     worker.wait_until_free(tmp_path)
     with atomic_files.hold(tmp_path), pytest.raises(ValueError, match="Another process works"):
         worker.wait_until_free(tmp_path, patience=0.3)
-    line = f"Waiting until the process ends that works in {tmp_path} yet.\n"
+    line = f"Waiting for the process that still works in {tmp_path}.\n"
     assert capsys.readouterr().out == line
 
 
@@ -178,9 +178,9 @@ def test_an_interruption_stops_what_runs_and_begins_nothing_more(tmp_path, monke
     jobs = [_job(scene, "tree") for scene in "abcdef"]
     with pytest.raises(KeyboardInterrupt):
         worker.run_in_order(jobs, Interrupted(None, 1, lambda out, job: run(job)), None)
-    assert "killed by SIGTERM" in ends[0] or "stopped before it began" in ends[0]
+    assert "killed by SIGTERM" in ends[0] or "stopped before it started" in ends[0]
     assert len(ends) < len(jobs)
-    with subprocesses.stopping(), pytest.raises(RunFailedError, match="stopped before it began"):
+    with subprocesses.stopping(), pytest.raises(RunFailedError, match="stopped before it started"):
         subprocesses.run("train", log=tmp_path / "log")
 
 

@@ -213,7 +213,7 @@ def test_another_scene_is_refused_and_a_moved_one_is_not(scene, whole, tmp_path)
 
 def test_folders_of_other_things_are_left_alone(scene, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match="something else than a reconstruction"):
+    with pytest.raises(ValueError, match="files, but no reconstruction"):
         _run(scene, tmp_path)
     with pytest.raises(ValueError, match="is a file"):
         _run(scene, tmp_path / "notes.txt")
@@ -311,7 +311,7 @@ def test_light_is_kept_only_where_validation_views_say_so(
     grown = np.ptp(part.vertices) / np.ptp(old.vertices)
     assert grown == pytest.approx(1.001 if kept else 1.0)
     told = (out / "report.md").read_text()
-    assert ("(light/ball_glass.ply)" in told) == kept and ("; left out" in told) != kept
+    assert ("(light/ball_glass.ply)" in told) == kept and ("; discarded" in told) != kept
     # The index was given, so that light leaves it alone.
     assert json.loads((out / "index.json").read_text())["index"] == part.index == 1.5
     if kept:
@@ -371,7 +371,7 @@ def test_a_wrong_mask_is_named_unless_one_may_be_wrong(scene, tmp_path, outliers
         assert facts.doubts == () and facts.volume == pytest.approx(true, rel=0.1)
     else:
         seen, taken = facts.doubts
-        assert "of 24 training masks overlap with the body by less than 0.9" in seen
+        assert "of 24 training masks overlap with the object by less than 0.9" in seen
         name = wrong.relative_to(spoilt).as_posix()
         assert taken.startswith(f"{name} alone carves away") and "--outliers=1" in taken
         assert facts.volume < 0.7 * true

@@ -174,27 +174,27 @@ def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
     ("name", "message"),
     [
         ("half", "Continue with --resume"),
-        ("named index", "--ior=glass=1.5, but there is one reconstructed object"),
-        ("two indices", "Give its index alone, once"),
-        ("no index", "--ior=15 is no index of refraction"),
-        ("no number", "--ior=glass is no index of refraction"),
-        ("oracle too", "--method=oracle takes the scene's own meshes"),
+        ("named index", "--ior=glass=1.5 is invalid for the single reconstructed object"),
+        ("two indices", "Pass its index once"),
+        ("no index", "--ior=15 is not an index of refraction"),
+        ("no number", "--ior=glass is not an index of refraction"),
+        ("oracle too", "--method=oracle uses the scene's own meshes"),
         ("no effect", "--resolution would have no effect"),
         ("no effect of oracle", "add --method=r3f"),
-        ("straight", "--paths=straight knows of no objects"),
-        ("nothing there", "nowhere holds no reconstruction"),
+        ("straight", "--paths=straight ignores objects"),
+        ("nothing there", "nowhere has no reconstruction"),
         ("outliers of no hull", "geometry=occupancy, outliers=1: --outliers has no effect"),
         ("run in its body", "is the reconstruction itself"),
-        ("r3f begun anew", "holds a run already"),
+        ("r3f begun anew", "already contains a run"),
         ("r3f with another grid", "ior 1.5, not 1.6"),
         ("r3f by name alone", "--method would have no effect"),
         ("r3f with a given one", "begun with other options"),
-        ("file with named index", "Give its index alone, once"),
+        ("file with named index", "Pass its index once"),
         ("file with oracle", "ball_glass.ply cannot be read"),
-        ("file with a grid", "is reconstructed already. Leave it out, or add --method=r3f."),
+        ("file with a grid", "is already reconstructed. Remove it, or add --method=r3f."),
         ("file with straight", "Add --method=oracle, since"),
         ("file with straight oracle", "ball_glass.ply cannot be read"),
-        ("moved without it", "which is not there. Give where it is now as --reconstruction"),
+        ("moved without it", "which does not exist. Set --reconstruction to"),
     ],
 )
 def test_mistakes_are_told(found, name, message):
@@ -225,7 +225,7 @@ def test_a_run_and_what_was_reconstructed_for_it_move_together(found, runs, move
     assert "hull of the training masks" not in found["moved, resumed by its file"]["printed"]
     told = found["file anew"]
     assert told["reconstruction"] == str(runs / "file anew" / "r3f")
-    assert "decided again, because of what is on top of" in told["printed"]
+    assert "decided again, because of flags that override" in told["printed"]
 
 
 @pytest.mark.slow

@@ -29,7 +29,7 @@ def _subject(budget=TREE, frames=None):
 @pytest.mark.parametrize(
     ("option", "words"),
     [
-        ("--heights=90,36", "--heights=90,36 are not two or more whole numbers that grow"),
+        ("--heights=90,36", "--heights=90,36 are not two or more increasing integers"),
         ("--heights=36", "--heights=36 are not"),
         ("--heights=small,large", "--heights=36,90,180"),
     ],
