@@ -14,7 +14,7 @@ Under any nesting of `vmap`, all rays are cast as one batch (see `bvh`). The tri
 a constant for differentiation: recompute the hit point from the triangle to obtain gradients.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -205,7 +205,7 @@ def _find(bvh: BVH, query: _Query) -> Int[Array, " rays"]:
 
 @_find.def_vmap
 def _find_mapped(
-    axis_size: int, in_batched: list, bvh: BVH, query: _Query
+    axis_size: int, in_batched: list[Any], bvh: BVH, query: _Query
 ) -> tuple[Int[Array, "axis rays"], bool]:
     bvh_batched, query_batched = in_batched
     if any(jax.tree.leaves(bvh_batched)):

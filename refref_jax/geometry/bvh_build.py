@@ -24,6 +24,7 @@ from jaxtyping import Bool, Float, Int
 
 from refref_jax.geometry import bvh_nodes
 from refref_jax.geometry.bvh import BVH, LEAF_SIZE
+from refref_jax.numerics import host_array
 
 
 def best_splits(
@@ -267,7 +268,8 @@ def build(
     nodes = pack_nodes(levels, lower[order], upper[order])
     facets = prepare_facets(triangles[slots])
     facets[len(order) :] = 0.0
-    return BVH(nodes, triangles[slots], facets), slots.astype(np.int32)
+    bvh = BVH(host_array(nodes), host_array(triangles[slots]), host_array(facets))
+    return bvh, slots.astype(np.int32)
 
 
 def _empty(dtype: np.dtype) -> BVH:
@@ -276,9 +278,9 @@ def _empty(dtype: np.dtype) -> BVH:
     level = Level(np.array([0]), np.array([1]), np.array([-1]))
     nodes = pack_nodes([level], point, point)
     return BVH(
-        nodes,
-        np.zeros((LEAF_SIZE, 3, 3), dtype),
-        prepare_facets(np.zeros((LEAF_SIZE, 3, 3), dtype)),
+        host_array(nodes),
+        host_array(np.zeros((LEAF_SIZE, 3, 3), dtype)),
+        host_array(prepare_facets(np.zeros((LEAF_SIZE, 3, 3), dtype))),
     )
 
 

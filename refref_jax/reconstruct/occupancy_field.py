@@ -40,6 +40,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from refref_jax import numerics
+from refref_jax.fields.base import evaluate
 from refref_jax.fields.hash_grid import HashGrid, HashGridConfig
 
 Params = Any
@@ -90,7 +91,7 @@ def signed(
       config: the same as there.
       position: in the unit cube; beyond it the grid's outer cells go on as they end.
     """
-    return _OccupancyField(config).apply(params, position)
+    return evaluate(_OccupancyField(config), params, position)
 
 
 def slope(
