@@ -187,7 +187,7 @@ def path_radiance(
     warp = distance_warp(config, line)
     # No interval straddles an interface, if there are enough edges.
     bends = scene_bounds.to_unit(warp, line.knots[1:])
-    histograms = []
+    histograms: list[Histogram] = []
     for level, proposal in enumerate(config.proposals):
         s = _resample(config, histograms, jitter.offsets[level], anneal, proposal.samples)
         s = stepfun.snap(s, bends)
@@ -201,8 +201,8 @@ def path_radiance(
     samples = _place(config, line, warp, s, jitter.rotations[-1])
     middles = 0.5 * (samples.t[1:] + samples.t[:-1])
     points = jax.vmap(polylines.point_at, in_axes=(None, 0))(line, middles)
-    see = jax.vmap(registry.radiance, in_axes=(None, None, 0, 0))
-    seen = see(params.field, config.field, samples.gaussians, points.direction)
+    look = jax.vmap(registry.radiance, in_axes=(None, None, 0, 0))
+    seen = look(params.field, config.field, samples.gaussians, points.direction)
     weights = _weigh(config, seen.density, samples.t)
     composited = composite(weights, seen.rgb, samples.t)
     return PathRadiance(
