@@ -395,7 +395,7 @@ def average(fine: Rendering, side: int) -> Rendering:
     of the two surfaces, never a place between them where nothing is.
     """
 
-    def filtered(values: Array) -> Any:
+    def filtered(values: Array | np.ndarray) -> Any:
         return host_array(box_filter(np.asarray(values), side))
 
     linear = filtered(fine.linear)
