@@ -42,6 +42,7 @@ test-slow: $(READY)
 lint: $(READY)
 	$(RUN) ruff check .
 	$(RUN) ruff format --check .
+	$(RUN) mypy
 
 format: $(READY)
 	$(RUN) ruff check --fix .
@@ -61,7 +62,7 @@ benchmark-small: $(READY) $(BLENDER_READY)
 		--preset=tiny --steps=1250 --rays_per_pixel=4 --out=$(SMALL)/results
 
 clean:
-	rm -rf $(VENV) $(BLENDER_VENV) .pytest_cache .ruff_cache *.egg-info
+	rm -rf $(VENV) $(BLENDER_VENV) .mypy_cache .pytest_cache .ruff_cache *.egg-info
 
 $(READY): pyproject.toml
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: install it first."; exit 1; }

@@ -13,12 +13,8 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Literal
-
-try:
-    import fcntl
-except ImportError:  # pragma: no cover
-    fcntl = None
 
 Stop = Literal["process", "machine"]
 """Failure that a write survives: termination of the process, or a crash of the machine."""
@@ -90,6 +86,15 @@ def beside(target: Path) -> Path:
     return target.with_name(f".{target.name}{UNFINISHED}")
 
 
+def _import_locks() -> ModuleType | None:
+    """Returns the module of file locks, or `None` on systems without it."""
+    try:
+        import fcntl
+    except ImportError:  # pragma: no cover
+        return None
+    return fcntl
+
+
 @contextlib.contextmanager
 def hold(folder: Path) -> Iterator[None]:
     """Locks a folder against other processes for the duration of the context.
@@ -100,6 +105,7 @@ def hold(folder: Path) -> Iterator[None]:
     Raises:
       ValueError: if another process holds the lock.
     """
+    fcntl = _import_locks()
     if fcntl is None:
         yield
         return

@@ -10,9 +10,11 @@ so the *argument* of the singular function is replaced as well as its result.
 
 import functools
 import operator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 # Direction components are clamped to at least this: a ray would have to travel 1e12 units before
@@ -222,3 +224,13 @@ def offset_origin(
     Self-Intersection, Ray Tracing Gems (2019), ch. 6.
     """
     return point + _OFFSET_IN_ULPS * jnp.finfo(point.dtype).eps * scale * towards
+
+
+def host_array(values: np.ndarray | np.generic) -> Any:
+    """Returns NumPy values as they are, for a record whose fields are annotated as arrays of JAX.
+
+    Records such as `Surfaces` are built on the host and hold NumPy arrays until JAX moves them to a
+    device. JAX takes both, so the type is left open here, and the annotations of the fields stay
+    those of the functions that compute with them.
+    """
+    return values

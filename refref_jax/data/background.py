@@ -21,6 +21,7 @@ from jaxtyping import Float
 
 from refref_jax.choices import Space
 from refref_jax.data import SceneError, image_files, scene_folder, scene_names
+from refref_jax.numerics import host_array
 from refref_jax.render.backgrounds import (
     Background,
     CubeBackground,
@@ -102,12 +103,13 @@ def _read_cube(record: dict[str, Any], scene: Path) -> CubeBackground:
         )
     axes = axes.astype(np.float32)
     texture = _stack([_read_texture(wall, scene) for wall in walls], path)
-    return CubeBackground(texture, axes[:, 0], axes[:, 1], axes[:, 2], np.float32(half))
+    normals, across, along = (host_array(axes[:, i]) for i in range(3))
+    return CubeBackground(texture, normals, across, along, host_array(np.float32(half)))
 
 
 def _read_sphere(record: dict[str, Any], scene: Path) -> SphereBackground:
     radius = _positive(scene_folder.get(record, "radius", scene / _FILE), "radius", scene)
-    return SphereBackground(_read_texture(record, scene), np.float32(radius))
+    return SphereBackground(_read_texture(record, scene), host_array(np.float32(radius)))
 
 
 def _read_environment(record: dict[str, Any], scene: Path) -> Environment:
@@ -125,13 +127,14 @@ def _read_texture(record: Any, scene: Path) -> Texture:
     """Reads the image of a record: EXR as linear RGB, other formats as 8-bit sRGB."""
     path = scene / scene_folder.get_text(record, "image", scene / _FILE)
     if path.suffix.lower() != ".exr":
-        return SrgbTexture((image_files.read_rgb(path) / 255.0).astype(np.float32))
+        texels = (image_files.read_rgb(path) / 255.0).astype(np.float32)
+        return SrgbTexture(host_array(texels))
     texels = image_files.read_exr(path)
     if texels.ndim != 3:
         raise SceneError(f"{path} has one channel, but a background has three. Export R, G and B.")
     if not np.all(np.isfinite(texels)):
         raise SceneError(f"{path} has a colour that is not finite. Export it again.")
-    return LinearTexture(texels)
+    return LinearTexture(host_array(texels))
 
 
 def _stack(textures: list[Texture], path: Path) -> Texture:
@@ -141,7 +144,7 @@ def _stack(textures: list[Texture], path: Path) -> Texture:
             f"The images of the faces in {path} differ in size or format. Use images "
             "of one size, all PNG or all EXR."
         )
-    return kinds.pop()(np.stack([texture.texels for texture in textures]))
+    return kinds.pop()(host_array(np.stack([texture.texels for texture in textures])))
 
 
 def _axes(wall: Any, name: str, path: Path) -> Float[np.ndarray, "3 3"]:

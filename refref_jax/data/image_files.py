@@ -69,7 +69,8 @@ def read_size(path: Path) -> tuple[int, int]:
     _require(path)
     if path.suffix != ".exr":
         try:
-            return iio.improps(path, plugin="pillow").shape[:2]
+            height, width = iio.improps(path, plugin="pillow").shape[:2]
+            return height, width
         except Exception as error:  # as in `_read_png`
             raise _unreadable_image(path, error) from error
     try:

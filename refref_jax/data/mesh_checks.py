@@ -376,9 +376,9 @@ def check_meshes(parts: Sequence[MeshPart], tree: Containment, *, rule: str) -> 
         findings += examine_priorities(parts, tree)
     advice = "note: there are no meshes, so all rays are straight."
     if parts:
-        advice = advise(parts, tree)
+        advice = str(advise(parts, tree))
     refuse_errors(findings)
-    return str(advice), *map(str, findings)
+    return advice, *map(str, findings)
 
 
 def examine_priorities(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:

@@ -213,7 +213,7 @@ def parts_around(
         inside[:, number] = np.abs(winding_number(part, points)) > 0.5
     if np.any(crowded := inside.sum(axis=1) > SLOTS):
         point = int(np.argmax(crowded))
-        names = ", ".join(parts[number].name for number in np.flatnonzero(inside[point]))
+        names = ", ".join(parts[number].name for number in np.flatnonzero(inside[point]).tolist())
         raise SceneError(
             f"More than {SLOTS} parts contain the point {points[point].tolist()}: {names}. Move "
             "the camera, or merge parts of one material."
@@ -305,7 +305,7 @@ def is_convex(part: MeshPart) -> bool:
         return False
     corners = part.vertices[faces]
     points = np.concatenate([corners.reshape(-1, 3), corners.mean(axis=1)])
-    tolerance = TOLERANCE * np.linalg.norm(np.ptp(part.vertices, axis=0))
+    tolerance = float(TOLERANCE * np.linalg.norm(np.ptp(part.vertices, axis=0)))
     return _lie_on(hull, np.unique(points, axis=0), tolerance)
 
 

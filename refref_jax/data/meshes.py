@@ -123,7 +123,7 @@ class PartDescription(NamedTuple):
       colour_known: whether tint or absorption is given; if only one is, the other is clear.
     """
 
-    index: float | None = None
+    index: float | None = None  # type: ignore[assignment]  # hides tuple.index
     shading: Shading = "auto"
     tint: Colour = CLEAR
     absorption: Colour = NO_ABSORPTION
@@ -219,7 +219,7 @@ class MeshPart(NamedTuple):
     name: str
     vertices: Float[np.ndarray, "vertices 3"]
     faces: Int[np.ndarray, "faces 3"]
-    index: float
+    index: float  # type: ignore[assignment]  # hides tuple.index
     shading: Shading
     tint: Colour = CLEAR
     absorption: Colour = NO_ABSORPTION

@@ -195,7 +195,7 @@ def _decoded(told: bytes, rows: int, shard: Path) -> Contents:
     """Returns the contents that the metadata describe."""
     try:
         record = configuration.parse_json(told)
-        frames = {split: int(record["frames"].get(split, 0)) for split in SPLITS}
+        frames: dict[str, int] = {split: int(record["frames"].get(split, 0)) for split in SPLITS}
         angle = float(record["camera_angle_x"])
         valid = min(frames.values()) >= 0
     except (ValueError, TypeError, KeyError, AttributeError):

@@ -141,9 +141,14 @@ class FieldKind(NamedTuple):
     hash_decay: float
 
 
+def evaluate(module: nn.Module, params: Params, *inputs: Any) -> Any:
+    """Returns what a Flax module computes; `apply` itself may return its variables as well."""
+    return module.apply(params, *inputs)
+
+
 def in_half_precision(size: FieldSize) -> FieldSize:
     """Returns the same fields with bfloat16 arithmetic."""
-    field, *proposals = (
-        dataclasses.replace(each, precision="bfloat16") for each in (size.field, *size.proposals)
+    return size._replace(
+        field=dataclasses.replace(size.field, precision="bfloat16"),
+        proposals=tuple(dataclasses.replace(each, precision="bfloat16") for each in size.proposals),
     )
-    return size._replace(field=field, proposals=tuple(proposals))

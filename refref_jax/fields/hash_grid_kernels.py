@@ -18,7 +18,7 @@ Source: Mueller et al., Instant NGP (2022), section 3.
 
 import functools
 import itertools
-import math
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -65,7 +65,7 @@ def corners(
     return [
         (
             _entry([terms[axis][corner[axis]] for axis in range(3)], strides, entries),
-            math.prod(weights[axis][corner[axis]] for axis in range(3)),
+            functools.reduce(operator.mul, (weights[axis][corner[axis]] for axis in range(3))),
         )
         for corner in _CORNERS
     ]

@@ -23,7 +23,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from refref_jax import numerics
-from refref_jax.fields.base import FieldKind, FieldSize, Params, Radiance, in_half_precision
+from refref_jax.fields.base import (
+    FieldKind,
+    FieldSize,
+    Params,
+    Radiance,
+    evaluate,
+    in_half_precision,
+)
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.fields.mlps import (
     GridDensityConfig,
@@ -65,7 +72,7 @@ def radiance(
       gaussians: points in the unit cube; their scales are ignored.
       direction: unit direction of travel at the interval, world frame.
     """
-    return _RadianceField(config).apply(params, gaussians, direction)
+    return evaluate(_RadianceField(config), params, gaussians, direction)
 
 
 def init_density(key: Array, config: NerfactoProposalConfig) -> Params:
@@ -83,7 +90,7 @@ def density(
       config: shape of the field, as in `init_density`.
       gaussians: points in the unit cube; their scales are ignored.
     """
-    return _DensityField(config).apply(params, gaussians)
+    return evaluate(_DensityField(config), params, gaussians)
 
 
 def _points(gaussians: Gaussians) -> Gaussians:

@@ -18,7 +18,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from refref_jax.fields.base import FieldKind, FieldSize, Params, Radiance, in_half_precision
+from refref_jax.fields.base import (
+    FieldKind,
+    FieldSize,
+    Params,
+    Radiance,
+    evaluate,
+    in_half_precision,
+)
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.fields.mlps import (
     GridDensityConfig,
@@ -56,7 +63,7 @@ def density(params: Params, config: DensityFieldConfig, gaussians: Gaussians) ->
       config: shape of the field, as in `init`.
       gaussians: multisamples in the unit cube, as fractions of its edge.
     """
-    return _DensityField(config).apply(params, gaussians)
+    return evaluate(_DensityField(config), params, gaussians)
 
 
 def activate_density(raw: Float[Array, ""]) -> Float[Array, ""]:
@@ -102,7 +109,7 @@ def radiance(
       gaussians: multisamples in the unit cube, as fractions of its edge.
       direction: unit direction of travel at the interval, world frame.
     """
-    return _RadianceField(config).apply(params, gaussians, direction)
+    return evaluate(_RadianceField(config), params, gaussians, direction)
 
 
 class _RadianceField(nn.Module):

@@ -10,7 +10,7 @@ triangle that is hit is a constant for differentiation: recompute the hit point 
 obtain gradients.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -201,7 +201,7 @@ def _find(bvh: BVH, query: _Query) -> Int[Array, " rays"]:
 
 @_find.def_vmap
 def _find_mapped(
-    axis_size: int, in_batched: list, bvh: BVH, query: _Query
+    axis_size: int, in_batched: list[Any], bvh: BVH, query: _Query
 ) -> tuple[Int[Array, "axis rays"], bool]:
     bvh_batched, query_batched = in_batched
     if any(jax.tree.leaves(bvh_batched)):

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from refref_jax.geometry import bvh_nodes
 from refref_jax.geometry.bvh import BVH, LEAF_SIZE
+from refref_jax.numerics import host_array
 
 # Sign bit of each axis in the number of an octant, as in `bvh_nodes.octant`.
 _BACKWARDS = ((np.arange(bvh_nodes.OCTANTS)[:, None] >> np.arange(3)) & 1).astype(bool)
@@ -260,7 +261,8 @@ def build(
     nodes = pack_nodes(levels, lower[order], upper[order])
     facets = prepare_facets(triangles[slots])
     facets[len(order) :] = 0.0
-    return BVH(nodes, triangles[slots], facets), slots.astype(np.int32)
+    bvh = BVH(host_array(nodes), host_array(triangles[slots]), host_array(facets))
+    return bvh, slots.astype(np.int32)
 
 
 def _empty(dtype: np.dtype) -> BVH:
@@ -269,9 +271,9 @@ def _empty(dtype: np.dtype) -> BVH:
     level = Level(np.array([0]), np.array([1]), np.array([-1]))
     nodes = pack_nodes([level], point, point)
     return BVH(
-        nodes,
-        np.zeros((LEAF_SIZE, 3, 3), dtype),
-        prepare_facets(np.zeros((LEAF_SIZE, 3, 3), dtype)),
+        host_array(nodes),
+        host_array(np.zeros((LEAF_SIZE, 3, 3), dtype)),
+        host_array(prepare_facets(np.zeros((LEAF_SIZE, 3, 3), dtype))),
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from refref_jax.geometry.rays import Rays
+from refref_jax.numerics import host_array
 
 
 class Cameras(NamedTuple):
@@ -58,9 +59,10 @@ def pixel_rays(
     # The solid angle of a pixel is the cube of its cosine over the squared focal length.
     width = cosine**1.5 / cameras.focal
     return Rays(
-        np.ascontiguousarray(pose[..., 3], np.float32),
-        directions.astype(np.float32),
-        np.asarray(width * 2.0 / math.sqrt(12.0), np.float32),  # an array for a single ray too
+        host_array(np.ascontiguousarray(pose[..., 3], np.float32)),
+        host_array(directions.astype(np.float32)),
+        # An array for a single ray too.
+        host_array(np.asarray(width * 2.0 / math.sqrt(12.0), np.float32)),
     )
 
 

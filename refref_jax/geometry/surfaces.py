@@ -105,5 +105,11 @@ def build_surfaces(
     """
     bvh, slots = bvh_build.build(triangles.astype(np.float32))
     if len(triangles) == 0:
-        return Surfaces(bvh, np.zeros_like(bvh.triangles), slots)
-    return Surfaces(bvh, normals[slots].astype(np.float32), parts[slots].astype(np.int32))
+        return Surfaces(
+            bvh, numerics.host_array(np.zeros_like(bvh.triangles)), numerics.host_array(slots)
+        )
+    return Surfaces(
+        bvh,
+        numerics.host_array(normals[slots].astype(np.float32)),
+        numerics.host_array(parts[slots].astype(np.int32)),
+    )

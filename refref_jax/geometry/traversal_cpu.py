@@ -181,18 +181,22 @@ def _test_leaf(
     Triangles are tested independently and compared afterwards. At equal distance the lower slot
     wins, regardless of the order of traversal.
     """
-    best = None
-    for offset in range(bvh_nodes.LEAF_SIZE):
+
+    def meet(offset: int) -> Closest:
         slot = first + offset
         facet = bvh_nodes.read_row(packed, slot)
         distances = jax.vmap(triangles.distance, in_axes=(-1, -1, None))(
             packet.origins, packet.directions, facet
         )
-        found = Closest(
+        return Closest(
             jnp.where(packet.leaving == slot, jnp.inf, distances),
             jnp.broadcast_to(slot, distances.shape),
         )
-        best = found if best is None else _closer(found, best, found.distances < best.distances)
+
+    best = meet(0)
+    for offset in range(1, bvh_nodes.LEAF_SIZE):
+        found = meet(offset)
+        best = _closer(found, best, found.distances < best.distances)
     tied = (best.distances == closest.distances) & (best.slots < closest.slots)
     return _closer(best, closest, (best.distances < closest.distances) | tied)
 

@@ -38,7 +38,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from refref_jax.numerics import safe_divide, safe_sqrt
+from refref_jax.numerics import host_array, safe_divide, safe_sqrt
 
 SMALLEST_FOR_SSIM = 11
 """Edge of SSIM's window in pixels; SSIM is undefined for smaller images."""
@@ -328,9 +328,9 @@ def load_lpips(path: Path) -> LpipsParams:
     chosen = read_lpips(path)
     return jax.device_put(
         LpipsParams(
-            kernels=tuple(chosen[name] for name in _KERNELS),
-            biases=tuple(chosen[name] for name in _BIASES),
-            channels=tuple(chosen[name].reshape(-1) for name in _CHANNELS),
+            kernels=tuple(host_array(chosen[name]) for name in _KERNELS),
+            biases=tuple(host_array(chosen[name]) for name in _BIASES),
+            channels=tuple(host_array(chosen[name].reshape(-1)) for name in _CHANNELS),
         )
     )
 

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from refref_jax.choices import CLEAR, NO_ABSORPTION, RuleName
+from refref_jax.numerics import host_array
 from refref_jax.optics.media import AMBIENT, INDEX_OF_AIR, Interfaces
 
 NO_PARENT = -1
@@ -98,7 +99,8 @@ def priority(
     """
     alone = [NO_PARENT] * len(parents)
     made = _interfaces(indices, [INDEX_OF_AIR] * len(indices), alone, tints, absorptions)
-    return made._replace(priority=_order(priorities or [0] * len(made.index_inside)))
+    order = _order(priorities or [0] * len(made.index_inside))
+    return made._replace(priority=host_array(order))
 
 
 RULES: dict[RuleName, Rule] = {"nested": nested, "facing": facing, "priority": priority}
@@ -128,12 +130,12 @@ def _interfaces(
             None,
         )
     return Interfaces(
-        np.asarray(inside, np.float32),
-        np.asarray(outside, np.float32),
-        np.asarray(media, np.int32),
-        _colours(tints, CLEAR, len(media)),
-        _colours(absorptions, NO_ABSORPTION, len(media)),
-        np.zeros(0, np.int32),
+        host_array(np.asarray(inside, np.float32)),
+        host_array(np.asarray(outside, np.float32)),
+        host_array(np.asarray(media, np.int32)),
+        host_array(_colours(tints, CLEAR, len(media))),
+        host_array(_colours(absorptions, NO_ABSORPTION, len(media))),
+        host_array(np.zeros(0, np.int32)),
     )
 
 

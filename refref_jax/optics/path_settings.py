@@ -18,7 +18,7 @@ Source: paper (arXiv 2505.05848), sections 4 and 5 (ablation study), for all but
 
 import dataclasses
 import math
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 from refref_jax.choices import Footprint
 
@@ -51,7 +51,7 @@ class Detail:
     segments: Literal["all", "outside"]
     most: int
     footprint: Footprint = "cone"
-    tally: Literal["none", "parts"] = "none"
+    tally: Tally = "none"
 
     def __post_init__(self) -> None:
         """Validates the number of segments."""
@@ -209,7 +209,7 @@ def budget_of(paths: str, *, cut: float | None = None, bends: int | None = None)
       ValueError: if rays are straight, but `cut` or `bends` is given.
     """
     budget = BUDGETS[paths]
-    given = {"cut": cut, "bends": bends}
+    given: dict[str, Any] = {"cut": cut, "bends": bends}
     changed = {n: x for n, x in given.items() if x is not None and x != getattr(budget, n)}
     if budget.bends == 0 and changed:
         raise ValueError(

@@ -93,8 +93,9 @@ def trace_ends(
     """
     geometry, rays = scene.in_one_precision(geometry, rays)
     if _needs_no_tracing(rays, budget):
-        ends = straight_ends(rays)
-        return TracedEnds(ends, jnp.zeros_like(rays.origins), jnp.zeros((), jnp.int32))
+        return TracedEnds(
+            straight_ends(rays), jnp.zeros_like(rays.origins), jnp.zeros((), jnp.int32)
+        )
     tree = follow(geometry, rays, _inside(geometry, rays, inside), budget=budget, block=block)
     ends = path_tree.listed(tree, room(budget, rays.radii.shape[0]).paths)
     last = path_tree.last_segments(tree.segments.items, ends)

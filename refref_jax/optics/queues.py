@@ -24,7 +24,7 @@ class Pool(NamedTuple):
     """
 
     items: Records
-    count: Int[Array, ""]
+    count: Int[Array, ""]  # type: ignore[assignment]  # hides tuple.count
 
 
 def fill(items: Records, count: int, slots: int) -> Pool:

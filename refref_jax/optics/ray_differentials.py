@@ -14,7 +14,7 @@ Source: Igehy, Tracing Ray Differentials (1999).
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,8 @@ from refref_jax.geometry.rays import Rays, orthonormal_basis
 # Near the critical angle the derivatives are unbounded. A footprint of this width covers the
 # scene, and its square is still finite.
 _WIDEST = 1e6
+
+_Result = TypeVar("_Result")
 
 
 class Spread(NamedTuple):
@@ -70,11 +72,11 @@ def nothing(like: Float[Array, "3"]) -> Spread:
 
 
 def bend(
-    surface: Callable[[Array, Array], tuple[Bend, object]],
+    surface: Callable[[Array, Array], tuple[Bend, _Result]],
     origin: Float[Array, "3"],
     direction: Float[Array, "3"],
     spread: Spread,
-) -> tuple[object, Spread, Spread]:
+) -> tuple[_Result, Spread, Spread]:
     """Bends a ray and its differential.
 
     Args:

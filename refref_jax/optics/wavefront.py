@@ -18,7 +18,7 @@ with surfaces.
 """
 
 import functools
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -253,7 +253,7 @@ def _work_off(
 @_follow.defjvp
 def _refuse_gradients(
     budget: Budget, footprint: Footprint, block: int, primals: object, tangents: object
-) -> None:
+) -> NoReturn:
     del budget, footprint, block, primals, tangents
     raise TypeError(
         "Light paths of trace have no derivatives with respect to rays or geometry. Use "

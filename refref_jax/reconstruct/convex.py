@@ -168,7 +168,7 @@ def _patches(mesh: Mesh, crease_angle: float) -> list[Int[np.ndarray, " _"]]:
     dropped = np.zeros(len(mesh.faces), bool)
     dropped[np.concatenate(_sharp_pairs(mesh, crease_angle))] = True
     for _ in range(_RINGS):
-        dropped = np.isin(mesh.faces, mesh.faces[dropped]).any(axis=1)
+        dropped = np.any(np.isin(mesh.faces, mesh.faces[dropped]), axis=1)
     first, second, _ = neighbours(mesh.faces)
     joined = ~dropped[first] & ~dropped[second]
     graph = coo_array(

@@ -35,6 +35,7 @@ from refref_jax import numerics
 from refref_jax.geometry import bvh_build
 from refref_jax.geometry.surfaces import Surfaces
 from refref_jax.geometry.triangle_meshes import Mesh, Vertices, smooth_groups
+from refref_jax.numerics import host_array
 from refref_jax.optics.media import Interfaces
 from refref_jax.optics.scene import Scene, with_index
 from refref_jax.reconstruct import ReconstructionError, refractive_index
@@ -85,7 +86,11 @@ def build(mesh: Mesh, *, handles: int = HANDLES) -> Rig:
     if handles < 4:
         raise ReconstructionError(f"handles={handles} is too small. Pass 4 or more.")
     bvh, slots = bvh_build.build(mesh.vertices[mesh.faces].astype(np.float32))
-    surfaces = Surfaces(bvh, mesh.normals[slots].astype(np.float32), np.zeros(len(slots), np.int32))
+    surfaces = Surfaces(
+        bvh,
+        host_array(mesh.normals[slots].astype(np.float32)),
+        host_array(np.zeros(len(slots), np.int32)),
+    )
     chosen = _spread(mesh.vertices, handles)
     hung, shares = _hang(mesh.vertices, mesh.vertices[chosen])
     around = KDTree(mesh.vertices[chosen]).query(
@@ -93,12 +98,12 @@ def build(mesh: Mesh, *, handles: int = HANDLES) -> Rig:
     )[1]
     return Rig(
         surfaces,
-        mesh.vertices.astype(np.float32),
-        mesh.faces.astype(np.int32),
-        smooth_groups(mesh.vertices, mesh.faces).astype(np.int32),
-        slots,
-        hung.astype(np.int32),
-        shares.astype(np.float32),
+        host_array(mesh.vertices.astype(np.float32)),
+        host_array(mesh.faces.astype(np.int32)),
+        host_array(smooth_groups(mesh.vertices, mesh.faces).astype(np.int32)),
+        host_array(slots),
+        host_array(hung.astype(np.int32)),
+        host_array(shares.astype(np.float32)),
         around.astype(np.int32),
     )
 
@@ -206,7 +211,7 @@ class Refined(NamedTuple):
     """
 
     mesh: Mesh
-    index: float
+    index: float  # type: ignore[assignment]  # hides tuple.index
     errors: tuple[float, ...]
     furthest: float
 
@@ -215,7 +220,7 @@ class _Unknowns(NamedTuple):
     """Unknowns of the descent, in strides."""
 
     shifts: Float[Array, "handles 3"]
-    index: Float[Array, ""]
+    index: Float[Array, ""]  # type: ignore[assignment]  # hides tuple.index
 
 
 class _State(NamedTuple):

@@ -142,7 +142,7 @@ def signed_distance(mesh: Mesh) -> Field:
         row = found.faces
         # The edge opposite a corner contains the points whose weight is small there.
         normal = np.where(
-            small.any(axis=1)[:, None],
+            small.any(axis=1, keepdims=True),
             of_edges[row, np.argmin(found.weights, axis=1)],
             of_faces[row],
         )

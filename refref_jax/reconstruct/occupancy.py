@@ -38,6 +38,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
 from refref_jax.geometry.cameras import Cameras, image_rays
+from refref_jax.numerics import host_array
 from refref_jax.reconstruct import ReconstructionError, occupancy_field
 from refref_jax.reconstruct.grids import Box, Grid, Points
 from refref_jax.reconstruct.masks import check_masks, signed_distances
@@ -408,10 +409,10 @@ def _silhouettes(
     parts = []
     for view, mask in enumerate(masks):
         rays = image_rays(cameras, view)
-        start, end = _crossing(rays.origins, rays.directions, box)
+        start, end = _crossing(np.asarray(rays.origins), np.asarray(rays.directions), box)
         kept = end > start
         close = np.abs(signed_distances(mask, blur=0.0)) <= band
-        chord = Chord((rays.origins - corner) / edge, rays.directions, start / edge, end / edge)
+        chord = ((rays.origins - corner) / edge, rays.directions, start / edge, end / edge)
         parts.append((*(x[kept] for x in chord), mask[kept], close[kept]))
     *chords, seen, close = (np.concatenate(x) for x in zip(*parts, strict=True))
     if len(seen) == 0:
@@ -424,12 +425,12 @@ def _silhouettes(
     room = (0, -len(seen) % _ROOM)
     chords = [x[order].astype(np.float32) for x in chords]
     return Silhouettes(
-        Chord(*(np.pad(x, (room, (0, 0))[: x.ndim]) for x in chords)),
-        np.pad(seen[order], room),
-        np.int32(len(seen)),
+        Chord(*(host_array(np.pad(x, (room, (0, 0))[: x.ndim])) for x in chords)),
+        host_array(np.pad(seen[order], room)),
+        host_array(np.int32(len(seen))),
         # Without an outline all rays count as near.
-        np.int32(close.sum() or len(seen)),
-        np.float32(np.median(away) / cameras.focal / edge),
+        host_array(np.int32(close.sum() or len(seen))),
+        host_array(np.float32(np.median(away) / cameras.focal / edge)),
     )
 
 

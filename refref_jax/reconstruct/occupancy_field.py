@@ -35,6 +35,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from refref_jax import numerics
+from refref_jax.fields.base import evaluate
 from refref_jax.fields.hash_grid import HashGrid, HashGridConfig
 
 Params = Any
@@ -85,7 +86,7 @@ def signed(
       config: configuration passed to `init`.
       position: point of the unit cube; outside of it the outermost cells are extrapolated.
     """
-    return _OccupancyField(config).apply(params, position)
+    return evaluate(_OccupancyField(config), params, position)
 
 
 def slope(

@@ -207,7 +207,7 @@ class IndexEstimate(NamedTuple):
       descents: descents from the best rungs, and from the user's start; the best one first.
     """
 
-    index: float
+    index: float  # type: ignore[assignment]  # hides tuple.index
     deviation: float
     error: float
     ladder: Descent

@@ -12,7 +12,7 @@ is one of the modules that call `jax.jit`.
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -106,7 +106,7 @@ def render_known(
     """
     if tile < 1:
         raise ValueError(f"tile is {tile}, but a tile needs rays. Give 1 or more.")
-    if jax.tree.structure(radiance) == jax.tree.structure(0):
+    if jax.tree_util.all_leaves([radiance]):
         radiance = jax.tree_util.Partial(radiance)  # a plain function cannot be an argument of jit
     count = rays.radii.size
     tile = images.size_for(count, most=tile)
@@ -116,9 +116,9 @@ def render_known(
 
     def see(
         rays: Rays, inside: Int[np.ndarray, "rays slots"] | None, real: int
-    ) -> tuple[Array | np.ndarray, ...]:
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         # Each padding ray misses, which counts as one cast if rays are cast at all.
-        seen = images.fetch(
+        seen: Any = images.fetch(
             _render_tile(geometry, radiance, rays, inside, budget=budget), instead=_INSTEAD
         )
         casts.append(int(seen.casts) - (tile - real) * (budget.bends > 0))

@@ -11,6 +11,7 @@ import dataclasses
 import os
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -136,7 +137,7 @@ def find_step(manager: ocp.CheckpointManager, run: Path, step: int | None) -> in
     return steps[-1] if step is None else step
 
 
-def restore(manager: ocp.CheckpointManager, step: int, items: dict) -> ocp.args.Composite:
+def restore(manager: ocp.CheckpointManager, step: int, items: dict[str, Any]) -> ocp.args.Composite:
     """Reads items of a checkpoint with the given shapes and types.
 
     Args:

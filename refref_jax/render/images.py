@@ -12,7 +12,7 @@ are averaged as linear light and encoded afterwards, as a camera does.
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, TypeVar, get_args
+from typing import Any, NamedTuple, TypeVar, get_args
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from refref_jax.choices import side_of
 from refref_jax.geometry.cameras import Cameras, box_filter, pixel_rays, supersample
 from refref_jax.geometry.rays import Rays
+from refref_jax.numerics import host_array
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import Branch, LightPaths, reflected_first
 from refref_jax.optics.media import EMPTY_SLOT
@@ -79,10 +80,10 @@ def in_tiles(
     """
     rays, inside = fetch((rays, inside), instead=instead)
     shape, count = rays.radii.shape, rays.radii.size
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), (rays, inside))
+    flat, listed = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), (rays, inside))
     parts = []
     for start in range(0, count, tile):
-        seen = see(*cut_out(*flat, start, tile), min(tile, count - start))
+        seen = see(*cut_out(flat, listed, start, tile), min(tile, count - start))
         parts.append(fetch(seen, instead=instead))
     joined = join(parts or [nothing])
     return jax.tree.map(lambda x: x[:count].reshape((*shape, *x.shape[1:])), joined)
@@ -130,7 +131,11 @@ def cut_out(
     part, within = jax.tree.map(lambda x: x[start : start + tile], (rays, inside))
     missing = tile - part.radii.shape[0]
     away = np.tile(np.eye(3, dtype=part.directions.dtype)[:1], (missing, 1))
-    filling = Rays(_OUT_OF_REACH * away, away, np.ones(missing, part.radii.dtype))
+    filling = Rays(
+        host_array(_OUT_OF_REACH * away),
+        host_array(away),
+        host_array(np.ones(missing, part.radii.dtype)),
+    )
     nowhere = jax.tree.map(lambda x: np.full((missing, x.shape[1]), EMPTY_SLOT, x.dtype), within)
     return jax.tree.map(lambda a, b: np.concatenate([a, b]), (part, within), (filling, nowhere))
 
@@ -168,7 +173,7 @@ class _Tile(NamedTuple):
 
     paths: LightPaths
     heaviest: Bool[Array, " paths"]
-    count: Int[Array, ""]
+    count: Int[Array, ""]  # type: ignore[assignment]  # hides tuple.count
     lost: Float[Array, "rays 3"]
 
 
@@ -247,7 +252,7 @@ def _trace_tile(
     geometry: Scene,
     rays: Rays,
     real: Int[Array, ""],
-    which: Int[Array, ""] = _ALL,
+    which: int | Int[Array, ""] = _ALL,
     *,
     budget: Budget,
     detail: Detail,
@@ -380,14 +385,18 @@ def average(fine: Rendering, side: int) -> Rendering:
     pixels', the lower of the two middle ones if their number is even: at an edge it is that of one
     of the two surfaces, never a place between them where nothing is.
     """
-    linear = box_filter(fine.linear, side)
+
+    def filtered(values: Array | np.ndarray) -> Any:
+        return host_array(box_filter(np.asarray(values), side))
+
+    linear = filtered(fine.linear)
     return Rendering(
         rgb=np.clip(jax.device_get(colour.linear_to_srgb(jax.device_put(linear))), 0.0, 1.0),
-        distance=_lower_median(fine.distance, side),
-        mean_distance=box_filter(fine.mean_distance, side),
-        accumulation=box_filter(fine.accumulation, side),
+        distance=host_array(_lower_median(np.asarray(fine.distance), side)),
+        mean_distance=filtered(fine.mean_distance),
+        accumulation=filtered(fine.accumulation),
         linear=linear,
-        lost=box_filter(fine.lost, side),
+        lost=filtered(fine.lost),
     )
 
 

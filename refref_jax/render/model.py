@@ -14,7 +14,7 @@ from jaxtyping import Array
 from refref_jax.choices import Footprint, Interior, Space
 from refref_jax.fields import base, registry
 from refref_jax.fields.base import DensityConfig, RadianceConfig
-from refref_jax.optics.path_settings import Budget, Detail
+from refref_jax.optics.path_settings import Budget, Detail, Tally
 from refref_jax.optics.scene import Scene
 from refref_jax.render import learned_media
 from refref_jax.render.learned_media import Dyes
@@ -103,7 +103,7 @@ class ModelConfig:
 
 def path_detail(config: ModelConfig, budget: Budget) -> Detail:
     """Returns the parts of light paths that a model needs."""
-    tally = "parts" if config.learned_tints else "none"
+    tally: Tally = "parts" if config.learned_tints else "none"
     most = budget.bends + 1
     if config.interior == "field":
         return Detail("all", most, config.footprint, tally)

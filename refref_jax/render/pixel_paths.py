@@ -14,7 +14,6 @@ its paths.
 
 import dataclasses
 import functools
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -23,9 +22,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from refref_jax.geometry.rays import Rays
+from refref_jax.numerics import host_array
 from refref_jax.optics import path_tracing
 from refref_jax.optics.light_paths import LightPaths, PathStatus
-from refref_jax.optics.path_settings import Budget, Detail
+from refref_jax.optics.path_settings import Budget, Detail, Tally
 from refref_jax.optics.scene import Scene
 from refref_jax.render import Model, learned_media, volume_rendering
 from refref_jax.render.learned_media import Dyes
@@ -122,7 +122,7 @@ def trace_pixel(
         segments_per_ray=float(_MOST_SEGMENTS),
         paths_per_ray=float(_MOST_PATHS),
     )
-    ray = Rays(*(np.asarray(x, np.float32)[None] for x in ray))
+    ray = Rays(*(host_array(np.asarray(x, np.float32)[None]) for x in ray))
     traced = _trace(geometry, ray, colours, budget=roomy, domain=domain)
     return _polylines(jax.device_get(traced), reach)
 
@@ -171,7 +171,7 @@ def _row(paths: PixelPaths, i: int) -> str:
 
 def _polylines(traced: _Traced, reach: float) -> PixelPaths:
     paths = traced.paths
-    real: Sequence[int] = np.flatnonzero(paths.statuses != PathStatus.EMPTY)
+    real = np.flatnonzero(paths.statuses != PathStatus.EMPTY).tolist()
     weight = paths.weights.mean(axis=-1)
     order = sorted(real, key=lambda i: -weight[i])
     lines = []
@@ -182,10 +182,10 @@ def _polylines(traced: _Traced, reach: float) -> PixelPaths:
         lines.append(np.concatenate([paths.points[i, : last + 1], end[None]]))
     return PixelPaths(
         polylines=tuple(lines),
-        weights=paths.weights[order],
+        weights=np.asarray(paths.weights)[order],
         statuses=tuple(PathStatus(int(paths.statuses[i])) for i in order),
-        bends=paths.bends[order],
-        lost=traced.lost[0],
+        bends=np.asarray(paths.bends)[order],
+        lost=np.asarray(traced.lost)[0],
     )
 
 
@@ -193,7 +193,7 @@ def _polylines(traced: _Traced, reach: float) -> PixelPaths:
 def _trace(
     geometry: Scene, ray: Rays, colours: Dyes | None, *, budget: Budget, domain: Domain | None
 ) -> _Traced:
-    tally = "none" if colours is None else "parts"
+    tally: Tally = "none" if colours is None else "parts"
     traced = path_tracing.trace(
         geometry,
         ray,

@@ -16,7 +16,7 @@ import math
 import typing
 from collections.abc import Iterator, Mapping
 from pathlib import PurePath
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from refref_jax import configuration
 from refref_jax.choices import (
@@ -34,6 +34,8 @@ from refref_jax.choices import (
     Tints,
 )
 from refref_jax.optics.path_settings import Reentry
+
+_Value = TypeVar("_Value")
 
 # Options that determine the objects.
 _OBJECTS = ("scene", "reconstruction")
@@ -265,8 +267,9 @@ class ScheduleConfig:
 
     def over(self, steps: int) -> "ScheduleConfig":
         """Returns the same schedule stretched over another number of steps."""
-        scale = steps / self.steps
-        warmup, anneal = round(self.warmup * scale), round(self.anneal * scale)
+        scale = steps / settled(self.steps)
+        warmup = round(settled(self.warmup) * scale)
+        anneal = round(settled(self.anneal) * scale)
         return dataclasses.replace(self, steps=steps, warmup=warmup, anneal=anneal)
 
 
@@ -293,7 +296,7 @@ class Option(NamedTuple):
 
     name: str
     section: str
-    field: dataclasses.Field
+    field: dataclasses.Field[Any]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -399,6 +402,20 @@ class TrainConfig:
         section = getattr(self, option.section)
         section = dataclasses.replace(section, **{option.field.name: value})
         return dataclasses.replace(self, **{option.section: section})
+
+
+def settled(value: _Value | None) -> _Value:
+    """Returns the value of an option that `training.resolve` has decided.
+
+    Raises:
+      ValueError: if it is `None`, which leaves the decision open.
+    """
+    if value is None:
+        raise ValueError(
+            "An option that training needs is None, which leaves it open. Use the configuration "
+            "that training.resolve returns."
+        )
+    return value
 
 
 def type_of(option: Option) -> Any:

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Array, Bool, Float, UInt8
 
 from refref_jax import choices, metrics
 from refref_jax.data import scene_folder
@@ -78,7 +78,7 @@ class EvaluatedView(NamedTuple):
 
     name: str
     place: int
-    count: int
+    count: int  # type: ignore[assignment]  # hides tuple.count
     target: UInt8[np.ndarray, "h w 3"]
     rendering: Rendering
     measures: Measured
@@ -221,9 +221,9 @@ def measure(
     """
     mask = None if truth.masks is None else truth.masks[i]
     target = (truth.images[i] / 255.0).astype(np.float32)
-    result = measure_colours(seen.rgb, target, mask, perceptual)
+    result = measure_colours(np.asarray(seen.rgb), target, mask, perceptual)
     true = None if truth.distances is None else truth.distances[i]
-    for name, known in _distances(seen.distance, first, true, mask).items():
+    for name, known in _distances(np.asarray(seen.distance), first, true, mask).items():
         result |= measure_distances(name, known, true, mask)
     return result | {"lost": float(np.mean(seen.lost))}
 
@@ -242,6 +242,7 @@ def measure_colours(
     shortest = min(target.shape[:2])
     result: Measured = dict.fromkeys(("psnr", "psnr_masked", "ssim", "lpips", "flip"))
     with jax.enable_x64(True), jax.default_device(_device_of_doubles()):
+        pair: tuple[Array, Array]
         pair = jax.device_put((rendered.astype(np.float64), target.astype(np.float64)))
         result["psnr"] = float(metrics.psnr(*pair))
         if mask is not None and mask.any():
@@ -277,6 +278,7 @@ def measure_distances(
     known = np.isfinite(true)
     areas = {"": known, "_masked": known & (False if mask is None else mask)}
     with jax.enable_x64(True), jax.default_device(_device_of_doubles()):
+        pair: tuple[Array, Array]
         pair = jax.device_put((seen.astype(np.float64), true.astype(np.float64)))
         for suffix, area in areas.items():
             if area.any():
@@ -307,11 +309,11 @@ def _distances(
     """Returns an image's distances of all three kinds; `None` if one is unknown."""
     if first is None:
         return dict.fromkeys(("distance", "surface", "substituted"), median)
-    unknown = true is None or mask is None
+    substituted = None if true is None or mask is None else np.where(mask, true, median)
     return {
         "distance": median,
         "surface": np.where(np.isfinite(first), first, median),
-        "substituted": None if unknown else np.where(mask, true, median),
+        "substituted": substituted,
     }
 
 

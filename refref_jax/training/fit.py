@@ -27,7 +27,7 @@ from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Model
 from refref_jax.training import devices, loop, run_folder
-from refref_jax.training.config import TrainConfig
+from refref_jax.training.config import TrainConfig, settled
 from refref_jax.training.loop import TrainState, init_state
 from refref_jax.training.objective import StepReport
 from refref_jax.training.resolve import Resolved, build_scene, read_facts, resolve
@@ -209,7 +209,7 @@ def train(
         if devices.any_process(stop()):
             raise KeyboardInterrupt  # there is no new state to save
         step = _take_steps(run, setup, state, checkpoints, periods, progress, stop)
-    if step < config.schedule.steps:
+    if step < settled(config.schedule.steps):
         report(f"Stopped at step {step}.")
     return step == config.schedule.steps
 
@@ -220,7 +220,7 @@ def _sampler(config: TrainConfig, scene: Path) -> PixelSampler:
     kept = None
     if config.scene.pixels == "background":
         kept = masks.well_outside(scene_folder.read_masks(frames))
-    images, batch = scene_folder.read_images(frames), config.schedule.batch
+    images, batch = scene_folder.read_images(frames), settled(config.schedule.batch)
     return PixelSampler(images, frames.cameras, seed=config.seed, batch=batch, kept=kept)
 
 
@@ -234,7 +234,8 @@ def _take_steps(
     stop: Callable[[], bool],
 ) -> int:
     """Takes the remaining steps, and returns the number of the last."""
-    total, step = setup.config.schedule.steps, int(state.step)
+    schedule = setup.config.schedule
+    total, batch, step = settled(schedule.steps), settled(schedule.batch), int(state.step)
     writes = devices.is_first()
     earlier = run_folder.rewind_metrics(run, step) if writes else 0.0
     start = last = time.monotonic()
@@ -246,7 +247,7 @@ def _take_steps(
         if step % periods.log == 0 or step == total:
             measured = jax.device_get(measured)
             now = time.monotonic()
-            rate = setup.config.schedule.batch * (step - logged) / (now - last)
+            rate = batch * (step - logged) / (now - last)
             line = _line(step, measured, rate, earlier + now - start)
             if writes:
                 run_folder.append_metrics(run, line)

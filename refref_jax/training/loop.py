@@ -25,7 +25,7 @@ from refref_jax.optics.scene import Scene
 from refref_jax.render import pixels
 from refref_jax.render.model import ModelConfig, Params, init_params, path_detail
 from refref_jax.training import devices, objective
-from refref_jax.training.config import ScheduleConfig, TrainConfig
+from refref_jax.training.config import ScheduleConfig, TrainConfig, settled
 from refref_jax.training.devices import AXIS
 from refref_jax.training.objective import StepReport, Totals
 
@@ -75,13 +75,15 @@ def learning_rate(schedule: ScheduleConfig) -> optax.Schedule:
 
     Source: paper (arXiv 2505.05848), supplement (implementation details).
     """
+    steps, warmup = settled(schedule.steps), settled(schedule.warmup)
+    peak, end = settled(schedule.peak), settled(schedule.end)
     return optax.warmup_exponential_decay_schedule(
         init_value=0.0,
-        peak_value=schedule.peak,
-        warmup_steps=schedule.warmup,
-        transition_steps=max(1, schedule.steps - schedule.warmup),
-        decay_rate=schedule.end / schedule.peak,
-        end_value=schedule.end,
+        peak_value=peak,
+        warmup_steps=warmup,
+        transition_steps=max(1, steps - warmup),
+        decay_rate=end / peak,
+        end_value=end,
     )
 
 
@@ -100,11 +102,10 @@ class Pool(NamedTuple):
 
 
 # Sharding of a pool: every device has a share of the paths of every batch, and all colours.
-_SHARED = Pool(
-    traced=Traced(paths=PartitionSpec(None, AXIS), lost=PartitionSpec()),
-    rgb=PartitionSpec(),
-    order=PartitionSpec(),
-)
+# `Any`, as a specification takes the place of each array.
+_SHARE: Any = PartitionSpec(None, AXIS)
+_WHOLE: Any = PartitionSpec()
+_SHARED = Pool(traced=Traced(paths=_SHARE, lost=_WHOLE), rgb=_WHOLE, order=_WHOLE)
 
 
 @functools.partial(jax.jit, static_argnames=("budget", "capacity", "detail", "mesh"))
@@ -215,7 +216,7 @@ def _step(
     traced, rgb = jax.tree.map(lambda x: x[batch], (pool.traced, pool.rgb))
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
     jitter = pixels.random_jitter(key, model, _slots(traced.paths.radii.shape[0], axis))
-    anneal = _anneal(state.step, config.schedule.anneal)
+    anneal = _anneal(state.step, settled(config.schedule.anneal))
 
     def look(params: Params) -> Totals:
         light = pixels.gather_light(
@@ -298,9 +299,8 @@ def set_up(
     geometry = jax.tree.map(jnp.asarray, geometry)
     found = survey_paths(geometry, sampler.survey(_SURVEY).rays, budget=budget)
     found = devices.as_in_the_first(jax.device_get(found))
-    capacity = capacity_for(
-        budget, config.schedule.batch, mean=float(found.mean), deviation=float(found.deviation)
-    )
+    batch = settled(config.schedule.batch)
+    capacity = capacity_for(budget, batch, mean=float(found.mean), deviation=float(found.deviation))
     hit_fraction = float(found.hit_fraction)
     geometry = devices.put_everywhere(geometry, mesh=mesh)
     setup = Setup(config, model, budget, geometry, sampler, capacity, hit_fraction, mesh=mesh)
@@ -326,9 +326,9 @@ def run_steps(
         every pool, and at the end. In between, the device takes steps without the host.
     """
     config = setup.config
-    step = int(state.step)
+    step, size = int(state.step), settled(config.schedule.pool)
     for first, pool in _pools(setup, step, until):
-        end = min(first + config.schedule.pool, until)
+        end = min(first + size, until)
         while step < end:
             last = min(end, *(step + period - step % period for period in every))
             batches = np.int32(step - first), np.int32(last - first)
@@ -341,19 +341,19 @@ def run_steps(
 
 def _pools(setup: Setup, step: int, until: int) -> Iterator[tuple[int, Pool]]:
     """Yields the pools of steps, with the number of steps before each; one is traced ahead."""
-    size = setup.config.schedule.pool
+    size = settled(setup.config.schedule.pool)
     firsts = range(step - step % size, until, size)
-    ahead = (_pool(setup, first) for first in firsts)
+    ahead = ((first, _pool(setup, first)) for first in firsts)
     pool = next(ahead, None)
-    for first in firsts:
+    while pool is not None:
         following = next(ahead, None)
-        yield first, pool
+        yield pool
         pool = following
 
 
 def _pool(setup: Setup, first: int) -> Pool:
     """Returns the pool of the steps after the first `first` ones."""
-    numbers = setup.sampler.numbers(first, setup.config.schedule.pool)
+    numbers = setup.sampler.numbers(first, settled(setup.config.schedule.pool))
     if setup.epoch is not None:
         return setup.epoch._replace(order=devices.put_everywhere(numbers, mesh=setup.mesh))
     return trace_batches(setup, numbers.tolist())
@@ -381,12 +381,13 @@ def _trace_epoch(setup: Setup) -> Pool | None:
     them, unless paths are dropped because a pool is full: otherwise its batches are different ones.
     """
     config, batches = setup.config, setup.sampler.batches
-    pools = range(0, batches, config.schedule.pool)
-    if config.schedule.steps <= batches:
+    size = settled(config.schedule.pool)
+    pools = range(0, batches, size)
+    if settled(config.schedule.steps) <= batches:
         return None
-    one = jax.eval_shape(lambda: trace_batches(setup, range(config.schedule.pool)))
+    one = jax.eval_shape(lambda: trace_batches(setup, range(size)))
     bytes_ = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(one))
     if bytes_ * len(pools) > _MOST_BYTES:
         return None
-    traced = [trace_batches(setup, range(first, first + config.schedule.pool)) for first in pools]
+    traced = [trace_batches(setup, range(first, first + size)) for first in pools]
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:batches], *traced)

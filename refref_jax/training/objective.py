@@ -28,7 +28,7 @@ from refref_jax.render import colour, learned_media, pixels
 from refref_jax.render.model import Params
 from refref_jax.render.volume_rendering import Histogram
 from refref_jax.sampling import stepfun
-from refref_jax.training.config import LossConfig
+from refref_jax.training.config import LossConfig, settled
 
 _CHARBONNIER_PADDING = 0.001
 
@@ -134,7 +134,7 @@ def total(light: pixels.Light, paths: LightPaths, config: LossConfig) -> Totals:
     *proposals, final = light.paths.histograms
     exists = light_paths.exists(paths)
     missed = jnp.zeros(())
-    for proposal, blur in zip(proposals, config.blurs, strict=True):
+    for proposal, blur in zip(proposals, settled(config.blurs), strict=True):
         per_path = jax.vmap(functools.partial(interlevel, blur=blur))(final, proposal)
         missed += _sum_where(exists, per_path)
     counted = light.paths.outside
@@ -164,7 +164,7 @@ def measure(
         data
         + config.interlevel * interlevel
         + config.distortion * distortion
-        + config.hash_decay * decay
+        + settled(config.hash_decay) * decay
         + config.dye_decay * learned_media.optical_density(params.dyes)
     )
     psnr = -10.0 * jnp.log10(mse)

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from refref_jax.choices import Interior
 from refref_jax.data import (
     background,
     mesh_checks,
@@ -44,7 +45,7 @@ from refref_jax.optics.scene import Scene
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import ModelConfig
 from refref_jax.training import presets
-from refref_jax.training.config import FieldConfig, SceneConfig, TrainConfig, options_of
+from refref_jax.training.config import FieldConfig, SceneConfig, TrainConfig, options_of, settled
 
 # Width of printed lines.
 _COLUMNS = 100
@@ -145,9 +146,9 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
     config = _resolve_inside(config, found, budget, reasons)
     model, config = _resolve_model(config, facts, reasons)
     if budget.bends:
-        budget = dataclasses.replace(budget, reentry=config.paths.reentry)
+        budget = dataclasses.replace(budget, reentry=settled(config.paths.reentry))
     config = _resolve_training(config, model, reasons)
-    check_batch(facts.cameras, config.schedule.batch)
+    check_batch(facts.cameras, settled(config.schedule.batch))
     return Resolved(config, SavedModel(model, budget), reasons, tuple(_doubts(asked, found)))
 
 
@@ -240,7 +241,7 @@ def _resolve_paths(
     name, why = ("tree", "there are meshes") if found.parts else ("straight", "there are no meshes")
     config = _decide(config, reasons, why, paths=name)
     paths = config.paths
-    budget = budget_of(paths.name, cut=paths.cut, bends=paths.bends)
+    budget = budget_of(settled(paths.name), cut=paths.cut, bends=paths.bends)
     if budget.bends == 0:
         _check_straight(config)
         return budget, _decide(config, reasons, f"paths={paths.name}", cut=budget.cut, bends=0)
@@ -271,6 +272,7 @@ def _resolve_inside(
     config: TrainConfig, found: Needs, budget: Budget, reasons: dict[str, str]
 ) -> TrainConfig:
     """Decides the model of the inside of the objects, and the source of their colours."""
+    interior: Interior | None
     if budget.bends == 0:
         interior, why = "field", "straight rays ignore the objects"
     elif found.interior == "clear" and config.model.tints != "learned":
@@ -317,7 +319,7 @@ def _resolve_model(
     why = "the cameras" if found.space == "unbounded" else why
     config = _decide(config, reasons, why, radius=extent.radius)
     preset = presets.PRESETS[config.model.preset]
-    model = preset.model(extent, config.model.interior, field=config.model.field)
+    model = preset.model(extent, settled(config.model.interior), field=config.model.field)
     learned = found.parts if config.model.tints == "learned" else 0
     model = override_model(dataclasses.replace(model, learned_tints=learned), config.model)
     config = _decide(
@@ -335,14 +337,15 @@ def _resolve_training(
     usual = presets.loss(model)
     why = f"field={config.model.field}"
     config = _decide(config, reasons, why, blurs=usual.blurs, hash_decay=usual.hash_decay)
-    blurs, rounds = len(config.losses.blurs), len(model.proposals)
+    blurs, rounds = len(settled(config.losses.blurs)), len(model.proposals)
     if blurs != rounds:
         raise ValueError(
             f"There are {blurs} blurs for {rounds} proposal levels. Give one for each, or leave "
             "them out."
         )
     preset = presets.PRESETS[config.model.preset]
-    schedule = preset.schedule.over(config.schedule.steps or preset.schedule.steps)
+    steps = config.schedule.steps or preset.schedule.steps
+    schedule = preset.schedule.over(settled(steps))
     return _decide(
         config,
         reasons,

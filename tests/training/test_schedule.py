@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.training.config import ScheduleConfig
+from refref_jax.training.config import ScheduleConfig, settled
 from refref_jax.training.loop import learning_rate, optimizer
 
 _PAPER = ScheduleConfig(steps=25_000, warmup=1000, peak=8e-3, end=1e-3, anneal=1000)
@@ -39,3 +39,9 @@ def test_a_schedule_stretches_with_its_steps():
     assert (half.steps, half.warmup, half.anneal) == (12_500, 500, 500)
     assert (half.peak, half.end) == (_PAPER.peak, _PAPER.end)
     assert _PAPER.over(25_000) == _PAPER
+
+
+def test_a_schedule_that_is_still_open_is_refused():
+    assert settled(0) == 0
+    with pytest.raises(ValueError, match=r"Use the configuration that training\.resolve returns"):
+        learning_rate(ScheduleConfig(steps=10))

@@ -186,7 +186,7 @@ def _focal(
         return None
     if pixels is not None and pixels > 0.0:
         return pixels
-    if pixels is None and 0.0 < angle < math.pi:
+    if pixels is None and angle is not None and 0.0 < angle < math.pi:
         return focal_length(size, angle)
     wrong = f"angle of view is {angle:g}" if pixels is None else f"focal length is {pixels:g}"
     raise SceneError(

@@ -257,24 +257,24 @@ def _write_split(
     sense: Sense,
     step: Callable[[], None],
 ) -> Converted:
-    is_masked = sense != "none" and views[0].frame.mask is not None
     records, shares = [], []
     for number, view in enumerate(views):
         names = scene_folder.plain(split, number)
         cut = _cut(lens, number)
         _write_image(view.frame, cut, scene / f"{names.image}.png")
-        if is_masked:
-            mask = _read_mask(view.frame, sense)[cut]
+        source = view.frame.mask if sense != "none" else None
+        if source is not None:
+            mask = _read_mask(view.frame, source, sense)[cut]
             if not mask.any():
                 raise SceneError(
-                    f"The mask {view.frame.mask} marks no object if {sense} is white. Give another "
+                    f"The mask {source} marks no object if {sense} is white. Give another "
                     "sense, or leave the frame out."
                 )
             (scene / names.mask).parent.mkdir(parents=True, exist_ok=True)
             image_files.write_mask(scene / names.mask, mask)
             shares.append(mask.mean())
         pose = [*view.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
-        record = scene_folder.frame_record(names, pose, masked=is_masked, deep=False)
+        record = scene_folder.frame_record(names, pose, masked=source is not None, deep=False)
         records.append(record | {"source": view.frame.name})
         step()
     angle = 2.0 * math.atan(0.5 * lens.columns.size / lens.focal)
@@ -300,12 +300,12 @@ def _write_image(frame: CaptureFrame, cut: tuple[slice, slice], path: Path) -> N
         image_files.write_png(path, kept)
 
 
-def _read_mask(frame: CaptureFrame, sense: Sense) -> Bool[np.ndarray, "h w"]:
-    white = nerfstudio.read_capture_mask(frame.mask)
+def _read_mask(frame: CaptureFrame, mask: Path, sense: Sense) -> Bool[np.ndarray, "h w"]:
+    white = nerfstudio.read_capture_mask(mask)
     expected = (frame.intrinsics.height, frame.intrinsics.width)
     if white.shape != expected:
         raise SceneError(
-            f"The mask {frame.mask} is {white.shape[1]} x {white.shape[0]} pixels, but its image "
+            f"The mask {mask} is {white.shape[1]} x {white.shape[0]} pixels, but its image "
             f"{expected[1]} x {expected[0]}. Resize it without interpolation."
         )
     return white if sense == "object" else ~white
@@ -351,7 +351,7 @@ def write_capture(
                 masks[split] = [f"masks/{name}" for name in files_of]
             for number, name in enumerate(images[split]):
                 shutil.copyfile(frames.images[number], folder / name)
-                if split in masks:
+                if frames.masks is not None and split in masks:
                     _write_mask(frames.masks[number], folder / masks[split][number], sense)
                 step()
         if not masks:
