@@ -26,6 +26,7 @@ Reflections = Literal["none", "first", "all"]
 TotalReflection = Literal["followed", "ended"]
 Reentry = Literal["possible", "impossible"]
 Unfinished = Literal["kept", "dark"]
+Tally = Literal["none", "parts"]
 
 # Max bends and throughput threshold for which the capacity factors below were measured.
 _PAPER_BENDS = 10

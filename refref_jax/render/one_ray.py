@@ -37,7 +37,9 @@ def render_ray(model: Model, ray: Rays) -> Float[Array, "3"]:
     config, params = model.config, model.params
     density = jax.vmap(registry.density, in_axes=(None, None, 0))
     radiance = jax.vmap(registry.radiance, in_axes=(None, None, 0, 0))
-    exact = {"jitter": Jitter(jnp.zeros(()), jnp.zeros(())), "anneal": jnp.ones(())}
+    middle = functools.partial(
+        volume_rendering.sample, jitter=Jitter(jnp.zeros(()), jnp.zeros(())), anneal=jnp.ones(())
+    )
     colour = jnp.zeros(3)
 
     # Trace: Snell's law, total internal reflection and Fresnel's equations at every surface.
@@ -46,7 +48,7 @@ def render_ray(model: Model, ray: Rays) -> Float[Array, "3"]:
         warp = volume_rendering.distance_warp(config, r)
 
         # Sample: each proposal level draws from the histogram of the level before.
-        draw = functools.partial(volume_rendering.sample, config, r, warp, **exact)
+        draw = functools.partial(middle, config, r, warp)
         histograms: list[Histogram] = []
         for proposal, learned in zip(config.proposals, params.proposals, strict=True):
             s, t, x = draw(histograms, proposal.samples)
