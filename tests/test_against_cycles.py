@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
+from benchmarks.oracles.backgrounds import CubeBackground
 from refref_jax.data import background, scene_folder
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, Budget
 from refref_jax.render import radiance_of, render_known
-from tests import reference, scenes
-from tests.backgrounds import CubeBackground
+from tests.factories import scenes
+from tests.oracles import reference
 
 # Rays a pixel along each axis: Cycles' pixels are box-filtered. What the paper's paths lack is more
 # than what fewer rays alias.

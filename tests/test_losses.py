@@ -7,7 +7,8 @@ import pytest
 
 from refref_jax.render.volume_rendering import Histogram
 from refref_jax.training import objective
-from tests import gradients, reference_sampling, transformations
+from tests.laws import gradients, transformations
+from tests.oracles import reference_sampling
 
 # A few float32 roundings.
 _ROUNDING = 1e-6

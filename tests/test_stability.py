@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from tests import stability_cases, stability_laws
-from tests.stability_measures import MEASURES
+from benchmarks.stability import cases as stability_cases
+from benchmarks.stability import laws as stability_laws
+from benchmarks.stability.measures import MEASURES
 
 
 def _case(measure):

@@ -5,8 +5,8 @@ import trimesh
 from refref_jax.data.mesh_checks import Finding, lint
 from refref_jax.data.mesh_queries import find_containment
 from refref_jax.data.meshes import read_meshes
-from tests.data.expectations import only
-from tests.data.solids import as_part, ball, box, inverted, joined, shell
+from tests.factories.solids import as_part, ball, box, inverted, joined, shell
+from tests.laws.expectations import only
 
 
 def _findings(*parts):

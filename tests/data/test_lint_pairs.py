@@ -6,9 +6,9 @@ import trimesh
 
 from refref_jax.data.mesh_checks import lint_pairs
 from refref_jax.data.mesh_queries import find_containment
-from tests.data.expectations import only
-from tests.data.solids import as_part, ball, box, shell
-from tests.scenes import volume_of
+from tests.factories.scenes import volume_of
+from tests.factories.solids import as_part, ball, box, shell
+from tests.laws.expectations import only
 
 
 def _findings(*parts):

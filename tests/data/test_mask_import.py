@@ -5,7 +5,7 @@ import pytest
 
 from refref_jax.data import SceneError, image_files, scene_folder
 from refref_jax.data.masks import add_masks
-from tests.data.small_scenes import HEIGHT, WIDTH, edit_transforms, without_masks, write_scene
+from tests.factories.small_scenes import HEIGHT, WIDTH, edit_transforms, without_masks, write_scene
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import trimesh
 from refref_jax.data import SceneError
 from refref_jax.data.scene_assembly import assemble, build_geometry, make_part, single_body
 from refref_jax.optics.interface_rules import NO_PARENT
-from tests.data.solids import ball, box, inverted
+from tests.factories.solids import ball, box, inverted
 
 
 def _same_scene(one, other):

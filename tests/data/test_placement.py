@@ -4,7 +4,7 @@ import pytest
 from refref_jax.data import SceneError
 from refref_jax.data.nerfstudio.conversion import Placement, meeting_point, place, undo_motion
 from refref_jax.geometry.cameras import orbit
-from tests.data.small_captures import pose_of
+from tests.factories.small_captures import pose_of
 
 _CENTRE = np.array([0.4, -1.0, 2.0])
 

@@ -2,8 +2,8 @@ import pytest
 
 from refref_jax.data.mesh_checks import Advice, advise, examine_priorities
 from refref_jax.data.mesh_queries import find_containment
-from tests.data.expectations import only
-from tests.data.solids import ball, box
+from tests.factories.solids import ball, box
+from tests.laws.expectations import only
 
 
 def _advice(*parts):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from refref_jax.fields import mlps
-from tests import gradients, reference_sampling, transformations
+from tests.laws import gradients, transformations
+from tests.oracles import reference_sampling
 
 # Cubic polynomials of float32 components.
 _POLYNOMIAL = 2e-6

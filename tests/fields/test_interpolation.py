@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from refref_jax.fields import hash_grid_kernels
-from tests import gradients, reference_sampling
-from tests.arrays import single
+from tests.factories.arrays import single
+from tests.laws import gradients
+from tests.oracles import reference_sampling
 
 # Sums of products of float32 numbers of about 1, eight a point.
 _BLENDING = 2e-5

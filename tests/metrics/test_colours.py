@@ -5,7 +5,7 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from refref_jax import metrics
-from tests import gradients, transformations
+from tests.laws import gradients, transformations
 
 # Decibels: float32 logarithms of float32 means.
 _DECIBELS = 1e-4

@@ -12,7 +12,7 @@ from refref_jax.optics import path_tracing
 from refref_jax.optics.differentiable_paths import follow_branch
 from refref_jax.optics.light_paths import PathStatus, exists, reflected_first, straight
 from refref_jax.optics.path_settings import TREE
-from tests import made_paths, scenes
+from tests.factories import made_paths, scenes
 
 _TURN = [(0.0, 0.0, -1.0), (0.0, 0.1, 1.0), (0.0, 1.0, 0.0)]
 

@@ -9,9 +9,9 @@ from refref_jax.optics.differentiable_paths import follow_branch
 from refref_jax.optics.light_paths import exists, straight
 from refref_jax.optics.path_settings import TREE, Budget, Detail
 from refref_jax.sampling import polylines
-from tests import scenes
+from tests.factories import scenes
 
-_RADIUS = 1e-3  # of every ray of tests.scenes
+_RADIUS = 1e-3  # of every ray of tests.factories.scenes
 _GLASS = scenes.geometry(scenes.ball(1.0, subdivisions=3))
 _SLAB = scenes.geometry(scenes.box((10.0, 10.0, 0.6)))
 _THROUGH = Budget(bends=2, reflections="none")

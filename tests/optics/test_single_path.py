@@ -16,7 +16,7 @@ from refref_jax.optics.differentiable_paths import follow_branch
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, Budget
 from refref_jax.optics.scene import Scene
-from tests import scenes
+from tests.factories import scenes
 
 _DEPTH = 4
 

@@ -8,7 +8,7 @@ import pytest
 from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.masks import Views
 from refref_jax.reconstruct.mesh_distance import carved_alone, without_outliers
-from tests.reconstruct import bodies
+from tests.factories import bodies
 
 _SPOILT = 7
 

@@ -8,7 +8,7 @@ from refref_jax.reconstruct.grids import find_isosurface
 from refref_jax.reconstruct.mesh_distance import compare_meshes, silhouette_overlap, silhouettes
 from refref_jax.reconstruct.refinement import Refinement, refine
 from refref_jax.reconstruct.visual_hull import carve
-from tests.reconstruct import bodies
+from tests.factories import bodies
 
 
 def test_a_mesh_is_no_distance_from_itself():

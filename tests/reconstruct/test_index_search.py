@@ -16,8 +16,7 @@ from refref_jax.reconstruct.refractive_index import (
     most_looks,
     scatter_of_bottoms,
 )
-from tests import scenes
-from tests.reconstruct import lit_scenes
+from tests.factories import lit_scenes, scenes
 
 # None of the rungs is the truth.
 _TRUE = 1.473

@@ -15,7 +15,7 @@ from refref_jax.reconstruct.occupancy_field import (
     silhouette_logit,
     weights,
 )
-from tests import gradients
+from tests.laws import gradients
 
 
 def _array(*values):

@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.oracles.backgrounds import CubeBackground as SlowCube
+from benchmarks.oracles.backgrounds import look_at_environment
 from refref_jax.data.background import read_background
 from refref_jax.render import backgrounds, radiance_of
 from refref_jax.render.backgrounds import (
@@ -14,9 +16,8 @@ from refref_jax.render.backgrounds import (
     SphereBackground,
     SrgbTexture,
 )
-from tests import gradients, reference, transformations
-from tests.backgrounds import CubeBackground as SlowCube
-from tests.backgrounds import look_at_environment
+from tests.laws import gradients, transformations
+from tests.oracles import reference
 
 # A texel is 1/512 of a wall: float32 places a point to 1e-4 of one, and the bundled images step
 # from dark to bright between two texels.

@@ -2,7 +2,7 @@ import dataclasses
 
 import pytest
 
-from tests.small_model import MODEL
+from tests.factories.small_model import MODEL
 
 
 def test_samples_may_begin_at_the_camera():

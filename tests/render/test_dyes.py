@@ -5,7 +5,8 @@ import pytest
 
 from refref_jax.render import learned_media
 from refref_jax.render.learned_media import Dyes
-from tests import gradients, made_paths
+from tests.factories import made_paths
+from tests.laws import gradients
 
 _RADIUS = 7.3
 

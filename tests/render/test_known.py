@@ -10,7 +10,8 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE
 from refref_jax.render import background_rendering, radiance_of, render_known
 from refref_jax.render.backgrounds import Environment, LinearTexture
-from tests import reference, scenes
+from tests.factories import scenes
+from tests.oracles import reference
 
 _BALL = scenes.ball(1.3, subdivisions=2)
 

@@ -11,8 +11,8 @@ from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import STRAIGHT, TREE
 from refref_jax.render import Model, init_params, pixel_paths
 from refref_jax.render.pixel_paths import PixelPaths
-from tests import scenes
-from tests.small_model import MODEL
+from tests.factories import scenes
+from tests.factories.small_model import MODEL
 
 _BUDGET = dataclasses.replace(TREE, bends=6, cut=1e-3)
 

@@ -8,7 +8,9 @@ import pytest
 from refref_jax.sampling import scene_bounds
 from refref_jax.sampling.cones import Gaussians
 from refref_jax.sampling.scene_bounds import Domain
-from tests import arrays, gradients, reference_sampling, transformations
+from tests.factories import arrays
+from tests.laws import gradients, transformations
+from tests.oracles import reference_sampling
 
 # A few float32 roundings.
 _ROUNDING = 1e-6

@@ -7,7 +7,8 @@ import pytest
 
 from refref_jax.sampling import scene_bounds
 from refref_jax.sampling.scene_bounds import DistanceWarp
-from tests import gradients, reference_sampling, transformations
+from tests.laws import gradients, transformations
+from tests.oracles import reference_sampling
 
 _EPSILON = float(np.finfo(np.float32).eps)
 

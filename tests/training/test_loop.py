@@ -15,8 +15,8 @@ from refref_jax.render.model import path_detail
 from refref_jax.training import loop, run_folder
 from refref_jax.training.loop import init_state
 from refref_jax.training.run_folder import Checkpoints
-from tests import scenes, small_model
-from tests.small_model import CONFIG, MODEL, SAVED
+from tests.factories import scenes, small_model
+from tests.factories.small_model import CONFIG, MODEL, SAVED
 
 _GEOMETRY = scenes.geometry(scenes.ball(1.3, subdivisions=2))
 

@@ -9,7 +9,7 @@ from experiments.viewer import controls
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.path_settings import TREE
 from refref_jax.render import pixel_paths
-from tests import scenes
+from tests.factories import scenes
 
 
 @pytest.fixture(scope="module")

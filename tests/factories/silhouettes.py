@@ -6,8 +6,8 @@ import numpy as np
 
 from refref_jax.data import image_files, scene_folder
 from refref_jax.data.meshes import write_mesh
-from tests.data.small_scenes import write_grey
-from tests.reconstruct import bodies
+from tests.factories import bodies
+from tests.factories.small_scenes import write_grey
 
 RADIUS = 1.1
 

@@ -2,7 +2,7 @@
 
 The step ends half a second after there is a file `go`.
 
-python -m tests.experiments.saving --folder=...
+python -m tests.fakes.saving --folder=...
 """
 
 import os

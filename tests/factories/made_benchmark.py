@@ -11,7 +11,7 @@ from experiments.benchmarking.plan import Skipped
 from experiments.benchmarking.results import Costs, Image, Record, Truth, View
 from experiments.benchmarking.settings import Benchmark, Scene, Settings
 from refref_jax.data import image_files
-from tests.data import small_scenes
+from tests.factories import small_scenes
 
 SETTINGS = Settings(preset="tiny", steps=6, limit=None, rays_per_pixel=1, seed=0, lpips=None)
 

@@ -15,7 +15,7 @@ from absl import flags
 
 from experiments import benchmark
 from experiments.cli import app, subprocesses
-from tests.experiments.benchmarking.conftest import stand_in_line
+from tests.fakes.job_commands import stand_in_line
 
 
 def _answer(request):

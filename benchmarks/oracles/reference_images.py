@@ -9,9 +9,9 @@ import imageio.v3 as iio
 import numpy as np
 import OpenEXR
 
-from tests.backgrounds import CubeBackground
-from tests.reference import linear_to_srgb
-from tests.reference_surfaces import unit
+from benchmarks.oracles.backgrounds import CubeBackground
+from benchmarks.oracles.reference_surfaces import unit
+from tests.oracles.reference import linear_to_srgb
 
 
 class EnvironmentBackground:

@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
+from benchmarks.oracles import reference_surfaces, reference_tree
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_assembly import build_geometry
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.path_settings import Budget
-from tests import reference_surfaces, reference_tree, scenes
+from tests.factories import scenes
 
 MAIN = Budget(10, "none", live_per_ray=1.0, segments_per_ray=10.0, paths_per_ray=1.0)
 """One path a ray: refracted wherever it can be."""

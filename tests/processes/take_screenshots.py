@@ -1,7 +1,7 @@
 """Takes the pictures of docs/viewer.md, of a viewer that runs.
 
     python -m experiments.view --run=runs/demo --heights=36,180,540
-    python -m tests.experiments.viewing.take_screenshots http://127.0.0.1:8080 docs
+    python -m tests.processes.take_screenshots http://127.0.0.1:8080 docs
 
 `viewer_rgb.jpg` is the page as it opens; `viewer_paths.jpg` after a click on the body and a turn of
 the camera, so that the paths are seen from beside.
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import imageio.v3 as iio
 
-from tests.experiments.viewing import browser
+from tests.processes import browser
 
 _SIZE = (1280, 720)
 

@@ -7,15 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.oracles.reference_surfaces import unit
+from benchmarks.stability import paths
+from benchmarks.stability.cases import RAYS, inner_rays, sphere
+from benchmarks.stability.laws import Found
 from refref_jax.data.scene_assembly import build_geometry
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import PAPER, TREE, Budget
-from tests import scenes
-from tests import stability_paths as paths
-from tests.reference_surfaces import unit
-from tests.stability_cases import RAYS, inner_rays, sphere
-from tests.stability_laws import Found
+from tests.factories import scenes
 
 _CUBE = 2.0, 2.0, 2.0
 

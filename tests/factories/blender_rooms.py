@@ -10,7 +10,7 @@ from experiments.dataset.render_settings import PerSplit, RenderSettings
 from refref_jax.data import image_files
 from refref_jax.data.scene_names import SceneName
 from refref_jax.geometry.cameras import Cameras, focal_length
-from tests.experiments.dataset import small_dataset
+from tests.factories import small_dataset
 
 SIZE = 48
 

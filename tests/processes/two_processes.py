@@ -1,6 +1,6 @@
 """Meets another process, and prints what they agree on as JSON.
 
-python -m tests.training.two_processes COORDINATOR PROCESSES PROCESS
+python -m tests.processes.two_processes COORDINATOR PROCESSES PROCESS
 """
 
 import json

@@ -4,7 +4,7 @@ import json
 import shutil
 from pathlib import Path
 
-from tests.experiments.command import ROOT
+from tests.processes.command import ROOT
 
 BALL = ROOT / "experiments" / "data" / "cube_smcvx_ball"
 

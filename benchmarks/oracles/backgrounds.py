@@ -9,7 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from tests import reference
+from tests.oracles import reference
 
 
 class CubeBackground:

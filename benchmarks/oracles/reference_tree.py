@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tests.reference_surfaces import Hits, Surfaces, face_normals, unit
+from benchmarks.oracles.reference_surfaces import Hits, Surfaces, face_normals, unit
 
 ESCAPED, OUT_OF_BENDS, NOT_TRACED = 2, 3, 4
 """How a path ended."""

@@ -1,6 +1,6 @@
 """Trains a small model on rows of devices, and prints what each run measured.
 
-    python -m tests.training.sharded RUNS [COORDINATOR PROCESSES PROCESS]
+    python -m tests.processes.sharded RUNS [COORDINATOR PROCESSES PROCESS]
 
 `RUNS` is JSON, `{"name": {"devices": 8, "steps": 24, "budget": "paper", "kept": true}}`, and so is
 what is printed: by name the `reports` of all steps, the `light` of each batch that was traced, the
@@ -20,8 +20,8 @@ from refref_jax.optics.path_settings import BUDGETS
 from refref_jax.training import devices, loop
 from refref_jax.training.loop import init_state
 from refref_jax.training.run_folder import Checkpoints
-from tests import scenes, small_model
-from tests.small_model import CONFIG, MODEL
+from tests.factories import scenes, small_model
+from tests.factories.small_model import CONFIG, MODEL
 
 
 def train(mesh, *, steps, budget, kept=True, folder=None, resumed=None):

@@ -6,10 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tests import stability_cases as cases
-from tests import stability_laws as laws
-from tests import stability_light as light
-from tests.stability_laws import Found
+from benchmarks.stability import cases, laws, light
+from benchmarks.stability.laws import Found
 
 
 class Measure(NamedTuple):

@@ -10,8 +10,8 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.optics.path_settings import TREE
 from refref_jax.reconstruct.refractive_index import Evidence
 from refref_jax.render import Model, init_params, render_rays
-from tests import scenes
-from tests.small_model import MODEL
+from tests.factories import scenes
+from tests.factories.small_model import MODEL
 
 CONFIG = dataclasses.replace(MODEL, interior="clear")
 

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 
-from tests.data.small_scenes import HEIGHT, WIDTH
+from tests.factories.small_scenes import HEIGHT, WIDTH
 
 NAME, CONFIG = "cube_smcvx_ball", "cubebg_single-convex"
 

@@ -15,7 +15,7 @@ from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_tracing import Traced
 from refref_jax.optics.ray_differentials import Spread
 from refref_jax.render.model import init_params
-from tests import made_paths, small_model
+from tests.factories import made_paths, small_model
 
 RAYS = 3
 PATHS = 8

@@ -1,6 +1,6 @@
 """Waits for a command in a thread, as the benchmark does, and stops it when it is to stop itself.
 
-python -m tests.experiments.waiting FOLDER
+python -m tests.fakes.waiting FOLDER
 """
 
 import contextlib
@@ -13,7 +13,7 @@ from experiments.cli import app, subprocesses
 
 
 def _command_line(name, options):
-    return [sys.executable, "-m", f"tests.experiments.{name}", *options]
+    return [sys.executable, "-m", f"tests.fakes.{name}", *options]
 
 
 def _work(folder):

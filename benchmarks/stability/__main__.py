@@ -10,7 +10,7 @@ import time
 
 from absl import app, flags
 
-from tests.stability_measures import MEASURES
+from benchmarks.stability.measures import MEASURES
 
 _DENSITY = flags.DEFINE_integer("density", 3, "Density of the lattices; the tests use 1.")
 _SLOW = flags.DEFINE_bool("slow", False, "Also a mesh of a million triangles.")

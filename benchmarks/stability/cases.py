@@ -7,10 +7,11 @@ import jax
 import numpy as np
 import trimesh
 
-from tests import scenes, stability_laws
-from tests import stability_paths as paths
-from tests.reference_surfaces import unit
-from tests.stability_laws import Found
+from benchmarks.oracles.reference_surfaces import unit
+from benchmarks.stability import laws as stability_laws
+from benchmarks.stability import paths
+from benchmarks.stability.laws import Found
+from tests.factories import scenes
 
 RAYS = 512
 """Rays of a case."""

@@ -5,9 +5,9 @@ import subprocess
 import sys
 from typing import NamedTuple
 
-from tests.experiments.command import ROOT
+from tests.processes.command import ROOT
 
-COMMAND = [sys.executable, "-m", "tests.experiments.benchmarking.with_stand_in"]
+COMMAND = [sys.executable, "-m", "tests.fakes.with_stand_in"]
 
 
 class Answer(NamedTuple):
