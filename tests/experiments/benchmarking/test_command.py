@@ -231,7 +231,7 @@ def test_a_dry_run_lists_and_does_nothing(tmp_path, serve, scenes):
         (("--job_cpus=1", "--job_gpus=1", _BUNDLED), "--job_cpus, --job_gpus would have no"),
         (("--methods=magic", _BUNDLED), "There is no method 'magic'"),
         (("--rays_per_pixel=3", _BUNDLED), "3 rays a pixel do not make a square"),
-        (("--lpips_weights=none.npz", _BUNDLED), "none.npz can not be read as the weights"),
+        (("--lpips_weights=none.npz", _BUNDLED), "none.npz cannot be read as weights"),
         (("--tables_only",), "holds no benchmark"),
         (("--tables_only", "--methods=tree"), "--tables_only does not use --methods:"),
         (("--tables_only", "--scenes=/nope"), "--tables_only does not use --scenes:"),
