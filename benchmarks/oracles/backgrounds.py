@@ -9,7 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from tests.oracles import reference
+from benchmarks.oracles.colours import srgb_to_linear
 
 
 class CubeBackground:
@@ -19,6 +19,7 @@ class CubeBackground:
     """
 
     def __init__(self, scene):
+        """Reads the walls of a scene's folder."""
         background = json.loads((scene / "scene.json").read_text())["background"]
         self.half_extent = background["half_extent"]
         self.faces = [
@@ -40,7 +41,7 @@ class CubeBackground:
             nearer = np.flatnonzero((towards > 0) & (t < distance))
             points = (origins + t[:, None] * directions)[nearer] / self.half_extent
             u, v = 0.5 * (points @ u_axis + 1.0), 0.5 * (points @ v_axis + 1.0)
-            rgb[nearer] = reference.srgb_to_linear(bilinear(texture, u, v, rows="wrap"))
+            rgb[nearer] = srgb_to_linear(bilinear(texture, u, v, rows="wrap"))
             distance[nearer] = t[nearer]
         return rgb, distance
 

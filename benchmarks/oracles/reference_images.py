@@ -10,14 +10,15 @@ import numpy as np
 import OpenEXR
 
 from benchmarks.oracles.backgrounds import CubeBackground
+from benchmarks.oracles.colours import linear_to_srgb
 from benchmarks.oracles.reference_surfaces import unit
-from tests.oracles.reference import linear_to_srgb
 
 
 class EnvironmentBackground:
     """A picture of all directions, infinitely distant, as `scene.json` describes it."""
 
     def __init__(self, scene: Path):
+        """Reads the picture of a scene's folder."""
         background = json.loads((scene / "scene.json").read_text())["background"]
         channels = OpenEXR.File(str(scene / background["image"])).channels()
         if "RGB" in channels:

@@ -122,6 +122,7 @@ class BruteForce:
     """Tests every triangle in float64; for small meshes."""
 
     def __init__(self, surfaces: Surfaces):
+        """Keeps the triangles."""
         self._corners = surfaces.corners
 
     def __call__(self, origins: np.ndarray, directions: np.ndarray, leaving: np.ndarray) -> Hits:
@@ -141,6 +142,7 @@ class Embree:
     """Finds triangles with Embree in float32, and where they are hit in float64."""
 
     def __init__(self, surfaces: Surfaces):
+        """Builds Embree's tree."""
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 

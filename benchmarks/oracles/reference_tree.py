@@ -72,7 +72,8 @@ def trace(
     Args:
       surfaces: the scene.
       cast: finds closest hits.
-      origins, directions: rays, directions of length 1.
+      origins: of rays.
+      directions: of rays, of length 1.
       rule: which light to follow.
     """
     count = len(origins)

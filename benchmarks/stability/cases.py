@@ -7,11 +7,10 @@ import jax
 import numpy as np
 import trimesh
 
+from benchmarks import balls_and_rays
 from benchmarks.oracles.reference_surfaces import unit
-from benchmarks.stability import laws as stability_laws
-from benchmarks.stability import paths
+from benchmarks.stability import laws, paths
 from benchmarks.stability.laws import Found
-from tests.factories import scenes
 
 RAYS = 512
 """Rays of a case."""
@@ -27,7 +26,7 @@ def inner_rays(radius=0.5):
 
 def _moved(rays, *, scale=1.0, offset=0.0):
     origins = scale * np.asarray(rays.origins, float) + offset
-    return scenes.rays(origins, np.asarray(rays.directions, float))
+    return balls_and_rays.rays(origins, np.asarray(rays.directions, float))
 
 
 def _worst(differences, error) -> Found:
@@ -47,12 +46,12 @@ def slabs(density: int, tracer=paths.trace, *, from_grazing=1e-3, from_critical=
     face at the critical angle, and rounding decides whether it leaves.
     """
     found = []
-    for ratio in stability_laws.ratios(density):
-        theta = np.resize(stability_laws.angles(density, 1.0 / ratio), RAYS)
+    for ratio in laws.ratios(density):
+        theta = np.resize(laws.angles(density, 1.0 / ratio), RAYS)
         turn = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi, RAYS)
         across = np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], axis=-1)
         directions = np.sin(theta)[:, None] * across - np.cos(theta)[:, None] * [0.0, 0.0, 1.0]
-        rays = scenes.rays(np.array([0.013, 0.017, 0.25]) - 3.0 * directions, directions)
+        rays = balls_and_rays.rays(np.array([0.013, 0.017, 0.25]) - 3.0 * directions, directions)
         compared = paths.compare([paths.slab(index=float(ratio))], rays, tracer=tracer)
         clear = 0.5 * np.pi - theta > from_grazing
         clear &= np.abs(theta - np.arcsin(min(1.0, ratio))) > from_critical
@@ -117,7 +116,7 @@ def needles(density: int) -> Found:
         points = np.stack([x, random.uniform(-0.5, 0.5, RAYS), np.full(RAYS, 0.25)], axis=-1)
         above = random.normal(size=points.shape)
         above[:, 2] = 0.3 + np.abs(above[:, 2])
-        rays = scenes.rays(points + 3.0 * unit(above), -above)
+        rays = balls_and_rays.rays(points + 3.0 * unit(above), -above)
         compared = paths.compare([paths.needles(2.0 * width)], rays)
         slipped += int(np.sum(~compared.same))
         cases += RAYS
@@ -148,7 +147,7 @@ def vertices_and_edges(density: int) -> Found:
             random = np.random.default_rng(seed)
             aims = targets[random.integers(0, len(targets), RAYS)]
             origins = 4.0 * unit(unit(aims) + 0.3 * unit(random.normal(size=aims.shape)))
-            rays = scenes.rays(origins, aims - origins)
+            rays = balls_and_rays.rays(origins, aims - origins)
             ends = paths.main_ends(paths.build(body), rays)
             slipped += int(np.sum(ends.bends != 2))
             cases += RAYS
@@ -167,9 +166,9 @@ def slabs_in_double(density: int) -> Found:
 
 def no_nan_in_any_operation(density: int) -> Found:
     """Runs the meeting of ray and interface operation by operation under the check for NaN."""
-    cases = stability_laws.rounded(stability_laws.lattice(density), np.float32)
+    cases = laws.rounded(laws.lattice(density), np.float32)
     some = np.random.default_rng(0).choice(len(cases.near), 100 * density, replace=False)
     picked = type(cases)(*(x[some] for x in cases))
     with jax.debug_nans(True), jax.disable_jit():
-        law = stability_laws.ours(picked)
+        law = laws.ours(picked)
     return Found(float(np.sum(~np.isfinite(law.reflectance.astype(float)))), len(some))

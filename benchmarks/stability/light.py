@@ -1,4 +1,4 @@
-"""What must hold for the light on all paths of a ray, at extremes; see `stability_cases`.
+"""What must hold for the light on all paths of a ray, at extremes; see `cases`.
 
 Clear glass loses nothing: the weights of a ray's paths and its loss sum to 1.
 """
@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks import balls_and_rays
 from benchmarks.oracles.reference_surfaces import unit
 from benchmarks.stability import paths
 from benchmarks.stability.cases import RAYS, inner_rays, sphere
@@ -15,7 +16,6 @@ from refref_jax.data.scene_assembly import build_geometry
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import PAPER, TREE, Budget
-from tests.factories import scenes
 
 _CUBE = 2.0, 2.0, 2.0
 
@@ -33,7 +33,7 @@ def edge_on(density: int) -> Found:
     worst = 0.0
     for directions in (axes, diagonals, axes + 1e-6 * random.normal(size=axes.shape)):
         for back in (0.0, 3.0):
-            rays = scenes.rays(origins - back * unit(directions), directions)
+            rays = balls_and_rays.rays(origins - back * unit(directions), directions)
             worst = max(worst, _unbalance(paths.build(box), rays, TREE))
     del density
     return Found(worst, 6 * RAYS)
@@ -47,7 +47,7 @@ def on_surfaces(density: int) -> Found:
     for origins in (body.vertices, corners.mean(axis=1), corners[:, :2].mean(axis=1)):
         origins = origins[random.integers(0, len(origins), RAYS)]
         directions = unit(random.normal(size=origins.shape))
-        rays = scenes.rays(origins, directions)
+        rays = balls_and_rays.rays(origins, directions)
         geometry = paths.build(body)
         worst = max(worst, _unbalance(geometry, rays, TREE))
         bends = paths.main_ends(geometry, rays).bends
@@ -86,7 +86,10 @@ def nested_and_overlapping(density: int) -> Found:
     """Sums of weights and losses in bodies within and across one another, under each rule."""
     within, across = [0.0, 0.0, 0.0], [1.0, 0.3, 0.0]
     bodies = [
-        (scenes.ball(1.0), scenes.ball(0.6, index=index, centre=centre, name="inner_water"))
+        (
+            balls_and_rays.ball(1.0),
+            balls_and_rays.ball(0.6, index=index, centre=centre, name="inner_water"),
+        )
         for index, centre in ((1.333, within), (2.5, across), (0.4, across))
     ]
     worst = 0.0
@@ -159,7 +162,7 @@ def whispering_gallery(density: int) -> Found:
     """Light of rays caught in a ball by total reflection, which must end by their budget."""
     sine = np.linspace(0.75, 0.999, RAYS)
     origins = np.stack([0.0 * sine, 0.0 * sine + 0.001, sine], axis=-1)
-    rays = scenes.rays(origins, [1.0, 0.0, 0.0])
+    rays = balls_and_rays.rays(origins, [1.0, 0.0, 0.0])
     worst, geometry = 0.0, paths.build(sphere())
     for bends in (24, 100)[: 1 + (density > 1)]:
         traced = paths.trace(geometry, rays, budget=Budget(bends, "all", cut=0.02))

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
+from benchmarks import balls_and_rays
 from benchmarks.oracles import reference_surfaces, reference_tree
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_assembly import build_geometry
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.path_settings import Budget
-from tests.factories import scenes
 
 MAIN = Budget(10, "none", live_per_ray=1.0, segments_per_ray=10.0, paths_per_ray=1.0)
 """One path a ray: refracted wherever it can be."""
@@ -82,7 +82,7 @@ def build(*parts):
 def trace(geometry, rays, *, budget):
     """Traces, and refuses any NaN on the way."""
     with jax.debug_nans(True):
-        return jax.tree.map(np.asarray, scenes.trace_ends(geometry, rays, budget=budget))
+        return jax.tree.map(np.asarray, balls_and_rays.trace_ends(geometry, rays, budget=budget))
 
 
 def trace_in_double(geometry, rays, *, budget):
@@ -151,7 +151,7 @@ def rays_at(points, *, distance=4.0, seed=0):
     """Returns rays from random places at that distance of the origin, aimed at points."""
     places = np.random.default_rng(seed).normal(size=np.shape(points))
     origins = distance * reference_surfaces.unit(places)
-    return scenes.rays(origins, points - origins)
+    return balls_and_rays.rays(origins, points - origins)
 
 
 def random_points(count, *, radius=1.0, seed=1):

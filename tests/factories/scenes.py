@@ -7,18 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
+from benchmarks.balls_and_rays import ball as ball
+from benchmarks.balls_and_rays import rays as rays
+from benchmarks.balls_and_rays import trace_ends as trace_ends
 from refref_jax.data import meshes
 from refref_jax.data.mesh_queries import find_containment
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_assembly import build_geometry
-from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.triangle_meshes import volume
-from refref_jax.optics import path_tracing
-
-
-def ball(radius=1.0, *, index=1.5, subdivisions=4, centre=(0.0, 0.0, 0.0), name="ball_glass"):
-    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
-    return MeshPart(name, mesh.vertices + np.asarray(centre), mesh.faces, index, "auto")
 
 
 def box(extents=(1.0, 1.0, 1.0), *, index=1.5, name="box_glass"):
@@ -38,28 +34,10 @@ def geometry(*parts, rule="nested"):
     return jax.tree.map(jnp.asarray, built)
 
 
-def rays(origins, directions):
-    origins = np.atleast_2d(np.asarray(origins, np.float64))
-    directions = np.atleast_2d(np.asarray(directions, np.float64))
-    origins, directions = np.broadcast_arrays(origins, directions)
-    unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    return Rays(
-        jnp.asarray(origins, jnp.float32),
-        jnp.asarray(unit, jnp.float32),
-        jnp.full(len(origins), 1e-3, jnp.float32),
-    )
-
-
 @functools.cache
 def read_geometry(scene):
     """Returns what the meshes of a scene's folder make, under the rule `nested`."""
     return geometry(*meshes.read_meshes(scene))
-
-
-@functools.partial(jax.jit, static_argnames="budget")
-def trace_ends(geometry, rays, *, budget):
-    """Traces a batch of rays in one program."""
-    return path_tracing.trace_ends(geometry, rays, budget=budget)
 
 
 def volume_of(mesh):
