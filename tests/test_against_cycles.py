@@ -18,6 +18,8 @@ from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, Budget
 from refref_jax.render import radiance_of, render_known
 from tests.factories import scenes
 
+pytestmark = pytest.mark.computing
+
 # Rays a pixel along each axis: Cycles' pixels are box-filtered. What the paper's paths lack is more
 # than what fewer rays alias.
 _FINE, _COARSE = 6, 3

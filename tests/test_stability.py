@@ -6,6 +6,8 @@ import pytest
 from benchmarks.stability import cases, laws
 from benchmarks.stability.measures import MEASURES
 
+pytestmark = pytest.mark.longest
+
 
 def _case(measure):
     return pytest.param(measure, id=measure.name, marks=[pytest.mark.slow] if measure.slow else [])

@@ -18,6 +18,8 @@ from refref_jax.optics import path_settings
 from refref_jax.optics.light_paths import PathStatus
 from tests.factories import scenes
 
+pytestmark = pytest.mark.computing
+
 _BUNDLED = Path(__file__).parents[1] / "experiments" / "data" / "cube_smcvx_ball"
 _SCENES = [_BUNDLED, *map(Path, filter(None, os.environ.get("REFREF_SCENES", "").split(":")))]
 

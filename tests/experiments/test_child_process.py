@@ -10,6 +10,8 @@ import pytest
 
 from tests.processes.command import ROOT
 
+pytestmark = pytest.mark.loose
+
 _LONG = 60.0
 
 

@@ -21,6 +21,8 @@ from refref_jax.render import load_model
 from tests.processes import code_generator
 from tests.processes.command import ROOT, TINY, run_command
 
+pytestmark = pytest.mark.loose
+
 # The kinds of distances that an evaluation measures, and how.
 _DISTANCES = ("distance", "surface", "substituted")
 _ERRORS = ("mae", "mae_masked", "rmse", "rmse_masked")

@@ -23,6 +23,8 @@ from tests.factories.small_captures import (
 from tests.factories.small_scenes import write_scene
 from tests.processes.command import run_command
 
+pytestmark = pytest.mark.loose
+
 
 @pytest.fixture
 def folder(tmp_path):

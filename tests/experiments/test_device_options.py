@@ -16,6 +16,8 @@ from experiments.runs import processes
 from tests.processes import code_generator
 from tests.processes.command import ROOT, run_command
 
+pytestmark = pytest.mark.loose
+
 _DEVICES = cli_flags.devices()
 
 

@@ -12,6 +12,8 @@ from tests.factories import made_lpips
 from tests.factories.small_scenes import truncate, write_grey
 from tests.processes.command import run_command
 
+pytestmark = pytest.mark.loose
+
 _NOTHING = Perceptual()
 
 

@@ -14,6 +14,8 @@ from refref_jax.optics.light_paths import PathStatus
 from refref_jax.render.pixel_paths import PixelPaths
 from tests.processes.command import ROOT, run_command
 
+pytestmark = pytest.mark.loose
+
 _SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
 
 

@@ -6,6 +6,8 @@ import pytest
 
 from tests.processes.command import ROOT
 
+pytestmark = pytest.mark.loose
+
 _FOLDER = ROOT / "experiments"
 _FILES = sorted(path for path in _FOLDER.glob("*.py") if path.name != "__init__.py")
 _COMMANDS = {f"experiments.{path.stem}" for path in _FILES}

@@ -20,6 +20,8 @@ from refref_jax.optics.path_settings import BUDGETS
 from refref_jax.training import presets, run_folder
 from tests.processes.command import ROOT
 
+pytestmark = pytest.mark.loose
+
 _SCRIPTS = [
     path.relative_to(ROOT / "experiments").with_suffix("")
     for path in (ROOT / "experiments").rglob("*.py")

@@ -8,6 +8,8 @@ from experiments.sweeps.recommend import Machine
 from tests.factories.made_rows import made_row
 from tests.processes.command import ROOT, run_command
 
+pytestmark = pytest.mark.loose
+
 # Twice as fast as the table's machine; both commands together start for 20 s.
 _MACHINE = Machine(ratio=0.5, startup=10.0, images=20)
 

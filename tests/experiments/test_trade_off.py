@@ -16,6 +16,8 @@ from experiments.sweeps.points import BASE
 from tests.factories.made_rows import made_row
 from tests.processes.command import ROOT, run_command
 
+pytestmark = pytest.mark.loose
+
 _SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
 
 

@@ -16,6 +16,8 @@ from refref_jax.sampling.cones import Gaussians
 from tests.laws import gradients, transformations
 from tests.oracles import reference_sampling
 
+pytestmark = pytest.mark.longest
+
 # Two small matrix products in float32.
 _NETWORK = 1e-5
 

@@ -11,6 +11,8 @@ from refref_jax.geometry.rays import Rays
 from tests.factories import arrays
 from tests.oracles import reference
 
+pytestmark = pytest.mark.longest
+
 # Distances are float32 sums of terms near 10.
 _DISTANCE_TOLERANCE = 2e-5
 

@@ -13,6 +13,8 @@ from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import Budget
 from tests.factories import scenes
 
+pytestmark = pytest.mark.computing
+
 _BUDGET = Budget(bends=6, reflections="all", cut=0.02)
 
 

@@ -13,6 +13,8 @@ from tests.factories import scenes
 from tests.oracles import reference
 from tests.oracles.reference import Sphere
 
+pytestmark = pytest.mark.longest
+
 # Planar bodies are exact: what is left is float32 rounding near coordinates of 4.
 _PLANAR_TOLERANCE = 5e-6
 

@@ -13,6 +13,8 @@ from refref_jax.reconstruct.light_refinement import LightRefinement, refine_by_l
 from refref_jax.reconstruct.mesh_distance import compare_meshes
 from tests.factories import bodies, lit_scenes, scenes
 
+pytestmark = [pytest.mark.loose, pytest.mark.computing]
+
 _TRUE = 1.5
 
 

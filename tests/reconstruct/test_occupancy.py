@@ -15,6 +15,8 @@ from refref_jax.reconstruct.occupancy_field import OccupancyFieldConfig
 from tests.factories import bodies
 from tests.laws import gradients
 
+pytestmark = pytest.mark.longest
+
 _FIELD = OccupancyFieldConfig(
     grid=HashGridConfig(levels=2, coarsest=4, finest=16, entries=1 << 13, features=2), width=16
 )

@@ -21,6 +21,8 @@ from tests.factories import made_paths, scenes, small_model
 from tests.factories.small_model import CONFIG, MODEL
 from tests.processes.command import ROOT
 
+pytestmark = pytest.mark.loose
+
 # Sums over devices add in another order, and 24 steps carry that on.
 _ROUNDING = 1e-4
 

@@ -16,6 +16,8 @@ from refref_jax.training.evaluation import Perceptual
 from tests.factories import made_lpips, scenes
 from tests.factories.small_model import CAMERAS, MODEL
 
+pytestmark = pytest.mark.loose
+
 _NOTHING = Perceptual()
 
 _KINDS = ("distance", "surface", "substituted")

@@ -20,6 +20,8 @@ from refref_jax.training.loop import TrainState, optimizer
 from tests.factories import extremes, small_model
 from tests.laws import gradients
 
+pytestmark = [pytest.mark.loose, pytest.mark.longest]
+
 _ADAM = 0.1
 
 # Without a warm-up the first step moves the parameters.

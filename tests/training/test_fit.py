@@ -13,6 +13,8 @@ from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig
 from tests.processes.command import ROOT
 
+pytestmark = pytest.mark.loose
+
 
 def _script():
     snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)

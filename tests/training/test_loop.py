@@ -18,6 +18,8 @@ from refref_jax.training.run_folder import Checkpoints
 from tests.factories import scenes, small_model
 from tests.factories.small_model import CONFIG, MODEL, SAVED
 
+pytestmark = [pytest.mark.loose, pytest.mark.longest]
+
 _GEOMETRY = scenes.geometry(scenes.ball(1.3, subdivisions=2))
 
 

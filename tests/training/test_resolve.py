@@ -24,6 +24,8 @@ from refref_jax.training.resolve import SceneFacts, override_model, resolve, sam
 from tests.factories.small_model import CAMERAS, MODEL
 from tests.processes.command import ROOT
 
+pytestmark = pytest.mark.loose
+
 _CLEAR = Needs(
     parts=1,
     bodies=1,

@@ -29,6 +29,8 @@ from refref_jax.reconstruct.refractive_index import Descent, IndexEstimate
 from tests.factories import bodies
 from tests.factories.silhouettes import RADIUS, without_masks, write_scene
 
+pytestmark = [pytest.mark.longest, pytest.mark.computing]
+
 _CONFIG = ReconstructionConfig("hull", 20, 0, 1.5, None, None, 0, 0)
 
 

@@ -11,6 +11,8 @@ from experiments.r3f.records import ReconstructionConfig
 from tests.factories.silhouettes import write_scene
 from tests.processes.command import ROOT, run_command
 
+pytestmark = pytest.mark.longest
+
 _GRID = "--resolution=20"
 
 
