@@ -74,3 +74,11 @@ def _compiled_lightly(request):
 def ball_scene() -> Path:
     """The bundled scene: a glass ball between textured walls, rendered by Blender Cycles."""
     return Path(__file__).parents[1] / "experiments" / "data" / "cube_smcvx_ball"
+
+
+@pytest.fixture(scope="module")
+def slab():
+    """A wide slab of glass, one unit thick."""
+    from tests.factories import scenes
+
+    return scenes.geometry(scenes.box((8.0, 8.0, 1.0)))

@@ -15,16 +15,13 @@ from refref_jax.reconstruct.occupancy_field import (
     silhouette_logit,
     weights,
 )
+from tests.factories.arrays import single
 from tests.laws import gradients
-
-
-def _array(*values):
-    return jnp.asarray(values, jnp.float32)
 
 
 def _chord(offset=0.0):
     """A chord through the unit cube along x, at some distance from the middle."""
-    return Chord(_array(-1.0, 0.5 + offset, 0.5), _array(1.0, 0.0, 0.0), _one(1.0), _one(2.0))
+    return Chord(single([-1.0, 0.5 + offset, 0.5]), single([1.0, 0.0, 0.0]), _one(1.0), _one(2.0))
 
 
 def _one(value):
@@ -36,7 +33,7 @@ def _ball(position, *, radius=0.25):
 
 
 def test_weights_are_known_by_hand():
-    found = weights(_array(0.5, 0.0, 0.5, 1.0, 0.7))
+    found = weights(single([0.5, 0.0, 0.5, 1.0, 0.7]))
     np.testing.assert_allclose(found, [0.5, 0.0, 0.25, 0.25, 0.0], atol=1e-7)
 
 
@@ -61,7 +58,7 @@ def test_the_logit_s_derivative_is_that_of_differences():
 
 @pytest.mark.parametrize("occupancies", [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.0, 1.0, 0.0]])
 def test_gradients_by_weights_are_finite_where_all_or_nothing_is_stopped(occupancies):
-    slopes = jax.grad(lambda x: jnp.sum(weights(x) * jnp.arange(3.0)))(_array(*occupancies))
+    slopes = jax.grad(lambda x: jnp.sum(weights(x) * jnp.arange(3.0)))(single(occupancies))
     assert gradients.all_finite(slopes)
 
 
@@ -72,7 +69,7 @@ def test_the_loss_and_its_gradient_are_finite_for_any_logits(size, signs, seen):
     def loss(logits):
         return cross_entropy(silhouette_logit(logits), _one(seen))
 
-    value, slopes = jax.value_and_grad(loss)(size * _array(*signs))
+    value, slopes = jax.value_and_grad(loss)(size * single(signs))
     assert np.isfinite(value) and value >= 0.0 and gradients.all_finite(slopes)
     pulled, most = np.abs(slopes).sum(), signs.count(max(signs))
     if size > 1.0 and seen == 0.0:

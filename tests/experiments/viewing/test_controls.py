@@ -13,11 +13,6 @@ from tests.factories import scenes
 
 
 @pytest.fixture(scope="module")
-def slab():
-    return scenes.geometry(scenes.box((8.0, 8.0, 1.0)))
-
-
-@pytest.fixture(scope="module")
 def straight_down(slab):
     ray = Rays(np.array([0.1, 0.2, 4.0]), np.array([0.0, 0.0, -1.0]), np.float64(1e-3))
     budget = dataclasses.replace(TREE, bends=6, cut=1e-3)
