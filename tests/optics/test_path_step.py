@@ -7,6 +7,7 @@ from refref_jax.geometry.surfaces import SurfacePoint
 from refref_jax.optics import interface_rules, media, path_step
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import AMBIENT
+from refref_jax.optics.path_settings import Budget
 
 _GLASS = jax.tree.map(jnp.asarray, interface_rules.nested([1.5], [NO_PARENT]))
 
@@ -67,3 +68,37 @@ def test_no_ray_leaves_on_the_wrong_side_however_the_shading_normal_leans(lean, 
 def test_the_shading_normal_bends_the_ray():
     flat, leaning = _meet([0.2, 0.0, -1.0]), _meet([0.2, 0.0, -1.0], shading=(0.1, 0.0, 1.0))
     assert np.linalg.norm(flat.transmitted - leaning.transmitted) > 0.02
+
+
+def _shares(reflectance, *, total=False, first=True, strength=1.0, **settings):
+    budget = Budget(bends=8, **settings)
+    found = path_step.shares(
+        budget,
+        reflectance=jnp.float32(reflectance),
+        total=jnp.asarray(total),
+        first=jnp.asarray(first),
+        strength=jnp.float32(strength),
+    )
+    return [float(share) for share in found]
+
+
+@pytest.mark.parametrize("reflections", ["all", "first", "none"])
+def test_a_total_reflection_takes_all_light_under_any_settings(reflections):
+    assert _shares(1.0, total=True, first=False, reflections=reflections) == [1.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("reflections", "first", "expected"),
+    [("all", False, 0.25), ("first", True, 0.25), ("first", False, 0.0), ("none", True, 0.0)],
+)
+def test_a_reflection_that_is_not_followed_leaves_its_share(reflections, first, expected):
+    assert _shares(0.25, first=first, reflections=reflections) == [expected, 1.0 - expected]
+
+
+@pytest.mark.parametrize(
+    ("reflectance", "strength", "expected"),
+    [(0.25, 1.0, 0.25), (0.25, 0.3, 0.0), (0.75, 1.0, 0.75), (0.75, 0.3, 1.0)],
+)
+def test_below_the_threshold_the_stronger_branch_takes_all(reflectance, strength, expected):
+    found = _shares(reflectance, strength=strength, reflections="all", cut=0.1)
+    assert found == [expected, 1.0 - expected]
