@@ -33,14 +33,14 @@ import jax.numpy as jnp
 import numpy as np
 from absl import app, flags
 
+from benchmarks.oracles import reference_images, reference_surfaces, reference_tree
+from benchmarks.oracles.reference_surfaces import Embree, Hits, Surfaces
 from refref_jax.data import mesh_queries, meshes
 from refref_jax.data.scene_assembly import build_geometry
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
 from refref_jax.optics.light_paths import exists
 from refref_jax.optics.path_settings import TREE
-from tests import reference_images, reference_surfaces, reference_tree
-from tests.reference_surfaces import Embree, Hits, Surfaces
 
 _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folder of the scene.")
 _VIEW = flags.DEFINE_integer("view", 0, "Test view.")

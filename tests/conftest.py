@@ -4,7 +4,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from tests import code_generator
+from tests.processes import code_generator
 
 # Several processes share an accelerator.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
@@ -22,36 +22,9 @@ import pytest
 # A silent broadcast between different ranks is a bug.
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# optax and dm-pix mix integers and floats; everything of ours must be explicit.
-_LOOSE = (
-    "training",
-    "experiments",
-    "test_colours.py",
-    "test_light_refinement.py",
-    "test_index_stage.py",
-)
-
-
-# Modules of more than half a minute: a worker that comes to one last keeps the others waiting.
-_LONGEST = (
-    "test_documents.py",
-    "test_path_tracing.py",
-    "test_path_tree.py",
-    "test_stability.py",
-    "test_loop.py",
-    "test_chain.py",
-    "test_bvh.py",
-    "test_corners.py",
-    "test_refinement.py",
-    "test_training_body.py",
-    "test_fields.py",
-    "test_extremes.py",
-    "test_occupancy.py",
-)
-
 
 def pytest_collection_modifyitems(items):
-    items.sort(key=lambda item: item.path.name not in _LONGEST)
+    items.sort(key=lambda item: item.get_closest_marker("longest") is None)
 
 
 def pytest_configure(config):
@@ -79,23 +52,9 @@ def _few_mappings():
 
 @pytest.fixture(autouse=True)
 def _strict_dtypes(request):
-    path = Path(request.fspath)
-    loose = path.parent.name in _LOOSE or path.name in _LOOSE
+    loose = request.node.get_closest_marker("loose")
     with jax.numpy_dtype_promotion("standard" if loose else "strict"):
         yield
-
-
-# Modules that compute more than they compile, and one whose bound is that of users' rounding.
-_COMPUTING = (
-    "test_main_branches.py",
-    "test_against_cycles.py",
-    "test_tree_against_reference.py",
-    "test_chain.py",
-    "test_corners.py",
-    "test_refinement.py",
-    "test_light_refinement.py",
-    "test_index_stage.py",
-)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -104,7 +63,8 @@ def _compiled_lightly(request):
 
     Not where slow tests are run, nor by `pytest -m "slow or not slow"`.
     """
-    lightly = _is_quick(request.config) and request.path.name not in _COMPUTING
+    computing = request.node.get_closest_marker("computing")
+    lightly = _is_quick(request.config) and not computing
     jax.config.update("jax_disable_most_optimizations", lightly)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
@@ -114,3 +74,11 @@ def _compiled_lightly(request):
 def ball_scene() -> Path:
     """The bundled scene: a glass ball between textured walls, rendered by Blender Cycles."""
     return Path(__file__).parents[1] / "experiments" / "data" / "cube_smcvx_ball"
+
+
+@pytest.fixture(scope="module")
+def slab():
+    """A wide slab of glass, one unit thick."""
+    from tests.factories import scenes
+
+    return scenes.geometry(scenes.box((8.0, 8.0, 1.0)))

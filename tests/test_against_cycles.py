@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
+from benchmarks.oracles import colours
+from benchmarks.oracles.backgrounds import CubeBackground
 from refref_jax.data import background, scene_folder
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, Budget
 from refref_jax.render import radiance_of, render_known
-from tests import reference, scenes
-from tests.backgrounds import CubeBackground
+from tests.factories import scenes
+
+pytestmark = pytest.mark.computing
 
 # Rays a pixel along each axis: Cycles' pixels are box-filtered. What the paper's paths lack is more
 # than what fewer rays alias.
@@ -36,7 +39,7 @@ def _render(scene, view, budget, *, oversampling=_FINE):
     seen = render_known(scenes.read_geometry(scene), radiance, rays, budget=budget)
     linear = cameras.box_filter(seen.linear, oversampling)
     return (
-        np.clip(reference.linear_to_srgb(linear), 0.0, 1.0),
+        np.clip(colours.linear_to_srgb(linear), 0.0, 1.0),
         seen.casts / seen.paths.size,
         np.mean(seen.paths),
     )

@@ -29,6 +29,10 @@ _FLOORS = {
 _MODULES = sorted(_PACKAGE.rglob("*.py"))
 _SCRIPTS = sorted((_ROOT / "experiments").rglob("*.py"))
 _BENCHMARKS = sorted((_ROOT / "benchmarks").rglob("*.py"))
+_TESTS = sorted((_ROOT / "tests").rglob("*.py"))
+
+# Folders of tests/ for what tests share; elsewhere there are tests and what prepares them.
+_SHARED = {"oracles", "factories", "fakes", "laws", "processes"}
 
 _LONGEST_MODULE = 500
 _LONGEST_FUNCTION = 45
@@ -50,6 +54,9 @@ _MAY_JIT = {
     "reconstruct/light_refinement.py",
     "reconstruct/refractive_index.py",
 }
+
+# Bodies of functions are compared from this many statements on, or nodes of the syntax tree.
+_STATEMENTS_COMPARED, _NODES_COMPARED = 3, 12
 
 _VAGUE_NAMES = {"utils", "util", "misc", "helpers", "common", "math"}
 
@@ -85,10 +92,15 @@ def _is_jit(node):
     return isinstance(node, ast.Attribute) and ast.unparse(node) == "jax.jit"
 
 
+def _body(function):
+    """Returns the statements of a function, without its docstring."""
+    first = function.body[0]
+    documented = isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant)
+    return function.body[1:] if documented else function.body
+
+
 def _body_lines(function):
-    body = function.body
-    if isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):
-        body = body[1:]
+    body = _body(function)
     return body[-1].end_lineno - body[0].lineno + 1 if body else 0
 
 
@@ -108,6 +120,29 @@ def test_imports_fall(path):
 @pytest.mark.parametrize("path", _MODULES, ids=_name)
 def test_the_library_imports_no_command(path):
     assert not {name.split(".")[0] for name in _imports(path)} & {"experiments", "benchmarks"}
+
+
+@pytest.mark.parametrize("path", _BENCHMARKS, ids=lambda path: path.stem)
+def test_benchmarks_import_no_test(path):
+    assert "tests" not in {name.split(".")[0] for name in _imports(path)}
+
+
+def test_what_tests_share_has_its_folders():
+    for path in _TESTS:
+        if path.parent.name not in _SHARED:
+            assert path.stem in ("__init__", "conftest") or path.stem.startswith("test_"), path
+
+
+def test_no_two_functions_of_the_tests_have_equal_bodies():
+    homes = {}
+    for path in _TESTS:
+        for function in _functions(path):
+            body = _body(function)
+            nodes = sum(1 for statement in body for _ in ast.walk(statement))
+            if len(body) >= _STATEMENTS_COMPARED or nodes >= _NODES_COMPARED:
+                home = f"{path.relative_to(_ROOT)}:{function.lineno}"
+                homes.setdefault("\n".join(map(ast.dump, body)), []).append(home)
+    assert not [found for found in homes.values() if len(found) > 1]
 
 
 def test_only_the_generator_imports_the_generator():

@@ -24,8 +24,8 @@ from refref_jax.sampling import scene_bounds
 from refref_jax.training import loop
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.resolve import SceneFacts, resolve
-from tests import made_paths, scenes
-from tests.small_model import CAMERAS, MODEL
+from tests.factories import made_paths, scenes
+from tests.factories.small_model import CAMERAS, MODEL
 
 _RAYS = jax.tree.map(lambda x: jnp.asarray(x).reshape(-1, *x.shape[2:]), image_rays(CAMERAS, 0))
 _BALL = scenes.ball(1.3, subdivisions=2)

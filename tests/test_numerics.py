@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from refref_jax import numerics
-from tests import gradients, transformations
+from tests.laws import gradients, transformations
 
 # A few float32 roundings.
 _ROUNDING = 5e-7

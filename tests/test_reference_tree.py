@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from tests import reference, reference_surfaces, reference_tree
-from tests.reference_surfaces import BruteForce, Embree, Part
-from tests.reference_tree import OUT_OF_BENDS, PAPER, TREE, Rule
+from benchmarks.oracles import reference_surfaces, reference_tree
+from benchmarks.oracles.reference_surfaces import BruteForce, Embree, Part
+from benchmarks.oracles.reference_tree import OUT_OF_BENDS, PAPER, TREE, Rule
+from tests.oracles import reference
 
 
 def _solid(mesh, *, smooth=False, inside=1.5, tint=(1.0, 1.0, 1.0)):

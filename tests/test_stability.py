@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from tests import stability_cases, stability_laws
-from tests.stability_measures import MEASURES
+from benchmarks.stability import cases, laws
+from benchmarks.stability.measures import MEASURES
+
+pytestmark = pytest.mark.longest
 
 
 def _case(measure):
@@ -19,18 +21,18 @@ def test_the_worst_error_is_within_its_bound(measure):
 
 
 def test_the_lattice_reaches_what_it_claims():
-    cases = stability_laws.lattice(2)
-    cosine = -np.sum(cases.normals * cases.directions, axis=-1)
-    assert np.sum(cases.near == cases.far) > 10
+    lattice = laws.lattice(2)
+    cosine = -np.sum(lattice.normals * lattice.directions, axis=-1)
+    assert np.sum(lattice.near == lattice.far) > 10
     assert cosine.min() < 1.1e-6
-    squared = 1.0 - (cases.near / cases.far) ** 2 * (1.0 - cosine**2)
+    squared = 1.0 - (lattice.near / lattice.far) ** 2 * (1.0 - cosine**2)
     assert np.sum(np.abs(squared) < 1e-5) > 10 and np.any(squared < 0)
-    assert (cases.near / cases.far).min() == pytest.approx(0.4)
-    assert (cases.near / cases.far).max() == pytest.approx(2.5)
+    assert (lattice.near / lattice.far).min() == pytest.approx(0.4)
+    assert (lattice.near / lattice.far).max() == pytest.approx(2.5)
 
 
 def test_needles_are_closed_and_thin():
-    body = stability_cases.paths.needles(2e-6)
+    body = cases.paths.needles(2e-6)
     edges = np.sort(body.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     assert np.all(np.unique(edges, axis=0, return_counts=True)[1] == 2)
     corners = body.vertices[body.faces]

@@ -23,8 +23,8 @@ from refref_jax.render import (
     render_rays,
     shade,
 )
-from tests import gradients
-from tests.small_model import MODEL
+from tests.factories.small_model import MODEL
+from tests.laws import gradients
 
 _PAGE = Path(__file__).parents[1] / "docs" / "library.md"
 

@@ -12,10 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.oracles import reference_images, reference_surfaces, reference_tree
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_settings
 from refref_jax.optics.light_paths import PathStatus
-from tests import reference_images, reference_surfaces, reference_tree, scenes
+from tests.factories import scenes
+
+pytestmark = pytest.mark.computing
 
 _BUNDLED = Path(__file__).parents[1] / "experiments" / "data" / "cube_smcvx_ball"
 _SCENES = [_BUNDLED, *map(Path, filter(None, os.environ.get("REFREF_SCENES", "").split(":")))]

@@ -13,7 +13,7 @@ from refref_jax.render.backgrounds import (
     SphereBackground,
     SrgbTexture,
 )
-from tests.data.expectations import scene_error
+from tests.laws.expectations import scene_error
 
 
 def _scene(folder, content=None):

@@ -9,9 +9,9 @@ from refref_jax.data.mesh_queries import find_containment, parts_around, winding
 from refref_jax.data.meshes import read_meshes
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import EMPTY_SLOT, SLOTS
-from tests.data.expectations import scene_error
-from tests.data.solids import as_part, ball, box, inverted, joined, shell
-from tests.scenes import volume_of
+from tests.factories.scenes import volume_of
+from tests.factories.solids import as_part, ball, box, inverted, joined, shell
+from tests.laws.expectations import scene_error
 
 # Sums of solid angles in double precision.
 _EXACT = 1e-9

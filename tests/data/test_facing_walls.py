@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from refref_jax.data.mesh_queries import diagonal, sample_surface, walls_between
-from tests.data.solids import as_part, ball, box, inverted, joined
+from tests.factories.solids import as_part, ball, box, inverted, joined
 
 _EXACT = 1e-12
 

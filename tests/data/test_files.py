@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from refref_jax.data import image_files
-from tests.data.expectations import scene_error
+from tests.laws.expectations import scene_error
 
 # Half of an 8-bit level, and the rounding of double precision.
 _HALF_LEVEL = 0.5 / 255.0 + 1e-12

@@ -6,7 +6,7 @@ from refref_jax.data.scene_assembly import build_geometry
 from refref_jax.geometry.triangle_meshes import corner_normals, face_normals
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import AMBIENT
-from tests.data.solids import ball, box
+from tests.factories.solids import ball, box
 
 # Positions and normals are stored in single precision.
 _SINGLE = 1e-6

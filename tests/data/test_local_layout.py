@@ -5,8 +5,7 @@ import pytest
 
 from refref_jax.data import image_files, scene_folder
 from refref_jax.geometry.cameras import image_rays, planar_depth_to_distance
-from tests.data.expectations import scene_error
-from tests.data.small_scenes import (
+from tests.factories.small_scenes import (
     HEIGHT,
     WIDTH,
     edit_transforms,
@@ -14,6 +13,7 @@ from tests.data.small_scenes import (
     write_grey,
     write_scene,
 )
+from tests.laws.expectations import scene_error
 
 # The bundled ball, and the sphere on which its cameras stand.
 _BALL_RADIUS, _CAMERA_DISTANCE = 1.4, 4.0

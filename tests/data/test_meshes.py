@@ -5,9 +5,9 @@ import pytest
 import trimesh
 
 from refref_jax.data import meshes
-from tests.data.expectations import scene_error
-from tests.data.small_scenes import truncate
-from tests.data.solids import ball
+from tests.factories.small_scenes import truncate
+from tests.factories.solids import ball
+from tests.laws.expectations import scene_error
 
 # Meshes are stored in single precision.
 _SINGLE = 1e-7

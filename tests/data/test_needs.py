@@ -6,7 +6,7 @@ from refref_jax.data import mesh_queries, meshes
 from refref_jax.data.mesh_queries import is_convex
 from refref_jax.data.scene_analysis import describe, find_needs
 from refref_jax.geometry.cameras import orbit
-from tests.data import solids
+from tests.factories import solids
 
 _CAMERAS = orbit(4, distance=4.0, elevation=0.3, size=8, angle_x=1.0)
 

@@ -8,7 +8,7 @@ import pytest
 from refref_jax.data import SceneError
 from refref_jax.data.nerfstudio import capture as nerfstudio
 from refref_jax.geometry.cameras import Cameras, image_rays
-from tests.data.small_captures import FOCAL, HEIGHT, LENS, WIDTH, edit, pose_of, write_capture
+from tests.factories.small_captures import FOCAL, HEIGHT, LENS, WIDTH, edit, pose_of, write_capture
 
 
 @pytest.fixture

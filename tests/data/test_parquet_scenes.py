@@ -6,9 +6,9 @@ import pytest
 from refref_jax.data import parquet_scenes, scene_folder
 from refref_jax.data.parquet_scenes import METADATA_KEY, Contents
 from refref_jax.geometry.cameras import focal_length, planar_depth_to_distance
-from tests.data.expectations import scene_error
-from tests.data.small_parquet import row, write_copy
-from tests.data.small_scenes import HEIGHT, WIDTH, truncate
+from tests.factories.small_parquet import row, write_copy
+from tests.factories.small_scenes import HEIGHT, WIDTH, truncate
+from tests.laws.expectations import scene_error
 
 
 def _unpack(shards, tmp_path, progress=lambda done, total: None):

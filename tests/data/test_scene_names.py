@@ -5,7 +5,7 @@ import pytest
 from experiments.dataset import parts
 from refref_jax.data import scene_names
 from refref_jax.data.scene_names import SceneName
-from tests.data.expectations import scene_error
+from tests.laws.expectations import scene_error
 
 
 @pytest.mark.parametrize(

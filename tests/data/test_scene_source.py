@@ -10,10 +10,10 @@ import trimesh
 
 from refref_jax.data import background, meshes, parquet_scenes, scene_folder
 from refref_jax.data.scene_source import SceneWarning, open_scene
-from tests.data.abandoned_folder import AbandonedFolder
-from tests.data.expectations import scene_error
-from tests.data.small_parquet import CONFIG, NAME, write_copy
-from tests.data.small_scenes import truncate, write_scene
+from tests.factories.small_parquet import CONFIG, NAME, write_copy
+from tests.factories.small_scenes import truncate, write_scene
+from tests.fakes.abandoned_folder import AbandonedFolder
+from tests.laws.expectations import scene_error
 
 _SOURCE = f"hf:{CONFIG}/{NAME}"
 _MESHES = "mesh_files/single-convex"

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.experiments.command import ROOT, TINY, run_command
+from tests.processes.command import ROOT, TINY, run_command
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,9 @@ import time
 
 import pytest
 
-from tests.experiments.command import ROOT
+from tests.processes.command import ROOT
+
+pytestmark = pytest.mark.loose
 
 _LONG = 60.0
 
@@ -51,7 +53,7 @@ def _service_manager(waiting, saving):
 )
 def test_whoever_is_waited_for_saves_once(tmp_path, stop, status):
     waiting = subprocess.Popen(
-        [sys.executable, "-m", "tests.experiments.waiting", str(tmp_path)],
+        [sys.executable, "-m", "tests.fakes.waiting", str(tmp_path)],
         cwd=ROOT,
         start_new_session=True,
         stdout=subprocess.DEVNULL,

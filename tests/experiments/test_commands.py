@@ -18,8 +18,10 @@ import trimesh
 from experiments.figures import video
 from refref_jax.data import image_files
 from refref_jax.render import load_model
-from tests import code_generator
-from tests.experiments.command import ROOT, TINY, run_command
+from tests.processes import code_generator
+from tests.processes.command import ROOT, TINY, run_command
+
+pytestmark = pytest.mark.loose
 
 # The kinds of distances that an evaluation measures, and how.
 _DISTANCES = ("distance", "surface", "substituted")

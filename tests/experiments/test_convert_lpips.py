@@ -10,8 +10,10 @@ from absl import flags
 
 from experiments import convert_lpips
 from refref_jax import metrics
-from tests import made_lpips
-from tests.experiments.command import run_command
+from tests.factories import made_lpips
+from tests.processes.command import run_command
+
+pytestmark = pytest.mark.loose
 
 # The options of a command that is imported must not meet those of another.
 for _flag in flags.FLAGS.flags_by_module_dict()[convert_lpips.__name__]:

@@ -11,9 +11,19 @@ from refref_jax.data.nerfstudio import capture as nerfstudio
 from refref_jax.data.nerfstudio import conversion as from_nerfstudio
 from refref_jax.data.nerfstudio import conversion as to_nerfstudio
 from refref_jax.data.nerfstudio.conversion import View
-from tests.data.small_captures import FOCAL, HEIGHT, WIDTH, edit, pixels_of, pose_of, write_capture
-from tests.data.small_scenes import write_scene
-from tests.experiments.command import run_command
+from tests.factories.small_captures import (
+    FOCAL,
+    HEIGHT,
+    WIDTH,
+    edit,
+    pixels_of,
+    pose_of,
+    write_capture,
+)
+from tests.factories.small_scenes import write_scene
+from tests.processes.command import run_command
+
+pytestmark = pytest.mark.loose
 
 
 @pytest.fixture

@@ -13,8 +13,10 @@ from absl.testing import flagsaver
 
 from experiments.cli import flags as cli_flags
 from experiments.runs import processes
-from tests import code_generator
-from tests.experiments.command import ROOT, run_command
+from tests.processes import code_generator
+from tests.processes.command import ROOT, run_command
+
+pytestmark = pytest.mark.loose
 
 _DEVICES = cli_flags.devices()
 

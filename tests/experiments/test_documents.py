@@ -6,7 +6,9 @@ import re
 
 import pytest
 
-from tests.experiments.command import ROOT
+from tests.processes.command import ROOT
+
+pytestmark = [pytest.mark.loose, pytest.mark.longest]
 
 _PAGES = ["README.md", *sorted(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md"))]
 _DECISIONS = sorted(page.name for page in (ROOT / "docs/decisions").glob("[0-9]*.md"))

@@ -4,6 +4,8 @@ import pytest
 
 from experiments.runs import evaluation
 
+pytestmark = pytest.mark.loose
+
 
 @pytest.mark.parametrize(
     ("count", "shown"), [(1, [0]), (3, [0, 1, 2]), (10, [0, 3, 6, 9]), (100, [0, 33, 66, 99])]

@@ -8,9 +8,11 @@ import pytest
 from experiments.runs import image_folders
 from refref_jax.data import image_files
 from refref_jax.training.evaluation import Perceptual
-from tests import made_lpips
-from tests.data.small_scenes import truncate, write_grey
-from tests.experiments.command import run_command
+from tests.factories import made_lpips
+from tests.factories.small_scenes import truncate, write_grey
+from tests.processes.command import run_command
+
+pytestmark = pytest.mark.loose
 
 _NOTHING = Perceptual()
 

@@ -12,7 +12,9 @@ from refref_jax.data import SceneError
 from refref_jax.data.meshes import MeshPart
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.render.pixel_paths import PixelPaths
-from tests.experiments.command import ROOT, run_command
+from tests.processes.command import ROOT, run_command
+
+pytestmark = pytest.mark.loose
 
 _SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
 

@@ -1,8 +1,12 @@
 """The command that takes over masks, as a user calls it."""
 
+import pytest
+
 from refref_jax.data import scene_folder
-from tests.data.small_scenes import edit_transforms, without_masks, write_scene
-from tests.experiments.command import run_command
+from tests.factories.small_scenes import edit_transforms, without_masks, write_scene
+from tests.processes.command import run_command
+
+pytestmark = pytest.mark.loose
 
 
 def test_masks_from_a_folder(tmp_path):

@@ -9,6 +9,8 @@ import pytest
 from experiments.cli import app
 from refref_jax.training import fit
 
+pytestmark = pytest.mark.loose
+
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 

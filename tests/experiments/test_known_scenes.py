@@ -10,7 +10,9 @@ import pytest
 
 from experiments.runs import view_numbers
 from refref_jax.data import image_files
-from tests.experiments.command import ROOT, run_command
+from tests.processes.command import ROOT, run_command
+
+pytestmark = pytest.mark.loose
 
 _SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
 _QUICK = ("--views=0,10", "--rays_per_pixel=1")

@@ -4,7 +4,9 @@ import ast
 
 import pytest
 
-from tests.experiments.command import ROOT
+from tests.processes.command import ROOT
+
+pytestmark = pytest.mark.loose
 
 _FOLDER = ROOT / "experiments"
 _FILES = sorted(path for path in _FOLDER.glob("*.py") if path.name != "__init__.py")

@@ -18,7 +18,9 @@ from refref_jax.fields import registry
 from refref_jax.optics.interface_rules import RULES
 from refref_jax.optics.path_settings import BUDGETS
 from refref_jax.training import presets, run_folder
-from tests.experiments.command import ROOT
+from tests.processes.command import ROOT
+
+pytestmark = pytest.mark.loose
 
 _SCRIPTS = [
     path.relative_to(ROOT / "experiments").with_suffix("")
@@ -164,7 +166,7 @@ def tried(tmp_path_factory):
             (folder / name).write_text("mine")
             cases[command].append([word.replace("FOLDER", str(folder)) for word in words])
     done = subprocess.run(
-        [sys.executable, "-m", "tests.experiments.print_manners"],
+        [sys.executable, "-m", "tests.processes.print_manners"],
         input=json.dumps(cases),
         capture_output=True,
         text=True,

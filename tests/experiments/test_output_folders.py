@@ -8,6 +8,8 @@ import pytest
 
 from experiments.cli import outputs
 
+pytestmark = pytest.mark.loose
+
 _WRITES = ("rgb", "metrics.json")
 
 

@@ -5,8 +5,10 @@ import pytest
 from experiments.runs.measured_runs import Training
 from experiments.sweeps import recommend, table
 from experiments.sweeps.recommend import Machine
-from tests.experiments.command import ROOT, run_command
-from tests.experiments.made_rows import made_row
+from tests.factories.made_rows import made_row
+from tests.processes.command import ROOT, run_command
+
+pytestmark = pytest.mark.loose
 
 # Twice as fast as the table's machine; both commands together start for 20 s.
 _MACHINE = Machine(ratio=0.5, startup=10.0, images=20)

@@ -3,6 +3,8 @@ from absl import flags
 
 from experiments.cli import flags as cli_flags
 
+pytestmark = pytest.mark.loose
+
 _SPACE = cli_flags.space()
 
 

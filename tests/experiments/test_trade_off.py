@@ -13,8 +13,10 @@ from experiments.runs import measured_runs
 from experiments.sweeps import points as trade_points
 from experiments.sweeps import report, sweep, table
 from experiments.sweeps.points import BASE
-from tests.experiments.command import ROOT, run_command
-from tests.experiments.made_rows import made_row
+from tests.factories.made_rows import made_row
+from tests.processes.command import ROOT, run_command
+
+pytestmark = pytest.mark.loose
 
 _SCENE = ROOT / "experiments" / "data" / "cube_smcvx_ball"
 

@@ -6,6 +6,8 @@ import pytest
 
 from experiments.figures import video
 
+pytestmark = pytest.mark.loose
+
 
 def _frames(height=23, width=25, count=5):
     """Grey pictures that grow brighter, with a red half."""

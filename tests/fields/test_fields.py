@@ -13,7 +13,10 @@ from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid, tables
 from refref_jax.fields.nerfacto import NerfactoConfig, NerfactoProposalConfig
 from refref_jax.fields.zipnerf import DensityFieldConfig, RadianceFieldConfig
 from refref_jax.sampling.cones import Gaussians
-from tests import gradients, reference_sampling, transformations
+from tests.laws import gradients, transformations
+from tests.oracles import reference_sampling
+
+pytestmark = pytest.mark.longest
 
 # Two small matrix products in float32.
 _NETWORK = 1e-5

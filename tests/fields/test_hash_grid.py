@@ -10,7 +10,8 @@ import scipy.special
 from refref_jax.fields import hash_grid, hash_grid_kernels
 from refref_jax.fields.hash_grid import HashGrid, HashGridConfig, MultisampledGrid
 from refref_jax.sampling.cones import Gaussians
-from tests import gradients, reference_sampling, transformations
+from tests.laws import gradients, transformations
+from tests.oracles import reference_sampling
 
 # Eight products of float32 numbers; the place in a cell of the finest level is rounded most.
 _BLENDING = 2e-5

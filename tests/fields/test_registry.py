@@ -21,7 +21,7 @@ from refref_jax.render.model import Model, init_params
 from refref_jax.training.config import FieldConfig
 from refref_jax.training.presets import PRESETS, Bounds, loss
 from refref_jax.training.resolve import override_model, samples_of
-from tests import scenes, small_model
+from tests.factories import scenes, small_model
 
 _BOUNDS = Bounds(near=0.05, far=16.0, radius=7.3, space="bounded")
 

@@ -8,7 +8,10 @@ import trimesh
 
 from refref_jax.geometry import bvh, bvh_build, traversal_accelerator
 from refref_jax.geometry.rays import Rays
-from tests import arrays, reference
+from tests.factories import arrays
+from tests.oracles import reference
+
+pytestmark = pytest.mark.longest
 
 # Distances are float32 sums of terms near 10.
 _DISTANCE_TOLERANCE = 2e-5

@@ -9,7 +9,8 @@ import trimesh
 from benchmarks import ray_sorting
 from refref_jax.geometry import bvh, bvh_build
 from refref_jax.geometry.rays import Rays
-from tests import arrays, reference
+from tests.factories import arrays
+from tests.oracles import reference
 
 _trace = jax.jit(bvh.closest_hits)
 

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from tests import code_generator
+from tests.processes import code_generator
 
 _PREAMBLE = """
 import jax, jax.numpy as jnp, numpy as np

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from refref_jax import metrics
-from tests import gradients, transformations
+from tests.laws import gradients, transformations
 
 _SHAPE = (14, 17)
 

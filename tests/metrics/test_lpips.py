@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from refref_jax import metrics
-from tests import gradients, made_lpips, transformations
+from tests.factories import made_lpips
+from tests.laws import gradients, transformations
 
 _SHAPE = (47, 39, 3)
 

@@ -9,7 +9,7 @@ from refref_jax.optics import path_tracing
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.media import AMBIENT
 from refref_jax.optics.path_settings import PAPER, TREE, Budget, Detail, everything
-from tests import scenes
+from tests.factories import scenes
 
 _CAPACITY = 256
 

@@ -5,7 +5,7 @@ import pytest
 from jax.test_util import check_grads
 
 from refref_jax.optics import fresnel
-from tests import reference
+from tests.oracles import reference
 
 _TOLERANCE = 2e-6
 

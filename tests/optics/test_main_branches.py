@@ -11,7 +11,9 @@ from refref_jax.optics import path_tracing
 from refref_jax.optics.differentiable_paths import follow_main_branches
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import Budget
-from tests import scenes
+from tests.factories import scenes
+
+pytestmark = pytest.mark.computing
 
 _BUDGET = Budget(bends=6, reflections="all", cut=0.02)
 

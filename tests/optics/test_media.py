@@ -10,7 +10,7 @@ import pytest
 from refref_jax.optics import fresnel, interface_rules, media, snell
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import AMBIENT, EMPTY_SLOT, SLOTS
-from tests.gradients import assert_numerical
+from tests.laws.gradients import assert_numerical
 
 _SINGLE = 1e-6
 

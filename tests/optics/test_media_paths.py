@@ -12,8 +12,9 @@ from refref_jax.optics import media, path_tracing
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.media import AMBIENT, EMPTY_SLOT
 from refref_jax.optics.path_settings import TREE, Budget
-from tests import reference, scenes
-from tests.reference import Sphere
+from tests.factories import scenes
+from tests.oracles import reference
+from tests.oracles.reference import Sphere
 
 # Planar bodies are exact: what is left is float32 rounding near coordinates of 4.
 _PLANAR_TOLERANCE = 5e-6

@@ -9,8 +9,11 @@ from refref_jax.optics import path_tracing
 from refref_jax.optics.light_paths import PathStatus, straight
 from refref_jax.optics.media import AMBIENT
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, Budget, capacity_for, room
-from tests import reference, scenes
-from tests.reference import Sphere
+from tests.factories import scenes
+from tests.oracles import reference
+from tests.oracles.reference import Sphere
+
+pytestmark = pytest.mark.longest
 
 # Planar bodies are exact: what is left is float32 rounding near coordinates of 4.
 _PLANAR_TOLERANCE = 5e-6

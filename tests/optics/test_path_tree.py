@@ -10,7 +10,9 @@ import pytest
 from refref_jax.optics import path_tracing
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import BUDGETS, PAPER, TREE, Budget, room
-from tests import scenes
+from tests.factories import scenes
+
+pytestmark = pytest.mark.longest
 
 _GLASS = 0.04
 """Fresnel's R of glass head-on."""

@@ -8,7 +8,7 @@ import pytest
 from refref_jax.data.scene_assembly import assemble
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.scene import in_one_precision, with_index
-from tests import scenes
+from tests.factories import scenes
 
 
 def _glass_with_a_bubble(rule="nested"):

@@ -5,7 +5,7 @@ import pytest
 from jax.test_util import check_grads
 
 from refref_jax.optics import snell
-from tests import reference
+from tests.oracles import reference
 
 _INDICES = [(1.0, 1.5), (1.5, 1.0), (1.0, 2.418), (1.333, 1.5), (1.5, 1.333), (1.0, 1.0 + 1e-6)]
 

@@ -16,8 +16,10 @@ from refref_jax.reconstruct.mesh_distance import silhouette_overlap
 from refref_jax.reconstruct.polytope_fit import fit_corners
 from refref_jax.reconstruct.refinement import Refinement, refine
 from refref_jax.reconstruct.visual_hull import carve
-from tests.reconstruct import bodies
-from tests.scenes import volume_of
+from tests.factories import bodies
+from tests.factories.scenes import volume_of
+
+pytestmark = [pytest.mark.longest, pytest.mark.computing]
 
 _TURN = trimesh.transformations.euler_matrix(0.3, 0.2, 0.1)[:3, :3]
 _PLATE = (0.8, 0.8, 0.12)

@@ -7,7 +7,7 @@ import pytest
 
 from refref_jax.geometry.triangle_meshes import corner_normals, is_closed, volume
 from refref_jax.reconstruct import ReconstructionError, light_refinement
-from tests.reconstruct import bodies
+from tests.factories import bodies
 
 
 def _ball(level=3):

@@ -8,7 +8,7 @@ from refref_jax.geometry.triangle_meshes import is_closed, volume
 from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.grids import Box, Grid, find_isosurface, sample
 from refref_jax.reconstruct.mesh_distance import ClosestSearch, signed_distance
-from tests.reconstruct import bodies
+from tests.factories import bodies
 
 _BOX = Box(np.full(3, -1.6), np.full(3, 1.6))
 

@@ -11,8 +11,9 @@ from refref_jax.optics.scene import Scene
 from refref_jax.reconstruct import refractive_index
 from refref_jax.reconstruct.light_refinement import LightRefinement, refine_by_light
 from refref_jax.reconstruct.mesh_distance import compare_meshes
-from tests import scenes
-from tests.reconstruct import bodies, lit_scenes
+from tests.factories import bodies, lit_scenes, scenes
+
+pytestmark = [pytest.mark.loose, pytest.mark.computing]
 
 _TRUE = 1.5
 

@@ -12,8 +12,10 @@ from refref_jax.reconstruct.grids import Box, find_isosurface
 from refref_jax.reconstruct.mesh_distance import compare_meshes
 from refref_jax.reconstruct.occupancy import OccupancyTrainingConfig
 from refref_jax.reconstruct.occupancy_field import OccupancyFieldConfig
-from tests import gradients
-from tests.reconstruct import bodies
+from tests.factories import bodies
+from tests.laws import gradients
+
+pytestmark = pytest.mark.longest
 
 _FIELD = OccupancyFieldConfig(
     grid=HashGridConfig(levels=2, coarsest=4, finest=16, entries=1 << 13, features=2), width=16

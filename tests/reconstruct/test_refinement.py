@@ -11,8 +11,10 @@ from refref_jax.reconstruct.masks import Views, some_of
 from refref_jax.reconstruct.mesh_distance import compare_meshes, silhouette_overlap
 from refref_jax.reconstruct.refinement import Refinement, keep_pieces, refine
 from refref_jax.reconstruct.smoothing import denoise_within
-from tests.reconstruct import bodies
-from tests.scenes import volume_of
+from tests.factories import bodies
+from tests.factories.scenes import volume_of
+
+pytestmark = [pytest.mark.longest, pytest.mark.computing]
 
 _BOX = Box(np.full(3, -1.6), np.full(3, 1.6))
 

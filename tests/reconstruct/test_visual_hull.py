@@ -9,7 +9,7 @@ from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.grids import Box, Grid, find_isosurface, gradient, interpolate, sample
 from refref_jax.reconstruct.masks import check_masks, signed_distances
 from refref_jax.reconstruct.visual_hull import LEAST_RESOLUTION, carve, hull_field
-from tests.reconstruct import bodies
+from tests.factories import bodies
 
 _BOX = Box(np.full(3, -1.5), np.full(3, 1.5))
 

@@ -1,7 +1,7 @@
 import pytest
 
 from refref_jax.geometry.cameras import image_rays
-from tests.small_model import CAMERAS
+from tests.factories.small_model import CAMERAS
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.oracles import colours
+from benchmarks.oracles.backgrounds import CubeBackground as SlowCube
+from benchmarks.oracles.backgrounds import look_at_environment
 from refref_jax.data.background import read_background
 from refref_jax.render import backgrounds, radiance_of
 from refref_jax.render.backgrounds import (
@@ -14,9 +17,7 @@ from refref_jax.render.backgrounds import (
     SphereBackground,
     SrgbTexture,
 )
-from tests import gradients, reference, transformations
-from tests.backgrounds import CubeBackground as SlowCube
-from tests.backgrounds import look_at_environment
+from tests.laws import gradients, transformations
 
 # A texel is 1/512 of a wall: float32 places a point to 1e-4 of one, and the bundled images step
 # from dark to bright between two texels.
@@ -73,7 +74,7 @@ def test_a_texel_of_a_wall_is_where_the_mapping_says(wall, row, column):
     point = _HALF_EXTENT * (
         _NORMALS[wall] + (2 * u - 1) * _U_AXES[wall] + (2 * v - 1) * _V_AXES[wall]
     )
-    expected = reference.srgb_to_linear(np.asarray(CUBE.texture.texels)[wall, row, column])
+    expected = colours.srgb_to_linear(np.asarray(CUBE.texture.texels)[wall, row, column])
     for origin in ([0.0, 0.0, 0.0], [0.5, -1.0, 2.0]):
         np.testing.assert_allclose(_see(CUBE, origin, point - origin), expected, atol=1e-5)
 
@@ -86,7 +87,7 @@ def test_srgb_is_interpolated_before_it_is_decoded_and_linear_as_it_is():
         _see(_cube(kind(texels)), [0, 0, 0], middle) for kind in (LinearTexture, SrgbTexture)
     )
     np.testing.assert_allclose(linear, 0.5, rtol=1e-5)
-    np.testing.assert_allclose(srgb, reference.srgb_to_linear(0.5), rtol=1e-5)
+    np.testing.assert_allclose(srgb, colours.srgb_to_linear(0.5), rtol=1e-5)
 
 
 def test_a_wall_s_image_repeats_over_its_border():

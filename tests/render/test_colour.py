@@ -3,8 +3,9 @@ import numpy as np
 import pytest
 
 from refref_jax.render import colour
-from tests import gradients, reference_sampling, transformations
-from tests.arrays import single
+from tests.factories.arrays import single
+from tests.laws import gradients, transformations
+from tests.oracles import reference_sampling
 
 # A power in float32.
 _POWER = 1e-6

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from refref_jax.render import volume_rendering
-from tests import gradients, reference_sampling, transformations
-from tests.arrays import singles
+from tests.factories.arrays import singles
+from tests.laws import gradients, transformations
+from tests.oracles import reference_sampling
 
 # A dozen float32 products and sums.
 _SUMMATION = 2e-6

@@ -4,7 +4,7 @@ import pytest
 
 from refref_jax.geometry.rays import Rays
 from refref_jax.render.first_surface import NO_PART, find_first_surface
-from tests import scenes
+from tests.factories import scenes
 
 
 def _cast(*parts, origins, directions, **options):

@@ -10,8 +10,8 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, everything
 from refref_jax.render import Model, images, init_params, render_image, render_rays
-from tests import scenes
-from tests.small_model import CAMERAS, MODEL
+from tests.factories import scenes
+from tests.factories.small_model import CAMERAS, MODEL
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -5,12 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.oracles import colours
 from refref_jax.data.mesh_queries import parts_around
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE
 from refref_jax.render import background_rendering, radiance_of, render_known
 from refref_jax.render.backgrounds import Environment, LinearTexture
-from tests import reference, scenes
+from tests.factories import scenes
 
 _BALL = scenes.ball(1.3, subdivisions=2)
 
@@ -49,7 +50,7 @@ def test_straight_rays_see_the_background_itself(geometry, rays):
 def test_an_image_has_the_shape_of_its_rays(whole):
     assert whole.rgb.shape == whole.linear.shape == whole.lost.shape == (16, 16, 3)
     assert whole.paths.shape == (16, 16)
-    srgb = np.clip(reference.linear_to_srgb(whole.linear), 0.0, 1.0)
+    srgb = np.clip(colours.linear_to_srgb(whole.linear), 0.0, 1.0)
     np.testing.assert_allclose(whole.rgb, srgb, atol=1e-6)
     # The corners miss the ball; its middle is seen along several paths.
     assert whole.paths[0, 0] == 1 and whole.paths[8, 8] > 1

@@ -11,8 +11,7 @@ from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import STRAIGHT, TREE
 from refref_jax.render import Model, init_params, pixel_paths
 from refref_jax.render.pixel_paths import PixelPaths
-from tests import scenes
-from tests.small_model import MODEL
+from tests.factories.small_model import MODEL
 
 _BUDGET = dataclasses.replace(TREE, bends=6, cut=1e-3)
 
@@ -20,11 +19,6 @@ _BUDGET = dataclasses.replace(TREE, bends=6, cut=1e-3)
 def _ray(origin, direction):
     direction = np.asarray(direction, np.float64)
     return Rays(np.asarray(origin), direction / np.linalg.norm(direction), np.float64(1e-3))
-
-
-@pytest.fixture(scope="module")
-def slab():
-    return scenes.geometry(scenes.box((8.0, 8.0, 1.0)))
 
 
 @pytest.fixture(scope="module")

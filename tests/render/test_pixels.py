@@ -12,8 +12,10 @@ from refref_jax.render import pixels, volume_rendering
 from refref_jax.render.model import init_params
 from refref_jax.render.volume_rendering import Jitter
 from refref_jax.training import objective
-from tests import gradients, made_paths, reference_sampling
-from tests.small_model import MODEL
+from tests.factories import made_paths
+from tests.factories.small_model import MODEL
+from tests.laws import gradients
+from tests.oracles import reference_sampling
 
 # Colours of a few float32 products, sums and one power.
 _COLOUR = 1e-5

@@ -12,7 +12,8 @@ from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import TREE
 from refref_jax.render import render_known, shade
-from tests import gradients, scenes
+from tests.factories import scenes
+from tests.laws import gradients
 
 
 def _paths():

@@ -8,8 +8,8 @@ from refref_jax import choices
 from refref_jax.geometry import cameras
 from refref_jax.optics.path_settings import STRAIGHT
 from refref_jax.render import Model, Rendering, images, init_params, render_camera, render_image
-from tests import scenes
-from tests.small_model import CAMERAS, MODEL
+from tests.factories import scenes
+from tests.factories.small_model import CAMERAS, MODEL
 
 _CHUNK = 512
 

@@ -14,8 +14,9 @@ from refref_jax.render import pixels, volume_rendering
 from refref_jax.render.model import Params, init_params
 from refref_jax.render.volume_rendering import Jitter
 from refref_jax.sampling import polylines, scene_bounds
-from tests import made_paths, reference_sampling
-from tests.small_model import MODEL
+from tests.factories import made_paths
+from tests.factories.small_model import MODEL
+from tests.oracles import reference_sampling
 
 # Sums of weights, and edges that are found by inverting a cumulative sum.
 _SUMMATION = 5e-6

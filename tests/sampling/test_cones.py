@@ -8,7 +8,9 @@ import pytest
 
 from refref_jax.geometry.rays import orthonormal_basis
 from refref_jax.sampling import cones, polylines
-from tests import gradients, made_paths, reference_sampling, transformations
+from tests.factories import made_paths
+from tests.laws import gradients, transformations
+from tests.oracles import reference_sampling
 
 # A few float32 roundings.
 _ROUNDING = 2e-6

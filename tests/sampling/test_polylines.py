@@ -5,7 +5,9 @@ import pytest
 
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.sampling import polylines
-from tests import gradients, made_paths, reference_sampling, transformations
+from tests.factories import made_paths
+from tests.laws import gradients, transformations
+from tests.oracles import reference_sampling
 
 # Sums of a few float32 lengths of about 10.
 _DISTANCE = 5e-6

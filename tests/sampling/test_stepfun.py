@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from refref_jax.sampling import stepfun
-from tests import gradients, reference_sampling, transformations
-from tests.arrays import singles
+from tests.factories.arrays import singles
+from tests.laws import gradients, transformations
+from tests.oracles import reference_sampling
 
 # Cumulative sums of a dozen float32 numbers of about 1.
 _SUMMATION = 2e-6

@@ -17,9 +17,11 @@ from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import STRAIGHT
 from refref_jax.training import devices, loop
 from refref_jax.training.loop import init_state
-from tests import made_paths, scenes, small_model
-from tests.experiments.command import ROOT
-from tests.small_model import CONFIG, MODEL
+from tests.factories import made_paths, scenes, small_model
+from tests.factories.small_model import CONFIG, MODEL
+from tests.processes.command import ROOT
+
+pytestmark = pytest.mark.loose
 
 # Sums over devices add in another order, and 24 steps carry that on.
 _ROUNDING = 1e-4
@@ -148,7 +150,7 @@ def test_eight_devices_train_as_one_does(tmp_path):
         "on five": {"devices": 5, "steps": 26, "resumed": saved},
     }
     runs = {name: {"budget": "paper", **options} for name, options in runs.items()}
-    found = _result(_start("tests.training.sharded", json.dumps(runs), flags=_EIGHT))
+    found = _result(_start("tests.processes.sharded", json.dumps(runs), flags=_EIGHT))
     one = found["one"]
     for name, steps in {"eight": (0, 24), "five": (0, 24), "on one": (24, 26)}.items():
         _assert_same_curve(found[name]["reports"], one["reports"][slice(*steps)])
@@ -168,7 +170,7 @@ def test_eight_devices_train_as_one_does(tmp_path):
 
 
 def test_two_processes_find_each_other_and_sum():
-    for number, found in enumerate(_in_two_processes("tests.training.two_processes")):
+    for number, found in enumerate(_in_two_processes("tests.processes.two_processes")):
         assert found["first"] == (number == 0) and found["devices"] == 2
         assert found["any"] == [True, False]
         assert found["agreed"] == [1.5, 3.0]
@@ -183,8 +185,8 @@ def test_two_processes_train_as_one_does(tmp_path):
         "on": {"devices": 1, "steps": 26, "budget": "paper", "resumed": folder},
     }
     alone = {"one": {"devices": 1, "steps": 26, "budget": "paper"}}
-    first, second = _in_two_processes("tests.training.sharded", json.dumps(together))
-    one = _result(_start("tests.training.sharded", json.dumps(alone)))["one"]
+    first, second = _in_two_processes("tests.processes.sharded", json.dumps(together))
+    one = _result(_start("tests.processes.sharded", json.dumps(alone)))["one"]
     assert first == second and first["two"]["parts"] == 2
     _assert_same_curve(first["two"]["reports"], one["reports"][:24])
     _assert_same_curve(first["on"]["reports"], one["reports"][24:])

@@ -13,8 +13,10 @@ from refref_jax.optics.path_settings import STRAIGHT, TREE
 from refref_jax.render import Model, Rendering, init_params
 from refref_jax.training import evaluation
 from refref_jax.training.evaluation import Perceptual
-from tests import made_lpips, scenes
-from tests.small_model import CAMERAS, MODEL
+from tests.factories import made_lpips, scenes
+from tests.factories.small_model import CAMERAS, MODEL
+
+pytestmark = pytest.mark.loose
 
 _NOTHING = Perceptual()
 

@@ -17,8 +17,10 @@ from refref_jax.fields import hash_grid
 from refref_jax.render import learned_media
 from refref_jax.training import loop
 from refref_jax.training.loop import TrainState, optimizer
-from tests import gradients, small_model
-from tests.training import extremes
+from tests.factories import extremes, small_model
+from tests.laws import gradients
+
+pytestmark = [pytest.mark.loose, pytest.mark.longest]
 
 _ADAM = 0.1
 

@@ -11,7 +11,9 @@ import pytest
 from refref_jax.render import checkpoint_io
 from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig
-from tests.experiments.command import ROOT
+from tests.processes.command import ROOT
+
+pytestmark = pytest.mark.loose
 
 
 def _script():

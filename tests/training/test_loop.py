@@ -15,8 +15,10 @@ from refref_jax.render.model import path_detail
 from refref_jax.training import loop, run_folder
 from refref_jax.training.loop import init_state
 from refref_jax.training.run_folder import Checkpoints
-from tests import scenes, small_model
-from tests.small_model import CONFIG, MODEL, SAVED
+from tests.factories import scenes, small_model
+from tests.factories.small_model import CONFIG, MODEL, SAVED
+
+pytestmark = [pytest.mark.loose, pytest.mark.longest]
 
 _GEOMETRY = scenes.geometry(scenes.ball(1.3, subdivisions=2))
 

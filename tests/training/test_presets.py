@@ -8,6 +8,8 @@ import pytest
 from refref_jax.geometry.cameras import orbit
 from refref_jax.training.presets import PRESETS, Bounds, bounds, loss
 
+pytestmark = pytest.mark.loose
+
 _BOUNDS = Bounds(near=0.05, far=16.0, radius=7.3, space="bounded")
 
 

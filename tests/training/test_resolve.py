@@ -21,8 +21,10 @@ from refref_jax.training.config import (
 )
 from refref_jax.training.fit import prepare
 from refref_jax.training.resolve import SceneFacts, override_model, resolve, samples_of
-from tests.experiments.command import ROOT
-from tests.small_model import CAMERAS, MODEL
+from tests.factories.small_model import CAMERAS, MODEL
+from tests.processes.command import ROOT
+
+pytestmark = pytest.mark.loose
 
 _CLEAR = Needs(
     parts=1,

@@ -6,6 +6,8 @@ import pytest
 from refref_jax.training.config import ScheduleConfig, settled
 from refref_jax.training.loop import learning_rate, optimizer
 
+pytestmark = pytest.mark.loose
+
 _PAPER = ScheduleConfig(steps=25_000, warmup=1000, peak=8e-3, end=1e-3, anneal=1000)
 
 

@@ -1,25 +1,9 @@
-import sys
-from pathlib import Path
-
 import pytest
 
-from experiments.benchmarking import worker
 from experiments.cli import subprocesses
-from tests.experiments.benchmarking.made import write_scene
-from tests.experiments.benchmarking.serving import Server
-
-_STAND_IN = Path(__file__).with_name("stand_in.py")
-
-
-def stand_in_line(name, options):
-    """Returns what runs the stand-in for a command of `experiments`."""
-    return [sys.executable, str(_STAND_IN), name, *options]
-
-
-def run_with_stand_in(out, job):
-    """Does a job with stand-ins for its commands, in whatever process."""
-    subprocesses.command_line = stand_in_line
-    return worker.run_job(out, job)
+from tests.factories.made_benchmark import write_scene
+from tests.fakes.job_commands import stand_in_line
+from tests.fakes.serving import Server
 
 
 @pytest.fixture

@@ -15,9 +15,9 @@ import pytest
 
 from experiments.benchmarking import plan, summary, worker
 from refref_jax import atomic_files
-from tests import made_lpips
-from tests.experiments.benchmarking.serving import COMMAND, calls
-from tests.experiments.command import ROOT
+from tests.factories import made_lpips
+from tests.fakes.serving import COMMAND, calls
+from tests.processes.command import ROOT
 
 _BUNDLED = f"--scenes={ROOT / 'experiments' / 'data' / 'cube_smcvx_ball'}"
 

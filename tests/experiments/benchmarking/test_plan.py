@@ -10,7 +10,7 @@ import pytest
 from experiments.benchmarking import methods, plan, results, settings
 from experiments.benchmarking.methods import METHODS, RECONSTRUCTION
 from experiments.cli import scenes as cli_scenes
-from tests.experiments.benchmarking.made import SETTINGS, write_scene
+from tests.factories.made_benchmark import SETTINGS, write_scene
 
 _INSIDES = ["tree_clear", "tree_tints_given", "tree_tints_learned"]
 

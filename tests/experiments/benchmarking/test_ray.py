@@ -7,8 +7,8 @@ import pytest
 
 from experiments.benchmarking import methods, plan, results, settings, worker
 from experiments.benchmarking.worker import LocalEngine, RayEngine
-from tests.experiments.benchmarking.conftest import run_with_stand_in
-from tests.experiments.benchmarking.made import SETTINGS, write_scene
+from tests.factories.made_benchmark import SETTINGS, write_scene
+from tests.fakes.job_commands import run_with_stand_in
 
 pytestmark = pytest.mark.slow
 

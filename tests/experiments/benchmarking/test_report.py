@@ -15,7 +15,7 @@ from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.report import charts, data, images, page
 from experiments.benchmarking.report.data import Result, Scene
 from experiments.benchmarking.results import Image, Truth, View
-from tests.experiments.benchmarking.made import QUALITY, made_record, write_benchmark
+from tests.factories.made_benchmark import QUALITY, made_record, write_benchmark
 
 _ODD = "a'b\"c <script>alert(1) &amp;%2F#"
 _SCENES = (_ODD, "cube_smcvx_ball")

@@ -10,7 +10,7 @@ from html import unescape
 import pytest
 
 from experiments.benchmarking.report import page
-from tests.experiments.benchmarking.made import write_benchmark
+from tests.factories.made_benchmark import write_benchmark
 
 _CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None

@@ -8,7 +8,7 @@ import pytest
 
 from experiments.benchmarking import paper_tables, plan, results, settings
 from experiments.benchmarking.results import Costs, Image, Truth, View
-from tests.experiments.benchmarking.made import SETTINGS, made_record
+from tests.factories.made_benchmark import SETTINGS, made_record
 
 _TREE = made_record("cube_smcvx_ball", "tree", psnr=30.0)
 

@@ -13,7 +13,7 @@ from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.results import Image
 from experiments.benchmarking.tables import NOTHING, Cell, Column, mean_over
 from refref_jax.data import scene_names
-from tests.experiments.benchmarking.made import made_record
+from tests.factories.made_benchmark import made_record
 
 _PSNR = Column("PSNR", "PSNR", "higher", 2)
 

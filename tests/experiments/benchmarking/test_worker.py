@@ -17,7 +17,7 @@ from experiments.benchmarking.worker import LocalEngine
 from experiments.cli import subprocesses
 from experiments.cli.subprocesses import RunFailedError
 from refref_jax import atomic_files
-from tests.experiments.benchmarking.made import SETTINGS, made_record, write_scene
+from tests.factories.made_benchmark import SETTINGS, made_record, write_scene
 
 # --- one job ---
 

@@ -11,7 +11,7 @@ from experiments.dataset.textures.faces import FACES, make_face
 from experiments.dataset.textures.spheres import SPHERES
 from refref_jax.data import background, image_files
 from refref_jax.render.backgrounds import CubeBackground, Environment, SphereBackground
-from tests.experiments.command import ROOT
+from tests.processes.command import ROOT
 
 _BUNDLED = ROOT / "experiments" / "data" / "cube_smcvx_ball"
 _SIZE = 32

@@ -16,9 +16,9 @@ from experiments.dataset.parts import ObjectPart
 from refref_jax.data.background import read_background
 from refref_jax.geometry.cameras import box_filter, image_rays, supersample
 from refref_jax.render.backgrounds import radiance_of
-from tests.experiments.command import ROOT
-from tests.experiments.dataset import small_dataset
-from tests.experiments.dataset.blender_rooms import Blender, cameras_at, pose, write_room
+from tests.factories import small_dataset
+from tests.factories.blender_rooms import Blender, cameras_at, pose, write_room
+from tests.processes.command import ROOT
 
 _PYTHON = ROOT / ".venv-dataset" / "bin" / "python"
 

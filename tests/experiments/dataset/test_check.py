@@ -9,9 +9,9 @@ from experiments.dataset import checks, scene_check
 from experiments.dataset.check_page import SceneReport, write_page
 from refref_jax.data.mesh_checks import Finding
 from refref_jax.optics import path_settings
-from tests.data.small_scenes import truncate
-from tests.experiments.command import run_command
-from tests.experiments.dataset.cut_ball import cut_ball
+from tests.factories.cut_ball import cut_ball
+from tests.factories.small_scenes import truncate
+from tests.processes.command import run_command
 
 
 def _view(**changes):

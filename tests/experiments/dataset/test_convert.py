@@ -19,11 +19,11 @@ from experiments.dataset import (
 from refref_jax.choices import SPLITS
 from refref_jax.data import background, meshes, scene_folder, scene_source
 from refref_jax.data.scene_names import parse
-from tests.data.abandoned_folder import AbandonedFolder
-from tests.data.expectations import scene_error
-from tests.data.small_parquet import write_copy
-from tests.experiments.command import run_command
-from tests.experiments.dataset.cut_ball import COUNTS, cut_ball
+from tests.factories.cut_ball import COUNTS, cut_ball
+from tests.factories.small_parquet import write_copy
+from tests.fakes.abandoned_folder import AbandonedFolder
+from tests.laws.expectations import scene_error
+from tests.processes.command import run_command
 
 _NAME = "cube_smcvx_ball"
 _RAW = "image_data/textured_cube_scene/single-convex/ball"

@@ -10,7 +10,7 @@ import scipy.stats
 from experiments.dataset import cameras
 from experiments.dataset.seeds import seed_of
 from refref_jax.data.nerfstudio import conversion
-from tests.experiments.command import ROOT
+from tests.processes.command import ROOT
 
 _BUNDLED = ROOT / "experiments" / "data" / "cube_smcvx_ball"
 

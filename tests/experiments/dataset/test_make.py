@@ -16,10 +16,11 @@ from experiments.dataset import render_settings
 from experiments.dataset.render_settings import PerSplit
 from experiments.dataset.workers import BlenderError
 from refref_jax.data import background, image_files, mesh_queries, meshes, scene_folder
-from tests import code_generator
-from tests.experiments.command import ROOT
-from tests.experiments.dataset import fake_blender, small_dataset
-from tests.experiments.dataset.small_dataset import make
+from tests.factories import small_dataset
+from tests.factories.small_dataset import make
+from tests.fakes import fake_blender
+from tests.processes import code_generator
+from tests.processes.command import ROOT
 
 _SCENES = ["cube_smcvx_box", "env_mmncvx_box_full", "env_smcvx_box", "sphere_smcvx_box"]
 _FILES_OF_A_FRAME = 5

@@ -3,7 +3,7 @@
 import pytest
 
 from experiments.dataset import blender_meshes
-from tests.experiments.command import run_command
+from tests.processes.command import run_command
 
 
 def test_mistakes_end_before_anything_is_made(tmp_path):

@@ -19,7 +19,7 @@ from experiments.dataset.objects.regions import (
     rounded,
     top,
 )
-from tests.experiments.dataset.polylines import distances
+from tests.oracles.polylines import distances
 
 
 def _turns(curve):

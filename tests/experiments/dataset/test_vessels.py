@@ -19,7 +19,7 @@ from experiments.dataset.objects.vessels import (
     space_in,
     vessel,
 )
-from tests.experiments.dataset.polylines import distances
+from tests.oracles.polylines import distances
 
 _FINE = Sampling(edge=0.04, turn=0.1, segments=180)
 _WATER = Look("water", tint=(0.5, 0.8, 0.9))

@@ -15,9 +15,8 @@ from refref_jax.fields.base import Radiance, RadianceConfig
 from refref_jax.optics.path_settings import PAPER
 from refref_jax.reconstruct.grids import Grid
 from refref_jax.render.model import Model, Params
-from tests import scenes, small_model
-from tests.data import solids
-from tests.experiments.command import run_command
+from tests.factories import scenes, small_model, solids
+from tests.processes.command import run_command
 
 _RADIUS = 2.0  # of the scene
 _SOFT = 0.15

@@ -26,8 +26,10 @@ from refref_jax.geometry.triangle_meshes import corner_normals
 from refref_jax.reconstruct.light_refinement import Refined
 from refref_jax.reconstruct.mesh_distance import compare_meshes
 from refref_jax.reconstruct.refractive_index import Descent, IndexEstimate
-from tests.experiments.r3f.small_scene import RADIUS, without_masks, write_scene
-from tests.reconstruct import bodies
+from tests.factories import bodies
+from tests.factories.silhouettes import RADIUS, without_masks, write_scene
+
+pytestmark = [pytest.mark.longest, pytest.mark.computing]
 
 _CONFIG = ReconstructionConfig("hull", 20, 0, 1.5, None, None, 0, 0)
 

@@ -11,6 +11,8 @@ from refref_jax.data.scene_assembly import shaded_mesh
 from refref_jax.reconstruct.refractive_index import IndexSearch
 from refref_jax.training import fit, run_folder
 
+pytestmark = [pytest.mark.loose, pytest.mark.computing]
+
 
 @pytest.mark.slow
 def test_a_background_is_learned_beside_the_body_and_once(ball_scene, tmp_path, monkeypatch):

@@ -7,9 +7,9 @@ import time
 
 import pytest
 
-from tests import code_generator
-from tests.experiments.command import ROOT, run_command
-from tests.experiments.r3f.small_scene import write_scene
+from tests.factories.silhouettes import write_scene
+from tests.processes import code_generator
+from tests.processes.command import ROOT, run_command
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,10 @@ import pytest
 
 from experiments.r3f import chain, records
 from experiments.r3f.records import ReconstructionConfig
-from tests.experiments.command import ROOT, run_command
-from tests.experiments.r3f.small_scene import write_scene
+from tests.factories.silhouettes import write_scene
+from tests.processes.command import ROOT, run_command
+
+pytestmark = pytest.mark.longest
 
 _GRID = "--resolution=20"
 
@@ -130,7 +132,7 @@ def found(scene, made, runs, moved):
     left = {"scene": {"path": str(scene), "reconstruction": "r3f"}}
     (moved / "gone" / "run" / "config.json").write_text(json.dumps(left))
     result = subprocess.run(
-        [sys.executable, "-m", "tests.experiments.r3f.print_beginnings"],
+        [sys.executable, "-m", "tests.processes.print_beginnings"],
         cwd=ROOT,
         input=json.dumps(sent),
         capture_output=True,

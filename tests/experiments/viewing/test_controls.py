@@ -9,12 +9,7 @@ from experiments.viewer import controls
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.path_settings import TREE
 from refref_jax.render import pixel_paths
-from tests import scenes
-
-
-@pytest.fixture(scope="module")
-def slab():
-    return scenes.geometry(scenes.box((8.0, 8.0, 1.0)))
+from tests.factories import scenes
 
 
 @pytest.fixture(scope="module")

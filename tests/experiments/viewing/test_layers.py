@@ -16,8 +16,8 @@ from refref_jax.geometry.cameras import image_rays
 from refref_jax.optics.interface_rules import RULES
 from refref_jax.optics.path_settings import PAPER, STRAIGHT
 from refref_jax.render import Model, images, init_params, render_image
-from tests import scenes
-from tests.small_model import CAMERAS, MODEL
+from tests.factories import scenes
+from tests.factories.small_model import CAMERAS, MODEL
 
 _RAYS = image_rays(CAMERAS, 0)
 _OPTIONS = {"chunk": 4096, "most": 256, "cancelled": lambda: False}

@@ -11,11 +11,11 @@ from experiments.viewer import session
 from refref_jax.data import scene_folder
 from refref_jax.optics.path_settings import TREE
 from refref_jax.render import Model, images, init_params
-from tests import scenes
-from tests.small_model import MODEL
+from tests.factories import scenes
+from tests.factories.small_model import MODEL
 
 serving = pytest.importorskip("experiments.viewer.server", exc_type=ModuleNotFoundError)
-browser = pytest.importorskip("tests.experiments.viewing.browser", exc_type=ModuleNotFoundError)
+browser = pytest.importorskip("tests.processes.browser", exc_type=ModuleNotFoundError)
 
 pytestmark = [
     pytest.mark.slow,

@@ -13,9 +13,9 @@ from experiments.viewer.session import Subject
 from refref_jax.data import scene_folder
 from refref_jax.optics.path_settings import STRAIGHT, TREE, capacity_factors
 from refref_jax.render import Model, init_params
-from tests import scenes
-from tests.experiments.command import ROOT, run_command
-from tests.small_model import MODEL
+from tests.factories import scenes
+from tests.factories.small_model import MODEL
+from tests.processes.command import ROOT, run_command
 
 
 def _subject(budget=TREE, frames=None):

@@ -1,0 +1,1 @@
+"""Slow references that benchmarks and tests compare the library with."""

@@ -1,0 +1,459 @@
+"""Claim: the tests catch each of these bugs, which are planted one at a time in a copy.
+
+    python -m benchmarks.planted_bugs [--only=NAME,...] [--jobs=N]
+
+Each bug replaces one piece of text in one file of the library. Its tests must pass on a copy
+without bugs, and one of them must fail, rather than not start, on a copy with the bug. Prints a
+table, writes benchmarks/results/planted_bugs.csv unless `--only` is given, and asserts that all
+bugs are caught.
+"""
+
+import concurrent.futures
+import csv
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from absl import app, flags
+
+_ONLY = flags.DEFINE_list("only", [], "Names of the bugs to plant; all by default.")
+_JOBS = flags.DEFINE_integer("jobs", 2, "Number of copies that are tested at the same time.", 1)
+
+_ROOT = Path(__file__).parents[1]
+_RESULTS = _ROOT / "benchmarks" / "results" / "planted_bugs.csv"
+
+# Exit status of pytest if a test failed, rather than that it could not be run.
+_FAILED = 1
+
+
+class Bug(NamedTuple):
+    """A bug to plant.
+
+    Attributes:
+      name: what is wrong.
+      file: module of the library, below `refref_jax`.
+      old: text of the module, which occurs once.
+      new: what replaces it.
+      tests: arguments for pytest, below `tests`.
+    """
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+
+class Outcome(NamedTuple):
+    """What became of a bug.
+
+    Attributes:
+      name: of the bug.
+      caught: whether a test failed.
+      test: the test that failed, or why none did.
+      seconds: how long the tests took.
+    """
+
+    name: str
+    caught: bool
+    test: str
+    seconds: float
+
+
+_SNELL = "optics/snell.py"
+_FRESNEL = "optics/fresnel.py"
+_STEP = "optics/path_step.py"
+_MEDIA = "optics/media.py"
+_VOLUME = "render/volume_rendering.py"
+_BOUNDS = "sampling/scene_bounds.py"
+_OBJECTIVE = "training/objective.py"
+_KERNELS = "fields/hash_grid_kernels.py"
+
+_TEST_STEP = ("optics/test_path_step.py",)
+_TEST_TREE = ("optics/test_path_tree.py",)
+_TEST_MEDIA = ("optics/test_media.py",)
+_TEST_BOUNDS = ("sampling/test_scene_bounds.py",)
+_TEST_COMPOSITING = ("render/test_compositing.py",)
+_TEST_OBJECTIVE = ("training/test_objective.py",)
+
+BUGS = (
+    Bug(
+        "sign of gamma",
+        _SNELL,
+        "(alpha * beta - gamma) * normal",
+        "(alpha * beta + gamma) * normal",
+        ("optics/test_snell.py",),
+    ),
+    Bug(
+        "alpha inverted",
+        _SNELL,
+        "alpha = index_near / index_far",
+        "alpha = index_far / index_near",
+        ("optics/test_snell.py",),
+    ),
+    Bug(
+        "total reflection on the wrong side",
+        _SNELL,
+        "squared < 0.0)",
+        "squared > 0.0)",
+        ("optics/test_snell.py",),
+    ),
+    Bug(
+        "indices of Fresnel swapped",
+        _FRESNEL,
+        "transmission(beta, index_near, index_far)",
+        "transmission(beta, index_far, index_near)",
+        ("optics/test_fresnel.py",),
+    ),
+    Bug(
+        "one polarisation counts twice",
+        _FRESNEL,
+        "_amplitude(index_far * beta, index_near * gamma)",
+        "_amplitude(index_near * beta, index_far * gamma)",
+        ("optics/test_fresnel.py",),
+    ),
+    Bug(
+        "limit of bends off by one",
+        _STEP,
+        "state.bends < budget.bends",
+        "state.bends <= budget.bends",
+        _TEST_TREE,
+    ),
+    Bug(
+        "total reflection not followed",
+        _STEP,
+        "reflected = jnp.where(total, jnp.ones_like(partial), partial)",
+        "reflected = partial",
+        _TEST_STEP,
+    ),
+    Bug(
+        "reflected branch dropped",
+        _STEP,
+        "weight=arrival.weight * share.reflected",
+        "weight=arrival.weight * share.reflected * 0.0",
+        _TEST_TREE,
+    ),
+    Bug(
+        "threshold compared with the wrong side",
+        _STEP,
+        "weaker * strength < budget.cut",
+        "weaker * strength > budget.cut",
+        _TEST_STEP,
+    ),
+    Bug(
+        "sibling does not get the cut energy",
+        _STEP,
+        "return Shares(reflected, 1.0 - reflected)",
+        "return Shares(reflected, 1.0 - jnp.where(total, 1.0, partial))",
+        _TEST_STEP,
+    ),
+    Bug(
+        "paper's reflection also at the second surface",
+        _STEP,
+        "first=state.bends == 0",
+        "first=state.bends <= 1",
+        ("optics/test_path_tracing.py::test_the_paper_reflects_once_at_the_first_surface",),
+    ),
+    Bug(
+        "wrong normal for entering",
+        _STEP,
+        "outward = jnp.where(entering, 1.0, -1.0)",
+        "outward = jnp.where(entering, -1.0, 1.0)",
+        _TEST_STEP,
+    ),
+    Bug(
+        "shading normal tells the sides",
+        _STEP,
+        "entering = numerics.dot(direction, point.geometric_normal)",
+        "entering = numerics.dot(direction, point.shading_normal)",
+        _TEST_STEP,
+    ),
+    Bug(
+        "shading normal sends rays to the wrong side",
+        _STEP,
+        "normal = jnp.where(_keeps_sides(direction, shading, geometric, sides), shading,",
+        "normal = jnp.where(True, shading,",
+        _TEST_STEP,
+    ),
+    Bug(
+        "absorption adds light",
+        "numerics.py",
+        "decay = jnp.exp(-rate *",
+        "decay = jnp.exp(rate *",
+        ("optics/test_media.py::test_absorption_follows_beer_and_lambert",),
+    ),
+    Bug(
+        "tint at the first surface only",
+        _STEP,
+        "weight = state.weight * passed * met.sides.tint",
+        "weight = state.weight * passed * jnp.where(state.bends == 0, met.sides.tint, 1.0)",
+        _TEST_TREE,
+    ),
+    Bug(
+        "priority list not updated",
+        _STEP,
+        "inside=met.sides.inside_after",
+        "inside=state.inside",
+        ("optics/test_media_paths.py",),
+    ),
+    Bug(
+        "part not taken off the priority list",
+        _MEDIA,
+        "without = jnp.where(inside == part, EMPTY_SLOT, inside)",
+        "without = inside",
+        _TEST_MEDIA,
+    ),
+    Bug(
+        "lowest priority wins",
+        _MEDIA,
+        "return 1 + inside[jnp.argmax(",
+        "return 1 + inside[jnp.argmin(",
+        _TEST_MEDIA,
+    ),
+    Bug(
+        "air around a nested part",
+        "optics/interface_rules.py",
+        "INDEX_OF_AIR if parent == NO_PARENT else indices[parent] for",
+        "INDEX_OF_AIR for",
+        ("optics/test_interface_rules.py",),
+    ),
+    Bug(
+        "tau not accumulated",
+        _STEP,
+        "tau=state.tau + arrival.length",
+        "tau=arrival.length",
+        ("optics/test_path_tracing.py::test_points_directions_and_distances_agree",),
+    ),
+    Bug(
+        "weakest records are kept",
+        "optics/queues.py",
+        "jnp.where(mask, -strength, jnp.inf)",
+        "jnp.where(mask, strength, jnp.inf)",
+        ("optics/test_queues.py",),
+    ),
+    Bug(
+        "dropped light is not counted",
+        "optics/queues.py",
+        "add(jnp.where(dropped[:, None], weights, 0.0))",
+        "add(jnp.where(dropped[:, None], 0.0, 0.0 * weights))",
+        ("optics/test_queues.py",),
+    ),
+    Bug(
+        "interval lengths not in units of the scene",
+        _VOLUME,
+        "lengths = jnp.diff(edges) / config.radius",
+        "lengths = jnp.diff(edges)",
+        ("render/test_transport.py::test_weights_follow_from_densities_and_lengths",),
+    ),
+    Bug(
+        "transmittance includes the own sample",
+        _VOLUME,
+        "jnp.concatenate([jnp.zeros_like(depth[:1]), jnp.cumsum(depth[:-1])])",
+        "jnp.cumsum(depth)",
+        _TEST_COMPOSITING,
+    ),
+    Bug(
+        "median distance at 0.4",
+        _VOLUME,
+        "jnp.full((1,), 0.5, weights",
+        "jnp.full((1,), 0.4, weights",
+        _TEST_COMPOSITING,
+    ),
+    Bug(
+        "distortion inside the objects",
+        _OBJECTIVE,
+        "jnp.where(outside, final.weights, 0.0)",
+        "jnp.where(outside, 0.0, final.weights)",
+        _TEST_OBJECTIVE,
+    ),
+    Bug(
+        "interlevel gradient reaches the final histogram",
+        _OBJECTIVE,
+        "edges, weights = jax.lax.stop_gradient(final)\n"
+        "    below = stepfun.blurred_mass_below(proposal.edges, edges, weights, blur)\n"
+        "    target = jax.lax.stop_gradient(jnp.diff(below))",
+        "edges, weights = final\n"
+        "    below = stepfun.blurred_mass_below(proposal.edges, edges, weights, blur)\n"
+        "    target = jnp.diff(below)",
+        _TEST_OBJECTIVE,
+    ),
+    Bug(
+        "different vertices share a hash",
+        _KERNELS,
+        "(x ^ (y ^ z)) & jnp",
+        "(x ^ (y ^ y)) & jnp",
+        ("fields/test_hash_grid_kernels.py",),
+    ),
+    Bug(
+        "different vertices share a row",
+        _KERNELS,
+        "side = resolution + 1",
+        "side = resolution",
+        ("fields/test_hash_grid_kernels.py",),
+    ),
+    Bug(
+        "contraction begins at twice the radius",
+        _BOUNDS,
+        "positions = gaussian.positions / domain.radius",
+        "positions = gaussian.positions / (2.0 * domain.radius)",
+        _TEST_BOUNDS,
+    ),
+    Bug(
+        "exit of the scene cube by its last face",
+        _BOUNDS,
+        "jnp.min(jnp.maximum(first, second))",
+        "jnp.max(jnp.maximum(first, second))",
+        _TEST_BOUNDS,
+    ),
+    Bug(
+        "a knot belongs to the segment before",
+        "sampling/polylines.py",
+        "line.knots[1:] <= t",
+        "line.knots[1:] < t",
+        ("sampling/test_polylines.py",),
+    ),
+    Bug(
+        "encoded before summed",
+        "render/pixels.py",
+        "jax.ops.segment_sum(paths.weights * seen.composite.rgb, paths.rays, num_segments=rays)",
+        "colour.srgb_to_linear(jax.ops.segment_sum(paths.weights * "
+        "colour.linear_to_srgb(seen.composite.rgb), paths.rays, num_segments=rays))",
+        (
+            "render/test_pixels.py::"
+            "test_the_paths_of_a_ray_are_blended_by_their_weights_in_linear_space",
+        ),
+    ),
+    Bug(
+        "rays through the corners of pixels",
+        "geometry/cameras.py",
+        "x = (column + 0.5 - 0.5 *",
+        "x = (column - 0.5 *",
+        ("data/test_cameras.py",),
+    ),
+    Bug(
+        "no warm-up of the learning rate",
+        "training/loop.py",
+        "init_value=0.0",
+        "init_value=schedule.peak",
+        ("training/test_schedule.py",),
+    ),
+    Bug(
+        "order of batches regardless of the seed",
+        "data/batches.py",
+        "key=[self._seed, number]",
+        "key=[0, number]",
+        ("data/test_batches.py",),
+    ),
+    Bug(
+        "same order of batches in every epoch",
+        "data/batches.py",
+        "self._generator(int(each) + 1)",
+        "self._generator(1)",
+        ("data/test_batches.py",),
+    ),
+    Bug(
+        "leaf of the tree skipped",
+        "geometry/traversal_cpu.py",
+        "leaf = jnp.where(leaf != 0, leaf, next_leaf)",
+        "leaf = next_leaf",
+        ("geometry/test_bvh.py::test_hits_of_random_rays_equal_brute_force",),
+    ),
+    Bug(
+        "triangle of a leaf skipped",
+        "geometry/traversal_cpu.py",
+        "for offset in range(bvh_nodes.LEAF_SIZE)",
+        "for offset in range(1, bvh_nodes.LEAF_SIZE)",
+        ("geometry/test_bvh.py::test_hits_of_random_rays_equal_brute_force",),
+    ),
+)
+
+
+def main(arguments: list[str]) -> None:
+    del arguments
+    if strange := set(_ONLY.value) - {bug.name for bug in BUGS}:
+        raise app.UsageError(f"There is no bug {', '.join(sorted(strange))}.")
+    chosen = [bug for bug in BUGS if not _ONLY.value or bug.name in _ONLY.value]
+    print("| bug | caught | test that failed | s |")
+    print("|---|---|---|---|")
+    with tempfile.TemporaryDirectory(prefix="refref_jax_bugs_") as folder:
+        with concurrent.futures.ThreadPoolExecutor(_JOBS.value) as pool:
+            sound = pool.submit(_assert_sound, Path(folder), chosen)
+            outcomes = list(pool.map(lambda bug: _try(Path(folder), bug), chosen))
+        sound.result()
+    if not _ONLY.value:
+        _write(outcomes)
+    missed = [found.name for found in outcomes if not found.caught]
+    assert not missed, f"not caught: {', '.join(missed)}"
+
+
+def _assert_sound(folder: Path, bugs: list[Bug]) -> None:
+    """Asserts that the tests pass on a copy without bugs."""
+    copy = _copy(folder / "sound")
+    tests = sorted({test for bug in bugs for test in bug.tests})
+    whole = [test for test in tests if "::" not in test]
+    parts = [test for test in tests if "::" in test and test.split("::")[0] not in whole]
+    ended = _run(copy, [*whole, *parts])
+    assert ended.returncode == 0, f"tests fail without a bug:\n{ended.stdout[-2000:]}"
+
+
+def _try(folder: Path, bug: Bug) -> Outcome:
+    copy = _copy(folder / re.sub(r"\W+", "_", bug.name))
+    module = copy / "refref_jax" / bug.file
+    text = module.read_text()
+    assert text.count(bug.old) == 1, f"{bug.name}: {bug.file} holds {bug.old!r} other than once"
+    module.write_text(text.replace(bug.old, bug.new))
+    begin = time.perf_counter()
+    ended = _run(copy, bug.tests)
+    seconds = time.perf_counter() - begin
+    shutil.rmtree(copy)
+    failed = re.search(r"^FAILED (?:tests/)?(.+?)(?: - |\[|$)", ended.stdout, re.MULTILINE)
+    caught = ended.returncode == _FAILED and failed is not None
+    test = failed[1] if failed else f"pytest ended with {ended.returncode}"
+    print(f"| {bug.name} | {'yes' if caught else 'NO'} | {test} | {seconds:.0f} |", flush=True)
+    return Outcome(bug.name, caught, test, seconds)
+
+
+def _copy(target: Path) -> Path:
+    """Copies the files of the working tree that git knows or does not ignore."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
+    listed = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True, check=True)
+    for name in filter(None, listed.stdout.split("\0")):
+        if (_ROOT / name).is_file():
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(_ROOT / name, target / name)
+    return target
+
+
+def _run(copy: Path, tests: tuple[str, ...] | list[str]) -> subprocess.CompletedProcess:
+    options = ["-x", "-q", "-p", "no:cacheprovider", *(f"tests/{test}" for test in tests)]
+    # Copies share what they compile; a bug compiles anew what it changes.
+    shared = {"JAX_COMPILATION_CACHE_DIR": str(copy.parent / "compiled")}
+    return subprocess.run(
+        [sys.executable, "-m", "pytest", *options],
+        cwd=copy,
+        env=os.environ | shared,
+        capture_output=True,
+        text=True,
+    )
+
+
+def _write(outcomes: list[Outcome]) -> None:
+    """Replaces the rows of the file of results; its header lines are edited by hand."""
+    lines = _RESULTS.read_text().splitlines() if _RESULTS.exists() else []
+    with _RESULTS.open("w", newline="") as file:
+        file.writelines(f"{line}\n" for line in lines if line.startswith("# "))
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(["bug", "caught", "test that failed", "seconds"])
+        for found in outcomes:
+            caught = "yes" if found.caught else "no"
+            table.writerow([found.name, caught, found.test, round(found.seconds)])
+
+
+if __name__ == "__main__":
+    app.run(main)

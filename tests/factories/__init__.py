@@ -1,0 +1,1 @@
+"""Scenes, models, cameras, records and files made for tests."""

@@ -1,0 +1,1 @@
+"""Stand-ins for programs and for what the system does."""

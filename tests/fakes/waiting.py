@@ -1,0 +1,37 @@
+"""Waits for a command in a thread, as the benchmark does, and stops it when it is to stop itself.
+
+python -m tests.fakes.waiting FOLDER
+"""
+
+import contextlib
+import signal
+import sys
+import threading
+from pathlib import Path
+
+from experiments.cli import app, subprocesses
+
+
+def _command_line(name, options):
+    return [sys.executable, "-m", f"tests.fakes.{name}", *options]
+
+
+def _work(folder):
+    with contextlib.suppress(subprocesses.RunFailedError):
+        subprocesses.run("saving", f"--folder={folder}", log=folder / "run.log")
+
+
+if __name__ == "__main__":
+    # As at a terminal: who is started in the background, or by nohup, ignores them.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    subprocesses.command_line = _command_line
+    app.stop_at_kill()
+    worker = threading.Thread(target=_work, args=[Path(sys.argv[1])])
+    try:
+        worker.start()
+        worker.join()
+    except KeyboardInterrupt:
+        with subprocesses.stopping():
+            worker.join()
+        sys.exit(app.INTERRUPTED)

@@ -1,0 +1,1 @@
+"""What must hold of any function, and of any error."""

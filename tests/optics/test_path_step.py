@@ -1,0 +1,104 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.geometry.surfaces import SurfacePoint
+from refref_jax.optics import interface_rules, media, path_step
+from refref_jax.optics.interface_rules import NO_PARENT
+from refref_jax.optics.media import AMBIENT
+from refref_jax.optics.path_settings import Budget
+
+_GLASS = jax.tree.map(jnp.asarray, interface_rules.nested([1.5], [NO_PARENT]))
+
+
+def _meet(direction, shading=(0.0, 0.0, 1.0)):
+    """Meets a glass surface z = 0 that faces up; the shading normal may lean."""
+    shading = np.asarray(shading) / np.linalg.norm(shading)
+    point = SurfacePoint(
+        position=jnp.zeros(3),
+        geometric_normal=jnp.array([0.0, 0.0, 1.0]),
+        shading_normal=jnp.asarray(shading, jnp.float32),
+        part=jnp.int32(0),
+        scale=jnp.float32(1.0),
+    )
+    unit = np.asarray(direction) / np.linalg.norm(direction)
+    nowhere = media.nowhere(_GLASS)
+    return path_step.meet(point, _GLASS, nowhere, jnp.asarray(unit, jnp.float32))
+
+
+def test_entering_glass():
+    met = _meet([0.0, 0.0, -1.0])
+    np.testing.assert_allclose(met.transmitted, [0, 0, -1], atol=1e-6)
+    np.testing.assert_allclose(met.reflected, [0, 0, 1], atol=1e-6)
+    assert met.reflectance == pytest.approx(0.04, abs=1e-6)
+    assert (int(met.sides.medium_near), int(met.sides.medium_far)) == (AMBIENT, 1)
+    assert met.restart_transmitted[2] < 0.0 < met.restart_reflected[2]
+
+
+def test_leaving_glass():
+    met = _meet([0.3, 0.0, 1.0])
+    assert (int(met.sides.medium_near), int(met.sides.medium_far)) == (1, AMBIENT)
+    sine = 1.5 * 0.3 / np.hypot(0.3, 1.0)
+    np.testing.assert_allclose(met.transmitted, [sine, 0, np.sqrt(1 - sine**2)], atol=1e-6)
+    assert met.restart_reflected[2] < 0.0 < met.restart_transmitted[2]
+
+
+def test_total_reflection_has_no_other_branch():
+    met = _meet([1.0, 0.0, 0.5])
+    assert met.total
+    assert met.reflectance == 1.0
+    np.testing.assert_allclose(met.reflected, np.array([1.0, 0.0, -0.5]) / np.hypot(1.0, 0.5))
+    assert met.restart_reflected[2] < 0.0
+    assert np.all(np.isfinite(met.transmitted))
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.1, -0.1, 1.0, -1.0, 10.0])
+@pytest.mark.parametrize("slope", [-1.0, -0.1, -1e-3, -1e-6, 1e-6, 1e-3, 0.1, 1.0])
+def test_no_ray_leaves_on_the_wrong_side_however_the_shading_normal_leans(lean, slope):
+    met = _meet([1.0, 0.0, slope], shading=(lean, 0.0, 1.0))
+    incident = -np.sign(slope)
+    assert np.sign(met.reflected[2]) == incident
+    assert met.total or np.sign(met.transmitted[2]) == -incident
+    for unit in (met.reflected,) if met.total else (met.reflected, met.transmitted):
+        assert np.linalg.norm(unit) == pytest.approx(1.0, abs=1e-6)
+    assert 0.0 <= met.reflectance <= 1.0
+
+
+def test_the_shading_normal_bends_the_ray():
+    flat, leaning = _meet([0.2, 0.0, -1.0]), _meet([0.2, 0.0, -1.0], shading=(0.1, 0.0, 1.0))
+    assert np.linalg.norm(flat.transmitted - leaning.transmitted) > 0.02
+
+
+def _shares(reflectance, *, total=False, first=True, strength=1.0, **settings):
+    budget = Budget(bends=8, **settings)
+    found = path_step.shares(
+        budget,
+        reflectance=jnp.float32(reflectance),
+        total=jnp.asarray(total),
+        first=jnp.asarray(first),
+        strength=jnp.float32(strength),
+    )
+    return [float(share) for share in found]
+
+
+@pytest.mark.parametrize("reflections", ["all", "first", "none"])
+def test_a_total_reflection_takes_all_light_under_any_settings(reflections):
+    assert _shares(1.0, total=True, first=False, reflections=reflections) == [1.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("reflections", "first", "expected"),
+    [("all", False, 0.25), ("first", True, 0.25), ("first", False, 0.0), ("none", True, 0.0)],
+)
+def test_a_reflection_that_is_not_followed_leaves_its_share(reflections, first, expected):
+    assert _shares(0.25, first=first, reflections=reflections) == [expected, 1.0 - expected]
+
+
+@pytest.mark.parametrize(
+    ("reflectance", "strength", "expected"),
+    [(0.25, 1.0, 0.25), (0.25, 0.3, 0.0), (0.75, 1.0, 0.75), (0.75, 0.3, 1.0)],
+)
+def test_below_the_threshold_the_stronger_branch_takes_all(reflectance, strength, expected):
+    found = _shares(reflectance, strength=strength, reflections="all", cut=0.1)
+    assert found == [expected, 1.0 - expected]

@@ -1,0 +1,1 @@
+"""Slow references that share nothing with the library."""

@@ -1,0 +1,355 @@
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.render.volume_rendering import Histogram
+from refref_jax.training import objective
+from tests.laws import gradients, transformations
+from tests.oracles import reference_sampling
+
+# A few float32 roundings.
+_ROUNDING = 1e-6
+
+# Two double sums or two integrals in float32 against float64.
+_SUMMATION = 2e-5
+
+_BLUR = 0.02
+
+
+def _histogram(edges, weights):
+    return Histogram(jnp.asarray(edges, jnp.float32), jnp.asarray(weights, jnp.float32))
+
+
+def _random_histogram(rng, samples, *, total=1.0):
+    edges = np.concatenate([[0.0], np.sort(rng.uniform(size=samples - 1)), [1.0]])
+    weights = rng.uniform(size=samples) ** 4
+    return _histogram(edges, total * weights / weights.sum())
+
+
+def _even_histogram(weights):
+    return _histogram(np.linspace(0.0, 1.0, len(weights) + 1), weights)
+
+
+@functools.cache
+def _interlevel_blurred(blur):
+    return jax.jit(functools.partial(objective.interlevel, blur=blur))
+
+
+_interlevel = _interlevel_blurred(_BLUR)
+_interlevel_gradients = jax.jit(jax.grad(_interlevel, argnums=(0, 1)))
+_distortion = jax.jit(objective.distortion)
+_PHOTOMETRIC = {
+    loss: jax.jit(loss) for loss in (objective.mean_squared_error, objective.charbonnier)
+}
+_PHOTOMETRIC_SLOPES = {loss: jax.jit(jax.value_and_grad(loss)) for loss in _PHOTOMETRIC}
+_hash_decay = jax.jit(objective.hash_decay)
+_distortion_gradient = jax.jit(jax.grad(objective.distortion))
+
+# --- photometric losses ---
+
+
+def test_mean_squared_error_by_hand():
+    rendered = jnp.array([[0.0, 0.5, 1.0], [0.2, 0.2, 0.2]])
+    target = jnp.array([[0.0, 0.0, 0.0], [0.2, 0.2, 0.5]])
+    expected = (0.25 + 1.0 + 0.09) / 6.0
+    np.testing.assert_allclose(
+        _PHOTOMETRIC[objective.mean_squared_error](rendered, target), expected, rtol=_ROUNDING
+    )
+
+
+def test_charbonnier_by_hand():
+    rendered, target = jnp.array([[0.0, 0.003, 1.0]]), jnp.array([[0.0, 0.0, 0.0]])
+    expected = (0.001 + np.sqrt(1e-5) + np.sqrt(1.0 + 1e-6)) / 3.0
+    np.testing.assert_allclose(
+        _PHOTOMETRIC[objective.charbonnier](rendered, target), expected, rtol=_ROUNDING
+    )
+
+
+@pytest.mark.parametrize("loss", _PHOTOMETRIC)
+def test_photometric_losses_treat_both_sides_alike(loss):
+    rendered, target = np.random.default_rng(0).uniform(size=(2, 2, 3)).astype(np.float32)
+    between = lambda a, b: float(_PHOTOMETRIC[loss](jnp.asarray(a), jnp.asarray(b)))
+    assert between(rendered, target) == between(target, rendered) > between(target, target)
+
+
+@pytest.mark.parametrize("loss", _PHOTOMETRIC)
+@pytest.mark.parametrize("size", [0.0, 1e-10, 1.0, 1e10])
+def test_photometric_losses_are_finite(loss, size):
+    rendered, target = (jnp.asarray(np.full((2, 3), x), jnp.float32) for x in (size, 0.0))
+    assert gradients.all_finite(_PHOTOMETRIC_SLOPES[loss](rendered, target))
+
+
+@pytest.mark.parametrize("loss", _PHOTOMETRIC)
+def test_photometric_losses_have_no_gradient_where_they_agree(loss):
+    image = jnp.asarray(np.full((2, 3), 0.4), jnp.float32)
+    np.testing.assert_array_equal(_PHOTOMETRIC_SLOPES[loss](image, image)[1], np.zeros((2, 3)))
+
+
+@pytest.mark.parametrize("loss", _PHOTOMETRIC)
+def test_photometric_losses_check_grads(loss):
+    rendered, target = np.random.default_rng(0).uniform(size=(2, 4, 3))
+    gradients.assert_numerical(loss, rendered, target)
+
+
+# --- interlevel ---
+
+
+def test_interlevel_by_hand():
+    # All light in [0.4, 0.6], which the proposal gives 0.75 of; the blur stays within 0.25.
+    final = _histogram([0.0, 0.4, 0.6, 1.0], [0.0, 1.0, 0.0])
+    proposal = _histogram([0.0, 0.25, 0.75, 1.0], [0.125, 0.75, 0.125])
+    expected = 0.25**2 / (0.75 + 1e-5)
+    np.testing.assert_allclose(_interlevel(final, proposal), expected, rtol=_SUMMATION)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_interlevel_against_its_definition(seed):
+    rng = np.random.default_rng(seed)
+    final, proposal = _random_histogram(rng, 12), _random_histogram(rng, 9)
+    expected = reference_sampling.interlevel(*final, *proposal, _BLUR)
+    assert expected > 0.0
+    np.testing.assert_allclose(_interlevel(final, proposal), expected, rtol=_SUMMATION)
+
+
+def test_interlevel_is_zero_where_the_proposal_bounds_the_final_histogram():
+    rng = np.random.default_rng(0)
+    final = _random_histogram(rng, 12)
+    edges = np.linspace(0.0, 1.0, 6)
+    below = [reference_sampling.blurred_mass_below(x, *final, _BLUR) for x in edges]
+    bound = _histogram(edges, np.diff(below) + 1e-4)
+    assert _interlevel(final, bound) == 0.0
+    assert not any(np.any(leaf) for leaf in jax.tree.leaves(_interlevel_gradients(final, bound)))
+
+
+def test_interlevel_is_zero_for_a_proposal_of_one_bin():
+    final = _random_histogram(np.random.default_rng(0), 12, total=0.99)
+    assert _interlevel(final, _histogram([0.0, 1.0], [1.0])) == 0.0
+
+
+def test_interlevel_is_positive_where_the_proposal_misses_light():
+    final = _histogram([0.0, 0.4, 0.6, 1.0], [0.0, 1.0, 0.0])
+    missed = _histogram([0.0, 0.3, 0.7, 1.0], [1.0, 0.0, 0.0])
+    # (1 - 0)^2 over the padding that keeps it finite.
+    np.testing.assert_allclose(_interlevel(final, missed), 1e5, rtol=1e-4)
+
+
+def test_interlevel_gradient_reaches_the_proposals_weights_only():
+    rng = np.random.default_rng(1)
+    final, proposal = _random_histogram(rng, 12), _random_histogram(rng, 9)
+    by_final, by_proposal = _interlevel_gradients(final, proposal)
+    for stopped in (*by_final, by_proposal.edges):
+        np.testing.assert_array_equal(stopped, np.zeros_like(stopped))
+    # More weight can only bring the bound closer.
+    assert (by_proposal.weights <= 0.0).all() and (by_proposal.weights < 0.0).any()
+
+
+def test_interlevel_check_grads():
+    # Even weights, so that the loss bends little over the step of the differences.
+    final, proposal = _random_histogram(np.random.default_rng(2), 12), _even_histogram([0.1] * 9)
+
+    def loss(weights):
+        wide = [jnp.asarray(x, jnp.float64) for x in (*final, proposal.edges)]
+        return objective.interlevel(Histogram(*wide[:2]), Histogram(wide[2], weights), blur=_BLUR)
+
+    gradients.assert_numerical(loss, proposal.weights)
+
+
+_NARROW = [0.0, 0.2, 0.2, 0.2, 0.5, 0.5 + 1e-6, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("final_weights", [np.zeros(7), np.eye(7)[2], np.full(7, 1.0 / 7.0)])
+@pytest.mark.parametrize("proposal_weights", [np.zeros(7), np.eye(7)[2], np.full(7, 1.0 / 7.0)])
+def test_interlevel_is_finite_with_empty_bins_and_bins_of_no_width(final_weights, proposal_weights):
+    final, proposal = _histogram(_NARROW, final_weights), _histogram(_NARROW, proposal_weights)
+    assert np.isfinite(_interlevel(final, proposal))
+    assert gradients.all_finite(_interlevel_gradients(final, proposal))
+
+
+def _converged_histogram(rng, width):
+    """Returns a histogram whose light lies in a few of many very thin bins, as round a wall."""
+    surface = rng.uniform(0.3, 0.6)
+    thin = rng.uniform(surface, surface + width, size=24)
+    edges = np.sort(np.concatenate([[0.0, 1.0], rng.uniform(size=8), thin]).astype(np.float32))
+    weights = rng.uniform(size=edges.size - 1) * 1e-3
+    first = np.searchsorted(edges, np.float32(surface))
+    weights[first + 8 : first + 11] = 0.3
+    # Edges that float32 can not tell apart hold nothing.
+    weights[np.diff(edges) == 0.0] = 0.0
+    return _histogram(edges, weights / weights.sum())
+
+
+@pytest.mark.parametrize("blur", [0.03, 0.003])
+@pytest.mark.parametrize("width", [1e-2, 1e-4, 1e-6])
+def test_interlevel_of_a_surface_in_thin_bins(width, blur):
+    """Heights of thin bins are huge; what they round off must not turn up as light elsewhere."""
+    loss = _interlevel_blurred(blur)
+    for seed in range(4):
+        final = _converged_histogram(np.random.default_rng(seed), width)
+        edges = np.linspace(0.0, 1.0, 33, dtype=np.float32)
+        below = [reference_sampling.blurred_mass_below(x, *final, blur) for x in edges]
+        proposal = _histogram(edges, np.maximum(0.9 * np.diff(below), 1e-4))
+        expected = reference_sampling.interlevel(*final, *proposal, blur)
+        np.testing.assert_allclose(loss(final, proposal), expected, rtol=1e-2)
+
+
+# --- distortion ---
+
+_ALL_OUTSIDE = jnp.ones(12, bool)
+
+
+def test_distortion_by_hand():
+    # 2 * 0.25 * 0.5 between the two bins, 2 * 0.25 * 0.5 / 3 within them.
+    final = _even_histogram([0.5, 0.5])
+    np.testing.assert_allclose(_distortion(final, jnp.ones(2, bool)), 1.0 / 3.0, rtol=_ROUNDING)
+
+
+def test_distortion_by_hand_of_the_outer_samples():
+    # The middle sample lies inside: 2 * 0.16 * 2/3 between the others, 2 * 0.16 / 3 / 3 within.
+    final = _even_histogram([0.4, 0.2, 0.4])
+    expected = 0.32 * 2.0 / 3.0 + 0.32 / 9.0
+    got = _distortion(final, jnp.array([True, False, True]))
+    np.testing.assert_allclose(got, expected, rtol=_ROUNDING)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_distortion_against_the_double_sum(seed):
+    rng = np.random.default_rng(seed)
+    final = _random_histogram(rng, 12)
+    outside = rng.uniform(size=12) > 0.4
+    expected = reference_sampling.distortion(*final, outside)
+    np.testing.assert_allclose(_distortion(final, jnp.asarray(outside)), expected, rtol=_SUMMATION)
+
+
+def _path_through_an_object(seed=3):
+    """Returns a histogram whose samples 4 to 7 lie inside, and which are outside."""
+    return _random_histogram(np.random.default_rng(seed), 12), np.array([1] * 4 + [0] * 4 + [1] * 4)
+
+
+def test_distortion_ignores_the_samples_inside():
+    final, outside = _path_through_an_object()
+    outside = jnp.asarray(outside, bool)
+    changed = final._replace(weights=jnp.where(outside, final.weights, 0.9))
+    assert _distortion(final, outside) == _distortion(changed, outside)
+    by_weights = _distortion_gradient(changed, outside).weights
+    np.testing.assert_array_equal(by_weights[4:8], np.zeros(4))
+
+
+def test_distortion_counts_the_samples_after_the_exit():
+    final, outside = _path_through_an_object()
+    outside = jnp.asarray(outside, bool)
+    changed = final._replace(weights=final.weights.at[8:].multiply(2.0))
+    assert _distortion(changed, outside) > _distortion(final, outside)
+    by_weights = _distortion_gradient(final, outside).weights
+    assert (by_weights[8:] > 0.0).all() and (by_weights[:4] > 0.0).all()
+
+
+def test_distortion_pairs_samples_across_the_object():
+    before = _histogram(np.linspace(0.0, 1.0, 13), np.eye(12)[0])
+    across = _histogram(np.linspace(0.0, 1.0, 13), 0.5 * (np.eye(12)[0] + np.eye(12)[11]))
+    _, outside = _path_through_an_object()
+    outside = jnp.asarray(outside, bool)
+    assert _distortion(across, outside) > 10.0 * _distortion(before, outside)
+
+
+def test_distortion_without_any_sample_outside_is_zero():
+    final, _ = _path_through_an_object()
+    assert _distortion(final, jnp.zeros(12, bool)) == 0.0
+
+
+def test_distortion_is_linear_in_distance_and_quadratic_in_weight():
+    final, _ = _path_through_an_object()
+    scaled = Histogram(3.0 * final.edges, 2.0 * final.weights)
+    np.testing.assert_allclose(
+        _distortion(scaled, _ALL_OUTSIDE),
+        12.0 * _distortion(final, _ALL_OUTSIDE),
+        rtol=_ROUNDING,
+    )
+
+
+@pytest.mark.parametrize("weights", [np.zeros(7), np.eye(7)[2], np.full(7, 1e-30), np.ones(7)])
+def test_distortion_is_finite_with_bins_of_no_width(weights):
+    final, outside = _histogram(_NARROW, weights), jnp.ones(7, bool)
+    assert np.isfinite(_distortion(final, outside))
+    assert gradients.all_finite(_distortion_gradient(final, outside))
+
+
+def test_distortion_check_grads():
+    final, outside = _path_through_an_object()
+    mask = jnp.asarray(outside, bool)
+    loss = lambda edges, weights: objective.distortion(Histogram(edges, weights), mask)
+    gradients.assert_numerical(loss, *final)
+
+
+# --- hash decay ---
+
+
+def test_hash_decay_by_hand():
+    tables = [jnp.array([[1.0, 2.0], [3.0, 4.0]]), jnp.array([[2.0, 0.0]])]
+    np.testing.assert_allclose(objective.hash_decay(tables), 7.5 + 2.0, rtol=_ROUNDING)
+
+
+def test_hash_decay_weighs_levels_alike_whatever_their_size():
+    table = jnp.array([[1.0, -2.0], [0.5, 3.0]])
+    repeated = jnp.concatenate([table] * 4)
+    np.testing.assert_allclose(
+        objective.hash_decay([table]), objective.hash_decay([repeated]), rtol=_ROUNDING
+    )
+
+
+def test_hash_decay_gradient_is_per_level():
+    tables = [jnp.array([[1.0, 2.0], [3.0, 4.0]]), jnp.array([[2.0, 0.0]])]
+    first, second = jax.grad(objective.hash_decay)(tables)
+    np.testing.assert_allclose(first, 2.0 * tables[0] / 4.0, rtol=_ROUNDING)
+    np.testing.assert_allclose(second, [[2.0, 0.0]], rtol=_ROUNDING)
+
+
+def test_hash_decay_takes_tables_of_any_sizes():
+    # The shape checks look at one table of a list at random: ask them often.
+    tables = [jnp.ones((2 + level, 1 + level % 2)) for level in range(8)]
+    for _ in range(5):
+        assert objective.hash_decay(tables) == 8.0
+
+
+def test_hash_decay_without_tables_is_zero():
+    assert objective.hash_decay([]) == 0.0
+
+
+# --- transformations ---
+
+
+def _batch(make):
+    items = [make(np.random.default_rng(seed)) for seed in range(3)]
+    return jax.tree.map(lambda *x: jnp.stack(x), *items)
+
+
+_COLOURS = tuple(np.random.default_rng(0).uniform(size=(2, 3, 5, 3)).astype(np.float32))
+
+_CASES = {
+    "mean_squared_error": (objective.mean_squared_error, lambda: _COLOURS),
+    "charbonnier": (objective.charbonnier, lambda: _COLOURS),
+    "interlevel": (
+        lambda final, proposal: objective.interlevel(final, proposal, blur=_BLUR),
+        lambda: (
+            _batch(lambda rng: _random_histogram(rng, 12)),
+            _batch(lambda rng: _random_histogram(rng, 9)),
+        ),
+    ),
+    "distortion": (
+        objective.distortion,
+        lambda: (
+            _batch(lambda rng: _random_histogram(rng, 12)),
+            _batch(lambda rng: rng.uniform(size=12) > 0.5),
+        ),
+    ),
+    "hash_decay": (lambda *tables: objective.hash_decay(list(tables)), lambda: _COLOURS),
+}
+
+
+@pytest.mark.parametrize("transformation", transformations.ALL)
+@pytest.mark.parametrize("name", _CASES)
+def test_transformations_change_nothing(name, transformation):
+    function, make = _CASES[name]
+    transformation(function, jax.tree.map(jnp.asarray, make()))
