@@ -70,8 +70,8 @@ def test_the_shading_normal_bends_the_ray():
     assert np.linalg.norm(flat.transmitted - leaning.transmitted) > 0.02
 
 
-def _shares(reflectance, *, total=False, first=True, strength=1.0, **settings):
-    budget = Budget(bends=8, **settings)
+def _shares(reflectance, *, total=False, first=True, strength=1.0, **options):
+    budget = Budget(bends=8, **options)
     found = path_step.shares(
         budget,
         reflectance=jnp.float32(reflectance),
