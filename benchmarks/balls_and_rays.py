@@ -31,7 +31,7 @@ def rays(origins, directions):
     )
 
 
-@functools.partial(jax.jit, static_argnames="budget")
-def trace_ends(geometry, rays, *, budget):
+@functools.partial(jax.jit, static_argnames="settings")
+def trace_ends(geometry, rays, *, settings):
     """Traces a batch of rays in one program."""
-    return path_tracing.trace_ends(geometry, rays, budget=budget)
+    return path_tracing.trace_ends(geometry, rays, settings=settings)

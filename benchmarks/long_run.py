@@ -22,14 +22,14 @@ import numpy as np
 from absl import app, flags, logging
 
 from experiments.runs import measured_runs
-from refref_jax.optics.path_settings import BUDGETS
+from refref_jax.optics.path_settings import PATH_PRESETS
 from refref_jax.render.checkpoint_io import load_model
 from refref_jax.training import run_folder
 from refref_jax.training.presets import PRESETS
 
 _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folder of the scene.")
 _PRESET = flags.DEFINE_enum("preset", "tiny", list(PRESETS), "Preset of all trainings.")
-_PATHS = flags.DEFINE_enum("paths", "tree", list(BUDGETS), "Path settings of all trainings.")
+_PATHS = flags.DEFINE_enum("paths", "tree", list(PATH_PRESETS), "Path settings of all trainings.")
 _STEPS = flags.DEFINE_integer("steps", 20_000, "Steps of the long training; 0 for none.", 0)
 _CURVE_STEPS = flags.DEFINE_integer("curve_steps", 2500, "Steps in each precision; 0 for none.", 0)
 _OUT = flags.DEFINE_string("out", "runs/long_run", "Output folder of the runs.")

@@ -86,7 +86,7 @@ class _Library:
         geometry = jax.tree.map(jnp.asarray, build_geometry(parts, parents, rule="nested"))
         radii = jnp.full(len(origins), 1e-3, jnp.float32)
         rays = Rays(jnp.asarray(origins), jnp.asarray(directions), radii)
-        trace = jax.jit(functools.partial(path_tracing.trace_ends, budget=TREE))
+        trace = jax.jit(functools.partial(path_tracing.trace_ends, settings=TREE))
         self._trace = lambda: jax.block_until_ready(trace(geometry, rays))
         self._trace()
 

@@ -121,8 +121,8 @@ BUGS = (
     Bug(
         "limit of bends off by one",
         _STEP,
-        "state.bends < budget.bends",
-        "state.bends <= budget.bends",
+        "state.bends < settings.bends",
+        "state.bends <= settings.bends",
         _TEST_TREE,
     ),
     Bug(
@@ -142,8 +142,8 @@ BUGS = (
     Bug(
         "threshold compared with the wrong side",
         _STEP,
-        "weaker * strength < budget.cut",
-        "weaker * strength > budget.cut",
+        "weaker * strength < settings.cut",
+        "weaker * strength > settings.cut",
         _TEST_STEP,
     ),
     Bug(

@@ -124,7 +124,7 @@ def _sampling(weights: list[jax.Array], blurs: tuple[float, ...]) -> jax.Array:
     edges = [jnp.broadcast_to(jnp.linspace(0.0, 1.0, count + 1), (paths, count + 1))]
     for before, after in itertools.pairwise(weights):
         strata = jnp.broadcast_to(jnp.linspace(0.01, 0.99, after.shape[1]), after.shape)
-        edges.append(stepfun.sample_edges(strata, edges[-1], jax.lax.stop_gradient(before)))
+        edges.append(stepfun.sample_intervals(strata, edges[-1], jax.lax.stop_gradient(before)))
     *proposals, final = map(Histogram, edges, weights)
     return sum(_interlevel(final, p, blur) for p, blur in zip(proposals, blurs, strict=True))
 

@@ -23,7 +23,7 @@ def set_up_training(scene: Path, *, preset: str, paths: str) -> tuple[loop.Setup
     frames = scene_folder.read_frames(scene, "train")
     images = scene_folder.read_images(frames)
     sampler = PixelSampler(images, frames.cameras, seed=config.seed, batch=config.schedule.batch)
-    setup = loop.set_up(config, model.config, model.budget, geometry, sampler)
+    setup = loop.set_up(config, model.config, model.settings, geometry, sampler)
     return setup, init_state(config.seed, model.config, config.schedule)
 
 

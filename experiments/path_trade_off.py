@@ -25,7 +25,7 @@ from experiments.runs import refraction_indices
 from refref_jax import choices
 from refref_jax.data import scene_names
 from refref_jax.optics import path_settings
-from refref_jax.optics.path_settings import BUDGETS, Budget
+from refref_jax.optics.path_settings import PATH_PRESETS, PathSettings
 
 if TYPE_CHECKING:
     from experiments.runs.known_scene import KnownScene
@@ -63,7 +63,7 @@ def main() -> None:
     out = Path(_OUT.value)
     place = {"module": __name__, "writes": _WRITES, "overwrite": _OVERWRITE.value}
     outputs.replaceable(out, **place)
-    settings, indices = chosen_budgets(), refraction_indices.parse_named(_IOR.value)
+    settings, indices = chosen_settings(), refraction_indices.parse_named(_IOR.value)
     # All scenes are opened first, so that a broken one is reported before anything is rendered.
     chosen = [_read(folder, indices) for folder in _open_scenes()]
     with outputs.fresh(out, **place) as draft:
@@ -105,13 +105,13 @@ def _open_scenes() -> list[Path]:
     return folders
 
 
-def chosen_budgets() -> list[tuple[str, str, Budget]]:
+def chosen_settings() -> list[tuple[str, str, PathSettings]]:
     """Returns sweep, name and path settings of all trials; equal ones are in both sweeps."""
     cuts = sorted(_numbers("cuts", _CUTS.value, float), reverse=True)
     bends = sorted(_numbers("bends", _BENDS.value, int))
-    swept = [("cut", f"{cut:g}", path_settings.budget_of("tree", cut=cut)) for cut in cuts]
-    swept += [("bends", str(n), path_settings.budget_of("tree", bends=n)) for n in bends]
-    points = [("budget", name, BUDGETS[name]) for name in ("straight", "paper")]
+    swept = [("cut", f"{cut:g}", path_settings.make_path_settings("tree", cut=cut)) for cut in cuts]
+    swept += [("bends", str(n), path_settings.make_path_settings("tree", bends=n)) for n in bends]
+    points = [("settings", name, PATH_PRESETS[name]) for name in ("straight", "paper")]
     return points + swept
 
 

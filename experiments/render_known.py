@@ -26,7 +26,7 @@ from experiments.cli import scenes as cli_scenes
 from experiments.cli.progress import ProgressBar
 from experiments.runs import refraction_indices
 from refref_jax import choices, configuration
-from refref_jax.optics.path_settings import BUDGETS, Budget
+from refref_jax.optics.path_settings import PATH_PRESETS, PathSettings
 
 if TYPE_CHECKING:
     from experiments.runs.known_scene import KnownScene, View
@@ -45,7 +45,7 @@ _OUT = cli_flags.out("Folder for the images.")
 _PATHS = flags.DEFINE_enum(
     "paths",
     "tree",
-    list(BUDGETS),
+    list(PATH_PRESETS),
     "Light paths: 'straight' ignores the objects; 'paper' bends up to 10 times and reflects at the "
     "first surface; 'tree' follows every branch above the throughput threshold.",
 )
@@ -57,7 +57,7 @@ _UNFINISHED = flags.DEFINE_enum(
     "background along their last direction; 'dark' makes them black, as in path tracers.",
 )
 _VIEWS = cli_flags.views("all")
-_BUDGET = cli_flags.budget()
+_SETTINGS = cli_flags.settings()
 _RULE = cli_flags.rule()
 _IOR = cli_flags.ior()
 _RAYS_PER_PIXEL = cli_flags.rays_per_pixel(9)
@@ -78,7 +78,7 @@ def main() -> None:
     outputs.replaceable(out, **place)
     metrics_file = None if _JSON.value is None else Path(_JSON.value)
     _check(metrics_file)
-    budget = _chosen_budget()
+    settings = _chosen_settings()
     indices, folder = refraction_indices.parse_named(_IOR.value), cli_scenes.opened(_SCENE.value)
     scene = known_scene.read_scene(
         folder,
@@ -88,7 +88,7 @@ def main() -> None:
         indices=indices,
     )
     with outputs.fresh(out, **place) as draft:
-        summary = render(scene, budget, draft)
+        summary = render(scene, settings, draft)
         text = json.dumps(configuration.string_safe(summary), indent=2, allow_nan=False) + "\n"
         if metrics_file is None:
             (draft / "metrics.json").write_text(text, encoding="utf-8")
@@ -102,16 +102,16 @@ def main() -> None:
     print(f"Next: {app.shell('path_trade_off', *given)}")
 
 
-def render(scene: KnownScene, budget: Budget, out: Path) -> dict[str, Any]:
+def render(scene: KnownScene, settings: PathSettings, out: Path) -> dict[str, Any]:
     """Renders and measures all views, writes the images, and returns the JSON content."""
     views, measured = [], []
     side = choices.side_of(_RAYS_PER_PIXEL.value)
     (out / "rgb").mkdir()
     print(f"Compiling for {scene.name}, {_PATHS.value} ...", flush=True)
-    known_scene.warm_up(scene, budget)
+    known_scene.warm_up(scene, settings)
     with ProgressBar("render", len(scene.indices)) as bar:
         for i, (index, name) in enumerate(zip(scene.indices, scene.frames.names, strict=True)):
-            view = known_scene.render_view(scene, i, budget=budget, side=side)
+            view = known_scene.render_view(scene, i, settings=settings, side=side)
             image_files.write_rgb(out / "rgb" / f"{name}.png", view.rgb)
             found = known_scene.measure(scene, i, view.rgb)
             views.append(view)
@@ -122,20 +122,20 @@ def render(scene: KnownScene, budget: Budget, out: Path) -> dict[str, Any]:
         for i in reporting.shown_views(len(views))
     ]
     comparison.write_comparison(out / "comparison.png", compared)
-    return summarise(scene, budget, views, measured)
+    return summarise(scene, settings, views, measured)
 
 
 def summarise(
-    scene: KnownScene, budget: Budget, views: list[View], measured: list[dict[str, Any]]
+    scene: KnownScene, settings: PathSettings, views: list[View], measured: list[dict[str, Any]]
 ) -> dict[str, Any]:
     """Returns the JSON content."""
     keys = ("psnr", "psnr_masked", "psnr_outside")
     return {
         "scene": scene.name,
         "paths": _PATHS.value,
-        "cut": budget.cut,
-        "bends": budget.bends,
-        "unfinished": budget.unfinished,
+        "cut": settings.cut,
+        "bends": settings.bends,
+        "unfinished": settings.unfinished,
         "views": measured,
         "mean": {key: evaluation.mean_of(measured, key) for key in keys},
         "casts_per_pixel": float(np.mean([view.casts for view in views])),
@@ -145,13 +145,13 @@ def summarise(
     }
 
 
-def _chosen_budget() -> Budget:
+def _chosen_settings() -> PathSettings:
     if _PATHS.value == "straight" and _UNFINISHED.value == "dark":
         raise ValueError(
             "--paths=straight has no bends, so no path is truncated. Remove --unfinished, or use "
             "--paths=tree."
         )
-    return dataclasses.replace(_BUDGET.chosen(_PATHS.value), unfinished=_UNFINISHED.value)
+    return dataclasses.replace(_SETTINGS.chosen(_PATHS.value), unfinished=_UNFINISHED.value)
 
 
 def _check(metrics_file: Path | None) -> None:
@@ -186,7 +186,7 @@ def _report(summary: dict[str, Any]) -> None:
     else:
         reporting.warn_of_lost_light(
             summary["lost_energy"],
-            advice="Use a larger --cut or fewer --bends, or, as a library, a Budget with larger "
+            advice="Use a larger --cut or fewer --bends, or, as a library, PathSettings with larger "
             "capacity factors.",
         )
 

@@ -20,7 +20,7 @@ from experiments.cli import scenes as cli_scenes
 from experiments.cli.progress import ProgressBar
 from experiments.r3f import training_body
 from experiments.runs import config_flags, processes
-from refref_jax.optics.path_settings import budget_of
+from refref_jax.optics.path_settings import make_path_settings
 from refref_jax.training.config import TrainConfig
 
 _OUT = cli_flags.out("Folder of the run.")
@@ -71,7 +71,7 @@ def check_flags() -> TrainConfig:
         )
     training_body.check_flags(config, _CONFIG)
     if config.paths.name is not None:
-        budget_of(config.paths.name, cut=config.paths.cut, bends=config.paths.bends)
+        make_path_settings(config.paths.name, cut=config.paths.cut, bends=config.paths.bends)
     return config
 
 

@@ -6,7 +6,7 @@ so that importing the package is fast and does not initialise a device.
 
 >>> import trimesh
 >>> import refref_jax
->>> ball = refref_jax.single_body(trimesh.creation.icosphere(), index=1.5)
+>>> ball = refref_jax.single_object(trimesh.creation.icosphere(), index=1.5)
 >>> cameras = refref_jax.orbit(8, distance=4.0, elevation=0.3, size=16, angle_x=1.2)
 >>> refref_jax.image_rays(cameras, 0).origins.shape
 (16, 16, 3)
@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # the same names for static type checkers; a test compares bo
     from refref_jax.data.meshes import read_meshes as read_meshes
     from refref_jax.data.scene_assembly import assemble as assemble
     from refref_jax.data.scene_assembly import make_part as make_part
-    from refref_jax.data.scene_assembly import single_body as single_body
+    from refref_jax.data.scene_assembly import single_object as single_object
     from refref_jax.geometry.cameras import Cameras as Cameras
     from refref_jax.geometry.cameras import image_rays as image_rays
     from refref_jax.geometry.cameras import orbit as orbit
@@ -30,8 +30,8 @@ if TYPE_CHECKING:  # the same names for static type checkers; a test compares bo
     from refref_jax.optics.differentiable_paths import follow_main_branches as follow_main_branches
     from refref_jax.optics.light_paths import LightPaths as LightPaths
     from refref_jax.optics.light_paths import PathStatus as PathStatus
-    from refref_jax.optics.path_settings import BUDGETS as BUDGETS
-    from refref_jax.optics.path_settings import Budget as Budget
+    from refref_jax.optics.path_settings import PATH_PRESETS as PATH_PRESETS
+    from refref_jax.optics.path_settings import PathSettings as PathSettings
     from refref_jax.optics.path_tracing import trace as trace
     from refref_jax.optics.scene import Scene as Scene
     from refref_jax.optics.scene import with_index as with_index
@@ -42,8 +42,8 @@ if TYPE_CHECKING:  # the same names for static type checkers; a test compares bo
 __version__ = "0.1.0"
 
 _HOMES = {
-    "BUDGETS": "optics.path_settings",
-    "Budget": "optics.path_settings",
+    "PATH_PRESETS": "optics.path_settings",
+    "PathSettings": "optics.path_settings",
     "Cameras": "geometry.cameras",
     "LightPaths": "optics.light_paths",
     "MeshPart": "data.meshes",
@@ -61,7 +61,7 @@ _HOMES = {
     "make_part": "data.scene_assembly",
     "orbit": "geometry.cameras",
     "read_meshes": "data.meshes",
-    "single_body": "data.scene_assembly",
+    "single_object": "data.scene_assembly",
     "trace": "optics.path_tracing",
     "with_index": "optics.scene",
 }

@@ -37,7 +37,7 @@ Pixels = Literal["all", "background"]
 """Pixels that are used for training."""
 
 Paths = Literal["straight", "paper", "tree", "paper_no_reflection", "paper_no_tir"]
-"""Names of preset path settings; see `optics.budgets.BUDGETS`."""
+"""Names of preset path settings; see `optics.budgets.PATH_PRESETS`."""
 
 PresetName = Literal["tiny", "small", "paper", "best"]
 """Sizes of a model and its training; see `training.presets`."""

@@ -14,7 +14,7 @@ from refref_jax.data import background, scene_folder
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
-from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, Budget
+from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, PathSettings
 from refref_jax.render import radiance_of, render_known
 from tests.factories import scenes
 
@@ -25,18 +25,18 @@ pytestmark = pytest.mark.computing
 _FINE, _COARSE = 6, 3
 
 
-@functools.partial(jax.jit, static_argnames="budget")
-def _trace(geometry, rays, *, budget):
-    return path_tracing.trace(geometry, rays, budget=budget, capacity=rays.radii.shape[0]).paths
+@functools.partial(jax.jit, static_argnames="settings")
+def _trace(geometry, rays, *, settings):
+    return path_tracing.trace(geometry, rays, settings=settings, capacity=rays.radii.shape[0]).paths
 
 
 @functools.cache
-def _render(scene, view, budget, *, oversampling=_FINE):
+def _render(scene, view, settings, *, oversampling=_FINE):
     """Renders a view of the test split; returns sRGB, and casts and paths a camera ray."""
     frames = scene_folder.read_frames(scene, "test")
     rays = cameras.image_rays(cameras.supersample(frames.cameras, oversampling), view)
     radiance = radiance_of(background.read_background(scene))
-    seen = render_known(scenes.read_geometry(scene), radiance, rays, budget=budget)
+    seen = render_known(scenes.read_geometry(scene), radiance, rays, settings=settings)
     linear = cameras.box_filter(seen.linear, oversampling)
     return (
         np.clip(colours.linear_to_srgb(linear), 0.0, 1.0),
@@ -50,23 +50,23 @@ def _psnr(image, target, mask):
 
 
 @pytest.mark.parametrize(
-    ("budget", "at_least", "at_most"),
+    ("settings", "at_least", "at_most"),
     [
         (STRAIGHT, 8.0, 13.0),
-        pytest.param(Budget(10, "none"), 22.0, 28.0, marks=pytest.mark.slow),
+        pytest.param(PathSettings(10, "none"), 22.0, 28.0, marks=pytest.mark.slow),
         pytest.param(PAPER, 27.0, 33.0, marks=pytest.mark.slow),
         (TREE, 41.5, 48.0),
     ],
     ids=["straight", "refraction", "paper", "tree"],
 )
-def test_the_glass_ball_is_as_good_as_its_path_model(ball_scene, budget, at_least, at_most):
+def test_the_glass_ball_is_as_good_as_its_path_model(ball_scene, settings, at_least, at_most):
     frames = scene_folder.read_frames(ball_scene, "test")
     masks = scene_folder.read_masks(frames)
     values = []
     for view in (0, 10):
         target = iio.imread(frames.images[view])[..., :3] / 255.0
-        side = _FINE if budget == TREE else _COARSE
-        image, *_ = _render(ball_scene, view, budget, oversampling=side)
+        side = _FINE if settings == TREE else _COARSE
+        image, *_ = _render(ball_scene, view, settings, oversampling=side)
         values.append(_psnr(image, target, masks[view]))
         # Outside lie only camera and walls, and the half-covered pixels of the rim.
         assert _psnr(image, target, ~masks[view]) > 36.0
@@ -97,7 +97,7 @@ def test_the_first_surface_is_where_cycles_sees_it(ball_scene):
     distances = scene_folder.read_distances(frames)[0]
     rays = cameras.image_rays(frames.cameras, 0)
     flat = Rays(*(x.reshape(-1, *x.shape[2:]) for x in rays))
-    paths = jax.tree.map(np.asarray, _trace(scenes.read_geometry(ball_scene), flat, budget=PAPER))
+    paths = jax.tree.map(np.asarray, _trace(scenes.read_geometry(ball_scene), flat, settings=PAPER))
     ours = paths.tau[: distances.size, 1].reshape(distances.shape)
     mask = scene_folder.read_masks(frames)[0]
     both = np.isfinite(ours) & mask

@@ -36,9 +36,9 @@ def _needs(*parts, rule="nested"):
     return find_needs(parts, tree, CAMERAS, rule=rule, space="bounded")
 
 
-def _budget(found, **given):
+def _settings(found, **given):
     facts = SceneFacts(found, CAMERAS, (), None, None, ())
-    return resolve(TrainConfig().override(**given), facts).model.budget
+    return resolve(TrainConfig().override(**given), facts).model.settings
 
 
 def _operations(text):
@@ -46,17 +46,19 @@ def _operations(text):
     return collections.Counter(re.findall(r"stablehlo\.(\w+)", text))
 
 
-def _training_programs(geometry, budget):
+def _training_programs(geometry, settings):
     """Returns the operations of all programs of a run that know of the meshes."""
     batches = jax.tree.map(lambda x: x[None], _RAYS)
-    detail = path_detail(dataclasses.replace(MODEL, interior="clear"), budget)
-    trace = loop.trace_pool.lower(geometry, batches, budget=budget, capacity=2048, detail=detail)
-    survey = loop.survey_paths.lower(geometry, _RAYS, budget=budget)
+    detail = path_detail(dataclasses.replace(MODEL, interior="clear"), settings)
+    trace = loop.trace_pool.lower(
+        geometry, batches, settings=settings, capacity=2048, detail=detail
+    )
+    survey = loop.survey_paths.lower(geometry, _RAYS, settings=settings)
     return _operations(trace.as_text()) + _operations(survey.as_text())
 
 
 def test_no_mesh_compiles_no_tracer():
-    empty = _budget(_needs())
+    empty = _settings(_needs())
     tracer = _training_programs(scenes.geometry(_BALL), TREE)
     nothing = _training_programs(scenes.geometry(), empty)
     assert nothing["while"] == 0 < tracer["while"]
@@ -67,7 +69,7 @@ def test_no_mesh_compiles_no_tracer():
 def _render_operations(model):
     """Returns the operations of rendering some straight paths."""
     paths = path_tracing.trace(
-        scenes.geometry(), _RAYS, budget=_budget(_needs()), capacity=256
+        scenes.geometry(), _RAYS, settings=_settings(_needs()), capacity=256
     ).paths
     params = jax.eval_shape(functools.partial(init_params, config=model), jax.random.key(0))
     jitter = pixels.no_jitter(model, paths.radii.shape[0])
@@ -96,7 +98,7 @@ def test_bounded_space_is_not_contracted(monkeypatch):
 
 def _carried_lists(geometry):
     """Returns the shapes of all interior lists that the tracer's loops carry."""
-    traced = functools.partial(path_tracing.trace_ends, budget=TREE)
+    traced = functools.partial(path_tracing.trace_ends, settings=TREE)
     shapes = []
 
     def visit(jaxpr):
@@ -156,14 +158,16 @@ def test_light_that_leaves_the_bundled_ball_for_good_is_cast_less_often(ball_sce
     )
     count = rays.radii.shape[0]
 
-    def trace(budget):
-        traced = jax.jit(functools.partial(path_tracing.trace_ends, budget=budget))(geometry, rays)
+    def trace(settings):
+        traced = jax.jit(functools.partial(path_tracing.trace_ends, settings=settings))(
+            geometry, rays
+        )
         ends = traced.ends
         light = ends.weights[:, :1] * ends.directions
         return int(traced.casts), jax.ops.segment_sum(light, ends.rays, num_segments=count)
 
-    spared, light = trace(_budget(found))
-    casts, expected = trace(_budget(found, reentry="possible"))
+    spared, light = trace(_settings(found))
+    casts, expected = trace(_settings(found, reentry="possible"))
     # A path of a ball is cast once for each of its bends, and once more only to find nothing.
     assert spared < 0.8 * casts
     np.testing.assert_allclose(light, expected, atol=1e-5)

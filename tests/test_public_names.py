@@ -60,7 +60,7 @@ def test_all_names_can_be_found_by_completion():
 def test_the_page_lists_every_public_name_once():
     render = {f"render.{name}" for name in _re_exports(refref_jax.render)}
     # The three that both have stand once, with the others of their module.
-    render -= {f"render.{name}" for name in ("Rays", "Budget", "BUDGETS")}
+    render -= {f"render.{name}" for name in ("Rays", "PathSettings", "PATH_PRESETS")}
     assert sorted(_listed()) == sorted({*refref_jax._HOMES, *render})
 
 

@@ -28,9 +28,9 @@ from tests.laws import gradients
 
 _PAGE = Path(__file__).parents[1] / "docs" / "library.md"
 
-_GLASS = refref_jax.single_body(trimesh.creation.box(), index=1.5)
-_BUDGET = refref_jax.Budget(bends=2, reflections="all")
-_STRAIGHT = refref_jax.BUDGETS["straight"]
+_GLASS = refref_jax.single_object(trimesh.creation.box(), index=1.5)
+_SETTINGS = refref_jax.PathSettings(bends=2, reflections="all")
+_STRAIGHT = refref_jax.PATH_PRESETS["straight"]
 _AHEAD = np.array([1.0, 0.0, 0.0])
 
 # Head-on, glass lets 4 n / (n + 1)^2 through at each of its two faces.
@@ -77,7 +77,7 @@ def _cell(function, transformation, *marks):
 
 # --- trace ---
 
-_trace = functools.partial(refref_jax.trace, budget=_BUDGET)
+_trace = functools.partial(refref_jax.trace, settings=_SETTINGS)
 _traced = jax.jit(_trace)
 
 
@@ -125,13 +125,13 @@ def _():
 
 def _transmitted(index, ray, *, reflects=(False, False)):
     scene = refref_jax.with_index(_GLASS, index)
-    path = refref_jax.follow_branch(scene, ray, jnp.asarray(reflects), budget=_BUDGET)
+    path = refref_jax.follow_branch(scene, ray, jnp.asarray(reflects), settings=_SETTINGS)
     return path.weights[0]
 
 
 def _colour(index, ray):
     scene = refref_jax.with_index(_GLASS, index)
-    paths = refref_jax.follow_main_branches(scene, ray, budget=_BUDGET, reflections=1)
+    paths = refref_jax.follow_main_branches(scene, ray, settings=_SETTINGS, reflections=1)
     return shade(paths, _wall, rays=1)[0, 0]
 
 
@@ -204,7 +204,7 @@ def _():
 
 
 def _straight():
-    return refref_jax.trace(_GLASS, _ROW, budget=_STRAIGHT).paths
+    return refref_jax.trace(_GLASS, _ROW, settings=_STRAIGHT).paths
 
 
 def _brightness(scale, paths):
@@ -355,8 +355,8 @@ def _():
 # --- what runs on the host ---
 
 
-def _picture(rays, glass=_GLASS, budget=_STRAIGHT):
-    return render_known(glass, _wall, rays, budget=budget).linear
+def _picture(rays, glass=_GLASS, settings=_STRAIGHT):
+    return render_known(glass, _wall, rays, settings=settings).linear
 
 
 def _image(rays, geometry=_GLASS):
@@ -379,7 +379,9 @@ for _name, _function, _instead in [
 
 
 def test_a_picture_has_no_gradient_of_the_scene_and_says_what_has():
-    by_index = lambda index: jnp.sum(_picture(_ROW, refref_jax.with_index(_GLASS, index), _BUDGET))
+    by_index = lambda index: jnp.sum(
+        _picture(_ROW, refref_jax.with_index(_GLASS, index), _SETTINGS)
+    )
     with pytest.raises(TypeError, match="follow_main_branches"):
         jax.grad(by_index)(1.5)
 
@@ -387,7 +389,7 @@ def test_a_picture_has_no_gradient_of_the_scene_and_says_what_has():
 @_cell("render_known", "in double precision", pytest.mark.slow)
 def _():
     with jax.enable_x64(True):
-        seen = _picture(_ROW, budget=_BUDGET)
+        seen = _picture(_ROW, settings=_SETTINGS)
     assert seen.dtype == np.float64
     np.testing.assert_allclose(seen[:, 0], [_THROUGH] * 3 + [1.0], rtol=1e-12)
 

@@ -52,8 +52,8 @@ def _rows(view):
 
 
 @pytest.mark.parametrize("scene", _SCENES, ids=lambda scene: scene.name)
-@pytest.mark.parametrize(("budget", "rule"), _RULES, ids=["straight", "paper", "tree"])
-def test_images_are_those_of_the_slow_tree(scene, budget, rule):
+@pytest.mark.parametrize(("settings", "rule"), _RULES, ids=["straight", "paper", "tree"])
+def test_images_are_those_of_the_slow_tree(scene, settings, rule):
     surfaces = reference_surfaces.read_surfaces(scene)
     few = len(surfaces.corners) < 50
     cast = (reference_surfaces.BruteForce if few else reference_surfaces.Embree)(surfaces)
@@ -67,7 +67,7 @@ def test_images_are_those_of_the_slow_tree(scene, budget, rule):
         traced = jax.tree.map(
             np.asarray,
             scenes.trace_ends(
-                scenes.read_geometry(scene), _rays(origins, directions), budget=budget
+                scenes.read_geometry(scene), _rays(origins, directions), settings=settings
             ),
         )
         assert not traced.lost.any()
@@ -84,5 +84,5 @@ def test_images_are_those_of_the_slow_tree(scene, budget, rule):
         assert reference_images.psnr(*images, view.mask[rows]) > _SAME_IMAGE
         paths = np.sum(traced.ends.statuses != PathStatus.EMPTY)
         np.testing.assert_allclose(paths, len(slow.rays), rtol=0.02)
-        if budget.bends > 0:
+        if settings.bends > 0:
             np.testing.assert_allclose(int(traced.casts), slow.casts, rtol=0.02)

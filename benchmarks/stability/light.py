@@ -15,7 +15,7 @@ from benchmarks.stability.laws import Found
 from refref_jax.data.scene_assembly import build_geometry
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.light_paths import PathStatus
-from refref_jax.optics.path_settings import PAPER, TREE, Budget
+from refref_jax.optics.path_settings import PAPER, TREE, PathSettings
 
 _CUBE = 2.0, 2.0, 2.0
 
@@ -57,10 +57,10 @@ def on_surfaces(density: int) -> Found:
     return Found(worst, 3 * RAYS)
 
 
-def _unbalance(geometry, rays, budget) -> float:
+def _unbalance(geometry, rays, settings) -> float:
     """Returns how far weights and losses are from summing to 1."""
-    traced = paths.trace(geometry, rays, budget=budget)
-    assert np.all(traced.ends.bends <= budget.bends)
+    traced = paths.trace(geometry, rays, settings=settings)
+    assert np.all(traced.ends.bends <= settings.bends)
     assert all(np.all(np.isfinite(x)) for x in traced.ends)
     return float(np.abs(paths.energy(traced, len(rays.radii)) - 1.0).max())
 
@@ -68,18 +68,20 @@ def _unbalance(geometry, rays, budget) -> float:
 def white_furnace(density: int) -> Found:
     """Sums of weights and losses in clear glass, with ample room and with too little."""
     geometry, rays = paths.build(paths.torus()), inner_rays(1.4)
-    budgets = [
-        Budget(24, "all", cut=0.0, live_per_ray=1.0, segments_per_ray=4.0, paths_per_ray=1.0),
+    all_settings = [
+        PathSettings(24, "all", cut=0.0, live_per_ray=1.0, segments_per_ray=4.0, paths_per_ray=1.0),
         TREE,
-        Budget(24, "all", cut=0.002, live_per_ray=1.0),
-        Budget(24, "all", cut=0.002, segments_per_ray=1.0),
-        Budget(24, "all", cut=0.002, paths_per_ray=1.0),
-        Budget(8, "all", cut=0.0, live_per_ray=64.0, segments_per_ray=600.0, paths_per_ray=300.0),
-        Budget(24, "all", cut=0.001),
+        PathSettings(24, "all", cut=0.002, live_per_ray=1.0),
+        PathSettings(24, "all", cut=0.002, segments_per_ray=1.0),
+        PathSettings(24, "all", cut=0.002, paths_per_ray=1.0),
+        PathSettings(
+            8, "all", cut=0.0, live_per_ray=64.0, segments_per_ray=600.0, paths_per_ray=300.0
+        ),
+        PathSettings(24, "all", cut=0.001),
         PAPER,
     ][: 2 * density]
-    worst = max(_unbalance(geometry, rays, budget) for budget in budgets)
-    return Found(worst, len(budgets) * RAYS)
+    worst = max(_unbalance(geometry, rays, settings) for settings in all_settings)
+    return Found(worst, len(all_settings) * RAYS)
 
 
 def nested_and_overlapping(density: int) -> Found:
@@ -125,7 +127,7 @@ def index_matched(density: int) -> Found:
     del density
     worst, rays = 0.0, inner_rays(0.9)
     for body in (sphere(index=1.0), paths.torus(index=1.0), paths.slab(_CUBE, index=1.0)):
-        traced = paths.trace(paths.build(body), rays, budget=TREE)
+        traced = paths.trace(paths.build(body), rays, settings=TREE)
         ends = traced.ends
         there = ends.statuses != PathStatus.EMPTY
         assert np.sum(there) == RAYS and np.all(ends.weights[there] == 1.0)
@@ -165,7 +167,7 @@ def whispering_gallery(density: int) -> Found:
     rays = balls_and_rays.rays(origins, [1.0, 0.0, 0.0])
     worst, geometry = 0.0, paths.build(sphere())
     for bends in (24, 100)[: 1 + (density > 1)]:
-        traced = paths.trace(geometry, rays, budget=Budget(bends, "all", cut=0.02))
+        traced = paths.trace(geometry, rays, settings=PathSettings(bends, "all", cut=0.02))
         there = traced.ends.statuses != PathStatus.EMPTY
         assert np.all(traced.ends.statuses[there] == PathStatus.OUT_OF_BENDS)
         assert np.all(traced.ends.bends[there] == bends)

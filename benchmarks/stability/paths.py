@@ -16,9 +16,9 @@ from benchmarks.oracles import reference_surfaces, reference_tree
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_assembly import build_geometry
 from refref_jax.optics.interface_rules import NO_PARENT
-from refref_jax.optics.path_settings import Budget
+from refref_jax.optics.path_settings import PathSettings
 
-MAIN = Budget(10, "none", live_per_ray=1.0, segments_per_ray=10.0, paths_per_ray=1.0)
+MAIN = PathSettings(10, "none", live_per_ray=1.0, segments_per_ray=10.0, paths_per_ray=1.0)
 """One path a ray: refracted wherever it can be."""
 
 
@@ -79,13 +79,15 @@ def build(*parts):
     return jax.tree.map(jnp.asarray, built)
 
 
-def trace(geometry, rays, *, budget):
+def trace(geometry, rays, *, settings):
     """Traces, and refuses any NaN on the way."""
     with jax.debug_nans(True):
-        return jax.tree.map(np.asarray, balls_and_rays.trace_ends(geometry, rays, budget=budget))
+        return jax.tree.map(
+            np.asarray, balls_and_rays.trace_ends(geometry, rays, settings=settings)
+        )
 
 
-def trace_in_double(geometry, rays, *, budget):
+def trace_in_double(geometry, rays, *, settings):
     """Traces in double precision what was built in single."""
 
     def widen(x):
@@ -96,7 +98,7 @@ def trace_in_double(geometry, rays, *, budget):
     rays = rays._replace(directions=reference_surfaces.unit(rays.directions.astype(float)))
     # Integers are 64 bits wide then, and meet those of the scene.
     with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
-        return trace(*(jax.tree.map(widen, x) for x in (geometry, rays)), budget=budget)
+        return trace(*(jax.tree.map(widen, x) for x in (geometry, rays)), settings=settings)
 
 
 def surfaces_of(parts):
@@ -114,7 +116,7 @@ def surfaces_of(parts):
 
 def main_ends(geometry, rays, *, tracer=trace):
     """Returns the end of the main path of every ray, in the order of the rays."""
-    ends = tracer(geometry, rays, budget=MAIN).ends
+    ends = tracer(geometry, rays, settings=MAIN).ends
     order = np.argsort(ends.rays)
     assert np.array_equal(ends.rays[order], np.arange(len(order)))
     return jax.tree.map(lambda x: x[order], ends)

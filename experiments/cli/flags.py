@@ -19,7 +19,7 @@ from etils import epy
 from experiments.cli import app
 from experiments.runs import processes, view_numbers
 from refref_jax import choices
-from refref_jax.optics.path_settings import Budget, budget_of
+from refref_jax.optics.path_settings import PathSettings, make_path_settings
 
 with epy.lazy_imports():
     from experiments.r3f import records
@@ -130,26 +130,26 @@ def lpips_weights() -> flags.FlagHolder[str | None]:
 
 
 # ---- Light paths ----
-class BudgetFlags(NamedTuple):
+class PathFlags(NamedTuple):
     """Flags of commands that trace light paths with the user's path settings."""
 
     cut: flags.FlagHolder[float | None]
     bends: flags.FlagHolder[int | None]
 
-    def chosen(self, paths: str) -> Budget:
+    def chosen(self, paths: str) -> PathSettings:
         """Returns the path settings of a preset, with the user's threshold and maximum of bends."""
-        return budget_of(paths, cut=self.cut.value, bends=self.bends.value)
+        return make_path_settings(paths, cut=self.cut.value, bends=self.bends.value)
 
 
-def budget(*, cut: float | None = None, bends: int | None = None) -> BudgetFlags:
+def settings(*, cut: float | None = None, bends: int | None = None) -> PathFlags:
     """Defines `--cut` and `--bends`; the defaults are those of the path preset."""
     what = ("Throughput threshold of paths, in [0, 1)", "Maximum number of bends of a path")
-    found = BudgetFlags(
+    found = PathFlags(
         flags.DEFINE_float("cut", cut, f"{what[0]}; that of the path preset by default."),
         flags.DEFINE_integer("bends", bends, f"{what[1]}; that of the path preset by default."),
     )
-    app.check(found.cut, lambda cut: budget_of("tree", cut=cut))
-    app.check(found.bends, lambda bends: budget_of("tree", bends=bends))
+    app.check(found.cut, lambda cut: make_path_settings("tree", cut=cut))
+    app.check(found.bends, lambda bends: make_path_settings("tree", bends=bends))
     return found
 
 

@@ -41,7 +41,7 @@ _OUT = flags.DEFINE_string("out", None, "Folder of the report; FOLDER if not giv
 _OVERWRITE = cli_flags.overwrite("the report of an earlier check")
 # The diamond traps light for so long that the tree's own threshold costs 5 dB of 39, and Cycles'
 # limit of 64 bounces another 6. Paths are checked here, not their truncation.
-_BUDGET = cli_flags.budget(cut=0.004, bends=render_settings.BOUNCES)
+_SETTINGS = cli_flags.settings(cut=0.004, bends=render_settings.BOUNCES)
 # Few rays per pixel alias where Cycles averages over hundreds: a face of the cube is 41 dB off with
 # 25 rays per pixel of 200 x 200, and 48 with 100.
 _RAYS_PER_PIXEL = cli_flags.rays_per_pixel(100)
@@ -51,7 +51,7 @@ _SHOWN_COMPLAINTS = 3
 
 def main(folder: str) -> None:
     """Checks every scene of a folder, and writes the report."""
-    budget = dataclasses.replace(_BUDGET.chosen("tree"), unfinished="dark")
+    settings = dataclasses.replace(_SETTINGS.chosen("tree"), unfinished="dark")
     checked, side = Path(folder), choices.side_of(_RAYS_PER_PIXEL.value)
     out = Path(_OUT.value) if _OUT.value else checked
     page, figures = out / "check.html", out / "check.json"
@@ -62,7 +62,7 @@ def main(folder: str) -> None:
     reports = []
     with ProgressBar("check", len(scenes)) as bar:
         for done, scene in enumerate(scenes, 1):
-            reports.append(scene_check.check_scene(scene, budget, views=_LIMIT.value, side=side))
+            reports.append(scene_check.check_scene(scene, settings, views=_LIMIT.value, side=side))
             bar.show(done, _summary(reports[-1]))
     content = configuration.string_safe([_record(report) for report in reports])
     for path, text in (

@@ -21,7 +21,7 @@ from refref_jax.data.mesh_checks import Finding
 from refref_jax.data.mesh_queries import Containment
 from refref_jax.data.meshes import MeshPart
 from refref_jax.geometry import cameras
-from refref_jax.optics.path_settings import Budget
+from refref_jax.optics.path_settings import PathSettings
 from refref_jax.render.first_surface import FirstSurface, find_first_surface
 
 PSNR = 33.0
@@ -121,9 +121,9 @@ def read_views(scene: Path, made_of: Meshes, *, count: int) -> KnownScene:
     return known_scene.build_scene(scene, *made_of, frames=frames, chosen=chosen, rule=rule)
 
 
-def compare_view(scene: KnownScene, index: int, *, budget: Budget, side: int) -> View:
+def compare_view(scene: KnownScene, index: int, *, settings: PathSettings, side: int) -> View:
     """Renders one of a scene's views and compares all available maps."""
-    rendered = known_scene.render_view(scene, index, budget=budget, side=side)
+    rendered = known_scene.render_view(scene, index, settings=settings, side=side)
     measured = known_scene.measure(scene, index, rendered.rgb)
     first = find_first_surface(
         scene.geometry.surfaces, cameras.image_rays(scene.frames.cameras, index)

@@ -7,7 +7,7 @@ import numpy as np
 from experiments.cli import app
 from experiments.dataset import checks
 from experiments.dataset.check_page import SceneReport
-from refref_jax.optics.path_settings import Budget
+from refref_jax.optics.path_settings import PathSettings
 
 _TRANSFORMS = "transforms_*.json"
 
@@ -36,12 +36,12 @@ def find_scenes(folder: Path, names: list[str] | None) -> list[Path]:
     return [path for path in found if names is None or path.resolve().name in names]
 
 
-def check_scene(scene: Path, budget: Budget, *, views: int, side: int) -> SceneReport:
+def check_scene(scene: Path, settings: PathSettings, *, views: int, side: int) -> SceneReport:
     """Checks one scene.
 
     Args:
       scene: folder of the scene.
-      budget: path settings.
+      settings: path settings.
       views: number of test views to compare, evenly spaced.
       side: rays along each edge of a pixel.
     """
@@ -53,7 +53,7 @@ def check_scene(scene: Path, budget: Budget, *, views: int, side: int) -> SceneR
     if views and made_of and not any(each.severity == "error" for each in findings):
         known = checks.read_views(scene, made_of, count=views)
         compared = [
-            checks.compare_view(known, i, budget=budget, side=side)
+            checks.compare_view(known, i, settings=settings, side=side)
             for i in range(len(known.indices))
         ]
     convex = "smcvx" in name.split("_")

@@ -22,7 +22,7 @@ from refref_jax.data import meshes
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.path_settings import BUDGETS, Budget
+from refref_jax.optics.path_settings import PATH_PRESETS, PathSettings
 from refref_jax.optics.scene import Scene
 from refref_jax.render.first_surface import find_first_surface
 from refref_jax.render.pixel_paths import PixelPaths, trace_pixel
@@ -80,7 +80,7 @@ def draw_views(scene: KnownScene, path: Path, *, side: int) -> None:
     """
     shown = [_truth(scene)]
     for name, title in _NAMES.items():
-        rgb = known_scene.render_view(scene, 0, budget=BUDGETS[name], side=side).rgb
+        rgb = known_scene.render_view(scene, 0, settings=PATH_PRESETS[name], side=side).rgb
         shown.append(Shown(title, rgb, known_scene.measure(scene, 0, rgb)["psnr_masked"]))
     write_views(path, shown)
 
@@ -101,7 +101,9 @@ def draw_fan(scene: KnownScene, folder: Path, half: float, path: Path) -> None:
         "straight": "the model of NeRF: straight rays",
         "paper_no_reflection": "actual light: neighbours separate, left and right swap",
     }
-    panels = [Panel(title, _follow(scene, rays, BUDGETS[name])) for name, title in titles.items()]
+    panels = [
+        Panel(title, _follow(scene, rays, PATH_PRESETS[name])) for name, title in titles.items()
+    ]
     write_fan(path, panels, outlines, half)
 
 
@@ -115,15 +117,17 @@ def draw_tree(scene: KnownScene, folder: Path, path: Path) -> None:
     """
     outlines = cross_sections.outlines_of(meshes.read_meshes(folder))
     rays = cross_sections.rays_towards(_CAMERA, [_AIM * cross_sections.width_of(outlines)])
-    budgets = {title: BUDGETS[name] for name, title in _NAMES.items()}
-    finer = dataclasses.replace(BUDGETS["tree"], cut=_FINER)
-    budgets[f"the tree, threshold {100.0 * _FINER:g} %"] = finer
-    panels = [Panel(title, _follow(scene, rays, budget)) for title, budget in budgets.items()]
+    all_settings = {title: PATH_PRESETS[name] for name, title in _NAMES.items()}
+    finer = dataclasses.replace(PATH_PRESETS["tree"], cut=_FINER)
+    all_settings[f"the tree, threshold {100.0 * _FINER:g} %"] = finer
+    panels = [
+        Panel(title, _follow(scene, rays, settings)) for title, settings in all_settings.items()
+    ]
     write_tree(path, panels, outlines)
 
 
-def _follow(scene: KnownScene, rays: list[Rays], budget: Budget) -> list[PixelPaths]:
-    trace = functools.partial(trace_pixel, scene.geometry, budget=budget, reach=_FAR)
+def _follow(scene: KnownScene, rays: list[Rays], settings: PathSettings) -> list[PixelPaths]:
+    trace = functools.partial(trace_pixel, scene.geometry, settings=settings, reach=_FAR)
     return [trace(ray) for ray in rays]
 
 
@@ -159,7 +163,9 @@ def _walls(
     """Returns the arc length of light to the background, straight and refracted."""
     leave = jax.vmap(functools.partial(scene_bounds.exit_distance, Domain(half, "bounded")))
     # Without reflections every ray has one path.
-    ends = path_tracing.trace_ends(geometry, rays, budget=BUDGETS["paper_no_reflection"]).ends
+    ends = path_tracing.trace_ends(
+        geometry, rays, settings=PATH_PRESETS["paper_no_reflection"]
+    ).ends
     reached = jax.numpy.where(
         light_paths.exists(ends), ends.tau + leave(ends.origins, ends.directions), -jax.numpy.inf
     )

@@ -18,7 +18,7 @@ from refref_jax.data.scene_assembly import build_geometry
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.media import interior_slots
-from refref_jax.optics.path_settings import Budget
+from refref_jax.optics.path_settings import PathSettings
 from refref_jax.optics.scene import Scene
 from refref_jax.render import colour
 from refref_jax.render.background_rendering import TILE, KnownRendering, render_known
@@ -130,24 +130,24 @@ def build_scene(
     )
 
 
-def warm_up(scene: KnownScene, budget: Budget) -> None:
+def warm_up(scene: KnownScene, settings: PathSettings) -> None:
     """Renders one tile, so that later timings exclude compilation."""
     rays = cameras.pixel_rays(scene.frames.cameras, *np.zeros((3, TILE), np.int64))
-    _render(scene, 0, rays, budget)
+    _render(scene, 0, rays, settings)
 
 
-def render_view(scene: KnownScene, view: int, *, budget: Budget, side: int) -> View:
+def render_view(scene: KnownScene, view: int, *, settings: PathSettings, side: int) -> View:
     """Renders a view with `side x side` rays per pixel, averaged in linear radiance.
 
     Args:
       scene: scene to render.
       view: position in the selected views.
-      budget: path settings.
+      settings: path settings.
       side: number of rays along each edge of a pixel.
     """
     rays = cameras.image_rays(cameras.supersample(scene.frames.cameras, side), view)
     start = time.monotonic()
-    seen = _render(scene, view, rays, budget)
+    seen = _render(scene, view, rays, settings)
     seconds = time.monotonic() - start
     linear = jax.device_put(cameras.box_filter(seen.linear, side))
     return View(
@@ -178,11 +178,11 @@ def measure(
     return result
 
 
-def _render(scene: KnownScene, view: int, rays: Rays, budget: Budget) -> KnownRendering:
+def _render(scene: KnownScene, view: int, rays: Rays, settings: PathSettings) -> KnownRendering:
     inside = scene.inside
     if inside is not None:
         inside = np.broadcast_to(inside[view], (*rays.radii.shape, inside.shape[1]))
-    return render_known(scene.geometry, scene.radiance, rays, budget=budget, inside=inside)
+    return render_known(scene.geometry, scene.radiance, rays, settings=settings, inside=inside)
 
 
 def _choose(frames: scene_folder.Frames, chosen: Sequence[int]) -> scene_folder.Frames:

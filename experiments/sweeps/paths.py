@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from experiments.figures.style import COLOURS, LABEL_HEIGHT, label_plainly, pyplot, style
 from experiments.runs import known_scene
 from experiments.runs.known_scene import KnownScene
-from refref_jax.optics.path_settings import Budget
+from refref_jax.optics.path_settings import PathSettings
 from refref_jax.training import evaluation
 
 _MARKERS = {"straight": "s", "paper": "D"}
@@ -34,14 +34,14 @@ class Setting(NamedTuple):
     """One setting of a sweep over path settings.
 
     Attributes:
-      sweep: varied option, `cut` or `bends`; `budget` for a single preset.
+      sweep: varied option, `cut` or `bends`; `settings` for a single preset.
       name: label in figures.
-      budget: path settings.
+      settings: path settings.
     """
 
     sweep: str
     name: str
-    budget: Budget
+    settings: PathSettings
 
 
 class Trial(NamedTuple):
@@ -49,7 +49,7 @@ class Trial(NamedTuple):
 
     Attributes:
       scene: name of the scene.
-      sweep: varied option: `cut`, `bends`, or `budget` for a single preset.
+      sweep: varied option: `cut`, `bends`, or `settings` for a single preset.
       name: value of that option, or name of the preset.
       cut: throughput threshold.
       bends: max bends.
@@ -79,19 +79,19 @@ class Trial(NamedTuple):
 def measure_all(chosen: list[KnownScene], plan: list[Setting], side: int) -> Iterator[Trial]:
     """Renders every scene with every setting; equal path settings are rendered once."""
     for scene in chosen:
-        known: dict[Budget, Trial] = {}
+        known: dict[PathSettings, Trial] = {}
         for setting in plan:
-            if setting.budget not in known:
-                known[setting.budget] = measure_one(scene, setting, side)
-            yield known[setting.budget]._replace(sweep=setting.sweep, name=setting.name)
+            if setting.settings not in known:
+                known[setting.settings] = measure_one(scene, setting, side)
+            yield known[setting.settings]._replace(sweep=setting.sweep, name=setting.name)
 
 
 def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
     """Renders all views of a scene with one setting."""
-    known_scene.warm_up(scene, setting.budget)
+    known_scene.warm_up(scene, setting.settings)
     views, measured = [], []
     for i in range(len(scene.indices)):
-        view = known_scene.render_view(scene, i, budget=setting.budget, side=side)
+        view = known_scene.render_view(scene, i, settings=setting.settings, side=side)
         views.append(view)
         measured.append(known_scene.measure(scene, i, view.rgb))
     pixels = scene.frames.cameras.height * scene.frames.cameras.width * side**2
@@ -99,8 +99,8 @@ def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
         scene=scene.name,
         sweep=setting.sweep,
         name=setting.name,
-        cut=setting.budget.cut,
-        bends=setting.budget.bends,
+        cut=setting.settings.cut,
+        bends=setting.settings.bends,
         psnr=evaluation.mean_of(measured, "psnr"),
         psnr_masked=evaluation.mean_of(measured, "psnr_masked"),
         psnr_outside=evaluation.mean_of(measured, "psnr_outside"),
@@ -170,7 +170,7 @@ def _draw_scene(
     y = [trial.psnr_masked for trial in line]
     axis.plot(x, y, "-o", color=colour, markersize=4.5, linewidth=1.8, zorder=3)
     for trial in trials:
-        if trial.sweep == "budget":
+        if trial.sweep == "settings":
             axis.plot(
                 scale * getattr(trial, cost),
                 trial.psnr_masked,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from experiments.cli import app
 from refref_jax.fields import registry
-from refref_jax.optics.path_settings import BUDGETS
+from refref_jax.optics.path_settings import PATH_PRESETS
 from refref_jax.training import resolve
 from refref_jax.training.presets import PRESETS, Bounds
 
@@ -79,8 +79,10 @@ def sweep(
         raise ValueError(
             f"--base={misplaced[0]}=... conflicts with the points. Use --{misplaced[0]}."
         )
-    if (paths := (base or {}).get("paths", "tree")) not in BUDGETS:
-        raise ValueError(f"--base=paths={paths} does not exist. Choose from {', '.join(BUDGETS)}.")
+    if (paths := (base or {}).get("paths", "tree")) not in PATH_PRESETS:
+        raise ValueError(
+            f"--base=paths={paths} does not exist. Choose from {', '.join(PATH_PRESETS)}."
+        )
     usual = PRESETS[preset].schedule.steps
     first, *others = steps or (usual, usual // 4, usual // 2, 2 * usual)
     base = _BASE_OPTIONS | dict(base or {})
@@ -136,8 +138,8 @@ def own_values(preset: str, paths: str = "tree", *, field: str = registry.USUAL)
         **of_grid,
         "footprint": model.footprint,
         "precision": model.field.precision,
-        "cut": str(BUDGETS[paths].cut),
-        "bends": str(BUDGETS[paths].bends),
+        "cut": str(PATH_PRESETS[paths].cut),
+        "bends": str(PATH_PRESETS[paths].bends),
         "rays_per_pixel": "1",
     }
 

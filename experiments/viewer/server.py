@@ -153,7 +153,7 @@ class Page:
         model = session.chosen_model(self._subject, choice)
         height, chunk = self._subject.heights[job.stage], self._subject.chunk
         most = height * cameras.width_of(height)
-        layer, what = choice.layer, ("image", model.budget)
+        layer, what = choice.layer, ("image", model.settings)
         if layer == layers.ERROR and job.stage > 0:
             return self._draw_error(job, view, model, most)
         if layer == layers.ERROR:  # no error is available while moving to a view
@@ -176,7 +176,7 @@ class Page:
         fov = cameras.containing_fov(frames.cameras, view.aspect)
         self._go_to(Viewpoint(frames.cameras.poses[i], fov, view.aspect))
         pixels = layers.view_pixels(frames, i, most)
-        with self._turns.drawing, self._compiling(("image", model.budget)):
+        with self._turns.drawing, self._compiling(("image", model.settings)):
             drawn = layers.draw_error(
                 model, pixels, chunk=self._subject.chunk, cancelled=lambda: self._stale(job)
             )
@@ -212,7 +212,7 @@ class Page:
         model = session.chosen_model(self._subject, self._panel.choice())
         direction = np.asarray(event.ray_direction)
         ray = Rays(np.asarray(event.ray_origin), direction / np.linalg.norm(direction), 1e-3)
-        with self._turns.tracing, self._compiling(("pixel", model.budget)):
+        with self._turns.tracing, self._compiling(("pixel", model.settings)):
             paths = pixel_paths.trace_pixel(model, ray)
         self._scenery.show_paths(pixel_paths.pieces(paths))
         self._panel.show_table(pixel_paths.describe(paths))

@@ -118,23 +118,25 @@ class Job(NamedTuple):
 def first_choice(subject: Subject) -> Choice:
     """Returns the initial settings: those of the trained model."""
     indices = tuple(float(x) for x in np.asarray(subject.model.geometry.interfaces.index_inside))
-    budget = subject.model.budget
-    return Choice(layers.RGB, indices, budget.cut, budget.bends)
+    settings = subject.model.settings
+    return Choice(layers.RGB, indices, settings.cut, settings.bends)
 
 
 def chosen_model(subject: Subject, choice: Choice) -> Model:
     """Returns the model with the chosen settings; the initial ones leave it as it was trained."""
     model = subject.model
-    if model.budget.bends == 0:
+    if model.settings.bends == 0:
         return model
     interfaces = model.geometry.interfaces
     if choice.indices != first_choice(subject).indices:
         # On the device, as those of the model are, so that both share one compiled program.
         interfaces = jax.device_put(layers.with_indices(interfaces, choice.indices, subject.rule))
-    budget = model.budget
-    if (choice.cut, choice.bends) != (budget.cut, budget.bends):
-        budget = dataclasses.replace(budget, cut=choice.cut, bends=choice.bends)
-    return model._replace(geometry=model.geometry._replace(interfaces=interfaces), budget=budget)
+    settings = model.settings
+    if (choice.cut, choice.bends) != (settings.cut, settings.bends):
+        settings = dataclasses.replace(settings, cut=choice.cut, bends=choice.bends)
+    return model._replace(
+        geometry=model.geometry._replace(interfaces=interfaces), settings=settings
+    )
 
 
 def part_names(scene: Path | None, count: int) -> tuple[str, ...]:

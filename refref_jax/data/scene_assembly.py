@@ -97,7 +97,7 @@ def _of_arrays(
     return MeshPart(name, vertices, faces, index, shading)
 
 
-def single_body(
+def single_object(
     mesh: MeshSource,
     *,
     index: float,
@@ -116,7 +116,7 @@ def single_body(
     Example:
       >>> import trimesh
       >>> import refref_jax
-      >>> glass = refref_jax.single_body(trimesh.creation.box(), index=1.5)
+      >>> glass = refref_jax.single_object(trimesh.creation.box(), index=1.5)
       >>> glass.interfaces.index_inside.tolist()
       [1.5]
     """

@@ -33,7 +33,7 @@ from refref_jax.geometry.bvh import NO_SLOT, closest_slot
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import media, path_step, ray_differentials, scene
 from refref_jax.optics.light_paths import LightPaths, PathStatus
-from refref_jax.optics.path_settings import Budget
+from refref_jax.optics.path_settings import PathSettings
 from refref_jax.optics.path_step import RayState
 from refref_jax.optics.scene import Scene
 
@@ -76,7 +76,7 @@ def follow_branch(
     ray: Rays,
     reflects: Bool[Array, " bends"],
     *,
-    budget: Budget,
+    settings: PathSettings,
     inside: Int[Array, " slots"] | None = None,
 ) -> LightPaths:
     """Traces one ray along one branch.
@@ -86,7 +86,7 @@ def follow_branch(
       ray: one camera ray.
       reflects: choice of the reflected branch at each bend; a total internal reflection is always
         followed. All false is the main path.
-      budget: path settings; `budget.bends` must be the length of `reflects`.
+      settings: path settings; `settings.bends` must be the length of `reflects`.
       inside: interior list of the camera, for the rule `priority` (see `media`).
 
     Returns:
@@ -102,19 +102,19 @@ def follow_branch(
 
       >>> import jax, numpy as np, trimesh
       >>> import refref_jax
-      >>> glass = refref_jax.single_body(trimesh.creation.box(), index=1.5)
+      >>> glass = refref_jax.single_object(trimesh.creation.box(), index=1.5)
       >>> ray = refref_jax.Rays(np.array([-2.0, 0.1, 0.2]), np.array([1.0, 0.0, 0.0]), 1e-3)
-      >>> budget = refref_jax.Budget(bends=1, reflections="all")
+      >>> settings = refref_jax.PathSettings(bends=1, reflections="all")
       >>> def transmitted(index):
       ...     scene, straight_on = refref_jax.with_index(glass, index), jax.numpy.zeros(1, bool)
-      ...     return refref_jax.follow_branch(scene, ray, straight_on, budget=budget).weights[0]
+      ...     return refref_jax.follow_branch(scene, ray, straight_on, settings=settings).weights[0]
       >>> share, slope = jax.jit(jax.value_and_grad(transmitted))(1.5)
       >>> print(f"{share:.4f} {slope:.4f}")
       0.9600 -0.1280
     """
-    if reflects.shape[0] != budget.bends:
+    if reflects.shape[0] != settings.bends:
         raise ValueError(
-            f"reflects has {reflects.shape[0]} choices for {budget.bends} bends. Give one choice "
+            f"reflects has {reflects.shape[0]} choices for {settings.bends} bends. Give one choice "
             "for each of the max bends."
         )
     reflects = jnp.asarray(reflects)
@@ -124,18 +124,18 @@ def follow_branch(
     start = _Walk(
         path_step.begin(ray, inside, ray_differentials.nothing(ray.origins)),
         jnp.int32(media.AMBIENT),
-        jnp.asarray(budget.bends > 0),
+        jnp.asarray(settings.bends > 0),
         jnp.int32(PathStatus.EMPTY),
     )
     # One step more than max bends: the last one only checks whether the path escapes.
     choices = jnp.append(reflects, False)
-    advance = functools.partial(_advance, geometry, budget)
+    advance = functools.partial(_advance, geometry, settings)
     end, segments = jax.lax.scan(advance, start, choices)
-    return _record(budget, ray, end, segments)
+    return _record(settings, ray, end, segments)
 
 
 def _advance(
-    geometry: Scene, budget: Budget, walk: _Walk, reflect: Bool[Array, ""]
+    geometry: Scene, settings: PathSettings, walk: _Walk, reflect: Bool[Array, ""]
 ) -> tuple[_Walk, _Segment]:
     """Casts the ray, then ends the path or follows one of the two branches."""
     state, alive = walk.state, walk.status == PathStatus.EMPTY
@@ -144,16 +144,16 @@ def _advance(
     hit = slot != NO_SLOT
     arrival = path_step.arrive(geometry, state, slot)
     ended = jnp.where(
-        walk.traced, path_step.ending(budget, state, arrival, hit), PathStatus.NOT_TRACED
+        walk.traced, path_step.ending(settings, state, arrival, hit), PathStatus.NOT_TRACED
     )
     status = jnp.where(alive, ended, walk.status).astype(jnp.int32)
     met, sides = arrival.interaction, arrival.interaction.sides
     mirrored = reflect | met.total
-    branches = path_step.branch(budget, state, arrival, slot)
+    branches = path_step.branch(settings, state, arrival, slot)
     bent = _Walk(
         state=_either(mirrored, branches.reflected, branches.transmitted),
         medium=jnp.where(mirrored, sides.medium_near, sides.medium_far),
-        traced=~(reflect & ~met.total & (budget.reflections == "first")),
+        traced=~(reflect & ~met.total & (settings.reflections == "first")),
         status=status,
     )
     segment = _Segment(state, jnp.where(hit, sides.medium_near, walk.medium), alive)
@@ -165,7 +165,7 @@ def _either(which: Bool[Array, ""], first: _Record, second: _Record) -> _Record:
     return jax.tree.map(lambda a, b: jnp.where(which, a, b), first, second)
 
 
-def _record(budget: Budget, ray: Rays, end: _Walk, segments: _Segment) -> LightPaths:
+def _record(settings: PathSettings, ray: Rays, end: _Walk, segments: _Segment) -> LightPaths:
     used = segments.used
     tau = jnp.where(used, segments.state.tau, jnp.inf)
     none = jnp.zeros_like(tau, shape=(0,))
@@ -174,27 +174,27 @@ def _record(budget: Budget, ray: Rays, end: _Walk, segments: _Segment) -> LightP
         directions=segments.state.direction,
         tau=tau,
         ends=jnp.append(tau[1:], jnp.inf),
-        spreads=segments.state.spread,
+        differentials=segments.state.differential,
         media=jnp.where(used, segments.medium, media.AMBIENT),
         rays=jnp.zeros_like(end.status),
-        weights=path_step.shown(budget, end.state.weight, end.status),
+        weights=path_step.shown(settings, end.state.weight, end.status),
         radii=ray.radii,
         bends=end.state.bends,
         statuses=end.status,
-        meetings=none,
-        passages=none,
+        hit_counts=none,
+        path_lengths=none,
     )
 
 
 def follow_main_branches(
-    geometry: Scene, ray: Rays, *, budget: Budget, reflections: int
+    geometry: Scene, ray: Rays, *, settings: PathSettings, reflections: int
 ) -> LightPaths:
     """Traces one ray along its main path, and along the paths that are reflected once.
 
     Args:
       geometry: the scene.
       ray: one camera ray.
-      budget: path settings.
+      settings: path settings.
       reflections: number of first surfaces at which a reflection is followed.
 
     Returns:
@@ -211,7 +211,7 @@ def follow_main_branches(
       >>> import jax, numpy as np, trimesh
       >>> import refref_jax
       >>> from refref_jax.render import shade
-      >>> glass = refref_jax.single_body(trimesh.creation.box(), index=1.5)
+      >>> glass = refref_jax.single_object(trimesh.creation.box(), index=1.5)
       >>> ray = refref_jax.Rays(np.array([-2.0, 0.1, 0.2]), np.array([1.0, 0.0, 0.0]), 1e-3)
       >>> red = jax.numpy.array([1.0, 0.0, 0.0])
       >>> wall = lambda origin, direction: jax.numpy.where(direction[0] > 0.0, red, 0.0)
@@ -219,7 +219,7 @@ def follow_main_branches(
       ...     paths = refref_jax.follow_main_branches(
       ...         refref_jax.with_index(glass, index),
       ...         ray,
-      ...         budget=refref_jax.Budget(bends=2, reflections="all"),
+      ...         settings=refref_jax.PathSettings(bends=2, reflections="all"),
       ...         reflections=1,
       ...     )
       ...     return shade(paths, wall, rays=1)[0]
@@ -227,15 +227,17 @@ def follow_main_branches(
       >>> print(f"{value[0]:.4f} {slope[0]:.4f}")  # (4 n / (n + 1)^2)^2, and its derivative
       0.9216 -0.2458
     """
-    if not 0 <= reflections <= budget.bends:
+    if not 0 <= reflections <= settings.bends:
         raise ValueError(
-            f"reflections is {reflections}, outside 0 to {budget.bends}, the max bends. Choose a "
+            f"reflections is {reflections}, outside 0 to {settings.bends}, the max bends. Choose a "
             "number in that range."
         )
     first = jnp.arange(reflections, dtype=jnp.int32)
-    once = first[:, None] == jnp.arange(budget.bends, dtype=jnp.int32)[None]
-    choices = jnp.concatenate([jnp.zeros_like(once, shape=(1, budget.bends)), once])
-    paths = jax.vmap(lambda choice: follow_branch(geometry, ray, choice, budget=budget))(choices)
+    once = first[:, None] == jnp.arange(settings.bends, dtype=jnp.int32)[None]
+    choices = jnp.concatenate([jnp.zeros_like(once, shape=(1, settings.bends)), once])
+    paths = jax.vmap(lambda choice: follow_branch(geometry, ray, choice, settings=settings))(
+        choices
+    )
     # If the main path stays in its medium at a bend, reflection is total there.
     total = paths.media[0, 1:] == paths.media[0, :-1]
     real = jnp.append(True, (paths.bends[1:] > first) & ~total[:reflections])

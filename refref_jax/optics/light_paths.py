@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import ray_differentials
 from refref_jax.optics.media import AMBIENT
-from refref_jax.optics.ray_differentials import Spread
+from refref_jax.optics.ray_differentials import RayDifferential
 
 
 class PathStatus(enum.IntEnum):
@@ -55,14 +55,14 @@ class LightPaths(NamedTuple):
       tau: arc length at the start of each segment, increasing from 0; `inf` where unused.
       ends: arc length at the end of each segment; `inf` for the last, and where unused.
       media: medium of each segment (see `media`).
-      spreads: ray differential of each segment, if carried (see `ray_differentials`).
+      differentials: ray differential of each segment, if carried (see `ray_differentials`).
       rays: index of each path's ray.
       weights: share of the path in its ray's linear RGB.
       radii: footprint of the ray's pixel as a cone radius at unit distance.
       bends: number of refractions and reflections.
       statuses: `PathStatus` of each path.
-      meetings: hit count per part, if tallied (see `path_settings`).
-      passages: path length in each part's medium, world units, if tallied.
+      hit_counts: hit count per part, if tallied (see `path_settings`).
+      path_lengths: path length in each part's medium, world units, if tallied.
     """
 
     points: Float[Array, "paths segments 3"]
@@ -70,14 +70,14 @@ class LightPaths(NamedTuple):
     tau: Float[Array, "paths segments"]
     ends: Float[Array, "paths segments"]
     media: Int[Array, "paths segments"]
-    spreads: Spread
+    differentials: RayDifferential
     rays: Int[Array, " paths"]
     weights: Float[Array, "paths 3"]
     radii: Float[Array, " paths"]
     bends: Int[Array, " paths"]
     statuses: Int[Array, " paths"]
-    meetings: Float[Array, "paths tallied"]
-    passages: Float[Array, "paths tallied"]
+    hit_counts: Float[Array, "paths tallied"]
+    path_lengths: Float[Array, "paths tallied"]
 
 
 class PathEnds(NamedTuple):
@@ -114,14 +114,14 @@ def straight(rays: Rays) -> LightPaths:
         tau=jnp.zeros_like(rays.radii)[:, None],
         ends=jnp.full_like(rays.radii, jnp.inf)[:, None],
         media=jnp.full((count, 1), AMBIENT, jnp.int32),
-        spreads=jax.vmap(jax.vmap(ray_differentials.nothing))(rays.origins[:, None]),
+        differentials=jax.vmap(jax.vmap(ray_differentials.nothing))(rays.origins[:, None]),
         rays=integers,
         weights=jnp.ones_like(rays.directions),
         radii=rays.radii,
         bends=jnp.zeros_like(integers),
         statuses=jnp.full_like(integers, PathStatus.NOT_TRACED),
-        meetings=jnp.zeros_like(rays.origins, shape=(count, 0)),
-        passages=jnp.zeros_like(rays.origins, shape=(count, 0)),
+        hit_counts=jnp.zeros_like(rays.origins, shape=(count, 0)),
+        path_lengths=jnp.zeros_like(rays.origins, shape=(count, 0)),
     )
 
 
@@ -149,10 +149,10 @@ def ends_of(paths: LightPaths) -> PathEnds:
 def filled_up(paths: LightPaths, *, multiple: int) -> LightPaths:
     """Returns the paths, padded with empty slots to a multiple of a number."""
     count = paths.radii.shape[0]
-    room = -(-count // multiple) * multiple
+    capacities = -(-count // multiple) * multiple
     # Empty slots repeat the last path with weight 0, so that their values are finite.
-    paths = jax.tree.map(lambda x: x[jnp.minimum(jnp.arange(room), count - 1)], paths)
-    real = jnp.arange(room) < count
+    paths = jax.tree.map(lambda x: x[jnp.minimum(jnp.arange(capacities), count - 1)], paths)
+    real = jnp.arange(capacities) < count
     return paths._replace(
         weights=jnp.where(real[:, None], paths.weights, 0.0),
         statuses=jnp.where(real, paths.statuses, PathStatus.EMPTY),

@@ -66,7 +66,7 @@ def everything(bends: int) -> Detail:
 
 
 @dataclasses.dataclass(frozen=True)
-class Budget:
+class PathSettings:
     """Path settings: the branches to follow, and the capacity for them.
 
     The capacity factors bound memory, per camera ray traced together. If a buffer is full, the
@@ -143,14 +143,14 @@ class Budget:
 
 
 class CapacityFactors(NamedTuple):
-    """Capacities per camera ray; see `Budget`."""
+    """Capacities per camera ray; see `PathSettings`."""
 
     live_per_ray: float
     segments_per_ray: float
     paths_per_ray: float
 
 
-def capacity_factors(budget: Budget) -> CapacityFactors:
+def capacity_factors(settings: PathSettings) -> CapacityFactors:
     """Returns the capacity factors of path settings; `None` is derived from `cut` and `bends`.
 
     The defaults are generous for images that are partly filled by glass. If all reflections are
@@ -158,22 +158,22 @@ def capacity_factors(budget: Budget) -> CapacityFactors:
     for segments also grows with the max bends. Measured: without this growth, a flask of three
     media drops 0.27 % of its light at a threshold of 0.002.
     """
-    set_here = (budget.live_per_ray, budget.segments_per_ray, budget.paths_per_ray)
-    pairs = zip(set_here, _usual_factors(budget), strict=True)
+    set_here = (settings.live_per_ray, settings.segments_per_ray, settings.paths_per_ray)
+    pairs = zip(set_here, _usual_factors(settings), strict=True)
     return CapacityFactors(*(usual if given is None else given for given, usual in pairs))
 
 
-def _usual_factors(budget: Budget) -> CapacityFactors:
-    if budget.bends == 0:
+def _usual_factors(settings: PathSettings) -> CapacityFactors:
+    if settings.bends == 0:
         return CapacityFactors(1.0, 24.0, 1.0)
-    if budget.reflections != "all":
-        return CapacityFactors(1.0, max(1.0, budget.bends / _PAPER_BENDS) * 11.0, 2.0)
-    segments = max(1.0, budget.bends / _TREE_BENDS) * 24.0
-    growth = math.sqrt(max(1.0, _TREE_CUT / max(budget.cut, _SMALLEST_CUT_WITH_ROOM)))
+    if settings.reflections != "all":
+        return CapacityFactors(1.0, max(1.0, settings.bends / _PAPER_BENDS) * 11.0, 2.0)
+    segments = max(1.0, settings.bends / _TREE_BENDS) * 24.0
+    growth = math.sqrt(max(1.0, _TREE_CUT / max(settings.cut, _SMALLEST_CUT_WITH_ROOM)))
     return CapacityFactors(growth * 6.0, growth * segments, growth * 8.0)
 
 
-class Room(NamedTuple):
+class Capacities(NamedTuple):
     """Capacities of the buffers of a batch of rays, from the capacity factors.
 
     Attributes:
@@ -187,14 +187,14 @@ class Room(NamedTuple):
     paths: int
 
 
-STRAIGHT = Budget(bends=0, reflections="none")
-PAPER = Budget(bends=10, reflections="first")
-TREE = Budget(bends=24, reflections="all", cut=0.02)
+STRAIGHT = PathSettings(bends=0, reflections="none")
+PAPER = PathSettings(bends=10, reflections="first")
+TREE = PathSettings(bends=24, reflections="all", cut=0.02)
 
 PAPER_NO_REFLECTION = dataclasses.replace(PAPER, reflections="none")
 PAPER_NO_TIR = dataclasses.replace(PAPER, total_reflection="ended")
 
-BUDGETS = {
+PATH_PRESETS = {
     "straight": STRAIGHT,
     "paper": PAPER,
     "tree": TREE,
@@ -203,33 +203,35 @@ BUDGETS = {
 }
 
 
-def budget_of(paths: str, *, cut: float | None = None, bends: int | None = None) -> Budget:
+def make_path_settings(
+    paths: str, *, cut: float | None = None, bends: int | None = None
+) -> PathSettings:
     """Returns preset path settings by name, with another throughput threshold or max bends.
 
     Raises:
       ValueError: if rays are straight, but `cut` or `bends` is given.
     """
-    budget = BUDGETS[paths]
+    settings = PATH_PRESETS[paths]
     given: dict[str, Any] = {"cut": cut, "bends": bends}
-    changed = {n: x for n, x in given.items() if x is not None and x != getattr(budget, n)}
-    if budget.bends == 0 and changed:
+    changed = {n: x for n, x in given.items() if x is not None and x != getattr(settings, n)}
+    if settings.bends == 0 and changed:
         raise ValueError(
             f"paths={paths} has no cut and no bends. Leave them out, or use paths=tree."
         )
-    return dataclasses.replace(budget, **changed)
+    return dataclasses.replace(settings, **changed)
 
 
-def room(budget: Budget, rays: int) -> Room:
+def capacities(settings: PathSettings, rays: int) -> Capacities:
     """Returns the capacities for a number of camera rays."""
-    factors = capacity_factors(budget)
-    return Room(
+    factors = capacity_factors(settings)
+    return Capacities(
         live=math.ceil(rays * factors.live_per_ray),
         segments=math.ceil(rays * (1.0 + factors.segments_per_ray)),
         paths=math.ceil(rays * factors.paths_per_ray),
     )
 
 
-def capacity_for(budget: Budget, rays: int, *, mean: float, deviation: float) -> int:
+def capacity_for(settings: PathSettings, rays: int, *, mean: float, deviation: float) -> int:
     """Returns the capacity for the paths of a batch of a scene.
 
     This is one standard deviation above the mean number of paths of a random batch, rounded up to a
@@ -237,11 +239,11 @@ def capacity_for(budget: Budget, rays: int, *, mean: float, deviation: float) ->
     cost of a step is proportional to this capacity; a capacity for all paths would cost 6 % more.
 
     Args:
-      budget: path settings.
+      settings: path settings.
       rays: number of rays in a batch.
       mean: mean number of paths per camera ray of the scene.
       deviation: standard deviation of the number of paths over rays.
     """
-    most = room(budget, rays).paths
+    most = capacities(settings, rays).paths
     needed = rays * mean + math.sqrt(rays) * deviation
     return max(rays, min(most, 8 * math.ceil(needed / 8)))

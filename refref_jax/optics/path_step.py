@@ -22,8 +22,8 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import SurfacePoint
 from refref_jax.optics import fresnel, media, ray_differentials, snell
 from refref_jax.optics.light_paths import PathStatus
-from refref_jax.optics.path_settings import Budget
-from refref_jax.optics.ray_differentials import Bend, Spread
+from refref_jax.optics.path_settings import PathSettings
+from refref_jax.optics.ray_differentials import Bend, RayDifferential
 from refref_jax.optics.scene import Scene
 
 
@@ -116,7 +116,7 @@ class Shares(NamedTuple):
 
 
 def shares(
-    budget: Budget,
+    settings: PathSettings,
     *,
     reflectance: Float[Array, ""],
     total: Bool[Array, ""],
@@ -131,22 +131,22 @@ def shares(
     follow `reflectance` elsewhere, so their gradient is that of Fresnel's equations or 0.
 
     Args:
-      budget: path settings.
+      settings: path settings.
       reflectance: Fresnel's `R`.
       total: whether reflection is total.
       first: whether this is the first surface of a path.
       strength: incident throughput times the interface's tint, the largest of its RGB.
     """
-    if budget.reflections == "all":
+    if settings.reflections == "all":
         partial = reflectance
-    elif budget.reflections == "first":
+    elif settings.reflections == "first":
         partial = jnp.where(first, reflectance, 0.0)
     else:
         partial = jnp.zeros_like(reflectance)
     reflected = jnp.where(total, jnp.ones_like(partial), partial)
     weaker = jnp.minimum(reflected, 1.0 - reflected)
     winner = jnp.where(reflected > 0.5, jnp.ones_like(reflected), jnp.zeros_like(reflected))
-    reflected = jnp.where(weaker * strength < budget.cut, winner, reflected)
+    reflected = jnp.where(weaker * strength < settings.cut, winner, reflected)
     return Shares(reflected, 1.0 - reflected)
 
 
@@ -162,7 +162,7 @@ class RayState(NamedTuple):
       bends: number of bends so far.
       leaving: excluded primitive, the triangle slot that the segment starts on.
       inside: interior list, the parts that the ray is in (see `media`).
-      spread: ray differential of the current segment (see `ray_differentials`).
+      differential: ray differential of the current segment (see `ray_differentials`).
     """
 
     origin: Float[Array, "*rays 3"]
@@ -173,7 +173,7 @@ class RayState(NamedTuple):
     bends: Int[Array, "*rays"]
     leaving: Int[Array, "*rays"]
     inside: Int[Array, "*rays slots"]
-    spread: Spread
+    differential: RayDifferential
 
 
 class Arrival(NamedTuple):
@@ -190,8 +190,8 @@ class Arrival(NamedTuple):
     interaction: Interaction
     length: Float[Array, "*rays"]
     weight: Float[Array, "*rays 3"]
-    reflected: Spread
-    transmitted: Spread
+    reflected: RayDifferential
+    transmitted: RayDifferential
 
 
 class Branches(NamedTuple):
@@ -201,7 +201,7 @@ class Branches(NamedTuple):
     transmitted: RayState
 
 
-def begin(ray: Rays, inside: Int[Array, " slots"], spread: Spread) -> RayState:
+def begin(ray: Rays, inside: Int[Array, " slots"], differential: RayDifferential) -> RayState:
     """Returns the state of a camera ray before its first surface."""
     return RayState(
         origin=ray.origins,
@@ -212,7 +212,7 @@ def begin(ray: Rays, inside: Int[Array, " slots"], spread: Spread) -> RayState:
         bends=jnp.zeros((), jnp.int32),
         leaving=jnp.full((), NO_SLOT, jnp.int32),
         inside=inside,
-        spread=spread,
+        differential=differential,
     )
 
 
@@ -237,7 +237,7 @@ def arrive(geometry: Scene, state: RayState, slot: Int[Array, ""]) -> Arrival:
         return Bend(met.position, met.reflected, met.transmitted), met
 
     met, reflected, transmitted = ray_differentials.bend(
-        surface, state.origin, state.direction, state.spread
+        surface, state.origin, state.direction, state.differential
     )
     length = numerics.length(met.position - state.point)
     passed = media.transmittance(geometry.interfaces, met.sides.medium_near, length)
@@ -246,35 +246,39 @@ def arrive(geometry: Scene, state: RayState, slot: Int[Array, ""]) -> Arrival:
 
 
 def ending(
-    budget: Budget, state: RayState, arrival: Arrival, hit: Bool[Array, ""]
+    settings: PathSettings, state: RayState, arrival: Arrival, hit: Bool[Array, ""]
 ) -> Int[Array, ""]:
     """Returns the status of a path that ends here; `EMPTY` if it bends and continues.
 
     Args:
-      budget: path settings.
+      settings: path settings.
       state: state of the ray.
       arrival: the ray's hit.
       hit: whether the ray hits anything.
     """
     missed = jnp.where(state.bends > 0, PathStatus.ESCAPED, PathStatus.MISSED)
-    met = jnp.where(state.bends < budget.bends, PathStatus.EMPTY, PathStatus.OUT_OF_BENDS)
-    if budget.total_reflection == "ended":
+    met = jnp.where(state.bends < settings.bends, PathStatus.EMPTY, PathStatus.OUT_OF_BENDS)
+    if settings.total_reflection == "ended":
         met = jnp.where(arrival.interaction.total, PathStatus.TOTALLY_REFLECTED, met)
     return jnp.where(hit, met, missed).astype(jnp.int32)
 
 
-def shown(budget: Budget, weight: Float[Array, "3"], status: Int[Array, ""]) -> Float[Array, "3"]:
+def shown(
+    settings: PathSettings, weight: Float[Array, "3"], status: Int[Array, ""]
+) -> Float[Array, "3"]:
     """Returns the weight that a path contributes when it ends with a status."""
-    if budget.unfinished == "kept":
+    if settings.unfinished == "kept":
         return weight
     return jnp.where(status == PathStatus.OUT_OF_BENDS, 0.0, weight)
 
 
-def branch(budget: Budget, state: RayState, arrival: Arrival, slot: Int[Array, ""]) -> Branches:
+def branch(
+    settings: PathSettings, state: RayState, arrival: Arrival, slot: Int[Array, ""]
+) -> Branches:
     """Returns both rays that leave the surface, with their shares of the throughput."""
     met = arrival.interaction
     share = shares(
-        budget,
+        settings,
         reflectance=met.reflectance,
         total=met.total,
         first=state.bends == 0,
@@ -291,13 +295,13 @@ def branch(budget: Budget, state: RayState, arrival: Arrival, slot: Int[Array, "
             origin=met.restart_reflected,
             direction=met.reflected,
             weight=arrival.weight * share.reflected,
-            spread=arrival.reflected,
+            differential=arrival.reflected,
         ),
         transmitted=after._replace(
             origin=met.restart_transmitted,
             direction=met.transmitted,
             weight=arrival.weight * share.transmitted,
             inside=met.sides.inside_after,
-            spread=arrival.transmitted,
+            differential=arrival.transmitted,
         ),
     )

@@ -26,7 +26,7 @@ from refref_jax.optics.light_paths import (
     straight,
     straight_ends,
 )
-from refref_jax.optics.path_settings import Budget, Detail, room
+from refref_jax.optics.path_settings import Detail, PathSettings, capacities
 from refref_jax.optics.scene import Scene
 from refref_jax.optics.wavefront import BLOCK, follow
 
@@ -77,7 +77,7 @@ def trace_ends(
     geometry: Scene,
     rays: Rays,
     *,
-    budget: Budget,
+    settings: PathSettings,
     inside: Int[Array, "rays slots"] | None = None,
     block: int = BLOCK,
 ) -> TracedEnds:
@@ -86,18 +86,18 @@ def trace_ends(
     Args:
       geometry: the scene.
       rays: camera rays.
-      budget: path settings.
+      settings: path settings.
       inside: interior list of each camera, for the rule `priority` (see `data.mesh_queries`); none
         by default. The other rules do not use it.
       block: number of rays cast at once, see `wavefront`.
     """
     geometry, rays = scene.in_one_precision(geometry, rays)
-    if _needs_no_tracing(rays, budget):
+    if _needs_no_tracing(rays, settings):
         return TracedEnds(
             straight_ends(rays), jnp.zeros_like(rays.origins), jnp.zeros((), jnp.int32)
         )
-    tree = follow(geometry, rays, _inside(geometry, rays, inside), budget=budget, block=block)
-    ends = path_tree.listed(tree, room(budget, rays.radii.shape[0]).paths)
+    tree = follow(geometry, rays, _inside(geometry, rays, inside), settings=settings, block=block)
+    ends = path_tree.listed(tree, capacities(settings, rays.radii.shape[0]).paths)
     last = path_tree.last_segments(tree.segments.items, ends)
     return TracedEnds(last, tree.lost, tree.casts)
 
@@ -106,7 +106,7 @@ def trace(
     geometry: Scene,
     rays: Rays,
     *,
-    budget: Budget,
+    settings: PathSettings,
     capacity: int | None = None,
     detail: Detail | None = None,
     inside: Int[Array, "rays slots"] | None = None,
@@ -116,7 +116,7 @@ def trace(
     Args:
       geometry: the scene.
       rays: camera rays.
-      budget: path settings.
+      settings: path settings.
       capacity: capacity for paths; by default that of the path settings for this number of rays,
         which is more than most scenes need, see `path_settings.capacity_for`. Unused if max bends
         is 0 or there are no rays.
@@ -129,11 +129,11 @@ def trace(
       >>> import functools
       >>> import jax, numpy as np, trimesh
       >>> import refref_jax
-      >>> glass = refref_jax.single_body(trimesh.creation.box(), index=1.5)
+      >>> glass = refref_jax.single_object(trimesh.creation.box(), index=1.5)
       >>> towards = np.array([[1.0, 0.0, 0.0]])
       >>> rays = refref_jax.Rays(np.array([[-2.0, 0.1, 0.2]]), towards, np.full(1, 1e-3))
-      >>> budget = refref_jax.Budget(bends=1, reflections="all")
-      >>> trace = jax.jit(functools.partial(refref_jax.trace, budget=budget))
+      >>> settings = refref_jax.PathSettings(bends=1, reflections="all")
+      >>> trace = jax.jit(functools.partial(refref_jax.trace, settings=settings))
       >>> paths = trace(glass, rays).paths  # each ray's heaviest path first
       >>> print(np.round(paths.weights[:2, 0], 2), paths.bends[:2], paths.tau[0, :2])
       [0.96 0.04] [1 1] [0.  1.5]
@@ -142,7 +142,7 @@ def trace(
     if inside is not None:
         inside = inside[None]
     traced = trace_batches(
-        geometry, batch, budget=budget, capacity=capacity, detail=detail, inside=inside
+        geometry, batch, settings=settings, capacity=capacity, detail=detail, inside=inside
     )
     return jax.tree.map(lambda x: x[0], traced)
 
@@ -151,7 +151,7 @@ def trace_batches(
     geometry: Scene,
     rays: Rays,
     *,
-    budget: Budget,
+    settings: PathSettings,
     capacity: int | None = None,
     detail: Detail | None = None,
     inside: Int[Array, "batches rays slots"] | None = None,
@@ -161,7 +161,7 @@ def trace_batches(
     Args:
       geometry: the scene.
       rays: camera rays `[batches, rays]`.
-      budget: path settings.
+      settings: path settings.
       capacity: capacity for the paths of each batch, as in `trace`.
       detail: parts of the paths to store, as in `trace`.
       inside: interior list of each camera, as in `trace_ends`.
@@ -170,16 +170,16 @@ def trace_batches(
       The paths of each batch, stacked; ray indices count within a batch.
     """
     geometry, rays = scene.in_one_precision(geometry, rays)
-    if _needs_no_tracing(rays, budget):
+    if _needs_no_tracing(rays, settings):
         return jax.vmap(lambda batch: Traced(straight(batch), jnp.zeros_like(batch.origins)))(rays)
     batches, count = rays.radii.shape
-    capacity = room(budget, count).paths if capacity is None else capacity
+    capacity = capacities(settings, count).paths if capacity is None else capacity
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
     if inside is not None:
         inside = inside.reshape(batches * count, inside.shape[-1])
-    detail = detail or path_settings.everything(budget.bends)
+    detail = detail or path_settings.everything(settings.bends)
     inside = _inside(geometry, flat, inside)
-    tree = follow(geometry, flat, inside, budget=budget, footprint=detail.footprint)
+    tree = follow(geometry, flat, inside, settings=settings, footprint=detail.footprint)
     ends, lost = path_tree.pack(tree, batches, count, capacity)
     paths = path_tree.polylines(
         tree.segments.items,
@@ -192,10 +192,10 @@ def trace_batches(
     return Traced(paths._replace(rays=paths.rays % count), lost.reshape(batches, count, 3))
 
 
-def survey(geometry: Scene, rays: Rays, *, budget: Budget) -> Survey:
+def survey(geometry: Scene, rays: Rays, *, settings: PathSettings) -> Survey:
     """Measures the path statistics that determine the capacity for batches of rays."""
     count = rays.radii.shape[0]
-    ends = trace_ends(geometry, rays, budget=budget).ends
+    ends = trace_ends(geometry, rays, settings=settings).ends
     one = exists(ends).astype(jnp.float32)
     paths = jax.ops.segment_sum(one, ends.rays, num_segments=count)
     untraced = (ends.statuses == PathStatus.NOT_TRACED) & (ends.bends == 0)
@@ -203,8 +203,8 @@ def survey(geometry: Scene, rays: Rays, *, budget: Budget) -> Survey:
     return Survey(jnp.mean(paths), jnp.std(paths), 1.0 - missing / count)
 
 
-def _needs_no_tracing(rays: Rays, budget: Budget) -> bool:
-    return budget.bends == 0 or rays.radii.size == 0
+def _needs_no_tracing(rays: Rays, settings: PathSettings) -> bool:
+    return settings.bends == 0 or rays.radii.size == 0
 
 
 def _inside(

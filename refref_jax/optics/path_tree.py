@@ -22,7 +22,7 @@ from refref_jax.optics.light_paths import LightPaths, PathEnds, PathStatus
 from refref_jax.optics.media import AMBIENT
 from refref_jax.optics.path_settings import Detail
 from refref_jax.optics.queues import Pool
-from refref_jax.optics.ray_differentials import Spread
+from refref_jax.optics.ray_differentials import RayDifferential
 
 NO_SEGMENT = -1
 """Parent of a camera ray's first segment."""
@@ -41,7 +41,7 @@ class Segments(NamedTuple):
       tau: arc length from the camera to the start.
       media: medium of the segment (see `media`).
       parts: part on whose surface the segment starts, or `media.EMPTY_SLOT`.
-      spreads: ray differential of the segment (see `ray_differentials`).
+      differentials: ray differential of the segment (see `ray_differentials`).
     """
 
     parents: Int[Array, " segments"]
@@ -50,7 +50,7 @@ class Segments(NamedTuple):
     tau: Float[Array, " segments"]
     media: Int[Array, " segments"]
     parts: Int[Array, " segments"]
-    spreads: Spread
+    differentials: RayDifferential
 
 
 class Ends(NamedTuple):
@@ -160,14 +160,14 @@ def polylines(
         tau=jnp.where(used, read.tau, jnp.inf),
         ends=jnp.where(used, stop, jnp.inf),
         media=jnp.where(used, read.media, AMBIENT),
-        spreads=read.spreads,
+        differentials=read.differentials,
         rays=ends.rays,
         weights=ends.weights,
         radii=radii,
         bends=ends.bends,
         statuses=ends.statuses,
-        meetings=walk.meetings,
-        passages=walk.passages,
+        hit_counts=walk.hit_counts,
+        path_lengths=walk.path_lengths,
     )
 
 
@@ -180,8 +180,8 @@ class _Walk(NamedTuple):
       found: number of selected segments so far.
       picked: selected segments, right-aligned; the first segment of a path goes leftmost.
       stops: arc lengths at the ends of the selected segments.
-      meetings: hit counts so far.
-      passages: path lengths so far.
+      hit_counts: hit counts so far.
+      path_lengths: path lengths so far.
     """
 
     segment: Int[Array, " paths"]
@@ -189,8 +189,8 @@ class _Walk(NamedTuple):
     found: Int[Array, " paths"]
     picked: Int[Array, "paths most"]
     stops: Float[Array, "paths most"]
-    meetings: Float[Array, "paths tallied"]
-    passages: Float[Array, "paths tallied"]
+    hit_counts: Float[Array, "paths tallied"]
+    path_lengths: Float[Array, "paths tallied"]
 
 
 def _walk_back(segments: Segments, ends: Ends, detail: Detail, tallied: int) -> _Walk:
@@ -215,8 +215,8 @@ def _walk_back(segments: Segments, ends: Ends, detail: Detail, tallied: int) -> 
             found=walk.found + wanted.astype(jnp.int32),
             picked=jnp.where(here, at[:, None], walk.picked),
             stops=jnp.where(here, walk.stop[:, None], walk.stops),
-            meetings=walk.meetings + met.astype(none.dtype),
-            passages=walk.passages + jnp.where(through, length[:, None], 0.0),
+            hit_counts=walk.hit_counts + met.astype(none.dtype),
+            path_lengths=walk.path_lengths + jnp.where(through, length[:, None], 0.0),
         )
 
     start = _Walk(
@@ -225,8 +225,8 @@ def _walk_back(segments: Segments, ends: Ends, detail: Detail, tallied: int) -> 
         found=jnp.zeros_like(ends.segments),
         picked=jnp.zeros((count, detail.most), jnp.int32),
         stops=jnp.full_like(none, jnp.inf, shape=(count, detail.most)),
-        meetings=none,
-        passages=none,
+        hit_counts=none,
+        path_lengths=none,
     )
     # Every segment has one bend more than its parent, so the loop terminates.
     return jax.lax.while_loop(lambda walk: jnp.any(walk.segment != NO_SEGMENT), step, start)
@@ -246,22 +246,22 @@ def pack(
     Returns:
       The concatenated lists, and the throughput dropped so far for each ray.
     """
-    room = min(batches * capacity, tree.ends.items.rays.shape[0])
-    pool, lost = queues.shed(tree.ends, tree.lost, room)
-    ends = listed(tree._replace(ends=pool), room)
+    capacities = min(batches * capacity, tree.ends.items.rays.shape[0])
+    pool, lost = queues.shed(tree.ends, tree.lost, capacities)
+    ends = listed(tree._replace(ends=pool), capacities)
     weight = jnp.max(ends.weights, axis=-1)
     # The slots past the last path form a batch of their own.
-    lanes = jnp.arange(room, dtype=jnp.int32)
+    lanes = jnp.arange(capacities, dtype=jnp.int32)
     batch = jnp.where(lanes < pool.count, ends.rays // rays, batches)
     fits = _strongest_of_each(batch, weight, batches, capacity)
     order = jnp.lexsort((-weight, jnp.where(fits, ends.rays, batches * rays))).astype(jnp.int32)
     group = jnp.where(fits, batch, batches)[order]
     target = jnp.where(fits[order], group * capacity + _rank_in_group(group, batches), _NOWHERE)
-    source = jnp.full(batches * capacity, room, jnp.int32).at[target].set(order, mode="drop")
-    packed = jax.tree.map(lambda x: x[jnp.minimum(source, room - 1)], ends)
+    source = jnp.full(batches * capacity, capacities, jnp.int32).at[target].set(order, mode="drop")
+    packed = jax.tree.map(lambda x: x[jnp.minimum(source, capacities - 1)], ends)
     home = jnp.repeat(jnp.arange(batches, dtype=jnp.int32) * rays, capacity)
     lost = queues.lose(lost, ends.rays, ends.weights, ~fits)
-    return emptied(packed, source == room, home), lost
+    return emptied(packed, source == capacities, home), lost
 
 
 def _strongest_of_each(

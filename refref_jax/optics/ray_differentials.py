@@ -31,7 +31,7 @@ _WIDEST = 1e6
 _Result = TypeVar("_Result")
 
 
-class Spread(NamedTuple):
+class RayDifferential(NamedTuple):
     """Ray differential: derivatives of a ray across its pixel; zero axes if they are not carried.
 
     Attributes:
@@ -57,55 +57,59 @@ class Bend(NamedTuple):
     transmitted: Float[Array, "3"]
 
 
-def begin(ray: Rays, footprint: Footprint) -> Spread:
+def begin(ray: Rays, footprint: Footprint) -> RayDifferential:
     """Returns the ray differential of a camera ray: all rays of a pixel start at one point."""
     if footprint == "cone":
         return nothing(ray.origins)
     sides = ray.radii * jnp.stack(orthonormal_basis(ray.directions))
-    return Spread(jnp.zeros_like(sides), sides)
+    return RayDifferential(jnp.zeros_like(sides), sides)
 
 
-def nothing(like: Float[Array, "3"]) -> Spread:
+def nothing(like: Float[Array, "3"]) -> RayDifferential:
     """Returns the empty ray differential of a ray whose derivatives are not carried."""
     none = jnp.zeros((0, 3), like.dtype)
-    return Spread(none, none)
+    return RayDifferential(none, none)
 
 
 def bend(
     surface: Callable[[Array, Array], tuple[Bend, _Result]],
     origin: Float[Array, "3"],
     direction: Float[Array, "3"],
-    spread: Spread,
-) -> tuple[_Result, Spread, Spread]:
+    differential: RayDifferential,
+) -> tuple[_Result, RayDifferential, RayDifferential]:
     """Bends a ray and its differential.
 
     Args:
       surface: function of origin and direction that returns a `Bend` and an auxiliary output.
       origin: origin of the ray.
       direction: unit direction of the ray.
-      spread: differential of the ray.
+      differential: differential of the ray.
 
     Returns:
       The auxiliary output, and the differentials of the reflected and the transmitted ray.
     """
-    if spread.points.shape[0] == 0:
-        return surface(origin, direction)[1], spread, spread
+    if differential.points.shape[0] == 0:
+        return surface(origin, direction)[1], differential, differential
     _, push, result = jax.linearize(surface, origin, direction, has_aux=True)
-    moved = jax.vmap(push)(spread.points, spread.directions)
+    moved = jax.vmap(push)(differential.points, differential.directions)
     moved = jax.tree.map(lambda x: jnp.clip(x, -_WIDEST, _WIDEST), moved)
-    return result, Spread(moved.point, moved.reflected), Spread(moved.point, moved.transmitted)
+    return (
+        result,
+        RayDifferential(moved.point, moved.reflected),
+        RayDifferential(moved.point, moved.transmitted),
+    )
 
 
 def across(
-    spread: Spread, along: Float[Array, ""], direction: Float[Array, "3"]
+    differential: RayDifferential, along: Float[Array, ""], direction: Float[Array, "3"]
 ) -> Float[Array, "axes 3"]:
     """Returns the half axes of a footprint in the plane perpendicular to its ray.
 
     Args:
-      spread: ray differential of the segment.
+      differential: ray differential of the segment.
       along: distance from the segment's start, world units.
       direction: unit direction of the segment.
     """
-    moved = spread.points + along * spread.directions
+    moved = differential.points + along * differential.directions
     rows = jnp.broadcast_to(direction, moved.shape)
     return moved - numerics.dot(moved, rows)[:, None] * rows

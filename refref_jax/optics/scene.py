@@ -40,7 +40,7 @@ def with_index(geometry: Scene, index: Float[ArrayLike, ""], *, part: int = 0) -
     Example:
       >>> import trimesh
       >>> import refref_jax
-      >>> box = refref_jax.single_body(trimesh.creation.box(), index=1.5)
+      >>> box = refref_jax.single_object(trimesh.creation.box(), index=1.5)
       >>> float(refref_jax.with_index(box, 1.25).interfaces.index_inside[0])
       1.25
     """

@@ -29,7 +29,7 @@ from refref_jax.geometry import bvh
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import media, path_settings, path_step, path_tree, queues, ray_differentials
 from refref_jax.optics.light_paths import PathStatus
-from refref_jax.optics.path_settings import Budget, Room
+from refref_jax.optics.path_settings import Capacities, PathSettings
 from refref_jax.optics.path_step import Arrival, Branches, RayState
 from refref_jax.optics.path_tree import NO_SEGMENT, Ends, PathTree, Segments
 from refref_jax.optics.queues import Pool
@@ -87,15 +87,15 @@ def children_of(
     branches: Branches,
     arrival: Arrival,
     bending: Bool[Array, " block"],
-    budget: Budget,
+    settings: PathSettings,
 ) -> Children:
     """Returns the child rays of the rays that bend."""
     sides = arrival.interaction.sides
     states = queues.join(branches.reflected, branches.transmitted)
     mediums = queues.join(sides.medium_near, sides.medium_far)
-    untraced = ~arrival.interaction.total & (budget.reflections == "first")
+    untraced = ~arrival.interaction.total & (settings.reflections == "first")
     traced = queues.join(~untraced, jnp.ones_like(bending))
-    if budget.reentry == "impossible":
+    if settings.reentry == "impossible":
         traced &= mediums != media.AMBIENT
     return Children(
         live=Live(
@@ -108,10 +108,10 @@ def children_of(
     )
 
 
-def log(tree: PathTree, children: Children, room: Room) -> tuple[PathTree, Children]:
+def log(tree: PathTree, children: Children, capacities: Capacities) -> tuple[PathTree, Children]:
     """Stores the segments of children; drops the weakest children if the buffer is full."""
     live = children.live
-    left = room.segments - tree.segments.count
+    left = capacities.segments - tree.segments.count
     kept = queues.strongest(children.exists, jnp.max(live.weights, axis=-1), left)
     index = tree.segments.count + jnp.cumsum(kept, dtype=jnp.int32) - 1
     state = live.state
@@ -122,7 +122,7 @@ def log(tree: PathTree, children: Children, room: Room) -> tuple[PathTree, Child
         state.tau,
         children.media,
         children.parts,
-        state.spread,
+        state.differential,
     )
     log = queues.append(tree.segments, logged, kept)
     lost = queues.lose(tree.lost, live.rays, live.weights, children.exists & ~kept)
@@ -130,28 +130,30 @@ def log(tree: PathTree, children: Children, room: Room) -> tuple[PathTree, Child
     return tree._replace(segments=log, lost=lost), children
 
 
-def push(tree: PathTree, stack: Pool, children: Children, budget: Budget) -> tuple[PathTree, Pool]:
+def push(
+    tree: PathTree, stack: Pool, children: Children, settings: PathSettings
+) -> tuple[PathTree, Pool]:
     """Pushes children on the stack, and ends those that are not traced further.
 
     The latter are the paper's first reflections, and rays that cannot hit an object again.
     """
     live = children.live
-    if budget.reflections == "first" or budget.reentry == "impossible":
-        escapes = (budget.reentry == "impossible") & (children.media == media.AMBIENT)
+    if settings.reflections == "first" or settings.reentry == "impossible":
+        escapes = (settings.reentry == "impossible") & (children.media == media.AMBIENT)
         status = jnp.where(escapes, PathStatus.ESCAPED, PathStatus.NOT_TRACED).astype(jnp.int32)
         tree = end(tree, live, status, children.exists & ~children.traced)
     return tree, queues.append(stack, live, children.exists & children.traced)
 
 
 def end_by(
-    budget: Budget,
+    settings: PathSettings,
     tree: PathTree,
     live: Live,
     status: Int[Array, " n"],
     ending: Bool[Array, " n"],
 ) -> PathTree:
     """Ends some rays as paths; the weight of paths that the settings make black is dropped."""
-    weights = jax.vmap(functools.partial(path_step.shown, budget))(live.weights, status)
+    weights = jax.vmap(functools.partial(path_step.shown, settings))(live.weights, status)
     lost = queues.lose(tree.lost, live.rays, live.weights - weights, ending)
     live = live._replace(state=live.state._replace(weight=weights))
     return end(tree._replace(lost=lost), live, status, ending)
@@ -184,7 +186,7 @@ def follow(
     rays: Rays,
     inside: Int[Array, "rays slots"],
     *,
-    budget: Budget,
+    settings: PathSettings,
     footprint: Footprint = "cone",
     block: int = BLOCK,
 ) -> PathTree:
@@ -194,16 +196,16 @@ def follow(
       geometry: the scene.
       rays: any number of camera rays.
       inside: interior list of each camera (see `media.nowhere`).
-      budget: path settings, with at least one bend.
+      settings: path settings, with at least one bend.
       footprint: `differential` carries derivatives across the pixel.
       block: number of rays cast per iteration.
     """
-    return _follow(budget, footprint, block, geometry, rays, inside)
+    return _follow(settings, footprint, block, geometry, rays, inside)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
 def _follow(
-    budget: Budget,
+    settings: PathSettings,
     footprint: Footprint,
     block: int,
     geometry: Scene,
@@ -212,22 +214,28 @@ def _follow(
 ) -> PathTree:
     count = rays.radii.shape[0]
     block = max(1, min(block, count))
-    room = path_settings.room(budget, count)
-    walk = _begin(rays, inside, footprint, block, room)
+    capacities = path_settings.capacities(settings, count)
+    walk = _begin(rays, inside, footprint, block, capacities)
     if count < _MANY_BLOCKS * block or block < _SMALLER:
-        return _work_off(geometry, walk, budget, block, room, least=1).tree
+        return _work_off(geometry, walk, settings, block, capacities, least=1).tree
     # Otherwise the few deepest rays would cast a full block in each iteration.
-    walk = _work_off(geometry, walk, budget, block, room, least=block // 4)
+    walk = _work_off(geometry, walk, settings, block, capacities, least=block // 4)
     stack = queues.append(
         walk.stack, walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
     )
     small = block // _SMALLER
     walk = _Walk(*queues.pop(stack, small), walk.tree)
-    return _work_off(geometry, walk, budget, small, room, least=1).tree
+    return _work_off(geometry, walk, settings, small, capacities, least=1).tree
 
 
 def _work_off(
-    geometry: Scene, walk: _Walk, budget: Budget, block: int, room: Room, *, least: int
+    geometry: Scene,
+    walk: _Walk,
+    settings: PathSettings,
+    block: int,
+    capacities: Capacities,
+    *,
+    least: int,
 ) -> _Walk:
     """Casts blocks until fewer than `least` rays are left."""
 
@@ -235,16 +243,16 @@ def _work_off(
         return walk.next.count + walk.stack.count >= least
 
     def fits(walk: _Walk) -> Bool[Array, ""]:
-        return (walk.stack.count <= room.live) & (walk.tree.ends.count <= room.paths)
+        return (walk.stack.count <= capacities.live) & (walk.tree.ends.count <= capacities.paths)
 
     def advance(walk: _Walk) -> _Walk:
         walk = jax.lax.while_loop(
             lambda walk: unfinished(walk) & fits(walk),
-            lambda walk: _round(geometry, walk, budget, block, room),
+            lambda walk: _round(geometry, walk, settings, block, capacities),
             walk,
         )
-        stack, lost = queues.shed(walk.stack, walk.tree.lost, room.live)
-        ends, lost = queues.shed(walk.tree.ends, lost, room.paths)
+        stack, lost = queues.shed(walk.stack, walk.tree.lost, capacities.live)
+        ends, lost = queues.shed(walk.tree.ends, lost, capacities.paths)
         return _Walk(stack, walk.next, walk.tree._replace(ends=ends, lost=lost))
 
     return jax.lax.while_loop(unfinished, advance, walk)
@@ -252,9 +260,9 @@ def _work_off(
 
 @_follow.defjvp
 def _refuse_gradients(
-    budget: Budget, footprint: Footprint, block: int, primals: object, tangents: object
+    settings: PathSettings, footprint: Footprint, block: int, primals: object, tangents: object
 ) -> NoReturn:
-    del budget, footprint, block, primals, tangents
+    del settings, footprint, block, primals, tangents
     raise TypeError(
         "Light paths of trace have no derivatives with respect to rays or geometry. Use "
         "follow_branch or follow_main_branches, or hold rays and geometry constant with "
@@ -263,51 +271,57 @@ def _refuse_gradients(
 
 
 def _begin(
-    rays: Rays, inside: Int[Array, "rays slots"], footprint: Footprint, block: int, room: Room
+    rays: Rays,
+    inside: Int[Array, "rays slots"],
+    footprint: Footprint,
+    block: int,
+    capacities: Capacities,
 ) -> _Walk:
     """Pushes the camera rays on the stack and stores their segments."""
     count = rays.radii.shape[0]
     order = jnp.arange(count, dtype=jnp.int32)
-    spread = jax.vmap(lambda ray: ray_differentials.begin(ray, footprint))(rays)
-    state = jax.vmap(path_step.begin)(rays, inside, spread)
+    differential = jax.vmap(lambda ray: ray_differentials.begin(ray, footprint))(rays)
+    state = jax.vmap(path_step.begin)(rays, inside, differential)
     ambient = jnp.full_like(order, media.AMBIENT)
     first = jnp.full_like(order, NO_SEGMENT)
     nowhere = jnp.full_like(order, media.EMPTY_SLOT)
     segments = Segments(
-        first, state.point, state.direction, state.tau, ambient, nowhere, state.spread
+        first, state.point, state.direction, state.tau, ambient, nowhere, state.differential
     )
     ends = Ends(order, order, state.weight, order, order)
     # Each buffer has slots beyond its capacity for the records that one iteration may append.
     tree = PathTree(
-        segments=queues.fill(segments, count, room.segments + 2 * block),
-        ends=queues.fill(ends, 0, room.paths + 3 * block),
+        segments=queues.fill(segments, count, capacities.segments + 2 * block),
+        ends=queues.fill(ends, 0, capacities.paths + 3 * block),
         lost=jnp.zeros_like(rays.origins),
         casts=jnp.zeros((), jnp.int32),
     )
-    stack = queues.fill(Live(state, order, order), count, room.live + 2 * block)
+    stack = queues.fill(Live(state, order, order), count, capacities.live + 2 * block)
     return _Walk(*queues.pop(stack, block), tree)
 
 
-def _round(geometry: Scene, walk: _Walk, budget: Budget, block: int, room: Room) -> _Walk:
+def _round(
+    geometry: Scene, walk: _Walk, settings: PathSettings, block: int, capacities: Capacities
+) -> _Walk:
     """Casts one block, ends paths, and pushes the children on the stack."""
     live, alive = walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
     hits = _cast(geometry, live.state, alive)
     arrive = jax.vmap(path_step.arrive, in_axes=(None, 0, 0))
     arrival = arrive(geometry, live.state, hits.slots)
     hit = alive & jnp.isfinite(hits.distances)
-    status = jax.vmap(functools.partial(path_step.ending, budget))(live.state, arrival, hit)
+    status = jax.vmap(functools.partial(path_step.ending, settings))(live.state, arrival, hit)
     bending = hit & (status == PathStatus.EMPTY)
     tree = walk.tree._replace(casts=walk.tree.casts + jnp.sum(alive, dtype=jnp.int32))
     medium = arrival.interaction.sides.medium_near
     # The medium of a camera is known only from the first surface it sees.
     tree = path_tree.name_media(tree, live.segments, medium, hit & (live.state.bends == 0))
-    tree = end_by(budget, tree, live, status, alive & ~bending)
-    branches = jax.vmap(functools.partial(path_step.branch, budget))(
+    tree = end_by(settings, tree, live, status, alive & ~bending)
+    branches = jax.vmap(functools.partial(path_step.branch, settings))(
         live.state, arrival, hits.slots
     )
-    children = children_of(live, branches, arrival, bending, budget)
-    tree, children = log(tree, children, room)
-    tree, stack = push(tree, walk.stack, children, budget)
+    children = children_of(live, branches, arrival, bending, settings)
+    tree, children = log(tree, children, capacities)
+    tree, stack = push(tree, walk.stack, children, settings)
     return _Walk(*queues.pop(stack, block), tree)
 
 

@@ -34,13 +34,13 @@ from jaxtyping import Array, Float, Int
 
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.differentiable_paths import follow_main_branches
-from refref_jax.optics.path_settings import Budget
+from refref_jax.optics.path_settings import PathSettings
 from refref_jax.optics.scene import Scene, with_index
 from refref_jax.reconstruct import ReconstructionError
 from refref_jax.render import pixels
 from refref_jax.render.model import ModelConfig, Params
 
-TRACING = Budget(bends=12, reflections="all", cut=0.02)
+TRACING = PathSettings(bends=12, reflections="all", cut=0.02)
 """Threshold as in the tree, half as many bends: the main branches of few rays are longer."""
 
 REFLECTIONS = 3
@@ -73,7 +73,7 @@ class Slope(NamedTuple):
 
 
 def errors(
-    evidence: Evidence, geometry: Scene, *, config: ModelConfig, budget: Budget = TRACING
+    evidence: Evidence, geometry: Scene, *, config: ModelConfig, settings: PathSettings = TRACING
 ) -> Float[Array, " rays"]:
     """Returns the Charbonnier error of each pixel in sRGB, of the length of the difference.
 
@@ -81,7 +81,7 @@ def errors(
       evidence: pixels and the field to compare with.
       geometry: scene that refracts their rays.
       config: configuration of the field's model; its footprint must be `cone`.
-      budget: path settings, see `differentiable_paths`.
+      settings: path settings, see `differentiable_paths`.
 
     Raises:
       ValueError: if the model's footprint is not `cone`.
@@ -93,7 +93,7 @@ def errors(
         )
     count = evidence.rays.radii.shape[0]
     follow = functools.partial(
-        follow_main_branches, geometry, budget=budget, reflections=REFLECTIONS
+        follow_main_branches, geometry, settings=settings, reflections=REFLECTIONS
     )
     branches = jax.vmap(follow)(evidence.rays)
     paths = jax.tree.map(lambda x: x.reshape(count * (1 + REFLECTIONS), *x.shape[2:]), branches)

@@ -8,8 +8,8 @@ background (`radiance_of`): `render_known` renders it in tiles, and `shade` is t
 """
 
 from refref_jax.geometry.rays import Rays as Rays
-from refref_jax.optics.path_settings import BUDGETS as BUDGETS
-from refref_jax.optics.path_settings import Budget as Budget
+from refref_jax.optics.path_settings import PATH_PRESETS as PATH_PRESETS
+from refref_jax.optics.path_settings import PathSettings as PathSettings
 from refref_jax.render.background_rendering import KnownRendering as KnownRendering
 from refref_jax.render.background_rendering import render_known as render_known
 from refref_jax.render.background_rendering import shade as shade

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import LightPaths, PathEnds
-from refref_jax.optics.path_settings import Budget
+from refref_jax.optics.path_settings import PathSettings
 from refref_jax.optics.scene import Scene
 from refref_jax.render import colour, images
 from refref_jax.render.backgrounds import Radiance
@@ -72,7 +72,7 @@ def render_known(
     radiance: Radiance,
     rays: Rays,
     *,
-    budget: Budget,
+    settings: PathSettings,
     inside: Int[np.ndarray, "*rays slots"] | None = None,
     tile: int = TILE,
 ) -> KnownRendering:
@@ -82,7 +82,7 @@ def render_known(
       geometry: the scene.
       radiance: function of origin and direction that returns the background's linear RGB.
       rays: camera rays with any leading axes, usually `[height, width]`.
-      budget: path settings.
+      settings: path settings.
       inside: interior list of each ray's origin, for the rule `priority` (see
         `data.containment.parts_around`); none by default.
       tile: number of rays traced at once. Lower it if memory runs out. The rays of a tile share the
@@ -96,11 +96,11 @@ def render_known(
       >>> import trimesh
       >>> import refref_jax
       >>> from refref_jax.render import render_known
-      >>> glass = refref_jax.single_body(trimesh.creation.box(), index=1.5)
+      >>> glass = refref_jax.single_object(trimesh.creation.box(), index=1.5)
       >>> camera = refref_jax.orbit(1, distance=4.0, elevation=0.3, size=4, angle_x=0.5)
       >>> rays = refref_jax.image_rays(camera, 0)
       >>> sky = lambda origin, direction: 0.5 + 0.5 * direction
-      >>> picture = render_known(glass, sky, rays, budget=refref_jax.BUDGETS["straight"])
+      >>> picture = render_known(glass, sky, rays, settings=refref_jax.PATH_PRESETS["straight"])
       >>> picture.rgb.shape, picture.casts
       ((4, 4, 3), 0)
     """
@@ -119,9 +119,9 @@ def render_known(
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         # Each padding ray misses, which counts as one cast if rays are cast at all.
         seen: Any = images.fetch(
-            _render_tile(geometry, radiance, rays, inside, budget=budget), instead=_INSTEAD
+            _render_tile(geometry, radiance, rays, inside, settings=settings), instead=_INSTEAD
         )
-        casts.append(int(seen.casts) - (tile - real) * (budget.bends > 0))
+        casts.append(int(seen.casts) - (tile - real) * (settings.bends > 0))
         return seen[:-1]
 
     fields = images.in_tiles(
@@ -154,7 +154,7 @@ def shade(paths: LightPaths | PathEnds, radiance: Radiance, *, rays: int) -> Flo
       >>> from refref_jax.render import shade
       >>> ray = refref_jax.Rays(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.full(1, 1e-3))
       >>> empty = refref_jax.assemble([])
-      >>> paths = refref_jax.trace(empty, ray, budget=refref_jax.BUDGETS["straight"]).paths
+      >>> paths = refref_jax.trace(empty, ray, settings=refref_jax.PATH_PRESETS["straight"]).paths
       >>> shade(paths, lambda origin, direction: 0.5 + 0.5 * direction, rays=1).tolist()
       [[0.5, 0.5, 1.0]]
     """
@@ -178,17 +178,17 @@ def _blank() -> KnownRendering:
     return KnownRendering(nothing, nothing, np.zeros(0, np.int32), nothing, casts=0)
 
 
-@functools.partial(jax.jit, static_argnames="budget")
+@functools.partial(jax.jit, static_argnames="settings")
 def _render_tile(
     geometry: Scene,
     radiance: Radiance,
     rays: Rays,
     inside: Int[Array, "rays slots"] | None,
     *,
-    budget: Budget,
+    settings: PathSettings,
 ) -> _Tile:
     count = rays.radii.shape[0]
-    traced = path_tracing.trace_ends(geometry, rays, budget=budget, inside=inside)
+    traced = path_tracing.trace_ends(geometry, rays, settings=settings, inside=inside)
     ends = traced.ends
     linear = _sum_light(radiance, ends, count)
     exists = light_paths.exists(ends).astype(jnp.int32)

@@ -23,7 +23,7 @@ from refref_jax.fields import registry
 from refref_jax.geometry.bvh import BVH
 from refref_jax.geometry.surfaces import Surfaces
 from refref_jax.optics.media import Interfaces
-from refref_jax.optics.path_settings import Budget
+from refref_jax.optics.path_settings import PathSettings
 from refref_jax.optics.scene import Scene
 from refref_jax.render.model import Model, ModelConfig, Params, init_params
 
@@ -42,11 +42,11 @@ class SavedModel:
 
     Attributes:
       config: configuration of the fields and the sampling.
-      budget: path settings.
+      settings: path settings.
     """
 
     config: ModelConfig
-    budget: Budget
+    settings: PathSettings = dataclasses.field(metadata={configuration.FORMERLY: "budget"})
 
 
 def save_scene(run: Path, saved: SavedModel, geometry: Scene) -> None:
@@ -91,7 +91,7 @@ def load_model(run: str | os.PathLike[str], *, step: int | None = None) -> Model
     # Restored arrays are committed to a device, and so are all results computed from them. The
     # initial sums of an image are not, so their chunk would be compiled separately.
     unbound = jax.tree.map(jnp.asarray, jax.device_get(params))
-    return Model(saved.config, saved.budget, load_geometry(run), Params(*unbound))
+    return Model(saved.config, saved.settings, load_geometry(run), Params(*unbound))
 
 
 def latest_step(run: Path) -> int:

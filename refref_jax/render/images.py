@@ -26,7 +26,7 @@ from refref_jax.numerics import host_array
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import Branch, LightPaths, reflected_first
 from refref_jax.optics.media import EMPTY_SLOT
-from refref_jax.optics.path_settings import Budget, Detail
+from refref_jax.optics.path_settings import Detail, PathSettings
 from refref_jax.optics.path_tracing import Traced
 from refref_jax.optics.scene import Scene
 from refref_jax.render import colour, learned_media, pixels
@@ -188,8 +188,8 @@ def render_rays(model: Model, rays: Rays) -> Rendering:
         sooner.
     """
     rays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), rays)
-    detail = path_detail(model.config, model.budget)
-    traced = path_tracing.trace(model.geometry, rays, budget=model.budget, detail=detail)
+    detail = path_detail(model.config, model.settings)
+    traced = path_tracing.trace(model.geometry, rays, settings=model.settings, detail=detail)
     tile = _sort(traced, traced.lost.shape[0])
     sums = _blank(tile.lost)
     return _finish(_add(model.params, tile.paths, tile.heaviest, sums, config=model.config))
@@ -230,9 +230,9 @@ def render_image(
 
 
 def _render_tile(model: Model, rays: Rays, real: int, chunk: int, branch: Branch) -> Rendering:
-    detail = path_detail(model.config, model.budget)
+    detail = path_detail(model.config, model.settings)
     which = _BRANCHES.index(branch)
-    tile = _trace_tile(model.geometry, rays, real, which, budget=model.budget, detail=detail)
+    tile = _trace_tile(model.geometry, rays, real, which, settings=model.settings, detail=detail)
     sums = _blank(tile.lost)
     count = int(fetch(tile.count, instead=_INSTEAD))
     for start in range(0, count, chunk):
@@ -247,17 +247,17 @@ def _blank(lost: Float[Array, "rays 3"]) -> Rendering:
     return Rendering(black, zeros, zeros, zeros, linear=black, lost=lost)
 
 
-@functools.partial(jax.jit, static_argnames=("budget", "detail"))
+@functools.partial(jax.jit, static_argnames=("settings", "detail"))
 def _trace_tile(
     geometry: Scene,
     rays: Rays,
     real: Int[Array, ""],
     which: int | Int[Array, ""] = _ALL,
     *,
-    budget: Budget,
+    settings: PathSettings,
     detail: Detail,
 ) -> _Tile:
-    traced = path_tracing.trace(geometry, rays, budget=budget, detail=detail)
+    traced = path_tracing.trace(geometry, rays, settings=settings, detail=detail)
     return _sort(traced, real, which)
 
 

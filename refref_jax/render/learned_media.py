@@ -75,6 +75,6 @@ def dye(dyes: Dyes | None, paths: LightPaths, *, radius: float) -> LightPaths:
     """
     if dyes is None:
         return paths
-    passed = paths.passages @ absorptions(dyes, radius)
-    met = paths.meetings @ jax.nn.softplus(dyes.density)
+    passed = paths.path_lengths @ absorptions(dyes, radius)
+    met = paths.hit_counts @ jax.nn.softplus(dyes.density)
     return paths._replace(weights=paths.weights * jnp.exp(-met - passed))

@@ -14,7 +14,7 @@ from jaxtyping import Array
 from refref_jax.choices import Footprint, Interior, Space
 from refref_jax.fields import base, registry
 from refref_jax.fields.base import DensityConfig, RadianceConfig
-from refref_jax.optics.path_settings import Budget, Detail, Tally
+from refref_jax.optics.path_settings import Detail, PathSettings, Tally
 from refref_jax.optics.scene import Scene
 from refref_jax.render import learned_media
 from refref_jax.render.learned_media import Dyes
@@ -101,13 +101,13 @@ class ModelConfig:
         _check_choice("footprint", self.footprint, get_args(Footprint))
 
 
-def path_detail(config: ModelConfig, budget: Budget) -> Detail:
+def path_detail(config: ModelConfig, settings: PathSettings) -> Detail:
     """Returns the parts of light paths that a model needs."""
     tally: Tally = "parts" if config.learned_tints else "none"
-    most = budget.bends + 1
+    most = settings.bends + 1
     if config.interior == "field":
         return Detail("all", most, config.footprint, tally)
-    legs = _CONVEX_LEGS if budget.reentry == "impossible" else _MOST_LEGS
+    legs = _CONVEX_LEGS if settings.reentry == "impossible" else _MOST_LEGS
     return Detail("outside", min(legs, most), config.footprint, tally)
 
 
@@ -135,13 +135,13 @@ class Model(NamedTuple):
 
     Attributes:
       config: static configuration of fields and sampling.
-      budget: path settings.
+      settings: path settings.
       geometry: the scene.
       params: learned parameters.
     """
 
     config: ModelConfig
-    budget: Budget
+    settings: PathSettings
     geometry: Scene
     params: Params
 

@@ -72,8 +72,8 @@ def render_ray(model: Model, ray: Rays) -> Float[Array, "3"]:
 def _light_paths(model: Model, ray: Rays) -> Iterator[LightPaths]:
     """Yields the light paths of one ray, the heaviest first."""
     batch = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32)[None], ray)
-    detail = path_detail(model.config, model.budget)
-    paths = path_tracing.trace(model.geometry, batch, budget=model.budget, detail=detail).paths
+    detail = path_detail(model.config, model.settings)
+    paths = path_tracing.trace(model.geometry, batch, settings=model.settings, detail=detail).paths
     paths = learned_media.dye(model.params.dyes, paths, radius=model.config.radius)
     for i, status in enumerate(paths.statuses):
         if status != PathStatus.EMPTY:

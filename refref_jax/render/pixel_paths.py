@@ -25,7 +25,7 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.numerics import host_array
 from refref_jax.optics import path_tracing
 from refref_jax.optics.light_paths import LightPaths, PathStatus
-from refref_jax.optics.path_settings import Budget, Detail, Tally
+from refref_jax.optics.path_settings import Detail, PathSettings, Tally
 from refref_jax.optics.scene import Scene
 from refref_jax.render import Model, learned_media, volume_rendering
 from refref_jax.render.learned_media import Dyes
@@ -88,7 +88,7 @@ class _Traced(NamedTuple):
 
 
 def trace_pixel(
-    scene: Model | Scene, ray: Rays, *, budget: Budget | None = None, reach: float = 4.0
+    scene: Model | Scene, ray: Rays, *, settings: PathSettings | None = None, reach: float = 4.0
 ) -> PixelPaths:
     """Traces one ray along all branches that the path settings follow.
 
@@ -96,14 +96,14 @@ def trace_pixel(
       scene: a model, or only its scene. The learned tints and absorption of a model attenuate the
         paths, and last segments are drawn up to its scene bounds.
       ray: one camera ray, with a unit direction.
-      budget: path settings; those of the model by default.
+      settings: path settings; those of the model by default.
       reach: length of last segments that have no scene bounds, world units.
 
     Returns:
       NumPy arrays.
 
     Raises:
-      ValueError: if `scene` is not a model and `budget` is not given.
+      ValueError: if `scene` is not a model and `settings` is not given.
     """
     if isinstance(scene, Model):
         geometry, colours, domain = (
@@ -111,19 +111,19 @@ def trace_pixel(
             scene.params.dyes,
             volume_rendering.domain(scene.config),
         )
-        budget = budget or scene.budget
+        settings = settings or scene.settings
     else:
         geometry, colours, domain = scene, None, None
-    if budget is None:
+    if settings is None:
         raise ValueError("budget is None, but scene is not a model. Give a budget.")
     roomy = dataclasses.replace(
-        budget,
+        settings,
         live_per_ray=float(_MOST_PATHS),
         segments_per_ray=float(_MOST_SEGMENTS),
         paths_per_ray=float(_MOST_PATHS),
     )
     ray = Rays(*(host_array(np.asarray(x, np.float32)[None]) for x in ray))
-    traced = _trace(geometry, ray, colours, budget=roomy, domain=domain)
+    traced = _trace(geometry, ray, colours, settings=roomy, domain=domain)
     return _polylines(jax.device_get(traced), reach)
 
 
@@ -189,17 +189,22 @@ def _polylines(traced: _Traced, reach: float) -> PixelPaths:
     )
 
 
-@functools.partial(jax.jit, static_argnames=("budget", "domain"))
+@functools.partial(jax.jit, static_argnames=("settings", "domain"))
 def _trace(
-    geometry: Scene, ray: Rays, colours: Dyes | None, *, budget: Budget, domain: Domain | None
+    geometry: Scene,
+    ray: Rays,
+    colours: Dyes | None,
+    *,
+    settings: PathSettings,
+    domain: Domain | None,
 ) -> _Traced:
     tally: Tally = "none" if colours is None else "parts"
     traced = path_tracing.trace(
         geometry,
         ray,
-        budget=budget,
+        settings=settings,
         capacity=_MOST_PATHS,
-        detail=Detail("all", budget.bends + 1, tally=tally),
+        detail=Detail("all", settings.bends + 1, tally=tally),
     )
     paths = traced.paths
     if domain is None:

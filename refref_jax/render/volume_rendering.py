@@ -97,7 +97,7 @@ def composite(
     mean = numerics.safe_divide(jnp.sum(weights * middles), accumulation)
     half = jnp.full((1,), 0.5, weights.dtype)
     level = numerics.safe_divide(half, accumulation[None])
-    median = stepfun.invert_cumulative(level, edges, stepfun.cumulative(weights))[0]
+    median = stepfun.invert_cdf(level, edges, stepfun.integrate_weights(weights))[0]
     return Composite(
         rgb=jnp.sum(weights[:, None] * rgb, axis=0),
         accumulation=accumulation,
@@ -280,7 +280,7 @@ def _draw(
     """Draws intervals in proportion to the weights of the last histogram, if there is one."""
     if not histograms:
         ends = jnp.array([0.0, 1.0], strata.dtype)
-        even = stepfun.sample_edges(strata, ends, jnp.ones_like(ends[:1]))
+        even = stepfun.sample_intervals(strata, ends, jnp.ones_like(ends[:1]))
         # Jitter must not shorten the path: its end is opaque and would move with the noise.
         return even.at[jnp.array([0, -1])].set(ends)
     edges, weights = jax.lax.stop_gradient(histograms[-1])
@@ -289,7 +289,7 @@ def _draw(
         edges, weights = stepfun.dilate(edges, weights, config.dilation / drawn + _DILATION_BIAS)
     # Bins of width 0 stay empty; the others tend to equal weight as the exponent tends to 0.
     trusted = jnp.where(jnp.diff(edges) > 0.0, weights**anneal, 0.0)
-    return stepfun.sample_edges(strata, edges, trusted)
+    return stepfun.sample_intervals(strata, edges, trusted)
 
 
 def _weigh(

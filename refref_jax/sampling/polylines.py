@@ -15,7 +15,7 @@ from refref_jax.geometry.rays import orthonormal_basis
 from refref_jax.optics import ray_differentials
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.optics.media import AMBIENT
-from refref_jax.optics.ray_differentials import Spread
+from refref_jax.optics.ray_differentials import RayDifferential
 
 
 class Polyline(NamedTuple):
@@ -28,7 +28,7 @@ class Polyline(NamedTuple):
       arcs: arc length from the camera to the start of each segment.
       outside: whether the segment is outside the objects. The last segment always counts as
         outside: truncated paths end on the background too.
-      spreads: ray differential of each segment, if carried.
+      differentials: ray differential of each segment, if carried.
       radius: radius of the pixel's cone at unit distance.
     """
 
@@ -37,7 +37,7 @@ class Polyline(NamedTuple):
     knots: Float[Array, " segments"]
     arcs: Float[Array, " segments"]
     outside: Bool[Array, " segments"]
-    spreads: Spread
+    differentials: RayDifferential
     radius: Float[Array, ""]
 
 
@@ -68,7 +68,7 @@ def whole_path(path: LightPaths) -> Polyline:
         knots=path.tau,
         arcs=jnp.where(used, path.tau, 0.0),
         outside=_outside(path),
-        spreads=path.spreads,
+        differentials=path.differentials,
         radius=path.radii,
     )
 
@@ -114,10 +114,10 @@ def _footprint(
 ) -> Float[Array, "2 3"]:
     """Returns the half axes of a footprint; those of a straight cone without differentials."""
     direction = line.directions[segment]
-    if line.spreads.points.shape[-2] == 0:
+    if line.differentials.points.shape[-2] == 0:
         return line.radius * arc * jnp.stack(orthonormal_basis(direction))
-    spread = jax.tree.map(lambda x: x[segment], line.spreads)
-    return ray_differentials.across(spread, along, direction)
+    differential = jax.tree.map(lambda x: x[segment], line.differentials)
+    return ray_differentials.across(differential, along, direction)
 
 
 def _outside(path: LightPaths) -> Bool[Array, " segments"]:

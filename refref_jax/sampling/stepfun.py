@@ -13,14 +13,14 @@ from jaxtyping import Array, Float, Int
 from refref_jax import numerics
 
 
-def heights(
+def weight_to_pdf(
     edges: Float[Array, "*batch edges"], weights: Float[Array, "*batch edges-1"]
 ) -> Float[Array, "*batch edges-1"]:
     """Returns `weights / widths`, 0 in bins of width 0."""
     return numerics.safe_divide(weights, jnp.diff(edges))
 
 
-def cumulative(weights: Float[Array, "*batch n"]) -> Float[Array, "*batch n+1"]:
+def integrate_weights(weights: Float[Array, "*batch n"]) -> Float[Array, "*batch n+1"]:
     """Returns the normalised cumulative sum, non-decreasing from exactly 0 to exactly 1.
 
     If all weights are zero, the distribution is uniform.
@@ -32,7 +32,7 @@ def cumulative(weights: Float[Array, "*batch n"]) -> Float[Array, "*batch n+1"]:
     return jnp.concatenate([ends, inner, ends + 1.0], axis=-1)
 
 
-def invert_cumulative(
+def invert_cdf(
     u: Float[Array, "*batch m"],
     edges: Float[Array, "*batch edges"],
     cdf: Float[Array, "*batch edges"],
@@ -44,7 +44,7 @@ def invert_cumulative(
     return left + numerics.safe_divide(u - low, high - low) * (right - left)
 
 
-def sample_edges(
+def sample_intervals(
     u: Float[Array, "*batch m"],
     edges: Float[Array, "*batch edges"],
     weights: Float[Array, "*batch edges-1"],
@@ -59,7 +59,7 @@ def sample_edges(
       edges: edges of the step function.
       weights: weights of the step function, in any scale.
     """
-    samples = invert_cumulative(u, edges, cumulative(weights))
+    samples = invert_cdf(u, edges, integrate_weights(weights))
     middles = 0.5 * (samples[..., 1:] + samples[..., :-1])
     first = jnp.maximum(2.0 * samples[..., :1] - middles[..., :1], edges[..., :1])
     last = jnp.minimum(2.0 * samples[..., -1:] - middles[..., -1:], edges[..., -1:])
@@ -110,7 +110,7 @@ def dilate(
     grid = jnp.clip(grid, edges[..., :1], edges[..., -1:])
     start = grid[..., :-1, None]
     covered = (left[..., None, :] <= start) & (start < right[..., None, :])
-    tops = jnp.where(covered, heights(edges, weights)[..., None, :], 0.0)
+    tops = jnp.where(covered, weight_to_pdf(edges, weights)[..., None, :], 0.0)
     mass = jnp.max(tops, axis=-1) * jnp.diff(grid)
     total = jnp.sum(mass, axis=-1, keepdims=True)
     return grid, numerics.safe_divide(mass, jnp.broadcast_to(total, mass.shape))

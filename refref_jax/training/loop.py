@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int, UInt8
 from refref_jax.data.batches import PixelSampler
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.path_settings import Budget, Detail, capacity_for
+from refref_jax.optics.path_settings import Detail, PathSettings, capacity_for
 from refref_jax.optics.path_tracing import Survey, Traced
 from refref_jax.optics.scene import Scene
 from refref_jax.render import pixels
@@ -108,12 +108,12 @@ _WHOLE: Any = PartitionSpec()
 _SHARED = Pool(traced=Traced(paths=_SHARE, lost=_WHOLE), rgb=_WHOLE, order=_WHOLE)
 
 
-@functools.partial(jax.jit, static_argnames=("budget", "capacity", "detail", "mesh"))
+@functools.partial(jax.jit, static_argnames=("settings", "capacity", "detail", "mesh"))
 def trace_pool(
     geometry: Scene,
     rays: Rays,
     *,
-    budget: Budget,
+    settings: PathSettings,
     capacity: int,
     detail: Detail,
     mesh: Mesh | None = None,
@@ -124,7 +124,7 @@ def trace_pool(
     batch. Lists that cannot be shared evenly are padded with empty slots.
     """
     trace = functools.partial(
-        path_tracing.trace_batches, budget=budget, capacity=capacity, detail=detail
+        path_tracing.trace_batches, settings=settings, capacity=capacity, detail=detail
     )
     if mesh is None:
         return trace(geometry, rays)
@@ -139,10 +139,10 @@ def trace_pool(
     return jax.lax.with_sharding_constraint(Traced(paths, lost), shared)
 
 
-@functools.partial(jax.jit, static_argnames="budget")
-def survey_paths(geometry: Scene, rays: Rays, *, budget: Budget) -> Survey:
+@functools.partial(jax.jit, static_argnames="settings")
+def survey_paths(geometry: Scene, rays: Rays, *, settings: PathSettings) -> Survey:
     """Returns statistics of the paths of the rays `[rays]`; see `path_tracing.survey`."""
-    return path_tracing.survey(geometry, rays, budget=budget)
+    return path_tracing.survey(geometry, rays, settings=settings)
 
 
 @functools.partial(jax.jit, static_argnames=("config", "model", "mesh"), donate_argnames="state")
@@ -262,7 +262,7 @@ class Setup(NamedTuple):
     Attributes:
       config: configuration of the run.
       model: configuration of the model.
-      budget: path settings.
+      settings: path settings.
       geometry: scene through which paths are traced.
       sampler: sampler of the training pixels.
       capacity: capacity for the paths of a batch.
@@ -273,7 +273,7 @@ class Setup(NamedTuple):
 
     config: TrainConfig
     model: ModelConfig
-    budget: Budget
+    settings: PathSettings
     geometry: Scene
     sampler: PixelSampler
     capacity: int
@@ -285,7 +285,7 @@ class Setup(NamedTuple):
 def set_up(
     config: TrainConfig,
     model: ModelConfig,
-    budget: Budget,
+    settings: PathSettings,
     geometry: Scene,
     sampler: PixelSampler,
     *,
@@ -297,13 +297,15 @@ def set_up(
     half a gibibyte; while they are concatenated, three times that is in use.
     """
     geometry = jax.tree.map(jnp.asarray, geometry)
-    found = survey_paths(geometry, sampler.survey(_SURVEY).rays, budget=budget)
+    found = survey_paths(geometry, sampler.survey(_SURVEY).rays, settings=settings)
     found = devices.as_in_the_first(jax.device_get(found))
     batch = settled(config.schedule.batch)
-    capacity = capacity_for(budget, batch, mean=float(found.mean), deviation=float(found.deviation))
+    capacity = capacity_for(
+        settings, batch, mean=float(found.mean), deviation=float(found.deviation)
+    )
     hit_fraction = float(found.hit_fraction)
     geometry = devices.put_everywhere(geometry, mesh=mesh)
-    setup = Setup(config, model, budget, geometry, sampler, capacity, hit_fraction, mesh=mesh)
+    setup = Setup(config, model, settings, geometry, sampler, capacity, hit_fraction, mesh=mesh)
     return setup._replace(epoch=_trace_epoch(setup))
 
 
@@ -365,9 +367,9 @@ def trace_batches(setup: Setup, numbers: Sequence[int]) -> Pool:
     traced = trace_pool(
         setup.geometry,
         drawn.rays,
-        budget=setup.budget,
+        settings=setup.settings,
         capacity=setup.capacity,
-        detail=path_detail(setup.model, setup.budget),
+        detail=path_detail(setup.model, setup.settings),
         mesh=setup.mesh,
     )
     order = np.arange(len(numbers), dtype=np.int32)

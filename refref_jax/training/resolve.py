@@ -40,7 +40,7 @@ from refref_jax.fields.base import RadianceConfig
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.optics.media import EMPTY_SLOT
-from refref_jax.optics.path_settings import Budget, budget_of
+from refref_jax.optics.path_settings import PathSettings, make_path_settings
 from refref_jax.optics.scene import Scene
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import ModelConfig
@@ -142,14 +142,14 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
     """
     asked, found = config, facts.needs
     reasons = _first_reasons(config)
-    budget, config = _resolve_paths(config, found, reasons)
-    config = _resolve_inside(config, found, budget, reasons)
+    settings, config = _resolve_paths(config, found, reasons)
+    config = _resolve_inside(config, found, settings, reasons)
     model, config = _resolve_model(config, facts, reasons)
-    if budget.bends:
-        budget = dataclasses.replace(budget, reentry=settled(config.paths.reentry))
+    if settings.bends:
+        settings = dataclasses.replace(settings, reentry=settled(config.paths.reentry))
     config = _resolve_training(config, model, reasons)
     check_batch(facts.cameras, settled(config.schedule.batch))
-    return Resolved(config, SavedModel(model, budget), reasons, tuple(_doubts(asked, found)))
+    return Resolved(config, SavedModel(model, settings), reasons, tuple(_doubts(asked, found)))
 
 
 def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
@@ -158,7 +158,7 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
     This is for runs of earlier versions, whose configurations lack these decisions. The preset of
     such a run is unknown, but the model determines all values that follow from it.
     """
-    model, budget = saved.config, saved.budget
+    model, settings = saved.config, saved.settings
     reasons: dict[str, str] = {}
     tints = "learned" if model.learned_tints else "given"
     config = config.decided(field=model.field.kind)
@@ -168,11 +168,11 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
         "the model",
         background=model.space,
         radius=model.radius,
-        cut=budget.cut,
-        bends=budget.bends,
-        reentry=budget.reentry if budget.bends else None,
+        cut=settings.cut,
+        bends=settings.bends,
+        reentry=settings.reentry if settings.bends else None,
         interior=model.interior,
-        tints=tints if model.interior == "absorbing" and budget.bends else "none",
+        tints=tints if model.interior == "absorbing" and settings.bends else "none",
         **_sampling_of(model),
     )
 
@@ -232,7 +232,7 @@ def _decide(
 
 def _resolve_paths(
     config: TrainConfig, found: Needs, reasons: dict[str, str]
-) -> tuple[Budget, TrainConfig]:
+) -> tuple[PathSettings, TrainConfig]:
     if found.parts == 0 and config.paths.name not in (None, "straight"):
         raise ValueError(
             f"There are no meshes that could bend light for paths={config.paths.name}."
@@ -241,16 +241,16 @@ def _resolve_paths(
     name, why = ("tree", "there are meshes") if found.parts else ("straight", "there are no meshes")
     config = _decide(config, reasons, why, paths=name)
     paths = config.paths
-    budget = budget_of(settled(paths.name), cut=paths.cut, bends=paths.bends)
-    if budget.bends == 0:
+    settings = make_path_settings(settled(paths.name), cut=paths.cut, bends=paths.bends)
+    if settings.bends == 0:
         _check_straight(config)
-        return budget, _decide(config, reasons, f"paths={paths.name}", cut=budget.cut, bends=0)
+        return settings, _decide(config, reasons, f"paths={paths.name}", cut=settings.cut, bends=0)
     why = "light may meet the objects again"
     if found.reentry == "impossible":
         why = "light that has left one convex object meets none again"
     config = _decide(config, reasons, why, reentry=found.reentry)
     why = f"paths={paths.name}"
-    return budget, _decide(config, reasons, why, cut=budget.cut, bends=budget.bends)
+    return settings, _decide(config, reasons, why, cut=settings.cut, bends=settings.bends)
 
 
 def _check_straight(config: TrainConfig) -> None:
@@ -269,11 +269,11 @@ def _check_straight(config: TrainConfig) -> None:
 
 
 def _resolve_inside(
-    config: TrainConfig, found: Needs, budget: Budget, reasons: dict[str, str]
+    config: TrainConfig, found: Needs, settings: PathSettings, reasons: dict[str, str]
 ) -> TrainConfig:
     """Decides the model of the inside of the objects, and the source of their colours."""
     interior: Interior | None
-    if budget.bends == 0:
+    if settings.bends == 0:
         interior, why = "field", "straight rays ignore the objects"
     elif found.interior == "clear" and config.model.tints != "learned":
         interior, why = "clear", "the objects are clear in scene.json"
@@ -281,12 +281,12 @@ def _resolve_inside(
         interior, why = "absorbing", "objects may absorb light"
     config = _decide(config, reasons, why, interior=interior)
     interior, tints = config.model.interior, config.model.tints
-    if interior != "absorbing" or budget.bends == 0:
+    if interior != "absorbing" or settings.bends == 0:
         given_as_clear = tints == "given" and found.tints == "none" and interior == "clear"
         if tints not in (None, "none") and not given_as_clear:
             raise ValueError(
-                f"tints={tints} has no effect with interior {interior} and at most {budget.bends} "
-                "bends. Leave it out, or use interior=absorbing and bent paths."
+                f"tints={tints} has no effect with interior {interior} and at most "
+                f"{settings.bends} bends. Leave it out, or use interior=absorbing and bent paths."
             )
         model = dataclasses.replace(config.model, tints=None)
         config = dataclasses.replace(config, model=model)

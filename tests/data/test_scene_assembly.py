@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from refref_jax.data import SceneError
-from refref_jax.data.scene_assembly import assemble, build_geometry, make_part, single_body
+from refref_jax.data.scene_assembly import assemble, build_geometry, make_part, single_object
 from refref_jax.optics.interface_rules import NO_PARENT
 from tests.factories.solids import ball, box, inverted
 
@@ -28,7 +28,7 @@ def test_a_file_a_mesh_and_its_arrays_are_one_body(tmp_path):
     made += [make_part(path, index=1.4), make_part(str(path), index=1.4)]
     for part in made:
         assert (part.name, part.index, part.shading, part.normals) == ("crate", 1.4, "auto", None)
-        _same_scene(assemble([part]), single_body(mesh, index=1.4))
+        _same_scene(assemble([part]), single_object(mesh, index=1.4))
 
 
 def test_equal_corners_are_merged():
@@ -91,7 +91,7 @@ def test_broken_arrays_are_refused(vertices, faces, message):
 
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(SceneError, match=r"ball\.ply cannot be read"):
-        single_body(tmp_path / "ball.ply", index=1.5)
+        single_object(tmp_path / "ball.ply", index=1.5)
 
 
 def test_a_scene_finds_what_lies_in_what():

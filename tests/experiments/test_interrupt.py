@@ -45,7 +45,7 @@ def test_before_its_first_step_a_training_ends_with_nothing_saved(tmp_path, monk
     known = types.SimpleNamespace(
         schedule=types.SimpleNamespace(steps=5),
         scene=types.SimpleNamespace(path="scene"),
-        budget=types.SimpleNamespace(bends=1),
+        settings=types.SimpleNamespace(bends=1),
         config=None,
         seed=0,
     )

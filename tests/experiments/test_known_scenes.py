@@ -113,8 +113,8 @@ def test_the_curve_has_a_row_for_every_setting(tmp_path):
     with (out / "path_trade_off.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [(row["sweep"], row["name"]) for row in rows] == [
-        ("budget", "straight"),
-        ("budget", "paper"),
+        ("settings", "straight"),
+        ("settings", "paper"),
         ("cut", "0.2"),
         ("cut", "0.02"),
         ("bends", "24"),

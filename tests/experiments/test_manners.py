@@ -16,7 +16,7 @@ from refref_jax import choices
 from refref_jax.data import scene_folder
 from refref_jax.fields import registry
 from refref_jax.optics.interface_rules import RULES
-from refref_jax.optics.path_settings import BUDGETS
+from refref_jax.optics.path_settings import PATH_PRESETS
 from refref_jax.training import presets, run_folder
 from tests.processes.command import ROOT
 
@@ -269,7 +269,7 @@ def test_names_of_what_can_be_chosen_are_those_that_exist():
     names = (registry.USUAL, *(x for x in registry.KINDS if x != registry.USUAL))
     assert names == get_args(choices.FieldName)
     assert tuple(RULES) == get_args(choices.RuleName)
-    assert tuple(BUDGETS) == get_args(choices.Paths)
+    assert tuple(PATH_PRESETS) == get_args(choices.Paths)
     assert tuple(GEOMETRIES) == cli_flags.GEOMETRIES
 
 

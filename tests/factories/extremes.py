@@ -13,7 +13,7 @@ import numpy as np
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_tracing import Traced
-from refref_jax.optics.ray_differentials import Spread
+from refref_jax.optics.ray_differentials import RayDifferential
 from refref_jax.render.model import init_params
 from tests.factories import made_paths, small_model
 
@@ -116,14 +116,16 @@ def _detailed(config, path):
     """Gives a path what a model asks of it: derivatives across the pixel, tallies of parts."""
     if config.footprint == "differential":
         ones = jnp.full((SEGMENTS, 2, 3), path.radii)
-        path = path._replace(spreads=Spread(0.1 * ones, ones))
+        path = path._replace(differentials=RayDifferential(0.1 * ones, ones))
     if not config.learned_tints:
-        return path._replace(meetings=jnp.zeros(0), passages=jnp.zeros(0))
-    return path if path.meetings.size else _tallied(path, 1.0, 0.5)
+        return path._replace(hit_counts=jnp.zeros(0), path_lengths=jnp.zeros(0))
+    return path if path.hit_counts.size else _tallied(path, 1.0, 0.5)
 
 
-def _tallied(path, meetings, passage):
-    return path._replace(meetings=jnp.full(PARTS, meetings), passages=jnp.full(PARTS, passage))
+def _tallied(path, hit_counts, passage):
+    return path._replace(
+        hit_counts=jnp.full(PARTS, hit_counts), path_lengths=jnp.full(PARTS, passage)
+    )
 
 
 def _straight(origin, direction):
@@ -169,10 +171,10 @@ def _empty():
 def _widened(paths):
     """Returns paths with derivatives as large as tracing lets them grow, of either sign."""
     signs = jnp.asarray(
-        np.random.default_rng(0).choice([-_WIDE, _WIDE], paths.spreads.points.shape)
+        np.random.default_rng(0).choice([-_WIDE, _WIDE], paths.differentials.points.shape)
     )
     wide = signs.astype(jnp.float32)
-    return paths._replace(spreads=Spread(wide, wide[..., ::-1]))
+    return paths._replace(differentials=RayDifferential(wide, wide[..., ::-1]))
 
 
 def _with_density(params, raw):

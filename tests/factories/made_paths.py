@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from refref_jax.optics.light_paths import LightPaths, PathStatus
-from refref_jax.optics.ray_differentials import Spread
+from refref_jax.optics.ray_differentials import RayDifferential
 
 
 def path(
@@ -47,15 +47,15 @@ def path(
         directions=jnp.asarray(np.pad(directions, [(0, unused), (0, 0)], "edge"), jnp.float32),
         tau=jnp.asarray(np.pad(tau, (0, unused), constant_values=np.inf), jnp.float32),
         ends=jnp.asarray(np.pad(tau[1:], (0, unused + 1), constant_values=np.inf), jnp.float32),
-        spreads=Spread(*[jnp.zeros((bends + 1 + unused, 0, 3), jnp.float32)] * 2),
+        differentials=RayDifferential(*[jnp.zeros((bends + 1 + unused, 0, 3), jnp.float32)] * 2),
         media=jnp.asarray(np.pad(np.asarray(media), (0, unused)), jnp.int32),
         rays=jnp.int32(ray),
         weights=jnp.asarray(weights, jnp.float32),
         radii=jnp.float32(radius),
         bends=jnp.int32(bends),
         statuses=jnp.int32(status),
-        meetings=jnp.zeros(0, jnp.float32),
-        passages=jnp.zeros(0, jnp.float32),
+        hit_counts=jnp.zeros(0, jnp.float32),
+        path_lengths=jnp.zeros(0, jnp.float32),
     )
 
 

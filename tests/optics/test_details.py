@@ -8,15 +8,15 @@ import pytest
 from refref_jax.optics import path_tracing
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.media import AMBIENT
-from refref_jax.optics.path_settings import PAPER, TREE, Budget, Detail, everything
+from refref_jax.optics.path_settings import PAPER, TREE, Detail, PathSettings, everything
 from tests.factories import scenes
 
 _CAPACITY = 256
 
 
-@functools.partial(jax.jit, static_argnames=("budget", "detail"))
-def _trace(geometry, rays, *, budget=TREE, detail=None):
-    return path_tracing.trace(geometry, rays, budget=budget, capacity=_CAPACITY, detail=detail)
+@functools.partial(jax.jit, static_argnames=("settings", "detail"))
+def _trace(geometry, rays, *, settings=TREE, detail=None):
+    return path_tracing.trace(geometry, rays, settings=settings, capacity=_CAPACITY, detail=detail)
 
 
 def _rays(count=40):
@@ -70,10 +70,12 @@ def test_of_too_many_segments_the_first_and_the_last_ones_are_kept():
         np.testing.assert_array_equal(got, whole.tau[index][np.array(ends)])
 
 
-@pytest.mark.parametrize("budget", [pytest.param(PAPER, marks=pytest.mark.slow), TREE])
+@pytest.mark.parametrize("settings", [pytest.param(PAPER, marks=pytest.mark.slow), TREE])
 @pytest.mark.slow
-def test_segments_end_where_the_next_ones_begin(budget):
-    paths = _trace(_two_balls(), _rays(), budget=budget, detail=everything(budget.bends)).paths
+def test_segments_end_where_the_next_ones_begin(settings):
+    paths = _trace(
+        _two_balls(), _rays(), settings=settings, detail=everything(settings.bends)
+    ).paths
     used = np.isfinite(paths.tau)
     following = np.append(paths.tau[:, 1:], np.full((_CAPACITY, 1), np.inf), axis=1)
     np.testing.assert_array_equal(paths.ends[used], following[used])
@@ -83,7 +85,9 @@ def test_segments_end_where_the_next_ones_begin(budget):
 @pytest.mark.slow
 def test_meetings_and_passages_are_those_of_the_whole_path():
     """Tints and absorption are put on the paths afterwards, and come to what tracing puts on."""
-    budget = Budget(bends=3, reflections="all")  # no cut: colours do not change what is followed
+    settings = PathSettings(
+        bends=3, reflections="all"
+    )  # no cut: colours do not change what is followed
     geometry = _two_balls()
     tint = jnp.array([[0.9, 0.5, 0.7], [0.6, 0.95, 1.0]])
     absorption = jnp.array([[0.1, 0.0, 2.0], [0.3, 0.4, 0.0]])
@@ -91,27 +95,27 @@ def test_meetings_and_passages_are_those_of_the_whole_path():
         interfaces=geometry.interfaces._replace(tint=tint, absorption=absorption)
     )
     detail = Detail("outside", 4, tally="parts")
-    white = _trace(geometry, _rays(), budget=budget, detail=detail).paths
-    coloured = _trace(dyed, _rays(), budget=budget).paths
+    white = _trace(geometry, _rays(), settings=settings, detail=detail).paths
+    coloured = _trace(dyed, _rays(), settings=settings).paths
     factor = np.exp(
-        np.asarray(white.meetings) @ np.log(tint) - np.asarray(white.passages) @ absorption
+        np.asarray(white.hit_counts) @ np.log(tint) - np.asarray(white.path_lengths) @ absorption
     )
     # A path that ran out of bends inside a body goes on through it, and is not dimmed there.
     np.testing.assert_allclose(white.weights * factor, coloured.weights, atol=2e-6)
-    assert white.meetings.max() == 3.0 and white.passages.max() > 1.0
+    assert white.hit_counts.max() == 3.0 and white.path_lengths.max() > 1.0
 
 
 @pytest.mark.slow
 def test_nothing_is_tallied_unless_asked():
     paths = _trace(_two_balls(), _rays()).paths
-    assert paths.meetings.shape == paths.passages.shape == (_CAPACITY, 0)
+    assert paths.hit_counts.shape == paths.path_lengths.shape == (_CAPACITY, 0)
 
 
 @pytest.mark.slow
 def test_a_promise_of_no_reentry_changes_casts_only():
     ball = scenes.geometry(scenes.ball(1.0, subdivisions=3))
-    never = Budget(bends=24, reflections="all", cut=0.02, reentry="impossible")
-    a, b = (path_tracing.trace_ends(ball, _rays(), budget=budget) for budget in (TREE, never))
+    never = PathSettings(bends=24, reflections="all", cut=0.02, reentry="impossible")
+    a, b = (path_tracing.trace_ends(ball, _rays(), settings=settings) for settings in (TREE, never))
 
     def sorted_weights(traced):
         escaped = traced.ends.statuses == PathStatus.ESCAPED

@@ -14,7 +14,7 @@ from jax.test_util import check_grads
 from refref_jax.optics import path_tracing
 from refref_jax.optics.differentiable_paths import follow_branch
 from refref_jax.optics.light_paths import PathStatus
-from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, Budget
+from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, PathSettings
 from refref_jax.optics.scene import Scene
 from tests.factories import scenes
 
@@ -25,9 +25,9 @@ def _every_choice():
     return np.array(list(itertools.product([False, True], repeat=_DEPTH)))
 
 
-def _all_branches(geometry, rays, budget):
+def _all_branches(geometry, rays, settings):
     """Returns one path a ray and choice, as `[rays, choices]`."""
-    follow = functools.partial(follow_branch, geometry, budget=budget)
+    follow = functools.partial(follow_branch, geometry, settings=settings)
     choices = jnp.asarray(_every_choice())
     each_choice = jax.vmap(follow, in_axes=(None, 0))
     found = jax.jit(jax.vmap(each_choice, in_axes=(0, None)))(rays, choices)
@@ -46,28 +46,30 @@ def _bodies():
     "body", ["tinted box", *(pytest.param(b, marks=pytest.mark.slow) for b in ("ball", "box"))]
 )
 @pytest.mark.parametrize(
-    "budget",
+    "settings",
     [
-        Budget(_DEPTH, "all", cut=0.02),
+        PathSettings(_DEPTH, "all", cut=0.02),
         *(
-            pytest.param(budget, marks=pytest.mark.slow)
-            for budget in (
-                Budget(_DEPTH, "first"),
-                Budget(_DEPTH, "none", total_reflection="ended"),
+            pytest.param(settings, marks=pytest.mark.slow)
+            for settings in (
+                PathSettings(_DEPTH, "first"),
+                PathSettings(_DEPTH, "none", total_reflection="ended"),
             )
         ),
     ],
 )
-def test_both_tracers_find_the_same_paths(body, budget):
+def test_both_tracers_find_the_same_paths(body, settings):
     geometry = scenes.geometry(_bodies()[body])
     targets = np.random.default_rng(5).uniform(-0.6, 0.6, (12, 3))
     rays = scenes.rays([-4.0, 0.3, 0.2], targets - [-4.0, 0.3, 0.2])
-    room = dataclasses.replace(budget, live_per_ray=20.0, segments_per_ray=40.0, paths_per_ray=20.0)
-    trace = jax.jit(functools.partial(path_tracing.trace, budget=room, capacity=240))
+    capacities = dataclasses.replace(
+        settings, live_per_ray=20.0, segments_per_ray=40.0, paths_per_ray=20.0
+    )
+    trace = jax.jit(functools.partial(path_tracing.trace, settings=capacities, capacity=240))
     tree = jax.tree.map(np.asarray, trace(geometry, rays).paths)
-    single = _all_branches(geometry, rays, budget)
+    single = _all_branches(geometry, rays, settings)
     there = np.flatnonzero(tree.statuses != PathStatus.EMPTY)
-    assert there.size > 12 or budget.reflections == "none"
+    assert there.size > 12 or settings.reflections == "none"
     weights = np.zeros((12, 3))
     for i in there:
         ray, bends = tree.rays[i], tree.bends[i]
@@ -89,13 +91,13 @@ def test_both_tracers_find_the_same_paths(body, budget):
 def test_the_choices_must_fit_the_budget():
     ray = jax.tree.map(lambda x: x[0], scenes.rays([-4.0, 0.0, 0.0], [1.0, 0.0, 0.0]))
     with pytest.raises(ValueError, match="3 choices for 10 bends"):
-        follow_branch(scenes.geometry(scenes.box()), ray, jnp.zeros(3, bool), budget=PAPER)
+        follow_branch(scenes.geometry(scenes.box()), ray, jnp.zeros(3, bool), settings=PAPER)
 
 
 def test_without_bends_nothing_is_traced():
     ray = jax.tree.map(lambda x: x[0], scenes.rays([-4.0, 0.0, 0.0], [1.0, 0.0, 0.0]))
     nowhere = jnp.zeros(0, bool)
-    path = follow_branch(scenes.geometry(scenes.box()), ray, nowhere, budget=STRAIGHT)
+    path = follow_branch(scenes.geometry(scenes.box()), ray, nowhere, settings=STRAIGHT)
     assert (int(path.statuses), int(path.bends)) == (PathStatus.NOT_TRACED, 0)
     np.testing.assert_array_equal(path.weights, 1.0)
 
@@ -103,9 +105,9 @@ def test_without_bends_nothing_is_traced():
 @pytest.mark.parametrize(("unfinished", "weight"), [("kept", 0.96), ("dark", 0.0)])
 def test_a_path_that_runs_out_of_bends_is_as_bright_as_the_budget_says(unfinished, weight):
     slab = scenes.geometry(scenes.box((20.0, 20.0, 0.5)))
-    budget = Budget(1, "all", unfinished=unfinished)
+    settings = PathSettings(1, "all", unfinished=unfinished)
     ray = _ray([0.3, 0.2, 3.0], [0.0, 0.0, -1.0])
-    path = follow_branch(slab, ray, jnp.zeros(1, bool), budget=budget)
+    path = follow_branch(slab, ray, jnp.zeros(1, bool), settings=settings)
     assert path.statuses == PathStatus.OUT_OF_BENDS
     np.testing.assert_allclose(path.weights, weight, rtol=1e-5)
 
@@ -113,8 +115,8 @@ def test_a_path_that_runs_out_of_bends_is_as_bright_as_the_budget_says(unfinishe
 def test_a_path_that_is_cut_weighs_nothing():
     geometry = scenes.geometry(scenes.box((20.0, 20.0, 0.5)))
     ray = jax.tree.map(lambda x: x[0], scenes.rays([0.0, 0.1, 3.0], [0.0, 0.0, -1.0]))
-    budget = Budget(2, "all", cut=0.039)
-    inner = follow_branch(geometry, ray, jnp.array([False, True]), budget=budget)
+    settings = PathSettings(2, "all", cut=0.039)
+    inner = follow_branch(geometry, ray, jnp.array([False, True]), settings=settings)
     np.testing.assert_array_equal(inner.weights, 0.0)
 
 
@@ -155,8 +157,8 @@ _CASES = {
 
 def _exit(geometry, ray, reflects):
     """Returns everything smooth about where a path leaves, and how it ends."""
-    budget = Budget(len(reflects), "all")
-    path = follow_branch(geometry, ray, jnp.asarray(reflects), budget=budget)
+    settings = PathSettings(len(reflects), "all")
+    path = follow_branch(geometry, ray, jnp.asarray(reflects), settings=settings)
     last = len(reflects)
     return path.points[last], path.directions[last], path.tau[last], path.weights, path.statuses
 
@@ -218,7 +220,7 @@ def test_gradients_at_the_critical_angle_are_finite():
     def leave(index, ray):
         media = geometry.interfaces._replace(index_inside=index[None])
         moved = geometry._replace(interfaces=media)
-        path = follow_branch(moved, ray, jnp.zeros(1, bool), budget=Budget(1, "all"))
+        path = follow_branch(moved, ray, jnp.zeros(1, bool), settings=PathSettings(1, "all"))
         return jnp.concatenate([path.points[1], path.directions[1], path.weights])
 
     off = np.array([0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3])
@@ -237,7 +239,7 @@ def test_rays_that_miss_have_no_gradient_of_the_scene():
     ray = _ray([-4.0, 3.0, 0.0], [1.0, 0.0, 0.0])
 
     def last(geometry):
-        path = follow_branch(geometry, ray, jnp.zeros(10, bool), budget=PAPER)
+        path = follow_branch(geometry, ray, jnp.zeros(10, bool), settings=PAPER)
         return jnp.sum(path.directions[0] + path.weights)
 
     gradient = jax.grad(last, allow_int=True)(geometry)
@@ -249,12 +251,12 @@ def test_rays_that_miss_have_no_gradient_of_the_scene():
 def test_an_index_can_be_found_by_descent():
     geometry = scenes.geometry(scenes.ball(1.0, subdivisions=4))
     rays = scenes.rays([[-4.0, y, 0.1] for y in np.linspace(-0.6, 0.6, 16)], [1.0, 0.0, 0.0])
-    budget = Budget(2, "none")
+    settings = PathSettings(2, "none")
 
     def leave(index):
         media = geometry.interfaces._replace(index_inside=index[None])
         follow = functools.partial(follow_branch, geometry._replace(interfaces=media))
-        paths = jax.vmap(lambda ray: follow(ray, jnp.zeros(2, bool), budget=budget))(rays)
+        paths = jax.vmap(lambda ray: follow(ray, jnp.zeros(2, bool), settings=settings))(rays)
         return paths.directions[:, 2]
 
     target = leave(jnp.float32(1.5))
@@ -269,6 +271,6 @@ def test_scenes_can_not_be_mapped_over():
     geometry = scenes.geometry(scenes.ball(1.0, subdivisions=1))
     twice = jax.tree.map(lambda x: jnp.stack([x, x]), geometry)
     ray = _ray([-4.0, 0.0, 0.0], [1.0, 0.0, 0.0])
-    follow = lambda scene: follow_branch(scene, ray, jnp.zeros(24, bool), budget=TREE)
+    follow = lambda scene: follow_branch(scene, ray, jnp.zeros(24, bool), settings=TREE)
     with pytest.raises(TypeError, match="one vmap cannot cast rays into several scenes"):
         jax.vmap(follow)(twice)

@@ -49,9 +49,9 @@ def test_straight_light_is_never_reflected():
 @pytest.mark.slow
 def test_the_tree_s_reflected_paths_set_out_as_the_single_reflection_does():
     geometry = scenes.geometry(scenes.ball(1.0, subdivisions=3))
-    budget = dataclasses.replace(TREE, bends=4, cut=1e-3)
+    settings = dataclasses.replace(TREE, bends=4, cut=1e-3)
     rays = scenes.rays([[-4.0, 0.2, 0.1]] * 5, [[4.0, y, 0.1] for y in np.linspace(-0.9, 0.5, 5)])
-    trace = jax.jit(functools.partial(path_tracing.trace, budget=budget, capacity=256))
+    trace = jax.jit(functools.partial(path_tracing.trace, settings=settings, capacity=256))
     paths = trace(geometry, rays).paths
     mirrored, real = np.asarray(reflected_first(paths)), np.asarray(exists(paths))
     paths = jax.tree.map(np.asarray, paths)
@@ -59,7 +59,7 @@ def test_the_tree_s_reflected_paths_set_out_as_the_single_reflection_does():
         ray = jax.tree.map(lambda x, i=i: x[i], rays)
         for choice in (True, False):
             branch = follow_branch(
-                geometry, ray, jnp.array([choice, False, False, False]), budget=budget
+                geometry, ray, jnp.array([choice, False, False, False]), settings=settings
             )
             ours = paths.directions[real & (paths.rays == i) & (mirrored == choice), 1]
             assert len(ours) >= 1

@@ -10,17 +10,17 @@ import pytest
 from refref_jax.optics import path_tracing
 from refref_jax.optics.differentiable_paths import follow_main_branches
 from refref_jax.optics.light_paths import PathStatus
-from refref_jax.optics.path_settings import Budget
+from refref_jax.optics.path_settings import PathSettings
 from tests.factories import scenes
 
 pytestmark = pytest.mark.computing
 
-_BUDGET = Budget(bends=6, reflections="all", cut=0.02)
+_SETTINGS = PathSettings(bends=6, reflections="all", cut=0.02)
 
 
 def _follow(geometry, rays, reflections=3):
     follow = functools.partial(
-        follow_main_branches, geometry, budget=_BUDGET, reflections=reflections
+        follow_main_branches, geometry, settings=_SETTINGS, reflections=reflections
     )
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(follow))(rays))
 
@@ -48,7 +48,7 @@ def test_they_are_the_branches_of_the_tree_and_nearly_all_of_its_light():
     found = _follow(geometry, rays)
     total = found.weights[..., 0].sum(axis=1)
     assert np.all(total <= 1.0 + 1e-5) and total.mean() > 0.99
-    trace = jax.jit(functools.partial(path_tracing.trace, budget=_BUDGET, capacity=512))
+    trace = jax.jit(functools.partial(path_tracing.trace, settings=_SETTINGS, capacity=512))
     tree = jax.tree.map(np.asarray, trace(geometry, rays).paths)
     last = np.arange(64)[:, None], np.arange(4)[None], found.bends
     for ray, branch in np.argwhere((found.statuses != PathStatus.EMPTY) & (total[:, None] > 0)):
@@ -86,7 +86,7 @@ def test_the_index_has_the_gradient_of_a_slab():
     def shift(index):
         inside = jnp.full_like(geometry.interfaces.index_inside, index)
         changed = geometry._replace(interfaces=geometry.interfaces._replace(index_inside=inside))
-        path = follow_main_branches(changed, ray, budget=_BUDGET, reflections=1)
+        path = follow_main_branches(changed, ray, settings=_SETTINGS, reflections=1)
         return path.points[0, 2, 0]
 
     def expected(index):

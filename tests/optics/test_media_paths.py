@@ -11,7 +11,7 @@ from refref_jax.data.mesh_queries import parts_around
 from refref_jax.optics import media, path_tracing
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.media import AMBIENT, EMPTY_SLOT
-from refref_jax.optics.path_settings import TREE, Budget
+from refref_jax.optics.path_settings import TREE, PathSettings
 from tests.factories import scenes
 from tests.oracles import reference
 from tests.oracles.reference import Sphere
@@ -25,22 +25,22 @@ _SLAB_TOLERANCE = 2e-4
 # An icosphere of 20,480 faces with interpolated normals against the true sphere.
 _SPHERE_TOLERANCE = 4e-3
 
-_REFRACTED = Budget(bends=16, reflections="none")
+_REFRACTED = PathSettings(bends=16, reflections="none")
 
 _RAYS = 64
 
 
-@functools.partial(jax.jit, static_argnames=("budget", "capacity"))
-def _trace_jitted(geometry, rays, inside, *, budget, capacity):
-    return path_tracing.trace(geometry, rays, budget=budget, capacity=capacity, inside=inside)
+@functools.partial(jax.jit, static_argnames=("settings", "capacity"))
+def _trace_jitted(geometry, rays, inside, *, settings, capacity):
+    return path_tracing.trace(geometry, rays, settings=settings, capacity=capacity, inside=inside)
 
 
-def _trace(geometry, rays, *, inside=None, budget=_REFRACTED):
+def _trace(geometry, rays, *, inside=None, settings=_REFRACTED):
     if inside is None:
         nowhere = media.nowhere(geometry.interfaces)
         inside = jnp.broadcast_to(nowhere, (len(rays.radii), nowhere.shape[0]))
     capacity = 8 * len(rays.radii)
-    traced = _trace_jitted(geometry, rays, inside, budget=budget, capacity=capacity)
+    traced = _trace_jitted(geometry, rays, inside, settings=settings, capacity=capacity)
     return jax.tree.map(np.asarray, traced)
 
 
@@ -54,12 +54,12 @@ def _ranked(part, priority, **values):
     return part._replace(priority=priority, **values)
 
 
-def _bundle(count, seed=0, spread=0.5):
+def _bundle(count, seed=0, differential=0.5):
     """Rays from all around towards the neighbourhood of the origin."""
     generator = np.random.default_rng(seed)
     origins = generator.normal(size=(count, 3))
     origins *= 4.0 / np.linalg.norm(origins, axis=-1, keepdims=True)
-    return origins, generator.uniform(-spread, spread, (count, 3)) - origins
+    return origins, generator.uniform(-differential, differential, (count, 3)) - origins
 
 
 def _last(paths):
@@ -265,7 +265,7 @@ def test_the_light_of_a_ray_is_shared_among_its_paths(priorities):
     glass = _ranked(scenes.box((1.0, 1.2, 0.8), index=1.5), priorities[0])
     water = _ranked(scenes.ball(0.6, index=1.333, centre=(0.4, 0.0, 0.2)), priorities[1])
     traced = _trace(
-        scenes.geometry(glass, water, rule="priority"), scenes.rays(*_bundle(200)), budget=TREE
+        scenes.geometry(glass, water, rule="priority"), scenes.rays(*_bundle(200)), settings=TREE
     )
     sums = np.zeros((200, 3))
     np.add.at(sums, traced.paths.rays, traced.paths.weights)

@@ -7,7 +7,7 @@ from refref_jax.geometry.surfaces import SurfacePoint
 from refref_jax.optics import interface_rules, media, path_step
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import AMBIENT
-from refref_jax.optics.path_settings import Budget
+from refref_jax.optics.path_settings import PathSettings
 
 _GLASS = jax.tree.map(jnp.asarray, interface_rules.nested([1.5], [NO_PARENT]))
 
@@ -71,9 +71,9 @@ def test_the_shading_normal_bends_the_ray():
 
 
 def _shares(reflectance, *, total=False, first=True, strength=1.0, **options):
-    budget = Budget(bends=8, **options)
+    settings = PathSettings(bends=8, **options)
     found = path_step.shares(
-        budget,
+        settings,
         reflectance=jnp.float32(reflectance),
         total=jnp.asarray(total),
         first=jnp.asarray(first),

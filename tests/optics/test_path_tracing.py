@@ -8,7 +8,14 @@ import pytest
 from refref_jax.optics import path_tracing
 from refref_jax.optics.light_paths import PathStatus, straight
 from refref_jax.optics.media import AMBIENT
-from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, Budget, capacity_for, room
+from refref_jax.optics.path_settings import (
+    PAPER,
+    STRAIGHT,
+    TREE,
+    PathSettings,
+    capacities,
+    capacity_for,
+)
 from tests.factories import scenes
 from tests.oracles import reference
 from tests.oracles.reference import Sphere
@@ -22,14 +29,14 @@ _PLANAR_TOLERANCE = 5e-6
 _SPHERE_TOLERANCE = 4e-3
 
 
-@functools.partial(jax.jit, static_argnames=("budget", "capacity"))
-def _trace_jitted(geometry, rays, *, budget, capacity):
-    return path_tracing.trace(geometry, rays, budget=budget, capacity=capacity)
+@functools.partial(jax.jit, static_argnames=("settings", "capacity"))
+def _trace_jitted(geometry, rays, *, settings, capacity):
+    return path_tracing.trace(geometry, rays, settings=settings, capacity=capacity)
 
 
-def _trace(geometry, rays, *, budget=PAPER, capacity=None):
-    capacity = room(budget, len(rays.radii)).paths if capacity is None else capacity
-    traced = _trace_jitted(geometry, rays, budget=budget, capacity=capacity)
+def _trace(geometry, rays, *, settings=PAPER, capacity=None):
+    capacity = capacities(settings, len(rays.radii)).paths if capacity is None else capacity
+    traced = _trace_jitted(geometry, rays, settings=settings, capacity=capacity)
     return jax.tree.map(np.asarray, traced)
 
 
@@ -39,8 +46,8 @@ def _existing(paths):
 
 def _refracted(geometry, rays, bends=10):
     """Returns the one path of each ray, in the order of the rays."""
-    budget = Budget(bends, "none", live_per_ray=1.0, paths_per_ray=1.0)
-    return _trace(geometry, rays, budget=budget).paths
+    settings = PathSettings(bends, "none", live_per_ray=1.0, paths_per_ray=1.0)
+    return _trace(geometry, rays, settings=settings).paths
 
 
 @functools.cache
@@ -143,8 +150,8 @@ def test_media_are_named_along_the_path():
 def test_equal_indices_are_invisible():
     geometry = scenes.geometry(scenes.ball(1.0, index=1.0, subdivisions=3))
     rays = scenes.rays([[-4.0, y, 0.0] for y in (0.0, 0.5, 0.9)], [1.0, 0.0, 0.0])
-    for budget in (PAPER, TREE):
-        paths = _existing(_trace(geometry, rays, budget=budget).paths)
+    for settings in (PAPER, TREE):
+        paths = _existing(_trace(geometry, rays, settings=settings).paths)
         np.testing.assert_array_equal(paths.rays, [0, 1, 2])
         for i in range(3):
             np.testing.assert_allclose(paths.directions[i, paths.bends[i]], [1, 0, 0], atol=1e-6)
@@ -244,15 +251,15 @@ def _many_rays():
 
 
 @pytest.mark.parametrize(
-    ("budget", "capacity"),
+    ("settings", "capacity"),
     [
         (TREE, 1),
         *(pytest.param(*case, marks=pytest.mark.slow) for case in ((PAPER, 70), (TREE, 200))),
     ],
 )
-def test_weights_and_losses_of_every_ray_sum_to_one_at_any_capacity(budget, capacity):
+def test_weights_and_losses_of_every_ray_sum_to_one_at_any_capacity(settings, capacity):
     traced = _trace(
-        scenes.geometry(scenes.ball(1.0)), _many_rays(), budget=budget, capacity=capacity
+        scenes.geometry(scenes.ball(1.0)), _many_rays(), settings=settings, capacity=capacity
     )
     sums = traced.lost.copy()
     np.add.at(sums, traced.paths.rays, traced.paths.weights)
@@ -270,7 +277,7 @@ def test_the_strongest_paths_are_kept():
 
 @pytest.mark.slow
 def test_paths_come_in_the_order_of_their_rays_the_heaviest_first():
-    paths = _trace(scenes.geometry(scenes.ball(1.0)), _many_rays(), budget=TREE).paths
+    paths = _trace(scenes.geometry(scenes.ball(1.0)), _many_rays(), settings=TREE).paths
     exists = paths.statuses != PathStatus.EMPTY
     assert np.all(np.diff(exists.astype(int)) <= 0)
     rays, weights = paths.rays[exists], paths.weights[exists, 0]
@@ -283,7 +290,7 @@ def test_tracing_in_a_pool_equals_tracing_batch_by_batch():
     geometry = scenes.geometry(scenes.ball(1.0))
     rays = _many_rays()
     batches = jax.tree.map(lambda x: x.reshape(4, 16, *x.shape[1:]), rays)
-    trace_pool = jax.jit(functools.partial(path_tracing.trace_batches, budget=PAPER, capacity=32))
+    trace_pool = jax.jit(functools.partial(path_tracing.trace_batches, settings=PAPER, capacity=32))
     pool = trace_pool(geometry, batches)
     for i in range(4):
         batch = jax.tree.map(lambda x, i=i: x[i], batches)
@@ -292,23 +299,23 @@ def test_tracing_in_a_pool_equals_tracing_batch_by_batch():
 
 
 def test_no_mesh_of_a_straight_ray_is_said_to_be_missed():
-    traced = _trace(scenes.geometry(scenes.ball(1.0)), _many_rays(), budget=STRAIGHT)
+    traced = _trace(scenes.geometry(scenes.ball(1.0)), _many_rays(), settings=STRAIGHT)
     assert np.all(traced.paths.statuses == PathStatus.NOT_TRACED)
-    found = path_tracing.survey(scenes.geometry(), _many_rays(), budget=STRAIGHT)
+    found = path_tracing.survey(scenes.geometry(), _many_rays(), settings=STRAIGHT)
     assert (float(found.mean), float(found.hit_fraction)) == (1.0, 0.0)
 
 
 def test_the_straight_budget_ignores_the_objects():
     rays = _many_rays()
-    traced = _trace(scenes.geometry(scenes.ball(1.0)), rays, budget=STRAIGHT, capacity=0)
+    traced = _trace(scenes.geometry(scenes.ball(1.0)), rays, settings=STRAIGHT, capacity=0)
     jax.tree.map(np.testing.assert_array_equal, traced.paths, straight(rays))
     assert np.all(traced.lost == 0.0)
 
 
-@pytest.mark.parametrize("budget", [PAPER, TREE])
+@pytest.mark.parametrize("settings", [PAPER, TREE])
 @pytest.mark.slow
-def test_an_empty_scene_bends_nothing(budget):
-    traced = _trace(scenes.geometry(), _many_rays(), budget=budget)
+def test_an_empty_scene_bends_nothing(settings):
+    traced = _trace(scenes.geometry(), _many_rays(), settings=settings)
     assert np.all(traced.paths.statuses[:64] == PathStatus.MISSED)
     assert np.all(traced.paths.statuses[64:] == PathStatus.EMPTY)
     assert all(np.all(np.isfinite(x)) for x in (traced.paths.points, traced.paths.weights))
@@ -316,9 +323,9 @@ def test_an_empty_scene_bends_nothing(budget):
 
 def test_no_rays_have_no_paths():
     rays = jax.tree.map(lambda x: x[:0], _many_rays())
-    traced = path_tracing.trace(scenes.geometry(scenes.ball(1.0)), rays, budget=TREE, capacity=8)
+    traced = path_tracing.trace(scenes.geometry(scenes.ball(1.0)), rays, settings=TREE, capacity=8)
     assert traced.paths.statuses.shape == (0,)
-    assert path_tracing.trace_ends(scenes.geometry(), rays, budget=TREE).casts == 0
+    assert path_tracing.trace_ends(scenes.geometry(), rays, settings=TREE).casts == 0
 
 
 def test_a_camera_inside_glass_starts_in_its_medium():
@@ -389,7 +396,7 @@ def test_capacity_covers_the_paths_of_random_batches():
 def test_a_survey_counts_paths_and_hits():
     rays = _many_rays()
     ball = scenes.geometry(scenes.ball(1.0))
-    found = jax.jit(functools.partial(path_tracing.survey, budget=PAPER))(ball, rays)
+    found = jax.jit(functools.partial(path_tracing.survey, settings=PAPER))(ball, rays)
     paths = _existing(_trace(ball, rays).paths)
     counts = np.bincount(paths.rays, minlength=64)
     assert float(found.mean) == pytest.approx(counts.mean())
@@ -423,7 +430,7 @@ def test_derivatives_of_light_paths_are_refused(derivative, of):
         moved = rays._replace(origins=rays.origins + x) if of == "rays" else rays
         surfaces = glass.surfaces._replace(normals=glass.surfaces.normals + x)
         shaped = glass._replace(surfaces=surfaces) if of == "geometry" else glass
-        return path_tracing.trace(shaped, moved, budget=PAPER, capacity=2).paths.points[0, 2, 1]
+        return path_tracing.trace(shaped, moved, settings=PAPER, capacity=2).paths.points[0, 2, 1]
 
     with pytest.raises(TypeError, match="no derivatives"):
         derivative(exit_height)(jnp.float32(0.0))

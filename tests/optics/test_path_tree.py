@@ -9,7 +9,7 @@ import pytest
 
 from refref_jax.optics import path_tracing
 from refref_jax.optics.light_paths import PathStatus
-from refref_jax.optics.path_settings import BUDGETS, PAPER, TREE, Budget, room
+from refref_jax.optics.path_settings import PAPER, PATH_PRESETS, TREE, PathSettings, capacities
 from tests.factories import scenes
 
 pytestmark = pytest.mark.longest
@@ -18,9 +18,9 @@ _GLASS = 0.04
 """Fresnel's R of glass head-on."""
 
 
-@functools.partial(jax.jit, static_argnames=("budget", "block"))
-def _trace_ends(geometry, rays, *, budget, block=8192):
-    return path_tracing.trace_ends(geometry, rays, budget=budget, block=block)
+@functools.partial(jax.jit, static_argnames=("settings", "block"))
+def _trace_ends(geometry, rays, *, settings, block=8192):
+    return path_tracing.trace_ends(geometry, rays, settings=settings, block=block)
 
 
 def _ends(geometry, rays, **options):
@@ -29,9 +29,11 @@ def _ends(geometry, rays, **options):
     return jax.tree.map(lambda x: x[there], traced.ends), traced
 
 
-def _generous(budget):
+def _generous(settings):
     """Returns a budget with room for the paths of few rays, all of which meet glass."""
-    return dataclasses.replace(budget, live_per_ray=50.0, segments_per_ray=90.0, paths_per_ray=50.0)
+    return dataclasses.replace(
+        settings, live_per_ray=50.0, segments_per_ray=90.0, paths_per_ray=50.0
+    )
 
 
 def _slab(**changes):
@@ -57,7 +59,7 @@ def _sums(ends, traced):
 
 def test_a_slab_sends_light_both_ways_by_the_geometric_series():
     # One ray has more paths than the mean ray of an image.
-    ends, traced = _ends(_slab(), _down(), budget=_generous(Budget(5, "all")))
+    ends, traced = _ends(_slab(), _down(), settings=_generous(PathSettings(5, "all")))
     r, t = _GLASS, 1.0 - _GLASS
     # Out by the top: at once, after 1 and after 3 inner reflections; by the bottom: after 0 and 2.
     escaped = ends.statuses == PathStatus.ESCAPED
@@ -72,8 +74,10 @@ def test_a_slab_sends_light_both_ways_by_the_geometric_series():
 
 
 def test_unfinished_light_is_lost_where_it_is_dark():
-    kept, _ = _ends(_slab(), _down(), budget=_generous(Budget(5, "all")))
-    ends, traced = _ends(_slab(), _down(), budget=_generous(Budget(5, "all", unfinished="dark")))
+    kept, _ = _ends(_slab(), _down(), settings=_generous(PathSettings(5, "all")))
+    ends, traced = _ends(
+        _slab(), _down(), settings=_generous(PathSettings(5, "all", unfinished="dark"))
+    )
     r, t = _GLASS, 1.0 - _GLASS
     trapped = ends.statuses == PathStatus.OUT_OF_BENDS
     assert trapped.sum() == 1 and not ends.weights[trapped].any()
@@ -83,23 +87,23 @@ def test_unfinished_light_is_lost_where_it_is_dark():
 
 
 def test_a_cut_branch_leaves_its_share_to_its_sibling():
-    ends, traced = _ends(_slab(), _down(), budget=Budget(5, "all", cut=0.039))
+    ends, traced = _ends(_slab(), _down(), settings=PathSettings(5, "all", cut=0.039))
     # The inner reflection, 0.96 * 0.04, is below the cut: what enters leaves below, whole.
     np.testing.assert_allclose(np.sort(ends.weights[:, 0]), [0.04, 0.96], atol=1e-6)
     assert traced.casts == 4
-    ends, _ = _ends(_slab(), _down(), budget=Budget(5, "all", cut=0.041))
+    ends, _ = _ends(_slab(), _down(), settings=PathSettings(5, "all", cut=0.041))
     np.testing.assert_array_equal(ends.weights, 1.0)
 
 
 def test_where_both_branches_are_below_the_cut_the_stronger_one_takes_all():
-    ends, _ = _ends(_slab(tint=(0.4, 0.3, 0.2)), _down(), budget=Budget(5, "all", cut=0.5))
+    ends, _ = _ends(_slab(tint=(0.4, 0.3, 0.2)), _down(), settings=PathSettings(5, "all", cut=0.5))
     np.testing.assert_allclose(ends.weights, [[0.16, 0.09, 0.04]], rtol=1e-5)
     assert ends.directions[0, 2] < 0.0
 
 
 def test_the_tint_colours_every_crossing_and_every_reflection():
     tint = np.array([0.5, 0.8, 0.95])
-    ends, _ = _ends(_slab(tint=tuple(tint)), _down(), budget=Budget(3, "all"))
+    ends, _ = _ends(_slab(tint=tuple(tint)), _down(), settings=PathSettings(3, "all"))
     r, t = _GLASS, 1.0 - _GLASS
     expected = {1: r * tint, 2: t * t * tint**2, 3: t * t * r * tint**3}
     for bends, weight in expected.items():
@@ -109,16 +113,16 @@ def test_the_tint_colours_every_crossing_and_every_reflection():
 
 def test_absorption_takes_light_by_the_length_of_the_way_inside():
     absorption = np.array([0.0, 1.0, 3.0])
-    ends, _ = _ends(_slab(absorption=tuple(absorption)), _down(), budget=Budget(3, "none"))
+    ends, _ = _ends(_slab(absorption=tuple(absorption)), _down(), settings=PathSettings(3, "none"))
     np.testing.assert_allclose(ends.weights[0], np.exp(-0.5 * absorption), rtol=1e-5)
     slanted = scenes.rays([0.0, 0.0, 3.0], [0.6, 0.0, -0.8])
-    ends, _ = _ends(_slab(absorption=tuple(absorption)), slanted, budget=Budget(3, "none"))
+    ends, _ = _ends(_slab(absorption=tuple(absorption)), slanted, settings=PathSettings(3, "none"))
     length = 0.5 / np.sqrt(1.0 - (0.6 / 1.5) ** 2)
     np.testing.assert_allclose(ends.weights[0], np.exp(-length * absorption), rtol=1e-5)
 
 
 def test_an_opaque_tint_leaves_no_path():
-    ends, traced = _ends(_slab(tint=(0.0, 0.0, 0.0)), _down(), budget=TREE)
+    ends, traced = _ends(_slab(tint=(0.0, 0.0, 0.0)), _down(), settings=TREE)
     assert len(ends.rays) == 0
     assert np.all(traced.lost == 0.0)
 
@@ -126,11 +130,11 @@ def test_an_opaque_tint_leaves_no_path():
 def test_a_total_reflection_may_end_the_path():
     geometry = scenes.geometry(scenes.right_prism())
     rays = scenes.rays([-2.0, 0.1, 0.3], [1.0, 0.0, 0.0])
-    budget = Budget(10, "none", total_reflection="ended")
-    ends, _ = _ends(geometry, rays, budget=budget)
+    settings = PathSettings(10, "none", total_reflection="ended")
+    ends, _ = _ends(geometry, rays, settings=settings)
     assert ends.statuses[0] == PathStatus.TOTALLY_REFLECTED
     np.testing.assert_allclose(ends.directions[0], [1.0, 0.0, 0.0], atol=1e-6)
-    followed, _ = _ends(geometry, rays, budget=Budget(10, "none"))
+    followed, _ = _ends(geometry, rays, settings=PathSettings(10, "none"))
     assert followed.statuses[0] == PathStatus.ESCAPED
     np.testing.assert_allclose(followed.directions[0], [0.0, 0.0, -1.0], atol=1e-6)
 
@@ -140,8 +144,8 @@ def test_the_papers_ablations_differ_from_its_budget_in_one_thing_each():
     changed = {
         name: {
             field.name
-            for field in dataclasses.fields(Budget)
-            if getattr(BUDGETS[name], field.name) != getattr(PAPER, field.name)
+            for field in dataclasses.fields(PathSettings)
+            if getattr(PATH_PRESETS[name], field.name) != getattr(PAPER, field.name)
         }
         for name in ("paper_no_reflection", "paper_no_tir")
     }
@@ -151,7 +155,7 @@ def test_the_papers_ablations_differ_from_its_budget_in_one_thing_each():
     }
     rays = scenes.rays([-2.0, 0.1, 0.3], [1.0, 0.0, 0.0])
     followed = {
-        name: _ends(scenes.geometry(scenes.right_prism()), rays, budget=BUDGETS[name])[0]
+        name: _ends(scenes.geometry(scenes.right_prism()), rays, settings=PATH_PRESETS[name])[0]
         for name in ("paper", *changed)
     }
     count = {name: len(ends.rays) for name, ends in followed.items()}
@@ -166,40 +170,40 @@ def test_the_papers_ablations_differ_from_its_budget_in_one_thing_each():
 def test_light_that_goes_round_inside_a_ball_ends_by_its_budget():
     geometry = scenes.geometry(scenes.ball(1.0, subdivisions=4))
     inside = scenes.rays([0.98, 0.0, 0.0], [0.0, 1.0, 0.0])
-    ends, traced = _ends(geometry, inside, budget=_generous(TREE))
+    ends, traced = _ends(geometry, inside, settings=_generous(TREE))
     assert ends.statuses.tolist() == [PathStatus.OUT_OF_BENDS]
     assert ends.bends[0] == TREE.bends
     assert traced.casts == TREE.bends + 1
 
 
 @pytest.mark.parametrize(
-    "budget",
+    "settings",
     [
         PAPER,
         TREE,
-        pytest.param(Budget(6, "all"), marks=pytest.mark.slow),
-        Budget(6, "all", cut=0.3),
+        pytest.param(PathSettings(6, "all"), marks=pytest.mark.slow),
+        PathSettings(6, "all", cut=0.3),
     ],
 )
-def test_untinted_light_is_conserved(budget):
+def test_untinted_light_is_conserved(settings):
     geometry = scenes.geometry(scenes.ball(1.0))
-    ends, traced = _ends(geometry, _towards_a_ball(), budget=_generous(budget))
+    ends, traced = _ends(geometry, _towards_a_ball(), settings=_generous(settings))
     np.testing.assert_array_equal(traced.lost, 0.0)
     np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-5)
 
 
 @pytest.mark.parametrize("short_of", ["live_per_ray", "segments_per_ray", "paths_per_ray"])
 def test_a_list_that_is_too_small_drops_the_least_light_and_returns_it(short_of):
-    generous = _generous(Budget(6, "all"))
+    generous = _generous(PathSettings(6, "all"))
     scarce = dataclasses.replace(generous, **{short_of: 1.5})
     geometry, rays = scenes.geometry(scenes.ball(1.0)), _towards_a_ball()
-    full, nothing_lost = _ends(geometry, rays, budget=generous)
-    ends, traced = _ends(geometry, rays, budget=scarce)
+    full, nothing_lost = _ends(geometry, rays, settings=generous)
+    ends, traced = _ends(geometry, rays, settings=scarce)
     assert np.all(nothing_lost.lost == 0.0)
     assert traced.lost.max() > 0.0
     np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-5)
     if short_of == "paths_per_ray":
-        assert len(ends.rays) == room(scarce, 64).paths
+        assert len(ends.rays) == capacities(scarce, 64).paths
         strongest = np.sort(full.weights[:, 0])[::-1][: len(ends.rays)]
         np.testing.assert_allclose(np.sort(ends.weights[:, 0])[::-1], strongest, rtol=1e-5)
 
@@ -214,8 +218,8 @@ def _by_ray(ends):
 def test_the_block_of_a_round_changes_nothing(block):
     geometry = scenes.geometry(scenes.box((1.0, 1.2, 1.4)))
     rays = _towards_a_ball(32)
-    expected, all_at_once = _ends(geometry, rays, budget=TREE)
-    found, in_blocks = _ends(geometry, rays, budget=TREE, block=block)
+    expected, all_at_once = _ends(geometry, rays, settings=TREE)
+    found, in_blocks = _ends(geometry, rays, settings=TREE, block=block)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), _by_ray(found), _by_ray(expected)
     )
@@ -225,8 +229,8 @@ def test_the_block_of_a_round_changes_nothing(block):
 @pytest.mark.slow
 def test_ends_are_the_last_segments_of_the_paths():
     geometry, rays = scenes.geometry(scenes.ball(1.0)), _towards_a_ball()
-    ends, _ = _ends(geometry, rays, budget=TREE)
-    trace = functools.partial(path_tracing.trace, budget=TREE, capacity=len(ends.rays))
+    ends, _ = _ends(geometry, rays, settings=TREE)
+    trace = functools.partial(path_tracing.trace, settings=TREE, capacity=len(ends.rays))
     paths = jax.tree.map(np.asarray, jax.jit(trace)(geometry, rays).paths)
     each = np.arange(len(paths.bends))
     lines = ends._replace(
@@ -248,7 +252,7 @@ def test_no_wall_of_a_ten_thousandth_of_its_body_is_skipped(size):
     angles = np.radians([0.0, 30.0, 60.0, 85.0])
     directions = np.stack([np.sin(angles), 0.1 * np.sin(angles), -np.cos(angles)], axis=-1)
     rays = scenes.rays(-3.0 * size * directions, directions)
-    ends, _ = _ends(scenes.geometry(body), rays, budget=Budget(10, "none"))
+    ends, _ = _ends(scenes.geometry(body), rays, settings=PathSettings(10, "none"))
     np.testing.assert_array_equal(ends.bends, 2)
     np.testing.assert_array_equal(ends.statuses, PathStatus.ESCAPED)
     np.testing.assert_allclose(ends.directions, rays.directions, atol=2e-6)
@@ -264,7 +268,7 @@ def test_budgets_refuse_what_makes_no_sense():
         ({"live_per_ray": float("inf")}, "live_per_ray"),
     ]:
         with pytest.raises(ValueError, match=reason):
-            Budget(**{"bends": 3, "reflections": "all", **options})
+            PathSettings(**{"bends": 3, "reflections": "all", **options})
 
 
 def test_nothing_is_nan_for_rays_that_meet_nothing_or_start_on_a_surface():
@@ -274,6 +278,6 @@ def test_nothing_is_nan_for_rays_that_meet_nothing_or_start_on_a_surface():
         [[1.0, 0.0, 0.0], [-1.0, -1.0, -1.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]],
     )
     with jax.debug_nans(True):
-        ends, traced = _ends(geometry, rays, budget=TREE)
+        ends, traced = _ends(geometry, rays, settings=TREE)
     np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-5)
     assert all(np.all(np.isfinite(x)) for x in (ends.origins, ends.directions, ends.tau))

@@ -7,20 +7,20 @@ from refref_jax.geometry.rays import orthonormal_basis
 from refref_jax.optics import path_tracing, ray_differentials
 from refref_jax.optics.differentiable_paths import follow_branch
 from refref_jax.optics.light_paths import exists, straight
-from refref_jax.optics.path_settings import TREE, Budget, Detail
+from refref_jax.optics.path_settings import TREE, Detail, PathSettings
 from refref_jax.sampling import polylines
 from tests.factories import scenes
 
 _RADIUS = 1e-3  # of every ray of tests.factories.scenes
 _GLASS = scenes.geometry(scenes.ball(1.0, subdivisions=3))
 _SLAB = scenes.geometry(scenes.box((10.0, 10.0, 0.6)))
-_THROUGH = Budget(bends=2, reflections="none")
+_THROUGH = PathSettings(bends=2, reflections="none")
 _WHOLE = Detail("all", TREE.bends + 1, "differential")
 
 
 @jax.jit
 def _traced(geometry, rays):
-    return path_tracing.trace(geometry, rays, budget=TREE, capacity=64, detail=_WHOLE).paths
+    return path_tracing.trace(geometry, rays, settings=TREE, capacity=64, detail=_WHOLE).paths
 
 
 def _one(paths, index):
@@ -42,7 +42,9 @@ def test_a_ray_that_meets_nothing_has_the_footprint_of_its_cone(t):
     rays = scenes.rays([0.0, 0.0, -4.0], [0.3, 0.9, 0.2])
     bent = _one(_traced(_GLASS, rays), 0)
     cone = jax.tree.map(lambda x: x[0], straight(rays))
-    assert bent.spreads.points.shape[-2:] == (2, 3) and cone.spreads.points.shape[-2:] == (0, 3)
+    assert bent.differentials.points.shape[-2:] == (2, 3) and cone.differentials.points.shape[
+        -2:
+    ] == (0, 3)
     np.testing.assert_allclose(_footprint(bent, t), _footprint(cone, t), atol=1e-9)
     np.testing.assert_allclose(
         _footprint(cone, t) @ _footprint(cone, t).T, (_RADIUS * t) ** 2 * np.eye(2), atol=1e-9
@@ -77,7 +79,7 @@ def _push(ray, across):
 
     def last(direction):
         moved = ray._replace(directions=direction)
-        scanned = follow_branch(_GLASS, moved, jnp.zeros(2, bool), budget=_THROUGH)
+        scanned = follow_branch(_GLASS, moved, jnp.zeros(2, bool), settings=_THROUGH)
         return scanned.points[2], scanned.directions[2]
 
     return jax.jvp(last, (ray.directions,), (across,))
@@ -92,9 +94,9 @@ def test_spreads_are_the_derivatives_of_the_differentiable_tracer(offset):
 
     for axis, across in enumerate(orthonormal_basis(rays.directions[0])):
         _, (point, direction) = _push(jax.tree.map(lambda x: x[0], rays), _RADIUS * across)
-        np.testing.assert_allclose(path.spreads.points[2, axis], point, rtol=2e-3, atol=2e-6)
+        np.testing.assert_allclose(path.differentials.points[2, axis], point, rtol=2e-3, atol=2e-6)
         np.testing.assert_allclose(
-            path.spreads.directions[2, axis], direction, rtol=2e-3, atol=2e-6
+            path.differentials.directions[2, axis], direction, rtol=2e-3, atol=2e-6
         )
 
 
@@ -111,7 +113,7 @@ def test_a_ball_of_glass_widens_pixels():
 @jax.jit
 def _legs(geometry, rays):
     detail = Detail("outside", 4, "differential")
-    return path_tracing.trace(geometry, rays, budget=TREE, capacity=1024, detail=detail).paths
+    return path_tracing.trace(geometry, rays, settings=TREE, capacity=1024, detail=detail).paths
 
 
 @pytest.mark.parametrize("index", [1.0, 1.0 + 1e-6, 1.5, 2.418])
@@ -119,12 +121,12 @@ def test_spreads_are_finite_at_grazing_and_critical_angles(index):
     glass = scenes.geometry(scenes.ball(1.0, index=index, subdivisions=2), scenes.box((3, 3, 1e-3)))
     heights = np.concatenate([np.linspace(-1.0, 1.0, 41), 1.0 - np.logspace(-8, -2, 20)])
     rays = scenes.rays([[y, 0.0, -4.0] for y in heights], [0.0, 0.0, 1.0])
-    for leaf in _legs(glass, rays).spreads:
+    for leaf in _legs(glass, rays).differentials:
         assert np.isfinite(leaf).all()
 
 
 def test_nothing_is_carried_for_a_cone():
-    spread = ray_differentials.begin(
+    differential = ray_differentials.begin(
         jax.tree.map(lambda x: x[0], scenes.rays([0, 0, 0], [0, 0, 1])), "cone"
     )
-    assert spread.points.size == 0 and spread.directions.size == 0
+    assert differential.points.size == 0 and differential.directions.size == 0

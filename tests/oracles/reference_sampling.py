@@ -99,7 +99,7 @@ def contracted(x):
 # --- step functions ---
 
 
-def cumulative(weights):
+def integrate_weights(weights):
     """Returns the normalised cumulative sum; uniform for weights that are all zero."""
     weights = [float(w) for w in weights]
     total = math.fsum(weights)
@@ -108,7 +108,7 @@ def cumulative(weights):
     return np.array([math.fsum(weights[:i]) / total for i in range(len(weights) + 1)])
 
 
-def invert_cumulative(u, edges, cdf):
+def invert_cdf(u, edges, cdf):
     """Returns where a piecewise linear cumulative function takes the value `u`.
 
     Where a whole interval does, its right end; at u = 1 the last such place of the last bin
@@ -123,11 +123,11 @@ def invert_cumulative(u, edges, cdf):
     raise AssertionError("a cumulative function has at least one bin")
 
 
-def sample_edges(u, edges, weights):
+def sample_intervals(u, edges, weights):
     """Returns the edges of intervals around the quantiles `u` of a step function."""
     (edges,) = _wide(edges)
-    cdf = cumulative(weights)
-    samples = [invert_cumulative(float(x), edges, cdf) for x in u]
+    cdf = integrate_weights(weights)
+    samples = [invert_cdf(float(x), edges, cdf) for x in u]
     inner = [0.5 * (a + b) for a, b in itertools.pairwise(samples)]
     first = max(2.0 * samples[0] - inner[0], edges[0])
     last = min(2.0 * samples[-1] - inner[-1], edges[-1])

@@ -16,7 +16,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from refref_jax.optics.path_settings import BUDGETS
+from refref_jax.optics.path_settings import PATH_PRESETS
 from refref_jax.training import devices, loop
 from refref_jax.training.loop import init_state
 from refref_jax.training.run_folder import Checkpoints
@@ -24,12 +24,14 @@ from tests.factories import scenes, small_model
 from tests.factories.small_model import CONFIG, MODEL
 
 
-def train(mesh, *, steps, budget, kept=True, folder=None, resumed=None):
+def train(mesh, *, steps, settings, kept=True, folder=None, resumed=None):
     """Returns what a run on some devices measured."""
     schedule = dataclasses.replace(CONFIG.schedule, steps=40)
     config = dataclasses.replace(CONFIG, schedule=schedule)
     geometry = scenes.geometry(scenes.ball(1.3, subdivisions=2))
-    setup = loop.set_up(config, MODEL, BUDGETS[budget], geometry, small_model.sampler(), mesh=mesh)
+    setup = loop.set_up(
+        config, MODEL, PATH_PRESETS[settings], geometry, small_model.sampler(), mesh=mesh
+    )
     setup = setup if kept else setup._replace(epoch=None)
     pool = setup.epoch or loop.trace_batches(setup, range(config.schedule.pool))
     state = devices.put_everywhere(init_state(config.seed, MODEL, schedule), mesh=mesh)

@@ -64,7 +64,7 @@ def test_one_ray_through_glass_has_the_room_of_its_tile(model, rays, monkeypatch
     # The ray has two paths. 64 copies of it would have to share the room of 96, and lose 4 %.
     scarce = dataclasses.replace(TREE, paths_per_ray=1.5)
     middle = jax.tree.map(lambda x: x[8, 8:9], rays)
-    seen = render_image(model._replace(budget=scarce), middle)
+    seen = render_image(model._replace(settings=scarce), middle)
     images._trace_tile.clear_cache()
     np.testing.assert_array_equal(seen.lost, 0.0)
     np.testing.assert_allclose(seen.accumulation, 1.0, atol=1e-5)
@@ -113,16 +113,18 @@ def test_rays_that_only_fill_up_a_tile_are_not_rendered(model, rays):
     flat = Rays(*(x.reshape(256, *x.shape[2:])[:200] for x in rays))
     full, _ = images.cut_out(flat, None, 0, 256)
     assert full.radii.shape == (256,)
-    tile = images._trace_tile(model.geometry, full, 200, budget=STRAIGHT, detail=everything(0))
+    tile = images._trace_tile(model.geometry, full, 200, settings=STRAIGHT, detail=everything(0))
     assert int(tile.count) == 200
 
 
 def test_rays_that_miss_pay_nothing_for_reflection(model, rays):
     flat = Rays(*(x.reshape(256, *x.shape[2:]) for x in rays))
     paper = images._trace_tile(
-        model.geometry, flat, 256, budget=PAPER, detail=everything(PAPER.bends)
+        model.geometry, flat, 256, settings=PAPER, detail=everything(PAPER.bends)
     )
-    straight = images._trace_tile(model.geometry, flat, 256, budget=STRAIGHT, detail=everything(0))
+    straight = images._trace_tile(
+        model.geometry, flat, 256, settings=STRAIGHT, detail=everything(0)
+    )
     count = int(paper.count)
     reflections = np.asarray(paper.paths.statuses)[:count] == PathStatus.NOT_TRACED
     hits = np.sum((np.asarray(paper.paths.bends)[:count] > 0) & ~reflections)

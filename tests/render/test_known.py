@@ -35,12 +35,12 @@ def geometry():
 
 @pytest.fixture(scope="module")
 def whole(geometry, rays):
-    return render_known(geometry, _environment(), rays, budget=TREE, tile=256)
+    return render_known(geometry, _environment(), rays, settings=TREE, tile=256)
 
 
 def test_straight_rays_see_the_background_itself(geometry, rays):
     radiance = _environment()
-    seen = render_known(geometry, radiance, rays, budget=STRAIGHT, tile=100)
+    seen = render_known(geometry, radiance, rays, settings=STRAIGHT, tile=100)
     flat = (jnp.asarray(x.reshape(-1, 3)) for x in rays[:2])
     expected = jax.vmap(radiance)(*flat).reshape(seen.linear.shape)
     np.testing.assert_allclose(seen.linear, expected, rtol=1e-5)
@@ -57,66 +57,68 @@ def test_an_image_has_the_shape_of_its_rays(whole):
 
 
 @pytest.mark.parametrize(
-    "budget",
+    "settings",
     [STRAIGHT, pytest.param(PAPER, marks=pytest.mark.slow), TREE],
     ids=["straight", "paper", "tree"],
 )
 @pytest.mark.slow
-def test_the_size_of_a_tile_does_not_matter(geometry, rays, budget):
-    one = render_known(geometry, _environment(), rays, budget=budget, tile=256)
-    pieces = render_known(geometry, _environment(), rays, budget=budget, tile=100)
+def test_the_size_of_a_tile_does_not_matter(geometry, rays, settings):
+    one = render_known(geometry, _environment(), rays, settings=settings, tile=256)
+    pieces = render_known(geometry, _environment(), rays, settings=settings, tile=100)
     np.testing.assert_allclose(pieces.linear, one.linear, atol=1e-5)
     np.testing.assert_array_equal(pieces.paths, one.paths)
     assert pieces.casts == one.casts
 
 
 @pytest.mark.parametrize(
-    "budget", [pytest.param(PAPER, marks=pytest.mark.slow), TREE], ids=["paper", "tree"]
+    "settings", [pytest.param(PAPER, marks=pytest.mark.slow), TREE], ids=["paper", "tree"]
 )
-def test_clear_glass_before_white_is_white(geometry, rays, budget):
-    seen = render_known(geometry, _WHITE, rays, budget=budget, tile=256)
+def test_clear_glass_before_white_is_white(geometry, rays, settings):
+    seen = render_known(geometry, _WHITE, rays, settings=settings, tile=256)
     np.testing.assert_allclose(seen.linear + seen.lost, 1.0, atol=1e-5)
 
 
 def test_lost_light_is_told(geometry, rays):
     tight = dataclasses.replace(TREE, cut=0.0, bends=6, paths_per_ray=1.0)
-    seen = render_known(geometry, _WHITE, rays, budget=tight, tile=256)
+    seen = render_known(geometry, _WHITE, rays, settings=tight, tile=256)
     assert np.max(seen.lost) > 0.0
     np.testing.assert_allclose(seen.linear + seen.lost, 1.0, atol=1e-5)
 
 
 def test_a_function_of_the_user_s_sees_origins_and_directions(geometry, rays):
-    seen = render_known(geometry, lambda o, d: o / 10.0 + d + 2.0, rays, budget=STRAIGHT, tile=256)
+    seen = render_known(
+        geometry, lambda o, d: o / 10.0 + d + 2.0, rays, settings=STRAIGHT, tile=256
+    )
     np.testing.assert_allclose(seen.linear, rays.origins / 10.0 + rays.directions + 2.0, rtol=1e-6)
 
 
 def test_backgrounds_are_arguments_of_one_program(geometry, rays):
-    first = render_known(geometry, _environment(1), rays, budget=TREE, tile=256)
+    first = render_known(geometry, _environment(1), rays, settings=TREE, tile=256)
     compiled = background_rendering._render_tile._cache_size()
-    second = render_known(geometry, _environment(2), rays, budget=TREE, tile=256)
+    second = render_known(geometry, _environment(2), rays, settings=TREE, tile=256)
     assert background_rendering._render_tile._cache_size() == compiled
     assert np.max(np.abs(first.linear - second.linear)) > 0.1
 
 
 def test_no_rays_give_an_empty_rendering(geometry):
     none = Rays(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
-    seen = render_known(geometry, _WHITE, none, budget=TREE)
+    seen = render_known(geometry, _WHITE, none, settings=TREE)
     assert seen.linear.shape == (0, 3) and seen.paths.shape == (0,) and seen.casts == 0
 
 
 def test_a_tile_without_rays_is_refused(geometry, rays):
     with pytest.raises(ValueError, match="Give 1 or more"):
-        render_known(geometry, _WHITE, rays, budget=TREE, tile=0)
+        render_known(geometry, _WHITE, rays, settings=TREE, tile=0)
 
 
 def test_a_camera_inside_a_body_is_told_by_the_rule_of_priorities():
     geometry = scenes.geometry(_BALL, rule="priority")
     rays = scenes.rays([[0.0, 0.0, 0.0]] * 3, np.eye(3))
     inside = parts_around([_BALL], np.asarray(rays.origins))
-    budget = dataclasses.replace(TREE, reflections="none")
+    settings = dataclasses.replace(TREE, reflections="none")
     # Seen from its centre a ball bends nothing, so directions stay as they are.
     seen = render_known(
-        geometry, lambda o, d: d + 1.0 + 0.0 * o, rays, budget=budget, inside=inside, tile=4
+        geometry, lambda o, d: d + 1.0 + 0.0 * o, rays, settings=settings, inside=inside, tile=4
     )
     np.testing.assert_allclose(seen.linear, 1.0 + np.eye(3), atol=0.05)
     assert seen.casts == 6

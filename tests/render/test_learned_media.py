@@ -11,10 +11,11 @@ from tests.laws import gradients
 _RADIUS = 7.3
 
 
-def _paths(meetings, passages):
-    plain = made_paths.stack([made_paths.path([], [[0, 0, 1]], [0])] * len(meetings))
+def _paths(hit_counts, path_lengths):
+    plain = made_paths.stack([made_paths.path([], [[0, 0, 1]], [0])] * len(hit_counts))
     return plain._replace(
-        meetings=jnp.asarray(meetings, jnp.float32), passages=jnp.asarray(passages, jnp.float32)
+        hit_counts=jnp.asarray(hit_counts, jnp.float32),
+        path_lengths=jnp.asarray(path_lengths, jnp.float32),
     )
 
 
@@ -26,13 +27,13 @@ def test_parts_begin_nearly_clear():
 
 def test_light_is_dimmed_at_every_meeting_and_along_every_passage():
     made = Dyes(jnp.array([[0.3, -1.0, 2.0], [0.0, 1.0, -4.0]]), jnp.array([[1.0, 0, 2]] * 2))
-    meetings, passages = [[0, 0], [2, 0], [1, 3]], [[0, 0], [0.5, 0], [1.5, 2.0]]
-    dimmed = learned_media.dye(made, _paths(meetings, passages), radius=_RADIUS).weights
+    hit_counts, path_lengths = [[0, 0], [2, 0], [1, 3]], [[0, 0], [0.5, 0], [1.5, 2.0]]
+    dimmed = learned_media.dye(made, _paths(hit_counts, path_lengths), radius=_RADIUS).weights
     tint, absorption = (
         np.asarray(learned_media.tints(made)),
         np.asarray(learned_media.absorptions(made, _RADIUS)),
     )
-    for n, lengths, got in zip(meetings, passages, dimmed, strict=True):
+    for n, lengths, got in zip(hit_counts, path_lengths, dimmed, strict=True):
         expected = np.prod(tint ** np.array(n)[:, None], axis=0)
         expected *= np.exp(-np.array(lengths) @ absorption)
         np.testing.assert_allclose(got, expected, rtol=2e-6)
@@ -67,8 +68,8 @@ def test_dye_check_grads():
     def light(density, absorption):
         wide = paths._replace(
             weights=paths.weights.astype(density.dtype),
-            meetings=paths.meetings.astype(density.dtype),
-            passages=paths.passages.astype(density.dtype),
+            hit_counts=paths.hit_counts.astype(density.dtype),
+            path_lengths=paths.path_lengths.astype(density.dtype),
         )
         return learned_media.dye(Dyes(density, absorption), wide, radius=_RADIUS).weights
 

@@ -37,7 +37,7 @@ def test_render_ray_equals_render_rays(name):
     # The object bends the ray: along a straight one the colour is another.
     straight = model._replace(
         config=dataclasses.replace(config, learned_tints=0),
-        budget=STRAIGHT,
+        settings=STRAIGHT,
         params=model.params._replace(dyes=None),
     )
     assert np.max(np.abs(_compiled(straight, rays).rgb[0] - got)) > 1e-4

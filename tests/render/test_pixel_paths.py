@@ -13,7 +13,7 @@ from refref_jax.render import Model, init_params, pixel_paths
 from refref_jax.render.pixel_paths import PixelPaths
 from tests.factories.small_model import MODEL
 
-_BUDGET = dataclasses.replace(TREE, bends=6, cut=1e-3)
+_SETTINGS = dataclasses.replace(TREE, bends=6, cut=1e-3)
 
 
 def _ray(origin, direction):
@@ -24,7 +24,7 @@ def _ray(origin, direction):
 @pytest.fixture(scope="module")
 def straight_down(slab):
     return pixel_paths.trace_pixel(
-        slab, _ray((0.1, 0.2, 4.0), (0.0, 0.0, -1.0)), budget=_BUDGET, reach=2.0
+        slab, _ray((0.1, 0.2, 4.0), (0.0, 0.0, -1.0)), settings=_SETTINGS, reach=2.0
     )
 
 
@@ -69,7 +69,7 @@ def test_pieces_are_the_tree_with_each_segment_once(straight_down):
 
 def test_a_ray_that_meets_nothing_is_one_straight_line(slab):
     paths = pixel_paths.trace_pixel(
-        slab, _ray((0.0, 0.0, 4.0), (0.0, 0.0, 1.0)), budget=_BUDGET, reach=2.0
+        slab, _ray((0.0, 0.0, 4.0), (0.0, 0.0, 1.0)), settings=_SETTINGS, reach=2.0
     )
     assert paths.statuses == (PathStatus.MISSED,) and paths.bends.tolist() == [0]
     np.testing.assert_allclose(paths.polylines[0], [[0, 0, 4], [0, 0, 6]], atol=1e-6)

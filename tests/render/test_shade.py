@@ -85,9 +85,9 @@ def test_it_sees_what_a_picture_shows():
     rays = image_rays(orbit(1, distance=4.0, elevation=0.3, size=8, angle_x=0.8), 0)
     sky = lambda origin, direction: 0.5 + 0.5 * direction
     roomy = dataclasses.replace(TREE, live_per_ray=20.0, paths_per_ray=20.0)
-    picture = render_known(glass, sky, rays, budget=TREE)
+    picture = render_known(glass, sky, rays, settings=TREE)
     flat = jax.tree.map(lambda x: jnp.asarray(x.reshape(64, *x.shape[2:])), rays)
-    traced = jax.jit(lambda rays: path_tracing.trace(glass, rays, budget=roomy))(flat)
+    traced = jax.jit(lambda rays: path_tracing.trace(glass, rays, settings=roomy))(flat)
     np.testing.assert_array_equal(traced.lost, 0.0)
     seen = shade(traced.paths, sky, rays=64)
     np.testing.assert_allclose(seen, picture.linear.reshape(64, 3), atol=2e-5)

@@ -459,7 +459,7 @@ def test_jitter_of_trusted_samples_keeps_them_within_their_quantiles():
     before, after = moved.histograms[0], moved.histograms[1]
     for edges, weights, drawn in zip(before.edges, before.weights, after.edges, strict=True):
         u = (np.arange(_FIELD.samples) + 0.8) / _FIELD.samples
-        expected = reference_sampling.sample_edges(u, edges, weights)
+        expected = reference_sampling.sample_intervals(u, edges, weights)
         np.testing.assert_allclose(drawn, expected, atol=1e-5)
 
 

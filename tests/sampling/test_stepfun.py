@@ -19,10 +19,10 @@ _AMOUNT = 0.07
 _AMOUNTS = [0.0, _AMOUNT, 3.0]
 _RADII = [0.003, _AMOUNT, 2.0]
 
-_heights = jax.jit(stepfun.heights)
-_cumulative = jax.jit(stepfun.cumulative)
-_invert = jax.jit(stepfun.invert_cumulative)
-_sample = jax.jit(stepfun.sample_edges)
+_heights = jax.jit(stepfun.weight_to_pdf)
+_cumulative = jax.jit(stepfun.integrate_weights)
+_invert = jax.jit(stepfun.invert_cdf)
+_sample = jax.jit(stepfun.sample_intervals)
 _dilate = jax.jit(stepfun.dilate, static_argnums=2)
 _blurred_mass = jax.jit(stepfun.blurred_mass_below, static_argnums=3)
 
@@ -65,7 +65,7 @@ def test_heights_times_widths_are_the_weights():
 
 
 def test_heights_have_finite_gradients_where_a_bin_has_no_width():
-    total = lambda edges, weights: jnp.sum(stepfun.heights(edges, weights))
+    total = lambda edges, weights: jnp.sum(stepfun.weight_to_pdf(edges, weights))
     assert gradients.all_finite(jax.grad(total, argnums=(0, 1))(_NARROW, jnp.ones(8)))
 
 
@@ -80,7 +80,7 @@ def test_cumulative_by_hand():
 @pytest.mark.parametrize("empty", [0, 4, _BINS - 1])
 def test_cumulative_against_a_loop(empty):
     _, weights = _step_function(1, empty=empty)
-    expected = reference_sampling.cumulative(weights)
+    expected = reference_sampling.integrate_weights(weights)
     np.testing.assert_allclose(_cumulative(weights), expected, atol=_SUMMATION)
 
 
@@ -106,7 +106,7 @@ def test_cumulative_runs_from_exactly_zero_to_exactly_one_and_never_decreases(bi
 
 @pytest.mark.parametrize("weights", [np.zeros(_BINS), np.eye(_BINS)[3], np.full(_BINS, 1e-30)])
 def test_cumulative_has_finite_gradients(weights):
-    total = lambda w: jnp.sum(jnp.square(stepfun.cumulative(w)))
+    total = lambda w: jnp.sum(jnp.square(stepfun.integrate_weights(w)))
     assert gradients.all_finite(jax.jit(jax.grad(total))(*singles(weights)))
 
 
@@ -124,7 +124,7 @@ def test_invert_cumulative_against_a_loop(empty):
     cdf = _cumulative(weights)
     u = np.random.default_rng(0).uniform(size=30).astype(np.float32)
     wide = np.asarray(edges, np.float64), np.asarray(cdf, np.float64)
-    expected = [reference_sampling.invert_cumulative(float(x), *wide) for x in u]
+    expected = [reference_sampling.invert_cdf(float(x), *wide) for x in u]
     np.testing.assert_allclose(_invert(jnp.asarray(u), edges, cdf), expected, atol=_SUMMATION)
 
 
@@ -162,7 +162,7 @@ def test_sample_edges_by_hand():
 def test_sample_edges_against_a_loop(empty, count):
     edges, weights = _step_function(6, empty=empty)
     u = np.sort(np.random.default_rng(count).uniform(size=count)).astype(np.float32)
-    expected = reference_sampling.sample_edges(u, edges, weights)
+    expected = reference_sampling.sample_intervals(u, edges, weights)
     np.testing.assert_allclose(
         _sample(jnp.asarray(u), edges, weights), expected, atol=2.0 * _SUMMATION
     )
@@ -373,9 +373,9 @@ def test_check_grads():
 
     def everything(u, edges, weights):
         return (
-            stepfun.heights(edges, weights),
-            stepfun.cumulative(weights),
-            stepfun.sample_edges(u, edges, weights),
+            stepfun.weight_to_pdf(edges, weights),
+            stepfun.integrate_weights(weights),
+            stepfun.sample_intervals(u, edges, weights),
             stepfun.blurred_mass_below(u, edges, weights, 0.2),
         )
 
@@ -390,12 +390,12 @@ def _batch():
 
 
 _CASES = {
-    "heights": lambda edges, weights, u: stepfun.heights(edges, weights),
-    "cumulative": lambda edges, weights, u: stepfun.cumulative(weights),
-    "invert_cumulative": lambda edges, weights, u: stepfun.invert_cumulative(
-        u, edges, stepfun.cumulative(weights)
+    "heights": lambda edges, weights, u: stepfun.weight_to_pdf(edges, weights),
+    "integrate_weights": lambda edges, weights, u: stepfun.integrate_weights(weights),
+    "invert_cdf": lambda edges, weights, u: stepfun.invert_cdf(
+        u, edges, stepfun.integrate_weights(weights)
     ),
-    "sample_edges": lambda edges, weights, u: stepfun.sample_edges(u, edges, weights),
+    "sample_intervals": lambda edges, weights, u: stepfun.sample_intervals(u, edges, weights),
     "dilate": lambda edges, weights, u: stepfun.dilate(edges, weights, _AMOUNT),
     "blurred_mass_below": lambda edges, weights, u: stepfun.blurred_mass_below(
         u, edges, weights, _AMOUNT

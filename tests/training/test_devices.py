@@ -149,7 +149,7 @@ def test_eight_devices_train_as_one_does(tmp_path):
         "on one": {"devices": 1, "steps": 26, "resumed": saved},
         "on five": {"devices": 5, "steps": 26, "resumed": saved},
     }
-    runs = {name: {"budget": "paper", **options} for name, options in runs.items()}
+    runs = {name: {"settings": "paper", **options} for name, options in runs.items()}
     found = _result(_start("tests.processes.sharded", json.dumps(runs), flags=_EIGHT))
     one = found["one"]
     for name, steps in {"eight": (0, 24), "five": (0, 24), "on one": (24, 26)}.items():
@@ -181,10 +181,10 @@ def test_two_processes_find_each_other_and_sum():
 def test_two_processes_train_as_one_does(tmp_path):
     folder = str(tmp_path / "saved")
     together = {
-        "two": {"devices": 1, "steps": 24, "budget": "paper", "folder": folder},
-        "on": {"devices": 1, "steps": 26, "budget": "paper", "resumed": folder},
+        "two": {"devices": 1, "steps": 24, "settings": "paper", "folder": folder},
+        "on": {"devices": 1, "steps": 26, "settings": "paper", "resumed": folder},
     }
-    alone = {"one": {"devices": 1, "steps": 26, "budget": "paper"}}
+    alone = {"one": {"devices": 1, "steps": 26, "settings": "paper"}}
     first, second = _in_two_processes("tests.processes.sharded", json.dumps(together))
     one = _result(_start("tests.processes.sharded", json.dumps(alone)))["one"]
     assert first == second and first["two"]["parts"] == 2

@@ -165,9 +165,9 @@ def test_eyes_are_asked_where_they_are_at_hand(tmp_path):
     assert small["lpips"] is None and small["flip"] == 0.125
 
 
-def _model(budget):
+def _model(settings):
     params = init_params(jax.random.key(0), MODEL)
-    return Model(MODEL, budget, scenes.geometry(scenes.ball(1.3, subdivisions=1)), params)
+    return Model(MODEL, settings, scenes.geometry(scenes.ball(1.3, subdivisions=1)), params)
 
 
 def test_evaluating_is_rendering_and_measuring_view_by_view(ball_scene):

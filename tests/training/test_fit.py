@@ -56,13 +56,13 @@ def test_the_configuration_of_a_run_repeats_it_bit_for_bit(fifty, tmp_path):
     model = fit.fit(config, out=tmp_path / "again", report=messages.append)
     assert run_folder.read_config(tmp_path / "again") == config
     first = checkpoint_io.load_model(fifty)
-    assert (first.config, first.budget) == (model.config, model.budget)
+    assert (first.config, first.settings) == (model.config, model.settings)
     pairs = zip(jax.tree.leaves(first.params), jax.tree.leaves(model.params), strict=True)
     assert all(np.array_equal(ours, again) for ours, again in pairs)
     assert any("given: scene=" in message for message in messages)
     # Resumed, it is done; with another option it is refused.
     done = fit.fit(config, out=tmp_path / "again", existing="resume", report=messages.append)
-    assert "trained already" in messages[-1] and done.budget == model.budget
+    assert "trained already" in messages[-1] and done.settings == model.settings
     with pytest.raises(ValueError, match=r"other options \(cut\)"):
         fit.fit(config.override(cut=0.05), out=tmp_path / "again", existing="resume")
     with pytest.raises(ValueError, match="contains a run already"):

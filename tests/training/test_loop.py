@@ -23,8 +23,8 @@ pytestmark = [pytest.mark.loose, pytest.mark.longest]
 _GEOMETRY = scenes.geometry(scenes.ball(1.3, subdivisions=2))
 
 
-def _setup(config=CONFIG, budget=PAPER):
-    return loop.set_up(config, MODEL, budget, _GEOMETRY, small_model.sampler(config.seed))
+def _setup(config=CONFIG, settings=PAPER):
+    return loop.set_up(config, MODEL, settings, _GEOMETRY, small_model.sampler(config.seed))
 
 
 def _start(config=CONFIG):
@@ -188,11 +188,11 @@ def test_charbonnier_changes_the_loss_only():
 
 
 # Other tests train along the tree as well.
-@pytest.mark.parametrize("budget", [STRAIGHT, TREE])
+@pytest.mark.parametrize("settings", [STRAIGHT, TREE])
 @pytest.mark.slow
-def test_any_budget_can_be_trained_along(budget):
-    setup = _setup(budget=budget)
-    assert CONFIG.schedule.batch <= setup.capacity <= room(budget, CONFIG.schedule.batch).paths
+def test_any_budget_can_be_trained_along(settings):
+    setup = _setup(settings=settings)
+    assert CONFIG.schedule.batch <= setup.capacity <= room(settings, CONFIG.schedule.batch).paths
     _, reports = _train(setup, _start(), 2)
     assert all(np.isfinite(report.loss) and report.lost < 1e-3 for report in reports)
 
@@ -208,7 +208,7 @@ def test_light_is_lost_only_where_paths_have_too_little_room():
     room = {"roomy": setup.capacity, "tight": CONFIG.schedule.batch}
     lost = {
         name: loop.trace_pool(
-            setup.geometry, rays, budget=PAPER, capacity=capacity, detail=detail
+            setup.geometry, rays, settings=PAPER, capacity=capacity, detail=detail
         ).lost
         for name, capacity in room.items()
     }
@@ -219,7 +219,7 @@ def test_light_is_lost_only_where_paths_have_too_little_room():
 
 
 def test_straight_light_needs_no_room_for_other_paths():
-    assert _setup(budget=STRAIGHT).capacity == CONFIG.schedule.batch < _setup().capacity
+    assert _setup(settings=STRAIGHT).capacity == CONFIG.schedule.batch < _setup().capacity
 
 
 def test_only_the_newest_checkpoints_are_kept_and_none_twice(tmp_path):
@@ -246,7 +246,7 @@ def test_a_run_folder_holds_everything_that_rendering_needs(tmp_path):
     with Checkpoints(run, keep=1) as checkpoints:
         checkpoints.save(state)
     model = load_model(run)
-    assert model.config == MODEL and model.budget == PAPER
+    assert model.config == MODEL and model.settings == PAPER
     _assert_identical(model.params, state.params)
     _assert_identical(model.geometry, _GEOMETRY)
     with pytest.raises(ValueError, match=r"step 7.*\[1\]"):

@@ -9,7 +9,13 @@ import pytest
 
 from refref_jax import configuration
 from refref_jax.data.scene_analysis import Needs
-from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, budget_of, capacity_factors
+from refref_jax.optics.path_settings import (
+    PAPER,
+    STRAIGHT,
+    TREE,
+    capacity_factors,
+    make_path_settings,
+)
 from refref_jax.render import checkpoint_io
 from refref_jax.training import config_files, run_folder
 from refref_jax.training.config import (
@@ -75,7 +81,7 @@ def test_resolve_takes_what_the_scene_requires(found, given, expected):
 @pytest.mark.parametrize("given", [{}, {"paths": "straight"}, {"field": "nerfacto", "steps": 7}])
 def test_resolve_leaves_nothing_open_and_is_idempotent(found, given):
     made = _resolve(found, **given)
-    straight = made.model.budget.bends == 0
+    straight = made.model.settings.bends == 0
     for option in options_of():
         left = straight and option.name == "reentry"
         assert left == (made.config.get(option.name) is None), option.name
@@ -100,28 +106,36 @@ def test_resolve_refuses_an_inside_for_straight_light(given, option):
 
 def test_resolve_grants_straight_light_what_it_has_anyway():
     made = _resolve(_TINTED, paths="straight", interior="field", reentry="possible")
-    assert made.model.config.interior == "field" and made.model.budget == STRAIGHT
+    assert made.model.config.interior == "field" and made.model.settings == STRAIGHT
 
 
 def test_resolve_promises_in_the_budget_what_the_scene_keeps():
-    assert _resolve(_CLEAR).model.budget == dataclasses.replace(TREE, reentry="impossible")
-    assert _resolve(_TINTED).model.budget == TREE
-    paper = _resolve(_TINTED, paths="paper", bends=3).model.budget
+    assert _resolve(_CLEAR).model.settings == dataclasses.replace(TREE, reentry="impossible")
+    assert _resolve(_TINTED).model.settings == TREE
+    paper = _resolve(_TINTED, paths="paper", bends=3).model.settings
     assert paper == dataclasses.replace(PAPER, bends=3)
-    assert _resolve(_EMPTY).model.budget == STRAIGHT
-    assert _resolve(_CLEAR, reentry="possible").model.budget == TREE
-    assert _resolve(_TINTED, cut=0.005).model.budget.cut == 0.005
+    assert _resolve(_EMPTY).model.settings == STRAIGHT
+    assert _resolve(_CLEAR, reentry="possible").model.settings == TREE
+    assert _resolve(_TINTED, cut=0.005).model.settings.cut == 0.005
 
 
 def test_a_finer_cut_has_room_for_its_paths_however_it_is_made():
     usual = capacity_factors(TREE)
-    for fine in (budget_of("tree", cut=TREE.cut / 4.0), dataclasses.replace(TREE, cut=0.005)):
+    for fine in (
+        make_path_settings("tree", cut=TREE.cut / 4.0),
+        dataclasses.replace(TREE, cut=0.005),
+    ):
         assert capacity_factors(fine) == tuple(2.0 * x for x in usual)
     longer = capacity_factors(dataclasses.replace(TREE, bends=48))
     assert longer == usual._replace(segments_per_ray=2.0 * usual.segments_per_ray)
     # Never without bound.
-    assert capacity_factors(budget_of("tree", cut=0.0)).paths_per_ray < 10.0 * usual.paths_per_ray
-    assert budget_of("tree", cut=0.1, bends=3) == dataclasses.replace(TREE, cut=0.1, bends=3)
+    assert (
+        capacity_factors(make_path_settings("tree", cut=0.0)).paths_per_ray
+        < 10.0 * usual.paths_per_ray
+    )
+    assert make_path_settings("tree", cut=0.1, bends=3) == dataclasses.replace(
+        TREE, cut=0.1, bends=3
+    )
     own = dataclasses.replace(TREE, paths_per_ray=3.0)
     assert capacity_factors(dataclasses.replace(own, cut=0.005)).paths_per_ray == 3.0
     # What an earlier version wrote out grows as well.
@@ -131,7 +145,7 @@ def test_a_finer_cut_has_room_for_its_paths_however_it_is_made():
 
 def test_resolve_warns_of_what_is_doubtful():
     made = _resolve(_TINTED, interior="clear", reentry="impossible")
-    assert made.model.config.interior == "clear" and made.model.budget.reentry == "impossible"
+    assert made.model.config.interior == "clear" and made.model.settings.reentry == "impossible"
     assert len(made.warnings) == 2 and made.describe().count("warning: ") == 2
 
 

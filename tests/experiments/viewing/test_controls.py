@@ -15,8 +15,8 @@ from tests.factories import scenes
 @pytest.fixture(scope="module")
 def straight_down(slab):
     ray = Rays(np.array([0.1, 0.2, 4.0]), np.array([0.0, 0.0, -1.0]), np.float64(1e-3))
-    budget = dataclasses.replace(TREE, bends=6, cut=1e-3)
-    return pixel_paths.trace_pixel(slab, ray, budget=budget, reach=2.0)
+    settings = dataclasses.replace(TREE, bends=6, cut=1e-3)
+    return pixel_paths.trace_pixel(slab, ray, settings=settings, reach=2.0)
 
 
 def test_strong_light_is_thick_and_yellow_and_weak_light_thin_and_blue():

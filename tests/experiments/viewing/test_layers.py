@@ -45,7 +45,7 @@ def test_a_model_offers_what_it_has(model):
         "mask",
         "error",
     )
-    straight = model._replace(budget=STRAIGHT)
+    straight = model._replace(settings=STRAIGHT)
     assert layers.offered(straight, truth=False) == ("rgb", "distance")
 
 

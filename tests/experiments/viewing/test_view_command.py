@@ -18,10 +18,10 @@ from tests.factories.small_model import MODEL
 from tests.processes.command import ROOT, run_command
 
 
-def _subject(budget=TREE, frames=None):
+def _subject(settings=TREE, frames=None):
     parts = scenes.geometry(scenes.ball(1.0, subdivisions=1), scenes.ball(0.5, subdivisions=1))
     model = Model(
-        MODEL, budget, parts, jax.eval_shape(lambda: init_params(jax.random.key(0), MODEL))
+        MODEL, settings, parts, jax.eval_shape(lambda: init_params(jax.random.key(0), MODEL))
     )
     return Subject("made", model, "nested", frames, ("glass", "bubble"), (36, 90), 4096)
 
@@ -64,14 +64,14 @@ def test_the_first_choice_is_the_model_as_it_was_trained():
     choice = session.first_choice(subject)
     assert choice.layer == layers.RGB and choice.indices == (1.5, 1.5)
     model = session.chosen_model(subject, choice)
-    assert model.budget is subject.model.budget and model.geometry == subject.model.geometry
+    assert model.settings is subject.model.settings and model.geometry == subject.model.geometry
 
 
 def test_another_index_changes_arrays_and_nothing_that_is_compiled():
     subject = _subject()
     choice = dataclasses.replace(session.first_choice(subject), indices=(1.7, 1.2))
     model = session.chosen_model(subject, choice)
-    assert model.budget == subject.model.budget
+    assert model.settings == subject.model.settings
     np.testing.assert_array_equal(model.geometry.interfaces.index_inside, np.float32([1.7, 1.2]))
     np.testing.assert_array_equal(model.geometry.interfaces.index_outside, np.float32([1.0, 1.7]))
     before, after = (jax.tree.map(np.shape, x.geometry) for x in (subject.model, model))
@@ -83,7 +83,7 @@ def test_another_index_changes_arrays_and_nothing_that_is_compiled():
 def test_another_cut_and_other_bends_are_another_budget_with_room_for_them():
     subject = _subject()
     first = session.first_choice(subject)
-    finer = session.chosen_model(subject, dataclasses.replace(first, cut=0.005, bends=32)).budget
+    finer = session.chosen_model(subject, dataclasses.replace(first, cut=0.005, bends=32)).settings
     assert (finer.cut, finer.bends) == (0.005, 32)
     paths = capacity_factors(finer).paths_per_ray
     assert paths == pytest.approx(2.0 * capacity_factors(TREE).paths_per_ray)
