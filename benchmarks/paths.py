@@ -182,7 +182,7 @@ def _casts_of_random_paths(
     some = np.arange(0, len(origins), 4)
     rays = origins[some].astype(float), directions[some].astype(float)
     ends = reference_tree.trace(clear, Embree(clear), *rays, rule)
-    return float(np.sum(ends.weights[:, 0] * (ends.bends + 1.0)) / len(some))
+    return float(np.sum(ends.weights[:, 0] * (ends.num_bends + 1.0)) / len(some))
 
 
 def _take_turns(

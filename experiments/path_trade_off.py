@@ -109,8 +109,13 @@ def chosen_settings() -> list[tuple[str, str, PathSettings]]:
     """Returns sweep, name and path settings of all trials; equal ones are in both sweeps."""
     cuts = sorted(_numbers("cuts", _CUTS.value, float), reverse=True)
     bends = sorted(_numbers("bends", _BENDS.value, int))
-    swept = [("cut", f"{cut:g}", path_settings.make_path_settings("tree", cut=cut)) for cut in cuts]
-    swept += [("bends", str(n), path_settings.make_path_settings("tree", bends=n)) for n in bends]
+    swept = [
+        ("cut", f"{cut:g}", path_settings.make_path_settings("tree", min_throughput=cut))
+        for cut in cuts
+    ]
+    swept += [
+        ("bends", str(n), path_settings.make_path_settings("tree", max_bends=n)) for n in bends
+    ]
     points = [("settings", name, PATH_PRESETS[name]) for name in ("straight", "paper")]
     return points + swept
 

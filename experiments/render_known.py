@@ -133,8 +133,8 @@ def summarise(
     return {
         "scene": scene.name,
         "paths": _PATHS.value,
-        "cut": settings.cut,
-        "bends": settings.bends,
+        "cut": settings.min_throughput,
+        "bends": settings.max_bends,
         "unfinished": settings.unfinished,
         "views": measured,
         "mean": {key: evaluation.mean_of(measured, key) for key in keys},
@@ -186,8 +186,8 @@ def _report(summary: dict[str, Any]) -> None:
     else:
         reporting.warn_of_lost_light(
             summary["lost_energy"],
-            advice="Use a larger --cut or fewer --bends, or, as a library, PathSettings with larger "
-            "capacity factors.",
+            advice="Use a larger --cut or fewer --bends, or, as a library, PathSettings with "
+            "larger capacity factors.",
         )
 
 

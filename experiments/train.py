@@ -71,7 +71,11 @@ def check_flags() -> TrainConfig:
         )
     training_body.check_flags(config, _CONFIG)
     if config.paths.name is not None:
-        make_path_settings(config.paths.name, cut=config.paths.cut, bends=config.paths.bends)
+        make_path_settings(
+            config.paths.name,
+            min_throughput=config.paths.min_throughput,
+            max_bends=config.paths.max_bends,
+        )
     return config
 
 

@@ -29,7 +29,7 @@ from tests.laws import gradients
 _PAGE = Path(__file__).parents[1] / "docs" / "library.md"
 
 _GLASS = refref_jax.single_object(trimesh.creation.box(), index=1.5)
-_SETTINGS = refref_jax.PathSettings(bends=2, reflections="all")
+_SETTINGS = refref_jax.PathSettings(max_bends=2, reflections="all")
 _STRAIGHT = refref_jax.PATH_PRESETS["straight"]
 _AHEAD = np.array([1.0, 0.0, 0.0])
 

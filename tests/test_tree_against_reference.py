@@ -84,5 +84,5 @@ def test_images_are_those_of_the_slow_tree(scene, settings, rule):
         assert reference_images.psnr(*images, view.mask[rows]) > _SAME_IMAGE
         paths = np.sum(traced.ends.statuses != PathStatus.EMPTY)
         np.testing.assert_allclose(paths, len(slow.rays), rtol=0.02)
-        if settings.bends > 0:
+        if settings.max_bends > 0:
             np.testing.assert_allclose(int(traced.casts), slow.casts, rtol=0.02)

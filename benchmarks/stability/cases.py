@@ -88,7 +88,7 @@ def powers_of_two(density: int) -> Found:
         moved = rays._replace(origins=rays.origins * np.float32(scale))
         geometry = paths.build(body._replace(vertices=scale * body.vertices))
         other = paths.main_ends(geometry, moved)
-        assert np.array_equal(other.bends, plain.bends)
+        assert np.array_equal(other.num_bends, plain.num_bends)
         apart = np.abs(other.origins / scale - plain.origins)
         turned = np.abs(other.directions - plain.directions)
         worst = max(worst, float(apart.max()), float(turned.max()))
@@ -149,7 +149,7 @@ def vertices_and_edges(density: int) -> Found:
             origins = 4.0 * unit(unit(aims) + 0.3 * unit(random.normal(size=aims.shape)))
             rays = balls_and_rays.rays(origins, aims - origins)
             ends = paths.main_ends(paths.build(body), rays)
-            slipped += int(np.sum(ends.bends != 2))
+            slipped += int(np.sum(ends.num_bends != 2))
             cases += RAYS
     return Found(slipped / cases, cases)
 

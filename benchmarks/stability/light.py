@@ -50,7 +50,7 @@ def on_surfaces(density: int) -> Found:
         rays = balls_and_rays.rays(origins, directions)
         geometry = paths.build(body)
         worst = max(worst, _unbalance(geometry, rays, TREE))
-        bends = paths.main_ends(geometry, rays).bends
+        bends = paths.main_ends(geometry, rays).num_bends
         # Rounding decides whether a start is inside; if it is, steep light leaves at once.
         outwards = np.sum(origins * directions, axis=-1) > 0.8
         assert np.all(bends[outwards] <= 1)
@@ -60,7 +60,7 @@ def on_surfaces(density: int) -> Found:
 def _unbalance(geometry, rays, settings) -> float:
     """Returns how far weights and losses are from summing to 1."""
     traced = paths.trace(geometry, rays, settings=settings)
-    assert np.all(traced.ends.bends <= settings.bends)
+    assert np.all(traced.ends.num_bends <= settings.max_bends)
     assert all(np.all(np.isfinite(x)) for x in traced.ends)
     return float(np.abs(paths.energy(traced, len(rays.radii)) - 1.0).max())
 
@@ -69,15 +69,22 @@ def white_furnace(density: int) -> Found:
     """Sums of weights and losses in clear glass, with ample room and with too little."""
     geometry, rays = paths.build(paths.torus()), inner_rays(1.4)
     all_settings = [
-        PathSettings(24, "all", cut=0.0, live_per_ray=1.0, segments_per_ray=4.0, paths_per_ray=1.0),
-        TREE,
-        PathSettings(24, "all", cut=0.002, live_per_ray=1.0),
-        PathSettings(24, "all", cut=0.002, segments_per_ray=1.0),
-        PathSettings(24, "all", cut=0.002, paths_per_ray=1.0),
         PathSettings(
-            8, "all", cut=0.0, live_per_ray=64.0, segments_per_ray=600.0, paths_per_ray=300.0
+            24, "all", min_throughput=0.0, live_per_ray=1.0, segments_per_ray=4.0, paths_per_ray=1.0
         ),
-        PathSettings(24, "all", cut=0.001),
+        TREE,
+        PathSettings(24, "all", min_throughput=0.002, live_per_ray=1.0),
+        PathSettings(24, "all", min_throughput=0.002, segments_per_ray=1.0),
+        PathSettings(24, "all", min_throughput=0.002, paths_per_ray=1.0),
+        PathSettings(
+            8,
+            "all",
+            min_throughput=0.0,
+            live_per_ray=64.0,
+            segments_per_ray=600.0,
+            paths_per_ray=300.0,
+        ),
+        PathSettings(24, "all", min_throughput=0.001),
         PAPER,
     ][: 2 * density]
     worst = max(_unbalance(geometry, rays, settings) for settings in all_settings)
@@ -152,7 +159,7 @@ def reversibility(density: int) -> Found:
                 directions=jnp.asarray(-ends.directions),
             )
             home = paths.main_ends(geometry, back)
-            same = escaped & (home.bends == ends.bends)
+            same = escaped & (home.num_bends == ends.num_bends)
             assert same[escaped].mean() > 0.99
             turned = home.directions + np.asarray(rays.directions)
             worst = max(worst, float(np.linalg.norm(turned, axis=-1)[same].max()))
@@ -167,9 +174,11 @@ def whispering_gallery(density: int) -> Found:
     rays = balls_and_rays.rays(origins, [1.0, 0.0, 0.0])
     worst, geometry = 0.0, paths.build(sphere())
     for bends in (24, 100)[: 1 + (density > 1)]:
-        traced = paths.trace(geometry, rays, settings=PathSettings(bends, "all", cut=0.02))
+        traced = paths.trace(
+            geometry, rays, settings=PathSettings(bends, "all", min_throughput=0.02)
+        )
         there = traced.ends.statuses != PathStatus.EMPTY
         assert np.all(traced.ends.statuses[there] == PathStatus.OUT_OF_BENDS)
-        assert np.all(traced.ends.bends[there] == bends)
+        assert np.all(traced.ends.num_bends[there] == bends)
         worst = max(worst, float(np.abs(paths.energy(traced, RAYS) - 1.0).max()))
     return Found(worst, RAYS)

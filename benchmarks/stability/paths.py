@@ -128,7 +128,7 @@ def compare(parts, rays, *, tracer=trace):
     few = len(surfaces.corners) <= 400
     cast = (reference_surfaces.BruteForce if few else reference_surfaces.Embree)(surfaces)
     origins, directions = (np.asarray(x, float) for x in (rays.origins, rays.directions))
-    rule = reference_tree.Rule(MAIN.bends, "none")
+    rule = reference_tree.Rule(MAIN.num_bends, "none")
     directions = reference_surfaces.unit(directions)
     true = reference_tree.trace(surfaces, cast, origins, directions, rule)
     true = true._replace(casts=np.zeros(len(true.rays)))
@@ -143,8 +143,8 @@ def difference(found, true):
     return Difference(
         direction=np.linalg.norm(found.directions - true.directions, axis=-1),
         position=np.linalg.norm(apart - along * true.directions, axis=-1),
-        bends=found.bends,
-        same=found.bends == true.bends,
+        bends=found.num_bends,
+        same=found.num_bends == true.num_bends,
         escaped=true.statuses == reference_tree.ESCAPED,
     )
 

@@ -133,23 +133,34 @@ def lpips_weights() -> flags.FlagHolder[str | None]:
 class PathFlags(NamedTuple):
     """Flags of commands that trace light paths with the user's path settings."""
 
-    cut: flags.FlagHolder[float | None]
-    bends: flags.FlagHolder[int | None]
+    min_throughput: flags.FlagHolder[float | None]
+    max_bends: flags.FlagHolder[int | None]
 
     def chosen(self, paths: str) -> PathSettings:
         """Returns the path settings of a preset, with the user's threshold and maximum of bends."""
-        return make_path_settings(paths, cut=self.cut.value, bends=self.bends.value)
+        return make_path_settings(
+            paths, min_throughput=self.min_throughput.value, max_bends=self.max_bends.value
+        )
 
 
-def settings(*, cut: float | None = None, bends: int | None = None) -> PathFlags:
-    """Defines `--cut` and `--bends`; the defaults are those of the path preset."""
+def settings(*, min_throughput: float | None = None, max_bends: int | None = None) -> PathFlags:
+    """Defines `--min_throughput` and `--max_bends`, by default those of the path preset.
+
+    Their former names `--cut` and `--bends` are aliases.
+    """
     what = ("Throughput threshold of paths, in [0, 1)", "Maximum number of bends of a path")
     found = PathFlags(
-        flags.DEFINE_float("cut", cut, f"{what[0]}; that of the path preset by default."),
-        flags.DEFINE_integer("bends", bends, f"{what[1]}; that of the path preset by default."),
+        flags.DEFINE_float(
+            "min_throughput", min_throughput, f"{what[0]}; that of the path preset by default."
+        ),
+        flags.DEFINE_integer(
+            "max_bends", max_bends, f"{what[1]}; that of the path preset by default."
+        ),
     )
-    app.check(found.cut, lambda cut: make_path_settings("tree", cut=cut))
-    app.check(found.bends, lambda bends: make_path_settings("tree", bends=bends))
+    app.check(found.min_throughput, lambda x: make_path_settings("tree", min_throughput=x))
+    app.check(found.max_bends, lambda n: make_path_settings("tree", max_bends=n))
+    flags.DEFINE_alias("cut", "min_throughput")
+    flags.DEFINE_alias("bends", "max_bends")
     return found
 
 

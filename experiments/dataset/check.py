@@ -41,7 +41,7 @@ _OUT = flags.DEFINE_string("out", None, "Folder of the report; FOLDER if not giv
 _OVERWRITE = cli_flags.overwrite("the report of an earlier check")
 # The diamond traps light for so long that the tree's own threshold costs 5 dB of 39, and Cycles'
 # limit of 64 bounces another 6. Paths are checked here, not their truncation.
-_SETTINGS = cli_flags.settings(cut=0.004, bends=render_settings.BOUNCES)
+_SETTINGS = cli_flags.settings(min_throughput=0.004, max_bends=render_settings.BOUNCES)
 # Few rays per pixel alias where Cycles averages over hundreds: a face of the cube is 41 dB off with
 # 25 rays per pixel of 200 x 200, and 48 with 100.
 _RAYS_PER_PIXEL = cli_flags.rays_per_pixel(100)

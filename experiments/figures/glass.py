@@ -118,7 +118,7 @@ def draw_tree(scene: KnownScene, folder: Path, path: Path) -> None:
     outlines = cross_sections.outlines_of(meshes.read_meshes(folder))
     rays = cross_sections.rays_towards(_CAMERA, [_AIM * cross_sections.width_of(outlines)])
     all_settings = {title: PATH_PRESETS[name] for name, title in _NAMES.items()}
-    finer = dataclasses.replace(PATH_PRESETS["tree"], cut=_FINER)
+    finer = dataclasses.replace(PATH_PRESETS["tree"], min_throughput=_FINER)
     all_settings[f"the tree, threshold {100.0 * _FINER:g} %"] = finer
     panels = [
         Panel(title, _follow(scene, rays, settings)) for title, settings in all_settings.items()

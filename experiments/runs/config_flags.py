@@ -17,6 +17,7 @@ from absl import flags
 
 from experiments.cli import app
 from experiments.runs import refraction_indices
+from refref_jax import configuration
 from refref_jax.training import config as training_config
 from refref_jax.training import config_files
 from refref_jax.training.config import Option, TrainConfig
@@ -64,7 +65,12 @@ def define_flags() -> dict[str, flags.FlagHolder]:
         "Configuration file, such as a run's config.json; other flags override it, and "
         "--NAME=auto resets an option.",
     )
-    return {option.name: _define(option) for option in training_config.options_of()}
+    options = training_config.options_of()
+    holders = {option.name: _define(option) for option in options}
+    for option in options:
+        if former := option.field.metadata[configuration.FORMERLY]:
+            flags.DEFINE_alias(former, option.name)
+    return holders
 
 
 def given(holders: Mapping[str, flags.FlagHolder]) -> dict[str, Any]:

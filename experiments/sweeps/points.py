@@ -138,8 +138,8 @@ def own_values(preset: str, paths: str = "tree", *, field: str = registry.USUAL)
         **of_grid,
         "footprint": model.footprint,
         "precision": model.field.precision,
-        "cut": str(PATH_PRESETS[paths].cut),
-        "bends": str(PATH_PRESETS[paths].bends),
+        "cut": str(PATH_PRESETS[paths].min_throughput),
+        "bends": str(PATH_PRESETS[paths].max_bends),
         "rays_per_pixel": "1",
     }
 

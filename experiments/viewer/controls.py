@@ -64,12 +64,12 @@ class Panel:
         self._layer = gui.add_dropdown("layer", subject.layers, initial_value=first.layer)
         self._status = gui.add_markdown("")
         self._sliders, self._cut, self._bends = [], None, None
-        if first.bends:
+        if first.max_bends:
             self._add_light(gui, subject, first)
         controls = [self._layer, self._cut, self._bends, *self._sliders]
         for control in filter(None, controls):
             control.on_update(lambda _: changed())
-        self._bodies = gui.add_checkbox("bodies", False, visible=bool(first.bends))
+        self._bodies = gui.add_checkbox("bodies", False, visible=bool(first.max_bends))
         self._bodies.on_update(lambda _: show_bodies(self._bodies.value))
         box = gui.add_checkbox("test cameras", False, visible=subject.views is not None)
         box.on_update(lambda _: show_cameras(box.value))
@@ -124,8 +124,8 @@ class Panel:
                 )
             hint = "A new value is compiled once, which takes a while."
             for name, offered, own in (
-                ("cut", session.CUTS, first.cut),
-                ("bends", session.BENDS, first.bends),
+                ("cut", session.CUTS, first.min_throughput),
+                ("bends", session.BENDS, first.max_bends),
             ):
                 values = [f"{x:g}" for x in np.unique([*offered, own])]
                 control = gui.add_dropdown(name, values, initial_value=f"{own:g}", hint=hint)

@@ -71,7 +71,7 @@ def offered(model: Model, *, truth: bool) -> tuple[str, ...]:
       truth: whether there are test views.
     """
     bent = (REFRACTION, REFLECTION, DISTANCE, NORMALS, MASK)
-    return (RGB, *(bent if model.settings.bends else (DISTANCE,)), *((ERROR,) if truth else ()))
+    return (RGB, *(bent if model.settings.max_bends else (DISTANCE,)), *((ERROR,) if truth else ()))
 
 
 def draw(

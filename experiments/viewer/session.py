@@ -77,14 +77,14 @@ class Choice:
     Attributes:
       layer: displayed layer.
       indices: index of refraction of each part.
-      cut: throughput threshold.
-      bends: largest number of bends of a path.
+      min_throughput: throughput threshold.
+      max_bends: largest number of bends of a path.
     """
 
     layer: str
     indices: tuple[float, ...]
-    cut: float
-    bends: int
+    min_throughput: float
+    max_bends: int
 
 
 class State(NamedTuple):
@@ -119,21 +119,23 @@ def first_choice(subject: Subject) -> Choice:
     """Returns the initial settings: those of the trained model."""
     indices = tuple(float(x) for x in np.asarray(subject.model.geometry.interfaces.index_inside))
     settings = subject.model.settings
-    return Choice(layers.RGB, indices, settings.cut, settings.bends)
+    return Choice(layers.RGB, indices, settings.min_throughput, settings.max_bends)
 
 
 def chosen_model(subject: Subject, choice: Choice) -> Model:
     """Returns the model with the chosen settings; the initial ones leave it as it was trained."""
     model = subject.model
-    if model.settings.bends == 0:
+    if model.settings.max_bends == 0:
         return model
     interfaces = model.geometry.interfaces
     if choice.indices != first_choice(subject).indices:
         # On the device, as those of the model are, so that both share one compiled program.
         interfaces = jax.device_put(layers.with_indices(interfaces, choice.indices, subject.rule))
     settings = model.settings
-    if (choice.cut, choice.bends) != (settings.cut, settings.bends):
-        settings = dataclasses.replace(settings, cut=choice.cut, bends=choice.bends)
+    if (choice.min_throughput, choice.max_bends) != (settings.min_throughput, settings.max_bends):
+        settings = dataclasses.replace(
+            settings, min_throughput=choice.min_throughput, max_bends=choice.max_bends
+        )
     return model._replace(
         geometry=model.geometry._replace(interfaces=interfaces), settings=settings
     )

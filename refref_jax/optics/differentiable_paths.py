@@ -112,10 +112,10 @@ def follow_branch(
       >>> print(f"{share:.4f} {slope:.4f}")
       0.9600 -0.1280
     """
-    if reflects.shape[0] != settings.bends:
+    if reflects.shape[0] != settings.max_bends:
         raise ValueError(
-            f"reflects has {reflects.shape[0]} choices for {settings.bends} bends. Give one choice "
-            "for each of the max bends."
+            f"reflects has {reflects.shape[0]} choices for {settings.max_bends} bends. Give one "
+            "choice for each of the max bends."
         )
     reflects = jnp.asarray(reflects)
     geometry, ray = scene.in_one_precision(geometry, ray)
@@ -124,7 +124,7 @@ def follow_branch(
     start = _Walk(
         path_step.begin(ray, inside, ray_differentials.nothing(ray.origins)),
         jnp.int32(media.AMBIENT),
-        jnp.asarray(settings.bends > 0),
+        jnp.asarray(settings.max_bends > 0),
         jnp.int32(PathStatus.EMPTY),
     )
     # One step more than max bends: the last one only checks whether the path escapes.
@@ -179,7 +179,7 @@ def _record(settings: PathSettings, ray: Rays, end: _Walk, segments: _Segment) -
         rays=jnp.zeros_like(end.status),
         weights=path_step.shown(settings, end.state.weight, end.status),
         radii=ray.radii,
-        bends=end.state.bends,
+        num_bends=end.state.num_bends,
         statuses=end.status,
         hit_counts=none,
         path_lengths=none,
@@ -227,20 +227,20 @@ def follow_main_branches(
       >>> print(f"{value[0]:.4f} {slope[0]:.4f}")  # (4 n / (n + 1)^2)^2, and its derivative
       0.9216 -0.2458
     """
-    if not 0 <= reflections <= settings.bends:
+    if not 0 <= reflections <= settings.max_bends:
         raise ValueError(
-            f"reflections is {reflections}, outside 0 to {settings.bends}, the max bends. Choose a "
-            "number in that range."
+            f"reflections is {reflections}, outside 0 to {settings.max_bends}, the max bends. "
+            "Choose a number in that range."
         )
     first = jnp.arange(reflections, dtype=jnp.int32)
-    once = first[:, None] == jnp.arange(settings.bends, dtype=jnp.int32)[None]
-    choices = jnp.concatenate([jnp.zeros_like(once, shape=(1, settings.bends)), once])
+    once = first[:, None] == jnp.arange(settings.max_bends, dtype=jnp.int32)[None]
+    choices = jnp.concatenate([jnp.zeros_like(once, shape=(1, settings.max_bends)), once])
     paths = jax.vmap(lambda choice: follow_branch(geometry, ray, choice, settings=settings))(
         choices
     )
     # If the main path stays in its medium at a bend, reflection is total there.
     total = paths.media[0, 1:] == paths.media[0, :-1]
-    real = jnp.append(True, (paths.bends[1:] > first) & ~total[:reflections])
+    real = jnp.append(True, (paths.num_bends[1:] > first) & ~total[:reflections])
     return paths._replace(
         statuses=jnp.where(real, paths.statuses, PathStatus.EMPTY),
         weights=jnp.where(real[:, None], paths.weights, 0.0),

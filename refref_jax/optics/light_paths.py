@@ -59,7 +59,7 @@ class LightPaths(NamedTuple):
       rays: index of each path's ray.
       weights: share of the path in its ray's linear RGB.
       radii: footprint of the ray's pixel as a cone radius at unit distance.
-      bends: number of refractions and reflections.
+      num_bends: number of refractions and reflections.
       statuses: `PathStatus` of each path.
       hit_counts: hit count per part, if tallied (see `path_settings`).
       path_lengths: path length in each part's medium, world units, if tallied.
@@ -74,7 +74,7 @@ class LightPaths(NamedTuple):
     rays: Int[Array, " paths"]
     weights: Float[Array, "paths 3"]
     radii: Float[Array, " paths"]
-    bends: Int[Array, " paths"]
+    num_bends: Int[Array, " paths"]
     statuses: Int[Array, " paths"]
     hit_counts: Float[Array, "paths tallied"]
     path_lengths: Float[Array, "paths tallied"]
@@ -90,7 +90,7 @@ class PathEnds(NamedTuple):
       media: medium of the last segment (see `media`).
       rays: index of each path's ray.
       weights: share of the path in its ray's linear RGB; 0 in empty slots.
-      bends: number of refractions and reflections.
+      num_bends: number of refractions and reflections.
       statuses: `PathStatus` of each path.
     """
 
@@ -100,7 +100,7 @@ class PathEnds(NamedTuple):
     media: Int[Array, " paths"]
     rays: Int[Array, " paths"]
     weights: Float[Array, "paths 3"]
-    bends: Int[Array, " paths"]
+    num_bends: Int[Array, " paths"]
     statuses: Int[Array, " paths"]
 
 
@@ -118,7 +118,7 @@ def straight(rays: Rays) -> LightPaths:
         rays=integers,
         weights=jnp.ones_like(rays.directions),
         radii=rays.radii,
-        bends=jnp.zeros_like(integers),
+        num_bends=jnp.zeros_like(integers),
         statuses=jnp.full_like(integers, PathStatus.NOT_TRACED),
         hit_counts=jnp.zeros_like(rays.origins, shape=(count, 0)),
         path_lengths=jnp.zeros_like(rays.origins, shape=(count, 0)),
@@ -141,7 +141,7 @@ def ends_of(paths: LightPaths) -> PathEnds:
         media=paths.media[path, last],
         rays=paths.rays,
         weights=paths.weights,
-        bends=paths.bends,
+        num_bends=paths.num_bends,
         statuses=paths.statuses,
     )
 
@@ -177,6 +177,6 @@ def reflected_first(paths: LightPaths) -> Bool[Array, " paths"]:
     assumed to be outside all objects.
     """
     if paths.tau.shape[-1] < 2:
-        return jnp.zeros_like(paths.bends, bool)
+        return jnp.zeros_like(paths.num_bends, bool)
     at_once = paths.tau[:, 1] == paths.ends[:, 0]
-    return (paths.bends > 0) & at_once & (paths.media[:, 1] == paths.media[:, 0])
+    return (paths.num_bends > 0) & at_once & (paths.media[:, 1] == paths.media[:, 0])

@@ -21,6 +21,7 @@ import math
 from typing import Any, Literal, NamedTuple, get_args
 
 from refref_jax.choices import Footprint
+from refref_jax.configuration import FORMERLY
 
 Reflections = Literal["none", "first", "all"]
 TotalReflection = Literal["followed", "ended"]
@@ -72,17 +73,17 @@ class PathSettings:
     The capacity factors bound memory, per camera ray traced together. If a buffer is full, the
     paths of least throughput are dropped, and the dropped throughput is returned; see `wavefront`.
     A factor of `None` is derived from the throughput threshold and the max bends
-    (`capacity_factors`), so `dataclasses.replace(TREE, cut=0.002)` also has capacity for the
-    additional paths. A batch of few rays that all hit much glass may need larger factors.
+    (`capacity_factors`), so `dataclasses.replace(TREE, min_throughput=0.002)` also has capacity for
+    the additional paths. A batch of few rays that all hit much glass may need larger factors.
 
     Attributes:
-      bends: max bends, the largest number of refractions and reflections of a path.
+      max_bends: largest number of refractions and reflections of a path.
       reflections: reflections to follow. `none` follows only total internal reflections; `first`
         adds the reflection at the first surface, untraced; `all` follows every reflection.
       total_reflection: `followed`, or `ended`: paths continue straight at a total internal
         reflection, as in the paper's ablation.
-      cut: throughput threshold for following a branch, compared to the largest RGB component. A
-        weaker branch leaves its share to its sibling, so that energy is conserved.
+      min_throughput: throughput threshold for following a branch, compared to the largest RGB
+        component. A weaker branch leaves its share to its sibling, so that energy is conserved.
       reentry: `impossible` states that a ray that has left the objects never hits one again, as
         with one convex object; such rays are not cast again.
       unfinished: treatment of truncated paths, which reach the max bends. `kept` ends them on the
@@ -93,10 +94,10 @@ class PathSettings:
       paths_per_ray: capacity for finished paths, per camera ray.
     """
 
-    bends: int
+    max_bends: int = dataclasses.field(metadata={FORMERLY: "bends"})
     reflections: Reflections
     total_reflection: TotalReflection = "followed"
-    cut: float = 0.0
+    min_throughput: float = dataclasses.field(default=0.0, metadata={FORMERLY: "cut"})
     reentry: Reentry = "possible"
     unfinished: Unfinished = "kept"
     live_per_ray: float | None = None
@@ -105,11 +106,11 @@ class PathSettings:
 
     def __post_init__(self) -> None:
         """Validates the values."""
-        if self.bends < 0:
-            raise ValueError(f"bends is {self.bends}, which is negative. Give 0 or more.")
-        if not 0.0 <= self.cut < 1.0:
+        if self.max_bends < 0:
+            raise ValueError(f"max_bends is {self.max_bends}, which is negative. Give 0 or more.")
+        if not 0.0 <= self.min_throughput < 1.0:
             raise ValueError(
-                f"The throughput threshold cut is {self.cut}, outside [0, 1). Give 0.02 for 2 % of "
+                f"min_throughput is {self.min_throughput}, outside [0, 1). Give 0.02 for 2 % of "
                 "a pixel's light."
             )
         if self.reflections not in get_args(Reflections):
@@ -137,7 +138,7 @@ class PathSettings:
                     f"{name} is {factor}, but every ray needs a capacity of at least 1. Give a "
                     "number of at least 1, or None."
                 )
-            # A default factor that is written out (as in files of older runs) still follows cut.
+            # A default factor that is written out, as in files of older runs, still adapts.
             if factor == usual:
                 object.__setattr__(self, name, None)
 
@@ -151,7 +152,7 @@ class CapacityFactors(NamedTuple):
 
 
 def capacity_factors(settings: PathSettings) -> CapacityFactors:
-    """Returns the capacity factors of path settings; `None` is derived from `cut` and `bends`.
+    """Returns the capacity factors of path settings, with those that are `None` derived.
 
     The defaults are generous for images that are partly filled by glass. If all reflections are
     followed, capacities grow with the inverse square root of a threshold below 0.02; the capacity
@@ -164,12 +165,12 @@ def capacity_factors(settings: PathSettings) -> CapacityFactors:
 
 
 def _usual_factors(settings: PathSettings) -> CapacityFactors:
-    if settings.bends == 0:
+    if settings.max_bends == 0:
         return CapacityFactors(1.0, 24.0, 1.0)
     if settings.reflections != "all":
-        return CapacityFactors(1.0, max(1.0, settings.bends / _PAPER_BENDS) * 11.0, 2.0)
-    segments = max(1.0, settings.bends / _TREE_BENDS) * 24.0
-    growth = math.sqrt(max(1.0, _TREE_CUT / max(settings.cut, _SMALLEST_CUT_WITH_ROOM)))
+        return CapacityFactors(1.0, max(1.0, settings.max_bends / _PAPER_BENDS) * 11.0, 2.0)
+    segments = max(1.0, settings.max_bends / _TREE_BENDS) * 24.0
+    growth = math.sqrt(max(1.0, _TREE_CUT / max(settings.min_throughput, _SMALLEST_CUT_WITH_ROOM)))
     return CapacityFactors(growth * 6.0, growth * segments, growth * 8.0)
 
 
@@ -187,9 +188,9 @@ class Capacities(NamedTuple):
     paths: int
 
 
-STRAIGHT = PathSettings(bends=0, reflections="none")
-PAPER = PathSettings(bends=10, reflections="first")
-TREE = PathSettings(bends=24, reflections="all", cut=0.02)
+STRAIGHT = PathSettings(max_bends=0, reflections="none")
+PAPER = PathSettings(max_bends=10, reflections="first")
+TREE = PathSettings(max_bends=24, reflections="all", min_throughput=0.02)
 
 PAPER_NO_REFLECTION = dataclasses.replace(PAPER, reflections="none")
 PAPER_NO_TIR = dataclasses.replace(PAPER, total_reflection="ended")
@@ -204,19 +205,20 @@ PATH_PRESETS = {
 
 
 def make_path_settings(
-    paths: str, *, cut: float | None = None, bends: int | None = None
+    paths: str, *, min_throughput: float | None = None, max_bends: int | None = None
 ) -> PathSettings:
     """Returns preset path settings by name, with another throughput threshold or max bends.
 
     Raises:
-      ValueError: if rays are straight, but `cut` or `bends` is given.
+      ValueError: if rays are straight, but `min_throughput` or `max_bends` is given.
     """
     settings = PATH_PRESETS[paths]
-    given: dict[str, Any] = {"cut": cut, "bends": bends}
+    given: dict[str, Any] = {"min_throughput": min_throughput, "max_bends": max_bends}
     changed = {n: x for n, x in given.items() if x is not None and x != getattr(settings, n)}
-    if settings.bends == 0 and changed:
+    if settings.max_bends == 0 and changed:
         raise ValueError(
-            f"paths={paths} has no cut and no bends. Leave them out, or use paths=tree."
+            f"paths={paths} has neither min_throughput nor max_bends. Leave them out, or use "
+            "paths=tree."
         )
     return dataclasses.replace(settings, **changed)
 

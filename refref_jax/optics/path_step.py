@@ -146,7 +146,7 @@ def shares(
     reflected = jnp.where(total, jnp.ones_like(partial), partial)
     weaker = jnp.minimum(reflected, 1.0 - reflected)
     winner = jnp.where(reflected > 0.5, jnp.ones_like(reflected), jnp.zeros_like(reflected))
-    reflected = jnp.where(weaker * strength < settings.cut, winner, reflected)
+    reflected = jnp.where(weaker * strength < settings.min_throughput, winner, reflected)
     return Shares(reflected, 1.0 - reflected)
 
 
@@ -159,7 +159,7 @@ class RayState(NamedTuple):
       direction: unit vector.
       tau: arc length from the camera to `point`.
       weight: throughput, the share of the camera ray's linear RGB.
-      bends: number of bends so far.
+      num_bends: number of bends so far.
       leaving: excluded primitive, the triangle slot that the segment starts on.
       inside: interior list, the parts that the ray is in (see `media`).
       differential: ray differential of the current segment (see `ray_differentials`).
@@ -170,7 +170,7 @@ class RayState(NamedTuple):
     direction: Float[Array, "*rays 3"]
     tau: Float[Array, "*rays"]
     weight: Float[Array, "*rays 3"]
-    bends: Int[Array, "*rays"]
+    num_bends: Int[Array, "*rays"]
     leaving: Int[Array, "*rays"]
     inside: Int[Array, "*rays slots"]
     differential: RayDifferential
@@ -209,7 +209,7 @@ def begin(ray: Rays, inside: Int[Array, " slots"], differential: RayDifferential
         direction=ray.directions,
         tau=jnp.zeros_like(ray.radii),
         weight=jnp.ones_like(ray.origins),
-        bends=jnp.zeros((), jnp.int32),
+        num_bends=jnp.zeros((), jnp.int32),
         leaving=jnp.full((), NO_SLOT, jnp.int32),
         inside=inside,
         differential=differential,
@@ -256,8 +256,8 @@ def ending(
       arrival: the ray's hit.
       hit: whether the ray hits anything.
     """
-    missed = jnp.where(state.bends > 0, PathStatus.ESCAPED, PathStatus.MISSED)
-    met = jnp.where(state.bends < settings.bends, PathStatus.EMPTY, PathStatus.OUT_OF_BENDS)
+    missed = jnp.where(state.num_bends > 0, PathStatus.ESCAPED, PathStatus.MISSED)
+    met = jnp.where(state.num_bends < settings.max_bends, PathStatus.EMPTY, PathStatus.OUT_OF_BENDS)
     if settings.total_reflection == "ended":
         met = jnp.where(arrival.interaction.total, PathStatus.TOTALLY_REFLECTED, met)
     return jnp.where(hit, met, missed).astype(jnp.int32)
@@ -281,13 +281,13 @@ def branch(
         settings,
         reflectance=met.reflectance,
         total=met.total,
-        first=state.bends == 0,
+        first=state.num_bends == 0,
         strength=jnp.max(arrival.weight),
     )
     after = state._replace(
         point=met.position,
         tau=state.tau + arrival.length,
-        bends=state.bends + 1,
+        num_bends=state.num_bends + 1,
         leaving=slot,
     )
     return Branches(

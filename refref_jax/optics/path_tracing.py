@@ -177,7 +177,7 @@ def trace_batches(
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
     if inside is not None:
         inside = inside.reshape(batches * count, inside.shape[-1])
-    detail = detail or path_settings.everything(settings.bends)
+    detail = detail or path_settings.everything(settings.max_bends)
     inside = _inside(geometry, flat, inside)
     tree = follow(geometry, flat, inside, settings=settings, footprint=detail.footprint)
     ends, lost = path_tree.pack(tree, batches, count, capacity)
@@ -198,13 +198,13 @@ def survey(geometry: Scene, rays: Rays, *, settings: PathSettings) -> Survey:
     ends = trace_ends(geometry, rays, settings=settings).ends
     one = exists(ends).astype(jnp.float32)
     paths = jax.ops.segment_sum(one, ends.rays, num_segments=count)
-    untraced = (ends.statuses == PathStatus.NOT_TRACED) & (ends.bends == 0)
+    untraced = (ends.statuses == PathStatus.NOT_TRACED) & (ends.num_bends == 0)
     missing = jnp.sum((ends.statuses == PathStatus.MISSED) | untraced, dtype=jnp.float32)
     return Survey(jnp.mean(paths), jnp.std(paths), 1.0 - missing / count)
 
 
 def _needs_no_tracing(rays: Rays, settings: PathSettings) -> bool:
-    return settings.bends == 0 or rays.radii.size == 0
+    return settings.max_bends == 0 or rays.radii.size == 0
 
 
 def _inside(

@@ -60,14 +60,14 @@ class Ends(NamedTuple):
       segments: index of the last segment.
       rays: index of the camera ray.
       weights: share of the path in its ray's linear RGB.
-      bends: number of bends.
+      num_bends: number of bends.
       statuses: `PathStatus` of each path.
     """
 
     segments: Int[Array, " paths"]
     rays: Int[Array, " paths"]
     weights: Float[Array, "paths 3"]
-    bends: Int[Array, " paths"]
+    num_bends: Int[Array, " paths"]
     statuses: Int[Array, " paths"]
 
 
@@ -113,7 +113,7 @@ def emptied(ends: Ends, empty: Bool[Array, " paths"], home: Int[Array, " paths"]
         segments=jnp.where(empty, home, ends.segments),
         rays=jnp.where(empty, home, ends.rays),
         weights=jnp.where(empty[:, None], 0.0, ends.weights),
-        bends=jnp.where(empty, 0, ends.bends),
+        num_bends=jnp.where(empty, 0, ends.num_bends),
         statuses=jnp.where(empty, PathStatus.EMPTY, ends.statuses).astype(jnp.int32),
     )
 
@@ -128,7 +128,7 @@ def last_segments(segments: Segments, ends: Ends) -> PathEnds:
         media=last.media,
         rays=ends.rays,
         weights=ends.weights,
-        bends=ends.bends,
+        num_bends=ends.num_bends,
         statuses=ends.statuses,
     )
 
@@ -164,7 +164,7 @@ def polylines(
         rays=ends.rays,
         weights=ends.weights,
         radii=radii,
-        bends=ends.bends,
+        num_bends=ends.num_bends,
         statuses=ends.statuses,
         hit_counts=walk.hit_counts,
         path_lengths=walk.path_lengths,

@@ -163,7 +163,7 @@ def end(
     tree: PathTree, live: Live, status: Int[Array, " n"], ending: Bool[Array, " n"]
 ) -> PathTree:
     """Ends some rays as paths."""
-    block = Ends(live.segments, live.rays, live.weights, live.state.bends, status)
+    block = Ends(live.segments, live.rays, live.weights, live.state.num_bends, status)
     return tree._replace(ends=queues.append(tree.ends, block, ending))
 
 
@@ -314,7 +314,7 @@ def _round(
     tree = walk.tree._replace(casts=walk.tree.casts + jnp.sum(alive, dtype=jnp.int32))
     medium = arrival.interaction.sides.medium_near
     # The medium of a camera is known only from the first surface it sees.
-    tree = path_tree.name_media(tree, live.segments, medium, hit & (live.state.bends == 0))
+    tree = path_tree.name_media(tree, live.segments, medium, hit & (live.state.num_bends == 0))
     tree = end_by(settings, tree, live, status, alive & ~bending)
     branches = jax.vmap(functools.partial(path_step.branch, settings))(
         live.state, arrival, hits.slots

@@ -40,7 +40,7 @@ from refref_jax.reconstruct import ReconstructionError
 from refref_jax.render import pixels
 from refref_jax.render.model import ModelConfig, Params
 
-TRACING = PathSettings(bends=12, reflections="all", cut=0.02)
+TRACING = PathSettings(max_bends=12, reflections="all", min_throughput=0.02)
 """Threshold as in the tree, half as many bends: the main branches of few rays are longer."""
 
 REFLECTIONS = 3

@@ -121,7 +121,7 @@ def render_known(
         seen: Any = images.fetch(
             _render_tile(geometry, radiance, rays, inside, settings=settings), instead=_INSTEAD
         )
-        casts.append(int(seen.casts) - (tile - real) * (settings.bends > 0))
+        casts.append(int(seen.casts) - (tile - real) * (settings.max_bends > 0))
         return seen[:-1]
 
     fields = images.in_tiles(

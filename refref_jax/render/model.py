@@ -104,7 +104,7 @@ class ModelConfig:
 def path_detail(config: ModelConfig, settings: PathSettings) -> Detail:
     """Returns the parts of light paths that a model needs."""
     tally: Tally = "parts" if config.learned_tints else "none"
-    most = settings.bends + 1
+    most = settings.max_bends + 1
     if config.interior == "field":
         return Detail("all", most, config.footprint, tally)
     legs = _CONVEX_LEGS if settings.reentry == "impossible" else _MOST_LEGS

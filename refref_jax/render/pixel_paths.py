@@ -55,14 +55,14 @@ class PixelPaths(NamedTuple):
         end of the last segment as drawn.
       weights: share of each path in the ray's linear RGB.
       statuses: status of each path.
-      bends: number of refractions and reflections of each path.
+      num_bends: number of refractions and reflections of each path.
       lost: dropped throughput of the ray, linear RGB.
     """
 
     polylines: tuple[Float[np.ndarray, "_ 3"], ...]
     weights: Float[np.ndarray, "paths 3"]
     statuses: tuple[PathStatus, ...]
-    bends: Int[np.ndarray, " paths"]
+    num_bends: Int[np.ndarray, " paths"]
     lost: Float[np.ndarray, "3"]
 
 
@@ -184,7 +184,7 @@ def _polylines(traced: _Traced, reach: float) -> PixelPaths:
         polylines=tuple(lines),
         weights=np.asarray(paths.weights)[order],
         statuses=tuple(PathStatus(int(paths.statuses[i])) for i in order),
-        bends=np.asarray(paths.bends)[order],
+        num_bends=np.asarray(paths.num_bends)[order],
         lost=np.asarray(traced.lost)[0],
     )
 
@@ -204,7 +204,7 @@ def _trace(
         ray,
         settings=settings,
         capacity=_MOST_PATHS,
-        detail=Detail("all", settings.bends + 1, tally=tally),
+        detail=Detail("all", settings.max_bends + 1, tally=tally),
     )
     paths = traced.paths
     if domain is None:

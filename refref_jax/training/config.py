@@ -53,16 +53,20 @@ _PATTERNS = (1, 6)
 _MOST_ENTRIES = 31
 
 
-def _option(default: Any = None, *, name: str = "", after: tuple[str, ...] = ()) -> Any:
+def _option(
+    default: Any = None, *, name: str = "", formerly: str = "", after: tuple[str, ...] = ()
+) -> Any:
     """Declares a value of the configuration.
 
     Args:
       default: value if none is given; `None` for a decision of the scene or the preset.
       name: name of the option if it differs from that of the field.
+      formerly: name of the option and the field in earlier versions, which is still read.
       after: options on which the decision depends. Overriding one of them takes it again, unless
         the option itself is an override.
     """
-    return dataclasses.field(default=default, metadata={"name": name, "after": after})
+    metadata = {"name": name, "after": after, configuration.FORMERLY: formerly or None}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,27 +121,28 @@ class PathsConfig:
         at the first surface; paper_no_reflection and paper_no_tir are its ablations without this
         reflection and without total internal reflections; tree follows every branch that carries
         light. By default tree if there are meshes, else straight.
-      cut: Throughput threshold, below which paths are not followed, in [0, 1); by default that of
-        the paths.
-      bends: Maximum number of refractions and reflections of a path; by default that of the paths.
+      min_throughput: Throughput threshold, below which paths are not followed, in [0, 1); by
+        default that of the paths.
+      max_bends: Maximum number of refractions and reflections of a path; by default that of the
+        paths.
       reentry: Whether light that has left the objects may meet them again; by default determined
         from the meshes.
     """
 
     name: Paths | None = _option(name="paths", after=_OBJECTS)
-    cut: float | None = _option(after=("paths",))
-    bends: int | None = _option(after=("paths",))
-    reentry: Reentry | None = _option(after=(*_OBJECTS, "rule", "paths", "bends"))
+    min_throughput: float | None = _option(formerly="cut", after=("paths",))
+    max_bends: int | None = _option(formerly="bends", after=("paths",))
+    reentry: Reentry | None = _option(after=(*_OBJECTS, "rule", "paths", "max_bends"))
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        if self.cut is not None and not 0.0 <= self.cut < 1.0:
+        if self.min_throughput is not None and not 0.0 <= self.min_throughput < 1.0:
             raise ValueError(
-                f"The throughput threshold cut is {self.cut}, outside [0, 1). Give 0.02 for 2 % of "
+                f"min_throughput is {self.min_throughput}, outside [0, 1). Give 0.02 for 2 % of "
                 "a pixel's light."
             )
-        if self.bends is not None and self.bends < 0:
-            raise ValueError(f"A path cannot have {self.bends} bends. Give 0 or more.")
+        if self.max_bends is not None and self.max_bends < 0:
+            raise ValueError(f"max_bends is {self.max_bends}, which is negative. Give 0 or more.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,8 +171,8 @@ class FieldConfig:
 
     preset: PresetName = _option("tiny")
     field: FieldName = _option("zipnerf")
-    interior: Interior | None = _option(after=(*_OBJECTS, "paths", "bends", "tints"))
-    tints: Tints | None = _option(after=(*_OBJECTS, "paths", "bends", "interior"))
+    interior: Interior | None = _option(after=(*_OBJECTS, "paths", "max_bends", "tints"))
+    tints: Tints | None = _option(after=(*_OBJECTS, "paths", "max_bends", "interior"))
     footprint: Footprint | None = _option(after=("preset", "field"))
     samples: tuple[int, ...] | None = _option(after=("preset", "field"))
     multisamples: int | None = _option(after=("preset", "field"))

@@ -182,7 +182,7 @@ def first_distances(model: Model, views: Cameras, i: int) -> Float[np.ndarray, "
       Distances in world units, `inf` where there is no surface; `None` for straight
       rays.
     """
-    if model.settings.bends == 0:
+    if model.settings.max_bends == 0:
         return None
     rays = cameras.image_rays(views, i)
     return first_surface.find_first_surface(model.geometry.surfaces, rays).distances

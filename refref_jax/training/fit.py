@@ -197,7 +197,7 @@ def train(
         sampler = _sampler(config, scene_source.open_scene(scene or config.scene.path))
         geometry = checkpoint_io.load_geometry(run)
         setup = loop.set_up(config, model.config, model.settings, geometry, sampler, mesh=mesh)
-        if setup.hit_fraction == 0.0 and model.settings.bends > 0:
+        if setup.hit_fraction == 0.0 and model.settings.max_bends > 0:
             report(
                 "warning: no camera ray hits the meshes, so no light is bent. Check that their "
                 "units, axes and position are those of the cameras."

@@ -145,7 +145,7 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
     settings, config = _resolve_paths(config, found, reasons)
     config = _resolve_inside(config, found, settings, reasons)
     model, config = _resolve_model(config, facts, reasons)
-    if settings.bends:
+    if settings.max_bends:
         settings = dataclasses.replace(settings, reentry=settled(config.paths.reentry))
     config = _resolve_training(config, model, reasons)
     check_batch(facts.cameras, settled(config.schedule.batch))
@@ -168,11 +168,11 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
         "the model",
         background=model.space,
         radius=model.radius,
-        cut=settings.cut,
-        bends=settings.bends,
-        reentry=settings.reentry if settings.bends else None,
+        min_throughput=settings.min_throughput,
+        max_bends=settings.max_bends,
+        reentry=settings.reentry if settings.max_bends else None,
         interior=model.interior,
-        tints=tints if model.interior == "absorbing" and settings.bends else "none",
+        tints=tints if model.interior == "absorbing" and settings.max_bends else "none",
         **_sampling_of(model),
     )
 
@@ -241,16 +241,26 @@ def _resolve_paths(
     name, why = ("tree", "there are meshes") if found.parts else ("straight", "there are no meshes")
     config = _decide(config, reasons, why, paths=name)
     paths = config.paths
-    settings = make_path_settings(settled(paths.name), cut=paths.cut, bends=paths.bends)
-    if settings.bends == 0:
+    settings = make_path_settings(
+        settled(paths.name), min_throughput=paths.min_throughput, max_bends=paths.max_bends
+    )
+    if settings.max_bends == 0:
         _check_straight(config)
-        return settings, _decide(config, reasons, f"paths={paths.name}", cut=settings.cut, bends=0)
+        return settings, _decide(
+            config,
+            reasons,
+            f"paths={paths.name}",
+            min_throughput=settings.min_throughput,
+            max_bends=0,
+        )
     why = "light may meet the objects again"
     if found.reentry == "impossible":
         why = "light that has left one convex object meets none again"
     config = _decide(config, reasons, why, reentry=found.reentry)
     why = f"paths={paths.name}"
-    return settings, _decide(config, reasons, why, cut=settings.cut, bends=settings.bends)
+    return settings, _decide(
+        config, reasons, why, min_throughput=settings.min_throughput, max_bends=settings.max_bends
+    )
 
 
 def _check_straight(config: TrainConfig) -> None:
@@ -273,7 +283,7 @@ def _resolve_inside(
 ) -> TrainConfig:
     """Decides the model of the inside of the objects, and the source of their colours."""
     interior: Interior | None
-    if settings.bends == 0:
+    if settings.max_bends == 0:
         interior, why = "field", "straight rays ignore the objects"
     elif found.interior == "clear" and config.model.tints != "learned":
         interior, why = "clear", "the objects are clear in scene.json"
@@ -281,12 +291,13 @@ def _resolve_inside(
         interior, why = "absorbing", "objects may absorb light"
     config = _decide(config, reasons, why, interior=interior)
     interior, tints = config.model.interior, config.model.tints
-    if interior != "absorbing" or settings.bends == 0:
+    if interior != "absorbing" or settings.max_bends == 0:
         given_as_clear = tints == "given" and found.tints == "none" and interior == "clear"
         if tints not in (None, "none") and not given_as_clear:
             raise ValueError(
                 f"tints={tints} has no effect with interior {interior} and at most "
-                f"{settings.bends} bends. Leave it out, or use interior=absorbing and bent paths."
+                f"{settings.max_bends} bends. Leave it out, or use interior=absorbing and bent "
+                "paths."
             )
         model = dataclasses.replace(config.model, tints=None)
         config = dataclasses.replace(config, model=model)

@@ -52,7 +52,7 @@ def path(
         rays=jnp.int32(ray),
         weights=jnp.asarray(weights, jnp.float32),
         radii=jnp.float32(radius),
-        bends=jnp.int32(bends),
+        num_bends=jnp.int32(bends),
         statuses=jnp.int32(status),
         hit_counts=jnp.zeros(0, jnp.float32),
         path_lengths=jnp.zeros(0, jnp.float32),

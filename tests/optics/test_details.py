@@ -36,7 +36,7 @@ def _two_balls():
 
 def _slow_outside(paths, index):
     """Returns the indices of the segments of one path that run outside, and its last one."""
-    bends = int(paths.bends[index])
+    bends = int(paths.num_bends[index])
     return [i for i in range(bends + 1) if paths.media[index, i] == AMBIENT or i == bends]
 
 
@@ -44,7 +44,7 @@ def _slow_outside(paths, index):
 def test_only_segments_outside_are_kept():
     whole = _trace(_two_balls(), _rays()).paths
     kept = _trace(_two_balls(), _rays(), detail=Detail("outside", 6)).paths
-    np.testing.assert_array_equal(whole.bends, kept.bends)
+    np.testing.assert_array_equal(whole.num_bends, kept.num_bends)
     np.testing.assert_array_equal(whole.weights, kept.weights)
     seen = set()
     for index in range(_CAPACITY):
@@ -74,7 +74,7 @@ def test_of_too_many_segments_the_first_and_the_last_ones_are_kept():
 @pytest.mark.slow
 def test_segments_end_where_the_next_ones_begin(settings):
     paths = _trace(
-        _two_balls(), _rays(), settings=settings, detail=everything(settings.bends)
+        _two_balls(), _rays(), settings=settings, detail=everything(settings.max_bends)
     ).paths
     used = np.isfinite(paths.tau)
     following = np.append(paths.tau[:, 1:], np.full((_CAPACITY, 1), np.inf), axis=1)
@@ -86,7 +86,7 @@ def test_segments_end_where_the_next_ones_begin(settings):
 def test_meetings_and_passages_are_those_of_the_whole_path():
     """Tints and absorption are put on the paths afterwards, and come to what tracing puts on."""
     settings = PathSettings(
-        bends=3, reflections="all"
+        max_bends=3, reflections="all"
     )  # no cut: colours do not change what is followed
     geometry = _two_balls()
     tint = jnp.array([[0.9, 0.5, 0.7], [0.6, 0.95, 1.0]])
@@ -114,7 +114,7 @@ def test_nothing_is_tallied_unless_asked():
 @pytest.mark.slow
 def test_a_promise_of_no_reentry_changes_casts_only():
     ball = scenes.geometry(scenes.ball(1.0, subdivisions=3))
-    never = PathSettings(bends=24, reflections="all", cut=0.02, reentry="impossible")
+    never = PathSettings(max_bends=24, reflections="all", min_throughput=0.02, reentry="impossible")
     a, b = (path_tracing.trace_ends(ball, _rays(), settings=settings) for settings in (TREE, never))
 
     def sorted_weights(traced):

@@ -48,7 +48,7 @@ def _bodies():
 @pytest.mark.parametrize(
     "settings",
     [
-        PathSettings(_DEPTH, "all", cut=0.02),
+        PathSettings(_DEPTH, "all", min_throughput=0.02),
         *(
             pytest.param(settings, marks=pytest.mark.slow)
             for settings in (
@@ -72,10 +72,10 @@ def test_both_tracers_find_the_same_paths(body, settings):
     assert there.size > 12 or settings.reflections == "none"
     weights = np.zeros((12, 3))
     for i in there:
-        ray, bends = tree.rays[i], tree.bends[i]
+        ray, bends = tree.rays[i], tree.num_bends[i]
         used = slice(0, bends + 1)
         apart = np.abs(single.directions[ray][:, used] - tree.directions[i, used]).max(axis=(1, 2))
-        apart = np.where(single.bends[ray] == bends, apart, np.inf)
+        apart = np.where(single.num_bends[ray] == bends, apart, np.inf)
         best = np.argmin(apart)
         np.testing.assert_allclose(single.points[ray, best, used], tree.points[i, used], atol=2e-5)
         np.testing.assert_allclose(apart[best], 0.0, atol=2e-5)
@@ -98,7 +98,7 @@ def test_without_bends_nothing_is_traced():
     ray = jax.tree.map(lambda x: x[0], scenes.rays([-4.0, 0.0, 0.0], [1.0, 0.0, 0.0]))
     nowhere = jnp.zeros(0, bool)
     path = follow_branch(scenes.geometry(scenes.box()), ray, nowhere, settings=STRAIGHT)
-    assert (int(path.statuses), int(path.bends)) == (PathStatus.NOT_TRACED, 0)
+    assert (int(path.statuses), int(path.num_bends)) == (PathStatus.NOT_TRACED, 0)
     np.testing.assert_array_equal(path.weights, 1.0)
 
 
@@ -115,7 +115,7 @@ def test_a_path_that_runs_out_of_bends_is_as_bright_as_the_budget_says(unfinishe
 def test_a_path_that_is_cut_weighs_nothing():
     geometry = scenes.geometry(scenes.box((20.0, 20.0, 0.5)))
     ray = jax.tree.map(lambda x: x[0], scenes.rays([0.0, 0.1, 3.0], [0.0, 0.0, -1.0]))
-    settings = PathSettings(2, "all", cut=0.039)
+    settings = PathSettings(2, "all", min_throughput=0.039)
     inner = follow_branch(geometry, ray, jnp.array([False, True]), settings=settings)
     np.testing.assert_array_equal(inner.weights, 0.0)
 

@@ -49,7 +49,7 @@ def test_straight_light_is_never_reflected():
 @pytest.mark.slow
 def test_the_tree_s_reflected_paths_set_out_as_the_single_reflection_does():
     geometry = scenes.geometry(scenes.ball(1.0, subdivisions=3))
-    settings = dataclasses.replace(TREE, bends=4, cut=1e-3)
+    settings = dataclasses.replace(TREE, max_bends=4, min_throughput=1e-3)
     rays = scenes.rays([[-4.0, 0.2, 0.1]] * 5, [[4.0, y, 0.1] for y in np.linspace(-0.9, 0.5, 5)])
     trace = jax.jit(functools.partial(path_tracing.trace, settings=settings, capacity=256))
     paths = trace(geometry, rays).paths

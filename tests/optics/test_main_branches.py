@@ -15,7 +15,7 @@ from tests.factories import scenes
 
 pytestmark = pytest.mark.computing
 
-_SETTINGS = PathSettings(bends=6, reflections="all", cut=0.02)
+_SETTINGS = PathSettings(max_bends=6, reflections="all", min_throughput=0.02)
 
 
 def _follow(geometry, rays, reflections=3):
@@ -37,7 +37,7 @@ def test_a_slab_from_above_has_the_shares_of_fresnel():
     # A second reflection has 0.0369 of the light, and the third one 0.0015, below the cut.
     expected = [(1 - part) ** 2, part, (1 - part) * part, 0.0]
     np.testing.assert_allclose(found.weights[0, :, 0], expected, atol=1e-6)
-    assert list(found.bends[0, :3]) == [2, 1, 3]
+    assert list(found.num_bends[0, :3]) == [2, 1, 3]
     assert found.statuses[0, 3] == PathStatus.EMPTY
 
 
@@ -50,12 +50,12 @@ def test_they_are_the_branches_of_the_tree_and_nearly_all_of_its_light():
     assert np.all(total <= 1.0 + 1e-5) and total.mean() > 0.99
     trace = jax.jit(functools.partial(path_tracing.trace, settings=_SETTINGS, capacity=512))
     tree = jax.tree.map(np.asarray, trace(geometry, rays).paths)
-    last = np.arange(64)[:, None], np.arange(4)[None], found.bends
+    last = np.arange(64)[:, None], np.arange(4)[None], found.num_bends
     for ray, branch in np.argwhere((found.statuses != PathStatus.EMPTY) & (total[:, None] > 0)):
         if found.weights[ray, branch, 0] == 0.0:
             continue
-        same = (tree.rays == ray) & (tree.bends == found.bends[ray, branch])
-        ends = tree.directions[same, found.bends[ray, branch]]
+        same = (tree.rays == ray) & (tree.num_bends == found.num_bends[ray, branch])
+        ends = tree.directions[same, found.num_bends[ray, branch]]
         apart = np.abs(ends - found.directions[last][ray, branch]).max(axis=-1)
         assert apart.min() < 1e-4
 
@@ -64,7 +64,7 @@ def test_a_total_reflection_is_not_counted_twice():
     # Through a leg of the prism onto its hypotenuse, at 45 degrees: beyond the critical angle.
     geometry = scenes.geometry(scenes.right_prism())
     found = _follow(geometry, scenes.rays([0.4, 0.0, -3.0], [0.0, 0.0, 1.0]))
-    assert found.bends[0, 0] == 3
+    assert found.num_bends[0, 0] == 3
     assert found.statuses[0, 2] == PathStatus.EMPTY
     assert found.weights[0, :, 0].sum() <= 1.0 + 1e-6
 

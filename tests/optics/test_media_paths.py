@@ -25,7 +25,7 @@ _SLAB_TOLERANCE = 2e-4
 # An icosphere of 20,480 faces with interpolated normals against the true sphere.
 _SPHERE_TOLERANCE = 4e-3
 
-_REFRACTED = PathSettings(bends=16, reflections="none")
+_REFRACTED = PathSettings(max_bends=16, reflections="none")
 
 _RAYS = 64
 
@@ -64,8 +64,8 @@ def _bundle(count, seed=0, differential=0.5):
 
 def _last(paths):
     """Returns start and direction of the last segment of every path."""
-    path = np.arange(len(paths.bends))
-    return paths.points[path, paths.bends], paths.directions[path, paths.bends]
+    path = np.arange(len(paths.num_bends))
+    return paths.points[path, paths.num_bends], paths.directions[path, paths.num_bends]
 
 
 # Bodies inside one another: both rules say the same.
@@ -85,7 +85,7 @@ def test_a_contained_body_of_higher_priority_is_the_nested_model():
     nested = _paths(scenes.geometry(*parts, rule="nested"), rays)
     ranked = _paths(scenes.geometry(*parts, rule="priority"), rays)
     assert set(np.unique(nested.media)) == {AMBIENT, 1, 2}
-    for name in ("rays", "bends", "statuses", "media"):
+    for name in ("rays", "num_bends", "statuses", "media"):
         np.testing.assert_array_equal(getattr(ranked, name), getattr(nested, name))
     for name in ("points", "directions", "tau", "weights"):
         np.testing.assert_allclose(getattr(ranked, name), getattr(nested, name), atol=1e-5)
@@ -104,7 +104,7 @@ def test_a_contained_body_of_lower_priority_is_invisible():
         )
         np.testing.assert_allclose(end, bends[-1].point, atol=_SPHERE_TOLERANCE)
         np.testing.assert_allclose(onward, bends[-1].direction, atol=_SPHERE_TOLERANCE)
-        outranked += paths.bends[i] == len(bends) + 2
+        outranked += paths.num_bends[i] == len(bends) + 2
     assert outranked > _RAYS // 4
 
 
@@ -134,7 +134,7 @@ def test_one_surface_is_left_between_slabs_that_overlap(degrees, priorities, bou
     direction = np.array([np.sin(theta), 0.0, up * np.cos(theta)])
     rays = scenes.rays([0.0, 0.0, -2.0 * up], direction)
     paths = _paths(_slabs(*priorities), rays)
-    assert paths.bends.tolist() == [4] and paths.statuses.tolist() == [PathStatus.ESCAPED]
+    assert paths.num_bends.tolist() == [4] and paths.statuses.tolist() == [PathStatus.ESCAPED]
     end, onward = _last(paths)
     in_glass, in_water = (np.tan(np.arcsin(np.sin(theta) / n)) for n in (1.5, 1.333))
     sideways = np.tan(theta) + in_glass * (1.0 + boundary) + in_water * (1.0 - boundary)
@@ -177,7 +177,7 @@ def test_water_that_overlaps_the_wall_of_a_hollow_ball(swapped):
     ends, onward = _last(paths)
     for i, origin in enumerate(origins):
         bends = reference.trace_concentric_spheres(spheres, origin, direction, 10)
-        assert paths.bends[i] == len(bends) + 2
+        assert paths.num_bends[i] == len(bends) + 2
         np.testing.assert_allclose(ends[i], bends[-1].point, atol=_SPHERE_TOLERANCE)
         np.testing.assert_allclose(onward[i], bends[-1].direction, atol=_SPHERE_TOLERANCE)
 
@@ -293,7 +293,7 @@ def test_a_camera_inside_of_balls(rule, start, slots):
     compared = 0
     for i, end, onward in zip(paths.rays, *_last(paths), strict=True):
         bends = reference.trace_concentric_spheres(spheres, origins[i], directions[i], 10)
-        if bends and len(bends) < 8 and paths.bends[i] == len(bends):
+        if bends and len(bends) < 8 and paths.num_bends[i] == len(bends):
             np.testing.assert_allclose(end, bends[-1].point, atol=0.02)
             np.testing.assert_allclose(onward, bends[-1].direction, atol=0.02)
             compared += 1

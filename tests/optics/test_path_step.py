@@ -71,7 +71,7 @@ def test_the_shading_normal_bends_the_ray():
 
 
 def _shares(reflectance, *, total=False, first=True, strength=1.0, **options):
-    settings = PathSettings(bends=8, **options)
+    settings = PathSettings(max_bends=8, **options)
     found = path_step.shares(
         settings,
         reflectance=jnp.float32(reflectance),

@@ -66,7 +66,7 @@ def _check_against_spheres(geometry, spheres, heights, bends):
         expected = reference.trace_concentric_spheres(
             spheres, origin, np.array([1.0, 0.0, 0.0]), 10
         )
-        assert len(expected) == bends == paths.bends[i]
+        assert len(expected) == bends == paths.num_bends[i]
         found = slice(1, bends + 1)
         np.testing.assert_allclose(
             paths.points[i, found], [b.point for b in expected], atol=_SPHERE_TOLERANCE
@@ -87,7 +87,7 @@ def test_a_slab_shifts_light_sideways(degrees):
     direction = np.array([np.sin(theta), 0.0, -np.cos(theta)])
     start = -3.0 * direction
     paths = _refracted(geometry, scenes.rays(start, direction))
-    assert paths.bends[0] == 2
+    assert paths.num_bends[0] == 2
     np.testing.assert_allclose(paths.directions[0, 2], direction, atol=_PLANAR_TOLERANCE)
     inner = np.arcsin(np.sin(theta) / 1.5)
     shift = thickness * np.sin(theta - inner) / np.cos(inner)
@@ -102,7 +102,7 @@ def test_a_right_prism_turns_light_by_total_reflection():
     geometry = scenes.geometry(scenes.right_prism())
     # Down through the leg z = 1 plane's neighbour x = 0, against the hypotenuse, out at z = 0.
     paths = _refracted(geometry, scenes.rays([-2.0, 0.1, 0.3], [1.0, 0.0, 0.0]))
-    assert paths.bends[0] == 3
+    assert paths.num_bends[0] == 3
     np.testing.assert_allclose(paths.points[0, 2], [0.7, 0.1, 0.3], atol=_PLANAR_TOLERANCE)
     np.testing.assert_allclose(paths.directions[0, 2], [0.0, 0.0, -1.0], atol=_PLANAR_TOLERANCE)
     np.testing.assert_allclose(paths.directions[0, 3], [0.0, 0.0, -1.0], atol=_PLANAR_TOLERANCE)
@@ -137,7 +137,7 @@ def test_nested_and_facing_differ_as_physics_says(height, nested, facing):
     rays = scenes.rays([-4.0, height, 0.0], [1.0, 0.0, 0.0])
     for rule, expected in (("nested", nested), ("facing", facing)):
         paths = _refracted(_ball_in_ball(rule), rays)
-        x, y, _ = paths.directions[0, paths.bends[0]]
+        x, y, _ = paths.directions[0, paths.num_bends[0]]
         assert np.degrees(np.arctan2(y, x)) == pytest.approx(expected, abs=0.3)
 
 
@@ -154,7 +154,9 @@ def test_equal_indices_are_invisible():
         paths = _existing(_trace(geometry, rays, settings=settings).paths)
         np.testing.assert_array_equal(paths.rays, [0, 1, 2])
         for i in range(3):
-            np.testing.assert_allclose(paths.directions[i, paths.bends[i]], [1, 0, 0], atol=1e-6)
+            np.testing.assert_allclose(
+                paths.directions[i, paths.num_bends[i]], [1, 0, 0], atol=1e-6
+            )
         np.testing.assert_array_equal(paths.weights, 1.0)
 
 
@@ -167,12 +169,12 @@ def test_light_paths_are_reversible():
     there = _refracted(
         geometry, scenes.rays(origins, generator.uniform(-0.4, 0.4, (200, 3)) - origins)
     )
-    through = np.flatnonzero((there.statuses == PathStatus.ESCAPED) & (there.bends <= 8))
+    through = np.flatnonzero((there.statuses == PathStatus.ESCAPED) & (there.num_bends <= 8))
     assert through.size > 50
-    last = there.bends[through]
+    last = there.num_bends[through]
     ends = there.points[through, last] + 2.0 * there.directions[through, last]
     back = _refracted(geometry, scenes.rays(ends, -there.directions[through, last]))
-    home = back.directions[np.arange(through.size), back.bends]
+    home = back.directions[np.arange(through.size), back.num_bends]
     # A path that grazes an edge or the critical angle may take another way back.
     same = np.linalg.norm(home + there.directions[through, 0], axis=-1) < 1e-3
     assert same.mean() > 0.97
@@ -184,11 +186,11 @@ def test_points_directions_and_distances_agree():
     rays = scenes.rays([[-4.0, y, 0.3] for y in np.linspace(-0.9, 0.9, 20)], [1.0, 0.0, 0.0])
     paths = _trace(geometry, rays).paths
     for i in np.flatnonzero(paths.statuses != PathStatus.EMPTY):
-        for k in range(paths.bends[i]):
+        for k in range(paths.num_bends[i]):
             length = paths.tau[i, k + 1] - paths.tau[i, k]
             end = paths.points[i, k] + length * paths.directions[i, k]
             np.testing.assert_allclose(end, paths.points[i, k + 1], atol=1e-5)
-        assert np.all(np.isinf(paths.tau[i, paths.bends[i] + 1 :]))
+        assert np.all(np.isinf(paths.tau[i, paths.num_bends[i] + 1 :]))
     np.testing.assert_allclose(np.linalg.norm(paths.directions, axis=-1), 1.0, atol=1e-6)
 
 
@@ -198,7 +200,7 @@ def test_a_path_out_of_bends_says_so_and_goes_on(bends):
     full = _refracted(_ball_in_ball("nested"), rays)
     cut = _refracted(_ball_in_ball("nested"), rays, bends=bends)
     assert cut.statuses[0] == PathStatus.OUT_OF_BENDS
-    assert cut.bends[0] == bends
+    assert cut.num_bends[0] == bends
     np.testing.assert_array_equal(cut.directions[0], full.directions[0, : bends + 1])
 
 
@@ -227,7 +229,7 @@ def test_the_paper_reflects_once_at_the_first_surface():
     np.testing.assert_allclose(paths.weights[0], 1.0 - reflectance, atol=1e-6)
     np.testing.assert_allclose(paths.weights[1], reflectance, atol=1e-6)
     assert paths.statuses[1] == PathStatus.NOT_TRACED
-    assert paths.bends[1] == 1
+    assert paths.num_bends[1] == 1
     np.testing.assert_allclose(paths.points[1, 1], [0.0, 0.0, 1.0], atol=_PLANAR_TOLERANCE)
     np.testing.assert_allclose(paths.directions[1, 1], [0.6, 0.0, 0.8], atol=_PLANAR_TOLERANCE)
     np.testing.assert_allclose(paths.tau[1, :2], [0.0, 4.0], atol=_PLANAR_TOLERANCE)
@@ -351,7 +353,7 @@ def test_paths_scale_with_the_scene(size):
         scenes.geometry(part._replace(vertices=part.vertices * size)),
         rays._replace(origins=rays.origins * size),
     )
-    np.testing.assert_array_equal(scaled.bends, small.bends)
+    np.testing.assert_array_equal(scaled.num_bends, small.num_bends)
     np.testing.assert_allclose(scaled.directions, small.directions, atol=1e-5)
     used = np.isfinite(small.tau)
     np.testing.assert_allclose(scaled.tau[used] / size, small.tau[used], atol=1e-5)
@@ -414,8 +416,8 @@ def test_light_that_escapes_a_closed_body_has_left_its_medium():
     aim[:, :2] = 0.5 * np.sign(aim[:, :2]) * (1.0 + rng.uniform(-1e-3, 1e-3, size=(4000, 2)))
     origin = np.array([-3.0, -2.0, 1.0])
     paths = _refracted(box, scenes.rays(origin, aim - origin))
-    last = paths.media[np.arange(4000), paths.bends]
-    escaped = (paths.statuses == PathStatus.ESCAPED) & (paths.bends > 0)
+    last = paths.media[np.arange(4000), paths.num_bends]
+    escaped = (paths.statuses == PathStatus.ESCAPED) & (paths.num_bends > 0)
     assert escaped.sum() > 500
     assert np.mean(last[escaped] != AMBIENT) <= 5e-3
 

@@ -87,16 +87,18 @@ def test_unfinished_light_is_lost_where_it_is_dark():
 
 
 def test_a_cut_branch_leaves_its_share_to_its_sibling():
-    ends, traced = _ends(_slab(), _down(), settings=PathSettings(5, "all", cut=0.039))
+    ends, traced = _ends(_slab(), _down(), settings=PathSettings(5, "all", min_throughput=0.039))
     # The inner reflection, 0.96 * 0.04, is below the cut: what enters leaves below, whole.
     np.testing.assert_allclose(np.sort(ends.weights[:, 0]), [0.04, 0.96], atol=1e-6)
     assert traced.casts == 4
-    ends, _ = _ends(_slab(), _down(), settings=PathSettings(5, "all", cut=0.041))
+    ends, _ = _ends(_slab(), _down(), settings=PathSettings(5, "all", min_throughput=0.041))
     np.testing.assert_array_equal(ends.weights, 1.0)
 
 
 def test_where_both_branches_are_below_the_cut_the_stronger_one_takes_all():
-    ends, _ = _ends(_slab(tint=(0.4, 0.3, 0.2)), _down(), settings=PathSettings(5, "all", cut=0.5))
+    ends, _ = _ends(
+        _slab(tint=(0.4, 0.3, 0.2)), _down(), settings=PathSettings(5, "all", min_throughput=0.5)
+    )
     np.testing.assert_allclose(ends.weights, [[0.16, 0.09, 0.04]], rtol=1e-5)
     assert ends.directions[0, 2] < 0.0
 
@@ -107,7 +109,7 @@ def test_the_tint_colours_every_crossing_and_every_reflection():
     r, t = _GLASS, 1.0 - _GLASS
     expected = {1: r * tint, 2: t * t * tint**2, 3: t * t * r * tint**3}
     for bends, weight in expected.items():
-        escaped = (ends.bends == bends) & (ends.statuses == PathStatus.ESCAPED)
+        escaped = (ends.num_bends == bends) & (ends.statuses == PathStatus.ESCAPED)
         np.testing.assert_allclose(ends.weights[escaped], weight[None], rtol=1e-4)
 
 
@@ -172,8 +174,8 @@ def test_light_that_goes_round_inside_a_ball_ends_by_its_budget():
     inside = scenes.rays([0.98, 0.0, 0.0], [0.0, 1.0, 0.0])
     ends, traced = _ends(geometry, inside, settings=_generous(TREE))
     assert ends.statuses.tolist() == [PathStatus.OUT_OF_BENDS]
-    assert ends.bends[0] == TREE.bends
-    assert traced.casts == TREE.bends + 1
+    assert ends.num_bends[0] == TREE.max_bends
+    assert traced.casts == TREE.max_bends + 1
 
 
 @pytest.mark.parametrize(
@@ -182,7 +184,7 @@ def test_light_that_goes_round_inside_a_ball_ends_by_its_budget():
         PAPER,
         TREE,
         pytest.param(PathSettings(6, "all"), marks=pytest.mark.slow),
-        PathSettings(6, "all", cut=0.3),
+        PathSettings(6, "all", min_throughput=0.3),
     ],
 )
 def test_untinted_light_is_conserved(settings):
@@ -232,15 +234,15 @@ def test_ends_are_the_last_segments_of_the_paths():
     ends, _ = _ends(geometry, rays, settings=TREE)
     trace = functools.partial(path_tracing.trace, settings=TREE, capacity=len(ends.rays))
     paths = jax.tree.map(np.asarray, jax.jit(trace)(geometry, rays).paths)
-    each = np.arange(len(paths.bends))
+    each = np.arange(len(paths.num_bends))
     lines = ends._replace(
-        origins=paths.points[each, paths.bends],
-        directions=paths.directions[each, paths.bends],
-        tau=paths.tau[each, paths.bends],
-        media=paths.media[each, paths.bends],
+        origins=paths.points[each, paths.num_bends],
+        directions=paths.directions[each, paths.num_bends],
+        tau=paths.tau[each, paths.num_bends],
+        media=paths.media[each, paths.num_bends],
         rays=paths.rays,
         weights=paths.weights,
-        bends=paths.bends,
+        num_bends=paths.num_bends,
         statuses=paths.statuses,
     )
     jax.tree.map(np.testing.assert_array_equal, _by_ray(lines), _by_ray(ends))
@@ -253,22 +255,22 @@ def test_no_wall_of_a_ten_thousandth_of_its_body_is_skipped(size):
     directions = np.stack([np.sin(angles), 0.1 * np.sin(angles), -np.cos(angles)], axis=-1)
     rays = scenes.rays(-3.0 * size * directions, directions)
     ends, _ = _ends(scenes.geometry(body), rays, settings=PathSettings(10, "none"))
-    np.testing.assert_array_equal(ends.bends, 2)
+    np.testing.assert_array_equal(ends.num_bends, 2)
     np.testing.assert_array_equal(ends.statuses, PathStatus.ESCAPED)
     np.testing.assert_allclose(ends.directions, rays.directions, atol=2e-6)
 
 
 def test_budgets_refuse_what_makes_no_sense():
     for options, reason in [
-        ({"bends": -1}, "bends"),
-        ({"cut": 1.0}, "cut"),
-        ({"cut": -0.1}, "cut"),
-        ({"cut": float("nan")}, "cut"),
+        ({"max_bends": -1}, "max_bends"),
+        ({"min_throughput": 1.0}, "min_throughput"),
+        ({"min_throughput": -0.1}, "min_throughput"),
+        ({"min_throughput": float("nan")}, "min_throughput"),
         ({"paths_per_ray": 0.5}, "paths_per_ray"),
         ({"live_per_ray": float("inf")}, "live_per_ray"),
     ]:
         with pytest.raises(ValueError, match=reason):
-            PathSettings(**{"bends": 3, "reflections": "all", **options})
+            PathSettings(**{"max_bends": 3, "reflections": "all", **options})
 
 
 def test_nothing_is_nan_for_rays_that_meet_nothing_or_start_on_a_surface():

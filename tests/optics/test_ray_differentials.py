@@ -14,8 +14,8 @@ from tests.factories import scenes
 _RADIUS = 1e-3  # of every ray of tests.factories.scenes
 _GLASS = scenes.geometry(scenes.ball(1.0, subdivisions=3))
 _SLAB = scenes.geometry(scenes.box((10.0, 10.0, 0.6)))
-_THROUGH = PathSettings(bends=2, reflections="none")
-_WHOLE = Detail("all", TREE.bends + 1, "differential")
+_THROUGH = PathSettings(max_bends=2, reflections="none")
+_WHOLE = Detail("all", TREE.max_bends + 1, "differential")
 
 
 @jax.jit
@@ -66,7 +66,7 @@ def test_a_slab_narrows_a_footprint_by_its_index():
 @pytest.mark.slow
 def test_a_mirror_leaves_a_footprint_as_wide_as_it_was():
     paths = _traced(_SLAB, scenes.rays([0.1, 0.05, -4.0], [0.3, 0.1, 1.0]))
-    mirrored = next(i for i in range(64) if exists(paths)[i] and int(paths.bends[i]) == 1)
+    mirrored = next(i for i in range(64) if exists(paths)[i] and int(paths.num_bends[i]) == 1)
     path = _one(paths, mirrored)
     t = float(path.tau[1]) + 3.0
     axes = _footprint(path, t)
@@ -90,7 +90,7 @@ def test_spreads_are_the_derivatives_of_the_differentiable_tracer(offset):
     """The main path through a smooth ball, against forward-mode derivatives of the scan."""
     rays = scenes.rays([offset[0], offset[1], -4.0], [0.02, -0.01, 1.0])
     path = _one(_traced(_GLASS, rays), 0)  # the heaviest: straight through
-    assert int(path.bends) == 2
+    assert int(path.num_bends) == 2
 
     for axis, across in enumerate(orthonormal_basis(rays.directions[0])):
         _, (point, direction) = _push(jax.tree.map(lambda x: x[0], rays), _RADIUS * across)
@@ -105,8 +105,8 @@ def test_a_ball_of_glass_widens_pixels():
     paths = _traced(_GLASS, ray)
     through = int(np.argmax(paths.weights[:, 0]))
     path = _one(paths, through)
-    axes = _footprint(path, float(path.tau[path.bends]) + 7.0)
-    cone = _RADIUS * (float(path.tau[path.bends]) + 7.0)
+    axes = _footprint(path, float(path.tau[path.num_bends]) + 7.0)
+    cone = _RADIUS * (float(path.tau[path.num_bends]) + 7.0)
     assert np.sqrt(np.trace(_gram(axes)) / 2.0) > 1.5 * cone
 
 

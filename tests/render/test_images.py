@@ -120,14 +120,14 @@ def test_rays_that_only_fill_up_a_tile_are_not_rendered(model, rays):
 def test_rays_that_miss_pay_nothing_for_reflection(model, rays):
     flat = Rays(*(x.reshape(256, *x.shape[2:]) for x in rays))
     paper = images._trace_tile(
-        model.geometry, flat, 256, settings=PAPER, detail=everything(PAPER.bends)
+        model.geometry, flat, 256, settings=PAPER, detail=everything(PAPER.max_bends)
     )
     straight = images._trace_tile(
         model.geometry, flat, 256, settings=STRAIGHT, detail=everything(0)
     )
     count = int(paper.count)
     reflections = np.asarray(paper.paths.statuses)[:count] == PathStatus.NOT_TRACED
-    hits = np.sum((np.asarray(paper.paths.bends)[:count] > 0) & ~reflections)
+    hits = np.sum((np.asarray(paper.paths.num_bends)[:count] > 0) & ~reflections)
     assert 0 < hits < 256
     assert count - int(straight.count) == np.sum(reflections) == hits
 

@@ -79,7 +79,7 @@ def test_clear_glass_before_white_is_white(geometry, rays, settings):
 
 
 def test_lost_light_is_told(geometry, rays):
-    tight = dataclasses.replace(TREE, cut=0.0, bends=6, paths_per_ray=1.0)
+    tight = dataclasses.replace(TREE, min_throughput=0.0, max_bends=6, paths_per_ray=1.0)
     seen = render_known(geometry, _WHITE, rays, settings=tight, tile=256)
     assert np.max(seen.lost) > 0.0
     np.testing.assert_allclose(seen.linear + seen.lost, 1.0, atol=1e-5)

@@ -13,7 +13,7 @@ from refref_jax.render import Model, init_params, pixel_paths
 from refref_jax.render.pixel_paths import PixelPaths
 from tests.factories.small_model import MODEL
 
-_SETTINGS = dataclasses.replace(TREE, bends=6, cut=1e-3)
+_SETTINGS = dataclasses.replace(TREE, max_bends=6, min_throughput=1e-3)
 
 
 def _ray(origin, direction):
@@ -38,7 +38,7 @@ def test_a_slab_seen_head_on_has_the_paths_of_a_textbook(straight_down):
     assert np.allclose(twice, [[*x, 4.0], [*x, 0.5], [*x, -0.5], [*x, 0.5], [*x, 2.5]], atol=1e-5)
     expected = [(1 - r) ** 2, r, r * (1 - r) ** 2]
     np.testing.assert_allclose(paths.weights[:3].mean(-1), expected, rtol=0.05)
-    assert paths.bends[:3].tolist() == [2, 1, 3]
+    assert paths.num_bends[:3].tolist() == [2, 1, 3]
     assert set(paths.statuses) <= {PathStatus.ESCAPED, PathStatus.OUT_OF_BENDS}
     np.testing.assert_allclose(paths.weights.sum(0) + paths.lost, 1.0, atol=1e-5)
     assert np.all(np.diff(paths.weights.mean(-1)) <= 0.0)
@@ -71,7 +71,7 @@ def test_a_ray_that_meets_nothing_is_one_straight_line(slab):
     paths = pixel_paths.trace_pixel(
         slab, _ray((0.0, 0.0, 4.0), (0.0, 0.0, 1.0)), settings=_SETTINGS, reach=2.0
     )
-    assert paths.statuses == (PathStatus.MISSED,) and paths.bends.tolist() == [0]
+    assert paths.statuses == (PathStatus.MISSED,) and paths.num_bends.tolist() == [0]
     np.testing.assert_allclose(paths.polylines[0], [[0, 0, 4], [0, 0, 6]], atol=1e-6)
     np.testing.assert_array_equal(paths.weights, [[1.0, 1.0, 1.0]])
 

@@ -220,7 +220,7 @@ def _walk(path, t, *, interior):
         path.directions,
         path.tau,
         path.media,
-        int(path.bends),
+        int(path.num_bends),
         t,
         skip_inside=interior == "clear",
     )
@@ -335,7 +335,7 @@ def _fine(interior):
 
 def _arc_at_z(path, z):
     """Returns the arc length at which the last segment of a path reaches a plane."""
-    last = int(path.bends)
+    last = int(path.num_bends)
     start, direction = np.asarray(path.points[last]), np.asarray(path.directions[last])
     return float(path.tau[last]) + (z - start[2]) / direction[2]
 

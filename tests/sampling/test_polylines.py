@@ -38,7 +38,7 @@ def _walk(path, t, *, skip_inside=False):
             path.directions,
             path.tau,
             path.media,
-            int(path.bends),
+            int(path.num_bends),
             x,
             skip_inside=skip_inside,
         )

@@ -62,7 +62,7 @@ def _resolve(found, **given):
         (_EMPTY, {}, ("straight", "field", "none", 0)),
         (_UNTOLD, {"paths": "paper"}, ("paper", "absorbing", "learned", 3)),
         (_UNTOLD, {"paths": "straight"}, ("straight", "field", "none", 0)),
-        (_UNTOLD, {"bends": 0}, ("tree", "field", "none", 0)),
+        (_UNTOLD, {"max_bends": 0}, ("tree", "field", "none", 0)),
         (_TINTED, {"tints": "learned"}, ("tree", "absorbing", "learned", 3)),
         (_CLEAR, {"tints": "learned"}, ("tree", "absorbing", "learned", 1)),
         (_CLEAR, {"interior": "absorbing"}, ("tree", "absorbing", "given", 0)),
@@ -81,7 +81,7 @@ def test_resolve_takes_what_the_scene_requires(found, given, expected):
 @pytest.mark.parametrize("given", [{}, {"paths": "straight"}, {"field": "nerfacto", "steps": 7}])
 def test_resolve_leaves_nothing_open_and_is_idempotent(found, given):
     made = _resolve(found, **given)
-    straight = made.model.settings.bends == 0
+    straight = made.model.settings.max_bends == 0
     for option in options_of():
         left = straight and option.name == "reentry"
         assert left == (made.config.get(option.name) is None), option.name
@@ -95,7 +95,7 @@ def test_resolve_leaves_nothing_open_and_is_idempotent(found, given):
     [
         ({"paths": "straight", "interior": "absorbing"}, "interior=absorbing"),
         ({"paths": "straight", "interior": "clear"}, "interior=clear"),
-        ({"bends": 0, "interior": "clear"}, "interior=clear"),
+        ({"max_bends": 0, "interior": "clear"}, "interior=clear"),
         ({"paths": "straight", "reentry": "impossible"}, "reentry=impossible"),
     ],
 )
@@ -112,35 +112,37 @@ def test_resolve_grants_straight_light_what_it_has_anyway():
 def test_resolve_promises_in_the_budget_what_the_scene_keeps():
     assert _resolve(_CLEAR).model.settings == dataclasses.replace(TREE, reentry="impossible")
     assert _resolve(_TINTED).model.settings == TREE
-    paper = _resolve(_TINTED, paths="paper", bends=3).model.settings
-    assert paper == dataclasses.replace(PAPER, bends=3)
+    paper = _resolve(_TINTED, paths="paper", max_bends=3).model.settings
+    assert paper == dataclasses.replace(PAPER, max_bends=3)
     assert _resolve(_EMPTY).model.settings == STRAIGHT
     assert _resolve(_CLEAR, reentry="possible").model.settings == TREE
-    assert _resolve(_TINTED, cut=0.005).model.settings.cut == 0.005
+    assert _resolve(_TINTED, min_throughput=0.005).model.settings.min_throughput == 0.005
 
 
 def test_a_finer_cut_has_room_for_its_paths_however_it_is_made():
     usual = capacity_factors(TREE)
     for fine in (
-        make_path_settings("tree", cut=TREE.cut / 4.0),
-        dataclasses.replace(TREE, cut=0.005),
+        make_path_settings("tree", min_throughput=TREE.min_throughput / 4.0),
+        dataclasses.replace(TREE, min_throughput=0.005),
     ):
         assert capacity_factors(fine) == tuple(2.0 * x for x in usual)
-    longer = capacity_factors(dataclasses.replace(TREE, bends=48))
+    longer = capacity_factors(dataclasses.replace(TREE, max_bends=48))
     assert longer == usual._replace(segments_per_ray=2.0 * usual.segments_per_ray)
     # Never without bound.
     assert (
-        capacity_factors(make_path_settings("tree", cut=0.0)).paths_per_ray
+        capacity_factors(make_path_settings("tree", min_throughput=0.0)).paths_per_ray
         < 10.0 * usual.paths_per_ray
     )
-    assert make_path_settings("tree", cut=0.1, bends=3) == dataclasses.replace(
-        TREE, cut=0.1, bends=3
+    assert make_path_settings("tree", min_throughput=0.1, max_bends=3) == dataclasses.replace(
+        TREE, min_throughput=0.1, max_bends=3
     )
     own = dataclasses.replace(TREE, paths_per_ray=3.0)
-    assert capacity_factors(dataclasses.replace(own, cut=0.005)).paths_per_ray == 3.0
+    assert capacity_factors(dataclasses.replace(own, min_throughput=0.005)).paths_per_ray == 3.0
     # What an earlier version wrote out grows as well.
     written = dataclasses.replace(TREE, live_per_ray=6.0, segments_per_ray=24.0, paths_per_ray=8.0)
-    assert capacity_factors(dataclasses.replace(written, cut=0.005)).paths_per_ray == 16.0
+    assert (
+        capacity_factors(dataclasses.replace(written, min_throughput=0.005)).paths_per_ray == 16.0
+    )
 
 
 def test_resolve_warns_of_what_is_doubtful():
@@ -159,10 +161,10 @@ def test_resolve_warns_of_what_is_doubtful():
         (_TINTED, {"tints": "none"}, "an absorbing interior has colours"),
         (_EMPTY, {"tints": "learned"}, "no effect"),
         (_EMPTY, {"paths": "tree"}, "no meshes"),
-        (_CLEAR, {"cut": 2.0}, "cut is 2.0"),
-        (_CLEAR, {"bends": -1}, "bends"),
-        (_CLEAR, {"paths": "straight", "bends": 10}, "no cut and no bends"),
-        (_CLEAR, {"paths": "straight", "cut": 0.02}, "no cut and no bends"),
+        (_CLEAR, {"min_throughput": 2.0}, "min_throughput is 2.0"),
+        (_CLEAR, {"max_bends": -1}, "bends"),
+        (_CLEAR, {"paths": "straight", "max_bends": 10}, "neither min_throughput nor max_bends"),
+        (_CLEAR, {"paths": "straight", "min_throughput": 0.02}, "neither min_throughput nor max_bends"),
         (_CLEAR, {"dilatation": 0.5}, "There is no option 'dilatation'"),
         (_CLEAR, {"samples": (32,)}, "is for 0 proposal levels, but preset tiny has 1"),
         (_CLEAR, {"samples": (32, 0)}, "not a list of positive numbers"),
@@ -191,18 +193,24 @@ def test_resolve_refuses_what_can_not_be(found, given, message):
 def test_override_takes_decisions_again_that_follow_from_a_change():
     config = _resolve(_TINTED, scene="a").config
     paper = config.override(paths="paper")
-    assert (paper.paths.cut, paper.model.interior, paper.model.samples) == (None, None, (32, 20))
+    assert (paper.paths.min_throughput, paper.model.interior, paper.model.samples) == (
+        None,
+        None,
+        (32, 20),
+    )
     assert config.override(paths="tree", steps=2500) == config
     shorter = config.override(steps=100).schedule
     assert (shorter.warmup, shorter.anneal, shorter.peak) == (None, None, 1e-2)
     assert config.override(steps=100, warmup=7).schedule.warmup == 7
     # Lists, mappings and paths are taken as users write them.
-    plain = TrainConfig().override(samples=[8, 4], ior={"glass": 1.52}, scene=Path("a"), cut=0)
+    plain = TrainConfig().override(
+        samples=[8, 4], ior={"glass": 1.52}, scene=Path("a"), min_throughput=0
+    )
     assert (plain.model.samples, plain.scene.indices) == ((8, 4), (("glass", 1.52),))
-    assert (plain.scene.path, type(plain.paths.cut)) == ("a", float)
+    assert (plain.scene.path, type(plain.paths.min_throughput)) == ("a", float)
     # Also those that followed from what is decided again.
     straight = _resolve(_EMPTY, scene="a").config.override(scene="b").paths
-    assert (straight.name, straight.cut, straight.bends) == (None, None, None)
+    assert (straight.name, straight.min_throughput, straight.max_bends) == (None, None, None)
     assert config.override(rule="facing").paths.reentry is None
     assert config.override(ior=[["glass", 1.4]]).paths.reentry is not None
     # What was never set is no change.
@@ -228,8 +236,8 @@ def test_what_was_asked_for_stays_and_what_was_decided_is_decided_again():
     # Resolving neither adds a wish nor drops one, and the reasons tell both apart.
     again = _resolve_again(config)
     assert again.config.chosen == config.chosen and again.config == config
-    assert (again.reasons["paths"], made.reasons["cut"]) == ("given", "paths=straight")
-    assert again.reasons["cut"] == "as the configuration has it"
+    assert (again.reasons["paths"], made.reasons["min_throughput"]) == ("given", "paths=straight")
+    assert again.reasons["min_throughput"] == "as the configuration has it"
     # Another object is no wish, and has another index of refraction.
     part = config.decided(reconstruction="r3f", ior={"ball": 1.5})
     assert part.chosen == config.chosen and part.override(reconstruction="x").scene.indices == ()
@@ -275,7 +283,7 @@ def test_a_configuration_is_read_as_it_was_written(tmp_path):
     assert read == config and read.chosen == config.chosen == ("scene", "ior", "batch")
     (tmp_path / "partial.json").write_text('{"paths": {"cut": 0.01}, "seed": 3}')
     partial = config_files.read_to_begin(tmp_path / "partial.json")
-    assert partial == TrainConfig().override(cut=0.01, seed=3)
+    assert partial == TrainConfig().override(min_throughput=0.01, seed=3)
 
 
 def test_a_reconstruction_is_named_as_seen_from_its_run(tmp_path, monkeypatch):
@@ -310,7 +318,7 @@ def test_a_reconstruction_is_named_as_seen_from_its_run(tmp_path, monkeypatch):
         ('{"paths": {"cut": NaN}}', "NaN, not a number"),
         ('{"seed": 0', "does not hold a TrainConfig"),
         ('{"sead": 0}', "unknown 'sead'"),
-        ('{"paths": {"cut": 2}}', "cut is 2.0, outside"),
+        ('{"paths": {"cut": 2}}', "min_throughput is 2.0, outside"),
         ("[]", "not an object"),
         ('{"loss": 1, "batch": 2, "pool": 3}', "not started again"),
         ('{"seed": -1}', "seed is -1"),
@@ -379,7 +387,7 @@ def test_prepare_resolves_scenes(scene):
         (tinted, {"interior": "clear"}, ("tree", "clear")),
         (untold, {}, ("tree", "absorbing")),
         (empty, {}, ("straight", "field")),
-        (tinted, {"paths": "paper", "bends": 4, "samples": (7, 6)}, ("paper", "absorbing")),
+        (tinted, {"paths": "paper", "max_bends": 4, "samples": (7, 6)}, ("paper", "absorbing")),
         (tinted, {"field": "nerfacto", "entries": 12}, ("tree", "absorbing")),
         (clear, {"paths": "paper_no_tir", "distortion": "everywhere"}, ("paper_no_tir", "clear")),
     ]

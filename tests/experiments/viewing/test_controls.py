@@ -15,7 +15,7 @@ from tests.factories import scenes
 @pytest.fixture(scope="module")
 def straight_down(slab):
     ray = Rays(np.array([0.1, 0.2, 4.0]), np.array([0.0, 0.0, -1.0]), np.float64(1e-3))
-    settings = dataclasses.replace(TREE, bends=6, cut=1e-3)
+    settings = dataclasses.replace(TREE, max_bends=6, min_throughput=1e-3)
     return pixel_paths.trace_pixel(slab, ray, settings=settings, reach=2.0)
 
 

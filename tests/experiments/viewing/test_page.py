@@ -32,7 +32,7 @@ _OF_THE_BALL, _BESIDE = (440, 290), (60, 600)
 def subject(ball_scene, monkeypatch):
     monkeypatch.setattr(images, "TILE", 1024)
     params = init_params(jax.random.key(0), MODEL)
-    settings = dataclasses.replace(TREE, bends=4, reentry="impossible")
+    settings = dataclasses.replace(TREE, max_bends=4, reentry="impossible")
     config = dataclasses.replace(MODEL, interior="clear")
     model = Model(config, settings, scenes.geometry(scenes.ball(1.4, subdivisions=3)), params)
     frames = scene_folder.read_frames(ball_scene, "test")

@@ -83,8 +83,10 @@ def test_another_index_changes_arrays_and_nothing_that_is_compiled():
 def test_another_cut_and_other_bends_are_another_budget_with_room_for_them():
     subject = _subject()
     first = session.first_choice(subject)
-    finer = session.chosen_model(subject, dataclasses.replace(first, cut=0.005, bends=32)).settings
-    assert (finer.cut, finer.bends) == (0.005, 32)
+    finer = session.chosen_model(
+        subject, dataclasses.replace(first, min_throughput=0.005, max_bends=32)
+    ).settings
+    assert (finer.min_throughput, finer.max_bends) == (0.005, 32)
     paths = capacity_factors(finer).paths_per_ray
     assert paths == pytest.approx(2.0 * capacity_factors(TREE).paths_per_ray)
     straight = _subject(STRAIGHT)
