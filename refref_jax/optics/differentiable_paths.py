@@ -86,7 +86,7 @@ def follow_branch(
       ray: one camera ray.
       reflects: choice of the reflected branch at each bend; a total internal reflection is always
         followed. All false is the main path.
-      settings: path settings; `settings.bends` must be the length of `reflects`.
+      settings: path settings; `settings.max_bends` must be the length of `reflects`.
       inside: interior list of the camera, for the rule `priority` (see `media`).
 
     Returns:

@@ -135,7 +135,7 @@ def trace(
       >>> settings = refref_jax.PathSettings(bends=1, reflections="all")
       >>> trace = jax.jit(functools.partial(refref_jax.trace, settings=settings))
       >>> paths = trace(glass, rays).paths  # each ray's heaviest path first
-      >>> print(np.round(paths.weights[:2, 0], 2), paths.bends[:2], paths.tau[0, :2])
+      >>> print(np.round(paths.weights[:2, 0], 2), paths.num_bends[:2], paths.tau[0, :2])
       [0.96 0.04] [1 1] [0.  1.5]
     """
     batch = jax.tree.map(lambda x: x[None], rays)

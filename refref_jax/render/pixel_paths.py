@@ -166,7 +166,7 @@ def _row(paths: PixelPaths, i: int) -> str:
     weight = paths.weights[i]
     channels = ", ".join(f"{x:.3f}" for x in weight)
     share, ending = f"{100.0 * weight.mean():.2f} %", ENDINGS[paths.statuses[i]]
-    return f"| {i + 1} | {share} | {channels} | {paths.bends[i]} | {ending} |"
+    return f"| {i + 1} | {share} | {channels} | {paths.num_bends[i]} | {ending} |"
 
 
 def _polylines(traced: _Traced, reach: float) -> PixelPaths:

@@ -164,7 +164,11 @@ def test_resolve_warns_of_what_is_doubtful():
         (_CLEAR, {"min_throughput": 2.0}, "min_throughput is 2.0"),
         (_CLEAR, {"max_bends": -1}, "bends"),
         (_CLEAR, {"paths": "straight", "max_bends": 10}, "neither min_throughput nor max_bends"),
-        (_CLEAR, {"paths": "straight", "min_throughput": 0.02}, "neither min_throughput nor max_bends"),
+        (
+            _CLEAR,
+            {"paths": "straight", "min_throughput": 0.02},
+            "neither min_throughput nor max_bends",
+        ),
         (_CLEAR, {"dilatation": 0.5}, "There is no option 'dilatation'"),
         (_CLEAR, {"samples": (32,)}, "is for 0 proposal levels, but preset tiny has 1"),
         (_CLEAR, {"samples": (32, 0)}, "not a list of positive numbers"),
