@@ -16,7 +16,7 @@ ESCAPED, OUT_OF_BENDS, NOT_TRACED = 2, 3, 4
 
 
 class Rule(NamedTuple):
-    """Which light to follow; the words are those of the library's budgets."""
+    """Which light to follow; the terms are those of the library's path settings."""
 
     bends: int
     reflections: str

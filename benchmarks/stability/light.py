@@ -168,7 +168,7 @@ def reversibility(density: int) -> Found:
 
 
 def whispering_gallery(density: int) -> Found:
-    """Light of rays caught in a ball by total reflection, which must end by their budget."""
+    """Light of rays caught in a ball by total reflection, which must end at their max bends."""
     sine = np.linspace(0.75, 0.999, RAYS)
     origins = np.stack([0.0 * sine, 0.0 * sine + 0.001, sine], axis=-1)
     rays = balls_and_rays.rays(origins, [1.0, 0.0, 0.0])

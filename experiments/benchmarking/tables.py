@@ -12,7 +12,7 @@ infinity, and over the image otherwise, like the paper's DMAE.
 
 The paper does not state the pixels of its DRMSE. It is unlikely to be over the image: the Oracle's
 is 0.00, but its DMAE there is 0.04 (cubes) and 0.15 (spheres), and an RMSE is never below the MAE
-of the same pixels. Our DRMSE in the mask is therefore next to the paper's, and that over the image
+of the same pixels. Our masked DRMSE is therefore next to the paper's, and that over the image
 has no counterpart.
 """
 

@@ -8,8 +8,8 @@ Distances are of three kinds, distinguished by name:
 - `surface_*`: the first surface of the meshes that the ray through the pixel's centre meets, and
   the median elsewhere. Clear glass has hardly any density, so the median passes through it to the
   background; a method that knows or reconstructs the glass has a better distance.
-- `substituted_*`: the true distance inside the object's mask, and the median elsewhere; its error
-  in the mask is 0 by definition. The first release of the paper's code did this for its two methods
+- `substituted_*`: the true distance inside the object's mask, and the median elsewhere; its masked
+  error is 0 by definition. The first release of the paper's code did this for its two methods
   that know objects, which explains the oracle's masked DMAE of 0.00 in the paper's table 2, though
   not R3F's 0.01 to 0.05. Only use it for comparison with that table.
 

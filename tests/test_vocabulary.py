@@ -1,0 +1,99 @@
+"""The words of docstrings, comments' neighbours and documents: the field's terms, in plain English.
+
+`docs/glossary.md` has the terms. Text in backticks is code, and may name what code names.
+"""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+_ROOT = Path(__file__).parents[1]
+_PAGES = [
+    *(_ROOT / name for name in ("README.md", "BUILD_NOTES.md", "CONTRIBUTING.md")),
+    *(_ROOT / "docs").rglob("*.md"),
+    *(_ROOT / "benchmarks").rglob("*.md"),
+]
+_MODULES = sorted(
+    path
+    for top in ("refref_jax", "experiments", "benchmarks")
+    for path in (_ROOT / top).rglob("*.py")
+)
+
+# Words that are not the field's, each with what to write in its place.
+_BANNED = {
+    r"can not": "cannot",
+    r"anew": "again",
+    r"whoever": "users who",
+    r"in the mask": "masked",
+    r"elders?": "parents",
+    r"manners": "conventions",
+    r"strangers?": "foreign files, independent references",
+    r"heed\w*": "respect",
+    r"mend\w*": "fix",
+    r"spoils?": "corrupts",
+    r"in vain": "needlessly",
+    r"seldom": "rarely",
+    r"affairs?": "a plain noun",
+    r"straight light": "straight rays",
+    r"budgets?": "path settings",
+    r"whose affair": "a plain noun",
+    r"asked for": "requested, set",
+    r"(?:is|are|be|was) told": "prints, reports",
+    r"goes on|go on": "continues, resumes",
+    r"found no room|finds no room": "dropped: buffer full",
+    r"DESIGN\.md": "a page of docs",
+    r"rules? \d+": "the rule itself",
+    r"old ball": "the scene and its date",
+    r"throw-away": "the command",
+}
+_PATTERN = re.compile(rf"(?<![\w./-])(?:{'|'.join(_BANNED)})(?![\w-])", re.IGNORECASE)
+
+_ARGUMENT_LINE = re.compile(r"^  (\w[\w, ]*): (.*)$", re.MULTILINE)
+_WITHOUT_NOUN = re.compile(r"(of|that|in|for|as|from|by|with|to|on|over) ")
+_MOST_WITHOUT_NOUN = 0.02
+
+_QUESTION = re.compile(r"(What|How|Who|Which|Where|Whether|When)\b")
+_MOST_QUESTIONS = 10
+
+
+def _docstrings(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Module | ast.FunctionDef | ast.ClassDef):
+            if text := ast.get_docstring(node):
+                yield text
+
+
+def _found(text):
+    return _PATTERN.findall(re.sub(r"```.*?```|`[^`]*`", "", text, flags=re.DOTALL))
+
+
+@pytest.mark.parametrize("path", _MODULES, ids=lambda path: path.relative_to(_ROOT).as_posix())
+def test_docstrings_use_the_fields_words(path):
+    assert [word for text in _docstrings(path) for word in _found(text)] == []
+
+
+@pytest.mark.parametrize("path", _PAGES, ids=lambda path: path.relative_to(_ROOT).as_posix())
+def test_documents_use_the_fields_words(path):
+    assert _found(path.read_text()) == []
+
+
+def test_argument_lines_begin_with_their_noun():
+    lines = [
+        match
+        for path in _MODULES
+        for text in _docstrings(path)
+        for match in _ARGUMENT_LINE.findall(text)
+    ]
+    without = [line for line in lines if _WITHOUT_NOUN.match(line[1])]
+    assert len(lines) > 1000 and len(without) < _MOST_WITHOUT_NOUN * len(lines), without
+
+
+def test_modules_say_what_they_do():
+    questions = [
+        path.relative_to(_ROOT).as_posix()
+        for path in _MODULES
+        if _QUESTION.match(ast.get_docstring(ast.parse(path.read_text())) or "")
+    ]
+    assert len(questions) < _MOST_QUESTIONS, questions
