@@ -59,10 +59,9 @@ _MOST_QUESTIONS = 10
 
 
 def _docstrings(path):
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Module | ast.FunctionDef | ast.ClassDef):
-            if text := ast.get_docstring(node):
-                yield text
+    kinds = ast.Module | ast.FunctionDef | ast.ClassDef
+    nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, kinds)]
+    return [text for node in nodes if (text := ast.get_docstring(node))]
 
 
 def _found(text):
