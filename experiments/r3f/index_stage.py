@@ -27,7 +27,6 @@ from refref_jax.geometry.cameras import pixel_rays
 from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.optics.interface_rules import NO_PARENT, nested
-from refref_jax.optics.path_settings import STRAIGHT
 from refref_jax.optics.scene import Scene
 from refref_jax.reconstruct.refractive_index import (
     Evidence,
@@ -38,7 +37,7 @@ from refref_jax.reconstruct.refractive_index import (
 )
 from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import SavedModel
-from refref_jax.render.model import Model
+from refref_jax.render.model import Model, ModelConfig
 from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.resolve import read_facts, resolve
@@ -179,27 +178,21 @@ def learn_background(
     """
     run = folder / "background"
     config = TrainConfig().override(
-        scene=str(scene),
+        scene=str(scene.resolve()),
         pixels="background",
         background=space,
         radius=radius,
         paths="straight",
         preset=PRESET,
+        footprint="cone",
         steps=steps,
         seed=seed,
     )
-    resolved = resolve(config, read_facts(config.scene, parts=()))
-    # Nothing is inside an object that is not there; straight rays are sampled all along either way.
-    model = dataclasses.replace(resolved.model.config, interior="clear")
-    wanted = SavedModel(model, STRAIGHT)
+    wanted = resolve(config, read_facts(config.scene, parts=()))
     if not run_folder.exists(run):
         empty = build_geometry([], [], rule="nested")
-        run_folder.create(run, resolved.config, wanted, empty)
-    elif checkpoint_io.read_static(run) != wanted:
-        raise ValueError(
-            f"{run} was begun with another --background or --radius than are given now. Give those "
-            "again, or remove that folder to have the background learned anew."
-        )
+        run_folder.create(run, wanted.config, wanted.model, empty)
+    _refuse_another(run, checkpoint_io.read_static(run), wanted.model)
     with app.Interrupt() as interrupt, ProgressBar("train", steps) as bar:
         ended = fit.train(
             run,
@@ -209,7 +202,35 @@ def learn_background(
         )
     if not ended:
         raise KeyboardInterrupt
-    return checkpoint_io.load_model(run)
+    model = checkpoint_io.load_model(run)
+    return model._replace(config=_as_background(model.config))
+
+
+def _as_background(config: ModelConfig) -> ModelConfig:
+    """Returns a model that was trained along straight light, for light that the body bends.
+
+    The field knows nothing inside of the body, and single paths carry no derivatives across the
+    pixel. Along straight light neither makes a difference, so that backgrounds of earlier versions,
+    which had it otherwise, can be used.
+    """
+    return dataclasses.replace(config, interior="clear", footprint="cone")
+
+
+def _refuse_another(run: Path, found: SavedModel, wanted: SavedModel) -> None:
+    """Refuses a background that was begun with another model than is wanted now."""
+    theirs, ours = _as_background(found.config), _as_background(wanted.config)
+    if (theirs, found.budget) == (ours, wanted.budget):
+        return
+    remove = "remove that folder to have the background learned anew."
+    if (theirs.space, theirs.radius) != (ours.space, ours.radius):
+        raise ValueError(
+            f"{run} was begun with another --background or --radius ({theirs.space}, "
+            f"{theirs.radius:g}) than now ({ours.space}, {ours.radius:g}). Give those again, or "
+            f"{remove}"
+        )
+    raise ValueError(
+        f"{run} was begun by a version with other fields or samples. Use that version, or {remove}"
+    )
 
 
 def draw(path: Path, found: IndexEstimate) -> None:
