@@ -83,6 +83,8 @@ def base() -> TrainConfig:
       ValueError: if the file is not a configuration.
     """
     path = flags.FLAGS["config"].value
+    if path == "":
+        raise ValueError("--config is empty. Give a file, as runs/demo/config.json.")
     return TrainConfig() if path is None else config_files.read_to_begin(Path(path))
 
 

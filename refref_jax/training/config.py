@@ -317,9 +317,13 @@ class TrainConfig:
     chosen: tuple[str, ...] | None = dataclasses.field(default=None, compare=False)
 
     def __post_init__(self) -> None:
-        """Checks the seed."""
+        """Checks the seed, and the names of what was asked for."""
         if not 0 <= self.seed < _SEEDS:
             raise ValueError(f"seed is {self.seed}. Give 0 to {_SEEDS - 1}.")
+        if unknown := sorted(set(self.chosen or ()) - set(_by_name())):
+            raise ValueError(
+                f"chosen names {unknown[0]!r}, but there is no such option. Remove it there."
+            )
 
     def override(self, **given: Any) -> "TrainConfig":
         """Returns this configuration with other values, by the names of their options.

@@ -63,7 +63,7 @@ def read_to_begin(path: Path) -> TrainConfig:
 def of_an_earlier_version(path: Path) -> dict[str, Any] | None:
     """Returns what the configuration of an earlier version says; `None` if it is not one."""
     try:
-        content = configuration.parse_json(path.read_text(encoding="utf-8"))
+        content = configuration.parse_json(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError):
         return None  # `configuration.read` says what is wrong
     is_earlier = isinstance(content, dict) and set(content) >= _KEYS_BEFORE

@@ -82,6 +82,7 @@ _MISTAKES = {
         "--out=OUT": "Add --scene=FOLDER, or --resume",
         "--out=OUT --scene=": "--scene is empty. Give a folder, or hf:CONFIG/SCENE",
         "--out=OUT --config=nowhere.json": "nowhere.json is not a file.",
+        "--out=OUT --config=": "--config is empty. Give a file",
         "--out=OUT --config=BARE": "which is not there. Give where it is now as --reconstruction",
         **{f"--out=OUT --config=CONFIG {x}": told for x, told in _ON_TOP_OF_R3F.items()},
         **{f"--out=OUT --scene=SCENE {words}": told for words, told in _OF_THE_SCENE.items()},
