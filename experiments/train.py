@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments.cli import app
+from experiments.cli import app, outputs
 from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
 from experiments.cli.progress import ProgressBar
@@ -82,6 +82,7 @@ def check_flags() -> TrainConfig:
     training_body.check_flags(config, _CONFIG)
     if config.paths.name is not None:
         budget_of(config.paths.name, cut=config.paths.cut, bends=config.paths.bends)
+    outputs.check_folder(run)
     return config
 
 
