@@ -61,7 +61,8 @@ def define_flags() -> dict[str, flags.FlagHolder]:
         "config",
         None,
         "File of a configuration, as a run's config.json; the other flags override it, and "
-        "--NAME=auto takes back what it asks for.",
+        "--NAME=auto takes back what it asks for, of every option but the folders --scene and "
+        "--reconstruction.",
     )
     return {option.name: _define(option) for option in training_config.options_of()}
 
@@ -135,15 +136,12 @@ def _define(option: Option) -> flags.FlagHolder:
     if default not in (None, "", ()):
         text += f" By default {default}."
     if typing.get_origin(kind) is Literal:
-        automatic = [AUTO] if default is None else []
-        return flags.DEFINE_enum(name, None, [*automatic, *typing.get_args(kind)], text)
+        return flags.DEFINE_enum(name, None, [AUTO, *typing.get_args(kind)], text)
     if name == "ior":
         text += " As glass=1.52; may be repeated."
         holder = flags.DEFINE_multi_string(name, None, text)
     elif typing.get_origin(kind) is tuple:
         holder = flags.DEFINE(_ListParser(), name, None, text, serializer=flags.ListSerializer(","))
-    elif kind is int and name == "seed":
-        return flags.DEFINE_integer(name, None, text, 0, 2**32 - 1)
     else:
         parser = {int: _IntegerParser, float: _FloatParser, str: flags.ArgumentParser}[kind]()
         holder = flags.DEFINE(parser, name, None, text, serializer=flags.ArgumentSerializer())
@@ -160,6 +158,8 @@ def _check(option: Option, value: Any) -> None:
 def _parse(option: Option, value: Any) -> Any:
     """Returns the value of an option, of that of its flag."""
     if value == AUTO and _kind(option) is not str:
+        return None
+    if option.name == "ior" and value == [AUTO]:
         return None
     if option.name == "ior":
         return refraction_indices.parse_named(value)
