@@ -107,13 +107,8 @@ class Budget:
 
     def __post_init__(self) -> None:
         """Validates the values."""
-        if self.bends < 0:
-            raise ValueError(f"bends is {self.bends}, which is negative. Give 0 or more.")
-        if not 0.0 <= self.cut < 1.0:
-            raise ValueError(
-                f"The throughput threshold cut is {self.cut}, outside [0, 1). Give 0.02 for 2 % of "
-                "a pixel's light."
-            )
+        check_bends(self.bends)
+        check_cut(self.cut)
         if self.reflections not in get_args(Reflections):
             raise ValueError(
                 f"reflections is {self.reflections!r}, which is unknown. Use 'none', 'first' or "
@@ -142,6 +137,21 @@ class Budget:
             # A default factor that is written out (as in files of older runs) still follows cut.
             if factor == usual:
                 object.__setattr__(self, name, None)
+
+
+def check_bends(bends: int) -> None:
+    """Refuses, by a `ValueError`, a number that can not be the max bends."""
+    if bends < 0:
+        raise ValueError(f"bends is {bends}, which is negative. Give 0 or more.")
+
+
+def check_cut(cut: float) -> None:
+    """Refuses, by a `ValueError`, a number that can not be a throughput threshold."""
+    if not 0.0 <= cut < 1.0:
+        raise ValueError(
+            f"The throughput threshold cut is {cut}, outside [0, 1). Give 0.02 for 2 % of a "
+            "pixel's light."
+        )
 
 
 class CapacityFactors(NamedTuple):

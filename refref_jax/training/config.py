@@ -33,7 +33,7 @@ from refref_jax.choices import (
     Space,
     Tints,
 )
-from refref_jax.optics.path_settings import Reentry
+from refref_jax.optics.path_settings import Reentry, check_bends, check_cut
 
 # Options that say which objects there are.
 _OBJECTS = ("scene", "reconstruction")
@@ -128,13 +128,11 @@ class PathsConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        if self.cut is not None and not 0.0 <= self.cut < 1.0:
-            raise ValueError(
-                f"The cut is a share of a pixel's light, in [0, 1), not {self.cut}. Give 0.02 for "
-                "2 %."
-            )
-        if self.bends is not None and self.bends < 0:
-            raise ValueError(f"A path can not have {self.bends} bends. Give 0 or more.")
+        _convert_fields(self)
+        if self.cut is not None:
+            check_cut(self.cut)
+        if self.bends is not None:
+            check_bends(self.bends)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -137,16 +137,12 @@ def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
 def loss(model: ModelConfig) -> LossConfig:
     """Returns what is minimised when a model is trained, the same for all presets.
 
-    The interlevel loss and its blurs are Zip-NeRF's for every kind of field.
+    What does not depend on the model is as `LossConfig` has it by default. The interlevel loss and its blurs are Zip-NeRF's for every kind of field.
     """
     finest = len(_BLURS) - 1
     return LossConfig(
-        data="mse",
-        interlevel=0.01,
         blurs=tuple(_BLURS[min(i, finest)] for i in range(len(model.proposals))),
-        distortion=0.01,
         hash_decay=registry.KINDS[model.field.kind].hash_decay,
-        dye_decay=1e-3,
     )
 
 

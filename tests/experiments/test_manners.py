@@ -42,8 +42,8 @@ _IN_THE_WAY = {
 }
 
 _OF_THE_SCENE = {
-    "--cut=1": "--cut=1.0: The cut is a share of a pixel's light",
-    "--bends=-1": "can not have -1 bends. Give 0 or more.",
+    "--cut=1": "--cut=1.0: The throughput threshold cut is 1.0, outside [0, 1).",
+    "--bends=-1": "bends is -1, which is negative. Give 0 or more.",
     "--samples=4,0": "--samples=4,0: samples is 4,0, not a list of positive numbers. Write as in",
     "--samples=a": "is not a list of numbers. Write as in --samples=32,20.",
     "--blurs=x": "--blurs=x is not a list of numbers. Write as in --blurs=0.03,0.003.",
@@ -96,14 +96,14 @@ _MISTAKES = {
     "render_known": {
         "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
         "--out=OUT --scene=": "--scene is empty. Give a folder",
-        "--out=OUT --scene=SCENE --cut=-0.5": "Give 0.02 for 2 %.",
+        "--out=OUT --scene=SCENE --cut=-0.5": "Give 0.02 for 2 % of a pixel",
         "--out=OUT --scene=SCENE --ior=glass": "Write as in --ior=glass=1.52.",
         "--out=OUT --scene=SCENE --paths=straight --unfinished=dark": "none is unfinished",
         "--out=OUT --scene=SCENE --views=1,1": "names a view twice",
     },
     "path_trade_off": {
         "--out=OUT --scenes=SCENE,nowhere": "nowhere/transforms_train.json does not exist",
-        "--out=OUT --scenes=SCENE --cuts=2": "Give 0.02 for 2 %.",
+        "--out=OUT --scenes=SCENE --cuts=2": "Give 0.02 for 2 % of a pixel",
         "--out=OUT --scenes=SCENE --ior=glass=x": "Write as in --ior=glass=1.52.",
         "--out=OUT --scenes=SCENE --views=a": "as in --views=0,10,20",
     },
@@ -139,7 +139,7 @@ _MISTAKES = {
     },
     "dataset.convert": {"--scene=nowhere --to=raw --out=OUT": "nowhere is no folder."},
     "dataset.make": {"--out=OUT --scenes=cube_smcvx_bal": "Did you mean cube_smcvx_ball"},
-    "dataset.check": {"x --cut=2": "Give 0.02 for 2 %.", "nowhere": "nowhere is no folder."},
+    "dataset.check": {"x --cut=2": "Give 0.02 for 2 % of a pixel", "nowhere": "nowhere is no folder."},
     "convert_nerfstudio": {
         "--source=x --out=OUT --scale=-1": "Give a positive number",
         "--source=nowhere --out=OUT": "nowhere is no folder.",
