@@ -336,10 +336,9 @@ class TrainConfig:
         Raises:
           ValueError: if there is no such option, or a value is out of range.
         """
-        given, options = _converted(given), _by_name()
+        given, options, taken_back = _converted(given), _by_name(), _nothing(given)
         usual = {name: options[name].field.default for name in self.followers(**given).decided}
-        asked = {name for name, value in given.items() if value not in (None, "", ())}
-        wishes = (self.wishes() - set(given)) | asked
+        wishes = (self.wishes() | set(given)) - taken_back
         chosen = tuple(name for name in options if name in wishes)
         return dataclasses.replace(self.decided(**usual, **given), chosen=chosen)
 
@@ -425,13 +424,10 @@ def _converted(given: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
-    """Returns a value as JSON has it."""
-    if isinstance(value, Mapping):
-        return [[name, _plain(each)] for name, each in sorted(value.items())]
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    return str(value) if isinstance(value, PurePath) else value
+def _nothing(given: Mapping[str, Any]) -> set[str]:
+    """Returns the names of values that ask for nothing: `None`, and what is empty."""
+    empty = {name for name, value in _converted(given).items() if value in ("", ())}
+    return empty | {name for name, value in given.items() if value is None}
 
 
 def _by_name() -> dict[str, Option]:
