@@ -12,7 +12,9 @@ Importing this module imports neither JAX nor the library's numerics.
 """
 
 import dataclasses
+import functools
 import math
+import numbers
 import typing
 from collections.abc import Iterator, Mapping
 from pathlib import PurePath
@@ -63,6 +65,37 @@ def _option(default: Any = None, *, name: str = "", after: tuple[str, ...] = ())
     return dataclasses.field(default=default, metadata={"name": name, "after": after})
 
 
+def _convert_fields(record: Any) -> None:
+    """Converts the values of a new record as `TrainConfig.override` does; see `_converted`."""
+    hints = _hints(type(record))
+    for field in dataclasses.fields(record):
+        value, kind = getattr(record, field.name), hints[field.name]
+        name = field.metadata.get("name") or field.name
+        if not dataclasses.is_dataclass(kind):
+            value = configuration.convert(_plain(value), kind, name=name)
+            object.__setattr__(record, field.name, value)
+        elif not isinstance(value, kind):
+            raise ValueError(f"{name} is {value!r}, not of type {kind.__name__}.")
+
+
+@functools.cache
+def _hints(owner: type) -> dict[str, Any]:
+    return typing.get_type_hints(owner)
+
+
+def _plain(value: Any) -> Any:
+    """Returns a value as JSON has it, also of numbers that are NumPy's."""
+    if isinstance(value, Mapping):
+        return [[name, _plain(each)] for name, each in sorted(value.items())]
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, numbers.Integral) and not isinstance(value, bool):
+        return int(value)
+    if isinstance(value, numbers.Real) and not isinstance(value, bool):
+        return float(value)
+    return str(value) if isinstance(value, PurePath) else value
+
+
 @dataclasses.dataclass(frozen=True)
 class SceneConfig:
     """The scene that is trained on.
@@ -93,6 +126,7 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
+        _convert_fields(self)
         if self.radius is not None and not 0.0 < self.radius < math.inf:
             raise ValueError(
                 f"radius is {self.radius}, but it is a length. Give a positive, finite number of "
@@ -172,6 +206,7 @@ class FieldConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
+        _convert_fields(self)
         if self.samples is not None and not (self.samples and min(self.samples) > 0):
             raise ValueError(
                 f"samples is {','.join(map(str, self.samples))}, not a list of positive numbers. "
@@ -218,6 +253,7 @@ class LossConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
+        _convert_fields(self)
         weights = (self.interlevel, self.distortion, self.hash_decay, self.dye_decay)
         for number in (*weights, *(self.blurs or ())):
             if number is not None and not 0.0 <= number < math.inf:
@@ -250,6 +286,7 @@ class ScheduleConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
+        _convert_fields(self)
         for name, least in [("steps", 1), ("batch", 1), ("pool", 1), ("warmup", 0), ("anneal", 0)]:
             number = getattr(self, name)
             if number is not None and not least <= number <= _MOST:
@@ -316,6 +353,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Checks the seed, and the names of what was asked for."""
+        _convert_fields(self)
         if not 0 <= self.seed < _SEEDS:
             raise ValueError(f"seed is {self.seed}. Give 0 to {_SEEDS - 1}.")
         if unknown := sorted(set(self.chosen or ()) - set(_by_name())):
@@ -356,6 +394,9 @@ class TrainConfig:
 
     def wishes(self) -> frozenset[str]:
         """Returns the names of the options that were asked for.
+
+        `override` and files note them in `chosen`; `dataclasses.replace` of a section does not, so
+        that a value that it puts into a configuration which has `chosen` counts as a decision.
 
         Where `chosen` does not tell, they are all that are not as usual; but none if the schedule
         is complete, as in the file of an earlier version's run, where decisions look the same.
@@ -401,7 +442,7 @@ class TrainConfig:
 def type_of(option: Option) -> Any:
     """Returns the annotation of an option's field."""
     owner = type(getattr(TrainConfig(), option.section)) if option.section else TrainConfig
-    return typing.get_type_hints(owner)[option.field.name]
+    return _hints(owner)[option.field.name]
 
 
 def _converted(given: Mapping[str, Any]) -> dict[str, Any]:
