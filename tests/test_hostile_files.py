@@ -73,8 +73,8 @@ _VALUES = {
     "cut": ({"paths": {"cut": _LARGE}}, "TrainConfig.paths.cut is too large"),
     "seed": ({"seed": -_LARGE}, "TrainConfig.seed is too large"),
     "samples": ({"model": {"samples": [_LARGE]}}, "TrainConfig.model.samples[0] is too large"),
-    "end of text": ({"scene": {"path": "a\0b"}}, "TrainConfig.scene.path is 'a\\x00b', which holds"),
-    "half a character": ({"scene": {"path": "\ud800x"}}, "TrainConfig.scene.path is '\\ud800x', whi"),
+    "end of text": ({"scene": {"path": "a\0b"}}, "TrainConfig.scene.path is 'a\\x00b', "),
+    "half a character": ({"scene": {"path": "\ud800x"}}, "scene.path is '\\ud800x', "),
     "unknown wish": ({"chosen": ["cut", "cot"]}, "chosen names 'cot'"),
 }
 

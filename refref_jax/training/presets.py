@@ -137,7 +137,8 @@ def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
 def loss(model: ModelConfig) -> LossConfig:
     """Returns what is minimised when a model is trained, the same for all presets.
 
-    What does not depend on the model is as `LossConfig` has it by default. The interlevel loss and its blurs are Zip-NeRF's for every kind of field.
+    What does not depend on the model is as `LossConfig` has it by default. The interlevel loss and
+    its blurs are Zip-NeRF's for every kind of field.
     """
     finest = len(_BLURS) - 1
     return LossConfig(

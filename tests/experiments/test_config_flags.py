@@ -23,7 +23,7 @@ print(json.dumps([names, kept, config.chosen, config.scene.path, "jax" in sys.mo
 
 def test_auto_takes_back_what_a_file_asks_for_of_all_options_but_the_folders(tmp_path):
     asked = {
-        "scene": {"path": "a", "rule": "facing", "indices": [["glass", 1.4]], "pixels": "background"},
+        "scene": {"path": "a", "rule": "facing", "indices": [["glass", 1.4]]},
         "paths": {"name": "tree", "cut": 0.1, "bends": 7},
         "model": {"preset": "small", "field": "nerfacto", "samples": [4, 3], "dilation": 0.5},
         "losses": {"data": "charbonnier", "interlevel": 0.5, "distortion_over": "everywhere"},

@@ -139,7 +139,10 @@ _MISTAKES = {
     },
     "dataset.convert": {"--scene=nowhere --to=raw --out=OUT": "nowhere is no folder."},
     "dataset.make": {"--out=OUT --scenes=cube_smcvx_bal": "Did you mean cube_smcvx_ball"},
-    "dataset.check": {"x --cut=2": "Give 0.02 for 2 % of a pixel", "nowhere": "nowhere is no folder."},
+    "dataset.check": {
+        "x --cut=2": "Give 0.02 for 2 % of a pixel",
+        "nowhere": "nowhere is no folder.",
+    },
     "convert_nerfstudio": {
         "--source=x --out=OUT --scale=-1": "Give a positive number",
         "--source=nowhere --out=OUT": "nowhere is no folder.",
