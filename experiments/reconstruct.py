@@ -13,7 +13,7 @@ from pathlib import Path
 from absl import flags
 from etils import epy
 
-from experiments.cli import app
+from experiments.cli import app, outputs
 from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
 from experiments.runs import refraction_indices
@@ -41,6 +41,7 @@ app.check(_IOR, _parse)
 def main() -> None:
     """Reconstructs a scene, or resumes its reconstruction."""
     cli_scenes.check(_SCENE.value)
+    outputs.check_folder(Path(_OUT.value))
     index = _parse(_IOR.value)
     config = _RECONSTRUCTION.chosen(
         index=index, seed=_SEED.value, space=_SPACE.chosen(), radius=_SPACE.radius.value

@@ -9,12 +9,14 @@ scene's own meshes are never read.
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from absl import flags
 
-from experiments.cli import app
+from experiments.cli import app, outputs
 from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
 from experiments.cli.progress import ProgressBar
@@ -22,6 +24,9 @@ from experiments.r3f import training_body
 from experiments.runs import config_flags, processes
 from refref_jax.optics.path_settings import make_path_settings
 from refref_jax.training.config import TrainConfig
+
+if TYPE_CHECKING:
+    from refref_jax.data.meshes import MeshPart
 
 _OUT = cli_flags.out("Folder of the run.")
 _CONFIG = config_flags.define_flags()
@@ -56,6 +61,11 @@ def check_flags() -> TrainConfig:
     Raises:
       ValueError: if a flag is invalid, or no scene is set.
     """
+    run = Path(_OUT.value)
+    if not _RESUME.value and (run / cli_flags.RUN).is_file():
+        raise ValueError(
+            f"{run} already contains a run. Continue it with --resume, or give another --out."
+        )
     say = (lambda line: None) if _DEVICES.process.value else print
     scene, config = _CONFIG["scene"].value, training_body.asked(_CONFIG, say=say)
     if processes.together(_DEVICES) and training_body.reconstructs(config):
@@ -76,61 +86,54 @@ def check_flags() -> TrainConfig:
             min_throughput=config.paths.min_throughput,
             max_bends=config.paths.max_bends,
         )
+    outputs.check_folder(run)
     return config
 
 
 def _train(run: Path, asked: TrainConfig) -> bool:
     """Starts or resumes a run; returns whether it has reached its last step."""
-    from refref_jax.training import fit, run_folder
+    from refref_jax.training import devices, fit
 
-    mesh = processes.mesh(_DEVICES)
-    resuming = _RESUME.value and run_folder.exists(run)
-    if run_folder.exists(run) and not resuming:
-        raise ValueError(
-            f"{run} already contains a run. Continue it with --resume, or give another --out."
-        )
-    if not resuming:
-        run_folder.check_free(run)
-    if not resuming or _CONFIG["scene"].value is not None:
-        _open(run, asked, resuming=resuming)
-    else:
+    existing = "resume" if _RESUME.value else "refuse"
+    resuming, mesh = fit.is_resumed(run, existing), processes.mesh(_DEVICES)
+    given, part, config = asked.scene.reconstruction, None, None
+    if resuming and _CONFIG["scene"].value is None:
         _refuse_flags(run)
-    moved = _CONFIG["scene"].value
-    periods = fit.Periods(_LOG_EVERY.value, _CHECKPOINT_EVERY.value, _KEEP.value)
-    with app.Interrupt() as interrupt, ProgressBar("train", 0) as bar:
-        return fit.train(
+    else:
+        config, part = _with_object(run, asked)
+    interrupt, bar = app.Interrupt(), ProgressBar("train", 0)
+    with contextlib.ExitStack() as stack:
+
+        def ready() -> None:
+            if not resuming and devices.is_first():
+                training_body.note(run, part, given)
+            stack.enter_context(interrupt)
+            stack.enter_context(bar)
+
+        return fit.train_into(
             run,
-            scene=None if moved is None else cli_scenes.opened(moved),
+            config,
+            existing=existing,
+            parts=None if part is None else [part],
+            ready=ready,
             progress=bar.move,
             stop=lambda: interrupt.requested,
-            periods=periods,
+            periods=fit.Periods(_LOG_EVERY.value, _CHECKPOINT_EVERY.value, _KEEP.value),
             mesh=mesh,
         )
 
 
-def _open(run: Path, asked: TrainConfig, *, resuming: bool) -> None:
-    """Resolves a run and creates its folder, or compares it with the one that is resumed."""
-    from refref_jax.training import devices, fit, run_folder
-
+def _with_object(run: Path, asked: TrainConfig) -> tuple[TrainConfig, MeshPart | None]:
+    """Returns the configuration with the scene's folder, and the object if it is reconstructed."""
     if not asked.scene.path:
         raise ValueError("The configuration has no scene. Add --scene=FOLDER.")
     config = asked.at(str(cli_scenes.opened(asked.scene.path).resolve()))
     ior = _CONFIG["ior"].value or ()
     part = training_body.find(run, config, ior=ior, resume=_RESUME.value)
-    given = config.scene.reconstruction
     if part is not None:
-        made = training_body.folder(run, given)
+        made = training_body.folder(run, config.scene.reconstruction)
         config = training_body.with_part(config, part, made, ior=ior, say=print)
-    resolved, scene = fit.prepare(config, parts=None if part is None else [part])
-    print(resolved.describe())
-    begun = resolved.config, resolved.model, scene
-    if resuming:
-        run_folder.check_unchanged(run, *begun)
-        return
-    devices.wait_for_all("all have planned")
-    if devices.is_first():
-        training_body.note(run, part, given)
-    fit.begin(run, *begun)
+    return config, part
 
 
 def _refuse_flags(run: Path) -> None:

@@ -10,6 +10,8 @@ is annotated with a base class, the key `kind` of its value selects the variant 
 import dataclasses
 import json
 import math
+import os
+import sys
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
@@ -86,7 +88,7 @@ def read(path: Path, kind: type[_Config], *, variants: Variants | None = None) -
     if not path.is_file():
         raise ValueError(f"{path} does not exist. Give a folder that a command wrote.")
     try:
-        content = parse_json(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8-sig"))
         return build(content, kind, variants=variants)
     except (ValueError, TypeError) as error:
         raise ValueError(
@@ -134,13 +136,28 @@ def _build(kind: Any, value: Any, where: str, variants: Variants) -> Any:
             return None
         (other,) = (a for a in arguments if a is not type(None))
         return _build(other, value, where, variants)
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+    if type(value) is int and abs(value) > sys.float_info.max:
+        raise ValueError(f"{where} is too large: a number of {value.bit_length()} bits")
+    if kind is float and type(value) is int:
         return float(value)
+    if isinstance(value, str):
+        _check_text(value, where)
     if value != value:
         raise ValueError(f"{where} is NaN, not a number")
     if type(value) is not kind:
         raise ValueError(f"{where} is {value!r}, not of type {kind.__name__}")
     return value
+
+
+def _check_text(value: str, where: str) -> None:
+    """Refuses text that can not be part of a path."""
+    try:
+        os.fsencode(value)
+        possible = "\0" not in value
+    except UnicodeEncodeError:
+        possible = False
+    if not possible:
+        raise ValueError(f"{where} is {value!r}, which holds a character that no name can have")
 
 
 def _build_dataclass(kind: Any, value: Any, where: str, variants: Variants) -> Any:

@@ -1,5 +1,6 @@
 """JSON files that are damaged, hostile or somebody else's: one line that names the file, always."""
 
+import json
 import shutil
 
 import pytest
@@ -8,7 +9,9 @@ from experiments.benchmarking import settings
 from experiments.r3f import object_source, records
 from refref_jax.data import background, meshes, scene_folder
 from refref_jax.render import checkpoint_io
-from refref_jax.training import run_folder
+from refref_jax.training import config_files, run_folder
+from refref_jax.training.config import TrainConfig
+from tests.small_model import SAVED
 
 _TEXTS = {
     "nested": b"[" * 200_000,
@@ -62,3 +65,41 @@ def test_a_scene_json_is_read_or_refused_in_one_line(ball_scene, tmp_path, read,
         read(tmp_path)
     except ValueError as error:
         assert "\n" not in str(error) and "scene.json" in str(error)
+
+
+_LARGE = 10**400
+
+_VALUES = {
+    "cut": ({"paths": {"cut": _LARGE}}, "TrainConfig.paths.cut is too large"),
+    "seed": ({"seed": -_LARGE}, "TrainConfig.seed is too large"),
+    "samples": ({"model": {"samples": [_LARGE]}}, "TrainConfig.model.samples[0] is too large"),
+    "end of text": ({"scene": {"path": "a\0b"}}, "TrainConfig.scene.path is 'a\\x00b', "),
+    "half a character": ({"scene": {"path": "\ud800x"}}, "scene.path is '\\ud800x', "),
+    "unknown wish": ({"chosen": ["cut", "cot"]}, "chosen names 'cot'"),
+}
+
+
+@pytest.mark.parametrize(("content", "message"), _VALUES.values(), ids=_VALUES)
+def test_a_value_that_nothing_can_hold_is_refused_with_its_file_and_key(tmp_path, content, message):
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError) as caught:
+        config_files.read_to_begin(path)
+    assert message in str(caught.value) and "mine.json" in str(caught.value)
+    str(caught.value).encode()  # it can be printed
+
+
+def test_a_number_that_is_too_large_is_refused_in_a_model_and_in_python(tmp_path):
+    checkpoint_io.write_static(tmp_path, SAVED)
+    content = json.loads((tmp_path / "model.json").read_text())
+    content["budget"]["cut"] = _LARGE
+    (tmp_path / "model.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"model\.json .*SavedModel\.budget\.cut is too large"):
+        checkpoint_io.read_static(tmp_path)
+    with pytest.raises(ValueError, match="cut is too large"):
+        TrainConfig().override(cut=_LARGE)
+
+
+def test_a_byte_order_mark_is_no_mistake(tmp_path):
+    (tmp_path / "mine.json").write_bytes(b'\xef\xbb\xbf{"seed": 3}')
+    assert config_files.read_to_begin(tmp_path / "mine.json").seed == 3

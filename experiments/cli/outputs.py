@@ -7,7 +7,9 @@ itself writes are replaced. All other files in the folder are left alone.
 """
 
 import contextlib
+import errno
 import json
+import os
 import shutil
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -68,6 +70,24 @@ def check_file(path: Path, *, overwrite: bool) -> None:
         raise ValueError(f"{path} is a folder, not a file. Give another name.")
     if path.exists() and not overwrite:
         raise ValueError(f"{path} exists. Give another --out, or use --overwrite to replace it.")
+
+
+def check_folder(out: Path) -> None:
+    """Refuses, by a `ValueError`, a folder that can not be written to; leaves none that was not."""
+    if out.exists() and not out.is_dir():
+        return  # who writes there says what it is
+    missing = [each for each in (out, *out.parents) if not each.exists()]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if not os.access(out, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        raise ValueError(
+            f"--out={out} can not be written to ({error.strerror}). Give another folder."
+        ) from error
+    finally:
+        for each in missing:
+            _remove_empty(each)
 
 
 def note(out: Path, module: str, files: Iterable[Path] = ()) -> None:

@@ -6,12 +6,15 @@ cameras look at the origin from a sphere of radius 4, with z up. Azimuth is coun
 """
 
 import math
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float
 
 from experiments.dataset.seeds import seed_of
-from refref_jax.choices import SPLITS, Split
+from refref_jax.choices import Split
+
+SPLITS: tuple[Split, ...] = get_args(Split)
 
 ANGLE_X = 1.1656107902526855
 """Horizontal field of view of all cameras, radians: `camera_angle_x`."""

@@ -28,7 +28,6 @@ from refref_jax.geometry.cameras import pixel_rays
 from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.optics.interface_rules import NO_PARENT, nested
-from refref_jax.optics.path_settings import STRAIGHT
 from refref_jax.optics.scene import Scene
 from refref_jax.reconstruct.refractive_index import (
     Evidence,
@@ -39,7 +38,7 @@ from refref_jax.reconstruct.refractive_index import (
 )
 from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import SavedModel
-from refref_jax.render.model import Model
+from refref_jax.render.model import Model, ModelConfig
 from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.resolve import read_facts, resolve
@@ -181,27 +180,21 @@ def learn_background(
     """
     run = folder / "background"
     config = TrainConfig().override(
-        scene=str(scene),
+        scene=str(scene.resolve()),
         pixels="background",
         background=space,
         radius=radius,
         paths="straight",
         preset=PRESET,
+        footprint="cone",
         steps=steps,
         seed=seed,
     )
-    resolved = resolve(config, read_facts(config.scene, parts=()))
-    # There is no object in this scene; straight rays are sampled over their full length anyway.
-    model = dataclasses.replace(resolved.model.config, interior="clear")
-    wanted = SavedModel(model, STRAIGHT)
+    wanted = resolve(config, read_facts(config.scene, parts=()))
     if not run_folder.exists(run):
         empty = build_geometry([], [], rule="nested")
-        run_folder.create(run, resolved.config, wanted, empty)
-    elif checkpoint_io.read_static(run) != wanted:
-        raise ValueError(
-            f"{run} was started with another --background or --radius. Repeat these flags, or "
-            "remove that folder to train the background again."
-        )
+        run_folder.create(run, wanted.config, wanted.model, empty)
+    _refuse_another(run, checkpoint_io.read_static(run), wanted.model)
     with app.Interrupt() as interrupt, ProgressBar("train", steps) as bar:
         ended = fit.train(
             run,
@@ -211,7 +204,36 @@ def learn_background(
         )
     if not ended:
         raise KeyboardInterrupt
-    return checkpoint_io.load_model(run)
+    model = checkpoint_io.load_model(run)
+    return model._replace(config=_as_background(model.config))
+
+
+def _as_background(config: ModelConfig) -> ModelConfig:
+    """Returns the configuration of a model trained along straight rays, for refracted paths.
+
+    The field was not trained inside the object, and single paths carry no derivatives across the
+    pixel. For straight rays neither makes a difference, so backgrounds of earlier versions, which
+    were trained with other values, can be used.
+    """
+    return dataclasses.replace(config, interior="clear", footprint="cone")
+
+
+def _refuse_another(run: Path, found: SavedModel, wanted: SavedModel) -> None:
+    """Rejects a background that was started with another model."""
+    theirs, ours = _as_background(found.config), _as_background(wanted.config)
+    if (theirs, found.settings) == (ours, wanted.settings):
+        return
+    remove = "remove that folder to train the background again."
+    if (theirs.space, theirs.radius) != (ours.space, ours.radius):
+        raise ValueError(
+            f"{run} was started with another --background or --radius ({theirs.space}, "
+            f"{theirs.radius:g}) than now ({ours.space}, {ours.radius:g}). Repeat these flags, or "
+            f"{remove}"
+        )
+    raise ValueError(
+        f"{run} was started by a version with other fields or samples. Use that version, or "
+        f"{remove}"
+    )
 
 
 def draw(path: Path, found: IndexEstimate) -> None:

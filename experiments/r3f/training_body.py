@@ -49,7 +49,8 @@ def asked(options: Options, *, say: config_flags.Say) -> TrainConfig:
         instead = {"reconstruction": "", "ior": ()}
     others = {name: holder for name, holder in options.items() if name != "ior"}
     config = config_flags.chosen(others, say=say, **instead)
-    if is_reconstructed(config) or not options["ior"].present:
+    takes_back = options["ior"].value == [config_flags.AUTO]
+    if not options["ior"].present or (is_reconstructed(config) and not takes_back):
         return config
     return config.override(**config_flags.given({"ior": options["ior"]}))
 
@@ -108,12 +109,12 @@ def check_flags(config: TrainConfig, options: Options) -> None:
 
 
 def given_index(ior: Sequence[str]) -> float | None:
-    """Returns the index of `--ior=NUMBER`, if it is given.
+    """Returns the index of `--ior=NUMBER`, if it is given and not `auto`.
 
     Raises:
       ValueError: if there are several, or one has a name.
     """
-    if not ior:
+    if not ior or list(ior) == [config_flags.AUTO]:
         return None
     if len(ior) > 1 or "=" in ior[0]:
         raise ValueError(
@@ -194,7 +195,8 @@ def with_part(
         config = config.decided(reconstruction=folder)
     else:
         config = config_flags.on_top(config, {"reconstruction": folder}, say=say)
-    return config.override(ior=index) if ior else config.decided(ior=index)
+    is_given = given_index(ior) is not None
+    return config.override(ior=index) if is_given else config.decided(ior=index)
 
 
 def note(run: Path, part: MeshPart | None, given: str) -> None:

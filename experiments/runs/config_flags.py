@@ -90,6 +90,8 @@ def base() -> TrainConfig:
       ValueError: if the file is not a configuration.
     """
     path = flags.FLAGS["config"].value
+    if path == "":
+        raise ValueError("--config is empty. Give a file, such as runs/demo/config.json.")
     return TrainConfig() if path is None else config_files.read_to_begin(Path(path))
 
 
@@ -140,15 +142,12 @@ def _define(option: Option) -> flags.FlagHolder:
     if default not in (None, "", ()):
         text += f" By default {default}."
     if typing.get_origin(kind) is Literal:
-        automatic = [AUTO] if default is None else []
-        return flags.DEFINE_enum(name, None, [*automatic, *typing.get_args(kind)], text)
+        return flags.DEFINE_enum(name, None, [AUTO, *typing.get_args(kind)], text)
     if name == "ior":
         text += " As glass=1.52; may be repeated."
         holder = flags.DEFINE_multi_string(name, None, text)
     elif typing.get_origin(kind) is tuple:
         holder = flags.DEFINE(_ListParser(), name, None, text, serializer=flags.ListSerializer(","))
-    elif kind is int and name == "seed":
-        return flags.DEFINE_integer(name, None, text, 0, 2**32 - 1)
     else:
         parser = {int: _IntegerParser, float: _FloatParser, str: flags.ArgumentParser}[kind]()
         holder = flags.DEFINE(parser, name, None, text, serializer=flags.ArgumentSerializer())
@@ -165,6 +164,8 @@ def _check(option: Option, value: Any) -> None:
 def _parse(option: Option, value: Any) -> Any:
     """Converts the value of a flag to that of its option."""
     if value == AUTO and _kind(option) is not str:
+        return None
+    if option.name == "ior" and value == [AUTO]:
         return None
     if option.name == "ior":
         return refraction_indices.parse_named(value)

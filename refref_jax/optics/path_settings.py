@@ -106,13 +106,8 @@ class PathSettings:
 
     def __post_init__(self) -> None:
         """Validates the values."""
-        if self.max_bends < 0:
-            raise ValueError(f"max_bends is {self.max_bends}, which is negative. Give 0 or more.")
-        if not 0.0 <= self.min_throughput < 1.0:
-            raise ValueError(
-                f"min_throughput is {self.min_throughput}, outside [0, 1). Give 0.02 for 2 % of "
-                "a pixel's light."
-            )
+        check_max_bends(self.max_bends)
+        check_min_throughput(self.min_throughput)
         if self.reflections not in get_args(Reflections):
             raise ValueError(
                 f"reflections is {self.reflections!r}, which is unknown. Use 'none', 'first' or "
@@ -141,6 +136,21 @@ class PathSettings:
             # A default factor that is written out, as in files of older runs, still adapts.
             if factor == usual:
                 object.__setattr__(self, name, None)
+
+
+def check_max_bends(max_bends: int) -> None:
+    """Raises a `ValueError` if max bends are negative."""
+    if max_bends < 0:
+        raise ValueError(f"max_bends is {max_bends}, which is negative. Give 0 or more.")
+
+
+def check_min_throughput(min_throughput: float) -> None:
+    """Raises a `ValueError` if a throughput threshold is outside [0, 1)."""
+    if not 0.0 <= min_throughput < 1.0:
+        raise ValueError(
+            f"min_throughput is {min_throughput}, outside [0, 1). Give 0.02 for 2 % of a pixel's "
+            "light."
+        )
 
 
 class CapacityFactors(NamedTuple):

@@ -12,7 +12,9 @@ This module imports neither JAX nor the library's numerics.
 """
 
 import dataclasses
+import functools
 import math
+import numbers
 import typing
 from collections.abc import Iterator, Mapping
 from pathlib import PurePath
@@ -33,7 +35,7 @@ from refref_jax.choices import (
     Space,
     Tints,
 )
-from refref_jax.optics.path_settings import Reentry
+from refref_jax.optics.path_settings import Reentry, check_max_bends, check_min_throughput
 
 _Value = TypeVar("_Value")
 
@@ -69,6 +71,39 @@ def _option(
     return dataclasses.field(default=default, metadata=metadata)
 
 
+def _convert_fields(record: Any) -> None:
+    """Converts the values of a new record as `TrainConfig.override` does; see `_converted`."""
+    hints = _hints(type(record))
+    for field in dataclasses.fields(record):
+        value, kind = getattr(record, field.name), hints[field.name]
+        name = field.metadata.get("name") or field.name
+        if not dataclasses.is_dataclass(kind):
+            value = configuration.convert(_plain(value), kind, name=name)
+            object.__setattr__(record, field.name, value)
+        elif not isinstance(value, kind):
+            raise ValueError(f"{name} is {value!r}, not of type {kind.__name__}.")
+
+
+@functools.cache
+def _hints(owner: Any) -> dict[str, Any]:
+    return typing.get_type_hints(owner)
+
+
+def _plain(value: Any) -> Any:
+    """Returns a value as JSON represents it; NumPy's numbers become Python's."""
+    if isinstance(value, Mapping):
+        return [[name, _plain(each)] for name, each in sorted(value.items())]
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, bool):
+        return value
+    if isinstance(value, numbers.Integral):
+        return int(value)
+    if isinstance(value, numbers.Real):
+        return float(value)
+    return str(value) if isinstance(value, PurePath) else value
+
+
 @dataclasses.dataclass(frozen=True)
 class SceneConfig:
     """The training scene.
@@ -99,6 +134,7 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
+        _convert_fields(self)
         if self.radius is not None and not 0.0 < self.radius < math.inf:
             raise ValueError(
                 f"radius is {self.radius}, but it is a length. Give a positive, finite number of "
@@ -136,13 +172,11 @@ class PathsConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        if self.min_throughput is not None and not 0.0 <= self.min_throughput < 1.0:
-            raise ValueError(
-                f"min_throughput is {self.min_throughput}, outside [0, 1). Give 0.02 for 2 % of "
-                "a pixel's light."
-            )
-        if self.max_bends is not None and self.max_bends < 0:
-            raise ValueError(f"max_bends is {self.max_bends}, which is negative. Give 0 or more.")
+        _convert_fields(self)
+        if self.min_throughput is not None:
+            check_min_throughput(self.min_throughput)
+        if self.max_bends is not None:
+            check_max_bends(self.max_bends)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,6 +217,7 @@ class FieldConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
+        _convert_fields(self)
         if self.samples is not None and not (self.samples and min(self.samples) > 0):
             raise ValueError(
                 f"samples is {','.join(map(str, self.samples))}, not a list of positive numbers. "
@@ -229,6 +264,7 @@ class LossConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
+        _convert_fields(self)
         weights = (self.interlevel, self.distortion, self.hash_decay, self.dye_decay)
         for number in (*weights, *(self.blurs or ())):
             if number is not None and not 0.0 <= number < math.inf:
@@ -262,6 +298,7 @@ class ScheduleConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
+        _convert_fields(self)
         for name, least in [("steps", 1), ("batch", 1), ("pool", 1), ("warmup", 0), ("anneal", 0)]:
             number = getattr(self, name)
             if number is not None and not least <= number <= _MOST:
@@ -328,9 +365,14 @@ class TrainConfig:
     chosen: tuple[str, ...] | None = dataclasses.field(default=None, compare=False)
 
     def __post_init__(self) -> None:
-        """Checks the seed."""
+        """Checks the seed, and the names of the overrides."""
+        _convert_fields(self)
         if not 0 <= self.seed < _SEEDS:
             raise ValueError(f"seed is {self.seed}. Give 0 to {_SEEDS - 1}.")
+        if unknown := sorted(set(self.chosen or ()) - set(_by_name())):
+            raise ValueError(
+                f"chosen names {unknown[0]!r}, but there is no such option. Remove it there."
+            )
 
     def override(self, **given: Any) -> "TrainConfig":
         """Returns this configuration with overrides, by the names of their options.
@@ -345,10 +387,9 @@ class TrainConfig:
         Raises:
           ValueError: if there is no such option, or a value is out of range.
         """
-        given, options = _converted(given), _by_name()
+        given, options, removed = _converted(given), _by_name(), _nothing(given)
         usual = {name: options[name].field.default for name in self.followers(**given).decided}
-        asked = {name for name, value in given.items() if value not in (None, "", ())}
-        wishes = (self.wishes() - set(given)) | asked
+        wishes = (self.wishes() | set(given)) - removed
         chosen = tuple(name for name in options if name in wishes)
         return dataclasses.replace(self.decided(**usual, **given), chosen=chosen)
 
@@ -426,7 +467,7 @@ def settled(value: _Value | None) -> _Value:
 def type_of(option: Option) -> Any:
     """Returns the annotation of an option's field."""
     owner = type(getattr(TrainConfig(), option.section)) if option.section else TrainConfig
-    return typing.get_type_hints(owner)[option.field.name]
+    return _hints(owner)[option.field.name]
 
 
 def _converted(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -449,13 +490,10 @@ def _converted(given: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
-    """Returns a value as JSON represents it."""
-    if isinstance(value, Mapping):
-        return [[name, _plain(each)] for name, each in sorted(value.items())]
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    return str(value) if isinstance(value, PurePath) else value
+def _nothing(given: Mapping[str, Any]) -> set[str]:
+    """Returns the names of values that remove an override: `None`, and empty ones."""
+    empty = {name for name, value in _converted(given).items() if value in ("", ())}
+    return empty | {name for name, value in given.items() if value is None}
 
 
 def _by_name() -> dict[str, Option]:

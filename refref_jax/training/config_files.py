@@ -66,7 +66,7 @@ def read_to_begin(path: Path) -> TrainConfig:
 def of_an_earlier_version(path: Path) -> dict[str, Any] | None:
     """Returns the content of a configuration of an earlier version; `None` for any other file."""
     try:
-        content = configuration.parse_json(path.read_text(encoding="utf-8"))
+        content = configuration.parse_json(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError):
         return None  # `configuration.read` raises the error
     is_earlier = isinstance(content, dict) and set(content) >= _KEYS_BEFORE

@@ -4,7 +4,8 @@
     model = fit(config, out="runs/fifty")
 
 `fit` consists of three functions that can also be called separately: `prepare` resolves a
-configuration, `begin` creates the run folder, and `train` takes the remaining steps.
+configuration, `begin` creates the run folder, and `train` takes the remaining steps. Their
+one order is that of `train_into`, which the command calls as well.
 """
 
 import contextlib
@@ -64,8 +65,10 @@ def fit(
     *,
     out: str | Path | None = None,
     existing: Existing = "refuse",
+    parts: Sequence[MeshPart] | None = None,
     progress: Progress = lambda step, total, text: None,
     report: Callable[[str], None] = print,
+    stop: Callable[[], bool] = lambda: False,
     periods: Periods = USUAL,
     mesh: Mesh | None = None,
 ) -> Model:
@@ -79,33 +82,86 @@ def fit(
         resume a run with its own configuration.
       out: folder of the run, which must not contain a run yet; a temporary one if `None`.
       existing: `refuse` or `resume` a run that is in `out` already.
+      parts: objects that take the place of the scene's own meshes.
       progress: function called every `periods.log` steps.
       report: function that receives decisions and warnings, as lines of text.
+      stop: is asked between steps whether to save a checkpoint, and return the model as it is.
       periods: periods of metrics and checkpoints.
       mesh: devices that train together; `None` for a single device.
 
     Raises:
       ValueError: if the configuration, the scene or the folder is not suitable for training.
+      KeyboardInterrupt: if it was to stop before it took a step.
     """
     with contextlib.ExitStack() as stack:
         if out is None:
             out = stack.enter_context(tempfile.TemporaryDirectory(prefix="refref_jax_"))
-        run = Path(out)
-        resuming = existing == "resume" and run_folder.exists(run)
-        if config is None and not resuming:
-            raise ValueError(
-                f"Without a configuration a run is resumed, but {run} holds none, or existing is "
-                "not 'resume'. Give a configuration, or existing='resume' and the folder of a run."
-            )
-        if not resuming:
-            run_folder.check_free(run)
-        if config is not None:
-            resolved, scene = prepare(config)
-            report(resolved.describe())
-            open_ = run_folder.check_unchanged if resuming else begin
-            open_(run, resolved.config, resolved.model, scene)
-        train(run, progress=progress, report=report, periods=periods, mesh=mesh)
-        return checkpoint_io.load_model(run)
+        train_into(
+            Path(out),
+            config,
+            existing=existing,
+            parts=parts,
+            progress=progress,
+            report=report,
+            stop=stop,
+            periods=periods,
+            mesh=mesh,
+        )
+        return checkpoint_io.load_model(out)
+
+
+def train_into(
+    run: Path,
+    config: TrainConfig | None,
+    *,
+    existing: Existing = "refuse",
+    parts: Sequence[MeshPart] | None = None,
+    ready: Callable[[], None] = lambda: None,
+    report: Callable[[str], None] = print,
+    **options: Any,
+) -> bool:
+    """Does what `fit` does, which explains the arguments, and leaves the model in the folder.
+
+    Args:
+      run: the folder.
+      config: configuration of the run.
+      existing: whether a run that is there is refused, or resumed.
+      parts: objects that take the place of the scene's own meshes.
+      ready: is called when all is decided, before the folder is opened.
+      report: is given what was decided, and warnings.
+      **options: of `train`.
+
+    Returns:
+      Whether it has reached its last step.
+    """
+    resuming = is_resumed(run, existing)
+    if config is None and not resuming:
+        raise ValueError(
+            f"Without a configuration a run is resumed, but {run} holds none, or existing is "
+            "not 'resume'. Give a configuration, or existing='resume' and the folder of a run."
+        )
+    if config is None:
+        ready()
+        return train(run, report=report, **options)
+    resolved, geometry = prepare(config, parts=parts, report=report)
+    report(resolved.describe())
+    ready()
+    open_ = run_folder.check_unchanged if resuming else begin
+    open_(run, resolved.config, resolved.model, geometry)
+    # Not what the folder says: a scene may have moved.
+    return train(run, scene=resolved.config.scene.path, report=report, **options)
+
+
+def is_resumed(run: Path, existing: Existing) -> bool:
+    """Returns whether training goes on with a run that is there.
+
+    Raises:
+      ValueError: if it does not, and no run can be begun there.
+    """
+    if existing == "resume" and run_folder.exists(run):
+        return True
+    run_folder.check_free(run)
+    return False
 
 
 def prepare(
@@ -129,7 +185,7 @@ def prepare(
     if config.scene.reconstruction and parts is None:
         raise ValueError(
             f"The object of this configuration was reconstructed ({config.scene.reconstruction}), "
-            "which fit does not read. Call prepare with its mesh as parts, then begin and train."
+            "which fit does not read. Give its mesh as parts."
         )
     config = config.at(str(scene_source.open_scene(config.scene.path).resolve()))
     facts = read_facts(config.scene, parts=parts)

@@ -139,16 +139,13 @@ def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
 def loss(model: ModelConfig) -> LossConfig:
     """Returns the training loss of a model, which is the same for all presets.
 
-    The interlevel loss and its blurs are those of Zip-NeRF for every field type.
+    What does not depend on the model is as `LossConfig` has it by default. The interlevel loss and
+    its blurs are those of Zip-NeRF for every field type.
     """
     finest = len(_BLURS) - 1
     return LossConfig(
-        data="mse",
-        interlevel=0.01,
         blurs=tuple(_BLURS[min(i, finest)] for i in range(len(model.proposals))),
-        distortion=0.01,
         hash_decay=registry.KINDS[model.field.kind].hash_decay,
-        dye_decay=1e-3,
     )
 
 

@@ -51,8 +51,8 @@ def test_before_its_first_step_a_training_ends_with_nothing_saved(tmp_path, monk
     )
     for module, name in (
         (fit.run_folder, "read_config"),
-        (fit.saved, "read_static"),
-        (fit.saved, "load_geometry"),
+        (fit.checkpoint_io, "read_static"),
+        (fit.checkpoint_io, "load_geometry"),
         (fit.scene_source, "open_scene"),
         (fit, "_sampler"),
         (fit, "init_state"),

@@ -45,7 +45,7 @@ _IN_THE_WAY = {
 
 _OF_THE_SCENE = {
     "--cut=1": "--cut=1.0: The throughput threshold cut is 1.0",
-    "--bends=-1": "cannot have -1 bends. Give 0 or more.",
+    "--bends=-1": "cannot is -1, which is negative. Give 0 or more.",
     "--samples=4,0": "--samples=4,0: samples is 4,0, not a list of positive numbers. Use a list",
     "--samples=a": "is not a list of numbers. Write as in --samples=32,20.",
     "--blurs=x": "--blurs=x is not a list of numbers. Write as in --blurs=0.03,0.003.",
@@ -84,6 +84,8 @@ _MISTAKES = {
         "--out=OUT": "Add --scene=FOLDER, or --resume",
         "--out=OUT --scene=": "--scene is empty. Give a folder, or hf:CONFIG/SCENE",
         "--out=OUT --config=nowhere.json": "nowhere.json is not a file.",
+        "--out=/dev/null/x --scene=SCENE": "--out=/dev/null/x can not be written to (Not a dir",
+        "--out=OUT --config=": "--config is empty. Give a file",
         "--out=OUT --config=BARE": "which does not exist. Set --reconstruction to",
         **{f"--out=OUT --config=CONFIG {x}": told for x, told in _ON_TOP_OF_R3F.items()},
         **{f"--out=OUT --scene=SCENE {words}": told for words, told in _OF_THE_SCENE.items()},
@@ -121,6 +123,7 @@ _MISTAKES = {
         "--run=nowhere --what=body --out=OUT.ply": "nowhere/config.json does not exist",
     },
     "reconstruct": {
+        "--out=/dev/null/x --scene=SCENE": "--out=/dev/null/x can not be written to (Not a dir",
         "--out=OUT --scene=x --ior=0.5": "--ior=0.5 is not an index",
         "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
     },
@@ -138,7 +141,10 @@ _MISTAKES = {
     },
     "dataset.convert": {"--scene=nowhere --to=raw --out=OUT": "nowhere is not a folder."},
     "dataset.make": {"--out=OUT --scenes=cube_smcvx_bal": "Did you mean cube_smcvx_ball"},
-    "dataset.check": {"x --cut=2": "Give 0.02 for 2 %", "nowhere": "nowhere is not a folder."},
+    "dataset.check": {
+        "x --cut=2": "Give 0.02 for 2 %",
+        "nowhere": "nowhere is not a folder.",
+    },
     "convert_nerfstudio": {
         "--source=x --out=OUT --scale=-1": "Give a positive number",
         "--source=nowhere --out=OUT": "nowhere is not a folder.",

@@ -32,6 +32,18 @@ def _files(folder):
     return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
 
 
+def test_a_folder_is_tried_before_and_nothing_is_left_of_it(tmp_path, monkeypatch):
+    outputs.check_folder(tmp_path / "a" / "b")
+    outputs.check_folder(tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match=r"--out=.*file/x can not be written to .Not a directory"):
+        outputs.check_folder(tmp_path / "file" / "x")
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(ValueError, match=r"--out=.* can not be written to .Permission denied"):
+        outputs.check_folder(tmp_path)
+    assert _files(tmp_path) == {"file"} and len(list(tmp_path.iterdir())) == 1
+
+
 def test_what_is_written_appears_with_a_note(tmp_path):
     out = tmp_path / "a" / "out"
     _write(out, ["rgb/0.png", "metrics.json"], overwrite=False)

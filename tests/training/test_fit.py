@@ -2,12 +2,14 @@
 
 import ast
 import re
+import shutil
 
 import imageio.v3 as iio
 import jax
 import numpy as np
 import pytest
 
+from refref_jax.data import meshes
 from refref_jax.render import checkpoint_io
 from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig
@@ -94,3 +96,44 @@ def test_fit_refuses_what_names_no_run(tmp_path):
     with pytest.raises(ValueError, match="was reconstructed"):
         fit.fit(TrainConfig().override(scene="x", reconstruction="y"), out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_run_is_resumed_with_its_scene_where_it_is_now_and_all_is_reported(
+    tmp_path, monkeypatch, capsys
+):
+    scenes = []
+
+    def train(run, *, scene, **options):
+        scenes.append(scene)
+        return True
+
+    monkeypatch.setattr(fit, "train", train)
+    before, now = tmp_path / "before", tmp_path / "now"
+    shutil.copytree(ROOT / "experiments" / "data" / "cube_smcvx_ball", before)
+    lines = []
+    config = TrainConfig().override(scene=before, steps=3)
+    fit.train_into(tmp_path / "run", config, report=lines.append)
+    before.rename(now)
+    moved = config.override(scene=now)
+    fit.train_into(tmp_path / "run", moved, existing="resume", report=lines.append)
+    assert scenes == [str(before), str(now)]
+    assert sum(line.startswith("this scene needs: ") for line in lines) == 2
+    assert capsys.readouterr().out == ""
+
+
+def test_fit_takes_objects_in_place_of_the_meshes_and_stops_when_it_is_asked_to(tmp_path):
+    scene = ROOT / "experiments" / "data" / "cube_smcvx_ball"
+    (part,) = meshes.read_meshes(scene)
+    config = TrainConfig().override(scene=scene, steps=30, batch=64, pool=4)
+    asked, lines = [], []
+
+    def stop():
+        asked.append(True)
+        return len(asked) > 1
+
+    part = part._replace(index=1.25)
+    out = {"out": tmp_path / "run", "report": lines.append}
+    model = fit.fit(config, **out, parts=[part], stop=stop)
+    assert model.geometry.interfaces.index_inside.tolist() == [1.25]
+    assert 0 < checkpoint_io.latest_step(tmp_path / "run") < 30
+    assert lines[-1].startswith("Stopped at step ")

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ from refref_jax.render import checkpoint_io
 from refref_jax.training import config_files, run_folder
 from refref_jax.training.config import (
     FieldConfig,
+    LossConfig,
     PathsConfig,
     SceneConfig,
     TrainConfig,
@@ -245,6 +248,79 @@ def test_what_was_asked_for_stays_and_what_was_decided_is_decided_again():
     # Another object is no wish, and has another index of refraction.
     part = config.decided(reconstruction="r3f", ior={"ball": 1.5})
     assert part.chosen == config.chosen and part.override(reconstruction="x").scene.indices == ()
+
+
+def test_a_wish_that_is_taken_back_is_none():
+    config = TrainConfig().override(preset="small", ior={"glass": 1.4}, seed=3)
+    assert config.chosen == ("ior", "preset", "seed")
+    taken = config.override(preset=None, ior={}, seed=None)
+    assert taken.chosen == () and taken == TrainConfig()
+    assert TrainConfig().override(preset="tiny").chosen == ("preset",)
+
+
+def test_numbers_of_numpy_are_numbers():
+    given = {"min_throughput": np.float64(0.25), "steps": np.int64(7), "samples": np.array([3, 4]).tolist()}
+    config = TrainConfig().override(**given, radius=np.float32(2.5), blurs=[np.float64(0.5)])
+    assert (config.paths.min_throughput, config.schedule.steps, config.scene.radius) == (0.25, 7, 2.5)
+    for value in (config.paths.min_throughput, config.scene.radius, *config.losses.blurs):
+        assert type(value) is float
+    assert type(config.schedule.steps) is int
+    for wrong in ({"steps": True}, {"steps": np.float64(7.0)}, {"min_throughput": np.bool_(True)}):
+        with pytest.raises(ValueError, match="not of type"):
+            TrainConfig().override(**wrong)
+
+
+_MADE = """
+from pathlib import Path
+import numpy as np
+from refref_jax.training.config import *
+def refused(kind, **given):
+    try:
+        print(kind(**given))
+    except ValueError as error:
+        print(error)
+refused(PathsConfig, name="trea")
+refused(PathsConfig, min_throughput="x")
+refused(ScheduleConfig, steps="x")
+refused(SceneConfig, path=3)
+refused(LossConfig, distortion_over="inside")
+refused(FieldConfig, samples=[3, "4"])
+refused(FieldConfig, preset=None)
+refused(TrainConfig, paths={"min_throughput": 0.1})
+refused(TrainConfig, seed=1.5)
+refused(TrainConfig, chosen=("cot",))
+print(FieldConfig(samples=[3, 4]).samples)
+print(SceneConfig(Path("a"), indices={"glass": 2}).indices)
+print(type(PathsConfig(min_throughput=np.float64(0.5)).min_throughput))
+"""
+
+
+def test_records_are_checked_in_full_when_they_are_made():
+    # In a process of its own: the tests' own would refuse wrong types before the records do.
+    command = [sys.executable, "-c", _MADE]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    expected = [
+        "paths is 'trea', not one of",
+        "min_throughput is 'x', not of type float",
+        "steps is 'x', not of type int",
+        "scene is 3, not of type str",
+        "distortion is 'inside', not one of",
+        "samples[1] is '4', not of type int",
+        "preset is None, not one of",
+        "paths is {'min_throughput': 0.1}, not of type PathsConfig",
+        "seed is 1.5, not of type int",
+        "chosen names 'cot'",
+        "(3, 4)",
+        "(('glass', 2.0),)",
+        "<class 'float'>",
+    ]
+    for told, meant in zip(done.stdout.splitlines(), expected, strict=True):
+        assert meant in told, done.stderr
+
+
+def test_losses_have_one_place_for_what_is_usual():
+    made = _resolve(_CLEAR).config.losses
+    assert dataclasses.replace(made, blurs=None, hash_decay=None) == LossConfig()
 
 
 def test_wishes_of_a_file_that_does_not_tell_them():

@@ -58,7 +58,9 @@ def _on_top(runs, moved, scene, r3f):
     sent = {name: (f"--out={runs / name}", file, *words) for name, words in on_top.items()}
     run = f"--out={moved / 'run'}"
     gone = f"--config={moved / 'gone' / 'run' / 'config.json'}"
+    index = f"--config={runs / 'file with index' / 'config.json'}"
     return sent | {
+        "file with index taken back": (f"--out={runs / 'taken back'}", index, "--ior=auto"),
         "file anew, resumed": (
             f"--out={runs / 'file anew'}",
             file,
@@ -158,6 +160,7 @@ def test_the_broken_mesh_stops_the_oracle_alone(found):
         ("other index", 1.7),
         ("file", 1.5),
         ("file with index", 1.7),
+        ("file with index taken back", 1.5),
         ("file anew", 1.5),
         ("file anew, resumed", 1.5),
         ("moved, resumed", 1.5),
