@@ -10,12 +10,13 @@ is annotated with a base class, the key `kind` of its value selects the variant 
 import dataclasses
 import json
 import math
+import numbers
 import os
 import sys
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 from refref_jax import atomic_files
@@ -120,6 +121,43 @@ def convert(value: Any, kind: Any, *, name: str) -> Any:
     return _build(kind, value, name, {})
 
 
+def convert_fields(record: Any) -> None:
+    """Converts the values of a new dataclass to the annotations of its fields, in place.
+
+    Raises:
+      ValueError: if a value has another type; the message names the field, or the `name` in its
+        metadata.
+    """
+    hints = hints_of(type(record))
+    for field in dataclasses.fields(record):
+        value, kind = getattr(record, field.name), hints[field.name]
+        name = field.metadata.get("name") or field.name
+        if not isinstance(kind, type) or not dataclasses.is_dataclass(kind):
+            object.__setattr__(record, field.name, convert(plain(value), kind, name=name))
+        elif not isinstance(value, kind):
+            raise ValueError(f"{name} is {value!r}, not of type {kind.__name__}.")
+
+
+def hints_of(owner: Any) -> dict[str, Any]:
+    """Returns the annotations of a class by field."""
+    return typing.get_type_hints(owner)
+
+
+def plain(value: Any) -> Any:
+    """Returns a value as JSON represents it; NumPy's numbers become Python's."""
+    if isinstance(value, Mapping):
+        return [[name, plain(each)] for name, each in sorted(value.items())]
+    if isinstance(value, list | tuple):
+        return [plain(each) for each in value]
+    if isinstance(value, bool):
+        return value
+    if isinstance(value, numbers.Integral):
+        return int(value)
+    if isinstance(value, numbers.Real):
+        return float(value)
+    return str(value) if isinstance(value, PurePath) else value
+
+
 def _build(kind: Any, value: Any, where: str, variants: Variants) -> Any:
     """Converts parsed JSON to an annotated type."""
     if dataclasses.is_dataclass(kind):
@@ -150,7 +188,7 @@ def _build(kind: Any, value: Any, where: str, variants: Variants) -> Any:
 
 
 def _check_text(value: str, where: str) -> None:
-    """Refuses text that can not be part of a path."""
+    """Refuses text that cannot be part of a path."""
     try:
         os.fsencode(value)
         possible = "\0" not in value

@@ -11,7 +11,7 @@ from refref_jax.data import background, meshes, scene_folder
 from refref_jax.render import checkpoint_io
 from refref_jax.training import config_files, run_folder
 from refref_jax.training.config import TrainConfig
-from tests.small_model import SAVED
+from tests.factories.small_model import SAVED
 
 _TEXTS = {
     "nested": b"[" * 200_000,
@@ -70,12 +70,12 @@ def test_a_scene_json_is_read_or_refused_in_one_line(ball_scene, tmp_path, read,
 _LARGE = 10**400
 
 _VALUES = {
-    "cut": ({"paths": {"cut": _LARGE}}, "TrainConfig.paths.cut is too large"),
+    "cut": ({"paths": {"cut": _LARGE}}, "TrainConfig.paths.min_throughput is too large"),
     "seed": ({"seed": -_LARGE}, "TrainConfig.seed is too large"),
     "samples": ({"model": {"samples": [_LARGE]}}, "TrainConfig.model.samples[0] is too large"),
     "end of text": ({"scene": {"path": "a\0b"}}, "TrainConfig.scene.path is 'a\\x00b', "),
     "half a character": ({"scene": {"path": "\ud800x"}}, "scene.path is '\\ud800x', "),
-    "unknown wish": ({"chosen": ["cut", "cot"]}, "chosen names 'cot'"),
+    "unknown wish": ({"chosen": ["seed", "cot"]}, "chosen names 'cot'"),
 }
 
 
@@ -92,12 +92,14 @@ def test_a_value_that_nothing_can_hold_is_refused_with_its_file_and_key(tmp_path
 def test_a_number_that_is_too_large_is_refused_in_a_model_and_in_python(tmp_path):
     checkpoint_io.write_static(tmp_path, SAVED)
     content = json.loads((tmp_path / "model.json").read_text())
-    content["budget"]["cut"] = _LARGE
+    content["settings"]["min_throughput"] = _LARGE
     (tmp_path / "model.json").write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"model\.json .*SavedModel\.budget\.cut is too large"):
+    with pytest.raises(
+        ValueError, match=r"model\.json .*SavedModel\.settings\.min_throughput is too large"
+    ):
         checkpoint_io.read_static(tmp_path)
-    with pytest.raises(ValueError, match="cut is too large"):
-        TrainConfig().override(cut=_LARGE)
+    with pytest.raises(ValueError, match="min_throughput is too large"):
+        TrainConfig().override(min_throughput=_LARGE)
 
 
 def test_a_byte_order_mark_is_no_mistake(tmp_path):

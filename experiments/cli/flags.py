@@ -144,18 +144,11 @@ class PathFlags(NamedTuple):
 
 
 def settings(*, min_throughput: float | None = None, max_bends: int | None = None) -> PathFlags:
-    """Defines `--min_throughput` and `--max_bends`, by default those of the path preset.
-
-    Their former names `--cut` and `--bends` are aliases.
-    """
-    what = ("Throughput threshold of paths, in [0, 1)", "Maximum number of bends of a path")
+    """Defines `--min_throughput` and `--max_bends`, formerly `--cut` and `--bends`."""
+    least, usual = "Throughput threshold of paths, in [0, 1)", "that of the path preset by default."
     found = PathFlags(
-        flags.DEFINE_float(
-            "min_throughput", min_throughput, f"{what[0]}; that of the path preset by default."
-        ),
-        flags.DEFINE_integer(
-            "max_bends", max_bends, f"{what[1]}; that of the path preset by default."
-        ),
+        flags.DEFINE_float("min_throughput", min_throughput, f"{least}; {usual}"),
+        flags.DEFINE_integer("max_bends", max_bends, f"Maximum bends of a path; {usual}"),
     )
     app.check(found.min_throughput, lambda x: make_path_settings("tree", min_throughput=x))
     app.check(found.max_bends, lambda n: make_path_settings("tree", max_bends=n))

@@ -73,7 +73,7 @@ def check_file(path: Path, *, overwrite: bool) -> None:
 
 
 def check_folder(out: Path) -> None:
-    """Refuses, by a `ValueError`, a folder that can not be written to; leaves none that was not."""
+    """Refuses, by a `ValueError`, a folder that cannot be written to; leaves none that was not."""
     if out.exists() and not out.is_dir():
         return  # who writes there says what it is
     missing = [each for each in (out, *out.parents) if not each.exists()]
@@ -83,7 +83,7 @@ def check_folder(out: Path) -> None:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except OSError as error:
         raise ValueError(
-            f"--out={out} can not be written to ({error.strerror}). Give another folder."
+            f"--out={out} cannot be written to ({error.strerror}). Give another folder."
         ) from error
     finally:
         for each in missing:

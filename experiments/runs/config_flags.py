@@ -65,10 +65,10 @@ def define_flags() -> dict[str, flags.FlagHolder]:
         "Configuration file, such as a run's config.json; other flags override it, and "
         "--NAME=auto resets an option.",
     )
-    options = training_config.options_of()
+    options = list(training_config.options_of())
     holders = {option.name: _define(option) for option in options}
     for option in options:
-        if former := option.field.metadata[configuration.FORMERLY]:
+        if former := option.field.metadata.get(configuration.FORMERLY):
             flags.DEFINE_alias(former, option.name)
     return holders
 

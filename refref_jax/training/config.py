@@ -12,12 +12,8 @@ This module imports neither JAX nor the library's numerics.
 """
 
 import dataclasses
-import functools
 import math
-import numbers
-import typing
 from collections.abc import Iterator, Mapping
-from pathlib import PurePath
 from typing import Any, NamedTuple, TypeVar
 
 from refref_jax import configuration
@@ -71,39 +67,6 @@ def _option(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def _convert_fields(record: Any) -> None:
-    """Converts the values of a new record as `TrainConfig.override` does; see `_converted`."""
-    hints = _hints(type(record))
-    for field in dataclasses.fields(record):
-        value, kind = getattr(record, field.name), hints[field.name]
-        name = field.metadata.get("name") or field.name
-        if not dataclasses.is_dataclass(kind):
-            value = configuration.convert(_plain(value), kind, name=name)
-            object.__setattr__(record, field.name, value)
-        elif not isinstance(value, kind):
-            raise ValueError(f"{name} is {value!r}, not of type {kind.__name__}.")
-
-
-@functools.cache
-def _hints(owner: Any) -> dict[str, Any]:
-    return typing.get_type_hints(owner)
-
-
-def _plain(value: Any) -> Any:
-    """Returns a value as JSON represents it; NumPy's numbers become Python's."""
-    if isinstance(value, Mapping):
-        return [[name, _plain(each)] for name, each in sorted(value.items())]
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    if isinstance(value, bool):
-        return value
-    if isinstance(value, numbers.Integral):
-        return int(value)
-    if isinstance(value, numbers.Real):
-        return float(value)
-    return str(value) if isinstance(value, PurePath) else value
-
-
 @dataclasses.dataclass(frozen=True)
 class SceneConfig:
     """The training scene.
@@ -134,7 +97,7 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        _convert_fields(self)
+        configuration.convert_fields(self)
         if self.radius is not None and not 0.0 < self.radius < math.inf:
             raise ValueError(
                 f"radius is {self.radius}, but it is a length. Give a positive, finite number of "
@@ -172,7 +135,7 @@ class PathsConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        _convert_fields(self)
+        configuration.convert_fields(self)
         if self.min_throughput is not None:
             check_min_throughput(self.min_throughput)
         if self.max_bends is not None:
@@ -217,7 +180,7 @@ class FieldConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        _convert_fields(self)
+        configuration.convert_fields(self)
         if self.samples is not None and not (self.samples and min(self.samples) > 0):
             raise ValueError(
                 f"samples is {','.join(map(str, self.samples))}, not a list of positive numbers. "
@@ -264,7 +227,7 @@ class LossConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        _convert_fields(self)
+        configuration.convert_fields(self)
         weights = (self.interlevel, self.distortion, self.hash_decay, self.dye_decay)
         for number in (*weights, *(self.blurs or ())):
             if number is not None and not 0.0 <= number < math.inf:
@@ -298,7 +261,7 @@ class ScheduleConfig:
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        _convert_fields(self)
+        configuration.convert_fields(self)
         for name, least in [("steps", 1), ("batch", 1), ("pool", 1), ("warmup", 0), ("anneal", 0)]:
             number = getattr(self, name)
             if number is not None and not least <= number <= _MOST:
@@ -366,7 +329,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Checks the seed, and the names of the overrides."""
-        _convert_fields(self)
+        configuration.convert_fields(self)
         if not 0 <= self.seed < _SEEDS:
             raise ValueError(f"seed is {self.seed}. Give 0 to {_SEEDS - 1}.")
         if unknown := sorted(set(self.chosen or ()) - set(_by_name())):
@@ -467,7 +430,7 @@ def settled(value: _Value | None) -> _Value:
 def type_of(option: Option) -> Any:
     """Returns the annotation of an option's field."""
     owner = type(getattr(TrainConfig(), option.section)) if option.section else TrainConfig
-    return _hints(owner)[option.field.name]
+    return configuration.hints_of(owner)[option.field.name]
 
 
 def _converted(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -485,7 +448,7 @@ def _converted(given: Mapping[str, Any]) -> dict[str, Any]:
     return {
         name: usual[name]
         if value is None
-        else configuration.convert(_plain(value), type_of(options[name]), name=name)
+        else configuration.convert(configuration.plain(value), type_of(options[name]), name=name)
         for name, value in given.items()
     }
 

@@ -153,7 +153,7 @@ def train_into(
 
 
 def is_resumed(run: Path, existing: Existing) -> bool:
-    """Returns whether training goes on with a run that is there.
+    """Returns whether an existing run is resumed.
 
     Raises:
       ValueError: if it does not, and no run can be begun there.

@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 from refref_jax.training.config import TrainConfig
-from tests.experiments.command import ROOT
+from tests.processes.command import ROOT
 
 _PROGRAM = """
 import json, sys

@@ -44,8 +44,8 @@ _IN_THE_WAY = {
 }
 
 _OF_THE_SCENE = {
-    "--cut=1": "--cut=1.0: The throughput threshold cut is 1.0",
-    "--bends=-1": "cannot is -1, which is negative. Give 0 or more.",
+    "--cut=1": "min_throughput=1.0: min_throughput is 1.0",
+    "--bends=-1": "max_bends is -1, which is negative. Give 0 or more.",
     "--samples=4,0": "--samples=4,0: samples is 4,0, not a list of positive numbers. Use a list",
     "--samples=a": "is not a list of numbers. Write as in --samples=32,20.",
     "--blurs=x": "--blurs=x is not a list of numbers. Write as in --blurs=0.03,0.003.",

@@ -8,8 +8,8 @@ import pytest
 
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE
 from refref_jax.render import Model, init_params, render_ray, render_rays
-from tests import scenes
-from tests.small_model import MODEL
+from tests.factories import scenes
+from tests.factories.small_model import MODEL
 
 _CLEAR = dataclasses.replace(MODEL, interior="clear", footprint="differential", multisamples=6)
 _TINTED = dataclasses.replace(MODEL, interior="absorbing", learned_tints=2)

@@ -259,9 +259,13 @@ def test_a_wish_that_is_taken_back_is_none():
 
 
 def test_numbers_of_numpy_are_numbers():
-    given = {"min_throughput": np.float64(0.25), "steps": np.int64(7), "samples": np.array([3, 4]).tolist()}
+    given = {"min_throughput": np.float64(0.25), "steps": np.int64(7), "samples": [3, np.int32(4)]}
     config = TrainConfig().override(**given, radius=np.float32(2.5), blurs=[np.float64(0.5)])
-    assert (config.paths.min_throughput, config.schedule.steps, config.scene.radius) == (0.25, 7, 2.5)
+    assert (config.paths.min_throughput, config.schedule.steps, config.scene.radius) == (
+        0.25,
+        7,
+        2.5,
+    )
     for value in (config.paths.min_throughput, config.scene.radius, *config.losses.blurs):
         assert type(value) is float
     assert type(config.schedule.steps) is int
