@@ -53,7 +53,7 @@ def test_the_main_path_through_a_ball_obeys_snell():
     spheres = [reference.Sphere(1.0, 1.5, 1.0)]
     for i, end in enumerate(order):
         path = reference.trace_concentric_spheres(spheres, origins[i], directions[i], 10)
-        assert len(path) == ends.bends[end] == 2
+        assert len(path) == ends.num_bends[end] == 2
         np.testing.assert_allclose(ends.origins[end], path[-1].point, atol=4e-3)
         np.testing.assert_allclose(ends.directions[end], path[-1].direction, atol=4e-3)
 
@@ -64,8 +64,8 @@ def test_clear_glass_loses_no_light(rule):
     origins, directions = _rays(500)
     ends = reference_tree.trace(surfaces, Embree(surfaces), origins, directions, rule)
     np.testing.assert_allclose(_shares(ends, 500), 1.0, rtol=1e-12)
-    assert ends.bends.max() <= rule.bends
-    assert np.all(ends.bends[ends.statuses == OUT_OF_BENDS] == rule.bends)
+    assert ends.num_bends.max() <= rule.bends
+    assert np.all(ends.num_bends[ends.statuses == OUT_OF_BENDS] == rule.bends)
 
 
 def test_embree_and_brute_force_find_the_same_paths():

@@ -36,7 +36,7 @@ class Live(NamedTuple):
     leaving: np.ndarray
     rays: np.ndarray
     weights: np.ndarray
-    bends: np.ndarray
+    num_bends: np.ndarray
 
 
 class Ends(NamedTuple):
@@ -46,7 +46,7 @@ class Ends(NamedTuple):
     directions: np.ndarray
     rays: np.ndarray
     weights: np.ndarray
-    bends: np.ndarray
+    num_bends: np.ndarray
     statuses: np.ndarray
     casts: int
 
@@ -87,13 +87,13 @@ def trace(
         hits = cast(live.origins, live.directions, live.leaving)
         casts += len(live.rays)
         met = hits.triangles >= 0
-        over = ~met | (live.bends >= rule.bends)
+        over = ~met | (live.num_bends >= rule.bends)
         ends.append((_take(live, over), np.where(met, OUT_OF_BENDS, ESCAPED)[over]))
         live, hits = _take(live, ~over), Hits(*(x[~over] for x in hits))
         split = meet(surfaces, live.directions, hits)
         reflected, refracted = _children(surfaces, live, hits.triangles, split, rule)
         if rule.reflections == "first":
-            first = (live.bends == 0) & (split.reflectance < 1.0)
+            first = (live.num_bends == 0) & (split.reflectance < 1.0)
             ends.append((_take(reflected, first), np.full(np.sum(first), NOT_TRACED)))
             reflected = _take(reflected, ~first)
         live = Live(*(np.concatenate(pair) for pair in zip(reflected, refracted, strict=True)))
@@ -113,7 +113,7 @@ def _join(ends: list[tuple[Live, np.ndarray]], casts: int) -> Ends:
         joined.directions,
         joined.rays,
         joined.weights,
-        joined.bends,
+        joined.num_bends,
         np.concatenate(statuses),
         casts,
     )
@@ -126,14 +126,14 @@ def _children(
     tinted = live.weights * surfaces.tints[surfaces.parts[triangles]]
     followed = {
         "none": np.zeros(len(live.rays)),
-        "first": np.where(live.bends == 0, split.reflectance, 0.0),
+        "first": np.where(live.num_bends == 0, split.reflectance, 0.0),
         "all": conserving_share(tinted.max(-1), split.reflectance, rule.cut),
     }
     share = np.where(split.reflectance == 1.0, 1.0, followed[rule.reflections])
     share = share.astype(tinted.dtype)[:, None]
 
     def child(directions: np.ndarray, weights: np.ndarray) -> Live:
-        return Live(split.points, directions, triangles, live.rays, weights, live.bends + 1)
+        return Live(split.points, directions, triangles, live.rays, weights, live.num_bends + 1)
 
     return child(split.reflected, tinted * share), child(split.refracted, tinted * (1.0 - share))
 

@@ -128,7 +128,7 @@ def compare(parts, rays, *, tracer=trace):
     few = len(surfaces.corners) <= 400
     cast = (reference_surfaces.BruteForce if few else reference_surfaces.Embree)(surfaces)
     origins, directions = (np.asarray(x, float) for x in (rays.origins, rays.directions))
-    rule = reference_tree.Rule(MAIN.num_bends, "none")
+    rule = reference_tree.Rule(MAIN.max_bends, "none")
     directions = reference_surfaces.unit(directions)
     true = reference_tree.trace(surfaces, cast, origins, directions, rule)
     true = true._replace(casts=np.zeros(len(true.rays)))

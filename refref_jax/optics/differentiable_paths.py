@@ -104,7 +104,7 @@ def follow_branch(
       >>> import refref_jax
       >>> glass = refref_jax.single_object(trimesh.creation.box(), index=1.5)
       >>> ray = refref_jax.Rays(np.array([-2.0, 0.1, 0.2]), np.array([1.0, 0.0, 0.0]), 1e-3)
-      >>> settings = refref_jax.PathSettings(bends=1, reflections="all")
+      >>> settings = refref_jax.PathSettings(max_bends=1, reflections="all")
       >>> def transmitted(index):
       ...     scene, straight_on = refref_jax.with_index(glass, index), jax.numpy.zeros(1, bool)
       ...     return refref_jax.follow_branch(scene, ray, straight_on, settings=settings).weights[0]
@@ -219,7 +219,7 @@ def follow_main_branches(
       ...     paths = refref_jax.follow_main_branches(
       ...         refref_jax.with_index(glass, index),
       ...         ray,
-      ...         settings=refref_jax.PathSettings(bends=2, reflections="all"),
+      ...         settings=refref_jax.PathSettings(max_bends=2, reflections="all"),
       ...         reflections=1,
       ...     )
       ...     return shade(paths, wall, rays=1)[0]

@@ -132,7 +132,7 @@ def trace(
       >>> glass = refref_jax.single_object(trimesh.creation.box(), index=1.5)
       >>> towards = np.array([[1.0, 0.0, 0.0]])
       >>> rays = refref_jax.Rays(np.array([[-2.0, 0.1, 0.2]]), towards, np.full(1, 1e-3))
-      >>> settings = refref_jax.PathSettings(bends=1, reflections="all")
+      >>> settings = refref_jax.PathSettings(max_bends=1, reflections="all")
       >>> trace = jax.jit(functools.partial(refref_jax.trace, settings=settings))
       >>> paths = trace(glass, rays).paths  # each ray's heaviest path first
       >>> print(np.round(paths.weights[:2, 0], 2), paths.num_bends[:2], paths.tau[0, :2])

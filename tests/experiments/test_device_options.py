@@ -50,7 +50,9 @@ def test_options_that_make_no_sense_are_not_taken(options, message):
 def test_more_devices_than_there_are_are_refused():
     with flagsaver.flagsaver(devices="4096"):
         processes.connect(_DEVICES)
-        with pytest.raises(ValueError, match=r"^There .*, not 4096\. Give 1 to \d+, or all"):
+        with pytest.raises(
+            ValueError, match=r"^There .*, not 4096\. Give 1 to \d+, or None for all"
+        ):
             processes.mesh(_DEVICES)
 
 

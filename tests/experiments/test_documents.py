@@ -94,8 +94,13 @@ def test_formulas_are_such_that_github_draws_them(page):
 def test_every_command_on_a_page_exists(page):
     text = (ROOT / page).read_text()
     modules = set(re.findall(r"python -m ((?:experiments|benchmarks)\.[a-z0-9_.]*[a-z0-9])", text))
-    assert [name for name in modules if not _file_of(name).exists()] == []
+    assert [name for name in modules if not _exists(name)] == []
     assert set(re.findall(r"^make ([a-z-]+)", text, re.MULTILINE)) <= _targets()
+
+
+def _exists(name):
+    module = ROOT / name.replace(".", "/")
+    return module.with_suffix(".py").exists() or (module / "__main__.py").exists()
 
 
 def _links(page):
@@ -129,10 +134,6 @@ def _defined(file):
         elif isinstance(node, ast.Assign):
             names |= {target.id for target in node.targets if isinstance(target, ast.Name)}
     return names
-
-
-def _file_of(module):
-    return ROOT / (module.replace(".", "/") + ".py")
 
 
 def _targets():

@@ -136,7 +136,7 @@ def test_the_curve_has_a_row_for_every_setting(tmp_path):
         ("render_known", "--scene=nowhere", "nowhere/transforms_train.json does not exist"),
         ("render_known", "--rays_per_pixel=5", "square"),
         ("render_known", "--views=0,99", "no view 99"),
-        ("render_known", "--cut=1.5", "cut"),
+        ("render_known", "--cut=1.5", "min_throughput"),
         ("render_known", "--out=README.md/x", "README.md"),
         ("path_trade_off", f"--scenes={_SCENE},nowhere", "nowhere"),
         ("path_trade_off", "--cuts=a", "list of numbers"),

@@ -84,7 +84,7 @@ _MISTAKES = {
         "--out=OUT": "Add --scene=FOLDER, or --resume",
         "--out=OUT --scene=": "--scene is empty. Give a folder, or hf:CONFIG/SCENE",
         "--out=OUT --config=nowhere.json": "nowhere.json is not a file.",
-        "--out=/dev/null/x --scene=SCENE": "--out=/dev/null/x can not be written to (Not a dir",
+        "--out=/dev/null/x --scene=SCENE": "--out=/dev/null/x cannot be written to (Not a dir",
         "--out=OUT --config=": "--config is empty. Give a file",
         "--out=OUT --config=BARE": "which does not exist. Set --reconstruction to",
         **{f"--out=OUT --config=CONFIG {x}": told for x, told in _ON_TOP_OF_R3F.items()},
@@ -123,7 +123,7 @@ _MISTAKES = {
         "--run=nowhere --what=body --out=OUT.ply": "nowhere/config.json does not exist",
     },
     "reconstruct": {
-        "--out=/dev/null/x --scene=SCENE": "--out=/dev/null/x can not be written to (Not a dir",
+        "--out=/dev/null/x --scene=SCENE": "--out=/dev/null/x cannot be written to (Not a dir",
         "--out=OUT --scene=x --ior=0.5": "--ior=0.5 is not an index",
         "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
     },

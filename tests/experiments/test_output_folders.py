@@ -36,10 +36,10 @@ def test_a_folder_is_tried_before_and_nothing_is_left_of_it(tmp_path, monkeypatc
     outputs.check_folder(tmp_path / "a" / "b")
     outputs.check_folder(tmp_path)
     (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match=r"--out=.*file/x can not be written to .Not a directory"):
+    with pytest.raises(ValueError, match=r"--out=.*file/x cannot be written to .Not a directory"):
         outputs.check_folder(tmp_path / "file" / "x")
     monkeypatch.setattr(os, "access", lambda path, mode: False)
-    with pytest.raises(ValueError, match=r"--out=.* can not be written to .Permission denied"):
+    with pytest.raises(ValueError, match=r"--out=.* cannot be written to .Permission denied"):
         outputs.check_folder(tmp_path)
     assert _files(tmp_path) == {"file"} and len(list(tmp_path.iterdir())) == 1
 

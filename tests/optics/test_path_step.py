@@ -100,5 +100,5 @@ def test_a_reflection_that_is_not_followed_leaves_its_share(reflections, first, 
     [(0.25, 1.0, 0.25), (0.25, 0.3, 0.0), (0.75, 1.0, 0.75), (0.75, 0.3, 1.0)],
 )
 def test_below_the_threshold_the_stronger_branch_takes_all(reflectance, strength, expected):
-    found = _shares(reflectance, strength=strength, reflections="all", cut=0.1)
+    found = _shares(reflectance, strength=strength, reflections="all", min_throughput=0.1)
     assert found == [expected, 1.0 - expected]

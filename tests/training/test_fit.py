@@ -65,7 +65,7 @@ def test_the_configuration_of_a_run_repeats_it_bit_for_bit(fifty, tmp_path):
     # Resumed, it is done; with another option it is refused.
     done = fit.fit(config, out=tmp_path / "again", existing="resume", report=messages.append)
     assert "trained already" in messages[-1] and done.settings == model.settings
-    with pytest.raises(ValueError, match=r"other options \(cut\)"):
+    with pytest.raises(ValueError, match=r"other options \(min_throughput\)"):
         fit.fit(config.override(min_throughput=0.05), out=tmp_path / "again", existing="resume")
     with pytest.raises(ValueError, match="contains a run already"):
         fit.fit(config, out=tmp_path / "again")

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, room
+from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, capacities
 from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import load_model
 from refref_jax.render.model import path_detail
@@ -192,7 +192,9 @@ def test_charbonnier_changes_the_loss_only():
 @pytest.mark.slow
 def test_any_budget_can_be_trained_along(settings):
     setup = _setup(settings=settings)
-    assert CONFIG.schedule.batch <= setup.capacity <= room(settings, CONFIG.schedule.batch).paths
+    assert (
+        CONFIG.schedule.batch <= setup.capacity <= capacities(settings, CONFIG.schedule.batch).paths
+    )
     _, reports = _train(setup, _start(), 2)
     assert all(np.isfinite(report.loss) and report.lost < 1e-3 for report in reports)
 

@@ -178,7 +178,7 @@ def test_a_benchmark_grows_but_does_not_change(tmp_path):
         ({"limit": 3}, [], [], "started without --limit"),
         ({"lpips": "abc"}, [], [], "--lpips_weights"),
         ({}, [another], [], "another scene named cube_smcvx_ball"),
-        ({}, [], [changed], "the method tree is --paths=tree, in this version"),
+        ({}, [], [changed], "the method tree is --paths=tree, but in this version"),
     ]:
         asked = settings.asked(dataclasses.replace(SETTINGS, **common), scenes, chosen)
         with pytest.raises(ValueError, match=message):

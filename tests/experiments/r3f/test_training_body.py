@@ -172,7 +172,7 @@ def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
     assert found[name]["indices"] == [["ball_glass", index]]
     assert found[name]["inside"] == pytest.approx([index])
     assert found[name]["faces"] == records.read(made).geometry.faces
-    assert "1 convex body" in found[name]["printed"]
+    assert "1 convex object" in found[name]["printed"]
 
 
 @pytest.mark.parametrize(
@@ -193,7 +193,7 @@ def test_light_is_bent_by_the_reconstructed_body(found, made, name, index):
         ("r3f begun anew", "already contains a run"),
         ("r3f with another grid", "ior 1.5, not 1.6"),
         ("r3f by name alone", "--method would have no effect"),
-        ("r3f with a given one", "begun with other options"),
+        ("r3f with a given one", "created with other options"),
         ("file with named index", "Pass its index once"),
         ("file with oracle", "ball_glass.ply cannot be read"),
         ("file with a grid", "is already reconstructed. Remove it, or add --method=r3f."),
@@ -230,7 +230,7 @@ def test_a_run_and_what_was_reconstructed_for_it_move_together(found, runs, move
     assert "hull of the training masks" not in found["moved, resumed by its file"]["printed"]
     told = found["file anew"]
     assert told["reconstruction"] == str(runs / "file anew" / "r3f")
-    assert "decided again, because of flags that override" in told["printed"]
+    assert "decided again because of flags that override" in told["printed"]
 
 
 @pytest.mark.slow
