@@ -19,7 +19,9 @@ SMALL := runs/benchmark-small
 SMALL_SCENES := cube_smcvx_cylinder,env_smcvx_pyramid,cube_smncvx_torus,sphere_smncvx_teapot
 SMALL_SCENES := $(SMALL_SCENES),sphere_mmncvx_conical_flask,env_mmncvx_perfume_red
 
-PYTEST := $(RUN) pytest --numprocesses=auto --maxprocesses=4 --dist=loadscope --no-loadscope-reorder
+# One process more than there are cores, at most 5: some tests wait for the commands that they start.
+PROCESSES = $(shell $(PYTHON) -c 'import os; print(min(5, 1 + (os.cpu_count() or 1)))')
+PYTEST = $(RUN) pytest --numprocesses=$(PROCESSES) --dist=loadscope --no-loadscope-reorder
 DATASET_TESTS := tests/experiments/dataset
 
 .PHONY: demo test test-dataset test-slow lint format clean notebooks dataset-env benchmark-small

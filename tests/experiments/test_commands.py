@@ -157,6 +157,7 @@ def test_a_loaded_model_compiles_an_image_once(trained):
     assert not any(leaf.committed for leaf in jax.tree.leaves(params))
 
 
+@pytest.mark.slow
 def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
     run_command(
         "render",

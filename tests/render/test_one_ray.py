@@ -25,7 +25,13 @@ _SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", _SCENES)
+# The path tree has the most paths to render one by one, uncompiled.
+_SLOW = "glass ball, path tree"
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == _SLOW)) for name in _SCENES]
+)
 def test_render_ray_equals_render_rays(name):
     config, settings, parts = _SCENES[name]
     model = Model(config, settings, scenes.geometry(*parts), _params(config))

@@ -194,6 +194,7 @@ def test_a_run_s_bodies_are_files_that_are_read_again(tmp_path, monkeypatch):
         object_meshes.write(tmp_path, tmp_path / "none.ply", overwrite=False)
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_bodies_of_a_run(trained, tmp_path):
     options = (f"--run={trained}", "--what=body", f"--out={tmp_path / 'body.ply'}")
     assert "body.ply" in run_command("export", *options).stdout

@@ -57,6 +57,7 @@ def test_a_background_that_was_begun_with_other_walls_is_not_taken(
             learn(space=space, radius=radius)
 
 
+@pytest.mark.slow
 def test_a_background_suits_the_search_for_the_index_and_its_configuration_is_true(
     ball_scene, tmp_path, monkeypatch
 ):
