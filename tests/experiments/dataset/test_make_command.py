@@ -11,7 +11,7 @@ def test_mistakes_end_before_anything_is_made(tmp_path):
     for options, said in [
         (("--blender=nowhere",), "make dataset-env"),
         (("--scenes=cube_smcvx_bal",), "cube_smcvx_ball"),
-        (("--out=",), "flag --out=: Give the place to write to."),
+        (("--out=",), "flag --out=: Give a path to write to."),
     ]:
         result = run_command("dataset.make", f"--out={out}", *options, fails=True)
         assert said in result.stderr and "Traceback" not in result.stderr
