@@ -78,7 +78,8 @@ def main() -> None:
     for key, value in summary["results"].items():
         print(f"{key:>24}  {'-' if value is None else format(value, '.4f')}")
     reporting.warn_of_lost_light(
-        summary["results"]["lost"], advice="Train with a larger --cut or fewer --bends."
+        summary["results"]["lost"],
+        advice="Train with a larger --min_throughput or a smaller --max_bends.",
     )
     print(f"Images:   {out / 'comparison.png'}, {out / 'rgb'}, {out / 'distance'}")
     print(f"Metrics:  {out / 'metrics.json'}")

@@ -72,7 +72,9 @@ def main() -> None:
         pictures = [out / path.name for path in paths.write_figures(draft, trials)]
     print(f"Figures:  {', '.join(map(str, pictures))}")
     print(f"Measures: {out / _TABLE}")
-    print("Next: choose a threshold, and use python -m experiments.render_known --cut=...")
+    print(
+        "Next: choose a threshold, and use python -m experiments.render_known --min_throughput=..."
+    )
 
 
 def _measure(chosen: list[KnownScene], plan: list[Setting]) -> list[Trial]:

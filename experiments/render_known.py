@@ -186,8 +186,8 @@ def _report(summary: dict[str, Any]) -> None:
     else:
         reporting.warn_of_lost_light(
             summary["lost_energy"],
-            advice="Use a larger --cut or fewer --bends, or, as a library, PathSettings with "
-            "larger capacity factors.",
+            advice="Use a larger --min_throughput or a smaller --max_bends, or, as a library, "
+            "PathSettings with larger capacity factors.",
         )
 
 

@@ -149,10 +149,10 @@ def ends_of(paths: LightPaths) -> PathEnds:
 def filled_up(paths: LightPaths, *, multiple: int) -> LightPaths:
     """Returns the paths, padded with empty slots to a multiple of a number."""
     count = paths.radii.shape[0]
-    capacities = -(-count // multiple) * multiple
+    padded = -(-count // multiple) * multiple
     # Empty slots repeat the last path with weight 0, so that their values are finite.
-    paths = jax.tree.map(lambda x: x[jnp.minimum(jnp.arange(capacities), count - 1)], paths)
-    real = jnp.arange(capacities) < count
+    paths = jax.tree.map(lambda x: x[jnp.minimum(jnp.arange(padded), count - 1)], paths)
+    real = jnp.arange(padded) < count
     return paths._replace(
         weights=jnp.where(real[:, None], paths.weights, 0.0),
         statuses=jnp.where(real, paths.statuses, PathStatus.EMPTY),

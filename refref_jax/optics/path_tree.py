@@ -246,22 +246,22 @@ def pack(
     Returns:
       The concatenated lists, and the throughput dropped so far for each ray.
     """
-    capacities = min(batches * capacity, tree.ends.items.rays.shape[0])
-    pool, lost = queues.shed(tree.ends, tree.lost, capacities)
-    ends = listed(tree._replace(ends=pool), capacities)
+    most = min(batches * capacity, tree.ends.items.rays.shape[0])
+    pool, lost = queues.shed(tree.ends, tree.lost, most)
+    ends = listed(tree._replace(ends=pool), most)
     weight = jnp.max(ends.weights, axis=-1)
     # The slots past the last path form a batch of their own.
-    lanes = jnp.arange(capacities, dtype=jnp.int32)
+    lanes = jnp.arange(most, dtype=jnp.int32)
     batch = jnp.where(lanes < pool.count, ends.rays // rays, batches)
     fits = _strongest_of_each(batch, weight, batches, capacity)
     order = jnp.lexsort((-weight, jnp.where(fits, ends.rays, batches * rays))).astype(jnp.int32)
     group = jnp.where(fits, batch, batches)[order]
     target = jnp.where(fits[order], group * capacity + _rank_in_group(group, batches), _NOWHERE)
-    source = jnp.full(batches * capacity, capacities, jnp.int32).at[target].set(order, mode="drop")
-    packed = jax.tree.map(lambda x: x[jnp.minimum(source, capacities - 1)], ends)
+    source = jnp.full(batches * capacity, most, jnp.int32).at[target].set(order, mode="drop")
+    packed = jax.tree.map(lambda x: x[jnp.minimum(source, most - 1)], ends)
     home = jnp.repeat(jnp.arange(batches, dtype=jnp.int32) * rays, capacity)
     lost = queues.lose(lost, ends.rays, ends.weights, ~fits)
-    return emptied(packed, source == capacities, home), lost
+    return emptied(packed, source == most, home), lost
 
 
 def _strongest_of_each(

@@ -102,21 +102,21 @@ def lose(
 
 
 def strongest(
-    mask: Bool[Array, " n"], strength: Float[Array, " n"], capacities: Int[Array, ""]
+    mask: Bool[Array, " n"], strength: Float[Array, " n"], capacity: Int[Array, ""]
 ) -> Bool[Array, " n"]:
-    """Returns the `capacities` strongest of the marked records; all of them if there are fewer.
+    """Returns the `capacity` strongest of the marked records; all of them if there are fewer.
 
     Among equally strong records, the first are kept. Sorts only if there are more than
-    `capacities`.
+    `capacity`.
     """
 
     def choose(mask: Bool[Array, " n"]) -> Bool[Array, " n"]:
         order = jnp.argsort(jnp.where(mask, -strength, jnp.inf), stable=True).astype(jnp.int32)
         places = jnp.arange(mask.shape[0], dtype=jnp.int32)
         rank = jnp.zeros_like(order).at[order].set(places)
-        return mask & (rank < capacities)
+        return mask & (rank < capacity)
 
-    fits = jnp.sum(mask, dtype=jnp.int32) <= capacities
+    fits = jnp.sum(mask, dtype=jnp.int32) <= capacity
     return jax.lax.cond(fits, lambda mask: mask, choose, mask)
 
 

@@ -120,19 +120,19 @@ def train_into(
     report: Callable[[str], None] = print,
     **options: Any,
 ) -> bool:
-    """Does what `fit` does, which explains the arguments, and leaves the model in the folder.
+    """Trains like `fit`, but leaves the model in the run folder.
 
     Args:
-      run: the folder.
-      config: configuration of the run.
-      existing: whether a run that is there is refused, or resumed.
-      parts: objects that take the place of the scene's own meshes.
-      ready: is called when all is decided, before the folder is opened.
-      report: is given what was decided, and warnings.
-      **options: of `train`.
+      run: folder of the run.
+      config: configuration of the run; `None` resumes the run with its own.
+      existing: `refuse` or `resume` a run that is in the folder.
+      parts: objects that replace the scene's own meshes.
+      ready: function that is called once everything is resolved, before the folder is created.
+      report: function that receives the resolved options and warnings, as lines of text.
+      **options: options of `train`.
 
     Returns:
-      Whether it has reached its last step.
+      Whether the run has reached its last step.
     """
     resuming = is_resumed(run, existing)
     if config is None and not resuming:
@@ -145,10 +145,12 @@ def train_into(
         return train(run, report=report, **options)
     resolved, geometry = prepare(config, parts=parts, report=report)
     report(resolved.describe())
+    # `ready` may write into the folder, which every process must have found free before.
+    devices.wait_for_all("all have resolved the configuration")
     ready()
     open_ = run_folder.check_unchanged if resuming else begin
     open_(run, resolved.config, resolved.model, geometry)
-    # Not what the folder says: a scene may have moved.
+    # The scene may have moved since the folder was written.
     return train(run, scene=resolved.config.scene.path, report=report, **options)
 
 
@@ -156,7 +158,7 @@ def is_resumed(run: Path, existing: Existing) -> bool:
     """Returns whether an existing run is resumed.
 
     Raises:
-      ValueError: if it does not, and no run can be begun there.
+      ValueError: if it is not, and no run can be created there.
     """
     if existing == "resume" and run_folder.exists(run):
         return True

@@ -62,10 +62,10 @@ def test_both_tracers_find_the_same_paths(body, settings):
     geometry = scenes.geometry(_bodies()[body])
     targets = np.random.default_rng(5).uniform(-0.6, 0.6, (12, 3))
     rays = scenes.rays([-4.0, 0.3, 0.2], targets - [-4.0, 0.3, 0.2])
-    capacities = dataclasses.replace(
+    ample = dataclasses.replace(
         settings, live_per_ray=20.0, segments_per_ray=40.0, paths_per_ray=20.0
     )
-    trace = jax.jit(functools.partial(path_tracing.trace, settings=capacities, capacity=240))
+    trace = jax.jit(functools.partial(path_tracing.trace, settings=ample, capacity=240))
     tree = jax.tree.map(np.asarray, trace(geometry, rays).paths)
     single = _all_branches(geometry, rays, settings)
     there = np.flatnonzero(tree.statuses != PathStatus.EMPTY)
