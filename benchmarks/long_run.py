@@ -83,7 +83,7 @@ def check_finite(run: Path) -> None:
     print(
         f"{lines[-1]['step']} steps: {len(lines)} lines of metrics and {numbers} parameters are "
         f"finite, the largest {largest:.3g}. Dropped throughput: at most "
-        f"{max(line['lost'] for line in lines):.2g}."
+        f"{max(line['dropped'] for line in lines):.2g}."
     )
 
 

@@ -36,7 +36,7 @@ from absl import app, flags
 from benchmarks.oracles import reference_images, reference_surfaces, reference_tree
 from benchmarks.oracles.reference_surfaces import Embree, Hits, Surfaces
 from refref_jax.data import mesh_queries, meshes
-from refref_jax.data.scene_assembly import build_geometry
+from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
 from refref_jax.optics.light_paths import exists
@@ -68,9 +68,11 @@ class SinglePrecisionEmbree(Embree):
         super().__init__(surfaces)
         self.seconds = 0.0
 
-    def __call__(self, origins: np.ndarray, directions: np.ndarray, leaving: np.ndarray) -> Hits:
+    def __call__(
+        self, origins: np.ndarray, directions: np.ndarray, exclude_primitive: np.ndarray
+    ) -> Hits:
         """Returns the closest hits of rays that start on the given triangles (-1: none)."""
-        starts = self.off_surface(origins, directions, leaving)
+        starts = self.off_surface(origins, directions, exclude_primitive)
         begin = time.perf_counter()
         found = self.scene.run(starts, directions, output=1)
         self.seconds += time.perf_counter() - begin
@@ -83,11 +85,11 @@ class _Library:
     def __init__(self, scene: Path, origins: np.ndarray, directions: np.ndarray):
         parts = meshes.read_meshes(scene)
         parents = mesh_queries.find_containment(parts).parents
-        geometry = jax.tree.map(jnp.asarray, build_geometry(parts, parents, rule="nested"))
+        scene = jax.tree.map(jnp.asarray, assemble_scene(parts, parents, rule="nested"))
         radii = jnp.full(len(origins), 1e-3, jnp.float32)
         rays = Rays(jnp.asarray(origins), jnp.asarray(directions), radii)
         trace = jax.jit(functools.partial(path_tracing.trace_ends, settings=TREE))
-        self._trace = lambda: jax.block_until_ready(trace(geometry, rays))
+        self._trace = lambda: jax.block_until_ready(trace(scene, rays))
         self._trace()
 
     def __call__(self) -> Outcome:
@@ -182,7 +184,7 @@ def _casts_of_random_paths(
     some = np.arange(0, len(origins), 4)
     rays = origins[some].astype(float), directions[some].astype(float)
     ends = reference_tree.trace(clear, Embree(clear), *rays, rule)
-    return float(np.sum(ends.weights[:, 0] * (ends.num_bends + 1.0)) / len(some))
+    return float(np.sum(ends.throughput[:, 0] * (ends.num_bends + 1.0)) / len(some))
 
 
 def _take_turns(

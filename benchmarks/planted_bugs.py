@@ -135,8 +135,8 @@ BUGS = (
     Bug(
         "reflected branch dropped",
         _STEP,
-        "weight=arrival.weight * share.reflected",
-        "weight=arrival.weight * share.reflected * 0.0",
+        "throughput=arrival.throughput * share.reflected",
+        "throughput=arrival.throughput * share.reflected * 0.0",
         _TEST_TREE,
     ),
     Bug(
@@ -191,29 +191,30 @@ BUGS = (
     Bug(
         "tint at the first surface only",
         _STEP,
-        "weight = state.weight * passed * met.sides.tint",
-        "weight = state.weight * passed * jnp.where(state.num_bends == 0, met.sides.tint, 1.0)",
+        "throughput = state.throughput * passed * met.sides.tint",
+        "throughput = state.throughput * passed "
+        "* jnp.where(state.num_bends == 0, met.sides.tint, 1.0)",
         _TEST_TREE,
     ),
     Bug(
         "priority list not updated",
         _STEP,
-        "inside=met.sides.inside_after",
-        "inside=state.inside",
+        "interior_list=met.sides.interior_list_after",
+        "interior_list=state.interior_list",
         ("optics/test_media_paths.py",),
     ),
     Bug(
         "part not taken off the priority list",
         _MEDIA,
-        "without = jnp.where(inside == part, EMPTY_SLOT, inside)",
-        "without = inside",
+        "without = jnp.where(interior_list == part, EMPTY_SLOT, interior_list)",
+        "without = interior_list",
         _TEST_MEDIA,
     ),
     Bug(
         "lowest priority wins",
         _MEDIA,
-        "return 1 + inside[jnp.argmax(",
-        "return 1 + inside[jnp.argmin(",
+        "return 1 + interior_list[jnp.argmax(",
+        "return 1 + interior_list[jnp.argmin(",
         _TEST_MEDIA,
     ),
     Bug(
@@ -240,8 +241,8 @@ BUGS = (
     Bug(
         "dropped light is not counted",
         "optics/queues.py",
-        "add(jnp.where(dropped[:, None], weights, 0.0))",
-        "add(jnp.where(dropped[:, None], 0.0, 0.0 * weights))",
+        "add(jnp.where(which[:, None], throughput, 0.0))",
+        "add(jnp.where(which[:, None], 0.0, 0.0 * throughput))",
         ("optics/test_queues.py",),
     ),
     Bug(
@@ -321,9 +322,9 @@ BUGS = (
     Bug(
         "encoded before summed",
         "render/pixels.py",
-        "jax.ops.segment_sum(paths.weights * seen.composite.rgb, paths.rays, num_segments=rays)",
-        "colour.srgb_to_linear(jax.ops.segment_sum(paths.weights * "
-        "colour.linear_to_srgb(seen.composite.rgb), paths.rays, num_segments=rays))",
+        "return Light(linear, seen)",
+        "return Light(colour.srgb_to_linear(jax.ops.segment_sum(paths.throughput * "
+        "colour.linear_to_srgb(seen.composite.rgb), paths.rays, num_segments=rays)), seen)",
         (
             "render/test_pixels.py::"
             "test_the_paths_of_a_ray_are_blended_by_their_weights_in_linear_space",

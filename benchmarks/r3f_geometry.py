@@ -52,7 +52,7 @@ def main(arguments: list[str]) -> None:
     del arguments
     print("| body | stage | Chamfer, % | normals, degrees: mean, 99 % | IoU | volume |")
     print("|---|---|---|---|---|---|")
-    for name, truth in _bodies().items():
+    for name, truth in _objects().items():
         raw, last, overlap = _measure(name, truth)
         assert last.chamfer <= 0.005, f"the {name} is further than 0.5 % of its diameter off"
         assert last.normal_error < raw.normal_error, (
@@ -64,7 +64,7 @@ def main(arguments: list[str]) -> None:
             assert last.normal_error <= 2.0, "the ball's normals are off by more than 2 degrees"
 
 
-def _bodies() -> dict[str, Mesh]:
+def _objects() -> dict[str, Mesh]:
     pyramid = trimesh.creation.cone(radius=1.6, height=2.0, sections=4)
     turn = trimesh.transformations.euler_matrix(0.3, 0.2, 0.1)
     bodies = {

@@ -66,7 +66,7 @@ def main(arguments: list[str]) -> None:
     print("|---|---|---|---|---|---|---|")
     for kind in _MASKS.value:
         refined = {}
-        for body, make in _bodies(kind).items():
+        for body, make in _objects(kind).items():
             views = Views(_altered(kind, masks), frames.cameras)
             mesh = find_isosurface(make(*views))
             trusted = without_outliers(mesh, views, _OUTLIERS.get(body, 0))
@@ -77,7 +77,7 @@ def main(arguments: list[str]) -> None:
             _check(refined)
 
 
-def _bodies(kind: str) -> dict[str, Callable[[Masks, Cameras], Grid]]:
+def _objects(kind: str) -> dict[str, Callable[[Masks, Cameras], Grid]]:
     resolution = _RESOLUTION.value
     config = OccupancyTrainingConfig(steps=_STEPS.value)
     bodies: dict[str, Callable[[Masks, Cameras], Grid]] = {

@@ -37,7 +37,7 @@ def closest_hits_sorted(
     rays: Rays,
     *,
     limits: Float[Array, " rays"],
-    leaving: Int[Array, " rays"],
+    exclude_primitive: Int[Array, " rays"],
 ) -> Hits:
     """Finds the same hits as `bvh.closest_hits`, tracing the rays in a coherent order.
 
@@ -50,7 +50,7 @@ def closest_hits_sorted(
       bvh: tree of the scene.
       rays: any number of rays.
       limits: limits of the hit distances, as in `bvh.closest_hits`.
-      leaving: excluded primitives, as in `bvh.closest_hits`.
+      exclude_primitive: excluded primitives, as in `bvh.closest_hits`.
 
     Returns:
       The hits, in the original order of the rays.
@@ -61,7 +61,10 @@ def closest_hits_sorted(
         return values.at[order].get(mode="promise_in_bounds", unique_indices=True)
 
     hits = closest_hits(
-        bvh, jax.tree.map(in_order, rays), limits=in_order(limits), leaving=in_order(leaving)
+        bvh,
+        jax.tree.map(in_order, rays),
+        limits=in_order(limits),
+        exclude_primitive=in_order(exclude_primitive),
     )
 
     def back(values: Array) -> Array:

@@ -21,7 +21,9 @@ from refref_jax.training import loop
 
 _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folder of the scene.")
 _PRESET = flags.DEFINE_string("preset", "tiny", "Preset of all models.")
-_ROUNDS = flags.DEFINE_integer("rounds", 8, "Number of times that each model steps two pools.")
+_ROUNDS = flags.DEFINE_integer(
+    "rounds", 8, "Number of times that each model steps the batches of two pre-tracings."
+)
 
 _STRAIGHT = "straight"
 _LIMITS = {_STRAIGHT: 1.0, "paper": 1.25, "tree": 1.5}
@@ -39,28 +41,31 @@ class _Cost(NamedTuple):
 
 
 class _Method:
-    """One model in training, stepped two pools of batches at a time."""
+    """One model in training, stepped through the batches of two pre-tracings at a time."""
 
     def __init__(self, scene: Path, paths: str) -> None:
         self._setup, self._state = set_up_training(scene, preset=_PRESET.value, paths=paths)
         self.paths_per_ray = self._setup.capacity / self._setup.config.schedule.batch
 
     def cost(self) -> _Cost:
-        """Traces a pool of batches and takes the steps of two."""
-        pool, batches = self._setup.config.schedule.pool, self._setup.sampler.batches
+        """Pre-traces batches, and takes the steps of two pre-tracings."""
+        pretraced, batches = (
+            self._setup.config.schedule.pretraced_batches,
+            self._setup.sampler.batches,
+        )
         begin = time.perf_counter()
-        jax.block_until_ready(loop.trace_batches(self._setup, range(pool)))
-        tracing = (time.perf_counter() - begin) / pool
+        jax.block_until_ready(loop.trace_batches(self._setup, range(pretraced)))
+        tracing = (time.perf_counter() - begin) / pretraced
         start = int(self._state.step)
         begin = time.perf_counter()
-        steps = loop.run_steps(self._setup, self._state, start + 2 * pool, every=(_STRIDE,))
+        steps = loop.run_steps(self._setup, self._state, start + 2 * pretraced, every=(_STRIDE,))
         for state, _ in steps:
             self._state = state
         jax.block_until_ready(self._state)
-        step = (time.perf_counter() - begin) / (2 * pool)
+        step = (time.perf_counter() - begin) / (2 * pretraced)
         if self._setup.epoch is None:
             return _Cost(step, tracing)
-        share = -(-batches // pool) * pool / self._setup.config.schedule.steps
+        share = -(-batches // pretraced) * pretraced / self._setup.config.schedule.steps
         return _Cost(step + share * tracing, share * tracing)
 
 

@@ -4,7 +4,7 @@
 
 Times a step and its parts in turn, in one process: shares hold when the machine's speed drifts.
 Parts are compiled separately, so they need not add up to the step. Tracing is that of a newly
-traced pool of batches; `step_cost` claims the share if paths are cached. Reading from and adding to
+pre-traced batches; `step_cost` claims the share if paths are cached. Reading from and adding to
 the tables of hash grids is bound by memory: it is compared with the device's copy speed.
 """
 
@@ -21,7 +21,7 @@ import numpy as np
 import optax
 from absl import app, flags
 
-from benchmarks.training_setup import set_up_training, trace_pool
+from benchmarks.training_setup import pretrace, set_up_training
 from refref_jax.fields import hash_grid, registry
 from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid
 from refref_jax.render import pixels
@@ -96,10 +96,10 @@ def _seen(params: tuple, config: ModelConfig, points: _Points) -> list[jax.Array
     return [*found, *jax.vmap(jax.vmap(radiance))(points.rounds[-1], points.directions)]
 
 
-def _loss(params: tuple, setup: loop.Setup, pool: tuple) -> jax.Array:
-    """Returns a step's loss on the first batch of a pool."""
+def _loss(params: tuple, setup: loop.Setup, pretraced: tuple) -> jax.Array:
+    """Returns a step's loss on the first pre-traced batch."""
     model, config = setup.model, setup.config
-    traced, rgb = jax.tree.map(lambda x: x[0], pool)
+    traced, rgb = jax.tree.map(lambda x: x[0], pretraced)
     slots = jnp.arange(traced.paths.radii.shape[0])
     jitter = pixels.random_jitter(jax.random.key(0), model, slots)
     seen = pixels.render_pixels(
@@ -134,20 +134,22 @@ class _Profile:
 
     def __init__(self, scene: Path, *, preset: str, paths: str) -> None:
         self.setup, self._state = set_up_training(scene, preset=preset, paths=paths)
-        self._pool = trace_pool(self.setup)
+        self._pretraced_after = pretrace(self.setup)
         self._params = jax.tree.map(jnp.copy, self._state.params)
-        self._points = _chords(self.setup.model, self._pool.traced.paths.radii.shape[1])
+        self._points = _chords(self.setup.model, self._pretraced_after.traced.paths.radii.shape[1])
         self._adam = self._prepare_adam()
         self.parts = {"step": self._pool_of_steps, "tracing": self._trace, "Adam": self._adam}
         self.parts |= self._prepare_render() | self._prepare_fields() | self._prepare_sampling()
 
     def milliseconds(self) -> dict[str, float]:
-        """Times every part once; a step and its tracing are means over a pool."""
+        """Times every part once; a step and its tracing are means over the pre-traced batches."""
         taken = {}
         for name, part in self.parts.items():
             begin = time.perf_counter()
             part()
-            steps = self.setup.config.schedule.pool if name in ("step", "tracing") else 1
+            steps = (
+                self.setup.config.schedule.pretraced_batches if name in ("step", "tracing") else 1
+            )
             taken[name] = 1e3 * (time.perf_counter() - begin) / steps
         return taken
 
@@ -160,13 +162,13 @@ class _Profile:
         )
 
     def _pool_of_steps(self) -> None:
-        until = int(self._state.step) + self.setup.config.schedule.pool
+        until = int(self._state.step) + self.setup.config.schedule.pretraced_batches
         for state, _ in loop.run_steps(self.setup, self._state, until):
             self._state = state
         jax.block_until_ready(self._state)
 
     def _trace(self) -> None:
-        jax.block_until_ready(trace_pool(self.setup))
+        jax.block_until_ready(pretrace(self.setup))
 
     def _prepare_adam(self) -> Callable[[], None]:
         rule = optimizer(self.setup.config.schedule)
@@ -188,12 +190,12 @@ class _Profile:
 
     def _prepare_render(self) -> dict[str, Callable[[], None]]:
 
-        def loss(params: tuple, pool: tuple) -> jax.Array:
-            return _loss(params, self.setup, pool)
+        def loss(params: tuple, pretraced: tuple) -> jax.Array:
+            return _loss(params, self.setup, pretraced)
 
         return {
-            "forward": _compiled(loss, self._params, self._pool),
-            "forward and backward": _compiled(jax.grad(loss), self._params, self._pool),
+            "forward": _compiled(loss, self._params, self._pretraced_after),
+            "forward and backward": _compiled(jax.grad(loss), self._params, self._pretraced_after),
         }
 
     def _prepare_fields(self) -> dict[str, Callable[[], None]]:

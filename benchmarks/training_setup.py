@@ -7,7 +7,7 @@ from refref_jax.data.batches import PixelSampler
 from refref_jax.training import loop
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.fit import prepare
-from refref_jax.training.loop import Pool, TrainState, init_state
+from refref_jax.training.loop import PretracedBatches, TrainState, init_state
 
 
 def set_up_training(scene: Path, *, preset: str, paths: str) -> tuple[loop.Setup, TrainState]:
@@ -19,14 +19,16 @@ def set_up_training(scene: Path, *, preset: str, paths: str) -> tuple[loop.Setup
       paths: name of path settings.
     """
     asked = TrainConfig().override(scene=str(scene), preset=preset, paths=paths)
-    (config, model, *_), geometry = prepare(asked)
+    (config, model, *_), scene = prepare(asked)
     frames = scene_folder.read_frames(scene, "train")
     images = scene_folder.read_images(frames)
     sampler = PixelSampler(images, frames.cameras, seed=config.seed, batch=config.schedule.batch)
-    setup = loop.set_up(config, model.config, model.settings, geometry, sampler)
+    setup = loop.set_up(config, model.config, model.settings, scene, sampler)
     return setup, init_state(config.seed, model.config, config.schedule)
 
 
-def trace_pool(setup: loop.Setup) -> Pool:
-    """Draws and traces the first pool of batches of a run, as its loop does."""
-    return loop.trace_batches(setup, setup.sampler.numbers(0, setup.config.schedule.pool).tolist())
+def pretrace(setup: loop.Setup) -> PretracedBatches:
+    """Draws and pre-traces the first batches of a run, as its loop does."""
+    return loop.trace_batches(
+        setup, setup.sampler.numbers(0, setup.config.schedule.pretraced_batches).tolist()
+    )

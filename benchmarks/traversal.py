@@ -163,14 +163,17 @@ def _compare(hits: bvh.Hits, theirs: dict) -> None:
 
 def _measure(case: _Case, tree: bvh.BVH, scene: EmbreeScene) -> tuple[float, float]:
     """Returns seconds for all rays, ours and Embree's."""
-    limits, leaving = jnp.full(_COUNT, jnp.inf), jnp.full(_COUNT, bvh.NO_SLOT, jnp.int32)
+    limits, exclude_primitive = (
+        jnp.full(_COUNT, jnp.inf),
+        jnp.full(_COUNT, bvh.NO_PRIMITIVE, jnp.int32),
+    )
     rays = jax.tree.map(jnp.asarray, case.rays)
 
     def theirs() -> dict:
         return scene.run(case.rays.origins, case.rays.directions, output=1)
 
     def ours() -> bvh.Hits:
-        return case.trace(tree, rays, limits=limits, leaving=leaving)
+        return case.trace(tree, rays, limits=limits, exclude_primitive=exclude_primitive)
 
     _compare(ours(), theirs())
     pairs = [(_seconds(ours), _seconds(theirs)) for _ in range(_ROUNDS.value)]

@@ -70,9 +70,9 @@ def main(arguments: list[str]) -> None:
     duels = [fight(scene, steps) for steps in counts for scene in scenes]
     print(table(duels))
     if len(counts) > 1:
-        picture = Path(_OUT.value) / "tree_versus_paper.png"
-        draw(picture, duels)
-        print(f"\nCurve: {picture}")
+        image = Path(_OUT.value) / "tree_versus_paper.png"
+        draw(image, duels)
+        print(f"\nCurve: {image}")
     check(duels, full=full, tiny=_PRESET.value == "tiny" and _STEPS.value is None)
 
 

@@ -77,8 +77,8 @@ def main() -> None:
         comparison.write_comparison(draft / "comparison.png", views)
     for key, value in summary["results"].items():
         print(f"{key:>24}  {'-' if value is None else format(value, '.4f')}")
-    reporting.warn_of_lost_light(
-        summary["results"]["lost"],
+    reporting.warn_of_dropped(
+        summary["results"]["dropped"],
         advice="Train with a larger --min_throughput or a smaller --max_bends.",
     )
     print(f"Images:   {out / 'comparison.png'}, {out / 'rgb'}, {out / 'distance'}")

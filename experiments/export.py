@@ -5,9 +5,9 @@ python -m experiments.export --run=runs/ball --what=mesh --out=ball.ply
     mesh      level set of the field's density at --level, and the background if it has walls, with
               normals and colours
     points    the same surfaces as points of a grid
-    body      the objects: those of R3F, or the scene's meshes; with their shading normals
+    object    the objects: those of R3F, or the scene's meshes; with their shading normals
 
-For body, --run may also be the folder of a reconstruction. A field learns nothing inside clear
+For object, --run may also be the folder of a reconstruction. A field learns nothing inside clear
 glass, so mesh and points show the surroundings of the objects.
 """
 
@@ -36,7 +36,9 @@ with epy.lazy_imports():
     from refref_jax.render import checkpoint_io
 
 _RUN = cli_flags.run()
-_WHAT = flags.DEFINE_enum("what", None, ["mesh", "points", "body"], "Output type.", required=True)
+_WHAT = cli_flags.enum(
+    "what", None, ["mesh", "points", "object"], "Output type.", formerly={"body": "object"}
+)
 _OUT = cli_flags.out("PLY file to write.")
 _OVERWRITE = cli_flags.overwrite("the file, or those of several objects")
 _STEP = cli_flags.step()
@@ -56,9 +58,9 @@ def main() -> None:
     """Writes one file, or one per object."""
     run, out = Path(_RUN.value), Path(_OUT.value)
     outputs.check_file(out, overwrite=_OVERWRITE.value)
-    others = (cli_flags.RECONSTRUCTION,) if _WHAT.value == "body" else ()
+    others = (cli_flags.RECONSTRUCTION,) if _WHAT.value == "object" else ()
     cli_flags.check_run(run, holds=(cli_flags.RUN, *others))
-    if _WHAT.value == "body":
+    if _WHAT.value == "object":
         written = object_meshes.write(run, out, overwrite=_OVERWRITE.value)
     else:
         written = _write_field(checkpoint_io.load_model(run, step=_STEP.value), out)

@@ -3,10 +3,10 @@
 python -m experiments.path_trade_off --scenes=experiments/data/cube_smcvx_ball --out=runs/paths
 
 Renders views of scenes with a known background, like `experiments.render_known`: once for every
-value of --cuts at the tree's maximum of bends, once for every value of --bends at its threshold,
-and with the straight and the paper's paths. Writes a CSV with one row per rendering, and two
-figures: masked PSNR over ray casts and over time. Casts, paths and seconds are those of one camera
-ray per pixel.
+value of --min_throughputs at the tree's maximum of bends, once for every value of --max_bends at
+its threshold, and with the straight and the paper's paths. Writes a CSV with one row per rendering,
+and two figures: masked PSNR over ray casts and over time. Casts, paths and seconds are those of one
+camera ray per pixel.
 """
 
 from __future__ import annotations
@@ -38,14 +38,16 @@ with epy.lazy_imports():
 _SCENES = flags.DEFINE_list(
     "scenes", None, f"Scenes, separated by commas: each {cli_flags.SCENE_FORMS}.", required=True
 )
-_CUTS = flags.DEFINE_list(
-    "cuts",
+_THRESHOLDS = flags.DEFINE_list(
+    "min_throughputs",
     ["0.2", "0.1", "0.05", "0.04", "0.03", "0.02", "0.01", "0.005", "0.002"],
     "Throughput thresholds.",
 )
-_BENDS = flags.DEFINE_list(
-    "bends", ["1", "2", "4", "6", "10", "16", "24", "32"], "Maximum numbers of bends."
+_MAX_BENDS = flags.DEFINE_list(
+    "max_bends", ["1", "2", "4", "6", "10", "16", "24", "32"], "Maximum numbers of bends."
 )
+flags.DEFINE_alias("cuts", "min_throughputs")
+flags.DEFINE_alias("bends", "max_bends")
 _VIEWS = cli_flags.views("0,10")
 _RULE = cli_flags.rule()
 _IOR = cli_flags.ior()
@@ -55,7 +57,7 @@ _OUT = cli_flags.out("Folder to write to.")
 _OVERWRITE = cli_flags.overwrite("the curves of an earlier call")
 
 _TABLE = "path_trade_off.csv"
-_WRITES = (_TABLE, *(f"path_trade_off_{sweep}.png" for sweep in ("cut", "bends")))
+_WRITES = (_TABLE, *(f"path_trade_off_{sweep}.png" for sweep in ("min_throughput", "max_bends")))
 
 
 def main() -> None:
@@ -69,8 +71,8 @@ def main() -> None:
     with outputs.fresh(out, **place) as draft:
         trials = _measure(chosen, [paths.Setting(*each) for each in settings])
         paths.write_table(draft / _TABLE, trials)
-        pictures = [out / path.name for path in paths.write_figures(draft, trials)]
-    print(f"Figures:  {', '.join(map(str, pictures))}")
+        images = [out / path.name for path in paths.write_figures(draft, trials)]
+    print(f"Figures:  {', '.join(map(str, images))}")
     print(f"Measures: {out / _TABLE}")
     print(
         "Next: choose a threshold, and use python -m experiments.render_known --min_throughput=..."
@@ -109,14 +111,14 @@ def _open_scenes() -> list[Path]:
 
 def chosen_settings() -> list[tuple[str, str, PathSettings]]:
     """Returns sweep, name and path settings of all trials; equal ones are in both sweeps."""
-    cuts = sorted(_numbers("cuts", _CUTS.value, float), reverse=True)
-    bends = sorted(_numbers("bends", _BENDS.value, int))
+    thresholds = sorted(_numbers("min_throughputs", _THRESHOLDS.value, float), reverse=True)
+    most = sorted(_numbers("max_bends", _MAX_BENDS.value, int))
     swept = [
-        ("cut", f"{cut:g}", path_settings.make_path_settings("tree", min_throughput=cut))
-        for cut in cuts
+        ("min_throughput", f"{x:g}", path_settings.make_path_settings("tree", min_throughput=x))
+        for x in thresholds
     ]
     swept += [
-        ("bends", str(n), path_settings.make_path_settings("tree", max_bends=n)) for n in bends
+        ("max_bends", str(n), path_settings.make_path_settings("tree", max_bends=n)) for n in most
     ]
     points = [("settings", name, PATH_PRESETS[name]) for name in ("straight", "paper")]
     return points + swept
@@ -147,8 +149,8 @@ def _numbers(option: str, words: list[str], kind: type) -> list:
         ) from error
 
 
-app.check(_CUTS, lambda words: _numbers("cuts", words, float))
-app.check(_BENDS, lambda words: _numbers("bends", words, int))
+app.check(_THRESHOLDS, lambda words: _numbers("min_throughputs", words, float))
+app.check(_MAX_BENDS, lambda words: _numbers("max_bends", words, int))
 
 
 if __name__ == "__main__":

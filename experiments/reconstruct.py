@@ -16,6 +16,7 @@ from etils import epy
 from experiments.cli import app, outputs
 from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
+from experiments.r3f import flags as r3f_flags
 from experiments.runs import refraction_indices
 
 with epy.lazy_imports():
@@ -26,7 +27,7 @@ _OUT = cli_flags.out("Folder to write to.")
 _IOR = flags.DEFINE_string(
     "ior", None, "Index of refraction of the object, as in 1.5; estimated by default."
 )
-_RECONSTRUCTION = cli_flags.reconstruction()
+_RECONSTRUCTION = r3f_flags.reconstruction()
 _SPACE = cli_flags.space()
 _SEED = cli_flags.seed()
 

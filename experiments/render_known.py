@@ -6,8 +6,8 @@ python -m experiments.render_known --scene=experiments/data/cube_smcvx_ball --ou
 view and as the mean over views, the JSON file contains: the PSNR in dB over the image, inside the
 mask and outside; `casts_per_pixel` and `paths_per_pixel`, the number of ray casts and light paths
 per camera ray, which does not depend on --rays_per_pixel; `seconds`, the time to render all views
-without compiling, reading and writing; and `lost_energy`, the share of the throughput that was
-dropped because buffers were full, or that exceeds --bends and is `dark`.
+without compiling, reading and writing; and `dropped`, the share of the throughput that was dropped
+because buffers were full, or of truncated paths with --truncated_paths=black.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from experiments.cli import scenes as cli_scenes
 from experiments.cli.progress import ProgressBar
 from experiments.runs import refraction_indices
 from refref_jax import choices, configuration
+from refref_jax.optics import path_settings
 from refref_jax.optics.path_settings import PATH_PRESETS, PathSettings
 
 if TYPE_CHECKING:
@@ -49,13 +50,15 @@ _PATHS = flags.DEFINE_enum(
     "Light paths: 'straight' ignores the objects; 'paper' bends up to 10 times and reflects at the "
     "first surface; 'tree' follows every branch above the throughput threshold.",
 )
-_UNFINISHED = flags.DEFINE_enum(
-    "unfinished",
-    "kept",
-    ["kept", "dark"],
-    "Truncated paths, which have reached the maximum of bends: 'kept' lets them end on the "
-    "background along their last direction; 'dark' makes them black, as in path tracers.",
+_TRUNCATED_PATHS = cli_flags.enum(
+    "truncated_paths",
+    "background",
+    ["background", "black"],
+    "Paths that reach the maximum of bends: 'background' ends them on the background along their "
+    "last direction; 'black' makes them black, as in path tracers.",
+    formerly=path_settings.FORMER_TRUNCATION,
 )
+flags.DEFINE_alias("unfinished", "truncated_paths")
 _VIEWS = cli_flags.views("all")
 _SETTINGS = cli_flags.settings()
 _RULE = cli_flags.rule()
@@ -133,25 +136,27 @@ def summarise(
     return {
         "scene": scene.name,
         "paths": _PATHS.value,
-        "cut": settings.min_throughput,
-        "bends": settings.max_bends,
-        "unfinished": settings.unfinished,
+        "min_throughput": settings.min_throughput,
+        "max_bends": settings.max_bends,
+        "truncated_paths": settings.truncated_paths,
         "views": measured,
         "mean": {key: evaluation.mean_of(measured, key) for key in keys},
         "casts_per_pixel": float(np.mean([view.casts for view in views])),
         "paths_per_pixel": float(np.mean([view.paths for view in views])),
         "seconds": sum(view.seconds for view in views),
-        "lost_energy": float(np.mean([view.lost for view in views])),
+        "dropped": float(np.mean([view.dropped for view in views])),
     }
 
 
 def _chosen_settings() -> PathSettings:
-    if _PATHS.value == "straight" and _UNFINISHED.value == "dark":
+    if _PATHS.value == "straight" and _TRUNCATED_PATHS.value == "black":
         raise ValueError(
-            "--paths=straight has no bends, so no path is truncated. Remove --unfinished, or use "
-            "--paths=tree."
+            "--paths=straight has no bends, so no path is truncated. Remove --truncated_paths, or "
+            "use --paths=tree."
         )
-    return dataclasses.replace(_SETTINGS.chosen(_PATHS.value), unfinished=_UNFINISHED.value)
+    return dataclasses.replace(
+        _SETTINGS.chosen(_PATHS.value), truncated_paths=_TRUNCATED_PATHS.value
+    )
 
 
 def _check(metrics_file: Path | None) -> None:
@@ -180,12 +185,12 @@ def _report(summary: dict[str, Any]) -> None:
     for key in ("casts_per_pixel", "paths_per_pixel"):
         print(f"{key:>16}  {summary[key]:.3f}")
     print(f"{'seconds':>16}  {summary['seconds']:.2f}")
-    print(f"{'lost_energy':>16}  {summary['lost_energy']:.2g}")
-    if summary["unfinished"] == "dark":
-        print("lost_energy: truncated paths, and paths dropped because buffers were full, if any.")
+    print(f"{'dropped':>16}  {summary['dropped']:.2g}")
+    if summary["truncated_paths"] == "black":
+        print("dropped: truncated paths, and paths dropped because buffers were full, if any.")
     else:
-        reporting.warn_of_lost_light(
-            summary["lost_energy"],
+        reporting.warn_of_dropped(
+            summary["dropped"],
             advice="Use a larger --min_throughput or a smaller --max_bends, or, as a library, "
             "PathSettings with larger capacity factors.",
         )

@@ -43,12 +43,13 @@ _STEPS = flags.DEFINE_list(
     "Steps of the base point, then those of further trainings of it; by default those of the "
     "preset, and a quarter, half and twice as many.",
 )
-_BASE = flags.DEFINE_multi_string("base", [], "Base option, as in cut=0.05. May be repeated.")
+_BASE = flags.DEFINE_multi_string("base", [], "Base option, as in max_bends=6. May be repeated.")
 _VALUES = flags.DEFINE_multi_string(
-    "values", [], "Values to try for an option, as in cut=0.1/0.05. May be repeated."
+    "values", [], "Values to try for an option, as in max_bends=2/6. May be repeated."
 )
-_KNOBS = flags.DEFINE_list("knobs", None, "Options to try; all by default.")
-_POINTS = flags.DEFINE_list("points", None, "Points to measure with the base, as in cut=0.1.")
+_OPTIONS = flags.DEFINE_list("options", None, "Options to try; all by default.")
+flags.DEFINE_alias("knobs", "options")
+_POINTS = flags.DEFINE_list("points", None, "Points to measure with the base, as in max_bends=6.")
 _LIMIT = cli_flags.limit()
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "List the points without measuring them.")
 
@@ -95,7 +96,7 @@ def points_from_flags() -> list[Point]:
         steps=read_steps(_STEPS.value),
         base=points.parse_base(_BASE.value),
         values=points.parse_values(_VALUES.value),
-        knobs=_KNOBS.value,
+        vary=_OPTIONS.value,
     )
     return found if _POINTS.value is None else points.choose(found, _POINTS.value)
 

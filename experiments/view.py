@@ -99,7 +99,7 @@ def read_subject(heights: tuple[int, ...]) -> session.Subject:
         model=model,
         rule=config.scene.rule,
         frames=None if scene is None else session.read_test_views(scene),
-        parts=session.part_names(scene, len(model.geometry.interfaces.index_inside)),
+        parts=session.part_names(scene, len(model.scene.interfaces.index_inside)),
         heights=heights,
         chunk=_CHUNK.value,
     )

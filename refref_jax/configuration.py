@@ -31,6 +31,9 @@ _KIND = "kind"
 FORMERLY = "formerly"
 """Key of a field's metadata: the name of the field in files of earlier versions."""
 
+FORMER_VALUES = "former_values"
+"""Key of a field's metadata: its values by their names in files of earlier versions."""
+
 NOT_FINITE = ("inf", "-inf", "nan")
 """Names of the numbers that JSON does not support."""
 
@@ -218,10 +221,15 @@ def _build_dataclass(kind: Any, value: Any, where: str, variants: Variants) -> A
 def _with_present_names(
     fields: Sequence[dataclasses.Field[Any]], value: dict[str, Any]
 ) -> dict[str, Any]:
-    """Renames keys that earlier versions wrote; a key stays if the present one is there, too."""
+    """Renames keys and values of earlier versions; a key stays if the present one is there, too."""
     names = {field.metadata.get(FORMERLY): field.name for field in fields}
     present = {old: new for old, new in names.items() if new not in value}
-    return {present.get(key, key): item for key, item in value.items()}
+    renamed = {present.get(key, key): item for key, item in value.items()}
+    for field in fields:
+        former, item = field.metadata.get(FORMER_VALUES, {}), renamed.get(field.name)
+        if isinstance(item, str) and item in former:
+            renamed[field.name] = former[item]
+    return renamed
 
 
 def _variant(known: Mapping[str, type], value: dict[str, Any], where: str) -> type:

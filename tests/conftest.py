@@ -81,4 +81,4 @@ def slab():
     """A wide slab of glass, one unit thick."""
     from tests.factories import scenes
 
-    return scenes.geometry(scenes.box((8.0, 8.0, 1.0)))
+    return scenes.build(scenes.box((8.0, 8.0, 1.0)))

@@ -26,8 +26,8 @@ _FINE, _COARSE = 6, 3
 
 
 @functools.partial(jax.jit, static_argnames="settings")
-def _trace(geometry, rays, *, settings):
-    return path_tracing.trace(geometry, rays, settings=settings, capacity=rays.radii.shape[0]).paths
+def _trace(scene, rays, *, settings):
+    return path_tracing.trace(scene, rays, settings=settings, capacity=rays.radii.shape[0]).paths
 
 
 @functools.cache

@@ -299,13 +299,22 @@ def test_who_is_stopped_while_writing_leaves_what_was_there(tmp_path, monkeypatc
 class _Renamed:
     most_steps: int = dataclasses.field(metadata={configuration.FORMERLY: "steps"})
     rate: float = 0.5
+    ending: Literal["plain", "black"] = dataclasses.field(
+        default="plain", metadata={configuration.FORMER_VALUES: {"dark": "black"}}
+    )
 
 
 def test_a_key_of_an_earlier_version_is_read_by_its_present_name(path):
     path.write_text('{"steps": 3, "rate": 0.25}')
     assert configuration.read(path, _Renamed) == _Renamed(3, 0.25)
     configuration.write(path, _Renamed(3))
-    assert json.loads(path.read_text()) == {"most_steps": 3, "rate": 0.5}
+    assert json.loads(path.read_text()) == {
+        "most_steps": 3,
+        "rate": 0.5,
+        "ending": "plain",
+    }
+    path.write_text('{"steps": 3, "ending": "dark"}')
+    assert configuration.read(path, _Renamed) == _Renamed(3, ending="black")
     path.write_text('{"steps": 3, "most_steps": 4}')
     with pytest.raises(ValueError, match="unknown 'steps'"):
         configuration.read(path, _Renamed)

@@ -72,7 +72,10 @@ _LARGE = 10**400
 _VALUES = {
     "cut": ({"paths": {"cut": _LARGE}}, "TrainConfig.paths.min_throughput is too large"),
     "seed": ({"seed": -_LARGE}, "TrainConfig.seed is too large"),
-    "samples": ({"model": {"samples": [_LARGE]}}, "TrainConfig.model.samples[0] is too large"),
+    "samples": (
+        {"model": {"samples": [_LARGE]}},
+        "TrainConfig.model.samples_per_ray[0] is too large",
+    ),
     "end of text": ({"scene": {"path": "a\0b"}}, "TrainConfig.scene.path is 'a\\x00b', "),
     "half a character": ({"scene": {"path": "\ud800x"}}, "scene.path is '\\ud800x', "),
     "unknown wish": ({"chosen": ["seed", "cot"]}, "chosen names 'cot'"),

@@ -12,8 +12,8 @@ import pytest
 from jax import extend
 
 from refref_jax.data import mesh_queries, meshes, scene_folder
-from refref_jax.data.scene_analysis import find_needs
-from refref_jax.data.scene_assembly import build_geometry
+from refref_jax.data.scene_analysis import analyse
+from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.geometry.cameras import image_rays
 from refref_jax.optics import path_tracing
 from refref_jax.optics.media import SLOTS
@@ -31,9 +31,9 @@ _RAYS = jax.tree.map(lambda x: jnp.asarray(x).reshape(-1, *x.shape[2:]), image_r
 _BALL = scenes.ball(1.3, subdivisions=2)
 
 
-def _needs(*parts, rule="nested"):
+def _analysis(*parts, rule="nested"):
     tree = mesh_queries.find_containment(parts)
-    return find_needs(parts, tree, CAMERAS, rule=rule, space="bounded")
+    return analyse(parts, tree, CAMERAS, rule=rule, space="bounded")
 
 
 def _settings(found, **given):
@@ -46,21 +46,19 @@ def _operations(text):
     return collections.Counter(re.findall(r"stablehlo\.(\w+)", text))
 
 
-def _training_programs(geometry, settings):
+def _training_programs(scene, settings):
     """Returns the operations of all programs of a run that know of the meshes."""
     batches = jax.tree.map(lambda x: x[None], _RAYS)
     detail = path_detail(dataclasses.replace(MODEL, interior="clear"), settings)
-    trace = loop.trace_pool.lower(
-        geometry, batches, settings=settings, capacity=2048, detail=detail
-    )
-    survey = loop.survey_paths.lower(geometry, _RAYS, settings=settings)
+    trace = loop.pretrace.lower(scene, batches, settings=settings, capacity=2048, detail=detail)
+    survey = loop.survey_paths.lower(scene, _RAYS, settings=settings)
     return _operations(trace.as_text()) + _operations(survey.as_text())
 
 
 def test_no_mesh_compiles_no_tracer():
-    empty = _settings(_needs())
-    tracer = _training_programs(scenes.geometry(_BALL), TREE)
-    nothing = _training_programs(scenes.geometry(), empty)
+    empty = _settings(_analysis())
+    tracer = _training_programs(scenes.build(_BALL), TREE)
+    nothing = _training_programs(scenes.build(), empty)
     assert nothing["while"] == 0 < tracer["while"]
     assert nothing["gather"] + nothing["sort"] == 0
     assert sum(nothing.values()) < 0.05 * sum(tracer.values())
@@ -69,7 +67,7 @@ def test_no_mesh_compiles_no_tracer():
 def _render_operations(model):
     """Returns the operations of rendering some straight paths."""
     paths = path_tracing.trace(
-        scenes.geometry(), _RAYS, settings=_settings(_needs()), capacity=256
+        scenes.build(), _RAYS, settings=_settings(_analysis()), capacity=256
     ).paths
     params = jax.eval_shape(functools.partial(init_params, config=model), jax.random.key(0))
     jitter = pixels.no_jitter(model, paths.radii.shape[0])
@@ -96,7 +94,7 @@ def test_bounded_space_is_not_contracted(monkeypatch):
         assert unbounded[operation] >= bounded[operation] + rounds
 
 
-def _carried_lists(geometry):
+def _carried_lists(scene):
     """Returns the shapes of all interior lists that the tracer's loops carry."""
     traced = functools.partial(path_tracing.trace_ends, settings=TREE)
     shapes = []
@@ -108,7 +106,7 @@ def _carried_lists(geometry):
             for inner in extend.core.jaxprs_in_params(equation.params):
                 visit(inner)
 
-    visit(jax.make_jaxpr(traced)(geometry, _RAYS).jaxpr)
+    visit(jax.make_jaxpr(traced)(scene, _RAYS).jaxpr)
     integers = [shape.shape for shape in shapes if shape.dtype == jnp.int32]
     return [shape for shape in integers if len(shape) == 2]
 
@@ -116,7 +114,7 @@ def _carried_lists(geometry):
 def test_only_overlapping_bodies_make_rays_carry_lists():
     parts = [_BALL, scenes.ball(0.5, subdivisions=1, name="inner_water")]
     lists = {
-        rule: _carried_lists(scenes.geometry(*parts, rule=rule)) for rule in ("nested", "priority")
+        rule: _carried_lists(scenes.build(*parts, rule=rule)) for rule in ("nested", "priority")
     }
     assert any(columns == SLOTS for _, columns in lists["priority"])
     assert lists["nested"] and all(columns != SLOTS for _, columns in lists["nested"])
@@ -151,19 +149,17 @@ def test_light_that_leaves_the_bundled_ball_for_good_is_cast_less_often(ball_sce
     parts = meshes.read_meshes(ball_scene)
     tree = mesh_queries.find_containment(parts)
     cameras = scene_folder.read_frames(ball_scene, "train").cameras
-    found = find_needs(parts, tree, cameras, rule="nested", space="bounded")
-    geometry = jax.tree.map(jnp.asarray, build_geometry(parts, tree.parents, rule="nested"))
+    found = analyse(parts, tree, cameras, rule="nested", space="bounded")
+    scene = jax.tree.map(jnp.asarray, assemble_scene(parts, tree.parents, rule="nested"))
     rays = jax.tree.map(
         lambda x: jnp.asarray(x[::8, ::8]).reshape(-1, *x.shape[2:]), image_rays(cameras, 0)
     )
     count = rays.radii.shape[0]
 
     def trace(settings):
-        traced = jax.jit(functools.partial(path_tracing.trace_ends, settings=settings))(
-            geometry, rays
-        )
+        traced = jax.jit(functools.partial(path_tracing.trace_ends, settings=settings))(scene, rays)
         ends = traced.ends
-        light = ends.weights[:, :1] * ends.directions
+        light = ends.throughput[:, :1] * ends.directions
         return int(traced.casts), jax.ops.segment_sum(light, ends.rays, num_segments=count)
 
     spared, light = trace(_settings(found))

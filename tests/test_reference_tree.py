@@ -27,7 +27,9 @@ def _rays(count, seed=0):
 
 
 def _shares(ends, count):
-    return np.stack([np.bincount(ends.rays, w, minlength=count) for w in ends.weights.T], axis=-1)
+    return np.stack(
+        [np.bincount(ends.rays, w, minlength=count) for w in ends.throughput.T], axis=-1
+    )
 
 
 @pytest.mark.parametrize("degrees", [0.0, 30.0, 60.0])
@@ -39,9 +41,9 @@ def test_a_slab_splits_light_into_a_geometric_series(degrees):
     ends = reference_tree.trace(slab, BruteForce(slab), origins, direction, Rule(30, "all", 1e-9))
     r = reference.fresnel_by_angles(theta, 1.0, 1.5)
     series = [r, (1 - r) ** 2, r * (1 - r) ** 2, r**2 * (1 - r) ** 2]
-    np.testing.assert_allclose(ends.weights[:4, 0], series, rtol=1e-12)
+    np.testing.assert_allclose(ends.throughput[:4, 0], series, rtol=1e-12)
     up = np.where(ends.directions[:, 2] > 0, 1.0, 0.0)
-    np.testing.assert_allclose(ends.weights[:, 0] @ up, 2 * r / (1 + r), rtol=1e-7)
+    np.testing.assert_allclose(ends.throughput[:, 0] @ up, 2 * r / (1 + r), rtol=1e-7)
 
 
 def test_the_main_path_through_a_ball_obeys_snell():
@@ -85,6 +87,6 @@ def test_tint_is_taken_at_every_meeting():
     box = reference_surfaces.join([_solid(trimesh.creation.box(), inside=1.0, tint=tuple(tint))])
     origins, directions = np.array([[3.0, 0.1, 0.2]]), np.array([[-1.0, 0.0, 0.0]])
     ends = reference_tree.trace(box, BruteForce(box), origins, directions, TREE)
-    np.testing.assert_allclose(ends.weights, tint[None] ** 2, rtol=1e-12)
+    np.testing.assert_allclose(ends.throughput, tint[None] ** 2, rtol=1e-12)
     np.testing.assert_allclose(ends.directions, directions, atol=1e-15)
     assert ends.casts == 3

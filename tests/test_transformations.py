@@ -84,9 +84,9 @@ _traced = jax.jit(_trace)
 def _check_traced(traced):
     paths = jax.tree.map(np.asarray, traced.paths)
     light = np.zeros((4, 3))
-    np.add.at(light, paths.rays, paths.weights)
-    np.testing.assert_allclose(light + traced.lost, 1.0, atol=1e-5)
-    heaviest = paths.weights[[np.argmax(paths.rays == ray) for ray in range(4)], 0]
+    np.add.at(light, paths.rays, paths.throughput)
+    np.testing.assert_allclose(light + traced.dropped, 1.0, atol=1e-5)
+    heaviest = paths.throughput[[np.argmax(paths.rays == ray) for ray in range(4)], 0]
     np.testing.assert_allclose(heaviest, [_THROUGH, _THROUGH, _THROUGH, 1.0], atol=1e-5)
 
 
@@ -106,7 +106,7 @@ def _():
 @_cell("trace", "grad")
 def _():
     def light(index):
-        return jnp.sum(_trace(refref_jax.with_index(_GLASS, index), _ROW).paths.weights)
+        return jnp.sum(_trace(refref_jax.with_index(_GLASS, index), _ROW).paths.throughput)
 
     with pytest.raises(TypeError, match="Use follow_branch"):
         jax.grad(light)(1.5)
@@ -126,7 +126,7 @@ def _():
 def _transmitted(index, ray, *, reflects=(False, False)):
     scene = refref_jax.with_index(_GLASS, index)
     path = refref_jax.follow_branch(scene, ray, jnp.asarray(reflects), settings=_SETTINGS)
-    return path.weights[0]
+    return path.throughput[0]
 
 
 def _colour(index, ray):
@@ -219,7 +219,7 @@ def _():
 @_cell("shade", "vmap")
 def _():
     twice = jax.tree.map(lambda x: jnp.stack([x, x]), _straight())
-    twice = twice._replace(weights=twice.weights * jnp.array([1.0, 0.5])[:, None, None])
+    twice = twice._replace(throughput=twice.throughput * jnp.array([1.0, 0.5])[:, None, None])
     expected = np.stack([np.full((4, 3), 0.5), np.full((4, 3), 0.25)])
     _same(jax.vmap(_brightness, in_axes=(None, 0))(0.5, twice), expected)
 
@@ -227,8 +227,8 @@ def _():
 @_cell("shade", "grad")
 def _():
     paths = _straight()
-    light = lambda scale, weights: jnp.sum(_brightness(scale, paths._replace(weights=weights)))
-    by_scale, by_weights = jax.grad(light, argnums=(0, 1))(0.5, paths.weights)
+    light = lambda scale, weights: jnp.sum(_brightness(scale, paths._replace(throughput=weights)))
+    by_scale, by_weights = jax.grad(light, argnums=(0, 1))(0.5, paths.throughput)
     _same((by_scale, by_weights), (12.0, np.full((4, 3), 0.5)))
 
 
@@ -359,8 +359,8 @@ def _picture(rays, glass=_GLASS, settings=_STRAIGHT):
     return render_known(glass, _wall, rays, settings=settings).linear
 
 
-def _image(rays, geometry=_GLASS):
-    return render_image(_model()._replace(geometry=geometry), rays).linear
+def _image(rays, scene=_GLASS):
+    return render_image(_model()._replace(scene=scene), rays).linear
 
 
 for _name, _function, _instead in [

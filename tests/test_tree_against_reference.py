@@ -70,14 +70,14 @@ def test_images_are_those_of_the_slow_tree(scene, settings, rule):
                 scenes.read_geometry(scene), _rays(origins, directions), settings=settings
             ),
         )
-        assert not traced.lost.any()
+        assert not traced.dropped.any()
         quality, images = [], []
         for ends in (slow, traced.ends):
             seen, _ = background.look(
                 np.asarray(ends.origins, float), np.asarray(ends.directions, float)
             )
             images.append(
-                reference_images.picture(ends.rays, ends.weights, seen, shaped[0].shape[:4])
+                reference_images.image(ends.rays, ends.throughput, seen, shaped[0].shape[:4])
             )
             quality.append(reference_images.psnr(images[-1], view.image[rows], view.mask[rows]))
         assert abs(quality[0] - quality[1]) < 0.5

@@ -83,7 +83,7 @@ def pixel_rays(view: View, rows: np.ndarray, fine: int) -> tuple[np.ndarray, np.
 Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
-def picture(
+def image(
     rays: np.ndarray, weights: np.ndarray, seen: np.ndarray, shape: tuple[int, ...]
 ) -> np.ndarray:
     """Sums paths to rays and averages these over pixels; returns sRGB in `[0, 1]`.

@@ -125,12 +125,14 @@ class BruteForce:
         """Keeps the triangles."""
         self._corners = surfaces.corners
 
-    def __call__(self, origins: np.ndarray, directions: np.ndarray, leaving: np.ndarray) -> Hits:
+    def __call__(
+        self, origins: np.ndarray, directions: np.ndarray, exclude_primitive: np.ndarray
+    ) -> Hits:
         """Returns the closest hits of rays, never on the triangle that they leave (-1: none)."""
         t, uv = in_plane(self._corners[None], origins[:, None], directions[:, None])
         within = (uv.min(-1) >= -_EDGE) & (uv.sum(-1) <= 1.0 + _EDGE)
         inside = within & (t > 0.0)
-        inside &= np.arange(len(self._corners)) != leaving[:, None]
+        inside &= np.arange(len(self._corners)) != exclude_primitive[:, None]
         t = np.where(inside, t, np.inf)
         best = np.argmin(t, axis=1)
         rays = np.arange(len(t))
@@ -152,19 +154,21 @@ class Embree:
         TriangleMesh(self.scene, surfaces.corners.astype(np.float32))
 
     def off_surface(
-        self, origins: np.ndarray, directions: np.ndarray, leaving: np.ndarray
+        self, origins: np.ndarray, directions: np.ndarray, exclude_primitive: np.ndarray
     ) -> np.ndarray:
         """Returns origins just off the triangles that rays leave, on the rays' side."""
-        normals = self._normals[leaving]
+        normals = self._normals[exclude_primitive]
         side = np.sign(np.einsum("ij,ij->i", normals, directions)).astype(origins.dtype)
-        step = np.where(leaving < 0, 0.0, _EMBREE_OFFSET * np.abs(origins).max(-1) * side)
+        step = np.where(exclude_primitive < 0, 0.0, _EMBREE_OFFSET * np.abs(origins).max(-1) * side)
         return origins + step.astype(origins.dtype)[:, None] * normals
 
-    def __call__(self, origins: np.ndarray, directions: np.ndarray, leaving: np.ndarray) -> Hits:
+    def __call__(
+        self, origins: np.ndarray, directions: np.ndarray, exclude_primitive: np.ndarray
+    ) -> Hits:
         """Returns the closest hits of rays, never on the triangle that they leave (-1: none)."""
         count = len(origins)
         hits = Hits(np.full(count, np.inf), np.full(count, -1), np.zeros((count, 2)))
-        starts, waiting = self.off_surface(origins, directions, leaving), np.arange(count)
+        starts, waiting = self.off_surface(origins, directions, exclude_primitive), np.arange(count)
         while len(waiting):
             found = self.scene.run(
                 starts[waiting].astype(np.float32), directions[waiting].astype(np.float32), output=1
@@ -172,7 +176,7 @@ class Embree:
             met = found["primID"] >= 0
             waiting, slots, near = waiting[met], found["primID"][met], found["tfar"][met]
             t, uv = in_plane(self._corners[slots], origins[waiting], directions[waiting])
-            real = (slots != leaving[waiting]) & (t > 0.0)
+            real = (slots != exclude_primitive[waiting]) & (t > 0.0)
             for kept, value in zip(hits, (t, slots, uv), strict=True):
                 kept[waiting[real]] = value[real]
             # A hit that float64 does not confirm is passed, and the ray cast on from behind it.

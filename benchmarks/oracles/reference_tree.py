@@ -33,9 +33,9 @@ class Live(NamedTuple):
 
     origins: np.ndarray
     directions: np.ndarray
-    leaving: np.ndarray
+    exclude_primitive: np.ndarray
     rays: np.ndarray
-    weights: np.ndarray
+    throughput: np.ndarray
     num_bends: np.ndarray
 
 
@@ -45,7 +45,7 @@ class Ends(NamedTuple):
     origins: np.ndarray
     directions: np.ndarray
     rays: np.ndarray
-    weights: np.ndarray
+    throughput: np.ndarray
     num_bends: np.ndarray
     statuses: np.ndarray
     casts: int
@@ -84,7 +84,7 @@ def trace(
     if rule.bends == 0:
         ends, live = [(live, np.full(count, OUT_OF_BENDS))], _take(live, index[:0])
     while len(live.rays):
-        hits = cast(live.origins, live.directions, live.leaving)
+        hits = cast(live.origins, live.directions, live.exclude_primitive)
         casts += len(live.rays)
         met = hits.triangles >= 0
         over = ~met | (live.num_bends >= rule.bends)
@@ -97,7 +97,7 @@ def trace(
             ends.append((_take(reflected, first), np.full(np.sum(first), NOT_TRACED)))
             reflected = _take(reflected, ~first)
         live = Live(*(np.concatenate(pair) for pair in zip(reflected, refracted, strict=True)))
-        live = _take(live, live.weights.max(-1) > 0.0)
+        live = _take(live, live.throughput.max(-1) > 0.0)
     return _join(ends, casts)
 
 
@@ -112,7 +112,7 @@ def _join(ends: list[tuple[Live, np.ndarray]], casts: int) -> Ends:
         joined.origins,
         joined.directions,
         joined.rays,
-        joined.weights,
+        joined.throughput,
         joined.num_bends,
         np.concatenate(statuses),
         casts,
@@ -123,7 +123,7 @@ def _children(
     surfaces: Surfaces, live: Live, triangles: np.ndarray, split: Split, rule: Rule
 ) -> tuple[Live, Live]:
     """Returns the two rays that leave each hit; those that are not followed have weight 0."""
-    tinted = live.weights * surfaces.tints[surfaces.parts[triangles]]
+    tinted = live.throughput * surfaces.tints[surfaces.parts[triangles]]
     followed = {
         "none": np.zeros(len(live.rays)),
         "first": np.where(live.num_bends == 0, split.reflectance, 0.0),
@@ -132,8 +132,8 @@ def _children(
     share = np.where(split.reflectance == 1.0, 1.0, followed[rule.reflections])
     share = share.astype(tinted.dtype)[:, None]
 
-    def child(directions: np.ndarray, weights: np.ndarray) -> Live:
-        return Live(split.points, directions, triangles, live.rays, weights, live.num_bends + 1)
+    def child(directions: np.ndarray, throughput: np.ndarray) -> Live:
+        return Live(split.points, directions, triangles, live.rays, throughput, live.num_bends + 1)
 
     return child(split.reflected, tinted * share), child(split.refracted, tinted * (1.0 - share))
 

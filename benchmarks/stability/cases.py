@@ -86,8 +86,8 @@ def powers_of_two(density: int) -> Found:
     exponents = np.linspace(-10, 10, 2 * density + 1).astype(int)
     for scale in np.exp2(exponents):
         moved = rays._replace(origins=rays.origins * np.float32(scale))
-        geometry = paths.build(body._replace(vertices=scale * body.vertices))
-        other = paths.main_ends(geometry, moved)
+        scene = paths.build(body._replace(vertices=scale * body.vertices))
+        other = paths.main_ends(scene, moved)
         assert np.array_equal(other.num_bends, plain.num_bends)
         apart = np.abs(other.origins / scale - plain.origins)
         turned = np.abs(other.directions - plain.directions)

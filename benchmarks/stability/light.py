@@ -12,7 +12,7 @@ from benchmarks.oracles.reference_surfaces import unit
 from benchmarks.stability import paths
 from benchmarks.stability.cases import RAYS, inner_rays, sphere
 from benchmarks.stability.laws import Found
-from refref_jax.data.scene_assembly import build_geometry
+from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import PAPER, TREE, PathSettings
@@ -48,18 +48,18 @@ def on_surfaces(density: int) -> Found:
         origins = origins[random.integers(0, len(origins), RAYS)]
         directions = unit(random.normal(size=origins.shape))
         rays = balls_and_rays.rays(origins, directions)
-        geometry = paths.build(body)
-        worst = max(worst, _unbalance(geometry, rays, TREE))
-        bends = paths.main_ends(geometry, rays).num_bends
+        scene = paths.build(body)
+        worst = max(worst, _unbalance(scene, rays, TREE))
+        bends = paths.main_ends(scene, rays).num_bends
         # Rounding decides whether a start is inside; if it is, steep light leaves at once.
         outwards = np.sum(origins * directions, axis=-1) > 0.8
         assert np.all(bends[outwards] <= 1)
     return Found(worst, 3 * RAYS)
 
 
-def _unbalance(geometry, rays, settings) -> float:
+def _unbalance(scene, rays, settings) -> float:
     """Returns how far weights and losses are from summing to 1."""
-    traced = paths.trace(geometry, rays, settings=settings)
+    traced = paths.trace(scene, rays, settings=settings)
     assert np.all(traced.ends.num_bends <= settings.max_bends)
     assert all(np.all(np.isfinite(x)) for x in traced.ends)
     return float(np.abs(paths.energy(traced, len(rays.radii)) - 1.0).max())
@@ -67,7 +67,7 @@ def _unbalance(geometry, rays, settings) -> float:
 
 def white_furnace(density: int) -> Found:
     """Sums of weights and losses in clear glass, with ample room and with too little."""
-    geometry, rays = paths.build(paths.torus()), inner_rays(1.4)
+    scene, rays = paths.build(paths.torus()), inner_rays(1.4)
     all_settings = [
         PathSettings(
             24, "all", min_throughput=0.0, live_per_ray=1.0, segments_per_ray=4.0, paths_per_ray=1.0
@@ -87,7 +87,7 @@ def white_furnace(density: int) -> Found:
         PathSettings(24, "all", min_throughput=0.001),
         PAPER,
     ][: 2 * density]
-    worst = max(_unbalance(geometry, rays, settings) for settings in all_settings)
+    worst = max(_unbalance(scene, rays, settings) for settings in all_settings)
     return Found(worst, len(all_settings) * RAYS)
 
 
@@ -104,9 +104,9 @@ def nested_and_overlapping(density: int) -> Found:
     worst = 0.0
     for pair in bodies:
         for rule in ("nested", "facing", "priority"):
-            built = build_geometry(pair, [NO_PARENT, 0], rule=rule)
-            geometry = jax.tree.map(jnp.asarray, built)
-            worst = max(worst, _unbalance(geometry, inner_rays(0.9), TREE))
+            built = assemble_scene(pair, [NO_PARENT, 0], rule=rule)
+            scene = jax.tree.map(jnp.asarray, built)
+            worst = max(worst, _unbalance(scene, inner_rays(0.9), TREE))
     del density
     return Found(worst, 9 * RAYS)
 
@@ -137,7 +137,7 @@ def index_matched(density: int) -> Found:
         traced = paths.trace(paths.build(body), rays, settings=TREE)
         ends = traced.ends
         there = ends.statuses != PathStatus.EMPTY
-        assert np.sum(there) == RAYS and np.all(ends.weights[there] == 1.0)
+        assert np.sum(there) == RAYS and np.all(ends.throughput[there] == 1.0)
         start, along = (np.asarray(x, float)[ends.rays] for x in (rays.origins, rays.directions))
         turned = np.linalg.norm(ends.directions - along, axis=-1)
         apart = np.linalg.norm(np.cross(ends.origins - start, along), axis=-1)
@@ -151,14 +151,14 @@ def reversibility(density: int) -> Found:
     for body, radius in ((sphere(), 0.5), (paths.slab(_CUBE), 0.5)):
         for seed in range(density):
             rays = paths.rays_at(paths.random_points(RAYS, radius=radius, seed=seed))
-            geometry = paths.build(body)
-            ends = paths.main_ends(geometry, rays)
+            scene = paths.build(body)
+            ends = paths.main_ends(scene, rays)
             escaped = ends.statuses == PathStatus.ESCAPED
             back = rays._replace(
                 origins=jnp.asarray(ends.origins + 4.0 * ends.directions),
                 directions=jnp.asarray(-ends.directions),
             )
-            home = paths.main_ends(geometry, back)
+            home = paths.main_ends(scene, back)
             same = escaped & (home.num_bends == ends.num_bends)
             assert same[escaped].mean() > 0.99
             turned = home.directions + np.asarray(rays.directions)
@@ -172,11 +172,9 @@ def whispering_gallery(density: int) -> Found:
     sine = np.linspace(0.75, 0.999, RAYS)
     origins = np.stack([0.0 * sine, 0.0 * sine + 0.001, sine], axis=-1)
     rays = balls_and_rays.rays(origins, [1.0, 0.0, 0.0])
-    worst, geometry = 0.0, paths.build(sphere())
+    worst, scene = 0.0, paths.build(sphere())
     for bends in (24, 100)[: 1 + (density > 1)]:
-        traced = paths.trace(
-            geometry, rays, settings=PathSettings(bends, "all", min_throughput=0.02)
-        )
+        traced = paths.trace(scene, rays, settings=PathSettings(bends, "all", min_throughput=0.02))
         there = traced.ends.statuses != PathStatus.EMPTY
         assert np.all(traced.ends.statuses[there] == PathStatus.OUT_OF_BENDS)
         assert np.all(traced.ends.num_bends[there] == bends)

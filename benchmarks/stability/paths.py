@@ -14,7 +14,7 @@ import trimesh
 from benchmarks import balls_and_rays
 from benchmarks.oracles import reference_surfaces, reference_tree
 from refref_jax.data.meshes import MeshPart
-from refref_jax.data.scene_assembly import build_geometry
+from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.path_settings import PathSettings
 
@@ -74,31 +74,29 @@ def part_from(mesh, *, index=1.5, shading="smooth"):
 
 
 def build(*parts):
-    """Returns the geometry of parts that do not contain one another."""
-    built = build_geometry(parts, [NO_PARENT] * len(parts), rule="nested")
+    """Returns the scene of parts that do not contain one another."""
+    built = assemble_scene(parts, [NO_PARENT] * len(parts), rule="nested")
     return jax.tree.map(jnp.asarray, built)
 
 
-def trace(geometry, rays, *, settings):
+def trace(scene, rays, *, settings):
     """Traces, and refuses any NaN on the way."""
     with jax.debug_nans(True):
-        return jax.tree.map(
-            np.asarray, balls_and_rays.trace_ends(geometry, rays, settings=settings)
-        )
+        return jax.tree.map(np.asarray, balls_and_rays.trace_ends(scene, rays, settings=settings))
 
 
-def trace_in_double(geometry, rays, *, settings):
+def trace_in_double(scene, rays, *, settings):
     """Traces in double precision what was built in single."""
 
     def widen(x):
         return jnp.asarray(x, jnp.float64) if x.dtype == np.float32 else jnp.asarray(x)
 
-    geometry, rays = (jax.tree.map(np.asarray, x) for x in (geometry, rays))
+    scene, rays = (jax.tree.map(np.asarray, x) for x in (scene, rays))
     # What was of length 1 in single precision is not in double, and no index would matter more.
     rays = rays._replace(directions=reference_surfaces.unit(rays.directions.astype(float)))
     # Integers are 64 bits wide then, and meet those of the scene.
     with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
-        return trace(*(jax.tree.map(widen, x) for x in (geometry, rays)), settings=settings)
+        return trace(*(jax.tree.map(widen, x) for x in (scene, rays)), settings=settings)
 
 
 def surfaces_of(parts):
@@ -114,9 +112,9 @@ def surfaces_of(parts):
     return joined._replace(corners=halved(joined.corners), inside=halved(joined.inside))
 
 
-def main_ends(geometry, rays, *, tracer=trace):
+def main_ends(scene, rays, *, tracer=trace):
     """Returns the end of the main path of every ray, in the order of the rays."""
-    ends = tracer(geometry, rays, settings=MAIN).ends
+    ends = tracer(scene, rays, settings=MAIN).ends
     order = np.argsort(ends.rays)
     assert np.array_equal(ends.rays[order], np.arange(len(order)))
     return jax.tree.map(lambda x: x[order], ends)
@@ -163,7 +161,7 @@ def random_points(count, *, radius=1.0, seed=1):
 
 def energy(traced, count):
     """Returns weights and losses, summed for each ray."""
-    sums = np.array(traced.lost, float)
-    np.add.at(sums, traced.ends.rays, traced.ends.weights.astype(float))
+    sums = np.array(traced.dropped, float)
+    np.add.at(sums, traced.ends.rays, traced.ends.throughput.astype(float))
     assert sums.shape == (count, 3)
     return sums

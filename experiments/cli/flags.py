@@ -5,38 +5,53 @@ that no command accepts a flag that it ignores. Values are validated during pars
 imported.
 """
 
-from __future__ import annotations
-
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, get_args
 
 from absl import flags
-from etils import epy
 
 from experiments.cli import app
 from experiments.runs import processes, view_numbers
 from refref_jax import choices
 from refref_jax.optics.path_settings import PathSettings, make_path_settings
 
-with epy.lazy_imports():
-    from experiments.r3f import records
-
 flags.disclaim_key_flags()
 
-# Choices of the library; a test keeps those of the geometry equal to their definition.
+# Choices of the library.
 SPLITS = get_args(choices.Split)
 PRESETS = get_args(choices.PresetName)
 RULES = get_args(choices.RuleName)
-GEOMETRIES = ("hull", "occupancy")
 
 SCENE_FORMS = "a folder, or hf:CONFIG/SCENE of the published data set"
 
 # Files that identify the folders of a run and of a reconstruction.
 RUN = "config.json"
 RECONSTRUCTION = "reconstruction.json"
+
+
+# ---- Values of earlier versions ----
+class _EnumParser(flags.EnumParser):
+    def __init__(self, values: Sequence[str], formerly: Mapping[str, str]):
+        super().__init__(values)
+        self._formerly = formerly
+
+    def parse(self, argument: str) -> str:
+        return super().parse(self._formerly.get(argument, argument))
+
+
+def enum(
+    name: str, default: str | None, values: Sequence[str], what: str, *, formerly: Mapping[str, str]
+) -> flags.FlagHolder[str]:
+    """Defines a choice whose values had other names in earlier versions, which are accepted.
+
+    It is required if its default is `None`.
+    """
+    flag = flags.EnumFlag(name, default, what, enum_values=list(values))
+    flag.parser = _EnumParser(values, formerly)
+    return flags.DEFINE_flag(flag, required=default is None)
 
 
 # ---- Runs ----
@@ -206,47 +221,6 @@ def space() -> SpaceFlags:
     finite = "It must be a finite number of world units."
     flags.register_validator("radius", lambda x: x is None or math.isfinite(x), finite)
     return SpaceFlags(background, radius)
-
-
-# ---- Reconstruction ----
-class ReconstructionFlags(NamedTuple):
-    """Flags of all commands that reconstruct an object."""
-
-    geometry: flags.FlagHolder[str]
-    resolution: flags.FlagHolder[int]
-    outliers: flags.FlagHolder[int]
-    light_steps: flags.FlagHolder[int]
-
-    def chosen(
-        self, *, index: float | None, seed: int, space: str | None, radius: float | None
-    ) -> records.ReconstructionConfig:
-        """Returns the options of the reconstruction; an index of `None` is estimated."""
-        geometry, resolution, outliers, light_steps = (each.value for each in self)
-        return records.ReconstructionConfig(
-            geometry, resolution, outliers, index, space, radius, light_steps, seed
-        )
-
-
-def reconstruction() -> ReconstructionFlags:
-    """Defines the flags of a reconstruction."""
-    how = "Method that turns masks into an object: their exact visual hull, or an occupancy field "
-    how += "trained on them."
-    cells = "Cells along the longest edge of the grid around the object."
-    wrong = "Number of masks that may be wrong, which reduces the accuracy of a hull everywhere."
-    steps = "Steps of the refinement of the surface with refracted light; 0 skips it. "
-    steps += "The result is kept only if it explains validation images better."
-    found = ReconstructionFlags(
-        flags.DEFINE_enum("geometry", "hull", GEOMETRIES, how),
-        flags.DEFINE_integer("resolution", 128, cells, 16, 1024),
-        flags.DEFINE_integer("outliers", 0, wrong, 0),
-        flags.DEFINE_integer("light_steps", 0, steps, 0),
-    )
-    flags.register_multi_flags_validator(
-        ["geometry", "outliers"],
-        lambda given: given["geometry"] == "hull" or not given["outliers"],
-        "--outliers has no effect on an occupancy field, which weighs all masks. Remove either.",
-    )
-    return found
 
 
 # ---- Devices and processes ----

@@ -51,7 +51,7 @@ _SHOWN_COMPLAINTS = 3
 
 def main(folder: str) -> None:
     """Checks every scene of a folder, and writes the report."""
-    settings = dataclasses.replace(_SETTINGS.chosen("tree"), unfinished="dark")
+    settings = dataclasses.replace(_SETTINGS.chosen("tree"), truncated_paths="black")
     checked, side = Path(folder), choices.side_of(_RAYS_PER_PIXEL.value)
     out = Path(_OUT.value) if _OUT.value else checked
     page, figures = out / "check.html", out / "check.json"

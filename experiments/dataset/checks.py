@@ -62,7 +62,7 @@ class View(NamedTuple):
       rgb: our rendering.
       psnr: PSNR over the whole image, dB.
       psnr_masked: masked PSNR, dB.
-      lost: share of the throughput that was dropped because the path buffer was full.
+      dropped: share of the throughput that was dropped because the path buffer was full.
       mask_share: share of pixels where mask and traced silhouette differ.
       depth_share: share of pixels away from silhouettes whose depths agree; NaN without a map.
       depth_error: the 99.9th percentile of the depths' difference there, world units.
@@ -74,7 +74,7 @@ class View(NamedTuple):
     rgb: Float[np.ndarray, "h w 3"]
     psnr: float
     psnr_masked: float
-    lost: float
+    dropped: float
     mask_share: float
     depth_share: float
     depth_error: float
@@ -126,7 +126,7 @@ def compare_view(scene: KnownScene, index: int, *, settings: PathSettings, side:
     rendered = known_scene.render_view(scene, index, settings=settings, side=side)
     measured = known_scene.measure(scene, index, rendered.rgb)
     first = find_first_surface(
-        scene.geometry.surfaces, cameras.image_rays(scene.frames.cameras, index)
+        scene.objects.surfaces, cameras.image_rays(scene.frames.cameras, index)
     )
     depth = cameras.distance_to_planar_depth(scene.frames.cameras, first.distances)
     hit = np.isfinite(depth)
@@ -139,7 +139,7 @@ def compare_view(scene: KnownScene, index: int, *, settings: PathSettings, side:
         rgb=rendered.rgb,
         psnr=_number(measured, "psnr"),
         psnr_masked=_number(measured, "psnr_masked"),
-        lost=rendered.lost,
+        dropped=rendered.dropped,
         mask_share=float(np.mean(mask != hit)),
         depth_share=float(np.mean(errors <= DEPTH)) if errors.size else np.nan,
         depth_error=float(np.quantile(errors, DEPTH_SHARE)) if errors.size else np.nan,

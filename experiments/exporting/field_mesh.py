@@ -92,7 +92,7 @@ def sample_density(
     axes = [low[i] + spacing * np.arange(counts[i]) for i in range(3)]
     unknown = np.zeros(counts, bool)
     if model.config.interior != "field":
-        unknown = inside_bodies(model.geometry, axes)
+        unknown = inside_bodies(model.scene, axes)
     values = np.zeros(counts, np.float32)
     for i, x in enumerate(axes[0]):
         rows = np.argwhere(~unknown[i])
@@ -143,7 +143,7 @@ def _chunk(params, points, directions, config, width):
 
 
 def inside_bodies(
-    geometry: Scene, axes: Sequence[Float[np.ndarray, " ticks"]]
+    scene: Scene, axes: Sequence[Float[np.ndarray, " ticks"]]
 ) -> Bool[np.ndarray, "nx ny nz"]:
     """Returns the mask of grid points inside any part of the scene.
 
@@ -151,11 +151,11 @@ def inside_bodies(
     point of a part's box, and the majority counts: at a grazing hit a shading normal may mislead.
 
     Args:
-      geometry: scene with the objects.
+      scene: scene with the objects.
       axes: coordinates of the grid along x, y and z, ascending.
     """
     inside = np.zeros([len(axis) for axis in axes], bool)
-    for surfaces, corners in split_parts(geometry):
+    for surfaces, corners in split_parts(scene):
         low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
         near = tuple(
             slice(*np.searchsorted(axis, (low[i], high[i]))) for i, axis in enumerate(axes)
@@ -171,10 +171,10 @@ def inside_bodies(
 
 
 def split_parts(
-    geometry: Scene,
+    scene: Scene,
 ) -> Iterator[tuple[Surfaces, Float[np.ndarray, "faces 3 3"]]]:
     """Yields the surfaces of each part, and their triangles, in the order of their numbers."""
-    surfaces = jax.device_get(geometry.surfaces)
+    surfaces = jax.device_get(scene.surfaces)
     real = slice(None, -LEAF_SIZE)  # the last slots fill up the last leaf
     triangles, owners = surfaces.bvh.triangles[real], surfaces.parts[real]
     for part in np.unique(owners):

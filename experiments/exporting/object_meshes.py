@@ -13,7 +13,7 @@ from experiments.r3f import object_source, records
 from refref_jax.data import meshes
 from refref_jax.geometry.triangle_meshes import Mesh
 from refref_jax.optics.scene import Scene
-from refref_jax.render.checkpoint_io import load_geometry
+from refref_jax.render.checkpoint_io import load_scene
 
 
 def write(run: Path, out: Path, *, overwrite: bool) -> list[Path]:
@@ -34,7 +34,7 @@ def write(run: Path, out: Path, *, overwrite: bool) -> list[Path]:
     if records.exists(run):
         found = [object_source.read_mesh(run, _finished(run))]
     else:
-        found = read_meshes(load_geometry(run))
+        found = read_meshes(load_scene(run))
     if not found:
         raise ValueError(
             f"{run} has no object: it was trained along straight rays, or without meshes. Export "
@@ -51,10 +51,10 @@ def write(run: Path, out: Path, *, overwrite: bool) -> list[Path]:
     return paths
 
 
-def read_meshes(geometry: Scene) -> list[Mesh]:
+def read_meshes(scene: Scene) -> list[Mesh]:
     """Returns the parts of a run's scene in their order; coincident vertices are merged."""
     found = []
-    for surfaces, triangles in split_parts(geometry):
+    for surfaces, triangles in split_parts(scene):
         normals = surfaces.normals[: len(triangles)].astype(np.float64)
         corners = surfaces.bvh.triangles[: len(triangles)].astype(np.float64)
         vertices, index = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)

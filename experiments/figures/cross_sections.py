@@ -88,7 +88,7 @@ def rays_towards(distance: float, heights: Sequence[float]) -> list[Rays]:
 
 def lines_within(paths: PixelPaths, half: float) -> list[Line]:
     """Returns paths from above, cut at their last exit from the square of half edge `half`."""
-    shares = paths.weights.mean(axis=-1)
+    shares = paths.throughput.mean(axis=-1)
     return [
         Line(_cut(line[:, :2].astype(float), half), float(share))
         for line, share in zip(paths.polylines, shares, strict=True)

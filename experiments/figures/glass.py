@@ -127,7 +127,7 @@ def draw_tree(scene: KnownScene, folder: Path, path: Path) -> None:
 
 
 def _follow(scene: KnownScene, rays: list[Rays], settings: PathSettings) -> list[PixelPaths]:
-    trace = functools.partial(trace_pixel, scene.geometry, settings=settings, reach=_FAR)
+    trace = functools.partial(trace_pixel, scene.objects, settings=settings, reach=_FAR)
     return [trace(ray) for ray in rays]
 
 
@@ -140,11 +140,9 @@ def draw_distances(scene: KnownScene, half: float, path: Path) -> None:
       path: output file.
     """
     rays = cameras.image_rays(scene.frames.cameras, 0)
-    first = find_first_surface(scene.geometry.surfaces, rays).distances
+    first = find_first_surface(scene.objects.surfaces, rays).distances
     flat = Rays(*(x.reshape(-1, *x.shape[2:]) for x in rays))
-    straight, bent = (
-        np.asarray(x).reshape(first.shape) for x in _walls(scene.geometry, flat, half)
-    )
+    straight, bent = (np.asarray(x).reshape(first.shape) for x in _walls(scene.objects, flat, half))
     write_distances(
         path,
         _truth(scene),
@@ -158,14 +156,12 @@ def draw_distances(scene: KnownScene, half: float, path: Path) -> None:
 
 @functools.partial(jax.jit, static_argnames="half")
 def _walls(
-    geometry: Scene, rays: Rays, half: float
+    scene: Scene, rays: Rays, half: float
 ) -> tuple[Float[Array, " rays"], Float[Array, " rays"]]:
     """Returns the arc length of light to the background, straight and refracted."""
     leave = jax.vmap(functools.partial(scene_bounds.exit_distance, Domain(half, "bounded")))
     # Without reflections every ray has one path.
-    ends = path_tracing.trace_ends(
-        geometry, rays, settings=PATH_PRESETS["paper_no_reflection"]
-    ).ends
+    ends = path_tracing.trace_ends(scene, rays, settings=PATH_PRESETS["paper_no_reflection"]).ends
     reached = jax.numpy.where(
         light_paths.exists(ends), ends.tau + leave(ends.origins, ends.directions), -jax.numpy.inf
     )

@@ -23,7 +23,7 @@ from experiments.figures import style
 from experiments.figures.style import COLOURS, pyplot
 from refref_jax.choices import Space
 from refref_jax.data import masks, scene_folder
-from refref_jax.data.scene_assembly import build_geometry
+from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.geometry.cameras import pixel_rays
 from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import Mesh
@@ -192,7 +192,7 @@ def learn_background(
     )
     wanted = resolve(config, read_facts(config.scene, parts=()))
     if not run_folder.exists(run):
-        empty = build_geometry([], [], rule="nested")
+        empty = assemble_scene([], [], rule="nested")
         run_folder.create(run, wanted.config, wanted.model, empty)
     _refuse_another(run, checkpoint_io.read_static(run), wanted.model)
     with app.Interrupt() as interrupt, ProgressBar("train", steps) as bar:

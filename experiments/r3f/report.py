@@ -165,11 +165,11 @@ def _distances(first: FirstSurface, rays: Rays, truth: Mesh) -> Float[np.ndarray
 
 
 def _within(view: SurfaceView, window: Window) -> SurfaceView:
-    pictures_of_view = view._asdict()
-    name = pictures_of_view.pop("name")
+    panels_of_view = view._asdict()
+    name = panels_of_view.pop("name")
     parts = (
-        None if picture is None else report_figures.cut_out(picture, window)
-        for picture in pictures_of_view.values()
+        None if panel is None else report_figures.cut_out(panel, window)
+        for panel in panels_of_view.values()
     )
     return SurfaceView(name, *parts)
 

@@ -115,12 +115,12 @@ def windows_around(areas: Sequence[Bool[np.ndarray, "h w"]], *, margin: float) -
     return [Window(float(top), float(left), side / height) for top, left in corners]
 
 
-def cut_out(picture: Shaped[np.ndarray, "h w *channels"], window: Window) -> np.ndarray:
+def cut_out(image: Shaped[np.ndarray, "h w *channels"], window: Window) -> np.ndarray:
     """Returns the part of an image in a window, rounded to pixels."""
-    height = len(picture)
+    height = len(image)
     top, left = math.floor(window.top * height), math.floor(window.left * height)
     side = max(1, math.ceil(window.side * height))
-    return picture[top : top + side, left : left + side]
+    return image[top : top + side, left : left + side]
 
 
 def shrink_any(area: Bool[np.ndarray, "h w"], stride: int) -> Bool[np.ndarray, "sh sw"]:
@@ -128,16 +128,16 @@ def shrink_any(area: Bool[np.ndarray, "h w"], stride: int) -> Bool[np.ndarray, "
     return _blocks(area, stride).any(axis=(1, 3))
 
 
-def shrink(picture: Num[np.ndarray, "h w 3"], stride: int) -> Num[np.ndarray, "sh sw 3"]:
+def shrink(image: Num[np.ndarray, "h w 3"], stride: int) -> Num[np.ndarray, "sh sw 3"]:
     """Downsamples an image by a stride, as means."""
-    return _blocks(picture, stride).mean(axis=(1, 3))
+    return _blocks(image, stride).mean(axis=(1, 3))
 
 
-def _blocks(picture: Shaped[np.ndarray, "h w *channels"], stride: int) -> np.ndarray:
+def _blocks(image: Shaped[np.ndarray, "h w *channels"], stride: int) -> np.ndarray:
     """Splits an image into squares; the last pixel is repeated at its ends."""
-    short = [-length % stride for length in picture.shape[:2]]
-    ends = [(0, short[0]), (0, short[1]), *[(0, 0)] * (picture.ndim - 2)]
-    padded = np.pad(picture, ends, mode="edge")
+    short = [-length % stride for length in image.shape[:2]]
+    ends = [(0, short[0]), (0, short[1]), *[(0, 0)] * (image.ndim - 2)]
+    padded = np.pad(image, ends, mode="edge")
     height, width, *channels = padded.shape
     return padded.reshape(height // stride, stride, width // stride, stride, *channels)
 
@@ -192,11 +192,11 @@ def colour_overlap(outline: Outline, window: Window) -> Float[np.ndarray, "ph pw
     stride = -(-max(mask.shape) // _PIXELS)
     grey = np.mean(shrink(image / 255.0, stride), axis=-1, keepdims=True)
     both = shrink_any(mask & silhouette, stride)
-    picture = np.repeat(1.0 - _CONTRAST * (1.0 - grey), 3, axis=-1)
-    picture[both] *= _tinted()
-    picture[shrink_any(mask & ~silhouette, stride)] = to_rgb(MISSING)
-    picture[shrink_any(silhouette & ~mask, stride)] = to_rgb(EXCESS)
-    return picture
+    drawn = np.repeat(1.0 - _CONTRAST * (1.0 - grey), 3, axis=-1)
+    drawn[both] *= _tinted()
+    drawn[shrink_any(mask & ~silhouette, stride)] = to_rgb(MISSING)
+    drawn[shrink_any(silhouette & ~mask, stride)] = to_rgb(EXCESS)
+    return drawn
 
 
 def draw_errors(path: Path, outlines: Sequence[Outline]) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from absl import flags
 
 from experiments.cli import flags as cli_flags
+from experiments.r3f import flags as r3f_flags
 from experiments.runs import config_flags, refraction_indices
 from refref_jax.training.config import TrainConfig
 
@@ -23,7 +24,7 @@ METHOD = flags.DEFINE_enum(
     "masks only, from which one object and its index are reconstructed into {out}/r3f. Then --ior "
     "is the index of that object, as in 1.5; it is estimated by default.",
 )
-_RECONSTRUCTED = cli_flags.reconstruction()
+_RECONSTRUCTED = r3f_flags.reconstruction()
 FLAGS = (METHOD, *_RECONSTRUCTED)
 """Flags of a new run, which cannot change when it is resumed."""
 

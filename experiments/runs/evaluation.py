@@ -18,15 +18,15 @@ def shown_views(count: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, _SHOWN).astype(int)).tolist()
 
 
-def warn_of_lost_light(lost: float, *, advice: str) -> None:
+def warn_of_dropped(dropped: float, *, advice: str) -> None:
     """Prints a warning if path buffers overflowed and dropped a visible share of the throughput.
 
     Args:
-      lost: dropped share of the throughput.
+      dropped: dropped share of the throughput.
       advice: sentence that suggests a fix.
     """
-    if lost > _WORTH_A_WARNING:
+    if dropped > _WORTH_A_WARNING:
         print(
-            f"warning: path buffer overflow: {100 * lost:.1f} % of the throughput was dropped, "
+            f"warning: path buffer overflow: {100 * dropped:.1f} % of the throughput was dropped, "
             f"images are too dark. {advice}"
         )

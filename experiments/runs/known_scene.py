@@ -14,7 +14,7 @@ from refref_jax import metrics
 from refref_jax.data import background, mesh_checks, mesh_queries, meshes, scene_folder, scene_names
 from refref_jax.data.mesh_queries import Containment
 from refref_jax.data.meshes import MeshPart
-from refref_jax.data.scene_assembly import build_geometry
+from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.media import interior_slots
@@ -30,23 +30,24 @@ class KnownScene(NamedTuple):
 
     Attributes:
       name: name of the folder.
-      geometry: scene that refracts and reflects the rays.
+      objects: scene that refracts and reflects the rays.
       radiance: background radiance.
       frames: selected views.
       indices: number of each view in its split.
       images: true images of the views, 8-bit sRGB.
       masks: object masks, or `None` if the split has none.
-      inside: interior list of each view's camera; `None` if the interface rule does not need it.
+      interior_list: interior list of each view's camera; `None` if the interface rule does not need
+        it.
     """
 
     name: str
-    geometry: Scene
+    objects: Scene
     radiance: Radiance
     frames: scene_folder.Frames
     indices: tuple[int, ...]
     images: UInt8[np.ndarray, "views h w 3"]
     masks: Bool[np.ndarray, "views h w"] | None
-    inside: Int[np.ndarray, "views slots"] | None
+    interior_list: Int[np.ndarray, "views slots"] | None
 
 
 class View(NamedTuple):
@@ -56,14 +57,15 @@ class View(NamedTuple):
       rgb: sRGB in `[0, 1]`.
       casts: closest-hit queries per camera ray.
       paths: light paths per camera ray.
-      lost: share of the throughput dropped because buffers were full, mean over rays and channels.
+      dropped: share of the throughput dropped because buffers were full, mean over rays and
+        channels.
       seconds: time to render the view.
     """
 
     rgb: Float[np.ndarray, "h w 3"]
     casts: float
     paths: float
-    lost: float
+    dropped: float
     seconds: float
 
 
@@ -113,18 +115,18 @@ def build_scene(
       ValueError: if the background is unknown, or an image is missing or broken.
     """
     frames = _choose(frames, chosen)
-    geometry = build_geometry(parts, tree.parents, rule=rule)
+    objects = assemble_scene(parts, tree.parents, rule=rule)
     return KnownScene(
         name=scene_names.of_folder(scene),
-        geometry=jax.device_put(geometry),
+        objects=jax.device_put(objects),
         radiance=jax.device_put(radiance_of(background.read_background(scene))),
         frames=frames,
         indices=tuple(chosen),
         images=scene_folder.read_images(frames),
         masks=scene_folder.read_masks(frames) if frames.masks else None,
-        inside=(
+        interior_list=(
             mesh_queries.parts_around(parts, frames.cameras.poses[:, :, 3])
-            if interior_slots(geometry.interfaces)
+            if interior_slots(objects.interfaces)
             else None
         ),
     )
@@ -154,7 +156,7 @@ def render_view(scene: KnownScene, view: int, *, settings: PathSettings, side: i
         rgb=np.clip(np.asarray(colour.linear_to_srgb(linear)), 0.0, 1.0),
         casts=seen.casts / seen.paths.size,
         paths=float(np.mean(seen.paths)),
-        lost=float(np.mean(seen.lost)),
+        dropped=float(np.mean(seen.dropped)),
         seconds=seconds,
     )
 
@@ -179,10 +181,14 @@ def measure(
 
 
 def _render(scene: KnownScene, view: int, rays: Rays, settings: PathSettings) -> KnownRendering:
-    inside = scene.inside
-    if inside is not None:
-        inside = np.broadcast_to(inside[view], (*rays.radii.shape, inside.shape[1]))
-    return render_known(scene.geometry, scene.radiance, rays, settings=settings, inside=inside)
+    interior_list = scene.interior_list
+    if interior_list is not None:
+        interior_list = np.broadcast_to(
+            interior_list[view], (*rays.radii.shape, interior_list.shape[1])
+        )
+    return render_known(
+        scene.objects, scene.radiance, rays, settings=settings, interior_list=interior_list
+    )
 
 
 def _choose(frames: scene_folder.Frames, chosen: Sequence[int]) -> scene_folder.Frames:

@@ -21,8 +21,8 @@ _GREY = "#777777"
 _LABEL_WIDTH = 34.0
 
 _SWEEPS = {
-    "cut": "cut: throughput threshold",
-    "bends": "bends: max bends of a path",
+    "min_throughput": "throughput threshold",
+    "max_bends": "maximum bends of a path",
 }
 _COSTS = {
     "casts_per_pixel": ("ray casts per pixel", 1.0),
@@ -34,7 +34,7 @@ class Setting(NamedTuple):
     """One setting of a sweep over path settings.
 
     Attributes:
-      sweep: varied option, `cut` or `bends`; `settings` for a single preset.
+      sweep: varied option, `min_throughput` or `max_bends`; `settings` for a single preset.
       name: label in figures.
       settings: path settings.
     """
@@ -49,31 +49,31 @@ class Trial(NamedTuple):
 
     Attributes:
       scene: name of the scene.
-      sweep: varied option: `cut`, `bends`, or `settings` for a single preset.
+      sweep: varied option: `min_throughput`, `max_bends`, or `settings` for a single preset.
       name: value of that option, or name of the preset.
-      cut: throughput threshold.
-      bends: max bends.
+      min_throughput: throughput threshold.
+      max_bends: max bends.
       psnr: PSNR over the image, dB.
       psnr_masked: masked PSNR, dB.
       psnr_outside: PSNR outside the mask, dB.
       casts_per_pixel: closest-hit queries per pixel.
       paths_per_pixel: light paths per pixel.
       seconds_per_pixel: rendering time per pixel, seconds.
-      lost_energy: share of the throughput that was dropped because the path buffer was full.
+      dropped: share of the throughput that was dropped because the path buffer was full.
     """
 
     scene: str
     sweep: str
     name: str
-    cut: float
-    bends: int
+    min_throughput: float
+    max_bends: int
     psnr: float | None
     psnr_masked: float
     psnr_outside: float | None
     casts_per_pixel: float
     paths_per_pixel: float
     seconds_per_pixel: float
-    lost_energy: float
+    dropped: float
 
 
 def measure_all(chosen: list[KnownScene], plan: list[Setting], side: int) -> Iterator[Trial]:
@@ -99,15 +99,15 @@ def measure_one(scene: KnownScene, setting: Setting, side: int) -> Trial:
         scene=scene.name,
         sweep=setting.sweep,
         name=setting.name,
-        cut=setting.settings.min_throughput,
-        bends=setting.settings.max_bends,
+        min_throughput=setting.settings.min_throughput,
+        max_bends=setting.settings.max_bends,
         psnr=evaluation.mean_of(measured, "psnr"),
         psnr_masked=evaluation.mean_of(measured, "psnr_masked"),
         psnr_outside=evaluation.mean_of(measured, "psnr_outside"),
         casts_per_pixel=float(np.mean([view.casts for view in views])),
         paths_per_pixel=float(np.mean([view.paths for view in views])),
         seconds_per_pixel=sum(view.seconds for view in views) / (pixels * len(views)),
-        lost_energy=float(np.mean([view.lost for view in views])),
+        dropped=float(np.mean([view.dropped for view in views])),
     )
 
 
@@ -211,7 +211,7 @@ def _label_points(
 
 def _fixed(trials: Sequence[Trial], sweep: str) -> str:
     """Returns the value that is constant over all trials of a sweep, as text."""
-    other = "bends" if sweep == "cut" else "cut"
+    other = "max_bends" if sweep == "min_throughput" else "min_throughput"
     values = {getattr(trial, other) for trial in trials if trial.sweep == sweep}
     return f"; {other} {values.pop():g}" if len(values) == 1 else ""
 

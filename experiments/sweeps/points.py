@@ -1,8 +1,8 @@
 """The points of a sweep: a base, and variants with one changed option each.
 
-A *knob* is an option of `experiments.train`, or `rays_per_pixel`, an option of
-`experiments.evaluate`. A point is named after the option and its value, as in `cut=0.01`; commas
-become `+`, so that points can be listed.
+An option is one of `experiments.train`, or `rays_per_pixel` of `experiments.evaluate`. A point is
+named after its option and value, as in `min_throughput=0.01`; commas become `+`, so that points can
+be listed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,6 +11,7 @@ from typing import NamedTuple
 from experiments.cli import app
 from refref_jax.fields import registry
 from refref_jax.optics.path_settings import PATH_PRESETS
+from refref_jax.training import config as training_config
 from refref_jax.training import resolve
 from refref_jax.training.presets import PRESETS, Bounds
 
@@ -21,7 +22,7 @@ OF_EVALUATION = ("rays_per_pixel",)
 
 _BASE_OPTIONS = {"paths": "tree"}
 
-_OF_BENT_LIGHT = ("cut", "bends", "interior", "reentry", "tints")
+_OF_BENT_PATHS = ("min_throughput", "max_bends", "interior", "reentry", "tints")
 
 _NOT_OF_BASE = ("preset", "seed", "steps", "scene", "out", "resume", "run", "limit")
 
@@ -33,14 +34,14 @@ class Point(NamedTuple):
 
     Attributes:
       name: `base`, or option and value.
-      knob: changed option; empty for the base.
+      option: changed option; empty for the base.
       value: value of that option; empty for the base.
       training: options of `experiments.train`, as `--name=value`, without scene and folder.
       evaluation: options of `experiments.evaluate`, likewise.
     """
 
     name: str
-    knob: str
+    option: str
     value: str
     training: tuple[str, ...]
     evaluation: tuple[str, ...]
@@ -53,7 +54,7 @@ def sweep(
     steps: Sequence[int] = (),
     base: Mapping[str, str] | None = None,
     values: Mapping[str, Sequence[str]] | None = None,
-    knobs: Sequence[str] | None = None,
+    vary: Sequence[str] | None = None,
 ) -> list[Point]:
     """Returns the base and all points around it; a point that equals the base is left out.
 
@@ -67,7 +68,7 @@ def sweep(
         own, and a quarter, half and twice of them. A single number keeps the steps constant.
       base: options of the base that override the preset.
       values: values of an option, in place of those of `default_values`; new options are added.
-      knobs: names of the options to vary; all if `None`.
+      vary: names of the options to vary; all if `None`.
 
     Raises:
       ValueError: if a preset or option does not exist, or the base sets an option of the sweep
@@ -97,22 +98,23 @@ def sweep(
         | {"steps": tuple(map(str, others))}
         | dict(values or {})
     )
-    if knobs is not None:
-        if unknown := [knob for knob in knobs if knob not in swept]:
+    if vary is not None:
+        vary = [present_name(name) for name in vary]
+        if unknown := [name for name in vary if name not in swept]:
             raise ValueError(
                 f"There is no option {unknown[0]}.{app.did_you_mean(unknown[0], swept)} "
                 f"Choose from {', '.join(swept)}, or give its "
                 f"values with --values={unknown[0]}=A/B."
             )
-        swept = {knob: swept[knob] for knob in knobs}
+        swept = {name: swept[name] for name in vary}
     known = own_values(preset, base["paths"], field=field) | options
     points = [_point(options, "", "")]
     points += [
-        _point(options, knob, value)
-        for knob, alternatives in swept.items()
+        _point(options, name, value)
+        for name, alternatives in swept.items()
         for value in alternatives
-        if not _same(value, known.get(knob))
-        and not (base["paths"] == "straight" and knob in _OF_BENT_LIGHT)
+        if not _same(value, known.get(name))
+        and not (base["paths"] == "straight" and name in _OF_BENT_PATHS)
     ]
     return points
 
@@ -129,17 +131,17 @@ def own_values(preset: str, paths: str = "tree", *, field: str = registry.USUAL)
     grid = resolve.grid_of(model)
     of_grid = {}
     if grid is not None:
-        entries = grid.entries.bit_length() - 1
-        of_grid = {"entries": str(entries), "finest": str(grid.finest)}
+        size = grid.hashmap_size.bit_length() - 1
+        of_grid = {"log2_hashmap_size": str(size), "max_res": str(grid.max_res)}
     return {
         "field": field,
-        "samples": ",".join(map(str, resolve.samples_of(model))),
+        "samples_per_ray": ",".join(map(str, resolve.samples_of(model))),
         "multisamples": str(model.multisamples),
         **of_grid,
         "footprint": model.footprint,
         "precision": model.field.precision,
-        "cut": str(PATH_PRESETS[paths].min_throughput),
-        "bends": str(PATH_PRESETS[paths].max_bends),
+        "min_throughput": str(PATH_PRESETS[paths].min_throughput),
+        "max_bends": str(PATH_PRESETS[paths].max_bends),
         "rays_per_pixel": "1",
     }
 
@@ -150,19 +152,19 @@ def default_values(preset: str, *, field: str = registry.USUAL) -> dict[str, tup
     For interiors this is the paper's field; the base has the interior that the scene requires.
     """
     own = own_values(preset, field=field)
-    rounds = [int(count) for count in own["samples"].split(",")]
+    rounds = [int(count) for count in own["samples_per_ray"].split(",")]
     of_grid = {}
-    if "entries" in own:
-        entries, finest = int(own["entries"]), int(own["finest"])
+    if "max_res" in own:
+        size, finest = int(own["log2_hashmap_size"]), int(own["max_res"])
         of_grid = {
-            "entries": tuple(str(entries + more) for more in (-3, -2, -1, 1, 2)),
-            "finest": tuple(str(round(share * finest)) for share in (0.25, 0.5, 2, 4)),
+            "log2_hashmap_size": tuple(str(size + more) for more in (-3, -2, -1, 1, 2)),
+            "max_res": tuple(str(round(share * finest)) for share in (0.25, 0.5, 2, 4)),
         }
     return {
         "paths": ("straight", "paper", "tree"),
-        "cut": ("0.1", "0.05", "0.02", "0.01", "0.005"),
-        "bends": ("2", "6", "10", "24"),
-        "samples": tuple(
+        "min_throughput": ("0.1", "0.05", "0.02", "0.01", "0.005"),
+        "max_bends": ("2", "6", "10", "24"),
+        "samples_per_ray": tuple(
             ",".join(str(round(share * count)) for count in rounds) for share in (0.5, 0.75, 1.5, 2)
         ),
         "multisamples": ("1", "6"),
@@ -174,13 +176,19 @@ def default_values(preset: str, *, field: str = registry.USUAL) -> dict[str, tup
     }
 
 
+def present_name(name: str) -> str:
+    """Returns the name of an option, or of a point, for its name in this or an earlier version."""
+    option, *value = name.split("=", 1)
+    return "=".join([training_config.present_name(option), *value])
+
+
 def choose(points: Sequence[Point], names: Sequence[str]) -> list[Point]:
     """Returns the points with these names, and the base, for comparison.
 
     Raises:
       ValueError: if a point does not exist.
     """
-    known = [point.name for point in points]
+    known, names = [point.name for point in points], [present_name(name) for name in names]
     if unknown := [name for name in names if name not in known]:
         near = app.did_you_mean(unknown[0], known)
         raise ValueError(f"There is no point {unknown[0]}.{near} Choose from {', '.join(known)}.")
@@ -188,7 +196,7 @@ def choose(points: Sequence[Point], names: Sequence[str]) -> list[Point]:
 
 
 def parse_base(words: Sequence[str]) -> dict[str, str]:
-    """Returns the options given by words such as `cut=0.05` or `samples=48,32`.
+    """Returns the options given by words such as `min_throughput=0.05` or `samples_per_ray=48,32`.
 
     Raises:
       ValueError: if a word does not have that form.
@@ -197,13 +205,15 @@ def parse_base(words: Sequence[str]) -> dict[str, str]:
     for word in words:
         name, equals, value = word.partition("=")
         if not (name and equals and value):
-            raise ValueError(f"--base={word} is not NAME=VALUE. Write for example --base=cut=0.05.")
-        options[name] = value
+            raise ValueError(
+                f"--base={word} is not NAME=VALUE. Write for example --base=min_throughput=0.05."
+            )
+        options[present_name(name)] = value
     return options
 
 
 def parse_values(words: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Returns the values of options from words such as `cut=0.1/0.05` or `samples=16,10/48,32`.
+    """Returns the values of options from words such as `max_bends=2/6`.
 
     Raises:
       ValueError: if a word does not have that form.
@@ -211,22 +221,23 @@ def parse_values(words: Sequence[str]) -> dict[str, tuple[str, ...]]:
     values = {}
     for word in words:
         name, equals, given = word.partition("=")
+        name = present_name(name)
         values[name] = tuple(value for value in given.split("/") if value)
         if not (name and equals and values[name]):
             raise ValueError(
-                f"--values={word} is not NAME=A/B. Write for example --values=cut=0.1/0.05."
+                f"--values={word} is not NAME=A/B. Write for example --values=max_bends=2/6."
             )
     return values
 
 
-def _point(base: Mapping[str, str], knob: str, value: str) -> Point:
-    options = {**base, knob: value} if knob else dict(base)
+def _point(base: Mapping[str, str], option: str, value: str) -> Point:
+    options = {**base, option: value} if option else dict(base)
     if options["paths"] == "straight":
-        options = {name: each for name, each in options.items() if name not in _OF_BENT_LIGHT}
+        options = {name: each for name, each in options.items() if name not in _OF_BENT_PATHS}
     evaluation = {name: options.pop(name) for name in OF_EVALUATION if name in options}
     return Point(
-        name=f"{knob}={value}".replace(",", "+") if knob else BASE,
-        knob=knob,
+        name=f"{option}={value}".replace(",", "+") if option else BASE,
+        option=option,
         value=value,
         training=tuple(f"--{name}={each}" for name, each in options.items()),
         evaluation=tuple(f"--{name}={each}" for name, each in evaluation.items()),

@@ -186,15 +186,15 @@ def combine(rows: Sequence[Row], cost: Callable[[Row], float], most: float) -> R
       A predicted row, or the base itself. It may exceed the time limit if the base does.
     """
     base = table.base_of(rows)
-    useful = [row for row in rows if row.quality > base.quality + NOISE and row.knob != "paths"]
+    useful = [row for row in rows if row.quality > base.quality + NOISE and row.option != "paths"]
     chosen: list[Row] = []
     while True:
         now = _together(base, chosen)
-        taken = {row.knob for row in chosen}
+        taken = {row.option for row in chosen}
         options = [
             (_worth(together, now, cost), index)
             for index, row in enumerate(useful)
-            if row.knob not in taken and cost(together := _together(base, [*chosen, row])) <= most
+            if row.option not in taken and cost(together := _together(base, [*chosen, row])) <= most
         ]
         if not options:
             return now
@@ -213,15 +213,15 @@ def _together(base: Row, turns: Sequence[Row]) -> Row:
     for row in turns:
         pace *= row.seconds_per_step / base.seconds_per_step
         image *= row.seconds_per_image / base.seconds_per_image
-        steps = row.steps if row.knob == "steps" else steps
+        steps = row.steps if row.option == "steps" else steps
     quality = {"psnr": base.psnr + sum(row.psnr - base.psnr for row in turns)}
     if base.psnr_masked is not None:
         quality["psnr_masked"] = base.psnr_masked + gain
     return dataclasses.replace(
         base,
         name=" ".join(row.name for row in turns) or BASE,
-        training=_options(base.training, [row for row in turns if row.knob not in OF_EVALUATION]),
-        evaluation=_options(base.evaluation, [row for row in turns if row.knob in OF_EVALUATION]),
+        training=_options(base.training, [row for row in turns if row.option not in OF_EVALUATION]),
+        evaluation=_options(base.evaluation, [row for row in turns if row.option in OF_EVALUATION]),
         steps=steps,
         seconds_per_step=pace,
         seconds_per_image=image,
@@ -231,5 +231,5 @@ def _together(base: Row, turns: Sequence[Row]) -> Row:
 
 def _options(base: str, turns: Sequence[Row]) -> str:
     options = dict(word.split("=", 1) for word in base.split())
-    options |= {f"--{row.knob}": row.value for row in turns}
+    options |= {f"--{row.option}": row.value for row in turns}
     return " ".join(f"{name}={value}" for name, value in options.items())

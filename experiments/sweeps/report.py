@@ -89,11 +89,11 @@ def _saving_table(found: Sequence[Turn]) -> str:
 
 
 def _option(turn: Turn) -> str:
-    return f"{turn.row.knob}={turn.row.value}"
+    return f"{turn.row.option}={turn.row.value}"
 
 
 def _time(turn: Turn) -> str:
-    of_evaluation = " of evaluation" if turn.row.knob in OF_EVALUATION else ""
+    of_evaluation = " of evaluation" if turn.row.option in OF_EVALUATION else ""
     return f"{turn.percent:+.0f} %{of_evaluation}"
 
 
@@ -108,10 +108,10 @@ def write_figure(path: Path, rows: Sequence[Row]) -> None:
       path: output file.
       rows: rows of one scene, with the base.
     """
-    knobs = list(dict.fromkeys(row.knob for row in rows))
+    options = list(dict.fromkeys(row.option for row in rows))
     styles = {
-        knob: (COLOURS[i % len(COLOURS)], _MARKERS[i // len(COLOURS) % len(_MARKERS)])
-        for i, knob in enumerate(knobs)
+        option: (COLOURS[i % len(COLOURS)], _MARKERS[i // len(COLOURS) % len(_MARKERS)])
+        for i, option in enumerate(options)
     }
     foot = max(row.quality for row in rows) - _DEPTH
     figure, axes = pyplot.subplots(1, 2, figsize=(14.0, 6.4), sharey=True, layout="constrained")
@@ -146,15 +146,15 @@ def _draw(
         where="post",
         label="none better",
     )
-    for knob, (colour, marker) in styles.items():
-        own = [row for row in rows if row.knob == knob]
+    for option, (colour, marker) in styles.items():
+        own = [row for row in rows if row.option == option]
         axis.plot(
             [cost(row) for row in own],
             [max(row.quality, foot) for row in own],
             marker,
             color=colour,
-            markersize=9 if not knob else 6,
-            label=knob or "base",
+            markersize=9 if not option else 6,
+            label=option or "base",
         )
     axis.set_xscale("log")
     axis.set_xlabel(label)
@@ -189,5 +189,5 @@ def _label_points(
             xytext=(6, -9),
             textcoords="offset points",
             fontsize=8,
-            color=styles[row.knob][0],
+            color=styles[row.option][0],
         )

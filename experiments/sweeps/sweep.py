@@ -106,7 +106,7 @@ def measure(point: Point, scene: Path, runs: Path, limit: Sequence[str] = ()) ->
     return Row(
         scene=scene_names.of_folder(scene),
         name=point.name,
-        knob=point.knob,
+        option=point.option,
         value=point.value,
         training=" ".join(point.training),
         evaluation=" ".join(point.evaluation),
@@ -119,7 +119,7 @@ def run_name(point: Point, scene: Path) -> str:
     """Returns the name of a training's folder, unique for each scene and set of options."""
     text = " ".join((str(scene.resolve()), *point.training))
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
-    shared = not point.knob or point.knob in OF_EVALUATION
+    shared = not point.option or point.option in OF_EVALUATION
     return f"{BASE if shared else point.name}-{digest}"
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from experiments.sweeps.points import BASE, OF_EVALUATION
+from experiments.sweeps.points import BASE, OF_EVALUATION, present_name
 from refref_jax import atomic_files
 
 NOISE = 0.3
@@ -24,7 +24,7 @@ class Row:
     Attributes:
       scene: name of the scene's folder.
       name: name of the point.
-      knob: option that differs from the base; empty for the base.
+      option: option that differs from the base; empty for the base.
       value: value of that option.
       training: options of `experiments.train`, separated by blanks.
       evaluation: options of `experiments.evaluate`, likewise.
@@ -32,7 +32,7 @@ class Row:
 
     scene: str
     name: str
-    knob: str
+    option: str
     value: str
     training: str
     evaluation: str
@@ -105,7 +105,7 @@ def read(path: Path) -> list[Row]:
     try:
         rows = [
             Row(**{name: _parse(record[name], kind) for name, kind in kinds.items()})
-            for record in records
+            for record in map(_with_present_names, records)
         ]
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(
@@ -116,6 +116,16 @@ def read(path: Path) -> list[Row]:
             f"{path} has no row of the base point. Measure it with experiments.trade_off."
         )
     return rows
+
+
+def _with_present_names(record: dict[str, str]) -> dict[str, str]:
+    """Renames the columns and options of a table of an earlier version."""
+    flags = [present_name(flag.removeprefix("--")) for flag in record["training"].split()]
+    return record | {
+        "name": present_name(record["name"]),
+        "option": present_name(record.get("option", record.get("knob", ""))),
+        "training": " ".join(f"--{flag}" for flag in flags),
+    }
 
 
 def pareto(rows: Sequence[Row], cost: Callable[[Row], float]) -> list[Row]:
@@ -137,8 +147,8 @@ def turns(rows: Sequence[Row]) -> list[Turn]:
     base = base_of(rows)
     found = []
     for row in rows:
-        if row.knob:
-            cost = _rendering if row.knob in OF_EVALUATION else _training
+        if row.option:
+            cost = _rendering if row.option in OF_EVALUATION else _training
             percent = 100.0 * (cost(row) / cost(base) - 1.0)
             found.append(Turn(row, row.quality - base.quality, percent))
     return found
@@ -181,7 +191,7 @@ def _rate(gain: float, price: float) -> tuple[bool, float]:
 def _best_of_each(found: Sequence[Turn], worth: Callable[[Turn], tuple[bool, float]]) -> list[Turn]:
     best: dict[str, Turn] = {}
     for turn in sorted(found, key=worth, reverse=True):
-        best.setdefault(turn.row.knob, turn)
+        best.setdefault(turn.row.option, turn)
     return list(best.values())
 
 

@@ -114,13 +114,13 @@ def containing_fov(views: Cameras, aspect: float) -> float:
 
 
 def letterbox(
-    picture: UInt8[np.ndarray, "h w 3"], aspect: float
+    image: UInt8[np.ndarray, "h w 3"], aspect: float
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Returns an image with equal grey bars on both sides that give it an aspect."""
-    height, width, _ = picture.shape
+    height, width, _ = image.shape
     across = max(0, round(0.5 * (height * aspect - width)))
     along = max(0, round(0.5 * (width / aspect - height)))
-    return np.pad(picture, ((along, along), (across, across), (0, 0)), constant_values=_GREY)
+    return np.pad(image, ((along, along), (across, across), (0, 0)), constant_values=_GREY)
 
 
 def _middle(whole: int, wanted: float) -> np.ndarray:

@@ -69,8 +69,8 @@ class Panel:
         controls = [self._layer, self._cut, self._bends, *self._sliders]
         for control in filter(None, controls):
             control.on_update(lambda _: changed())
-        self._bodies = gui.add_checkbox("bodies", False, visible=bool(first.max_bends))
-        self._bodies.on_update(lambda _: show_bodies(self._bodies.value))
+        self._objects = gui.add_checkbox("objects", False, visible=bool(first.max_bends))
+        self._objects.on_update(lambda _: show_bodies(self._objects.value))
         box = gui.add_checkbox("test cameras", False, visible=subject.views is not None)
         box.on_update(lambda _: show_cameras(box.value))
         with gui.add_folder("light paths"):
@@ -106,7 +106,7 @@ class Panel:
         """Shows a table of light paths, and the objects that they pass through."""
         self._paths.content = f"{table}\n\n{_HINT}"
         self._remove.visible = True
-        self._bodies.value = True
+        self._objects.value = True
 
     def _add_light(self, gui: Any, subject: Subject, first: Choice) -> None:
         with gui.add_folder("light"):
@@ -144,7 +144,7 @@ class Scenery:
           views: the test cameras.
         """
         self._scene = scene
-        self._bodies = [
+        self._objects = [
             scene.add_mesh_simple(
                 f"/bodies/{part}",
                 triangles.reshape(-1, 3),
@@ -163,7 +163,7 @@ class Scenery:
 
     def show_bodies(self, shown: bool) -> None:
         """Shows or hides the objects."""
-        for node in self._bodies:
+        for node in self._objects:
             node.visible = shown
 
     def show_cameras(self, shown: bool) -> None:

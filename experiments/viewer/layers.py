@@ -48,7 +48,7 @@ GAIN = comparison.ERROR_GAIN
 """Amplification of errors."""
 
 Cancelled = Callable[[], bool]
-Picture = UInt8[np.ndarray, "h w 3"]
+Image = UInt8[np.ndarray, "h w 3"]
 
 
 class Pixels(NamedTuple):
@@ -76,7 +76,7 @@ def offered(model: Model, *, truth: bool) -> tuple[str, ...]:
 
 def draw(
     model: Model, layer: str, rays: Rays, *, chunk: int, most: int, cancelled: Cancelled
-) -> Picture | None:
+) -> Image | None:
     """Draws a layer other than `error`.
 
     Args:
@@ -108,7 +108,7 @@ def draw(
 
 def draw_error(
     model: Model, pixels: Pixels, *, chunk: int, cancelled: Cancelled
-) -> tuple[Picture, float] | None:
+) -> tuple[Image, float] | None:
     """Draws the amplified error of a test view.
 
     Returns:
@@ -158,11 +158,11 @@ def with_indices(interfaces: Interfaces, indices: Sequence[float], rule: str) ->
     return interfaces._replace(index_inside=made.index_inside, index_outside=made.index_outside)
 
 
-def _draw_surface(model: Model, layer: str, rays: Rays, most: int) -> Picture:
+def _draw_surface(model: Model, layer: str, rays: Rays, most: int) -> Image:
     shape = rays.radii.shape
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
     filled, _ = images.cut_out(flat, None, 0, max(most, flat.radii.size))
-    met = find_first_surface(model.geometry.surfaces, filled)
+    met = find_first_surface(model.scene.surfaces, filled)
     count = flat.radii.size
     found = (met.parts[:count] != NO_PART).reshape(*shape, 1)
     if layer == MASK:

@@ -21,7 +21,7 @@ import viser
 from experiments.viewer import cameras, controls, layers, session
 from experiments.viewer.cameras import Viewpoint
 from experiments.viewer.controls import Panel
-from experiments.viewer.layers import Picture
+from experiments.viewer.layers import Image
 from experiments.viewer.session import Choice, Job, State, Subject
 from refref_jax.geometry.rays import Rays
 from refref_jax.render import pixel_paths
@@ -85,7 +85,7 @@ class Page:
         self._closed = False
         self._state = State(stages=len(subject.heights))
         self._view = self._viewpoint()
-        surfaces = subject.model.geometry.surfaces
+        surfaces = subject.model.scene.surfaces
         self._scenery = controls.Scenery(client.scene, surfaces, subject.views)
         self._panel = Panel(
             client.gui,
@@ -136,19 +136,19 @@ class Page:
                     self._event.wait(session.wait(self._state, now))
                     continue
             try:
-                picture = self._draw(job, view, self._panel.choice())
+                image = self._draw(job, view, self._panel.choice())
             except Exception as error:  # the page stays open and shows the error
                 traceback.print_exc()
                 self._say(f"**{type(error).__name__}**: {error}")
-                picture = np.zeros((2, 2, 3), np.uint8)
-            if picture is not None and not self._closed:
+                image = np.zeros((2, 2, 3), np.uint8)
+            if image is not None and not self._closed:
                 self._client.scene.set_background_image(
-                    picture, format="jpeg", jpeg_quality=_JPEG_QUALITY
+                    image, format="jpeg", jpeg_quality=_JPEG_QUALITY
                 )
                 with self._event:
                     self._state = session.finished(self._state, job)
 
-    def _draw(self, job: Job, view: Viewpoint, choice: Choice) -> Picture | None:
+    def _draw(self, job: Job, view: Viewpoint, choice: Choice) -> Image | None:
         """Draws a job's image; `None` if it was cancelled."""
         model = session.chosen_model(self._subject, choice)
         height, chunk = self._subject.heights[job.stage], self._subject.chunk
@@ -162,14 +162,14 @@ class Page:
             what = ("surfaces", most)
         rays = cameras.window_rays(view, height)
         with self._turns.drawing, self._compiling(what):
-            picture = layers.draw(
+            image = layers.draw(
                 model, layer, rays, chunk=chunk, most=most, cancelled=lambda: self._stale(job)
             )
-        if picture is not None:
-            self._say(_sized(picture, job.stage + 1, len(self._subject.heights)))
-        return picture
+        if image is not None:
+            self._say(_sized(image, job.stage + 1, len(self._subject.heights)))
+        return image
 
-    def _draw_error(self, job: Job, view: Viewpoint, model: Any, most: int) -> Picture | None:
+    def _draw_error(self, job: Job, view: Viewpoint, model: Any, most: int) -> Image | None:
         """Moves to the nearest test view and draws its error, with bars at the sides."""
         frames = self._subject.frames
         i = cameras.nearest(view.pose, frames.cameras)
@@ -182,14 +182,14 @@ class Page:
             )
         if drawn is None:
             return None
-        picture, error = drawn
+        image, error = drawn
         decibels = -20.0 * math.log10(error) if error else math.inf
         name = frames.names[i]
         self._say(
             f"test view **{name}**: {decibels:.1f} dB, errors x {layers.GAIN:g}. "
-            + _sized(picture, job.stage + 1, len(self._subject.heights))
+            + _sized(image, job.stage + 1, len(self._subject.heights))
         )
-        return cameras.letterbox(picture, view.aspect)
+        return cameras.letterbox(image, view.aspect)
 
     def _go_to(self, view: Viewpoint) -> None:
         """Moves the browser's camera, which does not count as a change.
@@ -242,6 +242,6 @@ class Page:
                 notice.remove()
 
 
-def _sized(picture: Picture, stage: int, stages: int) -> str:
-    height, width, _ = picture.shape
+def _sized(image: Image, stage: int, stages: int) -> str:
+    height, width, _ = image.shape
     return f"{width} x {height} pixels, size {stage} of {stages}"

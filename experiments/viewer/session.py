@@ -117,7 +117,7 @@ class Job(NamedTuple):
 
 def first_choice(subject: Subject) -> Choice:
     """Returns the initial settings: those of the trained model."""
-    indices = tuple(float(x) for x in np.asarray(subject.model.geometry.interfaces.index_inside))
+    indices = tuple(float(x) for x in np.asarray(subject.model.scene.interfaces.index_inside))
     settings = subject.model.settings
     return Choice(layers.RGB, indices, settings.min_throughput, settings.max_bends)
 
@@ -127,7 +127,7 @@ def chosen_model(subject: Subject, choice: Choice) -> Model:
     model = subject.model
     if model.settings.max_bends == 0:
         return model
-    interfaces = model.geometry.interfaces
+    interfaces = model.scene.interfaces
     if choice.indices != first_choice(subject).indices:
         # On the device, as those of the model are, so that both share one compiled program.
         interfaces = jax.device_put(layers.with_indices(interfaces, choice.indices, subject.rule))
@@ -136,9 +136,7 @@ def chosen_model(subject: Subject, choice: Choice) -> Model:
         settings = dataclasses.replace(
             settings, min_throughput=choice.min_throughput, max_bends=choice.max_bends
         )
-    return model._replace(
-        geometry=model.geometry._replace(interfaces=interfaces), settings=settings
-    )
+    return model._replace(scene=model.scene._replace(interfaces=interfaces), settings=settings)
 
 
 def part_names(scene: Path | None, count: int) -> tuple[str, ...]:

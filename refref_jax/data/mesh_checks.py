@@ -241,11 +241,11 @@ def lint(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
     for part in parts:
         findings += _edges(part)
         findings += _faces(part)
-        findings += _bodies(part)
+        findings += _objects(part)
     return findings + lint_pairs(parts, containment)
 
 
-def _bodies(part: MeshPart) -> list[Finding]:
+def _objects(part: MeshPart) -> list[Finding]:
     """Reports pieces whose faces point inwards; those of a cavity correctly do."""
     faces = _largest_faces(part)
     # The winding number is negative in front of an inverted piece, and 0 in a cavity.

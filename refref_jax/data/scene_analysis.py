@@ -21,12 +21,12 @@ NeededInterior = Literal["none", "clear", "absorbing"]
 """Interior of the objects; `none` without objects."""
 
 
-class Needs(NamedTuple):
+class SceneAnalysis(NamedTuple):
     """Features that a scene requires of a model.
 
     Attributes:
       parts: number of meshes; without any, rays are straight.
-      bodies: number of objects: outermost parts, which no other part contains.
+      objects: number of objects: outermost parts, which no other part contains.
       convex: whether there is one object, it is convex and contains all other parts.
       reentry: `impossible` if a ray that has left the objects cannot meet any again.
       interior: interior of the objects: `none` without objects, `clear` if their colours are known
@@ -37,7 +37,7 @@ class Needs(NamedTuple):
     """
 
     parts: int
-    bodies: int
+    objects: int
     convex: bool
     reentry: Reentry
     interior: NeededInterior
@@ -45,14 +45,14 @@ class Needs(NamedTuple):
     space: Space
 
 
-def find_needs(
+def analyse(
     parts: Sequence[MeshPart],
     tree: Containment,
     cameras: Cameras,
     *,
     rule: RuleName,
     space: Space,
-) -> Needs:
+) -> SceneAnalysis:
     """Analyses a scene.
 
     Parts nested inside one convex object do not affect `reentry`: a ray that has left the object
@@ -72,9 +72,9 @@ def find_needs(
     # Under other rules, a ray between two parts may count as outside of all parts.
     told_apart = rule == "nested" or len(parts) == 1
     leaves_for_good = convex and told_apart and not _any_inside(cameras, outermost[0])
-    return Needs(
+    return SceneAnalysis(
         parts=len(parts),
-        bodies=len(outermost),
+        objects=len(outermost),
         convex=convex,
         reentry="impossible" if leaves_for_good or not parts else "possible",
         interior=_interior(parts),
@@ -83,29 +83,31 @@ def find_needs(
     )
 
 
-def describe(needs: Needs) -> str:
+def describe(analysis: SceneAnalysis) -> str:
     """Returns the required features in one line of text."""
-    background = f"{needs.space} background"
-    if needs.parts == 0:
+    background = f"{analysis.space} background"
+    if analysis.parts == 0:
         return f"this scene has no meshes: no tracer, {background}"
     tints = {
         "none": "no tint",
         "given": "tints and absorption (given)",
         "learned": "tints and absorption (to be learned)",
     }
-    reentry = "re-entry" if needs.reentry == "possible" else "no re-entry"
-    return f"this scene needs: {_bodies(needs)}, {reentry}, {background}, {tints[needs.tints]}"
+    reentry = "re-entry" if analysis.reentry == "possible" else "no re-entry"
+    return (
+        f"this scene needs: {_objects(analysis)}, {reentry}, {background}, {tints[analysis.tints]}"
+    )
 
 
-def _bodies(needs: Needs) -> str:
-    before = ["clear"] if needs.interior == "clear" else []
-    if needs.convex:
+def _objects(analysis: SceneAnalysis) -> str:
+    before = ["clear"] if analysis.interior == "clear" else []
+    if analysis.convex:
         before.append("convex")
-    noun = "object" if needs.bodies == 1 else "objects"
-    text = " ".join([str(needs.bodies), *before, noun])
-    if needs.parts > needs.bodies:
-        text = f"{needs.parts} parts in {text}"
-    return text if needs.convex or needs.bodies > 1 else f"{text} that is not convex"
+    noun = "object" if analysis.objects == 1 else "objects"
+    text = " ".join([str(analysis.objects), *before, noun])
+    if analysis.parts > analysis.objects:
+        text = f"{analysis.parts} parts in {text}"
+    return text if analysis.convex or analysis.objects > 1 else f"{text} that is not convex"
 
 
 def _is_one_convex_body(body: MeshPart, parts: Sequence[MeshPart]) -> bool:
@@ -131,7 +133,7 @@ def _interior(parts: Sequence[MeshPart]) -> NeededInterior:
 def find_tints(
     parts: Sequence[MeshPart | PartDescription],
 ) -> Tints:
-    """Returns the source of the colours of parts or their descriptions; see `Needs`."""
+    """Returns the source of the colours of parts or their descriptions; see `SceneAnalysis`."""
     if not all(part.colour_known for part in parts):
         return "learned"
     return "given" if any(map(_takes_light, parts)) else "none"

@@ -159,10 +159,10 @@ def assemble(parts: Sequence[MeshPart], *, rule: RuleName = "nested") -> Scene:
     for finding in findings:
         if finding.severity == "warning":
             warnings.warn(f"{finding.part} {finding.message}", stacklevel=2)
-    return build_geometry(parts, tree.parents, rule=rule)
+    return assemble_scene(parts, tree.parents, rule=rule)
 
 
-def build_geometry(
+def assemble_scene(
     parts: Sequence[MeshPart],
     parents: Sequence[int],
     *,

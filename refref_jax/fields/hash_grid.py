@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from refref_jax import numerics
 from refref_jax.choices import Precision
+from refref_jax.configuration import FORMERLY
 from refref_jax.fields.hash_grid_kernels import interpolate
 from refref_jax.sampling.cones import Gaussians
 
@@ -33,38 +34,38 @@ class HashGridConfig:
 
     Attributes:
       levels: number of levels.
-      coarsest: base resolution, cells per side of the first level.
-      finest: finest resolution, cells per side of the last level; resolutions grow geometrically.
-      entries: hash map size, the maximum number of entries per level, a power of two.
+      base_res: base resolution, cells per side of the first level.
+      max_res: finest resolution, cells per side of the last level; resolutions grow geometrically.
+      hashmap_size: hash map size, the maximum number of entries per level, a power of two.
       features: number of features per entry.
     """
 
     levels: int
-    coarsest: int
-    finest: int
-    entries: int
+    base_res: int = dataclasses.field(metadata={FORMERLY: "coarsest"})
+    max_res: int = dataclasses.field(metadata={FORMERLY: "finest"})
+    hashmap_size: int = dataclasses.field(metadata={FORMERLY: "entries"})
     features: int
 
     def __post_init__(self) -> None:
         """Validates the shape."""
-        if self.levels < 1 or self.features < 1 or not 1 <= self.coarsest <= self.finest:
+        if self.levels < 1 or self.features < 1 or not 1 <= self.base_res <= self.max_res:
             raise ValueError(
                 f"The hash grid {self} is invalid. Give at least one level and one feature, and "
-                f"1 <= coarsest <= finest."
+                f"1 <= base_res <= max_res."
             )
-        if self.entries < 2 or self.entries & (self.entries - 1):
+        if self.hashmap_size < 2 or self.hashmap_size & (self.hashmap_size - 1):
             raise ValueError(
-                f"entries must be a power of two, not {self.entries}. Use for example "
-                f"{2 ** max(1, self.entries.bit_length())}."
+                f"hashmap_size must be a power of two, not {self.hashmap_size}. Use for example "
+                f"{2 ** max(1, self.hashmap_size.bit_length())}."
             )
 
 
 def resolutions(config: HashGridConfig) -> list[int]:
     """Returns the number of cells per side of each level."""
     if config.levels == 1:
-        return [config.coarsest]
-    growth = (config.finest / config.coarsest) ** (1.0 / (config.levels - 1))
-    return [round(config.coarsest * growth**level) for level in range(config.levels)]
+        return [config.base_res]
+    growth = (config.max_res / config.base_res) ** (1.0 / (config.levels - 1))
+    return [round(config.base_res * growth**level) for level in range(config.levels)]
 
 
 def tables(params: Any) -> list[Float[Array, "_ _"]]:
@@ -96,7 +97,7 @@ class HashGrid(nn.Module):
         """
         levels = []
         for level, resolution in enumerate(resolutions(self.config)):
-            size = min(self.config.entries, (resolution + 1) ** 3)
+            size = min(self.config.hashmap_size, (resolution + 1) ** 3)
             table = self.param(f"{_TABLE}{level:02d}", _initialise, (size, self.config.features))
             features = interpolate(table, position, resolution=resolution, precision=self.precision)
             levels.append(features * fading(scale, resolution))

@@ -131,20 +131,24 @@ class _RadianceField(nn.Module):
         return Radiance(numerics.truncated_exponential(raw[0]), rgb)
 
 
-def _proposal(*, levels: int, finest: int, entries: int) -> NerfactoProposalConfig:
-    grid = HashGridConfig(levels, coarsest=16, finest=finest, entries=entries, features=2)
+def _proposal(*, levels: int, max_res: int, hashmap_size: int) -> NerfactoProposalConfig:
+    grid = HashGridConfig(
+        levels, base_res=16, max_res=max_res, hashmap_size=hashmap_size, features=2
+    )
     return NerfactoProposalConfig(grid, width=16)
 
 
 _TINY = FieldSize(
     field=NerfactoConfig(
-        HashGridConfig(levels=8, coarsest=16, finest=512, entries=1 << 17, features=2),
+        HashGridConfig(levels=8, base_res=16, max_res=512, hashmap_size=1 << 17, features=2),
         density_width=32,
         bottleneck=15,
         colour_width=32,
         colour_depth=2,
     ),
-    proposals=tuple(_proposal(levels=4, finest=finest, entries=1 << 15) for finest in (32, 64)),
+    proposals=tuple(
+        _proposal(levels=4, max_res=max_res, hashmap_size=1 << 15) for max_res in (32, 64)
+    ),
     samples=(48, 24, 16),
     multisamples=1,
     footprint="cone",
@@ -153,13 +157,15 @@ _TINY = FieldSize(
 
 _PAPER = FieldSize(
     field=NerfactoConfig(
-        HashGridConfig(levels=16, coarsest=16, finest=2048, entries=1 << 19, features=2),
+        HashGridConfig(levels=16, base_res=16, max_res=2048, hashmap_size=1 << 19, features=2),
         density_width=64,
         bottleneck=15,
         colour_width=64,
         colour_depth=2,
     ),
-    proposals=tuple(_proposal(levels=5, finest=finest, entries=1 << 17) for finest in (128, 256)),
+    proposals=tuple(
+        _proposal(levels=5, max_res=max_res, hashmap_size=1 << 17) for max_res in (128, 256)
+    ),
     samples=(256, 96, 48),
     multisamples=1,
     footprint="cone",

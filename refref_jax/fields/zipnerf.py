@@ -131,21 +131,23 @@ class _RadianceField(nn.Module):
 
 
 def _proposal(
-    *, levels: int, finest: int, entries: int, features: int, width: int
+    *, levels: int, max_res: int, hashmap_size: int, features: int, width: int
 ) -> DensityFieldConfig:
-    grid = HashGridConfig(levels, coarsest=16, finest=finest, entries=entries, features=features)
+    grid = HashGridConfig(
+        levels, base_res=16, max_res=max_res, hashmap_size=hashmap_size, features=features
+    )
     return DensityFieldConfig(grid, width=width)
 
 
 _TINY = FieldSize(
     field=RadianceFieldConfig(
-        HashGridConfig(levels=6, coarsest=16, finest=512, entries=1 << 17, features=4),
+        HashGridConfig(levels=6, base_res=16, max_res=512, hashmap_size=1 << 17, features=4),
         density_width=32,
         bottleneck=15,
         colour_width=32,
         colour_depth=1,
     ),
-    proposals=(_proposal(levels=4, finest=64, entries=1 << 15, features=2, width=16),),
+    proposals=(_proposal(levels=4, max_res=64, hashmap_size=1 << 15, features=2, width=16),),
     samples=(32, 20),
     multisamples=1,
     footprint="differential",
@@ -154,13 +156,13 @@ _TINY = FieldSize(
 
 _SMALL = FieldSize(
     field=RadianceFieldConfig(
-        HashGridConfig(levels=8, coarsest=16, finest=2048, entries=1 << 19, features=4),
+        HashGridConfig(levels=8, base_res=16, max_res=2048, hashmap_size=1 << 19, features=4),
         density_width=64,
         bottleneck=31,
         colour_width=64,
         colour_depth=1,
     ),
-    proposals=(_proposal(levels=6, finest=256, entries=1 << 17, features=2, width=32),),
+    proposals=(_proposal(levels=6, max_res=256, hashmap_size=1 << 17, features=2, width=32),),
     samples=(48, 32),
     multisamples=1,
     footprint="differential",
@@ -169,15 +171,15 @@ _SMALL = FieldSize(
 
 _PAPER = FieldSize(
     field=RadianceFieldConfig(
-        HashGridConfig(levels=10, coarsest=16, finest=8192, entries=1 << 21, features=4),
+        HashGridConfig(levels=10, base_res=16, max_res=8192, hashmap_size=1 << 21, features=4),
         density_width=64,
         bottleneck=255,
         colour_width=256,
         colour_depth=2,
     ),
     proposals=(
-        _proposal(levels=6, finest=512, entries=1 << 21, features=1, width=64),
-        _proposal(levels=8, finest=2048, entries=1 << 21, features=1, width=64),
+        _proposal(levels=6, max_res=512, hashmap_size=1 << 21, features=1, width=64),
+        _proposal(levels=8, max_res=2048, hashmap_size=1 << 21, features=1, width=64),
     ),
     samples=(64, 64, 32),
     multisamples=6,

@@ -4,10 +4,10 @@ On a CPU, packets of rays traverse the tree together (`traversal_cpu`); on an ac
 traverses it alone and all rays run in lock-step (`traversal_accelerator`). `bvh_nodes` describes
 the memory layout of the tree, `bvh_build` its construction.
 
-`closest_hits` takes a batch of rays with one leading axis. `closest_slot` takes one ray, for use
-under `vmap` and differentiation: under any nesting of `vmap`, all rays are cast as one batch. The
-triangle that is hit is a constant for differentiation: recompute the hit point from the triangle to
-obtain gradients.
+`closest_hits` takes a batch of rays with one leading axis. `closest_primitive` takes one ray, for
+use under `vmap` and differentiation: under any nesting of `vmap`, all rays are cast as one batch.
+The triangle that is hit is a constant for differentiation: recompute the hit point from the
+triangle to obtain gradients.
 """
 
 from typing import Any, NamedTuple
@@ -25,8 +25,8 @@ from refref_jax.geometry.traversal_cpu import PACKET, Packet
 LEAF_SIZE = bvh_nodes.LEAF_SIZE
 """Maximum number of triangles in a leaf."""
 
-NO_SLOT = -1
-"""Triangle slot of a ray that hit nothing, or that does not start on a triangle."""
+NO_PRIMITIVE = -1
+"""Primitive of a ray that hit nothing, or that does not start on a triangle."""
 
 
 class BVH(NamedTuple):
@@ -34,13 +34,13 @@ class BVH(NamedTuple):
 
     Attributes:
       nodes: one node table for each octant of directions (see `bvh_nodes`).
-      triangles: corners by slot, in leaf order, padded by `LEAF_SIZE` slots that are never hit.
+      triangles: corners of each primitive, in leaf order, padded by `LEAF_SIZE` that are never hit.
       facets: the same triangles, precomputed for the intersection test (see `triangles`).
     """
 
     nodes: Int[Array, "8 nodes 8"]
-    triangles: Float[Array, "slots 3 3"]
-    facets: Float[Array, "slots 12"]
+    triangles: Float[Array, "primitives 3 3"]
+    facets: Float[Array, "primitives 12"]
 
 
 class Hits(NamedTuple):
@@ -48,12 +48,12 @@ class Hits(NamedTuple):
 
     Attributes:
       distances: arc length, `inf` for a miss.
-      slots: slot of the triangle that was hit, `NO_SLOT` for a miss.
+      primitive_ids: index of the triangle that was hit, in leaf order, `NO_PRIMITIVE` for a miss.
       barycentrics: weights of the triangle's second and third corner, 0 for a miss.
     """
 
     distances: Float[Array, " rays"]
-    slots: Int[Array, " rays"]
+    primitive_ids: Int[Array, " rays"]
     barycentrics: Float[Array, "rays 2"]
 
 
@@ -62,12 +62,12 @@ def closest_hits(
     rays: Rays,
     *,
     limits: Float[Array, " rays"],
-    leaving: Int[Array, " rays"],
+    exclude_primitive: Int[Array, " rays"],
 ) -> Hits:
     """Finds the first triangle that each ray hits, from either side.
 
-    Among triangles at the same distance the lowest slot is returned. Gradients do not flow through
-    the search: recompute the point from the slot and the barycentrics.
+    Among triangles at the same distance the lowest index is returned. Gradients do not flow through
+    the search: recompute the point from the triangle and the barycentrics.
 
     Neighbours in the batch should be neighbours in space, because on a CPU 16 of them traverse the
     tree together. Pixels in tiles of 4 x 4 are coherent already; for incoherent rays,
@@ -78,8 +78,8 @@ def closest_hits(
       rays: any number of rays; rays that are not finite hit nothing.
       limits: farthest distance of interest; `inf` for no limit, negative for a ray that is not to
         be traced (its cost is negligible).
-      leaving: excluded primitive, the slot of the triangle that a ray starts on, which it cannot
-        hit again, or `NO_SLOT`.
+      exclude_primitive: index of the triangle that a ray starts on, which it cannot
+        hit again, or `NO_PRIMITIVE`.
 
     Returns:
       The hits, in the order of the rays.
@@ -89,17 +89,17 @@ def closest_hits(
     )
     nodes = bvh.nodes.reshape(-1, bvh_nodes.WORDS)
     limits = jnp.where(_finite(origins) & _finite(directions), limits, -1.0)
-    distances, slots = jax.lax.platform_dependent(
+    distances, primitive_ids = jax.lax.platform_dependent(
         nodes,
         bvh.facets,
         origins,
         directions,
         limits,
-        leaving,
+        exclude_primitive,
         cpu=_closest_in_packets,
         default=jax.vmap(traversal_accelerator.trace_ray, in_axes=(None, None, 0, 0, 0, 0)),
     )
-    return _finish(bvh, origins, directions, distances, slots)
+    return _finish(bvh, origins, directions, distances, primitive_ids)
 
 
 def _finite(vectors: Float[Array, "rays 3"]) -> Bool[Array, " rays"]:
@@ -112,28 +112,28 @@ def _finish(
     origins: Float[Array, "rays 3"],
     directions: Float[Array, "rays 3"],
     distances: Float[Array, " rays"],
-    slots: Int[Array, " rays"],
+    primitive_ids: Int[Array, " rays"],
 ) -> Hits:
     """Converts the result of a traversal to hits."""
-    # Infinite distances tie, so a missed triangle may have been recorded as the slot.
-    hit = jnp.isfinite(distances) & (slots != bvh_nodes.NONE)
-    found = jnp.where(hit, slots, 0)
+    # Infinite distances tie, so a missed triangle may have been recorded.
+    hit = jnp.isfinite(distances) & (primitive_ids != bvh_nodes.NONE)
+    found = jnp.where(hit, primitive_ids, 0)
     met = bvh.facets.at[found].get(mode="promise_in_bounds")
     barycentrics = jax.vmap(prepared.barycentric)(origins, directions, met)
     return Hits(
         jnp.where(hit, distances, jnp.inf),
-        jnp.where(hit, slots, NO_SLOT),
+        jnp.where(hit, primitive_ids, NO_PRIMITIVE),
         jnp.where(hit[:, None], barycentrics, 0.0),
     )
 
 
 def _closest_in_packets(
     nodes: Int[Array, "rows 8"],
-    facets: Float[Array, "slots 12"],
+    facets: Float[Array, "primitives 12"],
     origins: Float[Array, "rays 3"],
     directions: Float[Array, "rays 3"],
     limits: Float[Array, " rays"],
-    leaving: Int[Array, " rays"],
+    exclude_primitive: Int[Array, " rays"],
 ) -> tuple[Float[Array, " rays"], Int[Array, " rays"]]:
     """Traces all rays, 16 to a packet."""
     count = limits.shape[0]
@@ -157,7 +157,7 @@ def _closest_in_packets(
             jax.tree.map(by_component, slabs),
             by_ray(octants, bvh_nodes.OCTANTS),
             by_ray(limits, -1.0),
-            by_ray(leaving, NO_SLOT),
+            by_ray(exclude_primitive, NO_PRIMITIVE),
         ),
     )
     return jax.tree.map(lambda x: x.reshape(-1)[:count], tuple(closest))
@@ -169,34 +169,36 @@ class _Query(NamedTuple):
     origins: Float[Array, " *rays 3"]
     directions: Float[Array, "*rays 3"]
     limits: Float[Array, "*rays"]
-    leaving: Int[Array, "*rays"]
+    exclude_primitive: Int[Array, "*rays"]
 
 
-def closest_slot(
+def closest_primitive(
     bvh: BVH,
     origin: Float[Array, "3"],
     direction: Float[Array, "3"],
     limit: Float[Array, ""],
-    leaving: Int[Array, ""],
+    exclude_primitive: Int[Array, ""],
 ) -> Int[Array, ""]:
-    """Returns the slot of the first triangle that a ray hits, `NO_SLOT` if there is none.
+    """Returns the index of the first triangle that a ray hits, `NO_PRIMITIVE` if there is none.
 
     Args:
       bvh: the tree of the scene; it cannot be mapped over.
       origin: start of the ray.
       direction: unit vector.
       limit: farthest distance of interest; negative for a ray that is not to be cast.
-      leaving: excluded primitive, the slot that the ray starts on, or `NO_SLOT`.
+      exclude_primitive: index of the triangle that the ray starts on, or `NO_PRIMITIVE`.
     """
-    query = _Query(origin[None], direction[None], limit[None], leaving[None])
+    query = _Query(origin[None], direction[None], limit[None], exclude_primitive[None])
     return _find(*jax.lax.stop_gradient((bvh, query)))[0]
 
 
 @custom_vmap
 def _find(bvh: BVH, query: _Query) -> Int[Array, " rays"]:
     rays = Rays(query.origins, query.directions, jnp.zeros_like(query.limits))
-    hits: Hits = closest_hits(bvh, rays, limits=query.limits, leaving=query.leaving)
-    return hits.slots
+    hits: Hits = closest_hits(
+        bvh, rays, limits=query.limits, exclude_primitive=query.exclude_primitive
+    )
+    return hits.primitive_ids
 
 
 @_find.def_vmap

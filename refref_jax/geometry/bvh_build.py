@@ -6,7 +6,7 @@ every split preserves the three orders. The nodes are then packed into the table
 
 A split sends the first `n` faces of a node, in the order of their centroids along an axis, to the
 left. Its cost is `area(left) leaves(left) + area(right) leaves(right)`. It counts the leaves that a
-side fills instead of its faces, because all slots of a leaf are tested.
+side fills instead of its faces, because all triangles of a leaf are tested.
 
 Source: Wald, On fast Construction of SAH-based Bounding Volume Hierarchies (2007), without bins.
 """
@@ -235,15 +235,15 @@ def _bounds(
 
 def build(
     triangles: Float[np.ndarray, "faces 3 3"],
-) -> tuple[BVH, Int[np.ndarray, " slots"]]:
+) -> tuple[BVH, Int[np.ndarray, " primitives"]]:
     """Builds the tree of a triangle soup.
 
     Args:
       triangles: corners, world units, finite. May be empty, degenerate or duplicate.
 
     Returns:
-      The tree, with triangles in leaf order, and the face of each slot (padding slots repeat the
-      last face and are never hit).
+      The tree, with triangles in leaf order, and the face of each primitive (the padding repeats
+      the last face, and is never hit).
 
     Raises:
       ValueError: if a coordinate is not finite.
@@ -257,12 +257,12 @@ def build(
         return _empty(triangles.dtype), np.zeros(LEAF_SIZE, np.int32)
     lower, upper = triangles.min(axis=1), triangles.max(axis=1)
     levels, order = _split_all(lower, upper)
-    slots = np.concatenate([order, np.repeat(order[-1], LEAF_SIZE)])
+    primitive_ids = np.concatenate([order, np.repeat(order[-1], LEAF_SIZE)])
     nodes = pack_nodes(levels, lower[order], upper[order])
-    facets = prepare_facets(triangles[slots])
+    facets = prepare_facets(triangles[primitive_ids])
     facets[len(order) :] = 0.0
-    bvh = BVH(host_array(nodes), host_array(triangles[slots]), host_array(facets))
-    return bvh, slots.astype(np.int32)
+    bvh = BVH(host_array(nodes), host_array(triangles[primitive_ids]), host_array(facets))
+    return bvh, primitive_ids.astype(np.int32)
 
 
 def _empty(dtype: np.dtype) -> BVH:

@@ -113,7 +113,7 @@ class Node(NamedTuple):
     Attributes:
       entry, exit: corners of the box.
       skip: row to visit after the node's subtree.
-      leaf: first triangle slot + 1 of a leaf, 0 for an inner node, -1 for the end of the table.
+      leaf: first triangle + 1 of a leaf, 0 for an inner node, -1 for the end of the table.
     """
 
     entry: Float[Array, "3"]

@@ -20,7 +20,7 @@ from refref_jax.geometry.triangle_meshes import Mesh
 
 
 class Surfaces(NamedTuple):
-    """All surfaces of a scene, indexed by the triangle slots of their BVH.
+    """All surfaces of a scene, indexed by the primitives of their BVH.
 
     Attributes:
       bvh: the BVH, which also holds the corners.
@@ -29,8 +29,8 @@ class Surfaces(NamedTuple):
     """
 
     bvh: BVH
-    normals: Float[Array, "slots 3 3"]
-    parts: Int[Array, " slots"]
+    normals: Float[Array, "primitives 3 3"]
+    parts: Int[Array, " primitives"]
 
 
 class SurfacePoint(NamedTuple):
@@ -53,7 +53,7 @@ class SurfacePoint(NamedTuple):
 
 
 def surface_point(
-    surfaces: Surfaces, slot: Int[Array, ""], barycentric: Float[Array, "2"]
+    surfaces: Surfaces, primitive_id: Int[Array, ""], barycentric: Float[Array, "2"]
 ) -> SurfacePoint:
     """Returns the point of one triangle at barycentric coordinates.
 
@@ -62,19 +62,19 @@ def surface_point(
 
     Args:
       surfaces: surfaces of the scene.
-      slot: slot of a triangle; for `NO_SLOT` the result is finite but meaningless.
+      primitive_id: index of a triangle; for `NO_PRIMITIVE` the result is finite but meaningless.
       barycentric: weights of the second and third corner.
     """
-    corners = surfaces.bvh.triangles[slot]
+    corners = surfaces.bvh.triangles[primitive_id]
     geometric = triangles.geometric_normal(corners)
-    blended = triangles.interpolate(surfaces.normals[slot], barycentric)
+    blended = triangles.interpolate(surfaces.normals[primitive_id], barycentric)
     shading = numerics.normalize(blended)
     opposed = numerics.dot(shading, geometric) <= 0.0
     return SurfacePoint(
         position=triangles.interpolate(corners, barycentric),
         geometric_normal=geometric,
         shading_normal=jnp.where(opposed, geometric, shading),
-        part=surfaces.parts[slot],
+        part=surfaces.parts[primitive_id],
         scale=numerics.largest_component(corners.reshape(9)),
     )
 
@@ -103,13 +103,15 @@ def build_surfaces(
     Returns:
       The surfaces, in the leaf order of their tree.
     """
-    bvh, slots = bvh_build.build(triangles.astype(np.float32))
+    bvh, primitive_ids = bvh_build.build(triangles.astype(np.float32))
     if len(triangles) == 0:
         return Surfaces(
-            bvh, numerics.host_array(np.zeros_like(bvh.triangles)), numerics.host_array(slots)
+            bvh,
+            numerics.host_array(np.zeros_like(bvh.triangles)),
+            numerics.host_array(primitive_ids),
         )
     return Surfaces(
         bvh,
-        numerics.host_array(normals[slots].astype(np.float32)),
-        numerics.host_array(parts[slots].astype(np.int32)),
+        numerics.host_array(normals[primitive_ids].astype(np.float32)),
+        numerics.host_array(parts[primitive_ids].astype(np.int32)),
     )

@@ -39,7 +39,7 @@ class Packet(NamedTuple):
       slabs: rays prepared for box tests.
       octants: octants of the directions, `_DONE` for a ray that is not to be traced.
       limits: farthest distance of interest.
-      leaving: excluded primitive, a slot that a ray cannot hit.
+      exclude_primitive: triangle that a ray cannot hit.
     """
 
     origins: Float[Array, "*packets 3 rays"]
@@ -47,14 +47,14 @@ class Packet(NamedTuple):
     slabs: bvh_nodes.Slabs
     octants: Int[Array, "*packets rays"]
     limits: Float[Array, "*packets rays"]
-    leaving: Int[Array, "*packets rays"]
+    exclude_primitive: Int[Array, "*packets rays"]
 
 
 class Closest(NamedTuple):
-    """The closest hit so far: distance (initially the limit) and slot (initially `NONE`)."""
+    """The closest hit so far: distance (initially the limit) and primitive (initially `NONE`)."""
 
     distances: Float[Array, "*packets rays"]
-    slots: Int[Array, "*packets rays"]
+    primitive_ids: Int[Array, "*packets rays"]
 
 
 class _Rounds(NamedTuple):
@@ -75,13 +75,13 @@ class _Walk(NamedTuple):
 
 @native_loop
 def trace(
-    nodes: Int[Array, "rows 8"], packed: Float[Array, "slots 12"], packets: Packet
+    nodes: Int[Array, "rows 8"], packed: Float[Array, "primitives 12"], packets: Packet
 ) -> Closest:
     """Traces packets one after the other.
 
     Args:
       nodes: node tables of all octants, concatenated.
-      packed: precomputed triangles by slot.
+      packed: precomputed triangles.
       packets: any number of packets, along the leading axis.
     """
     return jax.lax.map(lambda packet: _trace_packet(nodes, packed, packet), packets)
@@ -94,19 +94,19 @@ def _trace_packet(nodes: Int[Array, "rows 8"], packed: Array, packet: Packet) ->
         octant, octants, closest = rounds
         awake = octants == octant
         reach = jnp.where(awake, closest.distances, -1.0)
-        walked = _walk(nodes, packed, packet, octant, Closest(reach, closest.slots))
+        walked = _walk(nodes, packed, packet, octant, Closest(reach, closest.primitive_ids))
         distances = jnp.where(awake, walked.distances, closest.distances)
         left = jnp.where(awake, _DONE, octants)
-        return _Rounds(jnp.min(left), left, Closest(distances, walked.slots))
+        return _Rounds(jnp.min(left), left, Closest(distances, walked.primitive_ids))
 
-    nothing = Closest(packet.limits, jnp.full_like(packet.leaving, bvh_nodes.NONE))
+    nothing = Closest(packet.limits, jnp.full_like(packet.exclude_primitive, bvh_nodes.NONE))
     start = _Rounds(jnp.min(packet.octants), packet.octants, nothing)
     return jax.lax.while_loop(lambda rounds: rounds.octant < _DONE, walk_octant, start).closest
 
 
 def _walk(
     nodes: Int[Array, "rows 8"],
-    packed: Float[Array, "slots 12"],
+    packed: Float[Array, "primitives 12"],
     packet: Packet,
     octant: Int[Array, ""],
     closest: Closest,
@@ -171,33 +171,33 @@ def _visit(
 
 
 def _test_leaf(
-    packed: Float[Array, "slots 12"],
+    packed: Float[Array, "primitives 12"],
     packet: Packet,
     first: Int[Array, ""],
     closest: Closest,
 ) -> Closest:
     """Returns the closest of the hits so far and the hits in one leaf.
 
-    Triangles are tested independently and compared afterwards. At equal distance the lower slot
+    Triangles are tested independently and compared afterwards. At equal distance the lower index
     wins, regardless of the order of traversal.
     """
 
     def meet(offset: int) -> Closest:
-        slot = first + offset
-        facet = bvh_nodes.read_row(packed, slot)
+        primitive_id = first + offset
+        facet = bvh_nodes.read_row(packed, primitive_id)
         distances = jax.vmap(triangles.distance, in_axes=(-1, -1, None))(
             packet.origins, packet.directions, facet
         )
         return Closest(
-            jnp.where(packet.leaving == slot, jnp.inf, distances),
-            jnp.broadcast_to(slot, distances.shape),
+            jnp.where(packet.exclude_primitive == primitive_id, jnp.inf, distances),
+            jnp.broadcast_to(primitive_id, distances.shape),
         )
 
     best = meet(0)
     for offset in range(1, bvh_nodes.LEAF_SIZE):
         found = meet(offset)
         best = _closer(found, best, found.distances < best.distances)
-    tied = (best.distances == closest.distances) & (best.slots < closest.slots)
+    tied = (best.distances == closest.distances) & (best.primitive_ids < closest.primitive_ids)
     return _closer(best, closest, (best.distances < closest.distances) | tied)
 
 

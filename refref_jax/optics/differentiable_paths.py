@@ -2,8 +2,8 @@
 
 A path is a scan over the steps of `path_step`, for one ray along one branch of its tree. The search
 for the triangles that are hit has no gradients, but each hit point is recomputed from the corners
-of its triangle. Positions, directions, arc lengths and weights of a path therefore have gradients
-with respect to indices of refraction, tints, absorption, corners, normals and the ray.
+of its triangle. Positions, directions, arc lengths and throughput of a path therefore have
+gradients with respect to indices of refraction, tints, absorption, corners, normals and the ray.
 
 Gradients are those of a fixed path: the same triangles in the same order, and the same branches.
 They do not account for paths that move to another triangle or fall below the throughput threshold.
@@ -29,13 +29,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from refref_jax.geometry.bvh import NO_SLOT, closest_slot
+from refref_jax.geometry.bvh import NO_PRIMITIVE, closest_primitive
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import media, path_step, ray_differentials, scene
+from refref_jax.optics import media, path_step, ray_differentials
 from refref_jax.optics.light_paths import LightPaths, PathStatus
 from refref_jax.optics.path_settings import PathSettings
 from refref_jax.optics.path_step import RayState
-from refref_jax.optics.scene import Scene
+from refref_jax.optics.scene import Scene, in_one_precision
 
 _Record = TypeVar("_Record")
 
@@ -72,22 +72,22 @@ class _Walk(NamedTuple):
 
 
 def follow_branch(
-    geometry: Scene,
+    scene: Scene,
     ray: Rays,
     reflects: Bool[Array, " bends"],
     *,
     settings: PathSettings,
-    inside: Int[Array, " slots"] | None = None,
+    interior_list: Int[Array, " slots"] | None = None,
 ) -> LightPaths:
     """Traces one ray along one branch.
 
     Args:
-      geometry: the scene.
+      scene: the scene.
       ray: one camera ray.
       reflects: choice of the reflected branch at each bend; a total internal reflection is always
         followed. All false is the main path.
       settings: path settings; `settings.max_bends` must be the length of `reflects`.
-      inside: interior list of the camera, for the rule `priority` (see `media`).
+      interior_list: interior list of the camera, for the rule `priority` (see `media`).
 
     Returns:
       One path. Its weight is 0 if the path settings do not follow the branch, because its
@@ -107,7 +107,8 @@ def follow_branch(
       >>> settings = refref_jax.PathSettings(max_bends=1, reflections="all")
       >>> def transmitted(index):
       ...     scene, straight_on = refref_jax.with_index(glass, index), jax.numpy.zeros(1, bool)
-      ...     return refref_jax.follow_branch(scene, ray, straight_on, settings=settings).weights[0]
+      ...     path = refref_jax.follow_branch(scene, ray, straight_on, settings=settings)
+      ...     return path.throughput[0]
       >>> share, slope = jax.jit(jax.value_and_grad(transmitted))(1.5)
       >>> print(f"{share:.4f} {slope:.4f}")
       0.9600 -0.1280
@@ -118,38 +119,40 @@ def follow_branch(
             "choice for each of the max bends."
         )
     reflects = jnp.asarray(reflects)
-    geometry, ray = scene.in_one_precision(geometry, ray)
-    if inside is None:
-        inside = media.nowhere(geometry.interfaces)
+    scene, ray = in_one_precision(scene, ray)
+    if interior_list is None:
+        interior_list = media.nowhere(scene.interfaces)
     start = _Walk(
-        path_step.begin(ray, inside, ray_differentials.nothing(ray.origins)),
+        path_step.begin(ray, interior_list, ray_differentials.nothing(ray.origins)),
         jnp.int32(media.AMBIENT),
         jnp.asarray(settings.max_bends > 0),
         jnp.int32(PathStatus.EMPTY),
     )
     # One step more than max bends: the last one only checks whether the path escapes.
     choices = jnp.append(reflects, False)
-    advance = functools.partial(_advance, geometry, settings)
+    advance = functools.partial(_advance, scene, settings)
     end, segments = jax.lax.scan(advance, start, choices)
     return _record(settings, ray, end, segments)
 
 
 def _advance(
-    geometry: Scene, settings: PathSettings, walk: _Walk, reflect: Bool[Array, ""]
+    scene: Scene, settings: PathSettings, walk: _Walk, reflect: Bool[Array, ""]
 ) -> tuple[_Walk, _Segment]:
     """Casts the ray, then ends the path or follows one of the two branches."""
     state, alive = walk.state, walk.status == PathStatus.EMPTY
     limit = jnp.where(alive & walk.traced, jnp.inf, -1.0).astype(state.tau.dtype)
-    slot = closest_slot(geometry.surfaces.bvh, state.origin, state.direction, limit, state.leaving)
-    hit = slot != NO_SLOT
-    arrival = path_step.arrive(geometry, state, slot)
+    primitive_id = closest_primitive(
+        scene.surfaces.bvh, state.origin, state.direction, limit, state.exclude_primitive
+    )
+    hit = primitive_id != NO_PRIMITIVE
+    arrival = path_step.arrive(scene, state, primitive_id)
     ended = jnp.where(
         walk.traced, path_step.ending(settings, state, arrival, hit), PathStatus.NOT_TRACED
     )
     status = jnp.where(alive, ended, walk.status).astype(jnp.int32)
     met, sides = arrival.interaction, arrival.interaction.sides
     mirrored = reflect | met.total
-    branches = path_step.branch(settings, state, arrival, slot)
+    branches = path_step.branch(settings, state, arrival, primitive_id)
     bent = _Walk(
         state=_either(mirrored, branches.reflected, branches.transmitted),
         medium=jnp.where(mirrored, sides.medium_near, sides.medium_far),
@@ -177,7 +180,7 @@ def _record(settings: PathSettings, ray: Rays, end: _Walk, segments: _Segment) -
         differentials=segments.state.differential,
         media=jnp.where(used, segments.medium, media.AMBIENT),
         rays=jnp.zeros_like(end.status),
-        weights=path_step.shown(settings, end.state.weight, end.status),
+        throughput=path_step.shown(settings, end.state.throughput, end.status),
         radii=ray.radii,
         num_bends=end.state.num_bends,
         statuses=end.status,
@@ -187,12 +190,12 @@ def _record(settings: PathSettings, ray: Rays, end: _Walk, segments: _Segment) -
 
 
 def follow_main_branches(
-    geometry: Scene, ray: Rays, *, settings: PathSettings, reflections: int
+    scene: Scene, ray: Rays, *, settings: PathSettings, reflections: int
 ) -> LightPaths:
     """Traces one ray along its main path, and along the paths that are reflected once.
 
     Args:
-      geometry: the scene.
+      scene: the scene.
       ray: one camera ray.
       settings: path settings.
       reflections: number of first surfaces at which a reflection is followed.
@@ -235,13 +238,11 @@ def follow_main_branches(
     first = jnp.arange(reflections, dtype=jnp.int32)
     once = first[:, None] == jnp.arange(settings.max_bends, dtype=jnp.int32)[None]
     choices = jnp.concatenate([jnp.zeros_like(once, shape=(1, settings.max_bends)), once])
-    paths = jax.vmap(lambda choice: follow_branch(geometry, ray, choice, settings=settings))(
-        choices
-    )
+    paths = jax.vmap(lambda choice: follow_branch(scene, ray, choice, settings=settings))(choices)
     # If the main path stays in its medium at a bend, reflection is total there.
     total = paths.media[0, 1:] == paths.media[0, :-1]
     real = jnp.append(True, (paths.num_bends[1:] > first) & ~total[:reflections])
     return paths._replace(
         statuses=jnp.where(real, paths.statuses, PathStatus.EMPTY),
-        weights=jnp.where(real[:, None], paths.weights, 0.0),
+        throughput=jnp.where(real[:, None], paths.throughput, 0.0),
     )

@@ -28,7 +28,7 @@ class PathStatus(enum.IntEnum):
     """Reason for the end of a path."""
 
     EMPTY = 0
-    """The slot is empty; its weight is 0."""
+    """The slot is empty; its throughput is 0."""
     MISSED = 1
     """The ray hit no interface; the path is straight."""
     ESCAPED = 2
@@ -46,7 +46,7 @@ class LightPaths(NamedTuple):
     """The light paths of a batch of rays, padded to the same number of segments.
 
     A ray may have any number of paths, in any order. Its colour is the sum of the colours of its
-    paths, multiplied by their weights. Segments inside the objects may be omitted (see
+    paths, multiplied by their throughput. Segments inside the objects may be omitted (see
     `path_settings`); then there is a gap in arc length before the next segment.
 
     Attributes:
@@ -57,7 +57,7 @@ class LightPaths(NamedTuple):
       media: medium of each segment (see `media`).
       differentials: ray differential of each segment, if carried (see `ray_differentials`).
       rays: index of each path's ray.
-      weights: share of the path in its ray's linear RGB.
+      throughput: share of the path in its ray's linear RGB.
       radii: footprint of the ray's pixel as a cone radius at unit distance.
       num_bends: number of refractions and reflections.
       statuses: `PathStatus` of each path.
@@ -72,7 +72,7 @@ class LightPaths(NamedTuple):
     media: Int[Array, "paths segments"]
     differentials: RayDifferential
     rays: Int[Array, " paths"]
-    weights: Float[Array, "paths 3"]
+    throughput: Float[Array, "paths 3"]
     radii: Float[Array, " paths"]
     num_bends: Int[Array, " paths"]
     statuses: Int[Array, " paths"]
@@ -89,7 +89,7 @@ class PathEnds(NamedTuple):
       tau: arc length from the camera to the start of the last segment.
       media: medium of the last segment (see `media`).
       rays: index of each path's ray.
-      weights: share of the path in its ray's linear RGB; 0 in empty slots.
+      throughput: share of the path in its ray's linear RGB; 0 in empty slots.
       num_bends: number of refractions and reflections.
       statuses: `PathStatus` of each path.
     """
@@ -99,13 +99,13 @@ class PathEnds(NamedTuple):
     tau: Float[Array, " paths"]
     media: Int[Array, " paths"]
     rays: Int[Array, " paths"]
-    weights: Float[Array, "paths 3"]
+    throughput: Float[Array, "paths 3"]
     num_bends: Int[Array, " paths"]
     statuses: Int[Array, " paths"]
 
 
 def straight(rays: Rays) -> LightPaths:
-    """Returns one straight path per ray, with full weight: the light paths of a plain NeRF."""
+    """Returns one straight path per ray, with full throughput: the light paths of a plain NeRF."""
     count = rays.radii.shape[0]
     integers = jnp.arange(count, dtype=jnp.int32)
     return LightPaths(
@@ -116,7 +116,7 @@ def straight(rays: Rays) -> LightPaths:
         media=jnp.full((count, 1), AMBIENT, jnp.int32),
         differentials=jax.vmap(jax.vmap(ray_differentials.nothing))(rays.origins[:, None]),
         rays=integers,
-        weights=jnp.ones_like(rays.directions),
+        throughput=jnp.ones_like(rays.directions),
         radii=rays.radii,
         num_bends=jnp.zeros_like(integers),
         statuses=jnp.full_like(integers, PathStatus.NOT_TRACED),
@@ -140,7 +140,7 @@ def ends_of(paths: LightPaths) -> PathEnds:
         tau=paths.tau[path, last],
         media=paths.media[path, last],
         rays=paths.rays,
-        weights=paths.weights,
+        throughput=paths.throughput,
         num_bends=paths.num_bends,
         statuses=paths.statuses,
     )
@@ -150,11 +150,11 @@ def filled_up(paths: LightPaths, *, multiple: int) -> LightPaths:
     """Returns the paths, padded with empty slots to a multiple of a number."""
     count = paths.radii.shape[0]
     padded = -(-count // multiple) * multiple
-    # Empty slots repeat the last path with weight 0, so that their values are finite.
+    # Empty slots repeat the last path with throughput 0, so that their values are finite.
     paths = jax.tree.map(lambda x: x[jnp.minimum(jnp.arange(padded), count - 1)], paths)
     real = jnp.arange(padded) < count
     return paths._replace(
-        weights=jnp.where(real[:, None], paths.weights, 0.0),
+        throughput=jnp.where(real[:, None], paths.throughput, 0.0),
         statuses=jnp.where(real, paths.statuses, PathStatus.EMPTY),
     )
 

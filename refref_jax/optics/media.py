@@ -74,7 +74,7 @@ class Crossing(NamedTuple):
       medium_far: medium on the other side.
       tint: factor on linear RGB, reflected or transmitted.
       part: part whose surface is hit, or `EMPTY_SLOT` if it is outranked.
-      inside_after: interior list on the other side; a reflected ray keeps its own.
+      interior_list_after: interior list on the other side; a reflected ray keeps its own.
     """
 
     index_near: Float[Array, ""]
@@ -83,7 +83,7 @@ class Crossing(NamedTuple):
     medium_far: Int[Array, ""]
     tint: Float[Array, "3"]
     part: Int[Array, ""]
-    inside_after: Int[Array, " slots"]
+    interior_list_after: Int[Array, " slots"]
 
 
 def interior_slots(interfaces: Interfaces) -> int:
@@ -98,7 +98,7 @@ def nowhere(interfaces: Interfaces) -> Int[Array, " slots"]:
 
 def crossing(
     interfaces: Interfaces,
-    inside: Int[Array, " slots"],
+    interior_list: Int[Array, " slots"],
     part: Int[Array, ""],
     entering: Bool[Array, ""],
 ) -> Crossing:
@@ -106,13 +106,13 @@ def crossing(
 
     Args:
       interfaces: interfaces of the scene.
-      inside: interior list of the ray before the surface; empty under `nested` and `facing`.
+      interior_list: interior list of the ray before the surface; empty under `nested` and `facing`.
       part: part that is hit.
       entering: whether the ray comes from outside that part.
     """
     if interior_slots(interfaces) == 0:
-        return _declared_crossing(interfaces, inside, part, entering)
-    without = jnp.where(inside == part, EMPTY_SLOT, inside)
+        return _declared_crossing(interfaces, interior_list, part, entering)
+    without = jnp.where(interior_list == part, EMPTY_SLOT, interior_list)
     within = _add(interfaces, without, part)
     medium_without, medium_within = _medium(interfaces, without), _medium(interfaces, within)
     medium_near = jnp.where(entering, medium_without, medium_within)
@@ -125,7 +125,7 @@ def crossing(
         medium_far=medium_far,
         tint=jnp.where(outranked, 1.0, interfaces.tint[part]),
         part=jnp.where(outranked, EMPTY_SLOT, part),
-        inside_after=jnp.where(entering, within, without),
+        interior_list_after=jnp.where(entering, within, without),
     )
 
 
@@ -148,7 +148,7 @@ def transmittance(
 
 def _declared_crossing(
     interfaces: Interfaces,
-    inside: Int[Array, " slots"],
+    interior_list: Int[Array, " slots"],
     part: Int[Array, ""],
     entering: Bool[Array, ""],
 ) -> Crossing:
@@ -164,28 +164,30 @@ def _declared_crossing(
         medium_far=jnp.where(entering, within, without),
         tint=interfaces.tint[part],
         part=part,
-        inside_after=inside,
+        interior_list_after=interior_list,
     )
 
 
-def _ranks(interfaces: Interfaces, inside: Int[Array, " slots"]) -> Int[Array, " slots"]:
+def _ranks(interfaces: Interfaces, interior_list: Int[Array, " slots"]) -> Int[Array, " slots"]:
     """Returns the rank of every entry of an interior list; free slots rank lowest."""
-    return jnp.where(inside == EMPTY_SLOT, EMPTY_SLOT, interfaces.priority[jnp.maximum(inside, 0)])
+    return jnp.where(
+        interior_list == EMPTY_SLOT, EMPTY_SLOT, interfaces.priority[jnp.maximum(interior_list, 0)]
+    )
 
 
 def _add(
-    interfaces: Interfaces, inside: Int[Array, " slots"], part: Int[Array, ""]
+    interfaces: Interfaces, interior_list: Int[Array, " slots"], part: Int[Array, ""]
 ) -> Int[Array, " slots"]:
     """Adds a part to a free slot, or replaces the lowest entry if the part outranks it."""
-    ranks = _ranks(interfaces, inside)
+    ranks = _ranks(interfaces, interior_list)
     lowest = jnp.argmin(ranks)
     here = (jnp.arange(SLOTS) == lowest) & (interfaces.priority[part] > ranks[lowest])
-    return jnp.where(here, part, inside)
+    return jnp.where(here, part, interior_list)
 
 
-def _medium(interfaces: Interfaces, inside: Int[Array, " slots"]) -> Int[Array, ""]:
+def _medium(interfaces: Interfaces, interior_list: Int[Array, " slots"]) -> Int[Array, ""]:
     """Returns the medium of the highest entry; `1 + EMPTY_SLOT` is the ambient medium."""
-    return 1 + inside[jnp.argmax(_ranks(interfaces, inside))]
+    return 1 + interior_list[jnp.argmax(_ranks(interfaces, interior_list))]
 
 
 def _index(interfaces: Interfaces, medium: Int[Array, ""]) -> Float[Array, ""]:

@@ -21,13 +21,16 @@ import math
 from typing import Any, Literal, NamedTuple, get_args
 
 from refref_jax.choices import Footprint
-from refref_jax.configuration import FORMERLY
+from refref_jax.configuration import FORMER_VALUES, FORMERLY
 
 Reflections = Literal["none", "first", "all"]
 TotalReflection = Literal["followed", "ended"]
 Reentry = Literal["possible", "impossible"]
-Unfinished = Literal["kept", "dark"]
+TruncatedPaths = Literal["background", "black"]
 Tally = Literal["none", "parts"]
+
+FORMER_TRUNCATION = {"kept": "background", "dark": "black"}
+"""Values of `truncated_paths` by their names in earlier versions."""
 
 # Max bends and throughput threshold for which the capacity factors below were measured.
 _PAPER_BENDS = 10
@@ -86,8 +89,8 @@ class PathSettings:
         component. A weaker branch leaves its share to its sibling, so that energy is conserved.
       reentry: `impossible` states that a ray that has left the objects never hits one again, as
         with one convex object; such rays are not cast again.
-      unfinished: treatment of truncated paths, which reach the max bends. `kept` ends them on the
-        background along their last direction, as in the paper; `dark` makes them black, as in
+      truncated_paths: treatment of paths that reach the max bends. `background` ends them on the
+        background along their last direction, as in the paper; `black` makes them black, as in
         renderers with a max depth.
       live_per_ray: capacity for rays still to be cast, per camera ray; at least 1.
       segments_per_ray: capacity for path segments per camera ray, in addition to the camera rays.
@@ -99,7 +102,9 @@ class PathSettings:
     total_reflection: TotalReflection = "followed"
     min_throughput: float = dataclasses.field(default=0.0, metadata={FORMERLY: "cut"})
     reentry: Reentry = "possible"
-    unfinished: Unfinished = "kept"
+    truncated_paths: TruncatedPaths = dataclasses.field(
+        default="background", metadata={FORMERLY: "unfinished", FORMER_VALUES: FORMER_TRUNCATION}
+    )
     live_per_ray: float | None = None
     segments_per_ray: float | None = None
     paths_per_ray: float | None = None
@@ -122,9 +127,10 @@ class PathSettings:
             raise ValueError(
                 f"reentry is {self.reentry!r}, which is unknown. Use 'possible' or 'impossible'."
             )
-        if self.unfinished not in get_args(Unfinished):
+        if self.truncated_paths not in get_args(TruncatedPaths):
             raise ValueError(
-                f"unfinished is {self.unfinished!r}, which is unknown. Use 'kept' or 'dark'."
+                f"truncated_paths is {self.truncated_paths!r}, which is unknown. Use 'background' "
+                "or 'black'."
             )
         for name, usual in _usual_factors(self)._asdict().items():
             factor = getattr(self, name)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
 from refref_jax.geometry import surfaces, triangles
-from refref_jax.geometry.bvh import NO_SLOT
+from refref_jax.geometry.bvh import NO_PRIMITIVE
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import SurfacePoint
 from refref_jax.optics import fresnel, media, ray_differentials, snell
@@ -54,7 +54,7 @@ class Interaction(NamedTuple):
 def meet(
     point: SurfacePoint,
     interfaces: media.Interfaces,
-    inside: Int[Array, " slots"],
+    interior_list: Int[Array, " slots"],
     direction: Float[Array, "3"],
 ) -> Interaction:
     """Reflects and refracts a ray at an interface.
@@ -65,11 +65,11 @@ def meet(
     Args:
       point: hit point of the ray.
       interfaces: interfaces of the scene.
-      inside: interior list of the ray (see `media`).
+      interior_list: interior list of the ray (see `media`).
       direction: unit direction of the incident ray.
     """
     entering = numerics.dot(direction, point.geometric_normal) < 0.0
-    sides = media.crossing(interfaces, inside, point.part, entering)
+    sides = media.crossing(interfaces, interior_list, point.part, entering)
     outward = jnp.where(entering, 1.0, -1.0).astype(direction.dtype)
     geometric, shading = outward * point.geometric_normal, outward * point.shading_normal
 
@@ -158,10 +158,10 @@ class RayState(NamedTuple):
       point: start of the current segment, on the surface.
       direction: unit vector.
       tau: arc length from the camera to `point`.
-      weight: throughput, the share of the camera ray's linear RGB.
+      throughput: throughput, the share of the camera ray's linear RGB.
       num_bends: number of bends so far.
-      leaving: excluded primitive, the triangle slot that the segment starts on.
-      inside: interior list, the parts that the ray is in (see `media`).
+      exclude_primitive: triangle that the segment starts on, which it cannot hit.
+      interior_list: interior list, the parts that the ray is in (see `media`).
       differential: ray differential of the current segment (see `ray_differentials`).
     """
 
@@ -169,10 +169,10 @@ class RayState(NamedTuple):
     point: Float[Array, "*rays 3"]
     direction: Float[Array, "*rays 3"]
     tau: Float[Array, "*rays"]
-    weight: Float[Array, "*rays 3"]
+    throughput: Float[Array, "*rays 3"]
     num_bends: Int[Array, "*rays"]
-    leaving: Int[Array, "*rays"]
-    inside: Int[Array, "*rays slots"]
+    exclude_primitive: Int[Array, "*rays"]
+    interior_list: Int[Array, "*rays slots"]
     differential: RayDifferential
 
 
@@ -182,42 +182,44 @@ class Arrival(NamedTuple):
     Attributes:
       interaction: interaction of the ray with the interface.
       length: length of the segment that ends at the hit.
-      weight: throughput after absorption along the segment and the surface's tint.
+      throughput: throughput after absorption along the segment and the surface's tint.
       reflected: ray differential of the reflected ray.
       transmitted: ray differential of the transmitted ray.
     """
 
     interaction: Interaction
     length: Float[Array, "*rays"]
-    weight: Float[Array, "*rays 3"]
+    throughput: Float[Array, "*rays 3"]
     reflected: RayDifferential
     transmitted: RayDifferential
 
 
 class Branches(NamedTuple):
-    """The two rays that leave a surface; branches of weight 0 are not followed."""
+    """The two rays that leave a surface; branches of throughput 0 are not followed."""
 
     reflected: RayState
     transmitted: RayState
 
 
-def begin(ray: Rays, inside: Int[Array, " slots"], differential: RayDifferential) -> RayState:
+def begin(
+    ray: Rays, interior_list: Int[Array, " slots"], differential: RayDifferential
+) -> RayState:
     """Returns the state of a camera ray before its first surface."""
     return RayState(
         origin=ray.origins,
         point=ray.origins,
         direction=ray.directions,
         tau=jnp.zeros_like(ray.radii),
-        weight=jnp.ones_like(ray.origins),
+        throughput=jnp.ones_like(ray.origins),
         num_bends=jnp.zeros((), jnp.int32),
-        leaving=jnp.full((), NO_SLOT, jnp.int32),
-        inside=inside,
+        exclude_primitive=jnp.full((), NO_PRIMITIVE, jnp.int32),
+        interior_list=interior_list,
         differential=differential,
     )
 
 
-def arrive(geometry: Scene, state: RayState, slot: Int[Array, ""]) -> Arrival:
-    """Advances a ray to the triangle that it hits; finite but meaningless for `NO_SLOT`.
+def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arrival:
+    """Advances a ray to the triangle that it hits; finite but meaningless for `NO_PRIMITIVE`.
 
     The hit point is recomputed from the corners of the triangle, so it has gradients and the
     precision of the corners rather than that of the BVH traversal.
@@ -226,23 +228,23 @@ def arrive(geometry: Scene, state: RayState, slot: Int[Array, ""]) -> Arrival:
     def surface(
         origin: Float[Array, "3"], direction: Float[Array, "3"]
     ) -> tuple[Bend, Interaction]:
-        corners = geometry.surfaces.bvh.triangles[slot]
+        corners = scene.surfaces.bvh.triangles[primitive_id]
         found = triangles.intersect(origin, direction, corners).barycentric
         # A ray without a hit reads an arbitrary triangle: keep it out of values and gradients.
-        barycentric = jnp.where(slot == NO_SLOT, 1.0 / 3.0, found)
-        point = surfaces.surface_point(geometry.surfaces, slot, barycentric)
+        barycentric = jnp.where(primitive_id == NO_PRIMITIVE, 1.0 / 3.0, found)
+        point = surfaces.surface_point(scene.surfaces, primitive_id, barycentric)
         # Otherwise XLA would gather the triangle again for every result that depends on it.
         point = jax.lax.optimization_barrier(point)
-        met = meet(point, geometry.interfaces, state.inside, direction)
+        met = meet(point, scene.interfaces, state.interior_list, direction)
         return Bend(met.position, met.reflected, met.transmitted), met
 
     met, reflected, transmitted = ray_differentials.bend(
         surface, state.origin, state.direction, state.differential
     )
     length = numerics.length(met.position - state.point)
-    passed = media.transmittance(geometry.interfaces, met.sides.medium_near, length)
-    weight = state.weight * passed * met.sides.tint
-    return Arrival(met, length, weight, reflected, transmitted)
+    passed = media.transmittance(scene.interfaces, met.sides.medium_near, length)
+    throughput = state.throughput * passed * met.sides.tint
+    return Arrival(met, length, throughput, reflected, transmitted)
 
 
 def ending(
@@ -264,16 +266,16 @@ def ending(
 
 
 def shown(
-    settings: PathSettings, weight: Float[Array, "3"], status: Int[Array, ""]
+    settings: PathSettings, throughput: Float[Array, "3"], status: Int[Array, ""]
 ) -> Float[Array, "3"]:
-    """Returns the weight that a path contributes when it ends with a status."""
-    if settings.unfinished == "kept":
-        return weight
-    return jnp.where(status == PathStatus.OUT_OF_BENDS, 0.0, weight)
+    """Returns the throughput that a path contributes when it ends with a status."""
+    if settings.truncated_paths == "background":
+        return throughput
+    return jnp.where(status == PathStatus.OUT_OF_BENDS, 0.0, throughput)
 
 
 def branch(
-    settings: PathSettings, state: RayState, arrival: Arrival, slot: Int[Array, ""]
+    settings: PathSettings, state: RayState, arrival: Arrival, primitive_id: Int[Array, ""]
 ) -> Branches:
     """Returns both rays that leave the surface, with their shares of the throughput."""
     met = arrival.interaction
@@ -282,26 +284,26 @@ def branch(
         reflectance=met.reflectance,
         total=met.total,
         first=state.num_bends == 0,
-        strength=jnp.max(arrival.weight),
+        strength=jnp.max(arrival.throughput),
     )
     after = state._replace(
         point=met.position,
         tau=state.tau + arrival.length,
         num_bends=state.num_bends + 1,
-        leaving=slot,
+        exclude_primitive=primitive_id,
     )
     return Branches(
         reflected=after._replace(
             origin=met.restart_reflected,
             direction=met.reflected,
-            weight=arrival.weight * share.reflected,
+            throughput=arrival.throughput * share.reflected,
             differential=arrival.reflected,
         ),
         transmitted=after._replace(
             origin=met.restart_transmitted,
             direction=met.transmitted,
-            weight=arrival.weight * share.transmitted,
-            inside=met.sides.inside_after,
+            throughput=arrival.throughput * share.transmitted,
+            interior_list=met.sides.interior_list_after,
             differential=arrival.transmitted,
         ),
     )

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics import media, path_settings, path_tree, scene
+from refref_jax.optics import media, path_settings, path_tree
 from refref_jax.optics.light_paths import (
     LightPaths,
     PathEnds,
@@ -27,7 +27,7 @@ from refref_jax.optics.light_paths import (
     straight_ends,
 )
 from refref_jax.optics.path_settings import Detail, PathSettings, capacities
-from refref_jax.optics.scene import Scene
+from refref_jax.optics.scene import Scene, in_one_precision
 from refref_jax.optics.wavefront import BLOCK, follow
 
 
@@ -36,13 +36,13 @@ class Traced(NamedTuple):
 
     Attributes:
       paths: paths in the order of their rays, the heaviest of each ray first; empty slots last.
-      lost: dropped throughput of each ray, linear RGB, because a buffer was full or truncated
-        paths are black. The weights and dropped throughput of a ray sum to 1, minus absorption by
-        tints and media.
+      dropped: dropped throughput of each ray, linear RGB, because a buffer was full or truncated
+        paths are black. The throughput of a ray's paths and its dropped throughput sum to 1, minus
+        absorption by tints and media.
     """
 
     paths: LightPaths
-    lost: Float[Array, "rays 3"]
+    dropped: Float[Array, "rays 3"]
 
 
 class TracedEnds(NamedTuple):
@@ -50,12 +50,12 @@ class TracedEnds(NamedTuple):
 
     Attributes:
       ends: last segment of each path.
-      lost: dropped throughput of each ray, as in `Traced`.
+      dropped: dropped throughput of each ray, as in `Traced`.
       casts: number of rays that were cast.
     """
 
     ends: PathEnds
-    lost: Float[Array, "rays 3"]
+    dropped: Float[Array, "rays 3"]
     casts: Int[Array, ""]
 
 
@@ -74,54 +74,54 @@ class Survey(NamedTuple):
 
 
 def trace_ends(
-    geometry: Scene,
+    scene: Scene,
     rays: Rays,
     *,
     settings: PathSettings,
-    inside: Int[Array, "rays slots"] | None = None,
+    interior_list: Int[Array, "rays slots"] | None = None,
     block: int = BLOCK,
 ) -> TracedEnds:
     """Traces rays, and returns only the last segments of their paths.
 
     Args:
-      geometry: the scene.
+      scene: the scene.
       rays: camera rays.
       settings: path settings.
-      inside: interior list of each camera, for the rule `priority` (see `data.mesh_queries`); none
-        by default. The other rules do not use it.
+      interior_list: interior list of each camera, for the rule `priority` (see
+        `data.mesh_queries`); none by default. The other rules do not use it.
       block: number of rays cast at once, see `wavefront`.
     """
-    geometry, rays = scene.in_one_precision(geometry, rays)
+    scene, rays = in_one_precision(scene, rays)
     if _needs_no_tracing(rays, settings):
         return TracedEnds(
             straight_ends(rays), jnp.zeros_like(rays.origins), jnp.zeros((), jnp.int32)
         )
-    tree = follow(geometry, rays, _inside(geometry, rays, inside), settings=settings, block=block)
+    tree = follow(scene, rays, _inside(scene, rays, interior_list), settings=settings, block=block)
     ends = path_tree.listed(tree, capacities(settings, rays.radii.shape[0]).paths)
     last = path_tree.last_segments(tree.segments.items, ends)
-    return TracedEnds(last, tree.lost, tree.casts)
+    return TracedEnds(last, tree.dropped, tree.casts)
 
 
 def trace(
-    geometry: Scene,
+    scene: Scene,
     rays: Rays,
     *,
     settings: PathSettings,
     capacity: int | None = None,
     detail: Detail | None = None,
-    inside: Int[Array, "rays slots"] | None = None,
+    interior_list: Int[Array, "rays slots"] | None = None,
 ) -> Traced:
     """Traces one batch of rays: a pure function, to be jitted and mapped by the caller.
 
     Args:
-      geometry: the scene.
+      scene: the scene.
       rays: camera rays.
       settings: path settings.
       capacity: capacity for paths; by default that of the path settings for this number of rays,
         which is more than most scenes need, see `path_settings.capacity_for`. Unused if max bends
         is 0 or there are no rays.
       detail: parts of the paths to store; by default every segment, and nothing else.
-      inside: interior list of each camera, as in `trace_ends`.
+      interior_list: interior list of each camera, as in `trace_ends`.
 
     Example:
       Light that hits a glass surface head-on: 4 % is reflected, the rest is transmitted.
@@ -135,67 +135,72 @@ def trace(
       >>> settings = refref_jax.PathSettings(max_bends=1, reflections="all")
       >>> trace = jax.jit(functools.partial(refref_jax.trace, settings=settings))
       >>> paths = trace(glass, rays).paths  # each ray's heaviest path first
-      >>> print(np.round(paths.weights[:2, 0], 2), paths.num_bends[:2], paths.tau[0, :2])
+      >>> print(np.round(paths.throughput[:2, 0], 2), paths.num_bends[:2], paths.tau[0, :2])
       [0.96 0.04] [1 1] [0.  1.5]
     """
     batch = jax.tree.map(lambda x: x[None], rays)
-    if inside is not None:
-        inside = inside[None]
+    if interior_list is not None:
+        interior_list = interior_list[None]
     traced = trace_batches(
-        geometry, batch, settings=settings, capacity=capacity, detail=detail, inside=inside
+        scene,
+        batch,
+        settings=settings,
+        capacity=capacity,
+        detail=detail,
+        interior_list=interior_list,
     )
     return jax.tree.map(lambda x: x[0], traced)
 
 
 def trace_batches(
-    geometry: Scene,
+    scene: Scene,
     rays: Rays,
     *,
     settings: PathSettings,
     capacity: int | None = None,
     detail: Detail | None = None,
-    inside: Int[Array, "batches rays slots"] | None = None,
+    interior_list: Int[Array, "batches rays slots"] | None = None,
 ) -> Traced:
     """Traces many batches in one wavefront, which amortises the latency of the traversal loop.
 
     Args:
-      geometry: the scene.
+      scene: the scene.
       rays: camera rays `[batches, rays]`.
       settings: path settings.
       capacity: capacity for the paths of each batch, as in `trace`.
       detail: parts of the paths to store, as in `trace`.
-      inside: interior list of each camera, as in `trace_ends`.
+      interior_list: interior list of each camera, as in `trace_ends`.
 
     Returns:
       The paths of each batch, stacked; ray indices count within a batch.
     """
-    geometry, rays = scene.in_one_precision(geometry, rays)
+    scene, rays = in_one_precision(scene, rays)
     if _needs_no_tracing(rays, settings):
         return jax.vmap(lambda batch: Traced(straight(batch), jnp.zeros_like(batch.origins)))(rays)
     batches, count = rays.radii.shape
     capacity = capacities(settings, count).paths if capacity is None else capacity
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
-    if inside is not None:
-        inside = inside.reshape(batches * count, inside.shape[-1])
+    if interior_list is not None:
+        interior_list = interior_list.reshape(batches * count, interior_list.shape[-1])
     detail = detail or path_settings.everything(settings.max_bends)
-    inside = _inside(geometry, flat, inside)
-    tree = follow(geometry, flat, inside, settings=settings, footprint=detail.footprint)
-    ends, lost = path_tree.pack(tree, batches, count, capacity)
+    interior_list = _inside(scene, flat, interior_list)
+    tree = follow(scene, flat, interior_list, settings=settings, footprint=detail.footprint)
+    ends, dropped = path_tree.pack(tree, batches, count, capacity)
     paths = path_tree.polylines(
         tree.segments.items,
         ends,
         flat.radii[ends.rays],
         detail=detail,
-        parts=geometry.interfaces.index_inside.shape[0],
+        parts=scene.interfaces.index_inside.shape[0],
     )
     paths = jax.tree.map(lambda x: x.reshape(batches, capacity, *x.shape[1:]), paths)
-    return Traced(paths._replace(rays=paths.rays % count), lost.reshape(batches, count, 3))
+    return Traced(paths._replace(rays=paths.rays % count), dropped.reshape(batches, count, 3))
 
 
-def survey(geometry: Scene, rays: Rays, *, settings: PathSettings) -> Survey:
+def survey(scene: Scene, rays: Rays, *, settings: PathSettings) -> Survey:
     """Measures the path statistics that determine the capacity for batches of rays."""
     count = rays.radii.shape[0]
-    ends = trace_ends(geometry, rays, settings=settings).ends
+    ends = trace_ends(scene, rays, settings=settings).ends
     one = exists(ends).astype(jnp.float32)
     paths = jax.ops.segment_sum(one, ends.rays, num_segments=count)
     untraced = (ends.statuses == PathStatus.NOT_TRACED) & (ends.num_bends == 0)
@@ -208,9 +213,9 @@ def _needs_no_tracing(rays: Rays, settings: PathSettings) -> bool:
 
 
 def _inside(
-    geometry: Scene, rays: Rays, inside: Int[Array, "rays slots"] | None
+    scene: Scene, rays: Rays, interior_list: Int[Array, "rays slots"] | None
 ) -> Int[Array, "rays slots"]:
-    if inside is not None:
-        return inside
-    nowhere = media.nowhere(geometry.interfaces)
+    if interior_list is not None:
+        return interior_list
+    nowhere = media.nowhere(scene.interfaces)
     return jnp.broadcast_to(nowhere, (rays.radii.shape[0], nowhere.shape[0]))

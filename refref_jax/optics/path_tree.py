@@ -21,7 +21,7 @@ from refref_jax.optics import queues
 from refref_jax.optics.light_paths import LightPaths, PathEnds, PathStatus
 from refref_jax.optics.media import AMBIENT
 from refref_jax.optics.path_settings import Detail
-from refref_jax.optics.queues import Pool
+from refref_jax.optics.queues import Queue
 from refref_jax.optics.ray_differentials import RayDifferential
 
 NO_SEGMENT = -1
@@ -59,14 +59,14 @@ class Ends(NamedTuple):
     Attributes:
       segments: index of the last segment.
       rays: index of the camera ray.
-      weights: share of the path in its ray's linear RGB.
+      throughput: share of the path in its ray's linear RGB.
       num_bends: number of bends.
       statuses: `PathStatus` of each path.
     """
 
     segments: Int[Array, " paths"]
     rays: Int[Array, " paths"]
-    weights: Float[Array, "paths 3"]
+    throughput: Float[Array, "paths 3"]
     num_bends: Int[Array, " paths"]
     statuses: Int[Array, " paths"]
 
@@ -77,13 +77,13 @@ class PathTree(NamedTuple):
     Attributes:
       segments: list of `Segments`.
       ends: list of `Ends`, one per path.
-      lost: dropped throughput of each ray, linear RGB.
+      dropped: dropped throughput of each ray, linear RGB.
       casts: number of rays that were cast.
     """
 
-    segments: Pool
-    ends: Pool
-    lost: Float[Array, "rays 3"]
+    segments: Queue
+    ends: Queue
+    dropped: Float[Array, "rays 3"]
     casts: Int[Array, ""]
 
 
@@ -112,7 +112,7 @@ def emptied(ends: Ends, empty: Bool[Array, " paths"], home: Int[Array, " paths"]
     return Ends(
         segments=jnp.where(empty, home, ends.segments),
         rays=jnp.where(empty, home, ends.rays),
-        weights=jnp.where(empty[:, None], 0.0, ends.weights),
+        throughput=jnp.where(empty[:, None], 0.0, ends.throughput),
         num_bends=jnp.where(empty, 0, ends.num_bends),
         statuses=jnp.where(empty, PathStatus.EMPTY, ends.statuses).astype(jnp.int32),
     )
@@ -127,7 +127,7 @@ def last_segments(segments: Segments, ends: Ends) -> PathEnds:
         tau=last.tau,
         media=last.media,
         rays=ends.rays,
-        weights=ends.weights,
+        throughput=ends.throughput,
         num_bends=ends.num_bends,
         statuses=ends.statuses,
     )
@@ -162,7 +162,7 @@ def polylines(
         media=jnp.where(used, read.media, AMBIENT),
         differentials=read.differentials,
         rays=ends.rays,
-        weights=ends.weights,
+        throughput=ends.throughput,
         radii=radii,
         num_bends=ends.num_bends,
         statuses=ends.statuses,
@@ -247,30 +247,30 @@ def pack(
       The concatenated lists, and the throughput dropped so far for each ray.
     """
     most = min(batches * capacity, tree.ends.items.rays.shape[0])
-    pool, lost = queues.shed(tree.ends, tree.lost, most)
-    ends = listed(tree._replace(ends=pool), most)
-    weight = jnp.max(ends.weights, axis=-1)
+    queue, dropped = queues.drop_weakest(tree.ends, tree.dropped, most)
+    ends = listed(tree._replace(ends=queue), most)
+    throughput = jnp.max(ends.throughput, axis=-1)
     # The slots past the last path form a batch of their own.
     lanes = jnp.arange(most, dtype=jnp.int32)
-    batch = jnp.where(lanes < pool.count, ends.rays // rays, batches)
-    fits = _strongest_of_each(batch, weight, batches, capacity)
-    order = jnp.lexsort((-weight, jnp.where(fits, ends.rays, batches * rays))).astype(jnp.int32)
+    batch = jnp.where(lanes < queue.count, ends.rays // rays, batches)
+    fits = _strongest_of_each(batch, throughput, batches, capacity)
+    order = jnp.lexsort((-throughput, jnp.where(fits, ends.rays, batches * rays))).astype(jnp.int32)
     group = jnp.where(fits, batch, batches)[order]
     target = jnp.where(fits[order], group * capacity + _rank_in_group(group, batches), _NOWHERE)
     source = jnp.full(batches * capacity, most, jnp.int32).at[target].set(order, mode="drop")
     packed = jax.tree.map(lambda x: x[jnp.minimum(source, most - 1)], ends)
     home = jnp.repeat(jnp.arange(batches, dtype=jnp.int32) * rays, capacity)
-    lost = queues.lose(lost, ends.rays, ends.weights, ~fits)
-    return emptied(packed, source == most, home), lost
+    dropped = queues.add_dropped(dropped, ends.rays, ends.throughput, ~fits)
+    return emptied(packed, source == most, home), dropped
 
 
 def _strongest_of_each(
-    batch: Int[Array, " paths"], weight: Float[Array, " paths"], batches: int, capacity: int
+    batch: Int[Array, " paths"], throughput: Float[Array, " paths"], batches: int, capacity: int
 ) -> Bool[Array, " paths"]:
     """Returns which paths are among the strongest of their batch; sorts only if necessary."""
 
     def choose(batch: Int[Array, " paths"]) -> Bool[Array, " paths"]:
-        order = jnp.lexsort((-weight, batch))
+        order = jnp.lexsort((-throughput, batch))
         rank = _rank_in_group(batch[order], batches)
         return jnp.zeros_like(batch, bool).at[order].set(rank < capacity)
 

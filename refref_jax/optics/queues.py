@@ -1,8 +1,8 @@
 """Work queues of rays and paths with static capacity.
 
-A pool is an array of records with a count; records past the count are meaningless. Appending writes
-a full block, so a pool has one block of slots beyond its capacity. After appending, callers reduce
-the pool to its capacity with `shed`, which drops the records of least throughput.
+A queue is an array of records with a count; records past the count are meaningless. Appending
+writes a full block, so a queue has one block of space beyond its capacity. After appending, callers
+reduce the queue to its capacity with `drop_weakest`, which drops the records of least throughput.
 """
 
 from typing import Any, NamedTuple
@@ -12,10 +12,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 Records = Any
-"""NamedTuple of arrays with one leading axis; `shed` requires the fields `weights` and `rays`."""
+"""NamedTuple of arrays with one leading axis.
+
+`drop_weakest` requires the fields `throughput` and `rays`.
+"""
 
 
-class Pool(NamedTuple):
+class Queue(NamedTuple):
     """A list of records.
 
     Attributes:
@@ -27,13 +30,13 @@ class Pool(NamedTuple):
     count: Int[Array, ""]  # type: ignore[assignment]  # hides tuple.count
 
 
-def fill(items: Records, count: int, slots: int) -> Pool:
-    """Returns a pool of `slots` slots, whose first `count` hold the given records."""
+def fill(items: Records, count: int, size: int) -> Queue:
+    """Returns a queue of `size` records, whose first `count` hold the given records."""
 
     def pad(x: Array) -> Array:
-        return jnp.concatenate([x, jnp.zeros((slots - x.shape[0], *x.shape[1:]), x.dtype)])
+        return jnp.concatenate([x, jnp.zeros((size - x.shape[0], *x.shape[1:]), x.dtype)])
 
-    return Pool(jax.tree.map(pad, items), jnp.int32(count))
+    return Queue(jax.tree.map(pad, items), jnp.int32(count))
 
 
 def join(first: Records, second: Records) -> Records:
@@ -41,64 +44,64 @@ def join(first: Records, second: Records) -> Records:
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
 
 
-def append(pool: Pool, block: Records, keep: Bool[Array, " block"]) -> Pool:
+def append(queue: Queue, block: Records, keep: Bool[Array, " block"]) -> Queue:
     """Appends the selected records of a block, in order.
 
     Args:
-      pool: pool with at least one block of slots beyond its count.
+      queue: queue with space for at least one block beyond its count.
       block: records of the same type.
       keep: mask of the records to append.
     """
     order = front_first(keep)
     items = jax.tree.map(
-        lambda old, new: jax.lax.dynamic_update_slice_in_dim(old, new[order], pool.count, 0),
-        pool.items,
+        lambda old, new: jax.lax.dynamic_update_slice_in_dim(old, new[order], queue.count, 0),
+        queue.items,
         block,
     )
-    return Pool(items, pool.count + jnp.sum(keep, dtype=jnp.int32))
+    return Queue(items, queue.count + jnp.sum(keep, dtype=jnp.int32))
 
 
-def pop(pool: Pool, size: int) -> tuple[Pool, Pool]:
+def pop(queue: Queue, size: int) -> tuple[Queue, Queue]:
     """Removes up to `size` records from the end; returns the remaining and the removed records."""
-    start = jnp.maximum(pool.count - size, 0)
-    taken = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, size, 0), pool.items)
-    return Pool(pool.items, start), Pool(taken, pool.count - start)
+    start = jnp.maximum(queue.count - size, 0)
+    taken = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, size, 0), queue.items)
+    return Queue(queue.items, start), Queue(taken, queue.count - start)
 
 
-def shed(
-    pool: Pool, lost: Float[Array, "rays 3"], capacity: int
-) -> tuple[Pool, Float[Array, "rays 3"]]:
+def drop_weakest(
+    queue: Queue, dropped: Float[Array, "rays 3"], capacity: int
+) -> tuple[Queue, Float[Array, "rays 3"]]:
     """Drops the weakest records beyond a capacity. Its cost is negligible if there are none.
 
     Args:
-      pool: records with fields `weights` (linear RGB) and `rays` (index of the camera ray).
-      lost: throughput dropped so far for each ray.
+      queue: records with fields `throughput` (linear RGB) and `rays` (index of the camera ray).
+      dropped: throughput dropped so far for each ray.
       capacity: maximum number of records to keep.
 
     Returns:
-      The pool, in its order, and the updated dropped throughput.
+      The queue, in its order, and the updated dropped throughput.
     """
 
-    def drop(pool: Pool, lost: Float[Array, "rays 3"]) -> tuple[Pool, Float[Array, "rays 3"]]:
-        weights, rays = pool.items.weights, pool.items.rays
-        filled = jnp.arange(rays.shape[0], dtype=jnp.int32) < pool.count
-        kept = strongest(filled, jnp.max(weights, axis=-1), jnp.int32(capacity))
+    def drop(queue: Queue, dropped: Float[Array, "rays 3"]) -> tuple[Queue, Float[Array, "rays 3"]]:
+        throughput, rays = queue.items.throughput, queue.items.rays
+        filled = jnp.arange(rays.shape[0], dtype=jnp.int32) < queue.count
+        kept = strongest(filled, jnp.max(throughput, axis=-1), jnp.int32(capacity))
         order = front_first(kept)
-        items = jax.tree.map(lambda x: x[order], pool.items)
-        lost = lose(lost, rays, weights, filled & ~kept)
-        return Pool(items, jnp.sum(kept, dtype=jnp.int32)), lost
+        items = jax.tree.map(lambda x: x[order], queue.items)
+        dropped = add_dropped(dropped, rays, throughput, filled & ~kept)
+        return Queue(items, jnp.sum(kept, dtype=jnp.int32)), dropped
 
-    return jax.lax.cond(pool.count > capacity, drop, lambda *same: same, pool, lost)
+    return jax.lax.cond(queue.count > capacity, drop, lambda *same: same, queue, dropped)
 
 
-def lose(
-    lost: Float[Array, "rays 3"],
+def add_dropped(
+    dropped: Float[Array, "rays 3"],
     rays: Int[Array, " n"],
-    weights: Float[Array, "n 3"],
-    dropped: Bool[Array, " n"],
+    throughput: Float[Array, "n 3"],
+    which: Bool[Array, " n"],
 ) -> Float[Array, "rays 3"]:
-    """Adds the weights of dropped records to the dropped throughput of their rays."""
-    return lost.at[rays].add(jnp.where(dropped[:, None], weights, 0.0))
+    """Adds the throughput of the marked records to the dropped throughput of their rays."""
+    return dropped.at[rays].add(jnp.where(which[:, None], throughput, 0.0))
 
 
 def strongest(

@@ -21,7 +21,7 @@ class Scene(NamedTuple):
     interfaces: media.Interfaces
 
 
-def with_index(geometry: Scene, index: Float[ArrayLike, ""], *, part: int = 0) -> Scene:
+def with_index(scene: Scene, index: Float[ArrayLike, ""], *, part: int = 0) -> Scene:
     """Returns a scene in which one part has another index of refraction.
 
     The outer index of parts directly inside this part changes too, except under the rule `facing`,
@@ -29,7 +29,7 @@ def with_index(geometry: Scene, index: Float[ArrayLike, ""], *, part: int = 0) -
     compiled for one index work for all.
 
     Args:
-      geometry: the scene.
+      scene: the scene.
       index: index of refraction, relative to air.
       part: index of the part, in the order in which the parts were given; the parts of a scene
         folder are ordered by name.
@@ -45,7 +45,7 @@ def with_index(geometry: Scene, index: Float[ArrayLike, ""], *, part: int = 0) -
       1.25
     """
     new = jnp.asarray(index)
-    interfaces = jax.tree.map(jnp.asarray, geometry.interfaces)
+    interfaces = jax.tree.map(jnp.asarray, scene.interfaces)
     # A Python number has no precision of its own.
     decisive = interfaces if new.weak_type else (interfaces, new)
     interfaces = _in_precision(_highest(decisive), interfaces)
@@ -61,16 +61,16 @@ def with_index(geometry: Scene, index: Float[ArrayLike, ""], *, part: int = 0) -
         index_inside=interfaces.index_inside.at[part].set(new),
         index_outside=jnp.where(around, new, interfaces.index_outside),
     )
-    return geometry._replace(interfaces=changed)
+    return scene._replace(interfaces=changed)
 
 
-def in_one_precision(geometry: Scene, rays: Rays) -> tuple[Scene, Rays]:
+def in_one_precision(scene: Scene, rays: Rays) -> tuple[Scene, Rays]:
     """Returns a scene and rays as JAX arrays of the highest precision among their arrays.
 
     Scenes are built in single precision, so rays in double precision are traced in double
     precision through corners that were rounded to single precision.
     """
-    both = jax.tree.map(jnp.asarray, (geometry, rays))
+    both = jax.tree.map(jnp.asarray, (scene, rays))
     return _in_precision(_highest(both), both)
 
 

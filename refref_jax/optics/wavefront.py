@@ -10,8 +10,8 @@ Every segment of a path is stored once, with a pointer to its parent segment; a 
 by its last segment.
 
 If a buffer exceeds its capacity, its records of least throughput are dropped, and the dropped
-throughput of each ray is returned: the weights of a ray's paths and its dropped throughput sum to
-1, minus absorption by tints and media.
+throughput of each ray is returned: the throughput of a ray's paths and its dropped throughput sum
+to 1, minus absorption by tints and media.
 
 Letters as in `light_paths`. Source: paper (arXiv 2505.05848), section 4.2, for the interaction
 with surfaces.
@@ -32,7 +32,7 @@ from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import Capacities, PathSettings
 from refref_jax.optics.path_step import Arrival, Branches, RayState
 from refref_jax.optics.path_tree import NO_SEGMENT, Ends, PathTree, Segments
-from refref_jax.optics.queues import Pool
+from refref_jax.optics.queues import Queue
 from refref_jax.optics.scene import Scene
 
 BLOCK = 4096
@@ -59,9 +59,9 @@ class Live(NamedTuple):
     segments: Int[Array, " live"]
 
     @property
-    def weights(self) -> Float[Array, "live 3"]:
+    def throughput(self) -> Float[Array, "live 3"]:
         """Throughputs of the rays."""
-        return self.state.weight
+        return self.state.throughput
 
 
 class Children(NamedTuple):
@@ -71,7 +71,7 @@ class Children(NamedTuple):
       live: child rays; they have the segment index of their parent until their own is stored.
       media: medium of each child's segment.
       parts: part that each child's segment starts on.
-      exists: mask of children with positive weight.
+      exists: mask of children with positive throughput.
       traced: mask of children that are traced further.
     """
 
@@ -103,7 +103,7 @@ def children_of(
         ),
         media=mediums,
         parts=queues.join(sides.part, sides.part),
-        exists=queues.join(bending, bending) & (jnp.max(states.weight, axis=-1) > 0.0),
+        exists=queues.join(bending, bending) & (jnp.max(states.throughput, axis=-1) > 0.0),
         traced=traced,
     )
 
@@ -112,7 +112,7 @@ def log(tree: PathTree, children: Children, capacities: Capacities) -> tuple[Pat
     """Stores the segments of children; drops the weakest children if the buffer is full."""
     live = children.live
     left = capacities.segments - tree.segments.count
-    kept = queues.strongest(children.exists, jnp.max(live.weights, axis=-1), left)
+    kept = queues.strongest(children.exists, jnp.max(live.throughput, axis=-1), left)
     index = tree.segments.count + jnp.cumsum(kept, dtype=jnp.int32) - 1
     state = live.state
     logged = Segments(
@@ -125,14 +125,14 @@ def log(tree: PathTree, children: Children, capacities: Capacities) -> tuple[Pat
         state.differential,
     )
     log = queues.append(tree.segments, logged, kept)
-    lost = queues.lose(tree.lost, live.rays, live.weights, children.exists & ~kept)
+    dropped = queues.add_dropped(tree.dropped, live.rays, live.throughput, children.exists & ~kept)
     children = children._replace(live=live._replace(segments=index), exists=kept)
-    return tree._replace(segments=log, lost=lost), children
+    return tree._replace(segments=log, dropped=dropped), children
 
 
 def push(
-    tree: PathTree, stack: Pool, children: Children, settings: PathSettings
-) -> tuple[PathTree, Pool]:
+    tree: PathTree, stack: Queue, children: Children, settings: PathSettings
+) -> tuple[PathTree, Queue]:
     """Pushes children on the stack, and ends those that are not traced further.
 
     The latter are the paper's first reflections, and rays that cannot hit an object again.
@@ -152,18 +152,18 @@ def end_by(
     status: Int[Array, " n"],
     ending: Bool[Array, " n"],
 ) -> PathTree:
-    """Ends some rays as paths; the weight of paths that the settings make black is dropped."""
-    weights = jax.vmap(functools.partial(path_step.shown, settings))(live.weights, status)
-    lost = queues.lose(tree.lost, live.rays, live.weights - weights, ending)
-    live = live._replace(state=live.state._replace(weight=weights))
-    return end(tree._replace(lost=lost), live, status, ending)
+    """Ends some rays as paths; the throughput of paths that the settings make black is dropped."""
+    throughput = jax.vmap(functools.partial(path_step.shown, settings))(live.throughput, status)
+    dropped = queues.add_dropped(tree.dropped, live.rays, live.throughput - throughput, ending)
+    live = live._replace(state=live.state._replace(throughput=throughput))
+    return end(tree._replace(dropped=dropped), live, status, ending)
 
 
 def end(
     tree: PathTree, live: Live, status: Int[Array, " n"], ending: Bool[Array, " n"]
 ) -> PathTree:
     """Ends some rays as paths."""
-    block = Ends(live.segments, live.rays, live.weights, live.state.num_bends, status)
+    block = Ends(live.segments, live.rays, live.throughput, live.state.num_bends, status)
     return tree._replace(ends=queues.append(tree.ends, block, ending))
 
 
@@ -176,15 +176,15 @@ class _Walk(NamedTuple):
       tree: path tree so far.
     """
 
-    stack: Pool
-    next: Pool
+    stack: Queue
+    next: Queue
     tree: PathTree
 
 
 def follow(
-    geometry: Scene,
+    scene: Scene,
     rays: Rays,
-    inside: Int[Array, "rays slots"],
+    interior_list: Int[Array, "rays slots"],
     *,
     settings: PathSettings,
     footprint: Footprint = "cone",
@@ -193,14 +193,14 @@ def follow(
     """Traces each ray along all branches; every child has one bend more than its parent.
 
     Args:
-      geometry: the scene.
+      scene: the scene.
       rays: any number of camera rays.
-      inside: interior list of each camera (see `media.nowhere`).
+      interior_list: interior list of each camera (see `media.nowhere`).
       settings: path settings, with at least one bend.
       footprint: `differential` carries derivatives across the pixel.
       block: number of rays cast per iteration.
     """
-    return _follow(settings, footprint, block, geometry, rays, inside)
+    return _follow(settings, footprint, block, scene, rays, interior_list)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
@@ -208,28 +208,28 @@ def _follow(
     settings: PathSettings,
     footprint: Footprint,
     block: int,
-    geometry: Scene,
+    scene: Scene,
     rays: Rays,
-    inside: Int[Array, "rays slots"],
+    interior_list: Int[Array, "rays slots"],
 ) -> PathTree:
     count = rays.radii.shape[0]
     block = max(1, min(block, count))
     capacities = path_settings.capacities(settings, count)
-    walk = _begin(rays, inside, footprint, block, capacities)
+    walk = _begin(rays, interior_list, footprint, block, capacities)
     if count < _MANY_BLOCKS * block or block < _SMALLER:
-        return _work_off(geometry, walk, settings, block, capacities, least=1).tree
+        return _work_off(scene, walk, settings, block, capacities, least=1).tree
     # Otherwise the few deepest rays would cast a full block in each iteration.
-    walk = _work_off(geometry, walk, settings, block, capacities, least=block // 4)
+    walk = _work_off(scene, walk, settings, block, capacities, least=block // 4)
     stack = queues.append(
         walk.stack, walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
     )
     small = block // _SMALLER
     walk = _Walk(*queues.pop(stack, small), walk.tree)
-    return _work_off(geometry, walk, settings, small, capacities, least=1).tree
+    return _work_off(scene, walk, settings, small, capacities, least=1).tree
 
 
 def _work_off(
-    geometry: Scene,
+    scene: Scene,
     walk: _Walk,
     settings: PathSettings,
     block: int,
@@ -239,7 +239,7 @@ def _work_off(
 ) -> _Walk:
     """Casts blocks until fewer than `least` rays are left."""
 
-    def unfinished(walk: _Walk) -> Bool[Array, ""]:
+    def more(walk: _Walk) -> Bool[Array, ""]:
         return walk.next.count + walk.stack.count >= least
 
     def fits(walk: _Walk) -> Bool[Array, ""]:
@@ -247,15 +247,15 @@ def _work_off(
 
     def advance(walk: _Walk) -> _Walk:
         walk = jax.lax.while_loop(
-            lambda walk: unfinished(walk) & fits(walk),
-            lambda walk: _round(geometry, walk, settings, block, capacities),
+            lambda walk: more(walk) & fits(walk),
+            lambda walk: _round(scene, walk, settings, block, capacities),
             walk,
         )
-        stack, lost = queues.shed(walk.stack, walk.tree.lost, capacities.live)
-        ends, lost = queues.shed(walk.tree.ends, lost, capacities.paths)
-        return _Walk(stack, walk.next, walk.tree._replace(ends=ends, lost=lost))
+        stack, dropped = queues.drop_weakest(walk.stack, walk.tree.dropped, capacities.live)
+        ends, dropped = queues.drop_weakest(walk.tree.ends, dropped, capacities.paths)
+        return _Walk(stack, walk.next, walk.tree._replace(ends=ends, dropped=dropped))
 
-    return jax.lax.while_loop(unfinished, advance, walk)
+    return jax.lax.while_loop(more, advance, walk)
 
 
 @_follow.defjvp
@@ -264,15 +264,15 @@ def _refuse_gradients(
 ) -> NoReturn:
     del settings, footprint, block, primals, tangents
     raise TypeError(
-        "Light paths of trace have no derivatives with respect to rays or geometry. Use "
-        "follow_branch or follow_main_branches, or hold rays and geometry constant with "
+        "Light paths of trace have no derivatives with respect to rays or the scene. Use "
+        "follow_branch or follow_main_branches, or hold rays and the scene constant with "
         "jax.lax.stop_gradient."
     )
 
 
 def _begin(
     rays: Rays,
-    inside: Int[Array, "rays slots"],
+    interior_list: Int[Array, "rays slots"],
     footprint: Footprint,
     block: int,
     capacities: Capacities,
@@ -281,19 +281,19 @@ def _begin(
     count = rays.radii.shape[0]
     order = jnp.arange(count, dtype=jnp.int32)
     differential = jax.vmap(lambda ray: ray_differentials.begin(ray, footprint))(rays)
-    state = jax.vmap(path_step.begin)(rays, inside, differential)
+    state = jax.vmap(path_step.begin)(rays, interior_list, differential)
     ambient = jnp.full_like(order, media.AMBIENT)
     first = jnp.full_like(order, NO_SEGMENT)
     nowhere = jnp.full_like(order, media.EMPTY_SLOT)
     segments = Segments(
         first, state.point, state.direction, state.tau, ambient, nowhere, state.differential
     )
-    ends = Ends(order, order, state.weight, order, order)
+    ends = Ends(order, order, state.throughput, order, order)
     # Each buffer has slots beyond its capacity for the records that one iteration may append.
     tree = PathTree(
         segments=queues.fill(segments, count, capacities.segments + 2 * block),
         ends=queues.fill(ends, 0, capacities.paths + 3 * block),
-        lost=jnp.zeros_like(rays.origins),
+        dropped=jnp.zeros_like(rays.origins),
         casts=jnp.zeros((), jnp.int32),
     )
     stack = queues.fill(Live(state, order, order), count, capacities.live + 2 * block)
@@ -301,13 +301,13 @@ def _begin(
 
 
 def _round(
-    geometry: Scene, walk: _Walk, settings: PathSettings, block: int, capacities: Capacities
+    scene: Scene, walk: _Walk, settings: PathSettings, block: int, capacities: Capacities
 ) -> _Walk:
     """Casts one block, ends paths, and pushes the children on the stack."""
     live, alive = walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
-    hits = _cast(geometry, live.state, alive)
+    hits = _cast(scene, live.state, alive)
     arrive = jax.vmap(path_step.arrive, in_axes=(None, 0, 0))
-    arrival = arrive(geometry, live.state, hits.slots)
+    arrival = arrive(scene, live.state, hits.primitive_ids)
     hit = alive & jnp.isfinite(hits.distances)
     status = jax.vmap(functools.partial(path_step.ending, settings))(live.state, arrival, hit)
     bending = hit & (status == PathStatus.EMPTY)
@@ -317,7 +317,7 @@ def _round(
     tree = path_tree.name_media(tree, live.segments, medium, hit & (live.state.num_bends == 0))
     tree = end_by(settings, tree, live, status, alive & ~bending)
     branches = jax.vmap(functools.partial(path_step.branch, settings))(
-        live.state, arrival, hits.slots
+        live.state, arrival, hits.primitive_ids
     )
     children = children_of(live, branches, arrival, bending, settings)
     tree, children = log(tree, children, capacities)
@@ -325,10 +325,10 @@ def _round(
     return _Walk(*queues.pop(stack, block), tree)
 
 
-def _cast(geometry: Scene, state: RayState, alive: Bool[Array, " block"]) -> bvh.Hits:
+def _cast(scene: Scene, state: RayState, alive: Bool[Array, " block"]) -> bvh.Hits:
     return bvh.closest_hits(
-        geometry.surfaces.bvh,
+        scene.surfaces.bvh,
         Rays(state.origin, state.direction, jnp.zeros_like(state.tau)),
         limits=jnp.where(alive, jnp.inf, -1.0).astype(state.tau.dtype),
-        leaving=state.leaving,
+        exclude_primitive=state.exclude_primitive,
     )

@@ -57,7 +57,7 @@ class Rig(NamedTuple):
       vertices: vertices at rest, world units.
       faces: faces of the mesh.
       groups: number of the smoothing group that each corner of a face belongs to.
-      slots: face number of each primitive of the surfaces.
+      primitive_faces: face number of each primitive of the surfaces.
       handles: handles that move each vertex.
       shares: weights of these handles, which sum to 1.
       neighbours: handles next to each handle.
@@ -67,7 +67,7 @@ class Rig(NamedTuple):
     vertices: Float[Array, "vertices 3"]
     faces: Int[Array, "faces 3"]
     groups: Int[Array, "faces 3"]
-    slots: Int[Array, " slots"]
+    primitive_faces: Int[Array, " primitives"]
     handles: Int[Array, "vertices nearest"]
     shares: Float[Array, "vertices nearest"]
     neighbours: Int[Array, "handles around"]
@@ -85,11 +85,11 @@ def build(mesh: Mesh, *, handles: int = HANDLES) -> Rig:
     """
     if handles < 4:
         raise ReconstructionError(f"handles={handles} is too small. Pass 4 or more.")
-    bvh, slots = bvh_build.build(mesh.vertices[mesh.faces].astype(np.float32))
+    bvh, order = bvh_build.build(mesh.vertices[mesh.faces].astype(np.float32))
     surfaces = Surfaces(
         bvh,
-        host_array(mesh.normals[slots].astype(np.float32)),
-        host_array(np.zeros(len(slots), np.int32)),
+        host_array(mesh.normals[order].astype(np.float32)),
+        host_array(np.zeros(len(order), np.int32)),
     )
     chosen = _spread(mesh.vertices, handles)
     hung, shares = _hang(mesh.vertices, mesh.vertices[chosen])
@@ -101,7 +101,7 @@ def build(mesh: Mesh, *, handles: int = HANDLES) -> Rig:
         host_array(mesh.vertices.astype(np.float32)),
         host_array(mesh.faces.astype(np.int32)),
         host_array(smooth_groups(mesh.vertices, mesh.faces).astype(np.int32)),
-        host_array(slots),
+        host_array(order),
         host_array(hung.astype(np.int32)),
         host_array(shares.astype(np.float32)),
         around.astype(np.int32),
@@ -113,8 +113,10 @@ def move(rig: Rig, shifts: Float[Array, "handles 3"]) -> Surfaces:
     corners = _moved(rig, shifts)[rig.faces]
     still = rig.vertices[rig.faces]
     turned = _group_normals(rig, corners) - _group_normals(rig, still)
-    normals = jax.vmap(jax.vmap(numerics.normalize))(rig.surfaces.normals + turned[rig.slots])
-    bvh = rig.surfaces.bvh._replace(triangles=corners[rig.slots])
+    normals = jax.vmap(jax.vmap(numerics.normalize))(
+        rig.surfaces.normals + turned[rig.primitive_faces]
+    )
+    bvh = rig.surfaces.bvh._replace(triangles=corners[rig.primitive_faces])
     return rig.surfaces._replace(bvh=bvh, normals=normals)
 
 
@@ -124,7 +126,7 @@ def moved_mesh(mesh: Mesh, rig: Rig, shifts: Float[np.ndarray, "handles 3"]) -> 
     device = jax.device_put((rig, shifts.astype(np.float32)))
     normals = np.zeros(mesh.normals.shape)
     # Primitives at the end are padding, which repeats a face.
-    normals[rig.slots] = np.asarray(move(*device).normals, np.float64)
+    normals[rig.primitive_faces] = np.asarray(move(*device).normals, np.float64)
     return Mesh(mesh.vertices + moved, mesh.faces, normals)
 
 
@@ -305,8 +307,8 @@ def _step(
     def objective(unknowns: _Unknowns) -> tuple[Float[Array, ""], Float[Array, ""]]:
         shifts = settings.stride * unknowns.shifts
         moved = Scene(move(rig, shifts), interfaces)
-        geometry = with_index(moved, index + settings.index_stride * unknowns.index)
-        error = jnp.mean(refractive_index.errors(some, geometry, config=config))
+        scene = with_index(moved, index + settings.index_stride * unknowns.index)
+        error = jnp.mean(refractive_index.errors(some, scene, config=config))
         prior = settings.evenness * unevenness(rig, shifts)
         return error + prior, error
 

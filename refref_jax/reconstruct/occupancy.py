@@ -269,7 +269,7 @@ def _shape_terms(
     config: OccupancyTrainingConfig,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Returns the term of the field's slope, and that of the normals at surface points."""
-    cell = 1.0 / config.field.grid.finest
+    cell = 1.0 / config.field.grid.max_res
     gradient = jax.vmap(
         functools.partial(occupancy_field.slope, params, config.field, step=0.5 * cell)
     )

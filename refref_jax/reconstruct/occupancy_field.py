@@ -42,7 +42,7 @@ Params = Any
 """A pytree of arrays, as returned by `init`."""
 
 # The finest level is a dense grid: every vertex has an entry of its own.
-_GRID = HashGridConfig(levels=4, coarsest=8, finest=64, entries=1 << 19, features=2)
+_GRID = HashGridConfig(levels=4, base_res=8, max_res=64, hashmap_size=1 << 19, features=2)
 
 # Corners of a regular tetrahedron, whose outer products sum to 4 times the identity.
 _TETRAHEDRON = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))

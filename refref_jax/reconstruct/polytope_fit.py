@@ -234,17 +234,17 @@ def _find(points: Points, views: Views, most: int) -> Corners:
     points = points[_on_outlines(points, views)]
     directions = np.random.default_rng(0).normal(size=(_FIRST, 3))
     corners = points[np.unique(np.argmax(points @ directions.T, axis=0))]
-    settled = False
+    require = False
     for tolerance in _TOLERANCES:
         more = _insert(corners, points, views, tolerance, most)
         if len(more) > most:
             break
-        if not settled or len(more) > len(corners):
+        if not require or len(more) > len(corners):
             more = _move(more, views, images)
         corners = _prune(more, views, tolerance)
         if len(corners) < len(more):
             corners = _move(corners, views, images)
-        settled = True
+        require = True
     return corners
 
 

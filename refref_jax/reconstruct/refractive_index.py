@@ -73,13 +73,13 @@ class Slope(NamedTuple):
 
 
 def errors(
-    evidence: Evidence, geometry: Scene, *, config: ModelConfig, settings: PathSettings = TRACING
+    evidence: Evidence, scene: Scene, *, config: ModelConfig, settings: PathSettings = TRACING
 ) -> Float[Array, " rays"]:
     """Returns the Charbonnier error of each pixel in sRGB, of the length of the difference.
 
     Args:
       evidence: pixels and the field to compare with.
-      geometry: scene that refracts their rays.
+      scene: scene that refracts their rays.
       config: configuration of the field's model; its footprint must be `cone`.
       settings: path settings, see `differentiable_paths`.
 
@@ -93,7 +93,7 @@ def errors(
         )
     count = evidence.rays.radii.shape[0]
     follow = functools.partial(
-        follow_main_branches, geometry, settings=settings, reflections=REFLECTIONS
+        follow_main_branches, scene, settings=settings, reflections=REFLECTIONS
     )
     branches = jax.vmap(follow)(evidence.rays)
     paths = jax.tree.map(lambda x: x.reshape(count * (1 + REFLECTIONS), *x.shape[2:]), branches)
@@ -111,20 +111,20 @@ def errors(
 def errors_at_index(
     index: Float[Array, ""],
     evidence: Evidence,
-    geometry: Scene,
+    scene: Scene,
     *,
     part: int,
     config: ModelConfig,
 ) -> Float[Array, " rays"]:
     """Returns `errors` for a given index of refraction of one part."""
-    return errors(evidence, with_index(geometry, index, part=part), config=config)
+    return errors(evidence, with_index(scene, index, part=part), config=config)
 
 
 @functools.partial(jax.jit, static_argnames=("part", "config"))
 def slope_at_index(
     index: Float[Array, ""],
     evidence: Evidence,
-    geometry: Scene,
+    scene: Scene,
     *,
     part: int,
     config: ModelConfig,
@@ -132,7 +132,7 @@ def slope_at_index(
     """Returns the mean of `errors_at_index` and its derivative, in forward mode."""
 
     def mean(at: Float[Array, ""]) -> Float[Array, ""]:
-        return jnp.mean(errors_at_index(at, evidence, geometry, part=part, config=config))
+        return jnp.mean(errors_at_index(at, evidence, scene, part=part, config=config))
 
     return Slope(*jax.jvp(mean, (index,), (jnp.ones_like(index),)))
 
@@ -216,7 +216,7 @@ class IndexEstimate(NamedTuple):
 
 def estimate_index(
     evidence: Evidence,
-    geometry: Scene,
+    scene: Scene,
     views: Int[np.ndarray, " rays"],
     *,
     part: int,
@@ -229,7 +229,7 @@ def estimate_index(
 
     Args:
       evidence: pixels that see the part, and a field of the background.
-      geometry: scene; the part's own index is ignored.
+      scene: scene; the part's own index is ignored.
       views: image number of each ray, for the standard error.
       part: number of the part.
       config: configuration of the field's model.
@@ -247,12 +247,12 @@ def estimate_index(
 
     def errors(index: float) -> Float[np.ndarray, " rays"]:
         show()
-        return _errors(index, evidence, geometry, part=part, config=config)
+        return _errors(index, evidence, scene, part=part, config=config)
 
     def slope(index: float) -> tuple[float, float]:
         show()
         at = np.asarray(index, evidence.rgb.dtype)
-        found = slope_at_index(at, evidence, geometry, part=part, config=config)
+        found = slope_at_index(at, evidence, scene, part=part, config=config)
         return float(found.error), float(found.slope)
 
     heights = tuple(float(errors(rung).mean()) for rung in rungs)
@@ -340,10 +340,10 @@ def _lowest_rungs(heights: Sequence[float], count: int) -> list[int]:
 
 
 def _errors(
-    index: float, evidence: Evidence, geometry: Scene, *, part: int, config: ModelConfig
+    index: float, evidence: Evidence, scene: Scene, *, part: int, config: ModelConfig
 ) -> Float[np.ndarray, " rays"]:
     at = np.asarray(index, evidence.rgb.dtype)
-    found = errors_at_index(at, evidence, geometry, part=part, config=config)
+    found = errors_at_index(at, evidence, scene, part=part, config=config)
     return np.asarray(found, np.float64)
 
 

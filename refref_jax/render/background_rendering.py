@@ -45,7 +45,7 @@ class KnownRendering(NamedTuple):
       rgb: sRGB colours in `[0, 1]`.
       linear: linear RGB colours, not clipped.
       paths: number of light paths of each ray.
-      lost: dropped throughput of each ray, because a path buffer was full or truncated paths are
+      dropped: dropped throughput of each ray, because a path buffer was full or truncated paths are
         black.
       casts: total number of closest-hit queries.
     """
@@ -53,7 +53,7 @@ class KnownRendering(NamedTuple):
     rgb: Float[np.ndarray, "*rays 3"]
     linear: Float[np.ndarray, "*rays 3"]
     paths: Int[np.ndarray, "*rays"]
-    lost: Float[np.ndarray, "*rays 3"]
+    dropped: Float[np.ndarray, "*rays 3"]
     casts: int
 
 
@@ -63,27 +63,27 @@ class _Tile(NamedTuple):
     rgb: Float[Array, "rays 3"]
     linear: Float[Array, "rays 3"]
     paths: Int[Array, " rays"]
-    lost: Float[Array, "rays 3"]
+    dropped: Float[Array, "rays 3"]
     casts: Int[Array, ""]
 
 
 def render_known(
-    geometry: Scene,
+    scene: Scene,
     radiance: Radiance,
     rays: Rays,
     *,
     settings: PathSettings,
-    inside: Int[np.ndarray, "*rays slots"] | None = None,
+    interior_list: Int[np.ndarray, "*rays slots"] | None = None,
     tile: int = TILE,
 ) -> KnownRendering:
     """Renders any number of rays in front of a known background; 0 rays give an empty rendering.
 
     Args:
-      geometry: the scene.
+      scene: the scene.
       radiance: function of origin and direction that returns the background's linear RGB.
       rays: camera rays with any leading axes, usually `[height, width]`.
       settings: path settings.
-      inside: interior list of each ray's origin, for the rule `priority` (see
+      interior_list: interior list of each ray's origin, for the rule `priority` (see
         `data.containment.parts_around`); none by default.
       tile: number of rays traced at once. Lower it if memory runs out. The rays of a tile share the
         path buffers, so with few rays, throughput is dropped sooner.
@@ -111,27 +111,27 @@ def render_known(
     count = rays.radii.size
     tile = images.size_for(count, most=tile)
     # Transferred to the device once, not once per tile.
-    geometry, radiance = jax.device_put((geometry, radiance))
+    scene, radiance = jax.device_put((scene, radiance))
     casts = []
 
     def see(
-        rays: Rays, inside: Int[np.ndarray, "rays slots"] | None, real: int
+        rays: Rays, interior_list: Int[np.ndarray, "rays slots"] | None, real: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         # Each padding ray misses, which counts as one cast if rays are cast at all.
         seen: Any = images.fetch(
-            _render_tile(geometry, radiance, rays, inside, settings=settings), instead=_INSTEAD
+            _render_tile(scene, radiance, rays, interior_list, settings=settings), instead=_INSTEAD
         )
         casts.append(int(seen.casts) - (tile - real) * (settings.max_bends > 0))
         return seen[:-1]
 
     fields = images.in_tiles(
-        see, rays, tile=tile, nothing=_blank()[:-1], instead=_INSTEAD, inside=inside
+        see, rays, tile=tile, nothing=_blank()[:-1], instead=_INSTEAD, interior_list=interior_list
     )
     return KnownRendering(*fields, sum(casts))
 
 
 def shade(paths: LightPaths | PathEnds, radiance: Radiance, *, rays: int) -> Float[Array, "rays 3"]:
-    """Returns the linear RGB of rays: the sum over their paths of weight times radiance.
+    """Returns the linear RGB of rays: the sum over their paths of throughput times radiance.
 
     This is a pure function, for use under jit, vmap and differentiation: with respect to the
     radiance function's parameters, and to paths that have gradients (`follow_branch`,
@@ -180,15 +180,15 @@ def _blank() -> KnownRendering:
 
 @functools.partial(jax.jit, static_argnames="settings")
 def _render_tile(
-    geometry: Scene,
+    scene: Scene,
     radiance: Radiance,
     rays: Rays,
-    inside: Int[Array, "rays slots"] | None,
+    interior_list: Int[Array, "rays slots"] | None,
     *,
     settings: PathSettings,
 ) -> _Tile:
     count = rays.radii.shape[0]
-    traced = path_tracing.trace_ends(geometry, rays, settings=settings, inside=inside)
+    traced = path_tracing.trace_ends(scene, rays, settings=settings, interior_list=interior_list)
     ends = traced.ends
     linear = _sum_light(radiance, ends, count)
     exists = light_paths.exists(ends).astype(jnp.int32)
@@ -196,7 +196,7 @@ def _render_tile(
         rgb=jnp.clip(colour.linear_to_srgb(linear), 0.0, 1.0),
         linear=linear,
         paths=jax.ops.segment_sum(exists, ends.rays, num_segments=count),
-        lost=traced.lost,
+        dropped=traced.dropped,
         casts=traced.casts,
     )
 
@@ -218,7 +218,7 @@ def _sum_light(radiance: Radiance, ends: PathEnds, rays: int) -> Float[Array, "r
         light = _light(radiance, part, index < count)
         return start + chunk, linear.at[part.rays].add(light)
 
-    begin = jnp.zeros((), jnp.int32), jnp.zeros((rays, 3), ends.weights.dtype)
+    begin = jnp.zeros((), jnp.int32), jnp.zeros((rays, 3), ends.throughput.dtype)
     return jax.lax.while_loop(lambda state: state[0] < count, add, begin)[1]
 
 
@@ -232,4 +232,4 @@ def _light(
             f"The radiance function returned an array of shape {seen.shape[1:]} for one ray. "
             "Return linear RGB, of shape (3,)."
         )
-    return jnp.where(real[:, None], ends.weights * seen.astype(ends.weights.dtype), 0.0)
+    return jnp.where(real[:, None], ends.throughput * seen.astype(ends.throughput.dtype), 0.0)

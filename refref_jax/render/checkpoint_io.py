@@ -11,7 +11,7 @@ import dataclasses
 import os
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -49,10 +49,10 @@ class SavedModel:
     settings: PathSettings = dataclasses.field(metadata={configuration.FORMERLY: "budget"})
 
 
-def save_scene(run: Path, saved: SavedModel, geometry: Scene) -> None:
+def save_scene(run: Path, saved: SavedModel, scene: Scene) -> None:
     """Writes a model without its parameters to an existing folder."""
     write_static(run, saved)
-    surfaces, interfaces = geometry
+    surfaces, interfaces = scene
     np.savez_compressed(
         run / _GEOMETRY,
         **surfaces.bvh._asdict(),
@@ -91,7 +91,7 @@ def load_model(run: str | os.PathLike[str], *, step: int | None = None) -> Model
     # Restored arrays are committed to a device, and so are all results computed from them. The
     # initial sums of an image are not, so their chunk would be compiled separately.
     unbound = jax.tree.map(jnp.asarray, jax.device_get(params))
-    return Model(saved.config, saved.settings, load_geometry(run), Params(*unbound))
+    return Model(saved.config, saved.settings, load_scene(run), Params(*unbound))
 
 
 def latest_step(run: Path) -> int:
@@ -153,18 +153,43 @@ def restore(manager: ocp.CheckpointManager, step: int, items: dict[str, Any]) ->
     items = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding or here), items
     )
-    arguments = {name: ocp.args.StandardRestore(shapes) for name, shapes in items.items()}
     try:
-        return manager.restore(step, args=ocp.args.Composite(**arguments))
+        return _restore(manager, step, items)
     except Exception as error:  # Orbax raises the errors of its storage
-        raise ValueError(
-            f"The checkpoint {manager.directory / str(step)} cannot be read ({_brief(error)}). "
-            "Remove it to use an older one, or train again."
-        ) from error
+        try:
+            former = _restore(manager, step, _replace_each(items, Params, _FormerParams))
+            return ocp.args.Composite(**_replace_each(dict(former), _FormerParams, Params))
+        except Exception:
+            raise ValueError(
+                f"The checkpoint {manager.directory / str(step)} cannot be read ({_brief(error)}). "
+                "Remove it to use an older one, or train again."
+            ) from error
 
 
-def load_geometry(run: Path) -> Scene:
-    """Reads the geometry that a run was made with.
+class _FormerParams(NamedTuple):
+    """The fields of `Params` as earlier versions stored them."""
+
+    proposals: Any
+    field: Any
+    dyes: Any
+
+
+def _restore(
+    manager: ocp.CheckpointManager, step: int, items: dict[str, Any]
+) -> ocp.args.Composite:
+    arguments = {name: ocp.args.StandardRestore(shapes) for name, shapes in items.items()}
+    return manager.restore(step, args=ocp.args.Composite(**arguments))
+
+
+def _replace_each(tree: Any, old: Any, new: Any) -> Any:
+    """Replaces records by records of another type with the same values."""
+    return jax.tree.map(
+        lambda x: new(*x) if isinstance(x, old) else x, tree, is_leaf=lambda x: isinstance(x, old)
+    )
+
+
+def load_scene(run: Path) -> Scene:
+    """Reads the scene that a run was trained in.
 
     Raises:
       ValueError: if the file is missing or damaged.

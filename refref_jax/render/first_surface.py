@@ -67,9 +67,11 @@ def _cast(
     surfaces: Surfaces, rays: Rays
 ) -> tuple[Float[Array, " rays"], Float[Array, "rays 3"], Int[Array, " rays"]]:
     limits = jnp.full_like(rays.radii, jnp.inf)
-    leaving = jnp.full(rays.radii.shape, bvh.NO_SLOT, jnp.int32)
-    hits = bvh.closest_hits(surfaces.bvh, rays, limits=limits, leaving=leaving)
-    found = hits.slots != bvh.NO_SLOT
-    points = jax.vmap(surface_point, in_axes=(None, 0, 0))(surfaces, hits.slots, hits.barycentrics)
+    exclude_primitive = jnp.full(rays.radii.shape, bvh.NO_PRIMITIVE, jnp.int32)
+    hits = bvh.closest_hits(surfaces.bvh, rays, limits=limits, exclude_primitive=exclude_primitive)
+    found = hits.primitive_ids != bvh.NO_PRIMITIVE
+    points = jax.vmap(surface_point, in_axes=(None, 0, 0))(
+        surfaces, hits.primitive_ids, hits.barycentrics
+    )
     normals = jnp.where(found[:, None], points.shading_normal, 0.0)
     return hits.distances, normals, jnp.where(found, points.part, NO_PART)

@@ -62,7 +62,7 @@ def in_tiles(
     tile: int,
     nothing: _Tree,
     instead: str,
-    inside: Int[np.ndarray, "*rays slots"] | None = None,
+    interior_list: Int[np.ndarray, "*rays slots"] | None = None,
 ) -> _Tree:
     """Renders rays tile by tile, to NumPy arrays with the leading axes of the rays.
 
@@ -73,14 +73,16 @@ def in_tiles(
       tile: number of rays per tile.
       nothing: result for 0 rays.
       instead: advice at the end of the error message.
-      inside: interior list of each ray's origin, if known.
+      interior_list: interior list of each ray's origin, if known.
 
     Raises:
       TypeError: if an array is a tracer, see `fetch`.
     """
-    rays, inside = fetch((rays, inside), instead=instead)
+    rays, interior_list = fetch((rays, interior_list), instead=instead)
     shape, count = rays.radii.shape, rays.radii.size
-    flat, listed = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), (rays, inside))
+    flat, listed = jax.tree.map(
+        lambda x: x.reshape(-1, *x.shape[len(shape) :]), (rays, interior_list)
+    )
     parts = []
     for start in range(0, count, tile):
         seen = see(*cut_out(flat, listed, start, tile), min(tile, count - start))
@@ -118,17 +120,17 @@ def fetch(tree: _Tree, *, instead: str) -> _Tree:
 
 
 def cut_out(
-    rays: Rays, inside: Int[np.ndarray, "rays slots"] | None, start: int, tile: int
+    rays: Rays, interior_list: Int[np.ndarray, "rays slots"] | None, start: int, tile: int
 ) -> tuple[Rays, Int[np.ndarray, "tile slots"] | None]:
     """Returns one tile of rays; the last tile is padded with rays that hit nothing.
 
     Args:
       rays: all rays, as NumPy arrays.
-      inside: interior list of each ray's origin, if known.
+      interior_list: interior list of each ray's origin, if known.
       start: index of the first ray of the tile.
       tile: number of rays per tile.
     """
-    part, within = jax.tree.map(lambda x: x[start : start + tile], (rays, inside))
+    part, within = jax.tree.map(lambda x: x[start : start + tile], (rays, interior_list))
     missing = tile - part.radii.shape[0]
     away = np.tile(np.eye(3, dtype=part.directions.dtype)[:1], (missing, 1))
     filling = Rays(
@@ -150,7 +152,7 @@ class Rendering(NamedTuple):
       mean_distance: mean distance along the ray's heaviest path.
       accumulation: sum of the weights, 1 with an opaque background.
       linear: linear RGB colours, not clipped, for averaging the rays of a pixel.
-      lost: dropped throughput of each ray, because a path buffer was full.
+      dropped: dropped throughput of each ray, because a path buffer was full.
     """
 
     rgb: Float[Array, "*rays 3"]
@@ -158,7 +160,7 @@ class Rendering(NamedTuple):
     mean_distance: Float[Array, "*rays"]
     accumulation: Float[Array, "*rays"]
     linear: Float[Array, "*rays 3"]
-    lost: Float[Array, "*rays 3"]
+    dropped: Float[Array, "*rays 3"]
 
 
 class _Tile(NamedTuple):
@@ -168,13 +170,13 @@ class _Tile(NamedTuple):
       paths: light paths.
       heaviest: whether a path is the heaviest of its ray.
       count: number of selected paths.
-      lost: dropped throughput of each ray.
+      dropped: dropped throughput of each ray.
     """
 
     paths: LightPaths
     heaviest: Bool[Array, " paths"]
     count: Int[Array, ""]  # type: ignore[assignment]  # hides tuple.count
-    lost: Float[Array, "rays 3"]
+    dropped: Float[Array, "rays 3"]
 
 
 def render_rays(model: Model, rays: Rays) -> Rendering:
@@ -189,9 +191,9 @@ def render_rays(model: Model, rays: Rays) -> Rendering:
     """
     rays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), rays)
     detail = path_detail(model.config, model.settings)
-    traced = path_tracing.trace(model.geometry, rays, settings=model.settings, detail=detail)
-    tile = _sort(traced, traced.lost.shape[0])
-    sums = _blank(tile.lost)
+    traced = path_tracing.trace(model.scene, rays, settings=model.settings, detail=detail)
+    tile = _sort(traced, traced.dropped.shape[0])
+    sums = _blank(tile.dropped)
     return _finish(_add(model.params, tile.paths, tile.heaviest, sums, config=model.config))
 
 
@@ -232,24 +234,24 @@ def render_image(
 def _render_tile(model: Model, rays: Rays, real: int, chunk: int, branch: Branch) -> Rendering:
     detail = path_detail(model.config, model.settings)
     which = _BRANCHES.index(branch)
-    tile = _trace_tile(model.geometry, rays, real, which, settings=model.settings, detail=detail)
-    sums = _blank(tile.lost)
+    tile = _trace_tile(model.scene, rays, real, which, settings=model.settings, detail=detail)
+    sums = _blank(tile.dropped)
     count = int(fetch(tile.count, instead=_INSTEAD))
     for start in range(0, count, chunk):
         sums = _render_chunk(model.params, tile, sums, start, config=model.config, chunk=chunk)
     return _finish_tile(sums)
 
 
-def _blank(lost: Float[Array, "rays 3"]) -> Rendering:
+def _blank(dropped: Float[Array, "rays 3"]) -> Rendering:
     """Returns the initial rendering, before any path is added."""
-    black = jnp.zeros_like(lost)
+    black = jnp.zeros_like(dropped)
     zeros = black[:, 0]
-    return Rendering(black, zeros, zeros, zeros, linear=black, lost=lost)
+    return Rendering(black, zeros, zeros, zeros, linear=black, dropped=dropped)
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "detail"))
 def _trace_tile(
-    geometry: Scene,
+    scene: Scene,
     rays: Rays,
     real: Int[Array, ""],
     which: int | Int[Array, ""] = _ALL,
@@ -257,7 +259,7 @@ def _trace_tile(
     settings: PathSettings,
     detail: Detail,
 ) -> _Tile:
-    traced = path_tracing.trace(geometry, rays, settings=settings, detail=detail)
+    traced = path_tracing.trace(scene, rays, settings=settings, detail=detail)
     return _sort(traced, real, which)
 
 
@@ -271,12 +273,12 @@ def _render_chunk(
     config: ModelConfig,
     chunk: int,
 ) -> Rendering:
-    # Slots past the end repeat the last path with weight 0.
+    # Slots past the end repeat the last path with throughput 0.
     index = start + jnp.arange(chunk)
     held = jnp.minimum(index, tile.count - 1)
     paths = jax.tree.map(lambda x: x[held], tile.paths)
     real = index < tile.count
-    paths = paths._replace(weights=jnp.where(real[:, None], paths.weights, 0.0))
+    paths = paths._replace(throughput=jnp.where(real[:, None], paths.throughput, 0.0))
     return _add(params, paths, tile.heaviest[held] & real, sums, config=config)
 
 
@@ -293,16 +295,16 @@ def _sort(traced: Traced, real: int | Int[Array, ""], which: int | Int[Array, ""
       real: number of rays in the tile that are not padding.
       which: index of the selected branch in `_BRANCHES`.
     """
-    paths, rays = traced.paths, traced.lost.shape[0]
+    paths, rays = traced.paths, traced.dropped.shape[0]
     mirrored = jnp.where(reflected_first(paths), _MIRRORED, _PASSED)
     exists = light_paths.exists(paths) & (paths.rays < real)
     exists &= (which == _ALL) | (which == mirrored)
     order = jnp.argsort(~exists, stable=True)
-    weight = jnp.mean(paths.weights, axis=-1)
-    most = jax.ops.segment_max(weight, paths.rays, num_segments=rays)
-    heaviest = exists & (weight >= most[paths.rays])
+    throughput = jnp.mean(paths.throughput, axis=-1)
+    most = jax.ops.segment_max(throughput, paths.rays, num_segments=rays)
+    heaviest = exists & (throughput >= most[paths.rays])
     sorted_paths = jax.tree.map(lambda x: x[order], paths)
-    return _Tile(sorted_paths, heaviest[order], jnp.sum(exists), traced.lost)
+    return _Tile(sorted_paths, heaviest[order], jnp.sum(exists), traced.dropped)
 
 
 def _add(
@@ -317,13 +319,13 @@ def _add(
     jitter = pixels.no_jitter(config, paths.radii.shape[0])
     one = jnp.ones((), paths.radii.dtype)
     seen = pixels.render_paths(params, config, paths, jitter, anneal=one).composite
-    paths = learned_media.dye(params.dyes, paths, radius=config.radius)
-    share = jnp.mean(paths.weights, axis=-1)
+    paths = learned_media.attenuate(params.tints, paths, radius=config.radius)
+    share = jnp.mean(paths.throughput, axis=-1)
     rays = sums.distance.shape[0]
     # Writes to an index past the end are dropped.
     target = jnp.where(heaviest, paths.rays, rays)
     return sums._replace(
-        linear=sums.linear.at[paths.rays].add(paths.weights * seen.rgb),
+        linear=sums.linear.at[paths.rays].add(paths.throughput * seen.rgb),
         distance=sums.distance.at[target].set(seen.median, mode="drop"),
         mean_distance=sums.mean_distance.at[target].set(seen.mean, mode="drop"),
         accumulation=sums.accumulation.at[paths.rays].add(share * seen.accumulation),
@@ -396,7 +398,7 @@ def average(fine: Rendering, side: int) -> Rendering:
         mean_distance=filtered(fine.mean_distance),
         accumulation=filtered(fine.accumulation),
         linear=linear,
-        lost=filtered(fine.lost),
+        dropped=filtered(fine.dropped),
     )
 
 

@@ -20,7 +20,7 @@ from refref_jax.optics.light_paths import LightPaths
 _INITIAL = -3.0
 
 
-class Dyes(NamedTuple):
+class LearnedTints(NamedTuple):
     """Learned tints and absorption, before the softplus, linear RGB.
 
     Attributes:
@@ -32,49 +32,51 @@ class Dyes(NamedTuple):
     absorption: Float[Array, "parts 3"]
 
 
-def init(parts: int) -> Dyes:
+def init(parts: int) -> LearnedTints:
     """Returns initial values, for nearly clear parts."""
     # Two separate arrays, since training donates both buffers.
-    initial = (jnp.full((parts, 3), _INITIAL, jnp.float32) for _ in Dyes._fields)
-    return Dyes(*initial)
+    initial = (jnp.full((parts, 3), _INITIAL, jnp.float32) for _ in LearnedTints._fields)
+    return LearnedTints(*initial)
 
 
-def tints(dyes: Dyes) -> Float[Array, "parts 3"]:
+def tints(learned: LearnedTints) -> Float[Array, "parts 3"]:
     """Returns the factor on linear RGB at every hit of each part's surface."""
-    return jnp.exp(-jax.nn.softplus(dyes.density))
+    return jnp.exp(-jax.nn.softplus(learned.density))
 
 
-def absorptions(dyes: Dyes, radius: float) -> Float[Array, "parts 3"]:
+def absorptions(learned: LearnedTints, radius: float) -> Float[Array, "parts 3"]:
     """Returns the absorption of every part's medium, linear RGB, per world unit.
 
     Args:
-      dyes: learned tints and absorption.
+      learned: learned tints and absorption.
       radius: radius of the scene, world units.
     """
-    return jax.nn.softplus(dyes.absorption) / radius
+    return jax.nn.softplus(learned.absorption) / radius
 
 
-def optical_density(dyes: Dyes | None) -> Float[Array, ""]:
+def optical_density(learned: LearnedTints | None) -> Float[Array, ""]:
     """Returns the mean density of all surfaces and of all media over a scene radius; 0 for none.
 
     With a small weight in the loss, it resolves an ambiguity of the images: a tint at both ends of
     a segment looks similar to absorption along it, and needs far less density.
     """
-    if dyes is None:
+    if learned is None:
         return jnp.zeros(())
-    return jnp.mean(jax.nn.softplus(dyes.density)) + jnp.mean(jax.nn.softplus(dyes.absorption))
+    return jnp.mean(jax.nn.softplus(learned.density)) + jnp.mean(
+        jax.nn.softplus(learned.absorption)
+    )
 
 
-def dye(dyes: Dyes | None, paths: LightPaths, *, radius: float) -> LightPaths:
-    """Attenuates the weights of paths by the tints and absorption along them.
+def attenuate(learned: LearnedTints | None, paths: LightPaths, *, radius: float) -> LightPaths:
+    """Attenuates the throughput of paths by the tints and absorption along them.
 
     Args:
-      dyes: learned tints and absorption; `None` leaves the paths unchanged.
+      learned: learned tints and absorption; `None` leaves the paths unchanged.
       paths: any number of paths, with hit counts and path lengths per part.
       radius: radius of the scene, world units.
     """
-    if dyes is None:
+    if learned is None:
         return paths
-    passed = paths.path_lengths @ absorptions(dyes, radius)
-    met = paths.hit_counts @ jax.nn.softplus(dyes.density)
-    return paths._replace(weights=paths.weights * jnp.exp(-met - passed))
+    passed = paths.path_lengths @ absorptions(learned, radius)
+    met = paths.hit_counts @ jax.nn.softplus(learned.density)
+    return paths._replace(throughput=paths.throughput * jnp.exp(-met - passed))

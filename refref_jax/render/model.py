@@ -17,7 +17,7 @@ from refref_jax.fields.base import DensityConfig, RadianceConfig
 from refref_jax.optics.path_settings import Detail, PathSettings, Tally
 from refref_jax.optics.scene import Scene
 from refref_jax.render import learned_media
-from refref_jax.render.learned_media import Dyes
+from refref_jax.render.learned_media import LearnedTints
 
 # Segments before and after a convex object.
 _CONVEX_LEGS = 2
@@ -122,12 +122,12 @@ class Params(NamedTuple):
     Attributes:
       proposals: parameters of each proposal level's density field.
       field: parameters of the radiance field.
-      dyes: learned tints and absorption of the parts, if any.
+      tints: learned tints and absorption of the parts, if any.
     """
 
     proposals: tuple[base.Params, ...]
     field: base.Params
-    dyes: Dyes | None = None
+    tints: LearnedTints | None = None
 
 
 class Model(NamedTuple):
@@ -136,13 +136,13 @@ class Model(NamedTuple):
     Attributes:
       config: static configuration of fields and sampling.
       settings: path settings.
-      geometry: the scene.
+      scene: the scene.
       params: learned parameters.
     """
 
     config: ModelConfig
     settings: PathSettings
-    geometry: Scene
+    scene: Scene
     params: Params
 
 

@@ -63,7 +63,7 @@ def render_ray(model: Model, ray: Rays) -> Float[Array, "3"]:
         # Composite: the volume rendering integral along the path.
         w = _weights(sigma, jnp.diff(t) / config.radius)
         # Combine: the weight of a path is the product of its Fresnel factors and tints.
-        colour += path.weights * jnp.sum(w[:, None] * c, axis=0)
+        colour += path.throughput * jnp.sum(w[:, None] * c, axis=0)
 
     # Encode: radiance adds up linearly, images are sRGB.
     return linear_to_srgb(colour)
@@ -73,8 +73,8 @@ def _light_paths(model: Model, ray: Rays) -> Iterator[LightPaths]:
     """Yields the light paths of one ray, the heaviest first."""
     batch = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32)[None], ray)
     detail = path_detail(model.config, model.settings)
-    paths = path_tracing.trace(model.geometry, batch, settings=model.settings, detail=detail).paths
-    paths = learned_media.dye(model.params.dyes, paths, radius=model.config.radius)
+    paths = path_tracing.trace(model.scene, batch, settings=model.settings, detail=detail).paths
+    paths = learned_media.attenuate(model.params.tints, paths, radius=model.config.radius)
     for i, status in enumerate(paths.statuses):
         if status != PathStatus.EMPTY:
             yield jax.tree.map(lambda x, i=i: x[i], paths)

@@ -4,8 +4,8 @@
     ray = jax.tree.map(lambda x: x[64, 64], image_rays(cameras, 0))
     paths = trace_pixel(model, ray)
     print(describe(paths))                     # a table in Markdown
-    for line, weight in zip(paths.polylines, paths.weights):
-        axes.plot(*line.T, linewidth=5.0 * weight.mean() ** 0.5)
+    for line, throughput in zip(paths.polylines, paths.throughput):
+        axes.plot(*line.T, linewidth=5.0 * throughput.mean() ** 0.5)
 
 The paths come from the tracer that renders images, with the same path settings. Paths share their
 first segments: `pieces` returns each line segment of the tree once, with the combined throughput of
@@ -28,7 +28,7 @@ from refref_jax.optics.light_paths import LightPaths, PathStatus
 from refref_jax.optics.path_settings import Detail, PathSettings, Tally
 from refref_jax.optics.scene import Scene
 from refref_jax.render import Model, learned_media, volume_rendering
-from refref_jax.render.learned_media import Dyes
+from refref_jax.render.learned_media import LearnedTints
 from refref_jax.sampling import scene_bounds
 from refref_jax.sampling.scene_bounds import Domain
 
@@ -53,17 +53,17 @@ class PixelPaths(NamedTuple):
     Attributes:
       polylines: one polyline `[points, 3]` per path, world units: the camera, every bend, and the
         end of the last segment as drawn.
-      weights: share of each path in the ray's linear RGB.
+      throughput: share of each path in the ray's linear RGB.
       statuses: status of each path.
       num_bends: number of refractions and reflections of each path.
-      lost: dropped throughput of the ray, linear RGB.
+      dropped: dropped throughput of the ray, linear RGB.
     """
 
     polylines: tuple[Float[np.ndarray, "_ 3"], ...]
-    weights: Float[np.ndarray, "paths 3"]
+    throughput: Float[np.ndarray, "paths 3"]
     statuses: tuple[PathStatus, ...]
     num_bends: Int[np.ndarray, " paths"]
-    lost: Float[np.ndarray, "3"]
+    dropped: Float[np.ndarray, "3"]
 
 
 class Pieces(NamedTuple):
@@ -71,7 +71,7 @@ class Pieces(NamedTuple):
 
     Attributes:
       ends: start and end of each segment, world units.
-      shares: share of the pixel's light on each segment, mean over RGB, by the weights of its
+      shares: share of the pixel's light on each segment, mean over RGB, by the throughput of its
         paths.
     """
 
@@ -83,7 +83,7 @@ class _Traced(NamedTuple):
     """Paths, dropped throughput, and the distance at which each last segment leaves the bounds."""
 
     paths: LightPaths
-    lost: Float[Array, "1 3"]
+    dropped: Float[Array, "1 3"]
     leave: Float[Array, " paths"]
 
 
@@ -105,17 +105,13 @@ def trace_pixel(
     Raises:
       ValueError: if `scene` is not a model and `settings` is not given.
     """
+    colours = domain = None
     if isinstance(scene, Model):
-        geometry, colours, domain = (
-            scene.geometry,
-            scene.params.dyes,
-            volume_rendering.domain(scene.config),
-        )
+        colours, domain = scene.params.tints, volume_rendering.domain(scene.config)
         settings = settings or scene.settings
-    else:
-        geometry, colours, domain = scene, None, None
+        scene = scene.scene
     if settings is None:
-        raise ValueError("budget is None, but scene is not a model. Give a budget.")
+        raise ValueError("settings is None, but scene is not a model. Give path settings.")
     roomy = dataclasses.replace(
         settings,
         live_per_ray=float(_MOST_PATHS),
@@ -123,17 +119,17 @@ def trace_pixel(
         paths_per_ray=float(_MOST_PATHS),
     )
     ray = Rays(*(host_array(np.asarray(x, np.float32)[None]) for x in ray))
-    traced = _trace(geometry, ray, colours, settings=roomy, domain=domain)
+    traced = _trace(scene, ray, colours, settings=roomy, domain=domain)
     return _polylines(jax.device_get(traced), reach)
 
 
 def pieces(paths: PixelPaths) -> Pieces:
     """Returns each segment of the paths once, with the combined share of its paths."""
     shares: dict[bytes, float] = {}
-    for line, weight in zip(paths.polylines, paths.weights, strict=True):
+    for line, throughput in zip(paths.polylines, paths.throughput, strict=True):
         for ends in np.stack([line[:-1], line[1:]], axis=1):
             key = np.ascontiguousarray(ends, np.float32).tobytes()
-            shares[key] = shares.get(key, 0.0) + float(weight.mean())
+            shares[key] = shares.get(key, 0.0) + float(throughput.mean())
     ends = np.frombuffer(b"".join(shares), np.float32).reshape(-1, 2, 3)
     return Pieces(ends, np.fromiter(shares.values(), np.float64, len(shares)))
 
@@ -154,26 +150,30 @@ def describe(paths: PixelPaths, *, most: int = 12) -> str:
     ]
     lines += [_row(paths, i) for i in range(min(most, count))]
     if count > most:
-        rest = 100.0 * float(paths.weights[most:].mean(-1).sum())
+        rest = 100.0 * float(paths.throughput[most:].mean(-1).sum())
         lines += ["", f"and {count - most} more, {rest:.2g} % together."]
-    lost = 100.0 * float(paths.lost.mean())
-    if lost > 0.0:
-        lines += ["", f"{lost:.2g} % of the light found no room, or was left dark."]
+    dropped = 100.0 * float(paths.dropped.mean())
+    if dropped > 0.0:
+        lines += [
+            "",
+            f"{dropped:.2g} % of the throughput was dropped: a buffer was full, or truncated paths "
+            "are black.",
+        ]
     return "\n".join(lines)
 
 
 def _row(paths: PixelPaths, i: int) -> str:
-    weight = paths.weights[i]
-    channels = ", ".join(f"{x:.3f}" for x in weight)
-    share, ending = f"{100.0 * weight.mean():.2f} %", ENDINGS[paths.statuses[i]]
+    throughput = paths.throughput[i]
+    channels = ", ".join(f"{x:.3f}" for x in throughput)
+    share, ending = f"{100.0 * throughput.mean():.2f} %", ENDINGS[paths.statuses[i]]
     return f"| {i + 1} | {share} | {channels} | {paths.num_bends[i]} | {ending} |"
 
 
 def _polylines(traced: _Traced, reach: float) -> PixelPaths:
     paths = traced.paths
     real = np.flatnonzero(paths.statuses != PathStatus.EMPTY).tolist()
-    weight = paths.weights.mean(axis=-1)
-    order = sorted(real, key=lambda i: -weight[i])
+    throughput = paths.throughput.mean(axis=-1)
+    order = sorted(real, key=lambda i: -throughput[i])
     lines = []
     for i in order:
         last = int(np.sum(np.isfinite(paths.tau[i]))) - 1
@@ -182,25 +182,25 @@ def _polylines(traced: _Traced, reach: float) -> PixelPaths:
         lines.append(np.concatenate([paths.points[i, : last + 1], end[None]]))
     return PixelPaths(
         polylines=tuple(lines),
-        weights=np.asarray(paths.weights)[order],
+        throughput=np.asarray(paths.throughput)[order],
         statuses=tuple(PathStatus(int(paths.statuses[i])) for i in order),
         num_bends=np.asarray(paths.num_bends)[order],
-        lost=np.asarray(traced.lost)[0],
+        dropped=np.asarray(traced.dropped)[0],
     )
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "domain"))
 def _trace(
-    geometry: Scene,
+    scene: Scene,
     ray: Rays,
-    colours: Dyes | None,
+    colours: LearnedTints | None,
     *,
     settings: PathSettings,
     domain: Domain | None,
 ) -> _Traced:
     tally: Tally = "none" if colours is None else "parts"
     traced = path_tracing.trace(
-        geometry,
+        scene,
         ray,
         settings=settings,
         capacity=_MOST_PATHS,
@@ -208,11 +208,13 @@ def _trace(
     )
     paths = traced.paths
     if domain is None:
-        return _Traced(paths, traced.lost, jnp.full_like(paths.radii, jnp.inf))
+        return _Traced(paths, traced.dropped, jnp.full_like(paths.radii, jnp.inf))
     last = jnp.sum(jnp.isfinite(paths.tau), axis=-1, dtype=jnp.int32) - 1
 
     def leave(points: Array, directions: Array, i: Array) -> Array:
         return scene_bounds.exit_distance(domain, points[i], directions[i])
 
     ends = jax.vmap(leave)(paths.points, paths.directions, jnp.maximum(last, 0))
-    return _Traced(learned_media.dye(colours, paths, radius=domain.radius), traced.lost, ends)
+    return _Traced(
+        learned_media.attenuate(colours, paths, radius=domain.radius), traced.dropped, ends
+    )

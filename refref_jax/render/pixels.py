@@ -74,8 +74,10 @@ def gather_light(
 ) -> Light:
     """Sums the contributions of paths to their rays; arguments as in `render_pixels`."""
     seen = render_paths(params, config, paths, jitter, anneal=anneal)
-    paths = learned_media.dye(params.dyes, paths, radius=config.radius)
-    linear = jax.ops.segment_sum(paths.weights * seen.composite.rgb, paths.rays, num_segments=rays)
+    paths = learned_media.attenuate(params.tints, paths, radius=config.radius)
+    linear = jax.ops.segment_sum(
+        paths.throughput * seen.composite.rgb, paths.rays, num_segments=rays
+    )
     return Light(linear, seen)
 
 

@@ -156,11 +156,12 @@ class FieldConfig:
         learned; by default given if scene.json describes every part.
       footprint: Footprint of a pixel: widened by arc length (cone), or propagated through the bends
         by ray differentials (differential).
-      samples: Numbers of samples per path of each proposal level, then of the radiance field, such
-        as 32,20.
+      samples_per_ray: Numbers of samples per ray of each proposal level, then of the radiance
+        field, such as 32,20.
       multisamples: Number of multisamples per interval, 1 or 6.
-      entries: Hash map size of the radiance field, base-2 logarithm of the entries of a level.
-      finest: Finest resolution of the radiance field's hash grid, cells per side.
+      log2_hashmap_size: Hash map size of the radiance field, base-2 logarithm of the entries of a
+        level.
+      max_res: Finest resolution of the radiance field's hash grid, cells per side.
       precision: Arithmetic precision of the fields.
       dilation: Dilation of a proposal before it is sampled, as a share of its mean bin width; 0 for
         none.
@@ -171,33 +172,35 @@ class FieldConfig:
     interior: Interior | None = _option(after=(*_OBJECTS, "paths", "max_bends", "tints"))
     tints: Tints | None = _option(after=(*_OBJECTS, "paths", "max_bends", "interior"))
     footprint: Footprint | None = _option(after=("preset", "field"))
-    samples: tuple[int, ...] | None = _option(after=("preset", "field"))
+    samples_per_ray: tuple[int, ...] | None = _option(formerly="samples", after=("preset", "field"))
     multisamples: int | None = _option(after=("preset", "field"))
-    entries: int | None = _option(after=("preset", "field"))
-    finest: int | None = _option(after=("preset", "field"))
+    log2_hashmap_size: int | None = _option(formerly="entries", after=("preset", "field"))
+    max_res: int | None = _option(formerly="finest", after=("preset", "field"))
     precision: Precision | None = _option(after=("preset", "field"))
     dilation: float | None = _option(after=("preset", "field"))
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
         configuration.convert_fields(self)
-        if self.samples is not None and not (self.samples and min(self.samples) > 0):
+        counts = self.samples_per_ray
+        if counts is not None and not (counts and min(counts) > 0):
             raise ValueError(
-                f"samples is {','.join(map(str, self.samples))}, not a list of positive numbers. "
-                "Use a list such as samples=32,20."
+                f"samples_per_ray is {','.join(map(str, counts))}, not a list of positive numbers. "
+                "Use a list such as samples_per_ray=32,20."
             )
         if self.multisamples not in (None, *_PATTERNS):
             raise ValueError(
                 f"There is no pattern with multisamples={self.multisamples}. Give 1 (on the centre "
                 "line) or 6 (Zip-NeRF's hexagon)."
             )
-        if self.finest is not None and not 1 <= self.finest <= _FINEST:
-            raise ValueError(f"finest is {self.finest}. Give 1 to {_FINEST} cells per side.")
+        if self.max_res is not None and not 1 <= self.max_res <= _FINEST:
+            raise ValueError(f"max_res is {self.max_res}. Give 1 to {_FINEST} cells per side.")
         if self.dilation is not None and not 0.0 <= self.dilation < math.inf:
             raise ValueError(f"dilation is {self.dilation}. Give 0 or a positive number.")
-        if self.entries is not None and not 1 <= self.entries <= _MOST_ENTRIES:
+        size = self.log2_hashmap_size
+        if size is not None and not 1 <= size <= _MOST_ENTRIES:
             raise ValueError(
-                f"entries is {self.entries}, but it is the base-2 logarithm of a table's size. "
+                f"log2_hashmap_size is {size}, but it is the base-2 logarithm of a table's size. "
                 f"Give 1 to {_MOST_ENTRIES}, such as 17 for 131,072 entries."
             )
 
@@ -212,23 +215,23 @@ class LossConfig:
       blurs: Half-width of its blur for each proposal level, in normalised distance.
       distortion: Weight of the distortion loss.
       hash_decay: Weight of the decay of the hash grids; by default that of the field type.
-      dye_decay: Weight of the optical density of learned tints and absorption.
+      tint_decay: Weight of the optical density of learned tints and absorption.
       distortion_over: Samples in the distortion loss: those outside the objects (the paper's
         correction), or all (everywhere; Mip-NeRF 360, the paper's ablation).
     """
 
     data: DataLoss = _option("mse", name="data_loss")
     interlevel: float = _option(0.01, name="interlevel_weight")
-    blurs: tuple[float, ...] | None = _option(after=("preset", "field", "samples"))
+    blurs: tuple[float, ...] | None = _option(after=("preset", "field", "samples_per_ray"))
     distortion: float = _option(0.01, name="distortion_weight")
     hash_decay: float | None = _option(after=("field",))
-    dye_decay: float = _option(1e-3)
+    tint_decay: float = _option(1e-3, formerly="dye_decay")
     distortion_over: DistortionOver = _option("outside", name="distortion")
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
         configuration.convert_fields(self)
-        weights = (self.interlevel, self.distortion, self.hash_decay, self.dye_decay)
+        weights = (self.interlevel, self.distortion, self.hash_decay, self.tint_decay)
         for number in (*weights, *(self.blurs or ())):
             if number is not None and not 0.0 <= number < math.inf:
                 raise ValueError(
@@ -248,7 +251,7 @@ class ScheduleConfig:
       anneal: Number of steps over which proposal weights are annealed; by default the preset's
         share of the steps.
       batch: Number of rays per step.
-      pool: Number of batches whose light paths are traced at once.
+      pretraced_batches: Number of batches whose light paths are traced at once.
     """
 
     steps: int | None = _option(after=("preset",))
@@ -257,13 +260,13 @@ class ScheduleConfig:
     end: float | None = _option(name="final_learning_rate", after=("preset",))
     anneal: int | None = _option(after=("preset", "steps"))
     batch: int | None = _option(after=("preset",))
-    pool: int | None = _option(after=("preset",))
+    pretraced_batches: int | None = _option(formerly="pool", after=("preset",))
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
         configuration.convert_fields(self)
-        for name, least in [("steps", 1), ("batch", 1), ("pool", 1), ("warmup", 0), ("anneal", 0)]:
-            number = getattr(self, name)
+        for name in ("steps", "warmup", "anneal", "batch", "pretraced_batches"):
+            number, least = getattr(self, name), 0 if name in ("warmup", "anneal") else 1
             if number is not None and not least <= number <= _MOST:
                 raise ValueError(f"{name} is {number}. Give {least} to {_MOST}.")
         for name in ("peak", "end"):
@@ -272,9 +275,9 @@ class ScheduleConfig:
 
     def over(self, steps: int) -> "ScheduleConfig":
         """Returns the same schedule stretched over another number of steps."""
-        scale = steps / settled(self.steps)
-        warmup = round(settled(self.warmup) * scale)
-        anneal = round(settled(self.anneal) * scale)
+        scale = steps / require(self.steps)
+        warmup = round(require(self.warmup) * scale)
+        anneal = round(require(self.anneal) * scale)
         return dataclasses.replace(self, steps=steps, warmup=warmup, anneal=anneal)
 
 
@@ -332,6 +335,8 @@ class TrainConfig:
         configuration.convert_fields(self)
         if not 0 <= self.seed < _SEEDS:
             raise ValueError(f"seed is {self.seed}. Give 0 to {_SEEDS - 1}.")
+        if self.chosen is not None:
+            object.__setattr__(self, "chosen", tuple(map(present_name, self.chosen)))
         if unknown := sorted(set(self.chosen or ()) - set(_by_name())):
             raise ValueError(
                 f"chosen names {unknown[0]!r}, but there is no such option. Remove it there."
@@ -413,7 +418,7 @@ class TrainConfig:
         return dataclasses.replace(self, **{option.section: section})
 
 
-def settled(value: _Value | None) -> _Value:
+def require(value: _Value | None) -> _Value:
     """Returns the value of an option that `training.resolve` has decided.
 
     Raises:
@@ -434,12 +439,13 @@ def type_of(option: Option) -> Any:
 
 
 def _converted(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns values converted to the types of their fields.
+    """Returns values converted to the types of their fields, by the present names of options.
 
     Raises:
       ValueError: if a value has another type, is not one of the choices, or has no option.
     """
     options = _by_name()
+    given = {present_name(name): value for name, value in given.items()}
     if unknown := sorted(set(given) - set(options)):
         raise ValueError(
             f"There is no option {unknown[0]!r}. Choose from {', '.join(sorted(options))}."
@@ -457,6 +463,12 @@ def _nothing(given: Mapping[str, Any]) -> set[str]:
     """Returns the names of values that remove an override: `None`, and empty ones."""
     empty = {name for name, value in _converted(given).items() if value in ("", ())}
     return empty | {name for name, value in given.items() if value is None}
+
+
+def present_name(name: str) -> str:
+    """Returns the name of an option for its name in this or an earlier version."""
+    former = {o.field.metadata.get(configuration.FORMERLY): o.name for o in options_of()}
+    return former.get(name, name)
 
 
 def _by_name() -> dict[str, Option]:

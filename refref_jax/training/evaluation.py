@@ -160,7 +160,7 @@ def evaluate(
 
 def learned_colours(model: Model) -> dict[str, Any] | None:
     """Returns tints and absorptions of all parts, in the order of their file names, if learned."""
-    colours = model.params.dyes
+    colours = model.params.tints
     if colours is None:
         return None
     absorptions = learned_media.absorptions(colours, model.config.radius)
@@ -185,7 +185,7 @@ def first_distances(model: Model, views: Cameras, i: int) -> Float[np.ndarray, "
     if model.settings.max_bends == 0:
         return None
     rays = cameras.image_rays(views, i)
-    return first_surface.find_first_surface(model.geometry.surfaces, rays).distances
+    return first_surface.find_first_surface(model.scene.surfaces, rays).distances
 
 
 def read_truth(scene: Path, split: str) -> Truth:
@@ -209,7 +209,7 @@ def measure(
 ) -> Measured:
     """Returns all metrics of one image; `None` where the scene lacks the true values.
 
-    `lost` is the dropped throughput.
+    `dropped` is the dropped throughput.
 
     Args:
       seen: rendered image.
@@ -225,7 +225,7 @@ def measure(
     true = None if truth.distances is None else truth.distances[i]
     for name, known in _distances(np.asarray(seen.distance), first, true, mask).items():
         result |= measure_distances(name, known, true, mask)
-    return result | {"lost": float(np.mean(seen.lost))}
+    return result | {"dropped": float(np.mean(seen.dropped))}
 
 
 def measure_colours(

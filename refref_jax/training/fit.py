@@ -28,7 +28,7 @@ from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Model
 from refref_jax.training import devices, loop, run_folder
-from refref_jax.training.config import TrainConfig, settled
+from refref_jax.training.config import TrainConfig, require
 from refref_jax.training.loop import TrainState, init_state
 from refref_jax.training.objective import StepReport
 from refref_jax.training.resolve import Resolved, build_scene, read_facts, resolve
@@ -143,13 +143,13 @@ def train_into(
     if config is None:
         ready()
         return train(run, report=report, **options)
-    resolved, geometry = prepare(config, parts=parts, report=report)
+    resolved, scene = prepare(config, parts=parts, report=report)
     report(resolved.describe())
     # `ready` may write into the folder, which every process must have found free before.
     devices.wait_for_all("all have resolved the configuration")
     ready()
     open_ = run_folder.check_unchanged if resuming else begin
-    open_(run, resolved.config, resolved.model, geometry)
+    open_(run, resolved.config, resolved.model, scene)
     # The scene may have moved since the folder was written.
     return train(run, scene=resolved.config.scene.path, report=report, **options)
 
@@ -253,8 +253,8 @@ def train(
             report(f"{run} is trained already: {config.schedule.steps} steps.")
             return True
         sampler = _sampler(config, scene_source.open_scene(scene or config.scene.path))
-        geometry = checkpoint_io.load_geometry(run)
-        setup = loop.set_up(config, model.config, model.settings, geometry, sampler, mesh=mesh)
+        objects = checkpoint_io.load_scene(run)
+        setup = loop.set_up(config, model.config, model.settings, objects, sampler, mesh=mesh)
         if setup.hit_fraction == 0.0 and model.settings.max_bends > 0:
             report(
                 "warning: no camera ray hits the meshes, so no light is bent. Check that their "
@@ -267,7 +267,7 @@ def train(
         if devices.any_process(stop()):
             raise KeyboardInterrupt  # there is no new state to save
         step = _take_steps(run, setup, state, checkpoints, periods, progress, stop)
-    if step < settled(config.schedule.steps):
+    if step < require(config.schedule.steps):
         report(f"Stopped at step {step}.")
     return step == config.schedule.steps
 
@@ -278,7 +278,7 @@ def _sampler(config: TrainConfig, scene: Path) -> PixelSampler:
     kept = None
     if config.scene.pixels == "background":
         kept = masks.well_outside(scene_folder.read_masks(frames))
-    images, batch = scene_folder.read_images(frames), settled(config.schedule.batch)
+    images, batch = scene_folder.read_images(frames), require(config.schedule.batch)
     return PixelSampler(images, frames.cameras, seed=config.seed, batch=batch, kept=kept)
 
 
@@ -293,7 +293,7 @@ def _take_steps(
 ) -> int:
     """Takes the remaining steps, and returns the number of the last."""
     schedule = setup.config.schedule
-    total, batch, step = settled(schedule.steps), settled(schedule.batch), int(state.step)
+    total, batch, step = require(schedule.steps), require(schedule.batch), int(state.step)
     writes = devices.is_first()
     earlier = run_folder.rewind_metrics(run, step) if writes else 0.0
     start = last = time.monotonic()

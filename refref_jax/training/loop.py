@@ -1,6 +1,6 @@
 """Training loop: the state of a run, pre-traced batches of light paths, and compiled steps.
 
-The light paths of many batches are traced at once, as a *pool*, and then used by consecutive steps.
+The light paths of many batches are traced at once (*pre-traced*), then used by consecutive steps.
 If all batches of an epoch fit in memory, they are only traced once. This is one of the modules that
 call `jax.jit`.
 """
@@ -25,7 +25,7 @@ from refref_jax.optics.scene import Scene
 from refref_jax.render import pixels
 from refref_jax.render.model import ModelConfig, Params, init_params, path_detail
 from refref_jax.training import devices, objective
-from refref_jax.training.config import ScheduleConfig, TrainConfig, settled
+from refref_jax.training.config import ScheduleConfig, TrainConfig, require
 from refref_jax.training.devices import AXIS
 from refref_jax.training.objective import StepReport, Totals
 
@@ -75,8 +75,8 @@ def learning_rate(schedule: ScheduleConfig) -> optax.Schedule:
 
     Source: paper (arXiv 2505.05848), supplement (implementation details).
     """
-    steps, warmup = settled(schedule.steps), settled(schedule.warmup)
-    peak, end = settled(schedule.peak), settled(schedule.end)
+    steps, warmup = require(schedule.steps), require(schedule.warmup)
+    peak, end = require(schedule.peak), require(schedule.end)
     return optax.warmup_exponential_decay_schedule(
         init_value=0.0,
         peak_value=peak,
@@ -87,7 +87,7 @@ def learning_rate(schedule: ScheduleConfig) -> optax.Schedule:
     )
 
 
-class Pool(NamedTuple):
+class PretracedBatches(NamedTuple):
     """Pre-traced light paths and true colours of many batches, and the batch of each step.
 
     Attributes:
@@ -101,16 +101,16 @@ class Pool(NamedTuple):
     order: Int[Array, " steps"]
 
 
-# Sharding of a pool: every device has a share of the paths of every batch, and all colours.
-# `Any`, as a specification takes the place of each array.
+# Sharding of pre-traced batches: every device has a share of the paths of every batch, and all
+# colours. `Any`, as a specification takes the place of each array.
 _SHARE: Any = PartitionSpec(None, AXIS)
 _WHOLE: Any = PartitionSpec()
-_SHARED = Pool(traced=Traced(paths=_SHARE, lost=_WHOLE), rgb=_WHOLE, order=_WHOLE)
+_SHARED = PretracedBatches(traced=Traced(paths=_SHARE, dropped=_WHOLE), rgb=_WHOLE, order=_WHOLE)
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "capacity", "detail", "mesh"))
-def trace_pool(
-    geometry: Scene,
+def pretrace(
+    scene: Scene,
     rays: Rays,
     *,
     settings: PathSettings,
@@ -127,28 +127,28 @@ def trace_pool(
         path_tracing.trace_batches, settings=settings, capacity=capacity, detail=detail
     )
     if mesh is None:
-        return trace(geometry, rays)
+        return trace(scene, rays)
     batches = rays.radii.shape[0]
     again = jnp.arange(-(-batches // mesh.size) * mesh.size) % batches
     specs = PartitionSpec(), PartitionSpec(AXIS)
     trace = jax.shard_map(trace, mesh=mesh, in_specs=specs, out_specs=specs[1], check_vma=False)
-    traced = trace(geometry, jax.tree.map(lambda x: x[again], rays))
-    paths, lost = jax.tree.map(lambda x: x[:batches], traced)
+    traced = trace(scene, jax.tree.map(lambda x: x[again], rays))
+    paths, dropped = jax.tree.map(lambda x: x[:batches], traced)
     paths = jax.vmap(functools.partial(light_paths.filled_up, multiple=mesh.size))(paths)
     shared = jax.tree.map(lambda spec: NamedSharding(mesh, spec), _SHARED.traced)
-    return jax.lax.with_sharding_constraint(Traced(paths, lost), shared)
+    return jax.lax.with_sharding_constraint(Traced(paths, dropped), shared)
 
 
 @functools.partial(jax.jit, static_argnames="settings")
-def survey_paths(geometry: Scene, rays: Rays, *, settings: PathSettings) -> Survey:
+def survey_paths(scene: Scene, rays: Rays, *, settings: PathSettings) -> Survey:
     """Returns statistics of the paths of the rays `[rays]`; see `path_tracing.survey`."""
-    return path_tracing.survey(geometry, rays, settings=settings)
+    return path_tracing.survey(scene, rays, settings=settings)
 
 
 @functools.partial(jax.jit, static_argnames=("config", "model", "mesh"), donate_argnames="state")
 def train_steps(
     state: TrainState,
-    pool: Pool,
+    pretraced: PretracedBatches,
     first: Int[Array, ""],
     last: Int[Array, ""],
     *,
@@ -156,16 +156,16 @@ def train_steps(
     model: ModelConfig,
     mesh: Mesh | None = None,
 ) -> tuple[TrainState, StepReport]:
-    """Takes consecutive steps of a pool, without returning to the host in between.
+    """Takes consecutive steps with pre-traced batches, without returning to the host in between.
 
     Args:
       state: state before the first step, which is donated: its buffers are reused.
-      pool: light paths and colours.
-      first: index of the first step in the pool's order.
+      pretraced: light paths and colours.
+      first: index of the first step in the order of the batches.
       last: index after the last step; all numbers of steps share one compiled program.
       config: configuration of the run.
       model: configuration of the model.
-      mesh: devices that share the pool's paths, as in `trace_pool`. Results only depend on them by
+      mesh: devices that share the paths, as in `pretrace`. Results only depend on them by
         rounding.
 
     Returns:
@@ -181,12 +181,12 @@ def train_steps(
             out_specs=whole,
             check_vma=False,
         )
-    return take(state, pool, first, last)
+    return take(state, pretraced, first, last)
 
 
 def _take_steps(
     state: TrainState,
-    pool: Pool,
+    pretraced: PretracedBatches,
     first: Int[Array, ""],
     last: Int[Array, ""],
     *,
@@ -194,7 +194,7 @@ def _take_steps(
     model: ModelConfig,
     axis: str | None = None,
 ) -> tuple[TrainState, StepReport]:
-    step = functools.partial(_step, pool=pool, config=config, model=model, axis=axis)
+    step = functools.partial(_step, pretraced=pretraced, config=config, model=model, axis=axis)
     shapes = jax.eval_shape(step, state, first)[1]
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     return jax.lax.fori_loop(
@@ -206,17 +206,17 @@ def _step(
     state: TrainState,
     place: Int[Array, ""],
     *,
-    pool: Pool,
+    pretraced: PretracedBatches,
     config: TrainConfig,
     model: ModelConfig,
     axis: str | None,
 ) -> tuple[TrainState, StepReport]:
     """Takes one step, with this device's paths of the batch."""
-    batch = pool.order[place]
-    traced, rgb = jax.tree.map(lambda x: x[batch], (pool.traced, pool.rgb))
+    batch = pretraced.order[place]
+    traced, rgb = jax.tree.map(lambda x: x[batch], (pretraced.traced, pretraced.rgb))
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
     jitter = pixels.random_jitter(key, model, _slots(traced.paths.radii.shape[0], axis))
-    anneal = _anneal(state.step, settled(config.schedule.anneal))
+    anneal = _anneal(state.step, require(config.schedule.anneal))
 
     def look(params: Params) -> Totals:
         light = pixels.gather_light(
@@ -226,7 +226,7 @@ def _step(
 
     def judge(params: Params, totals: Totals) -> tuple[Float[Array, ""], StepReport]:
         target = rgb.astype(jnp.float32) / 255.0
-        report = objective.measure(params, totals, target, traced.lost, config.losses)
+        report = objective.measure(params, totals, target, traced.dropped, config.losses)
         return report.loss, report
 
     # In two halves, between which the sums over paths are summed over devices.
@@ -263,22 +263,22 @@ class Setup(NamedTuple):
       config: configuration of the run.
       model: configuration of the model.
       settings: path settings.
-      geometry: scene through which paths are traced.
+      scene: scene through which paths are traced.
       sampler: sampler of the training pixels.
       capacity: capacity for the paths of a batch.
       hit_fraction: share of the pixels whose rays hit an object, 0 if no light is bent.
-      epoch: all batches, if they are only traced once; `None` if they are traced pool by pool.
+      epoch: all batches, if they are only traced once; `None` if they are traced again and again.
       mesh: devices that train together; `None` for a single device.
     """
 
     config: TrainConfig
     model: ModelConfig
     settings: PathSettings
-    geometry: Scene
+    scene: Scene
     sampler: PixelSampler
     capacity: int
     hit_fraction: float
-    epoch: Pool | None = None
+    epoch: PretracedBatches | None = None
     mesh: Mesh | None = None
 
 
@@ -286,7 +286,7 @@ def set_up(
     config: TrainConfig,
     model: ModelConfig,
     settings: PathSettings,
-    geometry: Scene,
+    scene: Scene,
     sampler: PixelSampler,
     *,
     mesh: Mesh | None = None,
@@ -296,16 +296,16 @@ def set_up(
     The light paths of all pixels are kept if the run uses them more than once and they take at most
     half a gibibyte; while they are concatenated, three times that is in use.
     """
-    geometry = jax.tree.map(jnp.asarray, geometry)
-    found = survey_paths(geometry, sampler.survey(_SURVEY).rays, settings=settings)
+    scene = jax.tree.map(jnp.asarray, scene)
+    found = survey_paths(scene, sampler.survey(_SURVEY).rays, settings=settings)
     found = devices.as_in_the_first(jax.device_get(found))
-    batch = settled(config.schedule.batch)
+    batch = require(config.schedule.batch)
     capacity = capacity_for(
         settings, batch, mean=float(found.mean), deviation=float(found.deviation)
     )
     hit_fraction = float(found.hit_fraction)
-    geometry = devices.put_everywhere(geometry, mesh=mesh)
-    setup = Setup(config, model, settings, geometry, sampler, capacity, hit_fraction, mesh=mesh)
+    scene = devices.put_everywhere(scene, mesh=mesh)
+    setup = Setup(config, model, settings, scene, sampler, capacity, hit_fraction, mesh=mesh)
     return setup._replace(epoch=_trace_epoch(setup))
 
 
@@ -317,55 +317,57 @@ def run_steps(
     A yielded state is donated to the following steps: copy it to keep it. A run that starts from a
     restored state continues exactly like the uninterrupted run.
 
-    The light paths of the next pool are dispatched before the steps of the current pool, so that
-    they can be traced at the same time; there are at most two pools.
+    The light paths of the next batches are dispatched before the steps of the current ones, so that
+    they can be traced at the same time; at most twice `pretraced_batches` are held.
 
     Args:
       setup: constant part of the run.
       state: initial state, on all devices of the run if there are several.
       until: number of the last step.
       every: periods; the state is yielded at the multiples of each of these numbers, at the end of
-        every pool, and at the end. In between, the device takes steps without the host.
+        all pre-traced batches, and at the end. In between, the device takes steps without the host.
     """
     config = setup.config
-    step, size = int(state.step), settled(config.schedule.pool)
-    for first, pool in _pools(setup, step, until):
+    step, size = int(state.step), require(config.schedule.pretraced_batches)
+    for first, pretraced in _pretraced_in_turn(setup, step, until):
         end = min(first + size, until)
         while step < end:
             last = min(end, *(step + period - step % period for period in every))
             batches = np.int32(step - first), np.int32(last - first)
             state, report = train_steps(
-                state, pool, *batches, config=config, model=setup.model, mesh=setup.mesh
+                state, pretraced, *batches, config=config, model=setup.model, mesh=setup.mesh
             )
             step = last
             yield state, report
 
 
-def _pools(setup: Setup, step: int, until: int) -> Iterator[tuple[int, Pool]]:
-    """Yields the pools of steps, with the number of steps before each; one is traced ahead."""
-    size = settled(setup.config.schedule.pool)
+def _pretraced_in_turn(
+    setup: Setup, step: int, until: int
+) -> Iterator[tuple[int, PretracedBatches]]:
+    """Yields pre-traced batches, with the number of steps before them; traces one group ahead."""
+    size = require(setup.config.schedule.pretraced_batches)
     firsts = range(step - step % size, until, size)
-    ahead = ((first, _pool(setup, first)) for first in firsts)
-    pool = next(ahead, None)
-    while pool is not None:
+    ahead = ((first, _pretraced_after(setup, first)) for first in firsts)
+    pretraced = next(ahead, None)
+    while pretraced is not None:
         following = next(ahead, None)
-        yield pool
-        pool = following
+        yield pretraced
+        pretraced = following
 
 
-def _pool(setup: Setup, first: int) -> Pool:
-    """Returns the pool of the steps after the first `first` ones."""
-    numbers = setup.sampler.numbers(first, settled(setup.config.schedule.pool))
+def _pretraced_after(setup: Setup, first: int) -> PretracedBatches:
+    """Returns the pre-traced batches of the steps after the first `first` ones."""
+    numbers = setup.sampler.numbers(first, require(setup.config.schedule.pretraced_batches))
     if setup.epoch is not None:
         return setup.epoch._replace(order=devices.put_everywhere(numbers, mesh=setup.mesh))
     return trace_batches(setup, numbers.tolist())
 
 
-def trace_batches(setup: Setup, numbers: Sequence[int]) -> Pool:
+def trace_batches(setup: Setup, numbers: Sequence[int]) -> PretracedBatches:
     """Traces batches of a run, for steps in the order of `numbers`."""
     drawn = setup.sampler.draw(np.asarray(numbers))
-    traced = trace_pool(
-        setup.geometry,
+    traced = pretrace(
+        setup.scene,
         drawn.rays,
         settings=setup.settings,
         capacity=setup.capacity,
@@ -373,23 +375,23 @@ def trace_batches(setup: Setup, numbers: Sequence[int]) -> Pool:
         mesh=setup.mesh,
     )
     order = np.arange(len(numbers), dtype=np.int32)
-    return Pool(traced, *devices.put_everywhere((drawn.rgb, order), mesh=setup.mesh))
+    return PretracedBatches(traced, *devices.put_everywhere((drawn.rgb, order), mesh=setup.mesh))
 
 
-def _trace_epoch(setup: Setup) -> Pool | None:
+def _trace_epoch(setup: Setup) -> PretracedBatches | None:
     """Traces all batches in advance, if the run uses them more than once and they fit in memory.
 
-    They are traced pool by pool, with the capacity of a pool. Training is the same with and without
-    them, unless paths are dropped because a pool is full: otherwise its batches are different ones.
+    They are traced in groups, with the capacity of a group. Training is the same with and without
+    them, unless paths are dropped because a group is full: otherwise its batches are different.
     """
     config, batches = setup.config, setup.sampler.batches
-    size = settled(config.schedule.pool)
-    pools = range(0, batches, size)
-    if settled(config.schedule.steps) <= batches:
+    size = require(config.schedule.pretraced_batches)
+    groups = range(0, batches, size)
+    if require(config.schedule.steps) <= batches:
         return None
     one = jax.eval_shape(lambda: trace_batches(setup, range(size)))
     bytes_ = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(one))
-    if bytes_ * len(pools) > _MOST_BYTES:
+    if bytes_ * len(groups) > _MOST_BYTES:
         return None
-    traced = [trace_batches(setup, range(first, first + size)) for first in pools]
+    traced = [trace_batches(setup, range(first, first + size)) for first in groups]
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:batches], *traced)

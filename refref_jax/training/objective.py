@@ -28,7 +28,7 @@ from refref_jax.render import colour, learned_media, pixels
 from refref_jax.render.model import Params
 from refref_jax.render.volume_rendering import Histogram
 from refref_jax.sampling import stepfun
-from refref_jax.training.config import LossConfig, settled
+from refref_jax.training.config import LossConfig, require
 
 _CHARBONNIER_PADDING = 0.001
 
@@ -102,7 +102,7 @@ class StepReport(NamedTuple):
       interlevel: unweighted interlevel loss.
       distortion: unweighted distortion loss.
       hash_decay: unweighted hash decay.
-      lost: mean dropped throughput of the batch's rays.
+      dropped: mean dropped throughput of the batch's rays.
     """
 
     loss: Float[Array, ""]
@@ -110,7 +110,7 @@ class StepReport(NamedTuple):
     interlevel: Float[Array, ""]
     distortion: Float[Array, ""]
     hash_decay: Float[Array, ""]
-    lost: Float[Array, ""]
+    dropped: Float[Array, ""]
 
 
 class Totals(NamedTuple):
@@ -134,7 +134,7 @@ def total(light: pixels.Light, paths: LightPaths, config: LossConfig) -> Totals:
     *proposals, final = light.paths.histograms
     exists = light_paths.exists(paths)
     missed = jnp.zeros(())
-    for proposal, blur in zip(proposals, settled(config.blurs), strict=True):
+    for proposal, blur in zip(proposals, require(config.blurs), strict=True):
         per_path = jax.vmap(functools.partial(interlevel, blur=blur))(final, proposal)
         missed += _sum_where(exists, per_path)
     counted = light.paths.outside
@@ -149,7 +149,7 @@ def measure(
     params: Params,
     totals: Totals,
     target: Float[Array, "rays 3"],
-    lost: Float[Array, "rays 3"],
+    dropped: Float[Array, "rays 3"],
     config: LossConfig,
 ) -> StepReport:
     """Returns the losses of a batch; losses of paths are averaged over the paths that exist."""
@@ -164,11 +164,11 @@ def measure(
         data
         + config.interlevel * interlevel
         + config.distortion * distortion
-        + settled(config.hash_decay) * decay
-        + config.dye_decay * learned_media.optical_density(params.dyes)
+        + require(config.hash_decay) * decay
+        + config.tint_decay * learned_media.optical_density(params.tints)
     )
     psnr = -10.0 * jnp.log10(mse)
-    return StepReport(loss, psnr, interlevel, distortion, decay, jnp.mean(lost))
+    return StepReport(loss, psnr, interlevel, distortion, decay, jnp.mean(dropped))
 
 
 def _sum_where(mask: Bool[Array, " n"], values: Float[Array, " n"]) -> Float[Array, ""]:

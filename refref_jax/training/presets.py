@@ -153,25 +153,49 @@ PRESETS = {
     "tiny": Preset(
         size="tiny",
         schedule=ScheduleConfig(
-            steps=2500, warmup=100, peak=1e-2, end=1e-3, anneal=250, batch=1024, pool=32
+            steps=2500,
+            warmup=100,
+            peak=1e-2,
+            end=1e-3,
+            anneal=250,
+            batch=1024,
+            pretraced_batches=32,
         ),
     ),
     "small": Preset(
         size="small",
         schedule=ScheduleConfig(
-            steps=8000, warmup=300, peak=1e-2, end=1e-3, anneal=500, batch=2048, pool=32
+            steps=8000,
+            warmup=300,
+            peak=1e-2,
+            end=1e-3,
+            anneal=500,
+            batch=2048,
+            pretraced_batches=32,
         ),
     ),
     "paper": Preset(
         size="paper",
         schedule=ScheduleConfig(
-            steps=25_000, warmup=1000, peak=8e-3, end=1e-3, anneal=1000, batch=4096, pool=32
+            steps=25_000,
+            warmup=1000,
+            peak=8e-3,
+            end=1e-3,
+            anneal=1000,
+            batch=4096,
+            pretraced_batches=32,
         ),
     ),
     "best": Preset(
         size="best",
         schedule=ScheduleConfig(
-            steps=25_000, warmup=1000, peak=1e-2, end=1e-3, anneal=1000, batch=16_384, pool=8
+            steps=25_000,
+            warmup=1000,
+            peak=1e-2,
+            end=1e-3,
+            anneal=1000,
+            batch=16_384,
+            pretraced_batches=8,
         ),
     ),
 }

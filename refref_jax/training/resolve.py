@@ -33,8 +33,8 @@ from refref_jax.data import (
 from refref_jax.data.batches import check_batch
 from refref_jax.data.mesh_queries import Containment
 from refref_jax.data.meshes import MeshPart
-from refref_jax.data.scene_analysis import Needs
-from refref_jax.data.scene_assembly import build_geometry
+from refref_jax.data.scene_analysis import SceneAnalysis
+from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.fields import mlps
 from refref_jax.fields.base import RadianceConfig
 from refref_jax.fields.hash_grid import HashGridConfig
@@ -45,7 +45,7 @@ from refref_jax.optics.scene import Scene
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import ModelConfig
 from refref_jax.training import presets
-from refref_jax.training.config import FieldConfig, SceneConfig, TrainConfig, options_of, settled
+from refref_jax.training.config import FieldConfig, SceneConfig, TrainConfig, options_of, require
 
 # Width of printed lines.
 _COLUMNS = 100
@@ -60,7 +60,7 @@ class SceneFacts(NamedTuple):
     """Properties of a scene that decisions depend on.
 
     Attributes:
-      needs: required features, with the space of `SceneConfig` if that is given.
+      analysis: required features, with the space of `SceneConfig` if that is given.
       cameras: cameras of the training images.
       parts: meshes of the scene.
       tree: containment of the meshes.
@@ -69,7 +69,7 @@ class SceneFacts(NamedTuple):
       notes: results of the checks of the meshes.
     """
 
-    needs: Needs
+    analysis: SceneAnalysis
     cameras: Cameras
     parts: Sequence[MeshPart]
     tree: Containment
@@ -78,7 +78,7 @@ class SceneFacts(NamedTuple):
 
     def describe(self) -> str:
         """Returns the required features in one line of text."""
-        return scene_analysis.describe(self.needs)
+        return scene_analysis.describe(self.analysis)
 
 
 class Resolved(NamedTuple):
@@ -129,7 +129,7 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
     if scene.rule == "priority":
         _refuse_cameras_inside(parts, cameras)
     space = scene.space or background.space(folder)
-    found = scene_analysis.find_needs(parts, tree, cameras, rule=scene.rule, space=space)
+    found = scene_analysis.analyse(parts, tree, cameras, rule=scene.rule, space=space)
     extent = background.half_extent(folder) if space != "unbounded" else None
     return SceneFacts(found, cameras, parts, tree, extent, notes)
 
@@ -140,15 +140,15 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
     Raises:
       ValueError: if overrides contradict each other or the scene.
     """
-    asked, found = config, facts.needs
+    asked, found = config, facts.analysis
     reasons = _first_reasons(config)
     settings, config = _resolve_paths(config, found, reasons)
     config = _resolve_inside(config, found, settings, reasons)
     model, config = _resolve_model(config, facts, reasons)
     if settings.max_bends:
-        settings = dataclasses.replace(settings, reentry=settled(config.paths.reentry))
+        settings = dataclasses.replace(settings, reentry=require(config.paths.reentry))
     config = _resolve_training(config, model, reasons)
-    check_batch(facts.cameras, settled(config.schedule.batch))
+    check_batch(facts.cameras, require(config.schedule.batch))
     return Resolved(config, SavedModel(model, settings), reasons, tuple(_doubts(asked, found)))
 
 
@@ -181,7 +181,7 @@ def build_scene(resolved: Resolved, facts: SceneFacts) -> Scene:
     """Builds the scene for tracing; its parts only have colours if `tints` is `given`."""
     given = resolved.config.model.tints == "given"
     parts = facts.parts if given else meshes.without_colour(facts.parts)
-    return build_geometry(parts, facts.tree.parents, rule=resolved.config.scene.rule)
+    return assemble_scene(parts, facts.tree.parents, rule=resolved.config.scene.rule)
 
 
 def samples_of(model: ModelConfig) -> tuple[int, ...]:
@@ -199,10 +199,10 @@ def _sampling_of(model: ModelConfig) -> dict[str, Any]:
     grid = grid_of(model)
     return {
         "footprint": model.footprint,
-        "samples": samples_of(model),
+        "samples_per_ray": samples_of(model),
         "multisamples": model.multisamples,
-        "entries": grid and grid.entries.bit_length() - 1,
-        "finest": grid and grid.finest,
+        "log2_hashmap_size": grid and grid.hashmap_size.bit_length() - 1,
+        "max_res": grid and grid.max_res,
         "precision": model.field.precision,
         "dilation": model.dilation,
     }
@@ -231,7 +231,7 @@ def _decide(
 
 
 def _resolve_paths(
-    config: TrainConfig, found: Needs, reasons: dict[str, str]
+    config: TrainConfig, found: SceneAnalysis, reasons: dict[str, str]
 ) -> tuple[PathSettings, TrainConfig]:
     if found.parts == 0 and config.paths.name not in (None, "straight"):
         raise ValueError(
@@ -242,7 +242,7 @@ def _resolve_paths(
     config = _decide(config, reasons, why, paths=name)
     paths = config.paths
     settings = make_path_settings(
-        settled(paths.name), min_throughput=paths.min_throughput, max_bends=paths.max_bends
+        require(paths.name), min_throughput=paths.min_throughput, max_bends=paths.max_bends
     )
     if settings.max_bends == 0:
         _check_straight(config)
@@ -279,7 +279,7 @@ def _check_straight(config: TrainConfig) -> None:
 
 
 def _resolve_inside(
-    config: TrainConfig, found: Needs, settings: PathSettings, reasons: dict[str, str]
+    config: TrainConfig, found: SceneAnalysis, settings: PathSettings, reasons: dict[str, str]
 ) -> TrainConfig:
     """Decides the model of the inside of the objects, and the source of their colours."""
     interior: Interior | None
@@ -321,7 +321,7 @@ def _resolve_inside(
 def _resolve_model(
     config: TrainConfig, facts: SceneFacts, reasons: dict[str, str]
 ) -> tuple[ModelConfig, TrainConfig]:
-    scene, found = config.scene, facts.needs
+    scene, found = config.scene, facts.analysis
     config = _decide(config, reasons, "the scene", background=found.space)
     extent = presets.bounds(
         facts.cameras, space=found.space, radius=scene.radius or facts.half_extent
@@ -330,7 +330,7 @@ def _resolve_model(
     why = "the cameras" if found.space == "unbounded" else why
     config = _decide(config, reasons, why, radius=extent.radius)
     preset = presets.PRESETS[config.model.preset]
-    model = preset.model(extent, settled(config.model.interior), field=config.model.field)
+    model = preset.model(extent, require(config.model.interior), field=config.model.field)
     learned = found.parts if config.model.tints == "learned" else 0
     model = override_model(dataclasses.replace(model, learned_tints=learned), config.model)
     config = _decide(
@@ -348,7 +348,7 @@ def _resolve_training(
     usual = presets.loss(model)
     why = f"field={config.model.field}"
     config = _decide(config, reasons, why, blurs=usual.blurs, hash_decay=usual.hash_decay)
-    blurs, rounds = len(settled(config.losses.blurs)), len(model.proposals)
+    blurs, rounds = len(require(config.losses.blurs)), len(model.proposals)
     if blurs != rounds:
         raise ValueError(
             f"There are {blurs} blurs for {rounds} proposal levels. Give one for each, or leave "
@@ -356,7 +356,7 @@ def _resolve_training(
         )
     preset = presets.PRESETS[config.model.preset]
     steps = config.schedule.steps or preset.schedule.steps
-    schedule = preset.schedule.over(settled(steps))
+    schedule = preset.schedule.over(require(steps))
     return _decide(
         config,
         reasons,
@@ -367,7 +367,7 @@ def _resolve_training(
         final_learning_rate=schedule.end,
         anneal=schedule.anneal,
         batch=schedule.batch,
-        pool=schedule.pool,
+        pretraced_batches=schedule.pretraced_batches,
     )
 
 
@@ -377,8 +377,8 @@ def override_model(model: ModelConfig, asked: FieldConfig) -> ModelConfig:
     Raises:
       ValueError: if the model does not support an override.
     """
-    if asked.samples is not None:
-        model = _with_samples(model, asked.samples, asked.preset)
+    if asked.samples_per_ray is not None:
+        model = _with_samples(model, asked.samples_per_ray, asked.preset)
     names = ("multisamples", "footprint", "dilation")
     given = {name: getattr(asked, name) for name in names}
     model = dataclasses.replace(model, **{n: x for n, x in given.items() if x is not None})
@@ -398,9 +398,9 @@ def _with_samples(model: ModelConfig, samples: tuple[int, ...], preset: str) -> 
     rounds = len(model.proposals)
     if len(samples) != rounds + 1:
         raise ValueError(
-            f"samples={','.join(map(str, samples))} is for {len(samples) - 1} proposal levels, but "
-            f"preset {preset} has {rounds}. Give {rounds + 1} numbers: one for each proposal "
-            "level, then one for the radiance field."
+            f"samples_per_ray={','.join(map(str, samples))} is for {len(samples) - 1} proposal "
+            f"levels, but preset {preset} has {rounds}. Give {rounds + 1} numbers: one for each "
+            "proposal level, then one for the radiance field."
         )
     proposals = tuple(
         dataclasses.replace(proposal, samples=count)
@@ -410,27 +410,27 @@ def _with_samples(model: ModelConfig, samples: tuple[int, ...], preset: str) -> 
 
 
 def _with_grid(field: RadianceConfig, asked: FieldConfig) -> RadianceConfig:
-    if asked.entries is None and asked.finest is None:
+    if asked.log2_hashmap_size is None and asked.max_res is None:
         return field
     if not isinstance(field, mlps.GridRadianceConfig):
         raise ValueError(
-            f"entries and finest are options of a hash grid, which field type {field.kind} does "
-            "not have. Leave them out."
+            "log2_hashmap_size and max_res are options of a hash grid, which field type "
+            f"{field.kind} does not have. Leave them out."
         )
     grid = field.grid
-    if asked.entries is not None:
-        grid = dataclasses.replace(grid, entries=1 << asked.entries)
-    if asked.finest is not None:
-        if asked.finest < grid.coarsest:
+    if asked.log2_hashmap_size is not None:
+        grid = dataclasses.replace(grid, hashmap_size=1 << asked.log2_hashmap_size)
+    if asked.max_res is not None:
+        if asked.max_res < grid.base_res:
             raise ValueError(
-                f"finest={asked.finest} is coarser than the grid's first level of {grid.coarsest} "
-                "cells per side. Give at least that."
+                f"max_res={asked.max_res} is coarser than the grid's first level of "
+                f"{grid.base_res} cells per side. Give at least that."
             )
-        grid = dataclasses.replace(grid, finest=asked.finest)
+        grid = dataclasses.replace(grid, max_res=asked.max_res)
     return dataclasses.replace(field, grid=grid)
 
 
-def _doubts(asked: TrainConfig, found: Needs) -> list[str]:
+def _doubts(asked: TrainConfig, found: SceneAnalysis) -> list[str]:
     doubts = []
     if asked.model.interior == "clear" and found.tints == "given":
         doubts.append(

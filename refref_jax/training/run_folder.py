@@ -110,7 +110,7 @@ def exists(run: Path) -> bool:
     return (run / CONFIG).is_file()
 
 
-def create(run: Path, config: TrainConfig, model: SavedModel, geometry: Scene) -> None:
+def create(run: Path, config: TrainConfig, model: SavedModel, scene: Scene) -> None:
     """Creates a run; its configuration is written last, so that an incomplete folder is not a run.
 
     Raises:
@@ -118,7 +118,7 @@ def create(run: Path, config: TrainConfig, model: SavedModel, geometry: Scene) -
     """
     check_free(run)
     run.mkdir(parents=True, exist_ok=True)
-    checkpoint_io.save_scene(run, model, geometry)
+    checkpoint_io.save_scene(run, model, scene)
     config_files.write(run / CONFIG, config)
 
 
@@ -171,7 +171,7 @@ def _with_todays_keys(content: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, geometry: Scene) -> None:
+def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, scene: Scene) -> None:
     """Checks that a run has exactly this configuration and these meshes.
 
     Its scene and its reconstruction may have moved to other folders.
@@ -193,9 +193,7 @@ def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, geometry:
             f"({', '.join(differing) or 'in the model'}). Resume it without a configuration to "
             "continue it unchanged, or choose another folder."
         )
-    pairs = zip(
-        jax.tree.leaves(checkpoint_io.load_geometry(run)), jax.tree.leaves(geometry), strict=True
-    )
+    pairs = zip(jax.tree.leaves(checkpoint_io.load_scene(run)), jax.tree.leaves(scene), strict=True)
     if not all(np.array_equal(theirs, ours) for theirs, ours in pairs):
         raise ValueError(
             f"{run} was created with other meshes than those of "

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from refref_jax.data.mesh_queries import find_containment
-from refref_jax.data.scene_assembly import build_geometry
+from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.geometry.triangle_meshes import corner_normals, face_normals
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import AMBIENT
@@ -21,12 +21,12 @@ def _nested():
 
 
 def _build(parts, rule="nested"):
-    return build_geometry(parts, find_containment(parts).parents, rule=rule)
+    return assemble_scene(parts, find_containment(parts).parents, rule=rule)
 
 
-def _own_slots(geometry, part):
+def _own_slots(scene, part):
     """Returns the slots of the triangles of a part; every triangle has at least one."""
-    return np.flatnonzero(np.asarray(geometry.surfaces.parts) == part)
+    return np.flatnonzero(np.asarray(scene.surfaces.parts) == part)
 
 
 def test_media_of_nested_parts():
@@ -45,19 +45,19 @@ def test_media_of_the_facing_rule_have_air_outside():
 
 def test_every_triangle_keeps_its_part():
     parts = _nested()
-    geometry = _build(parts)
+    scene = _build(parts)
     for number, part in enumerate(parts):
-        stored = np.asarray(geometry.surfaces.bvh.triangles)[_own_slots(geometry, number)]
+        stored = np.asarray(scene.surfaces.bvh.triangles)[_own_slots(scene, number)]
         expected = part.vertices[part.faces].astype(np.float32)
         assert {t.tobytes() for t in stored} == {t.tobytes() for t in expected}
 
 
 def test_arrays_are_single_precision():
-    geometry = _build(_nested())
-    assert geometry.surfaces.normals.dtype == np.float32
-    assert geometry.surfaces.bvh.triangles.dtype == np.float32
-    assert geometry.surfaces.parts.dtype == np.int32
-    assert geometry.interfaces.index_inside.dtype == np.float32
+    scene = _build(_nested())
+    assert scene.surfaces.normals.dtype == np.float32
+    assert scene.surfaces.bvh.triangles.dtype == np.float32
+    assert scene.surfaces.parts.dtype == np.int32
+    assert scene.interfaces.index_inside.dtype == np.float32
 
 
 def _smooth(part):
@@ -80,30 +80,30 @@ def _flat(part):
     ],
 )
 def test_shading_decides_the_normals(part, shading, normals):
-    geometry = _build([part._replace(shading=shading)])
+    scene = _build([part._replace(shading=shading)])
     by_corners = {
         corners.tobytes(): normal
         for corners, normal in zip(
             part.vertices[part.faces].astype(np.float32), normals(part), strict=True
         )
     }
-    surfaces = geometry.surfaces
+    surfaces = scene.surfaces
     for corners, normal in zip(surfaces.bvh.triangles, surfaces.normals, strict=True):
         np.testing.assert_allclose(normal, by_corners[np.asarray(corners).tobytes()], atol=_SINGLE)
 
 
 def test_a_scene_without_parts_has_one_interface_that_does_nothing():
-    geometry = build_geometry([], [], rule="nested")
-    np.testing.assert_array_equal(geometry.interfaces.index_inside, [1.0])
-    np.testing.assert_array_equal(geometry.interfaces.index_outside, [1.0])
-    np.testing.assert_array_equal(geometry.interfaces.medium_outside, [AMBIENT])
-    assert geometry.surfaces.normals.shape == geometry.surfaces.bvh.triangles.shape
-    assert geometry.surfaces.parts.shape == geometry.surfaces.normals.shape[:1]
+    scene = assemble_scene([], [], rule="nested")
+    np.testing.assert_array_equal(scene.interfaces.index_inside, [1.0])
+    np.testing.assert_array_equal(scene.interfaces.index_outside, [1.0])
+    np.testing.assert_array_equal(scene.interfaces.medium_outside, [AMBIENT])
+    assert scene.surfaces.normals.shape == scene.surfaces.bvh.triangles.shape
+    assert scene.surfaces.parts.shape == scene.surfaces.normals.shape[:1]
 
 
 def test_a_scene_without_parts_can_be_ranked():
-    geometry = build_geometry([], [], rule="priority")
-    np.testing.assert_array_equal(geometry.interfaces.priority, [0])
+    scene = assemble_scene([], [], rule="priority")
+    np.testing.assert_array_equal(scene.interfaces.priority, [0])
 
 
 def test_media_of_the_priority_rule():
@@ -126,6 +126,6 @@ def test_colours_reach_the_interfaces(rule):
 
 @pytest.mark.parametrize("rule", ["nested", "facing", "priority"])
 def test_a_part_alone_is_surrounded_by_air(rule):
-    interfaces = build_geometry([ball()], [NO_PARENT], rule=rule).interfaces
+    interfaces = assemble_scene([ball()], [NO_PARENT], rule=rule).interfaces
     np.testing.assert_array_equal(interfaces.index_outside, [1.0])
     np.testing.assert_array_equal(interfaces.medium_outside, [AMBIENT])

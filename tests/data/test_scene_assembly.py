@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from refref_jax.data import SceneError
-from refref_jax.data.scene_assembly import assemble, build_geometry, make_part, single_object
+from refref_jax.data.scene_assembly import assemble, assemble_scene, make_part, single_object
 from refref_jax.optics.interface_rules import NO_PARENT
 from tests.factories.solids import ball, box, inverted
 
@@ -99,13 +99,13 @@ def test_a_scene_finds_what_lies_in_what():
     for rule in ("nested", "facing"):
         _same_scene(
             assemble([cup, drink], rule=rule),
-            build_geometry([cup, drink], [NO_PARENT, 0], rule=rule),
+            assemble_scene([cup, drink], [NO_PARENT, 0], rule=rule),
         )
     np.testing.assert_allclose(assemble([cup, drink]).interfaces.index_outside, [1.0, 1.5])
 
 
 def test_no_part_is_an_empty_scene():
-    _same_scene(assemble([]), build_geometry([], [], rule="nested"))
+    _same_scene(assemble([]), assemble_scene([], [], rule="nested"))
 
 
 def test_faces_that_point_inwards_are_refused():

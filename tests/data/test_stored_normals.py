@@ -6,7 +6,7 @@ import trimesh
 
 from refref_jax.data import meshes
 from refref_jax.data.meshes import PartDescription
-from refref_jax.data.scene_assembly import build_geometry, shaded_mesh
+from refref_jax.data.scene_assembly import assemble_scene, shaded_mesh
 from refref_jax.geometry.triangle_meshes import corner_normals
 
 
@@ -38,7 +38,7 @@ def test_a_mesh_comes_back_to_the_bit(tmp_path, mesh):
 def test_light_is_bent_by_the_stored_normals(tmp_path, mesh):
     meshes.write_mesh(tmp_path / "box_glass.ply", *mesh)
     part = meshes.read_part(tmp_path / "box_glass.ply", index=1.5)
-    surfaces = build_geometry([part], [-1], rule="nested").surfaces
+    surfaces = assemble_scene([part], [-1], rule="nested").surfaces
     ours = np.concatenate([surfaces.bvh.triangles, surfaces.normals], axis=-1).reshape(-1, 18)
     theirs = np.concatenate([mesh[0][mesh[1]], mesh[2]], axis=-1).reshape(-1, 18)
     # The tree sorts the faces, and pads its leaves.

@@ -32,7 +32,7 @@ def test_training_writes_a_readable_run(trained):
     lines = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [3, 6]
     for line in lines:
-        assert {"step", "loss", "psnr", "lost", "rays_per_second", "seconds"} <= set(line)
+        assert {"step", "loss", "psnr", "dropped", "rays_per_second", "seconds"} <= set(line)
         assert np.all(np.isfinite(list(line.values())))
     config = json.loads((trained / "config.json").read_text())
     assert config["paths"]["name"] == "tree" and config["schedule"]["steps"] == 6
@@ -128,7 +128,7 @@ def test_evaluation_writes_images_metrics_and_a_comparison(trained):
         "lpips",
         "flip",
         *(f"{kind}_{error}" for kind in _DISTANCES for error in _ERRORS),
-        "lost",
+        "dropped",
         "seconds_per_image",
     }
     # The body's mesh knows the distance to it, and the truth knows it altogether.
@@ -192,7 +192,7 @@ def test_rendering_an_orbit_writes_pictures_distances_and_gifs(trained):
         ("render", ("--run=nowhere", "--rays_per_pixel=0"), "Give 1."),
         ("export", ("--run=RUN", "--what=mesh", "--out=x.ply"), "run/model.json does not"),
         ("export", ("--run=RUN", "--what=body", "--out=x.ply"), "run/geometry.npz cannot"),
-        ("export", ("--run=nowhere", "--what=body", "--out=x.obj"), "ends in .ply"),
+        ("export", ("--run=nowhere", "--what=object", "--out=x.obj"), "ends in .ply"),
     ],
 )
 def test_mistakes_end_with_one_line_that_says_what_to_do(tmp_path, command, options, message):

@@ -40,6 +40,6 @@ def test_auto_takes_back_what_a_file_asks_for_of_all_options_but_the_folders(tmp
     )
     assert done.returncode == 0, done.stderr
     names, kept, chosen, scene, jax = json.loads(done.stdout)
-    assert {"ior", "seed", "preset", "samples"} <= set(names) and not jax
+    assert {"ior", "seed", "preset", "samples_per_ray"} <= set(names) and not jax
     assert (kept, chosen, scene) == ([], ["scene"], "a")
     assert TrainConfig().override(scene="a").chosen == ("scene",)

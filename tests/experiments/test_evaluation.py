@@ -15,9 +15,9 @@ def test_a_comparison_shows_views_from_first_to_last(count, shown):
 
 
 def test_only_light_that_may_be_seen_is_warned_of(capsys):
-    evaluation.warn_of_lost_light(1e-3, advice="Do this.")
+    evaluation.warn_of_dropped(1e-3, advice="Do this.")
     assert capsys.readouterr().out == ""
-    evaluation.warn_of_lost_light(2e-3, advice="Do this.")
+    evaluation.warn_of_dropped(2e-3, advice="Do this.")
     printed = capsys.readouterr().out
     assert printed.startswith("warning: path buffer overflow: 0.2 % of the throughput was dropped")
     assert "Do this." in printed

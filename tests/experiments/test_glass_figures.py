@@ -26,10 +26,10 @@ def _part(mesh):
 def _paths(*polylines, shares):
     return PixelPaths(
         polylines=tuple(np.array(line, np.float32) for line in polylines),
-        weights=np.repeat(np.array(shares, np.float32)[:, None], 3, axis=-1),
+        throughput=np.repeat(np.array(shares, np.float32)[:, None], 3, axis=-1),
         statuses=(PathStatus.ESCAPED,) * len(polylines),
         num_bends=np.array([len(line) - 2 for line in polylines]),
-        lost=np.zeros(3, np.float32),
+        dropped=np.zeros(3, np.float32),
     )
 
 

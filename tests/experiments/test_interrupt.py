@@ -52,7 +52,7 @@ def test_before_its_first_step_a_training_ends_with_nothing_saved(tmp_path, monk
     for module, name in (
         (fit.run_folder, "read_config"),
         (fit.checkpoint_io, "read_static"),
-        (fit.checkpoint_io, "load_geometry"),
+        (fit.checkpoint_io, "load_scene"),
         (fit.scene_source, "open_scene"),
         (fit, "_sampler"),
         (fit, "init_state"),

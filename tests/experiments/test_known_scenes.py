@@ -32,12 +32,13 @@ def test_a_rendering_is_measured_and_pictured(rendered):
     out, printed = rendered
     summary = json.loads((out / "metrics.json").read_text())
     assert (summary["scene"], summary["paths"]) == ("cube_smcvx_ball", "tree")
-    assert (summary["cut"], summary["bends"], summary["unfinished"]) == (0.02, 24, "kept")
+    assert (summary["min_throughput"], summary["max_bends"]) == (0.02, 24)
+    assert summary["truncated_paths"] == "background"
     assert [view["index"] for view in summary["views"]] == [0, 10]
     # Those of one camera ray, as `test_against_cycles` has them.
     assert summary["casts_per_pixel"] == pytest.approx(2.45, rel=0.02)
     assert summary["paths_per_pixel"] == pytest.approx(1.56, rel=0.02)
-    assert summary["seconds"] > 0.0 and 0.0 <= summary["lost_energy"] < 1e-3
+    assert summary["seconds"] > 0.0 and 0.0 <= summary["dropped"] < 1e-3
     for view in summary["views"]:
         picture = image_files.read_rgb(out / "rgb" / f"{view['name']}.png") / 255.0
         target = image_files.read_rgb(_SCENE / "test" / f"{view['name']}.png") / 255.0
@@ -85,9 +86,9 @@ def test_light_that_has_no_bend_left_may_be_dark(rendered, tmp_path):
     out = tmp_path / "dark"
     options = (f"--scene={_SCENE}", "--paths=paper", "--bends=1", "--unfinished=dark", *_QUICK)
     told = run_command("render_known", *options, f"--out={out}").stdout
-    assert "lost_energy: truncated paths" in told and "path buffer overflow" not in told
+    assert "dropped: truncated paths" in told and "path buffer overflow" not in told
     summary = json.loads((out / "metrics.json").read_text())
-    assert (summary["bends"], summary["unfinished"]) == (1, "dark")
+    assert (summary["max_bends"], summary["truncated_paths"]) == (1, "black")
     mask = image_files.read_mask(_SCENE / "mask" / "test" / "r_010.png")
     dark, kept = (
         image_files.read_rgb(folder / "rgb" / "r_010.png") / 255.0 for folder in (out, rendered[0])

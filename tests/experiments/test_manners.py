@@ -10,6 +10,7 @@ import pytest
 
 from experiments.cli import app
 from experiments.cli import flags as cli_flags
+from experiments.r3f import flags as r3f_flags
 from experiments.r3f import records
 from experiments.r3f.geometry_stage import GEOMETRIES
 from refref_jax import choices
@@ -46,8 +47,8 @@ _IN_THE_WAY = {
 _OF_THE_SCENE = {
     "--cut=1": "min_throughput=1.0: min_throughput is 1.0",
     "--bends=-1": "max_bends is -1, which is negative. Give 0 or more.",
-    "--samples=4,0": "--samples=4,0: samples is 4,0, not a list of positive numbers. Use a list",
-    "--samples=a": "is not a list of numbers. Write as in --samples=32,20.",
+    "--samples=4,0": "samples_per_ray is 4,0, not a list of positive numbers. Use a list",
+    "--samples=a": "is not a list of numbers. Write as in --samples_per_ray=32,20.",
     "--blurs=x": "--blurs=x is not a list of numbers. Write as in --blurs=0.03,0.003.",
     "--multisamples=3": "Give 1 (on the centre line) or 6",
     "--entries=40": "Give 1 to 31",
@@ -118,9 +119,9 @@ _MISTAKES = {
         "--run=nowhere": "nowhere/config.json does not exist",
     },
     "export": {
-        "--run=x --what=body --out=a.obj": "ends in .ply",
+        "--run=x --what=object --out=a.obj": "ends in .ply",
         "--run=nowhere --what=mesh --out=OUT.ply": "nowhere/config.json does not exist",
-        "--run=nowhere --what=body --out=OUT.ply": "nowhere/config.json does not exist",
+        "--run=nowhere --what=object --out=OUT.ply": "nowhere/config.json does not exist",
     },
     "reconstruct": {
         "--out=/dev/null/x --scene=SCENE": "--out=/dev/null/x cannot be written to (Not a dir",
@@ -276,7 +277,7 @@ def test_names_of_what_can_be_chosen_are_those_that_exist():
     assert names == get_args(choices.FieldName)
     assert tuple(RULES) == get_args(choices.RuleName)
     assert tuple(PATH_PRESETS) == get_args(choices.Paths)
-    assert tuple(GEOMETRIES) == cli_flags.GEOMETRIES
+    assert tuple(GEOMETRIES) == r3f_flags.GEOMETRIES
 
 
 def test_what_was_meant():

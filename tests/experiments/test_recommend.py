@@ -17,8 +17,8 @@ _MACHINE = Machine(ratio=0.5, startup=10.0, images=20)
 _ROWS = [
     made_row("steps=250", pace=0.1, steps=250, quality=20.0),
     made_row("base", pace=0.1, quality=25.0),
-    made_row("finest=64", pace=0.12, quality=22.0),
-    made_row("samples=48+30", pace=0.2, quality=27.0),
+    made_row("max_res=64", pace=0.12, quality=22.0),
+    made_row("samples_per_ray=48+30", pace=0.2, quality=27.0),
 ]
 
 
@@ -26,9 +26,9 @@ _ROWS = [
     ("seconds", "cheaper", "best", "dearer"),
     [
         (45.0, None, "steps=250", "base"),
-        (80.1, "steps=250", "base", "samples=48+30"),
-        (129.0, "steps=250", "base", "samples=48+30"),
-        (1e6, "base", "samples=48+30", None),
+        (80.1, "steps=250", "base", "samples_per_ray=48+30"),
+        (129.0, "steps=250", "base", "samples_per_ray=48+30"),
+        (1e6, "base", "samples_per_ray=48+30", None),
     ],
 )
 def test_the_best_that_fits_is_chosen(seconds, cheaper, best, dearer):
@@ -44,34 +44,37 @@ def test_the_best_that_fits_is_chosen(seconds, cheaper, best, dearer):
 def test_noise_decides_nothing():
     rows = [
         made_row("base", pace=0.1, quality=25.0),
-        made_row("finest=64", pace=0.09, quality=24.9),
-        made_row("finest=256", pace=0.3, quality=25.2),
+        made_row("max_res=64", pace=0.09, quality=24.9),
+        made_row("max_res=256", pace=0.3, quality=25.2),
     ]
     # A point that is as good and takes less time is better, unless the time is the same.
     choice = recommend.choose(rows, _MACHINE, 1e6)
-    assert (choice.best.name, choice.cheaper, choice.dearer) == ("finest=64", None, None)
-    near = [rows[0], made_row("finest=64", pace=0.0995, quality=24.9)]
+    assert (choice.best.name, choice.cheaper, choice.dearer) == ("max_res=64", None, None)
+    near = [rows[0], made_row("max_res=64", pace=0.0995, quality=24.9)]
     assert recommend.choose(near, _MACHINE, 1e6).best.name == "base"
 
 
 def test_turns_are_combined_when_there_is_time_and_that_is_said(tmp_path):
     rows = [
         made_row("base", pace=0.1, quality=25.0, evaluation="--rays_per_pixel=1"),
-        made_row("samples=48+30", pace=0.2, quality=27.0),
-        made_row("samples=64+40", pace=0.3, quality=27.5),
-        made_row("entries=19", pace=0.15, quality=26.0),
-        made_row("entries=20", pace=0.15, quality=25.1),
+        made_row("samples_per_ray=48+30", pace=0.2, quality=27.0),
+        made_row("samples_per_ray=64+40", pace=0.3, quality=27.5),
+        made_row("log2_hashmap_size=19", pace=0.15, quality=26.0),
+        made_row("log2_hashmap_size=20", pace=0.15, quality=25.1),
         made_row("steps=2000", pace=0.1, steps=2000, quality=25.5),
         made_row("rays_per_pixel=4", quality=28.0, evaluation="--rays_per_pixel=4"),
     ]
     choice = recommend.choose(rows, _MACHINE, 1e6)
     together = choice.combined
-    assert set(together.name.split()) >= {"entries=19", "steps=2000", "rays_per_pixel=4"}
+    assert set(together.name.split()) >= {"log2_hashmap_size=19", "steps=2000", "rays_per_pixel=4"}
     assert together.steps == 2000 and together.evaluation == "--rays_per_pixel=4"
     # 2 or 2.5 of samples, 1 of entries, 0.5 of steps, 3 of rays.
     assert together.quality == pytest.approx(25.0 + 2.0 + 1.0 + 0.5 + 3.0, abs=0.51)
-    assert "--steps=2000" in together.training and "--entries=19" in together.training
-    assert together.training.count("--steps") == 1 and "--entries=20" not in together.training
+    assert "--steps=2000" in together.training and "--log2_hashmap_size=19" in together.training
+    assert (
+        together.training.count("--steps") == 1
+        and "--log2_hashmap_size=20" not in together.training
+    )
     text = " ".join(recommend.told(choice, _MACHINE, tmp_path))
     assert "not measured together" in text
     tight = recommend.seconds_of(rows[-1], _MACHINE)
@@ -88,7 +91,14 @@ def test_the_machine_is_compared_by_the_base():
 def test_the_bundled_table_is_a_whole_sweep():
     rows = table.read(ROOT / "experiments" / "data" / "trade_off.csv")
     assert {row.scene for row in rows} == {"cube_smcvx_ball"}
-    assert {row.knob for row in rows} >= {"", "paths", "cut", "samples", "steps", "rays_per_pixel"}
+    assert {row.option for row in rows} >= {
+        "",
+        "paths",
+        "min_throughput",
+        "samples_per_ray",
+        "steps",
+        "rays_per_pixel",
+    }
     choice = recommend.choose(rows, _MACHINE, 600.0)
     assert choice.best.quality > 30.0
 

@@ -29,7 +29,7 @@ def test_every_point_changes_one_option_of_the_base():
         if point.name == "paths=straight":  # which has no inside
             ours.remove("--interior=clear")
         assert len(theirs - ours) == 1 and len(ours - theirs) <= 1, point.name
-        assert f"--{point.knob}={point.value}" in theirs
+        assert f"--{point.option}={point.value}" in theirs
 
 
 def test_no_point_is_the_base_and_none_comes_twice():
@@ -38,27 +38,46 @@ def test_no_point_is_the_base_and_none_comes_twice():
     assert len(set(options)) == len(options)
     names = {point.name for point in points}
     # What the preset, the budget and evaluation have anyway.
-    assert not names & {"samples=32+20", "finest=512", "entries=17", "cut=0.02", "paths=tree"}
-    assert "bends=24" not in names and "bends=10" in names
-    assert names >= {"samples=48+30", "entries=18", "precision=bfloat16", "rays_per_pixel=4"}
-    equal = {"cut": ("0.020", "0.1"), "samples": ("32, 20",)}
-    points = trade_points.sweep(preset="tiny", values=equal, knobs=["cut", "samples"])
-    assert [point.name for point in points] == [BASE, "cut=0.1"]
+    assert not names & {
+        "samples_per_ray=32+20",
+        "max_res=512",
+        "log2_hashmap_size=17",
+        "min_throughput=0.02",
+        "paths=tree",
+    }
+    assert "max_bends=24" not in names and "max_bends=10" in names
+    assert names >= {
+        "samples_per_ray=48+30",
+        "log2_hashmap_size=18",
+        "precision=bfloat16",
+        "rays_per_pixel=4",
+    }
+    equal = {"min_throughput": ("0.020", "0.1"), "samples_per_ray": ("32, 20",)}
+    points = trade_points.sweep(
+        preset="tiny", values=equal, vary=["min_throughput", "samples_per_ray"]
+    )
+    assert [point.name for point in points] == [BASE, "min_throughput=0.1"]
 
 
 def test_a_sweep_may_be_around_another_base():
     points = trade_points.sweep(
-        preset="tiny", base={"field": "nerfacto"}, knobs=["samples", "entries", "footprint"]
+        preset="tiny",
+        base={"field": "nerfacto"},
+        vary=["samples_per_ray", "log2_hashmap_size", "footprint"],
     )
     names = {point.name for point in points}
-    assert {"samples=24+12+8", "entries=18", "footprint=differential"} <= names
-    assert not names & {"samples=48+24+16", "entries=17", "footprint=cone"}
+    assert {"samples_per_ray=24+12+8", "log2_hashmap_size=18", "footprint=differential"} <= names
+    assert not names & {"samples_per_ray=48+24+16", "log2_hashmap_size=17", "footprint=cone"}
     # Straight light has neither a cut nor bends.
-    points = trade_points.sweep(preset="tiny", base={"cut": "0.05"}, knobs=["paths", "bends"])
+    points = trade_points.sweep(
+        preset="tiny", base={"min_throughput": "0.05"}, vary=["paths", "max_bends"]
+    )
     straight = next(point for point in points if point.name == "paths=straight")
-    assert not [word for word in straight.training if "cut" in word or "bends" in word]
+    assert not [
+        word for word in straight.training if "min_throughput" in word or "max_bends" in word
+    ]
     points = trade_points.sweep(preset="tiny", base={"paths": "straight"})
-    assert not {"cut", "bends"} & {point.knob for point in points}
+    assert not {"min_throughput", "max_bends"} & {point.option for point in points}
 
 
 def test_rays_per_pixel_are_evaluations_alone():
@@ -72,16 +91,16 @@ def test_rays_per_pixel_are_evaluations_alone():
 
 
 def test_the_lists_of_a_knob_can_be_replaced_and_knobs_added():
-    values = trade_points.parse_values(["samples=16,10/8,4", "batch=256"])
-    knobs = ("samples", "batch", "steps")
-    points = trade_points.sweep(preset="tiny", values=values, knobs=knobs)
+    values = trade_points.parse_values(["samples_per_ray=16,10/8,4", "batch=256"])
+    vary = ("samples_per_ray", "batch", "steps")
+    points = trade_points.sweep(preset="tiny", values=values, vary=vary)
     assert {point.name for point in points[1:]} == {
-        "samples=16+10",
-        "samples=8+4",
+        "samples_per_ray=16+10",
+        "samples_per_ray=8+4",
         "batch=256",
         *("steps=625", "steps=1250", "steps=5000"),
     }
-    points = trade_points.sweep(preset="tiny", steps=[300, 100], knobs=["steps"])
+    points = trade_points.sweep(preset="tiny", steps=[300, 100], vary=["steps"])
     assert [point.name for point in points] == [BASE, "steps=100"]
     assert "--steps=300" in points[0].training
 
@@ -90,7 +109,7 @@ def test_the_lists_of_a_knob_can_be_replaced_and_knobs_added():
     ("make", "message"),
     [
         (lambda: trade_points.sweep(preset="huge"), "Choose from tiny, small, paper, best"),
-        (lambda: trade_points.sweep(preset="tiny", knobs=["colour"]), "--values=colour=A/B"),
+        (lambda: trade_points.sweep(preset="tiny", vary=["colour"]), "--values=colour=A/B"),
         (lambda: trade_points.sweep(preset="tiny", base={"steps": "9"}), "Use --steps"),
         (
             lambda: trade_points.sweep(preset="tiny", base={"paths": "foo"}),
@@ -102,9 +121,12 @@ def test_the_lists_of_a_knob_can_be_replaced_and_knobs_added():
             lambda: trade_points.sweep(preset="tiny", base={"field": "a"}),
             "Choose from zipnerf",
         ),
-        (lambda: trade_points.parse_base(["cut"]), "NAME=VALUE"),
-        (lambda: trade_points.parse_values(["cut="]), "NAME=A/B"),
-        (lambda: trade_points.choose(trade_points.sweep(preset="tiny"), ["cut=1"]), "cut=1"),
+        (lambda: trade_points.parse_base(["min_throughput"]), "NAME=VALUE"),
+        (lambda: trade_points.parse_values(["min_throughput="]), "NAME=A/B"),
+        (
+            lambda: trade_points.choose(trade_points.sweep(preset="tiny"), ["min_throughput=1"]),
+            "min_throughput=1",
+        ),
     ],
 )
 def test_what_does_not_exist_is_named(make, message):
@@ -127,7 +149,7 @@ def test_mistakes_end_before_anything_is_trained(tmp_path, options, message):
 
 
 def test_a_table_is_read_as_it_was_written(tmp_path):
-    rows = [made_row(), dataclasses.replace(made_row("cut=0.1"), psnr_masked=None)]
+    rows = [made_row(), dataclasses.replace(made_row("min_throughput=0.1"), psnr_masked=None)]
     table.write(tmp_path / "t.csv", rows)
     assert table.read(tmp_path / "t.csv") == rows
     assert rows[1].quality == rows[1].psnr == 28.0
@@ -191,17 +213,17 @@ def test_the_report_marks_the_front_and_sorts_by_time():
 
 
 def test_a_sweep_writes_everything_and_outlives_a_point_that_fails(tmp_path):
-    points = trade_points.sweep(preset="tiny", knobs=["cut", "paths"])
+    points = trade_points.sweep(preset="tiny", vary=["min_throughput", "paths"])
 
     def measure(point):
-        if point.name == "cut=0.05":
+        if point.name == "min_throughput=0.05":
             raise RunFailedError("out of memory")
         return made_row(point.name, pace=0.1 + 0.01 * len(point.name), quality=20.0)
 
     failed = sweep.sweep(points, tmp_path / "out", measure)
-    assert failed == {"cut=0.05": "out of memory"}
+    assert failed == {"min_throughput=0.05": "out of memory"}
     rows = table.read(tmp_path / "out" / "trade_off.csv")
-    assert [row.name for row in rows] == [p.name for p in points if p.name != "cut=0.05"]
+    assert [row.name for row in rows] == [p.name for p in points if p.name != "min_throughput=0.05"]
     assert "paths=straight" in (tmp_path / "out" / "trade_off.md").read_text()
     assert iio.imread(tmp_path / "out" / "trade_off.png").shape[1] > 1000
 
@@ -215,12 +237,12 @@ def test_a_sweep_adds_to_the_one_before_it_around_the_same_base(tmp_path):
             row, scene=_SCENE.name, training=options[0], evaluation=options[1]
         )
 
-    for knobs in (["cut"], ["paths"]):
-        points = trade_points.sweep(preset="tiny", knobs=knobs)
+    for vary in (["min_throughput"], ["paths"]):
+        points = trade_points.sweep(preset="tiny", vary=vary)
         earlier = sweep.earlier_rows(tmp_path, points[0], _SCENE, images=20)
         sweep.sweep(points, tmp_path, measure, earlier)
     names = [row.name for row in table.read(tmp_path / "trade_off.csv")]
-    assert names[0] == BASE and {"cut=0.1", "paths=straight"} < set(names)
+    assert names[0] == BASE and {"min_throughput=0.1", "paths=straight"} < set(names)
     other = trade_points.sweep(preset="tiny", base={"batch": "64"})[0]
     with pytest.raises(ValueError, match="another --out"):
         sweep.earlier_rows(tmp_path, other, _SCENE, images=20)
@@ -255,7 +277,7 @@ command, run = sys.argv[1], pathlib.Path(options.get("out") or options["run"])
 with (run.parent / "calls.txt").open("a") as file:
     file.write(command + "\\n")
 (run.parent / "words.json").write_text(json.dumps(sys.argv[2:]))
-if options.get("cut") == "2":
+if options.get("min_throughput") == "2":
     sys.exit("error: The cut is a share, not 2. Give 0.02.")
 run.mkdir(exist_ok=True)
 if command == "train":
@@ -308,7 +330,7 @@ def test_a_point_is_measured_once(stub):
     assert sweep.measure(points[BASE], _SCENE, stub) == row
     sweep.measure(points["rays_per_pixel=4"], _SCENE, stub)
     sweep.measure(points[BASE], _SCENE, stub, ["--limit=1"])
-    sweep.measure(points["cut=0.1"], _SCENE, stub)
+    sweep.measure(points["min_throughput=0.1"], _SCENE, stub)
     calls = (stub / "calls.txt").read_text().split()
     assert calls == ["train", "evaluate", "evaluate", "evaluate", "train", "evaluate"]
     (stub / sweep.run_name(points[BASE], _SCENE) / "measured.json").unlink()
@@ -317,8 +339,8 @@ def test_a_point_is_measured_once(stub):
 
 
 def test_a_failure_tells_its_last_word_and_is_tried_again(stub):
-    values = {"cut": ("2",)}
-    point = trade_points.sweep(preset="tiny", values=values, knobs=["cut"])[1]
+    values = {"min_throughput": ("2",)}
+    point = trade_points.sweep(preset="tiny", values=values, vary=["min_throughput"])[1]
     log = stub / f"{sweep.run_name(point, _SCENE)}.log"
     log.parent.mkdir()
     log.write_text("error: an older one\n")

@@ -22,7 +22,7 @@ PATHS = 8
 SEGMENTS = 4
 PARTS = 2
 
-_GRID = HashGridConfig(levels=1, coarsest=16, finest=16, entries=1 << 10, features=2)
+_GRID = HashGridConfig(levels=1, base_res=16, max_res=16, hashmap_size=1 << 10, features=2)
 
 # An infinity for all purposes that is still a number; the largest density asked for.
 _HUGE = 1e10
@@ -51,7 +51,7 @@ def batches(config):
     straight = [_straight([0.0, 0.0, 4.0], [i - 2.5, 1.0, -4.0]) for i in range(6)]
     made = {
         "ordinary": ordinary,
-        "no weight": [path._replace(weights=jnp.zeros(3)) for path in ordinary],
+        "no weight": [path._replace(throughput=jnp.zeros(3)) for path in ordinary],
         "never leaving": [_never_leaving(i) for i in range(6)],
         "all missed": straight,
         "all hit": [made_paths.random_path(i, bends=3, segments=SEGMENTS) for i in range(6)],
@@ -159,7 +159,7 @@ def _long():
 
 def _empty():
     """Returns a slot without a path, with no sense in what is not looked at."""
-    path = made_paths.path([], [[0, 0, 1]], [0], segments=SEGMENTS, weights=(0.0, 0.0, 0.0))
+    path = made_paths.path([], [[0, 0, 1]], [0], segments=SEGMENTS, throughput=(0.0, 0.0, 0.0))
     return path._replace(
         points=jnp.full((SEGMENTS, 3), 7.0),
         directions=jnp.zeros((SEGMENTS, 3)),
@@ -194,7 +194,7 @@ def _steepened(params):
 
 
 def _with_dyes(params, raw):
-    return params._replace(dyes=jax.tree.map(lambda x: np.full_like(x, raw), params.dyes))
+    return params._replace(tints=jax.tree.map(lambda x: np.full_like(x, raw), params.tints))
 
 
 def _changed(params, *, density=None, colour=None):

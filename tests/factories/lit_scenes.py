@@ -42,9 +42,9 @@ def pixels(count=256, *, views=8, reach=0.75, seed=0):
     return scenes.rays(eyes[view], targets - eyes[view]), view
 
 
-def evidence(geometry, *, count=256, seed=0, contrast=1.0):
+def evidence(scene, *, count=256, seed=0, contrast=1.0):
     """Pixels as the tree of light paths shows them."""
     rays, view = pixels(count, seed=seed)
     field = params(contrast=contrast)
-    seen = jax.jit(lambda rays: render_rays(Model(CONFIG, TREE, geometry, field), Rays(*rays)).rgb)
+    seen = jax.jit(lambda rays: render_rays(Model(CONFIG, TREE, scene, field), Rays(*rays)).rgb)
     return Evidence(field, rays, jnp.asarray(seen(rays))), view

@@ -16,7 +16,7 @@ def path(
     origin=(0.0, 0.0, 0.0),
     segments=None,
     radius=1e-3,
-    weights=(1.0, 1.0, 1.0),
+    throughput=(1.0, 1.0, 1.0),
     ray=0,
     status=PathStatus.ESCAPED,
 ):
@@ -29,7 +29,7 @@ def path(
       origin: the camera.
       segments: number of slots; those that are not used are filled as the tracer does.
       radius: of the pixel's cone at unit distance.
-      weights: share of the path in its ray.
+      throughput: share of the path in its ray.
       ray: index of its ray.
       status: how it ended.
     """
@@ -50,7 +50,7 @@ def path(
         differentials=RayDifferential(*[jnp.zeros((bends + 1 + unused, 0, 3), jnp.float32)] * 2),
         media=jnp.asarray(np.pad(np.asarray(media), (0, unused)), jnp.int32),
         rays=jnp.int32(ray),
-        weights=jnp.asarray(weights, jnp.float32),
+        throughput=jnp.asarray(throughput, jnp.float32),
         radii=jnp.float32(radius),
         num_bends=jnp.int32(bends),
         statuses=jnp.int32(status),

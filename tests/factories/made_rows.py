@@ -5,11 +5,11 @@ from experiments.sweeps.table import Row
 
 def made_row(name="base", *, pace=0.1, quality=25.0, steps=1000, image=1.0, evaluation=""):
     """A row; `pace` in seconds a step, `image` in seconds an image."""
-    knob, _, value = name.partition("=")
+    option, _, value = name.partition("=")
     return Row(
         scene="cube_smcvx_ball",
         name=name,
-        knob=knob if value else "",
+        option=option if value else "",
         value=value,
         training=f"--preset=tiny --steps={steps}",
         evaluation=evaluation,

@@ -13,7 +13,7 @@ from benchmarks.balls_and_rays import trace_ends as trace_ends
 from refref_jax.data import meshes
 from refref_jax.data.mesh_queries import find_containment
 from refref_jax.data.meshes import MeshPart
-from refref_jax.data.scene_assembly import build_geometry
+from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.geometry.triangle_meshes import volume
 
 
@@ -29,15 +29,15 @@ def right_prism(index=1.5):
     return MeshPart("prism_glass", np.asarray(mesh.vertices), np.asarray(mesh.faces), index, "flat")
 
 
-def geometry(*parts, rule="nested"):
-    built = build_geometry(parts, find_containment(parts).parents, rule=rule)
+def build(*parts, rule="nested"):
+    built = assemble_scene(parts, find_containment(parts).parents, rule=rule)
     return jax.tree.map(jnp.asarray, built)
 
 
 @functools.cache
 def read_geometry(scene):
     """Returns what the meshes of a scene's folder make, under the rule `nested`."""
-    return geometry(*meshes.read_meshes(scene))
+    return build(*meshes.read_meshes(scene))
 
 
 def volume_of(mesh):

@@ -17,7 +17,7 @@ from refref_jax.training.config import (
     TrainConfig,
 )
 
-_GRID = HashGridConfig(levels=2, coarsest=4, finest=16, entries=1 << 10, features=2)
+_GRID = HashGridConfig(levels=2, base_res=4, max_res=16, hashmap_size=1 << 10, features=2)
 
 MODEL = ModelConfig(
     proposals=(ProposalConfig(DensityFieldConfig(_GRID, width=8), samples=8),),
@@ -40,9 +40,11 @@ CONFIG = TrainConfig(
     scene=SceneConfig("nowhere", "nested", ()),
     paths=PathsConfig("paper"),
     losses=LossConfig(
-        data="mse", interlevel=0.01, blurs=(0.01,), distortion=0.01, hash_decay=0.1, dye_decay=1e-3
+        data="mse", interlevel=0.01, blurs=(0.01,), distortion=0.01, hash_decay=0.1, tint_decay=1e-3
     ),
-    schedule=ScheduleConfig(steps=12, warmup=2, peak=1e-2, end=1e-3, anneal=4, batch=32, pool=4),
+    schedule=ScheduleConfig(
+        steps=12, warmup=2, peak=1e-2, end=1e-3, anneal=4, batch=32, pretraced_batches=4
+    ),
     seed=0,
 )
 

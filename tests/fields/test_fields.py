@@ -21,7 +21,7 @@ pytestmark = pytest.mark.longest
 # Two small matrix products in float32.
 _NETWORK = 1e-5
 
-_GRID = HashGridConfig(levels=2, coarsest=3, finest=10, entries=256, features=2)
+_GRID = HashGridConfig(levels=2, base_res=3, max_res=10, hashmap_size=256, features=2)
 _DENSITY = DensityFieldConfig(_GRID, width=8)
 _RADIANCE = RadianceFieldConfig(
     _GRID, density_width=8, bottleneck=4, colour_width=8, colour_depth=2

@@ -17,8 +17,8 @@ from tests.oracles import reference_sampling
 _BLENDING = 2e-5
 
 # The first two levels have fewer vertices than entries (4^3 and 6^3), the last two are hashed.
-_CONFIG = HashGridConfig(levels=4, coarsest=3, finest=18, entries=256, features=2)
-_SHAPE = (_CONFIG.levels, _CONFIG.coarsest, _CONFIG.finest, _CONFIG.entries)
+_CONFIG = HashGridConfig(levels=4, base_res=3, max_res=18, hashmap_size=256, features=2)
+_SHAPE = (_CONFIG.levels, _CONFIG.base_res, _CONFIG.max_res, _CONFIG.hashmap_size)
 _RESOLUTIONS = [3, 5, 10, 18]
 
 _POSITIONS = np.concatenate(
@@ -68,24 +68,24 @@ def _expected(positions, scales=None):
 
 
 def test_resolutions_by_hand():
-    config = HashGridConfig(levels=5, coarsest=16, finest=256, entries=2, features=1)
+    config = HashGridConfig(levels=5, base_res=16, max_res=256, hashmap_size=2, features=1)
     assert hash_grid.resolutions(config) == [16, 32, 64, 128, 256]
     assert hash_grid.resolutions(_CONFIG) == _RESOLUTIONS
 
 
 @pytest.mark.parametrize(
-    ("levels", "coarsest", "finest"), [(8, 16, 512), (10, 16, 8192), (2, 4, 4)]
+    ("levels", "base_res", "max_res"), [(8, 16, 512), (10, 16, 8192), (2, 4, 4)]
 )
-def test_resolutions_grow_geometrically_to_the_finest(levels, coarsest, finest):
-    config = HashGridConfig(levels, coarsest, finest, entries=2, features=1)
+def test_resolutions_grow_geometrically_to_the_finest(levels, base_res, max_res):
+    config = HashGridConfig(levels, base_res, max_res, hashmap_size=2, features=1)
     got = hash_grid.resolutions(config)
-    assert got == reference_sampling.grid_resolutions(levels, coarsest, finest)
-    assert len(got) == levels and got[0] == coarsest and got[-1] == finest
+    assert got == reference_sampling.grid_resolutions(levels, base_res, max_res)
+    assert len(got) == levels and got[0] == base_res and got[-1] == max_res
     assert got == sorted(got)
 
 
 def test_a_grid_of_one_level_has_its_coarsest_resolution():
-    config = HashGridConfig(levels=1, coarsest=7, finest=100, entries=2, features=3)
+    config = HashGridConfig(levels=1, base_res=7, max_res=100, hashmap_size=2, features=3)
     assert hash_grid.resolutions(config) == [7]
 
 
@@ -95,18 +95,18 @@ def test_a_point_has_the_features_of_all_levels():
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"levels": 0}, {"features": 0}, {"coarsest": 0}, {"coarsest": 20}, {"finest": 2}],
+    [{"levels": 0}, {"features": 0}, {"base_res": 0}, {"base_res": 20}, {"max_res": 2}],
 )
 def test_impossible_shapes_are_refused(wrong):
-    shape = {"levels": 4, "coarsest": 3, "finest": 18, "entries": 256, "features": 2}
-    with pytest.raises(ValueError, match="1 <= coarsest <= finest"):
+    shape = {"levels": 4, "base_res": 3, "max_res": 18, "hashmap_size": 256, "features": 2}
+    with pytest.raises(ValueError, match="1 <= base_res <= max_res"):
         HashGridConfig(**{**shape, **wrong})
 
 
 @pytest.mark.parametrize(("entries", "hint"), [(0, 2), (1, 2), (3, 4), (255, 256), (257, 512)])
 def test_tables_must_have_a_power_of_two_entries(entries, hint):
     with pytest.raises(ValueError, match=f"not {entries}. Use for example {hint}"):
-        HashGridConfig(levels=4, coarsest=3, finest=18, entries=entries, features=2)
+        HashGridConfig(levels=4, base_res=3, max_res=18, hashmap_size=entries, features=2)
 
 
 # --- vertices ---
@@ -300,7 +300,7 @@ def test_gradients_reach_the_touched_entries_only(position):
         expected = np.zeros(gradient.shape)
         fade = reference_sampling.grid_fading(0.02, resolution)
         for entry, weight in reference_sampling.touched_entries(
-            position, resolution, _CONFIG.entries
+            position, resolution, _CONFIG.hashmap_size
         ):
             expected[entry] += weight * fade
         np.testing.assert_allclose(gradient, expected, atol=_BLENDING)

@@ -71,13 +71,13 @@ def test_a_third_kind_is_rendered_saved_and_sized(fog, tmp_path):
     assert samples_of(model) == (8, 6, 4, 2)
     assert loss(model).blurs == (0.03, 0.003, 0.003) and loss(model).hash_decay == 0.0
     static = SavedModel(model, STRAIGHT)
-    geometry = scenes.geometry(scenes.ball(1.3, subdivisions=1))
-    checkpoint_io.save_scene(tmp_path, static, geometry)
+    scene = scenes.build(scenes.ball(1.3, subdivisions=1))
+    checkpoint_io.save_scene(tmp_path, static, scene)
     assert checkpoint_io.read_static(tmp_path) == static
     params = jax.jit(lambda: init_params(jax.random.key(0), model))()
     assert hash_grid.tables(params) == []
     rays = jax.tree.map(jnp.asarray, small_model.sampler().survey(4).rays)
-    seen = jax.jit(lambda rays: render_rays(Model(model, STRAIGHT, geometry, params), rays))(rays)
+    seen = jax.jit(lambda rays: render_rays(Model(model, STRAIGHT, scene, params), rays))(rays)
     np.testing.assert_allclose(seen.linear, 0.25, rtol=1e-5)
 
 
@@ -85,7 +85,7 @@ def test_what_a_third_kind_has_not_is_refused(fog):
     with pytest.raises(ValueError, match=r"Field type fog has no size paper\..* tiny"):
         PRESETS["paper"].model(_BOUNDS, "field", field="fog")
     model = PRESETS["tiny"].model(_BOUNDS, "field", field="fog")
-    for options in (FieldConfig(entries=12), FieldConfig(finest=64)):
+    for options in (FieldConfig(log2_hashmap_size=12), FieldConfig(max_res=64)):
         with pytest.raises(ValueError, match="which field type fog does not have"):
             override_model(model, options)
     assert override_model(model, FieldConfig(precision="bfloat16")) != model
@@ -140,13 +140,13 @@ def test_a_kind_that_is_not_known_is_named(tmp_path):
 def test_nerfacto_has_its_published_size():
     size = nerfacto.KIND.sizes["paper"]
     grid = size.field.grid
-    assert (grid.levels, grid.coarsest, grid.finest, grid.entries) == (16, 16, 2048, 2**19)
+    assert (grid.levels, grid.base_res, grid.max_res, grid.hashmap_size) == (16, 16, 2048, 2**19)
     assert (grid.features, size.field.density_width, size.field.bottleneck) == (2, 64, 15)
     assert (size.field.colour_width, size.field.colour_depth) == (64, 2)
-    assert [each.grid.finest for each in size.proposals] == [128, 256]
+    assert [each.grid.max_res for each in size.proposals] == [128, 256]
     for each in size.proposals:
-        assert (each.width, each.grid.levels, each.grid.entries) == (16, 5, 2**17)
-        assert (each.grid.features, each.grid.coarsest) == (2, 16)
+        assert (each.width, each.grid.levels, each.grid.hashmap_size) == (16, 5, 2**17)
+        assert (each.grid.features, each.grid.base_res) == (2, 16)
     assert size.samples == (256, 96, 48) and size.multisamples == 1
 
 

@@ -18,31 +18,35 @@ _DISTANCE_TOLERANCE = 2e-5
 
 
 @functools.partial(jax.jit, static_argnames="lockstep")
-def _trace(tree, origins, directions, limits, leaving, *, lockstep=False):
+def _trace(tree, origins, directions, limits, exclude_primitive, *, lockstep=False):
     if lockstep:
         nodes = tree.nodes.reshape(-1, 8)
         walk = jax.vmap(traversal_accelerator.trace_ray, in_axes=(None, None, 0, 0, 0, 0))
-        found = walk(nodes, tree.facets, origins, directions, limits, leaving)
+        found = walk(nodes, tree.facets, origins, directions, limits, exclude_primitive)
         return bvh._finish(tree, origins, directions, *found)
     rays = Rays(origins, directions, jnp.zeros(len(origins)))
-    return bvh.closest_hits(tree, rays, limits=limits, leaving=leaving)
+    return bvh.closest_hits(tree, rays, limits=limits, exclude_primitive=exclude_primitive)
 
 
-def _closest(triangles, origins, directions, *, limits=None, leaving=None, lockstep=False):
+def _closest(
+    triangles, origins, directions, *, limits=None, exclude_primitive=None, lockstep=False
+):
     """Builds a tree and traces rays; returns distances, faces and barycentrics."""
     tree, slots = bvh_build.build(np.asarray(triangles, np.float32))
     count = len(origins)
     limits = np.full(count, np.inf) if limits is None else limits
-    leaving = np.full(count, bvh.NO_SLOT) if leaving is None else leaving
+    exclude_primitive = (
+        np.full(count, bvh.NO_PRIMITIVE) if exclude_primitive is None else exclude_primitive
+    )
     hits = _trace(
         jax.tree.map(jnp.asarray, tree),
         jnp.asarray(origins, jnp.float32),
         jnp.asarray(directions, jnp.float32),
         jnp.asarray(limits, jnp.float32),
-        jnp.asarray(leaving, jnp.int32),
+        jnp.asarray(exclude_primitive, jnp.int32),
         lockstep=lockstep,
     )
-    found = np.asarray(hits.slots)
+    found = np.asarray(hits.primitive_ids)
     faces = np.where(found >= 0, slots[found], -1)
     return np.asarray(hits.distances), faces, np.asarray(hits.barycentrics)
 
@@ -221,7 +225,7 @@ def test_a_ray_does_not_hit_the_triangle_it_leaves():
     _, slots = bvh_build.build(triangles.astype(np.float32))
     first = int(np.flatnonzero(slots[:2] == 0)[0])
     distances, faces, _ = _closest(
-        triangles, [[-1e-7, 0.0, 0.0]], [[1.0, 0.0, 0.0]], leaving=[first]
+        triangles, [[-1e-7, 0.0, 0.0]], [[1.0, 0.0, 0.0]], exclude_primitive=[first]
     )
     assert faces[0] == 1
     assert distances[0] == pytest.approx(1.0, abs=1e-6)

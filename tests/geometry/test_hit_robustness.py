@@ -32,9 +32,9 @@ def _hits(triangles, origins, directions):
         jax.tree.map(jnp.asarray, tree),
         rays,
         limits=jnp.full(count, jnp.inf),
-        leaving=jnp.full(count, bvh.NO_SLOT, jnp.int32),
+        exclude_primitive=jnp.full(count, bvh.NO_PRIMITIVE, jnp.int32),
     )
-    found = np.asarray(hits.slots)
+    found = np.asarray(hits.primitive_ids)
     assert np.all(np.isfinite(hits.barycentrics))
     return np.asarray(hits.distances), np.where(found >= 0, slots[found], -1)
 
@@ -151,12 +151,12 @@ def test_duplicates_give_one_hit_whatever_their_order_and_the_company():
     origins = jnp.asarray(generator.uniform(-0.3, 0.3, (200, 3)), jnp.float32)
     directions = jnp.asarray(arrays.unit(generator.normal(size=(200, 3))), jnp.float32)
     rays = Rays(origins, directions, jnp.zeros(200))
-    extra = {"limits": jnp.full(200, jnp.inf), "leaving": jnp.full(200, -1, jnp.int32)}
+    extra = {"limits": jnp.full(200, jnp.inf), "exclude_primitive": jnp.full(200, -1, jnp.int32)}
     hits = _trace(tree, rays, **extra)
     # In another order every ray has other neighbours, and takes other turns with them.
     again = jax.jit(ray_sorting.closest_hits_sorted)(tree, rays, **extra)
-    np.testing.assert_array_equal(hits.slots, again.slots)
-    assert np.all(np.asarray(hits.slots) >= 0)
+    np.testing.assert_array_equal(hits.primitive_ids, again.primitive_ids)
+    assert np.all(np.asarray(hits.primitive_ids) >= 0)
 
 
 @pytest.mark.parametrize("broken", [np.nan, np.inf])
@@ -179,7 +179,7 @@ def test_the_traversal_lowers_for_accelerators(platform):
         jax.tree.map(jnp.asarray, tree),
         rays,
         limits=jnp.ones(32),
-        leaving=jnp.zeros(32, jnp.int32),
+        exclude_primitive=jnp.zeros(32, jnp.int32),
     )
     text = traced.lower(lowering_platforms=(platform,)).as_text()
     assert "stablehlo.while" in text

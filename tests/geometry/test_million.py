@@ -20,7 +20,7 @@ directions = generator.normal(size=(count, 3))
 directions = jnp.asarray(directions / np.linalg.norm(directions, axis=1)[:, None], jnp.float32)
 hits = jax.jit(bvh.closest_hits)(
     tree, Rays(origins, directions, jnp.zeros(count)),
-    limits=jnp.full(count, jnp.inf), leaving=jnp.full(count, bvh.NO_SLOT, jnp.int32),
+    limits=jnp.full(count, jnp.inf), exclude_primitive=jnp.full(count, bvh.NO_PRIMITIVE, jnp.int32),
 )
 reached = origins + hits.distances[:, None] * directions
 radii = np.linalg.norm(np.asarray(reached, np.float64), axis=1)

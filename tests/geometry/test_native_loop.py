@@ -16,10 +16,11 @@ triangles = generator.normal(size=(50, 3, 3)).astype(np.float32)
 tree = jax.tree.map(jnp.asarray, bvh_build.build(triangles)[0])
 origins = jnp.asarray(generator.normal(size=(20, 3)) * 4, jnp.float32)
 directions = -origins / jnp.linalg.norm(origins, axis=-1, keepdims=True)
-limits, leaving = jnp.full(20, jnp.inf), jnp.full(20, -1, jnp.int32)
+limits, exclude_primitive = jnp.full(20, jnp.inf), jnp.full(20, -1, jnp.int32)
 def cast(tree, origins, directions):
     rays = Rays(origins, directions, jnp.zeros(len(origins)))
-    return bvh.closest_hits(tree, rays, limits=limits, leaving=leaving).distances
+    hits = bvh.closest_hits(tree, rays, limits=limits, exclude_primitive=exclude_primitive)
+    return hits.distances
 expected = np.asarray(cast(tree, origins, directions))
 """
 

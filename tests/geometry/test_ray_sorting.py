@@ -26,11 +26,14 @@ def _rays(count, seed=0):
 
 
 def _arguments(count):
-    return {"limits": jnp.full(count, jnp.inf), "leaving": jnp.full(count, bvh.NO_SLOT, jnp.int32)}
+    return {
+        "limits": jnp.full(count, jnp.inf),
+        "exclude_primitive": jnp.full(count, bvh.NO_PRIMITIVE, jnp.int32),
+    }
 
 
 def _assert_same(hits, expected):
-    np.testing.assert_array_equal(hits.slots, expected.slots)
+    np.testing.assert_array_equal(hits.primitive_ids, expected.primitive_ids)
     np.testing.assert_allclose(hits.distances, expected.distances, rtol=2e-6)
     np.testing.assert_allclose(hits.barycentrics, expected.barycentrics, atol=1e-5)
 

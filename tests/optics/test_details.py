@@ -15,8 +15,8 @@ _CAPACITY = 256
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "detail"))
-def _trace(geometry, rays, *, settings=TREE, detail=None):
-    return path_tracing.trace(geometry, rays, settings=settings, capacity=_CAPACITY, detail=detail)
+def _trace(scene, rays, *, settings=TREE, detail=None):
+    return path_tracing.trace(scene, rays, settings=settings, capacity=_CAPACITY, detail=detail)
 
 
 def _rays(count=40):
@@ -28,7 +28,7 @@ def _rays(count=40):
 
 def _two_balls():
     """Two balls with a gap between them: light may leave one and enter the other."""
-    return scenes.geometry(
+    return scenes.build(
         scenes.ball(0.6, subdivisions=2, centre=(0.8, 0.0, 0.0), name="left_glass"),
         scenes.ball(0.6, subdivisions=2, centre=(-0.8, 0.0, 0.0), name="right_water", index=1.33),
     )
@@ -45,7 +45,7 @@ def test_only_segments_outside_are_kept():
     whole = _trace(_two_balls(), _rays()).paths
     kept = _trace(_two_balls(), _rays(), detail=Detail("outside", 6)).paths
     np.testing.assert_array_equal(whole.num_bends, kept.num_bends)
-    np.testing.assert_array_equal(whole.weights, kept.weights)
+    np.testing.assert_array_equal(whole.throughput, kept.throughput)
     seen = set()
     for index in range(_CAPACITY):
         wanted = _slow_outside(whole, index)
@@ -88,20 +88,18 @@ def test_meetings_and_passages_are_those_of_the_whole_path():
     settings = PathSettings(
         max_bends=3, reflections="all"
     )  # no cut: colours do not change what is followed
-    geometry = _two_balls()
+    scene = _two_balls()
     tint = jnp.array([[0.9, 0.5, 0.7], [0.6, 0.95, 1.0]])
     absorption = jnp.array([[0.1, 0.0, 2.0], [0.3, 0.4, 0.0]])
-    dyed = geometry._replace(
-        interfaces=geometry.interfaces._replace(tint=tint, absorption=absorption)
-    )
+    dyed = scene._replace(interfaces=scene.interfaces._replace(tint=tint, absorption=absorption))
     detail = Detail("outside", 4, tally="parts")
-    white = _trace(geometry, _rays(), settings=settings, detail=detail).paths
+    white = _trace(scene, _rays(), settings=settings, detail=detail).paths
     coloured = _trace(dyed, _rays(), settings=settings).paths
     factor = np.exp(
         np.asarray(white.hit_counts) @ np.log(tint) - np.asarray(white.path_lengths) @ absorption
     )
     # A path that ran out of bends inside a body goes on through it, and is not dimmed there.
-    np.testing.assert_allclose(white.weights * factor, coloured.weights, atol=2e-6)
+    np.testing.assert_allclose(white.throughput * factor, coloured.throughput, atol=2e-6)
     assert white.hit_counts.max() == 3.0 and white.path_lengths.max() > 1.0
 
 
@@ -113,13 +111,13 @@ def test_nothing_is_tallied_unless_asked():
 
 @pytest.mark.slow
 def test_a_promise_of_no_reentry_changes_casts_only():
-    ball = scenes.geometry(scenes.ball(1.0, subdivisions=3))
+    ball = scenes.build(scenes.ball(1.0, subdivisions=3))
     never = PathSettings(max_bends=24, reflections="all", min_throughput=0.02, reentry="impossible")
     a, b = (path_tracing.trace_ends(ball, _rays(), settings=settings) for settings in (TREE, never))
 
     def sorted_weights(traced):
         escaped = traced.ends.statuses == PathStatus.ESCAPED
-        return np.sort(np.asarray(traced.ends.weights)[np.asarray(escaped), 0])
+        return np.sort(np.asarray(traced.ends.throughput)[np.asarray(escaped), 0])
 
     np.testing.assert_allclose(sorted_weights(a), sorted_weights(b), atol=1e-6)
     escaped = int(np.sum(a.ends.statuses == PathStatus.ESCAPED))

@@ -25,16 +25,16 @@ def _every_choice():
     return np.array(list(itertools.product([False, True], repeat=_DEPTH)))
 
 
-def _all_branches(geometry, rays, settings):
+def _all_branches(scene, rays, settings):
     """Returns one path a ray and choice, as `[rays, choices]`."""
-    follow = functools.partial(follow_branch, geometry, settings=settings)
+    follow = functools.partial(follow_branch, scene, settings=settings)
     choices = jnp.asarray(_every_choice())
     each_choice = jax.vmap(follow, in_axes=(None, 0))
     found = jax.jit(jax.vmap(each_choice, in_axes=(0, None)))(rays, choices)
     return jax.tree.map(np.asarray, found)
 
 
-def _bodies():
+def _objects():
     return {
         "ball": scenes.ball(1.0, subdivisions=2),
         "box": scenes.box((1.0, 1.2, 1.4)),
@@ -59,15 +59,15 @@ def _bodies():
     ],
 )
 def test_both_tracers_find_the_same_paths(body, settings):
-    geometry = scenes.geometry(_bodies()[body])
+    scene = scenes.build(_objects()[body])
     targets = np.random.default_rng(5).uniform(-0.6, 0.6, (12, 3))
     rays = scenes.rays([-4.0, 0.3, 0.2], targets - [-4.0, 0.3, 0.2])
     ample = dataclasses.replace(
         settings, live_per_ray=20.0, segments_per_ray=40.0, paths_per_ray=20.0
     )
     trace = jax.jit(functools.partial(path_tracing.trace, settings=ample, capacity=240))
-    tree = jax.tree.map(np.asarray, trace(geometry, rays).paths)
-    single = _all_branches(geometry, rays, settings)
+    tree = jax.tree.map(np.asarray, trace(scene, rays).paths)
+    single = _all_branches(scene, rays, settings)
     there = np.flatnonzero(tree.statuses != PathStatus.EMPTY)
     assert there.size > 12 or settings.reflections == "none"
     weights = np.zeros((12, 3))
@@ -80,10 +80,10 @@ def test_both_tracers_find_the_same_paths(body, settings):
         np.testing.assert_allclose(single.points[ray, best, used], tree.points[i, used], atol=2e-5)
         np.testing.assert_allclose(apart[best], 0.0, atol=2e-5)
         np.testing.assert_allclose(single.tau[ray, best], tree.tau[i], atol=2e-5)
-        np.testing.assert_allclose(single.weights[ray, best], tree.weights[i], atol=1e-5)
+        np.testing.assert_allclose(single.throughput[ray, best], tree.throughput[i], atol=1e-5)
         np.testing.assert_array_equal(single.media[ray, best, used], tree.media[i, used])
         assert single.statuses[ray, best] == tree.statuses[i]
-        weights[ray] += single.weights[ray, best]
+        weights[ray] += single.throughput[ray, best]
     if body != "tinted box":
         np.testing.assert_allclose(weights, 1.0, atol=1e-5)
 
@@ -91,33 +91,33 @@ def test_both_tracers_find_the_same_paths(body, settings):
 def test_the_choices_must_fit_the_budget():
     ray = jax.tree.map(lambda x: x[0], scenes.rays([-4.0, 0.0, 0.0], [1.0, 0.0, 0.0]))
     with pytest.raises(ValueError, match="3 choices for 10 bends"):
-        follow_branch(scenes.geometry(scenes.box()), ray, jnp.zeros(3, bool), settings=PAPER)
+        follow_branch(scenes.build(scenes.box()), ray, jnp.zeros(3, bool), settings=PAPER)
 
 
 def test_without_bends_nothing_is_traced():
     ray = jax.tree.map(lambda x: x[0], scenes.rays([-4.0, 0.0, 0.0], [1.0, 0.0, 0.0]))
     nowhere = jnp.zeros(0, bool)
-    path = follow_branch(scenes.geometry(scenes.box()), ray, nowhere, settings=STRAIGHT)
+    path = follow_branch(scenes.build(scenes.box()), ray, nowhere, settings=STRAIGHT)
     assert (int(path.statuses), int(path.num_bends)) == (PathStatus.NOT_TRACED, 0)
-    np.testing.assert_array_equal(path.weights, 1.0)
+    np.testing.assert_array_equal(path.throughput, 1.0)
 
 
-@pytest.mark.parametrize(("unfinished", "weight"), [("kept", 0.96), ("dark", 0.0)])
-def test_a_path_that_runs_out_of_bends_is_as_bright_as_the_budget_says(unfinished, weight):
-    slab = scenes.geometry(scenes.box((20.0, 20.0, 0.5)))
-    settings = PathSettings(1, "all", unfinished=unfinished)
+@pytest.mark.parametrize(("truncated_paths", "weight"), [("background", 0.96), ("black", 0.0)])
+def test_a_path_that_runs_out_of_bends_is_as_bright_as_the_budget_says(truncated_paths, weight):
+    slab = scenes.build(scenes.box((20.0, 20.0, 0.5)))
+    settings = PathSettings(1, "all", truncated_paths=truncated_paths)
     ray = _ray([0.3, 0.2, 3.0], [0.0, 0.0, -1.0])
     path = follow_branch(slab, ray, jnp.zeros(1, bool), settings=settings)
     assert path.statuses == PathStatus.OUT_OF_BENDS
-    np.testing.assert_allclose(path.weights, weight, rtol=1e-5)
+    np.testing.assert_allclose(path.throughput, weight, rtol=1e-5)
 
 
 def test_a_path_that_is_cut_weighs_nothing():
-    geometry = scenes.geometry(scenes.box((20.0, 20.0, 0.5)))
+    scene = scenes.build(scenes.box((20.0, 20.0, 0.5)))
     ray = jax.tree.map(lambda x: x[0], scenes.rays([0.0, 0.1, 3.0], [0.0, 0.0, -1.0]))
     settings = PathSettings(2, "all", min_throughput=0.039)
-    inner = follow_branch(geometry, ray, jnp.array([False, True]), settings=settings)
-    np.testing.assert_array_equal(inner.weights, 0.0)
+    inner = follow_branch(scene, ray, jnp.array([False, True]), settings=settings)
+    np.testing.assert_array_equal(inner.throughput, 0.0)
 
 
 # --- gradients ---
@@ -155,12 +155,12 @@ _CASES = {
 }
 
 
-def _exit(geometry, ray, reflects):
+def _exit(scene, ray, reflects):
     """Returns everything smooth about where a path leaves, and how it ends."""
     settings = PathSettings(len(reflects), "all")
-    path = follow_branch(geometry, ray, jnp.asarray(reflects), settings=settings)
+    path = follow_branch(scene, ray, jnp.asarray(reflects), settings=settings)
     last = len(reflects)
-    return path.points[last], path.directions[last], path.tau[last], path.weights, path.statuses
+    return path.points[last], path.directions[last], path.tau[last], path.throughput, path.statuses
 
 
 class _Knobs(NamedTuple):
@@ -178,8 +178,8 @@ class _Knobs(NamedTuple):
 def test_gradients_agree_with_differences(case):
     make, origin, direction, reflects = _CASES[case]
     with jax.enable_x64(True):
-        geometry, ray = _double((scenes.geometry(make()), _ray(origin, direction)))
-        surfaces, interfaces = geometry
+        scene, ray = _double((scenes.build(make()), _ray(origin, direction)))
+        surfaces, interfaces = scene
 
         def run(knobs):
             tree = surfaces.bvh._replace(triangles=knobs.corners)
@@ -201,12 +201,12 @@ def test_gradients_agree_with_differences(case):
 def test_the_gradient_of_a_slab_is_the_closed_form():
     theta = np.radians(30.0)
     with jax.enable_x64(True):
-        geometry = _double(scenes.geometry(scenes.box((40.0, 40.0, 0.5))))
+        scene = _double(scenes.build(scenes.box((40.0, 40.0, 0.5))))
         ray = _double(_ray([0.0, 0.0, 3.0], [np.sin(theta), 0.0, -np.cos(theta)]))
 
         def shift(index):
-            media = geometry.interfaces._replace(index_inside=index[None])
-            return _exit(geometry._replace(interfaces=media), ray, [False, False])[0][0]
+            media = scene.interfaces._replace(index_inside=index[None])
+            return _exit(scene._replace(interfaces=media), ray, [False, False])[0][0]
 
         # x = 2.75 tan(theta) + 0.5 tan(inner), and sin(inner) = sin(theta) / n.
         n, s = 1.5, np.sin(theta)
@@ -215,13 +215,13 @@ def test_the_gradient_of_a_slab_is_the_closed_form():
 
 
 def test_gradients_at_the_critical_angle_are_finite():
-    geometry = scenes.geometry(scenes.box((20.0, 20.0, 0.5)))
+    scene = scenes.build(scenes.box((20.0, 20.0, 0.5)))
 
     def leave(index, ray):
-        media = geometry.interfaces._replace(index_inside=index[None])
-        moved = geometry._replace(interfaces=media)
+        media = scene.interfaces._replace(index_inside=index[None])
+        moved = scene._replace(interfaces=media)
         path = follow_branch(moved, ray, jnp.zeros(1, bool), settings=PathSettings(1, "all"))
-        return jnp.concatenate([path.points[1], path.directions[1], path.weights])
+        return jnp.concatenate([path.points[1], path.directions[1], path.throughput])
 
     off = np.array([0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3])
     theta = np.arcsin(1.0 / 1.5) + off
@@ -235,27 +235,27 @@ def test_gradients_at_the_critical_angle_are_finite():
 
 @pytest.mark.slow
 def test_rays_that_miss_have_no_gradient_of_the_scene():
-    geometry = scenes.geometry(scenes.ball(1.0, subdivisions=1))
+    scene = scenes.build(scenes.ball(1.0, subdivisions=1))
     ray = _ray([-4.0, 3.0, 0.0], [1.0, 0.0, 0.0])
 
-    def last(geometry):
-        path = follow_branch(geometry, ray, jnp.zeros(10, bool), settings=PAPER)
-        return jnp.sum(path.directions[0] + path.weights)
+    def last(scene):
+        path = follow_branch(scene, ray, jnp.zeros(10, bool), settings=PAPER)
+        return jnp.sum(path.directions[0] + path.throughput)
 
-    gradient = jax.grad(last, allow_int=True)(geometry)
+    gradient = jax.grad(last, allow_int=True)(scene)
     floats = [x for x in jax.tree.leaves(gradient) if x.dtype == jnp.float32]
     assert floats and all(np.all(x == 0.0) for x in floats)
 
 
 @pytest.mark.slow
 def test_an_index_can_be_found_by_descent():
-    geometry = scenes.geometry(scenes.ball(1.0, subdivisions=4))
+    scene = scenes.build(scenes.ball(1.0, subdivisions=4))
     rays = scenes.rays([[-4.0, y, 0.1] for y in np.linspace(-0.6, 0.6, 16)], [1.0, 0.0, 0.0])
     settings = PathSettings(2, "none")
 
     def leave(index):
-        media = geometry.interfaces._replace(index_inside=index[None])
-        follow = functools.partial(follow_branch, geometry._replace(interfaces=media))
+        media = scene.interfaces._replace(index_inside=index[None])
+        follow = functools.partial(follow_branch, scene._replace(interfaces=media))
         paths = jax.vmap(lambda ray: follow(ray, jnp.zeros(2, bool), settings=settings))(rays)
         return paths.directions[:, 2]
 
@@ -268,8 +268,8 @@ def test_an_index_can_be_found_by_descent():
 
 
 def test_scenes_can_not_be_mapped_over():
-    geometry = scenes.geometry(scenes.ball(1.0, subdivisions=1))
-    twice = jax.tree.map(lambda x: jnp.stack([x, x]), geometry)
+    scene = scenes.build(scenes.ball(1.0, subdivisions=1))
+    twice = jax.tree.map(lambda x: jnp.stack([x, x]), scene)
     ray = _ray([-4.0, 0.0, 0.0], [1.0, 0.0, 0.0])
     follow = lambda scene: follow_branch(scene, ray, jnp.zeros(24, bool), settings=TREE)
     with pytest.raises(TypeError, match="one vmap cannot cast rays into several scenes"):

@@ -48,18 +48,18 @@ def test_straight_light_is_never_reflected():
 
 @pytest.mark.slow
 def test_the_tree_s_reflected_paths_set_out_as_the_single_reflection_does():
-    geometry = scenes.geometry(scenes.ball(1.0, subdivisions=3))
+    scene = scenes.build(scenes.ball(1.0, subdivisions=3))
     settings = dataclasses.replace(TREE, max_bends=4, min_throughput=1e-3)
     rays = scenes.rays([[-4.0, 0.2, 0.1]] * 5, [[4.0, y, 0.1] for y in np.linspace(-0.9, 0.5, 5)])
     trace = jax.jit(functools.partial(path_tracing.trace, settings=settings, capacity=256))
-    paths = trace(geometry, rays).paths
+    paths = trace(scene, rays).paths
     mirrored, real = np.asarray(reflected_first(paths)), np.asarray(exists(paths))
     paths = jax.tree.map(np.asarray, paths)
     for i in range(5):
         ray = jax.tree.map(lambda x, i=i: x[i], rays)
         for choice in (True, False):
             branch = follow_branch(
-                geometry, ray, jnp.array([choice, False, False, False]), settings=settings
+                scene, ray, jnp.array([choice, False, False, False]), settings=settings
             )
             ours = paths.directions[real & (paths.rays == i) & (mirrored == choice), 1]
             assert len(ours) >= 1

@@ -18,9 +18,9 @@ pytestmark = pytest.mark.computing
 _SETTINGS = PathSettings(max_bends=6, reflections="all", min_throughput=0.02)
 
 
-def _follow(geometry, rays, reflections=3):
+def _follow(scene, rays, reflections=3):
     follow = functools.partial(
-        follow_main_branches, geometry, settings=_SETTINGS, reflections=reflections
+        follow_main_branches, scene, settings=_SETTINGS, reflections=reflections
     )
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(follow))(rays))
 
@@ -31,28 +31,28 @@ def _towards(count, seed=3):
 
 
 def test_a_slab_from_above_has_the_shares_of_fresnel():
-    geometry = scenes.geometry(scenes.box((4.0, 4.0, 1.0)))
-    found = _follow(geometry, scenes.rays([0.1, 0.2, 4.0], [0.0, 0.0, -1.0]))
+    scene = scenes.build(scenes.box((4.0, 4.0, 1.0)))
+    found = _follow(scene, scenes.rays([0.1, 0.2, 4.0], [0.0, 0.0, -1.0]))
     part = 0.04
     # A second reflection has 0.0369 of the light, and the third one 0.0015, below the cut.
     expected = [(1 - part) ** 2, part, (1 - part) * part, 0.0]
-    np.testing.assert_allclose(found.weights[0, :, 0], expected, atol=1e-6)
+    np.testing.assert_allclose(found.throughput[0, :, 0], expected, atol=1e-6)
     assert list(found.num_bends[0, :3]) == [2, 1, 3]
     assert found.statuses[0, 3] == PathStatus.EMPTY
 
 
 @pytest.mark.slow
 def test_they_are_the_branches_of_the_tree_and_nearly_all_of_its_light():
-    geometry = scenes.geometry(scenes.ball(1.0, subdivisions=3))
+    scene = scenes.build(scenes.ball(1.0, subdivisions=3))
     rays = _towards(64)
-    found = _follow(geometry, rays)
-    total = found.weights[..., 0].sum(axis=1)
+    found = _follow(scene, rays)
+    total = found.throughput[..., 0].sum(axis=1)
     assert np.all(total <= 1.0 + 1e-5) and total.mean() > 0.99
     trace = jax.jit(functools.partial(path_tracing.trace, settings=_SETTINGS, capacity=512))
-    tree = jax.tree.map(np.asarray, trace(geometry, rays).paths)
+    tree = jax.tree.map(np.asarray, trace(scene, rays).paths)
     last = np.arange(64)[:, None], np.arange(4)[None], found.num_bends
     for ray, branch in np.argwhere((found.statuses != PathStatus.EMPTY) & (total[:, None] > 0)):
-        if found.weights[ray, branch, 0] == 0.0:
+        if found.throughput[ray, branch, 0] == 0.0:
             continue
         same = (tree.rays == ray) & (tree.num_bends == found.num_bends[ray, branch])
         ends = tree.directions[same, found.num_bends[ray, branch]]
@@ -62,30 +62,30 @@ def test_they_are_the_branches_of_the_tree_and_nearly_all_of_its_light():
 
 def test_a_total_reflection_is_not_counted_twice():
     # Through a leg of the prism onto its hypotenuse, at 45 degrees: beyond the critical angle.
-    geometry = scenes.geometry(scenes.right_prism())
-    found = _follow(geometry, scenes.rays([0.4, 0.0, -3.0], [0.0, 0.0, 1.0]))
+    scene = scenes.build(scenes.right_prism())
+    found = _follow(scene, scenes.rays([0.4, 0.0, -3.0], [0.0, 0.0, 1.0]))
     assert found.num_bends[0, 0] == 3
     assert found.statuses[0, 2] == PathStatus.EMPTY
-    assert found.weights[0, :, 0].sum() <= 1.0 + 1e-6
+    assert found.throughput[0, :, 0].sum() <= 1.0 + 1e-6
 
 
 def test_a_ray_that_misses_has_one_path():
-    geometry = scenes.geometry(scenes.ball(1.0, subdivisions=1))
-    found = _follow(geometry, scenes.rays([-4.0, 0.0, 0.0], [-1.0, 0.0, 0.0]))
+    scene = scenes.build(scenes.ball(1.0, subdivisions=1))
+    found = _follow(scene, scenes.rays([-4.0, 0.0, 0.0], [-1.0, 0.0, 0.0]))
     assert list(found.statuses[0]) == [PathStatus.MISSED, *[PathStatus.EMPTY] * 3]
 
 
 def test_the_index_has_the_gradient_of_a_slab():
     """Shift across a slab of thickness 1: `sin a - cos a sin b / cos b`, Snell's law for `b`."""
-    geometry = scenes.geometry(scenes.box((40.0, 40.0, 1.0)))
+    scene = scenes.build(scenes.box((40.0, 40.0, 1.0)))
     angle = 0.6
     ray = jax.tree.map(
         lambda x: x[0], scenes.rays([0.0, 0.0, 3.0], [np.sin(angle), 0.0, -np.cos(angle)])
     )
 
     def shift(index):
-        inside = jnp.full_like(geometry.interfaces.index_inside, index)
-        changed = geometry._replace(interfaces=geometry.interfaces._replace(index_inside=inside))
+        inside = jnp.full_like(scene.interfaces.index_inside, index)
+        changed = scene._replace(interfaces=scene.interfaces._replace(index_inside=inside))
         path = follow_main_branches(changed, ray, settings=_SETTINGS, reflections=1)
         return path.points[0, 2, 0]
 
@@ -99,4 +99,4 @@ def test_the_index_has_the_gradient_of_a_slab():
 
 def test_more_reflections_than_bends_are_refused():
     with pytest.raises(ValueError, match="reflections is 7, outside 0 to 6"):
-        _follow(scenes.geometry(scenes.box()), _towards(1), reflections=7)
+        _follow(scenes.build(scenes.box()), _towards(1), reflections=7)

@@ -27,7 +27,7 @@ def _walk(interfaces, inside, parts, entering):
 
     def cross(inside, hit):
         crossing = media.crossing(interfaces, inside, *hit)
-        return crossing.inside_after, crossing
+        return crossing.interior_list_after, crossing
 
     return jax.lax.scan(cross, inside, (parts, entering))[1]
 
@@ -69,8 +69,8 @@ def test_only_the_priority_rule_carries_a_list(rule, slots):
 def test_one_body_is_entered_and_left():
     walk = _crossings(_interfaces([1.5], [0]), [(0, True), (0, False)])
     assert _sides(walk) == [((1.0, AMBIENT), (1.5, 1)), ((1.5, 1), (1.0, AMBIENT))]
-    assert sorted(walk.inside_after[0]) == [EMPTY_SLOT] * (SLOTS - 1) + [0]
-    np.testing.assert_array_equal(walk.inside_after[1], EMPTY_SLOT)
+    assert sorted(walk.interior_list_after[0]) == [EMPTY_SLOT] * (SLOTS - 1) + [0]
+    np.testing.assert_array_equal(walk.interior_list_after[1], EMPTY_SLOT)
 
 
 @pytest.mark.parametrize("rank", list(itertools.permutations(range(3))))
@@ -86,7 +86,7 @@ def test_a_walk_agrees_with_sets(rank, seed):
     walk = _crossings(_interfaces([1.5, 1.3, 1.1], list(rank)), steps)
     assert walk.medium_far.tolist() == expected
     assert walk.medium_near.tolist() == [AMBIENT, *expected[:-1]]
-    assert {int(part) for part in walk.inside_after[-1]} - {EMPTY_SLOT} == inside
+    assert {int(part) for part in walk.interior_list_after[-1]} - {EMPTY_SLOT} == inside
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -104,7 +104,7 @@ def test_a_full_list_forgets_the_lowest(seed):
     assert max(len(truly), 5) > SLOTS
     walk = _crossings(_interfaces([1.5] * 6, rank.tolist()), steps)
     assert walk.medium_far.tolist() == expected
-    assert {int(part) for part in walk.inside_after[-1]} - {EMPTY_SLOT} == known
+    assert {int(part) for part in walk.interior_list_after[-1]} - {EMPTY_SLOT} == known
 
 
 def test_a_part_that_was_forgotten_is_left_without_a_trace():

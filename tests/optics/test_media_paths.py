@@ -31,22 +31,24 @@ _RAYS = 64
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "capacity"))
-def _trace_jitted(geometry, rays, inside, *, settings, capacity):
-    return path_tracing.trace(geometry, rays, settings=settings, capacity=capacity, inside=inside)
+def _trace_jitted(scene, rays, interior_list, *, settings, capacity):
+    return path_tracing.trace(
+        scene, rays, settings=settings, capacity=capacity, interior_list=interior_list
+    )
 
 
-def _trace(geometry, rays, *, inside=None, settings=_REFRACTED):
-    if inside is None:
-        nowhere = media.nowhere(geometry.interfaces)
-        inside = jnp.broadcast_to(nowhere, (len(rays.radii), nowhere.shape[0]))
+def _trace(scene, rays, *, interior_list=None, settings=_REFRACTED):
+    if interior_list is None:
+        nowhere = media.nowhere(scene.interfaces)
+        interior_list = jnp.broadcast_to(nowhere, (len(rays.radii), nowhere.shape[0]))
     capacity = 8 * len(rays.radii)
-    traced = _trace_jitted(geometry, rays, inside, settings=settings, capacity=capacity)
+    traced = _trace_jitted(scene, rays, interior_list, settings=settings, capacity=capacity)
     return jax.tree.map(np.asarray, traced)
 
 
-def _paths(geometry, rays, **options):
+def _paths(scene, rays, **options):
     """Returns the paths there are."""
-    paths = _trace(geometry, rays, **options).paths
+    paths = _trace(scene, rays, **options).paths
     return jax.tree.map(lambda x: x[paths.statuses != PathStatus.EMPTY], paths)
 
 
@@ -82,8 +84,8 @@ def _balls(priorities=(1, 2), **outer):
 def test_a_contained_body_of_higher_priority_is_the_nested_model():
     parts = _balls(tint=(0.9, 0.8, 0.7), absorption=(0.1, 0.2, 0.4))
     rays = scenes.rays(*_bundle(_RAYS))
-    nested = _paths(scenes.geometry(*parts, rule="nested"), rays)
-    ranked = _paths(scenes.geometry(*parts, rule="priority"), rays)
+    nested = _paths(scenes.build(*parts, rule="nested"), rays)
+    ranked = _paths(scenes.build(*parts, rule="priority"), rays)
     assert set(np.unique(nested.media)) == {AMBIENT, 1, 2}
     for name in ("rays", "num_bends", "statuses", "media"):
         np.testing.assert_array_equal(getattr(ranked, name), getattr(nested, name))
@@ -93,10 +95,10 @@ def test_a_contained_body_of_higher_priority_is_the_nested_model():
 
 @pytest.mark.slow
 def test_a_contained_body_of_lower_priority_is_invisible():
-    geometry = scenes.geometry(*_balls((2, 1)), rule="priority")
+    scene = scenes.build(*_balls((2, 1)), rule="priority")
     origins, directions = _bundle(_RAYS)
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    paths = _paths(geometry, scenes.rays(origins, directions))
+    paths = _paths(scene, scenes.rays(origins, directions))
     outranked = 0
     for i, end, onward in zip(paths.rays, *_last(paths), strict=True):
         bends = reference.trace_concentric_spheres(
@@ -122,7 +124,7 @@ def _slabs(*priorities, **colours):
     for number, priority in enumerate(priorities):
         added = {name: value[number] for name, value in colours.items()}
         parts[number] = _ranked(parts[number], priority, **added)
-    return scenes.geometry(*parts, rule="priority")
+    return scenes.build(*parts, rule="priority")
 
 
 @pytest.mark.parametrize("degrees", [0.0, 20.0, 50.0, 75.0])
@@ -148,13 +150,13 @@ def test_one_surface_is_left_between_slabs_that_overlap(degrees, priorities, bou
 def test_only_real_surfaces_tint_and_only_the_medium_that_is_there_absorbs():
     tint = [(0.9, 0.8, 1.0), (0.5, 0.6, 0.7)]
     absorption = [(0.0, 0.3, 1.0), (2.0, 0.1, 0.0)]
-    geometry = _slabs(3, 1, tint=tint, absorption=absorption)
+    scene = _slabs(3, 1, tint=tint, absorption=absorption)
     theta = np.radians(40.0)
-    paths = _paths(geometry, scenes.rays([0.0, 0.0, -2.0], [np.sin(theta), 0.0, np.cos(theta)]))
+    paths = _paths(scene, scenes.rays([0.0, 0.0, -2.0], [np.sin(theta), 0.0, np.cos(theta)]))
     glass, water = (1.0 / np.cos(np.arcsin(np.sin(theta) / n)) for n in (1.5, 1.333))
     surfaces = np.square(tint[0]) * tint[1]
     left = np.exp(-glass * np.array(absorption[0]) - water * np.array(absorption[1]))
-    np.testing.assert_allclose(paths.weights[0], surfaces * left, rtol=1e-5)
+    np.testing.assert_allclose(paths.throughput[0], surfaces * left, rtol=1e-5)
 
 
 @pytest.mark.parametrize("swapped", [False, True])
@@ -169,10 +171,10 @@ def test_water_that_overlaps_the_wall_of_a_hollow_ball(swapped):
     )
     water = _ranked(scenes.ball(0.75, index=1.333, subdivisions=4, name="drink_water"), 1)
     parts = (water, wall) if swapped else (wall, water)
-    geometry = scenes.geometry(*parts, rule="priority")
+    scene = scenes.build(*parts, rule="priority")
     origins = np.array([[-4.0, y, 0.1] for y in (0.1, 0.3, 0.5)])
     direction = np.array([1.0, 0.0, 0.0])
-    paths = _paths(geometry, scenes.rays(origins, direction))
+    paths = _paths(scene, scenes.rays(origins, direction))
     spheres = [Sphere(1.0, 1.5, 1.0), Sphere(0.6, 1.333, 1.5)]
     ends, onward = _last(paths)
     for i, origin in enumerate(origins):
@@ -244,7 +246,7 @@ def test_three_balls_that_overlap(priorities):
     ]
     origins, directions = _bundle(60, seed=1)
     directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    paths = _paths(scenes.geometry(*balls, rule="priority"), scenes.rays(origins, directions))
+    paths = _paths(scenes.build(*balls, rule="priority"), scenes.rays(origins, directions))
     ends, onward = _last(paths)
     compared = 0
     for i in np.flatnonzero(paths.statuses == PathStatus.ESCAPED):
@@ -265,11 +267,11 @@ def test_the_light_of_a_ray_is_shared_among_its_paths(priorities):
     glass = _ranked(scenes.box((1.0, 1.2, 0.8), index=1.5), priorities[0])
     water = _ranked(scenes.ball(0.6, index=1.333, centre=(0.4, 0.0, 0.2)), priorities[1])
     traced = _trace(
-        scenes.geometry(glass, water, rule="priority"), scenes.rays(*_bundle(200)), settings=TREE
+        scenes.build(glass, water, rule="priority"), scenes.rays(*_bundle(200)), settings=TREE
     )
     sums = np.zeros((200, 3))
-    np.add.at(sums, traced.paths.rays, traced.paths.weights)
-    np.testing.assert_allclose(sums + traced.lost, 1.0, atol=1e-5)
+    np.add.at(sums, traced.paths.rays, traced.paths.throughput)
+    np.testing.assert_allclose(sums + traced.dropped, 1.0, atol=1e-5)
 
 
 # A camera inside.
@@ -287,8 +289,8 @@ def test_a_camera_inside_of_balls(rule, start, slots):
     around = parts_around(parts, origins)
     assert set(around[0]) - {EMPTY_SLOT} == slots
     inside = jnp.asarray(around) if rule == "priority" else None
-    geometry = scenes.geometry(*parts, rule=rule)
-    paths = _paths(geometry, scenes.rays(origins, directions), inside=inside)
+    scene = scenes.build(*parts, rule=rule)
+    paths = _paths(scene, scenes.rays(origins, directions), interior_list=inside)
     spheres = [Sphere(1.0, 1.5, 1.0), Sphere(0.6, 1.333, 1.5)]
     compared = 0
     for i, end, onward in zip(paths.rays, *_last(paths), strict=True):
@@ -309,6 +311,6 @@ def test_a_camera_in_a_drink_sees_its_wall(degrees):
     inside = jnp.asarray(parts_around(parts, origin))
     sine = np.sin(np.radians(degrees))
     rays = scenes.rays(origin, [sine, 0.0, -np.sqrt(1.0 - sine**2)])
-    paths = _paths(scenes.geometry(*parts, rule="priority"), rays, inside=inside)
+    paths = _paths(scenes.build(*parts, rule="priority"), rays, interior_list=inside)
     assert paths.media[0, :4].tolist() == [2, 1, 1, AMBIENT]
     np.testing.assert_allclose(_last(paths)[1][0, 0], 1.333 * sine, atol=_PLANAR_TOLERANCE)

@@ -30,13 +30,13 @@ _SPHERE_TOLERANCE = 4e-3
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "capacity"))
-def _trace_jitted(geometry, rays, *, settings, capacity):
-    return path_tracing.trace(geometry, rays, settings=settings, capacity=capacity)
+def _trace_jitted(scene, rays, *, settings, capacity):
+    return path_tracing.trace(scene, rays, settings=settings, capacity=capacity)
 
 
-def _trace(geometry, rays, *, settings=PAPER, capacity=None):
+def _trace(scene, rays, *, settings=PAPER, capacity=None):
     capacity = capacities(settings, len(rays.radii)).paths if capacity is None else capacity
-    traced = _trace_jitted(geometry, rays, settings=settings, capacity=capacity)
+    traced = _trace_jitted(scene, rays, settings=settings, capacity=capacity)
     return jax.tree.map(np.asarray, traced)
 
 
@@ -44,24 +44,24 @@ def _existing(paths):
     return jax.tree.map(lambda x: x[paths.statuses != PathStatus.EMPTY], paths)
 
 
-def _refracted(geometry, rays, bends=10):
+def _refracted(scene, rays, bends=10):
     """Returns the one path of each ray, in the order of the rays."""
     settings = PathSettings(bends, "none", live_per_ray=1.0, paths_per_ray=1.0)
-    return _trace(geometry, rays, settings=settings).paths
+    return _trace(scene, rays, settings=settings).paths
 
 
 @functools.cache
 def _ball_in_ball(rule, inner_index=1.333):
-    return scenes.geometry(
+    return scenes.build(
         scenes.ball(1.0, index=1.5, subdivisions=5, name="outer_glass"),
         scenes.ball(0.6, index=inner_index, subdivisions=5, name="inner"),
         rule=rule,
     )
 
 
-def _check_against_spheres(geometry, spheres, heights, bends):
+def _check_against_spheres(scene, spheres, heights, bends):
     origins = np.array([[-4.0, y, 0.1] for y in heights])
-    paths = _refracted(geometry, scenes.rays(origins, [1.0, 0.0, 0.0]))
+    paths = _refracted(scene, scenes.rays(origins, [1.0, 0.0, 0.0]))
     for i, origin in enumerate(origins):
         expected = reference.trace_concentric_spheres(
             spheres, origin, np.array([1.0, 0.0, 0.0]), 10
@@ -83,10 +83,10 @@ def _check_against_spheres(geometry, spheres, heights, bends):
 @pytest.mark.parametrize("degrees", [0.0, 10.0, 45.0, 70.0])
 def test_a_slab_shifts_light_sideways(degrees):
     thickness, theta = 0.5, np.radians(degrees)
-    geometry = scenes.geometry(scenes.box((20.0, 20.0, thickness), index=1.5))
+    scene = scenes.build(scenes.box((20.0, 20.0, thickness), index=1.5))
     direction = np.array([np.sin(theta), 0.0, -np.cos(theta)])
     start = -3.0 * direction
-    paths = _refracted(geometry, scenes.rays(start, direction))
+    paths = _refracted(scene, scenes.rays(start, direction))
     assert paths.num_bends[0] == 2
     np.testing.assert_allclose(paths.directions[0, 2], direction, atol=_PLANAR_TOLERANCE)
     inner = np.arcsin(np.sin(theta) / 1.5)
@@ -99,9 +99,9 @@ def test_a_slab_shifts_light_sideways(degrees):
 
 
 def test_a_right_prism_turns_light_by_total_reflection():
-    geometry = scenes.geometry(scenes.right_prism())
+    scene = scenes.build(scenes.right_prism())
     # Down through the leg z = 1 plane's neighbour x = 0, against the hypotenuse, out at z = 0.
-    paths = _refracted(geometry, scenes.rays([-2.0, 0.1, 0.3], [1.0, 0.0, 0.0]))
+    paths = _refracted(scene, scenes.rays([-2.0, 0.1, 0.3], [1.0, 0.0, 0.0]))
     assert paths.num_bends[0] == 3
     np.testing.assert_allclose(paths.points[0, 2], [0.7, 0.1, 0.3], atol=_PLANAR_TOLERANCE)
     np.testing.assert_allclose(paths.directions[0, 2], [0.0, 0.0, -1.0], atol=_PLANAR_TOLERANCE)
@@ -110,8 +110,8 @@ def test_a_right_prism_turns_light_by_total_reflection():
 
 
 def test_a_ball_of_glass():
-    geometry = scenes.geometry(scenes.ball(1.0, subdivisions=5))
-    _check_against_spheres(geometry, [Sphere(1.0, 1.5, 1.0)], [0.0, 0.2, 0.5, 0.8], 2)
+    scene = scenes.build(scenes.ball(1.0, subdivisions=5))
+    _check_against_spheres(scene, [Sphere(1.0, 1.5, 1.0)], [0.0, 0.2, 0.5, 0.8], 2)
 
 
 @pytest.mark.slow
@@ -148,32 +148,32 @@ def test_media_are_named_along_the_path():
 
 
 def test_equal_indices_are_invisible():
-    geometry = scenes.geometry(scenes.ball(1.0, index=1.0, subdivisions=3))
+    scene = scenes.build(scenes.ball(1.0, index=1.0, subdivisions=3))
     rays = scenes.rays([[-4.0, y, 0.0] for y in (0.0, 0.5, 0.9)], [1.0, 0.0, 0.0])
     for settings in (PAPER, TREE):
-        paths = _existing(_trace(geometry, rays, settings=settings).paths)
+        paths = _existing(_trace(scene, rays, settings=settings).paths)
         np.testing.assert_array_equal(paths.rays, [0, 1, 2])
         for i in range(3):
             np.testing.assert_allclose(
                 paths.directions[i, paths.num_bends[i]], [1, 0, 0], atol=1e-6
             )
-        np.testing.assert_array_equal(paths.weights, 1.0)
+        np.testing.assert_array_equal(paths.throughput, 1.0)
 
 
 @pytest.mark.slow
 def test_light_paths_are_reversible():
-    geometry = scenes.geometry(scenes.box((1.0, 1.2, 1.4), index=1.5))
+    scene = scenes.build(scenes.box((1.0, 1.2, 1.4), index=1.5))
     generator = np.random.default_rng(3)
     origins = generator.normal(size=(200, 3))
     origins *= 4.0 / np.linalg.norm(origins, axis=-1, keepdims=True)
     there = _refracted(
-        geometry, scenes.rays(origins, generator.uniform(-0.4, 0.4, (200, 3)) - origins)
+        scene, scenes.rays(origins, generator.uniform(-0.4, 0.4, (200, 3)) - origins)
     )
     through = np.flatnonzero((there.statuses == PathStatus.ESCAPED) & (there.num_bends <= 8))
     assert through.size > 50
     last = there.num_bends[through]
     ends = there.points[through, last] + 2.0 * there.directions[through, last]
-    back = _refracted(geometry, scenes.rays(ends, -there.directions[through, last]))
+    back = _refracted(scene, scenes.rays(ends, -there.directions[through, last]))
     home = back.directions[np.arange(through.size), back.num_bends]
     # A path that grazes an edge or the critical angle may take another way back.
     same = np.linalg.norm(home + there.directions[through, 0], axis=-1) < 1e-3
@@ -182,9 +182,9 @@ def test_light_paths_are_reversible():
 
 @pytest.mark.slow
 def test_points_directions_and_distances_agree():
-    geometry = scenes.geometry(scenes.ball(1.0, subdivisions=4))
+    scene = scenes.build(scenes.ball(1.0, subdivisions=4))
     rays = scenes.rays([[-4.0, y, 0.3] for y in np.linspace(-0.9, 0.9, 20)], [1.0, 0.0, 0.0])
-    paths = _trace(geometry, rays).paths
+    paths = _trace(scene, rays).paths
     for i in np.flatnonzero(paths.statuses != PathStatus.EMPTY):
         for k in range(paths.num_bends[i]):
             length = paths.tau[i, k + 1] - paths.tau[i, k]
@@ -211,23 +211,23 @@ def test_a_budget_that_just_suffices_escapes():
 
 
 def test_rays_that_miss_stay_straight():
-    geometry = scenes.geometry(scenes.ball(1.0))
+    scene = scenes.build(scenes.ball(1.0))
     rays = scenes.rays([-4.0, 2.0, 0.0], [1.0, 0.0, 0.0])
-    traced = _trace(geometry, rays)
+    traced = _trace(scene, rays)
     assert traced.paths.statuses[0] == PathStatus.MISSED
     assert traced.paths.statuses[1] == PathStatus.EMPTY
-    assert np.all(traced.paths.weights[0] == 1.0) and np.all(traced.paths.weights[1] == 0.0)
+    assert np.all(traced.paths.throughput[0] == 1.0) and np.all(traced.paths.throughput[1] == 0.0)
     assert np.all(np.isinf(traced.paths.tau[0, 1:]))
 
 
 def test_the_paper_reflects_once_at_the_first_surface():
-    geometry = scenes.geometry(scenes.box((2.0, 2.0, 2.0), index=1.5))
+    scene = scenes.build(scenes.box((2.0, 2.0, 2.0), index=1.5))
     direction = np.array([0.6, 0.0, -0.8])
     rays = scenes.rays(-4.0 * direction + [0.0, 0.0, 1.0], direction)
-    paths = _trace(geometry, rays).paths
+    paths = _trace(scene, rays).paths
     reflectance = reference.fresnel_by_angles(np.arccos(0.8), 1.0, 1.5)
-    np.testing.assert_allclose(paths.weights[0], 1.0 - reflectance, atol=1e-6)
-    np.testing.assert_allclose(paths.weights[1], reflectance, atol=1e-6)
+    np.testing.assert_allclose(paths.throughput[0], 1.0 - reflectance, atol=1e-6)
+    np.testing.assert_allclose(paths.throughput[1], reflectance, atol=1e-6)
     assert paths.statuses[1] == PathStatus.NOT_TRACED
     assert paths.num_bends[1] == 1
     np.testing.assert_allclose(paths.points[1, 1], [0.0, 0.0, 1.0], atol=_PLANAR_TOLERANCE)
@@ -240,10 +240,10 @@ def test_fresnel_uses_the_index_of_the_part_that_was_hit():
     diamond = scenes.box((1.0, 1.0, 1.0), index=2.418, name="a_diamond")
     glass = scenes.ball(0.5, index=1.5, centre=(5.0, 0.0, 0.0), name="b_glass")
     rays = scenes.rays([[0.0, 0.0, 4.0], [5.0, 0.0, 4.0]], [0.0, 0.0, -1.0])
-    paths = _trace(scenes.geometry(diamond, glass), rays).paths
-    np.testing.assert_allclose(1.0 - paths.weights[0], (1.418 / 3.418) ** 2, atol=1e-6)
+    paths = _trace(scenes.build(diamond, glass), rays).paths
+    np.testing.assert_allclose(1.0 - paths.throughput[0], (1.418 / 3.418) ** 2, atol=1e-6)
     # The ball's shading normal there is off by the mesh, not by much.
-    np.testing.assert_allclose(1.0 - paths.weights[2], 0.04, atol=1e-4)
+    np.testing.assert_allclose(1.0 - paths.throughput[2], 0.04, atol=1e-4)
 
 
 def _many_rays():
@@ -261,77 +261,77 @@ def _many_rays():
 )
 def test_weights_and_losses_of_every_ray_sum_to_one_at_any_capacity(settings, capacity):
     traced = _trace(
-        scenes.geometry(scenes.ball(1.0)), _many_rays(), settings=settings, capacity=capacity
+        scenes.build(scenes.ball(1.0)), _many_rays(), settings=settings, capacity=capacity
     )
-    sums = traced.lost.copy()
-    np.add.at(sums, traced.paths.rays, traced.paths.weights)
+    sums = traced.dropped.copy()
+    np.add.at(sums, traced.paths.rays, traced.paths.throughput)
     np.testing.assert_allclose(sums, 1.0, atol=1e-6)
-    assert (traced.lost.max() > 0.0) == (capacity < 100)
+    assert (traced.dropped.max() > 0.0) == (capacity < 100)
 
 
 @pytest.mark.slow
 def test_the_strongest_paths_are_kept():
-    geometry = scenes.geometry(scenes.ball(1.0))
-    full = _trace(geometry, _many_rays(), capacity=200).paths.weights[:, 0]
-    kept = _trace(geometry, _many_rays(), capacity=70).paths.weights[:, 0]
+    scene = scenes.build(scenes.ball(1.0))
+    full = _trace(scene, _many_rays(), capacity=200).paths.throughput[:, 0]
+    kept = _trace(scene, _many_rays(), capacity=70).paths.throughput[:, 0]
     np.testing.assert_allclose(np.sort(kept)[::-1], np.sort(full)[::-1][:70])
 
 
 @pytest.mark.slow
 def test_paths_come_in_the_order_of_their_rays_the_heaviest_first():
-    paths = _trace(scenes.geometry(scenes.ball(1.0)), _many_rays(), settings=TREE).paths
+    paths = _trace(scenes.build(scenes.ball(1.0)), _many_rays(), settings=TREE).paths
     exists = paths.statuses != PathStatus.EMPTY
     assert np.all(np.diff(exists.astype(int)) <= 0)
-    rays, weights = paths.rays[exists], paths.weights[exists, 0]
+    rays, weights = paths.rays[exists], paths.throughput[exists, 0]
     assert np.all(np.diff(rays) >= 0)
     assert np.all(np.diff(weights)[np.diff(rays) == 0] <= 0.0)
 
 
 @pytest.mark.slow
 def test_tracing_in_a_pool_equals_tracing_batch_by_batch():
-    geometry = scenes.geometry(scenes.ball(1.0))
+    scene = scenes.build(scenes.ball(1.0))
     rays = _many_rays()
     batches = jax.tree.map(lambda x: x.reshape(4, 16, *x.shape[1:]), rays)
     trace_pool = jax.jit(functools.partial(path_tracing.trace_batches, settings=PAPER, capacity=32))
-    pool = trace_pool(geometry, batches)
+    pool = trace_pool(scene, batches)
     for i in range(4):
         batch = jax.tree.map(lambda x, i=i: x[i], batches)
-        single = _trace(geometry, batch)
+        single = _trace(scene, batch)
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, atol=1e-6), pool, single)
 
 
 def test_no_mesh_of_a_straight_ray_is_said_to_be_missed():
-    traced = _trace(scenes.geometry(scenes.ball(1.0)), _many_rays(), settings=STRAIGHT)
+    traced = _trace(scenes.build(scenes.ball(1.0)), _many_rays(), settings=STRAIGHT)
     assert np.all(traced.paths.statuses == PathStatus.NOT_TRACED)
-    found = path_tracing.survey(scenes.geometry(), _many_rays(), settings=STRAIGHT)
+    found = path_tracing.survey(scenes.build(), _many_rays(), settings=STRAIGHT)
     assert (float(found.mean), float(found.hit_fraction)) == (1.0, 0.0)
 
 
 def test_the_straight_budget_ignores_the_objects():
     rays = _many_rays()
-    traced = _trace(scenes.geometry(scenes.ball(1.0)), rays, settings=STRAIGHT, capacity=0)
+    traced = _trace(scenes.build(scenes.ball(1.0)), rays, settings=STRAIGHT, capacity=0)
     jax.tree.map(np.testing.assert_array_equal, traced.paths, straight(rays))
-    assert np.all(traced.lost == 0.0)
+    assert np.all(traced.dropped == 0.0)
 
 
 @pytest.mark.parametrize("settings", [PAPER, TREE])
 @pytest.mark.slow
 def test_an_empty_scene_bends_nothing(settings):
-    traced = _trace(scenes.geometry(), _many_rays(), settings=settings)
+    traced = _trace(scenes.build(), _many_rays(), settings=settings)
     assert np.all(traced.paths.statuses[:64] == PathStatus.MISSED)
     assert np.all(traced.paths.statuses[64:] == PathStatus.EMPTY)
-    assert all(np.all(np.isfinite(x)) for x in (traced.paths.points, traced.paths.weights))
+    assert all(np.all(np.isfinite(x)) for x in (traced.paths.points, traced.paths.throughput))
 
 
 def test_no_rays_have_no_paths():
     rays = jax.tree.map(lambda x: x[:0], _many_rays())
-    traced = path_tracing.trace(scenes.geometry(scenes.ball(1.0)), rays, settings=TREE, capacity=8)
+    traced = path_tracing.trace(scenes.build(scenes.ball(1.0)), rays, settings=TREE, capacity=8)
     assert traced.paths.statuses.shape == (0,)
-    assert path_tracing.trace_ends(scenes.geometry(), rays, settings=TREE).casts == 0
+    assert path_tracing.trace_ends(scenes.build(), rays, settings=TREE).casts == 0
 
 
 def test_a_camera_inside_glass_starts_in_its_medium():
-    paths = _refracted(scenes.geometry(scenes.box()), scenes.rays([0.0, 0.0, 0.0], [0.1, 0.0, 1.0]))
+    paths = _refracted(scenes.build(scenes.box()), scenes.rays([0.0, 0.0, 0.0], [0.1, 0.0, 1.0]))
     np.testing.assert_array_equal(paths.media[0, :2], [1, AMBIENT])
     sine = 1.5 * 0.1 / np.hypot(0.1, 1.0)
     np.testing.assert_allclose(paths.directions[0, 1, 0], sine, atol=1e-6)
@@ -339,8 +339,8 @@ def test_a_camera_inside_glass_starts_in_its_medium():
 
 def test_total_reflection_at_the_first_surface_needs_no_second_path():
     rays = scenes.rays([0.0, 0.0, 0.0], [0.5, 0.0, 0.45])
-    paths = _trace(scenes.geometry(scenes.box((4.0, 4.0, 1.0))), rays).paths
-    np.testing.assert_array_equal(paths.weights[0], 1.0)
+    paths = _trace(scenes.build(scenes.box((4.0, 4.0, 1.0))), rays).paths
+    np.testing.assert_array_equal(paths.throughput[0], 1.0)
     assert paths.statuses[1] == PathStatus.EMPTY
 
 
@@ -348,9 +348,9 @@ def test_total_reflection_at_the_first_surface_needs_no_second_path():
 def test_paths_scale_with_the_scene(size):
     part = scenes.ball(1.0, subdivisions=3)
     rays = scenes.rays([[-4.0, y, 0.1] for y in (0.1, 0.5, 0.8)], [1.0, 0.0, 0.0])
-    small = _refracted(scenes.geometry(part), rays)
+    small = _refracted(scenes.build(part), rays)
     scaled = _refracted(
-        scenes.geometry(part._replace(vertices=part.vertices * size)),
+        scenes.build(part._replace(vertices=part.vertices * size)),
         rays._replace(origins=rays.origins * size),
     )
     np.testing.assert_array_equal(scaled.num_bends, small.num_bends)
@@ -361,9 +361,9 @@ def test_paths_scale_with_the_scene(size):
 
 def test_in_double_precision_a_slab_is_exact():
     with jax.enable_x64(True):
-        geometry = jax.tree.map(
+        scene = jax.tree.map(
             lambda x: x.astype(jnp.float64) if x.dtype == jnp.float32 else x,
-            scenes.geometry(scenes.box((8.0, 8.0, 0.5), index=1.5)),
+            scenes.build(scenes.box((8.0, 8.0, 0.5), index=1.5)),
         )
         theta = np.radians(40.0)
         direction = np.array([[np.sin(theta), 0.0, -np.cos(theta)]])
@@ -372,7 +372,7 @@ def test_in_double_precision_a_slab_is_exact():
             directions=jnp.asarray(direction),
             radii=jnp.full(1, 1e-3),
         )
-        paths = _trace(geometry, rays).paths
+        paths = _trace(scene, rays).paths
         np.testing.assert_allclose(paths.directions[0, 2], direction[0], atol=1e-14)
         inner = np.arcsin(np.sin(theta) / 1.5)
         np.testing.assert_allclose(
@@ -397,7 +397,7 @@ def test_capacity_covers_the_paths_of_random_batches():
 @pytest.mark.slow
 def test_a_survey_counts_paths_and_hits():
     rays = _many_rays()
-    ball = scenes.geometry(scenes.ball(1.0))
+    ball = scenes.build(scenes.ball(1.0))
     found = jax.jit(functools.partial(path_tracing.survey, settings=PAPER))(ball, rays)
     paths = _existing(_trace(ball, rays).paths)
     counts = np.bincount(paths.rays, minlength=64)
@@ -410,7 +410,7 @@ def test_a_survey_counts_paths_and_hits():
 def test_light_that_escapes_a_closed_body_has_left_its_medium():
     # Aimed next to the edges of a box: through a tolerant face light enters beside the body, and
     # never leaves it. Only rays as close to an edge as rounding may do so.
-    box = scenes.geometry(scenes.box((1.0, 1.0, 1.0)))
+    box = scenes.build(scenes.box((1.0, 1.0, 1.0)))
     rng = np.random.default_rng(0)
     aim = rng.uniform(-0.5, 0.5, size=(4000, 3))
     aim[:, :2] = 0.5 * np.sign(aim[:, :2]) * (1.0 + rng.uniform(-1e-3, 1e-3, size=(4000, 2)))
@@ -423,15 +423,15 @@ def test_light_that_escapes_a_closed_body_has_left_its_medium():
 
 
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
-@pytest.mark.parametrize("of", ["rays", "geometry"])
+@pytest.mark.parametrize("of", ["rays", "scene"])
 def test_derivatives_of_light_paths_are_refused(derivative, of):
-    glass = jax.tree.map(jnp.asarray, scenes.geometry(scenes.ball(1.0, subdivisions=1)))
+    glass = jax.tree.map(jnp.asarray, scenes.build(scenes.ball(1.0, subdivisions=1)))
     rays = jax.tree.map(jnp.asarray, scenes.rays(np.array([[-4.0, 0.2, 0.1]]), [1.0, 0.0, 0.0]))
 
     def exit_height(x):
         moved = rays._replace(origins=rays.origins + x) if of == "rays" else rays
         surfaces = glass.surfaces._replace(normals=glass.surfaces.normals + x)
-        shaped = glass._replace(surfaces=surfaces) if of == "geometry" else glass
+        shaped = glass._replace(surfaces=surfaces) if of == "scene" else glass
         return path_tracing.trace(shaped, moved, settings=PAPER, capacity=2).paths.points[0, 2, 1]
 
     with pytest.raises(TypeError, match="no derivatives"):

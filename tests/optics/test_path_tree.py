@@ -19,12 +19,12 @@ _GLASS = 0.04
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "block"))
-def _trace_ends(geometry, rays, *, settings, block=8192):
-    return path_tracing.trace_ends(geometry, rays, settings=settings, block=block)
+def _trace_ends(scene, rays, *, settings, block=8192):
+    return path_tracing.trace_ends(scene, rays, settings=settings, block=block)
 
 
-def _ends(geometry, rays, **options):
-    traced = jax.tree.map(np.asarray, _trace_ends(geometry, rays, **options))
+def _ends(scene, rays, **options):
+    traced = jax.tree.map(np.asarray, _trace_ends(scene, rays, **options))
     there = traced.ends.statuses != PathStatus.EMPTY
     return jax.tree.map(lambda x: x[there], traced.ends), traced
 
@@ -38,7 +38,7 @@ def _generous(settings):
 
 def _slab(**changes):
     part = scenes.box((20.0, 20.0, 0.5), index=1.5)._replace(**changes)
-    return scenes.geometry(part)
+    return scenes.build(part)
 
 
 def _down():
@@ -52,8 +52,8 @@ def _towards_a_ball(count=64):
 
 
 def _sums(ends, traced):
-    sums = traced.lost.copy()
-    np.add.at(sums, ends.rays, ends.weights)
+    sums = traced.dropped.copy()
+    np.add.at(sums, ends.rays, ends.throughput)
     return sums
 
 
@@ -63,43 +63,43 @@ def test_a_slab_sends_light_both_ways_by_the_geometric_series():
     r, t = _GLASS, 1.0 - _GLASS
     # Out by the top: at once, after 1 and after 3 inner reflections; by the bottom: after 0 and 2.
     escaped = ends.statuses == PathStatus.ESCAPED
-    up = np.sort(ends.weights[escaped & (ends.directions[:, 2] > 0), 0])
-    down = np.sort(ends.weights[escaped & (ends.directions[:, 2] < 0), 0])
+    up = np.sort(ends.throughput[escaped & (ends.directions[:, 2] > 0), 0])
+    down = np.sort(ends.throughput[escaped & (ends.directions[:, 2] < 0), 0])
     np.testing.assert_allclose(up, [t * t * r**3, t * t * r, r], rtol=1e-4)
     np.testing.assert_allclose(down, [t * t * r * r, t * t], rtol=1e-4)
-    trapped = ends.weights[ends.statuses == PathStatus.OUT_OF_BENDS, 0]
+    trapped = ends.throughput[ends.statuses == PathStatus.OUT_OF_BENDS, 0]
     np.testing.assert_allclose(trapped, [t * r**4], rtol=1e-4)
     assert traced.casts == 11
     np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-6)
 
 
-def test_unfinished_light_is_lost_where_it_is_dark():
+def test_the_throughput_of_black_truncated_paths_is_dropped():
     kept, _ = _ends(_slab(), _down(), settings=_generous(PathSettings(5, "all")))
     ends, traced = _ends(
-        _slab(), _down(), settings=_generous(PathSettings(5, "all", unfinished="dark"))
+        _slab(), _down(), settings=_generous(PathSettings(5, "all", truncated_paths="black"))
     )
     r, t = _GLASS, 1.0 - _GLASS
     trapped = ends.statuses == PathStatus.OUT_OF_BENDS
-    assert trapped.sum() == 1 and not ends.weights[trapped].any()
-    np.testing.assert_array_equal(ends.weights[~trapped], kept.weights[~trapped])
-    np.testing.assert_allclose(traced.lost, t * r**4, rtol=1e-4)
+    assert trapped.sum() == 1 and not ends.throughput[trapped].any()
+    np.testing.assert_array_equal(ends.throughput[~trapped], kept.throughput[~trapped])
+    np.testing.assert_allclose(traced.dropped, t * r**4, rtol=1e-4)
     np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-6)
 
 
 def test_a_cut_branch_leaves_its_share_to_its_sibling():
     ends, traced = _ends(_slab(), _down(), settings=PathSettings(5, "all", min_throughput=0.039))
     # The inner reflection, 0.96 * 0.04, is below the cut: what enters leaves below, whole.
-    np.testing.assert_allclose(np.sort(ends.weights[:, 0]), [0.04, 0.96], atol=1e-6)
+    np.testing.assert_allclose(np.sort(ends.throughput[:, 0]), [0.04, 0.96], atol=1e-6)
     assert traced.casts == 4
     ends, _ = _ends(_slab(), _down(), settings=PathSettings(5, "all", min_throughput=0.041))
-    np.testing.assert_array_equal(ends.weights, 1.0)
+    np.testing.assert_array_equal(ends.throughput, 1.0)
 
 
 def test_where_both_branches_are_below_the_cut_the_stronger_one_takes_all():
     ends, _ = _ends(
         _slab(tint=(0.4, 0.3, 0.2)), _down(), settings=PathSettings(5, "all", min_throughput=0.5)
     )
-    np.testing.assert_allclose(ends.weights, [[0.16, 0.09, 0.04]], rtol=1e-5)
+    np.testing.assert_allclose(ends.throughput, [[0.16, 0.09, 0.04]], rtol=1e-5)
     assert ends.directions[0, 2] < 0.0
 
 
@@ -110,33 +110,33 @@ def test_the_tint_colours_every_crossing_and_every_reflection():
     expected = {1: r * tint, 2: t * t * tint**2, 3: t * t * r * tint**3}
     for bends, weight in expected.items():
         escaped = (ends.num_bends == bends) & (ends.statuses == PathStatus.ESCAPED)
-        np.testing.assert_allclose(ends.weights[escaped], weight[None], rtol=1e-4)
+        np.testing.assert_allclose(ends.throughput[escaped], weight[None], rtol=1e-4)
 
 
 def test_absorption_takes_light_by_the_length_of_the_way_inside():
     absorption = np.array([0.0, 1.0, 3.0])
     ends, _ = _ends(_slab(absorption=tuple(absorption)), _down(), settings=PathSettings(3, "none"))
-    np.testing.assert_allclose(ends.weights[0], np.exp(-0.5 * absorption), rtol=1e-5)
+    np.testing.assert_allclose(ends.throughput[0], np.exp(-0.5 * absorption), rtol=1e-5)
     slanted = scenes.rays([0.0, 0.0, 3.0], [0.6, 0.0, -0.8])
     ends, _ = _ends(_slab(absorption=tuple(absorption)), slanted, settings=PathSettings(3, "none"))
     length = 0.5 / np.sqrt(1.0 - (0.6 / 1.5) ** 2)
-    np.testing.assert_allclose(ends.weights[0], np.exp(-length * absorption), rtol=1e-5)
+    np.testing.assert_allclose(ends.throughput[0], np.exp(-length * absorption), rtol=1e-5)
 
 
 def test_an_opaque_tint_leaves_no_path():
     ends, traced = _ends(_slab(tint=(0.0, 0.0, 0.0)), _down(), settings=TREE)
     assert len(ends.rays) == 0
-    assert np.all(traced.lost == 0.0)
+    assert np.all(traced.dropped == 0.0)
 
 
 def test_a_total_reflection_may_end_the_path():
-    geometry = scenes.geometry(scenes.right_prism())
+    scene = scenes.build(scenes.right_prism())
     rays = scenes.rays([-2.0, 0.1, 0.3], [1.0, 0.0, 0.0])
     settings = PathSettings(10, "none", total_reflection="ended")
-    ends, _ = _ends(geometry, rays, settings=settings)
+    ends, _ = _ends(scene, rays, settings=settings)
     assert ends.statuses[0] == PathStatus.TOTALLY_REFLECTED
     np.testing.assert_allclose(ends.directions[0], [1.0, 0.0, 0.0], atol=1e-6)
-    followed, _ = _ends(geometry, rays, settings=PathSettings(10, "none"))
+    followed, _ = _ends(scene, rays, settings=PathSettings(10, "none"))
     assert followed.statuses[0] == PathStatus.ESCAPED
     np.testing.assert_allclose(followed.directions[0], [0.0, 0.0, -1.0], atol=1e-6)
 
@@ -157,22 +157,24 @@ def test_the_papers_ablations_differ_from_its_budget_in_one_thing_each():
     }
     rays = scenes.rays([-2.0, 0.1, 0.3], [1.0, 0.0, 0.0])
     followed = {
-        name: _ends(scenes.geometry(scenes.right_prism()), rays, settings=PATH_PRESETS[name])[0]
+        name: _ends(scenes.build(scenes.right_prism()), rays, settings=PATH_PRESETS[name])[0]
         for name in ("paper", *changed)
     }
     count = {name: len(ends.rays) for name, ends in followed.items()}
     assert count == {"paper": 2, "paper_no_reflection": 1, "paper_no_tir": 2}
-    main = {name: ends.directions[np.argmax(ends.weights[:, 0])] for name, ends in followed.items()}
+    main = {
+        name: ends.directions[np.argmax(ends.throughput[:, 0])] for name, ends in followed.items()
+    }
     np.testing.assert_allclose(main["paper"], [0.0, 0.0, -1.0], atol=1e-6)
     np.testing.assert_allclose(main["paper_no_reflection"], [0.0, 0.0, -1.0], atol=1e-6)
     np.testing.assert_allclose(main["paper_no_tir"], [1.0, 0.0, 0.0], atol=1e-6)
-    np.testing.assert_allclose(followed["paper_no_reflection"].weights, 1.0, atol=1e-6)
+    np.testing.assert_allclose(followed["paper_no_reflection"].throughput, 1.0, atol=1e-6)
 
 
 def test_light_that_goes_round_inside_a_ball_ends_by_its_budget():
-    geometry = scenes.geometry(scenes.ball(1.0, subdivisions=4))
+    scene = scenes.build(scenes.ball(1.0, subdivisions=4))
     inside = scenes.rays([0.98, 0.0, 0.0], [0.0, 1.0, 0.0])
-    ends, traced = _ends(geometry, inside, settings=_generous(TREE))
+    ends, traced = _ends(scene, inside, settings=_generous(TREE))
     assert ends.statuses.tolist() == [PathStatus.OUT_OF_BENDS]
     assert ends.num_bends[0] == TREE.max_bends
     assert traced.casts == TREE.max_bends + 1
@@ -188,9 +190,9 @@ def test_light_that_goes_round_inside_a_ball_ends_by_its_budget():
     ],
 )
 def test_untinted_light_is_conserved(settings):
-    geometry = scenes.geometry(scenes.ball(1.0))
-    ends, traced = _ends(geometry, _towards_a_ball(), settings=_generous(settings))
-    np.testing.assert_array_equal(traced.lost, 0.0)
+    scene = scenes.build(scenes.ball(1.0))
+    ends, traced = _ends(scene, _towards_a_ball(), settings=_generous(settings))
+    np.testing.assert_array_equal(traced.dropped, 0.0)
     np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-5)
 
 
@@ -198,30 +200,30 @@ def test_untinted_light_is_conserved(settings):
 def test_a_list_that_is_too_small_drops_the_least_light_and_returns_it(short_of):
     generous = _generous(PathSettings(6, "all"))
     scarce = dataclasses.replace(generous, **{short_of: 1.5})
-    geometry, rays = scenes.geometry(scenes.ball(1.0)), _towards_a_ball()
-    full, nothing_lost = _ends(geometry, rays, settings=generous)
-    ends, traced = _ends(geometry, rays, settings=scarce)
-    assert np.all(nothing_lost.lost == 0.0)
-    assert traced.lost.max() > 0.0
+    scene, rays = scenes.build(scenes.ball(1.0)), _towards_a_ball()
+    full, nothing_lost = _ends(scene, rays, settings=generous)
+    ends, traced = _ends(scene, rays, settings=scarce)
+    assert np.all(nothing_lost.dropped == 0.0)
+    assert traced.dropped.max() > 0.0
     np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-5)
     if short_of == "paths_per_ray":
         assert len(ends.rays) == capacities(scarce, 64).paths
-        strongest = np.sort(full.weights[:, 0])[::-1][: len(ends.rays)]
-        np.testing.assert_allclose(np.sort(ends.weights[:, 0])[::-1], strongest, rtol=1e-5)
+        strongest = np.sort(full.throughput[:, 0])[::-1][: len(ends.rays)]
+        np.testing.assert_allclose(np.sort(ends.throughput[:, 0])[::-1], strongest, rtol=1e-5)
 
 
 def _by_ray(ends):
-    order = np.lexsort((ends.directions[:, 0], -ends.weights[:, 0], ends.rays))
+    order = np.lexsort((ends.directions[:, 0], -ends.throughput[:, 0], ends.rays))
     return jax.tree.map(lambda x: x[order], ends)
 
 
 @pytest.mark.parametrize("block", [1, 7, 64])
 @pytest.mark.slow
 def test_the_block_of_a_round_changes_nothing(block):
-    geometry = scenes.geometry(scenes.box((1.0, 1.2, 1.4)))
+    scene = scenes.build(scenes.box((1.0, 1.2, 1.4)))
     rays = _towards_a_ball(32)
-    expected, all_at_once = _ends(geometry, rays, settings=TREE)
-    found, in_blocks = _ends(geometry, rays, settings=TREE, block=block)
+    expected, all_at_once = _ends(scene, rays, settings=TREE)
+    found, in_blocks = _ends(scene, rays, settings=TREE, block=block)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), _by_ray(found), _by_ray(expected)
     )
@@ -230,10 +232,10 @@ def test_the_block_of_a_round_changes_nothing(block):
 
 @pytest.mark.slow
 def test_ends_are_the_last_segments_of_the_paths():
-    geometry, rays = scenes.geometry(scenes.ball(1.0)), _towards_a_ball()
-    ends, _ = _ends(geometry, rays, settings=TREE)
+    scene, rays = scenes.build(scenes.ball(1.0)), _towards_a_ball()
+    ends, _ = _ends(scene, rays, settings=TREE)
     trace = functools.partial(path_tracing.trace, settings=TREE, capacity=len(ends.rays))
-    paths = jax.tree.map(np.asarray, jax.jit(trace)(geometry, rays).paths)
+    paths = jax.tree.map(np.asarray, jax.jit(trace)(scene, rays).paths)
     each = np.arange(len(paths.num_bends))
     lines = ends._replace(
         origins=paths.points[each, paths.num_bends],
@@ -241,7 +243,7 @@ def test_ends_are_the_last_segments_of_the_paths():
         tau=paths.tau[each, paths.num_bends],
         media=paths.media[each, paths.num_bends],
         rays=paths.rays,
-        weights=paths.weights,
+        throughput=paths.throughput,
         num_bends=paths.num_bends,
         statuses=paths.statuses,
     )
@@ -254,7 +256,7 @@ def test_no_wall_of_a_ten_thousandth_of_its_body_is_skipped(size):
     angles = np.radians([0.0, 30.0, 60.0, 85.0])
     directions = np.stack([np.sin(angles), 0.1 * np.sin(angles), -np.cos(angles)], axis=-1)
     rays = scenes.rays(-3.0 * size * directions, directions)
-    ends, _ = _ends(scenes.geometry(body), rays, settings=PathSettings(10, "none"))
+    ends, _ = _ends(scenes.build(body), rays, settings=PathSettings(10, "none"))
     np.testing.assert_array_equal(ends.num_bends, 2)
     np.testing.assert_array_equal(ends.statuses, PathStatus.ESCAPED)
     np.testing.assert_allclose(ends.directions, rays.directions, atol=2e-6)
@@ -274,12 +276,12 @@ def test_budgets_refuse_what_makes_no_sense():
 
 
 def test_nothing_is_nan_for_rays_that_meet_nothing_or_start_on_a_surface():
-    geometry = scenes.geometry(scenes.box())
+    scene = scenes.build(scenes.box())
     rays = scenes.rays(
         [[0.5, 0.1, 0.2], [0.5, 0.5, 0.5], [9.0, 0.0, 0.0], [0.0, 0.0, 0.0]],
         [[1.0, 0.0, 0.0], [-1.0, -1.0, -1.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]],
     )
     with jax.debug_nans(True):
-        ends, traced = _ends(geometry, rays, settings=TREE)
+        ends, traced = _ends(scene, rays, settings=TREE)
     np.testing.assert_allclose(_sums(ends, traced), 1.0, atol=1e-5)
     assert all(np.all(np.isfinite(x)) for x in (ends.origins, ends.directions, ends.tau))

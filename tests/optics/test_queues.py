@@ -9,7 +9,7 @@ from refref_jax.optics import queues
 
 
 class _Light(NamedTuple):
-    weights: jax.Array
+    throughput: jax.Array
     rays: jax.Array
 
 
@@ -19,39 +19,39 @@ def _light(values, rays=None):
     return _Light(jnp.asarray(np.repeat(values[:, None], 3, 1)), jnp.asarray(rays, jnp.int32))
 
 
-def _values(pool):
-    return np.asarray(pool.items.weights)[: int(pool.count), 0].tolist()
+def _values(queue):
+    return np.asarray(queue.items.throughput)[: int(queue.count), 0].tolist()
 
 
 def test_appending_keeps_the_order_of_what_is_kept():
-    pool = queues.fill(_light([1.0, 2.0]), 2, 8)
-    pool = queues.append(pool, _light([3.0, 4.0, 5.0]), jnp.array([True, False, True]))
-    assert _values(pool) == [1.0, 2.0, 3.0, 5.0]
-    pool = queues.append(pool, _light([6.0, 7.0]), jnp.array([False, False]))
-    assert _values(pool) == [1.0, 2.0, 3.0, 5.0]
+    queue = queues.fill(_light([1.0, 2.0]), 2, 8)
+    queue = queues.append(queue, _light([3.0, 4.0, 5.0]), jnp.array([True, False, True]))
+    assert _values(queue) == [1.0, 2.0, 3.0, 5.0]
+    queue = queues.append(queue, _light([6.0, 7.0]), jnp.array([False, False]))
+    assert _values(queue) == [1.0, 2.0, 3.0, 5.0]
 
 
 def test_appending_equals_a_list():
     generator = np.random.default_rng(0)
-    pool, expected = queues.fill(_light([]), 0, 100), []
+    queue, expected = queues.fill(_light([]), 0, 100), []
     for _ in range(10):
         block, keep = generator.random(7).astype(np.float32), generator.random(7) < 0.5
-        pool = queues.append(pool, _light(block), jnp.asarray(keep))
+        queue = queues.append(queue, _light(block), jnp.asarray(keep))
         expected += block[keep].tolist()
-    assert _values(pool) == expected
+    assert _values(queue) == expected
 
 
 @pytest.mark.parametrize("capacity", [0, 1, 3, 4, 9])
 def test_shedding_drops_the_weakest_and_says_whose(capacity):
     values, rays = [0.5, 0.1, 0.4, 0.2], [0, 1, 1, 2]
-    pool = queues.fill(_light(values, rays), 4, 6)
-    kept, lost = queues.shed(pool, jnp.zeros((3, 3)), capacity)
+    queue = queues.fill(_light(values, rays), 4, 6)
+    kept, dropped = queues.drop_weakest(queue, jnp.zeros((3, 3)), capacity)
     strongest = sorted(values, reverse=True)[:capacity]
     assert _values(kept) == pytest.approx([v for v in values if v in strongest])
     expected = np.zeros(3)
     for value, ray in zip(values, rays, strict=True):
         expected[ray] += 0.0 if value in strongest else value
-    np.testing.assert_allclose(lost, np.repeat(expected[:, None], 3, 1), atol=1e-7)
+    np.testing.assert_allclose(dropped, np.repeat(expected[:, None], 3, 1), atol=1e-7)
 
 
 def test_of_equally_strong_records_the_first_stay():

@@ -12,15 +12,15 @@ from refref_jax.sampling import polylines
 from tests.factories import scenes
 
 _RADIUS = 1e-3  # of every ray of tests.factories.scenes
-_GLASS = scenes.geometry(scenes.ball(1.0, subdivisions=3))
-_SLAB = scenes.geometry(scenes.box((10.0, 10.0, 0.6)))
+_GLASS = scenes.build(scenes.ball(1.0, subdivisions=3))
+_SLAB = scenes.build(scenes.box((10.0, 10.0, 0.6)))
 _THROUGH = PathSettings(max_bends=2, reflections="none")
 _WHOLE = Detail("all", TREE.max_bends + 1, "differential")
 
 
 @jax.jit
-def _traced(geometry, rays):
-    return path_tracing.trace(geometry, rays, settings=TREE, capacity=64, detail=_WHOLE).paths
+def _traced(scene, rays):
+    return path_tracing.trace(scene, rays, settings=TREE, capacity=64, detail=_WHOLE).paths
 
 
 def _one(paths, index):
@@ -55,7 +55,7 @@ def test_a_ray_that_meets_nothing_has_the_footprint_of_its_cone(t):
 def test_a_slab_narrows_a_footprint_by_its_index():
     rays = scenes.rays([0.1, 0.05, -4.0], [0.0, 0.0, 1.0])
     paths = _traced(_SLAB, rays)
-    through = int(np.argmax(paths.weights[:, 0]))
+    through = int(np.argmax(paths.throughput[:, 0]))
     # 3.7 through air, 0.6 through glass, 2 through air.
     axes = _footprint(_one(paths, through), 3.7 + 0.6 + 2.0)
     np.testing.assert_allclose(
@@ -103,7 +103,7 @@ def test_spreads_are_the_derivatives_of_the_differentiable_tracer(offset):
 def test_a_ball_of_glass_widens_pixels():
     ray = scenes.rays([0.9, 0.0, -4.0], [0.0, 0.0, 1.0])
     paths = _traced(_GLASS, ray)
-    through = int(np.argmax(paths.weights[:, 0]))
+    through = int(np.argmax(paths.throughput[:, 0]))
     path = _one(paths, through)
     axes = _footprint(path, float(path.tau[path.num_bends]) + 7.0)
     cone = _RADIUS * (float(path.tau[path.num_bends]) + 7.0)
@@ -111,14 +111,14 @@ def test_a_ball_of_glass_widens_pixels():
 
 
 @jax.jit
-def _legs(geometry, rays):
+def _legs(scene, rays):
     detail = Detail("outside", 4, "differential")
-    return path_tracing.trace(geometry, rays, settings=TREE, capacity=1024, detail=detail).paths
+    return path_tracing.trace(scene, rays, settings=TREE, capacity=1024, detail=detail).paths
 
 
 @pytest.mark.parametrize("index", [1.0, 1.0 + 1e-6, 1.5, 2.418])
 def test_spreads_are_finite_at_grazing_and_critical_angles(index):
-    glass = scenes.geometry(scenes.ball(1.0, index=index, subdivisions=2), scenes.box((3, 3, 1e-3)))
+    glass = scenes.build(scenes.ball(1.0, index=index, subdivisions=2), scenes.box((3, 3, 1e-3)))
     heights = np.concatenate([np.linspace(-1.0, 1.0, 41), 1.0 - np.logspace(-8, -2, 20)])
     rays = scenes.rays([[y, 0.0, -4.0] for y in heights], [0.0, 0.0, 1.0])
     for leaf in _legs(glass, rays).differentials:

@@ -33,7 +33,7 @@ def _begin(options):
             train._train(run, train.check_flags())
     except (ValueError, flags.Error) as error:
         return {"error": str(error)}
-    geometry = checkpoint_io.load_geometry(run)
+    scene = checkpoint_io.load_scene(run)
     body = object_source.read(run)
     return {
         "error": None,
@@ -41,8 +41,8 @@ def _begin(options):
         "body": body and vars(body),
         "indices": run_folder.read_config(run).scene.indices,
         "reconstruction": run_folder.read_config(run).scene.reconstruction,
-        "faces": len(np.unique(geometry.surfaces.bvh.triangles.reshape(-1, 9), axis=0)),
-        "inside": geometry.interfaces.index_inside.tolist(),
+        "faces": len(np.unique(scene.surfaces.bvh.triangles.reshape(-1, 9), axis=0)),
+        "inside": scene.interfaces.index_inside.tolist(),
     }
 
 

@@ -28,12 +28,12 @@ def train(mesh, *, steps, settings, kept=True, folder=None, resumed=None):
     """Returns what a run on some devices measured."""
     schedule = dataclasses.replace(CONFIG.schedule, steps=40)
     config = dataclasses.replace(CONFIG, schedule=schedule)
-    geometry = scenes.geometry(scenes.ball(1.3, subdivisions=2))
+    scene = scenes.build(scenes.ball(1.3, subdivisions=2))
     setup = loop.set_up(
-        config, MODEL, PATH_PRESETS[settings], geometry, small_model.sampler(), mesh=mesh
+        config, MODEL, PATH_PRESETS[settings], scene, small_model.sampler(), mesh=mesh
     )
     setup = setup if kept else setup._replace(epoch=None)
-    pool = setup.epoch or loop.trace_batches(setup, range(config.schedule.pool))
+    pool = setup.epoch or loop.trace_batches(setup, range(config.schedule.pretraced_batches))
     state = devices.put_everywhere(init_state(config.seed, MODEL, schedule), mesh=mesh)
     if resumed is not None:
         with Checkpoints(Path(resumed), keep=1) as checkpoints:
@@ -45,7 +45,7 @@ def train(mesh, *, steps, settings, kept=True, folder=None, resumed=None):
     if folder is not None:
         with Checkpoints(Path(folder), keep=1) as checkpoints:
             checkpoints.save(state)
-    weights = pool.traced.paths.weights
+    weights = pool.traced.paths.throughput
     return {
         "reports": [[float(value) for value in report] for report in reports],
         "params": [float(jnp.sum(jnp.abs(leaf))) for leaf in jax.tree.leaves(state.params)],

@@ -74,7 +74,7 @@ def test_corners_have_the_gradient_of_their_shares():
     slope = jax.grad(total)(jnp.zeros((16, 3)))
     # Each corner of each slot moves by the shares of its vertex.
     share = np.zeros(16)
-    corner = mesh.faces[rig.slots].ravel()
+    corner = mesh.faces[rig.primitive_faces].ravel()
     np.add.at(share, rig.handles[corner], rig.shares[corner])
     np.testing.assert_allclose(slope[:, 0], share, rtol=1e-4)
     np.testing.assert_allclose(slope[:, 1:], 0.0, atol=1e-6)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from refref_jax.data.meshes import MeshPart
-from refref_jax.data.scene_assembly import build_geometry
+from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import make_mesh
 from refref_jax.optics.scene import Scene
@@ -25,7 +25,7 @@ def truth():
 
 @pytest.fixture(scope="module")
 def evidence():
-    ball = scenes.geometry(scenes.ball(1.0, subdivisions=3))
+    ball = scenes.build(scenes.ball(1.0, subdivisions=3))
     return lit_scenes.evidence(ball, count=2048, contrast=3.0)[0]
 
 
@@ -37,7 +37,7 @@ def _dented(mesh):
 
 def _error(mesh, index, evidence):
     part = MeshPart("ball_glass", mesh.vertices, mesh.faces, index, "auto")
-    interfaces = build_geometry([part], [-1], rule="nested").interfaces
+    interfaces = assemble_scene([part], [-1], rule="nested").interfaces
     surfaces = pack_meshes([mesh])
     found = refractive_index.errors_at_index(
         np.float32(index),

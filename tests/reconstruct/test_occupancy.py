@@ -18,7 +18,8 @@ from tests.laws import gradients
 pytestmark = pytest.mark.longest
 
 _FIELD = OccupancyFieldConfig(
-    grid=HashGridConfig(levels=2, coarsest=4, finest=16, entries=1 << 13, features=2), width=16
+    grid=HashGridConfig(levels=2, base_res=4, max_res=16, hashmap_size=1 << 13, features=2),
+    width=16,
 )
 _SMALL = OccupancyTrainingConfig(field=_FIELD, steps=200, batch=512, scan=16, surface=64)
 _BOX = Box(np.array([-1.2, -1.5, -1.1]), np.array([1.3, 1.4, 1.2]))

@@ -24,7 +24,7 @@ _TRUE = 1.473
 
 @pytest.fixture(scope="module")
 def ball():
-    return scenes.geometry(scenes.ball(1.0, index=_TRUE, subdivisions=4))
+    return scenes.build(scenes.ball(1.0, index=_TRUE, subdivisions=4))
 
 
 @pytest.fixture(scope="module")

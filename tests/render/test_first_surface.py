@@ -9,7 +9,7 @@ from tests.factories import scenes
 
 def _cast(*parts, origins, directions, **options):
     return find_first_surface(
-        scenes.geometry(*parts).surfaces, scenes.rays(origins, directions), **options
+        scenes.build(*parts).surfaces, scenes.rays(origins, directions), **options
     )
 
 
@@ -47,7 +47,7 @@ def test_tiles_and_leading_axes_change_nothing():
     origins, directions = rng.normal(size=(2, 35, 3))
     whole = _cast(scenes.ball(), origins=origins, directions=directions)
     rays = jax.tree.map(lambda x: x.reshape(7, 5, *x.shape[1:]), scenes.rays(origins, directions))
-    cut = find_first_surface(scenes.geometry(scenes.ball()).surfaces, rays, tile=16)
+    cut = find_first_surface(scenes.build(scenes.ball()).surfaces, rays, tile=16)
     assert cut.distances.shape == (7, 5) and cut.normals.shape == (7, 5, 3)
     for one, other in zip(whole, cut, strict=True):
         np.testing.assert_array_equal(one, other.reshape(one.shape))
@@ -57,7 +57,7 @@ def test_an_empty_scene_and_no_rays_and_no_tile():
     missed = _cast(origins=[0.0, 0.0, 0.0], directions=[1.0, 0.0, 0.0])
     assert missed.distances[0] == np.inf and missed.parts[0] == NO_PART
     np.testing.assert_array_equal(missed.normals, [[0.0, 0.0, 0.0]])
-    surfaces = scenes.geometry(scenes.ball()).surfaces
+    surfaces = scenes.build(scenes.ball()).surfaces
     nothing = Rays(*(np.zeros((0, *shape), np.float32) for shape in ((3,), (3,), ())))
     assert find_first_surface(surfaces, nothing).distances.shape == (0,)
     with pytest.raises(ValueError, match="tile is"):

@@ -25,7 +25,7 @@ def tile():
 @pytest.fixture(scope="module")
 def model():
     params = init_params(jax.random.key(0), MODEL)
-    return Model(MODEL, PAPER, scenes.geometry(scenes.ball(1.3, subdivisions=2)), params)
+    return Model(MODEL, PAPER, scenes.build(scenes.ball(1.3, subdivisions=2)), params)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_one_ray_through_glass_has_the_room_of_its_tile(model, rays, monkeypatch
     middle = jax.tree.map(lambda x: x[8, 8:9], rays)
     seen = render_image(model._replace(settings=scarce), middle)
     images._trace_tile.clear_cache()
-    np.testing.assert_array_equal(seen.lost, 0.0)
+    np.testing.assert_array_equal(seen.dropped, 0.0)
     np.testing.assert_allclose(seen.accumulation, 1.0, atol=1e-5)
 
 
@@ -113,18 +113,16 @@ def test_rays_that_only_fill_up_a_tile_are_not_rendered(model, rays):
     flat = Rays(*(x.reshape(256, *x.shape[2:])[:200] for x in rays))
     full, _ = images.cut_out(flat, None, 0, 256)
     assert full.radii.shape == (256,)
-    tile = images._trace_tile(model.geometry, full, 200, settings=STRAIGHT, detail=everything(0))
+    tile = images._trace_tile(model.scene, full, 200, settings=STRAIGHT, detail=everything(0))
     assert int(tile.count) == 200
 
 
 def test_rays_that_miss_pay_nothing_for_reflection(model, rays):
     flat = Rays(*(x.reshape(256, *x.shape[2:]) for x in rays))
     paper = images._trace_tile(
-        model.geometry, flat, 256, settings=PAPER, detail=everything(PAPER.max_bends)
+        model.scene, flat, 256, settings=PAPER, detail=everything(PAPER.max_bends)
     )
-    straight = images._trace_tile(
-        model.geometry, flat, 256, settings=STRAIGHT, detail=everything(0)
-    )
+    straight = images._trace_tile(model.scene, flat, 256, settings=STRAIGHT, detail=everything(0))
     count = int(paper.count)
     reflections = np.asarray(paper.paths.statuses)[:count] == PathStatus.NOT_TRACED
     hits = np.sum((np.asarray(paper.paths.num_bends)[:count] > 0) & ~reflections)

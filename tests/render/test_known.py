@@ -29,26 +29,26 @@ _WHITE = _environment_of(np.ones((8, 16, 3)))
 
 
 @pytest.fixture(scope="module")
-def geometry():
-    return scenes.geometry(_BALL)
+def scene():
+    return scenes.build(_BALL)
 
 
 @pytest.fixture(scope="module")
-def whole(geometry, rays):
-    return render_known(geometry, _environment(), rays, settings=TREE, tile=256)
+def whole(scene, rays):
+    return render_known(scene, _environment(), rays, settings=TREE, tile=256)
 
 
-def test_straight_rays_see_the_background_itself(geometry, rays):
+def test_straight_rays_see_the_background_itself(scene, rays):
     radiance = _environment()
-    seen = render_known(geometry, radiance, rays, settings=STRAIGHT, tile=100)
+    seen = render_known(scene, radiance, rays, settings=STRAIGHT, tile=100)
     flat = (jnp.asarray(x.reshape(-1, 3)) for x in rays[:2])
     expected = jax.vmap(radiance)(*flat).reshape(seen.linear.shape)
     np.testing.assert_allclose(seen.linear, expected, rtol=1e-5)
-    assert seen.casts == 0 and np.all(seen.paths == 1) and np.all(seen.lost == 0.0)
+    assert seen.casts == 0 and np.all(seen.paths == 1) and np.all(seen.dropped == 0.0)
 
 
 def test_an_image_has_the_shape_of_its_rays(whole):
-    assert whole.rgb.shape == whole.linear.shape == whole.lost.shape == (16, 16, 3)
+    assert whole.rgb.shape == whole.linear.shape == whole.dropped.shape == (16, 16, 3)
     assert whole.paths.shape == (16, 16)
     srgb = np.clip(colours.linear_to_srgb(whole.linear), 0.0, 1.0)
     np.testing.assert_allclose(whole.rgb, srgb, atol=1e-6)
@@ -62,9 +62,9 @@ def test_an_image_has_the_shape_of_its_rays(whole):
     ids=["straight", "paper", "tree"],
 )
 @pytest.mark.slow
-def test_the_size_of_a_tile_does_not_matter(geometry, rays, settings):
-    one = render_known(geometry, _environment(), rays, settings=settings, tile=256)
-    pieces = render_known(geometry, _environment(), rays, settings=settings, tile=100)
+def test_the_size_of_a_tile_does_not_matter(scene, rays, settings):
+    one = render_known(scene, _environment(), rays, settings=settings, tile=256)
+    pieces = render_known(scene, _environment(), rays, settings=settings, tile=100)
     np.testing.assert_allclose(pieces.linear, one.linear, atol=1e-5)
     np.testing.assert_array_equal(pieces.paths, one.paths)
     assert pieces.casts == one.casts
@@ -73,52 +73,50 @@ def test_the_size_of_a_tile_does_not_matter(geometry, rays, settings):
 @pytest.mark.parametrize(
     "settings", [pytest.param(PAPER, marks=pytest.mark.slow), TREE], ids=["paper", "tree"]
 )
-def test_clear_glass_before_white_is_white(geometry, rays, settings):
-    seen = render_known(geometry, _WHITE, rays, settings=settings, tile=256)
-    np.testing.assert_allclose(seen.linear + seen.lost, 1.0, atol=1e-5)
+def test_clear_glass_before_white_is_white(scene, rays, settings):
+    seen = render_known(scene, _WHITE, rays, settings=settings, tile=256)
+    np.testing.assert_allclose(seen.linear + seen.dropped, 1.0, atol=1e-5)
 
 
-def test_lost_light_is_told(geometry, rays):
+def test_lost_light_is_told(scene, rays):
     tight = dataclasses.replace(TREE, min_throughput=0.0, max_bends=6, paths_per_ray=1.0)
-    seen = render_known(geometry, _WHITE, rays, settings=tight, tile=256)
-    assert np.max(seen.lost) > 0.0
-    np.testing.assert_allclose(seen.linear + seen.lost, 1.0, atol=1e-5)
+    seen = render_known(scene, _WHITE, rays, settings=tight, tile=256)
+    assert np.max(seen.dropped) > 0.0
+    np.testing.assert_allclose(seen.linear + seen.dropped, 1.0, atol=1e-5)
 
 
-def test_a_function_of_the_user_s_sees_origins_and_directions(geometry, rays):
-    seen = render_known(
-        geometry, lambda o, d: o / 10.0 + d + 2.0, rays, settings=STRAIGHT, tile=256
-    )
+def test_a_function_of_the_user_s_sees_origins_and_directions(scene, rays):
+    seen = render_known(scene, lambda o, d: o / 10.0 + d + 2.0, rays, settings=STRAIGHT, tile=256)
     np.testing.assert_allclose(seen.linear, rays.origins / 10.0 + rays.directions + 2.0, rtol=1e-6)
 
 
-def test_backgrounds_are_arguments_of_one_program(geometry, rays):
-    first = render_known(geometry, _environment(1), rays, settings=TREE, tile=256)
+def test_backgrounds_are_arguments_of_one_program(scene, rays):
+    first = render_known(scene, _environment(1), rays, settings=TREE, tile=256)
     compiled = background_rendering._render_tile._cache_size()
-    second = render_known(geometry, _environment(2), rays, settings=TREE, tile=256)
+    second = render_known(scene, _environment(2), rays, settings=TREE, tile=256)
     assert background_rendering._render_tile._cache_size() == compiled
     assert np.max(np.abs(first.linear - second.linear)) > 0.1
 
 
-def test_no_rays_give_an_empty_rendering(geometry):
+def test_no_rays_give_an_empty_rendering(scene):
     none = Rays(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
-    seen = render_known(geometry, _WHITE, none, settings=TREE)
+    seen = render_known(scene, _WHITE, none, settings=TREE)
     assert seen.linear.shape == (0, 3) and seen.paths.shape == (0,) and seen.casts == 0
 
 
-def test_a_tile_without_rays_is_refused(geometry, rays):
+def test_a_tile_without_rays_is_refused(scene, rays):
     with pytest.raises(ValueError, match="Give 1 or more"):
-        render_known(geometry, _WHITE, rays, settings=TREE, tile=0)
+        render_known(scene, _WHITE, rays, settings=TREE, tile=0)
 
 
 def test_a_camera_inside_a_body_is_told_by_the_rule_of_priorities():
-    geometry = scenes.geometry(_BALL, rule="priority")
+    scene = scenes.build(_BALL, rule="priority")
     rays = scenes.rays([[0.0, 0.0, 0.0]] * 3, np.eye(3))
     inside = parts_around([_BALL], np.asarray(rays.origins))
     settings = dataclasses.replace(TREE, reflections="none")
     # Seen from its centre a ball bends nothing, so directions stay as they are.
     seen = render_known(
-        geometry, lambda o, d: d + 1.0 + 0.0 * o, rays, settings=settings, inside=inside, tile=4
+        scene, lambda o, d: d + 1.0 + 0.0 * o, rays, settings=settings, interior_list=inside, tile=4
     )
     np.testing.assert_allclose(seen.linear, 1.0 + np.eye(3), atol=0.05)
     assert seen.casts == 6

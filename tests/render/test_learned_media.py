@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from refref_jax.render import learned_media
-from refref_jax.render.learned_media import Dyes
+from refref_jax.render.learned_media import LearnedTints
 from tests.factories import made_paths
 from tests.laws import gradients
 
@@ -26,9 +26,13 @@ def test_parts_begin_nearly_clear():
 
 
 def test_light_is_dimmed_at_every_meeting_and_along_every_passage():
-    made = Dyes(jnp.array([[0.3, -1.0, 2.0], [0.0, 1.0, -4.0]]), jnp.array([[1.0, 0, 2]] * 2))
+    made = LearnedTints(
+        jnp.array([[0.3, -1.0, 2.0], [0.0, 1.0, -4.0]]), jnp.array([[1.0, 0, 2]] * 2)
+    )
     hit_counts, path_lengths = [[0, 0], [2, 0], [1, 3]], [[0, 0], [0.5, 0], [1.5, 2.0]]
-    dimmed = learned_media.dye(made, _paths(hit_counts, path_lengths), radius=_RADIUS).weights
+    dimmed = learned_media.attenuate(
+        made, _paths(hit_counts, path_lengths), radius=_RADIUS
+    ).throughput
     tint, absorption = (
         np.asarray(learned_media.tints(made)),
         np.asarray(learned_media.absorptions(made, _RADIUS)),
@@ -40,24 +44,26 @@ def test_light_is_dimmed_at_every_meeting_and_along_every_passage():
 
 
 def test_optical_density_by_hand():
-    made = Dyes(jnp.log(jnp.expm1(jnp.array([[0.5, 1.0, 1.5]]))), jnp.full((1, 3), -200.0))
+    made = LearnedTints(jnp.log(jnp.expm1(jnp.array([[0.5, 1.0, 1.5]]))), jnp.full((1, 3), -200.0))
     np.testing.assert_allclose(learned_media.optical_density(made), 1.0, rtol=1e-6)
     assert learned_media.optical_density(None) == 0.0
 
 
 def test_without_dyes_paths_stay_as_they_are():
     paths = _paths([[1.0]], [[2.0]])
-    assert learned_media.dye(None, paths, radius=_RADIUS) is paths
+    assert learned_media.attenuate(None, paths, radius=_RADIUS) is paths
 
 
 @pytest.mark.parametrize("raw", [-200.0, -30.0, -3.0, 0.0, 5.0, 200.0])
 def test_tints_are_factors_with_finite_gradients(raw):
-    made = Dyes(*[jnp.full((1, 3), raw)] * 2)
+    made = LearnedTints(*[jnp.full((1, 3), raw)] * 2)
     tint = np.asarray(learned_media.tints(made))
     assert np.all((tint >= 0.0) & (tint <= 1.0))
 
     def light(made):
-        return jnp.sum(learned_media.dye(made, _paths([[24.0]], [[1e3]]), radius=_RADIUS).weights)
+        return jnp.sum(
+            learned_media.attenuate(made, _paths([[24.0]], [[1e3]]), radius=_RADIUS).throughput
+        )
 
     assert gradients.all_finite(jax.grad(light)(made))
 
@@ -67,11 +73,13 @@ def test_dye_check_grads():
 
     def light(density, absorption):
         wide = paths._replace(
-            weights=paths.weights.astype(density.dtype),
+            throughput=paths.throughput.astype(density.dtype),
             hit_counts=paths.hit_counts.astype(density.dtype),
             path_lengths=paths.path_lengths.astype(density.dtype),
         )
-        return learned_media.dye(Dyes(density, absorption), wide, radius=_RADIUS).weights
+        return learned_media.attenuate(
+            LearnedTints(density, absorption), wide, radius=_RADIUS
+        ).throughput
 
     rng = np.random.default_rng(0)
     gradients.assert_numerical(light, *rng.normal(size=(2, 2, 3)))

@@ -34,22 +34,22 @@ _SLOW = "glass ball, path tree"
 )
 def test_render_ray_equals_render_rays(name):
     config, settings, parts = _SCENES[name]
-    model = Model(config, settings, scenes.geometry(*parts), _params(config))
+    model = Model(config, settings, scenes.build(*parts), _params(config))
     rays = scenes.rays([[-4.0, 0.21, 0.33]], [1.0, 0.02, 0.01])
     expected = _compiled(model, rays)
     assert expected.distance[0] > 0.0
     got = render_ray(model, jax.tree.map(lambda x: x[0], rays))
     np.testing.assert_allclose(got, expected.rgb[0], atol=2e-6)
     # The object bends the ray: its background is not that of a straight one.
-    ends = scenes.trace_ends(model.geometry, rays, settings=settings).ends
+    ends = scenes.trace_ends(model.scene, rays, settings=settings).ends
     assert np.max(ends.num_bends) >= 2
 
 
 def _compiled(model, rays):
-    def render(params, geometry):
-        return render_rays(model._replace(params=params, geometry=geometry), rays)
+    def render(params, scene):
+        return render_rays(model._replace(params=params, scene=scene), rays)
 
-    return jax.jit(render)(model.params, model.geometry)
+    return jax.jit(render)(model.params, model.scene)
 
 
 def _params(config):

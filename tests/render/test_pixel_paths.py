@@ -37,11 +37,11 @@ def test_a_slab_seen_head_on_has_the_paths_of_a_textbook(straight_down):
     assert np.allclose(mirrored, [[*x, 4.0], [*x, 0.5], [*x, 2.5]], atol=1e-5)
     assert np.allclose(twice, [[*x, 4.0], [*x, 0.5], [*x, -0.5], [*x, 0.5], [*x, 2.5]], atol=1e-5)
     expected = [(1 - r) ** 2, r, r * (1 - r) ** 2]
-    np.testing.assert_allclose(paths.weights[:3].mean(-1), expected, rtol=0.05)
+    np.testing.assert_allclose(paths.throughput[:3].mean(-1), expected, rtol=0.05)
     assert paths.num_bends[:3].tolist() == [2, 1, 3]
     assert set(paths.statuses) <= {PathStatus.ESCAPED, PathStatus.OUT_OF_BENDS}
-    np.testing.assert_allclose(paths.weights.sum(0) + paths.lost, 1.0, atol=1e-5)
-    assert np.all(np.diff(paths.weights.mean(-1)) <= 0.0)
+    np.testing.assert_allclose(paths.throughput.sum(0) + paths.dropped, 1.0, atol=1e-5)
+    assert np.all(np.diff(paths.throughput.mean(-1)) <= 0.0)
 
 
 def test_pieces_are_the_tree_with_each_segment_once(straight_down):
@@ -64,7 +64,7 @@ def test_pieces_are_the_tree_with_each_segment_once(straight_down):
         for i in range(len(keys))
         if any(np.array_equal(pieces.ends[i], x) for x in last)
     )
-    assert total == pytest.approx(straight_down.weights.mean(-1).sum(), abs=1e-5)
+    assert total == pytest.approx(straight_down.throughput.mean(-1).sum(), abs=1e-5)
 
 
 def test_a_ray_that_meets_nothing_is_one_straight_line(slab):
@@ -73,7 +73,7 @@ def test_a_ray_that_meets_nothing_is_one_straight_line(slab):
     )
     assert paths.statuses == (PathStatus.MISSED,) and paths.num_bends.tolist() == [0]
     np.testing.assert_allclose(paths.polylines[0], [[0, 0, 4], [0, 0, 6]], atol=1e-6)
-    np.testing.assert_array_equal(paths.weights, [[1.0, 1.0, 1.0]])
+    np.testing.assert_array_equal(paths.throughput, [[1.0, 1.0, 1.0]])
 
 
 def test_in_a_bounded_scene_last_segments_end_at_its_walls(slab):
@@ -88,7 +88,7 @@ def test_in_a_bounded_scene_last_segments_end_at_its_walls(slab):
 
 
 def test_geometry_alone_needs_a_budget(slab):
-    with pytest.raises(ValueError, match="Give a budget"):
+    with pytest.raises(ValueError, match="Give path settings"):
         pixel_paths.trace_pixel(slab, _ray((0, 0, 4), (0, 0, 1)))
 
 
@@ -105,7 +105,7 @@ def test_the_table_says_number_status_and_weights():
     assert "**4 light paths**" in table
     assert "| 1 | 80.00 % | 0.800, 0.800, 0.800 | 0 | left the objects |" in table
     assert table.count("\n| ") == 4 and "and 1 more, 1 % together" in table
-    assert "1 % of the light found no room" in table
-    one = pixel_paths.describe(_made([1.0])._replace(lost=np.zeros(3)))
+    assert "1 % of the throughput was dropped" in table
+    one = pixel_paths.describe(_made([1.0])._replace(dropped=np.zeros(3)))
     assert "**1 light path**" in one and "ran out of bends" in one and "room" not in one
     assert set(pixel_paths.ENDINGS) == set(PathStatus) - {PathStatus.EMPTY}

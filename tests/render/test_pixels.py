@@ -60,7 +60,7 @@ def _paths():
         items.append(
             path._replace(
                 rays=jnp.int32(owner),
-                weights=jnp.asarray(share, jnp.float32),
+                throughput=jnp.asarray(share, jnp.float32),
                 statuses=jnp.int32(status),
             )
         )
@@ -77,7 +77,7 @@ def _encoded(linear):
 def test_the_paths_of_a_ray_are_blended_by_their_weights_in_linear_space():
     paths = _paths()
     seen = _render(paths)
-    weights, rgb = (np.asarray(x, np.float64) for x in (paths.weights, seen.paths.composite.rgb))
+    weights, rgb = (np.asarray(x, np.float64) for x in (paths.throughput, seen.paths.composite.rgb))
     expected = weights[0] * rgb[0] + weights[2] * rgb[2] + weights[3] * rgb[3]
     np.testing.assert_allclose(seen.rgb[0], _encoded(expected), atol=_COLOUR)
     np.testing.assert_allclose(seen.rgb[1], _encoded(rgb[1]), atol=_COLOUR)
@@ -113,23 +113,23 @@ def test_the_order_of_paths_does_not_matter():
 def test_splitting_a_path_into_two_halves_changes_nothing():
     paths = _paths()
     copied = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[[0, 1, 2, 3, 0, 5]]), paths)
-    share = np.array(copied.weights)
+    share = np.array(copied.throughput)
     share[[0, 4]] *= 0.5
-    halves = copied._replace(weights=jnp.asarray(share))
+    halves = copied._replace(throughput=jnp.asarray(share))
     np.testing.assert_allclose(_render(halves).rgb, _render(paths).rgb, atol=_COLOUR)
 
 
 def test_colours_are_not_clipped():
     paths = _paths()
-    bright = paths._replace(weights=10.0 * paths.weights)
+    bright = paths._replace(throughput=10.0 * paths.throughput)
     assert (_render(bright).rgb[1] > 1.0).any()
-    dark = _render(paths._replace(weights=-1.0 * paths.weights)).rgb[1]
+    dark = _render(paths._replace(throughput=-1.0 * paths.throughput)).rgb[1]
     np.testing.assert_allclose(dark, -12.92 * _render(paths).paths.composite.rgb[1], atol=_COLOUR)
 
 
 def test_rendering_is_linear_in_the_weights():
     paths = _paths()
-    zero = _render(paths._replace(weights=0.0 * paths.weights)).rgb
+    zero = _render(paths._replace(throughput=0.0 * paths.throughput)).rgb
     np.testing.assert_array_equal(zero, np.zeros((_RAYS, 3)))
 
 

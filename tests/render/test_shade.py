@@ -23,7 +23,7 @@ def _paths():
     return paths._replace(
         directions=paths.directions.at[3].set(0.0),
         rays=jnp.array([1, 1, 0, 0], jnp.int32),
-        weights=jnp.array([0.75, 0.25, 0.5, 9.0])[:, None] * jnp.ones((1, 3)),
+        throughput=jnp.array([0.75, 0.25, 0.5, 9.0])[:, None] * jnp.ones((1, 3)),
         statuses=paths.statuses.at[3].set(PathStatus.EMPTY),
     )
 
@@ -81,13 +81,13 @@ def test_a_radiance_function_gives_three_numbers(wrong):
 
 
 def test_it_sees_what_a_picture_shows():
-    glass = scenes.geometry(scenes.ball(1.3, subdivisions=2))
+    glass = scenes.build(scenes.ball(1.3, subdivisions=2))
     rays = image_rays(orbit(1, distance=4.0, elevation=0.3, size=8, angle_x=0.8), 0)
     sky = lambda origin, direction: 0.5 + 0.5 * direction
     roomy = dataclasses.replace(TREE, live_per_ray=20.0, paths_per_ray=20.0)
-    picture = render_known(glass, sky, rays, settings=TREE)
+    image = render_known(glass, sky, rays, settings=TREE)
     flat = jax.tree.map(lambda x: jnp.asarray(x.reshape(64, *x.shape[2:])), rays)
     traced = jax.jit(lambda rays: path_tracing.trace(glass, rays, settings=roomy))(flat)
-    np.testing.assert_array_equal(traced.lost, 0.0)
+    np.testing.assert_array_equal(traced.dropped, 0.0)
     seen = shade(traced.paths, sky, rays=64)
-    np.testing.assert_allclose(seen, picture.linear.reshape(64, 3), atol=2e-5)
+    np.testing.assert_allclose(seen, image.linear.reshape(64, 3), atol=2e-5)

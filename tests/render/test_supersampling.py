@@ -17,7 +17,7 @@ _CHUNK = 512
 @pytest.fixture(scope="module")
 def model():
     params = init_params(jax.random.key(0), MODEL)
-    return Model(MODEL, STRAIGHT, scenes.geometry(scenes.ball(1.3, subdivisions=1)), params)
+    return Model(MODEL, STRAIGHT, scenes.build(scenes.ball(1.3, subdivisions=1)), params)
 
 
 @pytest.mark.parametrize(("rays", "side"), [(1, 1), (4, 2), (9, 3), (16, 4), (49, 7)])

@@ -116,7 +116,7 @@ def test_lists_are_filled_up_with_empty_slots(multiple, room):
     filled = light_paths.filled_up(paths, multiple=multiple)
     assert filled.radii.shape == (room,)
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[:3], b), filled, paths)
-    assert (filled.statuses[3:] == PathStatus.EMPTY).all() and not np.any(filled.weights[3:])
+    assert (filled.statuses[3:] == PathStatus.EMPTY).all() and not np.any(filled.throughput[3:])
     # Of an empty slot everything is a number that a full one may have.
     jax.tree.map(
         lambda a, b: np.testing.assert_array_equal(a[-1], b[2]), filled.points, paths.points
@@ -125,10 +125,10 @@ def test_lists_are_filled_up_with_empty_slots(multiple, room):
 
 @pytest.mark.slow
 def test_a_mesh_of_one_device_trains_as_no_mesh():
-    geometry = scenes.geometry(scenes.ball(1.3, subdivisions=1))
+    scene = scenes.build(scenes.ball(1.3, subdivisions=1))
     curves = []
     for mesh in (None, Mesh(jax.devices()[:1], (devices.AXIS,))):
-        setup = loop.set_up(CONFIG, MODEL, STRAIGHT, geometry, small_model.sampler(), mesh=mesh)
+        setup = loop.set_up(CONFIG, MODEL, STRAIGHT, scene, small_model.sampler(), mesh=mesh)
         state = init_state(CONFIG.seed, MODEL, CONFIG.schedule)
         state = devices.put_everywhere(state, mesh=mesh)
         steps = loop.run_steps(setup, state, 12)

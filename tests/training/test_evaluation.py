@@ -23,10 +23,10 @@ _NOTHING = Perceptual()
 _KINDS = ("distance", "surface", "substituted")
 
 
-def _seen(rgb, distance=1.0, lost=0.0):
+def _seen(rgb, distance=1.0, dropped=0.0):
     shape = rgb.shape[:2]
     grey = np.full(shape, np.float32(distance))
-    return Rendering(rgb, grey, grey, grey, rgb, np.full((*shape, 3), np.float32(lost)))
+    return Rendering(rgb, grey, grey, grey, rgb, np.full((*shape, 3), np.float32(dropped)))
 
 
 def _truth(masks, distances):
@@ -52,12 +52,12 @@ _GREY = np.full((16, 16, 3), np.float32(0.1))
 
 
 def test_all_measures_by_hand():
-    found = _measure(_seen(_GREY, distance=3.0, lost=0.25), _truth(_top_rows(), _ones()))
+    found = _measure(_seen(_GREY, distance=3.0, dropped=0.25), _truth(_top_rows(), _ones()))
     assert found["psnr"] == pytest.approx(20.0, abs=1e-6)
     assert found["psnr_masked"] == pytest.approx(20.0, abs=1e-6)
     assert found["distance_mae"] == found["distance_mae_masked"] == pytest.approx(2.0)
     assert found["distance_rmse"] == found["distance_rmse_masked"] == pytest.approx(2.0)
-    assert found["lost"] == 0.25
+    assert found["dropped"] == 0.25
     assert found["lpips"] is found["flip"] is None
 
 
@@ -167,7 +167,7 @@ def test_eyes_are_asked_where_they_are_at_hand(tmp_path):
 
 def _model(settings):
     params = init_params(jax.random.key(0), MODEL)
-    return Model(MODEL, settings, scenes.geometry(scenes.ball(1.3, subdivisions=1)), params)
+    return Model(MODEL, settings, scenes.build(scenes.ball(1.3, subdivisions=1)), params)
 
 
 def test_evaluating_is_rendering_and_measuring_view_by_view(ball_scene):

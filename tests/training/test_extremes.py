@@ -92,7 +92,7 @@ def _step(case, batch, params, target, *, step=2):
     order = jnp.arange(len(names), dtype=jnp.int32)
     state, report = loop.train_steps(
         state,
-        loop.Pool(traced, jnp.asarray(rgb), order),
+        loop.PretracedBatches(traced, jnp.asarray(rgb), order),
         first,
         first + 1,
         config=config,
@@ -133,12 +133,12 @@ def test_without_light_only_what_does_not_need_it_is_learned(batch):
     case = _case("absorbing", "float32")
     gradient, _, report = _step(case, batch, extremes.parameters(case[1])["trained"], 200)
     # Learned colours only fade, by the weight of their own loss.
-    assert np.all(gradient.dyes.density > 0.0) and np.all(gradient.dyes.absorption > 0.0)
+    assert np.all(gradient.tints.density > 0.0) and np.all(gradient.tints.absorption > 0.0)
     assert not np.any(extremes.colour_bias(gradient))
     assert all(np.any(table) for table in hash_grid.tables(gradient))
-    fading = learned_media.optical_density(extremes.parameters(case[1])["trained"].dyes)
+    fading = learned_media.optical_density(extremes.parameters(case[1])["trained"].tints)
     expected = (200 / 255.0) ** 2 + _CONFIG.losses.hash_decay * report.hash_decay
-    expected += _CONFIG.losses.dye_decay * fading
+    expected += _CONFIG.losses.tint_decay * fading
     if batch == "all empty":
         assert report.interlevel == report.distortion == 0.0
         np.testing.assert_allclose(report.loss, expected, rtol=1e-6)
@@ -147,12 +147,12 @@ def test_without_light_only_what_does_not_need_it_is_learned(batch):
 @pytest.mark.slow
 def test_light_that_found_no_room_is_told():
     config, model, names, traced = _case("field", "float32")
-    some = traced._replace(lost=traced.lost.at[:, 0].set(jnp.array([0.3, 0.6, 0.0])))
+    some = traced._replace(dropped=traced.dropped.at[:, 0].set(jnp.array([0.3, 0.6, 0.0])))
     params = extremes.parameters(model)["trained"]
     _, _, report = _step((config, model, names, some), "ordinary", params, 128)
-    np.testing.assert_allclose(report.lost, 0.9 / (3 * extremes.RAYS), rtol=1e-6)
+    np.testing.assert_allclose(report.dropped, 0.9 / (3 * extremes.RAYS), rtol=1e-6)
     _, _, report = _step((config, model, names, traced), "ordinary", params, 128)
-    assert report.lost == 0.0
+    assert report.dropped == 0.0
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from refref_jax.training import fit, run_folder
 from refref_jax.training.config import TrainConfig
 from tests.processes.command import ROOT
 
-pytestmark = pytest.mark.loose
+pytestmark = [pytest.mark.loose, pytest.mark.longest]
 
 
 def _script():
@@ -124,7 +124,7 @@ def test_a_run_is_resumed_with_its_scene_where_it_is_now_and_all_is_reported(
 def test_fit_takes_objects_in_place_of_the_meshes_and_stops_when_it_is_asked_to(tmp_path):
     scene = ROOT / "experiments" / "data" / "cube_smcvx_ball"
     (part,) = meshes.read_meshes(scene)
-    config = TrainConfig().override(scene=scene, steps=30, batch=64, pool=4)
+    config = TrainConfig().override(scene=scene, steps=30, batch=64, pretraced_batches=4)
     asked, lines = [], []
 
     def stop():
@@ -134,6 +134,6 @@ def test_fit_takes_objects_in_place_of_the_meshes_and_stops_when_it_is_asked_to(
     part = part._replace(index=1.25)
     out = {"out": tmp_path / "run", "report": lines.append}
     model = fit.fit(config, **out, parts=[part], stop=stop)
-    assert model.geometry.interfaces.index_inside.tolist() == [1.25]
+    assert model.scene.interfaces.index_inside.tolist() == [1.25]
     assert 0 < checkpoint_io.latest_step(tmp_path / "run") < 30
     assert lines[-1].startswith("Stopped at step ")

@@ -2,6 +2,7 @@ import dataclasses
 import itertools
 import json
 import shutil
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import pytest
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, capacities
 from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import load_model
-from refref_jax.render.model import path_detail
+from refref_jax.render.model import Params, path_detail
 from refref_jax.training import loop, run_folder
 from refref_jax.training.loop import init_state
 from refref_jax.training.run_folder import Checkpoints
@@ -20,7 +21,7 @@ from tests.factories.small_model import CONFIG, MODEL, SAVED
 
 pytestmark = [pytest.mark.loose, pytest.mark.longest]
 
-_GEOMETRY = scenes.geometry(scenes.ball(1.3, subdivisions=2))
+_GEOMETRY = scenes.build(scenes.ball(1.3, subdivisions=2))
 
 
 def _setup(config=CONFIG, settings=PAPER):
@@ -64,6 +65,26 @@ def test_a_resumed_run_continues_bit_for_bit(tmp_path, pause):
     _assert_identical(early + late, reports)
 
 
+class _ParamsOfBefore(NamedTuple):
+    proposals: Any
+    field: Any
+    dyes: Any
+
+
+def test_a_checkpoint_of_an_earlier_version_is_read(tmp_path):
+    config = dataclasses.replace(MODEL, interior="absorbing", learned_tints=2)
+    state = init_state(CONFIG.seed, config, CONFIG.schedule)
+    before = jax.tree.map(
+        lambda x: _ParamsOfBefore(*x) if isinstance(x, Params) else x,
+        state,
+        is_leaf=lambda x: isinstance(x, Params),
+    )
+    with Checkpoints(tmp_path, keep=1) as checkpoints:
+        checkpoints.save(before)
+    with Checkpoints(tmp_path, keep=1) as checkpoints:
+        _assert_identical(checkpoints.restore(state), state)
+
+
 @pytest.mark.parametrize("every", [pytest.param((3,), marks=pytest.mark.slow), (4,), (10, 5)])
 def test_steps_taken_at_once_are_the_same_steps(every):
     one_by_one = {
@@ -95,11 +116,11 @@ def test_a_run_resumed_within_a_pool_may_take_other_strides(tmp_path):
 
 def test_one_pool_is_traced_ahead_and_no_more(monkeypatch):
     traced = []
-    trace_pool = loop.trace_pool
+    pretrace = loop.pretrace
     noted = lambda *arguments, **options: (
-        traced.append(len(traced)) or trace_pool(*arguments, **options)
+        traced.append(len(traced)) or pretrace(*arguments, **options)
     )
-    monkeypatch.setattr(loop, "trace_pool", noted)
+    monkeypatch.setattr(loop, "pretrace", noted)
     setup = _setup()._replace(epoch=None)
     traced.clear()
     counts = [len(traced) for _ in loop.run_steps(setup, _start(), 12)]
@@ -159,7 +180,7 @@ def test_reports_say_what_was_measured():
         + weights.hash_decay * report.hash_decay
     )
     np.testing.assert_allclose(report.loss, expected, rtol=1e-4)
-    assert report.lost == 0.0
+    assert report.dropped == 0.0
 
 
 @pytest.mark.slow
@@ -196,7 +217,7 @@ def test_any_budget_can_be_trained_along(settings):
         CONFIG.schedule.batch <= setup.capacity <= capacities(settings, CONFIG.schedule.batch).paths
     )
     _, reports = _train(setup, _start(), 2)
-    assert all(np.isfinite(report.loss) and report.lost < 1e-3 for report in reports)
+    assert all(np.isfinite(report.loss) and report.dropped < 1e-3 for report in reports)
 
 
 @pytest.mark.slow
@@ -204,20 +225,20 @@ def test_light_is_lost_only_where_paths_have_too_little_room():
     setup = _setup()
     assert setup.capacity > CONFIG.schedule.batch
     rays, detail = (
-        setup.sampler.draw(np.arange(CONFIG.schedule.pool)).rays,
+        setup.sampler.draw(np.arange(CONFIG.schedule.pretraced_batches)).rays,
         path_detail(MODEL, PAPER),
     )
     room = {"roomy": setup.capacity, "tight": CONFIG.schedule.batch}
-    lost = {
-        name: loop.trace_pool(
-            setup.geometry, rays, settings=PAPER, capacity=capacity, detail=detail
-        ).lost
+    dropped = {
+        name: loop.pretrace(
+            setup.scene, rays, settings=PAPER, capacity=capacity, detail=detail
+        ).dropped
         for name, capacity in room.items()
     }
-    assert not np.any(lost["roomy"])
+    assert not np.any(dropped["roomy"])
     # No room for the second path of any ray that meets the ball: the weaker one is left out.
-    assert np.all(lost["tight"] >= 0.0) and np.all(lost["tight"] < 1.0)
-    assert np.all(np.mean(lost["tight"], axis=(1, 2)) > 0.0)
+    assert np.all(dropped["tight"] >= 0.0) and np.all(dropped["tight"] < 1.0)
+    assert np.all(np.mean(dropped["tight"], axis=(1, 2)) > 0.0)
 
 
 def test_straight_light_needs_no_room_for_other_paths():
@@ -250,7 +271,7 @@ def test_a_run_folder_holds_everything_that_rendering_needs(tmp_path):
     model = load_model(run)
     assert model.config == MODEL and model.settings == PAPER
     _assert_identical(model.params, state.params)
-    _assert_identical(model.geometry, _GEOMETRY)
+    _assert_identical(model.scene, _GEOMETRY)
     with pytest.raises(ValueError, match=r"step 7.*\[1\]"):
         load_model(run, step=7)
 
@@ -300,7 +321,7 @@ def test_a_damaged_geometry_is_named(tmp_path, damage):
     if damage == "truncated":
         path.write_bytes(content[: len(content) // 2])
     with pytest.raises(ValueError, match=r"geometry\.npz cannot be read"):
-        checkpoint_io.load_geometry(tmp_path)
+        checkpoint_io.load_scene(tmp_path)
 
 
 def test_a_damaged_checkpoint_is_named(tmp_path):

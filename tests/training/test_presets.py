@@ -28,7 +28,13 @@ def test_small_lies_between_tiny_and_paper():
         preset = PRESETS[name]
         model = preset.model(_BOUNDS, "field")
         grid = model.field.grid
-        numbers = (grid.levels, grid.finest, grid.entries, model.samples, model.field.colour_width)
+        numbers = (
+            grid.levels,
+            grid.max_res,
+            grid.hashmap_size,
+            model.samples,
+            model.field.colour_width,
+        )
         return (*numbers, preset.schedule.batch, preset.schedule.steps)
 
     for less, middle, more in zip(sizes("tiny"), sizes("small"), sizes("paper"), strict=True):
@@ -37,7 +43,7 @@ def test_small_lies_between_tiny_and_paper():
 
 def _rays_of_a_pool(name):
     schedule = PRESETS[name].schedule
-    return schedule.batch * schedule.pool
+    return schedule.batch * schedule.pretraced_batches
 
 
 def test_best_samples_as_the_paper_does_and_sees_through_bends():

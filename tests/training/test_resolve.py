@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from refref_jax import configuration
-from refref_jax.data.scene_analysis import Needs
+from refref_jax.data.scene_analysis import SceneAnalysis
 from refref_jax.optics.path_settings import (
     PAPER,
     STRAIGHT,
@@ -35,9 +35,9 @@ from tests.processes.command import ROOT
 
 pytestmark = pytest.mark.loose
 
-_CLEAR = Needs(
+_CLEAR = SceneAnalysis(
     parts=1,
-    bodies=1,
+    objects=1,
     convex=True,
     reentry="impossible",
     interior="clear",
@@ -48,7 +48,7 @@ _TINTED = _CLEAR._replace(
     parts=3, convex=False, reentry="possible", interior="absorbing", tints="given"
 )
 _UNTOLD = _TINTED._replace(tints="learned")
-_EMPTY = _CLEAR._replace(parts=0, bodies=0, convex=False, interior="none")
+_EMPTY = _CLEAR._replace(parts=0, objects=0, convex=False, interior="none")
 
 
 def _resolve(found, **given):
@@ -173,21 +173,21 @@ def test_resolve_warns_of_what_is_doubtful():
             "neither min_throughput nor max_bends",
         ),
         (_CLEAR, {"dilatation": 0.5}, "There is no option 'dilatation'"),
-        (_CLEAR, {"samples": (32,)}, "is for 0 proposal levels, but preset tiny has 1"),
-        (_CLEAR, {"samples": (32, 0)}, "not a list of positive numbers"),
+        (_CLEAR, {"samples_per_ray": (32,)}, "is for 0 proposal levels, but preset tiny has 1"),
+        (_CLEAR, {"samples_per_ray": (32, 0)}, "not a list of positive numbers"),
         (_CLEAR, {"multisamples": 3}, "multisamples=3"),
-        (_CLEAR, {"entries": 40}, "entries is 40"),
-        (_CLEAR, {"finest": 3}, "finest=3"),
+        (_CLEAR, {"log2_hashmap_size": 40}, "log2_hashmap_size is 40"),
+        (_CLEAR, {"max_res": 3}, "max_res=3"),
         (_CLEAR, {"radius": -1.0}, "radius is -1"),
         (_CLEAR, {"dilation": -0.5}, "dilation is -0.5"),
         (_CLEAR, {"paths": "treee"}, "paths is 'treee', not one of"),
         (_CLEAR, {"steps": "50"}, "steps is '50', not of type int"),
-        (_CLEAR, {"samples": [32, "20"]}, "not of type int"),
+        (_CLEAR, {"samples_per_ray": [32, "20"]}, "not of type int"),
         (_CLEAR, {"steps": 10**30}, "steps is 10"),
         (_CLEAR, {"seed": -1}, "seed is -1"),
         (_CLEAR, {"blurs": [0.1, 0.1, 0.1]}, "3 blurs for 1 proposal levels"),
         (_CLEAR, {"distortion_weight": -1.0}, "weight or blur"),
-        (_CLEAR, {"finest": 10**30}, "finest is 10"),
+        (_CLEAR, {"max_res": 10**30}, "max_res is 10"),
         (_CLEAR, {"steps": 0}, "steps is 0"),
         (_CLEAR, {"learning_rate": float("nan")}, "learning_rate is NaN"),
     ],
@@ -200,7 +200,7 @@ def test_resolve_refuses_what_can_not_be(found, given, message):
 def test_override_takes_decisions_again_that_follow_from_a_change():
     config = _resolve(_TINTED, scene="a").config
     paper = config.override(paths="paper")
-    assert (paper.paths.min_throughput, paper.model.interior, paper.model.samples) == (
+    assert (paper.paths.min_throughput, paper.model.interior, paper.model.samples_per_ray) == (
         None,
         None,
         (32, 20),
@@ -211,9 +211,9 @@ def test_override_takes_decisions_again_that_follow_from_a_change():
     assert config.override(steps=100, warmup=7).schedule.warmup == 7
     # Lists, mappings and paths are taken as users write them.
     plain = TrainConfig().override(
-        samples=[8, 4], ior={"glass": 1.52}, scene=Path("a"), min_throughput=0
+        samples_per_ray=[8, 4], ior={"glass": 1.52}, scene=Path("a"), min_throughput=0
     )
-    assert (plain.model.samples, plain.scene.indices) == ((8, 4), (("glass", 1.52),))
+    assert (plain.model.samples_per_ray, plain.scene.indices) == ((8, 4), (("glass", 1.52),))
     assert (plain.scene.path, type(plain.paths.min_throughput)) == ("a", float)
     # Also those that followed from what is decided again.
     straight = _resolve(_EMPTY, scene="a").config.override(scene="b").paths
@@ -231,7 +231,7 @@ def test_what_was_asked_for_stays_and_what_was_decided_is_decided_again():
     assert set(config.chosen) == {"scene", "paths", "radius", "steps", "batch"}
     other = config.override(scene="b", preset="small")
     assert {name: other.get(name) for name in wishes} == wishes
-    open_ = ("interior", "tints", "background", "samples", "warmup")
+    open_ = ("interior", "tints", "background", "samples_per_ray", "warmup")
     assert {other.get(name) for name in open_} == {None}
     decided, kept = config.followers(scene="b")
     assert {"paths", "radius"} <= kept and {"interior", "background"} <= decided
@@ -259,7 +259,11 @@ def test_a_wish_that_is_taken_back_is_none():
 
 
 def test_numbers_of_numpy_are_numbers():
-    given = {"min_throughput": np.float64(0.25), "steps": np.int64(7), "samples": [3, np.int32(4)]}
+    given = {
+        "min_throughput": np.float64(0.25),
+        "steps": np.int64(7),
+        "samples_per_ray": [3, np.int32(4)],
+    }
     config = TrainConfig().override(**given, radius=np.float32(2.5), blurs=[np.float64(0.5)])
     assert (config.paths.min_throughput, config.schedule.steps, config.scene.radius) == (
         0.25,
@@ -288,12 +292,12 @@ refused(PathsConfig, min_throughput="x")
 refused(ScheduleConfig, steps="x")
 refused(SceneConfig, path=3)
 refused(LossConfig, distortion_over="inside")
-refused(FieldConfig, samples=[3, "4"])
+refused(FieldConfig, samples_per_ray=[3, "4"])
 refused(FieldConfig, preset=None)
 refused(TrainConfig, paths={"min_throughput": 0.1})
 refused(TrainConfig, seed=1.5)
 refused(TrainConfig, chosen=("cot",))
-print(FieldConfig(samples=[3, 4]).samples)
+print(FieldConfig(samples_per_ray=[3, 4]).samples_per_ray)
 print(SceneConfig(Path("a"), indices={"glass": 2}).indices)
 print(type(PathsConfig(min_throughput=np.float64(0.5)).min_throughput))
 """
@@ -309,7 +313,7 @@ def test_records_are_checked_in_full_when_they_are_made():
         "steps is 'x', not of type int",
         "scene is 3, not of type str",
         "distortion is 'inside', not one of",
-        "samples[1] is '4', not of type int",
+        "samples_per_ray[1] is '4', not of type int",
         "preset is None, not one of",
         "paths is {'min_throughput': 0.1}, not of type PathsConfig",
         "seed is 1.5, not of type int",
@@ -342,10 +346,10 @@ def _resolve_again(config):
 
 def test_override_model_replaces_one_thing_an_option():
     asked = FieldConfig(
-        samples=(5, 4),
+        samples_per_ray=(5, 4),
         multisamples=6,
-        entries=8,
-        finest=32,
+        log2_hashmap_size=8,
+        max_res=32,
         precision="bfloat16",
         footprint="differential",
         dilation=0.25,
@@ -353,7 +357,7 @@ def test_override_model_replaces_one_thing_an_option():
     made = override_model(MODEL, asked)
     assert samples_of(made) == (5, 4)
     assert (made.multisamples, made.footprint, made.dilation) == (6, "differential", 0.25)
-    assert (made.field.grid.entries, made.field.grid.finest) == (256, 32)
+    assert (made.field.grid.hashmap_size, made.field.grid.max_res) == (256, 32)
     assert made.field.precision == made.proposals[0].field.precision == "bfloat16"
     # The proposals keep their grids.
     assert made.proposals[0].field.grid == MODEL.proposals[0].field.grid
@@ -428,12 +432,26 @@ def test_the_configuration_of_an_earlier_version_is_read(tmp_path):
         "loss": losses,
         "schedule": {n: schedule[n] for n in ("steps", "warmup", "peak", "end", "anneal")},
         "batch": schedule["batch"],
-        "pool": schedule["pool"],
+        "pool": schedule["pretraced_batches"],
         "seed": 3,
         "pixels": "all",
     }
     (tmp_path / "config.json").write_text(json.dumps(before))
     assert run_folder.read_config(tmp_path) == config
+
+
+def test_options_of_an_earlier_version_are_taken_by_their_present_names():
+    former = TrainConfig().override(samples=(5, 4), entries=8, cut=0.25, pool=3, dye_decay=0.5)
+    present = TrainConfig().override(
+        samples_per_ray=(5, 4),
+        log2_hashmap_size=8,
+        min_throughput=0.25,
+        pretraced_batches=3,
+        tint_decay=0.5,
+    )
+    assert former == present and former.chosen == present.chosen
+    chosen = configuration.build({"chosen": ["pool", "steps"]}, TrainConfig).chosen
+    assert chosen == ("pretraced_batches", "steps")
 
 
 @pytest.fixture(scope="module")
@@ -471,20 +489,24 @@ def test_prepare_resolves_scenes(scene):
         (tinted, {"interior": "clear"}, ("tree", "clear")),
         (untold, {}, ("tree", "absorbing")),
         (empty, {}, ("straight", "field")),
-        (tinted, {"paths": "paper", "max_bends": 4, "samples": (7, 6)}, ("paper", "absorbing")),
-        (tinted, {"field": "nerfacto", "entries": 12}, ("tree", "absorbing")),
+        (
+            tinted,
+            {"paths": "paper", "max_bends": 4, "samples_per_ray": (7, 6)},
+            ("paper", "absorbing"),
+        ),
+        (tinted, {"field": "nerfacto", "log2_hashmap_size": 12}, ("tree", "absorbing")),
         (clear, {"paths": "paper_no_tir", "distortion": "everywhere"}, ("paper_no_tir", "clear")),
     ]
     for place, given, expected in cases:
         lines = []
         config = TrainConfig().override(scene=place, **given)
-        made, geometry = prepare(config, report=lines.append)
+        made, scene = prepare(config, report=lines.append)
         assert (made.config.paths.name, made.config.model.interior) == expected
         # Colours that are given lie on the paths; all others must not, or they would count twice.
         on_paths = made.config.model.tints == "given"
         assert on_paths == (expected[1] == "absorbing" and place == tinted and "tints" not in given)
         if place != empty:
-            found = geometry.interfaces.tint[0], geometry.interfaces.absorption[0]
+            found = scene.interfaces.tint[0], scene.interfaces.absorption[0]
             expected = (tint, absorption) if on_paths else ([1.0] * 3, [0.0] * 3)
             np.testing.assert_array_equal(found, expected)
         assert any("this scene" in line for line in lines)

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.training.config import ScheduleConfig, settled
+from refref_jax.training.config import ScheduleConfig, require
 from refref_jax.training.loop import learning_rate, optimizer
 
 pytestmark = pytest.mark.loose
@@ -44,6 +44,6 @@ def test_a_schedule_stretches_with_its_steps():
 
 
 def test_a_schedule_that_is_still_open_is_refused():
-    assert settled(0) == 0
+    assert require(0) == 0
     with pytest.raises(ValueError, match=r"Use the configuration that training\.resolve returns"):
         learning_rate(ScheduleConfig(steps=10))

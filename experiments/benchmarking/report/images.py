@@ -213,15 +213,15 @@ def _picture(
     view, method, kind = key
     if pixels is None:
         return tag("figure", tag("p", NOT_HERE, class_="absent"), tag("figcaption", kind))
-    picture = Image.fromarray(pixels)
-    picture = picture.resize(_size(picture, edge), Image.Resampling.BOX)
+    thumbnail = Image.fromarray(pixels)
+    thumbnail = thumbnail.resize(_size(thumbnail, edge), Image.Resampling.BOX)
     file = io.BytesIO()
-    picture.save(file, "WEBP", quality=_QUALITY)
+    thumbnail.save(file, "WEBP", quality=_QUALITY)
     image = tag(
         "img",
         src=f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode('ascii')}",
-        width=picture.width,
-        height=picture.height,
+        width=thumbnail.width,
+        height=thumbnail.height,
         id=place,
         alt=f"{kind} of {view}, {title(method)}",
         data_key=method if kind == IMAGE else None,

@@ -19,7 +19,7 @@ def _view(**changes):
     numbers = {
         "psnr": 50.0,
         "psnr_masked": 45.0,
-        "lost": 0.0,
+        "dropped": 0.0,
         "mask_share": 0.0,
         "depth_share": 1.0,
         "depth_error": 1e-5,

@@ -47,7 +47,7 @@ def model(monkeypatch):
     config = dataclasses.replace(
         small_model.MODEL, field=_BallConfig(), radius=_RADIUS, interior="field"
     )
-    return Model(config, PAPER, scenes.geometry(), Params((), {}))
+    return Model(config, PAPER, scenes.build(), Params((), {}))
 
 
 def _sampled(model, resolution=40, half=1.6):
@@ -106,10 +106,8 @@ def test_density_is_per_world_unit_and_colours_go_by_the_side_that_is_looked_at(
 
 
 def test_where_no_samples_are_taken_there_is_no_density(model):
-    glass = scenes.geometry(scenes.ball(0.8, subdivisions=3))
-    clear = model._replace(
-        config=dataclasses.replace(model.config, interior="clear"), geometry=glass
-    )
+    glass = scenes.build(scenes.ball(0.8, subdivisions=3))
+    clear = model._replace(config=dataclasses.replace(model.config, interior="clear"), scene=glass)
     everywhere, outside = _sampled(model, 20), _sampled(clear, 20)
     ticks = np.linspace(-1.6, 1.6, 21)
     distance = np.sqrt(ticks[:, None, None] ** 2 + ticks[:, None] ** 2 + ticks**2)
@@ -120,13 +118,13 @@ def test_where_no_samples_are_taken_there_is_no_density(model):
 
 
 def test_a_cavity_is_inside_and_what_is_between_bodies_is_not():
-    geometry = scenes.geometry(
+    scene = scenes.build(
         solids.ball("ball_glass", radius=1.0),
         solids.ball("hole_air", radius=0.5, index=1.0),
         solids.ball("far_glass", radius=0.5, centre=(3.0, 0.0, 0.0)),
     )
     axes = [np.array([-1.2, -0.75, 0.0, 0.75, 1.75, 3.0, 3.9]), np.zeros(1), np.zeros(1)]
-    inside = field_mesh.inside_bodies(geometry, axes)[:, 0, 0]
+    inside = field_mesh.inside_bodies(scene, axes)[:, 0, 0]
     assert inside.tolist() == [False, True, True, True, False, True, False]
 
 
@@ -168,8 +166,8 @@ def test_a_spherical_model_ends_on_its_sphere():
 
 def test_bodies_keep_their_normals_and_corners():
     sharp, round_ = solids.box("box_glass", centre=(3.0, 0.0, 0.0)), solids.ball("ball_glass")
-    geometry = scenes.geometry(sharp, round_)
-    box, ball = object_meshes.read_meshes(geometry)
+    scene = scenes.build(sharp, round_)
+    box, ball = object_meshes.read_meshes(scene)
     assert (len(box.vertices), len(box.faces)) == (8, 12)
     assert len(ball.vertices) == len(round_.vertices)
     assert trimesh.Trimesh(*box[:2]).volume == pytest.approx(1.0)
@@ -180,8 +178,8 @@ def test_bodies_keep_their_normals_and_corners():
 
 
 def test_a_run_s_bodies_are_files_that_are_read_again(tmp_path, monkeypatch):
-    geometry = scenes.geometry(solids.box(centre=(3.0, 0.0, 0.0)), solids.ball())
-    monkeypatch.setattr(object_meshes, "load_geometry", lambda run: geometry)
+    scene = scenes.build(solids.box(centre=(3.0, 0.0, 0.0)), solids.ball())
+    monkeypatch.setattr(object_meshes, "load_scene", lambda run: scene)
     written = object_meshes.write(tmp_path, tmp_path / "new" / "body.ply", overwrite=False)
     assert [path.name for path in written] == ["body_0.ply", "body_1.ply"]
     part = meshes.read_part(written[1], index=1.5)
@@ -189,14 +187,14 @@ def test_a_run_s_bodies_are_files_that_are_read_again(tmp_path, monkeypatch):
     assert len(part.faces) == 320
     with pytest.raises(ValueError, match=r"body_0\.ply exists.* --overwrite"):
         object_meshes.write(tmp_path, tmp_path / "new" / "body.ply", overwrite=False)
-    monkeypatch.setattr(object_meshes, "load_geometry", lambda run: scenes.geometry())
+    monkeypatch.setattr(object_meshes, "load_scene", lambda run: scenes.build())
     with pytest.raises(ValueError, match="has no object"):
         object_meshes.write(tmp_path, tmp_path / "none.ply", overwrite=False)
 
 
 @pytest.mark.slow
 def test_the_command_writes_the_bodies_of_a_run(trained, tmp_path):
-    options = (f"--run={trained}", "--what=body", f"--out={tmp_path / 'body.ply'}")
+    options = (f"--run={trained}", "--what=object", f"--out={tmp_path / 'body.ply'}")
     assert "body.ply" in run_command("export", *options).stdout
     read = trimesh.load(tmp_path / "body.ply")
     assert read.volume == pytest.approx(4.0 / 3.0 * np.pi * 1.4**3, rel=0.01)  # the bundled ball

@@ -28,7 +28,7 @@ def model():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(images, "TILE", 256)
         params = init_params(jax.random.key(0), MODEL)
-        yield Model(MODEL, PAPER, scenes.geometry(scenes.ball(1.3, subdivisions=2)), params)
+        yield Model(MODEL, PAPER, scenes.build(scenes.ball(1.3, subdivisions=2)), params)
 
 
 def _blank():
@@ -151,9 +151,9 @@ def test_an_error_is_that_of_the_pixels_that_are_drawn(model, ball_scene, monkey
         lambda model, rays, **_: _blank()._replace(rgb=pixels.target + off),
     )
     options = {"chunk": 4096, "cancelled": lambda: False}
-    picture, error = layers.draw_error(model, pixels, **options)
+    image, error = layers.draw_error(model, pixels, **options)
     assert error == pytest.approx(0.1 * np.sqrt(np.mean(off > 0.0)), rel=1e-4)
-    assert set(np.unique(picture)) == {0, 102}  # 0.1 times 4, of 255
+    assert set(np.unique(image)) == {0, 102}  # 0.1 times 4, of 255
     assert layers.draw_error(model, pixels, chunk=1, cancelled=lambda: True) is None
 
 

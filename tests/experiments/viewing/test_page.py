@@ -34,7 +34,7 @@ def subject(ball_scene, monkeypatch):
     params = init_params(jax.random.key(0), MODEL)
     settings = dataclasses.replace(TREE, max_bends=4, reentry="impossible")
     config = dataclasses.replace(MODEL, interior="clear")
-    model = Model(config, settings, scenes.geometry(scenes.ball(1.4, subdivisions=3)), params)
+    model = Model(config, settings, scenes.build(scenes.ball(1.4, subdivisions=3)), params)
     frames = scene_folder.read_frames(ball_scene, "test")
     return session.Subject("made", model, "nested", frames, ("ball_glass",), (18, 36), 1024)
 

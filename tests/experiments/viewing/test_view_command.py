@@ -19,7 +19,7 @@ from tests.processes.command import ROOT, run_command
 
 
 def _subject(settings=TREE, frames=None):
-    parts = scenes.geometry(scenes.ball(1.0, subdivisions=1), scenes.ball(0.5, subdivisions=1))
+    parts = scenes.build(scenes.ball(1.0, subdivisions=1), scenes.ball(0.5, subdivisions=1))
     model = Model(
         MODEL, settings, parts, jax.eval_shape(lambda: init_params(jax.random.key(0), MODEL))
     )
@@ -64,7 +64,7 @@ def test_the_first_choice_is_the_model_as_it_was_trained():
     choice = session.first_choice(subject)
     assert choice.layer == layers.RGB and choice.indices == (1.5, 1.5)
     model = session.chosen_model(subject, choice)
-    assert model.settings is subject.model.settings and model.geometry == subject.model.geometry
+    assert model.settings is subject.model.settings and model.scene == subject.model.scene
 
 
 def test_another_index_changes_arrays_and_nothing_that_is_compiled():
@@ -72,11 +72,11 @@ def test_another_index_changes_arrays_and_nothing_that_is_compiled():
     choice = dataclasses.replace(session.first_choice(subject), indices=(1.7, 1.2))
     model = session.chosen_model(subject, choice)
     assert model.settings == subject.model.settings
-    np.testing.assert_array_equal(model.geometry.interfaces.index_inside, np.float32([1.7, 1.2]))
-    np.testing.assert_array_equal(model.geometry.interfaces.index_outside, np.float32([1.0, 1.7]))
-    before, after = (jax.tree.map(np.shape, x.geometry) for x in (subject.model, model))
+    np.testing.assert_array_equal(model.scene.interfaces.index_inside, np.float32([1.7, 1.2]))
+    np.testing.assert_array_equal(model.scene.interfaces.index_outside, np.float32([1.0, 1.7]))
+    before, after = (jax.tree.map(np.shape, x.scene) for x in (subject.model, model))
     assert before == after
-    types = (jax.tree.map(lambda x: x.dtype, each.geometry) for each in (subject.model, model))
+    types = (jax.tree.map(lambda x: x.dtype, each.scene) for each in (subject.model, model))
     assert len({tuple(jax.tree.leaves(each)) for each in types}) == 1
 
 

@@ -4,16 +4,16 @@ import trimesh
 
 from refref_jax.data import mesh_queries, meshes
 from refref_jax.data.mesh_queries import is_convex
-from refref_jax.data.scene_analysis import describe, find_needs
+from refref_jax.data.scene_analysis import analyse, describe
 from refref_jax.geometry.cameras import orbit
 from tests.factories import solids
 
 _CAMERAS = orbit(4, distance=4.0, elevation=0.3, size=8, angle_x=1.0)
 
 
-def _needs(*parts, rule="nested", space="bounded", cameras=_CAMERAS):
+def _analysis(*parts, rule="nested", space="bounded", cameras=_CAMERAS):
     tree = mesh_queries.find_containment(parts)
-    return find_needs(parts, tree, cameras, rule=rule, space=space)
+    return analyse(parts, tree, cameras, rule=rule, space=space)
 
 
 def _clear(part):
@@ -132,21 +132,21 @@ def test_a_flat_sheet_and_a_doubled_ball_are_not_convex():
 
 
 def test_light_leaves_one_convex_body_for_good():
-    needs = _needs(_clear(solids.ball()))
-    assert (needs.parts, needs.bodies, needs.convex) == (1, 1, True)
-    assert needs.reentry == "impossible"
-    assert describe(needs) == (
+    analysis = _analysis(_clear(solids.ball()))
+    assert (analysis.parts, analysis.objects, analysis.convex) == (1, 1, True)
+    assert analysis.reentry == "impossible"
+    assert describe(analysis) == (
         "this scene needs: 1 clear convex object, no re-entry, bounded background, no tint"
     )
 
 
 def test_parts_inside_a_convex_body_do_not_bring_light_back():
     parts = [solids.ball(), solids.ball("inner_water", radius=0.5)]
-    assert _needs(*parts).reentry == "impossible"
+    assert _analysis(*parts).reentry == "impossible"
     # Priorities may turn the order around, and to a facing inner wall what is outside is air.
-    assert _needs(*parts, rule="facing").reentry == "possible"
-    assert _needs(*parts, rule="priority").reentry == "possible"
-    assert _needs(parts[0], rule="priority").reentry == "impossible"
+    assert _analysis(*parts, rule="facing").reentry == "possible"
+    assert _analysis(*parts, rule="priority").reentry == "possible"
+    assert _analysis(parts[0], rule="priority").reentry == "impossible"
 
 
 @pytest.mark.parametrize(
@@ -159,54 +159,59 @@ def test_parts_inside_a_convex_body_do_not_bring_light_back():
     ],
 )
 def test_light_may_come_back_to_several_bodies_and_hollow_ones(parts):
-    assert _needs(*parts).reentry == "possible"
+    assert _analysis(*parts).reentry == "possible"
 
 
 def test_nothing_is_promised_to_a_camera_inside():
     inside = _CAMERAS._replace(poses=0.1 * _CAMERAS.poses)
-    assert _needs(solids.ball(), cameras=inside).reentry == "possible"
+    assert _analysis(solids.ball(), cameras=inside).reentry == "possible"
 
 
 def test_what_is_known_of_colours_decides_on_the_interior():
     ball, inner = solids.ball(), solids.ball("inner_water", radius=0.5)
-    assert _needs(_clear(ball))[4:6] == ("clear", "none")
-    assert _needs(ball)[4:6] == ("absorbing", "learned")
-    assert _needs(_clear(ball), inner)[4:6] == ("absorbing", "learned")
+    assert _analysis(_clear(ball))[4:6] == ("clear", "none")
+    assert _analysis(ball)[4:6] == ("absorbing", "learned")
+    assert _analysis(_clear(ball), inner)[4:6] == ("absorbing", "learned")
     tinted = _clear(inner)._replace(tint=(0.5, 1.0, 1.0))
-    assert _needs(_clear(ball), tinted)[4:6] == ("absorbing", "given")
+    assert _analysis(_clear(ball), tinted)[4:6] == ("absorbing", "given")
     dark = _clear(inner)._replace(absorption=(0.0, 0.0, 0.1))
-    assert _needs(_clear(ball), dark)[4:6] == ("absorbing", "given")
+    assert _analysis(_clear(ball), dark)[4:6] == ("absorbing", "given")
 
 
 def test_a_scene_is_described_in_one_line():
     wine = solids.ball("wine_water", radius=1.7)._replace(tint=(0.5, 1.0, 1.0))
-    tinted = describe(_needs(_clear(solids.shell()), _clear(wine), space="unbounded"))
+    tinted = describe(_analysis(_clear(solids.shell()), _clear(wine), space="unbounded"))
     assert tinted == (
         "this scene needs: 2 parts in 1 object that is not convex, re-entry, unbounded background, "
         "tints and absorption (given)"
     )
     apart = [solids.box(), solids.box("other_glass", centre=(3.0, 0.0, 0.0))]
-    assert "2 objects, re-entry" in describe(_needs(*apart))
-    assert "2 clear objects" in describe(_needs(*map(_clear, apart)))
-    nested = describe(_needs(solids.ball(), solids.ball("inner_water", radius=0.5)))
+    assert "2 objects, re-entry" in describe(_analysis(*apart))
+    assert "2 clear objects" in describe(_analysis(*map(_clear, apart)))
+    nested = describe(_analysis(solids.ball(), solids.ball("inner_water", radius=0.5)))
     assert "2 parts in 1 convex object, no re-entry" in nested and "(to be learned)" in nested
     torus = _made(trimesh.creation.torus(1.0, 0.3))
-    assert "1 object that is not convex, re-entry" in describe(_needs(torus))
+    assert "1 object that is not convex, re-entry" in describe(_analysis(torus))
 
 
 def test_a_spherical_background_is_told():
-    assert "spherical background" in describe(_needs(solids.ball(), space="spherical"))
+    assert "spherical background" in describe(_analysis(solids.ball(), space="spherical"))
 
 
 def test_no_mesh_needs_no_tracer():
-    needs = _needs(space="unbounded")
-    assert (needs.parts, needs.bodies, needs.interior, needs.tints) == (0, 0, "none", "none")
-    assert "no meshes: no tracer" in describe(needs)
+    analysis = _analysis(space="unbounded")
+    assert (analysis.parts, analysis.objects, analysis.interior, analysis.tints) == (
+        0,
+        0,
+        "none",
+        "none",
+    )
+    assert "no meshes: no tracer" in describe(analysis)
 
 
 def test_a_scene_tells_whether_its_colours_are_known(ball_scene):
     (part,) = meshes.read_meshes(ball_scene)
     assert part.colour_known
-    assert describe(_needs(part)) == (
+    assert describe(_analysis(part)) == (
         "this scene needs: 1 clear convex object, no re-entry, bounded background, no tint"
     )
