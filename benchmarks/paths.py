@@ -180,7 +180,7 @@ def _casts_of_random_paths(
 ) -> float:
     """Returns the mean casts of a path that takes each branch with its share as probability."""
     clear = surfaces._replace(tints=np.ones_like(surfaces.tints))
-    rule = reference_tree.Rule(_MITSUBA_DEPTH, "all", cut=0.002)
+    rule = reference_tree.Rule(_MITSUBA_DEPTH, "all", min_throughput=0.002)
     some = np.arange(0, len(origins), 4)
     rays = origins[some].astype(float), directions[some].astype(float)
     ends = reference_tree.trace(clear, Embree(clear), *rays, rule)

@@ -63,7 +63,7 @@ def main() -> None:
     step = _STEP.value if _STEP.value is not None else checkpoint_io.latest_step(run)
     model = checkpoint_io.load_model(run, step=step)
     scene = cli_scenes.opened(_SCENE.value or config.scene.path)
-    told = {
+    sources = {
         "scene": scene_names.of_folder(scene),
         "method": _method(run, config.paths.name),
         "step": step,
@@ -71,7 +71,7 @@ def main() -> None:
     }
     with outputs.fresh(out, **place) as draft:
         found, views = evaluate(model, scene, draft, lpips)
-        summary = told | found._asdict()
+        summary = sources | found._asdict()
         text = json.dumps(configuration.string_safe(summary), indent=2, allow_nan=False)
         (draft / "metrics.json").write_text(text + "\n", encoding="utf-8")
         comparison.write_comparison(draft / "comparison.png", views)

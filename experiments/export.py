@@ -2,8 +2,8 @@
 
 python -m experiments.export --run=runs/ball --what=mesh --out=ball.ply
 
-    mesh      level set of the field's density at --level, and the background if it has walls, with
-              normals and colours
+    mesh      level set of the field's density at --level, and the background cube or sphere, if
+              any, with normals and colours
     points    the same surfaces as points of a grid
     object    the objects: those of R3F, or the scene's meshes; with their shading normals
 
@@ -95,11 +95,11 @@ def _write_field(model: Model, out: Path) -> list[Path]:
             step=lambda done, total: bar.show(done, "slices"),
         )
     if space == "bounded" and half == radius:
-        density = field_mesh.with_walls(density, level=_LEVEL.value)
-        print("Walls:  the faces of the box, on which the model is opaque")
+        density = field_mesh.with_background(density, level=_LEVEL.value)
+        print("Background: the faces of the box, on which the model is opaque")
     if space == "spherical" and math.sqrt(3.0) * half > radius:
         density = field_mesh.with_sphere(density, level=_LEVEL.value, radius=radius)
-        print(f"Walls:  the sphere of radius {radius:g}, on which the model is opaque")
+        print(f"Background: the sphere of radius {radius:g}, on which the model is opaque")
     with outputs.fresh_file(out, overwrite=_OVERWRITE.value) as draft:
         if _WHAT.value == "mesh":
             surface = field_mesh.find_surface(density, level=_LEVEL.value)

@@ -68,12 +68,12 @@ def main() -> None:
 
 def _drawers(folder: Path, indices: dict[str, float]) -> dict[str, Callable[[Path], None]]:
     """Reads a scene, and returns functions that draw each figure into a file."""
-    walls = background.read_background(folder)
-    if not isinstance(walls, backgrounds.CubeBackground):
+    found = background.read_background(folder)
+    if not isinstance(found, backgrounds.CubeBackground):
         raise ValueError(
             f"The background of {folder} is not a cube. Choose a scene with a background cube."
         )
-    half = float(walls.half_extent)
+    half = float(found.half_extent)
     scene = known_scene.read_scene(
         folder,
         split=_SPLIT.value,

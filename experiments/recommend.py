@@ -49,7 +49,7 @@ def main() -> None:
         f"{machine.ratio:.2f}. Startup and compilation take {machine.startup:.0f} s."
     )
     choice = recommend.choose(rows, machine, 60.0 * _MINUTES.value)
-    print("\n".join(recommend.told(choice, machine, scene)))
+    print("\n".join(recommend.describe(choice, machine, scene)))
 
 
 if __name__ == "__main__":

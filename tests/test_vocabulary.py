@@ -1,4 +1,4 @@
-"""The words of docstrings, comments' neighbours and documents: the field's terms, in plain English.
+"""The words of names, messages, docstrings and documents: the field's terms, in plain English.
 
 `docs/glossary.md` has the terms. Text in backticks is code, and may name what code names.
 """
@@ -58,6 +58,59 @@ _QUESTION = re.compile(r"(What|How|Who|Which|Where|Whether|When)\b")
 _MOST_QUESTIONS = 10
 
 
+# Parts of public names, each with what the field says. Objects and textures of the generator have
+# their own terms (a vessel has a body, a bottle a wall).
+_BANNED_NAMES = {
+    "anew": "again",
+    "bodies": "objects",
+    "body": "object",
+    "budget": "path settings",
+    "budgets": "path settings",
+    "cut": "min_throughput",
+    "cuts": "thresholds",
+    "doubts": "warnings",
+    "dye": "attenuate",
+    "dyes": "tints",
+    "elders": "parents",
+    "knob": "option",
+    "knobs": "options",
+    "leaving": "exclude_primitive",
+    "lost": "dropped",
+    "manners": "conventions",
+    "needs": "requirements",
+    "picture": "image",
+    "pictures": "images",
+    "room": "capacity",
+    "settled": "required",
+    "slot": "primitive_id",
+    "told": "a plain noun",
+    "walls": "background",
+    "wishes": "overrides",
+}
+_OF_THEIR_OWN = ("experiments/dataset/objects", "experiments/dataset/textures")
+
+
+def _public_names(tree):
+    """Yields public functions, classes, their arguments and fields."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+            yield node.name
+            if isinstance(node, ast.FunctionDef):
+                yield from (each.arg for each in (*node.args.args, *node.args.kwonlyargs))
+            else:
+                fields = (each for each in node.body if isinstance(each, ast.AnnAssign))
+                yield from (each.target.id for each in fields)
+
+
+def _messages(tree):
+    """Yields texts of several words that are not docstrings: messages, help, printed lines."""
+    statements = {id(each.value) for each in ast.walk(tree) if isinstance(each, ast.Expr)}
+    for node in ast.walk(tree):
+        text = node.value if isinstance(node, ast.Constant) else None
+        if isinstance(text, str) and " " in text and id(node) not in statements:
+            yield text
+
+
 def _docstrings(path):
     kinds = ast.Module | ast.FunctionDef | ast.ClassDef
     nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, kinds)]
@@ -71,6 +124,23 @@ def _found(text):
 @pytest.mark.parametrize("path", _MODULES, ids=lambda path: path.relative_to(_ROOT).as_posix())
 def test_docstrings_use_the_fields_words(path):
     assert [word for text in _docstrings(path) for word in _found(text)] == []
+
+
+@pytest.mark.parametrize("path", _MODULES, ids=lambda path: path.relative_to(_ROOT).as_posix())
+def test_messages_use_the_fields_words(path):
+    assert [word for text in _messages(ast.parse(path.read_text())) for word in _found(text)] == []
+
+
+def test_public_names_are_the_fields():
+    found = {
+        f"{path.relative_to(_ROOT)}: {name} ({_BANNED_NAMES[word]})"
+        for path in _MODULES
+        if not path.relative_to(_ROOT).as_posix().startswith(_OF_THEIR_OWN)
+        for name in _public_names(ast.parse(path.read_text()))
+        for word in map(str.lower, re.findall(r"[A-Za-z][a-z]*", name))
+        if word in _BANNED_NAMES
+    }
+    assert found == set()
 
 
 @pytest.mark.parametrize("path", _PAGES, ids=lambda path: path.relative_to(_ROOT).as_posix())

@@ -20,12 +20,12 @@ class Rule(NamedTuple):
 
     bends: int
     reflections: str
-    cut: float = 0.0
+    min_throughput: float = 0.0
 
 
 STRAIGHT = Rule(0, "none")
 PAPER = Rule(10, "first")
-TREE = Rule(24, "all", cut=0.02)
+TREE = Rule(24, "all", min_throughput=0.02)
 
 
 class Live(NamedTuple):
@@ -127,7 +127,7 @@ def _children(
     followed = {
         "none": np.zeros(len(live.rays)),
         "first": np.where(live.num_bends == 0, split.reflectance, 0.0),
-        "all": conserving_share(tinted.max(-1), split.reflectance, rule.cut),
+        "all": conserving_share(tinted.max(-1), split.reflectance, rule.min_throughput),
     }
     share = np.where(split.reflectance == 1.0, 1.0, followed[rule.reflections])
     share = share.astype(tinted.dtype)[:, None]
@@ -138,13 +138,15 @@ def _children(
     return child(split.reflected, tinted * share), child(split.refracted, tinted * (1.0 - share))
 
 
-def conserving_share(throughput: np.ndarray, reflectance: np.ndarray, cut: float) -> np.ndarray:
-    """Returns the share to reflect: a child below the cut gives its light to its sibling.
+def conserving_share(
+    throughput: np.ndarray, reflectance: np.ndarray, min_throughput: float
+) -> np.ndarray:
+    """Returns the share to reflect: a child below the threshold gives its light to its sibling.
 
     Where both are below it, the stronger takes all.
     """
-    weak_reflected = throughput * reflectance < cut
-    weak_refracted = throughput * (1.0 - reflectance) < cut
+    weak_reflected = throughput * reflectance < min_throughput
+    weak_refracted = throughput * (1.0 - reflectance) < min_throughput
     stronger = np.where(reflectance > 0.5, 1.0, 0.0)
     share = np.where(weak_reflected, 0.0, np.where(weak_refracted, 1.0, reflectance))
     return np.where(weak_reflected & weak_refracted, stronger, share)

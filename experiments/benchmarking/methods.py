@@ -38,7 +38,7 @@ class Method:
       label: label in tables.
       group: comparison to which it belongs.
       train: options of `experiments.train`.
-      needs: requirements on a scene: `meshes` of its objects, `masks` of its training images,
+      requires: requirements on a scene: `meshes` of its objects, `masks` of its training images,
         `colours` of all its parts in scene.json.
       reconstructed: whether the objects come from R3F instead of the scene's meshes.
       published: row of the paper's tables with the same method, if there is one.
@@ -48,7 +48,7 @@ class Method:
     label: str
     group: Group
     train: tuple[str, ...]
-    needs: tuple[Need, ...] = ("meshes",)
+    requires: tuple[Need, ...] = ("meshes",)
     reconstructed: bool = False
     published: str | None = None
 
@@ -71,7 +71,7 @@ def _ablated(name: str, label: str, *options: str, published: str | None = None)
 def _varied(name: str, label: str, *options: str, colours: tuple[Need, ...] = ()) -> Method:
     """Returns the tree with changed options."""
     train = _over(_TREE, options)
-    return Method(name, label, "ablation of the tree", train, needs=("meshes", *colours))
+    return Method(name, label, "ablation of the tree", train, requires=("meshes", *colours))
 
 
 _ALL = (

@@ -67,7 +67,7 @@ _FARTHEST = (
     "the origin."
 )
 _DRMSE = (
-    "The paper does not state the pixels of its DRMSE. It is next to ours *in the mask*, because "
+    "The paper does not state the pixels of its DRMSE. It is next to our *masked* one, because "
     "it is unlikely to be over the image: its Oracle has 0.00 here, but a DMAE over the image of "
     "0.04 with cubes and 0.15 with spheres, and a root mean square is never below the mean of the "
     "same pixels. Our DRMSE *of the image* has no counterpart."

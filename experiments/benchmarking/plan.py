@@ -140,25 +140,25 @@ def options(method: str, train: Sequence[str], settings: Settings) -> dict[str, 
     }
 
 
-def _lacking(scene: Path, needs: set[Need]) -> set[Need]:
+def _lacking(scene: Path, requires: set[Need]) -> set[Need]:
     """Returns the requirements that a scene does not meet; none if it is broken."""
     try:
-        return _unmet(scene, needs)
+        return _unmet(scene, requires)
     except ValueError:
         return set()
 
 
-def _unmet(scene: Path, needs: set[Need]) -> set[Need]:
+def _unmet(scene: Path, requires: set[Need]) -> set[Need]:
     found: set[Need] = set()
-    files = meshes.mesh_files(scene) if needs & {"meshes", "colours"} else []
-    if "meshes" in needs and not files:
+    files = meshes.mesh_files(scene) if requires & {"meshes", "colours"} else []
+    if "meshes" in requires and not files:
         found.add("meshes")
-    if "colours" in needs:
+    if "colours" in requires:
         described = read_part_descriptions(scene / "scene.json")
-        told = [path.name in described and described[path.name].colour_known for path in files]
-        if not told or not all(told):
+        known = [path.name in described and described[path.name].colour_known for path in files]
+        if not known or not all(known):
             found.add("colours")
-    if "masks" in needs and _has_no_masks(scene):
+    if "masks" in requires and _has_no_masks(scene):
         found.add("masks")
     return found
 
@@ -179,17 +179,17 @@ def _reasons(scene: Scene, methods: Sequence[Method], preset: str) -> dict[str, 
         scene_folder.read_frames(Path(scene.path), SPLIT)
     except ValueError as error:
         return {method.name: f"its {SPLIT} views cannot be read: {error}" for method in methods}
-    needs = {need for method in methods for need in method.needs}
-    lacks, inside = _lacking(Path(scene.path), needs), _inside(Path(scene.path))
+    requires = {need for method in methods for need in method.requires}
+    lacks, inside = _lacking(Path(scene.path), requires), _inside(Path(scene.path))
     reasons = {}
     for method in methods:
-        if missing := [_WANTING[need] for need in method.needs if need in lacks]:
+        if missing := [_WANTING[need] for need in method.requires if need in lacks]:
             reasons[method.name] = missing[0]
         elif full := same_as(method, preset):
             reasons[method.name] = f"in the preset {preset} it equals {full}"
         elif full := same_inside(method, inside):
-            told = ", ".join(f"{name} {value}" for name, value in inside.items())
-            reasons[method.name] = f"in this scene it equals {full} ({told})"
+            text = ", ".join(f"{name} {value}" for name, value in inside.items())
+            reasons[method.name] = f"in this scene it equals {full} ({text})"
     return reasons
 
 

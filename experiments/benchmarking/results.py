@@ -164,8 +164,8 @@ def from_json(content: Any) -> Record:
     Raises:
       ValueError: if something is missing or has the wrong type.
     """
-    told = _object(content, "the file")
-    known = {key: _get(told, key, "the file") for key in Record._fields}
+    entry = _object(content, "the file")
+    known = {key: _get(entry, key, "the file") for key in Record._fields}
     texts = ("scene", "category", "background", "method", "scene_path", "fingerprint")
     given = _object(known["settings"], "settings")
     try:
@@ -205,13 +205,13 @@ def number(value: Any, what: str) -> float | None:
 
 
 def _image(content: Any) -> Image:
-    told = dict(_object(content, "an image of per_image"))
-    name = _text(told.pop("name", None), "the name of an image")
-    apart = number(told.pop("pose_distance", None), f"pose_distance of {name}")
+    entry = dict(_object(content, "an image of per_image"))
+    name = _text(entry.pop("name", None), "the name of an image")
+    apart = number(entry.pop("pose_distance", None), f"pose_distance of {name}")
     if apart is None or not math.isfinite(apart):
         raise ValueError(f"pose_distance of {name} is {apart}, which is not a distance")
-    seconds = number(told.pop("seconds", None), f"seconds of {name}")
-    return Image(name, apart, seconds, _numbers(told, name))
+    seconds = number(entry.pop("seconds", None), f"seconds of {name}")
+    return Image(name, apart, seconds, _numbers(entry, name))
 
 
 def _costs(content: Any) -> Costs:
@@ -222,11 +222,11 @@ def _costs(content: Any) -> Costs:
 
 
 def _view(content: Any) -> View:
-    told = _object(content, "a view")
+    entry = _object(content, "a view")
     name, rgb, distance = (
-        _text(told.get(key), f"{key} of a view") for key in ("name", "rgb", "distance")
+        _text(entry.get(key), f"{key} of a view") for key in ("name", "rgb", "distance")
     )
-    truth = _object(told.get("truth"), f"truth of {name}")
+    truth = _object(entry.get("truth"), f"truth of {name}")
     files = (_text_or_none(truth.get(key), f"{key} of {name}") for key in ("mask", "distance"))
     return View(name, Truth(_text(truth.get("rgb"), f"rgb of {name}"), *files), rgb, distance)
 
@@ -235,10 +235,10 @@ def _numbers(content: Any, what: str) -> dict[str, float | None]:
     return {key: number(value, f"{what}.{key}") for key, value in _object(content, what).items()}
 
 
-def _get(told: dict[str, Any], key: str, what: str) -> Any:
-    if key not in told:
+def _get(entry: dict[str, Any], key: str, what: str) -> Any:
+    if key not in entry:
         raise ValueError(f"{what} lacks {key}")
-    return told[key]
+    return entry[key]
 
 
 def _object(value: Any, what: str) -> dict[str, Any]:

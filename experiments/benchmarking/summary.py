@@ -161,13 +161,13 @@ def _missing(
     out: Path, benchmark: Benchmark, failed: Mapping[str, str], skipped: Sequence[Skipped]
 ) -> list[tuple[str, str]]:
     """Returns the scenes and methods of a benchmark that lack a result for no known reason."""
-    told = {*failed, *(each.name for each in skipped)}
+    reported = {*failed, *(each.name for each in skipped)}
     return [
         (scene, method)
         for method in METHODS
         if method in benchmark.methods
         for scene in sorted(benchmark.scenes)
-        if (name := f"{scene}/{method}") not in told and not _has_result(out, name)
+        if (name := f"{scene}/{method}") not in reported and not _has_result(out, name)
     ]
 
 
@@ -175,8 +175,8 @@ def _heading(benchmark: Benchmark, found: Sequence[Record]) -> list[str]:
     common = benchmark.settings
     images = "all test images" if common.limit is None else f"at most {common.limit} test images"
     versions = sorted({tuple(sorted(record.versions.items())) for record in found})
-    told = (", ".join(f"{name} {version}" for name, version in each) for each in versions)
-    several = ["Measured by several versions, which may differ: " + "; ".join(told) + ".", ""]
+    described = (", ".join(f"{name} {version}" for name, version in each) for each in versions)
+    several = ["Measured by several versions, which may differ: " + "; ".join(described) + ".", ""]
     return [
         "# Benchmark",
         "",

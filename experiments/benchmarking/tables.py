@@ -97,8 +97,8 @@ DMAE_SURFACE = Quantity(
 )
 DMAE_MEDIAN = Quantity("DMAE, median", "DMAE, median", "distance_mae", "lower", 3, by_mask=True)
 DRMSE_MASKED = Quantity(
-    "DRMSE, substituted, in the mask",
-    "DRMSE, substituted, in the mask",
+    "DRMSE, substituted, masked",
+    "DRMSE, substituted, masked",
     "substituted_rmse_masked",
     None,
     3,

@@ -145,10 +145,10 @@ def _learn(job: Job, folder: Path) -> Record:
     )
 
 
-def _image(told: dict[str, Any], apart: Mapping[str, float]) -> Image:
+def _image(entry: dict[str, Any], apart: Mapping[str, float]) -> Image:
     """Returns an image's entry of an evaluation, with its distance from the training views."""
-    metrics = {key: number(value, key) for key, value in told.items() if key != "name"}
-    name, seconds = told["name"], metrics.pop("seconds", None)
+    metrics = {key: number(value, key) for key, value in entry.items() if key != "name"}
+    name, seconds = entry["name"], metrics.pop("seconds", None)
     return Image(name, apart[name], seconds, metrics)
 
 
@@ -401,8 +401,8 @@ def run_missing(
     now = {each.name for each in (*planned, *skipped)}
     left_out = [*(each for each in skipped_before if each.name not in now), *skipped]
     names = {each.name for each in skipped}
-    told = {name: reason for name, reason in failed_before.items() if name not in names}
-    summary.write(out, benchmark, failed=told, skipped=left_out)
+    reported = {name: reason for name, reason in failed_before.items() if name not in names}
+    summary.write(out, benchmark, failed=reported, skipped=left_out)
     missing = [job for job in planned if not plan.is_done(out, job)]
     if not missing:
         print("All jobs are already finished." if planned else "All jobs are skipped.")
@@ -415,10 +415,10 @@ def run_missing(
         def done(job: Job, reason: str | None) -> None:
             nonlocal count
             count += 1
-            told.pop(job.name, None)
+            reported.pop(job.name, None)
             if reason is not None:
-                failed[job.name] = told[job.name] = reason
-            summary.write(out, benchmark, failed=told, skipped=left_out)
+                failed[job.name] = reported[job.name] = reason
+            summary.write(out, benchmark, failed=reported, skipped=left_out)
             left = (time.monotonic() - start) / count * (len(missing) - count)
             end = "failed" if reason is not None else "done"
             bar.show(count, f"{job.name} {end}, about {_duration(left)} left")

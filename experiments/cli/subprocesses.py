@@ -136,9 +136,9 @@ def _environment() -> dict[str, str]:
 def _complaint(printed: str, code: int) -> str:
     """Returns the last line with an error, or a description of the exit status."""
     lines = [line.strip() for line in printed.splitlines() if line.strip()]
-    told = [line for line in lines if re.search(r"(^e|E)rror: ", line)]
-    if told:
-        return told[-1]
+    errors = [line for line in lines if re.search(r"(^e|E)rror: ", line)]
+    if errors:
+        return errors[-1]
     if code < 0:
         return f"killed by {signal.Signals(-code).name}"
     return lines[-1] if lines else f"ended with status {code}, and printed nothing"

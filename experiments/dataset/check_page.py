@@ -52,12 +52,12 @@ def write_page(reports: Sequence[SceneReport], *, title: str) -> str:
     """Returns the page: a table of all scenes, then each scene with its views, failures first."""
     ordered = sorted(reports, key=lambda report: not report.complaints)
     failed = sum(bool(report.complaints) for report in reports)
-    told = "all passed" if not failed else f"{failed} failed"
+    verdict = "all passed" if not failed else f"{failed} failed"
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
         f"<style>{_STYLE}</style><h1>{html.escape(title)}</h1>"
-        f"<p>{len(reports)} scenes, {told}. Each view: the image, our rendering of the same scene "
-        f"along the path tree, and their difference times {_ERROR_GAIN:g}.</p>"
+        f"<p>{len(reports)} scenes, {verdict}. Each view: the image, our rendering of the same "
+        f"scene along the path tree, and their difference times {_ERROR_GAIN:g}.</p>"
         f"{_table(reports)}{''.join(map(_section, ordered))}</html>\n"
     )
 

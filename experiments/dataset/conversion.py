@@ -15,7 +15,7 @@ from experiments.dataset.scene_folders import FoundScene
 from refref_jax.data import scene_folder, scene_names
 
 
-def check_room(scenes: Sequence[FoundScene], layout: str, out: Path) -> None:
+def check_space(scenes: Sequence[FoundScene], layout: str, out: Path) -> None:
     """Rejects scenes that exist already, or whose names do not fit the layout.
 
     Raises:

@@ -41,7 +41,7 @@ def main() -> None:
     if layout == "parquet":
         parquet_scenes.import_parquet()  # before anything is read
     scenes = scene_folders.find(_SCENE.value, _SCENES.value)
-    conversion.check_room(scenes, layout, out)
+    conversion.check_space(scenes, layout, out)
     out.mkdir(parents=True, exist_ok=True)
     left: collections.Counter[str] = collections.Counter()
     done = 0

@@ -86,10 +86,10 @@ def _metadata(contents: SceneContents, name: SceneName) -> dict[bytes, bytes]:
             "files have only one. Leave the scene as a folder."
         )
     frames = {split: len(found.frames) for split, found in contents.splits.items()}
-    told = parquet_scenes.Contents(frames, float(angles.pop()))
+    contents = parquet_scenes.Contents(frames, float(angles.pop()))
     return {
         b"huggingface": json.dumps({"info": {"features": _FEATURES}}).encode(),
-        parquet_scenes.METADATA_KEY: parquet_scenes.encode(told),
+        parquet_scenes.METADATA_KEY: parquet_scenes.encode(contents),
     }
 
 

@@ -92,7 +92,7 @@ def sample_density(
     axes = [low[i] + spacing * np.arange(counts[i]) for i in range(3)]
     unknown = np.zeros(counts, bool)
     if model.config.interior != "field":
-        unknown = inside_bodies(model.scene, axes)
+        unknown = inside_objects(model.scene, axes)
     values = np.zeros(counts, np.float32)
     for i, x in enumerate(axes[0]):
         rows = np.argwhere(~unknown[i])
@@ -142,7 +142,7 @@ def _chunk(params, points, directions, config, width):
     return seen.density, jnp.clip(colour.linear_to_srgb(seen.linear), 0.0, 1.0)
 
 
-def inside_bodies(
+def inside_objects(
     scene: Scene, axes: Sequence[Float[np.ndarray, " ticks"]]
 ) -> Bool[np.ndarray, "nx ny nz"]:
     """Returns the mask of grid points inside any part of the scene.
@@ -191,7 +191,7 @@ def _meets_inner_side(
     return find_first_surface(surfaces, rays).normals @ direction > 0.0
 
 
-def with_walls(density: Grid, *, level: float) -> Grid:
+def with_background(density: Grid, *, level: float) -> Grid:
     """Returns the density with a surface at the border of the grid.
 
     This is the background cube of a bounded model: light that reaches its faces ends there, as if
@@ -204,7 +204,7 @@ def with_walls(density: Grid, *, level: float) -> Grid:
 
 
 def with_sphere(density: Grid, *, level: float, radius: float) -> Grid:
-    """Returns the density with a surface on a sphere around the origin, as `with_walls` has it.
+    """Returns the density with a surface on a sphere around the origin; see `with_background`.
 
     Args:
       density: density per world unit.

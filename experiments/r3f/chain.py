@@ -167,33 +167,33 @@ def _light(scene: Path, out: Path, found: Reconstruction) -> LightFacts:
 
 
 def _describe_light(facts: LightFacts) -> str:
-    told = (
+    lines = (
         f"refinement by light: error of the validation views {facts.before:.4f} before, "
         f"{facts.after:.4f} after {facts.steps} steps"
     )
-    return f"{told}; kept" if facts.kept else f"{told}; discarded"
+    return f"{lines}; kept" if facts.kept else f"{lines}; discarded"
 
 
 def _describe_geometry(found: Reconstruction) -> str:
     facts = found.geometry
-    told = [
+    lines = [
         f"geometry: {facts.faces} faces from {facts.masks} masks of {facts.width} x "
         f"{facts.height}; {', '.join(facts.stages) or 'not refined'}"
     ]
-    told += [f"  skipped {refused}" for refused in facts.refused]
-    told += [f"warning: {doubt}" for doubt in facts.doubts]
-    return "\n".join(told)
+    lines += [f"  skipped {refused}" for refused in facts.refused]
+    lines += [f"warning: {doubt}" for doubt in facts.warnings]
+    return "\n".join(lines)
 
 
 def _describe_report(found: Reconstruction) -> str:
     facts = found.report
-    told = [
+    lines = [
         f"silhouettes: overlap {facts.mean_overlap:.4f}, least {min(facts.overlaps):.4f}, of "
         f"{len(facts.overlaps)} {facts.split} views"
     ]
     if facts.truth is not None:
-        told.append(
+        lines.append(
             f"true surface: Chamfer distance {facts.truth.chamfer:.3%} of the diameter, normals "
             f"{facts.truth.normal_error:.2f} degrees"
         )
-    return "\n".join(told)
+    return "\n".join(lines)

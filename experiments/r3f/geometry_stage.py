@@ -95,7 +95,7 @@ def run(scene: Path, out: Path, config: ReconstructionConfig) -> GeometryFacts:
             if not np.array_equal(before.vertices, stage.mesh.vertices)
         ),
         refused=tuple(f"{stage.name}: {stage.refused}" for stage in refined if stage.refused),
-        doubts=about_masks(mesh, views, names, outliers=config.outliers),
+        warnings=about_masks(mesh, views, names, outliers=config.outliers),
     )
 
 
@@ -132,16 +132,16 @@ def about_masks(
         return ()
     worst = doubtful[np.argsort(overlaps[doubtful])][:_NAMED]
     named = ", ".join(f"{names[view]} ({overlaps[view]:.2f})" for view in worst)
-    told = (
+    message = (
         f"{len(doubtful)} of {len(overlaps)} training masks overlap with the object by less than "
         f"{_AGREES}, least {named}. Check the masks and the poses."
     )
     shares = carved_alone(views)
     taker = int(np.argmax(shares))
     if shares[taker] < _MUCH:
-        return (told,)
+        return (message,)
     return (
-        told,
+        message,
         f"{names[taker]} alone carves away {shares[taker]:.0%} of the other masks' hull. If this "
         f"mask is wrong, fix it, remove its frame, or use --outliers={outliers + 1}.",
     )

@@ -56,7 +56,7 @@ RAYS = 4096
 _BEFORE = 1.5
 
 
-class BodyPixels(NamedTuple):
+class ObjectPixels(NamedTuple):
     """Pixels of a split that see the object.
 
     Attributes:
@@ -68,7 +68,7 @@ class BodyPixels(NamedTuple):
     views: Int[np.ndarray, " rays"]
 
 
-def look(scene: Path, split: str, model: Model, *, seed: int, rays: int) -> BodyPixels:
+def look(scene: Path, split: str, model: Model, *, seed: int, rays: int) -> ObjectPixels:
     """Draws pixels well inside the masks of a split, evenly over its views.
 
     Args:
@@ -98,10 +98,10 @@ def look(scene: Path, split: str, model: Model, *, seed: int, rays: int) -> Body
     view, row, column = np.unravel_index(np.concatenate(chosen), inside.shape)
     rgb = scene_folder.read_images(frames)[view, row, column].astype(np.float32) / 255.0
     seen = pixel_rays(frames.cameras, view, row, column)
-    return BodyPixels(Evidence(model.params, *jax.device_put((seen, rgb))), view)
+    return ObjectPixels(Evidence(model.params, *jax.device_put((seen, rgb))), view)
 
 
-def body_geometry(mesh: Mesh, index: float) -> Scene:
+def object_scene(mesh: Mesh, index: float) -> Scene:
     """Returns a scene with one clear object in air, on the device."""
     return jax.device_put(Scene(pack_meshes([mesh]), nested([index], [NO_PARENT])))
 
@@ -142,7 +142,7 @@ def run(
     with ProgressBar("index", most_looks(search, start=start)) as bar:
         found = estimate_index(
             evidence,
-            body_geometry(mesh, _BEFORE),
+            object_scene(mesh, _BEFORE),
             views,
             part=0,
             config=model.config,

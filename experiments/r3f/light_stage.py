@@ -14,7 +14,7 @@ import numpy as np
 
 from experiments.cli.progress import ProgressBar
 from experiments.r3f import index_stage
-from experiments.r3f.index_stage import BodyPixels
+from experiments.r3f.index_stage import ObjectPixels
 from experiments.r3f.records import IndexFacts, LightFacts
 from refref_jax import atomic_files
 from refref_jax.data import meshes
@@ -60,7 +60,7 @@ def run(
         found = refine_by_light(
             mesh,
             index,
-            index_stage.body_geometry(mesh, index).interfaces,
+            index_stage.object_scene(mesh, index).interfaces,
             seen.evidence,
             config=model.config,
             settings=settings,
@@ -75,7 +75,7 @@ def run(
     return LightFacts(steps, kept, before, after, found.index, found.furthest)
 
 
-def find_judges(scene: Path, model: Model, *, seed: int) -> BodyPixels:
+def find_judges(scene: Path, model: Model, *, seed: int) -> ObjectPixels:
     """Returns the pixels of the validation views by which a refinement is judged.
 
     Raises:
@@ -84,12 +84,12 @@ def find_judges(scene: Path, model: Model, *, seed: int) -> BodyPixels:
     return index_stage.look(scene, "val", model, seed=seed + 1, rays=_JUDGES)
 
 
-def judge(mesh: Mesh, index: float, judges: BodyPixels, model: Model) -> float:
+def judge(mesh: Mesh, index: float, judges: ObjectPixels, model: Model) -> float:
     """Returns the mean error of the validation pixels in sRGB, with the mesh's own BVH."""
     errors = refractive_index.errors_at_index(
         np.float32(index),
         judges.evidence,
-        index_stage.body_geometry(mesh, index),
+        index_stage.object_scene(mesh, index),
         part=0,
         config=model.config,
     )

@@ -62,7 +62,7 @@ class GeometryFacts:
       diameter: diagonal of the bounding box, world units.
       stages: names of the refinement stages that changed the mesh.
       refused: skipped stages, and the reasons.
-      doubts: warnings about masks.
+      warnings: warnings about masks.
     """
 
     mesh: str
@@ -75,7 +75,7 @@ class GeometryFacts:
     diameter: float
     stages: tuple[str, ...]
     refused: tuple[str, ...]
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...] = dataclasses.field(metadata={configuration.FORMERLY: "doubts"})
 
 
 @dataclasses.dataclass(frozen=True)

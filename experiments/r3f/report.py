@@ -168,7 +168,7 @@ def _within(view: SurfaceView, window: Window) -> SurfaceView:
     panels_of_view = view._asdict()
     name = panels_of_view.pop("name")
     parts = (
-        None if panel is None else report_figures.cut_out(panel, window)
+        None if panel is None else report_figures.crop(panel, window)
         for panel in panels_of_view.values()
     )
     return SurfaceView(name, *parts)
@@ -201,7 +201,7 @@ def markdown(out: Path, found: Reconstruction, facts: ReportFacts) -> str:
         f"# The object of {found.scene}, reconstructed",
         f"From {geometry.masks} masks of {geometry.width} x {geometry.height} pixels and their "
         f"poses; {_of_index(found.index)}.",
-        *(f"**Warning:** {doubt}" for doubt in geometry.doubts),
+        *(f"**Warning:** {doubt}" for doubt in geometry.warnings),
         _table(out, found, facts),
         f"## Silhouettes\n\nMeasured on {len(facts.overlaps)} {_SEEN_ON[facts.split]}. IoU is the "
         "number of pixels in both mask and silhouette over the number in either.",
@@ -284,7 +284,7 @@ def _pictures_of_index(out: Path) -> list[str]:
 
 def _making(found: Reconstruction) -> str:
     config, geometry = found.config, found.geometry
-    told = [
+    lines = [
         f"- `--geometry={config.geometry} --resolution={config.resolution} "
         f"--outliers={config.outliers} --light_steps={config.light_steps} --seed={config.seed}`"
         + (f" `--ior={config.index:g}`" if config.index is not None else "")
@@ -293,4 +293,4 @@ def _making(found: Reconstruction) -> str:
         f"- refined: {', '.join(geometry.stages) or 'nothing to do'}",
         *(f"- skipped {refused}" for refused in geometry.refused),
     ]
-    return "\n".join(told)
+    return "\n".join(lines)

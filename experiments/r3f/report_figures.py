@@ -19,7 +19,7 @@ from matplotlib.patches import Patch
 from experiments.figures.style import COLOURS, pyplot, style
 
 AGREES, MISSING, EXCESS = COLOURS[5], COLOURS[1], COLOURS[3]
-"""Colours of pixels in mask and silhouette, in the mask only, and in the silhouette only."""
+"""Colours of pixels in both mask and silhouette, only in the mask, and only in the silhouette."""
 
 DPI = 110
 
@@ -115,7 +115,7 @@ def windows_around(areas: Sequence[Bool[np.ndarray, "h w"]], *, margin: float) -
     return [Window(float(top), float(left), side / height) for top, left in corners]
 
 
-def cut_out(image: Shaped[np.ndarray, "h w *channels"], window: Window) -> np.ndarray:
+def crop(image: Shaped[np.ndarray, "h w *channels"], window: Window) -> np.ndarray:
     """Returns the part of an image in a window, rounded to pixels."""
     height = len(image)
     top, left = math.floor(window.top * height), math.floor(window.left * height)
@@ -187,7 +187,7 @@ def draw_overlaps(path: Path, outlines: Sequence[Outline]) -> None:
 def colour_overlap(outline: Outline, window: Window) -> Float[np.ndarray, "ph pw 3"]:
     """Returns a grey window of the photograph, agreement tinted, errors in full colour."""
     image, mask, silhouette = (
-        cut_out(each, window) for each in (outline.image, outline.mask, outline.silhouette)
+        crop(each, window) for each in (outline.image, outline.mask, outline.silhouette)
     )
     stride = -(-max(mask.shape) // _PIXELS)
     grey = np.mean(shrink(image / 255.0, stride), axis=-1, keepdims=True)

@@ -163,12 +163,12 @@ def find(run: Path, config: TrainConfig, *, ior: Sequence[str], resume: bool) ->
         raise ValueError(
             f"{out} already contains a reconstruction. Continue with --resume, or change --out."
         )
-    wishes = config.wishes()  # a reconstruction makes its own decisions
+    overrides = config.overrides()  # a reconstruction makes its own decisions
     asked = _RECONSTRUCTED.chosen(
         index=index,
         seed=config.seed,
-        space=config.scene.space if "background" in wishes else None,
-        radius=config.scene.radius if "radius" in wishes else None,
+        space=config.scene.space if "background" in overrides else None,
+        radius=config.scene.radius if "radius" in overrides else None,
     )
     try:
         chain.reconstruct(scene, out, asked, compare=False)

@@ -17,7 +17,7 @@ from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics.media import interior_slots
+from refref_jax.optics.media import interior_length
 from refref_jax.optics.path_settings import PathSettings
 from refref_jax.optics.scene import Scene
 from refref_jax.render import colour
@@ -126,7 +126,7 @@ def build_scene(
         masks=scene_folder.read_masks(frames) if frames.masks else None,
         interior_list=(
             mesh_queries.parts_around(parts, frames.cameras.poses[:, :, 3])
-            if interior_slots(objects.interfaces)
+            if interior_length(objects.interfaces)
             else None
         ),
     )

@@ -133,7 +133,7 @@ def choose(rows: Sequence[Row], machine: Machine, seconds: float) -> Choice:
     )
 
 
-def told(choice: Choice, machine: Machine, scene: Path) -> list[str]:
+def describe(choice: Choice, machine: Machine, scene: Path) -> list[str]:
     """Returns the recommendation, line by line."""
     lines = ["", f"Use {choice.best.name}: {_expected(choice.best, machine)}."]
     lines += [*_commands(choice.best, scene), ""]

@@ -45,7 +45,7 @@ class Panel:
         subject: Subject,
         *,
         changed: Callable[[], None],
-        show_bodies: Callable[[bool], None],
+        show_objects: Callable[[bool], None],
         show_cameras: Callable[[bool], None],
         remove_paths: Callable[[], None],
     ) -> None:
@@ -55,7 +55,7 @@ class Panel:
           gui: GUI of the page.
           subject: displayed run.
           changed: callback after every choice that changes the image.
-          show_bodies: function that shows or hides the objects.
+          show_objects: function that shows or hides the objects.
           show_cameras: function that shows or hides the test cameras.
           remove_paths: function that removes the light paths.
         """
@@ -63,14 +63,14 @@ class Panel:
         self._own = first.indices
         self._layer = gui.add_dropdown("layer", subject.layers, initial_value=first.layer)
         self._status = gui.add_markdown("")
-        self._sliders, self._cut, self._bends = [], None, None
+        self._sliders, self._min_throughput, self._max_bends = [], None, None
         if first.max_bends:
             self._add_light(gui, subject, first)
-        controls = [self._layer, self._cut, self._bends, *self._sliders]
+        controls = [self._layer, self._min_throughput, self._max_bends, *self._sliders]
         for control in filter(None, controls):
             control.on_update(lambda _: changed())
         self._objects = gui.add_checkbox("objects", False, visible=bool(first.max_bends))
-        self._objects.on_update(lambda _: show_bodies(self._objects.value))
+        self._objects.on_update(lambda _: show_objects(self._objects.value))
         box = gui.add_checkbox("test cameras", False, visible=subject.views is not None)
         box.on_update(lambda _: show_cameras(box.value))
         with gui.add_folder("light paths"):
@@ -94,8 +94,8 @@ class Panel:
         return Choice(
             self._layer.value,
             tuple(indices),
-            float(self._cut.value) if self._cut else 0.0,
-            int(self._bends.value) if self._bends else 0,
+            float(self._min_throughput.value) if self._min_throughput else 0.0,
+            int(self._max_bends.value) if self._max_bends else 0,
         )
 
     def say(self, text: str) -> None:
@@ -124,8 +124,8 @@ class Panel:
                 )
             hint = "A new value is compiled once, which takes a while."
             for name, offered, own in (
-                ("cut", session.CUTS, first.min_throughput),
-                ("bends", session.BENDS, first.max_bends),
+                ("min_throughput", session.THRESHOLDS, first.min_throughput),
+                ("max_bends", session.BENDS, first.max_bends),
             ):
                 values = [f"{x:g}" for x in np.unique([*offered, own])]
                 control = gui.add_dropdown(name, values, initial_value=f"{own:g}", hint=hint)
@@ -161,7 +161,7 @@ class Scenery:
         self._cameras = [] if views is None else self._add_cameras(views)
         self._paths: list[Any] = []
 
-    def show_bodies(self, shown: bool) -> None:
+    def show_objects(self, shown: bool) -> None:
         """Shows or hides the objects."""
         for node in self._objects:
             node.visible = shown

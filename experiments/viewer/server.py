@@ -91,7 +91,7 @@ class Page:
             client.gui,
             subject,
             changed=self._change,
-            show_bodies=self._scenery.show_bodies,
+            show_objects=self._scenery.show_objects,
             show_cameras=self._scenery.show_cameras,
             remove_paths=self._scenery.remove_paths,
         )

@@ -24,7 +24,7 @@ from refref_jax.data.scene_folder import Frames
 from refref_jax.geometry.cameras import Cameras, orbit
 from refref_jax.render import Model
 
-CUTS = (0.1, 0.05, 0.02, 0.01, 0.005)
+THRESHOLDS = (0.1, 0.05, 0.02, 0.01, 0.005)
 """Throughput thresholds offered in addition to a model's own."""
 
 BENDS = (2, 4, 6, 10, 24, 32)

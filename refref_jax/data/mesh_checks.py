@@ -23,11 +23,11 @@ from refref_jax.data import SceneError
 from refref_jax.data.mesh_queries import (
     Containment,
     SampledSurface,
-    Walls,
+    SurfaceGaps,
     beside_faces,
     diagonal,
     sample_surface,
-    walls_between,
+    surface_gaps,
     winding_number,
 )
 from refref_jax.data.meshes import MeshPart
@@ -85,8 +85,8 @@ def refuse_errors(findings: Sequence[Finding]) -> None:
     """
     errors = [finding for finding in findings if finding.severity == "error"]
     if errors:
-        told = "\n".join(f"  {finding.part}: {finding.message}" for finding in errors)
-        raise SceneError(f"The meshes have errors. Fix them first:\n{told}")
+        text = "\n".join(f"  {finding.part}: {finding.message}" for finding in errors)
+        raise SceneError(f"The meshes have errors. Fix them first:\n{text}")
 
 
 class _Patch(NamedTuple):
@@ -126,14 +126,14 @@ def _lint_pair(
     sides = []
     if _box_distance(parts, pair) <= _THIN * size:
         sides = [
-            (a, b, walls_between(surfaces[a], surfaces[b]))
+            (a, b, surface_gaps(surfaces[a], surfaces[b]))
             for a, b in (pair, pair[::-1])
             if len(surfaces[a].points) and len(surfaces[b].points)
         ]
-    coincident = [_patch(a, walls, _coincide(walls, size)) for a, b, walls in sides]
+    coincident = [_patch(a, gaps, _coincide(gaps, size)) for a, b, gaps in sides]
     layers = [
-        _patch(a, walls, _thin_layer(parts, containment.parents, (a, b), walls, size))
-        for a, b, walls in sides
+        _patch(a, gaps, _thin_layer(parts, containment.parents, (a, b), gaps, size))
+        for a, b, gaps in sides
     ]
     findings = []
     if found := _largest(coincident, _COINCIDENT_SHARE):
@@ -145,15 +145,15 @@ def _lint_pair(
     return findings
 
 
-def _coincide(walls: Walls, size: float) -> Bool[np.ndarray, " samples"]:
-    return (walls.distances <= _COINCIDENT * size) & (np.abs(walls.alignment) > _PARALLEL)
+def _coincide(gaps: SurfaceGaps, size: float) -> Bool[np.ndarray, " samples"]:
+    return (gaps.distances <= _COINCIDENT * size) & (np.abs(gaps.alignment) > _PARALLEL)
 
 
 def _thin_layer(
     parts: Sequence[MeshPart],
     parents: Sequence[int],
     pair: tuple[int, int],
-    walls: Walls,
+    gaps: SurfaceGaps,
     size: float,
 ) -> Bool[np.ndarray, " samples"]:
     """Returns where a thin layer of lower index than both of its sides lies in front of a part.
@@ -162,8 +162,8 @@ def _thin_layer(
     index is a real wall, as of glass around a liquid, and refracts light correctly.
     """
     part, other = pair
-    thin = (walls.distances > _COINCIDENT * size) & (walls.distances <= _THIN * size)
-    ahead = thin & (walls.ahead > _PARALLEL)
+    thin = (gaps.distances > _COINCIDENT * size) & (gaps.distances <= _THIN * size)
+    ahead = thin & (gaps.ahead > _PARALLEL)
     near = parts[part].index
     # Between two objects that face each other is the medium around both; between an object and its
     # container is the medium of the container, whose surroundings are on the other side.
@@ -171,10 +171,10 @@ def _thin_layer(
     if parents[part] == parents[other] and _index(parts, parents[part]) < min(
         near, parts[other].index
     ):
-        apart = ahead & (walls.alignment < -_PARALLEL)
+        apart = ahead & (gaps.alignment < -_PARALLEL)
     beyond = _index(parts, parents[other])
     if parents[part] == other and parts[other].index < min(near, beyond):
-        return apart | (ahead & (walls.alignment > _PARALLEL))
+        return apart | (ahead & (gaps.alignment > _PARALLEL))
     return apart
 
 
@@ -189,9 +189,9 @@ def _box_distance(parts: Sequence[MeshPart], pair: tuple[int, int]) -> float:
     return float(np.linalg.norm(np.maximum(np.max(lows, axis=0) - np.min(highs, axis=0), 0.0)))
 
 
-def _patch(part: int, walls: Walls, there: Bool[np.ndarray, " samples"]) -> _Patch:
+def _patch(part: int, gaps: SurfaceGaps, there: Bool[np.ndarray, " samples"]) -> _Patch:
     # Samples represent equal areas.
-    distance = float(np.median(walls.distances[there])) if there.any() else 0.0
+    distance = float(np.median(gaps.distances[there])) if there.any() else 0.0
     return _Patch(part, float(np.mean(there)), distance)
 
 

@@ -83,7 +83,7 @@ class SampledSurface(NamedTuple):
     owners: Int[np.ndarray, " owners"]
 
 
-class Walls(NamedTuple):
+class SurfaceGaps(NamedTuple):
     """The nearest point of another surface to each sample of a surface.
 
     Attributes:
@@ -115,7 +115,7 @@ def sample_surface(part: MeshPart) -> SampledSurface:
     )
 
 
-def walls_between(surface: SampledSurface, other: SampledSurface) -> Walls:
+def surface_gaps(surface: SampledSurface, other: SampledSurface) -> SurfaceGaps:
     """Returns the nearest point of another surface to each sample; both surfaces have area."""
     _, near = other.tree.query(surface.points, k=_CANDIDATES)
     faces = other.owners[near]
@@ -127,7 +127,7 @@ def walls_between(surface: SampledSurface, other: SampledSurface) -> Walls:
     face = np.take_along_axis(faces, best, axis=1)[:, 0]
     normals = surface.normals[surface.faces]
     along = np.sum(normals * way, axis=-1)
-    return Walls(
+    return SurfaceGaps(
         distances=distances,
         ahead=np.divide(along, distances, out=np.zeros_like(along), where=distances > 0.0),
         alignment=np.sum(normals * other.normals[face], axis=-1),

@@ -60,7 +60,7 @@ def read_contents(shards: Sequence[Path]) -> Contents:
       SceneError: if pyarrow is missing, if a file is broken or lacks a column, or if the number
         of rows is wrong.
     """
-    rows, told = 0, None
+    rows, metadata = 0, None
     for shard in shards:
         with _opened(shard) as file:
             names = set(file.schema_arrow.names)
@@ -71,8 +71,8 @@ def read_contents(shards: Sequence[Path]) -> Contents:
                     "with the columns image and transform_matrix."
                 )
             rows += file.metadata.num_rows
-            told = told or (file.schema_arrow.metadata or {}).get(METADATA_KEY)
-    return _thirds(rows, shards[0]) if told is None else _decoded(told, rows, shards[0])
+            metadata = metadata or (file.schema_arrow.metadata or {}).get(METADATA_KEY)
+    return _thirds(rows, shards[0]) if metadata is None else _decoded(metadata, rows, shards[0])
 
 
 def unpack(shards: Sequence[Path], scene: Path, *, progress: Progress) -> None:
@@ -191,10 +191,10 @@ def _thirds(rows: int, shard: Path) -> Contents:
     return Contents(dict.fromkeys(SPLITS, rows // len(SPLITS)))
 
 
-def _decoded(told: bytes, rows: int, shard: Path) -> Contents:
+def _decoded(metadata: bytes, rows: int, shard: Path) -> Contents:
     """Returns the contents that the metadata describe."""
     try:
-        record = configuration.parse_json(told)
+        record = configuration.parse_json(metadata)
         frames: dict[str, int] = {split: int(record["frames"].get(split, 0)) for split in SPLITS}
         angle = float(record["camera_angle_x"])
         valid = min(frames.values()) >= 0

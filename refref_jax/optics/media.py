@@ -86,14 +86,14 @@ class Crossing(NamedTuple):
     interior_list_after: Int[Array, " slots"]
 
 
-def interior_slots(interfaces: Interfaces) -> int:
+def interior_length(interfaces: Interfaces) -> int:
     """Returns the length of a ray's interior list: `SLOTS` under `priority`, else 0."""
     return SLOTS if interfaces.priority.shape[0] else 0
 
 
 def nowhere(interfaces: Interfaces) -> Int[Array, " slots"]:
     """Returns the interior list of a ray outside all parts."""
-    return jnp.full(interior_slots(interfaces), EMPTY_SLOT, jnp.int32)
+    return jnp.full(interior_length(interfaces), EMPTY_SLOT, jnp.int32)
 
 
 def crossing(
@@ -110,7 +110,7 @@ def crossing(
       part: part that is hit.
       entering: whether the ray comes from outside that part.
     """
-    if interior_slots(interfaces) == 0:
+    if interior_length(interfaces) == 0:
         return _declared_crossing(interfaces, interior_list, part, entering)
     without = jnp.where(interior_list == part, EMPTY_SLOT, interior_list)
     within = _add(interfaces, without, part)

@@ -37,7 +37,7 @@ from refref_jax.reconstruct.polytope_fit import MOST, fit_corners
 from refref_jax.reconstruct.smoothing import CREASE, denoise_within, diffuse
 
 
-def check_body(mesh: Mesh) -> None:
+def check_mesh(mesh: Mesh) -> None:
     """Checks that a mesh bounds a volume.
 
     Raises:
@@ -162,7 +162,7 @@ def refine(mesh: Mesh, settings: Refinement, *, views: Views | None = None) -> t
       ReconstructionError: if the mesh is empty, open or inside out; if it is to be remeshed and
         scikit-image is not installed; or if masks and cameras do not match.
     """
-    check_body(mesh)
+    check_mesh(mesh)
     if max(settings.rounding, settings.spacing) > 0.0:
         import_skimage()
     first = keep_pieces(mesh, smallest=settings.smallest_piece)

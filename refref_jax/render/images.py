@@ -85,7 +85,7 @@ def in_tiles(
     )
     parts = []
     for start in range(0, count, tile):
-        seen = see(*cut_out(flat, listed, start, tile), min(tile, count - start))
+        seen = see(*crop(flat, listed, start, tile), min(tile, count - start))
         parts.append(fetch(seen, instead=instead))
     joined = join(parts or [nothing])
     return jax.tree.map(lambda x: x[:count].reshape((*shape, *x.shape[1:])), joined)
@@ -119,7 +119,7 @@ def fetch(tree: _Tree, *, instead: str) -> _Tree:
     return jax.tree.map(np.asarray, jax.device_get(tree))
 
 
-def cut_out(
+def crop(
     rays: Rays, interior_list: Int[np.ndarray, "rays slots"] | None, start: int, tile: int
 ) -> tuple[Rays, Int[np.ndarray, "tile slots"] | None]:
     """Returns one tile of rays; the last tile is padded with rays that hit nothing.

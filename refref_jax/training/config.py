@@ -318,7 +318,7 @@ class TrainConfig:
       losses: The training loss.
       schedule: Optimisation schedule.
       seed: Seed of the initial parameters, the order of pixels and the sampling.
-      chosen: Names of the options that are overrides, not an option itself; see `wishes` for
+      chosen: Names of the options that are overrides, not an option itself; see `overrides` for
         `None`. Configurations that only differ in it are equal.
     """
 
@@ -357,8 +357,8 @@ class TrainConfig:
         """
         given, options, removed = _converted(given), _by_name(), _nothing(given)
         usual = {name: options[name].field.default for name in self.followers(**given).decided}
-        wishes = (self.wishes() | set(given)) - removed
-        chosen = tuple(name for name in options if name in wishes)
+        overrides = (self.overrides() | set(given)) - removed
+        chosen = tuple(name for name in options if name in overrides)
         return dataclasses.replace(self.decided(**usual, **given), chosen=chosen)
 
     def decided(self, **values: Any) -> "TrainConfig":
@@ -366,14 +366,14 @@ class TrainConfig:
 
         Nothing else changes. The arguments and errors are those of `override`.
         """
-        options, wishes = _by_name(), self.wishes()
-        chosen = tuple(name for name in options if name in wishes)
+        options, overrides = _by_name(), self.overrides()
+        chosen = tuple(name for name in options if name in overrides)
         config = dataclasses.replace(self, chosen=chosen)
         for name, value in _converted(values).items():
             config = config._with(options[name], value)
         return config
 
-    def wishes(self) -> frozenset[str]:
+    def overrides(self) -> frozenset[str]:
         """Returns the names of the options that are overrides.
 
         If `chosen` is `None`, these are all options with values other than the default; but none
@@ -390,15 +390,15 @@ class TrainConfig:
     def followers(self, **given: Any) -> Followers:
         """Returns the options that depend on values that would change; see `override`."""
         changed = {name for name, value in _converted(given).items() if self.get(name) != value}
-        wishes = self.wishes()
+        overrides = self.overrides()
         after = {o.name: set(o.field.metadata.get("after", ())) - {o.name} for o in options_of()}
         decided: set[str] = set()
         while True:
             reached = {n for n, causes in after.items() if causes & (changed | decided)}
             reached -= set(given)
-            if reached - wishes <= decided:
-                return Followers(frozenset(decided), frozenset(reached & wishes))
-            decided |= reached - wishes
+            if reached - overrides <= decided:
+                return Followers(frozenset(decided), frozenset(reached & overrides))
+            decided |= reached - overrides
 
     def at(self, scene: str) -> "TrainConfig":
         """Returns this configuration with another path of the same scene; decisions are kept."""

@@ -149,7 +149,7 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
         settings = dataclasses.replace(settings, reentry=require(config.paths.reentry))
     config = _resolve_training(config, model, reasons)
     check_batch(facts.cameras, require(config.schedule.batch))
-    return Resolved(config, SavedModel(model, settings), reasons, tuple(_doubts(asked, found)))
+    return Resolved(config, SavedModel(model, settings), reasons, tuple(_warnings(asked, found)))
 
 
 def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
@@ -209,10 +209,10 @@ def _sampling_of(model: ModelConfig) -> dict[str, Any]:
 
 
 def _first_reasons(config: TrainConfig) -> dict[str, str]:
-    usual, wishes = TrainConfig(), config.wishes()
+    usual, overrides = TrainConfig(), config.overrides()
     reasons = {}
     for option in options_of():
-        is_decision = option.field.default is None and option.name not in wishes
+        is_decision = option.field.default is None and option.name not in overrides
         set_ = _KEPT if is_decision else _GIVEN
         same = config.get(option.name) == usual.get(option.name)
         reasons[option.name] = _USUAL if same else set_
@@ -430,19 +430,19 @@ def _with_grid(field: RadianceConfig, asked: FieldConfig) -> RadianceConfig:
     return dataclasses.replace(field, grid=grid)
 
 
-def _doubts(asked: TrainConfig, found: SceneAnalysis) -> list[str]:
-    doubts = []
+def _warnings(asked: TrainConfig, found: SceneAnalysis) -> list[str]:
+    warnings = []
     if asked.model.interior == "clear" and found.tints == "given":
-        doubts.append(
+        warnings.append(
             "interior=clear, but the objects have colours in scene.json, which will be missing. "
             "Use interior=absorbing."
         )
     if asked.paths.reentry == "impossible" and found.reentry == "possible":
-        doubts.append(
+        warnings.append(
             "reentry=impossible, but light that has left these objects may meet them again; "
             "such light will not be traced any further. Leave it out."
         )
-    return doubts
+    return warnings
 
 
 def _refuse_cameras_inside(parts: Sequence[MeshPart], cameras: Cameras) -> None:

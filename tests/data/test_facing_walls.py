@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.data.mesh_queries import diagonal, sample_surface, walls_between
+from refref_jax.data.mesh_queries import diagonal, sample_surface, surface_gaps
 from tests.factories.solids import as_part, ball, box, inverted, joined
 
 _EXACT = 1e-12
 
 
 def _walls(part, other):
-    return walls_between(sample_surface(part), sample_surface(other))
+    return surface_gaps(sample_surface(part), sample_surface(other))
 
 
 def _moved(part, shift):

@@ -75,7 +75,7 @@ def test_turns_are_combined_when_there_is_time_and_that_is_said(tmp_path):
         together.training.count("--steps") == 1
         and "--log2_hashmap_size=20" not in together.training
     )
-    text = " ".join(recommend.told(choice, _MACHINE, tmp_path))
+    text = " ".join(recommend.describe(choice, _MACHINE, tmp_path))
     assert "not measured together" in text
     tight = recommend.seconds_of(rows[-1], _MACHINE)
     assert recommend.choose(rows, _MACHINE, tight + 0.1).combined is None
@@ -106,9 +106,9 @@ def test_the_bundled_table_is_a_whole_sweep():
 def test_what_is_told_can_be_pasted(tmp_path):
     rows = [made_row("base", evaluation="--rays_per_pixel=4")]
     choice = recommend.choose(rows, _MACHINE, 1e6)
-    blank = "\n".join(recommend.told(choice, _MACHINE, tmp_path / "my ball"))
+    blank = "\n".join(recommend.describe(choice, _MACHINE, tmp_path / "my ball"))
     assert f"'--scene={tmp_path / 'my ball'}' '--out=runs/my ball'" in blank
-    text = "\n".join(recommend.told(choice, _MACHINE, tmp_path / "ball"))
+    text = "\n".join(recommend.describe(choice, _MACHINE, tmp_path / "ball"))
     train = f"python -m experiments.train --scene={tmp_path / 'ball'} --out=runs/ball"
     assert f"{train} --preset=tiny --steps=1000" in text
     assert "experiments.evaluate --run=runs/ball --split=test --rays_per_pixel=4" in text

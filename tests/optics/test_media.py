@@ -61,7 +61,7 @@ def _media_along(interfaces, steps):
 @pytest.mark.parametrize(("rule", "slots"), [("nested", 0), ("facing", 0), ("priority", SLOTS)])
 def test_only_the_priority_rule_carries_a_list(rule, slots):
     made = jax.tree.map(jnp.asarray, interface_rules.RULES[rule]([1.5], [NO_PARENT]))
-    assert media.interior_slots(made) == slots
+    assert media.interior_length(made) == slots
     np.testing.assert_array_equal(media.nowhere(made), np.full(slots, EMPTY_SLOT))
     assert media.nowhere(made).dtype == jnp.int32
 

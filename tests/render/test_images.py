@@ -111,7 +111,7 @@ def test_a_chunk_of_nothing_is_refused(model, rays):
 
 def test_rays_that_only_fill_up_a_tile_are_not_rendered(model, rays):
     flat = Rays(*(x.reshape(256, *x.shape[2:])[:200] for x in rays))
-    full, _ = images.cut_out(flat, None, 0, 256)
+    full, _ = images.crop(flat, None, 0, 256)
     assert full.radii.shape == (256,)
     tile = images._trace_tile(model.scene, full, 200, settings=STRAIGHT, detail=everything(0))
     assert int(tile.count) == 200

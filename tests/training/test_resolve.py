@@ -225,17 +225,17 @@ def test_override_takes_decisions_again_that_follow_from_a_change():
 
 
 def test_what_was_asked_for_stays_and_what_was_decided_is_decided_again():
-    wishes = {"paths": "straight", "radius": 9.0, "steps": 100}
-    made = _resolve(_TINTED, scene="a", **wishes)
+    overrides = {"paths": "straight", "radius": 9.0, "steps": 100}
+    made = _resolve(_TINTED, scene="a", **overrides)
     config = made.config
     assert set(config.chosen) == {"scene", "paths", "radius", "steps", "batch"}
     other = config.override(scene="b", preset="small")
-    assert {name: other.get(name) for name in wishes} == wishes
+    assert {name: other.get(name) for name in overrides} == overrides
     open_ = ("interior", "tints", "background", "samples_per_ray", "warmup")
     assert {other.get(name) for name in open_} == {None}
     decided, kept = config.followers(scene="b")
     assert {"paths", "radius"} <= kept and {"interior", "background"} <= decided
-    assert not decided & config.wishes()
+    assert not decided & config.overrides()
     # Until it is taken back, or something else is asked for.
     assert config.override(paths=None).paths.name is None
     assert "paths" not in config.override(paths=None).chosen
@@ -333,11 +333,11 @@ def test_losses_have_one_place_for_what_is_usual():
 
 def test_wishes_of_a_file_that_does_not_tell_them():
     partial = TrainConfig(scene=SceneConfig(path="a"), paths=PathsConfig(name="straight"))
-    assert partial.wishes() == {"scene", "paths"}
+    assert partial.overrides() == {"scene", "paths"}
     assert partial.override(scene="b").paths.name == "straight"
     # A run of an earlier version: decisions look as wishes do, and are taken again.
     before = dataclasses.replace(_resolve(_TINTED, scene="a", paths="paper").config, chosen=None)
-    assert before.wishes() == set() and before.override(scene="b").paths.name is None
+    assert before.overrides() == set() and before.override(scene="b").paths.name is None
 
 
 def _resolve_again(config):

@@ -198,8 +198,8 @@ def read_view(out: Path, scene: Scene, name: str) -> View:
         if view.name == name
     }
     roots = dict.fromkeys(root for result in scene.results for root in result.roots)
-    told = next(iter(files_of.values())).truth
-    truth, mask = _truth(list(roots), told)
+    entry = next(iter(files_of.values())).truth
+    truth, mask = _truth(list(roots), entry)
     rendered = {
         method: Image(
             _or_unknown(image_files.read_rgb, out / view.rgb),
@@ -218,14 +218,14 @@ def read_view(out: Path, scene: Scene, name: str) -> View:
     return View(name, truth, mask, rendered)
 
 
-def _truth(roots: Sequence[Path], told: Truth) -> tuple[Image, Bool[np.ndarray, "h w"] | None]:
+def _truth(roots: Sequence[Path], entry: Truth) -> tuple[Image, Bool[np.ndarray, "h w"] | None]:
     """Returns the reference image and the mask, from the first folder that contains the image."""
-    root = next((root for root in roots if (root / told.rgb).is_file()), None)
+    root = next((root for root in roots if (root / entry.rgb).is_file()), None)
     if root is None:
         return Image(None, None), None
-    rgb = _or_unknown(image_files.read_rgb, root / told.rgb)
-    mask = told.mask and _or_unknown(image_files.read_mask, root / told.mask)
-    depth = told.distance and _or_unknown(image_files.read_depth, root / told.distance)
+    rgb = _or_unknown(image_files.read_rgb, root / entry.rgb)
+    mask = entry.mask and _or_unknown(image_files.read_mask, root / entry.mask)
+    depth = entry.distance and _or_unknown(image_files.read_depth, root / entry.distance)
     return Image(rgb, None if depth is None else _distance(root, depth)), mask
 
 

@@ -229,7 +229,7 @@ def test_top_views_are_means_over_the_five_farthest():
 def test_the_drmse_beside_the_papers_is_that_in_the_mask():
     metrics = {"substituted_rmse": 0.75, "substituted_rmse_masked": 0.0}
     table = paper_tables.top_views_table([made_record("cube_smcvx_ball", "tree", **metrics)])
-    masked = _place(table, "DRMSE, substituted, in the mask")
+    masked = _place(table, "DRMSE, substituted, masked")
     image = _place(table, "DRMSE, substituted, of the image")
     ours = _rows(table.blocks[0])[_TREE].cells
     theirs = _rows(table.blocks[0], "published")["R3F"].cells

@@ -283,7 +283,7 @@ def test_scenes_are_chosen_by_name_and_looked_at_before_anything_is_written(ball
     _convert(ball, "raw", tmp_path / "out")
     scenes = scene_folders.find(str(ball.parent))
     with pytest.raises(ValueError, match=r"1 of the 2 scenes already.*--scenes=cube_smcvx_cube"):
-        conversion.check_room(scenes, "raw", tmp_path / "out")
+        conversion.check_space(scenes, "raw", tmp_path / "out")
     (other / "val" / "r_000.png").unlink()
     with scene_error("val/r_000.png", "does not exist"):
         scene_folders.find(str(ball.parent))
@@ -296,7 +296,7 @@ def test_scenes_are_chosen_by_name_and_looked_at_before_anything_is_written(ball
 def test_a_name_that_the_published_layouts_do_not_know(ball, tmp_path, layout):
     toy = ball.rename(ball.with_name("toy"))
     with scene_error("'toy' is not the name of a scene", "cube_smcvx_toy"):
-        conversion.check_room(scene_folders.find(str(toy)), layout, tmp_path)
+        conversion.check_space(scene_folders.find(str(toy)), layout, tmp_path)
     _convert(toy, "local", tmp_path / "out")
     assert _files(tmp_path / "out" / "toy") == _files(toy)
 

@@ -124,7 +124,7 @@ def test_a_cavity_is_inside_and_what_is_between_bodies_is_not():
         solids.ball("far_glass", radius=0.5, centre=(3.0, 0.0, 0.0)),
     )
     axes = [np.array([-1.2, -0.75, 0.0, 0.75, 1.75, 3.0, 3.9]), np.zeros(1), np.zeros(1)]
-    inside = field_mesh.inside_bodies(scene, axes)[:, 0, 0]
+    inside = field_mesh.inside_objects(scene, axes)[:, 0, 0]
     assert inside.tolist() == [False, True, True, True, False, True, False]
 
 
@@ -132,7 +132,7 @@ def test_walls_are_where_a_bounded_model_ends():
     empty = Grid(np.zeros((9, 9, 9)), np.full(3, -2.0), 0.5)
     with pytest.raises(ValueError, match="below 5 per world unit in the whole box"):
         field_mesh.find_surface(empty, level=5.0)
-    room = field_mesh.with_walls(empty, level=5.0)
+    room = field_mesh.with_background(empty, level=5.0)
     found = field_mesh.find_surface(room, level=5.0)
     largest = np.abs(found.vertices).max(axis=-1)
     assert largest.min() > 2.0 - 0.2 * 0.5 and largest.max() <= 2.0

@@ -74,7 +74,7 @@ def test_a_ball_is_found_from_its_masks(whole):
     assert [words.partition(":")[0] for words in found.geometry.refused] == ["corners"]
     assert found.geometry.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.04)
     assert found.report.split == "test" and len(found.report.overlaps) == 5
-    assert found.report.mean_overlap > 0.97 and found.geometry.doubts == ()
+    assert found.report.mean_overlap > 0.97 and found.geometry.warnings == ()
     assert found.report.truth.chamfer < 0.005 and found.report.truth.normal_error < 3.0
     index = json.loads((whole / "index.json").read_text())
     assert index == {"source": "given", "index": 1.5, "error": None, "loss": None}
@@ -292,7 +292,7 @@ def test_light_is_kept_only_where_validation_views_say_so(
 
     def look(folder, split, model, *, seed, rays):
         looked.append((split, seed))
-        return index_stage.BodyPixels(SimpleNamespace(rgb=np.zeros(rays)), None)
+        return index_stage.ObjectPixels(SimpleNamespace(rgb=np.zeros(rays)), None)
 
     def refine_by_light(mesh, index, interfaces, evidence, *, config, settings, progress):
         assert settings.steps == 7 and index == 1.5 and interfaces.index_inside.shape == (1,)
@@ -327,7 +327,7 @@ def test_light_is_kept_only_where_validation_views_say_so(
 def test_a_body_that_light_blew_up_is_left_out(scene, monkeypatch, tmp_path):
     mesh = bodies.icosphere(2)
     blown = Refined(mesh._replace(vertices=1.05 * mesh.vertices), 1.6, (0.04,), 0.05)
-    pixels = index_stage.BodyPixels(SimpleNamespace(rgb=np.zeros(3)), None)
+    pixels = index_stage.ObjectPixels(SimpleNamespace(rgb=np.zeros(3)), None)
     monkeypatch.setattr(index_stage, "look", lambda *_, **options: pixels)
     monkeypatch.setattr(light_stage, "refine_by_light", lambda *_, **options: blown)
     errors = [0.04, 0.01]
@@ -370,9 +370,9 @@ def test_a_wrong_mask_is_named_unless_one_may_be_wrong(scene, tmp_path, outliers
     facts = geometry_stage.run(spoilt, tmp_path, dataclasses.replace(_CONFIG, outliers=outliers))
     true = 4 / 3 * np.pi * RADIUS**3
     if outliers:
-        assert facts.doubts == () and facts.volume == pytest.approx(true, rel=0.1)
+        assert facts.warnings == () and facts.volume == pytest.approx(true, rel=0.1)
     else:
-        seen, taken = facts.doubts
+        seen, taken = facts.warnings
         assert "of 24 training masks overlap with the object by less than 0.9" in seen
         name = wrong.relative_to(spoilt).as_posix()
         assert taken.startswith(f"{name} alone carves away") and "--outliers=1" in taken
