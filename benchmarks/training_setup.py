@@ -19,11 +19,11 @@ def set_up_training(scene: Path, *, preset: str, paths: str) -> tuple[loop.Setup
       paths: name of path settings.
     """
     asked = TrainConfig().override(scene=str(scene), preset=preset, paths=paths)
-    (config, model, *_), scene = prepare(asked)
+    (config, model, *_), objects = prepare(asked)
     frames = scene_folder.read_frames(scene, "train")
     images = scene_folder.read_images(frames)
     sampler = PixelSampler(images, frames.cameras, seed=config.seed, batch=config.schedule.batch)
-    setup = loop.set_up(config, model.config, model.settings, scene, sampler)
+    setup = loop.set_up(config, model.config, model.settings, objects, sampler)
     return setup, init_state(config.seed, model.config, config.schedule)
 
 

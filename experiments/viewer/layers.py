@@ -161,7 +161,7 @@ def with_indices(interfaces: Interfaces, indices: Sequence[float], rule: str) ->
 def _draw_surface(model: Model, layer: str, rays: Rays, most: int) -> Image:
     shape = rays.radii.shape
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
-    filled, _ = images.cut_out(flat, None, 0, max(most, flat.radii.size))
+    filled, _ = images.crop(flat, None, 0, max(most, flat.radii.size))
     met = find_first_surface(model.scene.surfaces, filled)
     count = flat.radii.size
     found = (met.parts[:count] != NO_PART).reshape(*shape, 1)
