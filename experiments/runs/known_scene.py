@@ -115,7 +115,7 @@ def build_scene(
       ValueError: if the background is unknown, or an image is missing or broken.
     """
     frames = _choose(frames, chosen)
-    objects = assemble_scene(parts, tree.parents, rule=rule)
+    objects = assemble_scene(parts, tree.parents, rule=rule, overlaps=tree.overlaps)
     return KnownScene(
         name=scene_names.of_folder(scene),
         objects=jax.device_put(objects),

@@ -4,7 +4,7 @@ Each part is checked by itself: it should be closed and oriented outwards, witho
 duplicate faces. Pairs of parts are checked for their position relative to each other. A liquid in
 its glass has one surface in common with it. Modelled as two surfaces, they coincide (light meets
 them in either order), leave a gap (light is totally reflected at a layer of air that does not
-exist) or overlap (correct under the rule `priority` alone).
+exist) or overlap (correct under the rule `priority`, and under `facing` as in Cycles).
 
 The advised rule is one of `optics.interface_rules`.
 """
@@ -218,9 +218,10 @@ def _cut(parts: Sequence[MeshPart], pair: tuple[int, int]) -> Finding:
     return Finding(
         "warning",
         parts[pair[0]].name,
-        f"intersects or touches {parts[pair[1]].name}. The rules 'nested' and 'facing' require "
-        "objects that are apart or strictly inside one another: use the rule 'priority', or model "
-        "the surface between them as one interface.",
+        f"intersects or touches {parts[pair[1]].name}. The rule 'nested' requires objects that are "
+        "apart or strictly inside one another: use the rule 'priority', or 'facing' for images of "
+        "a renderer that takes every index relative to air, or model the surface between them as "
+        "one interface.",
     )
 
 

@@ -203,7 +203,8 @@ def parts_around(
 ) -> Int[np.ndarray, "points slots"]:
     """Returns the interior lists of rays that start at points: the parts that contain each point.
 
-    Only the rule `priority` needs them, see `optics.media`.
+    Only the rules `priority` and `facing` need them, the latter if parts overlap; see
+    `optics.media`.
 
     Raises:
       SceneError: if a list is too short for the parts around a point.

@@ -159,7 +159,7 @@ def assemble(parts: Sequence[MeshPart], *, rule: RuleName = "nested") -> Scene:
     for finding in findings:
         if finding.severity == "warning":
             warnings.warn(f"{finding.part} {finding.message}", stacklevel=2)
-    return assemble_scene(parts, tree.parents, rule=rule)
+    return assemble_scene(parts, tree.parents, rule=rule, overlaps=tree.overlaps)
 
 
 def assemble_scene(
@@ -167,6 +167,7 @@ def assemble_scene(
     parents: Sequence[int],
     *,
     rule: RuleName,
+    overlaps: Sequence[tuple[int, int]] = (),
 ) -> Scene:
     """Builds surfaces and interfaces of all parts.
 
@@ -174,6 +175,7 @@ def assemble_scene(
       parts: meshes of the scene, possibly none.
       parents: innermost part around each part, from `mesh_queries.find_containment`.
       rule: interface rule, see `optics.interface_rules`.
+      overlaps: pairs of parts that overlap, from `mesh_queries.find_containment`.
     """
     surfaces = pack_meshes([shaded_mesh(part) for part in parts])
     interfaces = RULES[rule](
@@ -182,6 +184,7 @@ def assemble_scene(
         tints=[part.tint for part in parts],
         absorptions=[part.absorption for part in parts],
         priorities=[part.priority for part in parts],
+        overlaps=overlaps,
     )
     return Scene(surfaces, interfaces)
 

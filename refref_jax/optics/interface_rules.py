@@ -16,7 +16,7 @@ rule:
 """
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -43,6 +43,7 @@ class Rule(Protocol):
         tints: Colours | None = None,
         absorptions: Colours | None = None,
         priorities: Sequence[int] | None = None,
+        overlaps: Sequence[tuple[int, int]] = (),
     ) -> Interfaces:
         """Builds the interfaces of a scene.
 
@@ -52,6 +53,7 @@ class Rule(Protocol):
           tints: factor on light at each part's surface, `CLEAR` by default.
           absorptions: absorption of each part's medium, per world unit, `NO_ABSORPTION` by default.
           priorities: priority of each part, 0 by default; the highest wins.
+          overlaps: pairs of parts that overlap; only `facing` needs them.
         """
 
 
@@ -62,9 +64,10 @@ def nested(
     tints: Colours | None = None,
     absorptions: Colours | None = None,
     priorities: Sequence[int] | None = None,
+    overlaps: Sequence[tuple[int, int]] = (),
 ) -> Interfaces:
-    """Applies the `nested` rule; arguments as in `Rule`. Priorities are ignored."""
-    del priorities
+    """Applies the `nested` rule; arguments as in `Rule`. Priorities and overlaps are ignored."""
+    del priorities, overlaps
     outside = [INDEX_OF_AIR if parent == NO_PARENT else indices[parent] for parent in parents]
     return _interfaces(indices, outside, parents, tints, absorptions)
 
@@ -76,13 +79,20 @@ def facing(
     tints: Colours | None = None,
     absorptions: Colours | None = None,
     priorities: Sequence[int] | None = None,
+    overlaps: Sequence[tuple[int, int]] = (),
 ) -> Interfaces:
-    """Applies the `facing` rule; arguments as in `Rule`. Priorities are ignored.
+    """Applies the `facing` rule; arguments as in `Rule`.
 
-    Parents determine the media, and therefore absorption, but not the indices.
+    Parents determine the media, and therefore absorption, but not the indices. If parts overlap,
+    rays carry an interior list for the media. The medium of an overlap is that of the part with
+    more parts around it, then that of the higher priority.
     """
-    del priorities
-    return _interfaces(indices, [INDEX_OF_AIR] * len(indices), parents, tints, absorptions)
+    made = _interfaces(indices, [INDEX_OF_AIR] * len(indices), parents, tints, absorptions)
+    if not overlaps:
+        return made
+    given = priorities or [0] * len(indices)
+    order = _order([(_depth(parents, part), given[part]) for part in range(len(indices))])
+    return made._replace(priority=host_array(order), index_by_face=host_array(np.ones(1, bool)))
 
 
 def priority(
@@ -92,11 +102,13 @@ def priority(
     tints: Colours | None = None,
     absorptions: Colours | None = None,
     priorities: Sequence[int] | None = None,
+    overlaps: Sequence[tuple[int, int]] = (),
 ) -> Interfaces:
-    """Applies the `priority` rule; arguments as in `Rule`. Parents are ignored.
+    """Applies the `priority` rule; arguments as in `Rule`. Parents and overlaps are ignored.
 
     Source: Schmidt and Budge, Simple Nested Dielectrics in Ray Traced Images (2002).
     """
+    del overlaps
     alone = [NO_PARENT] * len(parents)
     made = _interfaces(indices, [INDEX_OF_AIR] * len(indices), alone, tints, absorptions)
     order = _order(priorities or [0] * len(made.index_inside))
@@ -106,7 +118,12 @@ def priority(
 RULES: dict[RuleName, Rule] = {"nested": nested, "facing": facing, "priority": priority}
 
 
-def _order(priorities: Sequence[int]) -> Int[np.ndarray, " parts"]:
+def _depth(parents: Sequence[int], part: int) -> int:
+    """Returns the number of parts around a part."""
+    return 0 if parents[part] == NO_PARENT else 1 + _depth(parents, parents[part])
+
+
+def _order(priorities: Sequence[Any]) -> Int[np.ndarray, " parts"]:
     """Returns the rank of each part by priority; among equals, the first part ranks highest."""
     ascending = sorted(range(len(priorities)), key=lambda part: (priorities[part], -part))
     return np.argsort(ascending).astype(np.int32)
@@ -136,6 +153,7 @@ def _interfaces(
         host_array(_colours(tints, CLEAR, len(media))),
         host_array(_colours(absorptions, NO_ABSORPTION, len(media))),
         host_array(np.zeros(0, np.int32)),
+        host_array(np.zeros(0, bool)),
     )
 
 

@@ -9,6 +9,11 @@ Maxwell counts the other way): a point in several objects is filled with the med
 highest-ranked one only. A ray then carries its *interior list*, the indices of the parts that
 contain it. Surfaces of outranked objects do not separate media and leave the ray unchanged.
 
+Under `facing`, every face bends light between its part and air, as in Cycles. Where parts overlap,
+this does not determine the medium of the next segment: a ray that leaves a liquid inside the wall
+of its glass is still in the glass. Rays then carry an interior list, too, which determines media,
+but not indices.
+
 The list is an unordered array of `SLOTS` part indices, `EMPTY_SLOT` where free, and its updates are
 branch-free. The side of a surface that a ray comes from determines whether the ray is inside that
 part, regardless of the list. A part entered while the list is full replaces the entry of lowest
@@ -33,7 +38,7 @@ INDEX_OF_AIR = 1.0
 """Index of refraction of the ambient medium."""
 
 SLOTS = 4
-"""Length of the interior list under the rule `priority`."""
+"""Length of the interior list, where rays carry one."""
 
 EMPTY_SLOT = -1
 """Free slot in the interior list."""
@@ -45,12 +50,14 @@ class Interfaces(NamedTuple):
     Attributes:
       index_inside: index of refraction inside the part.
       index_outside: index of refraction outside the part, meaningless under `priority`.
-      medium_outside: medium outside the part, meaningless under `priority`.
+      medium_outside: medium outside the part, meaningless where rays carry an interior list.
       tint: factor on linear RGB at every reflection and refraction (the colour of the glass BSDF
         in Cycles).
       absorption: absorption of the medium inside the part, linear RGB, per world unit.
-      priority: rank of the part by priority, unique, the highest wins; an empty array under
-        `nested` and `facing`, where rays carry no interior list.
+      priority: rank of the part, unique, the highest wins; an empty array where rays carry no
+        interior list: under `nested`, and under `facing` without overlaps.
+      index_by_face: one value, which is true, under `facing` with an interior list, where faces
+        determine indices and the list determines media; otherwise empty.
     """
 
     index_inside: Float[Array, " parts"]
@@ -59,6 +66,7 @@ class Interfaces(NamedTuple):
     tint: Float[Array, "parts 3"]
     absorption: Float[Array, "parts 3"]
     priority: Int[Array, " ranked"]
+    index_by_face: Bool[Array, " by_face"]
 
 
 class Crossing(NamedTuple):
@@ -87,7 +95,7 @@ class Crossing(NamedTuple):
 
 
 def interior_length(interfaces: Interfaces) -> int:
-    """Returns the length of a ray's interior list: `SLOTS` under `priority`, else 0."""
+    """Returns the length of a ray's interior list: `SLOTS` if it carries one, else 0."""
     return SLOTS if interfaces.priority.shape[0] else 0
 
 
@@ -106,17 +114,23 @@ def crossing(
 
     Args:
       interfaces: interfaces of the scene.
-      interior_list: interior list of the ray before the surface; empty under `nested` and `facing`.
+      interior_list: interior list of the ray before the surface, possibly of length 0.
       part: part that is hit.
       entering: whether the ray comes from outside that part.
     """
+    declared = _declared_crossing(interfaces, interior_list, part, entering)
     if interior_length(interfaces) == 0:
-        return _declared_crossing(interfaces, interior_list, part, entering)
+        return declared
     without = jnp.where(interior_list == part, EMPTY_SLOT, interior_list)
     within = _add(interfaces, without, part)
     medium_without, medium_within = _medium(interfaces, without), _medium(interfaces, within)
     medium_near = jnp.where(entering, medium_without, medium_within)
     medium_far = jnp.where(entering, medium_within, medium_without)
+    after = jnp.where(entering, within, without)
+    if interfaces.index_by_face.shape[0]:
+        return declared._replace(
+            medium_near=medium_near, medium_far=medium_far, interior_list_after=after
+        )
     outranked = medium_without == medium_within
     return Crossing(
         index_near=_index(interfaces, medium_near),
@@ -125,7 +139,7 @@ def crossing(
         medium_far=medium_far,
         tint=jnp.where(outranked, 1.0, interfaces.tint[part]),
         part=jnp.where(outranked, EMPTY_SLOT, part),
-        interior_list_after=jnp.where(entering, within, without),
+        interior_list_after=after,
     )
 
 

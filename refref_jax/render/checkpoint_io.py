@@ -199,7 +199,9 @@ def load_scene(run: Path) -> Scene:
         with np.load(path) as arrays:
             bvh = BVH(*(arrays[name] for name in BVH._fields))
             surfaces = Surfaces(bvh, arrays["normals"], arrays["parts"])
-            interfaces = Interfaces(*(arrays[name] for name in Interfaces._fields))
+            # Earlier versions stored no `index_by_face`.
+            known: Any = {"index_by_face": np.zeros(0, bool)} | dict(arrays)
+            interfaces = Interfaces(*(known[name] for name in Interfaces._fields))
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(
             f"{path} cannot be read ({_brief(error)}). Restore it, or train again into another "

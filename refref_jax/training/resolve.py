@@ -126,7 +126,7 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
         parts = meshes.read_meshes(folder, indices=dict(scene.indices))
     tree = mesh_queries.find_containment(parts)
     notes = mesh_checks.check_meshes(parts, tree, rule=scene.rule)
-    if scene.rule == "priority":
+    if scene.rule == "priority" or (scene.rule == "facing" and tree.overlaps):
         _refuse_cameras_inside(parts, cameras)
     space = scene.space or background.space(folder)
     found = scene_analysis.analyse(parts, tree, cameras, rule=scene.rule, space=space)
@@ -181,7 +181,8 @@ def build_scene(resolved: Resolved, facts: SceneFacts) -> Scene:
     """Builds the scene for tracing; its parts only have colours if `tints` is `given`."""
     given = resolved.config.model.tints == "given"
     parts = facts.parts if given else meshes.without_colour(facts.parts)
-    return assemble_scene(parts, facts.tree.parents, rule=resolved.config.scene.rule)
+    rule, tree = resolved.config.scene.rule, facts.tree
+    return assemble_scene(parts, tree.parents, rule=rule, overlaps=tree.overlaps)
 
 
 def samples_of(model: ModelConfig) -> tuple[int, ...]:
@@ -449,8 +450,8 @@ def _refuse_cameras_inside(parts: Sequence[MeshPart], cameras: Cameras) -> None:
     """Refuses cameras inside a mesh, whose rays would start with an interior list."""
     if np.any(mesh_queries.parts_around(parts, cameras.poses[:, :, 3]) != EMPTY_SLOT):
         raise ValueError(
-            "A camera is inside a mesh, which training does not support under rule=priority. Use "
-            "rule=nested, or move the camera."
+            "A camera is inside a mesh, which training does not support under rule=priority, nor "
+            "under rule=facing if meshes overlap. Use rule=nested, or move the camera."
         )
 
 

@@ -30,7 +30,8 @@ def right_prism(index=1.5):
 
 
 def build(*parts, rule="nested"):
-    built = assemble_scene(parts, find_containment(parts).parents, rule=rule)
+    tree = find_containment(parts)
+    built = assemble_scene(parts, tree.parents, rule=rule, overlaps=tree.overlaps)
     return jax.tree.map(jnp.asarray, built)
 
 

@@ -30,7 +30,7 @@ def test_facing_takes_air_everywhere_but_knows_the_media():
 def test_a_scene_without_parts_can_be_indexed(rule):
     interfaces = rule((), ())
     ranked = 1 if rule is interface_rules.priority else 0
-    assert [len(field) for field in interfaces] == [1, 1, 1, 1, 1, ranked]
+    assert [len(field) for field in interfaces] == [1, 1, 1, 1, 1, ranked, 0]
     np.testing.assert_array_equal(interfaces.tint, 1.0)
     np.testing.assert_array_equal(interfaces.absorption, 0.0)
 
@@ -79,3 +79,13 @@ def test_other_rules_take_no_notice_of_priorities(rule):
     made = interface_rules.RULES[rule](_INDICES, _PARENTS, priorities=[3, 2, 1])
     for field, other in zip(made, interface_rules.RULES[rule](_INDICES, _PARENTS), strict=True):
         np.testing.assert_array_equal(field, other)
+
+
+def test_facing_ranks_media_of_overlapping_parts_by_depth_then_priority():
+    # A bubble in a cup, and a drink that overlaps the cup.
+    made = interface_rules.facing(
+        [1.5, 1.0, 1.33], [NO_PARENT, 0, NO_PARENT], priorities=[1, 0, 2], overlaps=[(0, 2)]
+    )
+    np.testing.assert_array_equal(np.argsort(made.priority), [0, 2, 1])
+    np.testing.assert_array_equal(made.index_outside, 1.0)
+    assert made.index_by_face.tolist() == [True]

@@ -7,12 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.data.mesh_queries import parts_around
+from refref_jax.data.mesh_queries import find_containment, parts_around
+from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.optics import media, path_tracing
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.media import AMBIENT, EMPTY_SLOT
 from refref_jax.optics.path_settings import TREE, PathSettings
-from tests.factories import scenes
+from tests.factories import scenes, solids
 from tests.oracles import reference
 from tests.oracles.reference import Sphere
 
@@ -89,7 +90,7 @@ def test_a_contained_body_of_higher_priority_is_the_nested_model():
     assert set(np.unique(nested.media)) == {AMBIENT, 1, 2}
     for name in ("rays", "num_bends", "statuses", "media"):
         np.testing.assert_array_equal(getattr(ranked, name), getattr(nested, name))
-    for name in ("points", "directions", "tau", "weights"):
+    for name in ("points", "directions", "tau", "throughput"):
         np.testing.assert_allclose(getattr(ranked, name), getattr(nested, name), atol=1e-5)
 
 
@@ -314,3 +315,53 @@ def test_a_camera_in_a_drink_sees_its_wall(degrees):
     paths = _paths(scenes.build(*parts, rule="priority"), rays, interior_list=inside)
     assert paths.media[0, :4].tolist() == [2, 1, 1, AMBIENT]
     np.testing.assert_allclose(_last(paths)[1][0, 0], 1.333 * sine, atol=_PLANAR_TOLERANCE)
+
+
+# The rule `facing`: faces bend light, the interior list says in which medium it is.
+
+
+def _overlapping_cup():
+    """A hollow ball of glass, and a ball of water that reaches into its wall."""
+    cup = solids.shell("cup_glass", outer=1.0, inner=0.7)
+    return [cup, solids.ball("drink_water", radius=0.8, index=1.333)]
+
+
+def test_facing_media_of_an_overlapping_cup():
+    paths = _paths(
+        scenes.build(*_overlapping_cup(), rule="facing"),
+        scenes.rays([[-3.0, 0.01, 0.02]], [[1.0, 0.0, 0.0]]),
+    )
+    glass, water = 1, 2
+    seen = paths.media[0, : paths.num_bends[0] + 1].tolist()
+    assert [seen[i] for i in (0, 1, 3, 5, 6)] == [AMBIENT, glass, water, glass, AMBIENT]
+    assert seen[2] in (glass, water) and seen[4] in (glass, water) and len(seen) == 7
+
+
+def test_facing_media_are_those_around_each_segment():
+    parts = _overlapping_cup()
+    paths = _paths(scenes.build(*parts, rule="facing"), scenes.rays(*_bundle(_RAYS)))
+    compared = 0
+    for path in range(len(paths.rays)):
+        ends = paths.points[path, : paths.num_bends[path] + 1]
+        middles = 0.5 * (ends[1:] + ends[:-1])
+        long = np.linalg.norm(ends[1:] - ends[:-1], axis=-1) > 1e-2
+        media_of = paths.media[path, : len(middles)]
+        for medium, around in zip(media_of[long], parts_around(parts, middles)[long], strict=True):
+            held = set(around[around != EMPTY_SLOT] + 1)
+            assert (medium in held) if held else medium == AMBIENT
+            compared += len(held) == 2
+    assert compared > _RAYS // 4
+
+
+def test_facing_bends_light_by_faces_whatever_the_media():
+    parts = _overlapping_cup()
+    tracked = scenes.build(*parts, rule="facing")
+    tree = find_containment(parts)
+    untracked = assemble_scene(parts, tree.parents, rule="facing")
+    rays = scenes.rays(*_bundle(_RAYS))
+    found, expected = _paths(tracked, rays), _paths(untracked, rays)
+    assert media.interior_length(untracked.interfaces) == 0
+    assert media.interior_length(tracked.interfaces) == media.SLOTS
+    for name in ("points", "directions", "tau", "throughput", "num_bends", "statuses"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    assert np.any(found.media != expected.media)
