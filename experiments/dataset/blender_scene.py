@@ -64,6 +64,27 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return vertices, faces
 
 
+def use_gpu() -> None:
+    """Renders on all GPUs of the first kind that Blender finds.
+
+    Raises:
+      RuntimeError: if it finds none.
+    """
+    preferences = bpy.context.preferences.addons["cycles"].preferences
+    for kind in ("OPTIX", "CUDA", "HIP", "ONEAPI", "METAL"):
+        try:
+            preferences.compute_device_type = kind
+        except TypeError:  # not a kind of this platform
+            continue
+        preferences.get_devices()
+        if gpus := [device for device in preferences.devices if device.type == kind]:
+            for device in preferences.devices:
+                device.use = device in gpus
+            bpy.context.scene.cycles.device = "GPU"
+            return
+    raise RuntimeError("Blender finds no GPU; use --device=CPU")
+
+
 def _set_up_cycles(scene: Any, bounces: int) -> None:
     """Disables all settings that trade correctness for noise or speed; see the comments."""
     scene.render.engine = "CYCLES"

@@ -1,6 +1,6 @@
 """Renders views in Blender for another process (bpy, NumPy and the standard library only).
 
-PYTHON_OF_BLENDER experiments/dataset/blender_worker.py --threads=2
+PYTHON_OF_BLENDER experiments/dataset/blender_worker.py --device=CPU --threads=2
 
 Jobs are lines of JSON on standard input; each is answered by one line on standard output. The first
 line of output is `{"blender": VERSION}`. A job is a `workers.Job`; its answer is `{}` once its
@@ -25,7 +25,8 @@ def main() -> None:
     """Renders until there are no more jobs."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--threads", type=int, required=True)
-    threads = parser.parse_args().threads
+    parser.add_argument("--device", choices=["CPU", "GPU"], default="CPU")
+    options = parser.parse_args()
     answers = _take_over_output()
     jobs: queue.SimpleQueue[str] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(jobs,), daemon=True).start()
@@ -44,7 +45,9 @@ def main() -> None:
                 record = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
                 blender_scene.build(folder, record)
                 bpy.context.scene.render.threads_mode = "FIXED"
-                bpy.context.scene.render.threads = threads
+                bpy.context.scene.render.threads = options.threads
+                if options.device == "GPU":
+                    blender_scene.use_gpu()
                 built = job["scene"]
             blender_scene.place_camera(job["pose"], job["angle_x"])
             blender_scene.filter_over(blender_scene.WHOLE_PIXEL)

@@ -6,8 +6,14 @@ Each scene gets a folder in --out. Blender requires a separate environment, crea
 dataset-env`. An interrupted command resumes when it is given again: the result is the same, to the
 bit. Existing files are never replaced.
 
+A mesh of your own, closed and in any units, takes the place of the objects:
+
+    python -m experiments.dataset.make --out=runs/mine --mesh=vase.ply --material=glass
+
 `--preview` renders one test view of each scene instead, into {out}/preview, and contact sheets.
 """
+
+from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
@@ -19,7 +25,7 @@ from etils import epy
 
 from experiments.cli import app, outputs
 from experiments.cli import flags as cli_flags
-from experiments.dataset.render_settings import LEAST_TEXTURE, PerSplit, RenderSettings
+from experiments.dataset.render_settings import LEAST_TEXTURE, Device, PerSplit, RenderSettings
 from refref_jax.choices import TwoSidedRule
 from refref_jax.data.scene_names import BACKGROUNDS, SceneName
 
@@ -31,7 +37,9 @@ with epy.lazy_imports():
         frame_files,
         production,
         scenes,
+        user_meshes,
     )
+    from experiments.dataset.parts import Object
 
 _OUT = cli_flags.out("Output folder, with a folder for each scene.")
 _SCENES = flags.DEFINE_string(
@@ -40,7 +48,6 @@ _SCENES = flags.DEFINE_string(
     "all, or names separated by commas: scenes such as cube_smcvx_ball, objects such as ball for "
     "all their backgrounds, or either with wildcards such as 'sphere_*'.",
 )
-app.check(_SCENES, lambda words: scenes.choose(words, catalogue.OBJECTS))
 _SIZE = flags.DEFINE_integer("size", 800, "Width and height of images in pixels.", lower_bound=1)
 _SPP = flags.DEFINE_integer("spp", 512, "Samples per pixel of train and val.", lower_bound=1)
 _TEST_SPP = flags.DEFINE_integer(
@@ -68,6 +75,14 @@ _TEXTURE_SIZE = flags.DEFINE_integer(
 _EXR = flags.DEFINE_enum(
     "exr", "test", ["all", "test", "none"], "Splits that also keep their images as linear EXRs."
 )
+_MESH = flags.DEFINE_multi_string(
+    "mesh", [], "Mesh of an object of your own. Repeat the flag for an object of several parts."
+)
+_MATERIAL = flags.DEFINE_multi_string(
+    "material", ["glass"], "Material of each --mesh, in their order, or one for all."
+)
+app.check(_SCENES, lambda words: _MESH.value or scenes.choose(words, catalogue.OBJECTS))
+_DEVICE = flags.DEFINE_enum("device", "CPU", get_args(Device), "Device of Cycles.")
 _PREVIEW = flags.DEFINE_bool("preview", False, "One test view of each scene, and contact sheets.")
 _BLENDER = flags.DEFINE_string(
     "blender", ".venv-dataset/bin/python", "Python of the environment that has Blender."
@@ -79,7 +94,8 @@ _TILE = 200
 
 def main() -> None:
     """Makes the missing files of the chosen scenes."""
-    chosen = scenes.choose(_SCENES.value, catalogue.OBJECTS)
+    objects = _objects()
+    chosen = scenes.choose(_SCENES.value, objects)
     settings = _settings()
     blender = Path(_BLENDER.value).absolute()
     if not blender.is_file():
@@ -88,14 +104,14 @@ def main() -> None:
             "the Python of an environment with bpy 5.0.1 as --blender."
         )
     out = Path(_OUT.value) / "preview" if _PREVIEW.value else Path(_OUT.value)
-    if any(scene.object == "monkey" for scene in chosen):
+    if not _MESH.value and any(scene.object == "monkey" for scene in chosen):
         blender_meshes.export_monkey(catalogue.SUZANNE, blender=blender)
     with app.Interrupt() as interrupt:
         whole = production.produce(
             out,
             chosen,
             settings,
-            objects=catalogue.OBJECTS,
+            objects=objects,
             blender=blender,
             workers=_WORKERS.value,
             stopped=lambda: interrupt.requested,
@@ -124,7 +140,24 @@ def _settings() -> RenderSettings:
         texture_size=_TEXTURE_SIZE.value,
         linear=_EXR.value,
         preview=_PREVIEW.value,
+        device=_DEVICE.value,
+        source=user_meshes.digest(*_user_meshes()) if _MESH.value else "",
     )
+
+
+def _objects() -> dict[str, Object]:
+    """Returns the objects by name: those of the data set, or the user's own."""
+    if not _MESH.value:
+        return catalogue.OBJECTS
+    own = user_meshes.read_object(*_user_meshes())
+    return {own.name: own}
+
+
+def _user_meshes() -> tuple[list[Path], list[str]]:
+    paths = [Path(name) for name in _MESH.value]
+    if missing := [path for path in paths if not path.is_file()]:
+        raise ValueError(f"--mesh={missing[0]} does not exist. Give a mesh file.")
+    return paths, _MATERIAL.value
 
 
 def _write_contact_sheets(out: Path, chosen: Sequence[SceneName], settings: RenderSettings) -> None:

@@ -56,13 +56,16 @@ def produce(
             print(f"Nothing to do: all {len(wanted)} views exist.")
             return True
         cores = _cores()
-        count = min(workers or cores, len(missing))
+        # A GPU renders one view at a time.
+        usual = cores if settings.device == "CPU" else 1
+        count = min(workers or usual, len(missing))
         pool = Pool(
             views.tasks(out, missing, settings, objects=objects, scratch=scratch),
             blender=blender,
             scratch=scratch,
             workers=count,
             threads=max(1, cores // count),
+            device=settings.device,
         )
         done = _render(pool, len(wanted) - len(missing), len(wanted), stopped)
         return done == len(missing)

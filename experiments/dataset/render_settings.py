@@ -11,6 +11,9 @@ LinearImages = Literal["all", "test", "none"]
 GENERATOR = 1
 """Version of the generator, incremented when scenes with the same settings would change."""
 
+Device = Literal["CPU", "GPU"]
+"""Devices of Cycles."""
+
 LEAST_TEXTURE = 16
 """Smallest useful number of rows of a texture."""
 
@@ -54,6 +57,8 @@ class RenderSettings:
       texture_size: rows of each image of the background.
       linear: splits that keep linear EXRs.
       preview: whether only `preview_view` is rendered.
+      device: device of Cycles; the noise of images depends on it.
+      source: digest of the user's meshes, if the object is made of them.
     """
 
     size: int
@@ -63,6 +68,8 @@ class RenderSettings:
     texture_size: int = 1024
     linear: LinearImages = "test"
     preview: bool = False
+    device: Device = "CPU"
+    source: str = ""
 
     def __post_init__(self) -> None:
         """Rejects invalid settings.
@@ -97,6 +104,11 @@ class RenderSettings:
 
     def record(self) -> dict[str, Any]:
         """Returns the record of the settings for `scene.json`."""
+        render = {"generator": GENERATOR, **_RENDER, "linear_images": self.linear}
+        if self.device != "CPU":
+            render["device"] = self.device
+        if self.source:
+            render["meshes_sha256"] = self.source
         return {
             "renderer": f"Blender Cycles {BLENDER}",
             "size": self.size,
@@ -106,7 +118,7 @@ class RenderSettings:
             else self.views._asdict(),
             "rule": self.rule,
             "texture_size": self.texture_size,
-            "render": {"generator": GENERATOR, **_RENDER, "linear_images": self.linear},
+            "render": render,
         }
 
 

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from experiments.dataset.render_settings import Device
 from experiments.dataset.workers import SCRIPT, BlenderError, Task, Worker, WorkerDiedError
 
 
@@ -16,7 +17,14 @@ class Pool:
     """The processes. The context manager ends all of them."""
 
     def __init__(
-        self, tasks: Iterable[Task], *, blender: Path, scratch: Path, workers: int, threads: int
+        self,
+        tasks: Iterable[Task],
+        *,
+        blender: Path,
+        scratch: Path,
+        workers: int,
+        threads: int,
+        device: Device,
     ) -> None:
         """Describes a pool; `run` starts it.
 
@@ -26,9 +34,10 @@ class Pool:
           scratch: existing folder for temporary files.
           workers: number of processes.
           threads: number of threads of each process.
+          device: device of Cycles.
         """
         self._tasks, self._taking = iter(tasks), threading.Lock()
-        self._command = [str(blender), str(SCRIPT)]
+        self._command = [str(blender), str(SCRIPT), f"--device={device}"]
         self._scratch, self._workers, self._threads = scratch, workers, threads
         self._done: queue.SimpleQueue[Task | Exception | None] = queue.SimpleQueue()
         self._stopping = threading.Event()
