@@ -2,12 +2,11 @@
 
 A method is a set of options of `experiments.train`, so adding one means adding a line here.
 Everything else is that of the preset for all methods: sizes, schedule and footprint. `oracle`,
-`--paths=paper --interior=field`, therefore has the published light paths and field, and is the
-complete published method only in the preset `paper`: the other presets are smaller, or have
-differential footprints where the paper uses cones. Ablations of `oracle` remove one component;
-those of `tree`, our method, change one. An ablation that equals the preset is skipped (`same_as`),
-as is one that equals the scene's own choice (`same_inside`). Nerfacto's fields (`oracle_nerfacto`)
-define their own sizes, samples and footprint, a cone.
+`--paths=paper --interior=field`, therefore has the published light paths and fields;
+`docs/benchmark.md` lists its differences from the released code. Ablations of `oracle` remove one
+component; those of `tree`, our method, change one. An ablation that equals the preset is skipped
+(`same_as`), as is one that equals the scene's own choice (`same_inside`). Nerfacto's fields
+(`oracle_nerfacto`) define their own sizes, samples and footprint, a cone.
 """
 
 import dataclasses
