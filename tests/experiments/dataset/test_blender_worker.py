@@ -13,12 +13,19 @@ import trimesh
 
 from experiments.dataset import cameras, frame_files, workers
 from experiments.dataset.parts import ObjectPart
+from refref_jax.data import meshes
 from refref_jax.data.background import read_background
+from refref_jax.data.scene_assembly import assemble
 from refref_jax.geometry.cameras import box_filter, image_rays, supersample
+from refref_jax.optics.media import interior_length
+from refref_jax.optics.path_settings import PathSettings
+from refref_jax.render import render_known
 from refref_jax.render.backgrounds import radiance_of
 from tests.factories import small_dataset
 from tests.factories.blender_rooms import Blender, cameras_at, pose, write_room
 from tests.processes.command import ROOT
+
+_THOROUGH = PathSettings(48, "all", min_throughput=0.004, truncated_paths="black")
 
 _PYTHON = ROOT / ".venv-dataset" / "bin" / "python"
 
@@ -184,3 +191,29 @@ def test_a_process_ends_when_nobody_listens(tmp_path):
         process.stdin.close()
         assert process.wait(timeout=60) == 0
         assert process.stdout.read() == ""
+
+
+def test_facing_bends_light_where_parts_overlap_as_cycles_does(tmp_path, blender):
+    """A hollow ball of glass, and a ball of water that reaches into its wall."""
+    wall = trimesh.util.concatenate(
+        [
+            trimesh.creation.icosphere(4, radius=1.8),
+            trimesh.creation.icosphere(4, radius=1.3).copy(),
+        ]
+    )
+    faces = wall.faces.copy()
+    inner = np.arange(len(faces)) >= len(faces) // 2
+    faces[inner] = faces[inner][:, ::-1]
+    cup = ObjectPart("cup", "glass", np.array(wall.vertices), faces)
+    water = trimesh.creation.icosphere(4, radius=1.5)
+    drink = ObjectPart("drink", "water", np.array(water.vertices), np.array(water.faces))
+    room = write_room(tmp_path / "room", "cube", [cup, drink], rule="facing")
+    rendering = blender.render(room, pose(4), samples=1024)
+    parts = meshes.read_meshes(room)
+    scene = jax.device_put(assemble(parts, rule="facing"))
+    assert interior_length(scene.interfaces)
+    rays = image_rays(supersample(cameras_at(pose(4)), 8), 0)
+    seen = render_known(
+        scene, radiance_of(jax.device_put(read_background(room))), rays, settings=_THOROUGH
+    )
+    assert _psnr(rendering.linear, box_filter(np.asarray(seen.linear), 8)) > 38.0
