@@ -147,7 +147,7 @@ BUGS = (
         _TEST_STEP,
     ),
     Bug(
-        "sibling does not get the cut energy",
+        "sibling does not get the dropped branch's share",
         _STEP,
         "return Shares(reflected, 1.0 - reflected)",
         "return Shares(reflected, 1.0 - jnp.where(total, 1.0, partial))",

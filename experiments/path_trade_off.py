@@ -46,8 +46,8 @@ _THRESHOLDS = flags.DEFINE_list(
 _MAX_BENDS = flags.DEFINE_list(
     "max_bends", ["1", "2", "4", "6", "10", "16", "24", "32"], "Maximum numbers of bends."
 )
-flags.DEFINE_alias("cuts", "min_throughputs")
-flags.DEFINE_alias("bends", "max_bends")
+cli_flags.alias("cuts", "min_throughputs")
+cli_flags.alias("bends", "max_bends")
 _VIEWS = cli_flags.views("0,10")
 _RULE = cli_flags.rule()
 _IOR = cli_flags.ior()

@@ -58,7 +58,7 @@ _TRUNCATED_PATHS = cli_flags.enum(
     "last direction; 'black' makes them black, as in path tracers.",
     formerly=path_settings.FORMER_TRUNCATION,
 )
-flags.DEFINE_alias("unfinished", "truncated_paths")
+cli_flags.alias("unfinished", "truncated_paths")
 _VIEWS = cli_flags.views("all")
 _SETTINGS = cli_flags.settings()
 _RULE = cli_flags.rule()

@@ -48,7 +48,7 @@ _VALUES = flags.DEFINE_multi_string(
     "values", [], "Values to try for an option, as in max_bends=2/6. May be repeated."
 )
 _OPTIONS = flags.DEFINE_list("options", None, "Options to try; all by default.")
-flags.DEFINE_alias("knobs", "options")
+cli_flags.alias("knobs", "options")
 _POINTS = flags.DEFINE_list("points", None, "Points to measure with the base, as in max_bends=6.")
 _LIMIT = cli_flags.limit()
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "List the points without measuring them.")
@@ -114,7 +114,7 @@ def read_steps(words: list[str]) -> list[int]:
             f"--steps={','.join(words)} is not a list of numbers. Write as in --steps=2500,1000."
         ) from error
     if any(count < 1 for count in steps):
-        raise ValueError(f"--steps={','.join(words)} has no training. Give 1 or more.")
+        raise ValueError(f"--steps={','.join(words)} contains a number below 1. Give 1 or more.")
     return steps
 
 

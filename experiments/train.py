@@ -138,11 +138,11 @@ def _with_object(run: Path, asked: TrainConfig) -> tuple[TrainConfig, MeshPart |
 
 def _refuse_flags(run: Path) -> None:
     """Rejects flags that a resumed run would ignore."""
-    require = [*_CONFIG, "config", *(holder.name for holder in training_body.FLAGS)]
-    if given := [f"--{name}" for name in require if flags.FLAGS[name].present]:
+    ignored = [*_CONFIG, "config", *(holder.name for holder in training_body.FLAGS)]
+    if given := [f"--{name}" for name in ignored if flags.FLAGS[name].present]:
         raise ValueError(
             f"{run} resumes with its original options: {', '.join(given)} would have no effect. "
-            "Remove it, or add --scene to compare all options."
+            "Remove them, or add --scene to compare all options."
         )
 
 

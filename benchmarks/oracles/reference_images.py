@@ -15,10 +15,10 @@ from benchmarks.oracles.reference_surfaces import unit
 
 
 class EnvironmentBackground:
-    """A picture of all directions, infinitely distant, as `scene.json` describes it."""
+    """An image of all directions, infinitely distant, as `scene.json` describes it."""
 
     def __init__(self, scene: Path):
-        """Reads the picture of a scene's folder."""
+        """Reads the image of a scene's folder."""
         background = json.loads((scene / "scene.json").read_text())["background"]
         channels = OpenEXR.File(str(scene / background["image"])).channels()
         if "RGB" in channels:

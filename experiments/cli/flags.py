@@ -32,7 +32,12 @@ RUN = "config.json"
 RECONSTRUCTION = "reconstruction.json"
 
 
-# ---- Values of earlier versions ----
+# ---- Names and values of earlier versions ----
+def alias(former: str, present: str) -> None:
+    """Accepts the name that a flag had in earlier versions; only `--helpfull` lists it."""
+    flags.DEFINE_alias(former, present, module_name="earlier versions")
+
+
 class _EnumParser(flags.EnumParser):
     def __init__(self, values: Sequence[str], formerly: Mapping[str, str]):
         super().__init__(values)
@@ -167,8 +172,8 @@ def settings(*, min_throughput: float | None = None, max_bends: int | None = Non
     )
     app.check(found.min_throughput, lambda x: make_path_settings("tree", min_throughput=x))
     app.check(found.max_bends, lambda n: make_path_settings("tree", max_bends=n))
-    flags.DEFINE_alias("cut", "min_throughput")
-    flags.DEFINE_alias("bends", "max_bends")
+    alias("cut", "min_throughput")
+    alias("bends", "max_bends")
     return found
 
 

@@ -36,7 +36,7 @@ with epy.lazy_imports():
 
 _SCENES = flags.DEFINE_list("scenes", None, "Names of the scenes to check; all if not given.")
 _LIMIT = flags.DEFINE_integer("limit", 3, "Number of test images, evenly spaced; 0: none.", 0)
-flags.DEFINE_alias("views", "limit")
+cli_flags.alias("views", "limit")
 _OUT = flags.DEFINE_string("out", None, "Folder of the report; FOLDER if not given.")
 _OVERWRITE = cli_flags.overwrite("the report of an earlier check")
 # The diamond traps light for so long that the tree's own threshold costs 5 dB of 39, and Cycles'

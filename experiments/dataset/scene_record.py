@@ -86,7 +86,9 @@ def _materials_outside(
     tree = find_containment([mesh_part(part) for part in parts])
     absorbing = {i for i, part in enumerate(parts) if part.absorption != NO_ABSORPTION}
     if rule == "facing" and not absorbing & set(itertools.chain(*tree.overlaps)):
-        tree = tree._replace(overlaps=())  # every face has its part on one side and air on the other
+        tree = tree._replace(
+            overlaps=()
+        )  # every face has its part on one side and air on the other
     if tree.overlaps:
         first, second = (parts[number].name for number in tree.overlaps[0])
         raise ValueError(

@@ -16,6 +16,7 @@ from typing import Any, Literal
 from absl import flags
 
 from experiments.cli import app
+from experiments.cli import flags as cli_flags
 from experiments.runs import refraction_indices
 from refref_jax import configuration
 from refref_jax.training import config as training_config
@@ -69,7 +70,7 @@ def define_flags() -> dict[str, flags.FlagHolder]:
     holders = {option.name: _define(option) for option in options}
     for option in options:
         if former := option.field.metadata.get(configuration.FORMERLY):
-            flags.DEFINE_alias(former, option.name)
+            cli_flags.alias(former, option.name)
     return holders
 
 

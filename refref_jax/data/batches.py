@@ -74,7 +74,7 @@ class PixelSampler:
         if images.shape != expected:
             raise ValueError(
                 f"The images are {images.shape}, but the cameras require {expected}. Give one "
-                "image a camera, in its size."
+                "image per camera, of the camera's size."
             )
         check_batch(cameras, batch)
         places = np.arange(images.size // 3) if kept is None else np.flatnonzero(kept)

@@ -50,8 +50,9 @@ class HashGridConfig:
         """Validates the shape."""
         if self.levels < 1 or self.features < 1 or not 1 <= self.base_res <= self.max_res:
             raise ValueError(
-                f"The hash grid {self} is invalid. Give at least one level and one feature, and "
-                f"1 <= base_res <= max_res."
+                f"A hash grid with levels={self.levels}, features={self.features}, "
+                f"base_res={self.base_res} and max_res={self.max_res} is invalid. Give at least "
+                "one level and one feature, and 1 <= base_res <= max_res."
             )
         if self.hashmap_size < 2 or self.hashmap_size & (self.hashmap_size - 1):
             raise ValueError(

@@ -87,10 +87,10 @@ def follow_branch(
       reflects: choice of the reflected branch at each bend; a total internal reflection is always
         followed. All false is the main path.
       settings: path settings; `settings.max_bends` must be the length of `reflects`.
-      interior_list: interior list of the camera, for the rule `priority` (see `media`).
+      interior_list: interior list of the camera, where rays carry one (see `media`).
 
     Returns:
-      One path. Its weight is 0 if the path settings do not follow the branch, because its
+      One path. Its throughput is 0 if the path settings do not follow the branch, because its
       throughput moves to the sibling.
 
     Raises:

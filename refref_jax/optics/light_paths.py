@@ -5,10 +5,8 @@ Letters, as in the paper (section 4.2): a path has points `p_0 .. p_K`, unit dir
 `r(t) = p_i + (t - tau_i) d_i` for `t` in `[tau_i, tau_{i+1})`, and the last one never ends.
 `t` is arc length in world units.
 
-Separates light paths by the branch that they take at their first surface.
-
-The first surface divides the light of a pixel into two images: light reflected by the outside of
-the objects, and the rest, which passes through the objects or misses them.
+`reflected_first` separates the paths of a pixel by their branch at the first surface: light that
+the outside of the objects reflects, and the rest, which passes through the objects or misses them.
 """
 
 import enum

@@ -3,11 +3,12 @@
 Every part is the boundary of an object. A *medium* is identified by an integer: 0 is the
 surrounding air (`AMBIENT`), `1 + k` is the inside of part `k`.
 
-Under the rules `nested` and `facing`, both sides of a part are known in advance. Under `priority`,
-objects may overlap, and THE HIGHEST PRIORITY WINS (as in Arnold and in the paper cited below;
-Maxwell counts the other way): a point in several objects is filled with the medium of the
-highest-ranked one only. A ray then carries its *interior list*, the indices of the parts that
-contain it. Surfaces of outranked objects do not separate media and leave the ray unchanged.
+Under the rule `nested`, and under `facing` without overlaps, both sides of a part are known in
+advance. Under `priority`, objects may overlap, and THE HIGHEST PRIORITY WINS (as in Arnold and in
+the paper cited below; Maxwell counts the other way): a point in several objects is filled with the
+medium of the highest-ranked one only. A ray then carries its *interior list*, the indices of the
+parts that contain it. Surfaces of outranked objects do not separate media and leave the ray
+unchanged.
 
 Under `facing`, every face bends light between its part and air, as in Cycles. Where parts overlap,
 this does not determine the medium of the next segment: a ray that leaves a liquid inside the wall

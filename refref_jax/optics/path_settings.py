@@ -35,10 +35,10 @@ FORMER_TRUNCATION = {"kept": "background", "dark": "black"}
 # Max bends and throughput threshold for which the capacity factors below were measured.
 _PAPER_BENDS = 10
 _TREE_BENDS = 24
-_TREE_CUT = 0.02
+_TREE_MIN_THROUGHPUT = 0.02
 
 # Capacities do not grow for thresholds below this one, so that memory is bounded.
-_SMALLEST_CUT_WITH_ROOM = 5e-4
+_SMALLEST_SCALED_THRESHOLD = 5e-4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -186,7 +186,9 @@ def _usual_factors(settings: PathSettings) -> CapacityFactors:
     if settings.reflections != "all":
         return CapacityFactors(1.0, max(1.0, settings.max_bends / _PAPER_BENDS) * 11.0, 2.0)
     segments = max(1.0, settings.max_bends / _TREE_BENDS) * 24.0
-    growth = math.sqrt(max(1.0, _TREE_CUT / max(settings.min_throughput, _SMALLEST_CUT_WITH_ROOM)))
+    growth = math.sqrt(
+        max(1.0, _TREE_MIN_THROUGHPUT / max(settings.min_throughput, _SMALLEST_SCALED_THRESHOLD))
+    )
     return CapacityFactors(growth * 6.0, growth * segments, growth * 8.0)
 
 

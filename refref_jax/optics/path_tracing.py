@@ -87,8 +87,8 @@ def trace_ends(
       scene: the scene.
       rays: camera rays.
       settings: path settings.
-      interior_list: interior list of each camera, for the rule `priority` (see
-        `data.mesh_queries`); none by default. The other rules do not use it.
+      interior_list: interior list of each camera, where rays carry one (see
+        `media.interior_length` and `data.mesh_queries.parts_around`); none by default.
       block: number of rays cast at once, see `wavefront`.
     """
     scene, rays = in_one_precision(scene, rays)

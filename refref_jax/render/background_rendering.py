@@ -83,8 +83,8 @@ def render_known(
       radiance: function of origin and direction that returns the background's linear RGB.
       rays: camera rays with any leading axes, usually `[height, width]`.
       settings: path settings.
-      interior_list: interior list of each ray's origin, for the rule `priority` (see
-        `data.containment.parts_around`); none by default.
+      interior_list: interior list of each ray's origin, where rays carry one (see
+        `media.interior_length` and `data.mesh_queries.parts_around`); none by default.
       tile: number of rays traced at once. Lower it if memory runs out. The rays of a tile share the
         path buffers, so with few rays, throughput is dropped sooner.
 
@@ -100,8 +100,8 @@ def render_known(
       >>> camera = refref_jax.orbit(1, distance=4.0, elevation=0.3, size=4, angle_x=0.5)
       >>> rays = refref_jax.image_rays(camera, 0)
       >>> sky = lambda origin, direction: 0.5 + 0.5 * direction
-      >>> picture = render_known(glass, sky, rays, settings=refref_jax.PATH_PRESETS["straight"])
-      >>> picture.rgb.shape, picture.casts
+      >>> image = render_known(glass, sky, rays, settings=refref_jax.PATH_PRESETS["straight"])
+      >>> image.rgb.shape, image.casts
       ((4, 4, 3), 0)
     """
     if tile < 1:

@@ -49,10 +49,10 @@ CHUNK = 4096
 
 _INSTEAD = "Call it outside, or use render_rays, which is a pure function."
 _BRANCHES: tuple[Branch, ...] = get_args(Branch)
-_ALL, _PASSED, _MIRRORED = range(len(_BRANCHES))
+_ALL, _TRANSMITTED, _REFLECTED = range(len(_BRANCHES))
 
 RAYS_OF_A_BAND = 1 << 18
-"""Most rays that are held at once, where a row of pixels has no more."""
+"""Maximum number of rays held at once, unless one row of pixels has more."""
 
 
 def in_tiles(
@@ -296,9 +296,9 @@ def _sort(traced: Traced, real: int | Int[Array, ""], which: int | Int[Array, ""
       which: index of the selected branch in `_BRANCHES`.
     """
     paths, rays = traced.paths, traced.dropped.shape[0]
-    mirrored = jnp.where(reflected_first(paths), _MIRRORED, _PASSED)
+    branch = jnp.where(reflected_first(paths), _REFLECTED, _TRANSMITTED)
     exists = light_paths.exists(paths) & (paths.rays < real)
-    exists &= (which == _ALL) | (which == mirrored)
+    exists &= (which == _ALL) | (which == branch)
     order = jnp.argsort(~exists, stable=True)
     throughput = jnp.mean(paths.throughput, axis=-1)
     most = jax.ops.segment_max(throughput, paths.rays, num_segments=rays)
@@ -350,7 +350,7 @@ def render_camera(
     Rows of pixels are rendered band by band, so that memory does not grow with the image.
 
     Args:
-      model: the scene.
+      model: trained model.
       cameras: cameras with the resolution of the image.
       view: index of the camera.
       rays_per_pixel: number of rays in each pixel, a square: 1, 4, 9, 16.

@@ -185,7 +185,8 @@ class FieldConfig:
         counts = self.samples_per_ray
         if counts is not None and not (counts and min(counts) > 0):
             raise ValueError(
-                f"samples_per_ray is {','.join(map(str, counts))}, not a list of positive numbers. "
+                f"samples_per_ray is {','.join(map(str, counts)) or 'empty'}, not a list of "
+                "positive numbers. "
                 "Use a list such as samples_per_ray=32,20."
             )
         if self.multisamples not in (None, *_PATTERNS):
@@ -269,9 +270,15 @@ class ScheduleConfig:
             number, least = getattr(self, name), 0 if name in ("warmup", "anneal") else 1
             if number is not None and not least <= number <= _MOST:
                 raise ValueError(f"{name} is {number}. Give {least} to {_MOST}.")
-        for name in ("peak", "end"):
-            if (rate := getattr(self, name)) is not None and not 0.0 < rate < math.inf:
-                raise ValueError(f"The learning rate {name} is {rate}. Give a positive number.")
+        for name in ("warmup", "anneal"):
+            number = getattr(self, name)
+            if None not in (number, self.steps) and number > self.steps:
+                raise ValueError(
+                    f"{name} is {number}, but the run has only {self.steps} steps. Give fewer."
+                )
+        for name, rate in (("learning_rate", self.peak), ("final_learning_rate", self.end)):
+            if rate is not None and not 0.0 < rate < math.inf:
+                raise ValueError(f"{name} is {rate}. Give a positive number.")
 
     def over(self, steps: int) -> "ScheduleConfig":
         """Returns the same schedule stretched over another number of steps."""

@@ -99,7 +99,8 @@ def row(count: int | None) -> Mesh | None:
     if not 1 <= count <= fewest:
         raise ValueError(
             f"There {'is 1 device' if fewest == 1 else f'are {fewest} devices'} of kind "
-            f"{jax.devices()[0].platform}, not {count}. Give 1 to {fewest}, or None for all."
+            f"{jax.devices()[0].platform}, not {count}. Give "
+            f"{'1' if fewest == 1 else f'1 to {fewest}'}, or use all."
         )
     chosen = [device for each in by_process for device in each[:count]]
     return None if len(chosen) == 1 else Mesh(chosen, (AXIS,))

@@ -85,7 +85,8 @@ def fit(
       parts: objects that take the place of the scene's own meshes.
       progress: function called every `periods.log` steps.
       report: function that receives decisions and warnings, as lines of text.
-      stop: is asked between steps whether to save a checkpoint, and return the model as it is.
+      stop: function called between steps; if it returns `True`, a checkpoint is saved, and the
+        model is returned as it is.
       periods: periods of metrics and checkpoints.
       mesh: devices that train together; `None` for a single device.
 

@@ -117,7 +117,8 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
       parts: objects that replace the scene's own meshes.
 
     Raises:
-      ValueError: if the scene is broken, or a camera is inside a mesh under the rule `priority`.
+      ValueError: if the scene is broken, or a camera is inside a mesh where rays carry an
+        interior list.
     """
     folder = Path(scene.path)
     scene_folder.check_scene(folder)
@@ -296,9 +297,9 @@ def _resolve_inside(
         given_as_clear = tints == "given" and found.tints == "none" and interior == "clear"
         if tints not in (None, "none") and not given_as_clear:
             raise ValueError(
-                f"tints={tints} has no effect with interior {interior} and at most "
-                f"{settings.max_bends} bends. Leave it out, or use interior=absorbing and bent "
-                "paths."
+                f"tints={tints} has no effect with interior {interior}"
+                f"{'' if settings.max_bends else ' and straight rays'}. Leave it out, or use "
+                "interior=absorbing and bent paths."
             )
         model = dataclasses.replace(config.model, tints=None)
         config = dataclasses.replace(config, model=model)

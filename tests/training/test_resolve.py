@@ -160,7 +160,7 @@ def test_resolve_warns_of_what_is_doubtful():
         (_UNTOLD, {"tints": "given"}, "scene.json lacks"),
         (_TINTED, {"tints": "learned", "interior": "clear"}, "no effect with interior clear"),
         (_TINTED, {"tints": "given", "interior": "field"}, "no effect with interior field"),
-        (_TINTED, {"tints": "given", "paths": "straight"}, "at most 0 bends"),
+        (_TINTED, {"tints": "given", "paths": "straight"}, "and straight rays"),
         (_TINTED, {"tints": "none"}, "an absorbing interior has colours"),
         (_EMPTY, {"tints": "learned"}, "no effect"),
         (_EMPTY, {"paths": "tree"}, "no meshes"),
