@@ -25,6 +25,7 @@ from etils import epy
 from experiments.cli import app, outputs
 from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
+from experiments.sweeps import options
 
 if TYPE_CHECKING:
     from experiments.sweeps.points import Point
@@ -49,6 +50,8 @@ _VALUES = flags.DEFINE_multi_string(
 )
 _OPTIONS = flags.DEFINE_list("options", None, "Options to try; all by default.")
 cli_flags.alias("knobs", "options")
+app.check(_BASE, options.parse_base)
+app.check(_VALUES, options.parse_values)
 _POINTS = flags.DEFINE_list("points", None, "Points to measure with the base, as in max_bends=6.")
 _LIMIT = cli_flags.limit()
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "List the points without measuring them.")
@@ -94,8 +97,8 @@ def points_from_flags() -> list[Point]:
         preset=_PRESET.value,
         seed=_SEED.value,
         steps=read_steps(_STEPS.value),
-        base=points.parse_base(_BASE.value),
-        values=points.parse_values(_VALUES.value),
+        base=options.parse_base(_BASE.value),
+        values=options.parse_values(_VALUES.value),
         vary=_OPTIONS.value,
     )
     return found if _POINTS.value is None else points.choose(found, _POINTS.value)

@@ -184,6 +184,30 @@ def _parse(option: Option, value: Any) -> Any:
     return value
 
 
+def parse_text(name: str, text: str) -> Any:
+    """Returns the value of an option that is given as text, as on the command line.
+
+    Raises:
+      ValueError: if there is no such option, or the value is invalid.
+    """
+    options = {option.name: option for option in training_config.options_of()}
+    if name not in options:
+        raise ValueError(f"There is no option {name}.{app.did_you_mean(name, options)}")
+    option, kind = options[name], _kind(options[name])
+    value: Any = text
+    if name == "ior" or typing.get_origin(kind) is tuple:
+        value = text.split(",")
+    elif kind in (int, float) and text != AUTO:
+        try:
+            value = kind(text)
+        except ValueError:
+            noun = "an integer" if kind is int else "a number"
+            raise ValueError(f"{name} is {text!r}, not {noun}.") from None
+    value = _parse(option, value)
+    TrainConfig().override(**{name: value})
+    return value
+
+
 def _kind(option: Option) -> Any:
     """Returns the type of an option that is not `None`."""
     kind = training_config.type_of(option)

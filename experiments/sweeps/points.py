@@ -9,16 +9,13 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from experiments.cli import app
+from experiments.sweeps.options import OF_EVALUATION, present_name
 from refref_jax.fields import registry
 from refref_jax.optics.path_settings import PATH_PRESETS
-from refref_jax.training import config as training_config
 from refref_jax.training import resolve
 from refref_jax.training.presets import PRESETS, Bounds
 
 BASE = "base"
-
-OF_EVALUATION = ("rays_per_pixel",)
-"""Options of the evaluation only."""
 
 _BASE_OPTIONS = {"paths": "tree"}
 
@@ -176,12 +173,6 @@ def default_values(preset: str, *, field: str = registry.USUAL) -> dict[str, tup
     }
 
 
-def present_name(name: str) -> str:
-    """Returns the name of an option, or of a point, for its name in this or an earlier version."""
-    option, *value = name.split("=", 1)
-    return "=".join([training_config.present_name(option), *value])
-
-
 def choose(points: Sequence[Point], names: Sequence[str]) -> list[Point]:
     """Returns the points with these names, and the base, for comparison.
 
@@ -193,41 +184,6 @@ def choose(points: Sequence[Point], names: Sequence[str]) -> list[Point]:
         near = app.did_you_mean(unknown[0], known)
         raise ValueError(f"There is no point {unknown[0]}.{near} Choose from {', '.join(known)}.")
     return [point for point in points if point.name in {BASE, *names}]
-
-
-def parse_base(words: Sequence[str]) -> dict[str, str]:
-    """Returns the options given by words such as `min_throughput=0.05` or `samples_per_ray=48,32`.
-
-    Raises:
-      ValueError: if a word does not have that form.
-    """
-    options = {}
-    for word in words:
-        name, equals, value = word.partition("=")
-        if not (name and equals and value):
-            raise ValueError(
-                f"--base={word} is not NAME=VALUE. Write for example --base=min_throughput=0.05."
-            )
-        options[present_name(name)] = value
-    return options
-
-
-def parse_values(words: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Returns the values of options from words such as `max_bends=2/6`.
-
-    Raises:
-      ValueError: if a word does not have that form.
-    """
-    values = {}
-    for word in words:
-        name, equals, given = word.partition("=")
-        name = present_name(name)
-        values[name] = tuple(value for value in given.split("/") if value)
-        if not (name and equals and values[name]):
-            raise ValueError(
-                f"--values={word} is not NAME=A/B. Write for example --values=max_bends=2/6."
-            )
-    return values
 
 
 def _point(base: Mapping[str, str], option: str, value: str) -> Point:

@@ -16,7 +16,8 @@ from experiments.cli.subprocesses import RunFailedError
 from experiments.runs import measured_runs
 from experiments.runs.measured_runs import Training
 from experiments.sweeps import table
-from experiments.sweeps.points import BASE, OF_EVALUATION
+from experiments.sweeps.options import OF_EVALUATION
+from experiments.sweeps.points import BASE
 from experiments.sweeps.table import NOISE, Row
 from refref_jax.data import scene_names
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from experiments.figures.style import COLOURS, LABEL_HEIGHT, label_plainly, pyplot, style
 from experiments.sweeps import table
-from experiments.sweeps.points import OF_EVALUATION
+from experiments.sweeps.options import OF_EVALUATION
 from experiments.sweeps.table import NOISE, Row, Turn
 
 _HEAD = (

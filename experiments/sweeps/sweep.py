@@ -9,7 +9,8 @@ from experiments.cli.progress import ProgressBar
 from experiments.cli.subprocesses import RunFailedError
 from experiments.runs import measured_runs
 from experiments.sweeps import report, table
-from experiments.sweeps.points import BASE, OF_EVALUATION, Point
+from experiments.sweeps.options import OF_EVALUATION
+from experiments.sweeps.points import BASE, Point
 from experiments.sweeps.table import Row
 from refref_jax.data import scene_names
 

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from experiments.sweeps.points import BASE, OF_EVALUATION, present_name
+from experiments.sweeps.options import OF_EVALUATION, present_name
+from experiments.sweeps.points import BASE
 from refref_jax import atomic_files
 
 NOISE = 0.3

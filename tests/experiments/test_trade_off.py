@@ -10,6 +10,7 @@ import pytest
 from experiments.cli import subprocesses
 from experiments.cli.subprocesses import RunFailedError
 from experiments.runs import measured_runs
+from experiments.sweeps import options as sweep_options
 from experiments.sweeps import points as trade_points
 from experiments.sweeps import report, sweep, table
 from experiments.sweeps.points import BASE
@@ -91,7 +92,7 @@ def test_rays_per_pixel_are_evaluations_alone():
 
 
 def test_the_lists_of_a_knob_can_be_replaced_and_knobs_added():
-    values = trade_points.parse_values(["samples_per_ray=16,10/8,4", "batch=256"])
+    values = sweep_options.parse_values(["samples_per_ray=16,10/8,4", "batch=256"])
     vary = ("samples_per_ray", "batch", "steps")
     points = trade_points.sweep(preset="tiny", values=values, vary=vary)
     assert {point.name for point in points[1:]} == {
@@ -121,8 +122,8 @@ def test_the_lists_of_a_knob_can_be_replaced_and_knobs_added():
             lambda: trade_points.sweep(preset="tiny", base={"field": "a"}),
             "Choose from zipnerf",
         ),
-        (lambda: trade_points.parse_base(["min_throughput"]), "NAME=VALUE"),
-        (lambda: trade_points.parse_values(["min_throughput="]), "NAME=A/B"),
+        (lambda: sweep_options.parse_base(["min_throughput"]), "NAME=VALUE"),
+        (lambda: sweep_options.parse_values(["min_throughput="]), "NAME=A/B"),
         (
             lambda: trade_points.choose(trade_points.sweep(preset="tiny"), ["min_throughput=1"]),
             "min_throughput=1",
