@@ -8,6 +8,7 @@ is annotated with a base class, the key `kind` of its value selects the variant 
 """
 
 import dataclasses
+import difflib
 import json
 import math
 import numbers
@@ -96,8 +97,7 @@ def read(path: Path, kind: type[_Config], *, variants: Variants | None = None) -
         return build(content, kind, variants=variants)
     except (ValueError, TypeError) as error:
         raise ValueError(
-            f"{path} does not hold a {kind.__name__} ({error}). Restore the file, or write it "
-            "again with this version."
+            f"{path} is not a valid {kind.__name__} ({error}). Correct or restore the file."
         ) from error
 
 
@@ -213,9 +213,18 @@ def _build_dataclass(kind: Any, value: Any, where: str, variants: Variants) -> A
     if missing := needed - set(value):
         raise ValueError(f"{where} lacks {', '.join(map(repr, sorted(missing)))}")
     if unknown := set(value) - set(names):
-        raise ValueError(f"{where} has the unknown {', '.join(map(repr, sorted(unknown)))}")
+        raise ValueError(f"{where} has the unknown key {_unknown(sorted(unknown)[0], hints)}")
     built = {n: _build(hints[n], value[n], f"{where}.{n}", variants) for n in names}
     return kind(**built)
+
+
+def _unknown(key: str, hints: Mapping[str, Any]) -> str:
+    """Returns an unknown key with advice: the nearest known one, or the section that it is in."""
+    for section, kind in hints.items():
+        if dataclasses.is_dataclass(kind) and key in {f.name for f in dataclasses.fields(kind)}:
+            return f"{key!r}, which belongs in {section!r}"
+    near = difflib.get_close_matches(key, hints, n=1)
+    return f"{key!r}" + (f": did you mean {near[0]!r}?" if near else "")
 
 
 def _with_present_names(

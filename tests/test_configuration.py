@@ -193,13 +193,13 @@ def test_wrong_item_of_a_tuple_is_named_by_its_place(path):
 @pytest.mark.parametrize("content", [b"", b'{"steps": 7', b"\xff\xfe", b"steps: 7"])
 def test_broken_json(path, content):
     path.write_bytes(content)
-    _assert_refused(path, "Restore the file")
+    _assert_refused(path, "Correct or restore the file")
 
 
 @pytest.mark.parametrize("content", ["[]", "7", "null", '"text"'])
 def test_json_that_is_no_object(path, content):
     path.write_text(content, encoding="utf-8")
-    _assert_refused(path, "not an object", "Restore the file")
+    _assert_refused(path, "not an object", "Correct or restore the file")
 
 
 def test_missing_file(path):
@@ -316,5 +316,5 @@ def test_a_key_of_an_earlier_version_is_read_by_its_present_name(path):
     path.write_text('{"steps": 3, "ending": "dark"}')
     assert configuration.read(path, _Renamed) == _Renamed(3, ending="black")
     path.write_text('{"steps": 3, "most_steps": 4}')
-    with pytest.raises(ValueError, match="unknown 'steps'"):
+    with pytest.raises(ValueError, match="unknown key 'steps'"):
         configuration.read(path, _Renamed)

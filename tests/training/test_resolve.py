@@ -404,13 +404,13 @@ def test_a_reconstruction_is_named_as_seen_from_its_run(tmp_path, monkeypatch):
         ("[" * 200_000, "nested too deeply"),
         ('{"seed": NaN}', "NaN, not a number"),
         ('{"paths": {"cut": NaN}}', "NaN, not a number"),
-        ('{"seed": 0', "does not hold a TrainConfig"),
-        ('{"sead": 0}', "unknown 'sead'"),
+        ('{"seed": 0', "is not a valid TrainConfig"),
+        ('{"sead": 0}', "unknown key 'sead': did you mean 'seed'"),
         ('{"paths": {"cut": 2}}', "min_throughput is 2.0, outside"),
         ("[]", "not an object"),
         ('{"loss": 1, "batch": 2, "pool": 3}', "not started again"),
         ('{"seed": -1}', "seed is -1"),
-        (b"\xff\xfe\x00", "does not hold a TrainConfig"),
+        (b"\xff\xfe\x00", "is not a valid TrainConfig"),
     ],
 )
 def test_a_file_that_is_no_configuration_is_refused_in_one_line(tmp_path, text, message):
