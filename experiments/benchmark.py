@@ -45,8 +45,8 @@ with epy.lazy_imports():
 _SCENES = flags.DEFINE_list(
     "scenes",
     [],
-    "Scenes, separated by commas: folders, with or without wildcards, or hf:CONFIG/SCENE of the "
-    "published data set.",
+    "Scenes, separated by commas: folders, or hf:CONFIG/SCENE of the published data set, both with "
+    "or without wildcards; hf:all and hf:CONFIG stand for all its scenes.",
 )
 _METHODS = flags.DEFINE_list(
     "methods",

@@ -215,13 +215,14 @@ def find_scenes(words: Sequence[str]) -> list[Scene]:
     """Returns scenes in the order of their names.
 
     Args:
-      words: folders, with or without wildcards, or `hf:CONFIG/SCENE`. Matches of a wildcard that
-        are not scenes are ignored.
+      words: folders, with or without wildcards, `hf:CONFIG/SCENE`, or patterns of the latter.
+        Matches of a wildcard that are not scenes are ignored.
 
     Raises:
       ValueError: if there are no scenes, if a folder is not a scene, or if two have the same name.
     """
-    folders = [folder for word in words if word for folder in _folders(word.strip())]
+    sources = cli_scenes.expanded([word for word in words if word.strip()])
+    folders = [folder for source in sources for folder in _folders(source)]
     if not folders:
         raise ValueError(
             f"--scenes={','.join(words)} matches no scene. Give folders that contain "

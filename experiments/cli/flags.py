@@ -27,6 +27,8 @@ RULES = get_args(choices.RuleName)
 
 SCENE_FORMS = "a folder, or hf:CONFIG/SCENE of the published data set"
 
+SCENES_FORMS = f"{SCENE_FORMS} (hf:all, hf:CONFIG and wildcards stand for several)"
+
 # Files that identify the folders of a run and of a reconstruction.
 RUN = "config.json"
 RECONSTRUCTION = "reconstruction.json"
