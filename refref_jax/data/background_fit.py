@@ -20,14 +20,15 @@ The background is opaque and encloses the cameras, so that nearer points are on 
 are no masks, this leaves the objects out.
 """
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from refref_jax.choices import Space
+from refref_jax.choices import Space, Split
 from refref_jax.data import background, image_files, scene_folder, scene_names
 from refref_jax.geometry.cameras import Cameras, planar_directions
 
@@ -124,8 +125,8 @@ def fit_size_and_centre(kind: Kind, samples: DepthSamples) -> BackgroundFit | No
 
 def sample_depths(
     cameras: Cameras,
-    depths: Sequence[Float[np.ndarray, "h w"]],
-    masks: Sequence[Bool[np.ndarray, "h w"]] | None = None,
+    depths: Float[np.ndarray, "views h w"],
+    masks: Bool[np.ndarray, "views h w"] | None = None,
     *,
     step: float = 0.0,
 ) -> DepthSamples:
@@ -141,11 +142,11 @@ def sample_depths(
     generator = np.random.default_rng(0)
     parts = 1 if len(depths) >= _FEWEST_CLUSTERS else _PARTS
     origins, directions, found, clusters = [], [], [], []
+    usable = image_files.is_measured(depths) if step else np.isfinite(depths)
+    if masks is not None:
+        usable &= image_files.well_outside(masks)
     for i, depth in enumerate(depths):
-        usable = image_files.is_measured(depth) if step else np.isfinite(depth)
-        if masks is not None:
-            usable &= image_files.well_outside(masks[i][None])[0]
-        row, column = np.nonzero(usable)
+        row, column = np.nonzero(usable[i])
         if len(row) > _MOST_PIXELS:
             chosen = generator.choice(len(row), _MOST_PIXELS, replace=False)
             row, column = row[chosen], column[chosen]
@@ -155,32 +156,31 @@ def sample_depths(
         found.append(np.asarray(depth[row, column], np.float64))
         part = parts * (row * parts // cameras.height) + column * parts // cameras.width
         clusters.append(i * parts**2 + part)
-    return DepthSamples(*map(np.concatenate, (origins, directions, found, clusters)), step)
+    join = np.concatenate
+    return DepthSamples(join(origins), join(directions), join(found), join(clusters), step)
 
 
-def measure(scene: Path, kind: Kind) -> tuple[BackgroundFit | None, str]:
-    """Measures the background of a scene around the origin from its training views.
-
-    Args:
-      scene: the scene folder.
-      kind: shape of the background.
+def read_samples(scene: Path, split: Split = "train") -> DepthSamples | None:
+    """Draws pixels beside the object from the depth maps of some views, evenly spread.
 
     Returns:
-      The fit, or `None` if there are no depth maps or they do not show the shape, and a warning if
-      the background is not around the origin, else an empty text.
+      The pixels; `None` without depth maps, or if some are 8-bit maps and some are not.
+
+    Raises:
+      SceneError: if a file is missing or broken.
     """
-    samples = _read_samples(scene)
-    fit = None if samples is None else fit_size(kind, samples)
-    free = None if samples is None else fit_size_and_centre(kind, samples)
-    if free is None or not _is_far_off(free):
-        return fit, ""
-    place = ", ".join(
-        f"{x:.3f} +- {error:.1g}" for x, error in zip(free.centre, free.centre_error, strict=True)
-    )
-    return fit, (
-        f"warning: the depth maps show a {kind} of size {free.describe()} around ({place}), but "
-        "the background is taken to be around the origin. Move the poses and the meshes."
-    )
+    frames = scene_folder.read_frames(scene, split)
+    if frames.depths is None or len({path.suffix for path in frames.depths}) > 1:
+        return None
+    count = min(len(frames.depths), _MOST_IMAGES)
+    chosen = np.unique(np.linspace(0, len(frames.depths) - 1, count).astype(int))
+    cameras = frames.cameras._replace(poses=frames.cameras.poses[chosen])
+    depths = np.stack([image_files.read_depth(frames.depths[i]) for i in chosen])
+    masks = None
+    if frames.masks is not None:
+        masks = np.stack([image_files.read_mask(frames.masks[i]) for i in chosen])
+    step = 0.0 if frames.depths[0].suffix == ".exr" else image_files.DEPTH_STEP
+    return sample_depths(cameras, depths, masks, step=step)
 
 
 class Bounds(NamedTuple):
@@ -222,31 +222,28 @@ def find_bounds(scene: Path, *, space: Space | None, radius: float | None) -> Bo
         found = "spherical"
     if radius is not None:
         return Bounds(found, None, "")
-    fit, warning = measure(scene, "sphere" if found == "spherical" else "cube")
-    notes = (warning,) if warning else ()
+    kind: Kind = "sphere" if found == "spherical" else "cube"
+    samples = read_samples(scene)
+    free = None if samples is None else fit_size_and_centre(kind, samples)
+    fit = None if samples is None else fit_size(kind, samples) or free
+    notes = () if free is None else _offset_warnings(free)
     if fit is None:
-        # Without a radius, a sphere that only the name tells of has the usual cube around it.
-        return Bounds(space or own, None, "", notes)
+        # Without a radius, a sphere that only the scene's name states has the usual cube around it.
+        return Bounds(space or own, None, "")
     return Bounds(found, fit.size, f"measured from depth maps: {fit.describe()}", notes)
 
 
-def _read_samples(scene: Path) -> DepthSamples | None:
-    """Reads some training views; `None` without depth maps, or if their formats differ."""
-    frames = scene_folder.read_frames(scene, "train")
-    if frames.depths is None or len({path.suffix for path in frames.depths}) > 1:
-        return None
-    count = min(len(frames.depths), _MOST_IMAGES)
-    chosen = np.unique(np.linspace(0, len(frames.depths) - 1, count).astype(int))
-    cameras = frames.cameras._replace(poses=frames.cameras.poses[chosen])
-    depths = [image_files.read_depth(frames.depths[i]) for i in chosen]
-    masks = frames.masks and [image_files.read_mask(frames.masks[i]) for i in chosen]
-    step = 0.0 if frames.depths[0].suffix == ".exr" else image_files.DEPTH_STEP
-    return sample_depths(cameras, depths, masks or None, step=step)
-
-
-def _is_far_off(fit: BackgroundFit) -> bool:
-    offset, error = np.linalg.norm(fit.centre), np.linalg.norm(fit.centre_error)
-    return bool(offset > max(_FAR_OFF * fit.size, _SIGNIFICANT * error))
+def _offset_warnings(fit: BackgroundFit) -> tuple[str, ...]:
+    """Returns a warning if the background is not around the origin, where models take it to be."""
+    offset, error = math.hypot(*fit.centre), math.hypot(*fit.centre_error)
+    if offset <= max(_FAR_OFF * fit.size, _SIGNIFICANT * error):
+        return ()
+    pairs = zip(fit.centre, fit.centre_error, strict=True)
+    centre = ", ".join(f"{x:.3f} +- {deviation:.1g}" for x, deviation in pairs)
+    return (
+        f"warning: the depth maps show a {fit.kind} of size {fit.describe()} around ({centre}), "
+        "but the background is taken to be around the origin. Move the poses and the meshes.",
+    )
 
 
 # ---- The fit ----
@@ -302,7 +299,7 @@ def _fit(kind: Kind, samples: DepthSamples, *, unknowns: int) -> BackgroundFit |
     if not len(extents):
         return None
     behind = extents > np.max(_extents(kind, samples.origins))
-    samples = DepthSamples(*(values[behind] for values in samples[:-1]), samples.step)
+    samples = _choose(samples, behind)
     if len(samples.depths) < _FEWEST_PIXELS:
         return None
     shape = np.array([np.median(extents[behind]), 0.0, 0.0, 0.0])
@@ -329,6 +326,16 @@ def _fit(kind: Kind, samples: DepthSamples, *, unknowns: int) -> BackgroundFit |
     size, *centre = shape.tolist()
     spread = [*error.tolist(), 0.0, 0.0, 0.0]
     return BackgroundFit(kind, size, spread[0], tuple(centre), tuple(spread[1:4]), agreement)
+
+
+def _choose(samples: DepthSamples, chosen: Bool[np.ndarray, " n"]) -> DepthSamples:
+    return DepthSamples(
+        samples.origins[chosen],
+        samples.directions[chosen],
+        samples.depths[chosen],
+        samples.clusters[chosen],
+        samples.step,
+    )
 
 
 def _weights(errors: Float[np.ndarray, " n"], least: float) -> Float[np.ndarray, " n"]:

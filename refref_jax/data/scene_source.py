@@ -13,8 +13,8 @@ precedence over the meshes. The name of a file is its path in the repository, wi
 
 A scene is unpacked once, into a folder in the local layout below REFREF_CACHE, which appears when
 it is complete. Its `scene.json` then states what its layout implies: the interface rule of Cycles,
-unless it has a rule already. REFREF_HF is the folder of the local copy, or several, separated like the entries of
-PATH. The cache may be removed at any time.
+unless it has a rule already. REFREF_HF is the folder of the local copy, or several, separated like
+the entries of PATH. The cache may be removed at any time.
 """
 
 import difflib
@@ -297,7 +297,9 @@ def _nearest_to_pattern(source: str, names: Sequence[SceneName]) -> list[str]:
     words = {each.source: f"{each.config}/{each}" for each in names}
     words |= {f"hf:{config}": config for config in sorted({each.config for each in names})}
     text = source.removeprefix("hf:")
-    score = {near: difflib.SequenceMatcher(None, text, word).ratio() for near, word in words.items()}
+    score = {
+        near: difflib.SequenceMatcher(None, text, word).ratio() for near, word in words.items()
+    }
     return sorted(words, key=lambda near: -score[near])[:_NEAREST]
 
 
