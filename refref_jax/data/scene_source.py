@@ -247,7 +247,7 @@ def open_scene(
         return folder
     name = scene_names.parse_source(str(source))
     repository = _repository(copies)
-    scene = (cache or _cache()) / repository.key(name) / str(name)
+    scene = _place(repository, name, cache)
     if not scene.is_dir():
         _unpack_whole(repository, name, scene, progress)
     if not (scene / "meshes").is_dir():
@@ -259,6 +259,14 @@ def open_scene(
             stacklevel=2,
         )
     return scene
+
+
+def is_unpacked(source: str | Path) -> bool:
+    """Returns whether `open_scene` only has to return a folder: the source is one, or unpacked."""
+    if not str(source).startswith("hf:"):
+        return True
+    name = scene_names.parse_source(str(source))
+    return _place(_repository(None), name, None).is_dir()
 
 
 def expand(source: str, *, copies: Sequence[Path] | None = None) -> list[str]:
@@ -306,6 +314,11 @@ def _nearest_to_pattern(source: str, names: Sequence[SceneName]) -> list[str]:
 def _repository(copies: Sequence[Path] | None) -> Repository:
     copies = copies_from_environment() if copies is None else copies
     return LocalCopy(copies) if copies else Hub()
+
+
+def _place(repository: Repository, name: SceneName, cache: Path | None) -> Path:
+    """Returns the folder of an unpacked scene."""
+    return (cache or _cache()) / repository.key(name) / str(name)
 
 
 def copies_from_environment() -> list[Path]:
