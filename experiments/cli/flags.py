@@ -216,8 +216,8 @@ def space() -> SpaceFlags:
         "radius",
         None,
         "Half-extent of the background cube, or radius of the background sphere (by default from "
-        "scene.json, otherwise 7.3), or radius of the uncontracted ball of an unbounded scene, in "
-        "world units.",
+        "scene.json, else measured, else 7.3), or radius of the uncontracted ball of an unbounded "
+        "scene, in world units.",
         lower_bound=1e-6,
     )
     finite = "It must be a finite number of world units."

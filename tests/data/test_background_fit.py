@@ -1,6 +1,8 @@
 """The size of a background from depth maps: analytic ones, quantised ones, and rendered ones."""
 
+import ast
 import json
+import re
 import shutil
 
 import numpy as np
@@ -14,6 +16,7 @@ from refref_jax.training.config import SceneConfig, TrainConfig
 from refref_jax.training.resolve import read_facts, resolve
 from tests.factories.small_scenes import write_grey, write_scene
 from tests.laws.expectations import scene_error
+from tests.processes.command import ROOT
 
 _SIZE = 48
 _OBJECT = 1.4
@@ -166,6 +169,17 @@ def test_the_size_is_described_with_its_error():
     assert fit.describe() == "7.298 +- 0.004"
     assert fit._replace(error=0.31).describe() == "7.30 +- 0.3"
     assert fit._replace(error=1e-9).describe() == "7.29812 +- 1e-05"
+
+
+def test_the_example_of_the_page_runs_and_gives_what_it_says(capsys, monkeypatch):
+    page = (ROOT / "docs/data_formats.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (example,) = (block for block in blocks if "background_fit" in block)
+    monkeypatch.chdir(ROOT)
+    exec(example, {})
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.removesuffix(" 1.0") in page
+    np.testing.assert_allclose(ast.literal_eval(second), 0.0, atol=0.002)
 
 
 # Scenes.
