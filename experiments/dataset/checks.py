@@ -114,7 +114,7 @@ def check_background(scene: Path) -> list[Finding]:
         splits = [each for each in SPLITS if (scene / f"transforms_{each}.json").is_file()]
         if size is None or space == "unbounded" or not splits:
             return []
-        samples = background_fit.read_samples(scene, splits[0])
+        samples = background_fit.read_samples(scene, split=splits[0])
     except ValueError as error:
         return [Finding("error", scene.name, str(error))]
     kind: background_fit.Kind = "sphere" if space == "spherical" else "cube"

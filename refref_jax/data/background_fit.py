@@ -126,8 +126,8 @@ def fit_size_and_centre(kind: Kind, samples: DepthSamples) -> BackgroundFit | No
 def sample_depths(
     cameras: Cameras,
     depths: Float[np.ndarray, "views h w"],
-    masks: Bool[np.ndarray, "views h w"] | None = None,
     *,
+    masks: Bool[np.ndarray, "views h w"] | None = None,
     step: float = 0.0,
 ) -> DepthSamples:
     """Draws pixels beside the object from depth maps, always the same ones.
@@ -160,8 +160,12 @@ def sample_depths(
     return DepthSamples(join(origins), join(directions), join(found), join(clusters), step)
 
 
-def read_samples(scene: Path, split: Split = "train") -> DepthSamples | None:
+def read_samples(scene: Path, *, split: Split = "train") -> DepthSamples | None:
     """Draws pixels beside the object from the depth maps of some views, evenly spread.
+
+    Args:
+      scene: the scene folder.
+      split: `train`, `val` or `test`.
 
     Returns:
       The pixels; `None` without depth maps, or if some are 8-bit maps and some are not.
@@ -180,7 +184,7 @@ def read_samples(scene: Path, split: Split = "train") -> DepthSamples | None:
     if frames.masks is not None:
         masks = np.stack([image_files.read_mask(frames.masks[i]) for i in chosen])
     step = 0.0 if frames.depths[0].suffix == ".exr" else image_files.DEPTH_STEP
-    return sample_depths(cameras, depths, masks, step=step)
+    return sample_depths(cameras, depths, masks=masks, step=step)
 
 
 class Bounds(NamedTuple):

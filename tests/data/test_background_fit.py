@@ -78,7 +78,7 @@ def _quantised(depths):
 def test_a_known_size_is_measured_from_float_depth(kind, size, known_masks):
     seen = _views(12)
     depths, masks = _render(kind, size, seen)
-    samples = sample_depths(seen, depths, masks if known_masks else None)
+    samples = sample_depths(seen, depths, masks=masks if known_masks else None)
     for fit in (fit_size(kind, samples), fit_size_and_centre(kind, samples)):
         np.testing.assert_allclose(fit.size, size, rtol=1e-7)
         np.testing.assert_allclose(fit.centre, 0.0, atol=1e-6)
@@ -93,7 +93,7 @@ def test_8_bit_depth_gives_the_size_within_its_error(kind, size, known_masks, ji
     depths, masks = _render(kind, size, seen, jitter=jitter)
     stored = _quantised(depths)
     assert np.mean(stored >= 11.5) > (0.05 if kind == "cube" else -1.0)  # saturated
-    samples = sample_depths(seen, stored, masks if known_masks else None, step=_STEP)
+    samples = sample_depths(seen, stored, masks=masks if known_masks else None, step=_STEP)
     assert samples.depths.max() < 11.5
     fit = fit_size(kind, samples)
     assert abs(fit.size - size) < 0.0005 * size
@@ -116,7 +116,9 @@ def test_the_standard_error_is_that_of_repeated_measurements():
 def test_a_centre_is_measured(kind):
     seen, centre = _views(20), (0.2, -0.1, 0.3)
     depths, masks = _render(kind, 6.0, seen, centre=centre)
-    fit = fit_size_and_centre(kind, sample_depths(seen, _quantised(depths), masks, step=_STEP))
+    fit = fit_size_and_centre(
+        kind, sample_depths(seen, _quantised(depths), masks=masks, step=_STEP)
+    )
     np.testing.assert_allclose(fit.centre, centre, atol=0.005)
     assert abs(fit.size - 6.0) < 0.005 and 0.0 < max(fit.centre_error) < 0.005
 
@@ -127,7 +129,7 @@ def test_saturated_and_infinite_depths_and_margins_of_masks_are_left_out():
     depth[0, 0], depth[0, 1], depth[0, 2] = 1.0, 11.5, 11.5 - _STEP
     mask = np.zeros((1, _SIZE, _SIZE), bool)
     mask[0, 20, 20] = True
-    samples = sample_depths(seen, depth, mask, step=_STEP)
+    samples = sample_depths(seen, depth, masks=mask, step=_STEP)
     assert len(samples.depths) == (_SIZE - 2) * _SIZE - 25
     assert set(np.round(samples.depths, 6)) == {5.0, np.round(11.5 - _STEP, 6)}
     depth[0, 3] = np.inf
@@ -138,7 +140,7 @@ def test_what_is_seen_beyond_holes_is_an_outlier():
     seen = _views(12)
     depths, masks = _render("cube", 7.3, seen)
     depths[:, ::9] = 40.0  # no wall there
-    fit = fit_size("cube", sample_depths(seen, depths, masks))
+    fit = fit_size("cube", sample_depths(seen, depths, masks=masks))
     np.testing.assert_allclose(fit.size, 7.3, rtol=1e-6)
     assert 0.85 < fit.agreement < 0.92
 
@@ -147,8 +149,8 @@ def test_what_is_seen_beyond_holes_is_an_outlier():
 def test_another_shape_is_not_taken_for_the_background(kind, other):
     seen = _views(12)
     depths, masks = _render(kind, 7.3, seen)
-    assert fit_size(other, sample_depths(seen, depths, masks)) is None
-    assert fit_size(other, sample_depths(seen, _quantised(depths), masks, step=_STEP)) is None
+    assert fit_size(other, sample_depths(seen, depths, masks=masks)) is None
+    assert fit_size(other, sample_depths(seen, _quantised(depths), masks=masks, step=_STEP)) is None
 
 
 def test_too_little_is_no_measurement():
