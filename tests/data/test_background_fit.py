@@ -10,13 +10,14 @@ import pytest
 
 from refref_jax.data import background_fit, image_files
 from refref_jax.data.background_fit import find_bounds, fit_size, fit_size_and_centre, sample_depths
+from refref_jax.data.scene_source import SceneWarning, expand, open_scene
 from refref_jax.geometry import cameras
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.training.config import SceneConfig, TrainConfig
 from refref_jax.training.resolve import read_facts, resolve
 from tests.factories.small_scenes import write_grey, write_scene
 from tests.laws.expectations import scene_error
-from tests.processes.command import ROOT
+from tests.processes.command import ROOT, run_command
 
 _SIZE = 48
 _OBJECT = 1.4
@@ -243,6 +244,20 @@ def test_a_sphere_by_name_gets_its_measured_radius_in_training(tmp_path):
     (scene / "depth/train/r_000.png").write_bytes(b"")
     bounds = find_bounds(scene, space="spherical", radius=made.config.scene.radius)
     assert bounds == ("spherical", None, "", ())
+
+
+def test_a_published_sphere_is_opened_with_what_its_layout_implies(tmp_path, monkeypatch):
+    scene = _scene(tmp_path, "sphere_smcvx_ball", "sphere", 6.7)
+    run_command("dataset.convert", f"--scene={scene}", "--to=parquet", f"--out={tmp_path / 'hf'}")
+    monkeypatch.setenv("REFREF_HF", str(tmp_path / "hf"))
+    monkeypatch.setenv("REFREF_CACHE", str(tmp_path / "cache"))
+    (source,) = expand("hf:spherebg_*/*")
+    with pytest.warns(SceneWarning, match="no meshes"):
+        opened = open_scene(source)
+    assert json.loads((opened / "scene.json").read_text()) == {"rule": "facing"}
+    facts = read_facts(SceneConfig(path=str(opened)))
+    assert facts.analysis.space == "spherical" and facts.source.startswith("measured from depth")
+    assert abs(facts.half_extent - 6.7) < 0.0005 * 6.7
 
 
 def test_what_is_stated_is_not_measured(tmp_path):
