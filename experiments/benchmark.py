@@ -45,8 +45,8 @@ with epy.lazy_imports():
 _SCENES = flags.DEFINE_list(
     "scenes",
     [],
-    "Scenes, separated by commas: folders, with or without wildcards, or hf:CONFIG/SCENE of the "
-    "published data set.",
+    "Scenes, separated by commas: folders, or hf:CONFIG/SCENE of the published data set, both with "
+    "or without wildcards; hf:all and hf:CONFIG stand for all its scenes.",
 )
 _METHODS = flags.DEFINE_list(
     "methods",
@@ -104,14 +104,18 @@ def main() -> None:
         return
     _check_engine()
     cli_scenes.check_all(_SCENES.value)
-    scenes, chosen = plan.find_scenes(_SCENES.value), methods.parse(_METHODS.value)
+    scenes = plan.find_scenes(_SCENES.value, unpack=not _DRY_RUN.value)
+    chosen = methods.parse(_METHODS.value)
     weights = perceptual.checked(_LPIPS_WEIGHTS.value)
     common = _settings(weights)
-    benchmark = settings.extended(out, settings.asked(common, scenes, chosen))
+    opened = [scene for scene in scenes if scene.fingerprint]
+    benchmark = settings.extended(out, settings.asked(common, opened, chosen))
     file = None if weights is None else str(weights.absolute())
     planned, skipped = plan.plan_jobs(scenes, chosen, common, lpips_weights=file)
     if _DRY_RUN.value:
         _list(out, planned, skipped)
+        if packed := len(scenes) - len(opened):
+            print(f"{packed} scenes are not unpacked yet: methods may be skipped when they are.")
         return
     # If the benchmark is killed, its child processes are stopped too.
     app.stop_at_kill()

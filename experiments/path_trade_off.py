@@ -36,7 +36,7 @@ with epy.lazy_imports():
     from experiments.sweeps import paths
 
 _SCENES = flags.DEFINE_list(
-    "scenes", None, f"Scenes, separated by commas: each {cli_flags.SCENE_FORMS}.", required=True
+    "scenes", None, f"Scenes, separated by commas: each {cli_flags.SCENES_FORMS}.", required=True
 )
 _THRESHOLDS = flags.DEFINE_list(
     "min_throughputs",
@@ -97,7 +97,7 @@ def _measure(chosen: list[KnownScene], plan: list[Setting]) -> list[Trial]:
 def _open_scenes() -> list[Path]:
     """Rejects an empty list of scenes, and scenes of the same name."""
     cli_scenes.check_all(_SCENES.value)
-    folders = [cli_scenes.opened(scene) for scene in _SCENES.value]
+    folders = [cli_scenes.opened(scene) for scene in cli_scenes.expanded(_SCENES.value)]
     names = [scene_names.of_folder(folder) for folder in folders]
     if not names:
         raise ValueError("No scene is given. Add --scenes=FOLDER,FOLDER.")

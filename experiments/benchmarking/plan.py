@@ -24,7 +24,7 @@ from experiments.benchmarking.methods import RECONSTRUCTION, Method, Need, same_
 from experiments.benchmarking.settings import Scene, Settings
 from experiments.cli import scenes as cli_scenes
 from refref_jax import configuration
-from refref_jax.data import meshes, scene_folder, scene_names
+from refref_jax.data import meshes, scene_folder, scene_names, scene_source
 from refref_jax.data.meshes import PartDescription, read_part_descriptions
 from refref_jax.data.scene_analysis import find_tints
 
@@ -175,6 +175,11 @@ def is_done(out: Path, job: Job) -> bool:
 
 def _reasons(scene: Scene, methods: Sequence[Method], preset: str) -> dict[str, str]:
     """Returns the reasons for skipping methods, by name."""
+    if not scene.fingerprint:  # what the scene lacks is found when it is unpacked
+        pairs = {method.name: same_as(method, preset) for method in methods}
+        return {
+            name: f"in the preset {preset} it equals {full}" for name, full in pairs.items() if full
+        }
     try:
         scene_folder.read_frames(Path(scene.path), SPLIT)
     except ValueError as error:
@@ -211,23 +216,31 @@ def _has_no_masks(scene: Path) -> bool:
     return not any(isinstance(frame, dict) and "mask_file_path" in frame for frame in frames)
 
 
-def find_scenes(words: Sequence[str]) -> list[Scene]:
+def find_scenes(words: Sequence[str], *, unpack: bool = True) -> list[Scene]:
     """Returns scenes in the order of their names.
 
+    Without unpacking, published scenes that are not unpacked yet have their source as path, and no
+    fingerprint: they can be listed, but not used.
+
     Args:
-      words: folders, with or without wildcards, or `hf:CONFIG/SCENE`. Matches of a wildcard that
-        are not scenes are ignored.
+      words: folders, with or without wildcards, `hf:CONFIG/SCENE`, or patterns of the latter.
+        Matches of a wildcard that are not scenes are ignored.
+      unpack: whether to unpack published scenes, which takes minutes for all of them.
 
     Raises:
       ValueError: if there are no scenes, if a folder is not a scene, or if two have the same name.
     """
-    folders = [folder for word in words if word for folder in _folders(word.strip())]
-    if not folders:
+    sources = cli_scenes.expanded([word for word in words if word.strip()])
+    later = [each for each in sources if not unpack and not scene_source.is_unpacked(each)]
+    now = [each for each in sources if each not in later]
+    folders = [folder for source in now for folder in _folders(source)]
+    if not folders and not later:
         raise ValueError(
             f"--scenes={','.join(words)} matches no scene. Give folders that contain "
             "transforms_train.json, as in --scenes='scenes/*'."
         )
-    found: dict[str, Scene] = {}
+    names = {str(scene_names.parse_source(source)): source for source in later}
+    found = {name: Scene(name, source, "") for name, source in names.items()}
     for folder in dict.fromkeys(folder.resolve() for folder in folders):
         name = scene_names.of_folder(folder)
         if name in found:

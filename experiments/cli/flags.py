@@ -27,6 +27,8 @@ RULES = get_args(choices.RuleName)
 
 SCENE_FORMS = "a folder, or hf:CONFIG/SCENE of the published data set"
 
+SCENES_FORMS = f"{SCENE_FORMS} (hf:all, hf:CONFIG and wildcards stand for several)"
+
 # Files that identify the folders of a run and of a reconstruction.
 RUN = "config.json"
 RECONSTRUCTION = "reconstruction.json"
@@ -219,8 +221,8 @@ def space() -> SpaceFlags:
         "radius",
         None,
         "Half-extent of the background cube, or radius of the background sphere (by default from "
-        "scene.json, otherwise 7.3), or radius of the uncontracted ball of an unbounded scene, in "
-        "world units.",
+        "scene.json, else measured, else 7.3), or radius of the uncontracted ball of an unbounded "
+        "scene, in world units.",
         lower_bound=1e-6,
     )
     finite = "It must be a finite number of world units."

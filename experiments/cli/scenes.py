@@ -1,4 +1,4 @@
-"""Opens the scene that a flag names: a folder, or `hf:CONFIG/SCENE`."""
+"""Opens the scenes that a flag names: folders, or `hf:CONFIG/SCENE`."""
 
 import contextlib
 import glob
@@ -38,10 +38,19 @@ def check(source: str | Path | None) -> None:
 
 
 def check_all(sources: Sequence[str]) -> None:
-    """Calls `check` for each source, except empty ones and those with wildcards."""
+    """Calls `check` for each source, except empty ones and patterns."""
     for source in sources:
-        if source and not has_wildcards(source):
+        if source and not has_wildcards(source) and not scene_names.is_pattern(source):
             check(source)
+
+
+def expanded(sources: Sequence[str]) -> list[str]:
+    """Returns sources with the patterns of `hf:...` replaced by the scenes that match them.
+
+    Raises:
+      SceneError: if no scene matches one of them.
+    """
+    return [each for source in sources for each in scene_source.expand(source.strip())]
 
 
 def has_wildcards(source: str) -> bool:

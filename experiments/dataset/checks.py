@@ -16,7 +16,16 @@ from scipy import ndimage
 
 from experiments.runs import known_scene
 from experiments.runs.known_scene import KnownScene
-from refref_jax.data import image_files, mesh_checks, mesh_queries, meshes, scene_folder
+from refref_jax.choices import SPLITS
+from refref_jax.data import (
+    background,
+    background_fit,
+    image_files,
+    mesh_checks,
+    mesh_queries,
+    meshes,
+    scene_folder,
+)
 from refref_jax.data.mesh_checks import Finding
 from refref_jax.data.mesh_queries import Containment
 from refref_jax.data.meshes import MeshPart
@@ -38,6 +47,9 @@ DEPTH_SHARE = 0.999
 
 MASK_SHARE = 0.002
 """Largest share of an image's pixels where mask and traced silhouette differ."""
+
+BACKGROUND = 0.005
+"""Largest difference of the background's size from that of the depth maps, relative."""
 
 # Pixels around a silhouette that are excluded from depths and normals.
 _MARGIN = 2
@@ -93,6 +105,27 @@ def check_files(scene: Path) -> list[Finding]:
     except ValueError as error:
         return [Finding("error", scene.name, str(error))]
     return []
+
+
+def check_background(scene: Path) -> list[Finding]:
+    """Compares the size of the background in `scene.json` with the depth maps of a split."""
+    try:
+        space, size = background.space(scene), background.half_extent(scene)
+        splits = [each for each in SPLITS if (scene / f"transforms_{each}.json").is_file()]
+        if size is None or space == "unbounded" or not splits:
+            return []
+        samples = background_fit.read_samples(scene, split=splits[0])
+    except ValueError as error:
+        return [Finding("error", scene.name, str(error))]
+    kind: background_fit.Kind = "sphere" if space == "spherical" else "cube"
+    fit = None if samples is None else background_fit.fit_size(kind, samples)
+    if fit is None or abs(fit.size - size) <= BACKGROUND * size + fit.error:
+        return []
+    message = (
+        f"the depth maps show a background {kind} of size {fit.describe()}, but scene.json states "
+        f"{size:g}. Correct it, or render the depth maps again."
+    )
+    return [Finding("error", scene.name, message)]
 
 
 def check_meshes(scene: Path) -> tuple[Meshes | None, list[Finding]]:

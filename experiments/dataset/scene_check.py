@@ -46,7 +46,7 @@ def check_scene(scene: Path, settings: PathSettings, *, views: int, side: int) -
       side: rays along each edge of a pixel.
     """
     name = scene.resolve().name
-    findings = checks.check_files(scene)
+    findings = checks.check_files(scene) or checks.check_background(scene)
     made_of, about_meshes = checks.check_meshes(scene)
     findings += about_meshes
     compared = []

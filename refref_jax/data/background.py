@@ -60,6 +60,11 @@ def space(scene: Path) -> Space:
     return _SPACES[kind]
 
 
+def is_described(scene: Path) -> bool:
+    """Returns whether `scene.json` states the type of the background."""
+    return "type" in _background(scene)
+
+
 def half_extent(scene: Path) -> float | None:
     """Returns half the edge of the background cube, or the radius of the sphere, if known."""
     record = _background(scene)

@@ -282,26 +282,33 @@ def read_part(path: Path, *, index: float, shading: Shading = "auto") -> MeshPar
 def mesh_files(scene: Path) -> list[Path]:
     """Returns the mesh files of a scene, ordered by name.
 
-    They are `meshes/*.ply` in its folder. If a folder of the raw release has none, they are
-    `mesh_files/{category}/{object}_{material}.ply` next to `image_data`.
+    They are `meshes/*.ply` in its folder. If a folder of the raw release has none, they are those
+    of `published_meshes` in `mesh_files/{category}` next to `image_data`.
     """
-    folder, stems = scene / "meshes", None
+    folder, name = scene / "meshes", None
     if not folder.is_dir() and (name := scene_names.of_raw_folder(scene)) is not None:
         places = [above / "mesh_files" for above in scene.resolve().parents[2:4]]
         category = scene_names.CATEGORIES[name.category]
         folder = next((each for each in places if each.is_dir()), folder) / category
-        stems = published_stems(name.object)
     found = folder.iterdir() if folder.is_dir() else ()
     paths = sorted(path for path in found if path.suffix.lower() == ".ply")
-    return [path for path in paths if stems is None or path.stem in stems]
+    return paths if name is None else published_meshes(name.object, paths)
 
 
-def published_stems(thing: str) -> set[str]:
-    """Returns the published names of an object's meshes, without extension: one per material.
+def published_meshes(thing: str, paths: Sequence[Path]) -> list[Path]:
+    """Returns the meshes of an object among the published files of its category.
 
-    Names are matched completely: ball_coloured_glass.ply is not a mesh of the object ball.
+    They are named `{object}_{material}.ply`, one per material. Names are matched completely:
+    ball_coloured_glass.ply is not a mesh of the object ball. Without any, the mesh of an object
+    that is named like its material may have this one word as name: `diamond.ply`.
+
+    Args:
+      thing: name of the object.
+      paths: paths of the category's mesh files.
     """
-    return {f"{thing}_{material}" for material in INDEX_OF_REFRACTION}
+    stems = {f"{thing}_{material}" for material in INDEX_OF_REFRACTION}
+    found = [path for path in paths if path.stem in stems]
+    return found or [path for path in paths if path.stem == thing in INDEX_OF_REFRACTION]
 
 
 def without_colour(parts: Sequence[MeshPart]) -> list[MeshPart]:

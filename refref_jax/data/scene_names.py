@@ -4,15 +4,20 @@
     cubebg_single-convex         its configuration on Hugging Face: background, category
     textured_cube_scene/single-convex/ball          its folder in the raw release; the folder of an
                                  object ends with _sphere or _hdr before these backgrounds
+    hf:CONFIG/SCENE              a scene on Hugging Face, or in a local copy
+    hf:all, hf:CONFIG, hf:cubebg_*/*, hf:*/*_ball      several of them: a pattern
 
 Errors of the parser suggest the nearest names.
 """
 
 import difflib
+import glob
 from collections.abc import Iterable
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import NamedTuple
 
+from refref_jax.choices import RuleName
 from refref_jax.data import SceneError
 
 
@@ -48,6 +53,11 @@ CONFIGS = tuple(
     for category in CATEGORIES.values()
 )
 """The nine configurations."""
+
+PUBLISHED_RULE: RuleName = "facing"
+"""Interface rule of the authors' scenes: Cycles decides the medium outside a face by its side."""
+
+_ALL = "all"
 
 
 class SceneName(NamedTuple):
@@ -133,6 +143,38 @@ def parse_source(source: str) -> SceneName:
     if name.config != config:
         raise SceneError(f"The scene {name} is not in {config}. Write {name.source}.")
     return name
+
+
+def is_pattern(source: str) -> bool:
+    """Returns whether a source is `hf:all`, `hf:CONFIG`, or has wildcards, and is no folder."""
+    text = source.removeprefix("hf:")
+    return text != source and (text == _ALL or text in CONFIGS or glob.has_magic(text))
+
+
+def select(source: str, names: Iterable[SceneName]) -> list[SceneName]:
+    """Returns the scenes that match a pattern.
+
+    Args:
+      source: pattern, see `is_pattern`; wildcards are those of the shell, separately for the
+        configuration and the scene. A configuration alone stands for all its scenes.
+      names: scenes to select from.
+    """
+    text = source.removeprefix("hf:")
+    config, _, scene = ("*" if text == _ALL else text).partition("/")
+    return [
+        name
+        for name in names
+        if fnmatchcase(name.config, config) and fnmatchcase(str(name), scene or "*")
+    ]
+
+
+def published_rule(scene: Path) -> RuleName | None:
+    """Returns the interface rule that a scene's layout implies, unless `scene.json` states one.
+
+    A folder of the raw release implies that of Cycles. A scene unpacked from parquet files has it
+    in its `scene.json`. All other folders imply none.
+    """
+    return None if of_raw_folder(scene) is None else PUBLISHED_RULE
 
 
 def of_raw_folder(scene: Path) -> SceneName | None:

@@ -1,4 +1,4 @@
-"""Opens a scene from a folder or from `hf:CONFIG/SCENE` (NumPy only).
+"""Opens a scene from a folder or from `hf:CONFIG/SCENE`, and finds several (NumPy only).
 
 The latter is a scene of the published data set in parquet files, in a local copy of its
 repositories or on Hugging Face:
@@ -12,12 +12,15 @@ The parquet files are in the repository `yinyue27/RefRef`, the meshes in
 precedence over the meshes. The name of a file is its path in the repository, with slashes.
 
 A scene is unpacked once, into a folder in the local layout below REFREF_CACHE, which appears when
-it is complete. REFREF_HF is the folder of the local copy, or several, separated like the entries of
-PATH. The cache may be removed at any time.
+it is complete. Its `scene.json` then states what its layout implies: the interface rule of Cycles,
+unless it has a rule already. REFREF_HF is the folder of the local copy, or several, separated like
+the entries of PATH. The cache may be removed at any time.
 """
 
+import difflib
 import hashlib
 import importlib
+import json
 import os
 import re
 import shutil
@@ -28,9 +31,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from refref_jax import atomic_files
+from refref_jax import atomic_files, configuration
 from refref_jax.data import SceneError, parquet_scenes, scene_names
-from refref_jax.data.meshes import published_stems
+from refref_jax.data.meshes import published_meshes
 from refref_jax.data.parquet_scenes import Progress
 from refref_jax.data.scene_names import CATEGORIES, CONFIGS, SceneName
 
@@ -41,6 +44,12 @@ _FOLDERS = ("data", *CONFIGS, "mesh_files", "scene_files")
 _SHARD = re.compile(rf"({'|'.join(_FOLDERS[:-2])})/(.+)-(\d+)-of-(\d+)\.parquet")
 
 _UNPACKING = ".unpacking-"
+
+# Increased when scenes are unpacked differently, so that those in the cache are unpacked again.
+_FORMAT = 2
+
+# Number of names that are suggested instead of a pattern.
+_NEAREST = 3
 
 # Age in seconds at which a folder of an unfinished unpacking is considered abandoned.
 _ABANDONED = 24 * 3600
@@ -83,7 +92,8 @@ class LocalCopy:
         """Returns a folder name for the scene, which changes with its files."""
         names = [*find_shards(self, scene), *find_others(self, scene).values()]
         stats = [(self._paths[name].resolve(), self._paths[name].stat()) for name in names]
-        text = "\n".join(f"{path} {stat.st_size} {stat.st_mtime_ns}" for path, stat in stats)
+        texts = [f"{path} {stat.st_size} {stat.st_mtime_ns}" for path, stat in stats]
+        text = "\n".join([*texts, f"format {_FORMAT}"])
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
@@ -129,7 +139,7 @@ class Hub:
     def key(self, scene: SceneName) -> str:
         """Returns a constant folder name, so that the scene can be opened offline."""
         del scene
-        return "huggingface"
+        return f"huggingface-{_FORMAT}"
 
     def _try(self, call: Any, repository: str, *arguments: str, **options: str) -> Any:
         try:
@@ -199,12 +209,9 @@ def find_others(repository: Repository, scene: SceneName) -> dict[str, str]:
     found = {name.removeprefix(own): name for name in names if name.startswith(own)}
     if not any(place.startswith("meshes/") for place in found):
         folder = f"mesh_files/{CATEGORIES[scene.category]}/"
-        meshes = {f"{stem}.ply" for stem in published_stems(scene.object)}
-        found |= {
-            f"meshes/{name.removeprefix(folder)}": name
-            for name in names
-            if name.removeprefix(folder) in meshes
-        }
+        paths = [Path(name) for name in names if name.startswith(folder) and name.endswith(".ply")]
+        meshes = published_meshes(scene.object, paths)
+        found |= {f"meshes/{path.name}": path.as_posix() for path in meshes}
     return found
 
 
@@ -239,9 +246,8 @@ def open_scene(
         _refuse_parquet(folder)
         return folder
     name = scene_names.parse_source(str(source))
-    copies = copies_from_environment() if copies is None else copies
-    repository = LocalCopy(copies) if copies else Hub()
-    scene = (cache or _cache()) / repository.key(name) / str(name)
+    repository = _repository(copies)
+    scene = _place(repository, name, cache)
     if not scene.is_dir():
         _unpack_whole(repository, name, scene, progress)
     if not (scene / "meshes").is_dir():
@@ -253,6 +259,66 @@ def open_scene(
             stacklevel=2,
         )
     return scene
+
+
+def is_unpacked(source: str | Path) -> bool:
+    """Returns whether `open_scene` only has to return a folder: the source is one, or unpacked."""
+    if not str(source).startswith("hf:"):
+        return True
+    name = scene_names.parse_source(str(source))
+    return _place(_repository(None), name, None).is_dir()
+
+
+def expand(source: str, *, copies: Sequence[Path] | None = None) -> list[str]:
+    """Returns the scenes that match `hf:all`, `hf:CONFIG` or a pattern with wildcards, by name.
+
+    Any other source is returned unchanged.
+
+    Args:
+      source: a source of `open_scene`, or a pattern, see `scene_names.is_pattern`.
+      copies: folders of local copies, as for `open_scene`.
+
+    Raises:
+      SceneError: if no scene matches.
+    """
+    if not scene_names.is_pattern(source):
+        return [source]
+    repository = _repository(copies)
+    names = scenes_in(repository)
+    if not names:
+        raise SceneError(
+            f"{source} matches no scene, because there are no parquet files in {repository.where}. "
+            "Set REFREF_HF to a folder that contains data/."
+        )
+    found = [name.source for name in scene_names.select(source, names)]
+    if not found:
+        near = _nearest_to_pattern(source, names)
+        raise SceneError(
+            f"{source} matches none of the {len(names)} scenes in {repository.where}. "
+            f"The nearest names there are {', '.join(near)}."
+        )
+    return found
+
+
+def _nearest_to_pattern(source: str, names: Sequence[SceneName]) -> list[str]:
+    """Returns up to three configurations or scenes similar to a pattern that matches nothing."""
+    words = {each.source: f"{each.config}/{each}" for each in names}
+    words |= {f"hf:{config}": config for config in sorted({each.config for each in names})}
+    text = source.removeprefix("hf:")
+    score = {
+        near: difflib.SequenceMatcher(None, text, word).ratio() for near, word in words.items()
+    }
+    return sorted(words, key=lambda near: -score[near])[:_NEAREST]
+
+
+def _repository(copies: Sequence[Path] | None) -> Repository:
+    copies = copies_from_environment() if copies is None else copies
+    return LocalCopy(copies) if copies else Hub()
+
+
+def _place(repository: Repository, name: SceneName, cache: Path | None) -> Path:
+    """Returns the folder of an unpacked scene."""
+    return (cache or _cache()) / repository.key(name) / str(name)
 
 
 def copies_from_environment() -> list[Path]:
@@ -282,6 +348,19 @@ def unpack_scene(
         target = scene / place
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(repository.fetch(other), target)
+    _state_rule(scene / "scene.json")
+
+
+def _state_rule(path: Path) -> None:
+    """Adds the rule of the published layout to `scene.json`, unless it has one or is broken."""
+    try:
+        text = path.read_text(encoding="utf-8") if path.is_file() else "{}"
+        content = configuration.parse_json(text)
+    except ValueError:
+        return  # its readers report it
+    if isinstance(content, dict) and "rule" not in content:
+        content = {"rule": scene_names.PUBLISHED_RULE} | content
+        path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def _unpack_whole(repository: Repository, name: SceneName, scene: Path, progress: Progress) -> None:

@@ -172,12 +172,19 @@ def distance_to_planar_depth(
     return (distance * cosine).astype(np.float32)
 
 
+def planar_directions(
+    cameras: Cameras, row: Int[np.ndarray, "*shape"], column: Int[np.ndarray, "*shape"]
+) -> Float[np.ndarray, "*shape 3"]:
+    """Returns directions to pixel centres in the camera frame, with unit depth."""
+    x = (column + 0.5 - 0.5 * cameras.width) / cameras.focal
+    y = -(row + 0.5 - 0.5 * cameras.height) / cameras.focal
+    return np.stack([x, y, -np.ones_like(x)], axis=-1)
+
+
 def _unit_directions(
     cameras: Cameras, row: Int[np.ndarray, "*shape"], column: Int[np.ndarray, "*shape"]
 ) -> tuple[Float[np.ndarray, "*shape 3"], Float[np.ndarray, "*shape"]]:
     """Returns unit directions in the camera frame, and their cosine with the optical axis."""
-    x = (column + 0.5 - 0.5 * cameras.width) / cameras.focal
-    y = -(row + 0.5 - 0.5 * cameras.height) / cameras.focal
-    planar = np.stack([x, y, -np.ones_like(x)], axis=-1)
+    planar = planar_directions(cameras, row, column)
     norm = np.linalg.norm(planar, axis=-1, keepdims=True)
     return planar / norm, (1.0 / norm)[..., 0]

@@ -81,7 +81,8 @@ class SceneConfig:
       space: Geometry of the background: a cube (bounded), a sphere (spherical), or infinitely far
         away (unbounded). By default that of scene.json or the scene's name.
       radius: Half edge of the background cube, or radius of the background sphere (by default that
-        of scene.json, else 7.3), or radius of an unbounded scene's uncontracted ball, world units.
+        of scene.json, else measured from depth maps, else 7.3), or radius of an unbounded scene's
+        uncontracted ball, world units.
       reconstruction: Output folder of experiments.reconstruct, whose object replaces the scene's
         meshes.
       pixels: Training pixels: all, or only those of the background, at a margin from the masks.

@@ -23,7 +23,7 @@ import numpy as np
 
 from refref_jax.choices import Interior
 from refref_jax.data import (
-    background,
+    background_fit,
     mesh_checks,
     mesh_queries,
     meshes,
@@ -65,8 +65,9 @@ class SceneFacts(NamedTuple):
       parts: meshes of the scene.
       tree: containment of the meshes.
       half_extent: half edge of the background cube, or radius of the background sphere, if it is in
-        scene.json.
-      notes: results of the checks of the meshes.
+        scene.json or measured.
+      notes: results of the checks of the meshes and of the background.
+      source: reason for `half_extent`.
     """
 
     analysis: SceneAnalysis
@@ -75,6 +76,7 @@ class SceneFacts(NamedTuple):
     tree: Containment
     half_extent: float | None
     notes: tuple[str, ...]
+    source: str = "scene.json"
 
     def describe(self) -> str:
         """Returns the required features in one line of text."""
@@ -129,10 +131,10 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
     notes = mesh_checks.check_meshes(parts, tree, rule=scene.rule)
     if scene.rule == "priority" or (scene.rule == "facing" and tree.overlaps):
         _refuse_cameras_inside(parts, cameras)
-    space = scene.space or background.space(folder)
-    found = scene_analysis.analyse(parts, tree, cameras, rule=scene.rule, space=space)
-    extent = background.half_extent(folder) if space != "unbounded" else None
-    return SceneFacts(found, cameras, parts, tree, extent, notes)
+    bounds = background_fit.find_bounds(folder, space=scene.space, radius=scene.radius)
+    found = scene_analysis.analyse(parts, tree, cameras, rule=scene.rule, space=bounds.space)
+    notes = (*notes, *bounds.notes)
+    return SceneFacts(found, cameras, parts, tree, bounds.size, notes, bounds.source)
 
 
 def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
@@ -328,7 +330,7 @@ def _resolve_model(
     extent = presets.bounds(
         facts.cameras, space=found.space, radius=scene.radius or facts.half_extent
     )
-    why = "scene.json" if facts.half_extent else "the data set's usual background"
+    why = facts.source if facts.half_extent else "the data set's usual background"
     why = "the cameras" if found.space == "unbounded" else why
     config = _decide(config, reasons, why, radius=extent.radius)
     preset = presets.PRESETS[config.model.preset]

@@ -2,7 +2,7 @@ import typing
 
 import pytest
 
-from experiments.dataset import parts
+from experiments.dataset import catalogue, parts
 from refref_jax.data import scene_names
 from refref_jax.data.scene_names import SceneName
 from tests.laws.expectations import scene_error
@@ -96,3 +96,47 @@ def test_folders_of_the_raw_release(tmp_path, folder, name):
 def test_other_folders_are_called_as_they_are(tmp_path, folder):
     assert scene_names.of_raw_folder(tmp_path / folder) is None
     assert scene_names.of_folder(tmp_path / folder) == (tmp_path / folder).name
+
+
+@pytest.mark.parametrize("folder", ["image_data/env_map_scene/single-convex/ball_hdr", "ball"])
+def test_the_raw_release_implies_the_rule_of_cycles(tmp_path, folder):
+    expected = None if folder == "ball" else "facing"
+    assert scene_names.published_rule(tmp_path / folder) == expected
+
+
+_ALL = [
+    SceneName(background, item.category, item.name)
+    for background in scene_names.BACKGROUNDS
+    for item in catalogue.OBJECTS.values()
+]
+
+
+@pytest.mark.parametrize(
+    ("source", "count"),
+    [
+        ("hf:all", 150),
+        ("hf:*", 150),
+        ("hf:*/*", 150),
+        ("hf:cubebg_*/*", 50),
+        ("hf:cubebg_*", 50),
+        ("hf:cubebg_single-convex", 9),
+        ("hf:*/*_ball", 3),
+        ("hf:*/cube_smcvx_*", 9),
+        ("hf:*/sphere_smcvx_[a-c]*", 6),
+        ("hf:env*/*_torus*", 2),
+        ("hf:spherebg_*/cube_*", 0),
+        ("hf:*/Cube_*", 0),
+    ],
+)
+def test_patterns_select_scenes(source, count):
+    assert scene_names.is_pattern(source)
+    found = scene_names.select(source, _ALL)
+    assert len(found) == len(set(found)) == count
+    assert found == [name for name in _ALL if name in found]  # in their order
+
+
+@pytest.mark.parametrize(
+    "source", ["all", "cubebg_single-convex", "scenes/*", "hf:cubebg_single-convex/cube_smcvx_ball"]
+)
+def test_other_sources_are_no_patterns(source):
+    assert not scene_names.is_pattern(source)

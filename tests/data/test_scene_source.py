@@ -1,3 +1,4 @@
+import json
 import os
 import sys
 import tempfile
@@ -9,7 +10,7 @@ import pytest
 import trimesh
 
 from refref_jax.data import background, meshes, parquet_scenes, scene_folder
-from refref_jax.data.scene_source import SceneWarning, open_scene
+from refref_jax.data.scene_source import SceneWarning, expand, open_scene
 from tests.factories.small_parquet import CONFIG, NAME, write_copy
 from tests.factories.small_scenes import truncate, write_scene
 from tests.fakes.abandoned_folder import AbandonedFolder
@@ -202,6 +203,77 @@ def test_the_folder_of_a_copy_is_no_scene(copy):
         open_scene(copy)
 
 
+def test_a_bare_name_of_a_material_is_a_mesh_of_the_object_named_so(copy):
+    write_copy(copy, name="cube_smcvx_diamond", rows=3)
+    source = "hf:cubebg_single-convex/cube_smcvx_diamond"
+    _write_mesh(copy / _MESHES / "diamond.ply")
+    (part,) = meshes.read_meshes(open_scene(source))
+    assert part.name == "diamond" and part.index == 2.418
+    # It is not a mesh of other objects, and a name with the object goes before.
+    assert [part.name for part in meshes.read_meshes(open_scene(_SOURCE))] == ["ball_glass"]
+    _write_mesh(copy / _MESHES / "diamond_diamond.ply")
+    assert [part.name for part in meshes.read_meshes(open_scene(source))] == ["diamond_diamond"]
+
+
+@pytest.mark.parametrize(
+    ("own", "expected"),
+    [
+        (None, {"rule": "facing"}),
+        ({"background": {"type": "env"}}, {"rule": "facing", "background": {"type": "env"}}),
+        ({"rule": "nested", "parts": []}, {"rule": "nested", "parts": []}),
+    ],
+)
+def test_an_unpacked_scene_states_the_rule_of_cycles(copy, own, expected):
+    if own is not None:
+        (copy / "scene_files" / NAME).mkdir(parents=True)
+        (copy / "scene_files" / NAME / "scene.json").write_text(json.dumps(own))
+    assert json.loads((open_scene(_SOURCE) / "scene.json").read_text()) == expected
+
+
+def test_a_broken_scene_json_is_left_to_its_readers(copy):
+    (copy / "scene_files" / NAME).mkdir(parents=True)
+    (copy / "scene_files" / NAME / "scene.json").write_text("{")
+    scene = open_scene(_SOURCE)
+    assert (scene / "scene.json").read_text() == "{"
+    with scene_error("scene.json", "not valid"):
+        meshes.read_meshes(scene)
+
+
+def test_patterns_are_expanded_from_a_copy(copy):
+    for name in ("sphere_smcvx_ball", "cube_smcvx_cube", "cube_mmncvx_cup"):
+        write_copy(copy, name=name, rows=3)
+    assert expand("hf:all") == [
+        "hf:cubebg_multiple-non-convex/cube_mmncvx_cup",
+        _SOURCE,
+        "hf:cubebg_single-convex/cube_smcvx_cube",
+        "hf:spherebg_single-convex/sphere_smcvx_ball",
+    ]
+    assert expand(f"hf:{CONFIG}") == expand("hf:*/cube_smcvx_*") == expand("hf:all")[1:3]
+    for source in (_SOURCE, "scenes/*", "hf:nonsense"):
+        assert expand(source) == [source]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "near"),
+    [
+        ("hf:*/cube_smcvx_bal", _SOURCE),
+        ("hf:cubebg_single-convx*", f"hf:{CONFIG}"),
+        ("hf:spherebg_*/*", _SOURCE),
+    ],
+)
+def test_a_pattern_without_a_match(copy, pattern, near):
+    with pytest.raises(ValueError) as caught:
+        expand(pattern)
+    message = str(caught.value)
+    assert message.startswith(f"{pattern} matches none of the 1 scenes in {copy}. The nearest")
+    assert near in message and "\n" not in message
+
+
+def test_a_pattern_without_any_parquet_files(tmp_path):
+    with scene_error("hf:all matches no scene", str(tmp_path), "Set REFREF_HF"):
+        expand("hf:all", copies=[tmp_path])
+
+
 # Hugging Face itself, by a client that the test replaces.
 
 
@@ -231,6 +303,8 @@ def test_without_a_copy_files_are_downloaded_once(tmp_path, monkeypatch):
     client = _Client({"yinyue27/RefRef": images, "yinyue27/RefRef_additional": additional})
     monkeypatch.setitem(sys.modules, "huggingface_hub", client)
     monkeypatch.delenv("REFREF_HF", raising=False)
+    assert expand("hf:*/*_cube") == ["hf:cubebg_single-convex/cube_smcvx_cube"]
+    client.asked.clear()
     scene = open_scene(_SOURCE, cache=tmp_path / "cache")
     scene_folder.check_scene(scene)
     assert [part.name for part in meshes.read_meshes(scene)] == ["ball_glass"]
@@ -262,3 +336,12 @@ def test_a_folder_of_the_raw_release_finds_the_published_meshes(tmp_path):
     assert background.space(scene) == "unbounded"
     _write_mesh(scene / "meshes" / "ball_body_water.ply")
     assert [part.name for part in meshes.read_meshes(scene)] == ["ball_body_water"]
+
+
+def test_a_bare_name_of_a_material_is_found_for_the_raw_release(tmp_path):
+    place = tmp_path / "image_data/textured_sphere_scene/single-convex"
+    scene, other = (write_scene(place / f"{name}_sphere") for name in ("diamond", "ball"))
+    _write_mesh(tmp_path / _MESHES / "diamond.ply")
+    (part,) = meshes.read_meshes(open_scene(scene))
+    assert part.name == "diamond" and part.index == 2.418
+    assert meshes.read_meshes(other) == []

@@ -1,5 +1,6 @@
 """Writes parquet files as the published data set has them, and breaks them."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,8 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 
+from experiments.dataset import catalogue
+from refref_jax.data import scene_names
 from tests.factories.small_scenes import HEIGHT, WIDTH
 
 NAME, CONFIG = "cube_smcvx_ball", "cubebg_single-convex"
@@ -47,6 +50,19 @@ def write_copy(
         pyarrow.parquet.write_table(table, path, row_group_size=7)
         paths.append(path)
     return paths
+
+
+def write_all(copy: Path) -> list[str]:
+    """Writes the same three views as each scene of the data set; returns the scenes' names."""
+    names = [
+        f"{background}_{item.category}_{item.name}"
+        for background in scene_names.BACKGROUNDS
+        for item in catalogue.OBJECTS.values()
+    ]
+    (first,) = write_copy(copy, name=names[0], rows=3)
+    for name in names[1:]:
+        shutil.copyfile(first, first.with_name(f"{name}-00000-of-00001.parquet"))
+    return names
 
 
 def row(number: int) -> dict[str, Any]:

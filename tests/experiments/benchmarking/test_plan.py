@@ -11,6 +11,8 @@ from experiments.benchmarking import methods, plan, results, settings
 from experiments.benchmarking.methods import METHODS, RECONSTRUCTION
 from experiments.cli import scenes as cli_scenes
 from tests.factories.made_benchmark import SETTINGS, write_scene
+from tests.factories.small_parquet import write_all, write_copy
+from tests.processes.command import run_command
 
 _INSIDES = ["tree_clear", "tree_tints_given", "tree_tints_learned"]
 
@@ -157,6 +159,55 @@ def test_scenes_are_found_by_wildcards_and_folders(tmp_path):
     (tmp_path / "no[1]scene").mkdir()
     with pytest.raises(ValueError, match=r"scene/transforms_train\.json does not exist"):
         cli_scenes.check_all([str(tmp_path / "no[1]scene")])
+
+
+def test_all_published_scenes_are_listed_without_unpacking_any(tmp_path, monkeypatch):
+    names = write_all(tmp_path / "RefRef")
+    monkeypatch.setenv("REFREF_HF", str(tmp_path / "RefRef"))
+    monkeypatch.setenv("REFREF_CACHE", str(tmp_path / "cache"))
+    out, ball = f"--out={tmp_path / 'out'}", "hf:cubebg_single-convex/cube_smcvx_ball"
+    lines = run_command("benchmark", "--scenes=hf:all", "--dry_run", out).stdout.splitlines()
+    jobs = [line.split()[2] for line in lines if line.startswith("to do")]
+    for method in ("straight", "oracle", "tree"):
+        assert sorted(names) == [job.split("/")[0] for job in jobs if job.endswith(f"/{method}")]
+    assert len(names) == 150 and len(jobs) == 450
+    assert lines[-2:] == [
+        "450 jobs, 450 to do.",
+        "150 scenes are not unpacked yet: methods may be skipped when they are.",
+    ]
+    assert not (tmp_path / "cache").exists() and not (tmp_path / "out").exists()
+    # What is unpacked is planned as any scene.
+    plan.find_scenes([ball])
+    found = {scene.name: scene for scene in plan.find_scenes(["hf:*/*_ball"], unpack=False)}
+    assert [bool(scene.fingerprint) for scene in found.values()] == [True, False, False]
+    assert _planned(found["cube_smcvx_ball"], "straight,tree") == (
+        ["straight"],
+        {"tree": "it has no meshes"},
+    )
+    common = dataclasses.replace(SETTINGS, preset="small")
+    assert _planned(found["env_smcvx_ball"], "tree,tree_differential", common) == (
+        ["tree"],
+        {"tree_differential": "in the preset small it equals tree"},
+    )
+    unpacked = plan.find_scenes(["hf:*/*_ball", ball])
+    assert all(scene.fingerprint and Path(scene.path).is_dir() for scene in unpacked)
+    assert [scene.name for scene in unpacked] == list(found)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--scenes=hf:*/cube_smcvx_bal"], "hf:cubebg_single-convex/cube_smcvx_ball"),
+        (["--scenes=hf:everything"], "hf:everything is not hf:CONFIG/SCENE"),
+    ],
+)
+def test_published_scenes_that_there_are_not(tmp_path, monkeypatch, options, message):
+    write_copy(tmp_path / "RefRef", rows=3)
+    monkeypatch.setenv("REFREF_HF", str(tmp_path / "RefRef"))
+    for command in ("benchmark", "path_trade_off"):
+        result = run_command(command, *options, f"--out={tmp_path / 'out'}", fails=True)
+        (line,) = result.stderr.splitlines()
+        assert message in line, line
 
 
 def test_a_benchmark_grows_but_does_not_change(tmp_path):

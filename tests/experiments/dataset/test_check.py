@@ -91,6 +91,22 @@ def test_a_preview_has_test_views_only(copy):
     )
 
 
+def test_a_background_of_another_size_than_rendered_is_found(copy):
+    assert checks.check_background(copy) == []
+    path = copy / "scene.json"
+    stated = json.loads(path.read_text())
+    stated["background"]["half_extent"] = 7.4
+    path.write_text(json.dumps(stated))
+    (finding,) = checks.check_background(copy)
+    assert finding.severity == "error"
+    assert "a background cube of size " in finding.message and "states 7.4" in finding.message
+    (copy / "depth/train/r_000.png").write_bytes(b"")
+    (finding,) = checks.check_background(copy)
+    assert "r_000.png" in finding.message
+    path.unlink()
+    assert checks.check_background(copy) == []
+
+
 @pytest.mark.slow
 def test_a_mesh_that_is_not_where_it_was_rendered_is_found(copy):
     path = next((copy / "meshes").iterdir())
