@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool
 
 with epy.lazy_imports():
-    from refref_jax.data import image_files, masks
+    from refref_jax.data import image_files, scene_folder
 
 _SCENE = flags.DEFINE_string("scene", None, "The scene, in the local layout.", required=True)
 _MASKS = flags.DEFINE_string("masks", None, "Folder of the masks.", required=True)
@@ -48,7 +48,7 @@ def main() -> None:
             )
         return image_files.read_mask(path)
 
-    count = masks.add_masks(scene, out, read)
+    count = scene_folder.add_masks(scene, out, read)
     print(f"Masks: {count}")
     print(f"Scene: {out}")
     print(f"Next: {app.shell('reconstruct', f'--scene={out}', f'--out={out}_r3f')}")

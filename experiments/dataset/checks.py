@@ -16,7 +16,14 @@ from scipy import ndimage
 
 from experiments.runs import known_scene
 from experiments.runs.known_scene import KnownScene
-from refref_jax.data import image_files, mesh_checks, mesh_queries, meshes, scene_folder
+from refref_jax.data import (
+    image_files,
+    mesh_checks,
+    mesh_queries,
+    meshes,
+    scene_folder,
+    scene_properties,
+)
 from refref_jax.data.mesh_checks import Finding
 from refref_jax.data.mesh_queries import Containment
 from refref_jax.data.meshes import MeshPart
@@ -116,9 +123,11 @@ def read_views(scene: Path, made_of: Meshes, *, count: int) -> KnownScene:
     last = len(frames.names) - 1
     spread = np.linspace(0, last, min(count, last + 1)).round().astype(int)
     chosen = tuple(int(i) for i in np.unique(spread))
-    path = scene / "scene.json"
-    rule = scene_folder.read_json(path).get("rule", "nested") if path.is_file() else "nested"
-    return known_scene.build_scene(scene, *made_of, frames=frames, chosen=chosen, rule=rule)
+    told = scene_properties.read(scene)
+    rule = known_scene.rule_of(told)
+    return known_scene.build_scene(
+        scene, *made_of, frames=frames, chosen=chosen, rule=rule, told=told
+    )
 
 
 def compare_view(scene: KnownScene, index: int, *, settings: PathSettings, side: int) -> View:

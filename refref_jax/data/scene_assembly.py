@@ -16,10 +16,12 @@ from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour, RuleName
 from refref_jax.data import SceneError, mesh_checks, meshes
 from refref_jax.data.mesh_checks import refuse_errors
 from refref_jax.data.mesh_queries import find_containment
-from refref_jax.data.meshes import MeshPart, Shading
+from refref_jax.data.meshes import MeshPart
+from refref_jax.data.scene_properties import Shading
 from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import CREASE_ANGLE, Mesh, make_mesh
 from refref_jax.optics.interface_rules import RULES
+from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.optics.scene import Scene
 
 Arrays = tuple[np.ndarray, np.ndarray]
@@ -124,14 +126,17 @@ def single_object(
     return assemble([part])
 
 
-def assemble(parts: Sequence[MeshPart], *, rule: RuleName = "nested") -> Scene:
+def assemble(
+    parts: Sequence[MeshPart], *, rule: RuleName = "nested", ambient: float = INDEX_OF_AIR
+) -> Scene:
     """Checks parts and builds a scene from them; without parts it is empty.
 
     Args:
       parts: parts from `make_part` or `meshes.read_meshes`.
-      rule: medium outside a part: that of the part around it (`nested`), always air (`facing`), or
-        that of the overlapping part with the highest priority (`priority`); see
+      rule: medium outside a part: that of the part around it (`nested`), always the ambient medium
+        (`facing`), or that of the overlapping part with the highest priority (`priority`); see
         `optics.interface_rules`.
+      ambient: index of refraction of the ambient medium, outside all parts.
 
     Returns:
       The scene, as NumPy arrays. Parts are numbered by their indices in `parts`.
@@ -159,7 +164,8 @@ def assemble(parts: Sequence[MeshPart], *, rule: RuleName = "nested") -> Scene:
     for finding in findings:
         if finding.severity == "warning":
             warnings.warn(f"{finding.part} {finding.message}", stacklevel=2)
-    return assemble_scene(parts, tree.parents, rule=rule)
+    meshes.check_index("ambient", ambient)
+    return assemble_scene(parts, tree.parents, rule=rule, ambient=ambient)
 
 
 def assemble_scene(
@@ -167,6 +173,7 @@ def assemble_scene(
     parents: Sequence[int],
     *,
     rule: RuleName,
+    ambient: float = INDEX_OF_AIR,
 ) -> Scene:
     """Builds surfaces and interfaces of all parts.
 
@@ -174,6 +181,7 @@ def assemble_scene(
       parts: meshes of the scene, possibly none.
       parents: innermost part around each part, from `mesh_queries.find_containment`.
       rule: interface rule, see `optics.interface_rules`.
+      ambient: index of refraction of the ambient medium.
     """
     surfaces = pack_meshes([shaded_mesh(part) for part in parts])
     interfaces = RULES[rule](
@@ -182,6 +190,7 @@ def assemble_scene(
         tints=[part.tint for part in parts],
         absorptions=[part.absorption for part in parts],
         priorities=[part.priority for part in parts],
+        ambient=ambient,
     )
     return Scene(surfaces, interfaces)
 

@@ -3,7 +3,7 @@
     {scene}/transforms_{train,val,test}.json    poses and file names
     {scene}/{split}/*.png  mask/  depth/        named in the JSON
     {scene}/meshes/*.ply                        see `meshes`
-    {scene}/scene.json                          optional, see `meshes` and `background`
+    {scene}/scene.json                          optional, see `scene_properties`
 
 Files are named in one of two ways; `raw` is that of the data set's raw release:
 
@@ -14,19 +14,26 @@ Readers use the names in the transforms file, never these patterns. A depth map 
 is read from the float EXR of the same name if there is one.
 
 Every function raises a `SceneError` that names the file and the remedy.
+
+The pixels at the outline of a mask see both sides; `well_inside` and `well_outside` leave them out.
+`add_masks` copies a scene and adds the masks of a segmentation model. Users choose the model: it is
+a function that takes the path of an image and returns the pixels that show the object.
+`docs/masks.md` has examples.
 """
 
 import collections
 import json
 import math
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import binary_dilation, binary_erosion
 
-from refref_jax import configuration
+from refref_jax import atomic_files, configuration
 from refref_jax.choices import SPLITS
 from refref_jax.data import SceneError, image_files
 from refref_jax.geometry.cameras import Cameras, focal_length, planar_depth_to_distance
@@ -36,6 +43,14 @@ _ROTATION_TOLERANCE = 1e-3
 
 TRANSFORMS = "transforms_{}.json"
 """Pattern of the name of a split's transforms file."""
+
+Masks = Bool[np.ndarray, "frames h w"]
+
+# Neighbours of a pixel, including diagonal ones, within its own image.
+_AROUND = np.ones((1, 3, 3), bool)
+
+Segment = Callable[[Path], Bool[np.ndarray, "h w"]]
+"""Segmentation model: takes the path of an image, returns the mask of the object."""
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -337,3 +352,81 @@ def _checked(pixels: np.ndarray, path: Path, frames: Frames) -> np.ndarray:
             f"{expected[0]}. Render it again at that size."
         )
     return pixels
+
+
+def well_inside(masks: Masks, *, margin: int = 1) -> Masks:
+    """Returns the pixels at least `margin` pixels inside a mask, and inside the image."""
+    return binary_erosion(masks, _AROUND, iterations=margin) if margin else masks
+
+
+def well_outside(masks: Masks, *, margin: int = 2) -> Masks:
+    """Returns the pixels more than `margin` pixels away from a mask."""
+    return ~(binary_dilation(masks, _AROUND, iterations=margin) if margin else masks)
+
+
+def add_masks(scene: Path, out: Path, segment: Segment) -> int:
+    """Writes a copy of a scene in which every frame of every split has a mask.
+
+    Masks are written to `mask/` under the names of the images, as in the data set. The scene itself
+    is not changed; masks that it has already are replaced in the copy. The copy appears when it is
+    complete.
+
+    Args:
+      scene: a folder in the local layout.
+      out: folder of the copy; must not exist, nor be inside the scene.
+      segment: segmentation model, called once for each image.
+
+    Returns:
+      The number of masks.
+
+    Raises:
+      SceneError: if the copy exists, the scene is broken, or a mask is not boolean, not of the size
+        of its image, or empty.
+    """
+    read_json(scene / "transforms_train.json")
+    if out.exists():
+        raise SceneError(f"{out} exists, and nothing is overwritten. Give a new folder.")
+    if scene.resolve() in out.resolve().parents:
+        raise SceneError(f"{out} is inside the scene {scene}. Give a folder next to it.")
+    with atomic_files.new_folder(out) as draft:
+        shutil.copytree(scene, draft, dirs_exist_ok=True)
+        paths = (draft / f"transforms_{split}.json" for split in SPLITS)
+        count = sum(_add_to_split(scene, path, segment) for path in paths if path.is_file())
+    return count
+
+
+def _add_to_split(scene: Path, path: Path, segment: Segment) -> int:
+    """Writes the masks of one split of the copy, and names them in its transforms file."""
+    content = read_json(path)
+    frames = get(content, "frames", path)
+    for frame in frames:
+        stem = get_text(frame, "file_path", path)
+        if Path(stem).is_absolute() or ".." in Path(stem).parts:
+            raise SceneError(
+                f"{path} names the image {stem}, which is not in the scene's folder. Move the "
+                "images there, and give their names relative to it."
+            )
+        mask = _mask_of(scene / f"{stem}.png", segment)
+        name = Path("mask") / f"{stem}.png"
+        (path.parent / name).parent.mkdir(parents=True, exist_ok=True)
+        image_files.write_mask(path.parent / name, mask)
+        frame["mask_file_path"] = f"./{name.as_posix()}"
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    return len(frames)
+
+
+def _mask_of(image: Path, segment: Segment) -> Bool[np.ndarray, "h w"]:
+    expected = image_files.read_rgb(image).shape[:2]
+    mask = np.asarray(segment(image))
+    if mask.dtype != bool or mask.shape != expected:
+        raise SceneError(
+            f"The mask of {image} is an array {mask.dtype}{list(mask.shape)}, not "
+            f"bool{list(expected)}. Compare the model's output with a threshold, and resize it to "
+            "the image without interpolation."
+        )
+    if not mask.any():
+        raise SceneError(
+            f"The mask of {image} marks no object. Mark the object by hand, or remove the frame "
+            "from the transforms file."
+        )
+    return mask

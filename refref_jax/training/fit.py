@@ -20,7 +20,7 @@ import jax
 from jax.sharding import Mesh
 
 from refref_jax import atomic_files, configuration
-from refref_jax.data import masks, scene_folder, scene_source
+from refref_jax.data import scene_folder, scene_source
 from refref_jax.data.batches import PixelSampler
 from refref_jax.data.meshes import MeshPart
 from refref_jax.optics.scene import Scene
@@ -190,6 +190,8 @@ def prepare(
             "which fit does not read. Give its mesh as parts."
         )
     config = config.at(str(scene_source.open_scene(config.scene.path).resolve()))
+    if config.scene.properties:
+        config = config.decided(properties=str(Path(config.scene.properties).resolve()))
     facts = read_facts(config.scene, parts=parts)
     for note in facts.notes:
         report(note)
@@ -277,7 +279,7 @@ def _sampler(config: TrainConfig, scene: Path) -> PixelSampler:
     frames = scene_folder.read_frames(scene, "train")
     kept = None
     if config.scene.pixels == "background":
-        kept = masks.well_outside(scene_folder.read_masks(frames))
+        kept = scene_folder.well_outside(scene_folder.read_masks(frames))
     images, batch = scene_folder.read_images(frames), require(config.schedule.batch)
     return PixelSampler(images, frames.cameras, seed=config.seed, batch=batch, kept=kept)
 

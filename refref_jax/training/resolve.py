@@ -15,20 +15,21 @@ again changes nothing.
 import dataclasses
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from refref_jax.choices import Interior
+from refref_jax.choices import Interior, RuleName
 from refref_jax.data import (
-    background,
     mesh_checks,
     mesh_queries,
     meshes,
     scene_analysis,
     scene_folder,
+    scene_properties,
 )
 from refref_jax.data.batches import check_batch
 from refref_jax.data.mesh_queries import Containment
@@ -39,7 +40,7 @@ from refref_jax.fields import mlps
 from refref_jax.fields.base import RadianceConfig
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.optics.media import EMPTY_SLOT
+from refref_jax.optics.media import EMPTY_SLOT, INDEX_OF_AIR
 from refref_jax.optics.path_settings import PathSettings, make_path_settings
 from refref_jax.optics.scene import Scene
 from refref_jax.render.checkpoint_io import SavedModel
@@ -66,7 +67,10 @@ class SceneFacts(NamedTuple):
       tree: containment of the meshes.
       half_extent: half edge of the background cube, or radius of the background sphere, if it is in
         scene.json.
-      notes: results of the checks of the meshes.
+      notes: results of the checks of the meshes, and overridden properties of scene.json.
+      rule: interface rule: that of `SceneConfig`, that of scene.json, or `nested`.
+      ambient: index of refraction of the medium outside all parts.
+      origins: names of the files that define properties, by their keys in scene.json.
     """
 
     analysis: SceneAnalysis
@@ -75,6 +79,9 @@ class SceneFacts(NamedTuple):
     tree: Containment
     half_extent: float | None
     notes: tuple[str, ...]
+    rule: RuleName = "nested"
+    ambient: float = INDEX_OF_AIR
+    origins: Mapping[str, str] = MappingProxyType({})
 
     def describe(self) -> str:
         """Returns the required features in one line of text."""
@@ -122,16 +129,29 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
     folder = Path(scene.path)
     scene_folder.check_scene(folder)
     cameras = scene_folder.read_frames(folder, "train").cameras
-    if parts is None:
-        parts = meshes.read_meshes(folder, indices=dict(scene.indices))
+    told = scene_properties.read(folder, overlay=scene.properties)
+    if parts is not None:  # they are not those that scene.json describes
+        origins = {key: path for key, path in told.origins.items() if key != "rule"}
+        told = dataclasses.replace(told, rule=None, parts={}, origins=origins)
+    else:
+        parts = meshes.read_meshes(folder, indices=dict(scene.indices), properties=told)
+    rule, space = scene.rule or told.rule or "nested", scene.space or told.space
     tree = mesh_queries.find_containment(parts)
-    notes = mesh_checks.check_meshes(parts, tree, rule=scene.rule)
-    if scene.rule == "priority":
+    notes = mesh_checks.check_meshes(parts, tree, rule=rule)
+    notes += scene_analysis.overridden(told, parts, rule=rule, space=space, radius=scene.radius)
+    if rule == "priority":
         _refuse_cameras_inside(parts, cameras)
-    space = scene.space or background.space(folder)
-    found = scene_analysis.analyse(parts, tree, cameras, rule=scene.rule, space=space)
-    extent = background.half_extent(folder) if space != "unbounded" else None
-    return SceneFacts(found, cameras, parts, tree, extent, notes)
+    return SceneFacts(
+        scene_analysis.analyse(parts, tree, cameras, rule=rule, space=space),
+        cameras,
+        parts,
+        tree,
+        told.background.extent if space != "unbounded" else None,
+        notes,
+        rule,
+        told.ambient_index,
+        {key: path.name for key, path in told.origins.items()},
+    )
 
 
 def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
@@ -142,6 +162,7 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
     """
     asked, found = config, facts.analysis
     reasons = _first_reasons(config)
+    config = _decide(config, reasons, facts.origins.get("rule", _USUAL), rule=facts.rule)
     settings, config = _resolve_paths(config, found, reasons)
     config = _resolve_inside(config, found, settings, reasons)
     model, config = _resolve_model(config, facts, reasons)
@@ -166,6 +187,7 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
         config,
         reasons,
         "the model",
+        rule="nested",
         background=model.space,
         radius=model.radius,
         min_throughput=settings.min_throughput,
@@ -181,7 +203,8 @@ def build_scene(resolved: Resolved, facts: SceneFacts) -> Scene:
     """Builds the scene for tracing; its parts only have colours if `tints` is `given`."""
     given = resolved.config.model.tints == "given"
     parts = facts.parts if given else meshes.without_colour(facts.parts)
-    return assemble_scene(parts, facts.tree.parents, rule=resolved.config.scene.rule)
+    rule = resolved.config.scene.rule or facts.rule
+    return assemble_scene(parts, facts.tree.parents, rule=rule, ambient=facts.ambient)
 
 
 def samples_of(model: ModelConfig) -> tuple[int, ...]:
@@ -326,7 +349,9 @@ def _resolve_model(
     extent = presets.bounds(
         facts.cameras, space=found.space, radius=scene.radius or facts.half_extent
     )
-    why = "scene.json" if facts.half_extent else "the data set's usual background"
+    why = "the data set's usual background"
+    if facts.half_extent:
+        why = facts.origins.get("background", "scene.json")
     why = "the cameras" if found.space == "unbounded" else why
     config = _decide(config, reasons, why, radius=extent.radius)
     preset = presets.PRESETS[config.model.preset]
