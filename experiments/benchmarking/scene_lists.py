@@ -124,7 +124,7 @@ def _listed(where: str, row: Any, path: Path) -> ListedScene:
         raise SceneError(f"{where} does not have the key 'scene' with a folder or hf:CONFIG/SCENE.")
     if unknown := [key for key in row if key not in _KEYS]:
         near = scene_names.nearest(unknown[0], _KEYS)
-        remedy = f"Did you mean {near!r}?" if near else f"The keys are {', '.join(_KEYS)}."
+        remedy = f"Write {near!r}, or remove it." if near else f"The keys are {', '.join(_KEYS)}."
         raise SceneError(f"{where}: {unknown[0]!r} is not a known key. {remedy}")
     options = []
     for key, names in (("rule", choices.RuleName), ("background", choices.Space)):

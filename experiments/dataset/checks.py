@@ -123,10 +123,10 @@ def read_views(scene: Path, made_of: Meshes, *, count: int) -> KnownScene:
     last = len(frames.names) - 1
     spread = np.linspace(0, last, min(count, last + 1)).round().astype(int)
     chosen = tuple(int(i) for i in np.unique(spread))
-    told = scene_properties.read(scene)
-    rule = known_scene.rule_of(told)
+    properties = scene_properties.read(scene)
+    rule = known_scene.rule_of(properties)
     return known_scene.build_scene(
-        scene, *made_of, frames=frames, chosen=chosen, rule=rule, told=told
+        scene, *made_of, frames=frames, chosen=chosen, rule=rule, properties=properties
     )
 
 

@@ -105,19 +105,21 @@ def read_scene(
     """
     frames = scene_folder.read_frames(scene, split)
     chosen = view_numbers.choose(views, len(frames.names))
-    told = scene_properties.read(scene, overlay=overlay)
-    parts = meshes.read_meshes(scene, indices=indices, properties=told)
-    tree, rule = mesh_queries.find_containment(parts), rule or rule_of(told)
+    properties = scene_properties.read(scene, overlay=overlay)
+    parts = meshes.read_meshes(scene, indices=indices, properties=properties)
+    tree, rule = mesh_queries.find_containment(parts), rule or rule_of(properties)
     notes = mesh_checks.check_meshes(parts, tree, rule=rule)
-    if told.rule is not None and told.rule == rule:
-        notes += (f"note: rule={rule}, from {told.origins['rule'].name}.",)
-    print("\n".join((*notes, *scene_analysis.overridden(told, parts, rule=rule))))
-    return build_scene(scene, parts, tree, frames=frames, chosen=chosen, rule=rule, told=told)
+    if properties.rule is not None and properties.rule == rule:
+        notes += (f"note: rule={rule}, from {properties.origins['rule'].name}.",)
+    print("\n".join((*notes, *scene_analysis.overridden(properties, parts, rule=rule))))
+    return build_scene(
+        scene, parts, tree, frames=frames, chosen=chosen, rule=rule, properties=properties
+    )
 
 
-def rule_of(told: SceneProperties) -> RuleName:
+def rule_of(properties: SceneProperties) -> RuleName:
     """Returns the interface rule of `scene.json`, or the default."""
-    return told.rule or "nested"
+    return properties.rule or "nested"
 
 
 def build_scene(
@@ -128,7 +130,7 @@ def build_scene(
     frames: scene_folder.Frames,
     chosen: Sequence[int],
     rule: RuleName,
-    told: SceneProperties,
+    properties: SceneProperties,
 ) -> KnownScene:
     """Returns a scene of meshes that have been checked before.
 
@@ -139,17 +141,19 @@ def build_scene(
       frames: a split of the scene.
       chosen: numbers of views in the split.
       rule: rule for the medium outside each mesh.
-      told: properties of the scene: its background, and the ambient medium.
+      properties: properties of the scene: its background, and the ambient medium.
 
     Raises:
       ValueError: if the background is unknown, or an image is missing or broken.
     """
     frames = _choose(frames, chosen)
-    objects = assemble_scene(parts, tree.parents, rule=rule, ambient=told.ambient_index)
+    objects = assemble_scene(parts, tree.parents, rule=rule, ambient=properties.ambient_index)
     return KnownScene(
         name=scene_names.of_folder(scene),
         objects=jax.device_put(objects),
-        radiance=jax.device_put(radiance_of(background.read_background(scene, told))),
+        radiance=jax.device_put(
+            radiance_of(background.read_background(scene, properties=properties))
+        ),
         frames=frames,
         indices=tuple(chosen),
         images=scene_folder.read_images(frames),

@@ -29,7 +29,7 @@ _WALLS = 6
 _AXES_TOLERANCE = 1e-3
 
 
-def read_background(scene: Path, properties: SceneProperties | None = None) -> Background:
+def read_background(scene: Path, *, properties: SceneProperties | None = None) -> Background:
     """Reads the background that the properties of a scene describe, with its images.
 
     Args:

@@ -104,7 +104,7 @@ def describe(analysis: SceneAnalysis) -> str:
 
 
 def overridden(
-    told: SceneProperties,
+    properties: SceneProperties,
     parts: Sequence[MeshPart],
     *,
     rule: RuleName,
@@ -114,26 +114,28 @@ def overridden(
     """Returns a line of text for each property of `scene.json` that another value overrides.
 
     Args:
-      told: properties in `scene.json`.
+      properties: properties in `scene.json`.
       parts: meshes, with the indices of refraction that are used.
       rule: interface rule that is used.
       space: geometry of the background that is used, if it may differ.
       radius: size of the background that is used, if it is given.
     """
-    background = told.background
+    background = properties.background
     lines: list[tuple[str, str, str]] = []
-    if told.rule is not None and told.rule != rule:
-        lines.append(("rule", f"rule={rule}", told.rule))
-    if background.kind is not None and space not in (None, told.space):
+    if properties.rule is not None and properties.rule != rule:
+        lines.append(("rule", f"rule={rule}", properties.rule))
+    if background.kind is not None and space not in (None, properties.space):
         lines.append(("background", f"background={space}", background.kind))
     elif background.extent is not None and radius not in (None, background.extent):
         lines.append(("background", f"radius={radius:g}", f"{background.extent:g}"))
     for part in parts:
-        for name, described in told.parts.items():
+        for name, described in properties.parts.items():
             index = described.index
             if Path(name).stem == part.name and index not in (None, part.index):
                 lines.append((name, f"index={part.index:g} of {part.name}", f"{index:g}"))
-    return tuple(f"note: {used} overrides {told.origins[key].name}: {x}." for key, used, x in lines)
+    return tuple(
+        f"note: {used} overrides {properties.origins[key].name}: {x}." for key, used, x in lines
+    )
 
 
 def _objects(analysis: SceneAnalysis) -> str:

@@ -454,7 +454,9 @@ def _checked(
     for key, value in _object(record, keys, sources).items():
         if key not in checks:
             near = scene_names.nearest(key, checks)
-            remedy = f"Did you mean {near!r}?" if near else f"The keys are {', '.join(checks)}."
+            remedy = (
+                f"Write {near!r}, or remove it." if near else f"The keys are {', '.join(checks)}."
+            )
             raise _error((*keys, key), sources, f"is not a known key. {remedy}")
         try:
             values[key] = checks[key](value)
