@@ -104,7 +104,7 @@ def test_a_scene_without_a_file_has_no_properties(tmp_path):
 
 @pytest.mark.parametrize("kind", ["cube", "sphere", "env"])
 def test_what_the_generator_writes_is_read(tmp_path, kind):
-    record = backgrounds.write_background(tmp_path, kind, seed=0, size=16)
+    record = backgrounds.write_background(tmp_path, kind, seed=0, size=64)
     per_split = render_settings.PerSplit(1, 1, 1)
     settings = render_settings.RenderSettings(8, per_split, per_split, rule="facing")
     name = SceneName(kind, "smcvx", "ball")
