@@ -146,5 +146,5 @@ def test_a_run_continues_after_its_overlay_has_moved(scene, tmp_path):
     run_folder.check_unchanged(tmp_path / "run", again.config, again.model, same)
     moved.write_text('{"rule": "nested"}')
     again, other = prepare(config.override(properties=str(moved)), report=lambda line: None)
-    with pytest.raises(ValueError, match=r"other options \(rule\)"):
+    with pytest.raises(ValueError, match=r"other options \(rule, reentry\)"):
         run_folder.check_unchanged(tmp_path / "run", again.config, again.model, other)
