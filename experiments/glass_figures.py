@@ -25,7 +25,7 @@ from refref_jax import choices
 with epy.lazy_imports():
     from experiments.figures import glass
     from experiments.runs import known_scene
-    from refref_jax.data import background, scene_properties
+    from refref_jax.data import scene_assembly, scene_properties
     from refref_jax.render import backgrounds
 
 FIGURES = ("views", "fan", "tree", "distances")
@@ -70,7 +70,7 @@ def main() -> None:
 def _drawers(folder: Path, indices: dict[str, float]) -> dict[str, Callable[[Path], None]]:
     """Reads a scene, and returns functions that draw each figure into a file."""
     told = scene_properties.read(folder, overlay=_PROPERTIES.value)
-    found = background.read_background(folder, properties=told)
+    found = scene_assembly.read_background(folder, properties=told)
     if not isinstance(found, backgrounds.CubeBackground):
         raise ValueError(
             f"The background of {folder} is not a cube. Choose a scene with a background cube."

@@ -35,7 +35,7 @@ def describe(
     Args:
       scene: scene to describe.
       parts: parts of its object.
-      background: record of its background, as `refref_jax.data.background` reads it.
+      background: record of its background, as `refref_jax.data.scene_properties` reads it.
       settings: settings of the rendering.
 
     Raises:

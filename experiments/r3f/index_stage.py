@@ -22,7 +22,7 @@ from experiments.cli.progress import ProgressBar
 from experiments.figures import style
 from experiments.figures.style import COLOURS, pyplot
 from refref_jax.choices import Space
-from refref_jax.data import scene_folder
+from refref_jax.data import image_files, scene_folder
 from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.geometry.cameras import pixel_rays
 from refref_jax.geometry.surfaces import pack_meshes
@@ -82,7 +82,7 @@ def look(scene: Path, split: str, model: Model, *, seed: int, rays: int) -> Obje
       ValueError: if there are no masks, or if they have no interior.
     """
     frames = scene_folder.read_frames(scene, split)
-    inside = scene_folder.well_inside(scene_folder.read_masks(frames))
+    inside = image_files.well_inside(scene_folder.read_masks(frames))
     if not inside.any():
         raise ValueError(
             f"No pixel of the {split} views of {scene} lies inside a mask and off its outline. "

@@ -13,7 +13,6 @@ from experiments.runs import view_numbers
 from refref_jax import metrics
 from refref_jax.choices import RuleName
 from refref_jax.data import (
-    background,
     mesh_checks,
     mesh_queries,
     meshes,
@@ -24,7 +23,7 @@ from refref_jax.data import (
 )
 from refref_jax.data.mesh_queries import Containment
 from refref_jax.data.meshes import MeshPart
-from refref_jax.data.scene_assembly import assemble_scene
+from refref_jax.data.scene_assembly import assemble_scene, read_background
 from refref_jax.data.scene_properties import SceneProperties
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
@@ -151,9 +150,7 @@ def build_scene(
     return KnownScene(
         name=scene_names.of_folder(scene),
         objects=jax.device_put(objects),
-        radiance=jax.device_put(
-            radiance_of(background.read_background(scene, properties=properties))
-        ),
+        radiance=jax.device_put(radiance_of(read_background(scene, properties=properties))),
         frames=frames,
         indices=tuple(chosen),
         images=scene_folder.read_images(frames),

@@ -1,4 +1,6 @@
-"""Reads and writes images, masks and depth maps (NumPy only).
+"""Reads and writes images, masks and depth maps, and margins of masks (NumPy only).
+
+The pixels at the outline of a mask see both sides; margins leave them out.
 
 Every reader raises a `SceneError` that names the file and the remedy.
 """
@@ -9,14 +11,23 @@ import imageio.v3 as iio
 import numpy as np
 import OpenEXR
 from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import binary_dilation, binary_erosion
 
 from refref_jax.data import SceneError
+
+Masks = Bool[np.ndarray, "frames h w"]
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 # The 8-bit depth maps of the data set: white is 1 world unit, black 11.5 or more.
 _NEAREST_DEPTH = 1.0
 _DEPTH_RANGE = 10.5
+
+DEPTH_STEP = _DEPTH_RANGE / 255.0
+"""Difference between two depths of an 8-bit depth map, world units."""
+
+# Neighbours of a pixel, including diagonal ones, within its own image.
+_AROUND = np.ones((1, 3, 3), bool)
 
 # Renderers write 1e4 or more for rays that hit nothing.
 _DEPTH_OF_A_MISS = 1e4
@@ -62,6 +73,22 @@ def read_depth(path: Path) -> Float[np.ndarray, "h w"]:
     pixels = _read_png(path)
     grey = pixels if pixels.ndim == 2 else pixels[..., 0]
     return (_NEAREST_DEPTH + _DEPTH_RANGE * (1.0 - grey / 255.0)).astype(np.float32)
+
+
+def is_measured(depth: Float[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:
+    """Returns whether depths of an 8-bit map are not saturated, at either end of its range."""
+    middle, half = _NEAREST_DEPTH + 0.5 * _DEPTH_RANGE, 0.5 * (_DEPTH_RANGE - DEPTH_STEP)
+    return np.abs(depth - middle) < half
+
+
+def well_inside(masks: Masks, *, margin: int = 1) -> Masks:
+    """Returns the pixels at least `margin` pixels inside a mask, and inside the image."""
+    return binary_erosion(masks, _AROUND, iterations=margin) if margin else masks
+
+
+def well_outside(masks: Masks, *, margin: int = 2) -> Masks:
+    """Returns the pixels more than `margin` pixels away from a mask."""
+    return ~(binary_dilation(masks, _AROUND, iterations=margin) if margin else masks)
 
 
 def read_size(path: Path) -> tuple[int, int]:

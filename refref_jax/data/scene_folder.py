@@ -13,12 +13,11 @@ Files are named in one of two ways; `raw` is that of the data set's raw release:
 Readers use the names in the transforms file, never these patterns. A depth map that is named as PNG
 is read from the float EXR of the same name if there is one.
 
-Every function raises a `SceneError` that names the file and the remedy.
-
-The pixels at the outline of a mask see both sides; `well_inside` and `well_outside` leave them out.
 `add_masks` copies a scene and adds the masks of a segmentation model. Users choose the model: it is
 a function that takes the path of an image and returns the pixels that show the object.
 `docs/masks.md` has examples.
+
+Every function raises a `SceneError` that names the file and the remedy.
 """
 
 import collections
@@ -31,7 +30,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from scipy.ndimage import binary_dilation, binary_erosion
 
 from refref_jax import atomic_files, configuration
 from refref_jax.choices import SPLITS
@@ -43,11 +41,6 @@ _ROTATION_TOLERANCE = 1e-3
 
 TRANSFORMS = "transforms_{}.json"
 """Pattern of the name of a split's transforms file."""
-
-Masks = Bool[np.ndarray, "frames h w"]
-
-# Neighbours of a pixel, including diagonal ones, within its own image.
-_AROUND = np.ones((1, 3, 3), bool)
 
 Segment = Callable[[Path], Bool[np.ndarray, "h w"]]
 """Segmentation model: takes the path of an image, returns the mask of the object."""
@@ -352,16 +345,6 @@ def _checked(pixels: np.ndarray, path: Path, frames: Frames) -> np.ndarray:
             f"{expected[0]}. Render it again at that size."
         )
     return pixels
-
-
-def well_inside(masks: Masks, *, margin: int = 1) -> Masks:
-    """Returns the pixels at least `margin` pixels inside a mask, and inside the image."""
-    return binary_erosion(masks, _AROUND, iterations=margin) if margin else masks
-
-
-def well_outside(masks: Masks, *, margin: int = 2) -> Masks:
-    """Returns the pixels more than `margin` pixels away from a mask."""
-    return ~(binary_dilation(masks, _AROUND, iterations=margin) if margin else masks)
 
 
 def add_masks(scene: Path, out: Path, segment: Segment) -> int:

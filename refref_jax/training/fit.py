@@ -20,7 +20,7 @@ import jax
 from jax.sharding import Mesh
 
 from refref_jax import atomic_files, configuration
-from refref_jax.data import scene_folder, scene_source
+from refref_jax.data import image_files, scene_folder, scene_source
 from refref_jax.data.batches import PixelSampler
 from refref_jax.data.meshes import MeshPart
 from refref_jax.optics.scene import Scene
@@ -279,7 +279,7 @@ def _sampler(config: TrainConfig, scene: Path) -> PixelSampler:
     frames = scene_folder.read_frames(scene, "train")
     kept = None
     if config.scene.pixels == "background":
-        kept = scene_folder.well_outside(scene_folder.read_masks(frames))
+        kept = image_files.well_outside(scene_folder.read_masks(frames))
     images, batch = scene_folder.read_images(frames), require(config.schedule.batch)
     return PixelSampler(images, frames.cameras, seed=config.seed, batch=batch, kept=kept)
 

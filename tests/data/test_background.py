@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from refref_jax.data import image_files
-from refref_jax.data.background import read_background
+from refref_jax.data.scene_assembly import read_background
 from refref_jax.data.scene_properties import read
 from refref_jax.render.backgrounds import (
     CubeBackground,

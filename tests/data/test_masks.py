@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from refref_jax.data import SceneError, image_files, scene_folder
-from refref_jax.data.scene_folder import add_masks, well_inside, well_outside
+from refref_jax.data.image_files import well_inside, well_outside
+from refref_jax.data.scene_folder import add_masks
 from tests.factories.small_scenes import HEIGHT, WIDTH, edit_transforms, without_masks, write_scene
 
 

@@ -14,7 +14,7 @@ import trimesh
 
 from experiments.dataset import backgrounds, render_settings, scene_record
 from refref_jax.data import SceneError, image_files, meshes, scene_properties
-from refref_jax.data.background import read_background
+from refref_jax.data.scene_assembly import read_background
 from refref_jax.data.scene_names import SceneName
 from refref_jax.data.scene_properties import RECORDS, PartDescription, check_file, read
 from tests.factories import small_dataset

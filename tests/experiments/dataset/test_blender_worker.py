@@ -13,7 +13,7 @@ import trimesh
 
 from experiments.dataset import cameras, frame_files, workers
 from experiments.dataset.parts import ObjectPart
-from refref_jax.data.background import read_background
+from refref_jax.data.scene_assembly import read_background
 from refref_jax.geometry.cameras import box_filter, image_rays, supersample
 from refref_jax.render.backgrounds import radiance_of
 from tests.factories import small_dataset

@@ -17,7 +17,7 @@ from experiments.dataset import (
     scene_folders,
 )
 from refref_jax.choices import SPLITS
-from refref_jax.data import background, meshes, scene_folder, scene_properties, scene_source
+from refref_jax.data import meshes, scene_assembly, scene_folder, scene_properties, scene_source
 from refref_jax.data.scene_names import parse
 from tests.factories.cut_ball import COUNTS, cut_ball
 from tests.factories.small_parquet import write_copy
@@ -122,7 +122,7 @@ def test_all_layouts_are_read_alike(ball, tmp_path):
         np.testing.assert_array_equal(part.vertices, same.vertices)
         told = scene_properties.read(scene)
         assert told.background.extent == 7.3 and told.parts == scene_properties.read(ball).parts
-        texture, other = (background.read_background(each).texture for each in (ball, scene))
+        texture, other = (scene_assembly.read_background(each).texture for each in (ball, scene))
         np.testing.assert_array_equal(texture.texels, other.texels)
 
 
