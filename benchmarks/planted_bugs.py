@@ -220,8 +220,8 @@ BUGS = (
     Bug(
         "air around a nested part",
         "optics/interface_rules.py",
-        "INDEX_OF_AIR if parent == NO_PARENT else indices[parent] for",
-        "INDEX_OF_AIR for",
+        "ambient if parent == NO_PARENT else indices[parent] for",
+        "ambient for",
         ("optics/test_interface_rules.py",),
     ),
     Bug(

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 from absl import flags
 from etils import epy
 
-from experiments.benchmarking import methods
+from experiments.benchmarking import methods, scene_lists
 from experiments.benchmarking.methods import Method
 from experiments.cli import app
 from experiments.cli import flags as cli_flags
@@ -46,8 +46,10 @@ _SCENES = flags.DEFINE_list(
     "scenes",
     [],
     "Scenes, separated by commas: folders, or hf:CONFIG/SCENE of the published data set, both with "
-    "or without wildcards; hf:all and hf:CONFIG stand for all its scenes.",
+    "or without wildcards; hf:all and hf:CONFIG stand for all its scenes; or JSON and CSV files "
+    "that list scenes with properties for each, see docs/benchmark.md.",
 )
+app.check(_SCENES, scene_lists.expand)
 _METHODS = flags.DEFINE_list(
     "methods",
     ["straight", "oracle", "tree"],
@@ -103,7 +105,7 @@ def main() -> None:
         _make_tables(out)
         return
     _check_engine()
-    cli_scenes.check_all(_SCENES.value)
+    cli_scenes.check_all(scene_lists.sources(_SCENES.value))
     scenes = plan.find_scenes(_SCENES.value, unpack=not _DRY_RUN.value)
     chosen = methods.parse(_METHODS.value)
     weights = perceptual.checked(_LPIPS_WEIGHTS.value)
@@ -191,7 +193,8 @@ def _engine(out: Path) -> worker.Engine:
 def _list(out: Path, planned: Sequence[Job], skipped: Sequence[Skipped]) -> None:
     done = [plan.is_done(out, job) for job in planned]
     for job, is_done in zip(planned, done, strict=True):
-        print(f"{'done' if is_done else 'to do':6} {job.name:48} {' '.join(job.train)}".rstrip())
+        words = " ".join([*job.train, *plan.given_properties(job)])
+        print(f"{'done' if is_done else 'to do':6} {job.name:48} {words}".rstrip())
     for each in skipped:
         print(f"{'skip':6} {each.name}: {each.reason}")
     print(f"{len(planned)} jobs, {done.count(False)} to do.")

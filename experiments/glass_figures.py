@@ -25,7 +25,7 @@ from refref_jax import choices
 with epy.lazy_imports():
     from experiments.figures import glass
     from experiments.runs import known_scene
-    from refref_jax.data import background
+    from refref_jax.data import scene_assembly, scene_properties
     from refref_jax.render import backgrounds
 
 FIGURES = ("views", "fan", "tree", "distances")
@@ -37,6 +37,7 @@ _FIGURES = flags.DEFINE_multi_enum(
 )
 _VIEW = flags.DEFINE_integer("view", 0, "Number of the view of the split.", 0)
 _RULE = cli_flags.rule()
+_PROPERTIES = cli_flags.properties()
 _IOR = cli_flags.ior()
 _RAYS_PER_PIXEL = cli_flags.rays_per_pixel(9)
 _SPLIT = cli_flags.split("Views to render.")
@@ -68,7 +69,8 @@ def main() -> None:
 
 def _drawers(folder: Path, indices: dict[str, float]) -> dict[str, Callable[[Path], None]]:
     """Reads a scene, and returns functions that draw each figure into a file."""
-    found = background.read_background(folder)
+    told = scene_properties.read(folder, overlay=_PROPERTIES.value)
+    found = scene_assembly.read_background(folder, properties=told)
     if not isinstance(found, backgrounds.CubeBackground):
         raise ValueError(
             f"The background of {folder} is not a cube. Choose a scene with a background cube."
@@ -80,6 +82,7 @@ def _drawers(folder: Path, indices: dict[str, float]) -> dict[str, Callable[[Pat
         views=str(_VIEW.value),
         rule=_RULE.value,
         indices=indices,
+        overlay=_PROPERTIES.value,
     )
     side = choices.side_of(_RAYS_PER_PIXEL.value)
     return {

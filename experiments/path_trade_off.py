@@ -50,6 +50,7 @@ cli_flags.alias("cuts", "min_throughputs")
 cli_flags.alias("bends", "max_bends")
 _VIEWS = cli_flags.views("0,10")
 _RULE = cli_flags.rule()
+_PROPERTIES = cli_flags.properties()
 _IOR = cli_flags.ior()
 _RAYS_PER_PIXEL = cli_flags.rays_per_pixel(9)
 _SPLIT = cli_flags.split("Views to render.")
@@ -131,6 +132,7 @@ def _read(folder: Path, indices: dict[str, float]) -> KnownScene:
         views=_VIEWS.value,
         rule=_RULE.value,
         indices=indices,
+        overlay=_PROPERTIES.value,
     )
     if scene.masks is None:
         raise ValueError(

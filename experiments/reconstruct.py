@@ -29,6 +29,7 @@ _IOR = flags.DEFINE_string(
 )
 _RECONSTRUCTION = r3f_flags.reconstruction()
 _SPACE = cli_flags.space()
+_PROPERTIES = cli_flags.properties()
 _SEED = cli_flags.seed()
 
 
@@ -44,16 +45,18 @@ def main() -> None:
     cli_scenes.check(_SCENE.value)
     outputs.check_folder(Path(_OUT.value))
     index = _parse(_IOR.value)
-    config = _RECONSTRUCTION.chosen(
-        index=index, seed=_SEED.value, space=_SPACE.chosen(), radius=_SPACE.radius.value
-    )
     scene, out = cli_scenes.opened(_SCENE.value), Path(_OUT.value)
+    space, radius = chain.bounds_of(
+        scene, _PROPERTIES.value or "", space=_SPACE.chosen(), radius=_SPACE.radius.value
+    )
+    config = _RECONSTRUCTION.chosen(index=index, seed=_SEED.value, space=space, radius=radius)
     found = chain.reconstruct(scene, out, config, compare=True)
     print(f"Report:  {out / report.FILE}, {out / report.FOLDER}")
     print(f"Surface: {object_source.surface_file(out, found)}")
     print(f"Index:   {out / chain.INDEX_FILE}")
     run = out.with_name(f"{out.name}_run")
-    given = (f"--scene={_SCENE.value}", f"--reconstruction={out}", f"--out={run}")
+    given = [f"--scene={_SCENE.value}", f"--reconstruction={out}", f"--out={run}"]
+    given += [f"--properties={_PROPERTIES.value}"] if _PROPERTIES.value else []
     print(f"Next: {app.shell('train', *given)}")
 
 

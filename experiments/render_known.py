@@ -62,6 +62,7 @@ cli_flags.alias("unfinished", "truncated_paths")
 _VIEWS = cli_flags.views("all")
 _SETTINGS = cli_flags.settings()
 _RULE = cli_flags.rule()
+_PROPERTIES = cli_flags.properties()
 _IOR = cli_flags.ior()
 _RAYS_PER_PIXEL = cli_flags.rays_per_pixel(9)
 _SPLIT = cli_flags.split("Views to render.")
@@ -89,6 +90,7 @@ def main() -> None:
         views=_VIEWS.value,
         rule=_RULE.value,
         indices=indices,
+        overlay=_PROPERTIES.value,
     )
     with outputs.fresh(out, **place) as draft:
         summary = render(scene, settings, draft)

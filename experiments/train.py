@@ -79,6 +79,7 @@ def check_flags() -> TrainConfig:
             "No scene is given. Add --scene=FOLDER, or --resume to continue a run, or "
             "--config=FILE."
         )
+    cli_flags.check_properties(config.scene.properties)
     training_body.check_flags(config, _CONFIG)
     if config.paths.name is not None:
         make_path_settings(

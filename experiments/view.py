@@ -97,7 +97,7 @@ def read_subject(heights: tuple[int, ...]) -> session.Subject:
     return session.Subject(
         name=run.resolve().name,
         model=model,
-        rule=config.scene.rule,
+        rule=config.scene.rule or "nested",
         frames=None if scene is None else session.read_test_views(scene),
         parts=session.part_names(scene, len(model.scene.interfaces.index_inside)),
         heights=heights,

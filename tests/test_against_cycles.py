@@ -10,7 +10,7 @@ from scipy.ndimage import binary_dilation
 
 from benchmarks.oracles import colours
 from benchmarks.oracles.backgrounds import CubeBackground
-from refref_jax.data import background, scene_folder
+from refref_jax.data import scene_assembly, scene_folder
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
@@ -35,7 +35,7 @@ def _render(scene, view, settings, *, oversampling=_FINE):
     """Renders a view of the test split; returns sRGB, and casts and paths a camera ray."""
     frames = scene_folder.read_frames(scene, "test")
     rays = cameras.image_rays(cameras.supersample(frames.cameras, oversampling), view)
-    radiance = radiance_of(background.read_background(scene))
+    radiance = radiance_of(scene_assembly.read_background(scene))
     seen = render_known(scenes.read_geometry(scene), radiance, rays, settings=settings)
     linear = cameras.box_filter(seen.linear, oversampling)
     return (

@@ -7,7 +7,7 @@ import pytest
 
 from experiments.benchmarking import settings
 from experiments.r3f import object_source, records
-from refref_jax.data import background, meshes, scene_folder
+from refref_jax.data import meshes, scene_assembly, scene_folder, scene_properties
 from refref_jax.render import checkpoint_io
 from refref_jax.training import config_files, run_folder
 from refref_jax.training.config import TrainConfig
@@ -37,9 +37,9 @@ _READERS = {
 
 _SCENE_READERS = {
     "meshes": lambda scene: meshes.read_meshes(scene, indices={}),
-    "space": background.space,
-    "extent": background.half_extent,
-    "background": background.read_background,
+    "properties": scene_properties.read,
+    "overlay": lambda scene: scene_properties.check_file(scene / "scene.json"),
+    "background": scene_assembly.read_background,
 }
 
 

@@ -10,26 +10,32 @@ There is one job for each scene and method, and one for the reconstruction that 
 A scene's fingerprint is a hash of the data that determines its results, so that results of another
 scene of the same name are not mixed in. It covers the contents of the transforms files, scene.json
 and the meshes, and the names and sizes of all images in the transforms files (colours, masks, depth
-maps); reading all images of a data set at every start would take minutes. It does not depend on the
-location of the folder or on other files in it.
+maps); reading all images of a data set at every start would take minutes. It also covers the
+properties that `scene_lists` gives with a scene. It does not depend on the location of the folder
+or on other files in it.
 """
 
+import dataclasses
 import glob
 import hashlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from experiments.benchmarking import scene_lists
 from experiments.benchmarking.methods import RECONSTRUCTION, Method, Need, same_as, same_inside
-from experiments.benchmarking.settings import Scene, Settings
+from experiments.benchmarking.settings import Scene, Settings, digest
 from experiments.cli import scenes as cli_scenes
 from refref_jax import configuration
-from refref_jax.data import meshes, scene_folder, scene_names, scene_source
-from refref_jax.data.meshes import PartDescription, read_part_descriptions
+from refref_jax.data import meshes, scene_folder, scene_names, scene_properties, scene_source
 from refref_jax.data.scene_analysis import find_tints
+from refref_jax.data.scene_properties import PartDescription
 
 FOLDER = "jobs"
 RESULT = "result.json"
+
+PROPERTIES = "scene"
+"""Key of the properties given with a scene among the options of a record."""
 
 SPLIT = "test"
 """Split whose views are evaluated."""
@@ -47,12 +53,14 @@ class Job(NamedTuple):
     Attributes:
       scene: name of the scene.
       path: folder of the scene.
-      fingerprint: hash of the scene's files at planning time.
+      fingerprint: hash of the scene's files and properties at planning time.
       method: name of the method, or `RECONSTRUCTION`.
       train: training options; empty for a reconstruction.
       reconstructed: whether it uses the objects of the scene's reconstruction.
       settings: settings of the benchmark.
       lpips_weights: file of LPIPS's weights.
+      properties: properties given with the scene, as options of `experiments.train`.
+      overlay: file of properties given with the scene, or an empty string.
     """
 
     scene: str
@@ -63,6 +71,8 @@ class Job(NamedTuple):
     reconstructed: bool
     settings: Settings
     lpips_weights: str | None
+    properties: tuple[str, ...] = ()
+    overlay: str = ""
 
     @property
     def name(self) -> str:
@@ -112,14 +122,14 @@ def plan_jobs(
     skipped: list[Skipped] = []
     for scene in scenes:
         place = (scene.name, scene.path, scene.fingerprint)
+        given = (settings, lpips_weights, scene.options, scene.properties)
         reasons = _reasons(scene, methods, settings.preset)
         skipped += [Skipped(scene.name, name, reason) for name, reason in reasons.items()]
         possible = [method for method in methods if method.name not in reasons]
         if any(method.reconstructed for method in possible):
-            jobs.append(Job(*place, RECONSTRUCTION, (), False, settings, lpips_weights))
+            jobs.append(Job(*place, RECONSTRUCTION, (), False, *given))
         jobs += [
-            Job(*place, each.name, each.train, each.reconstructed, settings, lpips_weights)
-            for each in possible
+            Job(*place, each.name, each.train, each.reconstructed, *given) for each in possible
         ]
     return jobs, skipped
 
@@ -140,7 +150,14 @@ def options(method: str, train: Sequence[str], settings: Settings) -> dict[str, 
     }
 
 
-def _lacking(scene: Path, requires: set[Need]) -> set[Need]:
+def given_properties(job: Job) -> list[str]:
+    """Returns the properties given with the scene of a job, which determine its result as well."""
+    if not job.overlay:
+        return list(job.properties)
+    return [*job.properties, f"--properties=sha256:{digest(Path(job.overlay))[:_LETTERS]}"]
+
+
+def _lacking(scene: Scene, requires: set[Need]) -> set[Need]:
     """Returns the requirements that a scene does not meet; none if it is broken."""
     try:
         return _unmet(scene, requires)
@@ -148,13 +165,14 @@ def _lacking(scene: Path, requires: set[Need]) -> set[Need]:
         return set()
 
 
-def _unmet(scene: Path, requires: set[Need]) -> set[Need]:
+def _unmet(listed: Scene, requires: set[Need]) -> set[Need]:
     found: set[Need] = set()
+    scene = Path(listed.path)
     files = meshes.mesh_files(scene) if requires & {"meshes", "colours"} else []
     if "meshes" in requires and not files:
         found.add("meshes")
     if "colours" in requires:
-        described = read_part_descriptions(scene / "scene.json")
+        described = scene_properties.read(scene, overlay=listed.properties).parts
         known = [path.name in described and described[path.name].colour_known for path in files]
         if not known or not all(known):
             found.add("colours")
@@ -185,7 +203,7 @@ def _reasons(scene: Scene, methods: Sequence[Method], preset: str) -> dict[str, 
     except ValueError as error:
         return {method.name: f"its {SPLIT} views cannot be read: {error}" for method in methods}
     requires = {need for method in methods for need in method.requires}
-    lacks, inside = _lacking(Path(scene.path), requires), _inside(Path(scene.path))
+    lacks, inside = _lacking(scene, requires), _inside(scene)
     reasons = {}
     for method in methods:
         if missing := [_WANTING[need] for need in method.requires if need in lacks]:
@@ -198,11 +216,12 @@ def _reasons(scene: Scene, methods: Sequence[Method], preset: str) -> dict[str, 
     return reasons
 
 
-def _inside(scene: Path) -> dict[str, str]:
+def _inside(scene: Scene) -> dict[str, str]:
     """Returns the interior options that a scene leads to; none if it is broken."""
     try:
-        described = read_part_descriptions(scene / "scene.json")
-        parts = [described.get(p.name, PartDescription()) for p in meshes.mesh_files(scene)]
+        described = scene_properties.read(Path(scene.path), overlay=scene.properties).parts
+        files = meshes.mesh_files(Path(scene.path))
+        parts = [described.get(path.name, PartDescription()) for path in files]
     except ValueError:
         return {}
     tints = find_tints(parts)
@@ -223,31 +242,51 @@ def find_scenes(words: Sequence[str], *, unpack: bool = True) -> list[Scene]:
     fingerprint: they can be listed, but not used.
 
     Args:
-      words: folders, with or without wildcards, `hf:CONFIG/SCENE`, or patterns of the latter.
-        Matches of a wildcard that are not scenes are ignored.
+      words: folders, with or without wildcards, `hf:CONFIG/SCENE`, patterns of the latter, or lists
+        of these, see `scene_lists`. Matches of a wildcard that are not scenes are ignored.
       unpack: whether to unpack published scenes, which takes minutes for all of them.
 
     Raises:
-      ValueError: if there are no scenes, if a folder is not a scene, or if two have the same name.
+      ValueError: if there are no scenes, if a folder is not a scene, if two have the same name, or
+        if different properties are given with the same one.
     """
-    sources = cli_scenes.expanded([word for word in words if word.strip()])
-    later = [each for each in sources if not unpack and not scene_source.is_unpacked(each)]
-    now = [each for each in sources if each not in later]
-    folders = [folder for source in now for folder in _folders(source)]
-    if not folders and not later:
+    listed = [
+        each._replace(source=source)
+        for each in scene_lists.expand(words)
+        for source in cli_scenes.expanded([each.source])
+    ]
+    later = [each for each in listed if not unpack and not scene_source.is_unpacked(each.source)]
+    now = [
+        (folder.resolve(), each)
+        for each in listed
+        if each not in later
+        for folder in _folders(each.source)
+    ]
+    if not now and not later:
         raise ValueError(
             f"--scenes={','.join(words)} matches no scene. Give folders that contain "
             "transforms_train.json, as in --scenes='scenes/*'."
         )
-    names = {str(scene_names.parse_source(source)): source for source in later}
-    found = {name: Scene(name, source, "") for name, source in names.items()}
-    for folder in dict.fromkeys(folder.resolve() for folder in folders):
+    waiting = {str(scene_names.parse_source(each.source)): each for each in later}
+    found = {
+        n: Scene(n, each.source, "", each.options, each.properties) for n, each in waiting.items()
+    }
+    for folder, (_, options, overlay) in now:
         name = scene_names.of_folder(folder)
-        if name in found:
+        made = Scene(name, str(folder), "", options, overlay)
+        known = found.get(name, made)
+        if known.path != made.path:
             raise ValueError(
-                f"Both {found[name].path} and {folder} are named {name}. Rename one of them."
+                f"Both {known.path} and {folder} are named {name}. Rename one of them."
             )
-        found[name] = Scene(name, str(folder), fingerprint(folder))
+        if (known.options, known.properties) != (options, overlay):
+            raise ValueError(f"{folder} is listed with different properties. Remove one entry.")
+        found[name] = made
+    for name, scene in found.items():
+        if name in waiting:
+            continue
+        told = fingerprint(Path(scene.path), scene.options, scene.properties)
+        found[name] = dataclasses.replace(scene, fingerprint=told)
     return [found[name] for name in sorted(found)]
 
 
@@ -266,9 +305,19 @@ def _is_scene(folder: Path) -> bool:
     return (folder / "transforms_train.json").is_file()
 
 
-def fingerprint(scene: Path) -> str:
-    """Returns the hash of a scene, which may be broken or incomplete."""
+def fingerprint(scene: Path, options: Sequence[str] = (), overlay: str = "") -> str:
+    """Returns the hash of a scene, which may be broken or incomplete.
+
+    Args:
+      scene: folder of the scene.
+      options: properties given with it.
+      overlay: file of properties given with it, or an empty string.
+    """
     found = hashlib.sha256()
+    for option in options:
+        _add(found, "option", option.encode())
+    if overlay:
+        _add(found, "properties", Path(overlay).read_bytes())
     described = scene / "scene.json"
     files = sorted(scene.glob("transforms_*.json"))
     for path in (*files, *([described] if described.is_file() else [])):

@@ -98,7 +98,8 @@ class Record(NamedTuple):
       background: `cube`, `sphere`, `env`, or `OTHER`.
       method: name of the method, or `RECONSTRUCTION`.
       fingerprint: hash of the scene's files, see `plan.fingerprint`.
-      options: options of its commands, by command.
+      options: options of its commands, by command, and the properties given with the scene by
+        `plan.PROPERTIES`.
       settings: settings of the benchmark.
       metrics: means over the images.
       per_image: metrics of each image.
@@ -319,7 +320,8 @@ def _check_method(path: Path, record: Record, benchmark: Benchmark) -> None:
     if train is None and record.method in METHODS:
         train = METHODS[record.method].train
     expected = plan.options(record.method, train or (), benchmark.settings)
-    for command in sorted({*expected, *record.options}):
+    # The fingerprint covers the properties given with a scene.
+    for command in sorted({*expected, *record.options} - {plan.PROPERTIES}):
         made, asked = record.options.get(command, []), expected.get(command, [])
         if made != asked:
             raise ValueError(
@@ -333,8 +335,8 @@ def _check_scene(path: Path, record: Record, fingerprint: str) -> None:
     if record.fingerprint != fingerprint:
         raise ValueError(
             f"{path} is of another scene named {record.scene} (fingerprint {record.fingerprint}) "
-            f"than the benchmark's ({fingerprint}): cameras, meshes, scene.json or images differ. "
-            f"{_TAKE_OUT}"
+            f"than the benchmark's ({fingerprint}): cameras, meshes, scene.json, images or "
+            f"properties differ. {_TAKE_OUT}"
         )
     kind = category_and_background(record.scene)
     if (record.category, record.background) != kind:

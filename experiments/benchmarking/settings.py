@@ -59,12 +59,16 @@ class Scene:
     Attributes:
       name: name, unique in the benchmark.
       path: latest absolute path of its folder.
-      fingerprint: hash of its files, see `plan.fingerprint`.
+      fingerprint: hash of its files and of the properties given with it, see `plan.fingerprint`.
+      options: properties given with it, as options of `experiments.train`.
+      properties: latest absolute path of a file of properties given with it, or an empty string.
     """
 
     name: str
     path: str
     fingerprint: str
+    options: tuple[str, ...] = ()
+    properties: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +108,10 @@ def read(out: Path) -> Benchmark:
     try:
         return Benchmark(
             Settings(**record["settings"]),
-            {name: Scene(**scene) for name, scene in record["scenes"].items()},
+            {
+                name: Scene(**scene | {"options": tuple(scene.get("options", ()))})
+                for name, scene in record["scenes"].items()
+            },
             {name: tuple(options) for name, options in record["methods"].items()},
         )
     except (KeyError, TypeError, AttributeError) as error:
@@ -129,8 +136,8 @@ def extended(out: Path, more: Benchmark) -> Benchmark:
         if known.fingerprint != scene.fingerprint:
             raise ValueError(
                 f"{out} was started with another scene named {name}: that of {known.path} had "
-                f"other cameras, meshes, images or scene.json than {scene.path} has now. Restore "
-                "or rename the folder, or give another --out."
+                f"other cameras, meshes, images, scene.json or properties than {scene.path} has "
+                "now. Restore or rename the folder, or give another --out."
             )
     for name, options in more.methods.items():
         known = begun.methods.get(name, options)

@@ -21,7 +21,7 @@ import jax
 import numpy as np
 
 import refref_jax
-from experiments.benchmarking import plan, pose_space, results, summary
+from experiments.benchmarking import plan, pose_space, results, scene_lists, summary
 from experiments.benchmarking.methods import RECONSTRUCTION
 from experiments.benchmarking.plan import SPLIT, Job, Skipped
 from experiments.benchmarking.results import Costs, Image, Record, Truth, View, number
@@ -98,10 +98,10 @@ def wait_until_free(folder: Path, patience: float = _PATIENCE) -> None:
 
 def _check_scene(job: Job) -> None:
     """Rejects a scene whose files have changed since the job was planned."""
-    if plan.fingerprint(Path(job.path)) != job.fingerprint:
+    if plan.fingerprint(Path(job.path), job.properties, job.overlay) != job.fingerprint:
         raise ValueError(
-            f"Cameras, meshes, images or scene.json of {job.path} have changed since the benchmark "
-            "was started. Restore them, or start another benchmark."
+            f"Cameras, meshes, images, scene.json or properties of {job.path} have changed since "
+            "the benchmark was started. Restore them, or start another benchmark."
         )
 
 
@@ -109,11 +109,12 @@ def _reconstruct(job: Job, folder: Path) -> Record:
     out = folder / "run"
     wait_until_free(out)
     options = plan.options(job.method, job.train, job.settings)
-    command = [f"--scene={job.path}", f"--out={out}", *options["reconstruct"]]
+    given = [*scene_lists.for_background(job.properties), *_overlay(job)]
+    command = [f"--scene={job.path}", f"--out={out}", *options["reconstruct"], *given]
     seconds, peak = subprocesses.run("reconstruct", *command, log=folder / "run.log")
     found = records.read(out)
     return _record(job)._replace(
-        options=options,
+        options=options | _properties(job),
         costs=Costs(seconds=seconds, peak_host_mib=peak),
         facts={"index": dataclasses.asdict(found.index)},
     )
@@ -122,9 +123,12 @@ def _reconstruct(job: Job, folder: Path) -> Record:
 def _learn(job: Job, folder: Path) -> Record:
     run_, scene = folder / "run", Path(job.path)
     options = plan.options(job.method, job.train, job.settings)
-    objects = []
+    objects = [*job.properties, *_overlay(job)]
     if job.reconstructed:
-        objects = [f"--reconstruction={folder.parent / RECONSTRUCTION / 'run'}"]
+        objects = [
+            *scene_lists.for_object(objects),
+            f"--reconstruction={folder.parent / RECONSTRUCTION / 'run'}",
+        ]
     weights = [] if job.lpips_weights is None else [f"--lpips_weights={job.lpips_weights}"]
     wait_until_free(run_)
     cost = measured_runs.train(run_, scene=scene, options=[*options["train"], *objects])
@@ -136,13 +140,23 @@ def _learn(job: Job, folder: Path) -> Record:
     frames, apart = _frames(scene)
     per_image = [_image(image, apart) for image in summary["per_image"]]
     return _record(job)._replace(
-        options=options,
+        options=options | _properties(job),
         metrics=metrics,
         per_image=per_image,
         costs=Costs(**dataclasses.asdict(cost), seconds_per_image=seconds),
         views=[_view(image.name, frames, scene) for image in per_image],
         facts={key: summary[key] for key in ("learned",) if summary.get(key) is not None},
     )
+
+
+def _overlay(job: Job) -> list[str]:
+    return [f"--properties={job.overlay}"] if job.overlay else []
+
+
+def _properties(job: Job) -> dict[str, list[str]]:
+    """Returns the properties given with the scene of a job, for its record."""
+    given = plan.given_properties(job)
+    return {plan.PROPERTIES: given} if given else {}
 
 
 def _image(entry: dict[str, Any], apart: Mapping[str, float]) -> Image:

@@ -16,6 +16,7 @@ from absl import flags
 from experiments.cli import app
 from experiments.runs import processes, view_numbers
 from refref_jax import choices
+from refref_jax.data import scene_properties
 from refref_jax.optics.path_settings import PathSettings, make_path_settings
 
 flags.disclaim_key_flags()
@@ -179,16 +180,31 @@ def settings(*, min_throughput: float | None = None, max_bends: int | None = Non
     return found
 
 
-# ---- Meshes and their materials ----
-def rule() -> flags.FlagHolder[str]:
+# ---- Properties of scenes ----
+def rule() -> flags.FlagHolder[str | None]:
     """Defines `--rule`."""
     return flags.DEFINE_enum(
         "rule",
-        "nested",
+        None,
         RULES,
         "Medium outside each mesh: that of the enclosing mesh, always air (as in Cycles), or, for "
-        "overlapping meshes, that with the highest 'priority' in scene.json.",
+        "overlapping meshes, that with the highest 'priority' in scene.json. By default that of "
+        "scene.json, else nested.",
     )
+
+
+def properties() -> flags.FlagHolder[str | None]:
+    """Defines `--properties`, a file like `scene.json`, which is read before the scene."""
+    what = "JSON file of properties, like scene.json, whose values override it."
+    holder = flags.DEFINE_string("properties", None, what)
+    app.check(holder, check_properties)
+    return holder
+
+
+def check_properties(path: str | None) -> None:
+    """Rejects a file that is not a valid overlay of a scene's properties."""
+    if path:
+        scene_properties.check_file(Path(path))
 
 
 def ior() -> flags.FlagHolder[list[str]]:

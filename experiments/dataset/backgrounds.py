@@ -1,4 +1,4 @@
-"""Writes the background of a scene, and describes it as `refref_jax.data.background` reads it.
+"""Writes the background of a scene, and describes it for `refref_jax.data.scene_properties`.
 
 A *kind* is `cube` (six different of the 24 faces), `sphere` (one of the 13) or `env` (one of the
 environments). An equirectangular image has +x in its middle column and -x at its seam: a unit

@@ -18,13 +18,13 @@ from experiments.runs import known_scene
 from experiments.runs.known_scene import KnownScene
 from refref_jax.choices import SPLITS
 from refref_jax.data import (
-    background,
     background_fit,
     image_files,
     mesh_checks,
     mesh_queries,
     meshes,
     scene_folder,
+    scene_properties,
 )
 from refref_jax.data.mesh_checks import Finding
 from refref_jax.data.mesh_queries import Containment
@@ -110,7 +110,8 @@ def check_files(scene: Path) -> list[Finding]:
 def check_background(scene: Path) -> list[Finding]:
     """Compares the size of the background in `scene.json` with the depth maps of a split."""
     try:
-        space, size = background.space(scene), background.half_extent(scene)
+        properties = scene_properties.read(scene)
+        space, size = properties.space, properties.background.extent
         splits = [each for each in SPLITS if (scene / f"transforms_{each}.json").is_file()]
         if size is None or space == "unbounded" or not splits:
             return []
@@ -149,9 +150,11 @@ def read_views(scene: Path, made_of: Meshes, *, count: int) -> KnownScene:
     last = len(frames.names) - 1
     spread = np.linspace(0, last, min(count, last + 1)).round().astype(int)
     chosen = tuple(int(i) for i in np.unique(spread))
-    path = scene / "scene.json"
-    rule = scene_folder.read_json(path).get("rule", "nested") if path.is_file() else "nested"
-    return known_scene.build_scene(scene, *made_of, frames=frames, chosen=chosen, rule=rule)
+    properties = scene_properties.read(scene)
+    rule = known_scene.rule_of(properties)
+    return known_scene.build_scene(
+        scene, *made_of, frames=frames, chosen=chosen, rule=rule, properties=properties
+    )
 
 
 def compare_view(scene: KnownScene, index: int, *, settings: PathSettings, side: int) -> View:

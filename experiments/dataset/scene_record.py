@@ -18,6 +18,7 @@ from refref_jax.choices import NO_ABSORPTION, TwoSidedRule
 from refref_jax.data.mesh_queries import find_containment
 from refref_jax.data.meshes import INDEX_OF_REFRACTION, MeshPart
 from refref_jax.data.scene_names import SceneName
+from refref_jax.data.scene_properties import VERSION
 from refref_jax.geometry.triangle_meshes import is_watertight
 from refref_jax.optics.interface_rules import NO_PARENT
 
@@ -35,7 +36,7 @@ def describe(
     Args:
       scene: scene to describe.
       parts: parts of its object.
-      background: record of its background, as `refref_jax.data.background` reads it.
+      background: record of its background, as `refref_jax.data.scene_properties` reads it.
       settings: settings of the rendering.
 
     Raises:
@@ -43,6 +44,7 @@ def describe(
     """
     outside = _materials_outside(scene, parts, settings.rule)
     return {
+        "version": VERSION,
         **identify(scene, settings),
         "parts": [
             _describe_part(scene, part, around) for part, around in zip(parts, outside, strict=True)

@@ -9,7 +9,8 @@ from pathlib import Path
 from experiments.r3f import geometry_stage, index_stage, light_stage, object_source, records, report
 from experiments.r3f.records import IndexFacts, LightFacts, Reconstruction, ReconstructionConfig
 from refref_jax import atomic_files, configuration
-from refref_jax.data import scene_folder, scene_names
+from refref_jax.choices import Space
+from refref_jax.data import SceneError, scene_folder, scene_names, scene_properties
 from refref_jax.data.meshes import MeshPart
 from refref_jax.reconstruct.grids import import_skimage
 
@@ -106,6 +107,32 @@ def fingerprint(scene: Path) -> str:
     for path in (*frames.images, *(frames.masks or ())):
         found.update(hashlib.sha256(path.read_bytes()).digest())
     return found.hexdigest()
+
+
+def bounds_of(
+    scene: Path, overlay: str, *, space: Space | None, radius: float | None
+) -> tuple[Space | None, float | None]:
+    """Returns type and size of the background, where `None` is what `scene.json` says.
+
+    Args:
+      scene: folder of the scene.
+      overlay: file whose properties override those of `scene.json`, or an empty string.
+      space: type of the background, if it is given.
+      radius: size of the background, if it is given.
+
+    Raises:
+      SceneError: if the properties are not valid, or the ambient medium is not air.
+    """
+    told = scene_properties.read(scene, overlay=overlay)
+    if told.ambient_index != 1.0:
+        raise SceneError(
+            f"{told.origins['ambient_index']}: ambient_index is {told.ambient_index:g}, but "
+            "reconstruction in a medium other than air is not supported yet. Train with the "
+            "scene's meshes."
+        )
+    if not overlay or told.origins.get("background") != Path(overlay):
+        return space, radius
+    return space or told.space, radius or told.background.extent
 
 
 def describe_index(index: IndexFacts) -> str:

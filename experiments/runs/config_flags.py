@@ -109,7 +109,7 @@ def chosen(holders: Mapping[str, flags.FlagHolder], *, say: Say, **instead: Any)
     """
     below = base()
     values = given({name: each for name, each in holders.items() if name not in instead})
-    for name in ("scene", "reconstruction"):
+    for name in ("scene", "properties", "reconstruction"):
         before, now = below.get(name), values.get(name)
         if before and now and Path(now).resolve() == Path(before).resolve():
             del values[name]  # the same folder, by another path

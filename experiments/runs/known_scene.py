@@ -11,10 +11,20 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from experiments.runs import view_numbers
 from refref_jax import metrics
-from refref_jax.data import background, mesh_checks, mesh_queries, meshes, scene_folder, scene_names
+from refref_jax.choices import RuleName
+from refref_jax.data import (
+    mesh_checks,
+    mesh_queries,
+    meshes,
+    scene_analysis,
+    scene_folder,
+    scene_names,
+    scene_properties,
+)
 from refref_jax.data.mesh_queries import Containment
 from refref_jax.data.meshes import MeshPart
-from refref_jax.data.scene_assembly import assemble_scene
+from refref_jax.data.scene_assembly import assemble_scene, read_background
+from refref_jax.data.scene_properties import SceneProperties
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.media import interior_length
@@ -70,7 +80,13 @@ class View(NamedTuple):
 
 
 def read_scene(
-    scene: Path, *, split: str, views: str, rule: str, indices: Mapping[str, float]
+    scene: Path,
+    *,
+    split: str,
+    views: str,
+    rule: RuleName | None,
+    indices: Mapping[str, float],
+    overlay: str | None = None,
 ) -> KnownScene:
     """Reads the data for rendering and measuring some views.
 
@@ -78,18 +94,31 @@ def read_scene(
       scene: folder of the scene.
       split: `train`, `val` or `test`.
       views: numbers of views in the split, as in `0,10,20`, or `all`.
-      rule: rule for the medium outside each mesh, see `optics.interface_rules`.
+      rule: rule for the medium outside each mesh, see `optics.interface_rules`; by default that of
+        `scene.json`, else `nested`.
       indices: indices of refraction by name, see `meshes.read_meshes`.
+      overlay: file whose properties override those of `scene.json`, see `scene_properties`.
 
     Raises:
       ValueError: if a file is missing or broken, or a view does not exist.
     """
     frames = scene_folder.read_frames(scene, split)
     chosen = view_numbers.choose(views, len(frames.names))
-    parts = meshes.read_meshes(scene, indices=indices)
-    tree = mesh_queries.find_containment(parts)
-    print("\n".join(mesh_checks.check_meshes(parts, tree, rule=rule)))
-    return build_scene(scene, parts, tree, frames=frames, chosen=chosen, rule=rule)
+    properties = scene_properties.read(scene, overlay=overlay)
+    parts = meshes.read_meshes(scene, indices=indices, properties=properties)
+    tree, rule = mesh_queries.find_containment(parts), rule or rule_of(properties)
+    notes = mesh_checks.check_meshes(parts, tree, rule=rule)
+    if properties.rule is not None and properties.rule == rule:
+        notes += (f"note: rule={rule}, from {properties.origins['rule'].name}.",)
+    print("\n".join((*notes, *scene_analysis.overridden(properties, parts, rule=rule))))
+    return build_scene(
+        scene, parts, tree, frames=frames, chosen=chosen, rule=rule, properties=properties
+    )
+
+
+def rule_of(properties: SceneProperties) -> RuleName:
+    """Returns the interface rule of `scene.json`, or the default."""
+    return properties.rule or "nested"
 
 
 def build_scene(
@@ -99,27 +128,35 @@ def build_scene(
     *,
     frames: scene_folder.Frames,
     chosen: Sequence[int],
-    rule: str,
+    rule: RuleName,
+    properties: SceneProperties,
 ) -> KnownScene:
     """Returns a scene of meshes that have been checked before.
 
     Args:
-      scene: folder of the scene, for its background.
+      scene: folder of the scene.
       parts: meshes of the scene.
       tree: nesting of the meshes.
       frames: a split of the scene.
       chosen: numbers of views in the split.
       rule: rule for the medium outside each mesh.
+      properties: properties of the scene: its background, and the ambient medium.
 
     Raises:
       ValueError: if the background is unknown, or an image is missing or broken.
     """
     frames = _choose(frames, chosen)
-    objects = assemble_scene(parts, tree.parents, rule=rule, overlaps=tree.overlaps)
+    objects = assemble_scene(
+        parts,
+        tree.parents,
+        rule=rule,
+        overlaps=tree.overlaps,
+        ambient=properties.ambient_index,
+    )
     return KnownScene(
         name=scene_names.of_folder(scene),
         objects=jax.device_put(objects),
-        radiance=jax.device_put(radiance_of(background.read_background(scene))),
+        radiance=jax.device_put(radiance_of(read_background(scene, properties=properties))),
         frames=frames,
         indices=tuple(chosen),
         images=scene_folder.read_images(frames),

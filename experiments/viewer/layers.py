@@ -28,7 +28,7 @@ from refref_jax.data import image_files
 from refref_jax.data.scene_folder import Frames
 from refref_jax.geometry import cameras
 from refref_jax.geometry.rays import Rays
-from refref_jax.optics.interface_rules import RULES
+from refref_jax.optics.interface_rules import RULES, ambient_of
 from refref_jax.optics.light_paths import Branch
 from refref_jax.optics.media import Interfaces
 from refref_jax.render import Model, images, render_image
@@ -154,7 +154,7 @@ def with_indices(interfaces: Interfaces, indices: Sequence[float], rule: str) ->
       rule: rule of the scene, a name in `interface_rules.RULES`.
     """
     parents = [int(medium) - 1 for medium in interfaces.medium_outside]
-    made = RULES[rule](indices, parents)
+    made = RULES[rule](indices, parents, ambient=ambient_of(interfaces))
     return interfaces._replace(index_inside=made.index_inside, index_outside=made.index_outside)
 
 

@@ -29,7 +29,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from refref_jax.choices import Space, Split
-from refref_jax.data import background, image_files, scene_folder, scene_names
+from refref_jax.data import image_files, scene_folder, scene_names
+from refref_jax.data.scene_properties import SceneProperties
 from refref_jax.geometry.cameras import Cameras, planar_directions
 
 Kind = Literal["cube", "sphere"]
@@ -203,26 +204,28 @@ class Bounds(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def find_bounds(scene: Path, *, space: Space | None, radius: float | None) -> Bounds:
+def find_bounds(
+    scene: Path, properties: SceneProperties, *, space: Space | None, radius: float | None
+) -> Bounds:
     """Determines the background of a scene: from `scene.json`, else from its name and depth maps.
 
     Args:
       scene: the scene folder.
+      properties: properties of the scene.
       space: geometry that is given; `None` for the scene's own.
       radius: size that is given, in place of the scene's own; nothing is measured then.
 
     Raises:
       SceneError: if `scene.json`, a depth map or a mask is broken.
     """
-    own = background.space(scene)
+    own, described = properties.space, properties.background
     found: Space = space or own
     if found == "unbounded":
         return Bounds(found, None, "")
-    size = background.half_extent(scene)
-    if size is not None:
-        return Bounds(found, size, "scene.json")
+    if described.extent is not None:
+        return Bounds(found, described.extent, "scene.json")
     is_sphere = scene_names.of_folder(scene).split("_")[0] == "sphere"
-    if space is None and own == "bounded" and is_sphere and not background.is_described(scene):
+    if space is None and own == "bounded" and is_sphere and described.kind is None:
         found = "spherical"
     if radius is not None:
         return Bounds(found, None, "")

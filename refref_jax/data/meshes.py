@@ -1,17 +1,9 @@
 """Reads the meshes of a scene and resolves their materials (NumPy only).
 
 One PLY file is one part. Its material is the last word of the file name that the table of indices
-contains: `perfume_red_glass.ply` is glass. An optional `scene.json` may describe each mesh:
-
-    {"parts": [{"mesh": "meshes/cup_glass.ply",
-                "ior_inside": 1.5,                        index of refraction
-                "smooth_normals": true,                   how it was shaded
-                "colour_per_interface": [0.9, 1.0, 0.9],  linear RGB factor at its surface
-                "absorption": [0.1, 0.0, 0.1],            linear RGB, per world unit inside
-                "priority": 3}]}                          where parts overlap, the highest wins
-
-Only `mesh` is required. The index of refraction is, in this order, that of the caller's `indices`,
-that of `scene.json`, and that of the table.
+contains: `perfume_red_glass.ply` is glass. `scene_properties` reads the description of each mesh in
+`scene.json`. The index of refraction is, in this order, that of the caller's `indices`, that of the
+part in `scene.json`, that of its material there, and that of the table.
 
 A reconstructed mesh has its own shading normals, from the gradient of a field or averaged within
 patches; those of any other mesh follow from its faces. `write_mesh` stores them: PLY has one normal
@@ -21,19 +13,18 @@ are only read from files with exactly the header that `write_mesh` writes, becau
 may store any normals.
 """
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
-from refref_jax import configuration
 from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
-from refref_jax.data import SceneError, scene_names
+from refref_jax.data import SceneError, scene_names, scene_properties
+from refref_jax.data.scene_properties import PartDescription, SceneProperties, Shading
 
 _HEADER = """ply
 format binary_little_endian 1.0
@@ -54,8 +45,6 @@ _VERTEX = np.dtype([("position", "<f8", 3), ("normal", "<f8", 3)])
 _FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
 
 _LONGEST_NORMALS_HEADER = len(_HEADER) + 40
-
-Shading = Literal["auto", "smooth", "flat"]
 
 INDEX_OF_REFRACTION: dict[str, float] = {
     "glass": 1.5,
@@ -111,94 +100,6 @@ def read_normals(path: Path) -> Float[np.ndarray, "faces 3 3"] | None:
     return points["normal"][triangles["vertices"]]
 
 
-class PartDescription(NamedTuple):
-    """Description of one mesh in `scene.json`, with defaults.
-
-    Attributes:
-      index: index of refraction inside, relative to air; `None` if the file name decides.
-      shading: `smooth`, `flat`, or `auto` for smooth up to the crease angle.
-      tint: factor of linear RGB light at every reflection and every crossing, 0 to 1.
-      absorption: absorption of the medium inside, linear RGB, per world unit.
-      priority: priority under the rule `priority`; the highest wins where parts overlap.
-      colour_known: whether tint or absorption is given; if only one is, the other is clear.
-    """
-
-    index: float | None = None  # type: ignore[assignment]  # hides tuple.index
-    shading: Shading = "auto"
-    tint: Colour = CLEAR
-    absorption: Colour = NO_ABSORPTION
-    priority: int = 0
-    colour_known: bool = False
-
-
-def read_part_descriptions(path: Path) -> dict[str, PartDescription]:
-    """Returns the description of each mesh file that `scene.json` names, by file name.
-
-    Raises:
-      SceneError: if the file is invalid, or a value has no physical meaning.
-    """
-    if not path.is_file():
-        return {}
-    try:
-        parts = configuration.parse_json(path.read_text(encoding="utf-8")).get("parts", [])
-        named = {Path(part["mesh"]).name: dict(part) for part in parts}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise SceneError(
-            f"{path} is not valid ({error}). Correct it, or remove it: it is optional."
-        ) from error
-    return {name: _describe(f"{path}: {name}", part) for name, part in named.items()}
-
-
-def _describe(where: str, part: dict[str, Any]) -> PartDescription:
-    found: dict[str, Any] = {}
-    if "ior_inside" in part:
-        found["index"] = index = _number(part["ior_inside"])
-        if not 0.0 < index < math.inf:
-            raise _refusal(where, part, "ior_inside", "a positive number, such as 1.5 for glass")
-    if "smooth_normals" in part:
-        if not isinstance(part["smooth_normals"], bool):
-            raise _refusal(where, part, "smooth_normals", "true or false")
-        found["shading"] = "smooth" if part["smooth_normals"] else "flat"
-    if "colour_per_interface" in part:
-        found["tint"] = tint = _colour(part["colour_per_interface"])
-        if not all(0.0 <= channel <= 1.0 for channel in tint):
-            wanted = "three numbers from 0 to 1, since no surface adds light"
-            raise _refusal(where, part, "colour_per_interface", wanted)
-    if "absorption" in part:
-        found["absorption"] = absorption = _colour(part["absorption"])
-        if not all(0.0 <= channel < math.inf for channel in absorption):
-            wanted = "three numbers that are 0 or positive, per world unit"
-            raise _refusal(where, part, "absorption", wanted)
-    if "priority" in part:
-        found["priority"] = part["priority"]
-        if not isinstance(part["priority"], int) or isinstance(part["priority"], bool):
-            raise _refusal(where, part, "priority", "a whole number; the highest wins")
-    found["colour_known"] = "tint" in found or "absorption" in found
-    return PartDescription(**found)
-
-
-def _number(value: Any) -> float:
-    """Returns a number, or NaN for any other value."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return math.nan
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf
-
-
-def _colour(value: Any) -> Colour:
-    """Returns three numbers, or NaN three times for any other value."""
-    if not isinstance(value, list) or len(value) != 3:
-        return math.nan, math.nan, math.nan
-    red, green, blue = map(_number, value)
-    return red, green, blue
-
-
-def _refusal(where: str, part: dict[str, Any], key: str, wanted: str) -> SceneError:
-    return SceneError(f"{where} has the {key} {part[key]!r}. Give {wanted}.")
-
-
 class MeshPart(NamedTuple):
     """One closed surface and its material.
 
@@ -228,13 +129,19 @@ class MeshPart(NamedTuple):
     normals: Float[np.ndarray, "faces 3 3"] | None = None
 
 
-def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> list[MeshPart]:
+def read_meshes(
+    scene: Path,
+    *,
+    indices: Mapping[str, float] | None = None,
+    properties: SceneProperties | None = None,
+) -> list[MeshPart]:
     """Reads all parts of a scene, ordered by name.
 
     Args:
       scene: the scene folder, see `mesh_files`; without mesh files, there are no parts.
       indices: indices of refraction that replace or extend the table and `scene.json`, by
         material or, for one part alone, by file stem.
+      properties: properties of the scene; by default those of its `scene.json`.
 
     Raises:
       SceneError: if a mesh is broken or empty, if its material is unknown, if an index is not
@@ -244,17 +151,25 @@ def read_meshes(scene: Path, *, indices: Mapping[str, float] | None = None) -> l
     overrides = dict(indices or {})
     for name, index in overrides.items():
         check_index(name, index)
-    paths = mesh_files(scene)
-    _check_overrides(overrides, paths)
-    described = read_part_descriptions(scene / "scene.json")
-    missing = sorted(set(described) - {path.name for path in paths})
+    paths, found = mesh_files(scene), properties or scene_properties.read(scene)
+    table = INDEX_OF_REFRACTION | dict(found.indices) | overrides
+    _check_overrides(overrides, paths, table)
+    foreign = set(found.indices) - set(INDEX_OF_REFRACTION)
+    if paths and (idle := sorted(foreign - {material_of(path, table=table) for path in paths})):
+        raise SceneError(
+            f"{found.origins['ior']}: ior.{idle[0]} fits no mesh. Remove it, or name a mesh "
+            f"so, as in {paths[0].stem}_{idle[0]}.ply."
+        )
+    missing = sorted(set(found.parts) - {path.name for path in paths})
     if missing and paths:
         raise SceneError(
-            f"{scene / 'scene.json'} describes {missing[0]}, but {paths[0].parent} does not hold "
-            "it. Restore the mesh, or remove its description."
+            f"{found.origins[missing[0]]} describes {missing[0]}, but {paths[0].parent} does not "
+            "hold it. Restore the mesh, or remove its description."
         )
     unknown = PartDescription()
-    return [_read_part(path, overrides, described.get(path.name, unknown)) for path in paths]
+    return [
+        _read_part(path, overrides, found.parts.get(path.name, unknown), table) for path in paths
+    ]
 
 
 def check_index(name: str, index: float) -> None:
@@ -276,7 +191,7 @@ def read_part(path: Path, *, index: float, shading: Shading = "auto") -> MeshPar
     Raises:
       SceneError: if the file is broken, or has no triangle.
     """
-    return _read_part(path, {path.stem: index}, PartDescription(shading=shading))
+    return _read_part(path, {path.stem: index}, PartDescription(shading=shading), {})
 
 
 def mesh_files(scene: Path) -> list[Path]:
@@ -367,18 +282,27 @@ def _declared_faces(path: Path) -> int:
     return int(found.group(1)) if found else 0
 
 
-def _read_part(path: Path, overrides: Mapping[str, float], described: PartDescription) -> MeshPart:
-    index = _index(path, overrides, described)
+def _read_part(
+    path: Path,
+    overrides: Mapping[str, float],
+    described: PartDescription,
+    table: Mapping[str, float],
+) -> MeshPart:
+    index = _index(path, overrides, described, table)
     vertices, faces = read_mesh(path)
     normals = read_normals(path) if described.shading == "auto" else None
     return MeshPart(path.stem, vertices, faces, index, *described[1:], normals)
 
 
-def _index(path: Path, overrides: Mapping[str, float], described: PartDescription) -> float:
+def _index(
+    path: Path,
+    overrides: Mapping[str, float],
+    described: PartDescription,
+    table: Mapping[str, float],
+) -> float:
     """Returns the index of refraction of a mesh file, by the order in the module docstring."""
     if path.stem in overrides:
         return overrides[path.stem]
-    table = INDEX_OF_REFRACTION | dict(overrides)
     material = material_of(path, table=table)
     if described.index is not None and material not in overrides:
         return described.index
@@ -397,8 +321,9 @@ def material_of(path: Path, *, table: Mapping[str, float] = INDEX_OF_REFRACTION)
     return known[-1] if known else None
 
 
-def _check_overrides(overrides: Mapping[str, float], paths: Sequence[Path]) -> None:
-    table = INDEX_OF_REFRACTION | dict(overrides)
+def _check_overrides(
+    overrides: Mapping[str, float], paths: Sequence[Path], table: Mapping[str, float]
+) -> None:
     known = {path.stem for path in paths} | {material_of(path, table=table) for path in paths}
     for name in overrides:
         if name not in known:

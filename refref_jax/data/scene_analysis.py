@@ -1,18 +1,22 @@
 """Analyses a scene: the features that a model of it requires (NumPy only).
 
+`overridden` compares the properties in `scene.json` with those that are used.
+
 A model only includes what its scene requires, so that no computation is spent on the rest. The
 analysis runs on the host, from the meshes, their description in `scene.json`, and the cameras; it
 determines which code is compiled. The background is opaque in every scene, so it is not listed.
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from refref_jax.choices import CLEAR, NO_ABSORPTION, RuleName, Space, Tints
 from refref_jax.data.mesh_queries import Containment, encloses, is_convex, winding_number
-from refref_jax.data.meshes import MeshPart, PartDescription
+from refref_jax.data.meshes import MeshPart
+from refref_jax.data.scene_properties import PartDescription, SceneProperties
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.path_settings import Reentry
@@ -96,6 +100,41 @@ def describe(analysis: SceneAnalysis) -> str:
     reentry = "re-entry" if analysis.reentry == "possible" else "no re-entry"
     return (
         f"this scene needs: {_objects(analysis)}, {reentry}, {background}, {tints[analysis.tints]}"
+    )
+
+
+def overridden(
+    properties: SceneProperties,
+    parts: Sequence[MeshPart],
+    *,
+    rule: RuleName,
+    space: Space | None = None,
+    radius: float | None = None,
+) -> tuple[str, ...]:
+    """Returns a line of text for each property of `scene.json` that another value overrides.
+
+    Args:
+      properties: properties in `scene.json`.
+      parts: meshes, with the indices of refraction that are used.
+      rule: interface rule that is used.
+      space: geometry of the background that is used, if it may differ.
+      radius: size of the background that is used, if it is given.
+    """
+    background = properties.background
+    lines: list[tuple[str, str, str]] = []
+    if properties.rule is not None and properties.rule != rule:
+        lines.append(("rule", f"rule={rule}", properties.rule))
+    if background.kind is not None and space not in (None, properties.space):
+        lines.append(("background", f"background={space}", background.kind))
+    elif background.extent is not None and radius not in (None, background.extent):
+        lines.append(("background", f"radius={radius:g}", f"{background.extent:g}"))
+    for part in parts:
+        for name, described in properties.parts.items():
+            index = described.index
+            if Path(name).stem == part.name and index not in (None, part.index):
+                lines.append((name, f"index={part.index:g} of {part.name}", f"{index:g}"))
+    return tuple(
+        f"note: {used} overrides {properties.origins[key].name}: {x}." for key, used, x in lines
     )
 
 

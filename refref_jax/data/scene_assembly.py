@@ -1,32 +1,54 @@
-"""Assembles meshes into the scene through which light paths are traced (NumPy only).
+"""Assembles what light paths meet: the meshes of a scene, and its background (NumPy only).
 
 Parts are read from a scene folder (`meshes`), or made from mesh files, trimeshes or arrays by
 `make_part`.
+
+`read_background` reads the images of the background that `scene_properties` describes. An image is
+a PNG of 8-bit sRGB, or an EXR of linear RGB; `render.backgrounds` defines how it is mapped onto the
+background.
 """
 
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import trimesh
+from jaxtyping import Float
 
 from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour, RuleName
-from refref_jax.data import SceneError, mesh_checks, meshes
+from refref_jax.data import SceneError, image_files, mesh_checks, meshes, scene_properties
 from refref_jax.data.mesh_checks import refuse_errors
 from refref_jax.data.mesh_queries import find_containment
-from refref_jax.data.meshes import MeshPart, Shading
+from refref_jax.data.meshes import MeshPart
+from refref_jax.data.scene_properties import Face, SceneProperties, Shading
 from refref_jax.geometry.surfaces import pack_meshes
 from refref_jax.geometry.triangle_meshes import CREASE_ANGLE, Mesh, make_mesh
+from refref_jax.numerics import host_array
 from refref_jax.optics.interface_rules import RULES
+from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.optics.scene import Scene
+from refref_jax.render.backgrounds import (
+    Background,
+    CubeBackground,
+    Environment,
+    LinearTexture,
+    SphereBackground,
+    SrgbTexture,
+    Texture,
+)
 
 Arrays = tuple[np.ndarray, np.ndarray]
 """Vertices `[vertices, 3]` in world units; faces `[faces, 3]`, counter-clockwise from outside."""
 
 MeshSource = str | os.PathLike[str] | trimesh.Trimesh | Arrays
 """Mesh of a part: a path, a trimesh, or arrays."""
+
+_WALLS = 6
+
+# Axes are stored with at least six digits.
+_AXES_TOLERANCE = 1e-3
 
 _CREASE_ANGLES: dict[Shading, float] = {"auto": CREASE_ANGLE, "smooth": np.pi, "flat": 0.0}
 
@@ -124,14 +146,17 @@ def single_object(
     return assemble([part])
 
 
-def assemble(parts: Sequence[MeshPart], *, rule: RuleName = "nested") -> Scene:
+def assemble(
+    parts: Sequence[MeshPart], *, rule: RuleName = "nested", ambient: float = INDEX_OF_AIR
+) -> Scene:
     """Checks parts and builds a scene from them; without parts it is empty.
 
     Args:
       parts: parts from `make_part` or `meshes.read_meshes`.
-      rule: medium outside a part: that of the part around it (`nested`), always air (`facing`), or
-        that of the overlapping part with the highest priority (`priority`); see
+      rule: medium outside a part: that of the part around it (`nested`), always the ambient medium
+        (`facing`), or that of the overlapping part with the highest priority (`priority`); see
         `optics.interface_rules`.
+      ambient: index of refraction of the ambient medium, outside all parts.
 
     Returns:
       The scene, as NumPy arrays. Parts are numbered by their indices in `parts`.
@@ -159,7 +184,8 @@ def assemble(parts: Sequence[MeshPart], *, rule: RuleName = "nested") -> Scene:
     for finding in findings:
         if finding.severity == "warning":
             warnings.warn(f"{finding.part} {finding.message}", stacklevel=2)
-    return assemble_scene(parts, tree.parents, rule=rule, overlaps=tree.overlaps)
+    meshes.check_index("ambient", ambient)
+    return assemble_scene(parts, tree.parents, rule=rule, overlaps=tree.overlaps, ambient=ambient)
 
 
 def assemble_scene(
@@ -168,6 +194,7 @@ def assemble_scene(
     *,
     rule: RuleName,
     overlaps: Sequence[tuple[int, int]] = (),
+    ambient: float = INDEX_OF_AIR,
 ) -> Scene:
     """Builds surfaces and interfaces of all parts.
 
@@ -176,6 +203,7 @@ def assemble_scene(
       parents: innermost part around each part, from `mesh_queries.find_containment`.
       rule: interface rule, see `optics.interface_rules`.
       overlaps: pairs of parts that overlap, from `mesh_queries.find_containment`.
+      ambient: index of refraction of the ambient medium.
     """
     surfaces = pack_meshes([shaded_mesh(part) for part in parts])
     interfaces = RULES[rule](
@@ -185,6 +213,7 @@ def assemble_scene(
         absorptions=[part.absorption for part in parts],
         priorities=[part.priority for part in parts],
         overlaps=overlaps,
+        ambient=ambient,
     )
     return Scene(surfaces, interfaces)
 
@@ -194,3 +223,105 @@ def shaded_mesh(part: MeshPart) -> Mesh:
     if part.normals is not None:
         return Mesh(part.vertices, part.faces, part.normals)
     return make_mesh(part.vertices, part.faces, crease_angle=_CREASE_ANGLES[part.shading])
+
+
+def read_background(scene: Path, *, properties: SceneProperties | None = None) -> Background:
+    """Reads the background that the properties of a scene describe, with its images.
+
+    Args:
+      scene: folder of the scene.
+      properties: properties of the scene; by default those of its `scene.json`.
+
+    Returns:
+      The background, as NumPy arrays.
+
+    Raises:
+      SceneError: if they do not describe the background, or an image is missing or broken.
+    """
+    found = scene_properties.read(scene) if properties is None else properties
+    path = found.origins.get("background", scene / scene_properties.FILE)
+    if found.background.kind is None:
+        raise SceneError(
+            f"The background is unknown: {path} does not describe it with one of the types "
+            f"{', '.join(_READERS)}. Describe it there, or use a scene with a background."
+        )
+    return _READERS[found.background.kind](found, path)
+
+
+def _read_cube(found: SceneProperties, path: Path) -> CubeBackground:
+    half, faces = np.float32(_extent(found, "half_extent", path)), found.background.faces
+    if len(faces) != _WALLS:
+        raise SceneError(f"The background in {path} does not have six faces. Describe all six.")
+    axes = np.stack([_axes(face, path) for face in faces])
+    towards = axes[:, 0] @ axes[:, 0].T
+    if np.max(np.abs(np.sort(towards, axis=1) - [-1.0, 0.0, 0.0, 0.0, 0.0, 1.0])) > _AXES_TOLERANCE:
+        raise SceneError(
+            f"The normals of the faces in {path} do not form a cube. Give six, two along each of "
+            "three perpendicular axes."
+        )
+    axes = axes.astype(np.float32)
+    texture = _stack([_read_texture(face.image, path) for face in faces], path)
+    normals, across, along = (host_array(axes[:, i]) for i in range(3))
+    return CubeBackground(texture, normals, across, along, host_array(half))
+
+
+def _read_sphere(found: SceneProperties, path: Path) -> SphereBackground:
+    radius = np.float32(_extent(found, "radius", path))
+    return SphereBackground(_read_texture(found.background.image, path), host_array(radius))
+
+
+def _read_environment(found: SceneProperties, path: Path) -> Environment:
+    return Environment(_read_texture(found.background.image, path))
+
+
+_READERS: dict[str, Callable[[SceneProperties, Path], Background]] = {
+    "cube": _read_cube,
+    "sphere": _read_sphere,
+    "env": _read_environment,
+}
+
+
+def _extent(found: SceneProperties, key: str, path: Path) -> float:
+    if found.background.extent is None:
+        raise SceneError(f"The background in {path} lacks the key {key!r}. Add it.")
+    return found.background.extent
+
+
+def _read_texture(image: str | None, described: Path) -> Texture:
+    """Reads an image: EXR as linear RGB, other formats as 8-bit sRGB."""
+    if image is None:
+        raise SceneError(f"The background in {described} lacks the key 'image'. Add it.")
+    path = Path(image)
+    if path.suffix.lower() != ".exr":
+        texels = (image_files.read_rgb(path) / 255.0).astype(np.float32)
+        return SrgbTexture(host_array(texels))
+    texels = image_files.read_exr(path)
+    if texels.ndim != 3:
+        raise SceneError(f"{path} has one channel, but a background has three. Export R, G and B.")
+    if not np.all(np.isfinite(texels)):
+        raise SceneError(f"{path} has a colour that is not finite. Export it again.")
+    return LinearTexture(host_array(texels))
+
+
+def _stack(textures: list[Texture], path: Path) -> Texture:
+    kinds = {type(texture) for texture in textures}
+    if len(kinds) > 1 or len({texture.texels.shape for texture in textures}) > 1:
+        raise SceneError(
+            f"The images of the faces in {path} differ in size or format. Use images "
+            "of one size, all PNG or all EXR."
+        )
+    return kinds.pop()(host_array(np.stack([texture.texels for texture in textures])))
+
+
+def _axes(face: Face, path: Path) -> Float[np.ndarray, "3 3"]:
+    """Returns the normal, u axis and v axis of a face as rows: unit vectors, perpendicular."""
+    missing = [key for key in ("normal", "u_axis", "v_axis") if getattr(face, key) is None]
+    if missing:
+        raise SceneError(f"The face {face.name!r} in {path} lacks the key {missing[0]!r}. Add it.")
+    axes = np.asarray([face.normal, face.u_axis, face.v_axis], np.float64)
+    if not np.max(np.abs(axes @ axes.T - np.eye(3))) < _AXES_TOLERANCE:
+        raise SceneError(
+            f"The normal, u_axis and v_axis of face {face.name!r} are not perpendicular unit "
+            f"vectors in {path}. Correct them."
+        )
+    return axes

@@ -3,7 +3,7 @@
     {scene}/transforms_{train,val,test}.json    poses and file names
     {scene}/{split}/*.png  mask/  depth/        named in the JSON
     {scene}/meshes/*.ply                        see `meshes`
-    {scene}/scene.json                          optional, see `meshes` and `background`
+    {scene}/scene.json                          optional, see `scene_properties`
 
 Files are named in one of two ways; `raw` is that of the data set's raw release:
 

@@ -4,15 +4,17 @@ A part defines the medium inside it. The medium on the other side of its surface
 rule:
 
 - `nested`: objects lie strictly inside one another, so it is the medium of the innermost part that
-  contains this one, or air. Physical.
-- `facing`: always air. This is the behaviour of Blender Cycles with indices relative to air: it
-  uses the index on a front face and its inverse on a back face, and does not track the media that
-  a ray is in.
+  contains this one, or the ambient medium. Physical.
+- `facing`: always the ambient medium. This is the behaviour of Blender Cycles with indices relative
+  to air: it uses the index on a front face and its inverse on a back face, and does not track the
+  media that a ray is in.
 - `priority`: objects may overlap, and THE HIGHEST PRIORITY WINS in the overlap. Physical. It models
   a liquid that fills a glass without a gap: the liquid overlaps the wall a little, and the glass
   has the higher priority (glass 3, ice 2, liquid 1). Of two objects *inside* each other, the inner
   one needs the higher priority (bubble 2, glass 1), so priorities cannot be derived from materials.
   Among equal priorities the part listed first wins: the media are defined, but arbitrary.
+
+The ambient medium, outside all parts, is air unless another index is given (`ambient`).
 """
 
 from collections.abc import Sequence
@@ -44,16 +46,18 @@ class Rule(Protocol):
         absorptions: Colours | None = None,
         priorities: Sequence[int] | None = None,
         overlaps: Sequence[tuple[int, int]] = (),
+        ambient: float = INDEX_OF_AIR,
     ) -> Interfaces:
         """Builds the interfaces of a scene.
 
         Args:
-          indices: index of refraction of each part's material, relative to air.
+          indices: index of refraction of each part's material, relative to vacuum.
           parents: innermost part that contains each part, or `NO_PARENT`.
           tints: factor on light at each part's surface, `CLEAR` by default.
           absorptions: absorption of each part's medium, per world unit, `NO_ABSORPTION` by default.
           priorities: priority of each part, 0 by default; the highest wins.
           overlaps: pairs of parts that overlap; only `facing` needs them.
+          ambient: index of refraction of the ambient medium.
         """
 
 
@@ -65,10 +69,11 @@ def nested(
     absorptions: Colours | None = None,
     priorities: Sequence[int] | None = None,
     overlaps: Sequence[tuple[int, int]] = (),
+    ambient: float = INDEX_OF_AIR,
 ) -> Interfaces:
     """Applies the `nested` rule; arguments as in `Rule`. Priorities and overlaps are ignored."""
     del priorities, overlaps
-    outside = [INDEX_OF_AIR if parent == NO_PARENT else indices[parent] for parent in parents]
+    outside = [ambient if parent == NO_PARENT else indices[parent] for parent in parents]
     return _interfaces(indices, outside, parents, tints, absorptions)
 
 
@@ -80,6 +85,7 @@ def facing(
     absorptions: Colours | None = None,
     priorities: Sequence[int] | None = None,
     overlaps: Sequence[tuple[int, int]] = (),
+    ambient: float = INDEX_OF_AIR,
 ) -> Interfaces:
     """Applies the `facing` rule; arguments as in `Rule`.
 
@@ -87,7 +93,7 @@ def facing(
     rays carry an interior list for the media. The medium of an overlap is that of the part with
     more parts around it, then that of the higher priority.
     """
-    made = _interfaces(indices, [INDEX_OF_AIR] * len(indices), parents, tints, absorptions)
+    made = _interfaces(indices, [ambient] * len(indices), parents, tints, absorptions)
     if not overlaps:
         return made
     given = priorities or [0] * len(indices)
@@ -103,6 +109,7 @@ def priority(
     absorptions: Colours | None = None,
     priorities: Sequence[int] | None = None,
     overlaps: Sequence[tuple[int, int]] = (),
+    ambient: float = INDEX_OF_AIR,
 ) -> Interfaces:
     """Applies the `priority` rule; arguments as in `Rule`. Parents and overlaps are ignored.
 
@@ -110,12 +117,17 @@ def priority(
     """
     del overlaps
     alone = [NO_PARENT] * len(parents)
-    made = _interfaces(indices, [INDEX_OF_AIR] * len(indices), alone, tints, absorptions)
+    made = _interfaces(indices, [ambient] * len(indices), alone, tints, absorptions)
     order = _order(priorities or [0] * len(made.index_inside))
     return made._replace(priority=host_array(order))
 
 
 RULES: dict[RuleName, Rule] = {"nested": nested, "facing": facing, "priority": priority}
+
+
+def ambient_of(interfaces: Interfaces) -> float:
+    """Returns the index of refraction of the ambient medium, which one part at least is in."""
+    return float(interfaces.index_outside[np.argmin(interfaces.medium_outside)])
 
 
 def _depth(parents: Sequence[int], part: int) -> int:

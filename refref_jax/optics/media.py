@@ -1,7 +1,7 @@
 """Media on both sides of the interfaces that a ray crosses.
 
-Every part is the boundary of an object. A *medium* is identified by an integer: 0 is the
-surrounding air (`AMBIENT`), `1 + k` is the inside of part `k`.
+Every part is the boundary of an object. A *medium* is identified by an integer: 0 is the ambient
+medium, usually air (`AMBIENT`), `1 + k` is the inside of part `k`.
 
 Under the rule `nested`, and under `facing` without overlaps, both sides of a part are known in
 advance. Under `priority`, objects may overlap, and THE HIGHEST PRIORITY WINS (as in Arnold and in
@@ -36,7 +36,7 @@ AMBIENT = 0
 """Medium outside all objects."""
 
 INDEX_OF_AIR = 1.0
-"""Index of refraction of the ambient medium."""
+"""Index of refraction of the usual ambient medium."""
 
 SLOTS = 4
 """Length of the interior list, where rays carry one."""
@@ -50,7 +50,8 @@ class Interfaces(NamedTuple):
 
     Attributes:
       index_inside: index of refraction inside the part.
-      index_outside: index of refraction outside the part, meaningless under `priority`.
+      index_outside: index of refraction outside the part; that of the ambient medium under
+        `facing` and `priority`.
       medium_outside: medium outside the part, meaningless where rays carry an interior list.
       tint: factor on linear RGB at every reflection and refraction (the colour of the glass BSDF
         in Cycles).
@@ -207,4 +208,4 @@ def _medium(interfaces: Interfaces, interior_list: Int[Array, " slots"]) -> Int[
 
 def _index(interfaces: Interfaces, medium: Int[Array, ""]) -> Float[Array, ""]:
     index = interfaces.index_inside[jnp.maximum(medium - 1, 0)]
-    return jnp.where(medium == AMBIENT, INDEX_OF_AIR, index)
+    return jnp.where(medium == AMBIENT, interfaces.index_outside[0], index)

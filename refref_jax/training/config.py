@@ -36,7 +36,7 @@ from refref_jax.optics.path_settings import Reentry, check_max_bends, check_min_
 _Value = TypeVar("_Value")
 
 # Options that determine the objects.
-_OBJECTS = ("scene", "reconstruction")
+_OBJECTS = ("scene", "properties", "reconstruction")
 
 # Maximum number of steps, rays and batches, which are 32-bit integers.
 _MOST = 2**31 - 1
@@ -75,7 +75,7 @@ class SceneConfig:
       path: Scene to train on: a folder, or hf:CONFIG/SCENE of the published data set.
       rule: Medium outside each mesh: that of the part around it (nested), always air as in Cycles
         (facing), or that of the overlapping mesh with the highest priority in scene.json
-        (priority).
+        (priority). By default that of scene.json, else nested.
       indices: Index of refraction of a material or a mesh, instead of that in scene.json or in the
         table of materials.
       space: Geometry of the background: a cube (bounded), a sphere (spherical), or infinitely far
@@ -86,15 +86,17 @@ class SceneConfig:
       reconstruction: Output folder of experiments.reconstruct, whose object replaces the scene's
         meshes.
       pixels: Training pixels: all, or only those of the background, at a margin from the masks.
+      properties: JSON file of properties of the scene, like scene.json, whose values override it.
     """
 
     path: str = _option("", name="scene")
-    rule: RuleName = _option("nested")
+    rule: RuleName | None = _option(after=_OBJECTS)
     indices: tuple[tuple[str, float], ...] = _option((), name="ior", after=("reconstruction",))
-    space: Space | None = _option(name="background", after=("scene",))
-    radius: float | None = _option(after=("scene", "background"))
+    space: Space | None = _option(name="background", after=("scene", "properties"))
+    radius: float | None = _option(after=("scene", "properties", "background"))
     reconstruction: str = _option("")
     pixels: Pixels = _option("all")
+    properties: str = _option("")
 
     def __post_init__(self) -> None:
         """Checks the numbers."""

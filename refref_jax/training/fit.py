@@ -191,6 +191,8 @@ def prepare(
             "which fit does not read. Give its mesh as parts."
         )
     config = config.at(str(scene_source.open_scene(config.scene.path).resolve()))
+    if config.scene.properties:
+        config = config.decided(properties=str(Path(config.scene.properties).resolve()))
     facts = read_facts(config.scene, parts=parts)
     for note in facts.notes:
         report(note)

@@ -15,13 +15,14 @@ again changes nothing.
 import dataclasses
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from refref_jax.choices import Interior
+from refref_jax.choices import Interior, RuleName
 from refref_jax.data import (
     background_fit,
     mesh_checks,
@@ -29,6 +30,8 @@ from refref_jax.data import (
     meshes,
     scene_analysis,
     scene_folder,
+    scene_names,
+    scene_properties,
 )
 from refref_jax.data.batches import check_batch
 from refref_jax.data.mesh_queries import Containment
@@ -39,7 +42,7 @@ from refref_jax.fields import mlps
 from refref_jax.fields.base import RadianceConfig
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.optics.media import EMPTY_SLOT
+from refref_jax.optics.media import EMPTY_SLOT, INDEX_OF_AIR
 from refref_jax.optics.path_settings import PathSettings, make_path_settings
 from refref_jax.optics.scene import Scene
 from refref_jax.render.checkpoint_io import SavedModel
@@ -66,7 +69,12 @@ class SceneFacts(NamedTuple):
       tree: containment of the meshes.
       half_extent: half edge of the background cube, or radius of the background sphere, if it is in
         scene.json or measured.
-      notes: results of the checks of the meshes and of the background.
+      notes: results of the checks of the meshes and of the background, and overridden properties of
+        scene.json.
+      rule: interface rule: that of `SceneConfig`, that of scene.json, that of the published layout,
+        or `nested`.
+      ambient: index of refraction of the medium outside all parts.
+      origins: names of the files that define properties, by their keys in scene.json.
       source: reason for `half_extent`.
     """
 
@@ -76,6 +84,9 @@ class SceneFacts(NamedTuple):
     tree: Containment
     half_extent: float | None
     notes: tuple[str, ...]
+    rule: RuleName = "nested"
+    ambient: float = INDEX_OF_AIR
+    origins: Mapping[str, str] = MappingProxyType({})
     source: str = "scene.json"
 
     def describe(self) -> str:
@@ -125,16 +136,34 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
     folder = Path(scene.path)
     scene_folder.check_scene(folder)
     cameras = scene_folder.read_frames(folder, "train").cameras
-    if parts is None:
-        parts = meshes.read_meshes(folder, indices=dict(scene.indices))
+    told = scene_properties.read(folder, overlay=scene.properties)
+    if parts is not None:  # they are not those that scene.json describes
+        known = {key: path for key, path in told.origins.items() if key != "rule"}
+        told = dataclasses.replace(told, rule=None, parts={}, origins=known)
+        own_rule = None
+    else:
+        parts = meshes.read_meshes(folder, indices=dict(scene.indices), properties=told)
+        own_rule = told.rule or scene_names.published_rule(folder)
+    rule, space = scene.rule or own_rule or "nested", scene.space or told.space
     tree = mesh_queries.find_containment(parts)
-    notes = mesh_checks.check_meshes(parts, tree, rule=scene.rule)
-    if scene.rule == "priority" or (scene.rule == "facing" and tree.overlaps):
+    notes = mesh_checks.check_meshes(parts, tree, rule=rule)
+    notes += scene_analysis.overridden(told, parts, rule=rule, space=space, radius=scene.radius)
+    if rule == "priority" or (rule == "facing" and tree.overlaps):
         _refuse_cameras_inside(parts, cameras)
-    bounds = background_fit.find_bounds(folder, space=scene.space, radius=scene.radius)
-    found = scene_analysis.analyse(parts, tree, cameras, rule=scene.rule, space=bounds.space)
-    notes = (*notes, *bounds.notes)
-    return SceneFacts(found, cameras, parts, tree, bounds.size, notes, bounds.source)
+    bounds = background_fit.find_bounds(folder, told, space=scene.space, radius=scene.radius)
+    origins = {key: path.name for key, path in told.origins.items()}
+    return SceneFacts(
+        scene_analysis.analyse(parts, tree, cameras, rule=rule, space=bounds.space),
+        cameras,
+        parts,
+        tree,
+        bounds.size,
+        (*notes, *bounds.notes),
+        rule,
+        told.ambient_index,
+        origins,
+        origins.get("background", "scene.json") if told.background.extent else bounds.source,
+    )
 
 
 def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
@@ -145,6 +174,7 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
     """
     asked, found = config, facts.analysis
     reasons = _first_reasons(config)
+    config = _decide(config, reasons, facts.origins.get("rule", _USUAL), rule=facts.rule)
     settings, config = _resolve_paths(config, found, reasons)
     config = _resolve_inside(config, found, settings, reasons)
     model, config = _resolve_model(config, facts, reasons)
@@ -169,6 +199,7 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
         config,
         reasons,
         "the model",
+        rule="nested",
         background=model.space,
         radius=model.radius,
         min_throughput=settings.min_throughput,
@@ -184,8 +215,10 @@ def build_scene(resolved: Resolved, facts: SceneFacts) -> Scene:
     """Builds the scene for tracing; its parts only have colours if `tints` is `given`."""
     given = resolved.config.model.tints == "given"
     parts = facts.parts if given else meshes.without_colour(facts.parts)
-    rule, tree = resolved.config.scene.rule, facts.tree
-    return assemble_scene(parts, tree.parents, rule=rule, overlaps=tree.overlaps)
+    rule, tree = resolved.config.scene.rule or facts.rule, facts.tree
+    return assemble_scene(
+        parts, tree.parents, rule=rule, overlaps=tree.overlaps, ambient=facts.ambient
+    )
 
 
 def samples_of(model: ModelConfig) -> tuple[int, ...]:

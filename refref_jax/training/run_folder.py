@@ -174,7 +174,7 @@ def _with_todays_keys(content: dict[str, Any]) -> dict[str, Any]:
 def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, scene: Scene) -> None:
     """Checks that a run has exactly this configuration and these meshes.
 
-    Its scene and its reconstruction may have moved to other folders.
+    Its scene, its properties and its reconstruction may have moved to other folders.
 
     Raises:
       ValueError: if it differs.
@@ -182,6 +182,8 @@ def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, scene: Sc
     moved = read_config(run).at(config.scene.path)
     if moved.scene.reconstruction and config.scene.reconstruction:
         moved = moved.decided(reconstruction=config.scene.reconstruction)
+    if moved.scene.properties and config.scene.properties:
+        moved = moved.decided(properties=config.scene.properties)
     if moved != config or checkpoint_io.read_static(run) != model:
         differing = [
             option.name

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from refref_jax.data import image_files
-from refref_jax.data.background import half_extent, read_background, space
+from refref_jax.data.scene_assembly import read_background
+from refref_jax.data.scene_properties import read
 from refref_jax.render.backgrounds import (
     CubeBackground,
     Environment,
@@ -34,18 +35,18 @@ def _scene(folder, content=None):
     ],
 )
 def test_the_folder_s_name_tells_the_background(tmp_path, name, expected):
-    assert space(_scene(tmp_path / name)) == expected
+    assert read(_scene(tmp_path / name)).space == expected
 
 
 def test_only_the_folder_s_own_name_counts(tmp_path):
     parent = _scene(tmp_path / "env_data")
-    assert space(_scene(parent / "cube_smcvx_ball")) == "bounded"
+    assert read(_scene(parent / "cube_smcvx_ball")).space == "bounded"
 
 
 def test_a_relative_path_is_resolved(tmp_path, monkeypatch):
     scene = _scene(tmp_path / "env_smcvx_ball")
     monkeypatch.chdir(scene)
-    assert space(type(scene)(".")) == "unbounded"
+    assert read(type(scene)(".")).space == "unbounded"
 
 
 @pytest.mark.parametrize(
@@ -54,44 +55,47 @@ def test_a_relative_path_is_resolved(tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", ["env_ball", "cube_ball"])
 def test_scene_json_decides_before_the_name(tmp_path, name, kind, expected):
     scene = _scene(tmp_path / name, {"background": {"type": kind}})
-    assert space(scene) == expected
+    assert read(scene).space == expected
 
 
 @pytest.mark.parametrize("content", [{}, {"parts": []}, {"background": {}}])
 def test_scene_json_may_be_silent(tmp_path, content):
-    assert space(_scene(tmp_path / "env_ball", content)) == "unbounded"
-    assert space(_scene(tmp_path / "cube_ball", content)) == "bounded"
+    assert read(_scene(tmp_path / "env_ball", content)).space == "unbounded"
+    assert read(_scene(tmp_path / "cube_ball", content)).space == "bounded"
 
 
 @pytest.mark.parametrize(
     "content", [{"background": None}, {"background": 7}, {"background": {"type": ["env"]}}]
 )
 def test_scene_json_of_another_shape(tmp_path, content):
-    with scene_error("scene.json", "or remove the file"):
-        space(_scene(tmp_path / "env_ball", content))
+    with scene_error("scene.json", "background", "Give "):
+        read(_scene(tmp_path / "env_ball", content))
 
 
 @pytest.mark.parametrize("content", [[], 7])
 def test_scene_json_that_is_no_object(tmp_path, content):
     with scene_error("scene.json", "not a JSON object"):
-        space(_scene(tmp_path / "env_ball", content))
+        read(_scene(tmp_path / "env_ball", content))
 
 
 def test_scene_json_tells_where_the_walls_stand(tmp_path, ball_scene):
-    assert half_extent(ball_scene) == 7.3
-    assert half_extent(_scene(tmp_path / "a", {"background": {"half_extent": 3}})) == 3.0
-    assert half_extent(_scene(tmp_path / "b", {"background": {"type": "cube"}})) is None
-    assert half_extent(_scene(tmp_path / "c")) is None
+    assert read(ball_scene).background.extent == 7.3
+    assert read(_scene(tmp_path / "a", {"background": {"half_extent": 3}})).background.extent == 3.0
+    assert read(_scene(tmp_path / "b", {"background": {"type": "cube"}})).background.extent is None
+    assert read(_scene(tmp_path / "c")).background.extent is None
     # The radius of a sphere.
     assert (
-        half_extent(_scene(tmp_path / "d", {"background": {"type": "sphere", "radius": 5}})) == 5.0
+        read(
+            _scene(tmp_path / "d", {"background": {"type": "sphere", "radius": 5}})
+        ).background.extent
+        == 5.0
     )
 
 
 @pytest.mark.parametrize("wrong", ["7", 0, -1.0, [7.3]])
 def test_walls_stand_at_a_positive_distance(tmp_path, wrong):
     with scene_error("scene.json", "half_extent", "positive number"):
-        half_extent(_scene(tmp_path / "a", {"background": {"half_extent": wrong}}))
+        read(_scene(tmp_path / "a", {"background": {"half_extent": wrong}}))
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00"])
@@ -99,11 +103,11 @@ def test_scene_json_that_is_no_json(tmp_path, content):
     scene = _scene(tmp_path / "env_ball")
     (scene / "scene.json").write_bytes(content)
     with scene_error("scene.json", "not valid JSON"):
-        space(scene)
+        read(scene)
 
 
 def test_bundled_scene_has_walls(ball_scene):
-    assert space(ball_scene) == "bounded"
+    assert read(ball_scene).space == "bounded"
 
 
 def _ball_with(tmp_path, ball_scene, change):
@@ -148,7 +152,7 @@ def test_spheres_and_environments(tmp_path, image, kind):
         assert record is not sphere or read.radius == 5.0
 
 
-@pytest.mark.parametrize("content", [None, {}, {"background": {"type": "fog"}}])
+@pytest.mark.parametrize("content", [None, {}, {"background": {}}])
 def test_a_background_that_is_not_told(tmp_path, content):
     with scene_error("scene.json", "unknown", "cube, sphere, env"):
         read_background(_scene(tmp_path / "a", content))
@@ -165,7 +169,7 @@ def test_a_background_that_is_not_told(tmp_path, content):
         (lambda r: r["faces"]["+x"].update(image=7), ("image is 7",)),
         (lambda r: r["faces"]["+x"].pop("u_axis"), ("u_axis",)),
         (lambda r: r["faces"]["+x"].update(u_axis=[0, 2, 0]), ("'+x'", "perpendicular unit")),
-        (lambda r: r["faces"]["+x"].update(u_axis="y"), ("'+x'", "perpendicular unit")),
+        (lambda r: r["faces"]["+x"].update(u_axis="y"), ("'+x'", "three numbers")),
         (lambda r: r["faces"].update({"+x": r["faces"]["-x"]}), ("do not form a cube",)),
     ],
 )

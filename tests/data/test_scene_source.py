@@ -9,7 +9,7 @@ import warnings
 import pytest
 import trimesh
 
-from refref_jax.data import background, meshes, parquet_scenes, scene_folder
+from refref_jax.data import meshes, parquet_scenes, scene_folder, scene_properties
 from refref_jax.data.scene_source import SceneWarning, expand, open_scene
 from tests.factories.small_parquet import CONFIG, NAME, write_copy
 from tests.factories.small_scenes import truncate, write_scene
@@ -57,7 +57,7 @@ def test_a_scene_is_unpacked_with_its_meshes(copy, tmp_path):
     assert (scene / "meshes/ball_glass.ply").read_bytes() == (
         copy / _MESHES / "ball_glass.ply"
     ).read_bytes()
-    assert background.space(scene) == "bounded"
+    assert scene_properties.read(scene).space == "bounded"
 
 
 def test_a_scene_is_unpacked_once(copy, monkeypatch):
@@ -101,7 +101,7 @@ def test_own_files_of_a_scene_go_before_the_published_meshes(copy):
     scene = open_scene(_SOURCE)
     assert [part.name for part in meshes.read_meshes(scene)] == ["ball_body_water"]
     assert (scene / "sky" / "a.exr").read_bytes() == b"sky"
-    assert background.space(scene) == "unbounded"
+    assert scene_properties.read(scene).space == "unbounded"
 
 
 def test_without_meshes_a_scene_is_read_with_a_warning(copy):
@@ -333,7 +333,7 @@ def test_a_folder_of_the_raw_release_finds_the_published_meshes(tmp_path):
     for name in ("ball_glass", "ball_coloured_glass", "ball_glass_est", "cube_glass"):
         _write_mesh(tmp_path / _MESHES / f"{name}.ply")
     assert [part.name for part in meshes.read_meshes(open_scene(scene))] == ["ball_glass"]
-    assert background.space(scene) == "unbounded"
+    assert scene_properties.read(scene).space == "unbounded"
     _write_mesh(scene / "meshes" / "ball_body_water.ply")
     assert [part.name for part in meshes.read_meshes(scene)] == ["ball_body_water"]
 

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from refref_jax.data import meshes
-from refref_jax.data.meshes import PartDescription
 from refref_jax.data.scene_assembly import assemble_scene, shaded_mesh
+from refref_jax.data.scene_properties import PartDescription
 from refref_jax.geometry.triangle_meshes import corner_normals
 
 

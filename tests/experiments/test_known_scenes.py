@@ -8,7 +8,8 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from experiments.runs import view_numbers
+from experiments.dataset import checks
+from experiments.runs import known_scene, view_numbers
 from refref_jax.data import image_files
 from tests.processes.command import ROOT, run_command
 
@@ -172,3 +173,51 @@ def test_a_scene_without_a_known_background_is_named(tmp_path):
     out = tmp_path / "out"
     refused = run_command("render_known", f"--scene={scene}", f"--out={out}", fails=True)
     assert "The background is unknown" in refused.stderr and not out.exists()
+
+
+@pytest.fixture
+def described(tmp_path):
+    """Makes the bundled scene with other properties, and an overlay of it."""
+    folder = tmp_path / "cube_smcvx_ball"
+    folder.mkdir()
+    for path in _SCENE.iterdir():
+        if path.name != "scene.json":
+            (folder / path.name).symlink_to(path)
+    content = json.loads((_SCENE / "scene.json").read_text())
+    changed = content | {"rule": "priority", "ambient_index": 1.2}
+    (folder / "scene.json").write_text(json.dumps(changed))
+    (tmp_path / "mine.json").write_text('{"rule": "facing", "ambient_index": 1.25}')
+    return folder, str(tmp_path / "mine.json")
+
+
+@pytest.mark.parametrize(
+    ("rule", "overlaid", "ambient", "note"),
+    [
+        (None, False, 1.2, "note: rule=priority, from scene.json."),
+        ("nested", False, 1.2, "note: rule=nested overrides scene.json: priority."),
+        (None, True, 1.25, "note: rule=facing, from mine.json."),
+    ],
+)
+def test_the_rule_and_the_ambient_medium_are_those_of_the_scene(
+    described, capsys, rule, overlaid, ambient, note
+):
+    scene, overlay = described
+    read = known_scene.read_scene(
+        scene,
+        split="test",
+        views="0",
+        rule=rule,
+        indices={},
+        overlay=overlay if overlaid else None,
+    )
+    assert (read.interior_list is not None) == (rule is None and not overlaid)
+    assert read.objects.interfaces.index_outside.tolist() == [np.float32(ambient)]
+    assert note in capsys.readouterr().out.splitlines()
+
+
+def test_dataset_check_uses_the_properties_of_the_scene(described):
+    scene, _ = described
+    made_of, _ = checks.check_meshes(scene)
+    read = checks.read_views(scene, made_of, count=1)
+    assert read.interior_list is not None
+    assert read.objects.interfaces.index_outside.tolist() == [np.float32(1.2)]

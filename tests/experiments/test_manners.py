@@ -62,6 +62,9 @@ _OF_THE_SCENE = {
     "--steps=many": "flag --steps=many",
     "--cut=auto --paths=straight --bends=3": "use paths=tree",
     "--devices=two": "Give a number, or all.",
+    "--properties=nowhere.json": "nowhere.json does not exist. Give a JSON file of properties",
+    "--properties=OVERLAY": "overlay.json: rul is not a known key. Write 'rule', or remove it.",
+    "--rule=nestd": "flag --rule=nestd",
 }
 
 # On top of a file that names a reconstruction, and asks for cut=0.01.
@@ -103,16 +106,19 @@ _MISTAKES = {
         "--out=OUT --scene=SCENE --ior=glass": "Write as in --ior=glass=1.52.",
         "--out=OUT --scene=SCENE --paths=straight --unfinished=dark": "no path is truncated",
         "--out=OUT --scene=SCENE --views=1,1": "names a view twice",
+        "--out=OUT --scene=SCENE --properties=OVERLAY": "overlay.json: rul is not a known key.",
     },
     "path_trade_off": {
         "--out=OUT --scenes=SCENE,nowhere": "nowhere/transforms_train.json does not exist",
         "--out=OUT --scenes=SCENE --cuts=2": "Give 0.02 for 2 %",
         "--out=OUT --scenes=SCENE --ior=glass=x": "Write as in --ior=glass=1.52.",
         "--out=OUT --scenes=SCENE --views=a": "as in --views=0,10,20",
+        "--out=OUT --scenes=SCENE --properties=OVERLAY": "overlay.json: rul is not a known key.",
     },
     "glass_figures": {
         "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
         "--out=OUT --scene=SCENE --ior==1.5": "Write as in --ior=glass=1.52.",
+        "--out=OUT --scene=SCENE --properties=OVERLAY": "overlay.json: rul is not a known key.",
     },
     "view": {
         "--run=x --heights=2,1": "increasing integers",
@@ -127,6 +133,7 @@ _MISTAKES = {
         "--out=/dev/null/x --scene=SCENE": "--out=/dev/null/x cannot be written to (Not a dir",
         "--out=OUT --scene=x --ior=0.5": "--ior=0.5 is not an index",
         "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
+        "--out=OUT --scene=SCENE --properties=OVERLAY": "overlay.json: rul is not a known key.",
     },
     "trade_off": {
         "--out=OUT --scene=x --steps=0,1": "Give 1 or more.",
@@ -139,6 +146,8 @@ _MISTAKES = {
     "benchmark": {
         "--out=OUT --methods=tree,strait": "Did you mean straight?",
         "--out=OUT --scenes=SCENE,nowhere": "nowhere/transforms_train.json does not exist",
+        "--out=OUT --scenes=nowhere.csv": "nowhere.csv does not exist. Give scenes, or a JSON",
+        "--out=OUT --scenes=LIST": "list.json: scene 1: 'rul' is not a known key. Write 'rule'",
     },
     "dataset.convert": {"--scene=nowhere --to=raw --out=OUT": "nowhere is not a folder."},
     "dataset.make": {"--out=OUT --scenes=cube_smcvx_bal": "Did you mean cube_smcvx_ball"},
@@ -159,6 +168,8 @@ def tried(tmp_path_factory):
     cases, folders = {}, {}
     given = tmp_path_factory.mktemp("given")
     content = {"scene": {"path": str(_SCENE), "reconstruction": "r3f"}, "paths": {"cut": 0.01}}
+    (given / "overlay.json").write_text('{"rul": "facing"}')
+    (given / "list.json").write_text('[{"scene": "x", "rul": "facing"}]')
     (given / "r3f").mkdir()
     (given / "r3f" / cli_flags.RECONSTRUCTION).write_text("{}")
     for folder in (given, given / "r3f"):
@@ -187,6 +198,8 @@ def tried(tmp_path_factory):
 
 def _words(line, out, given):
     config, bare = given / "config.json", given / "r3f" / "config.json"
+    for word, name in (("OVERLAY", "overlay.json"), ("LIST", "list.json")):
+        line = line.replace(word, str(given / name))
     line = line.replace("OUT", str(out)).replace("SCENE", str(_SCENE))
     return line.replace("CONFIG", str(config)).replace("BARE", str(bare)).split()
 

@@ -2,10 +2,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 
-from refref_jax.optics import interface_rules
+from refref_jax.data import SceneError, scene_assembly
+from refref_jax.geometry.rays import Rays
+from refref_jax.optics import interface_rules, path_tracing
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import AMBIENT, crossing, nowhere
+from refref_jax.optics.path_settings import make_path_settings
 
 # Glass holds water, and the water holds a bubble of air.
 _INDICES = (1.5, 1.333, 1.0)
@@ -89,3 +93,45 @@ def test_facing_ranks_media_of_overlapping_parts_by_depth_then_priority():
     np.testing.assert_array_equal(np.argsort(made.priority), [0, 2, 1])
     np.testing.assert_array_equal(made.index_outside, 1.0)
     assert made.index_by_face.tolist() == [True]
+
+
+@pytest.mark.parametrize(
+    ("rule", "outside"),
+    [("nested", [1.25, 1.5, 1.333]), ("facing", [1.25] * 3), ("priority", [1.25] * 3)],
+)
+def test_the_ambient_medium_is_outside_all_parts(rule, outside):
+    interfaces = interface_rules.RULES[rule](_INDICES, _PARENTS, ambient=1.25)
+    np.testing.assert_allclose(interfaces.index_outside, outside)
+    assert interface_rules.ambient_of(interfaces) == 1.25
+
+
+@pytest.mark.parametrize("rule", interface_rules.RULES)
+def test_only_the_ratio_of_indices_bends_light(rule):
+    parts = [
+        scene_assembly.make_part(trimesh.creation.icosphere(radius=radius), index=index, name=name)
+        for name, radius, index in (("glass", 1.0, 1.5), ("water", 0.6, 1.333))
+    ]
+    parts = [part._replace(priority=number) for number, part in enumerate(parts)]
+    scaled = [part._replace(index=1.25 * part.index) for part in parts]
+    in_air = scene_assembly.assemble(parts, rule=rule)
+    immersed = scene_assembly.assemble(scaled, rule=rule, ambient=1.25)
+    other = scene_assembly.assemble(parts, rule=rule, ambient=1.25)
+    heights = np.linspace(-0.9, 0.9, 12)
+    origins = np.stack([np.full(12, -3.0), heights, np.full(12, 0.1)], axis=-1)
+    directions = np.tile([1.0, 0.0, 0.0], (12, 1))
+    rays = Rays(*(jnp.asarray(x, jnp.float32) for x in (origins, directions, np.full(12, 1e-3))))
+    settings = make_path_settings("tree")
+    ours, same, different = (
+        path_tracing.trace_ends(scene, rays, settings=settings).ends
+        for scene in (in_air, immersed, other)
+    )
+    close = {"rtol": 1e-3, "atol": 1e-3}
+    np.testing.assert_allclose(ours.directions, same.directions, **close)
+    np.testing.assert_allclose(ours.throughput, same.throughput, **close)
+    assert np.abs(np.asarray(ours.directions) - np.asarray(different.directions)).max() > 0.05
+
+
+def test_the_index_of_the_ambient_medium_is_positive():
+    part = scene_assembly.make_part(trimesh.creation.box(), index=1.5)
+    with pytest.raises(SceneError, match="'ambient' is 0"):
+        scene_assembly.assemble([part], ambient=0.0)

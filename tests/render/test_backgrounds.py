@@ -8,7 +8,7 @@ import pytest
 from benchmarks.oracles import colours
 from benchmarks.oracles.backgrounds import CubeBackground as SlowCube
 from benchmarks.oracles.backgrounds import look_at_environment
-from refref_jax.data.background import read_background
+from refref_jax.data.scene_assembly import read_background
 from refref_jax.render import backgrounds, radiance_of
 from refref_jax.render.backgrounds import (
     CubeBackground,

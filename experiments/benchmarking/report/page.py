@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from experiments.benchmarking import paper_tables
+from experiments.benchmarking import paper_tables, plan
 from experiments.benchmarking.report import charts, data, images, markup
 from experiments.benchmarking.report.data import Case, Contents, Scene
 from experiments.benchmarking.report.images import (
@@ -310,7 +310,8 @@ def _settings(contents: Contents) -> Html:
     settings += [["versions", text] for text in versions if text]
     methods = []
     for name in dict.fromkeys(record.method for record in everything):
-        given = next(record.options for record in everything if record.method == name)
+        given = dict(next(record.options for record in everything if record.method == name))
+        given.pop(plan.PROPERTIES, None)  # of that scene alone
         line = tag("span", charts.swatch(name), " ", name) if name in contents.labels else name
         methods.append([line, contents.labels.get(name, "-"), markup.options(given)])
     return join(

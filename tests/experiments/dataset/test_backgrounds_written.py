@@ -9,7 +9,7 @@ from experiments.dataset import backgrounds
 from experiments.dataset.landscapes import ENVIRONMENTS, make_environment
 from experiments.dataset.textures.faces import FACES, make_face
 from experiments.dataset.textures.spheres import SPHERES
-from refref_jax.data import background, image_files
+from refref_jax.data import image_files, scene_assembly, scene_properties
 from refref_jax.render.backgrounds import CubeBackground, Environment, SphereBackground
 from tests.processes.command import ROOT
 
@@ -25,9 +25,10 @@ def _write(scene, kind, seed=0, size=_SIZE):
 
 def test_a_cube_comes_back_with_the_walls_of_the_bundled_scene(tmp_path):
     record = _write(tmp_path, "cube", seed=4)
-    read = background.read_background(tmp_path)
+    read = scene_assembly.read_background(tmp_path)
     assert isinstance(read, CubeBackground) and read.half_extent == np.float32(7.3)
-    assert background.half_extent(tmp_path) == 7.3 and background.space(tmp_path) == "bounded"
+    told = scene_properties.read(tmp_path)
+    assert (told.background.extent, told.space) == (7.3, "bounded")
     for wall, face in enumerate(record["faces"].values()):
         expected = make_face(face["texture"], _SIZE)
         # Half a step of eight bits.
@@ -43,14 +44,15 @@ def test_a_cube_comes_back_with_the_walls_of_the_bundled_scene(tmp_path):
 
 def test_spheres_and_environments_come_back(tmp_path):
     record = _write(tmp_path, "sphere")
-    read = background.read_background(tmp_path)
+    read = scene_assembly.read_background(tmp_path)
     assert isinstance(read, SphereBackground) and read.radius == np.float32(7.3)
     assert read.texture.texels.shape == (_SIZE, 2 * _SIZE, 3)
-    assert background.half_extent(tmp_path) == 7.3 and background.space(tmp_path) == "spherical"
+    told = scene_properties.read(tmp_path)
+    assert (told.background.extent, told.space) == (7.3, "spherical")
     assert record["texture"] in SPHERES
     record = _write(tmp_path, "env")
-    read = background.read_background(tmp_path)
-    assert isinstance(read, Environment) and background.space(tmp_path) == "unbounded"
+    read = scene_assembly.read_background(tmp_path)
+    assert isinstance(read, Environment) and scene_properties.read(tmp_path).space == "unbounded"
     np.testing.assert_array_equal(read.texture.texels, make_environment(record["texture"], _SIZE))
 
 

@@ -14,8 +14,7 @@ import trimesh
 from experiments.dataset import cameras, frame_files, workers
 from experiments.dataset.parts import ObjectPart
 from refref_jax.data import meshes
-from refref_jax.data.background import read_background
-from refref_jax.data.scene_assembly import assemble
+from refref_jax.data.scene_assembly import assemble, read_background
 from refref_jax.geometry.cameras import box_filter, image_rays, supersample
 from refref_jax.optics.media import interior_length
 from refref_jax.optics.path_settings import PathSettings

@@ -17,7 +17,7 @@ from experiments.dataset import (
     scene_folders,
 )
 from refref_jax.choices import SPLITS
-from refref_jax.data import background, meshes, scene_folder, scene_source
+from refref_jax.data import meshes, scene_assembly, scene_folder, scene_properties, scene_source
 from refref_jax.data.scene_names import parse
 from tests.factories.cut_ball import COUNTS, cut_ball
 from tests.factories.small_parquet import write_copy
@@ -120,8 +120,9 @@ def test_all_layouts_are_read_alike(ball, tmp_path):
         (part,), (same,) = meshes.read_meshes(ball), meshes.read_meshes(scene)
         assert part.name == same.name and part.index == same.index
         np.testing.assert_array_equal(part.vertices, same.vertices)
-        assert background.half_extent(scene) == background.half_extent(ball) == 7.3
-        texture, other = (background.read_background(each).texture for each in (ball, scene))
+        told = scene_properties.read(scene)
+        assert told.background.extent == 7.3 and told.parts == scene_properties.read(ball).parts
+        texture, other = (scene_assembly.read_background(each).texture for each in (ball, scene))
         np.testing.assert_array_equal(texture.texels, other.texels)
 
 
@@ -199,7 +200,7 @@ def test_published_scenes_become_folders(tmp_path):
     assert [part.name for part in meshes.read_meshes(vial)] == ["vial_water"]
     shutil.rmtree(vial / "meshes")  # as the authors' folders are
     assert [part.name for part in meshes.read_meshes(vial)] == ["vial_water"]
-    assert background.space(vial) == "unbounded"
+    assert scene_properties.read(vial).space == "unbounded"
     assert meshes.read_meshes(tmp_path / "raw" / _RAW) == []
 
 

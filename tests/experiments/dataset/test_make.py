@@ -15,7 +15,7 @@ import pytest
 from experiments.dataset import render_settings
 from experiments.dataset.render_settings import PerSplit
 from experiments.dataset.workers import BlenderError
-from refref_jax.data import background, image_files, mesh_queries, meshes, scene_folder
+from refref_jax.data import image_files, mesh_queries, meshes, scene_assembly, scene_folder
 from tests.factories import small_dataset
 from tests.factories.small_dataset import make
 from tests.fakes import fake_blender
@@ -161,7 +161,7 @@ def test_two_commands_never_work_in_one_folder(tmp_path, blender, monkeypatch):
 def test_the_library_reads_what_was_made_and_blender_is_given(made):
     for name in _SCENES:
         scene_folder.check_scene(made / name)
-        background.read_background(made / name)
+        scene_assembly.read_background(made / name)
     parts = meshes.read_meshes(made / "env_mmncvx_box_full")
     liquid, shell = parts
     assert (shell.index, liquid.index) == (1.5, 1.333)

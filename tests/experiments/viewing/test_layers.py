@@ -157,11 +157,13 @@ def test_an_error_is_that_of_the_pixels_that_are_drawn(model, ball_scene, monkey
     assert layers.draw_error(model, pixels, chunk=1, cancelled=lambda: True) is None
 
 
+@pytest.mark.parametrize("ambient", [1.0, 1.25])
 @pytest.mark.parametrize("rule", RULES)
-def test_other_indices_are_those_of_the_rule(rule):
-    made = RULES[rule]([1.5, 1.33], [-1, 0], tints=[[0.9, 1.0, 1.0]] * 2, priorities=[1, 2])
+def test_other_indices_are_those_of_the_rule(rule, ambient):
+    others = {"tints": [[0.9, 1.0, 1.0]] * 2, "priorities": [1, 2], "ambient": ambient}
+    made = RULES[rule]([1.5, 1.33], [-1, 0], **others)
     changed = layers.with_indices(made, (1.6, 1.4), rule)
-    expected = RULES[rule]([1.6, 1.4], [-1, 0], tints=[[0.9, 1.0, 1.0]] * 2, priorities=[1, 2])
+    expected = RULES[rule]([1.6, 1.4], [-1, 0], **others)
     for ours, theirs in zip(changed, expected, strict=True):
         np.testing.assert_array_equal(ours, theirs)
         assert ours.dtype == theirs.dtype
