@@ -236,8 +236,18 @@ def find_bounds(
     notes = () if free is None else _offset_warnings(free)
     if fit is None:
         # Without a radius, a sphere that only the scene's name states has the usual cube around it.
-        return Bounds(space or own, None, "")
+        return Bounds(space or own, None, "", _unfit_warnings(kind, samples))
     return Bounds(found, fit.size, f"measured from depth maps: {fit.describe()}", notes)
+
+
+def _unfit_warnings(kind: Kind, samples: DepthSamples | None) -> tuple[str, ...]:
+    """Returns a warning if there are depths, but they do not show the shape."""
+    if samples is None or len(samples.depths) < _FEWEST_PIXELS:
+        return ()
+    return (
+        f"warning: the depth maps show no {kind}, so that the size of the background is assumed to "
+        "be the usual one. Set radius, or background=unbounded.",
+    )
 
 
 def _offset_warnings(fit: BackgroundFit) -> tuple[str, ...]:

@@ -265,8 +265,9 @@ def test_what_is_stated_is_not_measured(tmp_path):
     config = SceneConfig(path=str(scene))
     assert find_bounds(scene, space=None, radius=5.0) == ("spherical", None, "", ())
     assert find_bounds(scene, space="unbounded", radius=None) == ("unbounded", None, "", ())
-    # As a cube, the depth maps fit no better than the usual one.
-    assert find_bounds(scene, space="bounded", radius=None) == ("bounded", None, "", ())
+    space, size, _, (note,) = find_bounds(scene, space="bounded", radius=None)
+    assert (space, size) == ("bounded", None)
+    assert note.startswith("warning: the depth maps show no cube") and "Set radius" in note
     (scene / "scene.json").write_text('{"background": {"type": "sphere", "radius": 7.0}}')
     assert find_bounds(scene, space=None, radius=None) == ("spherical", 7.0, "scene.json", ())
     (scene / "scene.json").write_text('{"background": {"type": "cube"}}')
