@@ -121,9 +121,9 @@ def follow_branch(
     reflects = jnp.asarray(reflects)
     scene, ray = in_one_precision(scene, ray)
     if interior_list is None:
-        interior_list = media.nowhere(scene.interfaces)
+        interior_list = media.empty_interior_list(scene.interfaces)
     start = _Walk(
-        path_step.begin(ray, interior_list, ray_differentials.nothing(ray.origins)),
+        path_step.begin(ray, interior_list, ray_differentials.no_differential(ray.origins)),
         jnp.int32(media.AMBIENT),
         jnp.asarray(settings.max_bends > 0),
         jnp.int32(PathStatus.EMPTY),
@@ -147,7 +147,7 @@ def _advance(
     hit = primitive_id != NO_PRIMITIVE
     arrival = path_step.arrive(scene, state, primitive_id)
     ended = jnp.where(
-        walk.traced, path_step.ending(settings, state, arrival, hit), PathStatus.NOT_TRACED
+        walk.traced, path_step.end_status(settings, state, arrival, hit), PathStatus.NOT_TRACED
     )
     status = jnp.where(alive, ended, walk.status).astype(jnp.int32)
     met, sides = arrival.interaction, arrival.interaction.sides
@@ -180,7 +180,7 @@ def _record(settings: PathSettings, ray: Rays, end: _Walk, segments: _Segment) -
         differentials=segments.state.differential,
         media=jnp.where(used, segments.medium, media.AMBIENT),
         rays=jnp.zeros_like(end.status),
-        throughput=path_step.shown(settings, end.state.throughput, end.status),
+        throughput=path_step.contribution(settings, end.state.throughput, end.status),
         radii=ray.radii,
         num_bends=end.state.num_bends,
         statuses=end.status,

@@ -112,7 +112,7 @@ def straight(rays: Rays) -> LightPaths:
         tau=jnp.zeros_like(rays.radii)[:, None],
         ends=jnp.full_like(rays.radii, jnp.inf)[:, None],
         media=jnp.full((count, 1), AMBIENT, jnp.int32),
-        differentials=jax.vmap(jax.vmap(ray_differentials.nothing))(rays.origins[:, None]),
+        differentials=jax.vmap(jax.vmap(ray_differentials.no_differential))(rays.origins[:, None]),
         rays=integers,
         throughput=jnp.ones_like(rays.directions),
         radii=rays.radii,

@@ -101,7 +101,7 @@ def interior_length(interfaces: Interfaces) -> int:
     return SLOTS if interfaces.priority.shape[0] else 0
 
 
-def nowhere(interfaces: Interfaces) -> Int[Array, " slots"]:
+def empty_interior_list(interfaces: Interfaces) -> Int[Array, " slots"]:
     """Returns the interior list of a ray outside all parts."""
     return jnp.full(interior_length(interfaces), EMPTY_SLOT, jnp.int32)
 

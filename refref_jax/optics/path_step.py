@@ -51,7 +51,7 @@ class Interaction(NamedTuple):
     sides: media.Crossing
 
 
-def meet(
+def interact(
     point: SurfacePoint,
     interfaces: media.Interfaces,
     interior_list: Int[Array, " slots"],
@@ -235,7 +235,7 @@ def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arriv
         point = surfaces.surface_point(scene.surfaces, primitive_id, barycentric)
         # Otherwise XLA would gather the triangle again for every result that depends on it.
         point = jax.lax.optimization_barrier(point)
-        met = meet(point, scene.interfaces, state.interior_list, direction)
+        met = interact(point, scene.interfaces, state.interior_list, direction)
         return Bend(met.position, met.reflected, met.transmitted), met
 
     met, reflected, transmitted = ray_differentials.bend(
@@ -247,7 +247,7 @@ def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arriv
     return Arrival(met, length, throughput, reflected, transmitted)
 
 
-def ending(
+def end_status(
     settings: PathSettings, state: RayState, arrival: Arrival, hit: Bool[Array, ""]
 ) -> Int[Array, ""]:
     """Returns the status of a path that ends here; `EMPTY` if it bends and continues.
@@ -265,7 +265,7 @@ def ending(
     return jnp.where(hit, met, missed).astype(jnp.int32)
 
 
-def shown(
+def contribution(
     settings: PathSettings, throughput: Float[Array, "3"], status: Int[Array, ""]
 ) -> Float[Array, "3"]:
     """Returns the throughput that a path contributes when it ends with a status."""

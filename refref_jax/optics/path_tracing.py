@@ -217,5 +217,5 @@ def _inside(
 ) -> Int[Array, "rays slots"]:
     if interior_list is not None:
         return interior_list
-    nowhere = media.nowhere(scene.interfaces)
+    nowhere = media.empty_interior_list(scene.interfaces)
     return jnp.broadcast_to(nowhere, (rays.radii.shape[0], nowhere.shape[0]))

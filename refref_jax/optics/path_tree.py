@@ -87,7 +87,7 @@ class PathTree(NamedTuple):
     casts: Int[Array, ""]
 
 
-def name_media(
+def set_media(
     tree: PathTree,
     segments: Int[Array, " n"],
     media: Int[Array, " n"],

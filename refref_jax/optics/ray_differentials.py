@@ -60,12 +60,12 @@ class Bend(NamedTuple):
 def begin(ray: Rays, footprint: Footprint) -> RayDifferential:
     """Returns the ray differential of a camera ray: all rays of a pixel start at one point."""
     if footprint == "cone":
-        return nothing(ray.origins)
+        return no_differential(ray.origins)
     sides = ray.radii * jnp.stack(orthonormal_basis(ray.directions))
     return RayDifferential(jnp.zeros_like(sides), sides)
 
 
-def nothing(like: Float[Array, "3"]) -> RayDifferential:
+def no_differential(like: Float[Array, "3"]) -> RayDifferential:
     """Returns the empty ray differential of a ray whose derivatives are not carried."""
     none = jnp.zeros((0, 3), like.dtype)
     return RayDifferential(none, none)

@@ -108,7 +108,9 @@ def children_of(
     )
 
 
-def log(tree: PathTree, children: Children, capacities: Capacities) -> tuple[PathTree, Children]:
+def store_segments(
+    tree: PathTree, children: Children, capacities: Capacities
+) -> tuple[PathTree, Children]:
     """Stores the segments of children; drops the weakest children if the buffer is full."""
     live = children.live
     left = capacities.segments - tree.segments.count
@@ -130,7 +132,7 @@ def log(tree: PathTree, children: Children, capacities: Capacities) -> tuple[Pat
     return tree._replace(segments=log, dropped=dropped), children
 
 
-def push(
+def push_or_end(
     tree: PathTree, stack: Queue, children: Children, settings: PathSettings
 ) -> tuple[PathTree, Queue]:
     """Pushes children on the stack, and ends those that are not traced further.
@@ -153,7 +155,9 @@ def end_by(
     ending: Bool[Array, " n"],
 ) -> PathTree:
     """Ends some rays as paths; the throughput of paths that the settings make black is dropped."""
-    throughput = jax.vmap(functools.partial(path_step.shown, settings))(live.throughput, status)
+    throughput = jax.vmap(functools.partial(path_step.contribution, settings))(
+        live.throughput, status
+    )
     dropped = queues.add_dropped(tree.dropped, live.rays, live.throughput - throughput, ending)
     live = live._replace(state=live.state._replace(throughput=throughput))
     return end(tree._replace(dropped=dropped), live, status, ending)
@@ -195,7 +199,7 @@ def follow(
     Args:
       scene: the scene.
       rays: any number of camera rays.
-      interior_list: interior list of each camera (see `media.nowhere`).
+      interior_list: interior list of each camera (see `media.empty_interior_list`).
       settings: path settings, with at least one bend.
       footprint: `differential` carries derivatives across the pixel.
       block: number of rays cast per iteration.
@@ -217,18 +221,18 @@ def _follow(
     capacities = path_settings.capacities(settings, count)
     walk = _begin(rays, interior_list, footprint, block, capacities)
     if count < _MANY_BLOCKS * block or block < _SMALLER:
-        return _work_off(scene, walk, settings, block, capacities, least=1).tree
+        return _trace_remaining(scene, walk, settings, block, capacities, least=1).tree
     # Otherwise the few deepest rays would cast a full block in each iteration.
-    walk = _work_off(scene, walk, settings, block, capacities, least=block // 4)
+    walk = _trace_remaining(scene, walk, settings, block, capacities, least=block // 4)
     stack = queues.append(
         walk.stack, walk.next.items, jnp.arange(block, dtype=jnp.int32) < walk.next.count
     )
     small = block // _SMALLER
     walk = _Walk(*queues.pop(stack, small), walk.tree)
-    return _work_off(scene, walk, settings, small, capacities, least=1).tree
+    return _trace_remaining(scene, walk, settings, small, capacities, least=1).tree
 
 
-def _work_off(
+def _trace_remaining(
     scene: Scene,
     walk: _Walk,
     settings: PathSettings,
@@ -248,7 +252,7 @@ def _work_off(
     def advance(walk: _Walk) -> _Walk:
         walk = jax.lax.while_loop(
             lambda walk: more(walk) & fits(walk),
-            lambda walk: _round(scene, walk, settings, block, capacities),
+            lambda walk: _trace_block(scene, walk, settings, block, capacities),
             walk,
         )
         stack, dropped = queues.drop_weakest(walk.stack, walk.tree.dropped, capacities.live)
@@ -300,7 +304,7 @@ def _begin(
     return _Walk(*queues.pop(stack, block), tree)
 
 
-def _round(
+def _trace_block(
     scene: Scene, walk: _Walk, settings: PathSettings, block: int, capacities: Capacities
 ) -> _Walk:
     """Casts one block, ends paths, and pushes the children on the stack."""
@@ -309,19 +313,19 @@ def _round(
     arrive = jax.vmap(path_step.arrive, in_axes=(None, 0, 0))
     arrival = arrive(scene, live.state, hits.primitive_ids)
     hit = alive & jnp.isfinite(hits.distances)
-    status = jax.vmap(functools.partial(path_step.ending, settings))(live.state, arrival, hit)
+    status = jax.vmap(functools.partial(path_step.end_status, settings))(live.state, arrival, hit)
     bending = hit & (status == PathStatus.EMPTY)
     tree = walk.tree._replace(casts=walk.tree.casts + jnp.sum(alive, dtype=jnp.int32))
     medium = arrival.interaction.sides.medium_near
     # The medium of a camera is known only from the first surface it sees.
-    tree = path_tree.name_media(tree, live.segments, medium, hit & (live.state.num_bends == 0))
+    tree = path_tree.set_media(tree, live.segments, medium, hit & (live.state.num_bends == 0))
     tree = end_by(settings, tree, live, status, alive & ~bending)
     branches = jax.vmap(functools.partial(path_step.branch, settings))(
         live.state, arrival, hits.primitive_ids
     )
     children = children_of(live, branches, arrival, bending, settings)
-    tree, children = log(tree, children, capacities)
-    tree, stack = push(tree, walk.stack, children, settings)
+    tree, children = store_segments(tree, children, capacities)
+    tree, stack = push_or_end(tree, walk.stack, children, settings)
     return _Walk(*queues.pop(stack, block), tree)
 
 

@@ -8,7 +8,7 @@ from refref_jax.data import SceneError, scene_assembly
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import interface_rules, path_tracing
 from refref_jax.optics.interface_rules import NO_PARENT
-from refref_jax.optics.media import AMBIENT, crossing, nowhere
+from refref_jax.optics.media import AMBIENT, crossing, empty_interior_list
 from refref_jax.optics.path_settings import make_path_settings
 
 # Glass holds water, and the water holds a bubble of air.
@@ -43,7 +43,9 @@ def test_a_scene_without_parts_can_be_indexed(rule):
 def test_a_crossing_exchanges_the_sides(entering):
     interfaces = interface_rules.nested(_INDICES, _PARENTS)
     interfaces = jax.tree.map(jnp.asarray, interfaces)
-    found = crossing(interfaces, nowhere(interfaces), jnp.int32(1), jnp.asarray(entering))
+    found = crossing(
+        interfaces, empty_interior_list(interfaces), jnp.int32(1), jnp.asarray(entering)
+    )
     inside, outside = (1.333, 2), (1.5, 1)
     near, far = (outside, inside) if entering else (inside, outside)
     assert (float(found.index_near), int(found.medium_near)) == pytest.approx(near)

@@ -35,7 +35,9 @@ def _walk(interfaces, inside, parts, entering):
 def _crossings(interfaces, steps):
     """Returns the crossings of a walk that begins in the air; a step is (part, entering)."""
     parts, entering = zip(*steps, strict=True)
-    walk = _walk(interfaces, media.nowhere(interfaces), jnp.array(parts), jnp.array(entering))
+    walk = _walk(
+        interfaces, media.empty_interior_list(interfaces), jnp.array(parts), jnp.array(entering)
+    )
     return jax.tree.map(np.asarray, walk)
 
 
@@ -62,8 +64,8 @@ def _media_along(interfaces, steps):
 def test_only_the_priority_rule_carries_a_list(rule, slots):
     made = jax.tree.map(jnp.asarray, interface_rules.RULES[rule]([1.5], [NO_PARENT]))
     assert media.interior_length(made) == slots
-    np.testing.assert_array_equal(media.nowhere(made), np.full(slots, EMPTY_SLOT))
-    assert media.nowhere(made).dtype == jnp.int32
+    np.testing.assert_array_equal(media.empty_interior_list(made), np.full(slots, EMPTY_SLOT))
+    assert media.empty_interior_list(made).dtype == jnp.int32
 
 
 def test_one_body_is_entered_and_left():

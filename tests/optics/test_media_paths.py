@@ -40,7 +40,7 @@ def _trace_jitted(scene, rays, interior_list, *, settings, capacity):
 
 def _trace(scene, rays, *, interior_list=None, settings=_REFRACTED):
     if interior_list is None:
-        nowhere = media.nowhere(scene.interfaces)
+        nowhere = media.empty_interior_list(scene.interfaces)
         interior_list = jnp.broadcast_to(nowhere, (len(rays.radii), nowhere.shape[0]))
     capacity = 8 * len(rays.radii)
     traced = _trace_jitted(scene, rays, interior_list, settings=settings, capacity=capacity)

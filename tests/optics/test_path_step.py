@@ -23,8 +23,8 @@ def _meet(direction, shading=(0.0, 0.0, 1.0)):
         scale=jnp.float32(1.0),
     )
     unit = np.asarray(direction) / np.linalg.norm(direction)
-    nowhere = media.nowhere(_GLASS)
-    return path_step.meet(point, _GLASS, nowhere, jnp.asarray(unit, jnp.float32))
+    nowhere = media.empty_interior_list(_GLASS)
+    return path_step.interact(point, _GLASS, nowhere, jnp.asarray(unit, jnp.float32))
 
 
 def test_entering_glass():
