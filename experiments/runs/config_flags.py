@@ -164,7 +164,7 @@ def _check(option: Option, value: Any) -> None:
 
 def _parse(option: Option, value: Any) -> Any:
     """Converts the value of a flag to that of its option."""
-    if value == AUTO and _kind(option) is not str:
+    if value == AUTO and (_kind(option) is not str or option.name == "properties"):
         return None
     if option.name == "ior" and value == [AUTO]:
         return None
