@@ -28,7 +28,7 @@ _IOR = flags.DEFINE_string(
     "ior", None, "Index of refraction of the object, as in 1.5; estimated by default."
 )
 _RECONSTRUCTION = r3f_flags.reconstruction()
-_SPACE = cli_flags.space()
+_SPACE = r3f_flags.space()
 _PROPERTIES = cli_flags.properties()
 _SEED = cli_flags.seed()
 

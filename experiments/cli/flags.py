@@ -5,7 +5,6 @@ that no command accepts a flag that it ignores. Values are validated during pars
 imported.
 """
 
-import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -211,39 +210,6 @@ def ior() -> flags.FlagHolder[list[str]]:
     """Defines `--ior` of meshes, which `runs.refraction_indices` parses."""
     what = "Index of refraction of a material or a mesh, as in glass=1.52. May be repeated."
     return flags.DEFINE_multi_string("ior", [], what)
-
-
-# ---- Background ----
-class SpaceFlags(NamedTuple):
-    """Flags for the type and size of a background, for scenes that do not define them."""
-
-    background: flags.FlagHolder[str]
-    radius: flags.FlagHolder[float | None]
-
-    def chosen(self) -> str | None:
-        """Returns the space that `--background` selects, or `None` for the scene's own."""
-        return None if self.background.value == "auto" else self.background.value
-
-
-def space() -> SpaceFlags:
-    """Defines `--background` and `--radius`."""
-    background = flags.DEFINE_enum(
-        "background",
-        "auto",
-        ["auto", *get_args(choices.Space)],
-        "Type of the background: walls (a cube or a sphere), or an environment at infinity.",
-    )
-    radius = flags.DEFINE_float(
-        "radius",
-        None,
-        "Half-extent of the background cube, or radius of the background sphere (by default from "
-        "scene.json, else measured, else 7.3), or radius of the uncontracted ball of an unbounded "
-        "scene, in world units.",
-        lower_bound=1e-6,
-    )
-    finite = "It must be a finite number of world units."
-    flags.register_validator("radius", lambda x: x is None or math.isfinite(x), finite)
-    return SpaceFlags(background, radius)
 
 
 # ---- Devices and processes ----

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from typing import NamedTuple, get_args
 
 from absl import flags
 from etils import epy
+
+from refref_jax import choices
 
 with epy.lazy_imports():
     from experiments.r3f import records
@@ -54,3 +57,35 @@ def reconstruction() -> ReconstructionFlags:
         "--outliers has no effect on an occupancy field, which weighs all masks. Remove either.",
     )
     return found
+
+
+class SpaceFlags(NamedTuple):
+    """Flags for the type and size of a background, for scenes that do not define them."""
+
+    background: flags.FlagHolder[str]
+    radius: flags.FlagHolder[float | None]
+
+    def chosen(self) -> str | None:
+        """Returns the space that `--background` selects, or `None` for the scene's own."""
+        return None if self.background.value == "auto" else self.background.value
+
+
+def space() -> SpaceFlags:
+    """Defines `--background` and `--radius`."""
+    background = flags.DEFINE_enum(
+        "background",
+        "auto",
+        ["auto", *get_args(choices.Space)],
+        "Type of the background: walls (a cube or a sphere), or an environment at infinity.",
+    )
+    radius = flags.DEFINE_float(
+        "radius",
+        None,
+        "Half-extent of the background cube, or radius of the background sphere (by default from "
+        "scene.json, else measured, else 7.3), or radius of the uncontracted ball of an unbounded "
+        "scene, in world units.",
+        lower_bound=1e-6,
+    )
+    finite = "It must be a finite number of world units."
+    flags.register_validator("radius", lambda x: x is None or math.isfinite(x), finite)
+    return SpaceFlags(background, radius)

@@ -223,7 +223,7 @@ def find_bounds(
     if found == "unbounded":
         return Bounds(found, None, "")
     if described.extent is not None:
-        return Bounds(found, described.extent, "scene.json")
+        return Bounds(found, described.extent, properties.origins["background"].name)
     is_sphere = scene_names.of_folder(scene).split("_")[0] == "sphere"
     if space is None and own == "bounded" and is_sphere and described.kind is None:
         found = "spherical"

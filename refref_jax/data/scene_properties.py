@@ -9,9 +9,8 @@ of them are optional.
      "parts": [{"mesh": "meshes/cup_glass.ply", "index": 1.5, "shading": "smooth", "priority": 3,
                 "tint": [0.9, 1.0, 0.9], "absorption": [0.1, 0.0, 0.1]}]}
 
-`docs/data_formats.md` documents every key. Nothing is ignored: a key that does not exist, a value
-out of range and a property that is not supported yet are errors, except for `RECORDS`, which
-generators write as a record and which have no effect.
+`docs/data_formats.md` documents every key. Unknown keys, values out of range and properties that
+are not supported yet are errors, except for `RECORDS`, which generators write and nothing reads.
 
 An overlay holds the properties of a scene whose folder cannot be written to. It is merged key by
 key with `scene.json`, and wins; parts are matched by the file name of their mesh.
@@ -392,15 +391,16 @@ def _built(content: dict[str, Any], sources: Sequence[_Source], scene: Path) -> 
     materials = _object(content.get("ior", {}), ("ior",), sources)
     background = _background(content.get("background", {}), sources)
     kind = background.kind or scene_names.of_folder(scene).split("_")[0]
-    parts = content.get("parts", {})
+    parts, layout = content.get("parts", {}), scene_names.published_rule(scene)
     return SceneProperties(
         space="bounded" if background.kind is None and kind != "env" else _SPACES[kind],
         background=background,
-        rule=top.get("rule"),
+        rule=top.get("rule", layout),
         ambient_index=top.get("ambient_index", 1.0),
         indices=_checked(materials, dict.fromkeys(materials, _index), ("ior",), sources),
         parts={name: _part(name, part, sources) for name, part in parts.items()},
         origins={
+            **({"rule": Path("the published layout")} if layout else {}),
             **{key: _origin((key,), sources) for key in content},
             **{name: _origin(("parts", name), sources) for name in parts},
         },

@@ -273,15 +273,22 @@ class ScheduleConfig:
             number, least = getattr(self, name), 0 if name in ("warmup", "anneal") else 1
             if number is not None and not least <= number <= _MOST:
                 raise ValueError(f"{name} is {number}. Give {least} to {_MOST}.")
-        for name in ("warmup", "anneal"):
-            number = getattr(self, name)
-            if None not in (number, self.steps) and number > self.steps:
-                raise ValueError(
-                    f"{name} is {number}, but the run has only {self.steps} steps. Give fewer."
-                )
         for name, rate in (("learning_rate", self.peak), ("final_learning_rate", self.end)):
             if rate is not None and not 0.0 < rate < math.inf:
                 raise ValueError(f"{name} is {rate}. Give a positive number.")
+
+    def check_lengths(self) -> None:
+        """Refuses a warm-up or annealing that is longer than the run; earlier runs may have one.
+
+        Raises:
+          ValueError: if it is.
+        """
+        for name in ("warmup", "anneal"):
+            if require(getattr(self, name)) > require(self.steps):
+                raise ValueError(
+                    f"{name} is {getattr(self, name)}, but the run has only {self.steps} steps. "
+                    "Give fewer."
+                )
 
     def over(self, steps: int) -> "ScheduleConfig":
         """Returns the same schedule stretched over another number of steps."""

@@ -30,7 +30,6 @@ from refref_jax.data import (
     meshes,
     scene_analysis,
     scene_folder,
-    scene_names,
     scene_properties,
 )
 from refref_jax.data.batches import check_batch
@@ -69,10 +68,8 @@ class SceneFacts(NamedTuple):
       tree: containment of the meshes.
       half_extent: half edge of the background cube, or radius of the background sphere, if it is in
         scene.json or measured.
-      notes: results of the checks of the meshes and of the background, and overridden properties of
-        scene.json.
-      rule: interface rule: that of `SceneConfig`, that of scene.json, that of the published layout,
-        or `nested`.
+      notes: results of checks, and overridden properties of scene.json.
+      rule: interface rule: that of `SceneConfig`, that of scene.json, or `nested`.
       ambient: index of refraction of the medium outside all parts.
       origins: names of the files that define properties, by their keys in scene.json.
       source: reason for `half_extent`.
@@ -130,8 +127,7 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
       parts: objects that replace the scene's own meshes.
 
     Raises:
-      ValueError: if the scene is broken, or a camera is inside a mesh where rays carry an
-        interior list.
+      ValueError: if the scene is broken, or a camera whose rays carry a list is inside a mesh.
     """
     folder = Path(scene.path)
     scene_folder.check_scene(folder)
@@ -140,18 +136,15 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
     if parts is not None:  # they are not those that scene.json describes
         known = {key: path for key, path in told.origins.items() if key != "rule"}
         told = dataclasses.replace(told, rule=None, parts={}, origins=known)
-        own_rule = None
     else:
         parts = meshes.read_meshes(folder, indices=dict(scene.indices), properties=told)
-        own_rule = told.rule or scene_names.published_rule(folder)
-    rule, space = scene.rule or own_rule or "nested", scene.space or told.space
+    rule, space = scene.rule or told.rule or "nested", scene.space or told.space
     tree = mesh_queries.find_containment(parts)
     notes = mesh_checks.check_meshes(parts, tree, rule=rule)
     notes += scene_analysis.overridden(told, parts, rule=rule, space=space, radius=scene.radius)
     if rule == "priority" or (rule == "facing" and tree.overlaps):
         _refuse_cameras_inside(parts, cameras)
     bounds = background_fit.find_bounds(folder, told, space=scene.space, radius=scene.radius)
-    origins = {key: path.name for key, path in told.origins.items()}
     return SceneFacts(
         scene_analysis.analyse(parts, tree, cameras, rule=rule, space=bounds.space),
         cameras,
@@ -159,10 +152,8 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
         tree,
         bounds.size,
         (*notes, *bounds.notes),
-        rule,
-        told.ambient_index,
-        origins,
-        origins.get("background", "scene.json") if told.background.extent else bounds.source,
+        *(rule, told.ambient_index, {key: path.name for key, path in told.origins.items()}),
+        bounds.source,
     )
 
 
@@ -215,10 +206,8 @@ def build_scene(resolved: Resolved, facts: SceneFacts) -> Scene:
     """Builds the scene for tracing; its parts only have colours if `tints` is `given`."""
     given = resolved.config.model.tints == "given"
     parts = facts.parts if given else meshes.without_colour(facts.parts)
-    rule, tree = resolved.config.scene.rule or facts.rule, facts.tree
-    return assemble_scene(
-        parts, tree.parents, rule=rule, overlaps=tree.overlaps, ambient=facts.ambient
-    )
+    rule, (parents, overlaps) = resolved.config.scene.rule or facts.rule, facts.tree
+    return assemble_scene(parts, parents, rule=rule, overlaps=overlaps, ambient=facts.ambient)
 
 
 def samples_of(model: ModelConfig) -> tuple[int, ...]:
@@ -394,7 +383,7 @@ def _resolve_training(
     preset = presets.PRESETS[config.model.preset]
     steps = config.schedule.steps or preset.schedule.steps
     schedule = preset.schedule.over(require(steps))
-    return _decide(
+    config = _decide(
         config,
         reasons,
         f"preset={config.model.preset}",
@@ -406,6 +395,8 @@ def _resolve_training(
         batch=schedule.batch,
         pretraced_batches=schedule.pretraced_batches,
     )
+    config.schedule.check_lengths()
+    return config
 
 
 def override_model(model: ModelConfig, asked: FieldConfig) -> ModelConfig:
@@ -486,8 +477,8 @@ def _refuse_cameras_inside(parts: Sequence[MeshPart], cameras: Cameras) -> None:
     """Refuses cameras inside a mesh, whose rays would start with an interior list."""
     if np.any(mesh_queries.parts_around(parts, cameras.poses[:, :, 3]) != EMPTY_SLOT):
         raise ValueError(
-            "A camera is inside a mesh, which training does not support under rule=priority, nor "
-            "under rule=facing if meshes overlap. Use rule=nested, or move the camera."
+            "A camera is inside a mesh, which training only supports under rule=nested, and under "
+            "rule=facing without overlaps. Use these, or move the camera."
         )
 
 

@@ -8,8 +8,8 @@ import shutil
 import numpy as np
 import pytest
 
-from refref_jax.data import background_fit, image_files
-from refref_jax.data.background_fit import find_bounds, fit_size, fit_size_and_centre, sample_depths
+from refref_jax.data import background_fit, image_files, scene_properties
+from refref_jax.data.background_fit import fit_size, fit_size_and_centre, sample_depths
 from refref_jax.data.scene_source import SceneWarning, expand, open_scene
 from refref_jax.geometry import cameras
 from refref_jax.geometry.cameras import Cameras
@@ -22,6 +22,10 @@ from tests.processes.command import ROOT, run_command
 _SIZE = 48
 _OBJECT = 1.4
 _STEP = image_files.DEPTH_STEP
+
+
+def find_bounds(scene, **given):
+    return background_fit.find_bounds(scene, scene_properties.read(scene), **given)
 
 
 def _views(frames, *, seed=0, distance=4.0):

@@ -316,3 +316,13 @@ def test_an_overlay_is_checked_by_itself(tmp_path):
             check_file(path)
     path.write_text(json.dumps(_background(half_extent=7)))
     assert check_file(path) is None
+
+
+def test_the_published_layout_implies_a_rule_that_scene_json_overrides(tmp_path):
+    scene = tmp_path / "textured_cube_scene" / "single-convex" / "ball"
+    scene.mkdir(parents=True)
+    told = read(scene)
+    assert (told.rule, told.origins["rule"].name) == ("facing", "the published layout")
+    (scene / "scene.json").write_text('{"rule": "nested"}')
+    told = read(scene)
+    assert (told.rule, told.origins["rule"]) == ("nested", scene / "scene.json")

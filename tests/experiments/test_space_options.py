@@ -1,11 +1,11 @@
 import pytest
 from absl import flags
 
-from experiments.cli import flags as cli_flags
+from experiments.r3f import flags as r3f_flags
 
 pytestmark = pytest.mark.loose
 
-_SPACE = cli_flags.space()
+_SPACE = r3f_flags.space()
 
 
 @pytest.mark.parametrize("radius", ["inf", "nan", "0", "-3"])
