@@ -283,12 +283,10 @@ class ScheduleConfig:
         Raises:
           ValueError: if it is.
         """
+        steps = require(self.steps)
         for name in ("warmup", "anneal"):
-            if require(getattr(self, name)) > require(self.steps):
-                raise ValueError(
-                    f"{name} is {getattr(self, name)}, but the run has only {self.steps} steps. "
-                    "Give fewer."
-                )
+            if (number := require(getattr(self, name))) > steps:
+                raise ValueError(f"{name} is {number}, but there are {steps} steps. Give fewer.")
 
     def over(self, steps: int) -> "ScheduleConfig":
         """Returns the same schedule stretched over another number of steps."""

@@ -514,3 +514,10 @@ def test_prepare_resolves_scenes(scene):
         prepare(TrainConfig().override(scene=untold, tints="given"))
     with pytest.raises(ValueError, match="no meshes"):
         prepare(TrainConfig().override(scene=empty, paths="tree"))
+
+
+@pytest.mark.parametrize("name", ["warmup", "anneal"])
+def test_resolve_refuses_a_warm_up_that_is_longer_than_the_run(name):
+    with pytest.raises(ValueError, match=f"{name} is 50, but there are 5 steps. Give fewer."):
+        _resolve(_CLEAR, steps=5, **{name: 50})
+    assert _resolve(_CLEAR, steps=5).config.schedule.warmup <= 5
