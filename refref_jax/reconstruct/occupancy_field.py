@@ -172,7 +172,7 @@ def at(chord: Chord, distance: Float[Array, ""]) -> Float[Array, "3"]:
 def scan(signed: Signed, chord: Chord, shift: Float[Array, ""], *, samples: int) -> Scan:
     """Samples a field along one chord, without gradient: evenly, then around the deepest sample.
 
-    A ray that cuts off an edge is inside for less than a step, hence the second scan.
+    A ray that crosses an edge is inside for less than one step, hence the second scan.
 
     Args:
       signed: field to sample.

@@ -123,8 +123,8 @@ class PathsConfig:
         at the first surface; paper_no_reflection and paper_no_tir are its ablations without this
         reflection and without total internal reflections; tree follows every branch that carries
         light. By default tree if there are meshes, else straight.
-      min_throughput: Throughput threshold, below which paths are not followed, in [0, 1); by
-        default that of the paths.
+      min_throughput: Throughput below which a branch is not followed and its sibling takes its
+        share, in [0, 1); by default that of the paths.
       max_bends: Maximum number of refractions and reflections of a path; by default that of the
         paths.
       reentry: Whether light that has left the objects may meet them again; by default determined
@@ -216,7 +216,7 @@ class LossConfig:
     Attributes:
       data: Loss on sRGB colours.
       interlevel: Weight of the anti-aliased interlevel loss.
-      blurs: Half-width of its blur for each proposal level, in normalised distance.
+      blurs: Half-width of the interlevel loss's blur at each proposal level, normalised distance.
       distortion: Weight of the distortion loss.
       hash_decay: Weight of the decay of the hash grids; by default that of the field type.
       tint_decay: Weight of the optical density of learned tints and absorption.

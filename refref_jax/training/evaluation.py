@@ -7,7 +7,7 @@ Distances are of three kinds, distinguished by name:
 - `distance_*`: the median of the weights of the field, as the paper defines it (section 5).
 - `surface_*`: the first surface of the meshes that the ray through the pixel's centre meets, and
   the median elsewhere. Clear glass has hardly any density, so the median passes through it to the
-  background; a method that knows or reconstructs the glass has a better distance.
+  background; a method that knows or reconstructs the glass has the distance of its surface.
 - `substituted_*`: the true distance inside the object's mask, and the median elsewhere; its masked
   error is 0 by definition. The first release of the paper's code did this for its two methods
   that know objects, which explains the oracle's masked DMAE of 0.00 in the paper's table 2, though

@@ -20,7 +20,7 @@ class Stick(NamedTuple):
 
     Attributes:
       origin: point on the line, in world units.
-      way: direction; its upward component is positive.
+      way: direction of the stick, with a positive upward component.
       radius: radius of the stick.
     """
 
