@@ -151,7 +151,7 @@ def _make_tables(out: Path) -> None:
     if unused:
         raise ValueError(
             f"--tables_only does not use {', '.join(unused)}, because it only reads existing "
-            "results. Remove one or the other."
+            "results. Remove --tables_only, or these flags."
         )
     benchmark = settings.read(out)
     with atomic_files.hold(out):

@@ -78,7 +78,8 @@ class View(NamedTuple):
       mask_share: share of pixels where mask and traced silhouette differ.
       depth_share: share of pixels away from silhouettes whose depths agree; NaN without a map.
       depth_error: the 99.9th percentile of the depths' difference there, world units.
-      normal_degrees: mean angle of the first surface's normals there; NaN without a map.
+      normal_degrees: mean angle between both normals of the first surface there, degrees; NaN
+        without a map.
     """
 
     name: str

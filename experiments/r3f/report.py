@@ -60,7 +60,7 @@ def run(scene: Path, out: Path, found: Reconstruction, compare: bool) -> ReportF
       scene: folder of the scene.
       out: folder of the reconstruction.
       found: results of the reconstruction.
-      compare: whether the scene's own meshes may be read.
+      compare: whether to compare with the scene's own meshes.
     """
     mesh = object_source.read_mesh(out, found)
     split, frames = judging_frames(scene)

@@ -1,4 +1,4 @@
-"""Interface of field types: their configurations, functions and arithmetic precision.
+"""Interface of field kinds: their configurations, functions and arithmetic precision.
 
 A radiance field has two functions, `init` and `radiance`; a proposal field has `init` and
 `density`. All are pure functions over Gaussians in the unit cube. A field type is one module with a

@@ -276,4 +276,4 @@ def denoise_within(mesh: Mesh, length: float, *, crease_angle: float, views: Vie
         after = denoise(mesh, share * length, crease_angle=crease_angle)
         if few is None or silhouette_overlap(after, *few).mean() >= least:
             return after
-    raise ReconstructionError("the overlap with the masks would fall")
+    raise ReconstructionError("every length would reduce the overlap with the masks too much")

@@ -218,7 +218,7 @@ class LossConfig:
       interlevel: Weight of the anti-aliased interlevel loss.
       blurs: Half-width of the interlevel loss's blur at each proposal level, normalised distance.
       distortion: Weight of the distortion loss.
-      hash_decay: Weight of the decay of the hash grids; by default that of the field type.
+      hash_decay: Weight of the hash decay; by default the one of the field kind.
       tint_decay: Weight of the optical density of learned tints and absorption.
       distortion_over: Samples in the distortion loss: those outside the objects (the paper's
         correction), or all (everywhere; Mip-NeRF 360, the paper's ablation).

@@ -66,7 +66,7 @@ def _background(**values):
 def test_the_example_of_the_documentation_is_read_completely(tmp_path):
     scene = _scene(tmp_path / "cup", json.loads(_examples()["scene.json"]))
     told = read(scene)
-    assert (told.rule, told.ambient_index, told.indices) == ("nested", 1.0, {"glass": 1.52})
+    assert (told.rule, told.ambient_index, told.indices) == ("priority", 1.0, {"glass": 1.52})
     assert (told.space, told.background.kind, told.background.extent) == (
         "spherical",
         "sphere",

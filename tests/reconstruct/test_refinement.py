@@ -235,7 +235,7 @@ def test_denoising_goes_as_far_as_masks_allow():
     assert freely < before - 0.05 and within > before - 0.01
     half = denoise_within(raw, 0.2, crease_angle=0.26, views=None)
     np.testing.assert_array_equal(held.vertices, half.vertices)
-    with pytest.raises(ReconstructionError, match="overlap with the masks would fall"):
+    with pytest.raises(ReconstructionError, match="reduce the overlap with the masks too much"):
         denoise_within(raw, 0.4, crease_angle=1.0, views=views)
 
 
