@@ -11,7 +11,7 @@ import trimesh
 
 from experiments.dataset.parts import RADIUS, Category, Object, ObjectPart
 from refref_jax.data import meshes
-from refref_jax.geometry.triangle_meshes import is_watertight
+from refref_jax.geometry.triangle_meshes import is_watertight, volume
 
 # Largest distance of a vertex from the origin after scaling, as a share of `RADIUS`.
 _FILLED = 0.9
@@ -19,8 +19,11 @@ _FILLED = 0.9
 # Largest angle in radians between neighbouring faces of a smooth part.
 _CREASE = math.radians(30.0)
 
-# Largest share of a mesh's volume that its convex hull may add.
+# Largest share by which a convex mesh and its convex hull may differ in volume.
 _CONVEX = 1e-3
+
+# Smallest volume of a mesh, as a share of that of its bounding box.
+_FLAT = 1e-6
 
 
 def read_object(paths: Sequence[Path], materials: Sequence[str]) -> Object:
@@ -87,6 +90,8 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
             "a thin object two sides."
         )
     trimesh.repair.fix_normals(mesh, multibody=False)
+    if volume(mesh.vertices, mesh.faces) <= _FLAT * np.prod(np.ptp(mesh.vertices, axis=0)):
+        raise ValueError(f"{path} encloses no volume. Give a thin object some thickness.")
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
@@ -102,8 +107,8 @@ def _category(parts: Sequence[ObjectPart]) -> Category:
     if len(parts) > 1:
         return "mmncvx"
     mesh = trimesh.Trimesh(parts[0].vertices, parts[0].faces, process=False)
-    convex = mesh.convex_hull.volume <= (1.0 + _CONVEX) * abs(mesh.volume)
-    return "smcvx" if convex else "smncvx"
+    hull = mesh.convex_hull.volume
+    return "smcvx" if abs(hull - mesh.volume) <= _CONVEX * hull else "smncvx"
 
 
 def _smooth(vertices: np.ndarray, faces: np.ndarray) -> bool:

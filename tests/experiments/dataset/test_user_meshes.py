@@ -51,6 +51,23 @@ def test_read_object_recognises_convex_meshes(tmp_path):
     assert user_meshes.read_object([tmp_path / "orb.ply"], ["glass"]).category == "smcvx"
 
 
+def test_read_object_keeps_a_cavity(tmp_path):
+    outer, inner = (trimesh.creation.icosphere(3, radius=radius) for radius in (1.0, 0.5))
+    inner.invert()
+    trimesh.util.concatenate([outer, inner]).export(tmp_path / "hollow.ply")
+    made = user_meshes.read_object([tmp_path / "hollow.ply"], ["glass"])
+    (part,) = made.make(1.0)
+    assert made.category == "smncvx"
+    whole = (0.9 * RADIUS) ** 3 * outer.volume
+    assert volume(part.vertices, part.faces) == pytest.approx(whole * (1.0 - 0.5**3), rel=1e-6)
+
+
+def test_pieces_within_one_another_are_not_convex(tmp_path):
+    balls = [trimesh.creation.icosphere(3, radius=radius) for radius in (1.0, 0.5)]
+    trimesh.util.concatenate(balls).export(tmp_path / "twice.ply")
+    assert user_meshes.read_object([tmp_path / "twice.ply"], ["glass"]).category == "smncvx"
+
+
 def test_digest_tells_meshes_and_materials_apart(ring, tmp_path):
     trimesh.creation.icosphere(1).export(tmp_path / "orb.ply")
     found = {
@@ -67,9 +84,12 @@ def test_mistakes_end_before_anything_is_made(tmp_path):
     ball.update_faces(np.arange(len(ball.faces)) > 3)
     ball.export(tmp_path / "open.ply")
     (tmp_path / "text.ply").write_text("not a mesh")
+    corners = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 1]], process=False).export(tmp_path / "flat.ply")
     out = tmp_path / "out"
     for options, said in [
         (("--mesh=open.ply",), "open.ply is not closed"),
+        (("--mesh=flat.ply",), "flat.ply encloses no volume"),
         (("--mesh=none.ply",), "none.ply does not exist"),
         (("--mesh=text.ply",), "text.ply is not a mesh"),
         (("--mesh=orb.ply", "--material=wine"), "no material 'wine'"),
