@@ -9,7 +9,9 @@ import pytest
 
 from refref_jax.data.mesh_queries import find_containment, parts_around
 from refref_jax.data.scene_assembly import assemble_scene
+from refref_jax.geometry.rays import Rays
 from refref_jax.optics import media, path_tracing
+from refref_jax.optics.differentiable_paths import follow_branch
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.media import AMBIENT, EMPTY_SLOT
 from refref_jax.optics.path_settings import TREE, PathSettings
@@ -365,3 +367,28 @@ def test_facing_bends_light_by_faces_whatever_the_media():
     for name in ("points", "directions", "tau", "throughput", "num_bends", "statuses"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
     assert np.any(found.media != expected.media)
+
+
+def test_facing_with_overlaps_has_the_same_media_in_the_differentiable_tracer():
+    scene = scenes.build(*_overlapping_cup(), rule="facing")
+    ray = Rays(jnp.array([-3.0, 0.1, 0.2]), jnp.array([1.0, 0.0, 0.0]), jnp.float32(1e-3))
+    straight_on = jnp.zeros(_REFRACTED.max_bends, bool)
+    single = follow_branch(scene, ray, straight_on, settings=_REFRACTED)
+    paths = _paths(scene, scenes.rays([[-3.0, 0.1, 0.2]], [[1.0, 0.0, 0.0]]))
+    segments = int(single.num_bends) + 1
+    assert segments > 5
+    np.testing.assert_array_equal(single.media[:segments], paths.media[0, :segments])
+    np.testing.assert_allclose(single.tau[:segments], paths.tau[0, :segments], rtol=1e-5)
+
+    def last_direction(indices):
+        changed = scene._replace(interfaces=scene.interfaces._replace(index_inside=indices))
+        path = follow_branch(changed, ray, straight_on, settings=_REFRACTED)
+        return path.directions[segments - 1, 1]
+
+    indices = scene.interfaces.index_inside
+    slopes = jax.grad(last_direction)(indices)
+    assert np.all(np.isfinite(slopes)) and np.all(np.asarray(slopes) != 0.0)
+    for part in range(2):
+        step = jnp.zeros(2).at[part].set(1e-3)
+        change = last_direction(indices + step) - last_direction(indices - step)
+        assert slopes[part] == pytest.approx(float(change) / 2e-3, rel=0.02, abs=1e-3)

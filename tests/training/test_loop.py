@@ -312,6 +312,24 @@ def test_what_is_left_of_a_run_is_not_taken_over(tmp_path, left):
     assert "--resume" not in str(refused.value)
 
 
+def test_the_interior_list_of_overlapping_parts_is_stored(tmp_path):
+    balls = [scenes.ball(radius, subdivisions=1) for radius in (1.0, 0.7)]
+    balls[1] = balls[1]._replace(vertices=balls[1].vertices + 0.5)
+    scene = scenes.build(*balls, rule="facing")
+    assert scene.interfaces.index_by_face.tolist() == [True]
+    checkpoint_io.save_scene(tmp_path, SAVED, scene)
+    _assert_identical(checkpoint_io.load_scene(tmp_path), scene)
+
+
+def test_the_scene_of_an_earlier_version_is_read(tmp_path):
+    checkpoint_io.save_scene(tmp_path, SAVED, _GEOMETRY)
+    path = tmp_path / "geometry.npz"
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored if name != "index_by_face"}
+    np.savez(path, **arrays)
+    _assert_identical(checkpoint_io.load_scene(tmp_path), _GEOMETRY)
+
+
 @pytest.mark.parametrize("damage", ["truncated", "missing"])
 def test_a_damaged_geometry_is_named(tmp_path, damage):
     run_folder.create(tmp_path, CONFIG, SAVED, _GEOMETRY)
