@@ -54,7 +54,7 @@ class Outcome(NamedTuple):
     """What became of a bug.
 
     Attributes:
-      name: of the bug.
+      name: name of the bug.
       caught: whether a test failed.
       test: the test that failed, or why none did.
       seconds: how long the tests took.

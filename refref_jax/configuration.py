@@ -16,7 +16,7 @@ import os
 import sys
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
@@ -141,6 +141,12 @@ def convert_fields(record: Any) -> None:
             raise ValueError(f"{name} is {value!r}, not of type {kind.__name__}.")
 
 
+def nearest(word: str, words: Iterable[str]) -> str | None:
+    """Returns the most similar of some words, or `None` if none is similar."""
+    found = difflib.get_close_matches(word, list(words), 1)
+    return found[0] if found else None
+
+
 def hints_of(owner: Any) -> dict[str, Any]:
     """Returns the annotations of a class by field."""
     return typing.get_type_hints(owner)
@@ -223,8 +229,8 @@ def _unknown(key: str, hints: Mapping[str, Any]) -> str:
     for section, kind in hints.items():
         if dataclasses.is_dataclass(kind) and key in {f.name for f in dataclasses.fields(kind)}:
             return f"{key!r}, which belongs in {section!r}"
-    near = difflib.get_close_matches(key, hints, n=1)
-    return f"{key!r}" + (f": did you mean {near[0]!r}?" if near else "")
+    near = nearest(key, hints)
+    return f"{key!r}" + (f": did you mean {near!r}?" if near else "")
 
 
 def _with_present_names(

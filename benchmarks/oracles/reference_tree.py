@@ -72,8 +72,8 @@ def trace(
     Args:
       surfaces: the scene.
       cast: finds closest hits.
-      origins: of rays.
-      directions: of rays, of length 1.
+      origins: origins of rays.
+      directions: unit directions of rays.
       rule: which light to follow.
     """
     count = len(origins)

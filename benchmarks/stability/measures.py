@@ -15,7 +15,7 @@ class Measure(NamedTuple):
 
     Attributes:
       name: what is measured.
-      unit: of the error.
+      unit: unit of the error.
       run: takes a density of the lattice, returns the worst error.
       bound: what it may be at any density.
       slow: whether it takes more than some seconds.

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, get_args
 
 from experiments.runs import refraction_indices
 from refref_jax import choices, configuration
-from refref_jax.data import SceneError, scene_names, scene_properties
+from refref_jax.data import SceneError, scene_properties
 
 _ENDINGS = (".json", ".csv")
 
@@ -123,7 +123,7 @@ def _listed(where: str, row: Any, path: Path) -> ListedScene:
     if not isinstance(row, dict) or not isinstance(row.get("scene"), str) or not row["scene"]:
         raise SceneError(f"{where} does not have the key 'scene' with a folder or hf:CONFIG/SCENE.")
     if unknown := [key for key in row if key not in _KEYS]:
-        near = scene_names.nearest(unknown[0], _KEYS)
+        near = configuration.nearest(unknown[0], _KEYS)
         remedy = f"Write {near!r}, or remove it." if near else f"The keys are {', '.join(_KEYS)}."
         raise SceneError(f"{where}: {unknown[0]!r} is not a known key. {remedy}")
     options = []

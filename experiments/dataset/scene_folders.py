@@ -8,6 +8,7 @@ from typing import NamedTuple, TypeVar
 
 from experiments.cli import scenes as cli_scenes
 from experiments.dataset import scene_contents
+from refref_jax import configuration
 from refref_jax.data import SceneError, parquet_scenes, scene_names, scene_source
 from refref_jax.data.scene_source import LocalCopy
 
@@ -110,7 +111,7 @@ def _wanted(found: dict[str, _T], chosen: Sequence[str] | None, place: str) -> l
     """Returns the requested scenes."""
     for name in chosen or ():
         if name not in found:
-            near = scene_names.nearest(name, found)
+            near = configuration.nearest(name, found)
             advice = f"The nearest there is {near}." if near else f"There are {', '.join(found)}."
             raise SceneError(f"There is no scene {name} in {place}. {advice}")
     return [found[name] for name in (found if chosen is None else dict.fromkeys(chosen))]

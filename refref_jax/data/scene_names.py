@@ -10,13 +10,13 @@
 Errors of the parser suggest the nearest names.
 """
 
-import difflib
 import glob
 from collections.abc import Iterable
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import NamedTuple
 
+from refref_jax import configuration
 from refref_jax.choices import RuleName
 from refref_jax.data import SceneError
 
@@ -111,10 +111,10 @@ def parse(name: str) -> SceneName:
     if is_name(name):
         return SceneName(*name.split("_", 2))
     words = Path(name).name.split("_")
-    background, category = nearest(words[0], BACKGROUNDS), None
+    background, category = configuration.nearest(words[0], BACKGROUNDS), None
     words = words[background is not None :]
     if words:
-        category = nearest(words[0], CATEGORIES)
+        category = configuration.nearest(words[0], CATEGORIES)
         words = words[category is not None :]
     wanted = SceneName(background or "cube", category or "smcvx", "_".join(words) or "ball")
     raise SceneError(
@@ -137,7 +137,7 @@ def parse_source(source: str) -> SceneName:
     if config not in CONFIGS:
         raise SceneError(
             f"{config!r} is not a configuration of the data set. Write "
-            f"{nearest(config, CONFIGS) or 'one of ' + ', '.join(CONFIGS)}."
+            f"{configuration.nearest(config, CONFIGS) or 'one of ' + ', '.join(CONFIGS)}."
         )
     name = parse(text)
     if name.config != config:
@@ -191,9 +191,3 @@ def of_raw_folder(scene: Path) -> SceneName | None:
 def of_folder(scene: Path) -> str:
     """Returns the name of a scene's folder, or the published name in the raw release."""
     return str(of_raw_folder(scene) or scene.resolve().name)
-
-
-def nearest(word: str, words: Iterable[str]) -> str | None:
-    """Returns the most similar of some words, or `None` if none is similar."""
-    found = difflib.get_close_matches(word, list(words), 1)
-    return found[0] if found else None

@@ -330,7 +330,7 @@ def _one_of(*names: str, later: Sequence[str] = ()) -> Callable[[Any], str]:
         if value in later:
             raise _UnsuitableError(f"{' or '.join(names)}: {value} is not supported yet")
         if not isinstance(value, str) or value not in names:
-            near = scene_names.nearest(value, names) if isinstance(value, str) else None
+            near = configuration.nearest(value, names) if isinstance(value, str) else None
             raise _UnsuitableError(f"one of {', '.join(names)}{f': {near}?' if near else ''}")
         return value
 
@@ -453,7 +453,7 @@ def _checked(
     values = {}
     for key, value in _object(record, keys, sources).items():
         if key not in checks:
-            near = scene_names.nearest(key, checks)
+            near = configuration.nearest(key, checks)
             remedy = (
                 f"Write {near!r}, or remove it." if near else f"The keys are {', '.join(checks)}."
             )

@@ -193,7 +193,7 @@ def find_shards(repository: Repository, scene: SceneName) -> list[str]:
 
 def _nearest(scene: SceneName, scenes: Sequence[SceneName]) -> SceneName | None:
     """Returns a scene with the same or a similar object, preferably with the same background."""
-    thing = scene_names.nearest(scene.object, {each.object for each in scenes})
+    thing = configuration.nearest(scene.object, {each.object for each in scenes})
     found = [each for each in scenes if each.object == thing]
     return max(found, key=lambda each: each.background == scene.background, default=None)
 
