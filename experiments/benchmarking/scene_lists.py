@@ -136,7 +136,7 @@ def _listed(where: str, row: Any, path: Path) -> ListedScene:
     if "radius" in row:
         if not _is_positive(row["radius"]):
             raise SceneError(f"{where}: radius is {row['radius']!r}. Give a positive number.")
-        options.append(f"--radius={row['radius']:g}")
+        options.append(f"--radius={row['radius']!r}")
     options += _indices(where, row.get("ior", {}))
     source, properties = row["scene"], row.get("properties", "")
     if not isinstance(properties, str):
@@ -155,7 +155,7 @@ def _indices(where: str, indices: Any) -> list[str]:
             f"{where}: ior is {json.dumps(indices)}. Give positive numbers by material or mesh, as "
             'in {"glass": 1.52}, or glass=1.52 in CSV.'
         )
-    options = [f"--ior={name}={number:g}" for name, number in sorted(indices.items())]
+    options = [f"--ior={name}={number!r}" for name, number in sorted(indices.items())]
     refraction_indices.parse_named([word.removeprefix("--ior=") for word in options])
     return options
 

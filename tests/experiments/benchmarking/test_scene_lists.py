@@ -163,3 +163,10 @@ def test_properties_reach_trainings_and_reconstructions_and_are_recorded(
 def test_the_scenes_of_lists_are_checked_before_they_are_opened(tmp_path):
     path = _write(tmp_path / "a.json", [{"scene": "ball"}, {"scene": "hf:x/y"}])
     assert scene_lists.sources([path, "z"]) == [str(tmp_path / "ball"), "hf:x/y", "z"]
+
+
+def test_numbers_of_a_list_keep_all_their_digits(tmp_path):
+    path = tmp_path / "scenes.csv"
+    path.write_text("scene,radius,ior\nball,7.29998123,glass=1.45833333\n")
+    (listed,) = scene_lists.expand([str(path)])
+    assert listed.options == ("--radius=7.29998123", "--ior=glass=1.45833333")
