@@ -317,7 +317,9 @@ _centre = vector_within(
 _Checks = Mapping[str, Callable[[Any], Any]]
 
 _TOP: _Checks = {
-    "version": number_within(VERSION, VERSION, f"{VERSION}, the version that this library reads"),
+    "version": number_within(
+        float(VERSION), float(VERSION), f"{VERSION}, the version that this library reads"
+    ),
     "rule": one_of(*get_args(RuleName)),
     "ambient_index": _positive,
     "ior": _record,

@@ -89,7 +89,7 @@ def surface_point(
 
 
 def pack_meshes(
-    meshes: Sequence[Mesh], *, radiance: Sequence[Float[np.ndarray, "faces 3 3"]] = ()
+    meshes: Sequence[Mesh], *, radiance: Sequence[Float[np.ndarray, "_ 3 3"]] = ()
 ) -> Surfaces:
     """Builds the device record of meshes; parts have the numbers of their places, none is empty.
 

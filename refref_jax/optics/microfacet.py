@@ -83,7 +83,7 @@ def masking(
     leaving = jnp.where(leaves, leaving, 1.0)
     here = towards + _slope_length(towards, alpha)
     product = here * leaving
-    excess = towards * (_slope_length(leaving, alpha) - leaving)
+    excess = towards * jnp.maximum(_slope_length(leaving, alpha) - leaving, 0.0)
     return jnp.where(leaves, numerics.safe_divide(product, product + excess), 0.0)
 
 

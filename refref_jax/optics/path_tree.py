@@ -171,20 +171,21 @@ def polylines(
         num_bends=ends.num_bends,
         statuses=ends.statuses,
         hit_counts=walk.hit_counts,
-        path_lengths=walk.path_lengths + _lengths_to_stops(segments, ends, walk.path_lengths),
+        path_lengths=_up_to_stops(segments, ends, walk.path_lengths),
         stop=ends.stop,
     )
 
 
-def _lengths_to_stops(
-    segments: Segments, ends: Ends, like: Float[Array, "paths tallied"]
-) -> Float[Array, "paths tallied"] | float:
-    """Returns the lengths of last segments that end on opaque surfaces, by the part around them."""
+def _up_to_stops(
+    segments: Segments, ends: Ends, lengths: Float[Array, "paths tallied"]
+) -> Float[Array, "paths tallied"]:
+    """Adds the lengths of last segments that end on opaque surfaces to those in media."""
     if ends.stop is None:
-        return 0.0
+        return lengths
     length = ends.stop.tau - segments.tau[ends.segments]
-    through = 1 + jnp.arange(like.shape[1]) == segments.media[ends.segments][:, None]
-    return jnp.where(through & jnp.isfinite(length)[:, None], length[:, None], 0.0)
+    parts = jnp.arange(lengths.shape[1], dtype=jnp.int32)[None]
+    through = 1 + parts == segments.media[ends.segments][:, None]
+    return lengths + jnp.where(through & jnp.isfinite(length)[:, None], length[:, None], 0.0)
 
 
 class _Walk(NamedTuple):
