@@ -10,10 +10,10 @@ paper's code, are exact inside the mask, by definition, for methods that know th
 not ranked. The error of a distance is taken inside the mask with a natural background, which is at
 infinity, and over the image otherwise, like the paper's DMAE.
 
-The paper does not state the pixels of its DRMSE. It is unlikely to be over the image: the Oracle's
-is 0.00, but its DMAE there is 0.04 (cubes) and 0.15 (spheres), and an RMSE is never below the MAE
-of the same pixels. Our masked DRMSE is therefore next to the paper's, and that over the image
-has no counterpart.
+The paper does not state over which pixels its DRMSE is computed. It is unlikely to be the image:
+the oracle's DRMSE is 0.00, but its DMAE over the image is 0.04 (cubes) and 0.15 (spheres), and an
+RMSE is never below the MAE of the same pixels. The tables therefore show our masked DRMSE next to
+the paper's; our DRMSE over the image has no counterpart.
 """
 
 import math

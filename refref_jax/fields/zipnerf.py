@@ -1,4 +1,4 @@
-"""Zip-NeRF field type: proposal field, radiance field and preset sizes.
+"""Zip-NeRF field kind: proposal field, radiance field and preset sizes.
 
 The proposal field has density only, and is cheap to query many times along a path. The radiance
 field has density and view-dependent colour. The interface of both is pure functions over Gaussians

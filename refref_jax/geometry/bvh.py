@@ -34,7 +34,7 @@ class BVH(NamedTuple):
 
     Attributes:
       nodes: one node table for each octant of directions (see `bvh_nodes`).
-      triangles: corners of each primitive, in leaf order, padded by `LEAF_SIZE` that are never hit.
+      triangles: corners of each primitive, in leaf order, then `LEAF_SIZE` that are never hit.
       facets: the same triangles, precomputed for the intersection test (see `triangles`).
     """
 

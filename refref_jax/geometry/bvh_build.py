@@ -74,7 +74,10 @@ def _areas(
     owner: Int[np.ndarray, " faces"],
     scene: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
 ) -> tuple[Float[np.ndarray, " faces"], Float[np.ndarray, " faces"]]:
-    """Returns half the areas of the boxes around each node's faces up to, and from, every face."""
+    """Returns half the areas of two boxes per face: around its node's faces up to it, and from it.
+
+    Both include the face itself.
+    """
     before, after = [], []
     for axis in range(3):
         base, top = scene[0][axis], scene[1][axis]

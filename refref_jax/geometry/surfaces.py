@@ -80,7 +80,7 @@ def surface_point(
 
 
 def pack_meshes(meshes: Sequence[Mesh]) -> Surfaces:
-    """Builds the device record of meshes; parts have the numbers of their places, none is empty."""
+    """Packs meshes for the device; none may be empty, and parts are numbered in their order."""
     return build_surfaces(
         np.concatenate([np.zeros((0, 3, 3)), *(mesh.vertices[mesh.faces] for mesh in meshes)]),
         np.concatenate([np.zeros((0, 3, 3)), *(mesh.normals for mesh in meshes)]),

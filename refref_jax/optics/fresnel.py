@@ -1,4 +1,4 @@
-"""Fresnel equations for unpolarised light. Letters as in `snell`."""
+"""Fresnel equations for unpolarised light. Symbols as in `snell`."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float

@@ -2,7 +2,7 @@
 
 Both tracers, `wavefront` and `differentiable_paths`, are built from these steps.
 
-Letters as in `snell` and `light_paths`. The geometric normal determines the side that a ray comes
+Symbols as in `snell` and `light_paths`. The geometric normal determines the side that a ray comes
 from and the origins of the new rays; the shading normal determines their directions.
 
 Source: paper (arXiv 2505.05848), section 4.2, with its Fresnel blend; the energy-conserving
@@ -135,7 +135,7 @@ def shares(
       reflectance: Fresnel's `R`.
       total: whether reflection is total.
       first: whether this is the first surface of a path.
-      strength: incident throughput times the interface's tint, the largest of its RGB.
+      strength: largest RGB component of incident throughput times the interface's tint.
     """
     if settings.reflections == "all":
         partial = reflectance

@@ -7,7 +7,7 @@ Light paths are constants for differentiation: field parameters have gradients a
 and the scene do not, and differentiating with respect to these is an error (use
 `differentiable_paths`).
 
-Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
+Source: paper (arXiv 2505.05848), section 4.2. Symbols as in `light_paths`.
 """
 
 from typing import NamedTuple

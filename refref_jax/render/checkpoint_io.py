@@ -211,5 +211,5 @@ def load_scene(run: Path) -> Scene:
 
 
 def _brief(error: Exception) -> str:
-    """Returns the kind of an error and the first line of what it says."""
+    """Returns the kind of an error and the first line of its message."""
     return f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"

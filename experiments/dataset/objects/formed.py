@@ -1,7 +1,7 @@
 """Makes parts from fields (see `distance_fields`), and centres objects (NumPy only).
 
-*Core*: a smaller solid of another medium inside a figure of clear glass, like the tinted spirit in
-a bottle in the shape of an animal.
+The *core* of a figure of clear glass is a smaller solid of another medium inside it, like the
+tinted spirit in a bottle shaped like an animal.
 """
 
 from collections.abc import Callable, Sequence
