@@ -158,8 +158,8 @@ def _thin_layer(
 ) -> Bool[np.ndarray, " samples"]:
     """Returns where a thin layer lies in front of a part, with a lower index than both sides.
 
-    Light that would continue if the sides touched is totally reflected there. A layer of higher
-    index is a real wall, as of glass around a liquid, and refracts light correctly.
+    Some light is totally reflected there that would pass if the two sides touched each other. A
+    layer of higher index is a real wall, as of glass around a liquid, and refracts light correctly.
     """
     part, other = pair
     thin = (gaps.distances > _COINCIDENT * size) & (gaps.distances <= _THIN * size)

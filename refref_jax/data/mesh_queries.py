@@ -71,7 +71,7 @@ class SampledSurface(NamedTuple):
       normals: unit normals of the triangles.
       faces: triangle of each sample.
       points: positions of the samples.
-      tree: search tree of more such points, and the centroids of all triangles.
+      tree: search tree of a larger number of such points and of the centroids of all triangles.
       owners: triangle of each point of the tree.
     """
 

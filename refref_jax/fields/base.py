@@ -1,8 +1,9 @@
 """Interface of field kinds: their configurations, functions and arithmetic precision.
 
-A radiance field has two functions, `init` and `radiance`; a proposal field has `init` and
-`density`. All are pure functions over Gaussians in the unit cube. A field kind is one module with a
-`FieldKind`, and one line in `registry`, through which all other modules query fields.
+A radiance field has two functions, `init_radiance` and `radiance`; a proposal field has
+`init_density` and `density`. All are pure functions over Gaussians in the unit cube. A field kind
+is one module with a `FieldKind`, and one line in `registry`, through which all other modules query
+fields.
 
 The precision is float32, or mixed with bfloat16: tables are then read and matrices multiplied in
 bfloat16, while parameters, sums, gradients and outputs stay in float32. bfloat16 has only 8
@@ -25,7 +26,7 @@ from refref_jax.choices import Footprint, Precision
 from refref_jax.sampling.cones import Gaussians
 
 Params = Any
-"""Pytree of arrays, from `init`."""
+"""Pytree of arrays, from `init_radiance` or `init_density`."""
 
 
 def check_precision(precision: str) -> None:

@@ -197,7 +197,7 @@ def _write_boxes(
 def _right_is_nearer(
     below: _Boxes, left: Int[np.ndarray, " nodes"], backwards: Bool[np.ndarray, "3"]
 ) -> Bool[np.ndarray, " nodes"]:
-    """Returns the nodes whose right child comes before the left along the octant's diagonal."""
+    """Returns which nodes have a right child that is nearer than the left one in an octant."""
     diagonal = np.where(backwards, -1.0, 1.0)
     middle = (below.lower + below.upper) @ diagonal
     return middle[left + 1] < middle[left]

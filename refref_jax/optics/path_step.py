@@ -127,8 +127,8 @@ def shares(
 
     If a reflection is not followed, the transmitted branch takes its share. If the weaker branch
     falls below the throughput threshold, the stronger one takes all, so the threshold neither
-    darkens the image nor adds noise. Shares are constant if a branch is below the threshold and
-    follow `reflectance` elsewhere, so their gradient is that of Fresnel's equations or 0.
+    darkens the image nor adds noise. If a branch is below the threshold, the shares are constant,
+    with gradient 0; otherwise, their gradient is that of `reflectance`.
 
     Args:
       settings: path settings.

@@ -65,7 +65,7 @@ def with_index(scene: Scene, index: Float[ArrayLike, ""], *, part: int = 0) -> S
 
 
 def in_one_precision(scene: Scene, rays: Rays) -> tuple[Scene, Rays]:
-    """Returns a scene and rays as JAX arrays of the highest precision among their arrays.
+    """Converts a scene and rays to JAX arrays, all in the highest precision that one of them has.
 
     Scenes are built in single precision, so rays in double precision are traced in double
     precision through corners that were rounded to single precision.

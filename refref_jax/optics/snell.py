@@ -47,7 +47,7 @@ def transmission(
 def reflect(direction: Float[Array, "3"], normal: Float[Array, "3"]) -> Float[Array, "3"]:
     """Returns the mirrored direction, for a unit normal on either side.
 
-    Source: paper, law of reflection; also its total internal reflection.
+    Source: paper, law of reflection and total internal reflection.
     """
     return direction - 2.0 * numerics.dot(direction, normal) * normal
 

@@ -208,7 +208,7 @@ def _planes(mesh: Mesh, patches: list[Int[np.ndarray, " _"]]) -> Float[np.ndarra
 def _flat_plane(
     points: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"], tolerance: float
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
-    """Returns the plane of most points: normal, a point of it, and the share near it."""
+    """Returns the plane near most points: its normal, one of its points, the share near it."""
     near = np.ones(len(points), bool)
     for _ in range(_FITS):
         some = weights * near

@@ -119,7 +119,11 @@ class ClosestSearch:
     def _nearest(
         self, points: Points, count: int
     ) -> tuple[Points, Values, Int[np.ndarray, " points"], Values]:
-        """Returns the closest of `count` pieces, and the distance of the furthest piece centre."""
+        """Returns the closest point on the `count` pieces with the nearest centres.
+
+        Returns:
+          The points, their distances and pieces, and the distance of the furthest of the centres.
+        """
         away, near = self._tree.query(points, k=[*range(1, count + 1)])
         corners = self._pieces[near].reshape(-1, 3, 3)
         on = closest_point(corners, np.repeat(points, count, axis=0)).reshape(-1, count, 3)
@@ -158,7 +162,7 @@ def signed_distance(mesh: Mesh) -> Field:
 def _edge_normals(
     faces: Faces, normals: Float[np.ndarray, "faces 3"]
 ) -> Float[np.ndarray, "faces 3 3"]:
-    """Returns for every edge, indexed by the opposite corner, the sum of its faces' normals."""
+    """Returns the sum of both faces' normals at every edge, indexed by the opposite corner."""
     edges = np.sort(faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
     _, edge = np.unique(edges, axis=0, return_inverse=True)
     edge = edge.reshape(-1)

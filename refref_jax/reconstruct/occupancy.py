@@ -71,7 +71,7 @@ class OccupancyTrainingConfig:
       solidity: weight `lambda_v` of the push outwards; without it flat faces keep dents, and three
         times as much distorts outlines.
       reach: standard deviation of the steps between compared normals, in cells of the finest grid.
-      surface: number of rays per batch for all terms but the first.
+      surface: number of rays per batch that are used for the terms after the first.
       band: distance from an outline up to which a ray counts as near it, pixels.
     """
 

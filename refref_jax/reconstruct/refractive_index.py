@@ -331,7 +331,7 @@ def _rungs(search: IndexSearch) -> tuple[float, ...]:
 
 
 def _lowest_rungs(heights: Sequence[float], count: int) -> list[int]:
-    """Returns the lowest rungs that are not adjacent to each other, as those share a valley."""
+    """Returns the lowest rungs, but no two adjacent ones, which would share a valley."""
     chosen: list[int] = []
     for rung in np.argsort(np.where(np.isfinite(heights), heights, np.inf), kind="stable"):
         if len(chosen) < count and all(abs(int(rung) - other) > 1 for other in chosen):

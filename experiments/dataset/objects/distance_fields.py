@@ -76,9 +76,9 @@ def sphere(centre: Vector, radius: float) -> Field:
 def ellipsoid(centre: Vector, radii: Vector) -> Field:
     """An ellipsoid along the axes.
 
-    Source: Eberly, Distance from a Point to an Ellipsoid (2013), with the reciprocal of the secular
-    equation as Moré and Sorensen (1983) solve theirs: it is concave, so that Newton's steps from
-    the left never pass its root.
+    Source: Eberly, Distance from a Point to an Ellipsoid (2013). Newton's method solves the
+    reciprocal of the secular equation, as in Moré and Sorensen (1983): it is concave, so that steps
+    from the left never pass its root.
     """
     middle, axes = np.asarray(centre, float), np.asarray(radii, float)
     _require(bool(np.all(axes > 0.0)), f"The radii {radii} of an ellipsoid are not all positive.")

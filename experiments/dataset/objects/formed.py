@@ -119,7 +119,7 @@ def softened(solid: Field) -> Field:
 
 
 def core(body: Field, wall: float) -> Field:
-    """Returns the interior of a 1-Lipschitz field below a wall, without its details."""
+    """Returns a rounded core of a 1-Lipschitz field, below a wall of a given thickness."""
     reserved = offset(body, -wall - _CORE_RESERVE)
     rounded = _blurred(reserved, width=_CORE_SOFTNESS, grid=_CORE_SPACING)
     return intersection(rounded, offset(body, -wall), blend=_CORE_BLEND)
