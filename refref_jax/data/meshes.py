@@ -227,7 +227,7 @@ def published_meshes(thing: str, paths: Sequence[Path]) -> list[Path]:
 
 
 def without_colour(parts: Sequence[MeshPart]) -> list[MeshPart]:
-    """Returns the parts with clear surfaces and media.
+    """Returns the parts without their colours, with clear surfaces and media.
 
     This is for fields that learn the colour of glass from images, as the paper's oracle does: a
     tint that is already applied to the light paths would count twice.

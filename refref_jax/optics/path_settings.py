@@ -83,8 +83,8 @@ class PathSettings:
       max_bends: largest number of refractions and reflections of a path.
       reflections: reflections to follow. `none` follows only total internal reflections; `first`
         adds the reflection at the first surface, untraced; `all` follows every reflection.
-      total_reflection: `followed`, or `ended`: paths continue straight at a total internal
-        reflection, as in the paper's ablation.
+      total_reflection: treatment of total internal reflection. `followed` reflects paths; `ended`
+        lets them continue straight, as in the paper's ablation.
       min_throughput: throughput threshold for following a branch, compared to the largest RGB
         component. A weaker branch leaves its share to its sibling, so that energy is conserved.
       reentry: `impossible` states that a ray that has left the objects never hits one again, as

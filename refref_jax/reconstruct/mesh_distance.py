@@ -9,8 +9,8 @@ is exact on closed surfaces.
 
 Correct masks agree with the silhouettes of their visual hull. If a mask marks too much, the others
 carve the excess away, and only this mask disagrees with the hull. If it marks too little, it carves
-away part of the object: it agrees, and all others disagree. The volume that no other mask carves
-away identifies it (`carved_alone`).
+away part of the object, so it agrees with the hull, but all other masks disagree. The volume that
+no other mask carves away identifies it (`carved_alone`).
 
 All of this runs on the host; only silhouettes are traced with JAX.
 

@@ -56,7 +56,7 @@ def even_angles(cut: Sampling, *, lobes: int = 1, each: int = 8) -> Float[np.nda
 
 
 def faded(section: Section, share: Callable[[Values, Values], Values]) -> Warp:
-    """Returns the warp that applies a share of a section, 0 to 1, at each (r, z)."""
+    """Returns the warp that applies a section to a degree, 0 to 1, which depends on (r, z)."""
     return lambda angle, r, z: r * (1.0 + share(r, z) * (section(angle) - 1.0))
 
 
