@@ -278,7 +278,7 @@ def read_background(scene: Path, *, properties: SceneProperties | None = None) -
       The background, as NumPy arrays.
 
     Raises:
-      SceneError: if they do not describe the background, or an image is missing or broken.
+      SceneError: if the properties lack the background, or an image is missing or broken.
     """
     found = scene_properties.read(scene) if properties is None else properties
     path = found.origins.get("background", scene / scene_properties.FILE)

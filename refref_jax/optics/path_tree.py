@@ -8,7 +8,7 @@ paths, in the order of its rays, the heaviest path of each ray first. If the bat
 the total capacity, the weakest paths of all batches are dropped first, because the cost of sorting
 depends on the number of slots.
 
-Letters as in `light_paths`.
+Symbols as in `light_paths`.
 """
 
 from typing import NamedTuple
@@ -59,7 +59,7 @@ class Ends(NamedTuple):
     Attributes:
       segments: index of the last segment.
       rays: index of the camera ray.
-      throughput: share of the path in its ray's linear RGB.
+      throughput: share of the ray's linear RGB that the path carries.
       num_bends: number of bends.
       statuses: `PathStatus` of each path.
       stop: ends on opaque surfaces, `None` without such surfaces.
@@ -195,7 +195,8 @@ class _Walk(NamedTuple):
       segment: current segment of each path, `NO_SEGMENT` if it is done.
       stop: arc length at the end of the current segment.
       found: number of selected segments so far.
-      picked: selected segments, right-aligned; the first segment of a path goes leftmost.
+      picked: selected segments of each path, right-aligned. If they do not fit, they overwrite each
+        other at the left end, where the first segment of the path remains.
       stops: arc lengths at the ends of the selected segments.
       hit_counts: hit counts so far.
       path_lengths: path lengths so far.
