@@ -94,6 +94,15 @@ def test_the_materials_of_the_documentation_are_read(tmp_path):
     assert (film.material.kind, film.index) == ("thin_sheet", 1.45)
 
 
+def test_the_interior_of_a_part_is_clear_absorbing_or_a_field(tmp_path):
+    found = {}
+    for interior in ("clear", "absorbing", "field"):
+        told = read(_scene(tmp_path / interior, _part(interior=interior)))
+        found[interior] = next(iter(told.parts.values()))
+    assert [part.colour_known for part in found.values()] == [True, False, False]
+    assert [part.material.interior for part in found.values()] == [None, None, "field"]
+
+
 def test_one_number_holds_for_all_colours(tmp_path):
     metal = read(_scene(tmp_path / "a", _part(kind="conductor", eta=0.2, k=3)))
     assert next(iter(metal.parts.values())).material.complex_index == ((0.2,) * 3, (3.0,) * 3)
@@ -221,10 +230,11 @@ _WRONG = {
     "shading": (_part(shading="soft"), "shading is 'soft'. Give one of auto, smooth, flat"),
     "roughness": (_part(roughness=1.5), "roughness is 1.5. Give a number from 0 to 1."),
     "kind": (_part(kind="opaq"), "kind is 'opaq'. Give one of dielectric, opaque, conductor, "),
-    "interior": (_part(interior="clear"), "interior is 'clear'. Give one of field"),
+    "interior": (_part(interior="empty"), "interior is 'empty'. Give one of clear, absorbing, "),
+    "clear tea": (_part(interior="clear", tint=[1, 0, 0]), "is clear, but has a colour. Remove "),
     "radiance": (_part(kind="opaque", radiance="white"), "Give vertex_colours, or three numbers"),
-    "radiance of glass": (_part(radiance=[1, 1, 1]), "has no effect on a part of kind dielectric."),
-    "index of a surface": (_part(kind="opaque", index=1.5), "no effect on a part of kind opaque."),
+    "radiance of glass": (_part(radiance=[1, 1, 1]), "has no effect on kind dielectric."),
+    "index of a surface": (_part(kind="opaque", index=1.5), "no effect on kind opaque."),
     "metal without k": (_part(kind="conductor", eta=0.2), "lacks the key 'k' of a conductor."),
     "metal": (_part(kind="conductor", eta=0.2, k=-1), "k is -1. Give a non-negative number, or"),
     "two names": (_part(index=1.5, ior_inside=1.5), "has both 'index' and 'ior_inside'"),
