@@ -240,7 +240,7 @@ def measure_view(
     first: Float[np.ndarray, "h w"] | None = None,
     perceptual: Perceptual = _WITHOUT_EYES,
 ) -> Measured:
-    """Returns the metrics of an image, whoever rendered it; `None` where a value is missing.
+    """Returns the metrics of an image from any renderer; `None` where a value is missing.
 
     Args:
       rgb: image, sRGB in `[0, 1]`.
