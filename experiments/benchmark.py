@@ -8,7 +8,11 @@ later. Failed jobs are listed, and the others continue. After every job {out}/su
 methods by category and background next to the paper's numbers, the test views farthest from the
 training views, and ablations. {out}/tables has the same as Markdown, CSV, JSON and LaTeX. At the
 end {out}/report.html shows all results with images in one self-contained page, and
-{out}/pictures.jpg a typical view of each scene. --tables_only writes these files again.
+{out}/pictures.jpg a typical view of each scene, {out}/distances.jpg the same with distances.
+--tables_only writes these files again.
+
+--external=NAME=FOLDER adds the renderings of another method, which are measured and not trained:
+an image for each test view in FOLDER/SCENE, under the view's name.
 
 Jobs run on this machine, --jobs at a time, or on a Ray cluster with --ray=ADDRESS, whose machines
 must see --out, --scenes and these modules under the same paths. See docs/benchmark.md.
@@ -25,7 +29,7 @@ from typing import TYPE_CHECKING
 from absl import flags
 from etils import epy
 
-from experiments.benchmarking import methods, scene_lists
+from experiments.benchmarking import externals, methods, scene_lists
 from experiments.benchmarking.methods import Method
 from experiments.cli import app
 from experiments.cli import flags as cli_flags
@@ -38,7 +42,7 @@ if TYPE_CHECKING:
 
 with epy.lazy_imports():
     from experiments.benchmarking import plan, settings, summary, worker
-    from experiments.benchmarking.report import images, page
+    from experiments.benchmarking.report import page, sheets
     from experiments.runs import perceptual
     from refref_jax.training import presets
 
@@ -55,7 +59,15 @@ _METHODS = flags.DEFINE_list(
     ["straight", "oracle", "tree"],
     f"Methods: {', '.join(methods.METHODS)}; main, ablations and all are groups of them.",
 )
-app.check(_METHODS, methods.parse)
+app.check(_METHODS, lambda words: methods.parse(words) if words else None)
+_EXTERNAL = flags.DEFINE_multi_string(
+    "external",
+    [],
+    "Renderings of another method, as NAME=FOLDER, to measure like ours: FOLDER has a folder for "
+    "each scene, under its name, with the image of each test view as VIEW.png and, if known, its "
+    "distances as VIEW.exr, see docs/benchmark.md. May be repeated; --methods= trains nothing.",
+)
+app.check(_EXTERNAL, externals.parse)
 _OUT = cli_flags.out("Folder of the benchmark.")
 _PRESET = cli_flags.preset("Preset of all trainings.")
 _STEPS = flags.DEFINE_integer(
@@ -107,13 +119,14 @@ def main() -> None:
     _check_engine()
     cli_scenes.check_all(scene_lists.sources(_SCENES.value))
     scenes = plan.find_scenes(_SCENES.value, unpack=not _DRY_RUN.value)
-    chosen = methods.parse(_METHODS.value)
+    given = externals.parse(_EXTERNAL.value)
+    chosen = [] if given and not _METHODS.value else methods.parse(_METHODS.value)
     weights = perceptual.checked(_LPIPS_WEIGHTS.value)
     common = _settings(weights)
     opened = [scene for scene in scenes if scene.fingerprint]
-    benchmark = settings.extended(out, settings.asked(common, opened, chosen))
+    benchmark = settings.extended(out, settings.asked(common, opened, chosen, given))
     file = None if weights is None else str(weights.absolute())
-    planned, skipped = plan.plan_jobs(scenes, chosen, common, lpips_weights=file)
+    planned, skipped = plan.plan_jobs(scenes, chosen, common, lpips_weights=file, given=given)
     if _DRY_RUN.value:
         _list(out, planned, skipped)
         if packed := len(scenes) - len(opened):
@@ -147,7 +160,8 @@ def _make_tables(out: Path) -> None:
       ValueError: if unused flags are set, if there is no benchmark, or if another process works in
         it.
     """
-    unused = [f"--{each.name}" for each in (_SCENES, _METHODS, *_OF_JOBS, _DRY_RUN) if each.present]
+    of_runs = (_SCENES, _METHODS, _EXTERNAL, *_OF_JOBS, _DRY_RUN)
+    unused = [f"--{each.name}" for each in of_runs if each.present]
     if unused:
         raise ValueError(
             f"--tables_only does not use {', '.join(unused)}, because it only reads existing "
@@ -193,7 +207,8 @@ def _engine(out: Path) -> worker.Engine:
 def _list(out: Path, planned: Sequence[Job], skipped: Sequence[Skipped]) -> None:
     done = [plan.is_done(out, job) for job in planned]
     for job, is_done in zip(planned, done, strict=True):
-        words = " ".join([*job.train, *plan.given_properties(job)])
+        options = [f"--external={job.method}={job.external}"] if job.external else job.train
+        words = " ".join([*options, *plan.given_properties(job)])
         print(f"{'done' if is_done else 'to do':6} {job.name:48} {words}".rstrip())
     for each in skipped:
         print(f"{'skip':6} {each.name}: {each.reason}")
@@ -201,13 +216,14 @@ def _list(out: Path, planned: Sequence[Job], skipped: Sequence[Skipped]) -> None
 
 
 def _finish(out: Path) -> None:
-    """Writes report and contact sheet, and prints the paths of all results."""
+    """Writes report and images, and prints the paths of all results."""
     report = page.write(out, views=_REPORT_VIEWS.value, edge=_REPORT_EDGE.value)
     print(f"Summary: {out / summary.FILE}")
     print(f"Tables:  {out / summary.TABLES}")
     print(f"Results: {out / summary.RESULTS}")
     print(f"Report:  {report} ({report.stat().st_size / 1e6:.1f} MB)")
-    print(f"Images:  {images.write_sheet(out) or 'none, because the scenes are missing'}")
+    drawn = ", ".join(map(str, sheets.write(out)))
+    print(f"Images:  {drawn or 'none, because the scenes are missing'}")
 
 
 def _next(out: Path, done: Sequence[Method]) -> str:

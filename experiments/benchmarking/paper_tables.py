@@ -1,4 +1,4 @@
-"""Builds the tables that compare methods with each other and with the paper's rows.
+"""Builds the tables that compare methods with each other and with the published rows.
 
 - `main_table`: by category and background, like the paper's table 2.
 - `top_views_table`: the same means over the test views farthest from all training views (the
@@ -45,14 +45,25 @@ BACKGROUNDS = {
     OTHER: "other backgrounds",
 }
 
+EXTERNAL = "external"
+"""Group of methods whose renderings were given."""
+
 _THEIRS = (
-    "Rows marked *published* are the paper's own (arXiv 2505.05848), measured on its data, which "
-    "differs from ours: they are shown for orientation and excluded from best and second best."
+    f"Rows marked *published* are the authors' own, measured on their data, which differs from "
+    f"ours: they are shown for orientation and excluded from best and second best. "
+    f"*{published.PAPER}* is the paper, arXiv 2505.05848; *{published.PAGE}* is the project page "
+    "on that day, which has categories over all backgrounds. The two differ without a stated "
+    "reason."
+)
+_GIVEN = (
+    "Rows marked *external* are renderings by other programs, measured here like ours, from 8-bit "
+    "images. Their distances, if given, are in all three columns of distances, as for methods that "
+    "know no objects."
 )
 _MEANS = (
     "Mean over the images of a scene, then over scenes; ± is the standard error over scenes. "
     "Unknown values are shown as - and not counted. Best **bold**, and of three or more second "
-    "best <u>underlined</u>, among our methods that have all scenes of a block."
+    "best <u>underlined</u>, among the methods measured here that have all scenes of a block."
 )
 _SUBSTITUTED = (
     "Substituted distances equal the true ones inside the mask, as in the first release of the "
@@ -101,7 +112,8 @@ def main_table(found: Sequence[Record]) -> Table:
                 rows += _theirs(published.MAIN, category, background, tables.MAIN)
                 title = describe(category, background)
                 blocks.append(_marked(title, rows, tables.MAIN, own))
-    return _table("main", "Methods by category and background", (), tables.MAIN, blocks)
+    notes = _of_externals(found)
+    return _table("main", "Methods by category and background", notes, tables.MAIN, blocks)
 
 
 def top_views_table(found: Sequence[Record]) -> Table:
@@ -110,7 +122,7 @@ def top_views_table(found: Sequence[Record]) -> Table:
     rows = _ours(found, tables.TOP_VIEWS, top_metrics)
     rows += _theirs(published.TOP_VIEWS, published.ALL, published.ALL, tables.TOP_VIEWS)
     blocks = [_marked("all scenes", rows, tables.TOP_VIEWS, found)] if found else []
-    notes = (_FARTHEST.format(views=_views(found)), _DRMSE)
+    notes = (_FARTHEST.format(views=_views(found)), _DRMSE, *_of_externals(found))
     return _table("top_views", "Farthest test views", notes, tables.TOP_VIEWS, blocks)
 
 
@@ -161,25 +173,37 @@ def _marked(
 def _ours(
     found: Sequence[Record], wanted: Sequence[Quantity], metrics: Callable[[Record], Metrics]
 ) -> list[Row]:
-    """Returns a row for each method with results, in the order of the methods."""
+    """Returns a row for each method with results, in the order of the methods, ours first."""
     rows = []
-    for name, method in METHODS.items():
+    given = sorted({record.method for record in found} - set(METHODS))
+    for name in (*METHODS, *given):
         own = [record for record in found if record.method == name]
         if not own:
             continue
         known = [(metrics(record), record.background) for record in own]
         cells = [mean_over(tables.value(each, *pair) for pair in known) for each in wanted]
-        rows.append(tables.row(method.label, "ours", len(own), cells))
+        if name in METHODS:
+            rows.append(tables.row(METHODS[name].label, "ours", len(own), cells))
+        else:
+            rows.append(tables.row(name, "external", len(own), cells))
     return rows
 
 
 def _without_ablations(found: Sequence[Record]) -> list[Record]:
-    return [record for record in found if METHODS[record.method].group == "main"]
+    return [
+        record
+        for record in found
+        if record.method not in METHODS or METHODS[record.method].group == "main"
+    ]
+
+
+def _of_externals(found: Sequence[Record]) -> tuple[str, ...]:
+    return (_GIVEN,) if any(record.method not in METHODS for record in found) else ()
 
 
 def _theirs(table: str, category: str, background: str, wanted: Sequence[Quantity]) -> list[Row]:
     return [
-        tables.row(row.method, "published", None, [row.cell(each) for each in wanted])
+        tables.row(row.method, "published", None, [row.cell(each) for each in wanted], row.version)
         for row in published.rows(table, category, background)
     ]
 

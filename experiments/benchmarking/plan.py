@@ -1,6 +1,8 @@
 """Plans a benchmark: its scenes, its jobs, and the inputs that determine each result.
 
-There is one job for each scene and method, and one for the reconstruction that some wait for:
+There is one job for each scene and method, and one for the reconstruction that some wait for. The
+job of an external method (`externals`) measures images that are given; it is done again if these
+have changed:
 
 {out}/jobs/{scene}/{method}/result.json    exists when the job is finished, see `results`
                            /run/           the trained run, with its evaluation
@@ -22,7 +24,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.benchmarking import scene_lists
+from experiments.benchmarking import externals, scene_lists
+from experiments.benchmarking.externals import External
 from experiments.benchmarking.methods import RECONSTRUCTION, Method, Need, same_as, same_inside
 from experiments.benchmarking.settings import Scene, Settings, digest
 from experiments.cli import scenes as cli_scenes
@@ -61,6 +64,8 @@ class Job(NamedTuple):
       lpips_weights: file of LPIPS's weights.
       properties: properties given with the scene, as options of `experiments.train`.
       overlay: file of properties given with the scene, or an empty string.
+      external: folder of the renderings of an external method, or an empty string.
+      digest: hash of these renderings at planning time; empty if the scene is not unpacked yet.
     """
 
     scene: str
@@ -73,6 +78,8 @@ class Job(NamedTuple):
     lpips_weights: str | None
     properties: tuple[str, ...] = ()
     overlay: str = ""
+    external: str = ""
+    digest: str = ""
 
     @property
     def name(self) -> str:
@@ -111,27 +118,49 @@ def plan_jobs(
     settings: Settings,
     *,
     lpips_weights: str | None = None,
+    given: Sequence[External] = (),
 ) -> tuple[list[Job], list[Skipped]]:
     """Returns all jobs, scene by scene, and the skipped ones.
 
     A reconstruction precedes the jobs that depend on it. A scene whose test views cannot be read is
     skipped, because it could be trained but not evaluated. A scene that is broken in another way is
     kept: each of its jobs fails with an error message.
+
+    Args:
+      scenes: scenes of the benchmark.
+      methods: methods to train.
+      settings: settings of all results.
+      lpips_weights: file of LPIPS's weights.
+      given: external methods.
+
+    Raises:
+      ValueError: if the renderings of an external method are not complete.
     """
     jobs: list[Job] = []
     skipped: list[Skipped] = []
     for scene in scenes:
         place = (scene.name, scene.path, scene.fingerprint)
-        given = (settings, lpips_weights, scene.options, scene.properties)
-        reasons = _reasons(scene, methods, settings.preset)
+        common = (settings, lpips_weights, scene.options, scene.properties)
+        reasons = _reasons(scene, methods, given, settings.preset)
         skipped += [Skipped(scene.name, name, reason) for name, reason in reasons.items()]
         possible = [method for method in methods if method.name not in reasons]
         if any(method.reconstructed for method in possible):
-            jobs.append(Job(*place, RECONSTRUCTION, (), False, *given))
+            jobs.append(Job(*place, RECONSTRUCTION, (), False, *common))
         jobs += [
-            Job(*place, each.name, each.train, each.reconstructed, *given) for each in possible
+            Job(*place, each.name, each.train, each.reconstructed, *common) for each in possible
         ]
+        for each in given:
+            if each.name not in reasons:
+                folder = externals.folder_of(each, scene.name, alone=len(scenes) == 1)
+                job = Job(*place, each.name, (), False, *common, external=str(folder))
+                jobs.append(job._replace(digest=_digest(job)) if scene.fingerprint else job)
     return jobs, skipped
+
+
+def _digest(job: Job) -> str:
+    """Returns the hash of the renderings of an external method."""
+    limit = job.settings.limit
+    return externals.digest(Path(job.external), Path(job.path), split=SPLIT, limit=limit)
 
 
 def options(method: str, train: Sequence[str], settings: Settings) -> dict[str, list[str]]:
@@ -147,6 +176,19 @@ def options(method: str, train: Sequence[str], settings: Settings) -> dict[str, 
     return {
         "train": [*settings.training(), *train],
         "evaluate": list(settings.evaluation()),
+    }
+
+
+def external_options(settings: Settings, digest: str) -> dict[str, list[str]]:
+    """Returns the options of the job of an external method, which determine its result.
+
+    Args:
+      settings: settings of the benchmark.
+      digest: hash of the renderings.
+    """
+    return {
+        "metrics": [f"--split={SPLIT}", *settings.views()],
+        externals.OPTIONS: [f"--renderings=sha256:{digest}"],
     }
 
 
@@ -187,11 +229,24 @@ def job_folder(out: Path, job: Job) -> Path:
 
 
 def is_done(out: Path, job: Job) -> bool:
-    """Returns whether the result of a job exists."""
-    return (job_folder(out, job) / RESULT).is_file()
+    """Returns whether the result of a job exists; that of other renderings does not count."""
+    path = job_folder(out, job) / RESULT
+    return path.is_file() and (not job.external or _measures(path, job))
 
 
-def _reasons(scene: Scene, methods: Sequence[Method], preset: str) -> dict[str, str]:
+def _measures(path: Path, job: Job) -> bool:
+    """Returns whether a result is that of the present renderings of an external method."""
+    try:
+        made = configuration.parse_json(path.read_text("utf-8"))["options"]
+        wanted = external_options(job.settings, job.digest)
+        return made[externals.OPTIONS] == wanted[externals.OPTIONS]
+    except (ValueError, KeyError, TypeError):
+        return False
+
+
+def _reasons(
+    scene: Scene, methods: Sequence[Method], given: Sequence[External], preset: str
+) -> dict[str, str]:
     """Returns the reasons for skipping methods, by name."""
     if not scene.fingerprint:  # what the scene lacks is found when it is unpacked
         pairs = {method.name: same_as(method, preset) for method in methods}
@@ -201,7 +256,8 @@ def _reasons(scene: Scene, methods: Sequence[Method], preset: str) -> dict[str, 
     try:
         scene_folder.read_frames(Path(scene.path), SPLIT)
     except ValueError as error:
-        return {method.name: f"its {SPLIT} views cannot be read: {error}" for method in methods}
+        names = [each.name for each in (*methods, *given)]
+        return dict.fromkeys(names, f"its {SPLIT} views cannot be read: {error}")
     requires = {need for method in methods for need in method.requires}
     lacks, inside = _lacking(scene, requires), _inside(scene)
     reasons = {}

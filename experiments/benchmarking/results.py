@@ -15,7 +15,7 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.benchmarking import plan, settings
+from experiments.benchmarking import externals, plan, settings
 from experiments.benchmarking.methods import METHODS, RECONSTRUCTION
 from experiments.benchmarking.settings import Benchmark, Settings
 from refref_jax import configuration
@@ -129,6 +129,11 @@ class Record(NamedTuple):
 def compared(found: list[Record]) -> list[Record]:
     """Returns the results of methods, without those of reconstructions."""
     return [record for record in found if record.method != RECONSTRUCTION]
+
+
+def is_external(record: Record) -> bool:
+    """Returns whether a result is that of an external method, whose renderings were given."""
+    return externals.OPTIONS in record.options
 
 
 def category_and_background(scene: str) -> tuple[str, str]:
@@ -311,7 +316,28 @@ def _check_method(path: Path, record: Record, benchmark: Benchmark) -> None:
             f"{path} was made with other settings than those of {path.parents[3] / settings.FILE}, "
             f"so it is not comparable. {_TAKE_OUT}"
         )
-    if record.method not in (*METHODS, RECONSTRUCTION):
+    expected = _expected_options(path, record, benchmark)
+    # The fingerprint covers the properties given with a scene; renderings may be given again.
+    for command in sorted({*expected, *record.options} - {plan.PROPERTIES, externals.OPTIONS}):
+        made, asked = record.options.get(command, []), expected.get(command, [])
+        if made != asked:
+            raise ValueError(
+                f"{path} was made by {command} {' '.join(made)}, but here {record.method} is "
+                f"{command} {' '.join(asked)}. {_TAKE_OUT}"
+            )
+
+
+def _expected_options(path: Path, record: Record, benchmark: Benchmark) -> dict[str, list[str]]:
+    """Returns the options that a method's jobs have in this benchmark and version."""
+    is_ours = record.method in (*METHODS, RECONSTRUCTION)
+    if is_external(record):
+        if is_ours:
+            raise ValueError(
+                f"{path} has renderings of the external method {record.method}, but this version "
+                "trains a method of that name. Remove its folder, and give them another name."
+            )
+        return plan.external_options(benchmark.settings, "")
+    if not is_ours:
         raise ValueError(
             f"{path} has the method {record.method}, which is unknown in this version. Use the "
             "version that made it, or remove its folder."
@@ -319,15 +345,7 @@ def _check_method(path: Path, record: Record, benchmark: Benchmark) -> None:
     train = benchmark.methods.get(record.method)
     if train is None and record.method in METHODS:
         train = METHODS[record.method].train
-    expected = plan.options(record.method, train or (), benchmark.settings)
-    # The fingerprint covers the properties given with a scene.
-    for command in sorted({*expected, *record.options} - {plan.PROPERTIES}):
-        made, asked = record.options.get(command, []), expected.get(command, [])
-        if made != asked:
-            raise ValueError(
-                f"{path} was made by {command} {' '.join(made)}, but here {record.method} is "
-                f"{command} {' '.join(asked)}. {_TAKE_OUT}"
-            )
+    return plan.options(record.method, train or (), benchmark.settings)
 
 
 def _check_scene(path: Path, record: Record, fingerprint: str) -> None:

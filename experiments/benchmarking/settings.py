@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from experiments.benchmarking.externals import External
 from experiments.benchmarking.methods import Method
 from refref_jax import atomic_files
 from refref_jax.data import scene_folder
@@ -48,8 +49,11 @@ class Settings:
 
     def evaluation(self) -> tuple[str, ...]:
         """Returns the flags that all evaluations share, except for the file of LPIPS's weights."""
-        limit = () if self.limit is None else (f"--limit={self.limit}",)
-        return (f"--rays_per_pixel={self.rays_per_pixel}", *limit)
+        return (f"--rays_per_pixel={self.rays_per_pixel}", *self.views())
+
+    def views(self) -> tuple[str, ...]:
+        """Returns the flags that select the views of an evaluation."""
+        return () if self.limit is None else (f"--limit={self.limit}",)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,19 +83,27 @@ class Benchmark:
       settings: settings of all results.
       scenes: scenes by name.
       methods: training options of each method, by its name.
+      externals: latest absolute folder of the renderings of each external method, by its name.
     """
 
     settings: Settings
     scenes: dict[str, Scene]
     methods: dict[str, tuple[str, ...]]
+    externals: dict[str, str] = dataclasses.field(default_factory=dict)
 
 
-def asked(settings: Settings, scenes: Sequence[Scene], methods: Sequence[Method]) -> Benchmark:
+def asked(
+    settings: Settings,
+    scenes: Sequence[Scene],
+    methods: Sequence[Method],
+    externals: Sequence[External] = (),
+) -> Benchmark:
     """Returns the benchmark that a command requests."""
     return Benchmark(
         settings,
         {scene.name: scene for scene in scenes},
         {method.name: method.train for method in methods},
+        {external.name: external.folder for external in externals},
     )
 
 
@@ -113,8 +125,9 @@ def read(out: Path) -> Benchmark:
                 for name, scene in record["scenes"].items()
             },
             {name: tuple(options) for name, options in record["methods"].items()},
+            dict(record.get("externals", {})),
         )
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(
             f"{path} is not a valid benchmark ({error!r}). Restore it, or give another --out."
         ) from error
@@ -146,7 +159,12 @@ def extended(out: Path, more: Benchmark) -> Benchmark:
                 f"In {out} the method {name} is {' '.join(known)}, but in this version it is "
                 f"{' '.join(options)}. Use the version that started it, or another --out."
             )
-    return Benchmark(begun.settings, begun.scenes | more.scenes, dict(begun.methods) | more.methods)
+    return Benchmark(
+        begun.settings,
+        begun.scenes | more.scenes,
+        begun.methods | more.methods,
+        begun.externals | more.externals,
+    )
 
 
 def write(out: Path, benchmark: Benchmark) -> None:

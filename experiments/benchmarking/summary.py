@@ -38,6 +38,7 @@ _HEAD = (
     "table",
     "block",
     "origin",
+    "version",
     "method",
     "quantity",
     "mean",
@@ -109,11 +110,7 @@ def write(
     _write_text(out / FILE, "\n".join([*lines, *map(markdown, made)]))
     index = {
         "settings": dataclasses.asdict(benchmark.settings),
-        "methods": {
-            name: {"label": METHODS[name].label, "group": METHODS[name].group}
-            for name in METHODS
-            if name in benchmark.methods or any(name == record.method for record in found)
-        },
+        "methods": {name: _described(name) for name in _methods(benchmark, found)},
         "jobs": [_indexed(out, record) for record in everything],
         "failed": dict(failed),
         "skipped": [each._asdict() for each in skipped],
@@ -157,15 +154,29 @@ def _has_result(out: Path, name: str) -> bool:
     return (out / plan.FOLDER / name / plan.RESULT).is_file()
 
 
+def _methods(benchmark: Benchmark, found: Sequence[Record]) -> list[str]:
+    """Returns the names of all methods that are requested or have results, external ones last."""
+    known = {*benchmark.methods, *(record.method for record in found)}
+    own = [name for name in METHODS if name in known]
+    return list(dict.fromkeys([*own, *benchmark.externals, *sorted(known.difference(METHODS))]))
+
+
+def _described(name: str) -> dict[str, str]:
+    """Returns the label and the group of a method; an external one is called by its name."""
+    if name not in METHODS:
+        return {"label": name, "group": paper_tables.EXTERNAL}
+    return {"label": METHODS[name].label, "group": METHODS[name].group}
+
+
 def _missing(
     out: Path, benchmark: Benchmark, failed: Mapping[str, str], skipped: Sequence[Skipped]
 ) -> list[tuple[str, str]]:
     """Returns the scenes and methods of a benchmark that lack a result for no known reason."""
     reported = {*failed, *(each.name for each in skipped)}
+    requested = [name for name in METHODS if name in benchmark.methods]
     return [
         (scene, method)
-        for method in METHODS
-        if method in benchmark.methods
+        for method in (*requested, *benchmark.externals)
         for scene in sorted(benchmark.scenes)
         if (name := f"{scene}/{method}") not in reported and not _has_result(out, name)
     ]
@@ -245,6 +256,7 @@ def table_as_csv(table: Table) -> str:
             table.name,
             block.title,
             row.origin,
+            row.version,
             row.label,
             column.label,
             _text(cell.mean),
@@ -274,6 +286,7 @@ def table_as_json(table: Table) -> dict[str, Any]:
                         {
                             "method": row.label,
                             "origin": row.origin,
+                            "version": row.version,
                             "scenes": row.scenes,
                             "cells": [
                                 {**cell._asdict(), "mark": mark}
@@ -329,7 +342,9 @@ def _row(record: dict[str, Any]) -> Row:
         for cell in record["cells"]
     ]
     marks = tuple(cell["mark"] for cell in record["cells"])
-    return Row(record["method"], record["origin"], record["scenes"], tuple(cells), marks)
+    version = record.get("version", "")  # indices of earlier versions lack it
+    whole = (tuple(cells), marks, version)
+    return Row(record["method"], record["origin"], record["scenes"], *whole)
 
 
 def _csv(rows: Sequence[Sequence[object]]) -> str:
@@ -375,7 +390,7 @@ def latex(table: Table) -> str:
     count = len(table.columns) + 2
     heads = [f"{column.latex}{_LATEX_ARROWS[column.better]}" for column in table.columns]
     lines = [
-        f"% {table.title}. Published rows and columns: arXiv 2505.05848, on its data.",
+        f"% {table.title}. Published rows and columns: the data of arXiv 2505.05848.",
         *(f"% {_MARKS.sub('', note)}" for note in table.notes),
         rf"\begin{{tabular}}{{@{{}}l{'r' * (count - 1)}@{{}}}}",
         r"\toprule",
@@ -391,7 +406,8 @@ def latex(table: Table) -> str:
 
 
 def _markdown_row(row: Row, columns: Sequence[Column]) -> list[str]:
-    label = in_markdown(row.label) + (", *published*" if row.origin == "published" else "")
+    source = tables.source(row)
+    label = in_markdown(row.label) + (f", *{source}*" if source else "")
     cells = [
         _marked(cell, column, _MARKDOWN_MARKS[mark], " ± {}")
         for cell, column, mark in zip(row.cells, columns, row.marks, strict=True)
@@ -400,7 +416,8 @@ def _markdown_row(row: Row, columns: Sequence[Column]) -> list[str]:
 
 
 def _latex_row(row: Row, columns: Sequence[Column]) -> list[str]:
-    label = _escaped(row.label) + (r" \emph{(published)}" if row.origin == "published" else "")
+    source = tables.source(row)
+    label = _escaped(row.label) + (rf" \emph{{({source})}}" if source else "")
     cells = [
         _marked(cell, column, _LATEX_MARKS[mark], r" {{\tiny$\pm${}}}")
         for cell, column, mark in zip(row.cells, columns, row.marks, strict=True)

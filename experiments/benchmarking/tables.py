@@ -23,7 +23,7 @@ from typing import Literal, NamedTuple
 
 Better = Literal["higher", "lower"]
 Mark = Literal["", "best", "second"]
-Origin = Literal["ours", "published"]
+Origin = Literal["ours", "external", "published"]
 
 
 class Cell(NamedTuple):
@@ -153,10 +153,11 @@ class Row(NamedTuple):
 
     Attributes:
       label: label of the method.
-      origin: origin of the numbers, ours or published.
+      origin: origin of the numbers: a method of ours, given renderings, or published.
       scenes: number of scenes of the method; `None` for published rows.
       cells: number for each column.
       marks: mark for each cell.
+      version: date of a published row.
     """
 
     label: str
@@ -164,6 +165,7 @@ class Row(NamedTuple):
     scenes: int | None
     cells: tuple[Cell, ...]
     marks: tuple[Mark, ...]
+    version: str = ""
 
 
 class Block(NamedTuple):
@@ -191,15 +193,23 @@ class Table(NamedTuple):
     blocks: tuple[Block, ...]
 
 
-def row(label: str, origin: Origin, scenes: int | None, cells: Sequence[Cell]) -> Row:
+def row(
+    label: str, origin: Origin, scenes: int | None, cells: Sequence[Cell], version: str = ""
+) -> Row:
     """Returns a row without marks."""
-    return Row(label, origin, scenes, tuple(cells), ("",) * len(cells))
+    return Row(label, origin, scenes, tuple(cells), ("",) * len(cells), version)
+
+
+def source(row: Row) -> str:
+    """Returns the source of a row's numbers, with its date; empty for ours."""
+    return "" if row.origin == "ours" else f"{row.origin} {row.version}".rstrip()
 
 
 def mark(rows: Sequence[Row], columns: Sequence[Column], scenes: int) -> tuple[Row, ...]:
-    """Marks the best of our rows, and the second best of three or more, by the digits shown.
+    """Marks the best of the rows measured here, and the second best of three or more.
 
-    Equal numbers share a mark. Rows that lack a scene, and `nan`, are not compared.
+    They are compared by the digits shown, so equal ones share a mark. Rows that lack a scene, and
+    `nan`, are not compared.
 
     Args:
       rows: rows of a block.
@@ -211,7 +221,7 @@ def mark(rows: Sequence[Row], columns: Sequence[Column], scenes: int) -> tuple[R
         shown = {
             i: _shown(row.cells[j], column)
             for i, row in enumerate(rows)
-            if row.origin == "ours" and _compares(row.cells[j], scenes)
+            if row.origin != "published" and _compares(row.cells[j], scenes)
         }
         ranked = sorted(set(shown.values()), reverse=column.better == "higher")
         if column.better is None or len(shown) < 2:

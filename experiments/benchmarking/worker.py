@@ -1,7 +1,8 @@
 """Runs the jobs of a benchmark: a single one, or all missing ones on an engine.
 
-A job is a sequence of commands in separate processes: `reconstruct`, or `train` and `evaluate`. An
-interrupted job resumes where it stopped, and a finished one is not repeated (`run_job`).
+A job is a sequence of commands in separate processes: `reconstruct`, or `train` and `evaluate`, or
+`metrics` for given renderings. An interrupted job resumes where it stopped, and a finished one is
+not repeated (`run_job`).
 
 An engine accepts jobs and returns each when it is finished, with a reason if it failed: local
 threads that wait for commands, or a Ray cluster. Engines ignore dependencies, which `run_in_order`
@@ -21,7 +22,14 @@ import jax
 import numpy as np
 
 import refref_jax
-from experiments.benchmarking import plan, pose_space, results, scene_lists, summary
+from experiments.benchmarking import (
+    externals,
+    plan,
+    pose_space,
+    results,
+    scene_lists,
+    summary,
+)
 from experiments.benchmarking.methods import RECONSTRUCTION
 from experiments.benchmarking.plan import SPLIT, Job, Skipped
 from experiments.benchmarking.results import Costs, Image, Record, Truth, View, number
@@ -30,7 +38,7 @@ from experiments.cli import subprocesses
 from experiments.cli.progress import ProgressBar
 from experiments.cli.subprocesses import RunFailedError
 from experiments.r3f import records
-from experiments.runs import measured_runs
+from experiments.runs import measured_runs, renderings
 from refref_jax import atomic_files, configuration
 from refref_jax.data import scene_folder
 
@@ -64,7 +72,7 @@ def run_job(out: Path, job: Job) -> str | None:
     try:
         _check_scene(job)
         folder.mkdir(parents=True, exist_ok=True)
-        record = _reconstruct(job, folder) if job.method == RECONSTRUCTION else _learn(job, folder)
+        record = _worker_of(job)(job, folder)
         _check_scene(job)
         results.write(folder, record)
     except (RunFailedError, ValueError, OSError) as error:
@@ -74,6 +82,13 @@ def run_job(out: Path, job: Job) -> str | None:
         log.write_text(traceback.format_exc(), encoding="utf-8")
         return f"{type(error).__name__}: {error} (all of it: {log})"
     return None
+
+
+def _worker_of(job: Job) -> Callable[[Job, Path], Record]:
+    """Returns the function that does the work of a job in its folder."""
+    if job.external:
+        return _measure
+    return _reconstruct if job.method == RECONSTRUCTION else _learn
 
 
 def wait_until_free(folder: Path, patience: float = _PATIENCE) -> None:
@@ -129,21 +144,51 @@ def _learn(job: Job, folder: Path) -> Record:
             *scene_lists.for_object(objects),
             f"--reconstruction={folder.parent / RECONSTRUCTION / 'run'}",
         ]
-    weights = [] if job.lpips_weights is None else [f"--lpips_weights={job.lpips_weights}"]
+    weights = _lpips_weights(job)
     wait_until_free(run_)
     cost = measured_runs.train(run_, scene=scene, options=[*options["train"], *objects])
     measured_runs.evaluate(run_, scene=scene, options=[*options["evaluate"], *weights], split=SPLIT)
-    summary = configuration.parse_json((run_ / "eval" / SPLIT / "metrics.json").read_text("utf-8"))
+    costs = Costs(**dataclasses.asdict(cost))
+    made = _record(job)._replace(options=options | _properties(job), costs=costs)
+    return _with_metrics(made, run_ / "eval" / SPLIT / "metrics.json", scene)
+
+
+def _measure(job: Job, folder: Path) -> Record:
+    """Copies the renderings of an external method, and measures the copies."""
+    # A result of other renderings must not outlive them.
+    (folder / plan.RESULT).unlink(missing_ok=True)
+    out, scene = folder / "run" / "eval" / SPLIT, Path(job.path)
+    frames, limit = scene_folder.read_frames(scene, SPLIT), job.settings.limit
+    renderings.copy(renderings.find(Path(job.external), frames, limit=limit), out)
+    if externals.digest(out, scene, split=SPLIT, limit=limit) != job.digest:
+        raise ValueError(
+            f"The files of {job.external} have changed since the benchmark was started. Repeat the "
+            "command to measure them."
+        )
+    options = plan.external_options(job.settings, job.digest)
+    words = [*options["metrics"], f"--out={out / 'metrics.json'}", "--overwrite"]
+    words += _lpips_weights(job)
+    subprocesses.run("metrics", str(out), job.path, *words, log=folder / "run.log")
+    made = _record(job)._replace(options=options | _properties(job))
+    return _with_metrics(made, out / "metrics.json", scene)
+
+
+def _lpips_weights(job: Job) -> list[str]:
+    return [] if job.lpips_weights is None else [f"--lpips_weights={job.lpips_weights}"]
+
+
+def _with_metrics(record: Record, path: Path, scene: Path) -> Record:
+    """Adds the metrics of an evaluation to a record."""
+    summary = configuration.parse_json(path.read_text("utf-8"))
     metrics = {key: number(value, key) for key, value in summary["results"].items()}
     # Tables only contain reproducible numbers.
-    seconds = metrics.pop("seconds_per_image")
+    seconds = metrics.pop("seconds_per_image", None)
     frames, apart = _frames(scene)
     per_image = [_image(image, apart) for image in summary["per_image"]]
-    return _record(job)._replace(
-        options=options | _properties(job),
+    return record._replace(
         metrics=metrics,
         per_image=per_image,
-        costs=Costs(**dataclasses.asdict(cost), seconds_per_image=seconds),
+        costs=record.costs._replace(seconds_per_image=seconds),
         views=[_view(image.name, frames, scene) for image in per_image],
         facts={key: summary[key] for key in ("learned",) if summary.get(key) is not None},
     )

@@ -1,4 +1,4 @@
-"""Parses a list of views of a split, such as `0,10,20` or `all`."""
+"""Parses a list of views of a split, such as `0,10,20` or `all`, and the place of a pixel."""
 
 from collections.abc import Sequence
 
@@ -22,3 +22,17 @@ def choose(text: str, count: int) -> Sequence[int]:
     if wrong := [view for view in views if view >= count]:
         raise ValueError(f"The split has no view {wrong[0]}. Choose from 0 to {count - 1}.")
     return views
+
+
+def parse_pixel(text: str | None) -> tuple[int, int] | None:
+    """Returns column and row of a pixel such as `64,60`; `None` if none is given.
+
+    Raises:
+      ValueError: if the text has another form.
+    """
+    if text is None:
+        return None
+    words = [word.strip() for word in text.split(",")]
+    if len(words) != 2 or not all(word.isdecimal() for word in words):
+        raise ValueError(f"--pixel={text} is not a column and a row. Write as in --pixel=64,60.")
+    return int(words[0]), int(words[1])

@@ -1,6 +1,7 @@
 """Evaluates a model: renders the images of a split, and compares them with the true images.
 
-`evaluate` does both; `measure` compares one image that has been rendered already.
+`evaluate` does both; `measure` compares one image that has been rendered already, and
+`measure_view` one that any program has rendered.
 
 Distances are of three kinds, distinguished by name:
 
@@ -134,7 +135,7 @@ def evaluate(
         raise ValueError(f"limit={limit} leaves no image to evaluate. Give 1 or more.")
     choices.side_of(rays_per_pixel)
     truth = read_truth(Path(scene), split)
-    chosen = _spread(len(truth.images), limit)
+    chosen = spread(len(truth.images), limit)
     views = truth.frames.cameras
     images.warm_up(model, views, chunk=chunk)
     if progress is not None:
@@ -219,13 +220,45 @@ def measure(
         straight rays.
       perceptual: perceptual metrics to compute in addition.
     """
+    result = measure_view(
+        np.asarray(seen.rgb),
+        np.asarray(seen.distance),
+        truth,
+        i,
+        first=first,
+        perceptual=perceptual,
+    )
+    return result | {"dropped": float(np.mean(seen.dropped))}
+
+
+def measure_view(
+    rgb: Float[np.ndarray, "h w 3"],
+    distance: Float[np.ndarray, "h w"] | None,
+    truth: Truth,
+    i: int,
+    *,
+    first: Float[np.ndarray, "h w"] | None = None,
+    perceptual: Perceptual = _WITHOUT_EYES,
+) -> Measured:
+    """Returns the metrics of an image from any renderer; `None` where a value is missing.
+
+    Args:
+      rgb: image, sRGB in `[0, 1]`.
+      distance: distances along the rays of the pixels, world units, `inf` where there is none;
+        `None` if they are unknown.
+      truth: true images of the split.
+      i: index of the image in the split.
+      first: distance of the first surface of the meshes, `inf` where there is none; `None` if the
+        method knows no objects.
+      perceptual: perceptual metrics to compute in addition.
+    """
     mask = None if truth.masks is None else truth.masks[i]
     target = (truth.images[i] / 255.0).astype(np.float32)
-    result = measure_colours(np.asarray(seen.rgb), target, mask, perceptual)
+    result = measure_colours(rgb, target, mask, perceptual)
     true = None if truth.distances is None else truth.distances[i]
-    for name, known in _distances(np.asarray(seen.distance), first, true, mask).items():
+    for name, known in _distances(distance, first, true, mask).items():
         result |= measure_distances(name, known, true, mask)
-    return result | {"dropped": float(np.mean(seen.dropped))}
+    return result
 
 
 def measure_colours(
@@ -294,20 +327,25 @@ def mean_of(per_image: Sequence[Mapping[str, Any]], measure: str) -> float | Non
     return float(np.mean(values)) if values else None
 
 
-def _spread(count: int, limit: int | None) -> list[int]:
-    """Returns indices of all images, or of `limit` evenly spaced ones."""
+def spread(count: int, limit: int | None) -> list[int]:
+    """Returns indices of all images, or of `limit` evenly spaced ones.
+
+    Args:
+      count: number of images.
+      limit: number of images to choose; all if not given.
+    """
     chosen = np.linspace(0, count - 1, min(limit or count, count)).astype(int)
     return np.unique(chosen).tolist()
 
 
 def _distances(
-    median: Float[np.ndarray, "h w"],
+    median: Float[np.ndarray, "h w"] | None,
     first: Float[np.ndarray, "h w"] | None,
     true: Float[np.ndarray, "h w"] | None,
     mask: Bool[np.ndarray, "h w"] | None,
 ) -> dict[str, Float[np.ndarray, "h w"] | None]:
     """Returns an image's distances of all three kinds; `None` if one is unknown."""
-    if first is None:
+    if first is None or median is None:
         return dict.fromkeys(("distance", "surface", "substituted"), median)
     substituted = None if true is None or mask is None else np.where(mask, true, median)
     return {

@@ -119,6 +119,10 @@ _MISTAKES = {
         "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
         "--out=OUT --scene=SCENE --ior==1.5": "Write as in --ior=glass=1.52.",
         "--out=OUT --scene=SCENE --properties=OVERLAY": "overlay.json: rul is not a known key.",
+        "--out=OUT --scene=SCENE --pixel=4": "--pixel=4 is not a column and a row",
+        "--out=OUT --scene=SCENE --pixel=4,5": "--pixel would have no effect. Add --figure=samples",
+        "--out=OUT --scene=SCENE --figure=samples": "shows trained runs. Give them, as in --runs",
+        "--out=OUT --scene=SCENE --figure=samples --runs=x": "x/config.json does not exist",
     },
     "view": {
         "--run=x --heights=2,1": "increasing integers",
@@ -146,6 +150,7 @@ _MISTAKES = {
     "benchmark": {
         "--out=OUT --methods=tree,strait": "Did you mean straight?",
         "--out=OUT --scenes=SCENE,nowhere": "nowhere/transforms_train.json does not exist",
+        "--out=OUT --scenes=SCENE --external=tree=x": "The name tree of --external=tree=x is taken",
         "--out=OUT --scenes=nowhere.csv": "nowhere.csv does not exist. Give scenes, or a JSON",
         "--out=OUT --scenes=LIST": "list.json: scene 1: 'rul' is not a known key. Write 'rule'",
     },

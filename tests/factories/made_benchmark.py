@@ -10,7 +10,7 @@ from experiments.benchmarking.methods import METHODS
 from experiments.benchmarking.plan import Skipped
 from experiments.benchmarking.results import Costs, Image, Record, Truth, View
 from experiments.benchmarking.settings import Benchmark, Scene, Settings
-from refref_jax.data import image_files
+from refref_jax.data import image_files, scene_folder
 from tests.factories import small_scenes
 
 SETTINGS = Settings(preset="tiny", steps=6, limit=None, rays_per_pixel=1, seed=0, lpips=None)
@@ -44,6 +44,18 @@ def write_scene(folder, *, meshes=True, masks=True, colours=True):
         colour = {"colour_per_interface": [1.0, 1.0, 1.0]} if colours else {}
         parts = [{"mesh": "meshes/ball_glass.ply", "ior_inside": 1.5, **colour}]
         (folder / "scene.json").write_text(json.dumps({"parts": parts}))
+    return folder
+
+
+def write_renderings(folder, scene, *, level=0.5, distance=None):
+    """Writes grey images of a scene's test views, and distances that are all the same."""
+    folder.mkdir(parents=True, exist_ok=True)
+    frames = scene_folder.read_frames(scene, plan.SPLIT)
+    size = (frames.cameras.height, frames.cameras.width)
+    for name in frames.names:
+        image_files.write_rgb(folder / f"{name}.png", np.full((*size, 3), level))
+        if distance is not None:
+            image_files.write_exr(folder / f"{name}.exr", np.full(size, distance, np.float32))
     return folder
 
 

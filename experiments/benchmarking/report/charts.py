@@ -41,7 +41,7 @@ def look(method: str) -> Line:
     """Returns the line style of a method.
 
     An ablation never has the colour of its reference method, and is dashed once the colours of its
-    group are used up. Methods that are unknown to this version share one style.
+    group are used up. External methods, which have no curves, share one style.
     """
     if method not in METHODS:
         return Line(len(COLOURS) - 1, _DASHES[-1])

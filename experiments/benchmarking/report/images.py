@@ -1,13 +1,12 @@
 """Downsamples, colours and compresses images, and embeds them in a page as text.
 
 The figure of a view shows the reference and each method next to each other: image, error and
-distance. The contact sheet is a separate image file: one view of each scene for every method.
+distance.
 """
 
 import base64
 import io
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import matplotlib
@@ -15,11 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
-from experiments.benchmarking.report import data, markup
+from experiments.benchmarking.report import markup
 from experiments.benchmarking.report.data import Scene, View
 from experiments.benchmarking.report.markup import Html, join, tag
-from experiments.figures.style import pyplot
-from refref_jax import atomic_files
 
 # Quality of WebP: above it the size of a 100 x 100 image grows without a visible gain.
 _QUALITY = 82
@@ -29,14 +26,6 @@ _STOPS = 12
 _GREY = 128.0
 
 _DISTANCES = "viridis"
-
-SHEET = "pictures.jpg"
-
-# With more scenes the tiles of the sheet become too small.
-_MOST_SCENES, _MOST_METHODS = 8, 7
-
-_INCHES = 1.7
-_DOTS = 120
 
 TRUTH = "truth"
 """Name of the reference image among those of methods."""
@@ -255,72 +244,3 @@ def _legend(name: str, scale: Scale) -> Html:
     ramp = tag("span", class_="ramp", style=f"background:{gradient(scale)}")
     bounds = tag("span", f"{scale.low:.3g} ", ramp, f" {scale.high:.3g} and more")
     return tag("p", f"{name}: ", bounds)
-
-
-def write_sheet(out: Path) -> Path | None:
-    """Draws a column for each scene: the reference, then each method's image with its masked PSNR.
-
-    The view is the median one of the scene, ordered by the mean over all methods. Scenes whose
-    images are missing are skipped; if there are many scenes, a subset is shown that is spread
-    evenly over their names.
-
-    Args:
-      out: folder of the benchmark, with its results.json.
-
-    Returns:
-      Path of the file; `None` if there is nothing to show.
-
-    Raises:
-      ValueError: if there are no results, or they are broken.
-    """
-    everything = data.read(out)
-    methods = list(everything.labels)[:_MOST_METHODS]
-    columns = []
-    for scene in _spread(everything.scenes, _MOST_SCENES):
-        name = data.typical_view(scene)
-        view = None if name is None else data.read_view(out, scene, name)
-        if view is not None and view.truth.rgb is not None:
-            columns.append((scene, view))
-    path = out / SHEET
-    if not columns:
-        path.unlink(missing_ok=True)  # an older sheet, of scenes that are missing now
-        return None
-    _draw_sheet(path, columns, {name: everything.labels[name] for name in methods})
-    return path
-
-
-def _spread(scenes: Sequence[Scene], most: int) -> list[Scene]:
-    count = min(len(scenes), most)
-    return [scenes[i * len(scenes) // count] for i in range(count)]
-
-
-def _draw_sheet(path: Path, columns: Sequence[tuple[Scene, View]], labels: dict[str, str]) -> None:
-    figure, axes = pyplot.subplots(
-        len(labels) + 1,
-        len(columns),
-        figsize=(_INCHES * len(columns) + 0.3, 1.1 * _INCHES * (len(labels) + 1) + 0.2),
-        squeeze=False,
-        layout="constrained",
-    )
-    for tiles, (scene, view) in zip(axes.T, columns, strict=True):
-        tiles[0].set_title(scene.name, fontsize=7)
-        images = [view.truth, *(view.rendered.get(name) for name in labels)]
-        below = [view.name, *(_psnr(scene, name, view.name) for name in labels)]
-        for tile, image, text in zip(tiles, images, below, strict=True):
-            tile.set_xticks([])
-            tile.set_yticks([])
-            tile.set_xlabel(text, fontsize=7, labelpad=2)
-            if image is not None and image.rgb is not None:
-                tile.imshow(image.rgb)
-            else:
-                tile.set_frame_on(False)
-    for tile, label in zip(axes[:, 0], ("ground truth", *labels.values()), strict=True):
-        tile.set_ylabel(label, fontsize=8)
-    with atomic_files.written_file(path) as draft:
-        figure.savefig(draft, format="jpeg", dpi=_DOTS, pil_kwargs={"quality": 88})
-    pyplot.close(figure)
-
-
-def _psnr(scene: Scene, method: str, view: str) -> str:
-    value = data.psnr_masked(scene, method, view)
-    return "" if value is None else f"{value:.1f} dB"

@@ -121,15 +121,16 @@ def _block(table: Table, block: Block, is_open: bool) -> Html:
 
 
 def _row(row: Row, columns: Sequence[Column]) -> Html:
-    theirs = row.origin == "published"
-    badge = tag("span", "published", class_="badge") if theirs else None
+    source = tables.source(row)
+    badge = tag("span", source, class_="badge") if source else None
     cells = [
         _cell(cell, column, mark)
         for cell, column, mark in zip(row.cells, columns, row.marks, strict=True)
     ]
     scenes = tag("td", "-" if row.scenes is None else str(row.scenes))
     name = tag("th", row.label, badge, scope="row")
-    return tag("tr", name, scenes, *cells, class_="published" if theirs else None)
+    theirs = row.origin if row.origin != "ours" else None
+    return tag("tr", name, scenes, *cells, class_=theirs)
 
 
 def _cell(cell: Cell, column: Column, mark: Mark) -> Html:

@@ -35,7 +35,7 @@ from refref_jax import atomic_files
 _WHAT = (
     "Error: mean over the channels of the absolute difference from the reference. Distance: for "
     "the reference, to the first surface; for methods, the median of the field's weights along the "
-    "path, which clear glass does not stop. Grey: no distance."
+    "path, which clear glass does not stop; for external methods, the given one. Grey: no distance."
 )
 
 # Number of failure cases per method.

@@ -12,7 +12,7 @@ from PIL import Image as Picture
 
 from experiments.benchmarking import plan, summary
 from experiments.benchmarking.methods import METHODS
-from experiments.benchmarking.report import charts, data, images, page
+from experiments.benchmarking.report import charts, data, images, page, sheets
 from experiments.benchmarking.report.data import Result, Scene
 from experiments.benchmarking.results import Image, Truth, View
 from tests.factories.made_benchmark import QUALITY, made_record, write_benchmark
@@ -135,8 +135,10 @@ def test_without_pictures_there_is_a_report_still(out, tmp_path):
     text = page.write(copy, views=2, edge=200).read_text("utf-8")
     assert _pictures(text) == [] and _absent(text) == ["image not available"] * 4 * 9
     assert len(_elements(text, "svg", class_="chart")) == 4  # the curves are in results.json
-    (copy / images.SHEET).write_bytes(b"of scenes that were there")
-    assert images.write_sheet(copy) is None and not (copy / images.SHEET).exists()
+    for file in (sheets.SHEET, sheets.GRID):
+        (copy / file).write_bytes(b"of scenes that were there")
+    assert sheets.write(copy) == []
+    assert not (copy / sheets.SHEET).exists() and not (copy / sheets.GRID).exists()
 
 
 def test_a_broken_picture_and_one_of_another_size_are_left_out(out, tmp_path):

@@ -21,10 +21,16 @@ _THEIRS = [
     *("NeuS", "Splatfacto", "Zip-NeRF", "TNSR", "MS-NeRF", "RayDef"),
     *("RoseNeRF", "R3F", "Oracle"),
 ]
+_THEIRS_LATER = [*_THEIRS[:7], "NU-NeRF", "NeRRF", "TransparentGS", *_THEIRS[7:]]
 
 
-def _rows(block, origin="ours"):
-    return {row.label: row for row in block.rows if row.origin == origin}
+def _rows(block, origin="ours", version=""):
+    return {row.label: row for row in block.rows if (row.origin, row.version) == (origin, version)}
+
+
+def _published(table, category, background, version=published.PAPER):
+    rows = published.rows(table, category, background)
+    return [row for row in rows if row.version == version]
 
 
 def _place(table, label):
@@ -37,7 +43,7 @@ def _place(table, label):
 def test_the_papers_tables_are_whole():
     for category in (*scene_names.CATEGORIES, published.ALL):
         for background in (*scene_names.BACKGROUNDS, published.ALL):
-            rows = published.rows(published.MAIN, category, background)
+            rows = _published(published.MAIN, category, background)
             assert [row.method for row in rows] == _THEIRS
             for row in rows:
                 missing = {name for name, number in row.numbers.items() if number is None}
@@ -45,8 +51,10 @@ def test_the_papers_tables_are_whole():
                 if row.method in ("NeuS", "TNSR") and background == "env":
                     expected = set(published.NUMBERS)
                 assert missing == expected, row
-    lines = [row.line for row in published.read()]
-    assert lines == sorted(lines) and len(published.read()) == 16 * 9 + 5 + 5
+    of_paper = [row for row in published.read() if row.version == published.PAPER]
+    lines = [row.line for row in of_paper]
+    assert lines == sorted(lines) and len(of_paper) == 16 * 9 + 5 + 5
+    assert published.read()[: len(of_paper)] == tuple(of_paper)
     ablated = published.rows(published.ABLATION, "smcvx", "cube")
     named = {m.published for m in METHODS.values() if m.group == "ablation of the oracle"}
     assert {row.method for row in ablated} == (named - {None}) | {"Oracle"}
@@ -57,6 +65,38 @@ def test_the_papers_tables_are_whole():
     for row in (*ablated, *top):
         assert None not in [row.numbers[name] for name in ("psnr", "psnr_masked", "ssim", "lpips")]
     assert {m.published for m in METHODS.values() if m.group == "main"} - {None} <= set(_THEIRS)
+
+
+def test_the_later_table_is_whole():
+    """It has twelve methods in three categories and in all, over all backgrounds."""
+    later = [row for row in published.read() if row.version == published.PAGE]
+    assert len(later) == 48 and {row.table for row in later} == {published.MAIN}
+    for category in (*scene_names.CATEGORIES, published.ALL):
+        rows = _published(published.MAIN, category, published.ALL, published.PAGE)
+        assert [row.method for row in rows] == _THEIRS_LATER
+        for row in rows:
+            missing = {name for name, number in row.numbers.items() if number is None}
+            assert missing == {"drmse"} | ({"dmae"} if row.method == "RoseNeRF" else set())
+            assert row.line is None and 10.0 < float(row.numbers["psnr"]) < 35.0
+            assert 0.0 < float(row.numbers["lpips"]) < 1.0 > float(row.numbers["ssim"]) > 0.4
+
+
+@pytest.mark.parametrize(
+    ("category", "method", "numbers"),
+    [
+        ("smcvx", "Oracle", (32.66, 26.12, 0.96, 0.05, 0.08)),
+        ("smncvx", "R3F", (21.76, 16.32, 0.79, 0.20, 0.18)),
+        ("mmncvx", "TransparentGS", (15.69, 10.62, 0.72, 0.31, 0.24)),
+        ("mmncvx", "RoseNeRF", (18.48, 14.34, 0.65, 0.43, None)),
+        ("all", "Zip-NeRF", (21.50, 16.68, 0.80, 0.24, 1.52)),
+    ],
+)
+def test_numbers_of_the_later_table(category, method, numbers):
+    rows = _published(published.MAIN, category, published.ALL, published.PAGE)
+    (row,) = [row for row in rows if row.method == method]
+    names = ("psnr", "psnr_masked", "ssim", "lpips", "dmae")
+    found = tuple(row.numbers[name] for name in names)
+    assert tuple(None if text is None else float(text) for text in found) == numbers
 
 
 @pytest.mark.parametrize(
@@ -72,7 +112,7 @@ def test_the_papers_tables_are_whole():
     ],
 )
 def test_numbers_of_the_paper(table, category, background, method, numbers):
-    (row,) = [row for row in published.rows(table, category, background) if row.method == method]
+    (row,) = [row for row in _published(table, category, background) if row.method == method]
     names = ("psnr", "psnr_masked", "ssim", "lpips", "dmae")
     found = tuple(row.numbers[name] for name in names)
     assert tuple(None if text is None else float(text) for text in found) == numbers
@@ -180,11 +220,21 @@ def test_the_main_table_by_hand():
     every = _rows(table.blocks[-1])[_TREE]
     assert every.cells[psnr].mean == pytest.approx(92.0 / 3.0) and every.scenes == 3
     # The paper's rows are beside ours and never marked.
-    theirs = _rows(table.blocks[0], "published")
+    theirs = _rows(table.blocks[0], "published", published.PAPER)
     assert list(theirs) == _THEIRS and all(row.scenes is None for row in theirs.values())
     assert theirs["Oracle"].cells[psnr] == Cell(31.64, digits=2)
     assert theirs["RoseNeRF"].cells[_place(table, "DMAE, substituted")] == NOTHING
     assert all(set(row.marks) == {""} for row in theirs.values())
+    # The later table has no single background, so it is beside those of all backgrounds alone.
+    versions = [{row.version for row in block.rows} for block in table.blocks]
+    both = {"", published.PAPER, published.PAGE}
+    assert [found == both for found in versions] == [
+        "all backgrounds" in b.title for b in table.blocks
+    ]
+    later = _rows(table.blocks[-1], "published", published.PAGE)
+    assert list(later) == _THEIRS_LATER and later["Zip-NeRF"].cells[psnr] == Cell(21.5, digits=2)
+    earlier = _rows(table.blocks[-1], "published", published.PAPER)
+    assert earlier["Zip-NeRF"].cells[psnr] == Cell(26.11, digits=2)
     # The paper's columns stay, though we know no LPIPS; FLIP, which nobody has, does not.
     labels = [column.label for column in table.columns]
     assert "LPIPS" in labels and "FLIP" not in labels and "DMAE, median" not in labels
@@ -232,7 +282,7 @@ def test_the_drmse_beside_the_papers_is_that_in_the_mask():
     masked = _place(table, "DRMSE, substituted, masked")
     image = _place(table, "DRMSE, substituted, of the image")
     ours = _rows(table.blocks[0])[_TREE].cells
-    theirs = _rows(table.blocks[0], "published")["R3F"].cells
+    theirs = _rows(table.blocks[0], "published", published.PAPER)["R3F"].cells
     assert (ours[masked].mean, ours[image].mean) == (0.0, 0.75)
     assert (theirs[masked].mean, theirs[image]) == (0.88, NOTHING)
     assert "does not state the pixels" in " ".join(table.notes)
@@ -309,12 +359,16 @@ def test_markdown_and_latex_mark_and_label():
     line = next(line for line in text.splitlines() if line.startswith("| Oracle (path tree) |"))
     assert "| 2 | **33.50** ± 2.50 | **30.00** ± 0.00 | - | - | - |" in line
     assert "| Oracle (paper's paths) | 2 | <u>32.00</u> ± 2.00 | 26.00 ± 2.00 |" in text
-    assert "| Oracle, *published* | - | 31.64 | 25.37 | 0.96 |" in text
+    assert "| Oracle, *published 2025-05* | - | 31.64 | 25.37 | 0.96 |" in text
+    assert "| Oracle, *published 2026-09-26* | - | 32.66 | 26.12 | 0.96 |" in text
     assert "| method | scenes | PSNR ↑ | masked PSNR ↑ | SSIM ↑ | LPIPS ↓ | DMAE, sub" in text
-    assert "measured on its data, which differs from ours" in " ".join(text.split())
+    assert "measured on their data, which differs from ours" in " ".join(text.split())
     tex = summary.latex(table)
     assert r"\textbf{33.50} {\tiny$\pm$2.50}" in tex and r"\underline{32.00}" in tex
-    assert r"Oracle \emph{(published)} & -- & 31.64" in tex and "& DMAE, substituted" in tex
+    assert r"Oracle \emph{(published 2025-05)} & -- & 31.64" in tex
+    assert (
+        r"Oracle \emph{(published 2026-09-26)} & -- & 32.66" in tex and "& DMAE, substituted" in tex
+    )
     assert tex.count(r"\begin{tabular}") == tex.count(r"\end{tabular}") == 1
     body = [line for line in tex.splitlines() if line.startswith("Oracle (path")]
     assert body and {line.count("&") for line in body} == {len(table.columns) + 1}
@@ -344,6 +398,9 @@ def test_csv_and_json_have_every_number():
     assert (line["mean"], line["standard_error"]) == ("33.5", "2.5")
     assert (line["scenes"], line["mark"], line["origin"]) == ("2", "best", "ours")
     assert {line["mean"] for line in lines if line["quantity"] == "LPIPS"} >= {"", "0.11"}
+    dates = {line["version"] for line in lines if line["origin"] == "published"}
+    assert line["version"] == "" and dates == {published.PAPER, published.PAGE}
+    assert summary.table_from_json(summary.table_as_json(table)) == table
     scenes = list(csv.DictReader(io.StringIO(summary.scenes_csv(_RESULTS))))
     assert len(scenes) == len(_RESULTS) and scenes[4]["psnr_masked"] == ""
     odd = [made_record("cube_smcvx_ball", "oracle", psnr=30.0, psnr_masked=math.inf)]
