@@ -35,14 +35,17 @@ batches have as many rays, and take as much memory, as those of `paper`.
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 
 from refref_jax.choices import Interior, Space
-from refref_jax.fields import registry
+from refref_jax.fields import mlps, registry
+from refref_jax.fields.base import RadianceConfig
+from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.render.model import ModelConfig, ProposalConfig
-from refref_jax.training.config import LossConfig, ScheduleConfig
+from refref_jax.training.config import FieldConfig, LossConfig, ScheduleConfig
 
 _WALLS = 7.3
 """Default half edge of the background cube, or radius of the background sphere: the data set's.
@@ -134,6 +137,89 @@ def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
     radius = radius or _WALLS
     reach = radius if space == "spherical" else math.sqrt(3.0) * radius
     return Bounds(_NEAR, farthest + reach, radius, space)
+
+
+def override_model(model: ModelConfig, asked: FieldConfig) -> ModelConfig:
+    """Returns a preset's model with overrides; `None` keeps the value of the preset.
+
+    Raises:
+      ValueError: if the model does not support an override.
+    """
+    if asked.samples_per_ray is not None:
+        model = _with_samples(model, asked.samples_per_ray, asked.preset)
+    names = ("multisamples", "footprint", "dilation")
+    given = {name: getattr(asked, name) for name in names}
+    model = dataclasses.replace(model, **{n: x for n, x in given.items() if x is not None})
+    if asked.precision is not None:
+        proposals = tuple(
+            dataclasses.replace(
+                each, field=dataclasses.replace(each.field, precision=asked.precision)
+            )
+            for each in model.proposals
+        )
+        field = dataclasses.replace(model.field, precision=asked.precision)
+        model = dataclasses.replace(model, proposals=proposals, field=field)
+    return dataclasses.replace(model, field=_with_grid(model.field, asked))
+
+
+def _with_samples(model: ModelConfig, samples: tuple[int, ...], preset: str) -> ModelConfig:
+    rounds = len(model.proposals)
+    if len(samples) != rounds + 1:
+        raise ValueError(
+            f"samples_per_ray={','.join(map(str, samples))} is for {len(samples) - 1} proposal "
+            f"levels, but preset {preset} has {rounds}. Give {rounds + 1} numbers: one for each "
+            "proposal level, then one for the radiance field."
+        )
+    proposals = tuple(
+        dataclasses.replace(proposal, samples=count)
+        for proposal, count in zip(model.proposals, samples[:-1], strict=True)
+    )
+    return dataclasses.replace(model, proposals=proposals, samples=samples[-1])
+
+
+def _with_grid(field: RadianceConfig, asked: FieldConfig) -> RadianceConfig:
+    if asked.log2_hashmap_size is None and asked.max_res is None:
+        return field
+    if not isinstance(field, mlps.GridRadianceConfig):
+        raise ValueError(
+            "log2_hashmap_size and max_res are options of a hash grid, which field type "
+            f"{field.kind} does not have. Leave them out."
+        )
+    grid = field.grid
+    if asked.log2_hashmap_size is not None:
+        grid = dataclasses.replace(grid, hashmap_size=1 << asked.log2_hashmap_size)
+    if asked.max_res is not None:
+        if asked.max_res < grid.base_res:
+            raise ValueError(
+                f"max_res={asked.max_res} is coarser than the grid's first level of "
+                f"{grid.base_res} cells per side. Give at least that."
+            )
+        grid = dataclasses.replace(grid, max_res=asked.max_res)
+    return dataclasses.replace(field, grid=grid)
+
+
+def samples_of(model: ModelConfig) -> tuple[int, ...]:
+    """Returns the number of samples of each proposal level, then of the radiance field."""
+    return (*(proposal.samples for proposal in model.proposals), model.samples)
+
+
+def grid_of(model: ModelConfig) -> HashGridConfig | None:
+    """Returns the hash grid of a model's radiance field, if its field type has one."""
+    return model.field.grid if isinstance(model.field, mlps.GridRadianceConfig) else None
+
+
+def sampling_of(model: ModelConfig) -> dict[str, Any]:
+    """Returns the options of a model's samples, grid and precision, by name."""
+    grid = grid_of(model)
+    return {
+        "footprint": model.footprint,
+        "samples_per_ray": samples_of(model),
+        "multisamples": model.multisamples,
+        "log2_hashmap_size": grid and grid.hashmap_size.bit_length() - 1,
+        "max_res": grid and grid.max_res,
+        "precision": model.field.precision,
+        "dilation": model.dilation,
+    }
 
 
 def loss(model: ModelConfig) -> LossConfig:

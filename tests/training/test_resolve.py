@@ -29,7 +29,8 @@ from refref_jax.training.config import (
     options_of,
 )
 from refref_jax.training.fit import prepare
-from refref_jax.training.resolve import SceneFacts, override_model, resolve, samples_of
+from refref_jax.training.presets import override_model, samples_of
+from refref_jax.training.resolve import SceneFacts, resolve
 from tests.factories.small_model import CAMERAS, MODEL
 from tests.processes.command import ROOT
 
