@@ -185,7 +185,12 @@ class Option(NamedTuple):
 
 
 def option(
-    default: Any = None, *, name: str = "", formerly: str = "", after: tuple[str, ...] = ()
+    default: Any = None,
+    *,
+    name: str = "",
+    formerly: str = "",
+    after: tuple[str, ...] = (),
+    compare: bool = True,
 ) -> Any:
     """Declares an option as a field of a dataclass.
 
@@ -195,9 +200,10 @@ def option(
       formerly: name of the option and the field in earlier versions, which is still read.
       after: options on which the decision depends. Overriding one of them takes it again, unless
         the option itself is an override.
+      compare: whether configurations that differ in this option are different.
     """
     metadata = {"name": name, "after": after, FORMERLY: formerly or None}
-    return dataclasses.field(default=default, metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata, compare=compare)
 
 
 def options_of(kind: type) -> Iterator[Option]:

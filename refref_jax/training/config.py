@@ -18,16 +18,20 @@ from typing import Any, NamedTuple, TypeVar
 
 from refref_jax import configuration
 from refref_jax.choices import (
+    ColourNetwork,
+    Contraction,
     DataLoss,
     DistortionOver,
     FieldName,
     Footprint,
     Interior,
+    PathLosses,
     Paths,
     Pixels,
     Precision,
     PresetName,
     RuleName,
+    ShadingOverride,
     Space,
     Tints,
 )
@@ -38,6 +42,10 @@ _Value = TypeVar("_Value")
 
 # Options that determine the objects.
 _OBJECTS = ("scene", "properties", "reconstruction")
+
+# Options that determine the near and far planes. These are not compared: runs of earlier versions
+# lack them, and the model, which is compared as well, contains them.
+_BOUNDS = ("scene", "properties", "background", "radius", "contraction")
 
 # Maximum number of steps, rays and batches, which are 32-bit integers.
 _MOST = 2**31 - 1
@@ -67,21 +75,24 @@ class SceneConfig:
         away (unbounded). By default that of scene.json or the scene's name.
       radius: Half edge of the background cube, or radius of the background sphere (by default that
         of scene.json, else measured from depth maps, else 7.3), or radius of an unbounded scene's
-        uncontracted ball, world units.
+        uncontracted ball, world units; with contraction=always only the latter has an effect.
       reconstruction: Output folder of experiments.reconstruct, whose object replaces the scene's
         meshes.
       pixels: Training pixels: all, or only those of the background, at a margin from the masks.
       properties: JSON file of properties of the scene, like scene.json, whose values override it.
+      shading: Shading of all objects: their own (scene), smooth, or flat, with face normals, as in
+        the paper's released code.
     """
 
     path: str = option("", name="scene")
     rule: RuleName | None = option(after=_OBJECTS)
     indices: tuple[tuple[str, float], ...] = option((), name="ior", after=("reconstruction",))
     space: Space | None = option(name="background", after=("scene", "properties"))
-    radius: float | None = option(after=("scene", "properties", "background"))
+    radius: float | None = option(after=("scene", "properties", "background", "contraction"))
     reconstruction: str = option("")
     pixels: Pixels = option("all")
     properties: str = option("")
+    shading: ShadingOverride = option("scene")
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -153,6 +164,14 @@ class FieldConfig:
       precision: Arithmetic precision of the fields.
       dilation: Dilation of a proposal before it is sampled, as a share of its mean bin width; 0 for
         none.
+      colour_network: Layers of the colour network: plain, or with a skip connection (skip), which
+        appends its inputs to the outputs of its first layer, as in the paper's released code.
+      contraction: Scenes whose space is contracted: unbounded ones, or all (always; the paper's
+        released code), as if the size of their background were unknown.
+      near: Near plane: distance of the first sample from the camera, world units; by default 0.05,
+        with contraction=always 0.5.
+      far: Far plane: distance of the last sample from the last bend in contracted space, world
+        units; by default 1000, with contraction=always 150, and 10,000 in unbounded scenes.
     """
 
     preset: PresetName = option("tiny")
@@ -166,6 +185,10 @@ class FieldConfig:
     max_res: int | None = option(formerly="finest", after=("preset", "field"))
     precision: Precision | None = option(after=("preset", "field"))
     dilation: float | None = option(after=("preset", "field"))
+    colour_network: ColourNetwork = option("plain")
+    contraction: Contraction = option("unbounded")
+    near: float | None = option(after=_BOUNDS, compare=False)
+    far: float | None = option(after=_BOUNDS, compare=False)
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -186,6 +209,9 @@ class FieldConfig:
             raise ValueError(f"max_res is {self.max_res}. Give 1 to {_FINEST} cells per side.")
         if self.dilation is not None and not 0.0 <= self.dilation < math.inf:
             raise ValueError(f"dilation is {self.dilation}. Give 0 or a positive number.")
+        for name, distance in (("near", self.near), ("far", self.far)):
+            if distance is not None and not 0.0 <= distance < math.inf:
+                raise ValueError(f"{name} is {distance}. Give 0 or a positive number.")
         size = self.log2_hashmap_size
         if size is not None and not 1 <= size <= _MOST_ENTRIES:
             raise ValueError(
@@ -207,6 +233,8 @@ class LossConfig:
       tint_decay: Weight of the optical density of learned tints and absorption.
       distortion_over: Samples in the distortion loss: those outside the objects (the paper's
         correction), or all (everywhere; Mip-NeRF 360, the paper's ablation).
+      path_losses: Light paths in the interlevel and distortion losses: all, or all but those that
+        are reflected at the first surface (transmitted; the paper's released code).
     """
 
     data: DataLoss = option("mse", name="data_loss")
@@ -216,6 +244,7 @@ class LossConfig:
     hash_decay: float | None = option(after=("field",))
     tint_decay: float = option(1e-3, formerly="dye_decay")
     distortion_over: DistortionOver = option("outside", name="distortion")
+    path_losses: PathLosses = option("all")
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -241,6 +270,8 @@ class ScheduleConfig:
         share of the steps.
       batch: Number of rays per step.
       pretraced_batches: Number of batches whose light paths are traced at once.
+      adam_b2: Decay of Adam's second moment, in [0, 1): 0.99 as in Zip-NeRF, whose hash entries are
+        touched too rarely for a longer memory, or 0.999 as in the paper's released code.
     """
 
     steps: int | None = option(after=("preset",))
@@ -250,6 +281,7 @@ class ScheduleConfig:
     anneal: int | None = option(after=("preset", "steps"))
     batch: int | None = option(after=("preset",))
     pretraced_batches: int | None = option(formerly="pool", after=("preset",))
+    adam_b2: float = option(0.99)
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -261,6 +293,8 @@ class ScheduleConfig:
         for name, rate in (("learning_rate", self.peak), ("final_learning_rate", self.end)):
             if rate is not None and not 0.0 < rate < math.inf:
                 raise ValueError(f"{name} is {rate}. Give a positive number.")
+        if not 0.0 <= self.adam_b2 < 1.0:
+            raise ValueError(f"adam_b2 is {self.adam_b2}. Give a number in [0, 1).")
 
     def check_lengths(self) -> None:
         """Refuses a warm-up or annealing that is longer than the run; earlier runs may have one.

@@ -19,8 +19,9 @@ in its own module; those of `paper` are the published ones.
 
 Samples are per path, for each proposal level and the radiance field; `multi` is the number of
 multisamples per interval; the hash map size is the number of entries of a level. Values that depend
-on the scene are not part of a preset: for the complete published set-up, use `paper` with the path
-settings `paper` and the interior `field`; leave both out for the other presets.
+on the scene are not part of a preset: for the paper's set-up, use `paper` with the path settings
+`paper` and the interior `field`; leave both out for the other presets. `docs/benchmark.md` lists
+what the paper's released code does otherwise, and the options for it.
 
 On the bundled ball, 1250 steps of 1024 rays reach a masked PSNR of 36.6 dB with `tiny` and 37.9 dB
 with `small`, whose steps take 3.1 times as long. `paper` and `best` require a GPU: a CPU core needs
@@ -56,6 +57,13 @@ costs 2.7 dB.
 
 _NEAR = 0.05
 _FAR_UNBOUNDED = 1000.0
+
+# World units per unit of the paper's released code (`--scale-factor 0.1`), whose near plane is
+# 0.05, and whose far plane is 15, or 1000 in unbounded scenes. It contracts space beyond one unit.
+_PUBLISHED_UNIT = 10.0
+_PUBLISHED_NEAR = 0.05 * _PUBLISHED_UNIT
+_PUBLISHED_FAR = 15.0 * _PUBLISHED_UNIT
+_PUBLISHED_FAR_UNBOUNDED = 1000.0 * _PUBLISHED_UNIT
 
 # Blur of the interlevel loss for each proposal level (Zip-NeRF, supplement).
 _BLURS = (0.03, 0.003)
@@ -139,6 +147,22 @@ def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
     return Bounds(_NEAR, farthest + reach, radius, space)
 
 
+def contracted(scene: Bounds, *, radius: float | None) -> Bounds:
+    """Returns bounds that ignore the size of the background: all of space is contracted.
+
+    Args:
+      scene: bounds of the scene.
+      radius: radius of an unbounded scene's uncontracted ball, world units; by default, and in
+        other scenes, that of the released code.
+
+    Source: the paper's released code, in world units.
+    """
+    if scene.space == "unbounded":
+        ball = radius or _PUBLISHED_UNIT
+        return Bounds(_PUBLISHED_NEAR, _PUBLISHED_FAR_UNBOUNDED, ball, "unbounded")
+    return Bounds(_PUBLISHED_NEAR, _PUBLISHED_FAR, _PUBLISHED_UNIT, "unbounded")
+
+
 def override_model(model: ModelConfig, asked: FieldConfig) -> ModelConfig:
     """Returns a preset's model with overrides; `None` keeps the value of the preset.
 
@@ -159,7 +183,15 @@ def override_model(model: ModelConfig, asked: FieldConfig) -> ModelConfig:
         )
         field = dataclasses.replace(model.field, precision=asked.precision)
         model = dataclasses.replace(model, proposals=proposals, field=field)
-    return dataclasses.replace(model, field=_with_grid(model.field, asked))
+    field = _with_grid(model.field, asked)
+    if asked.colour_network != "plain":
+        if not isinstance(field, mlps.GridRadianceConfig):
+            raise ValueError(
+                f"colour_network={asked.colour_network} is an option of field types with a hash "
+                f"grid, unlike {field.kind}. Leave it out."
+            )
+        field = dataclasses.replace(field, colour_network=asked.colour_network)
+    return dataclasses.replace(model, field=field)
 
 
 def _with_samples(model: ModelConfig, samples: tuple[int, ...], preset: str) -> ModelConfig:

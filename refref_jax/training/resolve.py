@@ -190,6 +190,8 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
         rule="nested",
         background=model.space,
         radius=model.radius,
+        near=model.near,
+        far=model.far,
         min_throughput=settings.min_throughput,
         max_bends=settings.max_bends,
         reentry=settings.reentry if settings.max_bends else None,
@@ -203,6 +205,7 @@ def build_scene(resolved: Resolved, facts: SceneFacts) -> Scene:
     """Builds the scene for tracing; its parts only have colours if `tints` is `given`."""
     given = resolved.config.model.tints == "given"
     parts = facts.parts if given else meshes.without_colour(facts.parts)
+    parts = meshes.with_shading(parts, resolved.config.scene.shading)
     rule, (parents, overlaps) = resolved.config.scene.rule or facts.rule, facts.tree
     return assemble_scene(parts, parents, rule=rule, overlaps=overlaps, ambient=facts.ambient)
 
@@ -320,17 +323,10 @@ def _resolve_inside(
 def _resolve_model(
     config: TrainConfig, facts: SceneFacts, reasons: dict[str, str]
 ) -> tuple[ModelConfig, TrainConfig]:
-    scene, found = config.scene, facts.analysis
-    config = _decide(config, reasons, "the scene", background=found.space)
-    extent = presets.bounds(
-        facts.cameras, space=found.space, radius=scene.radius or facts.half_extent
-    )
-    why = facts.source if facts.half_extent else "the data set's usual background"
-    why = "the cameras" if found.space == "unbounded" else why
-    config = _decide(config, reasons, why, radius=extent.radius)
+    extent, config = _resolve_bounds(config, facts, reasons)
     preset = presets.PRESETS[config.model.preset]
     model = preset.model(extent, require(config.model.interior), field=config.model.field)
-    learned = found.parts if config.model.tints == "learned" else 0
+    learned = facts.analysis.parts if config.model.tints == "learned" else 0
     model = presets.override_model(dataclasses.replace(model, learned_tints=learned), config.model)
     config = _decide(
         config,
@@ -339,6 +335,36 @@ def _resolve_model(
         **presets.sampling_of(model),
     )
     return model, config
+
+
+def _resolve_bounds(
+    config: TrainConfig, facts: SceneFacts, reasons: dict[str, str]
+) -> tuple[presets.Bounds, TrainConfig]:
+    """Decides the size of the background, and the near and far planes.
+
+    Raises:
+      ValueError: if a far plane is given where paths end at the background.
+    """
+    space, size = facts.analysis.space, config.scene.radius
+    config = _decide(config, reasons, "the scene", background=space)
+    why = facts.source if facts.half_extent else "the data set's usual background"
+    why = "the cameras" if space == "unbounded" else why
+    extent = presets.bounds(facts.cameras, space=space, radius=size or facts.half_extent)
+    sampled, reason = extent, f"background={space}"
+    if config.model.contraction == "always":
+        sampled, reason = presets.contracted(extent, radius=size), "contraction=always"
+        if space == "unbounded":
+            extent, why = sampled, reason
+    far = config.model.far
+    if sampled.space != "unbounded" and far not in (None, sampled.far):
+        raise ValueError(
+            f"far={far:g} has no effect in a {space} scene, whose paths end at the background. "
+            "Leave it out, or use contraction=always."
+        )
+    config = _decide(config, reasons, why, radius=extent.radius)
+    config = _decide(config, reasons, reason, near=sampled.near, far=sampled.far)
+    near, far = require(config.model.near), require(config.model.far)
+    return dataclasses.replace(sampled, near=near, far=far), config
 
 
 def _resolve_training(

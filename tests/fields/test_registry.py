@@ -87,6 +87,8 @@ def test_what_a_third_kind_has_not_is_refused(fog):
     for options in (FieldConfig(log2_hashmap_size=12), FieldConfig(max_res=64)):
         with pytest.raises(ValueError, match="which field type fog does not have"):
             override_model(model, options)
+    with pytest.raises(ValueError, match=r"colour_network=skip .* unlike fog"):
+        override_model(model, FieldConfig(colour_network="skip"))
     assert override_model(model, FieldConfig(precision="bfloat16")) != model
 
 
