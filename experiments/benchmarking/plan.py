@@ -23,7 +23,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from experiments.benchmarking import scene_lists
-from experiments.benchmarking.methods import RECONSTRUCTION, Method, Need, same_as, same_inside
+from experiments.benchmarking.methods import (
+    RECONSTRUCTION,
+    Method,
+    Need,
+    evaluation_options,
+    same_as,
+    same_inside,
+)
 from experiments.benchmarking.settings import Scene, Settings, digest
 from experiments.cli import scenes as cli_scenes
 from refref_jax import configuration
@@ -146,7 +153,7 @@ def options(method: str, train: Sequence[str], settings: Settings) -> dict[str, 
         return {"reconstruct": [f"--seed={settings.seed}"]}
     return {
         "train": [*settings.training(), *train],
-        "evaluate": list(settings.evaluation()),
+        "evaluate": evaluation_options(method, settings.evaluation()),
     }
 
 
