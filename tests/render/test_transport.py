@@ -130,7 +130,8 @@ def test_a_path_that_is_turned_around_again_and_again_still_reaches_the_walls():
 
 def test_samples_reach_from_the_near_to_the_far_plane():
     config = dataclasses.replace(_FIELD, space="unbounded", near=0.5, far=150.0, radius=10.0)
-    line = polylines.whole_path(_tree_item(_straight_paths(), 0))
+    path = jax.tree.map(jnp.asarray, _tree_item(_straight_paths(), 0))
+    line = polylines.whole_path(path)
     still = Jitter(jnp.float32(0.0), jnp.float32(0.0))
     warp = volume_rendering.distance_warp(config, line)
     t = volume_rendering.sample(config, line, warp, [], 9, jitter=still, anneal=jnp.float32(1.0)).t
