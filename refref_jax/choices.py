@@ -51,6 +51,9 @@ KnownTints = Literal["given", "learned"]
 Tints = Literal["none", KnownTints]
 """Source of tints and absorption; `none` if no part is coloured."""
 
+ShadingOverride = Literal["scene", "smooth", "flat"]
+"""Shading of all parts, in place of their own; `scene` keeps it."""
+
 Space = Literal["bounded", "spherical", "unbounded"]
 """Scene bounds: a background cube, a background sphere, or none."""
 
@@ -75,6 +78,12 @@ FieldName = Literal["zipnerf", "nerfacto"]
 Interior = Literal["field", "clear", "absorbing"]
 """Model of the inside of the objects; see `render.config.ModelConfig`."""
 
+ColourNetwork = Literal["plain", "skip"]
+"""Layers of the colour network: plain, or with a skip connection; see `fields.mlps`."""
+
+Contraction = Literal["unbounded", "always"]
+"""Scenes whose space is contracted: unbounded ones, or all; see `training.presets.contracted`."""
+
 Footprint = Literal["cone", "differential"]
 """Model of the pixel footprint along a path; see `render.config.ModelConfig`."""
 
@@ -83,6 +92,9 @@ Precision = Literal["float32", "bfloat16"]
 
 DataLoss = Literal["mse", "charbonnier"]
 """Loss on sRGB colours."""
+
+PathLosses = Literal["all", "transmitted"]
+"""Light paths that the interlevel and distortion losses include; see `training.objective`."""
 
 DistortionOver = Literal["outside", "everywhere"]
 """Samples that the distortion loss includes: those outside the objects, or all."""

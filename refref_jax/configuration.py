@@ -5,6 +5,9 @@ also read under its earlier name, `formerly` in its metadata.
 
 Fields may be numbers, strings, booleans, `None`, other dataclasses, and tuples of these. If a field
 is annotated with a base class, the key `kind` of its value selects the variant of that class.
+
+The leaves of a tree of dataclasses can be options (`option`), which are accessed by their names
+(`options_of`).
 """
 
 import dataclasses
@@ -16,9 +19,9 @@ import os
 import sys
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePath
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from refref_jax import atomic_files
 
@@ -165,6 +168,96 @@ def plain(value: Any) -> Any:
     if isinstance(value, numbers.Real):
         return float(value)
     return str(value) if isinstance(value, PurePath) else value
+
+
+class Option(NamedTuple):
+    """One option of a configuration.
+
+    Attributes:
+      name: name of the option.
+      section: field of the configuration that contains the option; empty if it is there itself.
+      field: dataclass field of the option in its section.
+    """
+
+    name: str
+    section: str
+    field: dataclasses.Field[Any]
+
+
+def option(
+    default: Any = None,
+    *,
+    name: str = "",
+    formerly: str = "",
+    after: tuple[str, ...] = (),
+    compare: bool = True,
+) -> Any:
+    """Declares an option as a field of a dataclass.
+
+    Args:
+      default: value if none is given; `None` for a decision that is taken later.
+      name: name of the option if it differs from that of the field.
+      formerly: name of the option and the field in earlier versions, which is still read.
+      after: options on which the decision depends. Overriding one of them takes it again, unless
+        the option itself is an override.
+      compare: whether configurations that differ in this option are different.
+    """
+    metadata = {"name": name, "after": after, FORMERLY: formerly or None}
+    return dataclasses.field(default=default, metadata=metadata, compare=compare)
+
+
+def options_of(kind: type) -> Iterator[Option]:
+    """Yields all options of a configuration class: its fields, and those of its sections.
+
+    A field of the class itself that is not compared is not an option.
+    """
+    for field in dataclasses.fields(kind):
+        if dataclasses.is_dataclass(field.default):
+            for leaf in dataclasses.fields(field.default):
+                yield Option(leaf.metadata["name"] or leaf.name, field.name, leaf)
+        elif field.compare:
+            yield Option(field.name, "", field)
+
+
+def type_of(kind: type, chosen: Option) -> Any:
+    """Returns the annotation of the field of an option of a configuration class."""
+    hints = hints_of(kind)
+    owner = hints[chosen.section] if chosen.section else kind
+    return hints_of(owner)[chosen.field.name]
+
+
+def present_name(kind: type, name: str) -> str:
+    """Returns the name of an option for its name in this or an earlier version."""
+    former = {each.field.metadata.get(FORMERLY): each.name for each in options_of(kind)}
+    return former.get(name, name)
+
+
+def convert_options(kind: type, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Converts values of options to the types of their fields; `None` becomes the default.
+
+    Args:
+      kind: class of the configuration.
+      given: values by name, present or former.
+
+    Returns:
+      The values by the present names of the options.
+
+    Raises:
+      ValueError: if a value has another type, is not one of the choices, or has no option.
+    """
+    options = {each.name: each for each in options_of(kind)}
+    given = {present_name(kind, name): value for name, value in given.items()}
+    if unknown := sorted(set(given) - set(options)):
+        raise ValueError(
+            f"There is no option {unknown[0]!r}. Choose from {', '.join(sorted(options))}."
+        )
+    usual = {name: options[name].field.default for name in given}
+    return {
+        name: usual[name]
+        if value is None
+        else convert(plain(value), type_of(kind, options[name]), name=name)
+        for name, value in given.items()
+    }
 
 
 def _build(kind: Any, value: Any, where: str, variants: Variants) -> Any:

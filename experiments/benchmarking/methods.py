@@ -2,10 +2,11 @@
 
 A method is a set of options of `experiments.train`, so adding one means adding a line here.
 Everything else is that of the preset for all methods: sizes, schedule and footprint. `oracle`,
-`--paths=paper --interior=field`, therefore has the published light paths and fields;
-`docs/benchmark.md` lists its differences from the released code. Ablations of `oracle` remove one
-component; those of `tree`, our method, change one. An ablation that equals the preset is skipped
-(`same_as`), as is one that equals the scene's own choice (`same_inside`). Nerfacto's fields
+`--paths=paper --interior=field`, therefore has the published light paths and fields, and
+`oracle_as_published` also has the scene bounds, normals, losses and evaluation of the paper's
+released code; `docs/benchmark.md` lists the differences that remain. Ablations of `oracle` remove
+one component; those of `tree`, our method, change one. An ablation that equals the preset is
+skipped (`same_as`), as is one that equals the scene's own choice (`same_inside`). Nerfacto's fields
 (`oracle_nerfacto`) define their own sizes, samples and footprint, a cone.
 """
 
@@ -41,6 +42,7 @@ class Method:
         `colours` of all its parts in scene.json.
       reconstructed: whether the objects come from R3F instead of the scene's meshes.
       published: row of the paper's tables with the same method, if there is one.
+      evaluate: options of `experiments.evaluate`, in place of those of the benchmark.
     """
 
     name: str
@@ -50,10 +52,23 @@ class Method:
     requires: tuple[Need, ...] = ("meshes",)
     reconstructed: bool = False
     published: str | None = None
+    evaluate: tuple[str, ...] = ()
 
 
 _ORACLE = ("--paths=paper", "--interior=field")
 _TREE = ("--paths=tree",)
+
+# What the released code does otherwise than `oracle`; near and far follow from `contraction`.
+_RELEASE = (
+    *_ORACLE,
+    "--contraction=always",
+    "--shading=flat",
+    "--footprint=cone",
+    "--colour_network=skip",
+    "--data_loss=charbonnier",
+    "--path_losses=transmitted",
+    "--adam_b2=0.999",
+)
 
 
 def _over(options: Sequence[str], others: Sequence[str]) -> tuple[str, ...]:
@@ -76,6 +91,14 @@ def _varied(name: str, label: str, *options: str, colours: tuple[Need, ...] = ()
 _ALL = (
     Method("straight", "Straight (Zip-NeRF)", "main", ("--paths=straight",), (), False, "Zip-NeRF"),
     Method("oracle", "Oracle (paper's paths)", "main", _ORACLE, published="Oracle"),
+    Method(
+        "oracle_as_published",
+        "Oracle (as published)",
+        "main",
+        _RELEASE,
+        published="Oracle",
+        evaluate=("--rays_per_pixel=1",),
+    ),
     Method("tree", "Oracle (path tree)", "main", _TREE),
     Method("r3f", "R3F (paper's paths)", "main", _ORACLE, ("masks",), True, "R3F"),
     Method("r3f_tree", "R3F (path tree)", "main", _TREE, ("masks",), True),
@@ -126,6 +149,8 @@ FULL: dict[Group, str] = {"ablation of the oracle": "oracle", "ablation of the t
 
 def same_as(method: Method, preset: str) -> str | None:
     """Returns the method that an ablation equals because its footprint is the preset's."""
+    if method.group not in FULL:
+        return None
     chosen = _options_of(method).get("footprint")
     size = registry.KINDS[registry.USUAL].sizes[presets.PRESETS[preset].size]
     return FULL[method.group] if chosen == size.footprint else None
@@ -145,6 +170,12 @@ def same_inside(method: Method, inside: Mapping[str, str]) -> str | None:
 
 def _options_of(method: Method) -> dict[str, str]:
     return dict(word.lstrip("-").split("=", 1) for word in method.train)
+
+
+def evaluation_options(name: str, common: Sequence[str]) -> list[str]:
+    """Returns the options that a method is evaluated with: those of all, replaced by its own."""
+    own = METHODS[name].evaluate if name in METHODS else ()
+    return list(_over(common, own))
 
 
 def parse(names: Sequence[str]) -> list[Method]:

@@ -26,7 +26,14 @@ from typing import Any, NamedTuple
 
 from experiments.benchmarking import externals, scene_lists
 from experiments.benchmarking.externals import External
-from experiments.benchmarking.methods import RECONSTRUCTION, Method, Need, same_as, same_inside
+from experiments.benchmarking.methods import (
+    RECONSTRUCTION,
+    Method,
+    Need,
+    evaluation_options,
+    same_as,
+    same_inside,
+)
 from experiments.benchmarking.settings import Scene, Settings, digest
 from experiments.cli import scenes as cli_scenes
 from refref_jax import configuration
@@ -175,7 +182,7 @@ def options(method: str, train: Sequence[str], settings: Settings) -> dict[str, 
         return {"reconstruct": [f"--seed={settings.seed}"]}
     return {
         "train": [*settings.training(), *train],
-        "evaluate": list(settings.evaluation()),
+        "evaluate": evaluation_options(method, settings.evaluation()),
     }
 
 

@@ -12,7 +12,7 @@ from experiments.cli import app
 from experiments.sweeps.options import OF_EVALUATION, present_name
 from refref_jax.fields import registry
 from refref_jax.optics.path_settings import PATH_PRESETS
-from refref_jax.training import resolve
+from refref_jax.training import presets
 from refref_jax.training.presets import PRESETS, Bounds
 
 BASE = "base"
@@ -125,14 +125,14 @@ def own_values(preset: str, paths: str = "tree", *, field: str = registry.USUAL)
       field: kind of the fields.
     """
     model = PRESETS[preset].model(_ANY_BOUNDS, "field", field=field)
-    grid = resolve.grid_of(model)
+    grid = presets.grid_of(model)
     of_grid = {}
     if grid is not None:
         size = grid.hashmap_size.bit_length() - 1
         of_grid = {"log2_hashmap_size": str(size), "max_res": str(grid.max_res)}
     return {
         "field": field,
-        "samples_per_ray": ",".join(map(str, resolve.samples_of(model))),
+        "samples_per_ray": ",".join(map(str, presets.samples_of(model))),
         "multisamples": str(model.multisamples),
         **of_grid,
         "footprint": model.footprint,

@@ -23,7 +23,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
-from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour, Material
+from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour, Material, ShadingOverride
 from refref_jax.data import SceneError, image_files, scene_names, scene_properties
 from refref_jax.data.scene_properties import PartDescription, SceneProperties, Shading
 
@@ -239,6 +239,13 @@ def without_colour(parts: Sequence[MeshPart]) -> list[MeshPart]:
     tint that is already applied to the light paths would count twice.
     """
     return [part._replace(tint=CLEAR, absorption=NO_ABSORPTION) for part in parts]
+
+
+def with_shading(parts: Sequence[MeshPart], shading: ShadingOverride) -> list[MeshPart]:
+    """Returns the parts with other shading; `scene` keeps the shading and normals of each part."""
+    if shading == "scene":
+        return list(parts)
+    return [part._replace(shading=shading, normals=None) for part in parts]
 
 
 def read_mesh(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from refref_jax.choices import Precision
+from refref_jax.choices import ColourNetwork, Precision
 from refref_jax.fields.base import DensityConfig, RadianceConfig, dense
 from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid
 from refref_jax.sampling.cones import Gaussians
@@ -59,6 +59,7 @@ class GridRadianceConfig(RadianceConfig):
       bottleneck: number of features passed from the density network to the colour network.
       colour_width: width of the colour network's hidden layers.
       colour_depth: number of hidden layers of the colour network.
+      colour_network: `skip` appends the colour network's inputs to the outputs of its first layer.
     """
 
     grid: HashGridConfig
@@ -66,6 +67,7 @@ class GridRadianceConfig(RadianceConfig):
     bottleneck: int
     colour_width: int
     colour_depth: int
+    colour_network: ColourNetwork = "plain"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,9 +117,14 @@ def colour(
     direction: Float[Array, "3"],
     config: GridRadianceConfig,
 ) -> Float[Array, "3"]:
-    """Returns a colour in `[0, 1]` from the bottleneck features and a unit direction."""
+    """Returns a colour in `[0, 1]` from the bottleneck features and a unit direction.
+
+    Source: Zip-NeRF's code in PyTorch, on which the paper's is based, for the skip connection.
+    """
     layer = dense(config.precision)
-    hidden = jnp.concatenate([bottleneck, spherical_harmonics(direction)])
-    for _ in range(config.colour_depth):
+    inputs = hidden = jnp.concatenate([bottleneck, spherical_harmonics(direction)])
+    for i in range(config.colour_depth):
         hidden = nn.relu(layer(config.colour_width)(hidden))
+        if i == 0 and config.colour_network == "skip":
+            hidden = jnp.concatenate([hidden, inputs])
     return jax.nn.sigmoid(layer(3)(hidden))

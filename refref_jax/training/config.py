@@ -18,25 +18,34 @@ from typing import Any, NamedTuple, TypeVar
 
 from refref_jax import configuration
 from refref_jax.choices import (
+    ColourNetwork,
+    Contraction,
     DataLoss,
     DistortionOver,
     FieldName,
     Footprint,
     Interior,
+    PathLosses,
     Paths,
     Pixels,
     Precision,
     PresetName,
     RuleName,
+    ShadingOverride,
     Space,
     Tints,
 )
+from refref_jax.configuration import Option, option
 from refref_jax.optics.path_settings import Reentry, check_max_bends, check_min_throughput
 
 _Value = TypeVar("_Value")
 
 # Options that determine the objects.
 _OBJECTS = ("scene", "properties", "reconstruction")
+
+# Options that determine the near and far planes. These are not compared: runs of earlier versions
+# lack them, and the model, which is compared as well, contains them.
+_BOUNDS = ("scene", "properties", "background", "radius", "contraction")
 
 # Maximum number of steps, rays and batches, which are 32-bit integers.
 _MOST = 2**31 - 1
@@ -49,22 +58,6 @@ _PATTERNS = (1, 6)
 
 # A 32-bit hash cannot address more entries.
 _MOST_ENTRIES = 31
-
-
-def _option(
-    default: Any = None, *, name: str = "", formerly: str = "", after: tuple[str, ...] = ()
-) -> Any:
-    """Declares a value of the configuration.
-
-    Args:
-      default: value if none is given; `None` for a decision of the scene or the preset.
-      name: name of the option if it differs from that of the field.
-      formerly: name of the option and the field in earlier versions, which is still read.
-      after: options on which the decision depends. Overriding one of them takes it again, unless
-        the option itself is an override.
-    """
-    metadata = {"name": name, "after": after, configuration.FORMERLY: formerly or None}
-    return dataclasses.field(default=default, metadata=metadata)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,21 +75,24 @@ class SceneConfig:
         away (unbounded). By default that of scene.json or the scene's name.
       radius: Half edge of the background cube, or radius of the background sphere (by default that
         of scene.json, else measured from depth maps, else 7.3), or radius of an unbounded scene's
-        uncontracted ball, world units.
+        uncontracted ball, world units; with contraction=always only the latter has an effect.
       reconstruction: Output folder of experiments.reconstruct, whose object replaces the scene's
         meshes.
       pixels: Training pixels: all, or only those of the background, at a margin from the masks.
       properties: JSON file of properties of the scene, like scene.json, whose values override it.
+      shading: Shading of all objects: their own (scene), smooth, or flat, with face normals, as in
+        the paper's released code.
     """
 
-    path: str = _option("", name="scene")
-    rule: RuleName | None = _option(after=_OBJECTS)
-    indices: tuple[tuple[str, float], ...] = _option((), name="ior", after=("reconstruction",))
-    space: Space | None = _option(name="background", after=("scene", "properties"))
-    radius: float | None = _option(after=("scene", "properties", "background"))
-    reconstruction: str = _option("")
-    pixels: Pixels = _option("all")
-    properties: str = _option("")
+    path: str = option("", name="scene")
+    rule: RuleName | None = option(after=_OBJECTS)
+    indices: tuple[tuple[str, float], ...] = option((), name="ior", after=("reconstruction",))
+    space: Space | None = option(name="background", after=("scene", "properties"))
+    radius: float | None = option(after=("scene", "properties", "background", "contraction"))
+    reconstruction: str = option("")
+    pixels: Pixels = option("all")
+    properties: str = option("")
+    shading: ShadingOverride = option("scene")
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -131,10 +127,10 @@ class PathsConfig:
         from the meshes.
     """
 
-    name: Paths | None = _option(name="paths", after=_OBJECTS)
-    min_throughput: float | None = _option(formerly="cut", after=("paths",))
-    max_bends: int | None = _option(formerly="bends", after=("paths",))
-    reentry: Reentry | None = _option(after=(*_OBJECTS, "rule", "paths", "max_bends"))
+    name: Paths | None = option(name="paths", after=_OBJECTS)
+    min_throughput: float | None = option(formerly="cut", after=("paths",))
+    max_bends: int | None = option(formerly="bends", after=("paths",))
+    reentry: Reentry | None = option(after=(*_OBJECTS, "rule", "paths", "max_bends"))
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -168,19 +164,31 @@ class FieldConfig:
       precision: Arithmetic precision of the fields.
       dilation: Dilation of a proposal before it is sampled, as a share of its mean bin width; 0 for
         none.
+      colour_network: Layers of the colour network: plain, or with a skip connection (skip), which
+        appends its inputs to the outputs of its first layer, as in the paper's released code.
+      contraction: Scenes whose space is contracted: unbounded ones, or all (always; the paper's
+        released code), as if the size of their background were unknown.
+      near: Near plane: distance of the first sample from the camera, world units; by default 0.05,
+        with contraction=always 0.5.
+      far: Far plane: distance of the last sample from the last bend in contracted space, world
+        units; by default 1000, with contraction=always 150, and 10,000 in unbounded scenes.
     """
 
-    preset: PresetName = _option("tiny")
-    field: FieldName = _option("zipnerf")
-    interior: Interior | None = _option(after=(*_OBJECTS, "paths", "max_bends", "tints"))
-    tints: Tints | None = _option(after=(*_OBJECTS, "paths", "max_bends", "interior"))
-    footprint: Footprint | None = _option(after=("preset", "field"))
-    samples_per_ray: tuple[int, ...] | None = _option(formerly="samples", after=("preset", "field"))
-    multisamples: int | None = _option(after=("preset", "field"))
-    log2_hashmap_size: int | None = _option(formerly="entries", after=("preset", "field"))
-    max_res: int | None = _option(formerly="finest", after=("preset", "field"))
-    precision: Precision | None = _option(after=("preset", "field"))
-    dilation: float | None = _option(after=("preset", "field"))
+    preset: PresetName = option("tiny")
+    field: FieldName = option("zipnerf")
+    interior: Interior | None = option(after=(*_OBJECTS, "paths", "max_bends", "tints"))
+    tints: Tints | None = option(after=(*_OBJECTS, "paths", "max_bends", "interior"))
+    footprint: Footprint | None = option(after=("preset", "field"))
+    samples_per_ray: tuple[int, ...] | None = option(formerly="samples", after=("preset", "field"))
+    multisamples: int | None = option(after=("preset", "field"))
+    log2_hashmap_size: int | None = option(formerly="entries", after=("preset", "field"))
+    max_res: int | None = option(formerly="finest", after=("preset", "field"))
+    precision: Precision | None = option(after=("preset", "field"))
+    dilation: float | None = option(after=("preset", "field"))
+    colour_network: ColourNetwork = option("plain")
+    contraction: Contraction = option("unbounded")
+    near: float | None = option(after=_BOUNDS, compare=False)
+    far: float | None = option(after=_BOUNDS, compare=False)
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -201,6 +209,9 @@ class FieldConfig:
             raise ValueError(f"max_res is {self.max_res}. Give 1 to {_FINEST} cells per side.")
         if self.dilation is not None and not 0.0 <= self.dilation < math.inf:
             raise ValueError(f"dilation is {self.dilation}. Give 0 or a positive number.")
+        for name, distance in (("near", self.near), ("far", self.far)):
+            if distance is not None and not 0.0 <= distance < math.inf:
+                raise ValueError(f"{name} is {distance}. Give 0 or a positive number.")
         size = self.log2_hashmap_size
         if size is not None and not 1 <= size <= _MOST_ENTRIES:
             raise ValueError(
@@ -222,15 +233,18 @@ class LossConfig:
       tint_decay: Weight of the optical density of learned tints and absorption.
       distortion_over: Samples in the distortion loss: those outside the objects (the paper's
         correction), or all (everywhere; Mip-NeRF 360, the paper's ablation).
+      path_losses: Light paths in the interlevel and distortion losses: all, or all but those that
+        are reflected at the first surface (transmitted; the paper's released code).
     """
 
-    data: DataLoss = _option("mse", name="data_loss")
-    interlevel: float = _option(0.01, name="interlevel_weight")
-    blurs: tuple[float, ...] | None = _option(after=("preset", "field", "samples_per_ray"))
-    distortion: float = _option(0.01, name="distortion_weight")
-    hash_decay: float | None = _option(after=("field",))
-    tint_decay: float = _option(1e-3, formerly="dye_decay")
-    distortion_over: DistortionOver = _option("outside", name="distortion")
+    data: DataLoss = option("mse", name="data_loss")
+    interlevel: float = option(0.01, name="interlevel_weight")
+    blurs: tuple[float, ...] | None = option(after=("preset", "field", "samples_per_ray"))
+    distortion: float = option(0.01, name="distortion_weight")
+    hash_decay: float | None = option(after=("field",))
+    tint_decay: float = option(1e-3, formerly="dye_decay")
+    distortion_over: DistortionOver = option("outside", name="distortion")
+    path_losses: PathLosses = option("all")
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -256,15 +270,18 @@ class ScheduleConfig:
         share of the steps.
       batch: Number of rays per step.
       pretraced_batches: Number of batches whose light paths are traced at once.
+      adam_b2: Decay of Adam's second moment, in [0, 1): 0.99 as in Zip-NeRF, whose hash entries are
+        touched too rarely for a longer memory, or 0.999 as in the paper's released code.
     """
 
-    steps: int | None = _option(after=("preset",))
-    warmup: int | None = _option(after=("preset", "steps"))
-    peak: float | None = _option(name="learning_rate", after=("preset",))
-    end: float | None = _option(name="final_learning_rate", after=("preset",))
-    anneal: int | None = _option(after=("preset", "steps"))
-    batch: int | None = _option(after=("preset",))
-    pretraced_batches: int | None = _option(formerly="pool", after=("preset",))
+    steps: int | None = option(after=("preset",))
+    warmup: int | None = option(after=("preset", "steps"))
+    peak: float | None = option(name="learning_rate", after=("preset",))
+    end: float | None = option(name="final_learning_rate", after=("preset",))
+    anneal: int | None = option(after=("preset", "steps"))
+    batch: int | None = option(after=("preset",))
+    pretraced_batches: int | None = option(formerly="pool", after=("preset",))
+    adam_b2: float = option(0.99)
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -276,6 +293,8 @@ class ScheduleConfig:
         for name, rate in (("learning_rate", self.peak), ("final_learning_rate", self.end)):
             if rate is not None and not 0.0 < rate < math.inf:
                 raise ValueError(f"{name} is {rate}. Give a positive number.")
+        if not 0.0 <= self.adam_b2 < 1.0:
+            raise ValueError(f"adam_b2 is {self.adam_b2}. Give a number in [0, 1).")
 
     def check_lengths(self) -> None:
         """Refuses a warm-up or annealing that is longer than the run; earlier runs may have one.
@@ -306,20 +325,6 @@ class Followers(NamedTuple):
 
     decided: frozenset[str]
     kept: frozenset[str]
-
-
-class Option(NamedTuple):
-    """One value of the configuration.
-
-    Attributes:
-      name: name of the option.
-      section: field of `TrainConfig` that contains the option; empty for the seed.
-      field: dataclass field of the option in its section.
-    """
-
-    name: str
-    section: str
-    field: dataclasses.Field[Any]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -449,29 +454,12 @@ def require(value: _Value | None) -> _Value:
 
 def type_of(option: Option) -> Any:
     """Returns the annotation of an option's field."""
-    owner = type(getattr(TrainConfig(), option.section)) if option.section else TrainConfig
-    return configuration.hints_of(owner)[option.field.name]
+    return configuration.type_of(TrainConfig, option)
 
 
 def _converted(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns values converted to the types of their fields, by the present names of options.
-
-    Raises:
-      ValueError: if a value has another type, is not one of the choices, or has no option.
-    """
-    options = _by_name()
-    given = {present_name(name): value for name, value in given.items()}
-    if unknown := sorted(set(given) - set(options)):
-        raise ValueError(
-            f"There is no option {unknown[0]!r}. Choose from {', '.join(sorted(options))}."
-        )
-    usual = {name: options[name].field.default for name in given}
-    return {
-        name: usual[name]
-        if value is None
-        else configuration.convert(configuration.plain(value), type_of(options[name]), name=name)
-        for name, value in given.items()
-    }
+    """Returns values converted to the types of their fields, by the present names of options."""
+    return configuration.convert_options(TrainConfig, given)
 
 
 def _nothing(given: Mapping[str, Any]) -> set[str]:
@@ -482,8 +470,7 @@ def _nothing(given: Mapping[str, Any]) -> set[str]:
 
 def present_name(name: str) -> str:
     """Returns the name of an option for its name in this or an earlier version."""
-    former = {o.field.metadata.get(configuration.FORMERLY): o.name for o in options_of()}
-    return former.get(name, name)
+    return configuration.present_name(TrainConfig, name)
 
 
 def _by_name() -> dict[str, Option]:
@@ -492,9 +479,4 @@ def _by_name() -> dict[str, Option]:
 
 def options_of() -> Iterator[Option]:
     """Yields all options of a training run, in the order of the configuration."""
-    for field in dataclasses.fields(TrainConfig):
-        if dataclasses.is_dataclass(field.default):
-            for leaf in dataclasses.fields(field.default):
-                yield Option(leaf.metadata["name"] or leaf.name, field.name, leaf)
-        elif field.compare:
-            yield Option(field.name, "", field)
+    return configuration.options_of(TrainConfig)

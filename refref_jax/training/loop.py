@@ -29,9 +29,6 @@ from refref_jax.training.config import ScheduleConfig, TrainConfig, require
 from refref_jax.training.devices import AXIS
 from refref_jax.training.objective import StepReport, Totals
 
-# Zip-NeRF's decay of the second moment; hash entries are touched too rarely for 0.999.
-_SECOND_MOMENT_DECAY = 0.99
-
 _EPSILON = 1e-15
 
 # Slope of Schlick's bias function for the annealing of proposal weights (Mip-NeRF 360).
@@ -66,8 +63,8 @@ def init_state(seed: int, model: ModelConfig, schedule: ScheduleConfig) -> Train
 
 
 def optimizer(schedule: ScheduleConfig) -> optax.GradientTransformation:
-    """Returns Adam with the schedule's learning rate."""
-    return optax.adam(learning_rate(schedule), b2=_SECOND_MOMENT_DECAY, eps=_EPSILON)
+    """Returns Adam with the schedule's learning rate and second moment decay."""
+    return optax.adam(learning_rate(schedule), b2=schedule.adam_b2, eps=_EPSILON)
 
 
 def learning_rate(schedule: ScheduleConfig) -> optax.Schedule:

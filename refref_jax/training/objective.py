@@ -120,7 +120,7 @@ class Totals(NamedTuple):
       linear: linear RGB of the rays.
       interlevel: sum of interlevel losses.
       distortion: sum of distortion losses.
-      paths: number of paths that exist.
+      paths: number of paths in the interlevel and distortion losses.
     """
 
     linear: Float[Array, "rays 3"]
@@ -130,19 +130,25 @@ class Totals(NamedTuple):
 
 
 def total(light: pixels.Light, paths: LightPaths, config: LossConfig) -> Totals:
-    """Sums the contributions of paths of a batch to the losses."""
+    """Sums the contributions of paths of a batch to the losses.
+
+    Paths that are reflected at the first surface are left out of the interlevel and distortion
+    losses if `config.path_losses` is `transmitted`, but remain in the colours of their rays.
+    """
     *proposals, final = light.paths.histograms
-    exists = light_paths.exists(paths)
+    included = light_paths.exists(paths)
+    if config.path_losses == "transmitted":
+        included &= ~light_paths.reflected_first(paths)
     missed = jnp.zeros(())
     for proposal, blur in zip(proposals, require(config.blurs), strict=True):
         per_path = jax.vmap(functools.partial(interlevel, blur=blur))(final, proposal)
-        missed += _sum_where(exists, per_path)
+        missed += _sum_where(included, per_path)
     counted = light.paths.outside
     if config.distortion_over == "everywhere":
         counted = jnp.ones_like(counted)
     spread = jax.vmap(distortion)(final, counted)
-    count = jnp.sum(exists, dtype=missed.dtype)
-    return Totals(light.linear, missed, _sum_where(exists, spread), count)
+    count = jnp.sum(included, dtype=missed.dtype)
+    return Totals(light.linear, missed, _sum_where(included, spread), count)
 
 
 def measure(
@@ -152,7 +158,7 @@ def measure(
     dropped: Float[Array, "rays 3"],
     config: LossConfig,
 ) -> StepReport:
-    """Returns the losses of a batch; losses of paths are averaged over the paths that exist."""
+    """Returns the losses of a batch; losses of paths are averaged over the included paths."""
     rgb = colour.linear_to_srgb(totals.linear)
     mse = mean_squared_error(rgb, target)
     data = mse if config.data == "mse" else charbonnier(rgb, target)

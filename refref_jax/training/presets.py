@@ -21,6 +21,7 @@ Samples are per path, for each proposal level and the radiance field; `multi` is
 multisamples per interval; the hash map size is the number of entries of a level. Values that depend
 on the scene are not part of a preset. For the complete published set-up, use the preset `paper`
 with the path settings `paper` and the interior `field`; leave these two out for other presets.
+`docs/benchmark.md` lists what the paper's released code does otherwise, and the options for it.
 
 On the bundled ball, 1250 steps of 1024 rays reach a masked PSNR of 36.6 dB with `tiny` and 37.9 dB
 with `small`, whose steps take 3.1 times as long. `paper` and `best` require a GPU: a CPU core needs
@@ -35,14 +36,17 @@ batches have as many rays, and take as much memory, as those of `paper`.
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 
 from refref_jax.choices import Interior, Space
-from refref_jax.fields import registry
+from refref_jax.fields import mlps, registry
+from refref_jax.fields.base import RadianceConfig
+from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.render.model import ModelConfig, ProposalConfig
-from refref_jax.training.config import LossConfig, ScheduleConfig
+from refref_jax.training.config import FieldConfig, LossConfig, ScheduleConfig
 
 _WALLS = 7.3
 """Default half edge of the background cube, or radius of the background sphere: the data set's.
@@ -53,6 +57,13 @@ costs 2.7 dB.
 
 _NEAR = 0.05
 _FAR_UNBOUNDED = 1000.0
+
+# World units per unit of the paper's released code (`--scale-factor 0.1`), whose near plane is
+# 0.05, and whose far plane is 15, or 1000 in unbounded scenes. It contracts space beyond one unit.
+_PUBLISHED_UNIT = 10.0
+_PUBLISHED_NEAR = 0.05 * _PUBLISHED_UNIT
+_PUBLISHED_FAR = 15.0 * _PUBLISHED_UNIT
+_PUBLISHED_FAR_UNBOUNDED = 1000.0 * _PUBLISHED_UNIT
 
 # Blur of the interlevel loss for each proposal level (Zip-NeRF, supplement).
 _BLURS = (0.03, 0.003)
@@ -134,6 +145,113 @@ def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
     radius = radius or _WALLS
     reach = radius if space == "spherical" else math.sqrt(3.0) * radius
     return Bounds(_NEAR, farthest + reach, radius, space)
+
+
+def contracted(scene: Bounds, *, radius: float | None) -> Bounds:
+    """Returns bounds that ignore the size of the background: all of space is contracted.
+
+    Args:
+      scene: bounds of the scene.
+      radius: radius of an unbounded scene's uncontracted ball, world units; by default, and in
+        other scenes, that of the released code.
+
+    Source: the paper's released code, in world units.
+    """
+    if scene.space == "unbounded":
+        ball = radius or _PUBLISHED_UNIT
+        return Bounds(_PUBLISHED_NEAR, _PUBLISHED_FAR_UNBOUNDED, ball, "unbounded")
+    return Bounds(_PUBLISHED_NEAR, _PUBLISHED_FAR, _PUBLISHED_UNIT, "unbounded")
+
+
+def override_model(model: ModelConfig, asked: FieldConfig) -> ModelConfig:
+    """Returns a preset's model with overrides; `None` keeps the value of the preset.
+
+    Raises:
+      ValueError: if the model does not support an override.
+    """
+    if asked.samples_per_ray is not None:
+        model = _with_samples(model, asked.samples_per_ray, asked.preset)
+    names = ("multisamples", "footprint", "dilation")
+    given = {name: getattr(asked, name) for name in names}
+    model = dataclasses.replace(model, **{n: x for n, x in given.items() if x is not None})
+    if asked.precision is not None:
+        proposals = tuple(
+            dataclasses.replace(
+                each, field=dataclasses.replace(each.field, precision=asked.precision)
+            )
+            for each in model.proposals
+        )
+        field = dataclasses.replace(model.field, precision=asked.precision)
+        model = dataclasses.replace(model, proposals=proposals, field=field)
+    field = _with_grid(model.field, asked)
+    if asked.colour_network != "plain":
+        if not isinstance(field, mlps.GridRadianceConfig):
+            raise ValueError(
+                f"colour_network={asked.colour_network} is an option of field kinds with a hash "
+                f"grid, unlike {field.kind}. Leave it out."
+            )
+        field = dataclasses.replace(field, colour_network=asked.colour_network)
+    return dataclasses.replace(model, field=field)
+
+
+def _with_samples(model: ModelConfig, samples: tuple[int, ...], preset: str) -> ModelConfig:
+    rounds = len(model.proposals)
+    if len(samples) != rounds + 1:
+        raise ValueError(
+            f"samples_per_ray={','.join(map(str, samples))} is for {len(samples) - 1} proposal "
+            f"levels, but preset {preset} has {rounds}. Give {rounds + 1} numbers: one for each "
+            "proposal level, then one for the radiance field."
+        )
+    proposals = tuple(
+        dataclasses.replace(proposal, samples=count)
+        for proposal, count in zip(model.proposals, samples[:-1], strict=True)
+    )
+    return dataclasses.replace(model, proposals=proposals, samples=samples[-1])
+
+
+def _with_grid(field: RadianceConfig, asked: FieldConfig) -> RadianceConfig:
+    if asked.log2_hashmap_size is None and asked.max_res is None:
+        return field
+    if not isinstance(field, mlps.GridRadianceConfig):
+        raise ValueError(
+            "log2_hashmap_size and max_res are options of a hash grid, which field kind "
+            f"{field.kind} does not have. Leave them out."
+        )
+    grid = field.grid
+    if asked.log2_hashmap_size is not None:
+        grid = dataclasses.replace(grid, hashmap_size=1 << asked.log2_hashmap_size)
+    if asked.max_res is not None:
+        if asked.max_res < grid.base_res:
+            raise ValueError(
+                f"max_res={asked.max_res} is coarser than the grid's first level of "
+                f"{grid.base_res} cells per side. Give at least that."
+            )
+        grid = dataclasses.replace(grid, max_res=asked.max_res)
+    return dataclasses.replace(field, grid=grid)
+
+
+def samples_of(model: ModelConfig) -> tuple[int, ...]:
+    """Returns the number of samples of each proposal level, then of the radiance field."""
+    return (*(proposal.samples for proposal in model.proposals), model.samples)
+
+
+def grid_of(model: ModelConfig) -> HashGridConfig | None:
+    """Returns the hash grid of a model's radiance field, if its field kind has one."""
+    return model.field.grid if isinstance(model.field, mlps.GridRadianceConfig) else None
+
+
+def sampling_of(model: ModelConfig) -> dict[str, Any]:
+    """Returns the options of a model's samples, grid and precision, by name."""
+    grid = grid_of(model)
+    return {
+        "footprint": model.footprint,
+        "samples_per_ray": samples_of(model),
+        "multisamples": model.multisamples,
+        "log2_hashmap_size": grid and grid.hashmap_size.bit_length() - 1,
+        "max_res": grid and grid.max_res,
+        "precision": model.field.precision,
+        "dilation": model.dilation,
+    }
 
 
 def loss(model: ModelConfig) -> LossConfig:

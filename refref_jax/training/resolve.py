@@ -37,9 +37,6 @@ from refref_jax.data.mesh_queries import Containment
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_analysis import SceneAnalysis
 from refref_jax.data.scene_assembly import assemble_scene
-from refref_jax.fields import mlps
-from refref_jax.fields.base import RadianceConfig
-from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.optics.media import EMPTY_SLOT, INDEX_OF_AIR
 from refref_jax.optics.path_settings import PathSettings, make_path_settings
@@ -47,7 +44,7 @@ from refref_jax.optics.scene import Scene
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import ModelConfig
 from refref_jax.training import presets
-from refref_jax.training.config import FieldConfig, SceneConfig, TrainConfig, options_of, require
+from refref_jax.training.config import SceneConfig, TrainConfig, options_of, require
 
 # Width of printed lines.
 _COLUMNS = 100
@@ -194,12 +191,14 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
         rule="nested",
         background=model.space,
         radius=model.radius,
+        near=model.near,
+        far=model.far,
         min_throughput=settings.min_throughput,
         max_bends=settings.max_bends,
         reentry=settings.reentry if settings.max_bends else None,
         interior=model.interior,
         tints=tints if model.interior == "absorbing" and settings.max_bends else "none",
-        **_sampling_of(model),
+        **presets.sampling_of(model),
     )
 
 
@@ -207,32 +206,9 @@ def build_scene(resolved: Resolved, facts: SceneFacts) -> Scene:
     """Builds the scene for tracing; its parts only have colours if `tints` is `given`."""
     given = resolved.config.model.tints == "given"
     parts = facts.parts if given else meshes.without_colour(facts.parts)
+    parts = meshes.with_shading(parts, resolved.config.scene.shading)
     rule, (parents, overlaps) = resolved.config.scene.rule or facts.rule, facts.tree
     return assemble_scene(parts, parents, rule=rule, overlaps=overlaps, ambient=facts.ambient)
-
-
-def samples_of(model: ModelConfig) -> tuple[int, ...]:
-    """Returns the number of samples of each proposal level, then of the radiance field."""
-    return (*(proposal.samples for proposal in model.proposals), model.samples)
-
-
-def grid_of(model: ModelConfig) -> HashGridConfig | None:
-    """Returns the hash grid of a model's radiance field, if its field kind has one."""
-    return model.field.grid if isinstance(model.field, mlps.GridRadianceConfig) else None
-
-
-def _sampling_of(model: ModelConfig) -> dict[str, Any]:
-    """Returns the options of a model's samples, grid and precision, by name."""
-    grid = grid_of(model)
-    return {
-        "footprint": model.footprint,
-        "samples_per_ray": samples_of(model),
-        "multisamples": model.multisamples,
-        "log2_hashmap_size": grid and grid.hashmap_size.bit_length() - 1,
-        "max_res": grid and grid.max_res,
-        "precision": model.field.precision,
-        "dilation": model.dilation,
-    }
 
 
 def _first_reasons(config: TrainConfig) -> dict[str, str]:
@@ -348,27 +324,50 @@ def _resolve_inside(
 def _resolve_model(
     config: TrainConfig, facts: SceneFacts, reasons: dict[str, str]
 ) -> tuple[ModelConfig, TrainConfig]:
-    scene, found = config.scene, facts.analysis
-    config = _decide(config, reasons, "the scene", background=found.space)
-    extent = presets.bounds(
-        facts.cameras, space=found.space, radius=scene.radius or facts.half_extent
-    )
-    why = facts.source if facts.half_extent else "the data set's usual background"
-    why = "the cameras" if found.space == "unbounded" else why
-    config = _decide(config, reasons, why, radius=extent.radius)
+    extent, config = _resolve_bounds(config, facts, reasons)
     preset = presets.PRESETS[config.model.preset]
     model = preset.model(extent, require(config.model.interior), field=config.model.field)
-    learned = found.parts if config.model.tints == "learned" else 0
-    fields = () if model.interior == "field" else found.field_parts
+    learned = facts.analysis.parts if config.model.tints == "learned" else 0
+    fields = () if model.interior == "field" else facts.analysis.field_parts
     model = dataclasses.replace(model, learned_tints=learned, field_parts=fields)
-    model = override_model(model, config.model)
+    model = presets.override_model(model, config.model)
     config = _decide(
         config,
         reasons,
         f"preset={config.model.preset}",
-        **_sampling_of(model),
+        **presets.sampling_of(model),
     )
     return model, config
+
+
+def _resolve_bounds(
+    config: TrainConfig, facts: SceneFacts, reasons: dict[str, str]
+) -> tuple[presets.Bounds, TrainConfig]:
+    """Decides the size of the background, and the near and far planes.
+
+    Raises:
+      ValueError: if a far plane is given where paths end at the background.
+    """
+    space, size = facts.analysis.space, config.scene.radius
+    config = _decide(config, reasons, "the scene", background=space)
+    why = facts.source if facts.half_extent else "the data set's usual background"
+    why = "the cameras" if space == "unbounded" else why
+    extent = presets.bounds(facts.cameras, space=space, radius=size or facts.half_extent)
+    sampled, reason = extent, f"background={space}"
+    if config.model.contraction == "always":
+        sampled, reason = presets.contracted(extent, radius=size), "contraction=always"
+        if space == "unbounded":
+            extent, why = sampled, reason
+    far = config.model.far
+    if sampled.space != "unbounded" and far not in (None, sampled.far):
+        raise ValueError(
+            f"far={far:g} has no effect in a {space} scene, whose paths end at the background. "
+            "Leave it out, or use contraction=always."
+        )
+    config = _decide(config, reasons, why, radius=extent.radius)
+    config = _decide(config, reasons, reason, near=sampled.near, far=sampled.far)
+    near, far = require(config.model.near), require(config.model.far)
+    return dataclasses.replace(sampled, near=near, far=far), config
 
 
 def _resolve_training(
@@ -400,65 +399,6 @@ def _resolve_training(
     )
     config.schedule.check_lengths()
     return config
-
-
-def override_model(model: ModelConfig, asked: FieldConfig) -> ModelConfig:
-    """Returns a preset's model with overrides; `None` keeps the value of the preset.
-
-    Raises:
-      ValueError: if the model does not support an override.
-    """
-    if asked.samples_per_ray is not None:
-        model = _with_samples(model, asked.samples_per_ray, asked.preset)
-    names = ("multisamples", "footprint", "dilation")
-    given = {name: getattr(asked, name) for name in names}
-    model = dataclasses.replace(model, **{n: x for n, x in given.items() if x is not None})
-    if asked.precision is not None:
-        proposals = tuple(
-            dataclasses.replace(
-                each, field=dataclasses.replace(each.field, precision=asked.precision)
-            )
-            for each in model.proposals
-        )
-        field = dataclasses.replace(model.field, precision=asked.precision)
-        model = dataclasses.replace(model, proposals=proposals, field=field)
-    return dataclasses.replace(model, field=_with_grid(model.field, asked))
-
-
-def _with_samples(model: ModelConfig, samples: tuple[int, ...], preset: str) -> ModelConfig:
-    rounds = len(model.proposals)
-    if len(samples) != rounds + 1:
-        raise ValueError(
-            f"samples_per_ray={','.join(map(str, samples))} is for {len(samples) - 1} proposal "
-            f"levels, but preset {preset} has {rounds}. Give {rounds + 1} numbers: one for each "
-            "proposal level, then one for the radiance field."
-        )
-    proposals = tuple(
-        dataclasses.replace(proposal, samples=count)
-        for proposal, count in zip(model.proposals, samples[:-1], strict=True)
-    )
-    return dataclasses.replace(model, proposals=proposals, samples=samples[-1])
-
-
-def _with_grid(field: RadianceConfig, asked: FieldConfig) -> RadianceConfig:
-    if asked.log2_hashmap_size is None and asked.max_res is None:
-        return field
-    if not isinstance(field, mlps.GridRadianceConfig):
-        raise ValueError(
-            "log2_hashmap_size and max_res are options of a hash grid, which field kind "
-            f"{field.kind} does not have. Leave them out."
-        )
-    grid = field.grid
-    if asked.log2_hashmap_size is not None:
-        grid = dataclasses.replace(grid, hashmap_size=1 << asked.log2_hashmap_size)
-    if asked.max_res is not None:
-        if asked.max_res < grid.base_res:
-            raise ValueError(
-                f"max_res={asked.max_res} is coarser than the grid's first level of "
-                f"{grid.base_res} cells per side. Give at least that."
-            )
-        grid = dataclasses.replace(grid, max_res=asked.max_res)
-    return dataclasses.replace(field, grid=grid)
 
 
 def _warnings(asked: TrainConfig, found: SceneAnalysis) -> list[str]:

@@ -39,6 +39,11 @@ _CONFIGS = {
     ),
 }
 
+_CONFIGS |= {
+    f"{name} with a skip": dataclasses.replace(_CONFIGS[name], colour_network="skip")
+    for name in ("radiance", "nerfacto radiance")
+}
+
 _RADIANCES = ("radiance", "nerfacto radiance")
 
 
@@ -189,15 +194,22 @@ def test_the_density_network_against_numpy(name, scale, activation):
 
 @pytest.mark.parametrize(
     ("name", "scale", "activation", "padding"),
-    [("radiance", 0.01, _softplus, 0.001), ("nerfacto radiance", 0.0, np.exp, 0.0)],
+    [
+        ("radiance", 0.01, _softplus, 0.001),
+        ("nerfacto radiance", 0.0, np.exp, 0.0),
+        ("radiance with a skip", 0.01, _softplus, 0.001),
+        ("nerfacto radiance with a skip", 0.0, np.exp, 0.0),
+    ],
 )
 def test_the_radiance_network_against_numpy(name, scale, activation, padding):
     params, direction = _parameters(name), _direction()
     hidden = np.maximum(_dense(params, 0, _mean_features(name, _gaussians(scale=scale))), 0.0)
     raw = _dense(params, 1, hidden)
-    hidden = np.concatenate([raw[1:], reference_sampling.spherical_harmonics(direction)])
-    for layer in (2, 3):
-        hidden = np.maximum(_dense(params, layer, hidden), 0.0)
+    inputs = np.concatenate([raw[1:], reference_sampling.spherical_harmonics(direction)])
+    hidden = np.maximum(_dense(params, 2, inputs), 0.0)
+    if name.endswith("skip"):
+        hidden = np.concatenate([hidden, inputs])
+    hidden = np.maximum(_dense(params, 3, hidden), 0.0)
     rgb = (1.0 + 2.0 * padding) / (1.0 + np.exp(-_dense(params, 4, hidden))) - padding
     got = _see(name, _gaussians(), direction)
     np.testing.assert_allclose(got[0], activation(raw[0]), rtol=_NETWORK)
@@ -331,3 +343,23 @@ def test_half_precision_is_finite(name, size, scale):
 def test_unknown_precisions_are_refused():
     with pytest.raises(ValueError, match="must be one of float32, bfloat16, not 'half'"):
         check_precision("half")
+
+
+def test_a_skip_makes_the_released_code_s_colour_network():
+    # There, 256 features and 27 of the direction are the inputs, of two layers of 256 neurons.
+    paper = zipnerf.KIND.sizes["paper"].field
+    config = dataclasses.replace(paper, colour_network="skip")
+    shapes = jax.eval_shape(lambda: registry.init_radiance(jax.random.key(0), config))["params"]
+    inputs = 255 + 16
+    layers = [shapes[f"Dense_{i}"]["kernel"].shape for i in (2, 3, 4)]
+    assert layers == [(inputs, 256), (256 + inputs, 256), (256, 3)]
+    theirs = [(inputs + 12, 256), (256 + inputs + 12, 256), (256, 3)]
+    sizes = [fan_in * width + width for fan_in, width in theirs]
+    density = [40 * 64 + 64, 64 * 256 + 256, 6 * 64 + 64 + 65, 8 * 64 + 64 + 65]
+    assert sum(sizes) + sum(density) == 232_133  # parameters of all of its networks
+
+
+def test_one_hidden_layer_skips_to_the_output():
+    tiny = dataclasses.replace(zipnerf.KIND.sizes["tiny"].field, colour_network="skip")
+    shapes = jax.eval_shape(lambda: registry.init_radiance(jax.random.key(0), tiny))["params"]
+    assert [shapes[f"Dense_{i}"]["kernel"].shape for i in (2, 3)] == [(31, 32), (63, 3)]

@@ -19,8 +19,7 @@ from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.images import render_rays
 from refref_jax.render.model import Model, init_params
 from refref_jax.training.config import FieldConfig
-from refref_jax.training.presets import PRESETS, Bounds, loss
-from refref_jax.training.resolve import override_model, samples_of
+from refref_jax.training.presets import PRESETS, Bounds, loss, override_model, samples_of
 from tests.factories import scenes, small_model
 
 _BOUNDS = Bounds(near=0.05, far=16.0, radius=7.3, space="bounded")
@@ -88,6 +87,8 @@ def test_what_a_third_kind_has_not_is_refused(fog):
     for options in (FieldConfig(log2_hashmap_size=12), FieldConfig(max_res=64)):
         with pytest.raises(ValueError, match="which field kind fog does not have"):
             override_model(model, options)
+    with pytest.raises(ValueError, match=r"colour_network=skip .* unlike fog"):
+        override_model(model, FieldConfig(colour_network="skip"))
     assert override_model(model, FieldConfig(precision="bfloat16")) != model
 
 

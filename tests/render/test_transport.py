@@ -128,6 +128,19 @@ def test_a_path_that_is_turned_around_again_and_again_still_reaches_the_walls():
     np.testing.assert_allclose(end, [0.0, 0.0, -MODEL.radius], atol=_DISTANCE)
 
 
+def test_samples_reach_from_the_near_to_the_far_plane():
+    config = dataclasses.replace(_FIELD, space="unbounded", near=0.5, far=150.0, radius=10.0)
+    path = jax.tree.map(jnp.asarray, _tree_item(_straight_paths(), 0))
+    line = polylines.whole_path(path)
+    still = Jitter(jnp.float32(0.0), jnp.float32(0.0))
+    warp = volume_rendering.distance_warp(config, line)
+    t = volume_rendering.sample(config, line, warp, [], 9, jitter=still, anneal=jnp.float32(1.0)).t
+    np.testing.assert_allclose([t[0], t[-1]], [0.5, 150.0], rtol=_DISTANCE)
+    # Zip-NeRF's power transformation in units of 10, where it is linear up to about 1.
+    s = [1.0 - (1.0 + x / 12.5) ** -1.5 for x in (0.5, float(t[4]), 150.0)]
+    np.testing.assert_allclose((s[1] - s[0]) / (s[2] - s[0]), 4.0 / 9.0, rtol=1e-3)
+
+
 def test_a_path_of_an_unbounded_scene_ends_far_away():
     config = dataclasses.replace(_FIELD, space="unbounded", far=1000.0)
     path = _bent()

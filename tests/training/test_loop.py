@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 import itertools
 import json
 import shutil
@@ -20,6 +21,17 @@ from tests.factories import scenes, small_model
 from tests.factories.small_model import CONFIG, MODEL, SAVED
 
 pytestmark = [pytest.mark.loose, pytest.mark.longest]
+
+# Keys that runs of earlier versions lack.
+_ADDED_SINCE = {
+    "config.json": [
+        ("scene", "shading"),
+        *(("model", name) for name in ("colour_network", "contraction", "near", "far")),
+        ("losses", "path_losses"),
+        ("schedule", "adam_b2"),
+    ],
+    "model.json": [("config", "field", "colour_network")],
+}
 
 _GEOMETRY = scenes.build(scenes.ball(1.3, subdivisions=2))
 
@@ -291,6 +303,27 @@ def test_a_run_can_not_change_its_options(tmp_path):
     model = dataclasses.replace(SAVED, config=dataclasses.replace(MODEL, samples=7))
     with pytest.raises(ValueError, match="other options"):
         run_folder.check_unchanged(tmp_path, CONFIG, model, _GEOMETRY)
+
+
+def test_a_run_from_before_the_released_code_s_options_continues(tmp_path):
+    model = dataclasses.replace(CONFIG.model, near=MODEL.near, far=MODEL.far)
+    config = dataclasses.replace(CONFIG, model=model)
+    run_folder.create(tmp_path, config, SAVED, _GEOMETRY)
+    for name, added in _ADDED_SINCE.items():
+        content = json.loads((tmp_path / name).read_text())
+        for *sections, key in added:
+            functools.reduce(lambda at, section: at[section], sections, content).pop(key)
+        (tmp_path / name).write_text(json.dumps(content))
+    assert checkpoint_io.read_static(tmp_path) == SAVED
+    assert run_folder.read_config(tmp_path) == config
+    assert run_folder.read_config(tmp_path).get("near") is None
+    run_folder.check_unchanged(tmp_path, config, SAVED, _GEOMETRY)
+    for changed in ({"adam_b2": 0.999}, {"path_losses": "transmitted"}, {"shading": "flat"}):
+        with pytest.raises(ValueError, match=rf"other options \(.*{next(iter(changed))}"):
+            run_folder.check_unchanged(tmp_path, config.decided(**changed), SAVED, _GEOMETRY)
+    farther = dataclasses.replace(SAVED, config=dataclasses.replace(MODEL, far=20.0))
+    with pytest.raises(ValueError, match="other options"):
+        run_folder.check_unchanged(tmp_path, config.decided(far=20.0), farther, _GEOMETRY)
 
 
 def test_a_scene_may_move_but_not_change(tmp_path):

@@ -5,8 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from refref_jax.render.volume_rendering import Histogram
+from refref_jax.optics.light_paths import PathStatus
+from refref_jax.render.pixels import Light
+from refref_jax.render.volume_rendering import Composite, Histogram, PathRadiance
 from refref_jax.training import objective
+from refref_jax.training.config import LossConfig
+from tests.factories import made_paths
 from tests.laws import gradients, transformations
 from tests.oracles import reference_sampling
 
@@ -281,6 +285,61 @@ def test_distortion_check_grads():
     mask = jnp.asarray(outside, bool)
     loss = lambda edges, weights: objective.distortion(Histogram(edges, weights), mask)
     gradients.assert_numerical(loss, *final)
+
+
+# --- losses of paths ---
+
+_TURN = [(0.0, 0.0, -1.0), (0.0, 0.1, 1.0), (0.0, 1.0, 0.0)]
+
+# Mirrored at the first surface, through the object, beside it, and an empty slot.
+_PATHS = made_paths.stack(
+    [
+        made_paths.path([2.0], _TURN[:2], [0, 0], segments=3, throughput=(0.04,) * 3),
+        made_paths.path([2.0, 1.0], _TURN, [0, 1, 0], segments=3, throughput=(0.96,) * 3),
+        made_paths.path([], _TURN[:1], [0], segments=3, ray=1, status=PathStatus.MISSED),
+        made_paths.path([], _TURN[:1], [0], segments=3, ray=1, status=PathStatus.EMPTY),
+    ]
+)
+
+
+def _path_losses(histograms, path_losses):
+    """Returns the totals of paths with histograms `[paths]`: of a proposal, then the final one."""
+    nothing = Composite(jnp.zeros((4, 3)), *jnp.zeros((3, 4)))
+    seen = PathRadiance(nothing, histograms, jnp.ones((4, 12), bool))
+    config = LossConfig(blurs=(_BLUR,), path_losses=path_losses)
+    return objective.total(Light(jnp.ones((2, 3)), seen), _PATHS, config)
+
+
+def _some_histograms(samples):
+    made = [_random_histogram(np.random.default_rng(seed), samples) for seed in range(4)]
+    return jax.tree.map(lambda *x: jnp.stack(x), *made)
+
+
+@pytest.mark.parametrize(("path_losses", "kept"), [("all", [0, 1, 2]), ("transmitted", [1, 2])])
+def test_losses_of_paths_are_those_of_the_included_paths(path_losses, kept):
+    histograms = (_some_histograms(9), _some_histograms(12))
+    totals = _path_losses(histograms, path_losses)
+    pairs = [jax.tree.map(lambda x, i=i: x[i], histograms) for i in kept]
+    expected = sum(float(_interlevel(final, proposal)) for proposal, final in pairs)
+    np.testing.assert_allclose(totals.interlevel, expected, rtol=_SUMMATION)
+    expected = sum(float(_distortion(final, _ALL_OUTSIDE)) for _, final in pairs)
+    np.testing.assert_allclose(totals.distortion, expected, rtol=_SUMMATION)
+    assert totals.paths == len(kept)
+    # The colours of rays keep all of their paths.
+    np.testing.assert_array_equal(totals.linear, np.ones((2, 3)))
+
+
+@pytest.mark.parametrize(("path_losses", "reached"), [("all", True), ("transmitted", False)])
+def test_a_reflected_path_has_no_gradient_from_the_losses_of_transmitted_ones(path_losses, reached):
+    def loss(proposal, final):
+        totals = _path_losses((proposal, final), path_losses)
+        return totals.interlevel + totals.distortion
+
+    slopes = jax.jit(jax.grad(loss, argnums=(0, 1)))(_some_histograms(9), _some_histograms(12))
+    for by_histogram in slopes:
+        weights = np.abs(by_histogram.weights).max(axis=-1)
+        assert (weights[0] > 0.0) == reached
+        assert weights[1] > 0.0 and weights[2] > 0.0 and weights[3] == 0.0
 
 
 # --- hash decay ---

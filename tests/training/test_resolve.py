@@ -2,15 +2,20 @@
 
 import dataclasses
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from refref_jax import configuration
+from refref_jax.data.mesh_queries import find_containment
 from refref_jax.data.scene_analysis import SceneAnalysis
+from refref_jax.data.scene_assembly import make_part
+from refref_jax.geometry.triangle_meshes import make_mesh
 from refref_jax.optics.path_settings import (
     PAPER,
     STRAIGHT,
@@ -29,7 +34,8 @@ from refref_jax.training.config import (
     options_of,
 )
 from refref_jax.training.fit import prepare
-from refref_jax.training.resolve import SceneFacts, override_model, resolve, samples_of
+from refref_jax.training.presets import Bounds, override_model, samples_of
+from refref_jax.training.resolve import SceneFacts, build_scene, resolve
 from tests.factories.small_model import CAMERAS, MODEL
 from tests.processes.command import ROOT
 
@@ -342,6 +348,95 @@ def test_wishes_of_a_file_that_does_not_tell_them():
 
 def _resolve_again(config):
     return resolve(config, SceneFacts(_TINTED, CAMERAS, (), None, None, ()))
+
+
+_BALL = Bounds(near=0.5, far=150.0, radius=10.0, space="unbounded")
+
+
+@pytest.mark.parametrize(
+    ("found", "given", "expected"),
+    [
+        # The size of a background is not used, even if it is given.
+        (_CLEAR, {}, _BALL),
+        (_CLEAR, {"radius": 5.0}, _BALL),
+        (_CLEAR._replace(space="spherical"), {}, _BALL),
+        (_EMPTY, {"near": 0.0, "far": 20.0}, dataclasses.replace(_BALL, near=0.0, far=20.0)),
+        (_CLEAR._replace(space="unbounded"), {}, dataclasses.replace(_BALL, far=10_000.0)),
+        (
+            _CLEAR._replace(space="unbounded"),
+            {"radius": 5.0},
+            dataclasses.replace(_BALL, far=10_000.0, radius=5.0),
+        ),
+    ],
+)
+def test_contraction_makes_the_bounds_of_the_released_code(found, given, expected):
+    facts = SceneFacts(found, CAMERAS, (), None, 6.5, ())
+    made = resolve(TrainConfig().override(batch=64, contraction="always", **given), facts)
+    model = made.model.config
+    assert Bounds(model.near, model.far, model.radius, model.space) == expected
+    # The configuration still says what is behind the objects.
+    walls = found.space != "unbounded"
+    assert made.config.scene.space == found.space
+    assert made.config.scene.radius == given.get("radius", 6.5 if walls else 10.0)
+    reason = "given" if "far" in given else "contraction=always"
+    assert made.reasons["far"] == made.reasons["near"] == reason
+    again = resolve(made.config, facts)
+    assert (again.config, again.model) == (made.config, made.model)
+
+
+def test_near_and_far_planes_are_decided_by_the_scene_unless_they_are_given():
+    model = _resolve(_CLEAR, radius=2.0).model.config
+    assert (model.near, model.far) == (0.05, pytest.approx(4.0 + 2.0 * 3.0**0.5))
+    made = _resolve(_CLEAR, near=0.25)
+    assert (made.model.config.near, made.config.model.near) == (0.25, 0.25)
+    assert (made.reasons["near"], made.reasons["far"]) == ("given", "background=bounded")
+    assert made.config.get("far") == made.model.config.far
+    endless = _CLEAR._replace(space="unbounded")
+    assert _resolve(endless).config.get("far") == 1000.0
+    assert _resolve(endless, far=300.0).model.config.far == 300.0
+    # Decided again for another background, unless it was given.
+    again = made.config.override(radius=3.0)
+    assert (again.model.near, again.model.far) == (0.25, None)
+
+
+@pytest.mark.parametrize("space", ["bounded", "spherical"])
+def test_a_far_plane_behind_a_background_is_refused(space):
+    with pytest.raises(ValueError, match=f"far=150 has no effect in a {space} scene"):
+        _resolve(_CLEAR._replace(space=space), far=150.0)
+
+
+@pytest.mark.parametrize("name", ["near", "far"])
+@pytest.mark.parametrize("distance", [-1.0, math.inf])
+def test_a_plane_that_is_no_distance_is_refused(name, distance):
+    with pytest.raises(ValueError, match=f"{name} is {distance}. Give 0 or a positive"):
+        FieldConfig(**{name: distance})
+    with pytest.raises(ValueError, match="such that 0 <= near < far"):
+        _resolve(_CLEAR, contraction="always", near=150.0)
+
+
+@pytest.mark.parametrize("shading", ["scene", "smooth", "flat"])
+@pytest.mark.parametrize("stored", [False, True])
+def test_shading_reaches_the_normals_of_the_scene(shading, stored):
+    part = make_part(trimesh.creation.box(), index=1.5, shading="smooth")
+    smooth = make_mesh(part.vertices, part.faces, crease_angle=math.pi).normals
+    flat = make_mesh(part.vertices, part.faces, crease_angle=0.0).normals
+    kept = np.roll(smooth, 1, axis=-1) if stored else smooth
+    part = part._replace(normals=kept) if stored else part
+    facts = SceneFacts(_CLEAR, CAMERAS, (part,), find_containment([part]), None, ())
+    made = build_scene(resolve(TrainConfig().override(batch=64, shading=shading), facts), facts)
+    expected = {"flat": flat, "smooth": smooth, "scene": kept}
+    np.testing.assert_array_equal(np.sort(np.abs(flat), axis=-1), [[[0.0, 0.0, 1.0]] * 3] * 12)
+    # The tree of boxes orders the faces, and repeats some.
+    rows = lambda x: {tuple(row) for row in 0.0 + np.asarray(x, np.float64).reshape(-1, 9).round(4)}
+    same = {name for name, x in expected.items() if rows(x) == rows(made.surfaces.normals)}
+    assert same == ({shading} if stored or shading == "flat" else {"scene", "smooth"})
+
+
+def test_a_skip_reaches_the_colour_network():
+    assert _resolve(_CLEAR).model.config.field.colour_network == "plain"
+    for field in ("zipnerf", "nerfacto"):
+        made = _resolve(_CLEAR, field=field, colour_network="skip")
+        assert made.model.config.field.colour_network == "skip"
 
 
 def test_override_model_replaces_one_thing_an_option():

@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,6 +36,19 @@ def test_adam_follows_the_schedule():
         update, state = jax.jit(adam.update)(jnp.float32(3.0), state, jnp.zeros(()))
         # On a constant gradient Adam's step is the learning rate.
         np.testing.assert_allclose(-update, learning_rate(schedule)(step), rtol=1e-4)
+
+
+@pytest.mark.parametrize(("given", "b2"), [({}, 0.99), ({"adam_b2": 0.999}, 0.999)])
+def test_adam_has_the_schedule_s_second_moment_decay(given, b2):
+    adam = optimizer(dataclasses.replace(_PAPER, **given))
+    _, state = adam.update(jnp.float32(3.0), adam.init(jnp.zeros(())), jnp.zeros(()))
+    np.testing.assert_allclose(state[0].nu, (1.0 - b2) * 9.0, rtol=1e-4)
+
+
+@pytest.mark.parametrize("b2", [-0.1, 1.0])
+def test_a_second_moment_decay_out_of_range_is_refused(b2):
+    with pytest.raises(ValueError, match="adam_b2 is"):
+        ScheduleConfig(adam_b2=b2)
 
 
 def test_a_schedule_stretches_with_its_steps():

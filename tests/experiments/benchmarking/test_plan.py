@@ -10,9 +10,24 @@ import pytest
 from experiments.benchmarking import methods, plan, results, settings
 from experiments.benchmarking.methods import METHODS, RECONSTRUCTION
 from experiments.cli import scenes as cli_scenes
+from experiments.runs import config_flags
+from refref_jax.data.scene_analysis import SceneAnalysis
+from refref_jax.training.config import TrainConfig
+from refref_jax.training.resolve import SceneFacts, resolve
 from tests.factories.made_benchmark import SETTINGS, write_scene
+from tests.factories.small_model import CAMERAS
 from tests.factories.small_parquet import write_all, write_copy
 from tests.processes.command import run_command
+
+_ANALYSIS = SceneAnalysis(
+    parts=1,
+    objects=1,
+    convex=True,
+    reentry="impossible",
+    interior="clear",
+    tints="none",
+    space="bounded",
+)
 
 _INSIDES = ["tree_clear", "tree_tints_given", "tree_tints_learned"]
 
@@ -52,6 +67,31 @@ def test_methods_are_in_the_order_of_the_table_and_none_hides_a_reconstruction()
     for word, message in [("magic", "no method 'magic'"), ("", "--methods is empty")]:
         with pytest.raises(ValueError, match=message):
             methods.parse([word])
+
+
+def test_the_published_oracle_differs_from_ours_as_the_documents_say():
+    ours, theirs = METHODS["oracle"], METHODS["oracle_as_published"]
+    assert set(theirs.train) - set(ours.train) == {
+        "--contraction=always",
+        "--shading=flat",
+        "--footprint=cone",
+        "--colour_network=skip",
+        "--data_loss=charbonnier",
+        "--path_losses=transmitted",
+        "--adam_b2=0.999",
+    }
+    assert set(ours.train) < set(theirs.train) and ours.published == theirs.published == "Oracle"
+    for name, rays in [("oracle", 4), ("oracle_as_published", 1)]:
+        common = dataclasses.replace(SETTINGS, rays_per_pixel=4, limit=3)
+        made = plan.options(name, METHODS[name].train, common)
+        assert made["evaluate"] == [f"--rays_per_pixel={rays}", "--limit=3"]
+    facts = SceneFacts(_ANALYSIS, CAMERAS, (), None, 7.3, ())
+    words = dict(word.removeprefix("--").split("=", 1) for word in theirs.train)
+    values = {name: config_flags.parse_text(name, word) for name, word in words.items()}
+    model = resolve(TrainConfig().override(batch=64, **values), facts).model.config
+    assert (model.near, model.far, model.radius, model.space) == (0.5, 150.0, 10.0, "unbounded")
+    assert (model.interior, model.footprint) == ("field", "cone")
+    assert model.field.colour_network == "skip"
 
 
 def test_there_is_a_job_for_each_scene_and_method_and_one_reconstruction_a_scene(tmp_path):
@@ -129,7 +169,7 @@ def test_a_scene_without_test_views_is_left_out_and_one_broken_otherwise_is_not(
     assert _planned(scene, "tree,tree_tints_given") == (["tree", "tree_tints_given"], {})
     spoil(Path(scene.path))
     names, reasons = _planned(scene, "main")
-    assert names == [] and len(reasons) == 5
+    assert names == [] and len(reasons) == 6
     assert all(
         "its test views cannot be read" in each and named in each for each in reasons.values()
     )
