@@ -323,8 +323,8 @@ BUGS = (
         "encoded before summed",
         "render/pixels.py",
         "return Light(linear, seen)",
-        "return Light(colour.srgb_to_linear(jax.ops.segment_sum(paths.throughput * "
-        "colour.linear_to_srgb(seen.composite.rgb), paths.rays, num_segments=rays)), seen)",
+        "return Light(srgb_to_linear(jax.ops.segment_sum(paths.throughput * "
+        "linear_to_srgb(seen.composite.rgb), paths.rays, num_segments=rays)), seen)",
         (
             "render/test_pixels.py::"
             "test_the_paths_of_a_ray_are_blended_by_their_weights_in_linear_space",

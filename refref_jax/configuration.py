@@ -185,12 +185,12 @@ class Option(NamedTuple):
 
 
 def option(
-    default: Any = None,
+    default: Any,
     *,
     name: str = "",
     formerly: str = "",
     after: tuple[str, ...] = (),
-    compare: bool = True,
+    comparison: Literal["strict", "none"] = "strict",
 ) -> Any:
     """Declares an option as a field of a dataclass.
 
@@ -200,10 +200,10 @@ def option(
       formerly: name of the option and the field in earlier versions, which is still read.
       after: options on which the decision depends. Overriding one of them takes it again, unless
         the option itself is an override.
-      compare: whether configurations that differ in this option are different.
+      comparison: `none` if configurations that differ in this option alone count as equal.
     """
     metadata = {"name": name, "after": after, FORMERLY: formerly or None}
-    return dataclasses.field(default=default, metadata=metadata, compare=compare)
+    return dataclasses.field(default=default, metadata=metadata, compare=comparison == "strict")
 
 
 def options_of(kind: type) -> Iterator[Option]:

@@ -23,7 +23,7 @@ from refref_jax.geometry.triangle_meshes import unit_vectors, vertex_vectors
 from refref_jax.optics.scene import Scene
 from refref_jax.reconstruct import grids
 from refref_jax.reconstruct.grids import Grid
-from refref_jax.render import Model, colour
+from refref_jax.render import Model, pixels
 from refref_jax.render.first_surface import find_first_surface
 from refref_jax.render.volume_rendering import look_up
 
@@ -139,7 +139,7 @@ def look_up_points(
 def _chunk(params, points, directions, config, width):
     look = functools.partial(look_up, width=width)
     seen = jax.vmap(look, in_axes=(None, None, 0, 0))(params, config, points, directions)
-    return seen.density, jnp.clip(colour.linear_to_srgb(seen.linear), 0.0, 1.0)
+    return seen.density, jnp.clip(pixels.linear_to_srgb(seen.linear), 0.0, 1.0)
 
 
 def inside_objects(

@@ -30,7 +30,7 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.optics.media import interior_length
 from refref_jax.optics.path_settings import PathSettings
 from refref_jax.optics.scene import Scene
-from refref_jax.render import colour
+from refref_jax.render import pixels
 from refref_jax.render.background_rendering import TILE, KnownRendering, render_known
 from refref_jax.render.backgrounds import Radiance, radiance_of
 
@@ -190,7 +190,7 @@ def render_view(scene: KnownScene, view: int, *, settings: PathSettings, side: i
     seconds = time.monotonic() - start
     linear = jax.device_put(cameras.box_filter(seen.linear, side))
     return View(
-        rgb=np.clip(np.asarray(colour.linear_to_srgb(linear)), 0.0, 1.0),
+        rgb=np.clip(np.asarray(pixels.linear_to_srgb(linear)), 0.0, 1.0),
         casts=seen.casts / seen.paths.size,
         paths=float(np.mean(seen.paths)),
         dropped=float(np.mean(seen.dropped)),

@@ -48,7 +48,7 @@ def read_rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def srgb_to_linear(encoded: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Returns sRGB values in `[0, 1]` as linear light; see `render.colour` for values of fields."""
+    """Returns sRGB values in `[0, 1]` as linear light; see `render.pixels` for values of fields."""
     curved = ((np.maximum(encoded, 0.0) + 0.055) / 1.055) ** 2.4
     return np.where(encoded <= 0.04045, encoded / 12.92, curved)
 

@@ -64,7 +64,7 @@ def facet_normal(
 
 
 def masking(
-    towards: Float[Array, ""], leaving: Float[Array, ""], alpha: Float[Array, ""]
+    cos_in: Float[Array, ""], cos_out: Float[Array, ""], alpha: Float[Array, ""]
 ) -> Float[Array, ""]:
     """Returns the share of the light from a facet that other facets do not hide, in `[0, 1]`.
 
@@ -72,19 +72,19 @@ def masking(
     of the incident one.
 
     Args:
-      towards: cosine between the surface's normal and the incident ray, in `[0, 1]`.
-      leaving: cosine between the leaving ray and the surface's normal on its side; at or below 0
-        the ray leaves through the wrong side of the surface, and the share is 0.
+      cos_in: cosine between the surface's normal and the incident ray, in `[0, 1]`.
+      cos_out: cosine between the outgoing ray and the surface's normal on its side; at or below 0
+        it is on the wrong side of the surface, and the share is 0.
       alpha: width of the distribution, >= 0.
 
     Source: Heitz, Understanding the Masking-Shadowing Function (2014), equation 99.
     """
-    leaves = leaving > 0.0
-    leaving = jnp.where(leaves, leaving, 1.0)
-    here = towards + _slope_length(towards, alpha)
-    product = here * leaving
-    excess = towards * jnp.maximum(_slope_length(leaving, alpha) - leaving, 0.0)
-    return jnp.where(leaves, numerics.safe_divide(product, product + excess), 0.0)
+    above = cos_out > 0.0
+    cos_out = jnp.where(above, cos_out, 1.0)
+    here = cos_in + _slope_length(cos_in, alpha)
+    product = here * cos_out
+    excess = cos_in * jnp.maximum(_slope_length(cos_out, alpha) - cos_out, 0.0)
+    return jnp.where(above, numerics.safe_divide(product, product + excess), 0.0)
 
 
 def _slope_length(cosine: Float[Array, ""], alpha: Float[Array, ""]) -> Float[Array, ""]:

@@ -13,7 +13,7 @@ own indices; the throughput of a path is then 0 in two channels. Other scenes ha
 Source: paper (arXiv 2505.05848), section 4.2. Symbols as in `light_paths`.
 """
 
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -234,7 +234,7 @@ def _traces(scene: Scene) -> int:
 
 def _of_one_ray(traced: _Traced, times: int) -> _Traced:
     """Returns traced paths with the indices of rays before they were repeated."""
-    paths: LightPaths | PathEnds = traced[0]
+    paths: Any = traced[0]
     shape = (*traced.dropped.shape[:-2], -1, times, traced.dropped.shape[-1])
     dropped = jnp.sum(traced.dropped.reshape(shape), axis=-2)
     return type(traced)(paths._replace(rays=paths.rays // times), dropped, *traced[2:])

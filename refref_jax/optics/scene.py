@@ -75,6 +75,15 @@ def of_channel(scene: Scene, channel: int) -> Scene:
     Args:
       scene: the scene.
       channel: 0 for red, 1 for green, 2 for blue; all are equal in a scene without dispersion.
+
+    Example:
+      >>> import trimesh
+      >>> import refref_jax
+      >>> flint = refref_jax.Material(dispersion=(1.61, 1.62, 1.64))
+      >>> prism = refref_jax.make_part(trimesh.creation.box(), index=1.62, material=flint)
+      >>> blue = refref_jax.of_channel(refref_jax.assemble([prism]), 2)
+      >>> print(f"{blue.interfaces.index_inside[0]:.2f}")
+      1.64
     """
     if not media.has_dispersion(scene.interfaces):
         return scene

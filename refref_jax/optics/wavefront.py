@@ -161,7 +161,7 @@ def end_by(
     )
     dropped = queues.add_dropped(tree.dropped, live.rays, live.throughput - throughput, ending)
     live = live._replace(state=live.state._replace(throughput=throughput))
-    return end(tree._replace(dropped=dropped), live, status, ending, stop)
+    return end(tree._replace(dropped=dropped), live, status, ending, stop=stop)
 
 
 def end(
@@ -169,6 +169,7 @@ def end(
     live: Live,
     status: Int[Array, " n"],
     ending: Bool[Array, " n"],
+    *,
     stop: Stop | None = None,
 ) -> PathTree:
     """Ends some rays as paths, on opaque surfaces if stops are given."""

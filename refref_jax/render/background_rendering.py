@@ -25,7 +25,7 @@ from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import LightPaths, PathEnds
 from refref_jax.optics.path_settings import PathSettings
 from refref_jax.optics.scene import Scene
-from refref_jax.render import colour, images
+from refref_jax.render import images, pixels
 from refref_jax.render.backgrounds import Radiance
 
 TILE = 65536
@@ -195,7 +195,7 @@ def _render_tile(
     linear = _sum_light(radiance, ends, count)
     exists = light_paths.exists(ends).astype(jnp.int32)
     return _Tile(
-        rgb=jnp.clip(colour.linear_to_srgb(linear), 0.0, 1.0),
+        rgb=jnp.clip(pixels.linear_to_srgb(linear), 0.0, 1.0),
         linear=linear,
         paths=jax.ops.segment_sum(exists, ends.rays, num_segments=count),
         dropped=traced.dropped,

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from refref_jax import numerics
-from refref_jax.render import colour
+from refref_jax.render import pixels
 from refref_jax.sampling import scene_bounds
 
 Radiance = Callable[[Float[Array, "3"], Float[Array, "3"]], Float[Array, "3"]]
@@ -222,7 +222,7 @@ def _interpolate(
         for row in (rows.low, rows.high)
     )
     colours = _mix(upper, lower, rows)
-    return colour.srgb_to_linear(colours) if isinstance(texture, SrgbTexture) else colours
+    return pixels.srgb_to_linear(colours) if isinstance(texture, SrgbTexture) else colours
 
 
 def _mix(low: Float[Array, "3"], high: Float[Array, "3"], at: _Neighbours) -> Float[Array, "3"]:

@@ -29,7 +29,7 @@ from refref_jax.optics.media import EMPTY_SLOT
 from refref_jax.optics.path_settings import Detail, PathSettings
 from refref_jax.optics.path_tracing import Traced
 from refref_jax.optics.scene import Scene
-from refref_jax.render import colour, learned_media, pixels
+from refref_jax.render import learned_media, pixels
 from refref_jax.render.model import Model, ModelConfig, Params, path_detail
 
 # Padding rays of a tile start at this distance and point away from the scene: they hit nothing and
@@ -333,7 +333,7 @@ def _add(
 
 
 def _finish(sums: Rendering) -> Rendering:
-    return sums._replace(rgb=jnp.clip(colour.linear_to_srgb(sums.linear), 0.0, 1.0))
+    return sums._replace(rgb=jnp.clip(pixels.linear_to_srgb(sums.linear), 0.0, 1.0))
 
 
 def render_camera(
@@ -393,7 +393,7 @@ def average(fine: Rendering, side: int) -> Rendering:
 
     linear = filtered(fine.linear)
     return Rendering(
-        rgb=np.clip(jax.device_get(colour.linear_to_srgb(jax.device_put(linear))), 0.0, 1.0),
+        rgb=np.clip(jax.device_get(pixels.linear_to_srgb(jax.device_put(linear))), 0.0, 1.0),
         distance=host_array(_lower_median(np.asarray(fine.distance), side)),
         mean_distance=filtered(fine.mean_distance),
         accumulation=filtered(fine.accumulation),

@@ -21,8 +21,8 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
 from refref_jax.optics.light_paths import LightPaths, PathStatus
 from refref_jax.render import learned_media, volume_rendering
-from refref_jax.render.colour import linear_to_srgb
 from refref_jax.render.model import Model, path_detail
+from refref_jax.render.pixels import linear_to_srgb
 from refref_jax.render.volume_rendering import Histogram, Jitter
 from refref_jax.sampling import polylines
 

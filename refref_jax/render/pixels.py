@@ -1,7 +1,8 @@
 """Colours of pixels from the light paths of a batch.
 
 Paths are rendered in parallel; the colour of a pixel is the weighted sum over its paths in linear
-RGB (paper, arXiv 2505.05848, Fresnel blend), and is converted to sRGB at the end.
+RGB (paper, arXiv 2505.05848, Fresnel blend), and is converted to sRGB at the end, by the transfer
+function of IEC 61966-2-1.
 """
 
 from typing import NamedTuple
@@ -11,9 +12,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from refref_jax.optics.light_paths import LightPaths
-from refref_jax.render import colour, learned_media, volume_rendering
+from refref_jax.render import learned_media, volume_rendering
 from refref_jax.render.model import ModelConfig, Params
 from refref_jax.render.volume_rendering import Jitter, PathRadiance
+
+# Thresholds between the linear and the power segment of the transfer function.
+_LINEAR_KNEE = 0.0031308
+_SRGB_KNEE = 0.04045
 
 
 class Light(NamedTuple):
@@ -60,7 +65,7 @@ def render_pixels(
       anneal: exponent on the proposals' weights, see `volume_rendering.path_radiance`.
     """
     light = gather_light(params, config, paths, jitter, rays=rays, anneal=anneal)
-    return Pixels(colour.linear_to_srgb(light.linear), light.paths)
+    return Pixels(linear_to_srgb(light.linear), light.paths)
 
 
 def gather_light(
@@ -115,3 +120,23 @@ def no_jitter(config: ModelConfig, paths: int) -> Jitter:
     """Returns zero jitter, for rendering without noise, in single precision like the fields."""
     zeros = jnp.zeros((paths, volume_rendering.levels(config)), jnp.float32)
     return Jitter(zeros, zeros)
+
+
+def linear_to_srgb(linear: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Applies the sRGB opto-electronic transfer function; 0 maps to 0 and 1 to 1.
+
+    Negative values use the linear segment and values above 1 the power segment, so that neither
+    value nor gradient is clipped. The gradient is finite everywhere: 12.92 at and below 0.
+
+    Source: IEC 61966-2-1.
+    """
+    curved = linear > _LINEAR_KNEE
+    power = jnp.where(curved, linear, 1.0) ** (1.0 / 2.4)
+    return jnp.where(curved, 1.055 * power - 0.055, 12.92 * linear)
+
+
+def srgb_to_linear(srgb: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Inverts `linear_to_srgb`."""
+    curved = srgb > _SRGB_KNEE
+    power = ((jnp.where(curved, srgb, 1.0) + 0.055) / 1.055) ** 2.4
+    return jnp.where(curved, power, srgb / 12.92)

@@ -85,10 +85,10 @@ class SceneConfig:
     """
 
     path: str = option("", name="scene")
-    rule: RuleName | None = option(after=_OBJECTS)
+    rule: RuleName | None = option(None, after=_OBJECTS)
     indices: tuple[tuple[str, float], ...] = option((), name="ior", after=("reconstruction",))
-    space: Space | None = option(name="background", after=("scene", "properties"))
-    radius: float | None = option(after=("scene", "properties", "background", "contraction"))
+    space: Space | None = option(None, name="background", after=("scene", "properties"))
+    radius: float | None = option(None, after=("scene", "properties", "background", "contraction"))
     reconstruction: str = option("")
     pixels: Pixels = option("all")
     properties: str = option("")
@@ -127,10 +127,10 @@ class PathsConfig:
         from the meshes.
     """
 
-    name: Paths | None = option(name="paths", after=_OBJECTS)
-    min_throughput: float | None = option(formerly="cut", after=("paths",))
-    max_bends: int | None = option(formerly="bends", after=("paths",))
-    reentry: Reentry | None = option(after=(*_OBJECTS, "rule", "paths", "max_bends"))
+    name: Paths | None = option(None, name="paths", after=_OBJECTS)
+    min_throughput: float | None = option(None, formerly="cut", after=("paths",))
+    max_bends: int | None = option(None, formerly="bends", after=("paths",))
+    reentry: Reentry | None = option(None, after=(*_OBJECTS, "rule", "paths", "max_bends"))
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -176,19 +176,21 @@ class FieldConfig:
 
     preset: PresetName = option("tiny")
     field: FieldName = option("zipnerf")
-    interior: Interior | None = option(after=(*_OBJECTS, "paths", "max_bends", "tints"))
-    tints: Tints | None = option(after=(*_OBJECTS, "paths", "max_bends", "interior"))
-    footprint: Footprint | None = option(after=("preset", "field"))
-    samples_per_ray: tuple[int, ...] | None = option(formerly="samples", after=("preset", "field"))
-    multisamples: int | None = option(after=("preset", "field"))
-    log2_hashmap_size: int | None = option(formerly="entries", after=("preset", "field"))
-    max_res: int | None = option(formerly="finest", after=("preset", "field"))
-    precision: Precision | None = option(after=("preset", "field"))
-    dilation: float | None = option(after=("preset", "field"))
+    interior: Interior | None = option(None, after=(*_OBJECTS, "paths", "max_bends", "tints"))
+    tints: Tints | None = option(None, after=(*_OBJECTS, "paths", "max_bends", "interior"))
+    footprint: Footprint | None = option(None, after=("preset", "field"))
+    samples_per_ray: tuple[int, ...] | None = option(
+        None, formerly="samples", after=("preset", "field")
+    )
+    multisamples: int | None = option(None, after=("preset", "field"))
+    log2_hashmap_size: int | None = option(None, formerly="entries", after=("preset", "field"))
+    max_res: int | None = option(None, formerly="finest", after=("preset", "field"))
+    precision: Precision | None = option(None, after=("preset", "field"))
+    dilation: float | None = option(None, after=("preset", "field"))
     colour_network: ColourNetwork = option("plain")
     contraction: Contraction = option("unbounded")
-    near: float | None = option(after=_BOUNDS, compare=False)
-    far: float | None = option(after=_BOUNDS, compare=False)
+    near: float | None = option(None, after=_BOUNDS, comparison="none")
+    far: float | None = option(None, after=_BOUNDS, comparison="none")
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -239,9 +241,9 @@ class LossConfig:
 
     data: DataLoss = option("mse", name="data_loss")
     interlevel: float = option(0.01, name="interlevel_weight")
-    blurs: tuple[float, ...] | None = option(after=("preset", "field", "samples_per_ray"))
+    blurs: tuple[float, ...] | None = option(None, after=("preset", "field", "samples_per_ray"))
     distortion: float = option(0.01, name="distortion_weight")
-    hash_decay: float | None = option(after=("field",))
+    hash_decay: float | None = option(None, after=("field",))
     tint_decay: float = option(1e-3, formerly="dye_decay")
     distortion_over: DistortionOver = option("outside", name="distortion")
     path_losses: PathLosses = option("all")
@@ -274,13 +276,13 @@ class ScheduleConfig:
         touched too rarely for a longer memory, or 0.999 as in the paper's released code.
     """
 
-    steps: int | None = option(after=("preset",))
-    warmup: int | None = option(after=("preset", "steps"))
-    peak: float | None = option(name="learning_rate", after=("preset",))
-    end: float | None = option(name="final_learning_rate", after=("preset",))
-    anneal: int | None = option(after=("preset", "steps"))
-    batch: int | None = option(after=("preset",))
-    pretraced_batches: int | None = option(formerly="pool", after=("preset",))
+    steps: int | None = option(None, after=("preset",))
+    warmup: int | None = option(None, after=("preset", "steps"))
+    peak: float | None = option(None, name="learning_rate", after=("preset",))
+    end: float | None = option(None, name="final_learning_rate", after=("preset",))
+    anneal: int | None = option(None, after=("preset", "steps"))
+    batch: int | None = option(None, after=("preset",))
+    pretraced_batches: int | None = option(None, formerly="pool", after=("preset",))
     adam_b2: float = option(0.99)
 
     def __post_init__(self) -> None:

@@ -6,7 +6,7 @@ sums over all of them.
 
 Rendered colours are compared without clipping: colours below black or above white have gradients
 that move them back, and black pixels have the slope 12.92 of the transfer function (see
-`render.colour`). Fields return colours in `[-0.001, 1.001]`, so that their sigmoid has a non-zero
+`render.pixels`). Fields return colours in `[-0.001, 1.001]`, so that their sigmoid has a non-zero
 slope at black and white.
 
 Symbols: `s` is the normalised distance along a path, `w` its weights (see `sampling.stepfun`).
@@ -24,7 +24,7 @@ from refref_jax import numerics
 from refref_jax.fields import hash_grid
 from refref_jax.optics import light_paths
 from refref_jax.optics.light_paths import LightPaths
-from refref_jax.render import colour, learned_media, pixels
+from refref_jax.render import learned_media, pixels
 from refref_jax.render.model import Params
 from refref_jax.render.volume_rendering import Histogram
 from refref_jax.sampling import stepfun
@@ -159,7 +159,7 @@ def measure(
     config: LossConfig,
 ) -> StepReport:
     """Returns the losses of a batch; losses of paths are averaged over the included paths."""
-    rgb = colour.linear_to_srgb(totals.linear)
+    rgb = pixels.linear_to_srgb(totals.linear)
     mse = mean_squared_error(rgb, target)
     data = mse if config.data == "mse" else charbonnier(rgb, target)
     # Without paths, both are 0 with gradient 0.

@@ -2,7 +2,7 @@ import jax
 import numpy as np
 import pytest
 
-from refref_jax.render import colour
+from refref_jax.render import pixels
 from tests.factories.arrays import single
 from tests.laws import gradients, transformations
 from tests.oracles import reference_sampling
@@ -10,10 +10,10 @@ from tests.oracles import reference_sampling
 # A power in float32.
 _POWER = 1e-6
 
-_encode = jax.jit(colour.linear_to_srgb)
-_decode = jax.jit(colour.srgb_to_linear)
-_encode_slope = jax.jit(jax.vmap(jax.grad(colour.linear_to_srgb)))
-_decode_slope = jax.jit(jax.vmap(jax.grad(colour.srgb_to_linear)))
+_encode = jax.jit(pixels.linear_to_srgb)
+_decode = jax.jit(pixels.srgb_to_linear)
+_encode_slope = jax.jit(jax.vmap(jax.grad(pixels.linear_to_srgb)))
+_decode_slope = jax.jit(jax.vmap(jax.grad(pixels.srgb_to_linear)))
 
 _LINEAR = np.concatenate(
     [[-1.0, -1e-3, 0.0, 1e-30, 0.003130, 0.0031308, 0.003131, 1.0], np.linspace(0.0, 4.0, 101)]
@@ -88,12 +88,12 @@ def test_gradient_of_the_inverse_is_finite():
     assert np.isfinite(slope).all() and (slope > 0.0).all()
 
 
-@pytest.mark.parametrize("function", [colour.linear_to_srgb, colour.srgb_to_linear])
+@pytest.mark.parametrize("function", [pixels.linear_to_srgb, pixels.srgb_to_linear])
 def test_check_grads(function):
     gradients.assert_numerical(function, [-0.5, 0.001, 0.2, 1.5], rtol=1e-4)
 
 
 @pytest.mark.parametrize("transformation", transformations.ALL)
-@pytest.mark.parametrize("function", [colour.linear_to_srgb, colour.srgb_to_linear])
+@pytest.mark.parametrize("function", [pixels.linear_to_srgb, pixels.srgb_to_linear])
 def test_transformations_change_nothing(function, transformation):
     transformation(function, (single([-0.5, 0.0, 0.001, 0.2, 1.5]),))

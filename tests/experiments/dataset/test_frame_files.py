@@ -4,12 +4,12 @@ import pytest
 
 from experiments.dataset import frame_files
 from refref_jax.data import image_files
-from refref_jax.render import colour
+from refref_jax.render import pixels
 
 
 def test_colours_are_encoded_as_the_library_does():
     linear = np.concatenate([np.linspace(0.0, 1.2, 1201), np.geomspace(1e-5, 1.0, 500)])
-    known = np.asarray(colour.linear_to_srgb(jnp.asarray(linear, jnp.float32)))
+    known = np.asarray(pixels.linear_to_srgb(jnp.asarray(linear, jnp.float32)))
     ours = frame_files.to_srgb(linear)
     assert np.max(np.abs(ours / 255.0 - np.clip(known, 0.0, 1.0))) <= 0.5 / 255.0 + 1e-5
     levels = frame_files.to_srgb(np.array([-1.0, 0.0, 0.5, 1.0, 7.0]))
