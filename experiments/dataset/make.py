@@ -46,7 +46,8 @@ _SCENES = flags.DEFINE_string(
     "scenes",
     "all",
     "all, or names separated by commas: scenes such as cube_smcvx_ball, objects such as ball for "
-    "all their backgrounds, or either with wildcards such as 'sphere_*'.",
+    "all their backgrounds, or either with wildcards such as 'sphere_*'; 'cube_materials_*' compare "
+    "materials with Cycles, and are not part of all.",
 )
 _SIZE = flags.DEFINE_integer("size", 800, "Width and height of images in pixels.", lower_bound=1)
 _SPP = flags.DEFINE_integer("spp", 512, "Samples per pixel of train and val.", lower_bound=1)
@@ -81,7 +82,7 @@ _MESH = flags.DEFINE_multi_string(
 _MATERIAL = flags.DEFINE_multi_string(
     "material", ["glass"], "Material of each --mesh, in their order, or one for all."
 )
-app.check(_SCENES, lambda words: _MESH.value or scenes.choose(words, catalogue.OBJECTS))
+app.check(_SCENES, lambda words: _MESH.value or scenes.choose(words, _catalogue()))
 _DEVICE = flags.DEFINE_enum("device", "CPU", get_args(Device), "Device of Cycles.")
 _PREVIEW = flags.DEFINE_bool("preview", False, "One test view of each scene, and contact sheets.")
 _BLENDER = flags.DEFINE_string(
@@ -148,9 +149,13 @@ def _settings() -> RenderSettings:
 def _objects() -> dict[str, Object]:
     """Returns the objects by name: those of the data set, or the user's own."""
     if not _MESH.value:
-        return catalogue.OBJECTS
+        return _catalogue()
     own = user_meshes.read_object(*_user_meshes())
     return {own.name: own}
+
+
+def _catalogue() -> dict[str, Object]:
+    return catalogue.OBJECTS | catalogue.COMPARISONS
 
 
 def _user_meshes() -> tuple[list[Path], list[str]]:

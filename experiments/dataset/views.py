@@ -98,8 +98,8 @@ def tasks(
 
 
 def _finish(
-    folder: Path, view: View, settings: RenderSettings, colour: Path, geometry: Path
+    folder: Path, view: View, settings: RenderSettings, colours: Sequence[Path], geometry: Path
 ) -> None:
-    rendering = frame_files.read_rendering(colour, geometry)
+    rendering = frame_files.read_rendering(colours, geometry)
     linear = settings.keeps_linear(view.split)
     frame_files.write(folder, view.split, view.number, rendering, linear=linear)
