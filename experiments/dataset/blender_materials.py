@@ -1,8 +1,8 @@
 """Blender materials: parts, emissive backgrounds, the world (bpy only).
 
 Cycles keeps no interior list for a ray: at a front face it divides by the index given here, at a
-back face it multiplies. So the index must be the ratio of the inside's to the outside's. Microfacets
-follow GGX with single scattering, whose alpha is the square of the roughness.
+back face it multiplies. So the index must be the ratio of the inside's to the outside's.
+Microfacets follow GGX with single scattering, whose alpha is the square of the roughness.
 """
 
 from pathlib import Path

@@ -46,8 +46,8 @@ _SCENES = flags.DEFINE_string(
     "scenes",
     "all",
     "all, or names separated by commas: scenes such as cube_smcvx_ball, objects such as ball for "
-    "all their backgrounds, or either with wildcards such as 'sphere_*'; 'cube_materials_*' compare "
-    "materials with Cycles, and are not part of all.",
+    "all their backgrounds, or either with wildcards such as 'sphere_*'. Scenes "
+    "such as 'cube_materials_*', which compare materials with Cycles, are not part of all.",
 )
 _SIZE = flags.DEFINE_integer("size", 800, "Width and height of images in pixels.", lower_bound=1)
 _SPP = flags.DEFINE_integer("spp", 512, "Samples per pixel of train and val.", lower_bound=1)
