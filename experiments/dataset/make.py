@@ -25,7 +25,13 @@ from etils import epy
 
 from experiments.cli import app, outputs
 from experiments.cli import flags as cli_flags
-from experiments.dataset.render_settings import LEAST_TEXTURE, Device, PerSplit, RenderSettings
+from experiments.dataset.render_settings import (
+    LEAST_TEXTURE,
+    Device,
+    OpaqueLight,
+    PerSplit,
+    RenderSettings,
+)
 from refref_jax.choices import TwoSidedRule
 from refref_jax.data.scene_names import BACKGROUNDS, SceneName
 
@@ -84,6 +90,12 @@ _MATERIAL = flags.DEFINE_multi_string(
 )
 app.check(_SCENES, lambda words: _MESH.value or scenes.choose(words, _catalogue()))
 _DEVICE = flags.DEFINE_enum("device", "CPU", get_args(Device), "Device of Cycles.")
+_OPAQUE = flags.DEFINE_enum(
+    "opaque",
+    "lit",
+    get_args(OpaqueLight),
+    "Opaque parts reflect the light of the scene, or emit known light, for dataset.check.",
+)
 _PREVIEW = flags.DEFINE_bool("preview", False, "One test view of each scene, and contact sheets.")
 _BLENDER = flags.DEFINE_string(
     "blender", ".venv-dataset/bin/python", "Python of the environment that has Blender."
@@ -142,6 +154,7 @@ def _settings() -> RenderSettings:
         linear=_EXR.value,
         preview=_PREVIEW.value,
         device=_DEVICE.value,
+        opaque=_OPAQUE.value,
         source=user_meshes.digest(*_user_meshes()) if _MESH.value else "",
     )
 

@@ -167,8 +167,9 @@ def _nest(parts: Sequence[ObjectPart]) -> Containment:
     overlaps = [(closed[one], closed[other]) for one, other in tree.overlaps]
     for number, part in enumerate(parts):
         around = []
+        places = np.concatenate([part.vertices, part.vertices[part.faces].mean(axis=1)])
         for other in closed if part.kind == "thin_sheet" else ():
-            inside = np.abs(winding_number(bodies[other], part.vertices)) > 0.5
+            inside = np.abs(winding_number(bodies[other], places)) > 0.5
             if inside.all():
                 around.append(other)
             elif inside.any():

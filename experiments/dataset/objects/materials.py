@@ -67,12 +67,12 @@ def _make_thin_dome(detail: float) -> list[ObjectPart]:
 
 
 def _make_prism(detail: float) -> list[ObjectPart]:
-    """A triangular prism that disperses light; the same for all levels of detail."""
+    """An upright triangular prism that disperses light; the same for all levels of detail."""
     del detail
     turn = np.radians([90.0, 210.0, 330.0])
     section = _PRISM_RADIUS * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     vertices = np.array(
-        [[side * _PRISM_HALF_LENGTH, x, z] for side in (-1.0, 1.0) for x, z in section]
+        [[x, y, side * _PRISM_HALF_LENGTH] for side in (-1.0, 1.0) for x, y in section]
     )
     sides = [
         face for i in range(3) for j in [(i + 1) % 3] for face in ([i, j, 3 + j], [i, 3 + j, 3 + i])
