@@ -23,7 +23,7 @@ _DEMIJOHN_GREEN = Look(tint=(0.84, 0.95, 0.88))
 _STAR_BLUE = Look(tint=(0.84, 0.92, 0.98))
 _PLASTIC = Look("plastic", tint=(0.93, 0.97, 0.99))
 _BLUE = painted(0.03, 0.16, 0.6)
-_PAPER = painted(0.75, 0.68, 0.5)
+_PAPER = painted(0.78, 0.74, 0.64)
 
 
 def _make_cola_bottle(detail: float) -> list[ObjectPart]:
