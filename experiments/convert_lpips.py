@@ -22,7 +22,7 @@ from experiments.cli import flags as cli_flags
 with epy.lazy_imports():
     import numpy as np
 
-    from refref_jax.metrics import images
+    from refref_jax import metrics
 
 _ALEXNET = flags.DEFINE_string(
     "alexnet", None, "State dict of torchvision's AlexNet, .pth or .npz.", required=True
@@ -40,10 +40,10 @@ def main() -> None:
     outputs.check_file(out, overwrite=_OVERWRITE.value)
     arrays = {}
     for path, shapes in (
-        (Path(_ALEXNET.value), images.ALEXNET_SHAPES),
-        (Path(_LPIPS.value), images.LINEAR_SHAPES),
+        (Path(_ALEXNET.value), metrics.ALEXNET_SHAPES),
+        (Path(_LPIPS.value), metrics.LINEAR_SHAPES),
     ):
-        arrays |= images.choose(read_state_dict(path), shapes, source=str(path))
+        arrays |= metrics.choose(read_state_dict(path), shapes, source=str(path))
     with outputs.fresh_file(out, overwrite=_OVERWRITE.value) as draft:
         _write(draft, arrays)
     print(f"Weights: {out}")

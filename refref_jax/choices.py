@@ -1,7 +1,7 @@
 """Values of the options of scenes and configurations (standard library only)."""
 
 import math
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 Colour = tuple[float, float, float]
 """Linear RGB."""
@@ -11,6 +11,33 @@ CLEAR: Colour = (1.0, 1.0, 1.0)
 
 NO_ABSORPTION: Colour = (0.0, 0.0, 0.0)
 """Absorption of a clear medium."""
+
+PartKind = Literal["dielectric", "opaque", "conductor", "thin_sheet"]
+"""Kinds of parts: bodies that light passes through, surfaces that it ends on, metals that reflect
+it, and open surfaces that stand for a thin wall."""
+
+
+class Material(NamedTuple):
+    """The material of a part, in addition to its index of refraction, tint and absorption.
+
+    Attributes:
+      kind: kind of the part.
+      roughness: roughness of the surface, 0 to 1, as in Cycles: the `alpha` of GGX is its square.
+      complex_index: `eta` and `k` of a conductor, relative to vacuum, linear RGB.
+      dispersion: index of refraction inside for red, green and blue, or `None` if one index holds
+        for all colours.
+      interior: `field` if a radiance field models the inside; `None` if the scene's model does.
+      radiance: linear RGB radiance of an opaque part, `vertex_colours` of its mesh, or `None` if
+        its colour is to be learned.
+    """
+
+    kind: PartKind = "dielectric"
+    roughness: float = 0.0
+    complex_index: tuple[Colour, Colour] | None = None
+    dispersion: Colour | None = None
+    interior: Literal["field"] | None = None
+    radiance: Colour | Literal["vertex_colours"] | None = None
+
 
 TwoSidedRule = Literal["nested", "facing"]
 """Rules under which the media on both sides of a part are known in advance."""

@@ -268,3 +268,71 @@ def _build_tuple(
     return tuple(
         _build(kind, item, f"{where}[{i}]", variants) for i, (kind, item) in enumerate(items)
     )
+
+
+# ---- Checks of single values, for files with a form of their own ----
+Vector = tuple[float, float, float]
+
+
+class UnsuitableError(ValueError):
+    """A value is not suitable; the message says what is, to follow the word Give."""
+
+
+def as_number(value: Any) -> float:
+    """Returns a number, or NaN for any other value."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return math.nan
+    return float(value) if abs(value) < 1e300 else math.inf  # of integers of any size
+
+
+def as_vector(value: Any) -> Vector:
+    """Returns three numbers, or NaN three times for any other value."""
+    if not isinstance(value, list) or len(value) != 3:
+        return math.nan, math.nan, math.nan
+    first, second, third = map(as_number, value)
+    return first, second, third
+
+
+def number_within(least: float, most: float, wanted: str) -> Callable[[Any], float]:
+    """Returns a check of a finite number in a range."""
+
+    def check(value: Any) -> float:
+        if not (least <= as_number(value) <= most and as_number(value) < math.inf):
+            raise UnsuitableError(wanted)
+        return as_number(value)
+
+    return check
+
+
+def vector_within(least: float, most: float, wanted: str) -> Callable[[Any], Vector]:
+    """Returns a check of three finite numbers in a range."""
+
+    def check(value: Any) -> Vector:
+        if not all(least <= each <= most and abs(each) < math.inf for each in as_vector(value)):
+            raise UnsuitableError(wanted)
+        return as_vector(value)
+
+    return check
+
+
+def of_type(kind: type, wanted: str) -> Callable[[Any], Any]:
+    """Returns a check of the type of a value; text is not empty."""
+
+    def check(value: Any) -> Any:
+        if type(value) is not kind or value == "" or "\0" in str(value):
+            raise UnsuitableError(wanted)
+        return value
+
+    return check
+
+
+def one_of(*names: str) -> Callable[[Any], str]:
+    """Returns a check of a name."""
+
+    def check(value: Any) -> str:
+        if not isinstance(value, str) or value not in names:
+            near = nearest(value, names) if isinstance(value, str) else None
+            raise UnsuitableError(f"one of {', '.join(names)}{f': {near}?' if near else ''}")
+        return value
+
+    return check

@@ -46,6 +46,12 @@ def read_rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     return np.round(pixels[..., :3] * alpha + 255.0 * (1.0 - alpha)).astype(np.uint8)
 
 
+def srgb_to_linear(encoded: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Returns sRGB values in `[0, 1]` as linear light; see `render.colour` for values of fields."""
+    curved = ((np.maximum(encoded, 0.0) + 0.055) / 1.055) ** 2.4
+    return np.where(encoded <= 0.04045, encoded / 12.92, curved)
+
+
 def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
     """Reads a mask: all nonzero values are the object."""
     pixels = _read_png(path)

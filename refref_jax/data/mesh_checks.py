@@ -131,9 +131,11 @@ def _lint_pair(
             if len(surfaces[a].points) and len(surfaces[b].points)
         ]
     coincident = [_patch(a, gaps, _coincide(gaps, size)) for a, b, gaps in sides]
+    bodies = all(parts[part].material.kind == "dielectric" for part in pair)
     layers = [
         _patch(a, gaps, _thin_layer(parts, containment.parents, (a, b), gaps, size))
         for a, b, gaps in sides
+        if bodies
     ]
     findings = []
     if found := _largest(coincident, _COINCIDENT_SHARE):
@@ -240,9 +242,10 @@ def lint(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
     """Checks every part (closed, oriented outwards, no needless faces), and all pairs of parts."""
     findings = []
     for part in parts:
-        findings += _edges(part)
         findings += _faces(part)
-        findings += _objects(part)
+        if part.material.kind == "dielectric":  # other parts may be open, and have no inside
+            findings += _edges(part)
+            findings += _objects(part)
     return findings + lint_pairs(parts, containment)
 
 

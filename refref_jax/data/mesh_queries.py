@@ -181,12 +181,17 @@ class Containment(NamedTuple):
 
 
 def find_containment(parts: Sequence[MeshPart]) -> Containment:
-    """Determines which parts contain which, and which overlap."""
+    """Determines which parts contain which, and which overlap.
+
+    Parts that are not dielectrics have no medium inside and take that of any ray that meets them,
+    so they neither contain parts, nor are contained, nor overlap.
+    """
     count = len(parts)
+    bodies = [n for n, part in enumerate(parts) if part.material.kind == "dielectric"]
     volumes = [abs(volume(part.vertices, part.faces)) for part in parts]
     contains = np.zeros((count, count), bool)
     overlaps = set()
-    for inner, outer in itertools.permutations(range(count), 2):
+    for inner, outer in itertools.permutations(bodies, 2):
         inside = np.abs(winding_number(parts[outer], _probes(parts[inner], parts[outer]))) > 0.5
         contains[outer, inner] = inside.all()
         if inside.any() and not inside.all():
@@ -203,14 +208,15 @@ def parts_around(
 ) -> Int[np.ndarray, "points slots"]:
     """Returns the interior lists of rays that start at points: the parts that contain each point.
 
-    Only the rules `priority` and `facing` need them, the latter if parts overlap; see
-    `optics.media`.
+    Only scenes whose rays carry lists need them; see `optics.media`.
 
     Raises:
       SceneError: if a list is too short for the parts around a point.
     """
     inside = np.zeros((len(points), max(len(parts), SLOTS)), bool)
     for number, part in enumerate(parts):
+        if part.material.kind != "dielectric":
+            continue
         inside[:, number] = np.abs(winding_number(part, points)) > 0.5
     if np.any(crowded := inside.sum(axis=1) > SLOTS):
         point = int(np.argmax(crowded))

@@ -13,17 +13,18 @@ are only read from files with exactly the header that `write_mesh` writes, becau
 may store any normals.
 """
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
-from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
-from refref_jax.data import SceneError, scene_names, scene_properties
+from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour, Material
+from refref_jax.data import SceneError, image_files, scene_names, scene_properties
 from refref_jax.data.scene_properties import PartDescription, SceneProperties, Shading
 
 _HEADER = """ply
@@ -113,8 +114,11 @@ class MeshPart(NamedTuple):
       absorption: absorption of the medium inside, linear RGB, per world unit.
       priority: priority under the rule `priority`; the highest wins where parts overlap.
       colour_known: whether tint or absorption is given, not just the default.
+      material: kind of the part, and what else its surface and its inside are made of.
       normals: outward unit shading normals at the corners of the faces, or `None` if `shading`
         decides them.
+      radiance: linear RGB radiance at the corners of the faces, or `None` if it is unknown or the
+        part is not opaque.
     """
 
     name: str
@@ -126,7 +130,9 @@ class MeshPart(NamedTuple):
     absorption: Colour = NO_ABSORPTION
     priority: int = 0
     colour_known: bool = False
+    material: Material = Material()
     normals: Float[np.ndarray, "faces 3 3"] | None = None
+    radiance: Float[np.ndarray, "faces 3 3"] | None = None
 
 
 def read_meshes(
@@ -291,7 +297,36 @@ def _read_part(
     index = _index(path, overrides, described, table)
     vertices, faces = read_mesh(path)
     normals = read_normals(path) if described.shading == "auto" else None
-    return MeshPart(path.stem, vertices, faces, index, *described[1:], normals)
+    part = MeshPart(path.stem, vertices, faces, index, *described[1:], normals)
+    return part._replace(radiance=read_radiance(part.material, faces, path=path))
+
+
+def read_radiance(
+    material: Material, faces: Int[np.ndarray, "faces 3"], *, path: Any
+) -> Float[np.ndarray, "faces 3 3"] | None:
+    """Returns the linear RGB radiance of an opaque part at the corners of its faces, if known.
+
+    Args:
+      material: material of the part.
+      faces: faces of its mesh.
+      path: file of its mesh, if the radiance is that of its vertices.
+
+    Raises:
+      SceneError: if the file has no vertex colours, but the material names them.
+    """
+    if material.radiance is None:
+        return None
+    if material.radiance != "vertex_colours":
+        return np.broadcast_to(np.asarray(material.radiance, np.float64), (len(faces), 3, 3))
+    mesh = trimesh.load_mesh(path, process=False) if isinstance(path, str | os.PathLike) else path
+    visual: Any = getattr(mesh, "visual", None)
+    if getattr(visual, "kind", None) != "vertex":
+        raise SceneError(
+            f"{path} has no vertex colours, which its material names as its radiance. Export them, "
+            "or give three numbers."
+        )
+    encoded = np.asarray(visual.vertex_colors, np.float64)[:, :3] / 255.0
+    return image_files.srgb_to_linear(encoded)[np.asarray(mesh.faces)]
 
 
 def _index(
@@ -303,6 +338,8 @@ def _index(
     """Returns the index of refraction of a mesh file, by the order in the module docstring."""
     if path.stem in overrides:
         return overrides[path.stem]
+    if described.material.kind in ("opaque", "conductor"):
+        return INDEX_OF_REFRACTION["air"]  # light does not enter
     material = material_of(path, table=table)
     if described.index is not None and material not in overrides:
         return described.index

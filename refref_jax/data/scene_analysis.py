@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from refref_jax.choices import CLEAR, NO_ABSORPTION, RuleName, Space, Tints
+from refref_jax.choices import CLEAR, NO_ABSORPTION, PartKind, RuleName, Space, Tints
 from refref_jax.data.mesh_queries import Containment, encloses, is_convex, winding_number
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_properties import PartDescription, SceneProperties
@@ -30,13 +30,17 @@ class SceneAnalysis(NamedTuple):
 
     Attributes:
       parts: number of meshes; without any, rays are straight.
-      objects: number of objects: outermost parts, which no other part contains.
+      objects: number of objects: parts that no other part contains.
       convex: whether there is one object, it is convex and contains all other parts.
       reentry: `impossible` if a ray that has left the objects cannot meet any again.
       interior: interior of the objects: `none` without objects, `clear` if their colours are known
         and absorb no light, otherwise `absorbing`.
       tints: colours of interfaces and media: `none` if they are clear, `given` if `scene.json` has
         them for every part, otherwise to be `learned`.
+      embedded: kinds of parts that are not dielectrics.
+      rough: whether a surface is rough.
+      dispersion: whether indices differ between red, green and blue.
+      field_parts: parts whose inside is to be modelled by a field.
       space: `unbounded` if the background is infinitely far away, `spherical` if it is a sphere.
     """
 
@@ -47,6 +51,10 @@ class SceneAnalysis(NamedTuple):
     interior: NeededInterior
     tints: Tints
     space: Space
+    embedded: tuple[PartKind, ...] = ()
+    rough: bool = False
+    dispersion: bool = False
+    field_parts: tuple[int, ...] = ()
 
 
 def analyse(
@@ -71,7 +79,14 @@ def analyse(
         `optics.interface_rules`.
       space: geometry of the background.
     """
-    outermost = [parts[i] for i, parent in enumerate(tree.parents) if parent == NO_PARENT]
+    bodies = [
+        parts[i]
+        for i, parent in enumerate(tree.parents)
+        if parent == NO_PARENT and parts[i].material.kind == "dielectric"
+    ]
+    others = [part for part in parts if part.material.kind != "dielectric"]
+    apart = [part for part in others if not any(encloses(body, part) for body in bodies)]
+    outermost = bodies + apart
     convex = len(outermost) == 1 and _is_one_convex_body(outermost[0], parts)
     # Under other rules, a ray between two parts may count as outside of all parts.
     told_apart = rule == "nested" or len(parts) == 1
@@ -84,6 +99,10 @@ def analyse(
         interior=_interior(parts),
         tints=find_tints(parts),
         space=space,
+        embedded=tuple(sorted({part.material.kind for part in others})),
+        rough=any(part.material.roughness > 0.0 for part in parts),
+        dispersion=any(part.material.dispersion is not None for part in parts),
+        field_parts=tuple(i for i, part in enumerate(parts) if part.material.interior == "field"),
     )
 
 
@@ -98,9 +117,11 @@ def describe(analysis: SceneAnalysis) -> str:
         "learned": "tints and absorption (to be learned)",
     }
     reentry = "re-entry" if analysis.reentry == "possible" else "no re-entry"
-    return (
-        f"this scene needs: {_objects(analysis)}, {reentry}, {background}, {tints[analysis.tints]}"
-    )
+    words = [_objects(analysis), reentry, background, tints[analysis.tints]]
+    words += [f"{kind.replace('_', ' ')} parts" for kind in analysis.embedded]
+    words += ["rough surfaces"] * analysis.rough + ["dispersion"] * analysis.dispersion
+    words += ["a field inside parts"] * bool(analysis.field_parts)
+    return f"this scene needs: {', '.join(words)}"
 
 
 def overridden(
@@ -172,7 +193,13 @@ def _interior(parts: Sequence[MeshPart]) -> NeededInterior:
 def find_tints(
     parts: Sequence[MeshPart | PartDescription],
 ) -> Tints:
-    """Returns the source of the colours of parts or their descriptions; see `SceneAnalysis`."""
+    """Returns the source of the colours of parts or their descriptions; see `SceneAnalysis`.
+
+    Light ends on opaque parts, a conductor has the colour of its index, and a field inside a part
+    learns its colour, so only the others have colours that may be unknown.
+    """
+    clear = ("dielectric", "thin_sheet")
+    parts = [x for x in parts if x.material.kind in clear and x.material.interior is None]
     if not all(part.colour_known for part in parts):
         return "learned"
     return "given" if any(map(_takes_light, parts)) else "none"

@@ -17,7 +17,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour, RuleName
+from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour, Material, RuleName
 from refref_jax.data import SceneError, image_files, mesh_checks, meshes, scene_properties
 from refref_jax.data.mesh_checks import refuse_errors
 from refref_jax.data.mesh_queries import find_containment
@@ -50,6 +50,8 @@ _WALLS = 6
 # Axes are stored with at least six digits.
 _AXES_TOLERANCE = 1e-3
 
+_DIELECTRIC = Material()
+
 _CREASE_ANGLES: dict[Shading, float] = {"auto": CREASE_ANGLE, "smooth": np.pi, "flat": 0.0}
 
 
@@ -62,6 +64,7 @@ def make_part(
     tint: Colour = CLEAR,
     absorption: Colour = NO_ABSORPTION,
     priority: int = 0,
+    material: Material = _DIELECTRIC,
 ) -> MeshPart:
     """Makes one part of a scene from a mesh; `assemble` combines parts.
 
@@ -74,6 +77,8 @@ def make_part(
       tint: factor of linear RGB light at every reflection and every crossing, 0 to 1.
       absorption: absorption of the medium inside, linear RGB, per world unit.
       priority: priority under the rule `priority`; the highest wins where parts overlap.
+      material: kind of the part, roughness and dispersion; a smooth dielectric by default. The
+        index has no effect on opaque parts and conductors.
 
     Raises:
       SceneError: if the mesh is broken or empty, or a number has no physical meaning.
@@ -102,7 +107,32 @@ def make_part(
             "positive, per world unit."
         )
     coloured = tuple(tint) != CLEAR or tuple(absorption) != NO_ABSORPTION
-    return part._replace(tint=tint, absorption=absorption, priority=priority, colour_known=coloured)
+    _check_material(part.name, material)
+    radiance = meshes.read_radiance(material, part.faces, path=mesh)
+    return part._replace(
+        tint=tint,
+        absorption=absorption,
+        priority=priority,
+        colour_known=coloured,
+        material=material,
+        radiance=radiance,
+    )
+
+
+def _check_material(name: str, material: Material) -> None:
+    """Refuses a material that `scene.json` could not describe, with the same message."""
+    eta, k = material.complex_index or (None, None)
+    values = {
+        "kind": material.kind,
+        "index": material.dispersion,
+        "eta": eta,
+        "k": k,
+        "radiance": material.radiance,
+        "roughness": material.roughness or None,
+        "interior": material.interior,
+    }
+    listed = {key: list(x) if isinstance(x, tuple) else x for key, x in values.items()}
+    scene_properties.check_part(name, {key: x for key, x in listed.items() if x is not None})
 
 
 def _of_arrays(
@@ -205,7 +235,7 @@ def assemble_scene(
       overlaps: pairs of parts that overlap, from `mesh_queries.find_containment`.
       ambient: index of refraction of the ambient medium.
     """
-    surfaces = pack_meshes([shaded_mesh(part) for part in parts])
+    surfaces = pack_meshes([shaded_mesh(part) for part in parts], radiance=_radiance(parts))
     interfaces = RULES[rule](
         [part.index for part in parts],
         parents,
@@ -214,8 +244,20 @@ def assemble_scene(
         priorities=[part.priority for part in parts],
         overlaps=overlaps,
         ambient=ambient,
+        materials=[part.material for part in parts],
     )
     return Scene(surfaces, interfaces)
+
+
+def _radiance(parts: Sequence[MeshPart]) -> list[Float[np.ndarray, "faces 3 3"]]:
+    """Returns the radiance of all parts, 0 where they are not opaque; nothing if one is unknown."""
+    opaque = [part for part in parts if part.material.kind == "opaque"]
+    if not opaque or any(part.radiance is None for part in opaque):
+        return []
+    return [
+        np.zeros((len(part.faces), 3, 3)) if part.radiance is None else part.radiance
+        for part in parts
+    ]
 
 
 def shaded_mesh(part: MeshPart) -> Mesh:

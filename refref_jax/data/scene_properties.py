@@ -24,7 +24,15 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 from refref_jax import configuration
-from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour, RuleName, Space
+from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour, Material, PartKind, RuleName, Space
+from refref_jax.configuration import (
+    UnsuitableError,
+    Vector,
+    number_within,
+    of_type,
+    one_of,
+    vector_within,
+)
 from refref_jax.data import SceneError, scene_names
 
 FILE = "scene.json"
@@ -40,18 +48,26 @@ RECORDS: dict[str, tuple[str, ...]] = {
     ),
     "background": ("texture",),
     "face": ("texture",),
-    "part": ("inside", "outside", "ior_outside", "watertight", "faces"),
+    "part": ("inside", "outside", "ior_outside", "watertight", "faces", "albedo"),
 }
 """Keys that generators write as a record, without effect, by the object that contains them."""
 
 Shading = Literal["auto", "smooth", "flat"]
 BackgroundKind = Literal["cube", "sphere", "env"]
-Vector = tuple[float, float, float]
 
 _SPACES: dict[str, Space] = {"cube": "bounded", "sphere": "spherical", "env": "unbounded"}
 
 # Keys of a background by its type, in addition to those of all types.
 _OF_KIND = {"cube": ("half_extent", "faces"), "sphere": ("radius", "image"), "env": ("image",)}
+
+# Keys of a part that its kind needs, and those that have no effect on it.
+_NEEDED = {"conductor": ("eta", "k")}
+_IDLE = {
+    "dielectric": ("eta", "k", "radiance"),
+    "opaque": ("eta", "k", "index", "ior_inside", "absorption", "roughness", "interior"),
+    "conductor": ("index", "ior_inside", "absorption", "radiance", "interior"),
+    "thin_sheet": ("eta", "k", "absorption", "radiance", "interior"),
+}
 
 # The mapping of an image: its name, or the beginning of the formula that generators write.
 _PLANAR = ("planar", "point = half_extent*(")
@@ -72,6 +88,7 @@ class PartDescription(NamedTuple):
       absorption: absorption of the medium inside, linear RGB, per world unit.
       priority: priority under the rule `priority`; the highest wins where parts overlap.
       colour_known: whether tint or absorption is given; if only one is, the other is clear.
+      material: kind of the part, and what else its surface and its inside are made of.
     """
 
     index: float | None = None  # type: ignore[assignment]  # hides tuple.index
@@ -80,6 +97,7 @@ class PartDescription(NamedTuple):
     absorption: Colour = NO_ABSORPTION
     priority: int = 0
     colour_known: bool = False
+    material: Material = Material()
 
 
 class Face(NamedTuple):
@@ -177,15 +195,21 @@ def check_file(path: Path) -> None:
         _part(name, part, [source])
 
 
+def check_part(name: str, description: Mapping[str, Any]) -> None:
+    """Checks the description of a part that is not from a file.
+
+    Raises:
+      SceneError: if it is not valid.
+    """
+    record = dict(description)
+    _part(name, record, [_Source(Path("The material"), {"parts": {name: record}})])
+
+
 class _Source(NamedTuple):
     """A file of properties, and its content with the parts by the names of their meshes."""
 
     path: Path
     content: dict[str, Any]
-
-
-class _UnsuitableError(ValueError):
-    """A value is not suitable; the message says what is, to follow the word Give."""
 
 
 def _read_file(path: Path) -> dict[str, Any]:
@@ -241,6 +265,8 @@ def _merged(below: Any, above: Any, key: str = "") -> Any:
         return above
     if key == "background" and _kind_of(above) not in (None, _kind_of(below)):
         return above  # the sizes and images of another type of background do not fit
+    if "kind" in above and above["kind"] != below.get("kind", "dielectric"):
+        return above  # the values of another kind of part do not fit
     twins = {name: pair for pair in _TWINS for name in pair}
     hidden = {other for name in above for other in twins.get(name, ())}
     kept = {name: value for name, value in below.items() if name not in hidden - set(above)}
@@ -255,133 +281,84 @@ def _kind_of(background: Mapping[str, Any]) -> Any:
 
 
 # ---- Values ----
-def _number(value: Any) -> float:
-    """Returns a number, or NaN for any other value."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return math.nan
-    return float(value) if abs(value) < 1e300 else math.inf  # of integers of any size
+def _index_or_three(value: Any) -> float | Vector:
+    """Returns an index of refraction, or three for red, green and blue: dispersion."""
+    return _indices(value) if isinstance(value, list) else _index(value)
 
 
-def _numbers(value: Any) -> Vector:
-    """Returns three numbers, or NaN three times for any other value."""
-    if not isinstance(value, list) or len(value) != 3:
-        return math.nan, math.nan, math.nan
-    first, second, third = map(_number, value)
-    return first, second, third
+def _metal(least: float, sign: str) -> Callable[[Any], Vector]:
+    """Returns a check of one number, or three for red, green and blue, from a limit on."""
+    three = vector_within(least, math.inf, f"a {sign} number, or three for red, green and blue")
+    return lambda value: three(value if isinstance(value, list) else [value] * 3)
 
 
-def _positive(value: Any) -> float:
-    if not 0.0 < (number := _number(value)) < math.inf:
-        raise _UnsuitableError("a positive number")
-    return number
-
-
-def _index(value: Any) -> float:
-    if all(math.isfinite(number) for number in _numbers(value)):
-        raise _UnsuitableError("one number: an index per colour (dispersion) is not supported yet")
-    if not 0.0 < (number := _number(value)) < math.inf:
-        raise _UnsuitableError("a positive number, such as 1.5 for glass")
-    return number
-
-
-def _three(least: float, most: float, wanted: str) -> Callable[[Any], Vector]:
-    """Returns a check of three finite numbers in a range."""
-
-    def check(value: Any) -> Vector:
-        if not all(least <= each <= most and abs(each) < math.inf for each in _numbers(value)):
-            raise _UnsuitableError(wanted)
-        return _numbers(value)
-
-    return check
-
-
-_vector = _three(-math.inf, math.inf, "three numbers")
-_tint = _three(0.0, 1.0, "three numbers from 0 to 1, since no surface adds light")
-_absorption = _three(0.0, math.inf, "three numbers that are 0 or positive, per world unit")
-_centre = _three(0.0, 0.0, "[0, 0, 0]: another centre is not supported yet, so move the cameras")
-
-
-def _typed(kind: type, wanted: str) -> Callable[[Any], Any]:
-    """Returns a check of the type of a value; text is not empty."""
-
-    def check(value: Any) -> Any:
-        if type(value) is not kind or value == "" or "\0" in str(value):
-            raise _UnsuitableError(wanted)
-        return value
-
-    return check
-
-
-def _only(only: int, wanted: str) -> Callable[[Any], int]:
-    """Returns a check of a number of which one value is possible."""
-
-    def check(value: Any) -> int:
-        if _number(value) != only:
-            raise _UnsuitableError(wanted)
-        return only
-
-    return check
-
-
-def _one_of(*names: str, later: Sequence[str] = ()) -> Callable[[Any], str]:
-    """Returns a check of a name; names in `later` are not supported yet."""
-
-    def check(value: Any) -> str:
-        if value in later:
-            raise _UnsuitableError(f"{' or '.join(names)}: {value} is not supported yet")
-        if not isinstance(value, str) or value not in names:
-            near = configuration.nearest(value, names) if isinstance(value, str) else None
-            raise _UnsuitableError(f"one of {', '.join(names)}{f': {near}?' if near else ''}")
-        return value
-
-    return check
+def _radiance(value: Any) -> Vector | str:
+    return value if value == "vertex_colours" else _light(value)
 
 
 def _record(value: Any) -> Any:
     return value
 
 
+# Smallest positive number that single precision holds with all its digits.
+_LEAST = 1.2e-38
+
+_positive = number_within(_LEAST, math.inf, "a positive number")
+_index = number_within(_LEAST, math.inf, "a positive number, such as 1.5 for glass")
+_indices = vector_within(_LEAST, math.inf, "a positive number, or three for red, green and blue")
+_vector = vector_within(-math.inf, math.inf, "three numbers")
+_tint = vector_within(0.0, 1.0, "three numbers from 0 to 1, since no surface adds light")
+_absorption = vector_within(0.0, math.inf, "three numbers that are 0 or positive, per world unit")
+_light = vector_within(0.0, math.inf, "vertex_colours, or three numbers that are 0 or positive")
+_centre = vector_within(
+    0.0, 0.0, "[0, 0, 0]: another centre is not supported yet, so move the cameras"
+)
+
 _Checks = Mapping[str, Callable[[Any], Any]]
 
 _TOP: _Checks = {
-    "version": _only(VERSION, f"{VERSION}, the version that this library reads"),
-    "rule": _one_of(*get_args(RuleName)),
+    "version": number_within(VERSION, VERSION, f"{VERSION}, the version that this library reads"),
+    "rule": one_of(*get_args(RuleName)),
     "ambient_index": _positive,
     "ior": _record,
     "background": _record,
     "parts": _record,
-    "notes": _typed(str, "text"),
+    "notes": of_type(str, "text"),
 } | dict.fromkeys(RECORDS[""], _record)
 
 _BACKGROUND: _Checks = {
-    "type": _one_of(*get_args(BackgroundKind)),
+    "type": one_of(*get_args(BackgroundKind)),
     "half_extent": _positive,
     "radius": _positive,
     "centre": _centre,
-    "image": _typed(str, "the name of a file"),
+    "image": of_type(str, "the name of a file"),
     "faces": _record,
-    "mapping": _typed(str, "its name"),
+    "mapping": of_type(str, "its name"),
 } | dict.fromkeys(RECORDS["background"], _record)
 
 _FACE: _Checks = {
-    "image": _typed(str, "the name of a file"),
+    "image": of_type(str, "the name of a file"),
     "normal": _vector,
     "u_axis": _vector,
     "v_axis": _vector,
 } | dict.fromkeys(RECORDS["face"], _record)
 
 _PART: _Checks = {
-    "mesh": _typed(str, "the name of a file"),
-    "kind": _one_of("dielectric", later=("opaque", "conductor", "thin_sheet")),
-    "index": _index,
-    "ior_inside": _index,
-    "shading": _one_of(*get_args(Shading)),
-    "smooth_normals": _typed(bool, "true or false"),
+    "mesh": of_type(str, "the name of a file"),
+    "kind": one_of(*get_args(PartKind)),
+    "index": _index_or_three,
+    "ior_inside": _index_or_three,
+    "eta": _metal(_LEAST, "positive"),
+    "k": _metal(0.0, "non-negative"),
+    "radiance": _radiance,
+    "interior": one_of("field"),
+    "shading": one_of(*get_args(Shading)),
+    "smooth_normals": of_type(bool, "true or false"),
     "tint": _tint,
     "colour_per_interface": _tint,
     "absorption": _absorption,
-    "priority": _typed(int, "a whole number; the highest wins"),
-    "roughness": _only(0, "0: rough surfaces are not supported yet"),
+    "priority": of_type(int, "a whole number; the highest wins"),
+    "roughness": number_within(0.0, 1.0, "a number from 0 to 1"),
 } | dict.fromkeys(RECORDS["part"], _record)
 
 
@@ -442,8 +419,30 @@ def _part(name: str, record: Any, sources: Sequence[_Source]) -> PartDescription
         values["shading"] = "smooth" if values["smooth_normals"] else "flat"
     for later, earlier in _TWINS[:2]:
         values |= {later: values[earlier]} if earlier in values else {}
+    kind = values.get("kind", "dielectric")
+    if idle := sorted(set(_IDLE[kind]) & set(values)):
+        raise _error(
+            ("parts", name, idle[0]), sources, f"has no effect on a part of kind {kind}. Remove it."
+        )
+    if missing := sorted(set(_NEEDED.get(kind, ())) - set(values)):
+        raise _error(("parts", name), sources, f"lacks the key {missing[0]!r} of a {kind}. Add it.")
+    values["material"] = _material(kind, values)
+    if isinstance(values.get("index"), tuple):
+        values["index"] = values["index"][1]  # the index of green stands for the material
     fields = {key: values[key] for key in PartDescription._fields if key in values}
     return PartDescription(**fields, colour_known="tint" in fields or "absorption" in fields)
+
+
+def _material(kind: PartKind, values: Mapping[str, Any]) -> Material:
+    index = values.get("index")
+    return Material(
+        kind,
+        roughness=values.get("roughness", 0.0),
+        complex_index=(values["eta"], values["k"]) if kind == "conductor" else None,
+        dispersion=index if isinstance(index, tuple) and len(set(index)) > 1 else None,
+        interior=values.get("interior"),
+        radiance=values.get("radiance"),
+    )
 
 
 def _checked(
@@ -460,7 +459,7 @@ def _checked(
             raise _error((*keys, key), sources, f"is not a known key. {remedy}")
         try:
             values[key] = checks[key](value)
-        except _UnsuitableError as error:
+        except UnsuitableError as error:
             raise _refusal((*keys, key), value, sources, str(error)) from None
     return values
 

@@ -26,11 +26,14 @@ class Surfaces(NamedTuple):
       bvh: the BVH, which also holds the corners.
       normals: outward unit shading normals at the three corners.
       parts: index of each triangle's mesh part.
+      radiance: linear RGB radiance of opaque parts at the three corners, meaningless elsewhere;
+        empty if it is unknown, or no part is opaque.
     """
 
     bvh: BVH
     normals: Float[Array, "primitives 3 3"]
     parts: Int[Array, " primitives"]
+    radiance: Float[Array, "radiating 3 3"]
 
 
 class SurfacePoint(NamedTuple):
@@ -43,6 +46,7 @@ class SurfacePoint(NamedTuple):
       part: index of the mesh part.
       scale: largest absolute coordinate of the triangle, which sets the rounding error of
         `position`.
+      radiance: linear RGB radiance of the surface, `None` if it is unknown.
     """
 
     position: Float[Array, "3"]
@@ -50,6 +54,7 @@ class SurfacePoint(NamedTuple):
     shading_normal: Float[Array, "3"]
     part: Int[Array, ""]
     scale: Float[Array, ""]
+    radiance: Float[Array, "3"] | None = None
 
 
 def surface_point(
@@ -70,21 +75,33 @@ def surface_point(
     blended = triangles.interpolate(surfaces.normals[primitive_id], barycentric)
     shading = numerics.normalize(blended)
     opposed = numerics.dot(shading, geometric) <= 0.0
+    radiance = None
+    if surfaces.radiance.shape[0]:
+        radiance = triangles.interpolate(surfaces.radiance[primitive_id], barycentric)
     return SurfacePoint(
         position=triangles.interpolate(corners, barycentric),
         geometric_normal=geometric,
         shading_normal=jnp.where(opposed, geometric, shading),
         part=surfaces.parts[primitive_id],
         scale=numerics.largest_component(corners.reshape(9)),
+        radiance=radiance,
     )
 
 
-def pack_meshes(meshes: Sequence[Mesh]) -> Surfaces:
-    """Builds the device record of meshes; parts have the numbers of their places, none is empty."""
+def pack_meshes(
+    meshes: Sequence[Mesh], *, radiance: Sequence[Float[np.ndarray, "faces 3 3"]] = ()
+) -> Surfaces:
+    """Builds the device record of meshes; parts have the numbers of their places, none is empty.
+
+    Args:
+      meshes: meshes of the parts.
+      radiance: linear RGB radiance at the corners of each mesh, or nothing.
+    """
     return build_surfaces(
         np.concatenate([np.zeros((0, 3, 3)), *(mesh.vertices[mesh.faces] for mesh in meshes)]),
         np.concatenate([np.zeros((0, 3, 3)), *(mesh.normals for mesh in meshes)]),
         np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes]),
+        radiance=np.concatenate([np.zeros((0, 3, 3)), *radiance]),
     )
 
 
@@ -92,6 +109,8 @@ def build_surfaces(
     triangles: Float[np.ndarray, "faces 3 3"],
     normals: Float[np.ndarray, "faces 3 3"],
     parts: Int[np.ndarray, " faces"],
+    *,
+    radiance: Float[np.ndarray, "radiating 3 3"] | None = None,
 ) -> Surfaces:
     """Builds the `Surfaces` of a triangle soup, in single precision.
 
@@ -99,19 +118,26 @@ def build_surfaces(
       triangles: corners, counter-clockwise seen from outside, world units. May be empty.
       normals: outward unit shading normals at the corners.
       parts: part index of each triangle.
+      radiance: linear RGB radiance at the corners of all triangles, or of none.
 
     Returns:
       The surfaces, in the leaf order of their tree.
     """
+    if radiance is None or len(radiance) == 0:
+        radiance = np.zeros((0, 3, 3))
     bvh, primitive_ids = bvh_build.build(triangles.astype(np.float32))
     if len(triangles) == 0:
         return Surfaces(
             bvh,
             numerics.host_array(np.zeros_like(bvh.triangles)),
             numerics.host_array(primitive_ids),
+            numerics.host_array(radiance.astype(np.float32)),
         )
     return Surfaces(
         bvh,
         numerics.host_array(normals[primitive_ids].astype(np.float32)),
         numerics.host_array(parts[primitive_ids].astype(np.int32)),
+        numerics.host_array(
+            (radiance[primitive_ids] if len(radiance) else radiance).astype(np.float32)
+        ),
     )

@@ -32,7 +32,7 @@ from jaxtyping import Array, Bool, Int
 from refref_jax.geometry.bvh import NO_PRIMITIVE, closest_primitive
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import media, path_step, ray_differentials
-from refref_jax.optics.light_paths import LightPaths, PathStatus
+from refref_jax.optics.light_paths import LightPaths, PathStatus, Stop
 from refref_jax.optics.path_settings import PathSettings
 from refref_jax.optics.path_step import RayState
 from refref_jax.optics.scene import Scene, in_one_precision
@@ -63,12 +63,14 @@ class _Walk(NamedTuple):
       traced: whether the ray is to be cast; false for the paper's first reflection, and if max
         bends is 0.
       status: `EMPTY` while the path continues.
+      stop: where the path ends on an opaque surface; `None` without such surfaces.
     """
 
     state: RayState
     medium: Int[Array, ""]
     traced: Bool[Array, ""]
     status: Int[Array, ""]
+    stop: Stop | None
 
 
 def follow_branch(
@@ -94,7 +96,7 @@ def follow_branch(
       throughput moves to the sibling.
 
     Raises:
-      ValueError: if the length of `reflects` is not the max bends.
+      ValueError: if the length of `reflects` is not the max bends, or the scene has dispersion.
 
     Example:
       The transmittance of a glass surface, and its derivative with respect to the index `n`:
@@ -118,6 +120,10 @@ def follow_branch(
             f"reflects has {reflects.shape[0]} choices for {settings.max_bends} bends. Give one "
             "choice for each of the max bends."
         )
+    if media.has_dispersion(scene.interfaces):
+        raise ValueError(
+            "The scene has dispersion, but a single path has one colour. Take one with of_channel."
+        )
     reflects = jnp.asarray(reflects)
     scene, ray = in_one_precision(scene, ray)
     if interior_list is None:
@@ -127,6 +133,7 @@ def follow_branch(
         jnp.int32(media.AMBIENT),
         jnp.asarray(settings.max_bends > 0),
         jnp.int32(PathStatus.EMPTY),
+        _no_stop(scene, ray),
     )
     # One step more than max bends: the last one only checks whether the path escapes.
     choices = jnp.append(reflects, False)
@@ -158,10 +165,25 @@ def _advance(
         medium=jnp.where(mirrored, sides.medium_near, sides.medium_far),
         traced=~(reflect & ~met.total & (settings.reflections == "first")),
         status=status,
+        stop=walk.stop,
     )
+    ended_state, stop = path_step.stop(state, arrival, status)
+    ended_walk = walk._replace(status=status)
+    if walk.stop is not None:
+        ended_walk = _either(
+            alive, walk._replace(state=ended_state, status=status, stop=stop), walk
+        )
     segment = _Segment(state, jnp.where(hit, sides.medium_near, walk.medium), alive)
     going_on = status == PathStatus.EMPTY
-    return _either(going_on, bent, walk._replace(status=status)), segment
+    return _either(going_on, bent, ended_walk), segment
+
+
+def _no_stop(scene: Scene, ray: Rays) -> Stop | None:
+    if not media.has_opaque(scene.interfaces):
+        return None
+    known = scene.surfaces.radiance.shape[0] > 0
+    infinite = jnp.full_like(ray.radii, jnp.inf)
+    return Stop(infinite, jnp.zeros_like(ray.origins) if known else None)
 
 
 def _either(which: Bool[Array, ""], first: _Record, second: _Record) -> _Record:
@@ -186,6 +208,7 @@ def _record(settings: PathSettings, ray: Rays, end: _Walk, segments: _Segment) -
         statuses=end.status,
         hit_counts=none,
         path_lengths=none,
+        stop=end.stop,
     )
 
 
@@ -241,6 +264,8 @@ def follow_main_branches(
     paths = jax.vmap(lambda choice: follow_branch(scene, ray, choice, settings=settings))(choices)
     # If the main path stays in its medium at a bend, reflection is total there.
     total = paths.media[0, 1:] == paths.media[0, :-1]
+    if media.has_kinds(scene.interfaces):  # a thin sheet lets light through on the same side
+        total &= jnp.any(paths.directions[0, 1:] != paths.directions[0, :-1], axis=-1)
     real = jnp.append(True, (paths.num_bends[1:] > first) & ~total[:reflections])
     return paths._replace(
         statuses=jnp.where(real, paths.statuses, PathStatus.EMPTY),

@@ -1,4 +1,7 @@
-"""Fresnel equations for unpolarised light. Letters as in `snell`."""
+"""Fresnel equations for unpolarised light at dielectrics, conductors and thin sheets.
+
+Letters as in `snell`.
+"""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -30,6 +33,43 @@ def reflectance(
     perpendicular = _amplitude(index_near * beta, index_far * gamma)
     partial = 0.5 * (jnp.square(parallel) + jnp.square(perpendicular))
     return jnp.where(total, 1.0, jnp.where(index_near == index_far, 0.0, partial))
+
+
+def conductor_reflectance(
+    beta: Float[Array, ""], eta: Float[Array, "3"], k: Float[Array, "3"]
+) -> Float[Array, "3"]:
+    """Returns the fraction of linear RGB light that a smooth conductor reflects, in `[0, 1]`.
+
+    The formula is that of a complex index `eta + i k`; `k = 0` gives the reflectance of a
+    dielectric of index `eta` >= 1. At grazing incidence everything is reflected.
+
+    Args:
+      beta: cosine of incidence, in `[0, 1]`.
+      eta: real part of the index, relative to the surrounding medium, > 0.
+      k: imaginary part, relative to the surrounding medium, >= 0.
+
+    Source: Born and Wolf, Principles of Optics, section 14.2, as written by Lagarde, Memo on
+    Fresnel equations (2013).
+    """
+    cos2 = jnp.square(beta)
+    sin2 = 1.0 - cos2
+    real = jnp.square(eta) - jnp.square(k) - sin2
+    both = numerics.safe_sqrt(jnp.square(real) + 4.0 * jnp.square(eta * k))
+    a = 2.0 * beta * numerics.safe_sqrt(0.5 * (both + real))
+    perpendicular = numerics.safe_divide(both + cos2 - a, both + cos2 + a)
+    c, d = cos2 * both + jnp.square(sin2), a * sin2
+    parallel = perpendicular * numerics.safe_divide(c - d, c + d)
+    return jnp.clip(0.5 * (perpendicular + parallel), 0.0, 1.0)
+
+
+def sheet_reflectance(reflectance: Float[Array, ""]) -> Float[Array, ""]:
+    """Returns the fraction of light that a thin wall reflects, of the reflectance of one side.
+
+    Light that is reflected inside the wall any number of times is summed: `2 R / (1 + R)`.
+
+    Source: the geometric series; Mitsuba's `thindielectric`.
+    """
+    return 2.0 * reflectance / (1.0 + reflectance)
 
 
 def _amplitude(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:

@@ -18,14 +18,14 @@ The ambient medium, outside all parts, is air unless another index is given (`am
 """
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from refref_jax.choices import CLEAR, NO_ABSORPTION, RuleName
+from refref_jax.choices import CLEAR, NO_ABSORPTION, Material, RuleName
 from refref_jax.numerics import host_array
-from refref_jax.optics.media import AMBIENT, INDEX_OF_AIR, Interfaces
+from refref_jax.optics.media import AMBIENT, CONDUCTOR, INDEX_OF_AIR, KINDS, OPAQUE, Interfaces
 
 NO_PARENT = -1
 """Parent of a part that is not inside another part."""
@@ -47,6 +47,7 @@ class Rule(Protocol):
         priorities: Sequence[int] | None = None,
         overlaps: Sequence[tuple[int, int]] = (),
         ambient: float = INDEX_OF_AIR,
+        materials: Sequence[Material] | None = None,
     ) -> Interfaces:
         """Builds the interfaces of a scene.
 
@@ -58,6 +59,7 @@ class Rule(Protocol):
           priorities: priority of each part, 0 by default; the highest wins.
           overlaps: pairs of parts that overlap; only `facing` needs them.
           ambient: index of refraction of the ambient medium.
+          materials: material of each part, smooth dielectrics by default.
         """
 
 
@@ -70,11 +72,14 @@ def nested(
     priorities: Sequence[int] | None = None,
     overlaps: Sequence[tuple[int, int]] = (),
     ambient: float = INDEX_OF_AIR,
+    materials: Sequence[Material] | None = None,
 ) -> Interfaces:
     """Applies the `nested` rule; arguments as in `Rule`. Priorities and overlaps are ignored."""
     del priorities, overlaps
-    outside = [ambient if parent == NO_PARENT else indices[parent] for parent in parents]
-    return _interfaces(indices, outside, parents, tints, absorptions)
+    made = _interfaces(indices, _Around(parents, ambient), tints, absorptions, materials)
+    if not _any_embedded(materials):
+        return made
+    return _with_lists(made, parents, [0] * len(parents), facing=False)
 
 
 def facing(
@@ -86,6 +91,7 @@ def facing(
     priorities: Sequence[int] | None = None,
     overlaps: Sequence[tuple[int, int]] = (),
     ambient: float = INDEX_OF_AIR,
+    materials: Sequence[Material] | None = None,
 ) -> Interfaces:
     """Applies the `facing` rule; arguments as in `Rule`.
 
@@ -93,12 +99,11 @@ def facing(
     rays carry an interior list for the media. The medium of an overlap is that of the part with
     more parts around it, then that of the higher priority.
     """
-    made = _interfaces(indices, [ambient] * len(indices), parents, tints, absorptions)
-    if not overlaps:
+    around = _Around(parents, ambient, always=True)
+    made = _interfaces(indices, around, tints, absorptions, materials)
+    if not overlaps and not _any_embedded(materials):
         return made
-    given = priorities or [0] * len(indices)
-    order = _order([(_depth(parents, part), given[part]) for part in range(len(indices))])
-    return made._replace(priority=host_array(order), index_by_face=host_array(np.ones(1, bool)))
+    return _with_lists(made, parents, priorities or [0] * len(parents), facing=True)
 
 
 def priority(
@@ -110,14 +115,15 @@ def priority(
     priorities: Sequence[int] | None = None,
     overlaps: Sequence[tuple[int, int]] = (),
     ambient: float = INDEX_OF_AIR,
+    materials: Sequence[Material] | None = None,
 ) -> Interfaces:
     """Applies the `priority` rule; arguments as in `Rule`. Parents and overlaps are ignored.
 
     Source: Schmidt and Budge, Simple Nested Dielectrics in Ray Traced Images (2002).
     """
     del overlaps
-    alone = [NO_PARENT] * len(parents)
-    made = _interfaces(indices, [ambient] * len(indices), alone, tints, absorptions)
+    around = _Around([NO_PARENT] * len(parents), ambient)
+    made = _interfaces(indices, around, tints, absorptions, materials)
     order = _order(priorities or [0] * len(made.index_inside))
     return made._replace(priority=host_array(order))
 
@@ -141,32 +147,92 @@ def _order(priorities: Sequence[Any]) -> Int[np.ndarray, " parts"]:
     return np.argsort(ascending).astype(np.int32)
 
 
+class _Around(NamedTuple):
+    """What is around each part.
+
+    Attributes:
+      parents: innermost part that contains each part, or `NO_PARENT`.
+      ambient: index of refraction of the ambient medium.
+      always: whether the index outside a part is always that of the ambient medium.
+    """
+
+    parents: Sequence[int]
+    ambient: float
+    always: bool = False
+
+    def indices(self, inside: Sequence[float]) -> list[float]:
+        """Returns the index outside each part, from the indices inside."""
+        return [
+            self.ambient if self.always or parent == NO_PARENT else inside[parent]
+            for parent in self.parents
+        ]
+
+
+def _with_lists(
+    made: Interfaces, parents: Sequence[int], priorities: Sequence[int], *, facing: bool
+) -> Interfaces:
+    """Makes rays carry interior lists, for the media alone."""
+    order = _order([(_depth(parents, part), priorities[part]) for part in range(len(parents))])
+    by_face = host_array(np.full(1, facing))
+    return made._replace(priority=host_array(order), index_by_face=by_face)
+
+
+def _any_embedded(materials: Sequence[Material] | None) -> bool:
+    return any(material.kind != "dielectric" for material in materials or ())
+
+
 def _interfaces(
     inside: Sequence[float],
-    outside: Sequence[float],
-    parents: Sequence[int],
+    around: _Around,
     tints: Colours | None,
     absorptions: Colours | None,
+    materials: Sequence[Material] | None,
 ) -> Interfaces:
-    media = [AMBIENT if parent == NO_PARENT else parent + 1 for parent in parents]
-    if not media:
+    if not inside:
         # A scene without parts gets one unused interface, so that arrays can be indexed.
-        inside, outside, media, tints, absorptions = (
-            [INDEX_OF_AIR],
-            [INDEX_OF_AIR],
-            [AMBIENT],
-            None,
-            None,
-        )
+        inside, around, tints, absorptions = [INDEX_OF_AIR], _Around([NO_PARENT], 1.0), None, None
+    materials = materials or [Material()] * len(inside)
+    media = [AMBIENT if parent == NO_PARENT else parent + 1 for parent in around.parents]
     return Interfaces(
-        host_array(np.asarray(inside, np.float32)),
-        host_array(np.asarray(outside, np.float32)),
-        host_array(np.asarray(media, np.int32)),
-        host_array(_colours(tints, CLEAR, len(media))),
-        host_array(_colours(absorptions, NO_ABSORPTION, len(media))),
-        host_array(np.zeros(0, np.int32)),
-        host_array(np.zeros(0, bool)),
+        index_inside=_floats(inside, len(inside)),
+        index_outside=_floats(around.indices(inside), len(inside)),
+        medium_outside=host_array(np.asarray(media, np.int32)),
+        tint=host_array(_colours(tints, CLEAR, len(media))),
+        absorption=host_array(_colours(absorptions, NO_ABSORPTION, len(media))),
+        priority=host_array(np.zeros(0, np.int32)),
+        index_by_face=host_array(np.zeros(0, bool)),
+        **_material_arrays(inside, around, materials),
     )
+
+
+def _material_arrays(
+    inside: Sequence[float], around: _Around, materials: Sequence[Material]
+) -> dict[str, Any]:
+    """Returns the arrays of `Interfaces` that are empty unless a part needs them."""
+    kinds = [KINDS.index(material.kind) for material in materials]
+    metal = [material.complex_index or (CLEAR, NO_ABSORPTION) for material in materials]
+    alpha = [material.roughness**2 for material in materials]
+    channels = [
+        [
+            index if material.dispersion is None else material.dispersion[channel]
+            for index, material in zip(inside, materials, strict=True)
+        ]
+        for channel in range(3)
+    ]
+    pairs = [[indices, around.indices(indices)] for indices in channels]
+    spread = any(material.dispersion for material in materials)
+    return {
+        "kinds": host_array(np.asarray(kinds if any(kinds) else [], np.int32)),
+        "opaque": host_array(np.equal(kinds if OPAQUE in kinds else [], OPAQUE)),
+        "complex_index": _floats(metal if CONDUCTOR in kinds else [], 0, 2, 3),
+        "alpha": _floats(alpha if any(alpha) else [], 0),
+        "index_by_channel": _floats(pairs if spread else [], 0, 2, len(inside)),
+    }
+
+
+def _floats(values: Sequence[Any], *shape: int) -> Any:
+    """Returns values as an array; without any, it has the given shape."""
+    return host_array(np.asarray(values, np.float32) if values else np.zeros(shape, np.float32))
 
 
 def _colours(

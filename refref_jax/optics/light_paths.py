@@ -38,6 +38,20 @@ class PathStatus(enum.IntEnum):
     rays if max bends is 0."""
     TOTALLY_REFLECTED = 5
     """The path hit a total internal reflection, which its settings do not follow."""
+    OPAQUE = 6
+    """The path ended on an opaque surface."""
+
+
+class Stop(NamedTuple):
+    """Where paths end on opaque surfaces; records of scenes without opaque parts have none.
+
+    Attributes:
+      tau: arc length from the camera to the surface; `inf` if the path ends elsewhere.
+      radiance: linear RGB radiance of the surface; `None` if it is unknown.
+    """
+
+    tau: Float[Array, "*paths"]
+    radiance: Float[Array, "*paths 3"] | None
 
 
 class LightPaths(NamedTuple):
@@ -61,6 +75,7 @@ class LightPaths(NamedTuple):
       statuses: `PathStatus` of each path.
       hit_counts: hit count per part, if tallied (see `path_settings`).
       path_lengths: path length in each part's medium, world units, if tallied.
+      stop: ends on opaque surfaces, `None` without such surfaces.
     """
 
     points: Float[Array, "paths segments 3"]
@@ -76,6 +91,7 @@ class LightPaths(NamedTuple):
     statuses: Int[Array, " paths"]
     hit_counts: Float[Array, "paths tallied"]
     path_lengths: Float[Array, "paths tallied"]
+    stop: Stop | None = None
 
 
 class PathEnds(NamedTuple):
@@ -90,6 +106,7 @@ class PathEnds(NamedTuple):
       throughput: share of the path in its ray's linear RGB; 0 in empty slots.
       num_bends: number of refractions and reflections.
       statuses: `PathStatus` of each path.
+      stop: ends on opaque surfaces, `None` without such surfaces.
     """
 
     origins: Float[Array, "paths 3"]
@@ -100,6 +117,7 @@ class PathEnds(NamedTuple):
     throughput: Float[Array, "paths 3"]
     num_bends: Int[Array, " paths"]
     statuses: Int[Array, " paths"]
+    stop: Stop | None = None
 
 
 def straight(rays: Rays) -> LightPaths:
@@ -141,6 +159,7 @@ def ends_of(paths: LightPaths) -> PathEnds:
         throughput=paths.throughput,
         num_bends=paths.num_bends,
         statuses=paths.statuses,
+        stop=paths.stop,
     )
 
 
@@ -169,12 +188,15 @@ Branch = Literal["both", "transmitted", "reflected"]
 def reflected_first(paths: LightPaths) -> Bool[Array, " paths"]:
     """Returns which paths were reflected at the first surface they hit.
 
-    These stay in their medium: their second segment starts at the end of the first. If a path has
-    more segments outside the objects than are stored (see `path_settings`), its second segment is
-    unknown and it counts as transmitted; with one convex object this never happens. The camera is
+    These change direction in their medium: their second segment starts at the end of the first. If
+    a path has more segments outside the objects than are stored (see `path_settings`), its second
+    segment is unknown and it counts as transmitted; with one convex object this never happens. The
+    camera is
     assumed to be outside all objects.
     """
     if paths.tau.shape[-1] < 2:
         return jnp.zeros_like(paths.num_bends, bool)
     at_once = paths.tau[:, 1] == paths.ends[:, 0]
+    # A thin sheet lets light through without a change of medium.
+    at_once &= jnp.any(paths.directions[:, 1] != paths.directions[:, 0], axis=-1)
     return (paths.num_bends > 0) & at_once & (paths.media[:, 1] == paths.media[:, 0])

@@ -15,6 +15,14 @@ this does not determine the medium of the next segment: a ray that leaves a liqu
 of its glass is still in the glass. Rays then carry an interior list, too, which determines media,
 but not indices.
 
+Parts that are not dielectrics (opaque parts, conductors, thin sheets) have no medium inside: the
+medium of the ray that meets them surrounds them, on both sides. They may be anywhere, half in a
+liquid and half in air. Where a scene has such parts, rays carry an interior list, which determines
+this medium, under every rule.
+
+A ray of a scene with dispersion carries light of one colour channel only, and `of_channel` gives
+the indices that it meets.
+
 The list is an unordered array of `SLOTS` part indices, `EMPTY_SLOT` where free, and its updates are
 branch-free. The side of a surface that a ray comes from determines whether the ray is inside that
 part, regardless of the list. A part entered while the list is full replaces the entry of lowest
@@ -25,12 +33,20 @@ Source: Schmidt and Budge, Simple Nested Dielectrics in Ray Traced Images, Journ
 Tools 7 (2002).
 """
 
-from typing import NamedTuple
+import functools
+from typing import NamedTuple, get_args
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax import numerics
+from refref_jax.choices import PartKind
+
+KINDS: tuple[PartKind, ...] = get_args(PartKind)
+"""Kinds of parts, in the order of their numbers in `Interfaces.kinds`."""
+
+DIELECTRIC, OPAQUE, CONDUCTOR, THIN_SHEET = range(len(KINDS))
 
 AMBIENT = 0
 """Medium outside all objects."""
@@ -57,9 +73,17 @@ class Interfaces(NamedTuple):
         in Cycles).
       absorption: absorption of the medium inside the part, linear RGB, per world unit.
       priority: rank of the part, unique, the highest wins; an empty array where rays carry no
-        interior list: under `nested`, and under `facing` without overlaps.
-      index_by_face: one value, which is true, under `facing` with an interior list, where faces
-        determine indices and the list determines media; otherwise empty.
+        interior list: with dielectrics only, under `nested`, and under `facing` without overlaps.
+      index_by_face: one value where faces determine indices and the interior list determines
+        media: true under `facing`, false under `nested`; empty without a list, or under `priority`.
+      kinds: index of each part's kind in `KINDS`; empty if all parts are dielectrics.
+      opaque: mask of opaque parts; empty without any.
+      complex_index: `eta` and `k` of each part relative to vacuum, linear RGB; empty without
+        conductors.
+      alpha: width of each part's distribution of microfacets, 0 where smooth; empty without rough
+        parts.
+      index_by_channel: indices inside and outside each part for red, green and blue; empty without
+        dispersion.
     """
 
     index_inside: Float[Array, " parts"]
@@ -69,6 +93,11 @@ class Interfaces(NamedTuple):
     absorption: Float[Array, "parts 3"]
     priority: Int[Array, " ranked"]
     index_by_face: Bool[Array, " by_face"]
+    kinds: Int[Array, " kinds"]
+    opaque: Bool[Array, " opaque"]
+    complex_index: Float[Array, "conductors 2 3"]
+    alpha: Float[Array, " rough"]
+    index_by_channel: Float[Array, "channels 2 parts"]
 
 
 class Crossing(NamedTuple):
@@ -85,6 +114,8 @@ class Crossing(NamedTuple):
       tint: factor on linear RGB, reflected or transmitted.
       part: part whose surface is hit, or `EMPTY_SLOT` if it is outranked.
       interior_list_after: interior list on the other side; a reflected ray keeps its own.
+      kind: kind of the part, or `None` if all parts are dielectrics.
+      opaque: whether the part is opaque, or `None` without opaque parts.
     """
 
     index_near: Float[Array, ""]
@@ -94,6 +125,38 @@ class Crossing(NamedTuple):
     tint: Float[Array, "3"]
     part: Int[Array, ""]
     interior_list_after: Int[Array, " slots"]
+    kind: Int[Array, ""] | None = None
+    opaque: Bool[Array, ""] | None = None
+
+
+def has_kinds(interfaces: Interfaces) -> bool:
+    """Returns whether a scene has parts that are not dielectrics."""
+    return interfaces.kinds.shape[0] > 0
+
+
+def has_opaque(interfaces: Interfaces) -> bool:
+    """Returns whether a scene has opaque parts."""
+    return interfaces.opaque.shape[0] > 0
+
+
+def has_dispersion(interfaces: Interfaces) -> bool:
+    """Returns whether indices of refraction depend on the colour channel."""
+    return interfaces.index_by_channel.shape[0] > 0
+
+
+def of_channel(interfaces: Interfaces, channel: Int[Array, ""]) -> Interfaces:
+    """Returns interfaces without dispersion: those that light of one channel meets.
+
+    Args:
+      interfaces: interfaces with dispersion.
+      channel: 0 for red, 1 for green, 2 for blue.
+    """
+    inside, outside = interfaces.index_by_channel[channel]
+    return interfaces._replace(
+        index_inside=inside,
+        index_outside=outside,
+        index_by_channel=interfaces.index_by_channel[:0],
+    )
 
 
 def interior_length(interfaces: Interfaces) -> int:
@@ -120,6 +183,45 @@ def crossing(
       part: part that is hit.
       entering: whether the ray comes from outside that part.
     """
+    sides = _dielectric_crossing(interfaces, interior_list, part, entering)
+    if not has_kinds(interfaces):
+        return sides
+    kind = interfaces.kinds[part]
+    embedded = _embedded_crossing(interfaces, interior_list, part)
+    sides = jax.tree.map(functools.partial(jnp.where, kind == DIELECTRIC), sides, embedded)
+    opaque = interfaces.opaque[part] if has_opaque(interfaces) else None
+    return sides._replace(kind=kind, opaque=opaque)
+
+
+def _embedded_crossing(
+    interfaces: Interfaces, interior_list: Int[Array, " slots"], part: Int[Array, ""]
+) -> Crossing:
+    """Returns the crossing of a part without a medium of its own: both sides have that of the ray.
+
+    The far index is that of the part, for the reflectance of a thin sheet.
+    """
+    medium = _medium(interfaces, interior_list)
+    ambient = interfaces.index_outside[part]  # no part contains this one
+    near = _index(interfaces, medium, ambient)
+    if interfaces.index_by_face.shape[0]:
+        near = jnp.where(interfaces.index_by_face[0], ambient, near)
+    return Crossing(
+        index_near=near,
+        index_far=interfaces.index_inside[part],
+        medium_near=medium,
+        medium_far=medium,
+        tint=interfaces.tint[part],
+        part=part,
+        interior_list_after=interior_list,
+    )
+
+
+def _dielectric_crossing(
+    interfaces: Interfaces,
+    interior_list: Int[Array, " slots"],
+    part: Int[Array, ""],
+    entering: Bool[Array, ""],
+) -> Crossing:
     declared = _declared_crossing(interfaces, interior_list, part, entering)
     if interior_length(interfaces) == 0:
         return declared
@@ -135,8 +237,8 @@ def crossing(
         )
     outranked = medium_without == medium_within
     return Crossing(
-        index_near=_index(interfaces, medium_near),
-        index_far=_index(interfaces, medium_far),
+        index_near=_index(interfaces, medium_near, interfaces.index_outside[0]),
+        index_far=_index(interfaces, medium_far, interfaces.index_outside[0]),
         medium_near=medium_near,
         medium_far=medium_far,
         tint=jnp.where(outranked, 1.0, interfaces.tint[part]),
@@ -206,6 +308,8 @@ def _medium(interfaces: Interfaces, interior_list: Int[Array, " slots"]) -> Int[
     return 1 + interior_list[jnp.argmax(_ranks(interfaces, interior_list))]
 
 
-def _index(interfaces: Interfaces, medium: Int[Array, ""]) -> Float[Array, ""]:
+def _index(
+    interfaces: Interfaces, medium: Int[Array, ""], ambient: Float[Array, ""]
+) -> Float[Array, ""]:
     index = interfaces.index_inside[jnp.maximum(medium - 1, 0)]
-    return jnp.where(medium == AMBIENT, interfaces.index_outside[0], index)
+    return jnp.where(medium == AMBIENT, ambient, index)

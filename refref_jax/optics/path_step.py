@@ -20,8 +20,8 @@ from refref_jax.geometry import surfaces, triangles
 from refref_jax.geometry.bvh import NO_PRIMITIVE
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import SurfacePoint
-from refref_jax.optics import fresnel, media, ray_differentials, snell
-from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics import fresnel, media, microfacet, ray_differentials, snell
+from refref_jax.optics.light_paths import PathStatus, Stop
 from refref_jax.optics.path_settings import PathSettings
 from refref_jax.optics.ray_differentials import Bend, RayDifferential
 from refref_jax.optics.scene import Scene
@@ -38,7 +38,10 @@ class Interaction(NamedTuple):
       transmitted: refracted unit direction; finite but meaningless if reflection is total.
       restart_reflected: origin of the mirrored ray, just off the surface.
       restart_transmitted: origin of the refracted ray, just off the surface on its other side.
-      sides: media on both sides.
+      sides: media on both sides; the tint of a conductor includes its reflectance.
+      unmasked: shares of the reflected and of the transmitted light that a rough surface does not
+        hide; `None` in scenes without rough surfaces.
+      radiance: linear RGB radiance of an opaque surface; `None` if it is unknown.
     """
 
     position: Float[Array, "3"]
@@ -49,6 +52,8 @@ class Interaction(NamedTuple):
     restart_reflected: Float[Array, "3"]
     restart_transmitted: Float[Array, "3"]
     sides: media.Crossing
+    unmasked: Float[Array, "2"] | None = None
+    radiance: Float[Array, "3"] | None = None
 
 
 def interact(
@@ -60,7 +65,7 @@ def interact(
     """Reflects and refracts a ray at an interface.
 
     If the shading normal would send either ray to the wrong side of the triangle, the geometric
-    normal is used for both.
+    normal is used for both. On a rough surface, both rays leave one facet (see `microfacet`).
 
     Args:
       point: hit point of the ray.
@@ -74,19 +79,73 @@ def interact(
     geometric, shading = outward * point.geometric_normal, outward * point.shading_normal
 
     normal = jnp.where(_keeps_sides(direction, shading, geometric, sides), shading, geometric)
+    alpha = interfaces.alpha[point.part] if interfaces.alpha.shape[0] else None
+    facet = normal
+    if alpha is not None:
+        facet = microfacet.facet_normal(point.position, direction, normal, alpha)
     near, far = sides.index_near, sides.index_far
-    beta = -numerics.dot(direction, normal)
+    beta = -numerics.dot(direction, facet)
     # Directions are renormalised, or rounding errors would accumulate over bends.
-    return Interaction(
+    met = Interaction(
         position=point.position,
         reflectance=fresnel.reflectance(beta, near, far),
         total=snell.transmission(beta, near, far).total,
-        reflected=numerics.renormalize(snell.reflect(direction, normal)),
-        transmitted=numerics.renormalize(snell.refract(direction, normal, near, far)),
+        reflected=numerics.renormalize(snell.reflect(direction, facet)),
+        transmitted=numerics.renormalize(snell.refract(direction, facet, near, far)),
         restart_reflected=numerics.offset_origin(point.position, geometric, point.scale),
         restart_transmitted=numerics.offset_origin(point.position, -geometric, point.scale),
         sides=sides,
+        radiance=point.radiance,
     )
+    met = _at_other_kinds(met, interfaces, direction, beta)
+    if alpha is None:
+        return met
+    return met._replace(unmasked=_unmasked(met, direction, normal, alpha))
+
+
+def _at_other_kinds(
+    met: Interaction,
+    interfaces: media.Interfaces,
+    direction: Float[Array, "3"],
+    beta: Float[Array, ""],
+) -> Interaction:
+    """Returns the interaction with a conductor or thin sheet in place of a dielectric."""
+    kind = met.sides.kind
+    if kind is None:
+        return met
+    metal, sheet = kind == media.CONDUCTOR, kind == media.THIN_SHEET
+    met = met._replace(
+        reflectance=jnp.where(
+            metal,
+            1.0,
+            jnp.where(sheet, fresnel.sheet_reflectance(met.reflectance), met.reflectance),
+        ),
+        total=metal | met.total,
+        transmitted=jnp.where(sheet, direction, met.transmitted),
+    )
+    if interfaces.complex_index.shape[0] == 0:
+        return met
+    eta, k = interfaces.complex_index[met.sides.part] / met.sides.index_near
+    reflected = jnp.where(metal, fresnel.conductor_reflectance(beta, eta, k), 1.0)
+    return met._replace(sides=met.sides._replace(tint=met.sides.tint * reflected))
+
+
+def _unmasked(
+    met: Interaction,
+    direction: Float[Array, "3"],
+    normal: Float[Array, "3"],
+    alpha: Float[Array, ""],
+) -> Float[Array, "2"]:
+    """Returns the shares of light that leave a rough surface reflected, and transmitted."""
+    towards = -numerics.dot(direction, normal)
+    leaving = jnp.stack(
+        [numerics.dot(met.reflected, normal), -numerics.dot(met.transmitted, normal)]
+    )
+    shares = jax.vmap(microfacet.masking, in_axes=(None, 0, None))(towards, leaving, alpha)
+    if met.sides.kind is None:
+        return shares
+    # A thin sheet transmits straight on, without facets.
+    return shares.at[1].set(jnp.where(met.sides.kind == media.THIN_SHEET, 1.0, shares[1]))
 
 
 def _keeps_sides(
@@ -224,6 +283,9 @@ def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arriv
     The hit point is recomputed from the corners of the triangle, so it has gradients and the
     precision of the corners rather than that of the BVH traversal.
     """
+    interfaces = scene.interfaces
+    if media.has_dispersion(interfaces):  # the ray carries light of one channel
+        interfaces = media.of_channel(interfaces, jnp.argmax(state.throughput))
 
     def surface(
         origin: Float[Array, "3"], direction: Float[Array, "3"]
@@ -235,7 +297,7 @@ def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arriv
         point = surfaces.surface_point(scene.surfaces, primitive_id, barycentric)
         # Otherwise XLA would gather the triangle again for every result that depends on it.
         point = jax.lax.optimization_barrier(point)
-        met = interact(point, scene.interfaces, state.interior_list, direction)
+        met = interact(point, interfaces, state.interior_list, direction)
         return Bend(met.position, met.reflected, met.transmitted), met
 
     met, reflected, transmitted = ray_differentials.bend(
@@ -262,6 +324,9 @@ def end_status(
     met = jnp.where(state.num_bends < settings.max_bends, PathStatus.EMPTY, PathStatus.OUT_OF_BENDS)
     if settings.total_reflection == "ended":
         met = jnp.where(arrival.interaction.total, PathStatus.TOTALLY_REFLECTED, met)
+    opaque = arrival.interaction.sides.opaque
+    if opaque is not None:
+        met = jnp.where(opaque, PathStatus.OPAQUE, met)
     return jnp.where(hit, met, missed).astype(jnp.int32)
 
 
@@ -272,6 +337,21 @@ def contribution(
     if settings.truncated_paths == "background":
         return throughput
     return jnp.where(status == PathStatus.OUT_OF_BENDS, 0.0, throughput)
+
+
+def stop(state: RayState, arrival: Arrival, status: Int[Array, ""]) -> tuple[RayState, Stop | None]:
+    """Returns the state of a ray that ends with a status, and where it stops.
+
+    Light that ends on an opaque surface has passed the medium before it; in other cases the state
+    is unchanged. There is no stop in scenes without opaque parts.
+    """
+    met = arrival.interaction
+    if met.sides.opaque is None:
+        return state, None
+    ends = status == PathStatus.OPAQUE
+    throughput = jnp.where(ends, arrival.throughput, state.throughput)
+    tau = jnp.where(ends, state.tau + arrival.length, jnp.inf)
+    return state._replace(throughput=throughput), Stop(tau, met.radiance)
 
 
 def branch(
@@ -292,17 +372,21 @@ def branch(
         num_bends=state.num_bends + 1,
         exclude_primitive=primitive_id,
     )
+    reflected = arrival.throughput * share.reflected
+    transmitted = arrival.throughput * share.transmitted
+    if met.unmasked is not None:
+        reflected, transmitted = reflected * met.unmasked[0], transmitted * met.unmasked[1]
     return Branches(
         reflected=after._replace(
             origin=met.restart_reflected,
             direction=met.reflected,
-            throughput=arrival.throughput * share.reflected,
+            throughput=reflected,
             differential=arrival.reflected,
         ),
         transmitted=after._replace(
             origin=met.restart_transmitted,
             direction=met.transmitted,
-            throughput=arrival.throughput * share.transmitted,
+            throughput=transmitted,
             interior_list=met.sides.interior_list_after,
             differential=arrival.transmitted,
         ),

@@ -7,10 +7,13 @@ Light paths are constants for differentiation: field parameters have gradients a
 and the scene do not, and differentiating with respect to these is an error (use
 `differentiable_paths`).
 
+In a scene with dispersion, each ray is traced three times, for red, green and blue light with its
+own indices; the throughput of a path is then 0 in two channels. Other scenes have one trace.
+
 Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -59,6 +62,9 @@ class TracedEnds(NamedTuple):
     casts: Int[Array, ""]
 
 
+_Traced = TypeVar("_Traced", Traced, TracedEnds)
+
+
 class Survey(NamedTuple):
     """Path statistics of a scene.
 
@@ -96,10 +102,17 @@ def trace_ends(
         return TracedEnds(
             straight_ends(rays), jnp.zeros_like(rays.origins), jnp.zeros((), jnp.int32)
         )
-    tree = follow(scene, rays, _inside(scene, rays, interior_list), settings=settings, block=block)
+    interior_list = _inside(scene, rays, interior_list)
+    times = _traces(scene)
+    if times > 1:
+        rays, interior_list = jax.tree.map(
+            lambda x: jnp.repeat(x, times, axis=0), (rays, interior_list)
+        )
+    tree = follow(scene, rays, interior_list, settings=settings, block=block)
     ends = path_tree.listed(tree, capacities(settings, rays.radii.shape[0]).paths)
     last = path_tree.last_segments(tree.segments.items, ends)
-    return TracedEnds(last, tree.dropped, tree.casts)
+    traced = TracedEnds(last, tree.dropped, tree.casts)
+    return traced if times == 1 else _of_one_ray(traced, times)
 
 
 def trace(
@@ -177,13 +190,18 @@ def trace_batches(
     scene, rays = in_one_precision(scene, rays)
     if _needs_no_tracing(rays, settings):
         return jax.vmap(lambda batch: Traced(straight(batch), jnp.zeros_like(batch.origins)))(rays)
-    batches, count = rays.radii.shape
+    (batches, count), times = rays.radii.shape, _traces(scene)
+    count *= times
     capacity = capacities(settings, count).paths if capacity is None else capacity
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
     if interior_list is not None:
         interior_list = interior_list.reshape(batches * count, interior_list.shape[-1])
     detail = detail or path_settings.everything(settings.max_bends)
     interior_list = _inside(scene, flat, interior_list)
+    if times > 1:
+        flat, interior_list = jax.tree.map(
+            lambda x: jnp.repeat(x, times, axis=0), (flat, interior_list)
+        )
     tree = follow(scene, flat, interior_list, settings=settings, footprint=detail.footprint)
     ends, dropped = path_tree.pack(tree, batches, count, capacity)
     paths = path_tree.polylines(
@@ -194,7 +212,8 @@ def trace_batches(
         parts=scene.interfaces.index_inside.shape[0],
     )
     paths = jax.tree.map(lambda x: x.reshape(batches, capacity, *x.shape[1:]), paths)
-    return Traced(paths._replace(rays=paths.rays % count), dropped.reshape(batches, count, 3))
+    traced = Traced(paths._replace(rays=paths.rays % count), dropped.reshape(batches, count, 3))
+    return traced if times == 1 else _of_one_ray(traced, times)
 
 
 def survey(scene: Scene, rays: Rays, *, settings: PathSettings) -> Survey:
@@ -206,6 +225,19 @@ def survey(scene: Scene, rays: Rays, *, settings: PathSettings) -> Survey:
     untraced = (ends.statuses == PathStatus.NOT_TRACED) & (ends.num_bends == 0)
     missing = jnp.sum((ends.statuses == PathStatus.MISSED) | untraced, dtype=jnp.float32)
     return Survey(jnp.mean(paths), jnp.std(paths), 1.0 - missing / count)
+
+
+def _traces(scene: Scene) -> int:
+    """Returns how often each ray is traced: once for each colour channel with dispersion."""
+    return 3 if media.has_dispersion(scene.interfaces) else 1
+
+
+def _of_one_ray(traced: _Traced, times: int) -> _Traced:
+    """Returns traced paths with the indices of rays before they were repeated."""
+    paths: LightPaths | PathEnds = traced[0]
+    shape = (*traced.dropped.shape[:-2], -1, times, traced.dropped.shape[-1])
+    dropped = jnp.sum(traced.dropped.reshape(shape), axis=-2)
+    return type(traced)(paths._replace(rays=paths.rays // times), dropped, *traced[2:])
 
 
 def _needs_no_tracing(rays: Rays, settings: PathSettings) -> bool:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.optics import queues
-from refref_jax.optics.light_paths import LightPaths, PathEnds, PathStatus
+from refref_jax.optics.light_paths import LightPaths, PathEnds, PathStatus, Stop
 from refref_jax.optics.media import AMBIENT
 from refref_jax.optics.path_settings import Detail
 from refref_jax.optics.queues import Queue
@@ -62,6 +62,7 @@ class Ends(NamedTuple):
       throughput: share of the path in its ray's linear RGB.
       num_bends: number of bends.
       statuses: `PathStatus` of each path.
+      stop: ends on opaque surfaces, `None` without such surfaces.
     """
 
     segments: Int[Array, " paths"]
@@ -69,6 +70,7 @@ class Ends(NamedTuple):
     throughput: Float[Array, "paths 3"]
     num_bends: Int[Array, " paths"]
     statuses: Int[Array, " paths"]
+    stop: Stop | None = None
 
 
 class PathTree(NamedTuple):
@@ -115,6 +117,7 @@ def emptied(ends: Ends, empty: Bool[Array, " paths"], home: Int[Array, " paths"]
         throughput=jnp.where(empty[:, None], 0.0, ends.throughput),
         num_bends=jnp.where(empty, 0, ends.num_bends),
         statuses=jnp.where(empty, PathStatus.EMPTY, ends.statuses).astype(jnp.int32),
+        stop=ends.stop and ends.stop._replace(tau=jnp.where(empty, jnp.inf, ends.stop.tau)),
     )
 
 
@@ -130,6 +133,7 @@ def last_segments(segments: Segments, ends: Ends) -> PathEnds:
         throughput=ends.throughput,
         num_bends=ends.num_bends,
         statuses=ends.statuses,
+        stop=ends.stop,
     )
 
 
@@ -167,8 +171,20 @@ def polylines(
         num_bends=ends.num_bends,
         statuses=ends.statuses,
         hit_counts=walk.hit_counts,
-        path_lengths=walk.path_lengths,
+        path_lengths=walk.path_lengths + _lengths_to_stops(segments, ends, walk.path_lengths),
+        stop=ends.stop,
     )
+
+
+def _lengths_to_stops(
+    segments: Segments, ends: Ends, like: Float[Array, "paths tallied"]
+) -> Float[Array, "paths tallied"] | float:
+    """Returns the lengths of last segments that end on opaque surfaces, by the part around them."""
+    if ends.stop is None:
+        return 0.0
+    length = ends.stop.tau - segments.tau[ends.segments]
+    through = 1 + jnp.arange(like.shape[1]) == segments.media[ends.segments][:, None]
+    return jnp.where(through & jnp.isfinite(length)[:, None], length[:, None], 0.0)
 
 
 class _Walk(NamedTuple):

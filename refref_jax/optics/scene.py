@@ -35,7 +35,7 @@ def with_index(scene: Scene, index: Float[ArrayLike, ""], *, part: int = 0) -> S
         folder are ordered by name.
 
     Raises:
-      ValueError: if the part does not exist.
+      ValueError: if the part does not exist, or the scene has dispersion.
 
     Example:
       >>> import trimesh
@@ -44,6 +44,11 @@ def with_index(scene: Scene, index: Float[ArrayLike, ""], *, part: int = 0) -> S
       >>> float(refref_jax.with_index(box, 1.25).interfaces.index_inside[0])
       1.25
     """
+    if media.has_dispersion(scene.interfaces):
+        raise ValueError(
+            "The scene has dispersion: its indices differ between red, green and blue. Take one "
+            "colour first, with of_channel."
+        )
     new = jnp.asarray(index)
     interfaces = jax.tree.map(jnp.asarray, scene.interfaces)
     # A Python number has no precision of its own.
@@ -62,6 +67,18 @@ def with_index(scene: Scene, index: Float[ArrayLike, ""], *, part: int = 0) -> S
         index_outside=jnp.where(around, new, interfaces.index_outside),
     )
     return scene._replace(interfaces=changed)
+
+
+def of_channel(scene: Scene, channel: int) -> Scene:
+    """Returns a scene without dispersion, with the indices of one colour channel.
+
+    Args:
+      scene: the scene.
+      channel: 0 for red, 1 for green, 2 for blue; all are equal in a scene without dispersion.
+    """
+    if not media.has_dispersion(scene.interfaces):
+        return scene
+    return scene._replace(interfaces=media.of_channel(scene.interfaces, jnp.int32(channel)))
 
 
 def in_one_precision(scene: Scene, rays: Rays) -> tuple[Scene, Rays]:

@@ -28,7 +28,7 @@ from refref_jax.choices import Footprint
 from refref_jax.geometry import bvh
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import media, path_settings, path_step, path_tree, queues, ray_differentials
-from refref_jax.optics.light_paths import PathStatus
+from refref_jax.optics.light_paths import PathStatus, Stop
 from refref_jax.optics.path_settings import Capacities, PathSettings
 from refref_jax.optics.path_step import Arrival, Branches, RayState
 from refref_jax.optics.path_tree import NO_SEGMENT, Ends, PathTree, Segments
@@ -153,6 +153,7 @@ def end_by(
     live: Live,
     status: Int[Array, " n"],
     ending: Bool[Array, " n"],
+    stop: Stop | None,
 ) -> PathTree:
     """Ends some rays as paths; the throughput of paths that the settings make black is dropped."""
     throughput = jax.vmap(functools.partial(path_step.contribution, settings))(
@@ -160,14 +161,22 @@ def end_by(
     )
     dropped = queues.add_dropped(tree.dropped, live.rays, live.throughput - throughput, ending)
     live = live._replace(state=live.state._replace(throughput=throughput))
-    return end(tree._replace(dropped=dropped), live, status, ending)
+    return end(tree._replace(dropped=dropped), live, status, ending, stop)
 
 
 def end(
-    tree: PathTree, live: Live, status: Int[Array, " n"], ending: Bool[Array, " n"]
+    tree: PathTree,
+    live: Live,
+    status: Int[Array, " n"],
+    ending: Bool[Array, " n"],
+    stop: Stop | None = None,
 ) -> PathTree:
-    """Ends some rays as paths."""
-    block = Ends(live.segments, live.rays, live.throughput, live.state.num_bends, status)
+    """Ends some rays as paths, on opaque surfaces if stops are given."""
+    like = tree.ends.items.stop
+    if like is not None and stop is None:
+        tau = jnp.full_like(live.state.tau, jnp.inf)
+        stop = Stop(tau, None if like.radiance is None else jnp.zeros_like(live.throughput))
+    block = Ends(live.segments, live.rays, live.throughput, live.state.num_bends, status, stop)
     return tree._replace(ends=queues.append(tree.ends, block, ending))
 
 
@@ -198,7 +207,8 @@ def follow(
 
     Args:
       scene: the scene.
-      rays: any number of camera rays.
+      rays: any number of camera rays; each of them three times, for red, green and blue, in a scene
+        with dispersion.
       interior_list: interior list of each camera (see `media.empty_interior_list`).
       settings: path settings, with at least one bend.
       footprint: `differential` carries derivatives across the pixel.
@@ -219,7 +229,7 @@ def _follow(
     count = rays.radii.shape[0]
     block = max(1, min(block, count))
     capacities = path_settings.capacities(settings, count)
-    walk = _begin(rays, interior_list, footprint, block, capacities)
+    walk = _begin(scene, rays, interior_list, footprint, block, capacities)
     if count < _MANY_BLOCKS * block or block < _SMALLER:
         return _trace_remaining(scene, walk, settings, block, capacities, least=1).tree
     # Otherwise the few deepest rays would cast a full block in each iteration.
@@ -274,7 +284,18 @@ def _refuse_gradients(
     )
 
 
+def _no_stop(scene: Scene, state: RayState) -> Stop | None:
+    """Returns stops for a list of paths that end nowhere; none without opaque parts."""
+    if not media.has_opaque(scene.interfaces):
+        return None
+    known = scene.surfaces.radiance.shape[0] > 0
+    return Stop(
+        jnp.full_like(state.tau, jnp.inf), jnp.zeros_like(state.throughput) if known else None
+    )
+
+
 def _begin(
+    scene: Scene,
     rays: Rays,
     interior_list: Int[Array, "rays slots"],
     footprint: Footprint,
@@ -286,13 +307,16 @@ def _begin(
     order = jnp.arange(count, dtype=jnp.int32)
     differential = jax.vmap(lambda ray: ray_differentials.begin(ray, footprint))(rays)
     state = jax.vmap(path_step.begin)(rays, interior_list, differential)
+    if media.has_dispersion(scene.interfaces):  # three rays follow each other, one per channel
+        channels = jnp.eye(3, dtype=state.throughput.dtype)
+        state = state._replace(throughput=channels[order % 3])
     ambient = jnp.full_like(order, media.AMBIENT)
     first = jnp.full_like(order, NO_SEGMENT)
     nowhere = jnp.full_like(order, media.EMPTY_SLOT)
     segments = Segments(
         first, state.point, state.direction, state.tau, ambient, nowhere, state.differential
     )
-    ends = Ends(order, order, state.throughput, order, order)
+    ends = Ends(order, order, state.throughput, order, order, _no_stop(scene, state))
     # Each buffer has slots beyond its capacity for the records that one iteration may append.
     tree = PathTree(
         segments=queues.fill(segments, count, capacities.segments + 2 * block),
@@ -319,7 +343,8 @@ def _trace_block(
     medium = arrival.interaction.sides.medium_near
     # The medium of a camera is known only from the first surface it sees.
     tree = path_tree.set_media(tree, live.segments, medium, hit & (live.state.num_bends == 0))
-    tree = end_by(settings, tree, live, status, alive & ~bending)
+    ended, stop = jax.vmap(path_step.stop)(live.state, arrival, status)
+    tree = end_by(settings, tree, live._replace(state=ended), status, alive & ~bending, stop)
     branches = jax.vmap(functools.partial(path_step.branch, settings))(
         live.state, arrival, hits.primitive_ids
     )

@@ -90,6 +90,7 @@ def build(mesh: Mesh, *, handles: int = HANDLES) -> Rig:
         bvh,
         host_array(mesh.normals[order].astype(np.float32)),
         host_array(np.zeros(len(order), np.int32)),
+        host_array(np.zeros((0, 3, 3), np.float32)),
     )
     chosen = _spread(mesh.vertices, handles)
     hung, shares = _hang(mesh.vertices, mesh.vertices[chosen])

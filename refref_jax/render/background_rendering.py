@@ -1,8 +1,9 @@
 """Renders scenes with a known background, without learned fields.
 
 The radiance function is evaluated at the last segment of every path, and the colour of a ray is the
-weighted sum over its paths. The function can be any JAX function of one ray, `radiance(origin,
-direction)` to linear RGB: a background (`backgrounds.radiance_of`) or a custom function. If it is a
+weighted sum over its paths. Paths that end on an opaque surface have its radiance instead. The
+function can be any JAX function of one ray, `radiance(origin, direction)` to linear RGB: a
+background (`backgrounds.radiance_of`) or a custom function. If it is a
 pytree, such as `jax.tree_util.Partial(function, arrays)`, its arrays are arguments of the compiled
 program; values that a plain function closes over are constants, and every new function triggers a
 compilation.
@@ -89,7 +90,8 @@ def render_known(
         path buffers, so with few rays, throughput is dropped sooner.
 
     Raises:
-      ValueError: if `tile` is less than 1, or the radiance function does not return three numbers.
+      ValueError: if `tile` is less than 1, the radiance function does not return three numbers, or
+        the radiance of an opaque part is unknown.
       TypeError: if it is called in a function that JAX transforms; see `shade`.
 
     Example:
@@ -145,8 +147,8 @@ def shade(paths: LightPaths | PathEnds, radiance: Radiance, *, rays: int) -> Flo
       rays: number of rays that the paths belong to.
 
     Raises:
-      ValueError: if the paths have more than one axis, or the radiance function does not return
-        three numbers.
+      ValueError: if the paths have more than one axis, the radiance function does not return
+        three numbers, or the radiance of an opaque part is unknown.
 
     Example:
       >>> import numpy as np
@@ -232,4 +234,11 @@ def _light(
             f"The radiance function returned an array of shape {seen.shape[1:]} for one ray. "
             "Return linear RGB, of shape (3,)."
         )
+    if ends.stop is not None:
+        if ends.stop.radiance is None:
+            raise ValueError(
+                "Light may end on a part whose radiance is unknown. Give every opaque part a "
+                "radiance in scene.json, or train a field."
+            )
+        seen = jnp.where(jnp.isfinite(ends.stop.tau)[:, None], ends.stop.radiance, seen)
     return jnp.where(real[:, None], ends.throughput * seen.astype(ends.throughput.dtype), 0.0)

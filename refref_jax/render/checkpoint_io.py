@@ -58,6 +58,7 @@ def save_scene(run: Path, saved: SavedModel, scene: Scene) -> None:
         **surfaces.bvh._asdict(),
         normals=surfaces.normals,
         parts=surfaces.parts,
+        radiance=surfaces.radiance,
         **interfaces._asdict(),
     )
 
@@ -198,9 +199,8 @@ def load_scene(run: Path) -> Scene:
     try:
         with np.load(path) as arrays:
             bvh = BVH(*(arrays[name] for name in BVH._fields))
-            surfaces = Surfaces(bvh, arrays["normals"], arrays["parts"])
-            # Earlier versions stored no `index_by_face`.
-            known: Any = {"index_by_face": np.zeros(0, bool)} | dict(arrays)
+            known: Any = _empty_arrays(arrays["index_inside"].size) | dict(arrays)
+            surfaces = Surfaces(bvh, *(known[name] for name in Surfaces._fields[1:]))
             interfaces = Interfaces(*(known[name] for name in Interfaces._fields))
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(
@@ -208,6 +208,18 @@ def load_scene(run: Path) -> Scene:
             "folder."
         ) from error
     return jax.tree.map(jax.numpy.asarray, Scene(surfaces, interfaces))
+
+
+def _empty_arrays(parts: int) -> dict[str, np.ndarray]:
+    """Returns the arrays that earlier versions did not store, as a scene without them has them."""
+    shapes = {"complex_index": (0, 2, 3), "alpha": (0,), "index_by_channel": (0, 2, parts)}
+    return {
+        "index_by_face": np.zeros(0, bool),
+        "kinds": np.zeros(0, np.int32),
+        "opaque": np.zeros(0, bool),
+        "radiance": np.zeros((0, 3, 3), np.float32),
+        **{name: np.zeros(shape, np.float32) for name, shape in shapes.items()},
+    }
 
 
 def _brief(error: Exception) -> str:

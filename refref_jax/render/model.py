@@ -66,6 +66,7 @@ class ModelConfig:
         beyond the ball).
       dilation: widening of a proposal before it is sampled, as a fraction of its mean bin width; 0
         for none.
+      field_parts: parts whose inside is sampled too, where `interior` leaves out the others.
     """
 
     proposals: tuple[ProposalConfig, ...]
@@ -80,6 +81,7 @@ class ModelConfig:
     radius: float
     space: Space
     dilation: float
+    field_parts: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         """Validates the values."""
@@ -105,7 +107,7 @@ def path_detail(config: ModelConfig, settings: PathSettings) -> Detail:
     """Returns the parts of light paths that a model needs."""
     tally: Tally = "parts" if config.learned_tints else "none"
     most = settings.max_bends + 1
-    if config.interior == "field":
+    if config.interior == "field" or config.field_parts:
         return Detail("all", most, config.footprint, tally)
     legs = _CONVEX_LEGS if settings.reentry == "impossible" else _MOST_LEGS
     return Detail("outside", min(legs, most), config.footprint, tally)

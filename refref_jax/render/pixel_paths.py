@@ -43,6 +43,7 @@ ENDINGS = {
     PathStatus.OUT_OF_BENDS: "ran out of bends",
     PathStatus.NOT_TRACED: "is not followed further",
     PathStatus.TOTALLY_REFLECTED: "met a total reflection",
+    PathStatus.OPAQUE: "met an opaque surface",
 }
 """Description of each path status, as a predicate of "the path"."""
 

@@ -211,7 +211,7 @@ def levels(config: ModelConfig) -> int:
 
 
 def distance_warp(config: ModelConfig, line: Polyline) -> scene_bounds.DistanceWarp:
-    """Returns the distance warp of a path, which ends at the scene bounds, if any.
+    """Returns the distance warp of a path, which ends on an opaque surface or the scene bounds.
 
     The far distance is measured from the last bend, so that paths with many bends still reach the
     background.
@@ -219,6 +219,8 @@ def distance_warp(config: ModelConfig, line: Polyline) -> scene_bounds.DistanceW
     last = jnp.sum(jnp.isfinite(line.knots)) - 1
     leave = scene_bounds.exit_distance(domain(config), line.points[last], line.directions[last])
     far = line.knots[last] + jnp.where(jnp.isfinite(leave), leave, config.far)
+    if line.stop is not None:
+        far = jnp.where(jnp.isfinite(line.stop), line.stop, far)
     # Keep a minimum length for samples even if the camera is on the scene bounds.
     far = jnp.maximum(far, config.near + _SHORTEST * config.radius)
     return scene_bounds.DistanceWarp(config.near, far, config.radius)
@@ -230,10 +232,10 @@ def domain(config: ModelConfig) -> scene_bounds.Domain:
 
 
 def polyline(config: ModelConfig, path: LightPaths) -> Polyline:
-    """Returns the polyline that a model samples: without the segments inside clear objects."""
+    """Returns the polyline that a model samples: without the segments that it takes to be empty."""
     if config.interior == "field":
         return polylines.whole_path(path)
-    return polylines.outside_path(path)
+    return polylines.outside_path(path, also=config.field_parts)
 
 
 def sample(

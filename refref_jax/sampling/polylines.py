@@ -30,6 +30,8 @@ class Polyline(NamedTuple):
         outside: truncated paths end on the background too.
       differentials: ray differential of each segment, if carried.
       radius: radius of the pixel's cone at unit distance.
+      stop: coordinate `t` at which the path ends on an opaque surface, `inf` if it does not;
+        `None` in scenes without such surfaces.
     """
 
     points: Float[Array, "segments 3"]
@@ -39,6 +41,7 @@ class Polyline(NamedTuple):
     outside: Bool[Array, " segments"]
     differentials: RayDifferential
     radius: Float[Array, ""]
+    stop: Float[Array, ""] | None = None
 
 
 class PolylinePoint(NamedTuple):
@@ -70,19 +73,32 @@ def whole_path(path: LightPaths) -> Polyline:
         outside=_outside(path),
         differentials=path.differentials,
         radius=path.radii,
+        stop=path.stop and path.stop.tau,
     )
 
 
-def outside_path(path: LightPaths) -> Polyline:
-    """Returns one light path whose coordinate does not advance inside the objects."""
+def outside_path(path: LightPaths, *, also: tuple[int, ...] = ()) -> Polyline:
+    """Returns one light path whose coordinate does not advance inside the objects.
+
+    Args:
+      path: one light path.
+      also: parts in whose media the coordinate advances, too.
+    """
     line = whole_path(path)
-    lengths = jnp.where(jnp.isfinite(path.ends) & line.outside, path.ends - line.arcs, 0.0)
+    sampled = line.outside
+    for part in also:
+        sampled |= path.media == 1 + part
+    lengths = jnp.where(jnp.isfinite(path.ends) & sampled, path.ends - line.arcs, 0.0)
     # Summed separately for each segment, in the same order, so that a segment of length 0 starts
     # exactly where the next one does. A running sum would round them apart, and a sample could fall
     # between.
     earlier = jnp.tril(jnp.ones((lengths.size, lengths.size), bool), k=-1)
     starts = jnp.sum(jnp.where(earlier, lengths[None, :], 0.0), axis=-1)
-    return line._replace(knots=jnp.where(jnp.isfinite(path.tau), starts, jnp.inf))
+    line = line._replace(knots=jnp.where(jnp.isfinite(path.tau), starts, jnp.inf))
+    if line.stop is None:
+        return line
+    last = jnp.sum(jnp.isfinite(path.tau)) - 1
+    return line._replace(stop=starts[last] + (line.stop - line.arcs[last]))
 
 
 def point_at(line: Polyline, t: Float[Array, ""]) -> PolylinePoint:

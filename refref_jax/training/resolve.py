@@ -142,7 +142,8 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
     tree = mesh_queries.find_containment(parts)
     notes = mesh_checks.check_meshes(parts, tree, rule=rule)
     notes += scene_analysis.overridden(told, parts, rule=rule, space=space, radius=scene.radius)
-    if rule == "priority" or (rule == "facing" and tree.overlaps):
+    embedded = any(part.material.kind != "dielectric" for part in parts)
+    if rule == "priority" or (rule == "facing" and tree.overlaps) or embedded:
         _refuse_cameras_inside(parts, cameras)
     bounds = background_fit.find_bounds(folder, told, space=scene.space, radius=scene.radius)
     return SceneFacts(
@@ -358,7 +359,9 @@ def _resolve_model(
     preset = presets.PRESETS[config.model.preset]
     model = preset.model(extent, require(config.model.interior), field=config.model.field)
     learned = found.parts if config.model.tints == "learned" else 0
-    model = override_model(dataclasses.replace(model, learned_tints=learned), config.model)
+    fields = () if model.interior == "field" else found.field_parts
+    model = dataclasses.replace(model, learned_tints=learned, field_parts=fields)
+    model = override_model(model, config.model)
     config = _decide(
         config,
         reasons,
@@ -478,7 +481,7 @@ def _refuse_cameras_inside(parts: Sequence[MeshPart], cameras: Cameras) -> None:
     if np.any(mesh_queries.parts_around(parts, cameras.poses[:, :, 3]) != EMPTY_SLOT):
         raise ValueError(
             "A camera is inside a mesh, which training only supports under rule=nested, and under "
-            "rule=facing without overlaps. Use these, or move the camera."
+            "rule=facing without overlaps, if all parts are dielectrics. Move the camera."
         )
 
 

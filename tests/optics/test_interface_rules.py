@@ -34,7 +34,7 @@ def test_facing_takes_air_everywhere_but_knows_the_media():
 def test_a_scene_without_parts_can_be_indexed(rule):
     interfaces = rule((), ())
     ranked = 1 if rule is interface_rules.priority else 0
-    assert [len(field) for field in interfaces] == [1, 1, 1, 1, 1, ranked, 0]
+    assert [len(field) for field in interfaces] == [1, 1, 1, 1, 1, ranked, *[0] * 6]
     np.testing.assert_array_equal(interfaces.tint, 1.0)
     np.testing.assert_array_equal(interfaces.absorption, 0.0)
 

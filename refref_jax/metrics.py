@@ -1,5 +1,8 @@
 """Image metrics: PSNR, masked PSNR, SSIM, LPIPS, FLIP, and errors of distance maps.
 
+All metrics are computed per image; tables contain their means over images. `docs/metrics.md` lists
+the metrics and their undefined values.
+
 Colours are sRGB in `[0, 1]`. In float32, the variance of a bright and nearly constant image is lost
 to rounding (the SSIM of two constant images had an error of 1e-4), so use double precision for
 reported numbers.

@@ -1,0 +1,125 @@
+"""Rough surfaces: microfacet normals of the GGX distribution.
+
+A rough surface consists of microscopic facets, each of them smooth. A ray meets one facet, whose
+normal `m` is drawn from the facets that the ray can see; it is reflected and refracted there by the
+laws of smooth surfaces. Facets in front hide a part of the light that leaves (`masking`). The mean
+over the rays of a pixel converges to the integral over all facets; light that several facets would
+scatter in turn is lost, as in Cycles' distribution `GGX`.
+
+Random numbers are a hash of the ray's hit point and direction. So a ray always meets the same
+facet, two rays of a pixel meet different ones, and tracing needs no random key.
+
+Letters: `n` unit normal of the surface on the incident side, `m` unit normal of the facet, `d` unit
+direction of the ray, `alpha` width of the distribution.
+
+Sources: Walter et al., Microfacet Models for Refraction through Rough Surfaces (2007); Heitz,
+Sampling the GGX Distribution of Visible Normals (2018).
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, UInt
+
+from refref_jax import numerics
+from refref_jax.geometry.rays import orthonormal_basis
+
+# Constants of the 32-bit hash lowbias32 (Wellons, Prospecting for Hash Functions, 2018).
+_FIRST, _SECOND = 0x7FEB352D, 0x846CA68B
+
+# Offset between the hashes of two numbers: the golden ratio times 2^32.
+_NEXT = 0x9E3779B9
+
+
+def facet_normal(
+    position: Float[Array, "3"],
+    direction: Float[Array, "3"],
+    normal: Float[Array, "3"],
+    alpha: Float[Array, ""],
+) -> Float[Array, "3"]:
+    """Returns the unit normal of the facet that a ray meets; the surface's if `alpha` is 0.
+
+    Args:
+      position: hit point of the ray, which selects the facet.
+      direction: unit direction of the ray.
+      normal: unit normal of the surface on the incident side.
+      alpha: width of the distribution, >= 0.
+
+    Source: Heitz (2018), listing 1.
+    """
+    tangent, bitangent = orthonormal_basis(normal)
+    frame = jnp.stack([tangent, bitangent, normal])
+    towards = -(frame @ direction)
+    # The ray as seen by a hemisphere that is stretched to alpha = 1.
+    stretched = numerics.normalize(towards * jnp.stack([alpha, alpha, jnp.ones_like(alpha)]))
+    across, along = _disc_axes(stretched)
+    radius, angle = _uniform_pair(position, direction)
+    radius, angle = numerics.safe_sqrt(radius), 2.0 * jnp.pi * angle
+    u, v = radius * jnp.cos(angle), radius * jnp.sin(angle)
+    half = 0.5 * (1.0 + stretched[2])
+    v = (1.0 - half) * numerics.safe_sqrt(1.0 - jnp.square(u)) + half * v
+    up = numerics.safe_sqrt(1.0 - jnp.square(u) - jnp.square(v))
+    facet = u * across + v * along + up * stretched
+    facet = jnp.stack([alpha * facet[0], alpha * facet[1], jnp.maximum(facet[2], 0.0)])
+    return jnp.where(alpha > 0.0, numerics.normalize(facet @ frame), normal)
+
+
+def masking(
+    towards: Float[Array, ""], leaving: Float[Array, ""], alpha: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Returns the share of the light from a facet that other facets do not hide, in `[0, 1]`.
+
+    It is `G2 / G1`, the height-correlated masking and shadowing of both directions over the masking
+    of the incident one.
+
+    Args:
+      towards: cosine between the surface's normal and the incident ray, in `[0, 1]`.
+      leaving: cosine between the leaving ray and the surface's normal on its side; at or below 0
+        the ray leaves through the wrong side of the surface, and the share is 0.
+      alpha: width of the distribution, >= 0.
+
+    Source: Heitz, Understanding the Masking-Shadowing Function (2014), equation 99.
+    """
+    leaves = leaving > 0.0
+    leaving = jnp.where(leaves, leaving, 1.0)
+    here = towards + _slope_length(towards, alpha)
+    product = here * leaving
+    excess = towards * (_slope_length(leaving, alpha) - leaving)
+    return jnp.where(leaves, numerics.safe_divide(product, product + excess), 0.0)
+
+
+def _slope_length(cosine: Float[Array, ""], alpha: Float[Array, ""]) -> Float[Array, ""]:
+    """Returns `sqrt(cos^2 + alpha^2 sin^2)`, which is `cos (1 + 2 Lambda)`."""
+    squared = jnp.square(cosine)
+    return numerics.safe_sqrt(squared + jnp.square(alpha) * (1.0 - squared))
+
+
+def _disc_axes(stretched: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Returns two unit axes perpendicular to a direction, the first one horizontal."""
+    x, y, _ = stretched
+    zero = jnp.zeros_like(x)
+    tilted = (x != 0.0) | (y != 0.0)
+    level = numerics.normalize(jnp.stack([-y, x, zero]))
+    across = jnp.where(tilted, level, jnp.stack([jnp.ones_like(x), zero, zero]))
+    return across, jnp.cross(stretched, across)
+
+
+def _uniform_pair(
+    position: Float[Array, "3"], direction: Float[Array, "3"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Returns two uniform numbers in `[0, 1)` that a ray's hit determines; they are constants."""
+    words = jax.lax.stop_gradient(jnp.concatenate([position, direction])).astype(jnp.float32)
+    state = jnp.uint32(0)
+    for word in jax.lax.bitcast_convert_type(words, jnp.uint32):
+        state = _mixed(state ^ word)
+    return _unit(state, position), _unit(_mixed(state + jnp.uint32(_NEXT)), position)
+
+
+def _mixed(state: UInt[Array, ""]) -> UInt[Array, ""]:
+    state = (state ^ (state >> 16)) * jnp.uint32(_FIRST)
+    state = (state ^ (state >> 15)) * jnp.uint32(_SECOND)
+    return state ^ (state >> 16)
+
+
+def _unit(state: UInt[Array, ""], like: Float[Array, "3"]) -> Float[Array, ""]:
+    # 24 bits are what float32 holds exactly.
+    return (state >> 8).astype(like.dtype) * 2.0**-24
