@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from experiments.dataset import catalogue, published_meshes, scene_record
+from experiments.dataset import catalogue, published_meshes, scene_record, scene_setup
 from experiments.dataset.parts import ObjectPart
 from experiments.dataset.render_settings import PerSplit, RenderSettings
+from refref_jax.data import image_files, meshes
 from refref_jax.data.scene_names import SceneName
 from tests.factories.small_dataset import box
 
@@ -58,6 +59,37 @@ def test_comparisons_are_oriented_outwards(name):
         volume = np.sum(np.cross(corners[:, 0], corners[:, 1]) * corners[:, 2]) / 6.0
         assert volume > 0.0 and np.linalg.norm(part.vertices, axis=1).max() < 2.0
         assert part.colours is None or len(part.colours) == len(part.vertices)
+
+
+_KINDS = {
+    "emissive_core": {"shell_glass": "dielectric", "core_opaque": "opaque"},
+    "gold_torus": {"body_conductor": "conductor"},
+    "thin_dome": {"sheet_glass": "thin_sheet"},
+    "prism": {"body_glass": "dielectric"},
+    "frosted_ball_030": {"body_glass": "dielectric"},
+}
+
+
+@pytest.mark.parametrize("name", list(_KINDS))
+def test_the_library_reads_comparisons(tmp_path, name):
+    scene, parts = SceneName("cube", "materials", name), catalogue.COMPARISONS[name].make(0.1)
+    (tmp_path / "meshes").mkdir()
+    scene_setup.write_meshes(tmp_path, scene, parts)
+    record = scene_record.describe(scene, parts, {"type": "cube", "half_extent": 7.3}, _SETTINGS)
+    (tmp_path / "scene.json").write_text(json.dumps(record))
+    read = {part.name.removeprefix(f"{name}_"): part for part in meshes.read_meshes(tmp_path)}
+    assert {key: part.material.kind for key, part in read.items()} == _KINDS[name]
+    if name == "emissive_core":
+        light = read["core_opaque"].radiance
+        bytes_ = parts[1].colours[parts[1].faces] / 255.0
+        np.testing.assert_allclose(light, image_files.srgb_to_linear(bytes_), atol=1e-6)
+        assert np.ptp(light) > 0.5
+    elif name == "gold_torus":
+        assert read["body_conductor"].material.complex_index == (parts[0].eta, parts[0].k)
+    elif name == "prism":
+        assert read["body_glass"].material.dispersion == parts[0].index
+    elif name == "frosted_ball_030":
+        assert read["body_glass"].material.roughness == 0.3
 
 
 def test_nothing_is_inside_a_thin_sheet_but_it_may_be_inside_a_body():
