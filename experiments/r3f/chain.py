@@ -112,7 +112,7 @@ def fingerprint(scene: Path) -> str:
 def bounds_of(
     scene: Path, overlay: str, *, space: Space | None, radius: float | None
 ) -> tuple[Space | None, float | None]:
-    """Returns type and size of the background, where `None` is what `scene.json` says.
+    """Returns type and size of the background; `None` stands for what `scene.json` says.
 
     Args:
       scene: folder of the scene.
