@@ -190,7 +190,7 @@ def option(
     name: str = "",
     formerly: str = "",
     after: tuple[str, ...] = (),
-    comparison: Literal["strict", "none"] = "strict",
+    comparison: typing.Literal["strict", "none"] = "strict",
 ) -> Any:
     """Declares an option as a field of a dataclass.
 

@@ -1,4 +1,9 @@
-"""Blender materials: glass, emissive backgrounds, the world (bpy only)."""
+"""Blender materials: parts, emissive backgrounds, the world (bpy only).
+
+Cycles keeps no interior list for a ray: at a front face it divides by the index given here, at a
+back face it multiplies. So the index must be the ratio of the inside's to the outside's.
+Microfacets follow GGX with single scattering, whose alpha is the square of the roughness.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -6,23 +11,47 @@ from typing import Any
 import bpy
 
 _LINEAR, _SRGB = "Linear Rec.709", "sRGB"
+_GLASS = "ShaderNodeBsdfGlass"
 
 
-def glass(part: dict[str, Any]) -> Any:
-    """Returns a clear, polished interface.
+COLOURS = "colours"
+"""Name of the mesh attribute that holds the light emitted at vertices."""
 
-    Cycles keeps no interior list for a ray: at a front face it divides by the index given here, at
-    a back face it multiplies. So the index must be the ratio of the inside's to the outside's.
+
+def of_part(part: dict[str, Any]) -> Any:
+    """Returns the material of a part.
 
     Args:
       part: record of the part in `scene.json`.
     """
+    if part.get("kind") == "conductor":
+        return _metal(part)
+    if part.get("kind") == "opaque":
+        return _emitter(part) if "radiance" in part else _diffuse(part)
+    return _glass(part)  # also a thin sheet, which is a wall of glass here
+
+
+def tune_to(material: Any, part: dict[str, Any], channel: int) -> None:
+    """Sets the index of refraction of a colour channel in the material of a part."""
+    for node in material.node_tree.nodes:
+        if node.bl_idname == _GLASS:
+            node.inputs["IOR"].default_value = _of_channel(
+                part.get("index", part.get("ior_inside")), channel
+            ) / _of_channel(part["ior_outside"], channel)
+
+
+def _of_channel(value: float | list[float], channel: int) -> float:
+    return value[channel] if isinstance(value, list) else value
+
+
+def _glass(part: dict[str, Any]) -> Any:
+    """Returns an interface of glass, for the first colour channel."""
     material, nodes, links = _new_material(part["mesh"])
-    bsdf = nodes.new("ShaderNodeBsdfGlass")
+    bsdf = nodes.new(_GLASS)
     bsdf.distribution = "GGX"  # a roughness of 0 makes it sharp
-    bsdf.inputs["Roughness"].default_value = 0.0
-    bsdf.inputs["IOR"].default_value = part["ior_inside"] / part["ior_outside"]
+    bsdf.inputs["Roughness"].default_value = part.get("roughness", 0.0)
     bsdf.inputs["Color"].default_value = (*part["colour_per_interface"], 1.0)
+    tune_to(material, part, 0)
     output = nodes.new("ShaderNodeOutputMaterial")
     links.new(bsdf.outputs["BSDF"], output.inputs["Surface"])
     absorption = part.get("absorption", (0.0, 0.0, 0.0))
@@ -34,6 +63,47 @@ def glass(part: dict[str, Any]) -> Any:
         volume.inputs["Color"].default_value = (*colour, 1.0)
         volume.inputs["Density"].default_value = density
         links.new(volume.outputs["Volume"], output.inputs["Volume"])
+    return material
+
+
+def _metal(part: dict[str, Any]) -> Any:
+    """Returns the surface of a conductor, relative to the medium outside."""
+    material, nodes, links = _new_material(part["mesh"])
+    bsdf = nodes.new("ShaderNodeBsdfMetallic")
+    bsdf.distribution, bsdf.fresnel_type = "GGX", "PHYSICAL_CONDUCTOR"
+    bsdf.inputs["Roughness"].default_value = part.get("roughness", 0.0)
+    for name, key in (("IOR", "eta"), ("Extinction", "k")):
+        bsdf.inputs[name].default_value = [
+            _of_channel(part[key], channel) / _of_channel(part["ior_outside"], channel)
+            for channel in range(3)
+        ]
+    output = nodes.new("ShaderNodeOutputMaterial")
+    links.new(bsdf.outputs["BSDF"], output.inputs["Surface"])
+    return material
+
+
+def _diffuse(part: dict[str, Any]) -> Any:
+    """Returns an opaque surface that is lit by the scene."""
+    material, nodes, links = _new_material(part["mesh"])
+    bsdf = nodes.new("ShaderNodeBsdfDiffuse")
+    bsdf.inputs["Color"].default_value = (*part["albedo"], 1.0)
+    bsdf.inputs["Roughness"].default_value = 0.0  # Lambert
+    output = nodes.new("ShaderNodeOutputMaterial")
+    links.new(bsdf.outputs["BSDF"], output.inputs["Surface"])
+    return material
+
+
+def _emitter(part: dict[str, Any]) -> Any:
+    """Returns an opaque surface that emits the same light to all directions, on both sides."""
+    material, nodes, _ = _new_material(part["mesh"])
+    if part["radiance"] == "vertex_colours":
+        colour = nodes.new("ShaderNodeAttribute")
+        colour.attribute_name = COLOURS
+        _glow(material, colour)
+    else:
+        colour = nodes.new("ShaderNodeRGB")
+        colour.outputs["Color"].default_value = (*part["radiance"], 1.0)
+        _glow(material, colour)
     return material
 
 
@@ -87,13 +157,13 @@ def _new_material(name: str) -> tuple[Any, Any, Any]:
     return material, material.node_tree.nodes, material.node_tree.links
 
 
-def _glow(material: Any, texture: Any) -> None:
-    """Makes a surface emit a texture's colour, without light sampling."""
+def _glow(material: Any, colour: Any) -> None:
+    """Makes a surface emit the colour of a node, without light sampling."""
     nodes, links = material.node_tree.nodes, material.node_tree.links
     emission = nodes.new("ShaderNodeEmission")
     emission.inputs["Strength"].default_value = 1.0
     output = nodes.new("ShaderNodeOutputMaterial")
-    links.new(texture.outputs["Color"], emission.inputs["Color"])
+    links.new(colour.outputs["Color"], emission.inputs["Color"])
     links.new(emission.outputs["Emission"], output.inputs["Surface"])
     material.cycles.emission_sampling = "NONE"
 

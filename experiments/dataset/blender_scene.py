@@ -16,6 +16,10 @@ import bpy
 import mathutils
 import numpy as np
 
+# Thickness of the wall that stands for a thin sheet, world units: far below the size of a pixel,
+# and far above rounding in single precision.
+_SHEET = 4e-4
+
 WHOLE_PIXEL, MIDDLE = "BOX", "GAUSSIAN"
 """Filters: the mean over a pixel's square, and 1 % of its width around its centre."""
 
@@ -38,10 +42,15 @@ def build(folder: Path, record: dict[str, Any]) -> None:
     _set_up_cycles(scene, record["render"]["bounces"])
     _set_up_output(scene, record["size"])
     for number, part in enumerate(record["parts"], start=1):
-        vertices, faces = read_ply(folder / part["mesh"])
-        material = blender_materials.glass(part)
+        vertices, faces, colours = read_ply(folder / part["mesh"])
+        if part.get("kind") == "thin_sheet":
+            vertices, faces = slab(vertices, faces)
+        material = blender_materials.of_part(part)
         body = _add_mesh(part["mesh"], vertices, faces, material, smooth=part["smooth_normals"])
         body.pass_index = number
+        if colours is not None:
+            layer = body.data.attributes.new(blender_materials.COLOURS, "FLOAT_COLOR", "POINT")
+            layer.data.foreach_set("color", _to_linear(colours).ravel())
     _BACKGROUNDS[record["background"]["type"]](folder, record["background"])
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     camera.data.sensor_fit = "HORIZONTAL"
@@ -50,18 +59,75 @@ def build(folder: Path, record: dict[str, Any]) -> None:
     scene.camera = camera
 
 
-def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Reads a mesh written by `meshes_written`: floats `[v, 3]` and corners `[f, 3]`."""
+def disperses(record: dict[str, Any]) -> bool:
+    """Returns whether a part of a scene has an index of refraction per colour channel."""
+    return any(isinstance(part.get("index"), list) for part in record["parts"])
+
+
+def tune_to(record: dict[str, Any], channel: int) -> None:
+    """Sets the indices of refraction of a colour channel in the current scene."""
+    if not disperses(record):
+        return
+    for body in bpy.context.scene.objects:
+        if body.pass_index:
+            part = record["parts"][body.pass_index - 1]
+            blender_materials.tune_to(body.data.materials[0], part, channel)
+
+
+def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Reads a mesh written by `scene_setup.write_meshes`.
+
+    Returns:
+      Positions `[v, 3]`, corners `[f, 3]`, and 8-bit colours `[v, 3]` if the file has any.
+    """
     header, body = path.read_bytes().split(b"end_header\n", 1)
     counts = {}
     for line in header.decode("ascii").splitlines():
         if line.startswith("element "):
             _, name, count = line.split()
             counts[name] = int(count)
-    vertices = np.frombuffer(body, "<f4", 3 * counts["vertex"]).reshape(-1, 3)
+    coloured = b"property uchar red" in header
+    fields = [("position", "<f4", 3), *[("colour", "u1", 4)] * coloured]
+    vertices = np.frombuffer(body, np.dtype(fields), counts["vertex"])
     face = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
     faces = np.frombuffer(body, face, counts["face"], offset=vertices.nbytes)["corners"]
-    return vertices, faces
+    return vertices["position"], faces, vertices["colour"][:, :3] if coloured else None
+
+
+def slab(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns a thin wall around an open surface, half of its thickness on either side.
+
+    The wall's rim has vertices of its own, so that it does not bend the normals of the sides.
+
+    Args:
+      vertices: positions of the surface.
+      faces: its corners.
+    """
+    a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
+    normals = np.zeros(vertices.shape)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], np.cross(b - a, c - a))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    front, back = (vertices + side * 0.5 * _SHEET * normals for side in (1.0, -1.0))
+    count = len(vertices)
+    edges = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64)
+    rim = edges[~np.isin(edges @ [count, 1], edges @ [1, count])]
+    first, second = 2 * count + rim.T
+    strip = [
+        np.stack([second, first, first + count], 1),
+        np.stack([second, first + count, second + count], 1),
+    ]
+    return (
+        np.concatenate([front, back, front, back]),
+        np.concatenate([faces, faces[:, ::-1] + count, *strip]),
+    )
+
+
+def _to_linear(colours: np.ndarray) -> np.ndarray:
+    """Decodes 8-bit sRGB as linear RGBA (IEC 61966-2-1)."""
+    share = colours / 255.0
+    linear = np.where(share > 0.04045, ((share + 0.055) / 1.055) ** 2.4, share / 12.92)
+    return np.column_stack([linear, np.ones(len(linear))]).astype(np.float32)
 
 
 def use_gpu() -> None:

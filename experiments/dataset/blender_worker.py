@@ -3,10 +3,11 @@
 PYTHON_OF_BLENDER experiments/dataset/blender_worker.py --device=CPU --threads=2
 
 Jobs are lines of JSON on standard input; each is answered by one line on standard output. The first
-line of output is `{"blender": VERSION}`. A job is a `workers.Job`; its answer is `{}` once its
-files are complete, or `{"error": TEXT}`. Two multi-layer EXRs are written: `colour`, with all
-samples, and `geometry`, whose single sample goes through the pixel centres, so that depth, normal
-and object index belong to one ray and are not averaged.
+line of output is `{"blender": VERSION}`. A job is a `workers.Job`; its answer is `{"written":
+COLOURS}` once its files are complete, or `{"error": TEXT}`. Multi-layer EXRs are written: the first
+of `colours`, with all samples, and `geometry`, whose single sample goes through the pixel centres,
+so that depth, normal and object index belong to one ray and are not averaged. Where parts disperse
+light, there is one colour file per channel, with the indices of refraction of that channel.
 
 The worker exits at the end of its input, also during a rendering: its parent process has ended.
 """
@@ -35,7 +36,7 @@ def main() -> None:
     import bpy
 
     _say(answers, {"blender": bpy.app.version_string})
-    built = ""
+    built, record = "", {}
     while True:
         job = json.loads(jobs.get())
         try:
@@ -51,10 +52,13 @@ def main() -> None:
                 built = job["scene"]
             blender_scene.place_camera(job["pose"], job["angle_x"])
             blender_scene.filter_over(blender_scene.WHOLE_PIXEL)
-            _render(bpy, job["colour"], job["samples"], job["seed"])
+            channels = range(3 if blender_scene.disperses(record) else 1)
+            for channel in channels:
+                blender_scene.tune_to(record, channel)
+                _render(bpy, job["colours"][channel], job["samples"], job["seed"])
             blender_scene.filter_over(blender_scene.MIDDLE)
             _render(bpy, job["geometry"], 1, job["seed"])
-            _say(answers, {})
+            _say(answers, {"written": len(channels)})
         except Exception as error:  # whatever Blender runs into is for the other side to judge
             _say(answers, {"error": f"{type(error).__name__}: {error}"})
 

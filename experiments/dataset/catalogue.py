@@ -1,11 +1,11 @@
-"""All objects of the data set, gathered from the modules of `objects` (NumPy only)."""
+"""All objects, gathered from the modules of `objects` (NumPy only)."""
 
 import importlib
 import pkgutil
 from pathlib import Path
 
 from experiments.dataset import objects
-from experiments.dataset.objects import monkey
+from experiments.dataset.objects import materials, monkey
 from experiments.dataset.parts import Object, ObjectPart
 
 SUZANNE = Path(__file__).parents[2] / "build" / "suzanne.npz"
@@ -39,4 +39,7 @@ def _make_monkey(detail: float) -> list[ObjectPart]:
 
 
 OBJECTS: dict[str, Object] = gather()
-"""Every object by name."""
+"""Every object of the data set by name."""
+
+COMPARISONS: dict[str, Object] = {item.name: item for item in materials.COMPARISONS}
+"""Objects that compare materials with Cycles, by name."""

@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from experiments.runs import known_scene
 from experiments.runs.known_scene import KnownScene
+from refref_jax import configuration
 from refref_jax.choices import SPLITS
 from refref_jax.data import (
     background_fit,
@@ -130,6 +131,22 @@ def check_background(scene: Path) -> list[Finding]:
     return [Finding("error", scene.name, message)]
 
 
+def unknown_light(scene: Path) -> list[str]:
+    """Returns the mesh names of opaque parts whose light `scene.json` does not state.
+
+    Colours of such a scene cannot be compared: the tracer does not know how the parts look.
+    """
+    path = scene / scene_properties.FILE
+    if not path.is_file():
+        return []
+    parts = configuration.parse_json(path.read_text(encoding="utf-8")).get("parts", [])
+    return [
+        Path(part["mesh"]).name
+        for part in parts
+        if part.get("kind") == "opaque" and "radiance" not in part
+    ]
+
+
 def check_meshes(scene: Path) -> tuple[Meshes | None, list[Finding]]:
     """Reads and lints the meshes of a scene; returns `None` for unreadable meshes."""
     try:
@@ -200,18 +217,21 @@ def away_from_silhouettes(
     return finite & mask & ~near
 
 
-def complaints(convex: bool, findings: Sequence[Finding], views: Sequence[View]) -> list[str]:
+def complaints(
+    convex: bool, findings: Sequence[Finding], views: Sequence[View], *, colours: bool = True
+) -> list[str]:
     """Returns the failed checks of a scene, in words; empty if the scene may be used.
 
     Args:
       convex: whether the object is convex; more checks apply then.
       findings: results for its files and meshes; notes do not count as failures.
       views: compared views.
+      colours: whether colours count; they cannot where `unknown_light` finds a part.
     """
     least = PSNR_CONVEX if convex else PSNR
     found = [f"{each.part}: {each.message}" for each in findings if each.severity != "note"]
     for view in views:
-        if not view.psnr_masked >= least:
+        if colours and not view.psnr_masked >= least:
             found.append(
                 f"{view.name}: {view.psnr_masked:.1f} dB masked PSNR, not at least {least:g}"
             )

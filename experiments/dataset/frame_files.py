@@ -4,7 +4,7 @@ Files are written under a temporary name in the same folder, and renamed when co
 done when all of its files exist.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -110,15 +110,22 @@ def remove_unfinished(scene: Path) -> None:
         path.unlink()
 
 
-def read_rendering(colour: Path, geometry: Path) -> Rendering:
-    """Reads the two files of a view written by `blender_worker`.
+def read_rendering(colours: Sequence[Path], geometry: Path) -> Rendering:
+    """Reads the files of a view written by `blender_worker`.
+
+    Args:
+      colours: one image, or three of which each has the right light in its own channel.
+      geometry: depth, normals and object indices.
 
     Raises:
       ValueError: if a file is missing or broken, or a colour is not finite.
     """
-    linear = _read_layers(colour)["Combined"][..., :3]
+    images = [_read_layers(path)["Combined"] for path in colours]
+    linear = np.stack([images[channel % len(images)][..., channel] for channel in range(3)], -1)
     if not np.all(np.isfinite(linear)):
-        raise ValueError(f"{colour} has colours that are not finite. Check the scene in Blender.")
+        raise ValueError(
+            f"{colours[0]} has colours that are not finite. Check the scene in Blender."
+        )
     layers = _read_layers(geometry)
     mask = layers["Object Index.X"] > 0.0
     normal = np.stack([layers[f"Normal.{axis}"] for axis in "XYZ"], axis=-1)

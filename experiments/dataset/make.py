@@ -25,7 +25,13 @@ from etils import epy
 
 from experiments.cli import app, outputs
 from experiments.cli import flags as cli_flags
-from experiments.dataset.render_settings import LEAST_TEXTURE, Device, PerSplit, RenderSettings
+from experiments.dataset.render_settings import (
+    LEAST_TEXTURE,
+    Device,
+    OpaqueLight,
+    PerSplit,
+    RenderSettings,
+)
 from refref_jax.choices import TwoSidedRule
 from refref_jax.data.scene_names import BACKGROUNDS, SceneName
 
@@ -46,7 +52,8 @@ _SCENES = flags.DEFINE_string(
     "scenes",
     "all",
     "all, or names separated by commas: scenes such as cube_smcvx_ball, objects such as ball for "
-    "all their backgrounds, or either with wildcards such as 'sphere_*'.",
+    "all their backgrounds, or either with wildcards such as 'sphere_*'. Scenes "
+    "such as 'cube_materials_*', which compare materials with Cycles, are not part of all.",
 )
 _SIZE = flags.DEFINE_integer("size", 800, "Width and height of images in pixels.", lower_bound=1)
 _SPP = flags.DEFINE_integer("spp", 512, "Samples per pixel of train and val.", lower_bound=1)
@@ -81,8 +88,14 @@ _MESH = flags.DEFINE_multi_string(
 _MATERIAL = flags.DEFINE_multi_string(
     "material", ["glass"], "Material of each --mesh, in their order, or one for all."
 )
-app.check(_SCENES, lambda words: _MESH.value or scenes.choose(words, catalogue.OBJECTS))
+app.check(_SCENES, lambda words: _MESH.value or scenes.choose(words, _catalogue()))
 _DEVICE = flags.DEFINE_enum("device", "CPU", get_args(Device), "Device of Cycles.")
+_OPAQUE = flags.DEFINE_enum(
+    "opaque",
+    "lit",
+    get_args(OpaqueLight),
+    "Opaque parts reflect the light of the scene, or emit known light, for dataset.check.",
+)
 _PREVIEW = flags.DEFINE_bool("preview", False, "One test view of each scene, and contact sheets.")
 _BLENDER = flags.DEFINE_string(
     "blender", ".venv-dataset/bin/python", "Python of the environment that has Blender."
@@ -141,6 +154,7 @@ def _settings() -> RenderSettings:
         linear=_EXR.value,
         preview=_PREVIEW.value,
         device=_DEVICE.value,
+        opaque=_OPAQUE.value,
         source=user_meshes.digest(*_user_meshes()) if _MESH.value else "",
     )
 
@@ -148,9 +162,13 @@ def _settings() -> RenderSettings:
 def _objects() -> dict[str, Object]:
     """Returns the objects by name: those of the data set, or the user's own."""
     if not _MESH.value:
-        return catalogue.OBJECTS
+        return _catalogue()
     own = user_meshes.read_object(*_user_meshes())
     return {own.name: own}
+
+
+def _catalogue() -> dict[str, Object]:
+    return catalogue.OBJECTS | catalogue.COMPARISONS
 
 
 def _user_meshes() -> tuple[list[Path], list[str]]:

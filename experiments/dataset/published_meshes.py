@@ -3,7 +3,7 @@
     mesh_files/{category}/{object}_{material}.ply
 
 All parts with the same material are in one file. Our reader uses the separate parts, which the
-scene keeps.
+scene keeps. Opaque parts and conductors are not published.
 """
 
 from collections.abc import Sequence
@@ -11,6 +11,7 @@ from pathlib import Path
 
 import trimesh
 
+from experiments.dataset.parts import CONDUCTOR, OPAQUE
 from refref_jax import atomic_files
 from refref_jax.data import SceneError, meshes
 from refref_jax.data.scene_names import CATEGORIES, SceneName
@@ -20,7 +21,8 @@ def write(parts: Sequence[Path], name: SceneName, out: Path) -> None:
     """Writes the meshes of a scene's object; they are the same for all backgrounds.
 
     Args:
-      parts: mesh files of the scene; those of unknown material are omitted.
+      parts: mesh files of the scene; those of unknown material, of opaque parts and of conductors
+        are omitted.
       name: name of the scene.
       out: folder of the complete layout.
 
@@ -29,6 +31,8 @@ def write(parts: Sequence[Path], name: SceneName, out: Path) -> None:
     """
     by_material: dict[str, list[Path]] = {}
     for part in sorted(parts):
+        if part.stem.rpartition("_")[2] in (OPAQUE, CONDUCTOR):
+            continue  # another word of the name may be a material, as in perfume_red_cap_opaque
         if (material := meshes.material_of(part)) is not None:
             by_material.setdefault(material, []).append(part)
     folder = out / "mesh_files" / CATEGORIES[name.category]

@@ -8,7 +8,10 @@ from refref_jax.choices import SPLITS, Split, TwoSidedRule
 LinearImages = Literal["all", "test", "none"]
 """Splits that also keep their images as linear EXRs."""
 
-GENERATOR = 1
+OpaqueLight = Literal["lit", "emitting"]
+"""Whether opaque parts reflect the light of the scene, or emit known light."""
+
+GENERATOR = 2
 """Version of the generator, incremented when scenes with the same settings would change."""
 
 Device = Literal["CPU", "GPU"]
@@ -59,6 +62,7 @@ class RenderSettings:
       preview: whether only `preview_view` is rendered.
       device: device of Cycles; the noise of images depends on it.
       source: digest of the user's meshes, if the object is made of them.
+      opaque: light of opaque parts: that of the scene, or known light that they emit.
     """
 
     size: int
@@ -70,6 +74,7 @@ class RenderSettings:
     preview: bool = False
     device: Device = "CPU"
     source: str = ""
+    opaque: OpaqueLight = "lit"
 
     def __post_init__(self) -> None:
         """Rejects invalid settings.
@@ -107,6 +112,8 @@ class RenderSettings:
         render = {"generator": GENERATOR, **_RENDER, "linear_images": self.linear}
         if self.device != "CPU":
             render["device"] = self.device
+        if self.opaque != "lit":
+            render["opaque"] = self.opaque
         if self.source:
             render["meshes_sha256"] = self.source
         return {

@@ -63,4 +63,10 @@ def check_scene(scene: Path, settings: PathSettings, *, views: int, side: int) -
         for view in compared
         if np.isnan(view.depth_share)
     ]
-    return SceneReport(name, checks.complaints(convex, findings, compared), notes, compared)
+    if dark := checks.unknown_light(scene) if compared else []:
+        notes.append(
+            f"{', '.join(dark)}: opaque, and the light is unknown, so colours are not compared. "
+            "Make the scene with --opaque=emitting to compare them."
+        )
+    failed = checks.complaints(convex, findings, compared, colours=not dark)
+    return SceneReport(name, failed, notes, compared)

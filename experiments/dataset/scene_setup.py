@@ -1,6 +1,7 @@
 """Creates the folder of a scene, ready to be rendered, and recognises one (NumPy only).
 
-    {scene}/meshes/{object}_{part}_{material}.ply    binary, single precision
+    {scene}/meshes/{object}_{part}_{material}.ply    binary, single precision; `opaque` and
+                                                     `conductor` in place of a material
     {scene}/background/                              files of the record
     {scene}/transforms_{train,val,test}.json         poses and file names, of splits with views
     {scene}/scene.json                               see `scene_record`
@@ -63,7 +64,7 @@ def make(
 def write_meshes(folder: Path, scene: SceneName, parts: Sequence[ObjectPart]) -> None:
     """Writes the parts of a scene into its folder, which must have a subfolder for meshes."""
     for part in parts:
-        mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
+        mesh = trimesh.Trimesh(part.vertices, part.faces, vertex_colors=part.colours, process=False)
         content = trimesh.exchange.ply.export_ply(mesh, vertex_normal=False)
         (folder / "meshes" / scene_record.mesh_name(scene, part)).write_bytes(content)
 

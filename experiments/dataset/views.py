@@ -5,6 +5,9 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+import trimesh
+
 from experiments.dataset import cameras, frame_files, scene_setup
 from experiments.dataset.cameras import Split
 from experiments.dataset.parts import Object, ObjectPart
@@ -17,6 +20,9 @@ from refref_jax.data.scene_names import SceneName
 _SEEDS = 1 << 31
 
 _DETAIL = 1.0
+
+# Light of an emitting part where it faces downwards, as a share of that where it faces upwards.
+_DARKEST = 0.4
 
 
 class View(NamedTuple):
@@ -80,7 +86,8 @@ def tasks(
     # Consecutive scenes share their object.
     @lru_cache(maxsize=1)
     def make(name: str) -> Sequence[ObjectPart]:
-        return objects[name].make(_DETAIL)
+        made = objects[name].make(_DETAIL)
+        return made if settings.opaque == "lit" else [emitting(part) for part in made]
 
     for view in views:
         scene, folder = view.scene, out / str(view.scene)
@@ -97,9 +104,23 @@ def tasks(
         yield Task(view.name, job, partial(_finish, folder, view, settings))
 
 
+def emitting(part: ObjectPart) -> ObjectPart:
+    """Returns a part that emits its albedo as light, brighter where it faces upwards.
+
+    A tracer can render this light, while that of a part that is lit by the scene is unknown to it.
+    Parts without an albedo are returned as they are.
+    """
+    if part.albedo is None:
+        return part
+    mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
+    upwards = 0.5 + 0.5 * np.asarray(mesh.vertex_normals)[:, 2:]
+    light = np.array(part.albedo) * (_DARKEST + (1.0 - _DARKEST) * upwards)
+    return part._replace(albedo=None, colours=frame_files.to_srgb(light))
+
+
 def _finish(
-    folder: Path, view: View, settings: RenderSettings, colour: Path, geometry: Path
+    folder: Path, view: View, settings: RenderSettings, colours: Sequence[Path], geometry: Path
 ) -> None:
-    rendering = frame_files.read_rendering(colour, geometry)
+    rendering = frame_files.read_rendering(colours, geometry)
     linear = settings.keeps_linear(view.split)
     frame_files.write(folder, view.split, view.number, rendering, linear=linear)

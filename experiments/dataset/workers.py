@@ -6,9 +6,9 @@ See `blender_worker` for the protocol.
 import json
 import signal
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from experiments.dataset.render_settings import BLENDER
 
@@ -40,13 +40,13 @@ class Task(NamedTuple):
     Attributes:
       name: name of the view in messages.
       job: description of the view.
-      finish: function that takes the multi-layer EXRs of colour and of geometry, which are deleted
-        afterwards.
+      finish: function that takes the multi-layer EXRs of colour, one or one per channel, and of
+        geometry, which are deleted afterwards.
     """
 
     name: str
     job: Job
-    finish: Callable[[Path, Path], None]
+    finish: Callable[[Sequence[Path], Path], None]
 
 
 class BlenderError(ValueError):
@@ -74,7 +74,8 @@ class Worker:
           threads: number of render threads.
         """
         self.log = scratch / f"{name}.log"
-        self._files = tuple(scratch / f"{name}_{kind}.exr" for kind in ("colour", "geometry"))
+        self._colours = [scratch / f"{name}_colour_{channel}.exr" for channel in range(3)]
+        self._geometry = scratch / f"{name}_geometry.exr"
         with self.log.open("a", encoding="utf-8") as log:
             # Ctrl-C reaches all processes of a session: only this one decides how to react.
             self._process = subprocess.Popen(
@@ -112,8 +113,11 @@ class Worker:
           WorkerDiedError: if the process ends.
           BlenderError: if Blender reports an error.
         """
-        colour, geometry = self._files
-        message = {**task.job._asdict(), "colour": str(colour), "geometry": str(geometry)}
+        message = {
+            **task.job._asdict(),
+            "colours": list(map(str, self._colours)),
+            "geometry": str(self._geometry),
+        }
         try:
             self._process.stdin.write(json.dumps(message) + "\n")
             self._process.stdin.flush()
@@ -124,8 +128,9 @@ class Worker:
             raise BlenderError(
                 f"Blender cannot render {task.name} ({answer['error']}). See {self.log}."
             )
-        task.finish(colour, geometry)
-        for path in self._files:
+        colours = self._colours[: answer["written"]]
+        task.finish(colours, self._geometry)
+        for path in (*colours, self._geometry):
             path.unlink()
 
     def kill(self) -> None:
@@ -133,7 +138,7 @@ class Worker:
         self._process.kill()
         self._process.wait()
 
-    def _receive(self) -> dict[str, str]:
+    def _receive(self) -> dict[str, Any]:
         line = self._process.stdout.readline()
         # An incomplete line is from a process that was killed meanwhile.
         if not line.endswith("\n"):

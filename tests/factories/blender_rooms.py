@@ -71,8 +71,8 @@ class Blender:
         """Renders a view."""
         seen = []
 
-        def finish(colour, geometry):
-            seen.append(frame_files.read_rendering(colour, geometry))
+        def finish(colours, geometry):
+            seen.append(frame_files.read_rendering(colours, geometry))
 
         job = workers.Job(str(folder), camera.tolist(), cameras.ANGLE_X, samples, seed)
         self._worker.render(workers.Task("a view", job, finish))

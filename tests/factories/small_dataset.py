@@ -36,6 +36,14 @@ SMALL_OBJECTS = {
             box(1.5, "liquid", "water", absorption=(0.1, 0.0, 0.2)),
         ],
     ),
+    "box_opaque": Object(
+        "box_opaque",
+        "mmncvx",
+        lambda detail: [
+            box(2.0, "shell", "water", absorption=(0.1, 0.0, 0.2)),
+            box(1.2, "core", "opaque", kind="opaque", albedo=(0.5, 0.2, 0.1)),
+        ],
+    ),
 }
 
 

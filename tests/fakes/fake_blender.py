@@ -29,7 +29,8 @@ def _render(job, kind, size):
     normal = random.normal(size=(3, size, size)).astype(np.float32)
     channels = {"ViewLayer.Combined": light, "ViewLayer.Depth.Z": depth}
     channels |= {f"ViewLayer.Normal.{axis}": normal[i] for i, axis in enumerate("XYZ")}
-    _write(job[kind], {"all": channels | {"ViewLayer.Object Index.X": index}})
+    path = job["geometry"] if kind == "geometry" else job["colours"][0]
+    _write(path, {"all": channels | {"ViewLayer.Object Index.X": index}})
 
 
 def main():
@@ -46,7 +47,7 @@ def main():
             left.unlink()
             os.kill(os.getpid(), signal.SIGKILL)
         _render(job, "geometry", record["size"])
-        print("{}", flush=True)
+        print('{"written": 1}', flush=True)
 
 
 if __name__ == "__main__":

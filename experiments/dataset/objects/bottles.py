@@ -1,8 +1,8 @@
-"""Empty bottles, each of one material: hollow, and open at the mouth."""
+"""Empty bottles, each of one transparent material: hollow, and open at the mouth."""
 
 import numpy as np
 
-from experiments.dataset.objects.placing import centred, united
+from experiments.dataset.objects.placing import centred
 from experiments.dataset.objects.profiles import filleted, joined, sampling, smooth
 from experiments.dataset.objects.regions import box, region, ring, rounded
 from experiments.dataset.objects.revolve import (
@@ -15,13 +15,15 @@ from experiments.dataset.objects.revolve import (
     waves,
     within,
 )
-from experiments.dataset.objects.vessels import Look, body, cap, hollow, space_in
+from experiments.dataset.objects.vessels import Look, body, cap, hollow, painted, space_in
 from experiments.dataset.parts import Object, ObjectPart
 
 _COLA_GREEN = Look(tint=(0.9, 0.97, 0.92))
 _DEMIJOHN_GREEN = Look(tint=(0.84, 0.95, 0.88))
 _STAR_BLUE = Look(tint=(0.84, 0.92, 0.98))
 _PLASTIC = Look("plastic", tint=(0.93, 0.97, 0.99))
+_BLUE = painted(0.03, 0.16, 0.6)
+_PAPER = painted(0.78, 0.74, 0.64)
 
 
 def _make_cola_bottle(detail: float) -> list[ObjectPart]:
@@ -58,7 +60,7 @@ def _fluted(r: Values, z: Values) -> Values:
 
 
 def _make_plastic_bottle(detail: float) -> list[ObjectPart]:
-    """A ribbed bottle with a foot of five lobes, and a screw cap around its neck."""
+    """A ribbed bottle with a foot of five lobes, an opaque screw cap, and an opaque label."""
     cut = sampling(0.75 * detail, segments=112)
     outline = region(
         filleted(
@@ -80,13 +82,15 @@ def _make_plastic_bottle(detail: float) -> list[ObjectPart]:
     collar = rounded(box(0.33, 2.98, 3.07), convex=0.035)
     shape = hollow(outline + collar, space, rim=0.024, inner=0.03)
     lid = cap(0.31, low=3.12, high=3.62, bore=0.25, ceiling=3.55, edge=0.025)
+    label = rounded(box(0.7, 1.12, 1.92) - box(0.676, 0.0, 3.0), convex=0.01)
     foot = faded(waves(5, 0.16), lambda r, z: ramp(r, 0.1, 0.35) * (1.0 - ramp(z, 0.0, 0.42)))
     knurled = faded(waves(20, 0.05), _side_of_cap)
     parts = [
         body("body", _PLASTIC, shape, cut, turned=Turned(even_angles(cut, lobes=5), foot)),
-        body("cap", _PLASTIC, lid, cut, turned=Turned(even_angles(cut, lobes=20, each=8), knurled)),
+        body("cap", _BLUE, lid, cut, turned=Turned(even_angles(cut, lobes=20, each=16), knurled)),
+        body("label", _PAPER, label, cut),
     ]
-    return centred([united(parts)])
+    return centred(parts)
 
 
 def _side_of_cap(r: Values, z: Values) -> Values:

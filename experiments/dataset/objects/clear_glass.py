@@ -1,10 +1,10 @@
-"""Objects of clear glass only: jars with glass lids, a light bulb, a candlestick, a cut vase."""
+"""Objects of clear glass: jars with glass lids, a light bulb, a candlestick, a cut vase."""
 
 import numpy as np
 
 from experiments.dataset.objects.placing import centred, united
 from experiments.dataset.objects.profiles import arc, filleted, joined, sampling, smooth
-from experiments.dataset.objects.regions import box, region, ring, rounded
+from experiments.dataset.objects.regions import Region, box, region, ring, rounded
 from experiments.dataset.objects.revolve import (
     Turned,
     Values,
@@ -14,15 +14,30 @@ from experiments.dataset.objects.revolve import (
     waves,
     within,
 )
-from experiments.dataset.objects.vessels import GLASS, Look, body, hollow, open_mouth, space_in
+from experiments.dataset.objects.sticks import Stick, piece
+from experiments.dataset.objects.vessels import (
+    GLASS,
+    Look,
+    body,
+    hollow,
+    open_mouth,
+    painted,
+    space_in,
+)
 from experiments.dataset.parts import Object, ObjectPart
 
 _PALE_GREEN = Look(tint=(0.95, 0.985, 0.96))
 _ROSE = Look(tint=(0.98, 0.93, 0.95))
+_RUBBER = painted(0.6, 0.16, 0.05)
+_BRASS = painted(0.6, 0.42, 0.16)
+_TUNGSTEN = painted(0.25, 0.24, 0.23)
+
+# Radius of a bulb's filament.
+_FILAMENT = 0.42
 
 
 def _make_korken_jar(detail: float) -> list[ObjectPart]:
-    """A preserving jar of 115 mm by 175 mm; its lid is raised by the height of a rubber ring."""
+    """A preserving jar of 115 mm by 175 mm, with an opaque rubber ring under its lid."""
     cut = sampling(detail)
     outline = region(
         filleted(
@@ -44,7 +59,8 @@ def _make_korken_jar(detail: float) -> list[ObjectPart]:
         body("body", GLASS, hollow(outline + flange, space, rim=0.03), cut),
         body("lid", GLASS, lid, cut),
     ]
-    return centred([united(parts)])
+    rubber = rounded(box(0.97, 2.791, 2.819) - box(0.77, 2.0, 3.0), convex=0.012)
+    return centred([united(parts), body("ring", _RUBBER, rubber, cut)])
 
 
 def _make_vardagen_jar(detail: float) -> list[ObjectPart]:
@@ -74,14 +90,14 @@ def _make_vardagen_jar(detail: float) -> list[ObjectPart]:
 
 
 def _make_light_bulb(detail: float) -> list[ObjectPart]:
-    """A bulb of 60 mm by 110 mm, all of it glass: a shell with a cavity and a mount inside.
+    """A bulb of 60 mm by 110 mm: glass, an opaque filament on two wires, and a brass screw.
 
     Like a real bulb it is closed. Outer surface and cavity are one part; the faces of the cavity
     point into the cavity, and thus out of the glass.
     """
     globe = region(arc((0.0, 2.5), 1.05, -90.0, 90.0))
     neck = filleted(
-        (0, 0.85), (0.46, 0.85), (0.5, 1.2, 0.3), (0.72, 1.75, 0.5), (0.9, 2.3), (0, 2.3)
+        (0, 0.85), (0.46, 0.85, 0.04), (0.5, 1.2, 0.3), (0.72, 1.75, 0.5), (0.9, 2.3), (0, 2.3)
     )
     glass = rounded(globe + region(neck), concave=0.8)
     space = space_in(glass + box(0.46, 0.6, 1.0), wall=0.06, floor=0.95, corner=0.1)
@@ -96,13 +112,30 @@ def _make_light_bulb(detail: float) -> list[ObjectPart]:
         (0, 2.16),
     )
     space = rounded(space - region(flare), convex=0.03, concave=0.05)
-    screw = box(0.43, 0.22, 0.9)
-    for height in np.arange(0.3, 0.86, 0.13):
+    cut = sampling(detail)
+    filament = body("filament", _TUNGSTEN, ring(_FILAMENT, 2.75, 0.05), cut)
+    wires = []
+    for side in (-1.0, 1.0):
+        lean = (_FILAMENT - 0.1) / (2.75 - 2.19)
+        wire = Stick((0.1 * side, 0.0, 2.19), (lean * side, 0.0, 1.0), 0.02)
+        wires.append(piece("wires", _TUNGSTEN, wire, 2.19, 2.7, detail))
+    parts = [
+        body("body", GLASS, glass - space, cut),
+        body("screw", _BRASS, _screw(), cut),
+        filament,
+        united(wires),
+    ]
+    return centred(parts)
+
+
+def _screw() -> Region:
+    """Returns the screw of a bulb, with a sheath around the end of its glass, and its contact."""
+    screw = box(0.43, 0.22, 0.82) + box(0.57, 0.72, 1.0)
+    for height in np.arange(0.3, 0.72, 0.13):
         screw = screw + ring(0.42, float(height), 0.09)
     contact = region(filleted((0, 0), (0.14, 0), (0.42, 0.24), (0.42, 0.3), (0, 0.3)))
-    foot = rounded(screw + contact, convex=0.035, concave=0.035)
-    shape = rounded(glass + foot, concave=0.04) - space
-    return centred([body("body", GLASS, shape, sampling(detail))])
+    whole = rounded(screw + contact, concave=0.035) - box(0.51, 0.82, 2.0)
+    return rounded(whole, convex=0.025)
 
 
 def _make_candle_holder(detail: float) -> list[ObjectPart]:

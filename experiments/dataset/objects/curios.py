@@ -1,4 +1,4 @@
-"""Magnifier, skull-shaped bottle, and an abstract sculpture: one piece of glass each (NumPy only).
+"""Magnifier, skull-shaped bottle, and an abstract sculpture, each of one transparent material.
 
 Fields are those of `distance_fields`; z is up, faces point to -y.
 """
@@ -6,11 +6,11 @@ Fields are those of `distance_fields`; z is up, faces point to -y.
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from experiments.dataset.objects import placing
 from experiments.dataset.objects.distance_fields import (
     Field,
     ellipsoid,
     revolution,
-    sphere,
     torus,
     tube,
 )
@@ -23,11 +23,23 @@ from experiments.dataset.objects.field_operations import (
     turned,
     union,
 )
-from experiments.dataset.objects.formed import single_glass
+from experiments.dataset.objects.formed import centred, single_glass, softened, spacing
+from experiments.dataset.objects.isosurface import isosurface
+from experiments.dataset.objects.placing import tilted
+from experiments.dataset.objects.profiles import arc, sampling
+from experiments.dataset.objects.regions import region, rounded
 from experiments.dataset.objects.space_curves import limb
+from experiments.dataset.objects.vessels import GLASS, body
+from experiments.dataset.parts import OPAQUE, Object, ObjectPart
+from refref_jax.choices import Colour
 
-# The lens: its radius, and its thickness at the centre.
-_LENS_RADIUS, _LENS_THICKNESS = 0.98, 0.42
+# The lens: the radius and the thickness of its caps, and the radius to which their edge is rounded.
+_LENS_RADIUS, _LENS_THICKNESS, _LENS_EDGE = 0.9, 0.42, 0.03
+
+# Height by which the magnifier is moved up into the searched cube.
+_GRIP = 0.9
+
+_BLACK: Colour = (0.04, 0.035, 0.03)
 
 _SKULL_WALL = 0.13
 
@@ -37,19 +49,30 @@ _KNOT_RING, _KNOT_AWAY, _KNOT_TUBE, _KNOT_SWELL = 1.15, 0.5, 0.27, 0.06
 _KNOT_POINTS = 360
 
 
-def _magnifier() -> Field:
-    # Two caps of a sphere, each with half the height of the lens.
-    half = 0.5 * _LENS_THICKNESS
-    curvature = (_LENS_RADIUS**2 + half**2) / (2.0 * half)
-    caps = [sphere((0.0, side * (curvature - half), 0.0), curvature) for side in (-1.0, 1.0)]
-    lens = intersection(*caps)
+def _frame() -> Field:
+    """Returns the rim and the handle, around a lens at the origin."""
     rim = turned(torus(1.02, 0.13), Rotation.from_euler("x", 90.0, degrees=True))
     collar = limb((0.0, 0.0, -1.1, 0.13), (0.0, 0.0, -1.45, 0.1))
     profile = [(0.0, -2.9), (0.12, -2.88), (0.19, -2.75), (0.2, -2.4), (0.15, -1.75), (0.13, -1.4)]
     handle = revolution(np.array([*profile, (0.0, -1.4)]))
     grip = union(collar, offset(handle, 0.02), blend=0.1)
-    disc = union(lens, rim, blend=0.06)
-    return moved(union(disc, grip, blend=0.1), (0.0, 0.0, 0.9))
+    return union(rim, grip, blend=0.1)
+
+
+def _make_magnifier(detail: float) -> list[ObjectPart]:
+    """A lens of glass in an opaque rim with a handle."""
+    half = 0.5 * _LENS_THICKNESS
+    # Two caps of a sphere, each with half the height of the lens.
+    curvature = (_LENS_RADIUS**2 + half**2) / (2.0 * half)
+    caps = [
+        region(arc((0.0, side * (curvature - half)), curvature, -90.0, 90.0)) for side in (-1, 1)
+    ]
+    shape = rounded(caps[0] ^ caps[1], convex=_LENS_EDGE)
+    lens = tilted([body("lens", GLASS, shape, sampling(detail))], axis="x", degrees=90.0)
+    step = spacing(1.5 * detail, thinnest=0.12)
+    grip = isosurface(softened(moved(_frame(), (0.0, 0.0, _GRIP))), spacing=step)
+    frame = ObjectPart("frame", OPAQUE, *grip, kind="opaque", albedo=_BLACK)
+    return centred([*placing.moved(lens, (0.0, 0.0, _GRIP)), frame], 1.9)
 
 
 def _skull_bottle() -> Field:
@@ -121,7 +144,7 @@ def _generic_sculpture() -> Field:
 
 
 OBJECTS = (
-    single_glass("magnifier", _magnifier, radius=1.9, thinnest=0.12, fineness=1.5),
+    Object("magnifier", "smncvx", _make_magnifier),
     single_glass("skull_bottle", _skull_bottle, radius=1.7, thinnest=0.09, fineness=1.05),
     single_glass("generic_sculpture", _generic_sculpture, radius=1.75, thinnest=0.12, fineness=0.9),
 )

@@ -17,6 +17,7 @@ from experiments.dataset.objects.sticks import along, bundle, piece
 from experiments.dataset.objects.vessels import (
     Look,
     filled,
+    painted,
     space_in,
     vessel,
 )
@@ -25,9 +26,12 @@ from experiments.dataset.parts import Object, ObjectPart
 _WINE = Look("alcohol", absorption=(0.35, 2.6, 2.2))
 _SCENT = Look("perfume", tint=(0.95, 0.86, 0.62))
 _WATER = Look("water", tint=(0.93, 0.98, 1.0))
-_REED = Look("plastic", tint=(0.75, 0.58, 0.4))
-_STEM = Look("plastic", tint=(0.5, 0.82, 0.45))
-_PETALS = Look("plastic", tint=(0.97, 0.62, 0.68))
+_REED = painted(0.5, 0.32, 0.16)
+_STEM = painted(0.1, 0.32, 0.07)
+_PETALS = painted(0.75, 0.1, 0.16)
+
+# Distances of sticks from the visible surface of a liquid: above it, and below its film.
+_OVER, _UNDER = 0.03, 0.05
 
 
 def _make_wine_glass(detail: float) -> list[ObjectPart]:
@@ -63,7 +67,7 @@ def _make_wine_glass(detail: float) -> list[ObjectPart]:
 
 
 def _make_reed_diffuser(detail: float) -> list[ObjectPart]:
-    """Six reeds in a square bottle."""
+    """Six opaque reeds in a square bottle."""
     outline = region(
         filleted(
             (0, 0),
@@ -85,16 +89,16 @@ def _make_reed_diffuser(detail: float) -> list[ObjectPart]:
     )
     sticks = bundle(6, waist=0.12, height=1.45, slope=0.22, radius=0.032)
     upper = [
-        piece("reeds", _REED, stick, level + 0.05, 3.3 + 0.05 * (number % 3), detail)
+        piece("reeds", _REED, stick, level + _OVER, 3.3 + 0.05 * (number % 3), detail)
         for number, stick in enumerate(sticks)
     ]
-    lower = [piece("reed_ends", _REED, stick, 0.24, level - 0.07, detail) for stick in sticks]
+    lower = [piece("reed_ends", _REED, stick, 0.24, level - _UNDER, detail) for stick in sticks]
     parts = vessel(shapes, cut, liquid=_SCENT, turned=turned)
     return centred([*parts, united(upper), united(lower)])
 
 
 def _make_flower_vase(detail: float) -> list[ObjectPart]:
-    """Three tulips in water."""
+    """Three opaque tulips in water."""
     side = smooth([(0.55, 0.1), (0.68, 0.5), (0.6, 1.05), (0.34, 1.5), (0.42, 1.95)])
     foot = filleted((0, 0), (0.5, 0, 0.06), (0.55, 0.1))
     outline = rounded(region(joined(foot, side, np.array([[0.0, 1.95]]))), convex=0.03)
@@ -115,8 +119,8 @@ def _make_flower_vase(detail: float) -> list[ObjectPart]:
         along("flowers", _PETALS, _tulip(), stick, high + 0.015, detail, turned=turned)
         for stick, high in pairs
     ]
-    upper = [piece("stems", _STEM, stick, level + 0.06, high, detail) for stick, high in pairs]
-    lower = [piece("stem_ends", _STEM, stick, 0.24, level - 0.07, detail) for stick in sticks]
+    upper = [piece("stems", _STEM, stick, level + _OVER, high, detail) for stick, high in pairs]
+    lower = [piece("stem_ends", _STEM, stick, 0.24, level - _UNDER, detail) for stick in sticks]
     return centred([*parts, united(heads), united(upper), united(lower)])
 
 

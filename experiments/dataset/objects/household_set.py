@@ -11,6 +11,7 @@ from experiments.dataset.objects.vessels import (
     cap,
     filled,
     open_mouth,
+    painted,
     rod,
     sealed,
     space_in,
@@ -23,10 +24,10 @@ _DRINK = Look("water", tint=(0.98, 0.86, 0.72))
 _SOAP = Look("water", absorption=(1.5, 0.35, 0.2))
 _HONEY = Look("alcohol", absorption=(0.12, 0.85, 3.0))
 _SCENT = Look("perfume", tint=(0.93, 0.78, 0.97))
-_STRAW = Look("plastic", tint=(0.95, 0.45, 0.4))
-_WHITE = Look("plastic", tint=(0.9, 0.92, 0.94))
+_STRAW = painted(0.7, 0.08, 0.06)
+_WHITE = painted(0.8, 0.8, 0.78)
 _CLEAR = Look("plastic")
-_LID = Look("plastic", tint=(0.92, 0.75, 0.4))
+_LID = painted(0.6, 0.36, 0.08)
 _STOPPER = Look("glass", tint=(0.9, 0.84, 0.97))
 
 
@@ -39,8 +40,8 @@ def _tumbler(cut: Sampling, detail: float) -> list[ObjectPart]:
     straw = Stick((-0.08, 0.0, level), (0.16, 0.05, 1.0), 0.05)
     return [
         *vessel(filled(outline, space, level=level, rim=0.022), cut, liquid=_DRINK, name="drink"),
-        piece("straw", _STRAW, straw, level + 0.06, 2.1, detail),
-        piece("straw_end", _STRAW, straw, 0.24, level - 0.07, detail),
+        piece("straw", _STRAW, straw, level + 0.04, 2.1, detail),
+        piece("straw_end", _STRAW, straw, 0.24, level - 0.06, detail),
     ]
 
 

@@ -21,6 +21,7 @@ from experiments.dataset.objects.vessels import (
     cap,
     filled,
     open_mouth,
+    painted,
     sealed,
     space_in,
     vessel,
@@ -31,8 +32,8 @@ _AMBER = Look("water", tint=(0.97, 0.82, 0.5))
 _CLEAR_BLUE = Look("water", tint=(0.78, 0.9, 0.99))
 _CYAN = Look("alcohol", absorption=(1.1, 0.25, 0.12))
 _PLASTIC = Look("plastic")
-_CAP = Look("plastic", tint=(0.6, 0.68, 0.9))
-_PLUNGER = Look("plastic", tint=(0.72, 0.86, 0.95))
+_CAP = painted(0.08, 0.12, 0.45)
+_PLUNGER = painted(0.75, 0.8, 0.82)
 
 
 def _make_ampoule(detail: float) -> list[ObjectPart]:
@@ -55,7 +56,7 @@ def _make_ampoule(detail: float) -> list[ObjectPart]:
 
 
 def _make_vial(detail: float) -> list[ObjectPart]:
-    """A scintillation vial of 20 ml with a knurled screw cap."""
+    """A scintillation vial of 20 ml with a knurled, opaque screw cap."""
     outline = region(
         filleted(
             (0, 0),
@@ -86,7 +87,7 @@ def _side_of_cap(r: Values, z: Values) -> Values:
 
 
 def _make_syringe(detail: float) -> list[ObjectPart]:
-    """A half full syringe, needle down, tilted."""
+    """A half full syringe with an opaque plunger, needle down, tilted."""
     cut = sampling(detail, segments=80)
     barrel, space = _barrel()
     shapes = filled(barrel, space, level=0.98, rim=0.024, meniscus=0.03)

@@ -1,4 +1,4 @@
-"""Perfume bottles: thick glass, a coloured liquid under air, and a cap."""
+"""Perfume bottles: thick glass, a coloured liquid under air, and an opaque cap."""
 
 from experiments.dataset.objects.placing import centred
 from experiments.dataset.objects.profiles import Sampling, filleted, sampling
@@ -12,13 +12,13 @@ from experiments.dataset.objects.revolve import (
     section_angles,
     stretched,
 )
-from experiments.dataset.objects.vessels import Look, body, cap, sealed, space_in, vessel
+from experiments.dataset.objects.vessels import Look, body, cap, painted, sealed, space_in, vessel
 from experiments.dataset.parts import Object, ObjectPart
 
 _RED = Look("perfume", absorption=(0.12, 1.9, 1.5))
 _YELLOW = Look("perfume", absorption=(0.04, 0.28, 1.7))
-_BLACK = Look("plastic", tint=(0.35, 0.35, 0.38))
-_GOLD = Look("plastic", tint=(0.93, 0.8, 0.5))
+_BLACK = painted(0.03, 0.03, 0.035)
+_GOLD = painted(0.72, 0.46, 0.13)
 
 
 def _make_perfume_red(detail: float) -> list[ObjectPart]:

@@ -23,7 +23,7 @@ from experiments.dataset.objects.regions import (
     top,
 )
 from experiments.dataset.objects.revolve import Turned, revolve, round_about
-from experiments.dataset.parts import ObjectPart
+from experiments.dataset.parts import OPAQUE, ObjectPart
 from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour
 
 FILM = 0.016
@@ -43,15 +43,22 @@ class Look(NamedTuple):
       material: material inside the surface.
       tint: tint of the surface; see `ObjectPart`.
       absorption: absorption of the medium; see `ObjectPart`.
+      albedo: albedo of an opaque part; see `ObjectPart`.
     """
 
     material: str = "glass"
     tint: Colour = CLEAR
     absorption: Colour = NO_ABSORPTION
+    albedo: Colour | None = None
 
 
 GLASS = Look()
 AIR = Look("air")
+
+
+def painted(red: float, green: float, blue: float) -> Look:
+    """Returns the look of an opaque part with an albedo, linear RGB."""
+    return Look(OPAQUE, albedo=(red, green, blue))
 
 
 class Filled(NamedTuple):
@@ -180,7 +187,14 @@ def body(
     ]
     vertices, faces = merged(pieces)
     return ObjectPart(
-        name, look.material, vertices, faces, tint=look.tint, absorption=look.absorption
+        name,
+        look.material,
+        vertices,
+        faces,
+        tint=look.tint,
+        absorption=look.absorption,
+        kind="dielectric" if look.albedo is None else "opaque",
+        albedo=look.albedo,
     )
 
 

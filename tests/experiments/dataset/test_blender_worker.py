@@ -137,6 +137,92 @@ def test_a_tint_multiplies_at_both_crossings(tmp_path, blender):
     np.testing.assert_allclose(middle, np.broadcast_to([0.25, 0.81, 1.0], middle.shape), atol=1e-3)
 
 
+def _light(blender, folder, part, *, samples=64, number=2, **options):
+    """The image of one part in a white environment, and its mask."""
+    room = write_room(folder, "env", [part], white=True, **options)
+    rendering = blender.render(room, pose(number), samples=samples)
+    return rendering.linear, rendering.mask
+
+
+def test_an_emitter_has_its_radiance_and_its_colours_are_decoded(tmp_path, blender):
+    radiance = (0.8, 0.3, 2.5)
+    part = _ball(1.5, material="opaque", kind="opaque", radiance=radiance)
+    linear, mask = _light(blender, tmp_path / "constant", part)
+    np.testing.assert_allclose(linear[20:28, 20:28].mean((0, 1)), radiance, rtol=1e-5)
+    colours = np.broadcast_to(np.array([188, 0, 10], np.uint8), part.vertices.shape)
+    part = part._replace(radiance=None, colours=colours)
+    coloured, same = _light(blender, tmp_path / "colours", part)
+    wanted = [((188 / 255 + 0.055) / 1.055) ** 2.4, 0.0, 10 / 255 / 12.92]
+    np.testing.assert_allclose(coloured[20:28, 20:28].mean((0, 1)), wanted, rtol=1e-5, atol=1e-7)
+    assert mask.any() and np.array_equal(mask, same)
+
+
+def test_a_diffuse_part_reflects_its_albedo_of_uniform_light(tmp_path, blender):
+    albedo = (0.7, 0.2, 0.05)
+    part = _ball(1.5, material="opaque", kind="opaque", albedo=albedo, smooth=False)
+    linear, mask = _light(blender, tmp_path / "diffuse", part, samples=16)
+    # A convex body in light from all sides: no noise, no interreflection.
+    np.testing.assert_allclose(linear[20:28, 20:28].mean((0, 1)), albedo, rtol=1e-4)
+    assert mask[24, 24]
+
+
+def test_a_conductor_reflects_as_fresnel_has_it(tmp_path, blender):
+    eta, k = np.array([0.143, 0.375, 1.442]), np.array([3.983, 2.386, 1.603])
+    part = small_dataset.box(2.0, "body", "conductor", kind="conductor")
+    part = part._replace(eta=tuple(eta.tolist()), k=tuple(k.tolist()))
+    linear, _ = _light(blender, tmp_path / "metal", part, number=0, samples=4)
+    # The camera sees the face at its middle under 10 degrees, where reflectance is that of 0.
+    wanted = ((eta - 1.0) ** 2 + k**2) / ((eta + 1.0) ** 2 + k**2)
+    np.testing.assert_allclose(linear[24, 24], wanted, rtol=2e-3)
+
+
+def test_a_thin_sheet_reflects_and_transmits_all_light_without_an_offset(tmp_path, blender):
+    grid = np.array([[0.0, y, z] for z in (-1.5, 1.5) for y in (-1.5, 1.5)])
+    sheet = ObjectPart("sheet", "glass", grid, np.array([[0, 1, 3], [0, 3, 2]]), smooth=False)
+    sheet = sheet._replace(kind="thin_sheet")
+    linear, mask = _light(blender, tmp_path / "white", sheet, number=0)
+    np.testing.assert_allclose(linear[mask], 1.0, atol=1e-4)
+    assert mask[24, 24] and not mask[0, 0]
+    # Before black, reflected light is missing: 2 R / (1 + R) at normal incidence.
+    room = write_room(tmp_path / "cube", "cube", [sheet], white=True)
+    for path in room.glob("background/wall_*.png"):
+        if path.stem != "wall_1":  # behind the sheet
+            iio.imwrite(path, np.zeros_like(iio.imread(path)))
+    rendering = blender.render(room, pose(0), samples=4096)
+    single = 0.04
+    wanted = 1.0 - 2.0 * single / (1.0 + single)
+    np.testing.assert_allclose(rendering.linear[22:26, 22:26].mean(), wanted, atol=3e-3)
+    distance = 4.0 / np.cos(np.radians(10.0)) * np.cos(np.radians(10.0))
+    np.testing.assert_allclose(rendering.depth[24, 24], distance, atol=0.05)
+
+
+def test_each_channel_of_a_dispersive_part_has_its_own_index(tmp_path, blender):
+    indices = (1.4, 1.5, 1.7)
+    images = []
+    for name, index in (("all", indices), *((str(each), each) for each in indices)):
+        room = write_room(tmp_path / name, "cube", [_ball(1.5)._replace(index=index)])
+        images.append(blender.render(room, pose(4), samples=64, seed=3).linear)
+    for channel in range(3):
+        np.testing.assert_array_equal(images[0][..., channel], images[1 + channel][..., channel])
+    assert _psnr(images[1], images[3]) < 35.0
+
+
+def test_roughness_spreads_light_and_loses_what_microfacets_scatter_twice(tmp_path, blender):
+    whole, means = [], []
+    for name, roughness, seed in (("clear", 0.0, 0), ("rough", 0.3, 0), ("again", 0.3, 1)):
+        part = _ball(1.5)._replace(roughness=roughness)
+        white, mask = _light(blender, tmp_path / f"white_{name}", part)
+        whole.append(white[mask].mean())
+        room = write_room(tmp_path / name, "cube", [part])
+        inner = blender.render(room, pose(4), samples=256, seed=seed).linear[16:32, 16:32]
+        means.append(inner.reshape(4, 4, 4, 4, 3).mean((1, 3)))
+    clear, rough, again = means
+    np.testing.assert_allclose(whole[0], 1.0, atol=2e-3)
+    assert 0.9 < whole[1] < whole[0] - 1e-3
+    # The noise of means over 4 x 4 pixels is far below the difference of the materials.
+    assert _psnr(rough, again) > 55.0 and _psnr(rough, clear) < 45.0
+
+
 def test_threads_and_order_do_not_show(tmp_path, blender):
     parts = [_ball(1.8, "shell"), _ball(1.3, "liquid", "water", absorption=(0.1, 0.4, 0.0))]
     rooms = [write_room(tmp_path / kind, kind, parts) for kind in ("cube", "env")]
@@ -181,10 +267,10 @@ def test_a_process_ends_when_nobody_listens(tmp_path):
         assert json.loads(process.stdout.readline())["blender"] == "5.0.1"
         for samples in (1, 1 << 22):
             job = workers.Job(str(room), pose(0).tolist(), cameras.ANGLE_X, samples, 0)
-            files = {"colour": f"{tmp_path}/colour.exr", "geometry": f"{tmp_path}/geometry.exr"}
+            files = {"colours": [f"{tmp_path}/colour.exr"], "geometry": f"{tmp_path}/geometry.exr"}
             print(json.dumps(job._asdict() | files), file=process.stdin, flush=True)
             if samples == 1:
-                assert process.stdout.readline() == "{}\n"
+                assert json.loads(process.stdout.readline()) == {"written": 1}
         # It takes hours to render this one.
         time.sleep(1.0)
         process.stdin.close()

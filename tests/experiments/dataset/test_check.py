@@ -66,6 +66,20 @@ def test_what_does_not_hold_is_told(changes, convex, message):
     assert not found if message is None else len(found) == 1 and message in found[0]
 
 
+def test_colours_are_not_compared_where_the_light_of_a_part_is_unknown(tmp_path):
+    assert checks.complaints(False, [], [_view(psnr_masked=9.0)], colours=False) == []
+    (found,) = checks.complaints(False, [], [_view(mask_share=0.1)], colours=False)
+    assert "the mask differs" in found
+    assert checks.unknown_light(tmp_path) == []
+    cap = {"mesh": "meshes/vial_cap_opaque.ply", "kind": "opaque", "albedo": [0.1, 0.1, 0.1]}
+    parts = [{"mesh": "meshes/vial_shell_glass.ply"}, cap]
+    (tmp_path / "scene.json").write_text(json.dumps({"parts": parts}))
+    assert checks.unknown_light(tmp_path) == ["vial_cap_opaque.ply"]
+    cap["radiance"] = [0.1, 0.1, 0.1]
+    (tmp_path / "scene.json").write_text(json.dumps({"parts": parts}))
+    assert checks.unknown_light(tmp_path) == []
+
+
 def test_findings_are_complaints_unless_they_are_notes():
     findings = [Finding(severity, "cup", "is odd") for severity in ("note", "warning", "error")]
     assert checks.complaints(False, findings, []) == ["cup: is odd"] * 2

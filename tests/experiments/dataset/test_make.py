@@ -11,6 +11,7 @@ import sys
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import trimesh
 
 from experiments.dataset import render_settings
 from experiments.dataset.render_settings import PerSplit
@@ -212,6 +213,37 @@ def test_the_rule_facing_gives_every_part_air_outside(tmp_path, blender):
     record = json.loads((scene / "scene.json").read_text())
     outside = [(part["outside"], part["ior_outside"]) for part in record["parts"]]
     assert outside == [("air", 1.0)] * 2 and not list((scene / "test").glob("*.exr"))
+
+
+def test_opaque_parts_are_lit_or_emit_known_light(tmp_path, blender):
+    """The record and the mesh file; the library's reader is tested with the library."""
+    parts = {}
+    for opaque in ("lit", "emitting"):
+        out = tmp_path / opaque
+        assert make(out, blender, "env_mmncvx_box_opaque", opaque=opaque)
+        scene = out / "env_mmncvx_box_opaque"
+        record = json.loads((scene / "scene.json").read_text())
+        assert record["render"].get("opaque", "lit") == opaque
+        parts[opaque] = {part["mesh"]: part for part in record["parts"]}
+    name = "meshes/box_opaque_core_opaque.ply"
+    shell, lit = parts["lit"].values()
+    assert shell["absorption"] == [0.1, 0.0, 0.2] and "kind" not in shell
+    assert (lit["kind"], lit["albedo"], lit["outside"]) == ("opaque", [0.5, 0.2, 0.1], "water")
+    assert not {"ior_inside", "index", "colour_per_interface", "radiance"} & set(lit)
+    emitting = parts["emitting"][name]
+    assert emitting["radiance"] == "vertex_colours" and "albedo" not in emitting
+    assert parts["emitting"]["meshes/box_opaque_shell_water.ply"] == shell
+    plain = trimesh.load(tmp_path / "lit" / scene.name / name, process=False)
+    mesh = trimesh.load(tmp_path / "emitting" / scene.name / name, process=False)
+    np.testing.assert_array_equal(mesh.vertices, plain.vertices)
+    colours = mesh.visual.vertex_colors[:, :3].astype(float)
+    assert plain.visual.kind is None and np.ptp(colours, axis=0).min() > 10
+    upper = mesh.vertices[:, 2] > 0.0
+    assert (colours[upper].min(axis=0) > colours[~upper].max(axis=0)).all()
+    # Diffuse light of 0.5 is 188 in sRGB: nothing is brighter than the albedo.
+    assert colours.max() <= 188
+    with pytest.raises(ValueError, match="another --out"):
+        make(tmp_path / "lit", blender, "env_mmncvx_box_opaque", opaque="emitting")
 
 
 def test_a_preview_is_a_test_view_as_it_is_in_the_whole(tmp_path, blender, made):

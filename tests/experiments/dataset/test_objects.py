@@ -3,6 +3,7 @@
 import collections
 import functools
 import itertools
+import re
 
 import manifold3d
 import numpy as np
@@ -35,6 +36,7 @@ from refref_jax.data.mesh_queries import (
 )
 from refref_jax.geometry.triangle_meshes import face_normals
 from refref_jax.optics.interface_rules import NO_PARENT
+from tests.processes.command import ROOT
 
 _OBJECTS = catalogue.OBJECTS
 _NAMES = [name for name in _OBJECTS if name != "monkey"]  # whose mesh Blender has to export
@@ -47,6 +49,8 @@ _TURNED = [
 # Each takes a second or more.
 _SLOW = {"teacup", "water_pitcher", "wisolt_kettle", "skull_bottle", "sleeping_dragon"}
 _SLOW |= {"cat", "dog", "cow", "woman_sculpture"}
+
+_PAGE = ROOT / "docs" / "dataset.md"
 
 _DETAIL = 0.3
 _GAP = 0.008
@@ -102,17 +106,39 @@ def test_parts_are_closed_outward_and_without_waste(name):
 def test_materials_and_shape_fit_the_category(name):
     parts, tree = _made(name)
     category = _OBJECTS[name].category
+    clear = [part for part in parts if part.kind == "dielectric"]
     if category == "mmncvx":
-        assert len({part.material for part in parts}) >= 2
+        assert len({part.material for part in clear}) >= 2
         assert any(parent != NO_PARENT for parent in tree.parents)
     else:
-        (part,) = parts
-        assert is_convex(scene_record.mesh_part(part)) == (category == "smcvx")
+        (part,) = clear
+        # A lens is convex, but not the object that it is part of.
+        convex = is_convex(scene_record.mesh_part(part)) and len(parts) == 1
+        assert convex == (category == "smcvx")
     for number, part in enumerate(parts):
         assert all(0.0 < share <= 1.0 for share in part.tint)
         assert all(each >= 0.0 for each in part.absorption)
         if part.absorption != NO_ABSORPTION:
-            assert number not in tree.parents, part.name
+            inside = [parts[i].kind for i, parent in enumerate(tree.parents) if parent == number]
+            assert set(inside) <= {"opaque"}, part.name
+        if part.kind == "opaque":
+            assert part.material == "opaque" and number not in tree.parents
+            assert all(0.0 < share < 0.9 for share in part.albedo), part.name
+        else:
+            assert part.albedo is None and part.radiance is None
+
+
+def test_opaque_parts_are_those_of_the_documented_table():
+    """The table of docs/dataset.md, which readers choose objects by."""
+    rows = re.findall(r"^\| (\w+) \| `(.+)` \|", _PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    documented = {name: set(parts.split("`, `")) for name, parts in rows}
+    made = {
+        name: {part.name for part in _made(name)[0] if part.kind == "opaque"}
+        for name in _NAMES
+        if name not in _SLOW
+    }
+    assert documented == {name: parts for name, parts in made.items() if parts}
+    assert len(documented) == 11
 
 
 @pytest.mark.parametrize("name", _each(_NAMES))

@@ -50,6 +50,15 @@ def test_the_catalogue_holds_objects_under_their_names():
     assert all(name == item.name for name, item in catalogue.OBJECTS.items())
 
 
+def test_comparisons_of_materials_are_chosen_by_their_own_names_alone():
+    objects = catalogue.OBJECTS | catalogue.COMPARISONS
+    assert len(scenes.choose("all", objects)) == 150
+    assert {s.category for s in scenes.choose("cube_*", objects)} == {"smcvx", "smncvx", "mmncvx"}
+    compared = [str(scene) for scene in scenes.choose("cube_materials_*", objects)]
+    assert compared == [f"cube_materials_{name}" for name in catalogue.COMPARISONS]
+    assert len(compared) == 6 and len(scenes.choose("prism", objects)) == 3
+
+
 def test_two_objects_of_one_name_are_refused(tmp_path, monkeypatch):
     for name in ("first", "second"):
         text = "from experiments.dataset.parts import Object\n"
