@@ -38,22 +38,9 @@ def test_psnr_by_hand(error, expected):
     np.testing.assert_allclose(metrics.psnr(target + error, target), expected, atol=_DECIBELS)
 
 
-def test_psnr_against_float64():
-    rendered, target = _images()
-    mean = np.mean(np.square(np.asarray(rendered, np.float64) - np.asarray(target, np.float64)))
-    np.testing.assert_allclose(
-        metrics.psnr(rendered, target), -10.0 * np.log10(mean), atol=_DECIBELS
-    )
-
-
 def test_psnr_of_equal_images_is_infinite():
     _, target = _images()
     assert metrics.psnr(target, target) == jnp.inf
-
-
-def test_psnr_treats_both_images_alike():
-    rendered, target = _images()
-    assert metrics.psnr(rendered, target) == metrics.psnr(target, rendered)
 
 
 @pytest.mark.parametrize("error", [1e-10, 1e-5, 1.0, 1e10])
@@ -64,22 +51,6 @@ def test_psnr_over_magnitudes(error):
 
 
 # --- PSNR over a mask ---
-
-
-def test_psnr_masked_by_hand():
-    mask, target = _mask(), jnp.zeros(_SHAPE)
-    rendered = jnp.where(mask[..., None], 0.1, 0.9) * jnp.ones(_SHAPE)
-    np.testing.assert_allclose(metrics.psnr_masked(rendered, target, mask), 20.0, atol=_DECIBELS)
-
-
-def test_psnr_masked_over_everything_is_the_psnr():
-    rendered, target = _images()
-    full = jnp.ones(_SHAPE[:2], bool)
-    np.testing.assert_allclose(
-        metrics.psnr_masked(rendered, target, full),
-        metrics.psnr(rendered, target),
-        atol=_DECIBELS,
-    )
 
 
 def test_psnr_masked_is_the_psnr_of_a_cropped_image():
@@ -130,31 +101,6 @@ def test_ssim_against_scikit_image(seed):
     rendered, target = _images(seed)
     np.testing.assert_allclose(
         metrics.ssim(rendered, target), _similarity(rendered, target), atol=_SIMILARITY
-    )
-
-
-def test_ssim_of_unrelated_images_against_scikit_image():
-    rendered, target = _images(0)[0], _images(1)[1]
-    expected = _similarity(rendered, target)
-    assert expected < 0.2
-    np.testing.assert_allclose(metrics.ssim(rendered, target), expected, atol=_SIMILARITY)
-
-
-def test_ssim_of_equal_images_is_one():
-    _, target = _images()
-    np.testing.assert_allclose(metrics.ssim(target, target), 1.0, atol=_SIMILARITY)
-
-
-def test_ssim_of_flat_images_by_hand():
-    # No variance: (2 a b + c1) / (a^2 + b^2 + c1), with c1 = 0.01^2.
-    got = metrics.ssim(jnp.full(_SHAPE, 0.2), jnp.full(_SHAPE, 0.6))
-    np.testing.assert_allclose(got, (0.24 + 1e-4) / (0.4 + 1e-4), atol=1e-4)
-
-
-def test_ssim_treats_both_images_alike():
-    rendered, target = _images()
-    np.testing.assert_allclose(
-        metrics.ssim(rendered, target), metrics.ssim(target, rendered), atol=_SIMILARITY
     )
 
 
