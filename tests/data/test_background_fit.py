@@ -182,9 +182,6 @@ def test_the_example_of_the_page_runs_and_gives_what_it_says(capsys, monkeypatch
     np.testing.assert_allclose(ast.literal_eval(second), 0.0, atol=0.002)
 
 
-# Scenes.
-
-
 @pytest.mark.parametrize("suffix", [".png", ".exr"])
 @pytest.mark.parametrize("masks", [True, False])
 def test_the_bundled_scene_is_measured(tmp_path, ball_scene, suffix, masks):

@@ -45,9 +45,6 @@ def _pairs(found):
     return {frozenset(pair) for pair in found.overlaps}
 
 
-# Winding numbers.
-
-
 def test_winding_number_of_an_octant_by_hand():
     origin = np.zeros((1, 3))
     np.testing.assert_allclose(winding_number(_octant(), origin), 0.125, atol=_EXACT)
@@ -104,9 +101,6 @@ def test_winding_number_of_no_points():
 def test_winding_number_beyond_the_bounding_box_is_exactly_zero():
     points = np.array([[0.51, 0.0, 0.0], [0.0, -3.0, 0.0], [1e6, 1e6, 1e6]])
     np.testing.assert_array_equal(winding_number(_open_box(3), points), 0.0)
-
-
-# Volumes.
 
 
 def test_volume_does_not_change_far_from_the_origin():
@@ -199,9 +193,6 @@ def test_a_hollow_body_lies_in_what_surrounds_it():
 def test_an_open_box_still_contains_what_is_deep_inside():
     found = find_containment([_open_box(1), ball(radius=0.1)])
     assert found == ((NO_PARENT, 0), ())
-
-
-# Points within parts.
 
 
 def test_the_parts_around_points():

@@ -59,9 +59,6 @@ def scene(tmp_path):
     return write_scene(tmp_path / "cube_smcvx_toy")
 
 
-# The bundled scene.
-
-
 @pytest.fixture
 def rendered(ball_scene):
     return scene_folder.read_frames(ball_scene, "test")
@@ -108,9 +105,6 @@ def test_distances_of_the_ball_are_those_of_a_sphere(rendered):
             distances[camera][head_on], (along - half_chord)[head_on], atol=_FACETS
         )
         assert np.all(distances[camera][~masks[camera]] > _CAMERA_DISTANCE)
-
-
-# A small scene of known values.
 
 
 def test_small_scene_is_read_as_written(scene):

@@ -210,9 +210,6 @@ def test_an_overlap_outweighs_nested_parts():
     assert _advice(cup, drink, ball("ice_glass", centre=(1.0, 0.0, 0.0))).rule == "priority"
 
 
-# Priorities.
-
-
 def test_good_priorities_have_no_findings():
     cup = _ranked(1, "cup_glass", radius=3.0)
     ice, drink = _ranked(3, "ice_glass", radius=0.5), _ranked(2, "drink_water")
@@ -319,9 +316,6 @@ def test_parts_that_cut_each_other_are_warned_about(shift):
     assert (finding.severity, finding.part) == ("warning", "a_glass")
     assert "intersects or touches b_water" in finding.message
     assert "use the rule 'priority'" in finding.message
-
-
-# Coincident walls.
 
 
 @pytest.mark.parametrize("part", [ball("b_water"), box("b_water")])

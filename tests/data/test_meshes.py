@@ -63,9 +63,6 @@ def _index(scene, indices=None):
     return part.index
 
 
-# Materials.
-
-
 @pytest.mark.parametrize(
     ("name", "index"),
     [
@@ -312,9 +309,6 @@ def test_a_priority_that_is_none(make_scene, value):
 def test_shading_is_true_or_false(make_scene):
     with scene_error("smooth_normals", "'false'", "Give true or false"):
         meshes.read_meshes(_described(make_scene, smooth_normals="false"))
-
-
-# Mesh files.
 
 
 @pytest.mark.parametrize("encoding", ["binary", "ascii"])

@@ -29,9 +29,6 @@ def _mask():
     return jnp.asarray(mask)
 
 
-# --- PSNR ---
-
-
 @pytest.mark.parametrize(("error", "expected"), [(1.0, 0.0), (0.1, 20.0), (0.01, 40.0)])
 def test_psnr_by_hand(error, expected):
     target = jnp.zeros(_SHAPE)
@@ -48,9 +45,6 @@ def test_psnr_over_magnitudes(error):
     target = jnp.zeros(_SHAPE)
     got = metrics.psnr(target + error, target)
     np.testing.assert_allclose(got, -20.0 * np.log10(error), atol=1e-2)
-
-
-# --- PSNR over a mask ---
 
 
 def test_psnr_masked_is_the_psnr_of_a_cropped_image():
@@ -81,9 +75,6 @@ def test_psnr_masked_over_nothing_is_undefined():
     assert np.isnan(metrics.psnr_masked(rendered, target, jnp.zeros(_SHAPE[:2], bool)))
 
 
-# --- SSIM ---
-
-
 def _similarity(rendered, target):
     return structural_similarity(
         np.asarray(rendered, np.float64),
@@ -111,9 +102,6 @@ def test_ssim_is_finite_on_flat_images(value):
     assert np.isfinite(metrics.ssim(flat, target)) and np.isfinite(metrics.ssim(flat, flat))
 
 
-# --- in double precision ---
-
-
 def _agreeing_images():
     """Yields pairs of images that are rendered, noisy, unlike, dark, bright and flat."""
     rng = np.random.default_rng(2)
@@ -136,9 +124,6 @@ def test_psnr_and_ssim_are_those_of_scikit_image(pair):
         np.testing.assert_allclose(metrics.psnr(*arrays), expected, atol=1e-5, rtol=0.0)
         expected = _similarity(*pair)
         np.testing.assert_allclose(metrics.ssim(*arrays), expected, atol=1e-5, rtol=0.0)
-
-
-# --- small images ---
 
 
 def test_ssim_of_the_smallest_image_is_that_of_its_one_window():
@@ -171,8 +156,6 @@ def test_metrics_check_grads():
     rendered, target = (np.asarray(image, np.float64)[:12, :12] for image in _images())
     gradients.assert_numerical(metrics.psnr, rendered, target)
 
-
-# --- transformations ---
 
 _METRICS = {
     "psnr": (metrics.psnr, lambda a, b, mask: (a, b)),

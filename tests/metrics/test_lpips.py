@@ -129,9 +129,6 @@ def test_transformations_change_nothing(params, transformation):
     )
 
 
-# --- weights ---
-
-
 def test_weights_are_those_of_the_file(params):
     alexnet, linear = made_lpips.state_dicts()
     assert len(params.kernels) == len(params.biases) == len(params.channels) == 5

@@ -142,7 +142,7 @@ def _many_outside_paths(paths):
     return lines, jax.vmap(near_knots)(lines)
 
 
-def test_an_outside_path_gives_inner_segments_no_length_at_all():
+def test_no_sample_of_an_outside_path_lies_inside():
     paths = made_paths.stack(
         made_paths.random_path(seed, bends=6, segments=_SEGMENTS) for seed in range(_MANY)
     )
