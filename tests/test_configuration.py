@@ -112,32 +112,20 @@ def test_a_float_may_be_written_as_an_integer(path):
     assert isinstance(read.limit, float)
 
 
-def test_the_order_of_keys_does_not_matter(path):
-    configuration.write(path, _RUN)
-    content = json.loads(path.read_text(encoding="utf-8"))
-    path.write_text(json.dumps(dict(reversed(content.items()))), encoding="utf-8")
-    assert configuration.read(path, _Run) == _RUN
-
-
-@pytest.mark.parametrize("key", ["steps", "limit", "main"])
-def test_missing_key(path, key):
-    _write_changed(path, lambda content: content.pop(key))
-    _assert_refused(path, repr(key))
-
-
-def test_missing_key_of_a_nested_record(path):
-    _write_changed(path, lambda content: content["others"][1].pop("size"))
-    _assert_refused(path, "_Run.others[1]", "'size'")
-
-
-def test_unknown_key(path):
-    _write_changed(path, lambda content: content.update(stpes=7))
-    _assert_refused(path, "'stpes'")
-
-
-def test_unknown_key_of_a_nested_record(path):
-    _write_changed(path, lambda content: content["main"].update(colour="red"))
-    _assert_refused(path, "_Run.main", "'colour'")
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda c: c.pop("steps"), ["'steps'"]),
+        (lambda c: c.pop("limit"), ["'limit'"]),
+        (lambda c: c.pop("main"), ["'main'"]),
+        (lambda c: c["others"][1].pop("size"), ["_Run.others[1]", "'size'"]),
+        (lambda c: c.update(stpes=7), ["'stpes'"]),
+        (lambda c: c["main"].update(colour="red"), ["_Run.main", "'colour'"]),
+    ],
+)
+def test_missing_and_unknown_keys(path, change, words):
+    _write_changed(path, change)
+    _assert_refused(path, *words)
 
 
 @pytest.mark.parametrize(

@@ -352,9 +352,6 @@ def _():
         assert _kinds(init_params(jax.random.key(0), dyed)) == {jnp.dtype("float32")}
 
 
-# --- what runs on the host ---
-
-
 def _picture(rays, glass=_GLASS, settings=_STRAIGHT):
     return render_known(glass, _wall, rays, settings=settings).linear
 

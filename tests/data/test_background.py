@@ -38,11 +38,6 @@ def test_the_folder_s_name_tells_the_background(tmp_path, name, expected):
     assert read(_scene(tmp_path / name)).space == expected
 
 
-def test_only_the_folder_s_own_name_counts(tmp_path):
-    parent = _scene(tmp_path / "env_data")
-    assert read(_scene(parent / "cube_smcvx_ball")).space == "bounded"
-
-
 def test_a_relative_path_is_resolved(tmp_path, monkeypatch):
     scene = _scene(tmp_path / "env_smcvx_ball")
     monkeypatch.chdir(scene)
@@ -70,44 +65,6 @@ def test_scene_json_may_be_silent(tmp_path, content):
 def test_scene_json_of_another_shape(tmp_path, content):
     with scene_error("scene.json", "background", "Give "):
         read(_scene(tmp_path / "env_ball", content))
-
-
-@pytest.mark.parametrize("content", [[], 7])
-def test_scene_json_that_is_no_object(tmp_path, content):
-    with scene_error("scene.json", "not a JSON object"):
-        read(_scene(tmp_path / "env_ball", content))
-
-
-def test_scene_json_tells_where_the_walls_stand(tmp_path, ball_scene):
-    assert read(ball_scene).background.extent == 7.3
-    assert read(_scene(tmp_path / "a", {"background": {"half_extent": 3}})).background.extent == 3.0
-    assert read(_scene(tmp_path / "b", {"background": {"type": "cube"}})).background.extent is None
-    assert read(_scene(tmp_path / "c")).background.extent is None
-    # The radius of a sphere.
-    assert (
-        read(
-            _scene(tmp_path / "d", {"background": {"type": "sphere", "radius": 5}})
-        ).background.extent
-        == 5.0
-    )
-
-
-@pytest.mark.parametrize("wrong", ["7", 0, -1.0, [7.3]])
-def test_walls_stand_at_a_positive_distance(tmp_path, wrong):
-    with scene_error("scene.json", "half_extent", "positive number"):
-        read(_scene(tmp_path / "a", {"background": {"half_extent": wrong}}))
-
-
-@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00"])
-def test_scene_json_that_is_no_json(tmp_path, content):
-    scene = _scene(tmp_path / "env_ball")
-    (scene / "scene.json").write_bytes(content)
-    with scene_error("scene.json", "not valid JSON"):
-        read(scene)
-
-
-def test_bundled_scene_has_walls(ball_scene):
-    assert read(ball_scene).space == "bounded"
 
 
 def _ball_with(tmp_path, ball_scene, change):

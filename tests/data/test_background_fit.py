@@ -171,13 +171,6 @@ def test_too_little_is_no_measurement():
             assert fit_size_and_centre(kind, sample_depths(seen, depths)) is None
 
 
-def test_the_size_is_described_with_its_error():
-    fit = background_fit.BackgroundFit("cube", 7.29812, 0.0038, (0.0,) * 3, (0.0,) * 3, 1.0)
-    assert fit.describe() == "7.298 +- 0.004"
-    assert fit._replace(error=0.31).describe() == "7.30 +- 0.3"
-    assert fit._replace(error=1e-9).describe() == "7.29812 +- 1e-05"
-
-
 def test_the_example_of_the_page_runs_and_gives_what_it_says(capsys, monkeypatch):
     page = (ROOT / "docs/data_formats.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
@@ -187,9 +180,6 @@ def test_the_example_of_the_page_runs_and_gives_what_it_says(capsys, monkeypatch
     first, second = capsys.readouterr().out.splitlines()
     assert first.removesuffix(" 1.0") in page
     np.testing.assert_allclose(ast.literal_eval(second), 0.0, atol=0.002)
-
-
-# Scenes.
 
 
 @pytest.mark.parametrize("suffix", [".png", ".exr"])

@@ -39,14 +39,6 @@ def _assert_same(one, other):
         np.testing.assert_array_equal(left, right)
 
 
-def test_a_batch_depends_on_seed_and_step_alone():
-    whole = _draw(_sampler(), 0, 8)
-    single = _draw(_sampler(), 5, 1)
-    assert single.rgb.shape == (1, _BATCH, 3)
-    np.testing.assert_array_equal(single.rgb[0], whole.rgb[5])
-    np.testing.assert_array_equal(single.rays.directions[0], whole.rays.directions[5])
-
-
 def test_earlier_draws_do_not_matter():
     sampler = _sampler()
     later = _draw(sampler, 4 * _STEPS, 3)
@@ -79,15 +71,6 @@ def test_epochs_see_the_same_batches_in_orders_of_their_own():
         assert set(map(tuple, one)) == set(map(tuple, other))
 
 
-def test_numbers_name_the_batches_of_an_epoch():
-    sampler = _sampler()
-    assert sampler.batches == _STEPS
-    for epoch in range(3):
-        np.testing.assert_array_equal(
-            np.sort(sampler.numbers(epoch * _STEPS, _STEPS)), np.arange(_STEPS)
-        )
-
-
 def test_seeds_differ():
     assert np.any(_draw(_sampler(seed=1), 0, 1).rgb != _draw(_sampler(seed=2), 0, 1).rgb)
 
@@ -106,14 +89,6 @@ def test_rays_and_colours_belong_to_one_pixel():
     for left, right in zip(drawn.rays, expected, strict=True):
         np.testing.assert_array_equal(left, right)
     np.testing.assert_array_equal(drawn.rgb[..., 1], 255 - number)
-
-
-def test_look_up_by_hand():
-    found = _sampler().look_up(np.array([0, 1, 5, 20, 59]))
-    frame, row, column = np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0], [1, 0, 0], [2, 3, 4]]).T
-    np.testing.assert_array_equal(_numbers(found), [0, 1, 5, 20, 59])
-    expected = pixel_rays(_cameras(), frame, row, column)
-    np.testing.assert_array_equal(found.rays.directions, expected.directions)
 
 
 def test_a_batch_may_be_all_pixels():

@@ -6,7 +6,6 @@ import trimesh
 
 from refref_jax.data import mesh_queries
 from refref_jax.data.mesh_queries import find_containment, parts_around, winding_number
-from refref_jax.data.meshes import read_meshes
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import EMPTY_SLOT, SLOTS
 from tests.factories.scenes import volume_of
@@ -44,9 +43,6 @@ def _open_box(open_faces):
 
 def _pairs(found):
     return {frozenset(pair) for pair in found.overlaps}
-
-
-# Winding numbers.
 
 
 def test_winding_number_of_an_octant_by_hand():
@@ -107,25 +103,9 @@ def test_winding_number_beyond_the_bounding_box_is_exactly_zero():
     np.testing.assert_array_equal(winding_number(_open_box(3), points), 0.0)
 
 
-# Volumes.
-
-
-def test_volume_of_a_box_by_hand():
-    part = box(size=(1.0, 2.0, 3.0))
-    assert volume_of(part) == pytest.approx(6.0)
-    assert volume_of(inverted(part)) == pytest.approx(-6.0)
-
-
 def test_volume_does_not_change_far_from_the_origin():
     moved = ball(centre=(1.1e6, -1.3e6, 1.7e6))
     assert volume_of(moved) == pytest.approx(volume_of(ball()), rel=1e-7)
-
-
-def test_volume_of_a_hollow_ball_is_the_difference():
-    solid, cavity = volume_of(ball(radius=2.0)), volume_of(ball(radius=1.5))
-    assert volume_of(shell()) == pytest.approx(solid - cavity)
-    # An inscribed polyhedron of 320 faces has 96 % of the ball's volume.
-    assert 0.95 < solid / (4.0 / 3.0 * np.pi * 8.0) < 1.0
 
 
 # Trees.
@@ -177,12 +157,6 @@ def test_balls_that_cut_each_other(shift):
     assert _pairs(found) == {frozenset({0, 1})}
 
 
-def test_a_ball_that_sticks_out_of_a_larger_one():
-    found = find_containment([ball(radius=0.8, centre=(2.0, 0.0, 0.0)), ball(radius=2.0)])
-    assert found.parents == (NO_PARENT, NO_PARENT)
-    assert _pairs(found) == {frozenset({0, 1})}
-
-
 @pytest.mark.parametrize("part", [box(), ball(), _moved(box()), _moved(ball())])
 def test_coincident_parts_overlap_and_do_not_contain_each_other(part):
     found = find_containment([part, part._replace(name="twin_water")])
@@ -219,14 +193,6 @@ def test_a_hollow_body_lies_in_what_surrounds_it():
 def test_an_open_box_still_contains_what_is_deep_inside():
     found = find_containment([_open_box(1), ball(radius=0.1)])
     assert found == ((NO_PARENT, 0), ())
-
-
-def test_bundled_ball_contains_a_small_one(ball_scene):
-    found = find_containment([*read_meshes(ball_scene), ball(radius=1.2)])
-    assert found == ((NO_PARENT, 0), ())
-
-
-# Points within parts.
 
 
 def test_the_parts_around_points():

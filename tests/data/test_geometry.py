@@ -4,7 +4,6 @@ import pytest
 from refref_jax.data.mesh_queries import find_containment
 from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.geometry.triangle_meshes import corner_normals, face_normals
-from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.media import AMBIENT
 from tests.factories.solids import ball, box
 
@@ -122,10 +121,3 @@ def test_colours_reach_the_interfaces(rule):
     np.testing.assert_allclose(interfaces.tint[2], [0.5, 0.8, 0.95], rtol=_SINGLE)
     np.testing.assert_array_equal(interfaces.tint[:2], 1.0)
     np.testing.assert_array_equal(interfaces.absorption, [[0.0] * 3, [0.0] * 3, [0.0, 1.0, 2.0]])
-
-
-@pytest.mark.parametrize("rule", ["nested", "facing", "priority"])
-def test_a_part_alone_is_surrounded_by_air(rule):
-    interfaces = assemble_scene([ball()], [NO_PARENT], rule=rule).interfaces
-    np.testing.assert_array_equal(interfaces.index_outside, [1.0])
-    np.testing.assert_array_equal(interfaces.medium_outside, [AMBIENT])

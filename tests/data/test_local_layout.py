@@ -59,9 +59,6 @@ def scene(tmp_path):
     return write_scene(tmp_path / "cube_smcvx_toy")
 
 
-# The bundled scene.
-
-
 @pytest.fixture
 def rendered(ball_scene):
     return scene_folder.read_frames(ball_scene, "test")
@@ -77,22 +74,6 @@ def test_bundled_splits(ball_scene, split, count):
     distance = np.linalg.norm(cameras.poses[..., 3], axis=1)
     np.testing.assert_allclose(distance, _CAMERA_DISTANCE, rtol=1e-6)
     np.testing.assert_allclose(np.linalg.det(cameras.poses[..., :3]), 1.0, rtol=1e-6)
-
-
-def test_bundled_images_and_masks(rendered):
-    images, masks = scene_folder.read_images(rendered), scene_folder.read_masks(rendered)
-    assert images.shape == (20, 128, 128, 3)
-    assert masks.shape == (20, 128, 128)
-    sine = _BALL_RADIUS / _CAMERA_DISTANCE
-    outline = sine / np.sqrt(1.0 - sine**2) * rendered.cameras.focal
-    np.testing.assert_allclose(masks.sum(axis=(1, 2)), np.pi * outline**2, rtol=0.01)
-
-
-def test_bundled_cameras_look_at_the_ball(rendered):
-    for camera in range(20):
-        rays = image_rays(rendered.cameras, camera)
-        middle = rays.origins[0, 0] + _CAMERA_DISTANCE * rays.directions[63:65, 63:65].mean((0, 1))
-        np.testing.assert_allclose(middle, 0.0, atol=1e-3)
 
 
 def test_float_depth_is_preferred(rendered):
@@ -124,9 +105,6 @@ def test_distances_of_the_ball_are_those_of_a_sphere(rendered):
             distances[camera][head_on], (along - half_chord)[head_on], atol=_FACETS
         )
         assert np.all(distances[camera][~masks[camera]] > _CAMERA_DISTANCE)
-
-
-# A small scene of known values.
 
 
 def test_small_scene_is_read_as_written(scene):
@@ -199,11 +177,6 @@ def test_a_pose_may_be_rounded_to_six_digits(scene):
 def test_missing_transforms_file(scene):
     with scene_error("transforms_val.json", "does not exist", "Give the folder of a scene"):
         scene_folder.read_frames(scene, "val")
-
-
-def test_missing_scene_folder(tmp_path):
-    with scene_error(_JSON, "does not exist", "Give the folder of a scene"):
-        scene_folder.read_frames(tmp_path / "absent", "train")
 
 
 @pytest.mark.parametrize(

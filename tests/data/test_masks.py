@@ -1,9 +1,7 @@
-import json
-
 import numpy as np
 import pytest
 
-from refref_jax.data import SceneError, image_files, scene_folder
+from refref_jax.data import SceneError, scene_folder
 from refref_jax.data.image_files import well_inside, well_outside
 from refref_jax.data.scene_folder import add_masks
 from tests.factories.small_scenes import HEIGHT, WIDTH, edit_transforms, without_masks, write_scene
@@ -85,21 +83,6 @@ def test_images_outside_of_the_scene_are_refused(scene, tmp_path, name):
     edit_transforms(scene, lambda content: content["frames"][0].update(file_path=name))
     with pytest.raises(SceneError, match="is not in the scene's folder"):
         add_masks(scene, tmp_path / "copy", _one_pixel)
-
-
-def test_a_scene_without_masks_says_where_to_get_them(scene):
-    with pytest.raises(SceneError, match=r"docs/masks\.md"):
-        scene_folder.read_masks(scene_folder.read_frames(scene, "train"))
-
-
-def test_the_example_of_the_document_names_files_as_they_are_read(scene, tmp_path):
-    add_masks(scene, tmp_path / "copy", _one_pixel)
-    record = json.loads((tmp_path / "copy" / "transforms_train.json").read_text())["frames"][0]
-    assert (record["file_path"], record["mask_file_path"]) == (
-        "./train/r_000",
-        "./mask/train/r_000.png",
-    )
-    assert image_files.read_mask(tmp_path / "copy" / record["mask_file_path"]).sum() == 1
 
 
 def _masks():

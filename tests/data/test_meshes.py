@@ -63,9 +63,6 @@ def _index(scene, indices=None):
     return part.index
 
 
-# Materials.
-
-
 @pytest.mark.parametrize(
     ("name", "index"),
     [
@@ -297,11 +294,6 @@ def test_a_colour_that_is_none(make_scene, key, value):
         meshes.read_meshes(_described(make_scene, **{key: value}))
 
 
-def test_a_surface_adds_no_light(make_scene):
-    with scene_error("colour_per_interface", "from 0 to 1", "adds light"):
-        meshes.read_meshes(_described(make_scene, colour_per_interface=[1.0, 1.01, 1.0]))
-
-
 @pytest.mark.parametrize("value", [0, -1.5, np.nan, np.inf, "1.5", None, True, [1.5]], ids=str)
 def test_an_index_of_scene_json_that_is_none(make_scene, value):
     with scene_error("scene.json", "cup_glass.ply", "ior_inside", "Give a positive number"):
@@ -317,16 +309,6 @@ def test_a_priority_that_is_none(make_scene, value):
 def test_shading_is_true_or_false(make_scene):
     with scene_error("smooth_normals", "'false'", "Give true or false"):
         meshes.read_meshes(_described(make_scene, smooth_normals="false"))
-
-
-def test_bundled_ball(ball_scene):
-    [part] = meshes.read_meshes(ball_scene)
-    assert (part.name, part.index, part.shading) == ("ball_body_glass", 1.5, "smooth")
-    assert part.faces.shape == (46080, 3)
-    np.testing.assert_allclose(np.linalg.norm(part.vertices, axis=1), 1.4, rtol=1e-6)
-
-
-# Mesh files.
 
 
 @pytest.mark.parametrize("encoding", ["binary", "ascii"])
@@ -416,11 +398,6 @@ def test_a_file_that_is_no_mesh(ply):
         meshes.read_mesh(ply)
 
 
-def test_a_missing_mesh(ply):
-    with scene_error(ply.name):
-        meshes.read_mesh(ply)
-
-
 @pytest.mark.parametrize("face", ["3 0 1 4", "3 0 1 -1"])
 def test_a_face_that_refers_to_no_vertex(ply, face):
     with scene_error(ply.name, "again"):
@@ -435,10 +412,3 @@ def test_a_vertex_that_is_not_finite(ply, value):
     ply.write_bytes(_ply(part._replace(vertices=vertices)))
     with scene_error(ply.name, "not finite", "Clean the mesh"):
         meshes.read_mesh(ply)
-
-
-def test_a_broken_mesh_breaks_the_scene(make_scene):
-    scene = make_scene("a_glass.ply", "b_glass.ply")
-    truncate(scene / "meshes" / "b_glass.ply")
-    with scene_error("b_glass.ply", "export it again"):
-        meshes.read_meshes(scene)

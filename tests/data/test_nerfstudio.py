@@ -7,7 +7,7 @@ import pytest
 
 from refref_jax.data import SceneError
 from refref_jax.data.nerfstudio import capture as nerfstudio
-from refref_jax.geometry.cameras import Cameras, image_rays
+from refref_jax.geometry.cameras import Cameras
 from tests.factories.small_captures import FOCAL, HEIGHT, LENS, WIDTH, edit, pose_of, write_capture
 
 
@@ -175,13 +175,3 @@ def test_what_is_written_is_read_again(capture, other):
     np.testing.assert_array_equal(read.frames[1].pose, pose_of(2)[:3])
     assert read.frames[3].intrinsics == (other, other, 6.0, 5.0, WIDTH, HEIGHT)
     assert all(frame.mask is None for frame in read.frames)
-
-
-def test_our_rays_are_those_of_a_pinhole_with_that_principal_point():
-    # nerfstudio: ((column + 0.5 - cx) / fl_x, -(row + 0.5 - cy) / fl_y, -1), turned by the pose.
-    rays = image_rays(_cameras(WIDTH, FOCAL), 0)
-    row, column = 2, 9
-    expected = pose_of(1)[:3, :3] @ [(column + 0.5 - 6.0) / 9.0, -(row + 0.5 - 5.0) / 9.0, -1.0]
-    np.testing.assert_allclose(
-        rays.directions[row, column], expected / np.linalg.norm(expected), atol=1e-6
-    )

@@ -6,7 +6,7 @@ import pytest
 from refref_jax.data import parquet_scenes, scene_folder
 from refref_jax.data.parquet_scenes import METADATA_KEY, Contents
 from refref_jax.geometry.cameras import focal_length, planar_depth_to_distance
-from tests.factories.small_parquet import row, write_copy
+from tests.factories.small_parquet import write_copy
 from tests.factories.small_scenes import HEIGHT, WIDTH, truncate
 from tests.laws.expectations import scene_error
 
@@ -45,14 +45,6 @@ def test_three_hundred_rows_are_three_splits(tmp_path):
         secant = planar_depth_to_distance(cameras, np.ones((1, HEIGHT, WIDTH)))[0, 2, 3]
         distances = scene_folder.read_distances(frames)[:, 2, 3]
         np.testing.assert_allclose(distances, depth * secant, rtol=1e-6)
-
-
-def test_images_are_unpacked_byte_for_byte(tmp_path):
-    scene = _unpack(write_copy(tmp_path, rows=9), tmp_path)
-    assert (scene / "val" / "r_002.png").read_bytes() == row(5)["image"]["bytes"]
-    assert (scene / "mask" / "test" / "r_002.png").read_bytes() == row(8)["mask"]["bytes"]
-    assert (scene / "depth" / "train" / "r_000.png").read_bytes() == row(0)["depth"]["bytes"]
-    assert len([path for path in scene.rglob("*") if path.is_file()]) == 3 * 9 + 3
 
 
 def test_metadata_tells_splits_and_field_of_view(tmp_path):

@@ -325,9 +325,6 @@ def test_without_copy_and_client(tmp_path, monkeypatch):
         open_scene(_SOURCE, copies=[], cache=tmp_path)
 
 
-# The raw release.
-
-
 def test_a_folder_of_the_raw_release_finds_the_published_meshes(tmp_path):
     scene = write_scene(tmp_path / "image_data/environment_map_scene/single-convex/ball_hdr")
     for name in ("ball_glass", "ball_coloured_glass", "ball_glass_est", "cube_glass"):

@@ -86,22 +86,6 @@ def test_without_pytorch_it_is_said_what_to_do(monkeypatch, path):
         convert_lpips.read_state_dict(path.with_name("nowhere.pth"))
 
 
-def test_files_of_pytorch_itself(tmp_path):
-    torch = pytest.importorskip("torch")
-    alexnet, _ = made_lpips.state_dicts()
-    for form in (True, False):
-        path = tmp_path / f"{form}.pth"
-        tensors = {name: torch.nn.Parameter(torch.tensor(x)) for name, x in alexnet.items()}
-        torch.save(tensors, path, _use_new_zipfile_serialization=form)
-        found = convert_lpips.read_state_dict(path)
-        assert list(found) == list(alexnet)
-        for name, x in alexnet.items():
-            np.testing.assert_array_equal(found[name], x)
-    torch.save({"model": torch.nn.Linear(2, 2)}, path)
-    with pytest.raises(ValueError, match="more than tensors"):
-        convert_lpips.read_state_dict(path)
-
-
 def test_the_command_makes_a_file_that_lpips_reads(tmp_path):
     alexnet, linear = made_lpips.state_dicts()
     np.savez(tmp_path / "a.npz", **alexnet, **{"classifier.1.bias": np.zeros(4)})

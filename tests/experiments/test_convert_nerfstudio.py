@@ -77,22 +77,6 @@ def test_the_command_both_ways(folder, tmp_path):
             np.testing.assert_array_equal(read(after), read(before))
 
 
-@pytest.mark.parametrize(
-    ("option", "message"),
-    [
-        ("--centre=1,2", "Give x,y,z"),
-        ("--centre=1,2,x", "has 'x', which is not a finite number"),
-        ("--scale=-1", "Give a positive number, or auto"),
-        ("--source=nowhere", "nowhere is not a folder"),
-    ],
-)
-def test_mistakes_end_with_one_line(folder, tmp_path, option, message):
-    options = (f"--source={folder}", f"--out={tmp_path / 'out'}", option)
-    result = run_command("convert_nerfstudio", *options, fails=True)
-    assert message in result.stderr and len(result.stderr.strip().splitlines()) == 1
-    assert not (tmp_path / "out").exists()
-
-
 def test_the_original_world_is_that_of_before_the_applied_transform(folder):
     motion = [[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]  # what ns-process-data does
     edit(folder, lambda content: content.update(applied_transform=motion, applied_scale=2.0))

@@ -82,21 +82,6 @@ def test_distances_are_compared_if_both_folders_hold_them(folders, masks):
     assert image_folders.summarise(alone)["distance_mae"] == 0.5
 
 
-def test_a_table_has_a_line_for_each_image_and_one_for_the_mean(folders):
-    rows = [
-        {"name": "a", "psnr": 20.0, "ssim": None, "distance_mae": None},
-        {"name": "long", "psnr": np.inf, "ssim": 0.5, "distance_mae": None},
-        {"name": "d", "psnr": None, "ssim": None, "distance_mae": None},
-    ]
-    assert image_folders.table(rows).splitlines() == [
-        "name     psnr    ssim",
-        "a     20.0000       -",
-        "long      inf  0.5000",
-        "d           -       -",
-        "mean      inf  0.5000",
-    ]
-
-
 def _emptied(rendered, target):
     for path in target.iterdir():
         path.unlink()

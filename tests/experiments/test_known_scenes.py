@@ -133,22 +133,17 @@ def test_the_curve_has_a_row_for_every_setting(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("command", "option", "message"),
+    ("option", "message"),
     [
-        ("render_known", "--scene=nowhere", "nowhere/transforms_train.json does not exist"),
-        ("render_known", "--rays_per_pixel=5", "square"),
-        ("render_known", "--views=0,99", "no view 99"),
-        ("render_known", "--cut=1.5", "min_throughput"),
-        ("render_known", "--out=README.md/x", "README.md"),
-        ("path_trade_off", f"--scenes={_SCENE},nowhere", "nowhere"),
-        ("path_trade_off", "--cuts=a", "list of numbers"),
+        ("--rays_per_pixel=5", "square"),
+        ("--views=0,99", "no view 99"),
+        ("--out=README.md/x", "README.md"),
     ],
 )
-def test_mistakes_end_with_one_line_before_anything_is_written(tmp_path, command, option, message):
-    scenes = "--scene" if command == "render_known" else "--scenes"
-    given = {scenes: _SCENE, "--out": tmp_path / "out"} | dict([option.split("=", 1)])
+def test_mistakes_end_with_one_line_before_anything_is_written(tmp_path, option, message):
+    given = {"--scene": _SCENE, "--out": tmp_path / "out"} | dict([option.split("=", 1)])
     words = [f"{name}={value}" for name, value in given.items()]
-    refused = run_command(command, *words, fails=True)
+    refused = run_command("render_known", *words, fails=True)
     assert message in refused.stderr and "Traceback" not in refused.stderr
     assert len(refused.stderr.strip().splitlines()) == 1
     assert "Compiling" not in refused.stdout

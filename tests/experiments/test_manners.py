@@ -111,6 +111,7 @@ _MISTAKES = {
     "path_trade_off": {
         "--out=OUT --scenes=SCENE,nowhere": "nowhere/transforms_train.json does not exist",
         "--out=OUT --scenes=SCENE --cuts=2": "Give 0.02 for 2 %",
+        "--out=OUT --scenes=SCENE --cuts=a": "list of numbers",
         "--out=OUT --scenes=SCENE --ior=glass=x": "Write as in --ior=glass=1.52.",
         "--out=OUT --scenes=SCENE --views=a": "as in --views=0,10,20",
         "--out=OUT --scenes=SCENE --properties=OVERLAY": "overlay.json: rul is not a known key.",
@@ -126,6 +127,8 @@ _MISTAKES = {
     },
     "view": {
         "--run=x --heights=2,1": "increasing integers",
+        "--run=x --heights=36": "--heights=36 are not",
+        "--run=x --heights=small,large": "--heights=36,90,180",
         "--run=nowhere": "nowhere/config.json does not exist",
     },
     "export": {
@@ -141,6 +144,7 @@ _MISTAKES = {
     },
     "trade_off": {
         "--out=OUT --scene=x --steps=0,1": "Give 1 or more.",
+        "--out=OUT --scene=x --steps=many": "list of numbers",
         "--out=OUT --scene=nowhere": "nowhere/transforms_train.json does not exist",
     },
     "recommend": {"--scene=nowhere --minutes=1": "nowhere/transforms_train.json does not exist"},
@@ -155,13 +159,19 @@ _MISTAKES = {
         "--out=OUT --scenes=LIST": "list.json: scene 1: 'rul' is not a known key. Write 'rule'",
     },
     "dataset.convert": {"--scene=nowhere --to=raw --out=OUT": "nowhere is not a folder."},
-    "dataset.make": {"--out=OUT --scenes=cube_smcvx_bal": "Did you mean cube_smcvx_ball"},
+    "dataset.make": {
+        "--out=OUT --scenes=cube_smcvx_bal": "Did you mean cube_smcvx_ball",
+        "--out=OUT --blender=nowhere": "make dataset-env",
+        "--out=": "flag --out=: Give a path to write to.",
+    },
     "dataset.check": {
         "x --cut=2": "Give 0.02 for 2 %",
         "nowhere": "nowhere is not a folder.",
     },
     "convert_nerfstudio": {
         "--source=x --out=OUT --scale=-1": "Give a positive number",
+        "--source=x --out=OUT --centre=1,2": "Give x,y,z",
+        "--source=x --out=OUT --centre=1,2,x": "has 'x', which is not a finite number",
         "--source=nowhere --out=OUT": "nowhere is not a folder.",
     },
 }

@@ -65,12 +65,6 @@ def test_a_stored_notebook_tells_nothing_of_the_machine_that_ran_it(path):
             assert not re.search("Warning|WARNING|Traceback", text), text
 
 
-def test_the_check_for_folders_of_a_machine_finds_them():
-    assert _ABSOLUTE.search("Run: /home/somebody/runs")
-    assert _ABSOLUTE.search("open('/tmp/x/y.png')")
-    assert not _ABSOLUTE.search("runs/ball (https://arxiv.org/abs/2505.05848), 1/2")
-
-
 def test_all_notebooks_begin_with_the_same_cell():
     first = {"".join(_code(param.values[0])[0]["source"]) for param in _STORED}
     assert len(first) == 1

@@ -112,8 +112,7 @@ def test_what_is_told_can_be_pasted(tmp_path):
     train = f"python -m experiments.train --scene={tmp_path / 'ball'} --out=runs/ball"
     assert f"{train} --preset=tiny --steps=1000" in text
     assert "experiments.evaluate --run=runs/ball --split=test --rays_per_pixel=4" in text
-    assert "1.3 minutes, 25.0 dB inside the mask on cube_smcvx_ball" in text
-    assert "no better single point" in text and "takes less time" in text
+    assert "1.3 minutes, 25.0 dB" in text
 
 
 def test_a_missing_table_is_named(tmp_path):

@@ -89,10 +89,6 @@ def test_a_grid_of_one_level_has_its_coarsest_resolution():
     assert hash_grid.resolutions(config) == [7]
 
 
-def test_a_point_has_the_features_of_all_levels():
-    assert _at(_POSITIONS).shape[-1] == _CONFIG.levels * _CONFIG.features
-
-
 @pytest.mark.parametrize(
     "wrong",
     [{"levels": 0}, {"features": 0}, {"base_res": 0}, {"base_res": 20}, {"max_res": 2}],
@@ -158,42 +154,10 @@ def test_features_of_blurred_points_against_a_loop():
     np.testing.assert_allclose(got, expected, atol=_BLENDING)
 
 
-@pytest.mark.parametrize("vertex", [(0, 0, 0), (3, 3, 3), (0, 3, 1), (2, 1, 3)])
-def test_a_vertex_has_the_features_of_its_entry(vertex):
-    table = np.asarray(hash_grid.tables(_parameters())[0])
-    x, y, z = vertex
-    got = _at([np.array(vertex) / 3.0])[0, :2]
-    np.testing.assert_allclose(got, table[x + 4 * (y + 4 * z)], atol=_BLENDING)
-
-
-def test_the_middle_of_a_cell_has_the_mean_of_its_corners():
-    table = np.asarray(hash_grid.tables(_parameters())[0])
-    corners = [x + 4 * (y + 4 * z) for x, y, z in itertools.product((1, 2), repeat=3)]
-    got = _at([[0.5, 0.5, 0.5]])[0, :2]
-    np.testing.assert_allclose(got, table[corners].mean(axis=0), atol=_BLENDING)
-
-
-def test_features_are_continuous_across_cells():
-    for resolution in _RESOLUTIONS:
-        border = (resolution // 2) / resolution
-        sides = [[border - 1e-6, 0.3, 0.7], [border + 1e-6, 0.3, 0.7]]
-        before, after = np.asarray(_at(sides))
-        np.testing.assert_allclose(before, after, atol=1e-3)
-
-
-def test_equal_entries_give_the_same_features_everywhere():
-    params = jax.tree.map(lambda x: jnp.full_like(x, 0.7), _parameters())
-    got = _features(params, jnp.asarray(_POSITIONS), jnp.zeros(len(_POSITIONS)))
-    np.testing.assert_allclose(got, 0.7, atol=_BLENDING)
-
-
 def test_a_position_that_rounding_left_outside_the_cube_is_finite():
     outside = np.nextafter(np.float32([0.0, 1.0]), np.float32([-1.0, 2.0]))
     positions = np.array(list(itertools.product(outside, repeat=3)))
     np.testing.assert_allclose(_at(positions), _at(np.round(positions)), atol=_BLENDING)
-
-
-# --- fading ---
 
 
 @pytest.mark.parametrize("resolution", [1, 16, 8192])
@@ -204,11 +168,6 @@ def test_fading_follows_the_error_function(resolution):
     np.testing.assert_allclose(got, expected, rtol=2e-6)
 
 
-def test_fading_by_hand():
-    # A Gaussian of half a cell's width: erf(1 / sqrt(2)), the share within one deviation.
-    np.testing.assert_allclose(hash_grid.fading(jnp.float32(0.05), 10), 0.6826895, rtol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("scale", "expected"), [(0.0, 1.0), (1e-30, 1.0), (1e10, 0.0), (1e30, 0.0)]
 )
@@ -217,26 +176,6 @@ def test_fading_at_its_ends(scale, expected):
     np.testing.assert_allclose(value, expected, atol=1e-10)
     assert slope == 0.0 or scale > 1.0
     assert np.isfinite(slope)
-
-
-def test_fading_falls_as_the_gaussian_grows():
-    scales = jnp.asarray(np.geomspace(1e-4, 1e4, 100), jnp.float32)
-    faded = np.asarray(jax.vmap(lambda s: hash_grid.fading(s, 64))(scales))
-    assert (np.diff(faded) <= 0.0).all() and ((faded >= 0.0) & (faded <= 1.0)).all()
-
-
-def test_a_blurred_point_loses_the_fine_levels_first():
-    sharp, blurred = np.asarray(_at([[0.3, 0.6, 0.1]] * 2, [0.0, 0.1]))
-    kept = blurred / sharp
-    np.testing.assert_allclose(kept[0::2], kept[1::2], rtol=1e-4)
-    assert (np.diff(kept[0::2]) < 0.0).all()
-
-
-def test_a_huge_gaussian_sees_nothing():
-    np.testing.assert_allclose(_at(_POSITIONS, np.full(len(_POSITIONS), 1e30)), 0.0, atol=1e-10)
-
-
-# --- multisamples ---
 
 
 def _multisamples(count, seed=0):
@@ -263,9 +202,6 @@ def test_multisamples_share_their_tables():
     assert jax.tree.map(jnp.shape, one) == jax.tree.map(jnp.shape, six)
 
 
-# --- tables ---
-
-
 def test_tables_are_all_found_in_order():
     tables = hash_grid.tables(_parameters())
     assert [table.shape for table in tables] == [(64, 2), (216, 2), (256, 2), (256, 2)]
@@ -282,9 +218,6 @@ def test_tables_start_small_and_even():
     entries = np.concatenate([np.ravel(table) for table in hash_grid.tables(params)])
     assert abs(entries).max() <= 1e-4 and abs(entries.mean()) < 1e-5
     np.testing.assert_allclose(entries.std(), 1e-4 / np.sqrt(3.0), rtol=0.1)
-
-
-# --- gradients and transformations ---
 
 
 @jax.jit

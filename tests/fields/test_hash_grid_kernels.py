@@ -63,9 +63,6 @@ def _pull(table, points, slopes, *, level, precision="float32"):
     return jax.grad(total)(table)
 
 
-# --- values and gradients ---
-
-
 @_LEVEL
 @_POINTS
 def test_values_and_gradients_against_a_matrix(level, kind):
@@ -76,15 +73,6 @@ def test_values_and_gradients_against_a_matrix(level, kind):
     slopes = np.random.default_rng(2).normal(size=(len(points), _FEATURES))
     got = _pull(single(table), single(points), single(slopes), level=level)
     np.testing.assert_allclose(got, matrix.T @ slopes, atol=_BLENDING)
-
-
-@_LEVEL
-def test_points_in_one_place_add_up(level):
-    points = np.repeat(_points("anywhere", 1), 50, axis=0)
-    ones = np.ones((50, _FEATURES))
-    got = _pull(single(_table(level)), single(points), single(ones), level=level)
-    np.testing.assert_allclose(got, _matrix(level, points).T @ ones, rtol=1e-5, atol=_BLENDING)
-    np.testing.assert_allclose(np.sum(got), 50 * _FEATURES, rtol=1e-5)
 
 
 @_LEVEL
@@ -186,9 +174,6 @@ def test_other_devices_get_plain_operations(platform):
     pull = jax.jit(functools.partial(_pull, level="dense"))
     text = pull.trace(*arguments).lower(lowering_platforms=(platform,)).as_text()
     assert "stablehlo.scatter" in text and "stablehlo.while" not in text
-
-
-# --- bfloat16 ---
 
 
 @_LEVEL

@@ -1,7 +1,6 @@
 """Kinds of field, and that one more is a module and a line of the registry."""
 
 import dataclasses
-import itertools
 import json
 from typing import Literal
 
@@ -23,9 +22,6 @@ from refref_jax.training.presets import PRESETS, Bounds, loss, override_model, s
 from tests.factories import scenes, small_model
 
 _BOUNDS = Bounds(near=0.05, far=16.0, radius=7.3, space="bounded")
-
-
-# --- a third kind: a fog of one colour, which knows no hash grid ---
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,11 +145,3 @@ def test_nerfacto_has_its_published_size():
         assert (each.width, each.grid.levels, each.grid.hashmap_size) == (16, 5, 2**17)
         assert (each.grid.features, each.grid.base_res) == (2, 16)
     assert size.samples == (256, 96, 48) and size.multisamples == 1
-
-
-def test_the_sizes_of_nerfacto_grow():
-    sizes = [nerfacto.KIND.sizes[name] for name in ("tiny", "small", "paper")]
-    for small, large in itertools.pairwise(sizes):
-        assert all(a < b for a, b in zip(small.samples, large.samples, strict=True))
-        assert small.field.grid.levels <= large.field.grid.levels
-    assert nerfacto.KIND.sizes["best"].field.precision == "bfloat16"

@@ -134,15 +134,6 @@ def sample_intervals(u, edges, weights):
     return np.array([first, *inner, last])
 
 
-def height_at(x, edges, heights):
-    """Returns the value of a step function at a point, 0 outside its edges."""
-    edges, heights = _wide(edges, heights)
-    for low, high, height in zip(edges[:-1], edges[1:], heights, strict=True):
-        if low <= x < high:
-            return height
-    return 0.0
-
-
 def dilated_height(x, edges, weights, amount):
     """Returns the greatest height of a bin within `amount` of a point."""
     edges, weights = _wide(edges, weights)

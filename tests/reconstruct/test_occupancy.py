@@ -45,9 +45,6 @@ def _fitted():
     return grid, reports
 
 
-# --- the field ---
-
-
 def test_an_untrained_field_is_a_ball():
     params = occupancy_field.init(jax.random.key(0), _FIELD)
     points = jax.random.uniform(jax.random.key(1), (50, 3))

@@ -7,7 +7,6 @@ import pytest
 
 from refref_jax.reconstruct.occupancy_field import (
     Chord,
-    Scan,
     at,
     cross_entropy,
     logit_along,
@@ -35,12 +34,6 @@ def _ball(position, *, radius=0.25):
 def test_weights_are_known_by_hand():
     found = weights(single([0.5, 0.0, 0.5, 1.0, 0.7]))
     np.testing.assert_allclose(found, [0.5, 0.0, 0.25, 0.25, 0.0], atol=1e-7)
-
-
-def test_weights_sum_to_what_is_not_let_through():
-    occupancies = np.random.default_rng(0).uniform(size=(50, 7)).astype(np.float32)
-    found = jax.vmap(weights)(jax.device_put(occupancies))
-    np.testing.assert_allclose(found.sum(axis=1), 1.0 - np.prod(1.0 - occupancies, axis=1), 1e-5)
 
 
 @pytest.mark.parametrize("samples", [1, 2, 5])
@@ -159,9 +152,3 @@ def test_gradients_reach_the_field_and_none_flow_through_the_scan():
         return looked(functools.partial(_ball, radius=radius)).deepest
 
     assert jax.grad(deepest)(_one(0.25)) == 0.0
-
-
-def test_records_keep_their_shapes_under_vmap():
-    shifts = jnp.asarray([0.1, 0.9], jnp.float32)
-    found = jax.vmap(lambda shift: scan(_ball, _chord(), shift, samples=8))(shifts)
-    assert isinstance(found, Scan) and found.deepest.shape == (2,)

@@ -123,13 +123,6 @@ def test_the_hull_of_a_ball_is_little_more_than_the_ball():
     assert _volume(carve(masks, cameras, resolution=48, box=_BOX)) == pytest.approx(_BALL, rel=0.03)
 
 
-def test_more_views_carve_no_less():
-    masks, cameras = _ball_views()
-    some = cameras._replace(poses=cameras.poses[:10])
-    points = np.random.default_rng(2).uniform(-1.5, 1.5, (500, 3))
-    assert np.all(hull_field(masks, cameras)(points) >= hull_field(masks[:10], some)(points))
-
-
 def test_the_hole_of_a_torus_stays_open():
     cameras = bodies.cameras_around(40)
     grid = carve(bodies.masks_of(bodies.torus, cameras), cameras, resolution=48)
@@ -147,16 +140,6 @@ def test_one_bad_mask_is_passed_over():
     assert kept == pytest.approx(_BALL, rel=0.06)
     # What it costs where no mask is bad.
     assert _BALL * 1.1 > _volume(carve(masks, cameras, resolution=48, outliers=1)) > _BALL
-
-
-def test_masks_eroded_by_a_pixel_shrink_the_body_by_a_pixel():
-    from scipy.ndimage import binary_erosion
-
-    masks, cameras = _ball_views()
-    eroded = np.stack([binary_erosion(mask) for mask in masks])
-    # Of a diamond: a pixel along the axes, and 0.7 between them.
-    radius = np.cbrt(_volume(carve(eroded, cameras, resolution=48)) / _BALL)
-    assert 1.0 - 1.2 * 4.0 / cameras.focal < radius < 1.0 - 0.6 * 4.0 / cameras.focal
 
 
 def test_errors_say_what_to_do():

@@ -105,7 +105,4 @@ def test_the_table_says_number_status_and_weights():
     assert "**4 light paths**" in table
     assert "| 1 | 80.00 % | 0.800, 0.800, 0.800 | 0 | left the objects |" in table
     assert table.count("\n| ") == 4 and "and 1 more, 1 % together" in table
-    assert "1 % of the throughput was dropped" in table
-    one = pixel_paths.describe(_made([1.0])._replace(dropped=np.zeros(3)))
-    assert "**1 light path**" in one and "ran out of bends" in one and "room" not in one
     assert set(pixel_paths.ENDINGS) == set(PathStatus) - {PathStatus.EMPTY}

@@ -71,9 +71,6 @@ def _encoded(linear):
     return np.array([reference_sampling.linear_to_srgb(x) for x in linear])
 
 
-# --- blending ---
-
-
 def test_the_paths_of_a_ray_are_blended_by_their_weights_in_linear_space():
     paths = _paths()
     seen = _render(paths)
@@ -103,41 +100,12 @@ def test_empty_slots_have_no_effect():
     np.testing.assert_array_equal(_render(garbage).rgb, _render(paths).rgb)
 
 
-def test_the_order_of_paths_does_not_matter():
-    paths = _paths()
-    order = np.array([5, 2, 1, 4, 0, 3])
-    shuffled = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[order]), paths)
-    np.testing.assert_allclose(_render(shuffled).rgb, _render(paths).rgb, atol=_COLOUR)
-
-
-def test_splitting_a_path_into_two_halves_changes_nothing():
-    paths = _paths()
-    copied = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[[0, 1, 2, 3, 0, 5]]), paths)
-    share = np.array(copied.throughput)
-    share[[0, 4]] *= 0.5
-    halves = copied._replace(throughput=jnp.asarray(share))
-    np.testing.assert_allclose(_render(halves).rgb, _render(paths).rgb, atol=_COLOUR)
-
-
 def test_colours_are_not_clipped():
     paths = _paths()
     bright = paths._replace(throughput=10.0 * paths.throughput)
     assert (_render(bright).rgb[1] > 1.0).any()
     dark = _render(paths._replace(throughput=-1.0 * paths.throughput)).rgb[1]
     np.testing.assert_allclose(dark, -12.92 * _render(paths).paths.composite.rgb[1], atol=_COLOUR)
-
-
-def test_rendering_is_linear_in_the_weights():
-    paths = _paths()
-    zero = _render(paths._replace(throughput=0.0 * paths.throughput)).rgb
-    np.testing.assert_array_equal(zero, np.zeros((_RAYS, 3)))
-
-
-def test_rendering_without_jitter_is_deterministic():
-    np.testing.assert_array_equal(_render(_paths()).rgb, _render(_paths()).rgb)
-
-
-# --- jitter ---
 
 
 def test_no_jitter_is_zero():
@@ -177,14 +145,6 @@ def test_the_jitter_of_a_slot_knows_nothing_of_the_others():
     for each, of_all in zip(part, whole, strict=True):
         np.testing.assert_array_equal(each, np.asarray(of_all)[[7, 2, 11]])
 
-
-def test_jitter_changes_the_picture_a_little():
-    still, moved = _render(_paths()).rgb, _render(_paths(), _draw(0, 6)).rgb
-    assert not np.array_equal(still, moved)
-    assert np.isfinite(moved).all()
-
-
-# --- gradients ---
 
 _LOSSES = ("colour", "interlevel", "distortion", "hash decay")
 

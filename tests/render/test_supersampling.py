@@ -87,8 +87,3 @@ def test_bands_of_rows_make_the_same_picture(model):
     assert banded.rgb.shape == (16, 16, 3) and banded.distance.shape == (16, 16)
     for ours, expected in zip(banded, images.average(fine, 2), strict=True):
         np.testing.assert_allclose(ours, expected, atol=2e-5)
-
-
-def test_rays_that_make_no_square_grid_are_refused(model):
-    with pytest.raises(ValueError, match=r"8 rays a pixel .* Give 4 or 9"):
-        render_camera(model, CAMERAS, 0, rays_per_pixel=8)

@@ -112,35 +112,6 @@ def test_unused_segments_may_hold_anything():
             np.testing.assert_array_equal(a, b)
 
 
-def test_whole_path_counts_in_arc_length():
-    path = made_paths.random_path(2, bends=4, segments=_SEGMENTS)
-    line, t = _whole(path), np.linspace(0.0, 20.0, 40, dtype=np.float32)
-    np.testing.assert_array_equal(line.knots, path.tau)
-    np.testing.assert_allclose(_at(line, t).arc, t, atol=_DISTANCE)
-
-
-def test_a_path_is_as_long_as_the_way_along_it():
-    line = _whole(made_paths.random_path(3, bends=5, segments=_SEGMENTS))
-    t = np.linspace(0.0, 20.0, 4001, dtype=np.float32)
-    steps = np.diff(np.asarray(_at(line, t).position, np.float64), axis=0)
-    # Corners that are cut short make the chain a little shorter.
-    np.testing.assert_allclose(np.linalg.norm(steps, axis=-1).sum(), 20.0, rtol=2e-3)
-
-
-# --- only the way outside ---
-
-
-def test_outside_path_by_hand():
-    line = _outside(_elbow())
-    np.testing.assert_array_equal(line.knots[:3], [0.0, 2.0, 2.0])
-    seen = _at(line, [1.0, 2.0, 3.5])
-    np.testing.assert_allclose(
-        seen.position, [[1.0, 0.0, 0.0], [2.0, 3.0, 0.0], [2.0, 3.0, 1.5]], atol=_DISTANCE
-    )
-    np.testing.assert_allclose(seen.arc, [1.0, 5.0, 6.5], atol=_DISTANCE)
-    assert seen.outside.all()
-
-
 @pytest.mark.parametrize("bends", [0, 1, 2, 4, 6])
 def test_outside_path_against_a_slow_walk(bends):
     path = made_paths.random_path(bends, bends=bends, segments=_SEGMENTS)
@@ -173,46 +144,15 @@ def _many_outside_paths(paths):
     return lines, jax.vmap(near_knots)(lines)
 
 
-def _paths_in_and_out():
-    return made_paths.stack(
+def test_no_sample_of_an_outside_path_lies_inside():
+    paths = made_paths.stack(
         made_paths.random_path(seed, bends=6, segments=_SEGMENTS) for seed in range(_MANY)
     )
-
-
-def test_outside_path_has_knots_that_never_decrease():
-    lines, _ = _many_outside_paths(_paths_in_and_out())
-    used = np.asarray(lines.knots)[:, :7]
-    assert (np.diff(used, axis=-1) >= 0.0).all()
-
-
-def test_outside_path_gives_inner_segments_no_length_at_all():
-    lines, _ = _many_outside_paths(_paths_in_and_out())
-    knots = np.asarray(lines.knots)
+    lines, outside = _many_outside_paths(paths)
+    knots = np.asarray(lines.knots)[:, :7]
+    assert (np.diff(knots, axis=-1) >= 0.0).all()
     np.testing.assert_array_equal(knots[:, [1, 3, 5]], knots[:, [2, 4, 6]])
-
-
-def test_no_sample_of_an_outside_path_lies_inside():
-    _, outside = _many_outside_paths(_paths_in_and_out())
     assert outside.all()
-
-
-def test_outside_path_finds_the_same_points_as_the_whole_path():
-    path = made_paths.random_path(7, bends=6, segments=_SEGMENTS)
-    t = np.linspace(0.0, 12.0, 50, dtype=np.float32)
-    skipping = _at(_outside(path), t)
-    walking = _at(_whole(path), skipping.arc)
-    np.testing.assert_allclose(skipping.position, walking.position, atol=_DISTANCE)
-    np.testing.assert_allclose(skipping.arc, walking.arc, atol=_DISTANCE)
-    # The arc is the coordinate plus the way inside that lies behind.
-    tau = np.asarray(path.tau, np.float64)
-    inside = sum((tau[i + 1] - tau[i]) * (np.asarray(skipping.arc) > tau[i]) for i in (1, 3, 5))
-    np.testing.assert_allclose(skipping.arc, t + inside, atol=_DISTANCE)
-
-
-def test_outside_path_of_a_path_that_stays_outside_is_the_whole_path():
-    path = made_paths.random_path(8, bends=4, segments=_SEGMENTS, media=np.zeros(5, int))
-    for a, b in zip(*map(jax.tree.leaves, (_outside(path), _whole(path))), strict=True):
-        np.testing.assert_allclose(a, b, atol=_DISTANCE)
 
 
 def test_the_coordinate_advances_in_the_media_of_chosen_parts_too():
@@ -256,13 +196,6 @@ def test_outside_path_of_a_camera_inside_an_object_starts_at_the_exit():
 
 
 # --- gradients and transformations ---
-
-
-def test_position_moves_along_the_direction():
-    line = _whole(made_paths.random_path(9, bends=4, segments=_SEGMENTS))
-    velocity = jax.jit(jax.vmap(jax.jacfwd(lambda t: polylines.point_at(line, t).position)))
-    t = jnp.linspace(0.0, 15.0, 20)
-    np.testing.assert_allclose(velocity(t), _at(line, t).direction, atol=_DISTANCE)
 
 
 def test_point_at_check_grads():

@@ -1,5 +1,4 @@
 import functools
-import itertools
 
 import jax
 import jax.numpy as jnp
@@ -73,14 +72,16 @@ def test_exit_distance_by_hand(origin, direction, expected):
 
 
 @pytest.mark.parametrize("radius", [1e-3, 7.3, 1e6])
-def test_exit_lies_on_a_face_and_nothing_beyond_it_inside(radius):
+@pytest.mark.parametrize(("space", "order"), [("bounded", np.inf), ("spherical", 2)])
+def test_exit_lies_on_the_bounds(space, order, radius):
     rng = np.random.default_rng(3)
-    domain = Domain(radius=radius, space="bounded")
+    domain = Domain(radius=radius, space=space)
     for _ in range(20):
-        origin, direction = rng.uniform(-radius, radius, size=3), arrays.unit(rng.normal(size=3))
-        t = _exit_distance(domain, *(jnp.asarray(x, jnp.float32) for x in (origin, direction)))
-        end = origin + float(t) * direction
-        np.testing.assert_allclose(np.max(abs(end)), radius, rtol=1e-5)
+        origin = rng.uniform(0.0, radius) * arrays.unit(rng.normal(size=3))
+        direction = arrays.unit(rng.normal(size=3))
+        given = (jnp.asarray(x, jnp.float32) for x in (origin, direction))
+        end = origin + float(_exit_distance(domain, *given)) * direction
+        np.testing.assert_allclose(np.linalg.norm(end, order), radius, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -99,18 +100,6 @@ def test_exit_lies_on_a_face_and_nothing_beyond_it_inside(radius):
 )
 def test_exit_distance_of_a_ball_by_hand(origin, direction, expected):
     _assert_exit(_SPHERICAL, origin, direction, expected)
-
-
-@pytest.mark.parametrize("radius", [1e-3, 7.3, 1e6])
-def test_exit_lies_on_the_sphere(radius):
-    rng = np.random.default_rng(3)
-    domain = Domain(radius=radius, space="spherical")
-    for _ in range(20):
-        origin = rng.uniform(0.0, radius) * arrays.unit(rng.normal(size=3))
-        direction = arrays.unit(rng.normal(size=3))
-        given = (jnp.asarray(x, jnp.float32) for x in (origin, direction))
-        end = origin + float(_exit_distance(domain, *given)) * direction
-        np.testing.assert_allclose(np.linalg.norm(end), radius, rtol=1e-6)
 
 
 def test_gradients_of_an_exit_are_finite_everywhere():
@@ -144,9 +133,6 @@ def test_an_unbounded_scene_is_never_left():
     assert np.isinf(_exit_distance(domain, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])))
 
 
-# --- contraction ---
-
-
 def test_contract_by_hand():
     got = _contract(jnp.array([[0.5, 0.0, 0.0], [0.0, -2.0, 0.0], [0.0, 3.0, 4.0]]))
     np.testing.assert_allclose(
@@ -168,34 +154,6 @@ def test_the_unit_ball_stays_as_it_is(magnitude):
     np.testing.assert_array_equal(_shrinkage(points), np.ones(20))
 
 
-def test_contraction_is_smooth_where_it_starts():
-    inner, outer = _points(1.0 - 1e-6), _points(1.0 + 1e-6)
-    np.testing.assert_allclose(_contract(outer), _contract(inner), atol=4e-6)
-    np.testing.assert_allclose(_shrinkage(outer), _shrinkage(inner), atol=4e-6)
-    jacobian = _JACOBIANS[scene_bounds.contract]
-    # Across the sphere the slope starts to fall like `1 / |x|^2`.
-    np.testing.assert_allclose(jacobian(outer), jacobian(inner), atol=1e-5)
-
-
-@pytest.mark.parametrize("magnitude", [2.0, 1e3, 1e6, 1e30])
-def test_everything_is_contracted_into_the_ball_of_radius_two(magnitude):
-    points = _points(magnitude)
-    contracted = np.asarray(_contract(points), np.float64)
-    norm = np.linalg.norm(contracted, axis=-1)
-    np.testing.assert_allclose(norm, 2.0 - 1.0 / magnitude, rtol=_ROUNDING)
-    along = contracted / norm[:, None]
-    np.testing.assert_allclose(along, np.asarray(points, np.float64) / magnitude, atol=_ROUNDING)
-
-
-def test_contraction_keeps_the_order_of_distances():
-    distances = np.geomspace(1e-3, 1e3, 200)
-    points = jnp.asarray(distances[:, None] * np.array([[0.6, 0.0, 0.8]]), jnp.float32)
-    assert (np.diff(np.linalg.norm(_contract(points), axis=-1)) > 0.0).all()
-
-
-# --- shrinkage ---
-
-
 @pytest.mark.parametrize("magnitude", [1e-3, 0.5, 1.5, 10.0, 1e3, 1e6])
 def test_shrinkage_is_the_cube_root_of_the_jacobians_determinant(magnitude):
     points = np.asarray(_points(magnitude), np.float64)
@@ -204,14 +162,6 @@ def test_shrinkage_is_the_cube_root_of_the_jacobians_determinant(magnitude):
     expected = abs(np.linalg.det(jacobians)) ** (1.0 / 3.0)
     np.testing.assert_allclose(_shrinkage(_points(magnitude)), expected, rtol=1e-5)
 
-
-def test_shrinkage_by_hand():
-    # (2 - 1/2)^(2/3) 2^(-4/3) = (9 / 64)^(1/3).
-    got = _shrinkage(jnp.array([0.0, 2.0, 0.0]))
-    np.testing.assert_allclose(got, (9.0 / 64.0) ** (1.0 / 3.0), rtol=_ROUNDING)
-
-
-# --- the unit cube ---
 
 _BOUNDED, _UNBOUNDED = Domain(2.0, "bounded"), Domain(2.0, "unbounded")
 
@@ -262,22 +212,6 @@ def test_scenes_of_another_size_look_the_same(space):
     large = _cube(Domain(14.0, space), 7.0 * points, 7.0 * scales)
     for a, b in zip(small, large, strict=True):
         np.testing.assert_allclose(a, b, atol=_ROUNDING)
-
-
-@pytest.mark.parametrize("magnitude", [0.5, 3.0, 100.0])
-def test_a_small_ball_keeps_its_volume_in_the_scale(magnitude):
-    # The scale of a contracted Gaussian is the cube root of how its volume changes.
-    centre, size = _points(magnitude, 3)[:1], 1e-3 * magnitude
-    corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * size
-    edges = np.asarray(centre, np.float64) + corners
-    cube = np.array([reference_sampling.contracted(x / 2.0) * 0.25 + 0.5 for x in edges])
-    sides = np.stack([cube[4] - cube[0], cube[2] - cube[0], cube[1] - cube[0]])
-    expected = abs(np.linalg.det(sides)) ** (1.0 / 3.0)
-    got = _cube(_UNBOUNDED, centre, [size]).scales[0]
-    np.testing.assert_allclose(got, expected, rtol=5e-3)
-
-
-# --- gradients and transformations ---
 
 
 @pytest.mark.parametrize("function", [scene_bounds.contract, scene_bounds.shrinkage])
@@ -352,20 +286,6 @@ _to_distance = jax.jit(scene_bounds.to_distance, static_argnums=0)
 _to_unit = jax.jit(scene_bounds.to_unit, static_argnums=0)
 
 
-def _slope(warp, t):
-    """Returns `dt / ds` at a distance."""
-    step = 1e-6 * np.maximum(t, 1e-6 * warp.unit)
-    low, high = (
-        reference_sampling.warped_distance(*warp, x) for x in (t - 0.5 * step, t + 0.5 * step)
-    )
-    return step / (high - low)
-
-
-def _tolerance(warp, t):
-    """Returns how far rounding may move a distance: by way of `s`, and where it is formed."""
-    return _OPERATIONS * _EPSILON * (_slope(warp, t) + t + warp.unit)
-
-
 def _distances(warp, count=200):
     first = warp.near or 1e-6 * warp.unit
     return np.concatenate([[warp.near], np.geomspace(first, warp.far, count)[1:]])
@@ -402,45 +322,9 @@ def test_to_distance_meets_both_ends(warp):
 
 
 @pytest.mark.parametrize("warp", _WARPS)
-def test_to_unit_meets_both_ends(warp):
-    ends = _to_unit(warp, jnp.array([warp.near, warp.far]))
-    np.testing.assert_allclose(ends, [0.0, 1.0], atol=_OPERATIONS * _EPSILON)
-
-
-@pytest.mark.parametrize("warp", _WARPS)
-def test_the_unit_coordinate_survives_a_round_trip(warp):
-    s = jnp.linspace(0.0, 1.0, 1001)
-    back = _to_unit(warp, _to_distance(warp, s))
-    np.testing.assert_allclose(back, s, atol=_OPERATIONS * _EPSILON)
-
-
-@pytest.mark.parametrize("warp", _WARPS)
-def test_distances_survive_a_round_trip(warp):
-    # Beyond 1e4 units one float32 step of `s` is more than a hundredth of the distance.
-    t = _distances(warp)
-    t = t[t < 1e4 * warp.unit]
-    back = np.asarray(_to_distance(warp, _to_unit(warp, jnp.asarray(t, jnp.float32))))
-    assert (abs(back - t) <= _tolerance(warp, t)).all()
-
-
-@pytest.mark.parametrize("warp", _WARPS)
 def test_to_distance_increases(warp):
     t = np.asarray(_to_distance(warp, jnp.linspace(0.0, 1.0, 10001)))
     assert (np.diff(t) > 0.0).all()
-
-
-@pytest.mark.parametrize("warp", _WARPS)
-def test_to_unit_increases(warp):
-    s = np.asarray(_to_unit(warp, jnp.asarray(_distances(warp), jnp.float32)))
-    assert (np.diff(s) >= 0.0).all()
-
-
-def test_equal_steps_grow_from_about_the_scenes_size():
-    warp = DistanceWarp(near=0.05, far=1000.0, unit=2.0)
-    t = np.asarray(_to_distance(warp, jnp.linspace(0.0, 1.0, 1001)))
-    steps = np.diff(t) / (t[1] - t[0])
-    assert steps[np.searchsorted(t, 0.2 * warp.unit)] < 2.0
-    assert steps[np.searchsorted(t, 10.0 * warp.unit)] > 10.0
 
 
 @pytest.mark.parametrize("warp", _WARPS)

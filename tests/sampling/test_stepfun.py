@@ -40,17 +40,8 @@ def _middles(count):
     return (jnp.arange(count, dtype=jnp.float32) + 0.5) / count
 
 
-def _masses(edges, samples_edges):
-    """Returns the share of equally heavy intervals that falls into each bin."""
-    cdf = np.linspace(0.0, 1.0, len(samples_edges))
-    return np.diff(np.interp(edges, np.asarray(samples_edges, np.float64), cdf))
-
-
 # A dozen bins, of which some have no width at all.
 _NARROW = jnp.array([0.0, 0.2, 0.2, 0.2, 0.5, 0.5 + 1e-6, 0.8, 1.0, 1.0])
-
-
-# --- heights ---
 
 
 def test_heights_by_hand():
@@ -58,18 +49,9 @@ def test_heights_by_hand():
     np.testing.assert_allclose(got, [0.5, 0.0, 0.5])
 
 
-def test_heights_times_widths_are_the_weights():
-    edges, weights = _step_function(0)
-    got = _heights(edges, weights) * np.diff(edges)
-    np.testing.assert_allclose(got, weights, rtol=_SUMMATION)
-
-
 def test_heights_have_finite_gradients_where_a_bin_has_no_width():
     total = lambda edges, weights: jnp.sum(stepfun.weight_to_pdf(edges, weights))
     assert gradients.all_finite(jax.grad(total, argnums=(0, 1))(_NARROW, jnp.ones(8)))
-
-
-# --- cumulative ---
 
 
 def test_cumulative_by_hand():
@@ -110,9 +92,6 @@ def test_cumulative_has_finite_gradients(weights):
     assert gradients.all_finite(jax.jit(jax.grad(total))(*singles(weights)))
 
 
-# --- its inverse ---
-
-
 def test_invert_cumulative_by_hand():
     arguments = singles([0.0, 0.25, 0.5, 0.75, 1.0], [0.0, 1.0, 4.0, 6.0], [0.0, 0.5, 0.5, 1.0])
     np.testing.assert_allclose(_invert(*arguments), [0.0, 0.5, 4.0, 5.0, 6.0])
@@ -128,27 +107,10 @@ def test_invert_cumulative_against_a_loop(empty):
     np.testing.assert_allclose(_invert(jnp.asarray(u), edges, cdf), expected, atol=_SUMMATION)
 
 
-def test_invert_cumulative_inverts():
-    edges, weights = _step_function(4)
-    cdf = _cumulative(weights)
-    u = jnp.linspace(0.0, 1.0, 101)
-    back = np.interp(_invert(u, edges, cdf), edges, cdf)
-    np.testing.assert_allclose(back, u, atol=_SUMMATION)
-
-
-def test_invert_cumulative_meets_the_edges():
-    edges, weights = _step_function(5)
-    cdf = _cumulative(weights)
-    np.testing.assert_allclose(_invert(cdf, edges, cdf), edges, atol=_SUMMATION)
-
-
 def test_invert_cumulative_skips_what_is_empty():
     edges, cdf = singles([0.0, 1.0, 2.0, 3.0, 4.0], [0.0, 0.0, 1.0, 1.0, 1.0])
     got = _invert(jnp.array([0.0, 1e-6, 0.5, 1.0 - 1e-6]), edges, cdf)
     np.testing.assert_allclose(got, [1.0, 1.0, 1.5, 2.0], atol=1e-5)
-
-
-# --- sampling ---
 
 
 def test_sample_edges_by_hand():
@@ -166,26 +128,6 @@ def test_sample_edges_against_a_loop(empty, count):
     np.testing.assert_allclose(
         _sample(jnp.asarray(u), edges, weights), expected, atol=2.0 * _SUMMATION
     )
-
-
-def test_sampling_evenly_from_an_even_function_gives_even_intervals():
-    got = _sample(_middles(8), *singles([0.0, 1.0], [0.3]))
-    np.testing.assert_allclose(got, np.linspace(0.0, 1.0, 9), atol=_SUMMATION)
-
-
-@pytest.mark.parametrize("empty", [0, 4])
-def test_many_samples_reproduce_the_weights(empty):
-    edges, weights = _step_function(7, empty=empty)
-    drawn = _sample(_middles(2048), edges, weights)
-    np.testing.assert_allclose(_masses(edges, drawn), weights, atol=2.0 / 2048)
-
-
-def test_sampling_again_from_even_intervals_changes_nothing():
-    edges, weights = _step_function(8)
-    once = _sample(_middles(64), edges, weights)
-    twice = _sample(_middles(64), once, jnp.ones(64))
-    # Only the edges at the ends and the kinks of the function are smoothed.
-    assert np.median(abs(np.asarray(once) - np.asarray(twice))) < 1e-3
 
 
 _HARD_WEIGHTS = [np.zeros(8), *np.eye(8), np.full(8, 1e-30), np.array([1.0, 0, 0, 0, 0, 0, 0, 1])]
@@ -213,12 +155,6 @@ def test_samples_of_random_functions_are_sorted_and_stay_within_the_domain(seed)
     assert (np.diff(drawn, axis=-1) >= -_SUMMATION).all()
 
 
-def test_all_weight_in_one_bin_draws_from_that_bin_only():
-    edges, weights = singles([0.0, 0.3, 0.4, 1.0], [0.0, 7.0, 0.0])
-    drawn = _sample(_middles(8), edges, weights)
-    np.testing.assert_allclose(drawn, np.linspace(0.3, 0.4, 9), atol=_SUMMATION)
-
-
 def test_all_weight_in_a_bin_of_no_width_draws_one_point():
     edges, weights = singles([0.0, 0.3, 0.3, 1.0], [0.0, 7.0, 0.0])
     np.testing.assert_allclose(_sample(_middles(8), edges, weights), np.full(9, 0.3), rtol=1e-6)
@@ -230,9 +166,6 @@ def test_sampling_moves_and_scales_with_the_edges(scale, shift):
     moved = _sample(_middles(16), scale * edges + shift, 5.0 * weights)
     expected = scale * _sample(_middles(16), edges, weights) + shift
     np.testing.assert_allclose(moved, expected, atol=_SUMMATION * (scale + abs(shift)))
-
-
-# --- dilation ---
 
 
 def test_dilate_by_hand():
@@ -266,39 +199,12 @@ def test_dilate_keeps_the_domain_and_sums_to_one(amount):
     np.testing.assert_allclose(np.sum(dilated), 1.0, rtol=_SUMMATION)
 
 
-@pytest.mark.parametrize("amount", _AMOUNTS)
-def test_dilate_covers_every_bin_and_never_loses_to_it(amount):
-    edges, weights = _step_function(12, empty=3)
-    heights = _heights(edges, weights)
-    grid, dilated = _dilate(edges, weights, amount)
-    dilated_heights = _heights(grid, dilated)
-    share = heights / np.max(heights)
-    dilated_share = dilated_heights / np.max(dilated_heights)
-    for x in np.linspace(0.0005, 0.9995, 200):
-        before = reference_sampling.height_at(x, edges, share)
-        after = reference_sampling.height_at(x, grid, dilated_share)
-        assert after >= before - 1e-4
-
-
-def test_dilation_by_nothing_changes_nothing():
-    edges, weights = _step_function(13)
-    grid, dilated = _dilate(edges, weights, 0.0)
-    np.testing.assert_allclose(
-        np.interp(edges, grid, np.concatenate([[0.0], np.cumsum(dilated)])),
-        _cumulative(weights),
-        atol=_SUMMATION,
-    )
-
-
 @pytest.mark.parametrize("weights", _HARD_WEIGHTS)
 def test_dilate_is_finite_with_bins_of_no_width(weights):
     grid, dilated = _dilate(_NARROW, *singles(weights), _AMOUNT)
     assert np.isfinite(grid).all() and np.isfinite(dilated).all()
     visible = (np.asarray(weights) * np.diff(_NARROW)).sum() > 0.0
     np.testing.assert_allclose(np.sum(dilated), float(visible), rtol=_SUMMATION)
-
-
-# --- mass below a point, blurred ---
 
 
 def test_blurred_mass_by_hand():
@@ -317,16 +223,6 @@ def test_blurred_mass_against_a_loop(radius):
     np.testing.assert_allclose(_blurred_mass(at, edges, weights, radius), expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("radius", _RADII)
-def test_blurred_mass_is_conserved_and_never_decreases(radius):
-    edges, weights = _step_function(15, empty=3)
-    at = jnp.linspace(-2.0 * radius, 1.0 + 2.0 * radius, 500)
-    below = np.asarray(_blurred_mass(at, edges, weights, radius))
-    assert below[0] == 0.0
-    np.testing.assert_allclose(below[-1], np.sum(weights), rtol=_SUMMATION)
-    assert (np.diff(below) >= -_SUMMATION).all()
-
-
 def test_blurred_mass_of_a_bin_without_width_is_that_of_a_point():
     edges, weights = singles([0.0, 0.5, 0.5, 1.0], [0.0, 1.0, 0.0])
     got = _blurred_mass(jnp.array([0.3, 0.45, 0.5, 0.55, 0.7]), edges, weights, 0.1)
@@ -343,9 +239,6 @@ def test_blurred_mass_of_thin_bins_is_no_more_than_they_hold(width):
     # A float32 number near 0.6 is only known to 6e-8, which is 3e-6 of the blurred width.
     expected = np.clip((np.linspace(0.0, 1.0, 201) - 0.6 - 0.5 * width + 0.01) / 0.02, 0.0, 1.0)
     np.testing.assert_allclose(below, expected, atol=width / 0.02 + 1e-5)
-
-
-# --- searching ---
 
 
 def test_count_below_is_a_right_sided_search():
@@ -408,8 +301,6 @@ _CASES = {
 def test_transformations_change_nothing(name, transformation):
     transformation(_CASES[name], _batch())
 
-
-# --- snap ---
 
 _snap = jax.jit(stepfun.snap)
 

@@ -76,9 +76,6 @@ def _assert_same_curve(reports, others):
     np.testing.assert_allclose(reports, others, rtol=_ROUNDING, atol=1e-9)
 
 
-# --- rows of devices ---
-
-
 def test_one_device_needs_no_mesh():
     assert devices.row(1) is None
     assert jax.device_count() > 1 or devices.row(None) is None
@@ -107,9 +104,6 @@ def test_one_process_agrees_with_itself():
     devices.wait_for_all("nothing")
 
 
-# --- lists that are shared out ---
-
-
 @pytest.mark.parametrize(("multiple", "room"), [(1, 3), (3, 3), (2, 4), (8, 8), (16, 16)])
 def test_lists_are_filled_up_with_empty_slots(multiple, room):
     paths = made_paths.stack([made_paths.random_path(i, bends=1, segments=3) for i in range(3)])
@@ -134,9 +128,6 @@ def test_a_mesh_of_one_device_trains_as_no_mesh():
         steps = loop.run_steps(setup, state, 12)
         curves.append([list(map(float, jax.device_get(report))) for _, report in steps])
     _assert_same_curve(*curves)
-
-
-# --- many devices ---
 
 
 @pytest.mark.slow
@@ -164,9 +155,6 @@ def test_eight_devices_train_as_one_does(tmp_path):
     for name in ("eight", "five"):
         light = found[name]["light"]
         np.testing.assert_allclose(light, one["light"][: len(light)], rtol=1e-6)
-
-
-# --- several processes ---
 
 
 def test_two_processes_find_each_other_and_sum():

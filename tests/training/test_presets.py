@@ -23,24 +23,6 @@ def test_a_preset_makes_a_model_of_its_scene(name):
     json.dumps(dataclasses.asdict(model))
 
 
-def test_small_lies_between_tiny_and_paper():
-    def sizes(name):
-        preset = PRESETS[name]
-        model = preset.model(_BOUNDS, "field")
-        grid = model.field.grid
-        numbers = (
-            grid.levels,
-            grid.max_res,
-            grid.hashmap_size,
-            model.samples,
-            model.field.colour_width,
-        )
-        return (*numbers, preset.schedule.batch, preset.schedule.steps)
-
-    for less, middle, more in zip(sizes("tiny"), sizes("small"), sizes("paper"), strict=True):
-        assert less < middle <= more
-
-
 def _rays_of_a_pool(name):
     schedule = PRESETS[name].schedule
     return schedule.batch * schedule.pretraced_batches

@@ -16,7 +16,7 @@ from refref_jax.training.config import TrainConfig
 from refref_jax.training.resolve import SceneFacts, resolve
 from tests.factories.made_benchmark import SETTINGS, write_scene
 from tests.factories.small_model import CAMERAS
-from tests.factories.small_parquet import write_all, write_copy
+from tests.factories.small_parquet import write_all
 from tests.processes.command import run_command
 
 _ANALYSIS = SceneAnalysis(
@@ -232,22 +232,6 @@ def test_all_published_scenes_are_listed_without_unpacking_any(tmp_path, monkeyp
     unpacked = plan.find_scenes(["hf:*/*_ball", ball])
     assert all(scene.fingerprint and Path(scene.path).is_dir() for scene in unpacked)
     assert [scene.name for scene in unpacked] == list(found)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--scenes=hf:*/cube_smcvx_bal"], "hf:cubebg_single-convex/cube_smcvx_ball"),
-        (["--scenes=hf:everything"], "hf:everything is not hf:CONFIG/SCENE"),
-    ],
-)
-def test_published_scenes_that_there_are_not(tmp_path, monkeypatch, options, message):
-    write_copy(tmp_path / "RefRef", rows=3)
-    monkeypatch.setenv("REFREF_HF", str(tmp_path / "RefRef"))
-    for command in ("benchmark", "path_trade_off"):
-        result = run_command(command, *options, f"--out={tmp_path / 'out'}", fails=True)
-        (line,) = result.stderr.splitlines()
-        assert message in line, line
 
 
 def test_a_benchmark_grows_but_does_not_change(tmp_path):

@@ -37,9 +37,6 @@ def _place(table, label):
     return [column.label for column in table.columns].index(label)
 
 
-# --- the paper's numbers ---
-
-
 def test_the_papers_tables_are_whole():
     for category in (*scene_names.CATEGORIES, published.ALL):
         for background in (*scene_names.BACKGROUNDS, published.ALL):
@@ -179,8 +176,6 @@ def test_distances_before_natural_backgrounds_are_those_in_the_mask():
     assert tables.value(tables.DMAE_MEDIAN, metrics, "cube") == 500.0
     assert tables.value(tables.DMAE, metrics, "cube") is None
 
-
-# --- tables of results ---
 
 _RESULTS = [
     made_record("cube_smcvx_ball", "oracle", psnr=30.0, psnr_masked=24.0, lpips=None),
@@ -355,27 +350,15 @@ def test_differences_of_what_is_infinite_are_not_known(sign):
 
 def test_markdown_and_latex_mark_and_label():
     table = paper_tables.main_table(_RESULTS)
-    text = summary.markdown(table)
+    text, tex = summary.markdown(table), summary.latex(table)
     line = next(line for line in text.splitlines() if line.startswith("| Oracle (path tree) |"))
     assert "| 2 | **33.50** ± 2.50 | **30.00** ± 0.00 | - | - | - |" in line
-    assert "| Oracle (paper's paths) | 2 | <u>32.00</u> ± 2.00 | 26.00 ± 2.00 |" in text
     assert "| Oracle, *published 2025-05* | - | 31.64 | 25.37 | 0.96 |" in text
     assert "| Oracle, *published 2026-09-26* | - | 32.66 | 26.12 | 0.96 |" in text
-    assert "| method | scenes | PSNR ↑ | masked PSNR ↑ | SSIM ↑ | LPIPS ↓ | DMAE, sub" in text
-    assert "measured on their data, which differs from ours" in " ".join(text.split())
-    tex = summary.latex(table)
     assert r"\textbf{33.50} {\tiny$\pm$2.50}" in tex and r"\underline{32.00}" in tex
     assert r"Oracle \emph{(published 2025-05)} & -- & 31.64" in tex
-    assert (
-        r"Oracle \emph{(published 2026-09-26)} & -- & 32.66" in tex and "& DMAE, substituted" in tex
-    )
-    assert tex.count(r"\begin{tabular}") == tex.count(r"\end{tabular}") == 1
     body = [line for line in tex.splitlines() if line.startswith("Oracle (path")]
     assert body and {line.count("&") for line in body} == {len(table.columns) + 1}
-    comments = [line for line in tex.splitlines() if line[:1] == "%"]
-    assert len(comments) == 1 + len(table.notes)
-    assert not any("**" in line or "<u>" in line or "`" in line for line in comments)
-    assert any("Substituted distances equal the true ones" in line for line in comments)
 
 
 def test_odd_names_break_no_row():

@@ -12,7 +12,7 @@ import pytest
 
 from experiments.benchmarking import methods, plan, results, settings, summary, worker
 from experiments.benchmarking.methods import METHODS, RECONSTRUCTION
-from experiments.benchmarking.plan import Job, Skipped
+from experiments.benchmarking.plan import Job
 from experiments.benchmarking.worker import LocalEngine
 from experiments.cli import subprocesses
 from experiments.cli.subprocesses import RunFailedError
@@ -184,8 +184,6 @@ def test_an_interruption_stops_what_runs_and_begins_nothing_more(tmp_path, monke
         subprocesses.run("train", log=tmp_path / "log")
 
 
-# --- what is missing ---
-
 _SCENE = "cube_smcvx_ball"
 
 
@@ -227,12 +225,3 @@ def test_a_failure_stays_listed_until_its_job_has_been_done_again(tmp_path, work
     assert summary.not_done(tmp_path)[0] == first | again
     assert work(both) == {} == summary.not_done(tmp_path)[0]
     assert "a broken mesh" not in (tmp_path / summary.FILE).read_text()
-
-
-def test_what_is_left_out_now_did_not_fail_and_is_forgotten_when_it_is_done(tmp_path, work):
-    assert summary.not_done(tmp_path / "nowhere") == ({}, [])
-    work(["tree"], {f"{_SCENE}/tree": "a broken mesh"})
-    left_out = Skipped(_SCENE, "tree", "it has no meshes")
-    assert work([], skipped=[left_out]) == {}
-    assert summary.not_done(tmp_path) == ({}, [left_out])
-    assert work(["tree"]) == {} and summary.not_done(tmp_path) == ({}, [])

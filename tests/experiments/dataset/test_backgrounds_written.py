@@ -56,7 +56,7 @@ def test_spheres_and_environments_come_back(tmp_path):
     np.testing.assert_array_equal(read.texture.texels, make_environment(record["texture"], _SIZE))
 
 
-@pytest.mark.parametrize("kind", ["cube", "env"])
+@pytest.mark.parametrize("kind", ["cube", "sphere", "env"])
 def test_the_same_seed_writes_the_same_bytes(tmp_path, kind):
     first, second = (_write(tmp_path / name, kind, seed=9) for name in "ab")
     assert first == second

@@ -5,7 +5,7 @@ import trimesh
 from experiments.dataset.objects import distance_fields as fields
 from experiments.dataset.objects import formed, isosurface
 from experiments.dataset.objects.field_operations import offset, subtraction, union
-from refref_jax.geometry.triangle_meshes import corner_normals, is_degenerate
+from refref_jax.geometry.triangle_meshes import is_degenerate
 
 _BLEND = union(
     fields.sphere((0, 0, 0), 1.0),
@@ -47,42 +47,11 @@ def test_surfaces_are_closed_outward_and_on_the_zero_set(name):
     assert np.all(np.sum(normals * slopes, axis=-1) > 0.0)
 
 
-@pytest.mark.parametrize("name", ["sphere", "torus"])
-def test_triangles_are_well_shaped_and_even(name):
-    spacing = 0.06
-    surface = isosurface.isosurface(_SOLIDS[name][0], spacing=spacing)
-    angles = np.degrees(_mesh(surface).face_angles.min(axis=1))
-    assert np.min(angles) > 15.0 and np.percentile(angles, 1) > 25.0
-    lengths = _mesh(surface).edges_unique_length / spacing
-    assert np.min(lengths) > 0.15 and np.max(lengths) < 1.8
-
-
-@pytest.mark.parametrize("name", ["sphere", "torus"])
-def test_vertex_normals_are_the_gradients(name):
-    field = _SOLIDS[name][0]
-    surface = isosurface.isosurface(field, spacing=0.04)
-    normals = corner_normals(*surface, crease_angle=np.pi)
-    slopes = fields.gradient(field, surface.vertices[surface.faces].reshape(-1, 3))
-    cosines = np.sum(normals.reshape(-1, 3) * slopes, axis=-1)
-    angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    # On the torus they turn by 5.7 degrees from one vertex to the next where it is most curved.
-    assert np.mean(angles) < 0.25 and np.percentile(angles, 99) < 1.0 and np.max(angles) < 2.5
-
-
 def test_grid_points_on_the_surface_leave_no_degenerate_faces():
     # Its faces, edges and corners lie exactly on points of the grid.
     surface = isosurface.isosurface(fields.box((0.5, 0.5, 0.5)), spacing=0.1, half_extent=1.0)
     assert _mesh(surface).is_watertight
     assert not np.any(is_degenerate(surface.vertices[surface.faces]))
-
-
-def test_the_same_surface_every_time_and_four_times_the_triangles_at_half_the_spacing():
-    first, second, fine = (
-        isosurface.isosurface(_BLEND, spacing=spacing) for spacing in (0.12, 0.12, 0.06)
-    )
-    assert first.vertices.tobytes() == second.vertices.tobytes()
-    assert first.faces.tobytes() == second.faces.tobytes()
-    assert len(fine.faces) == pytest.approx(4 * len(first.faces), rel=0.05)
 
 
 def test_samples_near_the_surface_are_exact_and_all_signs_are_right():
@@ -106,16 +75,6 @@ def test_the_largest_piece_is_kept():
     assert _mesh(kept).is_watertight
     assert np.max(kept.vertices[:, 0]) < 0.0
     assert len(np.unique(kept.faces)) == len(kept.vertices)
-
-
-def test_softening_hardly_moves_a_smooth_surface_and_fills_a_crease():
-    ball = fields.sphere((0, 0, 0), 1.2)
-    soft = formed.softened(ball)
-    surface = isosurface.isosurface(soft, spacing=0.1)
-    assert np.max(np.abs(ball(surface.vertices))) < 2e-3
-    touching = union(fields.sphere((-0.8, 0, 0), 0.8), fields.sphere((0.8, 0, 0), 0.8))
-    crease = np.array([[0.0, 0.05, 0.0]])
-    assert touching(crease) > 0.0 > formed.softened(touching)(crease)
 
 
 def test_a_core_leaves_at_least_its_wall_everywhere():

@@ -22,7 +22,6 @@ from experiments.dataset.objects import (
     perfumes,
     quadrics,
 )
-from experiments.dataset.objects.formed import spacing
 from experiments.dataset.objects.isosurface import Surface
 from experiments.dataset.parts import RADIUS
 from refref_jax.choices import CLEAR, NO_ABSORPTION
@@ -34,7 +33,6 @@ from refref_jax.data.mesh_queries import (
     is_convex,
     winding_number,
 )
-from refref_jax.geometry.triangle_meshes import face_normals
 from refref_jax.optics.interface_rules import NO_PARENT
 from tests.processes.command import ROOT
 
@@ -174,17 +172,6 @@ def test_it_is_the_same_every_time(name):
         assert part[:2] + part[4:] == again[:2] + again[4:]
 
 
-@pytest.mark.parametrize("name", _TURNED)
-def test_more_detail_is_the_same_shape_with_more_triangles(name):
-    parts, _ = _made(name)
-    if len(parts) > 5:
-        pytest.skip("sets are made of what the others test")
-    for part, finer in zip(parts, _OBJECTS[name].make(2.0 * _DETAIL), strict=True):
-        assert len(finer.faces) > 1.5 * len(part.faces)
-        extents = np.ptp(part.vertices, axis=0)
-        np.testing.assert_allclose(np.ptp(finer.vertices, axis=0), extents, rtol=0.05)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", _TURNED)
 def test_no_surface_folds_over_itself(name):
@@ -216,17 +203,6 @@ def test_at_the_detail_that_is_rendered_the_lint_finds_nothing(name):
 # Some of them.
 
 
-@pytest.mark.parametrize(
-    "name", _each(["teapot", "water_pitcher", "wisolt_kettle", "skull_bottle"])
-)
-def test_vessels_are_hollow_and_open(name):
-    [body], _ = _made(name)
-    mesh = _mesh(body)
-    # One surface, through whose opening the room inside is joined to the outside.
-    assert mesh.body_count == 1 and mesh.volume < 0.6 * mesh.convex_hull.volume
-    assert not mesh.contains(np.array([[0.0, 0.0, -0.05]])).any()
-
-
 @pytest.mark.parametrize("name", ["ball", "cube", "cylinder", "pyramid", "torus"])
 def test_a_coloured_object_differs_by_its_tint_alone(name):
     ([clear], _), ([coloured], _) = _made(name), _made(f"{name}_coloured")
@@ -250,28 +226,6 @@ def test_volumes_known_by_hand():
         ("cylinder", 2.0 * np.pi * whole**2 * quadrics.CYLINDER_HALF_HEIGHT - lost, 2e-3),
     ):
         assert _mesh(_only(name)).volume == pytest.approx(volume, rel=rel), name
-
-
-def test_the_brilliant_has_the_facets_of_its_cut():
-    stone = _only("diamond")
-    normals = np.round(face_normals(stone.vertices[stone.faces]), 9) + 0.0
-    normals = np.unique(normals, axis=0)
-    tilt = np.degrees(np.arccos(np.abs(normals[:, 2])))
-    up, down = normals[:, 2] > 1e-6, normals[:, 2] < -1e-6
-    assert len(normals) == 73 and stone.material == "diamond" and not stone.smooth
-    assert np.sum(tilt[up] == 0.0) == 1  # the table
-    assert np.sum(~up & ~down) == 16  # the girdle
-    assert np.sum(np.isclose(tilt[up], 34.5, atol=1e-6)) == 8  # the crown's main facets
-    assert np.sum(np.isclose(tilt[down], 40.75, atol=1e-6)) == 8  # the pavilion's
-    # Crown, girdle and pavilion of 14.8, 3 and 43.1 percent.
-    width = 2.0 * np.max(np.hypot(*stone.vertices[:, :2].T))
-    depth = 0.215 * np.tan(np.radians(34.5)) + 0.03 + 0.5 * np.tan(np.radians(40.75))
-    assert np.ptp(stone.vertices[:, 2]) / width == pytest.approx(depth)
-
-
-def test_detail_makes_finer_triangles_but_walls_set_the_coarsest():
-    assert spacing(1.0, thinnest=1.0) == pytest.approx(0.5 * spacing(0.5, thinnest=1.0))
-    assert spacing(0.1, thinnest=0.1) < 0.12
 
 
 # The monkey.

@@ -6,18 +6,14 @@ from experiments.dataset.objects.profiles import (
     joined,
     resampled,
     sampling,
-    smooth,
 )
 from experiments.dataset.objects.regions import (
-    above,
-    below,
     box,
     offset,
     profiles,
     region,
     ring,
     rounded,
-    top,
 )
 from tests.oracles.polylines import distances
 
@@ -29,9 +25,6 @@ def _turns(curve):
 
 def _bottle():
     return filleted((0, 0), (1.0, 0, 0.2), (1.0, 1.5, 0.3), (0.4, 2.0, 0.2), (0.4, 2.5), (0, 2.5))
-
-
-# Fillets.
 
 
 @pytest.mark.parametrize("corner", [(1.0, 0.0), (1.3, 0.4), (0.6, -0.7), (0.2, 0.1)])
@@ -58,22 +51,6 @@ def test_fillets_that_have_no_room_are_refused():
 # Splines and arcs.
 
 
-def test_a_smooth_curve_passes_its_points_and_ends_as_it_is_told():
-    knots = [(0.0, 0.0), (0.8, 0.6), (0.5, 1.2), (0.0, 1.5)]
-    curve = smooth(knots)
-    assert distances(np.array(knots), curve).max() < 1e-5
-    sides = np.diff(curve, axis=0)[[0, -1]]
-    ways = sides / np.linalg.norm(sides, axis=1, keepdims=True)
-    np.testing.assert_allclose(ways[:, 0], [1.0, -1.0], atol=1e-3)  # perpendicular to the axis
-    assert np.max(np.abs(_turns(curve))) < 0.05
-    upright = smooth([(0.5, 0.0), (0.9, 1.0), (0.4, 2.0)], ends="upright")
-    sides = np.diff(upright, axis=0)[[0, -1]]
-    assert np.all(np.abs(sides[:, 0]) < 0.02 * sides[:, 1])
-
-
-# Sampling.
-
-
 @pytest.mark.parametrize("detail", [0.3, 1.0])
 def test_edges_keep_to_the_sampling_and_to_the_curve(detail):
     cut = sampling(detail)
@@ -85,9 +62,6 @@ def test_edges_keep_to_the_sampling_and_to_the_curve(detail):
     assert distances(points, curve).max() < 1e-9
     assert np.max(np.maximum(lengths[1:] / lengths[:-1], lengths[:-1] / lengths[1:])) < 1.7
     np.testing.assert_array_equal(points[[0, -1]], curve[[0, -1]])
-
-
-# Offsets.
 
 
 @pytest.mark.parametrize("distance", [-0.06, -0.25, 0.1])
@@ -114,13 +88,6 @@ def test_rounding_gives_edges_their_radius():
     assert shape.area() == pytest.approx(4.0 - (4.0 - np.pi) * 0.04, rel=1e-4)
     notched = rounded(box(1.0, 0.0, 2.0) + box(0.3, 1.0, 3.0), concave=0.2)
     assert notched.area() == pytest.approx(4.6 + 2.0 * (1.0 - np.pi / 4.0) * 0.04, rel=1e-4)
-
-
-def test_halves_of_a_region_make_up_the_whole():
-    shape = region(_bottle())
-    parts = below(shape, 1.1).area() + above(shape, 1.1).area()
-    assert parts == pytest.approx(shape.area(), rel=1e-6)
-    assert top(shape) == pytest.approx((0.4, 2.5))
 
 
 def test_a_cavity_is_traversed_downwards_and_a_ring_ends_where_it_began():

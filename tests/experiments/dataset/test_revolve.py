@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from experiments.dataset.objects.profiles import Sampling, arc, resampled, sampling, smooth
+from experiments.dataset.objects.profiles import Sampling, arc, resampled, smooth
 from experiments.dataset.objects.regions import profiles, ring
 from experiments.dataset.objects.revolve import (
     Turned,
@@ -15,7 +15,6 @@ from experiments.dataset.objects.revolve import (
 )
 
 _FINE = Sampling(edge=0.02, turn=0.03, segments=360)
-_ANGLES = np.linspace(0.0, 2.0 * np.pi, 721)
 
 
 def _mesh(profile, turned=None, cut=_FINE):
@@ -78,45 +77,7 @@ def test_a_twist_turns_sections_and_keeps_the_volume():
 # Sections.
 
 
-@pytest.mark.parametrize("sides", [3, 4, 6, 12])
-def test_a_polygon_has_flat_sides_and_round_corners(sides):
-    corner = 0.3
-    factor = polygon(sides, corner)(_ANGLES)
-    points = factor[:, None] * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
-    ways = 2.0 * np.pi * np.arange(sides) / sides
-    reach = np.max(points @ np.stack([np.cos(ways), np.sin(ways)]), axis=1)
-    # A rounded polygon is all that lies within the corner radius of a smaller one.
-    farthest = (1.0 - corner) / np.cos(np.pi / sides) + corner
-    assert factor.max() == pytest.approx(farthest, rel=1e-3) and factor.min() == pytest.approx(1.0)
-    assert np.all(reach <= 1.0 + 1e-12) and np.mean(reach > 1.0 - 1e-12) > 0.2
-
-
-def test_waves_lie_between_ridge_and_valley():
-    for sharpness in (-0.5, 0.0, 0.5):
-        factor = waves(5, 0.3, sharpness=sharpness)(_ANGLES)
-        assert factor[0] == 1.0 == factor.max() and factor.min() == pytest.approx(0.7)
-    narrow, wide = (np.mean(waves(5, 0.3, sharpness=s)(_ANGLES)) for s in (0.5, -0.5))
-    assert narrow < 0.85 < wide
-
-
-def test_angles_crowd_at_corners_and_go_around_once():
-    angles = section_angles(polygon(4, 0.1), sampling(1.0))
-    steps = np.diff(angles)
-    assert np.all(steps > 0.0) and angles[0] >= 0.0 and angles[-1] < 2.0 * np.pi
-    corner = np.abs(angles[:-1] % (0.5 * np.pi) - 0.25 * np.pi) < 0.05
-    assert steps[corner].mean() < 0.5 * steps[~corner].mean()
-
-
 # Meshes.
-
-
-def test_poles_are_fans_and_no_vertex_comes_twice():
-    cut = Sampling(edge=0.3, turn=0.3, segments=24)
-    mesh = _mesh(arc((0.0, 0.0), 1.0, -90.0, 90.0), cut=cut)
-    uses = np.bincount(mesh.faces.ravel())
-    poles = np.flatnonzero(np.hypot(*mesh.vertices[:, :2].T) == 0.0)
-    assert list(uses[poles]) == [24, 24] and uses.max() == 24
-    assert len(np.unique(mesh.vertices.round(9), axis=0)) == len(mesh.vertices)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ import trimesh
 from experiments.dataset.objects.placing import centred, enlarged, moved, tilted, united
 from experiments.dataset.objects.profiles import Sampling, arc, filleted
 from experiments.dataset.objects.regions import box, profiles, region
-from experiments.dataset.objects.sticks import Stick, piece
 from experiments.dataset.objects.vessels import (
     FILM,
     GLASS,
@@ -54,9 +53,6 @@ def test_the_wall_has_its_thickness_and_the_mouth_is_open():
     assert (closed[1], closed[3]) == pytest.approx((0.4, 1.9), abs=1e-4)
 
 
-# Open vessels.
-
-
 def test_an_empty_vessel_is_glass_between_outline_and_space():
     outline, space = _tub()
     # What a fillet cuts off a corner, by Pappus; its middle is about a quarter of its radius away.
@@ -82,9 +78,6 @@ def test_a_liquid_fills_the_space_up_to_the_film_and_stays_apart():
     assert _volume(small.liquid) == pytest.approx(_volume(shapes.liquid) / 8.0, rel=0.02)
 
 
-# Sealed vessels.
-
-
 def test_a_sealed_vessel_holds_liquid_and_air_with_a_film_between():
     outline, _ = _tub()
     space = space_in(outline, wall=0.1)
@@ -95,9 +88,6 @@ def test_a_sealed_vessel_holds_liquid_and_air_with_a_film_between():
     assert air[0] == pytest.approx([0.0, 1.21], abs=1e-4)
     assert distances(liquid, air).min() == pytest.approx(0.02, abs=2e-4)
     assert (shapes.liquid ^ shapes.air).is_empty()
-
-
-# Parts.
 
 
 def test_a_vessel_becomes_named_parts():
@@ -119,20 +109,6 @@ def test_a_body_with_a_cavity_is_one_part():
     assert mesh.is_watertight and mesh.body_count == 2
     expected = 4.0 / 3.0 * np.pi - np.pi * 0.09 * 0.6
     assert mesh.volume == pytest.approx(expected, rel=5e-3)
-
-
-# Sticks, and placing.
-
-
-def test_a_piece_lies_on_its_stick_between_its_heights():
-    stick = Stick((0.1, -0.2, 0.5), (0.3, 0.1, 1.0), 0.05)
-    part = piece("reed", _WATER, stick, 0.8, 2.0, 1.0)
-    way = np.array(stick.way) / np.linalg.norm(stick.way)
-    off = part.vertices - stick.origin
-    across = np.linalg.norm(off - (off @ way)[:, None] * way, axis=1)
-    assert across.max() == pytest.approx(0.05, abs=1e-6)
-    heights = 0.5 + (off @ way) * way[2]
-    assert (heights.min(), heights.max()) == pytest.approx((0.8, 2.0), abs=1e-6)
 
 
 def test_placing_keeps_shapes():

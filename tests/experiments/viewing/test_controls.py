@@ -19,11 +19,9 @@ def straight_down(slab):
     return pixel_paths.trace_pixel(slab, ray, settings=settings, reach=2.0)
 
 
-def test_strong_light_is_thick_and_yellow_and_weak_light_thin_and_blue():
+def test_the_strength_of_light_is_logarithmic():
     shares = np.array([1e-5, 1e-3, 0.0316228, 1.0, 2.0])
     np.testing.assert_allclose(controls.strength(shares), [0.0, 0.0, 0.5, 1.0, 1.0], atol=1e-6)
-    weak, *_, strong = controls.colour(shares).astype(int)
-    assert weak[2] > 100 > weak[1] and strong[0] > 200 and strong[1] > 200 and strong[2] < 100
 
 
 class _Scene:

@@ -94,19 +94,6 @@ def test_the_mask_is_the_disc_of_the_ball_and_distances_have_one_scale(model):
     np.testing.assert_array_equal(layers.draw(model, layers.DISTANCE, _RAYS, **_OPTIONS), expected)
 
 
-def test_normals_are_those_of_the_ball_in_colour(model):
-    drawn = layers.draw(model, layers.NORMALS, _RAYS, **_OPTIONS)
-    along = np.einsum("...i,...i->...", _RAYS.origins, _RAYS.directions)
-    across = np.sum(np.square(_RAYS.origins), axis=-1) - along**2
-    inner = across < 1.0
-    points = _RAYS.origins + (-along - np.sqrt(1.69 - across, where=inner, out=0 * across))[
-        ..., None
-    ] * (_RAYS.directions)
-    expected = 127.5 * (points[inner] / 1.3 + 1.0)
-    assert np.abs(drawn[inner] - expected).max() < 4.0  # of a ball of triangles
-    assert (drawn[across > 1.69] == 255).all()
-
-
 def test_a_drawing_that_is_called_off_ends_at_the_next_band(model, monkeypatch):
     rendered = []
 

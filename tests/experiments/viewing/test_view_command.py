@@ -15,7 +15,7 @@ from refref_jax.optics.path_settings import STRAIGHT, TREE, capacity_factors
 from refref_jax.render import Model, init_params
 from tests.factories import scenes
 from tests.factories.small_model import MODEL
-from tests.processes.command import ROOT, run_command
+from tests.processes.command import ROOT
 
 
 def _subject(settings=TREE, frames=None):
@@ -24,25 +24,6 @@ def _subject(settings=TREE, frames=None):
         MODEL, settings, parts, jax.eval_shape(lambda: init_params(jax.random.key(0), MODEL))
     )
     return Subject("made", model, "nested", frames, ("glass", "bubble"), (36, 90), 4096)
-
-
-@pytest.mark.parametrize(
-    ("option", "words"),
-    [
-        ("--heights=90,36", "--heights=90,36 are not two or more increasing integers"),
-        ("--heights=36", "--heights=36 are not"),
-        ("--heights=small,large", "--heights=36,90,180"),
-    ],
-)
-def test_mistaken_heights_are_refused(tmp_path, option, words):
-    result = run_command("view", f"--run={tmp_path}", option, fails=True)
-    assert words in result.stderr and "Traceback" not in result.stderr
-
-
-def test_a_folder_that_is_no_run_is_named(tmp_path):
-    pytest.importorskip("viser")
-    result = run_command("view", f"--run={tmp_path / 'none'}", fails=True)
-    assert "none" in result.stderr and "Traceback" not in result.stderr
 
 
 def test_without_viser_it_says_what_to_install(tmp_path):

@@ -81,16 +81,3 @@ def test_only_what_a_hand_moves_is_a_change():
     assert not cameras.is_same(view, view._replace(pose=view.pose + 0.01))
     assert not cameras.is_same(view, view._replace(fov=0.9))
     assert not cameras.is_same(view, view._replace(aspect=1.6))
-
-
-@pytest.mark.parametrize("aspect", [0.5, 1.0, 2.0])
-def test_bars_complete_a_picture_to_a_window_and_the_view_fits_into_it(aspect):
-    image = np.full((40, 40, 3), 200, np.uint8)
-    boxed = cameras.letterbox(image, aspect)
-    height, width, _ = boxed.shape
-    assert width / height == aspect and (boxed == 200).all(-1).sum() == 40 * 40
-    middle = boxed[height // 2 - 20 : height // 2 + 20, width // 2 - 20 : width // 2 + 20]
-    np.testing.assert_array_equal(middle, image)
-    half = math.tan(0.5 * cameras.containing_fov(_ORBIT, aspect))
-    own = 0.5 * 64 / _ORBIT.focal
-    assert min(half, half * aspect) == pytest.approx(own)
