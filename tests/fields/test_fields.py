@@ -44,8 +44,6 @@ _CONFIGS |= {
     for name in ("radiance", "nerfacto radiance")
 }
 
-_RADIANCES = ("radiance", "nerfacto radiance")
-
 
 @jax.jit
 def _untrained(seed):

@@ -265,7 +265,7 @@ def test_losses_of_paths_are_those_of_the_included_paths(path_losses, kept):
     pairs = [jax.tree.map(lambda x, i=i: x[i], histograms) for i in kept]
     expected = sum(float(_interlevel(final, proposal)) for proposal, final in pairs)
     np.testing.assert_allclose(totals.interlevel, expected, rtol=_SUMMATION)
-    expected = sum(float(_distortion(final, _ALL_OUTSIDE)) for _, final in pairs)
+    expected = sum(float(_distortion(final, jnp.ones(12, bool))) for _, final in pairs)
     np.testing.assert_allclose(totals.distortion, expected, rtol=_SUMMATION)
     assert totals.paths == len(kept)
     # The colours of rays keep all of their paths.
