@@ -38,7 +38,7 @@ import math
 
 import numpy as np
 
-from refref_jax.choices import Interior, Space
+from refref_jax.choices import ORIGIN, Interior, Position, Space
 from refref_jax.fields import registry
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.render.model import ModelConfig, ProposalConfig
@@ -66,6 +66,7 @@ class Bounds:
     far: float
     radius: float
     space: Space
+    centre: Position = ORIGIN
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +110,9 @@ class Preset:
         )
 
 
-def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
+def bounds(
+    cameras: Cameras, *, space: Space, radius: float | None, centre: Position = ORIGIN
+) -> Bounds:
     """Returns the bounds of a scene.
 
     A bounded scene extends from any camera to the farthest corner of its cube, a spherical scene to
@@ -120,6 +123,7 @@ def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
       cameras: cameras of the training images.
       space: geometry of the background: `bounded`, `spherical` or `unbounded`.
       radius: radius instead of the default of `ModelConfig.radius`.
+      centre: centre of the background, world units.
 
     Raises:
       ValueError: if the radius is not positive and finite.
@@ -128,12 +132,12 @@ def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
         raise ValueError(
             f"radius is {radius}, but it is a length. Give a positive number of world units."
         )
-    farthest = float(np.max(np.linalg.norm(cameras.poses[:, :, 3], axis=-1)))
+    farthest = float(np.max(np.linalg.norm(cameras.poses[:, :, 3] - centre, axis=-1)))
     if space == "unbounded":
-        return Bounds(_NEAR, _FAR_UNBOUNDED, radius or 1.25 * farthest, space)
+        return Bounds(_NEAR, _FAR_UNBOUNDED, radius or 1.25 * farthest, space, centre)
     radius = radius or _WALLS
     reach = radius if space == "spherical" else math.sqrt(3.0) * radius
-    return Bounds(_NEAR, farthest + reach, radius, space)
+    return Bounds(_NEAR, farthest + reach, radius, space, centre)
 
 
 def loss(model: ModelConfig) -> LossConfig:
