@@ -94,3 +94,14 @@ def test_bars_complete_a_picture_to_a_window_and_the_view_fits_into_it(aspect):
     half = math.tan(0.5 * cameras.containing_fov(_ORBIT, aspect))
     own = 0.5 * 64 / _ORBIT.focal
     assert min(half, half * aspect) == pytest.approx(own)
+
+
+def test_the_nearest_view_does_not_depend_on_where_the_scene_is():
+    away = np.array([100.0, 0.0, 0.0])
+    moved = _ORBIT._replace(poses=_ORBIT.poses + np.pad(away[:, None], ((0, 0), (3, 0))))
+    for pose in _ORBIT.poses:
+        near = pose.copy()
+        near[:, 3] += [0.5, -0.3, 0.2]
+        expected = cameras.nearest(near, _ORBIT)
+        near[:, 3] += away
+        assert cameras.nearest(near, moved, centre=(100.0, 0.0, 0.0)) == expected
