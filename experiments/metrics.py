@@ -2,10 +2,10 @@
 
 python -m experiments.metrics RENDERED TRUTH --masks=MASKS --out=metrics.json
 
-Files are paired by name. Images are 8-bit .png files. If both folders also or only contain .exr
-files, these are compared as distances along the ray: both in world units, as written by `evaluate`.
-(A scene's own depth maps are planar and cannot be compared with them.) `docs/metrics.md` explains
-each metric.
+Files are paired by name. Images are 8-bit .png files. If both folders contain .exr files, alone or
+in addition, these are compared as distances along the ray in world units, as `evaluate` writes
+them. (A scene's own depth maps are planar and cannot be compared with them.) `docs/metrics.md`
+explains each metric.
 """
 
 import json

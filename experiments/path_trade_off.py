@@ -2,9 +2,9 @@
 
 python -m experiments.path_trade_off --scenes=experiments/data/cube_smcvx_ball --out=runs/paths
 
-Renders views of scenes with a known background, like `experiments.render_known`: once for every
-value of --min_throughputs at the tree's maximum of bends, once for every value of --max_bends at
-its threshold, and with the straight and the paper's paths. Writes a CSV with one row per rendering,
+Renders views of scenes with a known background, like `experiments.render_known`: for every value of
+--min_throughputs with the tree's max bends, for every value of --max_bends with the tree's
+threshold, and with straight rays and the paper's paths. Writes a CSV with one row per rendering,
 and two figures: masked PSNR over ray casts and over time. Casts, paths and seconds are those of one
 camera ray per pixel.
 """

@@ -2,12 +2,13 @@
 
 python -m experiments.render_known --scene=experiments/data/cube_smcvx_ball --out=runs/known
 
-`scene.json` must define the background. The remaining error is that of the light paths. For each
-view and as the mean over views, the JSON file contains: the PSNR in dB over the image, inside the
-mask and outside; `casts_per_pixel` and `paths_per_pixel`, the number of ray casts and light paths
-per camera ray, which does not depend on --rays_per_pixel; `seconds`, the time to render all views
-without compiling, reading and writing; and `dropped`, the share of the throughput that was dropped
-because buffers were full, or of truncated paths with --truncated_paths=black.
+`scene.json` must define the background. The remaining error is that of the light paths. The JSON
+file contains the PSNR in dB over the image, inside the mask and outside, for each view and as means
+over the views. For all views together it contains `casts_per_pixel` and `paths_per_pixel`, the
+number of ray casts and light paths per camera ray, which does not depend on --rays_per_pixel;
+`seconds`, the time to render them, without compiling, reading and writing; and `dropped`, the share
+of the throughput that was dropped because buffers were full or, with --truncated_paths=black,
+because paths were truncated.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # the same names for static type checkers; a test compares both lists
+    from refref_jax.choices import Material as Material
     from refref_jax.data import SceneError as SceneError
     from refref_jax.data.meshes import MeshPart as MeshPart
     from refref_jax.data.meshes import read_meshes as read_meshes
@@ -34,6 +35,7 @@ if TYPE_CHECKING:  # the same names for static type checkers; a test compares bo
     from refref_jax.optics.path_settings import PathSettings as PathSettings
     from refref_jax.optics.path_tracing import trace as trace
     from refref_jax.optics.scene import Scene as Scene
+    from refref_jax.optics.scene import of_channel as of_channel
     from refref_jax.optics.scene import with_index as with_index
     from refref_jax.training.config import TrainConfig as TrainConfig
     from refref_jax.training.evaluation import evaluate as evaluate
@@ -46,6 +48,7 @@ _HOMES = {
     "PathSettings": "optics.path_settings",
     "Cameras": "geometry.cameras",
     "LightPaths": "optics.light_paths",
+    "Material": "choices",
     "MeshPart": "data.meshes",
     "PathStatus": "optics.light_paths",
     "Rays": "geometry.rays",
@@ -59,6 +62,7 @@ _HOMES = {
     "follow_main_branches": "optics.differentiable_paths",
     "image_rays": "geometry.cameras",
     "make_part": "data.scene_assembly",
+    "of_channel": "optics.scene",
     "orbit": "geometry.cameras",
     "read_meshes": "data.meshes",
     "single_object": "data.scene_assembly",

@@ -29,8 +29,8 @@ def written_file(target: Path, *, survives: Stop = "process") -> Iterator[Path]:
 
     Args:
       target: path of the file, in an existing folder.
-      survives: failure after which the file is still complete. For `machine`, the content is synced
-        to disk before the file is renamed.
+      survives: failure that leaves the file complete: that of the process, or also of the machine.
+        For `machine`, the content is synced to disk before the file is renamed.
     """
     draft = beside(target)
     try:

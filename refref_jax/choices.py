@@ -76,7 +76,7 @@ PresetName = Literal["tiny", "small", "paper", "best"]
 """Sizes of a model and its training; see `training.presets`."""
 
 FieldName = Literal["zipnerf", "nerfacto"]
-"""Field types, the default first; see `fields.registry`."""
+"""Field kinds, the default first; see `fields.registry`."""
 
 Interior = Literal["field", "clear", "absorbing"]
 """Model of the inside of the objects; see `render.config.ModelConfig`."""

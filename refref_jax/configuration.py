@@ -1,7 +1,7 @@
 """Writes nested frozen dataclasses as JSON, and reads them back exactly.
 
-Fields with a default may be missing, as in files of older versions, and a field may be stored under
-the name that its metadata give as `formerly`.
+Fields with a default may be missing, as in files of older versions. A field that was renamed is
+also read under its earlier name, `formerly` in its metadata.
 
 Fields may be numbers, strings, booleans, `None`, other dataclasses, and tuples of these. If a field
 is annotated with a base class, the key `kind` of its value selects the variant of that class.
@@ -236,7 +236,7 @@ def _unknown(key: str, hints: Mapping[str, Any]) -> str:
 def _with_present_names(
     fields: Sequence[dataclasses.Field[Any]], value: dict[str, Any]
 ) -> dict[str, Any]:
-    """Renames keys and values of earlier versions; a key stays if the present one is there, too."""
+    """Renames keys and values of earlier versions, except keys whose present name exists too."""
     names = {field.metadata.get(FORMERLY): field.name for field in fields}
     present = {old: new for old, new in names.items() if new not in value}
     renamed = {present.get(key, key): item for key, item in value.items()}

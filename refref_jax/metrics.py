@@ -63,8 +63,8 @@ _POOL_STRIDE = 2
 def psnr(rendered: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Float[Array, ""]:
     """Returns the peak signal-to-noise ratio in dB, `-10 log10(mean((rendered - target)^2))`.
 
-    The mean is over pixels and channels, the peak is 1. At least 0 for images in `[0, 1]`, and
-    `inf` for equal images; higher is better.
+    The mean is over pixels and channels, and the peak is 1. The result is at least 0 for images in
+    `[0, 1]`, and `inf` for equal images; higher is better.
     """
     return dm_pix.psnr(rendered, target)
 
@@ -76,8 +76,8 @@ def psnr_masked(
 ) -> Float[Array, ""]:
     """Returns the PSNR over the pixels of a mask in dB.
 
-    As `psnr`, with the mean over the channels of the mask's pixels only: `inf` if they are equal,
-    NaN for an empty mask. The paper's PSNR_M is the mean of this metric over images.
+    This is `psnr` with the mean over the mask's pixels only: `inf` if these are equal, NaN for an
+    empty mask. The paper's PSNR_M is the mean of this metric over images.
 
     Source: paper (arXiv 2505.05848), section 5 (PSNR_M).
     """

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from jax import extend
 
+from refref_jax.choices import Material
 from refref_jax.data import mesh_queries, meshes, scene_folder
 from refref_jax.data.scene_analysis import analyse
 from refref_jax.data.scene_assembly import assemble_scene
@@ -29,6 +30,9 @@ from tests.factories.small_model import CAMERAS, MODEL
 
 _RAYS = jax.tree.map(lambda x: jnp.asarray(x).reshape(-1, *x.shape[2:]), image_rays(CAMERAS, 0))
 _BALL = scenes.ball(1.3, subdivisions=2)
+
+# Counted at the last commit without materials, bec1709, for a ball in a ball.
+_OPERATIONS_BEFORE = 7929
 
 
 def _analysis(*parts, rule="nested"):
@@ -118,6 +122,49 @@ def test_only_overlapping_bodies_make_rays_carry_lists():
     }
     assert any(columns == SLOTS for _, columns in lists["priority"])
     assert lists["nested"] and all(columns != SLOTS for _, columns in lists["nested"])
+
+
+_GOLD = Material("conductor", complex_index=((0.2, 0.4, 1.4), (3.4, 2.4, 1.8)))
+
+# The materials, and arrays of the interfaces that only they need.
+_MATERIALS = {
+    "opaque": (Material("opaque", radiance=(1.0, 1.0, 1.0)), {"kinds", "opaque"}),
+    "opaque_unknown": (Material("opaque"), {"kinds", "opaque"}),
+    "conductor": (_GOLD, {"kinds", "complex_index"}),
+    "thin_sheet": (Material("thin_sheet"), {"kinds"}),
+    "rough": (Material(roughness=0.3), {"alpha"}),
+    "dispersion": (Material(dispersion=(1.4, 1.5, 1.6)), {"index_by_channel"}),
+}
+
+
+def _inner(material):
+    part = scenes.ball(0.5, subdivisions=1, name="inner")._replace(material=material)
+    return part._replace(radiance=meshes.read_radiance(material, part.faces, path=None))
+
+
+@functools.cache
+def _traced_operations(material):
+    scene = scenes.build(_BALL, _inner(material))
+    return scene.interfaces, sum(_training_programs(scene, TREE).values())
+
+
+@pytest.mark.parametrize("name", _MATERIALS)
+def test_each_material_costs_operations_only_where_a_part_has_it(name):
+    material, needed = _MATERIALS[name]
+    interfaces, operations = _traced_operations(material)
+    plain, fewest = _traced_operations(Material())
+    lists = {"priority", "index_by_face"} if "kinds" in needed else set()
+    filled = {field for field, array in interfaces._asdict().items() if array.size}
+    assert (
+        filled - {field for field, array in plain._asdict().items() if array.size} == needed | lists
+    )
+    assert operations > fewest
+
+
+def test_a_clear_smooth_scene_of_one_index_compiles_to_as_much_as_before_the_materials():
+    if jax.__version__ != "0.10.2":
+        pytest.skip("operations were counted with jax 0.10.2")
+    assert _traced_operations(Material())[1] <= _OPERATIONS_BEFORE
 
 
 def _samples_inside(model):

@@ -136,7 +136,7 @@ def same_inside(method: Method, inside: Mapping[str, str]) -> str | None:
 
     Args:
       method: ablation.
-      inside: training options that the scene's objects lead to, of those in `_OF_INSIDE`.
+      inside: values of the options `_OF_INSIDE` that the scene's objects lead to.
     """
     given = _options_of(method)
     chosen = {name: given[name] for name in _OF_INSIDE if name in given}

@@ -2,8 +2,8 @@
 
 A record contains everything that is known of a job. Its JSON is validated when it is read;
 docs/benchmark.md has the schema. Numbers that JSON does not support are written as strings, "inf",
-"-inf" and "nan"; these are read as numbers only where a number is expected: a scene may be called
-nan.
+"-inf" and "nan"; these are read as numbers only where a number is expected, because a scene may be
+called nan.
 
 Tables are built from these files only. To merge the results of several machines, the folder of a
 job can be copied into another benchmark with the same settings. Each record is therefore compared

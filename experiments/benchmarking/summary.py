@@ -137,8 +137,8 @@ def _write_tables(folder: Path, made: Sequence[Table], found: Sequence[Record]) 
 def not_done(out: Path) -> tuple[dict[str, str], list[Skipped]]:
     """Returns the failed and skipped jobs when the results were last written.
 
-    Jobs that have a result since are not included. Both are empty if no results were written, or if
-    they cannot be read.
+    Jobs that have obtained a result since then are not included. Both are empty if no results were
+    written, or if they cannot be read.
     """
     try:
         index = configuration.parse_json((out / RESULTS).read_text("utf-8"))

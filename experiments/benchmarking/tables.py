@@ -6,14 +6,14 @@ scene of the block are excluded, and so are the paper's, which use other data.
 
 A `Quantity` defines a column: a value of a result, and whether higher or lower is better. There are
 three kinds of distances, see docs/metrics.md. Substituted distances, as in the first release of the
-paper's code, are exact inside the mask, by definition, for methods that know the objects: they are
-not ranked. The error of a distance is taken inside the mask with a natural background, which is at
+paper's code, are not ranked: for methods that know the objects, they are exact inside the mask by
+definition. The error of a distance is taken inside the mask with a natural background, which is at
 infinity, and over the image otherwise, like the paper's DMAE.
 
-The paper does not state the pixels of its DRMSE. It is unlikely to be over the image: the Oracle's
-is 0.00, but its DMAE there is 0.04 (cubes) and 0.15 (spheres), and an RMSE is never below the MAE
-of the same pixels. Our masked DRMSE is therefore next to the paper's, and that over the image
-has no counterpart.
+The paper does not state over which pixels its DRMSE is computed. It is unlikely to be the image:
+the oracle's DRMSE is 0.00, but its DMAE over the image is 0.04 (cubes) and 0.15 (spheres), and an
+RMSE is never below the MAE of the same pixels. The tables therefore show our masked DRMSE next to
+the paper's; our DRMSE over the image has no counterpart.
 """
 
 import math

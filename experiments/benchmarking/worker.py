@@ -80,7 +80,7 @@ def wait_until_free(folder: Path, patience: float = _PATIENCE) -> None:
     """Waits while a process of an earlier benchmark works in a folder, and prints a message.
 
     Raises:
-      ValueError: if it still does after `patience` seconds.
+      ValueError: if that process still works there after `patience` seconds.
     """
     end, said = time.monotonic() + patience, False
     while folder.is_dir():

@@ -73,7 +73,7 @@ def step() -> flags.FlagHolder[int | None]:
 
 
 def check_run(folder: Path, *, holds: Sequence[str] = (RUN,)) -> None:
-    """Rejects a folder that lacks any of some files, before its readers are imported."""
+    """Rejects a folder that lacks one of the given files, before its readers are imported."""
     if not any((folder / name).is_file() for name in holds):
         raise ValueError(
             f"{folder / holds[0]} does not exist. Give the folder that a training wrote, as in "

@@ -73,7 +73,7 @@ def check_file(path: Path, *, overwrite: bool) -> None:
 
 
 def check_folder(out: Path) -> None:
-    """Refuses, by a `ValueError`, a folder that cannot be written to; leaves none that was not."""
+    """Raises `ValueError` if a folder cannot be written to; does not leave behind a new one."""
     if out.exists() and not out.is_dir():
         return  # who writes there says what it is
     missing = [each for each in (out, *out.parents) if not each.exists()]

@@ -44,7 +44,7 @@ class ProgressBar:
         self.show(done, text)
 
     def show(self, done: int, text: str) -> None:
-        """Updates the bar; if the output is not a terminal a line is printed every twentieth."""
+        """Updates the bar, or prints 20 lines in total if the output is not a terminal."""
         self._bar.update(self._task, completed=done, text=text)
         due = done - self._printed >= self._total / self._PLAIN_LINES or done == self._total
         if self._bar.disable and due:

@@ -3,11 +3,11 @@
 python -m experiments.dataset.check runs/dataset --limit=3
 
 Each scene's meshes are linted and all of its images opened. Some of its test views are rendered
-again along the path tree, with a lower throughput threshold and more bends than the defaults of
-`render_known --paths=tree`, without light of more bends than Cycles traces, and compared with the
-image; depth map, mask and normals are compared with the first surface of our rays. {out}/check.html
-shows all results, {out}/check.json has the numbers; {out} is the folder itself by default. If a
-scene fails, the command ends with status 1.
+again along the path tree, and compared with the image. This uses a lower throughput threshold and
+more bends than the defaults of `render_known --paths=tree`, but no light with more bends than
+Cycles traces. Depth map, mask and normals are compared with the first surface that our rays hit.
+{out}/check.html shows all results, {out}/check.json has the numbers; {out} is the folder itself by
+default. If a scene fails, the command ends with status 1.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ def write_page(reports: Sequence[SceneReport], *, title: str) -> str:
 
 
 def mean(values: Sequence[float]) -> float:
-    """Returns the mean of all values but NaN, or NaN."""
+    """Returns the mean of the values that are not NaN; NaN if there are none."""
     known = [value for value in values if not np.isnan(value)]
     return float(np.mean(known)) if known else np.nan
 

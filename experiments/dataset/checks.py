@@ -2,8 +2,8 @@
 
 Two renderers share only the scene's files, so a disagreement means that one of them is wrong.
 Colours are compared inside the mask, where light passed through the object. Depths are compared
-away from *silhouettes*: pixels whose centre is within a pixel or two of an edge of the object, or
-of one part in front of another, hit one or the other by rounding.
+away from *silhouettes*, the edges of the object or of one part in front of another: within a pixel
+or two of such an edge, rounding decides which surface is hit.
 """
 
 from collections.abc import Mapping, Sequence

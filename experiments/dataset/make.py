@@ -3,8 +3,8 @@
 python -m experiments.dataset.make --out=runs/dataset --scenes=all --workers=4
 
 Each scene gets a folder in --out. Blender requires a separate environment, created by `make
-dataset-env`. An interrupted command resumes when it is given again: the result is the same, to the
-bit. Existing files are never replaced.
+dataset-env`. To resume an interrupted command, repeat it: the result is the same, to the bit.
+Existing files are never replaced.
 
 A mesh of your own, closed and in any units, takes the place of the objects:
 

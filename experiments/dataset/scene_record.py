@@ -1,8 +1,8 @@
 """The record of a scene in `scene.json` (NumPy only).
 
-For each part it has the media inside and outside of its surface, as passed to Blender: under the
-rule `nested` the outside is the innermost part around it, else air; under `facing` it is always
-air.
+For each part it contains the media inside and outside, as they were passed to Blender. Under the
+rule `nested`, outside is the innermost part around it, or air if there is none; under `facing`,
+outside is always air.
 """
 
 import itertools

@@ -27,7 +27,7 @@ _FLAT = 1e-6
 
 
 def read_object(paths: Sequence[Path], materials: Sequence[str]) -> Object:
-    """Reads meshes as the parts of one object, centred and scaled into the room.
+    """Reads meshes as the parts of one object, centred and scaled to fit between the cameras.
 
     All parts are moved and scaled together, so that their bounding box is around the origin and
     the farthest vertex at 0.9 of the largest radius of an object. A part is shaded with vertex

@@ -1,8 +1,8 @@
-"""Exports density and colours of a trained run: sampled on a grid, as a surface or points, as PLY.
+"""Exports the field of a trained run as PLY: a surface or points, with normals and colours.
 
-A surface is the level set of the density. It is computed on the logarithm, since densities grow by
-factors, and stays open at the borders of the grid. Inside objects that the model does not sample
-the density is 0: the field was never trained there.
+The density is sampled on a grid. A surface is a level set of the density, computed on its
+logarithm, since densities vary by orders of magnitude. It stays open at the borders of the grid.
+Inside objects that the model does not sample the density is 0: the field was never trained there.
 """
 
 import functools

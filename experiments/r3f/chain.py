@@ -117,7 +117,7 @@ def bounds_of(
     radius: float | None,
     centre: Position | None = None,
 ) -> tuple[Space | None, float | None, Position | None]:
-    """Returns type, size and centre of the background, where `None` is what `scene.json` says.
+    """Returns type, size and centre of the background; `None` stands for what `scene.json` says.
 
     Args:
       scene: folder of the scene.

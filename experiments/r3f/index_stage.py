@@ -215,11 +215,11 @@ def learn_background(
 
 
 def _as_background(config: ModelConfig) -> ModelConfig:
-    """Returns the configuration of a model trained along straight rays, for refracted paths.
+    """Adapts the configuration of a model that was trained along straight rays to bent paths.
 
-    The field was not trained inside the object, and single paths carry no derivatives across the
-    pixel. For straight rays neither makes a difference, so backgrounds of earlier versions, which
-    were trained with other values, can be used.
+    The field was not trained inside the object, so the interior is `clear`. Single paths carry no
+    derivatives across the pixel, so the footprint is `cone`. Neither matters for straight rays, so
+    backgrounds that earlier versions trained with other values can be used.
     """
     return dataclasses.replace(config, interior="clear", footprint="cone")
 

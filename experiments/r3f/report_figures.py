@@ -241,7 +241,7 @@ def _tinted() -> Float[np.ndarray, "3"]:
 
 
 def _share(pixels: Bool[np.ndarray, "h w"], outline: Outline) -> float:
-    """Returns the percentage of the pixels of mask or silhouette that a part of them makes up."""
+    """Returns the share of some pixels in the union of mask and silhouette, in percent."""
     return 100.0 * float(pixels.sum()) / max(1, int((outline.mask | outline.silhouette).sum()))
 
 

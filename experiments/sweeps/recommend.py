@@ -94,8 +94,8 @@ def compare(timing: Training, base: Row, images: int) -> Machine:
 def seconds_of(row: Row, machine: Machine) -> float:
     """Returns the expected seconds to train and evaluate a point on this machine.
 
-    Training and evaluation each start and compile once, for as long as in the timing. Images are
-    assumed to have the size of the table's.
+    Training and evaluation each start and compile once, which takes as long as it did in the
+    timing. Images are assumed to have the size of the table's.
     """
     working = row.stepping + machine.images * row.seconds_per_image
     return machine.ratio * working + 2.0 * machine.startup

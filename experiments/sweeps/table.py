@@ -158,7 +158,8 @@ def turns(rows: Sequence[Row]) -> list[Turn]:
 def worth_turning(found: Sequence[Turn]) -> list[Turn]:
     """Returns the best change of each option that gains more than noise, most worthwhile first.
 
-    Changes without additional time come first, by gain; then by decibels per percent of time.
+    Changes without additional time come first, sorted by their gain. The others follow, sorted by
+    decibels per percent of time.
     """
     gaining = [turn for turn in found if turn.gain > NOISE]
     return _best_of_each(
@@ -174,7 +175,8 @@ def is_free(turn: Turn) -> bool:
 def worth_saving(found: Sequence[Turn]) -> list[Turn]:
     """Returns the best change of each option that saves time and gains nothing, cheapest first.
 
-    Changes that lose no more than noise come first, by time saved; then by percent per decibel.
+    Changes that lose no more than noise come first, sorted by the time that they save. The others
+    follow, sorted by the percent of time that they save per decibel lost.
     """
     saving = [turn for turn in found if turn.percent < -TIME_NOISE and turn.gain <= NOISE]
 

@@ -84,7 +84,7 @@ def draw(
       layer: name of a layer of this module.
       rays: rays, `[h, w]`.
       chunk: number of paths rendered at once.
-      most: pixels of the largest image of this size; smaller crops are padded to it, so that
+      most: number of pixels of the uncropped image. Cropped images are padded to it, so that
         windows of all shapes share one compiled program.
       cancelled: callback that returns whether to stop; queried before every band.
 

@@ -178,7 +178,7 @@ def next_job(state: State, now: float) -> Job | None:
 
 
 def wait(state: State, now: float) -> float | None:
-    """Returns the seconds until there is something to draw; `None`: not before a change."""
+    """Returns the seconds until there is something to draw; `None` to wait for a change."""
     if state.change == 0 or state.drawn >= state.stages:
         return None
     if state.drawn == 0:

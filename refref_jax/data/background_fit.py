@@ -16,12 +16,12 @@ centre is further away than 0.1 % of the size and four standard errors, and the 
 the depths around it is less than half of that around the known one.
 
 8-bit maps are inverted, saturated and rounded (see `image_files.read_depth`). Saturated values are
-left out. Rounding is an error of the depth, uniform within a step and without bias; a deviation of
-less than a step is never an outlier. As the errors of neighbouring pixels are related, the standard
-error is that between images (a sandwich estimate with one cluster per image).
+left out. Rounding causes an error of the depth that is uniform within a step and has no bias; a
+deviation of less than a step is never an outlier. The errors of neighbouring pixels are correlated,
+so the standard error is estimated between images (a sandwich estimate with one cluster per image).
 
-The background is opaque and encloses the cameras, so that nearer points are on objects: where there
-are no masks, this leaves the objects out.
+The background is opaque and encloses the cameras, so a point that is nearer to its centre than some
+camera must be on an object. Such points are left out, even where there are no masks.
 """
 
 import math
@@ -90,7 +90,7 @@ class DepthSamples(NamedTuple):
       origins: positions of the cameras, world units.
       directions: directions in the world, with unit depth along the camera's axis.
       depths: planar depths, world units.
-      clusters: number of the image that a pixel is in, or of the part of an image.
+      clusters: number of the cluster of each pixel: its image, or a part of its image.
       step: difference between two depths of an 8-bit map; 0 for float maps.
     """
 
@@ -110,7 +110,7 @@ class BackgroundFit(NamedTuple):
       error: standard error of the size.
       centre: centre of the shape, world units.
       centre_error: standard errors of the centre; zeros if it is given.
-      agreement: part of the pixels that are at the fitted depth, 0 to 1.
+      agreement: share of the pixels that are at the fitted depth, 0 to 1.
     """
 
     kind: Kind
@@ -389,7 +389,7 @@ def _fit(
     unknowns: int,
     coarse: float = _ROUNDING,
 ) -> BackgroundFit | None:
-    """Fits the first unknowns of size and centre, from a first estimate of the centre on."""
+    """Fits the first `unknowns` of size and centre (four numbers), from an estimate of the centre."""
     extents = _extents(kind, _points(samples) - centre)
     if not len(extents):
         return None
@@ -435,7 +435,7 @@ def _choose(samples: DepthSamples, chosen: Bool[np.ndarray, " n"]) -> DepthSampl
 
 
 def _weights(errors: Float[np.ndarray, " n"], least: float) -> Float[np.ndarray, " n"]:
-    """Returns Tukey's biweights of deviations, which are positive up to a least deviation."""
+    """Returns Tukey's biweights of deviations; they are positive for deviations up to `least`."""
     scale = max(_TUKEY * _GAUSSIAN * float(np.median(np.abs(errors))), 2.0 * least)
     return np.maximum(1.0 - (errors / scale) ** 2, 0.0) ** 2
 
@@ -445,7 +445,7 @@ def _standard_errors(
     clusters: Int[np.ndarray, " n"],
     inverse: Float[np.ndarray, "unknowns unknowns"],
 ) -> Float[np.ndarray, " unknowns"]:
-    """Returns standard errors for errors that are only independent between clusters."""
+    """Returns standard errors, if only errors in different clusters are independent."""
     number = np.unique(clusters, return_inverse=True)[1]
     count = int(number.max()) + 1
     sums = np.stack([np.bincount(number, each, count) for each in scores.T], axis=1)

@@ -1,6 +1,6 @@
 """Draws the pixels of each training step (NumPy only).
 
-Pixels are assigned to batches once, at random; every epoch has all batches, in an order of its own.
+Pixels are assigned to batches once, at random; every epoch uses all batches, in a new random order.
 Results computed for a batch, such as its light paths, are therefore valid in every epoch. The batch
 of a step depends on the seed and the step alone, so a resumed run has the same pixels as an
 uninterrupted one. Within an epoch no pixel is repeated, except for those that fill up the last

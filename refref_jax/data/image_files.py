@@ -1,6 +1,7 @@
-"""Reads and writes images, masks and depth maps, and margins of masks (NumPy only).
+"""Reads and writes images, masks and depth maps (NumPy only).
 
-The pixels at the outline of a mask see both sides; margins leave them out.
+The pixels at the outline of a mask show the object and the background; `well_inside` and
+`well_outside` leave them out.
 
 Every reader raises a `SceneError` that names the file and the remedy.
 """

@@ -1,10 +1,10 @@
 """Checks the meshes of a scene, and advises an interface rule for them (NumPy only).
 
 Each part is checked by itself: it should be closed and oriented outwards, without degenerate or
-duplicate faces. Pairs of parts are checked for their position relative to each other. A liquid in
-its glass has one surface in common with it. Modelled as two surfaces, they coincide (light meets
+duplicate faces. Pairs of parts are checked for their position relative to each other. A liquid in a
+glass shares one surface with it. If this is modelled as two surfaces, they coincide (light meets
 them in either order), leave a gap (light is totally reflected at a layer of air that does not
-exist) or overlap (correct under the rule `priority`, and under `facing` as in Cycles).
+exist) or overlap (correct under the rule `priority`, and, as in Cycles, under `facing`).
 
 The advised rule is one of `optics.interface_rules`.
 """
@@ -158,10 +158,10 @@ def _thin_layer(
     gaps: SurfaceGaps,
     size: float,
 ) -> Bool[np.ndarray, " samples"]:
-    """Returns where a thin layer of lower index than both of its sides lies in front of a part.
+    """Returns where a thin layer lies in front of a part, with a lower index than both sides.
 
-    Light that would continue if the sides touched is totally reflected there. A layer of higher
-    index is a real wall, as of glass around a liquid, and refracts light correctly.
+    Some light is totally reflected there that would pass if the two sides touched each other. A
+    layer of higher index is a real wall, as of glass around a liquid, and refracts light correctly.
     """
     part, other = pair
     thin = (gaps.distances > _COINCIDENT * size) & (gaps.distances <= _THIN * size)
@@ -239,7 +239,7 @@ def _gap(parts: Sequence[MeshPart], pair: tuple[int, int], patch: _Patch) -> Fin
 
 
 def lint(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
-    """Checks every part (closed, oriented outwards, no needless faces), and all pairs of parts."""
+    """Checks all parts (closed, oriented outwards, clean faces), and all pairs of parts."""
     findings = []
     for part in parts:
         findings += _faces(part)
@@ -250,7 +250,7 @@ def lint(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
 
 
 def _objects(part: MeshPart) -> list[Finding]:
-    """Reports pieces whose faces point inwards; those of a cavity correctly do."""
+    """Reports pieces whose faces point inwards, except cavities, where that is correct."""
     faces = _largest_faces(part)
     # The winding number is negative in front of an inverted piece, and 0 in a cavity.
     winding = winding_number(part, beside_faces(part, faces, 1.0))

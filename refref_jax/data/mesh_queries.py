@@ -1,7 +1,7 @@
 """Queries of meshes: distances of surfaces, containment of parts, convexity (NumPy only).
 
-Distances: both surfaces are sampled, so small patches may be missed; distances are never
-underestimated.
+Distances between surfaces are those between samples, so they are never underestimated, but small
+patches may be missed.
 
 Containment: a point is inside a closed surface where the surface winds around it once. The winding
 number is a sum over triangles, so it needs no rays and tolerates small defects of a mesh.
@@ -71,7 +71,7 @@ class SampledSurface(NamedTuple):
       normals: unit normals of the triangles.
       faces: triangle of each sample.
       points: positions of the samples.
-      tree: search tree of more such points, and the centroids of all triangles.
+      tree: search tree of a larger number of such points and of the centroids of all triangles.
       owners: triangle of each point of the tree.
     """
 
@@ -298,8 +298,8 @@ def is_convex(part: MeshPart) -> bool:
     """Returns whether a part is one closed convex object with outward faces.
 
     All vertices and centroids of faces must lie on the convex hull within `TOLERANCE`. Depth below
-    a hull is a concave function, so between these points a face is at most three times as deep:
-    there is no reflex edge.
+    a hull is a concave function, so between these points a face is at most three times as deep.
+    Therefore the part has no reflex edge.
     """
     faces = part.faces[~is_degenerate(part.vertices[part.faces])]
     if len(faces) == 0 or not is_watertight(faces):

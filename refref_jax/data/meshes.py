@@ -6,11 +6,11 @@ contains: `perfume_red_glass.ply` is glass. `scene_properties` reads the descrip
 part in `scene.json`, that of its material there, and that of the table.
 
 A reconstructed mesh has its own shading normals, from the gradient of a field or averaged within
-patches; those of any other mesh follow from its faces. `write_mesh` stores them: PLY has one normal
-per vertex, so a vertex is written once for each normal that its faces have there, and the reader
-merges equal positions again. Numbers are in double precision, and are read back exactly. Normals
-are only read from files with exactly the header that `write_mesh` writes, because other programs
-may store any normals.
+patches; those of any other mesh follow from its faces. `write_mesh` stores them. PLY has one normal
+per vertex, so a vertex with several normals is written several times, and the reader merges equal
+positions again. Numbers are in double precision, and are read back exactly. Normals are only read
+from files with exactly the header that `write_mesh` writes, because other programs may store any
+normals.
 """
 
 import os
@@ -220,8 +220,8 @@ def published_meshes(thing: str, paths: Sequence[Path]) -> list[Path]:
     """Returns the meshes of an object among the published files of its category.
 
     They are named `{object}_{material}.ply`, one per material. Names are matched completely:
-    ball_coloured_glass.ply is not a mesh of the object ball. Without any, the mesh of an object
-    that is named like its material may have this one word as name: `diamond.ply`.
+    ball_coloured_glass.ply is not a mesh of the object ball. If there is none and the object is
+    named after its material, its mesh may have this single word as its name: `diamond.ply`.
 
     Args:
       thing: name of the object.
@@ -233,7 +233,7 @@ def published_meshes(thing: str, paths: Sequence[Path]) -> list[Path]:
 
 
 def without_colour(parts: Sequence[MeshPart]) -> list[MeshPart]:
-    """Returns the parts with clear surfaces and media.
+    """Returns the parts without their colours, with clear surfaces and media.
 
     This is for fields that learn the colour of glass from images, as the paper's oracle does: a
     tint that is already applied to the light paths would count twice.

@@ -30,8 +30,8 @@ class SceneAnalysis(NamedTuple):
 
     Attributes:
       parts: number of meshes; without any, rays are straight.
-      objects: number of objects: parts that no other part contains.
-      convex: whether there is one object, it is convex and contains all other parts.
+      objects: number of outermost parts, which no other part contains.
+      convex: whether there is exactly one object, and it is convex and contains all other parts.
       reentry: `impossible` if a ray that has left the objects cannot meet any again.
       interior: interior of the objects: `none` without objects, `clear` if their colours are known
         and absorb no light, otherwise `absorbing`.

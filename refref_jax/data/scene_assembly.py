@@ -249,7 +249,7 @@ def assemble_scene(
     return Scene(surfaces, interfaces)
 
 
-def _radiance(parts: Sequence[MeshPart]) -> list[Float[np.ndarray, "faces 3 3"]]:
+def _radiance(parts: Sequence[MeshPart]) -> list[Float[np.ndarray, "_ 3 3"]]:
     """Returns the radiance of all parts, 0 where they are not opaque; nothing if one is unknown."""
     opaque = [part for part in parts if part.material.kind == "opaque"]
     if not opaque or any(part.radiance is None for part in opaque):
@@ -278,7 +278,7 @@ def read_background(scene: Path, *, properties: SceneProperties | None = None) -
       The background, as NumPy arrays.
 
     Raises:
-      SceneError: if they do not describe the background, or an image is missing or broken.
+      SceneError: if the properties lack the background, or an image is missing or broken.
     """
     found = scene_properties.read(scene) if properties is None else properties
     path = found.origins.get("background", scene / scene_properties.FILE)

@@ -314,7 +314,7 @@ _light = vector_within(0.0, math.inf, "vertex_colours, or three numbers that are
 _Checks = Mapping[str, Callable[[Any], Any]]
 
 _TOP: _Checks = {
-    "version": number_within(VERSION, VERSION, f"{VERSION}, the version that this library reads"),
+    "version": number_within(1.0, 1.0, f"{VERSION}, the version that this library reads"),
     "rule": one_of(*get_args(RuleName)),
     "ambient_index": _positive,
     "ior": _record,
@@ -348,7 +348,7 @@ _PART: _Checks = {
     "eta": _metal(_LEAST, "positive"),
     "k": _metal(0.0, "non-negative"),
     "radiance": _radiance,
-    "interior": one_of("field"),
+    "interior": one_of("clear", "absorbing", "field"),
     "shading": one_of(*get_args(Shading)),
     "smooth_normals": of_type(bool, "true or false"),
     "tint": _tint,
@@ -419,16 +419,17 @@ def _part(name: str, record: Any, sources: Sequence[_Source]) -> PartDescription
         values |= {later: values[earlier]} if earlier in values else {}
     kind = values.get("kind", "dielectric")
     if idle := sorted(set(_IDLE[kind]) & set(values)):
-        raise _error(
-            ("parts", name, idle[0]), sources, f"has no effect on a part of kind {kind}. Remove it."
-        )
+        raise _error(("parts", name, idle[0]), sources, f"has no effect on kind {kind}. Remove it.")
     if missing := sorted(set(_NEEDED.get(kind, ())) - set(values)):
         raise _error(("parts", name), sources, f"lacks the key {missing[0]!r} of a {kind}. Add it.")
     values["material"] = _material(kind, values)
     if isinstance(values.get("index"), tuple):
         values["index"] = values["index"][1]  # the index of green stands for the material
     fields = {key: values[key] for key in PartDescription._fields if key in values}
-    return PartDescription(**fields, colour_known="tint" in fields or "absorption" in fields)
+    known = "tint" in fields or "absorption" in fields
+    if known and values.get("interior") == "clear":
+        raise _error(("parts", name), sources, "is clear, but has a colour. Remove one of the two.")
+    return PartDescription(**fields, colour_known=known or values.get("interior") == "clear")
 
 
 def _material(kind: PartKind, values: Mapping[str, Any]) -> Material:
@@ -438,7 +439,7 @@ def _material(kind: PartKind, values: Mapping[str, Any]) -> Material:
         roughness=values.get("roughness", 0.0),
         complex_index=(values["eta"], values["k"]) if kind == "conductor" else None,
         dispersion=index if isinstance(index, tuple) and len(set(index)) > 1 else None,
-        interior=values.get("interior"),
+        interior="field" if values.get("interior") == "field" else None,
         radiance=values.get("radiance"),
     )
 

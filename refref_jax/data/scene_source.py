@@ -56,7 +56,7 @@ _ABANDONED = 24 * 3600
 
 
 class LocalCopy:
-    """Local folders that together hold the files of the published repositories, or some of them.
+    """Local folders that together hold all or some files of the published repositories.
 
     Attributes:
       where: name in messages.
@@ -262,7 +262,7 @@ def open_scene(
 
 
 def is_unpacked(source: str | Path) -> bool:
-    """Returns whether `open_scene` only has to return a folder: the source is one, or unpacked."""
+    """Returns whether `open_scene` has nothing to unpack: the source is a folder, or unpacked."""
     if not str(source).startswith("hf:"):
         return True
     name = scene_names.parse_source(str(source))

@@ -1,8 +1,9 @@
 """Interface of field kinds: their configurations, functions and arithmetic precision.
 
-A radiance field has two functions, `init` and `radiance`; a proposal field has `init` and
-`density`. All are pure functions over Gaussians in the unit cube. A field type is one module with a
-`FieldKind`, and one line in `registry`, through which all other modules query fields.
+A radiance field has two functions, `init_radiance` and `radiance`; a proposal field has
+`init_density` and `density`. All are pure functions over Gaussians in the unit cube. A field kind
+is one module with a `FieldKind`, and one line in `registry`, through which all other modules query
+fields.
 
 The precision is float32, or mixed with bfloat16: tables are then read and matrices multiplied in
 bfloat16, while parameters, sums, gradients and outputs stay in float32. bfloat16 has only 8
@@ -25,7 +26,7 @@ from refref_jax.choices import Footprint, Precision
 from refref_jax.sampling.cones import Gaussians
 
 Params = Any
-"""Pytree of arrays, from `init`."""
+"""Pytree of arrays, from `init_radiance` or `init_density`."""
 
 
 def check_precision(precision: str) -> None:
@@ -58,12 +59,12 @@ def _product(left: Array, right: Array, axes: Any, precision: None = None) -> Ar
 class FieldConfig:
     """Shape of a field of any type.
 
-    Field types derive from `RadianceConfig` and `DensityConfig`, with their name as the default and
-    only value of `kind`. The registry and the files of a run identify the type by this name.
+    Field kinds derive from `RadianceConfig` and `DensityConfig`, with the name of the kind as the
+    default and only value of `kind`. The registry and the files of a run identify it by this name.
 
     Attributes:
       precision: precision of tables and matrix products.
-      kind: name of the field type.
+      kind: name of the field kind.
     """
 
     precision: Precision = dataclasses.field(default="float32", kw_only=True)
@@ -117,7 +118,7 @@ class FieldSize(NamedTuple):
 
 
 class FieldKind(NamedTuple):
-    """A field type.
+    """A field kind.
 
     Attributes:
       radiance_config: configuration class of the radiance field.
@@ -142,7 +143,7 @@ class FieldKind(NamedTuple):
 
 
 def evaluate(module: nn.Module, params: Params, *inputs: Any) -> Any:
-    """Returns what a Flax module computes; `apply` itself may return its variables as well."""
+    """Returns the output of a Flax module alone; its `apply` may return variables as well."""
     return module.apply(params, *inputs)
 
 

@@ -76,7 +76,7 @@ def tables(params: Any) -> list[Float[Array, "_ _"]]:
 
 
 class HashGrid(nn.Module):
-    """The tables, as a linen module over one Gaussian.
+    """The tables of a hash grid, as a linen module that is called with one Gaussian.
 
     Attributes:
       config: shape of the grid.

@@ -227,7 +227,7 @@ def _primitive(name: str, formula: Callable[..., Array], loop: Callable[..., Arr
 
 
 def _evaluate(formula: Callable[..., Array], *arguments: ArrayLike, **options: Any) -> Array:
-    """Returns the value of the formula; JAX passes constants to primitives as NumPy arrays."""
+    """Applies the formula to JAX arrays; a primitive may receive constants as NumPy arrays."""
     return formula(*map(jnp.asarray, arguments), **options)
 
 

@@ -1,6 +1,6 @@
-"""MLPs on hash grid features, and encodings of directions, shared by several field types.
+"""MLPs on hash grid features, and encodings of directions, shared by several field kinds.
 
-The functions of networks are called in a compact linen module, to which their layers belong.
+The network functions must be called in a compact method of a linen module, which owns their layers.
 """
 
 import dataclasses

@@ -6,7 +6,7 @@ is an exponential of the network output, and colour a sigmoid.
 
 Published Nerfacto also learns appearance embeddings and camera corrections, which concern
 photographs rather than the field; both are omitted. Sampling (with the first proposal level uniform
-in warped distance) and the proposal loss are those that this library uses for all field types.
+in warped distance) and the proposal loss are those that this library uses for all field kinds.
 Networks have biases, as in the PyTorch version.
 
 Source: Tancik et al., Nerfstudio (2023), section 4, and its code, `nerfstudio/models/nerfacto.py`,

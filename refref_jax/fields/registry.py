@@ -1,6 +1,6 @@
-"""Registry of field types.
+"""Registry of field kinds.
 
-Callers query fields through these functions, which dispatch on `config.kind`. To add a field type,
+Callers query fields through these functions, which dispatch on `config.kind`. To add a field kind,
 write a module with a `FieldKind` and add it to `KINDS`.
 """
 
@@ -25,7 +25,7 @@ KINDS: dict[str, FieldKind] = {
 }
 
 USUAL = "zipnerf"
-"""Field type if none is named, as in the files of older runs."""
+"""Field kind if none is named, as in the files of older runs."""
 
 
 def init_radiance(key: Array, config: RadianceConfig) -> Params:

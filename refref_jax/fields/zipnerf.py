@@ -1,4 +1,4 @@
-"""Zip-NeRF field type: proposal field, radiance field and preset sizes.
+"""Zip-NeRF field kind: proposal field, radiance field and preset sizes.
 
 The proposal field has density only, and is cheap to query many times along a path. The radiance
 field has density and view-dependent colour. The interface of both is pure functions over Gaussians
@@ -59,8 +59,8 @@ def density(params: Params, config: DensityFieldConfig, gaussians: Gaussians) ->
     """Returns the density of one interval, averaged over its multisamples, per scene radius.
 
     Args:
-      params: parameters, from `init`.
-      config: shape of the field, as in `init`.
+      params: parameters, from `init_density`.
+      config: shape of the field, as in `init_density`.
       gaussians: multisamples in the unit cube, as fractions of its edge.
     """
     return evaluate(_DensityField(config), params, gaussians)
@@ -104,8 +104,8 @@ def radiance(
     """Returns density and colour of one interval of a path.
 
     Args:
-      params: parameters, from `init`.
-      config: shape of the field, as in `init`.
+      params: parameters, from `init_radiance`.
+      config: shape of the field, as in `init_radiance`.
       gaussians: multisamples in the unit cube, as fractions of its edge.
       direction: unit direction of travel at the interval, world frame.
     """

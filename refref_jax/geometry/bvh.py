@@ -34,7 +34,7 @@ class BVH(NamedTuple):
 
     Attributes:
       nodes: one node table for each octant of directions (see `bvh_nodes`).
-      triangles: corners of each primitive, in leaf order, padded by `LEAF_SIZE` that are never hit.
+      triangles: corners of each primitive, in leaf order, then `LEAF_SIZE` that are never hit.
       facets: the same triangles, precomputed for the intersection test (see `triangles`).
     """
 
@@ -70,8 +70,8 @@ def closest_hits(
     the search: recompute the point from the triangle and the barycentrics.
 
     Neighbours in the batch should be neighbours in space, because on a CPU 16 of them traverse the
-    tree together. Pixels in tiles of 4 x 4 are coherent already; for incoherent rays,
-    `benchmarks/ray_sorting.py` has a sort.
+    tree together. Pixels in tiles of 4 x 4 are coherent already; sort incoherent rays as in
+    `benchmarks/ray_sorting.py`.
 
     Args:
       bvh: the tree of the scene.

@@ -74,7 +74,10 @@ def _areas(
     owner: Int[np.ndarray, " faces"],
     scene: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
 ) -> tuple[Float[np.ndarray, " faces"], Float[np.ndarray, " faces"]]:
-    """Returns half the areas of the boxes around each node's faces up to, and from, every face."""
+    """Returns half the areas of two boxes per face: around its node's faces up to it, and from it.
+
+    Both include the face itself.
+    """
     before, after = [], []
     for axis in range(3):
         base, top = scene[0][axis], scene[1][axis]
@@ -194,7 +197,7 @@ def _write_boxes(
 def _right_is_nearer(
     below: _Boxes, left: Int[np.ndarray, " nodes"], backwards: Bool[np.ndarray, "3"]
 ) -> Bool[np.ndarray, " nodes"]:
-    """Returns the nodes whose right child comes before the left along the octant's diagonal."""
+    """Returns which nodes have a right child that is nearer than the left one in an octant."""
     diagonal = np.where(backwards, -1.0, 1.0)
     middle = (below.lower + below.upper) @ diagonal
     return middle[left + 1] < middle[left]

@@ -95,7 +95,7 @@ class Projection(NamedTuple):
 def project(
     points: Float[np.ndarray, "points 3"], pose: Float[np.ndarray, "3 4"], cameras: Cameras
 ) -> Projection:
-    """Projects points, in world units, into the camera of one pose."""
+    """Projects points, in world units, into the image of the camera with one pose."""
     x, y, z = pose[:, :3].T @ (points.T - pose[:, 3:])
     scale = np.divide(-cameras.focal, z, out=np.zeros_like(z), where=z < 0.0)
     middle = 0.5 * np.array([cameras.width, cameras.height])

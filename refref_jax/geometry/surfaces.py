@@ -89,9 +89,9 @@ def surface_point(
 
 
 def pack_meshes(
-    meshes: Sequence[Mesh], *, radiance: Sequence[Float[np.ndarray, "faces 3 3"]] = ()
+    meshes: Sequence[Mesh], *, radiance: Sequence[Float[np.ndarray, "_ 3 3"]] = ()
 ) -> Surfaces:
-    """Builds the device record of meshes; parts have the numbers of their places, none is empty.
+    """Packs meshes for the device; none may be empty, and parts are numbered in their order.
 
     Args:
       meshes: meshes of the parts.

@@ -2,8 +2,8 @@
 
 The rays of a packet share one node index, and the packet descends where any of its rays hits. Rays
 are stored component by component, so that XLA turns each operation of the single-ray functions in
-`bvh_nodes` and `triangles` into one vector instruction. Packets run one after the other; the cost
-of a packet without active rays is negligible.
+`bvh_nodes` and `triangles` into one vector instruction. Packets are traced one after the other; the
+cost of a packet without active rays is negligible.
 
 A packet uses the node table of its rays' octant. If its rays have several octants, it traverses
 the tree once for each, with the other rays masked.

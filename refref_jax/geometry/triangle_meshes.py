@@ -143,13 +143,13 @@ def volume(vertices: Vertices, faces: Faces) -> float:
 
 
 def face_vectors(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "faces 3"]:
-    """Returns normals as long as the faces' areas."""
+    """Returns the faces' normals, each as long as the area of its face."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     return 0.5 * np.cross(b - a, c - a)
 
 
 def vertex_vectors(vertices: Vertices, faces: Faces) -> Vertices:
-    """Returns the gradient of the volume with respect to each vertex: outward, as long as an area.
+    """Returns the gradient of the volume with respect to each vertex, which points outwards.
 
     It is a third of the area vectors of the faces around.
     """
@@ -194,7 +194,7 @@ def diameter(vertices: Vertices) -> float:
 
 
 def pieces(faces: Faces, count: int) -> Int[np.ndarray, " vertices"]:
-    """Numbers the connected pieces of a mesh with so many vertices."""
+    """Numbers the connected pieces of a mesh with `count` vertices."""
     first, second = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
     graph = coo_array((np.ones(first.size, bool), (first, second)), shape=(count, count))
     return connected_components(graph, directed=False)[1]

@@ -1,6 +1,6 @@
 """Intersects one ray with one triangle, given by its corners or precomputed for the traversal.
 
-Letters: a triangle has corners `a, b, c`, counter-clockwise seen from outside; the barycentrics
+Symbols: a triangle has corners `a, b, c`, counter-clockwise seen from outside; the barycentrics
 `(u, v)` are the weights of `b` and `c`, so a point is `(1 - u - v) a + u b + v c`.
 
 A *facet* is a precomputed triangle, for the inner loop of the traversal: a row of twelve numbers in

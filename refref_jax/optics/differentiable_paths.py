@@ -13,13 +13,13 @@ totally reflected ray are exact.
 
 The *main branches* carry most of the light of a ray: the main path, which is refracted wherever it
 can be, and the paths that are reflected once, at one of the first surfaces, and then refracted like
-the main path. In clear glass, all other paths together carry 1 % of the light. Throughput that the
-threshold moves to siblings stays on these branches. A reflection that does not occur is an empty
-path: the path has already left the objects, or the reflection is total and therefore part of the
-main path.
+the main path. In clear glass, all other paths together carry 1 % of the light. If a branch is below
+the throughput threshold, its sibling on these paths takes its share. A reflection may not exist,
+because the main path has already left the objects, or because the reflection is total and therefore
+part of the main path; its path is then empty.
 
 Source: paper (arXiv 2505.05848), section 4.2; its two paths are the first two main branches.
-Letters as in `light_paths`.
+Symbols as in `light_paths`.
 """
 
 import functools
@@ -86,8 +86,8 @@ def follow_branch(
     Args:
       scene: the scene.
       ray: one camera ray.
-      reflects: choice of the reflected branch at each bend; a total internal reflection is always
-        followed. All false is the main path.
+      reflects: choice of branch at each bend: true for the reflected one. Total internal
+        reflections are always followed. All false is the main path.
       settings: path settings; `settings.max_bends` must be the length of `reflects`.
       interior_list: interior list of the camera, where rays carry one (see `media`).
 

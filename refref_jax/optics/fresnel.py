@@ -1,6 +1,6 @@
 """Fresnel equations for unpolarised light at dielectrics, conductors and thin sheets.
 
-Letters as in `snell`.
+Symbols as in `snell`.
 """
 
 import jax.numpy as jnp

@@ -10,9 +10,9 @@ rule:
   media that a ray is in.
 - `priority`: objects may overlap, and THE HIGHEST PRIORITY WINS in the overlap. Physical. It models
   a liquid that fills a glass without a gap: the liquid overlaps the wall a little, and the glass
-  has the higher priority (glass 3, ice 2, liquid 1). Of two objects *inside* each other, the inner
+  has the higher priority (glass 3, ice 2, liquid 1). If one object lies *inside* another, the inner
   one needs the higher priority (bubble 2, glass 1), so priorities cannot be derived from materials.
-  Among equal priorities the part listed first wins: the media are defined, but arbitrary.
+  Among equal priorities the part listed first wins: the result is well-defined, but arbitrary.
 
 The ambient medium, outside all parts, is air unless another index is given (`ambient`).
 """
@@ -132,7 +132,7 @@ RULES: dict[RuleName, Rule] = {"nested": nested, "facing": facing, "priority": p
 
 
 def ambient_of(interfaces: Interfaces) -> float:
-    """Returns the index of refraction of the ambient medium, which one part at least is in."""
+    """Returns the index of refraction of the ambient medium; at least one part must be in it."""
     return float(interfaces.index_outside[np.argmin(interfaces.medium_outside)])
 
 

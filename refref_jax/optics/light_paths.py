@@ -1,6 +1,6 @@
 """Light paths: polylines of light from a pixel into the scene.
 
-Letters, as in the paper (section 4.2): a path has points `p_0 .. p_K`, unit directions
+Symbols, as in the paper (section 4.2): a path has points `p_0 .. p_K`, unit directions
 `d_0 .. d_K` and cumulative distances `tau_0 = 0 .. tau_K`; segment `i` is
 `r(t) = p_i + (t - tau_i) d_i` for `t` in `[tau_i, tau_{i+1})`, and the last one never ends.
 `t` is arc length in world units.
@@ -69,7 +69,7 @@ class LightPaths(NamedTuple):
       media: medium of each segment (see `media`).
       differentials: ray differential of each segment, if carried (see `ray_differentials`).
       rays: index of each path's ray.
-      throughput: share of the path in its ray's linear RGB.
+      throughput: share of the ray's linear RGB that the path carries.
       radii: footprint of the ray's pixel as a cone radius at unit distance.
       num_bends: number of refractions and reflections.
       statuses: `PathStatus` of each path.
@@ -103,7 +103,7 @@ class PathEnds(NamedTuple):
       tau: arc length from the camera to the start of the last segment.
       media: medium of the last segment (see `media`).
       rays: index of each path's ray.
-      throughput: share of the path in its ray's linear RGB; 0 in empty slots.
+      throughput: share of the ray's linear RGB that the path carries; 0 in empty slots.
       num_bends: number of refractions and reflections.
       statuses: `PathStatus` of each path.
       stop: ends on opaque surfaces, `None` without such surfaces.

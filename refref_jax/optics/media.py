@@ -27,7 +27,7 @@ The list is an unordered array of `SLOTS` part indices, `EMPTY_SLOT` where free,
 branch-free. The side of a surface that a ray comes from determines whether the ray is inside that
 part, regardless of the list. A part entered while the list is full replaces the entry of lowest
 priority, or is omitted if its own priority is the lowest: with more than `SLOTS` objects around a
-point, the ray tracks those of highest priority and treats the others as left.
+point, the ray tracks those of highest priority, as if it had left the others.
 
 Source: Schmidt and Budge, Simple Nested Dielectrics in Ray Traced Images, Journal of Graphics
 Tools 7 (2002).

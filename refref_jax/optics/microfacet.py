@@ -9,7 +9,7 @@ scatter in turn is lost, as in Cycles' distribution `GGX`.
 Random numbers are a hash of the ray's hit point and direction. So a ray always meets the same
 facet, two rays of a pixel meet different ones, and tracing needs no random key.
 
-Letters: `n` unit normal of the surface on the incident side, `m` unit normal of the facet, `d` unit
+Symbols: `n` unit normal of the surface on the incident side, `m` unit normal of the facet, `d` unit
 direction of the ray, `alpha` width of the distribution.
 
 Sources: Walter et al., Microfacet Models for Refraction through Rough Surfaces (2007); Heitz,
@@ -83,7 +83,7 @@ def masking(
     leaving = jnp.where(leaves, leaving, 1.0)
     here = towards + _slope_length(towards, alpha)
     product = here * leaving
-    excess = towards * (_slope_length(leaving, alpha) - leaving)
+    excess = towards * jnp.maximum(_slope_length(leaving, alpha) - leaving, 0.0)
     return jnp.where(leaves, numerics.safe_divide(product, product + excess), 0.0)
 
 

@@ -73,18 +73,18 @@ def everything(bends: int) -> Detail:
 class PathSettings:
     """Path settings: the branches to follow, and the capacity for them.
 
-    The capacity factors bound memory, per camera ray traced together. If a buffer is full, the
-    paths of least throughput are dropped, and the dropped throughput is returned; see `wavefront`.
-    A factor of `None` is derived from the throughput threshold and the max bends
-    (`capacity_factors`), so `dataclasses.replace(TREE, min_throughput=0.002)` also has capacity for
-    the additional paths. A batch of few rays that all hit much glass may need larger factors.
+    The capacity factors limit the memory per camera ray. If a buffer is full, the paths of least
+    throughput are dropped, and the dropped throughput is returned; see `wavefront`. A factor of
+    `None` is derived from the throughput threshold and the max bends (`capacity_factors`), so
+    `dataclasses.replace(TREE, min_throughput=0.002)` also has capacity for the additional paths. A
+    batch of few rays that all hit much glass may need larger factors.
 
     Attributes:
       max_bends: largest number of refractions and reflections of a path.
       reflections: reflections to follow. `none` follows only total internal reflections; `first`
         adds the reflection at the first surface, untraced; `all` follows every reflection.
-      total_reflection: `followed`, or `ended`: paths continue straight at a total internal
-        reflection, as in the paper's ablation.
+      total_reflection: treatment of total internal reflection. `followed` reflects paths; `ended`
+        lets them continue straight, as in the paper's ablation.
       min_throughput: throughput threshold for following a branch, compared to the largest RGB
         component. A weaker branch leaves its share to its sibling, so that energy is conserved.
       reentry: `impossible` states that a ray that has left the objects never hits one again, as
@@ -168,7 +168,7 @@ class CapacityFactors(NamedTuple):
 
 
 def capacity_factors(settings: PathSettings) -> CapacityFactors:
-    """Returns the capacity factors of path settings, with those that are `None` derived.
+    """Returns the capacity factors of path settings, with defaults for those that are `None`.
 
     The defaults are generous for images that are partly filled by glass. If all reflections are
     followed, capacities grow with the inverse square root of a threshold below 0.02; the capacity
@@ -254,7 +254,7 @@ def capacities(settings: PathSettings, rays: int) -> Capacities:
 def capacity_for(settings: PathSettings, rays: int, *, mean: float, deviation: float) -> int:
     """Returns the capacity for the paths of a batch of a scene.
 
-    This is one standard deviation above the mean number of paths of a random batch, rounded up to a
+    This is the mean number of paths of a random batch plus one standard deviation, rounded up to a
     multiple of 8. One batch in six drops its weakest paths, and training logs their throughput. The
     cost of a step is proportional to this capacity; a capacity for all paths would cost 6 % more.
 

@@ -2,7 +2,7 @@
 
 Both tracers, `wavefront` and `differentiable_paths`, are built from these steps.
 
-Letters as in `snell` and `light_paths`. The geometric normal determines the side that a ray comes
+Symbols as in `snell` and `light_paths`. The geometric normal determines the side that a ray comes
 from and the origins of the new rays; the shading normal determines their directions.
 
 Source: paper (arXiv 2505.05848), section 4.2, with its Fresnel blend; the energy-conserving
@@ -186,15 +186,15 @@ def shares(
 
     If a reflection is not followed, the transmitted branch takes its share. If the weaker branch
     falls below the throughput threshold, the stronger one takes all, so the threshold neither
-    darkens the image nor adds noise. Shares are constant if a branch is below the threshold and
-    follow `reflectance` elsewhere, so their gradient is that of Fresnel's equations or 0.
+    darkens the image nor adds noise. If a branch is below the threshold, the shares are constant,
+    with gradient 0; otherwise, their gradient is that of `reflectance`.
 
     Args:
       settings: path settings.
       reflectance: Fresnel's `R`.
       total: whether reflection is total.
       first: whether this is the first surface of a path.
-      strength: incident throughput times the interface's tint, the largest of its RGB.
+      strength: largest RGB component of incident throughput times the interface's tint.
     """
     if settings.reflections == "all":
         partial = reflectance

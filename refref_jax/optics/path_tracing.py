@@ -10,7 +10,7 @@ and the scene do not, and differentiating with respect to these is an error (use
 In a scene with dispersion, each ray is traced three times, for red, green and blue light with its
 own indices; the throughput of a path is then 0 in two channels. Other scenes have one trace.
 
-Source: paper (arXiv 2505.05848), section 4.2. Letters as in `light_paths`.
+Source: paper (arXiv 2505.05848), section 4.2. Symbols as in `light_paths`.
 """
 
 from typing import NamedTuple, TypeVar

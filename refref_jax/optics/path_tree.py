@@ -8,7 +8,7 @@ paths, in the order of its rays, the heaviest path of each ray first. If the bat
 the total capacity, the weakest paths of all batches are dropped first, because the cost of sorting
 depends on the number of slots.
 
-Letters as in `light_paths`.
+Symbols as in `light_paths`.
 """
 
 from typing import NamedTuple
@@ -59,7 +59,7 @@ class Ends(NamedTuple):
     Attributes:
       segments: index of the last segment.
       rays: index of the camera ray.
-      throughput: share of the path in its ray's linear RGB.
+      throughput: share of the ray's linear RGB that the path carries.
       num_bends: number of bends.
       statuses: `PathStatus` of each path.
       stop: ends on opaque surfaces, `None` without such surfaces.
@@ -171,20 +171,21 @@ def polylines(
         num_bends=ends.num_bends,
         statuses=ends.statuses,
         hit_counts=walk.hit_counts,
-        path_lengths=walk.path_lengths + _lengths_to_stops(segments, ends, walk.path_lengths),
+        path_lengths=_up_to_stops(segments, ends, walk.path_lengths),
         stop=ends.stop,
     )
 
 
-def _lengths_to_stops(
-    segments: Segments, ends: Ends, like: Float[Array, "paths tallied"]
-) -> Float[Array, "paths tallied"] | float:
-    """Returns the lengths of last segments that end on opaque surfaces, by the part around them."""
+def _up_to_stops(
+    segments: Segments, ends: Ends, lengths: Float[Array, "paths tallied"]
+) -> Float[Array, "paths tallied"]:
+    """Adds the lengths of last segments that end on opaque surfaces to those in media."""
     if ends.stop is None:
-        return 0.0
+        return lengths
     length = ends.stop.tau - segments.tau[ends.segments]
-    through = 1 + jnp.arange(like.shape[1]) == segments.media[ends.segments][:, None]
-    return jnp.where(through & jnp.isfinite(length)[:, None], length[:, None], 0.0)
+    parts = jnp.arange(lengths.shape[1], dtype=jnp.int32)[None]
+    through = 1 + parts == segments.media[ends.segments][:, None]
+    return lengths + jnp.where(through & jnp.isfinite(length)[:, None], length[:, None], 0.0)
 
 
 class _Walk(NamedTuple):
@@ -194,7 +195,8 @@ class _Walk(NamedTuple):
       segment: current segment of each path, `NO_SEGMENT` if it is done.
       stop: arc length at the end of the current segment.
       found: number of selected segments so far.
-      picked: selected segments, right-aligned; the first segment of a path goes leftmost.
+      picked: selected segments of each path, right-aligned. If they do not fit, they overwrite each
+        other at the left end, where the first segment of the path remains.
       stops: arc lengths at the ends of the selected segments.
       hit_counts: hit counts so far.
       path_lengths: path lengths so far.

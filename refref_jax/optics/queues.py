@@ -79,7 +79,7 @@ def drop_weakest(
       capacity: maximum number of records to keep.
 
     Returns:
-      The queue, in its order, and the updated dropped throughput.
+      The queue, in its original order, and the updated dropped throughput.
     """
 
     def drop(queue: Queue, dropped: Float[Array, "rays 3"]) -> tuple[Queue, Float[Array, "rays 3"]]:

@@ -32,7 +32,7 @@ _Result = TypeVar("_Result")
 
 
 class RayDifferential(NamedTuple):
-    """Ray differential: derivatives of a ray across its pixel; zero axes if they are not carried.
+    """Ray differential: derivatives of a ray across its pixel; empty if they are not carried.
 
     Attributes:
       points: derivatives of the segment's start, world units.

@@ -82,7 +82,7 @@ def of_channel(scene: Scene, channel: int) -> Scene:
 
 
 def in_one_precision(scene: Scene, rays: Rays) -> tuple[Scene, Rays]:
-    """Returns a scene and rays as JAX arrays of the highest precision among their arrays.
+    """Converts a scene and rays to JAX arrays, all in the highest precision that one of them has.
 
     Scenes are built in single precision, so rays in double precision are traced in double
     precision through corners that were rounded to single precision.

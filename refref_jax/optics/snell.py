@@ -1,6 +1,6 @@
 """Snell's law and the law of reflection at one point of an interface.
 
-Letters, as in the paper (arXiv 2505.05848, section 4.2): `n` unit normal on the side the light
+Symbols, as in the paper (arXiv 2505.05848, section 4.2): `n` unit normal on the side the light
 comes from; `beta = -d.n` the cosine of incidence, in `[0, 1]`; `nu_0`, `nu_1` the indices of
 refraction on the near and on the far side; `alpha = nu_0 / nu_1`; `gamma` the cosine of the
 transmitted ray, `gamma^2 = 1 - alpha^2 (1 - beta^2)`; `gamma^2 < 0` is total internal
@@ -47,7 +47,7 @@ def transmission(
 def reflect(direction: Float[Array, "3"], normal: Float[Array, "3"]) -> Float[Array, "3"]:
     """Returns the mirrored direction, for a unit normal on either side.
 
-    Source: paper, law of reflection; also its total internal reflection.
+    Source: paper, law of reflection and total internal reflection.
     """
     return direction - 2.0 * numerics.dot(direction, normal) * normal
 

@@ -13,7 +13,7 @@ If a buffer exceeds its capacity, its records of least throughput are dropped, a
 throughput of each ray is returned: the throughput of a ray's paths and its dropped throughput sum
 to 1, minus absorption by tints and media.
 
-Letters as in `light_paths`. Source: paper (arXiv 2505.05848), section 4.2, for the interaction
+Symbols as in `light_paths`. Source: paper (arXiv 2505.05848), section 4.2, for the interaction
 with surfaces.
 """
 
@@ -68,9 +68,9 @@ class Children(NamedTuple):
     """The child rays of a block, reflected ones first.
 
     Attributes:
-      live: child rays; they have the segment index of their parent until their own is stored.
+      live: child rays; `segments` is that of the parent until the child's segment is stored.
       media: medium of each child's segment.
-      parts: part that each child's segment starts on.
+      parts: part on whose surface each child's segment starts.
       exists: mask of children with positive throughput.
       traced: mask of children that are traced further.
     """

@@ -80,11 +80,11 @@ def of_points(points: Float[np.ndarray, "n 3"]) -> Mesh:
 
 
 def weigh_facets(mesh: Mesh, *, crease_angle: float = CREASE_ANGLE) -> Mesh:
-    """Returns a mesh of few corners whose normals are averaged by the areas of flat facets.
+    """Returns a mesh of few corners with normals that are averaged by the areas of flat facets.
 
-    Averages weighted by angle would tilt the normals all over a large flat lid that meets a narrow
-    bevel at less than the crease angle. Weighted by area, the normals vary across the bevel
-    instead.
+    Suppose that a large flat lid meets a narrow bevel at less than the crease angle. An average
+    weighted by angle would tilt the normals of the entire lid. Weighted by area, the normals vary
+    on the bevel instead.
 
     Args:
       mesh: convex mesh.
@@ -208,7 +208,7 @@ def _planes(mesh: Mesh, patches: list[Int[np.ndarray, " _"]]) -> Float[np.ndarra
 def _flat_plane(
     points: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"], tolerance: float
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
-    """Returns the plane of most points: normal, a point of it, and the share near it."""
+    """Returns the plane near most points: its normal, one of its points, the share near it."""
     near = np.ones(len(points), bool)
     for _ in range(_FITS):
         some = weights * near

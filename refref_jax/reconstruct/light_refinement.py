@@ -187,8 +187,8 @@ class LightRefinement:
       steps: number of steps of the descent.
       rays: number of pixels per step.
       handles: largest number of handles on the surface.
-      stride: largest move of a coordinate of a handle per step, world units. The errors that masks
-        leave are as small: ten times this stride made the bundled ball worse.
+      stride: largest move of a coordinate of a handle per step, world units. It is as small as the
+        errors that masks leave: ten times this stride made the bundled ball worse.
       index_stride: largest change of the index per step.
       evenness: weight of the prior, per squared world unit.
       seed: seed of the pixels of each step.
@@ -245,7 +245,7 @@ def refine_by_light(
 ) -> Refined:
     """Refines the shape and the index of the only object of a scene.
 
-    Pixels that were not used in the descent must decide whether the result is better.
+    The caller must decide with other pixels whether the result is better.
 
     Args:
       mesh: mesh of the object.

@@ -7,10 +7,10 @@ and triangles beyond that bound plus their own radius are excluded. The sign is 
 angle-weighted normal of the feature (face, edge or vertex) that contains the closest point, which
 is exact on closed surfaces.
 
-Correct masks agree with the silhouettes of their visual hull. A mask that marks too much is
-overruled by the others, and only this mask disagrees. A mask that marks too little removes part of
-the object: it agrees, and all others disagree. The volume that only this mask carves away
-identifies it (`carved_alone`).
+Correct masks agree with the silhouettes of their visual hull. If a mask marks too much, the others
+carve the excess away, and only this mask disagrees with the hull. If it marks too little, it carves
+away part of the object, so it agrees with the hull, but all other masks disagree. The volume that
+no other mask carves away identifies it (`carved_alone`).
 
 All of this runs on the host; only silhouettes are traced with JAX.
 
@@ -119,7 +119,11 @@ class ClosestSearch:
     def _nearest(
         self, points: Points, count: int
     ) -> tuple[Points, Values, Int[np.ndarray, " points"], Values]:
-        """Returns the closest of `count` pieces, and the distance of the furthest piece centre."""
+        """Returns the closest point on the `count` pieces with the nearest centres.
+
+        Returns:
+          The points, their distances and pieces, and the distance of the furthest of the centres.
+        """
         away, near = self._tree.query(points, k=[*range(1, count + 1)])
         corners = self._pieces[near].reshape(-1, 3, 3)
         on = closest_point(corners, np.repeat(points, count, axis=0)).reshape(-1, count, 3)
@@ -158,7 +162,7 @@ def signed_distance(mesh: Mesh) -> Field:
 def _edge_normals(
     faces: Faces, normals: Float[np.ndarray, "faces 3"]
 ) -> Float[np.ndarray, "faces 3 3"]:
-    """Returns for every edge, indexed by the opposite corner, the sum of its faces' normals."""
+    """Returns the sum of both faces' normals at every edge, indexed by the opposite corner."""
     edges = np.sort(faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
     _, edge = np.unique(edges, axis=0, return_inverse=True)
     edge = edge.reshape(-1)
@@ -237,10 +241,10 @@ def compare_meshes(mesh: Mesh, truth: Mesh, *, samples: int = SAMPLES, seed: int
 def silhouette_overlap(
     mesh: Mesh, masks: Bool[np.ndarray, "views h w"], cameras: Cameras
 ) -> Float[np.ndarray, " views"]:
-    """Returns for each view the pixels in both mask and silhouette over those in either (IoU).
+    """Returns the intersection over union (IoU) of mask and silhouette in each view.
 
     A pixel is in the silhouette if the ray through its centre hits the mesh, as in the masks of the
-    data set. A view in which both are empty counts as 1.
+    data set. The IoU is 1 in a view in which both are empty.
     """
     return overlaps(silhouettes(mesh, cameras), masks)
 
@@ -295,7 +299,7 @@ def without_outliers(mesh: Mesh, views: Views, count: int) -> Views:
 
 
 def carved_alone(views: Views) -> Values:
-    """Returns for each view the share of the other views' hull that only this view carves away.
+    """Returns, for each view, the share of the other views' hull that only this view carves away.
 
     The share is measured on a lattice of 64 points along each edge of the cube that is searched for
     the object, see `visual_hull.REACH`. It is 0 if the hull of the other views contains none of

@@ -11,13 +11,13 @@ Each step draws rays, half of them from pixels near an outline of a mask, and mi
              +  lambda_v mean f(x) / p
 
 where `C` is the mean binary cross entropy between rendered silhouettes and masks, `b` the softness
-of the step and `p` the size of a pixel, both in edges of the cube. A ray on the wrong side of an
-outline then costs about its distance from it in pixels. The second term, which UNISURF does not
-have, keeps `f` close to a distance, at points of the surface and anywhere. The third is UNISURF's
-smoothness of the normals `n` at points of the surface, with small random steps `e`. The fourth
-pushes the surface outwards, too weakly to move outlines: a dent that no outline shows would
-otherwise remain where the first steps happened to leave it. Among all shapes with the same
-silhouettes it selects the largest.
+of the step and `p` the size of a pixel, both in edges of the cube. The first term of a ray on the
+wrong side of an outline is then about its distance from the outline, in pixels. The second term,
+which UNISURF does not have, keeps `f` close to a distance, at points of the surface and anywhere.
+The third is UNISURF's smoothness of the normals `n` at points of the surface, with small random
+steps `e`. The fourth pushes the surface outwards, too weakly to move outlines. It selects the
+largest of all shapes with the same silhouettes; otherwise, a dent that no outline shows would
+remain as the first steps happened to leave it.
 
 This is one of the modules that call `jax.jit`.
 
@@ -71,7 +71,7 @@ class OccupancyTrainingConfig:
       solidity: weight `lambda_v` of the push outwards; without it flat faces keep dents, and three
         times as much distorts outlines.
       reach: standard deviation of the steps between compared normals, in cells of the finest grid.
-      surface: number of rays per batch for all terms but the first.
+      surface: number of rays per batch that are used for the terms after the first.
       band: distance from an outline up to which a ray counts as near it, pixels.
     """
 
@@ -144,7 +144,7 @@ class OccupancyReport(NamedTuple):
 
     Attributes:
       loss: minimised loss.
-      wrong: share of the rays whose silhouette is on the other side of 1/2 than the mask.
+      wrong: share of the rays whose silhouette, rounded to 0 or 1, differs from the mask.
       slope: unweighted term of the field's slope.
       smoothness: unweighted term of the normals.
     """

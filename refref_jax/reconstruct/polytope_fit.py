@@ -5,13 +5,13 @@ whose hull it is. Image coordinates are in pixels, column to the right and row d
 of a pixel lies half a pixel from its edges. The corners of a polygon are listed in the order in
 which it turns.
 
-A visual hull bulges over a flat face, because few views lie in its plane: no mask shows the bulge,
-as the edge of the face lies on the same lines of sight. What the masks do show is the position of
-the corners. The simplest convex polytope with the outlines of the masks is therefore fitted. Among
-the hull's points, the one that sticks out furthest from the current outlines is added as a corner,
-as long as it does so by more than a tolerance. All corners are then moved by least squares until
-the outlines match those of the masks, and corners that do not affect any outline are removed. This
-is repeated with finer tolerances. A corner is visible in many views, so it is located far more
+A visual hull bulges over a flat face, because few views lie in its plane. No mask shows the bulge:
+in every view, it is within the outline of the face. What the masks do show is the position of the
+corners. Therefore the simplest convex polytope with the outlines of the masks is fitted. Among the
+hull's points, the one that sticks out furthest from the current outlines is added as a corner, as
+long as it does so by more than a tolerance. All corners are then moved by least squares until the
+outlines match those of the masks, and corners that do not affect any outline are removed. This is
+repeated with finer tolerances. A corner is visible in many views, so it is located far more
 accurately than an outline: to a hundredth of a pixel where the outlines are off by 0.14.
 
 A curved rim becomes a ring of corners a few pixels apart, so cylinders can be fitted. Balls cannot,

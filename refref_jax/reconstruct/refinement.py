@@ -229,7 +229,13 @@ def remesh(mesh: Mesh, spacing: float, *, level: float = 0.0) -> Mesh:
 def _changes(
     settings: Refinement, first: Mesh, views: Views | None
 ) -> dict[str, Callable[[Mesh], Mesh]]:
-    """Returns the stages after the first by name, in order; `first` is the first stage's mesh."""
+    """Returns the changes of all stages after the first, by name and in order.
+
+    Args:
+      settings: settings of the stages.
+      first: mesh after the first stage.
+      views: masks from which the mesh was made, if any.
+    """
     changes: dict[str, Callable[[Mesh], Mesh]] = {}
     if settings.denoising > 0.0:
         changes["denoised"] = lambda mesh: denoise_within(

@@ -75,7 +75,7 @@ class Slope(NamedTuple):
 def errors(
     evidence: Evidence, scene: Scene, *, config: ModelConfig, settings: PathSettings = TRACING
 ) -> Float[Array, " rays"]:
-    """Returns the Charbonnier error of each pixel in sRGB, of the length of the difference.
+    """Returns the Charbonnier error of each pixel: of the length of its sRGB difference.
 
     Args:
       evidence: pixels and the field to compare with.
@@ -235,7 +235,7 @@ def estimate_index(
       config: configuration of the field's model.
       search: settings of the search.
       start: index that the user expects, from which a descent always starts.
-      progress: called with the number of evaluations done, and their largest number.
+      progress: called with the number of evaluations done, and the largest possible number.
 
     Raises:
       ReconstructionError: if there are no pixels, or no error is finite.
@@ -331,7 +331,7 @@ def _rungs(search: IndexSearch) -> tuple[float, ...]:
 
 
 def _lowest_rungs(heights: Sequence[float], count: int) -> list[int]:
-    """Returns the lowest rungs that are not adjacent to each other, as those share a valley."""
+    """Returns the lowest rungs, but no two adjacent ones, which would share a valley."""
     chosen: list[int] = []
     for rung in np.argsort(np.where(np.isfinite(heights), heights, np.inf), kind="stable"):
         if len(chosen) < count and all(abs(int(rung) - other) > 1 for other in chosen):

@@ -85,7 +85,7 @@ def denoise(mesh: Mesh, length: float, *, crease_angle: float = CREASE, rounds: 
     """Diffuses normals over a length, but not across creases, and fits the vertices to them.
 
     An angle `a` between faces has the weight `exp(-(a / crease_angle)^2)`, recomputed at each of
-    four steps. Shape on lengths above four diffusion lengths and the volume are preserved.
+    four steps. The volume and features larger than four diffusion lengths are preserved.
 
     Args:
       mesh: closed mesh.

@@ -71,9 +71,8 @@ def carve(
 
     Up to `outliers` views may be wrong: at each point the `outliers` largest values are ignored, so
     that a mask that misses part of the object, or is shifted, does no harm. This costs accuracy
-    everywhere: the surplus that at most so many views would carve remains, so the object grows
-    between tangent cones. It is not a vote among nearby views: equal errors in many masks are not
-    detected.
+    everywhere: what only `outliers` views or fewer would carve remains, so the object grows between
+    tangent cones. If more masks have the same error, it is not detected.
 
     Args:
       masks: one mask per view, true where the object is visible.

@@ -223,5 +223,5 @@ def _empty_arrays(parts: int) -> dict[str, np.ndarray]:
 
 
 def _brief(error: Exception) -> str:
-    """Returns the kind of an error and the first line of what it says."""
+    """Returns the kind of an error and the first line of its message."""
     return f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"

@@ -5,9 +5,9 @@ then rendered in *chunks*: a pixel that misses the objects costs one path, not t
 tiles and chunks run on the host, so they cannot be part of a transformed function. This is one of
 the modules that call `jax.jit`.
 
-With several rays in every pixel, a pixel is divided into `side x side` smaller ones. Each has a ray
-of its own with a footprint as much smaller, so the fields are queried for finer detail too. Colours
-are averaged as linear light and encoded afterwards, as a camera does.
+With several rays per pixel, a pixel is divided into `side x side` smaller ones. Each has its own
+ray, with a footprint smaller by the same factor, so the fields are queried for finer detail too.
+Colours are averaged as linear light and encoded afterwards, as a camera does.
 """
 
 import functools
@@ -383,9 +383,9 @@ def average(fine: Rendering, side: int) -> Rendering:
     """Averages the small pixels of a supersampled camera.
 
     Colours are averaged as linear light, without clipping, and then encoded and clipped; mean
-    distances and accumulations are averaged as they are. The distance is the median of the small
-    pixels', the lower of the two middle ones if their number is even: at an edge it is that of one
-    of the two surfaces, never a place between them where nothing is.
+    distances and accumulations are averaged as they are. The distance is the median over the small
+    pixels, or the lower of the two middle values if their number is even. At an edge it is thus the
+    distance of one of the two surfaces, never one between them.
     """
 
     def filtered(values: Array | np.ndarray) -> Any:

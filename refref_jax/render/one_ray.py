@@ -3,7 +3,7 @@
 `render_image` and training compute the same for many rays at once, compiled; a test compares them
 (`tests/render/test_one_ray.py`).
 
-Letters, as in the paper (arXiv 2505.05848, section 4): a light path is `r(t) = p_i + (t - tau_i)
+Symbols, as in the paper (arXiv 2505.05848, section 4): a light path is `r(t) = p_i + (t - tau_i)
 d_i`; interval `i` of its samples has density `sigma_i`, colour `c_i` and length `delta_i`, and
 `T_i = exp(-sum_{j<i} sigma_j delta_j)` is its transmittance. `s` in `[0, 1]` is the normalised
 coordinate in which samples are drawn (Zip-NeRF, section 4); `x` are multisamples of intervals.

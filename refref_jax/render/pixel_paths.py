@@ -54,7 +54,7 @@ class PixelPaths(NamedTuple):
     Attributes:
       polylines: one polyline `[points, 3]` per path, world units: the camera, every bend, and the
         end of the last segment as drawn.
-      throughput: share of each path in the ray's linear RGB.
+      throughput: share of the ray's linear RGB that each path carries.
       statuses: status of each path.
       num_bends: number of refractions and reflections of each path.
       dropped: dropped throughput of the ray, linear RGB.
@@ -72,8 +72,7 @@ class Pieces(NamedTuple):
 
     Attributes:
       ends: start and end of each segment, world units.
-      shares: share of the pixel's light on each segment, mean over RGB, by the throughput of its
-        paths.
+      shares: share of the pixel's light on each segment: throughput of its paths, mean over RGB.
     """
 
     ends: Float[np.ndarray, "pieces 2 3"]

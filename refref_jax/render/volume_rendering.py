@@ -1,6 +1,6 @@
 """Integrates radiance along one light path: proposal levels, the radiance field, compositing.
 
-Letters, as in the paper (arXiv 2505.05848, section 4.1): interval `i` has density `sigma_i` and
+Symbols, as in the paper (arXiv 2505.05848, section 4.1): interval `i` has density `sigma_i` and
 length `delta_i`; `T_i = exp(-sum_{j<i} sigma_j delta_j)` is the light that reaches it and
 `w_i = T_i (1 - exp(-sigma_i delta_i))` its weight in the colour.
 
@@ -61,9 +61,9 @@ def alpha_weights(
     """Returns the weights `w_i`, which sum to at most 1.
 
     Value and gradient are finite for any density and length in `[0, inf)` whose product does not
-    overflow; the product may be infinite if it is not `0 * inf`. Edges that differ by a rounding
-    error may be out of order: lengths below 0 count as 0, because an opaque sample would otherwise
-    have a weight of minus infinity.
+    overflow, and also if one of them is infinite and the other is not 0. Edges that differ by a
+    rounding error may be out of order: a length below 0 counts as 0, because an opaque sample would
+    otherwise have a weight of minus infinity.
 
     Source: paper, volume rendering equation.
     """

@@ -1,9 +1,9 @@
 """Multisamples of a pixel's cone around the bent centre line of a light path.
 
 An interval of a path is a conical frustum, represented by a few multisamples, each an isotropic
-Gaussian, so that a field can blur detail that is finer than the pixel's footprint. Without ray
-differentials, the cone grows with arc length as along a straight ray, and the pattern follows the
-bends; with ray differentials (`optics.ray_differentials`), they determine its width.
+Gaussian, so that a field can blur detail that is finer than the pixel's footprint. The centre line
+follows the bends. The width of the cone grows with arc length, as along a straight ray, or is that
+of the ray differentials, if they are carried (`optics.ray_differentials`).
 
 Source: Barron et al., Zip-NeRF (2023), section 2; paper (arXiv 2505.05848), supplement, for the
 bent centre line.

@@ -4,7 +4,7 @@ A bounded scene is a scaled cube, and a spherical scene is the ball in this cube
 is contracted: a ball is unchanged, and the space beyond it is contracted to a shell of the same
 thickness. All of them are around the centre of the scene.
 
-Letters: `t` is distance in world units, `s` the normalised coordinate in `[0, 1]` in which samplers
+Symbols: `t` is distance in world units, `s` the normalised coordinate in `[0, 1]` in which samplers
 work. Equal steps in `s` are short near the camera and grow with distance, so that one interval
 covers near and far.
 

@@ -51,8 +51,8 @@ def sample_intervals(
 ) -> Float[Array, "*batch m+1"]:
     """Draws `m` intervals whose density follows a step function.
 
-    The samples at `u` become the middles of the new intervals: an edge lies half-way between two
-    samples; the outermost two edges are reflected at their samples, within the old domain.
+    Inner edges of the new intervals lie half-way between the samples at `u`. Each outermost edge is
+    the mirror image of its neighbour at the outermost sample, but stays within the old domain.
 
     Args:
       u: increasing quantiles in `[0, 1]`.

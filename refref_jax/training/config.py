@@ -155,7 +155,7 @@ class FieldConfig:
 
     Attributes:
       preset: Size of the model and length of its training.
-      field: Field type: zipnerf, or nerfacto, which has no anti-aliasing.
+      field: Field kind: zipnerf, or nerfacto, which has no anti-aliasing.
       interior: Model of the inside of the objects: a learned field (the paper), empty (clear), or
         interfaces and media that absorb light (absorbing). By default clear if all objects are
         clear in scene.json, else absorbing.
@@ -333,8 +333,8 @@ class TrainConfig:
       losses: The training loss.
       schedule: Optimisation schedule.
       seed: Seed of the initial parameters, the order of pixels and the sampling.
-      chosen: Names of the options that are overrides, not an option itself; see `overrides` for
-        `None`. Configurations that only differ in it are equal.
+      chosen: Names of the options that are overrides; `overrides` explains `None`. It is not an
+        option, and is ignored when configurations are compared.
     """
 
     scene: SceneConfig = SceneConfig()
@@ -391,7 +391,7 @@ class TrainConfig:
     def overrides(self) -> frozenset[str]:
         """Returns the names of the options that are overrides.
 
-        If `chosen` is `None`, these are all options with values other than the default; but none
+        If `chosen` is `None`, these are all options whose value is not the default. There are none
         if the schedule is complete, as in a configuration of an earlier version, which does not
         distinguish overrides from decisions.
         """

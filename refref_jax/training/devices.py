@@ -70,7 +70,7 @@ def any_process(flag: bool) -> bool:
 
 
 def as_in_the_first(tree: Any) -> Any:
-    """Returns the values of the first process, because rounding may differ between machines."""
+    """Returns the values of the first process; those of others may differ by rounding."""
     if jax.process_count() == 1:
         return tree
     return multihost_utils.broadcast_one_to_all(tree)

@@ -236,8 +236,8 @@ def measure_colours(
 ) -> Measured:
     """Returns the colour metrics of an image in sRGB, `[0, 1]`.
 
-    PSNR and SSIM are computed in double precision. With an empty mask there is no masked PSNR, and
-    for an image that is smaller than a window or the network, no SSIM or LPIPS.
+    PSNR and SSIM are computed in double precision. There is no masked PSNR if the mask is empty, no
+    SSIM if the image is smaller than its window, and no LPIPS if it is too small for the network.
     """
     shortest = min(target.shape[:2])
     result: Measured = dict.fromkeys(("psnr", "psnr_masked", "ssim", "lpips", "flip"))

@@ -4,8 +4,8 @@
     model = fit(config, out="runs/fifty")
 
 `fit` consists of three functions that can also be called separately: `prepare` resolves a
-configuration, `begin` creates the run folder, and `train` takes the remaining steps. Their
-one order is that of `train_into`, which the command calls as well.
+configuration, `begin` creates the run folder, and `train` takes the remaining steps. `train_into`
+calls them in this order; the command `train` calls it as well.
 """
 
 import contextlib
@@ -92,7 +92,7 @@ def fit(
 
     Raises:
       ValueError: if the configuration, the scene or the folder is not suitable for training.
-      KeyboardInterrupt: if it was to stop before it took a step.
+      KeyboardInterrupt: if `stop` returned `True` before the first step.
     """
     with contextlib.ExitStack() as stack:
         if out is None:
@@ -202,7 +202,7 @@ def prepare(
 
 
 def begin(run: Path, config: TrainConfig, model: SavedModel, scene: Scene) -> None:
-    """Creates a run folder; with several processes, the first one does when all are ready.
+    """Creates a run folder; with several processes, the first one creates it when all are ready.
 
     Args:
       run: folder of the run.

@@ -165,8 +165,7 @@ def train_steps(
       last: index after the last step; all numbers of steps share one compiled program.
       config: configuration of the run.
       model: configuration of the model.
-      mesh: devices that share the paths, as in `pretrace`. Results only depend on them by
-        rounding.
+      mesh: devices that share the paths, as in `pretrace`; they affect results only by rounding.
 
     Returns:
       The state after the last step, and the report of that step.
@@ -218,20 +217,20 @@ def _step(
     jitter = pixels.random_jitter(key, model, _slots(traced.paths.radii.shape[0], axis))
     anneal = _anneal(state.step, require(config.schedule.anneal))
 
-    def look(params: Params) -> Totals:
+    def sum_paths(params: Params) -> Totals:
         light = pixels.gather_light(
             params, model, traced.paths, jitter, rays=rgb.shape[0], anneal=anneal
         )
         return objective.total(light, traced.paths, config.losses)
 
-    def judge(params: Params, totals: Totals) -> tuple[Float[Array, ""], StepReport]:
+    def combine(params: Params, totals: Totals) -> tuple[Float[Array, ""], StepReport]:
         target = rgb.astype(jnp.float32) / 255.0
         report = objective.measure(params, totals, target, traced.dropped, config.losses)
         return report.loss, report
 
-    # In two halves, between which the sums over paths are summed over devices.
-    totals, pull_back = jax.vjp(look, state.params)
-    slopes = jax.grad(judge, argnums=(0, 1), has_aux=True)
+    # The sums over paths are summed over devices between the two halves.
+    totals, pull_back = jax.vjp(sum_paths, state.params)
+    slopes = jax.grad(combine, argnums=(0, 1), has_aux=True)
     (by_params, by_totals), report = slopes(state.params, _sum_devices(totals, axis))
     (through_paths,) = pull_back(by_totals)
     gradient = jax.tree.map(jnp.add, by_params, _sum_devices(through_paths, axis))
@@ -364,7 +363,7 @@ def _pretraced_after(setup: Setup, first: int) -> PretracedBatches:
 
 
 def trace_batches(setup: Setup, numbers: Sequence[int]) -> PretracedBatches:
-    """Traces batches of a run, for steps in the order of `numbers`."""
+    """Traces the batches of a run with these numbers, for steps in the same order."""
     drawn = setup.sampler.draw(np.asarray(numbers))
     traced = pretrace(
         setup.scene,
@@ -381,8 +380,9 @@ def trace_batches(setup: Setup, numbers: Sequence[int]) -> PretracedBatches:
 def _trace_epoch(setup: Setup) -> PretracedBatches | None:
     """Traces all batches in advance, if the run uses them more than once and they fit in memory.
 
-    They are traced in groups, with the capacity of a group. Training is the same with and without
-    them, unless paths are dropped because a group is full: otherwise its batches are different.
+    They are traced in groups, each with its own capacity. Tracing in advance does not change
+    training, unless a group is full and drops paths: which ones depends on the batches in the
+    group.
     """
     config, batches = setup.config, setup.sampler.batches
     size = require(config.schedule.pretraced_batches)

@@ -9,7 +9,7 @@ that move them back, and black pixels have the slope 12.92 of the transfer funct
 `render.colour`). Fields return colours in `[-0.001, 1.001]`, so that their sigmoid has a non-zero
 slope at black and white.
 
-Letters: `s` is the normalised distance along a path, `w` its weights (see `sampling.stepfun`).
+Symbols: `s` is the normalised distance along a path, `w` its weights (see `sampling.stepfun`).
 """
 
 import functools

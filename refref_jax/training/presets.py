@@ -14,13 +14,13 @@
 | `paper` | 2 x 256        | 4,096         | 25,000 | cone         |
 | `best`  | 2 x 256        | 16,384        | 25,000 | differential |
 
-These are the sizes of Zip-NeRF's fields (`fields/zipnerf.py`). The sizes of another field type are
+These are the sizes of Zip-NeRF's fields (`fields/zipnerf.py`). The sizes of another field kind are
 in its own module; those of `paper` are the published ones.
 
 Samples are per path, for each proposal level and the radiance field; `multi` is the number of
 multisamples per interval; the hash map size is the number of entries of a level. Values that depend
-on the scene are not part of a preset: for the complete published set-up, use `paper` with the path
-settings `paper` and the interior `field`; leave both out for the other presets.
+on the scene are not part of a preset. For the complete published set-up, use the preset `paper`
+with the path settings `paper` and the interior `field`; leave these two out for other presets.
 
 On the bundled ball, 1250 steps of 1024 rays reach a masked PSNR of 36.6 dB with `tiny` and 37.9 dB
 with `small`, whose steps take 3.1 times as long. `paper` and `best` require a GPU: a CPU core needs
@@ -87,12 +87,12 @@ class Preset:
         """Returns the configuration of a model of a scene, with fields of a given type.
 
         Raises:
-          ValueError: if that field type does not have this size.
+          ValueError: if that field kind does not have this size.
         """
         sizes = registry.KINDS[field].sizes
         if self.size not in sizes:
             raise ValueError(
-                f"Field type {field} has no size {self.size}. Use one of the presets "
+                f"Field kind {field} has no size {self.size}. Use one of the presets "
                 f"{', '.join(sizes)}."
             )
         size = sizes[self.size]
@@ -143,8 +143,8 @@ def bounds(
 def loss(model: ModelConfig) -> LossConfig:
     """Returns the training loss of a model, which is the same for all presets.
 
-    What does not depend on the model is as `LossConfig` has it by default. The interlevel loss and
-    its blurs are those of Zip-NeRF for every field type.
+    Values that do not depend on the model are the defaults of `LossConfig`. The interlevel loss and
+    its blurs are those of Zip-NeRF for every field kind.
     """
     finest = len(_BLURS) - 1
     return LossConfig(

@@ -129,7 +129,7 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
       parts: objects that replace the scene's own meshes.
 
     Raises:
-      ValueError: if the scene is broken, or a camera whose rays carry a list is inside a mesh.
+      ValueError: if the scene is broken, or a camera is inside a mesh under an unsuitable rule.
     """
     folder = Path(scene.path)
     scene_folder.check_scene(folder)
@@ -222,7 +222,7 @@ def samples_of(model: ModelConfig) -> tuple[int, ...]:
 
 
 def grid_of(model: ModelConfig) -> HashGridConfig | None:
-    """Returns the hash grid of a model's radiance field, if its field type has one."""
+    """Returns the hash grid of a model's radiance field, if its field kind has one."""
     return model.field.grid if isinstance(model.field, mlps.GridRadianceConfig) else None
 
 
@@ -299,7 +299,7 @@ def _check_straight(config: TrainConfig) -> None:
     """Refuses overrides about objects for straight rays, which ignore objects.
 
     Raises:
-      ValueError: if one is neither open nor equivalent to a field everywhere.
+      ValueError: if one would have no effect.
     """
     asked = {"interior": config.model.interior, "reentry": config.paths.reentry}
     for name, value in asked.items():
@@ -450,7 +450,7 @@ def _with_grid(field: RadianceConfig, asked: FieldConfig) -> RadianceConfig:
         return field
     if not isinstance(field, mlps.GridRadianceConfig):
         raise ValueError(
-            "log2_hashmap_size and max_res are options of a hash grid, which field type "
+            "log2_hashmap_size and max_res are options of a hash grid, which field kind "
             f"{field.kind} does not have. Leave them out."
         )
     grid = field.grid

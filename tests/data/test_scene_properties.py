@@ -84,6 +84,32 @@ def test_the_example_of_the_documentation_is_read_completely(tmp_path):
     assert set(told.origins.values()) == {scene / "scene.json"}
 
 
+def test_the_materials_of_the_documentation_are_read(tmp_path):
+    told = read(_scene(tmp_path / "flask", json.loads(_examples()["materials.json"])))
+    glass, pin, stopper, film = told.parts.values()
+    assert (glass.index, glass.material.dispersion) == (1.52, (1.51, 1.52, 1.53))
+    assert glass.material.roughness == 0.1 and pin.material.kind == "conductor"
+    assert pin.material.complex_index == ((0.18, 0.42, 1.37), (3.42, 2.35, 1.77))
+    assert (stopper.material.kind, stopper.material.radiance) == ("opaque", None)
+    assert (film.material.kind, film.index) == ("thin_sheet", 1.45)
+
+
+def test_the_interior_of_a_part_is_clear_absorbing_or_a_field(tmp_path):
+    found = {}
+    for interior in ("clear", "absorbing", "field"):
+        told = read(_scene(tmp_path / interior, _part(interior=interior)))
+        found[interior] = next(iter(told.parts.values()))
+    assert [part.colour_known for part in found.values()] == [True, False, False]
+    assert [part.material.interior for part in found.values()] == [None, None, "field"]
+
+
+def test_one_number_holds_for_all_colours(tmp_path):
+    metal = read(_scene(tmp_path / "a", _part(kind="conductor", eta=0.2, k=3)))
+    assert next(iter(metal.parts.values())).material.complex_index == ((0.2,) * 3, (3.0,) * 3)
+    same = read(_scene(tmp_path / "b", _part(index=[1.5, 1.5, 1.5])))
+    assert next(iter(same.parts.values())) == PartDescription(index=1.5)
+
+
 def test_every_key_of_the_reader_is_documented():
     section = (ROOT / "docs/data_formats.md").read_text().split("## Properties of a scene")[1]
     tables = (
@@ -201,14 +227,24 @@ _WRONG = {
         "parts['cup_glass.ply'].ior is not a known key. ",
     ),
     "index": (_part(index=-1.5), "parts['cup_glass.ply'].index is -1.5. Give a positive number"),
-    "dispersion": (_part(index=[1.5, 1.5, 1.6]), "dispersion) is not supported yet."),
+    "dispersion": (
+        _part(index=[1.5, 0, 1.6]),
+        "index is [1.5, 0, 1.6]. Give a positive number, or",
+    ),
     "key of dispersion": (_part(dispersion=55), ".dispersion is not a known key."),
     "tint": (_part(tint=[1, 1, 2]), "tint is [1, 1, 2]. Give three numbers from 0 to 1"),
     "absorption": (_part(absorption=-1), "absorption is -1. Give three numbers that are 0 or"),
     "priority": (_part(priority=1.5), "priority is 1.5. Give a whole number"),
     "shading": (_part(shading="soft"), "shading is 'soft'. Give one of auto, smooth, flat"),
-    "roughness": (_part(roughness=0.3), "roughness is 0.3. Give 0: rough surfaces are not "),
-    "opaque": (_part(kind="opaque"), "Give dielectric: opaque is not supported yet."),
+    "roughness": (_part(roughness=1.5), "roughness is 1.5. Give a number from 0 to 1."),
+    "kind": (_part(kind="opaq"), "kind is 'opaq'. Give one of dielectric, opaque, conductor, "),
+    "interior": (_part(interior="empty"), "interior is 'empty'. Give one of clear, absorbing, "),
+    "clear tea": (_part(interior="clear", tint=[1, 0, 0]), "is clear, but has a colour. Remove "),
+    "radiance": (_part(kind="opaque", radiance="white"), "Give vertex_colours, or three numbers"),
+    "radiance of glass": (_part(radiance=[1, 1, 1]), "has no effect on kind dielectric."),
+    "index of a surface": (_part(kind="opaque", index=1.5), "no effect on kind opaque."),
+    "metal without k": (_part(kind="conductor", eta=0.2), "lacks the key 'k' of a conductor."),
+    "metal": (_part(kind="conductor", eta=0.2, k=-1), "k is -1. Give a non-negative number, or"),
     "two names": (_part(index=1.5, ior_inside=1.5), "has both 'index' and 'ior_inside'"),
     "part without mesh": ({"parts": [{"index": 1.5}]}, "parts[0] does not name a file"),
     "part twice": ({"parts": [{"mesh": _MESH}] * 2}, "parts describe cup_glass.ply twice."),

@@ -82,11 +82,11 @@ def test_a_third_kind_is_rendered_saved_and_sized(fog, tmp_path):
 
 
 def test_what_a_third_kind_has_not_is_refused(fog):
-    with pytest.raises(ValueError, match=r"Field type fog has no size paper\..* tiny"):
+    with pytest.raises(ValueError, match=r"Field kind fog has no size paper\..* tiny"):
         PRESETS["paper"].model(_BOUNDS, "field", field="fog")
     model = PRESETS["tiny"].model(_BOUNDS, "field", field="fog")
     for options in (FieldConfig(log2_hashmap_size=12), FieldConfig(max_res=64)):
-        with pytest.raises(ValueError, match="which field type fog does not have"):
+        with pytest.raises(ValueError, match="which field kind fog does not have"):
             override_model(model, options)
     assert override_model(model, FieldConfig(precision="bfloat16")) != model
 

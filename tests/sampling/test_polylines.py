@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -209,8 +211,16 @@ def test_outside_path_finds_the_same_points_as_the_whole_path():
 
 def test_outside_path_of_a_path_that_stays_outside_is_the_whole_path():
     path = made_paths.random_path(8, bends=4, segments=_SEGMENTS, media=np.zeros(5, int))
-    for a, b in zip(_outside(path), _whole(path), strict=True):
+    for a, b in zip(*map(jax.tree.leaves, (_outside(path), _whole(path))), strict=True):
         np.testing.assert_allclose(a, b, atol=_DISTANCE)
+
+
+def test_the_coordinate_advances_in_the_media_of_chosen_parts_too():
+    path = made_paths.random_path(4, bends=4, segments=_SEGMENTS, media=np.array([0, 1, 2, 1, 0]))
+    line = jax.jit(functools.partial(polylines.outside_path, also=(1,)))(path)
+    lengths = np.asarray(path.ends - path.tau)[:4]
+    steps = np.diff(np.asarray(line.knots)[:5])
+    np.testing.assert_allclose(steps, lengths * np.array([1, 0, 1, 0]), atol=_DISTANCE)
 
 
 @pytest.mark.parametrize("make", [_whole, _outside])

@@ -319,8 +319,8 @@ def choose_views(scene: Scene, count: int) -> list[str]:
 def typical_view(scene: Scene) -> str | None:
     """Returns the name of the median view, ordered by the mean of all methods.
 
-    Views that lack the PSNR of a method come last, so that they are only selected if most views do;
-    `None` if there are no views.
+    Views that lack the PSNR of a method come last, so that one is only selected if most views lack
+    it. Returns `None` if there are no views.
     """
     values: dict[str, list[float | None]] = {name: [] for name in view_names(scene)}
     for result in scene.results:

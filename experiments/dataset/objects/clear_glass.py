@@ -76,8 +76,8 @@ def _make_vardagen_jar(detail: float) -> list[ObjectPart]:
 def _make_light_bulb(detail: float) -> list[ObjectPart]:
     """A bulb of 60 mm by 110 mm, all of it glass: a shell with a cavity and a mount inside.
 
-    Like a real one it is closed: outer surface and cavity are one part; the cavity's faces point
-    into it, which is outwards from the glass.
+    Like a real bulb it is closed. Outer surface and cavity are one part; the faces of the cavity
+    point into the cavity, and thus out of the glass.
     """
     globe = region(arc((0.0, 2.5), 1.05, -90.0, 90.0))
     neck = filleted(

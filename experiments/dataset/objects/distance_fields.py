@@ -40,7 +40,8 @@ class Field(NamedTuple):
     Attributes:
       distance: function from points to signed distances.
       centre: centre of the ball.
-      radius: radius of the ball, may be `inf`; outside, distances are at least those to the ball.
+      radius: radius of the ball, possibly `inf`. At any point outside the ball, `distance` is at
+        least the distance to the ball.
     """
 
     distance: Callable[[Points], Distances]
@@ -75,9 +76,9 @@ def sphere(centre: Vector, radius: float) -> Field:
 def ellipsoid(centre: Vector, radii: Vector) -> Field:
     """An ellipsoid along the axes.
 
-    Source: Eberly, Distance from a Point to an Ellipsoid (2013), with the reciprocal of the secular
-    equation as Moré and Sorensen (1983) solve theirs: it is concave, so that Newton's steps from
-    the left never pass its root.
+    Source: Eberly, Distance from a Point to an Ellipsoid (2013). Newton's method solves the
+    reciprocal of the secular equation, as in Moré and Sorensen (1983): it is concave, so that steps
+    from the left never pass its root.
     """
     middle, axes = np.asarray(centre, float), np.asarray(radii, float)
     _require(bool(np.all(axes > 0.0)), f"The radii {radii} of an ellipsoid are not all positive.")
@@ -106,8 +107,8 @@ def tube(
 ) -> Field:
     """The union of all balls along a polyline whose radius changes from joint to joint.
 
-    The distance is exact for a tube that does not bend within a few of its segments by more than
-    its radius allows; see `space_curves` for smooth polylines.
+    The distance is exact unless the tube bends too sharply for its radius within a few segments;
+    see `space_curves` for smooth polylines.
 
     Raises:
       ValueError: if the radius changes faster than the arc length.

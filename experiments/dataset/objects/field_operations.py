@@ -1,9 +1,9 @@
 """Combines fields (see `distance_fields`): union, subtraction, walls, and motions (NumPy only).
 
-*Blending length*: the union (or intersection) is rounded where two distances differ by less than
-this, by a sixth of it at equal distances. Elsewhere it is sharp. A blended field is 1-Lipschitz if
-its operands are, since its gradient is a mean of theirs: an inward offset by a wall leaves at least
-that wall.
+Where two distances differ by less than the *blending length*, their union (or intersection) is
+rounded, by up to a sixth of this length, where both are equal. Elsewhere it is sharp. A blended
+field is 1-Lipschitz if its operands are, since its gradient is a mean of theirs. Therefore an
+inward offset leaves a wall of at least that thickness.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """Makes parts from fields (see `distance_fields`), and centres objects (NumPy only).
 
-*Core*: a smaller solid of another medium inside a figure of clear glass, like the tinted spirit in
-a bottle in the shape of an animal.
+The *core* of a figure of clear glass is a smaller solid of another medium inside it, like the
+tinted spirit in a bottle shaped like an animal.
 """
 
 from collections.abc import Callable, Sequence
@@ -119,7 +119,7 @@ def softened(solid: Field) -> Field:
 
 
 def core(body: Field, wall: float) -> Field:
-    """Returns the interior of a 1-Lipschitz field below a wall, without its details."""
+    """Returns a rounded core of a 1-Lipschitz field, below a wall of a given thickness."""
     reserved = offset(body, -wall - _CORE_RESERVE)
     rounded = _blurred(reserved, width=_CORE_SOFTNESS, grid=_CORE_SPACING)
     return intersection(rounded, offset(body, -wall), blend=_CORE_BLEND)

@@ -1,7 +1,7 @@
 """Extracts the surface of a field (see `distance_fields`) as triangles (NumPy only).
 
-Marching cubes gives the right topology, but slivers. So its vertices are distributed evenly along
-the surface, and projected to the zero set by Newton steps along the gradient.
+Marching cubes gives the right topology, but thin triangles. Therefore its vertices are distributed
+evenly along the surface, and projected to the zero set by Newton steps along the gradient.
 """
 
 from typing import NamedTuple

@@ -21,7 +21,7 @@ def merged(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def united(parts: Sequence[ObjectPart]) -> ObjectPart:
-    """Returns separate parts with the same look as one part with the name of the first."""
+    """Joins separate parts of the same material to one part, named like the first."""
     vertices, faces = merged([(part.vertices, part.faces) for part in parts])
     return parts[0]._replace(vertices=vertices, faces=faces)
 

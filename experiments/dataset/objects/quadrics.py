@@ -1,7 +1,8 @@
 """Round objects in closed form: ball, cylinder, torus (NumPy only).
 
-Between a curved and a flat surface, a narrow ring of the flat one is inserted, so that vertex
-normals, which are means over a vertex's faces, deviate from the exact ones only there.
+A vertex normal is the mean over the vertex's faces. Where a curved surface meets a flat one, the
+flat one therefore begins with a narrow ring of faces, so that normals are inexact only on this
+ring.
 """
 
 from functools import partial

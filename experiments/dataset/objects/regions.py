@@ -1,8 +1,9 @@
 """Boolean operations on cross-sections of turned objects (Clipper2, through manifold3d).
 
-A *region* is the section of an object through its axis, both halves of it. Walls are regions shrunk
-by their thickness, cavities are subtracted, and edges are rounded by rolling a disc along them: all
-operations are exact up to the polygons of arcs, and free of self-intersections.
+A *region* is the section of an object through its axis, both halves of it. Walls are made by
+shrinking a region by their thickness, cavities are subtracted, and edges are rounded by rolling a
+disc along them. The results are exact, except that arcs become polygons, and free of
+self-intersections.
 """
 
 from typing import TypeAlias

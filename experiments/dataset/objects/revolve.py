@@ -48,7 +48,7 @@ def even_angles(cut: Sampling, *, lobes: int = 1, each: int = 8) -> Float[np.nda
     Args:
       cut: sampling of the surface; a round object has one angle per segment.
       lobes: number of lobes of the section, each with as many angles.
-      each: edges of a lobe where a round object has 96 in all; never reduced below 6.
+      each: edges per lobe if a round object has 96 edges in total; at least 6 are used.
     """
     share = max(cut.segments / lobes, each * cut.segments / 96.0, 6.0)
     count = lobes * int(np.ceil(share))
@@ -56,7 +56,7 @@ def even_angles(cut: Sampling, *, lobes: int = 1, each: int = 8) -> Float[np.nda
 
 
 def faded(section: Section, share: Callable[[Values, Values], Values]) -> Warp:
-    """Returns the warp that applies a share of a section, 0 to 1, at each (r, z)."""
+    """Returns the warp that applies a section to a degree, 0 to 1, which depends on (r, z)."""
     return lambda angle, r, z: r * (1.0 + share(r, z) * (section(angle) - 1.0))
 
 
@@ -72,7 +72,7 @@ def within(value: Values, low: float, high: float, *, soft: float) -> Values:
 
 
 def polygon(sides: int, corner: float) -> Section:
-    """Returns a regular polygon with rounded corners; 1 in the middle of each flat side.
+    """Returns the section of a regular polygon with rounded corners: 1 at the middles of its sides.
 
     Args:
       sides: number of sides; the normal of the first has angle 0.

@@ -1,7 +1,8 @@
 """Straight rods in a liquid: one piece in it, and one above.
 
-A rod must not intersect the surface of a liquid, since its own surface would then lie in two media;
-its lower piece ends below the surface, and its upper piece continues along the same line.
+A rod must not intersect the surface of a liquid, since its own surface would then lie in two media.
+Therefore its lower piece ends below the liquid's surface, and its upper piece continues above it
+along the same line.
 """
 
 from typing import NamedTuple

@@ -1,10 +1,9 @@
 """Vessels and their contents, as regions in the half plane, and the resulting parts.
 
 An *outline* is a vessel's outer shape as if it were solid, the *space* its capacity. An open vessel
-is one piece of glass that covers its liquid by a thin *film*, below which the liquid fills the
-space; a sealed one is solid except for the liquid and the air in it, with a film between them. So
-every surface lies strictly inside another or apart from it, and refraction is as in the real
-object.
+is one piece of glass whose space is filled with liquid, which a thin *film* of glass covers. A
+sealed vessel is solid glass except for the liquid and the air in it, with a film between the two.
+So any two surfaces are nested or apart, and refraction is as in the real object.
 """
 
 from typing import NamedTuple

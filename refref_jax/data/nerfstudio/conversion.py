@@ -187,7 +187,7 @@ def write_scene(
     Args:
       views: frames and poses of each split.
       out: folder of the scene; must not exist.
-      sense: white area of the masks.
+      sense: meaning of white in the masks: `object` or `background`; `none` drops the masks.
       step: function called after every image.
 
     Raises:
@@ -329,7 +329,7 @@ def write_capture(
     Args:
       splits: splits of the scene.
       out: folder of the capture; must not exist.
-      sense: white area of the masks.
+      sense: meaning of white in the masks: `object` or `background`; `none` drops the masks.
       step: function called after every image.
 
     Raises:

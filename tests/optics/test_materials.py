@@ -1,0 +1,263 @@
+"""Paths at opaque parts, conductors, thin sheets, rough surfaces and with dispersion."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+import refref_jax
+from refref_jax.choices import Material
+from refref_jax.optics import fresnel
+from refref_jax.optics.light_paths import PathStatus, exists
+from refref_jax.optics.path_settings import TREE
+from refref_jax.optics.path_tracing import trace, trace_ends
+from refref_jax.optics.scene import of_channel
+from refref_jax.render import shade
+from tests.factories import scenes
+
+_OPAQUE = Material("opaque", radiance=(0.8, 0.2, 0.1))
+_GOLD = ((0.18, 0.42, 1.37), (3.42, 2.35, 1.77))
+_BALL = scenes.ball(1.0, subdivisions=3)
+
+
+def _inner(material, radius=0.5, index=1.0):
+    part = scenes.ball(radius, subdivisions=2, name="inner")
+    colour = material.radiance
+    light = None if colour is None else np.broadcast_to(colour, (len(part.faces), 3, 3))
+    return part._replace(index=index, material=material, radiance=light)
+
+
+def _sheet(index=1.5, at=0.0, material=None):
+    square = np.array([[at, -1.0, -1.0], [at, 1.0, -1.0], [at, 1.0, 1.0], [at, -1.0, 1.0]])
+    mesh = refref_jax.make_part(
+        (square, np.array([[0, 1, 2], [0, 2, 3]])), index=index, name="sheet", shading="flat"
+    )
+    return mesh._replace(material=material or Material("thin_sheet"))
+
+
+def _rays(*heights, towards=(1.0, 0.0, 0.0)):
+    origins = jnp.array([[-3.0, height, 0.01] for height in heights], jnp.float32)
+    directions = jnp.broadcast_to(jnp.array(towards, jnp.float32), origins.shape)
+    return refref_jax.Rays(origins, directions, jnp.full(len(heights), 1e-3))
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def _paths(scene, rays, settings=TREE):
+    return trace(scene, rays, settings=settings).paths
+
+
+def _main(paths, ray=0):
+    """Returns the heaviest path of a ray."""
+    mine = np.flatnonzero((np.asarray(paths.rays) == ray) & np.asarray(exists(paths)))
+    heaviest = mine[np.argmax(np.max(np.asarray(paths.throughput), axis=1)[mine])]
+    return jax.tree.map(lambda x: np.asarray(x)[heaviest], paths)
+
+
+@pytest.mark.parametrize("rule", ["nested", "facing", "priority"])
+def test_light_ends_on_an_opaque_part_inside_glass(rule):
+    scene = scenes.build(_BALL, _inner(_OPAQUE), rule=rule)
+    path = _main(_paths(scene, _rays(0.02)))
+    assert path.statuses == PathStatus.OPAQUE and path.num_bends == 1
+    np.testing.assert_allclose(path.stop.tau, 2.5, atol=5e-3)
+    np.testing.assert_allclose(path.stop.radiance, _OPAQUE.radiance, rtol=1e-6)
+    np.testing.assert_allclose(path.throughput, 0.96, atol=1e-3)
+    assert path.media[:2].tolist() == [0, 1] and np.isinf(path.ends[1])
+
+
+def test_the_medium_in_front_of_an_opaque_part_absorbs():
+    glass = _BALL._replace(absorption=(0.5, 1.0, 2.0))
+    path = _main(_paths(scenes.build(glass, _inner(_OPAQUE)), _rays(0.02)))
+    expected = 0.96 * np.exp(-np.array([0.5, 1.0, 2.0]) * 0.5)
+    np.testing.assert_allclose(path.throughput, expected, rtol=6e-3)
+
+
+def test_opaque_parts_may_be_half_in_a_liquid():
+    reed = _inner(_OPAQUE, radius=0.3)
+    reed = reed._replace(vertices=reed.vertices + np.array([0.0, 1.0, 0.0]))  # at the wall
+    scene = scenes.build(_BALL._replace(index=1.001), reed)
+    outside, inside = (_main(_paths(scene, _rays(0.75, 1.15)), ray) for ray in (1, 0))
+    assert outside.statuses == inside.statuses == PathStatus.OPAQUE
+    assert (outside.num_bends, inside.num_bends) == (0, 1)
+    assert outside.media[0] == 0 and inside.media[1] == 1
+
+
+def test_unknown_radiance_is_left_to_the_field_and_refused_elsewhere():
+    scene = scenes.build(_BALL, _inner(Material("opaque")))
+    ends = jax.jit(functools.partial(trace_ends, settings=TREE))(scene, _rays(0.02)).ends
+    assert ends.stop.radiance is None and np.isfinite(ends.stop.tau[0])
+    with pytest.raises(ValueError, match="radiance is unknown"):
+        shade(ends, lambda origin, direction: direction, rays=1)
+
+
+def test_the_colour_of_an_opaque_part_is_interpolated_between_corners():
+    part = _sheet(material=Material("opaque", radiance="vertex_colours"))
+    corners = np.repeat(part.vertices[part.faces][..., 1:2] * 0.5 + 0.5, 3, axis=2)
+    scene = scenes.build(part._replace(radiance=corners))
+    heights = np.linspace(-0.9, 0.9, 7)
+    ends = jax.jit(functools.partial(trace_ends, settings=TREE))(scene, _rays(*heights)).ends
+    seen = shade(ends, lambda origin, direction: 0.0 * direction, rays=7)
+    np.testing.assert_allclose(seen[:, 0], heights * 0.5 + 0.5, atol=1e-5)
+
+
+@pytest.mark.parametrize("around", [1.0, 1.5])
+def test_a_conductor_reflects_by_its_index_relative_to_the_medium(around):
+    metal = _sheet(material=Material("conductor", complex_index=_GOLD))
+    parts = [metal] if around == 1.0 else [scenes.box((3.0, 3.0, 3.0), index=around), metal]
+    path = _main(_paths(scenes.build(*parts), _rays(0.2)))
+    eta, k = (np.array(value) / around for value in _GOLD)
+    expected = ((eta - 1.0) ** 2 + k**2) / ((eta + 1.0) ** 2 + k**2)
+    entered = 1.0 if around == 1.0 else (4.0 * around / (1.0 + around) ** 2) ** 2
+    np.testing.assert_allclose(path.throughput, entered * expected, rtol=1e-4)
+    np.testing.assert_allclose(path.directions[path.num_bends], [-1.0, 0.0, 0.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_thin_sheet_reflects_twice_from_either_side_and_does_not_bend_light(sign):
+    scene = scenes.build(_sheet())
+    towards = np.array([0.8, 0.6, 0.0])
+    rays = refref_jax.Rays(
+        jnp.array([-sign * towards * 2.0]), jnp.array([sign * towards]), jnp.full(1, 1e-3)
+    )
+    paths = _paths(scene, rays)
+    path = _main(paths)
+    once = float(fresnel.reflectance(jnp.float32(0.8), jnp.float32(1.0), jnp.float32(1.5)))
+    np.testing.assert_allclose(path.throughput, 1.0 - 2.0 * once / (1.0 + once), rtol=1e-5)
+    np.testing.assert_array_equal(path.directions[1], path.directions[0])
+    assert path.media[:2].tolist() == [0, 0]
+    np.testing.assert_allclose(jnp.sum(paths.throughput[:, 0]), 1.0, rtol=1e-5)
+
+
+def test_two_sheets_equal_the_slab_that_they_stand_for():
+    # A slab of glass far thinner than a pixel: all its reflections, summed.
+    slab = scenes.box((1e-3, 4.0, 4.0))
+    towards = np.array([np.cos(0.7), np.sin(0.7), 0.0])
+    rays = refref_jax.Rays(jnp.array([-towards]), jnp.array([towards]), jnp.full(1, 1e-3))
+    every = refref_jax.PathSettings(max_bends=12, reflections="all", min_throughput=1e-6)
+    shares = []
+    for part in (slab, _sheet()):
+        paths = _paths(scenes.build(part), rays, settings=every)
+        last = jnp.sum(jnp.isfinite(paths.tau), axis=1) - 1
+        back = paths.directions[jnp.arange(last.size), last, 0] < 0.0
+        shares.append(float(jnp.sum(jnp.where(back & exists(paths), paths.throughput[:, 0], 0.0))))
+    np.testing.assert_allclose(shares[0], shares[1], rtol=1e-4)
+
+
+def test_dispersion_is_three_scenes_of_one_colour_each():
+    indices = (1.4, 1.5, 1.7)
+    glass = _BALL._replace(material=Material(dispersion=indices))
+    rays = _rays(*np.linspace(-0.9, 0.9, 9))
+
+    def colour(scene):
+        ends = trace_ends(scene, rays, settings=TREE).ends
+        return shade(ends, lambda origin, direction: 0.5 + 0.5 * direction, rays=9)
+
+    found = jax.jit(colour)(scenes.build(glass))
+    for channel, index in enumerate(indices):
+        alone = jax.jit(colour)(scenes.build(_BALL._replace(index=index)))
+        np.testing.assert_allclose(found[:, channel], alone[:, channel], atol=2e-6)
+
+
+def test_dispersed_paths_belong_to_their_rays_and_share_their_light():
+    glass = _BALL._replace(material=Material(dispersion=(1.4, 1.5, 1.6)))
+    traced = trace(scenes.build(glass), _rays(0.1, 0.5, 2.0), settings=TREE)
+    sums = jax.ops.segment_sum(traced.paths.throughput, traced.paths.rays, num_segments=3)
+    np.testing.assert_allclose(sums + traced.dropped, 1.0, rtol=1e-5)
+    real = np.asarray(traced.paths.throughput)[np.asarray(exists(traced.paths))]
+    assert np.all(np.sum(real > 0.0, axis=1) == 1)
+
+
+def test_one_colour_of_a_dispersive_scene_has_gradients_and_all_three_are_refused():
+    scene = scenes.build(_BALL._replace(material=Material(dispersion=(1.4, 1.5, 1.6))))
+    ray = jax.tree.map(lambda x: x[0], _rays(0.3))
+    with pytest.raises(ValueError, match="dispersion"):
+        refref_jax.follow_branch(scene, ray, jnp.zeros(24, bool), settings=TREE)
+    with pytest.raises(ValueError, match="dispersion"):
+        refref_jax.with_index(scene, 1.5)
+    red, plain = of_channel(scene, 0), scenes.build(_BALL._replace(index=1.4))
+    one, other = (
+        refref_jax.follow_branch(each, ray, jnp.zeros(24, bool), settings=TREE)
+        for each in (red, plain)
+    )
+    np.testing.assert_allclose(one.points, other.points, atol=1e-6)
+
+
+def test_dispersion_reaches_the_medium_inside_another_one():
+    water = scenes.ball(0.5, subdivisions=2, name="water")._replace(index=1.33)
+    glass = _BALL._replace(material=Material(dispersion=(1.4, 1.5, 1.6)))
+    pairs = scenes.build(glass, water).interfaces.index_by_channel
+    np.testing.assert_allclose(pairs[:, 0], [[1.4, 1.33], [1.5, 1.33], [1.6, 1.33]], rtol=1e-6)
+    np.testing.assert_allclose(pairs[:, 1], [[1.0, 1.4], [1.0, 1.5], [1.0, 1.6]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.5, 1.0])
+def test_a_rough_surface_adds_no_light_and_scatters_around_the_mirror(roughness):
+    scene = scenes.build(
+        scenes.box((1.0, 9.0, 9.0))._replace(material=Material(roughness=roughness))
+    )
+    heights = np.random.default_rng(0).uniform(-1.0, 1.0, 4000)
+    one = refref_jax.PathSettings(max_bends=1, reflections="all")
+    paths = _paths(scene, _rays(*heights), settings=one)
+    sums = jax.ops.segment_sum(paths.throughput[:, 0], paths.rays, num_segments=4000)
+    assert np.all(sums <= 1.0 + 1e-5) and np.mean(sums) > (0.99 if roughness < 0.2 else 0.8)
+    sideways = np.asarray(paths.directions[:, 1, 1:])[np.asarray(exists(paths))]
+    spread = np.sqrt(np.mean(np.sum(sideways**2, axis=1)))
+    assert abs(np.mean(sideways)) < 0.05 and 0.1 < spread / roughness**2 < 6.0
+
+
+@pytest.mark.parametrize(
+    "material",
+    [Material("opaque"), Material("conductor", complex_index=_GOLD), Material("thin_sheet")],
+    ids=lambda material: material.kind,
+)
+def test_both_tracers_agree_on_every_kind(material):
+    scene = scenes.build(_BALL, _inner(material, index=1.33))
+    ray = jax.tree.map(lambda x: x[0], _rays(0.12))
+    branch = jax.jit(functools.partial(refref_jax.follow_branch, settings=TREE))
+    path = branch(scene, ray, jnp.zeros(24, bool))
+    paths = _paths(scene, _rays(0.12))
+    match = np.argmin(
+        np.abs(np.asarray(paths.throughput) - np.asarray(path.throughput)).sum(axis=1)
+    )
+    assert paths.statuses[match] == path.statuses and paths.num_bends[match] == path.num_bends
+    used = int(path.num_bends) + 1
+    np.testing.assert_allclose(paths.points[match, :used], path.points[:used], atol=1e-4)
+    if material.kind == "opaque":
+        np.testing.assert_allclose(paths.stop.tau[match], path.stop.tau, atol=1e-4)
+
+
+@pytest.mark.parametrize("rule", ["nested", "facing"])
+def test_metal_in_a_liquid_keeps_light_in_the_liquid(rule):
+    metal = _inner(Material("conductor", complex_index=_GOLD), radius=0.2)
+    water = scenes.ball(0.6, subdivisions=2, name="water")._replace(index=1.33)
+    path = _main(_paths(scenes.build(_BALL, water, metal, rule=rule), _rays(0.01)))
+    assert path.media[: path.num_bends + 1].tolist() == [0, 1, 2, 2, 1, 0]
+
+
+def test_gradients_of_the_complex_index_and_roughness_are_finite():
+    scene = scenes.build(
+        _BALL._replace(material=Material(roughness=0.3)),
+        _inner(Material("conductor", complex_index=_GOLD)),
+    )
+    ray = jax.tree.map(lambda x: x[0], _rays(0.1))
+
+    def light(interfaces):
+        changed = scene._replace(interfaces=interfaces)
+        path = refref_jax.follow_branch(changed, ray, jnp.zeros(24, bool), settings=TREE)
+        return jnp.sum(path.throughput)
+
+    names = ("complex_index", "alpha", "index_inside")
+    values = {name: getattr(scene.interfaces, name) for name in names}
+    slopes = jax.grad(lambda some: light(scene.interfaces._replace(**some)))(values)
+    assert all(np.all(np.isfinite(slope)) for slope in slopes.values())
+    assert np.any(slopes["complex_index"][1] != 0.0)
+
+
+def test_meshes_of_surfaces_without_inside_may_be_open():
+    icosphere = trimesh.creation.icosphere(subdivisions=1)
+    half = (icosphere.vertices, icosphere.faces[icosphere.triangles_center[:, 2] > 0])
+    for material in (Material("opaque"), Material("thin_sheet")):
+        part = refref_jax.make_part(half, index=1.5, name="cap", material=material)
+        assert refref_jax.assemble([part]).interfaces.kinds.size == 1
