@@ -389,7 +389,7 @@ def _fit(
     unknowns: int,
     coarse: float = _ROUNDING,
 ) -> BackgroundFit | None:
-    """Fits the first `unknowns` of size and centre (four numbers), from an estimate of the centre."""
+    """Fits the first `unknowns` of size and centre (four numbers); the others stay as given."""
     extents = _extents(kind, _points(samples) - centre)
     if not len(extents):
         return None

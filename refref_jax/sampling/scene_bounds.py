@@ -93,7 +93,9 @@ def exit_distance(
 
 def _from_centre(domain: Domain, points: Float[Array, "*shape 3"]) -> Float[Array, "*shape 3"]:
     """Returns points relative to the centre; nothing is computed if that is the origin."""
-    return points - jnp.asarray(domain.centre, points.dtype) if any(domain.centre) else points
+    if not any(domain.centre):
+        return points
+    return points - jnp.broadcast_to(jnp.asarray(domain.centre, points.dtype), points.shape)
 
 
 def chord(

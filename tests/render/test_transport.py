@@ -480,7 +480,7 @@ def test_a_model_that_is_moved_with_its_paths_gives_the_same(space):
     usual = dataclasses.replace(_FIELD, space=space)
     moved = dataclasses.replace(usual, centre=tuple(centre.tolist()))
     paths = _some_paths()
-    away = paths._replace(points=paths.points + centre)
+    away = paths._replace(points=paths.points + np.broadcast_to(centre, paths.points.shape))
     for old, new in zip(
         jax.tree.leaves(_render(usual, paths)), jax.tree.leaves(_render(moved, away)), strict=True
     ):
@@ -497,7 +497,7 @@ def test_samples_gradients_and_lookups_of_a_moved_model_are_the_same(space):
     results = []
     for config, shift in ((usual, np.zeros(3, np.float32)), (moved, centre)):
         line = polylines.whole_path(jax.tree.map(jnp.asarray, _bent()))
-        line = line._replace(points=line.points + shift)
+        line = line._replace(points=line.points + np.broadcast_to(shift, line.points.shape))
         warp = volume_rendering.distance_warp(config, line)
         jitter = Jitter(jnp.float32(0.0), jnp.float32(0.0))
         found = volume_rendering.sample(

@@ -494,7 +494,7 @@ def test_what_is_moved_as_a_whole_is_the_same(space):
     points = jnp.asarray(np.round(64 * rng.uniform(-4.0, 4.0, (50, 3))) / 64, jnp.float32)
     directions = rng.normal(size=(50, 3))
     directions = jnp.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
-    centre = jnp.array(_CENTRE)
+    centre = jnp.broadcast_to(jnp.array(_CENTRE), points.shape)
     for old, new in zip(
         scene_bounds.to_unit_cube(usual, Gaussians(points, jnp.ones(50))),
         scene_bounds.to_unit_cube(moved, Gaussians(points + centre, jnp.ones(50))),
