@@ -49,7 +49,7 @@ _RESOLUTION = flags.DEFINE_integer("resolution", 128, "Cells along each edge of 
 _BOX = flags.DEFINE_float(
     "box",
     None,
-    "Half-extent of the box around the origin, world units; that of the model by default.",
+    "Half-extent of the box around the model's centre, world units; that of the model by default.",
     1e-6,
 )
 
@@ -80,17 +80,19 @@ app.check(_OUT, _refuse_other_files)
 def _write_field(model: Model, out: Path) -> list[Path]:
     grids.import_skimage()  # reports a missing package early
     space, radius = model.config.space, model.config.radius
+    centre = np.array(model.config.centre)
     half = _BOX.value or radius
     if space != "unbounded":
         half = min(half, radius)  # there is nothing outside
-    print(f"Box:    from {-half:g} to {half:g} along each axis, {_RESOLUTION.value} cells")
+    around = f" around ({', '.join(f'{x:g}' for x in centre)})" if centre.any() else ""
+    print(f"Box:    from {-half:g} to {half:g} along each axis{around}, {_RESOLUTION.value} cells")
     if space == "unbounded":
         print("        The scene extends beyond it: a larger --box shows more of it.")
     with ProgressBar("density", _RESOLUTION.value + 1) as bar:
         density = field_mesh.sample_density(
             model,
-            np.full(3, -half),
-            np.full(3, half),
+            centre - half,
+            centre + half,
             resolution=_RESOLUTION.value,
             step=lambda done, total: bar.show(done, "slices"),
         )
@@ -98,7 +100,9 @@ def _write_field(model: Model, out: Path) -> list[Path]:
         density = field_mesh.with_background(density, level=_LEVEL.value)
         print("Background: the faces of the box, on which the model is opaque")
     if space == "spherical" and math.sqrt(3.0) * half > radius:
-        density = field_mesh.with_sphere(density, level=_LEVEL.value, radius=radius)
+        density = field_mesh.with_sphere(
+            density, level=_LEVEL.value, radius=radius, centre=model.config.centre
+        )
         print(f"Background: the sphere of radius {radius:g}, on which the model is opaque")
     with outputs.fresh_file(out, overwrite=_OVERWRITE.value) as draft:
         if _WHAT.value == "mesh":

@@ -33,6 +33,7 @@ with epy.lazy_imports():
     from experiments.runs import known_scene
     from refref_jax.data import scene_assembly, scene_folder, scene_names, scene_properties
     from refref_jax.render import backgrounds, checkpoint_io
+    from refref_jax.sampling import scene_bounds
     from refref_jax.training import run_folder
 
 FIGURES = ("views", "fan", "tree", "distances")
@@ -104,7 +105,13 @@ def _drawers(folder: Path, indices: dict[str, float]) -> dict[str, Callable[[Pat
         raise ValueError(
             f"The background of {folder} is not a cube. Choose a scene with a background cube."
         )
+    if found.centre is not None and "fan" in _FIGURES.value:
+        raise ValueError(
+            f"The background of {folder} is around {told.background.centre}, but the fan is "
+            "drawn in a section through the origin. Choose the others with --figure."
+        )
     half = float(found.half_extent)
+    domain = scene_bounds.Domain(half, "bounded", told.background.centre or choices.ORIGIN)
     scene = known_scene.read_scene(
         folder,
         split=_SPLIT.value,
@@ -118,7 +125,7 @@ def _drawers(folder: Path, indices: dict[str, float]) -> dict[str, Callable[[Pat
         "views": functools.partial(glass.draw_views, scene, side=side),
         "fan": functools.partial(glass.draw_fan, scene, folder, half),
         "tree": functools.partial(glass.draw_tree, scene, folder),
-        "distances": functools.partial(glass.draw_distances, scene, half),
+        "distances": functools.partial(glass.draw_distances, scene, domain),
     }
 
 

@@ -46,10 +46,12 @@ def main() -> None:
     outputs.check_folder(Path(_OUT.value))
     index = _parse(_IOR.value)
     scene, out = cli_scenes.opened(_SCENE.value), Path(_OUT.value)
-    space, radius = chain.bounds_of(
+    space, radius, centre = chain.bounds_of(
         scene, _PROPERTIES.value or "", space=_SPACE.chosen(), radius=_SPACE.radius.value
     )
-    config = _RECONSTRUCTION.chosen(index=index, seed=_SEED.value, space=space, radius=radius)
+    config = _RECONSTRUCTION.chosen(
+        index=index, seed=_SEED.value, space=space, radius=radius, centre=centre
+    )
     found = chain.reconstruct(scene, out, config, compare=True)
     print(f"Report:  {out / report.FILE}, {out / report.FOLDER}")
     print(f"Surface: {object_source.surface_file(out, found)}")

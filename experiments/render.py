@@ -37,7 +37,7 @@ _OUT = flags.DEFINE_string("out", None, "Folder to write; {run}/render/{views} b
 _FRAMES = flags.DEFINE_integer("frames", 60, "Number of frames of an orbit.", 1)
 _SIZE = flags.DEFINE_integer("size", 200, "Width and height of an orbit's frames, pixels.", 1)
 _FOV = flags.DEFINE_float("fov", 66.785, "Horizontal field of view of an orbit, degrees.", 1, 179)
-_DISTANCE = flags.DEFINE_float("distance", 4.0, "Distance of an orbit from the origin.", 1e-3)
+_DISTANCE = flags.DEFINE_float("distance", 4.0, "Distance of an orbit from the centre.", 1e-3)
 _ELEVATION = flags.DEFINE_float("elevation", 20.0, "Elevation of an orbit, degrees.", -89, 89)
 _FPS = flags.DEFINE_float("fps", 15.0, "Frames per second of the video.", 0.1)
 _RAYS_PER_PIXEL = cli_flags.rays_per_pixel(1)
@@ -56,7 +56,7 @@ def main() -> None:
     cli_flags.check_run(run)
     cli_scenes.check(_SCENE.value)
     model = checkpoint_io.load_model(run, step=_STEP.value)
-    seen_by, names = _cameras(run)
+    seen_by, names = _cameras(run, model)
     with outputs.fresh(out, **place) as draft:
         written = render(model, seen_by, names, draft)
     for name in written:
@@ -92,7 +92,7 @@ def render(model: Model, seen_by: cameras.Cameras, names: tuple[str, ...], out: 
     ]
 
 
-def _cameras(run: Path) -> tuple[cameras.Cameras, tuple[str, ...]]:
+def _cameras(run: Path, model: Model) -> tuple[cameras.Cameras, tuple[str, ...]]:
     if _VIEWS.value == "orbit":
         around = cameras.orbit(
             _FRAMES.value,
@@ -100,6 +100,7 @@ def _cameras(run: Path) -> tuple[cameras.Cameras, tuple[str, ...]]:
             elevation=math.radians(_ELEVATION.value),
             size=_SIZE.value,
             angle_x=math.radians(_FOV.value),
+            centre=model.config.centre,
         )
         return around, tuple(f"r_{i:03d}" for i in range(_FRAMES.value))
     scene = cli_scenes.opened(_SCENE.value or run_folder.read_config(run).scene.path)

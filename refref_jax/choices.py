@@ -12,6 +12,12 @@ CLEAR: Colour = (1.0, 1.0, 1.0)
 NO_ABSORPTION: Colour = (0.0, 0.0, 0.0)
 """Absorption of a clear medium."""
 
+Position = tuple[float, float, float]
+"""A point in world units."""
+
+ORIGIN: Position = (0.0, 0.0, 0.0)
+"""Centre of a scene that does not state another one."""
+
 PartKind = Literal["dielectric", "opaque", "conductor", "thin_sheet"]
 """Kinds of parts: bodies that light passes through, surfaces that it ends on, metals that reflect
 it, and open surfaces that stand for a thin wall."""

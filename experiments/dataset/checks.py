@@ -17,7 +17,7 @@ from scipy import ndimage
 from experiments.runs import known_scene
 from experiments.runs.known_scene import KnownScene
 from refref_jax import configuration
-from refref_jax.choices import SPLITS
+from refref_jax.choices import ORIGIN, SPLITS
 from refref_jax.data import (
     background_fit,
     image_files,
@@ -110,7 +110,7 @@ def check_files(scene: Path) -> list[Finding]:
 
 
 def check_background(scene: Path) -> list[Finding]:
-    """Compares the size of the background in `scene.json` with the depth maps of a split."""
+    """Compares the background in `scene.json` with the depth maps of a split."""
     try:
         properties = scene_properties.read(scene)
         space, size = properties.space, properties.background.extent
@@ -121,12 +121,17 @@ def check_background(scene: Path) -> list[Finding]:
     except ValueError as error:
         return [Finding("error", scene.name, str(error))]
     kind: background_fit.Kind = "sphere" if space == "spherical" else "cube"
-    fit = None if samples is None else background_fit.fit_size(kind, samples)
-    if fit is None or abs(fit.size - size) <= BACKGROUND * size + fit.error:
+    centre = properties.background.centre or ORIGIN
+    fit = samples and background_fit.fit_background(kind, samples, centre=centre)
+    if fit is None:
         return []
+    off = fit.centre != centre  # which it only is if the depths clearly show another one
+    if not off and abs(fit.size - size) <= BACKGROUND * size + fit.error:
+        return []
+    stated = f"{size:g}" + (f" around ({', '.join(f'{x:g}' for x in centre)})" if off else "")
     message = (
         f"the depth maps show a background {kind} of size {fit.describe()}, but scene.json states "
-        f"{size:g}. Correct it, or render the depth maps again."
+        f"{stated}. Correct it, or render the depth maps again."
     )
     return [Finding("error", scene.name, message)]
 

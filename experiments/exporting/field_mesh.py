@@ -203,17 +203,20 @@ def with_background(density: Grid, *, level: float) -> Grid:
     return density._replace(values=np.maximum(values, density.values))
 
 
-def with_sphere(density: Grid, *, level: float, radius: float) -> Grid:
-    """Returns the density with a surface on a sphere around the origin; see `with_background`.
+def with_sphere(
+    density: Grid, *, level: float, radius: float, centre: Sequence[float] = (0.0, 0.0, 0.0)
+) -> Grid:
+    """Returns the density with a surface on a sphere; see `with_background`.
 
     Args:
       density: density per world unit.
       level: level of the surface.
       radius: radius of the sphere that bounds a spherical model, world units.
+      centre: centre of the sphere, world units.
     """
     axes = [
         low + density.spacing * np.arange(count)
-        for low, count in zip(density.low, density.values.shape, strict=True)
+        for low, count in zip(density.low - centre, density.values.shape, strict=True)
     ]
     squares = [np.square(axis) for axis in np.meshgrid(*axes, indexing="ij", sparse=True)]
     beyond = (np.sqrt(sum(squares)) - radius) / density.spacing

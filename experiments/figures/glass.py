@@ -131,18 +131,19 @@ def _follow(scene: KnownScene, rays: list[Rays], settings: PathSettings) -> list
     return [trace(ray) for ray in rays]
 
 
-def draw_distances(scene: KnownScene, half: float, path: Path) -> None:
+def draw_distances(scene: KnownScene, domain: Domain, path: Path) -> None:
     """Draws three distances of a pixel: glass, background behind it, and visible background.
 
     Args:
       scene: scene with one view.
-      half: half the edge of the background cube, world units.
+      domain: background cube.
       path: output file.
     """
     rays = cameras.image_rays(scene.frames.cameras, 0)
     first = find_first_surface(scene.objects.surfaces, rays).distances
     flat = Rays(*(x.reshape(-1, *x.shape[2:]) for x in rays))
-    straight, bent = (np.asarray(x).reshape(first.shape) for x in _walls(scene.objects, flat, half))
+    walls = _walls(scene.objects, flat, domain)
+    straight, bent = (np.asarray(x).reshape(first.shape) for x in walls)
     write_distances(
         path,
         _truth(scene),
@@ -154,12 +155,12 @@ def draw_distances(scene: KnownScene, half: float, path: Path) -> None:
     )
 
 
-@functools.partial(jax.jit, static_argnames="half")
+@functools.partial(jax.jit, static_argnames="domain")
 def _walls(
-    scene: Scene, rays: Rays, half: float
+    scene: Scene, rays: Rays, domain: Domain
 ) -> tuple[Float[Array, " rays"], Float[Array, " rays"]]:
     """Returns the arc length of light to the background, straight and refracted."""
-    leave = jax.vmap(functools.partial(scene_bounds.exit_distance, Domain(half, "bounded")))
+    leave = jax.vmap(functools.partial(scene_bounds.exit_distance, domain))
     # Without reflections every ray has one path.
     ends = path_tracing.trace_ends(scene, rays, settings=PATH_PRESETS["paper_no_reflection"]).ends
     reached = jax.numpy.where(

@@ -9,7 +9,7 @@ from pathlib import Path
 from experiments.r3f import geometry_stage, index_stage, light_stage, object_source, records, report
 from experiments.r3f.records import IndexFacts, LightFacts, Reconstruction, ReconstructionConfig
 from refref_jax import atomic_files, configuration
-from refref_jax.choices import Space
+from refref_jax.choices import Position, Space
 from refref_jax.data import SceneError, scene_folder, scene_names, scene_properties
 from refref_jax.data.meshes import MeshPart
 from refref_jax.reconstruct.grids import import_skimage
@@ -110,15 +110,21 @@ def fingerprint(scene: Path) -> str:
 
 
 def bounds_of(
-    scene: Path, overlay: str, *, space: Space | None, radius: float | None
-) -> tuple[Space | None, float | None]:
-    """Returns type and size of the background; `None` stands for what `scene.json` says.
+    scene: Path,
+    overlay: str,
+    *,
+    space: Space | None,
+    radius: float | None,
+    centre: Position | None = None,
+) -> tuple[Space | None, float | None, Position | None]:
+    """Returns type, size and centre of the background; `None` stands for what `scene.json` says.
 
     Args:
       scene: folder of the scene.
       overlay: file whose properties override those of `scene.json`, or an empty string.
       space: type of the background, if it is given.
       radius: size of the background, if it is given.
+      centre: centre of the background, if it is given.
 
     Raises:
       SceneError: if the properties are not valid, or the ambient medium is not air.
@@ -131,8 +137,9 @@ def bounds_of(
             "scene's meshes."
         )
     if not overlay or told.origins.get("background") != Path(overlay):
-        return space, radius
-    return space or told.space, radius or told.background.extent
+        return space, radius, centre
+    background = told.background
+    return space or told.space, radius or background.extent, centre or background.centre
 
 
 def describe_index(index: IndexFacts) -> str:
@@ -150,7 +157,13 @@ def _index(scene: Path, out: Path, found: Reconstruction) -> IndexFacts:
     folder.mkdir(exist_ok=True)
     mesh = object_source.read_mesh(out, found)
     estimate = index_stage.run(
-        scene, mesh, folder, seed=config.seed, space=config.space, radius=config.radius
+        scene,
+        mesh,
+        folder,
+        seed=config.seed,
+        space=config.space,
+        radius=config.radius,
+        centre=config.centre,
     )
     if not math.isfinite(estimate.deviation):
         raise ValueError(
@@ -185,7 +198,12 @@ def _light(scene: Path, out: Path, found: Reconstruction) -> LightFacts:
         object_source.read_mesh(out, found),
         found.index,
         index_stage.learn_background(
-            scene, folder, seed=seed, space=found.config.space, radius=found.config.radius
+            scene,
+            folder,
+            seed=seed,
+            space=found.config.space,
+            radius=found.config.radius,
+            centre=found.config.centre,
         ),
         out / light_stage.FOLDER / found.geometry.mesh,
         steps=found.config.light_steps,

@@ -28,12 +28,18 @@ class ReconstructionFlags(NamedTuple):
     light_steps: flags.FlagHolder[int]
 
     def chosen(
-        self, *, index: float | None, seed: int, space: str | None, radius: float | None
+        self,
+        *,
+        index: float | None,
+        seed: int,
+        space: str | None,
+        radius: float | None,
+        centre: choices.Position | None = None,
     ) -> records.ReconstructionConfig:
         """Returns the options of the reconstruction; an index of `None` is estimated."""
         geometry, resolution, outliers, light_steps = (each.value for each in self)
         return records.ReconstructionConfig(
-            geometry, resolution, outliers, index, space, radius, light_steps, seed
+            geometry, resolution, outliers, index, space, radius, light_steps, seed, centre
         )
 
 

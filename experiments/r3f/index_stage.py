@@ -21,7 +21,7 @@ from experiments.cli import app
 from experiments.cli.progress import ProgressBar
 from experiments.figures import style
 from experiments.figures.style import COLOURS, pyplot
-from refref_jax.choices import Space
+from refref_jax.choices import Position, Space
 from refref_jax.data import image_files, scene_folder
 from refref_jax.data.scene_assembly import assemble_scene
 from refref_jax.geometry.cameras import pixel_rays
@@ -114,6 +114,7 @@ def run(
     seed: int,
     space: Space | None = None,
     radius: float | None = None,
+    centre: Position | None = None,
     start: float | None = None,
     steps: int = STEPS,
     rays: int = RAYS,
@@ -128,6 +129,7 @@ def run(
       space: type of the background; the scene's own if `None`.
       radius: half-extent of the background cube, or radius of the sphere or of the uncontracted
         ball, world units; the scene's own if `None`.
+      centre: centre of the background, world units; the scene's own if `None`.
       start: index from which to descend in addition to those of the search.
       steps: training steps of the background.
       rays: number of pixels to fit.
@@ -136,7 +138,8 @@ def run(
       ValueError: if the scene has no masks, or no pixel outside of them.
       KeyboardInterrupt: if the background's training was stopped; it has been saved.
     """
-    model = learn_background(scene, folder, seed=seed, space=space, radius=radius, steps=steps)
+    background = {"space": space, "radius": radius, "centre": centre}
+    model = learn_background(scene, folder, seed=seed, steps=steps, **background)
     evidence, views = look(scene, "train", model, seed=seed, rays=rays)
     search = IndexSearch()
     with ProgressBar("index", most_looks(search, start=start)) as bar:
@@ -161,6 +164,7 @@ def learn_background(
     seed: int,
     space: Space | None = None,
     radius: float | None = None,
+    centre: Position | None = None,
     steps: int = STEPS,
 ) -> Model:
     """Returns the field of the background, which is trained first or resumed if necessary.
@@ -171,6 +175,7 @@ def learn_background(
       seed: random seed.
       space: type of the background, see `run`.
       radius: size of the background, see `run`.
+      centre: centre of the background, see `run`.
       steps: number of training steps.
 
     Raises:
@@ -184,6 +189,7 @@ def learn_background(
         pixels="background",
         background=space,
         radius=radius,
+        centre=centre,
         paths="straight",
         preset=PRESET,
         footprint="cone",
@@ -229,6 +235,11 @@ def _refuse_another(run: Path, found: SavedModel, wanted: SavedModel) -> None:
             f"{run} was started with another --background or --radius ({theirs.space}, "
             f"{theirs.radius:g}) than now ({ours.space}, {ours.radius:g}). Repeat these flags, or "
             f"{remove}"
+        )
+    if theirs.centre != ours.centre:
+        raise ValueError(
+            f"{run} was started with a background around {theirs.centre}, which is now around "
+            f"{ours.centre}. Give the earlier centre in scene.json, or {remove}"
         )
     raise ValueError(
         f"{run} was started by a version with other fields or samples. Use that version, or "

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from refref_jax import atomic_files, configuration
-from refref_jax.choices import Space
+from refref_jax.choices import Position, Space
 
 FILE = "reconstruction.json"
 
@@ -35,6 +35,7 @@ class ReconstructionConfig:
         ball, world units; `None` for the scene's own.
       light_steps: number of steps of the refinement by light; 0 skips it.
       seed: random seed.
+      centre: centre of the background, world units; `None` for the scene's own.
     """
 
     geometry: str
@@ -45,6 +46,7 @@ class ReconstructionConfig:
     radius: float | None
     light_steps: int
     seed: int
+    centre: Position | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -246,4 +248,4 @@ def _told(name: str, value: object) -> object:
 
 _OPTIONS = {"index": "ior", "space": "background"}
 # First stage that an option affects, if it is not the geometry.
-_STAGES = {"index": "index", "space": "index", "radius": "index", "light_steps": "light"}
+_STAGES = dict.fromkeys(("index", "space", "radius", "centre"), "index") | {"light_steps": "light"}

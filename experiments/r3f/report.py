@@ -289,7 +289,8 @@ def _making(found: Reconstruction) -> str:
         f"--outliers={config.outliers} --light_steps={config.light_steps} --seed={config.seed}`"
         + (f" `--ior={config.index:g}`" if config.index is not None else "")
         + (f" `--background={config.space}`" if config.space is not None else "")
-        + (f" `--radius={config.radius:g}`" if config.radius is not None else ""),
+        + (f" `--radius={config.radius:g}`" if config.radius is not None else "")
+        + (f" around {config.centre}" if config.centre is not None else ""),
         f"- refined: {', '.join(geometry.stages) or 'nothing to do'}",
         *(f"- skipped {refused}" for refused in geometry.refused),
     ]

@@ -164,13 +164,16 @@ def find(run: Path, config: TrainConfig, *, ior: Sequence[str], resume: bool) ->
             f"{out} already contains a reconstruction. Continue with --resume, or change --out."
         )
     overrides = config.overrides()  # a reconstruction makes its own decisions
-    space, radius = chain.bounds_of(
+    space, radius, centre = chain.bounds_of(
         scene,
         config.scene.properties,
         space=config.scene.space if "background" in overrides else None,
         radius=config.scene.radius if "radius" in overrides else None,
+        centre=config.scene.centre if "centre" in overrides else None,
     )
-    asked = _RECONSTRUCTED.chosen(index=index, seed=config.seed, space=space, radius=radius)
+    asked = _RECONSTRUCTED.chosen(
+        index=index, seed=config.seed, space=space, radius=radius, centre=centre
+    )
     try:
         chain.reconstruct(scene, out, asked, compare=False)
     except KeyboardInterrupt:

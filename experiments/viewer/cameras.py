@@ -10,6 +10,7 @@ grey bars at the sides.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -85,15 +86,18 @@ def window_rays(view: Viewpoint, height: int) -> Rays:
     return cameras.pixel_rays(own, np.zeros_like(row), row, column)
 
 
-def nearest(pose: Float[np.ndarray, "3 4"], views: Cameras) -> int:
+def nearest(
+    pose: Float[np.ndarray, "3 4"], views: Cameras, *, centre: Sequence[float] = (0.0, 0.0, 0.0)
+) -> int:
     """Returns the index of the camera that is closest to a pose.
 
     The difference is that of the positions, plus that of the viewing directions times the distance
-    of the candidate from the origin: the displacement of an object there.
+    of the candidate from the centre of the scene: the displacement of an object there.
     """
     apart = np.linalg.norm(views.poses[:, :, 3] - pose[:, 3], axis=-1)
     turned = np.linalg.norm(views.poses[:, :, 2] - pose[:, 2], axis=-1)
-    return int(np.argmin(apart + turned * np.linalg.norm(views.poses[:, :, 3], axis=-1)))
+    distances = np.linalg.norm(views.poses[:, :, 3] - centre, axis=-1)
+    return int(np.argmin(apart + turned * distances))
 
 
 def is_same(a: Viewpoint, b: Viewpoint, *, within: float = ROUNDING) -> bool:

@@ -57,7 +57,8 @@ def serve(subject: Subject, *, host: str, port: int) -> viser.ViserServer:
     view = session.first_viewpoint(subject)
     position, back = view.pose[:, 3], view.pose[:, 2]
     server.initial_camera.position = position
-    server.initial_camera.look_at = position - back * np.linalg.norm(position)
+    distance = np.linalg.norm(position - subject.model.config.centre)
+    server.initial_camera.look_at = position - back * distance
     server.initial_camera.fov = view.fov
     turns, pages = Turns(), {}
 
@@ -172,7 +173,8 @@ class Page:
     def _draw_error(self, job: Job, view: Viewpoint, model: Any, most: int) -> Image | None:
         """Moves to the nearest test view and draws its error, with bars at the sides."""
         frames = self._subject.frames
-        i = cameras.nearest(view.pose, frames.cameras)
+        centre = self._subject.model.config.centre
+        i = cameras.nearest(view.pose, frames.cameras, centre=centre)
         fov = cameras.containing_fov(frames.cameras, view.aspect)
         self._go_to(Viewpoint(frames.cameras.poses[i], fov, view.aspect))
         pixels = layers.view_pixels(frames, i, most)

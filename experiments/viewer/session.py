@@ -151,12 +151,19 @@ def read_test_views(scene: Path) -> Frames:
 
 
 def first_viewpoint(subject: Subject, aspect: float = cameras.ASPECT) -> cameras.Viewpoint:
-    """Returns a new page's camera: the first test view, or a fixed one outside the origin."""
+    """Returns a new page's camera: the first test view, or one that looks at the scene's centre."""
     if subject.views is not None:
         fov = cameras.containing_fov(subject.views, aspect)
         return cameras.Viewpoint(subject.views.poses[0], fov, aspect)
-    pose = orbit(1, distance=_DISTANCE, elevation=_ELEVATION, size=1, angle_x=1.0).poses[0]
-    return cameras.Viewpoint(pose, _FOV, aspect)
+    around = orbit(
+        1,
+        distance=_DISTANCE,
+        elevation=_ELEVATION,
+        size=1,
+        angle_x=1.0,
+        centre=subject.model.config.centre,
+    )
+    return cameras.Viewpoint(around.poses[0], _FOV, aspect)
 
 
 def changed(state: State, now: float) -> State:

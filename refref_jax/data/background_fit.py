@@ -1,4 +1,4 @@
-"""Measures the size of a background from depth maps (NumPy only).
+"""Measures the size and the centre of a background from depth maps (NumPy only).
 
 Scenes of the data set do not state how far away their background is. Their depth maps do: a pixel
 beside the object with planar depth `z` shows the point `p = o + z d`, where `o` is the position of
@@ -7,16 +7,20 @@ the camera and `d` the pixel's direction with unit depth along the camera's axis
     cube      max_i |p_i - c_i| = h      half edge h
     sphere    |p - c| = h                radius h
 
-around the origin (`c = 0`), or around a centre that is fitted as well. Size and centre are fitted
-to the depths by least squares with Tukey's weights, after Beaton and Tukey, "The fitting of power
-series, meaning polynomials, illustrated on band-spectroscopic data" (1974).
+around a known centre, usually the origin (`c = 0`), or around one that is fitted as well. Size and
+centre are fitted to the depths by least squares with Tukey's weights, after Beaton and Tukey, "The
+fitting of power series, meaning polynomials, illustrated on band-spectroscopic data" (1974).
+
+`fit_background` keeps the known centre unless the depths clearly show another one: the fitted
+centre is further away than 0.1 % of the size and four standard errors, and the mean deviation of
+the depths around it is less than half of that around the known one.
 
 8-bit maps are inverted, saturated and rounded (see `image_files.read_depth`). Saturated values are
 left out. Rounding causes an error of the depth that is uniform within a step and has no bias; a
 deviation of less than a step is never an outlier. The errors of neighbouring pixels are correlated,
 so the standard error is estimated between images (a sandwich estimate with one cluster per image).
 
-The background is opaque and encloses the cameras, so a point that is nearer to the origin than some
+The background is opaque and encloses the cameras, so a point that is nearer to its centre than some
 camera must be on an object. Such points are left out, even where there are no masks.
 """
 
@@ -28,7 +32,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from refref_jax.choices import Space, Split
+from refref_jax.choices import ORIGIN, Position, Space, Split
 from refref_jax.data import image_files, scene_folder, scene_names
 from refref_jax.data.scene_properties import SceneProperties
 from refref_jax.geometry.cameras import Cameras, planar_directions
@@ -46,7 +50,7 @@ _FEWEST_PIXELS = 200
 _LEAST_AGREEMENT = 0.8
 _AGREES = 0.01
 
-# Maximum standard error of a size that is used, relative to the size.
+# Maximum standard errors of a size and a centre that are used, relative to the size.
 _LARGEST_ERROR = 0.01
 
 # Images are split into parts if there are fewer, to have enough clusters for a standard error.
@@ -63,12 +67,20 @@ _SLOWEST = 1e-12
 _TUKEY = 4.685
 _GAUSSIAN = 1.4826
 
-# Deviation of depths that is never an outlier, relative to the size; float maps are that accurate.
+# Deviation of depths that is never an outlier, relative to the size: float maps are that accurate.
+# From a rough estimate of the centre it starts higher, and is halved in every iteration, since a
+# wall whose place is still wrong would be an outlier.
 _ROUNDING = 1e-5
+_COARSE = 0.1
 
-# Offset of the background from the origin that is reported: relative, and in standard errors.
-_FAR_OFF = 0.005
+# Minimum distance of a fitted centre from the known one: relative to the size, and in standard
+# errors. The mean deviation of the depths must fall to this part.
+_LEAST_OFFSET = 0.001
 _SIGNIFICANT = 4.0
+_MUCH_BETTER = 0.5
+
+# Share of points beyond the first estimate of the background on either side, along each axis.
+_TAIL = 0.02
 
 
 class DepthSamples(NamedTuple):
@@ -104,24 +116,72 @@ class BackgroundFit(NamedTuple):
     kind: Kind
     size: float
     error: float
-    centre: tuple[float, float, float]
-    centre_error: tuple[float, float, float]
+    centre: Position
+    centre_error: Position
     agreement: float
 
     def describe(self) -> str:
-        """Returns the size with its standard error, as in `7.298 +- 0.004`."""
-        places = int(np.clip(-np.floor(np.log10(max(self.error, 1e-6))), 2, 5))
-        return f"{self.size:.{places}f} +- {max(self.error, 10.0**-places):.1g}"
+        """Returns size and fitted centre with their standard errors, as in `7.298 +- 0.004`."""
+        size = _with_error(self.size, self.error)
+        if not any(self.centre_error):
+            return size
+        return f"{size} around ({', '.join(map(_with_error, self.centre, self.centre_error))})"
 
 
-def fit_size(kind: Kind, samples: DepthSamples) -> BackgroundFit | None:
-    """Fits a background around the origin; `None` if the depths do not show one."""
-    return _fit(kind, samples, unknowns=1)
+def fit_background(
+    kind: Kind, samples: DepthSamples, *, centre: Position = ORIGIN
+) -> BackgroundFit | None:
+    """Fits a background around a known centre, or around another one that the depths clearly show.
+
+    Args:
+      kind: shape of the background.
+      samples: pixels that may show it.
+      centre: known centre, world units.
+
+    Returns:
+      The background; `None` if the depths do not show one.
+    """
+    known, free = fit_size(kind, samples, centre=centre), fit_size_and_centre(kind, samples)
+    if free is None:
+        return known
+    offset = math.dist(free.centre, centre)
+    if offset > max(_LEAST_OFFSET * free.size, _SIGNIFICANT * math.hypot(*free.centre_error)):
+        if known is None:
+            return free
+        before, after = _mean_deviations(samples, known, free)
+        if after < _MUCH_BETTER * before:
+            return free
+    return known or free._replace(centre=centre, centre_error=ORIGIN)
+
+
+def fit_size(
+    kind: Kind, samples: DepthSamples, *, centre: Position = ORIGIN
+) -> BackgroundFit | None:
+    """Fits a background around a known centre; `None` if the depths do not show one."""
+    return _fit(kind, samples, np.array(centre, np.float64), unknowns=1)
 
 
 def fit_size_and_centre(kind: Kind, samples: DepthSamples) -> BackgroundFit | None:
-    """Fits a background around any centre; `None` if the depths do not show one."""
-    return _fit(kind, samples, unknowns=4)
+    """Fits a background around any centre; `None` if the depths do not show one.
+
+    It has to enclose the cameras, whose distances from the first estimate of the centre decide
+    which points may be on it. That estimate is the middle between the outermost points along each
+    axis, and the fitted centre is the next one.
+    """
+    if not len(samples.depths):
+        return None
+    ends = np.quantile(_points(samples), [_TAIL, 1.0 - _TAIL], axis=0)
+    first = _fit(kind, samples, np.mean(ends, axis=0), unknowns=4, coarse=_COARSE)
+    found = first and _fit(kind, samples, np.array(first.centre), unknowns=4)
+    if found is None or not max(found.centre_error) < _LARGEST_ERROR * found.size:
+        return None
+    encloses = np.max(_extents(kind, samples.origins - found.centre)) < found.size
+    return found if encloses else None
+
+
+def _with_error(value: float, error: float) -> str:
+    places = int(np.clip(-np.floor(np.log10(max(error, 1e-6))), 2, 5))
+    return f"{value:.{places}f} +- {max(error, 10.0**-places):.1g}"
 
 
 def sample_depths(
@@ -194,18 +254,25 @@ class Bounds(NamedTuple):
     Attributes:
       space: geometry of the background.
       size: half edge or radius, world units; `None` if unknown or infinite.
-      source: reason for the size.
+      source: reason for the size, or for the centre if only that is known.
       notes: warnings.
+      centre: centre, world units.
     """
 
     space: Space
     size: float | None
     source: str
     notes: tuple[str, ...] = ()
+    centre: Position = ORIGIN
 
 
 def find_bounds(
-    scene: Path, properties: SceneProperties, *, space: Space | None, radius: float | None
+    scene: Path,
+    properties: SceneProperties,
+    *,
+    space: Space | None,
+    radius: float | None,
+    centre: Position | None = None,
 ) -> Bounds:
     """Determines the background of a scene: from `scene.json`, else from its name and depth maps.
 
@@ -214,6 +281,7 @@ def find_bounds(
       properties: properties of the scene.
       space: geometry that is given; `None` for the scene's own.
       radius: size that is given, in place of the scene's own; nothing is measured then.
+      centre: centre that is given, in place of the scene's own.
 
     Raises:
       SceneError: if `scene.json`, a depth map or a mask is broken.
@@ -221,23 +289,26 @@ def find_bounds(
     own, described = properties.space, properties.background
     found: Space = space or own
     if found == "unbounded":
-        return Bounds(found, None, "")
+        return Bounds(found, None, "", centre=centre or ORIGIN)
+    known, file = centre or described.centre, properties.origins.get("background")
+    stated = file.name if file else ""
     if described.extent is not None:
-        return Bounds(found, described.extent, properties.origins["background"].name)
+        return Bounds(found, described.extent, stated, centre=known or ORIGIN)
     is_sphere = scene_names.of_folder(scene).split("_")[0] == "sphere"
     if space is None and own == "bounded" and is_sphere and described.kind is None:
         found = "spherical"
+    # Without a radius, a sphere that only the scene's name states has the usual cube around it.
+    unmeasured = Bounds(space or own, None, "" if known == centre else stated, (), known or ORIGIN)
     if radius is not None:
-        return Bounds(found, None, "")
+        return unmeasured._replace(space=found)
     kind: Kind = "sphere" if found == "spherical" else "cube"
-    samples = read_samples(scene)
-    free = None if samples is None else fit_size_and_centre(kind, samples)
-    fit = None if samples is None else fit_size(kind, samples) or free
-    notes = () if free is None else _offset_warnings(free)
+    samples, fit = read_samples(scene), None
+    if samples is not None:
+        fit = fit_size(kind, samples, centre=known) if known else fit_background(kind, samples)
     if fit is None:
-        # Without a radius, a sphere that only the scene's name states has the usual cube around it.
-        return Bounds(space or own, None, "", _unfit_warnings(kind, samples))
-    return Bounds(found, fit.size, f"measured from depth maps: {fit.describe()}", notes)
+        return unmeasured._replace(notes=_unfit_warnings(kind, samples))
+    source = f"measured from depth maps: {fit.describe()}"
+    return Bounds(found, fit.size, source, centre=fit.centre)
 
 
 def _unfit_warnings(kind: Kind, samples: DepthSamples | None) -> tuple[str, ...]:
@@ -247,19 +318,6 @@ def _unfit_warnings(kind: Kind, samples: DepthSamples | None) -> tuple[str, ...]
     return (
         f"warning: the depth maps show no {kind}, so that the size of the background is assumed to "
         "be the usual one. Set radius, or background=unbounded.",
-    )
-
-
-def _offset_warnings(fit: BackgroundFit) -> tuple[str, ...]:
-    """Returns a warning if the background is not around the origin, as models assume."""
-    offset, error = math.hypot(*fit.centre), math.hypot(*fit.centre_error)
-    if offset <= max(_FAR_OFF * fit.size, _SIGNIFICANT * error):
-        return ()
-    pairs = zip(fit.centre, fit.centre_error, strict=True)
-    centre = ", ".join(f"{x:.3f} +- {deviation:.1g}" for x, deviation in pairs)
-    return (
-        f"warning: the depth maps show a {fit.kind} of size {fit.describe()} around ({centre}), "
-        "but the background is taken to be around the origin. Move the poses and the meshes.",
     )
 
 
@@ -306,25 +364,45 @@ _SHAPES: dict[Kind, _Shape] = {"cube": _cube, "sphere": _sphere}
 
 
 def _extents(kind: Kind, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Returns the sizes of the shapes around the origin on which points lie."""
+    """Returns the sizes of the shapes on which points lie, relative to the centre."""
     return np.max(np.abs(points), axis=1) if kind == "cube" else np.linalg.norm(points, axis=1)
 
 
-def _fit(kind: Kind, samples: DepthSamples, *, unknowns: int) -> BackgroundFit | None:
-    """Fits the first `unknowns` of size and centre (four numbers); the others stay 0."""
-    extents = _extents(kind, samples.origins + samples.depths[:, None] * samples.directions)
+def _points(samples: DepthSamples) -> Float[np.ndarray, "n 3"]:
+    return samples.origins + samples.depths[:, None] * samples.directions
+
+
+def _mean_deviations(samples: DepthSamples, *fits: BackgroundFit) -> list[float]:
+    """Returns the mean deviation of each fit, over the pixels that agree with any of them."""
+    shapes = [_SHAPES[fit.kind](samples, np.array([fit.size, *fit.centre])) for fit in fits]
+    deviations = np.abs(samples.depths - np.stack([depths for depths, _ in shapes]))
+    sizes = np.array([[fit.size] for fit in fits])
+    agree = np.any(deviations < samples.step + _AGREES * sizes, axis=0)
+    return np.mean(deviations[:, agree], axis=1).tolist()
+
+
+def _fit(
+    kind: Kind,
+    samples: DepthSamples,
+    centre: Float[np.ndarray, "3"],
+    *,
+    unknowns: int,
+    coarse: float = _ROUNDING,
+) -> BackgroundFit | None:
+    """Fits the first `unknowns` of size and centre (four numbers); the others stay as given."""
+    extents = _extents(kind, _points(samples) - centre)
     if not len(extents):
         return None
-    behind = extents > np.max(_extents(kind, samples.origins))
+    behind = extents > np.max(_extents(kind, samples.origins - centre))
     samples = _choose(samples, behind)
     if len(samples.depths) < _FEWEST_PIXELS:
         return None
-    shape = np.array([np.median(extents[behind]), 0.0, 0.0, 0.0])
+    shape = np.array([np.median(extents[behind]), *centre])
     inverse = np.eye(unknowns)
     for _ in range(_ITERATIONS):
         depths, slopes = _SHAPES[kind](samples, shape)
         errors, slopes = samples.depths - depths, slopes[:, :unknowns]
-        weights = _weights(errors, max(samples.step, _ROUNDING * shape[0]))
+        weights = _weights(errors, max(samples.step, coarse * shape[0]))
         normal = slopes.T @ (weights[:, None] * slopes)
         if np.linalg.matrix_rank(normal) < unknowns:
             return None
@@ -333,16 +411,17 @@ def _fit(kind: Kind, samples: DepthSamples, *, unknowns: int) -> BackgroundFit |
         shape[:unknowns] += change
         if not 0.0 < shape[0] < np.inf:
             return None
-        if np.max(np.abs(change)) < _CONVERGED * shape[0]:
+        if coarse == _ROUNDING and np.max(np.abs(change)) < _CONVERGED * shape[0]:
             break
+        coarse = max(0.5 * coarse, _ROUNDING)
     scores = slopes * (weights * errors)[:, None]
     error = _standard_errors(scores, samples.clusters, inverse)
     agreement = float(np.mean(np.abs(errors) < samples.step + _AGREES * shape[0]))
     if agreement < _LEAST_AGREEMENT or not error[0] < _LARGEST_ERROR * shape[0]:
         return None
-    size, *centre = shape.tolist()
+    size, *place = shape.tolist()
     spread = [*error.tolist(), 0.0, 0.0, 0.0]
-    return BackgroundFit(kind, size, spread[0], tuple(centre), tuple(spread[1:4]), agreement)
+    return BackgroundFit(kind, size, spread[0], tuple(place), tuple(spread[1:4]), agreement)
 
 
 def _choose(samples: DepthSamples, chosen: Bool[np.ndarray, " n"]) -> DepthSamples:

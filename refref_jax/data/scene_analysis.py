@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from refref_jax.choices import CLEAR, NO_ABSORPTION, PartKind, RuleName, Space, Tints
+from refref_jax.choices import CLEAR, NO_ABSORPTION, PartKind, Position, RuleName, Space, Tints
 from refref_jax.data.mesh_queries import Containment, encloses, is_convex, winding_number
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_properties import PartDescription, SceneProperties
@@ -131,6 +131,7 @@ def overridden(
     rule: RuleName,
     space: Space | None = None,
     radius: float | None = None,
+    centre: Position | None = None,
 ) -> tuple[str, ...]:
     """Returns a line of text for each property of `scene.json` that another value overrides.
 
@@ -140,6 +141,7 @@ def overridden(
       rule: interface rule that is used.
       space: geometry of the background that is used, if it may differ.
       radius: size of the background that is used, if it is given.
+      centre: centre of the background that is used, if it is given.
     """
     background = properties.background
     lines: list[tuple[str, str, str]] = []
@@ -149,6 +151,8 @@ def overridden(
         lines.append(("background", f"background={space}", background.kind))
     elif background.extent is not None and radius not in (None, background.extent):
         lines.append(("background", f"radius={radius:g}", f"{background.extent:g}"))
+    if background.centre is not None and centre not in (None, background.centre):
+        lines.append(("background", f"centre={centre}", f"{background.centre}"))
     for part in parts:
         for name, described in properties.parts.items():
             index = described.index

@@ -304,12 +304,13 @@ def _read_cube(found: SceneProperties, path: Path) -> CubeBackground:
     axes = axes.astype(np.float32)
     texture = _stack([_read_texture(face.image, path) for face in faces], path)
     normals, across, along = (host_array(axes[:, i]) for i in range(3))
-    return CubeBackground(texture, normals, across, along, host_array(half))
+    return CubeBackground(texture, normals, across, along, host_array(half), _centre(found))
 
 
 def _read_sphere(found: SceneProperties, path: Path) -> SphereBackground:
     radius = np.float32(_extent(found, "radius", path))
-    return SphereBackground(_read_texture(found.background.image, path), host_array(radius))
+    texture = _read_texture(found.background.image, path)
+    return SphereBackground(texture, host_array(radius), _centre(found))
 
 
 def _read_environment(found: SceneProperties, path: Path) -> Environment:
@@ -327,6 +328,12 @@ def _extent(found: SceneProperties, key: str, path: Path) -> float:
     if found.background.extent is None:
         raise SceneError(f"The background in {path} lacks the key {key!r}. Add it.")
     return found.background.extent
+
+
+def _centre(found: SceneProperties) -> Float[np.ndarray, "3"] | None:
+    """Returns the centre of the background, or `None` for the origin."""
+    centre = found.background.centre
+    return host_array(np.float32(centre)) if centre is not None and any(centre) else None
 
 
 def _read_texture(image: str | None, described: Path) -> Texture:

@@ -125,14 +125,14 @@ class BackgroundProperties:
     Attributes:
       kind: type of the background: `cube`, `sphere` or `env`.
       extent: half the edge of the cube, or radius of the sphere, world units.
-      centre: centre of the cube or sphere, world units: the origin.
+      centre: centre of the cube or sphere, world units.
       image: path of the image of a sphere or an environment.
       faces: walls of a cube.
     """
 
     kind: BackgroundKind | None = None
     extent: float | None = None
-    centre: Vector = (0.0, 0.0, 0.0)
+    centre: Vector | None = None
     image: str | None = None
     faces: tuple[Face, ...] = ()
 
@@ -310,9 +310,6 @@ _vector = vector_within(-math.inf, math.inf, "three numbers")
 _tint = vector_within(0.0, 1.0, "three numbers from 0 to 1, since no surface adds light")
 _absorption = vector_within(0.0, math.inf, "three numbers that are 0 or positive, per world unit")
 _light = vector_within(0.0, math.inf, "vertex_colours, or three numbers that are 0 or positive")
-_centre = vector_within(
-    0.0, 0.0, "[0, 0, 0]: another centre is not supported yet, so move the cameras"
-)
 
 _Checks = Mapping[str, Callable[[Any], Any]]
 
@@ -330,7 +327,7 @@ _BACKGROUND: _Checks = {
     "type": one_of(*get_args(BackgroundKind)),
     "half_extent": _positive,
     "radius": _positive,
-    "centre": _centre,
+    "centre": _vector,
     "image": of_type(str, "the name of a file"),
     "faces": _record,
     "mapping": of_type(str, "its name"),
@@ -405,7 +402,8 @@ def _background(record: Any, sources: Sequence[_Source]) -> BackgroundProperties
     walls = _object(values.get("faces", {}), (*keys, "faces"), sources)
     extent = values.get("radius" if kind == "sphere" else "half_extent")
     faces = (_face(name, wall, sources) for name, wall in walls.items())
-    return BackgroundProperties(kind, extent, image=values.get("image"), faces=tuple(faces))
+    centre, image = values.get("centre"), values.get("image")
+    return BackgroundProperties(kind, extent, centre, image, tuple(faces))
 
 
 def _face(name: str, record: Any, sources: Sequence[_Source]) -> Face:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from refref_jax.choices import ORIGIN, Position
 from refref_jax.geometry.rays import Rays
 from refref_jax.numerics import host_array
 
@@ -127,15 +128,24 @@ def box_filter(
     return blocks.mean(axis=(1, 3))
 
 
-def orbit(frames: int, *, distance: float, elevation: float, size: int, angle_x: float) -> Cameras:
-    """Returns cameras on a circle around the origin, all looking at it, with z up.
+def orbit(
+    frames: int,
+    *,
+    distance: float,
+    elevation: float,
+    size: int,
+    angle_x: float,
+    centre: Position = ORIGIN,
+) -> Cameras:
+    """Returns cameras on a circle around a centre, all looking at it, with z up.
 
     Args:
       frames: number of cameras, evenly spaced.
-      distance: distance to the origin, world units.
+      distance: distance to the centre, world units.
       elevation: angle above the horizontal plane in radians, strictly between -pi/2 and pi/2.
       size: width and height in pixels.
       angle_x: horizontal field of view in radians.
+      centre: point that the cameras look at, world units.
 
     Example:
       >>> import refref_jax
@@ -150,7 +160,7 @@ def orbit(frames: int, *, distance: float, elevation: float, size: int, angle_x:
     flat = np.stack([np.cos(azimuth), np.sin(azimuth), zero], axis=-1)
     back = np.cos(elevation) * flat + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
     up = np.cross(back, right)
-    poses = np.stack([right, up, back, distance * back], axis=-1)
+    poses = np.stack([right, up, back, distance * back + centre], axis=-1)
     return Cameras(poses, size, size, focal_length(size, angle_x))
 
 

@@ -52,9 +52,10 @@ Texture = SrgbTexture | LinearTexture
 
 
 class CubeBackground(NamedTuple):
-    """Background cube: six square walls around the origin, each with an image.
+    """Background cube: six square walls around a centre, each with an image.
 
-    The point `(u, v)` of a wall is `half_extent (normal + (2u - 1) u_axis + (2v - 1) v_axis)`.
+    The point `(u, v)` of a wall is
+    `centre + half_extent (normal + (2u - 1) u_axis + (2v - 1) v_axis)`.
 
     Attributes:
       texture: one image per wall, all of the same size.
@@ -62,6 +63,7 @@ class CubeBackground(NamedTuple):
       u_axes: unit direction of increasing `u` on each wall.
       v_axes: unit direction of increasing `v` on each wall.
       half_extent: half the edge of the cube, world units.
+      centre: centre of the cube, world units; `None` for the origin.
     """
 
     texture: Texture
@@ -69,20 +71,23 @@ class CubeBackground(NamedTuple):
     u_axes: Float[Array, "walls 3"]
     v_axes: Float[Array, "walls 3"]
     half_extent: Float[Array, ""]
+    centre: Float[Array, "3"] | None = None
 
 
 class SphereBackground(NamedTuple):
-    """Background sphere: a sphere around the origin with an equirectangular image.
+    """Background sphere: a sphere around a centre with an equirectangular image.
 
-    The image is indexed by the direction from the origin to the sphere, as in `Environment`.
+    The image is indexed by the direction from the centre to the sphere, as in `Environment`.
 
     Attributes:
       texture: one image.
       radius: radius of the sphere, world units.
+      centre: centre of the sphere, world units; `None` for the origin.
     """
 
     texture: Texture
     radius: Float[Array, ""]
+    centre: Float[Array, "3"] | None = None
 
 
 class Environment(NamedTuple):
@@ -145,6 +150,7 @@ def cube_radiance(
     or the border of a wall if it misses the cube. Images repeat beyond the border of a wall for the
     last half texel, as in Cycles. A zero direction sees the first wall at the origin of the ray.
     """
+    origin = _from_centre(background, origin)
     dot_all = jax.vmap(numerics.dot, in_axes=(0, None))
     gaps = background.half_extent - dot_all(background.normals, origin)
     distances = numerics.time_to_close(gaps, dot_all(background.normals, direction))
@@ -165,10 +171,11 @@ def sphere_radiance(
     """Returns the radiance along a ray inside the sphere, at the point where it leaves.
 
     A ray that starts outside and misses the sphere sees the nearest point of its line to the
-    origin; a ray with the sphere behind it sees the point where its line leaves the sphere.
+    centre; a ray with the sphere behind it sees the point where its line leaves the sphere.
     Gradients are finite everywhere; if the line is tangent to the sphere, the gradient of the
     distance is 0 (`numerics.safe_sqrt`).
     """
+    origin = _from_centre(background, origin)
     middle, half = scene_bounds.chord(background.radius, origin, direction)
     return _look(background.texture, origin + (middle + half) * direction)
 
@@ -179,6 +186,13 @@ def environment_radiance(
     """Returns the radiance of an environment along a ray; its origin has no effect."""
     del origin
     return _look(background.texture, direction)
+
+
+def _from_centre(
+    background: CubeBackground | SphereBackground, point: Float[Array, "3"]
+) -> Float[Array, "3"]:
+    """Returns a point relative to the centre of a background."""
+    return point if background.centre is None else point - background.centre
 
 
 def _look(texture: Texture, towards: Float[Array, "3"]) -> Float[Array, "3"]:

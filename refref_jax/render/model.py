@@ -11,7 +11,7 @@ from typing import NamedTuple, get_args
 import jax
 from jaxtyping import Array
 
-from refref_jax.choices import Footprint, Interior, Space
+from refref_jax.choices import ORIGIN, Footprint, Interior, Position, Space
 from refref_jax.fields import base, registry
 from refref_jax.fields.base import DensityConfig, RadianceConfig
 from refref_jax.optics.path_settings import Detail, PathSettings, Tally
@@ -60,13 +60,14 @@ class ModelConfig:
         the background is opaque there. In bounded and spherical scenes, paths end at the scene
         bounds, and `far` is only used for paths that miss them.
       radius: half edge of a bounded scene's cube, or radius of a spherical scene or of an
-        unbounded scene's uncontracted ball, world units, around the origin. A background cube
-        should coincide with the scene bounds: the field is unconstrained between the two.
+        unbounded scene's uncontracted ball, world units. A background cube should coincide with the
+        scene bounds: the field is unconstrained between the two.
       space: `bounded` by the cube, `spherical` (bounded by the ball), or `unbounded` (contracted
         beyond the ball).
       dilation: widening of a proposal before it is sampled, as a fraction of its mean bin width; 0
         for none.
       field_parts: parts whose inside is sampled too, where `interior` leaves out the others.
+      centre: centre of the cube or ball, world units; it is the centre of the fields' unit cube.
     """
 
     proposals: tuple[ProposalConfig, ...]
@@ -82,6 +83,7 @@ class ModelConfig:
     space: Space
     dilation: float
     field_parts: tuple[int, ...] = ()
+    centre: Position = ORIGIN
 
     def __post_init__(self) -> None:
         """Validates the values."""
@@ -94,6 +96,8 @@ class ModelConfig:
             )
         if not 0.0 < self.radius < math.inf:
             raise ValueError(f"radius is {self.radius}. Give a positive, finite radius.")
+        if not all(map(math.isfinite, self.centre)):
+            raise ValueError(f"centre is {self.centre}. Give three finite numbers of world units.")
         if self.learned_tints < 0:
             raise ValueError(
                 f"learned_tints is {self.learned_tints}. Give the number of parts, or 0."

@@ -228,7 +228,7 @@ def distance_warp(config: ModelConfig, line: Polyline) -> scene_bounds.DistanceW
 
 def domain(config: ModelConfig) -> scene_bounds.Domain:
     """Returns the scene bounds of a model."""
-    return scene_bounds.Domain(config.radius, config.space)
+    return scene_bounds.Domain(config.radius, config.space, config.centre)
 
 
 def polyline(config: ModelConfig, path: LightPaths) -> Polyline:

@@ -1,8 +1,8 @@
 """Maps world space to the unit cube of the fields, and distance along a path to `[0, 1]`.
 
 A bounded scene is a scaled cube, and a spherical scene is the ball in this cube. An unbounded scene
-is contracted: a ball around the origin is unchanged, and the space beyond it is contracted to a
-shell of the same thickness.
+is contracted: a ball is unchanged, and the space beyond it is contracted to a shell of the same
+thickness. All of them are around the centre of the scene.
 
 Symbols: `t` is distance in world units, `s` the normalised coordinate in `[0, 1]` in which samplers
 work. Equal steps in `s` are short near the camera and grow with distance, so that one interval
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from refref_jax import numerics
-from refref_jax.choices import Space
+from refref_jax.choices import ORIGIN, Position, Space
 from refref_jax.sampling.cones import Gaussians
 
 _LAMBDA = -1.5
@@ -33,10 +33,12 @@ class Domain(NamedTuple):
         unbounded scene's uncontracted ball; world units.
       space: `bounded` by the cube, `spherical` (bounded by the ball), or `unbounded` (contracted
         beyond the ball).
+      centre: centre of the cube or ball, world units.
     """
 
     radius: float
     space: Space
+    centre: Position = ORIGIN
 
 
 def to_unit_cube(domain: Domain, gaussian: Gaussians) -> Gaussians:
@@ -44,7 +46,7 @@ def to_unit_cube(domain: Domain, gaussian: Gaussians) -> Gaussians:
 
     In bounded and spherical scenes, points outside the cube are moved to its nearest face.
     """
-    positions = gaussian.positions / domain.radius
+    positions = _from_centre(domain, gaussian.positions) / domain.radius
     scales = gaussian.scales / domain.radius
     if domain.space == "unbounded":
         return Gaussians(0.25 * contract(positions) + 0.5, 0.25 * scales * shrinkage(positions))
@@ -52,12 +54,18 @@ def to_unit_cube(domain: Domain, gaussian: Gaussians) -> Gaussians:
 
 
 def nearest_within(domain: Domain, point: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Returns the nearest point in the domain; points inside it are unchanged."""
+    """Returns the nearest point in the domain; points inside it are unchanged.
+
+    Around another centre than the origin, the latter holds up to rounding.
+    """
     if domain.space == "unbounded":
         return point
+    held = _from_centre(domain, point)
     if domain.space == "spherical":
-        return point * (domain.radius / jnp.maximum(numerics.length(point), domain.radius))
-    return jnp.clip(point, -domain.radius, domain.radius)
+        held = held * (domain.radius / jnp.maximum(numerics.length(held), domain.radius))
+    else:
+        held = jnp.clip(held, -domain.radius, domain.radius)
+    return held + jnp.asarray(domain.centre, held.dtype) if any(domain.centre) else held
 
 
 def exit_distance(
@@ -72,6 +80,7 @@ def exit_distance(
     """
     if domain.space == "unbounded":
         return jnp.full_like(origin[0], jnp.inf)
+    origin = _from_centre(domain, origin)
     if domain.space == "spherical":
         middle, half = chord(domain.radius, origin, direction)
         return jnp.where((half > 0.0) & (middle + half >= 0.0), middle + half, jnp.inf)
@@ -80,6 +89,13 @@ def exit_distance(
     second = (domain.radius - origin) * inverse
     enter, leave = jnp.max(jnp.minimum(first, second)), jnp.min(jnp.maximum(first, second))
     return jnp.where((enter <= leave) & (leave >= 0.0), leave, jnp.inf)
+
+
+def _from_centre(domain: Domain, points: Float[Array, "*shape 3"]) -> Float[Array, "*shape 3"]:
+    """Returns points relative to the centre; nothing is computed if that is the origin."""
+    if not any(domain.centre):
+        return points
+    return points - jnp.broadcast_to(jnp.asarray(domain.centre, points.dtype), points.shape)
 
 
 def chord(

@@ -76,8 +76,9 @@ class SceneConfig:
       radius: Half edge of the background cube, or radius of the background sphere (by default that
         of scene.json, else measured from depth maps, else 7.3), or radius of an unbounded scene's
         uncontracted ball, world units; with contraction=always only the latter has an effect.
-      reconstruction: Output folder of experiments.reconstruct, whose object replaces the scene's
-        meshes.
+      centre: Centre of the background, x,y,z in world units; by default that of scene.json, else
+        measured from depth maps if the radius is, else the origin.
+      reconstruction: Folder of experiments.reconstruct, whose object replaces the scene's meshes.
       pixels: Training pixels: all, or only those of the background, at a margin from the masks.
       properties: JSON file of properties of the scene, like scene.json, whose values override it.
       shading: Shading of all objects: their own (scene), smooth, or flat, with face normals, as in
@@ -93,6 +94,9 @@ class SceneConfig:
     pixels: Pixels = option("all")
     properties: str = option("")
     shading: ShadingOverride = option("scene")
+    centre: tuple[float, float, float] | None = option(
+        None, after=("scene", "properties", "background")
+    )
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -102,6 +106,8 @@ class SceneConfig:
                 f"radius is {self.radius}, but it is a length. Give a positive, finite number of "
                 "world units."
             )
+        if not all(map(math.isfinite, self.centre or ())):
+            raise ValueError(f"centre is {self.centre}. Give three finite numbers of world units.")
         for name, index in self.indices:
             if not name or not 0.0 < index < math.inf:
                 raise ValueError(
@@ -158,8 +164,7 @@ class FieldConfig:
       samples_per_ray: Numbers of samples per ray of each proposal level, then of the radiance
         field, such as 32,20.
       multisamples: Number of multisamples per interval, 1 or 6.
-      log2_hashmap_size: Hash map size of the radiance field, base-2 logarithm of the entries of a
-        level.
+      log2_hashmap_size: Hash map size of the radiance field, base-2 logarithm of a level's entries.
       max_res: Finest resolution of the radiance field's hash grid, cells per side.
       precision: Arithmetic precision of the fields.
       dilation: Dilation of a proposal before it is sampled, as a share of its mean bin width; 0 for
@@ -199,8 +204,7 @@ class FieldConfig:
         if counts is not None and not (counts and min(counts) > 0):
             raise ValueError(
                 f"samples_per_ray is {','.join(map(str, counts)) or 'empty'}, not a list of "
-                "positive numbers. "
-                "Use a list such as samples_per_ray=32,20."
+                "positive numbers. Use a list such as samples_per_ray=32,20."
             )
         if self.multisamples not in (None, *_PATTERNS):
             raise ValueError(
@@ -312,8 +316,7 @@ class ScheduleConfig:
     def over(self, steps: int) -> "ScheduleConfig":
         """Returns the same schedule stretched over another number of steps."""
         scale = steps / require(self.steps)
-        warmup = round(require(self.warmup) * scale)
-        anneal = round(require(self.anneal) * scale)
+        warmup, anneal = (round(require(x) * scale) for x in (self.warmup, self.anneal))
         return dataclasses.replace(self, steps=steps, warmup=warmup, anneal=anneal)
 
 

@@ -40,7 +40,7 @@ from typing import Any
 
 import numpy as np
 
-from refref_jax.choices import Interior, Space
+from refref_jax.choices import ORIGIN, Interior, Position, Space
 from refref_jax.fields import mlps, registry
 from refref_jax.fields.base import RadianceConfig
 from refref_jax.fields.hash_grid import HashGridConfig
@@ -77,6 +77,7 @@ class Bounds:
     far: float
     radius: float
     space: Space
+    centre: Position = ORIGIN
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +121,9 @@ class Preset:
         )
 
 
-def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
+def bounds(
+    cameras: Cameras, *, space: Space, radius: float | None, centre: Position = ORIGIN
+) -> Bounds:
     """Returns the bounds of a scene.
 
     A bounded scene extends from any camera to the farthest corner of its cube, a spherical scene to
@@ -131,6 +134,7 @@ def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
       cameras: cameras of the training images.
       space: geometry of the background: `bounded`, `spherical` or `unbounded`.
       radius: radius instead of the default of `ModelConfig.radius`.
+      centre: centre of the background, world units.
 
     Raises:
       ValueError: if the radius is not positive and finite.
@@ -139,12 +143,12 @@ def bounds(cameras: Cameras, *, space: Space, radius: float | None) -> Bounds:
         raise ValueError(
             f"radius is {radius}, but it is a length. Give a positive number of world units."
         )
-    farthest = float(np.max(np.linalg.norm(cameras.poses[:, :, 3], axis=-1)))
+    farthest = float(np.max(np.linalg.norm(cameras.poses[:, :, 3] - centre, axis=-1)))
     if space == "unbounded":
-        return Bounds(_NEAR, _FAR_UNBOUNDED, radius or 1.25 * farthest, space)
+        return Bounds(_NEAR, _FAR_UNBOUNDED, radius or 1.25 * farthest, space, centre)
     radius = radius or _WALLS
     reach = radius if space == "spherical" else math.sqrt(3.0) * radius
-    return Bounds(_NEAR, farthest + reach, radius, space)
+    return Bounds(_NEAR, farthest + reach, radius, space, centre)
 
 
 def contracted(scene: Bounds, *, radius: float | None) -> Bounds:

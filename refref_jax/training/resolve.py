@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from refref_jax.choices import Interior, RuleName
+from refref_jax.choices import ORIGIN, Interior, Position, RuleName
 from refref_jax.data import (
     background_fit,
     mesh_checks,
@@ -69,7 +69,8 @@ class SceneFacts(NamedTuple):
       rule: interface rule: that of `SceneConfig`, that of scene.json, or `nested`.
       ambient: index of refraction of the medium outside all parts.
       origins: names of the files that define properties, by their keys in scene.json.
-      source: reason for `half_extent`.
+      source: reason for `half_extent` and `centre`.
+      centre: centre of the background, in scene.json, given or measured.
     """
 
     analysis: SceneAnalysis
@@ -82,6 +83,7 @@ class SceneFacts(NamedTuple):
     ambient: float = INDEX_OF_AIR
     origins: Mapping[str, str] = MappingProxyType({})
     source: str = "scene.json"
+    centre: Position = ORIGIN
 
     def describe(self) -> str:
         """Returns the required features in one line of text."""
@@ -135,14 +137,15 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
         told = dataclasses.replace(told, rule=None, parts={}, origins=known)
     else:
         parts = meshes.read_meshes(folder, indices=dict(scene.indices), properties=told)
-    rule, space = scene.rule or told.rule or "nested", scene.space or told.space
+    rule = scene.rule or told.rule or "nested"
+    given: dict[str, Any] = {"space": scene.space, "radius": scene.radius, "centre": scene.centre}
     tree = mesh_queries.find_containment(parts)
     notes = mesh_checks.check_meshes(parts, tree, rule=rule)
-    notes += scene_analysis.overridden(told, parts, rule=rule, space=space, radius=scene.radius)
+    notes += scene_analysis.overridden(told, parts, rule=rule, **given)
     embedded = any(part.material.kind != "dielectric" for part in parts)
     if rule == "priority" or (rule == "facing" and tree.overlaps) or embedded:
         _refuse_cameras_inside(parts, cameras)
-    bounds = background_fit.find_bounds(folder, told, space=scene.space, radius=scene.radius)
+    bounds = background_fit.find_bounds(folder, told, **given)
     return SceneFacts(
         scene_analysis.analyse(parts, tree, cameras, rule=rule, space=bounds.space),
         cameras,
@@ -152,6 +155,7 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
         (*notes, *bounds.notes),
         *(rule, told.ambient_index, {key: path.name for key, path in told.origins.items()}),
         bounds.source,
+        bounds.centre,
     )
 
 
@@ -193,6 +197,7 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
         radius=model.radius,
         near=model.near,
         far=model.far,
+        centre=model.centre if any(model.centre) else None,
         min_throughput=settings.min_throughput,
         max_bends=settings.max_bends,
         reentry=settings.reentry if settings.max_bends else None,
@@ -352,7 +357,10 @@ def _resolve_bounds(
     config = _decide(config, reasons, "the scene", background=space)
     why = facts.source if facts.half_extent else "the data set's usual background"
     why = "the cameras" if space == "unbounded" else why
-    extent = presets.bounds(facts.cameras, space=space, radius=size or facts.half_extent)
+    centre = config.scene.centre or facts.centre
+    extent = presets.bounds(
+        facts.cameras, space=space, radius=size or facts.half_extent, centre=centre
+    )
     sampled, reason = extent, f"background={space}"
     if config.model.contraction == "always":
         sampled, reason = presets.contracted(extent, radius=size), "contraction=always"
@@ -365,6 +373,7 @@ def _resolve_bounds(
             "Leave it out, or use contraction=always."
         )
     config = _decide(config, reasons, why, radius=extent.radius)
+    config = _decide(config, reasons, facts.source, centre=centre if any(centre) else None)
     config = _decide(config, reasons, reason, near=sampled.near, far=sampled.far)
     near, far = require(config.model.near), require(config.model.far)
     return dataclasses.replace(sampled, near=near, far=far), config

@@ -1,6 +1,8 @@
+import dataclasses
 import json
 import shutil
 
+import jax
 import numpy as np
 import pytest
 
@@ -93,7 +95,24 @@ def test_the_walls_of_the_bundled_scene(ball_scene):
     np.testing.assert_array_equal(walls.v_axes[:2], [[0, 0, 1], [0, 0, 1]])
     expected = image_files.read_rgb(ball_scene / "background" / "face_-x.png") / 255.0
     np.testing.assert_allclose(walls.texture.texels[1], expected, rtol=1e-6)
-    assert {leaf.dtype for leaf in (walls.texture.texels, *walls[1:])} == {np.dtype(np.float32)}
+    assert {leaf.dtype for leaf in jax.tree.leaves(walls)} == {np.dtype(np.float32)}
+    assert walls.centre is None
+
+
+def test_the_centre_of_the_background(tmp_path, ball_scene):
+    told = read(ball_scene)
+    for centre, expected in (((1.0, -2.5, 0.1), [1.0, -2.5, 0.1]), ((0.0, 0.0, 0.0), None)):
+        moved = dataclasses.replace(told.background, centre=centre)
+        cube = read_background(ball_scene, properties=dataclasses.replace(told, background=moved))
+        record = {"type": "sphere", "radius": 5, "image": "sky.png", "centre": list(centre)}
+        scene = _scene(tmp_path / f"{centre[0]}", {"background": record})
+        _image(scene, "sky.png")
+        for found in (cube, read_background(scene)):
+            if expected is None:
+                assert found.centre is None
+            else:
+                np.testing.assert_array_equal(found.centre, np.float32(expected))
+                assert found.centre.dtype == np.float32
 
 
 @pytest.mark.parametrize(("image", "kind"), [("sky.png", SrgbTexture), ("sky.exr", LinearTexture)])

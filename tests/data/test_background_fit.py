@@ -9,12 +9,17 @@ import numpy as np
 import pytest
 
 from refref_jax.data import background_fit, image_files, scene_properties
-from refref_jax.data.background_fit import fit_size, fit_size_and_centre, sample_depths
+from refref_jax.data.background_fit import (
+    fit_background,
+    fit_size,
+    fit_size_and_centre,
+    sample_depths,
+)
 from refref_jax.data.scene_source import SceneWarning, expand, open_scene
 from refref_jax.geometry import cameras
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.training.config import SceneConfig, TrainConfig
-from refref_jax.training.resolve import read_facts, resolve
+from refref_jax.training.resolve import as_trained, read_facts, resolve
 from tests.factories.small_scenes import write_grey, write_scene
 from tests.laws.expectations import scene_error
 from tests.processes.command import ROOT, run_command
@@ -22,6 +27,7 @@ from tests.processes.command import ROOT, run_command
 _SIZE = 48
 _OBJECT = 1.4
 _STEP = image_files.DEPTH_STEP
+_ORIGIN = (0.0, 0.0, 0.0)
 
 
 def find_bounds(scene, **given):
@@ -128,6 +134,73 @@ def test_a_centre_is_measured(kind):
     assert abs(fit.size - 6.0) < 0.005 and 0.0 < max(fit.centre_error) < 0.005
 
 
+def _seen_around(kind, size, centre, *, moved):
+    """Returns cameras, depths and masks of a background around a centre.
+
+    The ball that hides it is at the origin; the cameras are around the origin, or the centre.
+    """
+    seen = _views(20)
+    if moved:
+        seen = seen._replace(poses=seen.poses + np.pad(np.array(centre)[:, None], ((0, 0), (3, 0))))
+    return seen, *_render(kind, size, seen, centre=centre)
+
+
+@pytest.mark.parametrize("kind", ["cube", "sphere"])
+@pytest.mark.parametrize("eight_bit", [True, False], ids=["8 bit", "float"])
+@pytest.mark.parametrize("known_masks", [True, False])
+@pytest.mark.parametrize(
+    ("centre", "moved"),
+    [((0.05, 0.0, 0.0), False), ((1.0, -2.0, 0.5), False), ((30.0, -20.0, 10.0), True)],
+)
+def test_a_background_is_where_the_depths_show_it(kind, eight_bit, known_masks, centre, moved):
+    seen, depths, masks = _seen_around(kind, 6.5, centre, moved=moved)
+    samples = sample_depths(
+        seen,
+        _quantised(depths) if eight_bit else depths,
+        masks=masks if known_masks else None,
+        step=_STEP if eight_bit else 0.0,
+    )
+    assert not eight_bit or samples.depths.max() < 11.5  # saturated values are left out
+    fit = fit_background(kind, samples)
+    tolerance = 1e-3 if eight_bit else 1e-5
+    assert abs(fit.size - 6.5) < tolerance < 0.005 * 6.5
+    np.testing.assert_allclose(fit.centre, centre, atol=tolerance)
+    assert 0.0 < max(fit.centre_error) < tolerance
+    assert re.fullmatch(r"6\.\d+ \+- \S+ around \((\S+ \+- \S+, ){2}\S+ \+- \S+\)", fit.describe())
+    # A centre that is known is not fitted.
+    known = fit_size(kind, samples, centre=centre)
+    assert known.centre == centre and not any(known.centre_error)
+    assert abs(known.size - 6.5) < tolerance
+
+
+@pytest.mark.parametrize("kind", ["cube", "sphere"])
+@pytest.mark.parametrize(("step", "jitter"), [(0.0, 0.0), (_STEP, 0.0), (_STEP, 1.0)])
+def test_a_background_around_the_origin_stays_there(kind, step, jitter):
+    seen = _views(20)
+    depths, masks = _render(kind, 7.3, seen, jitter=jitter)
+    samples = sample_depths(seen, _quantised(depths) if step else depths, masks=masks, step=step)
+    fit = fit_background(kind, samples)
+    assert fit == fit_size(kind, samples) and fit.centre == (0.0, 0.0, 0.0)
+    assert " around " not in fit.describe()
+
+
+def test_a_small_offset_that_8_bit_depth_hardly_shows_is_not_used():
+    seen, depths, masks = _seen_around("cube", 6.5, (0.01, 0.0, 0.0), moved=False)
+    stored = sample_depths(seen, _quantised(depths), masks=masks, step=_STEP)
+    assert fit_background("cube", stored).centre == (0.0, 0.0, 0.0)
+    exact = sample_depths(seen, depths, masks=masks)
+    np.testing.assert_allclose(fit_background("cube", exact).centre, (0.01, 0.0, 0.0), atol=1e-5)
+    # Within 0.1 % of the size it is never used.
+    seen, depths, masks = _seen_around("cube", 6.5, (0.006, 0.0, 0.0), moved=False)
+    exact = sample_depths(seen, depths, masks=masks)
+    assert fit_background("cube", exact).centre == (0.0, 0.0, 0.0)
+
+
+def test_a_background_that_leaves_cameras_outside_is_none():
+    seen, depths, masks = _seen_around("sphere", 6.5, (2.0, 2.0, 2.0), moved=False)
+    assert fit_background("sphere", sample_depths(seen, depths, masks=masks)) is None
+
+
 def test_saturated_and_infinite_depths_and_margins_of_masks_are_left_out():
     seen = _views(1)
     depth = np.full((1, _SIZE, _SIZE), 5.0)
@@ -169,6 +242,7 @@ def test_too_little_is_no_measurement():
         for kind in ("cube", "sphere"):
             assert fit_size(kind, sample_depths(seen, depths)) is None
             assert fit_size_and_centre(kind, sample_depths(seen, depths)) is None
+            assert fit_background(kind, sample_depths(seen, depths)) is None
 
 
 def test_the_example_of_the_page_runs_and_gives_what_it_says(capsys, monkeypatch):
@@ -237,7 +311,7 @@ def test_a_sphere_by_name_gets_its_measured_radius_in_training(tmp_path):
     # What is decided stays, and is not measured again.
     (scene / "depth/train/r_000.png").write_bytes(b"")
     bounds = find_bounds(scene, space="spherical", radius=made.config.scene.radius)
-    assert bounds == ("spherical", None, "", ())
+    assert bounds == ("spherical", None, "", (), _ORIGIN)
 
 
 def test_a_published_sphere_is_opened_with_what_its_layout_implies(tmp_path, monkeypatch):
@@ -257,13 +331,13 @@ def test_a_published_sphere_is_opened_with_what_its_layout_implies(tmp_path, mon
 def test_what_is_stated_is_not_measured(tmp_path):
     scene = _scene(tmp_path, "sphere_smcvx_ball", "sphere", 6.7)
     config = SceneConfig(path=str(scene))
-    assert find_bounds(scene, space=None, radius=5.0) == ("spherical", None, "", ())
-    assert find_bounds(scene, space="unbounded", radius=None) == ("unbounded", None, "", ())
-    space, size, _, (note,) = find_bounds(scene, space="bounded", radius=None)
-    assert (space, size) == ("bounded", None)
+    assert find_bounds(scene, space=None, radius=5.0) == ("spherical", None, "", (), _ORIGIN)
+    assert find_bounds(scene, space="unbounded", radius=None)[:3] == ("unbounded", None, "")
+    space, size, _, (note,), centre = find_bounds(scene, space="bounded", radius=None)
+    assert (space, size, centre) == ("bounded", None, _ORIGIN)
     assert note.startswith("warning: the depth maps show no cube") and "Set radius" in note
     (scene / "scene.json").write_text('{"background": {"type": "sphere", "radius": 7.0}}')
-    assert find_bounds(scene, space=None, radius=None) == ("spherical", 7.0, "scene.json", ())
+    assert find_bounds(scene, space=None, radius=None)[:3] == ("spherical", 7.0, "scene.json")
     (scene / "scene.json").write_text('{"background": {"type": "cube"}}')
     assert find_bounds(scene, space=None, radius=None).space == "bounded"
     (scene / "scene.json").write_text('{"background": {"type": "sphere"}}')
@@ -273,13 +347,53 @@ def test_what_is_stated_is_not_measured(tmp_path):
     assert read_facts(config).half_extent is None
 
 
-def test_a_background_around_another_point_is_reported(tmp_path):
+def test_a_background_around_another_point_is_measured_there_in_training(tmp_path):
     scene = _scene(tmp_path, "cube_smcvx_ball", "cube", 6.0, centre=(0.0, 0.4, 0.0))
-    bounds = find_bounds(scene, space="bounded", radius=None)
-    (note,) = bounds.notes
-    assert abs(bounds.size - 6.0) < 0.005
-    assert note.startswith("warning: the depth maps show a cube of size ")
-    assert ", 0.400 +- 0.0001, " in note and "Move the poses and the meshes." in note
+    config = TrainConfig().override(scene=str(scene), batch=64)
+    facts = read_facts(config.scene)
+    made = resolve(config, facts)
+    assert abs(made.config.scene.radius - 6.0) < 0.005
+    assert not any(note.startswith("warning") for note in facts.notes)
+    np.testing.assert_allclose(made.config.scene.centre, (0.0, 0.4, 0.0), atol=0.002)
+    assert made.model.config.centre == made.config.scene.centre == facts.centre
+    assert made.reasons["centre"] == made.reasons["radius"] == facts.source
+    assert re.search(r"[56]\.\d+ \+- \S+ around \(\S+ \+- \S+, 0\.4", facts.source)
+    # Resolving again changes nothing, and measures nothing.
+    again = resolve(made.config, read_facts(made.config.scene))
+    assert (again.config, again.model) == (made.config, made.model)
+    assert as_trained(TrainConfig(), made.model).scene.centre == made.config.scene.centre
+
+
+def test_a_centre_that_is_stated_or_given_is_used(tmp_path):
+    scene = _scene(tmp_path, "cube_smcvx_ball", "cube", 6.0, centre=(0.0, 0.4, 0.0))
+    stated = {"background": {"type": "cube", "centre": [0.0, 0.4, 0.0]}}
+    (scene / "scene.json").write_text(json.dumps(stated))
+    found = find_bounds(scene, space=None, radius=None)
+    assert found.centre == (0.0, 0.4, 0.0) and abs(found.size - 6.0) < 0.005
+    assert " around " not in found.source
+    # A size does not replace it, nor does another shape; an unbounded scene has no background.
+    expected = ("bounded", None, "scene.json", (), (0.0, 0.4, 0.0))
+    assert find_bounds(scene, space=None, radius=5.0) == expected
+    assert find_bounds(scene, space="spherical", radius=5.0).centre == (0.0, 0.4, 0.0)
+    assert find_bounds(scene, space="unbounded", radius=5.0).centre == _ORIGIN
+    given = {"space": None, "radius": 5.0, "centre": (1.0, 2.0, 3.0)}
+    assert find_bounds(scene, **given).centre == (1.0, 2.0, 3.0)
+    stated["background"]["half_extent"] = 6.0
+    (scene / "scene.json").write_text(json.dumps(stated))
+    expected = ("bounded", 6.0, "scene.json", (), (0.0, 0.4, 0.0))
+    assert find_bounds(scene, space=None, radius=None) == expected
+    config = TrainConfig().override(scene=str(scene), batch=64, radius=5.0)
+    made = resolve(config, read_facts(config.scene))
+    assert made.model.config.centre == (0.0, 0.4, 0.0) and made.model.config.radius == 5.0
+    assert made.reasons["centre"] == "scene.json" and "scene.json: centre=0.0,0.4,0.0" in (
+        made.describe()
+    )
+    config = config.override(centre=(0.0, 0.0, 0.0))
+    facts = read_facts(config.scene)
+    assert resolve(config, facts).model.config.centre == _ORIGIN
+    assert any("centre=(0.0, 0.0, 0.0) overrides scene.json" in note for note in facts.notes)
+    with pytest.raises(ValueError, match=r"centre is .* Give three finite numbers"):
+        config.override(centre=(0.0, np.inf, 0.0))
 
 
 def test_without_depth_maps_there_is_the_usual_background(tmp_path):
@@ -292,7 +406,7 @@ def test_without_depth_maps_there_is_the_usual_background(tmp_path):
     for frame in content["frames"]:
         del frame["depth_file_path"]
     path.write_text(json.dumps(content))
-    assert find_bounds(scene, space=None, radius=None) == ("bounded", None, "", ())
+    assert find_bounds(scene, space=None, radius=None) == ("bounded", None, "", (), _ORIGIN)
     config = TrainConfig().override(scene=str(scene), batch=64)
     made = resolve(config, read_facts(config.scene))
     assert made.config.scene.radius == 7.3

@@ -202,8 +202,16 @@ _WRONG = {
     ),
     "radius": (_background(type="sphere", radius=-7), "background.radius is -7. Give a positive"),
     "centre": (
-        _background(type="cube", centre=[0, 0, 1]),
-        "background.centre is [0, 0, 1]. Give [0, 0, 0]: another centre is not supported yet",
+        _background(type="cube", centre=[0, 0, "1"]),
+        "background.centre is [0, 0, '1']. Give three numbers.",
+    ),
+    "centre at infinity": (
+        _background(type="sphere", centre=[0, 0, 1e400]),
+        "background.centre is [0, 0, inf]. Give three numbers.",
+    ),
+    "centre of an environment": (
+        _background(type="env", centre=[0, 0, 0]),
+        "background.centre has no effect on a background of type env",
     ),
     "mapping": (_background(type="env", mapping="planar"), "background.mapping is 'planar'."),
     "face": (

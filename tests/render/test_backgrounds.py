@@ -226,3 +226,47 @@ def test_transformations_change_nothing(name, transformation):
 def test_a_radiance_is_a_tree_of_its_background_s_arrays(name):
     assert len(jax.tree.leaves(radiance_of(_ALL[name]))) == len(jax.tree.leaves(_ALL[name])) >= 1
     assert backgrounds.radiance_of(_ALL[name]).func.__name__.endswith("_radiance")
+
+
+# A centre that float32 adds to multiples of 1/64 without rounding.
+_CENTRE = np.array([1.0, -2.0, 0.5], np.float32)
+_MOVED = {name: _ALL[name]._replace(centre=jnp.asarray(_CENTRE)) for name in ("cube", "sphere")}
+
+
+@pytest.mark.parametrize("wall", range(6))
+def test_a_texel_of_a_moved_wall_is_where_the_mapping_says(wall):
+    u, v = 2.5 / 8, 1.0 - 5.5 / 8
+    point = _CENTRE + _HALF_EXTENT * (
+        _NORMALS[wall] + (2 * u - 1) * _U_AXES[wall] + (2 * v - 1) * _V_AXES[wall]
+    )
+    expected = colours.srgb_to_linear(np.asarray(CUBE.texture.texels)[wall, 5, 2])
+    origin = np.array([0.5, -1.0, 2.0])
+    np.testing.assert_allclose(_see(_MOVED["cube"], origin, point - origin), expected, atol=1e-5)
+
+
+def test_the_image_of_a_moved_sphere_is_indexed_from_its_centre():
+    row, column = 2, 5
+    azimuth, elevation = np.pi * (1.0 - 2.0 * (column + 0.5) / 16), np.pi * (0.5 - (row + 0.5) / 8)
+    flat = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    towards = np.cos(elevation) * flat + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
+    point, origin = _CENTRE + _HALF_EXTENT * towards, np.array([0.5, -1.0, 2.0])
+    expected = np.asarray(SPHERE.texture.texels)[row, column]
+    np.testing.assert_allclose(_see(_MOVED["sphere"], origin, point - origin), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", _MOVED)
+def test_a_background_and_rays_that_are_moved_together_give_the_same_light(name):
+    origins, directions = _random_rays(200)
+    origins = np.round(64.0 * origins) / 64.0
+    expected = _see_all(_ALL[name], origins, directions)
+    np.testing.assert_array_equal(_see_all(_MOVED[name], origins + _CENTRE, directions), expected)
+    assert not np.array_equal(_see_all(_MOVED[name], origins, directions), expected)
+
+
+@pytest.mark.parametrize("name", _MOVED)
+def test_a_background_around_the_origin_computes_no_offset(name):
+    ray = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0])
+    operations = [
+        len(jax.make_jaxpr(radiance_of(each))(*ray).eqns) for each in (_ALL[name], _MOVED[name])
+    ]
+    assert operations[1] == operations[0] + 1

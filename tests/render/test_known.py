@@ -10,7 +10,12 @@ from refref_jax.data.mesh_queries import parts_around
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE
 from refref_jax.render import background_rendering, radiance_of, render_known
-from refref_jax.render.backgrounds import Environment, LinearTexture
+from refref_jax.render.backgrounds import (
+    CubeBackground,
+    Environment,
+    LinearTexture,
+    SphereBackground,
+)
 from tests.factories import scenes
 
 _BALL = scenes.ball(1.3, subdivisions=2)
@@ -120,3 +125,33 @@ def test_a_camera_inside_a_body_is_told_by_the_rule_of_priorities():
     )
     np.testing.assert_allclose(seen.linear, 1.0 + np.eye(3), atol=0.05)
     assert seen.casts == 6
+
+
+@pytest.mark.parametrize("kind", ["cube", "sphere"])
+def test_a_scene_that_is_moved_as_a_whole_gives_the_same_image(rays, kind):
+    texels = np.random.default_rng(1).uniform(size=(6, 4, 4, 3)).astype(np.float32)
+    axes = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
+    texture = LinearTexture(jnp.asarray(texels if kind == "cube" else texels[0]))
+    if kind == "cube":
+        # The walls' axes need not be right-handed.
+        turned = (axes, np.roll(axes, 1, axis=1), np.roll(axes, 2, axis=1))
+        background = CubeBackground(texture, *map(jnp.asarray, turned), jnp.float32(7.0))
+    else:
+        background = SphereBackground(texture, jnp.float32(7.0))
+    centre = np.array([2.0, -1.0, 0.5], np.float32)
+    images = []
+    for shift in (np.zeros(3, np.float32), centre):
+        part = _BALL._replace(vertices=_BALL.vertices + shift)
+        seen = render_known(
+            scenes.build(part),
+            radiance_of(background._replace(centre=jnp.asarray(shift))),
+            rays._replace(origins=rays.origins + shift),
+            settings=PAPER,
+            tile=256,
+        )
+        images.append(seen.linear)
+    np.testing.assert_allclose(images[1], images[0], atol=1e-5)
+    still = render_known(
+        scenes.build(_BALL), radiance_of(background), rays, settings=PAPER, tile=256
+    )
+    np.testing.assert_allclose(images[0], still.linear, atol=1e-6)

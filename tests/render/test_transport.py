@@ -416,3 +416,51 @@ def test_rotation_moves_no_interval():
     still, moved = _render(_FIELD, paths), _render(_FIELD, paths, turned)
     np.testing.assert_array_equal(still.histograms[0].edges, moved.histograms[0].edges)
     assert not np.array_equal(still.histograms[0].weights, moved.histograms[0].weights)
+
+
+# --- scenes around another centre ---
+
+
+@pytest.mark.parametrize("space", ["bounded", "spherical", "unbounded"])
+def test_a_model_that_is_moved_with_its_paths_gives_the_same(space):
+    centre = np.array([4.0, -2.0, 8.0], np.float32)
+    usual = dataclasses.replace(_FIELD, space=space)
+    moved = dataclasses.replace(usual, centre=tuple(centre.tolist()))
+    paths = _some_paths()
+    away = paths._replace(points=paths.points + np.broadcast_to(centre, paths.points.shape))
+    for old, new in zip(
+        jax.tree.leaves(_render(usual, paths)), jax.tree.leaves(_render(moved, away)), strict=True
+    ):
+        # Points near 8 are rounded to 1e-6, and the finest cells of the grids are 1 wide.
+        np.testing.assert_allclose(new, old, rtol=1e-4, atol=1e-4)
+    assert not np.allclose(_render(moved, paths).rgb, _render(usual, paths).rgb, atol=1e-2)
+
+
+@pytest.mark.parametrize("space", ["bounded", "spherical", "unbounded"])
+def test_samples_gradients_and_lookups_of_a_moved_model_are_the_same(space):
+    centre = np.array([4.0, -2.0, 8.0], np.float32)
+    usual = dataclasses.replace(_FIELD, space=space)
+    moved = dataclasses.replace(usual, centre=tuple(centre.tolist()))
+    results = []
+    for config, shift in ((usual, np.zeros(3, np.float32)), (moved, centre)):
+        line = polylines.whole_path(jax.tree.map(jnp.asarray, _bent()))
+        line = line._replace(points=line.points + np.broadcast_to(shift, line.points.shape))
+        warp = volume_rendering.distance_warp(config, line)
+        jitter = Jitter(jnp.float32(0.0), jnp.float32(0.0))
+        found = volume_rendering.sample(
+            config, line, warp, [], 8, jitter=jitter, anneal=jnp.float32(1.0)
+        )
+
+        def density(params, config=config, shift=shift):
+            point, towards = jnp.array([1.0, 2.0, -3.0]) + shift, jnp.array([0.0, 0.0, 1.0])
+            return volume_rendering.look_up(params, config, point, towards, width=0.1).density
+
+        gradient = jax.grad(density)(_params(usual))
+        results.append((found.gaussians, found.t, gradient.field, density(_params(usual))))
+    for old, new in zip(*map(jax.tree.leaves, results), strict=True):
+        np.testing.assert_allclose(new, old, rtol=1e-4, atol=1e-5)
+
+
+def test_a_centre_is_finite():
+    with pytest.raises(ValueError, match=r"centre is .*inf.* Give three finite numbers"):
+        dataclasses.replace(MODEL, centre=(0.0, float("inf"), 0.0))

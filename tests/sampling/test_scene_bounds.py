@@ -353,3 +353,57 @@ def test_check_grads_of_warps():
 @pytest.mark.parametrize("function", [scene_bounds.to_distance, scene_bounds.to_unit])
 def test_transformations_change_nothing_of_warps(function, transformation):
     transformation(functools.partial(function, _WARPS[0]), (jnp.array([0.1, 0.5, 0.9]),))
+
+
+# --- around another centre ---
+
+
+_CENTRE = (16.0, -8.0, 4.0)
+_SPACES = ("bounded", "spherical", "unbounded")
+
+
+def test_the_unit_cube_is_around_the_centre():
+    domain = Domain(2.0, "bounded", _CENTRE)
+    points = jnp.array([[16.0, -8.0, 4.0], [18.0, -10.0, 5.0], [99.0, -8.0, -99.0]])
+    found = scene_bounds.to_unit_cube(domain, Gaussians(points, jnp.full(3, 0.4)))
+    np.testing.assert_array_equal(found.positions, [[0.5] * 3, [1.0, 0.0, 0.75], [1.0, 0.5, 0.0]])
+    np.testing.assert_allclose(found.scales, 0.1, rtol=1e-6)
+
+
+@pytest.mark.parametrize("space", _SPACES)
+def test_what_is_moved_as_a_whole_is_the_same(space):
+    usual, moved = Domain(2.0, space), Domain(2.0, space, _CENTRE)
+    rng = np.random.default_rng(0)
+    # Multiples of 1/64, which are moved without rounding.
+    points = jnp.asarray(np.round(64 * rng.uniform(-4.0, 4.0, (50, 3))) / 64, jnp.float32)
+    directions = rng.normal(size=(50, 3))
+    directions = jnp.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    centre = jnp.broadcast_to(jnp.array(_CENTRE), points.shape)
+    for old, new in zip(
+        scene_bounds.to_unit_cube(usual, Gaussians(points, jnp.ones(50))),
+        scene_bounds.to_unit_cube(moved, Gaussians(points + centre, jnp.ones(50))),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(old, new)
+    leave = jax.vmap(scene_bounds.exit_distance, in_axes=(None, 0, 0))
+    np.testing.assert_array_equal(
+        leave(usual, points, directions), leave(moved, points + centre, directions)
+    )
+    nearest = jax.vmap(scene_bounds.nearest_within, in_axes=(None, 0))
+    np.testing.assert_allclose(
+        nearest(moved, points + centre), nearest(usual, points) + centre, rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("space", _SPACES)
+def test_the_origin_as_centre_costs_no_operation(space):
+    def count(domain):
+        def all_of(point, direction):
+            cell = scene_bounds.to_unit_cube(domain, Gaussians(point[None], jnp.ones(1)))
+            held = scene_bounds.nearest_within(domain, point)
+            return cell, held, scene_bounds.exit_distance(domain, point, direction)
+
+        return len(jax.make_jaxpr(all_of)(jnp.ones(3), jnp.ones(3)).eqns)
+
+    assert count(Domain(2.0, space, (0.0, -0.0, 0.0))) == count(Domain(2.0, space))
+    assert count(Domain(2.0, space, (0.0, 0.0, 1e-3))) > count(Domain(2.0, space))

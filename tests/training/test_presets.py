@@ -43,3 +43,16 @@ def test_bounds_reach_the_far_wall():
     sphere = bounds(cameras, space="spherical", radius=2.0)
     assert (cube.radius, sphere.radius, sphere.space) == (2.0, 2.0, "spherical")
     assert cube.far == pytest.approx(4.0 + 2.0 * 3.0**0.5) and sphere.far == pytest.approx(6.0)
+
+
+def test_bounds_move_with_the_cameras():
+    around = [
+        orbit(4, distance=4.0, elevation=0.3, size=8, angle_x=1.0, centre=centre)
+        for centre in ((0.0, 0.0, 0.0), (5.0, -3.0, 2.0))
+    ]
+    for space in ("bounded", "spherical", "unbounded"):
+        usual = bounds(around[0], space=space, radius=None)
+        moved = bounds(around[1], space=space, radius=None, centre=(5.0, -3.0, 2.0))
+        assert (moved.far, moved.radius) == pytest.approx((usual.far, usual.radius))
+        assert (usual.centre, moved.centre) == ((0.0, 0.0, 0.0), (5.0, -3.0, 2.0))
+        assert PRESETS["tiny"].model(moved, "clear").centre == moved.centre

@@ -114,6 +114,10 @@ def test_a_background_of_another_size_than_rendered_is_found(copy):
     (finding,) = checks.check_background(copy)
     assert finding.severity == "error"
     assert "a background cube of size " in finding.message and "states 7.4" in finding.message
+    stated["background"] |= {"half_extent": 7.3, "centre": [0.0, 0.2, 0.0]}
+    path.write_text(json.dumps(stated))
+    (finding,) = checks.check_background(copy)
+    assert " around (" in finding.message and "states 7.3 around (0, 0.2, 0)" in finding.message
     (copy / "depth/train/r_000.png").write_bytes(b"")
     (finding,) = checks.check_background(copy)
     assert "r_000.png" in finding.message

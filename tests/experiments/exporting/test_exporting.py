@@ -216,3 +216,12 @@ def test_the_command_writes_the_walls_of_a_run(trained, tmp_path):
         assert outermost.min() > 7.2 and outermost.max() < 7.3 + 1e-4
         colours = read.visual.vertex_colors if what == "mesh" else read.colors
         assert len(np.unique(colours, axis=0)) > 10
+
+
+def test_a_spherical_model_around_another_centre_ends_on_its_sphere():
+    centre = np.array([3.0, -1.0, 0.5])
+    empty = Grid(np.zeros((17, 17, 17)), centre - 2.0, 0.25)
+    room = field_mesh.with_sphere(empty, level=5.0, radius=1.7, centre=(3.0, -1.0, 0.5))
+    found = field_mesh.find_surface(room, level=5.0)
+    distances = np.linalg.norm(found.vertices - centre, axis=-1)
+    np.testing.assert_allclose(distances, 1.7, atol=0.025)

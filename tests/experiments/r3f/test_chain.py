@@ -410,16 +410,16 @@ def test_an_estimate_that_is_no_number_is_no_result(scene, tmp_path, monkeypatch
 def test_the_background_of_an_overlay_is_used_and_other_ambient_media_are_refused(tmp_path):
     (tmp_path / "cube_ball").mkdir()
     overlay = tmp_path / "mine.json"
-    overlay.write_text('{"background": {"type": "sphere", "radius": 5}}')
+    overlay.write_text('{"background": {"type": "sphere", "radius": 5, "centre": [1, 2, 3]}}')
 
     def bounds(path, space=None, radius=None):
         return chain.bounds_of(tmp_path / "cube_ball", path, space=space, radius=radius)
 
-    assert bounds(str(overlay)) == ("spherical", 5.0)
-    assert bounds(str(overlay), radius=6.0) == ("spherical", 6.0)
-    assert bounds("") == (None, None)
+    assert bounds(str(overlay)) == ("spherical", 5.0, (1.0, 2.0, 3.0))
+    assert bounds(str(overlay), radius=6.0) == ("spherical", 6.0, (1.0, 2.0, 3.0))
+    assert bounds("") == (None, None, None)
     (tmp_path / "cube_ball" / "scene.json").write_text('{"ambient_index": 1.333}')
     with pytest.raises(ValueError, match=r"scene\.json: ambient_index is 1\.333, but reconstruct"):
         bounds("")
     overlay.write_text('{"ambient_index": 1}')
-    assert bounds(str(overlay)) == (None, None)
+    assert bounds(str(overlay)) == (None, None, None)

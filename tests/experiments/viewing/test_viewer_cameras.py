@@ -81,3 +81,14 @@ def test_only_what_a_hand_moves_is_a_change():
     assert not cameras.is_same(view, view._replace(pose=view.pose + 0.01))
     assert not cameras.is_same(view, view._replace(fov=0.9))
     assert not cameras.is_same(view, view._replace(aspect=1.6))
+
+
+def test_the_nearest_view_does_not_depend_on_where_the_scene_is():
+    away = np.array([100.0, 0.0, 0.0])
+    moved = _ORBIT._replace(poses=_ORBIT.poses + np.pad(away[:, None], ((0, 0), (3, 0))))
+    for pose in _ORBIT.poses:
+        near = pose.copy()
+        near[:, 3] += [0.5, -0.3, 0.2]
+        expected = cameras.nearest(near, _ORBIT)
+        near[:, 3] += away
+        assert cameras.nearest(near, moved, centre=(100.0, 0.0, 0.0)) == expected
