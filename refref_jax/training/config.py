@@ -95,7 +95,7 @@ class SceneConfig:
     properties: str = option("")
     shading: ShadingOverride = option("scene")
     centre: tuple[float, float, float] | None = option(
-        None, after=("scene", "properties", "background")
+        None, after=("scene", "properties", "background"), comparison="none"
     )
 
     def __post_init__(self) -> None:

@@ -110,7 +110,7 @@ class Resolved(NamedTuple):
         by_reason: dict[str, list[str]] = {}
         for option in options_of():
             value = self.config.get(option.name)
-            if value not in (None, (), ""):
+            if value not in (None, (), "", ORIGIN):
                 text = f"{option.name}={_shown(value)}"
                 by_reason.setdefault(self.reasons[option.name], []).append(text)
         texts = [f"{reason}: {', '.join(values)}" for reason, values in by_reason.items()]
@@ -197,7 +197,7 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
         radius=model.radius,
         near=model.near,
         far=model.far,
-        centre=model.centre if any(model.centre) else None,
+        centre=model.centre,
         min_throughput=settings.min_throughput,
         max_bends=settings.max_bends,
         reentry=settings.reentry if settings.max_bends else None,
@@ -373,7 +373,7 @@ def _resolve_bounds(
             "Leave it out, or use contraction=always."
         )
     config = _decide(config, reasons, why, radius=extent.radius)
-    config = _decide(config, reasons, facts.source, centre=centre if any(centre) else None)
+    config = _decide(config, reasons, facts.source, centre=centre)
     config = _decide(config, reasons, reason, near=sampled.near, far=sampled.far)
     near, far = require(config.model.near), require(config.model.far)
     return dataclasses.replace(sampled, near=near, far=far), config
