@@ -12,12 +12,13 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from refref_jax.choices import CLEAR, NO_ABSORPTION, Colour, Material, RuleName
+from refref_jax.choices import CLEAR, NO_ABSORPTION, ORIGIN, Colour, Material, RuleName
 from refref_jax.data import SceneError, image_files, mesh_checks, meshes, scene_properties
 from refref_jax.data.mesh_checks import refuse_errors
 from refref_jax.data.mesh_queries import find_containment
@@ -330,10 +331,10 @@ def _extent(found: SceneProperties, key: str, path: Path) -> float:
     return found.background.extent
 
 
-def _centre(found: SceneProperties) -> Float[np.ndarray, "3"] | None:
-    """Returns the centre of the background, or `None` for the origin."""
-    centre = found.background.centre
-    return host_array(np.float32(centre)) if centre is not None and any(centre) else None
+def _centre(found: SceneProperties) -> Any:
+    """Returns the centre of the background (see `host_array`), or `None` for the origin."""
+    centre = found.background.centre or ORIGIN
+    return host_array(np.asarray(centre, np.float32)) if any(centre) else None
 
 
 def _read_texture(image: str | None, described: Path) -> Texture:

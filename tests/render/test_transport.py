@@ -433,7 +433,9 @@ def test_a_model_that_is_moved_with_its_paths_gives_the_same(space):
     ):
         # Points near 8 are rounded to 1e-6, and the finest cells of the grids are 1 wide.
         np.testing.assert_allclose(new, old, rtol=1e-4, atol=1e-4)
-    assert not np.allclose(_render(moved, paths).rgb, _render(usual, paths).rgb, atol=1e-2)
+    assert not np.allclose(
+        _render(moved, paths).composite.rgb, _render(usual, paths).composite.rgb, atol=1e-2
+    )
 
 
 @pytest.mark.parametrize("space", ["bounded", "spherical", "unbounded"])
