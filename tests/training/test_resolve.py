@@ -92,8 +92,7 @@ def test_resolve_leaves_nothing_open_and_is_idempotent(found, given):
     made = _resolve(found, **given)
     straight = made.model.settings.max_bends == 0
     for option in options_of():
-        # No centre means the origin, so that runs of earlier versions have the same configuration.
-        left = option.name == "centre" or (straight and option.name == "reentry")
+        left = straight and option.name == "reentry"
         assert left == (made.config.get(option.name) is None), option.name
         assert made.reasons[option.name]
     again = resolve(made.config, SceneFacts(found, CAMERAS, (), None, None, ()))
