@@ -208,9 +208,13 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
 
 
 def build_scene(resolved: Resolved, facts: SceneFacts) -> Scene:
-    """Builds the scene for tracing; its parts only have colours if `tints` is `given`."""
+    """Builds the scene for tracing; its parts only have colours if `tints` is `given`.
+
+    The field learns the colour of opaque parts, even if their radiance is known.
+    """
     given = resolved.config.model.tints == "given"
     parts = facts.parts if given else meshes.without_colour(facts.parts)
+    parts = [part._replace(radiance=None) for part in parts]
     parts = meshes.with_shading(parts, resolved.config.scene.shading)
     rule, (parents, overlaps) = resolved.config.scene.rule or facts.rule, facts.tree
     return assemble_scene(parts, parents, rule=rule, overlaps=overlaps, ambient=facts.ambient)

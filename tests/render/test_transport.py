@@ -10,6 +10,7 @@ import pytest
 
 from refref_jax.fields import registry
 from refref_jax.fields.base import Radiance
+from refref_jax.optics.light_paths import Stop
 from refref_jax.render import pixels, volume_rendering
 from refref_jax.render.model import Params, init_params
 from refref_jax.render.volume_rendering import Jitter
@@ -120,6 +121,17 @@ def test_a_path_that_is_turned_around_again_and_again_still_reaches_the_walls():
     assert float(warp.far) == 27.5 > MODEL.far
     end = _walk(path, float(warp.far), interior="field")[0]
     np.testing.assert_allclose(end, [0.0, 0.0, -MODEL.radius], atol=_DISTANCE)
+
+
+@pytest.mark.parametrize("interior", _MODELS)
+def test_a_path_ends_on_an_opaque_surface_inside_the_glass(interior):
+    made = made_paths.path([2.0], [(0, 0, -1), (0, 0.6, -0.8)], [0, 1], origin=(0, 0, 3))
+    stopped = made._replace(stop=Stop(jnp.float32(2.75), None))
+    warp = _warp(_MODELS[interior], stopped)
+    end = _walk(made, float(warp.far), interior=interior)[0]
+    np.testing.assert_allclose(end, [0.0, 0.45, 0.4], atol=_DISTANCE)
+    free = _warp(_MODELS[interior], made._replace(stop=Stop(jnp.float32(jnp.inf), None)))
+    assert float(free.far) == float(_warp(_MODELS[interior], made).far) > float(warp.far)
 
 
 def test_samples_reach_from_the_near_to_the_far_plane():
