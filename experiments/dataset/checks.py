@@ -275,4 +275,8 @@ def _normal_degrees(
     if not path.is_file() or not inner.any():
         return np.nan
     cosine = np.sum(image_files.read_exr(path) * first.normals, axis=-1)[inner]
+    kinds = scene.objects.interfaces.kinds
+    if kinds.size:  # an open surface has no outside: either of its two normals is right
+        open_ones = np.isin(first.parts, np.flatnonzero(np.asarray(kinds)))[inner]
+        cosine = np.where(open_ones, np.abs(cosine), cosine)
     return float(np.degrees(np.mean(np.arccos(np.clip(cosine, -1.0, 1.0)))))
