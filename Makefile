@@ -2,7 +2,7 @@
 # and the commands, `make test-dataset` the generator of scenes.
 # Both create .venv first, and may be repeated. `make dataset-env` installs Blender, which
 # `python -m experiments.dataset.make` renders with, beside it. `make benchmark-small` needs both: it
-# renders six scenes and compares three methods on them; docs/benchmark.md says how long that takes.
+# renders eight scenes and compares three methods on them; docs/benchmark.md says how long that takes.
 # `make notebooks` executes those of experiments/colab and stores them with what they print and draw.
 
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
@@ -14,10 +14,12 @@ BLENDER_VENV := .venv-dataset
 BLENDER_READY := $(BLENDER_VENV)/.ready
 RUN := $(VENV)/bin/python -m
 
-# Two scenes of each category and each background: 50 training views of 100 x 100 and 8 test views.
+# Two scenes of each category and each background, and two with opaque contents: 50 training views
+# of 100 x 100 and 8 test views.
 SMALL := runs/benchmark-small
 SMALL_SCENES := cube_smcvx_cylinder,env_smcvx_pyramid,cube_smncvx_torus,sphere_smncvx_teapot
 SMALL_SCENES := $(SMALL_SCENES),sphere_mmncvx_conical_flask,env_mmncvx_perfume_red
+SMALL_SCENES := $(SMALL_SCENES),cube_mmncvx_flower_vase,sphere_smncvx_light_bulb
 
 # One process more than there are cores, at most 5: some tests wait for the commands that they start.
 PROCESSES = $(shell $(PYTHON) -c 'import os; print(min(5, 1 + (os.cpu_count() or 1)))')
