@@ -185,6 +185,8 @@ def render_view(scene: KnownScene, view: int, *, settings: PathSettings, side: i
       side: number of rays along each edge of a pixel.
     """
     rays = cameras.image_rays(cameras.supersample(scene.frames.cameras, side), view)
+    if scene.objects.interfaces.alpha.size:
+        rays = rays._replace(strata=cameras.strata(scene.frames.cameras, side))
     start = time.monotonic()
     seen = _render(scene, view, rays, settings)
     seconds = time.monotonic() - start

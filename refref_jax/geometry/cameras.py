@@ -114,6 +114,18 @@ def supersample(cameras: Cameras, side: int) -> Cameras:
     )
 
 
+def strata(cameras: Cameras, side: int) -> Int[np.ndarray, "height width 2"]:
+    """Returns the pixel and the subpixel of every ray of a supersampled camera; see `Rays.strata`.
+
+    Args:
+      cameras: the cameras before `supersample`.
+      side: number of subpixels along each edge of a pixel.
+    """
+    row, column = np.indices((side * cameras.height, side * cameras.width), np.int32)
+    pixel = (row // side) * cameras.width + column // side
+    return np.stack([pixel, (row % side) * side + column % side], axis=-1)
+
+
 def box_filter(
     pixels: Float[np.ndarray, "height width *channels"], side: int
 ) -> Float[np.ndarray, "h w *channels"]:

@@ -7,7 +7,7 @@ axis.
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 
 class Rays(NamedTuple):
@@ -18,11 +18,14 @@ class Rays(NamedTuple):
       directions: unit vectors.
       radii: footprint of the pixel, as the cone radius at unit distance (world units per world
         unit).
+      strata: index of the pixel, and of the ray among those of the pixel, so that its rays meet
+        different facets of a rough surface (`cameras.strata`); `None` for rays without relation.
     """
 
     origins: Float[Array, "*rays 3"]
     directions: Float[Array, "*rays 3"]
     radii: Float[Array, "*rays"]
+    strata: Int[Array, "*rays 2"] | None = None
 
 
 def orthonormal_basis(

@@ -7,7 +7,9 @@ over the rays of a pixel converges to the integral over all facets; light that s
 scatter in turn is lost, as in Cycles' distribution `GGX`.
 
 Random numbers are a hash of the ray's hit point and direction. So a ray always meets the same
-facet, two rays of a pixel meet different ones, and tracing needs no random key.
+facet, two rays of a pixel meet different ones, and tracing needs no random key. Where it is known
+which rays belong to a pixel, they share the numbers evenly at their first three bends: a Kronecker
+sequence in six dimensions, shifted for each pixel, whose noise is lower.
 
 Symbols: `n` unit normal of the surface on the incident side, `m` unit normal of the facet, `d` unit
 direction of the ray, `alpha` width of the distribution.
@@ -16,9 +18,12 @@ Sources: Walter et al., Microfacet Models for Refraction through Rough Surfaces 
 Sampling the GGX Distribution of Visible Normals (2018).
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, UInt
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt
 
 from refref_jax import numerics
 from refref_jax.geometry.rays import orthonormal_basis
@@ -26,23 +31,46 @@ from refref_jax.geometry.rays import orthonormal_basis
 # Constants of the 32-bit hash lowbias32 (Wellons, Prospecting for Hash Functions, 2018).
 _FIRST, _SECOND = 0x7FEB352D, 0x846CA68B
 
+# Steps of the sequences that a pixel's rays follow at their first bends: powers of the root of
+# x^7 = x + 1 (Roberts, The Unreasonable Effectiveness of Quasirandom Sequences, 2018).
+_EARLY_BENDS = 3
+_STEPS = 1.1127756842787055 ** -np.arange(1.0, 1.0 + 2 * _EARLY_BENDS).reshape(_EARLY_BENDS, 2)
+
 # Offset between the hashes of two numbers: the golden ratio times 2^32.
 _NEXT = 0x9E3779B9
 
 
+class Stratum(NamedTuple):
+    """The place of a ray among those of its pixel.
+
+    Attributes:
+      pixel: index of the pixel.
+      ray: index of the ray in the pixel.
+      num_bends: number of bends of the ray so far.
+    """
+
+    pixel: Int[Array, ""]
+    ray: Int[Array, ""]
+    num_bends: Int[Array, ""]
+
+
+Pair = tuple[Float[Array, ""], Float[Array, ""]]
+"""Two numbers in `[0, 1)`."""
+
+
 def facet_normal(
-    position: Float[Array, "3"],
     direction: Float[Array, "3"],
     normal: Float[Array, "3"],
     alpha: Float[Array, ""],
+    numbers: Pair,
 ) -> Float[Array, "3"]:
     """Returns the unit normal of the facet that a ray meets; the surface's if `alpha` is 0.
 
     Args:
-      position: hit point of the ray, which selects the facet.
       direction: unit direction of the ray.
       normal: unit normal of the surface on the incident side.
       alpha: width of the distribution, >= 0.
+      numbers: uniform numbers that select the facet.
 
     Source: Heitz (2018), listing 1.
     """
@@ -52,8 +80,7 @@ def facet_normal(
     # The ray as seen by a hemisphere that is stretched to alpha = 1.
     stretched = numerics.normalize(towards * jnp.stack([alpha, alpha, jnp.ones_like(alpha)]))
     across, along = _disc_axes(stretched)
-    radius, angle = _uniform_pair(position, direction)
-    radius, angle = numerics.safe_sqrt(radius), 2.0 * jnp.pi * angle
+    radius, angle = numerics.safe_sqrt(numbers[0]), 2.0 * jnp.pi * numbers[1]
     u, v = radius * jnp.cos(angle), radius * jnp.sin(angle)
     half = 0.5 * (1.0 + stretched[2])
     v = (1.0 - half) * numerics.safe_sqrt(1.0 - jnp.square(u)) + half * v
@@ -103,15 +130,35 @@ def _disc_axes(stretched: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[A
     return across, jnp.cross(stretched, across)
 
 
-def _uniform_pair(
-    position: Float[Array, "3"], direction: Float[Array, "3"]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Returns two uniform numbers in `[0, 1)` that a ray's hit determines; they are constants."""
+def uniform_pair(
+    position: Float[Array, "3"], direction: Float[Array, "3"], stratum: Stratum | None = None
+) -> Pair:
+    """Returns two uniform numbers that the hit of a ray determines; they are constants.
+
+    Args:
+      position: hit point of the ray.
+      direction: unit direction of the ray.
+      stratum: place of the ray among those of its pixel, if it is known.
+    """
     words = jax.lax.stop_gradient(jnp.concatenate([position, direction])).astype(jnp.float32)
+    alone = _pair(jax.lax.bitcast_convert_type(words, jnp.uint32), position)
+    if stratum is None:
+        return alone
+    shift = _pair(jnp.stack([stratum.pixel, stratum.num_bends]).astype(jnp.uint32), position)
+    steps = jnp.asarray(_STEPS, position.dtype)
+    step = steps[jnp.minimum(stratum.num_bends, _EARLY_BENDS - 1)]
+    ray, early = stratum.ray.astype(position.dtype), stratum.num_bends < _EARLY_BENDS
+    even = (jnp.mod(shift[i] + ray * step[i], 1.0) for i in range(2))
+    first, second = (jnp.where(early, a, b) for a, b in zip(even, alone, strict=True))
+    return first, second
+
+
+def _pair(words: UInt[Array, " words"], like: Float[Array, "3"]) -> Pair:
+    """Returns two uniform numbers as a hash of words."""
     state = jnp.uint32(0)
-    for word in jax.lax.bitcast_convert_type(words, jnp.uint32):
+    for word in words:
         state = _mixed(state ^ word)
-    return _unit(state, position), _unit(_mixed(state + jnp.uint32(_NEXT)), position)
+    return _unit(state, like), _unit(_mixed(state + jnp.uint32(_NEXT)), like)
 
 
 def _mixed(state: UInt[Array, ""]) -> UInt[Array, ""]:

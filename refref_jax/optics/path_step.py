@@ -22,6 +22,7 @@ from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import SurfacePoint
 from refref_jax.optics import fresnel, media, microfacet, ray_differentials, snell
 from refref_jax.optics.light_paths import PathStatus, Stop
+from refref_jax.optics.microfacet import Stratum
 from refref_jax.optics.path_settings import PathSettings
 from refref_jax.optics.ray_differentials import Bend, RayDifferential
 from refref_jax.optics.scene import Scene
@@ -61,6 +62,8 @@ def interact(
     interfaces: media.Interfaces,
     interior_list: Int[Array, " slots"],
     direction: Float[Array, "3"],
+    *,
+    stratum: Stratum | None = None,
 ) -> Interaction:
     """Reflects and refracts a ray at an interface.
 
@@ -72,6 +75,7 @@ def interact(
       interfaces: interfaces of the scene.
       interior_list: interior list of the ray (see `media`).
       direction: unit direction of the incident ray.
+      stratum: place of the ray among those of its pixel, if it is known.
     """
     entering = numerics.dot(direction, point.geometric_normal) < 0.0
     sides = media.crossing(interfaces, interior_list, point.part, entering)
@@ -82,7 +86,8 @@ def interact(
     alpha = interfaces.alpha[point.part] if interfaces.alpha.shape[0] else None
     facet = normal
     if alpha is not None:
-        facet = microfacet.facet_normal(point.position, direction, normal, alpha)
+        numbers = microfacet.uniform_pair(point.position, direction, stratum)
+        facet = microfacet.facet_normal(direction, normal, alpha, numbers)
     near, far = sides.index_near, sides.index_far
     beta = -numerics.dot(direction, facet)
     # Directions are renormalised, or rounding errors would accumulate over bends.
@@ -222,6 +227,7 @@ class RayState(NamedTuple):
       exclude_primitive: triangle that the segment starts on, which it cannot hit.
       interior_list: interior list, the parts that the ray is in (see `media`).
       differential: ray differential of the current segment (see `ray_differentials`).
+      strata: pixel and number of the ray, see `Rays`.
     """
 
     origin: Float[Array, "*rays 3"]
@@ -233,6 +239,7 @@ class RayState(NamedTuple):
     exclude_primitive: Int[Array, "*rays"]
     interior_list: Int[Array, "*rays slots"]
     differential: RayDifferential
+    strata: Int[Array, "*rays 2"] | None = None
 
 
 class Arrival(NamedTuple):
@@ -274,6 +281,7 @@ def begin(
         exclude_primitive=jnp.full((), NO_PRIMITIVE, jnp.int32),
         interior_list=interior_list,
         differential=differential,
+        strata=ray.strata,
     )
 
 
@@ -283,7 +291,9 @@ def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arriv
     The hit point is recomputed from the corners of the triangle, so it has gradients and the
     precision of the corners rather than that of the BVH traversal.
     """
-    interfaces = scene.interfaces
+    interfaces, stratum = scene.interfaces, None
+    if state.strata is not None:
+        stratum = Stratum(*state.strata, state.num_bends)
     if media.has_dispersion(interfaces):  # the ray carries light of one channel
         interfaces = media.of_channel(interfaces, jnp.argmax(state.throughput))
 
@@ -297,7 +307,7 @@ def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arriv
         point = surfaces.surface_point(scene.surfaces, primitive_id, barycentric)
         # Otherwise XLA would gather the triangle again for every result that depends on it.
         point = jax.lax.optimization_barrier(point)
-        met = interact(point, interfaces, state.interior_list, direction)
+        met = interact(point, interfaces, state.interior_list, direction, stratum=stratum)
         return Bend(met.position, met.reflected, met.transmitted), met
 
     met, reflected, transmitted = ray_differentials.bend(

@@ -13,8 +13,14 @@ _UP = jnp.array([0.0, 0.0, 1.0])
 def _facets(direction, alpha, count=40_000, seed=0, normal=_UP):
     """Returns the facets that parallel rays meet at many points."""
     points = np.random.default_rng(seed).normal(size=(count, 3)).astype(np.float32)
-    facet = jax.jit(jax.vmap(microfacet.facet_normal, in_axes=(0, None, None, None)))
-    return np.asarray(facet(points, direction, normal, jnp.float32(alpha)), np.float64)
+
+    @jax.jit
+    @jax.vmap
+    def facet(point):
+        numbers = microfacet.uniform_pair(point, direction)
+        return microfacet.facet_normal(direction, normal, jnp.float32(alpha), numbers)
+
+    return np.asarray(facet(jnp.asarray(points)), np.float64)
 
 
 def _incident(degrees):
@@ -86,15 +92,35 @@ def test_a_smooth_surface_has_its_own_normal():
 def test_a_ray_always_meets_the_same_facet_and_neighbours_another():
     assert np.array_equal(_facets(_UP * -1.0, 0.3), _facets(_UP * -1.0, 0.3))
     near = jnp.array([[1.0, 2.0, 3.0], [1.0 + 2e-7, 2.0, 3.0]], jnp.float32)
-    facet = jax.vmap(microfacet.facet_normal, in_axes=(0, None, None, None))
-    one, other = facet(near, -_UP, _UP, jnp.float32(0.3))
-    assert np.max(np.abs(one - other)) > 1e-3
+    pairs = jax.vmap(microfacet.uniform_pair, in_axes=(0, None))(near, -_UP)
+    assert all(abs(float(one - other)) > 1e-3 for one, other in pairs)
+
+
+def test_the_rays_of_a_pixel_share_the_numbers_evenly_at_their_first_bends():
+    @jax.jit
+    def noise(bends):
+        """Returns how much the mean of a function over 64 rays varies between pixels."""
+
+        def value(pixel, ray):
+            stratum = microfacet.Stratum(pixel, ray, bends)
+            hit = jnp.stack([pixel, ray, bends]).astype(jnp.float32)
+            u, v = microfacet.uniform_pair(hit, -_UP, stratum)
+            return jnp.sin(2.0 * jnp.pi * u) + jnp.cos(2.0 * jnp.pi * v)
+
+        rays, pixels = jnp.arange(64, dtype=jnp.int32), jnp.arange(300, dtype=jnp.int32)
+        values = jax.vmap(lambda pixel: jax.vmap(lambda ray: value(pixel, ray))(rays))(pixels)
+        return jnp.std(jnp.mean(values, axis=1))
+
+    independent = 1.0 / 8.0
+    assert all(noise(jnp.int32(bends)) < 0.5 * independent for bends in range(3))
+    np.testing.assert_allclose(noise(jnp.int32(5)), independent, rtol=0.2)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 60.0, 90.0])
 def test_gradients_of_a_facet_are_finite(degrees):
     def facet(direction, alpha):
-        return microfacet.facet_normal(jnp.ones(3), direction, _UP, alpha)
+        numbers = microfacet.uniform_pair(jnp.ones(3), direction)
+        return microfacet.facet_normal(direction, _UP, alpha, numbers)
 
     for alpha in (0.0, 1e-6, 0.3):
         slopes = jax.jacfwd(facet, argnums=(0, 1))(_incident(degrees), jnp.float32(alpha))
