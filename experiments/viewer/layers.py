@@ -146,7 +146,7 @@ def view_pixels(frames: Frames, i: int, most: int) -> Pixels:
 
 
 def with_indices(interfaces: Interfaces, indices: Sequence[float], rule: str) -> Interfaces:
-    """Returns interfaces with new indices of refraction, one per part, and all else unchanged.
+    """Returns interfaces with new indices of refraction, one per part, without dispersion.
 
     Args:
       interfaces: interfaces of the scene.
@@ -155,7 +155,11 @@ def with_indices(interfaces: Interfaces, indices: Sequence[float], rule: str) ->
     """
     parents = [int(medium) - 1 for medium in interfaces.medium_outside]
     made = RULES[rule](indices, parents, ambient=ambient_of(interfaces))
-    return interfaces._replace(index_inside=made.index_inside, index_outside=made.index_outside)
+    return interfaces._replace(
+        index_inside=made.index_inside,
+        index_outside=made.index_outside,
+        index_by_channel=interfaces.index_by_channel[:0],
+    )
 
 
 def _draw_surface(model: Model, layer: str, rays: Rays, most: int) -> Image:

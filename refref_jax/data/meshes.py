@@ -238,7 +238,12 @@ def without_colour(parts: Sequence[MeshPart]) -> list[MeshPart]:
     This is for fields that learn the colour of glass from images, as the paper's oracle does: a
     tint that is already applied to the light paths would count twice.
     """
-    return [part._replace(tint=CLEAR, absorption=NO_ABSORPTION) for part in parts]
+    return [
+        part
+        if part.material.kind == "conductor"
+        else part._replace(tint=CLEAR, absorption=NO_ABSORPTION)
+        for part in parts
+    ]
 
 
 def with_shading(parts: Sequence[MeshPart], shading: ShadingOverride) -> list[MeshPart]:
@@ -305,6 +310,8 @@ def _read_part(
     vertices, faces = read_mesh(path)
     normals = read_normals(path) if described.shading == "auto" else None
     part = MeshPart(path.stem, vertices, faces, index, *described[1:], normals)
+    if {path.stem, material_of(path, table=table)} & set(overrides):  # one index for all colours
+        part = part._replace(material=part.material._replace(dispersion=None))
     return part._replace(radiance=read_radiance(part.material, faces, path=path))
 
 
@@ -329,8 +336,8 @@ def read_radiance(
     visual: Any = getattr(mesh, "visual", None)
     if getattr(visual, "kind", None) != "vertex":
         raise SceneError(
-            f"{path} has no vertex colours, which its material names as its radiance. Export them, "
-            "or give three numbers."
+            f"{path if isinstance(path, str | os.PathLike) else 'The mesh'} has no vertex colours, "
+            "which its material names as its radiance. Export them, or give three numbers."
         )
     encoded = np.asarray(visual.vertex_colors, np.float64)[:, :3] / 255.0
     return image_files.srgb_to_linear(encoded)[np.asarray(mesh.faces)]

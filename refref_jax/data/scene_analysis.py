@@ -91,6 +91,8 @@ def analyse(
     # Under other rules, a ray between two parts may count as outside of all parts.
     told_apart = rule == "nested" or len(parts) == 1
     leaves_for_good = convex and told_apart and not _any_inside(cameras, outermost[0])
+    if convex and outermost[0].material.kind == "thin_sheet":
+        leaves_for_good = False  # inside a closed sheet, light is still in the ambient medium
     return SceneAnalysis(
         parts=len(parts),
         objects=len(outermost),
@@ -203,7 +205,7 @@ def find_tints(
     learns its colour, so only the others have colours that may be unknown.
     """
     clear = ("dielectric", "thin_sheet")
-    parts = [x for x in parts if x.material.kind in clear and x.material.interior is None]
-    if not all(part.colour_known for part in parts):
+    coloured = [x for x in parts if x.material.kind in clear and x.material.interior is None]
+    if not all(part.colour_known for part in coloured):
         return "learned"
-    return "given" if any(map(_takes_light, parts)) else "none"
+    return "given" if any(map(_takes_light, coloured)) else "none"

@@ -108,7 +108,7 @@ def make_part(
             "positive, per world unit."
         )
     coloured = tuple(tint) != CLEAR or tuple(absorption) != NO_ABSORPTION
-    _check_material(part.name, material)
+    material = _checked_material(part.name, material)
     radiance = meshes.read_radiance(material, part.faces, path=mesh)
     return part._replace(
         tint=tint,
@@ -120,11 +120,13 @@ def make_part(
     )
 
 
-def _check_material(name: str, material: Material) -> None:
-    """Refuses a material that `scene.json` could not describe, with the same message."""
-    eta, k = material.complex_index or (None, None)
+def _checked_material(name: str, material: Material) -> Material:
+    """Returns a material as `scene.json` would describe it, or refuses it with the same message."""
+    if not isinstance(material, Material):
+        raise SceneError(f"The material of {name!r} is {material!r}. Give a refref_jax.Material.")
+    pair = material.complex_index
+    eta, k = pair if isinstance(pair, tuple | list) and len(pair) == 2 else (pair, None)
     values = {
-        "kind": material.kind,
         "index": material.dispersion,
         "eta": eta,
         "k": k,
@@ -132,8 +134,12 @@ def _check_material(name: str, material: Material) -> None:
         "roughness": material.roughness or None,
         "interior": material.interior,
     }
-    listed = {key: list(x) if isinstance(x, tuple) else x for key, x in values.items()}
-    scene_properties.check_part(name, {key: x for key, x in listed.items() if x is not None})
+    described = {
+        key: value if isinstance(value, str) else np.asarray(value).tolist()
+        for key, value in values.items()
+        if value is not None
+    }
+    return scene_properties.read_part(name, {"kind": material.kind, **described}).material
 
 
 def _of_arrays(

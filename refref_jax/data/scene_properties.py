@@ -64,7 +64,7 @@ _OF_KIND = {"cube": ("half_extent", "faces"), "sphere": ("radius", "image"), "en
 _NEEDED = {"conductor": ("eta", "k")}
 _IDLE = {
     "dielectric": ("eta", "k", "radiance"),
-    "opaque": ("eta", "k", "index", "ior_inside", "absorption", "roughness", "interior"),
+    "opaque": ("eta", "k", "index", "ior_inside", "tint", "absorption", "roughness", "interior"),
     "conductor": ("index", "ior_inside", "absorption", "radiance", "interior"),
     "thin_sheet": ("eta", "k", "absorption", "radiance", "interior"),
 }
@@ -192,17 +192,17 @@ def check_file(path: Path) -> None:
     _checked(source.content, _TOP, (), [source])
     _checked(source.content.get("background", {}), _BACKGROUND, ("background",), [source])
     for name, part in source.content.get("parts", {}).items():
-        _part(name, part, [source])
+        _checked(part, _PART, ("parts", name), [source])  # the scene may have what it lacks
 
 
-def check_part(name: str, description: Mapping[str, Any]) -> None:
-    """Checks the description of a part that is not from a file.
+def read_part(name: str, description: Mapping[str, Any]) -> PartDescription:
+    """Reads the description of a part that is not from a file.
 
     Raises:
       SceneError: if it is not valid.
     """
     record = dict(description)
-    _part(name, record, [_Source(Path("The material"), {"parts": {name: record}})])
+    return _part(name, record, [_Source(Path("The material"), {"parts": {name: record}})])
 
 
 class _Source(NamedTuple):
@@ -288,7 +288,7 @@ def _index_or_three(value: Any) -> float | Vector:
 
 def _metal(least: float, sign: str) -> Callable[[Any], Vector]:
     """Returns a check of one number, or three for red, green and blue, from a limit on."""
-    three = vector_within(least, math.inf, f"a {sign} number, or three for red, green and blue")
+    three = vector_within(least, _MOST, f"a {sign} number, or three for red, green and blue")
     return lambda value: three(value if isinstance(value, list) else [value] * 3)
 
 
@@ -300,16 +300,16 @@ def _record(value: Any) -> Any:
     return value
 
 
-# Smallest positive number that single precision holds with all its digits.
-_LEAST = 1.2e-38
+# Limits of indices of refraction and of light, whose powers single precision still holds.
+_LEAST, _MOST, _BRIGHTEST = 1e-3, 1e3, 1e9
 
-_positive = number_within(_LEAST, math.inf, "a positive number")
-_index = number_within(_LEAST, math.inf, "a positive number, such as 1.5 for glass")
-_indices = vector_within(_LEAST, math.inf, "a positive number, or three for red, green and blue")
+_positive = number_within(1.2e-38, math.inf, "a positive number")
+_index = number_within(_LEAST, _MOST, "a positive number, such as 1.5 for glass")
+_indices = vector_within(_LEAST, _MOST, "a positive number, or three for red, green and blue")
 _vector = vector_within(-math.inf, math.inf, "three numbers")
 _tint = vector_within(0.0, 1.0, "three numbers from 0 to 1, since no surface adds light")
 _absorption = vector_within(0.0, math.inf, "three numbers that are 0 or positive, per world unit")
-_light = vector_within(0.0, math.inf, "vertex_colours, or three numbers that are 0 or positive")
+_light = vector_within(0.0, _BRIGHTEST, "vertex_colours, or three numbers that are 0 or positive")
 
 _Checks = Mapping[str, Callable[[Any], Any]]
 

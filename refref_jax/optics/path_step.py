@@ -293,7 +293,7 @@ def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arriv
     """
     interfaces, stratum = scene.interfaces, None
     if state.strata is not None:
-        stratum = Stratum(*state.strata, state.num_bends)
+        stratum = Stratum(state.strata[0], state.strata[1], state.num_bends)
     if media.has_dispersion(interfaces):  # the ray carries light of one channel
         interfaces = media.of_channel(interfaces, jnp.argmax(state.throughput))
 
@@ -332,9 +332,12 @@ def end_status(
     """
     missed = jnp.where(state.num_bends > 0, PathStatus.ESCAPED, PathStatus.MISSED)
     met = jnp.where(state.num_bends < settings.max_bends, PathStatus.EMPTY, PathStatus.OUT_OF_BENDS)
+    kind, opaque = arrival.interaction.sides.kind, arrival.interaction.sides.opaque
     if settings.total_reflection == "ended":
-        met = jnp.where(arrival.interaction.total, PathStatus.TOTALLY_REFLECTED, met)
-    opaque = arrival.interaction.sides.opaque
+        total = arrival.interaction.total
+        if kind is not None:  # a mirror is not a total internal reflection
+            total &= kind != media.CONDUCTOR
+        met = jnp.where(total, PathStatus.TOTALLY_REFLECTED, met)
     if opaque is not None:
         met = jnp.where(opaque, PathStatus.OPAQUE, met)
     return jnp.where(hit, met, missed).astype(jnp.int32)

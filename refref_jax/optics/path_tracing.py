@@ -195,7 +195,7 @@ def trace_batches(
     capacity = capacities(settings, count).paths if capacity is None else capacity
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
     if interior_list is not None:
-        interior_list = interior_list.reshape(batches * count, interior_list.shape[-1])
+        interior_list = interior_list.reshape(rays.radii.size, interior_list.shape[-1])
     detail = detail or path_settings.everything(settings.max_bends)
     interior_list = _inside(scene, flat, interior_list)
     if times > 1:
@@ -224,7 +224,8 @@ def survey(scene: Scene, rays: Rays, *, settings: PathSettings) -> Survey:
     paths = jax.ops.segment_sum(one, ends.rays, num_segments=count)
     untraced = (ends.statuses == PathStatus.NOT_TRACED) & (ends.num_bends == 0)
     missing = jnp.sum((ends.statuses == PathStatus.MISSED) | untraced, dtype=jnp.float32)
-    return Survey(jnp.mean(paths), jnp.std(paths), 1.0 - missing / count)
+    traced = count if _needs_no_tracing(rays, settings) else count * _traces(scene)
+    return Survey(jnp.mean(paths), jnp.std(paths), 1.0 - missing / traced)
 
 
 def _traces(scene: Scene) -> int:

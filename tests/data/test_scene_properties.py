@@ -13,6 +13,7 @@ import pytest
 import trimesh
 
 from experiments.dataset import backgrounds, render_settings, scene_record
+from refref_jax.choices import Material
 from refref_jax.data import SceneError, image_files, meshes, scene_properties
 from refref_jax.data.scene_assembly import read_background
 from refref_jax.data.scene_names import SceneName
@@ -370,3 +371,15 @@ def test_the_published_layout_implies_a_rule_that_scene_json_overrides(tmp_path)
     (scene / "scene.json").write_text('{"rule": "nested"}')
     told = read(scene)
     assert (told.rule, told.origins["rule"]) == ("nested", scene / "scene.json")
+
+
+def test_an_overlay_may_change_one_value_of_a_metal(tmp_path):
+    told, _, overlay = _overlaid(tmp_path, _part(kind="conductor", eta=0.2, k=3), _part(eta=0.3))
+    scene_properties.check_file(overlay)
+    assert next(iter(told.parts.values())).material.complex_index == ((0.3,) * 3, (3.0,) * 3)
+
+
+def test_an_overlay_that_changes_the_kind_replaces_the_material(tmp_path):
+    told, _, overlay = _overlaid(tmp_path, _part(index=1.5, tint=[1, 0, 0]), _part(kind="opaque"))
+    scene_properties.check_file(overlay)
+    assert next(iter(told.parts.values())) == PartDescription(material=Material("opaque"))

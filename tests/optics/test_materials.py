@@ -10,13 +10,17 @@ import trimesh
 
 import refref_jax
 from refref_jax.choices import Material
+from refref_jax.data.mesh_queries import find_containment
+from refref_jax.data.scene_analysis import analyse
 from refref_jax.optics import fresnel
 from refref_jax.optics.light_paths import PathStatus, exists
-from refref_jax.optics.path_settings import TREE
-from refref_jax.optics.path_tracing import trace, trace_ends
+from refref_jax.optics.media import empty_interior_list, interior_length
+from refref_jax.optics.path_settings import PATH_PRESETS, TREE
+from refref_jax.optics.path_tracing import survey, trace, trace_ends
 from refref_jax.optics.scene import of_channel
 from refref_jax.render import shade
 from tests.factories import scenes
+from tests.factories.small_model import CAMERAS
 
 _OPAQUE = Material("opaque", radiance=(0.8, 0.2, 0.1))
 _GOLD = ((0.18, 0.42, 1.37), (3.42, 2.35, 1.77))
@@ -261,3 +265,69 @@ def test_meshes_of_surfaces_without_inside_may_be_open():
     for material in (Material("opaque"), Material("thin_sheet")):
         part = refref_jax.make_part(half, index=1.5, name="cap", material=material)
         assert refref_jax.assemble([part]).interfaces.kinds.size == 1
+
+
+@pytest.mark.parametrize("rule", ["nested", "facing", "priority"])
+def test_dispersed_rays_may_start_inside_parts(rule):
+    glass = _BALL._replace(material=Material(dispersion=(1.4, 1.5, 1.6)))
+    scene = scenes.build(glass, rule=rule)
+    lists = jnp.broadcast_to(
+        empty_interior_list(scene.interfaces), (2, interior_length(scene.interfaces))
+    )
+    rays = _rays(0.1, 0.2)
+    given = trace(scene, rays, settings=TREE, interior_list=lists).paths
+    np.testing.assert_array_equal(
+        given.throughput, trace(scene, rays, settings=TREE).paths.throughput
+    )
+
+
+def test_the_share_of_rays_that_hit_counts_rays_not_colours():
+    glass = _BALL._replace(material=Material(dispersion=(1.4, 1.5, 1.6)))
+    rays = _rays(0.1, 2.0, 3.0, 4.0)
+    assert float(survey(scenes.build(glass), rays, settings=TREE).hit_fraction) == 0.25
+    assert float(survey(scenes.build(_BALL), rays, settings=TREE).hit_fraction) == 0.25
+
+
+def test_a_mirror_is_followed_where_total_internal_reflections_are_not():
+    metal = _sheet(material=Material("conductor", complex_index=_GOLD))
+    path = _main(_paths(scenes.build(metal), _rays(0.2), settings=PATH_PRESETS["paper_no_tir"]))
+    assert path.num_bends == 1 and path.statuses == PathStatus.ESCAPED
+
+
+def test_light_inside_a_closed_sheet_meets_its_far_wall():
+    bubble = _BALL._replace(material=Material("thin_sheet"), colour_known=True)
+    tree = find_containment([bubble])
+    found = analyse([bubble], tree, CAMERAS, rule="nested", space="bounded")
+    assert found.reentry == "possible"
+    assert _main(_paths(scenes.build(bubble), _rays(0.1))).num_bends == 2
+
+
+@pytest.mark.parametrize(
+    "material",
+    [
+        Material("glass"),
+        Material("conductor"),
+        Material("conductor", complex_index=5.0),
+        Material("conductor", complex_index=(1e10, 1.0)),
+        Material(roughness=2.0),
+        Material(roughness=float("nan")),
+        Material(dispersion=(1.5, 1.5)),
+        Material("opaque", radiance=(1.0, float("inf"), 1.0)),
+        Material("opaque", radiance="vertex_colours"),
+        Material("opaque", roughness=0.1),
+    ],
+    ids=str,
+)
+def test_a_wrong_material_is_refused_in_one_line(material):
+    with pytest.raises(refref_jax.SceneError) as error:
+        refref_jax.make_part(trimesh.creation.box(), index=1.5, material=material)
+    assert "\n" not in str(error.value) and len(str(error.value)) < 300
+
+
+def test_numbers_and_arrays_of_materials_are_taken_as_in_a_file():
+    numbers = Material("conductor", complex_index=(0.2, np.array([3.0, 3.1, 3.2])))
+    part = refref_jax.make_part(trimesh.creation.box(), index=1.0, material=numbers)
+    assert part.material.complex_index == ((0.2, 0.2, 0.2), (3.0, 3.1, 3.2))
+    equal = Material(dispersion=(1.5, 1.5, 1.5))
+    part = refref_jax.make_part(trimesh.creation.box(), index=1.5, material=equal)
+    assert part.material == Material()
