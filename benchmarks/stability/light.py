@@ -61,7 +61,7 @@ def _unbalance(scene, rays, settings) -> float:
     """Returns how far weights and losses are from summing to 1."""
     traced = paths.trace(scene, rays, settings=settings)
     assert np.all(traced.ends.num_bends <= settings.max_bends)
-    assert all(np.all(np.isfinite(x)) for x in traced.ends)
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(traced.ends))
     return float(np.abs(paths.energy(traced, len(rays.radii)) - 1.0).max())
 
 
