@@ -12,7 +12,6 @@ from benchmarks.oracles import colours
 from benchmarks.oracles.backgrounds import CubeBackground
 from refref_jax.data import scene_assembly, scene_folder
 from refref_jax.geometry import cameras
-from refref_jax.geometry.rays import Rays
 from refref_jax.optics import path_tracing
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, PathSettings
 from refref_jax.render import radiance_of, render_known
@@ -96,7 +95,7 @@ def test_the_first_surface_is_where_cycles_sees_it(ball_scene):
     frames = scene_folder.read_frames(ball_scene, "test")
     distances = scene_folder.read_distances(frames)[0]
     rays = cameras.image_rays(frames.cameras, 0)
-    flat = Rays(*(x.reshape(-1, *x.shape[2:]) for x in rays))
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
     paths = jax.tree.map(np.asarray, _trace(scenes.read_geometry(ball_scene), flat, settings=PAPER))
     ours = paths.tau[: distances.size, 1].reshape(distances.shape)
     mask = scene_folder.read_masks(frames)[0]

@@ -141,7 +141,7 @@ def draw_distances(scene: KnownScene, domain: Domain, path: Path) -> None:
     """
     rays = cameras.image_rays(scene.frames.cameras, 0)
     first = find_first_surface(scene.objects.surfaces, rays).distances
-    flat = Rays(*(x.reshape(-1, *x.shape[2:]) for x in rays))
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays)
     walls = _walls(scene.objects, flat, domain)
     straight, bent = (np.asarray(x).reshape(first.shape) for x in walls)
     write_distances(

@@ -62,7 +62,7 @@ class Panel(NamedTuple):
 
 def pixel_ray(views: Cameras, view: int, column: int, row: int) -> Rays:
     """Returns the ray through the centre of a pixel."""
-    return Rays(*(x[row, column] for x in cameras.image_rays(views, view)))
+    return jax.tree.map(lambda x: x[row, column], cameras.image_rays(views, view))
 
 
 def sample_ray(model: Model, ray: Rays) -> RaySamples:

@@ -180,4 +180,4 @@ def _bands(rays: Rays) -> Iterator[Rays]:
     height, width = rays.radii.shape
     rows = max(1, images.TILE // width)
     for start in range(0, height, rows):
-        yield Rays(*(x[start : start + rows] for x in rays))
+        yield jax.tree.map(lambda x, start=start: x[start : start + rows], rays)

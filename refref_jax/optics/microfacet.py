@@ -131,7 +131,7 @@ def _disc_axes(stretched: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[A
 
 
 def uniform_pair(
-    position: Float[Array, "3"], direction: Float[Array, "3"], stratum: Stratum | None = None
+    position: Float[Array, "3"], direction: Float[Array, "3"], *, stratum: Stratum | None = None
 ) -> Pair:
     """Returns two uniform numbers that the hit of a ray determines; they are constants.
 

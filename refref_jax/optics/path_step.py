@@ -86,7 +86,7 @@ def interact(
     alpha = interfaces.alpha[point.part] if interfaces.alpha.shape[0] else None
     facet = normal
     if alpha is not None:
-        numbers = microfacet.uniform_pair(point.position, direction, stratum)
+        numbers = microfacet.uniform_pair(point.position, direction, stratum=stratum)
         facet = microfacet.facet_normal(direction, normal, alpha, numbers)
     near, far = sides.index_near, sides.index_far
     beta = -numerics.dot(direction, facet)

@@ -118,7 +118,7 @@ def trace_pixel(
         segments_per_ray=float(_MOST_SEGMENTS),
         paths_per_ray=float(_MOST_PATHS),
     )
-    ray = Rays(*(host_array(np.asarray(x, np.float32)[None]) for x in ray))
+    ray = jax.tree.map(lambda x: host_array(np.asarray(x)[None]), ray)
     traced = _trace(scene, ray, colours, settings=roomy, domain=domain)
     return _polylines(jax.device_get(traced), reach)
 

@@ -37,7 +37,8 @@ def test_nine_configurations_of_every_background_and_category():
     ]
     assert [name.config for name in names] == list(scene_names.CONFIGS)
     assert len(set(scene_names.CONFIGS)) == 9
-    assert tuple(scene_names.CATEGORIES) == typing.get_args(parts.Category)
+    ours = typing.get_args(parts.Category)
+    assert tuple(scene_names.CATEGORIES) == tuple(x for x in ours if x != "materials")
 
 
 @pytest.mark.parametrize(

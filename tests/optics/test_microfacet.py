@@ -104,7 +104,7 @@ def test_the_rays_of_a_pixel_share_the_numbers_evenly_at_their_first_bends():
         def value(pixel, ray):
             stratum = microfacet.Stratum(pixel, ray, bends)
             hit = jnp.stack([pixel, ray, bends]).astype(jnp.float32)
-            u, v = microfacet.uniform_pair(hit, -_UP, stratum)
+            u, v = microfacet.uniform_pair(hit, -_UP, stratum=stratum)
             return jnp.sin(2.0 * jnp.pi * u) + jnp.cos(2.0 * jnp.pi * v)
 
         rays, pixels = jnp.arange(64, dtype=jnp.int32), jnp.arange(300, dtype=jnp.int32)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from refref_jax.geometry.cameras import image_rays
-from refref_jax.geometry.rays import Rays
 from refref_jax.optics.light_paths import PathStatus
 from refref_jax.optics.path_settings import PAPER, STRAIGHT, TREE, everything
 from refref_jax.render import Model, images, init_params, render_image, render_rays
@@ -51,7 +50,7 @@ def test_the_size_of_a_chunk_does_not_matter(model, rays, whole, chunk):
 
 @pytest.mark.slow
 def test_rendering_in_one_piece_gives_the_same(model, rays, whole):
-    flat = Rays(*(jnp.asarray(x.reshape(256, *x.shape[2:])) for x in rays))
+    flat = _first(rays, 256)
     single = jax.jit(lambda params: render_rays(model._replace(params=params), flat))
     for ours, expected in zip(single(model.params), whole, strict=True):
         np.testing.assert_allclose(ours, expected.reshape(ours.shape), atol=2e-5)
@@ -88,18 +87,18 @@ def test_nothing_is_compiled_twice(model):
     assert (images._trace_tile._cache_size(), images._render_chunk._cache_size()) == before
 
 
-def _first(image, count, shape):
-    """Returns the first pixels of an image in another shape."""
-    return image.reshape(256, *image.shape[2:])[:count].reshape((*shape, *image.shape[2:]))
+def _first(images, count):
+    """Returns the first pixels of each image."""
+    return jax.tree.map(lambda x: x.reshape(256, *x.shape[2:])[:count], images)
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (0,), (2, 0), (3, 1, 2)])
 def test_rays_may_have_any_leading_axes(model, rays, whole, shape):
     count = int(np.prod(shape))
-    some = Rays(*(_first(x, count, shape) for x in rays))
+    some = jax.tree.map(lambda x: x.reshape((*shape, *x.shape[1:])), _first(rays, count))
     seen = render_image(model, some)
     for ours, image in zip(seen, whole, strict=True):
-        expected = _first(image, count, shape)
+        expected = _first(image, count).reshape((*shape, *image.shape[2:]))
         assert ours.shape == expected.shape
         np.testing.assert_allclose(ours, expected, atol=2e-5)
 
@@ -110,7 +109,7 @@ def test_a_chunk_of_nothing_is_refused(model, rays):
 
 
 def test_rays_that_only_fill_up_a_tile_are_not_rendered(model, rays):
-    flat = Rays(*(x.reshape(256, *x.shape[2:])[:200] for x in rays))
+    flat = _first(rays, 200)
     full, _ = images.crop(flat, None, 0, 256)
     assert full.radii.shape == (256,)
     tile = images._trace_tile(model.scene, full, 200, settings=STRAIGHT, detail=everything(0))
@@ -118,7 +117,7 @@ def test_rays_that_only_fill_up_a_tile_are_not_rendered(model, rays):
 
 
 def test_rays_that_miss_pay_nothing_for_reflection(model, rays):
-    flat = Rays(*(x.reshape(256, *x.shape[2:]) for x in rays))
+    flat = _first(rays, 256)
     paper = images._trace_tile(
         model.scene, flat, 256, settings=PAPER, detail=everything(PAPER.max_bends)
     )
@@ -131,7 +130,7 @@ def test_rays_that_miss_pay_nothing_for_reflection(model, rays):
 
 
 def test_gradients_reach_the_fields_and_are_finite(model, rays):
-    flat = Rays(*(jnp.asarray(x.reshape(256, *x.shape[2:])[::16]) for x in rays))
+    flat = jax.tree.map(lambda x: x[::16], _first(rays, 256))
 
     @jax.jit
     @jax.grad

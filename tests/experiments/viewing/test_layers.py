@@ -85,7 +85,7 @@ def test_the_mask_is_the_disc_of_the_ball_and_distances_have_one_scale(model):
     nearest = np.linalg.norm(np.cross(_RAYS.origins, _RAYS.directions), axis=-1)
     np.testing.assert_array_equal(mask[nearest < 1.26], 255)
     np.testing.assert_array_equal(mask[nearest > 1.3], 0)
-    cropped = type(_RAYS)(*(x[4:11] for x in _RAYS))
+    cropped = jax.tree.map(lambda x: x[4:11], _RAYS)
     drawn = layers.draw(model, layers.MASK, cropped, **_OPTIONS)
     np.testing.assert_array_equal(drawn, mask[4:11])
     # Distances have one scale from everywhere.
