@@ -81,6 +81,9 @@ PresetName = Literal["tiny", "small", "paper", "best"]
 FieldName = Literal["zipnerf", "nerfacto"]
 """Field kinds, the default first; see `fields.registry`."""
 
+FarField = Literal["field", "backdrop"]
+"""Model of the world behind the objects: the radiance field, or a surface (`render.backdrop`)."""
+
 Interior = Literal["field", "clear", "absorbing"]
 """Model of the inside of the objects; see `render.config.ModelConfig`."""
 

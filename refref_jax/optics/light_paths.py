@@ -10,12 +10,14 @@ the outside of the objects reflects, and the rest, which passes through the obje
 """
 
 import enum
+import functools
 from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from refref_jax.choices import Footprint
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import ray_differentials
 from refref_jax.optics.media import AMBIENT
@@ -106,6 +108,7 @@ class PathEnds(NamedTuple):
       throughput: share of the ray's linear RGB that the path carries; 0 in empty slots.
       num_bends: number of refractions and reflections.
       statuses: `PathStatus` of each path.
+      differentials: ray differential of the last segment, if carried (see `ray_differentials`).
       stop: ends on opaque surfaces, `None` without such surfaces.
     """
 
@@ -117,10 +120,11 @@ class PathEnds(NamedTuple):
     throughput: Float[Array, "paths 3"]
     num_bends: Int[Array, " paths"]
     statuses: Int[Array, " paths"]
+    differentials: RayDifferential
     stop: Stop | None = None
 
 
-def straight(rays: Rays) -> LightPaths:
+def straight(rays: Rays, *, footprint: Footprint = "cone") -> LightPaths:
     """Returns one straight path per ray, with full throughput: the light paths of a plain NeRF."""
     count = rays.radii.shape[0]
     integers = jnp.arange(count, dtype=jnp.int32)
@@ -130,7 +134,10 @@ def straight(rays: Rays) -> LightPaths:
         tau=jnp.zeros_like(rays.radii)[:, None],
         ends=jnp.full_like(rays.radii, jnp.inf)[:, None],
         media=jnp.full((count, 1), AMBIENT, jnp.int32),
-        differentials=jax.vmap(jax.vmap(ray_differentials.no_differential))(rays.origins[:, None]),
+        differentials=jax.tree.map(
+            lambda x: x[:, None],
+            jax.vmap(functools.partial(ray_differentials.begin, footprint=footprint))(rays),
+        ),
         rays=integers,
         throughput=jnp.ones_like(rays.directions),
         radii=rays.radii,
@@ -141,9 +148,9 @@ def straight(rays: Rays) -> LightPaths:
     )
 
 
-def straight_ends(rays: Rays) -> PathEnds:
+def straight_ends(rays: Rays, *, footprint: Footprint = "cone") -> PathEnds:
     """Returns the last segments of the paths of `straight`."""
-    return ends_of(straight(rays))
+    return ends_of(straight(rays, footprint=footprint))
 
 
 def ends_of(paths: LightPaths) -> PathEnds:
@@ -159,6 +166,7 @@ def ends_of(paths: LightPaths) -> PathEnds:
         throughput=paths.throughput,
         num_bends=paths.num_bends,
         statuses=paths.statuses,
+        differentials=jax.tree.map(lambda x: x[path, last], paths.differentials),
         stop=paths.stop,
     )
 

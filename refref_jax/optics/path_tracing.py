@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from refref_jax.choices import Footprint
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import media, path_settings, path_tree
 from refref_jax.optics.light_paths import (
@@ -85,6 +86,7 @@ def trace_ends(
     *,
     settings: PathSettings,
     interior_list: Int[Array, "rays slots"] | None = None,
+    footprint: Footprint = "cone",
     block: int = BLOCK,
 ) -> TracedEnds:
     """Traces rays, and returns only the last segments of their paths.
@@ -95,20 +97,20 @@ def trace_ends(
       settings: path settings.
       interior_list: interior list of each camera, where rays carry one (see
         `media.interior_length` and `data.mesh_queries.parts_around`); none by default.
+      footprint: `differential` carries derivatives across the pixel.
       block: number of rays cast at once, see `wavefront`.
     """
     scene, rays = in_one_precision(scene, rays)
     if _needs_no_tracing(rays, settings):
-        return TracedEnds(
-            straight_ends(rays), jnp.zeros_like(rays.origins), jnp.zeros((), jnp.int32)
-        )
+        lines = straight_ends(rays, footprint=footprint)
+        return TracedEnds(lines, jnp.zeros_like(rays.origins), jnp.zeros((), jnp.int32))
     interior_list = _inside(scene, rays, interior_list)
     times = _traces(scene)
     if times > 1:
         rays, interior_list = jax.tree.map(
             lambda x: jnp.repeat(x, times, axis=0), (rays, interior_list)
         )
-    tree = follow(scene, rays, interior_list, settings=settings, block=block)
+    tree = follow(scene, rays, interior_list, settings=settings, footprint=footprint, block=block)
     ends = path_tree.listed(tree, capacities(settings, rays.radii.shape[0]).paths)
     last = path_tree.last_segments(tree.segments.items, ends)
     traced = TracedEnds(last, tree.dropped, tree.casts)

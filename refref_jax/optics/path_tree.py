@@ -133,6 +133,7 @@ def last_segments(segments: Segments, ends: Ends) -> PathEnds:
         throughput=ends.throughput,
         num_bends=ends.num_bends,
         statuses=ends.statuses,
+        differentials=last.differentials,
         stop=ends.stop,
     )
 

@@ -16,7 +16,8 @@ from refref_jax.fields import base, registry
 from refref_jax.fields.base import DensityConfig, RadianceConfig
 from refref_jax.optics.path_settings import Detail, PathSettings, Tally
 from refref_jax.optics.scene import Scene
-from refref_jax.render import learned_media
+from refref_jax.render import backdrop, learned_media
+from refref_jax.render.backdrop import BackdropConfig
 from refref_jax.render.learned_media import LearnedTints
 
 # Segments before and after a convex object.
@@ -68,6 +69,7 @@ class ModelConfig:
         for none.
       field_parts: parts whose inside is sampled too, where `interior` leaves out the others.
       centre: centre of the cube or ball, world units; it is the centre of the fields' unit cube.
+      backdrop: surface behind the objects that takes the place of all fields, or `None`.
     """
 
     proposals: tuple[ProposalConfig, ...]
@@ -84,6 +86,7 @@ class ModelConfig:
     dilation: float
     field_parts: tuple[int, ...] = ()
     centre: Position = ORIGIN
+    backdrop: BackdropConfig | None = None
 
     def __post_init__(self) -> None:
         """Validates the values."""
@@ -111,6 +114,8 @@ def path_detail(config: ModelConfig, settings: PathSettings) -> Detail:
     """Returns the parts of light paths that a model needs."""
     tally: Tally = "parts" if config.learned_tints else "none"
     most = settings.max_bends + 1
+    if config.backdrop is not None:
+        return Detail("outside", min(_MOST_LEGS, most), "differential", tally)
     if config.interior == "field" or config.field_parts:
         return Detail("all", most, config.footprint, tally)
     legs = _CONVEX_LEGS if settings.reentry == "impossible" else _MOST_LEGS
@@ -127,7 +132,7 @@ class Params(NamedTuple):
 
     Attributes:
       proposals: parameters of each proposal level's density field.
-      field: parameters of the radiance field.
+      field: parameters of the radiance field, or the pyramid of a backdrop.
       tints: learned tints and absorption of the parts, if any.
     """
 
@@ -154,10 +159,12 @@ class Model(NamedTuple):
 
 def init_params(key: Array, config: ModelConfig) -> Params:
     """Returns initial parameters of all fields of a model."""
+    colours = learned_media.init(config.learned_tints) if config.learned_tints else None
+    if config.backdrop is not None:
+        return Params((), backdrop.init(config.backdrop.resolution), colours)
     field_key, *keys = jax.random.split(key, 1 + len(config.proposals))
     proposals = tuple(
         registry.init_density(proposal_key, proposal.field)
         for proposal_key, proposal in zip(keys, config.proposals, strict=True)
     )
-    colours = learned_media.init(config.learned_tints) if config.learned_tints else None
     return Params(proposals, registry.init_radiance(field_key, config.field), colours)

@@ -5,16 +5,19 @@ RGB (paper, arXiv 2505.05848, Fresnel blend), and is converted to sRGB at the en
 function of IEC 61966-2-1.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from refref_jax.optics import light_paths
 from refref_jax.optics.light_paths import LightPaths
-from refref_jax.render import learned_media, volume_rendering
+from refref_jax.render import backdrop, learned_media, volume_rendering
 from refref_jax.render.model import ModelConfig, Params
-from refref_jax.render.volume_rendering import Jitter, PathRadiance
+from refref_jax.render.volume_rendering import Composite, Jitter, PathRadiance
+from refref_jax.sampling import scene_bounds
 
 # Thresholds between the linear and the power segment of the transfer function.
 _LINEAR_KNEE = 0.0031308
@@ -95,8 +98,35 @@ def render_paths(
     anneal: Float[Array, ""],
 ) -> PathRadiance:
     """Renders each path of a batch independently."""
+    if config.backdrop is not None:
+        return _look_at_backdrop(params, config, paths)
     render = jax.vmap(volume_rendering.path_radiance, in_axes=(None, None, 0, 0, None))
     return render(params, config, paths, jitter, anneal)
+
+
+def _look_at_backdrop(params: Params, config: ModelConfig, paths: LightPaths) -> PathRadiance:
+    """Returns what each path sees of the backdrop, at the distance where it ends there."""
+    assert config.backdrop is not None
+    ends, bounds = light_paths.ends_of(paths), volume_rendering.domain(config)
+    resolution, count = config.backdrop.resolution, paths.radii.shape[0]
+    alone = ends._replace(throughput=jnp.ones_like(ends.throughput))
+    looks = backdrop.look_at(
+        bounds,
+        alone,
+        jnp.arange(count, dtype=jnp.int32),
+        resolution=resolution,
+        most_taps=config.backdrop.most_taps,
+    )
+    copies = backdrop.smoothed(params.field, config.space)
+    leave = jax.vmap(functools.partial(scene_bounds.exit_distance, bounds))
+    distance = ends.tau + leave(ends.origins, ends.directions)
+    seen = Composite(
+        rgb=backdrop.colours(copies, looks, pixels=count),
+        accumulation=jnp.ones_like(paths.radii),
+        median=distance,
+        mean=distance,
+    )
+    return PathRadiance(seen, histograms=(), outside=jnp.ones((count, 0), bool))
 
 
 def random_jitter(key: Array, config: ModelConfig, slots: Int[Array, " paths"]) -> Jitter:

@@ -22,6 +22,7 @@ from refref_jax.choices import (
     Contraction,
     DataLoss,
     DistortionOver,
+    FarField,
     FieldName,
     Footprint,
     Interior,
@@ -177,6 +178,9 @@ class FieldConfig:
         with contraction=always 0.5.
       far: Far plane: distance of the last sample from the last bend in contracted space, world
         units; by default 1000, with contraction=always 150, and 10,000 in unbounded scenes.
+      far_field: Model of the world behind the objects: the radiance field, or only its surface
+        (backdrop), a cube, sphere or environment whose radiance is solved for.
+      backdrop_resolution: Number of cells per side of a face of the backdrop.
     """
 
     preset: PresetName = option("tiny")
@@ -196,6 +200,8 @@ class FieldConfig:
     contraction: Contraction = option("unbounded")
     near: float | None = option(None, after=_BOUNDS, comparison="none")
     far: float | None = option(None, after=_BOUNDS, comparison="none")
+    far_field: FarField = option("field")
+    backdrop_resolution: int | None = option(None, after=("far_field",))
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -213,6 +219,10 @@ class FieldConfig:
             )
         if self.max_res is not None and not 1 <= self.max_res <= _FINEST:
             raise ValueError(f"max_res is {self.max_res}. Give 1 to {_FINEST} cells per side.")
+        if self.backdrop_resolution is not None and not 4 <= self.backdrop_resolution <= _FINEST:
+            raise ValueError(
+                f"backdrop_resolution is {self.backdrop_resolution}. Give 4 to {_FINEST}."
+            )
         if self.dilation is not None and not 0.0 <= self.dilation < math.inf:
             raise ValueError(f"dilation is {self.dilation}. Give 0 or a positive number.")
         for name, distance in (("near", self.near), ("far", self.far)):
@@ -278,6 +288,7 @@ class ScheduleConfig:
       pretraced_batches: Number of batches whose light paths are traced at once.
       adam_b2: Decay of Adam's second moment, in [0, 1): 0.99 as in Zip-NeRF, whose hash entries are
         touched too rarely for a longer memory, or 0.999 as in the paper's released code.
+      iterations: Number of iterations of the solver of a backdrop, which may need fewer.
     """
 
     steps: int | None = option(None, after=("preset",))
@@ -288,11 +299,12 @@ class ScheduleConfig:
     batch: int | None = option(None, after=("preset",))
     pretraced_batches: int | None = option(None, formerly="pool", after=("preset",))
     adam_b2: float = option(0.99)
+    iterations: int | None = option(None, after=("far_field",))
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
         configuration.convert_fields(self)
-        for name in ("steps", "warmup", "anneal", "batch", "pretraced_batches"):
+        for name in ("steps", "warmup", "anneal", "batch", "pretraced_batches", "iterations"):
             number, least = getattr(self, name), 0 if name in ("warmup", "anneal") else 1
             if number is not None and not least <= number <= _MOST:
                 raise ValueError(f"{name} is {number}. Give {least} to {_MOST}.")

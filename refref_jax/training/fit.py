@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
+import jax.numpy as jnp
+import optax
 from jax.sharding import Mesh
 
 from refref_jax import atomic_files, configuration
@@ -24,10 +26,10 @@ from refref_jax.data import image_files, scene_folder, scene_source
 from refref_jax.data.batches import PixelSampler
 from refref_jax.data.meshes import MeshPart
 from refref_jax.optics.scene import Scene
-from refref_jax.render import checkpoint_io
+from refref_jax.render import checkpoint_io, volume_rendering
 from refref_jax.render.checkpoint_io import SavedModel
-from refref_jax.render.model import Model
-from refref_jax.training import devices, loop, run_folder
+from refref_jax.render.model import Model, init_params
+from refref_jax.training import backdrop_solver, devices, loop, run_folder
 from refref_jax.training.config import TrainConfig, require
 from refref_jax.training.loop import TrainState, init_state
 from refref_jax.training.objective import StepReport
@@ -252,11 +254,19 @@ def train(
     config, model = run_folder.read_config(run), checkpoint_io.read_static(run)
     lock = atomic_files.hold(run) if devices.is_first() else contextlib.nullcontext()
     with lock, Checkpoints(run, keep=periods.keep) as checkpoints:
-        if checkpoints.newest() == config.schedule.steps:
-            report(f"{run} is trained already: {config.schedule.steps} steps.")
+        solved = model.config.backdrop is not None
+        total = require(config.schedule.iterations if solved else config.schedule.steps)
+        if checkpoints.newest() == total:
+            report(f"{run} is trained already: {total} {'iterations' if solved else 'steps'}.")
             return True
-        sampler = _sampler(config, scene_source.open_scene(scene or config.scene.path))
+        folder = scene_source.open_scene(scene or config.scene.path)
         objects = checkpoint_io.load_scene(run)
+        if solved:
+            step = _solve(run, config, model, objects, folder, checkpoints, progress, stop)
+            if step < total:
+                report(f"Stopped at iteration {step}.")
+            return step == total
+        sampler = _sampler(config, folder)
         setup = loop.set_up(config, model.config, model.settings, objects, sampler, mesh=mesh)
         if setup.hit_fraction == 0.0 and model.settings.max_bends > 0:
             report(
@@ -270,9 +280,9 @@ def train(
         if devices.any_process(stop()):
             raise KeyboardInterrupt  # there is no new state to save
         step = _take_steps(run, setup, state, checkpoints, periods, progress, stop)
-    if step < require(config.schedule.steps):
+    if step < total:
         report(f"Stopped at step {step}.")
-    return step == config.schedule.steps
+    return step == total
 
 
 def _sampler(config: TrainConfig, scene: Path) -> PixelSampler:
@@ -321,6 +331,67 @@ def _take_steps(
         if stopping:
             break
     return step
+
+
+def _solve(
+    run: Path,
+    config: TrainConfig,
+    model: SavedModel,
+    scene: Scene,
+    folder: Path,
+    checkpoints: Checkpoints,
+    progress: Progress,
+    stop: Callable[[], bool],
+) -> int:
+    """Solves for the backdrop, and returns the number of the last iteration.
+
+    A checkpoint is written after each round of iterations.
+    """
+    shape, bounds = model.config.backdrop, volume_rendering.domain(model.config)
+    assert shape is not None
+    total, begun = require(config.schedule.iterations), time.monotonic()
+    frames = scene_folder.read_frames(folder, "train")
+    blocks = backdrop_solver.read_equations(
+        scene,
+        frames.cameras,
+        scene_folder.read_images(frames),
+        settings=model.settings,
+        domain=bounds,
+        resolution=shape.resolution,
+        most_taps=shape.most_taps,
+        progress=lambda view, views: progress(0, total, f"tracing view {view} of {views}"),
+    )
+    state = TrainState(
+        jnp.zeros((), jnp.int32), init_params(jax.random.key(0), model.config), optax.EmptyState()
+    )
+    if checkpoints.newest() is not None:
+        state = checkpoints.restore(state)
+    step = int(state.step)
+    earlier = run_folder.rewind_metrics(run, step)
+    if stop():
+        raise KeyboardInterrupt  # there is no new state to save
+    iterations = backdrop_solver.solve(
+        blocks,
+        space=bounds.space,
+        resolution=shape.resolution,
+        iterations=total,
+        start=(step, state.params.field) if step else None,
+    )
+    for reached in iterations:
+        step = reached.step
+        psnr, held_out = reached.fitted, reached.held_out
+        seconds = earlier + time.monotonic() - begun
+        line = {"step": step, "psnr": psnr, "psnr_held_out": held_out, "seconds": seconds}
+        run_folder.append_metrics(run, configuration.string_safe(line))
+        progress(step, total, f"PSNR {psnr:.2f}  held out {held_out:.2f}")
+        state = state._replace(params=state.params._replace(field=reached.pyramid))
+        if step % backdrop_solver.ROUND == 0 and step < total:
+            checkpoints.save(state._replace(step=jnp.asarray(step, jnp.int32)))
+            if stop():
+                return step
+    # The solver may be done before the last iteration.
+    checkpoints.save(state._replace(step=jnp.asarray(total, jnp.int32)))
+    return total
 
 
 def _line(step: int, measured: StepReport, rate: float, seconds: float) -> dict[str, Any]:

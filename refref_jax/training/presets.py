@@ -45,6 +45,7 @@ from refref_jax.fields import mlps, registry
 from refref_jax.fields.base import RadianceConfig
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.geometry.cameras import Cameras
+from refref_jax.render.backdrop import BackdropConfig
 from refref_jax.render.model import ModelConfig, ProposalConfig
 from refref_jax.training.config import FieldConfig, LossConfig, ScheduleConfig
 
@@ -54,6 +55,12 @@ _WALLS = 7.3
 Paths end there, on an opaque background, so the value must be exact: a cube that is 3 % too large
 costs 2.7 dB.
 """
+
+BACKDROP_RESOLUTION = 384
+"""Default number of cells per side of a face of a backdrop."""
+
+BACKDROP_ITERATIONS = 32
+"""Default number of iterations of its solver."""
 
 _NEAR = 0.05
 _FAR_UNBOUNDED = 1000.0
@@ -177,6 +184,8 @@ def override_model(model: ModelConfig, asked: FieldConfig) -> ModelConfig:
         model = _with_samples(model, asked.samples_per_ray, asked.preset)
     names = ("multisamples", "footprint", "dilation")
     given = {name: getattr(asked, name) for name in names}
+    if asked.far_field == "backdrop":
+        given["backdrop"] = BackdropConfig(asked.backdrop_resolution or BACKDROP_RESOLUTION)
     model = dataclasses.replace(model, **{n: x for n, x in given.items() if x is not None})
     if asked.precision is not None:
         proposals = tuple(

@@ -340,6 +340,7 @@ def _resolve_model(
     fields = () if model.interior == "field" else facts.analysis.field_parts
     model = dataclasses.replace(model, learned_tints=learned, field_parts=fields)
     model = presets.override_model(model, config.model)
+    config = _resolve_far_field(config, model, facts, reasons)
     config = _decide(
         config,
         reasons,
@@ -347,6 +348,46 @@ def _resolve_model(
         **presets.sampling_of(model),
     )
     return model, config
+
+
+def _resolve_far_field(
+    config: TrainConfig, model: ModelConfig, facts: SceneFacts, reasons: dict[str, str]
+) -> TrainConfig:
+    """Decides the size and the solver of a backdrop.
+
+    Raises:
+      ValueError: if the scene needs a field.
+    """
+    if model.backdrop is None:
+        asked = config.model.backdrop_resolution, config.schedule.iterations
+        for name, value in zip(("backdrop_resolution", "iterations"), asked, strict=True):
+            if value is not None:
+                raise ValueError(
+                    f"{name}={value} has no effect with far_field=field. Leave it out, or use "
+                    "far_field=backdrop."
+                )
+        return config
+    opaque = any(part.material.kind == "opaque" for part in facts.parts)
+    why_not = {
+        "a field inside the objects (interior=field)": (
+            config.model.interior == "field" and config.paths.name != "straight"
+        ),
+        "parts whose interior is a field": bool(model.field_parts),
+        "opaque parts, whose colour a field learns": opaque and config.paths.name != "straight",
+        "learned tints": bool(model.learned_tints),
+        "contraction=always": config.model.contraction == "always",
+    }
+    if found := [name for name, holds in why_not.items() if holds]:
+        raise ValueError(
+            f"far_field=backdrop, but this run has {' and '.join(found)}. Use far_field=field."
+        )
+    return _decide(
+        config,
+        reasons,
+        "far_field=backdrop",
+        backdrop_resolution=model.backdrop.resolution,
+        iterations=presets.BACKDROP_ITERATIONS,
+    )
 
 
 def _resolve_bounds(

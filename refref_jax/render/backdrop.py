@@ -1,0 +1,450 @@
+"""The far field as a surface: a cube, a sphere or an environment with learned radiance.
+
+Where the world behind the objects is a surface at a known place, a pixel is a linear function of
+the radiance on that surface: the sum over its light paths of throughput times radiance. This module
+maps the ends of light paths to points of the surface (`look_at`), and evaluates the linear function
+(`colours`) and its transpose (`transposed`).
+
+The surface is a cube map: six faces with a grid of `n + 1` by `n + 1` vertices each, between which
+radiance is interpolated bilinearly. The faces of a cube are separate images; those of a sphere and
+of an environment share the vertices of their common edges, so that there are neither seams nor
+poles. A sphere is indexed by the direction from its centre, an environment by the direction of the
+light, both through equal angles.
+
+The unknowns are a pyramid: the radiance is the sum of the bilinear interpolations of all levels,
+each with half the resolution of the next. A coarse level is determined by many pixels and fills
+the gaps of the finer ones, where no light path ends.
+
+A pixel is a square, not a point: its light path is shifted by the ray differential to several
+places of the pixel (`taps`), and a footprint wider than the grid reads a smoothed copy of it.
+
+Sources: Igehy, Tracing Ray Differentials (1999); Bramble, Pasciak and Xu, Parallel Multilevel
+Preconditioners (1990), for the sum over levels.
+"""
+
+import dataclasses
+import functools
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from refref_jax import numerics
+from refref_jax.choices import Space
+from refref_jax.native_loop import native_loop
+from refref_jax.optics.light_paths import PathEnds
+from refref_jax.sampling import scene_bounds
+from refref_jax.sampling.scene_bounds import Domain
+
+FACES = 6
+
+
+@dataclasses.dataclass(frozen=True)
+class BackdropConfig:
+    """Shape of a far field surface; the kind of the surface is the space of the scene.
+
+    Attributes:
+      resolution: number of cells per side of a face.
+      most_taps: largest number of taps along each axis of a ray's footprint.
+    """
+
+    resolution: int
+    most_taps: int = 3
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        if self.resolution < 1 or self.most_taps < 1:
+            raise ValueError(
+                f"The backdrop has resolution {self.resolution} and at most {self.most_taps} taps. "
+                "Give positive numbers."
+            )
+
+
+# Number of cells per side below which a level is not halved again.
+_COARSEST = 4
+
+# Width of a pixel per cone radius: a square has the variance of a disc of this radius.
+_PIXEL_WIDTH = math.sqrt(3.0)
+
+# A footprint of this width, in cells, covers the surface; near the critical angle it is unbounded.
+_WIDEST = 1e6
+
+Pyramid = tuple[Float[Array, "6 _ _ 3"], ...]
+"""Radiance of each level, coarse to fine; linear RGB."""
+
+Copies = tuple[Float[Array, "6 _ _ 3"], ...]
+"""Radiance at each resolution, fine to coarse; linear RGB."""
+
+
+class Looks(NamedTuple):
+    """Points of the surface that light paths end on; lengths are in cells of the finest grid.
+
+    Attributes:
+      pixels: index of the pixel that each path belongs to.
+      faces: face of the cube map.
+      levels: number of times that the grid is halved, 0 for the finest.
+      taps: number of taps along each axis of the pixel, 0 for empty slots.
+      places: position of the path's end, column and row of the grid.
+      axes: change of the position across the pixel, along both axes.
+      throughput: throughput of the path, linear RGB.
+    """
+
+    pixels: Int[Array, "*paths"]
+    faces: Int[Array, "*paths"]
+    levels: Int[Array, "*paths"]
+    taps: Int[Array, "*paths"]
+    places: Float[Array, "*paths 2"]
+    axes: Float[Array, "*paths 2 2"]
+    throughput: Float[Array, "*paths 3"]
+
+
+def sides(resolution: int) -> tuple[int, ...]:
+    """Returns the number of cells per side of each level, coarse to fine."""
+    found = [resolution]
+    while found[-1] % 2 == 0 and found[-1] // 2 >= _COARSEST:
+        found.append(found[-1] // 2)
+    return tuple(reversed(found))
+
+
+def init(resolution: int, radiance: Float[Array, "3"] | float = 0.0) -> Pyramid:
+    """Returns a surface of uniform radiance.
+
+    Args:
+      resolution: number of cells per side of a face.
+      radiance: linear RGB.
+    """
+    first, *others = sides(resolution)
+    base = jnp.broadcast_to(jnp.asarray(radiance, jnp.float32), (FACES, first + 1, first + 1, 3))
+    return (base, *(jnp.zeros((FACES, side + 1, side + 1, 3)) for side in others))
+
+
+def look_at(
+    domain: Domain,
+    ends: PathEnds,
+    pixels: Int[Array, " paths"],
+    *,
+    resolution: int,
+    most_taps: int,
+) -> Looks:
+    """Returns where light paths end on the surface.
+
+    Args:
+      domain: scene bounds; their `space` is the kind of the surface.
+      ends: last segments of the paths. Paths without ray differentials have one tap.
+      pixels: index of the pixel that each path belongs to.
+      resolution: number of cells per side of a face.
+      most_taps: largest number of taps along each axis of a pixel.
+    """
+    faces, places, axes = jax.vmap(functools.partial(_place, domain))(
+        ends.origins, ends.directions, ends.differentials.points, ends.differentials.directions
+    )
+    half = 0.5 * resolution
+    axes = jnp.clip(_PIXEL_WIDTH * half * axes, -_WIDEST, _WIDEST)
+    width = jnp.sqrt(jnp.max(jnp.sum(jnp.square(axes), axis=-1), axis=-1))
+    taps = jnp.clip(jnp.ceil(width), 1, most_taps)
+    coarser = jnp.round(jnp.log2(jnp.maximum(width / taps, 1.0))).astype(jnp.int32)
+    real = jnp.any(ends.throughput > 0.0, axis=-1)
+    return Looks(
+        pixels=pixels,
+        faces=faces,
+        levels=jnp.minimum(coarser, len(sides(resolution)) - 1),
+        taps=jnp.where(real, taps.astype(jnp.int32), 0),
+        places=half * (places + 1.0),
+        axes=axes,
+        throughput=ends.throughput,
+    )
+
+
+def _place(
+    domain: Domain,
+    origin: Float[Array, "3"],
+    direction: Float[Array, "3"],
+    points: Float[Array, "axes 3"],
+    directions: Float[Array, "axes 3"],
+) -> tuple[Int[Array, ""], Float[Array, "2"], Float[Array, "2 2"]]:
+    """Returns a ray's face and its place there in `[-1, 1]`, with derivatives across the pixel."""
+    towards = _towards(domain, origin, direction)
+    axis = jnp.argmax(jnp.abs(towards)).astype(jnp.int32)
+    face = 2 * axis + (towards[axis] > 0.0).astype(jnp.int32)
+
+    def place(origin: Array, direction: Array) -> Array:
+        towards = _towards(domain, origin, direction, axis=axis)
+        major = jnp.abs(towards[axis])
+        others = jnp.stack([towards[(axis + 1) % 3], towards[(axis + 2) % 3]])
+        ratio = numerics.safe_divide(others, jnp.broadcast_to(major, others.shape))
+        return ratio if domain.space == "bounded" else (4.0 / jnp.pi) * jnp.arctan(ratio)
+
+    if points.shape[0] == 0:
+        return face, place(origin, direction), jnp.zeros((2, 2), origin.dtype)
+    at, push = jax.linearize(place, origin, direction)
+    return face, at, jax.vmap(push)(points, directions)
+
+
+def _towards(
+    domain: Domain,
+    origin: Float[Array, "3"],
+    direction: Float[Array, "3"],
+    *,
+    axis: Int[Array, ""] | None = None,
+) -> Float[Array, "3"]:
+    """Returns the vector from the centre to the surface; of a cube's plane, if `axis` is given."""
+    if domain.space == "unbounded":
+        return direction
+    from_centre = origin - jnp.asarray(domain.centre, origin.dtype)
+    if axis is not None and domain.space == "bounded":
+        wall = jnp.where(direction[axis] > 0.0, domain.radius, -domain.radius)
+        distance = numerics.safe_divide(wall - from_centre[axis], direction[axis])
+        return from_centre + distance * direction
+    if domain.space == "spherical":
+        middle, half = scene_bounds.chord(domain.radius, from_centre, direction)
+        return from_centre + (middle + half) * direction
+    distance = scene_bounds.exit_distance(domain, origin, direction)
+    return from_centre + jnp.where(jnp.isfinite(distance), distance, 0.0) * direction
+
+
+def smoothed(pyramid: Pyramid, space: Space) -> Copies:
+    """Returns the radiance at all resolutions, fine to coarse: the sum of the levels, then halved.
+
+    Args:
+      pyramid: radiance of each level.
+      space: kind of the surface, `bounded` for a cube, whose faces are separate.
+    """
+    total = pyramid[0]
+    for level in pyramid[1:]:
+        total = _refine(total) + level
+    copies = [_joined(total, space)]
+    for _ in pyramid[1:]:
+        copies.append(_joined(_halve(copies[-1]), space))
+    return tuple(copies)
+
+
+def _refine(grid: Float[Array, "6 side side 3"]) -> Float[Array, "6 finer finer 3"]:
+    """Returns the bilinear interpolation of a grid at the vertices of one twice as fine."""
+    zero = jnp.zeros((), grid.dtype)
+    for axis in (1, 2):
+        dilated = jax.lax.pad(grid, zero, [(0, 0, int(n == axis)) for n in range(4)])
+        wider = jax.lax.pad(dilated, zero, [(int(n == axis),) * 2 + (0,) for n in range(4)])
+        sides_ = _every(wider, axis, 0, -2, 1) + _every(wider, axis, 2, None, 1)
+        grid = dilated + 0.5 * sides_
+    return grid
+
+
+def _halve(grid: Float[Array, "6 side side 3"]) -> Float[Array, "6 coarser coarser 3"]:
+    """Returns weighted means at every second vertex: 1/4, 1/2, 1/4, or 2/3, 1/3 at an edge."""
+    zero = jnp.zeros((), grid.dtype)
+    for axis in (1, 2):
+        wider = jax.lax.pad(grid, zero, [(int(n == axis),) * 2 + (0,) for n in range(4)])
+        sides_ = _every(wider, axis, 0, -1, 2) + _every(wider, axis, 2, None, 2)
+        share = np.ones((grid.shape[axis] + 1) // 2, np.float32)
+        share[[0, -1]] = 4.0 / 3.0
+        mean = 0.5 * _every(grid, axis, 0, None, 2) + 0.25 * sides_
+        grid = mean * share.reshape([-1 if n == axis else 1 for n in range(4)])
+    return grid
+
+
+def _every(grid: Array, axis: int, start: int, stop: int | None, stride: int) -> Array:
+    """Returns a slice along one axis."""
+    return grid[tuple(slice(start, stop, stride) if n == axis else slice(None) for n in range(4))]
+
+
+def _joined(grid: Float[Array, "6 side side 3"], space: Space) -> Float[Array, "6 side side 3"]:
+    """Returns a grid whose faces agree on their common edges, unless it is a cube's."""
+    if space == "bounded":
+        return grid
+    where, groups = _edges(grid.shape[1] - 1)
+    rows = grid.reshape(-1, 3)
+    sums = jax.ops.segment_sum(rows[where], groups, num_segments=int(groups.max()) + 1)
+    shares = np.bincount(groups).astype(np.float32)[:, None]
+    return rows.at[where].set((sums / shares)[groups]).reshape(grid.shape)
+
+
+@functools.lru_cache(maxsize=64)
+def _edges(side: int) -> tuple[Int[np.ndarray, " edges"], Int[np.ndarray, " edges"]]:
+    """Returns the vertices on edges of the cube map, and a number for each point of the edges."""
+    row, column = np.mgrid[: side + 1, : side + 1]
+    corners = []
+    for face in range(FACES):
+        axis, positive = divmod(face, 2)
+        point = np.empty((side + 1, side + 1, 3), np.int64)
+        point[..., axis] = side * positive
+        point[..., (axis + 1) % 3], point[..., (axis + 2) % 3] = column, row
+        corners.append(point)
+    points = np.stack(corners).reshape(-1, 3)
+    where = np.flatnonzero(np.sum((points == 0) | (points == side), axis=1) > 1)
+    _, groups = np.unique(points[where], axis=0, return_inverse=True)
+    return where, groups.reshape(-1).astype(np.int32)
+
+
+def _table(copies: Copies) -> Float[Array, "texels 3"]:
+    """Returns the radiance of all resolutions as one list."""
+    return jnp.concatenate([copy.reshape(-1, 3) for copy in copies])
+
+
+def _grids(resolution: int) -> Int[np.ndarray, "levels 2"]:
+    """Returns the first entry in the list, and the number of cells per side, of each resolution."""
+    fine_to_coarse = sides(resolution)[::-1]
+    sizes = [FACES * (side + 1) ** 2 for side in fine_to_coarse]
+    first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    return np.stack([first, fine_to_coarse], axis=-1).astype(np.int32)
+
+
+def _corners(
+    looks: Looks, grids: Int[Array, "levels 2"], tap: Int[Array, ""]
+) -> list[tuple[Int[Array, "*paths"], Float[Array, "*paths"]]]:
+    """Returns entry and bilinear weight of the four vertices around one tap of a light path.
+
+    A tap beyond the edge of its face stays on it. Empty slots have weights of 0.
+    """
+    count = jnp.maximum(looks.taps, 1)
+    precision = looks.places.dtype
+    number = count.astype(precision)
+    share = jnp.where(tap < looks.taps * looks.taps, 1.0, 0.0) / (number * number)
+    along, across = (
+        (n.astype(precision) + 0.5) / number - 0.5 for n in (tap // count, tap % count)
+    )
+    first, side = grids[looks.levels, 0], grids[looks.levels, 1]
+    scale = jnp.exp2(-looks.levels.astype(precision))
+    low, high = [], []
+    for axis in range(2):
+        moved = along * looks.axes[..., 0, axis] + across * looks.axes[..., 1, axis]
+        place = scale * (looks.places[..., axis] + moved)
+        place = jnp.clip(place, 0.0, side.astype(precision))
+        cell = jnp.minimum(place.astype(jnp.int32), side - 1)
+        low.append(cell)
+        high.append(place - cell.astype(precision))
+    (column, row), (right, up), stride = low, high, side + 1
+    entry = first + (looks.faces * stride + row) * stride + column
+    return [
+        (entry, share * (1.0 - right) * (1.0 - up)),
+        (entry + 1, share * right * (1.0 - up)),
+        (entry + stride, share * (1.0 - right) * up),
+        (entry + stride + 1, share * right * up),
+    ]
+
+
+def colours(copies: Copies, looks: Looks, *, pixels: int) -> Float[Array, "pixels 3"]:
+    """Returns the linear RGB of pixels: their paths' sum of throughput times radiance.
+
+    Args:
+      copies: radiance at all resolutions (`smoothed`).
+      looks: points of the surface that the paths end on.
+      pixels: number of pixels.
+    """
+    table, grids = _table(copies), jnp.asarray(_grids(copies[0].shape[1] - 1))
+    return jax.lax.platform_dependent(
+        table,
+        grids,
+        looks,
+        cpu=functools.partial(_read_native, pixels),
+        default=functools.partial(_read, pixels),
+    )
+
+
+def transposed(slopes: Float[Array, "pixels 3"], looks: Looks, *, resolution: int) -> Copies:
+    """Returns the transpose of `colours`: what each pixel adds to the vertices that it reads.
+
+    Args:
+      slopes: factor of each pixel.
+      looks: points of the surface that the paths end on.
+      resolution: number of cells per side of a face.
+    """
+    grids = _grids(resolution)
+    entries = int(grids[-1, 0] + FACES * (grids[-1, 1] + 1) ** 2)
+    table = jax.lax.platform_dependent(
+        slopes,
+        jnp.asarray(grids),
+        looks,
+        cpu=functools.partial(_add_native, entries),
+        default=functools.partial(_add, entries),
+    )
+    shapes = [(FACES, side + 1, side + 1, 3) for side in sides(resolution)[::-1]]
+    parts = jnp.split(table, grids[1:, 0])
+    return tuple(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True))
+
+
+def _read(pixels: int, table: Array, grids: Array, looks: Looks) -> Float[Array, "pixels 3"]:
+    """Returns the colours of pixels, one tap of all paths at a time."""
+
+    def add(tap: Array, seen: Array) -> Array:
+        return seen + sum(
+            weight[:, None] * table[entry] for entry, weight in _corners(looks, grids, tap)
+        )
+
+    seen = jax.lax.fori_loop(0, jnp.max(looks.taps, initial=0) ** 2, add, 0.0 * looks.throughput)
+    return jax.ops.segment_sum(looks.throughput * seen, looks.pixels, num_segments=pixels)
+
+
+def _add(entries: int, slopes: Array, grids: Array, looks: Looks) -> Float[Array, "entries 3"]:
+    """Returns the transpose of `_read`."""
+    slope = looks.throughput * slopes[looks.pixels]
+
+    def add(tap: Array, table: Array) -> Array:
+        for entry, weight in _corners(looks, grids, tap):
+            table = table.at[entry].add(weight[:, None] * slope)
+        return table
+
+    table = jnp.zeros((entries, 3), slopes.dtype)
+    return jax.lax.fori_loop(0, jnp.max(looks.taps, initial=0) ** 2, add, table)
+
+
+def _read_native(pixels: int, table: Array, grids: Array, looks: Looks) -> Array:
+    """Is `_read` as one loop over paths."""
+
+    @native_loop
+    def read_all(table: Array, grids: Array, looks: Looks) -> Array:
+        def read(index: Array, seen: Array) -> Array:
+            look = _record(looks, index)
+
+            def add(tap: Array, total: Array) -> Array:
+                for entry, weight in _corners(look, grids, tap):
+                    total += weight * _record(table, entry)
+                return total
+
+            total = jax.lax.fori_loop(0, look.taps**2, add, jnp.zeros(3, table.dtype))
+            light = _record(seen, look.pixels) + look.throughput * total
+            return _with_record(seen, look.pixels, light)
+
+        start = jnp.zeros((pixels, 3), table.dtype)
+        return jax.lax.fori_loop(0, looks.taps.shape[0], read, start)
+
+    return read_all(table, grids, looks)
+
+
+def _add_native(entries: int, slopes: Array, grids: Array, looks: Looks) -> Array:
+    """Is `_add` as one loop over paths."""
+
+    @native_loop
+    def add_all(slopes: Array, grids: Array, looks: Looks) -> Array:
+        def add(index: Array, table: Array) -> Array:
+            look = _record(looks, index)
+            slope = look.throughput * _record(slopes, look.pixels)
+
+            def spread(tap: Array, table: Array) -> Array:
+                for entry, weight in _corners(look, grids, tap):
+                    table = _with_record(table, entry, _record(table, entry) + weight * slope)
+                return table
+
+            return jax.lax.fori_loop(0, look.taps**2, spread, table)
+
+        start = jnp.zeros((entries, 3), slopes.dtype)
+        return jax.lax.fori_loop(0, looks.taps.shape[0], add, start)
+
+    return add_all(slopes, grids, looks)
+
+
+def _record(values: Any, index: Array) -> Any:
+    """Returns one record of arrays."""
+
+    def pick(x: Array) -> Array:
+        return jax.lax.dynamic_index_in_dim(x, index, keepdims=False, allow_negative_indices=False)
+
+    return jax.tree.map(pick, values)
+
+
+def _with_record(values: Array, index: Array, value: Array) -> Array:
+    return jax.lax.dynamic_update_index_in_dim(
+        values, value, index, axis=0, allow_negative_indices=False
+    )
