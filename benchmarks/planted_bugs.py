@@ -360,14 +360,14 @@ BUGS = (
     ),
     Bug(
         "leaf of the tree skipped",
-        "geometry/traversal_cpu.py",
+        "geometry/traversal.py",
         "leaf = jnp.where(leaf != 0, leaf, next_leaf)",
         "leaf = next_leaf",
         ("geometry/test_bvh.py::test_hits_of_random_rays_equal_brute_force",),
     ),
     Bug(
         "triangle of a leaf skipped",
-        "geometry/traversal_cpu.py",
+        "geometry/traversal.py",
         "for offset in range(1, bvh_nodes.LEAF_SIZE)",
         "for offset in range(2, bvh_nodes.LEAF_SIZE)",
         ("geometry/test_bvh.py::test_hits_of_random_rays_equal_brute_force",),

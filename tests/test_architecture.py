@@ -45,7 +45,7 @@ _MOST_WITH_ONE_IMPORTER = 15
 _MAY_JIT = {
     "render/images.py",
     "render/background_rendering.py",
-    "render/first_surface.py",
+    "training/backdrop_solver.py",
     "render/pixel_paths.py",
     "training/loop.py",
     "training/evaluation.py",

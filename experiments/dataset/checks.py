@@ -32,7 +32,7 @@ from refref_jax.data.mesh_queries import Containment
 from refref_jax.data.meshes import MeshPart
 from refref_jax.geometry import cameras
 from refref_jax.optics.path_settings import PathSettings
-from refref_jax.render.first_surface import FirstSurface, find_first_surface
+from refref_jax.render.images import FirstSurface, find_first_surface
 
 PSNR = 33.0
 """Least masked PSNR, dB, of the rendering relative to the image."""

@@ -26,7 +26,7 @@ from refref_jax.geometry.triangle_meshes import Mesh, diameter, join
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.reconstruct.masks import overlaps
 from refref_jax.reconstruct.mesh_distance import compare_meshes, signed_distance, silhouettes
-from refref_jax.render.first_surface import FirstSurface, find_first_surface
+from refref_jax.render.images import FirstSurface, find_first_surface
 
 FOLDER = "pictures"
 FILE = "report.md"

@@ -32,7 +32,7 @@ from refref_jax.optics.interface_rules import RULES, ambient_of
 from refref_jax.optics.light_paths import Branch
 from refref_jax.optics.media import Interfaces
 from refref_jax.render import Model, images, render_image
-from refref_jax.render.first_surface import NO_PART, find_first_surface
+from refref_jax.render.images import NO_PART, find_first_surface
 
 RGB, REFRACTION, REFLECTION = "rgb", "refraction only", "reflection only"
 DISTANCE, NORMALS, MASK, ERROR = "distance", "normals", "mask", "error"

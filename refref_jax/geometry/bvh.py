@@ -1,8 +1,8 @@
 """Closest hits of rays with a packed bounding volume hierarchy (BVH) of triangles.
 
-On a CPU, packets of rays traverse the tree together (`traversal_cpu`); on an accelerator, every ray
-traverses it alone and all rays run in lock-step (`traversal_accelerator`). `bvh_nodes` describes
-the memory layout of the tree, `bvh_build` its construction.
+On a CPU, packets of rays traverse the tree together; on an accelerator, every ray traverses it
+alone and all rays run in lock-step (`traversal`). `bvh_nodes` describes the memory layout of the
+tree, `bvh_build` its construction.
 
 `closest_hits` takes a batch of rays with one leading axis. `closest_primitive` takes one ray, for
 use under `vmap` and differentiation: under any nesting of `vmap`, all rays are cast as one batch.
@@ -17,10 +17,10 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
-from refref_jax.geometry import bvh_nodes, traversal_accelerator, traversal_cpu
+from refref_jax.geometry import bvh_nodes, traversal
 from refref_jax.geometry import triangles as prepared
 from refref_jax.geometry.rays import Rays
-from refref_jax.geometry.traversal_cpu import PACKET, Packet
+from refref_jax.geometry.traversal import PACKET, Packet
 
 LEAF_SIZE = bvh_nodes.LEAF_SIZE
 """Maximum number of triangles in a leaf."""
@@ -97,7 +97,7 @@ def closest_hits(
         limits,
         exclude_primitive,
         cpu=_closest_in_packets,
-        default=jax.vmap(traversal_accelerator.trace_ray, in_axes=(None, None, 0, 0, 0, 0)),
+        default=jax.vmap(traversal.trace_ray, in_axes=(None, None, 0, 0, 0, 0)),
     )
     return _finish(bvh, origins, directions, distances, primitive_ids)
 
@@ -148,7 +148,7 @@ def _closest_in_packets(
 
     slabs = jax.vmap(bvh_nodes.slabs)(origins, directions)
     octants = jnp.where(limits >= 0.0, jax.vmap(bvh_nodes.octant)(directions), bvh_nodes.OCTANTS)
-    closest = traversal_cpu.trace(
+    closest = traversal.trace(
         nodes,
         facets,
         Packet(

@@ -42,7 +42,7 @@ from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.grids import Box, Field, Points, Values, lattice
 from refref_jax.reconstruct.masks import Views, check_masks, overlaps, views_at
 from refref_jax.reconstruct.visual_hull import REACH, values_by_view
-from refref_jax.render.first_surface import find_first_surface
+from refref_jax.render.images import find_first_surface
 
 # Triangles in the first query, and the factor by which each further query grows.
 _FIRST = 8

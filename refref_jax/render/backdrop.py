@@ -109,7 +109,7 @@ def sides(resolution: int) -> tuple[int, ...]:
     return tuple(reversed(found))
 
 
-def init(resolution: int, radiance: Float[Array, "3"] | float = 0.0) -> Pyramid:
+def init(resolution: int, *, radiance: Float[Array, "3"] | float = 0.0) -> Pyramid:
     """Returns a surface of uniform radiance.
 
     Args:
@@ -227,8 +227,8 @@ def _refine(grid: Float[Array, "6 side side 3"]) -> Float[Array, "6 finer finer 
     for axis in (1, 2):
         dilated = jax.lax.pad(grid, zero, [(0, 0, int(n == axis)) for n in range(4)])
         wider = jax.lax.pad(dilated, zero, [(int(n == axis),) * 2 + (0,) for n in range(4)])
-        sides_ = _every(wider, axis, 0, -2, 1) + _every(wider, axis, 2, None, 1)
-        grid = dilated + 0.5 * sides_
+        beside = _every(wider, axis, 0, -2, 1) + _every(wider, axis, 2, None, 1)
+        grid = dilated + 0.5 * beside
     return grid
 
 
@@ -237,10 +237,10 @@ def _halve(grid: Float[Array, "6 side side 3"]) -> Float[Array, "6 coarser coars
     zero = jnp.zeros((), grid.dtype)
     for axis in (1, 2):
         wider = jax.lax.pad(grid, zero, [(int(n == axis),) * 2 + (0,) for n in range(4)])
-        sides_ = _every(wider, axis, 0, -1, 2) + _every(wider, axis, 2, None, 2)
-        share = np.ones((grid.shape[axis] + 1) // 2, np.float32)
-        share[[0, -1]] = 4.0 / 3.0
-        mean = 0.5 * _every(grid, axis, 0, None, 2) + 0.25 * sides_
+        beside = _every(wider, axis, 0, -1, 2) + _every(wider, axis, 2, None, 2)
+        count = (grid.shape[axis] + 1) // 2
+        share = jnp.ones(count, grid.dtype).at[jnp.array([0, count - 1])].set(4.0 / 3.0)
+        mean = 0.5 * _every(grid, axis, 0, None, 2) + 0.25 * beside
         grid = mean * share.reshape([-1 if n == axis else 1 for n in range(4)])
     return grid
 

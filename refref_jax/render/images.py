@@ -8,6 +8,8 @@ the modules that call `jax.jit`.
 With several rays per pixel, a pixel is divided into `side x side` smaller ones. Each has its own
 ray, with a footprint smaller by the same factor, so the fields are queried for finer detail too.
 Colours are averaged as linear light and encoded afterwards, as a camera does.
+
+`find_first_surface` casts rays without light: distances, normals and parts.
 """
 
 import functools
@@ -20,8 +22,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from refref_jax.choices import side_of
+from refref_jax.geometry import bvh
 from refref_jax.geometry.cameras import Cameras, box_filter, pixel_rays, supersample
 from refref_jax.geometry.rays import Rays
+from refref_jax.geometry.surfaces import Surfaces, surface_point
 from refref_jax.numerics import host_array
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import Branch, LightPaths, reflected_first
@@ -47,6 +51,12 @@ TILE = 16384
 CHUNK = 4096
 """Number of paths rendered at once. Lower it if memory runs out."""
 
+CAST_TILE = 65536
+"""Number of rays cast at once."""
+
+NO_PART = -1
+
+_CAST_INSTEAD = "Call it outside, or cast single rays with bvh.closest_hits."
 _INSTEAD = "Call it outside, or use render_rays, which is a pure function."
 _BRANCHES: tuple[Branch, ...] = get_args(Branch)
 _ALL, _TRANSMITTED, _REFLECTED = range(len(_BRANCHES))
@@ -415,3 +425,56 @@ def _bands(cameras: Cameras, view: int, *, rows: int) -> Iterator[Rays]:
     for start in range(0, cameras.height, rows):
         row, column = np.indices((min(rows, cameras.height - start), cameras.width))
         yield pixel_rays(cameras, np.full(row.shape, view), start + row, column)
+
+
+class FirstSurface(NamedTuple):
+    """First surface hit by each ray. The leading axes are those of the rays.
+
+    Attributes:
+      distances: arc length from the ray's origin, world units; `inf` for a miss.
+      normals: unit shading normal, out of the object; zero for a miss.
+      parts: index of the mesh part, or `NO_PART`.
+    """
+
+    distances: Float[np.ndarray, "*rays"]
+    normals: Float[np.ndarray, "*rays 3"]
+    parts: Int[np.ndarray, "*rays"]
+
+
+def find_first_surface(surfaces: Surfaces, rays: Rays, *, tile: int = CAST_TILE) -> FirstSurface:
+    """Casts rays and returns the first surface of each.
+
+    Args:
+      surfaces: surfaces of the scene.
+      rays: rays with any leading axes, usually `[height, width]`, and unit directions.
+      tile: number of rays cast at once.
+
+    Raises:
+      ValueError: if `tile` is less than 1.
+    """
+    if tile < 1:
+        raise ValueError(f"tile is {tile}, but a tile needs rays. Give 1 or more.")
+    surfaces = jax.device_put(surfaces)
+    empty = np.zeros((0, 3), jax.dtypes.canonicalize_dtype(rays.radii.dtype))
+    return in_tiles(
+        lambda part, *_: FirstSurface(*_cast_tile(surfaces, part)),
+        rays,
+        tile=size_for(rays.radii.size, most=tile),
+        nothing=FirstSurface(empty[:, 0], empty, np.zeros(0, np.int32)),
+        instead=_CAST_INSTEAD,
+    )
+
+
+@jax.jit
+def _cast_tile(
+    surfaces: Surfaces, rays: Rays
+) -> tuple[Float[Array, " rays"], Float[Array, "rays 3"], Int[Array, " rays"]]:
+    limits = jnp.full_like(rays.radii, jnp.inf)
+    exclude_primitive = jnp.full(rays.radii.shape, bvh.NO_PRIMITIVE, jnp.int32)
+    hits = bvh.closest_hits(surfaces.bvh, rays, limits=limits, exclude_primitive=exclude_primitive)
+    found = hits.primitive_ids != bvh.NO_PRIMITIVE
+    points = jax.vmap(surface_point, in_axes=(None, 0, 0))(
+        surfaces, hits.primitive_ids, hits.barycentrics
+    )
+    normals = jnp.where(found[:, None], points.shading_normal, 0.0)
+    return hits.distances, normals, jnp.where(found, points.part, NO_PART)

@@ -4,8 +4,8 @@ The pixels are linear functions of the surface (`render.backdrop`), so its radia
 value, which is found without a learning rate: by conjugate gradients on the normal equations, with
 a diagonal preconditioner on the levels of the pyramid. Nothing is stored but where light paths end.
 
-The error that is minimised is that of sRGB colours. Every few iterations each pixel's equation is
-weighted anew, such that its linear residual becomes the sRGB one (an iteratively reweighted
+The error that is minimised is that of sRGB colours. Every few iterations each pixel's equation gets
+a new weight, such that its linear residual becomes the sRGB one (an iteratively reweighted
 Gauss-Newton method); saturated pixels that are predicted brighter, and outliers, such as pixels on
 outlines, lose their weight. A weak prior on the details of the pyramid determines vertices that no
 pixel sees: they continue their surroundings smoothly.
@@ -14,6 +14,7 @@ A fraction of the pixels is held out; their error decides when to stop.
 """
 
 import functools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -282,8 +283,8 @@ def solve(
 ) -> Iterator[Progress]:
     """Yields the state after each iteration; it may stop earlier than asked.
 
-    After every `ROUND` iterations the pixels are weighted anew, and the search starts again from
-    the radiance alone: a run that is continued from there is the same as one without a pause.
+    After every `ROUND` iterations the pixels get new weights, and the search starts again from the
+    radiance alone: a run that is continued from there is the same as one without a pause.
 
     Args:
       blocks: equations of all views.
@@ -293,10 +294,10 @@ def solve(
       start: number of iterations, a multiple of `ROUND`, and radiance of an earlier run.
       prior: weight of the details of the pyramid, relative to a pixel's squared sRGB error.
     """
-    kept = float(sum(np.sum(np.asarray(block.kept)) for block in blocks))
+    kept = float(sum(jnp.sum(block.kept) for block in blocks))
     total = float(sum(block.kept.size for block in blocks))
     mean = sum(jnp.sum(block.linear, axis=0) for block in blocks) / total
-    step, x = start or (0, backdrop.init(resolution, mean))
+    step, x = start or (0, backdrop.init(resolution, radiance=mean))
     priors = tuple(jnp.float32(prior if i else 1e-2 * prior) for i in range(len(x)))
 
     def transpose(slopes: list[Array]) -> Pyramid:
@@ -310,7 +311,7 @@ def solve(
         copies = _smoothed(x, space)
         return [_predict(copies, block) for block in blocks]
 
-    reached = -np.inf
+    reached = -math.inf
     while step < iterations:
         seen = predict(x)
         weights = [_first_weights(block) for block in blocks]

@@ -30,7 +30,7 @@ from refref_jax import choices, metrics
 from refref_jax.data import scene_folder
 from refref_jax.geometry import cameras
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.render import first_surface, images, learned_media
+from refref_jax.render import images, learned_media
 from refref_jax.render.images import CHUNK, Rendering
 from refref_jax.render.model import Model
 
@@ -186,7 +186,7 @@ def first_distances(model: Model, views: Cameras, i: int) -> Float[np.ndarray, "
     if model.settings.max_bends == 0:
         return None
     rays = cameras.image_rays(views, i)
-    return first_surface.find_first_surface(model.scene.surfaces, rays).distances
+    return images.find_first_surface(model.scene.surfaces, rays).distances
 
 
 def read_truth(scene: Path, split: str) -> Truth:

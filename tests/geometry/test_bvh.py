@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.geometry import bvh, bvh_build, traversal_accelerator
+from refref_jax.geometry import bvh, bvh_build, traversal
 from refref_jax.geometry.rays import Rays
 from tests.factories import arrays
 from tests.oracles import reference
@@ -21,7 +21,7 @@ _DISTANCE_TOLERANCE = 2e-5
 def _trace(tree, origins, directions, limits, exclude_primitive, *, lockstep=False):
     if lockstep:
         nodes = tree.nodes.reshape(-1, 8)
-        walk = jax.vmap(traversal_accelerator.trace_ray, in_axes=(None, None, 0, 0, 0, 0))
+        walk = jax.vmap(traversal.trace_ray, in_axes=(None, None, 0, 0, 0, 0))
         found = walk(nodes, tree.facets, origins, directions, limits, exclude_primitive)
         return bvh._finish(tree, origins, directions, *found)
     rays = Rays(origins, directions, jnp.zeros(len(origins)))

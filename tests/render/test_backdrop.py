@@ -47,7 +47,7 @@ def test_levels_are_halved_while_their_number_of_cells_is_even():
 @pytest.mark.parametrize("space", _SPACES)
 def test_a_uniform_surface_is_the_throughput_of_each_pixel(space):
     rays = _rays(200, radius=0.3)
-    copies = backdrop.smoothed(backdrop.init(_SIDE, jnp.array([0.2, 0.5, 4.0])), space)
+    copies = backdrop.smoothed(backdrop.init(_SIDE, radiance=jnp.array([0.2, 0.5, 4.0])), space)
     for copy in copies:
         np.testing.assert_allclose(copy, np.broadcast_to([0.2, 0.5, 4.0], copy.shape), rtol=1e-6)
     looks = _looks(_DOMAINS[space], rays)

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from refref_jax.geometry.rays import Rays
-from refref_jax.render.first_surface import NO_PART, find_first_surface
+from refref_jax.render.images import NO_PART, find_first_surface
 from tests.factories import scenes
 
 

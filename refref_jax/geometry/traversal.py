@@ -1,4 +1,4 @@
-"""Packet traversal of the BVH, for CPUs.
+"""Traversal of the BVH: packets of rays on CPUs, single rays in lock-step on accelerators.
 
 The rays of a packet share one node index, and the packet descends where any of its rays hits. Rays
 are stored component by component, so that XLA turns each operation of the single-ray functions in
@@ -7,6 +7,9 @@ cost of a packet without active rays is negligible.
 
 A packet uses the node table of its rays' octant. If its rays have several octants, it traverses
 the tree once for each, with the other rays masked.
+
+On an accelerator, the state of a ray's loop is a row of the node table and the closest hit so far.
+Under `vmap`, `trace_ray` becomes one loop over all rays, which ends with the slowest ray.
 
 Source: Wald et al., Interactive Rendering with Coherent Ray Tracing (2001), for packets; Smits,
 Efficiency Issues for Ray Tracing (1998), for skip pointers.
@@ -203,3 +206,78 @@ def _test_leaf(
 
 def _closer(a: Closest, b: Closest, take: Array) -> Closest:
     return Closest(*(jnp.where(take, x, y) for x, y in zip(a, b, strict=True)))
+
+
+class _RayWalk(NamedTuple):
+    """State of a ray's traversal: the next node, and the closest hit so far."""
+
+    node: Int[Array, ""]
+    distance: Float[Array, ""]
+    primitive_id: Int[Array, ""]
+
+
+def trace_ray(
+    nodes: Int[Array, "rows 8"],
+    packed: Float[Array, "primitives 12"],
+    origin: Float[Array, "3"],
+    direction: Float[Array, "3"],
+    limit: Float[Array, ""],
+    exclude_primitive: Int[Array, ""],
+) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """Traces one ray.
+
+    Args:
+      nodes: node tables of all octants, concatenated.
+      packed: precomputed triangles.
+      origin: start of the ray.
+      direction: unit vector.
+      limit: farthest distance of interest, negative for a ray that is not to be traced.
+      exclude_primitive: triangle that the ray cannot hit.
+
+    Returns:
+      The distance and index of the closest hit; the limit and `NONE` for a miss.
+    """
+    slabs = bvh_nodes.slabs(origin, direction)
+    rows = nodes.shape[0] // bvh_nodes.OCTANTS
+    root = bvh_nodes.octant(direction) * rows
+    end = root + rows - 1
+
+    def advance(walk: _RayWalk) -> _RayWalk:
+        node = bvh_nodes.read_node(nodes, walk.node)
+        hit = bvh_nodes.overlaps(slabs, node.entry, node.exit, walk.distance)
+        tested = hit & (node.leaf > 0)
+        distance, primitive_id = jax.lax.cond(
+            tested,
+            lambda: _test_leaf_of_ray(
+                packed, origin, direction, exclude_primitive, node.leaf - 1, walk
+            ),
+            lambda: (walk.distance, walk.primitive_id),
+        )
+        return _RayWalk(jnp.where(hit, walk.node + 1, node.skip), distance, primitive_id)
+
+    start = _RayWalk(
+        jnp.where(limit >= 0.0, root, end), limit, jnp.full_like(exclude_primitive, bvh_nodes.NONE)
+    )
+    walk = jax.lax.while_loop(lambda walk: walk.node < end, advance, start)
+    return walk.distance, walk.primitive_id
+
+
+def _test_leaf_of_ray(
+    packed: Float[Array, "primitives 12"],
+    origin: Float[Array, "3"],
+    direction: Float[Array, "3"],
+    exclude_primitive: Int[Array, ""],
+    first: Int[Array, ""],
+    walk: _RayWalk,
+) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """Returns the closest of the hit so far and the hits in one leaf; the lower index wins ties."""
+    distance, primitive_id = walk.distance, walk.primitive_id
+    for offset in range(bvh_nodes.LEAF_SIZE):
+        candidate = first + offset
+        facet = bvh_nodes.read_row(packed, candidate)
+        found = triangles.distance(origin, direction, facet)
+        closer = (found < distance) | ((found == distance) & (candidate < primitive_id))
+        closer = closer & (candidate != exclude_primitive)
+        distance = jnp.where(closer, found, distance)
+        primitive_id = jnp.where(closer, candidate, primitive_id)
+    return distance, primitive_id
