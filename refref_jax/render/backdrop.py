@@ -69,6 +69,9 @@ _COARSEST = 4
 # Width of a pixel per cone radius: a square has the variance of a disc of this radius.
 _PIXEL_WIDTH = math.sqrt(3.0)
 
+# XLA unrolls loops over fewer paths, and aborts if a native loop has none left.
+_FEW = 64
+
 # A footprint of this width, in cells, covers the surface; near the critical angle it is unbounded.
 _WIDEST = 1e6
 
@@ -258,7 +261,8 @@ def _joined(grid: Float[Array, "6 side side 3"], space: Space) -> Float[Array, "
     rows = grid.reshape(-1, 3)
     sums = jax.ops.segment_sum(rows[where], groups, num_segments=int(groups.max()) + 1)
     shares = np.bincount(groups).astype(np.float32)[:, None]
-    return rows.at[where].set((sums / shares)[groups]).reshape(grid.shape)
+    means = (sums / shares)[groups]
+    return rows.at[where].set(means, unique_indices=True).reshape(grid.shape)
 
 
 @functools.lru_cache(maxsize=64)
@@ -338,7 +342,7 @@ def colours(copies: Copies, looks: Looks, *, pixels: int) -> Float[Array, "pixel
         table,
         grids,
         looks,
-        cpu=functools.partial(_read_native, pixels),
+        cpu=functools.partial(_read if looks.taps.size < _FEW else _read_native, pixels),
         default=functools.partial(_read, pixels),
     )
 
@@ -357,7 +361,7 @@ def transposed(slopes: Float[Array, "pixels 3"], looks: Looks, *, resolution: in
         slopes,
         jnp.asarray(grids),
         looks,
-        cpu=functools.partial(_add_native, entries),
+        cpu=functools.partial(_add if looks.taps.size < _FEW else _add_native, entries),
         default=functools.partial(_add, entries),
     )
     shapes = [(FACES, side + 1, side + 1, 3) for side in sides(resolution)[::-1]]

@@ -16,7 +16,7 @@ A fraction of the pixels is held out; their error decides when to stop.
 import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -62,6 +62,9 @@ PRIOR = 1e-3
 
 # A round that improves the held-out pixels by less, in dB, is the last.
 _WORTH = 0.02
+
+
+_Arrays = TypeVar("_Arrays")
 
 
 class Block(NamedTuple):
@@ -190,7 +193,8 @@ def _block(looks: Looks, photographs: UInt8[np.ndarray, "views h w 3"], seed: in
     """Returns the equations of some views; the seed draws the pixels that are held out."""
     srgb = host_array(photographs.reshape(-1, 3).astype(np.float32) / 255.0)
     held_out = np.random.default_rng(seed).integers(_HELD_OUT, size=len(srgb)) == 0
-    return Block(looks, pixels.srgb_to_linear(srgb), srgb, host_array(np.float32(~held_out)))
+    linear = pixels.srgb_to_linear(jax.device_put(srgb))
+    return Block(looks, linear, srgb, host_array(np.float32(~held_out)))
 
 
 def _weights(predicted: Array, block: Block, typical: float | Array) -> Float[Array, "pixels 3"]:
@@ -251,6 +255,12 @@ def _dot(a: Pyramid, b: Pyramid) -> Array:
 
 
 @jax.jit
+def _add_scaled(a: _Arrays, scale: Float[Array, "3"], b: _Arrays) -> _Arrays:
+    """Returns `a + scale b`, with a scale for each channel."""
+    return jax.tree.map(lambda x, y: x + jnp.broadcast_to(scale, y.shape) * y, a, b)
+
+
+@jax.jit
 def _begin_search(residual: Pyramid, diagonal: Pyramid) -> tuple[Pyramid, Array]:
     direction = jax.tree.map(jnp.divide, residual, diagonal)
     return direction, _dot(residual, direction)
@@ -263,12 +273,12 @@ def _advance(
     """Takes one step of conjugate gradients; each channel is a system of its own."""
     curvature = _dot(direction, image)
     alpha = jnp.where(curvature > 0.0, rho / jnp.where(curvature > 0.0, curvature, 1.0), 0.0)
-    x = jax.tree.map(lambda a, b: a + alpha * b, x, direction)
-    residual = jax.tree.map(lambda a, b: a - alpha * b, residual, image)
+    x = _add_scaled(x, alpha, direction)
+    residual = _add_scaled(residual, -alpha, image)
     scaled = jax.tree.map(jnp.divide, residual, diagonal)
     after = _dot(residual, scaled)
     beta = jnp.where(rho > 0.0, after / jnp.where(rho > 0.0, rho, 1.0), 0.0)
-    direction = jax.tree.map(lambda a, b: a + beta * b, scaled, direction)
+    direction = _add_scaled(scaled, beta, direction)
     return x, residual, direction, after, alpha
 
 
@@ -297,7 +307,8 @@ def solve(
     kept = float(sum(jnp.sum(block.kept) for block in blocks))
     total = float(sum(block.kept.size for block in blocks))
     mean = sum(jnp.sum(block.linear, axis=0) for block in blocks) / total
-    step, x = start or (0, backdrop.init(resolution, radiance=mean))
+    uniform = backdrop.init(resolution, radiance=mean)
+    step, x = start or (0, uniform)
     priors = tuple(jnp.float32(prior if i else 1e-2 * prior) for i in range(len(x)))
 
     def transpose(slopes: list[Array]) -> Pyramid:
@@ -311,19 +322,18 @@ def solve(
         copies = _smoothed(x, space)
         return [_predict(copies, block) for block in blocks]
 
-    reached = -math.inf
     while step < iterations:
-        seen = predict(x)
+        seen, before = predict(x), -math.inf
         weights = [_first_weights(block) for block in blocks]
         if step:
             _, before, typical = _measure(blocks, seen, kept, total)
-            if before < reached + _WORTH:
-                return
-            reached = before
             weights = [_next_weights(s, b, typical) for s, b in zip(seen, blocks, strict=True)]
         diagonal = jax.tree.map(lambda ours, weight: ours + weight, transpose(weights), priors)
         gap = [w * (b.linear - s) for w, b, s in zip(weights, blocks, seen, strict=True)]
-        residual = jax.tree.map(lambda a, weight, b: a - weight * b, transpose(gap), priors, x)
+        # The prior of vertices that no pixel sees is the mean of all pixels.
+        residual = jax.tree.map(
+            lambda a, weight, b, c: a - weight * (b - c), transpose(gap), priors, x, uniform
+        )
         direction, rho = _begin_search(residual, diagonal)
         for _ in range(min(ROUND, iterations - step)):
             moved = predict(direction)
@@ -332,10 +342,12 @@ def solve(
             x, residual, direction, rho, alpha = _advance(
                 x, residual, direction, image, diagonal, rho
             )
-            seen = [s + alpha * m for s, m in zip(seen, moved, strict=True)]
+            seen = _add_scaled(seen, alpha, moved)
             step += 1
             fitted, held_out, _ = _measure(blocks, seen, kept, total)
             yield Progress(step, x, fitted, held_out)
+        if held_out < before + _WORTH:
+            return
 
 
 def _measure(
@@ -345,8 +357,7 @@ def _measure(
     measured = [_residuals(b, s) for b, s in zip(blocks, seen, strict=True)]
     fitted = float(sum(m[0] for m in measured)) / kept
     held_out = float(sum(m[1] for m in measured)) / max(total - kept, 1.0)
-    typical = float(
-        np.median(np.concatenate([np.asarray(m[2]).reshape(-1)[::17] for m in measured]))
-    )
+    some = np.concatenate([np.asarray(m[2]).reshape(-1)[::_EVERY] for m in measured])
+    typical = float(np.median(some))
     decibels = [-10.0 * np.log10(max(x, 1e-12)) for x in (fitted, held_out)]
     return decibels[0], decibels[1], max(1.4826 * typical, _ROUNDING)

@@ -1,0 +1,174 @@
+"""The solver of backdrops: recovers known backgrounds, at the extremes, and through glass."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.geometry import cameras
+from refref_jax.optics.path_settings import STRAIGHT, TREE
+from refref_jax.optics.scene import Scene
+from refref_jax.render import backdrop, pixels, render_known
+from refref_jax.render.backgrounds import Environment, LinearTexture, radiance_of
+from refref_jax.sampling.scene_bounds import Domain
+from refref_jax.training import backdrop_solver
+from refref_jax.training.backdrop_solver import Block
+from tests.factories import scenes
+
+_RESOLUTION = 16
+_SKY = Domain(1.0, "unbounded")
+_TREE = dataclasses.replace(TREE, max_bends=8)
+
+
+def _environment(brightness=1.0):
+    """Returns a smooth environment: three directions with a colour each."""
+    row, column = np.mgrid[:64, :128]
+    elevation, azimuth = np.pi * (0.5 - (row + 0.5) / 64), 2 * np.pi * (0.5 - (column + 0.5) / 128)
+    flat = np.cos(elevation)
+    towards = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1)
+    texels = brightness * (0.3 + 0.25 * np.sin(2.0 * towards))
+    return radiance_of(Environment(LinearTexture(jnp.asarray(texels, jnp.float32))))
+
+
+def _views(count=6, size=24):
+    """Returns cameras around the origin, half of them above it."""
+    rings = [
+        cameras.orbit(count // 2, distance=4.0, elevation=angle, size=size, angle_x=1.6)
+        for angle in (0.9, -0.8)
+    ]
+    return rings[0]._replace(poses=np.concatenate([ring.poses for ring in rings]))
+
+
+def _photographs(scene, radiance, views, settings):
+    images = []
+    for view in range(len(views.poses)):
+        rays = cameras.image_rays(cameras.supersample(views, 3), view)
+        linear = render_known(scene, radiance, rays, settings=settings).linear
+        srgb = pixels.linear_to_srgb(jnp.asarray(cameras.box_filter(np.asarray(linear), 3)))
+        images.append(np.round(255.0 * np.clip(srgb, 0.0, 1.0)).astype(np.uint8))
+    return np.stack(images)
+
+
+def _equations(scene, views, images, *, settings=STRAIGHT, domain=_SKY, **options):
+    return backdrop_solver.read_equations(
+        scene,
+        views,
+        images,
+        settings=settings,
+        domain=domain,
+        resolution=_RESOLUTION,
+        **options,
+    )
+
+
+def _solve(blocks, iterations=16, **options):
+    *_, last = backdrop_solver.solve(
+        blocks, space="unbounded", resolution=_RESOLUTION, iterations=iterations, **options
+    )
+    return last
+
+
+@pytest.fixture(scope="module")
+def ball() -> Scene:
+    return scenes.build(scenes.ball(1.3, subdivisions=3))
+
+
+def test_an_environment_is_recovered_through_glass(ball):
+    views, sky = _views(), _environment()
+    blocks = _equations(ball, views, _photographs(ball, sky, views, _TREE), settings=_TREE)
+    last = _solve(blocks)
+    assert last.fitted > 40.0 and last.held_out > 38.0
+    # Another view, rendered by the solved backdrop and by the known environment.
+    other = cameras.orbit(1, distance=3.0, elevation=0.1, size=24, angle_x=1.2)
+    image = _photographs(ball, sky, other, _TREE)
+    (block,) = _equations(ball, other, image, settings=_TREE, side=2)
+    copies = backdrop.smoothed(last.pyramid, "unbounded")
+    seen = pixels.linear_to_srgb(backdrop.colours(copies, block.looks, pixels=24**2))
+    assert np.sqrt(np.mean((seen - block.srgb) ** 2)) < 0.012
+
+
+def test_paused_solving_is_the_same_as_solving_without_a_pause(ball):
+    views = _views(4, 16)
+    blocks = _equations(ball, views, _photographs(ball, _environment(), views, STRAIGHT))
+    whole = _solve(blocks, 3 * backdrop_solver.ROUND)
+    first = _solve(blocks, backdrop_solver.ROUND)
+    rest = _solve(blocks, 3 * backdrop_solver.ROUND, start=(first.step, first.pyramid))
+    assert whole.step == rest.step
+    for ours, theirs in zip(whole.pyramid, rest.pyramid, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_the_number_of_rays_in_a_tile_does_not_matter(ball, monkeypatch):
+    views = _views(2, 16)
+    images = _photographs(ball, _environment(), views, STRAIGHT)
+    whole = _equations(ball, views, images, blocks=1)
+    monkeypatch.setattr(backdrop_solver.images, "TILE", 128)
+    tiled = _equations(ball, views, images, blocks=1)
+    for ours, theirs in zip(jax.tree.leaves(whole), jax.tree.leaves(tiled), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-4)
+
+
+def _one_pixel(srgb, *, throughput=1.0, kept=1.0):
+    """Returns the equation of one pixel whose only path ends in the middle of a face."""
+    looks = backdrop.Looks(
+        pixels=jnp.zeros(1, jnp.int32),
+        faces=jnp.zeros(1, jnp.int32),
+        levels=jnp.zeros(1, jnp.int32),
+        taps=jnp.ones(1, jnp.int32),
+        places=jnp.full((1, 2), 0.5 * _RESOLUTION),
+        axes=jnp.zeros((1, 2, 2)),
+        throughput=jnp.full((1, 3), throughput),
+    )
+    colour = jnp.full((1, 3), srgb)
+    return Block(looks, pixels.srgb_to_linear(colour), colour, jnp.full(1, kept))
+
+
+def test_one_vertex_seen_by_one_pixel_continues_everywhere():
+    last = _solve([_one_pixel(0.5)])
+    expected = float(pixels.srgb_to_linear(jnp.float32(0.5)))
+    for copy in backdrop.smoothed(last.pyramid, "unbounded"):
+        np.testing.assert_allclose(copy, expected, rtol=1e-3)
+
+
+def test_saturated_pixels_bound_the_radiance_from_below():
+    # The same vertex is white in one pixel, and far brighter behind a dark filter.
+    white, dimmed = _one_pixel(1.0), _one_pixel(0.5, throughput=0.05)
+    last = _solve([white, dimmed], iterations=32)
+    expected = float(pixels.srgb_to_linear(jnp.float32(0.5))) / 0.05
+    middle = backdrop.smoothed(last.pyramid, "unbounded")[0][0, 8, 8]
+    assert expected > 4.0
+    np.testing.assert_allclose(middle, expected, rtol=0.05)
+
+
+def test_pixels_that_are_held_out_have_no_weight():
+    last = _solve([_one_pixel(0.5), _one_pixel(0.9, kept=0.0)])
+    expected = float(pixels.srgb_to_linear(jnp.float32(0.5)))
+    middle = backdrop.smoothed(last.pyramid, "unbounded")[0][0, 8, 8]
+    np.testing.assert_allclose(middle, expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize("throughput", [0.0, 1e-20, 1e-6])
+def test_pixels_without_light_leave_the_radiance_finite(throughput):
+    last = _solve([_one_pixel(0.5, throughput=throughput)])
+    assert all(np.all(np.isfinite(level)) for level in last.pyramid)
+
+
+def test_a_wrong_size_of_the_background_is_seen_in_the_residuals(ball):
+    from refref_jax.render.backgrounds import SphereBackground  # noqa: PLC0415
+
+    sky = _environment()
+    texture = sky.args[0].texture
+    room = radiance_of(SphereBackground(texture, jnp.float32(6.0)))
+    views = _views()
+    images = _photographs(ball, room, views, _TREE)
+    reached = {}
+    for radius in (6.0, 9.0):
+        domain = Domain(radius, "spherical")
+        blocks = _equations(ball, views, images, settings=_TREE, domain=domain)
+        *_, last = backdrop_solver.solve(
+            blocks, space="spherical", resolution=_RESOLUTION, iterations=16
+        )
+        reached[radius] = last.held_out
+    assert reached[6.0] > reached[9.0] + 2.0
