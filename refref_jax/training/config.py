@@ -181,6 +181,7 @@ class FieldConfig:
       far_field: Model of the world behind the objects: the radiance field, or only its surface
         (backdrop), a cube, sphere or environment whose radiance is solved for.
       backdrop_resolution: Number of cells per side of a face of the backdrop.
+      iterations: Largest number of iterations of the backdrop's solver.
     """
 
     preset: PresetName = option("tiny")
@@ -202,6 +203,7 @@ class FieldConfig:
     far: float | None = option(None, after=_BOUNDS, comparison="none")
     far_field: FarField = option("field")
     backdrop_resolution: int | None = option(None, after=("far_field",))
+    iterations: int | None = option(None, after=("far_field",))
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -219,10 +221,10 @@ class FieldConfig:
             )
         if self.max_res is not None and not 1 <= self.max_res <= _FINEST:
             raise ValueError(f"max_res is {self.max_res}. Give 1 to {_FINEST} cells per side.")
-        if self.backdrop_resolution is not None and not 4 <= self.backdrop_resolution <= _FINEST:
-            raise ValueError(
-                f"backdrop_resolution is {self.backdrop_resolution}. Give 4 to {_FINEST}."
-            )
+        for name, least in (("backdrop_resolution", 4), ("iterations", 1)):
+            number = getattr(self, name)
+            if number is not None and not least <= number <= _FINEST:
+                raise ValueError(f"{name} is {number}. Give {least} to {_FINEST}.")
         if self.dilation is not None and not 0.0 <= self.dilation < math.inf:
             raise ValueError(f"dilation is {self.dilation}. Give 0 or a positive number.")
         for name, distance in (("near", self.near), ("far", self.far)):
@@ -288,7 +290,6 @@ class ScheduleConfig:
       pretraced_batches: Number of batches whose light paths are traced at once.
       adam_b2: Decay of Adam's second moment, in [0, 1): 0.99 as in Zip-NeRF, whose hash entries are
         touched too rarely for a longer memory, or 0.999 as in the paper's released code.
-      iterations: Number of iterations of the solver of a backdrop, which may need fewer.
     """
 
     steps: int | None = option(None, after=("preset",))
@@ -299,12 +300,11 @@ class ScheduleConfig:
     batch: int | None = option(None, after=("preset",))
     pretraced_batches: int | None = option(None, formerly="pool", after=("preset",))
     adam_b2: float = option(0.99)
-    iterations: int | None = option(None, after=("far_field",))
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
         configuration.convert_fields(self)
-        for name in ("steps", "warmup", "anneal", "batch", "pretraced_batches", "iterations"):
+        for name in ("steps", "warmup", "anneal", "batch", "pretraced_batches"):
             number, least = getattr(self, name), 0 if name in ("warmup", "anneal") else 1
             if number is not None and not least <= number <= _MOST:
                 raise ValueError(f"{name} is {number}. Give {least} to {_MOST}.")

@@ -255,7 +255,7 @@ def train(
     lock = atomic_files.hold(run) if devices.is_first() else contextlib.nullcontext()
     with lock, Checkpoints(run, keep=periods.keep) as checkpoints:
         solved = model.config.backdrop is not None
-        total = require(config.schedule.iterations if solved else config.schedule.steps)
+        total = require(config.model.iterations if solved else config.schedule.steps)
         if checkpoints.newest() == total:
             report(f"{run} is trained already: {total} {'iterations' if solved else 'steps'}.")
             return True
@@ -349,7 +349,7 @@ def _solve(
     """
     shape, bounds = model.config.backdrop, volume_rendering.domain(model.config)
     assert shape is not None
-    total, begun = require(config.schedule.iterations), time.monotonic()
+    total, begun = require(config.model.iterations), time.monotonic()
     frames = scene_folder.read_frames(folder, "train")
     blocks = backdrop_solver.read_equations(
         scene,

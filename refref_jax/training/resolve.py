@@ -359,7 +359,7 @@ def _resolve_far_field(
       ValueError: if the scene needs a field.
     """
     if model.backdrop is None:
-        asked = config.model.backdrop_resolution, config.schedule.iterations
+        asked = config.model.backdrop_resolution, config.model.iterations
         for name, value in zip(("backdrop_resolution", "iterations"), asked, strict=True):
             if value is not None:
                 raise ValueError(

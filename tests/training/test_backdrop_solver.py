@@ -156,7 +156,7 @@ def test_pixels_without_light_leave_the_radiance_finite(throughput):
 
 
 def test_a_wrong_size_of_the_background_is_seen_in_the_residuals(ball):
-    from refref_jax.render.backgrounds import SphereBackground  # noqa: PLC0415
+    from refref_jax.render.backgrounds import SphereBackground
 
     sky = _environment()
     texture = sky.args[0].texture

@@ -93,10 +93,35 @@ def test_resolve_leaves_nothing_open_and_is_idempotent(found, given):
     straight = made.model.settings.max_bends == 0
     for option in options_of():
         left = straight and option.name == "reentry"
+        left |= option.name in ("backdrop_resolution", "iterations")
         assert left == (made.config.get(option.name) is None), option.name
         assert made.reasons[option.name]
     again = resolve(made.config, SceneFacts(found, CAMERAS, (), None, None, ()))
     assert (again.config, again.model) == (made.config, made.model)
+
+
+def test_a_backdrop_has_a_size_and_a_number_of_iterations():
+    made = _resolve(_CLEAR, far_field="backdrop", backdrop_resolution=64)
+    assert made.model.config.backdrop.resolution == 64
+    assert made.config.model.iterations > 0
+    again = resolve(made.config, SceneFacts(_CLEAR, CAMERAS, (), None, None, ()))
+    assert (again.config, again.model) == (made.config, made.model)
+
+
+@pytest.mark.parametrize(
+    ("found", "given", "message"),
+    [
+        ("clear", {"backdrop_resolution": 64}, "backdrop_resolution=64 has no effect"),
+        ("clear", {"iterations": 8}, "iterations=8 has no effect"),
+        ("clear", {"far_field": "backdrop", "interior": "field"}, "interior=field"),
+        ("clear", {"far_field": "backdrop", "contraction": "always"}, "contraction=always"),
+        ("untold", {"far_field": "backdrop"}, "learned tints"),
+        ("clear", {"far_field": "backdrop", "backdrop_resolution": 3}, "backdrop_resolution is 3"),
+    ],
+)
+def test_a_backdrop_is_refused_where_the_scene_needs_a_field(found, given, message):
+    with pytest.raises(ValueError, match=message):
+        _resolve({"clear": _CLEAR, "untold": _UNTOLD}[found], **given)
 
 
 @pytest.mark.parametrize(

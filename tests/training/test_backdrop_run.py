@@ -1,0 +1,78 @@
+"""Runs with a backdrop: solved, paused and continued, rendered, and refused where none fits."""
+
+import jax
+import numpy as np
+import pytest
+
+from refref_jax.data import scene_folder
+from refref_jax.geometry.cameras import image_rays
+from refref_jax.render import Model, render_image
+from refref_jax.training import backdrop_solver, run_folder
+from refref_jax.training.config import TrainConfig
+from refref_jax.training.fit import fit
+from tests.factories.cut_ball import cut_ball
+
+pytestmark = [pytest.mark.loose]
+
+_ROUND = backdrop_solver.ROUND
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return cut_ball(tmp_path_factory.mktemp("scenes") / "cube_smcvx_ball")
+
+
+def _config(scene):
+    return TrainConfig().override(
+        scene=str(scene), far_field="backdrop", backdrop_resolution=64, iterations=2 * _ROUND
+    )
+
+
+@pytest.fixture(scope="module")
+def run(scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    lines = []
+    model = fit(_config(scene), out=folder, report=lines.append)
+    return folder, model, lines
+
+
+def test_a_backdrop_is_solved_and_rendered(scene, run):
+    folder, model, lines = run
+    assert isinstance(model, Model) and model.params.proposals == ()
+    assert any("far_field=backdrop" in line for line in lines)
+    reached = run_folder.read_metrics(folder)
+    assert [line["step"] for line in reached] == list(range(1, len(reached) + 1))
+    assert reached[-1]["psnr"] > reached[0]["psnr"] + 5.0
+    frames = scene_folder.read_frames(scene, "train")
+    seen = render_image(model, image_rays(frames.cameras, 0))
+    error = np.asarray(seen.rgb) - scene_folder.read_images(frames)[0] / 255.0
+    assert -10.0 * np.log10(np.mean(error**2)) > 19.0
+    np.testing.assert_allclose(seen.accumulation, 1.0, atol=1e-4)
+
+
+def test_distances_are_those_of_the_walls_along_the_path(scene, run):
+    frames = scene_folder.read_frames(scene, "train")
+    seen = render_image(run[1], image_rays(frames.cameras, 0))
+    away = ~scene_folder.read_masks(frames)[0]
+    expected = scene_folder.read_distances(frames)[0]
+    both = away & np.isfinite(expected)
+    # Depth maps are rounded to 8 bits, and the farthest values are saturated.
+    error = np.abs(np.asarray(seen.distance) - expected)[both]
+    assert np.median(error) < 0.05 and np.quantile(error, 0.9) < 0.1
+
+
+def test_a_paused_run_continues_to_the_same_bits(scene, run, tmp_path):
+    calls = []
+
+    def stop():
+        calls.append(len(calls))
+        return len(calls) == 2  # after the first round
+
+    fit(_config(scene), out=tmp_path / "run", stop=stop, report=lambda line: None)
+    assert run_folder.read_metrics(tmp_path / "run")[-1]["step"] == _ROUND
+    lines = []
+    again = fit(None, out=tmp_path / "run", existing="resume", report=lines.append)
+    pairs = zip(jax.tree.leaves(again.params), jax.tree.leaves(run[1].params), strict=True)
+    assert all(np.array_equal(ours, theirs) for ours, theirs in pairs)
+    fit(None, out=tmp_path / "run", existing="resume", report=lines.append)
+    assert "trained already" in lines[-1]
