@@ -14,9 +14,11 @@ A fraction of the pixels is held out; their error decides when to stop.
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, TypeVar
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -65,6 +67,7 @@ _WORTH = 0.02
 
 
 _Arrays = TypeVar("_Arrays")
+_Result = TypeVar("_Result")
 
 
 class Block(NamedTuple):
@@ -141,14 +144,15 @@ def read_equations(
       resolution: number of cells per side of a face.
       most_taps: largest number of taps along each axis of a ray's footprint.
       side: number of rays along each edge of a pixel.
-      blocks: number of blocks that the views are split into.
-      progress: function called after each view.
+      blocks: number of blocks that the views are split into; they are traced and solved at once.
+      progress: function called after each view, from several threads.
     """
     scene = jax.device_put(scene)
     shape = photographs.shape[1] * photographs.shape[2]
     group = max(1, images.TILE // (shape * side**2))
-    found = []
-    for views in np.array_split(np.arange(len(photographs)), min(blocks, len(photographs))):
+    done = itertools.count(1)
+
+    def trace(views: Int[np.ndarray, " views"]) -> Block:
         looks = []
         for start in range(0, len(views), group):
             rays, names = _rays(cameras, views[start : start + group], side)
@@ -170,11 +174,20 @@ def read_equations(
                 seen = jax.tree.map(lambda x, real=real: x[real], seen)
                 pixel = start * shape + names[first + seen.pixels]
                 looks.append(seen._replace(pixels=pixel.astype(np.int32)))
-            progress(int(views[0]) + min(start + group, len(views)), len(photographs))
+            for _ in views[start : start + group]:
+                progress(next(done), len(photographs))
         joined = jax.tree.map(lambda *each: np.concatenate(each), *looks)
         joined = joined._replace(throughput=joined.throughput / side**2)
-        found.append(_block(joined, photographs[views], seed=int(views[0])))
-    return tuple(jax.device_put(block) for block in found)
+        return _block(joined, photographs[views], seed=int(views[0]))
+
+    split = np.array_split(np.arange(len(photographs)), min(blocks, len(photographs)))
+    return tuple(jax.device_put(block) for block in _at_once(trace, split))
+
+
+def _at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Result]:
+    """Returns the results of a function for each block; a CPU runs as many as it has cores."""
+    with ThreadPoolExecutor(len(each[0])) as threads:
+        return list(threads.map(function, *each))
 
 
 def _rays(
@@ -304,29 +317,30 @@ def solve(
       start: number of iterations, a multiple of `ROUND`, and radiance of an earlier run.
       prior: weight of the details of the pyramid, relative to a pixel's squared sRGB error.
     """
-    kept = float(sum(jnp.sum(block.kept) for block in blocks))
-    total = float(sum(block.kept.size for block in blocks))
-    mean = sum(jnp.sum(block.linear, axis=0) for block in blocks) / total
+    mean = jnp.mean(jnp.stack([jnp.mean(block.linear, axis=0) for block in blocks]), axis=0)
     uniform = backdrop.init(resolution, radiance=mean)
     step, x = start or (0, uniform)
     priors = tuple(jnp.float32(prior if i else 1e-2 * prior) for i in range(len(x)))
 
+    def look(block: Block, copies: Copies) -> Array:
+        return jax.block_until_ready(_predict(copies, block))
+
+    def spread(slopes: Array, block: Block) -> Copies:
+        return jax.block_until_ready(_transposed(slopes, block, resolution=resolution))
+
     def transpose(slopes: list[Array]) -> Pyramid:
-        parts = [
-            _transposed(slope, block, resolution=resolution)
-            for slope, block in zip(slopes, blocks, strict=True)
-        ]
+        parts = _at_once(spread, slopes, blocks)
         return _unsmoothed(jax.tree.map(lambda *x: functools.reduce(jnp.add, x), *parts), space)
 
     def predict(x: Pyramid) -> list[Array]:
         copies = _smoothed(x, space)
-        return [_predict(copies, block) for block in blocks]
+        return _at_once(look, blocks, [copies] * len(blocks))
 
     while step < iterations:
         seen, before = predict(x), -math.inf
         weights = [_first_weights(block) for block in blocks]
         if step:
-            _, before, typical = _measure(blocks, seen, kept, total)
+            _, before, typical = _measure(blocks, seen)
             weights = [_next_weights(s, b, typical) for s, b in zip(seen, blocks, strict=True)]
         diagonal = jax.tree.map(lambda ours, weight: ours + weight, transpose(weights), priors)
         gap = [w * (b.linear - s) for w, b, s in zip(weights, blocks, seen, strict=True)]
@@ -344,16 +358,16 @@ def solve(
             )
             seen = _add_scaled(seen, alpha, moved)
             step += 1
-            fitted, held_out, _ = _measure(blocks, seen, kept, total)
+            fitted, held_out, _ = _measure(blocks, seen)
             yield Progress(step, x, fitted, held_out)
         if held_out < before + _WORTH:
             return
 
 
-def _measure(
-    blocks: Sequence[Block], seen: Sequence[Array], kept: float, total: float
-) -> tuple[float, float, float]:
+def _measure(blocks: Sequence[Block], seen: Sequence[Array]) -> tuple[float, float, float]:
     """Returns the PSNR of fitted and of held-out pixels, and the typical error of a pixel."""
+    kept = float(sum(np.sum(np.asarray(block.kept)) for block in blocks))
+    total = sum(block.kept.size for block in blocks)
     measured = [_residuals(b, s) for b, s in zip(blocks, seen, strict=True)]
     fitted = float(sum(m[0] for m in measured)) / kept
     held_out = float(sum(m[1] for m in measured)) / max(total - kept, 1.0)
