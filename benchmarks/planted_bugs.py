@@ -135,8 +135,8 @@ BUGS = (
     Bug(
         "reflected branch dropped",
         _STEP,
-        "throughput=arrival.throughput * share.reflected",
-        "throughput=arrival.throughput * share.reflected * 0.0",
+        "reflected = arrival.throughput * share.reflected",
+        "reflected = arrival.throughput * share.reflected * 0.0",
         _TEST_TREE,
     ),
     Bug(
@@ -220,8 +220,8 @@ BUGS = (
     Bug(
         "air around a nested part",
         "optics/interface_rules.py",
-        "ambient if parent == NO_PARENT else indices[parent] for",
-        "ambient for",
+        "self.ambient if self.always or parent == NO_PARENT else inside[parent]",
+        "self.ambient if self.always or parent == NO_PARENT else self.ambient",
         ("optics/test_interface_rules.py",),
     ),
     Bug(
@@ -301,8 +301,8 @@ BUGS = (
     Bug(
         "contraction begins at twice the radius",
         _BOUNDS,
-        "positions = gaussian.positions / domain.radius",
-        "positions = gaussian.positions / (2.0 * domain.radius)",
+        "positions = _from_centre(domain, gaussian.positions) / domain.radius",
+        "positions = _from_centre(domain, gaussian.positions) / (2.0 * domain.radius)",
         _TEST_BOUNDS,
     ),
     Bug(

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import planted_bugs
+
 _ROOT = Path(__file__).parents[1]
 _PACKAGE = _ROOT / "refref_jax"
 
@@ -233,3 +235,10 @@ def test_one_snell_and_one_fresnel():
         ("follow", "optics/wavefront.py"),
     ]:
         assert [where for found, where in definitions if found == name] == [home]
+
+
+def test_the_text_of_each_planted_bug_occurs_once():
+    """Otherwise `benchmarks.planted_bugs`, which takes an hour, would have to tell."""
+    for bug in planted_bugs.BUGS:
+        text = (_PACKAGE / bug.file).read_text(encoding="utf-8")
+        assert text.count(bug.old) == 1, f"{bug.name}: {bug.file}"
