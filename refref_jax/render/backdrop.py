@@ -2,7 +2,7 @@
 
 Where the world behind the objects is a surface at a known place, a pixel is a linear function of
 the radiance on that surface: the sum over its light paths of throughput times radiance. This module
-maps the ends of light paths to points of the surface (`look_at`), and evaluates the linear function
+maps the ends of light paths to points of the surface (`locate`), and evaluates the linear function
 (`colours`) and its transpose (`transposed`).
 
 The surface is a cube map: six faces with a grid of `n + 1` by `n + 1` vertices each, between which
@@ -16,7 +16,7 @@ each with half the resolution of the next. A coarse level is determined by many 
 the gaps of the finer ones, where no light path ends.
 
 A pixel is a square, not a point: its light path is shifted by the ray differential to several
-places of the pixel (`taps`), and a footprint wider than the grid reads a smoothed copy of it.
+places of the pixel (`taps`), and a footprint wider than that reads a coarser level of a mipmap.
 
 Sources: Igehy, Tracing Ray Differentials (1999); Bramble, Pasciak and Xu, Parallel Multilevel
 Preconditioners (1990), for the sum over levels.
@@ -78,11 +78,11 @@ _WIDEST = 1e6
 Pyramid = tuple[Float[Array, "6 _ _ 3"], ...]
 """Radiance of each level, coarse to fine; linear RGB."""
 
-Copies = tuple[Float[Array, "6 _ _ 3"], ...]
+Mips = tuple[Float[Array, "6 _ _ 3"], ...]
 """Radiance at each resolution, fine to coarse; linear RGB."""
 
 
-class Looks(NamedTuple):
+class Lookups(NamedTuple):
     """Points of the surface that light paths end on; lengths are in cells of the finest grid.
 
     Attributes:
@@ -124,14 +124,14 @@ def init(resolution: int, *, radiance: Float[Array, "3"] | float = 0.0) -> Pyram
     return (base, *(jnp.zeros((FACES, side + 1, side + 1, 3)) for side in others))
 
 
-def look_at(
+def locate(
     domain: Domain,
     ends: PathEnds,
     pixels: Int[Array, " paths"],
     *,
     resolution: int,
     most_taps: int,
-) -> Looks:
+) -> Lookups:
     """Returns where light paths end on the surface.
 
     Args:
@@ -150,7 +150,7 @@ def look_at(
     taps = jnp.clip(jnp.ceil(width), 1, most_taps)
     coarser = jnp.round(jnp.log2(jnp.maximum(width / taps, 1.0))).astype(jnp.int32)
     real = jnp.any(ends.throughput > 0.0, axis=-1)
-    return Looks(
+    return Lookups(
         pixels=pixels,
         faces=faces,
         levels=jnp.minimum(coarser, len(sides(resolution)) - 1),
@@ -208,7 +208,7 @@ def _towards(
     return from_centre + jnp.where(jnp.isfinite(distance), distance, 0.0) * direction
 
 
-def smoothed(pyramid: Pyramid, space: Space) -> Copies:
+def mipmap(pyramid: Pyramid, space: Space) -> Mips:
     """Returns the radiance at all resolutions, fine to coarse: the sum of the levels, then halved.
 
     Args:
@@ -218,10 +218,10 @@ def smoothed(pyramid: Pyramid, space: Space) -> Copies:
     total = pyramid[0]
     for level in pyramid[1:]:
         total = _refine(total) + level
-    copies = [_joined(total, space)]
+    mips = [_joined(total, space)]
     for _ in pyramid[1:]:
-        copies.append(_joined(_halve(copies[-1]), space))
-    return tuple(copies)
+        mips.append(_joined(_halve(mips[-1]), space))
+    return tuple(mips)
 
 
 def _refine(grid: Float[Array, "6 side side 3"]) -> Float[Array, "6 finer finer 3"]:
@@ -282,9 +282,9 @@ def _edges(side: int) -> tuple[Int[np.ndarray, " edges"], Int[np.ndarray, " edge
     return where, groups.reshape(-1).astype(np.int32)
 
 
-def _table(copies: Copies) -> Float[Array, "texels 3"]:
+def _table(mips: Mips) -> Float[Array, "texels 3"]:
     """Returns the radiance of all resolutions as one list."""
-    return jnp.concatenate([copy.reshape(-1, 3) for copy in copies])
+    return jnp.concatenate([mip.reshape(-1, 3) for mip in mips])
 
 
 def _grids(resolution: int) -> Int[np.ndarray, "levels 2"]:
@@ -296,31 +296,31 @@ def _grids(resolution: int) -> Int[np.ndarray, "levels 2"]:
 
 
 def _corners(
-    looks: Looks, grids: Int[Array, "levels 2"], tap: Int[Array, ""]
+    lookups: Lookups, grids: Int[Array, "levels 2"], tap: Int[Array, ""]
 ) -> list[tuple[Int[Array, "*paths"], Float[Array, "*paths"]]]:
     """Returns entry and bilinear weight of the four vertices around one tap of a light path.
 
     A tap beyond the edge of its face stays on it. Empty slots have weights of 0.
     """
-    count = jnp.maximum(looks.taps, 1)
-    precision = looks.places.dtype
+    count = jnp.maximum(lookups.taps, 1)
+    precision = lookups.places.dtype
     number = count.astype(precision)
-    share = jnp.where(tap < looks.taps * looks.taps, 1.0, 0.0) / (number * number)
+    share = jnp.where(tap < lookups.taps * lookups.taps, 1.0, 0.0) / (number * number)
     along, across = (
         (n.astype(precision) + 0.5) / number - 0.5 for n in (tap // count, tap % count)
     )
-    first, side = grids[looks.levels, 0], grids[looks.levels, 1]
-    scale = jnp.exp2(-looks.levels.astype(precision))
+    first, side = grids[lookups.levels, 0], grids[lookups.levels, 1]
+    scale = jnp.exp2(-lookups.levels.astype(precision))
     low, high = [], []
     for axis in range(2):
-        moved = along * looks.axes[..., 0, axis] + across * looks.axes[..., 1, axis]
-        place = scale * (looks.places[..., axis] + moved)
+        moved = along * lookups.axes[..., 0, axis] + across * lookups.axes[..., 1, axis]
+        place = scale * (lookups.places[..., axis] + moved)
         place = jnp.clip(place, 0.0, side.astype(precision))
         cell = jnp.minimum(place.astype(jnp.int32), side - 1)
         low.append(cell)
         high.append(place - cell.astype(precision))
     (column, row), (right, up), stride = low, high, side + 1
-    entry = first + (looks.faces * stride + row) * stride + column
+    entry = first + (lookups.faces * stride + row) * stride + column
     return [
         (entry, share * (1.0 - right) * (1.0 - up)),
         (entry + 1, share * right * (1.0 - up)),
@@ -329,30 +329,30 @@ def _corners(
     ]
 
 
-def colours(copies: Copies, looks: Looks, *, pixels: int) -> Float[Array, "pixels 3"]:
+def colours(mips: Mips, lookups: Lookups, *, pixels: int) -> Float[Array, "pixels 3"]:
     """Returns the linear RGB of pixels: their paths' sum of throughput times radiance.
 
     Args:
-      copies: radiance at all resolutions (`smoothed`).
-      looks: points of the surface that the paths end on.
+      mips: radiance at all resolutions (`mipmap`).
+      lookups: points of the surface that the paths end on.
       pixels: number of pixels.
     """
-    table, grids = _table(copies), jnp.asarray(_grids(copies[0].shape[1] - 1))
+    table, grids = _table(mips), jnp.asarray(_grids(mips[0].shape[1] - 1))
     return jax.lax.platform_dependent(
         table,
         grids,
-        looks,
-        cpu=functools.partial(_read if looks.taps.size < _FEW else _read_native, pixels),
+        lookups,
+        cpu=functools.partial(_read if lookups.taps.size < _FEW else _read_native, pixels),
         default=functools.partial(_read, pixels),
     )
 
 
-def transposed(slopes: Float[Array, "pixels 3"], looks: Looks, *, resolution: int) -> Copies:
+def transposed(slopes: Float[Array, "pixels 3"], lookups: Lookups, *, resolution: int) -> Mips:
     """Returns the transpose of `colours`: what each pixel adds to the vertices that it reads.
 
     Args:
       slopes: factor of each pixel.
-      looks: points of the surface that the paths end on.
+      lookups: points of the surface that the paths end on.
       resolution: number of cells per side of a face.
     """
     grids = _grids(resolution)
@@ -360,8 +360,8 @@ def transposed(slopes: Float[Array, "pixels 3"], looks: Looks, *, resolution: in
     table = jax.lax.platform_dependent(
         slopes,
         jnp.asarray(grids),
-        looks,
-        cpu=functools.partial(_add if looks.taps.size < _FEW else _add_native, entries),
+        lookups,
+        cpu=functools.partial(_add if lookups.taps.size < _FEW else _add_native, entries),
         default=functools.partial(_add, entries),
     )
     shapes = [(FACES, side + 1, side + 1, 3) for side in sides(resolution)[::-1]]
@@ -369,38 +369,40 @@ def transposed(slopes: Float[Array, "pixels 3"], looks: Looks, *, resolution: in
     return tuple(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True))
 
 
-def _read(pixels: int, table: Array, grids: Array, looks: Looks) -> Float[Array, "pixels 3"]:
+def _read(pixels: int, table: Array, grids: Array, lookups: Lookups) -> Float[Array, "pixels 3"]:
     """Returns the colours of pixels, one tap of all paths at a time."""
 
     def add(tap: Array, seen: Array) -> Array:
         return seen + sum(
-            weight[:, None] * table[entry] for entry, weight in _corners(looks, grids, tap)
+            weight[:, None] * table[entry] for entry, weight in _corners(lookups, grids, tap)
         )
 
-    seen = jax.lax.fori_loop(0, jnp.max(looks.taps, initial=0) ** 2, add, 0.0 * looks.throughput)
-    return jax.ops.segment_sum(looks.throughput * seen, looks.pixels, num_segments=pixels)
+    seen = jax.lax.fori_loop(
+        0, jnp.max(lookups.taps, initial=0) ** 2, add, 0.0 * lookups.throughput
+    )
+    return jax.ops.segment_sum(lookups.throughput * seen, lookups.pixels, num_segments=pixels)
 
 
-def _add(entries: int, slopes: Array, grids: Array, looks: Looks) -> Float[Array, "entries 3"]:
+def _add(entries: int, slopes: Array, grids: Array, lookups: Lookups) -> Float[Array, "entries 3"]:
     """Returns the transpose of `_read`."""
-    slope = looks.throughput * slopes[looks.pixels]
+    slope = lookups.throughput * slopes[lookups.pixels]
 
     def add(tap: Array, table: Array) -> Array:
-        for entry, weight in _corners(looks, grids, tap):
+        for entry, weight in _corners(lookups, grids, tap):
             table = table.at[entry].add(weight[:, None] * slope)
         return table
 
     table = jnp.zeros((entries, 3), slopes.dtype)
-    return jax.lax.fori_loop(0, jnp.max(looks.taps, initial=0) ** 2, add, table)
+    return jax.lax.fori_loop(0, jnp.max(lookups.taps, initial=0) ** 2, add, table)
 
 
-def _read_native(pixels: int, table: Array, grids: Array, looks: Looks) -> Array:
+def _read_native(pixels: int, table: Array, grids: Array, lookups: Lookups) -> Array:
     """Is `_read` as one loop over paths."""
 
     @native_loop
-    def read_all(table: Array, grids: Array, looks: Looks) -> Array:
+    def read_all(table: Array, grids: Array, lookups: Lookups) -> Array:
         def read(index: Array, seen: Array) -> Array:
-            look = _record(looks, index)
+            look = _record(lookups, index)
 
             def add(tap: Array, total: Array) -> Array:
                 for entry, weight in _corners(look, grids, tap):
@@ -412,18 +414,18 @@ def _read_native(pixels: int, table: Array, grids: Array, looks: Looks) -> Array
             return _with_record(seen, look.pixels, light)
 
         start = jnp.zeros((pixels, 3), table.dtype)
-        return jax.lax.fori_loop(0, looks.taps.shape[0], read, start)
+        return jax.lax.fori_loop(0, lookups.taps.shape[0], read, start)
 
-    return read_all(table, grids, looks)
+    return read_all(table, grids, lookups)
 
 
-def _add_native(entries: int, slopes: Array, grids: Array, looks: Looks) -> Array:
+def _add_native(entries: int, slopes: Array, grids: Array, lookups: Lookups) -> Array:
     """Is `_add` as one loop over paths."""
 
     @native_loop
-    def add_all(slopes: Array, grids: Array, looks: Looks) -> Array:
+    def add_all(slopes: Array, grids: Array, lookups: Lookups) -> Array:
         def add(index: Array, table: Array) -> Array:
-            look = _record(looks, index)
+            look = _record(lookups, index)
             slope = look.throughput * _record(slopes, look.pixels)
 
             def spread(tap: Array, table: Array) -> Array:
@@ -434,9 +436,9 @@ def _add_native(entries: int, slopes: Array, grids: Array, looks: Looks) -> Arra
             return jax.lax.fori_loop(0, look.taps**2, spread, table)
 
         start = jnp.zeros((entries, 3), slopes.dtype)
-        return jax.lax.fori_loop(0, looks.taps.shape[0], add, start)
+        return jax.lax.fori_loop(0, lookups.taps.shape[0], add, start)
 
-    return add_all(slopes, grids, looks)
+    return add_all(slopes, grids, lookups)
 
 
 def _record(values: Any, index: Array) -> Any:

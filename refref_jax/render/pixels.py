@@ -99,29 +99,29 @@ def render_paths(
 ) -> PathRadiance:
     """Renders each path of a batch independently."""
     if config.backdrop is not None:
-        return _look_at_backdrop(params, config, paths)
+        return _see_backdrop(params, config, paths)
     render = jax.vmap(volume_rendering.path_radiance, in_axes=(None, None, 0, 0, None))
     return render(params, config, paths, jitter, anneal)
 
 
-def _look_at_backdrop(params: Params, config: ModelConfig, paths: LightPaths) -> PathRadiance:
+def _see_backdrop(params: Params, config: ModelConfig, paths: LightPaths) -> PathRadiance:
     """Returns what each path sees of the backdrop, at the distance where it ends there."""
     assert config.backdrop is not None
     ends, bounds = light_paths.ends_of(paths), volume_rendering.domain(config)
     resolution, count = config.backdrop.resolution, paths.radii.shape[0]
     alone = ends._replace(throughput=jnp.ones_like(ends.throughput))
-    looks = backdrop.look_at(
+    lookups = backdrop.locate(
         bounds,
         alone,
         jnp.arange(count, dtype=jnp.int32),
         resolution=resolution,
         most_taps=config.backdrop.most_taps,
     )
-    copies = backdrop.smoothed(params.field, config.space)
+    mips = backdrop.mipmap(params.field, config.space)
     leave = jax.vmap(functools.partial(scene_bounds.exit_distance, bounds))
     distance = ends.tau + leave(ends.origins, ends.directions)
     seen = Composite(
-        rgb=backdrop.colours(copies, looks, pixels=count),
+        rgb=backdrop.colours(mips, lookups, pixels=count),
         accumulation=jnp.ones_like(paths.radii),
         median=distance,
         mean=distance,

@@ -34,7 +34,7 @@ from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.path_settings import PathSettings
 from refref_jax.optics.scene import Scene
 from refref_jax.render import backdrop, images, pixels
-from refref_jax.render.backdrop import Copies, Looks, Pyramid
+from refref_jax.render.backdrop import Lookups, Mips, Pyramid
 from refref_jax.sampling.scene_bounds import Domain
 
 # One error in this many determines their typical size.
@@ -74,13 +74,13 @@ class Block(NamedTuple):
     """The equations of some views.
 
     Attributes:
-      looks: points of the surface that the views' light paths end on.
+      lookups: points of the surface that the views' light paths end on.
       linear: linear RGB of the pixels, without light from elsewhere.
       srgb: sRGB of the pixels.
       kept: 1 for pixels that are fitted, 0 for those that are held out.
     """
 
-    looks: Looks
+    lookups: Lookups
     linear: Float[Array, "pixels 3"]
     srgb: Float[Array, "pixels 3"]
     kept: Float[Array, " pixels"]
@@ -111,13 +111,13 @@ def _look(
     domain: Domain,
     resolution: int,
     most_taps: int,
-) -> Looks:
+) -> Lookups:
     """Returns where the paths of rays end; their pixels are the indices of the rays."""
     traced = path_tracing.trace_ends(scene, rays, settings=settings, footprint="differential")
     ends = traced.ends
     throughput = jnp.where(light_paths.exists(ends)[:, None], ends.throughput, 0.0)
     ends = ends._replace(throughput=throughput)
-    return backdrop.look_at(domain, ends, ends.rays, resolution=resolution, most_taps=most_taps)
+    return backdrop.locate(domain, ends, ends.rays, resolution=resolution, most_taps=most_taps)
 
 
 def read_equations(
@@ -153,7 +153,7 @@ def read_equations(
     done = itertools.count(1)
 
     def trace(views: Int[np.ndarray, " views"]) -> Block:
-        looks = []
+        lookups = []
         for start in range(0, len(views), group):
             rays, names = _rays(cameras, views[start : start + group], side)
             tile = images.size_for(names.size, most=images.TILE)
@@ -173,10 +173,10 @@ def read_equations(
                 real = (seen.taps > 0) & (seen.pixels < names.size - first)
                 seen = jax.tree.map(lambda x, real=real: x[real], seen)
                 pixel = start * shape + names[first + seen.pixels]
-                looks.append(seen._replace(pixels=pixel.astype(np.int32)))
+                lookups.append(seen._replace(pixels=pixel.astype(np.int32)))
             for _ in views[start : start + group]:
                 progress(next(done), len(photographs))
-        joined = jax.tree.map(lambda *each: np.concatenate(each), *looks)
+        joined = jax.tree.map(lambda *each: np.concatenate(each), *lookups)
         joined = joined._replace(throughput=joined.throughput / side**2)
         return _block(joined, photographs[views], seed=int(views[0]))
 
@@ -202,12 +202,12 @@ def _rays(
     return rays, np.concatenate([number * shape + pixel for number in range(len(views))])
 
 
-def _block(looks: Looks, photographs: UInt8[np.ndarray, "views h w 3"], seed: int) -> Block:
+def _block(lookups: Lookups, photographs: UInt8[np.ndarray, "views h w 3"], seed: int) -> Block:
     """Returns the equations of some views; the seed draws the pixels that are held out."""
     srgb = host_array(photographs.reshape(-1, 3).astype(np.float32) / 255.0)
     held_out = np.random.default_rng(seed).integers(_HELD_OUT, size=len(srgb)) == 0
     linear = pixels.srgb_to_linear(jax.device_put(srgb))
-    return Block(looks, linear, srgb, host_array(np.float32(~held_out)))
+    return Block(lookups, linear, srgb, host_array(np.float32(~held_out)))
 
 
 def _weights(predicted: Array, block: Block, typical: float | Array) -> Float[Array, "pixels 3"]:
@@ -232,25 +232,25 @@ _next_weights = jax.jit(_weights)
 
 
 @functools.partial(jax.jit, static_argnames="space")
-def _smoothed(pyramid: Pyramid, space: Space) -> Copies:
-    return backdrop.smoothed(pyramid, space)
+def _mipmap(pyramid: Pyramid, space: Space) -> Mips:
+    return backdrop.mipmap(pyramid, space)
 
 
 @functools.partial(jax.jit, static_argnames="space")
-def _unsmoothed(copies: Copies, space: Space) -> Pyramid:
-    """Returns the transpose of `smoothed`."""
-    like = tuple(jnp.zeros_like(copy) for copy in copies[::-1])
-    return jax.linear_transpose(lambda x: backdrop.smoothed(x, space), like)(copies)[0]
+def _mipmap_transposed(mips: Mips, space: Space) -> Pyramid:
+    """Returns the transpose of `mipmap`."""
+    like = tuple(jnp.zeros_like(copy) for copy in mips[::-1])
+    return jax.linear_transpose(lambda x: backdrop.mipmap(x, space), like)(mips)[0]
 
 
 @jax.jit
-def _predict(copies: Copies, block: Block) -> Float[Array, "pixels 3"]:
-    return backdrop.colours(copies, block.looks, pixels=block.srgb.shape[0])
+def _predict(mips: Mips, block: Block) -> Float[Array, "pixels 3"]:
+    return backdrop.colours(mips, block.lookups, pixels=block.srgb.shape[0])
 
 
 @functools.partial(jax.jit, static_argnames="resolution")
-def _transposed(slopes: Array, block: Block, *, resolution: int) -> Copies:
-    return backdrop.transposed(slopes, block.looks, resolution=resolution)
+def _transposed(slopes: Array, block: Block, *, resolution: int) -> Mips:
+    return backdrop.transposed(slopes, block.lookups, resolution=resolution)
 
 
 @jax.jit
@@ -322,19 +322,21 @@ def solve(
     step, x = start or (0, uniform)
     priors = tuple(jnp.float32(prior if i else 1e-2 * prior) for i in range(len(x)))
 
-    def look(block: Block, copies: Copies) -> Array:
-        return jax.block_until_ready(_predict(copies, block))
+    def look(block: Block, mips: Mips) -> Array:
+        return jax.block_until_ready(_predict(mips, block))
 
-    def spread(slopes: Array, block: Block) -> Copies:
+    def spread(slopes: Array, block: Block) -> Mips:
         return jax.block_until_ready(_transposed(slopes, block, resolution=resolution))
 
     def transpose(slopes: list[Array]) -> Pyramid:
         parts = _at_once(spread, slopes, blocks)
-        return _unsmoothed(jax.tree.map(lambda *x: functools.reduce(jnp.add, x), *parts), space)
+        return _mipmap_transposed(
+            jax.tree.map(lambda *x: functools.reduce(jnp.add, x), *parts), space
+        )
 
     def predict(x: Pyramid) -> list[Array]:
-        copies = _smoothed(x, space)
-        return _at_once(look, blocks, [copies] * len(blocks))
+        mips = _mipmap(x, space)
+        return _at_once(look, blocks, [mips] * len(blocks))
 
     while step < iterations:
         seen, before = predict(x), -math.inf

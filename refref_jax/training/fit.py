@@ -254,7 +254,7 @@ def train(
     config, model = run_folder.read_config(run), checkpoint_io.read_static(run)
     lock = atomic_files.hold(run) if devices.is_first() else contextlib.nullcontext()
     with lock, Checkpoints(run, keep=periods.keep) as checkpoints:
-        solved = model.config.backdrop is not None
+        solved = config.model.far_field == "backdrop"
         total = require(config.model.iterations if solved else config.schedule.steps)
         if checkpoints.newest() == total:
             report(f"{run} is trained already: {total} {'iterations' if solved else 'steps'}.")

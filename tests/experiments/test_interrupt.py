@@ -46,6 +46,7 @@ def test_before_its_first_step_a_training_ends_with_nothing_saved(tmp_path, monk
         schedule=types.SimpleNamespace(steps=5),
         scene=types.SimpleNamespace(path="scene"),
         settings=types.SimpleNamespace(bends=1),
+        model=types.SimpleNamespace(far_field="field"),
         config=None,
         seed=0,
     )

@@ -27,7 +27,7 @@ def _rays(count, *, radius=1e-2, seed=0):
 def _looks(domain, rays, *, most_taps=3):
     ends = straight_ends(rays, footprint="differential")
     pixels = jnp.arange(rays.radii.size, dtype=jnp.int32) // 2
-    return backdrop.look_at(domain, ends, pixels, resolution=_SIDE, most_taps=most_taps)
+    return backdrop.locate(domain, ends, pixels, resolution=_SIDE, most_taps=most_taps)
 
 
 def _random_pyramid(seed=1):
@@ -47,41 +47,41 @@ def test_levels_are_halved_while_their_number_of_cells_is_even():
 @pytest.mark.parametrize("space", _SPACES)
 def test_a_uniform_surface_is_the_throughput_of_each_pixel(space):
     rays = _rays(200, radius=0.3)
-    copies = backdrop.smoothed(backdrop.init(_SIDE, radiance=jnp.array([0.2, 0.5, 4.0])), space)
-    for copy in copies:
+    mips = backdrop.mipmap(backdrop.init(_SIDE, radiance=jnp.array([0.2, 0.5, 4.0])), space)
+    for copy in mips:
         np.testing.assert_allclose(copy, np.broadcast_to([0.2, 0.5, 4.0], copy.shape), rtol=1e-6)
-    looks = _looks(_DOMAINS[space], rays)
-    assert np.any(looks.levels > 0) and np.all(looks.taps >= 1)
-    seen = backdrop.colours(copies, looks, pixels=100)
+    lookups = _looks(_DOMAINS[space], rays)
+    assert np.any(lookups.levels > 0) and np.all(lookups.taps >= 1)
+    seen = backdrop.colours(mips, lookups, pixels=100)
     np.testing.assert_allclose(seen, np.broadcast_to([0.4, 1.0, 8.0], (100, 3)), rtol=1e-5)
 
 
 @pytest.mark.parametrize("space", _SPACES)
 def test_native_loops_are_the_formulas_of_other_devices(space):
-    looks = _looks(_DOMAINS[space], _rays(300, radius=0.1))
-    copies = backdrop.smoothed(_random_pyramid(), space)
-    table, grids = backdrop._table(copies), jnp.asarray(backdrop._grids(_SIDE))
+    lookups = _looks(_DOMAINS[space], _rays(300, radius=0.1))
+    mips = backdrop.mipmap(_random_pyramid(), space)
+    table, grids = backdrop._table(mips), jnp.asarray(backdrop._grids(_SIDE))
     np.testing.assert_allclose(
-        jax.jit(functools.partial(backdrop._read_native, 150))(table, grids, looks),
-        backdrop._read(150, table, grids, looks),
+        jax.jit(functools.partial(backdrop._read_native, 150))(table, grids, lookups),
+        backdrop._read(150, table, grids, lookups),
         rtol=1e-5,
     )
     slopes = jnp.asarray(np.random.default_rng(2).normal(size=(150, 3)), jnp.float32)
     np.testing.assert_allclose(
-        jax.jit(functools.partial(backdrop._add_native, len(table)))(slopes, grids, looks),
-        backdrop._add(len(table), slopes, grids, looks),
+        jax.jit(functools.partial(backdrop._add_native, len(table)))(slopes, grids, lookups),
+        backdrop._add(len(table), slopes, grids, lookups),
         atol=1e-5,
     )
 
 
 @pytest.mark.parametrize("space", _SPACES)
 def test_the_transpose_of_the_colours(space):
-    looks = _looks(_DOMAINS[space], _rays(300, radius=0.1))
-    copies = tuple(_random_pyramid()[::-1])
+    lookups = _looks(_DOMAINS[space], _rays(300, radius=0.1))
+    mips = tuple(_random_pyramid()[::-1])
     slopes = jnp.asarray(np.random.default_rng(2).normal(size=(150, 3)), jnp.float32)
-    forward = jnp.sum(backdrop.colours(copies, looks, pixels=150) * slopes)
-    back = backdrop.transposed(slopes, looks, resolution=_SIDE)
-    backward = sum(jnp.sum(a * b) for a, b in zip(copies, back, strict=True))
+    forward = jnp.sum(backdrop.colours(mips, lookups, pixels=150) * slopes)
+    back = backdrop.transposed(slopes, lookups, resolution=_SIDE)
+    backward = sum(jnp.sum(a * b) for a, b in zip(mips, back, strict=True))
     np.testing.assert_allclose(forward, backward, rtol=1e-4)
 
 
@@ -91,22 +91,22 @@ def test_a_wall_is_interpolated_bilinearly_at_the_point_where_the_ray_leaves():
     origin = np.array([0.5, 0.1, 0.2])
     direction = (target - origin) / np.linalg.norm(target - origin)
     ray = Rays(*(jnp.asarray(x, jnp.float32)[None] for x in (origin, direction, 1e-4)))
-    looks = _looks(domain, ray)
-    assert looks.faces[0] == 3
+    lookups = _looks(domain, ray)
+    assert lookups.faces[0] == 3
     # Columns of a wall are along the next axis, rows along the one after: z, then x.
     expected = 0.5 * _SIDE * (np.array([-0.7, 0.3]) / 2.0 + 1.0)
-    np.testing.assert_allclose(looks.places[0], expected, atol=1e-4)
-    grid = np.asarray(backdrop.smoothed(_random_pyramid(), "bounded")[0])[3]
+    np.testing.assert_allclose(lookups.places[0], expected, atol=1e-4)
+    grid = np.asarray(backdrop.mipmap(_random_pyramid(), "bounded")[0])[3]
     column, row = np.floor(expected).astype(int)
     right, up = expected - (column, row)
     across = grid[row : row + 2, column] * (1 - right) + grid[row : row + 2, column + 1] * right
-    seen = backdrop.colours(backdrop.smoothed(_random_pyramid(), "bounded"), looks, pixels=1)
+    seen = backdrop.colours(backdrop.mipmap(_random_pyramid(), "bounded"), lookups, pixels=1)
     np.testing.assert_allclose(seen[0], across[0] * (1 - up) + across[1] * up, rtol=1e-3)
 
 
 @pytest.mark.parametrize("space", ["spherical", "unbounded"])
 def test_there_are_no_seams(space):
-    copies = backdrop.smoothed(_random_pyramid(), space)
+    mips = backdrop.mipmap(_random_pyramid(), space)
     domain = Domain(2.0, space)
     random = np.random.default_rng(3)
     for axis, other in ((0, 1), (1, 2), (2, 0)):
@@ -121,11 +121,11 @@ def test_there_are_no_seams(space):
             jnp.asarray(directions.reshape(-1, 3), jnp.float32),
             jnp.full(80, 1e-6),
         )
-        looks = _looks(domain, rays)._replace(pixels=jnp.arange(80, dtype=jnp.int32))
-        assert np.all(looks.faces[:40] != looks.faces[40:])
+        lookups = _looks(domain, rays)._replace(pixels=jnp.arange(80, dtype=jnp.int32))
+        assert np.all(lookups.faces[:40] != lookups.faces[40:])
         for level in range(3):
             seen = backdrop.colours(
-                copies, looks._replace(levels=jnp.full(80, level, jnp.int32)), pixels=80
+                mips, lookups._replace(levels=jnp.full(80, level, jnp.int32)), pixels=80
             )
             np.testing.assert_allclose(seen[:40], seen[40:], atol=2e-3)
 
@@ -133,24 +133,24 @@ def test_there_are_no_seams(space):
 @pytest.mark.parametrize("space", _SPACES)
 def test_axes_are_the_change_of_the_place_across_a_pixel(space):
     domain, rays = _DOMAINS[space], _rays(100, radius=1e-3)
-    looks = _looks(domain, rays)
+    lookups = _looks(domain, rays)
     ends = straight_ends(rays, footprint="differential")
     for axis in range(2):
         moved = rays._replace(directions=rays.directions + ends.differentials.directions[:, axis])
         there = _looks(domain, moved)
-        same = np.asarray(there.faces == looks.faces)
+        same = np.asarray(there.faces == lookups.faces)
         assert same.sum() > 90
-        change = np.sqrt(3.0) * (there.places - looks.places)
-        np.testing.assert_allclose(change[same], looks.axes[same][:, axis], rtol=0.03, atol=2e-3)
+        change = np.sqrt(3.0) * (there.places - lookups.places)
+        np.testing.assert_allclose(change[same], lookups.axes[same][:, axis], rtol=0.03, atol=2e-3)
 
 
 def test_a_wide_footprint_reads_the_mean_of_its_surroundings():
     grid = np.zeros((6, _SIDE + 1, _SIDE + 1, 3), np.float32)
     grid[:, ::2] = 1.0  # stripes of one cell
     pyramid = (*backdrop.init(_SIDE)[:-1], jnp.asarray(grid))
-    copies = backdrop.smoothed(pyramid, "bounded")
+    mips = backdrop.mipmap(pyramid, "bounded")
     narrow, wide = (_looks(_DOMAINS["bounded"], _rays(200, radius=r)) for r in (1e-5, 0.5))
-    seen = [np.std(backdrop.colours(copies, looks, pixels=100)) for looks in (narrow, wide)]
+    seen = [np.std(backdrop.colours(mips, lookups, pixels=100)) for lookups in (narrow, wide)]
     assert seen[0] > 0.3 and seen[1] < 0.2 * seen[0]
 
 
@@ -159,7 +159,7 @@ def test_places_and_axes_are_finite_at_the_extremes():
     directions = jnp.asarray([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]], jnp.float32)
     origins = jnp.asarray([[5.0, 0.0, 0.0], [0.1, -0.2, 0.3], [2.1, 1.8, 2.3]], jnp.float32)
     for space in _SPACES:
-        looks = _looks(_DOMAINS[space], Rays(origins, directions, jnp.full(3, 1e6)))
-        for values in looks:
+        lookups = _looks(_DOMAINS[space], Rays(origins, directions, jnp.full(3, 1e6)))
+        for values in lookups:
             assert np.all(np.isfinite(values))
     assert domain.space == "bounded"

@@ -39,4 +39,4 @@ def test_half_precision_does_not_overflow(tmp_path):
 def test_a_broken_rendering_is_told(tmp_path):
     (tmp_path / "colour.exr").write_bytes(b"v/1\x01")
     with pytest.raises(ValueError, match=r"colour\.exr cannot be read .*resumes"):
-        frame_files.read_rendering(tmp_path / "colour.exr", tmp_path / "geometry.exr")
+        frame_files.read_rendering([tmp_path / "colour.exr"], tmp_path / "geometry.exr")
