@@ -22,8 +22,8 @@ from typing import NamedTuple
 
 from absl import app, flags
 
-_ONLY = flags.DEFINE_list("only", [], "Names of the bugs to plant; all by default.")
-_JOBS = flags.DEFINE_integer("jobs", 2, "Number of copies that are tested at the same time.", 1)
+_ONLY = flags.DEFINE_list("bugs", [], "Names of the bugs to plant; all by default.")
+_JOBS = flags.DEFINE_integer("copies", 2, "Number of copies that are tested at the same time.", 1)
 
 _ROOT = Path(__file__).parents[1]
 _RESULTS = _ROOT / "benchmarks" / "results" / "planted_bugs.csv"

@@ -267,6 +267,10 @@ def _dot(a: Pyramid, b: Pyramid) -> Array:
     return functools.reduce(jnp.add, products)
 
 
+def _sum(parts: Sequence[_Arrays]) -> _Arrays:
+    return jax.tree.map(lambda *x: functools.reduce(jnp.add, x), *parts)
+
+
 @jax.jit
 def _add_scaled(a: _Arrays, scale: Float[Array, "3"], b: _Arrays) -> _Arrays:
     """Returns `a + scale b`, with a scale for each channel."""
@@ -330,9 +334,7 @@ def solve(
 
     def transpose(slopes: list[Array]) -> Pyramid:
         parts = _at_once(spread, slopes, blocks)
-        return _mipmap_transposed(
-            jax.tree.map(lambda *x: functools.reduce(jnp.add, x), *parts), space
-        )
+        return _mipmap_transposed(_sum(parts), space)
 
     def predict(x: Pyramid) -> list[Array]:
         mips = _mipmap(x, space)
