@@ -332,11 +332,18 @@ def _corners(
 def colours(mips: Mips, lookups: Lookups, *, pixels: int) -> Float[Array, "pixels 3"]:
     """Returns the linear RGB of pixels: their paths' sum of throughput times radiance.
 
+    Its gradients are those by the radiance and the throughput; places and footprints are constants.
+
     Args:
       mips: radiance at all resolutions (`mipmap`).
       lookups: points of the surface that the paths end on.
       pixels: number of pixels.
     """
+    return _colours(pixels, mips, lookups)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _colours(pixels: int, mips: Mips, lookups: Lookups) -> Float[Array, "pixels 3"]:
     table, grids = _table(mips), jnp.asarray(_grids(mips[0].shape[1] - 1))
     return jax.lax.platform_dependent(
         table,
@@ -345,6 +352,31 @@ def colours(mips: Mips, lookups: Lookups, *, pixels: int) -> Float[Array, "pixel
         cpu=functools.partial(_read if lookups.taps.size < _FEW else _read_native, pixels),
         default=functools.partial(_read, pixels),
     )
+
+
+def _colours_forward(
+    pixels: int, mips: Mips, lookups: Lookups
+) -> tuple[Array, tuple[Mips, Lookups]]:
+    return _colours(pixels, mips, lookups), (mips, lookups)
+
+
+def _colours_backward(
+    pixels: int, saved: tuple[Mips, Lookups], slopes: Array
+) -> tuple[Mips, Lookups]:
+    del pixels
+    mips, lookups = saved
+    count = lookups.taps.shape[0]
+    each = lookups._replace(
+        pixels=jnp.arange(count, dtype=jnp.int32), throughput=jnp.ones_like(lookups.throughput)
+    )
+    by_throughput = _colours(count, mips, each) * slopes[lookups.pixels]
+    # Nothing is the gradient of a constant.
+    nothing: Any = Lookups(*[None] * len(lookups))
+    by_radiance = transposed(slopes, lookups, resolution=mips[0].shape[1] - 1)
+    return by_radiance, nothing._replace(throughput=by_throughput)
+
+
+_colours.defvjp(_colours_forward, _colours_backward)
 
 
 def transposed(slopes: Float[Array, "pixels 3"], lookups: Lookups, *, resolution: int) -> Mips:
@@ -377,9 +409,8 @@ def _read(pixels: int, table: Array, grids: Array, lookups: Lookups) -> Float[Ar
             weight[:, None] * table[entry] for entry, weight in _corners(lookups, grids, tap)
         )
 
-    seen = jax.lax.fori_loop(
-        0, jnp.max(lookups.taps, initial=0) ** 2, add, 0.0 * lookups.throughput
-    )
+    most = jnp.max(lookups.taps, initial=0)
+    seen = jax.lax.fori_loop(0, most * most, add, jnp.zeros_like(lookups.throughput))
     return jax.ops.segment_sum(lookups.throughput * seen, lookups.pixels, num_segments=pixels)
 
 
@@ -397,7 +428,7 @@ def _add(entries: int, slopes: Array, grids: Array, lookups: Lookups) -> Float[A
 
 
 def _read_native(pixels: int, table: Array, grids: Array, lookups: Lookups) -> Array:
-    """Is `_read` as one loop over paths."""
+    """Computes `_read` in one native loop over paths."""
 
     @native_loop
     def read_all(table: Array, grids: Array, lookups: Lookups) -> Array:
@@ -420,7 +451,7 @@ def _read_native(pixels: int, table: Array, grids: Array, lookups: Lookups) -> A
 
 
 def _add_native(entries: int, slopes: Array, grids: Array, lookups: Lookups) -> Array:
-    """Is `_add` as one loop over paths."""
+    """Computes `_add` in one native loop over paths."""
 
     @native_loop
     def add_all(slopes: Array, grids: Array, lookups: Lookups) -> Array:

@@ -33,8 +33,13 @@ def render_ray(model: Model, ray: Rays) -> Float[Array, "3"]:
     Args:
       model: fields, scene and path settings.
       ray: one camera ray, without leading axes.
+
+    Raises:
+      ValueError: if the model has a backdrop instead of fields.
     """
     config, params = model.config, model.params
+    if config.backdrop is not None:
+        raise ValueError("This page shows fields, but the model has a backdrop. Use render_rays.")
     density = jax.vmap(registry.density, in_axes=(None, None, 0))
     radiance = jax.vmap(registry.radiance, in_axes=(None, None, 0, 0))
     middle = functools.partial(

@@ -338,7 +338,15 @@ def look_up(
       point: position in world units; beyond the scene bounds, their nearest point is used.
       direction: unit direction of travel of the viewing path.
       width: edge of the cell around the point, world units: finer detail is blurred.
+
+    Raises:
+      ValueError: if the model has a backdrop instead of fields.
     """
+    if config.backdrop is not None:
+        raise ValueError(
+            "This model has a backdrop in place of a field, so there is no density to look up. "
+            "Train it with far_field=field."
+        )
     # Standard deviation of a cube along each axis.
     scale = jnp.full((1,), width, point.dtype) / jnp.sqrt(jnp.asarray(12.0, point.dtype))
     bounds = domain(config)

@@ -75,7 +75,7 @@ class Block(NamedTuple):
 
     Attributes:
       lookups: points of the surface that the views' light paths end on.
-      linear: linear RGB of the pixels, without light from elsewhere.
+      linear: linear RGB of the pixels.
       srgb: sRGB of the pixels.
       kept: 1 for pixels that are fitted, 0 for those that are held out.
     """
@@ -210,6 +210,7 @@ def _block(lookups: Lookups, photographs: UInt8[np.ndarray, "views h w 3"], seed
     return Block(lookups, linear, srgb, host_array(np.float32(~held_out)))
 
 
+@jax.jit
 def _weights(predicted: Array, block: Block, typical: float | Array) -> Float[Array, "pixels 3"]:
     """Returns the squared weight of each pixel and channel, which is 0 where it is held out."""
     slope = 1.055 / 2.4 * jnp.maximum(block.linear, _DARK) ** (1.0 / 2.4 - 1.0)
@@ -223,14 +224,6 @@ def _weights(predicted: Array, block: Block, typical: float | Array) -> Float[Ar
     return jnp.where(bright, 0.0, huber * jnp.square(secant)) * block.kept[:, None]
 
 
-@jax.jit
-def _first_weights(block: Block) -> Float[Array, "pixels 3"]:
-    return _weights(block.linear, block, jnp.inf)
-
-
-_next_weights = jax.jit(_weights)
-
-
 @functools.partial(jax.jit, static_argnames="space")
 def _mipmap(pyramid: Pyramid, space: Space) -> Mips:
     return backdrop.mipmap(pyramid, space)
@@ -239,7 +232,7 @@ def _mipmap(pyramid: Pyramid, space: Space) -> Mips:
 @functools.partial(jax.jit, static_argnames="space")
 def _mipmap_transposed(mips: Mips, space: Space) -> Pyramid:
     """Returns the transpose of `mipmap`."""
-    like = tuple(jnp.zeros_like(copy) for copy in mips[::-1])
+    like = tuple(jnp.zeros_like(mip) for mip in mips[::-1])
     return jax.linear_transpose(lambda x: backdrop.mipmap(x, space), like)(mips)[0]
 
 
@@ -341,11 +334,11 @@ def solve(
         return _at_once(look, blocks, [mips] * len(blocks))
 
     while step < iterations:
-        seen, before = predict(x), -math.inf
-        weights = [_first_weights(block) for block in blocks]
+        seen, before, typical = predict(x), -math.inf, math.inf
         if step:
             _, before, typical = _measure(blocks, seen)
-            weights = [_next_weights(s, b, typical) for s, b in zip(seen, blocks, strict=True)]
+        expected = seen if step else [block.linear for block in blocks]
+        weights = [_weights(e, b, typical) for e, b in zip(expected, blocks, strict=True)]
         diagonal = jax.tree.map(lambda ours, weight: ours + weight, transpose(weights), priors)
         gap = [w * (b.linear - s) for w, b, s in zip(weights, blocks, seen, strict=True)]
         # The prior of vertices that no pixel sees is the mean of all pixels.

@@ -259,6 +259,11 @@ def train(
         if checkpoints.newest() == total:
             report(f"{run} is trained already: {total} {'iterations' if solved else 'steps'}.")
             return True
+        if solved and jax.process_count() > 1:
+            raise ValueError(
+                f"{run} has far_field=backdrop, which one process solves, but there are "
+                f"{jax.process_count()}. Run it in one."
+            )
         folder = scene_source.open_scene(scene or config.scene.path)
         objects = checkpoint_io.load_scene(run)
         if solved:

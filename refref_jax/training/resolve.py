@@ -376,6 +376,7 @@ def _resolve_far_field(
         "opaque parts, whose colour a field learns": opaque and config.paths.name != "straight",
         "learned tints": bool(model.learned_tints),
         "contraction=always": config.model.contraction == "always",
+        "pixels=background": config.scene.pixels == "background",
     }
     if found := [name for name, holds in why_not.items() if holds]:
         raise ValueError(

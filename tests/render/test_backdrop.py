@@ -24,7 +24,7 @@ def _rays(count, *, radius=1e-2, seed=0):
     return Rays(*(jnp.asarray(x, jnp.float32) for x in (0.3 * drawn[0], directions, radii)))
 
 
-def _looks(domain, rays, *, most_taps=3):
+def _lookups(domain, rays, *, most_taps=3):
     ends = straight_ends(rays, footprint="differential")
     pixels = jnp.arange(rays.radii.size, dtype=jnp.int32) // 2
     return backdrop.locate(domain, ends, pixels, resolution=_SIDE, most_taps=most_taps)
@@ -50,7 +50,7 @@ def test_a_uniform_surface_is_the_throughput_of_each_pixel(space):
     mips = backdrop.mipmap(backdrop.init(_SIDE, radiance=jnp.array([0.2, 0.5, 4.0])), space)
     for copy in mips:
         np.testing.assert_allclose(copy, np.broadcast_to([0.2, 0.5, 4.0], copy.shape), rtol=1e-6)
-    lookups = _looks(_DOMAINS[space], rays)
+    lookups = _lookups(_DOMAINS[space], rays)
     assert np.any(lookups.levels > 0) and np.all(lookups.taps >= 1)
     seen = backdrop.colours(mips, lookups, pixels=100)
     np.testing.assert_allclose(seen, np.broadcast_to([0.4, 1.0, 8.0], (100, 3)), rtol=1e-5)
@@ -58,7 +58,7 @@ def test_a_uniform_surface_is_the_throughput_of_each_pixel(space):
 
 @pytest.mark.parametrize("space", _SPACES)
 def test_native_loops_are_the_formulas_of_other_devices(space):
-    lookups = _looks(_DOMAINS[space], _rays(300, radius=0.1))
+    lookups = _lookups(_DOMAINS[space], _rays(300, radius=0.1))
     mips = backdrop.mipmap(_random_pyramid(), space)
     table, grids = backdrop._table(mips), jnp.asarray(backdrop._grids(_SIDE))
     np.testing.assert_allclose(
@@ -76,7 +76,7 @@ def test_native_loops_are_the_formulas_of_other_devices(space):
 
 @pytest.mark.parametrize("space", _SPACES)
 def test_the_transpose_of_the_colours(space):
-    lookups = _looks(_DOMAINS[space], _rays(300, radius=0.1))
+    lookups = _lookups(_DOMAINS[space], _rays(300, radius=0.1))
     mips = tuple(_random_pyramid()[::-1])
     slopes = jnp.asarray(np.random.default_rng(2).normal(size=(150, 3)), jnp.float32)
     forward = jnp.sum(backdrop.colours(mips, lookups, pixels=150) * slopes)
@@ -91,7 +91,7 @@ def test_a_wall_is_interpolated_bilinearly_at_the_point_where_the_ray_leaves():
     origin = np.array([0.5, 0.1, 0.2])
     direction = (target - origin) / np.linalg.norm(target - origin)
     ray = Rays(*(jnp.asarray(x, jnp.float32)[None] for x in (origin, direction, 1e-4)))
-    lookups = _looks(domain, ray)
+    lookups = _lookups(domain, ray)
     assert lookups.faces[0] == 3
     # Columns of a wall are along the next axis, rows along the one after: z, then x.
     expected = 0.5 * _SIDE * (np.array([-0.7, 0.3]) / 2.0 + 1.0)
@@ -121,7 +121,7 @@ def test_there_are_no_seams(space):
             jnp.asarray(directions.reshape(-1, 3), jnp.float32),
             jnp.full(80, 1e-6),
         )
-        lookups = _looks(domain, rays)._replace(pixels=jnp.arange(80, dtype=jnp.int32))
+        lookups = _lookups(domain, rays)._replace(pixels=jnp.arange(80, dtype=jnp.int32))
         assert np.all(lookups.faces[:40] != lookups.faces[40:])
         for level in range(3):
             seen = backdrop.colours(
@@ -133,11 +133,11 @@ def test_there_are_no_seams(space):
 @pytest.mark.parametrize("space", _SPACES)
 def test_axes_are_the_change_of_the_place_across_a_pixel(space):
     domain, rays = _DOMAINS[space], _rays(100, radius=1e-3)
-    lookups = _looks(domain, rays)
+    lookups = _lookups(domain, rays)
     ends = straight_ends(rays, footprint="differential")
     for axis in range(2):
         moved = rays._replace(directions=rays.directions + ends.differentials.directions[:, axis])
-        there = _looks(domain, moved)
+        there = _lookups(domain, moved)
         same = np.asarray(there.faces == lookups.faces)
         assert same.sum() > 90
         change = np.sqrt(3.0) * (there.places - lookups.places)
@@ -149,17 +149,50 @@ def test_a_wide_footprint_reads_the_mean_of_its_surroundings():
     grid[:, ::2] = 1.0  # stripes of one cell
     pyramid = (*backdrop.init(_SIDE)[:-1], jnp.asarray(grid))
     mips = backdrop.mipmap(pyramid, "bounded")
-    narrow, wide = (_looks(_DOMAINS["bounded"], _rays(200, radius=r)) for r in (1e-5, 0.5))
+    narrow, wide = (_lookups(_DOMAINS["bounded"], _rays(200, radius=r)) for r in (1e-5, 0.5))
     seen = [np.std(backdrop.colours(mips, lookups, pixels=100)) for lookups in (narrow, wide)]
     assert seen[0] > 0.3 and seen[1] < 0.2 * seen[0]
 
 
 def test_places_and_axes_are_finite_at_the_extremes():
-    domain = _DOMAINS["bounded"]
     directions = jnp.asarray([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]], jnp.float32)
     origins = jnp.asarray([[5.0, 0.0, 0.0], [0.1, -0.2, 0.3], [2.1, 1.8, 2.3]], jnp.float32)
     for space in _SPACES:
-        lookups = _looks(_DOMAINS[space], Rays(origins, directions, jnp.full(3, 1e6)))
+        lookups = _lookups(_DOMAINS[space], Rays(origins, directions, jnp.full(3, 1e6)))
         for values in lookups:
             assert np.all(np.isfinite(values))
-    assert domain.space == "bounded"
+
+
+def test_a_coarse_level_is_interpolated_exactly_on_finer_grids():
+    first, *others = backdrop.init(_SIDE)
+    ramp = jnp.broadcast_to(jnp.arange(5.0)[None, None, :, None], first.shape)
+    finest = backdrop.mipmap((ramp, *others), "bounded")[0]
+    expected = np.broadcast_to(np.linspace(0.0, 4.0, _SIDE + 1)[None, None, :, None], finest.shape)
+    np.testing.assert_allclose(finest, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("space", _SPACES)
+def test_gradients_by_radiance_and_throughput_are_finite_differences(space):
+    lookups, pyramid = _lookups(_DOMAINS[space], _rays(40, radius=0.1)), _random_pyramid()
+    target = jnp.asarray(np.random.default_rng(5).uniform(size=(20, 3)), jnp.float32)
+
+    def loss(pyramid, throughput):
+        seen = backdrop.colours(
+            backdrop.mipmap(pyramid, space), lookups._replace(throughput=throughput), pixels=20
+        )
+        return jnp.sum(jnp.square(seen - target))
+
+    given = pyramid, lookups.throughput
+    slopes = jax.jit(jax.grad(loss, argnums=(0, 1)))(*given)
+    random = np.random.default_rng(6)
+    for number in range(2):
+        towards = jax.tree.map(
+            lambda x: jnp.asarray(random.normal(size=x.shape), jnp.float32), given[number]
+        )
+        values = []
+        for step in (1e-2, -1e-2):
+            moved = jax.tree.map(lambda x, y, step=step: x + step * y, given[number], towards)
+            values.append(float(loss(*(moved if n == number else given[n] for n in range(2)))))
+        pairs = zip(jax.tree.leaves(slopes[number]), jax.tree.leaves(towards), strict=True)
+        expected = float(sum(jnp.sum(a * b) for a, b in pairs))
+        np.testing.assert_allclose((values[0] - values[1]) / 2e-2, expected, rtol=5e-3)

@@ -1,16 +1,19 @@
 """Runs with a backdrop: solved, paused and continued, rendered, and refused where none fits."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from refref_jax.data import scene_folder
 from refref_jax.geometry.cameras import image_rays
-from refref_jax.render import Model, render_image
+from refref_jax.render import Model, one_ray, render_image, render_rays
+from refref_jax.render.volume_rendering import look_up
 from refref_jax.training import backdrop_solver, run_folder
 from refref_jax.training.config import TrainConfig
 from refref_jax.training.fit import fit
 from tests.factories.cut_ball import cut_ball
+from tests.factories.small_model import CAMERAS
 
 pytestmark = [pytest.mark.loose]
 
@@ -56,6 +59,29 @@ def test_distances_are_those_of_the_walls_along_the_path(scene, run):
     away = ~scene_folder.read_masks(frames)[0]
     error = np.abs(np.asarray(seen.distance) - scene_folder.read_distances(frames)[0])[away]
     assert np.median(error) < 1e-3 and np.quantile(error, 0.95) < 0.05
+
+
+def test_the_radiance_has_gradients_through_the_renderer(scene, run):
+    frames, model = scene_folder.read_frames(scene, "train"), run[1]
+    row = jax.tree.map(lambda x: x[64, ::16], image_rays(frames.cameras, 0))
+
+    @jax.jit
+    @jax.grad
+    def slope(params):
+        return jnp.mean(render_rays(model._replace(params=params), row).linear)
+
+    slopes = [np.asarray(level) for level in slope(model.params).field]
+    assert all(np.all(np.isfinite(level)) for level in slopes)
+    # A uniformly brighter surface is a uniformly brighter image.
+    np.testing.assert_allclose(slopes[0].sum(), 1.0, rtol=1e-3)
+
+
+def test_a_model_with_a_backdrop_has_no_field_to_look_up(run):
+    model = run[1]
+    with pytest.raises(ValueError, match="no density to look up"):
+        look_up(model.params, model.config, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0]), width=0.1)
+    with pytest.raises(ValueError, match="the model has a backdrop"):
+        one_ray.render_ray(model, jax.tree.map(lambda x: x[0, 0], image_rays(CAMERAS, 0)))
 
 
 def test_a_paused_run_continues_to_the_same_bits(scene, run, tmp_path):
