@@ -114,8 +114,10 @@ def supersample(cameras: Cameras, side: int) -> Cameras:
     )
 
 
-def strata(cameras: Cameras, side: int) -> Int[np.ndarray, "height width 2"]:
-    """Returns the pixel and the subpixel of every ray of a supersampled camera; see `Rays.strata`.
+def strata(cameras: Cameras, side: int) -> Int[np.ndarray, "height width 3"]:
+    """Returns pixel, subpixel and number of subpixels of every ray of a supersampled camera.
+
+    See `Rays.strata`.
 
     Args:
       cameras: the cameras before `supersample`.
@@ -123,7 +125,8 @@ def strata(cameras: Cameras, side: int) -> Int[np.ndarray, "height width 2"]:
     """
     row, column = np.indices((side * cameras.height, side * cameras.width), np.int32)
     pixel = (row // side) * cameras.width + column // side
-    return np.stack([pixel, (row % side) * side + column % side], axis=-1)
+    subpixel = (row % side) * side + column % side
+    return np.stack([pixel, subpixel, np.full_like(pixel, side**2)], axis=-1)
 
 
 def box_filter(

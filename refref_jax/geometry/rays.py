@@ -18,14 +18,15 @@ class Rays(NamedTuple):
       directions: unit vectors.
       radii: footprint of the pixel, as the cone radius at unit distance (world units per world
         unit).
-      strata: index of the pixel, and of the ray among those of the pixel, so that its rays meet
-        different facets of a rough surface (`cameras.strata`); `None` for rays without relation.
+      strata: index of the pixel, index of the ray in the pixel, and number of rays in the pixel, so
+        that they meet different facets of a rough surface (`cameras.strata`); `None` for rays
+        without relation.
     """
 
     origins: Float[Array, "*rays 3"]
     directions: Float[Array, "*rays 3"]
     radii: Float[Array, "*rays"]
-    strata: Int[Array, "*rays 2"] | None = None
+    strata: Int[Array, "*rays 3"] | None = None
 
 
 def orthonormal_basis(

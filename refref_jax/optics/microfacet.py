@@ -46,11 +46,13 @@ class Stratum(NamedTuple):
     Attributes:
       pixel: index of the pixel.
       ray: index of the ray in the pixel.
+      num_rays: number of rays in the pixel.
       num_bends: number of bends of the ray so far.
     """
 
     pixel: Int[Array, ""]
     ray: Int[Array, ""]
+    num_rays: Int[Array, ""]
     num_bends: Int[Array, ""]
 
 
@@ -88,6 +90,30 @@ def facet_normal(
     facet = u * across + v * along + up * stretched
     facet = jnp.stack([alpha * facet[0], alpha * facet[1], jnp.maximum(facet[2], 0.0)])
     return jnp.where(alpha > 0.0, numerics.normalize(facet @ frame), normal)
+
+
+def tilted(facet: Float[Array, "3"], tilt: Float[Array, "2"]) -> Float[Array, "3"]:
+    """Returns the unit normal of a facet with a slope against another.
+
+    Args:
+      facet: unit normal of a facet.
+      tilt: slope along two directions in the facet.
+    """
+    return numerics.normalize(facet + tilt @ jnp.stack(orthonormal_basis(facet)))
+
+
+def spacing(alpha: Float[Array, ""], stratum: Stratum) -> Float[Array, ""]:
+    """Returns how far the slopes of facets that the rays of a pixel meet are apart.
+
+    `num_rays` cells cover the disc of slopes with radius `alpha`. Like `Rays.radii`, the result is
+    the edge of a square cell over the root of 3, so it is `alpha / sqrt(num_rays)` within 3 %.
+
+    Args:
+      alpha: width of the distribution, >= 0.
+      stratum: place of the ray among those of its pixel.
+    """
+    cells = 3.0 / jnp.pi * stratum.num_rays.astype(alpha.dtype)
+    return alpha / jnp.sqrt(cells)
 
 
 def masking(

@@ -64,6 +64,7 @@ def interact(
     direction: Float[Array, "3"],
     *,
     stratum: Stratum | None = None,
+    tilt: Float[Array, "2"] | None = None,
 ) -> Interaction:
     """Reflects and refracts a ray at an interface.
 
@@ -76,6 +77,7 @@ def interact(
       interior_list: interior list of the ray (see `media`).
       direction: unit direction of the incident ray.
       stratum: place of the ray among those of its pixel, if it is known.
+      tilt: tilt of the facet of a rough surface, as a slope; 0 by default.
     """
     entering = numerics.dot(direction, point.geometric_normal) < 0.0
     sides = media.crossing(interfaces, interior_list, point.part, entering)
@@ -88,6 +90,7 @@ def interact(
     if alpha is not None:
         numbers = microfacet.uniform_pair(point.position, direction, stratum=stratum)
         facet = microfacet.facet_normal(direction, normal, alpha, numbers)
+        facet = facet if tilt is None else microfacet.tilted(facet, tilt)
     near, far = sides.index_near, sides.index_far
     beta = -numerics.dot(direction, facet)
     # Directions are renormalised, or rounding errors would accumulate over bends.
@@ -227,7 +230,7 @@ class RayState(NamedTuple):
       exclude_primitive: triangle that the segment starts on, which it cannot hit.
       interior_list: interior list, the parts that the ray is in (see `media`).
       differential: ray differential of the current segment (see `ray_differentials`).
-      strata: pixel and number of the ray, see `Rays`.
+      strata: pixel, number of the ray and number of rays, see `Rays`.
     """
 
     origin: Float[Array, "*rays 3"]
@@ -239,7 +242,7 @@ class RayState(NamedTuple):
     exclude_primitive: Int[Array, "*rays"]
     interior_list: Int[Array, "*rays slots"]
     differential: RayDifferential
-    strata: Int[Array, "*rays 2"] | None = None
+    strata: Int[Array, "*rays 3"] | None = None
 
 
 class Arrival(NamedTuple):
@@ -293,12 +296,12 @@ def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arriv
     """
     interfaces, stratum = scene.interfaces, None
     if state.strata is not None:
-        stratum = Stratum(state.strata[0], state.strata[1], state.num_bends)
+        stratum = Stratum(state.strata[0], state.strata[1], state.strata[2], state.num_bends)
     if media.has_dispersion(interfaces):  # the ray carries light of one channel
         interfaces = media.of_channel(interfaces, jnp.argmax(state.throughput))
 
     def surface(
-        origin: Float[Array, "3"], direction: Float[Array, "3"]
+        origin: Float[Array, "3"], direction: Float[Array, "3"], tilt: Float[Array, "2"] | None
     ) -> tuple[Bend, Interaction]:
         corners = scene.surfaces.bvh.triangles[primitive_id]
         found = triangles.intersect(origin, direction, corners).barycentric
@@ -307,11 +310,18 @@ def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arriv
         point = surfaces.surface_point(scene.surfaces, primitive_id, barycentric)
         # Otherwise XLA would gather the triangle again for every result that depends on it.
         point = jax.lax.optimization_barrier(point)
-        met = interact(point, interfaces, state.interior_list, direction, stratum=stratum)
+        met = interact(
+            point, interfaces, state.interior_list, direction, stratum=stratum, tilt=tilt
+        )
         return Bend(met.position, met.reflected, met.transmitted), met
 
+    # The ray stands for the facets between it and the other rays of its pixel, too.
+    tilt = None
+    if stratum is not None and interfaces.alpha.shape[0]:
+        part = scene.surfaces.parts[primitive_id]
+        tilt = microfacet.spacing(interfaces.alpha[part], stratum)
     met, reflected, transmitted = ray_differentials.bend(
-        surface, state.origin, state.direction, state.differential
+        surface, state.origin, state.direction, state.differential, tilt=tilt
     )
     length = numerics.length(met.position - state.point)
     passed = media.transmittance(scene.interfaces, met.sides.medium_near, length)

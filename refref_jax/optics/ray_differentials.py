@@ -72,26 +72,32 @@ def no_differential(like: Float[Array, "3"]) -> RayDifferential:
 
 
 def bend(
-    surface: Callable[[Array, Array], tuple[Bend, _Result]],
+    surface: Callable[[Array, Array, Array | None], tuple[Bend, _Result]],
     origin: Float[Array, "3"],
     direction: Float[Array, "3"],
     differential: RayDifferential,
+    *,
+    tilt: Float[Array, ""] | None = None,
 ) -> tuple[_Result, RayDifferential, RayDifferential]:
     """Bends a ray and its differential.
 
     Args:
-      surface: function of origin and direction that returns a `Bend` and an auxiliary output.
+      surface: function of origin, direction and tilt of the surface (two slopes) that returns a
+        `Bend` and an auxiliary output.
       origin: origin of the ray.
       direction: unit direction of the ray.
       differential: differential of the ray.
+      tilt: change of the tilt from one coordinate across the pixel to the next; 0 by default.
 
     Returns:
       The auxiliary output, and the differentials of the reflected and the transmitted ray.
     """
+    none = None if tilt is None else jnp.zeros(2, origin.dtype)
     if differential.points.shape[0] == 0:
-        return surface(origin, direction)[1], differential, differential
-    _, push, result = jax.linearize(surface, origin, direction, has_aux=True)
-    moved = jax.vmap(push)(differential.points, differential.directions)
+        return surface(origin, direction, none)[1], differential, differential
+    _, push, result = jax.linearize(surface, origin, direction, none, has_aux=True)
+    tilts = None if tilt is None else tilt * jnp.eye(2, dtype=tilt.dtype)
+    moved = jax.vmap(push)(differential.points, differential.directions, tilts)
     moved = jax.tree.map(lambda x: jnp.clip(x, -_WIDEST, _WIDEST), moved)
     return (
         result,

@@ -371,7 +371,7 @@ def _colours_backward(
     )
     by_throughput = _colours(count, mips, each) * slopes[lookups.pixels]
     # Nothing is the gradient of a constant.
-    nothing: Any = Lookups(*[None] * len(lookups))
+    nothing = jax.tree.map(lambda constant: None, lookups)
     by_radiance = transposed(slopes, lookups, resolution=mips[0].shape[1] - 1)
     return by_radiance, nothing._replace(throughput=by_throughput)
 

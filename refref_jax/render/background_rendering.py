@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from refref_jax import numerics
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.light_paths import LightPaths, PathEnds
@@ -34,6 +35,9 @@ TILE = 65536
 _INSTEAD = (
     "Call it outside, or use trace or follow_main_branches and shade, which are pure functions."
 )
+
+# Middles of the quadrants of a pixel, whose edges are root 3 times its ray differential.
+_QUADRANTS = np.sqrt(3.0) / 4.0 * np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
 
 # Number of paths whose radiance is evaluated at once.
 _CHUNK = 4096
@@ -190,7 +194,15 @@ def _render_tile(
     settings: PathSettings,
 ) -> _Tile:
     count = rays.radii.shape[0]
-    traced = path_tracing.trace_ends(scene, rays, settings=settings, interior_list=interior_list)
+    # Behind a rough surface, a ray stands for the facets between it and the pixel's other rays.
+    rough = rays.strata is not None and scene.interfaces.alpha.shape[0] > 0
+    traced = path_tracing.trace_ends(
+        scene,
+        rays,
+        settings=settings,
+        interior_list=interior_list,
+        footprint="differential" if rough else "cone",
+    )
     ends = traced.ends
     linear = _sum_light(radiance, ends, count)
     exists = light_paths.exists(ends).astype(jnp.int32)
@@ -228,7 +240,7 @@ def _light(
     radiance: Radiance, ends: PathEnds, real: Bool[Array, " paths"]
 ) -> Float[Array, "paths 3"]:
     """Returns the contribution of each path to its ray; 0 for paths that are not `real`."""
-    seen = jax.vmap(radiance)(ends.origins, ends.directions)
+    seen = _seen(radiance, ends)
     if seen.shape != ends.directions.shape:
         raise ValueError(
             f"The radiance function returned an array of shape {seen.shape[1:]} for one ray. "
@@ -242,3 +254,17 @@ def _light(
             )
         seen = jnp.where(jnp.isfinite(ends.stop.tau)[:, None], ends.stop.radiance, seen)
     return jnp.where(real[:, None], ends.throughput * seen.astype(ends.throughput.dtype), 0.0)
+
+
+def _seen(radiance: Radiance, ends: PathEnds) -> Float[Array, "paths 3"]:
+    """Returns the radiance at the end of each path: the mean over four places of its footprint."""
+    look = jax.vmap(radiance)
+    if ends.differentials.points.shape[1] == 0:
+        return look(ends.origins, ends.directions)
+
+    def look_beside(offset: Float[Array, "2"]) -> Float[Array, "paths 3"]:
+        moved = jax.tree.map(lambda axes: jnp.einsum("a,pax->px", offset, axes), ends.differentials)
+        directions = jax.vmap(numerics.normalize)(ends.directions + moved.directions)
+        return look(ends.origins + moved.points, directions)
+
+    return jnp.mean(jax.lax.map(look_beside, jnp.asarray(_QUADRANTS, ends.tau.dtype)), axis=0)

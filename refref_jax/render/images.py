@@ -147,7 +147,7 @@ def crop(
         host_array(_OUT_OF_REACH * away),
         host_array(away),
         host_array(np.ones(missing, part.radii.dtype)),
-        None if part.strata is None else host_array(np.zeros((missing, 2), part.strata.dtype)),
+        None if part.strata is None else host_array(np.ones((missing, 3), part.strata.dtype)),
     )
     nowhere = jax.tree.map(lambda x: np.full((missing, x.shape[1]), EMPTY_SLOT, x.dtype), within)
     return jax.tree.map(lambda a, b: np.concatenate([a, b]), (part, within), (filling, nowhere))

@@ -211,6 +211,31 @@ def test_a_rough_surface_adds_no_light_and_scatters_around_the_mirror(roughness)
     assert abs(np.mean(sideways)) < 0.05 and 0.1 < spread / roughness**2 < 6.0
 
 
+@pytest.mark.parametrize("number", [1, 64])
+def test_the_footprint_behind_a_rough_surface_reaches_the_next_facet(number):
+    rough = Material("conductor", roughness=0.3, complex_index=_GOLD)
+    rays = _rays(0.0)._replace(strata=jnp.array([[0, 0, number]], jnp.int32))
+    one = refref_jax.PathSettings(max_bends=1, reflections="all")
+
+    @jax.jit
+    def reflected(scene, rays):
+        return trace_ends(scene, rays, settings=one, footprint="differential").ends
+
+    def edges(material, rays):
+        ends = reflected(scenes.build(_sheet()._replace(material=material)), rays)
+        return np.linalg.norm(ends.differentials.directions[0], axis=-1)
+
+    # A mirror turns a reflected ray by twice its own angle, here across and along its tilt.
+    alpha = 0.3**2
+    expected = 2.0 * np.sqrt(np.pi / 3.0) * alpha / np.sqrt(number)
+    np.testing.assert_allclose(edges(rough, rays), expected, rtol=0.2)
+    for material, some in [
+        (Material("conductor", complex_index=_GOLD), rays),
+        (rough, rays._replace(strata=None)),
+    ]:
+        np.testing.assert_allclose(edges(material, some), 1e-3, rtol=0.2)
+
+
 @pytest.mark.parametrize(
     "material",
     [Material("opaque"), Material("conductor", complex_index=_GOLD), Material("thin_sheet")],

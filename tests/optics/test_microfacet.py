@@ -102,7 +102,7 @@ def test_the_rays_of_a_pixel_share_the_numbers_evenly_at_their_first_bends():
         """Returns how much the mean of a function over 64 rays varies between pixels."""
 
         def value(pixel, ray):
-            stratum = microfacet.Stratum(pixel, ray, bends)
+            stratum = microfacet.Stratum(pixel, ray, jnp.int32(64), bends)
             hit = jnp.stack([pixel, ray, bends]).astype(jnp.float32)
             u, v = microfacet.uniform_pair(hit, -_UP, stratum=stratum)
             return jnp.sin(2.0 * jnp.pi * u) + jnp.cos(2.0 * jnp.pi * v)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import refref_jax
 from benchmarks.oracles import colours
 from refref_jax.data.mesh_queries import parts_around
 from refref_jax.geometry.rays import Rays
@@ -93,6 +94,30 @@ def test_lost_light_is_told(scene, rays):
 def test_a_function_of_the_user_s_sees_origins_and_directions(scene, rays):
     seen = render_known(scene, lambda o, d: o / 10.0 + d + 2.0, rays, settings=STRAIGHT, tile=256)
     np.testing.assert_allclose(seen.linear, rays.origins / 10.0 + rays.directions + 2.0, rtol=1e-6)
+
+
+def test_each_ray_behind_a_rough_surface_sees_its_share_of_the_background():
+    window = scenes.build(
+        scenes.box((9.0, 9.0, 0.5))._replace(material=refref_jax.Material(roughness=0.5))
+    )
+    pixels, side = 50, 16
+    rays = Rays(
+        np.tile(np.float32([0.1, 0.2, 3.0]), (pixels * side, 1)),
+        np.tile(np.float32([0.0, 0.0, -1.0]), (pixels * side, 1)),
+        np.full(pixels * side, 1e-4, np.float32),
+    )
+    pixel, ray = (x.ravel() for x in np.indices((pixels, side), np.int32))
+
+    def noise(number):
+        strata = np.stack([pixel, ray, np.full_like(pixel, number)], axis=-1)
+        sky = jax.tree_util.Partial(lambda origin, direction: 1.0 + jnp.sin(60.0 * direction))
+        seen = render_known(window, sky, rays._replace(strata=strata), settings=TREE, tile=1024)
+        each = seen.linear.reshape(pixels, side, 3).mean(axis=1)[:, :2]
+        return each.mean(), each.std()
+
+    # As one of very many rays, each is alone.
+    (alone, noisy), (shared, smooth) = noise(2**30), noise(side)
+    assert smooth < 0.9 * noisy and abs(shared - alone) < noisy
 
 
 def test_backgrounds_are_arguments_of_one_program(scene, rays):
