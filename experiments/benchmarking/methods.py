@@ -22,7 +22,7 @@ with epy.lazy_imports():
     from refref_jax.fields import registry
     from refref_jax.training import presets
 
-Need = Literal["meshes", "masks", "colours"]
+Need = Literal["meshes", "masks", "colours", "backdrop"]
 Group = Literal["main", "ablation of the oracle", "ablation of the tree"]
 
 RECONSTRUCTION = "reconstruction"
@@ -39,7 +39,8 @@ class Method:
       group: comparison to which it belongs.
       train: options of `experiments.train`.
       requires: requirements on a scene: `meshes` of its objects, `masks` of its training images,
-        `colours` of all its parts in scene.json.
+        `colours` of all its parts in scene.json, `backdrop` if all light ends on its background
+        and nothing but that is learned.
       reconstructed: whether the objects come from R3F instead of the scene's meshes.
       published: row of the paper's tables with the same method, if there is one.
       evaluate: options of `experiments.evaluate`, in place of those of the benchmark.
@@ -100,6 +101,13 @@ _ALL = (
         evaluate=("--rays_per_pixel=1",),
     ),
     Method("tree", "Oracle (path tree)", "main", _TREE),
+    Method(
+        "tree_backdrop",
+        "Oracle (path tree, backdrop)",
+        "main",
+        (*_TREE, "--far_field=backdrop"),
+        ("meshes", "backdrop"),
+    ),
     Method("r3f", "R3F (paper's paths)", "main", _ORACLE, ("masks",), True, "R3F"),
     Method("r3f_tree", "R3F (path tree)", "main", _TREE, ("masks",), True),
     _ablated(

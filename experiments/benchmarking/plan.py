@@ -116,6 +116,7 @@ _WANTING: dict[Need, str] = {
     "meshes": "it has no meshes",
     "masks": "its training images have no masks",
     "colours": "scene.json does not define the colours of all its parts",
+    "backdrop": "it needs a field: a part is opaque, or its colours or its interior are unknown",
 }
 
 
@@ -217,17 +218,24 @@ def _lacking(scene: Scene, requires: set[Need]) -> set[Need]:
 def _unmet(listed: Scene, requires: set[Need]) -> set[Need]:
     found: set[Need] = set()
     scene = Path(listed.path)
-    files = meshes.mesh_files(scene) if requires & {"meshes", "colours"} else []
+    of_meshes: set[Need] = {"meshes", "colours", "backdrop"}
+    files = meshes.mesh_files(scene) if requires & of_meshes else []
     if "meshes" in requires and not files:
         found.add("meshes")
-    if "colours" in requires:
+    if requires & {"colours", "backdrop"}:
         described = scene_properties.read(scene, overlay=listed.properties).parts
-        known = [path.name in described and described[path.name].colour_known for path in files]
-        if not known or not all(known):
+        parts = [described.get(path.name, PartDescription()) for path in files]
+        if not parts or not all(part.colour_known for part in parts):
             found.add("colours")
+        if find_tints(parts) == "learned" or any(map(_learns_inside, parts)):
+            found.add("backdrop")
     if "masks" in requires and _has_no_masks(scene):
         found.add("masks")
     return found
+
+
+def _learns_inside(part: PartDescription) -> bool:
+    return part.material.kind == "opaque" or part.material.interior == "field"
 
 
 def job_folder(out: Path, job: Job) -> Path:

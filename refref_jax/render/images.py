@@ -248,6 +248,8 @@ def _render_tile(model: Model, rays: Rays, real: int, chunk: int, branch: Branch
     tile = _trace_tile(model.scene, rays, real, which, settings=model.settings, detail=detail)
     sums = _blank(tile.dropped)
     count = int(fetch(tile.count, instead=_INSTEAD))
+    if model.config.backdrop is not None:  # every chunk builds its mipmap
+        chunk = tile.paths.radii.size
     for start in range(0, count, chunk):
         sums = _render_chunk(model.params, tile, sums, start, config=model.config, chunk=chunk)
     return _finish_tile(sums)

@@ -124,6 +124,17 @@ def test_what_a_scene_lacks_is_skipped_and_said(tmp_path, lacks, left, reason):
     assert all(reason in each for each in reasons.values())
 
 
+def test_a_backdrop_is_for_scenes_where_only_the_background_is_unknown(tmp_path):
+    clear = _scene(tmp_path / "clear")
+    assert _planned(clear, "tree_backdrop") == (["tree_backdrop"], {})
+    untold = _scene(tmp_path / "untold", colours=False)
+    opaque = _scene(tmp_path / "opaque", colours=False)
+    _edit("scene.json", '"ior_inside": 1.5', '"kind": "opaque"')(Path(opaque.path))
+    for scene in (untold, opaque):
+        names, reasons = _planned(scene, "tree,tree_backdrop")
+        assert names == ["tree"] and "it needs a field" in reasons["tree_backdrop"]
+
+
 @pytest.mark.parametrize(
     ("colour", "same", "told"),
     [
@@ -169,7 +180,7 @@ def test_a_scene_without_test_views_is_left_out_and_one_broken_otherwise_is_not(
     assert _planned(scene, "tree,tree_tints_given") == (["tree", "tree_tints_given"], {})
     spoil(Path(scene.path))
     names, reasons = _planned(scene, "main")
-    assert names == [] and len(reasons) == 6
+    assert names == [] and len(reasons) == 7
     assert all(
         "its test views cannot be read" in each and named in each for each in reasons.values()
     )
