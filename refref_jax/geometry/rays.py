@@ -19,8 +19,8 @@ class Rays(NamedTuple):
       radii: footprint of the pixel, as the cone radius at unit distance (world units per world
         unit).
       strata: index of the pixel, index of the ray in the pixel, and number of rays in the pixel, so
-        that they meet different facets of a rough surface (`cameras.strata`); `None` for rays
-        without relation.
+        that the rays of a pixel meet different facets of a rough surface (`cameras.strata`); `None`
+        for rays without relation.
     """
 
     origins: Float[Array, "*rays 3"]

@@ -93,27 +93,34 @@ def facet_normal(
 
 
 def tilted(facet: Float[Array, "3"], tilt: Float[Array, "2"]) -> Float[Array, "3"]:
-    """Returns the unit normal of a facet with a slope against another.
+    """Returns the unit normal of a facet, tilted by a slope.
 
     Args:
-      facet: unit normal of a facet.
+      facet: unit normal of the facet.
       tilt: slope along two directions in the facet.
     """
     return numerics.normalize(facet + tilt @ jnp.stack(orthonormal_basis(facet)))
 
 
-def spacing(alpha: Float[Array, ""], stratum: Stratum) -> Float[Array, ""]:
-    """Returns how far the slopes of facets that the rays of a pixel meet are apart.
+def spacing(alpha: Float[Array, ""], stratum: Stratum) -> Float[Array, "2 2"]:
+    """Returns the distance between the facet slopes of neighbouring rays of a pixel, as two axes.
 
-    `num_rays` cells cover the disc of slopes with radius `alpha`. Like `Rays.radii`, the result is
-    the edge of a square cell over the root of 3, so it is `alpha / sqrt(num_rays)` within 3 %.
+    `num_rays` cells cover the disc of slopes with radius `alpha`. Like `Rays.radii`, the length of
+    the axes is the edge of a square cell over the root of 3, so it is `alpha / sqrt(num_rays)`
+    within 3 %. It is 0 for a single ray, which would blur what it sees by all facets.
+
+    Entry and exit of a body would cancel if they shared their axes: every other bend turns them.
 
     Args:
       alpha: width of the distribution, >= 0.
       stratum: place of the ray among those of its pixel.
     """
-    cells = 3.0 / jnp.pi * stratum.num_rays.astype(alpha.dtype)
-    return alpha / jnp.sqrt(cells)
+    cells = 3.0 / jnp.pi * jnp.maximum(stratum.num_rays, 1).astype(alpha.dtype)
+    length = jnp.where(stratum.num_rays > 1, alpha / jnp.sqrt(cells), 0.0)
+    zero = jnp.zeros_like(length)
+    straight, turned = jnp.stack([length, zero]), jnp.stack([zero, length])
+    odd = stratum.num_bends % 2 == 1
+    return jnp.where(odd, jnp.stack([turned, -straight]), jnp.stack([straight, turned]))
 
 
 def masking(

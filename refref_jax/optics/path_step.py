@@ -316,12 +316,12 @@ def arrive(scene: Scene, state: RayState, primitive_id: Int[Array, ""]) -> Arriv
         return Bend(met.position, met.reflected, met.transmitted), met
 
     # The ray stands for the facets between it and the other rays of its pixel, too.
-    tilt = None
+    tilts = None
     if stratum is not None and interfaces.alpha.shape[0]:
         part = scene.surfaces.parts[primitive_id]
-        tilt = microfacet.spacing(interfaces.alpha[part], stratum)
+        tilts = microfacet.spacing(interfaces.alpha[part], stratum)
     met, reflected, transmitted = ray_differentials.bend(
-        surface, state.origin, state.direction, state.differential, tilt=tilt
+        surface, state.origin, state.direction, state.differential, tilts=tilts
     )
     length = numerics.length(met.position - state.point)
     passed = media.transmittance(scene.interfaces, met.sides.medium_near, length)

@@ -77,7 +77,7 @@ def bend(
     direction: Float[Array, "3"],
     differential: RayDifferential,
     *,
-    tilt: Float[Array, ""] | None = None,
+    tilts: Float[Array, "2 2"] | None = None,
 ) -> tuple[_Result, RayDifferential, RayDifferential]:
     """Bends a ray and its differential.
 
@@ -87,16 +87,15 @@ def bend(
       origin: origin of the ray.
       direction: unit direction of the ray.
       differential: differential of the ray.
-      tilt: change of the tilt from one coordinate across the pixel to the next; 0 by default.
+      tilts: tilt of the surface per unit of each coordinate across the pixel; 0 by default.
 
     Returns:
       The auxiliary output, and the differentials of the reflected and the transmitted ray.
     """
-    none = None if tilt is None else jnp.zeros(2, origin.dtype)
     if differential.points.shape[0] == 0:
-        return surface(origin, direction, none)[1], differential, differential
+        return surface(origin, direction, None)[1], differential, differential
+    none = None if tilts is None else jnp.zeros(2, origin.dtype)
     _, push, result = jax.linearize(surface, origin, direction, none, has_aux=True)
-    tilts = None if tilt is None else tilt * jnp.eye(2, dtype=tilt.dtype)
     moved = jax.vmap(push)(differential.points, differential.directions, tilts)
     moved = jax.tree.map(lambda x: jnp.clip(x, -_WIDEST, _WIDEST), moved)
     return (

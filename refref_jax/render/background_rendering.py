@@ -257,7 +257,10 @@ def _light(
 
 
 def _seen(radiance: Radiance, ends: PathEnds) -> Float[Array, "paths 3"]:
-    """Returns the radiance at the end of each path: the mean over four places of its footprint."""
+    """Returns the radiance at the end of each path.
+
+    It is the mean over four places of the path's footprint, if ray differentials are carried.
+    """
     look = jax.vmap(radiance)
     if ends.differentials.points.shape[1] == 0:
         return look(ends.origins, ends.directions)

@@ -216,7 +216,7 @@ def render_image(
     Args:
       model: trained model.
       rays: camera rays with any leading axes, usually `[height, width]`.
-      chunk: number of paths rendered at once.
+      chunk: number of paths rendered at once; a backdrop renders those of a tile.
       branch: selection of paths by their branch at the first surface. The linear colours of
         `transmitted` and `reflected` sum to those of `both`. All three use one compiled program.
 

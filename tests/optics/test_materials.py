@@ -211,7 +211,7 @@ def test_a_rough_surface_adds_no_light_and_scatters_around_the_mirror(roughness)
     assert abs(np.mean(sideways)) < 0.05 and 0.1 < spread / roughness**2 < 6.0
 
 
-@pytest.mark.parametrize("number", [1, 64])
+@pytest.mark.parametrize("number", [4, 64])
 def test_the_footprint_behind_a_rough_surface_reaches_the_next_facet(number):
     rough = Material("conductor", roughness=0.3, complex_index=_GOLD)
     rays = _rays(0.0)._replace(strata=jnp.array([[0, 0, number]], jnp.int32))
@@ -232,8 +232,24 @@ def test_the_footprint_behind_a_rough_surface_reaches_the_next_facet(number):
     for material, some in [
         (Material("conductor", complex_index=_GOLD), rays),
         (rough, rays._replace(strata=None)),
+        (rough, rays._replace(strata=jnp.array([[0, 0, 1]], jnp.int32))),
     ]:
         np.testing.assert_allclose(edges(material, some), 1e-3, rtol=0.2)
+
+
+def test_entry_and_exit_of_a_rough_body_widen_the_footprint_independently():
+    heights, rough = np.linspace(-1.0, 1.0, 200), Material(roughness=0.1)
+    pixel = np.stack([np.arange(200), np.zeros(200), np.full(200, 64)], axis=-1)
+    rays = _rays(*heights)._replace(strata=jnp.asarray(pixel, jnp.int32))
+    rays = rays._replace(radii=jnp.full(200, 1e-6))
+    two = refref_jax.PathSettings(max_bends=2, reflections="none")
+    slab = scenes.build(scenes.box((1.0, 9.0, 9.0))._replace(material=rough))
+    through = jax.jit(functools.partial(trace_ends, settings=two, footprint="differential"))
+    ends = through(slab, rays).ends
+    axes = np.linalg.norm(ends.differentials.directions, axis=-1)[np.asarray(exists(ends))]
+    # One surface of index 1.5 turns light by half of its tilt.
+    alone = 0.5 * np.sqrt(np.pi / 3.0) * 0.1**2 / 8.0
+    np.testing.assert_allclose(np.median(axes), np.sqrt(2.0) * alone, rtol=0.2)
 
 
 @pytest.mark.parametrize(
