@@ -256,7 +256,7 @@ def _light(
     return jnp.where(real[:, None], ends.throughput * seen.astype(ends.throughput.dtype), 0.0)
 
 
-def _seen(radiance: Radiance, ends: PathEnds) -> Float[Array, "paths 3"]:
+def _seen(radiance: Radiance, ends: PathEnds) -> Array:
     """Returns the radiance at the end of each path.
 
     It is the mean over four places of the path's footprint, if ray differentials are carried.
@@ -265,7 +265,7 @@ def _seen(radiance: Radiance, ends: PathEnds) -> Float[Array, "paths 3"]:
     if ends.differentials.points.shape[1] == 0:
         return look(ends.origins, ends.directions)
 
-    def look_beside(offset: Float[Array, "2"]) -> Float[Array, "paths 3"]:
+    def look_beside(offset: Float[Array, "2"]) -> Array:
         moved = jax.tree.map(lambda axes: jnp.einsum("a,pax->px", offset, axes), ends.differentials)
         directions = jax.vmap(numerics.normalize)(ends.directions + moved.directions)
         return look(ends.origins + moved.points, directions)
