@@ -156,12 +156,13 @@ def check_meshes(scene: Path) -> tuple[Meshes | None, list[Finding]]:
     """Reads and lints the meshes of a scene; returns `None` for unreadable meshes."""
     try:
         parts = meshes.read_meshes(scene)
+        rule = known_scene.rule_of(scene_properties.read(scene))
     except ValueError as error:
         return None, [Finding("error", scene.name, str(error))]
     if not parts:
         return None, [Finding("error", scene.name, "the scene has no meshes. Make it again.")]
     tree = mesh_queries.find_containment(parts)
-    return Meshes(parts, tree), mesh_checks.lint(parts, tree)
+    return Meshes(parts, tree), mesh_checks.lint(parts, tree, rule=rule)
 
 
 def read_views(scene: Path, made_of: Meshes, *, count: int) -> KnownScene:

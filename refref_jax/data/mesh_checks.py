@@ -103,8 +103,12 @@ class _Patch(NamedTuple):
     distance: float
 
 
-def lint_pairs(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
+def _lint_pairs(
+    parts: Sequence[MeshPart], containment: Containment, rule: RuleName
+) -> list[Finding]:
     """Reports parts that lie inside, intersect, coincide with or nearly touch others."""
+    if rule != "nested":
+        containment = containment._replace(overlaps=())  # which are correct under this rule
     findings = [
         Finding("note", parts[inner].name, f"lies inside {parts[outer].name}.")
         for inner, outer in enumerate(containment.parents)
@@ -238,15 +242,18 @@ def _gap(parts: Sequence[MeshPart], pair: tuple[int, int], patch: _Patch) -> Fin
     )
 
 
-def lint(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
-    """Checks all parts (closed, oriented outwards, clean faces), and all pairs of parts."""
+def lint(
+    parts: Sequence[MeshPart], containment: Containment, *, rule: RuleName = "nested"
+) -> list[Finding]:
+    """Checks all parts (closed, oriented outwards, clean faces), and all pairs under a rule."""
     findings = []
     for part in parts:
         findings += _faces(part)
         if part.material.kind == "dielectric":  # other parts may be open, and have no inside
             findings += _edges(part)
             findings += _objects(part)
-    return findings + lint_pairs(parts, containment)
+    findings += _lint_pairs(parts, containment, rule)
+    return findings + (_priorities(parts, containment) if rule == "priority" else [])
 
 
 def _objects(part: MeshPart) -> list[Finding]:
@@ -369,15 +376,15 @@ def advise(parts: Sequence[MeshPart], containment: Containment) -> Advice:
     return Advice("nested", f"{lone}, so 'nested', 'facing' and 'priority' are equivalent.")
 
 
-def check_meshes(parts: Sequence[MeshPart], tree: Containment, *, rule: str) -> tuple[str, ...]:
+def check_meshes(
+    parts: Sequence[MeshPart], tree: Containment, *, rule: RuleName
+) -> tuple[str, ...]:
     """Returns the advised rule for the meshes, and the findings of all checks, as text.
 
     Raises:
       SceneError: if there is an error among the findings.
     """
-    findings = lint(parts, tree)
-    if rule == "priority":
-        findings += examine_priorities(parts, tree)
+    findings = lint(parts, tree, rule=rule)
     advice = "note: there are no meshes, so all rays are straight."
     if parts:
         advice = str(advise(parts, tree))
@@ -385,11 +392,8 @@ def check_meshes(parts: Sequence[MeshPart], tree: Containment, *, rule: str) -> 
     return advice, *map(str, findings)
 
 
-def examine_priorities(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
-    """Reports priorities that hide a part, or leave an overlap undecided.
-
-    Only for scenes that are traced under the rule `priority`.
-    """
+def _priorities(parts: Sequence[MeshPart], containment: Containment) -> list[Finding]:
+    """Reports priorities that hide a part, or leave an overlap undecided."""
     findings = []
     for inner in range(len(parts)):
         for outer in _around(containment.parents, inner):

@@ -211,12 +211,7 @@ def assemble(
       [1.0, 1.5]
     """
     tree = find_containment(parts)
-    if rule == "priority":
-        # This rule allows overlapping parts.
-        findings = mesh_checks.lint(parts, tree._replace(overlaps=()))
-        findings += mesh_checks.examine_priorities(parts, tree)
-    else:
-        findings = mesh_checks.lint(parts, tree)
+    findings = mesh_checks.lint(parts, tree, rule=rule)
     refuse_errors(findings)
     for finding in findings:
         if finding.severity == "warning":

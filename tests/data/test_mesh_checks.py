@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.data.mesh_checks import (
-    advise,
-    examine_priorities,
-    lint,
-    lint_pairs,
-)
+from refref_jax.data.mesh_checks import advise, lint
 from refref_jax.data.mesh_queries import find_containment
 from refref_jax.data.meshes import read_meshes
 from tests.factories.solids import as_part, ball, box, inverted, joined, shell
@@ -176,7 +171,8 @@ def _advice(*parts):
 
 
 def _priorities(*parts):
-    return examine_priorities(parts, find_containment(parts))
+    findings = lint(parts, find_containment(parts), rule="priority")
+    return [finding for finding in findings if finding.severity != "note"]
 
 
 def _ranked(priority, name, **shape):
@@ -240,12 +236,8 @@ def test_an_overlap_that_is_left_to_chance():
     assert "different priorities" in finding.message
 
 
-def _findings_of_pairs(*parts):
-    return lint_pairs(parts, find_containment(parts))
-
-
 def _warnings(*parts):
-    return [finding for finding in _findings_of_pairs(*parts) if finding.severity != "note"]
+    return [finding for finding in _findings(*parts) if finding.severity != "note"]
 
 
 def _cylinder(name, radius, height, *, index, bottom=0.0):
@@ -285,11 +277,11 @@ def _share(message):
     ids=["none", "one", "apart", "at-a-point", "side-by-side", "loose-in-a-shell"],
 )
 def test_parts_that_are_apart_have_no_findings(parts):
-    assert _findings_of_pairs(*parts) == []
+    assert _findings(*parts) == []
 
 
 def test_a_part_inside_another_is_noted():
-    finding = only(_findings_of_pairs(ball("drink_water", radius=0.5), ball("cup_glass")))
+    finding = only(_findings(ball("drink_water", radius=0.5), ball("cup_glass")))
     assert (finding.severity, finding.part) == ("note", "drink_water")
     assert finding.message == "lies inside cup_glass."
 
@@ -312,7 +304,7 @@ def test_a_pane_between_two_liquids_is_no_gap():
 @pytest.mark.parametrize("shift", [0.3, 1.0])
 def test_parts_that_cut_each_other_are_warned_about(shift):
     parts = (ball("a_glass"), ball("b_water", centre=(shift, 0.0, 0.0)))
-    finding = only(_findings_of_pairs(*parts))
+    finding = only(_findings(*parts))
     assert (finding.severity, finding.part) == ("warning", "a_glass")
     assert "intersects or touches b_water" in finding.message
     assert "use the rule 'priority'" in finding.message
@@ -320,7 +312,7 @@ def test_parts_that_cut_each_other_are_warned_about(shift):
 
 @pytest.mark.parametrize("part", [ball("b_water"), box("b_water")])
 def test_coincident_parts_are_warned_about(part):
-    finding = only(_findings_of_pairs(part._replace(name="a_glass"), part))
+    finding = only(_findings(part._replace(name="a_glass"), part))
     assert finding.severity == "warning"
     assert "coincides with" in finding.message
     assert "a_glass" in str(finding) and "b_water" in str(finding)

@@ -130,5 +130,6 @@ def test_overlaps_that_the_rule_is_for_are_not_warned_of():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assemble(parts, rule="priority")
+        assemble(parts, rule="facing")
     with pytest.warns(UserWarning, match="ice intersects or touches drink"):
         assemble(parts)
