@@ -159,7 +159,7 @@ def bounds(
 
 
 def contracted(scene: Bounds, *, radius: float | None) -> Bounds:
-    """Returns bounds that ignore the size of the background: all of space is contracted.
+    """Returns bounds that ignore the size of the background: space is contracted around its centre.
 
     Args:
       scene: bounds of the scene.
@@ -170,8 +170,8 @@ def contracted(scene: Bounds, *, radius: float | None) -> Bounds:
     """
     if scene.space == "unbounded":
         ball = radius or _PUBLISHED_UNIT
-        return Bounds(_PUBLISHED_NEAR, _PUBLISHED_FAR_UNBOUNDED, ball, "unbounded")
-    return Bounds(_PUBLISHED_NEAR, _PUBLISHED_FAR, _PUBLISHED_UNIT, "unbounded")
+        return Bounds(_PUBLISHED_NEAR, _PUBLISHED_FAR_UNBOUNDED, ball, "unbounded", scene.centre)
+    return Bounds(_PUBLISHED_NEAR, _PUBLISHED_FAR, _PUBLISHED_UNIT, "unbounded", scene.centre)
 
 
 def override_model(model: ModelConfig, asked: FieldConfig) -> ModelConfig:

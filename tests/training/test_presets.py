@@ -6,7 +6,7 @@ import json
 import pytest
 
 from refref_jax.geometry.cameras import orbit
-from refref_jax.training.presets import PRESETS, Bounds, bounds, loss
+from refref_jax.training.presets import PRESETS, Bounds, bounds, contracted, loss
 
 pytestmark = pytest.mark.loose
 
@@ -21,6 +21,12 @@ def test_a_preset_makes_a_model_of_its_scene(name):
     assert len(loss(model).blurs) == len(model.proposals)
     assert preset.schedule.warmup < preset.schedule.steps and preset.schedule.end > 0.0
     json.dumps(dataclasses.asdict(model))
+
+
+@pytest.mark.parametrize("space", ["bounded", "spherical", "unbounded"])
+def test_space_is_contracted_around_the_centre_of_the_background(space):
+    moved = dataclasses.replace(_BOUNDS, space=space, centre=(5.0, -3.0, 2.0))
+    assert contracted(moved, radius=None).centre == moved.centre
 
 
 def _rays_of_a_pool(name):
