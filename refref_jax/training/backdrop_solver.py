@@ -65,6 +65,12 @@ PRIOR = 1e-3
 # A round that improves the held-out pixels by less, in dB, is the last.
 _WORTH = 0.02
 
+# Patches per edge of an image, and the mean sRGB error of a patch that does not fit.
+_PATCHES, _MISFIT = 16, 0.1
+
+MOST_MISFITS = 1e-3
+"""Share of misfits beyond which the far field is not the surface; see `misfits`."""
+
 
 _Arrays = TypeVar("_Arrays")
 _Result = TypeVar("_Result")
@@ -359,6 +365,45 @@ def solve(
             yield Progress(step, x, fitted, held_out)
         if held_out < before + _WORTH:
             return
+
+
+def misfits(
+    blocks: Sequence[Block], pyramid: Pyramid, *, space: Space, shape: tuple[int, int]
+) -> float:
+    """Returns the share of patches of the images that see the surface directly, but differ from it.
+
+    Errors at details of a texture average out over a patch. Those of something in front of the
+    surface do not, nor those of a surface of another size: they have parallax.
+
+    Args:
+      blocks: equations of all views, with one ray per pixel.
+      pyramid: radiance of each level.
+      space: kind of the surface.
+      shape: height and width of the images.
+
+    Returns:
+      The share among the patches whose rays all meet no object; 0 if there are none.
+    """
+    mips, (height, width) = _mipmap(pyramid, space), shape
+    edge = max(1, min(shape) // _PATCHES)
+    rows, columns = height // edge, width // edge
+    patches = (-1, rows, edge, columns, edge)
+
+    def averaged(values: np.ndarray) -> np.ndarray:
+        images = values.reshape(-1, height, width, values.shape[-1])
+        cropped = images[:, : rows * edge, : columns * edge]
+        return cropped.reshape(*patches, values.shape[-1]).mean((2, 4))
+
+    poor = total = 0
+    for block in blocks:
+        seen = np.asarray(pixels.linear_to_srgb(_predict(mips, block)))
+        directly = np.zeros((len(seen), 1))
+        unchanged = np.all(np.asarray(block.lookups.throughput) == 1.0, axis=-1)
+        directly[np.asarray(block.lookups.pixels)[unchanged]] = 1.0
+        error = np.abs(averaged(np.clip(seen, 0.0, 1.0) - np.asarray(block.srgb))).max(-1)
+        judged = averaged(directly)[..., 0] == 1.0
+        poor, total = poor + np.sum(error[judged] > _MISFIT), total + np.sum(judged)
+    return float(poor / max(total, 1))
 
 
 def _measure(blocks: Sequence[Block], seen: Sequence[Array]) -> tuple[float, float, float]:

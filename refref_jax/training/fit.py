@@ -267,7 +267,7 @@ def train(
         folder = scene_source.open_scene(scene or config.scene.path)
         objects = checkpoint_io.load_scene(run)
         if solved:
-            step = _solve(run, config, model, objects, folder, checkpoints, progress, stop)
+            step = _solve(run, config, model, objects, folder, checkpoints, progress, report, stop)
             if step < total:
                 report(f"Stopped at iteration {step}.")
             return step == total
@@ -346,6 +346,7 @@ def _solve(
     folder: Path,
     checkpoints: Checkpoints,
     progress: Progress,
+    report: Callable[[str], None],
     stop: Callable[[], bool],
 ) -> int:
     """Solves for the backdrop, and returns the number of the last iteration.
@@ -356,10 +357,11 @@ def _solve(
     assert shape is not None
     total, begun = require(config.model.iterations), time.monotonic()
     frames = scene_folder.read_frames(folder, "train")
+    photographs = scene_folder.read_images(frames)
     blocks = backdrop_solver.read_equations(
         scene,
         frames.cameras,
-        scene_folder.read_images(frames),
+        photographs,
         settings=model.settings,
         domain=bounds,
         resolution=shape.resolution,
@@ -396,6 +398,14 @@ def _solve(
                 return step
     # The solver may be done before the last iteration.
     checkpoints.save(state._replace(step=jnp.asarray(total, jnp.int32)))
+    views = photographs.shape[1:3]
+    found = backdrop_solver.misfits(blocks, state.params.field, space=bounds.space, shape=views)
+    if found > backdrop_solver.MOST_MISFITS:
+        report(
+            f"warning: {100.0 * found:.2g} % of the images beside the object differ from the "
+            f"backdrop. Something is in front of it, or its size ({bounds.radius:g}) or centre is "
+            "wrong: correct these, or use far_field=field."
+        )
     return total
 
 

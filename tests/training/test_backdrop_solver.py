@@ -11,7 +11,12 @@ from refref_jax.geometry import cameras
 from refref_jax.optics.path_settings import STRAIGHT, TREE
 from refref_jax.optics.scene import Scene
 from refref_jax.render import backdrop, pixels, render_known
-from refref_jax.render.backgrounds import Environment, LinearTexture, radiance_of
+from refref_jax.render.backgrounds import (
+    Environment,
+    LinearTexture,
+    SphereBackground,
+    radiance_of,
+)
 from refref_jax.sampling.scene_bounds import Domain
 from refref_jax.training import backdrop_solver
 from refref_jax.training.backdrop_solver import Block
@@ -155,20 +160,49 @@ def test_pixels_without_light_leave_the_radiance_finite(throughput):
     assert all(np.all(np.isfinite(level)) for level in last.pyramid)
 
 
-def test_a_wrong_size_of_the_background_is_seen_in_the_residuals(ball):
-    from refref_jax.render.backgrounds import SphereBackground
+_ROOM = Domain(6.0, "spherical")
 
-    sky = _environment()
-    texture = sky.args[0].texture
-    room = radiance_of(SphereBackground(texture, jnp.float32(6.0)))
+
+@pytest.fixture(scope="module")
+def room(ball):
+    """Views inside a sphere of radius 6, and their images."""
+    texture = _environment().args[0].texture
     views = _views()
-    images = _photographs(ball, room, views, STRAIGHT)
-    reached = {}
-    for radius in (6.0, 9.0):
-        domain = Domain(radius, "spherical")
-        blocks = _equations(ball, views, images, domain=domain)
-        *_, last = backdrop_solver.solve(
-            blocks, space="spherical", resolution=_RESOLUTION, iterations=16
-        )
-        reached[radius] = last.held_out
-    assert reached[6.0] > reached[9.0] + 2.0
+    known = radiance_of(SphereBackground(texture, jnp.float32(_ROOM.radius)))
+    return views, _photographs(ball, known, views, _TREE)
+
+
+def _misfits(scene, views, images, domain=_ROOM):
+    """Returns the last state of the solver, and the share of misfits."""
+    blocks = _equations(scene, views, images, settings=_TREE, domain=domain)
+    *_, last = backdrop_solver.solve(
+        blocks, space=domain.space, resolution=_RESOLUTION, iterations=16
+    )
+    shape = images.shape[1:3]
+    return last, backdrop_solver.misfits(blocks, last.pyramid, space=domain.space, shape=shape)
+
+
+def test_a_wrong_size_of_the_background_is_seen_in_the_residuals(ball, room):
+    right, few = _misfits(ball, *room)
+    wrong, many = _misfits(ball, *room, domain=_ROOM._replace(radius=9.0))
+    assert right.held_out > wrong.held_out + 2.0
+    assert few == 0.0 and many > 10.0 * backdrop_solver.MOST_MISFITS
+
+
+@pytest.mark.parametrize("size", [0.0, 0.4])
+def test_an_object_in_the_room_is_seen_in_the_residuals(ball, room, size):
+    views, images = room[0], room[1].copy()
+    for view in range(len(images)):
+        rays = cameras.image_rays(views, view)
+        away = np.array([0.0, 2.5, 0.0]) - rays.origins
+        along = np.sum(away * rays.directions, axis=-1)
+        hit = (np.sum(away**2, axis=-1) - along**2 < size**2) & (along > 0.0)
+        images[view][hit] = 255, 0, 0
+    found = _misfits(ball, views, images)[1]
+    assert (found > 10.0 * backdrop_solver.MOST_MISFITS) == (size > 0.0)
+
+
+def test_pixels_that_only_see_the_object_are_not_judged(room):
+    views, images = room
+    inside = scenes.build(scenes.ball(5.0, subdivisions=2))
+    assert _misfits(inside, views, 255 - images)[1] == 0.0
