@@ -66,9 +66,9 @@ PRIOR = 1e-3
 _WORTH = 0.02
 
 # Patches per edge of an image, and the mean sRGB error of a patch that does not fit.
-_PATCHES, _MISFIT = 16, 0.1
+_PATCHES, _MISFIT = 16, 0.05
 
-MOST_MISFITS = 1e-3
+MOST_MISFITS = 5e-3
 """Share of misfits beyond which the far field is not the surface; see `misfits`."""
 
 

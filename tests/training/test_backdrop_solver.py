@@ -186,7 +186,7 @@ def test_a_wrong_size_of_the_background_is_seen_in_the_residuals(ball, room):
     right, few = _misfits(ball, *room)
     wrong, many = _misfits(ball, *room, domain=_ROOM._replace(radius=9.0))
     assert right.held_out > wrong.held_out + 2.0
-    assert few == 0.0 and many > 10.0 * backdrop_solver.MOST_MISFITS
+    assert few < backdrop_solver.MOST_MISFITS < 0.1 * many
 
 
 @pytest.mark.parametrize("size", [0.0, 0.4])
@@ -199,7 +199,7 @@ def test_an_object_in_the_room_is_seen_in_the_residuals(ball, room, size):
         hit = (np.sum(away**2, axis=-1) - along**2 < size**2) & (along > 0.0)
         images[view][hit] = 255, 0, 0
     found = _misfits(ball, views, images)[1]
-    assert (found > 10.0 * backdrop_solver.MOST_MISFITS) == (size > 0.0)
+    assert (found > backdrop_solver.MOST_MISFITS) == (size > 0.0)
 
 
 def test_pixels_that_only_see_the_object_are_not_judged(room):
