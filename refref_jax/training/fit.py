@@ -25,10 +25,13 @@ from refref_jax import atomic_files, configuration
 from refref_jax.data import image_files, scene_folder, scene_source
 from refref_jax.data.batches import PixelSampler
 from refref_jax.data.meshes import MeshPart
+from refref_jax.geometry.cameras import Cameras
 from refref_jax.optics.scene import Scene
 from refref_jax.render import checkpoint_io, volume_rendering
+from refref_jax.render.backdrop import Pyramid
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Model, init_params
+from refref_jax.sampling.scene_bounds import Domain
 from refref_jax.training import backdrop_solver, devices, loop, run_folder
 from refref_jax.training.config import TrainConfig, require
 from refref_jax.training.loop import TrainState, init_state
@@ -357,11 +360,10 @@ def _solve(
     assert shape is not None
     total, begun = require(config.model.iterations), time.monotonic()
     frames = scene_folder.read_frames(folder, "train")
-    photographs = scene_folder.read_images(frames)
     blocks = backdrop_solver.read_equations(
         scene,
         frames.cameras,
-        photographs,
+        scene_folder.read_images(frames),
         settings=model.settings,
         domain=bounds,
         resolution=shape.resolution,
@@ -386,11 +388,10 @@ def _solve(
     )
     for reached in iterations:
         step = reached.step
-        psnr, held_out = reached.fitted, reached.held_out
-        seconds = earlier + time.monotonic() - begun
-        line = {"step": step, "psnr": psnr, "psnr_held_out": held_out, "seconds": seconds}
+        line = {"step": step, "psnr": reached.fitted, "psnr_held_out": reached.held_out}
+        line["seconds"] = earlier + time.monotonic() - begun
         run_folder.append_metrics(run, configuration.string_safe(line))
-        progress(step, total, f"PSNR {psnr:.2f}  held out {held_out:.2f}")
+        progress(step, total, f"PSNR {reached.fitted:.2f}  held out {reached.held_out:.2f}")
         state = state._replace(params=state.params._replace(field=reached.pyramid))
         if step % backdrop_solver.ROUND == 0 and step < total:
             checkpoints.save(state._replace(step=jnp.asarray(step, jnp.int32)))
@@ -398,15 +399,28 @@ def _solve(
                 return step
     # The solver may be done before the last iteration.
     checkpoints.save(state._replace(step=jnp.asarray(total, jnp.int32)))
-    views = photographs.shape[1:3]
-    found = backdrop_solver.misfits(blocks, state.params.field, space=bounds.space, shape=views)
-    if found > backdrop_solver.MOST_MISFITS:
-        report(
-            f"warning: {100.0 * found:.2g} % of the images beside the object differ from the "
-            f"backdrop. Something is in front of it, or its size ({bounds.radius:g}) or centre is "
-            "wrong: correct these, or use far_field=field."
-        )
+    _warn_of_misfits(blocks, state.params.field, bounds, frames.cameras, report)
     return total
+
+
+def _warn_of_misfits(
+    blocks: Sequence[backdrop_solver.Block],
+    pyramid: Pyramid,
+    bounds: Domain,
+    cameras: Cameras,
+    report: Callable[[str], None],
+) -> None:
+    shape = cameras.height, cameras.width
+    share = backdrop_solver.misfits(blocks, pyramid, space=bounds.space, shape=shape)
+    if share <= backdrop_solver.MOST_MISFITS:
+        return
+    causes = "Something is in front of it"
+    if bounds.space != "unbounded":
+        causes += f", or its size ({bounds.radius:g}) or centre is wrong"
+    report(
+        f"warning: {100.0 * share:.2g} % of the images beside the object differ from the "
+        f"backdrop. {causes}: correct this, or use far_field=field."
+    )
 
 
 def _line(step: int, measured: StepReport, rate: float, seconds: float) -> dict[str, Any]:
