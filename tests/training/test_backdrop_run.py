@@ -53,6 +53,14 @@ def test_a_backdrop_is_solved_and_rendered(scene, run):
     np.testing.assert_allclose(seen.accumulation, 1.0, atol=1e-4)
 
 
+def test_a_wrong_size_of_the_background_is_told(scene, tmp_path):
+    wrong = _config(scene).override(radius=9.5, iterations=_ROUND)
+    lines = []
+    fit(wrong, out=tmp_path / "wrong", report=lines.append)
+    told = [line for line in lines if "differ from the backdrop" in line]
+    assert len(told) == 1 and "its size (9.5) or centre is wrong" in told[0]
+
+
 def test_distances_are_those_of_the_walls_along_the_path(scene, run):
     frames = scene_folder.read_frames(scene, "test")
     seen = render_image(run[1], image_rays(frames.cameras, 0))
