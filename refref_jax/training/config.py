@@ -314,17 +314,6 @@ class ScheduleConfig:
         if not 0.0 <= self.adam_b2 < 1.0:
             raise ValueError(f"adam_b2 is {self.adam_b2}. Give a number in [0, 1).")
 
-    def check_lengths(self) -> None:
-        """Refuses a warm-up or annealing that is longer than the run; earlier runs may have one.
-
-        Raises:
-          ValueError: if it is.
-        """
-        steps = require(self.steps)
-        for name in ("warmup", "anneal"):
-            if (number := require(getattr(self, name))) > steps:
-                raise ValueError(f"{name} is {number}, but there are {steps} steps. Give fewer.")
-
     def over(self, steps: int) -> "ScheduleConfig":
         """Returns the same schedule stretched over another number of steps."""
         scale = steps / require(self.steps)

@@ -44,7 +44,13 @@ from refref_jax.optics.scene import Scene
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import ModelConfig
 from refref_jax.training import presets
-from refref_jax.training.config import SceneConfig, TrainConfig, options_of, require
+from refref_jax.training.config import (
+    SceneConfig,
+    ScheduleConfig,
+    TrainConfig,
+    options_of,
+    require,
+)
 
 # Width of printed lines.
 _COLUMNS = 100
@@ -176,35 +182,6 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
     config = _resolve_training(config, model, reasons)
     check_batch(facts.cameras, require(config.schedule.batch))
     return Resolved(config, SavedModel(model, settings), reasons, tuple(_warnings(asked, found)))
-
-
-def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
-    """Returns a configuration with the decisions that follow from a saved model.
-
-    This is for runs of earlier versions, whose configurations lack these decisions. The preset of
-    such a run is unknown, but the model determines all values that follow from it.
-    """
-    model, settings = saved.config, saved.settings
-    reasons: dict[str, str] = {}
-    tints = "learned" if model.learned_tints else "given"
-    config = config.decided(field=model.field.kind)
-    return _decide(
-        config,
-        reasons,
-        "the model",
-        rule="nested",
-        background=model.space,
-        radius=model.radius,
-        near=model.near,
-        far=model.far,
-        centre=model.centre,
-        min_throughput=settings.min_throughput,
-        max_bends=settings.max_bends,
-        reentry=settings.reentry if settings.max_bends else None,
-        interior=model.interior,
-        tints=tints if model.interior == "absorbing" and settings.max_bends else "none",
-        **presets.sampling_of(model),
-    )
 
 
 def build_scene(resolved: Resolved, facts: SceneFacts) -> Scene:
@@ -452,8 +429,20 @@ def _resolve_training(
         batch=schedule.batch,
         pretraced_batches=schedule.pretraced_batches,
     )
-    config.schedule.check_lengths()
+    _check_lengths(config.schedule)
     return config
+
+
+def _check_lengths(schedule: ScheduleConfig) -> None:
+    """Refuses a warm-up or annealing that is longer than the run; earlier runs may have one.
+
+    Raises:
+      ValueError: if it is.
+    """
+    steps = require(schedule.steps)
+    for name in ("warmup", "anneal"):
+        if (number := require(getattr(schedule, name))) > steps:
+            raise ValueError(f"{name} is {number}, but there are {steps} steps. Give fewer.")
 
 
 def _warnings(asked: TrainConfig, found: SceneAnalysis) -> list[str]:

@@ -28,7 +28,7 @@ from refref_jax.render.checkpoint_io import (
     open_checkpoints,
     restore,
 )
-from refref_jax.training import config_files, resolve
+from refref_jax.training import config_files, presets
 from refref_jax.training.config import TrainConfig, options_of
 from refref_jax.training.config_files import CONFIG
 from refref_jax.training.loop import TrainState
@@ -156,7 +156,7 @@ def read_config(run: Path) -> TrainConfig:
             f"{path} does not hold a TrainConfig of an earlier version ({error}). Restore the file."
         ) from error
     # Values that this file lacks follow from the model next to it.
-    return resolve.as_trained(config, checkpoint_io.read_static(run))
+    return as_trained(config, checkpoint_io.read_static(run))
 
 
 def _with_todays_keys(content: dict[str, Any]) -> dict[str, Any]:
@@ -169,6 +169,32 @@ def _with_todays_keys(content: dict[str, Any]) -> dict[str, Any]:
         "schedule": content["schedule"] | sizes,
         "seed": content["seed"],
     }
+
+
+def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
+    """Returns a configuration with the decisions that follow from a saved model.
+
+    This is for runs of earlier versions, whose configurations lack these decisions. The preset of
+    such a run is unknown, but the model determines all values that follow from it.
+    """
+    model, settings = saved.config, saved.settings
+    tints = "learned" if model.learned_tints else "given"
+    config = config.decided(field=model.field.kind)
+    follows: dict[str, Any] = {
+        "rule": "nested",
+        "background": model.space,
+        "radius": model.radius,
+        "near": model.near,
+        "far": model.far,
+        "centre": model.centre,
+        "min_throughput": settings.min_throughput,
+        "max_bends": settings.max_bends,
+        "reentry": settings.reentry if settings.max_bends else None,
+        "interior": model.interior,
+        "tints": tints if model.interior == "absorbing" and settings.max_bends else "none",
+    }
+    follows |= presets.sampling_of(model)
+    return config.decided(**{n: x for n, x in follows.items() if config.get(n) is None})
 
 
 def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, scene: Scene) -> None:

@@ -19,7 +19,8 @@ from refref_jax.data.scene_source import SceneWarning, expand, open_scene
 from refref_jax.geometry import cameras
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.training.config import SceneConfig, TrainConfig
-from refref_jax.training.resolve import as_trained, read_facts, resolve
+from refref_jax.training.resolve import read_facts, resolve
+from refref_jax.training.run_folder import as_trained
 from tests.factories.small_scenes import write_grey, write_scene
 from tests.laws.expectations import scene_error
 from tests.processes.command import ROOT, run_command
