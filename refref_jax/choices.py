@@ -63,6 +63,9 @@ ShadingOverride = Literal["scene", "smooth", "flat"]
 Space = Literal["bounded", "spherical", "unbounded"]
 """Scene bounds: a background cube, a background sphere, or none."""
 
+SURFACES: dict[Space, str] = {"bounded": "cube", "spherical": "sphere", "unbounded": "environment"}
+"""The background's surface in words."""
+
 Split = Literal["train", "val", "test"]
 """Splits of a scene's views."""
 

@@ -17,6 +17,7 @@ import math
 import numbers
 import os
 import sys
+import textwrap
 import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -31,6 +32,14 @@ Variants = Mapping[type, Mapping[str, type]]
 """Variants of each base class, by their key `kind`; the first is the default."""
 
 _KIND = "kind"
+
+_WRAPPER = textwrap.TextWrapper(
+    width=100,
+    initial_indent="  ",
+    subsequent_indent="    ",
+    break_long_words=False,
+    break_on_hyphens=False,
+)
 
 FORMERLY = "formerly"
 """Key of a field's metadata: the name of the field in files of earlier versions."""
@@ -258,6 +267,27 @@ def convert_options(kind: type, given: Mapping[str, Any]) -> dict[str, Any]:
         else convert(plain(value), type_of(kind, options[name]), name=name)
         for name, value in given.items()
     }
+
+
+def describe(values: Mapping[str, Any], reasons: Mapping[str, str]) -> list[str]:
+    """Returns lines of text with values, grouped by the reasons for them.
+
+    Args:
+      values: values by the names of options.
+      reasons: reasons by the names of options.
+    """
+    by_reason: dict[str, list[str]] = {}
+    for name, value in values.items():
+        by_reason.setdefault(reasons[name], []).append(f"{name}={_shown(value)}")
+    texts = (f"{reason}: {', '.join(each)}" for reason, each in by_reason.items())
+    return [line for text in texts for line in _WRAPPER.wrap(text)]
+
+
+def _shown(value: Any) -> str:
+    """Returns a value as text."""
+    if isinstance(value, tuple):
+        return ",".join(f"{x[0]}={x[1]:g}" if isinstance(x, tuple) else str(x) for x in value)
+    return f"{value:g}" if isinstance(value, float) and math.isfinite(value) else str(value)
 
 
 def _build(kind: Any, value: Any, where: str, variants: Variants) -> Any:

@@ -363,6 +363,19 @@ def _sphere(
 _SHAPES: dict[Kind, _Shape] = {"cube": _cube, "sphere": _sphere}
 
 
+def depths_of(
+    kind: Kind,
+    origins: Float[np.ndarray, "n 3"],
+    directions: Float[np.ndarray, "n 3"],
+    *,
+    size: float,
+) -> Float[np.ndarray, " n"]:
+    """Returns where rays from within a background around the origin meet it, in their lengths."""
+    unknown = np.zeros(len(origins))
+    rays = DepthSamples(origins, directions, unknown, unknown.astype(np.int32), 0.0)
+    return _SHAPES[kind](rays, np.array([size, 0.0, 0.0, 0.0]))[0]
+
+
 def _extents(kind: Kind, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Returns the sizes of the shapes on which points lie, relative to the centre."""
     return np.max(np.abs(points), axis=1) if kind == "cube" else np.linalg.norm(points, axis=1)

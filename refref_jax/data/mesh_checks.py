@@ -26,14 +26,16 @@ from refref_jax.data.mesh_queries import (
     SurfaceGaps,
     beside_faces,
     diagonal,
+    parts_around,
     sample_surface,
     surface_gaps,
     winding_number,
 )
 from refref_jax.data.meshes import MeshPart
+from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.triangle_meshes import is_degenerate
 from refref_jax.optics.interface_rules import NO_PARENT
-from refref_jax.optics.media import INDEX_OF_AIR
+from refref_jax.optics.media import EMPTY_SLOT, INDEX_OF_AIR
 
 # As shares of the smaller part's diagonal: surfaces closer than the first coincide, because the
 # tracer may not distinguish them; surfaces farther apart than the second are separate on purpose.
@@ -374,6 +376,19 @@ def advise(parts: Sequence[MeshPart], containment: Containment) -> Advice:
         )
     lone = "there is one part" if len(parts) == 1 else f"all {len(parts)} parts are apart"
     return Advice("nested", f"{lone}, so 'nested', 'facing' and 'priority' are equivalent.")
+
+
+def refuse_cameras_inside(parts: Sequence[MeshPart], cameras: Cameras) -> None:
+    """Refuses cameras inside a mesh, whose rays would start with an interior list.
+
+    Raises:
+      ValueError: if there is one.
+    """
+    if np.any(parts_around(parts, cameras.poses[:, :, 3]) != EMPTY_SLOT):
+        raise ValueError(
+            "A camera is inside a mesh, which training only supports under rule=nested, and under "
+            "rule=facing without overlaps, if all parts are dielectrics. Move the camera."
+        )
 
 
 def check_meshes(

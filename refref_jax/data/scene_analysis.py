@@ -1,6 +1,7 @@
 """Analyses a scene: the features that a model of it requires (NumPy only).
 
-`overridden` compares the properties in `scene.json` with those that are used.
+`overridden` compares the properties in `scene.json` with those that are used, and `misfits` the
+images with the background.
 
 A model only includes what its scene requires, so that no computation is spent on the rest. The
 analysis runs on the host, from the meshes, their description in `scene.json`, and the cameras; it
@@ -12,17 +13,39 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
 
-from refref_jax.choices import CLEAR, NO_ABSORPTION, PartKind, Position, RuleName, Space, Tints
+from refref_jax.choices import (
+    CLEAR,
+    NO_ABSORPTION,
+    ORIGIN,
+    PartKind,
+    Position,
+    RuleName,
+    Space,
+    Tints,
+)
+from refref_jax.data import background_fit, scene_folder
+from refref_jax.data.background_fit import Kind
 from refref_jax.data.mesh_queries import Containment, encloses, is_convex, winding_number
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_properties import PartDescription, SceneProperties
-from refref_jax.geometry.cameras import Cameras
+from refref_jax.geometry.cameras import Cameras, planar_directions
 from refref_jax.optics.interface_rules import NO_PARENT
 from refref_jax.optics.path_settings import Reentry
 
 NeededInterior = Literal["none", "clear", "absorbing"]
 """Interior of the objects; `none` without objects."""
+
+# Most images that are compared with the background; patches per edge of an image, and the number of
+# pixels along it that are enough; cells per side of a face of the background.
+_MOST_IMAGES, _PATCHES, _EDGE, _CELLS = 60, 16, 128, 128
+
+# Mean sRGB error of a patch that differs.
+_MISFIT = 0.05
+
+MOST_MISFITS = 5e-3
+"""Share of misfits beyond which the world behind the objects is not the background's surface."""
 
 
 class SceneAnalysis(NamedTuple):
@@ -209,3 +232,110 @@ def find_tints(
     if not all(part.colour_known for part in coloured):
         return "learned"
     return "given" if any(map(_takes_light, coloured)) else "none"
+
+
+def read_misfits(
+    scene: Path, parts: Sequence[MeshPart], *, space: Space, size: float, centre: Position
+) -> float:
+    """Returns the share of `misfits` of the training images, of which at most 60 are read.
+
+    Raises:
+      SceneError: if a file is missing or broken.
+    """
+    frames = scene_folder.read_frames(scene, "train")
+    count = len(frames.images)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _MOST_IMAGES)).astype(int))
+    cameras = frames.cameras._replace(poses=frames.cameras.poses[chosen])
+    frames = frames._replace(images=tuple(frames.images[i] for i in chosen), cameras=cameras)
+    images = scene_folder.read_images(frames)
+    return misfits(cameras, images, parts, space=space, size=size, centre=centre)
+
+
+def misfits(
+    cameras: Cameras,
+    photographs: UInt8[np.ndarray, "views h w 3"],
+    parts: Sequence[MeshPart],
+    *,
+    space: Space,
+    size: float,
+    centre: Position = ORIGIN,
+) -> float:
+    """Returns the share of patches of the images that see the background, but differ from it.
+
+    The background is one colour in each of many small cells, the mean of all pixels that see it
+    directly. Its errors at details of a texture average out over a patch, a sixteenth of an image's
+    edge. Those of something in front of it do not, nor those of a background of another size: they
+    have parallax.
+
+    Args:
+      cameras: cameras of the images.
+      photographs: 8-bit sRGB images.
+      parts: meshes of the scene; rays that meet the box around one are left out.
+      space: geometry of the background.
+      size: half edge of the cube, or radius of the sphere, world units.
+      centre: centre of the background, world units.
+
+    Returns:
+      The share among the patches all of whose rays miss the boxes; 0 if there are none.
+    """
+    views, height, width, _ = photographs.shape
+    stride = max(1, min(height, width) // _EDGE)
+    edge = max(1, min(height, width) // stride // _PATCHES)
+    rows, columns = (side // stride // edge for side in (height, width))
+    row, column = np.mgrid[: rows * edge, : columns * edge] * stride + stride // 2
+    planar = planar_directions(cameras, row.ravel(), column.ravel())
+    cells, direct = [], []
+    for pose in cameras.poses:
+        directions, origin = planar @ pose[:, :3].T, pose[:, 3]
+        cells.append(_cells(origin - np.array(centre), directions, space=space, size=size))
+        direct.append(_misses(origin, directions, parts))
+    cell, sees = np.concatenate(cells), np.concatenate(direct)
+    seen = photographs[:, row, column].reshape(-1, 3).T / 255.0
+    number = np.maximum(np.bincount(cell[sees], minlength=6 * _CELLS**2), 1)
+    means = [np.bincount(cell[sees], each[sees], len(number)) / number for each in seen]
+
+    def averaged(values: np.ndarray) -> np.ndarray:
+        return values.reshape(views, rows, edge, columns, edge).mean((2, 4))
+
+    judged = averaged(sees.astype(np.float64)) == 1.0
+    if not np.any(judged):
+        return 0.0
+    errors = [averaged(mean[cell] - each) for mean, each in zip(means, seen, strict=True)]
+    return float(np.mean(np.max(np.abs(errors), axis=0)[judged] > _MISFIT))
+
+
+def _cells(
+    origin: Float[np.ndarray, "3"],
+    directions: Float[np.ndarray, "n 3"],
+    *,
+    space: Space,
+    size: float,
+) -> Int[np.ndarray, " n"]:
+    """Returns the cell of a cube map that each ray sees; the origin is relative to its centre."""
+    towards = directions
+    if space != "unbounded":
+        kind: Kind = "sphere" if space == "spherical" else "cube"
+        origins = np.broadcast_to(origin, directions.shape)
+        depths = background_fit.depths_of(kind, origins, directions, size=size)
+        towards = origin + depths[:, None] * directions
+    axis = np.argmax(np.abs(towards), axis=1)[:, None]
+    major = np.take_along_axis(towards, axis, 1)
+    others = np.take_along_axis(towards, (axis + np.array([1, 2])) % 3, 1)
+    place = np.clip(0.5 * _CELLS * (others / np.abs(major) + 1.0), 0, _CELLS - 1).astype(np.int64)
+    face = 2 * axis[:, 0] + (major[:, 0] > 0.0)
+    return (face * _CELLS + place[:, 1]) * _CELLS + place[:, 0]
+
+
+def _misses(
+    origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "n 3"], parts: Sequence[MeshPart]
+) -> Bool[np.ndarray, " n"]:
+    """Returns which rays miss the boxes around all parts."""
+    misses = np.ones(len(directions), bool)
+    for part in parts:
+        planes = np.stack([np.min(part.vertices, axis=0), np.max(part.vertices, axis=0)]) - origin
+        with np.errstate(divide="ignore", invalid="ignore"):
+            low, high = (plane / directions for plane in planes)
+        # A ray within the plane of a face is 0/0 there, and counts as inside.
+        enters = np.nanmax(np.fmin(low, high), axis=1, initial=0.0)
+        misses &= enters > np.nanmin(np.fmax(low, high), axis=1, initial=np.inf)
+    return misses

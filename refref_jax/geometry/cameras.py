@@ -197,6 +197,24 @@ def distance_to_planar_depth(
     return (distance * cosine).astype(np.float32)
 
 
+def rays_of_views(
+    cameras: Cameras, views: Int[np.ndarray, " views"], side: int
+) -> tuple[Rays, Int[np.ndarray, " rays"]]:
+    """Returns all rays of some views, `side` times `side` in each pixel, and their pixels.
+
+    The index of a pixel counts those of the views before.
+    """
+    fine = supersample(cameras, side)
+    each = [image_rays(fine, int(view)) for view in views]
+    rays = Rays(
+        origins=host_array(np.concatenate([view.origins.reshape(-1, 3) for view in each])),
+        directions=host_array(np.concatenate([view.directions.reshape(-1, 3) for view in each])),
+        radii=host_array(np.concatenate([view.radii.reshape(-1) for view in each])),
+    )
+    pixel, count = strata(cameras, side)[..., 0].reshape(-1), cameras.height * cameras.width
+    return rays, np.concatenate([number * count + pixel for number in range(len(views))])
+
+
 def planar_directions(
     cameras: Cameras, row: Int[np.ndarray, "*shape"], column: Int[np.ndarray, "*shape"]
 ) -> Float[np.ndarray, "*shape 3"]:

@@ -18,13 +18,14 @@ the gaps of the finer ones, where no light path ends.
 A pixel is a square, not a point: its light path is shifted by the ray differential to several
 places of the pixel (`taps`), and a footprint wider than that reads a coarser level of a mipmap.
 
-Sources: Igehy, Tracing Ray Differentials (1999); Bramble, Pasciak and Xu, Parallel Multilevel
-Preconditioners (1990), for the sum over levels.
+Sources: Igehy, Tracing Ray Differentials (1999); for the sum over levels Bramble, Pasciak and Xu,
+Parallel Multilevel Preconditioners (1990).
 """
 
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -72,6 +73,7 @@ _PIXEL_WIDTH = math.sqrt(3.0)
 # XLA unrolls loops over fewer paths, and aborts if a native loop has none left.
 _FEW = 64
 
+
 # A footprint of this width, in cells, covers the surface; near the critical angle it is unbounded.
 _WIDEST = 1e6
 
@@ -83,24 +85,24 @@ Mips = tuple[Float[Array, "6 _ _ 3"], ...]
 
 
 class Lookups(NamedTuple):
-    """Points of the surface that light paths end on; lengths are in cells of the finest grid.
+    """Points of the surface that light paths end on; lengths are in cells of the resolution read.
 
     Attributes:
       pixels: index of the pixel that each path belongs to.
-      faces: face of the cube map.
-      levels: number of times that the grid is halved, 0 for the finest.
+      entries: first vertex of the face, in a list of the vertices of all resolutions.
+      sides: number of cells per side of the face.
       taps: number of taps along each axis of the pixel, 0 for empty slots.
-      places: position of the path's end, column and row of the grid.
-      axes: change of the position across the pixel, along both axes.
+      starts: position of the first tap, column and row of the grid.
+      steps: change of the position from tap to tap, along both axes.
       throughput: throughput of the path, linear RGB.
     """
 
     pixels: Int[Array, "*paths"]
-    faces: Int[Array, "*paths"]
-    levels: Int[Array, "*paths"]
+    entries: Int[Array, "*paths"]
+    sides: Int[Array, "*paths"]
     taps: Int[Array, "*paths"]
-    places: Float[Array, "*paths 2"]
-    axes: Float[Array, "*paths 2 2"]
+    starts: Float[Array, "*paths 2"]
+    steps: Float[Array, "*paths 2 2"]
     throughput: Float[Array, "*paths 3"]
 
 
@@ -148,15 +150,20 @@ def locate(
     axes = jnp.clip(_PIXEL_WIDTH * half * axes, -_WIDEST, _WIDEST)
     width = jnp.sqrt(jnp.max(jnp.sum(jnp.square(axes), axis=-1), axis=-1))
     taps = jnp.clip(jnp.ceil(width), 1, most_taps)
-    coarser = jnp.round(jnp.log2(jnp.maximum(width / taps, 1.0))).astype(jnp.int32)
+    coarser = jnp.round(jnp.log2(jnp.maximum(width / taps, 1.0)))
+    levels = jnp.minimum(coarser.astype(jnp.int32), len(sides(resolution)) - 1)
+    first, side = jnp.unstack(jnp.asarray(_grids(resolution))[levels], axis=-1)
+    scale = jnp.exp2(-levels.astype(axes.dtype))
+    steps = axes * (scale / taps)[:, None, None]
+    middle = (0.5 * (taps - 1.0))[:, None] * jnp.sum(steps, axis=1)
     real = jnp.any(ends.throughput > 0.0, axis=-1)
     return Lookups(
         pixels=pixels,
-        faces=faces,
-        levels=jnp.minimum(coarser, len(sides(resolution)) - 1),
+        entries=first + faces * (side + 1) ** 2,
+        sides=side,
         taps=jnp.where(real, taps.astype(jnp.int32), 0),
-        places=half * (places + 1.0),
-        axes=axes,
+        starts=(half * scale)[:, None] * (places + 1.0) - middle,
+        steps=steps,
         throughput=ends.throughput,
     )
 
@@ -296,37 +303,44 @@ def _grids(resolution: int) -> Int[np.ndarray, "levels 2"]:
 
 
 def _corners(
-    lookups: Lookups, grids: Int[Array, "levels 2"], tap: Int[Array, ""]
+    lookups: Lookups, along: Int[Array, "*paths"], across: Int[Array, "*paths"]
 ) -> list[tuple[Int[Array, "*paths"], Float[Array, "*paths"]]]:
     """Returns entry and bilinear weight of the four vertices around one tap of a light path.
 
-    A tap beyond the edge of its face stays on it. Empty slots have weights of 0.
+    A tap beyond the edge of its face stays on it.
     """
-    count = jnp.maximum(lookups.taps, 1)
-    precision = lookups.places.dtype
-    number = count.astype(precision)
-    share = jnp.where(tap < lookups.taps * lookups.taps, 1.0, 0.0) / (number * number)
-    along, across = (
-        (n.astype(precision) + 0.5) / number - 0.5 for n in (tap // count, tap % count)
+    precision = lookups.starts.dtype
+    shifts = [n.astype(precision)[..., None] for n in (along, across)]
+    place = (
+        lookups.starts + shifts[0] * lookups.steps[..., 0, :] + shifts[1] * lookups.steps[..., 1, :]
     )
-    first, side = grids[lookups.levels, 0], grids[lookups.levels, 1]
-    scale = jnp.exp2(-lookups.levels.astype(precision))
-    low, high = [], []
-    for axis in range(2):
-        moved = along * lookups.axes[..., 0, axis] + across * lookups.axes[..., 1, axis]
-        place = scale * (lookups.places[..., axis] + moved)
-        place = jnp.clip(place, 0.0, side.astype(precision))
-        cell = jnp.minimum(place.astype(jnp.int32), side - 1)
-        low.append(cell)
-        high.append(place - cell.astype(precision))
-    (column, row), (right, up), stride = low, high, side + 1
-    entry = first + (lookups.faces * stride + row) * stride + column
+    side = lookups.sides[..., None]
+    place = jnp.clip(place, 0.0, side.astype(precision))
+    cell = jnp.minimum(place.astype(jnp.int32), side - 1)
+    (column, row), part = jnp.unstack(cell, axis=-1), place - cell.astype(precision)
+    (right, up), stride = jnp.unstack(part, axis=-1), lookups.sides + 1
+    entry = lookups.entries + row * stride + column
     return [
-        (entry, share * (1.0 - right) * (1.0 - up)),
-        (entry + 1, share * right * (1.0 - up)),
-        (entry + stride, share * (1.0 - right) * up),
-        (entry + stride + 1, share * right * up),
+        (entry, (1.0 - right) * (1.0 - up)),
+        (entry + 1, right * (1.0 - up)),
+        (entry + stride, (1.0 - right) * up),
+        (entry + stride + 1, right * up),
     ]
+
+
+def _mean(lookups: Lookups) -> Float[Array, "*paths 3"]:
+    """Returns the share of the throughput that each tap of a path has."""
+    count = jnp.maximum(lookups.taps, 1).astype(lookups.starts.dtype)[..., None]
+    return lookups.throughput / jnp.square(count)
+
+
+def radiance(mips: Mips, lookups: Lookups) -> Float[Array, "paths 3"]:
+    """Returns the linear RGB radiance that each path sees; its throughput does not matter."""
+    count = lookups.taps.shape[0]
+    each = lookups._replace(
+        pixels=jnp.arange(count, dtype=jnp.int32), throughput=jnp.ones_like(lookups.throughput)
+    )
+    return _colours(count, mips, each)
 
 
 def colours(mips: Mips, lookups: Lookups, *, pixels: int) -> Float[Array, "pixels 3"]:
@@ -344,10 +358,8 @@ def colours(mips: Mips, lookups: Lookups, *, pixels: int) -> Float[Array, "pixel
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _colours(pixels: int, mips: Mips, lookups: Lookups) -> Float[Array, "pixels 3"]:
-    table, grids = _table(mips), jnp.asarray(_grids(mips[0].shape[1] - 1))
     return jax.lax.platform_dependent(
-        table,
-        grids,
+        _table(mips),
         lookups,
         cpu=functools.partial(_read if lookups.taps.size < _FEW else _read_native, pixels),
         default=functools.partial(_read, pixels),
@@ -365,11 +377,7 @@ def _colours_backward(
 ) -> tuple[Mips, Lookups]:
     del pixels
     mips, lookups = saved
-    count = lookups.taps.shape[0]
-    each = lookups._replace(
-        pixels=jnp.arange(count, dtype=jnp.int32), throughput=jnp.ones_like(lookups.throughput)
-    )
-    by_throughput = _colours(count, mips, each) * slopes[lookups.pixels]
+    by_throughput = radiance(mips, lookups) * slopes[lookups.pixels]
     # Nothing is the gradient of a constant.
     nothing = jax.tree.map(lambda constant: None, lookups)
     by_radiance = transposed(slopes, lookups, resolution=mips[0].shape[1] - 1)
@@ -380,18 +388,11 @@ _colours.defvjp(_colours_forward, _colours_backward)
 
 
 def transposed(slopes: Float[Array, "pixels 3"], lookups: Lookups, *, resolution: int) -> Mips:
-    """Returns the transpose of `colours`: what each pixel adds to the vertices that it reads.
-
-    Args:
-      slopes: factor of each pixel.
-      lookups: points of the surface that the paths end on.
-      resolution: number of cells per side of a face.
-    """
+    """Returns the transpose of `colours`: what factors of pixels add to the vertices they read."""
     grids = _grids(resolution)
     entries = int(grids[-1, 0] + FACES * (grids[-1, 1] + 1) ** 2)
     table = jax.lax.platform_dependent(
         slopes,
-        jnp.asarray(grids),
         lookups,
         cpu=functools.partial(_add if lookups.taps.size < _FEW else _add_native, entries),
         default=functools.partial(_add, entries),
@@ -401,75 +402,86 @@ def transposed(slopes: Float[Array, "pixels 3"], lookups: Lookups, *, resolution
     return tuple(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True))
 
 
-def _read(pixels: int, table: Array, grids: Array, lookups: Lookups) -> Float[Array, "pixels 3"]:
+def _read(pixels: int, table: Array, lookups: Lookups) -> Float[Array, "pixels 3"]:
     """Returns the colours of pixels, one tap of all paths at a time."""
 
     def add(tap: Array, seen: Array) -> Array:
-        return seen + sum(
-            weight[:, None] * table[entry] for entry, weight in _corners(lookups, grids, tap)
-        )
+        count = jnp.maximum(lookups.taps, 1)
+        corners = _corners(lookups, tap // count, tap % count)
+        exists = tap < lookups.taps * lookups.taps
+        light = sum(weight[:, None] * table[entry] for entry, weight in corners)
+        return seen + jnp.where(exists[:, None], light, 0.0)
 
     most = jnp.max(lookups.taps, initial=0)
     seen = jax.lax.fori_loop(0, most * most, add, jnp.zeros_like(lookups.throughput))
-    return jax.ops.segment_sum(lookups.throughput * seen, lookups.pixels, num_segments=pixels)
+    return jax.ops.segment_sum(_mean(lookups) * seen, lookups.pixels, num_segments=pixels)
 
 
-def _add(entries: int, slopes: Array, grids: Array, lookups: Lookups) -> Float[Array, "entries 3"]:
+def _add(entries: int, slopes: Array, lookups: Lookups) -> Float[Array, "entries 3"]:
     """Returns the transpose of `_read`."""
-    slope = lookups.throughput * slopes[lookups.pixels]
+    slope = _mean(lookups) * slopes[lookups.pixels]
 
     def add(tap: Array, table: Array) -> Array:
-        for entry, weight in _corners(lookups, grids, tap):
-            table = table.at[entry].add(weight[:, None] * slope)
+        count = jnp.maximum(lookups.taps, 1)
+        used = jnp.where((tap < lookups.taps * lookups.taps)[:, None], slope, 0.0)
+        for entry, weight in _corners(lookups, tap // count, tap % count):
+            table = table.at[entry].add(weight[:, None] * used)
         return table
 
     table = jnp.zeros((entries, 3), slopes.dtype)
     return jax.lax.fori_loop(0, jnp.max(lookups.taps, initial=0) ** 2, add, table)
 
 
-def _read_native(pixels: int, table: Array, grids: Array, lookups: Lookups) -> Array:
+def _read_native(pixels: int, table: Array, lookups: Lookups) -> Array:
     """Computes `_read` in one native loop over paths."""
 
     @native_loop
-    def read_all(table: Array, grids: Array, lookups: Lookups) -> Array:
+    def read_all(table: Array, lookups: Lookups) -> Array:
         def read(index: Array, seen: Array) -> Array:
             look = _record(lookups, index)
 
-            def add(tap: Array, total: Array) -> Array:
-                for entry, weight in _corners(look, grids, tap):
-                    total += weight * _record(table, entry)
-                return total
+            def add(along: Array, across: Array, total: Array) -> Array:
+                corners = _corners(look, along, across)
+                return total + sum(weight * _record(table, entry) for entry, weight in corners)
 
-            total = jax.lax.fori_loop(0, look.taps**2, add, jnp.zeros(3, table.dtype))
-            light = _record(seen, look.pixels) + look.throughput * total
-            return _with_record(seen, look.pixels, light)
+            light = _mean(look) * _over_taps(look, add, jnp.zeros(3, table.dtype))
+            return _with_record(seen, look.pixels, _record(seen, look.pixels) + light)
 
         start = jnp.zeros((pixels, 3), table.dtype)
         return jax.lax.fori_loop(0, lookups.taps.shape[0], read, start)
 
-    return read_all(table, grids, lookups)
+    return read_all(table, lookups)
 
 
-def _add_native(entries: int, slopes: Array, grids: Array, lookups: Lookups) -> Array:
+def _add_native(entries: int, slopes: Array, lookups: Lookups) -> Array:
     """Computes `_add` in one native loop over paths."""
 
     @native_loop
-    def add_all(slopes: Array, grids: Array, lookups: Lookups) -> Array:
+    def add_all(slopes: Array, lookups: Lookups) -> Array:
         def add(index: Array, table: Array) -> Array:
             look = _record(lookups, index)
-            slope = look.throughput * _record(slopes, look.pixels)
+            slope = _mean(look) * _record(slopes, look.pixels)
 
-            def spread(tap: Array, table: Array) -> Array:
-                for entry, weight in _corners(look, grids, tap):
+            def spread(along: Array, across: Array, table: Array) -> Array:
+                for entry, weight in _corners(look, along, across):
                     table = _with_record(table, entry, _record(table, entry) + weight * slope)
                 return table
 
-            return jax.lax.fori_loop(0, look.taps**2, spread, table)
+            return _over_taps(look, spread, table)
 
         start = jnp.zeros((entries, 3), slopes.dtype)
         return jax.lax.fori_loop(0, lookups.taps.shape[0], add, start)
 
-    return add_all(slopes, grids, lookups)
+    return add_all(slopes, lookups)
+
+
+def _over_taps(look: Lookups, body: Callable[[Array, Array, Array], Array], start: Array) -> Array:
+    """Returns the result of a loop over the taps of one path, along both axes."""
+
+    def line(along: Array, carried: Array) -> Array:
+        return jax.lax.fori_loop(0, look.taps, functools.partial(body, along), carried)
+
+    return jax.lax.fori_loop(0, look.taps, line, start)
 
 
 def _record(values: Any, index: Array) -> Any:

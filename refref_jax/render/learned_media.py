@@ -12,12 +12,17 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
 from jaxtyping import Array, Float
 
 from refref_jax.optics.light_paths import LightPaths
 
 # Almost white, with a useful slope of the softplus.
 _INITIAL = -3.0
+
+# Least density of a learned part.
+_LEAST = 1e-6
 
 
 class LearnedTints(NamedTuple):
@@ -77,6 +82,30 @@ def attenuate(learned: LearnedTints | None, paths: LightPaths, *, radius: float)
     """
     if learned is None:
         return paths
-    passed = paths.path_lengths @ absorptions(learned, radius)
-    met = paths.hit_counts @ jax.nn.softplus(learned.density)
-    return paths._replace(throughput=paths.throughput * jnp.exp(-met - passed))
+    dimmed = jnp.exp(-crossings(paths, radius=radius) @ densities(learned))
+    return paths._replace(throughput=paths.throughput * dimmed)
+
+
+def crossings(paths: LightPaths, *, radius: float) -> Float[Array, "paths unknowns"]:
+    """Returns how often paths hit each part, then their lengths in each medium over the radius."""
+    return jnp.concatenate([paths.hit_counts, paths.path_lengths / radius], axis=-1)
+
+
+def densities(learned: LearnedTints) -> Float[Array, "unknowns 3"]:
+    """Returns the optical density of each surface, then that of each medium over the radius."""
+    return jax.nn.softplus(jnp.concatenate(learned))
+
+
+def of_densities(found: Float[Array, "unknowns 3"]) -> LearnedTints:
+    """Inverts `densities`; they are at least 1e-6, where the softplus still has a gradient."""
+    raw = jnp.maximum(found, _LEAST)
+    return LearnedTints(*jnp.split(raw + jnp.log(-jnp.expm1(-raw)), 2))
+
+
+def non_negative(
+    normal: Float[np.ndarray, "unknowns unknowns"], right: Float[np.ndarray, " unknowns"]
+) -> Float[np.ndarray, " unknowns"]:
+    """Returns the non-negative densities `x` that minimise `x @ normal @ x / 2 - right @ x`."""
+    ridge = 1e-9 * (np.trace(normal) or 1.0)
+    root = np.linalg.cholesky(normal + ridge * np.eye(len(normal)))
+    return scipy.optimize.nnls(root.T, np.linalg.solve(root, right))[0]

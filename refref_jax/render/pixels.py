@@ -121,7 +121,7 @@ def _see_backdrop(params: Params, config: ModelConfig, paths: LightPaths) -> Pat
     leave = jax.vmap(functools.partial(scene_bounds.exit_distance, bounds))
     distance = ends.tau + leave(ends.origins, ends.directions)
     seen = Composite(
-        rgb=backdrop.colours(mips, lookups, pixels=count),
+        rgb=backdrop.radiance(mips, lookups),
         accumulation=jnp.ones_like(paths.radii),
         median=distance,
         mean=distance,

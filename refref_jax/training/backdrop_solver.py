@@ -11,6 +11,9 @@ outlines, lose their weight. A weak prior on the details of the pyramid determin
 pixel sees: they continue their surroundings smoothly.
 
 A fraction of the pixels is held out; their error decides when to stop.
+
+Learned tints and absorption take turns with the radiance: each round begins with Gauss-Newton steps
+of non-negative densities. The first round uses only pixels that see the surface directly.
 """
 
 import functools
@@ -31,10 +34,11 @@ from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.numerics import host_array
 from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.path_settings import PathSettings
+from refref_jax.optics.path_settings import Detail, PathSettings, Tally
 from refref_jax.optics.scene import Scene
-from refref_jax.render import backdrop, images, pixels
+from refref_jax.render import backdrop, images, learned_media, pixels
 from refref_jax.render.backdrop import Lookups, Mips, Pyramid
+from refref_jax.render.learned_media import LearnedTints
 from refref_jax.sampling.scene_bounds import Domain
 
 # One error in this many determines their typical size.
@@ -43,33 +47,25 @@ _EVERY = 17
 # One pixel in this many is held out.
 _HELD_OUT = 50
 
-# Linear value below which the slope of sRGB is taken to be constant, or noise in the dark would
-# have most of the weight.
+# Linear value below which sRGB has a constant slope here, or dark noise would weigh most.
 _DARK = 2e-3
 
 # An 8-bit value at or above this one is saturated.
 _SATURATED = 254.5 / 255.0
 
-# Residuals, in units of their typical size, beyond which a pixel loses weight (Huber).
-_TYPICAL = 3.0
-
-# Smallest typical residual: the rounding of 8 bits.
-_ROUNDING = 0.5 / 255.0
+# Residuals, in units of their typical size, beyond which a pixel loses weight (Huber), and the
+# smallest typical residual: the rounding of 8 bits.
+_TYPICAL, _ROUNDING = 3.0, 0.5 / 255.0
 
 ROUND = 8
 """Number of iterations with the same weights of the pixels."""
 
-PRIOR = 1e-3
-"""Weight of the details of the pyramid."""
-
 # A round that improves the held-out pixels by less, in dB, is the last.
 _WORTH = 0.02
 
-# Patches per edge of an image, and the mean sRGB error of a patch that does not fit.
-_PATCHES, _MISFIT = 16, 0.05
-
-MOST_MISFITS = 5e-3
-"""Share of misfits beyond which the far field is not the surface; see `misfits`."""
+# Most Gauss-Newton steps of the tints in a round, and the change of a density that ends them; most
+# pixels of a block that determine them.
+_TINT_STEPS, _TINT_CHANGE, _MOST_TINTED = 8, 1e-4, 200_000
 
 
 _Arrays = TypeVar("_Arrays")
@@ -81,12 +77,14 @@ class Block(NamedTuple):
 
     Attributes:
       lookups: points of the surface that the views' light paths end on.
+      crossings: what learned tints read of the paths (`learned_media.crossings`), if there are any.
       linear: linear RGB of the pixels.
       srgb: sRGB of the pixels.
       kept: 1 for pixels that are fitted, 0 for those that are held out.
     """
 
     lookups: Lookups
+    crossings: Float[Array, "paths unknowns"]
     linear: Float[Array, "pixels 3"]
     srgb: Float[Array, "pixels 3"]
     kept: Float[Array, " pixels"]
@@ -98,17 +96,28 @@ class Progress(NamedTuple):
     Attributes:
       step: number of iterations.
       pyramid: radiance of each level.
+      tints: learned tints and absorption, if any.
       fitted: PSNR of the fitted pixels, dB.
       held_out: PSNR of the held-out pixels, dB.
     """
 
     step: int
     pyramid: Pyramid
+    tints: LearnedTints | None
     fitted: float
     held_out: float
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "domain", "resolution", "most_taps"))
+class _Seen(NamedTuple):
+    """What some rays see."""
+
+    lookups: Lookups
+    crossings: Float[Array, "paths unknowns"]
+
+
+@functools.partial(
+    jax.jit, static_argnames=("settings", "domain", "resolution", "most_taps", "tally")
+)
 def _look(
     scene: Scene,
     rays: Rays,
@@ -117,13 +126,23 @@ def _look(
     domain: Domain,
     resolution: int,
     most_taps: int,
-) -> Lookups:
+    tally: Tally,
+) -> _Seen:
     """Returns where the paths of rays end; their pixels are the indices of the rays."""
-    traced = path_tracing.trace_ends(scene, rays, settings=settings, footprint="differential")
-    ends = traced.ends
+    if tally == "parts":
+        # The first and the last segment are the fewest that can be stored.
+        detail = Detail("outside", 2, "differential", tally)
+        paths = path_tracing.trace(scene, rays, settings=settings, detail=detail).paths
+        ends = light_paths.ends_of(paths)
+        crossings = learned_media.crossings(paths, radius=domain.radius)
+    else:
+        traced = path_tracing.trace_ends(scene, rays, settings=settings, footprint="differential")
+        ends = traced.ends
+        crossings = jnp.zeros((ends.rays.shape[0], 0), ends.tau.dtype)
     throughput = jnp.where(light_paths.exists(ends)[:, None], ends.throughput, 0.0)
     ends = ends._replace(throughput=throughput)
-    return backdrop.locate(domain, ends, ends.rays, resolution=resolution, most_taps=most_taps)
+    lookups = backdrop.locate(domain, ends, ends.rays, resolution=resolution, most_taps=most_taps)
+    return _Seen(lookups, crossings)
 
 
 def read_equations(
@@ -136,6 +155,7 @@ def read_equations(
     resolution: int,
     most_taps: int = 3,
     side: int = 1,
+    tally: Tally = "none",
     blocks: int = 2,
     progress: Callable[[int, int], None] = lambda view, total: None,
 ) -> tuple[Block, ...]:
@@ -150,6 +170,7 @@ def read_equations(
       resolution: number of cells per side of a face.
       most_taps: largest number of taps along each axis of a ray's footprint.
       side: number of rays along each edge of a pixel.
+      tally: `parts` if tints and absorption are learned.
       blocks: number of blocks that the views are split into; they are traced and solved at once.
       progress: function called after each view, from several threads.
     """
@@ -159,9 +180,9 @@ def read_equations(
     done = itertools.count(1)
 
     def trace(views: Int[np.ndarray, " views"]) -> Block:
-        lookups = []
+        each = []
         for start in range(0, len(views), group):
-            rays, names = _rays(cameras, views[start : start + group], side)
+            rays, names = cameras_module.rays_of_views(cameras, views[start : start + group], side)
             tile = images.size_for(names.size, most=images.TILE)
             for first in range(0, names.size, tile):
                 part, _ = images.crop(rays, None, first, tile)
@@ -173,17 +194,19 @@ def read_equations(
                         domain=domain,
                         resolution=resolution,
                         most_taps=most_taps,
+                        tally=tally,
                     )
                 )
                 # The last tile is filled up with rays that belong to no pixel.
-                real = (seen.taps > 0) & (seen.pixels < names.size - first)
+                real = (seen.lookups.taps > 0) & (seen.lookups.pixels < names.size - first)
                 seen = jax.tree.map(lambda x, real=real: x[real], seen)
-                pixel = start * shape + names[first + seen.pixels]
-                lookups.append(seen._replace(pixels=pixel.astype(np.int32)))
+                pixel = (start * shape + names[first + seen.lookups.pixels]).astype(np.int32)
+                each.append(seen._replace(lookups=seen.lookups._replace(pixels=pixel)))
             for _ in views[start : start + group]:
                 progress(next(done), len(photographs))
-        joined = jax.tree.map(lambda *each: np.concatenate(each), *lookups)
-        joined = joined._replace(throughput=joined.throughput / side**2)
+        joined = jax.tree.map(lambda *parts: np.concatenate(parts), *each)
+        lookups = joined.lookups._replace(throughput=joined.lookups.throughput / side**2)
+        joined = joined._replace(lookups=lookups)
         return _block(joined, photographs[views], seed=int(views[0]))
 
     split = np.array_split(np.arange(len(photographs)), min(blocks, len(photographs)))
@@ -196,24 +219,12 @@ def _at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Re
         return list(threads.map(function, *each))
 
 
-def _rays(
-    cameras: Cameras, views: Int[np.ndarray, " views"], side: int
-) -> tuple[Rays, Int[np.ndarray, " rays"]]:
-    """Returns all rays of some views, and the index of each ray's pixel."""
-    fine = cameras_module.supersample(cameras, side)
-    each = [cameras_module.image_rays(fine, int(view)) for view in views]
-    rays = jax.tree.map(lambda *x: np.concatenate([y.reshape(-1, *y.shape[2:]) for y in x]), *each)
-    pixel = cameras_module.strata(cameras, side)[..., 0].reshape(-1)
-    shape = cameras.height * cameras.width
-    return rays, np.concatenate([number * shape + pixel for number in range(len(views))])
-
-
-def _block(lookups: Lookups, photographs: UInt8[np.ndarray, "views h w 3"], seed: int) -> Block:
+def _block(seen: _Seen, photographs: UInt8[np.ndarray, "views h w 3"], seed: int) -> Block:
     """Returns the equations of some views; the seed draws the pixels that are held out."""
     srgb = host_array(photographs.reshape(-1, 3).astype(np.float32) / 255.0)
     held_out = np.random.default_rng(seed).integers(_HELD_OUT, size=len(srgb)) == 0
     linear = pixels.srgb_to_linear(jax.device_put(srgb))
-    return Block(lookups, linear, srgb, host_array(np.float32(~held_out)))
+    return Block(*seen, linear, srgb, host_array(np.float32(~held_out)))
 
 
 @jax.jit
@@ -224,7 +235,7 @@ def _weights(predicted: Array, block: Block, typical: float | Array) -> Float[Ar
     difference = predicted - block.linear
     # The secant gives the sRGB residual exactly; near 0 it is the tangent.
     secant = jnp.where(jnp.abs(difference) > 1e-3, jnp.abs(residual / difference), slope)
-    secant = jnp.minimum(secant, jnp.max(slope))
+    secant = jnp.minimum(secant, jnp.max(slope, initial=0.0))
     huber = jnp.minimum(1.0, _TYPICAL * typical / jnp.maximum(jnp.abs(residual), 1e-6))
     bright = (block.srgb >= _SATURATED) & (predicted >= block.linear)
     return jnp.where(bright, 0.0, huber * jnp.square(secant)) * block.kept[:, None]
@@ -305,12 +316,14 @@ def solve(
     resolution: int,
     iterations: int,
     start: tuple[int, Pyramid] | None = None,
-    prior: float = PRIOR,
+    tints: LearnedTints | None = None,
+    prior: float = 1e-3,
+    tint_decay: float = 0.0,
 ) -> Iterator[Progress]:
     """Yields the state after each iteration; it may stop earlier than asked.
 
-    After every `ROUND` iterations the pixels get new weights, and the search starts again from the
-    radiance alone: a run that is continued from there is the same as one without a pause.
+    Each `ROUND` of iterations depends only on the radiance and the tints at its start: a run that
+    is continued from there is the same as one without a pause.
 
     Args:
       blocks: equations of all views.
@@ -318,43 +331,41 @@ def solve(
       resolution: number of cells per side of a face.
       iterations: largest number of iterations.
       start: number of iterations, a multiple of `ROUND`, and radiance of an earlier run.
+      tints: tints and absorption to begin with, if they are learned.
       prior: weight of the details of the pyramid, relative to a pixel's squared sRGB error.
+      tint_decay: weight of the optical density of tints and absorption, relative to the mean
+        squared sRGB error.
     """
     mean = jnp.mean(jnp.stack([jnp.mean(block.linear, axis=0) for block in blocks]), axis=0)
     uniform = backdrop.init(resolution, radiance=mean)
     step, x = start or (0, uniform)
     priors = tuple(jnp.float32(prior if i else 1e-2 * prior) for i in range(len(x)))
-
-    def look(block: Block, mips: Mips) -> Array:
-        return jax.block_until_ready(_predict(mips, block))
-
-    def spread(slopes: Array, block: Block) -> Mips:
-        return jax.block_until_ready(_transposed(slopes, block, resolution=resolution))
-
-    def transpose(slopes: list[Array]) -> Pyramid:
-        parts = _at_once(spread, slopes, blocks)
-        return _mipmap_transposed(_sum(parts), space)
-
-    def predict(x: Pyramid) -> list[Array]:
-        mips = _mipmap(x, space)
-        return _at_once(look, blocks, [mips] * len(blocks))
-
+    tinted = [] if tints is None else [_tinted(block) for block in blocks]
     while step < iterations:
-        seen, before, typical = predict(x), -math.inf, math.inf
+        before, typical = -math.inf, math.inf
         if step:
+            seen = _System(blocks, space, resolution, tints).see(x)
             _, before, typical = _measure(blocks, seen)
+            if tints is not None:
+                mips = _mipmap(x, space)
+                tints = _fit_tints(tinted, mips, tints, typical=typical, decay=tint_decay)
+        system = _System(blocks, space, resolution, tints)
+        seen = system.see(x)
         expected = seen if step else [block.linear for block in blocks]
         weights = [_weights(e, b, typical) for e, b in zip(expected, blocks, strict=True)]
-        diagonal = jax.tree.map(lambda ours, weight: ours + weight, transpose(weights), priors)
+        if tints is not None and not step:
+            weights = [w * _is_direct(b) for w, b in zip(weights, blocks, strict=True)]
+        squares = system.transpose(weights)
+        diagonal = jax.tree.map(lambda ours, weight: ours + weight, squares, priors)
         gap = [w * (b.linear - s) for w, b, s in zip(weights, blocks, seen, strict=True)]
         # The prior of vertices that no pixel sees is the mean of all pixels.
         residual = jax.tree.map(
-            lambda a, weight, b, c: a - weight * (b - c), transpose(gap), priors, x, uniform
+            lambda a, weight, b, c: a - weight * (b - c), system.transpose(gap), priors, x, uniform
         )
         direction, rho = _begin_search(residual, diagonal)
         for _ in range(min(ROUND, iterations - step)):
-            moved = predict(direction)
-            image = transpose([w * m for w, m in zip(weights, moved, strict=True)])
+            moved = system.see(direction)
+            image = system.transpose([w * m for w, m in zip(weights, moved, strict=True)])
             image = jax.tree.map(lambda a, weight, b: a + weight * b, image, priors, direction)
             x, residual, direction, rho, alpha = _advance(
                 x, residual, direction, image, diagonal, rho
@@ -362,48 +373,117 @@ def solve(
             seen = _add_scaled(seen, alpha, moved)
             step += 1
             fitted, held_out, _ = _measure(blocks, seen)
-            yield Progress(step, x, fitted, held_out)
+            yield Progress(step, x, tints, fitted, held_out)
         if held_out < before + _WORTH:
             return
 
 
-def misfits(
-    blocks: Sequence[Block], pyramid: Pyramid, *, space: Space, shape: tuple[int, int]
-) -> float:
-    """Returns the share of patches of the images that see the surface directly, but differ from it.
+class _System:
+    """The linear function from the radiance to the pixels, and its transpose."""
 
-    Errors at details of a texture average out over a patch. Those of something in front of the
-    surface do not, nor those of a surface of another size: they have parallax.
+    def __init__(
+        self, blocks: Sequence[Block], space: Space, resolution: int, tints: LearnedTints | None
+    ) -> None:
+        """Sets up the function for present tints."""
+        self._blocks = blocks if tints is None else [_attenuated(b, tints) for b in blocks]
+        self._space, self._resolution = space, resolution
 
-    Args:
-      blocks: equations of all views, with one ray per pixel.
-      pyramid: radiance of each level.
-      space: kind of the surface.
-      shape: height and width of the images.
+    def see(self, x: Pyramid) -> list[Array]:
+        """Returns the linear RGB of the pixels of each block."""
+        mips = _mipmap(x, self._space)
 
-    Returns:
-      The share among the patches whose rays all meet no object; 0 if there are none.
-    """
-    mips, (height, width) = _mipmap(pyramid, space), shape
-    edge = max(1, min(shape) // _PATCHES)
-    rows, columns = height // edge, width // edge
-    patches = (-1, rows, edge, columns, edge)
+        def look(block: Block) -> Array:
+            return jax.block_until_ready(_predict(mips, block))
 
-    def averaged(values: np.ndarray) -> np.ndarray:
-        images = values.reshape(-1, height, width, values.shape[-1])
-        cropped = images[:, : rows * edge, : columns * edge]
-        return cropped.reshape(*patches, values.shape[-1]).mean((2, 4))
+        return _at_once(look, self._blocks)
 
-    poor = total = 0
-    for block in blocks:
-        seen = np.asarray(pixels.linear_to_srgb(_predict(mips, block)))
-        directly = np.zeros((len(seen), 1))
-        unchanged = np.all(np.asarray(block.lookups.throughput) == 1.0, axis=-1)
-        directly[np.asarray(block.lookups.pixels)[unchanged]] = 1.0
-        error = np.abs(averaged(np.clip(seen, 0.0, 1.0) - np.asarray(block.srgb))).max(-1)
-        judged = averaged(directly)[..., 0] == 1.0
-        poor, total = poor + np.sum(error[judged] > _MISFIT), total + np.sum(judged)
-    return float(poor / max(total, 1))
+    def transpose(self, slopes: list[Array]) -> Pyramid:
+        """Returns what the pixels of all blocks add to each level."""
+
+        def spread(slopes: Array, block: Block) -> Mips:
+            return jax.block_until_ready(_transposed(slopes, block, resolution=self._resolution))
+
+        return _mipmap_transposed(_sum(_at_once(spread, slopes, self._blocks)), self._space)
+
+
+# ---- Learned tints ----
+
+
+@jax.jit
+def _attenuated(block: Block, tints: LearnedTints) -> Block:
+    """Returns the equations with the throughput that tints and absorption leave."""
+    dimmed = jnp.exp(-block.crossings @ learned_media.densities(tints))
+    lookups = block.lookups._replace(throughput=block.lookups.throughput * dimmed)
+    return block._replace(lookups=lookups)
+
+
+@jax.jit
+def _is_direct(block: Block) -> Float[Array, "pixels 1"]:
+    """Returns 1 for pixels none of whose light has met a part, else 0."""
+    met = jnp.max(block.crossings, axis=-1, initial=0.0)
+    most = jax.ops.segment_max(met, block.lookups.pixels, num_segments=block.srgb.shape[0])
+    return (most <= 0.0).astype(met.dtype)[:, None]
+
+
+def _tinted(block: Block) -> Block:
+    """Returns the equations of the pixels behind parts; of some, if there are very many."""
+    pixel = np.asarray(block.lookups.pixels)
+    behind = np.flatnonzero(np.asarray(_is_direct(block))[:, 0] == 0.0)
+    chosen = behind[:: max(1, len(behind) // _MOST_TINTED)]
+    place = np.full(len(block.srgb), -1, np.int32)
+    place[chosen] = np.arange(len(chosen), dtype=np.int32)
+    paths = place[pixel] >= 0
+    lookups = jax.tree.map(lambda x: np.asarray(x)[paths], block.lookups)
+    lookups = lookups._replace(pixels=place[pixel[paths]])
+    colours = jax.tree.map(lambda x: np.asarray(x)[chosen], block[2:])
+    return Block(lookups, host_array(np.asarray(block.crossings)[paths]), *colours)
+
+
+def _fit_tints(
+    blocks: Sequence[Block], mips: Mips, tints: LearnedTints, *, typical: float, decay: float
+) -> LearnedTints:
+    """Returns the non-negative densities that fit best behind a surface of given radiance."""
+    seen = [_radiance(mips, block) for block in blocks]
+    densities = np.asarray(learned_media.densities(tints), np.float64)
+    penalty = decay * sum(len(block.srgb) for block in blocks) / len(densities)
+    for _ in range(_TINT_STEPS):
+        now = jax.device_put(densities.astype(np.float32))
+        found = [_tint_equations(now, s, b, typical) for s, b in zip(seen, blocks, strict=True)]
+        normal, right = (np.asarray(x, np.float64) for x in _sum(found))
+        right = right + np.einsum("ckl,lc->ck", normal, densities) - penalty
+        before = densities
+        densities = np.stack(
+            [learned_media.non_negative(*pair) for pair in zip(normal, right, strict=True)], 1
+        )
+        if np.max(np.abs(densities - before)) < _TINT_CHANGE:
+            break
+    return learned_media.of_densities(jax.device_put(densities.astype(np.float32)))
+
+
+@jax.jit
+def _radiance(mips: Mips, block: Block) -> Float[Array, "paths 3"]:
+    return backdrop.radiance(mips, block.lookups)
+
+
+@jax.jit
+def _tint_equations(
+    densities: Float[Array, "unknowns 3"],
+    seen: Float[Array, "paths 3"],
+    block: Block,
+    typical: float | Array,
+) -> tuple[Float[Array, "3 unknowns unknowns"], Float[Array, "3 unknowns"]]:
+    """Returns normal matrix and right-hand side of a Gauss-Newton step, for each channel."""
+    light = block.lookups.throughput * jnp.exp(-block.crossings @ densities) * seen
+
+    def summed(light: Array) -> Array:
+        return jax.ops.segment_sum(light, block.lookups.pixels, num_segments=block.srgb.shape[0])
+
+    predicted = summed(light)
+    weights = _weights(predicted, block, typical)
+    slopes = jax.lax.map(lambda each: -summed(each[:, None] * light), block.crossings.T)
+    exact = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
+    normal = exact("kpc,lpc->ckl", weights[None] * slopes, slopes)
+    return normal, exact("kpc,pc->ck", slopes, weights * (block.linear - predicted))
 
 
 def _measure(blocks: Sequence[Block], seen: Sequence[Array]) -> tuple[float, float, float]:

@@ -44,15 +44,31 @@ _Value = TypeVar("_Value")
 # Options that determine the objects.
 _OBJECTS = ("scene", "properties", "reconstruction")
 
-# Options that determine the near and far planes. These are not compared: runs of earlier versions
-# lack them, and the model, which is compared as well, contains them.
+FIELD_ONLY = (
+    *("preset", "field", "footprint", "samples_per_ray", "multisamples", "dilation"),
+    *("log2_hashmap_size", "max_res", "precision", "colour_network", "contraction", "near", "far"),
+    *("data_loss", "interlevel_weight", "blurs", "distortion_weight", "hash_decay", "distortion"),
+    *("path_losses", "steps", "warmup", "learning_rate", "final_learning_rate", "anneal", "batch"),
+    *("pretraced_batches", "adam_b2"),
+)
+"""Options that only a radiance field reads."""
+
+BACKDROP_ONLY = ("backdrop_resolution", "iterations")
+"""Options that only a backdrop reads."""
+
+# Options that determine the model of the far field.
+_FAR_FIELD = (
+    *(*_OBJECTS, "background", "radius", "centre", "pixels", "rule", "paths", "max_bends"),
+    *("interior", "tints", *FIELD_ONLY, *BACKDROP_ONLY),
+)
+
+# Options that determine the near and far planes, which earlier runs lack, and which the model has.
 _BOUNDS = ("scene", "properties", "background", "radius", "contraction")
 
 # Maximum number of steps, rays and batches, which are 32-bit integers.
 _MOST = 2**31 - 1
 
-_FINEST = 2**20
-_SEEDS = 2**32
+_FINEST, _SEEDS = 2**20, 2**32
 
 # Numbers of multisamples of the patterns in `sampling.cones`.
 _PATTERNS = (1, 6)
@@ -179,7 +195,9 @@ class FieldConfig:
       far: Far plane: distance of the last sample from the last bend in contracted space, world
         units; by default 1000, with contraction=always 150, and 10,000 in unbounded scenes.
       far_field: Model of the world behind the objects: the radiance field, or only its surface
-        (backdrop), a cube, sphere or environment whose radiance is solved for.
+        (backdrop), a cube, sphere or environment whose radiance is solved for. By default the
+        backdrop where the scene states which one it is and the images agree, unless a part or an
+        option needs a field.
       backdrop_resolution: Number of cells per side of a face of the backdrop.
       iterations: Largest number of iterations of the backdrop's solver.
     """
@@ -201,7 +219,7 @@ class FieldConfig:
     contraction: Contraction = option("unbounded")
     near: float | None = option(None, after=_BOUNDS, comparison="none")
     far: float | None = option(None, after=_BOUNDS, comparison="none")
-    far_field: FarField = option("field")
+    far_field: FarField | None = option(None, after=_FAR_FIELD)
     backdrop_resolution: int | None = option(None, after=("far_field",))
     iterations: int | None = option(None, after=("far_field",))
 
@@ -313,12 +331,6 @@ class ScheduleConfig:
                 raise ValueError(f"{name} is {rate}. Give a positive number.")
         if not 0.0 <= self.adam_b2 < 1.0:
             raise ValueError(f"adam_b2 is {self.adam_b2}. Give a number in [0, 1).")
-
-    def over(self, steps: int) -> "ScheduleConfig":
-        """Returns the same schedule stretched over another number of steps."""
-        scale = steps / require(self.steps)
-        warmup, anneal = (round(require(x) * scale) for x in (self.warmup, self.anneal))
-        return dataclasses.replace(self, steps=steps, warmup=warmup, anneal=anneal)
 
 
 class Followers(NamedTuple):

@@ -35,6 +35,8 @@ def read(path: Path) -> TrainConfig:
       ValueError: if the file is missing, or is not a configuration.
     """
     config = configuration.read(path, TrainConfig)
+    if config.model.far_field is None and config.schedule.steps is not None:
+        config = config.decided(far_field="field")  # of a version that knew nothing else
     made = config.scene.reconstruction
     if not made or Path(made).is_absolute():
         return config

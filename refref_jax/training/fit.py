@@ -22,16 +22,13 @@ import optax
 from jax.sharding import Mesh
 
 from refref_jax import atomic_files, configuration
-from refref_jax.data import image_files, scene_folder, scene_source
+from refref_jax.data import image_files, scene_analysis, scene_folder, scene_source
 from refref_jax.data.batches import PixelSampler
 from refref_jax.data.meshes import MeshPart
-from refref_jax.geometry.cameras import Cameras
 from refref_jax.optics.scene import Scene
 from refref_jax.render import checkpoint_io, volume_rendering
-from refref_jax.render.backdrop import Pyramid
 from refref_jax.render.checkpoint_io import SavedModel
-from refref_jax.render.model import Model, init_params
-from refref_jax.sampling.scene_bounds import Domain
+from refref_jax.render.model import Model, Params, init_params, path_detail
 from refref_jax.training import backdrop_solver, devices, loop, run_folder
 from refref_jax.training.config import TrainConfig, require
 from refref_jax.training.loop import TrainState, init_state
@@ -198,11 +195,13 @@ def prepare(
     config = config.at(str(scene_source.open_scene(config.scene.path).resolve()))
     if config.scene.properties:
         config = config.decided(properties=str(Path(config.scene.properties).resolve()))
+    if config.model.far_field is None and jax.process_count() > 1:
+        config = config.decided(far_field="field")  # one process solves a backdrop
     facts = read_facts(config.scene, parts=parts)
     for note in facts.notes:
         report(note)
     resolved = resolve(config, facts)
-    report(facts.describe())
+    report(scene_analysis.describe(facts.analysis))
     return resolved, build_scene(resolved, facts)
 
 
@@ -270,7 +269,7 @@ def train(
         folder = scene_source.open_scene(scene or config.scene.path)
         objects = checkpoint_io.load_scene(run)
         if solved:
-            step = _solve(run, config, model, objects, folder, checkpoints, progress, report, stop)
+            step = _solve(run, config, model, objects, folder, checkpoints, progress, stop)
             if step < total:
                 report(f"Stopped at iteration {step}.")
             return step == total
@@ -349,17 +348,16 @@ def _solve(
     folder: Path,
     checkpoints: Checkpoints,
     progress: Progress,
-    report: Callable[[str], None],
     stop: Callable[[], bool],
 ) -> int:
     """Solves for the backdrop, and returns the number of the last iteration.
 
-    A checkpoint is written after each round of iterations.
+    A checkpoint is written after each round of iterations; the solver may be done before the last.
     """
     shape, bounds = model.config.backdrop, volume_rendering.domain(model.config)
+    begun = time.monotonic()
     assert shape is not None
-    total, begun = require(config.model.iterations), time.monotonic()
-    frames = scene_folder.read_frames(folder, "train")
+    total, frames = require(config.model.iterations), scene_folder.read_frames(folder, "train")
     blocks = backdrop_solver.read_equations(
         scene,
         frames.cameras,
@@ -368,11 +366,11 @@ def _solve(
         domain=bounds,
         resolution=shape.resolution,
         most_taps=shape.most_taps,
+        tally=path_detail(model.config, model.settings).tally,
         progress=lambda view, views: progress(0, total, f"tracing view {view} of {views}"),
     )
-    state = TrainState(
-        jnp.zeros((), jnp.int32), init_params(jax.random.key(0), model.config), optax.EmptyState()
-    )
+    params = init_params(jax.random.key(0), model.config)
+    state = TrainState(jnp.zeros((), jnp.int32), params, optax.EmptyState())
     if checkpoints.newest() is not None:
         state = checkpoints.restore(state)
     step = int(state.step)
@@ -385,42 +383,22 @@ def _solve(
         resolution=shape.resolution,
         iterations=total,
         start=(step, state.params.field) if step else None,
+        tints=state.params.tints,
+        tint_decay=config.losses.tint_decay,
     )
     for reached in iterations:
         step = reached.step
         line = {"step": step, "psnr": reached.fitted, "psnr_held_out": reached.held_out}
-        line["seconds"] = earlier + time.monotonic() - begun
+        line |= {"seconds": earlier + time.monotonic() - begun}
         run_folder.append_metrics(run, configuration.string_safe(line))
         progress(step, total, f"PSNR {reached.fitted:.2f}  held out {reached.held_out:.2f}")
-        state = state._replace(params=state.params._replace(field=reached.pyramid))
+        state = state._replace(params=Params((), reached.pyramid, reached.tints))
         if step % backdrop_solver.ROUND == 0 and step < total:
             checkpoints.save(state._replace(step=jnp.asarray(step, jnp.int32)))
             if stop():
                 return step
-    # The solver may be done before the last iteration.
     checkpoints.save(state._replace(step=jnp.asarray(total, jnp.int32)))
-    _warn_of_misfits(blocks, state.params.field, bounds, frames.cameras, report)
     return total
-
-
-def _warn_of_misfits(
-    blocks: Sequence[backdrop_solver.Block],
-    pyramid: Pyramid,
-    bounds: Domain,
-    cameras: Cameras,
-    report: Callable[[str], None],
-) -> None:
-    shape = cameras.height, cameras.width
-    share = backdrop_solver.misfits(blocks, pyramid, space=bounds.space, shape=shape)
-    if share <= backdrop_solver.MOST_MISFITS:
-        return
-    causes = "Something is in front of it"
-    if bounds.space != "unbounded":
-        causes += f", or its size ({bounds.radius:g}) or centre is wrong"
-    report(
-        f"warning: {100.0 * share:.2g} % of the images beside the object differ from the "
-        f"backdrop. {causes}: correct this, or use far_field=field."
-    )
 
 
 def _line(step: int, measured: StepReport, rate: float, seconds: float) -> dict[str, Any]:

@@ -47,7 +47,7 @@ from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.render.backdrop import BackdropConfig
 from refref_jax.render.model import ModelConfig, ProposalConfig
-from refref_jax.training.config import FieldConfig, LossConfig, ScheduleConfig
+from refref_jax.training.config import FieldConfig, LossConfig, ScheduleConfig, require
 
 _WALLS = 7.3
 """Default half edge of the background cube, or radius of the background sphere: the data set's.
@@ -330,3 +330,22 @@ PRESETS = {
         ),
     ),
 }
+
+
+def stretched(schedule: ScheduleConfig, steps: int) -> ScheduleConfig:
+    """Returns the same schedule over another number of steps."""
+    scale = steps / require(schedule.steps)
+    warmup, anneal = (round(require(x) * scale) for x in (schedule.warmup, schedule.anneal))
+    return dataclasses.replace(schedule, steps=steps, warmup=warmup, anneal=anneal)
+
+
+def check_lengths(schedule: ScheduleConfig) -> None:
+    """Refuses a warm-up or annealing that is longer than the run; earlier runs may have one.
+
+    Raises:
+      ValueError: if it is.
+    """
+    steps = require(schedule.steps)
+    for name in ("warmup", "anneal"):
+        if (number := require(getattr(schedule, name))) > steps:
+            raise ValueError(f"{name} is {number}, but there are {steps} steps. Give fewer.")

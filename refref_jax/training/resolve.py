@@ -13,16 +13,14 @@ again changes nothing.
 """
 
 import dataclasses
-import math
-import textwrap
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from refref_jax.choices import ORIGIN, Interior, Position, RuleName
+from refref_jax import configuration
+from refref_jax.choices import ORIGIN, SURFACES, FarField, Interior, Position, RuleName
 from refref_jax.data import (
     background_fit,
     mesh_checks,
@@ -30,6 +28,7 @@ from refref_jax.data import (
     meshes,
     scene_analysis,
     scene_folder,
+    scene_names,
     scene_properties,
 )
 from refref_jax.data.batches import check_batch
@@ -37,23 +36,22 @@ from refref_jax.data.mesh_queries import Containment
 from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_analysis import SceneAnalysis
 from refref_jax.data.scene_assembly import assemble_scene
+from refref_jax.data.scene_properties import SceneProperties
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.optics.media import EMPTY_SLOT, INDEX_OF_AIR
+from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.optics.path_settings import PathSettings, make_path_settings
 from refref_jax.optics.scene import Scene
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import ModelConfig
 from refref_jax.training import presets
 from refref_jax.training.config import (
+    BACKDROP_ONLY,
+    FIELD_ONLY,
     SceneConfig,
-    ScheduleConfig,
     TrainConfig,
     options_of,
     require,
 )
-
-# Width of printed lines.
-_COLUMNS = 100
 
 # Reasons for the values of options.
 _GIVEN = "given"
@@ -77,6 +75,8 @@ class SceneFacts(NamedTuple):
       origins: names of the files that define properties, by their keys in scene.json.
       source: reason for `half_extent` and `centre`.
       centre: centre of the background, in scene.json, given or measured.
+      stated: what states the kind of the background, such as `scene.json`; empty if nothing does.
+      misfits: function of space, size and centre to `scene_analysis.misfits` of the scene's images.
     """
 
     analysis: SceneAnalysis
@@ -90,10 +90,8 @@ class SceneFacts(NamedTuple):
     origins: Mapping[str, str] = MappingProxyType({})
     source: str = "scene.json"
     centre: Position = ORIGIN
-
-    def describe(self) -> str:
-        """Returns the required features in one line of text."""
-        return scene_analysis.describe(self.analysis)
+    stated: str = ""
+    misfits: Callable[..., float] | None = None
 
 
 class Resolved(NamedTuple):
@@ -113,14 +111,9 @@ class Resolved(NamedTuple):
 
     def describe(self) -> str:
         """Returns the options as text, grouped by the reason for their values."""
-        by_reason: dict[str, list[str]] = {}
-        for option in options_of():
-            value = self.config.get(option.name)
-            if value not in (None, (), "", ORIGIN):
-                text = f"{option.name}={_shown(value)}"
-                by_reason.setdefault(self.reasons[option.name], []).append(text)
-        texts = [f"{reason}: {', '.join(values)}" for reason, values in by_reason.items()]
-        lines = [line for text in texts for line in _wrapped(text)]
+        values = {o.name: self.config.get(o.name) for o in options_of()}
+        shown = {n: x for n, x in values.items() if x not in (None, (), "", ORIGIN)}
+        lines = configuration.describe(shown, self.reasons)
         return "\n".join([*lines, *(f"warning: {each}" for each in self.warnings)])
 
 
@@ -150,7 +143,7 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
     notes += scene_analysis.overridden(told, parts, rule=rule, **given)
     embedded = any(part.material.kind != "dielectric" for part in parts)
     if rule == "priority" or (rule == "facing" and tree.overlaps) or embedded:
-        _refuse_cameras_inside(parts, cameras)
+        mesh_checks.refuse_cameras_inside(parts, cameras)
     bounds = background_fit.find_bounds(folder, told, **given)
     return SceneFacts(
         scene_analysis.analyse(parts, tree, cameras, rule=rule, space=bounds.space),
@@ -162,7 +155,17 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
         *(rule, told.ambient_index, {key: path.name for key, path in told.origins.items()}),
         bounds.source,
         bounds.centre,
+        f"background={scene.space}" if scene.space else _statement(folder, told),
+        functools.partial(scene_analysis.read_misfits, folder, parts),
     )
+
+
+def _statement(folder: Path, told: SceneProperties) -> str:
+    """Returns what states the kind of a scene's background; nothing if it is assumed."""
+    if told.background.kind is not None:
+        return told.origins["background"].name
+    kind = scene_names.of_folder(folder).split("_")[0]
+    return "its name" if kind in scene_names.BACKGROUNDS else ""
 
 
 def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
@@ -181,7 +184,9 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
         settings = dataclasses.replace(settings, reentry=require(config.paths.reentry))
     config = _resolve_training(config, model, reasons)
     check_batch(facts.cameras, require(config.schedule.batch))
-    return Resolved(config, SavedModel(model, settings), reasons, tuple(_warnings(asked, found)))
+    return Resolved(
+        config, SavedModel(model, settings), reasons, tuple(_warnings(asked, config, facts))
+    )
 
 
 def build_scene(resolved: Resolved, facts: SceneFacts) -> Scene:
@@ -316,8 +321,8 @@ def _resolve_model(
     learned = facts.analysis.parts if config.model.tints == "learned" else 0
     fields = () if model.interior == "field" else facts.analysis.field_parts
     model = dataclasses.replace(model, learned_tints=learned, field_parts=fields)
+    config = _resolve_far_field(config, facts, reasons)
     model = presets.override_model(model, config.model)
-    config = _resolve_far_field(config, model, facts, reasons)
     config = _decide(
         config,
         reasons,
@@ -328,44 +333,76 @@ def _resolve_model(
 
 
 def _resolve_far_field(
-    config: TrainConfig, model: ModelConfig, facts: SceneFacts, reasons: dict[str, str]
+    config: TrainConfig, facts: SceneFacts, reasons: dict[str, str]
 ) -> TrainConfig:
-    """Decides the size and the solver of a backdrop.
+    """Decides whether the world behind the objects is a surface, and how to solve for it.
 
     Raises:
-      ValueError: if the scene needs a field.
+      ValueError: if a surface is asked for where a field is needed.
     """
-    if model.backdrop is None:
-        asked = config.model.backdrop_resolution, config.model.iterations
-        for name, value in zip(("backdrop_resolution", "iterations"), asked, strict=True):
-            if value is not None:
-                raise ValueError(
-                    f"{name}={value} has no effect with far_field=field. Leave it out, or use "
-                    "far_field=backdrop."
-                )
-        return config
+    needs, model = _needs_of_a_field(config, facts), config.model
+    if model.far_field == "backdrop" and needs:
+        raise ValueError(
+            f"far_field=backdrop, but this run has {' and '.join(needs)}. Use far_field=field."
+        )
+    if model.far_field is None:
+        choice, why = _choose_far_field(config, facts, needs)
+        config = _decide(config, reasons, why, far_field=choice)
+    if config.model.far_field == "backdrop":
+        return _decide(
+            config,
+            reasons,
+            "far_field=backdrop",
+            backdrop_resolution=presets.BACKDROP_RESOLUTION,
+            iterations=presets.BACKDROP_ITERATIONS,
+        )
+    for name in BACKDROP_ONLY:
+        if (value := config.get(name)) is not None:
+            raise ValueError(
+                f"{name}={value} has no effect with far_field=field. Leave it out, or use "
+                "far_field=backdrop."
+            )
+    return config
+
+
+def _needs_of_a_field(config: TrainConfig, facts: SceneFacts) -> list[str]:
+    """Returns what a backdrop cannot model."""
     opaque = any(part.material.kind == "opaque" for part in facts.parts)
-    why_not = {
-        "a field inside the objects (interior=field)": (
-            config.model.interior == "field" and config.paths.name != "straight"
-        ),
-        "parts whose interior is a field": bool(model.field_parts),
-        "opaque parts, whose colour a field learns": opaque and config.paths.name != "straight",
-        "learned tints": bool(model.learned_tints),
+    bends = require(config.paths.max_bends) > 0
+    needs = {
+        "straight rays through objects": facts.analysis.parts > 0 and not bends,
+        "a field inside the objects (interior=field)": config.model.interior == "field" and bends,
+        "parts whose interior is a field": bool(facts.analysis.field_parts),
+        "opaque parts, whose colour a field learns": opaque and bends,
         "contraction=always": config.model.contraction == "always",
         "pixels=background": config.scene.pixels == "background",
     }
-    if found := [name for name, holds in why_not.items() if holds]:
-        raise ValueError(
-            f"far_field=backdrop, but this run has {' and '.join(found)}. Use far_field=field."
-        )
-    return _decide(
-        config,
-        reasons,
-        "far_field=backdrop",
-        backdrop_resolution=model.backdrop.resolution,
-        iterations=presets.BACKDROP_ITERATIONS,
-    )
+    return [name for name, holds in needs.items() if holds]
+
+
+def _choose_far_field(
+    config: TrainConfig, facts: SceneFacts, needs: Sequence[str]
+) -> tuple[FarField, str]:
+    """Returns the model of the far field, and the reason for it."""
+    if needs:
+        return "field", f"the scene needs a field: {needs[0]}"
+    given = [name for name in (*BACKDROP_ONLY, *FIELD_ONLY) if name in config.overrides()]
+    if given:
+        choice: FarField = "backdrop" if given[0] in BACKDROP_ONLY else "field"
+        return choice, f"{given[0]} is an option of a {choice}"
+    if facts.misfits is None or not facts.stated:
+        return "field", "the scene does not state what is behind the objects"
+    surface = f"{SURFACES[require(config.scene.space)]} that {facts.stated} states"
+    if share := _share_of_misfits(config, facts):
+        return "field", f"{100.0 * share:.2g} % of the images differ from the {surface}"
+    return "backdrop", f"behind the objects is the {surface}, as the images show"
+
+
+def _share_of_misfits(config: TrainConfig, facts: SceneFacts) -> float:
+    """Returns the share of the images that differs from the background; 0 if it is small."""
+    space, size, centre = (config.get(name) for name in ("background", "radius", "centre"))
+    share = facts.misfits(space=space, size=size, centre=centre) if facts.misfits else 0.0
+    return share if share > scene_analysis.MOST_MISFITS else 0.0
 
 
 def _resolve_bounds(
@@ -416,7 +453,7 @@ def _resolve_training(
         )
     preset = presets.PRESETS[config.model.preset]
     steps = config.schedule.steps or preset.schedule.steps
-    schedule = preset.schedule.over(require(steps))
+    schedule = presets.stretched(preset.schedule, require(steps))
     config = _decide(
         config,
         reasons,
@@ -429,24 +466,20 @@ def _resolve_training(
         batch=schedule.batch,
         pretraced_batches=schedule.pretraced_batches,
     )
-    _check_lengths(config.schedule)
+    presets.check_lengths(config.schedule)
     return config
 
 
-def _check_lengths(schedule: ScheduleConfig) -> None:
-    """Refuses a warm-up or annealing that is longer than the run; earlier runs may have one.
-
-    Raises:
-      ValueError: if it is.
-    """
-    steps = require(schedule.steps)
-    for name in ("warmup", "anneal"):
-        if (number := require(getattr(schedule, name))) > steps:
-            raise ValueError(f"{name} is {number}, but there are {steps} steps. Give fewer.")
-
-
-def _warnings(asked: TrainConfig, found: SceneAnalysis) -> list[str]:
-    warnings = []
+def _warnings(asked: TrainConfig, config: TrainConfig, facts: SceneFacts) -> list[str]:
+    warnings, found = [], facts.analysis
+    if asked.model.far_field == "backdrop" and (share := _share_of_misfits(config, facts)):
+        causes = "something is in front of it"
+        if config.scene.space != "unbounded":
+            causes += f", or its size ({config.scene.radius:g}) or centre is wrong"
+        warnings.append(
+            f"{100.0 * share:.2g} % of the images beside the objects differ from the backdrop: "
+            f"{causes}. Correct this, or use far_field=field."
+        )
     if asked.model.interior == "clear" and found.tints == "given":
         warnings.append(
             "interior=clear, but the objects have colours in scene.json, which will be missing. "
@@ -458,30 +491,3 @@ def _warnings(asked: TrainConfig, found: SceneAnalysis) -> list[str]:
             "such light will not be traced any further. Leave it out."
         )
     return warnings
-
-
-def _refuse_cameras_inside(parts: Sequence[MeshPart], cameras: Cameras) -> None:
-    """Refuses cameras inside a mesh, whose rays would start with an interior list."""
-    if np.any(mesh_queries.parts_around(parts, cameras.poses[:, :, 3]) != EMPTY_SLOT):
-        raise ValueError(
-            "A camera is inside a mesh, which training only supports under rule=nested, and under "
-            "rule=facing without overlaps, if all parts are dielectrics. Move the camera."
-        )
-
-
-def _wrapped(text: str) -> list[str]:
-    return textwrap.wrap(
-        text,
-        _COLUMNS,
-        initial_indent="  ",
-        subsequent_indent="    ",
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
-
-
-def _shown(value: Any) -> str:
-    """Returns a value as text."""
-    if isinstance(value, tuple):
-        return ",".join(f"{x[0]}={x[1]:g}" if isinstance(x, tuple) else str(x) for x in value)
-    return f"{value:g}" if isinstance(value, float) and math.isfinite(value) else str(value)

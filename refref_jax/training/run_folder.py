@@ -191,6 +191,7 @@ def as_trained(config: TrainConfig, saved: SavedModel) -> TrainConfig:
         "max_bends": settings.max_bends,
         "reentry": settings.reentry if settings.max_bends else None,
         "interior": model.interior,
+        "far_field": "backdrop" if model.backdrop else "field",
         "tints": tints if model.interior == "absorbing" and settings.max_bends else "none",
     }
     follows |= presets.sampling_of(model)

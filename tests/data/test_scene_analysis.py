@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from refref_jax.data import mesh_queries, meshes
+from refref_jax.data import mesh_queries, meshes, scene_analysis
 from refref_jax.data.mesh_queries import is_convex
 from refref_jax.data.scene_analysis import analyse, describe
-from refref_jax.geometry.cameras import orbit
+from refref_jax.geometry.cameras import image_rays, orbit
 from tests.factories import solids
 
 _CAMERAS = orbit(4, distance=4.0, elevation=0.3, size=8, angle_x=1.0)
@@ -205,3 +205,63 @@ def test_a_scene_tells_whether_its_colours_are_known(ball_scene):
     assert describe(_analysis(part)) == (
         "this scene needs: 1 clear convex object, no re-entry, bounded background, no tint"
     )
+
+
+def _wall(points):
+    """Returns a smooth texture: the colour of each direction from the centre."""
+    towards = points / np.linalg.norm(points, axis=-1, keepdims=True)
+    return 0.5 + 0.4 * np.sin(25.0 * towards)
+
+
+def _photographs(views, *, space="spherical", blob=0.0):
+    """Returns images of a background of size 6, with a red ball in front of it."""
+    images = []
+    for view in range(len(views.poses)):
+        rays = image_rays(views, view)
+        origins, towards = np.float64(rays.origins), np.float64(rays.directions)
+        if space == "spherical":
+            along = np.sum(origins * towards, axis=-1)
+            depth = np.sqrt(along**2 + 36.0 - np.sum(origins**2, axis=-1)) - along
+        elif space == "bounded":
+            depth = np.min((6.0 * np.sign(towards) - origins) / towards, axis=-1)
+        seen = towards if space == "unbounded" else origins + depth[..., None] * towards
+        image = _wall(seen)
+        away = np.array([0.0, 2.5, 0.0]) - origins
+        along = np.sum(away * towards, axis=-1)
+        image[(np.sum(away**2, axis=-1) - along**2 < blob**2) & (along > 0.0)] = 1.0, 0.0, 0.0
+        images.append(np.round(255.0 * image).astype(np.uint8))
+    return np.stack(images)
+
+
+def _room_views():
+    rings = [orbit(8, distance=4.0, elevation=e, size=96, angle_x=1.6) for e in (0.9, 0.0, -0.8)]
+    return rings[0]._replace(poses=np.concatenate([ring.poses for ring in rings]))
+
+
+@pytest.mark.parametrize("space", ["spherical", "bounded", "unbounded"])
+def test_an_object_in_front_of_the_background_is_seen_in_the_images(space):
+    views, ball = _room_views(), [_made(trimesh.creation.icosphere(2, 1.0))]
+    known = {"space": space, "size": 6.0}
+    clean, painted = (_photographs(views, space=space, blob=size) for size in (0.0, 0.4))
+    few = scene_analysis.misfits(views, clean, ball, **known)
+    many = scene_analysis.misfits(views, painted, ball, **known)
+    assert few < scene_analysis.MOST_MISFITS < 0.5 * many
+
+
+@pytest.mark.parametrize("space", ["spherical", "bounded"])
+def test_a_wrong_size_of_the_background_is_seen_in_the_images(space):
+    views = _room_views()
+    images = _photographs(views, space=space)
+    shares = [scene_analysis.misfits(views, images, (), space=space, size=s) for s in (6.0, 7.5)]
+    assert shares[0] < scene_analysis.MOST_MISFITS < 0.5 * shares[1]
+
+
+def test_pixels_that_only_see_objects_are_not_judged():
+    views = _room_views()
+    noise = np.random.default_rng(0).integers(256, size=(24, 96, 96, 3), dtype=np.uint8)
+    around = [_made(trimesh.creation.icosphere(2, 5.0))]
+    assert scene_analysis.misfits(views, noise, around, space="spherical", size=6.0) == 0.0
+    for shape in ((3, 5), (1, 1)):  # images smaller than a patch
+        tiny = views._replace(height=shape[0], width=shape[1])
+        image = np.full((24, *shape, 3), 99, np.uint8)
+        assert scene_analysis.misfits(tiny, image, (), space="unbounded", size=1.0) == 0.0

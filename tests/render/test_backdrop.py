@@ -38,6 +38,17 @@ def _random_pyramid(seed=1):
     )
 
 
+def _faces(lookups):
+    """Returns the faces of lookups at the finest resolution."""
+    return np.asarray(lookups.entries) // (np.asarray(lookups.sides) + 1) ** 2
+
+
+def _middles(lookups):
+    """Returns the middle of all taps of each path."""
+    half = 0.5 * (np.asarray(lookups.taps) - 1.0)[:, None]
+    return np.asarray(lookups.starts) + half * np.sum(np.asarray(lookups.steps), axis=1)
+
+
 def test_levels_are_halved_while_their_number_of_cells_is_even():
     assert backdrop.sides(16) == (4, 8, 16)
     assert backdrop.sides(12) == (6, 12)
@@ -51,7 +62,7 @@ def test_a_uniform_surface_is_the_throughput_of_each_pixel(space):
     for copy in mips:
         np.testing.assert_allclose(copy, np.broadcast_to([0.2, 0.5, 4.0], copy.shape), rtol=1e-6)
     lookups = _lookups(_DOMAINS[space], rays)
-    assert np.any(lookups.levels > 0) and np.all(lookups.taps >= 1)
+    assert np.any(lookups.sides < _SIDE) and np.all(lookups.taps >= 1)
     seen = backdrop.colours(mips, lookups, pixels=100)
     np.testing.assert_allclose(seen, np.broadcast_to([0.4, 1.0, 8.0], (100, 3)), rtol=1e-5)
 
@@ -60,16 +71,16 @@ def test_a_uniform_surface_is_the_throughput_of_each_pixel(space):
 def test_native_loops_are_the_formulas_of_other_devices(space):
     lookups = _lookups(_DOMAINS[space], _rays(300, radius=0.1))
     mips = backdrop.mipmap(_random_pyramid(), space)
-    table, grids = backdrop._table(mips), jnp.asarray(backdrop._grids(_SIDE))
+    table = backdrop._table(mips)
     np.testing.assert_allclose(
-        jax.jit(functools.partial(backdrop._read_native, 150))(table, grids, lookups),
-        backdrop._read(150, table, grids, lookups),
+        jax.jit(functools.partial(backdrop._read_native, 150))(table, lookups),
+        backdrop._read(150, table, lookups),
         rtol=1e-5,
     )
     slopes = jnp.asarray(np.random.default_rng(2).normal(size=(150, 3)), jnp.float32)
     np.testing.assert_allclose(
-        jax.jit(functools.partial(backdrop._add_native, len(table)))(slopes, grids, lookups),
-        backdrop._add(len(table), slopes, grids, lookups),
+        jax.jit(functools.partial(backdrop._add_native, len(table)))(slopes, lookups),
+        backdrop._add(len(table), slopes, lookups),
         atol=1e-5,
     )
 
@@ -92,10 +103,10 @@ def test_a_wall_is_interpolated_bilinearly_at_the_point_where_the_ray_leaves():
     direction = (target - origin) / np.linalg.norm(target - origin)
     ray = Rays(*(jnp.asarray(x, jnp.float32)[None] for x in (origin, direction, 1e-4)))
     lookups = _lookups(domain, ray)
-    assert lookups.faces[0] == 3
+    assert _faces(lookups)[0] == 3
     # Columns of a wall are along the next axis, rows along the one after: z, then x.
     expected = 0.5 * _SIDE * (np.array([-0.7, 0.3]) / 2.0 + 1.0)
-    np.testing.assert_allclose(lookups.places[0], expected, atol=1e-4)
+    np.testing.assert_allclose(_middles(lookups)[0], expected, atol=1e-4)
     grid = np.asarray(backdrop.mipmap(_random_pyramid(), "bounded")[0])[3]
     column, row = np.floor(expected).astype(int)
     right, up = expected - (column, row)
@@ -122,11 +133,17 @@ def test_there_are_no_seams(space):
             jnp.full(80, 1e-6),
         )
         lookups = _lookups(domain, rays)._replace(pixels=jnp.arange(80, dtype=jnp.int32))
-        assert np.all(lookups.faces[:40] != lookups.faces[40:])
-        for level in range(3):
-            seen = backdrop.colours(
-                mips, lookups._replace(levels=jnp.full(80, level, jnp.int32)), pixels=80
+        faces = _faces(lookups)
+        assert np.all(faces[:40] != faces[40:])
+        first = 0
+        for side in backdrop.sides(_SIDE)[::-1]:
+            coarser = lookups._replace(
+                entries=jnp.asarray(first + faces * (side + 1) ** 2),
+                sides=jnp.full(80, side, jnp.int32),
+                starts=lookups.starts * (side / _SIDE),
             )
+            first += 6 * (side + 1) ** 2
+            seen = backdrop.colours(mips, coarser, pixels=80)
             np.testing.assert_allclose(seen[:40], seen[40:], atol=2e-3)
 
 
@@ -138,10 +155,11 @@ def test_axes_are_the_change_of_the_place_across_a_pixel(space):
     for axis in range(2):
         moved = rays._replace(directions=rays.directions + ends.differentials.directions[:, axis])
         there = _lookups(domain, moved)
-        same = np.asarray(there.faces == lookups.faces)
-        assert same.sum() > 90
-        change = np.sqrt(3.0) * (there.places - lookups.places)
-        np.testing.assert_allclose(change[same], lookups.axes[same][:, axis], rtol=0.03, atol=2e-3)
+        same = _faces(there) == _faces(lookups)
+        assert same.sum() > 90 and np.all(lookups.sides == _SIDE)
+        change = np.sqrt(3.0) * (_middles(there) - _middles(lookups))
+        across = np.asarray(lookups.steps) * np.asarray(lookups.taps)[:, None, None]
+        np.testing.assert_allclose(change[same], across[same][:, axis], rtol=0.03, atol=2e-3)
 
 
 def test_a_wide_footprint_reads_the_mean_of_its_surroundings():

@@ -11,7 +11,7 @@ from refref_jax.render import Model, one_ray, render_image, render_rays
 from refref_jax.render.volume_rendering import look_up
 from refref_jax.training import backdrop_solver, run_folder
 from refref_jax.training.config import TrainConfig
-from refref_jax.training.fit import fit
+from refref_jax.training.fit import fit, prepare
 from tests.factories.cut_ball import cut_ball
 from tests.factories.small_model import CAMERAS
 
@@ -53,12 +53,26 @@ def test_a_backdrop_is_solved_and_rendered(scene, run):
     np.testing.assert_allclose(seen.accumulation, 1.0, atol=1e-4)
 
 
-def test_a_wrong_size_of_the_background_is_told(scene, tmp_path):
-    wrong = _config(scene).override(radius=9.5, iterations=_ROUND)
+def test_the_scene_alone_chooses_the_backdrop(scene, tmp_path):
+    asked = TrainConfig().override(scene=str(scene))
     lines = []
-    fit(wrong, out=tmp_path / "wrong", report=lines.append)
-    told = [line for line in lines if "differ from the backdrop" in line]
-    assert len(told) == 1 and "its size (9.5) or centre is wrong" in told[0]
+    resolved, _ = prepare(asked, report=lines.append)
+    assert resolved.config.model.far_field == "backdrop"
+    assert "behind the objects is the cube that scene.json states" in resolved.describe()
+    given = {"steps": 9, "preset": "tiny", "far_field": "field", "paths": "straight"}
+    for name, value in given.items():
+        other, _ = prepare(asked.override(**{name: value}), report=lines.append)
+        assert other.config.model.far_field == "field", name
+
+
+def test_a_wrong_size_of_the_background_leads_to_a_field_or_is_told(scene):
+    lines = []
+    wrong = TrainConfig().override(scene=str(scene), radius=9.5)
+    resolved, _ = prepare(wrong, report=lines.append)
+    assert resolved.config.model.far_field == "field"
+    assert "of the images differ from the cube" in resolved.reasons["far_field"]
+    asked, _ = prepare(wrong.override(far_field="backdrop"), report=lines.append)
+    assert len(asked.warnings) == 1 and "its size (9.5) or centre is wrong" in asked.warnings[0]
 
 
 def test_distances_are_those_of_the_walls_along_the_path(scene, run):

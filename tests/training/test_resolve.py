@@ -111,12 +111,13 @@ def test_a_backdrop_has_a_size_and_a_number_of_iterations():
 @pytest.mark.parametrize(
     ("found", "given", "message"),
     [
-        ("clear", {"backdrop_resolution": 64}, "backdrop_resolution=64 has no effect"),
-        ("clear", {"iterations": 8}, "iterations=8 has no effect"),
+        ("clear", {"far_field": "field", "backdrop_resolution": 64}, "=64 has no effect"),
+        ("clear", {"far_field": "field", "iterations": 8}, "iterations=8 has no effect"),
+        ("clear", {"interior": "field", "iterations": 8}, "iterations=8 has no effect"),
         ("clear", {"far_field": "backdrop", "interior": "field"}, "interior=field"),
         ("clear", {"far_field": "backdrop", "contraction": "always"}, "contraction=always"),
         ("clear", {"far_field": "backdrop", "pixels": "background"}, "pixels=background"),
-        ("untold", {"far_field": "backdrop"}, "learned tints"),
+        ("clear", {"far_field": "backdrop", "paths": "straight"}, "straight rays"),
         ("clear", {"far_field": "backdrop", "backdrop_resolution": 3}, "backdrop_resolution is 3"),
     ],
 )

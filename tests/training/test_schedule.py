@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from refref_jax.training import presets
 from refref_jax.training.config import ScheduleConfig, require
 from refref_jax.training.loop import learning_rate, optimizer
 
@@ -52,10 +53,10 @@ def test_a_second_moment_decay_out_of_range_is_refused(b2):
 
 
 def test_a_schedule_stretches_with_its_steps():
-    half = _PAPER.over(12_500)
+    half = presets.stretched(_PAPER, 12_500)
     assert (half.steps, half.warmup, half.anneal) == (12_500, 500, 500)
     assert (half.peak, half.end) == (_PAPER.peak, _PAPER.end)
-    assert _PAPER.over(25_000) == _PAPER
+    assert presets.stretched(_PAPER, 25_000) == _PAPER
 
 
 def test_a_schedule_that_is_still_open_is_refused():
