@@ -338,7 +338,7 @@ def _resolve_far_field(
     """Decides whether the world behind the objects is a surface, and how to solve for it.
 
     Raises:
-      ValueError: if a surface is asked for where a field is needed.
+      ValueError: if far_field=backdrop where a field is needed.
     """
     needs, model = _needs_of_a_field(config, facts), config.model
     if model.far_field == "backdrop" and needs:

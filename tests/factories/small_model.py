@@ -10,6 +10,7 @@ from refref_jax.optics.path_settings import PAPER
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import ModelConfig, ProposalConfig
 from refref_jax.training.config import (
+    FieldConfig,
     LossConfig,
     PathsConfig,
     SceneConfig,
@@ -39,6 +40,7 @@ SAVED = SavedModel(MODEL, PAPER)
 CONFIG = TrainConfig(
     scene=SceneConfig("nowhere", "nested", ()),
     paths=PathsConfig("paper"),
+    model=FieldConfig(far_field="field"),
     losses=LossConfig(
         data="mse", interlevel=0.01, blurs=(0.01,), distortion=0.01, hash_decay=0.1, tint_decay=1e-3
     ),
