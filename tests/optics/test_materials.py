@@ -237,6 +237,39 @@ def test_the_footprint_behind_a_rough_surface_reaches_the_next_facet(number):
         np.testing.assert_allclose(edges(material, some), 1e-3, rtol=0.2)
 
 
+def _of_a_pixel(*heights):
+    """Returns rays that share the strata of one pixel."""
+    count = len(heights)
+    strata = np.stack([np.full(count, 7), np.arange(count), np.full(count, count)], axis=-1)
+    return _rays(*heights)._replace(strata=jnp.asarray(strata, jnp.int32))
+
+
+def _assert_same_paths(one, other):
+    ones, others = np.asarray(exists(one)), np.asarray(exists(other))
+    np.testing.assert_array_equal(ones.sum(), others.sum())
+    for field in ("points", "throughput", "num_bends", "rays"):
+        first, second = np.asarray(getattr(one, field))[ones], np.asarray(getattr(other, field))
+        np.testing.assert_allclose(first, second[others], atol=2e-5)
+
+
+@pytest.mark.parametrize("channel", [0, 1, 2])
+def test_each_channel_of_a_rough_prism_meets_the_facets_of_its_stratum(channel):
+    indices = (1.4, 1.5, 1.6)
+    both = scenes.build(_BALL._replace(material=Material(dispersion=indices, roughness=0.2)))
+    one = scenes.build(_BALL._replace(index=indices[channel], material=Material(roughness=0.2)))
+    rays = _of_a_pixel(-0.3, -0.1, 0.2, 0.4)
+    _assert_same_paths(_paths(of_channel(both, channel), rays), _paths(one, rays))
+
+
+def test_interior_lists_leave_the_facets_of_a_stratum_as_they_are():
+    rough = Material(roughness=0.2)
+    outer = _BALL._replace(material=rough)
+    inner = _inner(rough, index=1.33)._replace(priority=1)
+    rays = _of_a_pixel(-0.3, -0.1, 0.2, 0.4)
+    listed, nested = (scenes.build(outer, inner, rule=rule) for rule in ("priority", "nested"))
+    _assert_same_paths(_paths(listed, rays), _paths(nested, rays))
+
+
 def test_entry_and_exit_of_a_rough_body_widen_the_footprint_independently():
     heights, rough = np.linspace(-1.0, 1.0, 200), Material(roughness=0.1)
     pixel = np.stack([np.arange(200), np.zeros(200), np.full(200, 64)], axis=-1)
