@@ -29,8 +29,7 @@ DATASET_TESTS := tests/experiments/dataset
 .PHONY: demo test test-dataset test-slow lint format clean notebooks dataset-env benchmark-small
 
 demo: $(READY)
-	$(RUN) experiments.train --scene=experiments/data/cube_smcvx_ball --far_field=backdrop \
-		--out=runs/demo --resume
+	$(RUN) experiments.train --scene=experiments/data/cube_smcvx_ball --out=runs/demo --resume
 	$(RUN) experiments.evaluate --run=runs/demo --split=test --rays_per_pixel=4 --overwrite
 	@echo "Look at runs/demo/eval/test/comparison.png"
 
