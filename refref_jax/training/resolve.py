@@ -110,9 +110,12 @@ class Resolved(NamedTuple):
     warnings: tuple[str, ...]
 
     def describe(self) -> str:
-        """Returns the options as text, grouped by the reason for their values."""
+        """Returns the options that the run reads as text, grouped by the reason for their values."""
         values = {o.name: self.config.get(o.name) for o in options_of()}
-        shown = {n: x for n, x in values.items() if x not in (None, (), "", ORIGIN)}
+        surface = self.config.model.far_field == "backdrop"
+        unread = {n for n in FIELD_ONLY if surface and self.reasons.get(n) != _GIVEN}
+        used = {n: x for n, x in values.items() if n not in unread}
+        shown = {n: x for n, x in used.items() if x not in (None, (), "", ORIGIN)}
         lines = configuration.describe(shown, self.reasons)
         return "\n".join([*lines, *(f"warning: {each}" for each in self.warnings)])
 

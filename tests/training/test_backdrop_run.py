@@ -59,10 +59,12 @@ def test_the_scene_alone_chooses_the_backdrop(scene, tmp_path):
     resolved, _ = prepare(asked, report=lines.append)
     assert resolved.config.model.far_field == "backdrop"
     assert "behind the objects is the cube that scene.json states" in resolved.describe()
+    assert "preset=" not in resolved.describe() and "steps=" not in resolved.describe()
     given = {"steps": 9, "preset": "tiny", "far_field": "field", "paths": "straight"}
     for name, value in given.items():
         other, _ = prepare(asked.override(**{name: value}), report=lines.append)
         assert other.config.model.far_field == "field", name
+        assert "preset=tiny" in other.describe()
 
 
 def test_a_wrong_size_of_the_background_leads_to_a_field_or_is_told(scene):
