@@ -68,7 +68,7 @@ _BOUNDS = ("scene", "properties", "background", "radius", "contraction")
 # Maximum number of steps, rays and batches, which are 32-bit integers.
 _MOST = 2**31 - 1
 
-_FINEST, _SEEDS = 2**20, 2**32
+_FINEST, _CELLS, _SEEDS = 2**20, 2**13, 2**32
 
 # Numbers of multisamples of the patterns in `sampling.cones`.
 _PATTERNS = (1, 6)
@@ -239,10 +239,10 @@ class FieldConfig:
             )
         if self.max_res is not None and not 1 <= self.max_res <= _FINEST:
             raise ValueError(f"max_res is {self.max_res}. Give 1 to {_FINEST} cells per side.")
-        for name, least in (("backdrop_resolution", 4), ("iterations", 1)):
+        for name, least, most in (("backdrop_resolution", 4, _CELLS), ("iterations", 1, _FINEST)):
             number = getattr(self, name)
-            if number is not None and not least <= number <= _FINEST:
-                raise ValueError(f"{name} is {number}. Give {least} to {_FINEST}.")
+            if number is not None and not least <= number <= most:
+                raise ValueError(f"{name} is {number}. Give {least} to {most}.")
         if self.dilation is not None and not 0.0 <= self.dilation < math.inf:
             raise ValueError(f"dilation is {self.dilation}. Give 0 or a positive number.")
         for name, distance in (("near", self.near), ("far", self.far)):

@@ -110,7 +110,7 @@ class Resolved(NamedTuple):
     warnings: tuple[str, ...]
 
     def describe(self) -> str:
-        """Returns the options that the run reads as text, grouped by the reason for their values."""
+        """Returns the options that the run reads, grouped by the reason for their values."""
         values = {o.name: self.config.get(o.name) for o in options_of()}
         surface = self.config.model.far_field == "backdrop"
         unread = {n for n in FIELD_ONLY if surface and self.reasons.get(n) != _GIVEN}

@@ -119,6 +119,7 @@ def test_a_backdrop_has_a_size_and_a_number_of_iterations():
         ("clear", {"far_field": "backdrop", "pixels": "background"}, "pixels=background"),
         ("clear", {"far_field": "backdrop", "paths": "straight"}, "straight rays"),
         ("clear", {"far_field": "backdrop", "backdrop_resolution": 3}, "backdrop_resolution is 3"),
+        ("clear", {"far_field": "backdrop", "backdrop_resolution": 8193}, "Give 4 to 8192"),
     ],
 )
 def test_a_backdrop_is_refused_where_the_scene_needs_a_field(found, given, message):
