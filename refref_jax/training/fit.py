@@ -357,26 +357,20 @@ def _solve(
     shape, bounds = model.config.backdrop, volume_rendering.domain(model.config)
     begun = time.monotonic()
     assert shape is not None
-    total, frames = require(config.model.iterations), scene_folder.read_frames(folder, "train")
-    blocks = backdrop_solver.read_equations(
-        scene,
-        frames.cameras,
-        scene_folder.read_images(frames),
-        settings=model.settings,
-        domain=bounds,
-        resolution=shape.resolution,
-        most_taps=shape.most_taps,
-        tally=path_detail(model.config, model.settings).tally,
-        progress=lambda view, views: progress(0, total, f"tracing view {view} of {views}"),
-    )
+    total = require(config.model.iterations)
+
+    def traced(view: int, views: int) -> None:
+        progress(0, total, f"tracing view {view} of {views}")
+        if stop():
+            raise KeyboardInterrupt  # there is no new state to save
+
+    blocks = _equations(model, scene, folder, traced)
     params = init_params(jax.random.key(0), model.config)
     state = TrainState(jnp.zeros((), jnp.int32), params, optax.EmptyState())
     if checkpoints.newest() is not None:
         state = checkpoints.restore(state)
     step = int(state.step)
     earlier = run_folder.rewind_metrics(run, step)
-    if stop():
-        raise KeyboardInterrupt  # there is no new state to save
     iterations = backdrop_solver.solve(
         blocks,
         space=bounds.space,
@@ -399,6 +393,25 @@ def _solve(
                 return step
     checkpoints.save(state._replace(step=jnp.asarray(total, jnp.int32)))
     return total
+
+
+def _equations(
+    model: SavedModel, scene: Scene, folder: Path, progress: Callable[[int, int], None]
+) -> tuple[backdrop_solver.Block, ...]:
+    """Reads the training images, and returns the equations of their pixels."""
+    shape, frames = model.config.backdrop, scene_folder.read_frames(folder, "train")
+    assert shape is not None
+    return backdrop_solver.read_equations(
+        scene,
+        frames.cameras,
+        scene_folder.read_images(frames),
+        settings=model.settings,
+        domain=volume_rendering.domain(model.config),
+        resolution=shape.resolution,
+        most_taps=shape.most_taps,
+        tally=path_detail(model.config, model.settings).tally,
+        progress=progress,
+    )
 
 
 def _line(step: int, measured: StepReport, rate: float, seconds: float) -> dict[str, Any]:

@@ -109,11 +109,8 @@ def test_a_model_with_a_backdrop_has_no_field_to_look_up(run):
 
 
 def test_a_paused_run_continues_to_the_same_bits(scene, run, tmp_path):
-    calls = []
-
     def stop():
-        calls.append(len(calls))
-        return len(calls) == 2  # after the first round
+        return len(run_folder.read_metrics(tmp_path / "run")) == _ROUND
 
     fit(_config(scene), out=tmp_path / "run", stop=stop, report=lambda line: None)
     assert run_folder.read_metrics(tmp_path / "run")[-1]["step"] == _ROUND
@@ -123,3 +120,15 @@ def test_a_paused_run_continues_to_the_same_bits(scene, run, tmp_path):
     assert all(np.array_equal(ours, theirs) for ours, theirs in pairs)
     fit(None, out=tmp_path / "run", existing="resume", report=lines.append)
     assert "trained already" in lines[-1]
+
+
+def test_a_run_stops_between_the_views_that_it_traces(scene, tmp_path):
+    lines = []
+    with pytest.raises(KeyboardInterrupt):
+        fit(
+            _config(scene),
+            out=tmp_path / "run",
+            progress=lambda step, total, text: lines.append(text),
+            stop=lambda: any("tracing" in line for line in lines),
+        )
+    assert len(lines) < 4 and all("tracing view" in line for line in lines)
