@@ -35,7 +35,8 @@ class Training:
       steps: number of steps.
       seconds_per_step: median over the logged intervals, without the first, which includes
         compilation.
-      rays_per_second: batch size divided by `seconds_per_step`.
+      rays_per_second: batch size divided by `seconds_per_step`; `None` for a backdrop, whose
+        iterations have no batches.
       train_seconds: duration of all steps, compilation included.
       startup_seconds: remaining duration of the process at that pace: startup, reading,
         compilation, saving. Too small if the training was resumed.
@@ -45,7 +46,7 @@ class Training:
 
     steps: int
     seconds_per_step: float
-    rays_per_second: float
+    rays_per_second: float | None
     train_seconds: float
     startup_seconds: float
     peak_host_mib: float | None
@@ -173,12 +174,13 @@ def read_training(run: Path, *, wall: float, peak_host_mib: float | None) -> Tra
     lines = run_folder.read_metrics(run)
     last = lines[-1]
     pace = seconds_per_step(lines)
-    batch = run_folder.read_config(run).schedule.batch
+    config = run_folder.read_config(run)
+    rays = None if config.model.far_field == "backdrop" else config.schedule.batch / pace
     device = last.get("peak_device_bytes")
     return Training(
         steps=last["step"],
         seconds_per_step=pace,
-        rays_per_second=batch / pace,
+        rays_per_second=rays,
         train_seconds=last["seconds"],
         startup_seconds=max(0.0, wall - last["step"] * pace),
         peak_host_mib=peak_host_mib,

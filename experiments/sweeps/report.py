@@ -56,7 +56,7 @@ def _all_points(rows: Sequence[Row]) -> str:
             "●" if row.name in front else "",
             row.name,
             f"{1e3 * row.seconds_per_step:.1f}",
-            f"{row.rays_per_second:.0f}",
+            _or_dash(row.rays_per_second, ".0f"),
             f"{row.stepping:.0f}",
             _or_dash(row.peak_host_mib, ".0f"),
             _or_dash(row.peak_device_mib, ".0f"),

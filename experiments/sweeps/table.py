@@ -39,7 +39,7 @@ class Row:
     evaluation: str
     steps: int
     seconds_per_step: float
-    rays_per_second: float
+    rays_per_second: float | None
     train_seconds: float
     startup_seconds: float
     peak_host_mib: float | None

@@ -318,6 +318,20 @@ def test_a_point_is_measured_once(stub):
     assert again.peak_host_mib is None and again.seconds_per_step == row.seconds_per_step
 
 
+@pytest.mark.parametrize(("far_field", "rays"), [("field", 200.0), ("backdrop", None)])
+def test_only_a_field_is_trained_on_rays_per_second(tmp_path, far_field, rays):
+    config = {"schedule": {"batch": 100}, "model": {"far_field": far_field}}
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    lines = [json.dumps({"step": n, "seconds": 5.0 + 0.5 * n}) for n in (1, 2)]
+    (tmp_path / "metrics.jsonl").write_text("\n".join(lines) + "\n")
+    training = measured_runs.read_training(tmp_path, wall=9.0, peak_host_mib=None)
+    assert (training.seconds_per_step, training.rays_per_second) == (0.5, rays)
+    row = dataclasses.replace(made_row("base"), rays_per_second=training.rays_per_second)
+    table.write(tmp_path / "trade_off.csv", [row])
+    assert table.read(tmp_path / "trade_off.csv") == [row]
+    assert f"| 100.0 | {'-' if rays is None else '200'} |" in report.markdown([row])
+
+
 def test_a_failure_tells_its_last_word_and_is_tried_again(stub):
     values = {"min_throughput": ("2",)}
     point = trade_points.sweep(preset="tiny", values=values, vary=["min_throughput"])[1]
