@@ -397,7 +397,7 @@ def _choose_far_field(
         return "field", "the scene does not state what is behind the objects"
     surface = f"{SURFACES[require(config.scene.space)]} that {facts.stated} states"
     if share := _share_of_misfits(config, facts):
-        return "field", f"{100.0 * share:.2g} % of the images differ from the {surface}"
+        return "field", f"{100.0 * share:.2g} % of the images' patches differ from the {surface}"
     return "backdrop", f"behind the objects is the {surface}, as the images show"
 
 
@@ -480,7 +480,7 @@ def _warnings(asked: TrainConfig, config: TrainConfig, facts: SceneFacts) -> lis
         if config.scene.space != "unbounded":
             causes += f", or its size ({config.scene.radius:g}) or centre is wrong"
         warnings.append(
-            f"{100.0 * share:.2g} % of the images beside the objects differ from the backdrop: "
+            f"{100.0 * share:.2g} % of the patches beside the objects differ from the backdrop: "
             f"{causes}. Correct this, or use far_field=field."
         )
     if asked.model.interior == "clear" and found.tints == "given":

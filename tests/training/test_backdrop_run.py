@@ -72,7 +72,7 @@ def test_a_wrong_size_of_the_background_leads_to_a_field_or_is_told(scene):
     wrong = TrainConfig().override(scene=str(scene), radius=9.5)
     resolved, _ = prepare(wrong, report=lines.append)
     assert resolved.config.model.far_field == "field"
-    assert "of the images differ from the cube" in resolved.reasons["far_field"]
+    assert "of the images' patches differ from the cube" in resolved.reasons["far_field"]
     asked, _ = prepare(wrong.override(far_field="backdrop"), report=lines.append)
     assert len(asked.warnings) == 1 and "its size (9.5) or centre is wrong" in asked.warnings[0]
 
