@@ -66,7 +66,6 @@ class Outcome(NamedTuple):
     seconds: float
 
 
-_SNELL = "optics/snell.py"
 _FRESNEL = "optics/fresnel.py"
 _STEP = "optics/path_step.py"
 _MEDIA = "optics/media.py"
@@ -85,21 +84,21 @@ _TEST_OBJECTIVE = ("training/test_objective.py",)
 BUGS = (
     Bug(
         "sign of gamma",
-        _SNELL,
+        _FRESNEL,
         "(alpha * beta - gamma) * normal",
         "(alpha * beta + gamma) * normal",
         ("optics/test_snell.py",),
     ),
     Bug(
         "alpha inverted",
-        _SNELL,
+        _FRESNEL,
         "alpha = index_near / index_far",
         "alpha = index_far / index_near",
         ("optics/test_snell.py",),
     ),
     Bug(
         "total reflection on the wrong side",
-        _SNELL,
+        _FRESNEL,
         "squared < 0.0)",
         "squared > 0.0)",
         ("optics/test_snell.py",),
@@ -107,8 +106,8 @@ BUGS = (
     Bug(
         "indices of Fresnel swapped",
         _FRESNEL,
-        "transmission(beta, index_near, index_far)",
-        "transmission(beta, index_far, index_near)",
+        "gamma, total = transmission(beta, index_near, index_far)",
+        "gamma, total = transmission(beta, index_far, index_near)",
         ("optics/test_fresnel.py",),
     ),
     Bug(

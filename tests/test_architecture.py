@@ -229,8 +229,8 @@ def test_one_snell_and_one_fresnel():
         (function.name, _name(path)) for path in _MODULES for function in _functions(path)
     ]
     for name, home in [
-        ("refract", "optics/snell.py"),
-        ("reflect", "optics/snell.py"),
+        ("refract", "optics/fresnel.py"),
+        ("reflect", "optics/fresnel.py"),
         ("reflectance", "optics/fresnel.py"),
         ("follow", "optics/wavefront.py"),
     ]:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from refref_jax.optics import fresnel, snell
+from refref_jax.optics import fresnel
 
 # Nearest that the lattice comes to grazing, normal and critical incidence, in radians.
 _NEAREST = 1e-6
@@ -86,11 +86,11 @@ def ours(cases: Lattice) -> Law:
 
     def one(direction, normal, near, far):
         beta = -jnp.dot(direction, normal)
-        gamma, total = snell.transmission(beta, near, far)
+        gamma, total = fresnel.transmission(beta, near, far)
         squared = jnp.where(total, -1.0, jnp.square(gamma))
-        refracted = snell.refract(direction, normal, near, far)
+        refracted = fresnel.refract(direction, normal, near, far)
         reflectance = fresnel.reflectance(beta, near, far)
-        return Law(squared, refracted, snell.reflect(direction, normal), reflectance)
+        return Law(squared, refracted, fresnel.reflect(direction, normal), reflectance)
 
     with jax.enable_x64(True) if double else contextlib.nullcontext():
         law = jax.jit(jax.vmap(one))(*(jnp.asarray(x) for x in cases))

@@ -8,7 +8,7 @@ gradients with respect to indices of refraction, tints, absorption, corners, nor
 Gradients are those of a fixed path: the same triangles in the same order, and the same branches.
 They do not account for paths that move to another triangle or fall below the throughput threshold.
 Towards the critical angle, the gradients of refraction and reflectance are unbounded; at it and
-beyond, the derivatives of the refracted ray are 0 (see `snell.transmission`), while those of the
+beyond, the derivatives of the refracted ray are 0 (see `fresnel.transmission`), while those of the
 totally reflected ray are exact.
 
 The *main branches* carry most of the light of a ray: the main path, which is refracted wherever it

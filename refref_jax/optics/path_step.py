@@ -20,7 +20,7 @@ from refref_jax.geometry import surfaces, triangles
 from refref_jax.geometry.bvh import NO_PRIMITIVE
 from refref_jax.geometry.rays import Rays
 from refref_jax.geometry.surfaces import SurfacePoint
-from refref_jax.optics import fresnel, media, microfacet, ray_differentials, snell
+from refref_jax.optics import fresnel, media, microfacet, ray_differentials
 from refref_jax.optics.light_paths import PathStatus, Stop
 from refref_jax.optics.microfacet import Stratum
 from refref_jax.optics.path_settings import PathSettings
@@ -97,9 +97,9 @@ def interact(
     met = Interaction(
         position=point.position,
         reflectance=fresnel.reflectance(beta, near, far),
-        total=snell.transmission(beta, near, far).total,
-        reflected=numerics.renormalize(snell.reflect(direction, facet)),
-        transmitted=numerics.renormalize(snell.refract(direction, facet, near, far)),
+        total=fresnel.transmission(beta, near, far).total,
+        reflected=numerics.renormalize(fresnel.reflect(direction, facet)),
+        transmitted=numerics.renormalize(fresnel.refract(direction, facet, near, far)),
         restart_reflected=numerics.offset_origin(point.position, geometric, point.scale),
         restart_transmitted=numerics.offset_origin(point.position, -geometric, point.scale),
         sides=sides,
@@ -165,9 +165,9 @@ def _keeps_sides(
     """Returns whether the shading normal sends both rays to the correct side of the triangle."""
     near, far = sides.index_near, sides.index_far
     beta = -numerics.dot(direction, shading)
-    total = snell.transmission(beta, near, far).total
-    reflected = snell.reflect(direction, shading)
-    refracted = snell.refract(direction, shading, near, far)
+    total = fresnel.transmission(beta, near, far).total
+    reflected = fresnel.reflect(direction, shading)
+    refracted = fresnel.refract(direction, shading, near, far)
     return (
         (beta > 0.0)
         & (numerics.dot(reflected, geometric) > 0.0)
