@@ -47,6 +47,7 @@ _MOST_WITH_ONE_IMPORTER = 15
 _MAY_JIT = {
     "render/images.py",
     "render/background_rendering.py",
+    "training/backdrop_equations.py",
     "training/backdrop_solver.py",
     "render/pixel_paths.py",
     "training/loop.py",

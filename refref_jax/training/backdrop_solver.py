@@ -17,35 +17,24 @@ of non-negative densities. The first round uses only pixels that see the surface
 """
 
 import functools
-import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Float
 
 from refref_jax.choices import Space
-from refref_jax.geometry import cameras as cameras_module
-from refref_jax.geometry.cameras import Cameras
-from refref_jax.geometry.rays import Rays
 from refref_jax.numerics import host_array
-from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.path_settings import Detail, PathSettings, Tally
-from refref_jax.optics.scene import Scene
-from refref_jax.render import backdrop, images, learned_media, pixels
-from refref_jax.render.backdrop import Lookups, Mips, Pyramid
+from refref_jax.render import backdrop, learned_media, pixels
+from refref_jax.render.backdrop import Mips, Pyramid
 from refref_jax.render.learned_media import LearnedTints
-from refref_jax.sampling.scene_bounds import Domain
+from refref_jax.training.backdrop_equations import Block, at_once
 
 # One error in this many determines their typical size.
 _EVERY = 17
-
-# One pixel in this many is held out.
-_HELD_OUT = 50
 
 # Linear value below which sRGB has a constant slope here, or dark noise would weigh most.
 _DARK = 2e-3
@@ -69,25 +58,6 @@ _TINT_STEPS, _TINT_CHANGE, _MOST_TINTED = 8, 1e-4, 200_000
 
 
 _Arrays = TypeVar("_Arrays")
-_Result = TypeVar("_Result")
-
-
-class Block(NamedTuple):
-    """The equations of some views.
-
-    Attributes:
-      lookups: points of the surface that the views' light paths end on.
-      crossings: what learned tints read of the paths (`learned_media.crossings`), if there are any.
-      linear: linear RGB of the pixels.
-      srgb: sRGB of the pixels.
-      kept: 1 for pixels that are fitted, 0 for those that are held out.
-    """
-
-    lookups: Lookups
-    crossings: Float[Array, "paths unknowns"]
-    linear: Float[Array, "pixels 3"]
-    srgb: Float[Array, "pixels 3"]
-    kept: Float[Array, " pixels"]
 
 
 class Progress(NamedTuple):
@@ -106,125 +76,6 @@ class Progress(NamedTuple):
     tints: LearnedTints | None
     fitted: float
     held_out: float
-
-
-class _Seen(NamedTuple):
-    """What some rays see."""
-
-    lookups: Lookups
-    crossings: Float[Array, "paths unknowns"]
-
-
-@functools.partial(
-    jax.jit, static_argnames=("settings", "domain", "resolution", "most_taps", "tally")
-)
-def _look(
-    scene: Scene,
-    rays: Rays,
-    *,
-    settings: PathSettings,
-    domain: Domain,
-    resolution: int,
-    most_taps: int,
-    tally: Tally,
-) -> _Seen:
-    """Returns where the paths of rays end; their pixels are the indices of the rays."""
-    if tally == "parts":
-        # The first and the last segment are the fewest that can be stored.
-        detail = Detail("outside", 2, "differential", tally)
-        paths = path_tracing.trace(scene, rays, settings=settings, detail=detail).paths
-        ends = light_paths.ends_of(paths)
-        crossings = learned_media.crossings(paths, radius=domain.radius)
-    else:
-        traced = path_tracing.trace_ends(scene, rays, settings=settings, footprint="differential")
-        ends = traced.ends
-        crossings = jnp.zeros((ends.rays.shape[0], 0), ends.tau.dtype)
-    throughput = jnp.where(light_paths.exists(ends)[:, None], ends.throughput, 0.0)
-    ends = ends._replace(throughput=throughput)
-    lookups = backdrop.locate(domain, ends, ends.rays, resolution=resolution, most_taps=most_taps)
-    return _Seen(lookups, crossings)
-
-
-def read_equations(
-    scene: Scene,
-    cameras: Cameras,
-    photographs: UInt8[np.ndarray, "views h w 3"],
-    *,
-    settings: PathSettings,
-    domain: Domain,
-    resolution: int,
-    most_taps: int = 3,
-    side: int = 1,
-    tally: Tally = "none",
-    blocks: int = 2,
-    progress: Callable[[int, int], None] = lambda view, total: None,
-) -> tuple[Block, ...]:
-    """Traces the training pixels, and returns their equations.
-
-    Args:
-      scene: the scene.
-      cameras: cameras of the views.
-      photographs: training images, 8-bit sRGB.
-      settings: path settings.
-      domain: scene bounds; their `space` is the kind of the surface.
-      resolution: number of cells per side of a face.
-      most_taps: largest number of taps along each axis of a ray's footprint.
-      side: number of rays along each edge of a pixel.
-      tally: `parts` if tints and absorption are learned.
-      blocks: number of blocks that the views are split into; they are traced and solved at once.
-      progress: function called after each view, from several threads.
-    """
-    scene = jax.device_put(scene)
-    shape = photographs.shape[1] * photographs.shape[2]
-    group = max(1, images.TILE // (shape * side**2))
-    done = itertools.count(1)
-
-    def trace(views: Int[np.ndarray, " views"]) -> Block:
-        each = []
-        for start in range(0, len(views), group):
-            rays, names = cameras_module.rays_of_views(cameras, views[start : start + group], side)
-            tile = images.size_for(names.size, most=images.TILE)
-            for first in range(0, names.size, tile):
-                part, _ = images.crop(rays, None, first, tile)
-                seen = jax.device_get(
-                    _look(
-                        scene,
-                        part,
-                        settings=settings,
-                        domain=domain,
-                        resolution=resolution,
-                        most_taps=most_taps,
-                        tally=tally,
-                    )
-                )
-                # The last tile is filled up with rays that belong to no pixel.
-                real = (seen.lookups.taps > 0) & (seen.lookups.pixels < names.size - first)
-                seen = jax.tree.map(lambda x, real=real: x[real], seen)
-                pixel = (start * shape + names[first + seen.lookups.pixels]).astype(np.int32)
-                each.append(seen._replace(lookups=seen.lookups._replace(pixels=pixel)))
-            for _ in views[start : start + group]:
-                progress(next(done), len(photographs))
-        joined = jax.tree.map(lambda *parts: np.concatenate(parts), *each)
-        lookups = joined.lookups._replace(throughput=joined.lookups.throughput / side**2)
-        joined = joined._replace(lookups=lookups)
-        return _block(joined, photographs[views], seed=int(views[0]))
-
-    split = np.array_split(np.arange(len(photographs)), min(blocks, len(photographs)))
-    return tuple(jax.device_put(block) for block in _at_once(trace, split))
-
-
-def _at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Result]:
-    """Returns the results of a function for each block; a CPU runs as many as it has cores."""
-    with ThreadPoolExecutor(len(each[0])) as threads:
-        return list(threads.map(function, *each))
-
-
-def _block(seen: _Seen, photographs: UInt8[np.ndarray, "views h w 3"], seed: int) -> Block:
-    """Returns the equations of some views; the seed draws the pixels that are held out."""
-    srgb = host_array(photographs.reshape(-1, 3).astype(np.float32) / 255.0)
-    held_out = np.random.default_rng(seed).integers(_HELD_OUT, size=len(srgb)) == 0
-    linear = pixels.srgb_to_linear(jax.device_put(srgb))
-    return Block(*seen, linear, srgb, host_array(np.float32(~held_out)))
 
 
 @jax.jit
@@ -395,7 +246,7 @@ class _System:
         def look(block: Block) -> Array:
             return jax.block_until_ready(_predict(mips, block))
 
-        return _at_once(look, self._blocks)
+        return at_once(look, self._blocks)
 
     def transpose(self, slopes: list[Array]) -> Pyramid:
         """Returns what the pixels of all blocks add to each level."""
@@ -403,7 +254,7 @@ class _System:
         def spread(slopes: Array, block: Block) -> Mips:
             return jax.block_until_ready(_transposed(slopes, block, resolution=self._resolution))
 
-        return _mipmap_transposed(_sum(_at_once(spread, slopes, self._blocks)), self._space)
+        return _mipmap_transposed(_sum(at_once(spread, slopes, self._blocks)), self._space)
 
 
 # ---- Learned tints ----

@@ -29,7 +29,7 @@ from refref_jax.optics.scene import Scene
 from refref_jax.render import checkpoint_io, volume_rendering
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Model, Params, init_params, path_detail
-from refref_jax.training import backdrop_solver, devices, loop, run_folder
+from refref_jax.training import backdrop_equations, backdrop_solver, devices, loop, run_folder
 from refref_jax.training.config import TrainConfig, require
 from refref_jax.training.loop import TrainState, init_state
 from refref_jax.training.objective import StepReport
@@ -397,11 +397,11 @@ def _solve(
 
 def _equations(
     model: SavedModel, scene: Scene, folder: Path, progress: Callable[[int, int], None]
-) -> tuple[backdrop_solver.Block, ...]:
+) -> tuple[backdrop_equations.Block, ...]:
     """Reads the training images, and returns the equations of their pixels."""
     shape, frames = model.config.backdrop, scene_folder.read_frames(folder, "train")
     assert shape is not None
-    return backdrop_solver.read_equations(
+    return backdrop_equations.read(
         scene,
         frames.cameras,
         scene_folder.read_images(frames),

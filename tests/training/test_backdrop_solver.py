@@ -17,8 +17,8 @@ from refref_jax.render.backgrounds import (
     radiance_of,
 )
 from refref_jax.sampling.scene_bounds import Domain
-from refref_jax.training import backdrop_solver
-from refref_jax.training.backdrop_solver import Block
+from refref_jax.training import backdrop_equations, backdrop_solver
+from refref_jax.training.backdrop_equations import Block
 from tests.factories import scenes
 
 _RESOLUTION = 16
@@ -56,7 +56,7 @@ def _photographs(scene, radiance, views, settings):
 
 
 def _equations(scene, views, images, *, settings=STRAIGHT, domain=_SKY, **options):
-    return backdrop_solver.read_equations(
+    return backdrop_equations.read(
         scene,
         views,
         images,
@@ -108,7 +108,7 @@ def test_the_number_of_rays_in_a_tile_does_not_matter(ball, monkeypatch):
     views = _views(2, 16)
     images = _photographs(ball, _environment(), views, STRAIGHT)
     whole = _equations(ball, views, images, blocks=1)
-    monkeypatch.setattr(backdrop_solver.images, "TILE", 128)
+    monkeypatch.setattr(backdrop_equations.images, "TILE", 128)
     tiled = _equations(ball, views, images, blocks=1)
     for ours, theirs in zip(jax.tree.leaves(whole), jax.tree.leaves(tiled), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-4)
