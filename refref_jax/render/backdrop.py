@@ -6,17 +6,16 @@ maps the ends of light paths to points of the surface (`locate`), and evaluates 
 (`colours`) and its transpose (`transposed`).
 
 The surface is a cube map: six faces with a grid of `n + 1` by `n + 1` vertices each, between which
-radiance is interpolated bilinearly. The faces of a cube are separate images; those of a sphere and
-of an environment share the vertices of their common edges, so that there are neither seams nor
-poles. A sphere is indexed by the direction from its centre, an environment by the direction of the
-light, both through equal angles.
+radiance is interpolated bilinearly. The faces of a cube are separate images; those of a sphere (by
+direction from its centre) and of an environment (by direction of the light) are indexed through
+equal angles and share the vertices of common edges: there are neither seams nor poles.
 
 The unknowns are a pyramid: the radiance is the sum of the bilinear interpolations of all levels,
 each with half the resolution of the next. A coarse level is determined by many pixels and fills
 the gaps of the finer ones, where no light path ends.
 
-A pixel is a square, not a point: its light path is shifted by the ray differential to several
-places of the pixel (`taps`), and a footprint wider than that reads a coarser level of a mipmap.
+A pixel is a square: its light path is shifted by the ray differential to several places of the
+pixel (`taps`), and a footprint wider than that reads a coarser level of a mipmap.
 
 Sources: Igehy, Tracing Ray Differentials (1999); for the sum over levels Bramble, Pasciak and Xu,
 Parallel Multilevel Preconditioners (1990).
@@ -73,13 +72,14 @@ _PIXEL_WIDTH = math.sqrt(3.0)
 # XLA unrolls loops over fewer paths, and aborts if a native loop has none left.
 _FEW = 64
 
+# Paths of less throughput have one tap: their detail would not be seen.
+_FAINT = 0.1
 
 # A footprint of this width, in cells, covers the surface; near the critical angle it is unbounded.
 _WIDEST = 1e6
 
 Pyramid = tuple[Float[Array, "6 _ _ 3"], ...]
 """Radiance of each level, coarse to fine; linear RGB."""
-
 Mips = tuple[Float[Array, "6 _ _ 3"], ...]
 """Radiance at each resolution, fine to coarse; linear RGB."""
 
@@ -91,7 +91,7 @@ class Lookups(NamedTuple):
       pixels: index of the pixel that each path belongs to.
       entries: first vertex of the face, in a list of the vertices of all resolutions.
       sides: number of cells per side of the face.
-      taps: number of taps along each axis of the pixel, 0 for empty slots.
+      taps: number of taps along both axes of the pixel, 0 for empty slots.
       starts: position of the first tap, column and row of the grid.
       steps: change of the position from tap to tap, along both axes.
       throughput: throughput of the path, linear RGB.
@@ -100,7 +100,7 @@ class Lookups(NamedTuple):
     pixels: Int[Array, "*paths"]
     entries: Int[Array, "*paths"]
     sides: Int[Array, "*paths"]
-    taps: Int[Array, "*paths"]
+    taps: Int[Array, "*paths 2"]
     starts: Float[Array, "*paths 2"]
     steps: Float[Array, "*paths 2 2"]
     throughput: Float[Array, "*paths 3"]
@@ -141,27 +141,28 @@ def locate(
       ends: last segments of the paths. Paths without ray differentials have one tap.
       pixels: index of the pixel that each path belongs to.
       resolution: number of cells per side of a face.
-      most_taps: largest number of taps along each axis of a pixel.
+      most_taps: largest number of taps along each axis of a pixel, of paths that are not faint.
     """
     faces, places, axes = jax.vmap(functools.partial(_place, domain))(
         ends.origins, ends.directions, ends.differentials.points, ends.differentials.directions
     )
     half = 0.5 * resolution
     axes = jnp.clip(_PIXEL_WIDTH * half * axes, -_WIDEST, _WIDEST)
-    width = jnp.sqrt(jnp.max(jnp.sum(jnp.square(axes), axis=-1), axis=-1))
-    taps = jnp.clip(jnp.ceil(width), 1, most_taps)
-    coarser = jnp.round(jnp.log2(jnp.maximum(width / taps, 1.0)))
+    widths = jnp.sqrt(jnp.sum(jnp.square(axes), axis=-1))
+    brightest = jnp.max(ends.throughput, axis=-1)
+    most = jnp.where(brightest < _FAINT, 1, most_taps)
+    coarser = jnp.round(jnp.log2(jnp.maximum(jnp.max(widths, axis=-1) / most, 1.0)))
     levels = jnp.minimum(coarser.astype(jnp.int32), len(sides(resolution)) - 1)
     first, side = jnp.unstack(jnp.asarray(_grids(resolution))[levels], axis=-1)
     scale = jnp.exp2(-levels.astype(axes.dtype))
-    steps = axes * (scale / taps)[:, None, None]
-    middle = (0.5 * (taps - 1.0))[:, None] * jnp.sum(steps, axis=1)
-    real = jnp.any(ends.throughput > 0.0, axis=-1)
+    taps = jnp.clip(jnp.ceil(scale[:, None] * widths), 1, most[:, None])
+    steps = axes * (scale[:, None] / taps)[..., None]
+    middle = jnp.sum(0.5 * (taps - 1.0)[..., None] * steps, axis=1)
     return Lookups(
         pixels=pixels,
         entries=first + faces * (side + 1) ** 2,
         sides=side,
-        taps=jnp.where(real, taps.astype(jnp.int32), 0),
+        taps=jnp.where(brightest[:, None] > 0.0, taps.astype(jnp.int32), 0),
         starts=(half * scale)[:, None] * (places + 1.0) - middle,
         steps=steps,
         throughput=ends.throughput,
@@ -330,13 +331,13 @@ def _corners(
 
 def _mean(lookups: Lookups) -> Float[Array, "*paths 3"]:
     """Returns the share of the throughput that each tap of a path has."""
-    count = jnp.maximum(lookups.taps, 1).astype(lookups.starts.dtype)[..., None]
-    return lookups.throughput / jnp.square(count)
+    count = jnp.maximum(jnp.prod(lookups.taps, axis=-1, keepdims=True), 1)
+    return lookups.throughput / count.astype(lookups.starts.dtype)
 
 
 def radiance(mips: Mips, lookups: Lookups) -> Float[Array, "paths 3"]:
     """Returns the linear RGB radiance that each path sees; its throughput does not matter."""
-    count = lookups.taps.shape[0]
+    count = lookups.pixels.shape[0]
     each = lookups._replace(
         pixels=jnp.arange(count, dtype=jnp.int32), throughput=jnp.ones_like(lookups.throughput)
     )
@@ -361,7 +362,7 @@ def _colours(pixels: int, mips: Mips, lookups: Lookups) -> Float[Array, "pixels 
     return jax.lax.platform_dependent(
         _table(mips),
         lookups,
-        cpu=functools.partial(_read if lookups.taps.size < _FEW else _read_native, pixels),
+        cpu=functools.partial(_read if lookups.pixels.size < _FEW else _read_native, pixels),
         default=functools.partial(_read, pixels),
     )
 
@@ -394,7 +395,7 @@ def transposed(slopes: Float[Array, "pixels 3"], lookups: Lookups, *, resolution
     table = jax.lax.platform_dependent(
         slopes,
         lookups,
-        cpu=functools.partial(_add if lookups.taps.size < _FEW else _add_native, entries),
+        cpu=functools.partial(_add if lookups.pixels.size < _FEW else _add_native, entries),
         default=functools.partial(_add, entries),
     )
     shapes = [(FACES, side + 1, side + 1, 3) for side in sides(resolution)[::-1]]
@@ -404,32 +405,33 @@ def transposed(slopes: Float[Array, "pixels 3"], lookups: Lookups, *, resolution
 
 def _read(pixels: int, table: Array, lookups: Lookups) -> Float[Array, "pixels 3"]:
     """Returns the colours of pixels, one tap of all paths at a time."""
+    counts = jnp.prod(lookups.taps, axis=-1)
+    across = jnp.maximum(lookups.taps[..., 1], 1)
 
     def add(tap: Array, seen: Array) -> Array:
-        count = jnp.maximum(lookups.taps, 1)
-        corners = _corners(lookups, tap // count, tap % count)
-        exists = tap < lookups.taps * lookups.taps
+        corners = _corners(lookups, tap // across, tap % across)
         light = sum(weight[:, None] * table[entry] for entry, weight in corners)
-        return seen + jnp.where(exists[:, None], light, 0.0)
+        return seen + jnp.where((tap < counts)[:, None], light, 0.0)
 
-    most = jnp.max(lookups.taps, initial=0)
-    seen = jax.lax.fori_loop(0, most * most, add, jnp.zeros_like(lookups.throughput))
+    most = jnp.max(counts, initial=0)
+    seen = jax.lax.fori_loop(0, most, add, jnp.zeros_like(lookups.throughput))
     return jax.ops.segment_sum(_mean(lookups) * seen, lookups.pixels, num_segments=pixels)
 
 
 def _add(entries: int, slopes: Array, lookups: Lookups) -> Float[Array, "entries 3"]:
     """Returns the transpose of `_read`."""
     slope = _mean(lookups) * slopes[lookups.pixels]
+    counts = jnp.prod(lookups.taps, axis=-1)
+    across = jnp.maximum(lookups.taps[..., 1], 1)
 
     def add(tap: Array, table: Array) -> Array:
-        count = jnp.maximum(lookups.taps, 1)
-        used = jnp.where((tap < lookups.taps * lookups.taps)[:, None], slope, 0.0)
-        for entry, weight in _corners(lookups, tap // count, tap % count):
+        used = jnp.where((tap < counts)[:, None], slope, 0.0)
+        for entry, weight in _corners(lookups, tap // across, tap % across):
             table = table.at[entry].add(weight[:, None] * used)
         return table
 
     table = jnp.zeros((entries, 3), slopes.dtype)
-    return jax.lax.fori_loop(0, jnp.max(lookups.taps, initial=0) ** 2, add, table)
+    return jax.lax.fori_loop(0, jnp.max(counts, initial=0), add, table)
 
 
 def _read_native(pixels: int, table: Array, lookups: Lookups) -> Array:
@@ -448,7 +450,7 @@ def _read_native(pixels: int, table: Array, lookups: Lookups) -> Array:
             return _with_record(seen, look.pixels, _record(seen, look.pixels) + light)
 
         start = jnp.zeros((pixels, 3), table.dtype)
-        return jax.lax.fori_loop(0, lookups.taps.shape[0], read, start)
+        return jax.lax.fori_loop(0, lookups.pixels.shape[0], read, start)
 
     return read_all(table, lookups)
 
@@ -470,7 +472,7 @@ def _add_native(entries: int, slopes: Array, lookups: Lookups) -> Array:
             return _over_taps(look, spread, table)
 
         start = jnp.zeros((entries, 3), slopes.dtype)
-        return jax.lax.fori_loop(0, lookups.taps.shape[0], add, start)
+        return jax.lax.fori_loop(0, lookups.pixels.shape[0], add, start)
 
     return add_all(slopes, lookups)
 
@@ -479,9 +481,9 @@ def _over_taps(look: Lookups, body: Callable[[Array, Array, Array], Array], star
     """Returns the result of a loop over the taps of one path, along both axes."""
 
     def line(along: Array, carried: Array) -> Array:
-        return jax.lax.fori_loop(0, look.taps, functools.partial(body, along), carried)
+        return jax.lax.fori_loop(0, look.taps[1], functools.partial(body, along), carried)
 
-    return jax.lax.fori_loop(0, look.taps, line, start)
+    return jax.lax.fori_loop(0, look.taps[0], line, start)
 
 
 def _record(values: Any, index: Array) -> Any:
@@ -493,7 +495,6 @@ def _record(values: Any, index: Array) -> Any:
     return jax.tree.map(pick, values)
 
 
-def _with_record(values: Array, index: Array, value: Array) -> Array:
-    return jax.lax.dynamic_update_index_in_dim(
-        values, value, index, axis=0, allow_negative_indices=False
-    )
+def _with_record(values: Array, at: Array, value: Array) -> Array:
+    update = jax.lax.dynamic_update_index_in_dim
+    return update(values, value, at, axis=0, allow_negative_indices=False)

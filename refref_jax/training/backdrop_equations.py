@@ -141,7 +141,7 @@ def read(
                     )
                 )
                 # The last tile is filled up with rays that belong to no pixel.
-                real = (seen.lookups.taps > 0) & (seen.lookups.pixels < names.size - first)
+                real = (seen.lookups.taps[:, 0] > 0) & (seen.lookups.pixels < names.size - first)
                 seen = jax.tree.map(lambda x, real=real: x[real], seen)
                 pixel = (start * shape + names[first + seen.lookups.pixels]).astype(np.int32)
                 each.append(seen._replace(lookups=seen.lookups._replace(pixels=pixel)))
@@ -168,3 +168,23 @@ def _block(seen: _Seen, photographs: UInt8[np.ndarray, "views h w 3"], seed: int
     held_out = np.random.default_rng(seed).integers(_HELD_OUT, size=len(srgb)) == 0
     linear = pixels.srgb_to_linear(jax.device_put(srgb))
     return Block(*seen, linear, srgb, host_array(np.float32(~held_out)))
+
+
+def thinned(block: Block, one_in: int) -> Block:
+    """Returns the equations of one pixel in `one_in`, drawn at random but always the same."""
+    if one_in == 1:
+        return block
+    drawn = np.random.default_rng(0).integers(one_in, size=len(block.srgb)) == 0
+    return of_pixels(block, np.flatnonzero(drawn))
+
+
+def of_pixels(block: Block, chosen: Int[np.ndarray, " chosen"]) -> Block:
+    """Returns the equations of some pixels, given by their indices."""
+    pixel = np.asarray(block.lookups.pixels)
+    place = np.full(len(block.srgb), -1, np.int32)
+    place[chosen] = np.arange(len(chosen), dtype=np.int32)
+    paths = place[pixel] >= 0
+    lookups = jax.tree.map(lambda x: host_array(np.asarray(x)[paths]), block.lookups)
+    lookups = lookups._replace(pixels=host_array(place[pixel[paths]]))
+    colours = jax.tree.map(lambda x: host_array(np.asarray(x)[chosen]), block[2:])
+    return Block(lookups, host_array(np.asarray(block.crossings)[paths]), *colours)

@@ -27,10 +27,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from refref_jax.choices import Space
-from refref_jax.numerics import host_array
 from refref_jax.render import backdrop, learned_media, pixels
 from refref_jax.render.backdrop import Mips, Pyramid
 from refref_jax.render.learned_media import LearnedTints
+from refref_jax.training import backdrop_equations
 from refref_jax.training.backdrop_equations import Block, at_once
 
 # One error in this many determines their typical size.
@@ -48,6 +48,9 @@ _TYPICAL, _ROUNDING = 3.0, 0.5 / 255.0
 
 ROUND = 8
 """Number of iterations with the same weights of the pixels."""
+
+# Number of rounds that begin with fewer pixels, where there are more of them than vertices.
+_FEWER = 2
 
 # A round that improves the held-out pixels by less, in dB, is the last.
 _WORTH = 0.02
@@ -192,7 +195,9 @@ def solve(
     step, x = start or (0, uniform)
     priors = tuple(jnp.float32(prior if i else 1e-2 * prior) for i in range(len(x)))
     tinted = [] if tints is None else [_tinted(block) for block in blocks]
+    whole, fewer = blocks, _thinned(blocks, x[-1][..., 0].size)
     while step < iterations:
+        blocks = whole if step >= _FEWER * ROUND else fewer
         before, typical = -math.inf, math.inf
         if step:
             seen = _System(blocks, space, resolution, tints).see(x)
@@ -225,8 +230,14 @@ def solve(
             step += 1
             fitted, held_out, _ = _measure(blocks, seen)
             yield Progress(step, x, tints, fitted, held_out)
-        if held_out < before + _WORTH:
+        if held_out < before + _WORTH and blocks is whole:
             return
+
+
+def _thinned(blocks: Sequence[Block], vertices: int) -> Sequence[Block]:
+    """Returns the equations of as many pixels as there are finest vertices, or all of them."""
+    one_in = max(1, sum(len(block.srgb) for block in blocks) // vertices)
+    return blocks if one_in == 1 else [backdrop_equations.thinned(b, one_in) for b in blocks]
 
 
 class _System:
@@ -278,16 +289,9 @@ def _is_direct(block: Block) -> Float[Array, "pixels 1"]:
 
 def _tinted(block: Block) -> Block:
     """Returns the equations of the pixels behind parts; of some, if there are very many."""
-    pixel = np.asarray(block.lookups.pixels)
     behind = np.flatnonzero(np.asarray(_is_direct(block))[:, 0] == 0.0)
     chosen = behind[:: max(1, len(behind) // _MOST_TINTED)]
-    place = np.full(len(block.srgb), -1, np.int32)
-    place[chosen] = np.arange(len(chosen), dtype=np.int32)
-    paths = place[pixel] >= 0
-    lookups = jax.tree.map(lambda x: np.asarray(x)[paths], block.lookups)
-    lookups = lookups._replace(pixels=place[pixel[paths]])
-    colours = jax.tree.map(lambda x: np.asarray(x)[chosen], block[2:])
-    return Block(lookups, host_array(np.asarray(block.crossings)[paths]), *colours)
+    return backdrop_equations.of_pixels(block, chosen)
 
 
 def _fit_tints(

@@ -45,8 +45,8 @@ def _faces(lookups):
 
 def _middles(lookups):
     """Returns the middle of all taps of each path."""
-    half = 0.5 * (np.asarray(lookups.taps) - 1.0)[:, None]
-    return np.asarray(lookups.starts) + half * np.sum(np.asarray(lookups.steps), axis=1)
+    half = 0.5 * (np.asarray(lookups.taps) - 1.0)[..., None]
+    return np.asarray(lookups.starts) + np.sum(half * np.asarray(lookups.steps), axis=1)
 
 
 def test_levels_are_halved_while_their_number_of_cells_is_even():
@@ -158,7 +158,7 @@ def test_axes_are_the_change_of_the_place_across_a_pixel(space):
         same = _faces(there) == _faces(lookups)
         assert same.sum() > 90 and np.all(lookups.sides == _SIDE)
         change = np.sqrt(3.0) * (_middles(there) - _middles(lookups))
-        across = np.asarray(lookups.steps) * np.asarray(lookups.taps)[:, None, None]
+        across = np.asarray(lookups.steps) * np.asarray(lookups.taps)[..., None]
         np.testing.assert_allclose(change[same], across[same][:, axis], rtol=0.03, atol=2e-3)
 
 

@@ -120,7 +120,7 @@ def _one_pixel(srgb, *, throughput=1.0, kept=1.0):
         pixels=jnp.zeros(1, jnp.int32),
         entries=jnp.zeros(1, jnp.int32),
         sides=jnp.full(1, _RESOLUTION, jnp.int32),
-        taps=jnp.ones(1, jnp.int32),
+        taps=jnp.ones((1, 2), jnp.int32),
         starts=jnp.full((1, 2), 0.5 * _RESOLUTION),
         steps=jnp.zeros((1, 2, 2)),
         throughput=jnp.full((1, 3), throughput),
@@ -185,7 +185,7 @@ def test_parts_that_no_pixel_sees_become_clear(ball):
     views = _views(2, 16)
     images = _photographs(ball, _environment(), views, STRAIGHT)
     blocks = _equations(ball, views, images, tally="none")
-    empty = [b._replace(crossings=jnp.zeros((b.lookups.taps.size, 2))) for b in blocks]
+    empty = [b._replace(crossings=jnp.zeros((b.lookups.pixels.size, 2))) for b in blocks]
     last = _solve(empty, tints=learned_media.init(1), tint_decay=1e-3)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(last.tints))
     np.testing.assert_allclose(learned_media.tints(last.tints), 1.0, atol=1e-5)
