@@ -173,6 +173,7 @@ def solve(
     tints: LearnedTints | None = None,
     prior: float = 1e-3,
     tint_decay: float = 0.0,
+    thin: bool = True,
 ) -> Iterator[Progress]:
     """Yields the state after each iteration; it may stop earlier than asked.
 
@@ -189,13 +190,14 @@ def solve(
       prior: weight of the details of the pyramid, relative to a pixel's squared sRGB error.
       tint_decay: weight of the optical density of tints and absorption, relative to the mean
         squared sRGB error.
+      thin: whether the first two rounds take only as many pixels as there are vertices.
     """
     mean = jnp.mean(jnp.stack([jnp.mean(block.linear, axis=0) for block in blocks]), axis=0)
     uniform = backdrop.init(resolution, radiance=mean)
     step, x = start or (0, uniform)
     priors = tuple(jnp.float32(prior if i else 1e-2 * prior) for i in range(len(x)))
     tinted = [] if tints is None else [_tinted(block) for block in blocks]
-    whole, fewer = blocks, _thinned(blocks, x[-1][..., 0].size)
+    whole, fewer = blocks, _thinned(blocks, x[-1][..., 0].size) if thin else blocks
     while step < iterations:
         blocks = whole if step >= _FEWER * ROUND else fewer
         before, typical = -math.inf, math.inf
