@@ -10,6 +10,10 @@ are those of this machine, which should be idle otherwise.
 
 --base=NAME=VALUE changes the base, --values=NAME=A/B the values to try for an option. Both may be
 repeated, and accept any option of `experiments.train`, and rays_per_pixel.
+
+The base has a field or a backdrop, as `experiments.train` would choose for this scene and these
+options; --far_field overrides this. Around a backdrop, the options are its resolution, iterations,
+light paths and the rays per pixel of the evaluation, and the figure shows curves.
 """
 
 from __future__ import annotations
@@ -17,7 +21,7 @@ from __future__ import annotations
 import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 from absl import flags
 from etils import epy
@@ -26,23 +30,30 @@ from experiments.cli import app, outputs
 from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
 from experiments.sweeps import options
+from refref_jax import choices
 
 if TYPE_CHECKING:
     from experiments.sweeps.points import Point
 
 with epy.lazy_imports():
-    from experiments.sweeps import points, sweep
+    from experiments.sweeps import far_fields, points, sweep
     from refref_jax.data import scene_folder
 
 _SCENE = cli_flags.scene("The scene")
 _OUT = cli_flags.out("Folder of the sweep.")
-_PRESET = cli_flags.preset("Preset of the base point.")
+_FAR_FIELD = flags.DEFINE_enum(
+    "far_field",
+    None,
+    get_args(choices.FarField),
+    "Far field of the base; by default that of the table in --out, else as for training.",
+)
+_PRESET = cli_flags.preset("Preset of the base point, if it has a field.")
 _SEED = cli_flags.seed("Seed of all trainings.")
 _STEPS = flags.DEFINE_list(
     "steps",
     [],
-    "Steps of the base point, then those of further trainings of it; by default those of the "
-    "preset, and a quarter, half and twice as many.",
+    "Steps of the base point, if it has a field, then those of further trainings of it; by default "
+    "those of the preset, and a quarter, half and twice as many.",
 )
 _BASE = flags.DEFINE_multi_string("base", [], "Base option, as in max_bends=6. May be repeated.")
 _VALUES = flags.DEFINE_multi_string(
@@ -60,7 +71,7 @@ _DRY_RUN = flags.DEFINE_bool("dry_run", False, "List the points without measurin
 def main() -> None:
     """Measures all points and writes the report."""
     cli_scenes.check(_SCENE.value)
-    chosen = points_from_flags()
+    chosen = points_from_flags(choose_far_field())
     if _DRY_RUN.value:
         for point in chosen:
             print(f"{point.name:24} {' '.join((*point.training, *point.evaluation))}")
@@ -91,16 +102,43 @@ def main() -> None:
         sys.exit(1)
 
 
-def points_from_flags() -> list[Point]:
-    """Returns the points that the flags select."""
-    found = points.sweep(
-        preset=_PRESET.value,
-        seed=_SEED.value,
-        steps=read_steps(_STEPS.value),
-        base=options.parse_base(_BASE.value),
-        values=options.parse_values(_VALUES.value),
-        vary=_OPTIONS.value,
-    )
+def choose_far_field() -> choices.FarField:
+    """Returns the far field of the base, and prints it if it depends on the scene.
+
+    Raises:
+      ValueError: if an option of a field is given with a backdrop.
+    """
+    of_field = [flag.name for flag in (_PRESET, _STEPS) if flag.present]
+    if _FAR_FIELD.value == "backdrop" and of_field:
+        raise ValueError(
+            f"--{of_field[0]} is an option of a field, which a backdrop does not read. Leave it "
+            "out, or use --far_field=field."
+        )
+    names = [*of_field, *options.parse_base(_BASE.value), *options.parse_values(_VALUES.value)]
+    names += [options.present_name(each).split("=")[0] for each in _OPTIONS.value or ()]
+    names += [options.present_name(each).split("=")[0] for each in _POINTS.value or ()]
+    if _FAR_FIELD.value is not None:
+        return _FAR_FIELD.value
+    if (found := far_fields.of_options(names)) or (found := far_fields.of_table(Path(_OUT.value))):
+        return found
+    base = options.parse_base(_BASE.value)
+    found, why = far_fields.of_scene(cli_scenes.opened(_SCENE.value), base)
+    print(f"Far field: {found} ({why}); --far_field overrides it.", flush=True)
+    return found
+
+
+def points_from_flags(far_field: choices.FarField) -> list[Point]:
+    """Returns the points that the flags select, around a base with a field or a backdrop."""
+    common = {
+        "seed": _SEED.value,
+        "base": options.parse_base(_BASE.value),
+        "values": options.parse_values(_VALUES.value),
+        "vary": _OPTIONS.value,
+    }
+    if far_field == "backdrop":
+        found = points.sweep_backdrop(**common)
+    else:
+        found = points.sweep(preset=_PRESET.value, steps=read_steps(_STEPS.value), **common)
     return found if _POINTS.value is None else points.choose(found, _POINTS.value)
 
 

@@ -16,6 +16,7 @@ from typing import Any
 from experiments.cli import subprocesses
 from refref_jax import atomic_files, configuration
 from refref_jax.data import scene_folder
+from refref_jax.render import checkpoint_io
 from refref_jax.training import run_folder
 
 _MEASURED = "measured.json"
@@ -34,12 +35,14 @@ class Training:
     Attributes:
       steps: number of steps.
       seconds_per_step: median over the logged intervals, without the first, which includes
-        compilation.
+        compilation; of a backdrop the mean over its iterations after the first, since those that
+        begin a round take longer.
       rays_per_second: batch size divided by `seconds_per_step`; `None` for a backdrop, whose
         iterations have no batches.
       train_seconds: duration of all steps, compilation included.
       startup_seconds: remaining duration of the process at that pace: startup, reading,
-        compilation, saving. Too small if the training was resumed.
+        compilation, saving; of a backdrop without compilation, which `train_seconds` includes. Too
+        small if the training was resumed.
       peak_host_mib: largest resident set of the process; `None` if it had ended before, unmeasured.
       peak_device_mib: largest memory of the accelerator; `None` if there is none.
     """
@@ -173,16 +176,17 @@ def read_training(run: Path, *, wall: float, peak_host_mib: float | None) -> Tra
     """
     lines = run_folder.read_metrics(run)
     last = lines[-1]
-    pace = seconds_per_step(lines)
     config = run_folder.read_config(run)
-    rays = None if config.model.far_field == "backdrop" else config.schedule.batch / pace
+    backdrop = config.model.far_field == "backdrop"
+    pace = seconds_per_step([lines[0], last] if backdrop and len(lines) > 1 else lines)
     device = last.get("peak_device_bytes")
+    working = last["seconds"] if backdrop else last["step"] * pace
     return Training(
         steps=last["step"],
         seconds_per_step=pace,
-        rays_per_second=rays,
+        rays_per_second=None if backdrop else config.schedule.batch / pace,
         train_seconds=last["seconds"],
-        startup_seconds=max(0.0, wall - last["step"] * pace),
+        startup_seconds=max(0.0, wall - working),
         peak_host_mib=peak_host_mib,
         peak_device_mib=None if device is None else device / _MIB,
     )
@@ -201,7 +205,12 @@ def seconds_per_step(lines: Sequence[dict[str, Any]]) -> float:
 def _has_ended(run: Path, steps: int | None) -> bool:
     """Returns whether a run is finished, so that training it takes no time."""
     lines = run_folder.read_metrics(run)
-    return bool(lines) and lines[-1]["step"] == steps
+    if not lines:
+        return False
+    model = run_folder.read_config(run).model
+    if model.far_field == "backdrop":  # whose solver may end before its last iteration
+        return (run / checkpoint_io.CHECKPOINTS / str(model.iterations)).is_dir()
+    return lines[-1]["step"] == steps
 
 
 def _steps_in(options: Sequence[str]) -> int | None:

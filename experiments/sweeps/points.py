@@ -13,6 +13,7 @@ from experiments.sweeps.options import OF_EVALUATION, present_name
 from refref_jax.fields import registry
 from refref_jax.optics.path_settings import PATH_PRESETS
 from refref_jax.training import presets
+from refref_jax.training.config import BACKDROP_ONLY, FIELD_ONLY
 from refref_jax.training.presets import PRESETS, Bounds
 
 BASE = "base"
@@ -21,7 +22,9 @@ _BASE_OPTIONS = {"paths": "tree"}
 
 _OF_BENT_PATHS = ("min_throughput", "max_bends", "interior", "reentry", "tints")
 
-_NOT_OF_BASE = ("preset", "seed", "steps", "scene", "out", "resume", "run", "limit")
+_NOT_OF_BASE = ("preset", "seed", "steps", "far_field", "scene", "out", "resume", "run", "limit")
+
+_BACKDROP = {"far_field": "backdrop"}
 
 _ANY_BOUNDS = Bounds(near=0.05, far=20.0, radius=7.3, space="bounded")
 
@@ -73,14 +76,7 @@ def sweep(
     """
     if preset not in PRESETS:
         raise ValueError(f"There is no preset {preset}. Choose from {', '.join(PRESETS)}.")
-    if misplaced := [name for name in _NOT_OF_BASE if name in (base or {})]:
-        raise ValueError(
-            f"--base={misplaced[0]}=... conflicts with the points. Use --{misplaced[0]}."
-        )
-    if (paths := (base or {}).get("paths", "tree")) not in PATH_PRESETS:
-        raise ValueError(
-            f"--base=paths={paths} does not exist. Choose from {', '.join(PATH_PRESETS)}."
-        )
+    _check_base(base or {})
     usual = PRESETS[preset].schedule.steps
     first, *others = steps or (usual, usual // 4, usual // 2, 2 * usual)
     base = _BASE_OPTIONS | dict(base or {})
@@ -95,25 +91,117 @@ def sweep(
         | {"steps": tuple(map(str, others))}
         | dict(values or {})
     )
-    if vary is not None:
-        vary = [present_name(name) for name in vary]
-        if unknown := [name for name in vary if name not in swept]:
-            raise ValueError(
-                f"There is no option {unknown[0]}.{app.did_you_mean(unknown[0], swept)} "
-                f"Choose from {', '.join(swept)}, or give its "
-                f"values with --values={unknown[0]}=A/B."
-            )
-        swept = {name: swept[name] for name in vary}
-    known = own_values(preset, base["paths"], field=field) | options
+    known = own_values(preset, base["paths"], field=field)
+    return _around(options, known, _varied(swept, vary))
+
+
+def sweep_backdrop(
+    *,
+    seed: int = 0,
+    base: Mapping[str, str] | None = None,
+    values: Mapping[str, Sequence[str]] | None = None,
+    vary: Sequence[str] | None = None,
+) -> list[Point]:
+    """Returns the points of a sweep whose base has a backdrop; see `sweep`.
+
+    A backdrop is fitted to one traced ray per pixel, whose footprint covers the pixel, so the
+    number of rays per pixel is an option of the evaluation alone.
+
+    Args:
+      seed: seed of the points that train a field; a backdrop has no random numbers.
+      base: options of the base.
+      values: values of an option, in place of the usual ones; new options are added.
+      vary: names of the options to vary; all if `None`.
+
+    Raises:
+      ValueError: if an option does not exist, the base sets an option of the sweep itself, or an
+        option is one of a field.
+    """
+    _check_base(base or {})
+    if of_field := [name for name in (*(base or {}), *(values or {})) if name in FIELD_ONLY]:
+        raise ValueError(
+            f"{of_field[0]} is an option of a field, which a backdrop does not read. Leave it out, "
+            "or use --far_field=field."
+        )
+    options = _BACKDROP | {"seed": str(seed)} | _BASE_OPTIONS | dict(base or {})
+    if options["paths"] == "straight":
+        raise ValueError(
+            "A backdrop is not solved along straight rays. Use --base=paths=tree or "
+            "--far_field=field."
+        )
+    known = own_backdrop_values(options["paths"])
+    swept = default_backdrop_values() | dict(values or {})
+    return _around(options, known, _varied(swept, vary))
+
+
+def _check_base(base: Mapping[str, str]) -> None:
+    if misplaced := [name for name in _NOT_OF_BASE if name in base]:
+        raise ValueError(
+            f"--base={misplaced[0]}=... conflicts with the points. Use --{misplaced[0]}."
+        )
+    if (paths := base.get("paths", "tree")) not in PATH_PRESETS:
+        raise ValueError(
+            f"--base=paths={paths} does not exist. Choose from {', '.join(PATH_PRESETS)}."
+        )
+
+
+def _varied(
+    swept: Mapping[str, Sequence[str]], vary: Sequence[str] | None
+) -> Mapping[str, Sequence[str]]:
+    """Returns the values of the options to vary."""
+    if vary is None:
+        return swept
+    vary = [present_name(name) for name in vary]
+    if unknown := [name for name in vary if name not in swept]:
+        raise ValueError(
+            f"There is no option {unknown[0]}.{app.did_you_mean(unknown[0], swept)} "
+            f"Choose from {', '.join(swept)}, or give its "
+            f"values with --values={unknown[0]}=A/B."
+        )
+    return {name: swept[name] for name in vary}
+
+
+def _around(
+    options: Mapping[str, str], own: Mapping[str, str], swept: Mapping[str, Sequence[str]]
+) -> list[Point]:
+    """Returns the base with some options, and its variants; `own` has the values of the others."""
+    known = {**own, **options}
     points = [_point(options, "", "")]
     points += [
         _point(options, name, value)
         for name, alternatives in swept.items()
         for value in alternatives
         if not _same(value, known.get(name))
-        and not (base["paths"] == "straight" and name in _OF_BENT_PATHS)
+        and not (options["paths"] == "straight" and name in _OF_BENT_PATHS)
     ]
     return points
+
+
+def own_backdrop_values(paths: str = "tree") -> dict[str, str]:
+    """Returns the options' values that apply by default with a backdrop, along some paths."""
+    return {
+        "backdrop_resolution": str(presets.BACKDROP_RESOLUTION),
+        "iterations": str(presets.BACKDROP_ITERATIONS),
+        "min_throughput": str(PATH_PRESETS[paths].min_throughput),
+        "max_bends": str(PATH_PRESETS[paths].max_bends),
+        "rays_per_pixel": "1",
+    }
+
+
+def default_backdrop_values() -> dict[str, tuple[str, ...]]:
+    """Returns the values of each option that a sweep around a backdrop tries.
+
+    The last is the field of the smallest preset, for comparison.
+    """
+    return {
+        "backdrop_resolution": ("128", "256", "512", "768"),
+        "iterations": ("8", "16", "24", "48"),
+        "rays_per_pixel": ("1", "4", "9"),
+        "paths": ("paper", "tree"),
+        "min_throughput": ("0.1", "0.05", "0.02", "0.01", "0.005"),
+        "max_bends": ("2", "6", "10", "24"),
+        "far_field": ("field",),
+    }
 
 
 def own_values(preset: str, paths: str = "tree", *, field: str = registry.USUAL) -> dict[str, str]:
@@ -190,6 +278,8 @@ def _point(base: Mapping[str, str], option: str, value: str) -> Point:
     options = {**base, option: value} if option else dict(base)
     if options["paths"] == "straight":
         options = {name: each for name, each in options.items() if name not in _OF_BENT_PATHS}
+    if options.get("far_field") == "field":
+        options = {name: each for name, each in options.items() if name not in BACKDROP_ONLY}
     evaluation = {name: options.pop(name) for name in OF_EVALUATION if name in options}
     return Point(
         name=f"{option}={value}".replace(",", "+") if option else BASE,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from experiments.figures.style import COLOURS, LABEL_HEIGHT, label_plainly, pyplot, style
 from experiments.sweeps import table
@@ -12,11 +13,6 @@ _HEAD = (
     "| | point | ms a step | rays/s | training, s | host MiB | device MiB | PSNR in mask | PSNR "
     "| SSIM | distance error | s an image |"
 )
-
-_COSTS: dict[str, Callable[[Row], float]] = {
-    "time of a step, ms": lambda row: 1e3 * row.seconds_per_step,
-    "time of all steps, s": lambda row: row.stepping,
-}
 
 _FRONT = "#999999"
 _MARKERS = "osD^vP"
@@ -29,16 +25,32 @@ _DEPTH = 10.0
 _LETTER_WIDTH = 6.5
 
 
+class _Panel(NamedTuple):
+    """One plot of a figure: the label and value of the cost, then those of the quality."""
+
+    cost_label: str
+    cost: Callable[[Row], float]
+    label: str
+    quality: Callable[[Row], float]
+
+
 def markdown(rows: Sequence[Row]) -> str:
     """Returns the text of a report on a sweep; its figure must be in the same folder."""
     base = table.base_of(rows)
     found = table.turns(rows)
+    training = "Training is the time of all steps, compiling excluded"
+    if base.has_backdrop:
+        training = (
+            "Its backdrop is fitted to one traced ray per pixel, and a step is an iteration of its "
+            "solver. Training is the time of tracing, compiling and all iterations; of a field, "
+            "that of all steps, compiling excluded"
+        )
     parts = [
         f"# Trade-off between speed and accuracy on {base.scene}",
         f"Base: `{base.training}`{base.evaluation and f', evaluated with `{base.evaluation}`'}. "
         "Every other point changes one option of it, and is trained from the same seed. Errors are "
-        f"means over {base.images} test images. Training is the time of all steps, compiling "
-        "excluded; device memory is empty where there is no accelerator.",
+        f"means over {base.images} test images. {training}; device memory is empty where there is "
+        "no accelerator.",
         "![PSNR against time](trade_off.png)",
         f"## Options to change first\n\n{_first_table(table.worth_turning(found))}",
         f"## Options that save time\n\n{_saving_table(table.worth_saving(found))}",
@@ -102,7 +114,10 @@ def _or_dash(value: float | None, form: str) -> str:
 
 
 def write_figure(path: Path, rows: Sequence[Row]) -> None:
-    """Draws the points of a sweep against both costs.
+    """Draws the points of a sweep: masked PSNR over the time of a step and of all steps.
+
+    If the base has a backdrop, curves show masked PSNR and PSNR over the time of training, and
+    masked PSNR over that of rendering an image.
 
     Args:
       path: output file.
@@ -113,34 +128,56 @@ def write_figure(path: Path, rows: Sequence[Row]) -> None:
         option: (COLOURS[i % len(COLOURS)], _MARKERS[i // len(COLOURS) % len(_MARKERS)])
         for i, option in enumerate(options)
     }
-    foot = max(row.quality for row in rows) - _DEPTH
-    figure, axes = pyplot.subplots(1, 2, figsize=(14.0, 6.4), sharey=True, layout="constrained")
-    for axis, (label, cost) in zip(axes, _COSTS.items(), strict=True):
-        _draw(axis, rows, label, cost, styles, foot)
-    masked = all(row.psnr_masked is not None for row in rows)
-    axes[0].set_ylabel("masked PSNR, dB" if masked else "PSNR, dB")
+    panels = _panels(rows)
+    figure, axes = pyplot.subplots(
+        1, len(panels), figsize=(7.0 * len(panels), 6.4), layout="constrained", squeeze=False
+    )
+    for i, (axis, panel) in enumerate(zip(axes[0], panels, strict=True)):
+        _draw(axis, rows, panel, styles)
+        if i and panel.label == panels[0].label:
+            axis.sharey(axes[0, 0])
+            axis.tick_params(labelleft=False)
+        else:
+            axis.set_ylabel(panel.label)
     figure.suptitle(f"{rows[0].scene}: one option changed at a time")
-    handles, labels = axes[0].get_legend_handles_labels()
+    handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=7, frameon=False)
     figure.canvas.draw()  # places the axes, so that labels know where they are
-    for axis, cost in zip(axes, _COSTS.values(), strict=True):
-        _label_points(axis, rows, cost, styles, foot)
+    for axis, panel in zip(axes[0], panels, strict=True):
+        _label_points(axis, rows, panel, styles)
     figure.savefig(path, dpi=130)
     pyplot.close(figure)
 
 
+def _panels(rows: Sequence[Row]) -> list[_Panel]:
+    masked = all(row.psnr_masked is not None for row in rows)
+    label = "masked PSNR, dB" if masked else "PSNR, dB"
+
+    def quality(row: Row) -> float:
+        return row.quality
+
+    if not table.base_of(rows).has_backdrop:
+        return [
+            _Panel("time of a step, ms", lambda row: 1e3 * row.seconds_per_step, label, quality),
+            _Panel("time of all steps, s", lambda row: row.stepping, label, quality),
+        ]
+    training, rendering = "time of training, s", "time of rendering an image, s"
+    whole = _Panel(training, lambda row: row.stepping, "PSNR, dB", lambda row: row.psnr)
+    return [
+        _Panel(training, lambda row: row.stepping, label, quality),
+        *([whole] if masked else []),
+        _Panel(rendering, lambda row: row.seconds_per_image, label, quality),
+    ]
+
+
 def _draw(
-    axis: pyplot.Axes,
-    rows: Sequence[Row],
-    label: str,
-    cost: Callable[[Row], float],
-    styles: dict[str, tuple[str, str]],
-    foot: float,
+    axis: pyplot.Axes, rows: Sequence[Row], panel: _Panel, styles: dict[str, tuple[str, str]]
 ) -> None:
-    front = table.pareto(rows, cost)
+    foot, base = _foot(rows, panel), table.base_of(rows)
+    front = table.pareto(rows, panel.cost, panel.quality)
     axis.step(
-        [cost(row) for row in front],
-        [max(row.quality, foot) for row in front],
+        [panel.cost(row) for row in front],
+        [max(panel.quality(row), foot) for row in front],
         color=_FRONT,
         linewidth=1.5,
         where="post",
@@ -148,34 +185,44 @@ def _draw(
     )
     for option, (colour, marker) in styles.items():
         own = [row for row in rows if row.option == option]
+        if base.has_backdrop and option:
+            curve = sorted([base, *own], key=lambda row: (panel.cost(row), panel.quality(row)))
+            axis.plot(
+                [panel.cost(row) for row in curve],
+                [max(panel.quality(row), foot) for row in curve],
+                color=colour,
+                linewidth=0.8,
+            )
         axis.plot(
-            [cost(row) for row in own],
-            [max(row.quality, foot) for row in own],
+            [panel.cost(row) for row in own],
+            [max(panel.quality(row), foot) for row in own],
             marker,
             color=colour,
             markersize=9 if not option else 6,
             label=option or "base",
         )
     axis.set_xscale("log")
-    axis.set_xlabel(label)
+    axis.set_xlabel(panel.cost_label)
     style(axis)
     label_plainly(axis.xaxis)
 
 
+def _foot(rows: Sequence[Row], panel: _Panel) -> float:
+    return max(panel.quality(row) for row in rows) - _DEPTH
+
+
 def _label_points(
-    axis: pyplot.Axes,
-    rows: Sequence[Row],
-    cost: Callable[[Row], float],
-    styles: dict[str, tuple[str, str]],
-    foot: float,
+    axis: pyplot.Axes, rows: Sequence[Row], panel: _Panel, styles: dict[str, tuple[str, str]]
 ) -> None:
     """Labels the points with their values, the Pareto front first; omits overlapping labels."""
-    front = table.pareto(rows, cost)
+    foot = _foot(rows, panel)
+    front = table.pareto(rows, panel.cost, panel.quality)
     taken: list[tuple[float, float, float]] = []
     named_first = [table.base_of(rows), *front]
     for row in [*named_first, *(row for row in rows if row not in named_first)]:
-        name = (row.value or row.name) + f" ({row.quality:.1f} dB)" * (row.quality < foot)
-        point = (cost(row), max(row.quality, foot))
+        quality = panel.quality(row)
+        name = (row.value or row.name) + f" ({quality:.1f} dB)" * (quality < foot)
+        point = (panel.cost(row), max(quality, foot))
         x, y = axis.transData.transform(point)
         width = _LETTER_WIDTH * len(name)
         if any(

@@ -58,9 +58,18 @@ class Row:
         return self.psnr if self.psnr_masked is None else self.psnr_masked
 
     @property
+    def has_backdrop(self) -> bool:
+        """Whether a backdrop was solved for; its steps are iterations."""
+        return "--far_field=backdrop" in self.training.split()
+
+    @property
     def stepping(self) -> float:
-        """Seconds of all steps, without compiling."""
-        return self.steps * self.seconds_per_step
+        """Seconds of all steps, without compiling.
+
+        Of a backdrop they include compiling, since tracing the images, which no iteration
+        includes, is not measured apart from it.
+        """
+        return self.train_seconds if self.has_backdrop else self.steps * self.seconds_per_step
 
 
 class Turn(NamedTuple):
@@ -129,11 +138,15 @@ def _with_present_names(record: dict[str, str]) -> dict[str, str]:
     }
 
 
-def pareto(rows: Sequence[Row], cost: Callable[[Row], float]) -> list[Row]:
+def pareto(
+    rows: Sequence[Row],
+    cost: Callable[[Row], float],
+    quality: Callable[[Row], float] = lambda row: row.quality,
+) -> list[Row]:
     """Returns the Pareto front of cost and quality, cheapest first."""
     front: list[Row] = []
-    for row in sorted(rows, key=lambda row: (cost(row), -row.quality)):
-        if not front or row.quality > front[-1].quality:
+    for row in sorted(rows, key=lambda row: (cost(row), -quality(row))):
+        if not front or quality(row) > quality(front[-1]):
             front.append(row)
     return front
 

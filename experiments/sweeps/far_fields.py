@@ -1,0 +1,44 @@
+"""Finds out whether a training has a field or a backdrop: from options, a table, or the scene."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from experiments.runs import config_flags
+from experiments.sweeps import table
+from experiments.sweeps.options import OF_EVALUATION
+from refref_jax.choices import FarField
+from refref_jax.training import fit
+from refref_jax.training.config import BACKDROP_ONLY, FIELD_ONLY, TrainConfig
+
+
+def of_options(names: Sequence[str]) -> FarField | None:
+    """Returns the far field that reads the first of some options that only one of both reads."""
+    given = [name for name in names if name in (*FIELD_ONLY, *BACKDROP_ONLY)]
+    if not given:
+        return None
+    return "backdrop" if given[0] in BACKDROP_ONLY else "field"
+
+
+def of_table(out: Path) -> FarField | None:
+    """Returns the far field of the base of a sweep's folder, or `None` if there is no table yet."""
+    path = out / "trade_off.csv"
+    if not path.exists():
+        return None
+    return "backdrop" if table.base_of(table.read(path)).has_backdrop else "field"
+
+
+def of_scene(scene: Path, options: Mapping[str, str]) -> tuple[FarField, str]:
+    """Returns the far field that a training of a scene would choose, and the reason.
+
+    Args:
+      scene: folder of the scene.
+      options: further options of the training, as text; those of evaluation are ignored.
+    """
+    values = {
+        name: config_flags.parse_text(name, text)
+        for name, text in options.items()
+        if name not in OF_EVALUATION
+    }
+    config = TrainConfig().override(scene=str(scene), **values)
+    resolved, _ = fit.prepare(config, report=lambda line: None)
+    return resolved.config.model.far_field or "field", resolved.reasons["far_field"]
