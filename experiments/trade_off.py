@@ -31,6 +31,7 @@ from experiments.cli import flags as cli_flags
 from experiments.cli import scenes as cli_scenes
 from experiments.sweeps import options
 from refref_jax import choices
+from refref_jax.training.config import require
 
 if TYPE_CHECKING:
     from experiments.sweeps.points import Point
@@ -122,9 +123,9 @@ def choose_far_field() -> choices.FarField:
     if (found := far_fields.of_options(names)) or (found := far_fields.of_table(Path(_OUT.value))):
         return found
     base = options.parse_base(_BASE.value)
-    found, why = far_fields.of_scene(cli_scenes.opened(_SCENE.value), base)
-    print(f"Far field: {found} ({why}); --far_field overrides it.", flush=True)
-    return found
+    resolved, _ = far_fields.prepare(cli_scenes.opened(_SCENE.value), base)
+    print(far_fields.describe(resolved), flush=True)
+    return require(resolved.config.model.far_field)
 
 
 def points_from_flags(far_field: choices.FarField) -> list[Point]:

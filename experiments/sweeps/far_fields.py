@@ -7,8 +7,10 @@ from experiments.runs import config_flags
 from experiments.sweeps import table
 from experiments.sweeps.options import OF_EVALUATION
 from refref_jax.choices import FarField
+from refref_jax.optics.scene import Scene
 from refref_jax.training import fit
 from refref_jax.training.config import BACKDROP_ONLY, FIELD_ONLY, TrainConfig
+from refref_jax.training.resolve import Resolved
 
 
 def of_options(names: Sequence[str]) -> FarField | None:
@@ -27,8 +29,8 @@ def of_table(out: Path) -> FarField | None:
     return "backdrop" if table.base_of(table.read(path)).has_backdrop else "field"
 
 
-def of_scene(scene: Path, options: Mapping[str, str]) -> tuple[FarField, str]:
-    """Returns the far field that a training of a scene would choose, and the reason.
+def prepare(scene: Path, options: Mapping[str, str]) -> tuple[Resolved, Scene]:
+    """Resolves a training of a scene, which decides between a field and a backdrop.
 
     Args:
       scene: folder of the scene.
@@ -40,5 +42,10 @@ def of_scene(scene: Path, options: Mapping[str, str]) -> tuple[FarField, str]:
         if name not in OF_EVALUATION
     }
     config = TrainConfig().override(scene=str(scene), **values)
-    resolved, _ = fit.prepare(config, report=lambda line: None)
-    return resolved.config.model.far_field or "field", resolved.reasons["far_field"]
+    return fit.prepare(config, report=lambda line: None)
+
+
+def describe(resolved: Resolved) -> str:
+    """Returns the far field of a training, and the reason, as a line of text."""
+    why = resolved.reasons["far_field"]
+    return f"Far field: {resolved.config.model.far_field} ({why}); --far_field overrides it."

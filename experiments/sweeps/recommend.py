@@ -21,6 +21,9 @@ from experiments.sweeps.points import BASE
 from experiments.sweeps.table import NOISE, Row
 from refref_jax.data import scene_names
 
+# Iterations of a timed backdrop: a round of its solver.
+_ITERATIONS = 8
+
 # Times within this ratio count as equal.
 _SAME_TIME = 1.0 + table.TIME_NOISE / 100.0
 
@@ -63,15 +66,17 @@ def time_machine(scene: Path, base: Row, steps: int) -> Training:
     """Trains the table's base point for a few steps, in a temporary folder.
 
     So few steps never repeat a pixel, and do not cache light paths: if the table's base does, the
-    time per step is overestimated by up to a tenth.
+    time per step is overestimated by up to a tenth. Of a backdrop, all views are traced and a round
+    of iterations is timed, whatever the number of steps.
     """
-    options = [word for word in base.training.split() if not word.startswith("--steps=")]
+    name, count = ("iterations", _ITERATIONS) if base.has_backdrop else ("steps", steps)
+    options = [word for word in base.training.split() if not word.startswith(f"--{name}=")]
     with tempfile.TemporaryDirectory() as folder:
         try:
             return measured_runs.train(
                 Path(folder) / "timing",
                 scene=scene,
-                options=[*options, f"--steps={steps}"],
+                options=[*options, f"--{name}={count}"],
                 log_every=steps // 3,
             )
         except RunFailedError as error:
@@ -187,7 +192,11 @@ def combine(rows: Sequence[Row], cost: Callable[[Row], float], most: float) -> R
       A predicted row, or the base itself. It may exceed the time limit if the base does.
     """
     base = table.base_of(rows)
-    useful = [row for row in rows if row.quality > base.quality + NOISE and row.option != "paths"]
+    useful = [
+        row
+        for row in rows
+        if row.quality > base.quality + NOISE and row.option not in ("paths", "far_field")
+    ]
     chosen: list[Row] = []
     while True:
         now = _together(base, chosen)
@@ -211,10 +220,12 @@ def _worth(together: Row, now: Row, cost: Callable[[Row], float]) -> float:
 def _together(base: Row, turns: Sequence[Row]) -> Row:
     gain = sum(row.quality - base.quality for row in turns)
     pace, image, steps = base.seconds_per_step, base.seconds_per_image, base.steps
+    training = base.train_seconds
     for row in turns:
+        training *= row.train_seconds / base.train_seconds
         pace *= row.seconds_per_step / base.seconds_per_step
         image *= row.seconds_per_image / base.seconds_per_image
-        steps = row.steps if row.option == "steps" else steps
+        steps = row.steps if row.option in ("steps", "iterations") else steps
     quality = {"psnr": base.psnr + sum(row.psnr - base.psnr for row in turns)}
     if base.psnr_masked is not None:
         quality["psnr_masked"] = base.psnr_masked + gain
@@ -225,6 +236,7 @@ def _together(base: Row, turns: Sequence[Row]) -> Row:
         evaluation=_options(base.evaluation, [row for row in turns if row.option in OF_EVALUATION]),
         steps=steps,
         seconds_per_step=pace,
+        train_seconds=training,
         seconds_per_image=image,
         **quality,
     )
