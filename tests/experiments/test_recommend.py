@@ -1,10 +1,18 @@
-"""Recommendations from a table; nothing is trained here."""
+"""Recommendations from a table, where nothing is trained, and from a trial of a backdrop."""
 
+import dataclasses
+import re
+
+import numpy as np
 import pytest
 
 from experiments.runs.measured_runs import Training
-from experiments.sweeps import recommend, table
+from experiments.sweeps import backdrop_trial, far_fields, recommend, table
+from experiments.sweeps.backdrop_trial import Setting, Trial
 from experiments.sweeps.recommend import Machine
+from refref_jax.render.backdrop import Lookups
+from refref_jax.training.backdrop_equations import Block
+from tests.factories.cut_ball import cut_ball
 from tests.factories.made_rows import made_row
 from tests.processes.command import ROOT, run_command
 
@@ -121,3 +129,120 @@ def test_a_missing_table_is_named(tmp_path):
     result = run_command("recommend", *options, fails=True)
     assert "none.csv" in result.stderr and "experiments.trade_off" in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_a_table_of_a_backdrop_is_timed_by_its_iterations(tmp_path, monkeypatch):
+    training = "--far_field=backdrop --paths=tree --iterations=32"
+    base = dataclasses.replace(made_row(pace=1.0, steps=32), training=training, train_seconds=60.0)
+    asked = {}
+
+    def train(run, *, scene, options, log_every):
+        asked["options"] = options
+        return Training(8, 3.0, None, 40.0, 10.0, None, None)
+
+    monkeypatch.setattr(recommend.measured_runs, "train", train)
+    timing = recommend.time_machine(tmp_path, base, 96)
+    assert asked["options"] == ["--far_field=backdrop", "--paths=tree", "--iterations=8"]
+    machine = recommend.compare(timing, base, 20)
+    # Three times as slow: 60 s of training, 20 images of 1 s, and two startups of 10 s.
+    assert recommend.seconds_of(base, machine) == pytest.approx(3.0 * (60.0 + 20.0) + 20.0)
+    eight = dataclasses.replace(
+        made_row("iterations=48", pace=1.0, steps=48, quality=26.0),
+        training=training.replace("32", "48"),
+        train_seconds=80.0,
+    )
+    both = recommend.combine([base, eight], lambda row: recommend.seconds_of(row, machine), 1e6)
+    assert (both.steps, both.train_seconds) == (48, 80.0) and "--iterations=48" in both.training
+
+
+# 40 views of 0.1 s; an iteration of 40 * 0.02 s for the views and 0.2 s for the grid of 256 cells.
+_TRIAL = Trial(
+    startup=5.0,
+    compiling=10.0,
+    view=0.1,
+    iteration=0.02,
+    grid=0.2,
+    image=0.5,
+    views=40,
+    images=20,
+    resolution=256,
+)
+
+
+def test_seconds_of_a_backdrop_are_reckoned_from_the_trial():
+    training, evaluating = backdrop_trial.seconds_of(Setting(256, 32, 9), _TRIAL)
+    assert training == pytest.approx(5.0 + 10.0 + 4.0 + 32 * 1.0)
+    assert evaluating == pytest.approx(5.0 + 20 * 9 * 0.5)
+    # A quarter of the cells.
+    training, _ = backdrop_trial.seconds_of(Setting(128, 8, 1), _TRIAL)
+    assert training == pytest.approx(19.0 + 8 * 0.85)
+
+
+@pytest.mark.parametrize("resolution", [64, 128, 192, 384, 1472])
+def test_settings_cost_more_from_one_to_the_next(resolution):
+    trial = dataclasses.replace(_TRIAL, resolution=resolution)
+    found = backdrop_trial.settings(resolution)
+    costs = [sum(backdrop_trial.seconds_of(each, trial)) for each in found]
+    assert costs == sorted(costs) and len(set(costs)) == len(found)
+    assert found[-1] == Setting(resolution, 32, 9)
+    assert all(each.backdrop_resolution % 64 == 0 for each in found)
+
+
+def test_the_best_setting_that_fits_is_chosen():
+    whole = backdrop_trial.choose(_TRIAL, 1e6)
+    assert whole.best == Setting(256, 32, 9) and whole.dearer is None
+    tight = sum(backdrop_trial.seconds_of(whole.best, _TRIAL)) - 0.1
+    choice = backdrop_trial.choose(_TRIAL, tight)
+    assert choice.best == whole.cheaper and choice.dearer == whole.best
+    # 5 + 10 + 4 + 8 * 0.85 s of training, 5 + 20 * 0.5 s of evaluation.
+    with pytest.raises(ValueError, match=r"less than 0\.7 minutes here \(128 cells per side, 8"):
+        backdrop_trial.choose(_TRIAL, 40.7)
+    cheapest = backdrop_trial.choose(_TRIAL, 41.0)
+    assert cheapest.cheaper is None and cheapest.best == Setting(128, 8, 1)
+    assert "1 ray per pixel" in cheapest.best.words()
+
+
+def test_the_command_of_a_backdrop_can_be_pasted(tmp_path):
+    choice = backdrop_trial.choose(_TRIAL, 1e6)
+    text = "\n".join(backdrop_trial.describe(choice, _TRIAL, tmp_path / "ball"))
+    assert "an iteration takes 1.00 s at 256 cells per side" in text
+    train = f"python -m experiments.train --scene={tmp_path / 'ball'} --out=runs/ball"
+    assert f"{train} --far_field=backdrop --backdrop_resolution=256 --iterations=32" in text
+    assert "experiments.evaluate --run=runs/ball --split=test --rays_per_pixel=9" in text
+    assert "about 2.4 minutes (51 s of training, 95 s for 20 test images)" in text
+    assert "Dearer: more cells or iterations hardly gain anything." in text
+
+
+def test_a_cell_is_as_wide_as_the_median_pixel():
+    # Three pixels of 0.5, 2 and 8 cells of a surface of 256: the last reads a level of 64 cells.
+    widths, sides, taps = np.array([0.5, 2.0, 2.0]), np.array([256, 256, 64]), np.array([1, 2, 1])
+    steps = np.zeros((3, 2, 2))
+    steps[:, 0, 1] = widths / taps
+    steps[:, 1, 0] = 0.1 * widths / taps
+    lookups = Lookups(*([None] * 2), sides, taps, None, steps, None)
+    blocks = [Block(lookups, *([None] * 4))]
+    assert backdrop_trial.resolution_of(blocks, 256) == 128
+    tiny = [Block(lookups._replace(steps=0.0 * steps), *([None] * 4))]
+    assert backdrop_trial.resolution_of(tiny, 256) == 4096
+    wide = [Block(lookups._replace(steps=1e3 * steps), *([None] * 4))]
+    assert backdrop_trial.resolution_of(wide, 256) == 64
+
+
+def test_a_trial_times_each_part_of_a_training(tmp_path):
+    scene = cut_ball(tmp_path / "cube_smcvx_ball")
+    resolved, objects = far_fields.prepare(scene, {})
+    assert "backdrop (behind the objects is the cube" in far_fields.describe(resolved)
+    trial = backdrop_trial.try_out(resolved, objects, startup=3.0, images=7)
+    assert (trial.startup, trial.images) == (3.0, 7)
+    times = (trial.view, trial.iteration, trial.image, trial.compiling)
+    assert all(0.0 < each < 100.0 for each in times) and trial.grid >= 0.0
+    assert trial.resolution % 64 == 0 and trial.views > 1
+    assert backdrop_trial.choose(trial, 1e6).best.iterations == 32
+
+
+def test_a_far_field_that_the_table_lacks_is_named():
+    scene = ROOT / "experiments" / "data" / "cube_smcvx_ball"
+    bundled = ROOT / "experiments" / "data" / "trade_off.csv"
+    options = (f"--scene={scene}", "--minutes=5", f"--table={bundled}", "--far_field=backdrop")
+    result = run_command("recommend", *options, fails=True)
+    assert re.search(r"--far_field=backdrop, but the base of .* has a field", result.stderr)

@@ -10,9 +10,9 @@ import pytest
 from experiments.cli import subprocesses
 from experiments.cli.subprocesses import RunFailedError
 from experiments.runs import measured_runs
+from experiments.sweeps import far_fields, report, sweep, table
 from experiments.sweeps import options as sweep_options
 from experiments.sweeps import points as trade_points
-from experiments.sweeps import report, sweep, table
 from experiments.sweeps.points import BASE
 from tests.factories.made_rows import made_row
 from tests.processes.command import ROOT, run_command
@@ -82,6 +82,96 @@ def test_rays_per_pixel_are_evaluations_alone():
     assert names["rays_per_pixel=9"] == names[BASE]  # trained once
     assert len(set(names.values())) == len(names) - 2
     assert sweep.run_name(points[BASE], ROOT) != names[BASE]
+
+
+def test_around_a_backdrop_its_own_options_are_varied():
+    base, *others = trade_points.sweep_backdrop(base={"backdrop_resolution": "64"})
+    assert base.training[0] == "--far_field=backdrop"
+    assert not [word for word in base.training if "preset" in word or "steps" in word]
+    assert {point.option for point in others} >= {"backdrop_resolution", "iterations", "paths"}
+    # The defaults of a backdrop are not tried again, unless the base has others.
+    names = {point.name for point in others}
+    assert "backdrop_resolution=256" in names and "iterations=16" in names
+    assert not names & {"backdrop_resolution=64", "iterations=32", "rays_per_pixel=1"}
+    field = next(point for point in others if point.name == "far_field=field")
+    assert "--far_field=field" in field.training
+    assert not [word for word in field.training if "backdrop" in word]
+    nine = next(point for point in others if point.name == "rays_per_pixel=9")
+    assert nine.training == base.training and nine.evaluation == ("--rays_per_pixel=9",)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"base": {"preset": "small"}}, "Use --preset"),
+        ({"base": {"far_field": "field"}}, "Use --far_field"),
+        ({"base": {"multisamples": "6"}}, "multisamples is an option of a field"),
+        ({"values": {"max_res": ("64",)}}, "max_res is an option of a field"),
+        ({"base": {"paths": "straight"}}, "not solved along straight rays"),
+        ({"vary": ["iteration"]}, "Did you mean iterations"),
+    ],
+)
+def test_what_a_backdrop_does_not_read_is_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        trade_points.sweep_backdrop(**options)
+
+
+def test_the_far_field_follows_from_options_or_an_earlier_table(tmp_path):
+    assert far_fields.of_options(["paths", "rays_per_pixel"]) is None
+    assert far_fields.of_options(["paths", "steps"]) == "field"
+    assert far_fields.of_options(["iterations"]) == "backdrop"
+    assert far_fields.of_table(tmp_path) is None
+    for row, expected in ((made_row(), "field"), (_backdrop_row(), "backdrop")):
+        table.write(tmp_path / "trade_off.csv", [row])
+        assert far_fields.of_table(tmp_path) == expected
+
+
+def test_a_sweep_is_of_what_training_would_choose(tmp_path):
+    options = (f"--scene={_SCENE}", f"--out={tmp_path / 'sweep'}", "--dry_run")
+    told = run_command("trade_off", *options, "--points=iterations=16").stdout
+    assert told.splitlines()[1].split() == [
+        *("iterations=16", "--far_field=backdrop", "--seed=0", "--paths=tree", "--iterations=16")
+    ]
+    told = run_command("trade_off", *options, "--points=rays_per_pixel=4").stdout
+    assert "Far field: backdrop (behind the objects is the cube that scene.json states" in told
+    told = run_command("trade_off", *options, "--steps=9", "--points=max_bends=6").stdout
+    assert told.splitlines()[0].startswith("base ") and "--preset=tiny --seed=0 --steps=9" in told
+    wrong = run_command("trade_off", *options, "--far_field=backdrop", "--steps=9", fails=True)
+    assert "--steps is an option of a field" in wrong.stderr
+
+
+def _backdrop_row(name="base", *, seconds=60.0, **options):
+    row = made_row(name, **options)
+    training = "--far_field=backdrop --seed=0 --paths=tree"
+    return dataclasses.replace(row, training=training, train_seconds=seconds, rays_per_second=None)
+
+
+def test_a_backdrop_takes_the_time_of_its_whole_training(tmp_path):
+    rows = [
+        _backdrop_row(pace=1.0, steps=32),
+        _backdrop_row("iterations=8", seconds=30.0, pace=1.0, steps=8, quality=24.0),
+        _backdrop_row("rays_per_pixel=9", pace=1.0, steps=32, image=9.0, quality=27.0),
+        made_row("far_field=field", pace=0.1, quality=21.0),
+    ]
+    assert [row.stepping for row in rows] == [60.0, 30.0, 60.0, 100.0]
+    lines = report.markdown(rows).splitlines()
+    assert any("Its backdrop is fitted to one traced ray per pixel" in line for line in lines)
+    assert "| `--iterations=8` | -50 % | -1.00 |" in lines
+    assert "| `--rays_per_pixel=9` | +2.00 | +800 % of evaluation | 0.003 |" in lines
+    labels = [(panel.cost_label, panel.label) for panel in report._panels(rows)]
+    assert labels == [
+        ("time of training, s", "masked PSNR, dB"),
+        ("time of training, s", "PSNR, dB"),
+        ("time of rendering an image, s", "masked PSNR, dB"),
+    ]
+    unmasked = [dataclasses.replace(row, psnr_masked=None) for row in rows]
+    assert [panel.label for panel in report._panels(unmasked)] == ["PSNR, dB"] * 2
+    assert [panel.cost_label for panel in report._panels([made_row()])] == [
+        "time of a step, ms",
+        "time of all steps, s",
+    ]
+    report.write_figure(tmp_path / "figure.png", rows)
+    assert iio.imread(tmp_path / "figure.png").shape[1] > 2000
 
 
 def test_the_lists_of_a_knob_can_be_replaced_and_knobs_added():
@@ -330,6 +420,21 @@ def test_only_a_field_is_trained_on_rays_per_second(tmp_path, far_field, rays):
     table.write(tmp_path / "trade_off.csv", [row])
     assert table.read(tmp_path / "trade_off.csv") == [row]
     assert f"| 100.0 | {'-' if rays is None else '200'} |" in report.markdown([row])
+
+
+def test_an_iteration_of_a_backdrop_takes_the_mean_of_its_rounds(tmp_path):
+    """Iterations that begin a round take longer; a training of fewer than asked has ended."""
+    model = {"far_field": "backdrop", "iterations": 32}
+    (tmp_path / "config.json").write_text(json.dumps({"model": model}))
+    seconds = [20.0, 21.0, 22.0, 26.0]
+    lines = [json.dumps({"step": n, "seconds": s}) for n, s in enumerate(seconds, 1)]
+    (tmp_path / "metrics.jsonl").write_text("\n".join(lines) + "\n")
+    training = measured_runs.read_training(tmp_path, wall=30.0, peak_host_mib=None)
+    assert training.seconds_per_step == pytest.approx(2.0)
+    assert (training.steps, training.train_seconds, training.startup_seconds) == (4, 26.0, 4.0)
+    assert not measured_runs._has_ended(tmp_path, None)
+    (tmp_path / "checkpoints" / "32").mkdir(parents=True)
+    assert measured_runs._has_ended(tmp_path, None)
 
 
 def test_a_failure_tells_its_last_word_and_is_tried_again(stub):
