@@ -142,7 +142,7 @@ def resolution_of(blocks: Sequence[Block], resolution: int) -> int:
     widths = []
     for block in blocks:
         taps, sides = np.asarray(block.lookups.taps), np.asarray(block.lookups.sides)
-        axes = np.asarray(block.lookups.steps) * (taps * resolution / sides)[:, None, None]
+        axes = np.asarray(block.lookups.steps) * (taps * (resolution / sides)[:, None])[..., None]
         widths.append(np.sqrt(np.max(np.sum(np.square(axes), axis=-1), axis=-1)))
     cells = resolution / max(float(np.median(np.concatenate(widths))), resolution / _FINEST)
     return min(_FINEST, max(_MULTIPLE, _MULTIPLE * math.ceil(cells / _MULTIPLE)))
@@ -288,6 +288,7 @@ def _solve(
             iterations=2 * backdrop_solver.ROUND,
             tints=params.tints,
             tint_decay=resolved.config.losses.tint_decay,
+            thin=False,
         )
         return Params((), jax.block_until_ready(last.pyramid), last.tints)
 

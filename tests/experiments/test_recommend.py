@@ -215,10 +215,11 @@ def test_the_command_of_a_backdrop_can_be_pasted(tmp_path):
 
 def test_a_cell_is_as_wide_as_the_median_pixel():
     # Three pixels of 0.5, 2 and 8 cells of a surface of 256: the last reads a level of 64 cells.
-    widths, sides, taps = np.array([0.5, 2.0, 2.0]), np.array([256, 256, 64]), np.array([1, 2, 1])
+    widths, sides = np.array([0.5, 2.0, 2.0]), np.array([256, 256, 64])
+    taps = np.array([[1, 1], [2, 1], [1, 1]])
     steps = np.zeros((3, 2, 2))
-    steps[:, 0, 1] = widths / taps
-    steps[:, 1, 0] = 0.1 * widths / taps
+    steps[:, 0, 1] = widths / taps[:, 0]
+    steps[:, 1, 0] = 0.1 * widths / taps[:, 1]
     lookups = Lookups(*([None] * 2), sides, taps, None, steps, None)
     blocks = [Block(lookups, *([None] * 4))]
     assert backdrop_trial.resolution_of(blocks, 256) == 128
