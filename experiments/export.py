@@ -1,4 +1,4 @@
-"""Exports a run's surfaces as PLY: those of the field, or the objects that refract light.
+"""Exports what a run has learned, or the objects that refract light.
 
 python -m experiments.export --run=runs/ball --what=mesh --out=ball.ply
 
@@ -6,6 +6,11 @@ python -m experiments.export --run=runs/ball --what=mesh --out=ball.ply
               any, with normals and colours
     points    the same surfaces as points of a grid
     object    the objects: those of R3F, or the scene's meshes; with their shading normals
+    textured_mesh  the cube, sphere or environment of a backdrop, as GLB
+    faces     the six faces of a backdrop in one image: PNG, or linear EXR
+    coverage  how many pixels see each vertex of a backdrop, in the order of faces: PNG (magenta:
+              none), or the numbers as EXR
+    panorama  what is seen of a backdrop from the centre of the scene: PNG, or linear EXR
 
 For object, --run may also be the folder of a reconstruction. A field learns nothing inside clear
 glass, so mesh and points show the surroundings of the objects.
@@ -30,16 +35,26 @@ if TYPE_CHECKING:
 with epy.lazy_imports():
     import numpy as np
 
-    from experiments.exporting import field_mesh, object_meshes
+    from experiments.exporting import backdrop_surface, field_mesh, object_meshes
     from refref_jax.data import image_files
     from refref_jax.reconstruct import grids
     from refref_jax.render import checkpoint_io
+    from refref_jax.training import run_folder
+
+# Endings of the files of each kind.
+_ENDINGS = {
+    "mesh": (".ply",),
+    "points": (".ply",),
+    "object": (".ply",),
+    "textured_mesh": (".glb",),
+    "faces": (".png", ".exr"),
+    "panorama": (".png", ".exr"),
+    "coverage": (".png", ".exr"),
+}
 
 _RUN = cli_flags.run()
-_WHAT = cli_flags.enum(
-    "what", None, ["mesh", "points", "object"], "Output type.", formerly={"body": "object"}
-)
-_OUT = cli_flags.out("PLY file to write.")
+_WHAT = cli_flags.enum("what", None, list(_ENDINGS), "Output type.", formerly={"body": "object"})
+_OUT = cli_flags.out("File to write: PLY, GLB for textured_mesh, PNG or EXR for images.")
 _OVERWRITE = cli_flags.overwrite("the file, or those of several objects")
 _STEP = cli_flags.step()
 _LEVEL = flags.DEFINE_float(
@@ -62,19 +77,74 @@ def main() -> None:
     cli_flags.check_run(run, holds=(cli_flags.RUN, *others))
     if _WHAT.value == "object":
         written = object_meshes.write(run, out, overwrite=_OVERWRITE.value)
+    elif _WHAT.value in ("mesh", "points"):
+        written = _write_field(_with_field(run), out)
     else:
-        written = _write_field(checkpoint_io.load_model(run, step=_STEP.value), out)
+        written = _write_backdrop(checkpoint_io.load_model(run, step=_STEP.value), run, out)
     for path in written:
         print(f"Wrote:  {path}")
-    print("Next: open it with Blender, MeshLab or CloudCompare: z is up.")
+    if out.suffix.lower() in (".png", ".exr"):
+        print("Next: look at it; Blender and Mitsuba read a panorama as an environment map.")
+    else:
+        print("Next: open it with Blender, MeshLab or CloudCompare: z is up.")
 
 
 def _refuse_other_files(out: str | None) -> None:
-    if out is not None and not out.lower().endswith(".ply"):
-        raise ValueError(f"--out is {out}, which is not a PLY file. Give a name that ends in .ply.")
+    endings = _ENDINGS[_WHAT.value] if _WHAT.value else sum(_ENDINGS.values(), ())
+    if out is not None and not out.lower().endswith(endings):
+        kinds = " or ".join(dict.fromkeys(ending[1:].upper() for ending in endings))
+        raise ValueError(
+            f"--out is {out}, which is not a {kinds} file. Give a name that ends in "
+            f"{' or '.join(dict.fromkeys(endings))}."
+        )
 
 
 app.check(_OUT, _refuse_other_files)
+
+
+def _with_field(run: Path) -> Model:
+    """Returns the model of a run.
+
+    Raises:
+      ValueError: if it has a backdrop.
+    """
+    model = checkpoint_io.load_model(run, step=_STEP.value)
+    if model.config.backdrop is not None:
+        raise ValueError(
+            f"{run} has a backdrop, not a field. Use --what=textured_mesh, faces or panorama."
+        )
+    return model
+
+
+def _write_backdrop(model: Model, run: Path, out: Path) -> list[Path]:
+    backdrop_surface.check(model, run)
+    with outputs.fresh_file(out, overwrite=_OVERWRITE.value) as draft:
+        if _WHAT.value == "textured_mesh":
+            backdrop_surface.write_textured_mesh(draft, model)
+            return [out]
+        if _WHAT.value == "coverage":
+            _write_coverage(draft, run, is_exr=out.suffix.lower() == ".exr")
+            return [out]
+        grid = backdrop_surface.faces(model)
+        if _WHAT.value == "faces":
+            linear = backdrop_surface.as_sheet(grid)
+        else:
+            linear = backdrop_surface.panorama(model, height=2 * (grid.shape[1] - 1))
+        print(f"Image:  {linear.shape[1]} x {linear.shape[0]} pixels")
+        if out.suffix.lower() == ".exr":
+            image_files.write_exr(draft, linear)
+        else:
+            image_files.write_rgb(draft, backdrop_surface.as_srgb(linear))
+    return [out]
+
+
+def _write_coverage(draft: Path, run: Path, *, is_exr: bool) -> None:
+    seen = run_folder.read_coverage(run)
+    print(f"Never seen: {np.mean(seen == 0.0):.1%} of the vertices")
+    if is_exr:
+        image_files.write_exr(draft, backdrop_surface.as_sheet(seen[..., None]))
+    else:
+        image_files.write_rgb(draft, backdrop_surface.as_heat(seen))
 
 
 def _write_field(model: Model, out: Path) -> list[Path]:

@@ -242,6 +242,27 @@ def _thinned(blocks: Sequence[Block], vertices: int) -> Sequence[Block]:
     return blocks if one_in == 1 else [backdrop_equations.thinned(b, one_in) for b in blocks]
 
 
+def coverage(
+    blocks: Sequence[Block], *, space: Space, resolution: int, tints: LearnedTints | None = None
+) -> Float[Array, "6 side side"]:
+    """Returns how many fitted pixels see each vertex: the sum of its weights in all of them.
+
+    The weights of a pixel add up to the throughput of its paths, the mean of the channels. A vertex
+    with 0 was never seen: it continues its surroundings. If pixels have independent errors of
+    deviation `sigma`, in linear light, a vertex has a standard error of at least
+    `sigma / sqrt(coverage)`, since no weight exceeds 1.
+
+    Args:
+      blocks: equations of all views.
+      space: kind of the surface.
+      resolution: number of cells per side of a face.
+      tints: tints and absorption, if they are learned.
+    """
+    kept = [jnp.broadcast_to(block.kept[:, None], block.srgb.shape) for block in blocks]
+    finest = _System(blocks, space, resolution, tints).transpose(kept)[-1]
+    return jnp.mean(finest, axis=-1)
+
+
 class _System:
     """The linear function from the radiance to the pixels, and its transpose."""
 

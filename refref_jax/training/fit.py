@@ -371,13 +371,15 @@ def _solve(
         state = checkpoints.restore(state)
     step = int(state.step)
     earlier = run_folder.rewind_metrics(run, step)
+    surface: Any = {"space": bounds.space, "resolution": shape.resolution}
+    surface |= {"tints": state.params.tints}
+    seen = backdrop_solver.coverage(blocks, **surface)
+    run_folder.write_coverage(run, jax.device_get(seen))
     iterations = backdrop_solver.solve(
         blocks,
-        space=bounds.space,
-        resolution=shape.resolution,
         iterations=total,
         start=(step, state.params.field) if step else None,
-        tints=state.params.tints,
+        **surface,
         tint_decay=config.losses.tint_decay,
     )
     for reached in iterations:

@@ -4,8 +4,9 @@
     {run}/model.json       the model, see `render.checkpoint_io`
     {run}/metrics.jsonl    one line for every logged step
     {run}/checkpoints/     the newest few states, saved atomically by Orbax
+    {run}/coverage.npz     how many pixels see each vertex of a backdrop
 
-All but the checkpoints are readable text.
+All but the last two are readable text.
 """
 
 import json
@@ -16,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+from jaxtyping import Float
 
 from refref_jax import atomic_files, configuration
 from refref_jax.optics.scene import Scene
@@ -34,7 +36,8 @@ from refref_jax.training.config_files import CONFIG
 from refref_jax.training.loop import TrainState
 
 _METRICS = "metrics.jsonl"
-_LEFT_BEHIND = (_METRICS, checkpoint_io.CHECKPOINTS)
+_COVERAGE = "coverage.npz"
+_LEFT_BEHIND = (_METRICS, _COVERAGE, checkpoint_io.CHECKPOINTS)
 
 
 class Checkpoints:
@@ -229,6 +232,28 @@ def check_unchanged(run: Path, config: TrainConfig, model: SavedModel, scene: Sc
             f"{config.scene.reconstruction or config.scene.path}. Use the original meshes, or "
             "choose another folder."
         )
+
+
+def write_coverage(run: Path, coverage: Float[np.ndarray, "6 side side"]) -> None:
+    """Writes how many pixels see each vertex of a backdrop (`backdrop_solver.coverage`)."""
+    with atomic_files.written_file(run / _COVERAGE) as draft, draft.open("wb") as file:
+        np.savez_compressed(file, coverage=coverage)
+
+
+def read_coverage(run: Path) -> Float[np.ndarray, "6 side side"]:
+    """Reads how many pixels see each vertex of a backdrop.
+
+    Raises:
+      ValueError: if the run has no such file.
+    """
+    path = run / _COVERAGE
+    if not path.is_file():
+        raise ValueError(
+            f"{path} does not exist: the run is of an earlier version, or has no backdrop. Train "
+            "it again in another folder."
+        )
+    with np.load(path) as file:
+        return np.asarray(file["coverage"])
 
 
 def append_metrics(run: Path, line: dict[str, Any]) -> None:

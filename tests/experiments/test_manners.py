@@ -133,6 +133,7 @@ _MISTAKES = {
     },
     "export": {
         "--run=x --what=object --out=a.obj": "ends in .ply",
+        "--run=x --what=faces --out=a.ply": "ends in .png or .exr",
         "--run=nowhere --what=mesh --out=OUT.ply": "nowhere/config.json does not exist",
         "--run=nowhere --what=object --out=OUT.ply": "nowhere/config.json does not exist",
     },

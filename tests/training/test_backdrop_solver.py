@@ -137,6 +137,14 @@ def test_one_vertex_seen_by_one_pixel_continues_everywhere():
         np.testing.assert_allclose(copy, expected, rtol=1e-3)
 
 
+def test_the_coverage_is_the_sum_of_the_weights_of_fitted_pixels():
+    blocks = [_one_pixel(0.5), _one_pixel(0.5, throughput=0.4), _one_pixel(0.5, kept=0.0)]
+    seen = backdrop_solver.coverage(blocks, space="unbounded", resolution=_RESOLUTION)
+    assert seen.shape == (6, _RESOLUTION + 1, _RESOLUTION + 1)
+    np.testing.assert_allclose(jnp.sum(seen), 1.4, rtol=1e-6)
+    np.testing.assert_allclose(seen[0, _RESOLUTION // 2, _RESOLUTION // 2], 1.4, rtol=1e-6)
+
+
 def test_saturated_pixels_bound_the_radiance_from_below():
     # The same vertex is white in one pixel, and far brighter behind a dark filter.
     white, dimmed = _one_pixel(1.0), _one_pixel(0.5, throughput=0.05)
