@@ -72,7 +72,7 @@ def measure(scene: str, enlarge: int, point: dict[str, float]) -> dict[str, floa
     times = [
         time.monotonic()
         for _ in backdrop_solver.solve(
-            blocks, space=domain.space, resolution=cells, iterations=2, thin=False
+            blocks, space=domain.space, resolution=cells, iterations=2, thinned_rounds=0
         )
     ]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20

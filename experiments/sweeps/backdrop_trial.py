@@ -288,7 +288,7 @@ def _solve(
             iterations=2 * backdrop_solver.ROUND,
             tints=params.tints,
             tint_decay=resolved.config.losses.tint_decay,
-            thin=False,
+            thinned_rounds=0,
         )
         return Params((), jax.block_until_ready(last.pyramid), last.tints)
 

@@ -49,9 +49,6 @@ _TYPICAL, _ROUNDING = 3.0, 0.5 / 255.0
 ROUND = 8
 """Number of iterations with the same weights of the pixels."""
 
-# Number of rounds that begin with fewer pixels, where there are more of them than vertices.
-_FEWER = 2
-
 # A round that improves the held-out pixels by less, in dB, is the last.
 _WORTH = 0.02
 
@@ -173,7 +170,7 @@ def solve(
     tints: LearnedTints | None = None,
     prior: float = 1e-3,
     tint_decay: float = 0.0,
-    thin: bool = True,
+    thinned_rounds: int = 2,
 ) -> Iterator[Progress]:
     """Yields the state after each iteration; it may stop earlier than asked.
 
@@ -190,16 +187,16 @@ def solve(
       prior: weight of the details of the pyramid, relative to a pixel's squared sRGB error.
       tint_decay: weight of the optical density of tints and absorption, relative to the mean
         squared sRGB error.
-      thin: whether the first two rounds take only as many pixels as there are vertices.
+      thinned_rounds: number of first rounds that take only as many pixels as there are vertices.
     """
     mean = jnp.mean(jnp.stack([jnp.mean(block.linear, axis=0) for block in blocks]), axis=0)
     uniform = backdrop.init(resolution, radiance=mean)
     step, x = start or (0, uniform)
     priors = tuple(jnp.float32(prior if i else 1e-2 * prior) for i in range(len(x)))
     tinted = [] if tints is None else [_tinted(block) for block in blocks]
-    whole, fewer = blocks, _thinned(blocks, x[-1][..., 0].size) if thin else blocks
+    whole, fewer = blocks, _thinned(blocks, x[-1][..., 0].size) if thinned_rounds else blocks
     while step < iterations:
-        blocks = whole if step >= _FEWER * ROUND else fewer
+        blocks = fewer if step < thinned_rounds * ROUND else whole
         before, typical = -math.inf, math.inf
         if step:
             seen = _System(blocks, space, resolution, tints).see(x)
