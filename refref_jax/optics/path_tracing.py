@@ -32,7 +32,7 @@ from refref_jax.optics.light_paths import (
 )
 from refref_jax.optics.path_settings import Detail, PathSettings, capacities
 from refref_jax.optics.scene import Scene, in_one_precision
-from refref_jax.optics.wavefront import BLOCK, follow
+from refref_jax.optics.wavefront import follow
 
 
 class Traced(NamedTuple):
@@ -87,7 +87,7 @@ def trace_ends(
     settings: PathSettings,
     interior_list: Int[Array, "rays slots"] | None = None,
     footprint: Footprint = "cone",
-    block: int = BLOCK,
+    block: int | None = None,
 ) -> TracedEnds:
     """Traces rays, and returns only the last segments of their paths.
 
@@ -98,7 +98,7 @@ def trace_ends(
       interior_list: interior list of each camera, where rays carry one (see
         `media.interior_length` and `data.mesh_queries.parts_around`); none by default.
       footprint: `differential` carries derivatives across the pixel.
-      block: number of rays cast at once, see `wavefront`.
+      block: number of rays cast at once; by default what suits the platform.
     """
     scene, rays = in_one_precision(scene, rays)
     if _needs_no_tracing(rays, settings):

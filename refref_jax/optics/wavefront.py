@@ -35,8 +35,9 @@ from refref_jax.optics.path_tree import NO_SEGMENT, Ends, PathTree, Segments
 from refref_jax.optics.queues import Queue
 from refref_jax.optics.scene import Scene
 
-BLOCK = 4096
-"""Number of rays cast per iteration. Accelerators benefit from more, at the cost of memory."""
+# Number of rays cast per iteration: a core's cache holds so many, with their children. Accelerators
+# benefit from more.
+_BLOCK_ON_CPU, _BLOCK = 1024, 4096
 
 # From this number of blocks, the last rays are cast in smaller blocks, by a second compiled loop.
 _MANY_BLOCKS = 6
@@ -202,7 +203,7 @@ def follow(
     *,
     settings: PathSettings,
     footprint: Footprint = "cone",
-    block: int = BLOCK,
+    block: int | None = None,
 ) -> PathTree:
     """Traces each ray along all branches; every child has one bend more than its parent.
 
@@ -213,8 +214,10 @@ def follow(
       interior_list: interior list of each camera (see `media.empty_interior_list`).
       settings: path settings, with at least one bend.
       footprint: `differential` carries derivatives across the pixel.
-      block: number of rays cast per iteration.
+      block: number of rays cast per iteration; by default what suits the platform.
     """
+    if block is None:
+        block = _BLOCK_ON_CPU if jax.default_backend() == "cpu" else _BLOCK
     return _follow(settings, footprint, block, scene, rays, interior_list)
 
 

@@ -1,13 +1,13 @@
 """Equations of training pixels for a far field surface: where light paths end, and colours.
 
 The paths of all training views are traced once, and nothing is kept but their ends as points of
-the surface (`backdrop.locate`), what learned tints read of them, and the pixels' colours. A
-fraction of the pixels is held out.
+the surface (`backdrop.locate`), what learned tints read of them, and the pixels' colours. Rays that
+meet no object are straight and are not traced. A fraction of the pixels is held out.
 """
 
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,7 +21,7 @@ from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
 from refref_jax.numerics import host_array
 from refref_jax.optics import light_paths, path_tracing
-from refref_jax.optics.path_settings import Detail, PathSettings, Tally
+from refref_jax.optics.path_settings import STRAIGHT, Detail, PathSettings, Tally
 from refref_jax.optics.scene import Scene
 from refref_jax.render import backdrop, images, learned_media, pixels
 from refref_jax.render.backdrop import Lookups
@@ -72,7 +72,8 @@ def _look(
     tally: Tally,
 ) -> _Seen:
     """Returns where the paths of rays end; their pixels are the indices of the rays."""
-    if tally == "parts":
+    unknowns = 2 * scene.interfaces.index_inside.shape[0] if tally == "parts" else 0
+    if unknowns and settings.max_bends:
         # The first and the last segment are the fewest that can be stored.
         detail = Detail("outside", 2, "differential", tally)
         paths = path_tracing.trace(scene, rays, settings=settings, detail=detail).paths
@@ -81,7 +82,7 @@ def _look(
     else:
         traced = path_tracing.trace_ends(scene, rays, settings=settings, footprint="differential")
         ends = traced.ends
-        crossings = jnp.zeros((ends.rays.shape[0], 0), ends.tau.dtype)
+        crossings = jnp.zeros((ends.rays.shape[0], unknowns), ends.tau.dtype)
     throughput = jnp.where(light_paths.exists(ends)[:, None], ends.throughput, 0.0)
     ends = ends._replace(throughput=throughput)
     lookups = backdrop.locate(domain, ends, ends.rays, resolution=resolution, most_taps=most_taps)
@@ -115,37 +116,48 @@ def read(
       side: number of rays along each edge of a pixel.
       tally: `parts` if tints and absorption are learned.
       blocks: number of blocks that the views are split into; they are traced and solved at once.
-      progress: function called after each view, from several threads.
+      progress: function called for each view, after the views that are traced with it; from several
+        threads.
     """
     scene = jax.device_put(scene)
-    shape = photographs.shape[1] * photographs.shape[2]
-    group = max(1, images.TILE // (shape * side**2))
+    rays_per_view = photographs.shape[1] * photographs.shape[2] * side**2
+    group = max(1, images.RAYS_OF_A_BAND // rays_per_view)
+    tile = images.size_for(min(group, len(photographs)) * rays_per_view, most=images.TILE)
     done = itertools.count(1)
+
+    def look(
+        rays: Rays, names: Int[np.ndarray, " rays"], settings: PathSettings
+    ) -> Iterator[_Seen]:
+        for first in range(0, names.size, tile):
+            part, _ = images.crop(rays, None, first, tile)
+            seen = jax.device_get(
+                _look(
+                    scene,
+                    part,
+                    settings=settings,
+                    domain=domain,
+                    resolution=resolution,
+                    most_taps=most_taps,
+                    tally=tally,
+                )
+            )
+            # The last tile is filled up with rays that belong to no pixel.
+            real = (seen.lookups.taps[:, 0] > 0) & (seen.lookups.pixels < names.size - first)
+            seen = jax.tree.map(lambda x, real=real: x[real], seen)
+            pixel = names[first + seen.lookups.pixels].astype(np.int32)
+            yield seen._replace(lookups=seen.lookups._replace(pixels=pixel))
 
     def trace(views: Int[np.ndarray, " views"]) -> Block:
         each = []
         for start in range(0, len(views), group):
-            rays, names = cameras_module.rays_of_views(cameras, views[start : start + group], side)
-            tile = images.size_for(names.size, most=images.TILE)
-            for first in range(0, names.size, tile):
-                part, _ = images.crop(rays, None, first, tile)
-                seen = jax.device_get(
-                    _look(
-                        scene,
-                        part,
-                        settings=settings,
-                        domain=domain,
-                        resolution=resolution,
-                        most_taps=most_taps,
-                        tally=tally,
-                    )
-                )
-                # The last tile is filled up with rays that belong to no pixel.
-                real = (seen.lookups.taps[:, 0] > 0) & (seen.lookups.pixels < names.size - first)
-                seen = jax.tree.map(lambda x, real=real: x[real], seen)
-                pixel = (start * shape + names[first + seen.lookups.pixels]).astype(np.int32)
-                each.append(seen._replace(lookups=seen.lookups._replace(pixels=pixel)))
-            for _ in views[start : start + group]:
+            some = views[start : start + group]
+            rays, names = cameras_module.rays_of_views(cameras, some, side)
+            names = start * photographs[0, ..., 0].size + names
+            met = np.isfinite(images.find_first_surface(scene.surfaces, rays).distances)
+            for which, bends in ((~met, STRAIGHT), (met, settings)):
+                chosen = jax.tree.map(lambda x, which=which: host_array(x[which]), rays)
+                each += look(chosen, names[which], bends)
+            for _ in some:
                 progress(next(done), len(photographs))
         joined = jax.tree.map(lambda *parts: np.concatenate(parts), *each)
         lookups = joined.lookups._replace(throughput=joined.lookups.throughput / side**2)
