@@ -125,27 +125,9 @@ def read(
     tile = images.size_for(min(group, len(photographs)) * rays_per_view, most=images.TILE)
     done = itertools.count(1)
 
-    def look(
-        rays: Rays, names: Int[np.ndarray, " rays"], settings: PathSettings
-    ) -> Iterator[_Seen]:
-        for first in range(0, names.size, tile):
-            part, _ = images.crop(rays, None, first, tile)
-            seen = jax.device_get(
-                _look(
-                    scene,
-                    part,
-                    settings=settings,
-                    domain=domain,
-                    resolution=resolution,
-                    most_taps=most_taps,
-                    tally=tally,
-                )
-            )
-            # The last tile is filled up with rays that belong to no pixel.
-            real = (seen.lookups.taps[:, 0] > 0) & (seen.lookups.pixels < names.size - first)
-            seen = jax.tree.map(lambda x, real=real: x[real], seen)
-            pixel = names[first + seen.lookups.pixels].astype(np.int32)
-            yield seen._replace(lookups=seen.lookups._replace(pixels=pixel))
+    look = functools.partial(
+        _look, scene, domain=domain, resolution=resolution, most_taps=most_taps, tally=tally
+    )
 
     def trace(views: Int[np.ndarray, " views"]) -> Block:
         each = []
@@ -156,7 +138,9 @@ def read(
             met = np.isfinite(images.find_first_surface(scene.surfaces, rays).distances)
             for which, bends in ((~met, STRAIGHT), (met, settings)):
                 chosen = jax.tree.map(lambda x, which=which: host_array(x[which]), rays)
-                each += look(chosen, names[which], bends)
+                each += _in_tiles(
+                    functools.partial(look, settings=bends), chosen, names[which], tile
+                )
             for _ in some:
                 progress(next(done), len(photographs))
         joined = jax.tree.map(lambda *parts: np.concatenate(parts), *each)
@@ -166,6 +150,27 @@ def read(
 
     split = np.array_split(np.arange(len(photographs)), min(blocks, len(photographs)))
     return tuple(jax.device_put(block) for block in at_once(trace, split))
+
+
+def _in_tiles(
+    look: Callable[[Rays], _Seen], rays: Rays, names: Int[np.ndarray, " rays"], tile: int
+) -> Iterator[_Seen]:
+    """Yields what rays see, tile by tile.
+
+    Args:
+      look: function that returns what the rays of a tile see.
+      rays: camera rays.
+      names: pixel of each ray.
+      tile: number of rays per tile.
+    """
+    for first in range(0, names.size, tile):
+        part, _ = images.crop(rays, None, first, tile)
+        seen = jax.device_get(look(part))
+        # The last tile is filled up with rays that belong to no pixel.
+        real = (seen.lookups.taps[:, 0] > 0) & (seen.lookups.pixels < names.size - first)
+        seen = jax.tree.map(lambda x, real=real: x[real], seen)
+        pixel = names[first + seen.lookups.pixels].astype(np.int32)
+        yield seen._replace(lookups=seen.lookups._replace(pixels=pixel))
 
 
 def at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Result]:
