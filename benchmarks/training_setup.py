@@ -20,11 +20,15 @@ def set_up_training(scene: Path, *, preset: str, paths: str) -> tuple[loop.Setup
     """
     asked = TrainConfig().override(scene=str(scene), preset=preset, paths=paths)
     (config, model, *_), objects = prepare(asked)
-    frames = scene_folder.read_frames(scene, "train")
-    images = scene_folder.read_images(frames)
-    sampler = PixelSampler(images, frames.cameras, seed=config.seed, batch=config.schedule.batch)
-    setup = loop.set_up(config, model.config, model.settings, objects, sampler)
+    setup = loop.set_up(config, model.config, model.settings, objects, sampler_of(config))
     return setup, init_state(config.seed, model.config, config.schedule)
+
+
+def sampler_of(config: TrainConfig) -> PixelSampler:
+    """Returns the training pixels of a resolved configuration."""
+    frames = scene_folder.read_frames(Path(config.scene.path), "train")
+    images = scene_folder.read_images(frames)
+    return PixelSampler(images, frames.cameras, seed=config.seed, batch=config.schedule.batch)
 
 
 def pretrace(setup: loop.Setup) -> PretracedBatches:

@@ -96,6 +96,9 @@ ColourNetwork = Literal["plain", "skip"]
 Contraction = Literal["unbounded", "always"]
 """Scenes whose space is contracted: unbounded ones, or all; see `training.presets.contracted`."""
 
+LastSample = Literal["middle", "end"]
+"""Where the field is evaluated for a path's last interval; see `render.model.ModelConfig`."""
+
 Footprint = Literal["cone", "differential"]
 """Model of the pixel footprint along a path; see `render.config.ModelConfig`."""
 

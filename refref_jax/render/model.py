@@ -11,7 +11,7 @@ from typing import NamedTuple, get_args
 import jax
 from jaxtyping import Array
 
-from refref_jax.choices import ORIGIN, Footprint, Interior, Position, Space
+from refref_jax.choices import ORIGIN, Footprint, Interior, LastSample, Position, Space
 from refref_jax.fields import base, registry
 from refref_jax.fields.base import DensityConfig, RadianceConfig
 from refref_jax.optics.path_settings import Detail, PathSettings, Tally
@@ -70,6 +70,9 @@ class ModelConfig:
       field_parts: parts whose inside is sampled too, where `interior` leaves out the others.
       centre: centre of the cube or ball, world units; it is the centre of the fields' unit cube.
       backdrop: surface behind the objects that takes the place of all fields, or `None`.
+      last_sample: where the field is evaluated for the last, opaque interval: in its `middle`,
+        as in models of earlier versions, or at the `end` of the path, which is on a surface if the
+        scene is bounded or spherical; if it is unbounded, always in the middle.
     """
 
     proposals: tuple[ProposalConfig, ...]
@@ -87,6 +90,7 @@ class ModelConfig:
     field_parts: tuple[int, ...] = ()
     centre: Position = ORIGIN
     backdrop: BackdropConfig | None = None
+    last_sample: LastSample = "middle"
 
     def __post_init__(self) -> None:
         """Validates the values."""
@@ -108,6 +112,7 @@ class ModelConfig:
         _check_choice("space", self.space, get_args(Space))
         _check_choice("interior", self.interior, get_args(Interior))
         _check_choice("footprint", self.footprint, get_args(Footprint))
+        _check_choice("last_sample", self.last_sample, get_args(LastSample))
 
 
 def path_detail(config: ModelConfig, settings: PathSettings) -> Detail:

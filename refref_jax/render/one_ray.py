@@ -24,7 +24,6 @@ from refref_jax.render import learned_media, volume_rendering
 from refref_jax.render.model import Model, path_detail
 from refref_jax.render.pixels import linear_to_srgb
 from refref_jax.render.volume_rendering import Histogram, Jitter
-from refref_jax.sampling import polylines
 
 
 def render_ray(model: Model, ray: Rays) -> Float[Array, "3"]:
@@ -56,14 +55,13 @@ def render_ray(model: Model, ray: Rays) -> Float[Array, "3"]:
         draw = functools.partial(middle, config, r, warp)
         histograms: list[Histogram] = []
         for proposal, learned in zip(config.proposals, params.proposals, strict=True):
-            s, t, x = draw(histograms, proposal.samples)
+            s, t, x, _ = draw(histograms, proposal.samples)
             sigma = density(learned, proposal.field, x)
             histograms.append(Histogram(s, _weights(sigma, jnp.diff(t) / config.radius)))
 
         # Query: density and colour of the multisamples, seen along the local direction.
-        s, t, x = draw(histograms, config.samples)
-        d = jax.vmap(polylines.point_at, in_axes=(None, 0))(r, (t[1:] + t[:-1]) / 2.0).direction
-        sigma, c = radiance(params.field, config.field, x, d)
+        s, t, x, points = draw(histograms, config.samples)
+        sigma, c = radiance(params.field, config.field, x, points.direction)
 
         # Composite: the volume rendering integral along the path.
         w = _weights(sigma, jnp.diff(t) / config.radius)

@@ -26,7 +26,7 @@ from refref_jax.optics.light_paths import LightPaths
 from refref_jax.render.model import ModelConfig, Params
 from refref_jax.sampling import cones, polylines, scene_bounds, stepfun
 from refref_jax.sampling.cones import Gaussians
-from refref_jax.sampling.polylines import Polyline
+from refref_jax.sampling.polylines import Polyline, PolylinePoint
 
 # Minimum dilation of a proposal, in units of the full path (Mip-NeRF 360, supplement).
 _DILATION_BIAS = 0.0025
@@ -151,11 +151,14 @@ class Samples(NamedTuple):
       s: edges in the normalised coordinate.
       t: edges in the coordinate of the polyline, world units.
       gaussians: multisamples of each interval, in the unit cube.
+      points: point of each interval, its middle or the end of the path, from whose direction the
+        field is seen.
     """
 
     s: Float[Array, " edges"]
     t: Float[Array, " edges"]
     gaussians: Gaussians
+    points: PolylinePoint
 
 
 def path_radiance(
@@ -191,17 +194,15 @@ def path_radiance(
         histograms.append(Histogram(samples.s, _weigh(config, density, samples.t)))
 
     samples = drawn(-1, config.samples)
-    middles = 0.5 * (samples.t[1:] + samples.t[:-1])
-    points = jax.vmap(polylines.point_at, in_axes=(None, 0))(line, middles)
     seen = jax.vmap(registry.radiance, in_axes=(None, None, 0, 0))(
-        params.field, config.field, samples.gaussians, points.direction
+        params.field, config.field, samples.gaussians, samples.points.direction
     )
     weights = _weigh(config, seen.density, samples.t)
     composited = composite(weights, seen.rgb, samples.t)
     return PathRadiance(
         composite=_in_arc_length(line, composited),
         histograms=(*histograms, Histogram(samples.s, weights)),
-        outside=points.outside,
+        outside=samples.points.outside,
     )
 
 
@@ -250,6 +251,9 @@ def sample(
 ) -> Samples:
     """Samples one level's intervals from the histogram of the level before; uniformly at first.
 
+    The last interval is opaque. With `last_sample="end"`, the field is evaluated at the end of the
+    path, on a surface, so that its colour does not depend on the length of the interval.
+
     Args:
       config: configuration of the model.
       line: polyline of the path.
@@ -264,13 +268,17 @@ def sample(
     bends = scene_bounds.to_unit(warp, line.knots[1:])
     s = stepfun.snap(_draw(config, histograms, strata, anneal), bends)
     t = scene_bounds.to_distance(warp, s)
+    starts, ends = t[:-1], t[1:]
+    if config.last_sample == "end" and config.space != "unbounded":
+        starts, ends = (x.at[-1].set(warp.far) for x in (starts, ends))
+    points = jax.vmap(polylines.point_at, in_axes=(None, 0))(line, 0.5 * (starts + ends))
     turns = jitter.rotations + _PATTERN_TURN * (jnp.arange(count, dtype=t.dtype) % 2)
 
     def cone(start: Array, end: Array, turn: Array) -> Gaussians:
         world = cones.multisamples(line, start, end, turn, count=config.multisamples)
         return scene_bounds.to_unit_cube(domain(config), world)
 
-    return Samples(s, t, jax.vmap(cone)(t[:-1], t[1:], turns))
+    return Samples(s, t, jax.vmap(cone)(starts, ends, turns), points)
 
 
 def _draw(

@@ -124,6 +124,7 @@ class Preset:
             footprint=size.footprint,
             learned_tints=0,
             dilation=size.dilation,
+            last_sample="end",
             **dataclasses.asdict(bounds_),
         )
 

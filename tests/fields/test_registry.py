@@ -138,6 +138,16 @@ def test_files_of_older_runs_mean_the_origin(tmp_path):
     assert checkpoint_io.read_static(tmp_path).config.centre == (1.0, 2.0, -3.0)
 
 
+def test_files_of_older_runs_mean_the_middle_of_the_last_interval(tmp_path):
+    static = SavedModel(PRESETS["tiny"].model(_BOUNDS, "clear"), STRAIGHT)
+    path = tmp_path / "model.json"
+    configuration.write(path, static)
+    content = json.loads(path.read_text())
+    assert content["config"].pop("last_sample") == "end"
+    path.write_text(json.dumps(content))
+    assert checkpoint_io.read_static(tmp_path).config.last_sample == "middle"
+
+
 def test_a_kind_that_is_not_known_is_named(tmp_path):
     static = SavedModel(PRESETS["tiny"].model(_BOUNDS, "clear"), STRAIGHT)
     path = tmp_path / "model.json"

@@ -12,7 +12,7 @@ from tests.factories import scenes
 from tests.factories.small_model import MODEL
 
 _CLEAR = dataclasses.replace(MODEL, interior="clear", footprint="differential")
-_TINTED = dataclasses.replace(MODEL, interior="absorbing", learned_tints=2)
+_TINTED = dataclasses.replace(MODEL, interior="absorbing", learned_tints=2, last_sample="end")
 
 _SCENES = {
     "glass ball, path tree": (_CLEAR, TREE, [scenes.ball(subdivisions=3)]),
