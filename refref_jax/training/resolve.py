@@ -475,6 +475,9 @@ def _resolve_training(
 
 def _warnings(asked: TrainConfig, config: TrainConfig, facts: SceneFacts) -> list[str]:
     warnings, found = [], facts.analysis
+    ignored = [name for name in FIELD_ONLY if name in asked.overrides()]
+    if asked.model.far_field == "backdrop" and ignored:
+        warnings.append(f"No effect on a backdrop: {', '.join(ignored)}. Use far_field=field.")
     if asked.model.far_field == "backdrop" and (share := _share_of_misfits(config, facts)):
         causes = "something is in front of it"
         if config.scene.space != "unbounded":

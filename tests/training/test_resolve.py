@@ -100,6 +100,12 @@ def test_resolve_leaves_nothing_open_and_is_idempotent(found, given):
     assert (again.config, again.model) == (made.config, made.model)
 
 
+def test_options_of_a_field_that_a_backdrop_ignores_are_named():
+    made = _resolve(_CLEAR, far_field="backdrop", steps=100)
+    assert "No effect on a backdrop: steps, batch. Use far_field=field." in made.warnings
+    assert not any("No effect" in line for line in _resolve(_CLEAR, steps=100).warnings)
+
+
 def test_a_backdrop_has_a_size_and_a_number_of_iterations():
     made = _resolve(_CLEAR, far_field="backdrop", backdrop_resolution=64)
     assert made.model.config.backdrop.resolution == 64
