@@ -130,7 +130,7 @@ def read(
     )
 
     def trace(views: Int[np.ndarray, " views"]) -> Block:
-        each = []
+        each: list[_Seen] = []
         for start in range(0, len(views), group):
             some = views[start : start + group]
             rays, names = cameras_module.rays_of_views(cameras, some, side)
