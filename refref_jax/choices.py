@@ -76,7 +76,7 @@ Pixels = Literal["all", "background"]
 """Pixels that are used for training."""
 
 Paths = Literal["straight", "paper", "tree", "paper_no_reflection", "paper_no_tir"]
-"""Names of preset path settings; see `optics.budgets.PATH_PRESETS`."""
+"""Names of preset path settings; see `optics.path_settings`."""
 
 PresetName = Literal["tiny", "small", "paper", "best"]
 """Sizes of a model and its training; see `training.presets`."""
@@ -87,8 +87,11 @@ FieldName = Literal["zipnerf", "nerfacto"]
 FarField = Literal["field", "backdrop"]
 """Model of the world behind the objects: the radiance field, or a surface (`render.backdrop`)."""
 
+Exposure = Literal["fixed", "per_image"]
+"""Exposure of the training images: the same for all, or a gain for each of them."""
+
 Interior = Literal["field", "clear", "absorbing"]
-"""Model of the inside of the objects; see `render.config.ModelConfig`."""
+"""Model of the inside of the objects; see `render.model.ModelConfig`."""
 
 ColourNetwork = Literal["plain", "skip"]
 """Layers of the colour network: plain, or with a skip connection; see `fields.mlps`."""
@@ -100,7 +103,7 @@ LastSample = Literal["middle", "end"]
 """Where the field is evaluated for a path's last interval; see `render.model.ModelConfig`."""
 
 Footprint = Literal["cone", "differential"]
-"""Model of the pixel footprint along a path; see `render.config.ModelConfig`."""
+"""Model of the pixel footprint along a path; see `render.model.ModelConfig`."""
 
 Precision = Literal["float32", "bfloat16"]
 """Arithmetic precision of the fields."""

@@ -273,6 +273,7 @@ def find_bounds(
     space: Space | None,
     radius: float | None,
     centre: Position | None = None,
+    measure: Callable[[Kind, Position], tuple[float, float] | None] = lambda kind, centre: None,
 ) -> Bounds:
     """Determines the background of a scene: from `scene.json`, else from its name and depth maps.
 
@@ -282,6 +283,8 @@ def find_bounds(
       space: geometry that is given; `None` for the scene's own.
       radius: size that is given, in place of the scene's own; nothing is measured then.
       centre: centre that is given, in place of the scene's own.
+      measure: function of shape and centre to the size that the images show, and its standard
+        error, or `None`; called if neither `scene.json` nor depth maps tell the size.
 
     Raises:
       SceneError: if `scene.json`, a depth map or a mask is broken.
@@ -305,6 +308,9 @@ def find_bounds(
     samples, fit = read_samples(scene), None
     if samples is not None:
         fit = fit_size(kind, samples, centre=known) if known else fit_background(kind, samples)
+    if fit is None and (seen := measure(kind, known or ORIGIN)):
+        source = f"measured from the parallax of the images: {_with_error(*seen)}"
+        return Bounds(found, seen[0], source, centre=known or ORIGIN)
     if fit is None:
         return unmeasured._replace(notes=_unfit_warnings(kind, samples))
     source = f"measured from depth maps: {fit.describe()}"

@@ -1,13 +1,14 @@
 """Analyses a scene: the features that a model of it requires (NumPy only).
 
 `overridden` compares the properties in `scene.json` with those that are used, and `misfits` the
-images with the background.
+images with the background, whose size `size_in_images` measures by its parallax.
 
 A model only includes what its scene requires, so that no computation is spent on the rest. The
 analysis runs on the host, from the meshes, their description in `scene.json`, and the cameras; it
 determines which code is compiled. The background is opaque in every scene, so it is not listed.
 """
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -43,6 +44,14 @@ _MOST_IMAGES, _PATCHES, _EDGE, _CELLS = 60, 16, 128, 128
 
 # Mean sRGB error of a patch that differs.
 _MISFIT = 0.05
+
+# Largest size of a background that is searched for, relative to the cameras' distance from its
+# centre; number of sizes at first; then cells per side of a face and steps between sizes.
+_LARGEST, _SIZES, _ZOOMS = 16.0, 40, ((64, 0.035), (128, 0.01), (256, 0.004))
+
+# Relative change of the size that shows whether the images determine it; least increase of their
+# variance; groups of images that the standard error is estimated from.
+_OFF, _LEAST_INCREASE, _GROUPS = 0.05, 1.5, 4
 
 MOST_MISFITS = 5e-3
 """Share of misfits beyond which the world behind the objects is not the background's surface."""
@@ -242,13 +251,102 @@ def read_misfits(
     Raises:
       SceneError: if a file is missing or broken.
     """
+    cameras, images = _read_some(scene)
+    return misfits(cameras, images, parts, space=space, size=size, centre=centre)
+
+
+def _read_some(scene: Path) -> tuple[Cameras, UInt8[np.ndarray, "views h w 3"]]:
+    """Reads training images that are evenly spread, at most 60, and their cameras."""
     frames = scene_folder.read_frames(scene, "train")
     count = len(frames.images)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _MOST_IMAGES)).astype(int))
     cameras = frames.cameras._replace(poses=frames.cameras.poses[chosen])
     frames = frames._replace(images=tuple(frames.images[i] for i in chosen), cameras=cameras)
-    images = scene_folder.read_images(frames)
-    return misfits(cameras, images, parts, space=space, size=size, centre=centre)
+    return cameras, scene_folder.read_images(frames)
+
+
+def size_in_images(
+    scene: Path, parts: Sequence[MeshPart], kind: Kind, centre: Position
+) -> tuple[float, float] | None:
+    """Returns the size of the background and its standard error, as the images of a scene show it.
+
+    Raises:
+      SceneError: if a file is missing or broken.
+    """
+    return fit_size(*_read_some(scene), parts, kind, centre=centre)
+
+
+def fit_size(
+    cameras: Cameras,
+    photographs: UInt8[np.ndarray, "views h w 3"],
+    parts: Sequence[MeshPart],
+    kind: Kind,
+    *,
+    centre: Position = ORIGIN,
+) -> tuple[float, float] | None:
+    """Returns the size of a background, half edge or radius, and its standard error.
+
+    With the right size, all pixels that see the same small cell of the background directly have the
+    same colour; with a wrong one, parallax mixes different places. The size minimises the variance
+    of the colours within the cells, from coarse cells to fine ones. The error is estimated from
+    groups of the images.
+
+    Args:
+      cameras: cameras of the images.
+      photographs: 8-bit sRGB images.
+      parts: meshes of the scene; rays that meet the box around one are left out.
+      kind: shape of the background.
+      centre: centre of the background, world units.
+
+    Returns:
+      Size and standard error, world units; `None` if the variance is not at least half as large
+      again for a size that is 5 % off, as in front of smooth walls.
+    """
+    views, height, width, _ = photographs.shape
+    stride = max(1, 2 * min(height, width) // _EDGE)
+    row, column = np.mgrid[stride // 2 : height : stride, stride // 2 : width : stride]
+    planar = planar_directions(cameras, row.ravel(), column.ravel())
+    rays = np.stack([planar @ pose[:, :3].T for pose in cameras.poses])
+    origins = cameras.poses[:, :, 3] - np.array(centre)
+    sees = np.stack([_misses(p[:, 3], d, parts) for p, d in zip(cameras.poses, rays, strict=True)])
+    seen = photographs[:, row.ravel(), column.ravel()] / 255.0
+    space: Space = "spherical" if kind == "sphere" else "bounded"
+
+    def variance(size: float, cells: int, group: slice = slice(None)) -> float:
+        pairs = zip(origins[group], rays[group], strict=True)
+        cell = np.stack([_cells(o, d, space=space, size=size, cells=cells) for o, d in pairs])
+        return _variance(cell[sees[group]], seen[group][sees[group]])
+
+    reach = np.abs(origins) if kind == "cube" else np.linalg.norm(origins, axis=1)
+    sizes = 1.02 * np.max(reach) * np.geomspace(1.0, _LARGEST, _SIZES)
+    size = min(sizes[1:-1].tolist(), key=lambda x: variance(x, _ZOOMS[0][0]))
+    for cells, step in _ZOOMS:
+        size = min(
+            (size * (1.0 + step * n) for n in range(-3, 4)), key=lambda x: variance(x, cells)
+        )
+    off = min(variance(size * (1.0 + x), cells) for x in (-_OFF, _OFF))
+    if not off > _LEAST_INCREASE * variance(size, cells):
+        return None
+
+    def vertex(group: slice) -> float:
+        low, middle, high = (variance(size * (1.0 + n * step), cells, group) for n in (-1, 0, 1))
+        curvature = low - 2.0 * middle + high
+        return size * (1.0 + 0.5 * step * (low - high) / curvature) if curvature > 0.0 else size
+
+    apart = np.std([vertex(slice(n, None, _GROUPS)) for n in range(min(_GROUPS, views))])
+    return vertex(slice(None)), float(apart) / math.sqrt(_GROUPS - 1.0)
+
+
+def _variance(cell: Int[np.ndarray, " n"], seen: Float[np.ndarray, "n 3"]) -> float:
+    """Returns the mean variance of the colours within the cells that two or more pixels see."""
+    number = np.bincount(cell)
+    shared = number[cell] > 1
+    if not np.any(shared):
+        return np.inf
+    unbiased = number / np.maximum(number - 1, 1)
+    means = [np.bincount(cell, each) / np.maximum(number, 1) for each in seen.T]
+    squared = sum((each - mean[cell]) ** 2 for each, mean in zip(seen.T, means, strict=True))
+    return float(np.mean((unbiased[cell] * squared)[shared]))
 
 
 def misfits(
@@ -310,6 +408,7 @@ def _cells(
     *,
     space: Space,
     size: float,
+    cells: int = _CELLS,
 ) -> Int[np.ndarray, " n"]:
     """Returns the cell of a cube map that each ray sees; the origin is relative to its centre."""
     towards = directions
@@ -321,9 +420,9 @@ def _cells(
     axis = np.argmax(np.abs(towards), axis=1)[:, None]
     major = np.take_along_axis(towards, axis, 1)
     others = np.take_along_axis(towards, (axis + np.array([1, 2])) % 3, 1)
-    place = np.clip(0.5 * _CELLS * (others / np.abs(major) + 1.0), 0, _CELLS - 1).astype(np.int64)
+    place = np.clip(0.5 * cells * (others / np.abs(major) + 1.0), 0, cells - 1).astype(np.int64)
     face = 2 * axis[:, 0] + (major[:, 0] > 0.0)
-    return (face * _CELLS + place[:, 1]) * _CELLS + place[:, 0]
+    return (face * cells + place[:, 1]) * cells + place[:, 0]
 
 
 def _misses(

@@ -3,6 +3,8 @@
 The paths of all training views are traced once, and nothing is kept but their ends as points of
 the surface (`backdrop.locate`), what learned tints read of them, and the pixels' colours. Rays that
 meet no object are straight and are not traced. A fraction of the pixels is held out.
+
+`System` is the function from the unknowns to the colours of all pixels, and its transpose.
 """
 
 import functools
@@ -16,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
+from refref_jax.choices import Space
 from refref_jax.geometry import cameras as cameras_module
 from refref_jax.geometry.cameras import Cameras
 from refref_jax.geometry.rays import Rays
@@ -24,13 +27,18 @@ from refref_jax.optics import light_paths, path_tracing
 from refref_jax.optics.path_settings import STRAIGHT, Detail, PathSettings, Tally
 from refref_jax.optics.scene import Scene
 from refref_jax.render import backdrop, images, learned_media, pixels
-from refref_jax.render.backdrop import Lookups
+from refref_jax.render.backdrop import Lookups, Mips, Pyramid
+from refref_jax.render.learned_media import LearnedTints
 from refref_jax.sampling.scene_bounds import Domain
 
 # One pixel in this many is held out.
 _HELD_OUT = 50
 
 _Result = TypeVar("_Result")
+_Arrays = TypeVar("_Arrays")
+
+Gains = Float[Array, "views 3"]
+"""Logarithm of the gain of each image and channel."""
 
 
 class Block(NamedTuple):
@@ -41,7 +49,8 @@ class Block(NamedTuple):
       crossings: what learned tints read of the paths (`learned_media.crossings`), if there are any.
       linear: linear RGB of the pixels.
       srgb: sRGB of the pixels.
-      kept: 1 for pixels that are fitted, 0 for those that are held out.
+      kept: weight of the pixels: 1 if they are fitted, 0 if they are held out.
+      views: view of each pixel.
     """
 
     lookups: Lookups
@@ -49,6 +58,20 @@ class Block(NamedTuple):
     linear: Float[Array, "pixels 3"]
     srgb: Float[Array, "pixels 3"]
     kept: Float[Array, " pixels"]
+    views: Int[Array, " pixels"]
+
+
+class Unknowns(NamedTuple):
+    """What one system of equations determines.
+
+    Attributes:
+      levels: radiance of each level.
+      gains: change of the logarithm of each image's gain, shaped like a level; without images if
+        gains are fixed.
+    """
+
+    levels: Pyramid
+    gains: Float[Array, "views 1 1 3"]
 
 
 class _Seen(NamedTuple):
@@ -146,7 +169,7 @@ def read(
         joined = jax.tree.map(lambda *parts: np.concatenate(parts), *each)
         lookups = joined.lookups._replace(throughput=joined.lookups.throughput / side**2)
         joined = joined._replace(lookups=lookups)
-        return _block(joined, photographs[views], seed=int(views[0]))
+        return _block(joined, photographs[views], views)
 
     split = np.array_split(np.arange(len(photographs)), min(blocks, len(photographs)))
     return tuple(jax.device_put(block) for block in at_once(trace, split))
@@ -179,12 +202,15 @@ def at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Res
         return list(threads.map(function, *each))
 
 
-def _block(seen: _Seen, photographs: UInt8[np.ndarray, "views h w 3"], seed: int) -> Block:
-    """Returns the equations of some views; the seed draws the pixels that are held out."""
+def _block(
+    seen: _Seen, photographs: UInt8[np.ndarray, "views h w 3"], views: Int[np.ndarray, " views"]
+) -> Block:
+    """Returns the equations of some views; the first one seeds which pixels are held out."""
     srgb = host_array(photographs.reshape(-1, 3).astype(np.float32) / 255.0)
-    held_out = np.random.default_rng(seed).integers(_HELD_OUT, size=len(srgb)) == 0
+    held_out = np.random.default_rng(int(views[0])).integers(_HELD_OUT, size=len(srgb)) == 0
     linear = pixels.srgb_to_linear(jax.device_put(srgb))
-    return Block(*seen, linear, srgb, host_array(np.float32(~held_out)))
+    view = np.repeat(views.astype(np.int32), len(srgb) // len(views))
+    return Block(*seen, linear, srgb, host_array(np.float32(~held_out)), host_array(view))
 
 
 def thinned(block: Block, one_in: int) -> Block:
@@ -205,3 +231,149 @@ def of_pixels(block: Block, chosen: Int[np.ndarray, " chosen"]) -> Block:
     lookups = lookups._replace(pixels=host_array(place[pixel[paths]]))
     colours = jax.tree.map(lambda x: host_array(np.asarray(x)[chosen]), block[2:])
     return Block(lookups, host_array(np.asarray(block.crossings)[paths]), *colours)
+
+
+# ---- The function from the unknowns to the pixels ----
+
+
+class System:
+    """The function from the unknowns to the pixels: linear in the radiance, linearised in gains."""
+
+    def __init__(
+        self,
+        blocks: Sequence[Block],
+        space: Space,
+        resolution: int,
+        tints: LearnedTints | None,
+        gains: Gains | None,
+    ) -> None:
+        """Sets up the function for present tints and gains."""
+        dimmed = blocks if tints is None else [_attenuated(block, tints) for block in blocks]
+        self.blocks = [exposed(block, gains) for block in dimmed]
+        self._space, self._resolution = space, resolution
+        self._gains = jnp.zeros((0, 3)) if gains is None else gains
+        self._views = self._gains.shape[0]
+        self._slopes: list[Array] = []
+
+    def present(self, levels: Pyramid) -> Unknowns:
+        """Returns unknowns that leave the gains as they are."""
+        return Unknowns(levels, jnp.zeros((self._views, 1, 1, 3)))
+
+    def usual(self, levels: Pyramid) -> Unknowns:
+        """Returns unknowns that make all gains 1."""
+        return Unknowns(levels, -self._gains[:, None, None])
+
+    def gains(self, x: Unknowns) -> Gains:
+        """Returns the logarithms of the gains after a change; their mean is 0."""
+        return self._gains + _centred(x.gains)[:, 0, 0]
+
+    def see(self, levels: Pyramid) -> list[Array]:
+        """Returns the linear RGB of the pixels of each block, with the present gains."""
+        mips = mipmap(levels, self._space)
+
+        def look(block: Block) -> Array:
+            return jax.block_until_ready(_predict(mips, block))
+
+        return at_once(look, self.blocks)
+
+    def linearise(self, seen: list[Array]) -> None:
+        """Takes the colours of the pixels as their derivatives by the logarithm of the gains."""
+        self._slopes = seen if self._views else []
+
+    def change(self, x: Unknowns) -> list[Array]:
+        """Returns how the linear RGB of the pixels changes with the unknowns."""
+        moved = self.see(x.levels)
+        if not self._slopes:
+            return moved
+        each = zip(moved, self.blocks, self._slopes, strict=True)
+        return [m + _by_gain(b, s, x.gains) for m, b, s in each]
+
+    def transpose(self, factors: list[Array]) -> Unknowns:
+        """Returns what the pixels of all blocks add to each unknown."""
+
+        def spread(factors: Array, block: Block) -> Mips:
+            return jax.block_until_ready(_transposed(factors, block, resolution=self._resolution))
+
+        levels = _mipmap_transposed(sum_of(at_once(spread, factors, self.blocks)), self._space)
+        if not self._slopes:
+            return self.present(levels)
+        by_gain = [s * f for s, f in zip(self._slopes, factors, strict=True)]
+        return Unknowns(levels, _centred(self._per_view(by_gain)))
+
+    def diagonal(self, weights: list[Array]) -> Unknowns:
+        """Returns the scales of the unknowns, from the weights of the pixels."""
+        scales = self.transpose(weights)
+        if not self._slopes:
+            return scales
+        squares = [jnp.square(s) * w for s, w in zip(self._slopes, weights, strict=True)]
+        return scales._replace(gains=self._per_view(squares))
+
+    def _per_view(self, values: list[Array]) -> Float[Array, "views 1 1 3"]:
+        """Returns the sums of values of pixels over each view."""
+        each = zip(self.blocks, values, strict=True)
+        return sum_of([_sum_views(b, x, self._views) for b, x in each])[:, None, None]
+
+
+def exposed(block: Block, gains: Gains | None) -> Block:
+    """Returns the equations with the throughput times the gain of the image."""
+    return block if gains is None else _with_gains(block, gains)
+
+
+@jax.jit
+def _with_gains(block: Block, gains: Gains) -> Block:
+    gain = jnp.exp(gains)[block.views[block.lookups.pixels]]
+    lookups = block.lookups._replace(throughput=block.lookups.throughput * gain)
+    return block._replace(lookups=lookups)
+
+
+@jax.jit
+def _by_gain(
+    block: Block, slopes: Array, gains: Float[Array, "views 1 1 3"]
+) -> Float[Array, "pixels 3"]:
+    """Returns how the pixels change with the logarithms of the gains, whose mean stays 0."""
+    return slopes * _centred(gains)[block.views, 0, 0]
+
+
+def _centred(gains: Float[Array, "views 1 1 3"]) -> Float[Array, "views 1 1 3"]:
+    return gains - jnp.mean(gains, axis=0, keepdims=True)
+
+
+@functools.partial(jax.jit, static_argnames="views")
+def _sum_views(block: Block, values: Array, views: int) -> Float[Array, "views 3"]:
+    return jax.ops.segment_sum(values, block.views, num_segments=views)
+
+
+@functools.partial(jax.jit, static_argnames="space")
+def mipmap(pyramid: Pyramid, space: Space) -> Mips:
+    """Returns the radiance at all resolutions (`backdrop.mipmap`)."""
+    return backdrop.mipmap(pyramid, space)
+
+
+@functools.partial(jax.jit, static_argnames="space")
+def _mipmap_transposed(mips: Mips, space: Space) -> Pyramid:
+    """Returns the transpose of `mipmap`."""
+    like = tuple(jnp.zeros_like(mip) for mip in mips[::-1])
+    return jax.linear_transpose(lambda x: backdrop.mipmap(x, space), like)(mips)[0]
+
+
+@jax.jit
+def _predict(mips: Mips, block: Block) -> Float[Array, "pixels 3"]:
+    return backdrop.colours(mips, block.lookups, pixels=block.srgb.shape[0])
+
+
+@functools.partial(jax.jit, static_argnames="resolution")
+def _transposed(slopes: Array, block: Block, *, resolution: int) -> Mips:
+    return backdrop.transposed(slopes, block.lookups, resolution=resolution)
+
+
+@jax.jit
+def _attenuated(block: Block, tints: LearnedTints) -> Block:
+    """Returns the equations with the throughput that tints and absorption leave."""
+    dimmed = jnp.exp(-block.crossings @ learned_media.densities(tints))
+    lookups = block.lookups._replace(throughput=block.lookups.throughput * dimmed)
+    return block._replace(lookups=lookups)
+
+
+def sum_of(parts: Sequence[_Arrays]) -> _Arrays:
+    """Returns the sum of records of arrays."""
+    return jax.tree.map(lambda *x: functools.reduce(jnp.add, x), *parts)

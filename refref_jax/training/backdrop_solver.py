@@ -14,9 +14,14 @@ A fraction of the pixels is held out; their error decides when to stop.
 
 Learned tints and absorption take turns with the radiance: each round begins with Gauss-Newton steps
 of non-negative densities. The first round uses only pixels that see the surface directly.
+
+If the images differ in exposure or white balance, their gains are unknowns of the same system: a
+pixel is linearised by the radiance and by the logarithm of its image's gain. The mean of these
+logarithms is 0.
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple, TypeVar
@@ -31,7 +36,15 @@ from refref_jax.render import backdrop, learned_media, pixels
 from refref_jax.render.backdrop import Mips, Pyramid
 from refref_jax.render.learned_media import LearnedTints
 from refref_jax.training import backdrop_equations
-from refref_jax.training.backdrop_equations import Block, at_once
+from refref_jax.training.backdrop_equations import (
+    Block,
+    Gains,
+    System,
+    Unknowns,
+    exposed,
+    mipmap,
+    sum_of,
+)
 
 # One error in this many determines their typical size.
 _EVERY = 17
@@ -48,6 +61,10 @@ _TYPICAL, _ROUNDING = 3.0, 0.5 / 255.0
 
 ROUND = 8
 """Number of iterations with the same weights of the pixels."""
+
+# Weight of the logarithm of a gain, relative to that of the details: images of separate parts of
+# the surface have no common scale.
+_GAIN_PRIOR = 10.0
 
 # A round that improves the held-out pixels by less, in dB, is the last.
 _WORTH = 0.02
@@ -67,6 +84,7 @@ class Progress(NamedTuple):
       step: number of iterations.
       pyramid: radiance of each level.
       tints: learned tints and absorption, if any.
+      gains: logarithm of the gain of each image and channel, if they are learned.
       fitted: PSNR of the fitted pixels, dB.
       held_out: PSNR of the held-out pixels, dB.
     """
@@ -74,6 +92,7 @@ class Progress(NamedTuple):
     step: int
     pyramid: Pyramid
     tints: LearnedTints | None
+    gains: Gains | None
     fitted: float
     held_out: float
 
@@ -92,28 +111,6 @@ def _weights(predicted: Array, block: Block, typical: float | Array) -> Float[Ar
     return jnp.where(bright, 0.0, huber * jnp.square(secant)) * block.kept[:, None]
 
 
-@functools.partial(jax.jit, static_argnames="space")
-def _mipmap(pyramid: Pyramid, space: Space) -> Mips:
-    return backdrop.mipmap(pyramid, space)
-
-
-@functools.partial(jax.jit, static_argnames="space")
-def _mipmap_transposed(mips: Mips, space: Space) -> Pyramid:
-    """Returns the transpose of `mipmap`."""
-    like = tuple(jnp.zeros_like(mip) for mip in mips[::-1])
-    return jax.linear_transpose(lambda x: backdrop.mipmap(x, space), like)(mips)[0]
-
-
-@jax.jit
-def _predict(mips: Mips, block: Block) -> Float[Array, "pixels 3"]:
-    return backdrop.colours(mips, block.lookups, pixels=block.srgb.shape[0])
-
-
-@functools.partial(jax.jit, static_argnames="resolution")
-def _transposed(slopes: Array, block: Block, *, resolution: int) -> Mips:
-    return backdrop.transposed(slopes, block.lookups, resolution=resolution)
-
-
 @jax.jit
 def _residuals(block: Block, predicted: Array) -> tuple[Array, Array, Array]:
     """Returns the sums of squared sRGB errors of fitted and of held-out pixels; all errors."""
@@ -122,14 +119,10 @@ def _residuals(block: Block, predicted: Array) -> tuple[Array, Array, Array]:
     return jnp.sum(squared * block.kept), jnp.sum(squared * (1.0 - block.kept)), jnp.abs(error)
 
 
-def _dot(a: Pyramid, b: Pyramid) -> Array:
+def _dot(a: Unknowns, b: Unknowns) -> Array:
     """Returns the inner product of each channel."""
-    products = [jnp.sum(x * y, axis=(0, 1, 2)) for x, y in zip(a, b, strict=True)]
-    return functools.reduce(jnp.add, products)
-
-
-def _sum(parts: Sequence[_Arrays]) -> _Arrays:
-    return jax.tree.map(lambda *x: functools.reduce(jnp.add, x), *parts)
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return functools.reduce(jnp.add, [jnp.sum(x * y, axis=(0, 1, 2)) for x, y in pairs])
 
 
 @jax.jit
@@ -139,15 +132,20 @@ def _add_scaled(a: _Arrays, scale: Float[Array, "3"], b: _Arrays) -> _Arrays:
 
 
 @jax.jit
-def _begin_search(residual: Pyramid, diagonal: Pyramid) -> tuple[Pyramid, Array]:
+def _begin_search(residual: Unknowns, diagonal: Unknowns) -> tuple[Unknowns, Array]:
     direction = jax.tree.map(jnp.divide, residual, diagonal)
     return direction, _dot(residual, direction)
 
 
 @jax.jit
 def _advance(
-    x: Pyramid, residual: Pyramid, direction: Pyramid, image: Pyramid, diagonal: Pyramid, rho: Array
-) -> tuple[Pyramid, Pyramid, Pyramid, Array, Array]:
+    x: Unknowns,
+    residual: Unknowns,
+    direction: Unknowns,
+    image: Unknowns,
+    diagonal: Unknowns,
+    rho: Array,
+) -> tuple[Unknowns, Unknowns, Unknowns, Array, Array]:
     """Takes one step of conjugate gradients; each channel is a system of its own."""
     curvature = _dot(direction, image)
     alpha = jnp.where(curvature > 0.0, rho / jnp.where(curvature > 0.0, curvature, 1.0), 0.0)
@@ -168,14 +166,15 @@ def solve(
     iterations: int,
     start: tuple[int, Pyramid] | None = None,
     tints: LearnedTints | None = None,
+    gains: Gains | None = None,
     prior: float = 1e-3,
     tint_decay: float = 0.0,
     thinned_rounds: int = 2,
 ) -> Iterator[Progress]:
     """Yields the state after each iteration; it may stop earlier than asked.
 
-    Each `ROUND` of iterations depends only on the radiance and the tints at its start: a run that
-    is continued from there is the same as one without a pause.
+    Each `ROUND` of iterations depends only on the radiance, tints and gains at its start: a run
+    that is continued from there is the same as one without a pause.
 
     Args:
       blocks: equations of all views.
@@ -184,6 +183,7 @@ def solve(
       iterations: largest number of iterations.
       start: number of iterations, a multiple of `ROUND`, and radiance of an earlier run.
       tints: tints and absorption to begin with, if they are learned.
+      gains: logarithm of the gain of each image to begin with, if they are learned.
       prior: weight of the details of the pyramid, relative to a pixel's squared sRGB error.
       tint_decay: weight of the optical density of tints and absorption, relative to the mean
         squared sRGB error.
@@ -191,46 +191,75 @@ def solve(
     """
     mean = jnp.mean(jnp.stack([jnp.mean(block.linear, axis=0) for block in blocks]), axis=0)
     uniform = backdrop.init(resolution, radiance=mean)
-    step, x = start or (0, uniform)
-    priors = tuple(jnp.float32(prior if i else 1e-2 * prior) for i in range(len(x)))
+    step, levels = start or (0, uniform)
     tinted = [] if tints is None else [_tinted(block) for block in blocks]
-    whole, fewer = blocks, _thinned(blocks, x[-1][..., 0].size) if thinned_rounds else blocks
+    whole, fewer = blocks, _thinned(blocks, levels[-1][..., 0].size) if thinned_rounds else blocks
     while step < iterations:
         blocks = fewer if step < thinned_rounds * ROUND else whole
         before, typical = -math.inf, math.inf
         if step:
-            seen = _System(blocks, space, resolution, tints).see(x)
+            seen = System(blocks, space, resolution, tints, gains).see(levels)
             _, before, typical = _measure(blocks, seen)
             if tints is not None:
-                mips = _mipmap(x, space)
-                tints = _fit_tints(tinted, mips, tints, typical=typical, decay=tint_decay)
-        system = _System(blocks, space, resolution, tints)
-        seen = system.see(x)
+                brightened = [exposed(block, gains) for block in tinted]
+                mips = mipmap(levels, space)
+                tints = _fit_tints(brightened, mips, tints, typical=typical, decay=tint_decay)
+        system = System(blocks, space, resolution, tints, gains)
+        seen = system.see(levels)
         expected = seen if step else [block.linear for block in blocks]
         weights = [_weights(e, b, typical) for e, b in zip(expected, blocks, strict=True)]
         if tints is not None and not step:
             weights = [w * _is_direct(b) for w, b in zip(weights, blocks, strict=True)]
-        squares = system.transpose(weights)
-        diagonal = jax.tree.map(lambda ours, weight: ours + weight, squares, priors)
-        gap = [w * (b.linear - s) for w, b, s in zip(weights, blocks, seen, strict=True)]
-        # The prior of vertices that no pixel sees is the mean of all pixels.
-        residual = jax.tree.map(
-            lambda a, weight, b, c: a - weight * (b - c), system.transpose(gap), priors, x, uniform
-        )
-        direction, rho = _begin_search(residual, diagonal)
-        for _ in range(min(ROUND, iterations - step)):
-            moved = system.see(direction)
-            image = system.transpose([w * m for w, m in zip(weights, moved, strict=True)])
-            image = jax.tree.map(lambda a, weight, b: a + weight * b, image, priors, direction)
-            x, residual, direction, rho, alpha = _advance(
-                x, residual, direction, image, diagonal, rho
-            )
-            seen = _add_scaled(seen, alpha, moved)
+        if step:  # the radiance is no longer uniform, and explains most of the images
+            system.linearise(seen)
+        steps, changed = _search(system, levels, uniform, weights, seen, prior), gains
+        for x, found in itertools.islice(steps, min(ROUND, iterations - step)):
             step += 1
-            fitted, held_out, _ = _measure(blocks, seen)
-            yield Progress(step, x, tints, fitted, held_out)
+            fitted, held_out, _ = _measure(blocks, found)
+            levels, changed = x.levels, None if gains is None else system.gains(x)
+            yield Progress(step, levels, tints, changed, fitted, held_out)
+        gains = changed
         if held_out < before + _WORTH and blocks is whole:
             return
+
+
+def _search(
+    system: System,
+    levels: Pyramid,
+    uniform: Pyramid,
+    weights: list[Array],
+    seen: list[Array],
+    prior: float,
+) -> Iterator[tuple[Unknowns, list[Array]]]:
+    """Yields the unknowns, and the colours of the pixels, after each step of conjugate gradients.
+
+    Args:
+      system: linear function from the unknowns to the pixels.
+      levels: radiance at the start.
+      uniform: radiance of vertices that no pixel sees, the mean of all pixels.
+      weights: squared weight of each pixel and channel.
+      seen: colours of the pixels at the start.
+      prior: weight of the details of the pyramid.
+    """
+    blocks = system.blocks
+    x, mean = system.present(levels), system.usual(uniform)
+    ridge = Unknowns(
+        tuple(jnp.float32(prior if i else 1e-2 * prior) for i in range(len(levels))),
+        jnp.float32(_GAIN_PRIOR * prior),
+    )
+    diagonal = jax.tree.map(jnp.add, system.diagonal(weights), ridge)
+    gap = [w * (b.linear - s) for w, b, s in zip(weights, blocks, seen, strict=True)]
+    residual = jax.tree.map(
+        lambda a, weight, b, c: a - weight * (b - c), system.transpose(gap), ridge, x, mean
+    )
+    direction, rho = _begin_search(residual, diagonal)
+    while True:
+        moved = system.change(direction)
+        image = system.transpose([w * m for w, m in zip(weights, moved, strict=True)])
+        image = jax.tree.map(lambda a, weight, b: a + weight * b, image, ridge, direction)
+        x, residual, direction, rho, alpha = _advance(x, residual, direction, image, diagonal, rho)
+        seen = _add_scaled(seen, alpha, moved)
+        yield x, seen
 
 
 def _thinned(blocks: Sequence[Block], vertices: int) -> Sequence[Block]:
@@ -256,47 +285,11 @@ def coverage(
       tints: tints and absorption, if they are learned.
     """
     kept = [jnp.broadcast_to(block.kept[:, None], block.srgb.shape) for block in blocks]
-    finest = _System(blocks, space, resolution, tints).transpose(kept)[-1]
+    finest = System(blocks, space, resolution, tints, None).transpose(kept).levels[-1]
     return jnp.mean(finest, axis=-1)
 
 
-class _System:
-    """The linear function from the radiance to the pixels, and its transpose."""
-
-    def __init__(
-        self, blocks: Sequence[Block], space: Space, resolution: int, tints: LearnedTints | None
-    ) -> None:
-        """Sets up the function for present tints."""
-        self._blocks = blocks if tints is None else [_attenuated(b, tints) for b in blocks]
-        self._space, self._resolution = space, resolution
-
-    def see(self, x: Pyramid) -> list[Array]:
-        """Returns the linear RGB of the pixels of each block."""
-        mips = _mipmap(x, self._space)
-
-        def look(block: Block) -> Array:
-            return jax.block_until_ready(_predict(mips, block))
-
-        return at_once(look, self._blocks)
-
-    def transpose(self, slopes: list[Array]) -> Pyramid:
-        """Returns what the pixels of all blocks add to each level."""
-
-        def spread(slopes: Array, block: Block) -> Mips:
-            return jax.block_until_ready(_transposed(slopes, block, resolution=self._resolution))
-
-        return _mipmap_transposed(_sum(at_once(spread, slopes, self._blocks)), self._space)
-
-
 # ---- Learned tints ----
-
-
-@jax.jit
-def _attenuated(block: Block, tints: LearnedTints) -> Block:
-    """Returns the equations with the throughput that tints and absorption leave."""
-    dimmed = jnp.exp(-block.crossings @ learned_media.densities(tints))
-    lookups = block.lookups._replace(throughput=block.lookups.throughput * dimmed)
-    return block._replace(lookups=lookups)
 
 
 @jax.jit
@@ -324,7 +317,7 @@ def _fit_tints(
     for _ in range(_TINT_STEPS):
         now = jax.device_put(densities.astype(np.float32))
         found = [_tint_equations(now, s, b, typical) for s, b in zip(seen, blocks, strict=True)]
-        normal, right = (np.asarray(x, np.float64) for x in _sum(found))
+        normal, right = (np.asarray(x, np.float64) for x in sum_of(found))
         right = right + np.einsum("ckl,lc->ck", normal, densities) - penalty
         before = densities
         densities = np.stack(

@@ -16,26 +16,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, TypeVar
 
-from refref_jax import configuration
-from refref_jax.choices import (
-    ColourNetwork,
-    Contraction,
-    DataLoss,
-    DistortionOver,
-    FarField,
-    FieldName,
-    Footprint,
-    Interior,
-    PathLosses,
-    Paths,
-    Pixels,
-    Precision,
-    PresetName,
-    RuleName,
-    ShadingOverride,
-    Space,
-    Tints,
-)
+from refref_jax import choices, configuration
 from refref_jax.configuration import Option, option
 from refref_jax.optics.path_settings import Reentry, check_max_bends, check_min_throughput
 
@@ -53,7 +34,7 @@ FIELD_ONLY = (
 )
 """Options that only a radiance field reads."""
 
-BACKDROP_ONLY = ("backdrop_resolution", "iterations")
+BACKDROP_ONLY = ("backdrop_resolution", "iterations", "exposure")
 """Options that only a backdrop reads."""
 
 # Options that determine the model of the far field.
@@ -103,14 +84,14 @@ class SceneConfig:
     """
 
     path: str = option("", name="scene")
-    rule: RuleName | None = option(None, after=_OBJECTS)
+    rule: choices.RuleName | None = option(None, after=_OBJECTS)
     indices: tuple[tuple[str, float], ...] = option((), name="ior", after=("reconstruction",))
-    space: Space | None = option(None, name="background", after=("scene", "properties"))
+    space: choices.Space | None = option(None, name="background", after=("scene", "properties"))
     radius: float | None = option(None, after=("scene", "properties", "background", "contraction"))
     reconstruction: str = option("")
-    pixels: Pixels = option("all")
+    pixels: choices.Pixels = option("all")
     properties: str = option("")
-    shading: ShadingOverride = option("scene")
+    shading: choices.ShadingOverride = option("scene")
     centre: tuple[float, float, float] | None = option(
         None, after=("scene", "properties", "background"), comparison="none"
     )
@@ -150,7 +131,7 @@ class PathsConfig:
         from the meshes.
     """
 
-    name: Paths | None = option(None, name="paths", after=_OBJECTS)
+    name: choices.Paths | None = option(None, name="paths", after=_OBJECTS)
     min_throughput: float | None = option(None, formerly="cut", after=("paths",))
     max_bends: int | None = option(None, formerly="bends", after=("paths",))
     reentry: Reentry | None = option(None, after=(*_OBJECTS, "rule", "paths", "max_bends"))
@@ -200,28 +181,33 @@ class FieldConfig:
         option needs a field.
       backdrop_resolution: Number of cells per side of a face of the backdrop.
       iterations: Largest number of iterations of the backdrop's solver.
+      exposure: Exposure and white balance of the training images: fixed, or a learned gain for each
+        image and channel (per_image), for captures; only of a backdrop.
     """
 
-    preset: PresetName = option("tiny")
-    field: FieldName = option("zipnerf")
-    interior: Interior | None = option(None, after=(*_OBJECTS, "paths", "max_bends", "tints"))
-    tints: Tints | None = option(None, after=(*_OBJECTS, "paths", "max_bends", "interior"))
-    footprint: Footprint | None = option(None, after=("preset", "field"))
+    preset: choices.PresetName = option("tiny")
+    field: choices.FieldName = option("zipnerf")
+    interior: choices.Interior | None = option(
+        None, after=(*_OBJECTS, "paths", "max_bends", "tints")
+    )
+    tints: choices.Tints | None = option(None, after=(*_OBJECTS, "paths", "max_bends", "interior"))
+    footprint: choices.Footprint | None = option(None, after=("preset", "field"))
     samples_per_ray: tuple[int, ...] | None = option(
         None, formerly="samples", after=("preset", "field")
     )
     multisamples: int | None = option(None, after=("preset", "field"))
     log2_hashmap_size: int | None = option(None, formerly="entries", after=("preset", "field"))
     max_res: int | None = option(None, formerly="finest", after=("preset", "field"))
-    precision: Precision | None = option(None, after=("preset", "field"))
+    precision: choices.Precision | None = option(None, after=("preset", "field"))
     dilation: float | None = option(None, after=("preset", "field"))
-    colour_network: ColourNetwork = option("plain")
-    contraction: Contraction = option("unbounded")
+    colour_network: choices.ColourNetwork = option("plain")
+    contraction: choices.Contraction = option("unbounded")
     near: float | None = option(None, after=_BOUNDS, comparison="none")
     far: float | None = option(None, after=_BOUNDS, comparison="none")
-    far_field: FarField | None = option(None, after=_FAR_FIELD)
+    far_field: choices.FarField | None = option(None, after=_FAR_FIELD)
     backdrop_resolution: int | None = option(None, after=("far_field",))
     iterations: int | None = option(None, after=("far_field",))
+    exposure: choices.Exposure | None = option(None, after=("far_field",))
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -273,14 +259,14 @@ class LossConfig:
         are reflected at the first surface (transmitted; the paper's released code).
     """
 
-    data: DataLoss = option("mse", name="data_loss")
+    data: choices.DataLoss = option("mse", name="data_loss")
     interlevel: float = option(0.01, name="interlevel_weight")
     blurs: tuple[float, ...] | None = option(None, after=("preset", "field", "samples_per_ray"))
     distortion: float = option(0.01, name="distortion_weight")
     hash_decay: float | None = option(None, after=("field",))
     tint_decay: float = option(1e-3, formerly="dye_decay")
-    distortion_over: DistortionOver = option("outside", name="distortion")
-    path_losses: PathLosses = option("all")
+    distortion_over: choices.DistortionOver = option("outside", name="distortion")
+    path_losses: choices.PathLosses = option("all")
 
     def __post_init__(self) -> None:
         """Checks the numbers."""

@@ -25,6 +25,7 @@ from refref_jax import atomic_files, configuration
 from refref_jax.data import image_files, scene_analysis, scene_folder, scene_source
 from refref_jax.data.batches import PixelSampler
 from refref_jax.data.meshes import MeshPart
+from refref_jax.data.scene_folder import Frames
 from refref_jax.optics.scene import Scene
 from refref_jax.render import checkpoint_io, volume_rendering
 from refref_jax.render.checkpoint_io import SavedModel
@@ -357,22 +358,22 @@ def _solve(
     shape, bounds = model.config.backdrop, volume_rendering.domain(model.config)
     begun = time.monotonic()
     assert shape is not None
-    total = require(config.model.iterations)
+    total, learned = require(config.model.iterations), config.model.exposure == "per_image"
 
     def traced(view: int, views: int) -> None:
         progress(0, total, f"tracing view {view} of {views}")
         if stop():
             raise KeyboardInterrupt  # there is no new state to save
 
-    blocks = _equations(model, scene, folder, traced)
-    params = init_params(jax.random.key(0), model.config)
-    state = TrainState(jnp.zeros((), jnp.int32), params, optax.EmptyState())
+    frames = scene_folder.read_frames(folder, "train")
+    blocks = _equations(model, scene, frames, traced)
+    state = _unsolved(model, gains=len(frames.names) if learned else 0)
     if checkpoints.newest() is not None:
         state = checkpoints.restore(state)
     step = int(state.step)
     earlier = run_folder.rewind_metrics(run, step)
     surface: Any = {"space": bounds.space, "resolution": shape.resolution}
-    surface |= {"tints": state.params.tints}
+    surface["tints"] = state.params.tints
     seen = backdrop_solver.coverage(blocks, **surface)
     run_folder.write_coverage(run, jax.device_get(seen))
     iterations = backdrop_solver.solve(
@@ -380,6 +381,7 @@ def _solve(
         iterations=total,
         start=(step, state.params.field) if step else None,
         **surface,
+        gains=state.optimizer if learned else None,
         tint_decay=config.losses.tint_decay,
     )
     for reached in iterations:
@@ -388,20 +390,30 @@ def _solve(
         line |= {"seconds": earlier + time.monotonic() - begun}
         run_folder.append_metrics(run, configuration.string_safe(line))
         progress(step, total, f"PSNR {reached.fitted:.2f}  held out {reached.held_out:.2f}")
-        state = state._replace(params=Params((), reached.pyramid, reached.tints))
+        own = reached.gains if learned else state.optimizer
+        state = TrainState(state.step, Params((), reached.pyramid, reached.tints), own)
         if step % backdrop_solver.ROUND == 0 and step < total:
             checkpoints.save(state._replace(step=jnp.asarray(step, jnp.int32)))
             if stop():
                 return step
     checkpoints.save(state._replace(step=jnp.asarray(total, jnp.int32)))
+    if learned:
+        run_folder.write_gains(run, frames.names, jax.device_get(jnp.exp(state.optimizer)))
     return total
 
 
+def _unsolved(model: SavedModel, *, gains: int) -> TrainState:
+    """Returns the state before the first iteration, with gains in place of an optimiser's state."""
+    params = init_params(jax.random.key(0), model.config)
+    learned = jnp.zeros((gains, 3)) if gains else optax.EmptyState()
+    return TrainState(jnp.zeros((), jnp.int32), params, learned)
+
+
 def _equations(
-    model: SavedModel, scene: Scene, folder: Path, progress: Callable[[int, int], None]
+    model: SavedModel, scene: Scene, frames: Frames, progress: Callable[[int, int], None]
 ) -> tuple[backdrop_equations.Block, ...]:
     """Reads the training images, and returns the equations of their pixels."""
-    shape, frames = model.config.backdrop, scene_folder.read_frames(folder, "train")
+    shape = model.config.backdrop
     assert shape is not None
     return backdrop_equations.read(
         scene,

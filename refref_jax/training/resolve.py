@@ -147,7 +147,8 @@ def read_facts(scene: SceneConfig, *, parts: Sequence[MeshPart] | None = None) -
     embedded = any(part.material.kind != "dielectric" for part in parts)
     if rule == "priority" or (rule == "facing" and tree.overlaps) or embedded:
         mesh_checks.refuse_cameras_inside(parts, cameras)
-    bounds = background_fit.find_bounds(folder, told, **given)
+    measure = functools.partial(scene_analysis.size_in_images, folder, parts)
+    bounds = background_fit.find_bounds(folder, told, **given, measure=measure)
     return SceneFacts(
         scene_analysis.analyse(parts, tree, cameras, rule=rule, space=bounds.space),
         cameras,
@@ -209,10 +210,9 @@ def _first_reasons(config: TrainConfig) -> dict[str, str]:
     usual, overrides = TrainConfig(), config.overrides()
     reasons = {}
     for option in options_of():
-        is_decision = option.field.default is None and option.name not in overrides
-        set_ = _KEPT if is_decision else _GIVEN
+        decided = option.field.default is None and option.name not in overrides
         same = config.get(option.name) == usual.get(option.name)
-        reasons[option.name] = _USUAL if same else set_
+        reasons[option.name] = _USUAL if same else _KEPT if decided else _GIVEN
     return reasons
 
 
@@ -358,6 +358,7 @@ def _resolve_far_field(
             "far_field=backdrop",
             backdrop_resolution=presets.BACKDROP_RESOLUTION,
             iterations=presets.BACKDROP_ITERATIONS,
+            exposure="fixed",
         )
     for name in BACKDROP_ONLY:
         if (value := config.get(name)) is not None:

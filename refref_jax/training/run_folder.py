@@ -4,12 +4,14 @@
     {run}/model.json       the model, see `render.checkpoint_io`
     {run}/metrics.jsonl    one line for every logged step
     {run}/checkpoints/     the newest few states, saved atomically by Orbax
+    {run}/gains.json       gain of each training image, RGB, if exposure=per_image
     {run}/coverage.npz     how many pixels see each vertex of a backdrop
 
-All but the last two are readable text.
+All but checkpoints and coverage are readable text.
 """
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +39,8 @@ from refref_jax.training.loop import TrainState
 
 _METRICS = "metrics.jsonl"
 _COVERAGE = "coverage.npz"
-_LEFT_BEHIND = (_METRICS, _COVERAGE, checkpoint_io.CHECKPOINTS)
+_GAINS = "gains.json"
+_LEFT_BEHIND = (_METRICS, _COVERAGE, _GAINS, checkpoint_io.CHECKPOINTS)
 
 
 class Checkpoints:
@@ -254,6 +257,13 @@ def read_coverage(run: Path) -> Float[np.ndarray, "6 side side"]:
         )
     with np.load(path) as file:
         return np.asarray(file["coverage"])
+
+
+def write_gains(run: Path, names: Sequence[str], gains: Float[np.ndarray, "views 3"]) -> None:
+    """Writes the gain of each training image, by its name; their geometric mean is 1."""
+    rows = zip(names, np.round(gains.astype(np.float64), 6).tolist(), strict=True)
+    with atomic_files.written_file(run / _GAINS) as draft:
+        draft.write_text(json.dumps(dict(rows), indent=2) + "\n", encoding="utf-8")
 
 
 def append_metrics(run: Path, line: dict[str, Any]) -> None:

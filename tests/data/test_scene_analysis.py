@@ -1,3 +1,6 @@
+import json
+import shutil
+
 import numpy as np
 import pytest
 import trimesh
@@ -6,7 +9,10 @@ from refref_jax.data import mesh_queries, meshes, scene_analysis
 from refref_jax.data.mesh_queries import is_convex
 from refref_jax.data.scene_analysis import analyse, describe
 from refref_jax.geometry.cameras import image_rays, orbit
+from refref_jax.training.config import SceneConfig
+from refref_jax.training.resolve import read_facts
 from tests.factories import solids
+from tests.factories.cut_ball import BALL
 
 _CAMERAS = orbit(4, distance=4.0, elevation=0.3, size=8, angle_x=1.0)
 
@@ -265,3 +271,35 @@ def test_pixels_that_only_see_objects_are_not_judged():
         tiny = views._replace(height=shape[0], width=shape[1])
         image = np.full((24, *shape, 3), 99, np.uint8)
         assert scene_analysis.misfits(tiny, image, (), space="unbounded", size=1.0) == 0.0
+
+
+@pytest.mark.parametrize(("kind", "space"), [("sphere", "spherical"), ("cube", "bounded")])
+def test_the_size_of_the_background_is_measured_by_its_parallax(kind, space):
+    views = _room_views()
+    images, other = (_photographs(views, space=s) for s in (space, "unbounded"))
+    size, error = scene_analysis.fit_size(views, images, (), kind)
+    assert abs(size - 6.0) < max(3.0 * error, 0.01) and 0.0 < error < 0.05
+    assert scene_analysis.fit_size(views, other, (), kind) is None
+
+
+def test_walls_of_one_colour_have_no_measurable_size():
+    views = _room_views()
+    grey = np.full((24, 96, 96, 3), 99, np.uint8)
+    assert scene_analysis.fit_size(views, grey, (), "cube") is None
+    around = [_made(trimesh.creation.icosphere(2, 5.0))]  # no pixel sees the background directly
+    assert scene_analysis.fit_size(views, grey, around, "cube") is None
+
+
+def test_a_scene_that_states_no_size_gets_that_of_its_images(tmp_path):
+    scene = shutil.copytree(BALL, tmp_path / "cube_smcvx_ball")
+    properties = json.loads((scene / "scene.json").read_text())
+    del properties["background"]
+    (scene / "scene.json").write_text(json.dumps(properties))
+    for path in scene.glob("transforms_*.json"):
+        content = json.loads(path.read_text())
+        for frame in content["frames"]:
+            del frame["depth_file_path"]
+        path.write_text(json.dumps(content))
+    facts = read_facts(SceneConfig(path=str(scene)))
+    assert abs(facts.half_extent - 7.3) < 0.005 and facts.centre == (0.0, 0.0, 0.0)
+    assert facts.source.startswith("measured from the parallax of the images: 7.30")

@@ -221,11 +221,11 @@ def test_a_cell_is_as_wide_as_the_median_pixel():
     steps[:, 0, 1] = widths / taps[:, 0]
     steps[:, 1, 0] = 0.1 * widths / taps[:, 1]
     lookups = Lookups(*([None] * 2), sides, taps, None, steps, None)
-    blocks = [Block(lookups, *([None] * 4))]
+    blocks = [Block(lookups, *([None] * 5))]
     assert backdrop_trial.resolution_of(blocks, 256) == 128
-    tiny = [Block(lookups._replace(steps=0.0 * steps), *([None] * 4))]
+    tiny = [Block(lookups._replace(steps=0.0 * steps), *([None] * 5))]
     assert backdrop_trial.resolution_of(tiny, 256) == 4096
-    wide = [Block(lookups._replace(steps=1e3 * steps), *([None] * 4))]
+    wide = [Block(lookups._replace(steps=1e3 * steps), *([None] * 5))]
     assert backdrop_trial.resolution_of(wide, 256) == 64
 
 

@@ -1,5 +1,7 @@
 """Runs with a backdrop: solved, paused and continued, rendered, and refused where none fits."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -108,10 +110,12 @@ def test_a_model_with_a_backdrop_has_no_field_to_look_up(run):
         one_ray.render_ray(model, jax.tree.map(lambda x: x[0, 0], image_rays(CAMERAS, 0)))
 
 
-def test_a_paused_run_continues_to_the_same_bits(scene, run, tmp_path):
-    def stop():
-        return len(run_folder.read_metrics(tmp_path / "run")) == _ROUND
+def _after_a_round(run):
+    return lambda: len(run_folder.read_metrics(run)) == _ROUND
 
+
+def test_a_paused_run_continues_to_the_same_bits(scene, run, tmp_path):
+    stop = _after_a_round(tmp_path / "run")
     fit(_config(scene), out=tmp_path / "run", stop=stop, report=lambda line: None)
     assert run_folder.read_metrics(tmp_path / "run")[-1]["step"] == _ROUND
     lines = []
@@ -120,6 +124,26 @@ def test_a_paused_run_continues_to_the_same_bits(scene, run, tmp_path):
     assert all(np.array_equal(ours, theirs) for ours, theirs in pairs)
     fit(None, out=tmp_path / "run", existing="resume", report=lines.append)
     assert "trained already" in lines[-1]
+
+
+def test_gains_of_the_images_are_learned_resumed_and_written(scene, tmp_path):
+    config = _config(scene).override(exposure="per_image")
+    lines, stop = [], _after_a_round(tmp_path / "run")
+    fit(config, out=tmp_path / "run", stop=stop, report=lines.append)
+    assert any("exposure=per_image" in line for line in lines)
+    fit(None, out=tmp_path / "run", existing="resume", report=lines.append)
+    gains = json.loads((tmp_path / "run" / "gains.json").read_text())
+    assert list(gains) == list(scene_folder.read_frames(scene, "train").names)
+    values = np.array(list(gains.values()))
+    np.testing.assert_allclose(np.exp(np.log(values).mean(axis=0)), 1.0, atol=1e-5)
+    assert 1e-5 < np.max(np.abs(values - 1.0)) < 0.1
+    with pytest.raises(ValueError, match="exposure=fixed has no effect with far_field=field"):
+        prepare(
+            config.override(
+                far_field="field", exposure="fixed", iterations=None, backdrop_resolution=None
+            ),
+            report=lines.append,
+        )
 
 
 def test_a_run_stops_between_the_views_that_it_traces(scene, tmp_path):
