@@ -6,7 +6,7 @@ Copies the scene, and multiplies the linear colours of each training image by th
 log-normally. Trains a backdrop on the original images, on the copy with `exposure=fixed`, and on
 the copy with `exposure=per_image`, and evaluates all on the original test views. Prints PSNR,
 masked PSNR, and the largest error of a gain. Asserted is that learned gains lose at most
-`--margin` dB inside the mask.
+`--largest_loss` dB inside the mask.
 """
 
 import json
@@ -24,7 +24,7 @@ from refref_jax.render import pixels
 
 _SCENE = flags.DEFINE_string("scene", "experiments/data/cube_smcvx_ball", "Folder of the scene.")
 _SPREAD = flags.DEFINE_float("spread", 0.15, "Standard deviation of the gains' logarithms.")
-_MARGIN = flags.DEFINE_float("margin", 0.5, "Largest loss in masked PSNR, dB.")
+_LOSS = flags.DEFINE_float("largest_loss", 0.5, "Largest loss in masked PSNR, dB.")
 
 
 def expose(scene: Path, out: Path) -> np.ndarray:
@@ -62,7 +62,7 @@ def main(arguments: list[str]) -> None:
         shown = f"{error:.4f}" if name == "per_image" else ""
         print(f"{name},{row['psnr']:.2f},{row['psnr_masked']:.2f},{shown}")
     loss = rows["original"]["psnr_masked"] - rows["per_image"]["psnr_masked"]
-    assert loss <= _MARGIN.value, f"{loss:.2f} dB"
+    assert loss <= _LOSS.value, f"{loss:.2f} dB"
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from refref_jax.choices import Space
 from refref_jax.geometry import cameras as cameras_module
@@ -124,6 +124,8 @@ def read(
     side: int = 1,
     tally: Tally = "none",
     blocks: int = 2,
+    share: float = 1.0,
+    draw: int = 0,
     progress: Callable[[int, int], None] = lambda view, total: None,
 ) -> tuple[Block, ...]:
     """Traces the training pixels, and returns their equations.
@@ -139,6 +141,8 @@ def read(
       side: number of rays along each edge of a pixel.
       tally: `parts` if tints and absorption are learned.
       blocks: number of blocks that the views are split into; they are traced and solved at once.
+      share: share of the pixels, drawn at random.
+      draw: number of the draw; another one draws other pixels.
       progress: function called for each view, after the views that are traced with it; from several
         threads.
     """
@@ -154,25 +158,35 @@ def read(
 
     def trace(views: Int[np.ndarray, " views"]) -> Block:
         each: list[_Seen] = []
+        drawn = _drawn(len(views) * photographs[0, ..., 0].size, share, (draw, int(views[0])))
+        place = np.cumsum(drawn, dtype=np.int32) - 1
         for start in range(0, len(views), group):
             some = views[start : start + group]
             rays, names = cameras_module.rays_of_views(cameras, some, side)
             names = start * photographs[0, ..., 0].size + names
+            kept = drawn[names]
             met = np.isfinite(images.find_first_surface(scene.surfaces, rays).distances)
-            for which, bends in ((~met, STRAIGHT), (met, settings)):
+            for which, bends in ((kept & ~met, STRAIGHT), (kept & met, settings)):
                 chosen = jax.tree.map(lambda x, which=which: host_array(x[which]), rays)
                 each += _in_tiles(
-                    functools.partial(look, settings=bends), chosen, names[which], tile
+                    functools.partial(look, settings=bends), chosen, place[names[which]], tile
                 )
             for _ in some:
                 progress(next(done), len(photographs))
         joined = jax.tree.map(lambda *parts: np.concatenate(parts), *each)
         lookups = joined.lookups._replace(throughput=joined.lookups.throughput / side**2)
         joined = joined._replace(lookups=lookups)
-        return _block(joined, photographs[views], views)
+        return _block(joined, photographs[views], views, drawn)
 
     split = np.array_split(np.arange(len(photographs)), min(blocks, len(photographs)))
     return tuple(jax.device_put(block) for block in at_once(trace, split))
+
+
+def _drawn(count: int, share: float, seed: tuple[int, int]) -> Bool[np.ndarray, " pixels"]:
+    """Returns which pixels are drawn."""
+    if share >= 1.0:
+        return np.ones(count, bool)
+    return np.random.default_rng(seed).random(count, np.float32) < share
 
 
 def _in_tiles(
@@ -203,14 +217,17 @@ def at_once(function: Callable[..., _Result], *each: Sequence[Any]) -> list[_Res
 
 
 def _block(
-    seen: _Seen, photographs: UInt8[np.ndarray, "views h w 3"], views: Int[np.ndarray, " views"]
+    seen: _Seen,
+    photographs: UInt8[np.ndarray, "views h w 3"],
+    views: Int[np.ndarray, " views"],
+    drawn: Bool[np.ndarray, " pixels"],
 ) -> Block:
     """Returns the equations of some views; the first one seeds which pixels are held out."""
-    srgb = host_array(photographs.reshape(-1, 3).astype(np.float32) / 255.0)
-    held_out = np.random.default_rng(int(views[0])).integers(_HELD_OUT, size=len(srgb)) == 0
-    linear = pixels.srgb_to_linear(jax.device_put(srgb))
-    view = np.repeat(views.astype(np.int32), len(srgb) // len(views))
-    return Block(*seen, linear, srgb, host_array(np.float32(~held_out)), host_array(view))
+    srgb = photographs.reshape(-1, 3)[drawn].astype(np.float32) / 255.0
+    held_out = np.random.default_rng(int(views[0])).integers(_HELD_OUT, size=drawn.size) == 0
+    kept, view = np.float32(~held_out[drawn]), np.repeat(views, drawn.size // len(views))[drawn]
+    linear = pixels.srgb_to_linear(jax.device_put(host_array(srgb)))
+    return Block(*seen, linear, *map(host_array, (srgb, kept, view.astype(np.int32))))
 
 
 def thinned(block: Block, one_in: int) -> Block:

@@ -23,7 +23,7 @@ logarithms is 0.
 import functools
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -66,6 +66,9 @@ ROUND = 8
 # the surface have no common scale.
 _GAIN_PRIOR = 10.0
 
+# What pixels of earlier rounds have told counts this much in the next one.
+_FADES = 0.5
+
 # A round that improves the held-out pixels by less, in dB, is the last.
 _WORTH = 0.02
 
@@ -85,6 +88,7 @@ class Progress(NamedTuple):
       pyramid: radiance of each level.
       tints: learned tints and absorption, if any.
       gains: logarithm of the gain of each image and channel, if they are learned.
+      held: weight with which the next round keeps to the radiance, if rounds have other pixels.
       fitted: PSNR of the fitted pixels, dB.
       held_out: PSNR of the held-out pixels, dB.
     """
@@ -93,6 +97,7 @@ class Progress(NamedTuple):
     pyramid: Pyramid
     tints: LearnedTints | None
     gains: Gains | None
+    held: Pyramid | None
     fitted: float
     held_out: float
 
@@ -167,9 +172,11 @@ def solve(
     start: tuple[int, Pyramid] | None = None,
     tints: LearnedTints | None = None,
     gains: Gains | None = None,
+    held: Pyramid | None = None,
     prior: float = 1e-3,
     tint_decay: float = 0.0,
     thinned_rounds: int = 2,
+    others: Callable[[int], Sequence[Block]] | None = None,
 ) -> Iterator[Progress]:
     """Yields the state after each iteration; it may stop earlier than asked.
 
@@ -184,18 +191,25 @@ def solve(
       start: number of iterations, a multiple of `ROUND`, and radiance of an earlier run.
       tints: tints and absorption to begin with, if they are learned.
       gains: logarithm of the gain of each image to begin with, if they are learned.
+      held: weight with which the radiance is kept, of an earlier run with `others`.
       prior: weight of the details of the pyramid, relative to a pixel's squared sRGB error.
       tint_decay: weight of the optical density of tints and absorption, relative to the mean
         squared sRGB error.
       thinned_rounds: number of first rounds that take only as many pixels as there are vertices.
+      others: function of the number of a round to its equations, where all of them do not fit in
+        memory; `blocks` are those of the round at the start. A round then also keeps to its start,
+        the more so the more pixels of earlier rounds have seen a vertex, and takes all iterations.
     """
     mean = jnp.mean(jnp.stack([jnp.mean(block.linear, axis=0) for block in blocks]), axis=0)
     uniform = backdrop.init(resolution, radiance=mean)
     step, levels = start or (0, uniform)
-    tinted = [] if tints is None else [_tinted(block) for block in blocks]
-    whole, fewer = blocks, _thinned(blocks, levels[-1][..., 0].size) if thinned_rounds else blocks
+    whole, tinted = blocks, [] if tints is None else [_tinted(block) for block in blocks]
+    fewer = _thinned(blocks, levels[-1][..., 0].size) if thinned_rounds and not others else blocks
     while step < iterations:
         blocks = fewer if step < thinned_rounds * ROUND else whole
+        if others and step != (start or (0,))[0]:
+            blocks = others(step // ROUND)
+            tinted = [] if tints is None else [_tinted(block) for block in blocks]
         before, typical = -math.inf, math.inf
         if step:
             seen = System(blocks, space, resolution, tints, gains).see(levels)
@@ -212,45 +226,80 @@ def solve(
             weights = [w * _is_direct(b) for w, b in zip(weights, blocks, strict=True)]
         if step:  # the radiance is no longer uniform, and explains most of the images
             system.linearise(seen)
-        steps, changed = _search(system, levels, uniform, weights, seen, prior), gains
+        priors = _priors(system, uniform, prior, held)
+        steps, changed = _search(system, levels, weights, seen, priors), gains
+        if others:
+            held = _add_seen(held, system.diagonal(weights).levels)
         for x, found in itertools.islice(steps, min(ROUND, iterations - step)):
             step += 1
             fitted, held_out, _ = _measure(blocks, found)
             levels, changed = x.levels, None if gains is None else system.gains(x)
-            yield Progress(step, levels, tints, changed, fitted, held_out)
+            yield Progress(step, levels, tints, changed, held, fitted, held_out)
         gains = changed
-        if held_out < before + _WORTH and blocks is whole:
+        if held_out < before + _WORTH and blocks is whole and not others:
             return
+
+
+class _Priors(NamedTuple):
+    """What is known of the unknowns without the pixels.
+
+    Attributes:
+      weights: weight of the difference from `usual`.
+      usual: value of unknowns that no pixel sees: the mean of all pixels, and gains of 1.
+      held: weight of the difference from the start, for pixels of earlier rounds; 0 without them.
+    """
+
+    weights: Unknowns
+    usual: Unknowns
+    held: Unknowns
+
+
+def _priors(system: System, uniform: Pyramid, prior: float, held: Pyramid | None) -> _Priors:
+    weights = Unknowns(
+        tuple(jnp.float32(prior if i else 1e-2 * prior) for i in range(len(uniform))),
+        jnp.float32(_GAIN_PRIOR * prior),
+    )
+    nothing = jnp.zeros(())
+    return _Priors(
+        weights,
+        system.usual(uniform),
+        Unknowns(held or (nothing,) * len(uniform), nothing),
+    )
+
+
+def _add_seen(held: Pyramid | None, seen: Pyramid) -> Pyramid:
+    """Returns the weight of what pixels of earlier rounds have told, which fades."""
+    if held is None:
+        return jax.tree.map(lambda x: _FADES * x, seen)
+    return jax.tree.map(lambda x, y: _FADES * (x + y), held, seen)
 
 
 def _search(
     system: System,
     levels: Pyramid,
-    uniform: Pyramid,
     weights: list[Array],
     seen: list[Array],
-    prior: float,
+    priors: _Priors,
 ) -> Iterator[tuple[Unknowns, list[Array]]]:
     """Yields the unknowns, and the colours of the pixels, after each step of conjugate gradients.
 
     Args:
       system: linear function from the unknowns to the pixels.
       levels: radiance at the start.
-      uniform: radiance of vertices that no pixel sees, the mean of all pixels.
       weights: squared weight of each pixel and channel.
       seen: colours of the pixels at the start.
-      prior: weight of the details of the pyramid.
+      priors: what is known without the pixels.
     """
-    blocks = system.blocks
-    x, mean = system.present(levels), system.usual(uniform)
-    ridge = Unknowns(
-        tuple(jnp.float32(prior if i else 1e-2 * prior) for i in range(len(levels))),
-        jnp.float32(_GAIN_PRIOR * prior),
-    )
+    blocks, x = system.blocks, system.present(levels)
+    ridge = jax.tree.map(jnp.add, priors.weights, priors.held)
     diagonal = jax.tree.map(jnp.add, system.diagonal(weights), ridge)
     gap = [w * (b.linear - s) for w, b, s in zip(weights, blocks, seen, strict=True)]
     residual = jax.tree.map(
-        lambda a, weight, b, c: a - weight * (b - c), system.transpose(gap), ridge, x, mean
+        lambda a, weight, b, c: a - weight * (b - c),
+        system.transpose(gap),
+        priors.weights,
+        x,
+        priors.usual,
     )
     direction, rho = _begin_search(residual, diagonal)
     while True:

@@ -34,7 +34,7 @@ FIELD_ONLY = (
 )
 """Options that only a radiance field reads."""
 
-BACKDROP_ONLY = ("backdrop_resolution", "iterations", "exposure")
+BACKDROP_ONLY = ("backdrop_resolution", "iterations", "most_pixels", "exposure")
 """Options that only a backdrop reads."""
 
 # Options that determine the model of the far field.
@@ -181,6 +181,8 @@ class FieldConfig:
         option needs a field.
       backdrop_resolution: Number of cells per side of a face of the backdrop.
       iterations: Largest number of iterations of the backdrop's solver.
+      most_pixels: Largest number of pixels whose equations are in memory at once; of more, each
+        round of 8 iterations takes others, drawn at random.
       exposure: Exposure and white balance of the training images: fixed, or a learned gain for each
         image and channel (per_image), for captures; only of a backdrop.
     """
@@ -207,6 +209,7 @@ class FieldConfig:
     far_field: choices.FarField | None = option(None, after=_FAR_FIELD)
     backdrop_resolution: int | None = option(None, after=("far_field",))
     iterations: int | None = option(None, after=("far_field",))
+    most_pixels: int | None = option(None, after=("far_field",))
     exposure: choices.Exposure | None = option(None, after=("far_field",))
 
     def __post_init__(self) -> None:
@@ -225,7 +228,8 @@ class FieldConfig:
             )
         if self.max_res is not None and not 1 <= self.max_res <= _FINEST:
             raise ValueError(f"max_res is {self.max_res}. Give 1 to {_FINEST} cells per side.")
-        for name, least, most in (("backdrop_resolution", 4, _CELLS), ("iterations", 1, _FINEST)):
+        ranges = {"backdrop_resolution": (4, _CELLS), "iterations": (1, _FINEST)}
+        for name, (least, most) in {**ranges, "most_pixels": (1, _MOST)}.items():
             number = getattr(self, name)
             if number is not None and not least <= number <= most:
                 raise ValueError(f"{name} is {number}. Give {least} to {most}.")

@@ -9,17 +9,19 @@ calls them in this order; the command `train` calls it as well.
 """
 
 import contextlib
+import functools
 import math
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
+import numpy as np
 from jax.sharding import Mesh
+from jaxtyping import UInt8
 
 from refref_jax import atomic_files, configuration
 from refref_jax.data import image_files, scene_analysis, scene_folder, scene_source
@@ -28,9 +30,11 @@ from refref_jax.data.meshes import MeshPart
 from refref_jax.data.scene_folder import Frames
 from refref_jax.optics.scene import Scene
 from refref_jax.render import checkpoint_io, volume_rendering
+from refref_jax.render.backdrop import Pyramid
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Model, Params, init_params, path_detail
 from refref_jax.training import backdrop_equations, backdrop_solver, devices, loop, run_folder
+from refref_jax.training.backdrop_equations import Block, Gains
 from refref_jax.training.config import TrainConfig, require
 from refref_jax.training.loop import TrainState, init_state
 from refref_jax.training.objective import StepReport
@@ -355,10 +359,7 @@ def _solve(
 
     A checkpoint is written after each round of iterations; the solver may be done before the last.
     """
-    shape, bounds = model.config.backdrop, volume_rendering.domain(model.config)
-    begun = time.monotonic()
-    assert shape is not None
-    total, learned = require(config.model.iterations), config.model.exposure == "per_image"
+    begun, total = time.monotonic(), require(config.model.iterations)
 
     def traced(view: int, views: int) -> None:
         progress(0, total, f"tracing view {view} of {views}")
@@ -366,64 +367,103 @@ def _solve(
             raise KeyboardInterrupt  # there is no new state to save
 
     frames = scene_folder.read_frames(folder, "train")
-    blocks = _equations(model, scene, frames, traced)
-    state = _unsolved(model, gains=len(frames.names) if learned else 0)
+    images = scene_folder.read_images(frames)
+    share = min(1.0, require(config.model.most_pixels) / (images.size // 3))
+    equations = functools.partial(_equations, model, scene, frames, images, traced, share)
+    state = _unsolved(config, model, views=len(images), streams=share < 1.0)
     if checkpoints.newest() is not None:
         state = checkpoints.restore(state)
     step = int(state.step)
     earlier = run_folder.rewind_metrics(run, step)
-    surface: Any = {"space": bounds.space, "resolution": shape.resolution}
-    surface["tints"] = state.params.tints
-    seen = backdrop_solver.coverage(blocks, **surface)
-    run_folder.write_coverage(run, jax.device_get(seen))
-    iterations = backdrop_solver.solve(
-        blocks,
-        iterations=total,
-        start=(step, state.params.field) if step else None,
-        **surface,
-        gains=state.optimizer if learned else None,
-        tint_decay=config.losses.tint_decay,
-    )
-    for reached in iterations:
+    blocks = equations(step // backdrop_solver.ROUND if share < 1.0 else 0)
+    seen = backdrop_solver.coverage(blocks, **_surface(model), tints=state.params.tints)
+    run_folder.write_coverage(run, jax.device_get(seen / share))
+    others = equations if share < 1.0 else None
+    for reached in _iterate(config, model, state, blocks, others):
         step = reached.step
         line = {"step": step, "psnr": reached.fitted, "psnr_held_out": reached.held_out}
         line |= {"seconds": earlier + time.monotonic() - begun}
         run_folder.append_metrics(run, configuration.string_safe(line))
         progress(step, total, f"PSNR {reached.fitted:.2f}  held out {reached.held_out:.2f}")
-        own = reached.gains if learned else state.optimizer
-        state = TrainState(state.step, Params((), reached.pyramid, reached.tints), own)
+        params = Params((), reached.pyramid, reached.tints)
+        state = TrainState(state.step, params, _SolverState(reached.gains, reached.held))
         if step % backdrop_solver.ROUND == 0 and step < total:
             checkpoints.save(state._replace(step=jnp.asarray(step, jnp.int32)))
             if stop():
                 return step
     checkpoints.save(state._replace(step=jnp.asarray(total, jnp.int32)))
-    if learned:
-        run_folder.write_gains(run, frames.names, jax.device_get(jnp.exp(state.optimizer)))
+    if state.optimizer.gains is not None:
+        gains = jax.device_get(jnp.exp(state.optimizer.gains))
+        run_folder.write_gains(run, frames.names, gains)
     return total
 
 
-def _unsolved(model: SavedModel, *, gains: int) -> TrainState:
-    """Returns the state before the first iteration, with gains in place of an optimiser's state."""
+class _SolverState(NamedTuple):
+    """What continues the solver, beside the model; see `backdrop_solver.Progress`."""
+
+    gains: Gains | None
+    held: Pyramid | None
+
+
+def _unsolved(config: TrainConfig, model: SavedModel, *, views: int, streams: bool) -> TrainState:
+    """Returns the state before the first iteration."""
     params = init_params(jax.random.key(0), model.config)
-    learned = jnp.zeros((gains, 3)) if gains else optax.EmptyState()
-    return TrainState(jnp.zeros((), jnp.int32), params, learned)
+    gains = jnp.zeros((views, 3)) if config.model.exposure == "per_image" else None
+    held = jax.tree.map(jnp.zeros_like, params.field) if streams else None
+    return TrainState(jnp.zeros((), jnp.int32), params, _SolverState(gains, held))
+
+
+def _surface(model: SavedModel) -> dict[str, Any]:
+    """Returns kind and resolution of a backdrop."""
+    assert model.config.backdrop is not None
+    return {"space": model.config.space, "resolution": model.config.backdrop.resolution}
+
+
+def _iterate(
+    config: TrainConfig,
+    model: SavedModel,
+    state: TrainState,
+    blocks: Sequence[Block],
+    others: Callable[[int], Sequence[Block]] | None,
+) -> Iterator[backdrop_solver.Progress]:
+    """Yields the progress of the solver from a state on."""
+    step = int(state.step)
+    return backdrop_solver.solve(
+        blocks,
+        iterations=require(config.model.iterations),
+        start=(step, state.params.field) if step else None,
+        **_surface(model),
+        tints=state.params.tints,
+        gains=state.optimizer.gains,
+        held=state.optimizer.held,
+        tint_decay=config.losses.tint_decay,
+        others=others,
+    )
 
 
 def _equations(
-    model: SavedModel, scene: Scene, frames: Frames, progress: Callable[[int, int], None]
-) -> tuple[backdrop_equations.Block, ...]:
-    """Reads the training images, and returns the equations of their pixels."""
+    model: SavedModel,
+    scene: Scene,
+    frames: Frames,
+    images: UInt8[np.ndarray, "views h w 3"],
+    progress: Callable[[int, int], None],
+    share: float,
+    draw: int,
+) -> tuple[Block, ...]:
+    """Returns the equations of the pixels of training images, or of a share drawn at random."""
     shape = model.config.backdrop
     assert shape is not None
     return backdrop_equations.read(
         scene,
         frames.cameras,
-        scene_folder.read_images(frames),
+        images,
         settings=model.settings,
         domain=volume_rendering.domain(model.config),
         resolution=shape.resolution,
         most_taps=shape.most_taps,
         tally=path_detail(model.config, model.settings).tally,
+        share=share,
+        draw=draw,
         progress=progress,
     )
 

@@ -62,6 +62,9 @@ BACKDROP_RESOLUTION = 384
 BACKDROP_ITERATIONS = 32
 """Default number of iterations of its solver."""
 
+BACKDROP_PIXELS = 64_000_000
+"""Default number of pixels whose equations are in memory at once; they take 18.6 GiB."""
+
 _NEAR = 0.05
 _FAR_UNBOUNDED = 1000.0
 
@@ -265,6 +268,19 @@ def sampling_of(model: ModelConfig) -> dict[str, Any]:
         "max_res": grid and grid.max_res,
         "precision": model.field.precision,
         "dilation": model.dilation,
+    }
+
+
+def schedule_of(schedule: ScheduleConfig) -> dict[str, Any]:
+    """Returns the options of a schedule, by name."""
+    return {
+        "steps": schedule.steps,
+        "warmup": schedule.warmup,
+        "learning_rate": schedule.peak,
+        "final_learning_rate": schedule.end,
+        "anneal": schedule.anneal,
+        "batch": schedule.batch,
+        "pretraced_batches": schedule.pretraced_batches,
     }
 
 

@@ -358,6 +358,7 @@ def _resolve_far_field(
             "far_field=backdrop",
             backdrop_resolution=presets.BACKDROP_RESOLUTION,
             iterations=presets.BACKDROP_ITERATIONS,
+            most_pixels=presets.BACKDROP_PIXELS,
             exposure="fixed",
         )
     for name in BACKDROP_ONLY:
@@ -458,18 +459,8 @@ def _resolve_training(
     preset = presets.PRESETS[config.model.preset]
     steps = config.schedule.steps or preset.schedule.steps
     schedule = presets.stretched(preset.schedule, require(steps))
-    config = _decide(
-        config,
-        reasons,
-        f"preset={config.model.preset}",
-        steps=schedule.steps,
-        warmup=schedule.warmup,
-        learning_rate=schedule.peak,
-        final_learning_rate=schedule.end,
-        anneal=schedule.anneal,
-        batch=schedule.batch,
-        pretraced_batches=schedule.pretraced_batches,
-    )
+    why = f"preset={config.model.preset}"
+    config = _decide(config, reasons, why, **presets.schedule_of(schedule))
     presets.check_lengths(config.schedule)
     return config
 

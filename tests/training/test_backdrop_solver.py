@@ -234,3 +234,34 @@ def test_equal_images_have_equal_gains(ball):
 def test_a_black_image_leaves_all_gains_finite():
     last = _solve([_one_pixel(0.0), _one_pixel(0.5)], gains=jnp.zeros((2, 3)))
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(last[:4]))
+
+
+def test_rounds_with_other_pixels_come_close_to_all_pixels(ball):
+    views, sky = _views(10, 32), _environment()
+    images = _photographs(ball, sky, views, _TREE)
+
+    def some(draw):
+        return _equations(ball, views, images, settings=_TREE, share=0.3, draw=draw)
+
+    counts = [sum(len(block.srgb) for block in some(draw)) for draw in range(2)]
+    assert counts[0] != counts[1] and np.allclose(counts, 0.3 * 10 * 32**2, rtol=0.1)
+    rounds = {"iterations": 8 * backdrop_solver.ROUND}
+    blocks = _equations(ball, views, images, settings=_TREE)
+    all_, few = _solve(blocks, **rounds), _solve(some(0), **rounds)
+    streamed = _solve(some(0), others=some, **rounds)
+    assert streamed.step == 8 * backdrop_solver.ROUND
+
+    def held_out(solved):
+        seen = backdrop_equations.System(blocks, "unbounded", _RESOLUTION, None, None).see(
+            solved.pyramid
+        )
+        return backdrop_solver._measure(blocks, seen)[0]
+
+    assert held_out(streamed) > held_out(all_) - 0.8 and held_out(streamed) > held_out(few)
+    # A run that was paused after a round ends with the same bits.
+    first = _solve(some(0), others=some, iterations=2 * backdrop_solver.ROUND)
+    again = _solve(
+        some(2), others=some, start=(first.step, first.pyramid), held=first.held, **rounds
+    )
+    for ours, theirs in zip(jax.tree.leaves(again), jax.tree.leaves(streamed), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
