@@ -28,7 +28,7 @@ from refref_jax.render import pixels
 from refref_jax.render.model import ModelConfig
 from refref_jax.render.volume_rendering import Histogram
 from refref_jax.sampling import stepfun
-from refref_jax.sampling.cones import Gaussians
+from refref_jax.sampling.polylines import Gaussians
 from refref_jax.training import loop, objective
 from refref_jax.training.loop import optimizer
 
@@ -171,7 +171,7 @@ class _Profile:
         jax.block_until_ready(pretrace(self.setup))
 
     def _prepare_adam(self) -> Callable[[], None]:
-        rule = optimizer(self.setup.config.schedule)
+        rule = optimizer(self.setup.config.schedule, self.setup.model)
         slopes = jax.tree.map(jnp.ones_like, self._params)
 
         def update(held: tuple, slopes: tuple) -> tuple:

@@ -90,6 +90,9 @@ FarField = Literal["field", "backdrop"]
 Exposure = Literal["fixed", "per_image"]
 """Exposure of the training images: the same for all, or a gain for each of them."""
 
+InFront = Literal["nothing", "field"]
+"""What is in front of a backdrop; see `render.backdrop.BackdropConfig`."""
+
 Interior = Literal["field", "clear", "absorbing"]
 """Model of the inside of the objects; see `render.model.ModelConfig`."""
 

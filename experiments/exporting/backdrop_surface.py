@@ -18,7 +18,7 @@ from refref_jax.data import image_files
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths
 from refref_jax.render import backdrop, pixels, volume_rendering
-from refref_jax.render.model import Model
+from refref_jax.render.model import Model, surface_of
 from refref_jax.sampling.scene_bounds import Domain
 
 # Cells along each edge of a face of a sphere's mesh.
@@ -50,7 +50,7 @@ def faces(model: Model) -> Float[np.ndarray, "6 side side 3"]:
     Faces are in the order -x, +x, -y, +y, -z, +z. On a face of axis `a`, columns go along axis
     `a + 1` and rows along axis `a + 2`, both modulo 3, from the negative to the positive end.
     """
-    return np.asarray(backdrop.mipmap(model.params.field, model.config.space)[0])
+    return np.asarray(backdrop.mipmap(surface_of(model.params), model.config.space)[0])
 
 
 def as_sheet(grid: Float[np.ndarray, "6 side side n"]) -> Float[np.ndarray, "h w n"]:
@@ -102,7 +102,7 @@ def _from_centre(domain: Domain, directions: Float[np.ndarray, "rays 3"]) -> Ray
 
 def _look(model: Model, domain: Domain, rays: Rays) -> Float[np.ndarray, "rays 3"]:
     """Returns the linear RGB radiance that straight rays see."""
-    grids = backdrop.mipmap(model.params.field, model.config.space)
+    grids = backdrop.mipmap(surface_of(model.params), model.config.space)
     numbers = jnp.arange(rays.radii.size, dtype=jnp.int32)
     lookups = backdrop.locate(
         domain,

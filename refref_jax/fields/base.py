@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from refref_jax.choices import Footprint, Precision
-from refref_jax.sampling.cones import Gaussians
+from refref_jax.sampling.polylines import Gaussians
 
 Params = Any
 """Pytree of arrays, from `init_radiance` or `init_density`."""

@@ -21,7 +21,7 @@ from refref_jax import numerics
 from refref_jax.choices import Precision
 from refref_jax.configuration import FORMERLY
 from refref_jax.fields.hash_grid_kernels import interpolate
-from refref_jax.sampling.cones import Gaussians
+from refref_jax.sampling.polylines import Gaussians
 
 _INITIAL_RANGE = 1e-4
 

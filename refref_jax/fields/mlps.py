@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from refref_jax.choices import ColourNetwork, Precision
 from refref_jax.fields.base import DensityConfig, RadianceConfig, dense
 from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid
-from refref_jax.sampling.cones import Gaussians
+from refref_jax.sampling.polylines import Gaussians
 
 
 def spherical_harmonics(direction: Float[Array, "3"]) -> Float[Array, "16"]:

@@ -39,7 +39,7 @@ from refref_jax.fields.mlps import (
     grid_network,
     nowhere,
 )
-from refref_jax.sampling.cones import Gaussians
+from refref_jax.sampling.polylines import Gaussians
 
 
 @dataclasses.dataclass(frozen=True)

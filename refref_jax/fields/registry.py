@@ -17,7 +17,7 @@ from refref_jax.fields.base import (
     Radiance,
     RadianceConfig,
 )
-from refref_jax.sampling.cones import Gaussians
+from refref_jax.sampling.polylines import Gaussians
 
 KINDS: dict[str, FieldKind] = {
     "zipnerf": zipnerf.KIND,

@@ -34,7 +34,7 @@ from refref_jax.fields.mlps import (
     grid_network,
     nowhere,
 )
-from refref_jax.sampling.cones import Gaussians
+from refref_jax.sampling.polylines import Gaussians
 
 # Shift of the softplus: the density of an untrained field is low, but not zero.
 _DENSITY_SHIFT = -1.0

@@ -33,7 +33,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from refref_jax import numerics
-from refref_jax.choices import Space
+from refref_jax.choices import InFront, Space
 from refref_jax.native_loop import native_loop
 from refref_jax.optics.light_paths import PathEnds
 from refref_jax.sampling import scene_bounds
@@ -49,18 +49,18 @@ class BackdropConfig:
     Attributes:
       resolution: number of cells per side of a face.
       most_taps: largest number of taps along each axis of a ray's footprint.
+      in_front: `field` for opaque parts and parts whose inside is a field, `nothing` without such.
     """
 
     resolution: int
     most_taps: int = 3
+    in_front: InFront = "nothing"
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
-        if self.resolution < 1 or self.most_taps < 1:
-            raise ValueError(
-                f"The backdrop has resolution {self.resolution} and at most {self.most_taps} taps. "
-                "Give positive numbers."
-            )
+        counts = self.resolution, self.most_taps
+        if min(counts) < 1:
+            raise ValueError(f"Resolution and taps are {counts}. Give positive numbers.")
 
 
 # Number of cells per side below which a level is not halved again.

@@ -17,7 +17,7 @@ from refref_jax.fields.base import DensityConfig, RadianceConfig
 from refref_jax.optics.path_settings import Detail, PathSettings, Tally
 from refref_jax.optics.scene import Scene
 from refref_jax.render import backdrop, learned_media
-from refref_jax.render.backdrop import BackdropConfig
+from refref_jax.render.backdrop import BackdropConfig, Pyramid
 from refref_jax.render.learned_media import LearnedTints
 
 # Segments before and after a convex object.
@@ -69,7 +69,7 @@ class ModelConfig:
         for none.
       field_parts: parts whose inside is sampled too, where `interior` leaves out the others.
       centre: centre of the cube or ball, world units; it is the centre of the fields' unit cube.
-      backdrop: surface behind the objects that takes the place of all fields, or `None`.
+      backdrop: surface behind the objects that takes the place of the field around them, or `None`.
       last_sample: where the field is evaluated for the last, opaque interval: in its `middle`,
         as in models of earlier versions, or at the `end` of the path, which is on a surface if the
         scene is bounded or spherical; if it is unbounded, always in the middle.
@@ -119,10 +119,11 @@ def path_detail(config: ModelConfig, settings: PathSettings) -> Detail:
     """Returns the parts of light paths that a model needs."""
     tally: Tally = "parts" if config.learned_tints else "none"
     most = settings.max_bends + 1
-    if config.backdrop is not None:
+    samples_inside = config.interior == "field" or bool(config.field_parts)
+    if config.backdrop is not None and not (has_foreground(config) and samples_inside):
         return Detail("outside", min(_MOST_LEGS, most), "differential", tally)
-    if config.interior == "field" or config.field_parts:
-        return Detail("all", most, config.footprint, tally)
+    if samples_inside:
+        return Detail("all", most, "differential" if config.backdrop else config.footprint, tally)
     legs = _CONVEX_LEGS if settings.reentry == "impossible" else _MOST_LEGS
     return Detail("outside", min(legs, most), config.footprint, tally)
 
@@ -132,12 +133,24 @@ def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
         raise ValueError(f"{name} is {value!r}, which is unknown. Use one of {', '.join(choices)}.")
 
 
+class Layers(NamedTuple):
+    """Parameters of a backdrop and of what is in front of it.
+
+    Attributes:
+      field: parameters of the radiance field.
+      backdrop: radiance of each level of the surface.
+    """
+
+    field: base.Params
+    backdrop: Pyramid
+
+
 class Params(NamedTuple):
     """The learned part of a model.
 
     Attributes:
       proposals: parameters of each proposal level's density field.
-      field: parameters of the radiance field, or the pyramid of a backdrop.
+      field: parameters of the radiance field, the pyramid of a backdrop, or both (`Layers`).
       tints: learned tints and absorption of the parts, if any.
     """
 
@@ -165,11 +178,24 @@ class Model(NamedTuple):
 def init_params(key: Array, config: ModelConfig) -> Params:
     """Returns initial parameters of all fields of a model."""
     colours = learned_media.init(config.learned_tints) if config.learned_tints else None
-    if config.backdrop is not None:
+    if config.backdrop is not None and not has_foreground(config):
         return Params((), backdrop.init(config.backdrop.resolution), colours)
     field_key, *keys = jax.random.split(key, 1 + len(config.proposals))
     proposals = tuple(
         registry.init_density(proposal_key, proposal.field)
         for proposal_key, proposal in zip(keys, config.proposals, strict=True)
     )
-    return Params(proposals, registry.init_radiance(field_key, config.field), colours)
+    field = registry.init_radiance(field_key, config.field)
+    if config.backdrop is not None:
+        field = Layers(field, backdrop.init(config.backdrop.resolution))
+    return Params(proposals, field, colours)
+
+
+def has_foreground(config: ModelConfig) -> bool:
+    """Returns whether a field is in front of a backdrop."""
+    return config.backdrop is not None and config.backdrop.in_front == "field"
+
+
+def surface_of(params: Params) -> Pyramid:
+    """Returns the radiance of a backdrop."""
+    return params.field.backdrop if isinstance(params.field, Layers) else params.field

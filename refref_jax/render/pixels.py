@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 from refref_jax.optics import light_paths
 from refref_jax.optics.light_paths import LightPaths
 from refref_jax.render import backdrop, learned_media, volume_rendering
-from refref_jax.render.model import ModelConfig, Params
+from refref_jax.render.model import ModelConfig, Params, has_foreground, surface_of
 from refref_jax.render.volume_rendering import Composite, Jitter, PathRadiance
 from refref_jax.sampling import scene_bounds
 
@@ -99,12 +99,18 @@ def render_paths(
 ) -> PathRadiance:
     """Renders each path of a batch independently."""
     if config.backdrop is not None:
-        return _see_backdrop(params, config, paths)
+        seen = _see_backdrop(params, config, paths)
+        if not has_foreground(config):
+            return PathRadiance(seen, (), jnp.ones((paths.radii.shape[0], 0), bool))
+        render = jax.vmap(volume_rendering.foreground_radiance, in_axes=(None, None, 0, 0, None))
+        front = render(params, config, paths, jitter, anneal)
+        behind = jax.vmap(volume_rendering.in_front_of)(front.composite, seen.rgb, seen.mean)
+        return front._replace(composite=behind)
     render = jax.vmap(volume_rendering.path_radiance, in_axes=(None, None, 0, 0, None))
     return render(params, config, paths, jitter, anneal)
 
 
-def _see_backdrop(params: Params, config: ModelConfig, paths: LightPaths) -> PathRadiance:
+def _see_backdrop(params: Params, config: ModelConfig, paths: LightPaths) -> Composite:
     """Returns what each path sees of the backdrop, at the distance where it ends there."""
     assert config.backdrop is not None
     ends, bounds = light_paths.ends_of(paths), volume_rendering.domain(config)
@@ -117,16 +123,18 @@ def _see_backdrop(params: Params, config: ModelConfig, paths: LightPaths) -> Pat
         resolution=resolution,
         most_taps=config.backdrop.most_taps,
     )
-    mips = backdrop.mipmap(params.field, config.space)
+    surface = surface_of(params)
+    if has_foreground(config):  # only the field in front of it is trained
+        surface = jax.lax.stop_gradient(surface)
+    mips = backdrop.mipmap(surface, config.space)
     leave = jax.vmap(functools.partial(scene_bounds.exit_distance, bounds))
     distance = ends.tau + leave(ends.origins, ends.directions)
-    seen = Composite(
+    return Composite(
         rgb=backdrop.radiance(mips, lookups),
         accumulation=jnp.ones_like(paths.radii),
         median=distance,
         mean=distance,
     )
-    return PathRadiance(seen, histograms=(), outside=jnp.ones((count, 0), bool))
 
 
 def random_jitter(key: Array, config: ModelConfig, slots: Int[Array, " paths"]) -> Jitter:

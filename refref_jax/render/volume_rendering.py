@@ -21,12 +21,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from refref_jax import numerics
-from refref_jax.fields import registry
+from refref_jax.fields import base, registry
+from refref_jax.fields.base import Radiance
 from refref_jax.optics.light_paths import LightPaths
-from refref_jax.render.model import ModelConfig, Params
-from refref_jax.sampling import cones, polylines, scene_bounds, stepfun
-from refref_jax.sampling.cones import Gaussians
-from refref_jax.sampling.polylines import Polyline, PolylinePoint
+from refref_jax.render.model import Layers, ModelConfig, Params
+from refref_jax.sampling import polylines, scene_bounds, stepfun
+from refref_jax.sampling.polylines import Gaussians, Polyline, PolylinePoint
 
 # Minimum dilation of a proposal, in units of the full path (Mip-NeRF 360, supplement).
 _DILATION_BIAS = 0.0025
@@ -180,6 +180,92 @@ def path_radiance(
     """
     line = polyline(config, path)
     warp = distance_warp(config, line)
+    samples, seen, histograms = _sampled(params, config, line, warp, jitter, anneal)
+    weights = _weigh(config, seen.density, samples.t)
+    composited = composite(weights, seen.rgb, samples.t)
+    return PathRadiance(
+        composite=_in_arc_length(line, composited),
+        histograms=(*histograms, Histogram(samples.s, weights)),
+        outside=samples.points.outside,
+    )
+
+
+def foreground_radiance(
+    params: Params,
+    config: ModelConfig,
+    path: LightPaths,
+    jitter: Jitter,
+    anneal: Float[Array, ""],
+) -> PathRadiance:
+    """Renders what is in front of a backdrop along one light path.
+
+    The field is sampled inside the objects whose interior it models, and once where the path ends
+    on an opaque surface. The accumulation is the share of the light that does not come from the
+    backdrop; arguments as in `path_radiance`.
+    """
+    nothing = jnp.zeros_like(path.radii)
+    front = Composite(jnp.zeros_like(path.throughput), nothing, nothing + jnp.inf, nothing)
+    histograms: tuple[Histogram, ...] = ()
+    outside = jnp.ones((0,), bool)
+    if config.interior == "field" or config.field_parts:
+        line = polyline(config, path)
+        length = jnp.max(line.knots, where=jnp.isfinite(line.knots), initial=0.0)
+        far = jnp.maximum(length, _SHORTEST * config.radius)
+        warp = scene_bounds.DistanceWarp(0.0, far, config.radius)
+        samples, seen, proposed = _sampled(params, config, line, warp, jitter, anneal)
+        weights = jnp.where(length > 0.0, _weigh(config, seen.density, samples.t), 0.0)
+        front = _in_arc_length(line, composite(weights, seen.rgb, samples.t))
+        histograms = (*proposed, Histogram(samples.s, weights))
+        outside = samples.points.outside
+    if path.stop is not None:
+        stop = path.stop.tau
+        rgb = _opaque_surface(params, config, polylines.whole_path(path))
+        closed = in_front_of(front, rgb, stop)
+        front = jax.tree.map(lambda x, y: jnp.where(jnp.isfinite(stop), x, y), closed, front)
+    return PathRadiance(front, histograms, outside)
+
+
+def in_front_of(front: Composite, rgb: Float[Array, "3"], distance: Float[Array, ""]) -> Composite:
+    """Returns the colour and distance of a path that ends on an opaque surface.
+
+    Args:
+      front: light from in front of the surface.
+      rgb: linear radiance of the surface.
+      distance: distance of the surface.
+    """
+    rest = jnp.maximum(1.0 - front.accumulation, 0.0)
+    near = jnp.where(jnp.isfinite(front.mean), front.mean, 0.0)
+    return Composite(
+        rgb=front.rgb + rest * rgb,
+        accumulation=front.accumulation + rest,
+        median=jnp.where(jnp.isfinite(front.median), front.median, distance),
+        mean=front.accumulation * near + rest * distance,
+    )
+
+
+def _opaque_surface(params: Params, config: ModelConfig, whole: Polyline) -> Float[Array, "3"]:
+    """Returns the radiance of the opaque surface that a path ends on; any if it does not."""
+    assert whole.stop is not None
+    at = jnp.where(jnp.isfinite(whole.stop), whole.stop, 0.0)
+    cone = polylines.multisamples(whole, at, at, jnp.zeros_like(at), count=config.multisamples)
+    cell = scene_bounds.to_unit_cube(domain(config), cone)
+    direction = polylines.point_at(whole, at).direction
+    return registry.radiance(_field_of(params), config.field, cell, direction).rgb
+
+
+def _field_of(params: Params) -> base.Params:
+    return params.field.field if isinstance(params.field, Layers) else params.field
+
+
+def _sampled(
+    params: Params,
+    config: ModelConfig,
+    line: Polyline,
+    warp: scene_bounds.DistanceWarp,
+    jitter: Jitter,
+    anneal: Float[Array, ""],
+) -> tuple[Samples, Radiance, list[Histogram]]:
+    """Returns the final samples, what the field returns there, and the proposals' histograms."""
 
     def drawn(level: int, count: int) -> Samples:
         noise = jax.tree.map(lambda x: x[level], jitter)
@@ -195,15 +281,9 @@ def path_radiance(
 
     samples = drawn(-1, config.samples)
     seen = jax.vmap(registry.radiance, in_axes=(None, None, 0, 0))(
-        params.field, config.field, samples.gaussians, samples.points.direction
+        _field_of(params), config.field, samples.gaussians, samples.points.direction
     )
-    weights = _weigh(config, seen.density, samples.t)
-    composited = composite(weights, seen.rgb, samples.t)
-    return PathRadiance(
-        composite=_in_arc_length(line, composited),
-        histograms=(*histograms, Histogram(samples.s, weights)),
-        outside=samples.points.outside,
-    )
+    return samples, seen, histograms
 
 
 def levels(config: ModelConfig) -> int:
@@ -234,6 +314,10 @@ def domain(config: ModelConfig) -> scene_bounds.Domain:
 
 def polyline(config: ModelConfig, path: LightPaths) -> Polyline:
     """Returns the polyline that a model samples: without the segments that it takes to be empty."""
+    if config.backdrop is not None:
+        return polylines.inside_path(
+            path, parts=None if config.interior == "field" else config.field_parts
+        )
     if config.interior == "field":
         return polylines.whole_path(path)
     return polylines.outside_path(path, also=config.field_parts)
@@ -269,13 +353,13 @@ def sample(
     s = stepfun.snap(_draw(config, histograms, strata, anneal), bends)
     t = scene_bounds.to_distance(warp, s)
     starts, ends = t[:-1], t[1:]
-    if config.last_sample == "end" and config.space != "unbounded":
+    if config.last_sample == "end" and config.space != "unbounded" and config.backdrop is None:
         starts, ends = (x.at[-1].set(warp.far) for x in (starts, ends))
     points = jax.vmap(polylines.point_at, in_axes=(None, 0))(line, 0.5 * (starts + ends))
     turns = jitter.rotations + _PATTERN_TURN * (jnp.arange(count, dtype=t.dtype) % 2)
 
     def cone(start: Array, end: Array, turn: Array) -> Gaussians:
-        world = cones.multisamples(line, start, end, turn, count=config.multisamples)
+        world = polylines.multisamples(line, start, end, turn, count=config.multisamples)
         return scene_bounds.to_unit_cube(domain(config), world)
 
     return Samples(s, t, jax.vmap(cone)(starts, ends, turns), points)
@@ -299,15 +383,20 @@ def _draw(
         edges, weights = stepfun.dilate(edges, weights, config.dilation / drawn + _DILATION_BIAS)
     # Bins of width 0 stay empty; the others tend to equal weight as the exponent tends to 0.
     trusted = jnp.where(jnp.diff(edges) > 0.0, weights**anneal, 0.0)
-    return stepfun.sample_intervals(strata, edges, trusted)
+    intervals = stepfun.sample_intervals(strata, edges, trusted)
+    if config.backdrop is None:
+        return intervals
+    # In front of a backdrop, no light may pass beside the intervals.
+    return intervals.at[0].set(edges[0]).at[-1].set(edges[-1])
 
 
 def _weigh(
     config: ModelConfig, density: Float[Array, " samples"], edges: Float[Array, " edges"]
 ) -> Float[Array, " samples"]:
-    """Converts densities to weights; the last interval is opaque, like the background."""
+    """Converts densities to weights; the last interval is opaque, unless there is a backdrop."""
     lengths = jnp.diff(edges) / config.radius
-    return opaque_end(alpha_weights(density, lengths))
+    weights = alpha_weights(density, lengths)
+    return weights if config.backdrop is not None else opaque_end(weights)
 
 
 def _in_arc_length(line: Polyline, composite: Composite) -> Composite:

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from refref_jax import numerics
 from refref_jax.choices import ORIGIN, Position, Space
-from refref_jax.sampling.cones import Gaussians
+from refref_jax.sampling.polylines import Gaussians
 
 _LAMBDA = -1.5
 

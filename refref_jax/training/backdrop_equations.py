@@ -75,14 +75,22 @@ class Unknowns(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """What some rays see."""
+    """What some rays see.
+
+    Attributes:
+      lookups: points of the surface that the light paths end on.
+      crossings: what learned tints read of the paths.
+      hidden: whether a path meets something in front of the surface.
+    """
 
     lookups: Lookups
     crossings: Float[Array, "paths unknowns"]
+    hidden: Bool[Array, " paths"]
 
 
 @functools.partial(
-    jax.jit, static_argnames=("settings", "domain", "resolution", "most_taps", "tally")
+    jax.jit,
+    static_argnames=("settings", "domain", "resolution", "most_taps", "tally", "fields"),
 )
 def _look(
     scene: Scene,
@@ -93,23 +101,29 @@ def _look(
     resolution: int,
     most_taps: int,
     tally: Tally,
+    fields: tuple[int, ...],
 ) -> _Seen:
     """Returns where the paths of rays end; their pixels are the indices of the rays."""
-    unknowns = 2 * scene.interfaces.index_inside.shape[0] if tally == "parts" else 0
-    if unknowns and settings.max_bends:
+    parts = scene.interfaces.index_inside.shape[0]
+    unknowns = 2 * parts if tally == "parts" else 0
+    if (unknowns or fields) and settings.max_bends:
         # The first and the last segment are the fewest that can be stored.
-        detail = Detail("outside", 2, "differential", tally)
+        detail = Detail("outside", 2, "differential", "parts")
         paths = path_tracing.trace(scene, rays, settings=settings, detail=detail).paths
         ends = light_paths.ends_of(paths)
-        crossings = learned_media.crossings(paths, radius=domain.radius)
+        crossings = learned_media.crossings(paths, radius=domain.radius)[:, :unknowns]
+        hidden = jnp.any(paths.path_lengths[:, jnp.asarray(fields, jnp.int32)] > 0.0, axis=1)
     else:
         traced = path_tracing.trace_ends(scene, rays, settings=settings, footprint="differential")
         ends = traced.ends
         crossings = jnp.zeros((ends.rays.shape[0], unknowns), ends.tau.dtype)
+        hidden = jnp.zeros(ends.rays.shape, bool)
+    if ends.stop is not None:
+        hidden |= jnp.isfinite(ends.stop.tau)
     throughput = jnp.where(light_paths.exists(ends)[:, None], ends.throughput, 0.0)
     ends = ends._replace(throughput=throughput)
     lookups = backdrop.locate(domain, ends, ends.rays, resolution=resolution, most_taps=most_taps)
-    return _Seen(lookups, crossings)
+    return _Seen(lookups, crossings, hidden)
 
 
 def read(
@@ -123,6 +137,7 @@ def read(
     most_taps: int = 3,
     side: int = 1,
     tally: Tally = "none",
+    fields: tuple[int, ...] = (),
     blocks: int = 2,
     share: float = 1.0,
     draw: int = 0,
@@ -140,6 +155,8 @@ def read(
       most_taps: largest number of taps along each axis of a ray's footprint.
       side: number of rays along each edge of a pixel.
       tally: `parts` if tints and absorption are learned.
+      fields: parts whose inside is a field: pixels whose light crosses one, or ends on an opaque
+        part, are left out.
       blocks: number of blocks that the views are split into; they are traced and solved at once.
       share: share of the pixels, drawn at random.
       draw: number of the draw; another one draws other pixels.
@@ -153,7 +170,13 @@ def read(
     done = itertools.count(1)
 
     look = functools.partial(
-        _look, scene, domain=domain, resolution=resolution, most_taps=most_taps, tally=tally
+        _look,
+        scene,
+        domain=domain,
+        resolution=resolution,
+        most_taps=most_taps,
+        tally=tally,
+        fields=fields,
     )
 
     def trace(views: Int[np.ndarray, " views"]) -> Block:
@@ -176,10 +199,23 @@ def read(
         joined = jax.tree.map(lambda *parts: np.concatenate(parts), *each)
         lookups = joined.lookups._replace(throughput=joined.lookups.throughput / side**2)
         joined = joined._replace(lookups=lookups)
-        return _block(joined, photographs[views], views, drawn)
+        block = _block(joined, photographs[views], views, drawn)
+        if not np.any(joined.hidden):
+            return block
+        hidden = joined.lookups.pixels[joined.hidden]
+        return of_pixels(block, np.setdiff1d(np.arange(len(block.srgb)), hidden))
 
     split = np.array_split(np.arange(len(photographs)), min(blocks, len(photographs)))
     return tuple(jax.device_put(block) for block in at_once(trace, split))
+
+
+def meets(scene: Scene, cameras: Cameras) -> Bool[np.ndarray, "views h w"]:
+    """Returns which pixels' camera rays meet an object."""
+    views, found = len(cameras.poses), []
+    for view in range(views):
+        rays, _ = cameras_module.rays_of_views(cameras, np.array([view]), 1)
+        found.append(np.isfinite(images.find_first_surface(scene.surfaces, rays).distances))
+    return np.stack(found).reshape(views, cameras.height, cameras.width)
 
 
 def _drawn(count: int, share: float, seed: tuple[int, int]) -> Bool[np.ndarray, " pixels"]:
@@ -227,7 +263,8 @@ def _block(
     held_out = np.random.default_rng(int(views[0])).integers(_HELD_OUT, size=drawn.size) == 0
     kept, view = np.float32(~held_out[drawn]), np.repeat(views, drawn.size // len(views))[drawn]
     linear = pixels.srgb_to_linear(jax.device_put(host_array(srgb)))
-    return Block(*seen, linear, *map(host_array, (srgb, kept, view.astype(np.int32))))
+    known = (srgb, kept, view.astype(np.int32))
+    return Block(seen.lookups, seen.crossings, linear, *map(host_array, known))
 
 
 def thinned(block: Block, one_in: int) -> Block:

@@ -173,6 +173,7 @@ def solve(
     tints: LearnedTints | None = None,
     gains: Gains | None = None,
     held: Pyramid | None = None,
+    mean: Float[Array, "3"] | None = None,
     prior: float = 1e-3,
     tint_decay: float = 0.0,
     thinned_rounds: int = 2,
@@ -192,6 +193,7 @@ def solve(
       tints: tints and absorption to begin with, if they are learned.
       gains: logarithm of the gain of each image to begin with, if they are learned.
       held: weight with which the radiance is kept, of an earlier run with `others`.
+      mean: linear RGB of vertices that no pixel sees; by default the mean of the pixels.
       prior: weight of the details of the pyramid, relative to a pixel's squared sRGB error.
       tint_decay: weight of the optical density of tints and absorption, relative to the mean
         squared sRGB error.
@@ -200,7 +202,8 @@ def solve(
         memory; `blocks` are those of the round at the start. A round then also keeps to its start,
         the more so the more pixels of earlier rounds have seen a vertex, and takes all iterations.
     """
-    mean = jnp.mean(jnp.stack([jnp.mean(block.linear, axis=0) for block in blocks]), axis=0)
+    if mean is None:
+        mean = jnp.mean(jnp.stack([jnp.mean(block.linear, axis=0) for block in blocks]), axis=0)
     uniform = backdrop.init(resolution, radiance=mean)
     step, levels = start or (0, uniform)
     whole, tinted = blocks, [] if tints is None else [_tinted(block) for block in blocks]

@@ -51,7 +51,7 @@ _MOST = 2**31 - 1
 
 _FINEST, _CELLS, _SEEDS = 2**20, 2**13, 2**32
 
-# Numbers of multisamples of the patterns in `sampling.cones`.
+# Numbers of multisamples of the patterns in `sampling.polylines`.
 _PATTERNS = (1, 6)
 
 # A 32-bit hash cannot address more entries.

@@ -9,32 +9,28 @@ calls them in this order; the command `train` calls it as well.
 """
 
 import contextlib
-import functools
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import UInt8
 
 from refref_jax import atomic_files, configuration
 from refref_jax.data import image_files, scene_analysis, scene_folder, scene_source
 from refref_jax.data.batches import PixelSampler
 from refref_jax.data.meshes import MeshPart
-from refref_jax.data.scene_folder import Frames
 from refref_jax.optics.scene import Scene
-from refref_jax.render import checkpoint_io, volume_rendering
-from refref_jax.render.backdrop import Pyramid
+from refref_jax.render import checkpoint_io
 from refref_jax.render.checkpoint_io import SavedModel
-from refref_jax.render.model import Model, Params, init_params, path_detail
-from refref_jax.training import backdrop_equations, backdrop_solver, devices, loop, run_folder
-from refref_jax.training.backdrop_equations import Block, Gains
+from refref_jax.render.model import (
+    Model,
+    has_foreground,
+)
+from refref_jax.training import backdrop_equations, backdrop_fit, devices, loop, run_folder
 from refref_jax.training.config import TrainConfig, require
 from refref_jax.training.loop import TrainState, init_state
 from refref_jax.training.objective import StepReport
@@ -261,12 +257,13 @@ def train(
     config, model = run_folder.read_config(run), checkpoint_io.read_static(run)
     lock = atomic_files.hold(run) if devices.is_first() else contextlib.nullcontext()
     with lock, Checkpoints(run, keep=periods.keep) as checkpoints:
-        solved = config.model.far_field == "backdrop"
+        surface = model.config.backdrop is not None
+        solved = surface and not has_foreground(model.config)
         total = require(config.model.iterations if solved else config.schedule.steps)
         if checkpoints.newest() == total:
             report(f"{run} is trained already: {total} {'iterations' if solved else 'steps'}.")
             return True
-        if solved and jax.process_count() > 1:
+        if surface and jax.process_count() > 1:
             raise ValueError(
                 f"{run} has far_field=backdrop, which one process solves, but there are "
                 f"{jax.process_count()}. Run it in one."
@@ -274,35 +271,44 @@ def train(
         folder = scene_source.open_scene(scene or config.scene.path)
         objects = checkpoint_io.load_scene(run)
         if solved:
-            step = _solve(run, config, model, objects, folder, checkpoints, progress, stop)
+            step = backdrop_fit.solve(
+                run, config, model, objects, folder, checkpoints, progress, stop
+            )
             if step < total:
                 report(f"Stopped at iteration {step}.")
             return step == total
-        sampler = _sampler(config, folder)
+        sampler = _sampler(config, folder, objects if surface else None)
         setup = loop.set_up(config, model.config, model.settings, objects, sampler, mesh=mesh)
         if setup.hit_fraction == 0.0 and model.settings.max_bends > 0:
             report(
                 "warning: no camera ray hits the meshes, so no light is bent. Check that their "
                 "units, axes and position are those of the cameras."
             )
+        begun = time.monotonic()
         state = init_state(config.seed, model.config, config.schedule)
         state = devices.put_everywhere(state, mesh=mesh)
         if checkpoints.newest() is not None:
             state = checkpoints.restore(state)
+        elif surface:
+            state = backdrop_fit.behind_field(state, config, model, objects, folder, progress, stop)
         if devices.any_process(stop()):
             raise KeyboardInterrupt  # there is no new state to save
-        step = _take_steps(run, setup, state, checkpoints, periods, progress, stop)
+        # Of a run with fields alone, these are the seconds of its steps.
+        begun = begun if surface else time.monotonic()
+        step = _take_steps(run, setup, state, checkpoints, periods, progress, stop, begun)
     if step < total:
         report(f"Stopped at step {step}.")
     return step == total
 
 
-def _sampler(config: TrainConfig, scene: Path) -> PixelSampler:
-    """Reads the training pixels of a run."""
+def _sampler(config: TrainConfig, scene: Path, objects: Scene | None) -> PixelSampler:
+    """Reads the training pixels of a run, or only those whose rays meet given objects."""
     frames = scene_folder.read_frames(scene, "train")
     kept = None
     if config.scene.pixels == "background":
         kept = image_files.well_outside(scene_folder.read_masks(frames))
+    if objects is not None:
+        kept = backdrop_equations.meets(objects, frames.cameras)
     images, batch = scene_folder.read_images(frames), require(config.schedule.batch)
     return PixelSampler(images, frames.cameras, seed=config.seed, batch=batch, kept=kept)
 
@@ -315,14 +321,14 @@ def _take_steps(
     periods: Periods,
     progress: Progress,
     stop: Callable[[], bool],
+    begun: float,
 ) -> int:
-    """Takes the remaining steps, and returns the number of the last."""
+    """Takes the remaining steps, and returns the number of the last; seconds count from `begun`."""
     schedule = setup.config.schedule
     total, batch, step = require(schedule.steps), require(schedule.batch), int(state.step)
     writes = devices.is_first()
     earlier = run_folder.rewind_metrics(run, step) if writes else 0.0
-    start = last = time.monotonic()
-    logged = step
+    last, logged = time.monotonic(), step
     progress(step, total, "")
     every = (_MOST_STEPS, periods.log, periods.checkpoint)
     for stepped, measured in loop.run_steps(setup, state, total, every=every):
@@ -331,7 +337,7 @@ def _take_steps(
             measured = jax.device_get(measured)
             now = time.monotonic()
             rate = batch * (step - logged) / (now - last)
-            line = _line(step, measured, rate, earlier + now - start)
+            line = _line(step, measured, rate, earlier + now - begun)
             if writes:
                 run_folder.append_metrics(run, line)
             text = f"loss {measured.loss:.5f}  PSNR {measured.psnr:.2f}  {rate:.0f} rays/s"
@@ -343,129 +349,6 @@ def _take_steps(
         if stopping:
             break
     return step
-
-
-def _solve(
-    run: Path,
-    config: TrainConfig,
-    model: SavedModel,
-    scene: Scene,
-    folder: Path,
-    checkpoints: Checkpoints,
-    progress: Progress,
-    stop: Callable[[], bool],
-) -> int:
-    """Solves for the backdrop, and returns the number of the last iteration.
-
-    A checkpoint is written after each round of iterations; the solver may be done before the last.
-    """
-    begun, total = time.monotonic(), require(config.model.iterations)
-
-    def traced(view: int, views: int) -> None:
-        progress(0, total, f"tracing view {view} of {views}")
-        if stop():
-            raise KeyboardInterrupt  # there is no new state to save
-
-    frames = scene_folder.read_frames(folder, "train")
-    images = scene_folder.read_images(frames)
-    share = min(1.0, require(config.model.most_pixels) / (images.size // 3))
-    equations = functools.partial(_equations, model, scene, frames, images, traced, share)
-    state = _unsolved(config, model, views=len(images), streams=share < 1.0)
-    if checkpoints.newest() is not None:
-        state = checkpoints.restore(state)
-    step = int(state.step)
-    earlier = run_folder.rewind_metrics(run, step)
-    blocks = equations(step // backdrop_solver.ROUND if share < 1.0 else 0)
-    seen = backdrop_solver.coverage(blocks, **_surface(model), tints=state.params.tints)
-    run_folder.write_coverage(run, jax.device_get(seen / share))
-    others = equations if share < 1.0 else None
-    for reached in _iterate(config, model, state, blocks, others):
-        step = reached.step
-        line = {"step": step, "psnr": reached.fitted, "psnr_held_out": reached.held_out}
-        line |= {"seconds": earlier + time.monotonic() - begun}
-        run_folder.append_metrics(run, configuration.string_safe(line))
-        progress(step, total, f"PSNR {reached.fitted:.2f}  held out {reached.held_out:.2f}")
-        params = Params((), reached.pyramid, reached.tints)
-        state = TrainState(state.step, params, _SolverState(reached.gains, reached.held))
-        if step % backdrop_solver.ROUND == 0 and step < total:
-            checkpoints.save(state._replace(step=jnp.asarray(step, jnp.int32)))
-            if stop():
-                return step
-    checkpoints.save(state._replace(step=jnp.asarray(total, jnp.int32)))
-    if state.optimizer.gains is not None:
-        gains = jax.device_get(jnp.exp(state.optimizer.gains))
-        run_folder.write_gains(run, frames.names, gains)
-    return total
-
-
-class _SolverState(NamedTuple):
-    """What continues the solver, beside the model; see `backdrop_solver.Progress`."""
-
-    gains: Gains | None
-    held: Pyramid | None
-
-
-def _unsolved(config: TrainConfig, model: SavedModel, *, views: int, streams: bool) -> TrainState:
-    """Returns the state before the first iteration."""
-    params = init_params(jax.random.key(0), model.config)
-    gains = jnp.zeros((views, 3)) if config.model.exposure == "per_image" else None
-    held = jax.tree.map(jnp.zeros_like, params.field) if streams else None
-    return TrainState(jnp.zeros((), jnp.int32), params, _SolverState(gains, held))
-
-
-def _surface(model: SavedModel) -> dict[str, Any]:
-    """Returns kind and resolution of a backdrop."""
-    assert model.config.backdrop is not None
-    return {"space": model.config.space, "resolution": model.config.backdrop.resolution}
-
-
-def _iterate(
-    config: TrainConfig,
-    model: SavedModel,
-    state: TrainState,
-    blocks: Sequence[Block],
-    others: Callable[[int], Sequence[Block]] | None,
-) -> Iterator[backdrop_solver.Progress]:
-    """Yields the progress of the solver from a state on."""
-    step = int(state.step)
-    return backdrop_solver.solve(
-        blocks,
-        iterations=require(config.model.iterations),
-        start=(step, state.params.field) if step else None,
-        **_surface(model),
-        tints=state.params.tints,
-        gains=state.optimizer.gains,
-        held=state.optimizer.held,
-        tint_decay=config.losses.tint_decay,
-        others=others,
-    )
-
-
-def _equations(
-    model: SavedModel,
-    scene: Scene,
-    frames: Frames,
-    images: UInt8[np.ndarray, "views h w 3"],
-    progress: Callable[[int, int], None],
-    share: float,
-    draw: int,
-) -> tuple[Block, ...]:
-    """Returns the equations of the pixels of training images, or of a share drawn at random."""
-    shape = model.config.backdrop
-    assert shape is not None
-    return backdrop_equations.read(
-        scene,
-        frames.cameras,
-        images,
-        settings=model.settings,
-        domain=volume_rendering.domain(model.config),
-        resolution=shape.resolution,
-        most_taps=shape.most_taps,
-        tally=path_detail(model.config, model.settings).tally,
-        share=share,
-        draw=draw,
-        progress=progress,
-    )
 
 
 def _line(step: int, measured: StepReport, rate: float, seconds: float) -> dict[str, Any]:

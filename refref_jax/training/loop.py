@@ -23,7 +23,14 @@ from refref_jax.optics.path_settings import Detail, PathSettings, capacity_for
 from refref_jax.optics.path_tracing import Survey, Traced
 from refref_jax.optics.scene import Scene
 from refref_jax.render import pixels
-from refref_jax.render.model import ModelConfig, Params, init_params, path_detail
+from refref_jax.render.model import (
+    ModelConfig,
+    Params,
+    has_foreground,
+    init_params,
+    path_detail,
+    surface_of,
+)
 from refref_jax.training import devices, objective
 from refref_jax.training.config import ScheduleConfig, TrainConfig, require
 from refref_jax.training.devices import AXIS
@@ -59,12 +66,26 @@ class TrainState(NamedTuple):
 def init_state(seed: int, model: ModelConfig, schedule: ScheduleConfig) -> TrainState:
     """Returns the initial state of a run."""
     params = init_params(jax.random.key(seed), model)
-    return TrainState(jnp.zeros((), jnp.int32), params, optimizer(schedule).init(params))
+    moments = optimizer(schedule, model).init(params)
+    return TrainState(jnp.zeros((), jnp.int32), params, moments)
 
 
-def optimizer(schedule: ScheduleConfig) -> optax.GradientTransformation:
-    """Returns Adam with the schedule's learning rate and second moment decay."""
-    return optax.adam(learning_rate(schedule), b2=schedule.adam_b2, eps=_EPSILON)
+def optimizer(schedule: ScheduleConfig, model: ModelConfig) -> optax.GradientTransformation:
+    """Returns Adam with the schedule's learning rate and second moment decay.
+
+    A backdrop behind a field stays as it is.
+    """
+    adam = optax.adam(learning_rate(schedule), b2=schedule.adam_b2, eps=_EPSILON)
+    if not has_foreground(model):
+        return adam
+    return optax.partition({"learned": adam, "fixed": optax.set_to_zero()}, _labels)
+
+
+def _labels(params: Params) -> Params:
+    """Returns which parameters are learned in front of a backdrop, and which are fixed."""
+    learned = jax.tree.map(lambda leaf: "learned", params)
+    fixed = jax.tree.map(lambda leaf: "fixed", surface_of(params))
+    return learned._replace(field=learned.field._replace(backdrop=fixed))
 
 
 def learning_rate(schedule: ScheduleConfig) -> optax.Schedule:
@@ -231,7 +252,8 @@ def _step(
     (by_params, by_totals), report = slopes(state.params, _sum_devices(totals, axis))
     (through_paths,) = pull_back(by_totals)
     gradient = jax.tree.map(jnp.add, by_params, _sum_devices(through_paths, axis))
-    updates, moments = optimizer(config.schedule).update(gradient, state.optimizer, state.params)
+    adam = optimizer(config.schedule, model)
+    updates, moments = adam.update(gradient, state.optimizer, state.params)
     params = optax.apply_updates(state.params, updates)
     return TrainState(state.step + 1, params, moments), report
 

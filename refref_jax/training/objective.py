@@ -135,6 +135,8 @@ def total(light: pixels.Light, paths: LightPaths, config: LossConfig) -> Totals:
     Paths that are reflected at the first surface are left out of the interlevel and distortion
     losses if `config.path_losses` is `transmitted`, but remain in the colours of their rays.
     """
+    if not light.paths.histograms:  # the only samples are on opaque surfaces
+        return Totals(light.linear, *jnp.zeros(3))
     *proposals, final = light.paths.histograms
     included = light_paths.exists(paths)
     if config.path_losses == "transmitted":

@@ -40,7 +40,7 @@ from typing import Any
 
 import numpy as np
 
-from refref_jax.choices import ORIGIN, Interior, Position, Space
+from refref_jax.choices import ORIGIN, InFront, Interior, Position, Space
 from refref_jax.fields import mlps, registry
 from refref_jax.fields.base import RadianceConfig
 from refref_jax.fields.hash_grid import HashGridConfig
@@ -178,8 +178,15 @@ def contracted(scene: Bounds, *, radius: float | None) -> Bounds:
     return Bounds(_PUBLISHED_NEAR, _PUBLISHED_FAR, _PUBLISHED_UNIT, "unbounded", scene.centre)
 
 
-def override_model(model: ModelConfig, asked: FieldConfig) -> ModelConfig:
+def override_model(
+    model: ModelConfig, asked: FieldConfig, *, in_front: InFront = "nothing"
+) -> ModelConfig:
     """Returns a preset's model with overrides; `None` keeps the value of the preset.
+
+    Args:
+      model: model of a preset.
+      asked: overrides.
+      in_front: what is in front of a backdrop, if there is one.
 
     Raises:
       ValueError: if the model does not support an override.
@@ -189,7 +196,8 @@ def override_model(model: ModelConfig, asked: FieldConfig) -> ModelConfig:
     names = ("multisamples", "footprint", "dilation")
     given = {name: getattr(asked, name) for name in names}
     if asked.far_field == "backdrop":
-        given["backdrop"] = BackdropConfig(asked.backdrop_resolution or BACKDROP_RESOLUTION)
+        cells = asked.backdrop_resolution or BACKDROP_RESOLUTION
+        given["backdrop"] = BackdropConfig(cells, in_front=in_front)
     model = dataclasses.replace(model, **{n: x for n, x in given.items() if x is not None})
     if asked.precision is not None:
         proposals = tuple(

@@ -19,8 +19,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from refref_jax import configuration
-from refref_jax.choices import ORIGIN, SURFACES, FarField, Interior, Position, RuleName
+from refref_jax import choices, configuration
 from refref_jax.data import (
     background_fit,
     mesh_checks,
@@ -42,7 +41,7 @@ from refref_jax.optics.media import INDEX_OF_AIR
 from refref_jax.optics.path_settings import PathSettings, make_path_settings
 from refref_jax.optics.scene import Scene
 from refref_jax.render.checkpoint_io import SavedModel
-from refref_jax.render.model import ModelConfig
+from refref_jax.render.model import ModelConfig, has_foreground
 from refref_jax.training import presets
 from refref_jax.training.config import (
     BACKDROP_ONLY,
@@ -85,11 +84,11 @@ class SceneFacts(NamedTuple):
     tree: Containment
     half_extent: float | None
     notes: tuple[str, ...]
-    rule: RuleName = "nested"
+    rule: choices.RuleName = "nested"
     ambient: float = INDEX_OF_AIR
     origins: Mapping[str, str] = MappingProxyType({})
     source: str = "scene.json"
-    centre: Position = ORIGIN
+    centre: choices.Position = choices.ORIGIN
     stated: str = ""
     misfits: Callable[..., float] | None = None
 
@@ -112,10 +111,11 @@ class Resolved(NamedTuple):
     def describe(self) -> str:
         """Returns the options that the run reads, grouped by the reason for their values."""
         values = {o.name: self.config.get(o.name) for o in options_of()}
-        surface = self.config.model.far_field == "backdrop"
+        model = self.model.config
+        surface = model.backdrop is not None and not has_foreground(model)
         unread = {n for n in FIELD_ONLY if surface and self.reasons.get(n) != _GIVEN}
         used = {n: x for n, x in values.items() if n not in unread}
-        shown = {n: x for n, x in used.items() if x not in (None, (), "", ORIGIN)}
+        shown = {n: x for n, x in used.items() if x not in (None, (), "", choices.ORIGIN)}
         lines = configuration.describe(shown, self.reasons)
         return "\n".join([*lines, *(f"warning: {each}" for each in self.warnings)])
 
@@ -188,9 +188,8 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
         settings = dataclasses.replace(settings, reentry=require(config.paths.reentry))
     config = _resolve_training(config, model, reasons)
     check_batch(facts.cameras, require(config.schedule.batch))
-    return Resolved(
-        config, SavedModel(model, settings), reasons, tuple(_warnings(asked, config, facts))
-    )
+    saved = SavedModel(model, settings)
+    return Resolved(config, saved, reasons, tuple(_warnings(asked, config, facts)))
 
 
 def build_scene(resolved: Resolved, facts: SceneFacts) -> Scene:
@@ -279,7 +278,7 @@ def _resolve_inside(
     config: TrainConfig, found: SceneAnalysis, settings: PathSettings, reasons: dict[str, str]
 ) -> TrainConfig:
     """Decides the model of the inside of the objects, and the source of their colours."""
-    interior: Interior | None
+    interior: choices.Interior | None
     if settings.max_bends == 0:
         interior, why = "field", "straight rays ignore the objects"
     elif found.interior == "clear" and config.model.tints != "learned":
@@ -325,7 +324,8 @@ def _resolve_model(
     fields = () if model.interior == "field" else facts.analysis.field_parts
     model = dataclasses.replace(model, learned_tints=learned, field_parts=fields)
     config = _resolve_far_field(config, facts, reasons)
-    model = presets.override_model(model, config.model)
+    in_front: choices.InFront = "field" if _in_front(config, facts) else "nothing"
+    model = presets.override_model(model, config.model, in_front=in_front)
     config = _decide(
         config,
         reasons,
@@ -371,33 +371,38 @@ def _resolve_far_field(
 
 
 def _needs_of_a_field(config: TrainConfig, facts: SceneFacts) -> list[str]:
-    """Returns what a backdrop cannot model."""
-    opaque = any(part.material.kind == "opaque" for part in facts.parts)
-    bends = require(config.paths.max_bends) > 0
+    """Returns what a backdrop cannot model, even with a field in front of it."""
     needs = {
-        "straight rays through objects": facts.analysis.parts > 0 and not bends,
-        "a field inside the objects (interior=field)": config.model.interior == "field" and bends,
-        "parts whose interior is a field": bool(facts.analysis.field_parts),
-        "opaque parts, whose colour a field learns": opaque and bends,
+        "straight rays through objects": facts.analysis.parts > 0 and not config.paths.max_bends,
         "contraction=always": config.model.contraction == "always",
         "pixels=background": config.scene.pixels == "background",
     }
     return [name for name, holds in needs.items() if holds]
 
 
+def _in_front(config: TrainConfig, facts: SceneFacts) -> list[str]:
+    """Returns what only a field models in front of a backdrop."""
+    needs = {
+        "a field inside the objects (interior=field)": config.model.interior == "field",
+        "parts whose interior is a field": bool(facts.analysis.field_parts),
+        "opaque parts, whose colour a field learns": "opaque" in facts.analysis.embedded,
+    }
+    return [name for name, holds in needs.items() if holds and config.paths.max_bends]
+
+
 def _choose_far_field(
     config: TrainConfig, facts: SceneFacts, needs: Sequence[str]
-) -> tuple[FarField, str]:
+) -> tuple[choices.FarField, str]:
     """Returns the model of the far field, and the reason for it."""
-    if needs:
-        return "field", f"the scene needs a field: {needs[0]}"
+    if needs or (config.model.interior == "field" and config.paths.max_bends):
+        return "field", f"the scene needs a field: {[*needs, *_in_front(config, facts)][0]}"
     given = [name for name in (*BACKDROP_ONLY, *FIELD_ONLY) if name in config.overrides()]
     if given:
-        choice: FarField = "backdrop" if given[0] in BACKDROP_ONLY else "field"
+        choice: choices.FarField = "backdrop" if given[0] in BACKDROP_ONLY else "field"
         return choice, f"{given[0]} is an option of a {choice}"
     if facts.misfits is None or not facts.stated:
         return "field", "the scene does not state what is behind the objects"
-    surface = f"{SURFACES[require(config.scene.space)]} that {facts.stated} states"
+    surface = f"{choices.SURFACES[require(config.scene.space)]} that {facts.stated} states"
     if share := _share_of_misfits(config, facts):
         return "field", f"{100.0 * share:.2g} % of the images' patches differ from the {surface}"
     return "backdrop", f"behind the objects is the {surface}, as the images show"
@@ -406,7 +411,9 @@ def _choose_far_field(
 def _share_of_misfits(config: TrainConfig, facts: SceneFacts) -> float:
     """Returns the share of the images that differs from the background; 0 if it is small."""
     space, size, centre = (config.get(name) for name in ("background", "radius", "centre"))
-    share = facts.misfits(space=space, size=size, centre=centre) if facts.misfits else 0.0
+    if facts.misfits is None or config.model.exposure == "per_image":
+        return 0.0
+    share = facts.misfits(space=space, size=size, centre=centre)
     return share if share > scene_analysis.MOST_MISFITS else 0.0
 
 
@@ -468,7 +475,7 @@ def _resolve_training(
 def _warnings(asked: TrainConfig, config: TrainConfig, facts: SceneFacts) -> list[str]:
     warnings, found = [], facts.analysis
     ignored = [name for name in FIELD_ONLY if name in asked.overrides()]
-    if asked.model.far_field == "backdrop" and ignored:
+    if asked.model.far_field == "backdrop" and ignored and not _in_front(config, facts):
         warnings.append(f"No effect on a backdrop: {', '.join(ignored)}. Use far_field=field.")
     if asked.model.far_field == "backdrop" and (share := _share_of_misfits(config, facts)):
         causes = "something is in front of it"

@@ -12,7 +12,7 @@ from refref_jax.fields.base import DensityConfig, check_precision
 from refref_jax.fields.hash_grid import HashGridConfig, MultisampledGrid, tables
 from refref_jax.fields.nerfacto import NerfactoConfig, NerfactoProposalConfig
 from refref_jax.fields.zipnerf import DensityFieldConfig, RadianceFieldConfig
-from refref_jax.sampling.cones import Gaussians
+from refref_jax.sampling.polylines import Gaussians
 from tests.laws import gradients, transformations
 from tests.oracles import reference_sampling
 

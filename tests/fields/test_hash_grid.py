@@ -9,7 +9,7 @@ import scipy.special
 
 from refref_jax.fields import hash_grid, hash_grid_kernels
 from refref_jax.fields.hash_grid import HashGrid, HashGridConfig, MultisampledGrid
-from refref_jax.sampling.cones import Gaussians
+from refref_jax.sampling.polylines import Gaussians
 from tests.laws import gradients, transformations
 from tests.oracles import reference_sampling
 

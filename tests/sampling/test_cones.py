@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from refref_jax.geometry.rays import orthonormal_basis
-from refref_jax.sampling import cones, polylines
+from refref_jax.sampling import polylines
 from tests.factories import made_paths
 from tests.laws import gradients, transformations
 from tests.oracles import reference_sampling
@@ -31,7 +31,9 @@ _INTERVALS = [
 @functools.partial(jax.jit, static_argnames="count")
 def _sample(line, start, end, rotation=0.0, radius=_RADIUS, *, count=6):
     line = line._replace(radius=jnp.float32(radius))
-    return cones.multisamples(line, *(jnp.float32(x) for x in (start, end, rotation)), count=count)
+    return polylines.multisamples(
+        line, *(jnp.float32(x) for x in (start, end, rotation)), count=count
+    )
 
 
 _basis = jax.jit(orthonormal_basis)
@@ -178,7 +180,7 @@ def test_points_of_an_interval_across_an_interface_lie_on_both_of_its_sides(make
 def _gradients(line, start, end):
     def total(radius, start, end, rotation):
         wide = line._replace(radius=radius)
-        positions, scales = cones.multisamples(wide, start, end, rotation, count=6)
+        positions, scales = polylines.multisamples(wide, start, end, rotation, count=6)
         return jnp.sum(positions) + jnp.sum(scales)
 
     arguments = jnp.float32(1e-3), start, end, jnp.float32(0.3)
@@ -245,7 +247,7 @@ def test_multisamples_check_grads(count):
     def sample(radius, start, end, rotation):
         wide = jax.tree.map(lambda x: x if x.dtype == bool else x.astype(jnp.float64), line)
         wide = wide._replace(radius=radius)
-        return tuple(cones.multisamples(wide, start, end, rotation, count=count))
+        return tuple(polylines.multisamples(wide, start, end, rotation, count=count))
 
     gradients.assert_numerical(sample, _RADIUS, 1.0, 2.5, 0.3)
 
@@ -256,10 +258,10 @@ def test_orthonormal_basis_check_grads():
 
 
 _CASES = {
-    "six": lambda path, start, end: cones.multisamples(
+    "six": lambda path, start, end: polylines.multisamples(
         polylines.whole_path(path), start, end, 0.5 * start, count=6
     ),
-    "one": lambda path, start, end: cones.multisamples(
+    "one": lambda path, start, end: polylines.multisamples(
         polylines.outside_path(path), start, end, 0.5 * start, count=1
     ),
     "orthonormal_basis": lambda path, start, end: orthonormal_basis(path.directions[0]),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from refref_jax.sampling import scene_bounds
-from refref_jax.sampling.cones import Gaussians
+from refref_jax.sampling.polylines import Gaussians
 from refref_jax.sampling.scene_bounds import DistanceWarp, Domain
 from tests.factories import arrays
 from tests.laws import gradients, transformations

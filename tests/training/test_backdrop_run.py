@@ -1,11 +1,13 @@
 """Runs with a backdrop: solved, paused and continued, rendered, and refused where none fits."""
 
 import json
+import shutil
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 
 from refref_jax.data import scene_folder
 from refref_jax.geometry.cameras import image_rays
@@ -13,7 +15,7 @@ from refref_jax.render import Model, one_ray, render_image, render_rays
 from refref_jax.render.volume_rendering import look_up
 from refref_jax.training import backdrop_solver, run_folder
 from refref_jax.training.config import TrainConfig
-from refref_jax.training.fit import fit, prepare
+from refref_jax.training.fit import Periods, fit, prepare
 from tests.factories.cut_ball import cut_ball
 from tests.factories.small_model import CAMERAS
 
@@ -144,6 +146,52 @@ def test_gains_of_the_images_are_learned_resumed_and_written(scene, tmp_path):
             ),
             report=lines.append,
         )
+
+
+@pytest.fixture(scope="module")
+def filled(scene, tmp_path_factory):
+    """The scene with an opaque ball in the glass, which its images do not show."""
+    folder = tmp_path_factory.mktemp("scenes") / "cube_smcvx_ball"
+    shutil.copytree(scene, folder)
+    core = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
+    core.export(folder / "meshes" / "ball_core_opaque.ply")
+    properties = json.loads((folder / "scene.json").read_text())
+    properties["parts"].append({"mesh": "meshes/ball_core_opaque.ply", "kind": "opaque"})
+    (folder / "scene.json").write_text(json.dumps(properties))
+    return folder
+
+
+def test_a_field_on_opaque_parts_is_trained_in_front_of_the_backdrop(filled, tmp_path):
+    options = {"backdrop_resolution": 64, "iterations": _ROUND}
+    config = TrainConfig().override(scene=str(filled), **options)
+    config = config.override(far_field="backdrop", steps=6, batch=64, pretraced_batches=2)
+    lines = []
+    model = fit(config, out=tmp_path / "run", report=lines.append)
+    assert model.config.backdrop.in_front == "field"
+    assert any("steps=6" in line for line in lines) and not any("No effect" in x for x in lines)
+    reached = run_folder.read_metrics(tmp_path / "run")
+    assert reached[-1]["step"] == 6 and np.isfinite(reached[-1]["loss"])
+    # The backdrop is that of the pixels that see nothing else, and training leaves it as it is.
+    frames = scene_folder.read_frames(filled, "train")
+    seen = render_image(model, image_rays(frames.cameras, 0))
+    away = ~scene_folder.read_masks(frames)[0]
+    error = (np.asarray(seen.rgb) - scene_folder.read_images(frames)[0] / 255.0)[away]
+    assert -10.0 * np.log10(np.mean(error**2)) > 19.0
+    # A run that was stopped after some steps ends with the same bits.
+    periods = Periods(log=2, checkpoint=2)
+    again = {"out": tmp_path / "again", "report": lines.append, "periods": periods}
+    fit(config, **again, stop=lambda: bool(run_folder.read_metrics(tmp_path / "again")))
+    assert 0 < run_folder.read_metrics(tmp_path / "again")[-1]["step"] < 6
+    resumed = fit(None, **again, existing="resume")
+    pairs = zip(jax.tree.leaves(resumed.params), jax.tree.leaves(model.params), strict=True)
+    assert all(np.array_equal(ours, theirs) for ours, theirs in pairs)
+
+
+def test_opaque_parts_lead_to_a_backdrop_with_a_field_in_front_of_it(filled):
+    resolved, _ = prepare(TrainConfig().override(scene=str(filled)), report=lambda line: None)
+    assert resolved.config.model.far_field == "backdrop"
+    assert resolved.model.config.backdrop.in_front == "field"
+    assert "preset=tiny" in resolved.describe()
 
 
 def test_a_run_stops_between_the_views_that_it_traces(scene, tmp_path):

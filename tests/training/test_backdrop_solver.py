@@ -245,7 +245,7 @@ def test_rounds_with_other_pixels_come_close_to_all_pixels(ball):
 
     counts = [sum(len(block.srgb) for block in some(draw)) for draw in range(2)]
     assert counts[0] != counts[1] and np.allclose(counts, 0.3 * 10 * 32**2, rtol=0.1)
-    rounds = {"iterations": 8 * backdrop_solver.ROUND}
+    rounds = {"iterations": 8 * backdrop_solver.ROUND, "mean": jnp.full(3, 0.3)}
     blocks = _equations(ball, views, images, settings=_TREE)
     all_, few = _solve(blocks, **rounds), _solve(some(0), **rounds)
     streamed = _solve(some(0), others=some, **rounds)
@@ -259,7 +259,7 @@ def test_rounds_with_other_pixels_come_close_to_all_pixels(ball):
 
     assert held_out(streamed) > held_out(all_) - 0.8 and held_out(streamed) > held_out(few)
     # A run that was paused after a round ends with the same bits.
-    first = _solve(some(0), others=some, iterations=2 * backdrop_solver.ROUND)
+    first = _solve(some(0), others=some, **rounds | {"iterations": 2 * backdrop_solver.ROUND})
     again = _solve(
         some(2), others=some, start=(first.step, first.pyramid), held=first.held, **rounds
     )

@@ -58,7 +58,7 @@ _CASES = {
     ),
 }
 
-_begin = jax.jit(optimizer(_SCHEDULE).init)
+_begin = jax.jit(optimizer(_SCHEDULE, small_model.MODEL).init)
 
 _each_precision = pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 

@@ -8,6 +8,7 @@ import pytest
 from refref_jax.training import presets
 from refref_jax.training.config import ScheduleConfig, require
 from refref_jax.training.loop import learning_rate, optimizer
+from tests.factories.small_model import MODEL
 
 pytestmark = pytest.mark.loose
 
@@ -31,7 +32,7 @@ def test_the_papers_schedule(step, rate):
 
 def test_adam_follows_the_schedule():
     schedule = ScheduleConfig(steps=10, warmup=2, peak=1e-2, end=1e-3, anneal=1)
-    adam = optimizer(schedule)
+    adam = optimizer(schedule, MODEL)
     state = adam.init(jnp.zeros(()))
     for step in range(10):
         update, state = jax.jit(adam.update)(jnp.float32(3.0), state, jnp.zeros(()))
@@ -41,7 +42,7 @@ def test_adam_follows_the_schedule():
 
 @pytest.mark.parametrize(("given", "b2"), [({}, 0.99), ({"adam_b2": 0.999}, 0.999)])
 def test_adam_has_the_schedule_s_second_moment_decay(given, b2):
-    adam = optimizer(dataclasses.replace(_PAPER, **given))
+    adam = optimizer(dataclasses.replace(_PAPER, **given), MODEL)
     _, state = adam.update(jnp.float32(3.0), adam.init(jnp.zeros(())), jnp.zeros(()))
     np.testing.assert_allclose(state[0].nu, (1.0 - b2) * 9.0, rtol=1e-4)
 

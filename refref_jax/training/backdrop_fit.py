@@ -1,0 +1,240 @@
+"""Trains the backdrop of a run: reads its images, solves, and saves rounds of iterations.
+
+`solve` is the whole training of a model that is a backdrop. `behind_field` solves for the backdrop
+of a model with a field in front of it, whose steps `fit` takes afterwards.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+
+from refref_jax import configuration
+from refref_jax.data import scene_folder
+from refref_jax.data.scene_folder import Frames
+from refref_jax.optics.scene import Scene
+from refref_jax.render import pixels, volume_rendering
+from refref_jax.render.backdrop import Pyramid
+from refref_jax.render.checkpoint_io import SavedModel
+from refref_jax.render.model import Params, init_params, path_detail, surface_of
+from refref_jax.training import backdrop_equations, backdrop_solver, run_folder
+from refref_jax.training.backdrop_equations import Block, Gains
+from refref_jax.training.config import TrainConfig, require
+from refref_jax.training.loop import TrainState
+from refref_jax.training.run_folder import Checkpoints
+
+# Number of values that determine the mean colour of the images.
+_MOST_MEAN = 10_000_000
+
+_Progress = Callable[[int, int, str], None]
+
+
+class _SolverState(NamedTuple):
+    """What continues the solver, beside the model; see `backdrop_solver.Progress`."""
+
+    gains: Gains | None
+    held: Pyramid | None
+
+
+class _Problem(NamedTuple):
+    """A backdrop to solve for.
+
+    Attributes:
+      config: configuration of the run.
+      model: static part of the model.
+      scene: the scene.
+      frames: training images and cameras.
+      images: training images, 8-bit sRGB.
+      traced: function that is called for each view that is traced, and may interrupt.
+    """
+
+    config: TrainConfig
+    model: SavedModel
+    scene: Scene
+    frames: Frames
+    images: UInt8[np.ndarray, "views h w 3"]
+    traced: Callable[[int, int], None]
+
+    @property
+    def share(self) -> float:
+        """The share of the pixels whose equations are in memory at once."""
+        return min(1.0, require(self.config.model.most_pixels) / (self.images.size // 3))
+
+    @property
+    def surface(self) -> dict[str, Any]:
+        """Kind and resolution of the backdrop."""
+        shape = self.model.config.backdrop
+        assert shape is not None
+        return {"space": self.model.config.space, "resolution": shape.resolution}
+
+    def unsolved(self) -> TrainState:
+        """Returns the state before the first iteration."""
+        params = init_params(jax.random.key(0), self.model.config)
+        per_image = self.config.model.exposure == "per_image"
+        gains = jnp.zeros((len(self.images), 3)) if per_image else None
+        held = jax.tree.map(jnp.zeros_like, surface_of(params)) if self.share < 1.0 else None
+        return TrainState(jnp.zeros((), jnp.int32), params, _SolverState(gains, held))
+
+    def equations(self, draw: int) -> tuple[Block, ...]:
+        """Returns the equations of all pixels, or of a share of them, drawn at random."""
+        shape = self.model.config.backdrop
+        assert shape is not None
+        return backdrop_equations.read(
+            self.scene,
+            self.frames.cameras,
+            self.images,
+            settings=self.model.settings,
+            domain=volume_rendering.domain(self.model.config),
+            resolution=shape.resolution,
+            most_taps=shape.most_taps,
+            tally=path_detail(self.model.config, self.model.settings).tally,
+            fields=self._interiors(),
+            share=self.share,
+            draw=draw,
+            progress=self.traced,
+        )
+
+    def _mean(self) -> Float[Array, "3"]:
+        """Returns the mean linear RGB of the images; of some pixels, if there are very many."""
+        some = self.images.reshape(-1, 3)[:: 1 + self.images.size // _MOST_MEAN]
+        return jnp.mean(pixels.srgb_to_linear(jnp.asarray(some, jnp.float32) / 255.0), axis=0)
+
+    def _interiors(self) -> tuple[int, ...]:
+        """Returns the parts whose inside is a field."""
+        if self.model.config.interior == "field":
+            return tuple(range(self.scene.interfaces.index_inside.shape[0]))
+        return self.model.config.field_parts
+
+    def iterate(
+        self, state: TrainState, blocks: Sequence[Block]
+    ) -> Iterator[backdrop_solver.Progress]:
+        """Yields the progress of the solver from a state on."""
+        step = int(state.step)
+        return backdrop_solver.solve(
+            blocks,
+            iterations=require(self.config.model.iterations),
+            start=(step, surface_of(state.params)) if step else None,
+            **self.surface,
+            tints=state.params.tints,
+            gains=state.optimizer.gains,
+            held=state.optimizer.held,
+            mean=self._mean() if self.share < 1.0 else None,
+            tint_decay=self.config.losses.tint_decay,
+            others=self.equations if self.share < 1.0 else None,
+        )
+
+
+def _read(
+    config: TrainConfig,
+    model: SavedModel,
+    scene: Scene,
+    folder: Path,
+    report: Callable[[str], None],
+    stop: Callable[[], bool],
+) -> _Problem:
+    """Reads the training images of a run."""
+
+    def traced(view: int, views: int) -> None:
+        report(f"tracing view {view} of {views}")
+        if stop():
+            raise KeyboardInterrupt  # there is no new state to save
+
+    frames = scene_folder.read_frames(folder, "train")
+    return _Problem(config, model, scene, frames, scene_folder.read_images(frames), traced)
+
+
+def solve(
+    run: Path,
+    config: TrainConfig,
+    model: SavedModel,
+    scene: Scene,
+    folder: Path,
+    checkpoints: Checkpoints,
+    progress: _Progress,
+    stop: Callable[[], bool],
+) -> int:
+    """Solves for the backdrop of a run, and returns the number of the last iteration.
+
+    A checkpoint is written after each round of iterations; the solver may be done before the last.
+
+    Args:
+      run: folder of the run.
+      config: its configuration.
+      model: static part of its model.
+      scene: its scene.
+      folder: folder of its training images.
+      checkpoints: its checkpoints; the newest one is continued.
+      progress: function of iteration, their largest number, and a line of text.
+      stop: function that is called between rounds, and between traced views; if it returns `True`,
+        solving ends.
+
+    Raises:
+      KeyboardInterrupt: if `stop` returned `True` while views were traced.
+    """
+    begun, total = time.monotonic(), require(config.model.iterations)
+    problem = _read(config, model, scene, folder, lambda text: progress(0, total, text), stop)
+    state = problem.unsolved()
+    if checkpoints.newest() is not None:
+        state = checkpoints.restore(state)
+    step = int(state.step)
+    earlier = run_folder.rewind_metrics(run, step)
+    blocks = problem.equations(step // backdrop_solver.ROUND if problem.share < 1.0 else 0)
+    seen = backdrop_solver.coverage(blocks, **problem.surface, tints=state.params.tints)
+    run_folder.write_coverage(run, jax.device_get(seen / problem.share))
+    for reached in problem.iterate(state, blocks):
+        step = reached.step
+        line = {"step": step, "psnr": reached.fitted, "psnr_held_out": reached.held_out}
+        line |= {"seconds": earlier + time.monotonic() - begun}
+        run_folder.append_metrics(run, configuration.string_safe(line))
+        progress(step, total, f"PSNR {reached.fitted:.2f}  held out {reached.held_out:.2f}")
+        params = Params((), reached.pyramid, reached.tints)
+        state = TrainState(state.step, params, _SolverState(reached.gains, reached.held))
+        if step % backdrop_solver.ROUND == 0 and step < total:
+            checkpoints.save(state._replace(step=jnp.asarray(step, jnp.int32)))
+            if stop():
+                return step
+    checkpoints.save(state._replace(step=jnp.asarray(total, jnp.int32)))
+    if state.optimizer.gains is not None:
+        gains = jax.device_get(jnp.exp(state.optimizer.gains))
+        run_folder.write_gains(run, problem.frames.names, gains)
+    return total
+
+
+def behind_field(
+    state: TrainState,
+    config: TrainConfig,
+    model: SavedModel,
+    scene: Scene,
+    folder: Path,
+    progress: _Progress,
+    stop: Callable[[], bool],
+) -> TrainState:
+    """Solves for the backdrop behind a field, from the pixels that see nothing but the backdrop.
+
+    Args:
+      state: state before the first step of the field.
+      config: configuration of the run.
+      model: static part of its model.
+      scene: its scene.
+      folder: folder of its training images.
+      progress: function of step, number of steps, and a line of text.
+      stop: function that is called between iterations; if it returns `True`, solving ends.
+
+    Raises:
+      KeyboardInterrupt: if `stop` returned `True`.
+    """
+    total = require(config.schedule.steps)
+    problem = _read(config, model, scene, folder, lambda text: progress(0, total, text), stop)
+    params = state.params
+    for reached in problem.iterate(problem.unsolved(), problem.equations(0)):
+        progress(0, total, f"backdrop, iteration {reached.step}  PSNR {reached.fitted:.2f}")
+        if stop():
+            raise KeyboardInterrupt  # there is no new state to save
+        field = params.field._replace(backdrop=reached.pyramid)
+        params = params._replace(field=field, tints=reached.tints)
+    return state._replace(params=params)

@@ -1,0 +1,117 @@
+"""What is in front of a backdrop: closed forms of a planted field, and gradients."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from refref_jax.fields import registry
+from refref_jax.fields.base import Radiance
+from refref_jax.optics.light_paths import Stop
+from refref_jax.render import backdrop, pixels
+from refref_jax.render.backdrop import BackdropConfig
+from refref_jax.render.model import Layers, Params, init_params
+from tests.factories import made_paths
+from tests.factories.small_model import MODEL
+
+_SURFACE = BackdropConfig(8, in_front="field")
+_INSIDE = dataclasses.replace(MODEL, backdrop=_SURFACE)
+_CLEAR = dataclasses.replace(MODEL, backdrop=_SURFACE, interior="clear")
+_GREY = 0.7
+_ONE = jnp.float32(1.0)
+
+
+def _bent():
+    """Enters an object after 2 units, is inside for 1.5, and leaves along the last direction."""
+    return made_paths.path(
+        [2.0, 1.5], [(0, 0, -1), (0, 0.6, -0.8), (0, 0, -1)], [0, 1, 0], origin=(0, 0, 3)
+    )
+
+
+def _straight():
+    return made_paths.path([], [(0, 0, -1)], [0], origin=(0, 0, 3), segments=3)
+
+
+@pytest.fixture
+def plant(monkeypatch):
+    """Returns a function that renders one path; the field's colour is the direction."""
+
+    def density(fog, config, gaussians):
+        return fog
+
+    def radiance(fog, config, gaussians, direction):
+        return Radiance(fog, direction)
+
+    monkeypatch.setattr(registry, "density", density)
+    monkeypatch.setattr(registry, "radiance", radiance)
+
+    def render(config, path, fog):
+        paths = jax.tree.map(lambda x: jnp.asarray(x)[None], path)
+        fog = jnp.float32(fog)
+        params = Params((fog,), Layers(fog, backdrop.init(8, radiance=_GREY)))
+        jitter = pixels.no_jitter(config, 1)
+        seen = pixels.render_paths(params, config, paths, jitter, anneal=_ONE)
+        return jax.tree.map(lambda x: x[0], seen)
+
+    return render
+
+
+@pytest.mark.parametrize("fog", [0.0, 1e-6, 0.8, 30.0, 1e6])
+def test_light_of_the_backdrop_is_dimmed_by_the_field_inside_the_objects(plant, fog):
+    seen = plant(_INSIDE, _bent(), fog).composite
+    passed = np.exp(-fog * 1.5 / MODEL.radius)
+    expected = passed * _GREY + (1.0 - passed) * np.array([0.0, 0.6, -0.8])
+    np.testing.assert_allclose(seen.rgb, expected, atol=2e-5)
+    np.testing.assert_allclose(seen.accumulation, 1.0, atol=1e-6)
+    # From (0, 0.9, -0.2), the path goes down to the wall at -7.5.
+    wall = 3.5 + 7.3
+    if fog == 0.0:
+        np.testing.assert_allclose([seen.median, seen.mean], wall, rtol=1e-5)
+    if fog == 1e6:
+        np.testing.assert_allclose(seen.median, 2.0, atol=0.1)
+
+
+@pytest.mark.parametrize("fog", [0.0, 0.8, 1e6])
+def test_paths_beside_the_objects_see_nothing_but_the_backdrop(plant, fog):
+    seen = plant(_INSIDE, _straight(), fog)
+    np.testing.assert_allclose(seen.composite.rgb, _GREY, atol=1e-6)
+    np.testing.assert_allclose(seen.composite.median, 10.5, rtol=1e-5)
+    np.testing.assert_allclose(seen.histograms[-1].weights, 0.0)
+
+
+def test_a_path_that_ends_on_an_opaque_surface_sees_the_field_there(plant):
+    inside = made_paths.path([2.0], [(0, 0, -1), (0, 0.6, -0.8)], [0, 1], origin=(0, 0, 3))
+    stopped = inside._replace(stop=Stop(jnp.float32(2.75), None))
+    seen = plant(_CLEAR, stopped, 0.8)
+    np.testing.assert_allclose(seen.composite.rgb, [0.0, 0.6, -0.8], atol=1e-6)
+    np.testing.assert_allclose([seen.composite.median, seen.composite.mean], 2.75, rtol=1e-6)
+    assert seen.histograms == ()
+    free = inside._replace(stop=Stop(jnp.float32(jnp.inf), None))
+    np.testing.assert_allclose(plant(_CLEAR, free, 0.8).composite.rgb, _GREY, atol=1e-6)
+
+
+def test_only_the_field_in_front_of_the_backdrop_has_gradients():
+    paths = jax.tree.map(lambda x: jnp.asarray(x)[None], _bent())
+    params = init_params(jax.random.key(0), _INSIDE)
+    jitter = pixels.no_jitter(_INSIDE, 1)
+
+    @jax.jit
+    @jax.grad
+    def slope(params):
+        light = pixels.gather_light(params, _INSIDE, paths, jitter, rays=1, anneal=_ONE)
+        return jnp.sum(light.linear)
+
+    slopes = slope(params)
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slopes))
+    assert any(np.any(leaf != 0.0) for leaf in jax.tree.leaves(slopes.field.field))
+    assert not any(np.any(leaf != 0.0) for leaf in jax.tree.leaves(slopes.field.backdrop))
+
+
+def test_only_given_parts_are_sampled(plant):
+    first, second = (dataclasses.replace(_CLEAR, field_parts=parts) for parts in ((0,), (1,)))
+    passed = np.exp(-0.8 * 1.5 / MODEL.radius)
+    expected = passed * _GREY + (1.0 - passed) * np.array([0.0, 0.6, -0.8])
+    np.testing.assert_allclose(plant(first, _bent(), 0.8).composite.rgb, expected, atol=2e-5)
+    np.testing.assert_allclose(plant(second, _bent(), 0.8).composite.rgb, _GREY, atol=1e-6)
