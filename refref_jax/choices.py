@@ -90,8 +90,11 @@ FarField = Literal["field", "backdrop"]
 Exposure = Literal["fixed", "per_image"]
 """Exposure of the training images: the same for all, or a gain for each of them."""
 
+ViewDependence = Literal["none", "linear"]
+"""How the radiance of a backdrop depends on the direction of light; see `render.backdrop`."""
+
 InFront = Literal["nothing", "field"]
-"""What is in front of a backdrop; see `render.backdrop.BackdropConfig`."""
+"""What is in front of a backdrop; see `render.model.BackdropConfig`."""
 
 Interior = Literal["field", "clear", "absorbing"]
 """Model of the inside of the objects; see `render.model.ModelConfig`."""

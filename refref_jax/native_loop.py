@@ -7,10 +7,11 @@ ignore it, and only the speed changes.
 """
 
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 from jax.experimental.xla_metadata import set_xla_metadata
+from jaxtyping import Array
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -40,3 +41,18 @@ def native_loop(function: Callable[_Arguments, _Result]) -> Callable[_Arguments,
             return compiled(*args, **kwargs)
 
     return marked
+
+
+def record(values: Any, index: Array) -> Any:
+    """Returns one record of arrays, as a native loop reads it."""
+
+    def pick(x: Array) -> Array:
+        return jax.lax.dynamic_index_in_dim(x, index, keepdims=False, allow_negative_indices=False)
+
+    return jax.tree.map(pick, values)
+
+
+def with_record(values: Array, at: Array, value: Array) -> Array:
+    """Returns an array with one record replaced."""
+    update = jax.lax.dynamic_update_index_in_dim
+    return update(values, value, at, axis=0, allow_negative_indices=False)

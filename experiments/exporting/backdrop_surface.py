@@ -45,12 +45,12 @@ def check(model: Model, run: Path) -> None:
 
 
 def faces(model: Model) -> Float[np.ndarray, "6 side side 3"]:
-    """Returns the linear RGB radiance at the vertices of each face.
+    """Returns the linear RGB radiance at the vertices of each face, its mean over directions.
 
     Faces are in the order -x, +x, -y, +y, -z, +z. On a face of axis `a`, columns go along axis
     `a + 1` and rows along axis `a + 2`, both modulo 3, from the negative to the positive end.
     """
-    return np.asarray(backdrop.mipmap(surface_of(model.params), model.config.space)[0])
+    return np.asarray(backdrop.mipmap(surface_of(model.params), model.config.space)[0][..., :3])
 
 
 def as_sheet(grid: Float[np.ndarray, "6 side side n"]) -> Float[np.ndarray, "h w n"]:
@@ -110,6 +110,7 @@ def _look(model: Model, domain: Domain, rays: Rays) -> Float[np.ndarray, "rays 3
         numbers,
         resolution=grids[0].shape[1] - 1,
         most_taps=1,
+        axes=grids[0].shape[3] // 3 - 1,
     )
     return backdrop.radiance(grids, lookups)
 

@@ -8,6 +8,7 @@ from experiments.sweeps import table
 from experiments.sweeps.options import OF_EVALUATION
 from refref_jax.choices import FarField
 from refref_jax.optics.scene import Scene
+from refref_jax.render.model import has_foreground
 from refref_jax.training import fit
 from refref_jax.training.config import BACKDROP_ONLY, FIELD_ONLY, TrainConfig
 from refref_jax.training.resolve import Resolved
@@ -32,9 +33,14 @@ def of_table(out: Path) -> FarField | None:
 def prepare(scene: Path, options: Mapping[str, str]) -> tuple[Resolved, Scene]:
     """Resolves a training of a scene, which decides between a field and a backdrop.
 
+    A scene that needs a field in front of its backdrop gets a field for everything.
+
     Args:
       scene: folder of the scene.
       options: further options of the training, as text; those of evaluation are ignored.
+
+    Raises:
+      ValueError: if such a scene is to have a backdrop.
     """
     values = {
         name: config_flags.parse_text(name, text)
@@ -42,7 +48,15 @@ def prepare(scene: Path, options: Mapping[str, str]) -> tuple[Resolved, Scene]:
         if name not in OF_EVALUATION
     }
     config = TrainConfig().override(scene=str(scene), **values)
-    return fit.prepare(config, report=lambda line: None)
+    resolved, objects = fit.prepare(config, report=lambda line: None)
+    if not has_foreground(resolved.model.config):
+        return resolved, objects
+    if config.model.far_field == "backdrop":
+        raise ValueError(
+            f"{scene} needs a field in front of its backdrop, whose options no sweep varies. Use "
+            "--far_field=field."
+        )
+    return fit.prepare(config.override(far_field="field"), report=lambda line: None)
 
 
 def describe(resolved: Resolved) -> str:

@@ -14,6 +14,8 @@ The unknowns are a pyramid: the radiance is the sum of the bilinear interpolatio
 each with half the resolution of the next. A coarse level is determined by many pixels and fills
 the gaps of the finer ones, where no light path ends.
 
+The radiance may be linear in the direction of light: a vertex then holds nine derivatives as well.
+
 A pixel is a square: its light path is shifted by the ray differential to several places of the
 pixel (`taps`), and a footprint wider than that reads a coarser level of a mipmap.
 
@@ -21,11 +23,10 @@ Sources: Igehy, Tracing Ray Differentials (1999); for the sum over levels Brambl
 Parallel Multilevel Preconditioners (1990).
 """
 
-import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,34 +34,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from refref_jax import numerics
-from refref_jax.choices import InFront, Space
-from refref_jax.native_loop import native_loop
+from refref_jax.choices import Space
+from refref_jax.native_loop import native_loop, record, with_record
 from refref_jax.optics.light_paths import PathEnds
 from refref_jax.sampling import scene_bounds
 from refref_jax.sampling.scene_bounds import Domain
 
 FACES = 6
-
-
-@dataclasses.dataclass(frozen=True)
-class BackdropConfig:
-    """Shape of a far field surface; the kind of the surface is the space of the scene.
-
-    Attributes:
-      resolution: number of cells per side of a face.
-      most_taps: largest number of taps along each axis of a ray's footprint.
-      in_front: `field` for opaque parts and parts whose inside is a field, `nothing` without such.
-    """
-
-    resolution: int
-    most_taps: int = 3
-    in_front: InFront = "nothing"
-
-    def __post_init__(self) -> None:
-        """Checks the numbers."""
-        counts = self.resolution, self.most_taps
-        if min(counts) < 1:
-            raise ValueError(f"Resolution and taps are {counts}. Give positive numbers.")
 
 
 # Number of cells per side below which a level is not halved again.
@@ -78,10 +58,10 @@ _FAINT = 0.1
 # A footprint of this width, in cells, covers the surface; near the critical angle it is unbounded.
 _WIDEST = 1e6
 
-Pyramid = tuple[Float[Array, "6 _ _ 3"], ...]
-"""Radiance of each level, coarse to fine; linear RGB."""
-Mips = tuple[Float[Array, "6 _ _ 3"], ...]
-"""Radiance at each resolution, fine to coarse; linear RGB."""
+Pyramid = tuple[Float[Array, "6 _ _ channels"], ...]
+"""Radiance of each level, coarse to fine; linear RGB, then its derivatives by the direction."""
+Mips = tuple[Float[Array, "6 _ _ channels"], ...]
+"""The same at each resolution, fine to coarse."""
 
 
 class Lookups(NamedTuple):
@@ -95,6 +75,7 @@ class Lookups(NamedTuple):
       starts: position of the first tap, column and row of the grid.
       steps: change of the position from tap to tap, along both axes.
       throughput: throughput of the path, linear RGB.
+      directions: direction of the light's path, if the radiance depends on it.
     """
 
     pixels: Int[Array, "*paths"]
@@ -104,6 +85,7 @@ class Lookups(NamedTuple):
     starts: Float[Array, "*paths 2"]
     steps: Float[Array, "*paths 2 2"]
     throughput: Float[Array, "*paths 3"]
+    directions: Float[Array, "*paths axes"]
 
 
 def sides(resolution: int) -> tuple[int, ...]:
@@ -114,16 +96,17 @@ def sides(resolution: int) -> tuple[int, ...]:
     return tuple(reversed(found))
 
 
-def init(resolution: int, *, radiance: Float[Array, "3"] | float = 0.0) -> Pyramid:
+def init(resolution: int, *, radiance: Float[Array, "3"] | float = 0.0, axes: int = 0) -> Pyramid:
     """Returns a surface of uniform radiance.
 
     Args:
       resolution: number of cells per side of a face.
       radiance: linear RGB.
+      axes: number of axes of the direction that the radiance may depend on, 0 or 3.
     """
-    first, *others = sides(resolution)
-    base = jnp.broadcast_to(jnp.asarray(radiance, jnp.float32), (FACES, first + 1, first + 1, 3))
-    return (base, *(jnp.zeros((FACES, side + 1, side + 1, 3)) for side in others))
+    shapes = [(FACES, side + 1, side + 1, 3 + 3 * axes) for side in sides(resolution)]
+    base = jnp.zeros(shapes[0]).at[..., :3].set(radiance)
+    return (base, *(jnp.zeros(shape) for shape in shapes[1:]))
 
 
 def locate(
@@ -133,6 +116,7 @@ def locate(
     *,
     resolution: int,
     most_taps: int,
+    axes: int = 0,
 ) -> Lookups:
     """Returns where light paths end on the surface.
 
@@ -142,21 +126,22 @@ def locate(
       pixels: index of the pixel that each path belongs to.
       resolution: number of cells per side of a face.
       most_taps: largest number of taps along each axis of a pixel, of paths that are not faint.
+      axes: number of axes of the direction that the radiance depends on.
     """
-    faces, places, axes = jax.vmap(functools.partial(_place, domain))(
+    faces, places, across = jax.vmap(functools.partial(_place, domain))(
         ends.origins, ends.directions, ends.differentials.points, ends.differentials.directions
     )
     half = 0.5 * resolution
-    axes = jnp.clip(_PIXEL_WIDTH * half * axes, -_WIDEST, _WIDEST)
-    widths = jnp.sqrt(jnp.sum(jnp.square(axes), axis=-1))
+    across = jnp.clip(_PIXEL_WIDTH * half * across, -_WIDEST, _WIDEST)
+    widths = jnp.sqrt(jnp.sum(jnp.square(across), axis=-1))
     brightest = jnp.max(ends.throughput, axis=-1)
     most = jnp.where(brightest < _FAINT, 1, most_taps)
     coarser = jnp.round(jnp.log2(jnp.maximum(jnp.max(widths, axis=-1) / most, 1.0)))
     levels = jnp.minimum(coarser.astype(jnp.int32), len(sides(resolution)) - 1)
     first, side = jnp.unstack(jnp.asarray(_grids(resolution))[levels], axis=-1)
-    scale = jnp.exp2(-levels.astype(axes.dtype))
+    scale = jnp.exp2(-levels.astype(across.dtype))
     taps = jnp.clip(jnp.ceil(scale[:, None] * widths), 1, most[:, None])
-    steps = axes * (scale[:, None] / taps)[..., None]
+    steps = across * (scale[:, None] / taps)[..., None]
     middle = jnp.sum(0.5 * (taps - 1.0)[..., None] * steps, axis=1)
     return Lookups(
         pixels=pixels,
@@ -166,6 +151,7 @@ def locate(
         starts=(half * scale)[:, None] * (places + 1.0) - middle,
         steps=steps,
         throughput=ends.throughput,
+        directions=ends.directions[:, :axes],
     )
 
 
@@ -232,7 +218,7 @@ def mipmap(pyramid: Pyramid, space: Space) -> Mips:
     return tuple(mips)
 
 
-def _refine(grid: Float[Array, "6 side side 3"]) -> Float[Array, "6 finer finer 3"]:
+def _refine(grid: Float[Array, "6 side side channels"]) -> Float[Array, "6 finer finer channels"]:
     """Returns the bilinear interpolation of a grid at the vertices of one twice as fine."""
     zero = jnp.zeros((), grid.dtype)
     for axis in (1, 2):
@@ -243,7 +229,9 @@ def _refine(grid: Float[Array, "6 side side 3"]) -> Float[Array, "6 finer finer 
     return grid
 
 
-def _halve(grid: Float[Array, "6 side side 3"]) -> Float[Array, "6 coarser coarser 3"]:
+def _halve(
+    grid: Float[Array, "6 side side channels"],
+) -> Float[Array, "6 coarser coarser channels"]:
     """Returns weighted means at every second vertex: 1/4, 1/2, 1/4, or 2/3, 1/3 at an edge."""
     zero = jnp.zeros((), grid.dtype)
     for axis in (1, 2):
@@ -261,12 +249,14 @@ def _every(grid: Array, axis: int, start: int, stop: int | None, stride: int) ->
     return grid[tuple(slice(start, stop, stride) if n == axis else slice(None) for n in range(4))]
 
 
-def _joined(grid: Float[Array, "6 side side 3"], space: Space) -> Float[Array, "6 side side 3"]:
+def _joined(
+    grid: Float[Array, "6 side side channels"], space: Space
+) -> Float[Array, "6 side side channels"]:
     """Returns a grid whose faces agree on their common edges, unless it is a cube's."""
     if space == "bounded":
         return grid
     where, groups = _edges(grid.shape[1] - 1)
-    rows = grid.reshape(-1, 3)
+    rows = grid.reshape(-1, grid.shape[-1])
     sums = jax.ops.segment_sum(rows[where], groups, num_segments=int(groups.max()) + 1)
     shares = np.bincount(groups).astype(np.float32)[:, None]
     means = (sums / shares)[groups]
@@ -290,9 +280,9 @@ def _edges(side: int) -> tuple[Int[np.ndarray, " edges"], Int[np.ndarray, " edge
     return where, groups.reshape(-1).astype(np.int32)
 
 
-def _table(mips: Mips) -> Float[Array, "texels 3"]:
+def _table(mips: Mips) -> Float[Array, "texels channels"]:
     """Returns the radiance of all resolutions as one list."""
-    return jnp.concatenate([mip.reshape(-1, 3) for mip in mips])
+    return jnp.concatenate([mip.reshape(-1, mip.shape[-1]) for mip in mips])
 
 
 def _grids(resolution: int) -> Int[np.ndarray, "levels 2"]:
@@ -333,6 +323,20 @@ def _mean(lookups: Lookups) -> Float[Array, "*paths 3"]:
     """Returns the share of the throughput that each tap of a path has."""
     count = jnp.maximum(jnp.prod(lookups.taps, axis=-1, keepdims=True), 1)
     return lookups.throughput / count.astype(lookups.starts.dtype)
+
+
+def _seen_along(
+    lookups: Lookups, values: Float[Array, "*paths channels"]
+) -> Float[Array, "*paths 3"]:
+    """Returns the radiance along paths, of values at the points that they end on."""
+    each = [values[..., 3 * n : 3 * n + 3] for n in range(values.shape[-1] // 3)]
+    return sum((lookups.directions[..., n, None] * x for n, x in enumerate(each[1:])), each[0])
+
+
+def _along(lookups: Lookups, slopes: Float[Array, "*paths 3"]) -> Float[Array, "*paths channels"]:
+    """Returns the transpose of `_seen_along`."""
+    axes = range(lookups.directions.shape[-1])
+    return jnp.concatenate([slopes, *(lookups.directions[..., n, None] * slopes for n in axes)], -1)
 
 
 def radiance(mips: Mips, lookups: Lookups) -> Float[Array, "paths 3"]:
@@ -398,7 +402,7 @@ def transposed(slopes: Float[Array, "pixels 3"], lookups: Lookups, *, resolution
         cpu=functools.partial(_add if lookups.pixels.size < _FEW else _add_native, entries),
         default=functools.partial(_add, entries),
     )
-    shapes = [(FACES, side + 1, side + 1, 3) for side in sides(resolution)[::-1]]
+    shapes = [(FACES, side + 1, side + 1, table.shape[1]) for side in sides(resolution)[::-1]]
     parts = jnp.split(table, grids[1:, 0])
     return tuple(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True))
 
@@ -414,13 +418,14 @@ def _read(pixels: int, table: Array, lookups: Lookups) -> Float[Array, "pixels 3
         return seen + jnp.where((tap < counts)[:, None], light, 0.0)
 
     most = jnp.max(counts, initial=0)
-    seen = jax.lax.fori_loop(0, most, add, jnp.zeros_like(lookups.throughput))
+    start = jnp.zeros((counts.size, table.shape[1]), table.dtype)
+    seen = _seen_along(lookups, jax.lax.fori_loop(0, most, add, start))
     return jax.ops.segment_sum(_mean(lookups) * seen, lookups.pixels, num_segments=pixels)
 
 
-def _add(entries: int, slopes: Array, lookups: Lookups) -> Float[Array, "entries 3"]:
+def _add(entries: int, slopes: Array, lookups: Lookups) -> Float[Array, "entries channels"]:
     """Returns the transpose of `_read`."""
-    slope = _mean(lookups) * slopes[lookups.pixels]
+    slope = _along(lookups, _mean(lookups) * slopes[lookups.pixels])
     counts = jnp.prod(lookups.taps, axis=-1)
     across = jnp.maximum(lookups.taps[..., 1], 1)
 
@@ -430,7 +435,7 @@ def _add(entries: int, slopes: Array, lookups: Lookups) -> Float[Array, "entries
             table = table.at[entry].add(weight[:, None] * used)
         return table
 
-    table = jnp.zeros((entries, 3), slopes.dtype)
+    table = jnp.zeros((entries, slope.shape[1]), slopes.dtype)
     return jax.lax.fori_loop(0, jnp.max(counts, initial=0), add, table)
 
 
@@ -440,14 +445,15 @@ def _read_native(pixels: int, table: Array, lookups: Lookups) -> Array:
     @native_loop
     def read_all(table: Array, lookups: Lookups) -> Array:
         def read(index: Array, seen: Array) -> Array:
-            look = _record(lookups, index)
+            look = record(lookups, index)
 
             def add(along: Array, across: Array, total: Array) -> Array:
                 corners = _corners(look, along, across)
-                return total + sum(weight * _record(table, entry) for entry, weight in corners)
+                return total + sum(weight * record(table, entry) for entry, weight in corners)
 
-            light = _mean(look) * _over_taps(look, add, jnp.zeros(3, table.dtype))
-            return _with_record(seen, look.pixels, _record(seen, look.pixels) + light)
+            values = _over_taps(look, add, jnp.zeros(table.shape[1], table.dtype))
+            light = _mean(look) * _seen_along(look, values)
+            return with_record(seen, look.pixels, record(seen, look.pixels) + light)
 
         start = jnp.zeros((pixels, 3), table.dtype)
         return jax.lax.fori_loop(0, lookups.pixels.shape[0], read, start)
@@ -461,17 +467,18 @@ def _add_native(entries: int, slopes: Array, lookups: Lookups) -> Array:
     @native_loop
     def add_all(slopes: Array, lookups: Lookups) -> Array:
         def add(index: Array, table: Array) -> Array:
-            look = _record(lookups, index)
-            slope = _mean(look) * _record(slopes, look.pixels)
+            look = record(lookups, index)
+            slope = _along(look, _mean(look) * record(slopes, look.pixels))
 
             def spread(along: Array, across: Array, table: Array) -> Array:
                 for entry, weight in _corners(look, along, across):
-                    table = _with_record(table, entry, _record(table, entry) + weight * slope)
+                    table = with_record(table, entry, record(table, entry) + weight * slope)
                 return table
 
             return _over_taps(look, spread, table)
 
-        start = jnp.zeros((entries, 3), slopes.dtype)
+        channels = 3 + 3 * lookups.directions.shape[1]
+        start = jnp.zeros((entries, channels), slopes.dtype)
         return jax.lax.fori_loop(0, lookups.pixels.shape[0], add, start)
 
     return add_all(slopes, lookups)
@@ -484,17 +491,3 @@ def _over_taps(look: Lookups, body: Callable[[Array, Array, Array], Array], star
         return jax.lax.fori_loop(0, look.taps[1], functools.partial(body, along), carried)
 
     return jax.lax.fori_loop(0, look.taps[0], line, start)
-
-
-def _record(values: Any, index: Array) -> Any:
-    """Returns one record of arrays."""
-
-    def pick(x: Array) -> Array:
-        return jax.lax.dynamic_index_in_dim(x, index, keepdims=False, allow_negative_indices=False)
-
-    return jax.tree.map(pick, values)
-
-
-def _with_record(values: Array, at: Array, value: Array) -> Array:
-    update = jax.lax.dynamic_update_index_in_dim
-    return update(values, value, at, axis=0, allow_negative_indices=False)

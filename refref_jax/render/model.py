@@ -11,13 +11,22 @@ from typing import NamedTuple, get_args
 import jax
 from jaxtyping import Array
 
-from refref_jax.choices import ORIGIN, Footprint, Interior, LastSample, Position, Space
+from refref_jax.choices import (
+    ORIGIN,
+    Footprint,
+    InFront,
+    Interior,
+    LastSample,
+    Position,
+    Space,
+    ViewDependence,
+)
 from refref_jax.fields import base, registry
 from refref_jax.fields.base import DensityConfig, RadianceConfig
 from refref_jax.optics.path_settings import Detail, PathSettings, Tally
 from refref_jax.optics.scene import Scene
 from refref_jax.render import backdrop, learned_media
-from refref_jax.render.backdrop import BackdropConfig, Pyramid
+from refref_jax.render.backdrop import Pyramid
 from refref_jax.render.learned_media import LearnedTints
 
 # Segments before and after a convex object.
@@ -39,6 +48,34 @@ class ProposalConfig:
 
     field: DensityConfig
     samples: int
+
+
+@dataclasses.dataclass(frozen=True)
+class BackdropConfig:
+    """Shape of a far field surface; the kind of the surface is the space of the scene.
+
+    Attributes:
+      resolution: number of cells per side of a face.
+      most_taps: largest number of taps along each axis of a ray's footprint.
+      in_front: `field` for opaque parts and parts whose inside is a field, `nothing` without such.
+      view_dependence: whether radiance is `linear` in the direction of light, or `none`.
+    """
+
+    resolution: int
+    most_taps: int = 3
+    in_front: InFront = "nothing"
+    view_dependence: ViewDependence = "none"
+
+    @property
+    def axes(self) -> int:
+        """Number of axes of the direction of light that the radiance depends on."""
+        return 3 if self.view_dependence == "linear" else 0
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        counts = self.resolution, self.most_taps
+        if min(counts) < 1:
+            raise ValueError(f"Resolution and taps are {counts}. Give positive numbers.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,7 +216,8 @@ def init_params(key: Array, config: ModelConfig) -> Params:
     """Returns initial parameters of all fields of a model."""
     colours = learned_media.init(config.learned_tints) if config.learned_tints else None
     if config.backdrop is not None and not has_foreground(config):
-        return Params((), backdrop.init(config.backdrop.resolution), colours)
+        surface = backdrop.init(config.backdrop.resolution, axes=config.backdrop.axes)
+        return Params((), surface, colours)
     field_key, *keys = jax.random.split(key, 1 + len(config.proposals))
     proposals = tuple(
         registry.init_density(proposal_key, proposal.field)
@@ -187,7 +225,8 @@ def init_params(key: Array, config: ModelConfig) -> Params:
     )
     field = registry.init_radiance(field_key, config.field)
     if config.backdrop is not None:
-        field = Layers(field, backdrop.init(config.backdrop.resolution))
+        surface = backdrop.init(config.backdrop.resolution, axes=config.backdrop.axes)
+        field = Layers(field, surface)
     return Params(proposals, field, colours)
 
 

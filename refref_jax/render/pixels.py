@@ -122,6 +122,7 @@ def _see_backdrop(params: Params, config: ModelConfig, paths: LightPaths) -> Com
         jnp.arange(count, dtype=jnp.int32),
         resolution=resolution,
         most_taps=config.backdrop.most_taps,
+        axes=config.backdrop.axes,
     )
     surface = surface_of(params)
     if has_foreground(config):  # only the field in front of it is trained

@@ -7,6 +7,7 @@ meet no object are straight and are not traced. A fraction of the pixels is held
 `System` is the function from the unknowns to the colours of all pixels, and its transpose.
 """
 
+import copy
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
@@ -90,7 +91,7 @@ class _Seen(NamedTuple):
 
 @functools.partial(
     jax.jit,
-    static_argnames=("settings", "domain", "resolution", "most_taps", "tally", "fields"),
+    static_argnames=("settings", "domain", "resolution", "most_taps", "axes", "tally", "fields"),
 )
 def _look(
     scene: Scene,
@@ -100,6 +101,7 @@ def _look(
     domain: Domain,
     resolution: int,
     most_taps: int,
+    axes: int,
     tally: Tally,
     fields: tuple[int, ...],
 ) -> _Seen:
@@ -122,7 +124,9 @@ def _look(
         hidden |= jnp.isfinite(ends.stop.tau)
     throughput = jnp.where(light_paths.exists(ends)[:, None], ends.throughput, 0.0)
     ends = ends._replace(throughput=throughput)
-    lookups = backdrop.locate(domain, ends, ends.rays, resolution=resolution, most_taps=most_taps)
+    lookups = backdrop.locate(
+        domain, ends, ends.rays, resolution=resolution, most_taps=most_taps, axes=axes
+    )
     return _Seen(lookups, crossings, hidden)
 
 
@@ -135,6 +139,7 @@ def read(
     domain: Domain,
     resolution: int,
     most_taps: int = 3,
+    axes: int = 0,
     side: int = 1,
     tally: Tally = "none",
     fields: tuple[int, ...] = (),
@@ -153,6 +158,7 @@ def read(
       domain: scene bounds; their `space` is the kind of the surface.
       resolution: number of cells per side of a face.
       most_taps: largest number of taps along each axis of a ray's footprint.
+      axes: number of axes of the direction that the radiance depends on, 0 or 3.
       side: number of rays along each edge of a pixel.
       tally: `parts` if tints and absorption are learned.
       fields: parts whose inside is a field: pixels whose light crosses one, or ends on an opaque
@@ -175,6 +181,7 @@ def read(
         domain=domain,
         resolution=resolution,
         most_taps=most_taps,
+        axes=axes,
         tally=tally,
         fields=fields,
     )
@@ -356,11 +363,19 @@ class System:
 
     def diagonal(self, weights: list[Array]) -> Unknowns:
         """Returns the scales of the unknowns, from the weights of the pixels."""
-        scales = self.transpose(weights)
+        # Directions may be negative, scales may not.
+        positive = [_with_positive_directions(block) for block in self.blocks]
+        scales = self._replaced(positive).transpose(weights)
         if not self._slopes:
             return scales
         squares = [jnp.square(s) * w for s, w in zip(self._slopes, weights, strict=True)]
         return scales._replace(gains=self._per_view(squares))
+
+    def _replaced(self, blocks: list[Block]) -> "System":
+        """Returns the same function of other equations."""
+        other = copy.copy(self)
+        other.blocks = blocks
+        return other
 
     def _per_view(self, values: list[Array]) -> Float[Array, "views 1 1 3"]:
         """Returns the sums of values of pixels over each view."""
@@ -377,6 +392,11 @@ def exposed(block: Block, gains: Gains | None) -> Block:
 def _with_gains(block: Block, gains: Gains) -> Block:
     gain = jnp.exp(gains)[block.views[block.lookups.pixels]]
     lookups = block.lookups._replace(throughput=block.lookups.throughput * gain)
+    return block._replace(lookups=lookups)
+
+
+def _with_positive_directions(block: Block) -> Block:
+    lookups = block.lookups._replace(directions=jnp.abs(block.lookups.directions))
     return block._replace(lookups=lookups)
 
 

@@ -92,6 +92,7 @@ class _Problem(NamedTuple):
             domain=volume_rendering.domain(self.model.config),
             resolution=shape.resolution,
             most_taps=shape.most_taps,
+            axes=shape.axes,
             tally=path_detail(self.model.config, self.model.settings).tally,
             fields=self._interiors(),
             share=self.share,

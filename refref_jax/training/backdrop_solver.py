@@ -66,6 +66,9 @@ ROUND = 8
 # the surface have no common scale.
 _GAIN_PRIOR = 10.0
 
+# Weight of the derivatives of the radiance by the direction, relative to that of the details.
+_VIEW_PRIOR = 10.0
+
 # What pixels of earlier rounds have told counts this much in the next one.
 _FADES = 0.5
 
@@ -127,13 +130,18 @@ def _residuals(block: Block, predicted: Array) -> tuple[Array, Array, Array]:
 def _dot(a: Unknowns, b: Unknowns) -> Array:
     """Returns the inner product of each channel."""
     pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
-    return functools.reduce(jnp.add, [jnp.sum(x * y, axis=(0, 1, 2)) for x, y in pairs])
+    products = [jnp.sum(x * y, axis=(0, 1, 2)).reshape(-1, 3) for x, y in pairs]
+    return functools.reduce(jnp.add, [jnp.sum(each, axis=0) for each in products])
 
 
 @jax.jit
 def _add_scaled(a: _Arrays, scale: Float[Array, "3"], b: _Arrays) -> _Arrays:
     """Returns `a + scale b`, with a scale for each channel."""
-    return jax.tree.map(lambda x, y: x + jnp.broadcast_to(scale, y.shape) * y, a, b)
+
+    def add(x: Array, y: Array) -> Array:
+        return x + jnp.broadcast_to(jnp.tile(scale, y.shape[-1] // 3), y.shape) * y
+
+    return jax.tree.map(add, a, b)
 
 
 @jax.jit
@@ -204,7 +212,8 @@ def solve(
     """
     if mean is None:
         mean = jnp.mean(jnp.stack([jnp.mean(block.linear, axis=0) for block in blocks]), axis=0)
-    uniform = backdrop.init(resolution, radiance=mean)
+    axes = blocks[0].lookups.directions.shape[1]
+    uniform = backdrop.init(resolution, radiance=mean, axes=axes)
     step, levels = start or (0, uniform)
     whole, tinted = blocks, [] if tints is None else [_tinted(block) for block in blocks]
     fewer = _thinned(blocks, levels[-1][..., 0].size) if thinned_rounds and not others else blocks
@@ -258,8 +267,11 @@ class _Priors(NamedTuple):
 
 
 def _priors(system: System, uniform: Pyramid, prior: float, held: Pyramid | None) -> _Priors:
+    each = [prior if i else 1e-2 * prior for i in range(len(uniform))]
+    extra = uniform[0].shape[-1] - 3
+    by_channel = [_VIEW_PRIOR * prior] * extra
     weights = Unknowns(
-        tuple(jnp.float32(prior if i else 1e-2 * prior) for i in range(len(uniform))),
+        tuple(jnp.array([[[[w] * 3 + by_channel]]] if extra else w, jnp.float32) for w in each),
         jnp.float32(_GAIN_PRIOR * prior),
     )
     nothing = jnp.zeros(())
@@ -338,7 +350,7 @@ def coverage(
     """
     kept = [jnp.broadcast_to(block.kept[:, None], block.srgb.shape) for block in blocks]
     finest = System(blocks, space, resolution, tints, None).transpose(kept).levels[-1]
-    return jnp.mean(finest, axis=-1)
+    return jnp.mean(finest[..., :3], axis=-1)
 
 
 # ---- Learned tints ----

@@ -34,7 +34,7 @@ FIELD_ONLY = (
 )
 """Options that only a radiance field reads."""
 
-BACKDROP_ONLY = ("backdrop_resolution", "iterations", "most_pixels", "exposure")
+BACKDROP_ONLY = ("backdrop_resolution", "iterations", "most_pixels", "exposure", "view_dependence")
 """Options that only a backdrop reads."""
 
 # Options that determine the model of the far field.
@@ -185,6 +185,8 @@ class FieldConfig:
         round of 8 iterations takes others, drawn at random.
       exposure: Exposure and white balance of the training images: fixed, or a learned gain for each
         image and channel (per_image), for captures; only of a backdrop.
+      view_dependence: Dependence of a backdrop's radiance on the direction of light: none, or
+        linear, for walls that shine.
     """
 
     preset: choices.PresetName = option("tiny")
@@ -211,6 +213,7 @@ class FieldConfig:
     iterations: int | None = option(None, after=("far_field",))
     most_pixels: int | None = option(None, after=("far_field",))
     exposure: choices.Exposure | None = option(None, after=("far_field",))
+    view_dependence: choices.ViewDependence | None = option(None, after=("far_field",))
 
     def __post_init__(self) -> None:
         """Checks the numbers."""

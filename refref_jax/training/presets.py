@@ -45,8 +45,7 @@ from refref_jax.fields import mlps, registry
 from refref_jax.fields.base import RadianceConfig
 from refref_jax.fields.hash_grid import HashGridConfig
 from refref_jax.geometry.cameras import Cameras
-from refref_jax.render.backdrop import BackdropConfig
-from refref_jax.render.model import ModelConfig, ProposalConfig
+from refref_jax.render.model import BackdropConfig, ModelConfig, ProposalConfig
 from refref_jax.training.config import FieldConfig, LossConfig, ScheduleConfig, require
 
 _WALLS = 7.3
@@ -197,7 +196,8 @@ def override_model(
     given = {name: getattr(asked, name) for name in names}
     if asked.far_field == "backdrop":
         cells = asked.backdrop_resolution or BACKDROP_RESOLUTION
-        given["backdrop"] = BackdropConfig(cells, in_front=in_front)
+        seen = asked.view_dependence or "none"
+        given["backdrop"] = BackdropConfig(cells, in_front=in_front, view_dependence=seen)
     model = dataclasses.replace(model, **{n: x for n, x in given.items() if x is not None})
     if asked.precision is not None:
         proposals = tuple(

@@ -360,6 +360,7 @@ def _resolve_far_field(
             iterations=presets.BACKDROP_ITERATIONS,
             most_pixels=presets.BACKDROP_PIXELS,
             exposure="fixed",
+            view_dependence="none",
         )
     for name in BACKDROP_ONLY:
         if (value := config.get(name)) is not None:

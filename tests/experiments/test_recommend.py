@@ -220,7 +220,7 @@ def test_a_cell_is_as_wide_as_the_median_pixel():
     steps = np.zeros((3, 2, 2))
     steps[:, 0, 1] = widths / taps[:, 0]
     steps[:, 1, 0] = 0.1 * widths / taps[:, 1]
-    lookups = Lookups(*([None] * 2), sides, taps, None, steps, None)
+    lookups = Lookups(*([None] * 2), sides, taps, None, steps, None, None)
     blocks = [Block(lookups, *([None] * 5))]
     assert backdrop_trial.resolution_of(blocks, 256) == 128
     tiny = [Block(lookups._replace(steps=0.0 * steps), *([None] * 5))]

@@ -24,10 +24,11 @@ def _rays(count, *, radius=1e-2, seed=0):
     return Rays(*(jnp.asarray(x, jnp.float32) for x in (0.3 * drawn[0], directions, radii)))
 
 
-def _lookups(domain, rays, *, most_taps=3):
+def _lookups(domain, rays, *, most_taps=3, axes=0):
     ends = straight_ends(rays, footprint="differential")
     pixels = jnp.arange(rays.radii.size, dtype=jnp.int32) // 2
-    return backdrop.locate(domain, ends, pixels, resolution=_SIDE, most_taps=most_taps)
+    shape = {"resolution": _SIDE, "most_taps": most_taps, "axes": axes}
+    return backdrop.locate(domain, ends, pixels, **shape)
 
 
 def _random_pyramid(seed=1):
@@ -35,6 +36,31 @@ def _random_pyramid(seed=1):
     return tuple(
         jnp.asarray(random.uniform(size=(6, side + 1, side + 1, 3)), jnp.float32)
         for side in backdrop.sides(_SIDE)
+    )
+
+
+@pytest.mark.parametrize("count", [40, 400])
+def test_the_radiance_may_be_linear_in_the_direction(count):
+    domain, rays = _DOMAINS["spherical"], _rays(count)
+    lookups, plain = _lookups(domain, rays, axes=3), _lookups(domain, rays)
+    each = [backdrop.mipmap(_random_pyramid(seed), "spherical") for seed in range(4)]
+    mips = tuple(jnp.concatenate(level, axis=-1) for level in zip(*each, strict=True))
+    seen = jax.jit(lambda mips: backdrop.colours(mips, lookups, pixels=count // 2))(mips)
+    shares = [jnp.ones((count, 1)), *jnp.split(rays.directions, 3, axis=1)]
+    expected = sum(
+        backdrop.colours(
+            mip, plain._replace(throughput=share * plain.throughput), pixels=count // 2
+        )
+        for mip, share in zip(each, shares, strict=True)
+    )
+    np.testing.assert_allclose(seen, expected, atol=1e-5)
+    # The transpose is that of the same function.
+    slopes = jnp.asarray(np.random.default_rng(7).normal(size=(count // 2, 3)), jnp.float32)
+    spread = jax.jit(lambda x: backdrop.transposed(x, lookups, resolution=_SIDE))(slopes)
+    assert spread[0].shape[-1] == 12
+    pairs = zip(spread, mips, strict=True)
+    np.testing.assert_allclose(
+        sum(float(jnp.vdot(a, b)) for a, b in pairs), float(jnp.vdot(seen, slopes)), rtol=1e-4
     )
 
 

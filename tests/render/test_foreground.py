@@ -11,8 +11,7 @@ from refref_jax.fields import registry
 from refref_jax.fields.base import Radiance
 from refref_jax.optics.light_paths import Stop
 from refref_jax.render import backdrop, pixels
-from refref_jax.render.backdrop import BackdropConfig
-from refref_jax.render.model import Layers, Params, init_params
+from refref_jax.render.model import BackdropConfig, Layers, Params, init_params
 from tests.factories import made_paths
 from tests.factories.small_model import MODEL
 

@@ -124,6 +124,7 @@ def _one_pixel(srgb, *, throughput=1.0, kept=1.0):
         starts=jnp.full((1, 2), 0.5 * _RESOLUTION),
         steps=jnp.zeros((1, 2, 2)),
         throughput=jnp.full((1, 3), throughput),
+        directions=jnp.zeros((1, 0)),
     )
     colour = jnp.full((1, 3), srgb)
     nothing = jnp.zeros((1, 0))
@@ -265,3 +266,24 @@ def test_rounds_with_other_pixels_come_close_to_all_pixels(ball):
     )
     for ours, theirs in zip(jax.tree.leaves(again), jax.tree.leaves(streamed), strict=True):
         np.testing.assert_array_equal(ours, theirs)
+
+
+def test_radiance_that_is_linear_in_the_direction_is_recovered():
+    # A grey cube that is brighter for light that travels up, seen from two rings of cameras.
+    views, domain = _views(12, 32), Domain(6.0, "bounded")
+    images = []
+    for view in range(12):
+        towards = cameras.image_rays(views, view).directions
+        linear = np.broadcast_to(0.3 + 0.2 * np.asarray(towards)[..., 2:], (32, 32, 3))
+        srgb = pixels.linear_to_srgb(jnp.asarray(linear, jnp.float32))
+        images.append(np.round(255.0 * np.asarray(srgb)).astype(np.uint8))
+    found = {}
+    for axes in (0, 3):
+        blocks = _equations(
+            scenes.build(scenes.ball(0.01)), views, np.stack(images), domain=domain, axes=axes
+        )
+        *_, found[axes] = backdrop_solver.solve(
+            blocks, space="bounded", resolution=_RESOLUTION, iterations=24
+        )
+    assert found[3].held_out > max(42.0, found[0].held_out + 8.0)
+    assert found[3].pyramid[-1].shape[-1] == 12

@@ -11,8 +11,7 @@ from experiments.exporting import backdrop_surface
 from refref_jax.geometry.rays import Rays
 from refref_jax.optics import light_paths
 from refref_jax.render import backdrop, pixels
-from refref_jax.render.backdrop import BackdropConfig
-from refref_jax.render.model import Model, Params
+from refref_jax.render.model import BackdropConfig, Model, Params
 from refref_jax.sampling.scene_bounds import Domain
 from tests.factories import small_model
 
