@@ -7,7 +7,6 @@ meet no object are straight and are not traced. A fraction of the pixels is held
 `System` is the function from the unknowns to the colours of all pixels, and its transpose.
 """
 
-import copy
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
@@ -351,11 +350,7 @@ class System:
 
     def transpose(self, factors: list[Array]) -> Unknowns:
         """Returns what the pixels of all blocks add to each unknown."""
-
-        def spread(factors: Array, block: Block) -> Mips:
-            return jax.block_until_ready(_transposed(factors, block, resolution=self._resolution))
-
-        levels = _mipmap_transposed(sum_of(at_once(spread, factors, self.blocks)), self._space)
+        levels = self._spread(factors, self.blocks)
         if not self._slopes:
             return self.present(levels)
         by_gain = [s * f for s, f in zip(self._slopes, factors, strict=True)]
@@ -365,17 +360,19 @@ class System:
         """Returns the scales of the unknowns, from the weights of the pixels."""
         # Directions may be negative, scales may not.
         positive = [_with_positive_directions(block) for block in self.blocks]
-        scales = self._replaced(positive).transpose(weights)
+        scales = self.present(self._spread(weights, positive))
         if not self._slopes:
             return scales
         squares = [jnp.square(s) * w for s, w in zip(self._slopes, weights, strict=True)]
         return scales._replace(gains=self._per_view(squares))
 
-    def _replaced(self, blocks: list[Block]) -> "System":
-        """Returns the same function of other equations."""
-        other = copy.copy(self)
-        other.blocks = blocks
-        return other
+    def _spread(self, factors: list[Array], blocks: list[Block]) -> Pyramid:
+        """Returns what pixels add to the levels."""
+
+        def spread(factors: Array, block: Block) -> Mips:
+            return jax.block_until_ready(_transposed(factors, block, resolution=self._resolution))
+
+        return _mipmap_transposed(sum_of(at_once(spread, factors, blocks)), self._space)
 
     def _per_view(self, values: list[Array]) -> Float[Array, "views 1 1 3"]:
         """Returns the sums of values of pixels over each view."""

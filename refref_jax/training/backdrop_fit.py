@@ -100,6 +100,11 @@ class _Problem(NamedTuple):
             progress=self.traced,
         )
 
+    def write_coverage(self, run: Path, blocks: Sequence[Block], state: TrainState) -> None:
+        """Writes how many pixels see each vertex, or an estimate from a share of them."""
+        seen = backdrop_solver.coverage(blocks, **self.surface, tints=state.params.tints)
+        run_folder.write_coverage(run, jax.device_get(seen / self.share))
+
     def _mean(self) -> Float[Array, "3"]:
         """Returns the mean linear RGB of the images; of some pixels, if there are very many."""
         some = self.images.reshape(-1, 3)[:: 1 + self.images.size // _MOST_MEAN]
@@ -185,8 +190,7 @@ def solve(
     step = int(state.step)
     earlier = run_folder.rewind_metrics(run, step)
     blocks = problem.equations(step // backdrop_solver.ROUND if problem.share < 1.0 else 0)
-    seen = backdrop_solver.coverage(blocks, **problem.surface, tints=state.params.tints)
-    run_folder.write_coverage(run, jax.device_get(seen / problem.share))
+    problem.write_coverage(run, blocks, state)
     for reached in problem.iterate(state, blocks):
         step = reached.step
         line = {"step": step, "psnr": reached.fitted, "psnr_held_out": reached.held_out}
@@ -207,6 +211,7 @@ def solve(
 
 
 def behind_field(
+    run: Path,
     state: TrainState,
     config: TrainConfig,
     model: SavedModel,
@@ -218,6 +223,7 @@ def behind_field(
     """Solves for the backdrop behind a field, from the pixels that see nothing but the backdrop.
 
     Args:
+      run: folder of the run.
       state: state before the first step of the field.
       config: configuration of the run.
       model: static part of its model.
@@ -231,8 +237,9 @@ def behind_field(
     """
     total = require(config.schedule.steps)
     problem = _read(config, model, scene, folder, lambda text: progress(0, total, text), stop)
-    params = state.params
-    for reached in problem.iterate(problem.unsolved(), problem.equations(0)):
+    params, unsolved, blocks = state.params, problem.unsolved(), problem.equations(0)
+    problem.write_coverage(run, blocks, unsolved)
+    for reached in problem.iterate(unsolved, blocks):
         progress(0, total, f"backdrop, iteration {reached.step}  PSNR {reached.fitted:.2f}")
         if stop():
             raise KeyboardInterrupt  # there is no new state to save

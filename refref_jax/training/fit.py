@@ -279,18 +279,16 @@ def train(
             return step == total
         sampler = _sampler(config, folder, objects if surface else None)
         setup = loop.set_up(config, model.config, model.settings, objects, sampler, mesh=mesh)
-        if setup.hit_fraction == 0.0 and model.settings.max_bends > 0:
-            report(
-                "warning: no camera ray hits the meshes, so no light is bent. Check that their "
-                "units, axes and position are those of the cameras."
-            )
+        _report_misses(setup, report)
         begun = time.monotonic()
         state = init_state(config.seed, model.config, config.schedule)
         state = devices.put_everywhere(state, mesh=mesh)
         if checkpoints.newest() is not None:
             state = checkpoints.restore(state)
         elif surface:
-            state = backdrop_fit.behind_field(state, config, model, objects, folder, progress, stop)
+            state = backdrop_fit.behind_field(
+                run, state, config, model, objects, folder, progress, stop
+            )
         if devices.any_process(stop()):
             raise KeyboardInterrupt  # there is no new state to save
         # Of a run with fields alone, these are the seconds of its steps.
@@ -299,6 +297,15 @@ def train(
     if step < total:
         report(f"Stopped at step {step}.")
     return step == total
+
+
+def _report_misses(setup: loop.Setup, report: Callable[[str], None]) -> None:
+    """Reports that no light is bent, although there are objects."""
+    if setup.hit_fraction == 0.0 and setup.settings.max_bends > 0:
+        report(
+            "warning: no camera ray hits the meshes, so no light is bent. Check that their "
+            "units, axes and position are those of the cameras."
+        )
 
 
 def _sampler(config: TrainConfig, scene: Path, objects: Scene | None) -> PixelSampler:

@@ -194,6 +194,11 @@ def override_model(
         model = _with_samples(model, asked.samples_per_ray, asked.preset)
     names = ("multisamples", "footprint", "dilation")
     given = {name: getattr(asked, name) for name in names}
+    if asked.exposure == "per_image" and in_front == "field":
+        raise ValueError(
+            "exposure=per_image, but this scene needs a field in front of its backdrop, and a "
+            "field has one exposure for all images. Leave it out."
+        )
     if asked.far_field == "backdrop":
         cells = asked.backdrop_resolution or BACKDROP_RESOLUTION
         seen = asked.view_dependence or "none"

@@ -171,6 +171,8 @@ def test_a_field_on_opaque_parts_is_trained_in_front_of_the_backdrop(filled, tmp
     assert any("steps=6" in line for line in lines) and not any("No effect" in x for x in lines)
     reached = run_folder.read_metrics(tmp_path / "run")
     assert reached[-1]["step"] == 6 and np.isfinite(reached[-1]["loss"])
+    seen = run_folder.read_coverage(tmp_path / "run")
+    assert seen.shape == (6, 65, 65) and np.sum(seen) > 1e4
     # The backdrop is that of the pixels that see nothing else, and training leaves it as it is.
     frames = scene_folder.read_frames(filled, "train")
     seen = render_image(model, image_rays(frames.cameras, 0))
@@ -192,6 +194,9 @@ def test_opaque_parts_lead_to_a_backdrop_with_a_field_in_front_of_it(filled):
     assert resolved.config.model.far_field == "backdrop"
     assert resolved.model.config.backdrop.in_front == "field"
     assert "preset=tiny" in resolved.describe()
+    gains = TrainConfig().override(scene=str(filled), exposure="per_image")
+    with pytest.raises(ValueError, match="one exposure for all images"):
+        prepare(gains, report=lambda line: None)
 
 
 def test_a_run_stops_between_the_views_that_it_traces(scene, tmp_path):
