@@ -111,7 +111,8 @@ def _with_field(run: Path) -> Model:
     model = checkpoint_io.load_model(run, step=_STEP.value)
     if model.config.backdrop is not None:
         raise ValueError(
-            f"{run} has a backdrop, not a field. Use --what=textured_mesh, faces or panorama."
+            f"{run} has a backdrop, and no density around the objects. Use --what=textured_mesh, "
+            "faces or panorama."
         )
     return model
 

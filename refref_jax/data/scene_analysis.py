@@ -333,8 +333,9 @@ def fit_size(
         curvature = low - 2.0 * middle + high
         return size * (1.0 + 0.5 * step * (low - high) / curvature) if curvature > 0.0 else size
 
-    apart = np.std([vertex(slice(n, None, _GROUPS)) for n in range(min(_GROUPS, views))])
-    return vertex(slice(None)), float(apart) / math.sqrt(_GROUPS - 1.0)
+    groups = min(_GROUPS, views)
+    apart = np.std([vertex(slice(n, None, groups)) for n in range(groups)])
+    return vertex(slice(None)), float(apart) / math.sqrt(max(groups - 1, 1))
 
 
 def _variance(cell: Int[np.ndarray, " n"], seen: Float[np.ndarray, "n 3"]) -> float:

@@ -239,7 +239,7 @@ def in_front_of(front: Composite, rgb: Float[Array, "3"], distance: Float[Array,
         rgb=front.rgb + rest * rgb,
         accumulation=front.accumulation + rest,
         median=jnp.where(jnp.isfinite(front.median), front.median, distance),
-        mean=front.accumulation * near + rest * distance,
+        mean=front.accumulation * near + jnp.where(rest > 0.0, rest * distance, 0.0),
     )
 
 

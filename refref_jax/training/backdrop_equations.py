@@ -34,6 +34,9 @@ from refref_jax.sampling.scene_bounds import Domain
 # One pixel in this many is held out.
 _HELD_OUT = 50
 
+# Seeds of draws begin with this number, which is no view's.
+_DRAWS = 2**31
+
 _Result = TypeVar("_Result")
 _Arrays = TypeVar("_Arrays")
 
@@ -225,10 +228,10 @@ def meets(scene: Scene, cameras: Cameras) -> Bool[np.ndarray, "views h w"]:
 
 
 def _drawn(count: int, share: float, seed: tuple[int, int]) -> Bool[np.ndarray, " pixels"]:
-    """Returns which pixels are drawn."""
+    """Returns which pixels are drawn, independently of those that are held out."""
     if share >= 1.0:
         return np.ones(count, bool)
-    return np.random.default_rng(seed).random(count, np.float32) < share
+    return np.random.default_rng((_DRAWS, *seed)).random(count, np.float32) < share
 
 
 def _in_tiles(

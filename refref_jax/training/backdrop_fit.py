@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import UInt8
 
 from refref_jax import configuration
 from refref_jax.data import scene_folder
 from refref_jax.data.scene_folder import Frames
 from refref_jax.optics.scene import Scene
-from refref_jax.render import pixels, volume_rendering
+from refref_jax.render import backdrop, pixels, volume_rendering
 from refref_jax.render.backdrop import Pyramid
 from refref_jax.render.checkpoint_io import SavedModel
 from refref_jax.render.model import Params, init_params, path_detail, surface_of
@@ -100,15 +100,18 @@ class _Problem(NamedTuple):
             progress=self.traced,
         )
 
-    def write_coverage(self, run: Path, blocks: Sequence[Block], state: TrainState) -> None:
+    def _write_coverage(self, run: Path, blocks: Sequence[Block], state: TrainState) -> None:
         """Writes how many pixels see each vertex, or an estimate from a share of them."""
         seen = backdrop_solver.coverage(blocks, **self.surface, tints=state.params.tints)
         run_folder.write_coverage(run, jax.device_get(seen / self.share))
 
-    def _mean(self) -> Float[Array, "3"]:
-        """Returns the mean linear RGB of the images; of some pixels, if there are very many."""
-        some = self.images.reshape(-1, 3)[:: 1 + self.images.size // _MOST_MEAN]
-        return jnp.mean(pixels.srgb_to_linear(jnp.asarray(some, jnp.float32) / 255.0), axis=0)
+    def _uniform(self) -> Pyramid:
+        """Returns a surface with the mean colour of the images, or of some of many pixels."""
+        shape, some = self.model.config.backdrop, self.images.reshape(-1, 3)
+        assert shape is not None
+        few = jnp.asarray(some[:: 1 + self.images.size // _MOST_MEAN], jnp.float32)
+        mean = jnp.mean(pixels.srgb_to_linear(few / 255.0), axis=0)
+        return backdrop.init(shape.resolution, radiance=mean, axes=shape.axes)
 
     def _interiors(self) -> tuple[int, ...]:
         """Returns the parts whose inside is a field."""
@@ -116,22 +119,26 @@ class _Problem(NamedTuple):
             return tuple(range(self.scene.interfaces.index_inside.shape[0]))
         return self.model.config.field_parts
 
-    def iterate(
-        self, state: TrainState, blocks: Sequence[Block]
-    ) -> Iterator[backdrop_solver.Progress]:
-        """Yields the progress of the solver from a state on."""
-        step = int(state.step)
+    def iterate(self, run: Path, state: TrainState) -> Iterator[backdrop_solver.Progress]:
+        """Yields the progress of the solver from a state on; at first, the coverage is written."""
+        step, streams = int(state.step), self.share < 1.0
+        first = [self.equations(step // backdrop_solver.ROUND if streams else 0)]
+        if not step:
+            self._write_coverage(run, first[0], state)
+
+        def drawn(number: int) -> Sequence[Block]:
+            return first.pop() if first else self.equations(number)
+
         return backdrop_solver.solve(
-            blocks,
+            drawn if streams else first.pop(),
             iterations=require(self.config.model.iterations),
             start=(step, surface_of(state.params)) if step else None,
             **self.surface,
             tints=state.params.tints,
             gains=state.optimizer.gains,
             held=state.optimizer.held,
-            mean=self._mean() if self.share < 1.0 else None,
+            uniform=self._uniform() if streams else None,
             tint_decay=self.config.losses.tint_decay,
-            others=self.equations if self.share < 1.0 else None,
         )
 
 
@@ -189,9 +196,7 @@ def solve(
         state = checkpoints.restore(state)
     step = int(state.step)
     earlier = run_folder.rewind_metrics(run, step)
-    blocks = problem.equations(step // backdrop_solver.ROUND if problem.share < 1.0 else 0)
-    problem.write_coverage(run, blocks, state)
-    for reached in problem.iterate(state, blocks):
+    for reached in problem.iterate(run, state):
         step = reached.step
         line = {"step": step, "psnr": reached.fitted, "psnr_held_out": reached.held_out}
         line |= {"seconds": earlier + time.monotonic() - begun}
@@ -237,9 +242,8 @@ def behind_field(
     """
     total = require(config.schedule.steps)
     problem = _read(config, model, scene, folder, lambda text: progress(0, total, text), stop)
-    params, unsolved, blocks = state.params, problem.unsolved(), problem.equations(0)
-    problem.write_coverage(run, blocks, unsolved)
-    for reached in problem.iterate(unsolved, blocks):
+    params = state.params
+    for reached in problem.iterate(run, problem.unsolved()):
         progress(0, total, f"backdrop, iteration {reached.step}  PSNR {reached.fitted:.2f}")
         if stop():
             raise KeyboardInterrupt  # there is no new state to save

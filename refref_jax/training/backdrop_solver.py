@@ -23,7 +23,7 @@ logarithms is 0.
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -68,6 +68,9 @@ _GAIN_PRIOR = 10.0
 
 # Weight of the derivatives of the radiance by the direction, relative to that of the details.
 _VIEW_PRIOR = 10.0
+
+# First rounds take at least this many pixels, also of a coarse surface.
+_FEWEST_PIXELS = 200_000
 
 # What pixels of earlier rounds have told counts this much in the next one.
 _FADES = 0.5
@@ -172,7 +175,7 @@ def _advance(
 
 
 def solve(
-    blocks: Sequence[Block],
+    blocks: Sequence[Block] | Callable[[int], Sequence[Block]],
     *,
     space: Space,
     resolution: int,
@@ -181,11 +184,10 @@ def solve(
     tints: LearnedTints | None = None,
     gains: Gains | None = None,
     held: Pyramid | None = None,
-    mean: Float[Array, "3"] | None = None,
+    uniform: Pyramid | None = None,
     prior: float = 1e-3,
     tint_decay: float = 0.0,
     thinned_rounds: int = 2,
-    others: Callable[[int], Sequence[Block]] | None = None,
 ) -> Iterator[Progress]:
     """Yields the state after each iteration; it may stop earlier than asked.
 
@@ -193,63 +195,120 @@ def solve(
     that is continued from there is the same as one without a pause.
 
     Args:
-      blocks: equations of all views.
+      blocks: equations of all views; or a function of the number of a round to its equations, where
+        all of them do not fit in memory. A round then also keeps to its start, the more so the more
+        pixels of earlier rounds have seen a vertex, and all iterations are taken.
       space: kind of the surface.
       resolution: number of cells per side of a face.
       iterations: largest number of iterations.
       start: number of iterations, a multiple of `ROUND`, and radiance of an earlier run.
       tints: tints and absorption to begin with, if they are learned.
       gains: logarithm of the gain of each image to begin with, if they are learned.
-      held: weight with which the radiance is kept, of an earlier run with `others`.
-      mean: linear RGB of vertices that no pixel sees; by default the mean of the pixels.
+      held: weight with which the radiance of an earlier run with other pixels is kept.
+      uniform: radiance of vertices that no pixel sees, which must be given with a function; by
+        default that of a surface with the mean colour of the pixels.
       prior: weight of the details of the pyramid, relative to a pixel's squared sRGB error.
       tint_decay: weight of the optical density of tints and absorption, relative to the mean
         squared sRGB error.
       thinned_rounds: number of first rounds that take only as many pixels as there are vertices.
-      others: function of the number of a round to its equations, where all of them do not fit in
-        memory; `blocks` are those of the round at the start. A round then also keeps to its start,
-        the more so the more pixels of earlier rounds have seen a vertex, and takes all iterations.
+
+    Raises:
+      ValueError: if `blocks` is a function, and `uniform` is not given.
     """
-    if mean is None:
-        mean = jnp.mean(jnp.stack([jnp.mean(block.linear, axis=0) for block in blocks]), axis=0)
-    axes = blocks[0].lookups.directions.shape[1]
-    uniform = backdrop.init(resolution, radiance=mean, axes=axes)
+    if callable(blocks):
+        if uniform is None:
+            raise ValueError("Equations of each round need the radiance `uniform`. Give it.")
+        draw, tinted, thinned_rounds = blocks, None, 0
+    else:
+        every, mean = blocks, _mean_colour(blocks)
+        axes = blocks[0].lookups.directions.shape[1]
+        uniform = uniform or backdrop.init(resolution, radiance=mean, axes=axes)
+        fewer = _thinned(blocks, uniform[-1][..., 0].size) if thinned_rounds else blocks
+        draw = functools.partial(_first_fewer, every, fewer, thinned_rounds)
+        tinted = None if tints is None else [_tinted(block) for block in blocks]
+    streams, known = callable(blocks), _Known(space, resolution, uniform, prior, tint_decay)
+    del blocks
     step, levels = start or (0, uniform)
-    whole, tinted = blocks, [] if tints is None else [_tinted(block) for block in blocks]
-    fewer = _thinned(blocks, levels[-1][..., 0].size) if thinned_rounds and not others else blocks
-    while step < iterations:
-        blocks = fewer if step < thinned_rounds * ROUND else whole
-        if others and step != (start or (0,))[0]:
-            blocks = others(step // ROUND)
-            tinted = [] if tints is None else [_tinted(block) for block in blocks]
-        before, typical = -math.inf, math.inf
-        if step:
-            seen = System(blocks, space, resolution, tints, gains).see(levels)
-            _, before, typical = _measure(blocks, seen)
-            if tints is not None:
-                brightened = [exposed(block, gains) for block in tinted]
-                mips = mipmap(levels, space)
-                tints = _fit_tints(brightened, mips, tints, typical=typical, decay=tint_decay)
-        system = System(blocks, space, resolution, tints, gains)
-        seen = system.see(levels)
-        expected = seen if step else [block.linear for block in blocks]
-        weights = [_weights(e, b, typical) for e, b in zip(expected, blocks, strict=True)]
-        if tints is not None and not step:
-            weights = [w * _is_direct(b) for w, b in zip(weights, blocks, strict=True)]
-        if step:  # the radiance is no longer uniform, and explains most of the images
-            system.linearise(seen)
-        priors = _priors(system, uniform, prior, held)
-        steps, changed = _search(system, levels, weights, seen, priors), gains
-        if others:
-            held = _add_seen(held, system.diagonal(weights).levels)
-        for x, found in itertools.islice(steps, min(ROUND, iterations - step)):
-            step += 1
-            fitted, held_out, _ = _measure(blocks, found)
-            levels, changed = x.levels, None if gains is None else system.gains(x)
-            yield Progress(step, levels, tints, changed, held, fitted, held_out)
-        gains = changed
-        if held_out < before + _WORTH and blocks is whole and not others:
+    state = Progress(step, levels, tints, gains, held, math.nan, math.nan)
+    while state.step < iterations:
+        number, count = state.step // ROUND, min(ROUND, iterations - state.step)
+        # Nothing here refers to the equations of a round: they are freed before the next ones.
+        state, before = yield from _round(draw(number), tinted, known, state, count, streams)
+        if state.held_out < before + _WORTH and number >= thinned_rounds and not streams:
             return
+
+
+class _Known(NamedTuple):
+    """What is the same in all rounds; see `solve`."""
+
+    space: Space
+    resolution: int
+    uniform: Pyramid
+    prior: float
+    tint_decay: float
+
+
+def _mean_colour(blocks: Sequence[Block]) -> Float[Array, "3"]:
+    return jnp.mean(jnp.stack([jnp.mean(block.linear, axis=0) for block in blocks]), axis=0)
+
+
+def _first_fewer(
+    every: Sequence[Block], fewer: Sequence[Block], rounds: int, number: int
+) -> Sequence[Block]:
+    """Returns the equations of a round, fewer in the first ones."""
+    return fewer if number < rounds else every
+
+
+def _round(
+    blocks: Sequence[Block],
+    tinted: Sequence[Block] | None,
+    known: _Known,
+    state: Progress,
+    count: int,
+    streams: bool,
+) -> Generator[Progress, None, tuple[Progress, float]]:
+    """Takes a round of iterations, with the same weights of the pixels.
+
+    Args:
+      blocks: equations of the round.
+      tinted: equations that tints are learned from; by default those of the round.
+      known: what is the same in all rounds.
+      state: state at the start.
+      count: number of iterations.
+      streams: whether the next round has other equations.
+
+    Returns:
+      The last state, and the PSNR of the held-out pixels at the start.
+    """
+    space, resolution, step = known.space, known.resolution, state.step
+    tints, gains, held, levels = state.tints, state.gains, state.held, state.pyramid
+    before, typical = -math.inf, math.inf
+    if step:
+        seen = System(blocks, space, resolution, tints, gains).see(levels)
+        _, before, typical = _measure(blocks, seen)
+        if tints is not None:
+            behind = tinted or [_tinted(block) for block in blocks]
+            brightened, mips = [exposed(b, gains) for b in behind], mipmap(levels, space)
+            decay = known.tint_decay
+            tints = _fit_tints(brightened, mips, tints, typical=typical, decay=decay)
+    system = System(blocks, space, resolution, tints, gains)
+    seen = system.see(levels)
+    expected = seen if step else [block.linear for block in blocks]
+    weights = [_weights(e, b, typical) for e, b in zip(expected, blocks, strict=True)]
+    if tints is not None and not step:
+        weights = [w * _is_direct(b) for w, b in zip(weights, blocks, strict=True)]
+    if step:  # the radiance is no longer uniform, and explains most of the images
+        system.linearise(seen)
+    priors = _priors(system, known.uniform, known.prior, held)
+    steps = _search(system, levels, weights, seen, priors)
+    if streams:
+        held = _add_seen(held, system.diagonal(weights).levels)
+    for x, found in itertools.islice(steps, count):
+        fitted, held_out, _ = _measure(blocks, found)
+        changed = None if gains is None else system.gains(x)
+        state = Progress(state.step + 1, x.levels, tints, changed, held, fitted, held_out)
+        yield state
+    return state, before
 
 
 class _Priors(NamedTuple):
@@ -328,7 +387,8 @@ def _search(
 
 def _thinned(blocks: Sequence[Block], vertices: int) -> Sequence[Block]:
     """Returns the equations of as many pixels as there are finest vertices, or all of them."""
-    one_in = max(1, sum(len(block.srgb) for block in blocks) // vertices)
+    total = sum(len(block.srgb) for block in blocks)
+    one_in = max(1, total // max(vertices, _FEWEST_PIXELS))
     return blocks if one_in == 1 else [backdrop_equations.thinned(b, one_in) for b in blocks]
 
 
@@ -424,8 +484,9 @@ def _measure(blocks: Sequence[Block], seen: Sequence[Array]) -> tuple[float, flo
     total = sum(block.kept.size for block in blocks)
     measured = [_residuals(b, s) for b, s in zip(blocks, seen, strict=True)]
     fitted = float(sum(m[0] for m in measured)) / kept
-    held_out = float(sum(m[1] for m in measured)) / max(total - kept, 1.0)
+    # Without held-out pixels, their error is unknown.
+    held_out = float(sum(m[1] for m in measured)) / (total - kept) if total > kept else math.nan
     some = np.concatenate([np.asarray(m[2]).reshape(-1)[::_EVERY] for m in measured])
     typical = float(np.median(some))
-    decibels = [-10.0 * np.log10(max(x, 1e-12)) for x in (fitted, held_out)]
+    decibels = [float(-10.0 * np.log10(np.maximum(x, 1e-12))) for x in (fitted, held_out)]
     return decibels[0], decibels[1], max(1.4826 * typical, _ROUNDING)

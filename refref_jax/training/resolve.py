@@ -346,7 +346,7 @@ def _resolve_far_field(
     needs, model = _needs_of_a_field(config, facts), config.model
     if model.far_field == "backdrop" and needs:
         raise ValueError(
-            f"far_field=backdrop, but this run has {' and '.join(needs)}. Use far_field=field."
+            f"far_field=backdrop cannot model {' and '.join(needs)}. Use far_field=field."
         )
     if model.far_field is None:
         choice, why = _choose_far_field(config, facts, needs)
@@ -374,7 +374,7 @@ def _resolve_far_field(
 def _needs_of_a_field(config: TrainConfig, facts: SceneFacts) -> list[str]:
     """Returns what a backdrop cannot model, even with a field in front of it."""
     needs = {
-        "straight rays through objects": facts.analysis.parts > 0 and not config.paths.max_bends,
+        "straight rays (paths=straight)": facts.analysis.parts > 0 and not config.paths.max_bends,
         "contraction=always": config.model.contraction == "always",
         "pixels=background": config.scene.pixels == "background",
     }
@@ -474,11 +474,12 @@ def _resolve_training(
 
 
 def _warnings(asked: TrainConfig, config: TrainConfig, facts: SceneFacts) -> list[str]:
-    warnings, found = [], facts.analysis
-    ignored = [name for name in FIELD_ONLY if name in asked.overrides()]
-    if asked.model.far_field == "backdrop" and ignored and not _in_front(config, facts):
+    warnings, found, given = [], facts.analysis, asked.overrides()
+    ignored = [name for name in FIELD_ONLY if name in given]
+    asks = config.model.far_field == "backdrop" and given & {"far_field", *BACKDROP_ONLY}
+    if asks and ignored and not _in_front(config, facts):
         warnings.append(f"No effect on a backdrop: {', '.join(ignored)}. Use far_field=field.")
-    if asked.model.far_field == "backdrop" and (share := _share_of_misfits(config, facts)):
+    if asks and (share := _share_of_misfits(config, facts)):
         causes = "something is in front of it"
         if config.scene.space != "unbounded":
             causes += f", or its size ({config.scene.radius:g}) or centre is wrong"
