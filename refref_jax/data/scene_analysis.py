@@ -273,10 +273,10 @@ def size_in_images(
     Raises:
       SceneError: if a file is missing or broken.
     """
-    return fit_size(*_read_some(scene), parts, kind, centre=centre)
+    return fit_size_by_parallax(*_read_some(scene), parts, kind, centre=centre)
 
 
-def fit_size(
+def fit_size_by_parallax(
     cameras: Cameras,
     photographs: UInt8[np.ndarray, "views h w 3"],
     parts: Sequence[MeshPart],

@@ -57,8 +57,9 @@ class BackdropConfig:
     Attributes:
       resolution: number of cells per side of a face.
       most_taps: largest number of taps along each axis of a ray's footprint.
-      in_front: `field` for opaque parts and parts whose inside is a field, `nothing` without such.
-      view_dependence: whether radiance is `linear` in the direction of light, or `none`.
+      in_front: model of what is in front of the surface: a `field` on opaque parts, and inside
+        parts that need one, or `nothing`.
+      view_dependence: dependence of radiance on the direction of light: `linear`, or `none`.
     """
 
     resolution: int

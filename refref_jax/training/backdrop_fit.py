@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from jaxtyping import UInt8
 
 from refref_jax import configuration
@@ -37,8 +38,19 @@ _Progress = Callable[[int, int, str], None]
 class _SolverState(NamedTuple):
     """What continues the solver, beside the model; see `backdrop_solver.Progress`."""
 
-    gains: Gains | None
-    held: Pyramid | None
+    gains: Gains | None = None
+    held: Pyramid | None = None
+
+    def stored(self) -> Any:
+        """Returns the state as a checkpoint stores it, like earlier versions if it is empty."""
+        nothing = self.gains is None and self.held is None
+        return optax.EmptyState() if nothing else self
+
+
+def _solver_of(state: TrainState) -> _SolverState:
+    """Returns the solver's part of a state."""
+    stored = state.optimizer
+    return stored if isinstance(stored, _SolverState) else _SolverState()
 
 
 class _Problem(NamedTuple):
@@ -78,7 +90,8 @@ class _Problem(NamedTuple):
         per_image = self.config.model.exposure == "per_image"
         gains = jnp.zeros((len(self.images), 3)) if per_image else None
         held = jax.tree.map(jnp.zeros_like, surface_of(params)) if self.share < 1.0 else None
-        return TrainState(jnp.zeros((), jnp.int32), params, _SolverState(gains, held))
+        solver = _SolverState(gains, held).stored()
+        return TrainState(jnp.zeros((), jnp.int32), params, solver)
 
     def equations(self, draw: int) -> tuple[Block, ...]:
         """Returns the equations of all pixels, or of a share of them, drawn at random."""
@@ -135,8 +148,8 @@ class _Problem(NamedTuple):
             start=(step, surface_of(state.params)) if step else None,
             **self.surface,
             tints=state.params.tints,
-            gains=state.optimizer.gains,
-            held=state.optimizer.held,
+            gains=_solver_of(state).gains,
+            held=_solver_of(state).held,
             uniform=self._uniform() if streams else None,
             tint_decay=self.config.losses.tint_decay,
         )
@@ -203,14 +216,15 @@ def solve(
         run_folder.append_metrics(run, configuration.string_safe(line))
         progress(step, total, f"PSNR {reached.fitted:.2f}  held out {reached.held_out:.2f}")
         params = Params((), reached.pyramid, reached.tints)
-        state = TrainState(state.step, params, _SolverState(reached.gains, reached.held))
+        solver = _SolverState(reached.gains, reached.held).stored()
+        state = TrainState(state.step, params, solver)
         if step % backdrop_solver.ROUND == 0 and step < total:
             checkpoints.save(state._replace(step=jnp.asarray(step, jnp.int32)))
             if stop():
                 return step
     checkpoints.save(state._replace(step=jnp.asarray(total, jnp.int32)))
-    if state.optimizer.gains is not None:
-        gains = jax.device_get(jnp.exp(state.optimizer.gains))
+    if (learned := _solver_of(state).gains) is not None:
+        gains = jax.device_get(jnp.exp(learned))
         run_folder.write_gains(run, problem.frames.names, gains)
     return total
 

@@ -72,7 +72,7 @@ _VIEW_PRIOR = 10.0
 # First rounds take at least this many pixels, also of a coarse surface.
 _FEWEST_PIXELS = 200_000
 
-# What pixels of earlier rounds have told counts this much in the next one.
+# Factor by which the weight of the pixels of earlier rounds falls in every round.
 _FADES = 0.5
 
 # A round that improves the held-out pixels by less, in dB, is the last.
@@ -342,7 +342,7 @@ def _priors(system: System, uniform: Pyramid, prior: float, held: Pyramid | None
 
 
 def _add_seen(held: Pyramid | None, seen: Pyramid) -> Pyramid:
-    """Returns the weight of what pixels of earlier rounds have told, which fades."""
+    """Returns the weight with which the next round keeps to the radiance of earlier ones."""
     if held is None:
         return jax.tree.map(lambda x: _FADES * x, seen)
     return jax.tree.map(lambda x, y: _FADES * (x + y), held, seen)

@@ -37,6 +37,9 @@ FIELD_ONLY = (
 BACKDROP_ONLY = ("backdrop_resolution", "iterations", "most_pixels", "exposure", "view_dependence")
 """Options that only a backdrop reads."""
 
+BACKDROP_PIXELS = 64_000_000
+"""Default number of pixels whose equations are in memory at once; they take 18.6 GiB."""
+
 # Options that determine the model of the far field.
 _FAR_FIELD = (
     *(*_OBJECTS, "background", "radius", "centre", "pixels", "rule", "paths", "max_bends"),

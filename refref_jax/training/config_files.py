@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from refref_jax import configuration
-from refref_jax.training.config import TrainConfig
+from refref_jax.training.config import BACKDROP_PIXELS, TrainConfig
 
 CONFIG = "config.json"
 """Name of the file that marks a folder as a run."""
@@ -37,6 +37,10 @@ def read(path: Path) -> TrainConfig:
     config = configuration.read(path, TrainConfig)
     if config.model.far_field is None and config.schedule.steps is not None:
         config = config.decided(far_field="field")  # of a version that knew nothing else
+    if config.model.far_field == "backdrop" and config.schedule.steps is not None:
+        usual = {"most_pixels": BACKDROP_PIXELS, "exposure": "fixed", "view_dependence": "none"}
+        missing = {name: x for name, x in usual.items() if config.get(name) is None}
+        config = config.decided(**missing)  # of a version that knew nothing else
     made = config.scene.reconstruction
     if not made or Path(made).is_absolute():
         return config

@@ -61,9 +61,6 @@ BACKDROP_RESOLUTION = 384
 BACKDROP_ITERATIONS = 32
 """Default number of iterations of its solver."""
 
-BACKDROP_PIXELS = 64_000_000
-"""Default number of pixels whose equations are in memory at once; they take 18.6 GiB."""
-
 _NEAR = 0.05
 _FAR_UNBOUNDED = 1000.0
 

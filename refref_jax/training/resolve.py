@@ -45,6 +45,7 @@ from refref_jax.render.model import ModelConfig, has_foreground
 from refref_jax.training import presets
 from refref_jax.training.config import (
     BACKDROP_ONLY,
+    BACKDROP_PIXELS,
     FIELD_ONLY,
     SceneConfig,
     TrainConfig,
@@ -53,9 +54,7 @@ from refref_jax.training.config import (
 )
 
 # Reasons for the values of options.
-_GIVEN = "given"
-_USUAL = "by default"
-_KEPT = "as the configuration has it"
+_GIVEN, _USUAL, _KEPT = "given", "by default", "as the configuration has it"
 
 
 class SceneFacts(NamedTuple):
@@ -188,8 +187,8 @@ def resolve(config: TrainConfig, facts: SceneFacts) -> Resolved:
         settings = dataclasses.replace(settings, reentry=require(config.paths.reentry))
     config = _resolve_training(config, model, reasons)
     check_batch(facts.cameras, require(config.schedule.batch))
-    saved = SavedModel(model, settings)
-    return Resolved(config, saved, reasons, tuple(_warnings(asked, config, facts)))
+    warnings = tuple(_warnings(asked, config, facts))
+    return Resolved(config, SavedModel(model, settings), reasons, warnings)
 
 
 def build_scene(resolved: Resolved, facts: SceneFacts) -> Scene:
@@ -358,7 +357,7 @@ def _resolve_far_field(
             "far_field=backdrop",
             backdrop_resolution=presets.BACKDROP_RESOLUTION,
             iterations=presets.BACKDROP_ITERATIONS,
-            most_pixels=presets.BACKDROP_PIXELS,
+            most_pixels=BACKDROP_PIXELS,
             exposure="fixed",
             view_dependence="none",
         )

@@ -277,17 +277,17 @@ def test_pixels_that_only_see_objects_are_not_judged():
 def test_the_size_of_the_background_is_measured_by_its_parallax(kind, space):
     views = _room_views()
     images, other = (_photographs(views, space=s) for s in (space, "unbounded"))
-    size, error = scene_analysis.fit_size(views, images, (), kind)
+    size, error = scene_analysis.fit_size_by_parallax(views, images, (), kind)
     assert abs(size - 6.0) < max(3.0 * error, 0.01) and 0.0 < error < 0.05
-    assert scene_analysis.fit_size(views, other, (), kind) is None
+    assert scene_analysis.fit_size_by_parallax(views, other, (), kind) is None
 
 
 def test_walls_of_one_colour_have_no_measurable_size():
     views = _room_views()
     grey = np.full((24, 96, 96, 3), 99, np.uint8)
-    assert scene_analysis.fit_size(views, grey, (), "cube") is None
+    assert scene_analysis.fit_size_by_parallax(views, grey, (), "cube") is None
     around = [_made(trimesh.creation.icosphere(2, 5.0))]  # no pixel sees the background directly
-    assert scene_analysis.fit_size(views, grey, around, "cube") is None
+    assert scene_analysis.fit_size_by_parallax(views, grey, around, "cube") is None
 
 
 def test_a_scene_that_states_no_size_gets_that_of_its_images(tmp_path):

@@ -91,6 +91,15 @@ def test_a_path_that_ends_on_an_opaque_surface_sees_the_field_there(plant):
     np.testing.assert_allclose(plant(_CLEAR, free, 0.8).composite.rgb, _GREY, atol=1e-6)
 
 
+def test_opaque_surfaces_in_front_of_an_environment_have_finite_distances(plant):
+    sky = dataclasses.replace(_CLEAR, space="unbounded")
+    inside = made_paths.path([2.0], [(0, 0, -1), (0, 0.6, -0.8)], [0, 1], origin=(0, 0, 3))
+    seen = plant(sky, inside._replace(stop=Stop(jnp.float32(2.75), None)), 0.8).composite
+    np.testing.assert_allclose([seen.median, seen.mean], 2.75, rtol=1e-6)
+    free = plant(sky, inside._replace(stop=Stop(jnp.float32(jnp.inf), None)), 0.8).composite
+    assert np.all(np.isposinf([free.median, free.mean])) and np.all(np.isfinite(free.rgb))
+
+
 def test_only_the_field_in_front_of_the_backdrop_has_gradients():
     paths = jax.tree.map(lambda x: jnp.asarray(x)[None], _bent())
     params = init_params(jax.random.key(0), _INSIDE)

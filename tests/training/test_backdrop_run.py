@@ -120,6 +120,11 @@ def test_a_paused_run_continues_to_the_same_bits(scene, run, tmp_path):
     stop = _after_a_round(tmp_path / "run")
     fit(_config(scene), out=tmp_path / "run", stop=stop, report=lambda line: None)
     assert run_folder.read_metrics(tmp_path / "run")[-1]["step"] == _ROUND
+    # A run of an earlier version lacks some options.
+    stored = json.loads((tmp_path / "run" / "config.json").read_text())
+    for name in ("most_pixels", "exposure", "view_dependence"):
+        del stored["model"][name]
+    (tmp_path / "run" / "config.json").write_text(json.dumps(stored))
     lines = []
     again = fit(None, out=tmp_path / "run", existing="resume", report=lines.append)
     pairs = zip(jax.tree.leaves(again.params), jax.tree.leaves(run[1].params), strict=True)

@@ -1,6 +1,8 @@
 """The solver of backdrops: recovers known backgrounds, at the extremes, and through glass."""
 
 import dataclasses
+import gc
+import weakref
 
 import jax
 import jax.numpy as jnp
@@ -266,6 +268,22 @@ def test_rounds_with_other_pixels_come_close_to_all_pixels(ball):
     again = _solve(some, start=(first.step, first.pyramid), held=first.held, **rounds)
     for ours, theirs in zip(jax.tree.leaves(again), jax.tree.leaves(streamed), strict=True):
         np.testing.assert_array_equal(ours, theirs)
+
+
+def test_the_equations_of_a_round_are_freed_before_the_next_are_made():
+    alive = []
+
+    def draw(number):
+        gc.collect()
+        assert sum(each() is not None for each in alive) == 0
+        block = _one_pixel(0.5)
+        alive.append(weakref.ref(block.srgb))
+        return [block]
+
+    last = _solve(draw, uniform=backdrop.init(_RESOLUTION), iterations=3 * backdrop_solver.ROUND)
+    assert last.step == 3 * backdrop_solver.ROUND and len(alive) == 3
+    with pytest.raises(ValueError, match="need the radiance `uniform`"):
+        _solve(draw)
 
 
 def test_radiance_that_is_linear_in_the_direction_is_recovered():

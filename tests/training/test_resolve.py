@@ -105,6 +105,8 @@ def test_options_of_a_field_that_a_backdrop_ignores_are_named():
     made = _resolve(_CLEAR, far_field="backdrop", steps=100)
     assert "No effect on a backdrop: steps, batch. Use far_field=field." in made.warnings
     assert not any("No effect" in line for line in _resolve(_CLEAR, steps=100).warnings)
+    implied = _resolve(_CLEAR, iterations=8, steps=100)
+    assert implied.config.model.far_field == "backdrop" and implied.warnings == made.warnings
 
 
 def test_a_backdrop_has_a_size_and_a_number_of_iterations():
