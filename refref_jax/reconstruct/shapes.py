@@ -1,0 +1,371 @@
+"""Closed surfaces that depend on unknowns, and the free surface among them (NumPy only).
+
+A shape turns a vector of unknowns into a mesh of fixed connectivity and the exact derivatives of
+its vertices and normals, as a Gauss-Newton solver needs them. `families` has the shapes of few
+unknowns. The free surface is a mesh deformed along its normals by handles, which are vertices
+spread evenly over it.
+
+Sources: Max, Weights for Computing Vertex Normals from Facet Normals (1999), for the normals: they
+are exact if the vertices lie on a sphere. The derivatives and the priors are ours.
+"""
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array, csr_array, eye_array
+from scipy.spatial import KDTree
+
+from refref_jax.geometry.triangle_meshes import (
+    Faces,
+    Mesh,
+    Vertices,
+    diameter,
+    is_degenerate,
+    smooth_groups,
+    unit_vectors,
+    vertex_vectors,
+)
+from refref_jax.reconstruct import ReconstructionError
+
+Unknowns = Float[np.ndarray, " n"]
+Matrix = csr_array | np.ndarray
+
+LARGEST_STEP = 0.0077
+"""A sensible largest step of a length per iteration, as a share of the diameter of the mesh."""
+
+# Handles per vertex, and neighbours of a handle in the prior.
+_NEAREST = 6
+
+# Mean distance between handles, as a share of the diameter, and the least distance between two as
+# a share of the mean distance.
+_SPACING = 1.0 / 40.0
+_APART = 0.82
+
+# Lengths of the priors are stated for bodies of this diameter, world units.
+_STATED_FOR = 2.6
+
+
+class Posed(NamedTuple):
+    """A surface at given unknowns, and its derivatives.
+
+    Attributes:
+      vertices: world units.
+      faces: counter-clockwise seen from outside.
+      normals: unit, outward, shared between corners.
+      normal_ids: number of the normal of each corner.
+      by_vertices: derivatives of the vertices, `[3 vertices, n]`; row `3 v + axis`.
+      by_normals: derivatives of the normals, `[3 normals, n]`; row `3 i + axis`.
+    """
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    normals: Float[np.ndarray, "normals 3"]
+    normal_ids: Int[np.ndarray, "faces 3"]
+    by_vertices: Matrix
+    by_normals: Matrix
+
+
+class Shape(Protocol):
+    """A closed surface that depends on unknowns."""
+
+    @property
+    def name(self) -> str:
+        """Kind of the shape, in words."""
+
+    def start(self) -> Unknowns:
+        """Returns the unknowns of the fit to the mesh."""
+
+    def pose(self, unknowns: Unknowns) -> Posed:
+        """Returns the surface; its connectivity does not depend on the unknowns."""
+
+    def prior(self, unknowns: Unknowns) -> tuple[Matrix, Unknowns]:
+        """Returns the precision matrix and the gradient of the negative log prior."""
+
+    def scales(self) -> Unknowns:
+        """Returns a sensible largest step of each unknown, in world units or radians."""
+
+
+def mesh_of(posed: Posed) -> Mesh:
+    """Returns the surface as a mesh, whose normals are per corner."""
+    return Mesh(posed.vertices, posed.faces, posed.normals[posed.normal_ids])
+
+
+class Cloud(NamedTuple):
+    """Samples of a surface.
+
+    Attributes:
+      points: world units.
+      normals: unit, outward.
+      areas: share of the surface that each point stands for; they sum to 1.
+    """
+
+    points: Float[np.ndarray, "points 3"]
+    normals: Float[np.ndarray, "points 3"]
+    areas: Float[np.ndarray, " points"]
+
+
+def cloud_of(mesh: Mesh) -> Cloud:
+    """Returns the vertices of a mesh, with normals averaged by area, as samples of its surface.
+
+    Raises:
+      ReconstructionError: if the mesh is empty, flat or has coordinates that are not finite.
+    """
+    check(mesh)
+    vectors = vertex_vectors(mesh.vertices, mesh.faces)
+    areas = np.linalg.norm(vectors, axis=-1)
+    used = areas > 0.0
+    return Cloud(mesh.vertices[used], unit_vectors(vectors[used]), areas[used] / areas.sum())
+
+
+def check(mesh: Mesh) -> None:
+    """Checks that a mesh encloses a body.
+
+    Raises:
+      ReconstructionError: if the mesh is empty, flat or has coordinates that are not finite.
+    """
+    if len(mesh.faces) < 4 or len(mesh.vertices) < 4:
+        raise ReconstructionError(
+            f"The mesh has {len(mesh.vertices)} vertices and {len(mesh.faces)} faces, so it "
+            "encloses nothing. Pass a closed mesh."
+        )
+    if not np.all(np.isfinite(mesh.vertices)):
+        raise ReconstructionError("A vertex of the mesh is not finite. Remove it from the mesh.")
+    spread = np.linalg.svd(mesh.vertices - mesh.vertices.mean(axis=0), compute_uv=False)
+    if spread[2] <= 1e-9 * spread[0]:
+        raise ReconstructionError("The mesh is flat, so it encloses nothing. Pass a closed mesh.")
+
+
+class FreeSurface:
+    """A mesh that handles deform along its normals.
+
+    The unknowns are the displacements of the handles in world units, positive outwards. A vertex
+    moves along its normal at rest by the weighted mean of its nearest handles. Handles on the other
+    side of a thin wall are far: distances include the difference of the normals, times the mean
+    distance between handles. Shading normals are Max's, within the smooth groups of the mesh at
+    rest; their derivatives are exact.
+
+    Attributes:
+      name: kind of the shape.
+      mesh: mesh at rest.
+      handles: vertices that are handles.
+      weights: shares of the handles in the displacement of each vertex, `[vertices, handles]`.
+    """
+
+    name = "free surface"
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        spacing: float | None = None,
+        *,
+        roughness: float = 0.002,
+        size: float = 0.02,
+    ) -> None:
+        """Places the handles.
+
+        Args:
+          mesh: mesh at rest.
+          spacing: mean distance between handles, world units; by default 1/40 of the diameter.
+          roughness: standard deviation of a handle minus the mean of its neighbours, in world
+            units of a body of diameter 2.6; scaled to that of the mesh.
+          size: standard deviation of a displacement, in the same units.
+
+        Raises:
+          ReconstructionError: if the mesh is empty, flat or not finite, or `spacing` leaves fewer
+            than 4 handles.
+        """
+        check(mesh)
+        self.mesh = mesh
+        self._size = diameter(mesh.vertices)
+        spacing = _SPACING * self._size if spacing is None else spacing
+        self.directions = unit_vectors(vertex_vectors(mesh.vertices, mesh.faces))
+        self.handles = _spread(mesh.vertices, _APART * spacing)
+        if len(self.handles) < 4:
+            raise ReconstructionError(
+                f"spacing={spacing:g} leaves {len(self.handles)} handles. Pass a smaller one."
+            )
+        places = np.concatenate([mesh.vertices, spacing * self.directions], axis=-1)
+        self.weights = _shares(places, self.handles)
+        scale = self._size / _STATED_FOR
+        uneven = _unevenness(places[self.handles])
+        self._precision = csr_array(
+            uneven.T @ uneven / (scale * roughness) ** 2
+            + eye_array(len(self.handles)) / (scale * size) ** 2
+        )
+        groups = smooth_groups(mesh.vertices, mesh.faces)
+        flat = is_degenerate(mesh.vertices[mesh.faces])
+        self._corners = _Corners(mesh.faces, groups, ~flat)
+        self._fallback = np.zeros((groups.max() + 1, 3))
+        self._fallback[groups.ravel()] = mesh.normals.reshape(-1, 3)
+
+    def start(self) -> Unknowns:
+        """Returns no displacement."""
+        return np.zeros(len(self.handles))
+
+    def pose(self, unknowns: Unknowns) -> Posed:
+        """Returns the deformed mesh."""
+        shifts = self.weights @ unknowns
+        vertices = self.mesh.vertices + shifts[:, None] * self.directions
+        normals, slopes = _max_normals(vertices, self.directions, self._corners)
+        lost = np.all(normals == 0.0, axis=-1, keepdims=True)
+        return Posed(
+            vertices,
+            self.mesh.faces,
+            np.where(lost, self._fallback, normals),
+            self._corners.groups,
+            csr_array(_along(self.directions) @ self.weights),
+            csr_array(slopes @ self.weights),
+        )
+
+    def prior(self, unknowns: Unknowns) -> tuple[Matrix, Unknowns]:
+        """Returns the prior: displacements are small, and handles move like their neighbours."""
+        return self._precision, self._precision @ unknowns
+
+    def scales(self) -> Unknowns:
+        """Returns 0.0077 of the diameter."""
+        return np.full(len(self.handles), LARGEST_STEP * self._size)
+
+
+class _Corners(NamedTuple):
+    """What does not change when a mesh deforms.
+
+    Attributes:
+      faces: corner indices.
+      groups: number of the normal of each corner.
+      kept: faces that are not degenerate.
+    """
+
+    faces: Int[np.ndarray, "faces 3"]
+    groups: Int[np.ndarray, "faces 3"]
+    kept: Bool[np.ndarray, " faces"]
+
+
+def _spread(vertices: Vertices, apart: float) -> Int[np.ndarray, " handles"]:
+    """Returns vertices no two of which are nearer than a distance; all others are near one."""
+    tree = KDTree(vertices)
+    free = np.ones(len(vertices), bool)
+    chosen = []
+    for vertex in np.random.default_rng(0).permutation(len(vertices)):
+        if free[vertex]:
+            chosen.append(vertex)
+            free[tree.query_ball_point(vertices[vertex], apart)] = False
+    return np.sort(np.array(chosen, np.int64))
+
+
+def _shares(
+    places: Float[np.ndarray, "vertices 6"], handles: Int[np.ndarray, " handles"]
+) -> csr_array:
+    """Returns the weights of the nearest handles of each vertex, which sum to 1."""
+    count = min(_NEAREST + 1, len(handles))
+    away, nearest = KDTree(places[handles]).query(places, k=count)
+    # One handle more than has a say, where the weights fade to (almost) nothing.
+    reach = 1.001 * away[:, -1:]
+    shares = (1.0 - (away / reach) ** 2)[:, : max(count - 1, 1)] ** 2
+    shares /= shares.sum(axis=1, keepdims=True)
+    rows = np.repeat(np.arange(len(places)), shares.shape[1])
+    at = (rows, nearest[:, : shares.shape[1]].ravel())
+    return csr_array(coo_array((shares.ravel(), at), shape=(len(places), len(handles))))
+
+
+def _unevenness(places: Float[np.ndarray, "handles 6"]) -> csr_array:
+    """Returns the matrix that maps displacements to handle minus mean of its neighbours."""
+    count = min(_NEAREST, len(places) - 1)
+    around = KDTree(places).query(places, k=count + 1)[1][:, 1:]
+    rows = np.repeat(np.arange(len(places)), count)
+    shape = (len(places), len(places))
+    mean = coo_array((np.full(rows.size, 1.0 / count), (rows, around.ravel())), shape=shape)
+    return csr_array(eye_array(len(places)) - mean)
+
+
+def _along(directions: Vertices) -> csr_array:
+    """Returns the matrix `[3 vertices, vertices]` from displacements to vertices."""
+    count = len(directions)
+    columns = np.repeat(np.arange(count), 3)
+    return csr_array((directions.ravel(), columns, np.arange(3 * count + 1)))
+
+
+def max_normals(
+    vertices: Vertices, faces: Faces, groups: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "groups 3"]:
+    """Returns the unit normals of groups of corners, weighted as Max does.
+
+    A corner between the edges a and b adds `a x b / (|a|^2 |b|^2)`.
+    """
+    kept = ~is_degenerate(vertices[faces])
+    sums = np.zeros((groups.max() + 1, 3))
+    for corner in range(3):
+        a, b = _edges(vertices, faces[kept], corner)
+        sums += _summed(groups[kept, corner], _weighted(a, b), len(sums))
+    return unit_vectors(sums)
+
+
+def _max_normals(
+    vertices: Vertices, directions: Vertices, corners: _Corners
+) -> tuple[Float[np.ndarray, "groups 3"], csr_array]:
+    """Returns the normals, and their derivatives `[3 groups, vertices]` by displacements.
+
+    With `m = a x b / (|a|^2 |b|^2)`, `dm = (da x b + a x db) / (|a|^2 |b|^2)
+    - 2 m (a da / |a|^2 + b db / |b|^2)`. The normal `s / |s|` of the sum s changes by
+    `(I - n n^T) ds / |s|`.
+    """
+    faces, groups = corners.faces[corners.kept], corners.groups[corners.kept]
+    count = int(corners.groups.max()) + 1
+    sums = np.zeros((count, 3))
+    slopes, rows, columns = [], [], []
+    for corner in range(3):
+        a, b = _edges(vertices, faces, corner)
+        sums += _summed(groups[:, corner], _weighted(a, b), count)
+        for step in range(3):
+            column = faces[:, (corner + step) % 3]
+            slopes.append(_slope(a, b, directions[column], step))
+            rows.append(groups[:, corner])
+            columns.append(column)
+    length = np.linalg.norm(sums, axis=-1)
+    inverse = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0.0)
+    normals = sums * inverse[:, None]
+    row = np.concatenate(rows)
+    slope = np.concatenate(slopes) * inverse[row, None]
+    slope -= np.sum(slope * normals[row], axis=-1, keepdims=True) * normals[row]
+    at = (3 * row[:, None] + np.arange(3)).ravel(), np.repeat(np.concatenate(columns), 3)
+    return normals, csr_array(coo_array((slope.ravel(), at), shape=(3 * count, len(vertices))))
+
+
+def _edges(vertices: Vertices, faces: Faces, corner: int) -> tuple[Vertices, Vertices]:
+    here = vertices[faces[:, corner]]
+    return tuple(vertices[faces[:, (corner + step) % 3]] - here for step in (1, 2))
+
+
+def _weighted(a: Vertices, b: Vertices) -> Vertices:
+    return np.cross(a, b) / (np.sum(a**2, axis=-1) * np.sum(b**2, axis=-1))[:, None]
+
+
+def _slope(a: Vertices, b: Vertices, direction: Vertices, step: int) -> Vertices:
+    """Returns the derivative of a corner's vector as the corner or the end of an edge moves."""
+    aa, bb = np.sum(a**2, axis=-1, keepdims=True), np.sum(b**2, axis=-1, keepdims=True)
+    along_a = np.sum(a * direction, axis=-1, keepdims=True) / aa
+    along_b = np.sum(b * direction, axis=-1, keepdims=True) / bb
+    first = np.cross(direction, b) / (aa * bb) - 2.0 * along_a * _weighted(a, b)
+    second = np.cross(a, direction) / (aa * bb) - 2.0 * along_b * _weighted(a, b)
+    return (-first - second, first, second)[step]
+
+
+def _summed(at: Int[np.ndarray, " corners"], values: Vertices, count: int) -> Vertices:
+    return np.stack([np.bincount(at, values[:, i], count) for i in range(3)], axis=-1)
+
+
+def independent_prior(
+    deviations: Float[np.ndarray, " n"], away: Float[np.ndarray, " n"]
+) -> tuple[np.ndarray, Unknowns]:
+    """Returns the prior of independent unknowns: precision matrix and gradient.
+
+    Args:
+      deviations: standard deviation of each unknown.
+      away: unknowns minus their means.
+    """
+    return np.diag(deviations**-2.0), away / deviations**2
+
+
+def rms(values: np.ndarray, weights: np.ndarray) -> float:
+    """Returns the root of the weighted mean square."""
+    return float(np.sqrt(np.sum(weights * values**2) / np.sum(weights)))
