@@ -18,7 +18,6 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial import KDTree
 
 from refref_jax.geometry.triangle_meshes import Mesh, face_vectors
-from refref_jax.reconstruct import ReconstructionError
 from refref_jax.reconstruct.grids import import_skimage
 from refref_jax.reconstruct.shapes import Cloud
 
@@ -97,9 +96,9 @@ def lathe(
     """
     kept = ~poles[:, None] | (np.arange(azimuths) == 0)
     rows = np.flatnonzero(kept)
-    numbers = np.where(poles[:, None], 0, np.arange(azimuths)) + azimuths * np.arange(len(poles))[
-        :, None
-    ]
+    numbers = (
+        np.where(poles[:, None], 0, np.arange(azimuths)) + azimuths * np.arange(len(poles))[:, None]
+    )
     numbers = np.searchsorted(rows, numbers)
     here, there = np.arange(azimuths), (np.arange(azimuths) + 1) % azimuths
     (first, second), (begin, end) = segments.T, azimuths * ends.T
@@ -119,7 +118,10 @@ def lathe(
 
 
 def sweep(
-    values: Float[np.ndarray, "k 2"], slopes: Float[np.ndarray, "k 2 m"], frame: Frame, azimuths: int
+    values: Float[np.ndarray, "k 2"],
+    slopes: Float[np.ndarray, "k 2 m"],
+    frame: Frame,
+    azimuths: int,
 ) -> tuple[Float[np.ndarray, "ka 3"], Float[np.ndarray, "ka 3 m"]]:
     """Turns points or directions of the half-plane around the axis; also their derivatives.
 
@@ -215,7 +217,7 @@ class Fit(NamedTuple):
     rms: float
 
 
-def fit_revolution(mesh: Mesh, cloud: Cloud, size: float, *, rounds: int = 3) -> Fit:
+def fit_axis_and_profile(mesh: Mesh, cloud: Cloud, size: float, *, rounds: int = 3) -> Fit | None:
     """Fits a surface of revolution: the axis and the profile in turn.
 
     A point of the half-plane is inside if more than half of its circle is inside the mesh. The
@@ -229,13 +231,18 @@ def fit_revolution(mesh: Mesh, cloud: Cloud, size: float, *, rounds: int = 3) ->
       size: diameter of the mesh, world units.
       rounds: number of times that the axis is found; each but the first corrects it.
 
+    Returns:
+      The fit, however bad; `None` if no circle around the axis is mostly inside the mesh.
+
     Raises:
       ReconstructionError: if scikit-image is not installed.
     """
     axis, smoothing = find_axis(cloud), _LEAST_SMOOTHING * size
     for last in range(rounds - 1, -1, -1):
-        profile = outline(section(mesh, axis, size))
-        profile = _smooth(profile, smoothing, size)
+        contour = outline(section(mesh, axis, size))
+        if contour is None:
+            return None
+        profile = _smooth(contour, smoothing, size)
         for _ in range(_CORRECTIONS):
             matched = _match(profile, axis, cloud, size)
             profile = _corrected(profile, matched, smoothing, size)
@@ -336,11 +343,11 @@ def _between(
     return (1.0 - share) * corners[cut, low] + share * corners[cut, high]
 
 
-def outline(section: Section) -> Profile:
-    """Returns the contour at one half that encloses the largest body.
+def outline(section: Section) -> Profile | None:
+    """Returns the contour at one half that encloses the largest body, if there is one.
 
     Raises:
-      ReconstructionError: if no circle is inside, or scikit-image is not installed.
+      ReconstructionError: if scikit-image is not installed.
     """
     measure = import_skimage()
     # The mirror image beyond the axis makes the filter blind to it.
@@ -358,9 +365,7 @@ def outline(section: Section) -> Profile:
             curve = np.concatenate([ends[0], inside, ends[1]])
         found.append((_swept_volume(curve, closed), curve, closed))
     if not found:
-        raise ReconstructionError(
-            "No circle around the axis is inside the mesh. Check that its faces point outwards."
-        )
+        return None
     content, curve, closed = max(found, key=lambda item: abs(item[0]))
     curve = section.cell * curve + [0.0, section.bottom]
     return Profile(curve if content > 0.0 else curve[::-1], closed)
@@ -440,7 +445,9 @@ def _match(profile: Profile, axis: Axis, cloud: Cloud, size: float) -> _Match:
     errors = np.sum((flat - profile.points[nearest]) * normal, axis=-1)
     near = (distance < _REACH * size) & (np.sum(turned * normals, axis=-1) > 0.3)
     weights = np.where(near, cloud.areas * robust_weights(errors), 0.0)
-    return _Match(local, nearest, normals, errors, weights, np.where(near, np.abs(errors), distance))
+    return _Match(
+        local, nearest, normals, errors, weights, np.where(near, np.abs(errors), distance)
+    )
 
 
 def _corrected(profile: Profile, match: _Match, deviation: float, size: float) -> Profile:
@@ -461,16 +468,20 @@ def _corrected(profile: Profile, match: _Match, deviation: float, size: float) -
 
 
 def _corrected_axis(axis: Axis, match: _Match, size: float) -> Axis:
-    """Returns the axis after one weighted least-squares step.
+    """Returns the axis after a robust linear fit of the errors.
 
     A turn w about the point of the axis and a shift t move a point p of normal n outwards by
     `w . (p x n) + t . n`. A small ridge keeps the tilt of a ball as it is.
     """
     turns = np.cross(match.local, match.normals)[:, :2] / size
     rows = np.concatenate([turns, match.normals[:, :2]], axis=-1)
-    moments = (rows * match.weights[:, None]).T @ rows
-    moments += 1e-4 * np.trace(moments) * np.eye(4)
-    step = np.linalg.solve(moments, rows.T @ (match.weights * match.errors))
+    areas = match.weights / robust_weights(match.errors)
+    step = np.zeros(4)
+    for _ in range(_AXIS_ROUNDS):
+        weights = areas * robust_weights(match.errors - rows @ step)
+        moments = (rows * weights[:, None]).T @ rows
+        moments += 1e-4 * np.trace(moments) * np.eye(4)
+        step = np.linalg.lstsq(moments, rows.T @ (weights * match.errors), rcond=1e-12)[0]
     turn, shift = np.clip(step[:2] / size, -0.1, 0.1), step[2:]
     direction = axis.frame @ [turn[1], -turn[0], 1.0]
     return Axis(axis.point + axis.frame[:, :2] @ shift, frame_along(direction))

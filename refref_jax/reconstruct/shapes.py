@@ -15,6 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array, csr_array, eye_array
 from scipy.spatial import KDTree
+from trimesh import Trimesh
+from trimesh.remesh import subdivide_to_size
 
 from refref_jax.geometry.triangle_meshes import (
     Faces,
@@ -25,6 +27,7 @@ from refref_jax.geometry.triangle_meshes import (
     smooth_groups,
     unit_vectors,
     vertex_vectors,
+    volume,
 )
 from refref_jax.reconstruct import ReconstructionError
 
@@ -34,6 +37,12 @@ Matrix = csr_array | np.ndarray
 LARGEST_STEP = 0.0077
 """A sensible largest step of a length per iteration, as a share of the diameter of the mesh."""
 
+LARGEST_TURN = 0.02
+"""A sensible largest step of an angle per iteration, in radians."""
+
+FURTHEST = 0.015
+"""Largest rms distance of a mesh from a family that may explain it, as a share of its diameter."""
+
 # Handles per vertex, and neighbours of a handle in the prior.
 _NEAREST = 6
 
@@ -41,6 +50,9 @@ _NEAREST = 6
 # a share of the mean distance.
 _SPACING = 1.0 / 40.0
 _APART = 0.82
+
+# Longest edge of a mesh that is sampled at its vertices, as a share of the diameter.
+_LONGEST = 0.04
 
 # Lengths of the priors are stated for bodies of this diameter, world units.
 _STATED_FOR = 2.6
@@ -108,21 +120,30 @@ class Cloud(NamedTuple):
 def cloud_of(mesh: Mesh) -> Cloud:
     """Returns the vertices of a mesh, with normals averaged by area, as samples of its surface.
 
+    Long edges are divided first, so that a flat face of few vertices has samples inside.
+
     Raises:
-      ReconstructionError: if the mesh is empty, flat or has coordinates that are not finite.
+      ReconstructionError: if the mesh is empty, flat, inside out or not finite.
     """
     check(mesh)
-    vectors = vertex_vectors(mesh.vertices, mesh.faces)
+    middle, size = mesh.vertices.mean(axis=0), diameter(mesh.vertices)
+    vertices, faces = (mesh.vertices - middle) / size, mesh.faces
+    corners = vertices[faces]
+    if np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max() > _LONGEST:
+        divided = Trimesh(*subdivide_to_size(vertices, faces, _LONGEST))
+        vertices, faces = np.asarray(divided.vertices), np.asarray(divided.faces, np.int64)
+    vectors = vertex_vectors(vertices, faces)
     areas = np.linalg.norm(vectors, axis=-1)
     used = areas > 0.0
-    return Cloud(mesh.vertices[used], unit_vectors(vectors[used]), areas[used] / areas.sum())
+    points = middle + size * vertices[used]
+    return Cloud(points, unit_vectors(vectors[used]), areas[used] / areas.sum())
 
 
 def check(mesh: Mesh) -> None:
     """Checks that a mesh encloses a body.
 
     Raises:
-      ReconstructionError: if the mesh is empty, flat or has coordinates that are not finite.
+      ReconstructionError: if the mesh is empty, flat, inside out or not finite.
     """
     if len(mesh.faces) < 4 or len(mesh.vertices) < 4:
         raise ReconstructionError(
@@ -134,6 +155,10 @@ def check(mesh: Mesh) -> None:
     spread = np.linalg.svd(mesh.vertices - mesh.vertices.mean(axis=0), compute_uv=False)
     if spread[2] <= 1e-9 * spread[0]:
         raise ReconstructionError("The mesh is flat, so it encloses nothing. Pass a closed mesh.")
+    if volume(mesh.vertices, mesh.faces) <= 0.0:
+        raise ReconstructionError(
+            "The faces of the mesh point inwards. Reverse the order of their corners."
+        )
 
 
 class FreeSurface:
@@ -172,8 +197,8 @@ class FreeSurface:
           size: standard deviation of a displacement, in the same units.
 
         Raises:
-          ReconstructionError: if the mesh is empty, flat or not finite, or `spacing` leaves fewer
-            than 4 handles.
+          ReconstructionError: if the mesh is empty, flat, inside out or not finite, or `spacing`
+            leaves fewer than 4 handles.
         """
         check(mesh)
         self.mesh = mesh

@@ -1,0 +1,488 @@
+"""Families of closed surfaces with few unknowns, fitted to noisy meshes (NumPy only).
+
+A mesh from masks is wrong by up to a few percent of a face's length, so its normals are off by
+degrees. If the object is a ball, a torus or a vase, the right few numbers describe it without
+noise. `candidates` returns the families that come near a mesh as shapes (`shapes`), whose unknowns
+a solver then fits to images.
+
+All fits are equivariant: a mesh that is moved and scaled has the same fit, moved and scaled.
+
+Sources: Pottmann and Randrup (1998) for axes, see `revolution`; the rest is ours.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+from scipy.optimize import least_squares
+from trimesh.creation import icosphere
+
+from refref_jax.geometry.triangle_meshes import Mesh, diameter
+from refref_jax.reconstruct.polyhedra import fit_polyhedron
+from refref_jax.reconstruct.revolution import (
+    Axis,
+    Curve,
+    Lathe,
+    Profile,
+    find_axis,
+    fit_axis_and_profile,
+    lathe,
+    profile_normals,
+    robust_weights,
+    sweep,
+    tilt,
+)
+from refref_jax.reconstruct.shapes import (
+    FURTHEST,
+    LARGEST_STEP,
+    LARGEST_TURN,
+    FreeSurface,
+    Matrix,
+    Posed,
+    Shape,
+    Unknowns,
+    cloud_of,
+    independent_prior,
+    rms,
+)
+
+# Standard deviations of the priors: positions and radii, as shares of the diameter, and angles, in
+# radians. Offsets of a profile: second differences between knots, and their size.
+_LENGTH, _ANGLE = 0.01, 0.02
+_BEND, _OFFSET = 0.004, 0.008
+
+# Mesh of a ball, of a torus (around the tube, around the axis), and of other bodies of revolution.
+_SUBDIVISIONS = 5
+_AROUND_TUBE, _AROUND_TORUS = 96, 160
+_ALONG_PROFILE, _AROUND_AXIS = 192, 128
+
+# Knots of the offset along a profile.
+_KNOTS = 36
+
+# Rounds of robust weights. A torus is not tried if the first guess is further from the mesh than
+# this multiple of what is accepted; its tube is at most this share of the radius of its circle.
+_ROUNDS = 8
+_HOPELESS = 3.0
+_FATTEST = 0.98
+_EVALUATIONS = 30
+
+# Smoothing of the curvature that decides where a profile has points and knots, in its even steps.
+_CURVATURE_STEPS = 4.0
+
+
+class Sphere:
+    """A ball: its centre and its radius.
+
+    Attributes:
+      name: kind of the shape.
+    """
+
+    name = "sphere"
+
+    def __init__(self, centre: Float[np.ndarray, "3"], radius: float) -> None:
+        """Takes the centre and the radius in world units."""
+        self._start = np.append(centre, radius)
+        ball = icosphere(subdivisions=_SUBDIVISIONS)
+        self._faces = np.asarray(ball.faces, np.int64)
+        directions = np.asarray(ball.vertices, np.float64)
+        self._directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+    def start(self) -> Unknowns:
+        """Returns centre and radius of the fit, world units."""
+        return self._start.copy()
+
+    def pose(self, unknowns: Unknowns) -> Posed:
+        """Returns an icosphere, whose vertices lie on the ball."""
+        directions = self._directions
+        still = np.broadcast_to(np.eye(3), (len(directions), 3, 3))
+        return Posed(
+            unknowns[:3] + unknowns[3] * directions,
+            self._faces,
+            directions,
+            self._faces,
+            np.concatenate([still, directions[..., None]], axis=-1).reshape(-1, 4),
+            np.zeros((3 * len(directions), 4)),
+        )
+
+    def prior(self, unknowns: Unknowns) -> tuple[Matrix, Unknowns]:
+        """Returns the prior: unknowns are near those of the fit, within 1 % of the diameter."""
+        deviations = np.full(4, 2.0 * _LENGTH * self._start[3])
+        return independent_prior(deviations, unknowns - self._start)
+
+    def scales(self) -> Unknowns:
+        """Returns 0.77 % of the diameter."""
+        return np.full(4, 2.0 * LARGEST_STEP * self._start[3])
+
+
+class Torus:
+    """A torus.
+
+    The unknowns are two angles that tilt the axis, the shift of the centre along the three
+    directions of the frame of the fit, the radius of the circle in the middle of the tube, and that
+    of the tube.
+
+    Attributes:
+      name: kind of the shape.
+      axis: axis of the fit, through its centre.
+    """
+
+    name = "torus"
+
+    def __init__(self, axis: Axis, radius: float, tube: float) -> None:
+        """Takes the axis, whose point is the centre, and the two radii in world units."""
+        self.axis = axis
+        self._start = np.array([0.0, 0.0, 0.0, 0.0, 0.0, radius, tube])
+        self._size = 2.0 * (radius + tube)
+        number = np.arange(_AROUND_TUBE)
+        segments = np.stack([number, (number + 1) % _AROUND_TUBE], axis=-1)
+        self._lathe = lathe(np.zeros(_AROUND_TUBE, bool), segments, segments, _AROUND_TORUS)
+        angle = 2.0 * np.pi / _AROUND_TUBE * number
+        self._directions = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+    def start(self) -> Unknowns:
+        """Returns the unknowns of the fit."""
+        return self._start.copy()
+
+    def pose(self, unknowns: Unknowns) -> Posed:
+        """Returns the torus, with vertices on it."""
+        normals = self._directions
+        points = [unknowns[5], 0.0] + unknowns[6] * normals
+        outward = np.broadcast_to([1.0, 0.0], points.shape)
+        turned = _Turned(
+            points, np.stack([outward, normals], axis=-1), normals, np.zeros((*normals.shape, 2))
+        )
+        return _place(turned, self._lathe, _AROUND_TORUS, self.axis, unknowns[:5])
+
+    def prior(self, unknowns: Unknowns) -> tuple[Matrix, Unknowns]:
+        """Returns the prior: near the fit, within 1 % of the diameter and 0.02 radians."""
+        deviations = np.repeat([_ANGLE, _LENGTH * self._size], [2, 5])
+        return independent_prior(deviations, unknowns - self._start)
+
+    def scales(self) -> Unknowns:
+        """Returns 0.02 radians and 0.77 % of the diameter."""
+        return np.repeat([LARGEST_TURN, LARGEST_STEP * self._size], [2, 5])
+
+
+class Revolution:
+    """A surface of revolution.
+
+    The unknowns are two angles that tilt the axis, the shift of its point along the two directions
+    across it, and the offset of the profile along its normals at knots. Between knots, the offset
+    is a cubic spline, even about the poles; a pole stays on the axis. Normals are those of the
+    spline through the offset points. The body is smooth: a crease of the mesh is rounded.
+
+    Attributes:
+      name: kind of the shape.
+      axis: axis of the fit.
+      points: profile of the fit, relative to the point of the axis.
+      directions: its outward normals.
+      closed: whether the profile is closed.
+    """
+
+    name = "surface of revolution"
+
+    def __init__(self, axis: Axis, profile: Profile, size: float) -> None:
+        """Takes the axis, its profile in even steps, and the diameter of the body."""
+        self.axis, self.closed, self._size = axis, profile.closed, size
+        at, length = _places(profile, _ALONG_PROFILE)
+        knots, _ = _places(profile, _KNOTS)
+        self.points = _spline(*_even_length(profile), profile.closed)(at)
+        self._along = _slope_matrices(at, length, profile.closed)
+        along = np.stack([m @ self.points[:, i] for i, m in enumerate(self._along)], axis=-1)
+        self.directions = _turn_right(along) / np.linalg.norm(along, axis=-1, keepdims=True)
+        hats = _even_spline(knots, length, profile.closed)(at)
+        moved = self.directions[:, :, None] * hats[:, None]
+        self._slopes = moved
+        number = np.arange(len(at) if profile.closed else len(at) - 1)
+        segments = np.stack([number, (number + 1) % len(at)], axis=-1)
+        poles = np.zeros(len(at), bool)
+        poles[[0, -1]] = not profile.closed
+        self._lathe = lathe(poles, segments, segments, _AROUND_AXIS)
+
+    def start(self) -> Unknowns:
+        """Returns zeros: the axis and the profile of the fit."""
+        return np.zeros(4 + _KNOTS)
+
+    def profile(self, unknowns: Unknowns) -> "_Turned":
+        """Returns points and normals of the profile, and their derivatives by the offsets."""
+        points = self.points + self._slopes @ unknowns[4:]
+        along = np.stack([m @ points[:, i] for i, m in enumerate(self._along)], axis=-1)
+        moved = np.stack([m @ self._slopes[:, i] for i, m in enumerate(self._along)], axis=1)
+        length = np.linalg.norm(along, axis=-1)[:, None]
+        normals, turned = _turn_right(along) / length, _turn_right(moved) / length[..., None]
+        turned = turned - normals[..., None] * np.sum(normals[..., None] * turned, axis=1)[:, None]
+        return _Turned(points, self._slopes, normals, turned)
+
+    def pose(self, unknowns: Unknowns) -> Posed:
+        """Returns the body; its vertices lie on the spline."""
+        shift = np.append(unknowns[:4], 0.0)
+        posed = _place(self.profile(unknowns), self._lathe, _AROUND_AXIS, self.axis, shift)
+        # A shift along the axis is an offset of the profile.
+        return posed._replace(
+            by_vertices=np.delete(posed.by_vertices, 4, axis=1),
+            by_normals=np.delete(posed.by_normals, 4, axis=1),
+        )
+
+    def prior(self, unknowns: Unknowns) -> tuple[Matrix, Unknowns]:
+        """Returns the prior: a small change of the axis, small offsets, and smaller bends.
+
+        Standard deviations are 0.02 radians and 1 % of the diameter for the axis, 0.8 % for an
+        offset, and 0.4 % for the second difference of three neighbours.
+        """
+        bends = np.diff(np.eye(_KNOTS), 2, axis=0)
+        if self.closed:
+            bends = np.roll(np.eye(_KNOTS), 1, axis=0) - 2.0 * np.eye(_KNOTS)
+            bends += np.roll(np.eye(_KNOTS), -1, axis=0)
+        deviations = [_ANGLE, _LENGTH * self._size, _OFFSET * self._size]
+        precision = np.diag(np.repeat(deviations, [2, 2, _KNOTS]) ** -2.0)
+        precision[4:, 4:] += bends.T @ bends / (_BEND * self._size) ** 2
+        return precision, precision @ unknowns
+
+    def scales(self) -> Unknowns:
+        """Returns 0.02 radians and 0.77 % of the diameter."""
+        return np.repeat([LARGEST_TURN, LARGEST_STEP * self._size], [2, 2 + _KNOTS])
+
+
+class _Turned(NamedTuple):
+    """A profile and its derivatives by m unknowns.
+
+    Attributes:
+      points: radius and height.
+      by_points: derivatives of the points.
+      normals: outward unit normals at the points.
+      by_normals: derivatives of the normals.
+    """
+
+    points: Float[np.ndarray, "points 2"]
+    by_points: Float[np.ndarray, "points 2 m"]
+    normals: Float[np.ndarray, "points 2"]
+    by_normals: Float[np.ndarray, "points 2 m"]
+
+
+def _place(
+    turned: _Turned, connected: Lathe, azimuths: int, axis: Axis, pose: Float[np.ndarray, "5"]
+) -> Posed:
+    """Turns a profile around an axis that is tilted and shifted.
+
+    Args:
+      turned: profile relative to the point of the axis.
+      connected: connectivity.
+      azimuths: number of half-planes.
+      axis: axis at rest.
+      pose: two angles of the tilt, and the shift in the frame of the axis.
+
+    Returns:
+      The surface; unknowns are the pose and then those of the profile.
+    """
+    rotations = [axis.frame @ rotation for rotation in tilt(pose[:2])]
+
+    def turn(values: Curve, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        swept, moved = sweep(values, slopes, rotations[0], azimuths)
+        local = swept @ rotations[0]
+        tilted = np.stack([local @ rotation.T for rotation in rotations[1:]], axis=-1)
+        return swept, np.concatenate([tilted, np.zeros((*swept.shape, 3)), moved], axis=-1)
+
+    vertices, by_vertices = turn(turned.points, turned.by_points)
+    by_vertices[..., 2:5] = axis.frame
+    normals, by_normals = turn(turned.normals, turned.by_normals)
+    rows = connected.rows
+    return Posed(
+        axis.point + axis.frame @ pose[2:] + vertices[rows],
+        connected.faces,
+        normals,
+        connected.normal_ids,
+        by_vertices[rows].reshape(3 * len(rows), -1),
+        by_normals.reshape(3 * len(normals), -1),
+    )
+
+
+def _turn_right(along: np.ndarray) -> np.ndarray:
+    """Returns directions of the half-plane turned by a right angle, outwards from a profile."""
+    return np.stack([along[:, 1], -along[:, 0]], axis=1)
+
+
+def _even_length(profile: Profile) -> tuple[Float[np.ndarray, " n"], Curve]:
+    """Returns lengths along a profile and its points; a closed one returns to its first."""
+    points = profile.points
+    if profile.closed:
+        points = np.concatenate([points, points[:1]])
+    steps = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=-1)
+    return np.cumsum(steps), points
+
+
+def _places(profile: Profile, count: int) -> tuple[Float[np.ndarray, " count"], float]:
+    """Returns lengths along a profile, half of them even and half where it turns; its length."""
+    length, _ = _even_length(profile)
+    normals = profile_normals(profile)
+    if profile.closed:
+        normals = np.concatenate([normals, normals[:1]])
+    before, after = normals[:-1], normals[1:]
+    angle = np.arctan2(
+        before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0], np.sum(before * after, axis=-1)
+    )
+    mode = "wrap" if profile.closed else "reflect"
+    turn = np.abs(gaussian_filter1d(angle, _CURVATURE_STEPS, mode=mode))
+    turn = gaussian_filter1d(turn, _CURVATURE_STEPS, mode=mode)
+    share = np.diff(length) / length[-1] + turn / turn.sum()
+    total = np.concatenate([[0.0], np.cumsum(share)])
+    ticks = np.linspace(0.0, total[-1], count + profile.closed)
+    at = np.interp(ticks, total, length)
+    return at[:count], float(length[-1])
+
+
+def _spline(at: Float[np.ndarray, " n"], points: Curve, closed: bool) -> Callable[..., Curve]:
+    """Returns the spline through a profile: radii odd about the poles, heights even."""
+    if closed:
+        return CubicSpline(at, points, bc_type="periodic")
+    radii = CubicSpline(at, points[:, 0], bc_type="natural")
+    heights = CubicSpline(at, points[:, 1], bc_type="clamped")
+    return lambda s: np.stack([radii(s), heights(s)], axis=-1)
+
+
+def _slope_matrices(
+    at: Float[np.ndarray, " n"], length: float, closed: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the matrices from radii, and from heights, at places to derivatives there."""
+    if closed:
+        matrix = _even_spline(at, length, closed)(at, 1)
+        return matrix, matrix
+    one = np.eye(len(at))
+    return (
+        CubicSpline(at, one, bc_type="natural")(at, 1),
+        CubicSpline(at, one, bc_type="clamped")(at, 1),
+    )
+
+
+def _even_spline(knots: Float[np.ndarray, " n"], length: float, closed: bool) -> CubicSpline:
+    """Returns the splines that are 1 at one knot each: periodic, or even about both ends."""
+    one = np.eye(len(knots))
+    if closed:
+        around = np.append(knots, knots[0] + length)
+        return CubicSpline(around, np.concatenate([one, one[:1]]), bc_type="periodic")
+    return CubicSpline(knots, one, bc_type="clamped")
+
+
+def fit_sphere(mesh: Mesh, *, furthest: float = FURTHEST) -> Sphere | None:
+    """Fits a ball by linear least squares of `|p|^2 = 2 c . p + k`, weighted by area and robust.
+
+    Args:
+      mesh: closed mesh.
+      furthest: largest rms distance of the mesh from the ball, as a share of its diameter.
+
+    Returns:
+      The ball, or `None` if the mesh is further from it.
+
+    Raises:
+      ReconstructionError: if the mesh is empty, flat, inside out or not finite.
+    """
+    cloud, size = cloud_of(mesh), diameter(mesh.vertices)
+    middle = cloud.areas @ cloud.points
+    points = (cloud.points - middle) / size
+    centre, radius = _fit_ball(points, cloud.areas)
+    if rms(np.linalg.norm(points - centre, axis=-1) - radius, cloud.areas) > furthest:
+        return None
+    return Sphere(middle + size * centre, size * radius)
+
+
+def _fit_ball(
+    points: Float[np.ndarray, "points d"], areas: Float[np.ndarray, " points"]
+) -> tuple[Float[np.ndarray, " d"], float]:
+    """Returns centre and radius of the ball or circle through points."""
+    rows = np.append(2.0 * points, np.ones((len(points), 1)), axis=-1)
+    squares = np.sum(points**2, axis=-1)
+    weights = areas
+    for _ in range(_ROUNDS):
+        root = np.sqrt(weights)
+        found = np.linalg.lstsq(rows * root[:, None], squares * root, rcond=None)[0]
+        weights = areas * robust_weights(squares - rows @ found)
+    return found[:-1], float(np.sqrt(max(found[-1] + found[:-1] @ found[:-1], 0.0)))
+
+
+def fit_torus(mesh: Mesh, *, furthest: float = FURTHEST) -> Torus | None:
+    """Fits a torus by robust least squares of distances, from the axis that normals meet.
+
+    Args:
+      mesh: closed mesh.
+      furthest: largest rms distance of the mesh from the torus, as a share of its diameter.
+
+    Returns:
+      The torus, or `None` if the mesh is further from it, or the torus has no hole.
+
+    Raises:
+      ReconstructionError: if the mesh is empty, flat, inside out or not finite.
+    """
+    cloud, size = cloud_of(mesh), diameter(mesh.vertices)
+    axis = find_axis(cloud)
+    local = (cloud.points - axis.point) @ axis.frame / size
+    flat = np.stack([np.linalg.norm(local[:, :2], axis=-1), local[:, 2]], axis=-1)
+    centre, tube = _fit_ball(flat, cloud.areas)
+    first = np.array([0.0, 0.0, 0.0, 0.0, centre[1], centre[0], tube])
+    errors = _torus_distances(local, first)
+    if rms(errors, cloud.areas) > _HOPELESS * furthest:
+        return None
+    root = np.sqrt(cloud.areas * len(cloud.areas))
+    found = least_squares(
+        lambda x: root * _torus_distances(local, x),
+        first,
+        loss="soft_l1",
+        f_scale=max(1.5 * float(np.median(np.abs(errors))), 1e-9),
+        x_scale=0.1,
+        max_nfev=_EVALUATIONS,
+    ).x
+    far = rms(_torus_distances(local, found), cloud.areas) > furthest
+    if far or not 0.0 < found[6] < _FATTEST * found[5]:
+        return None
+    point = axis.point + size * axis.frame @ found[2:5]
+    return Torus(
+        Axis(point, axis.frame @ tilt(found[:2])[0]), size * found[5], size * float(found[6])
+    )
+
+
+def _torus_distances(
+    local: Float[np.ndarray, "points 3"], unknowns: Float[np.ndarray, "7"]
+) -> Float[np.ndarray, " points"]:
+    """Returns distances from a torus, positive outside; unknowns as in `Torus`."""
+    points = (local - unknowns[2:5]) @ tilt(unknowns[:2])[0]
+    around = np.hypot(points[:, 0], points[:, 1]) - unknowns[5]
+    return np.hypot(around, points[:, 2]) - unknowns[6]
+
+
+def fit_revolution(mesh: Mesh, *, furthest: float = FURTHEST) -> Revolution | None:
+    """Fits a surface of revolution: see `revolution.fit_axis_and_profile`.
+
+    Args:
+      mesh: closed mesh, in one piece.
+      furthest: largest rms distance of the mesh from the body, as a share of its diameter.
+
+    Returns:
+      The body, or `None` if the mesh is further from it.
+
+    Raises:
+      ReconstructionError: if the mesh is empty, flat, inside out or not finite, or
+        scikit-image is not installed.
+    """
+    cloud, size = cloud_of(mesh), diameter(mesh.vertices)
+    fit = fit_axis_and_profile(mesh, cloud, size)
+    if fit is None or fit.rms > furthest * size:
+        return None
+    return Revolution(fit.axis, fit.profile, size)
+
+
+def candidates(mesh: Mesh) -> list[Shape]:
+    """Returns the families that come near a mesh, the fewest unknowns first, the free surface last.
+
+    Example:
+      >>> shapes = candidates(mesh)
+      >>> [shape.name for shape in shapes]
+      ['sphere', 'surface of revolution', 'free surface']
+
+    Raises:
+      ReconstructionError: if the mesh is empty, flat, inside out or not finite, or
+        scikit-image is not installed.
+    """
+    fits = (fit_sphere(mesh), fit_torus(mesh), fit_revolution(mesh), fit_polyhedron(mesh))
+    found: list[Shape] = [fit for fit in fits if fit is not None]
+    return [*sorted(found, key=lambda shape: len(shape.start())), FreeSurface(mesh)]
