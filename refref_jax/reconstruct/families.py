@@ -31,9 +31,7 @@ from refref_jax.reconstruct.revolution import (
     fit_axis_and_profile,
     lathe,
     profile_normals,
-    robust_weights,
     sweep,
-    tilt,
 )
 from refref_jax.reconstruct.shapes import (
     FURTHEST,
@@ -47,6 +45,8 @@ from refref_jax.reconstruct.shapes import (
     cloud_of,
     independent_prior,
     rms,
+    robust_weights,
+    tilt,
 )
 
 # Standard deviations of the priors: positions and radii, as shares of the diameter, and angles, in

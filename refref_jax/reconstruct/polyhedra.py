@@ -23,7 +23,6 @@ from refref_jax.geometry.triangle_meshes import (
     neighbours,
     unit_vectors,
 )
-from refref_jax.reconstruct.revolution import frame_along, robust_weights, tilt
 from refref_jax.reconstruct.shapes import (
     FURTHEST,
     LARGEST_STEP,
@@ -32,8 +31,11 @@ from refref_jax.reconstruct.shapes import (
     Posed,
     Unknowns,
     check,
+    frame_along,
     independent_prior,
     rms,
+    robust_weights,
+    tilt,
 )
 
 Planes = Float[np.ndarray, "planes 4"]
@@ -45,7 +47,7 @@ MOST = 60
 _ANGLE, _LENGTH = 0.02, 0.01
 
 # Rounds of averaging normals between neighbouring faces that agree.
-_AVERAGED = 8
+_AVERAGED = 30
 
 # Directions among which normals are counted. A normal is that of a flat face if the area with
 # normals within the first angle is at least this share of that within the second.
@@ -245,7 +247,8 @@ def _peaks(
     tree = KDTree(np.stack([radius * np.cos(turn), radius * np.sin(turn), height], axis=-1))
     cell = tree.query(normals)[1]
     left, faces = np.bincount(cell, areas, _DIRECTIONS), KDTree(normals)
-    found, covered = [], 0.0
+    found: list[np.ndarray] = []
+    covered = 0.0
     close = tree.query_ball_point(tree.data, _NEAR)
     while len(found) <= MOST:
         density = np.array([left[some].sum() for some in close])

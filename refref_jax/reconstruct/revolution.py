@@ -19,13 +19,9 @@ from scipy.spatial import KDTree
 
 from refref_jax.geometry.triangle_meshes import Mesh, face_vectors
 from refref_jax.reconstruct.grids import import_skimage
-from refref_jax.reconstruct.shapes import Cloud
+from refref_jax.reconstruct.shapes import Cloud, Frame, frame_along, robust_weights
 
 Curve = Float[np.ndarray, "points 2"]
-Frame = Float[np.ndarray, "3 3"]
-
-# Robust weights 1 / (1 + (e / s)^2)^2 have s at this multiple of the median error.
-_ROBUST = 1.5
 
 # Rounds of robust weights, of the axis against the profile, and of the profile's corrections.
 _AXIS_ROUNDS = 12
@@ -143,24 +139,6 @@ def sweep(
     return swept.reshape(-1, 3), moved.reshape(len(swept) * azimuths, 3, -1)
 
 
-def tilt(angles: Float[np.ndarray, "2"]) -> tuple[Frame, Frame, Frame]:
-    """Returns the rotation about x by one angle after y by another, and its two derivatives."""
-    (c, d), (s, t) = np.cos(angles), np.sin(angles)
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-    about_y = np.array([[d, 0.0, t], [0.0, 1.0, 0.0], [-t, 0.0, d]])
-    by_x = np.array([[0.0, 0.0, 0.0], [0.0, -s, -c], [0.0, c, -s]])
-    by_y = np.array([[-t, 0.0, d], [0.0, 0.0, 0.0], [-d, 0.0, -t]])
-    return about_x @ about_y, by_x @ about_y, about_x @ by_y
-
-
-def frame_along(direction: Float[np.ndarray, "3"]) -> Frame:
-    """Returns a right-handed frame whose third column has a direction."""
-    third = direction / np.linalg.norm(direction)
-    first = np.cross(third, np.eye(3)[np.argmin(np.abs(third))])
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(third, first), third], axis=-1)
-
-
 def find_axis(cloud: Cloud) -> Axis:
     """Returns the line that most normals of a surface meet.
 
@@ -183,12 +161,6 @@ def find_axis(cloud: Cloud) -> Axis:
         weights = cloud.areas * robust_weights(error)
     point = middle + size * np.cross(direction, moment)
     return Axis(point, frame_along(direction * np.sign(direction[np.argmax(np.abs(direction))])))
-
-
-def robust_weights(errors: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Returns weights that fade for errors above 1.5 times the median."""
-    scale = max(_ROBUST * float(np.median(np.abs(errors))), 1e-30)
-    return (1.0 + (errors / scale) ** 2) ** -2.0
 
 
 class Profile(NamedTuple):
@@ -379,7 +351,7 @@ def _swept_volume(curve: Curve, closed: bool) -> float:
     return float(np.sum((r * r + r * s + s * s) * (t - z))) / 3.0
 
 
-def _loop(points: Curve, closed: bool) -> Curve:
+def _loop(points: Curve, closed: bool) -> Float[np.ndarray, "loop 2"]:
     """Returns a closed curve: an open profile continues with its mirror image."""
     return points if closed else np.concatenate([points, points[-2:0:-1] * [-1.0, 1.0]])
 

@@ -9,7 +9,7 @@ Sources: Max, Weights for Computing Vertex Normals from Facet Normals (1999), fo
 are exact if the vertices lie on a sphere. The derivatives and the priors are ours.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -32,7 +32,9 @@ from refref_jax.geometry.triangle_meshes import (
 from refref_jax.reconstruct import ReconstructionError
 
 Unknowns = Float[np.ndarray, " n"]
-Matrix = csr_array | np.ndarray
+Matrix: TypeAlias = csr_array | np.ndarray
+Frame = Float[np.ndarray, "3 3"]
+AtCorners = Float[np.ndarray, "corners 3"]
 
 LARGEST_STEP = 0.0077
 """A sensible largest step of a length per iteration, as a share of the diameter of the mesh."""
@@ -40,7 +42,7 @@ LARGEST_STEP = 0.0077
 LARGEST_TURN = 0.02
 """A sensible largest step of an angle per iteration, in radians."""
 
-FURTHEST = 0.015
+FURTHEST = 0.01
 """Largest rms distance of a mesh from a family that may explain it, as a share of its diameter."""
 
 # Handles per vertex, and neighbours of a handle in the prior.
@@ -48,8 +50,11 @@ _NEAREST = 6
 
 # Mean distance between handles, as a share of the diameter, and the least distance between two as
 # a share of the mean distance.
-_SPACING = 1.0 / 40.0
+_SPACING = 1.0 / 44.0
 _APART = 0.82
+
+# Robust weights 1 / (1 + (e / s)^2)^2 have s at this multiple of the median error.
+_ROBUST = 1.5
 
 # Longest edge of a mesh that is sampled at its vertices, as a share of the diameter.
 _LONGEST = 0.04
@@ -78,6 +83,7 @@ class Posed(NamedTuple):
     by_normals: Matrix
 
 
+@runtime_checkable
 class Shape(Protocol):
     """A closed surface that depends on unknowns."""
 
@@ -161,14 +167,40 @@ def check(mesh: Mesh) -> None:
         )
 
 
+def tilt(angles: Float[np.ndarray, "2"]) -> tuple[Frame, Frame, Frame]:
+    """Returns the rotation about x by one angle after y by another, and its two derivatives."""
+    (c, d), (s, t) = np.cos(angles), np.sin(angles)
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    about_y = np.array([[d, 0.0, t], [0.0, 1.0, 0.0], [-t, 0.0, d]])
+    by_x = np.array([[0.0, 0.0, 0.0], [0.0, -s, -c], [0.0, c, -s]])
+    by_y = np.array([[-t, 0.0, d], [0.0, 0.0, 0.0], [-d, 0.0, -t]])
+    return about_x @ about_y, by_x @ about_y, about_x @ by_y
+
+
+def frame_along(direction: Float[np.ndarray, "3"]) -> Frame:
+    """Returns a right-handed frame whose third column has a direction."""
+    third = direction / np.linalg.norm(direction)
+    first = np.cross(third, np.eye(3)[np.argmin(np.abs(third))])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(third, first), third], axis=-1)
+
+
+def robust_weights(errors: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Returns weights that fade for errors above 1.5 times the median, or a tenth of their rms."""
+    scale = max(
+        _ROBUST * float(np.median(np.abs(errors))), 0.1 * float(np.sqrt(np.mean(errors**2))), 1e-300
+    )
+    return (1.0 + (errors / scale) ** 2) ** -2.0
+
+
 class FreeSurface:
     """A mesh that handles deform along its normals.
 
     The unknowns are the displacements of the handles in world units, positive outwards. A vertex
     moves along its normal at rest by the weighted mean of its nearest handles. Handles on the other
-    side of a thin wall are far: distances include the difference of the normals, times the mean
-    distance between handles. Shading normals are Max's, within the smooth groups of the mesh at
-    rest; their derivatives are exact.
+    side of a thin wall are far: distances include the difference of the normals, times twice the
+    mean distance between handles. Shading normals are Max's, within the smooth groups of the mesh
+    at rest; their derivatives are exact.
 
     Attributes:
       name: kind of the shape.
@@ -191,7 +223,7 @@ class FreeSurface:
 
         Args:
           mesh: mesh at rest.
-          spacing: mean distance between handles, world units; by default 1/40 of the diameter.
+          spacing: mean distance between handles, world units; by default 1/44 of the diameter.
           roughness: standard deviation of a handle minus the mean of its neighbours, in world
             units of a body of diameter 2.6; scaled to that of the mesh.
           size: standard deviation of a displacement, in the same units.
@@ -210,7 +242,7 @@ class FreeSurface:
             raise ReconstructionError(
                 f"spacing={spacing:g} leaves {len(self.handles)} handles. Pass a smaller one."
             )
-        places = np.concatenate([mesh.vertices, spacing * self.directions], axis=-1)
+        places = np.concatenate([mesh.vertices, 2.0 * spacing * self.directions], axis=-1)
         self.weights = _shares(places, self.handles)
         scale = self._size / _STATED_FOR
         uneven = _unevenness(places[self.handles])
@@ -310,21 +342,6 @@ def _along(directions: Vertices) -> csr_array:
     return csr_array((directions.ravel(), columns, np.arange(3 * count + 1)))
 
 
-def max_normals(
-    vertices: Vertices, faces: Faces, groups: Int[np.ndarray, "faces 3"]
-) -> Float[np.ndarray, "groups 3"]:
-    """Returns the unit normals of groups of corners, weighted as Max does.
-
-    A corner between the edges a and b adds `a x b / (|a|^2 |b|^2)`.
-    """
-    kept = ~is_degenerate(vertices[faces])
-    sums = np.zeros((groups.max() + 1, 3))
-    for corner in range(3):
-        a, b = _edges(vertices, faces[kept], corner)
-        sums += _summed(groups[kept, corner], _weighted(a, b), len(sums))
-    return unit_vectors(sums)
-
-
 def _max_normals(
     vertices: Vertices, directions: Vertices, corners: _Corners
 ) -> tuple[Float[np.ndarray, "groups 3"], csr_array]:
@@ -356,16 +373,16 @@ def _max_normals(
     return normals, csr_array(coo_array((slope.ravel(), at), shape=(3 * count, len(vertices))))
 
 
-def _edges(vertices: Vertices, faces: Faces, corner: int) -> tuple[Vertices, Vertices]:
-    here = vertices[faces[:, corner]]
-    return tuple(vertices[faces[:, (corner + step) % 3]] - here for step in (1, 2))
+def _edges(vertices: Vertices, faces: Faces, corner: int) -> tuple[AtCorners, AtCorners]:
+    first, second, third = (vertices[faces[:, (corner + step) % 3]] for step in range(3))
+    return second - first, third - first
 
 
-def _weighted(a: Vertices, b: Vertices) -> Vertices:
+def _weighted(a: AtCorners, b: AtCorners) -> AtCorners:
     return np.cross(a, b) / (np.sum(a**2, axis=-1) * np.sum(b**2, axis=-1))[:, None]
 
 
-def _slope(a: Vertices, b: Vertices, direction: Vertices, step: int) -> Vertices:
+def _slope(a: AtCorners, b: AtCorners, direction: AtCorners, step: int) -> AtCorners:
     """Returns the derivative of a corner's vector as the corner or the end of an edge moves."""
     aa, bb = np.sum(a**2, axis=-1, keepdims=True), np.sum(b**2, axis=-1, keepdims=True)
     along_a = np.sum(a * direction, axis=-1, keepdims=True) / aa
@@ -375,7 +392,7 @@ def _slope(a: Vertices, b: Vertices, direction: Vertices, step: int) -> Vertices
     return (-first - second, first, second)[step]
 
 
-def _summed(at: Int[np.ndarray, " corners"], values: Vertices, count: int) -> Vertices:
+def _summed(at: Int[np.ndarray, " corners"], values: AtCorners, count: int) -> Vertices:
     return np.stack([np.bincount(at, values[:, i], count) for i in range(3)], axis=-1)
 
 
